@@ -62,7 +62,7 @@ def text(summary: Summary) -> list[str]:
         if source not in inputs or explain(reason).effect is not Effect.REFUSED
         for line in _counted_lines(source, reason, times)
     ]
-    return [*lines, *undetermined, *others, *_gyro(summary), *calibration(summary), *table(summary)]
+    return [*lines, *undetermined, *others, *_gyro(summary), *calibration(summary), *_clocks(summary), *table(summary)]
 
 
 def _gyro(summary: Summary) -> Iterator[str]:
@@ -97,6 +97,14 @@ def calibration(summary: Summary) -> Iterator[str]:
     for one in report["parameters"]:
         if one["verdict"] not in ("admitted", "nothing_to_correct"):
             yield from _wrapped(f"calibrated {one['text']}", 11)
+
+
+def _clocks(summary: Summary) -> Iterator[str]:
+    """Yield the clocks that the association of sightings without identity found, with the setting of each."""
+    for topic, one in summary.get("association", {}).get("clocks", {}).items():
+        if one["setting"]:
+            found = f"{one['value']:+.3f} s (sigma {one['sigma']:.3f} s), used to recognise landmarks"
+            yield from _wrapped(f"clock      of {topic}: {found}; in the estimate, too: --set {one['setting']}", 11)
 
 
 def _solves(summary: Summary) -> str:

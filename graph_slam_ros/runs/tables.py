@@ -18,6 +18,8 @@ from graph_slam_ros.messages.inputs import recorded_uses
 from graph_slam_ros.runs.folder import COVARIANCES, GRAPH, LANDMARKS, ODOMETRY, PATH, PATH_ODOMETRY, SIGHTINGS, VERTICES
 from graph_slam_ros.runs.ledger_file import CHANGES, LEDGER, changes_text, ledger_text
 from graph_slam_ros.slam import Counters, GraphSlam
+from graph_slam_ros.slam.calibration.decision import SIGMAS
+from graph_slam_ros.slam.calibration.parameters import QUANTITIES
 from graph_slam_ros.slam.robust.gating import CANDIDATES
 from graph_slam_ros.slam.robust.ledger import INSIDE, Verdict
 
@@ -86,8 +88,19 @@ def summarize(slam: GraphSlam, earlier: Counters | None = None) -> dict[str, Any
         }
         | ({"gyro": asdict(gyro)} if (gyro := slam.gyro) else {})
         | ({"calibration": report} if (report := slam.calibration_report) else {})
+        | ({"association": found} if (found := _association(slam)) else {})
         | account(slam, counters)
     )
+
+
+def _association(slam: GraphSlam) -> dict[str, Any]:
+    """The report on sightings without identity, with the setting of each clock that was found."""
+    report, clock = slam.association_report, QUANTITIES["clock"]
+    for topic, one in report.get("clocks", {}).items():
+        is_found = abs(one["value"]) > max(SIGMAS * one["sigma"], clock.least) and one["sigma"] < clock.determined_below
+        value = slam.calibrated(topic, "clock") + one["value"]
+        one["setting"] = f"{topic}.offset_s={value:.4g}" if is_found else ""
+    return report
 
 
 INPUT_COLUMNS = {

@@ -234,6 +234,11 @@ class MapView:
         return self._calibrator.summary()
 
     @property
+    def association_report(self) -> dict[str, Any]:
+        """The report on the last explanation of all sightings without identity; empty if there was none."""
+        return self._landmarks.anonymous.report
+
+    @property
     def calibration(self) -> dict[tuple[str, str], float]:
         """The corrections that were found, with those that were configured, by input and name."""
         return self._frontend.corrections.totals()

@@ -8,6 +8,7 @@ result is used a fixed number of keyframes later.
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -31,6 +32,7 @@ from graph_slam_ros.slam.landmarks.elsewhere import UnnamedDisplacement
 from graph_slam_ros.slam.landmarks.hindsight import Found, FrozenScans, Hindsight
 from graph_slam_ros.slam.landmarks.landmark_map import Landmarks
 from graph_slam_ros.slam.landmarks.scans import (
+    NEARBY_NS,
     SCAN_NS,
     DeadReckoning,
     Motion,
@@ -83,6 +85,8 @@ class AnonymousLandmarks:
             space.dimensions * float(np.log(c.density_per_m)),
             hypotheses=1 if c.association == "nearest" else 40,
             size_sigma_m=c.size_sigma_m,
+            clock_sigma_s=config.calibrate.clock_sigma_s,
+            has_clocks="clock" not in config.calibrate.asked,
         )
         self._belief = SolverBelief(space, solver, landmarks)
         self._hindsight = Hindsight(config, self._settings, executor)
@@ -92,6 +96,7 @@ class AnonymousLandmarks:
         self._leader: Decision | None = None
         self._scans: list[Scan] = []
         self._motions: list[Motion] = []
+        self._nearby: list[Array] = []  # of the scans after which odometry went on for long enough
         self._same: dict[int, int] = {}  # landmarks of the beam that are others in the graph
         self._firsts: list[int] = []  # the first cluster of each scan
         self._doubt: Callable[[float], Array] | None = None
@@ -109,8 +114,21 @@ class AnonymousLandmarks:
         """Add a step of odometry. Returns the sightings of a scan that ended long before it."""
         stands = step.broken or self._noise.stands(step.T_last_base, self._reckoning.since_s(step.stamp_ns))
         self._reckoning.step(step, stands=stands)
+        self._note_motion(step.stamp_ns)
         began_ns = self._builder.began_ns
         return self.end_scan() if began_ns is not None and began_ns < step.stamp_ns - 2 * SCAN_NS else []
+
+    def _note_motion(self, now_ns: int) -> None:
+        """Keep how the robot moved around the scans, as far as odometry shows it by now."""
+        for scan in self._scans[len(self._nearby) :]:
+            if now_ns < scan.at.stamp_ns + NEARBY_NS:
+                break
+            self._nearby.append(self._reckoning.nearby(scan.at.stamp_ns))
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """The report on the last explanation of all scans; empty if there was none."""
+        return self._hindsight.report
 
     def forget_belief(self) -> None:
         """Restart the beam from the solver's estimate, because the map has moved."""
@@ -311,7 +329,8 @@ class AnonymousLandmarks:
         leader = given.copy()
         for cluster, landmark in changes(None, self._leader).items():
             leader[cluster] = landmark
-        return FrozenScans(tuple(scans), tuple(self._motions), poses, scales.copy(), given, leader)
+        nearby = self._nearby + [self._reckoning.nearby(scan.at.stamp_ns) for scan in scans[len(self._nearby) :]]
+        return FrozenScans(tuple(scans), tuple(self._motions), np.array(nearby), poses, scales.copy(), given, leader)
 
     def _adopt(self, found: Found | None, keyframes: StampedPoses[Keyframe]) -> None:
         """Use an explanation of all scans up to one."""

@@ -7,6 +7,7 @@ and their costs are compared.
 
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -33,26 +34,31 @@ Motion = tuple[Array, Array]  # rotation, translation
 
 def laid_on_the_map(drive: Drive, e: Estimate) -> tuple[Estimate, int]:
     """Move stretches onto the map while that lowers the cost. Returns also how many fit several places."""
-    undecided = 0
-    for _ in range(_MOST_MOVES):
-        undecided = 0
-        for landmark, first, last in stretches(drive, e):
+    undecided, moves, moves_before = 0, 0, -1
+    while moves > moves_before and moves < _MOST_MOVES:  # until nothing moves in a whole round
+        undecided, moves_before = 0, moves
+        tried: set[tuple[int, int, int]] = set()
+        while left := [one for one in stretches(drive, e) if one not in tried]:
             if not drive.may_move:
                 return e, undecided
-            better = _laid(drive, e, landmark, first, last)
+            tried.add(left[0])
+            better = _laid(drive, e, *left[0])
             undecided += better is e
             if better is not None and better is not e:
-                e = merged(drive, better)
-                break
-        else:
-            break
+                e, moves = merged(drive, better), moves + 1
     return e, undecided
 
 
 def stretches(drive: Drive, e: Estimate) -> list[tuple[int, int, int]]:
-    """Landmarks that were seen in a single stretch of time, or rarely, and the scans around them."""
+    """Stretches of scans that odometry may have laid at a wrong place.
+
+    First those around landmarks that were seen in a single stretch of time, or rarely, each with its landmark. Then
+    those between two gaps, in which nothing was seen, and the pairs of these: in a gap odometry may have erred.
+    """
     stamps, counts = drive.stamps_s, np.bincount(e.which[e.which >= 0], minlength=len(e.landmarks))
     out: list[tuple[int, int, int]] = []
+    ends = np.flatnonzero(np.diff(stamps) > _GAP_S)
+    runs = list(zip(np.r_[0, ends + 1].tolist(), np.r_[ends, len(stamps) - 1].tolist(), strict=True))
     for landmark in np.argsort(counts, kind="stable").tolist():
         scans = drive.scan[e.which == landmark]
         t = stamps[scans]
@@ -63,7 +69,8 @@ def stretches(drive: Drive, e: Estimate) -> list[tuple[int, int, int]]:
         own = [(int(scans[a]), int(scans[b])) for a, b in zip(starts, ends, strict=True)]
         out += [(landmark, *one) for one in own]
         out += [(landmark, *_grown(stamps, *one)) for one in own]
-    return list(dict.fromkeys(out))[:_MOST_STRETCHES]
+    out = list(dict.fromkeys(out))[:_MOST_STRETCHES]
+    return out + [(UNUSED, *one) for one in runs] + [(UNUSED, a[0], b[1]) for a, b in pairwise(runs)]
 
 
 def _grown(stamps: Array, first: int, last: int) -> tuple[int, int]:
@@ -101,7 +108,7 @@ def _laid(drive: Drive, e: Estimate, landmark: int, first: int, last: int) -> Es
         if len(found) == _TRIES:
             break
     found.sort(key=drive.total)
-    if not found or drive.total(found[0]) >= drive.total(e) - 1e-6:
+    if not found or drive.total(found[0]) >= drive.total(e) - drive.costs.ambiguous:
         return None
     others = [one for one in found[1:] if _are_apart(found[0], one, scans) and _are_apart(e, one, scans)]
     is_unique = all(drive.total(one) >= drive.total(found[0]) + drive.costs.ambiguous for one in others)

@@ -1,4 +1,4 @@
-"""The explanation of all scans of a drive at once: poses, landmarks and odometry's two scales, and its cost.
+"""The explanation of all scans of a drive at once: poses, landmarks, odometry's two scales, clocks, and its cost.
 
 The method is Gauss-Newton with Levenberg's damping. Odometry is tight or has slipped, whichever costs less. Clusters
 have Cauchy's loss. The first stage has no slip and a wide loss, because a local minimum looks like a wrong association.
@@ -10,13 +10,12 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
-from scipy.sparse.linalg import splu
 
 from graph_slam_ros.slam.landmarks.beam import LOG_SIZES, SIZE_CHI2, BeamSettings
+from graph_slam_ros.slam.landmarks.bordered import BorderedEquations, Rows
 from graph_slam_ros.slam.landmarks.rotations import lever, rotation, rotation_vector
-from graph_slam_ros.slam.landmarks.scans import Motion, Scan
-from graph_slam_ros.typing import Array
+from graph_slam_ros.slam.landmarks.scans import NEARBY_S, Motion, Scan
+from graph_slam_ros.typing import Array, Mask
 
 UNUSED = -1
 Ids = NDArray[np.int64]
@@ -24,6 +23,7 @@ Ids = NDArray[np.int64]
 _LEAST_SLIP = 0.25  # of a slip, of how long it takes
 _HELD = 1e8  # information on the first pose
 _WEAK_PRIOR = 1e-6  # on a landmark
+_LOG_2_PI = float(np.log(2.0 * np.pi))
 _NEVER = 1e9  # the cost of a slip where none may be
 _DAMPED_AT_MOST = 1e6
 _MOST_WORK = 5_000_000  # rows that are linearised for moves: half a minute, ten times what 15 minutes of driving need
@@ -56,16 +56,20 @@ class Estimate:
     position, turn : (N, n), (N, n, n) of the scans
     landmarks : (J, n)
     scales : (2,) by which ways and turns are longer than odometry says
+    clocks : (T,) [s] to add to the stamps of each input
     which : (M,) the landmark of each cluster, or ``UNUSED``
     cost : without that of the landmarks
+    volume : log determinant of the information of all unknowns, less what its dimension adds (Laplace)
     """
 
     position: Array
     turn: Array
     landmarks: Array
     scales: Array
+    clocks: Array
     which: Ids
     cost: float = np.inf
+    volume: float = 0.0
 
 
 class Drive:
@@ -76,11 +80,19 @@ class Drive:
     stamps_s : (N,)
     scan : (M,) the scan of each cluster
     points : (M, n) clusters, from their scans
+    topics : (T,) inputs
     whiten : (M, n, n)
     work : rows of odometry and clusters that were linearised by now
     """
 
-    def __init__(self, scans: Sequence[Scan], motions: Sequence[Motion], settings: BeamSettings, costs: Costs) -> None:
+    def __init__(
+        self,
+        scans: Sequence[Scan],
+        motions: Sequence[Motion],
+        nearby: Array,
+        settings: BeamSettings,
+        costs: Costs,
+    ) -> None:
         self.settings = settings
         self.stamps_s = np.array([one.at.stamp_ns for one in scans]) * 1e-9
         self.scan = np.array([k for k, one in enumerate(scans) for _ in one.clusters], dtype=np.int64)
@@ -92,6 +104,7 @@ class Drive:
         self.costs = replace(costs, landmark=costs.landmark + 2.0 * LOG_SIZES) if self._has_sizes else costs
         self.whiten = _whitening(np.array([c.covariance for one in scans for c in one.clusters]))
         self._set_motions(motions)
+        self._set_clocks(scans, nearby)
         self.work = self._free = 0
 
     @property
@@ -120,6 +133,14 @@ class Drive:
         volumes = np.linalg.slogdet(slipped)[1] - np.linalg.slogdet(tight)[1]
         self.slip_cost = volumes - 2.0 * c.slip_log_prior
 
+    def _set_clocks(self, scans: Sequence[Scan], nearby: Array) -> None:
+        """Note of which input each cluster is, and how the robot moved around each scan, by odometry."""
+        of = [[seen.topic for seen in c.seen] for one in scans for c in one.clusters]
+        self.topics = tuple(sorted({topic for names in of for topic in names})) if self.settings.has_clocks else ()
+        parts = [[names.count(topic) / len(names) for topic in self.topics] for names in of]
+        self._part = np.array(parts).reshape(len(of), len(self.topics))
+        self._nearby = nearby
+
     # -- what it costs -----------------------------------------------------------------------------------------------
 
     def along_odometry(self, position: Array, turn: Array, scales: Array) -> tuple[Array, Array]:
@@ -134,7 +155,20 @@ class Drive:
     def seen_at(self, e: Estimate, clusters: Ids | slice = slice(None)) -> Array:
         """Positions of clusters in map (m, n)."""
         k = self.scan[clusters]
-        return e.position[k] + (e.turn[k] @ self.points[clusters][..., None])[..., 0]
+        return e.position[k] + (e.turn[k] @ self.points_at(e, clusters)[0][..., None])[..., 0]
+
+    def points_at(self, e: Estimate, clusters: Ids | Mask | slice = slice(None)) -> tuple[Array, Array]:
+        """Clusters (m, n), from where the robot was at their scan's stamp, and what a second of clock moves them by.
+
+        A clock says that they were seen from another point on the way, which odometry has.
+        """
+        points = self.points[clusters]
+        if not e.clocks.any() and not self.topics:
+            return points, np.zeros_like(points)
+        moved, rate = _interpolated(self._nearby[self.scan[clusters]], self._part[clusters] @ e.clocks)
+        turned = (rotation(moved[:, self.n :]) @ points[..., None])[..., 0]
+        swung = (lever(turned) @ rate[:, self.n :, None])[..., 0]
+        return turned + moved[:, : self.n], swung + rate[:, : self.n]
 
     def chi2_with(self, e: Estimate, clusters: Ids | slice = slice(None)) -> Array:
         """chi2 (m, J) of clusters with every landmark."""
@@ -163,14 +197,19 @@ class Drive:
         chi2 = np.square((self.whiten[used] @ self._residuals(e, used)[0][..., None])[..., 0]).sum(axis=1)
         square = (loss_scale or self.costs.loss_scale) ** 2
         scales = float(np.square(e.scales).sum()) / self.settings.scale_sigma**2
+        scales += float(np.square(e.clocks).sum()) / self.settings.clock_sigma_s**2
         if self._has_sizes:
             scales += float(self.size_chi2(e)[np.flatnonzero(used), e.which[used]].sum())
         clusters = square * np.log1p(chi2 / square).sum() + self.costs.unused * np.count_nonzero(~used)
         return float(np.minimum(tight, slipped).sum() + clusters) + scales
 
     def total(self, e: Estimate) -> float:
-        """The cost of an estimate with its landmarks."""
-        return e.cost + self.costs.landmark * len(e.landmarks)
+        """Minus twice the log evidence of an estimate, up to a constant: its cost, its landmarks, and its volume.
+
+        The evidence is Laplace's. A landmark must be worth more than its prior: what it fits it could also have fitted
+        at many other places.
+        """
+        return e.cost + self.costs.landmark * len(e.landmarks) + e.volume
 
     def _both(self, residual: Array, *, slips: bool) -> tuple[Array, Array]:
         tight = np.square((self._tight @ residual[..., None])[..., 0]).sum(axis=1)
@@ -187,12 +226,13 @@ class Drive:
         turned = rotation_vector(back @ a.transpose(0, 2, 1) @ e.turn[1:])
         return np.concatenate([moved - (1.0 + e.scales[0]) * local, turned], axis=1), moved, local
 
-    def _residuals(self, e: Estimate, used: NDArray[np.bool_]) -> tuple[Array, Array]:
-        """Residuals of the clusters that are used, and the positions of their landmarks relative to the scans."""
+    def _residuals(self, e: Estimate, used: Mask) -> tuple[Array, Array, Array]:
+        """Residuals of used clusters, their landmarks' positions relative to the scans, and the rate by the clock."""
         k = self.scan[used]
         away = e.landmarks[e.which[used]] - e.position[k]
         seen = (e.turn[k].transpose(0, 2, 1) @ away[..., None])[..., 0]
-        return seen - self.points[used], seen
+        points, rate = self.points_at(e, used)
+        return seen - points, seen, rate
 
     # -- least squares -----------------------------------------------------------------------------------------------
 
@@ -203,12 +243,15 @@ class Drive:
         damping = 1e-6
         e = replace(e, cost=self.cost_of(e, loss_scale=loss_scale, slips=slips))
         for _ in range(iterations):
-            h, b, floor = self._normal(e, loss_scale or self.costs.loss_scale, slips=slips)
-            diagonal = 1.0 + h.diagonal()
+            normal, floor = self._normal(e, loss_scale or self.costs.loss_scale, slips=slips)
+            diagonal = 1.0 + normal.diagonal
             while True:
-                step = splu((h + sparse.diags(floor + damping * diagonal)).tocsc(), "MMD_AT_PLUS_A").solve(b)
-                tried = self._moved(e, step)
-                cost = self.cost_of(tried, loss_scale=loss_scale, slips=slips)
+                try:
+                    step = normal.factor(floor + damping * diagonal).solve(normal.b)
+                    tried = self._moved(e, step)
+                    cost = self.cost_of(tried, loss_scale=loss_scale, slips=slips)
+                except np.linalg.LinAlgError:  # rounding: more damping mends it
+                    cost = np.inf
                 if cost <= e.cost + 1e-9 or damping > _DAMPED_AT_MOST:
                     break
                 damping = max(damping, 1e-6) * 10.0
@@ -217,7 +260,30 @@ class Drive:
             gain, e, damping = e.cost - cost, replace(tried, cost=cost), damping / 5.0
             if gain < enough * max(1.0, 1e-4 * cost):
                 break
-        return e
+        return replace(e, volume=self._volume(e, loss_scale, slips=slips))
+
+    def border_covariance(self, e: Estimate) -> Array | None:
+        """The covariance of all landmarks, then scales and clocks, jointly; None if rounding leaves none."""
+        normal, floor = self._normal(e, self.costs.loss_scale, slips=True)
+        try:
+            return normal.factor(floor).border_covariance()
+        except np.linalg.LinAlgError:
+            return None
+
+    def clocks_of(self, e: Estimate) -> dict[str, tuple[float, float]]:
+        """The clock of each input, and its standard deviation [s]."""
+        covariance = self.border_covariance(e)
+        if covariance is None:
+            return {}
+        sigmas = np.sqrt(covariance.diagonal()[self.n * len(e.landmarks) + 2 :])
+        return dict(zip(self.topics, zip(e.clocks.tolist(), sigmas.tolist(), strict=True), strict=True))
+
+    def _volume(self, e: Estimate, loss_scale: float, *, slips: bool) -> float:
+        normal, floor = self._normal(e, loss_scale or self.costs.loss_scale, slips=slips)
+        try:
+            return normal.factor(floor).log_determinant - self.n * len(e.landmarks) * _LOG_2_PI
+        except np.linalg.LinAlgError:
+            return np.inf  # not to be preferred
 
     def staged(self, e: Estimate) -> Estimate:
         """Solve in stages: first without slip and with a wide loss, then with a narrower one."""
@@ -234,71 +300,77 @@ class Drive:
     def _moved(self, e: Estimate, step: Array) -> Estimate:
         n, size = self.n, self.size
         dof = self._dof
-        poses, landmarks = step[: dof * size].reshape(size, dof), step[dof * size : -2].reshape(-1, n)
+        end = dof * size + n * len(e.landmarks)
+        poses, landmarks = step[: dof * size].reshape(size, dof), step[dof * size : end].reshape(-1, n)
         turn = e.turn @ rotation(poses[:, n:])
         return replace(
             e,
             position=e.position + poses[:, :n],
             turn=turn,
             landmarks=e.landmarks + landmarks,
-            scales=e.scales + step[-2:],
+            scales=e.scales + step[end : end + 2],
+            clocks=e.clocks + step[end + 2 :],
         )
 
     @cached_property
     def _dof(self) -> int:
         return self.n + self.turned.shape[1]
 
-    def _normal(self, e: Estimate, loss_scale: float, *, slips: bool) -> tuple[sparse.csc_matrix, Array, Array]:
-        """Gauss-Newton matrix, right-hand side, and the damping of the diagonal."""
-        n, dof, size = self.n, self._dof, self.size
-        self.work += size + len(self.scan)
-        total = dof * size + n * len(e.landmarks) + 2
-        blocks = [self._odometry_rows(e, total, slips=slips), self._cluster_rows(e, loss_scale)]
-        rows, columns, values, b = [], [], [], np.zeros(total)
-        for j, r, at in blocks:
-            transposed = j.transpose(0, 2, 1)
-            width = at.shape[1]
-            rows.append(np.repeat(at, width, axis=1).ravel())
-            columns.append(np.tile(at, (1, width)).ravel())
-            values.append((transposed @ j).ravel())
-            b -= np.bincount(at.ravel(), (transposed @ r[..., None]).ravel(), minlength=total)
-        h = sparse.coo_matrix(
-            (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), (total, total)
-        ).tocsc()
-        floor = np.zeros(total)
-        floor[:dof], floor[dof * size :], floor[-2:] = _HELD, _WEAK_PRIOR, 1.0 / self.settings.scale_sigma**2
-        b[-2:] -= e.scales * floor[-2:]
-        return h, b, floor
+    def _normal(self, e: Estimate, loss_scale: float, *, slips: bool) -> tuple[BorderedEquations, Array]:
+        """The normal equations, and the floor of their diagonal: priors. Scales and clocks are the last unknowns."""
+        count, of_landmarks = self._dof * self.size, self.n * len(e.landmarks)
+        self.work += self.size + len(self.scan)
+        own = np.concatenate([e.scales, e.clocks])
+        rows = [self._odometry_rows(e, of_landmarks, slips=slips), self._cluster_rows(e, of_landmarks + 2, loss_scale)]
+        normal = BorderedEquations(rows, count, of_landmarks + len(own), 2 * self._dof)
+        floor = np.zeros(count + of_landmarks + len(own))
+        floor[: self._dof], floor[count : count + of_landmarks] = _HELD, _WEAK_PRIOR
+        sigmas = [self.settings.scale_sigma] * 2 + [self.settings.clock_sigma_s] * len(e.clocks)
+        floor[count + of_landmarks :] = np.square(sigmas) ** -1.0
+        normal.b[count + of_landmarks :] -= own * floor[count + of_landmarks :]
+        return normal, floor
 
-    def _odometry_rows(self, e: Estimate, total: int, *, slips: bool) -> tuple[Array, Array, Ids]:
+    def _odometry_rows(self, e: Estimate, first: int, *, slips: bool) -> Rows:
         n, dof, size = self.n, self._dof, self.size
         r, moved, local = self._odometry(e)
         tight, slipped = self._both(r, slips=slips)
         whiten = np.where((slipped < tight)[:, None, None], self._slipped, self._tight)
         back = e.turn[:-1].transpose(0, 2, 1)
-        j = np.zeros((size - 1, dof, 2 * dof + 2))
+        j, by_scale = np.zeros((size - 1, dof, 2 * dof)), np.empty((size - 1, dof, 2))
         j[:, :n, :n], j[:, :n, n:dof], j[:, :n, dof : dof + n] = -back, -lever(moved), back
         j[:, n:, n:dof] = -e.turn[1:].transpose(0, 2, 1) @ e.turn[:-1] if n == 3 else -1.0
-        j[:, n:, dof + n : 2 * dof] = np.eye(dof - n)
-        j[:, :n, -2] = -local
-        j[:, :n, -1] = -0.5 * (1.0 + e.scales[0]) * (lever(local) @ self.turned[..., None])[..., 0]
-        j[:, n:, -1] = -self.turned
-        at = dof * np.arange(size - 1)[:, None] + np.arange(2 * dof)
-        scales = np.broadcast_to([total - 2, total - 1], (size - 1, 2))
-        return whiten @ j, (whiten @ r[..., None])[..., 0], np.concatenate([at, scales], axis=1)
+        j[:, n:, dof + n :] = np.eye(dof - n)
+        by_scale[:, :n, 0], by_scale[:, n:, 0], by_scale[:, n:, 1] = -local, 0.0, -self.turned
+        by_scale[:, :n, 1] = -0.5 * (1.0 + e.scales[0]) * (lever(local) @ self.turned[..., None])[..., 0]
+        at, border = dof * np.arange(size - 1), np.tile([first, first + 1], (size - 1, 1))
+        return Rows(whiten @ j, whiten @ by_scale, (whiten @ r[..., None])[..., 0], at, border)
 
-    def _cluster_rows(self, e: Estimate, loss_scale: float) -> tuple[Array, Array, Ids]:
-        n, dof, size = self.n, self._dof, self.size
+    def _cluster_rows(self, e: Estimate, first_clock: int, loss_scale: float) -> Rows:
+        n, dof = self.n, self._dof
         used = e.which >= 0
-        r, seen = self._residuals(e, used)
+        r, seen, rate = self._residuals(e, used)
         k, whiten = self.scan[used], self.whiten[used]
         back = e.turn[k].transpose(0, 2, 1)
-        j = np.concatenate([-back, -lever(seen), back], axis=2)
-        j, r = whiten @ j, (whiten @ r[..., None])[..., 0]
+        by_clock = -rate[..., None] * self._part[used][:, None]
+        j, by_border = whiten @ np.concatenate([-back, -lever(seen)], axis=2), np.concatenate([back, by_clock], axis=2)
+        r = (whiten @ r[..., None])[..., 0]
         weight = 1.0 / np.sqrt(1.0 + np.square(r).sum(axis=1) / loss_scale**2)
-        of_pose = dof * k[:, None] + np.arange(dof)
-        of_landmark = dof * size + n * e.which[used][:, None] + np.arange(n)
-        return weight[:, None, None] * j, weight[:, None] * r, np.concatenate([of_pose, of_landmark], axis=1)
+        clocks = np.tile(first_clock + np.arange(len(e.clocks)), (len(k), 1))
+        border = np.concatenate([n * e.which[used][:, None] + np.arange(n), clocks], axis=1)
+        j, by_border = weight[:, None, None] * j, weight[:, None, None] * (whiten @ by_border)
+        return Rows(j, by_border, weight[:, None] * r, dof * k, border)
+
+
+def _interpolated(nearby: Array, at_s: Array) -> tuple[Array, Array]:
+    """Motions (m, dof) at times relative to the stamps, from those (m, S, dof) at ``NEARBY_S``, and their rates.
+
+    Beyond these times the motion goes on as at the end.
+    """
+    k = np.clip(np.searchsorted(NEARBY_S, at_s, side="right") - 1, 0, len(NEARBY_S) - 2)
+    rows = np.arange(len(k))
+    before, after = nearby[rows, k], nearby[rows, k + 1]
+    rate = (after - before) / (NEARBY_S[k + 1] - NEARBY_S[k])[:, None]
+    return before + (at_s - NEARBY_S[k])[:, None] * rate, rate
 
 
 def _whitening(covariances: Array) -> Array:

@@ -5,7 +5,8 @@ Then moves correct the association. The result does not depend on when the work 
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -37,10 +38,12 @@ class FrozenScans:
     poses : (N, 3) or (N, 7) of the scans, by the solver
     given : (M,) the number of each cluster's landmark
     leader : (M,) the same, by the beam alone
+    nearby : (N, S, dof) how the robot moved around each scan, by odometry
     """
 
     scans: tuple[Scan, ...]
     motions: tuple[Motion, ...]
+    nearby: Array
     poses: Array
     scales: Array
     given: Ids
@@ -54,12 +57,14 @@ class Found:
     Attributes
     ----------
     is_whole : whether all moves were tried
+    clocks : of each input the correction of its stamps [s], and its standard deviation
     """
 
     frozen: FrozenScans
     estimate: Estimate
     undecided: int = 0
     is_whole: bool = True
+    clocks: dict[str, tuple[float, float]] = field(default_factory=dict)
 
     def numbers(self, given: Sequence[int], fresh: Callable[[], int]) -> Ids:
         """The number of each landmark: that of most of its clusters, each used once, or a fresh one."""
@@ -120,6 +125,7 @@ class Hindsight:
     ----------
     is_on : whether it does
     scales : (2,) of odometry, as last found, and their standard deviation
+    newest : the explanation that was found last
     """
 
     def __init__(self, config: Config, settings: BeamSettings, executor: Executor) -> None:
@@ -133,6 +139,7 @@ class Hindsight:
         self._last: Ids | None = None
         self.is_on = True
         self.scales: tuple[Array, float] = np.zeros(2), settings.scale_sigma
+        self.newest: Found | None = None
 
     def is_due(self, scans: int) -> bool:
         """Return whether an explanation is due at this number of scans."""
@@ -170,15 +177,27 @@ class Hindsight:
         """Note that everything was explained, and the landmark of each cluster."""
         self._last = np.array(given)
 
+    @property
+    def report(self) -> dict[str, Any]:
+        """The report on the last explanation: how many scans, whether moves are left, undecided stretches, clocks."""
+        if self.newest is None:
+            return {}
+        return {
+            "scans": len(self.newest.frozen.scans),
+            "is_whole": self.newest.is_whole,
+            "undecided": self.newest.undecided,
+            "clocks": {topic: {"value": c, "sigma": sigma} for topic, (c, sigma) in self.newest.clocks.items()},
+        }
+
     def _noted(self, found: Found | None) -> Found | None:
         if found is not None:
-            self.scales = found.estimate.scales, _SCALE_SIGMA
+            self.scales, self.newest = (found.estimate.scales, _SCALE_SIGMA), found
         return found
 
 
 def explained(space: Geometry, frozen: FrozenScans, settings: BeamSettings, costs: Costs) -> Found | None:
     """Explain all scans, from the graph's assignment and from the beam's; None if too little was seen."""
-    drive = Drive(frozen.scans, frozen.motions, settings, costs)
+    drive = Drive(frozen.scans, frozen.motions, frozen.nearby, settings, costs)
     here = matrices_of(space, frozen.poses)
     paths = here, drive.along_odometry(here[0][0], here[1][0], frozen.scales)
     found: list[Found] = []
@@ -186,7 +205,8 @@ def explained(space: Geometry, frozen: FrozenScans, settings: BeamSettings, cost
         numbers, which = _indices(given)
         if not len(numbers) or (found and np.array_equal(frozen.given, frozen.leader)):
             continue
-        starts = [Estimate(position, turn, np.empty((0, drive.n)), frozen.scales, which) for position, turn in paths]
+        no_landmarks, clocks = np.empty((0, drive.n)), np.zeros(len(drive.topics))
+        starts = [Estimate(*path, no_landmarks, frozen.scales, clocks, which) for path in paths]
         staged = min((drive.staged(start) for start in starts), key=lambda e: e.cost)
         drive.begin_moves()
         found.append(Found(frozen, refined(drive, staged), is_whole=drive.may_move))
@@ -195,7 +215,8 @@ def explained(space: Geometry, frozen: FrozenScans, settings: BeamSettings, cost
     best = min(found, key=lambda one: drive.total(one.estimate))
     drive.begin_moves()
     estimate, undecided = laid_on_the_map(drive, best.estimate)
-    return replace(best, estimate=estimate, undecided=undecided, is_whole=best.is_whole and drive.may_move)
+    is_whole = best.is_whole and drive.may_move
+    return replace(best, estimate=estimate, undecided=undecided, is_whole=is_whole, clocks=drive.clocks_of(estimate))
 
 
 def _indices(given: Ids) -> tuple[Ids, Ids]:

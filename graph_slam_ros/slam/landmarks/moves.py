@@ -12,6 +12,7 @@ LEAST_SCANS = 3  # of a landmark
 _MERGE_M = 3.0
 _APART = 0.02  # of the scans of two landmarks, that show both, if they may be one
 _BOTH_AT_MOST = 3  # scans that showed both, that count
+_HOPELESS = 4.0  # times what a landmark costs: a merge that costs more by the covariance is not tried
 _BETTER = 4.0  # chi2 by which another landmark fits a cluster better
 _ROUNDS = 6
 TRIAL = 0.1  # a solve that compares ends where an iteration gains less
@@ -34,7 +35,7 @@ def merged(drive: Drive, e: Estimate) -> Estimate:
     """Merge pairs, the nearest first, if that costs less than the landmark that it saves."""
     tried: set[tuple[tuple[float, ...], tuple[float, ...]]] = set()
     while True:
-        for key, i, j in _pairs(e.landmarks):
+        for key, i, j in _pairs(drive, e):
             if key in tried:
                 continue
             if not drive.may_move:
@@ -48,10 +49,21 @@ def merged(drive: Drive, e: Estimate) -> Estimate:
             return e
 
 
-def _pairs(landmarks: Array) -> list[tuple[tuple[tuple[float, ...], tuple[float, ...]], int, int]]:
-    """Pairs of close landmarks, the nearest first, with their positions."""
+def _pairs(drive: Drive, e: Estimate) -> list[tuple[tuple[tuple[float, ...], tuple[float, ...]], int, int]]:
+    """Pairs of close landmarks, the nearest first, with their positions. By their covariance they may be one."""
+    n, landmarks, covariance = drive.n, e.landmarks, drive.border_covariance(e)
     apart = np.linalg.norm(landmarks[:, None] - landmarks[None], axis=2)
     i, j = np.nonzero(np.tril(apart < _MERGE_M, -1))
+    if covariance is not None and len(i):
+        size = len(landmarks)
+        blocks = covariance[: n * size, : n * size].reshape(size, n, size, n).transpose(0, 2, 1, 3)
+        away = landmarks[i] - landmarks[j]
+        between = blocks[i, i] + blocks[j, j] - blocks[i, j] - blocks[j, i]
+        chi2 = (away * np.linalg.solve(between, away[..., None])[..., 0]).sum(axis=1)
+        counts = np.bincount(e.which[e.which >= 0], minlength=size)
+        most = (counts[i] + counts[j]) * drive.costs.loss_scale**2  # Cauchy's loss, if all clusters share it
+        is_near = most * np.log1p(chi2 / most) < _HOPELESS * drive.costs.landmark * (1 + _BOTH_AT_MOST)
+        i, j = i[is_near], j[is_near]
     order = np.argsort(apart[i, j], kind="stable")
     keys = [tuple(place) for place in np.round(landmarks, 1).tolist()]
     return [((keys[a], keys[b]), a, b) for a, b in zip(i[order].tolist(), j[order].tolist(), strict=True)]
@@ -69,8 +81,8 @@ def _merged_pair(drive: Drive, e: Estimate, i: int, j: int) -> Estimate | None:
     landmarks = e.landmarks.copy()
     landmarks[j] = np.average(e.landmarks[[i, j]], axis=0, weights=counts)
     one = drive.solve(compressed(replace(e, which=np.where(is_i, j, e.which), landmarks=landmarks)), 12, enough=TRIAL)
-    allowed = drive.costs.landmark * (1 + min(both, _BOTH_AT_MOST))
-    return one if one.cost - e.cost < allowed else None
+    allowed = drive.costs.landmark * min(both, _BOTH_AT_MOST)
+    return one if drive.total(one) < drive.total(e) + allowed else None
 
 
 def reassigned(drive: Drive, e: Estimate) -> tuple[Estimate, bool]:
@@ -87,7 +99,7 @@ def reassigned(drive: Drive, e: Estimate) -> tuple[Estimate, bool]:
     if (which == e.which).all():
         return e, False
     one = drive.solve(compressed(replace(e, which=without_few(which))), enough=TRIAL)
-    if one.cost > e.cost + drive.costs.landmark * max(0, len(one.landmarks) - len(e.landmarks)):
+    if drive.total(one) > drive.total(e):
         return e, False
     return one, True
 

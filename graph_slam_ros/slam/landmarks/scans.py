@@ -20,6 +20,9 @@ from graph_slam_ros.slam.landmarks.rotations import lever, turn_of
 from graph_slam_ros.typing import Array, Numbers
 
 SCAN_NS, _SCAN_RAD = 500_000_000, 0.15
+NEARBY_S = np.linspace(-0.5, 0.5, 21)
+NEARBY_NS = 500_000_000
+"""Times relative to a scan's stamp, at which its motion by odometry is kept, for clocks that differ."""
 _OTHER_SIZE = 6.0  # sigmas by which sizes of two sightings of one thing do not differ
 _SAME = 0.9973  # probability with which two sightings of one thing fall into one cluster
 
@@ -112,6 +115,13 @@ class DeadReckoning:
         sums = [u + part * (v - u) for u, v in ((a.turned, b.turned), (a.way, b.way), (a.moving_s, b.moving_s))]
         pose = tuple(map(float, self._space.group.interpolate(a.pose, b.pose, part)))
         return Reckoned(stamp_ns, pose, sums[0], sums[1], sums[2], a.segment if part < 1.0 else b.segment)
+
+    def nearby(self, stamp_ns: int) -> Array:
+        """Motions (S, dof) from the pose at a stamp to those at ``NEARBY_S`` from it, as way and rotation vector."""
+        space, here = self._space, self.at(stamp_ns).pose
+        there = [self.at(stamp_ns + round(1e9 * after_s)).pose for after_s in NEARBY_S.tolist()]
+        moved = [tuple(map(float, space.group.between(here, pose))) for pose in there]
+        return np.array([[*one[: space.dimensions], *turn_of(space, one)] for one in moved])
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,6 +18,7 @@ from graph_slam_ros.slam.landmarks.explanation import Costs, Drive, Estimate
 from graph_slam_ros.slam.landmarks.moves import refined
 from graph_slam_ros.slam.landmarks.rotations import rotation, rotation_vector
 from graph_slam_ros.slam.landmarks.scans import (
+    NEARBY_S,
     Cluster,
     DeadReckoning,
     MotionNoise,
@@ -244,10 +245,16 @@ def circle(seed=0, laps=3, scale=1.0, marks=ROUND, per_lap=40):
     return scans, np.concatenate(truth)
 
 
-def of_drive(scans, which, n=2):
-    drive = Drive(scans, motions(scans, n), SETTINGS, COSTS)
+def around(scans):
+    """The robot stands at each scan: clocks do not matter."""
+    return np.zeros((len(scans), len(NEARBY_S), 3))
+
+
+def of_drive(scans, which, n=2, nearby=None, settings=SETTINGS):
+    drive = Drive(scans, motions(scans, n), around(scans) if nearby is None else nearby, settings, COSTS)
     position, turn = drive.along_odometry(np.zeros(n), np.eye(n), np.zeros(2))
-    return drive, drive.staged(Estimate(position, turn, np.empty((0, n)), np.zeros(2), np.array(which)))
+    clocks = np.zeros(len(drive.topics))
+    return drive, drive.staged(Estimate(position, turn, np.empty((0, n)), np.zeros(2), clocks, np.array(which)))
 
 
 def test_solving_all_finds_the_landmarks_and_what_odometry_is_short_of():
@@ -255,6 +262,60 @@ def test_solving_all_finds_the_landmarks_and_what_odometry_is_short_of():
     _, e = of_drive(scans, truth)
     assert e.landmarks == pytest.approx(ROUND, abs=0.1)
     assert e.scales[0] == pytest.approx(0.08, abs=0.02)
+
+
+def weaving(late_s, count=120):
+    """A robot turns to and fro, and its sightings are stamped too late. Also what each is of, and the motion around."""
+    rng, scans, truth, nearby = np.random.default_rng(3), [], [], []
+
+    def place(t):
+        return 2.0 * np.cos(0.1 * t), 2.0 * np.sin(0.1 * t), float(np.sin(0.7 * t))
+
+    way = turned = 0.0
+    for k in range(count):
+        t = 0.5 * k
+        x, y, yaw = place(t - late_s)
+        seen = (ROUND - (x, y)) @ rotation(np.array([yaw]))
+        at_ = Reckoned(round(t * S), place(t), turned=turned, way=way, moving_s=t)
+        points = seen + rng.normal(0.0, 0.05, seen.shape)
+        scans.append(Scan(at_, WHERE, tuple(Cluster(p, 0.0025 * np.eye(2), (SEEN,)) for p in points)))
+        truth += range(len(ROUND))
+        nearby.append([PLANAR.group.between(place(t), place(t + after_s)) for after_s in NEARBY_S.tolist()])
+        way, turned = way + 0.1, turned + 0.35
+    return scans, np.array(truth), np.array(nearby, dtype=float)
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.22, -0.13])
+def test_solving_all_finds_the_clock_of_an_input(late_s):
+    scans, truth, nearby = weaving(late_s)
+    drive, e = of_drive(scans, truth, nearby=nearby)
+    (value, sigma) = drive.clocks_of(e)["seen"]
+    assert value == pytest.approx(-late_s, abs=0.02)
+    assert sigma < 0.03
+    without, same = of_drive(scans, truth, nearby=nearby, settings=replace(SETTINGS, has_clocks=False))
+    assert without.clocks_of(same) == {}
+    assert (same.cost > e.cost + 16.0) == bool(late_s), "four sigmas"
+
+
+def test_a_robot_that_does_not_turn_knows_nothing_of_a_clock():
+    scans, truth = circle()
+    seen = [replace(one, clusters=tuple(replace(c, seen=(SEEN,)) for c in one.clusters)) for one in scans]
+    drive, e = of_drive(seen, truth, nearby=around(scans))
+    assert drive.clocks_of(e)["seen"] == pytest.approx((0.0, SETTINGS.clock_sigma_s))
+
+
+def test_the_factor_is_that_of_the_whole_matrix():
+    scans, truth, nearby = weaving(0.1, count=8)
+    drive, e = of_drive(scans, truth, nearby=nearby)
+    normal, floor = drive._normal(e, 3.0, slips=True)
+    columns = [normal.factor(floor).solve(unit) for unit in np.eye(len(floor))]
+    inverse = np.array(columns).T
+    assert inverse == pytest.approx(inverse.T, rel=1e-6, abs=1e-12)
+    assert np.linalg.eigvalsh(0.5 * (inverse + inverse.T)).min() > 0.0
+    assert normal.factor(floor).log_determinant == pytest.approx(-np.linalg.slogdet(inverse)[1])
+    assert np.linalg.inv(inverse).diagonal() == pytest.approx(normal.diagonal + floor, rel=1e-4)
+    border = normal.factor(floor).border_covariance()
+    assert border == pytest.approx(inverse[-len(border) :, -len(border) :], abs=1e-9)
 
 
 def test_what_was_taken_for_two_is_merged_and_what_was_given_wrongly_is_given_to_another():
@@ -274,7 +335,8 @@ def test_moves_end_at_their_limit_of_work_and_that_is_said(monkeypatch):
     wrong = truth.copy()
     wrong[(truth == 1) & (np.arange(len(truth)) > len(truth) // 2)] = len(ROUND)
     poses = np.array([one.at.pose for one in scans])
-    frozen = hindsight.FrozenScans(tuple(scans), tuple(motions(scans)), poses, np.zeros(2), wrong, wrong)
+    steps, nearby = tuple(motions(scans)), around(scans)
+    frozen = hindsight.FrozenScans(tuple(scans), steps, nearby, poses, np.zeros(2), wrong, wrong)
     found = {}
     for most in (1_000_000, 0):
         monkeypatch.setattr("graph_slam_ros.slam.landmarks.explanation._MOST_WORK", most)
@@ -338,9 +400,10 @@ def test_which_of_two_halls_alike_it_is_stays_open(halls):
         which.append(5 * hall + seen_in_one[:count])
     jump = np.diag([100.0, 100.0, 9.0])
     steps = [motion_between(PLANAR, NOISE, a.at, b.at, jump) for a, b in itertools.pairwise(scans)]
-    drive = Drive(scans, steps, SETTINGS, COSTS)
+    drive = Drive(scans, steps, around(scans), SETTINGS, COSTS)
     position, turn = drive.along_odometry(np.zeros(2), np.eye(2), np.zeros(2))
-    e = drive.staged(Estimate(position, turn, np.empty((0, 2)), np.zeros(2), np.concatenate(which)))
+    clocks = np.zeros(len(drive.topics))
+    e = drive.staged(Estimate(position, turn, np.empty((0, 2)), np.zeros(2), clocks, np.concatenate(which)))
     assert len(e.landmarks) == 5 * (halls + 1)
     laid, undecided = laid_on_the_map(drive, e)
     assert len(laid.landmarks) == (5 if halls == 1 else 15)
