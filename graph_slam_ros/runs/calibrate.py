@@ -1,6 +1,6 @@
 """The calibration of a recording: replays in memory, each with what the last one found, until nothing changes."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,6 +9,7 @@ from graph_slam_ros.check.checks import worst_of_replay
 from graph_slam_ros.check.columns import Collector
 from graph_slam_ros.check.finding import Finding
 from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.messages.inputs import recorded_uses
 from graph_slam_ros.messages.survey import with_survey
 from graph_slam_ros.recordings.bag import open_bag
 from graph_slam_ros.recordings.contents import recording_of
@@ -16,6 +17,7 @@ from graph_slam_ros.runs.replay import END, RecordedRuns, choose_inputs
 from graph_slam_ros.runs.suggestion import Suggestion
 from graph_slam_ros.runs.tables import account
 from graph_slam_ros.slam import Config, Counters, GraphSlam
+from graph_slam_ros.slam.calibration.parameters import OF_ODOMETRY, QUANTITIES, Parameter
 from graph_slam_ros.warmup import warmup
 
 _ROUNDS = 4  # replays; a large clock needs two or three
@@ -104,10 +106,26 @@ def calibrate(
             refused, report = f"nothing is calibrated: mend {fault.code} first", {"settings": {}, "parameters": []}
             break
         found |= report["settings"]
+    parameters = report["parameters"] or ([] if refused else list(_undriven(config, len(slam.keyframes))))
     losses, warnings = list(dict.fromkeys(bag.losses)), list(dict.fromkeys(bag.warnings))
     command = chosen.command(found | dict(settings or {}) | found)
     complete = not report["settings"] and not refused
-    return Calibrated(found, report["parameters"], command, rounds, complete, refused, fault, losses, warnings)
+    return Calibrated(found, parameters, command, rounds, complete, refused, fault, losses, warnings)
+
+
+def _undriven(config: Config, keyframes: int) -> Iterator[dict[str, Any]]:
+    """What to drive for each parameter, where there was nothing to fit."""
+    uses = recorded_uses(config)
+    for name, quantity in QUANTITIES.items():
+        if quantity.group not in config.calibrate.asked or (
+            name in ("roll", "pitch", "z") and config.world.dimensions == 2
+        ):
+            continue
+        use = "odometry" if name in OF_ODOMETRY else "landmarks"
+        for source in (one for one, used in uses.items() if used == use):
+            why = f"not determined (the robot stood: {keyframes} keyframe{'' if keyframes == 1 else 's'})"
+            text = f"{Parameter(source, name)}: {why}: {quantity.manoeuvre}"
+            yield {"source": source, "name": name, "verdict": "not_determined", "text": text}
 
 
 def _config(given: Mapping[str, Any]) -> Config:

@@ -1,7 +1,8 @@
 """Calibration while driving: trial fits at fixed keyframes, whose findings correct the measurements.
 
-A trial starts at keyframes 50, 100, 200 and so on, and when everything is solved. It works on a copy, in the background
-if possible. Its outcome is used a fixed number of keyframes later, so that a replay decides as the live run did.
+A trial starts at keyframes 50, 100, 200 and so on of this drive, and when everything is solved. It works on a copy, in
+the background if possible. Its outcome is used a fixed number of keyframes later, so that a replay decides as the live
+run did.
 """
 
 from collections.abc import Callable
@@ -67,7 +68,8 @@ class Calibrator:
         self._due, self._steady = FIRST_DUE, 0
         self._job: Trial | None = None
         self._apply_at = 0  # the keyframe
-        self._windows = DriftWindows(config.calibrate.drift, backend.graph.edge_count)
+        self._first_keyframe = 0 if start is None else len(start.keyframes)  # of what is driven now
+        self._windows = DriftWindows(config.calibrate.drift, backend.graph.edge_count, self._first_keyframe)
         if start is not None:
             frontend.corrections.restore(start.calibration)
             self._admitted = {Parameter(*key) for key in start.calibration}
@@ -88,8 +90,9 @@ class Calibrator:
         if self._job is not None and keyframe >= self._apply_at:
             job, self._job = self._job, None
             self._adopt(self._guarded(job), keyframe, None)
-        if keyframe + 1 >= self._due and self._job is None:
-            while keyframe + 1 >= self._due:
+        driven = keyframe + 1 - self._first_keyframe
+        if driven >= self._due and self._job is None:
+            while driven >= self._due:
                 self._due = self._windows.next_trial(self._due)
             if (self._steady < _STEADY or self._windows.drifts) and not self._backend.spares_memory:
                 self._job = self._executor(self._trial(self._backend.solver.settings))
@@ -138,6 +141,8 @@ class Calibrator:
             self._admitted,
             slides=self._config.odometry.slides,
             drifts=self._windows.drifts,
+            sigma_per_m=self._problem().model().sigma_per_m(),
+            are_unnamed=self._are_unnamed(),
         )
         values = {one.parameter: _rounded(one.value) for one in findings if one.verdict == "admitted"}
         moved = any(one.parameter in values and abs(one.value) > one.sigma for one in findings)
@@ -155,6 +160,12 @@ class Calibrator:
 
     def _count_landmarks(self) -> int:
         return sum(not mark.is_tentative for mark in self._landmarks.known.values())
+
+    def _are_unnamed(self) -> bool:
+        """Return whether odometry told most landmarks apart in this drive, and nobody asked for its factors by name."""
+        known = [mark.is_unnamed for mark in self._landmarks.known.values() if not mark.is_tentative]
+        is_asked = "factors" in self._config.calibrate.groups.split()
+        return not is_asked and not self._first_keyframe and 2 * sum(known) > len(known)
 
     def _correct(self, values: Values, keyframe: int, everything: Settings | None, x: Array | None) -> Report | None:
         """Correct all measurements, present and future, and solve. A failure is undone.

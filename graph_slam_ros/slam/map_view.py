@@ -226,7 +226,8 @@ class MapView:
         problem = self.backend.trial_problem(self.space, frontend.path, origins, factors=frontend.corrections.factors)
         wanted = parameters_of(problem, groups, chooses=chooses)
         found = fit(problem, {one: one.quantity.prior for one in wanted})
-        return found, decide(found, len(self.landmarks), slides=self.config.odometry.slides)
+        stated = problem.model().sigma_per_m()
+        return found, decide(found, len(self.landmarks), slides=self.config.odometry.slides, sigma_per_m=stated)
 
     @property
     def calibration_report(self) -> dict[str, Any]:

@@ -6,6 +6,12 @@
 4. Is it this parameter, not another? Its correlation with any other must be below 0.95, and it must lie within three
    sigmas of its prior.
 
+The sigmas of the first two hang on the noise that odometry states: where it is too small, the drift of a heading passes
+for a wrong factor. So nothing is let in where odometry states less noise than any wheels have.
+
+Landmarks without identities were told apart by this odometry. So they confirm its factors, whatever these are: its
+factors are refused, unless they are asked for by name or the map was there before.
+
 A yaw (in space a pitch, too) is measured against the direction in which odometry moves. So it is refused for a robot
 that is configured to slide across that direction.
 """
@@ -15,7 +21,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from graph_slam_ros.slam.calibration.fit import TrialFit
-from graph_slam_ros.slam.calibration.parameters import Parameter
+from graph_slam_ros.slam.calibration.parameters import OF_ODOMETRY, Parameter
 
 SIGMAS = 4.0
 MOST_CORRELATED = 0.95
@@ -23,6 +29,7 @@ PRIOR_SIGMAS = 3.0
 MOST_LOST = 0.2
 LEAST_LANDMARKS = 3
 MOST_SLIDING = 0.3  # of odometry's noise ahead: with more sideways, a turned sensor and a robot that slides are one
+LEAST_SIGMA_PER_M = 1e-3  # of odometry: the noise of its position [m] for each metre
 FOLLOWED = 0.1  # of a sigma: what is left of a correction that is used is followed from there on
 
 Verdict = Literal["admitted", "nothing_to_correct", "not_determined", "not_reproducible", "not_separable", "refused"]
@@ -58,6 +65,8 @@ def decide(
     *,
     slides: tuple[float, float] = (0.0, 0.0),
     drifts: bool = False,
+    sigma_per_m: float = float("inf"),
+    are_unnamed: bool = False,
 ) -> list[Finding]:
     """Answer the four questions for each parameter of a trial fit.
 
@@ -67,10 +76,15 @@ def decide(
     corrected : parameters that were let in before: what is left of them is followed
     slides : configured noise of odometry sideways and upwards, relative to that ahead
     drifts : whether parameters may change on the way
+    sigma_per_m : of odometry's position for each metre, as stated; in the middle of all steps
+    are_unnamed : whether the landmarks were told apart by odometry alone, and nobody asked for its factors by name
     """
-    void, remedy = _void(found, landmarks), "raise calibrate.drift, or " * drifts + "correct the configuration first"
+    void, remedy = (
+        _void(found, landmarks, sigma_per_m),
+        "raise calibrate.drift, or " * drifts + "correct the configuration first",
+    )
     return [
-        _finding(found, k, void, remedy, _slides(one, slides), one in corrected)
+        _finding(found, k, void, remedy, _slides(one, slides) or _unnamed(one, are_unnamed), one in corrected)
         for k, one in enumerate(found.parameters)
     ]
 
@@ -81,12 +95,15 @@ def amount(parameter: Parameter, value: float, digits: int = 2) -> str:
     return f"{value * quantity.shown:.{digits}g}{' ' * bool(quantity.unit)}{quantity.unit}"
 
 
-def _void(found: TrialFit, landmarks: int) -> str:
+def _void(found: TrialFit, landmarks: int, sigma_per_m: float) -> str:
     """Return why a whole fit is not used; empty if it may be."""
     if landmarks < LEAST_LANDMARKS:
         return f"{landmarks} landmark{' was' if landmarks == 1 else 's were'} seen, {LEAST_LANDMARKS} are needed"
     if found.lost > MOST_LOST:
         return f"{found.lost:.0%} of the sightings do not fit, more than {MOST_LOST:.0%}: check their ids and noise"
+    if sigma_per_m < LEAST_SIGMA_PER_M:
+        stated = f"odometry states {sigma_per_m:.1g} m of noise for each metre"
+        return f"{stated}, no wheels are so good: set odometry.noise=motion"
     return ""
 
 
@@ -99,9 +116,10 @@ def _finding(found: TrialFit, k: int, void: str, remedy: str, slides: str, is_co
 def _verdict(found: TrialFit, k: int, void: str, remedy: str, slides: str, is_corrected: bool) -> tuple[Verdict, str]:
     parameter, value, sigma = found.parameters[k], float(found.values[k]), float(found.sigmas[k])
     quantity, (correlation, other) = parameter.quantity, found.worst_correlation(k)
+    is_unseen = void.endswith(" are needed")
     shown = f"{amount(parameter, value, 3)}, sigma {amount(parameter, sigma)}"
     if void:
-        return "refused", f"not determined: {void}"
+        return "refused", f"not determined: {void}{f': {quantity.manoeuvre}' if is_unseen else ''}"
     if sigma >= quantity.determined_below and not is_corrected:
         needs = f"sigma {amount(parameter, sigma)}, needs {amount(parameter, quantity.determined_below)}"
         return "not_determined", f"not determined ({needs}): {quantity.manoeuvre}"
@@ -134,6 +152,14 @@ def _slides(parameter: Parameter, slides: tuple[float, float]) -> str:
         f"odometry.translation_density, more than {MOST_SLIDING}. If it does not slide, lower it; "
         f"{parameter.quantity.manoeuvre}"
     )
+
+
+def _unnamed(parameter: Parameter, are_unnamed: bool) -> str:
+    """Return why a factor of odometry is not believed of landmarks without identities; empty if it may be."""
+    if not are_unnamed or parameter.name not in OF_ODOMETRY:
+        return ""
+    group = parameter.quantity.group
+    return f"landmarks without ids were told apart by this odometry. Use ids, or ask for it: calibrate.groups={group}"
 
 
 def _agree(first: float, second: float) -> bool:

@@ -20,7 +20,7 @@ class DriftWindows:
     Parameters
     ----------
     rate : change in an hour, in parts of the configured prior's sigma; 0: all of the drive is one window
-    first_edge : edges before are of another drive
+    first_edge, first_keyframe : edges and keyframes before are of another drive
 
     Attributes
     ----------
@@ -28,10 +28,10 @@ class DriftWindows:
     closed : first keyframe of each window before, with its settings
     """
 
-    def __init__(self, rate: float, first_edge: int) -> None:
+    def __init__(self, rate: float, first_edge: int, first_keyframe: int = 0) -> None:
         self.rate, self.first_edge = rate, first_edge
         self.closed: list[tuple[int, dict[str, float | str]]] = []
-        self._first_keyframe, self._before_ns = 0, 0  # where the window before began
+        self._first_keyframe, self._before_ns = first_keyframe, 0  # of the newest window; where the one before began
         self._left: dict[Parameter, float] = {}
 
     @property

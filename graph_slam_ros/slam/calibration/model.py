@@ -24,6 +24,8 @@ from graph_slam_ros.typing import Array, Index, Numbers
 Values = Mapping[Parameter, float]
 _POINTS = ("landmark position", "tag position")
 
+_MOVED_M = 0.01  # of a step: with less, noise is not for its metres
+
 
 @dataclass(frozen=True, slots=True)
 class OdometryEdges:
@@ -110,6 +112,20 @@ class MeasurementModel:
             tail = z.shape[1] - self._space.pose.size
             found.sensor[:] = found.seen[:, tail : tail + n]
         return found
+
+    def sigma_per_m(self) -> float:
+        """The stated noise of odometry's way for each metre, in the middle of all steps; infinite where it stands."""
+        n, found = self._space.dimensions, [np.empty(0)]
+        for edges in self.odometry:
+            roots = edges.table.sqrt_information.values[edges.rows]
+            covariance = np.linalg.inv(np.swapaxes(roots, 1, 2) @ roots)[:, :n, :n]
+            way_m = np.linalg.norm(edges.measured[:, :n], axis=1)
+            along = edges.measured[:, :n] / np.maximum(way_m, _MOVED_M)[:, None]
+            variance = np.einsum("ni,nij,nj->n", along, covariance, along)
+            is_moving = way_m > _MOVED_M
+            found.append(np.sqrt(np.maximum(variance[is_moving], 0.0)) / way_m[is_moving])
+        every = np.concatenate(found)
+        return float(np.median(every)) if len(every) else float("inf")
 
     def corrected_odometry(self, edges: OdometryEdges, values: Values) -> Array:
         """Measurements (n, size) of odometry with other factors."""

@@ -9,6 +9,7 @@ from graph_slam_ros.cli import main
 from graph_slam_ros.formats.parameters import read_parameters
 from graph_slam_ros.simulation import simulate, write_bag
 from graph_slam_ros.slam import GraphSlam
+from graph_slam_ros.slam.calibration.parameters import QUANTITIES
 
 DEMO = str(ROOT / "data" / "demo.mcap")
 WRONG = ("--set", "detections.mount_correction=0 0 0 0 0 0.1", "--set", "odometry.distance_factor=1.08")
@@ -34,7 +35,8 @@ def test_a_recording_without_landmarks_determines_nothing_and_says_so(tmp_path, 
     capsys.readouterr()
     assert main(["calibrate", bag]) == 3
     out, err = capsys.readouterr()
-    assert "distance of odom: not determined: 0 landmarks were seen, 3 are needed" in out
+    said = " ".join(out.split())
+    assert "distance of odom: not determined: 0 landmarks were seen, 3 are needed: drive 10 m and back in sight" in said
     assert "nothing to correct" not in out
     assert err == "graph_slam: this recording determines none of these parameters\n"
     assert main(["check", bag]) == 4, "what a replay calls odometry alone is no clean recording"
@@ -68,6 +70,18 @@ def test_a_recording_that_is_wrong_in_itself_is_not_calibrated_and_says_what_is_
     assert main(["calibrate", faulty, "--json"]) == 3
     said = json.loads(capsys.readouterr().out)
     assert (said["settings"], said["parameters"], said["fault"]["code"]) == ({}, [], code)
+
+
+def test_a_robot_that_stood_says_for_each_parameter_what_to_drive(tmp_path, capsys):
+    bag, still = str(tmp_path / "drive.mcap"), str(tmp_path / "still.mcap")
+    write_bag(simulate("warehouse", 1, aisles=2, aisle_m=4.0, laps=1), bag)
+    assert main(["simulate", bag, "--out", still, "--fault", "standing"]) == 0
+    capsys.readouterr()
+    assert main(["calibrate", still, "--json"]) == 3
+    found = json.loads(capsys.readouterr().out)["parameters"]
+    assert [one["name"] for one in found] == ["distance", "turn", "clock", "yaw"]
+    for one in found:
+        assert QUANTITIES[one["name"]].manoeuvre in one["text"]
 
 
 def test_constant_settings_of_what_changes_are_refused(capsys):

@@ -12,6 +12,7 @@ from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.lie import se2
 from graph_slam_ros.runs.map_journal import MapGrowth, extend, state_of
 from graph_slam_ros.slam import GraphSlam, Odometry
+from graph_slam_ros.slam.calibrator import FIRST_DUE
 from graph_slam_ros.slam.robust.background import run_when_asked
 from graph_slam_ros.slam.snapshot import MapSnapshot
 
@@ -101,6 +102,30 @@ def test_a_map_that_is_loaded_goes_on_with_its_calibration(calibrated):
     configured = {"odometry.distance_factor": calibrated.calibration_report["settings"]["odometry.distance_factor"]}
     told = GraphSlam(Config.from_mapping(configured), start=state_of(calibrated))
     assert told._frontend.corrections.found["odometry", "distance"] == pytest.approx(0.0, abs=1e-5)
+
+
+def test_in_a_loaded_map_trials_begin_by_what_was_driven_since(wrong, calibrated):
+    """As many keyframes after loading as after the beginning of a map, whatever the map has."""
+    again = GraphSlam(Config.from_mapping(ON), start=state_of(calibrated))
+    loaded, trials = len(again.keyframes), []
+    assert loaded > 2 * FIRST_DUE
+    later_ns = wrong[-1].stamp_ns + 10**9 - wrong[0].stamp_ns
+    for m in wrong:
+        again.process(replace(m, stamp_ns=m.stamp_ns + later_ns))
+        trials.append((len(again.keyframes) - loaded, again.calibration_report["trials"]))
+    first = next(driven for driven, count in trials if count)
+    assert FIRST_DUE <= first < 2 * FIRST_DUE
+    assert trials[-1][1] > 1
+
+
+def test_a_covariance_of_odometry_that_is_absurd_lets_nothing_in():
+    """Its heading drifts, and nothing but a track width could explain it."""
+    drive = imperfect_drive(Faults(), seconds=60.0)
+    none = tuple(np.diag([1e-12] * 3).ravel().tolist())
+    tiny = [replace(m, twist_covariance=none) if isinstance(m, Odometry) else m for m in drive]
+    slam = driven(tiny, ON)
+    assert slam.calibration_report["settings"] == {}
+    assert all("states" in one["text"] for one in slam.calibration_report["parameters"])
 
 
 @pytest.mark.parametrize(

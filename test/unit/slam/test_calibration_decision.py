@@ -1,5 +1,7 @@
 """The four questions, on made-up outcomes of a trial fit."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -55,3 +57,29 @@ def test_without_drift_all_of_the_drive_is_one_window():
 def test_a_change_beyond_the_prior_names_what_mends_it():
     (one,) = decide(fitted(2.0, 0.01), 10, drifts=True)
     assert one.text.endswith("raise calibrate.drift, or correct the configuration first")
+
+
+def test_nothing_is_let_in_where_odometry_states_less_noise_than_any_wheels_have():
+    """The drift of a heading would pass for a wrong track width."""
+    (one,) = decide(fitted(0.3, 0.025), 10, sigma_per_m=4e-4)
+    assert one.verdict == "refused"
+    assert one.text.endswith("no wheels are so good: set odometry.noise=motion")
+    assert decide(fitted(0.3, 0.025), 10, sigma_per_m=2e-3)[0].verdict == "admitted"
+
+
+def test_factors_are_refused_where_odometry_told_the_landmarks_apart():
+    distance = Parameter("odom", "distance")
+    found = replace(fitted(-0.11, 0.01), parameters=(distance,))
+    assert decide(found, 10)[0].verdict == "admitted"
+    (one,) = decide(found, 10, are_unnamed=True)
+    assert one.verdict == "refused"
+    assert one.text.endswith("Use ids, or ask for it: calibrate.groups=factors")
+    assert decide(fitted(0.3, 0.025), 10, are_unnamed=True)[0].verdict == "admitted", "a clock shows in turns"
+
+
+def test_windows_of_a_loaded_map_begin_with_the_drive():
+    windows, stamps_ns = DriftWindows(0.2, 7, 500), np.arange(900) * 10**9
+    windows.close_if_full(520, stamps_ns, 90, [], {})
+    assert windows.closed == []
+    windows.close_if_full(500 + WINDOW, stamps_ns, 90, [], {})
+    assert windows.closed == [(500, {})]
