@@ -61,7 +61,7 @@ class Facts:
     Attributes
     ----------
     lifecycle : ``unconfigured``, ``inactive``, ``active`` or ``finalized``
-    weakest : the weakest direction of the newest pose, by quantity, with its sigma
+    weakest : the weakest direction of the newest pose, by quantity, and of all landmarks, with its sigma
     loads : the run whose map is being loaded; empty where none is
     faults : exceptions of callbacks in the last ten seconds
     busy_s : for how long the solver has been at what it does
@@ -279,10 +279,14 @@ def statuses(facts: Facts, verdict: Health, node: str) -> Iterator[Status]:
 
 
 def _weakness(facts: Facts, estimate: Estimate) -> str:
-    """The weakest direction of the newest pose, and the distance without a landmark if it is long."""
+    """The weakest directions, and for how long and why the pose is weak, if no landmark is seen for long."""
     weakest, unseen_m = ", ".join(facts.weakest.values()), estimate.unseen.length_m
     uses_landmarks = any(one.use == "landmarks" for one in facts.inputs)
-    unseen = f"no landmark seen for {unseen_m:.0f} m" if uses_landmarks and unseen_m >= _UNSEEN_M else ""
+    unseen = (
+        f"position and heading weak for {unseen_m:.0f} m: no landmark seen"
+        if uses_landmarks and unseen_m >= _UNSEEN_M
+        else ""
+    )
     return "; ".join(filter(None, (weakest, unseen)))
 
 

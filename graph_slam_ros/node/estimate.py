@@ -9,8 +9,10 @@ import numpy as np
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.slam import GraphSlam
 from graph_slam_ros.slam.solution import Correction
-from graph_slam_ros.slam.weak_direction import position_covariance, weakest_position, weakest_turn
+from graph_slam_ros.slam.weak_direction import WeakDirection, position_covariance, weakest_position, weakest_turn
 from graph_slam_ros.typing import Numbers
+
+_IN_TURN = 4  # landmarks whose covariance is computed anew at an update
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +43,35 @@ class UnseenWay:
         return UnseenWay(count, changes, length_m if changes == self.changes else 0.0, direction)
 
 
+class WeakestLandmark:
+    """The landmark that is known least. A few covariances are computed anew at each update, in turn."""
+
+    def __init__(self) -> None:
+        self._found: dict[str, WeakDirection] = {}
+        self._next = 0
+
+    def goes_on(self, slam: GraphSlam) -> str:
+        """Return the weakest landmark after an update, in words; empty where none is known."""
+        names = list(slam.landmarks)
+        if not names or not slam.is_solved:
+            return ""
+        self._found = {name: one for name, one in self._found.items() if name in slam.landmarks}
+        turn = [names[(self._next + k) % len(names)] for k in range(min(_IN_TURN, len(names)))]
+        self._next = (self._next + len(turn)) % len(names)
+        chosen = list(dict.fromkeys([*filter(None, [self._name]), *turn]))
+        for name, covariance in zip(chosen, slam.landmark_covariances(chosen), strict=True):
+            if np.isfinite(covariance).all():
+                value = tuple(slam.solver.estimate([slam.landmarks[name].vertex])[0].tolist())
+                self._found[name] = weakest_position(position_covariance(slam.space, value, covariance))
+        if not self._found:
+            return ""
+        return f"landmark {self._name} {self._found[self._name].sigma:.3f} m {self._found[self._name].words}"
+
+    @property
+    def _name(self) -> str:
+        return max(self._found, key=lambda name: self._found[name].sigma, default="")
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Estimate:
     """The state of the pipeline after an update, for threads that cannot wait for the next one.
@@ -52,6 +83,7 @@ class Estimate:
     source : the odometry in use
     is_confirmed : whether the robot knows where it is in a map that was loaded
     unseen : the way since a landmark was seen
+    weakest_landmark : the landmark that is known least, with its weakest direction; empty where none is known
     fit : chi2 per degree of freedom; NaN before it was looked at
     rivals : loop closures of other explanations that could not be ruled out
     displaced : that the landmarks say that the robot is elsewhere than odometry; empty where they do not
@@ -78,6 +110,7 @@ class Estimate:
     fit: float
     unseen: UnseenWay
     rivals: int
+    weakest_landmark: str = ""
     displaced: str = ""
     motion: str = ""
     gyro: str = ""
@@ -90,7 +123,7 @@ class Estimate:
         return self.is_confirmed or self.is_resumed
 
     def weakest(self, space: Geometry) -> dict[str, str]:
-        """The weakest direction of the newest keyframe, of its position and of its orientation, in words."""
+        """The weakest direction of the newest keyframe's position and orientation, and of all landmarks, in words."""
         pose = space.group.compose(self.T_map_odom, self.T_odom_keyframe)
         path = space.turn(self.T_map_odom) @ np.array(self.unseen.direction) if self.unseen.direction else None
         position = weakest_position(position_covariance(space, pose, self.covariance), path)
@@ -98,7 +131,7 @@ class Estimate:
         return {
             "position": f"{position.sigma:.3f} m {position.words}",
             "orientation": f"{np.degrees(turn.sigma):.2f} deg {turn.words}",
-        }
+        } | ({"landmark": self.weakest_landmark} if self.weakest_landmark else {})
 
     @classmethod
     def of(
@@ -112,6 +145,7 @@ class Estimate:
         slowest_solve_s: float,
         fit: float,
         unseen: UnseenWay,
+        weakest_landmark: str = "",
     ) -> "Estimate":
         """Return the estimate of a pipeline that has keyframes; the rest is as of the attributes."""
         newest = slam.keyframes[-1]
@@ -132,6 +166,7 @@ class Estimate:
             slowest_solve_s=slowest_solve_s,
             fit=fit,
             unseen=unseen,
+            weakest_landmark=weakest_landmark,
             rivals=sum(len(rival.only_here) for rival in slam.backend.rivals),
             displaced=str(slam.displaced or ""),
             motion="; ".join(filter(None, (slam.gyro.fault if slam.gyro else "", slam.backend.odometries.doubted))),

@@ -15,7 +15,7 @@ import numpy as np
 
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.measurements.types import InitialPose
-from graph_slam_ros.node.estimate import Estimate, UnseenWay
+from graph_slam_ros.node.estimate import Estimate, UnseenWay, WeakestLandmark
 from graph_slam_ros.node.resumption import Resumption
 from graph_slam_ros.node.threads import run_in_thread
 from graph_slam_ros.runs.folder import (
@@ -83,7 +83,7 @@ class Session:
         self._loaded = len(self.slam.keyframes)
         self._is_confirmed = not self._loaded
         self._resumption: Resumption | None = None
-        self._unseen = UnseenWay(self._loaded, slam.landmark_changes)
+        self._unseen, self._weakest = UnseenWay(self._loaded, slam.landmark_changes), WeakestLandmark()
         self._slowest_s = 0.0
         self._fit, self._fitted_at, self._fit_due_s = float("nan"), 0, 0.0
 
@@ -190,6 +190,7 @@ class Session:
             slowest_solve_s=self._slowest_s,
             fit=self._fit,
             unseen=self._unseen,
+            weakest_landmark=self._weakest.goes_on(slam),
         )
 
     @property

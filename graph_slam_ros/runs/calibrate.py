@@ -114,7 +114,7 @@ def calibrate(
 
 
 def _undriven(config: Config, keyframes: int) -> Iterator[dict[str, Any]]:
-    """What to drive for each parameter, where there was nothing to fit."""
+    """Yield each parameter with what to drive, where there was nothing to fit."""
     uses = recorded_uses(config)
     for name, quantity in QUANTITIES.items():
         if quantity.group not in config.calibrate.asked or (

@@ -162,7 +162,7 @@ class Calibrator:
         return sum(not mark.is_tentative for mark in self._landmarks.known.values())
 
     def _are_unnamed(self) -> bool:
-        """Return whether odometry told most landmarks apart in this drive, and nobody asked for its factors by name."""
+        """Return whether odometry identified most landmarks of this drive, and nobody asked for its factors by name."""
         known = [mark.is_unnamed for mark in self._landmarks.known.values() if not mark.is_tentative]
         is_asked = "factors" in self._config.calibrate.groups.split()
         return not is_asked and not self._first_keyframe and 2 * sum(known) > len(known)

@@ -297,9 +297,15 @@ class MapView:
         covariance = self._frontend.covariance.copy()
         return self._calibrator.widened(covariance, int(self.keyframes.ids[-1])) if self.keyframes else covariance
 
-    def landmark_covariances(self) -> list[Array]:
-        """Marginal of each landmark: of a point in the map's axes, of a pose in its tangent space; NaN if unknown."""
-        return self._marginals([landmark.vertex for landmark in self.landmarks.values()])
+    def landmark_covariances(self, names: Sequence[str] | None = None) -> list[Array]:
+        """Marginal of each landmark: of a point in the map's axes, of a pose in its tangent space; NaN if unknown.
+
+        Parameters
+        ----------
+        names : of some landmarks; all if None
+        """
+        known = self.landmarks
+        return self._marginals([known[name].vertex for name in (known if names is None else names)])
 
     def keyframe_covariances(self) -> Array:
         """Marginal of every keyframe in its tangent space, (n, 3, 3) or (n, 6, 6); NaN if unknown."""

@@ -9,7 +9,7 @@
 The sigmas of the first two hang on the noise that odometry states: where it is too small, the drift of a heading passes
 for a wrong factor. So nothing is let in where odometry states less noise than any wheels have.
 
-Landmarks without identities were told apart by this odometry. So they confirm its factors, whatever these are: its
+Landmarks without identities were identified by this odometry. So they confirm its factors, whatever these are: its
 factors are refused, unless they are asked for by name or the map was there before.
 
 A yaw (in space a pitch, too) is measured against the direction in which odometry moves. So it is refused for a robot
@@ -77,7 +77,7 @@ def decide(
     slides : configured noise of odometry sideways and upwards, relative to that ahead
     drifts : whether parameters may change on the way
     sigma_per_m : of odometry's position for each metre, as stated; in the middle of all steps
-    are_unnamed : whether the landmarks were told apart by odometry alone, and nobody asked for its factors by name
+    are_unnamed : whether the landmarks were identified by odometry alone, and nobody asked for its factors by name
     """
     void, remedy = (
         _void(found, landmarks, sigma_per_m),
@@ -159,7 +159,7 @@ def _unnamed(parameter: Parameter, are_unnamed: bool) -> str:
     if not are_unnamed or parameter.name not in OF_ODOMETRY:
         return ""
     group = parameter.quantity.group
-    return f"landmarks without ids were told apart by this odometry. Use ids, or ask for it: calibrate.groups={group}"
+    return f"landmarks without ids were identified by this odometry. Use ids, or ask for it: calibrate.groups={group}"
 
 
 def _agree(first: float, second: float) -> bool:

@@ -13,6 +13,7 @@ from messages import STAMP_NS
 from graph_slam_ros.lie import so3
 from graph_slam_ros.node import diagnostics
 from graph_slam_ros.node.diagnostics import Facts, InputFacts, judge, statuses
+from graph_slam_ros.node.estimate import WeakestLandmark
 from graph_slam_ros.node.ingest import FutureStamps
 from graph_slam_ros.node.map_to_odom import MapToOdom
 from graph_slam_ros.node.pose_extrapolator import PoseExtrapolator
@@ -20,7 +21,7 @@ from graph_slam_ros.node.recent import Recent, RecentInputs
 from graph_slam_ros.node.session import Session
 from graph_slam_ros.node.throttle import Throttle
 from graph_slam_ros.node.worker import Worker
-from graph_slam_ros.slam import Config, Counters, Odometry, Sighting, Sightings
+from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Odometry, Sighting, Sightings
 
 NS = 1_000_000_000
 HERE, THERE = (1.0, 2.0, 0.3), (2.0, 2.0, 0.3)
@@ -198,12 +199,44 @@ def test_the_weakest_direction_of_the_newest_pose_and_the_way_without_a_landmark
     assert session.slam.segments[-1] > 0
     assert session.estimate.unseen.length_m == pytest.approx(20.7, abs=0.7)
     seen = status((odom(), tags()))
-    assert seen.message.endswith(f"deg heading; no landmark seen for {session.estimate.unseen.length_m:.0f} m")
+    for_m = f"; position and heading weak for {session.estimate.unseen.length_m:.0f} m: no landmark seen"
+    assert seen.message.endswith(for_m)
+    (landmark,) = session.slam.landmark_covariances(["a"])
+    known = float(np.sqrt(np.linalg.eigvalsh(landmark)[-1]))
+    assert seen.values["landmark"].startswith(f"landmark a {known:.3f} m ")
+    assert f", {seen.values['landmark']};" in seen.message
     assert "no landmark" not in status((odom(),)).message, "none is used"
     covariance = session.slam.pose_covariance
     sigma = float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1]))
     assert seen.values["position"].startswith(f"{sigma:.3f} m ")
     assert seen.values["orientation"] == f"{math.degrees(covariance[2, 2] ** 0.5):.2f} deg heading"
+
+
+def test_the_weakest_landmark_is_found_with_few_covariances_at_an_update(monkeypatch):
+    """Twenty tags, of which the one that is farthest away was seen with the most noise."""
+    slam = GraphSlam(Config.from_mapping({"ordering.window_s": 0.0}))
+    for k in range(30):
+        slam.process(Odometry(STAMP_NS + k * NS // 10, (0.1 * k, 0.0, 0.0)))
+        seen = []
+        for n in range(20):
+            variance = 5e-3 if n == 13 else 1e-4
+            seen.append(Sighting(f"t{n}", "position", (1.0 + n - 0.1 * k, 1.0), (variance, 0.0, 0.0, variance)))
+        slam.process(Sightings(STAMP_NS + k * NS // 10, "tags", tuple(seen)))
+    slam.process(Control("end"))
+    slam.process(Control("optimize"))
+    counts, every = [], GraphSlam.landmark_covariances
+    sigmas = [np.linalg.eigvalsh(one)[-1] for one in every(slam)]
+
+    def counted(self, names):
+        counts.append(len(names))
+        return every(self, names)
+
+    monkeypatch.setattr(GraphSlam, "landmark_covariances", counted)
+    weakest = WeakestLandmark()
+    said = [weakest.goes_on(slam) for _ in range(5)]
+    assert max(counts) <= 5
+    assert said[-1].startswith(f"landmark {list(slam.landmarks)[int(np.argmax(sigmas))]} {max(sigmas) ** 0.5:.3f} m ")
+    assert WeakestLandmark().goes_on(GraphSlam(Config())) == ""
 
 
 # -- the worker --------------------------------------------------------------------------------------------------------
