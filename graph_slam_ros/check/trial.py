@@ -36,7 +36,11 @@ _LIMITS = {
 _OVER_CONFIDENT, _ODOMETRY_OVER_CONFIDENT, _LEAST_DOF = 2.0, 6.0**0.5, 100.0
 _LOST = 0.25
 _JUMPED_S = 0.08
-_OF_A_BREAK = ("ids_unsure", "map_breaks")  # what a robot that was carried makes of identities that are right
+_OF_A_BREAK = (
+    "ids_unsure",
+    "map_breaks",
+    "landmark_moved",
+)  # what a robot that was carried makes of identities that are right
 _MOST, _SHIFTS = 0.9, 2.0
 
 
@@ -102,10 +106,11 @@ def check_trial(c: Columns, slam: GraphSlam) -> Iterator[Finding]:
             yield Finding("fit_unsure", "warning", fit.lost, _LOST, "part", text)
         yield from found
         return
-    for one in fitted:
-        yield from _fitted(c, one)
+    off = [found_one for one in fitted for found_one in _fitted(c, one)]
+    yield from off
     yield from _clock_jumps(c, fit)
-    slips = list(check_slips(c, slam))
+    is_off = any(one.severity == "warning" for one in off)  # a clock or mount that is wrong bends the path in turns
+    slips = [] if is_off else list(check_slips(c, slam))
     is_displaced = any(one.severity == "warning" for one in slips)
     yield from slips
     yield from (one for one in found if not (is_displaced and one.code in _OF_A_BREAK))
