@@ -30,6 +30,10 @@ _CONTRADICT = (
     "left, where the sensor is (TF or {0}.mount), its clock ({0}.offset_s), ids that are used twice. If only its noise "
     "is larger than stated: --set {0}.noise=sigmas --set {0}.sigma_m=..."
 )
+_CONFUSED = (
+    "Landmarks a few metres apart are confused less with a density that is theirs, e.g. for 2 m "
+    "--set landmarks.density_per_m=0.4; and with classes, sizes or ids"
+)
 _ON_JUMP = "--set time.on_jump=segment goes on in the same map, reset in another run"
 _NOT_CONVERGED = (
     "the estimate is not at its optimum: --set solve.max_iterations=1000. If that does not help, measurements that are "
@@ -181,6 +185,7 @@ def shortcomings(summary: Summary) -> Iterator[str]:
                 "metres and radians? A robot as fast as that: --set odometry.max_speed_m_s=..."
             )
     yield from _gyro_faults(summary)
+    yield from _association_faults(summary)
     if not sum(counts["believed"] or 0 for counts in inputs.values()):
         yield (
             "this is odometry alone: no landmark, fix or closure is in the result; "
@@ -188,6 +193,19 @@ def shortcomings(summary: Summary) -> Iterator[str]:
         )
     elif summary["landmarks"] and summary["sightings"] == summary["landmarks"]:
         yield "no landmark was seen twice, so they correct nothing: do ids change? --set landmarks.association=joint"
+
+
+def _association_faults(summary: Summary) -> Iterator[str]:
+    """Yield why the association of sightings without identity is not to be believed; empty if it is."""
+    found = summary.get("association", {})
+    if found.get("is_doubtful"):
+        missing, lost = 100.0 * found["missing_part"], 100.0 * found["lost_part"]
+        yield (
+            f"sightings without identity: {missing:.0f} % of the landmarks that should be seen are not, and the sensor "
+            f"misses {lost:.1f} %: the map is probably wrong. {_CONFUSED}"
+        )
+    if not found.get("is_whole", True):
+        yield f"sightings without identity: landmarks may still be two that are one (moves_left). {_CONFUSED}"
 
 
 def doubts(summary: Summary) -> Iterator[str]:

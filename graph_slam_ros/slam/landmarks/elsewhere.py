@@ -112,7 +112,7 @@ class UnnamedDisplacement:
         missing = np.zeros(len(places), dtype=np.int64)
         for scan in seen.scans[-_SCANS:]:
             points = scan.points
-            missing += _is_missing(self._landmarks.seen_from(scan.where, places), points, points)
+            missing += is_missing(self._landmarks.seen_from(scan.where, places), points, points)
         return _are_gone(seen, missing)
 
     def _is_lost(self, seen: Seen) -> bool:
@@ -137,7 +137,7 @@ class UnnamedDisplacement:
             moved = group.between(scan.at.pose, last.at.pose)
             in_base = last.points[is_followed] @ space.turn(moved).T + np.array(moved[: space.dimensions])
             fit_m = _FIT_M + _SLIP * float(np.linalg.norm(moved[: space.dimensions]))
-            missing += _is_missing(in_base, view, scan.points, fit_m)
+            missing += is_missing(in_base, view, scan.points, fit_m)
         return _are_gone(seen, missing)
 
     def proposal(self, seen: Seen) -> dict[int, int]:
@@ -195,7 +195,7 @@ def _missed_part(seen: Seen) -> float:
     return (missed + 1) / (count + 2)
 
 
-def _is_missing(in_base: Array, view: Array, points: Array, fit_m: float = _FIT_M) -> NDArray[np.bool_]:
+def is_missing(in_base: Array, view: Array, points: Array, fit_m: float = _FIT_M) -> NDArray[np.bool_]:
     """Return which of the landmarks should be seen and are not.
 
     Parameters

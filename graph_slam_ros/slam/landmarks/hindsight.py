@@ -19,6 +19,7 @@ from graph_slam_ros.slam.landmarks.beam import NOTHING, BeamSettings, Ids
 from graph_slam_ros.slam.landmarks.constellation import laid_on_the_map
 from graph_slam_ros.slam.landmarks.explanation import UNUSED, Costs, Drive, Estimate
 from graph_slam_ros.slam.landmarks.moves import refined, without_few
+from graph_slam_ros.slam.landmarks.presence_check import NOTHING_SEEN, Presence, presence
 from graph_slam_ros.slam.landmarks.rotations import matrices_of, poses_of
 from graph_slam_ros.slam.landmarks.scans import Motion, Scan
 from graph_slam_ros.solver import Solver
@@ -58,6 +59,7 @@ class Found:
     ----------
     is_whole : whether all moves were tried
     clocks : of each input the correction of its stamps [s], and its standard deviation
+    presence : which landmarks in view were seen
     """
 
     frozen: FrozenScans
@@ -65,6 +67,7 @@ class Found:
     undecided: int = 0
     is_whole: bool = True
     clocks: dict[str, tuple[float, float]] = field(default_factory=dict)
+    presence: Presence = NOTHING_SEEN
 
     def numbers(self, given: Sequence[int], fresh: Callable[[], int]) -> Ids:
         """The number of each landmark: that of most of its clusters, each used once, or a fresh one."""
@@ -186,6 +189,9 @@ class Hindsight:
             "scans": len(self.newest.frozen.scans),
             "is_whole": self.newest.is_whole,
             "undecided": self.newest.undecided,
+            "missing_part": self.newest.presence.missing_part,
+            "lost_part": self.newest.presence.lost_part,
+            "is_doubtful": self.newest.presence.is_doubtful,
             "clocks": {topic: {"value": c, "sigma": sigma} for topic, (c, sigma) in self.newest.clocks.items()},
         }
 
@@ -216,7 +222,14 @@ def explained(space: Geometry, frozen: FrozenScans, settings: BeamSettings, cost
     drive.begin_moves()
     estimate, undecided = laid_on_the_map(drive, best.estimate)
     is_whole = best.is_whole and drive.may_move
-    return replace(best, estimate=estimate, undecided=undecided, is_whole=is_whole, clocks=drive.clocks_of(estimate))
+    return replace(
+        best,
+        estimate=estimate,
+        undecided=undecided,
+        is_whole=is_whole,
+        clocks=drive.clocks_of(estimate),
+        presence=presence(drive, estimate),
+    )
 
 
 def _indices(given: Ids) -> tuple[Ids, Ids]:

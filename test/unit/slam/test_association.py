@@ -9,6 +9,7 @@ import pytest
 from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
 from graph_slam_ros.measurements.types import Sighting
+from graph_slam_ros.runs.outcome import shortcomings
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
 from graph_slam_ros.slam.frontend.odometry_selector import Step
 from graph_slam_ros.slam.landmarks import hindsight
@@ -16,6 +17,7 @@ from graph_slam_ros.slam.landmarks.beam import NOTHING, Beam, BeamSettings, Deci
 from graph_slam_ros.slam.landmarks.constellation import laid_on_the_map
 from graph_slam_ros.slam.landmarks.explanation import Costs, Drive, Estimate
 from graph_slam_ros.slam.landmarks.moves import refined
+from graph_slam_ros.slam.landmarks.presence_check import presence
 from graph_slam_ros.slam.landmarks.rotations import rotation, rotation_vector
 from graph_slam_ros.slam.landmarks.scans import (
     NEARBY_S,
@@ -342,6 +344,32 @@ def test_moves_end_at_their_limit_of_work_and_that_is_said(monkeypatch):
         monkeypatch.setattr("graph_slam_ros.slam.landmarks.explanation._MOST_WORK", most)
         found[most] = hindsight.explained(PLANAR, frozen, SETTINGS, COSTS)
     assert [(one.is_whole, len(one.estimate.landmarks)) for one in found.values()] == [(True, 5), (False, 6)]
+
+
+def test_landmarks_that_should_be_seen_and_are_not_make_an_explanation_doubtful():
+    scans, truth = circle(laps=4)
+    drive, e = of_drive(scans, truth)
+    right = presence(drive, e)
+    assert (right.missing, right.is_doubtful) == (0, False)
+    turned = replace(e, landmarks=np.concatenate([e.landmarks, 0.6 * e.landmarks]))  # nearer than what is seen
+    wrong = presence(drive, turned)
+    assert wrong.seen == right.seen
+    assert wrong.missing > 100
+    assert wrong.is_doubtful
+
+
+@pytest.mark.parametrize("found", [{}, {"is_doubtful": True}, {"is_whole": False}])
+def test_an_association_that_cannot_be_believed_is_a_shortcoming(found):
+    summary = {
+        "counters": {},
+        "inputs": {},
+        "landmarks": 0,
+        "sightings": 0,
+        "association": {"is_whole": True, "is_doubtful": False, "missing_part": 0.113, "lost_part": 0.012} | found,
+    }
+    about = [one for one in shortcomings(summary) if one.startswith("sightings without identity")]
+    assert len(about) == len(found)
+    assert all("--set landmarks.density_per_m" in one for one in about)
 
 
 def two_rooms(marks_of_second):
