@@ -224,8 +224,7 @@ class MapView:
         """
         frontend, origins = self._frontend, self._landmarks.map.origins
         problem = self.backend.trial_problem(self.space, frontend.path, origins, factors=frontend.corrections.factors)
-        wanted = parameters_of(problem, groups, chooses=chooses)
-        found = fit(problem, {one: one.quantity.prior for one in wanted})
+        found = fit(problem, {one: one.quantity.prior for one in parameters_of(problem, groups, chooses=chooses)})
         stated = problem.model().sigma_per_m()
         return found, decide(found, len(self.landmarks), slides=self.config.odometry.slides, sigma_per_m=stated)
 
