@@ -26,7 +26,7 @@ from graph_slam_ros.analysis.trajectories import Truth, read_truth
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.files import is_empty
 from graph_slam_ros.lie import se3
-from graph_slam_ros.runs.folder import is_run, run_config, summary_of
+from graph_slam_ros.runs.folder import is_recording, is_run, run_config, summary_of
 from graph_slam_ros.runs.trajectory import Point, Trajectory, read_landmarks, read_tum
 
 _KEYFRAMES = ("path.tum", "path_odometry.tum")  # estimate and dead reckoning
@@ -162,6 +162,8 @@ def evaluate(
         A file or topic that is missing or unreadable, or too few common stamps.
     """
     run = Path(run)
+    if is_recording(run):
+        run_config(run)  # it is refused as such
     inputs = input_topics(run)
     known = truth if isinstance(truth, Truth) else read_truth(truth, topic, inputs)
     dimensions = dimensions_of(run)

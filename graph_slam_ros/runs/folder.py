@@ -152,10 +152,16 @@ def recording_of(folder: Path) -> str:
     return name if isinstance(name, str) else ""
 
 
+def is_recording(path: Path) -> bool:
+    """Return whether a path is that of a recording by its form: a file, or a folder of rosbag2."""
+    return path.is_file() or (path / "metadata.yaml").exists()
+
+
 def run_config(folder: Path) -> Config:
     """The configuration a run was made with. Raises ConfigError naming the file."""
     if not os.path.lexists(folder / CONFIG):
-        raise ConfigError(f"{folder}: not a run: no {CONFIG} in it")
+        mend = f"; of a recording graph_slam replay {folder} --out RUN makes one" if is_recording(folder) else ""
+        raise ConfigError(f"{folder}: not a run: no {CONFIG} in it{mend}")
     values = read_parameters(folder / CONFIG, follow=False)
     try:
         return Config.from_mapping({name: value for name, value in flatten(values) if name not in REMOVED})

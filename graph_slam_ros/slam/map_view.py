@@ -297,12 +297,7 @@ class MapView:
         return self._calibrator.widened(covariance, int(self.keyframes.ids[-1])) if self.keyframes else covariance
 
     def landmark_covariances(self, names: Sequence[str] | None = None) -> list[Array]:
-        """Marginal of each landmark: of a point in the map's axes, of a pose in its tangent space; NaN if unknown.
-
-        Parameters
-        ----------
-        names : of some landmarks; all if None
-        """
+        """Marginals of all or some landmarks: of points in map's axes, of poses in tangent space; NaN if unknown."""
         known = self.landmarks
         return self._marginals([known[name].vertex for name in (known if names is None else names)])
 

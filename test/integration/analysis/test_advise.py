@@ -210,13 +210,15 @@ def test_of_a_drive_in_a_frozen_map_the_drive_is_advised_on(straight, tmp_path, 
     ("words", "why"),
     [
         (["NONE"], "not a run: no config.yaml in it"),
+        (["BAG"], "not a run: no config.yaml in it; of a recording graph_slam replay"),
         (["RUN", "--survey-sigma", "0"], "0 is not a positive number"),
         (["RUN", "--survey-sigma", "1e-200"], "is not positive definite"),
         (["RUN", "--count", "0"], "0 is not a positive integer"),
     ],
 )
 def test_what_cannot_be_advised_on_is_refused_in_one_line(straight, tmp_path, told, words, why):
-    words = [{"NONE": tmp_path, "RUN": straight}.get(word, word) for word in words]
+    (bag := tmp_path / "drive.mcap").touch()
+    words = [{"NONE": tmp_path, "BAG": bag, "RUN": straight}.get(word, word) for word in words]
     with pytest.raises(SystemExit) if "0" in words else pytest.MonkeyPatch.context():
         code, out, err = told("advise", *words)
         assert (code, out, err.count("\n")) == (2, "", 1)
