@@ -15,7 +15,11 @@ from graph_slam_ros.messages.inputs.source import InputContext
 from graph_slam_ros.messages.inputs.transforms import pose
 
 _DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # sensor_msgs/PointField
-_FIELDS = ("x", "y", "z", "range", "bearing", "elevation", "id", "sigma", "sigma_bearing", "size", "diameter", "radius")
+_CLASSES = "class_id", "class", "label"
+_FIELDS = (
+    *("x", "y", "z", "range", "bearing", "elevation", "id", "sigma", "sigma_bearing"),
+    *("size", "diameter", "radius", *_CLASSES),
+)
 _MOST_POINTS = 100_000  # landmarks in one message: a scan is no list of landmarks
 _UNKNOWN_ID = -1
 
@@ -25,7 +29,7 @@ def point_cloud(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
 
     ``x``, ``y`` and perhaps ``z``; or ``range``, ``bearing`` (and ``elevation``), or some of these, in the sensor's
     frame; ``id`` where it is known; ``sigma`` (m, or rad of bearings alone) and ``sigma_bearing``
-    (rad); ``size``, ``diameter`` or ``radius`` (m) of the landmark.
+    (rad); ``size``, ``diameter`` or ``radius`` (m) of the landmark; ``class_id``, ``class`` or ``label``, a number.
     """
     there = {f.name for f in m.fields} & set(_FIELDS)
     angles = [name for name in ("bearing", "elevation") if name in there]
@@ -41,10 +45,12 @@ def point_cloud(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
         row = {name: one[name].item() for name in there}
         name, sigma = _identity(row.get("id")), row.get("sigma", 0.0)
         size = row.get("size", row.get("diameter", 2.0 * row.get("radius", 0.0)))
+        sort = next((_identity(row[one]) for one in _CLASSES if one in row), "")
         if kind == "position":
             at = SimpleNamespace(x=row["x"], y=row["y"], z=row.get("z", 0.0))
             covariance = np.diag([sigma * sigma] * 3 + [0.0] * 3).ravel() if "sigma" in there else None
-            yield ObservedLandmark(m.header.stamp, m.header.frame_id, name, at, covariance=covariance, size=size)
+            frame = m.header.frame_id
+            yield ObservedLandmark(m.header.stamp, frame, name, at, covariance=covariance, sort=sort, size=size)
             continue
         sigma_rad = row.get("sigma_bearing", sigma if kind == "bearing" else 0.0)
         measured = [
@@ -57,6 +63,7 @@ def point_cloud(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
             name,
             polar=(kind, tuple(measured)),
             sigmas=sigmas if there & {"sigma", "sigma_bearing"} else None,
+            sort=sort,
             size=size,
         )
 

@@ -63,6 +63,16 @@ def test_the_size_of_a_point_without_identity_is_that_of_its_field(name, size):
     assert only(heard(scanner(sigma_rad=0.1), "scan", polar)).size == size
 
 
+@pytest.mark.parametrize("name", ["class_id", "class", "label"])
+def test_the_class_of_a_point_without_identity_is_that_of_its_field(name):
+    at = cloud([("x", "f8"), ("y", "f8"), (name, "i2")], (1.0, 2.0, 4), (3.0, 4.0, -1))
+    assert [s.sort for s in heard(scanner(sigma_m=0.3), "scan", at).sightings] == ["4", ""]
+    polar = cloud([("range", "f8"), ("bearing", "f8"), ("sigma", "f8"), (name, "u1")], (1.0, 0.1, 0.1, 2))
+    assert only(heard(scanner(sigma_rad=0.1), "scan", polar)).sort == "2"
+    named = cloud([("x", "f8"), ("y", "f8"), ("id", "u4"), (name, "u1")], (1.0, 2.0, 7, 4))
+    assert only(heard(scanner(sigma_m=0.3), "scan", named)).sort == "", "it has an identity"
+
+
 def test_a_range_and_a_bearing_are_those_of_a_sensor_that_may_be_turned():
     eye = ("base_link", "eye", (1.0, 2.0, 0.5), quaternion(yaw=0.5))
     layout = [("id", "u4"), ("range", "f8"), ("bearing", "f8"), ("sigma", "f8"), ("sigma_bearing", "f8")]
