@@ -8,9 +8,10 @@ in the frame of the landmarks; NEES is that of one degree of freedom, 1 is right
 import argparse
 import sys
 import time
-from collections.abc import Hashable
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -19,10 +20,11 @@ if not __package__:  # run as a script: what it imports is in the repository, no
 
 from graph_slam_ros.graph import Gaussian, Graph
 from graph_slam_ros.graph.geometry import PLANAR, Geometry
-from graph_slam_ros.slam.lifelong.compaction import compacted
+from graph_slam_ros.slam import Config, Measurement, Odometry, Sighting, Sightings
+from graph_slam_ros.slam.lifelong.compaction import compact
 from graph_slam_ros.slam.lifelong.condenser import Condenser, RemovedPose, poses_of
 from graph_slam_ros.solver import Solver
-from graph_slam_ros.typing import Array
+from graph_slam_ros.typing import Array, Numbers
 
 STEP_M, REACH_M, SEEN = 0.5, 8.0, 0.5
 CELL_M, LONGEST = 10.0, 60
@@ -102,6 +104,42 @@ def _seen(there: Array, rng: np.random.Generator) -> tuple[Array, Array]:
     return there + np.linalg.cholesky(covariance) @ rng.standard_normal(len(there)), covariance
 
 
+STEP_S = 0.2
+
+
+def config(space: Geometry, **values: Any) -> Config:
+    """Parameters of a pipeline for the noise of a hall; more by name, with ``_`` for the dot."""
+    per_root_s = STEP_S**-0.5
+    densities = {
+        "translation_density": SIGMA_ALONG,
+        **dict.fromkeys(("lateral_density", "vertical_density", "rotation_density", "tilt_density"), SIGMA_TURN),
+    }
+    known = {f"odometry.{name}": sigma * per_root_s for name, sigma in densities.items()}
+    known |= {"world.dimensions": space.dimensions, "odometry.noise": "density", "odometry.max_speed_m_s": 20.0}
+    known |= {"odometry.timeout_s": 1.0, "keyframes.min_distance_m": 0.3, "landmarks.added_sigma_m": 0.0}
+    return Config.from_mapping(known | {name.replace("_", ".", 1): value for name, value in values.items()})
+
+
+def measurements(world: Hall) -> Iterator[Measurement]:
+    """What a robot measures in a hall: odometry and sightings at each keyframe, one keyframe each 0.2 s."""
+    at = world.space.identity
+    for k, seen in enumerate(world.sightings):
+        if k:
+            at = world.space.normalized(world.space.group.compose(at, world.steps[k - 1]))
+        yield from measured(tuple(map(float, at)), round((k + 5) * STEP_S * 1e9), seen)
+
+
+def measured(T_odom_base: Numbers, stamp_ns: int, seen: Sequence[tuple[int, Array, Array]]) -> Iterator[Measurement]:
+    """What a robot measures at one keyframe."""
+    yield Odometry(stamp_ns, T_odom_base, source="odom")
+    if seen:
+        sightings = (
+            Sighting(f"m{mark}", "position", tuple(at.tolist()), tuple(noise.ravel().tolist()))
+            for mark, at, noise in seen
+        )
+        yield Sightings(stamp_ns, "landmarks", tuple(sightings))
+
+
 @dataclass(slots=True)
 class Robot:
     """A robot that maps a hall, a keyframe at a time; ``window`` keyframes stay as they are, all of them where it is 0.
@@ -169,7 +207,7 @@ class Robot:
     def _condense(self, newest: int) -> None:
         began, first = time.thread_time(), self.first
         at = self.solver.estimate([self.vertices[k] for k in range(first, min(first + LONGEST, newest))])
-        cells: list[Hashable] = list(map(tuple, np.floor(at[:, : self.world.space.dimensions] / CELL_M).tolist()))
+        cells = list(map(tuple, np.floor(at[:, : self.world.space.dimensions] / CELL_M).tolist()))
         length = next((k for k, cell in enumerate(cells) if cell != cells[0]), len(cells))
         end = first + length
         if end + self.window > newest:
@@ -194,11 +232,10 @@ class Robot:
 
     def compact(self) -> None:
         """Make graph and solver anew without what was removed."""
-        anew = compacted(self.solver)
-        self.solver = anew.solver
-        self.condenser.renumber(anew)
-        self.vertices = {k: anew.vertices[vertex] for k, vertex in self.vertices.items()}
-        self.marks = {mark: anew.vertices[vertex] for mark, vertex in self.marks.items()}
+        new = compact(self.solver)
+        self.condenser.renumber(new)
+        self.vertices = {k: int(new.vertices[vertex]) for k, vertex in self.vertices.items()}
+        self.marks = {mark: int(new.vertices[vertex]) for mark, vertex in self.marks.items()}
         self._update()
 
     @property

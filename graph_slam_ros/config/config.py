@@ -93,6 +93,18 @@ class Config:
                 "(landmarks.surveyed)"
             )
 
+        if self.map.condense and (not_yet := self._not_condensed):
+            raise ConfigError(f"map.condense: not with {not_yet} yet: set map.condense=false, or change that")
+
+    @property
+    def _not_condensed(self) -> str:
+        """Return the parameter with which nothing is condensed yet; empty if there is none."""
+        if self.landmarks.association in ("nearest", "joint"):
+            return f"landmarks.association={self.landmarks.association}"
+        if self.odometry.fusion == "parallel":
+            return "odometry.fusion=parallel"
+        return f"calibrate.groups={self.calibrate.groups}" if self.calibrate.is_on else ""
+
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any]) -> "Config":
         """Read nested or dotted names and their values. A parameter that is not named keeps its default.

@@ -61,10 +61,23 @@ class AnchorConfig:
 
 @dataclass(frozen=True, slots=True)
 class MapConfig:
-    """Mapping, or localization in a fixed map."""
+    """Mapping, or localization in a fixed map; and a map whose size follows its area."""
 
     localize: bool = setting(
         False,
         "true: the map stays fixed and the robot is located in it; false: the map grows and is corrected",
         live=True,
     )
+    condense: bool = setting(
+        False,
+        "true: what was driven long ago is condensed to one measurement of each place, so that memory and time follow "
+        "the area and not the distance driven; false: every keyframe is kept",
+    )
+    window_keyframes: int = setting(
+        2000,
+        "with condense: so many of the newest keyframes are kept as they were measured, and can be doubted one by one",
+        "keyframes",
+        low=40,
+        high=10_000_000,
+    )
+    cell_m: float = setting(10.0, "with condense: width of a place", "m", low=1.0, high=1000.0)

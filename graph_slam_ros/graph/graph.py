@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph.edge_type import EdgeType
+from graph_slam_ros.graph.lasting_ids import LastingIds
 from graph_slam_ros.graph.noise import Gaussian
 from graph_slam_ros.graph.tables import Column, Edge, EdgeTable, Vertex
 from graph_slam_ros.graph.vertices import VertexKind
@@ -33,6 +34,7 @@ class Graph:
     kind : code of each vertex's kind, an index into ``kinds``
     offset : where each vertex begins in ``initial``, the stored numbers of all vertices end to end
     table_of_edge, row_of_edge : of each edge, its table (counted in the order of ``tables``) and row
+    vertex_ids, edge_ids : the ids that last, where rows were removed (``kept_part``); until then they are the same
     """
 
     def __init__(self) -> None:
@@ -46,6 +48,7 @@ class Graph:
         self.sources: list[str] = []
         self.table_of_edge = Column(np.int64)
         self.row_of_edge = Column(np.int64)
+        self.vertex_ids, self.edge_ids = LastingIds(), LastingIds()
 
     def __repr__(self) -> str:
         codes, counts = np.unique(self.kind.values, return_counts=True)
@@ -209,6 +212,13 @@ class Graph:
             return np.empty(0, dtype=np.int64)
         code = self.labels.index(label)
         found = [table.id.values[table.label.values == code] for table in self.tables.values()]
+        return np.sort(np.concatenate(found))
+
+    def edges_since(self, vertex: int) -> Index:
+        """Ids of the edges with an end at a vertex or a later one, in order."""
+        found = [np.empty(0, dtype=np.int64)]
+        for table in self.tables.values():
+            found.append(table.id.values[(table.vertices.values >= vertex).any(axis=1)])
         return np.sort(np.concatenate(found))
 
     def _check(self, edge: EdgeType, at: Index, measured: Array, noise: Gaussian) -> None:

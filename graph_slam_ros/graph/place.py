@@ -16,6 +16,8 @@ from graph_slam_ros.typing import Array, Index
 
 POINTS_OF = {SE2: R2, SE3: R3}
 MOST_MEMBERS = 999
+LABEL = "places"
+"""The class of these edges."""
 
 
 @kernel

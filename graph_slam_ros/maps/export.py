@@ -5,16 +5,20 @@ Everything is read from ``map.mcap``. So a run that never ended can be exported,
 
 from pathlib import Path
 
+import numpy as np
+
 from graph_slam_ros.formats.durable import replaced
 from graph_slam_ros.formats.g2o_writer import write_g2o, write_text
 from graph_slam_ros.formats.strict import is_gzipped
 from graph_slam_ros.formats.tum import tum_text
 from graph_slam_ros.messages import results, to_msg
 from graph_slam_ros.recordings.bag import BagWriter
+from graph_slam_ros.runs.condensed_map import read_left
 from graph_slam_ros.runs.folder import RunError, is_run
 from graph_slam_ros.runs.restore import restored
-from graph_slam_ros.runs.tables import graph_file, numbered
+from graph_slam_ros.runs.tables import graph_file, numbered, removed_path
 from graph_slam_ros.slam import GraphSlam
+from graph_slam_ros.slam.lifelong.removed import Records
 
 
 def export(folder: Path, out: Path, target: str, losses: list[str], *, last_drive: bool = False) -> list[Path]:
@@ -32,12 +36,13 @@ def export(folder: Path, out: Path, target: str, losses: list[str], *, last_driv
         raise RunError(f"{out}: a run is there, with files of its own")
     if target == "mcap" and out.suffix != ".mcap":
         raise RunError(f"{out}: what reads mcap wants a name that ends in .mcap")
-    slam = restored(folder, losses)
+    slam = restored(folder, losses, condensed=True)
+    keyframes, _ = read_left(folder, slam.space, slam.bounded)
     if last_drive:
         if target != "tum":
             raise RunError(f"--last-drive: {target} holds a whole map; with --to tum it is the path of the last drive")
-        return _tum(slam, out, slam.drives[-1])
-    return TARGETS[target](slam, out)
+        return _tum(slam, keyframes, out, slam.drives[-1])
+    return TARGETS[target](slam, keyframes, out)
 
 
 def files_of(out: Path, target: str) -> list[Path]:
@@ -48,13 +53,15 @@ def files_of(out: Path, target: str) -> list[Path]:
     return [out, whole.with_name(f"{whole.stem}_vertices.csv")]
 
 
-def _tum(slam: GraphSlam, out: Path, first: int = 0) -> list[Path]:
+def _tum(slam: GraphSlam, left: Records, out: Path, first: int = 0) -> list[Path]:
     """The keyframes from a number on."""
-    write_text(out, tum_text(slam.keyframes.stamps_ns.tolist()[first:], slam.trajectory()[first:]))
+    stamps_ns = [*left["stamp_ns"].tolist(), *slam.keyframes.stamps_ns.tolist()]
+    path = np.concatenate((removed_path(slam, left), slam.trajectory()))
+    write_text(out, tum_text(stamps_ns[first:], path[first:]))
     return [out]
 
 
-def _g2o(slam: GraphSlam, out: Path) -> list[Path]:
+def _g2o(slam: GraphSlam, left: Records, out: Path) -> list[Path]:
     """All accepted edges. g2o has neither stamps nor names; a second table has these."""
     ids, table = numbered(slam)
     _, names_file = files_of(out, "g2o")
@@ -63,16 +70,22 @@ def _g2o(slam: GraphSlam, out: Path) -> list[Path]:
     return [out, names_file]
 
 
-def _mcap(slam: GraphSlam, out: Path) -> list[Path]:
-    """Every keyframe at its stamp with its covariance; at the last stamp the path and the landmarks."""
+def _mcap(slam: GraphSlam, left: Records, out: Path) -> list[Path]:
+    """Every keyframe at its stamp with its covariance; at the last stamp the path and the landmarks.
+
+    The covariance of a keyframe that was condensed is not known: all variances are those of what a pose does not have.
+    """
     frame, unused = slam.config.frames.map, slam.config.output.pose_covariance_max
-    poses = zip(slam.keyframes.stamps_ns.tolist(), slam.trajectory(), slam.keyframe_covariances(), strict=True)
+    path = np.concatenate((removed_path(slam, left), slam.trajectory()))
+    stamps_ns = [*left["stamp_ns"].tolist(), *slam.keyframes.stamps_ns.tolist()]
+    unknown = np.broadcast_to(unused * np.eye(slam.space.dof), (len(left), slam.space.dof, slam.space.dof))
+    poses = zip(stamps_ns, path, np.concatenate((unknown, slam.keyframe_covariances())), strict=True)
     last_ns, landmarks = slam.keyframes[-1].stamp_ns, results.landmark_estimates(slam)
     with replaced(out) as new, BagWriter(new) as bag:
         for stamp_ns, at, covariance in poses:
             pose = to_msg.pose_with_covariance_stamped(stamp_ns, frame, tuple(at.tolist()), covariance, unused)
             bag.write("/pose", results.POSE, stamp_ns, pose)
-        bag.write("/path", results.PATH, last_ns, results.path(slam))
+        bag.write("/path", results.PATH, last_ns, to_msg.path(frame, np.array(stamps_ns), path))
         bag.write("/landmarks", results.LANDMARKS, last_ns, results.landmarks(slam, landmarks))
         bag.write("/landmarks_estimate", results.ESTIMATES, last_ns, results.landmarks_estimate(slam, landmarks))
     return [out]

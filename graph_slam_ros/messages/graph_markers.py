@@ -61,7 +61,7 @@ def graph_view(slam: GraphSlam, most: int) -> GraphView:
             if of.any():
                 lines[name].append(Lines(start[of], end[of], misfit[some.ids[of]]))
     joined = {name: _joined(parts) for name, parts in lines.items()}
-    keyframes = slam.keyframes.ids[thinned(len(slam.keyframes), most)]
+    keyframes = slam.keyframes.ids[thinned(len(slam.keyframes.ids), most)]
     landmarks = np.array([mark.vertex for mark in slam.landmarks.values()], dtype=np.int64)
     landmarks = landmarks[thinned(len(landmarks), most)]
     return GraphView(at[keyframes], at[landmarks], joined, rejected=joined.pop(""))

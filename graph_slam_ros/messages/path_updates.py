@@ -2,6 +2,8 @@
 
 A message has the keyframes that are new or have moved. Each pose is identified by its stamp: it replaces the pose with
 this stamp, or is inserted between its neighbours. A message without poses means: forget all, the whole path follows.
+Keyframes that were condensed are not sent again.
+
 Messages are numbered, as those of interactive markers are (``seq_num``). nav_msgs/Path has no field for the number, so
 ``/diagnostics`` publishes the count. A subscriber that received fewer messages since the path began lacks some poses.
 """
@@ -30,6 +32,7 @@ class PathUpdates:
         self.version = 0
         self._moved_m, self._moved_rad = moved_m, moved_rad
         self._sent: Array = np.empty((0, 0))
+        self._first = 0  # the number of the first keyframe of these
 
     def restart(self, slam: GraphSlam) -> bytes:
         """nav_msgs/Path without poses: forget all; the next update contains every keyframe.
@@ -37,7 +40,7 @@ class PathUpdates:
         It is due for a new subscriber, and after another ``GraphSlam`` has begun.
         """
         self.version = 1
-        self._sent = np.empty((0, 0))
+        self._sent, self._first = np.empty((0, 0)), slam.first_keyframe
         return to_msg.path(slam.config.frames.map, [], self._sent)
 
     def update(self, slam: GraphSlam) -> bytes | None:
@@ -45,11 +48,12 @@ class PathUpdates:
 
         None if there are none.
         """
-        now, old = slam.trajectory(), self._sent
+        now, old = slam.trajectory(), self._sent[slam.first_keyframe - self._first :]
         changed = np.ones(len(now), dtype=bool)
         if len(old):
             changed[: len(old)] = self._moved(slam.space.dimensions, old, now[: len(old)])
         which = np.flatnonzero(changed)
+        self._sent, self._first = old, slam.first_keyframe
         if not len(which):
             return None
         self._sent = np.concatenate((old.reshape(-1, now.shape[1]), now[len(old) :]))

@@ -30,9 +30,10 @@ def newest_pose(slam: GraphSlam) -> Numbers:
 
 
 def path(slam: GraphSlam, most: int = 0) -> bytes:
-    """The corrected path: every keyframe at its own stamp, or those that ``thinned`` selects."""
-    kept = thinned(len(slam.keyframes), most)
-    return to_msg.path(slam.config.frames.map, slam.keyframes.stamps_ns[kept], slam.trajectory()[kept])
+    """The corrected path: every keyframe of the graph at its own stamp, or those that ``thinned`` selects."""
+    stamps_ns, poses = slam.shown_path()
+    kept = thinned(len(stamps_ns), most)
+    return to_msg.path(slam.config.frames.map, stamps_ns[kept], poses[kept])
 
 
 def pose(slam: GraphSlam) -> bytes:

@@ -34,7 +34,8 @@ class UnseenWay:
     def goes_on(self, slam: GraphSlam) -> "UnseenWay":
         """Return the distance after an update."""
         count, changes = len(slam.keyframes), slam.landmark_changes
-        positions = slam.keyframes.poses[max(self.keyframes - 1, 0) : count, : slam.space.dimensions]
+        since = max(self.keyframes - 1 - slam.first_keyframe, 0)
+        positions = slam.keyframes.poses[since:, : slam.space.dimensions]
         steps = np.diff(positions, axis=0)
         length_m, direction = self.length_m, self.direction
         if len(steps) and slam.segments[-1] < self.keyframes:  # a jump of odometry is no way

@@ -67,7 +67,9 @@ class Session:
         recorder: RunRecorder | None = None
         if self._folder is not None:
             named = self._folder.with_name(load) if (load := self.config.output.load) else None
-            keep_earlier(self._folder, self.config.output.keep_earlier, loaded or named)
+            moved = keep_earlier(self._folder, self.config.output.keep_earlier, loaded or named)
+            if start is not None and start.folder == self._folder:
+                start.folder = moved
             self._recorder = None
             try:
                 recorder = RunRecorder(self._folder, self.config, self.config.journal.sync_s, start, force=True)
@@ -245,7 +247,7 @@ class Session:
             )
         out = folder.with_name(name)
         try:
-            save_copy(self.slam, out)
+            save_copy(self.slam, out, folder)
         except GraphSlamError as error:
             raise RunError(f"{folder.name} is saved; {error}") from None
         return out

@@ -25,6 +25,7 @@ from graph_slam_ros.formats.durable import NEW, claimed, sync_folder, write_whol
 from graph_slam_ros.formats.files import is_regular, opened, read_bytes, read_text
 from graph_slam_ros.formats.parameters import read_parameters
 from graph_slam_ros.recordings.mcap_records import begin, records
+from graph_slam_ros.runs.condensed_map import CONDENSED, LEFT
 from graph_slam_ros.runs.journal import INGEST, MAP, MEASUREMENT, parts_of, read_ingest
 from graph_slam_ros.runs.ledger_file import CHANGES, LEDGER
 from graph_slam_ros.runs.map_journal import GROWTH, grew
@@ -41,9 +42,9 @@ MARK = "graph_slam_ros run"
 """The ``format`` of the ``run.json`` of a run."""
 BEGUN = json.dumps({"format": MARK, "version": __version__, "ended": False}).encode()
 """The ``run.json`` of a run until it is saved."""
-_RECORDED = re.compile(r"(ingest|map|run)(_\d+)?\.mcap")
+_RECORDED = re.compile(r"(ingest|map|condensed|run)(_\d+)?\.mcap")
 _UNFINISHED = re.compile(r"\.[0-9a-f]{8}" + re.escape(NEW))
-_SCHEMAS = {INGEST: MEASUREMENT, MAP: GROWTH}
+_SCHEMAS = {INGEST: MEASUREMENT, MAP: GROWTH, CONDENSED: LEFT}
 _OF_RECORDINGS = re.compile(r"(\.(mcap|db3|bag|active|zstd|gz))+$")
 _NO_FILE = (errno.ENOENT, errno.ENOTDIR)
 _ENDS = 2**16
@@ -206,7 +207,7 @@ def recorded_files(folder: Path) -> dict[str, str]:
 
     Somebody may have removed the configuration meanwhile, or put a link there: results are saved all the same.
     """
-    parts = [file for name in (INGEST, MAP) for file in parts_of(folder, name)]
+    parts = [file for name in (INGEST, MAP, CONDENSED) for file in parts_of(folder, name)]
     config = [folder / CONFIG] if os.path.lexists(folder / CONFIG) else []
     return {file.name: ends_of(file) if is_regular(file) else _NOT_A_FILE for file in (*parts, *config)}
 
@@ -224,7 +225,7 @@ def _parts(folder: Path) -> Iterator[tuple[str, int, int]]:
     """The parts of each recording of a saved run: their number then and now."""
     parts = summary_of(folder).get("parts")
     recorded: dict[str, Any] = parts if isinstance(parts, dict) else {}
-    for name in (INGEST, MAP):
+    for name in (INGEST, MAP, CONDENSED):
         if isinstance(then := recorded.get(name), int):
             yield name, then, len(parts_of(folder, name))
 

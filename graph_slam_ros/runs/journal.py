@@ -97,6 +97,7 @@ class Parts:
     def __init__(self, folder: Path, name: str, schema: str) -> None:
         self._folder, self._name, self._schema = folder, name, schema
         self._part = 0
+        self._replaces: int | None = None  # the present part takes the place of all but so many before
         self._present: RecordWriter | None = None
         self._ended: list[AppendedFile] = []
 
@@ -111,6 +112,31 @@ class Parts:
         if several:
             self.begin().write(several)
 
+    def begin_anew(self, kept: int = 0) -> None:
+        """Begin a part that takes the place of all parts before, once its first records are on the disk.
+
+        Parameters
+        ----------
+        kept : so many of the first parts stay. Raises OSError as ``end`` does if the present part is one of them
+        """
+        if self._part < kept:
+            self.end()
+        else:
+            for file in self._files():
+                file.abandon()
+            self._part += bool(self._present)
+            self._ended, self._present = [], None
+        self._replaces = kept
+
+    def _replace(self, kept: int) -> None:
+        """Remove the parts between the kept ones and the present one, which is on the disk, and let it follow them."""
+        if self._present is None:
+            return
+        if self._part > kept:
+            between = [self._folder / part_name(self._name, part) for part in range(kept + 1, self._part)]
+            self._present.file.replace(self._folder / part_name(self._name, kept), between)
+        self._part, self._replaces = kept, None
+
     @property
     def unwritten(self) -> int:
         """The number of bytes that are not in files yet."""
@@ -121,6 +147,8 @@ class Parts:
         close_all(self._ended)
         for file in self._files():
             file.flush()
+        if self._replaces is not None:
+            self._replace(self._replaces)
 
     def sync(self) -> None:
         """Sync to disk what was flushed. It may be called from another thread. Raises OSError."""
@@ -131,6 +159,8 @@ class Parts:
     def end(self) -> None:
         """End the present part, and begin the next with the next record. Raises OSError as ``flush`` does."""
         if self._present is not None:
+            if self._replaces is not None:
+                self.flush()
             self._ended.append(self._present.end())
             self._present = None
             self._part += 1

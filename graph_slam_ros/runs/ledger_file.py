@@ -7,7 +7,7 @@ import csv
 import io
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from enum import IntEnum
 from functools import cache
 from pathlib import Path
@@ -22,6 +22,8 @@ from graph_slam_ros.errors import ConfigError, FormatError
 from graph_slam_ros.formats.strict import integer, lines, numbers, stamp
 from graph_slam_ros.graph.losses import weight_and_cost
 from graph_slam_ros.graph.tables import EdgeTable
+from graph_slam_ros.runs.condensed_map import CONDENSED
+from graph_slam_ros.runs.journal import parts_of
 from graph_slam_ros.slam import GraphSlam
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict, VerdictChange
 from graph_slam_ros.typing import Index, Numbers
@@ -116,14 +118,17 @@ def ledger_text(slam: GraphSlam, ids: list[int]) -> str:
 
 def changes_text(slam: GraphSlam) -> str:
     """The history of all verdicts as a table."""
-    return _text(VerdictChange, slam.ledger.history)
+    number = slam.graph.edge_ids.of
+    return _text(VerdictChange, (replace(one, edge=number(one.edge)) for one in slam.ledger.history))
 
 
 def read_ledger(folder: Path) -> list[Entry]:
     """The entries of a run, by edge. Raises FormatError naming the line."""
-    entries = list[Entry]()
+    entries, is_condensed = list[Entry](), bool(parts_of(folder, CONDENSED))
     for line, entry in _read(Entry, folder / LEDGER):
-        fault = f"edge {entry.edge} where {len(entries)} is due" if entry.edge != len(entries) else _fault(entry)
+        due = entries[-1].edge + 1 if entries else 0
+        is_due = entry.edge >= due if is_condensed else entry.edge == due
+        fault = _fault(entry) if is_due else f"edge {entry.edge} where {due} is due"
         if fault:
             raise FormatError(f"{folder / LEDGER}:{line}: {fault}")
         entries.append(entry)
@@ -156,6 +161,7 @@ def ledger_entries(slam: GraphSlam, ids: Sequence[int]) -> Iterator[Entry]:
     """Each edge of the solver; ``ids`` are the numbers of its vertices in the file."""
     graph, ledger = slam.graph, slam.ledger
     stamps_ns: list[int] = slam.keyframes.stamps_ns.tolist()
+    lasting: list[int] = graph.edge_ids.of_all(np.arange(graph.edge_count)).tolist()
     judged = {change.edge: change.threshold for change in ledger.history}
     last_loss, count = cache(slam.solver.settings.last_loss), len(ledger)
     rows_of = {table.code: _rows(slam, table, np.asarray(ids, dtype=np.int64)) for table in graph.tables.values()}
@@ -166,18 +172,18 @@ def ledger_entries(slam: GraphSlam, ids: Sequence[int]) -> Iterator[Entry]:
     numbered = zip(*(column.tolist() for column in of_graph), *(c.values.tolist() for c in columns), strict=True)
     for edge, (code, row, now, keyframe, statistic, dof, threshold, verdict, reason) in enumerate(numbered):
         tag, rows = rows_of[code]
-        vertices, landmark, newest, measured, information, label_code, source_code, factor = rows[row]
+        vertices, landmark, newest_ns, measured, information, label_code, source_code, factor = rows[row]
         label, source = graph.labels[label_code], graph.sources[source_code]
         loss = last_loss(label, source)
         yield Entry(
-            edge,
+            lasting[edge],
             label,
             tag,
             source,
             landmark,
             vertices,
             keyframe,
-            Stamp(stamps_ns[newest if newest >= 0 else keyframe]),
+            Stamp(newest_ns or stamps_ns[max(keyframe - slam.first_keyframe, 0)]),
             measured,
             information,
             tuple(residuals[ends[edge] - dof : ends[edge]]),
@@ -193,8 +199,10 @@ def ledger_entries(slam: GraphSlam, ids: Sequence[int]) -> Iterator[Entry]:
 
 def _rows(slam: GraphSlam, table: EdgeTable, ids: Index) -> tuple[str, list[Any]]:
     """The tag of a table, and what an entry has of each row: all rows at once, as one by one is slow."""
-    keyframe_of, names = np.full(slam.graph.vertex_count, -1), [""] * slam.graph.vertex_count
-    keyframe_of[slam.keyframes.ids] = np.arange(len(slam.keyframes.ids))
+    stamp_of, names = np.zeros(slam.graph.vertex_count, dtype=np.int64), [""] * slam.graph.vertex_count
+    stamp_of[slam.keyframes.ids] = slam.keyframes.stamps_ns
+    for one in slam.bounded.old if slam.bounded else ():
+        stamp_of[one.vertex] = one.stamp_ns
     for name, mark in slam.landmarks.items():
         names[mark.vertex] = name
     vertices, roots = table.vertices.values, table.sqrt_information.values
@@ -202,7 +210,7 @@ def _rows(slam: GraphSlam, table: EdgeTable, ids: Index) -> tuple[str, list[Any]
     rows = zip(
         map(tuple, ids[vertices].tolist()),
         [next((names[v] for v in several if names[v]), "") for several in vertices.tolist()],
-        keyframe_of[vertices].max(axis=1).tolist(),
+        stamp_of[vertices].max(axis=1).tolist(),
         map(tuple, table.measured.values.tolist()),
         map(tuple, (roots.transpose(0, 2, 1) @ roots)[:, upper[0], upper[1]].tolist()),
         *(column.values.tolist() for column in (table.label, table.source, table.weight)),

@@ -28,7 +28,8 @@ def fault_of(state: MapSnapshot) -> str:
         if not (fits and is_instant(one.stamp_ns, one.T_odom_base)):
             return f"keyframe {k} is none"
     for k, seen in enumerate(state.sighting_poses):
-        if not (is_index(seen.keyframe, len(state.keyframes)) and is_instant(seen.stamp_ns, seen.T_keyframe_base)):
+        is_of_one = is_index(seen.keyframe, state.keyframe_count) and seen.keyframe >= state.first_keyframe
+        if not (is_of_one and is_instant(seen.stamp_ns, seen.T_keyframe_base)):
             return f"sighting {k} is none"
     for name, mark in state.landmarks.items():
         if not all(map(is_index, (mark.vertex, mark.sightings), (len(kinds), 2**31))):
@@ -41,7 +42,7 @@ def fault_of(state: MapSnapshot) -> str:
     for name, vertex in state.range_offsets.items():
         if not (is_index(vertex, len(kinds)) and kinds[vertex] is R1):
             return f"the offset of {name} is none"
-    if not all(is_index(one, len(state.keyframes)) for one in (*state.segments, *state.drives)):
+    if not all(is_index(one, state.keyframe_count) for one in (*state.segments, *state.drives)):
         return "a segment or a drive begins where no keyframe is"
     if not (state.used_ns is None or is_index(state.used_ns, 2**63)) or not isinstance(state.source, str):
         return "the odometry that was used last is none"

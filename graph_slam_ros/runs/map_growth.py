@@ -11,13 +11,14 @@ from graph_slam_ros.graph import Gaussian, Graph
 from graph_slam_ros.graph.vertices import R1, R2, R3, SE2, SE3
 from graph_slam_ros.measurements.edits import applied_edit
 from graph_slam_ros.measurements.types import Sighting
+from graph_slam_ros.runs.condensed_map import read_condensed
 from graph_slam_ros.runs.map_faults import is_index
 from graph_slam_ros.slam.calibration.recalibration import Recalibration, read_totals
 from graph_slam_ros.slam.frontend.gyro import SavedBias
 from graph_slam_ros.slam.frontend.keyframes import Keyframe, SightingPose
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
 from graph_slam_ros.slam.frontend.noise_factors import Rescaling, read_factors
-from graph_slam_ros.slam.landmarks.landmark_map import Landmark, LandmarkEdge
+from graph_slam_ros.slam.landmarks.landmark import Landmark, LandmarkEdge
 from graph_slam_ros.slam.robust.ledger import Ledger, Reason, Verdict
 from graph_slam_ros.slam.snapshot import MapSnapshot
 
@@ -25,7 +26,7 @@ Growth = Mapping[str, Any]
 
 AT_ONCE = 500
 """Records that are read at once."""
-_ALONE = frozenset(("rescaled", "recalibrated", "frozen", "held"))  # they are of all that was there before
+_ALONE = frozenset(("rescaled", "recalibrated", "frozen", "held", "condensed"))  # they are of all that was there before
 _KINDS = {kind.name: kind for kind in (SE2, SE3, R1, R2, R3)}
 _VERDICTS = {verdict.name.lower(): verdict for verdict in Verdict}
 _REASONS = {reason.name.lower(): reason for reason in Reason}
@@ -85,6 +86,8 @@ def grow(state: MapSnapshot, records: Sequence[Growth]) -> None:
     _judge(ledger, of_all("judged"))
     for edge, keyframe, verdict, reason, statistic, threshold in of_all("changes"):
         ledger.note(edge, keyframe, *_verdict(verdict, reason), float(statistic), float(threshold))
+    for one in (record["condensed"] for record in records if "condensed" in record):
+        state.first_keyframe, state.bounded = read_condensed(graph, one)
     state.keyframes += [Keyframe(vertex, stamp, tuple(pose)) for vertex, stamp, pose in of_all("keyframes")]
     state.segments += of_all("segments")
     state.drives += of_all("drives")

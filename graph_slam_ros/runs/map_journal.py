@@ -22,13 +22,15 @@ JSON records in mcap, as in the journal. The first is ``map`` with the version o
 * ``gyro``: its input, the bias about each axis and the variance of that, stamp of the newest odometry by then;
 * ``calibration``: corrections with those configured, ``[input, name, value]`` each; ``recalibrated``: edges of
   earlier records as they are by these: edge type, rows of its table, numbers measured, square roots of the information;
+* ``condensed``: first in a map from which visits were condensed, see ``condensed_map.py``;
 * ``frozen``: so many vertices, the first, stay where they are, and verdicts on so many edges as they are; ``held``: the
   same while ``map.localize`` is true, zeros when it ends; ``edits``: ``AppliedEdit.record`` of each edit by hand.
 
 Now and then an ``estimate`` tells all values, end to end. A run that goes on in another's map has that first, as one
 ``growth`` and one ``estimate``, up to a record ``start``. After a part of the drive was cut out, ``anew`` ends all
 before it, and a ``growth`` of the whole map follows. Programs of version 1 do not know ``anew``: a second ``map`` with
-version 2 stands before it, which they refuse.
+version 2 stands before it, which they refuse. So it is after visits were condensed, with version 3, in a part of its
+own that takes the place of all parts before.
 """
 
 import math
@@ -41,6 +43,7 @@ from graph_slam_ros.edge_tags import tag_of
 from graph_slam_ros.errors import FormatError, GraphSlamError
 from graph_slam_ros.graph import Graph
 from graph_slam_ros.measurements.types import sighting_record
+from graph_slam_ros.runs.condensed_map import condensed_record
 from graph_slam_ros.runs.journal import MAP, parts_of, read_records
 from graph_slam_ros.runs.map_faults import fault_of
 from graph_slam_ros.runs.map_growth import AT_ONCE, Growing, apply_verdicts, grow
@@ -48,13 +51,13 @@ from graph_slam_ros.slam import GraphSlam
 from graph_slam_ros.slam.calibration.recalibration import Totals, totals_record
 from graph_slam_ros.slam.frontend.gyro import SavedBias
 from graph_slam_ros.slam.frontend.noise_factors import Key, factors_record
-from graph_slam_ros.slam.landmarks.landmark_map import Landmark, LandmarkEdge
+from graph_slam_ros.slam.landmarks.landmark import Landmark, LandmarkEdge
 from graph_slam_ros.slam.robust.ledger import Ledger, Reason, Verdict, VerdictChange
 from graph_slam_ros.slam.snapshot import MapSnapshot
 
 GROWTH = "graph_slam_ros.Map"
-VERSION = 2
-_FIRST = 1  # what every program reads: a map from which nothing was cut out
+VERSION = 3
+_FIRST, _CUT = 1, 2  # what every program reads: a map from which nothing was cut out; and one from which something was
 _MORE = 1.1  # an estimate is written when there are so many times the keyframes: in total it stays linear
 _JUMP_M = 0.5  # or when a solve moved the newest that far, and there are a hundredth more
 
@@ -88,11 +91,17 @@ class MapGrowth:
         self._settings: dict[str, Any] = {}
         self._estimated = 0  # keyframes at the last estimate
 
-    def of(self, slam: GraphSlam) -> Iterator[Record]:
-        """The growth since the last call, and from time to time the whole estimate."""
-        if any(one.edit.do == "cut" for one in slam.edits[self._edits :]):
+    def of(self, slam: GraphSlam, *, is_anew: bool = False) -> Iterator[Record]:
+        """The growth since the last call, and from time to time the whole estimate.
+
+        Parameters
+        ----------
+        is_anew : whether a part of the map has left it, so that all ids are others
+        """
+        if is_anew or any(one.edit.do == "cut" for one in slam.edits[self._edits :]):
             self._begin()
-            yield from ({"type": "map", "version": VERSION}, {"type": "anew"})
+            version = _CUT if slam.bounded is None else VERSION
+            yield from ({"type": "map", "version": version}, {"type": "anew"})
         changed = {"settings": dict(slam.settings)} if slam.settings != self._settings else {}
         self._settings = dict(slam.settings)
         used = {"used": [slam.newest_odometry_ns, slam.odometry_source]} if slam.odometry_source else {}
@@ -111,7 +120,9 @@ class MapGrowth:
         out["edges"] = [_edge(graph, edge) for edge in range(first_edge, graph.edge_count)]
         out["judged"] = [_judgement(a.ledger, edge) for edge in range(self._judged, len(a.ledger))]
         out["changes"] = [_change(change) for change in a.ledger.history[self._changes :]]
-        keyframes = [a.keyframes[k] for k in range(self._keyframes, len(a.keyframes))]
+        if not self._keyframes and a.bounded is not None:
+            out["condensed"] = condensed_record(graph, a.first_keyframe, a.bounded)
+        keyframes = a.newer_keyframes(self._keyframes)
         out["keyframes"] = [[k.vertex, k.stamp_ns, k.T_odom_base] for k in keyframes]
         out["segments"] = a.segments[self._segments :]
         out["drives"] = a.drives[self._drives :]
@@ -146,7 +157,7 @@ class MapGrowth:
         if keyframes:
             out["stamp_ns"] = keyframes[-1].stamp_ns
         self._vertices, self._edges, self._judged = graph.vertex_count, graph.edge_count, len(a.ledger)
-        self._changes, self._keyframes, self._segments = len(a.ledger.history), len(a.keyframes), len(a.segments)
+        self._changes, self._keyframes, self._segments = len(a.ledger.history), a.keyframe_count, len(a.segments)
         self._sightings, self._offsets, self._frozen = len(a.sighting_poses), len(a.range_offsets), a.frozen
         self._drives, self._edits, self._landmarks = len(a.drives), len(a.edits), a.landmark_changes
         return {name: part for name, part in out.items() if part}
@@ -207,12 +218,18 @@ def _read(folder: Path, losses: list[str], at_once: int, *, start_only: bool) ->
     if fault := fault_of(state):
         raise FormatError(f"{file}: {fault}")
     apply_verdicts(state)
+    state.folder = folder
     return state
 
 
-def state_of(slam: GraphSlam) -> MapSnapshot:
-    """A copy of the map of a pipeline."""
-    state = MapSnapshot()
+def state_of(slam: GraphSlam, folder: Path | None = None) -> MapSnapshot:
+    """A copy of the map of a pipeline.
+
+    Parameters
+    ----------
+    folder : that has what was condensed
+    """
+    state = MapSnapshot(folder=folder)
     extend(state, MapGrowth().since(slam))
     state.values, state.settings = slam.solver.values, dict(slam.settings)
     state.used_ns, state.source = slam.newest_odometry_ns, slam.odometry_source

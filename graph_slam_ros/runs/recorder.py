@@ -16,6 +16,7 @@ from graph_slam_ros.formats.parameters import parameters_text
 from graph_slam_ros.measurements.types import Odometry, to_record
 from graph_slam_ros.messages import results
 from graph_slam_ros.recordings.bag import BagWriter
+from graph_slam_ros.runs.condensed_map import CONDENSED, LEFT, carried, left_records, read_left
 from graph_slam_ros.runs.folder import (
     CONFIG,
     MARK,
@@ -32,6 +33,7 @@ from graph_slam_ros.runs.load import Load
 from graph_slam_ros.runs.map_journal import GROWTH, MapGrowth
 from graph_slam_ros.runs.tables import counted, noise_summary, result_texts, summarize
 from graph_slam_ros.slam import Config, Counters, GraphSlam, Measurement, Update
+from graph_slam_ros.slam.bounded_map import Condensation
 from graph_slam_ros.slam.snapshot import MapSnapshot
 
 _PATH_GROWTH = 1.1  # the whole path is recorded again when it has grown by a tenth: its total stays linear
@@ -72,8 +74,9 @@ class RunRecorder:
         self._syncing: Future[None] | None = None
         self._journal = Parts(self.folder, INGEST, MEASUREMENT)
         self._map = Parts(self.folder, MAP, GROWTH)
+        self._left = Parts(self.folder, CONDENSED, LEFT)
         self._accepted: deque[Measurement] = deque()  # and not written yet
-        self._growth = MapGrowth(start)
+        self._growth, self._begins_in_a_map = MapGrowth(start), start is not None
         self._grown = self._growth.first
         self._bag: BagWriter | None = None
         self._bags = 0
@@ -86,6 +89,7 @@ class RunRecorder:
             self._journal.begin()
             self._journal.write([BEGINS_IN_A_MAP] if start is not None else [])
             self._journal.flush()
+            self._carry(start)
             _put(self.folder, CONFIG, parameters_text(config.as_mapping()))
         except KeyboardInterrupt:
             self.discard()
@@ -93,6 +97,13 @@ class RunRecorder:
         except OSError as error:
             self.abandon()
             raise RunError(f"{self.folder}: {error.strerror}") from None
+
+    def _carry(self, start: MapSnapshot | None) -> None:
+        """Take over what has left the map that the run goes on in."""
+        if start is not None and start.bounded is not None and start.folder is not None:
+            for record in carried(start.folder, start.bounded):
+                self._left.write([record])
+                self._left.flush()
 
     def accept(self, measurement: Measurement) -> None:
         """Add a measurement to the journal. It is kept in memory until ``flush`` or ``flush_in_background``."""
@@ -137,6 +148,7 @@ class RunRecorder:
                 return
             self._fill()
             self._journal.flush()
+            self._left.flush()
             self._map.flush()  # last: it is never ahead of what it came of
             if self._syncing is None or self._syncing.done():
                 synced, self._syncing = self._syncing, self._sync_if_due()
@@ -155,7 +167,7 @@ class RunRecorder:
     @property
     def unwritten(self) -> int:
         """The number of bytes of the journal that are not on the disk."""
-        return self._journal.unwritten + self._map.unwritten
+        return self._journal.unwritten + self._left.unwritten + self._map.unwritten
 
     def _sync_if_due(self) -> Future[None] | None:
         """Start to sync in the background, because the disk may be slow."""
@@ -173,6 +185,7 @@ class RunRecorder:
 
     def _sync(self) -> None:
         self._journal.sync()
+        self._left.sync()
         self._map.sync()
 
     def record(self, slam: GraphSlam, update: Update) -> None:
@@ -182,10 +195,14 @@ class RunRecorder:
         self._load.add(len(slam.keyframes), max(0, self.accepted - slam.processed))
         with self._writing:
             if not self._is_ended:
-                self._record(slam)
+                self._record(slam, update.condensed)
 
-    def _record(self, slam: GraphSlam) -> None:
-        self._grown += self._growth.of(slam)
+    def _record(self, slam: GraphSlam, condensed: Condensation | None) -> None:
+        if condensed is not None:
+            self._left.write(list(left_records(condensed)))
+            self._map.begin_anew(kept=int(self._begins_in_a_map))
+            self._grown = []
+        self._grown += self._growth.of(slam, is_anew=condensed is not None)
         stamp = slam.keyframes[-1].stamp_ns
         self._write("/tf", results.TF, stamp, results.map_to_odom(slam, stamp))
         self._write("/tf", results.TF, stamp, results.odom_to_base(slam))
@@ -218,7 +235,7 @@ class RunRecorder:
 
     def _ended_parts(self) -> dict[str, Any]:
         """The parts for the summary: their number, which grows if the run goes on, and their checksums."""
-        parts = {name: len(parts_of(self.folder, name)) for name in (INGEST, MAP)}
+        parts = {name: len(of) for name in (INGEST, MAP, CONDENSED) if (of := parts_of(self.folder, name))}
         return {"parts": parts, "recorded": recorded_files(self.folder)}
 
     def _refuse_if_ended(self) -> None:
@@ -277,6 +294,7 @@ class RunRecorder:
         if self._disk is not None:
             self._disk.shutdown(wait=False)
         self._journal.abandon()
+        self._left.abandon()
         self._map.abandon()
         for bag in self._ended_bags:
             bag.abandon()
@@ -302,6 +320,7 @@ class RunRecorder:
             self._ended_bags.append(self._bag.end())
             self._bag, self._bags = None, self._bags + 1
         self._journal.end()
+        self._left.end()
         self._map.end()
         close_all(self._ended_bags)
         if failed is not None:
@@ -332,7 +351,8 @@ def save_results(
         check()
         return _put(folder, name, text)
 
-    files = {name: put(name, text) for name, text in result_texts(slam).items()}
+    left = read_left(folder, slam.space, slam.bounded)
+    files = {name: put(name, text) for name, text in result_texts(slam, *left).items()}
     noise = {} if "noise" in summary else noise_summary(slam)
     contents = {"format": MARK} | summarize(slam) | summary | noise | {"format": MARK, "files": files}
     put(SUMMARY, json.dumps(contents, indent=2) + "\n")

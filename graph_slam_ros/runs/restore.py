@@ -28,6 +28,7 @@ from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.warmup import warmup
 
 Summary = dict[str, Any]
+_NOTHING_LEAVES = {"map.condense": False}  # what left while a map is made again would be in no file
 Stopwatch = Callable[[], dict[str, float]]
 
 
@@ -69,12 +70,13 @@ def config_of(folder: Path, state: MapSnapshot) -> Config:
 
 
 def _repeated(folder: Path, losses: list[str], counters: Counters) -> MapSnapshot:
-    slam = GraphSlam(run_config(folder), start=read_map(folder, [], start_only=True))  # its losses are known
+    config = run_config(folder).changed(_NOTHING_LEAVES)
+    slam = GraphSlam(config, start=read_map(folder, [], start_only=True))  # its losses are known
     for measurement in read_measurements(folder, losses):
         slam.process(measurement)
     slam.process(Control("end"))
     counters.raise_to(slam.counters)
-    return state_of(slam)
+    return state_of(slam, folder)
 
 
 def _with_rest(folder: Path, state: MapSnapshot, losses: list[str], counters: Counters) -> MapSnapshot:
@@ -86,19 +88,31 @@ def _with_rest(folder: Path, state: MapSnapshot, losses: list[str], counters: Co
         return state
     state.continues_with = state.source if state.used_ns is not None else ""
     settings = dict(state.settings)
-    slam = GraphSlam(config_of(folder, state), start=state)
+    slam = GraphSlam(config_of(folder, state).changed(_NOTHING_LEAVES), start=state)
     for measurement in [*rest, Control("end")]:
         slam.process(measurement)
     counters.update(slam.counters)
-    out = state_of(slam)
+    out = state_of(slam, folder)
     out.settings = settings | out.settings
     return out
 
 
-def restored(folder: Path, losses: list[str], counters: Counters | None = None) -> GraphSlam:
-    """The map of a run, solved; see ``map_of``."""
+def restored(
+    folder: Path, losses: list[str], counters: Counters | None = None, *, condensed: bool = False
+) -> GraphSlam:
+    """The map of a run, solved; see ``map_of``.
+
+    Parameters
+    ----------
+    condensed : whether a map with condensed visits will do; if not, it is refused
+    """
     lost = len(losses)
     state = map_of(folder, losses, counters)
+    if state.bounded is not None and not condensed:
+        raise RunError(
+            f"{folder}: visits of its map are condensed, and this needs all keyframes: "
+            f"graph_slam replay {folder} --out WHOLE --set map.condense=false makes them"
+        )
     losses[lost:] = [f"{folder}: {loss}" for loss in losses[lost:]]
     config = config_of(folder, state).changed({"map.localize": False})  # what is asked of a map is asked of all of it
     slam = GraphSlam(config, start=state)
@@ -106,9 +120,11 @@ def restored(folder: Path, losses: list[str], counters: Counters | None = None) 
     return slam
 
 
-def restored_and_solved(folder: Path, losses: list[str], counters: Counters | None = None) -> GraphSlam:
+def restored_and_solved(
+    folder: Path, losses: list[str], counters: Counters | None = None, *, condensed: bool = False
+) -> GraphSlam:
     """The same with all edges judged. Raises GraphSlamError also if it cannot be solved."""
-    slam = restored(folder, losses, counters)
+    slam = restored(folder, losses, counters, condensed=condensed)
     slam.process(Control("optimize"))
     if not slam.is_solved:
         raise RunError(f"{folder}: its map cannot be solved: {slam.failing}")
@@ -203,7 +219,7 @@ def complete(folder: Path) -> Summary:
     try:
         with claimed(folder):
             before, counters = summary_of(folder), Counters()
-            slam = restored_and_solved(folder, losses, counters)
+            slam = restored_and_solved(folder, losses, counters, condensed=True)
             summary = (
                 before | summarize(slam, counters) | took() | {"losses": losses, "ended": True, "is_incomplete": False}
             )
@@ -213,8 +229,12 @@ def complete(folder: Path) -> Summary:
     return summary
 
 
-def save_copy(slam: GraphSlam, out: Path) -> None:
+def save_copy(slam: GraphSlam, out: Path, folder: Path) -> None:
     """Write the map of a pipeline as a run of its own, which others can load. The pipeline goes on unchanged.
+
+    Parameters
+    ----------
+    folder : of its own run, which is saved
 
     Raises
     ------
@@ -228,7 +248,7 @@ def save_copy(slam: GraphSlam, out: Path) -> None:
     if not slam.is_solved:
         raise RunError(f"{out.name}: not written: the map cannot be solved: {slam.failing}")
     try:
-        record_run(out, slam.config, (), [], state_of(slam))
+        record_run(out, slam.config, (), [], state_of(slam, folder))
     except Exception:
         discard(out)
         raise
@@ -239,7 +259,7 @@ def freeze(folder: Path, out: Path, *, force: bool = False) -> Summary:
     took = stopwatch()
     check_room(out, folder, force=force)
     losses: list[str] = []
-    slam = restored_and_solved(folder, losses)
-    state = state_of(slam)
+    slam = restored_and_solved(folder, losses, condensed=True)
+    state = state_of(slam, folder)
     state.freeze()
     return record_run(out, slam.config, [Control("optimize")], losses, state, took=took, force=force)[1]

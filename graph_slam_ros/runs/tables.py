@@ -20,30 +20,55 @@ from graph_slam_ros.runs.ledger_file import CHANGES, LEDGER, changes_text, ledge
 from graph_slam_ros.slam import Counters, GraphSlam
 from graph_slam_ros.slam.calibration.decision import SIGMAS
 from graph_slam_ros.slam.calibration.parameters import QUANTITIES
+from graph_slam_ros.slam.lifelong.removed import Records, composed, seen_from
 from graph_slam_ros.slam.robust.gating import CANDIDATES
 from graph_slam_ros.slam.robust.ledger import INSIDE, Verdict
+from graph_slam_ros.typing import Array
 
 Name = TypeVar("Name")
 _TANGENT = {3: ("x", "y", "theta"), 6: ("x", "y", "z", "rx", "ry", "rz")}
 _POSE = {3: "x,y,theta", 6: "x,y,z,qx,qy,qz,qw"}
 
 
-def result_texts(slam: GraphSlam) -> dict[str, str]:
-    """All results except the summary, by file name."""
-    stamps = slam.sighting_poses.stamps_ns.tolist()
+def result_texts(slam: GraphSlam, keyframes: Records, sightings: Records) -> dict[str, str]:
+    """All results except the summary, by file name.
+
+    Parameters
+    ----------
+    keyframes, sightings : that have left the map
+    """
     ids, vertices = numbered(slam)
+    before = removed_path(slam, keyframes)
+    odometry = np.concatenate((keyframes["T_odom"], slam.keyframes.poses))
+    path = np.concatenate((before, slam.trajectory()))
+    seen = np.concatenate(
+        (seen_from(slam.space, sightings, before), slam.sighting_trajectory().reshape(-1, path.shape[1]))
+    )
+    seen_odometry = np.concatenate((sightings["T_odom"], slam.sighting_odometry().reshape(-1, path.shape[1])))
+    stamps = [*sightings["stamp_ns"].tolist(), *slam.sighting_poses.stamps_ns.tolist()]
+    stamps_ns = [*keyframes["stamp_ns"].tolist(), *slam.keyframes.stamps_ns.tolist()]
     return {
         GRAPH: g2o_text(graph_file(slam, ids), slam.solver.estimate),
         VERTICES: vertices,
         LEDGER: ledger_text(slam, ids),
         CHANGES: changes_text(slam),
-        PATH: tum_text(slam.keyframes.stamps_ns.tolist(), slam.trajectory()),
-        PATH_ODOMETRY: tum_text(slam.keyframes.stamps_ns.tolist(), slam.keyframes.poses),
-        COVARIANCES: _covariance_table(slam),
-        SIGHTINGS: tum_text(stamps, slam.sighting_trajectory()),
-        ODOMETRY: tum_text(stamps, slam.sighting_odometry()),
+        PATH: tum_text(stamps_ns, path),
+        PATH_ODOMETRY: tum_text(stamps_ns, odometry),
+        COVARIANCES: _covariance_table(slam, keyframes["stamp_ns"].tolist()),
+        SIGHTINGS: tum_text(stamps, seen),
+        ODOMETRY: tum_text(stamps, seen_odometry),
         LANDMARKS: _landmark_table(slam),
     }
+
+
+def removed_path(slam: GraphSlam, keyframes: Records) -> Array:
+    """Return the present poses of the keyframes that have left the map, (n, size)."""
+    if slam.bounded is None:
+        return np.empty((0, slam.space.pose.size))
+    vertices = np.array([*(one.vertex for one in slam.bounded.old), *slam.keyframes.ids.tolist()], dtype=np.int64)
+    order = np.argsort(vertices)
+    ids = slam.graph.vertex_ids.of_all(vertices[order])
+    return composed(slam.space, keyframes, ids, slam.solver.estimate(vertices[order]))
 
 
 def noise_summary(slam: GraphSlam) -> dict[str, Any]:
@@ -84,7 +109,7 @@ def summarize(slam: GraphSlam, earlier: Counters | None = None) -> dict[str, Any
             "classes": {name: asdict(share) for name, share in (last.classes if last else {}).items()},
             "rivals": [asdict(rival) for rival in slam.backend.rivals],
             "displacements": [asdict(alarm) | {"text": str(alarm)} for alarm in slam.alarms],
-            "span_s": (slam.keyframes[-1].stamp_ns - slam.keyframes[0].stamp_ns) * 1e-9 if slam.keyframes else 0.0,
+            "span_s": (slam.keyframes[-1].stamp_ns - slam.began_ns) * 1e-9 if slam.keyframes else 0.0,
         }
         | ({"gyro": asdict(gyro)} if (gyro := slam.gyro) else {})
         | ({"calibration": report} if (report := slam.calibration_report) else {})
@@ -125,7 +150,8 @@ def account(slam: GraphSlam, counters: Counters) -> dict[str, Any]:
     odometries = dict.fromkeys(slam.odometry_sources, "odometry")  # a source need not be an input
     used_as = odometries | recorded_uses(slam.config)
     is_of_map = not slam.counters.used  # nothing was measured since: a run that is written from its map
-    begins = 0 if is_of_map or not slam.drives else slam.keyframes[slam.drives[-1]].vertex
+    newest_drive = 0 if is_of_map or not slam.drives else slam.drives[-1]
+    begins = slam.keyframes[newest_drive].vertex if newest_drive > slam.first_keyframe else 0
     accepted = _accepted_by_input(slam, begins)
     inputs = {}
     for name in dict.fromkeys([*slam.config.inputs.names.split(), *counters.used, *accepted]):
@@ -186,8 +212,11 @@ def _accepted_by_input(slam: GraphSlam, first: int) -> dict[str, int]:
 
 def _drives(slam: GraphSlam) -> list[dict[str, int]]:
     """Return the first row of each drive in ``path.tum`` and in ``sightings.tum``, from 0."""
-    of = slam.sighting_poses.ids
-    return [{"keyframe": first, "sighting": int(np.sum(of < first))} for first in slam.drives]
+    of, before = slam.sighting_poses.ids, slam.bounded.sightings if slam.bounded else 0
+    return [
+        {"keyframe": first, "sighting": before + int(np.sum(of < first)) if first >= slam.first_keyframe else 0}
+        for first in slam.drives
+    ]
 
 
 def numbered(slam: GraphSlam) -> tuple[list[int], str]:
@@ -197,17 +226,20 @@ def numbered(slam: GraphSlam) -> tuple[list[int], str]:
     A vertex that is not part of the map any more is ``unused``: a cut keyframe, a deleted landmark. Any other one is an
     offset that the ranges of a sensor share.
     """
-    names: list[tuple[int, str, int | str, str]] = []
-    for k, keyframe in enumerate(slam.keyframes):
-        names.append((keyframe.vertex, "keyframe", keyframe.stamp_ns, str(k)))
-    for name, landmark in slam.landmarks.items():
-        names.append((landmark.vertex, "landmark", "", name))
-    named = {vertex for vertex, *_ in names}
+    names: list[tuple[int, int, str, int | str, str]] = []
+    for one in slam.bounded.old if slam.bounded else ():
+        names.append((one.number, one.vertex, "keyframe", one.stamp_ns, str(one.number)))
+    for k, keyframe in enumerate(slam.keyframes, start=slam.first_keyframe):
+        names.append((k, keyframe.vertex, "keyframe", keyframe.stamp_ns, str(k)))
+    for k, (name, landmark) in enumerate(slam.landmarks.items(), start=len(slam.keyframes)):
+        names.append((k, landmark.vertex, "landmark", "", name))
+    named = {vertex for _, vertex, *_ in names}
     offsets, rest = set(slam.range_offsets.values()), sorted(set(range(slam.graph.vertex_count)) - named)
-    names += [(vertex, "offset" if vertex in offsets else "unused", "", "") for vertex in rest]
+    more = enumerate(rest, start=len(slam.keyframes) + len(slam.landmarks))
+    names += [(k, vertex, "offset" if vertex in offsets else "unused", "", "") for k, vertex in more]
     ids = [0] * slam.graph.vertex_count
     rows = ["id,vertex,stamp_ns,name"]
-    for file_id, (vertex, what, stamp, name) in enumerate(names):
+    for file_id, vertex, what, stamp, name in names:
         ids[vertex] = file_id
         rows.append(f"{file_id},{what},{stamp},{_csv(name)}")
     return ids, "\n".join(rows) + "\n"
@@ -216,13 +248,17 @@ def numbered(slam: GraphSlam) -> tuple[list[int], str]:
 def graph_file(slam: GraphSlam, ids: list[int]) -> G2oFile:
     """The graph, with the vertices of a frozen map fixed, and without those that are not part of the map any more."""
     named = {*slam.keyframes.ids.tolist(), *(mark.vertex for mark in slam.landmarks.values())}
+    named |= {one.vertex for one in slam.bounded.old} if slam.bounded else set()
     absent = frozenset(range(slam.graph.vertex_count)) - named - set(slam.range_offsets.values())
     return G2oFile(slam.graph, ids, slam.solver.held.tolist(), absent=absent)
 
 
-def _covariance_table(slam: GraphSlam) -> str:
+def _covariance_table(slam: GraphSlam, before_ns: Sequence[int]) -> str:
+    """The covariances of all keyframes; of those that have left the map, with these stamps, nothing is known."""
     dof = slam.config.space.dof
+    unknown = ",".join(["nan"] * (dof * (dof + 1) // 2))
     rows = [f"stamp_ns,{','.join(f'tangent_{a}{b}' for a, b in _upper(_TANGENT[dof]))}"]
+    rows += [f"{stamp_ns},{unknown}" for stamp_ns in before_ns]
     for stamp_ns, covariance in zip(slam.keyframes.stamps_ns, slam.keyframe_covariances(), strict=True):
         rows.append(f"{stamp_ns},{','.join(map(repr, covariance[np.triu_indices(dof)].tolist()))}")
     return "\n".join(rows) + "\n"

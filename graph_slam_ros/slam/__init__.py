@@ -15,7 +15,7 @@ from graph_slam_ros.measurements.types import (
 )
 from graph_slam_ros.slam.frontend.keyframes import Keyframe
 from graph_slam_ros.slam.graph_slam import GraphSlam
-from graph_slam_ros.slam.landmarks.landmark_map import Landmark
+from graph_slam_ros.slam.landmarks.landmark import Landmark
 from graph_slam_ros.slam.update import Update
 
 __all__ = [

@@ -14,6 +14,7 @@ from graph_slam_ros.slam.frontend.keyframes import Keyframe, KeyframeList
 from graph_slam_ros.slam.frontend.noise_factors import NoiseScales
 from graph_slam_ros.slam.frontend.sighting_edges import SightingEdges
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
+from graph_slam_ros.slam.lifelong.state import BoundedState
 from graph_slam_ros.slam.noise_scale import NoiseScale, estimate_noise, factors_of
 from graph_slam_ros.slam.robust.admission import Admission
 from graph_slam_ros.slam.robust.background import Background, Work, run_when_asked
@@ -24,7 +25,7 @@ from graph_slam_ros.slam.robust.ledger import FINAL, Ledger, Reason
 from graph_slam_ros.slam.robust.odometry_judge import OdometryJudge
 from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.solver import Report, Settings, Solver
-from graph_slam_ros.typing import Array, Executor, Numbers
+from graph_slam_ros.typing import Array, Executor, Index, Numbers
 
 _MAX_PENDING = 200  # edges that are compared with all that is known at once, at most; reviews look at the others
 _NOISE_ROUNDS, _NOISE_ROUNDS_ONLINE = 8, 2  # of estimating the scale of the noise and solving with it
@@ -51,6 +52,7 @@ class Backend:
     trusts_sightings : whether a new sighting that fits is believed; else it waits until it is compared with all else
     rivals : other explanations of the same measurements that the last second look could not rule out
     edits : by hand, in order
+    bounded : what has been condensed
     """
 
     def __init__(
@@ -71,7 +73,7 @@ class Backend:
         self.handed_over, self.frozen = (0, 0), start.frozen
         self.frozen_edges = start.ledger.final
         self.held = (0, 0)
-        self.edits = list(start.edits)
+        self.edits, self.bounded = list(start.edits), start.bounded or BoundedState()
         self.odometries = OdometryJudge(config.odometry_gate, self.graph, self.solver, self.ledger, self._counters)
         self._background = Background(config, executor)
         self.rivals: tuple[Alternative, ...] = ()
@@ -243,10 +245,32 @@ class Backend:
         """
         graph, solver, out = self.graph.copy(), self.solver, self.ledger.outside
         graph.set_weights(out[graph.has_label(out, ("landmarks",))], 1.0)
-        keyframes = path.keyframes.ids.copy(), path.keyframes.stamps_ns.copy(), tuple(path.segments)
+        rows, begins = path.keyframes, [max(k - path.keyframes.first, 0) for k in path.segments]
+        keyframes = rows.ids.copy(), rows.stamps_ns.copy(), tuple(dict.fromkeys(begins))
         problem = solver.vertices, solver.held, solver.values, settings or solver.settings
         track = path.samples.track(path.keyframes.poses, factors)
         return TrialProblem(space, graph, *problem, origins.copy(), *keyframes, track, self._first_free_edge)
+
+    @property
+    def is_quiet(self) -> bool:
+        """Return whether every edge was judged and solved, and nothing that could change a verdict goes on."""
+        graph, count = self.graph, (self.graph.vertex_count, self.graph.edge_count)
+        is_judged = self.handed_over == count and len(self.ledger) == graph.edge_count and not self._pending
+        return is_judged and not (self.holds_back or self.held[0] or self._background.is_busy)
+
+    def hand_over_condensed(self, keyframe: int) -> None:
+        """Note edges that the solver has already: nobody doubts them."""
+        self.handed_over = self.graph.vertex_count, self.graph.edge_count
+        self.decisions.gate_new(self.handed_over[1], keyframe)
+
+    def renumber(self, new: Index) -> None:
+        """Take over new ids of edges, by old ones, after graph and solver were compacted."""
+        self.decisions.renumber(new)
+        self.frozen_edges = self.ledger.final
+        self.odometries.forget()
+        self.handed_over = self.graph.vertex_count, self.graph.edge_count
+        self.rivals = ()
+        self._background.cancel(self.ledger.outside_count)
 
     def cancel_search(self) -> None:
         """Cancel a running search, because everything was reviewed."""

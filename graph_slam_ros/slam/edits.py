@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from graph_slam_ros.slam.robust.landmark_support import landmark_of
 from graph_slam_ros.slam.robust.ledger import Reason
 
 SOURCE = "edit"
+_OF_ONE_EDGE = ("remove_edge", "let_in_edge")
 _EDIT = re.compile(r"\s*(edge|landmark)\s+(\S.{0,127}?)\s*", re.DOTALL)
 _ID = re.compile(r"\d{1,18}", re.ASCII)
 
@@ -94,6 +95,8 @@ class Edits:
             raise GraphSlamError(f"edit {edit.name}: the map has an edit of that name already")
         if not self._frontend.path.keyframes:
             raise GraphSlamError(f"edit {edit.name}: there is no map yet")
+        if self._frontend.path.keyframes.first and edit.do not in _OF_ONE_EDGE:
+            raise GraphSlamError(f"edit {edit.name}: {self._tools.refusal('condensed_in_map')}")
         backend.gate_new(keyframe)
         edges, changes = backend.graph.edge_count, len(backend.ledger.history)
         try:
@@ -105,17 +108,18 @@ class Edits:
             raise GraphSlamError(f"edit {name}: {error}") from None
         decided = [one.edge for one in backend.ledger.history[changes:] if one.reason is Reason.BY_HAND]
         out = tuple(edge for edge in dict.fromkeys(decided) if edge < edges)
-        added = tuple(range(edges, backend.graph.edge_count))
-        backend.edits.append(AppliedEdit(edit, len(self._frontend.path.keyframes) - 1, out, added))
+        added, number = range(edges, backend.graph.edge_count), backend.graph.edge_ids.of
+        ids = (tuple(map(number, some)) for some in (out, added))
+        backend.edits.append(AppliedEdit(edit, len(self._frontend.path.keyframes) - 1, *ids))
         self._landmarks.aliases = aliases(backend.edits)
 
     def _apply(self, do: str, a: dict[str, Any], keyframe: int) -> None:
         marks, path = self._of_landmarks, self._of_path
         match do:
             case "remove_edge":
-                self._remove_edge(a["edge"], keyframe, Reason.BY_HAND)
+                self._remove_edge(self._row(a["edge"]), keyframe, Reason.BY_HAND)
             case "let_in_edge":
-                self._include_by_hand(a["edge"], keyframe)
+                self._include_by_hand(self._row(a["edge"]), keyframe)
             case "add_closure":
                 ends = path.at(a["from_keyframe"]), path.at(a["to_keyframe"])
                 path.add_closure(ends, a["pose"], (a["sigma_m"], a["sigma_rad"]), keyframe)
@@ -139,7 +143,9 @@ class Edits:
         """Remove what a control event names, an edge or a landmark; returns whether it was there."""
         try:
             if "edge" in what:
-                self._remove_edge(int(str(what["edge"])), keyframe, Reason.WITHDRAWN)
+                self._remove_edge(self._row(int(str(what["edge"]))), keyframe, Reason.WITHDRAWN)
+            elif self._frontend.path.keyframes.first:
+                self._refuse("condensed_in_map")
             else:
                 self._of_landmarks.remove(str(what["landmark"]), keyframe, Reason.WITHDRAWN)
         except GraphSlamError:  # it is counted
@@ -155,6 +161,13 @@ class Edits:
         if closures:
             self._counters.count("closures", "cleared", len(closures))
         return bool(closures)
+
+    def _row(self, lasting: int) -> int:
+        """The edge of the graph that has a lasting id."""
+        row = self._backend.graph.edge_ids.find(lasting) if lasting >= 0 else lasting
+        if row is None:
+            self._refuse("condensed_in_map")
+        return row
 
     def _remove_edge(self, edge: int, keyframe: int, reason: Reason) -> None:
         """Remove a loop closure, a fix or an observation of a landmark, by its id.
@@ -197,5 +210,5 @@ class Edits:
     def _name_of(self, vertex: int) -> str:
         return next((name for name, mark in self._landmarks.known.items() if mark.vertex == vertex), "")
 
-    def _refuse(self, reason: str) -> None:
+    def _refuse(self, reason: str) -> NoReturn:
         raise GraphSlamError(self._tools.refusal(reason))

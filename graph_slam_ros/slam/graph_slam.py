@@ -28,6 +28,7 @@ from graph_slam_ros.measurements.types import (
 from graph_slam_ros.plugin_edges import failed_edges
 from graph_slam_ros.slam.anchor import Anchor
 from graph_slam_ros.slam.backend import Backend
+from graph_slam_ros.slam.bounded_map import BoundedMap
 from graph_slam_ros.slam.calibrator import Calibrator
 from graph_slam_ros.slam.custom_edges import CustomEdges
 from graph_slam_ros.slam.edits import Edits
@@ -72,8 +73,7 @@ class GraphSlam(MapView):
         executor: Executor = run_when_asked,
         start: MapSnapshot | None = None,
     ) -> None:
-        config = config or Config()
-        self.counters = counters = Counters()
+        config, self.counters = config or Config(), (counters := Counters())
         backend = Backend(config.robust, config.solver_settings(), executor, start, counters)
         landmarks = LandmarkFrontend(
             *(config, backend.noise, backend.solver, counters, backend.ledger),
@@ -97,7 +97,8 @@ class GraphSlam(MapView):
                 self._restore(start)
             if self._custom.withdraw(failed.values(), len(self.keyframes) - 1):
                 self._solve(self.config.solver_settings())
-        self._updates = UpdateLog(self)
+        bounded = BoundedMap(backend, frontend, landmarks, self._anchor, kidnaps, solution, counters)
+        self._updates = UpdateLog(self, bounded)
 
     @property
     def processed(self) -> int:
@@ -288,7 +289,7 @@ class GraphSlam(MapView):
         frontend, localizes = self._frontend, self.config.map.localize
         if self.graph.kind_of(start.keyframes[0].vertex) is not self.space.pose:
             raise GraphSlamError(f"the map is not in {self.space.dimensions} dimensions")
-        frontend.restore(*start.path, start.continues_with, start.gyro_bias)
+        frontend.restore(*start.path, start.continues_with, start.gyro_bias, start.first_keyframe)
         self._anchor.restore()
         self._landmarks.restore(start.landmarks, start.range_offsets, start.passes)
         report = self.backend.restore(start.vertices, start.values, start.held if localizes else (0, 0))

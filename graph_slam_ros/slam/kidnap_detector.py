@@ -8,11 +8,11 @@ begins there, at the pose that the landmarks show, and the path before it stays 
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.graph import Gaussian
 from graph_slam_ros.measurements.counters import Counters
+from graph_slam_ros.slam.alarm import Alarm
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.frontend.keyframes import Keyframe
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
@@ -33,55 +33,8 @@ _DECIDED_LANDMARKS, _DECIDED_KEYFRAMES = 3, 4  # two landmarks with headings tel
 _TRIED = 5  # sightings that are compared with odometry's noise
 _MOST = 0.8  # part of the sightings since then that fit the other pose
 _DRIFT = 3.0  # sigmas
+_REMEMBERED = 64  # keyframes that are compared again after a compaction
 _CALM_S = 5.0  # after the decision the alarm goes on for so long at least
-
-
-@dataclass(frozen=True, slots=True)
-class Alarm:
-    """A time when the landmarks said that the robot was elsewhere than odometry.
-
-    Attributes
-    ----------
-    began_ns, ended_ns : stamps of odometry; None while it goes on
-    evidence : sightings more for another pose than for odometry's, at most; 0 where none was found
-    segment : the keyframe, by its index, at which a segment begins since it was decided so; None where it was not
-    distance_m, angle_rad : how far the robot was moved there, against odometry
-    held_back, tested : when it began, of the newest sightings how many were held back, and all
-    determines_pose : whether what is held back can tell a pose; ranges and bearings alone do not
-    outcome : what came of it otherwise: it ended undecided since a segment began, or what was decided was taken back
-    """
-
-    began_ns: int
-    evidence: int
-    ended_ns: int | None = None
-    segment: int | None = None
-    distance_m: float = 0.0
-    angle_rad: float = 0.0
-    held_back: int = 0
-    tested: int = 0
-    determines_pose: bool = True
-    outcome: str = ""
-
-    def __str__(self) -> str:
-        at = f"{self.began_ns * 1e-9:.1f} s"
-        if self.segment is not None:
-            moved = f"{self.distance_m:.2f} m and {np.rad2deg(self.angle_rad):.1f} degrees"
-            return (
-                f"the landmarks said at {at} that the robot is elsewhere, {moved} from where odometry had it: "
-                f"a segment begins at keyframe {self.segment}{self.outcome and '; '}{self.outcome}"
-            )
-        why = f"{self.evidence} sightings more than not"
-        if not self.evidence:
-            why = f"{self.held_back} of the last {self.tested} sightings contradict odometry"
-            why = why if self.held_back else "what should be seen there is not"
-        if self.ended_ns is None:
-            remedy = (
-                "" if self.determines_pose else "; ranges or bearings alone do not determine the pose: give initialpose"
-            )
-            return f"the landmarks say since {at} that the robot is elsewhere ({why}){remedy}"
-        until = f"{self.ended_ns * 1e-9:.1f} s"
-        outcome = self.outcome or "it was not so"
-        return f"from {at} to {until} the landmarks said that the robot is elsewhere ({why}); {outcome}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,19 +83,50 @@ class KidnapDetector:
         segments: list[int],
         anonymous: AnonymousLandmarks,
     ) -> None:
-        space, odometry = config.space, config.odometry
-        self._space, self._odometry, self._backend, self._counters = space, odometry, backend, counters
-        self._segments = segments
+        self._space, self._odometry, self._backend, self._counters = config.space, config.odometry, backend, counters
+        self._segments, self._anonymous = segments, anonymous
+        self.alarms: list[Alarm] = []
+        self._begin()
+
+    def _begin(self) -> None:
+        """Begin with what is in the graph, and nothing seen lately."""
+        backend, space = self._backend, self._space
         graph, solver = backend.graph, backend.solver
         self._history = LandmarkHistory(graph, backend.ledger)
         self._search = DisplacementSearch(space, graph, solver, backend.ledger, self._history)
         self._monitor = InnovationMonitor(solver, backend.decisions, self._history)
-        self._slips = SlipDetector(space, odometry, backend, counters, self._history, anonymous.doubt)
-        self._anonymous = anonymous
+        doubt = self._anonymous.doubt
+        self._slips = SlipDetector(space, self._odometry, backend, self._counters, self._history, doubt)
         self._next = graph.edge_count
         self._splits: list[_Split] = []  # of the present frame of odometry
         self._refuted: list[Numbers] = []  # where that frame does not lie: it was decided and taken back
-        self.alarms: list[Alarm] = []
+
+    @property
+    def is_quiet(self) -> bool:
+        """Return whether no alarm goes on."""
+        return self.now is None and self.slips_now is None
+
+    def begin_anew(self, keyframes: StampedPoses[Keyframe]) -> None:
+        """Begin anew after the graph was compacted, with the newest keyframes and what was seen from them."""
+        slips = self._slips.slips
+        self._begin()
+        self._slips.slips[:] = slips
+        newest = keyframes.since(max(keyframes.first, len(keyframes) - _REMEMBERED))
+        begins = [k for k in self._segments if k >= newest.first]
+        first = int(newest.ids[begins[-1] - newest.first if begins else 0])
+        self._history.begin_at(int(keyframes.ids[0]))
+        self._search.begin(first)
+        stamps_ns = dict(zip(newest.ids.tolist(), newest.stamps_ns.tolist(), strict=True))
+        graph = self._backend.graph
+        for edge in np.union1d(graph.edges_of("surveyed"), graph.edges_since(int(keyframes.ids[0]))).tolist():
+            one = graph.edge(edge)
+            at = max((vertex for vertex in one.vertices if vertex in stamps_ns), default=-1)
+            if one.label == "surveyed":
+                self._history.add_survey(one.vertices[0])
+            elif one.label == "landmarks" and at < first:
+                self._history.add(edge, *one.vertices[:2])
+            elif at >= first and (one.label != "odometry" or (one.weight and min(one.vertices) >= first)):
+                self._add(edge, stamps_ns[at], newest)
 
     @property
     def slips(self) -> list[Slip]:
@@ -172,29 +156,31 @@ class KidnapDetector:
 
     def add(self, count: int, stamp_ns: int, keyframes: StampedPoses[Keyframe]) -> None:
         """Note the edges that are new, up to a count, in order, at the stamp of the newest odometry."""
-        graph, search = self._backend.graph, self._search
         edges, self._next = range(self._next, count), count
         for edge in edges:
-            one = graph.edge(edge)
-            vertices = one.vertices
-            match one.label:
-                case "odometry":
-                    search.add_odometry(edge, vertices, tuple(one.measured.tolist()), stamp_ns)
-                    first, last = keyframes.stamps_ns[np.searchsorted(keyframes.ids, vertices)].tolist()
-                    self._slips.add_odometry(edge, vertices, (first, last), len(keyframes) - 1)
-                case "initialpose":
-                    search.add_initial_pose(edge, vertices[0])
-                case "surveyed":
-                    self._history.add_survey(vertices[0])
-                case "landmarks":
-                    self._history.add(edge, vertices[0], vertices[1])
-                    search.add_sighting(edge, vertices[0], vertices[1])
-                    self._monitor.add(edge, vertices[0], vertices[1], stamp_ns)
-                    self._slips.add_seen(edge, vertices[0], vertices[1])
-                case "fixes":
-                    self._slips.add_seen(edge, vertices[0], one.label)
-                case "closures":
-                    self._slips.add_seen(edge, max(vertices), one.label)
+            self._add(edge, stamp_ns, keyframes)
+
+    def _add(self, edge: int, stamp_ns: int, keyframes: StampedPoses[Keyframe]) -> None:
+        one, search = self._backend.graph.edge(edge), self._search
+        vertices = one.vertices
+        match one.label:
+            case "odometry":
+                search.add_odometry(edge, vertices, tuple(one.measured.tolist()), stamp_ns)
+                first, last = keyframes.stamps_ns[np.searchsorted(keyframes.ids, vertices)].tolist()
+                self._slips.add_odometry(edge, vertices, (first, last), len(keyframes) - 1)
+            case "initialpose":
+                search.add_initial_pose(edge, vertices[0])
+            case "surveyed":
+                self._history.add_survey(vertices[0])
+            case "landmarks":
+                self._history.add(edge, vertices[0], vertices[1])
+                search.add_sighting(edge, vertices[0], vertices[1])
+                self._monitor.add(edge, vertices[0], vertices[1], stamp_ns)
+                self._slips.add_seen(edge, vertices[0], vertices[1])
+            case "fixes":
+                self._slips.add_seen(edge, vertices[0], one.label)
+            case "closures":
+                self._slips.add_seen(edge, max(vertices), one.label)
 
     def check(self, keyframes: StampedPoses[Keyframe], stamp_ns: int, *, doubts: bool = True) -> None:
         """Look at the evidence after a solve.
@@ -216,9 +202,9 @@ class KidnapDetector:
         if found is not None and is_decided:
             last = self._splits[-1] if self._splits else None
             if last and self._is_refuted(last, found, int(vertices[-1])):
-                self._revoke(last, found, vertices, stamp_ns)
+                self._revoke(last, found, len(keyframes) - 1, stamp_ns)
             else:
-                self._decide(found, vertices, stamp_ns)
+                self._decide(found, keyframes, stamp_ns)
             found = None
         self._note(found, stamp_ns)
         self._protect()
@@ -298,9 +284,9 @@ class KidnapDetector:
             return False
         return self._monitor.is_calm
 
-    def _decide(self, found: DisplacementHypothesis, vertices: NDArray[np.int64], stamp_ns: int) -> None:
+    def _decide(self, found: DisplacementHypothesis, keyframes: StampedPoses[Keyframe], stamp_ns: int) -> None:
         """Begin a segment where the landmarks say that the robot is."""
-        index = int(np.searchsorted(vertices, found.first))
+        index = keyframes.first + int(np.searchsorted(keyframes.ids, found.first))
         group, before = self._space.group, self._estimate(found.first)
         there = group.compose(found.T_map_chain, self._search.chain(found.first))
         moved = group.between(before, there)
@@ -313,7 +299,7 @@ class KidnapDetector:
             self._search.initial_poses(found.first),
             self._moved(self._motions(found)),
             found,
-            len(vertices) - 1,
+            len(keyframes) - 1,
         )
         self._counters.count("odometry", "displaced")
         is_new = index not in self._segments  # where a pose was given, one begins already
@@ -344,12 +330,12 @@ class KidnapDetector:
             )
         )
 
-    def _revoke(self, split: _Split, found: DisplacementHypothesis, vertices: NDArray[np.int64], stamp_ns: int) -> None:
+    def _revoke(self, split: _Split, found: DisplacementHypothesis, keyframe: int, stamp_ns: int) -> None:
         """Believe odometry again where the last segment begins: the landmarks show that it was right."""
         group = self._space.group
         back = group.compose(split.T_map_chain_before, group.inverse(split.T_map_chain))
         values = self._moved({split.first: back})
-        self._backend.rejoin(split.link, split.replacement, values, found, len(vertices) - 1)
+        self._backend.rejoin(split.link, split.replacement, values, found, keyframe)
         self._counters.count("odometry", "displacement_taken_back")
         if split.index is not None:
             self._segments.remove(split.index)

@@ -8,7 +8,7 @@ import numpy as np
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.slam.edit_tools import EditTools
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
-from graph_slam_ros.slam.landmarks.landmark_map import Landmark
+from graph_slam_ros.slam.landmarks.landmark import Landmark
 from graph_slam_ros.slam.robust.ledger import INSIDE, Reason
 
 

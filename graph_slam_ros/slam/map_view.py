@@ -6,9 +6,8 @@ from typing import Any
 import numpy as np
 
 from graph_slam_ros.config.config import Config
-from graph_slam_ros.graph import Graph
-from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.measurements.edits import AppliedEdit
+from graph_slam_ros.slam.alarm import Alarm
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.calibration.choice import parameters_of
 from graph_slam_ros.slam.calibration.decision import Finding, decide
@@ -18,23 +17,22 @@ from graph_slam_ros.slam.calibration.recalibration import Recalibration
 from graph_slam_ros.slam.calibrator import Calibrator
 from graph_slam_ros.slam.frontend.gyro import GyroState, SavedBias
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
-from graph_slam_ros.slam.frontend.keyframes import Keyframe, SightingPose
 from graph_slam_ros.slam.frontend.noise_factors import Key, Rescaling
 from graph_slam_ros.slam.frontend.sighting_edges import SightingEdges
-from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
-from graph_slam_ros.slam.kidnap_detector import Alarm, KidnapDetector
+from graph_slam_ros.slam.kidnap_detector import KidnapDetector
+from graph_slam_ros.slam.landmarks.landmark import Landmark
 from graph_slam_ros.slam.landmarks.landmark_frontend import LandmarkFrontend
-from graph_slam_ros.slam.landmarks.landmark_map import Landmark
 from graph_slam_ros.slam.landmarks.lifetimes import LandmarkEvent
 from graph_slam_ros.slam.noise_scale import NoiseScale
+from graph_slam_ros.slam.path_view import PathView
 from graph_slam_ros.slam.robust.ledger import Ledger
 from graph_slam_ros.slam.slip_review import Slip
 from graph_slam_ros.slam.solution import Correction, Solution
-from graph_slam_ros.solver import Report, Solver
-from graph_slam_ros.typing import Array, Index, Numbers
+from graph_slam_ros.solver import Report
+from graph_slam_ros.typing import Array, Numbers
 
 
-class MapView:
+class MapView(PathView):
     """The map, the path and the health of a pipeline, read from its parts.
 
     Attributes
@@ -62,73 +60,7 @@ class MapView:
         counts = f"{len(self.keyframes)} keyframes, {len(self.landmarks)} landmarks, {self.graph.edge_count} edges"
         return f"{type(self).__name__}({counts}, {self.solves} solves)"
 
-    @property
-    def space(self) -> Geometry:
-        """The plane or space."""
-        return self.config.space
-
-    # -- the path ------------------------------------------------------------------------------------------------
-
-    @property
-    def keyframes(self) -> StampedPoses[Keyframe]:
-        """The keyframes, in order of time."""
-        return self._frontend.path.keyframes
-
-    @property
-    def segments(self) -> list[int]:
-        """The indices of the keyframes at which a segment begins: odometry started there, or jumped."""
-        return self._frontend.path.segments
-
-    @property
-    def drives(self) -> list[int]:
-        """The index of the first keyframe of each drive; the last drive is the present one."""
-        return self._frontend.path.drives
-
-    @property
-    def sighting_poses(self) -> StampedPoses[SightingPose]:
-        """The poses at the stamps of the sightings, each relative to a keyframe."""
-        return self._frontend.sighting_poses
-
-    def trajectory(self) -> Array:
-        """Estimated poses ``T_map_base`` of all keyframes, (n, 3) or (n, 7)."""
-        return self.solver.estimate(self.keyframes.ids).reshape(-1, self.space.pose.size)
-
-    def sighting_trajectory(self) -> Array:
-        """Estimated poses ``T_map_base`` at the stamps of the sightings, (n, 3) or (n, 7).
-
-        The correction of odometry between two keyframes is spread evenly over the time between them.
-        """
-        poses, group = self.trajectory(), self.space.group
-        found, stamps_ns = self._at_sightings(poses), self.keyframes.stamps_ns
-        since_ns = self.sighting_poses.stamps_ns - stamps_ns[self.sighting_poses.ids]
-        ends = np.isin(self.sighting_poses.ids + 1, [*self.segments, len(self.keyframes)])
-        a = self.sighting_poses.ids[~ends]
-        motion = self._motions(a)
-        wrong = group.local(tuple(poses[a + 1].T), group.compose(tuple(poses[a].T), motion))
-        part = np.minimum(since_ns[~ends] / np.maximum(stamps_ns[a + 1] - stamps_ns[a], 1), 1.0)
-        found[~ends] = np.stack(group.retract(tuple(found[~ends].T), tuple(part * d for d in wrong)), axis=-1)
-        return found
-
-    def _motions(self, keyframes: Index) -> Numbers:
-        """The motion from each of some keyframes to the next as measured, in arrays."""
-        odometry, group = self.keyframes.poses, self.space.group
-        motion: Numbers = group.between(tuple(odometry[keyframes].T), tuple(odometry[keyframes + 1].T))
-        if self._frontend.gyro is None:
-            return self._frontend.corrections.motion(motion)
-        out, ids = np.stack(motion, axis=-1), self.keyframes.ids
-        edges = map(self.graph.edge, self.graph.edges_of("odometry").tolist())
-        measured = {tuple(edge.vertices): edge.measured for edge in edges}
-        for k, ends in enumerate(zip(ids[keyframes].tolist(), ids[keyframes + 1].tolist(), strict=True)):
-            out[k] = measured.get(ends, out[k])
-        return tuple(out.T)
-
-    def sighting_odometry(self) -> Array:
-        """Return the poses of odometry alone, ``T_odom_base`` at the stamps of the sightings, (n, 3) or (n, 7)."""
-        return self._at_sightings(self.keyframes.poses)
-
-    def _at_sightings(self, keyframe_poses: Array) -> Array:
-        keyframes = keyframe_poses[self.sighting_poses.ids]
-        return np.stack(self.space.group.compose(tuple(keyframes.T), tuple(self.sighting_poses.poses.T)), axis=-1)
+    # -- odometry and sightings ------------------------------------------------------------------------------------
 
     @property
     def sighting_origins(self) -> SightingEdges:
@@ -264,12 +196,14 @@ class MapView:
 
     def touched_landmarks(self, first: int) -> dict[str, Landmark | None]:
         """The landmarks that changed after the ``first`` changes, tentative ones included; None: removed."""
-        return {name: self._landmarks.map.known.get(name) for name in self._landmarks.map.touched[first:]}
+        landmarks = self._landmarks.map
+        since = max(first - landmarks.touched_before, 0)
+        return {name: landmarks.known.get(name) for name in landmarks.touched[since:]}
 
     @property
     def landmark_changes(self) -> int:
         """The number of changes of landmarks."""
-        return len(self._landmarks.map.touched)
+        return self._landmarks.map.touched_before + len(self._landmarks.map.touched)
 
     @property
     def landmark_events(self) -> Sequence[LandmarkEvent]:
@@ -316,16 +250,6 @@ class MapView:
         return out
 
     # -- the graph and its solution --------------------------------------------------------------------------------
-
-    @property
-    def graph(self) -> Graph:
-        """The graph of vertices and edges."""
-        return self.backend.graph
-
-    @property
-    def solver(self) -> Solver:
-        """The solver of the graph."""
-        return self.backend.solver
 
     @property
     def ledger(self) -> Ledger:

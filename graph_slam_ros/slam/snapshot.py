@@ -11,7 +11,8 @@ from graph_slam_ros.slam.calibration.recalibration import Recalibration
 from graph_slam_ros.slam.frontend.gyro import SavedBias
 from graph_slam_ros.slam.frontend.keyframes import Keyframe, SightingPose
 from graph_slam_ros.slam.frontend.noise_factors import Key, Rescaling
-from graph_slam_ros.slam.landmarks.landmark_map import Landmark
+from graph_slam_ros.slam.landmarks.landmark import Landmark
+from graph_slam_ros.slam.lifelong.state import BoundedState
 from graph_slam_ros.slam.robust.ledger import Ledger, Reason, Verdict
 from graph_slam_ros.typing import Array
 
@@ -35,6 +36,9 @@ class MapSnapshot:
     calibration : corrections that were found, with those that were configured, by input and name
     edits : by hand, in order
     gyro_bias : of the gyro, as far as it was learnt; None without a gyro
+    first_keyframe : the number of the first of ``keyframes``: those before were condensed
+    bounded : what a condensed map has besides; None where nothing was condensed
+    folder : path of the run that it was read of, which has what was condensed; None where it is of none
     continues_with : the odometry whose next message belongs to the same drive; empty where a new drive begins
     """
 
@@ -60,6 +64,9 @@ class MapSnapshot:
     edits: list[AppliedEdit] = field(default_factory=list)
     calibration: dict[tuple[str, str], float] = field(default_factory=dict)
     gyro_bias: SavedBias | None = None
+    first_keyframe: int = 0
+    bounded: BoundedState | None = None
+    folder: Any = None
 
     @property
     def noise_changes(self) -> tuple[Rescaling, ...]:
@@ -76,6 +83,15 @@ class MapSnapshot:
         """Keyframes, segments, drives and poses of sightings."""
         return self.keyframes, self.segments, self.drives, self.sighting_poses
 
+    def newer_keyframes(self, first: int) -> list[Keyframe]:
+        """The keyframes from a number on, without those that were condensed."""
+        return self.keyframes[max(first - self.first_keyframe, 0) :]
+
+    @property
+    def keyframe_count(self) -> int:
+        """The number of keyframes, condensed ones included."""
+        return self.first_keyframe + len(self.keyframes)
+
     @property
     def frozen_edges(self) -> int:
         """The number of edges whose verdicts are final."""
@@ -85,6 +101,7 @@ class MapSnapshot:
     def vertices(self) -> list[int]:
         """The vertices of the problem. The others belonged to removed landmarks."""
         poses = {one.vertex for one in self.keyframes}
+        poses |= {one.vertex for one in self.bounded.old} if self.bounded else set()
         points = {mark.vertex for mark in self.landmarks.values()}
         return sorted(poses | points | {*self.range_offsets.values()})
 
@@ -99,7 +116,7 @@ class MapSnapshot:
         self.ledger.finish(self.graph.edge_count)
 
     def _prune(self, name: str) -> None:
-        mark, last = self.landmarks.pop(name), len(self.keyframes) - 1
+        mark, last = self.landmarks.pop(name), self.keyframe_count - 1
         for edge in [one.edge for one in mark.seen]:
             self.graph.set_weights(np.array([edge]), 0.0)
             statistic = float(self.ledger.statistic.values[edge])

@@ -98,6 +98,16 @@ class Solution:
         self.guard.go_back()
         self.vertices = 0
 
+    @property
+    def is_whole(self) -> bool:
+        """Return whether the last solve succeeded and has all of the graph."""
+        return (self.vertices, self._edges) == self._backend.handed_over and self._backend.solver.is_current
+
+    def renumber(self) -> None:
+        """Take over the ids of a graph that was compacted; all of it is solved."""
+        self.guard.note_good()
+        self.vertices, self._edges = self._backend.handed_over
+
     def is_due(self, keyframes: int, every_keyframes: int) -> bool:
         """Return whether enough is unsolved."""
         return keyframes - min(self._keyframes, keyframes) + self.resting >= every_keyframes

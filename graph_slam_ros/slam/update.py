@@ -2,8 +2,9 @@
 
 from dataclasses import dataclass
 
+from graph_slam_ros.slam.alarm import Alarm
+from graph_slam_ros.slam.bounded_map import BoundedMap, Condensation
 from graph_slam_ros.slam.calibration.decision import Finding
-from graph_slam_ros.slam.kidnap_detector import Alarm
 from graph_slam_ros.slam.landmarks.lifetimes import LandmarkEvent
 from graph_slam_ros.slam.map_view import MapView
 from graph_slam_ros.slam.robust.ledger import VerdictChange
@@ -29,6 +30,7 @@ class Update:
     calibrated : corrections by calibration
     landmarks : what happened to them: which were retired, moved or returned
     alarms : that began, were decided or ended since then: the landmarks contradict odometry
+    condensed : what left the map before anything else, when all that stays got new ids
     """
 
     keyframes: tuple[int, ...] = ()
@@ -40,9 +42,10 @@ class Update:
     alarms: tuple[Alarm | Slip, ...] = ()
     calibrated: tuple[Finding, ...] = ()
     landmarks: tuple[LandmarkEvent, ...] = ()
+    condensed: Condensation | None = None
 
     def __bool__(self) -> bool:
-        return bool(self.keyframes) or self.solved
+        return bool(self.keyframes) or self.solved or self.condensed is not None
 
     def __repr__(self) -> str:
         parts = [_counted(len(self.keyframes), "keyframe")] if self.keyframes else []
@@ -60,23 +63,31 @@ NOTHING = Update()
 class UpdateLog:
     """Makes each update from the difference to the previous one.
 
+    Parameters
+    ----------
+    bounded : condenses what has left the window before an update begins
+
     Attributes
     ----------
     begun : the number of updates that were begun
     """
 
-    def __init__(self, view: MapView) -> None:
-        self._view, self.begun = view, 0
+    def __init__(self, view: MapView, bounded: BoundedMap) -> None:
+        self._view, self._bounded, self.begun = view, bounded, 0
         self._keyframes = self._edges = self._solves = 0
         self._report: Report | None = None
         self._changes = len(view.ledger.history)  # of verdicts, that updates have reported
         self._alarms, self._corrections = view.alarms, len(view.corrected)
         self._landmarks = len(view.landmark_events)
+        self._condensed: Condensation | None = None
 
     def begin(self) -> None:
-        """Mark the start of the next update."""
+        """Mark the start of the next update, before which something may be condensed."""
         view = self._view
         self.begun += 1
+        self._condensed = self._bounded.condense()
+        if self._condensed is not None:
+            self._changes = len(view.ledger.history)
         self._keyframes, self._edges = len(view.keyframes), view.backend.handed_over[1]
         self._solves, self._report = view.solves, view.report
 
@@ -85,7 +96,7 @@ class UpdateLog:
         view = self._view
         solved, keyframes = view.solves > self._solves, range(self._keyframes, len(view.keyframes))
         if not solved and not keyframes:
-            return NOTHING
+            return NOTHING if self._condensed is None else Update(condensed=self._condensed)
         changes, self._changes = tuple(view.ledger.history[self._changes :]), len(view.ledger.history)
         before, self._alarms = self._alarms, view.alarms
         known = set(map(_state, before))
@@ -99,6 +110,7 @@ class UpdateLog:
             tuple(one for one in self._alarms if _state(one) not in known),
             self._new_corrections(),
             self._new_landmark_events(),
+            self._condensed,
         )
 
     def _new_landmark_events(self) -> tuple[LandmarkEvent, ...]:

@@ -35,7 +35,7 @@ from graph_slam_ros.slam.frontend.pose_edges import PoseEdges
 from graph_slam_ros.slam.frontend.stamp_order import PendingObservations, StampOrder
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.slam.frontend.thinning import ObservationThinning
-from graph_slam_ros.typing import Array, Numbers
+from graph_slam_ros.typing import Array, Index, Numbers
 
 _UNCERTAIN, _MAX_UNCERTAIN_M = 10.0, 1e5  # times as far as a given pose is away: so little odometry is trusted there
 _SHARED_WHEN_SOON = 1.0  # of a variance: with more, what comes fast would seem better than it is
@@ -123,9 +123,15 @@ class KeyframeFrontend:
         sighting_poses: Sequence[SightingPose],
         continues_with: str,
         gyro_bias: SavedBias | None,
+        first: int = 0,
     ) -> None:
-        """Continue after the keyframes of a map. If an input is given, its odometry continues the drive."""
-        self.path.restore(keyframes, segments, drives)
+        """Continue after the keyframes of a map. If an input is given, its odometry continues the drive.
+
+        Parameters
+        ----------
+        first : the number of the first keyframe
+        """
+        self.path.restore(keyframes, segments, drives, first)
         if self.gyro and gyro_bias:
             self.gyro.restore(gyro_bias)
         if continues_with:
@@ -142,6 +148,11 @@ class KeyframeFrontend:
         self.sighting_poses = self.sighting_poses.without(np.flatnonzero((of >= first) & (of <= last)))
         of = self.sighting_poses.ids
         of[of > last] -= last - first + 1
+
+    def forget_before(self, first: int, vertices: Index) -> None:
+        """Forget the keyframes before a number. All others have other vertices now, given in order."""
+        self.path.forget_before(first, vertices)
+        self.sighting_poses = self.sighting_poses.without(np.flatnonzero(self.sighting_poses.ids < first))
 
     def forget_time(self) -> None:
         """Keep the map and start over with the stamps: the next odometry begins a segment."""

@@ -12,7 +12,7 @@ from graph_slam_ros.slam.frontend.odometry_integration import IntegratedOdometry
 from graph_slam_ros.slam.frontend.odometry_selector import Step
 from graph_slam_ros.slam.frontend.odometry_track import OdometrySamples
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
-from graph_slam_ros.typing import Numbers
+from graph_slam_ros.typing import Index, Numbers
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,12 +67,17 @@ class KeyframeList:
     @property
     def oldest_ns(self) -> int:
         """Stamp of the first keyframe since stamps last jumped back."""
-        return int(self.keyframes.stamps_ns[self._epoch])
+        return int(self.keyframes.stamps_ns[max(self._epoch - self.keyframes.first, 0)])
 
     @property
     def remembered_ns(self) -> int:
         """The stamp from which on each odometry message is remembered."""
         return self._motions[0].start_ns
+
+    @property
+    def remembered_from(self) -> int:
+        """The number of the keyframe from which on each odometry message is remembered."""
+        return self._motions[0].keyframe if self._motions else len(self.keyframes)
 
     def append(self, vertex: int, step: Step, late_s: float) -> None:
         """Add a keyframe at odometry's pose; forget motions that ended more than ``late_s`` ago."""
@@ -86,8 +91,16 @@ class KeyframeList:
         while len(self._motions) > 2 and self._motions[1].start_ns <= oldest_ns:
             self._motions.popleft()
 
-    def restore(self, keyframes: Sequence[Keyframe], segments: Sequence[int], drives: Sequence[int]) -> None:
-        """Continue after these keyframes. The motion from the last of them to the present is unknown."""
+    def restore(
+        self, keyframes: Sequence[Keyframe], segments: Sequence[int], drives: Sequence[int], first: int = 0
+    ) -> None:
+        """Continue after these keyframes. The motion from the last of them to the present is unknown.
+
+        Parameters
+        ----------
+        first : the number of the first of them: the others were condensed
+        """
+        self.keyframes.first = first
         for one in keyframes:
             self.keyframes.append(one.vertex, one.stamp_ns, one.T_odom_base)
         self.segments += segments
@@ -98,7 +111,8 @@ class KeyframeList:
         """Continue the drive after ``restore``: odometry knows the motion since the last keyframe."""
         last = len(self.keyframes) - 1
         backwards = np.flatnonzero(np.diff(self.keyframes.stamps_ns) < 0)
-        self._epoch = max(self.drives[-1], int(backwards[-1]) + 1 if len(backwards) else 0)
+        jump = self.keyframes.first + int(backwards[-1]) + 1 if len(backwards) else 0
+        self._epoch = max(self.drives[-1], jump)
         self._is_new_drive = False
         self._motions.append(
             IntegratedOdometry(self._noise, self._space, last, self.keyframes[last].stamp_ns, self._rest)
@@ -113,6 +127,11 @@ class KeyframeList:
             begins[:] = [k for k in dict.fromkeys(moved) if k < left]
         self._epoch = min(self._epoch, left)
 
+    def forget_before(self, first: int, vertices: Index) -> None:
+        """Forget the keyframes before a number. The others have other vertices now, given in order."""
+        self.keyframes = self.keyframes.since(first, vertices)
+        self.samples.forget_before(int(self.keyframes.stamps_ns[0]))
+
     def forget_time(self) -> None:
         """Start over with the stamps: they cannot be compared with those before."""
         self._motions.clear()
@@ -126,13 +145,14 @@ class KeyframeList:
         if motion is None:
             return self._where_long_ago(stamp_ns)
         moved = motion.at(stamp_ns)
-        vertex = int(self.keyframes.ids[motion.keyframe])
+        vertex = self.keyframes[motion.keyframe].vertex
         return PoseAtStamp(motion.keyframe, vertex, stamp_ns, moved.T_keyframe_base, moved.covariance)
 
     def _where_long_ago(self, stamp_ns: int) -> PoseAtStamp:
         """Interpolate between two keyframes whose odometry is no longer remembered."""
-        present = self.keyframes.stamps_ns[self._epoch :]
-        k = self._epoch + int(np.searchsorted(present, stamp_ns, side="right")) - 1
+        first = max(self._epoch, self.keyframes.first)
+        present = self.keyframes.stamps_ns[first - self.keyframes.first :]
+        k = first + int(np.searchsorted(present, stamp_ns, side="right")) - 1
         group, (a, b) = self._space.group, (self.keyframes[k], self.keyframes[k + 1])
         T_a_b = self._space.identity if k + 1 in self.segments else group.between(a.T_odom_base, b.T_odom_base)
         fraction = (stamp_ns - a.stamp_ns) / (b.stamp_ns - a.stamp_ns)

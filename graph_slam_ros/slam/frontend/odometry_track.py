@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.slam.frontend.odometry_selector import Step
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
@@ -41,6 +43,11 @@ class OdometrySamples:
         self._kept = StampedPoses[Sample](lambda *sample: sample, self._space.pose.size)
         self._last: Step | None = None
         self._kept_ns, self._there = 0, self._space.identity  # of the newest that is kept
+
+    def forget_before(self, stamp_ns: int) -> None:
+        """Forget the samples before a stamp."""
+        first = int(np.searchsorted(self._kept.stamps_ns, stamp_ns))
+        self._kept = self._kept.without(np.arange(first))
 
     def add(self, step: Step) -> None:
         """Keep a step if the next sample is due, and the one before where the robot begins to move."""

@@ -12,18 +12,25 @@ Instant = TypeVar("Instant")
 
 
 class StampedPoses(Generic[Instant]):
-    """Rows of an id, a stamp and a pose, in columns that grow.
+    """Rows of an id, a stamp and a pose, in columns that grow. The first of them may be forgotten.
+
+    Rows are numbered from 0, and keep their number: ``len`` is how many there were. ``ids``, ``stamps_ns`` and
+    ``poses`` begin with the row ``first``.
 
     Parameters
     ----------
     record : makes the record of one instant of these three
     size : numbers of a pose
+
+    Attributes
+    ----------
+    first : the number of the first row that is there
     """
 
-    __slots__ = ("_id", "_pose", "_record", "_stamp_ns")
+    __slots__ = ("_id", "_pose", "_record", "_stamp_ns", "first")
 
-    def __init__(self, record: Callable[[int, int, Numbers], Instant], size: int) -> None:
-        self._record = record
+    def __init__(self, record: Callable[[int, int, Numbers], Instant], size: int, first: int = 0) -> None:
+        self._record, self.first = record, first
         self._id, self._stamp_ns, self._pose = Column(np.int64), Column(np.int64), Column(np.float64, size)
 
     @property
@@ -46,18 +53,34 @@ class StampedPoses(Generic[Instant]):
         Column.extend((self._id, id_, 1), (self._stamp_ns, stamp_ns, 1), (self._pose, pose, 1))
 
     def without(self, gone: Index) -> "StampedPoses[Instant]":
-        """Return the same without some rows."""
-        left = np.delete(np.arange(len(self)), gone)
-        out = StampedPoses(self._record, self.poses.shape[1])
+        """Return the same without some rows, by number."""
+        return self._part(np.delete(np.arange(len(self.ids)), gone - self.first), self.first)
+
+    def since(self, first: int, ids: Index | None = None) -> "StampedPoses[Instant]":
+        """Return the rows from a number on, with other ids if they are given."""
+        out = self._part(np.arange(first - self.first, len(self.ids)), first)
+        if ids is not None:
+            out.ids[:] = ids
+        return out
+
+    def _part(self, rows: Index, first: int) -> "StampedPoses[Instant]":
+        out = StampedPoses(self._record, self.poses.shape[1], first)
         columns = (out._id, self.ids), (out._stamp_ns, self.stamps_ns), (out._pose, self.poses)
-        Column.extend(*((column, values[left], len(left)) for column, values in columns))
+        Column.extend(*((column, values[rows], len(rows)) for column, values in columns))
         return out
 
     def __len__(self) -> int:
-        return len(self._id)
+        return self.first + len(self._id)
 
-    def __getitem__(self, index: int) -> Instant:
-        return self._record(int(self.ids[index]), int(self.stamps_ns[index]), tuple(self.poses[index].tolist()))
+    def __getitem__(self, number: int) -> Instant:
+        row = number if number < 0 else number - self.first
+        if row < 0 <= number:
+            raise IndexError(f"row {number} was forgotten: the first is {self.first}")
+        return self._record(int(self.ids[row]), int(self.stamps_ns[row]), tuple(self.poses[row].tolist()))
 
     def __iter__(self) -> Iterator[Instant]:
-        return (self[k] for k in range(len(self)))
+        return (self[k] for k in range(self.first, len(self)))
+
+    def after(self, number: int) -> list[Instant]:
+        """Return the rows from a number on that are there."""
+        return [self[k] for k in range(max(number, self.first), len(self))]

@@ -16,10 +16,11 @@ from graph_slam_ros.slam.frontend.odometry_selector import Step
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.slam.landmarks.anonymous import AnonymousLandmarks
 from graph_slam_ros.slam.landmarks.assignments import Assigned
-from graph_slam_ros.slam.landmarks.landmark_map import Landmark, Landmarks
+from graph_slam_ros.slam.landmarks.landmark import Landmark
+from graph_slam_ros.slam.landmarks.landmark_map import Landmarks
 from graph_slam_ros.slam.landmarks.lifetimes import Lifetimes, Verdicts
 from graph_slam_ros.solver import Solver
-from graph_slam_ros.typing import Executor
+from graph_slam_ros.typing import Executor, Index
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,6 +121,11 @@ class LandmarkFrontend:
         self.map.restore(landmarks, range_offsets)
         self.lifetimes.restore(passes)
         self.anonymous.restore()
+
+    def renumber(self, vertices: Index, edges: Index) -> None:
+        """Take over new ids of vertices and edges, by old ones; -1: it was removed."""
+        self.map.renumber(vertices, edges)
+        self.lifetimes.renumber(vertices, edges)
 
     def identified(self, m: Sightings, where: PoseAtStamp) -> list[Assigned]:
         """The sightings that can be used now, each with its landmark. The others are counted."""

@@ -1,7 +1,7 @@
 """Landmarks: sightings become vertices and edges. A landmark that is not determined yet is kept with the reason."""
 
 from collections.abc import Callable, Mapping, Sequence, Set
-from dataclasses import dataclass, field
+from dataclasses import replace
 
 import numpy as np
 
@@ -17,58 +17,14 @@ from graph_slam_ros.slam.frontend.motion_compensation import KeyframeMeasurement
 from graph_slam_ros.slam.frontend.noise_factors import NoiseScales
 from graph_slam_ros.slam.frontend.sighting_edges import SightingEdges
 from graph_slam_ros.slam.landmarks import triangulation
+from graph_slam_ros.slam.landmarks.landmark import Landmark, LandmarkEdge, UndeterminedLandmark
 from graph_slam_ros.slam.landmarks.triangulation import PartialObservation, PositionHypothesis
 from graph_slam_ros.solver import Solver
-from graph_slam_ros.typing import Array, Numbers
+from graph_slam_ros.typing import Array, Index, Numbers
 
 LABEL = "landmarks"
 _SOMEWHERE_M = 3.0  # away, of what was seen by its bearing alone
 _MAX_SIGHTINGS = 60  # sightings of one landmark: every other is forgotten beyond
-
-
-@dataclass(frozen=True, slots=True)
-class LandmarkEdge:
-    """One sighting of a landmark, and its edge."""
-
-    edge: int
-    topic: str
-    sighting: Sighting
-    where: PoseAtStamp
-
-
-@dataclass(slots=True)
-class Landmark:
-    """A landmark of the graph.
-
-    Attributes
-    ----------
-    is_unnamed : whether no sighting of it tells which it is
-    is_tentative : whether it is too new to be believed: it may be given up
-    retired_ns : stamp since which it is known to be gone; 0 where it is there
-    seen : its sightings that do not tell which it is: they may change hands
-    stamps : of these; a landmark is never seen twice at once
-    """
-
-    name: str
-    vertex: int
-    is_unnamed: bool = False
-    is_tentative: bool = False
-    sightings: int = 0
-    first_seen_ns: int = 0
-    last_seen_ns: int = 0
-    retired_ns: int = 0
-    seen: list[LandmarkEdge] = field(default_factory=list)
-    stamps: set[int] = field(default_factory=set)
-
-
-@dataclass(slots=True)
-class UndeterminedLandmark:
-    """A landmark without a vertex yet: its sightings, its possible positions, and why they are not enough."""
-
-    topic: str
-    seen: list[tuple[PoseAtStamp, Sighting]] = field(default_factory=list)
-    places: list[PositionHypothesis] = field(default_factory=list)
-    reason: str = ""
 
 
 class Landmarks:
@@ -80,6 +36,7 @@ class Landmarks:
     undetermined : those that are not determined yet
     offsets : by input, the vertex of what all its ranges have in common
     touched : the name of a landmark of the graph for each change of it, in order
+    touched_before : changes that are not in ``touched`` any more
     aliases : the landmark that an identity is of, where somebody has merged two
     origins : when each edge of a sighting was measured, and where from
     begins_new : whether what is not known begins a landmark; not so while the map is held
@@ -106,6 +63,7 @@ class Landmarks:
                 self._noise_of_pose(name, known)
         self.offsets: dict[str, int] = {}
         self.touched: list[str] = []
+        self.touched_before = 0
         self.aliases: dict[str, str] = {}
         self.origins = SightingEdges(self._space)
 
@@ -155,6 +113,24 @@ class Landmarks:
         self.known.update(known)
         self.offsets.update(offsets)
         self.touched += known
+
+    def renumber(self, vertices: Index, edges: Index) -> None:
+        """Take over new ids of vertices and edges, by old ones; -1: it was removed.
+
+        Sightings of landmarks that are not determined yet are forgotten with their keyframe, and counted.
+        """
+        for landmark in self.known.values():
+            landmark.vertex = int(vertices[landmark.vertex])
+        self.offsets = {name: int(vertices[vertex]) for name, vertex in self.offsets.items()}
+        self.touched_before += len(self.touched) - len(self.known)
+        self.touched[:] = self.known
+        self.origins.renumber(edges)
+        for name, candidate in list(self.undetermined.items()):
+            left = [(where, s) for where, s in candidate.seen if vertices[where.vertex] >= 0]
+            self._counters.count(candidate.topic, "condensed", len(candidate.seen) - len(left))
+            candidate.seen = [(replace(where, vertex=int(vertices[where.vertex])), s) for where, s in left]
+            if not left:
+                del self.undetermined[name]
 
     # -- in the graph --------------------------------------------------------------------------------------------
 
@@ -293,6 +269,10 @@ class Landmarks:
     def _withdraw_sightings(self, seen: Sequence[LandmarkEdge]) -> None:
         self._counters.used.subtract(one.topic for one in seen)
         self._withdraw([one.edge for one in seen])
+
+    def names(self) -> dict[int, str]:
+        """Return the names of all landmarks, by their vertices."""
+        return {landmark.vertex: name for name, landmark in self.known.items()}
 
     def is_there(self, name: str) -> bool:
         """Return whether a landmark is in the graph, and not retired."""

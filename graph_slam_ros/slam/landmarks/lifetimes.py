@@ -8,7 +8,7 @@ sighting. What is frozen, held or surveyed is reported and stays.
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import count
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
@@ -18,11 +18,13 @@ from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.slam.frontend import motion_compensation
 from graph_slam_ros.slam.frontend.keyframes import Keyframe
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
-from graph_slam_ros.slam.landmarks.landmark_map import LABEL, Landmark, Landmarks
+from graph_slam_ros.slam.landmarks.landmark import Landmark
+from graph_slam_ros.slam.landmarks.landmark_map import LABEL, Landmarks
 from graph_slam_ros.slam.landmarks.presence import Pass, Presence, views_of
 from graph_slam_ros.solver import Solver
-from graph_slam_ros.typing import Array
+from graph_slam_ros.typing import Array, Index
 
+Value = TypeVar("Value")
 ALL_VOID = -1  # in a record, instead of a vertex: the map was moved, so all records before it are void
 OLD = "#"  # in the name of an old place of a landmark that moved, before its number
 _LAG = 5  # keyframes after which the verdicts on the sightings from one are visited
@@ -135,6 +137,19 @@ class Lifetimes:
                 continue
             self._known.setdefault(vertex, Presence()).read(record)
         self._log, self._edge, self._next = list(records), self._solver.graph.edge_count, -1
+
+    def renumber(self, vertices: Index, edges: Index) -> None:
+        """Take over new ids of vertices and edges, by old ones; -1: it was removed."""
+        if self._survey is None:
+            return
+        self._known, self._passes = _moved(self._known, vertices), _moved(self._passes, vertices)
+        self._held, self._seen = _moved(self._held, vertices), _moved(self._seen, vertices)
+        for part in (self._held, self._seen):
+            for several in part.values():
+                several[:] = [new for new in edges[several].tolist() if new >= 0]
+        self._edge = self._solver.graph.edge_count
+        self._newest = int(vertices[self._newest]) if self._newest >= 0 else -1
+        self._log = [[vertex, *one.record()] for vertex, one in self._known.items()]
 
     def forget(self) -> None:
         """Forget all views, because the map has moved."""
@@ -348,6 +363,11 @@ class Lifetimes:
         if self._landmarks.is_held(name):
             return f"the map is held: remove it with the edit remove_landmark of {name}, and freeze again"
         return ""
+
+
+def _moved(part: dict[int, Value], vertices: Index) -> dict[int, Value]:
+    """Return values by new vertices, without those that were removed."""
+    return {new: value for old, value in part.items() if (new := int(vertices[old])) >= 0}
 
 
 def _point_of(space: Geometry, edge: Edge) -> Array | None:

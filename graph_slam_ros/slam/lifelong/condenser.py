@@ -1,21 +1,23 @@
 """Condensing: the keyframes of a visit leave the problem, and an edge of the place has what they measured."""
 
-from collections.abc import Collection, Hashable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.errors import SingularError
-from graph_slam_ros.graph import Gaussian, place_edge
+from graph_slam_ros.graph import Edge, Gaussian, place_edge
 from graph_slam_ros.graph.geometry import Geometry
-from graph_slam_ros.slam.lifelong.compaction import Compacted
-from graph_slam_ros.slam.lifelong.elimination import square_root
+from graph_slam_ros.graph.place import LABEL
+from graph_slam_ros.slam.lifelong.compaction import Renumbered
+from graph_slam_ros.slam.lifelong.elimination import product, square_root
 from graph_slam_ros.slam.lifelong.place import Fused, Place, fewest_shared, fused, visit_without
 from graph_slam_ros.slam.lifelong.surroundings import Motion, Surroundings, chained, motion_of, surroundings
 from graph_slam_ros.slam.lifelong.visit import Visit, visit_of
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Numbers
 
-LABEL = "places"
+Cell = tuple[int, ...]
+CHAIN = "composed"  # label of edges that are composed of odometry
 _AHEAD = 3  # landmarks of places that the keyframes after a visit must see before odometry to it is cut
 _STRIKES = 2  # visits in a row that contradict a place in the same landmark: then that begins anew
 
@@ -54,6 +56,14 @@ class PlaceEdge:
     strikes: dict[int, int] = field(default_factory=dict)
 
 
+def place_of(edge: Edge, visits: int, strikes: Mapping[int, int] | None = None) -> PlaceEdge:
+    """Return the place of an edge; the edge has all of its numbers."""
+    base, *members = edge.vertices
+    information = product(edge.sqrt_information.T, edge.sqrt_information)
+    place = Place(tuple(members), edge.measured.reshape(len(members), -1), information, visits)
+    return PlaceEdge(base, place, edge.id, dict(strikes or {}))
+
+
 @dataclass(frozen=True, slots=True)
 class Condensed:
     """The end of one visit.
@@ -87,15 +97,18 @@ class Condenser:
 
     def __init__(self, space: Geometry, solver: Solver, limits: Limits | None = None) -> None:
         self.space, self.solver, self.limits = space, solver, limits or Limits()
-        self.places: dict[Hashable, list[PlaceEdge]] = {}
+        self.places: dict[Cell, list[PlaceEdge]] = {}
 
-    def condense(self, visit: Sequence[int], after: int, cell: Hashable, ahead: Collection[int]) -> Condensed:
+    def condense(
+        self, visit: Sequence[int], after: int, cell: Cell, ahead: Collection[int], *, waits: bool = True
+    ) -> Condensed:
         """Condense a visit. Where ``waits`` or ``kept`` is returned nothing was changed.
 
         Parameters
         ----------
         visit : vertices of its keyframes, in order of time; after : the keyframe that follows
         ahead : landmarks that the keyframes after the visit see
+        waits : whether it may wait until these see enough places; if not, it begins a place instead, if it can
         """
         around = surroundings(self.space, self.solver, visit, after)
         if around.unfit:
@@ -105,9 +118,11 @@ class Condenser:
         best = max(in_cell, key=lambda one: len(seen & set(one.place.members)), default=None)
         fits = best is not None and len(seen | set(best.place.members)) <= self.limits.members
         is_again = fits and best is not None and len(seen & set(best.place.members)) >= fewest_shared(self.space)
-        if is_again and len(self._known() & set(ahead)) < _AHEAD:
-            return Condensed("waits")
         has_room = len(in_cell) < self.limits.places and len(seen) >= fewest_shared(self.space)
+        if is_again and len(self._known() & set(ahead)) < _AHEAD:
+            if waits or not has_room:
+                return Condensed("waits")
+            is_again = False
         if not (is_again or has_room):
             return self._composed(visit, after, around, "it sees too few landmarks, or the cell is full")
         try:
@@ -122,17 +137,17 @@ class Condenser:
         except SingularError as error:
             return self._composed(visit, after, around, str(error))
 
-    def renumber(self, compacted: Compacted) -> None:
-        """Go on in a compacted problem."""
-        self.solver, vertices = compacted.solver, compacted.vertices
+    def renumber(self, new: Renumbered) -> None:
+        """Take over new ids after a compaction."""
         for one in (one for in_cell in self.places.values() for one in in_cell):
-            one.base, one.edge = vertices[one.base], compacted.edges[one.edge]
-            one.place = replace(one.place, members=tuple(vertices[mark] for mark in one.place.members))
-            one.strikes = {vertices[mark]: count for mark, count in one.strikes.items() if mark in vertices}
+            one.base, one.edge = int(new.vertices[one.base]), int(new.edges[one.edge])
+            one.place = replace(one.place, members=tuple(new.vertices[list(one.place.members)].tolist()))
+            strikes = {int(new.vertices[mark]): count for mark, count in one.strikes.items()}
+            one.strikes = {mark: count for mark, count in strikes.items() if mark >= 0}
 
     # -- what becomes of a visit -------------------------------------------------------------------------------------
 
-    def _first(self, visit: Sequence[int], after: int, around: Surroundings, one: Visit, cell: Hashable) -> Condensed:
+    def _first(self, visit: Sequence[int], after: int, around: Surroundings, one: Visit, cell: Cell) -> Condensed:
         """Begin a place: half of the odometry is in its edge, the other half joins its base to what is around it."""
         k = len(visit) // 2
         if lonely := self._left_alone(around, one.members):
@@ -142,7 +157,7 @@ class Condenser:
         onward = [motion_of(edge) for edge in around.onward.values()]
         joins = [(edge.vertices[0], visit[k], [motion_of(edge), *legs[:k]]) for edge in around.into.values()]
         added = self._join([*joins, (visit[k], after, [*legs[k:], *onward])])
-        begun = PlaceEdge(visit[k], Place.begun_by(one), self._place_edge(visit[k], Place.begun_by(one), root))
+        begun = self._place_edge(visit[k], Place.begun_by(one), root)
         self.places.setdefault(cell, []).append(begun)
         removed = self._replace(visit, around, [*added, begun.edge], kept=visit[k], seen_from=visit[k])
         return Condensed("first", removed=removed)
@@ -165,15 +180,15 @@ class Condenser:
             result = self._fused(place, used, guess)
         if lonely := self._left_alone(around, result.place.members):
             return Condensed("kept", f"landmark {lonely[0]} would be left without a measurement")
-        edge = self._place_edge(at.base, result.place, square_root(result.place.information))
-        removed = self._replace(visit, around, [edge], kept=None, seen_from=at.base, also=[at.edge])
+        now = self._place_edge(at.base, result.place, square_root(result.place.information))
+        removed = self._replace(visit, around, [now.edge], kept=None, seen_from=at.base, also=[at.edge])
         if without is None:
             at.strikes = {mark: count for mark, count in at.strikes.items() if mark not in one.members}
         elif anew is None:
             at.strikes[without] = at.strikes.get(without, 0) + 1
         else:
             at.strikes.pop(anew, None)
-        at.place, at.edge = result.place, edge
+        at.place, at.edge = now.place, now.edge
         return Condensed("again", "", done.statistic, done.degrees, None if anew else without, anew, removed)
 
     def _composed(
@@ -226,14 +241,15 @@ class Condenser:
         for first, last, motions in joins:
             pose, covariance = chained(self.space, motions)
             noise = Gaussian.from_covariance(covariance)
-            edge = self.solver.graph.add_edge(self.space.relative_pose, [first, last], pose, noise, "odometry")
+            edge = self.solver.graph.add_edge(self.space.relative_pose, [first, last], pose, noise, CHAIN)
             out.append(edge)
         return out
 
-    def _place_edge(self, base: int, place: Place, root: Array) -> int:
+    def _place_edge(self, base: int, place: Place, root: Array) -> PlaceEdge:
         kind = place_edge(self.space.pose, len(place.members))
         at = [base, *place.members]
-        return self.solver.graph.add_edge(kind, at, place.points.ravel(), Gaussian(root), LABEL)
+        edge = self.solver.graph.add_edge(kind, at, place.points.ravel(), Gaussian(root), LABEL)
+        return place_of(self.solver.graph.edge(edge), place.visits)
 
     def _replace(
         self,

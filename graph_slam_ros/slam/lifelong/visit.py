@@ -56,7 +56,8 @@ def visit_of(
     SingularError
         The edges do not determine the poses, or no landmark.
     """
-    ends = {edge: graph.edge(edge).vertices for edge in sorted(edges)}
+    records = {edge: graph.edge(edge) for edge in sorted(edges)}
+    ends = {number: one.vertices for number, one in records.items()}
     marks = sorted({v for vertices in ends.values() for v in vertices} - set(poses))
     while marks:
         order = [base, *(v for v in poses if v != base), *marks]
@@ -65,16 +66,18 @@ def visit_of(
         solver = Solver(local, _SETTINGS)
         solver.add(range(local.vertex_count), range(local.edge_count))
         solver.hold(at[base])
-        information = solver.information_matrix()
         size = space.dimensions
-        blocks = [len(information) - size * (len(marks) - k) for k in range(len(marks))]
-        sure = [_is_sure(information[low : low + size, low : low + size]) for low in blocks]
-        if not all(sure):
-            marks = [mark for mark, is_sure in zip(marks, sure, strict=True) if is_sure]
-            continue
+        whole = {ends[edge][1] for edge in inside if records[edge].type.residual_size >= size}
+        if not whole.issuperset(marks):
+            information = solver.information_matrix()
+            blocks = [len(information) - size * (len(marks) - k) for k in range(len(marks))]
+            sure = [_is_sure(information[low : low + size, low : low + size]) for low in blocks]
+            if not all(sure):
+                marks = [mark for mark, is_sure in zip(marks, sure, strict=True) if is_sure]
+                continue
         report = solver.optimize()
         information = solver.information_matrix()
-        kept = np.arange(blocks[0], len(information))
+        kept = np.arange(len(information) - size * len(marks), len(information))
         points = solver.estimate([at[mark] for mark in marks])
         marginal = marginal_information(information, kept)
         return Visit(tuple(marks), points, marginal, report.chi2_final, solver.degrees_of_freedom)

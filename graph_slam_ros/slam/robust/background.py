@@ -38,6 +38,11 @@ class Background:
         self._out = 0  # candidates that were out at the last look
         self._job: _Job | None = None
 
+    @property
+    def is_busy(self) -> bool:
+        """Return whether a search goes on."""
+        return self._job is not None
+
     def is_due(self, out: int) -> bool:
         """Return whether this number of rejected candidates makes a search due."""
         after, self._out = self._config.second_look_after, min(self._out, out)

@@ -41,6 +41,12 @@ class OutlierGate:
         self._next = 0  # of the accepted, where the next review goes on
         self._next_out = 0  # and of those that are out
 
+    def renumber(self, new: Index) -> None:
+        """Take over new ids of all edges, by old ones; -1: it was removed. Every edge has been judged."""
+        self.ledger.renumber(new)
+        self._support = LandmarkSupport(self._graph, self._solver, self.ledger.inside)
+        self._vertices = self._graph.vertex_count
+
     # -- what is new -------------------------------------------------------------------------------------------------
 
     def gate_new(self, count: int, keyframe: int, *, trusts_sightings: bool = True) -> list[int]:

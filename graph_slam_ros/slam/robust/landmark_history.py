@@ -27,6 +27,10 @@ class LandmarkHistory:
         self._earliest: dict[int, list[tuple[int, int]]] = {}  # (edge, keyframe) of each landmark's first sightings
         self._known: dict[int, _Judged] = {}
 
+    def begin_at(self, vertex: int) -> None:
+        """Note that the landmarks before a vertex are known, and that sightings of later ones follow."""
+        self._start = vertex
+
     def add_survey(self, landmark: int) -> None:
         """Note a landmark, by its vertex, whose position is surveyed."""
         self._surveyed.add(landmark)

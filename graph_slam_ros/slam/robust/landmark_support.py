@@ -3,6 +3,7 @@
 import numpy as np
 
 from graph_slam_ros.graph import Graph
+from graph_slam_ros.graph.place import LABEL as PLACES
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Index
 
@@ -30,6 +31,10 @@ class LandmarkSupport:
             for landmark, times in zip(*map(np.ndarray.tolist, np.unique(several, return_counts=True)), strict=True):
                 of = self._among(landmark, table.type.residual_size)
                 of[landmark] = of.get(landmark, 0) + times
+        for edge in graph.edges_of(PLACES).tolist():
+            if (one := graph.edge(edge)).weight:
+                for landmark in one.vertices[1:]:
+                    self._holds[landmark] = self._holds.get(landmark, 0) + 1
 
     def count(self, edge: int, more: int) -> None:
         """Count an edge that comes in (1) or goes out (-1)."""

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 from copy import copy, deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Any
 
@@ -94,6 +94,25 @@ class Ledger:
 
     def __len__(self) -> int:
         return len(self.verdict)
+
+    def renumber(self, new: Index) -> None:
+        """Take over new ids of all edges, by old ones; -1: it was removed. The history of those is gone."""
+        kept = np.flatnonzero(new >= 0)
+        numbers = self.numbers.values[kept]
+        begins = np.cumsum(numbers) - numbers
+        at = np.repeat(self._residual_at.values[kept] - begins, numbers) + np.arange(int(numbers.sum()))
+        residual, residual_at = Column(np.float64), Column(np.int64)
+        Column.extend((residual, self._residual.values[at], len(at)))
+        Column.extend((residual_at, begins, len(kept)))
+        self._residual, self._residual_at = residual, residual_at
+        for name in ("verdict", "reason", "statistic", "threshold", "numbers", "keyframe"):
+            old = getattr(self, name).values
+            column = Column(old.dtype.type)
+            Column.extend((column, old[kept], len(kept)))
+            setattr(self, name, column)
+        self.history[:] = [replace(one, edge=int(new[one.edge])) for one in self.history if new[one.edge] >= 0]
+        self.final = int(np.count_nonzero(new[: self.final] >= 0))
+        self._out = {edge for edge in new[sorted(self._out)].tolist() if edge >= 0}
 
     def copy(self) -> "Ledger":
         """Another ledger with the same records and an empty history."""

@@ -152,6 +152,15 @@ class OdometryJudge:
         self.contradictions.clear()
         self._displaced.clear()
 
+    def forget(self) -> None:
+        """Forget all edges: they have other ids now. What is decided stays."""
+        self.finish()
+        self._pairs.clear()
+        self._used.clear()
+        for history in self._histories.values():
+            history.pairs.clear()
+        self._next = self._graph.edge_count
+
     # -- where they contradict each other ----------------------------------------------------------------------------
 
     def _compare(self, pair: _Pair, source: str, keyframe: int) -> None:

@@ -347,7 +347,7 @@ OPENING = {"open", "read_text", "read_bytes", "write_text", "write_bytes", "unli
 OPENING |= {"rmtree", "rmdir", "FileIO", "fdopen", "savefig", "touch", "move", "copy", "copyfile", "copytree"}
 OF_FILES = {
     "formats/files.py": {"os.open"},
-    "formats/durable.py": {"os.open", "os.replace", "new.unlink"},
+    "formats/durable.py": {"os.open", "os.replace", "new.unlink", "other.unlink"},
     "runs/folder.py": {"folder.rename", "file.unlink", "(folder / SUMMARY).unlink", "folder.rmdir"},
     # not of runs, nor of the user's
     "node/player.py": {"parameters.write_text", "subprocess.Popen"},

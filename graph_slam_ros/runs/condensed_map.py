@@ -1,0 +1,146 @@
+"""A condensed map on the disk: what it has besides a graph, and what has left it.
+
+The record ``condensed`` of a ``growth`` (``map_journal``) has
+
+* ``first``: the number of the first keyframe that was not condensed;
+* ``vertices``, ``edges``: the lasting ids of the first rows, and that of the row after these;
+* ``old``: number, vertex, stamp and ``T_odom_base`` of each keyframe before the first that is in the graph;
+* ``places``: cell, edge, visits, and the strikes against its landmarks, by vertex, of each place;
+* ``left``: how many keyframes, and poses at which something was seen, have left the map.
+
+What has left is in ``condensed.mcap``, a record ``left`` each time: the number of its first keyframe, how many poses
+had left before, and the rows of ``slam.lifelong.removed.record_type`` in base64. ``left_edges`` has the table of the
+edges. A map may know of fewer than are there, if its run was killed: the others do not count.
+"""
+
+import base64
+import csv
+import io
+from collections.abc import Iterator, Mapping
+from dataclasses import astuple, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from graph_slam_ros.errors import FormatError
+from graph_slam_ros.graph import Graph
+from graph_slam_ros.graph.geometry import Geometry
+from graph_slam_ros.graph.lasting_ids import LastingIds
+from graph_slam_ros.runs.journal import read_records
+from graph_slam_ros.slam.bounded_map import Condensation
+from graph_slam_ros.slam.condensed_edges import CondensedEdge
+from graph_slam_ros.slam.lifelong.condenser import place_of
+from graph_slam_ros.slam.lifelong.removed import OldKeyframe, Records, no_records, record_type
+from graph_slam_ros.slam.lifelong.state import BoundedState
+
+CONDENSED = "condensed"
+"""Name of the recording of what has left the map."""
+LEFT = "graph_slam_ros.Left"
+COLUMNS = [field.name for field in fields(CondensedEdge)]
+_IDS = {"vertices": "vertex_ids", "edges": "edge_ids"}
+
+Record = dict[str, Any]
+
+
+def condensed_record(graph: Graph, first: int, state: BoundedState) -> Record:
+    """Return the part of a map besides its graph."""
+    ids = ([*of.early.tolist(), of.later] for of in (graph.vertex_ids, graph.edge_ids))
+    places = [
+        [list(cell), one.edge, one.place.visits, [list(pair) for pair in one.strikes.items()]]
+        for cell, several in state.places.items()
+        for one in several
+    ]
+    old = [[one.number, one.vertex, one.stamp_ns, one.T_odom_base] for one in state.old]
+    left = [state.keyframes, state.sightings]
+    return {
+        "first": first,
+        **dict(zip(("vertices", "edges"), ids, strict=True)),
+        "old": old,
+        "places": places,
+        "left": left,
+    }
+
+
+def read_condensed(graph: Graph, record: Mapping[str, Any]) -> tuple[int, BoundedState]:
+    """Read ``condensed_record`` into a graph that has all of its edges; returns the number of its first keyframe, too.
+
+    Raises
+    ------
+    ValueError
+        The numbers contradict one another.
+    """
+    for name in ("vertices", "edges"):
+        ids = np.array(record[name], dtype=np.int64)
+        count = graph.vertex_count if name == "vertices" else graph.edge_count
+        if not len(ids) or (np.diff(ids) <= 0).any() or ids[0] < 0 or len(ids) - 1 > count:
+            raise ValueError(f"condensed: the ids of its {name} do not ascend, or are more than there are")
+        setattr(graph, _IDS[name], LastingIds(ids[:-1], int(ids[-1])))
+    keyframes, sightings = record["left"]
+    state = BoundedState(keyframes=keyframes, sightings=sightings)
+    for cell, edge, visits, strikes in record["places"]:
+        state.places.setdefault(tuple(cell), []).append(place_of(graph.edge(edge), visits, dict(strikes)))
+    state.old += [OldKeyframe(number, vertex, stamp, tuple(pose)) for number, vertex, stamp, pose in record["old"]]
+    known = [one.vertex for one in state.old]
+    if known and not 0 <= min(known) <= max(known) < graph.vertex_count:
+        raise ValueError("condensed: an old keyframe is no vertex")
+    return record["first"], state
+
+
+def left_records(done: Condensation) -> Iterator[Record]:
+    """Return the records of what has left a map."""
+    rows = {"keyframes": _text(done.keyframes), "sightings": _text(done.sightings)}
+    yield {"type": "left", "first": done.first, "sightings_before": done.sightings_before, **rows}
+    if done.edges:
+        out = io.StringIO()
+        writer = csv.writer(out, lineterminator="\n")
+        writer.writerows([_word(value) for value in astuple(one)] for one in done.edges)
+        yield {"type": "left_edges", "first": done.first, "table": out.getvalue()}
+
+
+def read_left(folder: Path, space: Geometry, state: BoundedState | None) -> tuple[Records, Records]:
+    """Return the keyframes that have left a map, and the poses at which something was seen from them.
+
+    Raises
+    ------
+    FormatError
+        Some of those that the map knows of are missing.
+    """
+    if state is None:
+        return no_records(space), no_records(space)
+    found: dict[str, list[Records]] = {"keyframes": [], "sightings": []}
+    kind, count = record_type(space), 0
+    for record in read_records(folder, CONDENSED, [], "left"):
+        if record["first"] >= state.keyframes:
+            break
+        for name, several in found.items():
+            several.append(np.frombuffer(base64.b64decode(record[name]), dtype=kind))
+        count += len(found["keyframes"][-1])
+    keyframes, sightings = (np.concatenate([no_records(space), *several]) for several in found.values())
+    if count != state.keyframes or len(sightings) != state.sightings:
+        raise FormatError(
+            f"{folder}: {CONDENSED}.mcap has {count} keyframes, and {state.keyframes} have left the map: the others "
+            f"are lost; graph_slam replay {folder} makes the map anew"
+        )
+    return keyframes, sightings
+
+
+def carried(folder: Path, state: BoundedState) -> Iterator[Record]:
+    """Return the records of what has left a map, one by one, for the run that goes on in it."""
+    for record in read_records(folder, CONDENSED, []):
+        if record["first"] < state.keyframes:
+            yield record
+
+
+def read_left_edges(folder: Path) -> Iterator[dict[str, str]]:
+    """Return the rows of the edges that have left the map of a run, by column."""
+    for record in read_records(folder, CONDENSED, [], "left_edges"):
+        yield from csv.DictReader(io.StringIO(record["table"]), COLUMNS)
+
+
+def _text(rows: Records) -> str:
+    return base64.b64encode(rows.tobytes()).decode()
+
+
+def _word(value: Any) -> Any:
+    return value.name.lower() if hasattr(value, "name") else value

@@ -1,0 +1,266 @@
+"""A map bounded by its area: visits that left the window are condensed, and graph and solver are compacted.
+
+Both are done at once, at keyframes that follow from the accepted measurements alone, and only while nothing goes on
+that could change a verdict: no search, no alarm, nothing held back undecided. So a replay condenses as the live run
+does.
+"""
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+
+import numpy as np
+
+from graph_slam_ros.measurements.counters import Counters
+from graph_slam_ros.slam.anchor import Anchor
+from graph_slam_ros.slam.backend import Backend
+from graph_slam_ros.slam.condensed_edges import CondensedEdge, archived
+from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
+from graph_slam_ros.slam.kidnap_detector import KidnapDetector
+from graph_slam_ros.slam.landmarks.landmark_frontend import LandmarkFrontend
+from graph_slam_ros.slam.lifelong.compaction import compact
+from graph_slam_ros.slam.lifelong.condenser import CHAIN, Cell, Condensed, Condenser, PlaceEdge
+from graph_slam_ros.slam.lifelong.removed import OldKeyframe, Records, record_type
+from graph_slam_ros.slam.solution import Solution
+from graph_slam_ros.solver import Solver
+from graph_slam_ros.typing import Array, Index, Numbers
+
+LONGEST = 60  # keyframes of a visit
+BATCH = 100  # keyframes that leave the window together
+_PATIENCE = 2 * BATCH  # keyframes that are out of the window while a visit waits
+_SOURCE = "map"  # of what is counted
+
+
+@dataclass(frozen=True, slots=True)
+class Condensation:
+    """The part of a map that left it at one time.
+
+    Attributes
+    ----------
+    keyframes, sightings : records of the keyframes that left, and of the poses at which something was seen from them
+    first : number of the first of these keyframes; sightings_before : how many such poses had left before
+    edges : of the graph that are gone, with what was decided of them
+    """
+
+    keyframes: Records
+    sightings: Records
+    first: int
+    sightings_before: int
+    edges: tuple[CondensedEdge, ...]
+
+
+class BoundedMap:
+    """Condenses what has left the window.
+
+    Parameters
+    ----------
+    backend : its graph, solver and ``bounded`` are changed; all other parts get the new ids
+    """
+
+    def __init__(
+        self,
+        backend: Backend,
+        frontend: KeyframeFrontend,
+        landmarks: LandmarkFrontend,
+        anchor: Anchor,
+        kidnaps: KidnapDetector,
+        solution: Solution,
+        counters: Counters,
+    ) -> None:
+        self._space, self._backend, self._frontend = frontend.config.space, backend, frontend
+        self._landmarks, self._anchor, self._kidnaps = landmarks, anchor, kidnaps
+        self._solution, self._counters = solution, counters
+        self.condenser, self.state = Condenser(self._space, backend.solver), backend.bounded
+        self.condenser.places = self.state.places
+        self._tried = 0  # keyframes at the last try
+
+    @property
+    def _is_due(self) -> bool:
+        """Return whether so many keyframes are out of the window that some should leave, and nothing else goes on."""
+        keyframes, map_ = self._frontend.path.keyframes, self._frontend.config.map
+        count = len(keyframes)
+        if not map_.condense or count - keyframes.first < map_.window_keyframes + BATCH or count == self._tried:
+            return False
+        return self._backend.is_quiet and self._kidnaps.is_quiet and self._solution.is_whole
+
+    def condense(self) -> Condensation | None:
+        """Condense what has left the window, if that is due; returns what has left the map.
+
+        A failure is counted, and changes nothing.
+        """
+        if not self._is_due:
+            return None
+        backend, keyframes = self._backend, self._frontend.path.keyframes
+        graph, values, places = backend.graph.copy(), backend.solver.values, _copies(self.state.places)
+        vertices, self._tried = backend.solver.vertices, len(keyframes)
+        try:
+            rows, end = self._condensed_visits()
+            backend.hand_over_condensed(len(keyframes) - 1)
+        except Exception as error:
+            self._counters.count(_SOURCE, type(error).__name__)
+            vars(backend.graph).update(vars(graph))
+            self.state.places.clear()
+            self.state.places.update(places)
+            _restart(backend.solver, vertices, values)
+            return None
+        return self._compacted(rows, end) if end > keyframes.first else None
+
+    # -- visits ------------------------------------------------------------------------------------------------------
+
+    def _condensed_visits(self) -> tuple[list[tuple[int, int, Numbers]], int]:
+        """Condense; returns (vertex, base, pose) of what left, in order of time, and the first number that stays."""
+        path, solver = self._frontend.path, self._backend.solver
+        keyframes, map_ = path.keyframes, self._frontend.config.map
+        ids, first = keyframes.ids, keyframes.first
+        limit = min(len(keyframes) - map_.window_keyframes, path.remembered_from) - first
+        at, rows = solver.estimate(ids), list[tuple[int, int, Numbers]]()
+        cells = list(map(tuple, np.floor(at[:, : self._space.dimensions] / map_.cell_m).astype(np.int64).tolist()))
+        k = 0
+        while k < limit:
+            end = k + self._length(ids[k : k + LONGEST].tolist(), cells[k : k + LONGEST])
+            if max(end, k + 1) > limit:
+                break
+            if end == k:  # it has an edge that cannot be condensed
+                rows.append(self._own(int(ids[k])))
+                self._counters.count(_SOURCE, "not_condensed")
+                k += 1
+                continue
+            visit = ids[k:end].tolist()
+            waits = limit - end < _PATIENCE
+            done = self.condenser.condense(visit, int(ids[end]), cells[k], self._ahead(int(ids[end])), waits=waits)
+            if done.how == "waits":
+                break
+            self._note_end(done.how)
+            rows += self._rows(visit, done)
+            k = end
+        solver.update()
+        return rows, first + k
+
+    def _note_end(self, how: str) -> None:
+        """Count how a visit ended."""
+        if how == "kept":
+            self._counters.count(_SOURCE, "not_condensed")
+        elif how == "composed":
+            self._counters.count(_SOURCE, "visit_lost")
+        else:
+            self._counters.count(_SOURCE, "visit_condensed")
+
+    def _length(self, ids: Sequence[int], cells: Sequence[tuple[int, ...]]) -> int:
+        """The number of keyframes, from the first of some on, that are in one cell and can be condensed."""
+        for k, (vertex, cell) in enumerate(zip(ids, cells, strict=True)):
+            if cell != cells[0] or not self._is_plain(vertex):
+                return k
+        return len(ids)
+
+    def _is_plain(self, vertex: int) -> bool:
+        """Return whether a keyframe has edges of odometry and sightings of points alone."""
+        graph, space = self._backend.graph, self._space
+        for edge in self._backend.solver.edges_on(vertex).tolist():
+            one = graph.edge(edge)
+            is_odometry = one.type is space.relative_pose and one.label in ("odometry", CHAIN)
+            is_sighting = len(one.vertices) == 2 and graph.kind_of(one.vertices[1]) is space.point
+            if one.weight and not (is_odometry or is_sighting):
+                return False
+        return True
+
+    def _ahead(self, vertex: int) -> set[int]:
+        """The landmarks that are seen from a keyframe and later ones."""
+        graph, out = self._backend.graph, set[int]()
+        if "landmarks" not in graph.labels:
+            return out
+        code = graph.labels.index("landmarks")
+        for table in graph.tables.values():
+            ends = table.vertices.values
+            if ends.shape[1] > 1:
+                is_one = (table.label.values == code) & (ends[:, 0] >= vertex) & (table.weight.values > 0.0)
+                out.update(ends[is_one, 1].tolist())
+        return out
+
+    def _own(self, vertex: int) -> tuple[int, int, Numbers]:
+        return vertex, vertex, self._space.identity
+
+    def _rows(self, visit: Sequence[int], done: Condensed) -> list[tuple[int, int, Numbers]]:
+        gone = {one.vertex: (one.vertex, one.base, one.T_base_vertex) for one in done.removed}
+        return [gone.get(vertex) or self._own(vertex) for vertex in visit]
+
+    # -- compaction --------------------------------------------------------------------------------------------------
+
+    def _compacted(self, rows: list[tuple[int, int, Numbers]], end: int) -> Condensation:
+        """Remove what has left from the graph, and give all parts the new ids."""
+        keyframes, graph = self._frontend.path.keyframes, self._backend.graph
+        lasting = graph.vertex_ids.of
+        left = np.zeros(len(rows), dtype=record_type(self._space))
+        for k, (vertex, base, pose) in enumerate(rows):
+            one = keyframes[keyframes.first + k]
+            left[k] = one.stamp_ns, lasting(vertex), lasting(base), pose, one.T_odom_base
+            if base == vertex:
+                self.state.old.append(OldKeyframe(keyframes.first + k, vertex, one.stamp_ns, one.T_odom_base))
+        seen, before = self._sightings(end), self.state.sightings
+        vertices, edges = self._staying(int(keyframes.ids[end - keyframes.first]))
+        gone = np.setdiff1d(np.arange(graph.edge_count), edges)
+        out = Condensation(
+            left, seen, keyframes.first, before, archived(self._backend, keyframes, gone, self._landmarks.map.names())
+        )
+        new = compact(self._backend.solver, vertices, edges)
+        self._backend.renumber(new.edges)
+        self._frontend.forget_before(end, new.vertices[keyframes.ids[end - keyframes.first :]])
+        self.condenser.renumber(new)
+        self.state.old[:] = [
+            OldKeyframe(one.number, int(new.vertices[one.vertex]), one.stamp_ns, one.T_odom_base)
+            for one in self.state.old
+        ]
+        self.state.keyframes, self.state.sightings = end, before + len(seen)
+        self._landmarks.renumber(new.vertices, new.edges)
+        self._anchor.restore()
+        self._backend.solver.update()
+        self._kidnaps.begin_anew(self._frontend.path.keyframes)
+        self._solution.renumber()
+        return out
+
+    def _staying(self, window: int) -> tuple[Index, Index]:
+        """The vertices and edges that stay; ``window`` is the first keyframe of the window, by its vertex.
+
+        Edges stay that count, and those of the window that may count again; all of a frozen map do.
+        """
+        backend, graph = self._backend, self._backend.graph
+        is_vertex = np.zeros(graph.vertex_count, dtype=bool)
+        is_vertex[backend.solver.vertices] = True
+        is_vertex[: backend.frozen] = True
+        is_edge = np.zeros(graph.edge_count, dtype=bool)
+        for table in graph.tables.values():
+            ids, ends = table.id.values, table.vertices.values
+            is_young = ((ends >= window) & is_vertex[ends]).any(axis=1)
+            is_edge[ids] = is_vertex[ends].all(axis=1) & ((table.weight.values > 0.0) | is_young)
+            is_edge[ids] |= ids < backend.frozen_edges
+        return np.flatnonzero(is_vertex), np.flatnonzero(is_edge)
+
+    def _sightings(self, end: int) -> Records:
+        """Records of the poses at which something was seen from the keyframes that leave."""
+        keyframes, poses = self._frontend.path.keyframes, self._frontend.sighting_poses
+        rows = np.flatnonzero(poses.ids < end)
+        out = np.zeros(len(rows), dtype=record_type(self._space))
+        out["stamp_ns"], out["of"], out["base"] = poses.stamps_ns[rows], poses.ids[rows], poses.ids[rows]
+        out["T_base"] = poses.poses[rows]
+        odom = keyframes.poses[poses.ids[rows] - keyframes.first]
+        if len(rows):
+            out["T_odom"] = np.stack(self._space.group.compose(tuple(odom.T), tuple(poses.poses[rows].T)), axis=-1)
+        return out
+
+
+def _copies(places: dict[Cell, list[PlaceEdge]]) -> dict[Cell, list[PlaceEdge]]:
+    return {
+        cell: [PlaceEdge(one.base, one.place, one.edge, dict(one.strikes)) for one in several]
+        for cell, several in places.items()
+    }
+
+
+def _restart(solver: Solver, vertices: Index, values: Array) -> None:
+    """Begin a solver anew with the graph as it is."""
+    held, fresh = solver.held.tolist(), Solver(solver.graph, solver.settings)
+    fresh.start_at(values)
+    fresh.add(vertices, np.arange(solver.graph.edge_count))
+    for vertex in held:
+        fresh.hold(vertex)
+    with suppress(Exception):
+        fresh.update()
+    vars(solver).update(vars(fresh))

@@ -1,0 +1,52 @@
+"""The records of landmarks: of the graph, or not determined yet; and of their sightings."""
+
+from dataclasses import dataclass, field
+
+from graph_slam_ros.measurements.types import Sighting
+from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
+from graph_slam_ros.slam.landmarks.triangulation import PositionHypothesis
+
+
+@dataclass(frozen=True, slots=True)
+class LandmarkEdge:
+    """One sighting of a landmark, and its edge."""
+
+    edge: int
+    topic: str
+    sighting: Sighting
+    where: PoseAtStamp
+
+
+@dataclass(slots=True)
+class Landmark:
+    """A landmark of the graph.
+
+    Attributes
+    ----------
+    is_unnamed : whether no sighting of it tells which it is
+    is_tentative : whether it is too new to be believed: it may be given up
+    retired_ns : stamp since which it is known to be gone; 0 where it is there
+    seen : its sightings that do not tell which it is: they may change hands
+    stamps : of these; a landmark is never seen twice at once
+    """
+
+    name: str
+    vertex: int
+    is_unnamed: bool = False
+    is_tentative: bool = False
+    sightings: int = 0
+    first_seen_ns: int = 0
+    last_seen_ns: int = 0
+    retired_ns: int = 0
+    seen: list[LandmarkEdge] = field(default_factory=list)
+    stamps: set[int] = field(default_factory=set)
+
+
+@dataclass(slots=True)
+class UndeterminedLandmark:
+    """A landmark without a vertex yet: its sightings, its possible positions, and why they are not enough."""
+
+    topic: str
+    seen: list[tuple[PoseAtStamp, Sighting]] = field(default_factory=list)
+    places: list[PositionHypothesis] = field(default_factory=list)
+    reason: str = ""

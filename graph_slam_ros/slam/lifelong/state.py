@@ -1,0 +1,23 @@
+"""The state of a condensed map that is not in its graph."""
+
+from dataclasses import dataclass, field
+
+from graph_slam_ros.slam.lifelong.condenser import Cell, PlaceEdge
+from graph_slam_ros.slam.lifelong.removed import OldKeyframe
+
+
+@dataclass(slots=True)
+class BoundedState:
+    """The state of a condensed map that is not in its graph.
+
+    Attributes
+    ----------
+    places : by cell
+    old : the keyframes in the graph that are in no list of keyframes any more, in order of time
+    keyframes, sightings : how many have left the map
+    """
+
+    places: dict[Cell, list[PlaceEdge]] = field(default_factory=dict)
+    old: list[OldKeyframe] = field(default_factory=list)
+    keyframes: int = 0
+    sightings: int = 0

@@ -1,0 +1,233 @@
+"""The pipeline with ``map.condense``: a map whose size follows its area, live, replayed, killed and taken up again."""
+
+import tracemalloc
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from benchmarks.lifelong import config, hall, measurements, rms
+from graph_slam_ros.errors import ConfigError
+from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
+from graph_slam_ros.graph.place import LABEL
+from graph_slam_ros.runs.condensed_map import read_left, read_left_edges
+from graph_slam_ros.runs.folder import changed_since
+from graph_slam_ros.runs.journal import MAP, parts_of, read_measurements
+from graph_slam_ros.runs.map_journal import read_map
+from graph_slam_ros.runs.recorder import RunRecorder
+from graph_slam_ros.runs.restore import record_run, recover
+from graph_slam_ros.runs.tables import removed_path
+from graph_slam_ros.runs.trajectory import read_tum
+from graph_slam_ros.slam import Config, Control, GraphSlam
+from graph_slam_ros.slam.lifelong.condenser import CHAIN
+from graph_slam_ros.slam.robust.ledger import Verdict
+
+KEYFRAMES, WINDOW = 700, 60
+SPACES = {"plane": PLANAR, "space": SPATIAL}
+
+
+def bounded(space=PLANAR, **values):
+    return config(space, map_condense=True, map_window_keyframes=WINDOW, **values)
+
+
+def driven(world, settings, until=None):
+    """The pipeline after a drive, and what has left its map."""
+    slam, left = GraphSlam(settings), []
+    for m in list(measurements(world))[:until]:
+        update = slam.process(m)
+        left += [update.condensed] if update.condensed is not None else []
+    return slam, left
+
+
+def true_path(world, count):
+    return np.array([pose[: world.space.dimensions] for pose in world.poses[:count]])
+
+
+def whole_path(slam, left):
+    before = np.concatenate([one.keyframes for one in left])
+    return np.concatenate((removed_path(slam, before), slam.trajectory()))[:, : slam.space.dimensions]
+
+
+def landmarks(world, slam):
+    vertices = [mark.vertex for mark in slam.landmarks.values()]
+    return slam.solver.estimate(vertices), world.points[[int(name[1:]) for name in slam.landmarks]]
+
+
+@pytest.fixture(scope="module", params=list(SPACES))
+def both(request):
+    world = hall(2, KEYFRAMES, SPACES[request.param])
+    return world, GraphSlamAfter(world, config(world.space)), GraphSlamAfter(world, bounded(world.space))
+
+
+class GraphSlamAfter:
+    def __init__(self, world, settings):
+        self.slam, self.left = driven(world, settings)
+
+
+def test_the_map_is_small_and_as_good_and_the_whole_path_is_there(both):
+    world, whole, small = both
+    assert small.slam.first_keyframe > 0.6 * KEYFRAMES
+    assert len(small.slam.solver.vertices) < 0.35 * len(whole.slam.solver.vertices)
+    assert small.slam.graph.edge_count == len(small.slam.ledger) < 0.3 * whole.slam.graph.edge_count
+    path = whole_path(small.slam, small.left)
+    assert len(path) == len(whole.slam.keyframes) == len(small.slam.keyframes)
+    true = true_path(world, len(path))
+    assert rms(path, true) < 1.25 * rms(whole.slam.trajectory()[:, : world.space.dimensions], true)
+    assert rms(*landmarks(world, small.slam)) < 1.25 * rms(*landmarks(world, whole.slam))
+
+
+def test_records_of_what_left_have_no_gap_and_each_base_is_there(both):
+    _, whole, small = both
+    for before, after in pairwise(small.left):
+        assert after.first == before.first + len(before.keyframes)
+        assert after.sightings_before == before.sightings_before + len(before.sightings)
+    records = np.concatenate([one.keyframes for one in small.left])
+    assert records["stamp_ns"].tolist() == whole.slam.keyframes.stamps_ns[: len(records)].tolist()
+    assert records["T_odom"] == pytest.approx(whole.slam.keyframes.poses[: len(records)])
+    sightings = sum(len(one.sightings) for one in small.left) + len(small.slam.sighting_poses)
+    assert sightings == len(whole.slam.sighting_poses)
+
+
+def test_ids_last_and_are_never_used_twice(both):
+    _, whole, small = both
+    graph = small.slam.graph
+    for ids, count in ((graph.edge_ids, graph.edge_count), (graph.vertex_ids, graph.vertex_count)):
+        lasting = ids.of_all(np.arange(count))
+        assert (np.diff(lasting) > 0).all()
+        assert [ids.find(one) for one in lasting.tolist()] == list(range(count))
+    gone = [edge.edge for one in small.left for edge in one.edges]
+    assert len(set(gone)) == len(gone)
+    assert not set(gone) & set(graph.edge_ids.of_all(np.arange(graph.edge_count)).tolist())
+    kept = [e for e in range(graph.edge_count) if graph.label_of(e) not in (LABEL, CHAIN)]
+    assert len(gone) + len(kept) == whole.slam.graph.edge_count  # each measurement once, there or gone
+    assert {one.became for part in small.left for one in part.edges} <= {"condensed", "expired"}
+    assert all(e.landmark for one in small.left for e in one.edges if e.label == "landmarks")
+
+
+def test_places_hold_their_landmarks_and_verdicts_go_on(both):
+    _, _, small = both
+    slam = small.slam
+    places = [one for several in slam.bounded.places.values() for one in several]
+    assert len(places) == len(slam.graph.edges_of(LABEL)) > 5
+    for one in places:
+        edge = slam.graph.edge(one.edge)
+        assert edge.weight == 1.0
+        assert edge.vertices == (one.base, *one.place.members)
+    verdicts = slam.ledger.verdict.values[slam.graph.edges_of("landmarks")]
+    assert (verdicts != Verdict.NOT_EVALUATED).all()
+    assert not slam.alarms
+
+
+def test_a_drive_within_the_window_gives_the_same_bytes_as_without():
+    world = hall(4, WINDOW + 90)
+    (one, left), (other, _) = driven(world, bounded()), driven(world, config(PLANAR))
+    assert not left
+    assert one.solver.values.tobytes() == other.solver.values.tobytes()
+    assert one.ledger.statistic.values.tobytes() == other.ledger.statistic.values.tobytes()
+
+
+def test_memory_follows_the_area():
+    """From keyframes 500 to 700 to 1,200 to 1,400; without condensing, a keyframe takes several kilobytes."""
+    world, slam, early, late = hall(1, 1400), GraphSlam(bounded()), [], []
+    tracemalloc.start()
+    try:
+        for m in measurements(world):
+            slam.process(m)
+            among = early if 500 < len(slam.keyframes) < 700 else late if len(slam.keyframes) > 1200 else []
+            among.append(tracemalloc.get_traced_memory()[0])
+    finally:
+        tracemalloc.stop()
+    assert min(late) - min(early) < 700 * 1000
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    world, folder = hall(3, 500), tmp_path_factory.mktemp("condense") / "run"
+    drive = [*measurements(world), Control("end"), Control("optimize")]
+    slam, summary = record_run(folder, bounded(), drive, [])
+    return world, folder, slam, summary
+
+
+def test_a_replay_condenses_as_the_live_run_did(recorded, tmp_path):
+    _, folder, slam, _ = recorded
+    again, _ = record_run(tmp_path / "again", bounded(), read_measurements(folder, []), [])
+    assert again.first_keyframe == slam.first_keyframe > 0
+    assert again.solver.values.tobytes() == slam.solver.values.tobytes()
+    for name in ("path.tum", "landmarks.csv", "ledger.csv", "sightings.tum", "graph.g2o", "graph_vertices.csv"):
+        assert (tmp_path / "again" / name).read_bytes() == (folder / name).read_bytes(), name
+    ours, theirs = (read_left(at, PLANAR, slam.bounded) for at in (folder, tmp_path / "again"))
+    assert [one.tobytes() for one in ours] == [one.tobytes() for one in theirs]
+
+
+def test_the_run_folder_has_the_whole_path(recorded):
+    world, folder, _, summary = recorded
+    assert summary["keyframes"] == 500
+    path = read_tum(folder / "path.tum")
+    assert len(path.stamps_s) == len(read_tum(folder / "path_odometry.tum").stamps_s) == 500
+    assert rms(path.poses[:, :2], true_path(world, 500)) < 0.1
+    assert len(read_tum(folder / "sightings.tum").stamps_s) == len(read_tum(folder / "odometry.tum").stamps_s)
+    assert changed_since(folder) == []
+    assert {row["became"] for row in read_left_edges(folder)} == {"condensed"}
+
+
+def test_the_map_on_disk_is_the_map_in_memory_and_one_part(recorded):
+    _, folder, slam, _ = recorded
+    losses = []
+    state = read_map(folder, losses)
+    assert losses == []
+    assert [file.name for file in parts_of(folder, MAP)] == ["map.mcap"]
+    assert state.first_keyframe == slam.first_keyframe
+    assert [one.vertex for one in state.keyframes] == slam.keyframes.ids.tolist()
+    assert (state.bounded.old, state.bounded.sightings) == (slam.bounded.old, slam.bounded.sightings)
+    assert list(state.bounded.places) == list(slam.bounded.places)
+    for mine, theirs in zip(state.graph.tables.values(), slam.graph.tables.values(), strict=True):
+        assert mine.type is theirs.type
+        for name in ("id", "vertices", "measured", "sqrt_information", "weight"):
+            assert getattr(mine, name).values.tobytes() == getattr(theirs, name).values.tobytes()
+    assert state.ledger.verdict.values.tolist() == slam.ledger.verdict.values.tolist()
+    for one, other in zip(*(flat(of) for of in (state.bounded, slam.bounded)), strict=True):
+        assert one.place.information.tobytes() == other.place.information.tobytes()
+
+
+def flat(state):
+    return [one for several in state.places.values() for one in several]
+
+
+def test_a_map_that_is_taken_up_again_goes_on_condensing(recorded, tmp_path):
+    _, folder, slam, _ = recorded
+    losses = []
+    recover(folder, tmp_path / "again")
+    assert (
+        read_tum(tmp_path / "again" / "path.tum").stamps_s.tolist() == read_tum(folder / "path.tum").stamps_s.tolist()
+    )
+    start = read_map(tmp_path / "again", losses)
+    start.continues_with = "odom"
+    longer = list(measurements(hall(3, 900)))
+    at_ns = slam.keyframes[-1].stamp_ns
+    rest = [m for m in longer if m.stamp_ns > at_ns]
+    gone_on, summary = record_run(tmp_path / "more", bounded(), [*rest, Control("end")], losses, start)
+    assert losses == []
+    assert gone_on.first_keyframe > slam.first_keyframe
+    assert len(read_tum(tmp_path / "more" / "path.tum").stamps_s) == summary["keyframes"] > 850
+    again = read_map(tmp_path / "more", losses, start_only=True)
+    assert again is not None and again.first_keyframe == slam.first_keyframe
+    assert read_map(tmp_path / "more", losses).first_keyframe == gone_on.first_keyframe
+    assert losses == []
+
+
+def test_what_cannot_be_condensed_yet_is_refused_by_name():
+    for name, value in (
+        ("landmarks.association", "joint"),
+        ("odometry.fusion", "parallel"),
+        ("calibrate.groups", "auto"),
+    ):
+        with pytest.raises(ConfigError, match=f"map.condense: not with {name}={value} yet"):
+            Config.from_mapping({"map.condense": True, name: value})
+
+
+def test_a_run_without_what_left_its_map_says_so(recorded, tmp_path):
+    *_, slam, _ = recorded
+    recorder = RunRecorder(tmp_path / "other", bounded())
+    recorder.close()
+    with pytest.raises(Exception, match=r"condensed\.mcap has 0 keyframes"):
+        read_left(tmp_path / "other", PLANAR, slam.bounded)
