@@ -15,7 +15,7 @@ from graph_slam_ros.messages.inputs.source import InputContext
 from graph_slam_ros.messages.inputs.transforms import pose
 
 _DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # sensor_msgs/PointField
-_CLASSES = "class_id", "class", "label"
+_CLASSES = "class_id", "class"
 _FIELDS = (
     *("x", "y", "z", "range", "bearing", "elevation", "id", "sigma", "sigma_bearing"),
     *("size", "diameter", "radius", *_CLASSES),
@@ -29,7 +29,7 @@ def point_cloud(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
 
     ``x``, ``y`` and perhaps ``z``; or ``range``, ``bearing`` (and ``elevation``), or some of these, in the sensor's
     frame; ``id`` where it is known; ``sigma`` (m, or rad of bearings alone) and ``sigma_bearing``
-    (rad); ``size``, ``diameter`` or ``radius`` (m) of the landmark; ``class_id``, ``class`` or ``label``, a number.
+    (rad); ``size``, ``diameter`` or ``radius`` (m) of the landmark; ``class_id`` or ``class``, a number.
     """
     there = {f.name for f in m.fields} & set(_FIELDS)
     angles = [name for name in ("bearing", "elevation") if name in there]

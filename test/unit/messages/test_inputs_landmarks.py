@@ -63,7 +63,7 @@ def test_the_size_of_a_point_without_identity_is_that_of_its_field(name, size):
     assert only(heard(scanner(sigma_rad=0.1), "scan", polar)).size == size
 
 
-@pytest.mark.parametrize("name", ["class_id", "class", "label"])
+@pytest.mark.parametrize("name", ["class_id", "class"])
 def test_the_class_of_a_point_without_identity_is_that_of_its_field(name):
     at = cloud([("x", "f8"), ("y", "f8"), (name, "i2")], (1.0, 2.0, 4), (3.0, 4.0, -1))
     assert [s.sort for s in heard(scanner(sigma_m=0.3), "scan", at).sightings] == ["4", ""]
