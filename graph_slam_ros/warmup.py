@@ -45,10 +45,19 @@ from graph_slam_ros.lie import se2, se3
 from graph_slam_ros.lie.jit import CACHE_DIR
 from graph_slam_ros.progress import report
 from graph_slam_ros.solver import METHODS, Settings, Solver, covariance
-from graph_slam_ros.solver.clique_tree import incremental, indices, numeric, ordering, pools, substitution, symbolic
+from graph_slam_ros.solver.clique_tree import (
+    advance,
+    incremental,
+    indices,
+    numeric,
+    ordering,
+    pools,
+    substitution,
+    symbolic,
+)
 from graph_slam_ros.solver.clique_tree.storage import empty_tree
 
-_KERNELS = 147  # about so many there are; a test compares it with the cache
+_KERNELS = 155  # about so many there are; a test compares it with the cache
 _SHARED = "shared"  # file that is there when the kernels that two parts call are in the cache
 
 
@@ -255,7 +264,7 @@ def _structure_kernels() -> list[_Kernel]:
     return [
         (ordering.move_tail, (tree, index, index)),
         (ordering.dissect, (tree, number)),
-        (incremental._regroup, (tree, index, index, real, real)),
+        (advance._regroup, (tree, index, index, real, real)),
         (incremental.relinearize, (tree, index, real, real)),
         (pools.compact, (tree,)),
     ]
@@ -268,6 +277,7 @@ def _number_kernels() -> list[_Kernel]:
         (numeric.eliminate, (tree, index, real)),
         (substitution.substitute, (tree, index, real, real, real, real)),
         (incremental.solve, (tree, index, real, real, real, real)),
+        (advance.advance, (index, index, index, index, types.boolean, index, index, types.float64[::1], *[real] * 4)),
         (covariance.marginals, (tree, index)),
         (covariance.joint, (tree, index)),
     ]

@@ -4,6 +4,7 @@ import numpy as np
 
 from graph_slam_ros.graph import R1, R2, SE2, EdgeType
 from graph_slam_ros.solver.clique_tree import storage as t
+from graph_slam_ros.solver.clique_tree.pointers import pointers_of
 
 # everything is linearised anew until nothing moves: the optimum of all there is
 EXACT = {
@@ -52,6 +53,9 @@ def check_tree(solver, *, regions_separate=False):
     """
     tree = solver._tree
     vertex, clique, state = tree.vertex, tree.clique, tree.state
+    assert np.array_equal(solver._pointers, pointers_of(tree)), "kernels get arrays that are gone"
+    assert min(map(len, (tree.vertex, tree.listed, solver._inside, solver._held))) >= solver._vertices
+    assert min(map(len, (tree.edge, solver._edge_inside))) >= solver.graph.edge_count
     free = np.flatnonzero(vertex[: solver._vertices, t.FREE] == 1).tolist()
     key = vertex[:, t.KEY]
     assert state[t.TAIL_END] <= len(tree.tail)

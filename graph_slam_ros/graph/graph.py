@@ -244,8 +244,9 @@ class Graph:
             itself = at[:, slot] == at[:, other]
             if itself.any():
                 raise GraphSlamError(f"{edge.name}: edge from vertex {int(at[itself, slot][0])} to itself")
-        for slot, kinds in enumerate(edge.accepts):
-            fits = np.array([kind in kinds for kind in self.kinds])[self.kind.values[at[:, slot]]]
+        accepted = [[kind in kinds for kind in self.kinds] for kinds in edge.accepts]
+        for slot, kinds in enumerate(edge.accepts if not all(map(all, accepted)) else ()):
+            fits = np.array(accepted[slot])[self.kind.values[at[:, slot]]]
             if not fits.all():
                 vertex = int(at[~fits, slot][0])
                 raise GraphSlamError(

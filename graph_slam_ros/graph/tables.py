@@ -34,19 +34,20 @@ class Column:
 
         Half a record would shift all later ones.
         """
-        ends = [column._put(rows, count) for column, rows, count in parts]
-        for (column, _, _), end in zip(parts, ends, strict=True):
-            column._length = end
+        for column, rows, count in parts:
+            begin = column._length
+            end = begin + count
+            if end > len(column._buffer):
+                column._lengthen(end)
+            column._buffer[begin:end] = rows  # beyond the end, where nothing is visible yet
+        for column, _, count in parts:
+            column._length += count
 
-    def _put(self, rows: ArrayLike, count: int) -> int:
-        """Write beyond the end, where nothing is visible yet; return the new end."""
-        end = self._length + count
-        if end > len(self._buffer):
-            grown = np.empty((max(end, 2 * len(self._buffer)), *self._buffer.shape[1:]), dtype=self._buffer.dtype)
-            grown[: self._length] = self.values
-            self._buffer = grown
-        self._buffer[self._length : end] = rows
-        return end
+    def _lengthen(self, rows: int) -> None:
+        """Make room for at least so many rows."""
+        grown = np.empty((max(rows, 2 * len(self._buffer)), *self._buffer.shape[1:]), dtype=self._buffer.dtype)
+        grown[: self._length] = self.values
+        self._buffer = grown
 
 
 @dataclass(slots=True, eq=False)

@@ -13,7 +13,8 @@ from graph_slam_ros.graph.losses import weight_and_cost
 from graph_slam_ros.graph.tables import EdgeTable
 from graph_slam_ros.lie.jit import kernel
 from graph_slam_ros.solver.clique_tree.numeric import add_to_diagonal, clear_block
-from graph_slam_ros.solver.clique_tree.storage import BLOCK, Tree
+from graph_slam_ros.solver.clique_tree.pointers import tree_of
+from graph_slam_ros.solver.clique_tree.storage import BLOCK, NOTHING, Tree
 from graph_slam_ros.solver.report import ClassCost
 from graph_slam_ros.typing import Array, Index
 
@@ -130,6 +131,27 @@ def linearize(graph: Graph, x: Array, rows: Mapping[EdgeTable, Index], losses: L
             yield Block(table, some, residual, jacobian, chi2, cost)
 
 
+def linearize_into(pointers: Index, graph: Graph, x: Array, rows: Mapping[EdgeTable, Index], losses: Losses) -> None:
+    """Linearise rows of tables at the stored values x, and put them into the tree (``pointers_of``).
+
+    Raises
+    ------
+    GraphSlamError
+        The cost of an edge is not finite.
+    """
+    offset = graph.offset.values
+    for table, chosen in rows.items():
+        ids, columns = table.id.values, (table.sqrt_information.values, table.weight.values)
+        for first in range(0, len(chosen), CHUNK):
+            some = chosen[first : first + CHUNK] if len(chosen) > CHUNK else chosen
+            at, measured = _gather(some, table.vertices.values, offset, table.measured.values)
+            residual, jacobian = table.type.linearize(x, at, measured)
+            loss = losses.codes(table, some), losses.kind, losses.scale
+            bad = _whiten_and_store(pointers, ids, some, residual, jacobian, *columns, *loss)
+            if bad != NOTHING:
+                _refuse_row(table, bad)
+
+
 def linearized(graph: Graph, x: Array, edge: EdgeType, vertices: Sequence[int], measured: Array) -> tuple[Array, Array]:
     """Residual (m,) and Jacobian (m, width) of one measurement (p,) between vertices (k,) at the stored values x."""
     residual, jacobian = edge.linearize(x, graph.offset.values[list(vertices)][None], measured[None])
@@ -176,6 +198,34 @@ def store(t: Tree, rows: Index, ids: Index, residual: Array, jacobian: Array) ->
         add_to_diagonal(vertex, edge, link, e, block, diagonal)
 
 
+@kernel
+def _whiten_and_store(
+    pointers: Index,
+    ids: Index,
+    rows: Index,
+    residual: Array,
+    jacobian: Array,
+    sqrt_information: Array,
+    weight: Array,
+    loss: Index,
+    loss_kind: Index,
+    loss_scale: Array,
+) -> int:
+    """Whiten edges and add them to the tree; or add none, and return the row of one whose cost is not finite."""
+    _, cost = _whiten(rows, residual, jacobian, sqrt_information, weight, loss, loss_kind, loss_scale)
+    total, worst = 0.0, 0
+    for k in range(len(cost)):
+        total += cost[k]
+        if not np.isfinite(cost[k]):
+            return rows[k]
+        if cost[k] > cost[worst]:
+            worst = k
+    if not np.isfinite(total):
+        return rows[worst]
+    store(tree_of(pointers), rows, ids, residual, jacobian)
+    return NOTHING
+
+
 def information(graph: Graph, x: Array, rows: Mapping[EdgeTable, Index], free: Index, losses: Losses) -> Array:
     """H as a dense matrix over some vertices, in this order."""
     dof = np.array([graph.kind_of(v).dof for v in free.tolist()], dtype=np.int64)
@@ -207,8 +257,11 @@ def refuse_nonfinite(block: Block) -> None:
     if isfinite(block.cost[0] if len(block.cost) == 1 else block.cost.sum()):
         return
     bad = np.flatnonzero(~np.isfinite(block.cost))
-    row = block.rows[bad[0] if len(bad) else int(block.cost.argmax())]
-    table = block.table
+    _refuse_row(block.table, block.rows[bad[0] if len(bad) else int(block.cost.argmax())])
+
+
+def _refuse_row(table: EdgeTable, row: int) -> None:
+    """Raise GraphSlamError for an edge whose cost is not finite."""
     raise GraphSlamError(
         f"edge {int(table.id.values[row])} ({table.type.name}) between vertices"
         f" {table.vertices.values[row].tolist()}: its chi2 is not finite"

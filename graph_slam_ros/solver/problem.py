@@ -1,7 +1,7 @@
 """The problem: which vertices and edges of a graph are solved for, and the edits that the next update integrates."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,6 +13,7 @@ from graph_slam_ros.graph.tables import EdgeTable
 from graph_slam_ros.solver.batch import Settings
 from graph_slam_ros.solver.clique_tree import incremental
 from graph_slam_ros.solver.clique_tree.numeric import accept_steps
+from graph_slam_ros.solver.clique_tree.pointers import pointers_of
 from graph_slam_ros.solver.clique_tree.storage import (
     ACTIVE,
     BLOCKS_TOP,
@@ -49,6 +50,9 @@ class Problem:
         self.graph = graph
         self.settings = settings or Settings()
         self._tree = empty_tree()
+        self._pointers = pointers_of(self._tree)
+        self._shapes = np.zeros((0, 3), dtype=np.int64)  # of the graph's kinds
+        self._room = 0, 0  # for vertices and their numbers
         self._vertices = 0  # of the graph, that have a record in the tree
         self._inside = np.zeros(0, dtype=bool)  # vertices of the problem
         self._held = np.zeros(0, dtype=bool)
@@ -205,28 +209,46 @@ class Problem:
         count = len(graph.kind)
         if count > known:
             size = len(graph.initial)
-            self._tree = with_room(self._tree, vertex=count, region=2 * count, tail=2 * count, listed=count)
-            self._tree = with_room(self._tree, diagonal=size, step=size, reference=size, value=size, estimate=size)
-            self._inside, self._held = longer(self._inside, count), longer(self._held, count)
-            self._kept = longer(self._kept, len(self._tree.estimate))
+            if count > self._room[0] or size > self._room[1]:
+                self._make_room(vertex=count, region=2 * count, tail=2 * count, listed=count)
+                self._make_room(diagonal=size, step=size, reference=size, value=size, estimate=size)
+                self._inside, self._held = longer(self._inside, count), longer(self._held, count)
+                self._kept = longer(self._kept, len(self._tree.estimate))
+                self._room = self._room_now()
             first = int(graph.offset.values[known])
             self._kept[first:size] = graph.initial.values[first:]
-            shapes = np.array([(k.dof, k.size, _KINDS.get(k, VECTOR)) for k in graph.kinds])
+            if len(self._shapes) != len(graph.kinds):
+                self._shapes = np.array([(k.dof, k.size, _KINDS.get(k, VECTOR)) for k in graph.kinds])
+            shapes = self._shapes[graph.kind.values[known:]]
             incremental.append_vertices(
-                self._tree, known, graph.offset.values[known:], graph.initial.values, shapes[graph.kind.values[known:]]
+                self._pointers, known, graph.offset.values[known:], graph.initial.values, shapes
             )
             self._vertices = count
-        if len(graph.row_of_edge) > len(self._edge_inside):
-            self._tree = with_room(self._tree, edge=graph.edge_count)
+        if len(graph.row_of_edge) > min(len(self._edge_inside), len(self._tree.edge)):
+            self._make_room(edge=graph.edge_count)
             self._edge_inside = longer(self._edge_inside, graph.edge_count)
+
+    def _room_now(self) -> tuple[int, int]:
+        """Return for how many vertices, and numbers of theirs, there is room."""
+        t = self._tree
+        vertices = t.vertex, t.listed, self._inside, self._held, t.tail[::2], t.region[::2]
+        return min(map(len, vertices)), min(map(len, (t.diagonal, t.step, t.reference, t.value, t.estimate)))
+
+    def _make_room(self, **lengths: int) -> None:
+        """Let arrays of the tree have at least so many rows."""
+        try:
+            self._tree = with_room(self._tree, **lengths)
+        finally:  # some may have grown in place
+            self._pointers = pointers_of(self._tree)
 
     def _record(self, table: EdgeTable, rows: Index) -> None:
         """Link edges to their vertices; they are not in the structure yet."""
         state, width = self._tree.state, sum(table.type.dofs)
         links = int(state[LINKS]) + len(rows) * len(table.type.accepts)
         blocks = int(state[BLOCKS_TOP]) + len(rows) * width * (width + 1)
-        self._tree = with_room(self._tree, link=links, blocks=blocks)
-        incremental.append_edges(self._tree, rows, table.id.values, table.vertices.values)
+        if links > len(self._tree.link) or blocks > len(self._tree.blocks):
+            self._make_room(link=links, blocks=blocks)
+        incremental.append_edges(self._pointers, rows, table.id.values, table.vertices.values)
 
     def _unknowns(self) -> Index:
         return np.flatnonzero(self._tree.vertex[: self._vertices, FREE])
@@ -269,25 +291,30 @@ class Problem:
         return vertices, edges
 
     @contextmanager
-    def _entering(self, vertices: Index, edges: Index) -> Iterator[None]:
-        """Let vertices and edges enter; an error undoes it: they are pending again, and the estimate stays.
+    def _transaction(self, vertices: Index, edges: Index) -> Iterator[None]:
+        """Solve with vertices and edges that enter; an error undoes it: they are pending again, and the estimate stays.
 
         After an error the tree is rebuilt at the next update, because its numbers are half old and half new.
         """
         pending, tree = self._pending, self._tree
         substituted = int(tree.state[SUBSTITUTED])
         try:
-            incremental.enter(tree, vertices, edges)
+            incremental.enter_newest(self._pointers, vertices, edges)
             yield
         except BaseException:
             pending.broken = True
             if tree.state[SUBSTITUTED] == substituted:
-                self._estimates()  # what waits still can be solved
+                with suppress(MemoryError):
+                    self._estimates()  # what waits still can be solved
             tree.state[TAIL_FIRST] = tree.state[TAIL_END] = 0  # it is filled anew with the tree
             self._set_estimate(self._kept)
+            self._after_error()
             incremental.leave(self._tree, vertices, edges)  # the last: it needs memory
             raise
         self._pending = PendingChanges()
+
+    def _after_error(self) -> None:
+        """Undo what a solution keeps besides."""
 
     def _fix_at_estimate(self, one: Index) -> None:
         """Remove a vertex from the unknowns; it stays at its estimate."""

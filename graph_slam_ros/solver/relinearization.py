@@ -1,10 +1,9 @@
 """The schedule of relinearisation: when vertices are searched for large steps."""
 
-import numpy as np
-
 from graph_slam_ros.solver.pending import NONE
 from graph_slam_ros.typing import Index
 
+NOT_YET, MAYBE, SURELY = range(3)
 BY_FAR = 10.0  # times the threshold: steps that are linearised anew at once
 
 
@@ -23,15 +22,18 @@ class RelinearizationSchedule:
         """Let the next update search all vertices."""
         self._updates = every
 
-    def is_due(self, every: int, *, closes: bool) -> bool:
-        """Return whether all vertices that moved are to be searched: every so many updates, or sooner at a closure."""
+    def is_due(self, every: int) -> int:
+        """Return whether all vertices that moved are to be searched: SURELY, NOT_YET, or MAYBE, at a closure."""
         self._updates += 1
-        if self._updates * (3 if closes else 2) < 2 * every:
-            return False
-        self._updates = 0
-        return True
+        if self._updates >= every:
+            return SURELY
+        return MAYBE if 3 * self._updates >= 2 * every else NOT_YET
 
-    def after_update(self, solved: Index) -> Index:
-        """Return the vertices to search for steps that are large by far: those that this update solved."""
+    def begin(self) -> None:
+        """Count from the present search."""
+        self._updates = 0
+
+    def unseen(self) -> Index:
+        """Return the vertices that the last update solved after its last search; once."""
         unseen, self._unseen = self._unseen, NONE
-        return np.union1d(solved, unseen) if len(unseen) else solved
+        return unseen

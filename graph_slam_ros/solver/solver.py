@@ -11,6 +11,9 @@ from graph_slam_ros.graph import Graph
 from graph_slam_ros.graph.graph import whole_numbers
 from graph_slam_ros.solver.batch import BatchProblem, Settings, minimise
 from graph_slam_ros.solver.clique_tree import incremental
+from graph_slam_ros.solver.clique_tree.advance import DISSECT, DONE, advance, more_room, restructure
+from graph_slam_ros.solver.clique_tree.ordering import dissect
+from graph_slam_ros.solver.clique_tree.pointers import pointers_of
 from graph_slam_ros.solver.clique_tree.pools import compact
 from graph_slam_ros.solver.clique_tree.storage import AFFECTED, CLIQUE, DOF, NOTHING, SUBSTITUTED
 from graph_slam_ros.solver.clique_tree.substitution import forget, read, show
@@ -23,15 +26,14 @@ from graph_slam_ros.solver.linearization import (
     costs,
     information,
     linearize,
-    refuse_nonfinite,
+    linearize_into,
     residuals_of,
     rows_of,
-    store,
 )
 from graph_slam_ros.solver.loss_stages import LossStages
 from graph_slam_ros.solver.pending import NONE
 from graph_slam_ros.solver.problem import Problem, existing
-from graph_slam_ros.solver.relinearization import BY_FAR, RelinearizationSchedule
+from graph_slam_ros.solver.relinearization import BY_FAR, MAYBE, SURELY, RelinearizationSchedule
 from graph_slam_ros.solver.report import Change, Report
 from graph_slam_ros.typing import Array, Index
 
@@ -77,16 +79,16 @@ class Solver(Problem):
         eliminated = int(self._tree.state[AFFECTED])
         arriving = self._arriving()
         with self._transaction(*arriving):
-            solved, linearized = self._integrate(*arriving)
+            solved, far, linearized = self._integrate(*arriving)
             if self._unfinished:
-                solved = self._continue_batch()
+                solved, far = self._continue_batch()
             found = [solved]
-            for edges, these in self._relinearized(solved):
+            for edges, these in self._relinearized(far):
                 linearized += edges
                 found.append(these)
         if self.settings.at_once:
             self._estimates()
-        else:
+        elif len(found) > 1:
             for these in found:
                 show(self._tree, self._kept, these)
         return Change(int(self._tree.state[AFFECTED]) - eliminated, linearized, sum(map(len, found)))
@@ -159,7 +161,7 @@ class Solver(Problem):
         graph = self.graph
         size = graph.kind_of(existing(at[:1], self._vertices, "vertex")[0]).size
         tolerances = self.settings.tolerance, self.settings.tolerance_sigmas
-        unfit, out = read(self._tree, self._kept, graph.kind.values, graph.offset.values, at, size, *tolerances)
+        unfit, out = read(self._pointers, self._kept, graph.kind.values, graph.offset.values, at, size, *tolerances)
         if unfit != NOTHING:
             existing(at, self._vertices, "vertex")
             raise GraphSlamError("estimate: the vertices are not of one kind")
@@ -257,15 +259,9 @@ class Solver(Problem):
                 raise GraphSlamError("a covariance was asked for within an update")
         return wanted
 
-    @contextmanager
-    def _transaction(self, vertices: Index, edges: Index) -> Iterator[None]:
-        """Solve with vertices and edges that enter; an error undoes it, and the estimate stays."""
-        try:
-            with self._entering(vertices, edges):
-                yield
-        except BaseException:
-            self._stages.young, self._numbers_current = NONE, True
-            raise
+    def _after_error(self) -> None:
+        """Forget what an update that failed knew of stages and numbers."""
+        self._stages.young, self._numbers_current = NONE, True
 
     @contextmanager
     def _tree_remade_after_error(self) -> Iterator[None]:
@@ -276,15 +272,19 @@ class Solver(Problem):
             self._pending.broken = True
             raise
 
-    def _integrate(self, vertices: Index, edges: Index) -> tuple[Index, int]:
-        """Solve with all that enters; return the vertices that were solved, and how many edges were linearised."""
+    def _integrate(self, vertices: Index, edges: Index) -> tuple[Index, Index, int]:
+        """Solve with all that enters.
+
+        Returns the vertices that were solved, the edges on those that are far from their linearisation point (now moved
+        there), and how many edges were linearised.
+        """
         pending = self._pending
         if not self._numbers_current and not pending.broken:
             self._renumber_after_batch()
         settings, young = self.settings, self._stages.young
         again = self._relinearized_first(edges)
         if not pending and not len(young) and not len(again):
-            return NONE, 0
+            return NONE, NONE, 0
         fresh = np.union1d(edges, young) if len(young) else edges
         self._stages.begin(edges, settings)
         if pending.broken:
@@ -292,31 +292,56 @@ class Solver(Problem):
             fresh, again = self._active(), NONE
         both = np.union1d(fresh, again) if len(again) else fresh
         self._linearize(both)
-        cliques = self._restructure(vertices, fresh)
-        if len(again):
-            cliques = incremental.with_those_of(self._tree, cliques, again)
-        failed, solved = incremental.solve(self._tree, cliques, *self._limits())
+        if pending.broken:
+            vertices = self._unknowns()
+            self._estimates()
+            incremental.reset(self._tree, vertices)
+        failed, solved, far = self._advanced(vertices, fresh, again)
         if failed != NOTHING:
             self._refuse_floating()
             raise undetermined(failed)
         self._stages.mature(self._tree.value, settings)
         self._solved_with, self._numbers_current = None, True
-        return solved, len(both)
+        return solved, far, len(both)
 
-    def _continue_batch(self) -> Index:
-        """Step on from where a batch stopped before the optimum; return the vertices that were solved."""
+    def _advanced(self, vertices: Index, edges: Index, again: Index) -> tuple[int, Index, Index]:
+        """Advance the tree (``advance``), with as much room as it needs; returns the last three of its results."""
+        touched, limits, unseen = self._pending.touched, self._limits(), self._schedule.unseen()
+        tail = True
+        while True:
+            how, touched, failed, solved, far = advance(
+                self._pointers, edges, touched, vertices, tail, again, unseen, self._kept, *limits
+            )
+            if how == DONE:
+                return failed, solved, far
+            tail = False
+            if how == DISSECT:
+                touched = np.concatenate((touched, dissect(self._tree, failed)))
+            else:
+                try:
+                    self._tree = more_room(self._tree)
+                finally:  # some arrays may have grown in place
+                    self._pointers = pointers_of(self._tree)
+
+    def _continue_batch(self) -> tuple[Index, Index]:
+        """Step on from where a batch stopped before the optimum; returns what was solved, and edges that are far."""
         self._unfinished = False
         failed, solved = incremental.renumber(self._tree, self._active(), *self._limits())
         if failed != NOTHING:
             raise undetermined(failed)
         self._schedule.hasten(self.settings.relinearize_every)
-        return solved
+        return solved, incremental.relinearize(self._tree, solved, *self._limits()[2:])
 
     def _relinearized_first(self, edges: Index) -> Index:
         """Search all vertices for large steps, if it is time before these edges enter; return edges to linearise."""
         settings, pending = self.settings, self._pending
-        closes = bool(len(edges)) and not pending.broken and incremental.reach_back(self._tree, edges)
-        if not self._schedule.is_due(settings.relinearize_every, closes=closes) or pending.broken:
+        due = self._schedule.is_due(settings.relinearize_every)
+        if due == MAYBE and len(edges) and not pending.broken and incremental.reach_back(self._tree, edges):
+            due = SURELY
+        if due != SURELY:
+            return NONE
+        self._schedule.begin()
+        if pending.broken:
             return NONE
         tolerances, limits = self._limits()[:2], (settings.relinearize_above, settings.relinearize_error)
         return incremental.relinearize_changed(self._tree, *tolerances, *limits)
@@ -324,37 +349,40 @@ class Solver(Problem):
     def _limits(self) -> tuple[float, float, float, float]:
         """The tolerances of steps, and the limits above which a step is far (``substitute``)."""
         s = self.settings
+        if not s.relinearize_passes:
+            return s.tolerance, s.tolerance_sigmas, np.inf, np.inf
         return s.tolerance, s.tolerance_sigmas, BY_FAR * s.relinearize_above, BY_FAR**2 * s.relinearize_error
 
-    def _relinearized(self, solved: Index) -> Iterator[tuple[int, Index]]:
-        """Relinearise what moved far, pass after pass; yields how many edges, and the vertices that were solved."""
-        limits = self._limits()
-        solved = self._schedule.after_update(solved)
-        for _ in range(self.settings.relinearize_passes):
-            edges = incremental.relinearize(self._tree, solved, *limits[2:])
-            if not len(edges):
-                return
-            self._linearize(edges)
-            failed, solved = incremental.renumber(self._tree, edges, *limits)
+    def _relinearized(self, far: Index) -> Iterator[tuple[int, Index]]:
+        """Linearise edges that are far, pass after pass; yields how many were, and the vertices that were solved."""
+        limits, passes = self._limits(), self.settings.relinearize_passes
+        for k in range(passes if len(far) else 0):
+            self._linearize(far)
+            failed, solved = incremental.renumber(self._tree, far, *limits)
             if failed != NOTHING:
                 raise undetermined(failed)
-            self._schedule.note(solved)
-            yield len(edges), solved
+            yield len(far), solved
+            if k == passes - 1:
+                self._schedule.note(solved)
+                return
+            far = incremental.relinearize(self._tree, solved, *limits[2:])
+            if not len(far):
+                return
 
     def _forget_numbers(self) -> None:
         """Set the sums to zero, because all edges are about to be linearised."""
         self._tree.blocks[:] = 0.0
         self._tree.diagonal[:] = 0.0
 
-    def _restructure(self, vertices: Index, edges: Index) -> Index:
-        """Order and group what new vertices and edges touch; return the cliques whose numbers are to be computed."""
+    def _restructure(self, vertices: Index, edges: Index) -> None:
+        """Order and group what new vertices and edges touch, without numbers."""
         if self._pending.broken:
             vertices = self._unknowns()
-            self._estimates()
             incremental.reset(self._tree, vertices)
-        touched, tolerances = self._pending.touched, self._limits()[:2]
-        self._tree, cliques = incremental.restructure(self._tree, edges, touched, vertices, *tolerances)
-        return cliques
+        try:
+            self._tree = restructure(self._tree, edges, self._pending.touched, vertices, *self._limits()[:2])
+        finally:
+            self._pointers = pointers_of(self._tree)
 
     def _renumber_after_batch(self) -> None:
         """Compute the numbers of the tree at the result of a batch. The result stays."""
@@ -367,6 +395,4 @@ class Solver(Problem):
     def _linearize(self, edges: Index) -> None:
         """Put the blocks of edges at the linearisation points into the tree."""
         for ids, losses in self._stages.of(edges, self.settings):
-            for b in linearize(self.graph, self._tree.value, rows_of(self.graph, ids), losses):
-                refuse_nonfinite(b)
-                store(self._tree, b.rows, b.table.id.values, b.residual, b.jacobian)
+            linearize_into(self._pointers, self.graph, self._tree.value, rows_of(self.graph, ids), losses)

@@ -6,17 +6,15 @@ from numpy.typing import NDArray
 from graph_slam_ros.lie.jit import kernel
 from graph_slam_ros.solver.clique_tree.indices import in_order, joined, lengthened
 from graph_slam_ros.solver.clique_tree.numeric import accept_steps, clear_block, eliminate
-from graph_slam_ros.solver.clique_tree.ordering import dissect, ends_of, key_of, move_tail, neighbourhood
-from graph_slam_ros.solver.clique_tree.pools import compact, release, room_for
+from graph_slam_ros.solver.clique_tree.ordering import ends_of, key_of, neighbourhood
+from graph_slam_ros.solver.clique_tree.pointers import tree_of
 from graph_slam_ros.solver.clique_tree.storage import (
     ACTIVE,
-    AFFECTED,
     BLOCK,
     BLOCKS_TOP,
     CHANGED,
     CLIQUE,
     CLIQUES,
-    CLIQUES_WANTED,
     COUNT,
     DEFERRED_COUNT,
     DOF,
@@ -26,7 +24,6 @@ from graph_slam_ros.solver.clique_tree.storage import (
     FREE_REGION,
     FRONT_DOF,
     FRONTS_TOP,
-    FRONTS_WANTED,
     FULL_DOF,
     IN_DEFERRED,
     KEY,
@@ -43,7 +40,6 @@ from graph_slam_ros.solver.clique_tree.storage import (
     MARK,
     MARKED,
     MEMBERS_TOP,
-    MEMBERS_WANTED,
     NEXT,
     NOTED,
     NOTHING,
@@ -60,20 +56,19 @@ from graph_slam_ros.solver.clique_tree.storage import (
     WIDTH,
     ZERO,
     Tree,
-    with_room,
 )
-from graph_slam_ros.solver.clique_tree.substitution import find_changed, is_large, solve_marked, substitute
-from graph_slam_ros.solver.clique_tree.symbolic import build, cliques_of, collect, mark, structure
+from graph_slam_ros.solver.clique_tree.substitution import find_changed, is_large, substitute
+from graph_slam_ros.solver.clique_tree.symbolic import mark
 from graph_slam_ros.typing import Array, Index
 
-SPARSE = 1.2  # of the memory of fronts, as a multiple of those in use: then it is compacted, not lengthened
 MUCH = 0.2  # of the threshold above which a vertex is linearised anew: changes below are not followed for that
 FEW = 64  # new vertices whose anchorage is looked for; more are said to be loose, which is then looked into
 
 
 @kernel
-def append_vertices(t: Tree, first: int, offset: Index, initial: Array, shapes: Index) -> None:
+def append_vertices(pointers: Index, first: int, offset: Index, initial: Array, shapes: Index) -> None:
     """Append the records of new vertices with their initial values. They are not unknowns yet."""
+    t = tree_of(pointers)
     vertex, t_step, value, estimate = t.vertex, t.step, t.value, t.estimate
     step = 0 if first == 0 else vertex[first - 1, STEP] + vertex[first - 1, DOF]
     for k in range(len(offset)):
@@ -123,8 +118,9 @@ def outside(rows: Index, ends: Index, weight: Array, inside: NDArray[np.bool_], 
 
 
 @kernel
-def append_edges(t: Tree, rows: Index, all_ids: Index, all_ends: Index) -> None:
+def append_edges(pointers: Index, rows: Index, all_ids: Index, all_ends: Index) -> None:
     """Append the records of edges, and link them to their vertices. They are not in the structure yet."""
+    t = tree_of(pointers)
     vertex, edge, t_link, state, blocks = t.vertex, t.edge, t.link, t.state, t.blocks
     for row in rows:
         e = all_ids[row]
@@ -162,6 +158,12 @@ def enter(t: Tree, vertices: Index, edges: Index) -> None:
         state[TAIL_END] += 1
     for e in edges:
         t.edge[e, ACTIVE] = 1
+
+
+@kernel
+def enter_newest(pointers: Index, vertices: Index, edges: Index) -> None:
+    """Call ``enter`` for the tree of some pointers."""
+    enter(tree_of(pointers), vertices, edges)
 
 
 @kernel
@@ -245,75 +247,6 @@ def edges_of(vertex: Index, link: Index, v: int) -> Index:
         count += 1
         a = link[a, LINK_NEXT]
     return in_order(out[:count])
-
-
-@kernel
-def _regroup(t: Tree, touched: Index, new: Index, tolerance: float, sigmas: float) -> tuple[bool, Index]:
-    """Apply changes of the structure to the tree: eliminate what they touch again, and group it into cliques.
-
-    Parameters
-    ----------
-    touched : vertices whose surroundings changed; new : vertices that are not in it yet
-    tolerance, sigmas : of the steps that are computed first, as the fronts go (``substitute``)
-
-    Returns
-    -------
-    Whether there was room, and then the new cliques; otherwise nothing was changed, and ``state`` says how long the
-    pools must be.
-    """
-    clique, state = t.clique, t.state
-    marked = mark(t, touched)
-    solve_marked(t, marked, tolerance, sigmas)
-    order, orphans = collect(t, marked, new)
-    start, later = structure(t, order, orphans)
-    group, last, size = cliques_of(t, order, start, later)
-    cliques, members, numbers = room_for(t, size, marked)
-    state[CLIQUES_WANTED] = state[CLIQUES] + cliques
-    state[MEMBERS_WANTED] = state[MEMBERS_TOP] + members
-    state[FRONTS_WANTED] = state[FRONTS_TOP] + numbers
-    if (
-        state[CLIQUES_WANTED] > len(clique)
-        or state[MEMBERS_WANTED] > len(t.members)
-        or state[FRONTS_WANTED] > len(t.fronts)
-    ):
-        return False, new
-    release(t, marked)
-    state[AFFECTED] += len(order)
-    cliques = build(t, order, start, later, group, last, size, orphans)
-    state[LIVE_MADE] = state[LIVE_MADE] or state[LIVE]
-    return True, cliques
-
-
-def restructure(
-    tree: Tree, edges: Index, touched: Index, new: Index, tolerance: float, sigmas: float
-) -> tuple[Tree, Index]:
-    """Return the tree after changes of the structure, and its new cliques, whose numbers are not computed yet.
-
-    Parameters
-    ----------
-    edges : that are new or have changed
-    touched : other vertices whose surroundings changed; new : vertices that are not in it yet
-    tolerance, sigmas : see ``substitute``
-    """
-    while True:
-        touched, overgrown = move_tail(tree, edges, touched)
-        edges = edges[:0]
-        if overgrown != NOTHING:
-            touched = np.concatenate((touched, dissect(tree, overgrown)))
-        done, cliques = _regroup(tree, touched, new, tolerance, sigmas)
-        if done:
-            return tree, cliques
-        state = tree.state
-        if state[FRONTS_TOP] > SPARSE * state[LIVE]:
-            compact(tree)
-            continue
-        tree = with_room(
-            tree,
-            clique=state[CLIQUES_WANTED],
-            listed=state[CLIQUES_WANTED],
-            members=state[MEMBERS_WANTED],
-            fronts=state[FRONTS_WANTED],
-        )
 
 
 @kernel

@@ -12,6 +12,7 @@ Because contributions are kept, an update touches only the cliques of changed ed
 Records are columns of integer arrays, so that compiled code reaches everything through one tuple.
 """
 
+import math
 from sys import getrefcount, version_info
 from typing import Any, NamedTuple
 
@@ -109,6 +110,7 @@ RECENT = 32  # closures that are looked at
 FAR = 1 << 40  # vertices: further than any closure reaches
 
 _REFERENCES = 3  # to an array that is about to grow: its owner's, an argument, and another
+_LEAST = 16384  # bytes by which an array grows
 _UNCOUNTED = (3, 14)  # from then on references may be borrowed, so that a count says nothing of views
 
 _STEPS = np.array([4, 5, 6, 7])
@@ -201,7 +203,8 @@ def longer(array: NDArray[Any], count: int) -> NDArray[Any]:
     """Return the array with at least so many rows and room for more; added rows are zero."""
     if count <= len(array):
         return array
-    shape = (max(count, len(array) + len(array) // 16, 64), *array.shape[1:])
+    of_row = array.itemsize * math.prod(array.shape[1:])
+    shape = (max(count, len(array) + max(len(array) // 16, _LEAST // of_row)), *array.shape[1:])
     if version_info < _UNCOUNTED and getrefcount(array) <= _REFERENCES:
         # no view of it: the system need not copy it, nor hand out its memory anew
         array.resize(shape, refcheck=False)

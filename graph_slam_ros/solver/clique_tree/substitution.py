@@ -12,6 +12,7 @@ from graph_slam_ros.lie.jit import kernel
 from graph_slam_ros.solver.clique_tree.dense import solve_upper
 from graph_slam_ros.solver.clique_tree.indices import in_order, lengthened
 from graph_slam_ros.solver.clique_tree.numeric import retract
+from graph_slam_ros.solver.clique_tree.pointers import tree_of
 from graph_slam_ros.solver.clique_tree.storage import (
     CHANGED,
     CHILD,
@@ -281,9 +282,10 @@ def show_all(t: Tree, kept: Array, tolerance: float, sigmas: float) -> None:
 
 @kernel
 def read(
-    t: Tree, kept: Array, kind: Index, offset: Index, ids: Index, size: int, tolerance: float, sigmas: float
+    pointers: Index, kept: Array, kind: Index, offset: Index, ids: Index, size: int, tolerance: float, sigmas: float
 ) -> tuple[int, Array]:
     """Return stored numbers (n, size) of vertices of the first one's kind, and the index of an unfit id or NOTHING."""
+    t = tree_of(pointers)
     vertex, estimate = t.vertex, t.estimate
     out = np.empty((len(ids), size))
     for k in range(len(ids)):
@@ -381,19 +383,17 @@ def _note_if_much(
 @kernel
 def step_all(t: Tree, cliques: Index) -> None:
     """Solve cliques (children before parents) from the root down, to the last digit; estimates are not computed."""
-    clique, x = t.clique, np.empty(256)
-    for j in range(len(cliques) - 1, -1, -1):
-        c = cliques[j]
-        if len(x) < clique[c, FULL_DOF]:
-            x = np.empty(2 * clique[c, FULL_DOF])
+    x = np.empty(256)
+    for c in cliques[::-1]:
+        if len(x) < t.clique[c, FULL_DOF]:
+            x = np.empty(2 * t.clique[c, FULL_DOF])
         visit(t, c, x, -1.0, -1.0)
 
 
 @kernel
 def forget(t: Tree) -> None:
     """Forget all steps, and what waits: the estimates are the linearisation points."""
-    t.step[:] = 0.0
-    t.reference[:] = 0.0
+    t.step[:] = t.reference[:] = 0.0
     t.vertex[:, NOTED] = 0
     t.clique[:, IN_DEFERRED] = 0
     t.clique[:, SEEN] = t.state[SOLUTIONS]

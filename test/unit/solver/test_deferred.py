@@ -8,6 +8,7 @@ from graph_slam_ros.errors import SingularError
 from graph_slam_ros.graph import R1, R2, RELATIVE_POSE, SE2, Gaussian, Graph
 from graph_slam_ros.lie import se2
 from graph_slam_ros.solver import Settings, Solver
+from graph_slam_ros.solver.clique_tree.pointers import pointers_of, tree_of
 from graph_slam_ros.solver.clique_tree.storage import DEFERRED_COUNT
 
 PLANAR = Gaussian.from_sigmas(0.05, 0.05, 0.02)
@@ -46,6 +47,16 @@ class Laps:
 
 def waiting(solver):
     return int(solver._tree.state[DEFERRED_COUNT])
+
+
+def test_kernels_see_the_arrays_of_the_tree_by_their_pointers():
+    laps = Laps()
+    laps.drive(60)
+    tree = laps.solver._tree
+    for mine, seen in zip(tree, tree_of(pointers_of(tree)), strict=True):
+        assert seen.shape == mine.shape
+        assert seen.dtype == mine.dtype
+        assert seen.ctypes.data == mine.ctypes.data
 
 
 def test_an_update_with_a_closure_leaves_what_nobody_reads_waiting_and_reading_solves_it():

@@ -1,0 +1,148 @@
+"""An update of the clique tree in one call: its structure, its numbers, and what is to be linearised anew."""
+
+import numpy as np
+
+from graph_slam_ros.lie.jit import kernel
+from graph_slam_ros.solver.clique_tree.incremental import relinearize, solve, with_those_of
+from graph_slam_ros.solver.clique_tree.indices import joined
+from graph_slam_ros.solver.clique_tree.ordering import dissect, move_tail
+from graph_slam_ros.solver.clique_tree.pointers import tree_of
+from graph_slam_ros.solver.clique_tree.pools import compact, release, room_for
+from graph_slam_ros.solver.clique_tree.storage import (
+    AFFECTED,
+    CLIQUES,
+    CLIQUES_WANTED,
+    FRONTS_TOP,
+    FRONTS_WANTED,
+    LIVE,
+    LIVE_MADE,
+    MEMBERS_TOP,
+    MEMBERS_WANTED,
+    NOTHING,
+    Tree,
+    with_room,
+)
+from graph_slam_ros.solver.clique_tree.substitution import show, solve_marked
+from graph_slam_ros.solver.clique_tree.symbolic import build, cliques_of, collect, mark, structure
+from graph_slam_ros.typing import Array, Index
+
+SPARSE = 1.2  # of the memory of fronts, as a multiple of those in use: then it is compacted, not lengthened
+DONE, ROOM, DISSECT = range(3)  # how ``advance`` ends
+
+
+@kernel
+def _regroup(t: Tree, touched: Index, new: Index, tolerance: float, sigmas: float) -> tuple[bool, Index]:
+    """Apply changes of the structure to the tree: eliminate what they touch again, and group it into cliques.
+
+    Parameters
+    ----------
+    touched : vertices whose surroundings changed; new : vertices that are not in it yet
+    tolerance, sigmas : of the steps that are computed first, as the fronts go (``substitute``)
+
+    Returns
+    -------
+    Whether there was room, and then the new cliques; otherwise nothing was changed, and ``state`` says how long the
+    pools must be.
+    """
+    clique, state = t.clique, t.state
+    marked = mark(t, touched)
+    solve_marked(t, marked, tolerance, sigmas)
+    order, orphans = collect(t, marked, new)
+    start, later = structure(t, order, orphans)
+    group, last, size = cliques_of(t, order, start, later)
+    cliques, members, numbers = room_for(t, size, marked)
+    state[CLIQUES_WANTED] = state[CLIQUES] + cliques
+    state[MEMBERS_WANTED] = state[MEMBERS_TOP] + members
+    state[FRONTS_WANTED] = state[FRONTS_TOP] + numbers
+    if (
+        state[CLIQUES_WANTED] > len(clique)
+        or state[MEMBERS_WANTED] > len(t.members)
+        or state[FRONTS_WANTED] > len(t.fronts)
+    ):
+        return False, new
+    release(t, marked)
+    state[AFFECTED] += len(order)
+    cliques = build(t, order, start, later, group, last, size, orphans)
+    state[LIVE_MADE] = state[LIVE_MADE] or state[LIVE]
+    return True, cliques
+
+
+def restructure(tree: Tree, edges: Index, touched: Index, new: Index, tolerance: float, sigmas: float) -> Tree:
+    """Return the tree after changes of the structure; its new cliques have no numbers yet. Arguments as ``advance``."""
+    tail = True
+    while True:
+        overgrown = NOTHING
+        if tail:
+            touched, overgrown = move_tail(tree, edges, touched)
+            tail = False
+        if overgrown != NOTHING:
+            touched = np.concatenate((touched, dissect(tree, overgrown)))
+        done, _ = _regroup(tree, touched, new, tolerance, sigmas)
+        if done:
+            return tree
+        tree = more_room(tree)
+
+
+@kernel
+def advance(
+    pointers: Index,
+    edges: Index,
+    touched: Index,
+    new: Index,
+    tail: bool,
+    again: Index,
+    unseen: Index,
+    kept: Array,
+    tolerance: float,
+    sigmas: float,
+    far: float,
+    error: float,
+) -> tuple[int, Index, int, Index, Index]:
+    """Apply changes of the structure to the tree, solve, and relinearise what is far (``substitute``).
+
+    Parameters
+    ----------
+    edges : that are new or have changed; touched : other vertices whose surroundings changed
+    new : vertices that are not in the tree yet
+    tail : whether its older part may move down
+    again : edges that were linearised again; unseen : more vertices to search for far steps
+    kept : gets the estimates of what was solved, if nothing is far
+
+    Returns
+    -------
+    DONE; or ROOM or DISSECT, where the pools are too small, or a region is to be dissected, before it is called again
+    with the touched vertices, which come next. Then a vertex that has no pivot, or the region, or NOTHING; the vertices
+    that were solved; the edges to linearise at once.
+    """
+    t, none = tree_of(pointers), edges[:0].copy()
+    if tail:
+        touched, overgrown = move_tail(t, edges, touched)
+        if overgrown != NOTHING:
+            return DISSECT, touched, overgrown, none, none
+    done, cliques = _regroup(t, touched, new, tolerance, sigmas)
+    if not done:
+        return ROOM, touched, NOTHING, none, none
+    if len(again):
+        cliques = with_those_of(t, cliques, again)
+    failed, solved = solve(t, cliques, tolerance, sigmas, far, error)
+    if failed != NOTHING:
+        return DONE, touched, failed, none, none
+    found = relinearize(t, joined(solved, unseen), far, error)
+    if not len(found):
+        show(t, kept, solved)
+    return DONE, touched, NOTHING, solved, found
+
+
+def more_room(tree: Tree) -> Tree:
+    """Return the tree with room for what ``advance`` could not place: compacted, or with longer pools."""
+    state = tree.state
+    if state[FRONTS_TOP] > SPARSE * state[LIVE]:
+        compact(tree)
+        return tree
+    return with_room(
+        tree,
+        clique=state[CLIQUES_WANTED],
+        listed=state[CLIQUES_WANTED],
+        members=state[MEMBERS_WANTED],
+        fronts=state[FRONTS_WANTED],
+    )
