@@ -397,7 +397,7 @@ def test_a_reader_of_a_run_folder_follows_no_link():
         "analysis/trajectories.py: path",
         "report/places.py: file",
         "report/places.py: file.parent / os.fspath(content['image'])",  # of a floor plan that the user names
-        "cli/calibrate.py: args.config",
+        "cli/check.py: args.config",
     }
 
 
