@@ -236,6 +236,8 @@ def _faults(facts: Facts, config: Config) -> Iterator[str]:
         yield "where the robot is in the loaded map is not known yet"
     if estimate and estimate.displaced:
         yield estimate.displaced
+    if estimate and estimate.association:
+        yield estimate.association
     if estimate and estimate.motion:
         yield estimate.motion
     if estimate and estimate.rivals:

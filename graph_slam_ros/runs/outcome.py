@@ -185,7 +185,7 @@ def shortcomings(summary: Summary) -> Iterator[str]:
                 "metres and radians? A robot as fast as that: --set odometry.max_speed_m_s=..."
             )
     yield from _gyro_faults(summary)
-    yield from _association_faults(summary)
+    yield from association_faults(summary.get("association", {}))
     if not sum(counts["believed"] or 0 for counts in inputs.values()):
         yield (
             "this is odometry alone: no landmark, fix or closure is in the result; "
@@ -195,9 +195,13 @@ def shortcomings(summary: Summary) -> Iterator[str]:
         yield "no landmark was seen twice, so they correct nothing: do ids change? --set landmarks.association=joint"
 
 
-def _association_faults(summary: Summary) -> Iterator[str]:
-    """Yield why the association of sightings without identity is not to be believed; empty if it is."""
-    found = summary.get("association", {})
+def association_faults(found: Mapping[str, Any]) -> Iterator[str]:
+    """Yield why the association of sightings without identity is not to be believed; empty if it is.
+
+    Parameters
+    ----------
+    found : ``MapView.association_report``
+    """
     if found.get("is_doubtful"):
         missing, lost = 100.0 * found["missing_part"], 100.0 * found["lost_part"]
         yield (

@@ -423,3 +423,15 @@ def test_A37_what_is_told_seldom_tells_how_often_it_was_left_out(monkeypatch):
         told.append(throttle.next())
         at[0] += 1.0
     assert told == [0, *[None] * 4, 4, *[None] * 4, 4, *[None] * 3]
+
+
+@pytest.mark.parametrize("dimensions", [2, 3])
+def test_while_an_association_is_not_to_be_believed_the_node_is_degraded(monkeypatch, dimensions):
+    """By what the pipeline reports: the same sentence as at the end of a replay."""
+    report = {"is_whole": True, "is_doubtful": True, "missing_part": 0.11, "lost_part": 0.013, "clocks": {}}
+    monkeypatch.setattr(GraphSlam, "association_report", property(lambda slam: report))
+    estimate = round_a_curve(dimensions, 3.2).estimate
+    verdict = judge(Facts("active", (odom(received=9, silent_s=0.0),), estimate), Config())
+    assert verdict.state == "DEGRADED"
+    assert verdict.reasons[0].startswith("sightings without identity: 11 % of the landmarks that should be seen")
+    assert "landmarks.density_per_m" in verdict.reasons[0]
