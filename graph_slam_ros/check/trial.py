@@ -1,6 +1,6 @@
 """A trial of a recording: a replay in memory, then a fit of clock, mount and scales that starts at its estimate."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from graph_slam_ros.measurements.types import Control, Measurement, Odometry
 from graph_slam_ros.slam import Config, GraphSlam
 from graph_slam_ros.slam.calibration.decision import Finding as Fitted
 from graph_slam_ros.slam.calibration.fit import TrialFit
+from graph_slam_ros.slam.noise_scale import NoiseScale
 from graph_slam_ros.typing import Array, Index
 
 _THIN_NS = 80_000_000
@@ -80,6 +81,14 @@ def poses_in_map(slam: GraphSlam, stamp_ns: Index, path_ns: Index, path: Array) 
     return np.stack(se3.interpolate(ends[0], ends[1], part), axis=1)
 
 
+def _noise_scales(slam: GraphSlam) -> tuple[Sequence[NoiseScale], str]:
+    """Return the noise of each class and input, or none and why it cannot be estimated."""
+    try:
+        return slam.noise_scale(), ""
+    except GraphSlamError as error:
+        return (), str(error)
+
+
 def check_trial(c: Columns, slam: GraphSlam) -> Iterator[Finding]:
     """Findings of the replay and of the fit: clock, mount, scales, noise, identities, outliers."""
     path_ns, path = path_of(c)
@@ -87,11 +96,10 @@ def check_trial(c: Columns, slam: GraphSlam) -> Iterator[Finding]:
         return
     try:
         fit, fitted = slam.trial_fit(chooses=True)
-        scales = slam.noise_scale()
     except GraphSlamError as error:
-        text = f"the trial fit failed: {error}"
-        yield Finding("fit_unsure", "note", 1, 0, "fits", text)
+        yield Finding("fit_unsure", "note", 1, 0, "fits", f"the trial fit failed: {error}")
         return
+    scales, no_scales = _noise_scales(slam)
     scale = next((one for one in fitted if one.parameter.name == "distance"), None)
     if scale is not None and _has_points(c) and scale.sigma < _SURE and abs(scale.value - 0.1) > _ABSURD:
         yield _absurd(c, 1.0 + scale.value)
@@ -114,6 +122,8 @@ def check_trial(c: Columns, slam: GraphSlam) -> Iterator[Finding]:
     is_displaced = any(one.severity == "warning" for one in slips)
     yield from slips
     yield from (one for one in found if not (is_displaced and one.code in _OF_A_BREAK))
+    if no_scales:
+        yield Finding("fit_unsure", "note", 1, 0, "fits", f"noise cannot be checked: {no_scales}")
     for noise in scales if c.config.robust.noise_scale != "estimated" else ():
         limit = _ODOMETRY_OVER_CONFIDENT if noise.label == "odometry" else _OVER_CONFIDENT
         factor = float(np.sqrt(noise.per_dof))

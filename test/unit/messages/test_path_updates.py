@@ -30,20 +30,21 @@ def nanoseconds(stamp):
     return stamp.sec * 10**9 + stamp.nanosec
 
 
-def standing_in(space, poses):
-    """What an update reads of a GraphSlam, with poses of our choice."""
+def standing_in(space, poses, first=0):
+    """What an update reads of a GraphSlam, with poses of our choice; ``first`` is the number of the first."""
     poses = np.array(poses, dtype=float)
     return SimpleNamespace(
         space=space,
         config=Config(),
-        keyframes=SimpleNamespace(stamps_ns=STAMP_NS + np.arange(len(poses))),
+        first_keyframe=first,
+        keyframes=SimpleNamespace(stamps_ns=STAMP_NS + first + np.arange(len(poses))),
         trajectory=lambda: poses,
     )
 
 
-def sent(updates, space, poses):
+def sent(updates, space, poses, first=0):
     """Which poses an update tells of."""
-    cdr = updates.update(standing_in(space, poses))
+    cdr = updates.update(standing_in(space, poses, first))
     return None if cdr is None else [stamp - STAMP_NS for stamp in decoded(cdr)[1]]
 
 
@@ -61,6 +62,16 @@ def test_what_is_new_or_has_moved_too_far_is_sent_once():
     path[1] = [1.0, 0.0, -2.9]
     assert sent(updates, PLANAR, path) == [1]
     assert updates.version == 4
+
+
+def test_of_a_path_whose_first_keyframes_have_left_only_what_is_new_or_has_moved_is_sent():
+    updates = PathUpdates(0.1, 0.2)
+    path = [[float(k), 0.0, 0.0] for k in range(4)]
+    assert sent(updates, PLANAR, path) == [0, 1, 2, 3]
+    assert sent(updates, PLANAR, path[2:], first=2) is None
+    moved = [path[2], [3.0, 0.5, 0.0], [4.0, 0.0, 0.0]]
+    assert sent(updates, PLANAR, moved, first=2) == [3, 4]
+    assert sent(updates, PLANAR, moved[1:], first=3) is None
 
 
 def test_small_movements_add_up_to_one_that_is_sent():
