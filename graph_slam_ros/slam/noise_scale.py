@@ -25,7 +25,7 @@ from graph_slam_ros.graph import Graph
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
 from graph_slam_ros.graph.losses import weight_and_cost
 from graph_slam_ros.graph.tables import EdgeTable
-from graph_slam_ros.slam.frontend.noise_factors import PER_M, PER_RAD, Key, groups, grows, parts_of
+from graph_slam_ros.slam.frontend.noise_factors import PER_M, PER_RAD, Key, groups, grows, motion_parts, parts_of
 from graph_slam_ros.slam.motion_noise import Growth, Motions, fit_growth, growth_of
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.solver.linearization import Losses
@@ -153,9 +153,12 @@ def estimate_noise(
         if len(rows):
             block = _Block(table, rows, label, solver, values, losses)
             passes = _passes(block.ends, stamp_of) if label == "landmarks" else []
-            for part, axes in parts_of(table.type, label, block.measured).items():
+            does_grow = grows(table.type, label)
+            of_type = table.type, label, block.measured
+            parts = motion_parts(*of_type, block.roots) if does_grow else parts_of(*of_type)
+            for part, axes in parts.items():
                 key, total = (label, source, part), sums.setdefault((label, source, part), _Sums())
-                if grows(table.type, label):
+                if does_grow:
                     now = growth_of(factors, key)
                     block.add_odometry(total, axes, now, stamp_of, is_rotation=part == "rotation")
                 else:
@@ -186,7 +189,7 @@ class _Block:
         self.ends, self.measured = table.vertices.values[rows], table.measured.values[rows]
         offset, code = solver.graph.offset.values, int(losses.codes(table, rows[:1])[0])
         self.residual, self._jacobian = table.type.linearize(values, offset[self.ends], self.measured)
-        roots = table.sqrt_information.values[rows]
+        self.roots = roots = table.sqrt_information.values[rows]
         chi2 = np.sum(np.einsum("nij,nj->ni", roots, self.residual) ** 2, axis=1)
         self._solver, self._dof = solver, table.type.dofs[0]
         self.weight = np.array([weight_and_cost(losses.kind[code], losses.scale[code], one)[0] for one in chi2])

@@ -74,6 +74,26 @@ def parts_of(edge: EdgeType, label: str, measured: Array) -> dict[str, Array]:
     return {"all": axes}
 
 
+def motion_parts(edge: EdgeType, label: str, measured: Array, roots: Array) -> dict[str, Array]:
+    """Split the residual of odometry's edges into parts: directions (n, m, k) of each, that are independent.
+
+    A wrong heading at the begin of an edge moves its end sideways, so errors of position and rotation are correlated,
+    often nearly to one. That is geometry: it does not change with the noise. ``position`` is therefore what is left of
+    the position if the rotation is known. Its directions are not orthonormal.
+
+    Parameters
+    ----------
+    roots : (n, m, m) square roots of the information
+    """
+    parts = parts_of(edge, label, measured)
+    information = np.swapaxes(roots, 1, 2) @ roots
+    d = parts["position"].shape[2]
+    given_rotation = np.linalg.solve(information[:, :d, :d], information[:, :d, d:])
+    directions = parts["position"].copy()
+    directions[:, d:] = np.swapaxes(given_rotation, 1, 2)
+    return parts | {"position": directions}
+
+
 def _sight_parts(position: Array) -> dict[str, Array]:
     """Return the directions along the line of sight, and across it."""
     n, m = position.shape
@@ -192,15 +212,26 @@ def _of(factors: Mapping[Key, float], label: str, source: str) -> dict[str, floa
 def _rescaled(
     edge: EdgeType, label: str, measured: Array, roots: Array, before: Mapping[str, float], after: Mapping[str, float]
 ) -> Array:
+    if grows(edge, label):
+        return _regrown(edge, label, measured, roots, before, after)
     narrower = np.zeros((len(measured), edge.residual_size, edge.residual_size))
     for part, axes in parts_of(edge, label, measured).items():
-        ratio = np.full(len(measured), after.get(part, 1.0) / before.get(part, 1.0))
-        if grows(edge, label):
-            now = variance_of(roots, axes)
-            own = configured_variance(now, part, before, measured) * after.get(part, 1.0) ** 2
-            ratio = np.sqrt((own + added_variance(part, after, measured)) / now)
-        narrower += axes @ np.swapaxes(axes, 1, 2) / ratio[:, None, None]
+        ratio = after.get(part, 1.0) / before.get(part, 1.0)
+        narrower += axes @ np.swapaxes(axes, 1, 2) / ratio
     return roots @ narrower
+
+
+def _regrown(
+    edge: EdgeType, label: str, measured: Array, roots: Array, before: Mapping[str, float], after: Mapping[str, float]
+) -> Array:
+    into, scaled = list[Array](), list[Array]()
+    for part, axes in motion_parts(edge, label, measured, roots).items():
+        now = variance_of(roots, axes)
+        own = configured_variance(now, part, before, measured) * after.get(part, 1.0) ** 2
+        ratio = np.sqrt((own + added_variance(part, after, measured)) / now)
+        into.append(np.swapaxes(axes, 1, 2))
+        scaled.append(into[-1] / ratio[:, None, None])
+    return roots @ np.linalg.solve(np.concatenate(into, axis=1), np.concatenate(scaled, axis=1))
 
 
 def variance_of(roots: Array, axes: Array) -> Array:

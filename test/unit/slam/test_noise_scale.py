@@ -12,6 +12,7 @@ from graph_slam_ros.graph import (
     RELATIVE_POSE,
     RELATIVE_POSE_3D,
     SE2,
+    SE3,
     Gaussian,
     Graph,
 )
@@ -244,3 +245,29 @@ def test_a_rescaled_edge_has_its_sigma_along_the_line_of_sight_and_a_new_one_the
     for covariance_now, factors in zip(found, ([2.0, 0.5], [3.0, 0.5]), strict=True):
         expected = np.diag(factors) @ frame.T @ covariance @ frame @ np.diag(factors)
         np.testing.assert_allclose(frame.T @ covariance_now @ frame, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("dof", [3, 6])
+def test_noise_of_odometry_that_changes_keeps_what_a_wrong_heading_does_to_the_position(dof):
+    """Most of the position's error is that of the heading, times the way: so it is with any noise."""
+    rng = np.random.default_rng(5)
+    edge, n = (RELATIVE_POSE, 2) if dof == 3 else (RELATIVE_POSE_3D, 3)
+    moved = 2.0 * rng.normal(size=(n, dof - n))  # metres for each radian
+    sigmas = np.r_[np.full(n, 1e-3), np.full(dof - n, 0.3)]
+    mixed = np.block([[np.eye(n), moved], [np.zeros((dof - n, n)), np.eye(dof - n)]])
+    noise = Gaussian.from_covariance(mixed @ np.diag(sigmas**2) @ mixed.T)
+    graph = Graph()
+    kind, at = (SE2, np.zeros((2, 3))) if dof == 3 else (SE3, np.tile([0.0, 0, 0, 0, 0, 0, 1], (2, 1)))
+    a, b = graph.add_vertices(kind, at)
+    measured = np.r_[1.0, np.zeros(dof - 1)] if dof == 3 else np.r_[1.0, np.zeros(5), 1.0]
+    scales = NoiseScales(graph)
+    one = scales.add_edge(edge, [a, b], measured, noise, *ODOMETRY[:2])
+    scales.change({("odometry", "odom", "position"): 2.0, ODOMETRY: 0.5}, 0)
+    root = graph.edge(one).sqrt_information
+    wanted = mixed @ np.diag((sigmas * np.r_[np.full(n, 2.0), np.full(dof - n, 0.5)]) ** 2) @ mixed.T
+    np.testing.assert_allclose(np.linalg.inv(root.T @ root), wanted, rtol=1e-6, atol=1e-12)
+    added = scales.add_edge(edge, [a, b], measured, noise, *ODOMETRY[:2])
+    np.testing.assert_allclose(graph.edge(added).sqrt_information, root, rtol=1e-6)
+    scales.change(scales.neutral(), 0)
+    back = graph.edge(one).sqrt_information
+    np.testing.assert_allclose(back.T @ back, noise.sqrt_information.T @ noise.sqrt_information, rtol=1e-6, atol=1.0)
