@@ -27,6 +27,8 @@ INGEST, MAP = "ingest", "map"
 BEGINS_IN_A_MAP = {"type": "begins_in_a_map"}
 """The first record of the journal of such a run; its start is in ``map.mcap``."""
 MEASUREMENT = "graph_slam_ros.Measurement"
+ANEW = "anew"
+"""Type of the record that ends all before it."""
 _SCHEMA = _ENCODE({"type": "object", "properties": {"type": {"type": "string"}}, "required": ["type"]}).encode()
 
 
@@ -286,6 +288,8 @@ def _messages(folder: Path, name: str, losses: list[str]) -> Iterator[tuple[str,
     for part, file in enumerate(parts_of(folder, name)):
         if file.name != (due := part_name(name, part)):
             losses.append(f"{due}: not there; what came after was not read")
+        elif len(losses) > lost and _begins_anew(file):  # killed before it took the place of those before
+            del losses[lost:]
         if len(losses) > lost:
             if file.name == due:
                 losses.append(f"{due}: not read, with what came after it: it would be out of place")
@@ -303,3 +307,17 @@ def _messages(folder: Path, name: str, losses: list[str]) -> Iterator[tuple[str,
                     return
                 expected += 1
                 yield file.name, known[record.channel_id], record
+
+
+def _begins_anew(file: Path) -> bool:
+    """Return whether a part has all that was in the parts before it: then nothing is lost with these.
+
+    Its first records are one chunk. So the map that follows is there as a whole, too.
+    """
+    known: dict[int, str] = {}
+    for record in records(file, [], follow=False):
+        if isinstance(record, Channel):
+            known[record.id] = record.topic
+        elif isinstance(record, Message) and known.get(record.channel_id) != "map":
+            return known.get(record.channel_id) == ANEW
+    return False

@@ -30,7 +30,7 @@ Now and then an ``estimate`` tells all values, end to end. A run that goes on in
 ``growth`` and one ``estimate``, up to a record ``start``. After a part of the drive was cut out, ``anew`` ends all
 before it, and a ``growth`` of the whole map follows. Programs of version 1 do not know ``anew``: a second ``map`` with
 version 2 stands before it, which they refuse. So it is after visits were condensed, with version 3, in a part of its
-own that takes the place of all parts before.
+own that takes the place of all parts before. Where a run was killed before it did, it is read instead of these.
 """
 
 import math
@@ -44,7 +44,7 @@ from graph_slam_ros.errors import FormatError, GraphSlamError
 from graph_slam_ros.graph import Graph
 from graph_slam_ros.measurements.types import sighting_record
 from graph_slam_ros.runs.condensed_map import condensed_record
-from graph_slam_ros.runs.journal import MAP, parts_of, read_records
+from graph_slam_ros.runs.journal import ANEW, MAP, parts_of, read_records
 from graph_slam_ros.runs.map_faults import fault_of
 from graph_slam_ros.runs.map_growth import AT_ONCE, Growing, apply_verdicts, grow
 from graph_slam_ros.slam import GraphSlam
@@ -101,7 +101,7 @@ class MapGrowth:
         if is_anew or any(one.edit.do == "cut" for one in slam.edits[self._edits :]):
             self._begin()
             version = _CUT if slam.bounded is None else VERSION
-            yield from ({"type": "map", "version": version}, {"type": "anew"})
+            yield from ({"type": "map", "version": version}, {"type": ANEW})
         changed = {"settings": dict(slam.settings)} if slam.settings != self._settings else {}
         self._settings = dict(slam.settings)
         used = {"used": [slam.newest_odometry_ns, slam.odometry_source]} if slam.odometry_source else {}
@@ -203,7 +203,7 @@ def _read(folder: Path, losses: list[str], at_once: int, *, start_only: bool) ->
                     growing.append(record)
                 case "estimate":
                     growing.estimate(record["values"])
-                case "anew":
+                case kind if kind == ANEW:
                     growing = Growing(at_once)
                 case "start":
                     has_start = True
