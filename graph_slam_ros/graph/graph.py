@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from copy import deepcopy
-from itertools import combinations
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,6 +13,7 @@ from graph_slam_ros.graph.lasting_ids import LastingIds
 from graph_slam_ros.graph.noise import Gaussian
 from graph_slam_ros.graph.tables import Column, Edge, EdgeTable, Vertex
 from graph_slam_ros.graph.vertices import VertexKind
+from graph_slam_ros.lie.jit import kernel
 from graph_slam_ros.typing import Array, Index
 
 
@@ -43,6 +44,7 @@ class Graph:
         self.offset = Column(np.int64)
         self.initial = Column(np.float64)
         self.tables: dict[EdgeType, EdgeTable] = {}
+        self._accepted: dict[EdgeType, NDArray[np.bool_]] = {}  # (slots, kinds): whether a slot takes a kind
         self._in_order: list[EdgeTable] = []
         self.labels: list[str] = []
         self.sources: list[str] = []
@@ -79,12 +81,13 @@ class Graph:
             row, why = fault
             raise GraphSlamError(f"initial value {rows[row].tolist()} of vertex {self.vertex_count + row} {why}")
         count, start = len(rows), len(self.initial)
-        ids = np.arange(self.vertex_count, self.vertex_count + count)
+        first = self.vertex_count
+        ids = np.arange(first, first + count)
         if kind not in self.kinds:
             self.kinds.append(kind)
         Column.extend(
             (self.kind, self.kinds.index(kind), count),
-            (self.offset, start + kind.size * np.arange(count), count),
+            (self.offset, start if count == 1 else start + kind.size * np.arange(count), count),
             (self.initial, rows.ravel(), rows.size),
         )
         return ids
@@ -119,11 +122,12 @@ class Graph:
             table = EdgeTable(edge, len(self.tables))
             self._in_order[table.code :] = [table]  # also where this was interrupted before
             self.tables[edge] = table
-        ids, count = np.arange(self.edge_count, self.edge_count + len(at)), len(at)
+        first, row, count = self.edge_count, len(table), len(at)
+        ids = np.arange(first, first + count)
         Column.extend(
             (self.table_of_edge, table.code, count),
-            (self.row_of_edge, np.arange(len(table), len(table) + count), count),
-            (table.id, ids, count),
+            (self.row_of_edge, row if count == 1 else np.arange(row, row + count), count),
+            (table.id, first if count == 1 else ids, count),
             (table.vertices, at, count),
             (table.measured, z, count),
             (table.sqrt_information, noise.sqrt_information, count),
@@ -193,7 +197,7 @@ class Graph:
 
     def copy(self) -> "Graph":
         """Another graph with the same records; kinds and types are the same objects."""
-        same = (*self.tables, *self.kinds)
+        same = (*self.tables, *self._accepted, *self.kinds)
         return deepcopy(self, {id(one): one for one in same})
 
     def has_label(self, edges: Index, labels: Sequence[str]) -> NDArray[np.bool_]:
@@ -232,26 +236,56 @@ class Graph:
             len(noise.sqrt_information.shape) == 3 and len(noise.sqrt_information) != len(at)
         ):
             raise GraphSlamError(f"{edge.name}: noise of shape {noise.sqrt_information.shape} does not fit")
-        if not np.isfinite(measured).all():
-            row = int(np.flatnonzero(~np.isfinite(measured).all(axis=1))[0])
+        fault, row, slot = _misfit(_plain(at), _plain(measured), self.kind.values, self._accepted_by(edge))
+        if fault == _FITS:
+            return
+        vertex = int(at[row, slot])
+        if fault == _NOT_FINITE:
             raise GraphSlamError(
                 f"{edge.name}: measurement {measured[row].tolist()} at vertices {at[row].tolist()} is not finite"
             )
-        if len(at) and (at.min() < 0 or at.max() >= self.vertex_count):
-            missing = int(at.max() if at.max() >= self.vertex_count else at.min())
-            raise GraphSlamError(f"{edge.name}: vertex {missing} does not exist")
-        for other, slot in combinations(range(at.shape[1]), 2):
-            itself = at[:, slot] == at[:, other]
-            if itself.any():
-                raise GraphSlamError(f"{edge.name}: edge from vertex {int(at[itself, slot][0])} to itself")
-        accepted = [[kind in kinds for kind in self.kinds] for kinds in edge.accepts]
-        for slot, kinds in enumerate(edge.accepts if not all(map(all, accepted)) else ()):
-            fits = np.array(accepted[slot])[self.kind.values[at[:, slot]]]
-            if not fits.all():
-                vertex = int(at[~fits, slot][0])
-                raise GraphSlamError(
-                    f"{edge.name}: vertex {vertex} is {self.kind_of(vertex).name}, not {kinds[0].name}"
-                )
+        if fault == _MISSING:
+            raise GraphSlamError(f"{edge.name}: vertex {vertex} does not exist")
+        if fault == _ITSELF:
+            raise GraphSlamError(f"{edge.name}: edge from vertex {vertex} to itself")
+        kind = edge.accepts[slot][0].name
+        raise GraphSlamError(f"{edge.name}: vertex {vertex} is {self.kind_of(vertex).name}, not {kind}")
+
+    def _accepted_by(self, edge: EdgeType) -> NDArray[np.bool_]:
+        """Return whether each slot of an edge takes each kind, (slots, kinds)."""
+        found = self._accepted.get(edge)
+        if found is None or found.shape[1] != len(self.kinds):
+            rows = [[kind in kinds for kind in self.kinds] for kinds in edge.accepts]
+            found = self._accepted[edge] = np.array(rows, dtype=bool)
+        return found
+
+
+_FITS, _NOT_FINITE, _MISSING, _ITSELF, _OF_ANOTHER_KIND = range(5)
+
+
+@kernel
+def _misfit(at: Index, measured: Array, kind: Index, accepted: NDArray[np.bool_]) -> tuple[int, int, int]:
+    """Return what the first edge that cannot be is refused for, its row, and the slot of the vertex."""
+    count, slots = at.shape
+    for row in range(count):
+        for k in range(measured.shape[1]):
+            if not np.isfinite(measured[row, k]):
+                return _NOT_FINITE, row, 0
+        for slot in range(slots):
+            if at[row, slot] < 0 or at[row, slot] >= len(kind):
+                return _MISSING, row, slot
+            for other in range(slot):
+                if at[row, slot] == at[row, other]:
+                    return _ITSELF, row, slot
+        for slot in range(slots):
+            if not accepted[slot, kind[at[row, slot]]]:
+                return _OF_ANOTHER_KIND, row, slot
+    return _FITS, 0, 0
+
+
+def _plain(array: NDArray[Any]) -> NDArray[Any]:
+    """Return the array as kernels are compiled for it: one block of memory, writable."""
+    return array if array.flags.carray else array.copy()
 
 
 def _one(one: int, count: int, what: str) -> int:

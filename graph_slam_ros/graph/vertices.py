@@ -33,15 +33,21 @@ class VertexKind:
 
     def fault(self, values: Array) -> tuple[int, str] | None:
         """The first row of (n, size) that is none of its values, and why."""
-        fit = np.isfinite(values).all(axis=1)
-        why = "is not finite"
-        if self.holds is not None and fit.all():
-            fit, why = self.holds(values), f"is no {self.name}: its quaternion is not of unit length"
-        return None if fit.all() else (int(fit.argmin()), why)
+        finite = np.isfinite(values)
+        if np.count_nonzero(finite) < finite.size:  # faster than ``all`` on a few numbers
+            return int(finite.all(axis=1).argmin()), "is not finite"
+        if self.holds is None or (fit := self.holds(values)).all():
+            return None
+        return int(fit.argmin()), f"is no {self.name}: its quaternion is not of unit length"
+
+
+def _retract_se2(values: Array, steps: Array) -> Array:
+    # columns of a wider array would be compiled for once more, while a robot drives
+    return _retracted_se2(np.ascontiguousarray(values), np.ascontiguousarray(steps))
 
 
 @kernel
-def _retract_se2(values: Array, steps: Array) -> Array:
+def _retracted_se2(values: Array, steps: Array) -> Array:
     """Compiled: the last digit of NumPy's sine of an array may depend on where in memory the array is."""
     out = np.empty((len(values), 3))
     for i in range(len(values)):

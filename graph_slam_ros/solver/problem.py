@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import SE2, SE3, Graph
@@ -18,7 +18,6 @@ from graph_slam_ros.solver.clique_tree.storage import (
     ACTIVE,
     BLOCKS_TOP,
     FREE,
-    KEY,
     LINKS,
     NOTHING,
     SE2_KIND,
@@ -64,8 +63,14 @@ class Problem:
         """Add vertices (at their initial values) and edges of the graph to the problem, by id, each once."""
         self._grow()
         new, new_edges = whole_numbers(vertices, "vertex").ravel(), whole_numbers(edges, "edge").ravel()
-        _refuse_unfit(new, self._inside, self._vertices, "vertex")
-        _refuse_unfit(new_edges, self._edge_inside, self.graph.edge_count, "edge")
+        inside, edge_inside = self._inside, self._edge_inside
+        unfit, unfit_edge, there = incremental.unfit(
+            self._pointers, new, inside, self._vertices, new_edges, edge_inside, self.graph.edge_count
+        )
+        if unfit != NOTHING:
+            _refuse_unfit(new, unfit, self._vertices, "vertex")
+        if unfit_edge != NOTHING:
+            _refuse_unfit(new_edges, unfit_edge, self.graph.edge_count, "edge")
         rows = rows_of(self.graph, new_edges)
         for table, chosen in rows.items():
             missing = incremental.outside(chosen, table.vertices.values, table.weight.values, self._inside, new)
@@ -73,10 +78,9 @@ class Problem:
                 raise GraphSlamError(f"an edge needs vertex {missing}, which was not added")
         for table, chosen in rows.items():
             self._record(table, chosen)
-        there = np.count_nonzero(self._tree.vertex[new, KEY] != NOTHING)
-        self._pending.broken |= bool(there)  # removed before: they are in the order still
+        self._pending.broken |= there  # removed before: they are in the order still
         self._pending.add(new, new_edges)
-        self._inside[new], self._edge_inside[new_edges] = True, True
+        inside[new], edge_inside[new_edges] = True, True
 
     def start_at(self, values: Array) -> None:
         """Start from other values than the graph's initial ones: the stored numbers of all vertices in one array."""
@@ -243,7 +247,7 @@ class Problem:
 
     def _record(self, table: EdgeTable, rows: Index) -> None:
         """Link edges to their vertices; they are not in the structure yet."""
-        state, width = self._tree.state, sum(table.type.dofs)
+        state, width = self._tree.state, table.width
         links = int(state[LINKS]) + len(rows) * len(table.type.accepts)
         blocks = int(state[BLOCKS_TOP]) + len(rows) * width * (width + 1)
         if links > len(self._tree.link) or blocks > len(self._tree.blocks):
@@ -345,9 +349,7 @@ def existing(ids: ArrayLike, count: int, what: str) -> Index:
     return at
 
 
-def _refuse_unfit(ids: Index, inside: NDArray[np.bool_], count: int, what: str) -> None:
-    """Raise GraphSlamError if an id does not exist, is in the problem already or is repeated."""
-    unfit = incremental.unfit(ids, inside, count)
-    if unfit != NOTHING:
-        existing(ids[unfit], count, what)
-        raise GraphSlamError(f"{what} {int(ids[unfit])} was added before")
+def _refuse_unfit(ids: Index, unfit: int, count: int, what: str) -> None:
+    """Raise GraphSlamError for an id that does not exist, is in the problem already or is repeated."""
+    existing(ids[unfit], count, what)
+    raise GraphSlamError(f"{what} {int(ids[unfit])} was added before")

@@ -158,8 +158,10 @@ class Solver(Problem):
         at = whole_numbers(ids, "vertex").ravel()
         if not len(at):
             return np.empty((0, 0))
-        graph = self.graph
-        size = graph.kind_of(existing(at[:1], self._vertices, "vertex")[0]).size
+        graph, first = self.graph, int(at[0])
+        if not 0 <= first < self._vertices:
+            existing(at, self._vertices, "vertex")
+        size = graph.kind_of(first).size
         tolerances = self.settings.tolerance, self.settings.tolerance_sigmas
         unfit, out = read(self._pointers, self._kept, graph.kind.values, graph.offset.values, at, size, *tolerances)
         if unfit != NOTHING:

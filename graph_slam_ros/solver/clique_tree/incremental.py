@@ -88,7 +88,29 @@ def append_vertices(pointers: Index, first: int, offset: Index, initial: Array, 
 
 
 @kernel
-def unfit(ids: Index, inside: NDArray[np.bool_], count: int) -> int:
+def unfit(
+    pointers: Index,
+    new: Index,
+    inside: NDArray[np.bool_],
+    count: int,
+    edges: Index,
+    edge_inside: NDArray[np.bool_],
+    edge_count: int,
+) -> tuple[int, int, bool]:
+    """Return the indices of a new vertex and of an edge that cannot be added, or NOTHING (``_unfit``).
+
+    Then, where both are NOTHING, whether one of the vertices is in the order of the tree still.
+    """
+    bad, bad_edge, there = _unfit(new, inside, count), _unfit(edges, edge_inside, edge_count), False
+    if bad == NOTHING and bad_edge == NOTHING:
+        vertex = tree_of(pointers).vertex
+        for v in new:
+            there = there or vertex[v, KEY] != NOTHING
+    return bad, bad_edge, there
+
+
+@kernel
+def _unfit(ids: Index, inside: NDArray[np.bool_], count: int) -> int:
     """Return the index in ``ids`` of an id that is too large, already in the problem or repeated; or NOTHING."""
     found, marked = NOTHING, 0
     for k in range(len(ids)):

@@ -120,7 +120,10 @@ def test_one_core_and_two_compile_code_that_computes_the_same_bytes(tmp_path, co
 
 COMPILED_LATER = """
 import sys
+import numpy as np
 from graph_slam_ros.formats.g2o import read_g2o
+from graph_slam_ros.graph import BEARING, LANDMARK_POSITION, R2, RELATIVE_POSE, SE2, Gaussian
+from graph_slam_ros.slam.robust.innovation import innovation
 from graph_slam_ros.solver import Settings, Solver
 from graph_slam_ros.warmup import warmup
 
@@ -143,6 +146,17 @@ for path in sys.argv[1:]:
     solver.joint_marginal([1, 2])
     solver.set_weight(file.graph.edge_count - 1, 0.0)
     solver.update()
+    if file.graph.kinds[0] is not SE2:
+        continue
+    # arrays of any layout; then the search for the least cost of a bearing to a landmark that may lie anywhere
+    far = file.graph.add_vertices(R2, np.array([[3.0, 4.0]]))
+    ends, noise = np.asfortranarray([[0, 1], [1, 2]]), Gaussian.from_sigmas(1.0, 1.0, 1.0)
+    ends.flags.writeable = False
+    file.graph.add_edges(RELATIVE_POSE, ends, np.zeros((3, 2)).T, noise, "other")
+    vague, sharp = Gaussian.from_sigmas(30.0, 30.0), Gaussian.from_sigmas(0.1)
+    seen = file.graph.add_edge(LANDMARK_POSITION, [0, far[0]], [3.0, 4.0], vague, "seen")
+    solver.add(far, [seen])
+    assert 0.0 <= innovation(file.graph, solver, file.graph.add_edge(BEARING, [1, far[0]], [0.5], sharp, "seen"))
 print([name for name, count in signatures().items() if count != before.get(name, 0)])
 """
 
