@@ -9,10 +9,18 @@ from typing import Any, NamedTuple
 from scipy.special import gammainc
 
 from graph_slam_ros.analysis import measurement_text
+from graph_slam_ros.analysis.explain_condensed import (
+    became,
+    condensed_lines,
+    edges_that_left,
+    statements_of_one_that_left,
+    statements_of_place,
+)
 from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.errors import FormatError, GaugeError, GraphSlamError, SingularError
 from graph_slam_ros.formats.strict import integer
+from graph_slam_ros.graph.place import LABEL as PLACES
 from graph_slam_ros.runs.folder import SUMMARY, summary_of
 from graph_slam_ros.runs.ledger_file import Entry
 from graph_slam_ros.slam import Config
@@ -77,6 +85,7 @@ def explain_run(run: SavedGraph) -> Iterator[str]:
         yield from _table(judged)
     yield from _worst(e for e in judged if not e.is_in and e.reason not in FINAL)
     yield from _least(e for e in judged if e.is_in)
+    yield from condensed_lines(run)
     yield from _gates(judged, run.changes, run.config)
     yield from (f"by hand: {one.text}" for one in run.edits)
     yield from _rivals(run.folder)
@@ -191,11 +200,15 @@ def explain_edge(run: SavedGraph, which: str) -> Iterator[str]:
 def _landmark(run: SavedGraph, name: str) -> Iterator[str]:
     entries = run.entries
     seen = [e for e in entries if name in run.landmarks_of(e)]
-    if not seen:
+    left = [row for row in edges_that_left(run) if row["landmark"] == name]
+    if not (seen or left):
         names = sorted({e.landmark for e in entries} - {""})
         there = ", ".join(names[:20]) + (", ..." if len(names) > 20 else "")
         raise GraphSlamError(f"{name}: neither the id of an edge nor a landmark; there are {there or 'no landmarks'}")
-    yield from landmark_lines(run.folder, name, seen)
+    if seen:
+        yield from landmark_lines(run.folder, name, seen)
+    if left:
+        yield f"landmark {name}: {len(left)} edges are not in the map any more: {became(left)}"
     events = summary_of(run.folder).get("landmark_events", ())
     yield from (one for one in events if one.startswith(f"landmark {name} ") or f" old place is {name}" in f"{one} ")
 
@@ -212,7 +225,13 @@ def landmark_lines(folder: Path, name: str, seen: Sequence[Entry]) -> Iterator[s
 
 
 def _edge(run: SavedGraph, edge: int) -> Iterator[str]:
+    if left := [row for row in edges_that_left(run) if row["edge"] == str(edge)]:
+        yield from (line for what, text in statements_of_one_that_left(run, left[0]) for line in _words(what, text))
+        return
     e = run.edge(edge)
+    if e.label == PLACES:
+        yield from (line for what, text in statements_of_place(run, e) for line in _words(what, text))
+        return
     history = [change for change in run.changes if change.edge == edge]
     yield title(e, " and ".join(run.landmarks_of(e)))
     for what, text in statements(e, [_vertex(run, e, v) for v in e.vertices], Numbers.of(e), history, run.config):
@@ -356,6 +375,12 @@ def _state(verdict: Verdict, reason: Reason) -> str:
 def _line(what: str, text: str) -> Iterator[str]:
     """A paragraph with its name at the left."""
     yield from textwrap.wrap(text, _WIDTH, initial_indent=f"{what:11s}", subsequent_indent=" " * 11)
+
+
+def _words(what: str, text: str) -> Iterator[str]:
+    """The same with no word broken: commands and names stay whole."""
+    wrapper = textwrap.TextWrapper(_WIDTH, f"{what:11s}", " " * 11, break_long_words=False, break_on_hyphens=False)
+    yield from wrapper.wrap(text)
 
 
 def _vertex(run: SavedGraph, e: Entry, vertex: int) -> str:

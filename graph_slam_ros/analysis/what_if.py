@@ -15,7 +15,7 @@ from graph_slam_ros.errors import GaugeError, GraphSlamError, SingularError
 from graph_slam_ros.graph import Gaussian, Graph, Loss
 from graph_slam_ros.runs.folder import RunError
 from graph_slam_ros.runs.ledger_file import Entry, ledger_entries
-from graph_slam_ros.runs.restore import restored
+from graph_slam_ros.runs.restore import of_all, restored
 from graph_slam_ros.runs.tables import numbered
 from graph_slam_ros.solver import Report, Solver
 from graph_slam_ros.typing import Array
@@ -64,11 +64,14 @@ class SavedGraph:
     Parameters
     ----------
     losses : a line is added for each part of the run that could not be read
+    condensed : whether a map with condensed visits will do; if not, it is refused
 
     Attributes
     ----------
     slam : the pipeline that holds the map
-    keyframes, stamps_ns, segments : vertices and stamps of the keyframes; the keyframes at which odometry begins
+    keyframes, stamps_ns, segments : vertices and stamps of the keyframes that are in the graph, in order of time; the
+        keyframes at which odometry begins
+    entries, changes : their edges have lasting ids; ``entries`` are in the order of the rows of the graph
     edits : by hand, in order
     landmarks : vertex of each landmark that an accepted edge is about, by its name
     held : vertices of a frozen map
@@ -79,8 +82,8 @@ class SavedGraph:
         There is no map, it cannot be read, or it cannot be solved.
     """
 
-    def __init__(self, folder: Path, losses: list[str]) -> None:
-        slam = restored(folder, losses)
+    def __init__(self, folder: Path, losses: list[str], *, condensed: bool = False) -> None:
+        slam = restored(folder, losses, condensed=condensed)
         if not slam.is_solved:
             raise RunError(f"{folder}: its map cannot be solved: {slam.failing}")
         self.slam, self.folder, self.space, self.config = slam, folder, slam.space, slam.config
@@ -88,16 +91,18 @@ class SavedGraph:
         self.restored = slam.solver
         self.graph.initial.values[:] = slam.solver.values
         self.entries = list(ledger_entries(slam, range(self.graph.vertex_count)))
-        self.changes = slam.ledger.history
+        number, old = self.graph.edge_ids.of, slam.bounded.old if slam.bounded else ()
+        self.changes = [replace(one, edge=number(one.edge)) for one in slam.ledger.history]
         self.edits = slam.edits
         self.ids, _ = numbered(slam)
-        self.keyframes: list[int] = slam.keyframes.ids.tolist()
+        self.keyframes: list[int] = [*(one.vertex for one in old), *slam.keyframes.ids.tolist()]
         self._names = {mark.vertex: name for name, mark in slam.landmarks.items()}
-        self.stamps_ns: list[int] = slam.keyframes.stamps_ns.tolist()
+        self.stamps_ns: list[int] = [*(one.stamp_ns for one in old), *slam.keyframes.stamps_ns.tolist()]
         self.segments = list(slam.segments)
         joined = {vertex for entry in self.entries if entry.is_in for vertex in entry.vertices}
         self.landmarks = {name: mark.vertex for name, mark in slam.landmarks.items() if mark.vertex in joined}
-        self._numbers = {vertex: k for k, vertex in enumerate(self.keyframes)}
+        numbers = [*(one.number for one in old), *range(slam.first_keyframe, len(slam.keyframes))]
+        self._numbers = dict(zip(self.keyframes, numbers, strict=True))
 
     @cached_property
     def solver(self) -> Solver:
@@ -123,9 +128,18 @@ class SavedGraph:
 
     def edge(self, edge: int) -> Entry:
         """The ledger entry of an edge. Raises GraphSlamError for an unknown id."""
-        if not 0 <= edge < len(self.entries):
-            raise GraphSlamError(f"no edge {edge}: their ids are below {len(self.entries)}")
-        return self.entries[edge]
+        return self.entries[self._row(edge)]
+
+    def _row(self, edge: int) -> int:
+        ids = self.graph.edge_ids
+        row = ids.find(edge) if edge >= 0 else None
+        if row is not None and row < len(self.entries):
+            return row
+        if (most := ids.of(len(self.entries))) > edge >= 0:
+            raise GraphSlamError(
+                f"edge {edge} is not in the map any more, since visits are condensed: {of_all(self.folder)}"
+            )
+        raise GraphSlamError(f"no edge {edge}: their ids are below {most}")
 
     def solve(self, without: Iterable[int] = (), let_in: Sequence[int] = (), loss: Loss | None = None) -> Solver:
         """Solve the accepted edges without some, and with others at full weight, from the saved estimate.
@@ -155,35 +169,36 @@ class SavedGraph:
         GraphSlamError
             There is no such edge, or one is both taken out and let in.
         """
-        gone, let_in = {self.edge(e).edge for e in without}, list(dict.fromkeys(let_in))
-        if gone & set(let_in):
-            raise GraphSlamError(f"edge {min(gone & set(let_in))}: cannot be taken out and let in at once")
-        edges = [e.edge for e in self.entries if e.is_in and e.edge not in gone]
+        gone, anew = {self._row(e) for e in without}, list(dict.fromkeys(map(self._row, let_in)))
+        if gone & set(anew):
+            edge = self.entries[min(gone & set(anew))].edge
+            raise GraphSlamError(f"edge {edge}: cannot be taken out and let in at once")
+        edges = [row for row, e in enumerate(self.entries) if e.is_in and row not in gone]
         graph, settings = self.graph, self.config.solver_settings()
         settings = replace(settings, max_iterations=max(settings.max_iterations, MOST_STEPS))
-        if let_in:
+        if anew:
             graph = graph.copy()
-            edges += [_accepted(graph, self.edge(e)) for e in let_in]
-            edges = [e for e in edges if e not in set(let_in)]
+            edges += [_accepted(graph, row, self.entries[row]) for row in anew]
+            edges = [row for row in edges if row not in set(anew)]
         if loss is not None:
             settings = replace(settings, losses={label: [loss] for label in settings.losses})
         solver = Solver(graph, settings)
-        vertices = np.unique([*self.keyframes, *(v for e in edges for v in self._ends(graph, e))])
+        vertices = np.unique([*self.keyframes, *(v for row in edges for v in self._ends(graph, row))])
         solver.add(vertices, edges)
         for vertex in np.intersect1d(vertices, self.held).tolist():
             solver.hold(vertex)
         return solver
 
-    def _ends(self, graph: Graph, edge: int) -> Sequence[int]:
+    def _ends(self, graph: Graph, row: int) -> Sequence[int]:
         """The vertices of an edge of the run, or of one that is let in."""
-        return self.entries[edge].vertices if edge < len(self.entries) else graph.edge(edge).vertices
+        return self.entries[row].vertices if row < len(self.entries) else graph.edge(row).vertices
 
     def moved(self, solver: Solver) -> MovedVertex:
         """Compare a solution with that of the run."""
         a, b = self.solver.estimate(self.keyframes), solver.estimate(self.keyframes)
         distance = np.linalg.norm(b[:, : self.space.dimensions] - a[:, : self.space.dimensions], axis=1)
         turned = self.space.angle(self.space.group.between(tuple(a[-1]), tuple(b[-1])))
-        inside = np.array([e.edge for e in self.entries if e.is_in], dtype=np.int64)
+        inside = np.array([row for row, e in enumerate(self.entries) if e.is_in], dtype=np.int64)
         before, after = self.solver.chi2_of(inside)[0], solver.chi2_of(inside)[0]
         worse = [k for k in np.argsort(before - after, kind="stable").tolist() if after[k] > before[k]]
         return MovedVertex(
@@ -191,17 +206,17 @@ class SavedGraph:
             solver.evaluate(),
             (float(distance[-1]), float(turned)),
             (self.keyframes[int(distance.argmax())], float(distance.max())),
-            [(int(inside[k]), float(before[k]), float(after[k])) for k in worse],
+            [(self.entries[inside[k]].edge, float(before[k]), float(after[k])) for k in worse],
         )
 
     def influences(self, count: int) -> list[Influence]:
         """The judged edges without which the last keyframe would move most, ranked to first order."""
-        judged = [e.edge for e in self.entries if e.is_in and e.verdict]
+        judged = [row for row, e in enumerate(self.entries) if e.is_in and e.verdict]
         step = self.influence_model.without(judged).step
         first = np.linalg.norm(step[:, : self.space.dimensions], axis=1)
         out = []
         for k in np.argsort(-first, kind="stable")[:count].tolist():
-            edge = judged[k]
+            edge = self.entries[judged[k]].edge
             try:
                 solver = self.problem([edge])
                 exact_m = self.moved(solver).final[0] if solver.optimize().converged else np.nan
@@ -212,10 +227,10 @@ class SavedGraph:
 
     def first_order(self, edge: int) -> Array:
         """The step (dof,) of the last keyframe, in its tangent space, if an edge is removed."""
-        return self.influence_model.without([self.edge(edge).edge]).step[0]
+        return self.influence_model.without([self._row(edge)]).step[0]
 
 
-def _accepted(graph: Graph, entry: Entry) -> int:
+def _accepted(graph: Graph, row: int, entry: Entry) -> int:
     """Add a rejected edge again, as one that is never rejected."""
     noise = Gaussian.from_information(entry.information_matrix)
-    return graph.add_edge(graph.edge(entry.edge).type, entry.vertices, entry.measured, noise, _ACCEPTED)
+    return graph.add_edge(graph.edge(row).type, entry.vertices, entry.measured, noise, _ACCEPTED)

@@ -12,14 +12,17 @@ import numpy as np
 from graph_slam_ros.edge_tags import tag_of
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.maps.alignment import Alignment, align, as_they_are, laid_on, positions
+from graph_slam_ros.runs.condensed_map import read_left
 from graph_slam_ros.runs.restore import restored
+from graph_slam_ros.runs.tables import removed_path
 from graph_slam_ros.slam import GraphSlam
 from graph_slam_ros.slam.landmarks.lifetimes import has_identity
-from graph_slam_ros.typing import Array, Numbers
+from graph_slam_ros.typing import Array, Index, Numbers
 
 _SAME_M = 1e-3  # nobody calls that moved
 _DIGITS = 6  # of what was measured
 _SHOWN = 10
+StampedPath = tuple[Index, Array]
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +66,7 @@ class Difference:
     keyframes_m : how far keyframes of one stamp are apart, of half of them and at most; none: not a number
     moved : landmarks, the farthest in standard deviations first
     edits_a, edits_b : edits by hand that only one of them has
+    condensed : how many keyframes of each have left it, or are in a place: their edges are compared no more
     """
 
     keyframes: Counts
@@ -78,6 +82,7 @@ class Difference:
     verdicts: list[Judged]
     edits_a: list[str]
     edits_b: list[str]
+    condensed: tuple[int, int] = (0, 0)
 
     @property
     def is_same(self) -> bool:
@@ -101,6 +106,9 @@ class Difference:
         for name in ("keyframes", "landmarks", "edges"):
             one: Counts = getattr(self, name)
             yield f"{name:10s}{one.a:14d}{one.b:14d}{one.both:14d}"
+        if any(self.condensed):
+            counts = "".join(f"{count:14d}" for count in self.condensed)
+            yield f"condensed {counts}  keyframes, whose edges are in places"
         yield f"{'chi2':10s}{self.chi2[0]:14.3f}{self.chi2[1]:14.3f}"
         n = 2 if len(self.T_a_b) == 3 else 3
         where = ", ".join(f"{x:.3f}" for x in self.T_a_b[:n])
@@ -135,16 +143,19 @@ def _shown(lines: Iterable[str]) -> Iterator[str]:
 def diff(a: Path, b: Path, losses: list[str]) -> Difference:
     """Compare the maps of two runs. What could not be read of them is added to ``losses``.
 
+    Keyframes that were condensed count, at their present poses. Their edges do not: what they measured is in places.
+
     Raises
     ------
     GraphSlamError
         One of them has no map, or another number of dimensions.
     """
-    one, two = (restored(folder, losses) for folder in (a, b))
+    one, two = (restored(folder, losses, condensed=True) for folder in (a, b))
     refuse_other_space(one, two, a, b)
     common = shared_landmarks(one, two)
-    aligned, by, T_a_b = _aligned(one, two, common)
-    apart = _keyframe_distances(one, two, T_a_b)
+    at = _of_one_stamp(*(whole_path(folder, slam) for folder, slam in ((a, one), (b, two))))
+    aligned, by, T_a_b = _aligned(one, two, common, at)
+    apart = _keyframe_distances(one, at, T_a_b)
     known = [set(slam.landmarks) for slam in (one, two)]
     edges, verdicts = _edges(one, two)
     moved = [MovedLandmark(name, *aligned.distance(k)) for k, name in enumerate(common)]
@@ -162,6 +173,7 @@ def diff(a: Path, b: Path, losses: list[str]) -> Difference:
         verdicts,
         [edit.text for edit in one.edits if edit.edit not in [other.edit for other in two.edits]],
         [edit.text for edit in two.edits if edit.edit not in [other.edit for other in one.edits]],
+        (one.first_keyframe, two.first_keyframe),
     )
 
 
@@ -179,38 +191,46 @@ def shared_landmarks(one: GraphSlam, two: GraphSlam) -> list[str]:
     return [name for name in one.landmarks if name in named[0] & named[1]]
 
 
-def _aligned(one: GraphSlam, two: GraphSlam, common: list[str]) -> tuple[Alignment, str, Numbers]:
-    """Align by landmarks, else by stamps, else use the maps as they are."""
+def _aligned(
+    one: GraphSlam, two: GraphSlam, common: list[str], at: tuple[Array, Array]
+) -> tuple[Alignment, str, Numbers]:
+    """Align by landmarks, else by stamps, else use the maps as they are; ``at`` are the poses of one stamp."""
     space, robust = one.space, one.config.robust
     a, b = positions(one, common), positions(two, common)
     found = align(space, a, b, robust.gate, robust.noise_factor)
     if found is not None:
         return found, f"{int(found.fits.sum())} of {len(common)} landmarks", found.T_a_b
-    at = [poses[:, : space.dimensions] for poses in _of_one_stamp(one, two)]
-    T_a_b = laid_on(space, *at)
+    T_a_b = laid_on(space, *(poses[:, : space.dimensions] for poses in at))
     by = f"{len(at[0])} stamps" if T_a_b is not None else "nothing"
     T_a_b = T_a_b or space.identity
     return as_they_are(space, a, b, T_a_b), by, T_a_b
 
 
-def _of_one_stamp(one: GraphSlam, two: GraphSlam) -> tuple[Array, Array]:
+def whole_path(folder: Path, slam: GraphSlam) -> StampedPath:
+    """Return stamps [ns] (n,) and poses (n, size) of all keyframes of a run, those that were condensed included."""
+    left, _ = read_left(folder, slam.space, slam.bounded)
+    stamps_ns = np.concatenate((left["stamp_ns"], slam.keyframes.stamps_ns))
+    return stamps_ns, np.concatenate((removed_path(slam, left), slam.trajectory()))
+
+
+def _of_one_stamp(one: StampedPath, two: StampedPath) -> tuple[Array, Array]:
     """Poses of the keyframes with the same stamp. Several of one stamp are paired in order."""
-    a, b = _by_stamp(one), _by_stamp(two)
+    a, b = _by_stamp(one[0]), _by_stamp(two[0])
     common = [stamp for stamp in a if stamp in b]
-    return one.trajectory()[[a[stamp] for stamp in common]], two.trajectory()[[b[stamp] for stamp in common]]
+    return one[1][[a[stamp] for stamp in common]], two[1][[b[stamp] for stamp in common]]
 
 
-def _by_stamp(slam: GraphSlam) -> dict[tuple[int, int], int]:
+def _by_stamp(stamps_ns: Index) -> dict[tuple[int, int], int]:
     times = Counter[int]()
     out = {}
-    for k, stamp in enumerate(slam.keyframes.stamps_ns.tolist()):
+    for k, stamp in enumerate(stamps_ns.tolist()):
         out[stamp, times[stamp]] = k
         times[stamp] += 1
     return out
 
 
-def _keyframe_distances(one: GraphSlam, two: GraphSlam, T_a_b: Numbers) -> Array:
-    a, b = _of_one_stamp(one, two)
+def _keyframe_distances(one: GraphSlam, at: tuple[Array, Array], T_a_b: Numbers) -> Array:
+    a, b = at
     n = one.space.dimensions
     moved = np.stack(one.space.group.act(T_a_b, tuple(b[:, :n].T)), axis=-1).reshape(-1, n)
     return np.linalg.norm(moved - a[:, :n], axis=1)
@@ -232,7 +252,8 @@ def _edges(one: GraphSlam, two: GraphSlam) -> tuple[Counts, list[Judged]]:
         verdicts = one.ledger.verdict_of(in_a), two.ledger.verdict_of(in_b)
         if verdicts[0] is not verdicts[1]:
             words = [verdict.name.lower() for verdict in verdicts]
-            unlike.append(Judged(_about(one, names, in_a), in_a, in_b, *words))
+            ids = one.graph.edge_ids.of(in_a), two.graph.edge_ids.of(in_b)
+            unlike.append(Judged(_about(one, names, in_a), *ids, *words))
     return Counts(one.graph.edge_count, two.graph.edge_count, len(pairs)), unlike
 
 
@@ -250,6 +271,7 @@ def _by_meaning(slam: GraphSlam) -> dict[Any, list[int]]:
 def _names(slam: GraphSlam) -> dict[int, int | str]:
     """Return the identity of a vertex in any map: a stamp, or a name."""
     poses = dict(zip(slam.keyframes.ids.tolist(), slam.keyframes.stamps_ns.tolist(), strict=True))
+    poses |= {one.vertex: one.stamp_ns for one in slam.bounded.old} if slam.bounded else {}
     return poses | {mark.vertex: name for name, mark in slam.landmarks.items()}
 
 

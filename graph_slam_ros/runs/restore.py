@@ -97,6 +97,11 @@ def _with_rest(folder: Path, state: MapSnapshot, losses: list[str], counters: Co
     return out
 
 
+def of_all(folder: Path) -> str:
+    """Return how a map of all keyframes is made of a run whose visits are condensed."""
+    return f"graph_slam replay {folder} --out WHOLE --set map.condense=false makes a map with all of them"
+
+
 def restored(
     folder: Path, losses: list[str], counters: Counters | None = None, *, condensed: bool = False
 ) -> GraphSlam:
@@ -109,10 +114,7 @@ def restored(
     lost = len(losses)
     state = map_of(folder, losses, counters)
     if state.bounded is not None and not condensed:
-        raise RunError(
-            f"{folder}: visits of its map are condensed, and this needs all keyframes: "
-            f"graph_slam replay {folder} --out WHOLE --set map.condense=false makes them"
-        )
+        raise RunError(f"{folder}: visits of its map are condensed, and this needs all keyframes: {of_all(folder)}")
     losses[lost:] = [f"{folder}: {loss}" for loss in losses[lost:]]
     config = config_of(folder, state).changed({"map.localize": False})  # what is asked of a map is asked of all of it
     slam = GraphSlam(config, start=state)

@@ -7,9 +7,12 @@ import numpy as np
 import pytest
 
 from benchmarks.lifelong import config, hall, measurements, rms
-from graph_slam_ros.errors import ConfigError
+from graph_slam_ros.analysis.explain import explain_edge, explain_run
+from graph_slam_ros.analysis.what_if import SavedGraph
+from graph_slam_ros.errors import ConfigError, GraphSlamError
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
 from graph_slam_ros.graph.place import LABEL
+from graph_slam_ros.maps.diff import diff
 from graph_slam_ros.runs.condensed_map import read_left, read_left_edges
 from graph_slam_ros.runs.folder import changed_since
 from graph_slam_ros.runs.journal import MAP, parts_of, read_measurements
@@ -231,3 +234,63 @@ def test_a_run_without_what_left_its_map_says_so(recorded, tmp_path):
     recorder.close()
     with pytest.raises(Exception, match=r"condensed\.mcap has 0 keyframes"):
         read_left(tmp_path / "other", PLANAR, slam.bounded)
+
+
+@pytest.fixture(scope="module")
+def saved(recorded):
+    return SavedGraph(recorded[1], [], condensed=True)
+
+
+def test_each_edge_is_explained_by_its_lasting_id(recorded, saved):
+    _, folder, slam, _ = recorded
+    assert [saved.edge(e.edge).edge for e in saved.entries] == slam.graph.edge_ids.of_all(
+        np.arange(slam.graph.edge_count)
+    ).tolist()
+    left = list(read_left_edges(folder))
+    for row in left[:: len(left) // 10]:
+        text = "\n".join(explain_edge(saved, row["edge"]))
+        assert text.startswith(f"edge {row['edge']}")
+        assert row["label"] in text
+        assert f"graph_slam replay {folder} --out WHOLE --set map.condense=false" in " ".join(text.split())
+    place = next(e for e in saved.entries if e.label == LABEL)
+    text = "\n".join(explain_edge(saved, str(place.edge)))
+    assert all(f"{saved.landmark_of(vertex)} (" in text for vertex in place.vertices[1:])
+
+
+def test_the_whole_says_how_much_is_condensed(recorded, saved):
+    _, folder, slam, _ = recorded
+    text = "\n".join(explain_run(saved))
+    assert f"condensed: keyframes 0 to {slam.first_keyframe - 1}, into {len(flat(slam.bounded))} places" in text
+    assert f"{len(list(read_left_edges(folder)))} condensed (believed" in text
+    seen = next(row["landmark"] for row in read_left_edges(folder) if row["landmark"])
+    assert "edges are not in the map any more" in "\n".join(explain_edge(saved, seen))
+
+
+def test_what_if_takes_out_the_edge_of_that_id(recorded, saved):
+    *_, slam, _ = recorded
+    last = saved.entries[-1]
+    assert last.edge > len(saved.entries)
+    row = slam.graph.edge_ids.find(last.edge)
+    solver = saved.solve([last.edge])
+    assert row in saved.solver.edges
+    assert row not in solver.edges
+    assert saved.moved(solver).after.chi2_final < saved.moved(solver).before.chi2_final
+    assert {one.edge for one in saved.influences(3)} <= {e.edge for e in saved.entries if e.verdict}
+    gone = next(read_left_edges(recorded[1]))["edge"]
+    with pytest.raises(GraphSlamError, match=rf"edge {gone} is not in the map any more.*map\.condense=false"):
+        saved.solve([int(gone)])
+    with pytest.raises(GraphSlamError, match="no edge 99999: their ids are below"):
+        saved.solve([99999])
+
+
+def test_diff_compares_the_whole_paths(recorded, tmp_path):
+    _, folder, slam, _ = recorded
+    record_run(tmp_path / "whole", config(PLANAR), read_measurements(folder, []), [])
+    found = diff(tmp_path / "whole", folder, [])
+    assert (found.keyframes.a, found.keyframes.b, found.keyframes.both) == (500, 500, 500)
+    assert found.condensed == (0, slam.first_keyframe)
+    assert 0.0 < found.keyframes_m[0] < found.keyframes_m[1] < 0.2
+    assert f"{slam.first_keyframe}  keyframes, whose edges are in places" in str(found)
+    same = diff(folder, folder, [])
+    assert same.is_same
+    assert same.edges.a == same.edges.both
