@@ -252,8 +252,9 @@ class _Second:
         out: dict[str, Any] = {}
         known = self._one.touched_landmarks(0)
         number = last_number({*known, *landmarks})
-        for name, (vertex, is_unnamed, is_tentative, sightings, first_ns, last_ns, *retired) in landmarks.items():
-            retired_ns = retired[0] if retired else 0
+        for name, fields in landmarks.items():
+            vertex, is_unnamed, is_tentative, sightings, first_ns, last_ns, *rest = fields
+            retired_ns, features = rest[0] if rest else 0, rest[1:]
             if name in self._shared:
                 mark = self._one.landmarks[name]
                 sightings += mark.sightings
@@ -266,5 +267,5 @@ class _Second:
                 name = f"{NAME}{number}"
             retired_ns *= retired_ns >= last_ns  # it was seen since
             of_it = [is_unnamed, is_tentative, sightings, first_ns, last_ns]
-            out[name] = [self._vertex[vertex], *of_it, *[retired_ns] * bool(retired_ns)]
+            out[name] = [self._vertex[vertex], *of_it, *[retired_ns] * bool(retired_ns or features), *features]
         return out

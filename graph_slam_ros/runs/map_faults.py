@@ -36,6 +36,9 @@ def fault_of(state: MapSnapshot) -> str:
             return f"landmark {name} is none"
         if not all(is_index(ns, 2**63) for ns in (mark.first_seen_ns, mark.last_seen_ns, mark.retired_ns)):
             return f"landmark {name} was never seen"
+        is_sized = is_index(mark.sized, 2**31) and are_numbers((mark.size,)) and mark.size >= 0.0
+        if not (isinstance(mark.sort, str) and is_sized):
+            return f"the class or size of landmark {name} is none"
     for k, record in enumerate(state.passes):
         if record != [ALL_VOID] and not (is_index(record[0], len(kinds)) and Presence.is_record(record[1:])):
             return f"record {k} of the passes of landmarks is none"

@@ -10,7 +10,8 @@ JSON records in mcap, as in the journal. The first is ``map`` with the version o
 * ``keyframes``: vertex, stamp, ``T_odom_base``; ``segments``: keyframes at which odometry began; ``drives``:
   the first keyframe of each drive; ``sightings``: keyframe, stamp, ``T_keyframe_base``;
 * ``landmarks``: by name, vertex, whether without identity, whether tentative, number of sightings, first and last
-  stamp, and where it is retired since when, or null where it was given up; ``seen``: of those without identity, each
+  stamp, and where it is retired since when, where it has a class or size these two and how many sightings have a
+  size, or null where it was given up; ``seen``: of those without identity, each
   sighting and its edge; ``passes``: by vertex, what is known of when a landmark is seen (``Presence.record``);
   ``offsets``: by input, the vertex of what its ranges have in common;
 * ``datum``: latitude, longitude and height that fixes are from; ``settings``: parameters that were changed on the way;
@@ -285,8 +286,10 @@ def _as_json(number: float) -> float | str:
 
 def _landmark(mark: Landmark) -> list[Any]:
     stamps = mark.first_seen_ns, mark.last_seen_ns
-    retired = [mark.retired_ns] * bool(mark.retired_ns)
-    return [mark.vertex, mark.is_unnamed, mark.is_tentative, mark.sightings, *stamps, *retired]
+    has_features = bool(mark.sort or mark.sized)
+    retired = [mark.retired_ns] * bool(mark.retired_ns or has_features)
+    features = [mark.sort, mark.size, mark.sized] * has_features
+    return [mark.vertex, mark.is_unnamed, mark.is_tentative, mark.sightings, *stamps, *retired, *features]
 
 
 def _newer(seen: Sequence[LandmarkEdge], first_edge: int) -> Iterable[LandmarkEdge]:

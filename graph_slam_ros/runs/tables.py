@@ -269,13 +269,16 @@ def _landmark_table(slam: GraphSlam) -> str:
     rows = [f"id,kind,{_POSE[space.dof]},sightings,{','.join(f'cov_{a}{b}' for a, b in _upper(_TANGENT[space.dof]))}"]
     has_retired = any(mark.retired_ns for mark in slam.landmarks.values())
     rows[0] += ",retired_ns" * has_retired
+    has_features = any(mark.sort or mark.sized for mark in slam.landmarks.values())
+    rows[0] += ",class,size" * has_features
     for name, value, covariance in results.landmark_estimates(slam):
         kind = "pose" if len(value) == space.pose.size else "point"
         at = [*map(repr, value), *[""] * (space.pose.size - len(value))]
         spread = [f"{covariance[i, j]:.9e}" if j < len(covariance) else "" for i, j in _upper(range(space.dof))]
         mark = slam.landmarks[name]
         retired = [str(mark.retired_ns or "")] * has_retired
-        rows.append(",".join([_csv(name), kind, *at, str(mark.sightings), *spread, *retired]))
+        features = [_csv(mark.sort), repr(mark.size) if mark.sized else ""] if has_features else []
+        rows.append(",".join([_csv(name), kind, *at, str(mark.sightings), *spread, *retired, *features]))
     return "\n".join(rows) + "\n"
 
 

@@ -80,6 +80,7 @@ class LandmarkEdits:
         tools.replace(copies, pulling, keyframe)
         new = Landmark(to, vertex, landmark.is_unnamed, landmark.is_tentative)
         new.seen = [replace(one, edge=copies[one.edge]) for one in landmark.seen if one.edge in copies]
+        new.reset_features()
         new.stamps, new.sightings = {one.where.stamp_ns for one in new.seen}, len(chosen)
         new.first_seen_ns, new.last_seen_ns = self.seen_between(landmark, chosen, all_edges)
         self.withdraw_from(landmark, chosen, keyframe)
@@ -95,6 +96,7 @@ class LandmarkEdits:
         landmark.first_seen_ns, landmark.last_seen_ns = self.seen_between(landmark, left, all_edges)
         landmark.seen = [one for one in landmark.seen if one.edge not in gone]
         landmark.stamps = {one.where.stamp_ns for one in landmark.seen}
+        landmark.reset_features()
         landmark.sightings = max(len(landmark.seen), landmark.sightings - len(gone))
         self._tools.withdraw(edges, keyframe)
         self._landmarks.touched.append(landmark.name)
@@ -142,6 +144,7 @@ class LandmarkEdits:
         """One landmark has all edges of another from now on; ``edges`` has the new edge of each."""
         a.seen += [replace(one, edge=edges[one.edge]) for one in b.seen if one.edge in edges]
         a.stamps |= b.stamps
+        a.note_features(b.sort, b.size, b.sized)
         a.sightings += b.sightings
         a.first_seen_ns, a.last_seen_ns = min(a.first_seen_ns, b.first_seen_ns), max(a.last_seen_ns, b.last_seen_ns)
         a.is_tentative &= b.is_tentative

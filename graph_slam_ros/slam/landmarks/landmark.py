@@ -26,6 +26,9 @@ class Landmark:
     is_unnamed : whether no sighting of it tells which it is
     is_tentative : whether it is too new to be believed: it may be given up
     retired_ns : stamp since which it is known to be gone; 0 where it is there
+    sort : its class, by its sightings; empty where none has one
+    size : the mean of the sizes of its sightings [m]; zero where none has one
+    sized : sightings with a size
     seen : its sightings that do not tell which it is: they may change hands
     stamps : of these; a landmark is never seen twice at once
     """
@@ -38,8 +41,24 @@ class Landmark:
     first_seen_ns: int = 0
     last_seen_ns: int = 0
     retired_ns: int = 0
+    sort: str = ""
+    size: float = 0.0
+    sized: int = 0
     seen: list[LandmarkEdge] = field(default_factory=list)
     stamps: set[int] = field(default_factory=set)
+
+    def note_features(self, sort: str, size: float, sized: int = 1) -> None:
+        """Take over class and size of a sighting, or the mean size of several."""
+        self.sort = self.sort or sort
+        if size and sized:
+            self.sized += sized
+            self.size += (size - self.size) * sized / self.sized
+
+    def reset_features(self) -> None:
+        """Compute class and size anew from its sightings."""
+        self.sort, self.size, self.sized = "", 0.0, 0
+        for one in self.seen:
+            self.note_features(one.sighting.sort, one.sighting.size)
 
 
 @dataclass(slots=True)

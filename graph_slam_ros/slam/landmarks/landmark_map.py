@@ -198,6 +198,7 @@ class Landmarks:
         if not s.id:
             landmark.seen.append(LandmarkEdge(edge, topic, s, where))
             landmark.stamps.add(where.stamp_ns)
+            landmark.note_features(s.sort, s.size)
         landmark.sightings += 1
         self._counters.used[topic] += 1
         self.touched.append(landmark.name)
@@ -258,6 +259,7 @@ class Landmarks:
         landmark.sightings -= len(gone)
         if left and landmark.sightings == len(left):
             landmark.first_seen_ns, landmark.last_seen_ns = min(landmark.stamps), max(landmark.stamps)
+            landmark.reset_features()
         self._withdraw_sightings(gone)
         self.touched.append(name)
 
