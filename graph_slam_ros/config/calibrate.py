@@ -6,6 +6,7 @@ from graph_slam_ros.config.parameter import setting
 from graph_slam_ros.errors import ConfigError
 
 DEFAULT_GROUPS = ("factors", "clock", "yaw")
+_ALONE = ("association", "none")
 GROUPS = (*DEFAULT_GROUPS, "mount", "range_offset", "range_factor", "turn_bias")
 _RULER_M = 0.05  # a prior on the mount that tells it from an offset of the ranges
 
@@ -16,9 +17,10 @@ class CalibrateConfig:
 
     groups: str = setting(
         "none",
-        "what is estimated and corrected: none, auto (factors of odometry, clock and yaw of sensors; of an input with "
-        "ranges alone their offset and factor, while odometry keeps its scale), or a list of factors, clock, yaw, "
-        "mount, range_offset, range_factor, turn_bias",
+        "what is estimated and corrected: none, association (the factors of odometry that "
+        "landmarks.association=joint finds), auto (factors of odometry, clock and yaw of "
+        "sensors; of an input with ranges alone their offset and factor, while odometry keeps its scale), or a list of "
+        "factors, clock, yaw, mount, range_offset, range_factor, turn_bias",
     )
     factor_sigma: float = setting(0.2, "prior of odometry's distance and turn factors", "times", low=1e-4, high=1.0)
     clock_sigma_s: float = setting(0.5, "prior of a sensor's clock against odometry", "s", low=1e-4, high=10.0)
@@ -39,12 +41,13 @@ class CalibrateConfig:
     )
 
     def __post_init__(self) -> None:
-        unknown = [word for word in self.groups.split() if word not in (*GROUPS, "auto", "none")]
+        unknown = [word for word in self.groups.split() if word not in (*GROUPS, "auto", *_ALONE)]
         if unknown:
             raise ConfigError(f"calibrate.groups: {unknown[0]!r} is not auto, none or one of {', '.join(GROUPS)}")
         words = self.groups.split()
-        if "none" in words and len(words) > 1:
-            raise ConfigError(f"calibrate.groups: {self.groups!r} is none and some")
+        for word in _ALONE:
+            if word in words and len(words) > 1:
+                raise ConfigError(f"calibrate.groups: {self.groups!r} is {word} and some")
         asked = self.asked
         if "mount" in asked and "range_offset" in asked and self.mount_sigma_m > _RULER_M:
             raise ConfigError(
@@ -54,14 +57,14 @@ class CalibrateConfig:
 
     @property
     def asked(self) -> tuple[str, ...]:
-        """Names of the groups that are estimated."""
+        """Names of the groups that somebody asked for."""
         words = self.groups.split()
         wanted = {*words, *(DEFAULT_GROUPS if "auto" in words else ())}
         return tuple(group for group in GROUPS if group in wanted)
 
     @property
     def is_on(self) -> bool:
-        """Return whether anything is estimated."""
+        """Return whether somebody asked for any."""
         return bool(self.asked)
 
     @property

@@ -93,8 +93,15 @@ class Config:
                 "(landmarks.surveyed)"
             )
 
+        if "association" in words and self.landmarks.association != "joint":
+            raise ConfigError("calibrate.groups: association needs landmarks.association=joint")
         if self.map.condense and (not_yet := self._not_condensed):
             raise ConfigError(f"map.condense: not with {not_yet} yet: set map.condense=false, or change that")
+
+    @property
+    def uses_found_factors(self) -> bool:
+        """Return whether the factors of odometry that the association finds correct the graph."""
+        return self.landmarks.association == "joint" and self.calibrate.groups == "association"
 
     @property
     def _not_condensed(self) -> str:

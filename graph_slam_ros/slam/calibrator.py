@@ -5,7 +5,7 @@ the background if possible. Its outcome is used a fixed number of keyframes late
 run did.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -15,7 +15,7 @@ from graph_slam_ros.config.config import Config
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.calibration.choice import parameters_of
-from graph_slam_ros.slam.calibration.decision import Finding, decide
+from graph_slam_ros.slam.calibration.decision import Finding, decide, of_association
 from graph_slam_ros.slam.calibration.drift import DriftWindows
 from graph_slam_ros.slam.calibration.fit import TrialFit, fit
 from graph_slam_ros.slam.calibration.model import Values
@@ -23,7 +23,8 @@ from graph_slam_ros.slam.calibration.parameters import Parameter
 from graph_slam_ros.slam.calibration.recalibration import Recalibration
 from graph_slam_ros.slam.calibration.rows import TrialProblem
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
-from graph_slam_ros.slam.landmarks.landmark_map import Landmarks
+from graph_slam_ros.slam.landmarks.explanation import SCALES
+from graph_slam_ros.slam.landmarks.landmark_frontend import LandmarkFrontend
 from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.solver import Report, Settings
 from graph_slam_ros.typing import Array, Executor, Index
@@ -52,19 +53,21 @@ class Calibrator:
         config: Config,
         backend: Backend,
         frontend: KeyframeFrontend,
-        landmarks: Landmarks,
+        landmarks: LandmarkFrontend,
         counters: Counters,
         executor: Executor,
         start: MapSnapshot | None = None,
     ) -> None:
         self._config, self._backend, self._frontend = config, backend, frontend
-        self._landmarks, self._counters, self._executor = landmarks, counters, executor
+        self._landmarks, self._anonymous = landmarks.map, landmarks.anonymous
+        self._counters, self._executor = counters, executor
         self.findings: dict[Parameter, Finding] = {}
         self.history: list[Recalibration] = []
         self.corrected: list[Finding] = []
         self.trials = 0
         self._admitted: set[Parameter] = set()
         self._last: TrialFit | None = None
+        self._used: Mapping[str, tuple[float, float]] = landmarks.anonymous.scales
         self._due, self._steady = FIRST_DUE, 0
         self._job: Trial | None = None
         self._apply_at = 0  # the keyframe
@@ -83,7 +86,11 @@ class Calibrator:
 
     def after_solve(self, keyframe: int, everything: Settings | None) -> Report | None:
         """Start a trial if it is due, and apply the outcome of an earlier one. Returns the report of a solve."""
-        if not self._config.calibrate.is_on or self._backend.holds_back:
+        if self._backend.holds_back:
+            return None
+        if self._config.uses_found_factors:
+            return self._adopt_association(keyframe, everything)
+        if not self._config.calibrate.is_on:
             return None
         if everything is not None:
             return self._at_the_end(keyframe, everything)
@@ -142,7 +149,7 @@ class Calibrator:
             slides=self._config.odometry.slides,
             drifts=self._windows.drifts,
             sigma_per_m=self._problem().model().sigma_per_m(),
-            are_unnamed=self._are_unnamed(),
+            by_association=self._by_association(),
         )
         values = {one.parameter: _rounded(one.value) for one in findings if one.verdict == "admitted"}
         moved = any(one.parameter in values and abs(one.value) > one.sigma for one in findings)
@@ -158,14 +165,37 @@ class Calibrator:
         self._windows.close_if_full(keyframe, stamps_ns, edges, findings, self._frontend.corrections.lines())
         return report
 
+    def _adopt_association(self, keyframe: int, everything: Settings | None) -> Report | None:
+        """Apply the factors of odometry that the last explanation of all scans has found. Returns a solve's report."""
+        scales = self._anonymous.scales
+        if scales is self._used or self._first_keyframe:
+            return None
+        self._used, report = scales, None
+        sources = {edges.source for edges in self._problem().model().odometry}
+        if len(sources) == 1:
+            (source,) = sources
+            found = {Parameter(source, name): one for name, one in scales.items()}
+            findings = [of_association(one, *estimate, one in self._admitted) for one, estimate in found.items()]
+            values = {one.parameter: _rounded(one.value) for one in findings if one.verdict == "admitted"}
+            report = self._correct(values, keyframe, everything, None) if values else None
+            if report is not None:
+                self._admitted |= values.keys()
+                self.corrected += [one for one in findings if one.parameter in values]
+            self.findings |= {one.parameter: one for one in findings}
+        return report
+
     def _count_landmarks(self) -> int:
         return sum(not mark.is_tentative for mark in self._landmarks.known.values())
 
-    def _are_unnamed(self) -> bool:
-        """Return whether odometry identified most landmarks of this drive, and nobody asked for its factors by name."""
+    def _by_association(self) -> dict[str, tuple[float, float]] | None:
+        """Odometry's factors less 1 as the association has them, with sigmas.
+
+        None where its word is not needed: most landmarks have identities, or somebody asked for the factors by name.
+        """
         known = [mark.is_unnamed for mark in self._landmarks.known.values() if not mark.is_tentative]
         is_asked = "factors" in self._config.calibrate.groups.split()
-        return not is_asked and not self._first_keyframe and 2 * sum(known) > len(known)
+        is_needed = not is_asked and not self._first_keyframe and 2 * sum(known) > len(known)
+        return self._anonymous.scales if is_needed else None
 
     def _correct(self, values: Values, keyframe: int, everything: Settings | None, x: Array | None) -> Report | None:
         """Correct all measurements, present and future, and solve. A failure is undone.
@@ -196,6 +226,10 @@ class Calibrator:
         for row, stamp_ns, pose in origins:
             self._landmarks.origins.move(row, stamp_ns, pose)
         self.history += changes
+        factors = [1.0 + next((v for p, v in values.items() if p.name == name), 0.0) for name in SCALES]
+        clocks = {one.source: value for one, value in values.items() if one.name == "clock"}
+        if factors != [1.0, 1.0] or clocks:
+            self._anonymous.recalibrate((factors[0], factors[1]), clocks)
         backend.cancel_search()
         return report
 

@@ -91,7 +91,7 @@ class GraphSlam(MapView):
         self._sink, self._faults = sink or (lambda measurement: None), Faults(counters)
         self._edits = Edits(config.space, backend, frontend, landmarks, self._anchor, solution.guard, counters)
         self._custom = CustomEdges(config, backend, frontend, landmarks.map, self._anchor, counters)
-        self._calibrator = Calibrator(config, backend, frontend, landmarks.map, counters, executor, start)
+        self._calibrator = Calibrator(config, backend, frontend, landmarks, counters, executor, start)
         if start is not None and start.keyframes:
             with failed_edges() as failed:
                 self._restore(start)

@@ -9,14 +9,16 @@
 The sigmas of the first two hang on the noise that odometry states: where it is too small, the drift of a heading passes
 for a wrong factor. So nothing is let in where odometry states less noise than any wheels have.
 
-Landmarks without identities were identified by this odometry. So they confirm its factors, whatever these are: its
-factors are refused, unless they are asked for by name or the map was there before.
+Landmarks without identities were identified by this odometry. So they confirm its factors, whatever these are. A factor
+is refused, unless the association of these landmarks, which leaves it open, has found the same within three sigmas, it
+is asked for by name, or the map was there before.
 
 A yaw (in space a pitch, too) is measured against the direction in which odometry moves. So it is refused for a robot
 that is configured to slide across that direction.
 """
 
-from collections.abc import Collection
+import math
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -26,6 +28,7 @@ from graph_slam_ros.slam.calibration.parameters import OF_ODOMETRY, Parameter
 SIGMAS = 4.0
 MOST_CORRELATED = 0.95
 PRIOR_SIGMAS = 3.0
+AGREEING_SIGMAS = 3.0
 MOST_LOST = 0.2
 LEAST_LANDMARKS = 3
 MOST_SLIDING = 0.3  # of odometry's noise ahead: with more sideways, a turned sensor and a robot that slides are one
@@ -66,7 +69,7 @@ def decide(
     slides: tuple[float, float] = (0.0, 0.0),
     drifts: bool = False,
     sigma_per_m: float = float("inf"),
-    are_unnamed: bool = False,
+    by_association: Mapping[str, tuple[float, float]] | None = None,
 ) -> list[Finding]:
     """Answer the four questions for each parameter of a trial fit.
 
@@ -77,16 +80,34 @@ def decide(
     slides : configured noise of odometry sideways and upwards, relative to that ahead
     drifts : whether parameters may change on the way
     sigma_per_m : of odometry's position for each metre, as stated; in the middle of all steps
-    are_unnamed : whether the landmarks were identified by odometry alone, and nobody asked for its factors by name
+    by_association : odometry's factors less 1 with sigmas, as far as the association of landmarks without identities
+        found them; None where landmarks have identities
     """
     void, remedy = (
         _void(found, landmarks, sigma_per_m),
         "raise calibrate.drift, or " * drifts + "correct the configuration first",
     )
     return [
-        _finding(found, k, void, remedy, _slides(one, slides) or _unnamed(one, are_unnamed), one in corrected)
+        _finding(found, k, void, remedy, _slides(one, slides) or _unnamed(found, k, by_association), one in corrected)
         for k, one in enumerate(found.parameters)
     ]
+
+
+def of_association(parameter: Parameter, value: float, sigma: float, is_corrected: bool) -> Finding:
+    """Judge a factor of odometry that the association of landmarks without identities has left open and found.
+
+    The first two questions are asked. The others its search has answered: it compares whole explanations, each with
+    the clocks and factors that fit it best.
+    """
+    quantity = parameter.quantity
+    shown = f"{amount(parameter, value, 3)}, sigma {amount(parameter, sigma)}"
+    least = FOLLOWED * sigma if is_corrected else max(SIGMAS * sigma, quantity.least)
+    verdict: Verdict = "admitted"
+    if sigma >= quantity.determined_below and not is_corrected:
+        verdict, shown = "not_determined", f"not determined ({shown}): {quantity.manoeuvre}"
+    elif abs(value) < least:
+        verdict, shown = "nothing_to_correct", f"nothing to correct ({shown})"
+    return Finding(parameter, value, sigma, verdict, f"{parameter}: {shown}")
 
 
 def amount(parameter: Parameter, value: float, digits: int = 2) -> str:
@@ -154,12 +175,19 @@ def _slides(parameter: Parameter, slides: tuple[float, float]) -> str:
     )
 
 
-def _unnamed(parameter: Parameter, are_unnamed: bool) -> str:
+def _unnamed(found: TrialFit, k: int, by_association: Mapping[str, tuple[float, float]] | None) -> str:
     """Return why a factor of odometry is not believed of landmarks without identities; empty if it may be."""
-    if not are_unnamed or parameter.name not in OF_ODOMETRY:
+    parameter = found.parameters[k]
+    if by_association is None or parameter.name not in OF_ODOMETRY:
         return ""
-    group = parameter.quantity.group
-    return f"landmarks without ids were identified by this odometry. Use ids, or ask for it: calibrate.groups={group}"
+    remedy = f"Use ids, or ask for it: calibrate.groups={parameter.quantity.group}"
+    if parameter.name not in by_association:
+        return f"landmarks without ids were identified by this odometry. {remedy}"
+    value, sigma = by_association[parameter.name]
+    if abs(value - float(found.values[k])) <= AGREEING_SIGMAS * math.hypot(sigma, float(found.sigmas[k])):
+        return ""
+    has = f"{amount(parameter, value, 3)}, sigma {amount(parameter, sigma)}"
+    return f"the association of landmarks without ids, which leaves it open, has {has}. {remedy}"
 
 
 def _agree(first: float, second: float) -> bool:

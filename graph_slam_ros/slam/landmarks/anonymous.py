@@ -6,7 +6,7 @@ scans are explained at once, in the background on a copy (``explanation.py``, ``
 result is used a fixed number of keyframes later.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -41,6 +41,7 @@ from graph_slam_ros.slam.landmarks.scans import (
     ScanBuilder,
     Seen,
     motion_between,
+    rescaled_nearby,
 )
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Executor
@@ -86,7 +87,6 @@ class AnonymousLandmarks:
             hypotheses=1 if c.association == "nearest" else 40,
             size_sigma_m=c.size_sigma_m,
             clock_sigma_s=config.calibrate.clock_sigma_s,
-            has_clocks="clock" not in config.calibrate.asked,
         )
         self._belief = SolverBelief(space, solver, landmarks)
         self._hindsight = Hindsight(config, self._settings, executor)
@@ -99,6 +99,7 @@ class AnonymousLandmarks:
         self._nearby: list[Array] = []  # of the scans after which odometry went on for long enough
         self._same: dict[int, int] = {}  # landmarks of the beam that are others in the graph
         self._firsts: list[int] = []  # the first cluster of each scan
+        self._clocks: dict[str, float] = {}  # of each input the correction that its stamps have
         self._doubt: Callable[[float], Array] | None = None
         self._compared = 0  # scans
         self._displaced: int | None = None  # the scan from which on all are explained anew
@@ -134,13 +135,36 @@ class AnonymousLandmarks:
         """Restart the beam from the solver's estimate, because the map has moved."""
         self._beam = None
 
+    @property
+    def scales(self) -> dict[str, tuple[float, float]]:
+        """The scales of odometry by the last explanation, less 1, with standard deviations; empty if there was none."""
+        return self._hindsight.found_scales
+
+    def recalibrate(self, factors: tuple[float, float], clocks: Mapping[str, float]) -> None:
+        """Take over that odometry's distance and turn were multiplied, and seconds added to the clocks of inputs.
+
+        Stamps of scans stay: the explanation knows what they lack.
+        """
+        for topic, seconds in clocks.items():
+            self._clocks[topic] = self._clocks.get(topic, 0.0) + seconds
+        self._motions = [motion.rescaled(factors) for motion in self._motions]
+        self._nearby = [rescaled_nearby(self._space, one, factors) for one in self._nearby]
+        self._reckoning.rescale(factors)
+        at = self._reckoning.at
+        self._builder.reckon_anew(at)
+        known = [self._reckoning.remembers(scan.at.stamp_ns) for scan in self._scans]
+        self._scans = [replace(s, at=at(s.at.stamp_ns)) if k else s for s, k in zip(self._scans, known, strict=True)]
+        self._hindsight.rescale(factors)
+        self.forget_belief()
+
     def see(self, m: Sightings, where: PoseAtStamp) -> list[Assigned]:
         """Add the sightings without id to a scan. Returns those of the previous scan if it has ended."""
         at = self._reckoning.at(m.stamp_ns)
         out = self.end_scan() if self._builder.is_full(at) else []
         for s in m.sightings:
             point, covariance = self._point(s)
-            self._builder.add(at, point, covariance, Seen(m.topic, self._widened(s, where), where), s.sort)
+            seen = Seen(m.topic, self._widened(s, where), where, self._clocks.get(m.topic, 0.0))
+            self._builder.add(at, point, covariance, seen, s.sort)
         return out
 
     def identified(self, m: Sightings, where: PoseAtStamp) -> list[Assigned]:
@@ -210,7 +234,7 @@ class AnonymousLandmarks:
             scales, sigma = self._hindsight.scales
             seed = self._belief.seed(scan, names, scales if beam is None else beam.scales[0], sigma)
             beam, self._leader = Beam(self._settings, seed), None
-            beam.sorts, beam.sizes = self._sorts, self._sizes
+            beam.sorts, beam.sizes = self._features()
         else:
             beam.advance(motion)
             self._belief.recall(beam, scan, names)
@@ -219,6 +243,16 @@ class AnonymousLandmarks:
             raise GraphSlamError("the hypotheses are not finite")
         self._beam = beam
         return decision
+
+    def _features(self) -> tuple[dict[int, str], dict[int, float]]:
+        """Classes and sizes of landmarks, also of those that no beam began: of a map, or of an explanation of all."""
+        for number, name in self.clusters.names.items():
+            mark = self._landmarks.known.get(name)
+            if mark is not None and mark.sort:
+                self._sorts[number] = mark.sort
+            if mark is not None and mark.sized:
+                self._sizes[number] = mark.size
+        return self._sorts, self._sizes
 
     def doubt(self, since_ns: int, added: Callable[[float], Array] | None) -> None:
         """Use odometry with more noise, or as stated again. In the first case the scans since then are explained anew.
@@ -330,7 +364,8 @@ class AnonymousLandmarks:
         for cluster, landmark in changes(None, self._leader).items():
             leader[cluster] = landmark
         nearby = self._nearby + [self._reckoning.nearby(scan.at.stamp_ns) for scan in scans[len(self._nearby) :]]
-        return FrozenScans(tuple(scans), tuple(self._motions), np.array(nearby), poses, scales.copy(), given, leader)
+        motions, clocks = tuple(self._motions), dict(self._clocks)
+        return FrozenScans(tuple(scans), motions, np.array(nearby), poses, scales.copy(), given, leader, clocks)
 
     def _adopt(self, found: Found | None, keyframes: StampedPoses[Keyframe]) -> None:
         """Use an explanation of all scans up to one."""

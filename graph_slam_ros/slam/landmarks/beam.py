@@ -43,7 +43,6 @@ class BeamSettings:
     slots : landmarks that a hypothesis holds at once; the one not seen for longest leaves
     scale_sigma : of odometry's two scales
     clock_sigma_s : of the clock of each input, against odometry's
-    has_clocks : whether the explanation of all scans estimates the clocks
     size_sigma_m : of the size of a cluster; zero: sizes are not compared
     slip_every_s, slip_log_prior, slip_sigma_m, slip_sigma_rad : how odometry slips
     """
@@ -56,7 +55,6 @@ class BeamSettings:
     slots: int = 40
     scale_sigma: float = 0.1
     clock_sigma_s: float = 0.5
-    has_clocks: bool = True
     size_sigma_m: float = 0.0
     slip_every_s: float = 2.0
     slip_log_prior: float = -3.5

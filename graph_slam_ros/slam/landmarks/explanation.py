@@ -4,7 +4,7 @@ The method is Gauss-Newton with Levenberg's damping. Odometry is tight or has sl
 have Cauchy's loss. The first stage has no slip and a wide loss, because a local minimum looks like a wrong association.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -18,6 +18,8 @@ from graph_slam_ros.slam.landmarks.scans import NEARBY_S, Motion, Scan
 from graph_slam_ros.typing import Array, Mask
 
 UNUSED = -1
+SCALES = ("distance", "turn")
+"""Names of odometry's scales, as calibration has them."""
 Ids = NDArray[np.int64]
 
 _LEAST_SLIP = 0.25  # of a slip, of how long it takes
@@ -80,7 +82,7 @@ class Drive:
     stamps_s : (N,)
     scan : (M,) the scan of each cluster
     points : (M, n) clusters, from their scans
-    topics : (T,) inputs
+    topics : (T,) inputs; ``clocks`` are the corrections that stamps have by now
     whiten : (M, n, n)
     work : rows of odometry and clusters that were linearised by now
     """
@@ -92,6 +94,7 @@ class Drive:
         nearby: Array,
         settings: BeamSettings,
         costs: Costs,
+        clocks: Mapping[str, float] | None = None,
     ) -> None:
         self.settings = settings
         self.stamps_s = np.array([one.at.stamp_ns for one in scans]) * 1e-9
@@ -104,7 +107,7 @@ class Drive:
         self.costs = replace(costs, landmark=costs.landmark + 2.0 * LOG_SIZES) if self._has_sizes else costs
         self.whiten = _whitening(np.array([c.covariance for one in scans for c in one.clusters]))
         self._set_motions(motions)
-        self._set_clocks(scans, nearby)
+        self._set_clocks(scans, nearby, clocks or {})
         self.work = self._free = 0
 
     @property
@@ -133,12 +136,14 @@ class Drive:
         volumes = np.linalg.slogdet(slipped)[1] - np.linalg.slogdet(tight)[1]
         self.slip_cost = volumes - 2.0 * c.slip_log_prior
 
-    def _set_clocks(self, scans: Sequence[Scan], nearby: Array) -> None:
-        """Note of which input each cluster is, and how the robot moved around each scan, by odometry."""
+    def _set_clocks(self, scans: Sequence[Scan], nearby: Array, clocks: Mapping[str, float]) -> None:
+        """Note of which input each cluster is, what its stamps lack, and how the robot moved around each scan."""
         of = [[seen.topic for seen in c.seen] for one in scans for c in one.clusters]
-        self.topics = tuple(sorted({topic for names in of for topic in names})) if self.settings.has_clocks else ()
+        self.topics = tuple(sorted({topic for names in of for topic in names}))
         parts = [[names.count(topic) / len(names) for topic in self.topics] for names in of]
         self._part = np.array(parts).reshape(len(of), len(self.topics))
+        lacks = [[clocks.get(s.topic, 0.0) - s.clock_s for s in c.seen] for one in scans for c in one.clusters]
+        self._late_s = np.array([np.mean(one) if one else 0.0 for one in lacks])
         self._nearby = nearby
 
     # -- what it costs -----------------------------------------------------------------------------------------------
@@ -163,9 +168,8 @@ class Drive:
         A clock says that they were seen from another point on the way, which odometry has.
         """
         points = self.points[clusters]
-        if not e.clocks.any() and not self.topics:
-            return points, np.zeros_like(points)
-        moved, rate = _interpolated(self._nearby[self.scan[clusters]], self._part[clusters] @ e.clocks)
+        after_s = self._part[clusters] @ e.clocks + self._late_s[clusters]
+        moved, rate = _interpolated(self._nearby[self.scan[clusters]], after_s)
         turned = (rotation(moved[:, self.n :]) @ points[..., None])[..., 0]
         swung = (lever(turned) @ rate[:, self.n :, None])[..., 0]
         return turned + moved[:, : self.n], swung + rate[:, : self.n]
@@ -270,13 +274,14 @@ class Drive:
         except np.linalg.LinAlgError:
             return None
 
-    def clocks_of(self, e: Estimate) -> dict[str, tuple[float, float]]:
-        """The clock of each input, and its standard deviation [s]."""
+    def named(self, e: Estimate) -> dict[str, tuple[float, float]]:
+        """Odometry's scales, ``distance`` and ``turn``, and the clock of each input [s], with standard deviations."""
         covariance = self.border_covariance(e)
         if covariance is None:
             return {}
-        sigmas = np.sqrt(covariance.diagonal()[self.n * len(e.landmarks) + 2 :])
-        return dict(zip(self.topics, zip(e.clocks.tolist(), sigmas.tolist(), strict=True), strict=True))
+        sigmas = np.sqrt(covariance.diagonal()[self.n * len(e.landmarks) :]).tolist()
+        names, values = (*SCALES, *self.topics), [*e.scales.tolist(), *e.clocks.tolist()]
+        return dict(zip(names, zip(values, sigmas, strict=True), strict=True))
 
     def _volume(self, e: Estimate, loss_scale: float, *, slips: bool) -> float:
         normal, floor = self._normal(e, loss_scale or self.costs.loss_scale, slips=slips)

@@ -4,7 +4,7 @@ The scans are solved in stages, once from odometry and once from the present pat
 Then moves correct the association. The result does not depend on when the work is done.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -17,7 +17,7 @@ from graph_slam_ros.slam.frontend.keyframes import Keyframe
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.slam.landmarks.beam import NOTHING, BeamSettings, Ids
 from graph_slam_ros.slam.landmarks.constellation import laid_on_the_map
-from graph_slam_ros.slam.landmarks.explanation import UNUSED, Costs, Drive, Estimate
+from graph_slam_ros.slam.landmarks.explanation import SCALES, UNUSED, Costs, Drive, Estimate
 from graph_slam_ros.slam.landmarks.moves import refined, without_few
 from graph_slam_ros.slam.landmarks.presence_check import NOTHING_SEEN, Presence, presence
 from graph_slam_ros.slam.landmarks.rotations import matrices_of, poses_of
@@ -40,6 +40,7 @@ class FrozenScans:
     given : (M,) the number of each cluster's landmark
     leader : (M,) the same, by the beam alone
     nearby : (N, S, dof) how the robot moved around each scan, by odometry
+    clocks : of each input the correction that its stamps have by now [s]
     """
 
     scans: tuple[Scan, ...]
@@ -49,6 +50,7 @@ class FrozenScans:
     scales: Array
     given: Ids
     leader: Ids
+    clocks: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +60,7 @@ class Found:
     Attributes
     ----------
     is_whole : whether all moves were tried
+    scales : of odometry, by name, with standard deviations
     clocks : of each input the correction of its stamps [s], and its standard deviation
     presence : which landmarks in view were seen
     """
@@ -66,6 +69,7 @@ class Found:
     estimate: Estimate
     undecided: int = 0
     is_whole: bool = True
+    scales: dict[str, tuple[float, float]] = field(default_factory=dict)
     clocks: dict[str, tuple[float, float]] = field(default_factory=dict)
     presence: Presence = NOTHING_SEEN
 
@@ -128,6 +132,7 @@ class Hindsight:
     ----------
     is_on : whether it does
     scales : (2,) of odometry, as last found, and their standard deviation
+    found_scales : the same by name, as the last explanation has them, with its standard deviations
     newest : the explanation that was found last
     """
 
@@ -142,6 +147,7 @@ class Hindsight:
         self._last: Ids | None = None
         self.is_on = True
         self.scales: tuple[Array, float] = np.zeros(2), settings.scale_sigma
+        self.found_scales: dict[str, tuple[float, float]] = {}
         self.newest: Found | None = None
 
     def is_due(self, scans: int) -> bool:
@@ -158,6 +164,16 @@ class Hindsight:
         """Drop the explanation in the background, and start another soon: what it began with is wrong."""
         if self._job is not None:
             self._job, self._next = None, 0
+
+    def rescale(self, factors: tuple[float, float]) -> None:
+        """Use scales of odometry that was corrected by these factors."""
+        self.restart()
+        values, sigma = self.scales
+        self.scales = (1.0 + values) / np.array(factors) - 1.0, sigma
+        for name, factor in zip(SCALES, factors, strict=True):
+            if name in self.found_scales:
+                value, own = self.found_scales[name]
+                self.found_scales[name] = (1.0 + value) / factor - 1.0, own / factor
 
     def outcome(self, keyframes: int) -> Found | None:
         """The explanation that is due at a keyframe. It waits for it."""
@@ -198,12 +214,13 @@ class Hindsight:
     def _noted(self, found: Found | None) -> Found | None:
         if found is not None:
             self.scales, self.newest = (found.estimate.scales, _SCALE_SIGMA), found
+            self.found_scales = dict(found.scales)
         return found
 
 
 def explained(space: Geometry, frozen: FrozenScans, settings: BeamSettings, costs: Costs) -> Found | None:
     """Explain all scans, from the graph's assignment and from the beam's; None if too little was seen."""
-    drive = Drive(frozen.scans, frozen.motions, frozen.nearby, settings, costs)
+    drive = Drive(frozen.scans, frozen.motions, frozen.nearby, settings, costs, frozen.clocks)
     here = matrices_of(space, frozen.poses)
     paths = here, drive.along_odometry(here[0][0], here[1][0], frozen.scales)
     found: list[Found] = []
@@ -222,12 +239,14 @@ def explained(space: Geometry, frozen: FrozenScans, settings: BeamSettings, cost
     drive.begin_moves()
     estimate, undecided = laid_on_the_map(drive, best.estimate)
     is_whole = best.is_whole and drive.may_move
+    unknowns = drive.named(estimate)
     return replace(
         best,
         estimate=estimate,
         undecided=undecided,
         is_whole=is_whole,
-        clocks=drive.clocks_of(estimate),
+        scales={name: one for name, one in unknowns.items() if name in SCALES},
+        clocks={name: one for name, one in unknowns.items() if name not in SCALES},
         presence=presence(drive, estimate),
     )
 

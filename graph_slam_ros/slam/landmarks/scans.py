@@ -5,8 +5,9 @@ because an error that lasts half a second is the same in all of them. The cluste
 """
 
 from bisect import bisect_right
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.measurements.types import Sighting
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
 from graph_slam_ros.slam.frontend.odometry_selector import Step
-from graph_slam_ros.slam.landmarks.rotations import lever, turn_of
+from graph_slam_ros.slam.landmarks.rotations import lever, rotation, turn_of
 from graph_slam_ros.typing import Array, Numbers
 
 SCAN_NS, _SCAN_RAD = 500_000_000, 0.15
@@ -98,6 +99,21 @@ class DeadReckoning:
         if len(self._samples) > 64 and self._samples[32].stamp_ns < step.stamp_ns - self._remembered_ns:
             del self._samples[:32]
 
+    def rescale(self, factors: tuple[float, float]) -> None:
+        """Multiply the distance and the turn of all steps that are remembered by these factors, from the first on."""
+        space, n, dof = self._space, self._space.dimensions, self._space.dof
+        group, by = space.group, [factors[0]] * n + [factors[1]] * (dof - n)
+        before, samples = self._samples, self._samples[:1]
+        for a, b in pairwise(before):
+            step = group.exp(tuple(f * x for f, x in zip(by, group.log(group.between(a.pose, b.pose)), strict=True)))
+            pose = space.normalized(tuple(map(float, group.compose(samples[-1].pose, step))))
+            samples.append(replace(b, pose=pose))
+        self._samples = samples
+
+    def remembers(self, stamp_ns: int) -> bool:
+        """Return whether a stamp is as late as what is remembered."""
+        return bool(self._samples) and stamp_ns >= self._samples[0].stamp_ns
+
     def since_s(self, stamp_ns: int) -> float:
         """Seconds from the last step to a stamp."""
         return (stamp_ns - self._samples[-1].stamp_ns) * 1e-9 if self._samples else 0.0
@@ -143,6 +159,19 @@ class Motion:
     moving_s: float
     is_broken: bool
 
+    def rescaled(self, factors: tuple[float, float]) -> "Motion":
+        """The motion with its distance and turn multiplied."""
+        way = factors[0] * rotation(0.5 * (factors[1] - 1.0) * self.turn) @ self.way
+        return replace(self, way=way, turn=factors[1] * self.turn)
+
+
+def rescaled_nearby(space: Geometry, nearby: Array, factors: tuple[float, float]) -> Array:
+    """Motions (S, dof) as of ``DeadReckoning.nearby``, their distance and turn multiplied."""
+    n = space.dimensions
+    way, turn = nearby[:, :n], nearby[:, n:]
+    way = factors[0] * (rotation(0.5 * (factors[1] - 1.0) * turn) @ way[..., None])[..., 0]
+    return np.concatenate([way, factors[1] * turn], axis=1)
+
 
 def motion_between(space: Geometry, noise: MotionNoise, a: Reckoned, b: Reckoned, jump: Array) -> Motion:
     """The motion from one instant to another.
@@ -168,11 +197,12 @@ def motion_between(space: Geometry, noise: MotionNoise, a: Reckoned, b: Reckoned
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """A sighting without id: its input, and the robot's pose."""
+    """A sighting without id: its input, and the robot's pose; ``clock_s`` is the correction that its stamp has."""
 
     topic: str
     sighting: Sighting
     where: PoseAtStamp
+    clock_s: float = 0.0
 
     def shared_by(self, count: int) -> "Seen":
         """The sighting as one of several with the same error: together they count as one."""
@@ -244,6 +274,10 @@ class ScanBuilder:
         first = self._glimpses[0].at
         is_over = at.stamp_ns - first.stamp_ns >= SCAN_NS or at.turned - first.turned >= _SCAN_RAD
         return is_over or at.segment != first.segment
+
+    def reckon_anew(self, at: Callable[[int], Reckoned]) -> None:
+        """Take over dead reckoning that was corrected."""
+        self._glimpses = [replace(one, at=at(one.at.stamp_ns)) for one in self._glimpses]
 
     def add(self, at: Reckoned, point: Array, covariance: Array, seen: Seen, sort: str = "") -> None:
         """Add a sighting of a point (n,) in the base frame, with its covariance (n, n)."""

@@ -9,6 +9,8 @@ from reliability import times
 
 from graph_slam_ros.graph import R2
 from graph_slam_ros.lie import se2
+from graph_slam_ros.runs.journal import RecordWriter
+from graph_slam_ros.runs.map_journal import MapGrowth, read_map, state_of
 from graph_slam_ros.simulation import Fault, faulty_recording, measurements
 from graph_slam_ros.simulation.motion import VelocityNoise
 from graph_slam_ros.simulation.recording import drive
@@ -254,8 +256,8 @@ def test_G19_where_association_asks_of_what_cannot_be_solved_no_covariance_is_kn
     assert np.isnan(slam.keyframe_covariances()).all()
 
 
-@pytest.mark.parametrize("by", ["class", "size"])
-def test_landmarks_near_one_another_are_told_apart_by_their_class_or_size(by):
+@functools.cache
+def pairs():
     """Pairs of a tree and a pole 0.3 m apart, seen with an error of 0.1 m and half a degree from up to 15 m."""
     places_of = trees(3, count=8, apart_m=9.0)
     points = np.vstack([places_of, places_of + np.array([0.3, 0.0])])
@@ -267,29 +269,77 @@ def test_landmarks_near_one_another_are_told_apart_by_their_class_or_size(by):
 
     twists = np.tile([2.0, 0.0, 2.0 * np.pi / (LAP_TICKS * 0.1)], (LAP_TICKS, 1))
     true = dict(zip(names, points.tolist(), strict=True))
-    recording = drive(rng, (0.0, 0.0, 0.0), twists, TICK_NS, NOISE, observe, 5, true)
+    return drive(rng, (0.0, 0.0, 0.0), twists, TICK_NS, NOISE, observe, 5, true)
+
+
+def with_features(by):
+    """The measurements of ``pairs`` without ids; sightings have a class or a size."""
+    rng = np.random.default_rng(4)
 
     def known(s):
         if by == "class":
             return replace(s, id="", sort=s.id.split()[0])
-        return replace(s, id="", size=(0.5 if s.id.startswith("tree") else 0.15) + 0.03 * float(rng.standard_normal()))
+        size = 0.5 if s.id.startswith("tree") else 0.15
+        return replace(s, id="", size=size + 0.03 * float(rng.standard_normal()) if by == "size" else 0.0)
 
-    def found(*, is_known):
-        slam = pipeline("joint", size_sigma_m=0.03)
-        for m in measurements(recording):
-            if isinstance(m, Sightings):
-                m = replace(m, sightings=tuple(known(s) if is_known else replace(s, id="") for s in m.sightings))
-            slam.process(m)
-        slam.process(Control("end"))
-        slam.process(Control("optimize"))
-        at = places(slam)
-        apart = np.linalg.norm(at[:, None] - at, axis=2) + 100.0 * np.eye(len(at))
-        return len(at), apart.min(axis=1)
+    for m in measurements(pairs()):
+        yield replace(m, sightings=tuple(known(s) for s in m.sightings)) if isinstance(m, Sightings) else m
 
-    count, nearest = found(is_known=True)
-    assert count == 16
-    assert nearest.max() < 0.6
-    assert found(is_known=False)[0] < 16
+
+def kind_of(one):
+    """Of a sighting or a landmark, by its class or size."""
+    return one.sort or ("tree" if one.size > 0.325 else "pole")
+
+
+def seen_by(slam, by):
+    for m in [*with_features(by), Control("end"), Control("optimize")]:
+        slam.process(m)
+    return slam
+
+
+@pytest.mark.parametrize("by", ["class", "size"])
+def test_landmarks_near_one_another_are_told_apart_by_their_class_or_size_and_a_map_has_them(by, tmp_path):
+    slam = seen_by(pipeline("joint", size_sigma_m=0.03), by)
+    at = places(slam)
+    apart = np.linalg.norm(at[:, None] - at, axis=2) + 100.0 * np.eye(len(at))
+    assert len(at) == 16
+    assert apart.min(axis=1).max() < 0.6
+    assert len(seen_by(pipeline("joint", size_sigma_m=0.03), "nothing").landmarks) < 16
+
+    marks = slam.landmarks.values()
+    assert sorted(map(kind_of, marks)) == ["pole"] * 8 + ["tree"] * 8
+    assert all(bool(mark.sort) == (by == "class") and bool(mark.sized) == (by == "size") for mark in marks)
+    writer = RecordWriter(tmp_path / "map.mcap")
+    writer.write([{"type": "map", "version": 1}, MapGrowth().since(state_of(slam))])
+    writer.close()
+    start = read_map(tmp_path, [])
+    assert [(m.sort, m.size, m.sized) for m in start.landmarks.values()] == [(m.sort, m.size, m.sized) for m in marks]
+    again = seen_by(GraphSlam(slam.config, start=start), by)
+    seen = {name: [kind_of(one.sighting) for one in mark.seen] for name, mark in again.landmarks.items()}
+    wrong = sum(kind != kind_of(start.landmarks[name]) for name in start.landmarks for kind in seen[name])
+    assert sum(map(len, seen.values())) > 1.5 * sum(len(mark.seen) for mark in marks), "they are seen again"
+    assert wrong < 0.01 * sum(map(len, seen.values()))
+
+
+def test_the_factor_of_odometry_that_the_association_finds_corrects_the_graph():
+    """Odometry tells 10 % too long a way."""
+    recording, scale = park(1, laps=1), 1.1
+
+    def found(groups):
+        slam = GraphSlam(Config.from_mapping({"landmarks.association": "joint", "calibrate.groups": groups}))
+        for m in [*measurements(recording), Control("end"), Control("optimize")]:
+            if isinstance(m, Odometry):
+                x, y, heading = m.T_odom_base
+                m = replace(m, T_odom_base=(scale * x, scale * y, heading))
+            slam.process(without_ids(m))
+        return slam
+
+    slam, without = found("association"), found("none")
+    assert slam.calibrated("odometry", "distance") == pytest.approx(1.0 / scale, abs=0.015)
+    assert slam.calibrated("odometry", "turn") == 1.0, "one circle does not determine it"
+    assert not without.calibration_report
+    assert path_rmse(slam, recording) < 0.3 * path_rmse(without, recording)
+    assert len(slam.landmarks) == 40
 
 
 def test_where_odometry_slips_what_was_seen_since_is_explained_anew():

@@ -252,8 +252,8 @@ def around(scans):
     return np.zeros((len(scans), len(NEARBY_S), 3))
 
 
-def of_drive(scans, which, n=2, nearby=None, settings=SETTINGS):
-    drive = Drive(scans, motions(scans, n), around(scans) if nearby is None else nearby, settings, COSTS)
+def of_drive(scans, which, n=2, nearby=None, settings=SETTINGS, clocks=None):
+    drive = Drive(scans, motions(scans, n), around(scans) if nearby is None else nearby, settings, COSTS, clocks)
     position, turn = drive.along_odometry(np.zeros(n), np.eye(n), np.zeros(2))
     clocks = np.zeros(len(drive.topics))
     return drive, drive.staged(Estimate(position, turn, np.empty((0, n)), np.zeros(2), clocks, np.array(which)))
@@ -291,19 +291,48 @@ def weaving(late_s, count=120):
 def test_solving_all_finds_the_clock_of_an_input(late_s):
     scans, truth, nearby = weaving(late_s)
     drive, e = of_drive(scans, truth, nearby=nearby)
-    (value, sigma) = drive.clocks_of(e)["seen"]
+    (value, sigma) = drive.named(e)["seen"]
     assert value == pytest.approx(-late_s, abs=0.02)
     assert sigma < 0.03
-    without, same = of_drive(scans, truth, nearby=nearby, settings=replace(SETTINGS, has_clocks=False))
-    assert without.clocks_of(same) == {}
+    _, same = of_drive(scans, truth, nearby=nearby, settings=replace(SETTINGS, clock_sigma_s=1e-6))
     assert (same.cost > e.cost + 16.0) == bool(late_s), "four sigmas"
+
+
+def test_what_stamps_lack_of_a_clock_that_was_corrected_is_no_unknown():
+    scans, truth, nearby = weaving(0.22)
+    drive, e = of_drive(scans, truth, nearby=nearby, clocks={"seen": -0.22})
+    assert drive.named(e)["seen"][0] == pytest.approx(0.0, abs=0.02)
+    with_it = [
+        replace(one, clusters=tuple(replace(c, seen=(replace(SEEN, clock_s=-0.22),)) for c in one.clusters))
+        for one in scans
+    ]
+    drive, e = of_drive(with_it, truth, nearby=nearby, clocks={"seen": -0.22})
+    assert drive.named(e)["seen"][0] == pytest.approx(-0.22, abs=0.02), "these stamps have it already"
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_dead_reckoning_and_motions_are_rescaled_alike(n):
+    space, factors = SPACES[n], (0.9, 1.2)
+    plain, scaled = (DeadReckoning(space, 100.0) for _ in range(2))
+    for k in range(20):
+        way, turn = 0.02 * k, 0.01 * k
+        for reckoning, by in ((plain, (1.0, 1.0)), (scaled, factors)):
+            step = space.group.exp((by[0] * way, *[0.0] * (space.dof - 2), by[1] * turn))
+            reckoning.step(Step(k * S // 10, step, step, None), stands=False)
+    begin, end = 3 * S // 10, 19 * S // 10
+    before = motion_between(space, NOISE, plain.at(begin), plain.at(begin + S // 10), np.zeros((space.dof,) * 2))
+    plain.rescale(factors)
+    assert plain.at(end).pose == pytest.approx(scaled.at(end).pose)
+    after = motion_between(space, NOISE, plain.at(begin), plain.at(begin + S // 10), np.zeros((space.dof,) * 2))
+    assert before.rescaled(factors).way == pytest.approx(after.way, rel=1e-4), "as the explanation has its scales"
+    assert before.rescaled(factors).turn == pytest.approx(after.turn, abs=1e-9)
 
 
 def test_a_robot_that_does_not_turn_knows_nothing_of_a_clock():
     scans, truth = circle()
     seen = [replace(one, clusters=tuple(replace(c, seen=(SEEN,)) for c in one.clusters)) for one in scans]
     drive, e = of_drive(seen, truth, nearby=around(scans))
-    assert drive.clocks_of(e)["seen"] == pytest.approx((0.0, SETTINGS.clock_sigma_s))
+    assert drive.named(e)["seen"] == pytest.approx((0.0, SETTINGS.clock_sigma_s))
 
 
 def test_the_factor_is_that_of_the_whole_matrix():

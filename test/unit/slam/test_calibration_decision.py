@@ -5,6 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from graph_slam_ros.config.config import Config
+from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.slam.calibration.decision import decide
 from graph_slam_ros.slam.calibration.drift import WINDOW, DriftWindows
 from graph_slam_ros.slam.calibration.fit import TrialFit
@@ -71,10 +73,18 @@ def test_factors_are_refused_where_odometry_told_the_landmarks_apart():
     distance = Parameter("odom", "distance")
     found = replace(fitted(-0.11, 0.01), parameters=(distance,))
     assert decide(found, 10)[0].verdict == "admitted"
-    (one,) = decide(found, 10, are_unnamed=True)
+    (one,) = decide(found, 10, by_association={})
     assert one.verdict == "refused"
     assert one.text.endswith("Use ids, or ask for it: calibrate.groups=factors")
-    assert decide(fitted(0.3, 0.025), 10, are_unnamed=True)[0].verdict == "admitted", "a clock shows in turns"
+    assert decide(fitted(0.3, 0.025), 10, by_association={})[0].verdict == "admitted", "a clock shows in turns"
+
+
+@pytest.mark.parametrize(("found_there", "verdict"), [(-0.10, "admitted"), (-0.03, "refused"), (0.11, "refused")])
+def test_a_factor_that_the_association_found_as_well_is_let_in(found_there, verdict):
+    """The association leaves odometry's scales open, so it does not merely confirm them."""
+    found = replace(fitted(-0.11, 0.01), parameters=(Parameter("odom", "distance"),))
+    (one,) = decide(found, 10, by_association={"distance": (found_there, 0.01)})
+    assert one.verdict == verdict
 
 
 def test_windows_of_a_loaded_map_begin_with_the_drive():
@@ -83,3 +93,12 @@ def test_windows_of_a_loaded_map_begin_with_the_drive():
     assert windows.closed == []
     windows.close_if_full(500 + WINDOW, stamps_ns, 90, [], {})
     assert windows.closed == [(500, {})]
+
+
+def test_the_factors_of_an_association_need_one():
+    with pytest.raises(ConfigError, match=r"calibrate\.groups: association needs landmarks\.association=joint"):
+        Config.from_mapping({"calibrate.groups": "association"})
+    both = {"calibrate.groups": "association", "landmarks.association": "joint"}
+    assert Config.from_mapping(both).uses_found_factors
+    with pytest.raises(ConfigError, match="is association and some"):
+        Config.from_mapping(both | {"calibrate.groups": "association clock"})
