@@ -165,6 +165,29 @@ class OutlierGate:
                 return True
         return False
 
+    def readmit_group(self, keyframe: int) -> list[int]:
+        """Accept, as a trial, the rejected edges that may be likely together. Returns them: none, or at least two.
+
+        A group costs at least what each of its edges costs alone. So one that costs more than all their gates together
+        is in no such group.
+        """
+        outside = self.ledger.outside
+        chi2, _ = self._solver.chi2_of(outside)
+        group = outside[np.argsort(chi2, kind="stable")[:_READMISSIONS]].tolist()
+        costs = dict(zip(group, self.innovations(group), strict=True))
+        while group and max(map(costs.__getitem__, group)) > (most := self.most_cost(group)):
+            group = [edge for edge in group if costs[edge] <= most]
+        if len(group) < 2:
+            return []
+        for edge in group:
+            self._readmit(edge, keyframe, costs[edge])
+        return group
+
+    def most_cost(self, edges: Sequence[int]) -> float:
+        """Return what some rejected edges may cost together: for each its gate, or the limit of its residual."""
+        limits = self.ledger.threshold.values
+        return sum(min(self._innovation_gate(edge), float(limits[edge])) for edge in edges)
+
     def withdraw(self, edges: Sequence[int], keyframe: int, reason: Reason = Reason.WITHDRAWN) -> None:
         """Remove edges permanently, for a reason other than their fit.
 

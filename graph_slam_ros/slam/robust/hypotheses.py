@@ -15,7 +15,7 @@ import numpy as np
 
 from graph_slam_ros.config.robust import RobustConfig
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.graph import GROUPS, SE2, Graph
+from graph_slam_ros.graph import GROUPS, SE2, Graph, Loss
 from graph_slam_ros.slam.robust.gating import OutlierGate
 from graph_slam_ros.slam.robust.ledger import Ledger
 from graph_slam_ros.slam.robust.pairwise_consistency import consistent_groups
@@ -196,11 +196,32 @@ def _explained(
                 continue
             solver.start_at(values)
             break
-        if _is_known(_cost(solver, mine), mine, found) or not decisions.readmit_next(frozen.keyframe):
+        if _is_known(_cost(solver, mine), mine, found):
+            break
+        if not decisions.readmit_next(frozen.keyframe) and not _readmit_together(decisions, solver, frozen):
             break
     judged = np.concatenate((mine.inside, mine.outside))
     mine.statistic.values[judged], _ = solver.chi2_of(judged)
     return Outcome(name, mine, solver.values, _cost(solver, mine), frozen)
+
+
+def _readmit_together(decisions: OutlierGate, solver: Solver, frozen: FrozenGraph) -> bool:
+    """Accept rejected edges that support one another: they fit, and cost together no more than a gate for each.
+
+    Alone each of them may be too unlikely, because the map was solved without the others.
+    """
+    before, chi2 = solver.values, solver.evaluate().chi2_final
+    group = decisions.readmit_group(frozen.keyframe)
+    if not group:
+        return False
+    full = {key: [Loss(), stages[-1]] for key, stages in frozen.settings.losses.items()}
+    solver.optimize(replace(frozen.settings, losses=full, max_iterations=_ITERATIONS))
+    rise = solver.evaluate().chi2_final - chi2
+    if not decisions.unfit(group) and rise <= decisions.most_cost(group):
+        return True
+    decisions.exchange((), group, frozen.keyframe)
+    solver.start_at(before)
+    return False
 
 
 def _is_known(cost: float, ledger: Ledger, found: Sequence[Outcome]) -> bool:

@@ -10,6 +10,7 @@ from graph_slam_ros.lie import se2
 from graph_slam_ros.node.threads import run_in_thread
 from graph_slam_ros.slam import Config
 from graph_slam_ros.slam.backend import Backend
+from graph_slam_ros.slam.robust import hypotheses
 from graph_slam_ros.slam.robust.background import run_when_asked
 from graph_slam_ros.slam.robust.gating import OutlierGate
 from graph_slam_ros.slam.robust.hypotheses import search_alternatives
@@ -297,3 +298,34 @@ def test_a_second_look_starts_from_odometry_where_landmarks_are_poses_too():
     drive.solve()
     assert drive.verdicts([false]) == {Verdict.PENDING}
     assert tuple(drive.backend.solver.estimate([tag])[0]) == pytest.approx((5.0, 5.0, 0.0), abs=0.3)
+
+
+@pytest.mark.parametrize("offsets, verdict", [([(1.0, 0.0)] * 3, "ACCEPTED"), ([(1.0, 0.0), (0.0, 1.0)], "PENDING")])
+def test_closures_that_support_one_another_come_in_together(monkeypatch, offsets, verdict):
+    """Each costs more than a gate alone, and all that is accepted would be without them."""
+
+    class Quiet(Drive):
+        def noisy(self, a, b):
+            return se2.retract(
+                se2.between(self.true[a], self.true[b]), tuple(self.rng.normal(0.0, 0.3 * np.array(SIGMAS)))
+            )
+
+    def lie(drive, k):
+        if 0 <= k - 84 < len(offsets):
+            x, y, turn = se2.between(drive.true[k - 27], drive.true[k])
+            drive.close(k - 27, k, (x + offsets[k - 84][0], y + offsets[k - 84][1], turn))
+
+    drive = Quiet(0).go(76)
+    drive.closes_laps = False
+    drive.go(92, lie)
+    decisions = drive.backend.decisions
+    assert drive.verdicts(drive.false) == {Verdict.PENDING}
+    costs = decisions.innovations(drive.false)
+    assert min(costs) > decisions.most_cost(drive.false[:1])
+    assert max(costs) < decisions.most_cost(drive.false) or verdict == "PENDING"
+    monkeypatch.setattr(
+        hypotheses, "_starts", lambda frozen: [("online", frozen.values, None)]
+    )  # others may find it, too
+    drive.solve()
+    assert drive.verdicts(drive.false) == {Verdict[verdict]}
+    assert drive.verdicts(drive.closures) == {Verdict.ACCEPTED}
