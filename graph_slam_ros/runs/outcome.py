@@ -66,7 +66,8 @@ def text(summary: Summary) -> list[str]:
         if source not in inputs or explain(reason).effect is not Effect.REFUSED
         for line in _counted_lines(source, reason, times)
     ]
-    return [*lines, *undetermined, *others, *_gyro(summary), *calibration(summary), *_clocks(summary), *table(summary)]
+    more = [*_gyro(summary), *noise(summary), *calibration(summary), *_clocks(summary), *table(summary)]
+    return [*lines, *undetermined, *others, *more]
 
 
 def _gyro(summary: Summary) -> Iterator[str]:
@@ -88,6 +89,24 @@ def _gyro_faults(summary: Summary) -> Iterator[str]:
         yield GyroState(**gyro).fault
     elif silent > _MOSTLY * steps and inputs.get(name, {}).get("used"):
         yield f"{name}: in {silent} of {steps} steps odometry turned without the gyro: {remedy(name, 'gyro_silent')}"
+
+
+def noise(summary: Summary) -> Iterator[str]:
+    """Yield the factors of the configured sigmas that the run used, and those that it could not estimate."""
+    if summary.get("noise_scale") != "estimated":
+        return
+    known, unknown = list[str](), list[str]()
+    for one in summary.get("noise", ()):
+        name = f"{one['label']} {one['source']} {one['part']}"
+        if one["reason"]:
+            unknown.append(f"{name} ({one['reason']})")
+        else:
+            grows = " and more by motion" if one["per_rad"] > 0.0 or one["per_m"] > 0.0 else ""
+            known.append(f"{name} {one['factor']:.2f}{grows}")
+    if known:
+        yield from _wrapped(f"noise      estimated; factors of the configured sigmas: {', '.join(known)}", 11)
+    if unknown:
+        yield from _wrapped(f"noise      as configured: {', '.join(unknown)}", 11)
 
 
 def calibration(summary: Summary) -> Iterator[str]:
@@ -235,15 +254,10 @@ def checked(summary: Summary, severity: str) -> Iterator[str]:
 
 
 def unscaled(summary: Summary) -> Iterator[str]:
-    """Return why noise that should be estimated is as configured."""
-    if summary.get("noise_scale") != "estimated":
-        return
-    if why := summary.get("noise_unknown"):
+    """Return why noise that should be estimated is as configured, though something was solved."""
+    why = summary.get("noise_unknown")
+    if why and summary.get("noise_scale") == "estimated" and summary["landmarks"]:
         yield f"robust.noise_scale=estimated: no noise could be estimated at the end: {why}"
-    unknown = [one for one in summary.get("noise", ()) if one["reason"]]
-    if unknown:
-        groups = "; ".join(f"{one['label']} {one['source']} {one['part']}: {one['reason']}" for one in unknown)
-        yield f"robust.noise_scale=estimated: not estimated at the end: {groups}; a longer drive has more data"
 
 
 def _unused(summary: Summary, name: str, received: int | None) -> str:

@@ -10,13 +10,14 @@ from graph_slam_ros.analysis.evaluation import evaluate
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.errors import SingularError
 from graph_slam_ros.runs.map_journal import read_map
-from graph_slam_ros.runs.outcome import unscaled
+from graph_slam_ros.runs.outcome import noise
 from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.simulation import measurements, simulate, write_bag
 from graph_slam_ros.slam import Control, GraphSlam
 from graph_slam_ros.slam.frontend.noise_factors import FIRST_DUE
 from graph_slam_ros.slam.noise_scale import NoiseScale
 
+CONFIGURED = Config.from_mapping({"robust.noise_scale": "configured"})
 ESTIMATED = Config.from_mapping({"robust.noise_scale": "estimated"})
 
 
@@ -25,7 +26,7 @@ def drive(tmp_path_factory):
     """A drive whose sightings are better than the default noise says, replayed with either noise."""
     folder = tmp_path_factory.mktemp("noise")
     write_bag(simulate("warehouse", 1, laps=2), folder / "bag.mcap")
-    configured = replay(folder / "bag.mcap", folder / "configured")
+    configured = replay(folder / "bag.mcap", folder / "configured", CONFIGURED)
     estimated = replay(folder / "bag.mcap", folder / "estimated", ESTIMATED)
     return folder, configured.slam, estimated.slam
 
@@ -60,7 +61,7 @@ def test_a_saved_map_has_the_noise_of_the_run(drive):
 def test_a_run_that_goes_on_in_the_map_keeps_its_factors_or_goes_back_to_what_is_configured(drive, is_estimated):
     folder, configured, estimated = drive
     saved = read_map(folder / "estimated", [])
-    slam = GraphSlam(ESTIMATED if is_estimated else Config(), start=saved)
+    slam = GraphSlam(ESTIMATED if is_estimated else CONFIGURED, start=saved)
     expected = (estimated if is_estimated else configured).graph
     neutral = slam.backend.noise.neutral()
     assert slam.noise_factors == (estimated.noise_factors if is_estimated else neutral)
@@ -102,12 +103,13 @@ def test_the_summary_says_it_by_class_input_and_part(drive):
 def test_a_drive_that_says_too_little_of_its_noise_is_told_so_at_its_end(drive):
     folder, *_ = drive
     summary = json.loads((folder / "estimated" / "run.json").read_text())
-    assert list(unscaled(summary)) == []
+    assert not any("as configured:" in line for line in noise(summary))
     few = "61 degrees of freedom, fewer than 200"
     summary["noise"][1]["reason"] = few
-    (said,) = unscaled(summary)
-    assert f"{summary['noise'][1]['source']} {summary['noise'][1]['part']}: {few}" in said
-    assert list(unscaled(summary | {"noise_scale": "configured"})) == []
+    said = " ".join(" ".join(noise(summary)).split())
+    name = " ".join(summary["noise"][1][key] for key in ("label", "source", "part"))
+    assert f"noise as configured: {name} ({few})" in said
+    assert list(noise(summary | {"noise_scale": "configured"})) == []
 
 
 def test_a_map_whose_noise_cannot_be_estimated_says_why(tmp_path, monkeypatch):
@@ -151,8 +153,8 @@ def test_smaller_sigmas_are_not_advised_where_errors_are_larger_than_the_covaria
     assert "0.45 times" not in str(wrong)
     assert "not smaller: the covariances are too small" in str(wrong)
     assert "2 times as large" in str(wrong)
-    for noise in ((SMALLER,), (SMALLER, LARGER)):
-        advice = noise_advice(noise, is_applied=False, config=Config(), over_confident=wrong.over_confidence)
+    for scales in ((SMALLER,), (SMALLER, LARGER)):
+        advice = noise_advice(scales, is_applied=False, config=Config(), over_confident=wrong.over_confidence)
         assert "no smaller sigmas are advised (landmarks detections position)" in advice
         assert "--set" not in advice
     larger = noise_advice((LARGER,), is_applied=False, over_confident=wrong.over_confidence)
