@@ -43,7 +43,9 @@ class CalibrateConfig:
     def __post_init__(self) -> None:
         unknown = [word for word in self.groups.split() if word not in (*GROUPS, "auto", *_ALONE)]
         if unknown:
-            raise ConfigError(f"calibrate.groups: {unknown[0]!r} is not auto, none or one of {', '.join(GROUPS)}")
+            raise ConfigError(
+                f"calibrate.groups: {unknown[0]!r} is not none, association, auto or one of {', '.join(GROUPS)}"
+            )
         words = self.groups.split()
         for word in _ALONE:
             if word in words and len(words) > 1:

@@ -134,7 +134,7 @@ def test_a_covariance_of_odometry_that_is_absurd_lets_nothing_in():
         ("factors range_factor", "one scale"),
         ("auto range_factor", "one scale"),
         ("auto none", "none and some"),
-        ("wheels", "'wheels' is not auto, none or one of factors"),
+        ("wheels", "'wheels' is not none, association, auto or one of factors"),
     ],
 )
 def test_what_cannot_be_told_apart_is_refused_by_configuration(groups, why):
