@@ -11,6 +11,7 @@ from places import ROOT, test_path
 from reliability import times
 
 from graph_slam_ros import warmup
+from graph_slam_ros.lie import jit
 
 TEST = ROOT / "test"
 # Small, and between them they call every kernel.
@@ -97,8 +98,12 @@ def test_a_moved_copy_and_a_second_environment_load_what_was_compiled(tmp_path):
     for file in package.rglob("*.py"):
         os.utime(file, (1e9, 1e9))
     assert answers("moved", environment / "bin" / "python") == (folder, 1, 0)
-    with (package / "lie" / "so3.py").open("a") as file:
-        file.write("# changed\n")
+    edges, so3 = package / "graph" / "edges.py", package / "lie" / "so3.py"
+    edges.write_text(
+        '"""Another docstring.\n\nOf several lines.\n"""\n# and a comment\n' + edges.read_text().split('"""', 2)[2]
+    )
+    assert answers("moved") == (folder, 1, 0)
+    so3.write_text(so3.read_text() + "_CHANGED = 1\n")
     other, *counts = answers("moved")
     assert other != folder
     assert counts == [0, 1]
@@ -159,6 +164,16 @@ for path in sys.argv[1:]:
     assert 0.0 <= innovation(file.graph, solver, file.graph.add_edge(BEARING, [1, far[0]], [0.5], sharp, "seen"))
 print([name for name, count in signatures().items() if count != before.get(name, 0)])
 """
+
+
+def test_code_is_the_same_whatever_its_comments_and_docstrings():
+    code = jit._code_of(
+        b'"""Module."""\n\n\nclass A:\n    """Class."""\n    def f(x):\n        """Text."""\n        return "s"\n'
+    )
+    assert code == jit._code_of(
+        b'# comment\nclass A:\n    """B"""\n    def f(\n        x,\n    ):\n        return "s"  # s\n'
+    )
+    assert code != jit._code_of(b'class A:\n    """B"""\n    def f(x):\n        return "t"\n')
 
 
 def test_the_progress_of_the_compiler_counts_to_about_as_many_kernels_as_there_are():
