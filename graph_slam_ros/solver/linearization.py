@@ -119,16 +119,24 @@ def linearize(graph: Graph, x: Array, rows: Mapping[EdgeTable, Index], losses: L
 
     Blocks come some hundred edges at a time: arrays of that size stay in the cache and in the process.
     """
-    offset = graph.offset.values
     for table, chosen in rows.items():
-        columns = table.sqrt_information.values, table.weight.values
         for first in range(0, len(chosen), CHUNK):
             some = chosen[first : first + CHUNK]
-            at, measured = _gather(some, table.vertices.values, offset, table.measured.values)
-            residual, jacobian = table.type.linearize(x, at, measured)
-            loss = losses.codes(table, some), losses.kind, losses.scale
-            chi2, cost = _whiten(some, residual, jacobian, *columns, *loss)
+            residual, jacobian = given = _evaluate(graph, x, table, some)
+            chi2, cost = _whiten(some, *given, *_weights(table, some, losses))
             yield Block(table, some, residual, jacobian, chi2, cost)
+
+
+def _evaluate(graph: Graph, x: Array, table: EdgeTable, rows: Index) -> tuple[Array, Array]:
+    """Return residuals (n, m) and Jacobians (n, m, width) of rows of a table at the stored values x."""
+    at, measured = _gather(rows, table.vertices.values, graph.offset.values, table.measured.values)
+    return table.type.linearize(x, at, measured)
+
+
+def _weights(table: EdgeTable, rows: Index, losses: Losses) -> tuple[Array, Array, Index, Index, Array]:
+    """Return root information and weight by row, the loss of each given row, and kinds and scales of all losses."""
+    of_each = losses.codes(table, rows)
+    return table.sqrt_information.values, table.weight.values, of_each, losses.kind, losses.scale
 
 
 def linearize_into(pointers: Index, graph: Graph, x: Array, rows: Mapping[EdgeTable, Index], losses: Losses) -> None:
@@ -139,15 +147,11 @@ def linearize_into(pointers: Index, graph: Graph, x: Array, rows: Mapping[EdgeTa
     GraphSlamError
         The cost of an edge is not finite.
     """
-    offset = graph.offset.values
     for table, chosen in rows.items():
-        ids, columns = table.id.values, (table.sqrt_information.values, table.weight.values)
         for first in range(0, len(chosen), CHUNK):
             some = chosen[first : first + CHUNK] if len(chosen) > CHUNK else chosen
-            at, measured = _gather(some, table.vertices.values, offset, table.measured.values)
-            residual, jacobian = table.type.linearize(x, at, measured)
-            loss = losses.codes(table, some), losses.kind, losses.scale
-            bad = _whiten_and_store(pointers, ids, some, residual, jacobian, *columns, *loss)
+            given = *_evaluate(graph, x, table, some), *_weights(table, some, losses)
+            bad = _whiten_and_store(pointers, table.id.values, some, *given)
             if bad != NOTHING:
                 _refuse_row(table, bad)
 
@@ -166,8 +170,7 @@ def residuals_of(graph: Graph, x: Array, edges: Index) -> Iterator[tuple[Index, 
         for first in range(0, len(of_table), CHUNK):
             some = of_table[first : first + CHUNK]
             rows = graph.row_of_edge.values[edges[some]]
-            at, measured = _gather(rows, table.vertices.values, graph.offset.values, table.measured.values)
-            residual, _ = table.type.linearize(x, at, measured)
+            residual, _ = _evaluate(graph, x, table, rows)
             yield some, residual, table.sqrt_information.values[rows]
 
 

@@ -11,7 +11,6 @@ front below the diagonal, which is not used otherwise.
 import numpy as np
 
 from graph_slam_ros.lie.jit import kernel
-from graph_slam_ros.solver.clique_tree.indices import lengthened
 from graph_slam_ros.solver.clique_tree.storage import (
     CHECKED,
     CHILD,
@@ -28,6 +27,7 @@ from graph_slam_ros.solver.clique_tree.storage import (
     ZERO,
     Tree,
     front_of,
+    with_children,
 )
 from graph_slam_ros.typing import Array, Index
 
@@ -92,13 +92,7 @@ def magnitude_of(t: Tree, c: int, row: int) -> float:
                 x_of[d] = x[at]
                 magnitude += diagonal[d] * x[at] * x[at]
                 at += 1
-        k = clique[k, CHILD]
-        while k != NOTHING:
-            if count == len(walk):
-                walk = lengthened(walk, count)
-            walk[count] = k
-            count += 1
-            k = clique[k, SIBLING]
+        walk, count = with_children(clique, k, walk, count)
     t.state[CHECKED] += count
     place = np.empty(len(t.step), np.int64)
     for i in range(count - 1, -1, -1):  # children before parents

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graph_slam_ros.lie.jit import kernel
+from graph_slam_ros.solver.clique_tree.indices import lengthened
 from graph_slam_ros.typing import Array, Index
 
 NOTHING = -1
@@ -158,6 +159,19 @@ def front_of(clique: Index, fronts: Array, c: int) -> Array:
     """The front (full, full + 1): an upper triangle, and the right side as its last column."""
     full, base = clique[c, FULL_DOF], clique[c, FRONT]
     return fronts[base : base + full * (full + 1)].reshape(full, full + 1)
+
+
+@kernel
+def with_children(clique: Index, c: int, cliques: Index, count: int) -> tuple[Index, int]:
+    """Append the children of a clique to the first ``count`` of a list; returns it, perhaps longer, and the count."""
+    k = clique[c, CHILD]
+    while k != NOTHING:
+        if count == len(cliques):
+            cliques = lengthened(cliques, count)
+        cliques[count] = k
+        count += 1
+        k = clique[k, SIBLING]
+    return cliques, count
 
 
 def empty_tree() -> Tree:

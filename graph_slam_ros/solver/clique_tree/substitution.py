@@ -49,6 +49,7 @@ from graph_slam_ros.solver.clique_tree.storage import (
     ZERO,
     Tree,
     front_of,
+    with_children,
 )
 from graph_slam_ros.typing import Array, Index
 
@@ -206,13 +207,7 @@ def solve_deferred(t: Tree, tolerance: float, sigmas: float) -> None:
             if len(x) < clique[c, FULL_DOF]:
                 x = np.empty(2 * clique[c, FULL_DOF])
             visit(t, c, x, tolerance, sigmas)
-            k = clique[c, CHILD]
-            while k != NOTHING:
-                if top == len(stack):
-                    stack = lengthened(stack, top)
-                stack[top] = k
-                top += 1
-                k = clique[k, SIBLING]
+            stack, top = with_children(clique, c, stack, top)
     state[DEFERRED_COUNT] = 0
 
 
@@ -336,13 +331,7 @@ def find_changed(t: Tree, tolerance: float, sigmas: float, threshold: float, err
             visit(t, c, x, tolerance, sigmas)
             for m in range(clique[c, MEMBERS], clique[c, MEMBERS] + clique[c, FRONTALS]):
                 _note_if_much(vertex, step, reference, t.diagonal, members[m], threshold, error)
-            child = clique[c, CHILD]
-            while child != NOTHING:
-                if top == len(stack):
-                    stack = lengthened(stack, top)
-                stack[top] = child
-                top += 1
-                child = clique[child, SIBLING]
+            stack, top = with_children(clique, c, stack, top)
     count = kept = 0
     for k in range(state[DEFERRED_COUNT]):
         c = listed[k, DEFERRED]
