@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from benchmarks.lifelong import config, hall, measurements, rms
+from benchmarks.hall import config, hall, measurements, rms
 from graph_slam_ros.analysis.explain import explain_edge, explain_run
 from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.errors import ConfigError, GraphSlamError

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from condensed_robot import Robot
 
-from benchmarks.lifelong import Robot, hall, rms
+from benchmarks.hall import hall, rms
 from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.graph import Gaussian
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL

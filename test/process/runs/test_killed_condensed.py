@@ -16,7 +16,7 @@ from graph_slam_ros.runs.trajectory import read_tum
 
 KILLED = """
 import os, signal, sys
-from benchmarks.lifelong import config, hall, measurements
+from benchmarks.hall import config, hall, measurements
 from graph_slam_ros.runs.recorder import RunRecorder
 from graph_slam_ros.slam import GraphSlam
 folder, when = sys.argv[1:]

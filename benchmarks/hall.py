@@ -1,0 +1,166 @@
+"""A hall of 60 by 40 m that a robot drives through without end: its truth, and what it measures.
+
+Aisles driven at random, a keyframe each 0.5 m, 40 landmarks that are seen within 8 m, every second one.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from graph_slam_ros.graph.geometry import PLANAR, Geometry
+from graph_slam_ros.slam import Config, Measurement, Odometry, Sighting, Sightings
+from graph_slam_ros.typing import Array, Numbers
+
+STEP_M, REACH_M, SEEN = 0.5, 8.0, 0.5
+SIGMA_ALONG, SIGMA_TURN, SIGMA_RANGE, SIGMA_BEARING = 0.01, 0.005, 0.05, np.deg2rad(1.0)
+_X, _Y = np.array([6.0, 18.0, 30.0, 42.0, 54.0]), np.array([6.0, 20.0, 34.0])
+STEP_S = 0.2
+Seen = tuple[int, Array, Array]
+"""A sighting: number of the landmark, its position in the axes of the robot [m], and the covariance of that."""
+
+
+@dataclass(frozen=True, slots=True)
+class Hall:
+    """A drive: true poses, landmarks, odometry, and what each keyframe sees."""
+
+    space: Geometry
+    poses: list[tuple[float, ...]]
+    points: Array
+    steps: list[tuple[float, ...]]
+    sightings: list[list[Seen]]
+
+    @property
+    def sigmas(self) -> list[float]:
+        """Standard deviations of a step of odometry."""
+        return _sigmas(self.space)
+
+
+class Course:
+    """The same drive, a keyframe at a time: only its positions are in memory.
+
+    Attributes
+    ----------
+    where : true positions (n + 1, 2) of the keyframes and of the one after
+    points : true positions of the landmarks
+    """
+
+    def __init__(self, seed: int, keyframes: int, space: Geometry = PLANAR, landmarks: int = 40) -> None:
+        self.space, self._rng, n = space, np.random.default_rng(seed), space.dimensions
+        self.where = _driven(self._rng, keyframes + 1)
+        grid = np.array([(60 * (i + 0.5) / 8, 40 * (j + 0.5) / 5) for i in range(8) for j in range(5)])[:landmarks]
+        self.points = np.zeros((len(grid), n))
+        self.points[:, :2] = grid + self._rng.uniform(-2.5, 2.5, grid.shape)
+        self.points[:, 2:] = self._rng.uniform(0.0, 3.0, (len(grid), n - 2))
+
+    def pose(self, keyframe: int) -> tuple[float, ...]:
+        """The true pose of a keyframe: it looks at the next one."""
+        (x, y), (dx, dy) = self.where[keyframe], self.where[keyframe + 1] - self.where[keyframe]
+        return _pose(self.space, float(x), float(y), float(np.arctan2(dy, dx)))
+
+    def keyframes(self) -> Iterator[tuple[tuple[float, ...], tuple[float, ...] | None, list[Seen]]]:
+        """Return true pose, odometry since the keyframe before, and sightings of each; once."""
+        rng, group, before = self._rng, self.space.group, None
+        sigmas = np.array(_sigmas(self.space))
+        for k in range(len(self.where) - 1):
+            pose, step = self.pose(k), None
+            if before is not None:
+                error = group.exp(tuple(sigmas * rng.standard_normal(self.space.dof)))
+                step = tuple(map(float, group.compose(group.between(before, pose), error)))
+            local = np.stack(group.act(group.inverse(pose), tuple(self.points.T)), axis=-1)
+            near = (np.hypot(*local.T[:2]) < REACH_M) & (rng.random(len(self.points)) < SEEN)
+            yield pose, step, [(int(m), *_seen(local[m], rng)) for m in np.flatnonzero(near)]
+            before = pose
+
+
+def hall(seed: int, keyframes: int, space: Geometry = PLANAR, landmarks: int = 40) -> Hall:
+    """Make a drive."""
+    course = Course(seed, keyframes, space, landmarks)
+    poses, steps, sightings = zip(*course.keyframes(), strict=True)
+    return Hall(space, list(poses), course.points, list(steps[1:]), list(sightings))
+
+
+def _driven(rng: np.random.Generator, count: int) -> Array:
+    """Positions each half metre, along aisles and 0.7 m to either side; no turn on the spot."""
+    crossing, way = (0, 0), (0, 0)
+    points = [np.array([_X[0], _Y[0]])]
+    while len(points) < count:
+        ways = [w for w in ((1, 0), (-1, 0), (0, 1), (0, -1)) if w != (-way[0], -way[1])]
+        ways = [w for w in ways if 0 <= crossing[0] + w[0] < len(_X) and 0 <= crossing[1] + w[1] < len(_Y)]
+        way = ways[rng.integers(len(ways))]
+        crossing = crossing[0] + way[0], crossing[1] + way[1]
+        goal = np.array([_X[crossing[0]], _Y[crossing[1]]]) + rng.uniform(-0.7, 0.7, 2)
+        off = goal - points[-1]
+        step = STEP_M * off / np.linalg.norm(off)
+        points += [points[-1] + step * (k + 1) for k in range(int(np.linalg.norm(off) / STEP_M))]
+    return np.array(points[:count])
+
+
+def _sigmas(space: Geometry) -> list[float]:
+    """Return the standard deviations of a step of odometry."""
+    n = space.dimensions
+    return [SIGMA_ALONG, *[SIGMA_TURN] * (n - 1), *[SIGMA_TURN] * (space.dof - n)]
+
+
+def _pose(space: Geometry, x: float, y: float, yaw: float) -> tuple[float, ...]:
+    if space.dimensions == 2:
+        return x, y, yaw
+    return x, y, 0.0, 0.0, 0.0, float(np.sin(yaw / 2)), float(np.cos(yaw / 2))
+
+
+def _seen(there: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Return a sighting: noise along the ray, and as much as the bearing has across it."""
+    distance = float(np.linalg.norm(there))
+    ray = there / distance
+    along, across = SIGMA_RANGE, SIGMA_BEARING * distance
+    covariance = across**2 * np.eye(len(there)) + (along**2 - across**2) * np.outer(ray, ray)
+    return there + np.linalg.cholesky(covariance) @ rng.standard_normal(len(there)), covariance
+
+
+def config(space: Geometry, **values: Any) -> Config:
+    """Parameters of a pipeline for the noise of a hall; more by name, with ``_`` for the dot."""
+    per_root_s = STEP_S**-0.5
+    densities = {
+        "translation_density": SIGMA_ALONG,
+        **dict.fromkeys(("lateral_density", "vertical_density", "rotation_density", "tilt_density"), SIGMA_TURN),
+    }
+    known = {f"odometry.{name}": sigma * per_root_s for name, sigma in densities.items()}
+    known |= {"world.dimensions": space.dimensions, "odometry.noise": "density", "odometry.max_speed_m_s": 20.0}
+    known |= {"odometry.timeout_s": 1.0, "keyframes.min_distance_m": 0.3, "landmarks.added_sigma_m": 0.0}
+    return Config.from_mapping(known | {name.replace("_", ".", 1): value for name, value in values.items()})
+
+
+def measurements(world: Hall) -> Iterator[Measurement]:
+    """What a robot measures in a hall: odometry and sightings at each keyframe, one keyframe each 0.2 s."""
+    at = world.space.identity
+    for k, seen in enumerate(world.sightings):
+        if k:
+            at = world.space.normalized(world.space.group.compose(at, world.steps[k - 1]))
+        yield from measured(tuple(map(float, at)), round((k + 5) * STEP_S * 1e9), seen)
+
+
+def measured(T_odom_base: Numbers, stamp_ns: int, seen: Sequence[tuple[int, Array, Array]]) -> Iterator[Measurement]:
+    """What a robot measures at one keyframe."""
+    yield Odometry(stamp_ns, T_odom_base, source="odom")
+    if seen:
+        sightings = (
+            Sighting(f"m{mark}", "position", tuple(at.tolist()), tuple(noise.ravel().tolist()))
+            for mark, at, noise in seen
+        )
+        yield Sightings(stamp_ns, "landmarks", tuple(sightings))
+
+
+def fitted(estimated: Array, true: Array) -> tuple[Array, Array]:
+    """Return the rotation and shift that lay the one on the other best."""
+    middle, centre = estimated.mean(axis=0), true.mean(axis=0)
+    u, _, vt = np.linalg.svd((estimated - middle).T @ (true - centre))
+    flip = np.diag([*[1.0] * (len(middle) - 1), np.sign(np.linalg.det(vt.T @ u.T))])
+    turn = vt.T @ flip @ u.T
+    return turn, centre - turn @ middle
+
+
+def rms(estimated: Array, true: Array) -> float:
+    """Return the root mean square of what is left after one was laid on the other [m]."""
+    turn, shift = fitted(estimated, true)
+    return float(np.sqrt((((estimated @ turn.T + shift) - true) ** 2).sum(axis=1).mean()))
