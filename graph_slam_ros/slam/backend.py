@@ -137,9 +137,9 @@ class Backend:
 
     def hand_over(self) -> None:
         """Pass new vertices and edges to the solver."""
-        vertices, edges = self.handed_over
-        if (vertices, edges) == (self.graph.vertex_count, self.graph.edge_count):
+        if self.is_handed_over:
             return
+        vertices, edges = self.handed_over
         self.solver.add(range(vertices, self.graph.vertex_count), range(edges, self.graph.edge_count))
         self.handed_over = self.graph.vertex_count, self.graph.edge_count
 
@@ -157,7 +157,8 @@ class Backend:
         if self.holds_back:
             self.solver.update()
             return
-        if self._config.decide and keyframe - self._reviewed >= self._config.review_every_keyframes:
+        is_due = self._config.decide and keyframe - self._reviewed >= self._config.review_every_keyframes
+        if is_due:
             self._reviewed = keyframe
             self.decisions.review(keyframe)
         outcome = self._guarded(lambda: self._background.outcome(keyframe))
@@ -165,6 +166,8 @@ class Backend:
             self.solver.optimize()
         self.solver.update()
         self._admit(keyframe)
+        if is_due and (group := self.decisions.readmit_likely_group(keyframe)):
+            self._admission.make_fit(group, keyframe)
         if self.odometries.decide(keyframe):
             self.solver.update()
         out = self.ledger.outside_count
@@ -252,10 +255,14 @@ class Backend:
         return TrialProblem(space, graph, *problem, origins.copy(), *keyframes, track, self._first_free_edge)
 
     @property
+    def is_handed_over(self) -> bool:
+        """Return whether the solver has all of the graph."""
+        return self.handed_over == (self.graph.vertex_count, self.graph.edge_count)
+
+    @property
     def is_quiet(self) -> bool:
         """Return whether every edge was judged and solved, and nothing that could change a verdict goes on."""
-        graph, count = self.graph, (self.graph.vertex_count, self.graph.edge_count)
-        is_judged = self.handed_over == count and len(self.ledger) == graph.edge_count and not self._pending
+        is_judged = self.is_handed_over and len(self.ledger) == self.graph.edge_count and not self._pending
         return is_judged and not (self.holds_back or self.held[0] or self._background.is_busy)
 
     def hand_over_condensed(self, keyframe: int) -> None:

@@ -5,7 +5,7 @@ covariance of its vertices and its own (Neira and Tardos, "Data association in s
 compatibility test", 2001, eq. 2). One that fits badly loses weight, then is removed; all are judged again and again.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.config.robust import RobustConfig
 from graph_slam_ros.graph import Graph, Loss
 from graph_slam_ros.graph.losses import weight_and_cost
-from graph_slam_ros.slam.robust.innovation import innovation
+from graph_slam_ros.slam.robust.innovation import innovation, joint_innovations
 from graph_slam_ros.slam.robust.landmark_support import LandmarkSupport, landmark_of
 from graph_slam_ros.slam.robust.ledger import FINAL, Ledger, Reason, Verdict
 from graph_slam_ros.slam.robust.tightness import TIGHTEST, TYPICAL, Tightness
@@ -23,6 +23,7 @@ from graph_slam_ros.typing import Array, Index
 
 CANDIDATES = ("landmarks", "fixes", "closures", "initialpose", "custom")
 _READMISSIONS = 50  # edges that are out and are tried again after everything was solved
+_AGREEING = 3  # edges that are out, at least, come in together between full solves: two agree by chance
 _REVIEWED_AT_ONCE = 1000  # accepted edges that one review looks at, besides as many of the newest
 
 
@@ -154,34 +155,83 @@ class OutlierGate:
                 changed = True
         return changed
 
-    def readmit_next(self, keyframe: int) -> bool:
-        """Accept the rejected edge that fits best, if it would fit once accepted. Returns whether there was one."""
-        outside = self.ledger.outside
-        chi2, _ = self._solver.chi2_of(outside)
-        for edge in outside[np.argsort(chi2, kind="stable")[:_READMISSIONS]].tolist():
-            innovation = self._innovation(edge)
-            if innovation <= self.ledger.threshold.values[edge] and self._is_likely(edge, innovation):
-                self._readmit(edge, keyframe, innovation)
+    def readmit_next(self, keyframe: int, costs: dict[int, float]) -> bool:
+        """Accept the rejected edge that fits best, if it would fit once accepted. Returns whether there was one.
+
+        Parameters
+        ----------
+        costs : gets the innovations that were computed, by edge
+        """
+        for edge in self._nearest():
+            costs[edge] = self._innovation(edge)
+            if costs[edge] <= self.ledger.threshold.values[edge] and self._is_likely(edge, costs[edge]):
+                self._readmit(edge, keyframe, costs[edge])
                 return True
         return False
 
-    def readmit_group(self, keyframe: int) -> list[int]:
+    def readmit_group(self, keyframe: int, costs: Mapping[int, float]) -> list[int]:
         """Accept, as a trial, the rejected edges that may be likely together. Returns them: none, or at least two.
 
         A group costs at least what each of its edges costs alone. So one that costs more than all their gates together
         is in no such group.
+
+        Parameters
+        ----------
+        costs : innovations, by edge
         """
-        outside = self.ledger.outside
-        chi2, _ = self._solver.chi2_of(outside)
-        group = outside[np.argsort(chi2, kind="stable")[:_READMISSIONS]].tolist()
-        costs = dict(zip(group, self.innovations(group), strict=True))
-        while group and max(map(costs.__getitem__, group)) > (most := self.most_cost(group)):
-            group = [edge for edge in group if costs[edge] <= most]
-        if len(group) < 2:
-            return []
+        group = self._affordable(costs)
         for edge in group:
             self._readmit(edge, keyframe, costs[edge])
         return group
+
+    def readmit_likely_group(self, keyframe: int) -> list[int]:
+        """Accept those of the rejected edges that fit best of which each is likely given the others, though not alone.
+
+        Their costs follow from their joint covariance, so nothing is solved for edges that stay out.
+        """
+        nearest = self._nearest(self._config.retests)
+        costs = {edge: self._innovation(edge) for edge in nearest}
+        group = self._affordable(costs)
+        if not group:
+            return []
+        try:
+            white, covariance, edge_of = joint_innovations(self._graph, self._solver, group)
+        except (np.linalg.LinAlgError, ValueError):
+            return []
+
+        def cost_of(edges: Sequence[int]) -> float:
+            rows = np.flatnonzero(np.isin(edge_of, edges))
+            return float(white[rows] @ np.linalg.solve(covariance[np.ix_(rows, rows)], white[rows]))
+
+        while len(group) >= _AGREEING:
+            together = cost_of(group)
+            excess = {
+                edge: together - cost_of([other for other in group if other != edge]) - self.most_cost([edge])
+                for edge in group
+            }
+            worst = max(group, key=excess.__getitem__)
+            if excess[worst] <= 0.0:
+                if together > self.most_cost(group):
+                    return []
+                for edge in group:
+                    self._readmit(edge, keyframe, costs[edge])
+                return group
+            group.remove(worst)
+        return []
+
+    def _affordable(self, costs: Mapping[int, float]) -> list[int]:
+        """Return the edges of which none costs more than all may together: none, or at least two."""
+        group = list(costs)
+        while group and max(map(costs.__getitem__, group)) > (most := self.most_cost(group)):
+            group = [edge for edge in group if costs[edge] <= most]
+        return group if len(group) > 1 else []
+
+    def _nearest(self, count: int = _READMISSIONS) -> list[int]:
+        """Return the rejected edges that fit best."""
+        outside = self.ledger.outside
+        chi2, _ = self._solver.chi2_of(outside)
+        nearest: list[int] = outside[np.argsort(chi2, kind="stable")[:count]].tolist()
+        return nearest
 
     def most_cost(self, edges: Sequence[int]) -> float:
         """Return what some rejected edges may cost together: for each its gate, or the limit of its residual."""

@@ -7,7 +7,7 @@ is judged by its residual, until no verdict changes. A rejected candidate costs 
 squares).
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -198,20 +198,25 @@ def _explained(
             break
         if _is_known(_cost(solver, mine), mine, found):
             break
-        if not decisions.readmit_next(frozen.keyframe) and not _readmit_together(decisions, solver, frozen):
+        costs = dict[int, float]()
+        if not decisions.readmit_next(frozen.keyframe, costs) and not _together(decisions, solver, frozen, costs):
             break
     judged = np.concatenate((mine.inside, mine.outside))
     mine.statistic.values[judged], _ = solver.chi2_of(judged)
     return Outcome(name, mine, solver.values, _cost(solver, mine), frozen)
 
 
-def _readmit_together(decisions: OutlierGate, solver: Solver, frozen: FrozenGraph) -> bool:
+def _together(decisions: OutlierGate, solver: Solver, frozen: FrozenGraph, costs: Mapping[int, float]) -> bool:
     """Accept rejected edges that support one another: they fit, and cost together no more than a gate for each.
 
     Alone each of them may be too unlikely, because the map was solved without the others.
+
+    Parameters
+    ----------
+    costs : innovations of the edges that fit best
     """
     before, chi2 = solver.values, solver.evaluate().chi2_final
-    group = decisions.readmit_group(frozen.keyframe)
+    group = decisions.readmit_group(frozen.keyframe, costs)
     if not group:
         return False
     full = {key: [Loss(), stages[-1]] for key, stages in frozen.settings.losses.items()}

@@ -1,18 +1,20 @@
 """The innovation: the difference between a measurement and its prediction, normalised by both covariances."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 
 import numpy as np
-from scipy.optimize import least_squares
+from scipy.optimize import leastsq
 
 from graph_slam_ros.graph import POINT_SEEN_FROM, SE2, SE3, Edge, Graph
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.solver.linearization import linearized
-from graph_slam_ros.typing import Array
+from graph_slam_ros.typing import Array, Index
 
 _ANGLES = {SE2: 1, SE3: 3}  # of a pose, its last coordinates
 _MOST_STEPS = 60  # of a search: with extreme numbers it would creep for seconds; the least it has found is taken
 _DIFFERENCE = float(np.finfo(float).eps ** 0.5)  # of numerical derivatives
+_CONVERGED = 1e-6  # of costs and steps: where they change less, a search has ended
 _LINEAR_RAD2 = 0.1  # of a direction: beyond, a linear prediction is none
 
 
@@ -45,6 +47,30 @@ def innovation(graph: Graph, solver: Solver, edge: int) -> float:
     return _least_cost(graph, x, one, joint)
 
 
+def joint_innovations(graph: Graph, solver: Solver, edges: Sequence[int]) -> tuple[Array, Array, Index]:
+    """What several edges together would cost, as parts from which each subset of them has its cost.
+
+    Returns whitened residuals (n,), their covariance (n, n) with the edges' own noise, and the edge of each.
+    With the rows of a subset, ``r' S^-1 r`` is its cost where residuals are linear. None of them may be part of the
+    problem at present. Raises as ``innovation``.
+    """
+    ones = [graph.edge(edge) for edge in edges]
+    vertices = list(dict.fromkeys(vertex for one in ones for vertex in one.vertices))
+    joint, x = solver.joint_marginal(vertices), solver.values
+    ends = np.cumsum([0] + [graph.kind_of(vertex).dof for vertex in vertices]).tolist()
+    columns = {vertex: range(*ends[k : k + 2]) for k, vertex in enumerate(vertices)}
+    residuals, rows, edge_of = list[Array](), list[Array](), list[int]()
+    for edge, one in zip(edges, ones, strict=True):
+        residual, jacobian = linearized(graph, x, one.type, one.vertices, one.measured)
+        row = np.zeros((len(residual), ends[-1]))
+        row[:, [c for vertex in one.vertices for c in columns[vertex]]] = one.sqrt_information @ jacobian
+        residuals.append(one.sqrt_information @ residual)
+        rows.append(row)
+        edge_of += [edge] * len(residual)
+    by_step = np.vstack(rows)
+    return np.concatenate(residuals), by_step @ joint @ by_step.T + np.eye(len(edge_of)), np.array(edge_of)
+
+
 def _least_cost(graph: Graph, x: Array, edge: Edge, joint: Array) -> float:
     """The minimum of ``|u|^2 + |R r|^2`` over steps ``d = L u`` of the vertices, with ``L L' = Sigma``, by search."""
     variances, axes = np.linalg.eigh(joint)
@@ -53,14 +79,15 @@ def _least_cost(graph: Graph, x: Array, edge: Edge, joint: Array) -> float:
     kinds = [end.kind for end in ends]
     at = np.cumsum([0] + [kind.size for kind in kinds])
     first = np.cumsum([0] + [kind.dof for kind in kinds])
-    before = [x[end.stored][None] for end in ends]
-
-    ends_at = np.arange(len(sigmas) + 1)[:, None] * at[-1] + at[:-1]
+    rows = len(sigmas) + 1
+    before = [np.repeat(x[end.stored][None], rows, axis=0) for end in ends]
+    measured, root = np.repeat(edge.measured[None], rows, axis=0), edge.sqrt_information.T
+    ends_at = np.arange(rows)[:, None] * at[-1] + at[:-1]
     found, evaluated = list[float](), 0
 
     def counted(units: Array) -> Array:
         nonlocal evaluated
-        if evaluated >= _MOST_STEPS * (1 + len(sigmas)):
+        if evaluated >= _MOST_STEPS * rows:
             raise _Enough
         evaluated += 1
         out: Array = costs(units[None])[0]
@@ -78,17 +105,17 @@ def _least_cost(graph: Graph, x: Array, edge: Edge, joint: Array) -> float:
         """The whitened step and the whitened residual, for rows of units at once."""
         steps, count = units @ sigmas.T, len(units)
         moved = [
-            kind.retract(np.repeat(value, count, axis=0), steps[:, k : k + kind.dof])
+            kind.retract(value[:count], steps[:, k : k + kind.dof])
             for kind, value, k in zip(kinds, before, first.tolist(), strict=False)
         ]
-        measured = np.repeat(edge.measured[None], count, axis=0)
-        residual, _ = edge.type.linearize(np.hstack(moved).ravel(), ends_at[:count], measured)
-        return np.hstack((units, residual @ edge.sqrt_information.T))
+        residual, _ = edge.type.linearize(np.hstack(moved).ravel(), ends_at[:count], measured[:count])
+        return np.hstack((units, residual @ root))
 
-    try:
-        return float(2.0 * least_squares(counted, np.zeros(len(sigmas)), jac=derivative, method="lm").cost)
-    except _Enough:
-        return min(found)
+    # not least_squares, whose checks take half of the time
+    enough, most = dict.fromkeys(("ftol", "xtol", "gtol"), _CONVERGED), _MOST_STEPS * rows
+    with suppress(_Enough):
+        leastsq(counted, np.zeros(len(sigmas)), Dfun=derivative, full_output=True, maxfev=most, **enough)
+    return min(found)
 
 
 def _spread(graph: Graph, x: Array, vertices: Sequence[int], joint: Array, predicted: Array) -> float:
