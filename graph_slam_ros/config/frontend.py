@@ -151,6 +151,11 @@ class OdometryConfig:
         return self.lateral_density / self.translation_density, self.vertical_density / self.translation_density
 
     @property
+    def log_odds(self) -> float:
+        """The logarithm of ``doubt_odds``."""
+        return math.log(self.doubt_odds)
+
+    @property
     def has_densities(self) -> bool:
         """Return whether a density differs from its default."""
         return any(getattr(self, one.name) != one.default for one in fields(self) if one.name.endswith("_density"))

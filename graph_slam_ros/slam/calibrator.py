@@ -17,12 +17,13 @@ from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.calibration.choice import parameters_of
 from graph_slam_ros.slam.calibration.decision import Finding, decide, of_association
 from graph_slam_ros.slam.calibration.drift import DriftWindows
-from graph_slam_ros.slam.calibration.fit import TrialFit, fit
+from graph_slam_ros.slam.calibration.fit import TrialFit, likelier_fit
 from graph_slam_ros.slam.calibration.model import Values
 from graph_slam_ros.slam.calibration.parameters import Parameter
 from graph_slam_ros.slam.calibration.recalibration import Recalibration
 from graph_slam_ros.slam.calibration.rows import TrialProblem
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
+from graph_slam_ros.slam.kidnap_detector import KidnapDetector
 from graph_slam_ros.slam.landmarks.explanation import SCALES
 from graph_slam_ros.slam.landmarks.landmark_frontend import LandmarkFrontend
 from graph_slam_ros.slam.snapshot import MapSnapshot
@@ -54,13 +55,14 @@ class Calibrator:
         backend: Backend,
         frontend: KeyframeFrontend,
         landmarks: LandmarkFrontend,
+        kidnaps: KidnapDetector,
         counters: Counters,
         executor: Executor,
         start: MapSnapshot | None = None,
     ) -> None:
         self._config, self._backend, self._frontend = config, backend, frontend
         self._landmarks, self._anonymous = landmarks.map, landmarks.anonymous
-        self._counters, self._executor = counters, executor
+        self._kidnaps, self._counters, self._executor = kidnaps, counters, executor
         self.findings: dict[Parameter, Finding] = {}
         self.history: list[Recalibration] = []
         self.corrected: list[Finding] = []
@@ -76,13 +78,6 @@ class Calibrator:
         if start is not None:
             frontend.corrections.restore(start.calibration)
             self._admitted = {Parameter(*key) for key in start.calibration}
-
-    @property
-    def may_be_wrong(self) -> bool:
-        """Return whether odometry's factors are still to be found: until then they would pass for slips."""
-        factors = [one for one in self.findings.values() if one.parameter.name in ("distance", "turn")]
-        is_unknown = any(one.verdict in ("not_determined", "not_separable") for one in factors)
-        return self._config.calibrate.is_on and (not self.trials or is_unknown)
 
     def after_solve(self, keyframe: int, everything: Settings | None) -> Report | None:
         """Start a trial if it is due, and apply the outcome of an earlier one. Returns the report of a solve."""
@@ -116,7 +111,8 @@ class Calibrator:
         return report
 
     def _trial(self, settings: Settings) -> Trial:
-        problem, calibrate = self._problem(settings), self._config.calibrate
+        problem, calibrate = self._problem_with_slips(settings), self._config.calibrate
+        log_odds = self._config.odometry.log_odds
         has_gyro, windows, now_ns = bool(self._config.gyro_input), self._windows, int(problem.stamps_ns[-1])
 
         def run() -> TrialFit | None:
@@ -124,7 +120,7 @@ class Calibrator:
             if has_gyro:  # odometry's turn is mostly that of the gyro
                 wanted = [one for one in wanted if one.name != "turn"]
             priors = {one: windows.prior(one, calibrate.prior(one.name), now_ns) for one in wanted}
-            return fit(problem, priors) if wanted else None
+            return likelier_fit(problem, priors, log_odds) if wanted else None
 
         return run
 
@@ -159,11 +155,24 @@ class Calibrator:
         if report is not None:
             self._admitted |= values.keys()
             self.corrected += [one for one in findings if one.parameter in values]
+            if not found.slips:
+                report = self._without_slips(everything) or report
         for one in findings:
             self.findings[one.parameter] = one
         edges, stamps_ns = self._backend.graph.edge_count, self._frontend.path.keyframes.stamps_ns
         self._windows.close_if_full(keyframe, stamps_ns, edges, findings, self._frontend.corrections.lines())
         return report
+
+    def _without_slips(self, everything: Settings | None) -> Report | None:
+        """Take back all slips, if all measurements as they are corrected now are likelier so. Returns a solve's report.
+
+        A parameter that was fitted but not used still passes for them.
+        """
+        problem = self._problem_with_slips(everything or self._backend.solver.settings)
+        found = self._guarded(lambda: likelier_fit(problem, {}, self._config.odometry.log_odds))
+        if found is None or found.slips:
+            return None
+        return self._kidnaps.revoke_slips(self._frontend.path.keyframes, everything)
 
     def _adopt_association(self, keyframe: int, everything: Settings | None) -> Report | None:
         """Apply the factors of odometry that the last explanation of all scans has found. Returns a solve's report."""
@@ -263,6 +272,9 @@ class Calibrator:
         factors = self._frontend.corrections.factors
         problem = self._backend.trial_problem(self._config.space, path, origins, settings, factors)
         return replace(problem, first_edge=max(problem.first_edge, self._windows.first_edge))
+
+    def _problem_with_slips(self, settings: Settings) -> TrialProblem:
+        return replace(self._problem(settings), slips=self._kidnaps.slipped(self._frontend.path.keyframes))
 
     def widened(self, marginal: Array, vertex: int) -> Array:
         """The marginal of a vertex with the uncertainty of the parameters; the same where none was corrected.

@@ -91,7 +91,7 @@ class GraphSlam(MapView):
         self._sink, self._faults = sink or (lambda measurement: None), Faults(counters)
         self._edits = Edits(config.space, backend, frontend, landmarks, self._anchor, solution.guard, counters)
         self._custom = CustomEdges(config, backend, frontend, landmarks.map, self._anchor, counters)
-        self._calibrator = Calibrator(config, backend, frontend, landmarks, counters, executor, start)
+        self._calibrator = Calibrator(config, backend, frontend, landmarks, kidnaps, counters, executor, start)
         if start is not None and start.keyframes:
             with failed_edges() as failed:
                 self._restore(start)
@@ -224,7 +224,7 @@ class GraphSlam(MapView):
         self._landmarks.review(self.keyframes, everything=everything is not None)
         if everything is None:
             self.backend.update(keyframe)
-            self._kidnaps.check(self.keyframes, now_ns, doubts=not self._calibrator.may_be_wrong)
+            self._kidnaps.check(self.keyframes, now_ns)
         else:
             report = self._kidnaps.optimize(self.keyframes, everything)
         report = self.backend.scale_noise(self.keyframes, everything) or report

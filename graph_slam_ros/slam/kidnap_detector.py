@@ -182,13 +182,12 @@ class KidnapDetector:
             case "closures":
                 self._slips.add_seen(edge, max(vertices), one.label)
 
-    def check(self, keyframes: StampedPoses[Keyframe], stamp_ns: int, *, doubts: bool = True) -> None:
+    def check(self, keyframes: StampedPoses[Keyframe], stamp_ns: int) -> None:
         """Look at the evidence after a solve.
 
         Parameters
         ----------
         stamp_ns : of the newest odometry
-        doubts : whether odometry may be found to slip
         """
         vertices = keyframes.ids
         if not self._backend.decides:
@@ -197,7 +196,7 @@ class KidnapDetector:
         found = self._significant(int(vertices[-1]))
         found = found and self._search.begun_at(found, self._anonymous.elsewhere.fits_from)
         is_decided = found is not None and self._is_decided(found)
-        if doubts and self._slips.check(keyframes, stamp_ns, self._moved_to(found), is_decided=is_decided):
+        if self._slips.check(keyframes, stamp_ns, self._moved_to(found), is_decided=is_decided):
             found = None
         if found is not None and is_decided:
             last = self._splits[-1] if self._splits else None
@@ -214,6 +213,18 @@ class KidnapDetector:
         report = self._backend.optimize(len(keyframes) - 1, settings)
         if self._slips.slips and self._slips.review(keyframes):
             report = self._backend.optimize(len(keyframes) - 1, settings)
+        return report
+
+    def slipped(self, keyframes: StampedPoses[Keyframe]) -> tuple[tuple[tuple[int, int], ...], ...]:
+        """The edges of odometry of each slip, each with the one that replaces it."""
+        return self._slips.slipped(keyframes)
+
+    def revoke_slips(self, keyframes: StampedPoses[Keyframe], settings: Settings | None) -> Report:
+        """Take back all slips, because wrong parameters, corrected by now, passed for them; and solve."""
+        self._slips.revoke_all(keyframes)
+        report = self._backend.solver.optimize(settings)
+        if self._backend.decisions.reclassify(len(keyframes) - 1):
+            report = self._backend.solver.optimize(settings)
         return report
 
     def _moved_to(self, found: DisplacementHypothesis | None) -> Moved | None:

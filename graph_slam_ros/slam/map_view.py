@@ -1,6 +1,7 @@
 """The read-only part of the pipeline: path, landmarks, covariances, statistics and health."""
 
 from collections.abc import Collection, Sequence, Set
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from graph_slam_ros.slam.alarm import Alarm
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.calibration.choice import parameters_of
 from graph_slam_ros.slam.calibration.decision import Finding, decide
-from graph_slam_ros.slam.calibration.fit import TrialFit, fit
+from graph_slam_ros.slam.calibration.fit import TrialFit, likelier_fit
 from graph_slam_ros.slam.calibration.parameters import DEFAULT_GROUPS
 from graph_slam_ros.slam.calibration.recalibration import Recalibration
 from graph_slam_ros.slam.calibrator import Calibrator
@@ -156,7 +157,9 @@ class MapView(PathView):
         """
         frontend, origins = self._frontend, self._landmarks.map.origins
         problem = self.backend.trial_problem(self.space, frontend.path, origins, factors=frontend.corrections.factors)
-        found = fit(problem, {one: one.quantity.prior for one in parameters_of(problem, groups, chooses=chooses)})
+        problem = replace(problem, slips=self._kidnaps.slipped(self.keyframes))
+        priors = {one: one.quantity.prior for one in parameters_of(problem, groups, chooses=chooses)}
+        found = likelier_fit(problem, priors, self.config.odometry.log_odds)
         stated = problem.model().sigma_per_m()
         return found, decide(found, len(self.landmarks), slides=self.config.odometry.slides, sigma_per_m=stated)
 

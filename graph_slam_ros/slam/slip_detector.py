@@ -38,7 +38,7 @@ from graph_slam_ros.slam.robust.odometry_hypotheses import (
     Stretch,
 )
 from graph_slam_ros.slam.slip_noise import SlipNoise
-from graph_slam_ros.slam.slip_review import Slip, covariance_of, revoke_slip, slipped_pairs
+from graph_slam_ros.slam.slip_review import Pair, Slip, covariance_of, revoke_slip, slipped_pairs
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array
 
@@ -350,25 +350,46 @@ class SlipDetector:
         self.slips[-1] = replace(now, edges=left, ended_ns=stamp_ns, outcome=outcome)
         self._doubt(stamp_ns, None)
 
+    def slipped(self, keyframes: StampedPoses[Keyframe]) -> tuple[tuple[Pair, ...], ...]:
+        """The edges of odometry of each slip that is not taken back, each with the one that replaces it."""
+        every = [slipped_pairs(self._backend, keyframes, one.began_ns, one.ended_ns) for one in self.slips]
+        return tuple(tuple(pairs) for pairs in every if pairs)
+
     def review(self, keyframes: StampedPoses[Keyframe]) -> bool:
         """Take back the slips that all measurements together contradict. Returns whether there were any."""
-        changed, restored = False, set[int]()
+        changed = False
         for k, slip in enumerate(self.slips):
             pairs = slipped_pairs(self._backend, keyframes, slip.began_ns, slip.ended_ns) if slip.ended_ns else []
             if revoke_slip(self._backend, pairs, len(keyframes) - 1, _FACTOR):
-                changed, outcome = True, "taken back: all measurements together agree with odometry"
-                restored |= {edge for _, edge in pairs}
-                self._counters.count("odometry", "slip_taken_back")
-                self.slips[k] = replace(slip, edges=max(0, slip.edges - len(pairs)), outcome=outcome)
+                changed = True
+                self._note_revoked(k, pairs, "all measurements together agree with odometry")
+        return changed
+
+    def revoke_all(self, keyframes: StampedPoses[Keyframe]) -> None:
+        """Take back all slips, because wrong parameters, which are corrected now, passed for them."""
+        keyframe, stamp_ns = len(keyframes) - 1, int(keyframes.stamps_ns[-1])
+        for k, slip in enumerate(self.slips):
+            pairs = slipped_pairs(self._backend, keyframes, slip.began_ns, slip.ended_ns)
+            if pairs:
+                restore_odometry(self._backend, pairs, keyframe, 0.0)
+                self._note_revoked(k, pairs, "a wrong parameter, which is corrected now, passed for it")
+        if (now := self.now) is not None:
+            self.slips[-1] = replace(now, ended_ns=stamp_ns)
+            self._doubt(stamp_ns, None)
+
+    def _note_revoked(self, k: int, pairs: Sequence[Pair], why: str) -> None:
+        """Note that odometry counts again with its own noise where a slip was."""
+        self._counters.count("odometry", "slip_taken_back")
+        slip, restored = self.slips[k], {edge for _, edge in pairs}
+        self.slips[k] = replace(slip, edges=max(0, slip.edges - len(pairs)), outcome=f"taken back: {why}")
         for link in self._links:
             link.edge = link.own if link.edge in restored else link.edge
-        return changed
 
     # -- the graph ---------------------------------------------------------------------------------------------------
 
     def _replace(self, links: Sequence[_Link], slip: Slip, keyframe: int) -> None:
         """Replace odometry edges by edges with more noise."""
-        graph, threshold = self._backend.graph, -2.0 * float(np.log(self._config.doubt_odds))
+        graph, threshold = self._backend.graph, -2.0 * self._config.log_odds
         own = [link.edge for link in links]
         noises = []
         for link in links:

@@ -10,7 +10,7 @@ covariance (White, "Maximum likelihood estimation of misspecified models", 1982)
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import sparse
@@ -46,6 +46,8 @@ class TrialFit:
     path : stored numbers of all vertices
     sensitivity : (unknowns, p) steps of all unknowns with each parameter
     column : (vertices,) first row of each vertex in ``sensitivity``, or -1
+    evidence : logarithm of the likelihood of all measurements, whatever unknowns and parameters are, but for a constant
+    slips : whether odometry counts for less where slips were found
     """
 
     parameters: tuple[Parameter, ...]
@@ -59,6 +61,8 @@ class TrialFit:
     path: Array
     sensitivity: Array
     column: Index
+    evidence: float
+    slips: bool = True
 
     def adds(self, vertex: int, dof: int, left: Values) -> Array:
         """The covariance (dof, dof) that parameters add to a vertex whose marginal takes them for known.
@@ -112,6 +116,27 @@ def fit(problem: TrialProblem, priors: Mapping[Parameter, float], start: Values 
         The edges do not determine the estimate.
     """
     return _Fit(problem, priors).run(start or {})
+
+
+def likelier_fit(problem: TrialProblem, priors: Mapping[Parameter, float], log_odds: float) -> TrialFit:
+    """Fit parameters with the slips that were found and, if there are any, without: what is wrong passes for slips.
+
+    Returns the fit of more evidence (MacKay, "Bayesian interpolation", 1992).
+
+    Parameters
+    ----------
+    log_odds : logarithm of the odds of a slip before anything is seen
+
+    Raises
+    ------
+    SingularError
+        The edges do not determine the estimate.
+    """
+    if not problem.slips:
+        return fit(problem, priors)
+    without = fit(problem.without_slips(), priors)
+    found = fit(problem, priors)
+    return replace(without, slips=False) if without.evidence > found.evidence + log_odds * len(problem.slips) else found
 
 
 class _Fit:
@@ -170,16 +195,19 @@ class _Fit:
     # -- what it says ----------------------------------------------------------------------------------------------
 
     def _outcome(self, x: Array, theta: Array, rows: Rows) -> TrialFit:
-        _, border = _factor(rows)
+        factor, border = _factor(rows)
         rest = rows.columns - rows.jacobian @ border
-        covariance = np.asarray(np.linalg.inv(self._information(rest)))
+        information = self._information(rest)
+        covariance = np.asarray(np.linalg.inv(information))
         scores = rest * rows.residual[:, None]
         robust = np.asarray(covariance @ self._meat(scores, rows) @ covariance)
         first, second = self._halves(rest, scores, theta, rows.stamp_ns)
         sightings = rows.landmark >= 0
         lost = float(np.mean(rows.weight[sightings] < _LOST)) if sightings.any() else 0.0
         found = self._parameters, theta, self._priors, covariance, robust, first, second, lost, x
-        return TrialFit(*found, -border, self._linear.column)
+        curvature = float(np.log(np.abs(factor.U.diagonal())).sum() + np.linalg.slogdet(information)[1])
+        evidence = -0.5 * (float(np.sum(rows.cost) + np.sum((theta / self._priors) ** 2)) + curvature)
+        return TrialFit(*found, -border, self._linear.column, evidence)
 
     def _meat(self, scores: Array, rows: Rows) -> Array:
         """The scatter of scores, grouped by landmark or by half a minute, whichever is larger relative to them."""

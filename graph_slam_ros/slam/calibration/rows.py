@@ -36,6 +36,7 @@ class TrialProblem:
     keyframes, stamps_ns, segments : vertex and stamp of each keyframe, and where odometry does not lead to
     track : odometry between the keyframes
     first_edge : edges before are of a map that is held, and not corrected
+    slips : of each stretch in which odometry counts for less, its edges, each with the one that replaces it
     """
 
     space: Geometry
@@ -50,6 +51,14 @@ class TrialProblem:
     segments: tuple[int, ...]
     track: OdometryTrack
     first_edge: int
+    slips: tuple[tuple[tuple[int, int], ...], ...] = ()
+
+    def without_slips(self) -> "TrialProblem":
+        """The same with odometry as it was stated, in a copy of the graph."""
+        graph, pairs = self.graph.copy(), np.array([pair for slip in self.slips for pair in slip], dtype=np.int64)
+        graph.set_weights(pairs[:, 0], 1.0)
+        graph.set_weights(pairs[:, 1], 0.0)
+        return replace(self, graph=graph, slips=())
 
     def model(self) -> MeasurementModel:
         """Its measurements as functions of parameters."""
@@ -78,6 +87,7 @@ class Rows:
     ----------
     jacobian, columns, residual : (r, unknowns), (r, p), (r,)
     landmark, stamp_ns, weight : (r,) landmark or -1, when, and the part of their weight that the loss leaves
+    cost : (edges,) with the losses, and with the noise: minus twice the logarithm of the likelihood, but for a constant
     """
 
     jacobian: sparse.csr_matrix
@@ -86,9 +96,10 @@ class Rows:
     landmark: Index
     stamp_ns: Index
     weight: Array
+    cost: Array
 
 
-_COLUMNS = ("columns", "residual", "landmark", "stamp_ns", "weight")
+_COLUMNS = ("columns", "residual", "landmark", "stamp_ns", "weight", "cost")
 
 
 class _Eyes:
@@ -239,8 +250,10 @@ class Linearization:
         if is_seen.any():
             ends, jacobian = self._through_eyes(ends, jacobian, columns, x)
             dofs, landmark = (dofs[0], *dofs), np.where(is_seen, ends[:, 2], -1)
-        each = (np.repeat(one, m) for one in (landmark, stamps, slope))
-        return Rows(self._sparse(ends, jacobian, dofs), columns.reshape(n * m, -1), block.residual.ravel(), *each)
+        each = [np.repeat(one, m) for one in (landmark, stamps, slope)]
+        each.append(block.cost - 2.0 * np.linalg.slogdet(table.sqrt_information.values[rows])[1])
+        here = self._sparse(ends, jacobian, dofs), columns.reshape(n * m, -1), block.residual.ravel()
+        return Rows(*here, *each)
 
     def _sparse(self, ends: Index, jacobian: Array, dofs: Sequence[int]) -> sparse.csr_matrix:
         """The Jacobians of some edges in the columns of their unknowns."""

@@ -2,16 +2,21 @@
 
 import numpy as np
 import pytest
-from imperfect import Faults, driven, imperfect_drive
+from imperfect import Faults, driven, error_m, imperfect_drive
+from random_drives import random_drive
 
 from graph_slam_ros.slam import Odometry, Sightings
-from graph_slam_ros.slam.kidnap_detector import KidnapDetector
+from graph_slam_ros.slam.slip_review import Slip
 
 ON = {"calibrate.groups": "auto"}
 
 
 def findings(slam):
     return {one["name"]: one for one in slam.calibration_report["parameters"]}
+
+
+def slips_of(slam):
+    return [one for one in slam.alarms if isinstance(one, Slip)]
 
 
 def only(measurements, names):
@@ -101,14 +106,31 @@ def test_a_robot_that_may_slide_does_not_tell_the_yaw_of_its_sensor():
     assert findings(driven(measurements, ON))["yaw"]["verdict"] != "refused"
 
 
-@pytest.mark.parametrize(("turns", "is_doubted"), [(0.0, False), (0.8, True)])
-def test_odometry_whose_factors_are_still_to_be_found_is_not_doubted(turns, is_doubted, monkeypatch):
-    """A wrong factor passes for a slip, which takes the motion from the trial that would find it."""
-    doubts, check = [], KidnapDetector.check
-    monkeypatch.setattr(
-        KidnapDetector, "check", lambda *given, **how: (doubts.append(how["doubts"]), check(*given, **how))[1]
-    )
-    slam = driven(imperfect_drive(Faults(), seconds=25.0, turns=turns), ON)
-    assert findings(slam)["turn"]["verdict"] == ("nothing_to_correct" if is_doubted else "not_determined")
-    assert doubts[0] is False
-    assert doubts[-1] is is_doubted
+def test_where_nothing_is_corrected_slips_are_found_as_without_calibration():
+    drive, settings, _, _ = random_drive("a prior that contradicts", 1002)
+    on, off = driven(drive, ON | settings), driven(drive)
+    assert not on.calibration_report["settings"]
+    assert findings(on)["yaw"]["verdict"] == "refused"
+    assert len(slips_of(off)) > 0
+    assert slips_of(on) == slips_of(off)
+    assert (on.solver.values == off.solver.values).all()
+
+
+def test_a_slip_for_which_a_turned_sensor_has_passed_is_taken_back_with_its_correction():
+    drive, settings, truth, _ = random_drive("no turns", 1006)
+    on, off = driven(drive, ON | settings), driven(drive)
+    (slip,) = slips_of(on)
+    assert slips_of(off)[0].edges > 0
+    assert slip.edges == 0
+    assert slip.outcome == "taken back: a wrong parameter, which is corrected now, passed for it"
+    assert on.counters["odometry", "slip_taken_back"] == 1
+    assert error_m(on, truth) < 0.2 * error_m(off, truth)
+
+
+def test_slips_stay_if_a_parameter_that_is_not_used_passes_for_them():
+    """The turn factor is corrected, the yaw is refused: without the slips the path would bend by it."""
+    drive, settings, truth, _ = random_drive("a prior that contradicts", 1006)
+    on, off = driven(drive, ON | settings), driven(drive)
+    assert list(on.calibration_report["settings"]) == ["odometry.turn_factor"]
+    assert sum(slip.edges for slip in slips_of(on)) > 0
+    assert error_m(on, truth) < 1.2 * error_m(off, truth)

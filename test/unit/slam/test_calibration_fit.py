@@ -1,14 +1,20 @@
 """The trial fit: derivatives against differences, and what was wrong is found with an honest sigma."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from imperfect import Faults, driven, imperfect_drive
+from imperfect import START_NS, Faults, driven, imperfect_drive
 
 from graph_slam_ros.graph import LANDMARK_POSITION
+from graph_slam_ros.lie import se2
+from graph_slam_ros.slam import Odometry
 from graph_slam_ros.slam.calibration.choice import parameters_of
-from graph_slam_ros.slam.calibration.fit import fit
+from graph_slam_ros.slam.calibration.fit import fit, likelier_fit
 from graph_slam_ros.slam.calibration.parameters import GROUPS, Parameter
 from graph_slam_ros.slam.calibration.rows import Linearization
+from graph_slam_ros.slam.robust.odometry_errors import odometry_errors
+from graph_slam_ros.slam.slip_review import covariance_of
 
 FAULTS = Faults(distance=0.95, turn=1.05, clock_s=0.12, yaw=0.08)
 TRUTH = {"distance": -0.05, "turn": 0.05, "clock": 0.12, "yaw": 0.08}
@@ -102,3 +108,45 @@ def test_range_factor_and_offset_are_found_where_distance_is_held():
     found = fit(problem, {one: one.quantity.prior for one in wanted})
     for parameter, truth in zip(wanted, (0.2, -0.07), strict=True):
         assert abs(found.value(parameter) - truth) < 5.0 * found.sigmas[wanted.index(parameter)] + 0.005, parameter
+
+
+def slipped(factor, seconds=60.0):
+    """A drive in which odometry tells a multiple of the way from 40 s on for 8 s, and its trial problem with slips."""
+    told, out, odom, last = (40.0, 48.0), [], (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+    for m in imperfect_drive(Faults(), seconds=seconds):
+        if isinstance(m, Odometry):
+            motion = se2.log(se2.between(last, m.T_odom_base))
+            is_slipping = told[0] < (m.stamp_ns - START_NS) * 1e-9 < told[1]
+            odom = se2.compose(odom, se2.exp((motion[0] * (factor if is_slipping else 1.0), *motion[1:])))
+            last, m = m.T_odom_base, replace(m, T_odom_base=odom)
+        out.append(m)
+    slam = driven(out)
+    return slam, replace(trial_problem(slam), slips=slam._kidnaps.slipped(slam.keyframes))
+
+
+def test_evidence_of_a_slip_is_that_of_the_errors_of_odometry():
+    """Computed in two ways: all unknowns integrated out, and from the joint covariance of the stretch's poses."""
+    slam, problem = slipped(1.4)
+    (pairs,) = problem.slips
+    errors = odometry_errors(slam.graph, slam.solver, [edge for _, edge in pairs], 1.0)
+    ratio = errors.log_ratio_of(covariance_of(slam.graph, [own for own, _ in pairs], 0, errors.covariance))
+    problem = replace(problem, settings=replace(slam.solver.settings, losses={}))
+    without, found = fit(problem.without_slips(), {}), fit(problem, {})  # a fit overwrites its graph
+    assert ratio < -20.0
+    assert without.evidence - found.evidence == pytest.approx(ratio, rel=0.03)
+
+
+def test_a_slip_is_a_slip_whatever_the_parameters_are():
+    _, problem = slipped(1.4)
+    priors = {one: one.quantity.prior for one in parameters_of(problem, ("factors", "clock", "yaw"))}
+    assert likelier_fit(problem, priors, np.log(1e-6)).slips
+
+
+def test_a_wrong_mount_that_passes_for_slips_is_found_without_them():
+    slam = driven(imperfect_drive(Faults(yaw=-0.15, distance=0.95), seconds=60.0))
+    problem = replace(trial_problem(slam), slips=slam._kidnaps.slipped(slam.keyframes))
+    assert problem.slips
+    priors = {one: one.quantity.prior for one in parameters_of(problem, ("factors", "clock", "yaw"))}
+    found = likelier_fit(problem, priors, np.log(1e-6))
+    assert not found.slips
+    assert found.value(Parameter("detections", "yaw")) == pytest.approx(-0.15, abs=0.01)
