@@ -13,12 +13,14 @@ process of its own. What is printed of a drive:
 
 import argparse
 import os
+import pickle
 import sys
+import tempfile
 import time
 from array import array
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
@@ -31,7 +33,7 @@ from graph_slam_ros.cli import values
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
 from graph_slam_ros.runs.tables import removed_path
 from graph_slam_ros.slam import Control, GraphSlam
-from graph_slam_ros.slam.lifelong.removed import record_type
+from graph_slam_ros.slam.lifelong.removed import Left
 from graph_slam_ros.typing import Array, Numbers
 
 _WARM, _LOOK = 640, 40  # keyframes: before errors of the newest pose are taken, and from one to the next
@@ -51,11 +53,21 @@ class Drive:
         self.course, self.slam = course, GraphSlam(config(course.space, **settings))
         self.update_s = array("d", bytes(8 * (len(course.where) - 1)))
         self.looks, self.memory_mib = list[tuple[float, float, float]](), [0.0, 0.0]
-        self._left = np.ones(len(self.update_s), dtype=record_type(course.space))  # in memory before it begins
-        self._left_count = 0
+        self.path = np.empty((0, course.space.dimensions))  # estimated positions of all keyframes, at the end
 
     def run(self) -> None:
         """Drive to the end."""
+        with tempfile.TemporaryFile() as left:  # what leaves the map is not in memory, as in a run
+            self._run(left)
+            left.seek(0)
+            parts = list[Left]()
+            while left.peek(1):
+                parts.append(pickle.load(left))
+        before = removed_path(self.slam, Left.joined(self.course.space, parts))
+        whole = np.concatenate((before, self.slam.trajectory()))
+        self.path = whole[:, : self.course.space.dimensions]
+
+    def _run(self, left: IO[bytes]) -> None:
         count, space, at = len(self.course.where) - 1, self.course.space, self.course.space.identity
         tenth = max(count // 10, 1)
         for k, (_, step, seen) in enumerate(self.course.keyframes()):
@@ -65,8 +77,7 @@ class Drive:
             updates = [self.slam.process(m) for m in given]
             self.update_s[k] = time.thread_time() - began
             for one in (update.condensed for update in updates if update.condensed is not None):
-                self._left[one.first : one.first + len(one.keyframes)] = one.keyframes
-                self._left_count = one.first + len(one.keyframes)
+                pickle.dump(one.left, left)
             if k >= _WARM and k % _LOOK == 0:
                 self.looks.append(self._newest())
             if (k + 1) in (tenth, count):
@@ -79,12 +90,6 @@ class Drive:
         vertices, numbers = [mark.vertex for mark in marks.values()], [int(name[1:]) for name in marks]
         true = np.stack(self._in_map("act", tuple(self.course.points[numbers].T)), axis=-1)
         return vertices, self.slam.solver.estimate(vertices), true
-
-    def path(self) -> Array:
-        """Estimated positions of all keyframes, those that left the map included."""
-        before = removed_path(self.slam, self._left[: self._left_count])
-        whole = np.concatenate((before, self.slam.trajectory()))
-        return np.asarray(whole[:, : self.course.space.dimensions])
 
     def figures(self) -> dict[str, float]:
         """What was measured."""
@@ -99,7 +104,7 @@ class Drive:
             "early MiB": self.memory_mib[0],
             "late MiB": self.memory_mib[1],
             "newest m": float(np.sqrt((error**2).mean())),
-            "path m": rms(self.path(), true),
+            "path m": rms(self.path, true),
             "landmarks m": rms(there, right),
             "NEES newest": float(nees.mean()),
             "NEES landmarks": float(of_marks.mean()),

@@ -80,4 +80,4 @@ class MapConfig:
         low=40,
         high=10_000_000,
     )
-    cell_m: float = setting(10.0, "with condense: width of a place", "m", low=1.0, high=1000.0)
+    cell_m: float = setting(20.0, "with condense: width of a place", "m", low=1.0, high=1000.0)

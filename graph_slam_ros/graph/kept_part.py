@@ -28,10 +28,10 @@ def kept_part(graph: Graph, vertices: Index, edges: Index, values: Array) -> Gra
     count, code_of_edge, row_of_edge = len(edges), np.empty(len(edges), np.int64), np.empty(len(edges), np.int64)
     new_edge, is_kept = new_ids(edges, graph.edge_count), np.zeros(graph.edge_count, dtype=bool)
     is_kept[edges] = True
-    for table in graph.tables.values():
-        rows = np.flatnonzero(is_kept[table.id.values])
-        if not len(rows):
-            continue
+    found = [(table, rows) for table in graph.tables.values() if len(rows := np.flatnonzero(is_kept[table.id.values]))]
+    for table, rows in sorted(
+        found, key=lambda one: int(one[0].id.values[one[1][0]])
+    ):  # as if it was added edge by edge
         code = len(out.tables)
         fresh = out.tables[table.type] = EdgeTable(table.type, code)
         out._in_order.append(fresh)

@@ -208,8 +208,8 @@ def _aligned(
 
 def whole_path(folder: Path, slam: GraphSlam) -> StampedPath:
     """Return stamps [ns] (n,) and poses (n, size) of all keyframes of a run, those that were condensed included."""
-    left, _ = read_left(folder, slam.space, slam.bounded)
-    stamps_ns = np.concatenate((left["stamp_ns"], slam.keyframes.stamps_ns))
+    left = read_left(folder, slam.space, slam.bounded)
+    stamps_ns = np.concatenate((left.keyframes["stamp_ns"], slam.keyframes.stamps_ns))
     return stamps_ns, np.concatenate((removed_path(slam, left), slam.trajectory()))
 
 

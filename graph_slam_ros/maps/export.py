@@ -18,7 +18,7 @@ from graph_slam_ros.runs.folder import RunError, is_run
 from graph_slam_ros.runs.restore import restored
 from graph_slam_ros.runs.tables import graph_file, numbered, removed_path
 from graph_slam_ros.slam import GraphSlam
-from graph_slam_ros.slam.lifelong.removed import Records
+from graph_slam_ros.slam.lifelong.removed import Left
 
 
 def export(folder: Path, out: Path, target: str, losses: list[str], *, last_drive: bool = False) -> list[Path]:
@@ -37,12 +37,12 @@ def export(folder: Path, out: Path, target: str, losses: list[str], *, last_driv
     if target == "mcap" and out.suffix != ".mcap":
         raise RunError(f"{out}: what reads mcap wants a name that ends in .mcap")
     slam = restored(folder, losses, condensed=True)
-    keyframes, _ = read_left(folder, slam.space, slam.bounded)
+    left = read_left(folder, slam.space, slam.bounded)
     if last_drive:
         if target != "tum":
             raise RunError(f"--last-drive: {target} holds a whole map; with --to tum it is the path of the last drive")
-        return _tum(slam, keyframes, out, slam.drives[-1])
-    return TARGETS[target](slam, keyframes, out)
+        return _tum(slam, left, out, slam.drives[-1])
+    return TARGETS[target](slam, left, out)
 
 
 def files_of(out: Path, target: str) -> list[Path]:
@@ -53,15 +53,15 @@ def files_of(out: Path, target: str) -> list[Path]:
     return [out, whole.with_name(f"{whole.stem}_vertices.csv")]
 
 
-def _tum(slam: GraphSlam, left: Records, out: Path, first: int = 0) -> list[Path]:
+def _tum(slam: GraphSlam, left: Left, out: Path, first: int = 0) -> list[Path]:
     """The keyframes from a number on."""
-    stamps_ns = [*left["stamp_ns"].tolist(), *slam.keyframes.stamps_ns.tolist()]
+    stamps_ns = [*left.keyframes["stamp_ns"].tolist(), *slam.keyframes.stamps_ns.tolist()]
     path = np.concatenate((removed_path(slam, left), slam.trajectory()))
     write_text(out, tum_text(stamps_ns[first:], path[first:]))
     return [out]
 
 
-def _g2o(slam: GraphSlam, left: Records, out: Path) -> list[Path]:
+def _g2o(slam: GraphSlam, left: Left, out: Path) -> list[Path]:
     """All accepted edges. g2o has neither stamps nor names; a second table has these."""
     ids, table = numbered(slam)
     _, names_file = files_of(out, "g2o")
@@ -70,15 +70,15 @@ def _g2o(slam: GraphSlam, left: Records, out: Path) -> list[Path]:
     return [out, names_file]
 
 
-def _mcap(slam: GraphSlam, left: Records, out: Path) -> list[Path]:
+def _mcap(slam: GraphSlam, left: Left, out: Path) -> list[Path]:
     """Every keyframe at its stamp with its covariance; at the last stamp the path and the landmarks.
 
     The covariance of a keyframe that was condensed is not known: all variances are those of what a pose does not have.
     """
     frame, unused = slam.config.frames.map, slam.config.output.pose_covariance_max
     path = np.concatenate((removed_path(slam, left), slam.trajectory()))
-    stamps_ns = [*left["stamp_ns"].tolist(), *slam.keyframes.stamps_ns.tolist()]
-    unknown = np.broadcast_to(unused * np.eye(slam.space.dof), (len(left), slam.space.dof, slam.space.dof))
+    stamps_ns = [*left.keyframes["stamp_ns"].tolist(), *slam.keyframes.stamps_ns.tolist()]
+    unknown = np.broadcast_to(unused * np.eye(slam.space.dof), (len(left.keyframes), slam.space.dof, slam.space.dof))
     poses = zip(stamps_ns, path, np.concatenate((unknown, slam.keyframe_covariances())), strict=True)
     last_ns, landmarks = slam.keyframes[-1].stamp_ns, results.landmark_estimates(slam)
     with replaced(out) as new, BagWriter(new) as bag:

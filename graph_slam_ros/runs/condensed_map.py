@@ -6,10 +6,11 @@ The record ``condensed`` of a ``growth`` (``map_journal``) has
 * ``vertices``, ``edges``: the lasting ids of the first rows, and that of the row after these;
 * ``old``: number, vertex, stamp and ``T_odom_base`` of each keyframe before the first that is in the graph;
 * ``places``: cell, edge, visits, and the strikes against its landmarks, by vertex, of each place;
-* ``left``: how many keyframes, and poses at which something was seen, have left the map.
+* ``left``: how many keyframes, poses at which something was seen, and frames have left the map.
 
 What has left is in ``condensed.mcap``, a record ``left`` each time: the number of its first keyframe, how many poses
-had left before, and the rows of ``slam.lifelong.removed.record_type`` in base64. ``left_edges`` has the table of the
+had left before, and the rows of ``slam.lifelong.removed.record_type`` and of ``slam.lifelong.frames`` in base64; there
+are no frames in a map that an older version made. ``left_edges`` has the table of the
 edges. A map may know of fewer than are there, if its run was killed: the others do not count.
 """
 
@@ -31,7 +32,8 @@ from graph_slam_ros.runs.journal import read_records
 from graph_slam_ros.slam.bounded_map import Condensation
 from graph_slam_ros.slam.condensed_edges import CondensedEdge
 from graph_slam_ros.slam.lifelong.condenser import place_of
-from graph_slam_ros.slam.lifelong.removed import OldKeyframe, Records, no_records, record_type
+from graph_slam_ros.slam.lifelong.frames import Frames, frame_type, member_type
+from graph_slam_ros.slam.lifelong.removed import Left, OldKeyframe, Records, record_type
 from graph_slam_ros.slam.lifelong.state import BoundedState
 
 CONDENSED = "condensed"
@@ -52,7 +54,7 @@ def condensed_record(graph: Graph, first: int, state: BoundedState) -> Record:
         for one in several
     ]
     old = [[one.number, one.vertex, one.stamp_ns, one.T_odom_base] for one in state.old]
-    left = [state.keyframes, state.sightings]
+    left = [state.keyframes, state.sightings, state.frames]
     return {
         "first": first,
         **dict(zip(("vertices", "edges"), ids, strict=True)),
@@ -76,8 +78,8 @@ def read_condensed(graph: Graph, record: Mapping[str, Any]) -> tuple[int, Bounde
         if not len(ids) or (np.diff(ids) <= 0).any() or ids[0] < 0 or len(ids) - 1 > count:
             raise ValueError(f"condensed: the ids of its {name} do not ascend, or are more than there are")
         setattr(graph, _IDS[name], LastingIds(ids[:-1], int(ids[-1])))
-    keyframes, sightings = record["left"]
-    state = BoundedState(keyframes=keyframes, sightings=sightings)
+    keyframes, sightings, *frames = record["left"]
+    state = BoundedState(keyframes=keyframes, sightings=sightings, frames=frames[0] if frames else 0)
     for cell, edge, visits, strikes in record["places"]:
         state.places.setdefault(tuple(cell), []).append(place_of(graph.edge(edge), visits, dict(strikes)))
     state.old += [OldKeyframe(number, vertex, stamp, tuple(pose)) for number, vertex, stamp, pose in record["old"]]
@@ -89,7 +91,9 @@ def read_condensed(graph: Graph, record: Mapping[str, Any]) -> tuple[int, Bounde
 
 def left_records(done: Condensation) -> Iterator[Record]:
     """Return the records of what has left a map."""
-    rows = {"keyframes": _text(done.keyframes), "sightings": _text(done.sightings)}
+    left = done.left
+    rows = {"keyframes": _text(left.keyframes), "sightings": _text(left.sightings)}
+    rows |= {"frames": _text(left.frames.rows), "members": _text(left.frames.members)}
     yield {"type": "left", "first": done.first, "sightings_before": done.sightings_before, **rows}
     if done.edges:
         out = io.StringIO()
@@ -98,31 +102,32 @@ def left_records(done: Condensation) -> Iterator[Record]:
         yield {"type": "left_edges", "first": done.first, "table": out.getvalue()}
 
 
-def read_left(folder: Path, space: Geometry, state: BoundedState | None) -> tuple[Records, Records]:
-    """Return the keyframes that have left a map, and the poses at which something was seen from them.
+def read_left(folder: Path, space: Geometry, state: BoundedState | None) -> Left:
+    """Return what has left a map.
 
     Raises
     ------
     FormatError
         Some of those that the map knows of are missing.
     """
-    if state is None:
-        return no_records(space), no_records(space)
-    found: dict[str, list[Records]] = {"keyframes": [], "sightings": []}
-    kind, count = record_type(space), 0
-    for record in read_records(folder, CONDENSED, [], "left"):
-        if record["first"] >= state.keyframes:
-            break
-        for name, several in found.items():
-            several.append(np.frombuffer(base64.b64decode(record[name]), dtype=kind))
-        count += len(found["keyframes"][-1])
-    keyframes, sightings = (np.concatenate([no_records(space), *several]) for several in found.values())
-    if count != state.keyframes or len(sightings) != state.sightings:
+    found: list[Left] = []
+    if state is not None:
+        for record in read_records(folder, CONDENSED, [], "left"):
+            if record["first"] >= state.keyframes:
+                break
+            keyframes, sightings = (_rows(record[name], record_type(space)) for name in ("keyframes", "sightings"))
+            frames = _rows(record.get("frames", ""), frame_type(space))
+            found.append(
+                Left(keyframes, sightings, Frames(frames, _rows(record.get("members", ""), member_type(space))))
+            )
+    out = Left.joined(space, found)
+    count = len(out.keyframes), len(out.sightings), len(out.frames)
+    if state is not None and count != (state.keyframes, state.sightings, state.frames):
         raise FormatError(
-            f"{folder}: {CONDENSED}.mcap has {count} keyframes, and {state.keyframes} have left the map: the others "
+            f"{folder}: {CONDENSED}.mcap has {count[0]} keyframes, and {state.keyframes} have left the map: the others "
             f"are lost; graph_slam replay {folder} makes the map anew"
         )
-    return keyframes, sightings
+    return out
 
 
 def carried(folder: Path, state: BoundedState) -> Iterator[Record]:
@@ -140,6 +145,10 @@ def read_left_edges(folder: Path) -> Iterator[dict[str, str]]:
 
 def _text(rows: Records) -> str:
     return base64.b64encode(rows.tobytes()).decode()
+
+
+def _rows(text: str, kind: np.dtype[np.void]) -> Records:
+    return np.frombuffer(base64.b64decode(text), dtype=kind)
 
 
 def _word(value: Any) -> Any:

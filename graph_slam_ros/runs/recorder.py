@@ -352,7 +352,7 @@ def save_results(
         return _put(folder, name, text)
 
     left = read_left(folder, slam.space, slam.bounded)
-    files = {name: put(name, text) for name, text in result_texts(slam, *left).items()}
+    files = {name: put(name, text) for name, text in result_texts(slam, left).items()}
     noise = {} if "noise" in summary else noise_summary(slam)
     contents = {"format": MARK} | summarize(slam) | summary | noise | {"format": MARK, "files": files}
     put(SUMMARY, json.dumps(contents, indent=2) + "\n")

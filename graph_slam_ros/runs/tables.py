@@ -20,7 +20,7 @@ from graph_slam_ros.runs.ledger_file import CHANGES, LEDGER, changes_text, ledge
 from graph_slam_ros.slam import Counters, GraphSlam
 from graph_slam_ros.slam.calibration.decision import SIGMAS
 from graph_slam_ros.slam.calibration.parameters import QUANTITIES
-from graph_slam_ros.slam.lifelong.removed import Records, composed, seen_from
+from graph_slam_ros.slam.lifelong.removed import Left, seen_from
 from graph_slam_ros.slam.robust.gating import CANDIDATES
 from graph_slam_ros.slam.robust.ledger import INSIDE, Verdict
 from graph_slam_ros.typing import Array
@@ -30,15 +30,10 @@ _TANGENT = {3: ("x", "y", "theta"), 6: ("x", "y", "z", "rx", "ry", "rz")}
 _POSE = {3: "x,y,theta", 6: "x,y,z,qx,qy,qz,qw"}
 
 
-def result_texts(slam: GraphSlam, keyframes: Records, sightings: Records) -> dict[str, str]:
-    """All results except the summary, by file name.
-
-    Parameters
-    ----------
-    keyframes, sightings : that have left the map
-    """
+def result_texts(slam: GraphSlam, left: Left) -> dict[str, str]:
+    """All results except the summary, by file name; ``left`` has what has left the map."""
     ids, vertices = numbered(slam)
-    before = removed_path(slam, keyframes)
+    before, keyframes, sightings = removed_path(slam, left), left.keyframes, left.sightings
     odometry = np.concatenate((keyframes["T_odom"], slam.keyframes.poses))
     path = np.concatenate((before, slam.trajectory()))
     seen = np.concatenate(
@@ -61,14 +56,16 @@ def result_texts(slam: GraphSlam, keyframes: Records, sightings: Records) -> dic
     }
 
 
-def removed_path(slam: GraphSlam, keyframes: Records) -> Array:
+def removed_path(slam: GraphSlam, left: Left) -> Array:
     """Return the present poses of the keyframes that have left the map, (n, size)."""
     if slam.bounded is None:
         return np.empty((0, slam.space.pose.size))
     vertices = np.array([*(one.vertex for one in slam.bounded.old), *slam.keyframes.ids.tolist()], dtype=np.int64)
-    order = np.argsort(vertices)
-    ids = slam.graph.vertex_ids.of_all(vertices[order])
-    return composed(slam.space, keyframes, ids, slam.solver.estimate(vertices[order]))
+    order, lasting = np.argsort(vertices), slam.graph.vertex_ids
+    marks = np.sort(np.array([mark.vertex for mark in slam.landmarks.values()], dtype=np.int64))
+    points = slam.solver.estimate(marks)[:, : slam.space.dimensions]
+    ids, poses = lasting.of_all(vertices[order]), slam.solver.estimate(vertices[order])
+    return left.path(slam.space, ids, poses, (lasting.of_all(marks), points))
 
 
 def noise_summary(slam: GraphSlam) -> dict[str, Any]:

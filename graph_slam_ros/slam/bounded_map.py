@@ -20,15 +20,19 @@ from graph_slam_ros.slam.kidnap_detector import KidnapDetector
 from graph_slam_ros.slam.landmarks.landmark_frontend import LandmarkFrontend
 from graph_slam_ros.slam.lifelong.compaction import compact
 from graph_slam_ros.slam.lifelong.condenser import CHAIN, Cell, Condensed, Condenser, PlaceEdge
-from graph_slam_ros.slam.lifelong.removed import OldKeyframe, Records, record_type
+from graph_slam_ros.slam.lifelong.frames import LONGEST as FRAME
+from graph_slam_ros.slam.lifelong.frames import Frames, frame_of, weight_at
+from graph_slam_ros.slam.lifelong.removed import Left, OldKeyframe, Records, record_type
+from graph_slam_ros.slam.lifelong.surroundings import CLOSURES, FIXES
 from graph_slam_ros.slam.solution import Solution
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Index, Numbers
 
 LONGEST = 60  # keyframes of a visit
-BATCH = 100  # keyframes that leave the window together
-_PATIENCE = 2 * BATCH  # keyframes that are out of the window while a visit waits
+BATCH = 200  # keyframes that leave the window together
+_PATIENCE = 200  # keyframes that are out of the window while a visit waits
 _SOURCE = "map"  # of what is counted
+_Row = tuple[int, int, Numbers]  # a keyframe's vertex, lasting id of its base or -1 - n of frame n, and pose
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,13 +41,12 @@ class Condensation:
 
     Attributes
     ----------
-    keyframes, sightings : records of the keyframes that left, and of the poses at which something was seen from them
+    left : records of the keyframes that left, and of the poses at which something was seen from them
     first : number of the first of these keyframes; sightings_before : how many such poses had left before
     edges : of the graph that are gone, with what was decided of them
     """
 
-    keyframes: Records
-    sightings: Records
+    left: Left
     first: int
     sightings_before: int
     edges: tuple[CondensedEdge, ...]
@@ -94,7 +97,7 @@ class BoundedMap:
         graph, values, places = backend.graph.copy(), backend.solver.values, _copies(self.state.places)
         vertices, self._tried = backend.solver.vertices, len(keyframes)
         try:
-            rows, end = self._condensed_visits()
+            rows, frames, end = self._condensed_visits()
             backend.hand_over_condensed(len(keyframes) - 1)
         except Exception as error:
             self._counters.count(_SOURCE, type(error).__name__)
@@ -103,17 +106,17 @@ class BoundedMap:
             self.state.places.update(places)
             _restart(backend.solver, vertices, values)
             return None
-        return self._compacted(rows, end) if end > keyframes.first else None
+        return self._compacted(rows, frames, end) if end > keyframes.first else None
 
     # -- visits ------------------------------------------------------------------------------------------------------
 
-    def _condensed_visits(self) -> tuple[list[tuple[int, int, Numbers]], int]:
-        """Condense; returns (vertex, base, pose) of what left, in order of time, and the first number that stays."""
+    def _condensed_visits(self) -> tuple[list[_Row], Frames, int]:
+        """Condense; returns what left, in order of time, its frames, and the first number that stays."""
         path, solver = self._frontend.path, self._backend.solver
         keyframes, map_ = path.keyframes, self._frontend.config.map
         ids, first = keyframes.ids, keyframes.first
         limit = min(len(keyframes) - map_.window_keyframes, path.remembered_from) - first
-        at, rows = solver.estimate(ids), list[tuple[int, int, Numbers]]()
+        at, rows, frames = solver.estimate(ids), list[_Row](), list[Frames]()
         cells = list(map(tuple, np.floor(at[:, : self._space.dimensions] / map_.cell_m).astype(np.int64).tolist()))
         k = 0
         while k < limit:
@@ -131,10 +134,10 @@ class BoundedMap:
             if done.how == "waits":
                 break
             self._note_end(done.how)
-            rows += self._rows(visit, done)
+            rows += self._rows(visit, done, frames)
             k = end
         solver.update()
-        return rows, first + k
+        return rows, Frames.joined(self._space, frames), first + k
 
     def _note_end(self, how: str) -> None:
         """Count how a visit ended."""
@@ -153,13 +156,13 @@ class BoundedMap:
         return len(ids)
 
     def _is_plain(self, vertex: int) -> bool:
-        """Return whether a keyframe has edges of odometry and sightings of points alone."""
+        """Return whether a keyframe has edges of odometry, sightings of points, closures and fixes alone."""
         graph, space = self._backend.graph, self._space
         for edge in self._backend.solver.edges_on(vertex).tolist():
             one = graph.edge(edge)
             is_odometry = one.type is space.relative_pose and one.label in ("odometry", CHAIN)
             is_sighting = len(one.vertices) == 2 and graph.kind_of(one.vertices[1]) is space.point
-            if one.weight and not (is_odometry or is_sighting):
+            if one.weight and not (is_odometry or is_sighting or one.label in (CLOSURES, FIXES)):
                 return False
         return True
 
@@ -176,30 +179,58 @@ class BoundedMap:
                 out.update(ends[is_one, 1].tolist())
         return out
 
-    def _own(self, vertex: int) -> tuple[int, int, Numbers]:
-        return vertex, vertex, self._space.identity
+    def _own(self, vertex: int) -> _Row:
+        return vertex, self._backend.graph.vertex_ids.of(vertex), self._space.identity
 
-    def _rows(self, visit: Sequence[int], done: Condensed) -> list[tuple[int, int, Numbers]]:
-        gone = {one.vertex: (one.vertex, one.base, one.T_base_vertex) for one in done.removed}
-        return [gone.get(vertex) or self._own(vertex) for vertex in visit]
+    def _rows(self, visit: Sequence[int], done: Condensed, frames: list[Frames]) -> list[_Row]:
+        """Return what left of a visit; frames that it moves with are added."""
+        lasting, out = self._backend.graph.vertex_ids, {vertex: self._own(vertex) for vertex in visit}
+        for one in done.removed:
+            out[one.vertex] = one.vertex, lasting.of(one.base), one.T_base_vertex
+        for k in range(0, len(visit), FRAME if done.seen else len(visit)):
+            stretch = visit[k : k + FRAME]
+            gone = [vertex for vertex in stretch if done.seen and out[vertex][1] != lasting.of(vertex)]
+            if gone:
+                at = self._solution.pose(stretch[len(stretch) // 2])
+                frames.append(self._frame(done, stretch, at))
+                number = -self.state.frames - len(frames)
+                for vertex in gone:
+                    pose = self._space.group.between(at, self._solution.pose(vertex))
+                    out[vertex] = vertex, number, tuple(map(float, pose))
+        return [out[vertex] for vertex in visit]
+
+    def _frame(self, done: Condensed, stretch: Sequence[int], at: Numbers) -> Frames:
+        """Return the frame of a stretch of a visit."""
+        solver, lasting, n = self._backend.solver, self._backend.graph.vertex_ids, self._space.dimensions
+        landmarks = dict[int, tuple[Numbers, float]]()
+        for vertex, mark in (both for both in done.seen if both[0] in stretch):
+            ends = solver.estimate([mark])[0], solver.estimate([vertex])[0]
+            weight = weight_at(float(np.linalg.norm(ends[0] - ends[1][:n])))
+            before = landmarks.get(lasting.of(mark), ((), 0.0))[1]
+            landmarks[lasting.of(mark)] = tuple(ends[0].tolist()), before + weight
+        base = done.removed[0].base
+        return frame_of(self._space, (lasting.of(base), self._solution.pose(base)), at, landmarks)
 
     # -- compaction --------------------------------------------------------------------------------------------------
 
-    def _compacted(self, rows: list[tuple[int, int, Numbers]], end: int) -> Condensation:
+    def _compacted(self, rows: list[_Row], frames: Frames, end: int) -> Condensation:
         """Remove what has left from the graph, and give all parts the new ids."""
         keyframes, graph = self._frontend.path.keyframes, self._backend.graph
         lasting = graph.vertex_ids.of
         left = np.zeros(len(rows), dtype=record_type(self._space))
         for k, (vertex, base, pose) in enumerate(rows):
             one = keyframes[keyframes.first + k]
-            left[k] = one.stamp_ns, lasting(vertex), lasting(base), pose, one.T_odom_base
-            if base == vertex:
+            left[k] = one.stamp_ns, lasting(vertex), base, pose, one.T_odom_base
+            if base == lasting(vertex):
                 self.state.old.append(OldKeyframe(keyframes.first + k, vertex, one.stamp_ns, one.T_odom_base))
         seen, before = self._sightings(end), self.state.sightings
         vertices, edges = self._staying(int(keyframes.ids[end - keyframes.first]))
         gone = np.setdiff1d(np.arange(graph.edge_count), edges)
         out = Condensation(
-            left, seen, keyframes.first, before, archived(self._backend, keyframes, gone, self._landmarks.map.names())
+            Left(left, seen, frames),
+            keyframes.first,
+            before,
+            archived(self._backend, keyframes, gone, self._landmarks.map.names()),
         )
         new = compact(self._backend.solver, vertices, edges)
         self._backend.renumber(new.edges)
@@ -210,6 +241,7 @@ class BoundedMap:
             for one in self.state.old
         ]
         self.state.keyframes, self.state.sightings = end, before + len(seen)
+        self.state.frames += len(frames)
         self._landmarks.renumber(new.vertices, new.edges)
         self._anchor.restore()
         self._backend.solver.update()

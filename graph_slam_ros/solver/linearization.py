@@ -231,17 +231,17 @@ def _whiten_and_store(
 
 def information(graph: Graph, x: Array, rows: Mapping[EdgeTable, Index], free: Index, losses: Losses) -> Array:
     """H as a dense matrix over some vertices, in this order."""
-    dof = np.array([graph.kind_of(v).dof for v in free.tolist()], dtype=np.int64)
-    first = dict(zip(free.tolist(), (np.cumsum(dof) - dof).tolist(), strict=True))
-    out = np.zeros((int(dof.sum()), int(dof.sum())))
+    dof = np.array([kind.dof for kind in graph.kinds], dtype=np.int64)[graph.kind.values[free]]
+    size, first = int(dof.sum()), np.full(graph.vertex_count, -1)
+    first[free] = np.cumsum(dof) - dof
+    out = np.zeros((size + 1, size + 1))  # the last row and column are for all other vertices
     for b in linearize(graph, x, rows, losses):
         slots = np.repeat(np.arange(len(b.table.type.dofs)), b.table.type.dofs)
         within = np.concatenate([np.arange(d) for d in b.table.type.dofs])
-        for jacobian, ends in zip(b.jacobian, b.table.vertices.values[b.rows], strict=True):
-            mine = np.isin(ends[slots], free)
-            at = [first[v] + d for v, d in zip(ends[slots][mine].tolist(), within[mine].tolist(), strict=True)]
-            out[np.ix_(at, at)] += jacobian[:, mine].T @ jacobian[:, mine]
-    return out
+        begins = first[b.table.vertices.values[b.rows]][:, slots]
+        at = np.where(begins < 0, size, begins + within)
+        np.add.at(out, (at[:, :, None], at[:, None, :]), np.swapaxes(b.jacobian, 1, 2) @ b.jacobian)
+    return out[:size, :size]
 
 
 def rows_of(graph: Graph, edges: Index) -> dict[EdgeTable, Index]:

@@ -152,9 +152,10 @@ class Problem:
         one = existing([vertex], self._vertices, "vertex")
         if not self._inside[vertex]:
             raise GraphSlamError(f"vertex {vertex} is not in the problem")
-        there = self._weighted(self.edges_on(vertex))
-        if len(there):
-            raise GraphSlamError(f"vertex {vertex} is needed by edge {int(there[0])}")
+        for edge in self.edges_on(vertex).tolist():
+            table, row = self.graph.row(edge)
+            if table.weight.values[row]:
+                raise GraphSlamError(f"vertex {vertex} is needed by edge {edge}")
         self._inside[vertex] = self._held[vertex] = False
         self._pending.forget(vertex)
         self._fix_at_estimate(one)

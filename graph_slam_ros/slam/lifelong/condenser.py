@@ -3,15 +3,24 @@
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
+import numpy as np
+
 from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.errors import SingularError
 from graph_slam_ros.graph import Edge, Gaussian, place_edge
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.graph.place import LABEL
+from graph_slam_ros.slam.lifelong.carried import (
+    Carried,
+    carried_closure,
+    carried_fixes,
+    fused_closure,
+    motions_from,
+)
 from graph_slam_ros.slam.lifelong.compaction import Renumbered
 from graph_slam_ros.slam.lifelong.elimination import product, square_root
 from graph_slam_ros.slam.lifelong.place import Fused, Place, fewest_shared, fused, visit_without
-from graph_slam_ros.slam.lifelong.surroundings import Motion, Surroundings, chained, motion_of, surroundings
+from graph_slam_ros.slam.lifelong.surroundings import CLOSURES, Motion, Surroundings, chained, motion_of, surroundings
 from graph_slam_ros.slam.lifelong.visit import Visit, visit_of
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Numbers
@@ -19,6 +28,7 @@ from graph_slam_ros.typing import Array, Numbers
 Cell = tuple[int, ...]
 CHAIN = "composed"  # label of edges that are composed of odometry
 _AHEAD = 3  # landmarks of places that the keyframes after a visit must see before odometry to it is cut
+_SHARE = 0.5  # of the odometry of a first visit that is in its place; the rest joins the place to what is around it
 _STRIKES = 2  # visits in a row that contradict a place in the same landmark: then that begins anew
 
 
@@ -29,11 +39,13 @@ class Limits:
     Attributes
     ----------
     members : landmarks of one place, at most; places : of one cell, at most
+    closures : between the same two bases, at most: those that agree are one
     gate : quantile of chi2 above which a visit contradicts itself or its place
     """
 
-    members: int = 24
-    places: int = 4
+    members: int = 48
+    places: int = 8
+    closures: int = 4
     gate: float = 0.9999
 
 
@@ -71,11 +83,13 @@ class Condensed:
     Attributes
     ----------
     how : ``first`` (of a place), ``again`` (added to a place), ``composed`` (odometry is kept, sightings are lost),
-        ``waits`` (until the keyframes after it see enough places), ``kept`` (it cannot be condensed)
-    why : of ``composed`` and ``kept``
+        ``alone`` (one keyframe is kept with all closures and fixes, sightings are lost), ``waits`` (until the keyframes
+        after it see enough places), ``kept`` (it cannot be condensed)
+    why : of ``composed``, ``alone`` and ``kept``
     statistic, degrees : chi2 of the visit against all before in its place
     without, anew : the landmark that contradicts the place and was left out, or that the place has anew
     removed : the keyframes that left the problem, in order of time
+    seen : (keyframe, landmark) of each sighting that is in the place now
     """
 
     how: str
@@ -85,6 +99,7 @@ class Condensed:
     without: int | None = None
     anew: int | None = None
     removed: tuple[RemovedPose, ...] = ()
+    seen: tuple[tuple[int, int], ...] = ()
 
 
 class Condenser:
@@ -127,7 +142,7 @@ class Condenser:
             return self._composed(visit, after, around, "it sees too few landmarks, or the cell is full")
         try:
             base = visit[len(visit) // 2]
-            factors = around.factors if is_again else around.factors | _halved(around)
+            factors = around.local if is_again else around.local | _halved(around)
             one = visit_of(self.space, self.solver.graph, self.solver.estimate, visit, base, factors)
             if one.degrees > 0 and one.chi2 > quantile(self.limits.gate, one.degrees):
                 return self._composed(visit, after, around, "it contradicts itself")
@@ -148,23 +163,51 @@ class Condenser:
     # -- what becomes of a visit -------------------------------------------------------------------------------------
 
     def _first(self, visit: Sequence[int], after: int, around: Surroundings, one: Visit, cell: Cell) -> Condensed:
-        """Begin a place: half of the odometry is in its edge, the other half joins its base to what is around it."""
-        k = len(visit) // 2
+        """Begin a place: a part of the odometry is in its edge, the rest joins its base to what is around it."""
+        base = visit[len(visit) // 2]
         if lonely := self._left_alone(around, one.members):
             return Condensed("kept", f"landmark {lonely[0]} would be left without a measurement")
         root = square_root(one.information)
-        legs = [motion_of(edge, 0.5 * around.factors[edge.id]) for edge in around.steps]
+        added, also = self._joined(visit, after, around, 1.0 - _SHARE)
+        begun = self._place_edge(base, Place.begun_by(one), root)
+        self.places.setdefault(cell, []).append(begun)
+        removed = self._replace(visit, around, [*added, begun.edge], kept=base, seen_from=base, also=also)
+        return Condensed("first", removed=removed, seen=_seen(around, one.members))
+
+    def _alone(self, visit: Sequence[int], after: int, around: Surroundings, why: str) -> Condensed:
+        """Keep the middle keyframe with its closures and fixes, joined by all of the odometry."""
+        base = visit[len(visit) // 2]
+        if lonely := self._left_alone(around, ()):
+            return Condensed("kept", f"{why}; landmark {lonely[0]} would be left without a measurement")
+        added, also = self._joined(visit, after, around, 1.0)
+        return Condensed("alone", why, removed=self._replace(visit, around, added, base, base, also))
+
+    def _joined(
+        self, visit: Sequence[int], after: int, around: Surroundings, share: float
+    ) -> tuple[list[int], list[int]]:
+        """Join the middle keyframe to what is around it, and carry closures and fixes to it.
+
+        Parameters
+        ----------
+        share : part of the odometry inside the visit that joins it
+
+        Returns
+        -------
+        The new edges, and those that they replace.
+        """
+        k = len(visit) // 2
+        legs = [motion_of(edge, share * around.factors[edge.id]) for edge in around.steps]
+        carried = self._carried(visit, around, visit[k], [], [motion_of(edge) for edge in around.steps])
         onward = [motion_of(edge) for edge in around.onward.values()]
         joins = [(edge.vertices[0], visit[k], [motion_of(edge), *legs[:k]]) for edge in around.into.values()]
         added = self._join([*joins, (visit[k], after, [*legs[k:], *onward])])
-        begun = self._place_edge(visit[k], Place.begun_by(one), root)
-        self.places.setdefault(cell, []).append(begun)
-        removed = self._replace(visit, around, [*added, begun.edge], kept=visit[k], seen_from=visit[k])
-        return Condensed("first", removed=removed)
+        more, also = self._add_carried(carried)
+        return [*added, *more], also
 
     def _again(self, visit: Sequence[int], after: int, around: Surroundings, one: Visit, at: PlaceEdge) -> Condensed:
         """Add a visit to a place, and cut the odometry on both sides of it."""
-        base, mine = self.solver.estimate([at.base, visit[len(visit) // 2]]).tolist()
+        k = len(visit) // 2
+        base, mine = self.solver.estimate([at.base, visit[k]]).tolist()
         guess = tuple(map(float, self.space.group.between(tuple(base), tuple(mine))))
         done, without, place = self._fused(at.place, one, guess), None, at.place
         if not self._passes(done):
@@ -180,8 +223,11 @@ class Condenser:
             result = self._fused(place, used, guess)
         if lonely := self._left_alone(around, result.place.members):
             return Condensed("kept", f"landmark {lonely[0]} would be left without a measurement")
+        legs = [motion_of(edge) for edge in around.steps]
+        carried = self._carried(visit, around, at.base, [(guess, result.covariance)], legs)
         now = self._place_edge(at.base, result.place, square_root(result.place.information))
-        removed = self._replace(visit, around, [now.edge], kept=None, seen_from=at.base, also=[at.edge])
+        added, also = self._add_carried(carried)
+        removed = self._replace(visit, around, [now.edge, *added], kept=None, seen_from=at.base, also=[at.edge, *also])
         if without is None:
             at.strikes = {mark: count for mark, count in at.strikes.items() if mark not in one.members}
         elif anew is None:
@@ -189,12 +235,15 @@ class Condenser:
         else:
             at.strikes.pop(anew, None)
         at.place, at.edge = now.place, now.edge
-        return Condensed("again", "", done.statistic, done.degrees, None if anew else without, anew, removed)
+        left_out, seen = None if anew else without, _seen(around, used.members)
+        return Condensed("again", "", done.statistic, done.degrees, left_out, anew, removed, seen)
 
     def _composed(
         self, visit: Sequence[int], after: int, around: Surroundings, why: str, done: Fused | None = None
     ) -> Condensed:
         """Join what is before the visit to what is after it by its odometry alone."""
+        if around.closures or around.fixes:
+            return self._alone(visit, after, around, why)
         if lonely := self._left_alone(around, ()):
             return Condensed("kept", f"{why}; landmark {lonely[0]} would be left without a measurement")
         legs = [motion_of(edge) for edge in (*around.steps, *around.onward.values())]
@@ -221,6 +270,57 @@ class Condenser:
         return min(found)[1] if found else None
 
     # -- edits of the graph ------------------------------------------------------------------------------------------
+
+    def _carried(
+        self, visit: Sequence[int], around: Surroundings, base: int, to_visit: Sequence[Motion], legs: Sequence[Motion]
+    ) -> list[Carried]:
+        """Return the closures and fixes of a visit as edges of a base, and odometry from a keyframe that has no place.
+
+        Parameters
+        ----------
+        to_visit : the motion from the base to the middle keyframe, where that is another one
+        legs : odometry from each keyframe but the last to the next
+        """
+        bases = {one.base for in_cell in self.places.values() for one in in_cell}
+        from_kept = [edge for edge in around.into.values() if to_visit and edge.vertices[0] not in bases]
+        if not (around.closures or around.fixes or from_kept):
+            return []
+        space, out = self.space, list[Carried]()
+        begin, *poses = self.solver.estimate([base, *visit]).tolist()
+        by_odometry, motions = motions_from(space, visit, legs), dict[int, Motion]()
+        for vertex, pose in zip(visit, poses, strict=True):
+            _, covariance = chained(space, [*to_visit, by_odometry[vertex]])
+            motions[vertex] = tuple(map(float, space.group.between(tuple(begin), tuple(pose)))), covariance
+        out += [replace(carried_closure(space, edge, base, motions, edge.weight), label=CHAIN) for edge in from_kept]
+        for number, edge in around.closures.items():
+            one = carried_closure(space, edge, base, motions, around.factors[number])
+            if len(set(one.vertices)) > 1:  # else the place knows it
+                out.append(one)
+        if around.fixes:
+            on_it = [self.solver.graph.edge(int(edge)) for edge in self.solver.edges_on(base)]
+            prior = next((one for one in on_it if one.weight and one.label == CHAIN and len(one.vertices) == 1), None)
+            out.append(carried_fixes(space, self.solver, base, around.fixes, around.factors, motions, prior))
+        return out
+
+    def _add_carried(self, carried: Sequence[Carried]) -> tuple[list[int], list[int]]:
+        """Add closures and fixes of a base; returns the new edges and those that they replace."""
+        graph, space, added, replaced = self.solver.graph, self.space, list[int](), set[int]()
+        for one in carried:
+            edge_type, label, fusion = space.pose_prior, CHAIN, one
+            if len(one.vertices) == 2:
+                on_it = {*map(int, self.solver.edges_on(one.vertices[0])), *added} - replaced
+                edge_type, label = space.relative_pose, one.label
+                others = [edge for edge in map(graph.edge, sorted(on_it)) if edge.label == CLOSURES and edge.weight]
+                others = [edge for edge in others if set(edge.vertices) == set(one.vertices)]
+                found = fused_closure(space, one, others, self.limits.gate) if label == CLOSURES else None
+                if found is None and label == CLOSURES and len(others) >= self.limits.closures:
+                    continue
+                fusion = found or one
+            noise, ends = Gaussian(fusion.root), list(fusion.vertices)
+            added.append(graph.add_edge(edge_type, ends, fusion.measured, noise, label, fusion.source))
+            replaced |= set() if fusion.replaces is None else {fusion.replaces}
+        graph.set_weights(np.array(sorted(replaced & set(added)), dtype=np.int64), 0.0)
+        return [edge for edge in added if edge not in replaced], sorted(replaced - set(added))
 
     def _known(self) -> set[int]:
         return {mark for in_cell in self.places.values() for one in in_cell for mark in one.place.members}
@@ -288,4 +388,10 @@ def poses_of(space: Geometry, removed: Sequence[RemovedPose], kept: Mapping[int,
 def _halved(around: Surroundings) -> dict[int, float]:
     """Return the factors of the odometry inside a visit, half of which joins the place to what is around it."""
     steps = {edge.id for edge in around.steps}
-    return {number: 0.5 * around.factors[number] for number in steps}
+    return {number: _SHARE * around.factors[number] for number in steps}
+
+
+def _seen(around: Surroundings, members: Collection[int]) -> tuple[tuple[int, int], ...]:
+    """Return keyframe and landmark of the sightings of some landmarks."""
+    ends = ((edge.vertices[0], edge.vertices[1]) for edge in around.sightings.values())
+    return tuple(dict.fromkeys(both for both in ends if both[1] in members))

@@ -56,11 +56,13 @@ class Fused:
     ----------
     statistic, degrees : chi2 of the visit against all before, and its degrees of freedom; 0 where they share too little
         to contradict each other
+    covariance : (dof, dof) of the pose of the visit in the axes of the place, in the tangent space there
     """
 
     place: Place
     statistic: float
     degrees: int
+    covariance: Array
 
 
 def visit_without(visit: Visit, member: int) -> Visit:
@@ -94,14 +96,17 @@ def fused(space: Geometry, place: Place, visit: Visit, T_place_visit: Numbers) -
         raise SingularError(f"the visit shares {len(shared)} landmarks with the place")
     at_place, at_visit = _places(place.members, shared), _places(visit.members, shared)
     weight = marginal_information(visit.information, _numbers(at_visit, size))
-    turn, shift = _motion(place.points[at_place], visit.points[at_visit], weight, space, T_place_visit)
+    turn, shift, resists = _motion(place.points[at_place], visit.points[at_visit], weight, space, T_place_visit)
     there = product(visit.points - shift, turn)  # R' (p - t)
     blocks = visit.information.reshape(len(there), size, len(there), size)
     turned = np.einsum("ba,ibjc,cd->iajd", turn, blocks, turn, optimize=False).reshape(visit.information.shape)
     where = there.copy()
     where[at_visit] = place.points[at_place]
     shape = without(0.5 * (turned + turned.T), rigid_motions(where))
-    return _sum(place, visit.members, there, shape, size * len(shared) - rigid_motions(where).shape[1])
+    degrees = size * len(shared) - rigid_motions(where).shape[1]
+    fusion, statistic = _sum(place, visit.members, there, shape)
+    # The place knows its landmarks no worse than one visit does: twice the covariance by the visit alone.
+    return Fused(fusion, statistic, max(degrees, 0), np.asarray(2.0 * np.linalg.inv(resists)))
 
 
 def rigid_motions(points: Array) -> Array:
@@ -120,8 +125,8 @@ def rigid_motions(points: Array) -> Array:
     return out.reshape(m * size, -1)
 
 
-def _sum(place: Place, members: Sequence[int], points: Array, information: Array, degrees: int) -> Fused:
-    """Add information on some landmarks, in the axes of the place, to what the place has."""
+def _sum(place: Place, members: Sequence[int], points: Array, information: Array) -> tuple[Place, float]:
+    """Add information on some landmarks, in the axes of the place, to what the place has; returns chi2, too."""
     size = points.shape[1]
     all_members = sorted({*place.members, *members})
     mine, new = _places(all_members, place.members), _places(all_members, members)
@@ -137,20 +142,24 @@ def _sum(place: Place, members: Sequence[int], points: Array, information: Array
     after = before + step.reshape(before.shape)
     statistic = quadratic(place.information, (after[mine] - place.points).ravel())
     statistic += quadratic(information, (after[new] - points).ravel())
-    return Fused(Place(tuple(all_members), after, whole, place.visits + 1), statistic, max(degrees, 0))
+    return Place(tuple(all_members), after, whole, place.visits + 1), statistic
 
 
 def _motion(
     mine: Array, theirs: Array, information: Array, space: Geometry, T_mine_theirs: Numbers
-) -> tuple[Array, Array]:
-    """Return R and t of the motion that lays points best on theirs: ``R p + t``, weighted in the axes of theirs."""
+) -> tuple[Array, Array, Array]:
+    """Return R and t of the motion that lays points best on theirs: ``R p + t``, weighted in the axes of theirs.
+
+    Also the information of that motion in the tangent space there.
+    """
     start = space.group.inverse(T_mine_theirs)
     turn, shift = space.turn(start), np.array(start[: space.dimensions])
     for _ in range(_STEPS):
         there = product(mine, turn.T) + shift
         columns = rigid_motions(there)
         along = product(information, columns)
-        step = -solution(product(columns.T, along), product(along.T, (there - theirs).ravel()))
+        resists = product(columns.T, along)
+        step = -solution(resists, product(along.T, (there - theirs).ravel()))
         linear, angular = step[: space.dimensions], step[space.dimensions :]
         if space.dimensions == 2:
             added = space.turn((0.0, 0.0, float(angular[0])))
@@ -159,7 +168,7 @@ def _motion(
         turn, shift = product(added, turn), product(added, shift) + linear
         if np.abs(step).max() <= _STILL:
             break
-    return turn, shift
+    return turn, shift, resists
 
 
 def _places(among: Sequence[int], wanted: Sequence[int]) -> list[int]:

@@ -14,10 +14,11 @@ class BoundedState:
     ----------
     places : by cell
     old : the keyframes in the graph that are in no list of keyframes any more, in order of time
-    keyframes, sightings : how many have left the map
+    keyframes, sightings, frames : how many have left the map
     """
 
     places: dict[Cell, list[PlaceEdge]] = field(default_factory=dict)
     old: list[OldKeyframe] = field(default_factory=list)
     keyframes: int = 0
     sightings: int = 0
+    frames: int = 0

@@ -13,6 +13,7 @@ from graph_slam_ros.slam.lifelong.elimination import product
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Numbers
 
+CLOSURES, FIXES = "closures", "fixes"  # labels
 Motion = tuple[Numbers, Array]
 """A relative pose and its covariance (dof, dof) in the tangent space at its end."""
 
@@ -26,7 +27,8 @@ class Surroundings:
     inside : between its keyframes; sightings : of landmarks that are points
     into : from elsewhere to the first keyframe; onward : from the last one to the keyframe after the visit
     steps : of each keyframe but the last, the edge of odometry to the next
-    factors : of ``inside`` and ``sightings``: how much each counts, by its weight and loss
+    closures : from a keyframe to one elsewhere; fixes : of one keyframe
+    factors : of ``inside``, ``sightings``, ``closures`` and ``fixes``: how much each counts, by its weight and loss
     unfit : why these cannot be condensed; empty where they can
     """
 
@@ -35,13 +37,20 @@ class Surroundings:
     into: dict[int, Edge] = field(default_factory=dict)
     onward: dict[int, Edge] = field(default_factory=dict)
     steps: list[Edge] = field(default_factory=list)
+    closures: dict[int, Edge] = field(default_factory=dict)
+    fixes: dict[int, Edge] = field(default_factory=dict)
     factors: dict[int, float] = field(default_factory=dict)
     unfit: str = ""
 
     @property
     def all(self) -> list[int]:
         """All of them, in order of id."""
-        return sorted({*self.inside, *self.sightings, *self.into, *self.onward})
+        return sorted({*self.inside, *self.sightings, *self.into, *self.onward, *self.closures, *self.fixes})
+
+    @property
+    def local(self) -> dict[int, float]:
+        """The factors of the edges that are within the visit and its landmarks."""
+        return {number: self.factors[number] for number in (*self.inside, *self.sightings)}
 
 
 def surroundings(space: Geometry, solver: Solver, visit: Sequence[int], after: int) -> Surroundings:
@@ -57,7 +66,11 @@ def surroundings(space: Geometry, solver: Solver, visit: Sequence[int], after: i
     members = set(visit)
     for number, edge in edges.items():
         first, last = edge.vertices[0], edge.vertices[-1]
-        if edge.type is space.relative_pose:
+        if edge.label == CLOSURES and not members >= {first, last}:
+            out.closures[number] = edge
+        elif edge.label == FIXES:
+            out.fixes[number] = edge
+        elif edge.type is space.relative_pose:
             if members >= {first, last}:
                 out.inside[number] = edge
             elif (first, last) == (visit[-1], after):
@@ -70,11 +83,11 @@ def surroundings(space: Geometry, solver: Solver, visit: Sequence[int], after: i
             out.sightings[number] = edge
         else:
             out.unfit = f"edge {number} is a {edge.type.name}"
-    by_ends = {edge.vertices: edge for edge in reversed(out.inside.values())}
+    by_ends = {edge.vertices: edge for edge in reversed(out.inside.values()) if edge.label != CLOSURES}
     out.steps = [by_ends[ends] for ends in pairwise(visit) if ends in by_ends]
     if len(out.steps) < len(visit) - 1 or len(out.onward) != 1:
         out.unfit = out.unfit or "odometry does not join its keyframes one by one"
-    out.factors = _factors(solver, {**out.inside, **out.sightings})
+    out.factors = _factors(solver, {**out.inside, **out.sightings, **out.closures, **out.fixes})
     return out
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from graph_slam_ros.errors import SingularError
-from graph_slam_ros.graph import Gaussian, Graph
+from graph_slam_ros.graph import Edge, EdgeType, Gaussian, Graph
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.slam.lifelong.elimination import marginal_information
 from graph_slam_ros.solver import Settings, Solver
@@ -61,8 +61,10 @@ def visit_of(
     marks = sorted({v for vertices in ends.values() for v in vertices} - set(poses))
     while marks:
         order = [base, *(v for v in poses if v != base), *marks]
-        inside = [edge for edge in ends if set(ends[edge]) <= set(order)]
-        local, at = _local_graph(space, graph, estimate, order, len(marks), {edge: edges[edge] for edge in inside})
+        known = set(order)
+        inside = [edge for edge in ends if known.issuperset(ends[edge])]
+        counting = [(records[edge], edges[edge]) for edge in inside]
+        local, at = _local_graph(space, estimate, order, len(marks), counting)
         solver = Solver(local, _SETTINGS)
         solver.add(range(local.vertex_count), range(local.edge_count))
         solver.hold(at[base])
@@ -91,18 +93,20 @@ def _is_sure(information: Array) -> bool:
 
 
 def _local_graph(
-    space: Geometry, graph: Graph, estimate: Estimate, order: Sequence[int], marks: int, edges: Mapping[int, float]
+    space: Geometry, estimate: Estimate, order: Sequence[int], marks: int, edges: Sequence[tuple[Edge, float]]
 ) -> tuple[Graph, dict[int, int]]:
-    """Copy some vertices, the base first and landmarks last, and edges, in the axes of the base."""
+    """Copy some vertices, the base first and landmarks last, and edges with their factors, in the axes of the base."""
     poses, points = order[: len(order) - marks], order[len(order) - marks :]
     at_poses, at_points = estimate(poses), estimate(points)
     local, group = Graph(), space.group
     base = tuple(at_poses[0].tolist())
     local.add_vertices(space.pose, np.stack(group.between(base, tuple(at_poses.T)), axis=-1))
     local.add_vertices(space.point, np.stack(group.act(group.inverse(base), tuple(at_points.T)), axis=-1))
-    at = {vertex: k for k, vertex in enumerate(order)}
-    for edge, factor in edges.items():
-        one = graph.edge(edge)
-        noise = Gaussian(np.sqrt(factor) * one.sqrt_information)
-        local.add_edge(one.type, [at[v] for v in one.vertices], one.measured, noise, one.label)
+    at, by_type = {vertex: k for k, vertex in enumerate(order)}, dict[EdgeType, list[tuple[Edge, float]]]()
+    for one in edges:
+        by_type.setdefault(one[0].type, []).append(one)
+    for edge_type, several in by_type.items():
+        ends = [[at[v] for v in edge.vertices] for edge, _ in several]
+        noise = Gaussian(np.stack([np.sqrt(factor) * edge.sqrt_information for edge, factor in several]))
+        local.add_edges(edge_type, ends, np.stack([edge.measured for edge, _ in several]), noise, several[0][0].label)
     return local, at

@@ -29,13 +29,13 @@ def killed(file, to):
         os.kill(os.getpid(), signal.SIGKILL)
     rename(file, to)
 os.replace = killed
-for m in measurements(hall(3, 500)):
+for m in measurements(hall(3, 700)):
     update = slam.process(m)
     recorder.record(slam, update)
     recorder.flush()
     if update.condensed is not None and slam.first_keyframe > 200 and when != "later":
         os.kill(os.getpid(), signal.SIGKILL)
-    if len(slam.keyframes) == 430:
+    if len(slam.keyframes) == 600:
         os.kill(os.getpid(), signal.SIGKILL)
 """
 RESULTS = ("path.tum", "landmarks.csv", "ledger.csv", "sightings.tum", "graph.g2o", "graph_vertices.csv", "map.mcap")

@@ -1,0 +1,119 @@
+"""Frames: poses that removed keyframes move with, by the landmarks that were seen from them.
+
+A keyframe that left the map is told relative to a *frame*, the pose of a short stretch of keyframes. The frame knows
+where the landmarks that were seen from the stretch were in its axes when it left. So its present pose is the one that
+lays these on the present landmarks best, and an old path becomes as good as the landmarks are now.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph_slam_ros.graph.geometry import Geometry
+from graph_slam_ros.slam.lifelong.place import rigid_motions
+from graph_slam_ros.typing import Array, Index, Numbers
+
+LONGEST = 20  # keyframes of a frame
+_SIGMA, _LEAST_M = 0.05, 0.05  # standard deviation of a sighting: by its distance, and at least
+_ARM_M, _SHARE = 5.0, 0.02  # by the base alone: points so far from the frame, with so much of the weight
+_ROUNDS, _OFF = 6, 3.0  # of the fit; standard deviations from which on a landmark loses its say
+
+Rows = NDArray[np.void]
+
+
+@dataclass(frozen=True, slots=True)
+class Frames:
+    """Frames, and the landmarks of each.
+
+    Attributes
+    ----------
+    rows : ``base``, the lasting id of a vertex that stays, ``T_base`` (size,), ``count`` of its landmarks
+    members : of all frames, in order: ``landmark``, its lasting id, ``point`` (d,) in the axes of the frame [m],
+        ``weight`` [1/m^2]
+    """
+
+    rows: Rows
+    members: Rows
+
+    @classmethod
+    def none(cls, space: Geometry) -> "Frames":
+        """Return no frame."""
+        return cls(np.empty(0, frame_type(space)), np.empty(0, member_type(space)))
+
+    @classmethod
+    def joined(cls, space: Geometry, several: Sequence["Frames"]) -> "Frames":
+        """Return all of several, in order."""
+        parts = [cls.none(space), *several]
+        return cls(np.concatenate([one.rows for one in parts]), np.concatenate([one.members for one in parts]))
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def poses(self, space: Geometry, bases: Array, ids: Index, points: Array) -> Array:
+        """Return the present poses (n, size) of all frames.
+
+        Parameters
+        ----------
+        bases : the present poses of their bases, (n, size)
+        ids, points : lasting ids of the landmarks that are in the map, ascending, and their positions (m, d)
+        """
+        count, d, group = len(self), space.dimensions, space.group
+        out = np.stack(group.compose(tuple(bases.T), tuple(self.rows["T_base"].T)), axis=-1)
+        frame, at = np.repeat(np.arange(count), self.rows["count"]), np.searchsorted(ids, self.members["landmark"])
+        is_there = np.isin(self.members["landmark"], ids)
+        frame, known, now = frame[is_there], self.members[is_there], points[at[is_there]]
+        # The base has a say, too: as if landmarks at these arms had moved with it.
+        arms = _ARM_M * np.concatenate((np.eye(d), -np.eye(d)))
+        of_arms, share = np.repeat(np.arange(count), len(arms)), np.bincount(frame, known["weight"], minlength=count)
+        by_base = np.tile(arms, (count, 1))
+        moved = np.stack(group.act(tuple(out[of_arms].T), tuple(by_base.T)), axis=-1)
+        frame, is_arm = np.concatenate((frame, of_arms)), np.arange(len(frame) + len(of_arms)) >= len(frame)
+        here, there = np.concatenate((known["point"], by_base)), np.concatenate((now, moved))
+        weight = np.concatenate((known["weight"], (_SHARE / len(arms) * np.maximum(share, 1.0))[of_arms]))
+        columns = rigid_motions(here).reshape(len(here), d, -1)
+        for _ in range(_ROUNDS):
+            seen = np.stack(group.act(group.inverse(tuple(out[frame].T)), tuple(there.T)), axis=-1)
+            off = seen - here
+            robust = np.where(is_arm, weight, weight / (1.0 + weight * (off**2).sum(axis=1) / _OFF**2) ** 2)
+            weighted = robust[:, None, None] * columns
+            normal, right = np.zeros((count, space.dof, space.dof)), np.zeros((count, space.dof))
+            np.add.at(normal, frame, np.einsum("nik,nil->nkl", weighted, columns))
+            np.add.at(right, frame, np.einsum("nik,ni->nk", weighted, off))
+            step = np.linalg.solve(normal, right[:, :, None])[:, :, 0]
+            out = np.stack(group.compose(tuple(out.T), group.exp(tuple(step.T))), axis=-1)
+        return out
+
+
+def frame_of(
+    space: Geometry, base: tuple[int, Numbers], at: Numbers, landmarks: Mapping[int, tuple[Numbers, float]]
+) -> Frames:
+    """Return one frame.
+
+    Parameters
+    ----------
+    base : lasting id and pose of a vertex that stays; at : pose of the frame
+    landmarks : that were seen from its keyframes: by lasting id the position [m] and the weight [1/m^2]
+    """
+    group = space.group
+    out = Frames(np.empty(1, frame_type(space)), np.empty(len(landmarks), member_type(space)))
+    out.rows[0] = base[0], group.between(base[1], at), len(landmarks)
+    for k, (landmark, (point, weight)) in enumerate(sorted(landmarks.items())):
+        out.members[k] = landmark, group.act(group.inverse(at), point), weight
+    return out
+
+
+def weight_at(distance_m: float) -> float:
+    """Return the weight of a sighting of a landmark at a distance [1/m^2]."""
+    return max(_LEAST_M, _SIGMA * distance_m) ** -2
+
+
+def frame_type(space: Geometry) -> np.dtype[np.void]:
+    """Return the type of the rows of frames."""
+    return np.dtype([("base", "<i8"), ("T_base", "<f8", (space.pose.size,)), ("count", "<i8")])
+
+
+def member_type(space: Geometry) -> np.dtype[np.void]:
+    """Return the type of the rows of their landmarks."""
+    return np.dtype([("landmark", "<i8"), ("point", "<f8", (space.dimensions,)), ("weight", "<f8")])

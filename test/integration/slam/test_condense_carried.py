@@ -1,0 +1,161 @@
+"""Closures and fixes of keyframes that were condensed are carried to the bases of places, and can be doubted still."""
+
+import numpy as np
+import pytest
+
+from benchmarks.hall import STEP_S, config, hall, measurements, rms
+from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
+from graph_slam_ros.runs.tables import removed_path
+from graph_slam_ros.slam import Closure, Control, Fix, GraphSlam, Odometry
+from graph_slam_ros.slam.lifelong.carried import carried_closure, fused_closure, inverse
+from graph_slam_ros.slam.lifelong.condenser import CHAIN
+from graph_slam_ros.slam.lifelong.removed import Left
+from graph_slam_ros.slam.robust.ledger import INSIDE
+
+KEYFRAMES, WINDOW, NEAR_M, SIGMA_FIX_M = 900, 160, 3.0, 0.2
+SPACES = {"plane": PLANAR, "space": SPATIAL}
+
+
+def with_closures(world):
+    """Each third keyframe, a closure to the nearest of the last 150, but for the last 40."""
+    rng, group = np.random.default_rng(1), world.space.group
+    sigmas = np.array(world.space.sigmas(0.03, 0.01))
+    where, k = np.array([pose[:2] for pose in world.poses]), -1
+    for m in measurements(world):
+        yield m
+        k += isinstance(m, Odometry)
+        first, last = max(0, k - 150), k - 40
+        if isinstance(m, Odometry) and k % 3 == 0 and last > first:
+            away = np.linalg.norm(where[first:last] - where[k], axis=1)
+            j = first + int(np.argmin(away))
+            if away.min() < NEAR_M:
+                error = group.exp(tuple(sigmas * rng.standard_normal(len(sigmas))))
+                motion = group.compose(group.between(world.poses[j], world.poses[k]), error)
+                at_ns = round((j + 5) * STEP_S * 1e9)
+                covariance = tuple(np.diag(sigmas**2).ravel().tolist())
+                yield Closure(m.stamp_ns, at_ns, "loops", tuple(map(float, motion)), covariance)
+
+
+def with_fixes(world):
+    """Each fifth keyframe, a position in the frame of the first."""
+    rng, group, n = np.random.default_rng(1), world.space.group, world.space.dimensions
+    begin, k = group.inverse(world.poses[0]), -1
+    for m in measurements(world):
+        yield m
+        k += isinstance(m, Odometry)
+        if isinstance(m, Odometry) and k % 5 == 0:
+            at = np.array(group.act(begin, world.poses[k][:n])) + SIGMA_FIX_M * rng.standard_normal(n)
+            covariance = tuple((SIGMA_FIX_M**2 * np.eye(n)).ravel().tolist())
+            yield Fix(m.stamp_ns, "gnss", "position", tuple(at.tolist()), covariance)
+
+
+def driven(world, given, changed=None, **values):
+    slam, parts = GraphSlam(config(world.space, **values)), []
+    for m in given(world):
+        update = slam.process(m)
+        parts += [update.condensed] if update.condensed is not None else []
+        if changed is not None:
+            changed(slam)
+    return slam, parts
+
+
+def path_of(slam, parts):
+    left = Left.joined(slam.space, [one.left for one in parts])
+    return np.concatenate((removed_path(slam, left), slam.trajectory()))[:, : slam.space.dimensions]
+
+
+def errors(world, slam, parts):
+    true = np.array([pose[: world.space.dimensions] for pose in world.poses])
+    path = path_of(slam, parts)
+    vertices = [mark.vertex for mark in slam.landmarks.values()]
+    points = world.points[[int(name[1:]) for name in slam.landmarks]]
+    return rms(path, true[: len(path)]), rms(slam.solver.estimate(vertices), points)
+
+
+def old_closures(slam):
+    """Closures between keyframes that are bases of places."""
+    bases = {one.base for several in slam.bounded.places.values() for one in several}
+    return [e for e in slam.graph.edges_of("closures").tolist() if bases.issuperset(slam.graph.edge(e).vertices)]
+
+
+@pytest.mark.parametrize("space", SPACES)
+@pytest.mark.parametrize("given", [with_closures, with_fixes])
+def test_what_is_carried_serves_as_well(given, space):
+    world = hall(1, KEYFRAMES, SPACES[space])
+    whole = driven(world, given)
+    small = driven(world, given, map_condense=True, map_window_keyframes=WINDOW)
+    slam = small[0]
+    assert slam.first_keyframe > 0.5 * KEYFRAMES
+    assert len(slam.solver.vertices) < 0.5 * len(whole[0].solver.vertices)
+    counted = slam.counters.as_dict()["map"]
+    assert set(counted) <= {"not_condensed", "visit_condensed", "visit_lost"}
+    assert counted["not_condensed"] == 1  # the first keyframe, which has the prior
+    for one, other in zip(errors(world, *small), errors(world, *whole), strict=True):
+        assert one < (1.15 if space == "plane" else 1.3) * other
+    if given is with_fixes:
+        priors = [e for e in slam.graph.edges_of(CHAIN).tolist() if len(slam.graph.edge(e).vertices) == 1]
+        gone = sum(edge.label == "fixes" for part in small[1] for edge in part.edges)
+        assert 0 < len(priors) < 0.3 * gone  # one of each base, however many fixes there were
+        assert slam.ledger.verdict.values[priors].max() == 0  # nobody judges them
+
+
+def test_a_false_closure_that_was_condensed_is_outvoted_as_a_whole():
+    world, planted = hall(1, KEYFRAMES), []
+
+    def falsify(slam):
+        """The first closure between places was false, and nobody had noticed until it was condensed."""
+        if not planted and slam.bounded is not None and (found := old_closures(slam)):
+            table, row = slam.graph.row(found[0])
+            table.measured.values[row, 0] += 2.0
+            slam.solver.rebuild()
+            planted.append(slam.graph.edge_ids.of(found[0]))
+
+    clean = driven(world, with_closures, map_condense=True, map_window_keyframes=WINDOW)
+    slam, parts = driven(world, with_closures, falsify, map_condense=True, map_window_keyframes=WINDOW)
+    assert planted
+    slam.process(Control("optimize"))
+    row = slam.graph.edge_ids.find(planted[0])
+    gone = {edge.edge: edge for part in parts for edge in part.edges}
+    if row is None:
+        assert gone[planted[0]].became == "expired"
+        verdict, reason = gone[planted[0]].verdict, gone[planted[0]].reason
+    else:
+        verdict, reason = slam.ledger.verdict_of(row), slam.ledger.reason.values.item(row)
+    assert verdict not in INSIDE
+    assert int(reason)
+    for one, other in zip(errors(world, slam, parts), errors(world, *clean), strict=True):
+        assert one < 1.2 * other
+
+
+@pytest.mark.parametrize("space", SPACES)
+def test_closures_that_agree_become_one_and_others_do_not(space):
+    space = SPACES[space]
+    world = hall(1, KEYFRAMES, space)
+    slam, _ = driven(world, with_closures, map_condense=True, map_window_keyframes=WINDOW)
+    edge = slam.graph.edge(slam.graph.edges_of("closures")[0])
+    nothing = {edge.vertices[0]: (space.identity, np.zeros((space.dof, space.dof)))}
+    same = carried_closure(space, edge, edge.vertices[0], nothing, 1.0)
+    both = fused_closure(space, same, [edge], 0.9999)
+    assert both.replaces == edge.id
+    assert both.measured == pytest.approx(tuple(edge.measured), abs=1e-12)
+    assert both.root.T @ both.root == pytest.approx(2.0 * edge.sqrt_information.T @ edge.sqrt_information, rel=1e-9)
+    off = carried_closure(
+        space,
+        edge,
+        edge.vertices[0],
+        {edge.vertices[0]: ((1.0, *space.identity[1:]), nothing[edge.vertices[0]][1])},
+        1.0,
+    )
+    assert fused_closure(space, off, [edge], 0.9999) is None
+
+
+@pytest.mark.parametrize("space", SPACES)
+def test_the_way_back_has_the_covariance_of_the_way_back(space):
+    """Compared with random motions."""
+    space, rng = SPACES[space], np.random.default_rng(0)
+    group, root = space.group, 0.01 * rng.standard_normal((space.dof, space.dof))
+    pose = group.exp(tuple(rng.standard_normal(space.dof)))
+    back, covariance = inverse(space, (pose, root @ root.T))
+    draws = [group.compose(pose, group.exp(tuple(root @ rng.standard_normal(space.dof)))) for _ in range(4000)]
+    off = np.array([group.log(group.between(back, group.inverse(one))) for one in draws])
+    assert off.T @ off / len(off) == pytest.approx(covariance, abs=0.08 * np.abs(covariance).max())
