@@ -16,11 +16,11 @@ class CalibrateConfig:
     """Calibration of odometry and sensors, estimated with the map."""
 
     groups: str = setting(
-        "none",
-        "what is estimated and corrected: none, association (the factors of odometry that "
-        "landmarks.association=joint finds), auto (factors of odometry, clock and yaw of "
-        "sensors; of an input with ranges alone their offset and factor, while odometry keeps its scale), or a list of "
-        "factors, clock, yaw, mount, range_offset, range_factor, turn_bias",
+        "association",
+        "what is estimated and corrected: none, association (the factors of odometry that landmarks.association=joint "
+        "finds; nothing with another association), auto (factors of odometry, clock and yaw of sensors; of an input "
+        "with ranges alone their offset and factor, while odometry keeps its scale), or a list of factors, clock, yaw, "
+        "mount, range_offset, range_factor, turn_bias",
     )
     factor_sigma: float = setting(0.2, "prior of odometry's distance and turn factors", "times", low=1e-4, high=1.0)
     clock_sigma_s: float = setting(0.5, "prior of a sensor's clock against odometry", "s", low=1e-4, high=10.0)

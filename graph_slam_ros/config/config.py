@@ -92,9 +92,6 @@ class Config:
                 "calibrate.groups: factors and range_factor are one scale: leave one out, or survey landmarks "
                 "(landmarks.surveyed)"
             )
-
-        if "association" in words and self.landmarks.association != "joint":
-            raise ConfigError("calibrate.groups: association needs landmarks.association=joint")
         if self.map.condense and (not_yet := self._not_condensed):
             raise ConfigError(f"map.condense: not with {not_yet} yet: set map.condense=false, or change that")
 

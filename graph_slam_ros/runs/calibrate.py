@@ -131,7 +131,8 @@ def _undriven(config: Config, keyframes: int) -> Iterator[dict[str, Any]]:
 def _config(given: Mapping[str, Any]) -> Config:
     config = with_survey(Config.from_mapping(given))
     if not config.calibrate.is_on:
-        raise GraphSlamError("calibrate.groups: none leaves nothing to estimate; without this setting it is auto")
+        groups = config.calibrate.groups
+        raise GraphSlamError(f"calibrate.groups: {groups} leaves nothing to fit here; without this setting it is auto")
     if config.calibrate.drift:
         raise GraphSlamError("calibrate.drift: settings are constant; graph_slam replay with it corrects what changes")
     return config

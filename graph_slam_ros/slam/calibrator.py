@@ -184,6 +184,8 @@ class Calibrator:
         if len(sources) == 1:
             (source,) = sources
             found = {Parameter(source, name): one for name, one in scales.items()}
+            if self._config.gyro_input:  # odometry's turn is mostly that of the gyro
+                found.pop(Parameter(source, "turn"), None)
             findings = [of_association(one, *estimate, one in self._admitted) for one, estimate in found.items()]
             values = {one.parameter: _rounded(one.value) for one in findings if one.verdict == "admitted"}
             report = self._correct(values, keyframe, everything, None) if values else None

@@ -325,8 +325,8 @@ def test_the_factor_of_odometry_that_the_association_finds_corrects_the_graph():
     """Odometry tells 10 % too long a way."""
     recording, scale = park(1, laps=1), 1.1
 
-    def found(groups):
-        slam = GraphSlam(Config.from_mapping({"landmarks.association": "joint", "calibrate.groups": groups}))
+    def found(settings):
+        slam = GraphSlam(Config.from_mapping({"landmarks.association": "joint"} | settings))
         for m in [*measurements(recording), Control("end"), Control("optimize")]:
             if isinstance(m, Odometry):
                 x, y, heading = m.T_odom_base
@@ -334,7 +334,7 @@ def test_the_factor_of_odometry_that_the_association_finds_corrects_the_graph():
             slam.process(without_ids(m))
         return slam
 
-    slam, without = found("association"), found("none")
+    slam, without = found({}), found({"calibrate.groups": "none"})
     assert slam.calibrated("odometry", "distance") == pytest.approx(1.0 / scale, abs=0.015)
     assert slam.calibrated("odometry", "turn") == 1.0, "one circle does not determine it"
     assert not without.calibration_report

@@ -95,10 +95,10 @@ def test_windows_of_a_loaded_map_begin_with_the_drive():
     assert windows.closed == [(500, {})]
 
 
-def test_the_factors_of_an_association_need_one():
-    with pytest.raises(ConfigError, match=r"calibrate\.groups: association needs landmarks\.association=joint"):
-        Config.from_mapping({"calibrate.groups": "association"})
-    both = {"calibrate.groups": "association", "landmarks.association": "joint"}
-    assert Config.from_mapping(both).uses_found_factors
+def test_the_factors_of_an_association_are_used_by_default_where_there_is_one():
+    assert not Config().uses_found_factors
+    assert Config.from_mapping({"landmarks.association": "joint"}).uses_found_factors
+    for other in ({"landmarks.association": "nearest"}, {"calibrate.groups": "none"}, {"calibrate.groups": "auto"}):
+        assert not Config.from_mapping({"landmarks.association": "joint"} | other).uses_found_factors
     with pytest.raises(ConfigError, match="is association and some"):
-        Config.from_mapping(both | {"calibrate.groups": "association clock"})
+        Config.from_mapping({"calibrate.groups": "association clock"})
