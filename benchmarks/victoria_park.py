@@ -22,6 +22,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the commands do, before NumPy comes in
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.io import loadmat

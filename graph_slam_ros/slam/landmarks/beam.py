@@ -162,7 +162,7 @@ class Beam:
         first : number of its first cluster; the others follow
         """
         self._scans += 1
-        used: list[frozenset[int]] = [frozenset()] * len(self.log_weight)
+        used = np.empty((len(self.log_weight), 0), dtype=np.int64)
         order = sorted(range(len(scan.clusters)), key=lambda k: float(np.linalg.norm(scan.clusters[k].point)))
         for k in order:
             used = self._explain_cluster(scan.clusters[k], first + k, used)
@@ -211,14 +211,12 @@ class Beam:
 
     # -- a cluster ---------------------------------------------------------------------------------------------------
 
-    def _explain_cluster(self, cluster: Cluster, number: int, used: list[frozenset[int]]) -> list[frozenset[int]]:
-        """Branch over the landmarks of a cluster. Returns the landmarks that each hypothesis has used in this scan."""
+    def _explain_cluster(self, cluster: Cluster, number: int, used: Ids) -> Ids:
+        """Branch over the landmarks of a cluster. Takes and returns what each hypothesis has used in this scan."""
         c, slots = self.settings, self.ids.shape[1]
         what = self._expect(cluster)
         fits = what.log_likelihood
-        for i, names in enumerate(used):
-            for name in names:
-                fits[i, self.ids[i] == name] = -np.inf
+        fits[(self.ids[:, :, None] == used[:, None]).any(axis=2)] = -np.inf
         log_new = c.log_new - LOG_SIZES * bool(cluster.size and c.size_sigma_m)
         others = np.broadcast_to([log_new, log_new - _UNLIKELY], (len(fits), 2))
         weights = (np.concatenate([fits, others], axis=1) + self.log_weight[:, None]).ravel()
@@ -244,7 +242,7 @@ class Beam:
         options = np.array([option for _, option, _ in kept])
         self._update(source, options, what)
         self._begin(np.flatnonzero(options == slots), cluster, number)
-        return [used[i] | {name} if name != NOTHING else used[i] for i, _, name in kept]
+        return np.column_stack([used[source], [name for _, _, name in kept]])
 
     def _expect(self, cluster: Cluster) -> _Expected:
         """Predict all landmarks in all hypotheses: the likelihood of the cluster, and the terms of an update."""

@@ -5,11 +5,11 @@ come from pairs of landmarks in the stretch and equally distant pairs in the map
 and their costs are compared.
 """
 
-from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from graph_slam_ros.slam.landmarks.explanation import UNUSED, Drive, Estimate, Ids, compressed
 from graph_slam_ros.slam.landmarks.moves import TRIAL, are_others, merged, reassigned, sorts_of, without_few
@@ -29,7 +29,7 @@ _MOST_LOCAL, _MOST_SCORED = 8, 200
 _APART_M = 0.5  # explanations that have a stretch farther apart are two
 _HOPELESS = 60.0  # that much more than before is never mended by giving clusters to others
 
-Motion = tuple[Array, Array]  # rotation, translation
+Motions = tuple[Array, Array]  # rotations (m, n, n), translations (m, n)
 
 
 def laid_on_the_map(drive: Drive, e: Estimate) -> tuple[Estimate, int]:
@@ -138,7 +138,7 @@ def _candidates(drive: Drive, e: Estimate, inside: Ids, strong: Ids, middle: int
     local = np.array([np.median(at[names == k], axis=0) for k in ids[np.argsort(-counts, kind="stable")]])
     local = local.reshape(-1, drive.n)
     centre = e.position[middle]
-    turns, moves = (np.array(one) for one in zip(*_motions(local[:_MOST_LOCAL], there, centre), strict=True))
+    turns, moves = _motions(local[:_MOST_LOCAL], there, centre)
     rough = _rough_scores(local, there, turns, moves) + _priors(turns, moves, centre)
     rough[0] = 0.0  # as it lies
     likely = np.argsort(rough, kind="stable")[:_MOST_SCORED]
@@ -162,12 +162,8 @@ def _candidates(drive: Drive, e: Estimate, inside: Ids, strong: Ids, middle: int
 def _rough_scores(local: Array, there: Array, turns: Array, moves: Array) -> Array:
     """The misfit of a stretch with the landmarks, for each motion."""
     at = np.einsum("mij,uj->mui", turns, local) + moves[:, None]
-    nearest = np.concatenate([_nearest(there, some) for some in np.array_split(at, max(1, len(at) // 256))])
+    nearest, _ = KDTree(there).query(at, distance_upper_bound=_MOVE_M * _MOST_COST**0.5)
     return np.asarray(np.minimum(np.square(nearest / _MOVE_M), _MOST_COST).sum(axis=1))
-
-
-def _nearest(there: Array, at: Array) -> Array:
-    return np.asarray(np.linalg.norm(there - at[:, :, None], axis=-1).min(axis=2))
 
 
 def _priors(turns: Array, moves: Array, centre: Array) -> Array:
@@ -178,26 +174,25 @@ def _priors(turns: Array, moves: Array, centre: Array) -> Array:
     )
 
 
-def _motions(local: Array, there: Array, centre: Array) -> Iterator[Motion]:
-    """Motions that align clusters with landmarks: none, by one pair, by two pairs."""
+def _motions(local: Array, there: Array, centre: Array) -> Motions:
+    """Motions that align clusters with landmarks: none, by one pair, by two pairs. The first is none."""
     n = len(centre)
-    yield np.eye(n), np.zeros(n)
+    turns, moves = [np.eye(n)[None]], [np.zeros((1, n))]
     bearing = np.arctan2((there - centre)[:, 1], (there - centre)[:, 0])
     apart = np.linalg.norm(there[:, None] - there[None], axis=2)
+    np.fill_diagonal(apart, np.inf)
     for u, one in enumerate(local):
-        from_centre = np.arctan2(*(one - centre)[1::-1])
-        for i, landmark in enumerate(there):
-            turn = yaw(float(bearing[i] - from_centre), n)
-            yield turn, centre - turn @ centre
-            yield np.eye(n), landmark - one
+        turn = yaw(bearing - np.arctan2(*(one - centre)[1::-1]), n)
+        turns += [turn, np.broadcast_to(np.eye(n), turn.shape)]
+        moves += [centre - turn @ centre, there - one]
         for other in local[:u]:
             d = other - one
             far = float(np.linalg.norm(d))
             if far < _LEAST_M:
                 continue
-            close = np.abs(apart - far) <= _SAME_M
-            np.fill_diagonal(close, val=False)
-            for i, h in np.argwhere(close).tolist():
-                between = there[h] - there[i]
-                turn = yaw(float(np.arctan2(between[1], between[0]) - np.arctan2(d[1], d[0])), n)
-                yield turn, 0.5 * (there[i] + there[h]) - turn @ (0.5 * (one + other))
+            i, h = np.nonzero(np.abs(apart - far) <= _SAME_M)
+            between = there[h] - there[i]
+            turn = yaw(np.arctan2(between[:, 1], between[:, 0]) - np.arctan2(d[1], d[0]), n)
+            turns.append(turn)
+            moves.append(0.5 * (there[i] + there[h]) - turn @ (0.5 * (one + other)))
+    return np.concatenate(turns), np.concatenate(moves)

@@ -225,7 +225,7 @@ def only_motion(points: Array, places: Array, here: tuple[float, ...]) -> tuple[
     c, s = np.cos(turns)[:, None], np.sin(turns)[:, None]
     x, y = points.T
     laid = np.stack([c * x - s * y + shifts[:, :1], s * x + c * y + shifts[:, 1:]], axis=-1)
-    away, _ = tree.query(laid)
+    away, _ = tree.query(laid, distance_upper_bound=_FIT_M)
     counts = np.count_nonzero(away < _FIT_M, axis=1)
     best = int(counts.argmax())
     position = (

@@ -214,7 +214,7 @@ class Hindsight:
     def _noted(self, found: Found | None) -> Found | None:
         if found is not None:
             self.scales, self.newest = (found.estimate.scales, _SCALE_SIGMA), found
-            self.found_scales = dict(found.scales)
+            self.found_scales = {} if found.presence.is_doubtful else dict(found.scales)
         return found
 
 

@@ -13,7 +13,7 @@ from graph_slam_ros.slam.landmarks.elsewhere import is_missing
 from graph_slam_ros.slam.landmarks.explanation import UNUSED, Drive, Estimate
 
 _MUCH_MORE = 4.0  # times what the sensor misses; maps that are right reach 2.3
-_LEAST_PART, _LEAST = 0.03, 10
+_LEAST_PART, _LEAST = 0.02, 10
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,10 +24,10 @@ def rotation_vector(matrices: Array) -> Array:
     return np.arctan2(matrices[..., 1, 0], matrices[..., 0, 0])[..., None]
 
 
-def yaw(angle: float, n: int) -> Array:
-    """Rotation matrix (n, n) about the vertical."""
-    out = np.eye(n)
-    out[:2, :2] = rotation(np.array([angle]))
+def yaw(angles: Array, n: int) -> Array:
+    """Rotation matrices (k, n, n) about the vertical, of angles (k,)."""
+    out = np.tile(np.eye(n), (len(angles), 1, 1))
+    out[:, :2, :2] = rotation(angles[:, None])
     return out
 
 
