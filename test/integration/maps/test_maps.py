@@ -529,6 +529,40 @@ def test_without_names_and_with_closures_a_frozen_map_stays(tmp_path):
     assert not any(mark.is_tentative for mark in read_map(tmp_path / "frozen", []).landmarks.values())
 
 
+def with_features(measured):
+    """Sightings without names, which say whether a tag is on a rack or a wall, and how large it is."""
+    for m in measured:
+        if isinstance(m, Sightings):
+            sorts = [s.id.rstrip("0123456789ewns") for s in m.sightings]
+            known = zip(m.sightings, sorts, strict=True)
+            m = replace(m, sightings=tuple(replace(s, id="", sort=k, size=0.1 + 0.2 * (k == "wall")) for s, k in known))
+        yield m
+
+
+def test_class_and_size_are_the_same_bytes_after_freezing_and_a_restart(tmp_path):
+    config = Config.from_mapping({"landmarks.association": "joint", "landmarks.size_sigma_m": 0.03})
+    first, second = (simulate("warehouse", seed, aisles=2, laps=1, aisle_m=6.0, sensor="position") for seed in (0, 5))
+    source = ended(tmp_path / "run", with_features(measurements(first)), config)
+    assert run("freeze", source, "--out", tmp_path / "frozen") == 0
+
+    def features(folder):
+        return {name: (m.sort, m.size, m.sized) for name, m in read_map(folder, []).landmarks.items()}
+
+    saved = features(tmp_path / "frozen")
+    assert saved.items() <= features(source).items(), "one that is not believed is not frozen"
+    assert {sort for sort, _, _ in saved.values()} == {"rack", "wall"}
+    assert all(size == pytest.approx(0.3 if sort == "wall" else 0.1) for sort, size, _ in saved.values())
+    again = list(with_features(measurements(second)))
+    slam = gone_on(tmp_path / "once", tmp_path / "frozen", again)
+    gone_on(tmp_path / "twice", tmp_path / "frozen", again)
+    assert_untouched(slam, tmp_path / "frozen")
+    for name in RECORDED:
+        assert (tmp_path / "once" / name).read_bytes() == (tmp_path / "twice" / name).read_bytes(), name
+    later = features(tmp_path / "once")
+    assert {name: later[name][0] for name in saved} == {name: sort for name, (sort, _, _) in saved.items()}
+    assert sum(later[name][2] for name in saved) > sum(sized for _, _, sized in saved.values()), "they are seen again"
+
+
 def test_merge_keeps_the_edits_of_both_with_the_ids_of_their_edges(first, second, tmp_path):
     edited = []
     for number, folder in enumerate((first, second)):
