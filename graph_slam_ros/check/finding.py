@@ -157,9 +157,14 @@ KINDS: dict[str, Kind] = {
     ),
     "not_observable": Kind("the drive does not determine a clock, a mount or a scale", "drive what the text names"),
     "over_confident": Kind(
-        "the residuals of an input are larger than its noise says", "set robust.noise_scale=estimated"
+        "the residuals of an input are larger than its noise says",
+        "correct its noise: INPUT.noise=sigmas with INPUT.sigma_m; robust.noise_scale=estimated (the default) allows "
+        "for 3 times",
     ),
-    "odometry_over_confident": Kind("odometry is worse than its noise says", "set robust.noise_scale=estimated"),
+    "odometry_over_confident": Kind(
+        "odometry is worse than its noise says",
+        "state its noise (odometry.noise); robust.noise_scale=estimated (the default) allows for it",
+    ),
     "odometry_slips": Kind(
         "in a stretch odometry drives or turns far more or less than the map shows",
         "look at the ground and the tyres there; a run finds slips (odometry.doubt); a gyro helps in turns",

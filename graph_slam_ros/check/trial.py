@@ -16,7 +16,7 @@ from graph_slam_ros.measurements.types import Control, Measurement, Odometry
 from graph_slam_ros.slam import Config, GraphSlam
 from graph_slam_ros.slam.calibration.decision import Finding as Fitted
 from graph_slam_ros.slam.calibration.fit import TrialFit
-from graph_slam_ros.slam.noise_scale import NoiseScale
+from graph_slam_ros.slam.noise_scale import LARGEST, NoiseScale
 from graph_slam_ros.typing import Array, Index
 
 _THIN_NS = 80_000_000
@@ -124,11 +124,11 @@ def check_trial(c: Columns, slam: GraphSlam) -> Iterator[Finding]:
     yield from (one for one in found if not (is_displaced and one.code in _OF_A_BREAK))
     if no_scales:
         yield Finding("fit_unsure", "note", 1, 0, "fits", f"noise cannot be checked: {no_scales}")
-    for noise in scales if c.config.robust.noise_scale != "estimated" else ():
+    for noise in scales:
         limit = _ODOMETRY_OVER_CONFIDENT if noise.label == "odometry" else _OVER_CONFIDENT
         factor = float(np.sqrt(noise.per_dof))
         if factor > limit and noise.dof > _LEAST_DOF and not noise.reason:
-            yield _over_confident(c, noise.source, noise.label, noise.part, factor, limit)
+            yield _over_confident(c, noise, factor, limit)
 
 
 def _goes_back(c: Columns) -> bool:
@@ -153,12 +153,20 @@ def _absurd(c: Columns, factor: float) -> Finding:
     return Finding("unrelated", "error", factor, 1.0 + _ABSURD, "times", f"{s.topic}: {text}", **where)
 
 
-def _over_confident(c: Columns, source: str, label: str, part: str, factor: float, limit: float) -> Finding:
-    code = "odometry_over_confident" if label == "odometry" else "over_confident"
-    topic = next((t.name for t in c.topics.values() if source in t.inputs), source)
-    what = " ".join(filter(None, (label, part)))
+def _over_confident(c: Columns, noise: NoiseScale, factor: float, limit: float) -> Finding:
+    """Noise that is too small: a note where the run allows for it."""
+    code = "odometry_over_confident" if noise.label == "odometry" else "over_confident"
+    topic = next((t.name for t in c.topics.values() if noise.source in t.inputs), noise.source)
+    what = " ".join(filter(None, (noise.label, noise.part)))
     text = f"{topic}: residuals ({what}) are {factor:.1f} times as large as its noise says"
-    settings = ("robust.noise_scale=estimated",)
+    if c.config.robust.noise_scale != "estimated":
+        mends = ("robust.noise_scale=estimated",)
+        return Finding(code, "warning", factor, limit, "times", text, topic, settings=mends)
+    if noise.factor < LARGEST:
+        return Finding(code, "note", factor, limit, "times", f"{text}; a run allows for it", topic)
+    text += f"; a run allows for {LARGEST:g} times"
+    own = next((one for one in c.config.sources if one.name == noise.source and one.use == "odometry"), None)
+    settings = (f"{own.name}.sigma_factor={own.sigma_factor * factor:.2g}",) if own else ()
     return Finding(code, "warning", factor, limit, "times", text, topic, settings=settings)
 
 

@@ -35,9 +35,9 @@ class RobustConfig:
         low=1.0,
     )
     noise_scale: str = setting(
-        "configured",
-        "noise of all inputs: configured: as messages and parameters state it; estimated: that times factors from the "
-        "residuals, for each input and class of edges, from 50 keyframes on",
+        "estimated",
+        "noise of all inputs: estimated: as messages and parameters state it, times factors from the residuals, for "
+        "each input and class of edges, from 50 keyframes on; configured: without factors",
         choices=("configured", "estimated"),
     )
     loss: str = setting(

@@ -73,6 +73,7 @@ def merge(a: Path, b: Path, out: Path, *, force: bool = False) -> Merged:
     _refuse_same_drive(one, two, a, b)
     state = state_of(one)
     first_edge = state.graph.edge_count
+    two.backend.use_noise(one.noise_factors)  # the merged map has one factor for each group
     extend(state, _Second(one, two, aligned, shared).record())
     left_out = {name: aligned.distance(k) for k, name in enumerate(shared) if not aligned.fits[k]}
     chi2 = {one.landmarks[name].vertex: float(aligned.chi2[k]) for k, name in enumerate(shared) if name in left_out}

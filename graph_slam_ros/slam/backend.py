@@ -1,6 +1,6 @@
 """The back-end: the graph, its solver, and what is believed of its edges, in step with one another."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.plugin_edges import failed_edges
 from graph_slam_ros.slam.calibration.rows import TrialProblem
 from graph_slam_ros.slam.frontend.keyframes import Keyframe, KeyframeList
-from graph_slam_ros.slam.frontend.noise_factors import NoiseScales
+from graph_slam_ros.slam.frontend.noise_factors import Key, NoiseScales
 from graph_slam_ros.slam.frontend.sighting_edges import SightingEdges
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.slam.lifelong.state import BoundedState
@@ -107,7 +107,7 @@ class Backend:
         if held[0]:
             self._hold(*held)
         if self._config.noise_scale != "estimated":
-            self.noise.change(self.noise.neutral(), self._first_free_edge)
+            self.use_noise({})
         self.handed_over = self.graph.vertex_count, self.graph.edge_count
         report = self.solver.optimize(self.solver.settings.until_still())  # what is believed was decided before
         self.decisions.recalibrate()
@@ -195,9 +195,11 @@ class Backend:
     def scale_noise(self, keyframes: StampedPoses[Keyframe], everything: Settings | None) -> Report | None:
         """Estimate the scale of the noise if that is due, and solve with it. Returns the last report of a solve.
 
-        It is due at 50 keyframes, 100, 200 and so on, and when everything is solved.
+        It is due at 50 keyframes, 100, 200 and so on, and when everything is solved. A map that was edited by hand
+        keeps its noise until a keyframe is added: residuals that an edit makes are not the noise of a sensor.
         """
-        is_due = everything is not None or self.noise.is_due(len(keyframes))
+        is_driven = not self.edits or len(keyframes) > self.edits[-1].keyframe + 1
+        is_due = is_driven if everything is not None else self.noise.is_due(len(keyframes))
         if self._config.noise_scale != "estimated" or self.holds_back or not is_due:
             return None
         first_edge, report = self._first_free_edge, None
@@ -226,6 +228,11 @@ class Backend:
         stamps[keyframes.ids] = keyframes.stamps_ns
         edges = range(self._first_free_edge, self.handed_over[1])
         return estimate_noise(self.graph, self.solver, self.noise.factors, stamps, edges)
+
+    def use_noise(self, factors: Mapping[Key, float]) -> None:
+        """Scale the configured noise of edges by other factors than now; groups without one have none."""
+        if self.noise.change(self.noise.neutral() | dict(factors), self._first_free_edge):
+            self.solver.rebuild()
 
     @property
     def _first_free_edge(self) -> int:

@@ -244,8 +244,6 @@ class GraphSlam(MapView):
                 self._add_assigned(self._landmarks.end_scan())
                 if event == "time_jump":
                     self._frontend.forget_time()
-                elif not self.backend.is_handed_over:
-                    self._solve()
             case "optimize":
                 self._add_assigned(self._landmarks.end_scan())
                 self._solve(self.config.solver_settings())

@@ -293,6 +293,8 @@ def _scale(key: Key, total: _Sums, factor_now: float) -> NoiseScale:
     if total.errors:
         return scale
     factor = float(np.sqrt(per_dof * design_effect))
+    if factor < 1.0 and key[0] == "fixes":
+        return replace(scale, reason="errors of fixes that last leave no residuals: smaller sigmas are not believed")
     if factor < 1.0 and key[0] == "landmarks" and total.passes < LEAST_PASSES:
         few = f"{total.passes} passes by landmarks, fewer than {LEAST_PASSES}: smaller sigmas are not believed"
         return replace(scale, reason=few)

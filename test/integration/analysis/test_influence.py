@@ -55,7 +55,8 @@ def test_with_an_edge_that_is_out_so_it_is_where_a_step_says_anything(saved):
     for k in np.flatnonzero(known).tolist():
         step = exact(saved, int(found.edges[k]), let_in=True)
         assert found.step[k] @ step > 0.0
-        assert np.linalg.norm(found.step[k]) == pytest.approx(np.linalg.norm(step), rel=0.2)
+        length = np.linalg.norm(step)  # of millimetres the loss of the edge itself makes a third
+        assert np.linalg.norm(found.step[k]) == pytest.approx(length, rel=0.2, abs=0.002)
 
 
 def test_the_cost_changes_as_solving_again_says(saved):

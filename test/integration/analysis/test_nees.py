@@ -25,13 +25,14 @@ WORLDS = {
 }
 
 
-def mean_nees(dimensions, told):
+def mean_nees(dimensions, told, noise_scale="configured"):
     """Of the last pose and of the landmarks, by a pipeline that is told so many times the sigmas that were drawn."""
+    config = Config.from_mapping(TOLD | {"world.dimensions": dimensions, "robust.noise_scale": noise_scale})
     world, options = WORLDS[dimensions]
     last, landmarks = [], []
     for seed in SEEDS:
         recording = simulate(world, seed, correlation_time_s=0.0, **options)
-        slam = GraphSlam(Config.from_mapping(TOLD | {"world.dimensions": dimensions}))
+        slam = GraphSlam(config)
         for m in [*measurements(recording), Control("end"), Control("optimize")]:
             slam.process(said(m, told))
         at = np.searchsorted(recording.stamps_ns, slam.keyframes.stamps_ns)
@@ -64,9 +65,10 @@ def usual(dof):
     return chi2.ppf([0.0005, 0.9995], dof * len(SEEDS)) / len(SEEDS)
 
 
+@pytest.mark.parametrize("noise_scale", ["configured", "estimated"])
 @pytest.mark.parametrize("dimensions, dof", [(2, 3), (3, 6)])
-def test_errors_are_as_large_as_the_covariances_say(dimensions, dof):
-    last, landmarks = mean_nees(dimensions, told=1.0)
+def test_errors_are_as_large_as_the_covariances_say(dimensions, dof, noise_scale):
+    last, landmarks = mean_nees(dimensions, 1.0, noise_scale)
     assert usual(dof)[0] < last < usual(dof)[1]
     assert usual(dimensions)[0] < landmarks < usual(dimensions)[1]
 

@@ -262,9 +262,12 @@ def test_odometry_that_is_rougher_than_it_says_is_found_and_its_setting_mends_it
     poses[:, :2] += np.random.default_rng(1).normal(0.0, 0.015, (len(poses), 2)).cumsum(axis=0)
     drive.poses = poses
     drive.write(bag)
-    found, mended = found_and_mended(bag, ROUGH, {"odometry.doubt": False})
-    assert found.settings == ("robust.noise_scale=estimated",)
+    configured = {"odometry.doubt": False, "robust.noise_scale": "configured"}
+    found, mended = found_and_mended(bag, ROUGH, configured)
+    assert (found.severity, found.settings) == ("warning", ("robust.noise_scale=estimated",))
     assert ROUGH not in mended
+    allowed, _ = found_and_mended(bag, ROUGH, {"odometry.doubt": False})
+    assert (allowed.severity, allowed.settings) == ("note", ()) and "a run allows for it" in allowed.text
 
 
 def test_a_few_wrong_ids_are_a_note_where_what_contradicts_is_left_out(laps, tmp_path):

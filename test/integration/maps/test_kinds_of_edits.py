@@ -302,6 +302,8 @@ def test_a_part_of_the_drive_is_cut_out(where, either):
         events = list(small_drive.drive(slam.space.dimensions))
         for m in [m for m in events if getattr(m, "stamp_ns", 0) < 1019 * 10**9]:
             short.process(m)
+        short.backend.use_noise(slam.noise_factors)  # an edited map keeps that of the whole drive
+        short.solver.optimize()
         assert slam.trajectory() == pytest.approx(short.trajectory(), abs=1e-4)
     else:
         most = 0.2 if where == "middle" else 1.0  # without its beginning it is no loop: odometry drifts

@@ -38,6 +38,7 @@ class Drive:
     def __init__(self, seed=0, beside=run_when_asked, **robust):
         self.rng = np.random.default_rng(seed)
         self.true = laps()
+        robust = {"noise_scale": "configured"} | robust  # what is planted is not taken for noise
         config = Config.from_mapping({f"robust.{name}": value for name, value in robust.items()})
         self.settings = config.solver_settings()
         self.backend = Backend(config.robust, self.settings, beside)
