@@ -1,16 +1,23 @@
 """Normal equations of a chain of poses with a border: landmarks, and parameters of the whole drive.
 
-Odometry connects each pose with the next one only, so the part of the poses is a band. With its Cholesky factor the
-border is reduced to a small dense matrix (the Schur complement).
+Odometry connects each pose with the next one only, so the part of the poses is a band. A short border is solved for
+after it (Schur complement). Of a long one the landmarks, each seen from some poses, are factorised with the poses as a
+sparse matrix, and the parameters of the whole drive, which are coupled with everything, are solved for after it.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy import sparse
-from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_banded
+from scipy.linalg import cho_solve_banded, cholesky_banded
+from scipy.sparse.linalg import splu
 
 from graph_slam_ros.typing import Array, Index
+
+_SHORT = 48  # unknowns of a border that is dense
+_SYMMETRIC = {"SymmetricMode": True}
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,25 +45,31 @@ class Factor:
 
     Attributes
     ----------
+    own : solves for the chain, with the landmarks of a long border
+    coupling, solved : (last, n - last) rows of the unknowns that are solved for last, and these rows, solved for
+    corner : (last, last) what is left
+    border : unknowns of the border
     log_determinant : of the matrix
     """
 
-    chain: Array
+    own: Callable[[Array], Array]
+    coupling: Array
     solved: Array
-    coupling: sparse.csr_matrix
-    corner: tuple[Array, bool]
+    corner: Array
+    border: int
     log_determinant: float
 
     def solve(self, b: Array) -> Array:
-        """Solve for a right-hand side."""
-        count = self.chain.shape[1]
-        chain = cho_solve_banded((self.chain, True), b[:count], check_finite=False)
-        border = cho_solve(self.corner, b[count:] - self.coupling @ chain, check_finite=False)
-        return np.concatenate([chain - self.solved @ border, border])
+        """Solve for right-hand sides (n,) or (n, k)."""
+        count = self.coupling.shape[1]
+        own = self.own(b[:count])
+        last = np.linalg.solve(self.corner, b[count:] - self.coupling @ own)
+        return np.concatenate([own - self.solved @ last, last])
 
     def border_covariance(self) -> Array:
         """The covariance of the border's unknowns."""
-        return np.asarray(cho_solve(self.corner, np.eye(len(self.corner[0])), check_finite=False))
+        first = self.coupling.shape[1] + len(self.corner) - self.border
+        return self.solve(np.eye(first + self.border)[:, first:])[first:]
 
 
 class BorderedEquations:
@@ -66,13 +79,15 @@ class BorderedEquations:
     ----------
     count, size : unknowns of the chain and of the border
     width : of the chain's longest row: so many unknowns that follow one another
+    parameters : the last so many unknowns of the border are of the whole drive
 
     Attributes
     ----------
     b : (count + size,) right-hand side
     """
 
-    def __init__(self, rows: list[Rows], count: int, size: int, width: int) -> None:
+    def __init__(self, rows: list[Rows], count: int, size: int, width: int, parameters: int) -> None:
+        self._parameters = parameters
         self._band, self._corner = np.zeros((width, count)), np.zeros((size, size))
         self.b = np.zeros(count + size)
         at, columns, values = [], [], []
@@ -110,11 +125,35 @@ class BorderedEquations:
             if the matrix is not positive definite
         """
         count = self._band.shape[1]
+        last = len(self._corner) if len(self._corner) <= _SHORT else self._parameters
+        of_own = len(self._corner) - last
+        coupling = np.hstack([self._coupling[of_own:].toarray(), self._corner[of_own:, :of_own]])
+        own, pivots = self._sparse(added[: count + of_own]) if of_own else self._banded(added[:count])
+        solved = own(coupling.T.copy())
+        left = self._corner[of_own:, of_own:] + np.diag(added[count + of_own :]) - coupling @ solved
+        pivots = np.concatenate([pivots, np.linalg.cholesky(left).diagonal() ** 2])
+        if not (pivots > 0.0).all():
+            raise np.linalg.LinAlgError("not positive definite")
+        return Factor(own, coupling, solved, left, len(self._corner), float(np.log(pivots).sum()))
+
+    def _banded(self, added: Array) -> tuple[Callable[[Array], Array], Array]:
+        """Factorise the chain. Returns what solves for it, and the pivots."""
         band = self._band.copy()
-        band[0] += added[:count]
+        band[0] += added
         chain = cholesky_banded(band, lower=True, overwrite_ab=True, check_finite=False)
-        solved = cho_solve_banded((chain, True), self._coupling.toarray().T, check_finite=False)
-        corner = self._corner + np.diag(added[count:]) - self._coupling @ solved
-        reduced = cho_factor(0.5 * (corner + corner.T), lower=True, check_finite=False)
-        diagonal = np.concatenate([chain[0], reduced[0].diagonal()])
-        return Factor(chain, solved, self._coupling, reduced, 2.0 * float(np.log(diagonal).sum()))
+        return partial(cho_solve_banded, (chain, True), check_finite=False), chain[0] ** 2
+
+    def _sparse(self, added: Array) -> tuple[Callable[[Array], Array], Array]:
+        """Factorise the chain with the landmarks. Returns what solves for them, and the pivots."""
+        width, count = self._band.shape
+        size = len(added) - count
+        below = [-i for i in range(1, width)]
+        lower = sparse.diags([self._band[-i, : count + i] for i in below], below, shape=(count, count))
+        chain = lower + lower.T + sparse.diags(self._band[0])
+        seen, corner = self._coupling[:size], sparse.csc_matrix(self._corner[:size, :size])
+        matrix = (sparse.bmat([[chain, seen.T], [seen, corner]]) + sparse.diags(added)).tocsc()
+        try:
+            own = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=_SYMMETRIC)
+        except RuntimeError as error:  # it is singular
+            raise np.linalg.LinAlgError(str(error)) from None
+        return own.solve, own.U.diagonal()

@@ -327,7 +327,7 @@ class Drive:
         self.work += self.size + len(self.scan)
         own = np.concatenate([e.scales, e.clocks])
         rows = [self._odometry_rows(e, of_landmarks, slips=slips), self._cluster_rows(e, of_landmarks + 2, loss_scale)]
-        normal = BorderedEquations(rows, count, of_landmarks + len(own), 2 * self._dof)
+        normal = BorderedEquations(rows, count, of_landmarks + len(own), 2 * self._dof, len(own))
         floor = np.zeros(count + of_landmarks + len(own))
         floor[: self._dof], floor[count : count + of_landmarks] = _HELD, _WEAK_PRIOR
         sigmas = [self.settings.scale_sigma] * 2 + [self.settings.clock_sigma_s] * len(e.clocks)

@@ -14,6 +14,7 @@ from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
 from graph_slam_ros.slam.frontend.odometry_selector import Step
 from graph_slam_ros.slam.landmarks import hindsight
 from graph_slam_ros.slam.landmarks.beam import NOTHING, Beam, BeamSettings, Decision, Seed, changes
+from graph_slam_ros.slam.landmarks.bordered import BorderedEquations, Rows
 from graph_slam_ros.slam.landmarks.constellation import laid_on_the_map
 from graph_slam_ros.slam.landmarks.explanation import Costs, Drive, Estimate
 from graph_slam_ros.slam.landmarks.moves import refined
@@ -485,3 +486,42 @@ def test_what_has_another_size_is_another_landmark_and_of_two_the_one_of_its_siz
     both = sized(0.0, [(4.0, 0.1), (4.0, -0.1)], [0.2, 0.6])
     names = explained([both, sized(0.5, [(4.0, 0.0)], [0.6])], settings)[1]
     assert names[2] == names[1], "the second is as near"
+
+
+@pytest.mark.parametrize("landmarks", [3, 40])
+def test_the_equations_of_a_chain_with_a_border_are_solved_as_the_dense_ones(landmarks):
+    """A short border is dense; the landmarks of a long one are factorised as a sparse matrix."""
+    rng, poses, parameters = np.random.default_rng(landmarks), 60, 3
+    count, size = 3 * poses, 2 * landmarks + parameters
+    steps, seen = np.arange(poses - 1), rng.integers(0, poses, 300)
+    which, last = rng.integers(0, landmarks, 300), size - parameters + np.arange(parameters)
+    border = np.column_stack([2 * which, 2 * which + 1, np.tile(last[2:], (300, 1))])
+    draw = rng.standard_normal
+    rows = [
+        Rows(
+            draw((poses - 1, 3, 6)),
+            draw((poses - 1, 3, 2)),
+            draw((poses - 1, 3)),
+            3 * steps,
+            np.tile(last[:2], (poses - 1, 1)),
+        ),
+        Rows(draw((300, 2, 3)), draw((300, 2, 3)), draw((300, 2)), 3 * seen, border),
+    ]
+    jacobian, residuals = [], []
+    for one in rows:
+        for k in range(len(one.first)):
+            full = np.zeros((one.residuals.shape[1], count + size))
+            first, width = int(one.first[k]), one.of_chain.shape[2]
+            full[:, first : first + width] = one.of_chain[k]
+            full[:, count + one.border[k]] = one.of_border[k]
+            jacobian.append(full)
+            residuals.append(one.residuals[k])
+    j, r, added = np.vstack(jacobian), np.concatenate(residuals), rng.uniform(0.1, 1.0, count + size)
+    dense = j.T @ j + np.diag(added)
+    normal = BorderedEquations(rows, count, size, 6, parameters)
+    factor = normal.factor(added)
+    assert factor.solve(normal.b) == pytest.approx(np.linalg.solve(dense, -j.T @ r), rel=1e-9, abs=1e-12)
+    assert factor.log_determinant == pytest.approx(np.linalg.slogdet(dense)[1], rel=1e-12)
+    assert factor.border_covariance() == pytest.approx(np.linalg.inv(dense)[count:, count:], rel=1e-9, abs=1e-12)
+    with pytest.raises(np.linalg.LinAlgError):
+        normal.factor(-1e3 * added)
