@@ -155,7 +155,7 @@ class Additions:
         types = {*space.sightings.values(), space.tag_position, space.range_with_offset}
         for entry in self._run.entries:
             is_known = entry.is_in and entry.landmark in self._run.landmarks
-            key = entry.source, self._run.graph.edge(entry.edge).type
+            key = entry.source, self._run.type_of(entry)
             if is_known and key[1] in types and self._run.keyframe(entry.vertices[0]) is not None:
                 of_key.setdefault(key, []).append(entry)
                 self._of_landmark.setdefault(entry.landmark, Counter())[key] += 1
@@ -191,7 +191,8 @@ class Additions:
                 if like is not None and (self._vertices[k], name) not in self._seen:
                     edge = self._sighting(group, like, self._vertices[k], vertex, ())
                     distance = float(np.linalg.norm(places[k]))
-                    where = f"keyframe {self._keyframes[k]} {self._at(self._vertices[k])}, {distance:.1f} m away"
+                    number = self._run.numbers[self._keyframes[k]]
+                    where = f"keyframe {number} {self._at(self._vertices[k])}, {distance:.1f} m away"
                     yield Addition(SIGHTING, f"see landmark {name} from {where}", (edge,))
 
     def _sighting(
@@ -244,7 +245,7 @@ class Additions:
         for a, b in far[:: max(1, -(-len(far) // most))]:
             ends, start = (vertices[a], vertices[b]), np.array(self._space.identity)
             like = PlannedEdge(self._space.relative_pose, ends, start, noise, "closures", source, share)
-            names = f"{self._keyframes[a]} and {self._keyframes[b]}"
+            names = " and ".join(str(self._run.numbers[self._keyframes[k]]) for k in (a, b))
             about = f"close the loop between keyframes {names} {self._at(vertices[b])}{assumed}"
             yield Addition(CLOSURE, about, (self._as_expected(like, ()),))
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graph_slam_ros.analysis.what_if import SavedGraph
+from graph_slam_ros.graph.place import LABEL as PLACES
 from graph_slam_ros.runs.folder import RunError
 from graph_slam_ros.slam.weak_direction import WeakDirection, position_covariance, weakest_position, weakest_turn
 from graph_slam_ros.typing import Array, Numbers
@@ -31,7 +32,7 @@ class Weakest:
     what : ``position`` or ``heading`` of a keyframe, or ``landmark``: its position
     about : the keyframe or landmark by its name
     vertex, value : its vertex, and the estimate
-    keyframe : index of the keyframe; of a landmark the first that saw it
+    keyframe : index of the keyframe among those in the graph; of a landmark the first that saw it
     direction : the weakest direction, with sigma [m or rad]
     usual : the median of this sigma in the run
     functional : (dof,) of the vertex' tangent space: the direction as a linear function of its error
@@ -54,7 +55,7 @@ class Stretch:
     Attributes
     ----------
     what : ``position`` or ``heading``; empty: only no landmark was seen
-    first, last : keyframes
+    first, last : keyframes, by their numbers
     begins_ns, ends_ns : their stamps
     begins_m, length_m : the way driven until the first, and from there to the last
     sigma, usual : the largest sigma in it, and the median of the run [m or rad]
@@ -94,9 +95,11 @@ class Weakness:
         space, n = run.space, run.space.dimensions
         self.poses = run.solver.estimate(run.keyframes)
         steps = np.diff(self.poses[:, :n], axis=0, prepend=self.poses[:1, :n])
-        steps[run.segments] = 0.0
-        self.travelled_m = np.cumsum(np.linalg.norm(steps, axis=1))
-        self._steps = steps
+        steps[np.isin(run.numbers, run.segments)] = 0.0
+        self._steps, whole = steps, run.whole_path()[:, :n]
+        driven = np.diff(whole, axis=0, prepend=whole[:1])
+        driven[run.segments] = 0.0
+        self.travelled_m = np.cumsum(np.linalg.norm(driven, axis=1))[run.numbers]
         self._free = np.flatnonzero(~np.isin(run.keyframes, run.held))
         if not len(self._free):
             raise RunError(f"{run.folder}: all keyframes are of a frozen map: nothing of it is estimated")
@@ -135,7 +138,14 @@ class Weakness:
                 direction = self._turns[k]
                 in_map = np.concatenate([np.zeros(space.dimensions), direction.axis])
             yield Weakest(
-                *(what, f"keyframe {keyframe}", self.run.keyframes[keyframe], pose, keyframe, direction),
+                *(
+                    what,
+                    f"keyframe {self.run.numbers[keyframe]}",
+                    self.run.keyframes[keyframe],
+                    pose,
+                    keyframe,
+                    direction,
+                ),
                 *(float(np.median(sigmas)), self._in_tangent(pose, in_map)),
             )
         yield from self._weakest_landmark()
@@ -187,11 +197,12 @@ class Weakness:
         return self._landmarks_of(is_in=True)
 
     def _landmarks_of(self, *, is_in: bool) -> list[list[str]]:
-        out: list[list[str]] = [[] for _ in self.run.keyframes]
+        at = {vertex: k for k, vertex in enumerate(self.run.keyframes)}
+        out: list[list[str]] = [[] for _ in at]
         for entry in self.run.entries:
-            keyframe = self.run.keyframe(entry.vertices[0]) if entry.landmark and entry.is_in == is_in else None
-            if keyframe is not None:
-                out[keyframe].append(entry.landmark)
+            names = self.run.landmarks_of(entry) if entry.label == PLACES else [entry.landmark] * bool(entry.landmark)
+            if names and entry.is_in == is_in and entry.vertices[0] in at:
+                out[at[entry.vertices[0]]] += names
         return out
 
     def stretches(self) -> Iterator[Stretch]:
@@ -225,7 +236,7 @@ class Weakness:
     def _stretch(self, what: str, first: int, last: int, sigma: float, usual: float) -> Stretch:
         stamps_ns = self.run.stamps_ns
         return Stretch(
-            *(what, first, last, stamps_ns[first], stamps_ns[last]),
+            *(what, self.run.numbers[first], self.run.numbers[last], stamps_ns[first], stamps_ns[last]),
             *(float(self.travelled_m[first]), self._length(first, last), sigma, usual),
             self._reason(first, last) if what else "no landmark seen",
         )

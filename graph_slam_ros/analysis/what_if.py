@@ -12,11 +12,12 @@ import numpy as np
 
 from graph_slam_ros.analysis.influence import InfluenceModel
 from graph_slam_ros.errors import GaugeError, GraphSlamError, SingularError
-from graph_slam_ros.graph import Gaussian, Graph, Loss
+from graph_slam_ros.graph import EdgeType, Gaussian, Graph, Loss
+from graph_slam_ros.runs.condensed_map import read_left
 from graph_slam_ros.runs.folder import RunError
 from graph_slam_ros.runs.ledger_file import Entry, ledger_entries
 from graph_slam_ros.runs.restore import of_all, restored
-from graph_slam_ros.runs.tables import numbered
+from graph_slam_ros.runs.tables import numbered, removed_path
 from graph_slam_ros.solver import Report, Solver
 from graph_slam_ros.typing import Array
 
@@ -69,8 +70,9 @@ class SavedGraph:
     Attributes
     ----------
     slam : the pipeline that holds the map
-    keyframes, stamps_ns, segments : vertices and stamps of the keyframes that are in the graph, in order of time; the
-        keyframes at which odometry begins
+    keyframes, numbers, stamps_ns : vertices of the keyframes that are in the graph, in order of time, their numbers
+        among all keyframes, and stamps
+    segments : numbers of the keyframes at which odometry begins
     entries, changes : their edges have lasting ids; ``entries`` are in the order of the rows of the graph
     edits : by hand, in order
     landmarks : vertex of each landmark that an accepted edge is about, by its name
@@ -101,8 +103,8 @@ class SavedGraph:
         self.segments = list(slam.segments)
         joined = {vertex for entry in self.entries if entry.is_in for vertex in entry.vertices}
         self.landmarks = {name: mark.vertex for name, mark in slam.landmarks.items() if mark.vertex in joined}
-        numbers = [*(one.number for one in old), *range(slam.first_keyframe, len(slam.keyframes))]
-        self._numbers = dict(zip(self.keyframes, numbers, strict=True))
+        self.numbers: list[int] = [*(one.number for one in old), *range(slam.first_keyframe, len(slam.keyframes))]
+        self._numbers = dict(zip(self.keyframes, self.numbers, strict=True))
 
     @cached_property
     def solver(self) -> Solver:
@@ -117,6 +119,18 @@ class SavedGraph:
     def keyframe(self, vertex: int) -> int | None:
         """The number of the keyframe of a vertex; None if it is not a keyframe."""
         return self._numbers.get(vertex)
+
+    def whole_path(self) -> Array:
+        """The poses of all keyframes, those that were condensed included, (n, size)."""
+        path = self.solver.estimate(self.keyframes[len(self.keyframes) - len(self.slam.keyframes.ids) :])
+        if self.slam.bounded is None:
+            return path
+        left = read_left(self.folder, self.space, self.slam.bounded)
+        return np.concatenate((removed_path(self.slam, left), path))
+
+    def type_of(self, entry: Entry) -> EdgeType:
+        """The type of an edge."""
+        return self.graph.edge(self._row(entry.edge)).type
 
     def landmark_of(self, vertex: int) -> str:
         """The name of the landmark of a vertex; empty if it is not a landmark."""

@@ -21,7 +21,7 @@ def advise(args: argparse.Namespace) -> int:
     from graph_slam_ros.analysis.what_if import SavedGraph
 
     losses: list[str] = []
-    run = SavedGraph(args.run_folder, losses)
+    run = SavedGraph(args.run_folder, losses, condensed=True)
     weakness = Weakness(run)
     advisor = Advisor(weakness, args.survey_sigma)
     everything = advisor.advise()
@@ -52,8 +52,8 @@ def _best(some: "list[Advice]", count: int) -> "list[Advice]":
 def _weak_text(weakness: "Weakness", advisor: "Advisor") -> Iterator[str]:
     run = weakness.run
     yield (
-        f"{len(run.keyframes)} keyframes, {len(run.landmarks)} landmarks; all sigmas are relative to what holds the"
-        f" map: {weakness.held_by()}"
+        f"{len(run.slam.keyframes)} keyframes, {len(run.landmarks)} landmarks; all sigmas are relative to what holds"
+        f" the map: {weakness.held_by()}"
     )
     yield "weakest"
     for one in advisor.weakest:
@@ -121,7 +121,7 @@ def _as_dict(
 ) -> dict[str, Any]:
     stretches, unseen = [*weakness.stretches()], weakness.longest_unseen()
     return {
-        "keyframes": len(weakness.run.keyframes),
+        "keyframes": len(weakness.run.slam.keyframes),
         "landmarks": len(weakness.run.landmarks),
         "sampled_keyframes": len(advisor.keyframes),
         "sampled_landmarks": len(advisor.landmarks),
@@ -130,7 +130,7 @@ def _as_dict(
             {
                 "what": one.what,
                 "about": one.about,
-                "keyframe": one.keyframe,
+                "keyframe": weakness.run.numbers[one.keyframe],
                 "direction": one.direction.words,
                 "axis": one.direction.axis.tolist(),
                 "sigma": one.direction.sigma,

@@ -48,7 +48,7 @@ def innovation(graph: Graph, solver: Solver, edge: int) -> float:
 
 
 def joint_innovations(graph: Graph, solver: Solver, edges: Sequence[int]) -> tuple[Array, Array, Index]:
-    """What several edges together would cost, as parts from which each subset of them has its cost.
+    """The costs of several edges together, as parts from which each subset of them has its cost.
 
     Returns whitened residuals (n,), their covariance (n, n) with the edges' own noise, and the edge of each.
     With the rows of a subset, ``r' S^-1 r`` is its cost where residuals are linear. None of them may be part of the

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 from benchmarks.hall import config, hall, measurements, rms
+from graph_slam_ros.analysis.advice import Advisor
 from graph_slam_ros.analysis.explain import explain_edge, explain_run
+from graph_slam_ros.analysis.weakness import Weakness
 from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.errors import ConfigError, GraphSlamError
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
@@ -288,6 +290,21 @@ def test_what_if_takes_out_the_edge_of_that_id(recorded, saved):
         saved.solve([int(gone)])
     with pytest.raises(GraphSlamError, match="no edge 99999: their ids are below"):
         saved.solve([99999])
+
+
+def test_advice_names_keyframes_by_their_numbers_and_the_way_of_the_whole_path(recorded, saved):
+    world = recorded[0]
+    weakness = Weakness(saved)
+    assert saved.numbers[0] == 0 and saved.numbers[-1] == 499
+    assert len(saved.numbers) == len(saved.keyframes) < 400
+    driven = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(true_path(world, 500), axis=0), axis=1))))
+    assert weakness.travelled_m == pytest.approx(driven[saved.numbers], rel=0.02, abs=0.5)
+    place = next(e for e in saved.entries if e.label == LABEL)
+    assert set(saved.landmarks_of(place)) <= set(weakness.seen[saved.keyframes.index(place.vertices[0])])
+    advisor = Advisor(weakness)
+    assert {one.what for one in advisor.weakest} == {"position", "heading", "landmark"}
+    best = min((one for some in advisor.advise() for one in some), key=lambda one: one.path_m)
+    assert best.path_m < best.path_now_m
 
 
 def test_diff_compares_the_whole_paths(recorded, tmp_path):
