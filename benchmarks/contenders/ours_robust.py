@@ -23,6 +23,8 @@ _SECOND_NS = 10**9
 _AS_THE_GRAPH: Mapping[str, Any] = {
     "odometry.still_m_s": 0.0,
     "odometry.still_rad_s": 0.0,
+    "odometry.still_m": 0.0,
+    "odometry.still_rad": 0.0,
     "odometry.max_speed_m_s": 1e6,
     "landmarks.added_sigma_m": 0.0,
 }
