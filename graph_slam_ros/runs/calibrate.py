@@ -1,4 +1,8 @@
-"""The calibration of a recording: replays in memory, each with what the last one found, until nothing changes."""
+"""The calibration of a recording: replays in memory, each with what the last one found, until nothing changes.
+
+From the last correction by more than a sigma on, a replay is as one with these settings. So it is enough to replay what
+came before once more. Where that part finds more, or believes fewer of the measurements, all is replayed.
+"""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -21,6 +25,7 @@ from graph_slam_ros.slam.calibration.parameters import OF_ODOMETRY, QUANTITIES, 
 from graph_slam_ros.warmup import warmup
 
 _ROUNDS = 4  # replays; a large clock needs two or three
+_MOST_REPEATED = 0.8  # of the keyframes: of more, all are
 _STILL_ACCEPTED = 0.9  # of the part that was accepted before: with less, what was found does harm
 
 Progress = Callable[[Iterable[Any], int], Iterable[Any]]
@@ -35,7 +40,7 @@ class Calibrated:
     settings : parameters to be set, by dotted name
     parameters : of the last replay, as ``calibration`` in ``run.json``
     command : the replay with them
-    rounds : replays
+    rounds : replays, that of a part included
     is_complete : whether the last replay found nothing more
     refused : why what was found is not among the settings; empty if it is
     fault : the worst that ``check`` finds without a fit; with an error nothing is among the settings
@@ -87,7 +92,7 @@ def calibrate(
     total = sum(bag.topics[topic].count for topic in inputs.by_topic())
     report: Mapping[str, Any] = {"settings": {"": 0.0}}
     fault: Finding | None = None
-    rounds, kept, before, refused = 0, dict[str, float | str](), (0, 0), ""
+    rounds, kept, before, refused, has_nothing_left = 0, dict[str, float | str](), (0, 0), "", False
     columns, counters = Collector(config, inputs.topics), Counters()
     while report["settings"] and rounds < _ROUNDS:
         rounds, now = rounds + 1, config.changed(found)
@@ -96,7 +101,7 @@ def calibrate(
         if not slam.keyframes:
             raise GraphSlamError(f"{path}: no odometry of it could be used: graph_slam info {path}")
         accepted = _accepted(slam)
-        if accepted[0] * before[1] < _STILL_ACCEPTED * before[0] * accepted[1]:
+        if _is_less(accepted, before):
             refused, found = _harm(found, kept, before, accepted), kept
             break
         report, kept, before = slam.calibration_report, dict(found), accepted
@@ -106,10 +111,18 @@ def calibrate(
             refused, report = f"nothing is calibrated: mend {fault.code} first", {"settings": {}, "parameters": []}
             break
         found |= report["settings"]
+        part = (slam.calibrated_since + 1) / len(slam.keyframes)
+        if report["settings"] and rounds < _ROUNDS and part < _MOST_REPEATED:
+            rounds, again = rounds + 1, config.changed(found)
+            runs = progress(RecordedRuns(bag, inputs, again, Counters()), round(part * total))
+            begun = _replayed(runs, again, slam.calibrated_since + 1)
+            if not begun.calibration_report["settings"] and not _is_less(_accepted(begun), accepted):
+                has_nothing_left = True
+                break
     parameters = report["parameters"] or ([] if refused else list(_undriven(config, len(slam.keyframes))))
     losses, warnings = list(dict.fromkeys(bag.losses)), list(dict.fromkeys(bag.warnings))
     command = chosen.command(found | dict(settings or {}) | found)
-    complete = not report["settings"] and not refused
+    complete = (has_nothing_left or not report["settings"]) and not refused
     return Calibrated(found, parameters, command, rounds, complete, refused, fault, losses, warnings)
 
 
@@ -138,9 +151,12 @@ def _config(given: Mapping[str, Any]) -> Config:
     return config
 
 
-def _replayed(runs: Iterable[Any], config: Config) -> GraphSlam:
+def _replayed(runs: Iterable[Any], config: Config, most: int | None = None) -> GraphSlam:
+    """Replay in memory, all or until there are so many keyframes."""
     slam = GraphSlam(config)
     for _, some in runs:
+        if most is not None and len(slam.keyframes) >= most:
+            break
         for one in some:
             slam.process(one)
     for event in END:
@@ -152,6 +168,11 @@ def _accepted(slam: GraphSlam) -> tuple[int, int]:
     """Count the measurements that the estimate uses, and all; odometry is in neither."""
     of_inputs = [one for one in account(slam, slam.counters)["inputs"].values() if one["use"] != "odometry"]
     return sum(one["believed"] or 0 for one in of_inputs), sum(one["used"] for one in of_inputs)
+
+
+def _is_less(accepted: tuple[int, int], before: tuple[int, int]) -> bool:
+    """Return whether clearly fewer of the measurements are accepted than before."""
+    return accepted[0] * before[1] < _STILL_ACCEPTED * before[0] * accepted[1]
 
 
 def _harm(

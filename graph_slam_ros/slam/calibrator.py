@@ -47,6 +47,7 @@ class Calibrator:
     corrected : findings that were used, in order
     history : all corrections of measurements that were there, in order
     trials : how many there were
+    corrected_at : the keyframe at which a parameter was last corrected by more than its sigma
     """
 
     def __init__(
@@ -66,7 +67,7 @@ class Calibrator:
         self.findings: dict[Parameter, Finding] = {}
         self.history: list[Recalibration] = []
         self.corrected: list[Finding] = []
-        self.trials = 0
+        self.trials = self.corrected_at = 0
         self._admitted: set[Parameter] = set()
         self._last: TrialFit | None = None
         self._used: Mapping[str, tuple[float, float]] = landmarks.anonymous.scales
@@ -155,6 +156,7 @@ class Calibrator:
         if report is not None:
             self._admitted |= values.keys()
             self.corrected += [one for one in findings if one.parameter in values]
+            self.corrected_at = keyframe if moved else self.corrected_at
             if not found.slips:
                 report = self._without_slips(everything) or report
         for one in findings:

@@ -188,6 +188,11 @@ class MapView(PathView):
         return self._calibrator.corrected
 
     @property
+    def calibrated_since(self) -> int:
+        """The keyframe, by its number, at which calibration last corrected a parameter by more than its sigma."""
+        return self._calibrator.corrected_at
+
+    @property
     def recalibrations(self) -> Sequence[Recalibration]:
         """The corrections of measurements that were in the graph, in order."""
         return self._calibrator.history

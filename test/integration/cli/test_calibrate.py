@@ -7,6 +7,7 @@ from places import ROOT
 
 from graph_slam_ros.cli import main
 from graph_slam_ros.formats.parameters import read_parameters
+from graph_slam_ros.runs.calibrate import calibrate
 from graph_slam_ros.simulation import simulate, write_bag
 from graph_slam_ros.slam import GraphSlam
 from graph_slam_ros.slam.calibration.parameters import QUANTITIES
@@ -27,6 +28,24 @@ def test_wrong_settings_of_a_recording_come_back_right(tmp_path, capsys):
     assert written["odometry"]["distance_factor"] == found["settings"]["odometry.distance_factor"]
     assert main(["calibrate", DEMO, "--out", str(file)]) != 0, "a file of somebody's is not replaced"
     assert read_parameters(file) == written
+
+
+def test_only_what_came_before_the_last_correction_is_replayed_again(tmp_path):
+    bag, late = str(tmp_path / "drive.mcap"), {"detections.offset_s": 0.2}
+    write_bag(simulate("warehouse", 3, aisles=2, aisle_m=10.0, laps=2), bag)
+    read = []
+
+    def counted(items, total):
+        read.append(0)
+        for one in items:
+            read[-1] += 1
+            yield one
+
+    done = calibrate(bag, late, progress=counted)
+    assert abs(float(done.settings["detections.offset_s"])) < 0.01
+    assert done.is_complete
+    assert done.rounds == len(read) == 2
+    assert 0.1 * read[0] < read[1] < 0.7 * read[0]
 
 
 def test_a_recording_without_landmarks_determines_nothing_and_says_so(tmp_path, capsys):

@@ -23,12 +23,14 @@ def drives(seed):
 
 
 def parameter_nees(slam, truth):
-    """The normalised squared error of the four parameters by the last trial fit."""
+    """The normalised squared error of the four parameters by the last trial fit; that of those in use, and how many."""
     fit, _ = slam.trial_fit()
     found = slam._frontend.corrections.found
     used = np.array([found.get((p.source, p.name), 0.0) for p in fit.parameters])
-    error = used + fit.values - np.array([truth[p.name] for p in fit.parameters])
-    return float(error @ np.linalg.solve(fit.covariance, error))
+    error = used - np.array([truth[p.name] for p in fit.parameters])
+    every, k = error + fit.values, np.flatnonzero(used)
+    of_used = error[k] @ np.linalg.solve(fit.covariance[np.ix_(k, k)], error[k])
+    return float(every @ np.linalg.solve(fit.covariance, every)), float(of_used), len(k)
 
 
 def pose_errors(slam, truth):
@@ -51,10 +53,18 @@ def test_what_calibration_finds_is_as_uncertain_as_it_says():
         calibrated.append(pose_errors(slam, wrong_truth))
         of_parameters.append(parameter_nees(slam, truth))
     (known_m, known_nees), (calibrated_m, calibrated_nees) = np.mean(known, axis=0), np.mean(calibrated, axis=0)
-    nees = {"parameters": np.mean(of_parameters), "pose_known": known_nees, "pose_calibrated": calibrated_nees}
+    nees_of_all, nees_of_used, used = np.array(of_parameters).T
+    nees = {
+        "parameters": np.mean(nees_of_all),
+        "used": nees_of_used.sum() / used.sum(),
+        "pose_known": known_nees,
+        "pose_calibrated": calibrated_nees,
+    }
     tell("calibration_nees", tried=SEEDS, worst={**nees, "error_over_known": calibrated_m / known_m})
     low, high = chi2.ppf([0.0005, 0.9995], 4 * SEEDS) / SEEDS
-    assert low < np.mean(of_parameters) < high
+    assert low < np.mean(nees_of_all) < high
+    low, high = chi2.ppf([0.0005, 0.9995], used.sum()) / used.sum()
+    assert low < nees["used"] < high
     low, high = chi2.ppf([0.0005, 0.9995], 3 * SEEDS) / SEEDS
     assert low < known_nees < high
     if SEEDS > 1:  # one drive may be either
