@@ -15,9 +15,9 @@ from graph_slam_ros.check.finding import Finding
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.messages.inputs import recorded_uses
 from graph_slam_ros.messages.survey import with_survey
-from graph_slam_ros.recordings.bag import open_bag
+from graph_slam_ros.recordings.bag import Bag, open_bag
 from graph_slam_ros.recordings.contents import recording_of
-from graph_slam_ros.runs.replay import END, RecordedRuns, choose_inputs
+from graph_slam_ros.runs.replay import END, Inputs, RecordedRuns, choose_inputs
 from graph_slam_ros.runs.suggestion import Suggestion
 from graph_slam_ros.runs.tables import account
 from graph_slam_ros.slam import Config, Counters, GraphSlam
@@ -80,14 +80,9 @@ def calibrate(
     GraphSlamError
         The recording or an input cannot be used, or has no keyframe.
     """
-    path, given = Path(path), {"calibrate.groups": "auto"} | dict(settings or {})
-    bag, found = open_bag(path), dict[str, float | str]()
+    path, bag, found = Path(path), open_bag(Path(path)), dict[str, float | str]()
     chosen = Suggestion(bag, recording_of(bag), path)
-    if not chosen.trouble and "inputs.names" not in given:
-        given = chosen.settings | given
-        odometry, landmarks = odometry or chosen.topics.get("odom"), landmarks or chosen.topics.get("detections")
-    config = _config(given)
-    inputs = choose_inputs(bag, config, odometry, landmarks)
+    config, inputs = _inputs(bag, chosen, {"calibrate.groups": "auto"} | dict(settings or {}), odometry, landmarks)
     warmup(dimensions=config.world.dimensions)
     total = sum(bag.topics[topic].count for topic in inputs.by_topic())
     report: Mapping[str, Any] = {"settings": {"": 0.0}}
@@ -116,14 +111,34 @@ def calibrate(
             rounds, again = rounds + 1, config.changed(found)
             runs = progress(RecordedRuns(bag, inputs, again, Counters()), round(part * total))
             begun = _replayed(runs, again, slam.calibrated_since + 1)
-            if not begun.calibration_report["settings"] and not _is_less(_accepted(begun), accepted):
-                has_nothing_left = True
+            if has_nothing_left := _leaves_nothing(begun, accepted):
                 break
     parameters = report["parameters"] or ([] if refused else list(_undriven(config, len(slam.keyframes))))
-    losses, warnings = list(dict.fromkeys(bag.losses)), list(dict.fromkeys(bag.warnings))
     command = chosen.command(found | dict(settings or {}) | found)
     complete = (has_nothing_left or not report["settings"]) and not refused
-    return Calibrated(found, parameters, command, rounds, complete, refused, fault, losses, warnings)
+    notes = _once(bag.losses), _once(bag.warnings)
+    return Calibrated(found, parameters, command, rounds, complete, refused, fault, *notes)
+
+
+def _inputs(
+    bag: Bag, chosen: Suggestion, given: dict[str, Any], odometry: str | None, landmarks: str | None
+) -> tuple[Config, Inputs]:
+    """The configuration and the inputs that are given, or else suggested."""
+    if not chosen.trouble and "inputs.names" not in given:
+        given = chosen.settings | given
+        odometry, landmarks = odometry or chosen.topics.get("odom"), landmarks or chosen.topics.get("detections")
+    config = _config(given)
+    return config, choose_inputs(bag, config, odometry, landmarks)
+
+
+def _once(lines: Iterable[str]) -> list[str]:
+    """Return lines without repetitions."""
+    return list(dict.fromkeys(lines))
+
+
+def _leaves_nothing(slam: GraphSlam, accepted: tuple[int, int]) -> bool:
+    """Return whether a replay with corrections finds no others, and accepts at least as much."""
+    return not slam.calibration_report["settings"] and not _is_less(_accepted(slam), accepted)
 
 
 def _undriven(config: Config, keyframes: int) -> Iterator[dict[str, Any]]:

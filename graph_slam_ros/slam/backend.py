@@ -213,9 +213,8 @@ class Backend:
                 report = self.solver.optimize(everything)
             except Exception as error:
                 self._counters.count("noise_scale", type(error).__name__)
-                if self.noise.change(self.noise.neutral() | before, first_edge):
-                    self.solver.rebuild()
-                    report = self.solver.optimize(everything)
+                self.use_noise(before)
+                report = self.solver.optimize(everything)
                 break
         if report is not None:
             self.decisions.recalibrate()

@@ -38,7 +38,7 @@ from graph_slam_ros.slam.robust.odometry_hypotheses import (
     Stretch,
 )
 from graph_slam_ros.slam.slip_noise import SlipNoise
-from graph_slam_ros.slam.slip_review import Pair, Slip, covariance_of, revoke_slip, slipped_pairs
+from graph_slam_ros.slam.slip_review import Pair, Slip, View, covariance_of, revoke_slip, slipped_pairs
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array
 
@@ -72,17 +72,6 @@ class _Link:
         return (self.stamps_ns[1] - self.stamps_ns[0]) * 1e-9
 
 
-@dataclass(slots=True)
-class _View:
-    """The edges that were measured from one keyframe, their landmarks or classes, and the sum of their innovations."""
-
-    vertex: int
-    edges: list[int]
-    seen: list[int | str]
-    statistic: float = 0.0
-    numbers: int = 0
-
-
 class SlipDetector:
     """Detects slips, and keeps the edges of odometry in step with them.
 
@@ -108,7 +97,7 @@ class SlipDetector:
         self._space, self._config, self._backend, self._counters = space, odometry, backend, counters
         self._history, self._doubt = history, doubt
         self._links: deque[_Link] = deque(maxlen=_MOST_EDGES)
-        self._views: deque[_View] = deque(maxlen=_VIEWS + 1)
+        self._views: deque[View] = deque(maxlen=_VIEWS + 1)
         self._new: list[int] = []  # edges that came since the last check, whose innovation is not known yet
         self._replacing: set[int] = set()  # edges that replace others
         self._checked, self._allowed = -1, _BURST
@@ -151,7 +140,7 @@ class SlipDetector:
     def add_seen(self, edge: int, vertex: int, what: int | str) -> None:
         """Add an edge that was measured from a keyframe: of a landmark, by its vertex, or of another class."""
         if not self._views or self._views[-1].vertex < vertex:
-            self._views.append(_View(vertex, [], []))
+            self._views.append(View(vertex, [], []))
         view = next((one for one in reversed(self._views) if one.vertex == vertex), None)
         if view is not None:
             view.edges.append(edge)
@@ -258,7 +247,7 @@ class SlipDetector:
             compared.add_moved(k, there, self._config.jump_sigma_m, self._config.jump_sigma_rad)
         return compared.choice()
 
-    def _known_seen(self, view: _View, first: int) -> list[tuple[int, int | str]]:
+    def _known_seen(self, view: View, first: int) -> list[tuple[int, int | str]]:
         """Edges of a view of what was known at a keyframe, held back or not, and what they are of."""
         ledger = self._backend.ledger
         return [

@@ -54,6 +54,17 @@ class Slip:
         return f"odometry was in doubt from {since} to {until}: its {self.kind} was wrong ({why}); {outcome}"
 
 
+@dataclass(slots=True)
+class View:
+    """The edges that were measured from one keyframe, their landmarks or classes, and the sum of their innovations."""
+
+    vertex: int
+    edges: list[int]
+    seen: list[int | str]
+    statistic: float = 0.0
+    numbers: int = 0
+
+
 def revoke_slip(backend: Backend, pairs: Sequence[Pair], keyframe: int, noise_factor: float) -> bool:
     """Use odometry edges with their own noise again, if that is likelier given all measurements.
 

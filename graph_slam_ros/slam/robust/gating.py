@@ -14,10 +14,10 @@ from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.config.robust import RobustConfig
 from graph_slam_ros.graph import Graph, Loss
 from graph_slam_ros.graph.losses import weight_and_cost
-from graph_slam_ros.slam.robust.innovation import innovation, joint_innovations
+from graph_slam_ros.slam.robust.innovation import innovation, likely_together
 from graph_slam_ros.slam.robust.landmark_support import LandmarkSupport, landmark_of
 from graph_slam_ros.slam.robust.ledger import FINAL, Ledger, Reason, Verdict
-from graph_slam_ros.slam.robust.tightness import TIGHTEST, TYPICAL, Tightness
+from graph_slam_ros.slam.robust.tightness import TIGHTEST, TYPICAL, Tightness, chi2_per_dof
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Index
 
@@ -189,35 +189,11 @@ class OutlierGate:
 
         Their costs follow from their joint covariance, so nothing is solved for edges that stay out.
         """
-        nearest = self._nearest(self._config.retests)
-        costs = {edge: self._innovation(edge) for edge in nearest}
-        group = self._affordable(costs)
-        if not group:
-            return []
-        try:
-            white, covariance, edge_of = joint_innovations(self._graph, self._solver, group)
-        except (np.linalg.LinAlgError, ValueError):
-            return []
-
-        def cost_of(edges: Sequence[int]) -> float:
-            rows = np.flatnonzero(np.isin(edge_of, edges))
-            return float(white[rows] @ np.linalg.solve(covariance[np.ix_(rows, rows)], white[rows]))
-
-        while len(group) >= _AGREEING:
-            together = cost_of(group)
-            excess = {
-                edge: together - cost_of([other for other in group if other != edge]) - self.most_cost([edge])
-                for edge in group
-            }
-            worst = max(group, key=excess.__getitem__)
-            if excess[worst] <= 0.0:
-                if together > self.most_cost(group):
-                    return []
-                for edge in group:
-                    self._readmit(edge, keyframe, costs[edge])
-                return group
-            group.remove(worst)
-        return []
+        costs = {edge: self._innovation(edge) for edge in self._nearest(self._config.retests)}
+        group = likely_together(self._graph, self._solver, self._affordable(costs), self.most_cost, _AGREEING)
+        for edge in group:
+            self._readmit(edge, keyframe, costs[edge])
+        return group
 
     def _affordable(self, costs: Mapping[int, float]) -> list[int]:
         """Return the edges of which none costs more than all may together: none, or at least two."""
@@ -411,18 +387,10 @@ class OutlierGate:
         if self.is_calibrated:
             # estimated noise allows for errors that are alike, so residuals are smaller: that says nothing of odometry
             is_stated = self._config.noise_scale == "configured"
-            noise_ratio = self._chi2_per_dof(freedom) if is_stated else 1.0
+            noise_ratio = chi2_per_dof(self._solver, freedom) if is_stated else 1.0
             self._gate_scale = min(factor, max(TIGHTEST, factor * noise_ratio))
         edges = np.concatenate((inside, ledger.outside))
         ledger.threshold.values[edges] = self._limits(edges, ledger.numbers.values[edges])
-
-    def _chi2_per_dof(self, freedom: int) -> float:
-        """Chi2 per degree of freedom, without parallel odometries: where these are alike it says nothing of noise."""
-        report = self._solver.evaluate()
-        parallel = report.classes.get("parallel")
-        if parallel is None or freedom - parallel.residuals < TYPICAL:
-            return report.chi2_final / freedom
-        return (report.chi2_final - parallel.chi2) / (freedom - parallel.residuals)
 
 
 def _judged(ledger: Ledger, edge: int) -> tuple[float, float]:

@@ -1,6 +1,6 @@
 """The innovation: the difference between a measurement and its prediction, normalised by both covariances."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 
 import numpy as np
@@ -69,6 +69,40 @@ def joint_innovations(graph: Graph, solver: Solver, edges: Sequence[int]) -> tup
         edge_of += [edge] * len(residual)
     by_step = np.vstack(rows)
     return np.concatenate(residuals), by_step @ joint @ by_step.T + np.eye(len(edge_of)), np.array(edge_of)
+
+
+def likely_together(
+    graph: Graph, solver: Solver, edges: Sequence[int], most_cost: Callable[[Sequence[int]], float], least: int
+) -> list[int]:
+    """Return those of some edges of which each is likely given the others: none, or at least so many.
+
+    The edge that costs most beyond what it may is left out, until there is none. Costs are by the joint covariance.
+
+    Parameters
+    ----------
+    most_cost : what some edges may cost together
+    """
+    group = list(edges)
+    if len(group) < least:
+        return []
+    try:
+        white, covariance, edge_of = joint_innovations(graph, solver, group)
+    except (np.linalg.LinAlgError, ValueError):
+        return []
+
+    def cost_of(some: Sequence[int]) -> float:
+        rows = np.flatnonzero(np.isin(edge_of, some))
+        return float(white[rows] @ np.linalg.solve(covariance[np.ix_(rows, rows)], white[rows]))
+
+    while len(group) >= least:
+        together = cost_of(group)
+        without = {edge: cost_of([other for other in group if other != edge]) for edge in group}
+        excess = {edge: together - without[edge] - most_cost([edge]) for edge in group}
+        worst = max(group, key=excess.__getitem__)
+        if excess[worst] <= 0.0:
+            return group if together <= most_cost(group) else []
+        group.remove(worst)
+    return []
 
 
 def _least_cost(graph: Graph, x: Array, edge: Edge, joint: Array) -> float:
