@@ -167,7 +167,7 @@ def _over_confident(c: Columns, noise: NoiseScale, factor: float, limit: float) 
     text += f"; a run allows for {LARGEST:g} times"
     own = next((one for one in c.config.sources if one.name == noise.source and one.use == "odometry"), None)
     settings = (f"{own.name}.sigma_factor={own.sigma_factor * factor:.2g}",) if own else ()
-    return Finding(code, "warning", factor, limit, "times", text, topic, settings=settings)
+    return Finding(code, "note", factor, limit, "times", text, topic, settings=settings)
 
 
 def _fitted(c: Columns, one: Fitted) -> Iterator[Finding]:
