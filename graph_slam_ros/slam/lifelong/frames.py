@@ -18,7 +18,7 @@ from graph_slam_ros.typing import Array, Index, Numbers
 LONGEST = 20  # keyframes of a frame
 _SIGMA, _LEAST_M = 0.05, 0.05  # standard deviation of a sighting: by its distance, and at least
 _ARM_M, _SHARE = 5.0, 0.02  # by the base alone: points so far from the frame, with so much of the weight
-_ROUNDS, _OFF = 6, 3.0  # of the fit; standard deviations from which on a landmark loses its say
+_ROUNDS, _OFF = 6, 3.0  # of the fit; a landmark that is farther off, in standard deviations, counts less
 
 Rows = NDArray[np.void]
 
@@ -64,7 +64,7 @@ class Frames:
         frame, at = np.repeat(np.arange(count), self.rows["count"]), np.searchsorted(ids, self.members["landmark"])
         is_there = np.isin(self.members["landmark"], ids)
         frame, known, now = frame[is_there], self.members[is_there], points[at[is_there]]
-        # The base has a say, too: as if landmarks at these arms had moved with it.
+        # The base counts, too: as if landmarks at these arms had moved with it.
         arms = _ARM_M * np.concatenate((np.eye(d), -np.eye(d)))
         of_arms, share = np.repeat(np.arange(count), len(arms)), np.bincount(frame, known["weight"], minlength=count)
         by_base = np.tile(arms, (count, 1))

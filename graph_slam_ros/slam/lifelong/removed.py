@@ -1,4 +1,4 @@
-"""Keyframes that left the map: each is told relative to a frame or another pose, its base, and moves with it."""
+"""Keyframes that left the map: each is stored relative to a frame or another pose, its base, and moves with it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
