@@ -34,6 +34,7 @@ from vision_msgs.msg import Detection3DArray
 
 from graph_slam_ros.messages import topics
 from graph_slam_ros.messages.message_class import message_class
+from graph_slam_ros.runs.folder import was_saved_whole
 from graph_slam_ros.runs.replay import replay
 
 RESULTS = ("graph.g2o", "path.tum", "sightings.tum", "landmarks.csv", "ledger.csv", "ledger_changes.csv")
@@ -299,6 +300,16 @@ class Robot:
     def save(self):
         return self.call("save")
 
+    def save_all(self, run):
+        """Save until the results are of all that was sent: what comes after a save is in the journal alone."""
+
+        def is_whole():
+            assert self.save().success
+            self.settle()
+            return was_saved_whole(run)
+
+        until(is_whole, self.spin, "save of everything")
+
     def close(self):
         self._is_closed = True
         self._hears.join()
@@ -384,3 +395,10 @@ def node(*parameters, **options):
         if started.is_alive:
             started.process.kill()
             started.ended()
+
+
+def finish(n, r):
+    """Stop a node when it has processed all that has come; a busy one would leave the rest to its next start."""
+    r.settle()
+    r.call("save", patience_s=60.0)  # answered in turn, so after all that came before
+    assert n.stop()[0] == 0

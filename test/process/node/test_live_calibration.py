@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from live_drive import TAGS, Drive
-from live_nodes import ENVIRONMENT, node, own_domain, replayed, results, robot, until
+from live_nodes import ENVIRONMENT, finish, node, own_domain, replayed, results, robot, until
 from messages import detection, detections, pose
 
 from graph_slam_ros.lie import se2
@@ -48,7 +48,7 @@ def test_a_sensor_that_is_turned_is_corrected_while_the_robot_drives(tmp_path):
         )
         heard = [s for m in r.heard["events"] for s in m.status if s.name.endswith("calibration")]
         assert any(s.message.startswith("corrected yaw of detections") for s in heard)
-        assert n.stop()[0] == 0
+        finish(n, r)
     assert replayed(tmp_path / "run", tmp_path) == results(tmp_path / "run")
 
 

@@ -5,7 +5,7 @@ import signal
 
 import pytest
 from live_drive import Drive
-from live_nodes import ENVIRONMENT, node, own_domain, replayed, results, robot
+from live_nodes import ENVIRONMENT, finish, node, own_domain, replayed, results, robot
 from messages import imu, quaternion
 from sensor_msgs.msg import Imu
 
@@ -67,7 +67,7 @@ def test_the_gyro_is_used_and_its_bias_is_gone_on_with_after_a_kill(tmp_path):
         r.wait_for_node()
         r.until_it_says("OK", spin=lambda s: (go(r, drive, gyro, 1), r.spin(s)))
         after = told(r)
-        assert n.stop()[0] == 0
+        finish(n, r)
     assert "the last run was never ended: going on in its map" in n.said
     (b0, s0), (b1, s1) = (map(float, text.split()[2:5:2]) for text in (before, after))
     assert math.isclose(b1, b0, abs_tol=3.0 * s0), (before, after)

@@ -136,7 +136,7 @@ def test_P10_what_does_not_fit_into_the_queue_is_refused_before_it_is_accepted_a
             r.until_it_says("DEGRADED", "messages refused: the queue is full", spin=drive.pace(r))
             assert run._worker.waiting <= 21
         r.until_it_says("OK", spin=drive.pace(r))
-        assert r.save().success
+        r.save_all(tmp_path / "run")
         assert results(tmp_path / "run") == replayed(tmp_path / "run", tmp_path)
 
 
@@ -148,7 +148,7 @@ def test_P17_a_parameter_that_is_set_during_a_solve_takes_effect_after_it(tmp_pa
             assert r.set({"keyframes.min_distance_m": 2.5}) == (True, "")
             assert session.slam.config.keyframes.min_distance_m < 2.5
         until(lambda: session.slam.config.keyframes.min_distance_m == 2.5, drive.pace(r), "the new value")
-        assert r.save().success
+        r.save_all(tmp_path / "run")
         assert results(tmp_path / "run") == replayed(tmp_path / "run", tmp_path)
 
 
@@ -198,7 +198,7 @@ def test_P7_above_its_limit_of_memory_closures_are_refused_and_counted_and_below
         until(lambda: not backend.spares_memory, drive.pace(r), "second looks")
         run._ingest.receive([closure], b"")
         assert run.counters["/closures", "memory"] == 1
-        assert r.save().success
+        r.save_all(tmp_path / "run")
         assert results(tmp_path / "run") == replayed(tmp_path / "run", tmp_path)
 
 

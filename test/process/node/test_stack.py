@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from live_drive import TAGS, Drive, distance, earlier_run
-from live_nodes import ENVIRONMENT, lenient, node, own_domain, replayed, results, robot, until
+from live_nodes import ENVIRONMENT, finish, lenient, node, own_domain, replayed, results, robot, until
 from nav_msgs.msg import Path
 from places import ROOT
 from rclpy.qos import ReliabilityPolicy
@@ -200,7 +200,7 @@ def test_after_eight_seconds_of_detections_at_1e8_m_every_solve_succeeds_as_befo
         drive.go(r, 60)
         r.until_it_says("OK", spin=drive.pace(r))
         assert r.save().success
-        assert n.stop()[0] == 0
+        finish(n, r)
     record = json.loads((run / "run.json").read_text())
     assert record["counters"]["detections"]["beyond_max_distance"] == 27
     assert "solver" not in record["counters"]

@@ -14,7 +14,20 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from live_drive import TAGS, Drive, earlier_run
-from live_nodes import ENVIRONMENT, MODULE, lenient, node, often, own_domain, replayed, results, robot, server, until
+from live_nodes import (
+    ENVIRONMENT,
+    MODULE,
+    finish,
+    lenient,
+    node,
+    often,
+    own_domain,
+    replayed,
+    results,
+    robot,
+    server,
+    until,
+)
 from messages import detection, detections, pose
 from rcl_interfaces.msg import Parameter, ParameterValue
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
@@ -342,7 +355,7 @@ def test_P2_P12_killed_it_goes_on_in_its_map_and_where_it_was_if_odometry_goes_o
         drive.sees = True
         r.until_it_says("OK", spin=drive.pace(r))
         until(lambda: drive.off_by(r) < 0.5, drive.pace(r), "the pose of now")
-        assert n.stop()[0] == 0
+        finish(n, r)
     assert "the last run was never ended: going on in its map" in n.said
     assert is_repeated(tmp_path / "run", tmp_path)
     assert not is_cut_off(tmp_path / "run")
@@ -365,7 +378,7 @@ def test_P2_P12_killed_with_its_odometry_it_claims_no_pose_until_a_landmark_is_r
         drive.sees = True
         until(lambda: r.heard["pose"] and r.heard["tf"], drive.pace(r), "place in the map")
         until(lambda: drive.off_by(r) < 0.5, drive.pace(r), "the pose of now")
-        assert n.stop()[0] == 0
+        finish(n, r)
     assert is_repeated(tmp_path / "run", tmp_path)
 
 
@@ -440,7 +453,7 @@ def test_P15_of_parameters_that_are_set_together_all_or_none_change_and_the_run_
         r.until_it_says("OK", spin=drive.pace(r))
         r.settle()
         assert drive.off_by(r) < 1.0
-        assert n.stop()[0] == 0
+        finish(n, r)
     assert "Traceback" not in n.said
     assert [m.event for m in accepted(tmp_path / "run") if isinstance(m, Control)].count("set") == done + 1
     assert is_repeated(tmp_path / "run", tmp_path)
@@ -518,7 +531,7 @@ def test_P12_of_a_loaded_map_nothing_is_claimed_until_a_landmark_is_recognised(t
         r.until_it_says("OK", spin=elsewhere.pace(r))
         until(lambda: elsewhere.off_by(r) < 0.5, elsewhere.pace(r), "the pose of now")
         assert r.graph()["landmarks"] == len(TAGS)
-        assert n.stop()[0] == 0
+        finish(n, r)
     assert is_repeated(tmp_path / "run", tmp_path)
     if loaded == "frozen":
         frozen, since = (read_map(tmp_path / name, []) for name in ("frozen", "run"))
@@ -535,7 +548,7 @@ def test_X9_reset_saves_first_and_of_what_it_saved_the_last_five_are_kept(tmp_pa
             until(lambda: len(r.heard["pose"]) > 3, drive.pace(r), "poses")
             answer = r.call("reset")
             assert (answer.success, answer.message) == (True, str(tmp_path / "run"))
-        assert n.stop()[0] == 0
+        finish(n, r)
     kept = {int(run.name.removeprefix("run-")): run for run in tmp_path.glob("run-*")}
     assert sorted(kept) == [3, 4, 5, 6, 7]
     for run in kept.values():
@@ -565,7 +578,7 @@ def test_while_it_is_paused_it_takes_nothing_and_its_transform_goes_on(tmp_path)
         r.until_it_says("OK", spin=drive.pace(r))
         assert r.graph()["keyframes"] > before
         assert r.graph()["segments"] == 1, "odometry of later tells what was missed"
-        assert n.stop()[0] == 0
+        finish(n, r)
     counted = numbers(tmp_path / "run")["counters"]
     assert counted["odom"]["paused"] > 30
     assert counted["detections"]["paused"] > 10
@@ -602,7 +615,7 @@ def test_closures_bend_the_path_until_they_are_cleared_and_optimize_says_how_muc
         r.until_it_says("OK", spin=drive.pace(r))
         assert answer.success
         assert 20 <= int(answer.message.removesuffix(" keyframes")) <= r.graph()["keyframes"]
-        assert n.stop()[0] == 0
+        finish(n, r)
     assert is_repeated(tmp_path / "run", tmp_path)
 
 
@@ -627,5 +640,5 @@ def test_a_pose_that_somebody_gives_begins_a_segment_or_is_weighed(tmp_path, use
         until(lambda: drive.off_by(r) < 0.4, drive.pace(r), "pose where it was told to be")
         r.until_it_says("OK", spin=drive.pace(r))
         assert r.graph()["segments"] == segments
-        assert n.stop()[0] == 0
+        finish(n, r)
     assert is_repeated(tmp_path / "run", tmp_path)

@@ -9,7 +9,7 @@ pytest.importorskip("rclpy", reason="needs ROS 2")
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from live_drive import Drive
-from live_nodes import node, replayed, results, robot, until
+from live_nodes import finish, node, replayed, results, robot, until
 
 
 def is_repeated(run, tmp_path):
@@ -50,6 +50,6 @@ def test_a_robot_that_is_elsewhere_is_degraded_until_it_is_found(tmp_path, how):
         assert r.graph()["segments"] == 2
         told = [s for m in r.heard["events"] for s in m.status if s.name == "graph_slam: displaced"]
         assert any("segment" in {v.key for v in s.values} for s in told)
-        assert n.stop()[0] == 0
+        finish(n, r)
     assert is_repeated(tmp_path / "run", tmp_path)
     assert math.isfinite(drive.off_by(r))

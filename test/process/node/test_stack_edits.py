@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 from live_drive import Drive, distance, earlier_run
-from live_nodes import ENVIRONMENT, node, own_domain, replayed, results, robot, until
+from live_nodes import ENVIRONMENT, finish, node, own_domain, replayed, results, robot, until
 from std_msgs.msg import String
 
 from graph_slam_ros.cli import main
@@ -60,7 +60,7 @@ def test_the_map_is_held_and_edited_while_the_node_runs_and_the_run_repeats(tmp_
         until(gone, r.spin, "the landmark to be removed")
         drive.go(r, 30, every=2)
         r.settle()
-        assert n.stop()[0] == 0
+        finish(n, r)
     assert "neither 'edge ID' nor 'landmark NAME'" in n.said
     assert counters(tmp_path / "run")["edit"] == {"removed": 1, "unknown_landmark": 1}
     assert replayed(tmp_path / "run", tmp_path) == results(tmp_path / "run")
@@ -105,7 +105,7 @@ def test_a_map_is_saved_by_name_and_loaded_with_the_pose_of_the_robot(tmp_path):
         r.heard["pose"].clear()
         r.heard["tf"].clear()
         located(r, drive)
-        assert n.stop()[0] == 0
+        finish(n, r)
     assert replayed(tmp_path / "run", tmp_path) == results(tmp_path / "run")
     assert not (tmp_path / "run-3").exists()
 
@@ -182,7 +182,7 @@ def test_a_node_that_goes_on_in_a_map_keeps_every_edit(tmp_path):
         drive.go(r, 60, every=3)
         r.settle()
         assert {"gate", "north", "east", "south", "west"} == places(r.heard["landmarks_estimate"][-1]).keys()
-        assert n.stop()[0] == 0
+        finish(n, r)
     after = read_map(tmp_path / "run", [])
     assert after.edits == start.edits
     assert len(after.edits) == 10 and len(after.drives) == 2

@@ -6,7 +6,7 @@ import time
 
 import pytest
 from live_drive import TAGS, Drive
-from live_nodes import ENVIRONMENT, node, often, own_domain, replayed, results, robot, until
+from live_nodes import ENVIRONMENT, finish, node, often, own_domain, replayed, results, robot, until
 from rclpy.clock import ClockType, JumpThreshold
 from rclpy.context import Context
 from rclpy.duration import Duration
@@ -93,7 +93,7 @@ def test_B7_when_the_clock_jumps_back_the_map_stays_a_segment_begins_and_transfo
         assert played.drive.off_by(r) < 1.0, "still in the same map"
         r.settle()
         after = stamps(r)
-        assert n.stop()[0] == 0
+        finish(n, r)
     assert is_ascending(before)
     assert is_ascending(after)
     assert len(after) > 10
@@ -123,7 +123,7 @@ def test_messages_of_before_the_jump_that_come_after_it_hold_nothing_up(tmp_path
         until(lambda: len(stamps(r)) > 5, played.step, "transforms after the jump")
         assert played.drive.stamp_ns < begin_ns + 30 * NS, "at once"
         assert max(stamps(r)) < played.drive.stamp_ns + NS
-        assert n.stop()[0] == 0
+        finish(n, r)
     assert numbers(tmp_path / "run")["segments"] == 2
     assert replayed(tmp_path / "run", tmp_path) == results(tmp_path / "run")
 
@@ -171,7 +171,7 @@ def test_B7_where_no_clock_tells_that_stamps_have_gone_back_odometry_does(tmp_pa
         assert drive.off_by(r) < 1.0, "still in the same map"
         assert is_ascending(stamps(r))
         assert begin_ns < min(stamps(r)) < max(stamps(r)) < drive.stamp_ns + NS
-        assert n.stop()[0] == 0
+        finish(n, r)
     assert replayed(tmp_path / "run", tmp_path) == results(tmp_path / "run")
 
 
@@ -189,7 +189,7 @@ def test_B14_where_another_clock_is_used_a_segment_begins_and_the_map_stays(tmp_
         until(lambda: len(r.heard["pose"]) > 10, played.step, "poses by the other clock")
         assert r.graph()["segments"] == 2
         assert played.drive.off_by(r) < 1.0, "still in the same map"
-        assert n.stop()[0] == 0
+        finish(n, r)
     assert replayed(tmp_path / "run", tmp_path) == results(tmp_path / "run")
 
 
@@ -229,7 +229,7 @@ def test_B7_where_that_is_asked_for_a_jump_back_saves_the_run_and_begins_another
         played.drive.stamp_ns -= 60 * NS
         until((tmp_path / "run-1" / "path.tum").exists, played.step, "new run")
         r.until_it_says("OK", spin=played.step)
-        assert n.stop()[0] == 0
+        finish(n, r)
     earlier, later = numbers(tmp_path / "run-1"), numbers(tmp_path / "run")
     assert earlier["keyframes"] >= before
     assert (earlier["segments"], later["segments"]) == (1, 1)
@@ -272,7 +272,7 @@ def test_B6_odometry_from_the_future_is_refused_and_holds_no_transform_up(tmp_pa
         until(lambda: len(stamps(r)) > 5 and len(r.heard["odometry"]) > 5, drive.pace(r), "transforms and odometry")
         assert max(stamps(r)) < drive.stamp_ns + NS
         r.settle()
-        assert n.stop()[0] == 0
+        finish(n, r)
     told = numbers(tmp_path / "run")
     assert told["counters"]["odom"] == {"future": 1}
     assert "odom: future, ahead of the clock: is use_sim_time to be set" in n.said
@@ -303,7 +303,7 @@ def test_B25_stamps_at_both_ends_of_time_count_and_the_robot_goes_on_by_a_clock_
         r.until_it_says("OK", spin=played.step)
         assert r.save().success
         assert drive.off_by(r) < 1.0
-        assert n.stop()[0] == 0
+        finish(n, r)
         assert "Traceback" not in n.said
     counters = numbers(tmp_path / "run")["counters"]
     assert counters["odom"]["late"] == 2
@@ -347,7 +347,7 @@ def test_B11_a_recording_that_is_played_again_and_again_adds_segments_to_one_map
         r.settle()
         assert r.graph()["segments"] == loops
         assert played.drive.off_by(r) < 1.0
-        assert n.stop()[0] == 0
+        finish(n, r)
     told = numbers(tmp_path / "run")
     assert (told["segments"], told["landmarks"]) == (loops, len(TAGS))
     assert told["keyframes"] > 30 * loops
