@@ -253,7 +253,7 @@ def _shared_kernels() -> list[_Kernel]:
         (indices.joined, (index, index)),
         (indices.lengthened, (index, number)),
         (symbolic.mark, (tree, index)),
-        (numeric.clear_block, (tree, number)),
+        (numeric.clear_block, (*[types.int64[:, ::1]] * 3, number, *[types.float64[::1]] * 2)),
         (numeric.accept_steps, (tree, index)),
     ]
 
@@ -280,6 +280,7 @@ def _number_kernels() -> list[_Kernel]:
         (advance.advance, (index, index, index, index, types.boolean, index, index, types.float64[::1], *[real] * 4)),
         (covariance.marginals, (tree, index)),
         (covariance.joint, (tree, index)),
+        (covariance.among, (tree, types.int64[:, ::1])),
     ]
 
 

@@ -102,13 +102,14 @@ class InfluenceModel:
     def without(self, edges: Sequence[int]) -> Influences:
         """The influence of edges of the problem: what changes without each of them."""
         found, place = self._empty(edges)
-        known = self._solver.edge_covariances()
+        known = self._solver.cross_covariances()
         plain = Losses(self._curved, {})
         for block in linearize(self._curved, self._values, rows_of(self._curved, found.edges), plain):
             rows = block.table.at(block.rows)
             block.residual[:] /= self._along[rows.ids, None] ** 2
             ends = rows.vertices
-            _fill(found, place[rows.ids], block, known.among(ends), known.with_vertex(self._last, ends), -1.0)
+            joint, of_last = self._solver.edge_marginals(ends), known.with_vertex(self._last, ends)
+            _fill(found, place[rows.ids], block, joint, of_last, -1.0)
             found.cost[place[rows.ids]] += np.sum(block.residual**2, axis=1) - self._cost[rows.ids]
         return found
 

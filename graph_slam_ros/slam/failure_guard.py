@@ -54,7 +54,7 @@ class FailureGuard:
     def solve(self, work: Callable[[], Result], keyframe: int) -> Result | None:
         """Solve by ``work`` and return its result; None if it fails, or if its result is impossible."""
         try:
-            return self._done(lambda: self._damped(work))
+            return self._done(work, again=True)
         except Exception as error:
             self._fail(error)
         if self._in_a_row == 1 or self._in_a_row.bit_count() > 1:  # then at 2, 4, 8, ...: it costs some solves
@@ -80,20 +80,17 @@ class FailureGuard:
         with suppress(Exception):  # e.g. no memory for it: the estimate is good without
             self._solver.rebuild()
 
-    def _damped(self, work: Callable[[], Result]) -> Result:
-        """Run the work. If its steps overshoot, repeat it after a damped solve of everything."""
+    def _done(self, work: Callable[[], Result], *, again: bool = False) -> Result:
+        """Run the work. If its steps overshoot, it may be repeated, once, after a damped solve of everything."""
         done = work()
         try:
             self._refuse_absurd()
         except DivergedError:
+            if not again:
+                raise
             self.go_back()
             self._solver.optimize()
-            done = work()
-        return done
-
-    def _done(self, work: Callable[[], Result]) -> Result:
-        done = work()
-        self._refuse_absurd()
+            return self._done(work)
         self.note_good()
         return done
 

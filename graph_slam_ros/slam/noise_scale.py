@@ -195,9 +195,8 @@ class _Block:
         self.weight = np.array([weight_and_cost(losses.kind[code], losses.scale[code], one)[0] for one in chi2])
         self.covariance = np.linalg.inv(np.swapaxes(roots, 1, 2) @ roots)
         self.sampled = np.arange(0, len(rows), max(1, -(-len(rows) // _MOST_SAMPLED)))
-        joint = [solver.joint_marginal(self.ends[k]) for k in self.sampled]
-        of = self._jacobian
-        self.hat = np.stack([of[k] @ cov @ of[k].T for k, cov in zip(self.sampled, joint, strict=True)])
+        of = self._jacobian[self.sampled]
+        self.hat = of @ solver.edge_marginals(self.ends[self.sampled]) @ np.swapaxes(of, 1, 2)
 
     def add_to(self, total: "_Sums", axes: Array, factor: float, passes: Sequence[Index]) -> None:
         """Add a part of the residuals: chi2 with the configured noise, the rest with the noise as it is scaled now."""

@@ -10,6 +10,7 @@ from graph_slam_ros.solver.clique_tree.indices import ascending, chosen
 from graph_slam_ros.solver.clique_tree.storage import (
     CLIQUE,
     DOF,
+    FREE,
     FRONT_DOF,
     FRONTALS,
     FULL_DOF,
@@ -29,28 +30,14 @@ from graph_slam_ros.typing import Array, Index
 
 @kernel
 def marginals(t: Tree, vertices: Index) -> Array:
-    """Return the covariances of vertices, (dof, dof) each, one after the other.
-
-    Each clique's covariance follows from its parent's, from the root down, once for all vertices.
-    """
+    """Return the covariances of vertices, (dof, dof) each, one after the other."""
     vertex, clique, members = t.vertex, t.clique, t.members
     cliques = mark(t, vertices)[::-1]
-    start, size = np.zeros(len(cliques) + 1, np.int64), 0
-    for k in range(len(cliques)):
-        clique[cliques[k], MARK] = k
-        start[k + 1] = start[k] + clique[cliques[k], FULL_DOF] ** 2
+    start, pool = _of_cliques(t, cliques)
+    size = 0
     for v in vertices:
         size += vertex[v, DOF] ** 2
-    pool, out = np.empty(start[-1]), np.empty(size)
-    for k in range(len(cliques)):
-        c = cliques[k]
-        full = clique[c, FULL_DOF]
-        covariance = pool[start[k] : start[k + 1]].reshape(full, full)
-        if clique[c, PARENT] != NOTHING:
-            above = clique[clique[c, PARENT], MARK]
-            wide = clique[clique[c, PARENT], FULL_DOF]
-            _inherit(t, c, pool[start[above] : start[above + 1]].reshape(wide, wide), covariance)
-        _complete(front_of(clique, t.fronts, c), clique[c, FRONT_DOF], covariance)
+    out = np.empty(size)
     size = 0
     for v in vertices:
         c, dof = vertex[v, CLIQUE], vertex[v, DOF]
@@ -63,6 +50,68 @@ def marginals(t: Tree, vertices: Index) -> Array:
     for c in cliques:
         clique[c, MARK] = 0
     return out
+
+
+@kernel
+def among(t: Tree, ends: Index) -> Array:
+    """Return joint covariances (n, D, D) of the vertices (n, k) of edges of one type; zero for held vertices.
+
+    All vertices of an edge are in the clique of the one that is eliminated first.
+    """
+    vertex, clique, members = t.vertex, t.clique, t.members
+    n, count = ends.shape
+    every = ends.ravel()
+    cliques = mark(t, every[vertex[every, FREE] == 1])[::-1]
+    start, pool = _of_cliques(t, cliques)
+    width = 0
+    for s in range(count):
+        width += vertex[ends[0, s], DOF]
+    out, place = np.zeros((n, width, width)), np.empty(width, np.int64)
+    for k in range(n):
+        lowest, at = NOTHING, 0
+        for v in ends[k]:
+            if vertex[v, FREE]:
+                lowest = max(lowest, clique[vertex[v, CLIQUE], MARK])
+        if lowest == NOTHING:
+            continue
+        for v in ends[k]:
+            first = _place_in(vertex, clique, members, cliques[lowest], v) if vertex[v, FREE] else NOTHING
+            for i in range(vertex[v, DOF]):
+                place[at] = first + i if vertex[v, FREE] else NOTHING
+                at += 1
+        full = clique[cliques[lowest], FULL_DOF]
+        covariance = pool[start[lowest] : start[lowest + 1]].reshape(full, full)
+        for i in range(width):
+            for j in range(width):
+                if place[i] != NOTHING and place[j] != NOTHING:
+                    out[k, i, j] = covariance[place[i], place[j]]
+    for c in cliques:
+        clique[c, MARK] = 0
+    return out
+
+
+@kernel
+def _of_cliques(t: Tree, cliques: Index) -> tuple[Index, Array]:
+    """Return where each clique's covariance begins, and all of them; the cliques' marks count them until reset.
+
+    Each clique's covariance follows from its parent's, from the root down, once for all vertices.
+    """
+    clique = t.clique
+    start = np.zeros(len(cliques) + 1, np.int64)
+    for k in range(len(cliques)):
+        clique[cliques[k], MARK] = k
+        start[k + 1] = start[k] + clique[cliques[k], FULL_DOF] ** 2
+    pool = np.empty(start[-1])
+    for k in range(len(cliques)):
+        c = cliques[k]
+        full = clique[c, FULL_DOF]
+        covariance = pool[start[k] : start[k + 1]].reshape(full, full)
+        if clique[c, PARENT] != NOTHING:
+            above = clique[clique[c, PARENT], MARK]
+            wide = clique[clique[c, PARENT], FULL_DOF]
+            _inherit(t, c, pool[start[above] : start[above + 1]].reshape(wide, wide), covariance)
+        _complete(front_of(clique, t.fronts, c), clique[c, FRONT_DOF], covariance)
+    return start, pool
 
 
 @kernel

@@ -190,15 +190,19 @@ def store(t: Tree, rows: Index, ids: Index, residual: Array, jacobian: Array) ->
     n, m, width = jacobian.shape
     for k in range(n):
         e = ids[rows[k]]
-        block = blocks[edge[e, BLOCK] : edge[e, BLOCK] + width * (width + 1)].reshape(width, width + 1)
-        clear_block(t, e)
-        for a in range(m):
-            for p in range(width):
-                x = jacobian[k, a, p]
-                for c in range(width):
-                    block[p, c] += x * jacobian[k, a, c]
-                block[p, width] += x * residual[k, a]
-        add_to_diagonal(vertex, edge, link, e, block, diagonal)
+        clear_block(vertex, edge, link, e, blocks, diagonal)
+        at = edge[e, BLOCK]
+        for p in range(width):
+            for c in range(p, width):
+                s = 0.0
+                for a in range(m):
+                    s += jacobian[k, a, p] * jacobian[k, a, c]
+                blocks[at + p * (width + 1) + c] = blocks[at + c * (width + 1) + p] = s
+            s = 0.0
+            for a in range(m):
+                s += jacobian[k, a, p] * residual[k, a]
+            blocks[at + p * (width + 1) + width] = s
+        add_to_diagonal(vertex, edge, link, e, blocks, diagonal)
 
 
 @kernel

@@ -14,6 +14,7 @@ from graph_slam_ros.solver.batch import Settings
 from graph_slam_ros.solver.clique_tree import incremental
 from graph_slam_ros.solver.clique_tree.numeric import accept_steps
 from graph_slam_ros.solver.clique_tree.pointers import pointers_of
+from graph_slam_ros.solver.clique_tree.pools import compact
 from graph_slam_ros.solver.clique_tree.storage import (
     ACTIVE,
     BLOCKS_TOP,
@@ -200,6 +201,13 @@ class Problem:
         """The estimates of all vertices, in the layout of ``Graph.initial``; ``start_at`` accepts them."""
         self._grow()
         return self._estimates()[: len(self.graph.initial)].copy()
+
+    def compact(self) -> None:
+        """Move the fronts in use together in memory; memory is not returned to the system.
+
+        The solver does so itself before it asks for more memory.
+        """
+        compact(self._tree)
 
     # -- for the solution --------------------------------------------------------------------------------------------
 

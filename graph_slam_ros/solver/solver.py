@@ -14,11 +14,10 @@ from graph_slam_ros.solver.clique_tree import incremental
 from graph_slam_ros.solver.clique_tree.advance import DISSECT, DONE, advance, more_room, restructure
 from graph_slam_ros.solver.clique_tree.ordering import dissect
 from graph_slam_ros.solver.clique_tree.pointers import pointers_of
-from graph_slam_ros.solver.clique_tree.pools import compact
 from graph_slam_ros.solver.clique_tree.storage import AFFECTED, CLIQUE, DOF, NOTHING, SUBSTITUTED
 from graph_slam_ros.solver.clique_tree.substitution import forget, read, show
-from graph_slam_ros.solver.covariance import joint, marginals
-from graph_slam_ros.solver.edge_covariance import EdgeCovariances
+from graph_slam_ros.solver.covariance import among, joint, marginals
+from graph_slam_ros.solver.cross_covariance import CrossCovariances
 from graph_slam_ros.solver.gauge import undetermined
 from graph_slam_ros.solver.linearization import (
     Losses,
@@ -196,21 +195,28 @@ class Solver(Problem):
     def joint_marginal(self, ids: ArrayLike) -> Array:
         """Covariance (D, D) of some vertices together, in the order given, each once; as ``marginal`` for each."""
         wanted = self._with_covariance(ids)
-        if len(np.unique(wanted)) < len(wanted):
+        if len(set(wanted.tolist())) < len(wanted):
             raise GraphSlamError("a joint covariance of a vertex with itself")
-        dof = self._tree.vertex[wanted, DOF]
-        free = ~self._held[wanted]
-        out = np.zeros((int(dof.sum()), int(dof.sum())))
-        if free.any():
-            at = np.flatnonzero(np.repeat(free, dof))
-            with self._tree_remade_after_error():
-                out[np.ix_(at, at)] = joint(self._tree, wanted[free])
+        held = self._held[wanted]
+        with self._tree_remade_after_error():
+            of_free = np.zeros((0, 0)) if held.all() else joint(self._tree, wanted[~held])
+        if not held.any():
+            return of_free
+        free = np.repeat(~held, self._tree.vertex[wanted, DOF])
+        out = np.zeros((len(free), len(free)))
+        out[np.ix_(free, free)] = of_free
         return out
 
-    def edge_covariances(self) -> EdgeCovariances:
-        """Covariances of the vertices of all edges, as ``joint_marginal`` has them, for many edges at once."""
+    def edge_marginals(self, ends: Index) -> Array:
+        """Covariances (n, D, D) as ``joint_marginal`` has them, of the vertices (n, k) of edges of one type."""
+        self._with_covariance(ends)
+        with self._tree_remade_after_error():
+            return among(self._tree, np.ascontiguousarray(ends)) if len(ends) else np.zeros((0, 0, 0))
+
+    def cross_covariances(self) -> CrossCovariances:
+        """Covariances of all vertices with one of them, as ``joint_marginal`` has them."""
         self._with_covariance(self.vertices)
-        return EdgeCovariances(self._tree, np.flatnonzero(self._inside & ~self._held))
+        return CrossCovariances(self._tree, np.flatnonzero(self._inside & ~self._held))
 
     def information_matrix(self) -> Array:
         """H as a dense matrix, vertices in order of id, with pending edges: for tests and small examples.
@@ -222,13 +228,6 @@ class Solver(Problem):
         free = np.flatnonzero(self._inside & ~self._held)
         losses = self._stages.losses(self.settings)[-1]
         return information(self.graph, self._estimates(), rows_of(self.graph, self.edges), free, losses)
-
-    def compact(self) -> None:
-        """Move the fronts in use together in memory; memory is not returned to the system.
-
-        The solver does so itself before it asks for more memory.
-        """
-        compact(self._tree)
 
     def rebuild(self) -> None:
         """Rebuild everything from the graph, at the present estimate; a failure leaves all as it was.

@@ -201,10 +201,10 @@ def leave(t: Tree, vertices: Index, edges: Index) -> Index:
 @kernel
 def deactivate(t: Tree, edges: Index) -> None:
     """Remove edges from the structure and from the diagonal of H."""
-    edge = t.edge
+    vertex, edge, link, blocks, diagonal = t.vertex, t.edge, t.link, t.blocks, t.diagonal
     for e in edges:
         edge[e, ACTIVE], edge[e, OWNER] = 0, NOTHING
-        clear_block(t, e)
+        clear_block(vertex, edge, link, e, blocks, diagonal)
 
 
 @kernel

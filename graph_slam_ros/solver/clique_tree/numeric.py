@@ -179,43 +179,40 @@ def retract(vertex: Index, value: Array, step: Array, estimate: Array, v: int) -
 
 
 @kernel
-def add_to_diagonal(vertex: Index, edge: Index, link: Index, e: int, block: Array, diagonal: Array) -> None:
+def add_to_diagonal(vertex: Index, edge: Index, link: Index, e: int, blocks: Array, diagonal: Array) -> None:
     """Add the diagonal of an edge's block to that of the information matrix."""
-    p = 0
+    at, across = edge[e, BLOCK], edge[e, WIDTH] + 2  # from one number of a diagonal to the next
     for s in range(edge[e, COUNT]):
         v = link[edge[e, LINKED] + s, LINK_END]
         for i in range(vertex[v, DOF]):
-            diagonal[vertex[v, STEP] + i] += block[p, p]
-            p += 1
+            diagonal[vertex[v, STEP] + i] += blocks[at]
+            at += across
 
 
 @kernel
-def clear_block(t: Tree, e: int) -> None:
+def clear_block(vertex: Index, edge: Index, link: Index, e: int, blocks: Array, diagonal: Array) -> None:
     """Clear an edge's block, and its part of the diagonal of H.
 
     If that was nearly all of the diagonal, the difference would be rounding. Then the diagonal is summed again.
     """
-    vertex, edge, link, blocks, diagonal = t.vertex, t.edge, t.link, t.blocks, t.diagonal
-    width = edge[e, WIDTH]
-    block = blocks[edge[e, BLOCK] : edge[e, BLOCK] + width * (width + 1)].reshape(width, width + 1)
-    p = 0
-    cancelled = False
+    begin, width = edge[e, BLOCK], edge[e, WIDTH]
+    at, cancelled = begin, False
     for s in range(edge[e, COUNT]):
         v = link[edge[e, LINKED] + s, LINK_END]
         for i in range(vertex[v, DOF]):
-            diagonal[vertex[v, STEP] + i] -= block[p, p]
-            cancelled = cancelled or diagonal[vertex[v, STEP] + i] < CANCELLED * block[p, p]
-            p += 1
-    block[:] = 0.0
+            diagonal[vertex[v, STEP] + i] -= blocks[at]
+            cancelled = cancelled or diagonal[vertex[v, STEP] + i] < CANCELLED * blocks[at]
+            at += width + 2  # from one number of the block's diagonal to the next
+    for i in range(begin, begin + width * (width + 1)):
+        blocks[i] = 0.0
     if cancelled:
         for s in range(edge[e, COUNT]):
-            _add_up_diagonal(t, link[edge[e, LINKED] + s, LINK_END])
+            _add_up_diagonal(vertex, edge, link, link[edge[e, LINKED] + s, LINK_END], blocks, diagonal)
 
 
 @kernel
-def _add_up_diagonal(t: Tree, v: int) -> None:
-    vertex, edge, link, blocks = t.vertex, t.edge, t.link, t.blocks
-    own = t.diagonal[vertex[v, STEP] : vertex[v, STEP] + vertex[v, DOF]]
+def _add_up_diagonal(vertex: Index, edge: Index, link: Index, v: int, blocks: Array, diagonal: Array) -> None:
+    own = diagonal[vertex[v, STEP] : vertex[v, STEP] + vertex[v, DOF]]
     own[:] = 0.0
     a = vertex[v, LINK]
     while a != NOTHING:

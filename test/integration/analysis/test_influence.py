@@ -69,11 +69,11 @@ def test_the_cost_changes_as_solving_again_says(saved):
 
 def test_covariances_of_all_edges_at_once_are_those_of_each(saved):
     solver, last = saved.solver, saved.keyframes[-1]
-    known = solver.edge_covariances()
+    known = solver.cross_covariances()
     for label in ("odometry", "landmarks", "closures"):
         edges = [e for e in saved.entries if e.is_in and e.label == label][::7]
         ends = np.array([e.vertices for e in edges])
-        among, of_last = known.among(ends), known.with_vertex(last, ends)
+        among, of_last = solver.edge_marginals(ends), known.with_vertex(last, ends)
         for k, e in enumerate(edges):
             assert among[k] == pytest.approx(solver.joint_marginal(e.vertices), rel=1e-6, abs=1e-12)
             if last not in e.vertices:
@@ -91,9 +91,10 @@ def test_in_a_map_that_is_held_an_edge_moves_nothing(saved):
     assert not found.end_m.any()
     solver = saved.solve()
     solver.hold(saved.keyframes[0])
-    known, edge = solver.edge_covariances(), saved.entries[1]
+    edge = saved.entries[1]
     assert saved.keyframes[0] in edge.vertices
-    assert known.among(np.array([edge.vertices]))[0] == pytest.approx(solver.joint_marginal(edge.vertices), abs=1e-12)
+    (at_once,) = solver.edge_marginals(np.array([edge.vertices]))
+    assert at_once == pytest.approx(solver.joint_marginal(edge.vertices), abs=1e-12)
 
 
 def test_an_unknown_edge_is_refused(saved):
