@@ -20,7 +20,7 @@ from graph_slam_ros.solver.clique_tree.storage import NOTHING, Tree
 from graph_slam_ros.solver.clique_tree.substitution import forget, step_all
 from graph_slam_ros.solver.clique_tree.symbolic import mark
 from graph_slam_ros.solver.gauge import undetermined
-from graph_slam_ros.solver.linearization import Losses, LossKey, costs, linearize, refuse_nonfinite, store
+from graph_slam_ros.solver.linearization import Losses, LossKey, costs, linearize, refuse_nonfinite, store_first
 from graph_slam_ros.solver.report import Iteration, Report
 from graph_slam_ros.typing import Array, Index
 
@@ -139,10 +139,11 @@ class BatchProblem:
     def linearize(self, losses: Losses, *, refuse: bool = False) -> None:
         """Put the blocks of all edges at the linearisation points into the tree; costs not finite may be refused."""
         self.chi2 = self.cost = 0.0
+        self.tree.diagonal[:] = 0.0
         for b in linearize(self.graph, self.tree.value, self.rows, losses):
             if refuse:
                 refuse_nonfinite(b)
-            store(self.tree, b.rows, b.table.id.values, b.residual, b.jacobian)
+            store_first(self.tree, b.rows, b.table.id.values, b.residual, b.jacobian)
             self.chi2 += float(b.chi2.sum())
             self.cost += float(b.cost.sum())
 

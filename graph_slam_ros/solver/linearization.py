@@ -185,23 +185,40 @@ def chi2_of(graph: Graph, x: Array, edges: Index) -> tuple[Array, Index]:
 
 @kernel
 def store(t: Tree, rows: Index, ids: Index, residual: Array, jacobian: Array) -> None:
-    """Add whitened edges to the tree: J'J and J'r, and the diagonal of H."""
+    """Put whitened edges into the tree: J'J and J'r, and the diagonal of H, instead of what they had there."""
+    vertex, edge, link, blocks, diagonal = t.vertex, t.edge, t.link, t.blocks, t.diagonal
+    for k in range(len(rows)):
+        clear_block(vertex, edge, link, ids[rows[k]], blocks, diagonal)
+    store_first(t, rows, ids, residual, jacobian)
+
+
+@kernel
+def store_first(t: Tree, rows: Index, ids: Index, residual: Array, jacobian: Array) -> None:
+    """Put whitened edges into the tree that have nothing there yet."""
     vertex, edge, link, blocks, diagonal = t.vertex, t.edge, t.link, t.blocks, t.diagonal
     n, m, width = jacobian.shape
     for k in range(n):
         e = ids[rows[k]]
-        clear_block(vertex, edge, link, e, blocks, diagonal)
         at = edge[e, BLOCK]
         for p in range(width):
-            for c in range(p, width):
-                s = 0.0
+            if m == 2:  # the usual sizes by themselves: short loops take most of the time
+                x, y = jacobian[k, 0, p], jacobian[k, 1, p]
+                for c in range(width):
+                    blocks[at + c] = x * jacobian[k, 0, c] + y * jacobian[k, 1, c]
+                blocks[at + width] = x * residual[k, 0] + y * residual[k, 1]
+            elif m == 3:
+                x, y, z = jacobian[k, 0, p], jacobian[k, 1, p], jacobian[k, 2, p]
+                for c in range(width):
+                    blocks[at + c] = x * jacobian[k, 0, c] + y * jacobian[k, 1, c] + z * jacobian[k, 2, c]
+                blocks[at + width] = x * residual[k, 0] + y * residual[k, 1] + z * residual[k, 2]
+            else:
+                blocks[at : at + width + 1] = 0.0
                 for a in range(m):
-                    s += jacobian[k, a, p] * jacobian[k, a, c]
-                blocks[at + p * (width + 1) + c] = blocks[at + c * (width + 1) + p] = s
-            s = 0.0
-            for a in range(m):
-                s += jacobian[k, a, p] * residual[k, a]
-            blocks[at + p * (width + 1) + width] = s
+                    x = jacobian[k, a, p]
+                    for c in range(width):
+                        blocks[at + c] += x * jacobian[k, a, c]
+                    blocks[at + width] += x * residual[k, a]
+            at += width + 1
         add_to_diagonal(vertex, edge, link, e, blocks, diagonal)
 
 
