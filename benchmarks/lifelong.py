@@ -31,7 +31,7 @@ from benchmarks import fresh, lifelong, table
 from benchmarks.hall import STEP_S, Course, config, fitted, measured, rms
 from graph_slam_ros.cli import values
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
-from graph_slam_ros.runs.tables import removed_path
+from graph_slam_ros.runs.whole_path import removed_path
 from graph_slam_ros.slam import Control, GraphSlam
 from graph_slam_ros.slam.lifelong.removed import Left
 from graph_slam_ros.typing import Array, Numbers

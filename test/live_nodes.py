@@ -20,6 +20,7 @@ pytest.importorskip("rclpy")
 pytest.importorskip("vision_msgs")
 pytest.importorskip("tf2_msgs")
 
+from busy import lenient
 from forked_nodes import Server
 from lifecycle_msgs.srv import ChangeState, GetState
 from nav_msgs.msg import Odometry
@@ -69,11 +70,6 @@ ENVIRONMENT = dict(
 def often(times):
     """How many repetitions: ``make soak`` asks for more."""
     return times * int(os.environ.get("GRAPH_SLAM_SOAK", "1"))
-
-
-def lenient(seconds):
-    """So many, or as many more as the machine has more to do than it can."""
-    return seconds * max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
 
 
 @dataclass(frozen=True)

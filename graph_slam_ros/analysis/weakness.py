@@ -96,7 +96,7 @@ class Weakness:
         self.poses = run.solver.estimate(run.keyframes)
         steps = np.diff(self.poses[:, :n], axis=0, prepend=self.poses[:1, :n])
         steps[np.isin(run.numbers, run.segments)] = 0.0
-        self._steps, whole = steps, run.whole_path()[:, :n]
+        self._steps, whole = steps, run.whole_path.poses(run.solver)[:, :n]
         driven = np.diff(whole, axis=0, prepend=whole[:1])
         driven[run.segments] = 0.0
         self.travelled_m = np.cumsum(np.linalg.norm(driven, axis=1))[run.numbers]

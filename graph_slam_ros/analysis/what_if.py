@@ -13,11 +13,11 @@ import numpy as np
 from graph_slam_ros.analysis.influence import InfluenceModel
 from graph_slam_ros.errors import GaugeError, GraphSlamError, SingularError
 from graph_slam_ros.graph import EdgeType, Gaussian, Graph, Loss
-from graph_slam_ros.runs.condensed_map import read_left
 from graph_slam_ros.runs.folder import RunError
 from graph_slam_ros.runs.ledger_file import Entry, ledger_entries
 from graph_slam_ros.runs.restore import of_all, restored
-from graph_slam_ros.runs.tables import numbered, removed_path
+from graph_slam_ros.runs.tables import numbered
+from graph_slam_ros.runs.whole_path import WholePath
 from graph_slam_ros.solver import Report, Solver
 from graph_slam_ros.typing import Array
 
@@ -120,13 +120,15 @@ class SavedGraph:
         """The number of the keyframe of a vertex; None if it is not a keyframe."""
         return self._numbers.get(vertex)
 
-    def whole_path(self) -> Array:
-        """The poses of all keyframes, those that were condensed included, (n, size)."""
-        path = self.solver.estimate(self.keyframes[len(self.keyframes) - len(self.slam.keyframes.ids) :])
-        if self.slam.bounded is None:
-            return path
-        left = read_left(self.folder, self.space, self.slam.bounded)
-        return np.concatenate((removed_path(self.slam, left), path))
+    def name(self, vertex: int) -> int:
+        """The number by which a vertex is called: of its keyframe, or its own in the saved graph."""
+        number = self._numbers.get(vertex)
+        return self.ids[vertex] if number is None else number
+
+    @cached_property
+    def whole_path(self) -> WholePath:
+        """All keyframes, those that were condensed included."""
+        return WholePath.of(self.slam, self.folder)
 
     def type_of(self, entry: Entry) -> EdgeType:
         """The type of an edge."""

@@ -12,9 +12,8 @@ import numpy as np
 from graph_slam_ros.edge_tags import tag_of
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.maps.alignment import Alignment, align, as_they_are, laid_on, positions
-from graph_slam_ros.runs.condensed_map import read_left
 from graph_slam_ros.runs.restore import restored
-from graph_slam_ros.runs.tables import removed_path
+from graph_slam_ros.runs.whole_path import WholePath
 from graph_slam_ros.slam import GraphSlam
 from graph_slam_ros.slam.landmarks.lifetimes import has_identity
 from graph_slam_ros.typing import Array, Index, Numbers
@@ -208,9 +207,8 @@ def _aligned(
 
 def whole_path(folder: Path, slam: GraphSlam) -> StampedPath:
     """Return stamps [ns] (n,) and poses (n, size) of all keyframes of a run, those that were condensed included."""
-    left = read_left(folder, slam.space, slam.bounded)
-    stamps_ns = np.concatenate((left.keyframes["stamp_ns"], slam.keyframes.stamps_ns))
-    return stamps_ns, np.concatenate((removed_path(slam, left), slam.trajectory()))
+    whole = WholePath.of(slam, folder)
+    return whole.stamps_ns, whole.poses()
 
 
 def _of_one_stamp(one: StampedPath, two: StampedPath) -> tuple[Array, Array]:

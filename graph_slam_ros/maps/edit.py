@@ -246,15 +246,15 @@ def edit(folder: Path, plan: Plan, out: Path | None) -> Edited:
         raise GraphSlamError("the plan has no edits")
     losses: list[str] = []
     counters = Counters()
-    slam = restored(folder, losses, counters)
-    state, events = state_of(slam), [Control("edit", tuple(one.values.items())) for one in plan.edits]
-    measurements = [*events, Control("optimize")]
-    edited = _applied(slam, measurements, losses)
+    slam = restored(folder, losses, counters, condensed=True)
+    rehearsal = Rehearsal(slam, folder)
+    edited = rehearsal.attempt(plan.edits, losses)[1]
     if out is None:
         return edited
     options: dict[str, Any] = {"earlier": counters, "took": took, "recording": recording_of(folder)}
     try:
-        edited.summary.update(record_run(out, slam.config, measurements, losses, state, **options)[1])
+        measurements = _controls(plan.edits)
+        edited.summary.update(record_run(out, slam.config, measurements, losses, rehearsal.state, **options)[1])
     except Exception:
         discard(out)
         raise
@@ -304,7 +304,7 @@ def undo_edit(run: Path | str, name: str, out: Path | str) -> dict[str, Any]:
         raise GraphSlamError(f"{folder}: edit {shortened(name)} {why}")
     gone = [one.name for one in made].index(name)
     for one in made[gone + 1 :]:
-        if any(edge >= start.graph.edge_count for edge in one.named_edges):
+        if any(edge >= start.graph.edge_ids.of(start.graph.edge_count) for edge in one.named_edges):
             raise GraphSlamError(f"edit {one.name} is of an edge that an edit has added: undo {one.name} first")
     rest = [m for m in events if not (isinstance(m, Control) and ("name", name) in m.values)]
     slam = GraphSlam(config, start=start)
@@ -325,28 +325,38 @@ class Rehearsal:
     Parameters
     ----------
     slam : the restored run, which stays as it is
+    folder : of the run
+
+    Attributes
+    ----------
+    state : the map of the run
     """
 
-    def __init__(self, slam: GraphSlam) -> None:
-        self._config, self._state = slam.config, state_of(slam)
+    def __init__(self, slam: GraphSlam, folder: Path) -> None:
+        self.state = state_of(slam, folder)
+        self._config = slam.config.changed({"map.condense": False})  # nothing leaves the map while it is compared
 
-    def attempt(self, edits: Sequence[Edit]) -> tuple[GraphSlam, Edited]:
+    def attempt(self, edits: Sequence[Edit], losses: Sequence[str] = ()) -> tuple[GraphSlam, Edited]:
         """Apply edits to a copy of the map; returns it, and what changed. Raises GraphSlamError where one fails."""
-        state = copy.deepcopy(self._state, {id(self._state.graph): self._state.graph.copy()})  # kinds are shared
+        state = copy.deepcopy(self.state, {id(self.state.graph): self.state.graph.copy()})  # kinds are shared
         slam = GraphSlam(self._config, start=state)
-        events = [Control("edit", tuple(one.values.items())) for one in edits]
-        return slam, _applied(slam, [*events, Control("optimize")], [])
+        return slam, _applied(slam, _controls(edits), [*losses])
+
+
+def _controls(edits: Sequence[Edit]) -> list[Control]:
+    """The control events of a plan, with the solve after them."""
+    return [*(Control("edit", tuple(one.values.items())) for one in edits), Control("optimize")]
 
 
 def _applied(slam: GraphSlam, measurements: Sequence[Control], losses: list[str]) -> Edited:
     """Apply edits to a map in memory, and compare it with what it was."""
     known, vertices, before = len(slam.edits), slam.keyframes.ids.copy(), slam.trajectory()
     chi2, inside = slam.solver.evaluate().chi2_final, slam.ledger.inside
-    fits = list[Fit]()
+    fits, ids = list[Fit](), slam.graph.edge_ids
     for one in measurements:
         slam.process(one)
         if one.event == "edit" and slam.edits[-1].edit.do in ("add_closure", "let_in_edge"):
-            fits += [_fit(slam, edge) for edge in slam.edits[-1].added]
+            fits += [_fit(slam, one) for one in slam.edits[-1].added]
     if not slam.is_solved:
         raise GraphSlamError(f"the map cannot be solved with these edits: {slam.failing}")
     n, done = slam.space.dimensions, tuple(slam.edits[known:])
@@ -357,10 +367,10 @@ def _applied(slam: GraphSlam, measurements: Sequence[Control], losses: list[str]
     return Edited(
         done,
         (chi2, slam.solver.evaluate().chi2_final),
-        (farthest, float(distances[farthest])),
+        (slam.first_keyframe + farthest, float(distances[farthest])),
         float(distances[-1]),
-        tuple(_solved(slam, fit) for fit in fits if not slam.ledger.is_withdrawn(fit.edge)),
-        tuple(edge for edge in inside.tolist() if not slam.ledger.is_inside(edge) and edge not in by_hand),
+        tuple(_solved(slam, fit) for fit in fits if not slam.ledger.is_withdrawn(_row(slam, fit.edge))),
+        tuple(ids.of(row) for row in inside.tolist() if not slam.ledger.is_inside(row) and ids.of(row) not in by_hand),
         {},
         losses,
     )
@@ -368,13 +378,22 @@ def _applied(slam: GraphSlam, measurements: Sequence[Control], losses: list[str]
 
 def _fit(slam: GraphSlam, edge: int) -> Fit:
     """Compare an edge that is in by hand with all else."""
-    decisions, numbers = slam.backend.decisions, slam.graph.edge(edge).type.residual_size
-    slam.solver.set_weight(edge, 0.0)
-    (innovation,) = decisions.innovations([edge])
-    slam.solver.set_weight(edge, 1.0)
+    row = _row(slam, edge)
+    decisions, numbers = slam.backend.decisions, slam.graph.edge(row).type.residual_size
+    slam.solver.set_weight(row, 0.0)
+    (innovation,) = decisions.innovations([row])
+    slam.solver.set_weight(row, 1.0)
     return Fit(edge, innovation, decisions.gate_scale * quantile(slam.config.robust.gate, numbers))
 
 
 def _solved(slam: GraphSlam, fit: Fit) -> Fit:
-    chi2, _ = slam.solver.chi2_of([fit.edge])
-    return replace(fit, chi2=float(chi2[0]), residual=tuple(slam.solver.residuals_of([fit.edge]).tolist()))
+    row = _row(slam, fit.edge)
+    chi2, _ = slam.solver.chi2_of([row])
+    return replace(fit, chi2=float(chi2[0]), residual=tuple(slam.solver.residuals_of([row]).tolist()))
+
+
+def _row(slam: GraphSlam, edge: int) -> int:
+    """The row of an edge that the map has, by its id."""
+    row = slam.graph.edge_ids.find(edge)
+    assert row is not None, f"edge {edge} was just added"
+    return row

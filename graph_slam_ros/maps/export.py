@@ -16,7 +16,8 @@ from graph_slam_ros.recordings.bag import BagWriter
 from graph_slam_ros.runs.condensed_map import read_left
 from graph_slam_ros.runs.folder import RunError, is_run
 from graph_slam_ros.runs.restore import restored
-from graph_slam_ros.runs.tables import graph_file, numbered, removed_path
+from graph_slam_ros.runs.tables import graph_file, numbered
+from graph_slam_ros.runs.whole_path import WholePath
 from graph_slam_ros.slam import GraphSlam
 from graph_slam_ros.slam.lifelong.removed import Left
 
@@ -55,9 +56,8 @@ def files_of(out: Path, target: str) -> list[Path]:
 
 def _tum(slam: GraphSlam, left: Left, out: Path, first: int = 0) -> list[Path]:
     """The keyframes from a number on."""
-    stamps_ns = [*left.keyframes["stamp_ns"].tolist(), *slam.keyframes.stamps_ns.tolist()]
-    path = np.concatenate((removed_path(slam, left), slam.trajectory()))
-    write_text(out, tum_text(stamps_ns[first:], path[first:]))
+    whole = WholePath(slam, left)
+    write_text(out, tum_text(whole.stamps_ns.tolist()[first:], whole.poses()[first:]))
     return [out]
 
 
@@ -76,8 +76,8 @@ def _mcap(slam: GraphSlam, left: Left, out: Path) -> list[Path]:
     The covariance of a keyframe that was condensed is not known: all variances are those of what a pose does not have.
     """
     frame, unused = slam.config.frames.map, slam.config.output.pose_covariance_max
-    path = np.concatenate((removed_path(slam, left), slam.trajectory()))
-    stamps_ns = [*left.keyframes["stamp_ns"].tolist(), *slam.keyframes.stamps_ns.tolist()]
+    whole = WholePath(slam, left)
+    path, stamps_ns = whole.poses(), whole.stamps_ns.tolist()
     unknown = np.broadcast_to(unused * np.eye(slam.space.dof), (len(left.keyframes), slam.space.dof, slam.space.dof))
     poses = zip(stamps_ns, path, np.concatenate((unknown, slam.keyframe_covariances())), strict=True)
     last_ns, landmarks = slam.keyframes[-1].stamp_ns, results.landmark_estimates(slam)

@@ -11,17 +11,20 @@ from scipy.special import gammainc
 from graph_slam_ros.analysis.consistency import nees_of_each
 from graph_slam_ros.analysis.evaluation import Scores, dimensions_of, evaluate, input_topics, scored_drive
 from graph_slam_ros.analysis.explain import REASONS, STATES, landmark_lines
+from graph_slam_ros.analysis.explain_condensed import statements_of_place
 from graph_slam_ros.analysis.path_error import interpolated
 from graph_slam_ros.analysis.trajectories import Truth, read_truth
 from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.colours import DARK, LIGHT
 from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.graph.place import LABEL as PLACES
 from graph_slam_ros.report import drive, verdict
 from graph_slam_ros.report.groups import closure_groups
 from graph_slam_ros.report.packing import Packing, shown
 from graph_slam_ros.report.places import floor_plan, keyframe_paths, outside, paths
 from graph_slam_ros.report.sentences import effects, sentences
 from graph_slam_ros.runs.folder import COVARIANCES, changed_since, run_config, summary_of
+from graph_slam_ros.runs.ledger_file import Entry
 from graph_slam_ros.runs.run_check import check_run
 from graph_slam_ros.runs.tables import INPUT_COLUMNS
 from graph_slam_ros.runs.trajectory import read_covariances, read_tum
@@ -83,7 +86,7 @@ def read_contents(
     out = Contents(run)
     summary = out.attempt(lambda: summary_of(run)) or {}
     known = read_truth(truth, topic, out.attempt(lambda: input_topics(run)) or set()) if truth else None
-    saved = out.saved = out.attempt(lambda: SavedGraph(run, out.losses))
+    saved = out.saved = out.attempt(lambda: SavedGraph(run, out.losses, condensed=True))
     out.beware += out.attempt(lambda: changed_since(run)) or []
     scores = evaluate(run, known, align=align) if known and saved else None
     out.data["run"] = shown(run.resolve().name)
@@ -116,9 +119,10 @@ def _edges(out: Contents, saved: SavedGraph) -> dict[str, Any]:
     """The columns of the ledger, and the sentences on each edge."""
     pack, entries, found = out.packing, saved.entries, effects(saved)
     texts = sentences(saved, found)
-    keyframes = {vertex: k for k, vertex in enumerate(saved.keyframes)}
-    names = list(dict.fromkeys(e.landmark for e in entries))
-    places = {name: len(saved.keyframes) + k for k, name in enumerate(name for name in names if name)}
+    ends = [[_end(saved, e, vertex) for vertex in e.vertices] for e in entries]
+    names = list(dict.fromkeys(name for several in ends for name in several if isinstance(name, str) and name))
+    places = {name: len(saved.slam.keyframes) + k for k, name in enumerate(names)}
+    is_condensed = saved.slam.bounded is not None
 
     def coded(values: list[str]) -> dict[str, Any]:
         several = list(dict.fromkeys(values))
@@ -126,12 +130,8 @@ def _edges(out: Contents, saved: SavedGraph) -> dict[str, Any]:
         return {"names": several, "of": pack.column([code[value] for value in values], "i4")}
 
     def end(slot: int) -> list[int]:
-        def place(e: Any) -> int:
-            if slot >= len(e.vertices):
-                return -1
-            return keyframes.get(e.vertices[slot], places.get(e.landmark, -1))
-
-        return [place(e) for e in entries]
+        some = (several[slot] if slot < len(several) else "" for several in ends)
+        return [places.get(one, -1) if isinstance(one, str) else one for one in some]
 
     def numbers(name: str) -> Any:
         return np.array([getattr(e, name) for e in entries], dtype=float)
@@ -145,18 +145,20 @@ def _edges(out: Contents, saved: SavedGraph) -> dict[str, Any]:
     columns |= {name: pack.column(numbers(name), "i4") for name in ("keyframe", "dof")}
     for name, values in texts.numbers.items():
         columns[name] = pack.fixed(values, _step(values))
-    for slot in range(max((len(e.vertices) for e in entries), default=0)):
-        ends = [e.vertices[slot] if slot < len(e.vertices) else None for e in entries]
-        shown_as = [-1 if vertex is None else keyframes.get(vertex, saved.ids[vertex]) for vertex in ends]
-        columns[f"end{slot}"] = pack.column(shown_as, "i4")
+    slots = max((len(e.vertices) for e in entries), default=0)
+    for slot in range(slots):
+        vertices = [e.vertices[slot] if slot < len(e.vertices) else None for e in entries]
+        columns[f"end{slot}"] = pack.column([-1 if v is None else saved.name(v) for v in vertices], "i4")
     return {
         "count": len(entries),
+        "ids": pack.column([e.edge for e in entries], "i4") if is_condensed else None,
         "columns": columns,
         "group": pack.column(texts.group, "i4"),
         "groups": texts.groups,
         "changes": {str(edge): lines for edge, lines in texts.changes.items()},
         "by_hand": _by_hand(saved),
-        "places": [pack.column(end(slot), "i4") for slot in range(2)],
+        "condensed": {str(e.edge): [*statements_of_place(saved, e)] for e in entries if e.label == PLACES},
+        "places": [pack.column(end(slot), "i4") for slot in range(max(slots, 2))],
         "label": coded([e.label for e in entries]),
         "source": coded([shown(e.source) for e in entries]),
         "landmark": coded([shown(e.landmark) for e in entries]),
@@ -164,9 +166,18 @@ def _edges(out: Contents, saved: SavedGraph) -> dict[str, Any]:
         "reason": pack.column([int(e.reason) for e in entries], "u1"),
         "verdicts": [STATES[one] for one in Verdict],
         "reasons": [REASONS[one] for one in Reason],
-        "landmark_lines": pack.texts(_landmark_texts(saved, [name for name in names if name])),
-        "landmark_names": pack.texts([shown(name) for name in names if name]),
+        "landmark_lines": pack.texts(_landmark_texts(saved, names)),
+        "landmark_names": pack.texts([shown(name) for name in names]),
     }
+
+
+def _end(saved: SavedGraph, e: Entry, vertex: int) -> int | str:
+    """The number of the keyframe at an end of an edge, or the name of the landmark; empty where it is neither."""
+    number = saved.keyframe(vertex)
+    if number is not None:
+        return number
+    name = saved.landmark_of(vertex)
+    return name or ("" if saved.landmarks_of(e) else e.landmark)  # of one that was removed the ledger knows the name
 
 
 def _by_hand(saved: SavedGraph) -> dict[str, list[str]]:
@@ -192,15 +203,15 @@ def _landmark_texts(saved: SavedGraph, names: list[str]) -> list[str]:
     """The lines of ``explain`` on each landmark."""
     seen: dict[str, list[Any]] = {name: [] for name in names}
     for e in saved.entries:
-        if e.landmark:
-            seen[e.landmark].append(e)
+        for name in {_end(saved, e, vertex) for vertex in e.vertices} & seen.keys():
+            seen[str(name)].append(e)
     return ["\n".join(map(shown, landmark_lines(saved.folder, name, several))) for name, several in seen.items()]
 
 
 def _charts(out: Contents, saved: SavedGraph) -> dict[str, Any]:
     """Histograms: verdicts over the drive, and chi2 of each class against what it should be."""
     judged = [e for e in saved.entries if e.verdict]
-    count = max(1, len(saved.keyframes))
+    count = max(1, len(saved.slam.keyframes))
     edges = np.linspace(0, count, min(_BINS, count) + 1)
     over = {}
     for one in Verdict:

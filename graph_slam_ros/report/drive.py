@@ -43,7 +43,8 @@ def frames(run: Path, saved: SavedGraph, losses: list[str]) -> list[Frame]:
     several = [np.array(record["values"], dtype=float) for record in read_records(run, MAP, losses, "estimate")]
     some = np.unique(np.linspace(0, len(several) - 1, min(len(several), MOST_FRAMES)).astype(int))
     width = saved.space.dimensions
-    first = np.array([saved.graph.vertex(vertex).stored.start for vertex in saved.keyframes])
+    before, known = saved.slam.first_keyframe, saved.slam.keyframes.ids.tolist()
+    first = np.array([saved.graph.vertex(vertex).stored.start for vertex in known])
     vertices = sorted(saved.landmarks.values())[:MOST_LANDMARKS]
     marks = np.array([saved.graph.vertex(vertex).stored.start for vertex in vertices], dtype=int)
     found = []
@@ -57,7 +58,9 @@ def frames(run: Path, saved: SavedGraph, losses: list[str]) -> list[Frame]:
         count = int(np.searchsorted(first + width, len(values), side="right"))
         if count:
             at = first[np.unique(np.linspace(0, count - 1, min(count, MOST_POINTS)).astype(int))]
-            found.append(Frame(count, positions(values, at), positions(values, marks[marks + width <= len(values)])))
+            found.append(
+                Frame(before + count, positions(values, at), positions(values, marks[marks + width <= len(values)]))
+            )
     return found
 
 

@@ -57,21 +57,31 @@ function formatted(value, spec) {
   return plus && value >= 0 ? `+${text}` : text;
 }
 
-const named = (coded, k) => coded.names[column(coded.of)[k]];
+// An edge is called by its id everywhere. Ids are rows of the columns, but in a map with condensed visits.
+const edgeIds = () => (data.edges.ids ? column(data.edges.ids) : Array.from({length: data.edges.count}, (_, k) => k));
+let edgeRows = null;
+function rowOf(k) {
+  if (!data.edges.ids) return k;
+  edgeRows = edgeRows || new Map(Array.from(column(data.edges.ids), (id, row) => [id, row]));
+  return edgeRows.get(k);
+}
+const ofEdge = (packed, k) => column(packed)[rowOf(k)];
+const named = (coded, k) => coded.names[ofEdge(coded.of, k)];
 
 function valueOf(name, k) {
   const e = data.edges;
   if (name === "edge") return k;
   if (name === "landmark" || name === "source") return named(e[name], k);
-  return column(e.columns[name])[k];
+  return ofEdge(e.columns[name], k);
 }
 
 const filled = (text, k) => text.replace(/\{(\w+)(?::([^}]*))?\}/g, (_, name, spec) => formatted(valueOf(name, k), spec));
 
 function explained(k) {
-  const group = data.edges.groups[column(data.edges.group)[k]], lines = [];
+  const group = data.edges.groups[ofEdge(data.edges.group, k)], lines = [];
   for (const [what, text] of group.lines) {
     if (text === "{changes}") for (const one of data.edges.changes[k] || []) lines.push([what, one]);
+    else if (text === "{place}") lines.push(...data.edges.condensed[k]);
     else lines.push([what, filled(text, k)]);
   }
   for (const one of data.edges.by_hand[k] || []) lines.push(["by hand", one]);
@@ -150,6 +160,7 @@ const CONFIG = {responsive: true, displaylogo: false, modeBarButtonsToRemove: ["
 // -- the map ---------------------------------------------------------------------------------------------------------
 
 const CAMERA = {eye: {x: 1.2, y: -2.3, z: 1.8}};
+const ALONG = ["odometry", "composed"];  // classes of edges along the path
 const MOST_SHOWN = 5000, MOST_DRAWN = 20000;  // edges of one class and verdict
 const map = {inSpace: false, points: null, moved: null};  // moved: {path, landmarks} of another solution
 
@@ -195,27 +206,24 @@ function trace(name, axes, colour, more) {  // edges are many: they are drawn by
 }
 
 function edgeTraces() {
-  const e = data.edges, all = points(), [from, to] = e.places.map(column), groups = new Map();
+  const e = data.edges, all = points(), [from, ...others] = e.places.map(column), groups = new Map();
   const label = column(e.label.of), verdict = column(e.verdict);
-  for (let k = 0; k < e.count; k++) {
-    if (from[k] < 0 || to[k] < 0 || e.label.names[label[k]] === "odometry") continue;
-    const key = `${e.label.names[label[k]]}, ${changeOf(k) || e.verdicts[verdict[k]]}`;
+  for (const [row, k] of edgeIds().entries()) {
+    if (from[row] < 0 || !others.some((to) => to[row] >= 0) || ALONG.includes(e.label.names[label[row]])) continue;
+    const key = `${e.label.names[label[row]]}, ${changeOf(k) || e.verdicts[verdict[row]]}`;
     if (!groups.has(key)) groups.set(key, []);
     groups.get(key).push(k);
   }
   const out = [];
   for (const [key, edges] of groups) {
-    const name = key.split(", ")[1], isIn = name === "accepted" || name === "not judged", isChanged = name.endsWith(UNSAVED), isSighting = key.startsWith("landmarks");
+    const name = key.split(", ")[1], isIn = name === "accepted" || name === "not judged", isChanged = name.endsWith(UNSAVED), isSighting = key.startsWith("landmarks") || key.startsWith("places");
     const every = Math.max(1, Math.ceil(edges.length / MOST_DRAWN)), some = edges.filter((_, k) => k % every === 0);
     if (every > 1) map.notes.push(`one of ${every} edges of "${key}" is drawn (the ledger has all)`);
     const visible = isIn && edges.length > MOST_SHOWN ? "legendonly" : true;
     if (visible !== true) map.notes.push(`${edges.length} edges of "${key}" are hidden at first: click that name in the legend`);
-    const axes = [0, 1, 2].map((axis) => {
-      const line = new Float64Array(3 * some.length);
-      some.forEach((k, at) => { line[3 * at] = all[axis][from[k]]; line[3 * at + 1] = all[axis][to[k]]; line[3 * at + 2] = NaN; });
-      return line;
-    });
-    const middle = axes.map((line) => Float64Array.from(some, (_, at) => (line[3 * at] + line[3 * at + 1]) / 2));
+    const ends = some.flatMap((k) => others.map((to) => [from[rowOf(k)], to[rowOf(k)], k]).filter(([, to]) => to >= 0));
+    const axes = all.map((axis) => Float64Array.from(ends.flatMap(([a, b]) => [axis[a], axis[b], NaN])));
+    const middle = all.map((axis) => Float64Array.from(ends, ([a, b]) => (axis[a] + axis[b]) / 2));
     const faint = Math.max(0.02, Math.min(0.25, 80 / edges.length));  // many sightings would hide the path
     const colour = isIn && isSighting ? colours().landmarks : isIn ? colours().closures : colours()[name];
     const isFaint = isIn && isSighting, dash = isIn || name === "down-weighted" || name.startsWith("let in") ? "solid" : name === "held back" ? "dot" : "dash";
@@ -224,7 +232,7 @@ function edgeTraces() {
     out.push(trace(plain(key), axes, colour, {visible, isMany: true, opacity: isFaint ? faint : strength, line: {color: colour, dash, width: isChanged ? 3 : isFaint ? 1.5 : 2}, legendgroup: key, showlegend: !isFaint}));
     out.push(trace("", middle, colour, {
       visible, isMany: true, mode: "markers", marker: {color: colour, size: (isIn ? 4 : 7) / (map.inSpace ? 2 : 1), symbol: name.startsWith("taken out") ? "x" : "diamond", opacity: isIn ? (isSighting ? faint : 0.35) : strength}, showlegend: false,
-      legendgroup: key, customdata: some, meta: "edge", hovertemplate: `edge %{customdata}: ${plain(key)}<extra></extra>`, hoverinfo: "all",
+      legendgroup: key, customdata: ends.map(([, , k]) => k), meta: "edge", hovertemplate: `edge %{customdata}: ${plain(key)}<extra></extra>`, hoverinfo: "all",
     }));
   }
   return out;
@@ -329,7 +337,7 @@ function placesOf(kind, which) {
   const all = points(), n = data.map.keyframes;
   if (kind === "keyframe") return [Number(which)];
   if (kind === "landmark") return [n + column(data.edges.landmark_names).indexOf(which)];
-  return data.edges.places.map((one) => column(one)[which]).filter((at) => at >= 0 && Number.isFinite(all[0][at]));
+  return data.edges.places.map((one) => ofEdge(one, which)).filter((at) => at >= 0 && Number.isFinite(all[0][at]));
 }
 
 function mark(kind, which, move = false) {
@@ -382,9 +390,11 @@ function show(kind, which, move = false) {
   const body = byId("why-body");
   body.replaceChildren();
   byId("why-hint").hidden = true;
-  const known = {edge: data.edges.count, keyframe: data.map ? data.map.keyframes : 0};
-  const isThere = kind === "landmark" ? column(data.edges.landmark_names).includes(which) : which < known[kind];
-  if (!isThere) return body.append(element("p", `there is no ${kind} ${short(String(which))}`));
+  const isThere = {
+    edge: () => rowOf(which) < data.edges.count, keyframe: () => data.map && which < data.map.keyframes,
+    landmark: () => column(data.edges.landmark_names).includes(which),
+  };
+  if (!isThere[kind]()) return body.append(element("p", `there is no ${kind} ${short(String(which))}${kind === "edge" && data.edges.ids ? " in the map: visits are condensed" : ""}`));
   ({edge: showEdge, keyframe: showKeyframe, landmark: showLandmark})[kind](which, body);
   if (extra) extra.show(kind, which, body);
   if (data.map) mark(kind, which, move);
@@ -403,7 +413,7 @@ function showEdge(k, body) {
   if (group) list.append(element("dt", "group"), groupText(group));
   body.append(list);
   const also = element("p");
-  for (const at of data.edges.places.map((one) => column(one)[k])) {
+  for (const at of data.edges.places.map((one) => ofEdge(one, k))) {
     if (at < 0) continue;
     if (also.childNodes.length) also.append(", ");
     const isKeyframe = at < data.map.keyframes, name = isKeyframe ? at : column(data.edges.landmark_names)[at - data.map.keyframes];
@@ -420,9 +430,8 @@ function groupText({edges, most}) {
 }
 
 function edgesAt(place) {
-  const [from, to] = data.edges.places.map(column), out = [];
-  for (let k = 0; k < data.edges.count; k++) if (from[k] === place || to[k] === place) out.push(k);
-  return out;
+  const ends = data.edges.places.map(column);
+  return Array.from(edgeIds()).filter((_, row) => ends.some((one) => one[row] === place));
 }
 
 function edgeList(edges, body) {
@@ -440,6 +449,7 @@ function showKeyframe(k, body) {
   const stamp = column(data.map.stamps)[k], [x, y, z] = data.map.paths.estimate.map((axis) => column(axis)[k]), edges = edgesAt(k);
   const where = `x ${x.toFixed(3)} m, y ${y.toFixed(3)} m${data.dimensions === 3 ? `, z ${z.toFixed(3)} m` : ""}`;
   body.append(element("h3", `keyframe ${k}: ${edges.length} edges`), element("p", `${stamp.toFixed(3)} s, at ${where}`));
+  if (data.edges.ids && !edges.length) body.append(element("p", "It was condensed: what was measured there is in the places around it."));
   edgeList(edges, body);
 }
 
@@ -456,8 +466,8 @@ const HEIGHT = 24;
 const UNSAVED = "(not saved)";
 const changeOf = (k) => (extra ? extra.changeOf(k) : "");  // what an edit makes of an edge: "taken out (not saved)"
 const verdictAndReason = (k) => {
-  const e = data.edges, reason = e.reasons[column(e.reason)[k]];
-  return e.verdicts[column(e.verdict)[k]] + (reason ? `: ${reason}` : "");
+  const e = data.edges, reason = e.reasons[ofEdge(e.reason, k)];
+  return e.verdicts[ofEdge(e.verdict, k)] + (reason ? `: ${reason}` : "");
 };
 const verdictOf = (k) => changeOf(k) || verdictAndReason(k);
 const HINTS = {  // of verdicts and reasons
@@ -467,13 +477,13 @@ const HINTS = {  // of verdicts and reasons
   outvoted: "more or better measurements say something else", contradicted: "measurements that came later say something else",
   "by hand": "a person decided it",
 };
-const values = (name) => (k) => column(data.edges.columns[name])[k];
+const values = (name) => (k) => ofEdge(data.edges.columns[name], k);
 const FIELDS = [  // name, value, and what it is
   ["edge", (k) => k, "its id"], ["class", (k) => named(data.edges.label, k), "what kind of measurement it is"],
   ["about", (k) => named(data.edges.landmark, k), "its landmark"], ["input", (k) => named(data.edges.source, k), "where it came from"],
   ["keyframe", values("keyframe"), "the keyframe at which it was judged first"],
-  ["verdict", (k) => changeOf(k) || data.edges.verdicts[column(data.edges.verdict)[k]], "whether it is in the map"],
-  ["reason", (k) => (changeOf(k) ? "" : data.edges.reasons[column(data.edges.reason)[k]]), "why it is not in the map"],
+  ["verdict", (k) => changeOf(k) || data.edges.verdicts[ofEdge(data.edges.verdict, k)], "whether it is in the map"],
+  ["reason", (k) => (changeOf(k) ? "" : data.edges.reasons[ofEdge(data.edges.reason, k)]), "why it is not in the map"],
   ["chi2", values("chi2"), "its squared error in the map of the run, in sigmas"], ["dof", values("dof"), "degrees of freedom: how many numbers it measures"],
   ["judged chi2", values("statistic"), "its chi2 when it was judged"], ["limit", values("threshold"), "up to this judged chi2 it would have been accepted"],
   ["weight %", (k) => (changeOf(k) ? (changeOf(k).startsWith("let in") ? 100 : 0) : values("percent")(k)), "how much of it counts"],
@@ -490,7 +500,7 @@ function startLedger() {
     byId("head").append(cell);
   });
   const classes = data.edges.label.names;
-  byId("filter").value = classes.find((one) => one === "closures") || classes.find((one) => !["odometry", "prior", "priors"].includes(one)) || "";
+  byId("filter").value = classes.find((one) => one === "closures") || classes.find((one) => ![...ALONG, "anchor", "prior", "priors"].includes(one)) || "";
   byId("filter").addEventListener("input", arrange);
   byId("rows").addEventListener("scroll", () => requestAnimationFrame(drawRows));
   byId("rows").addEventListener("keydown", (event) => {
@@ -516,8 +526,8 @@ function arrange() {
   const parts = [e.label, e.landmark, e.source].map((one) => [lower(one.names), column(one.of)]);
   parts.push([lower(e.verdicts), column(e.verdict)], [lower(e.reasons), column(e.reason)]);
   const hits = words.map((word) => parts.map(([names, codes]) => [names.map((name) => name.includes(word)), codes]));
-  for (let k = 0; k < e.count; k++) {
-    if (hits.every((of, w) => String(k) === words[w] || changeOf(k).includes(words[w]) || of.some(([has, codes]) => has[codes[k]]))) kept.push(k);
+  for (const [row, k] of edgeIds().entries()) {
+    if (hits.every((of, w) => String(k) === words[w] || changeOf(k).includes(words[w]) || of.some(([has, codes]) => has[codes[row]]))) kept.push(k);
   }
   const of = FIELDS[ledger.sort][1], way = ledger.up ? 1 : -1, isSorted = !ledger.sort && ledger.up;
   const keys = isSorted ? null : new Map(kept.map((k) => [k, of(k)]));

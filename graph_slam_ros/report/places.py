@@ -64,16 +64,16 @@ def paths(
 
 def keyframe_paths(run: Path, saved: SavedGraph) -> tuple[Trajectory, Trajectory]:
     """The estimate and odometry at the keyframes: of the run's files, or of its map where they are not of that."""
-    several = saved.slam.keyframes
+    whole = saved.whole_path
 
     def of(name: str, poses: Array) -> Trajectory:
         with suppress(GraphSlamError):
             path = read_tum(run / name)
-            if len(path.stamps_s) == len(several):
+            if len(path.stamps_s) == len(whole.stamps_ns):
                 return path
-        return Trajectory(several.stamps_ns / 1e9, se3.in_space(poses))
+        return Trajectory(whole.stamps_ns / 1e9, se3.in_space(poses))
 
-    return of(PATH, saved.slam.solver.estimate(saved.keyframes)), of(PATH_ODOMETRY, several.poses)
+    return of(PATH, whole.poses()), of(PATH_ODOMETRY, whole.odometry)
 
 
 def _known_landmarks(run: Path, saved: SavedGraph) -> dict[str, Landmark]:
@@ -166,7 +166,7 @@ def _unturned(picture: Any, resolution: float, origin: tuple[float, float, float
 
 def outside(file: Path, plan: dict[str, Any], saved: SavedGraph) -> list[str]:
     """A warning where most of the drive is outside of the floor plan."""
-    at = saved.slam.solver.estimate(saved.keyframes)[:, :2] - [plan["x"], plan["y"]]
+    at = saved.whole_path.poses()[:, :2] - [plan["x"], plan["y"]]
     count = int(np.count_nonzero(((at < 0.0) | (at > [plan["width"], plan["height"]])).any(axis=1)))
     if count <= _MOST_OUTSIDE * len(at):
         return []

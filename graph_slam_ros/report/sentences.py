@@ -15,6 +15,7 @@ from graph_slam_ros.analysis.explain import Numbers, change_text, remedy, statem
 from graph_slam_ros.analysis.influence import Influences
 from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.chi_square import quantile
+from graph_slam_ros.graph.place import LABEL as PLACES
 from graph_slam_ros.report.packing import shown
 from graph_slam_ros.runs.ledger_file import Entry
 from graph_slam_ros.slam.edit_tools import HAND_MADE
@@ -90,8 +91,8 @@ def effects(run: SavedGraph) -> Effects:
         out.last_m[at], out.end_m[at] = np.linalg.norm(found.step[:, :n], axis=1), found.end_m
         out.end[at], out.cost[at], out.is_alone[at] = found.end, found.cost, found.is_alone
 
-    inside = [e.edge for e in run.entries if e.is_in and e.verdict]
-    outside = [e.edge for e in run.entries if not e.is_in and e.reason not in FINAL]
+    inside = [row for row, e in enumerate(run.entries) if e.is_in and e.verdict]
+    outside = [row for row, e in enumerate(run.entries) if not e.is_in and e.reason not in FINAL]
     if inside:
         enter(run.influence_model.without(inside))
     if outside:
@@ -132,7 +133,8 @@ def sentences(run: SavedGraph, found: Effects) -> Sentences:
         bounds = e.threshold < 0.99 * limit, limit < 0.99 * e.threshold
         effect = bool(is_known[k]), bool(found.is_alone[k]), int(found.end[k])
         about = bool(e.landmark), e.source if e.source in ("", HAND_MADE) else True, k in history
-        key = (e.tag, e.label, e.verdict, e.reason, *kinds, *bounds, *effect, *about)
+        key: tuple[Any, ...] = (e.tag, e.label, e.verdict, e.reason, *kinds, *bounds, *effect, *about)
+        key = (PLACES,) if e.label == PLACES else key
         if key not in known:
             known[key] = len(groups)
             groups.append(_group(run, e, kinds, history.get(k, ()), effect))
@@ -151,6 +153,8 @@ def _group(
     run: SavedGraph, e: Entry, kinds: Sequence[str], history: Sequence[Any], effect: tuple[bool, bool, int]
 ) -> dict[str, Any]:
     """The texts of one edge, with places for what is its own."""
+    if e.label == PLACES:
+        return {"title": "edge {edge}", "lines": [["", "{place}"]], "ends": []}
     ends = ["landmark {landmark}" if kind == "landmark" else f"{kind} {{end{slot}}}" for slot, kind in enumerate(kinds)]
     own: Any = SimpleNamespace(
         edge=_Number(e.edge, "edge"),
@@ -201,11 +205,12 @@ def _what_if(run: SavedGraph, e: Entry, ends: Sequence[str], is_known: bool, is_
 def _numbers(entries: Sequence[Entry]) -> dict[str, Array]:
     """The numbers that texts have places for, in the units that are shown."""
     out: dict[str, Array] = {}
-    by_tag: dict[str, list[Entry]] = {}
-    for e in entries:
-        by_tag.setdefault(e.tag, []).append(e)
-    for tag, several in by_tag.items():
-        at = np.array([e.edge for e in several])
+    by_tag: dict[str, list[tuple[int, Entry]]] = {}
+    for row, e in enumerate(entries):
+        if e.label != PLACES:
+            by_tag.setdefault(e.tag, []).append((row, e))
+    for tag, rows in by_tag.items():
+        at, several = np.array([row for row, _ in rows]), [e for _, e in rows]
         m = several[0].dof
         upper, information = np.triu_indices(m), np.zeros((len(several), m, m))
         values = np.array([e.information for e in several])

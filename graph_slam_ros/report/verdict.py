@@ -58,7 +58,7 @@ def _state(
 ) -> str:
     if saved is None:
         return f"There is no map to show: {losses[0] if losses else 'the run holds no keyframe'}."
-    size = f"{len(saved.keyframes)} keyframes and {summary.get('landmarks', len(saved.landmarks))} landmarks"
+    size = f"{len(saved.slam.keyframes)} keyframes and {summary.get('landmarks', len(saved.landmarks))} landmarks"
     fit = _fit(saved)
     error = ""
     if scores is not None:
@@ -111,6 +111,8 @@ def _judged(saved: SavedGraph | None) -> str:
     out = [e for e in judged if not e.is_in]
     weak = sum(e.verdict.name == "DOWN_WEIGHTED" for e in judged)
     low = f"; {weak} more have little weight" if weak else ""
+    condensed = sum(sum(of.values()) for of in saved.slam.bounded.accepted.values()) if saved.slam.bounded else 0
+    low += f"; {condensed} more were believed, and are condensed" if condensed else ""
     if not out:
         return f"All {len(judged)} measurements are in the map{low}."
     counted = Counter((e.source or e.label, e.reason.name.lower().replace("_", " ")) for e in out)

@@ -6,7 +6,8 @@ The record ``condensed`` of a ``growth`` (``map_journal``) has
 * ``vertices``, ``edges``: the lasting ids of the first rows, and that of the row after these;
 * ``old``: number, vertex, stamp and ``T_odom_base`` of each keyframe before the first that is in the graph;
 * ``places``: cell, edge, visits, and the strikes against its landmarks, by vertex, of each place;
-* ``left``: how many keyframes, poses at which something was seen, and frames have left the map.
+* ``left``: how many keyframes, poses at which something was seen, and frames have left the map;
+* ``accepted``: of each drive, by its first keyframe, how many accepted measurements of each input have left the map.
 
 What has left is in ``condensed.mcap``, a record ``left`` each time: the number of its first keyframe, how many poses
 had left before, and the rows of ``slam.lifelong.removed.record_type`` and of ``slam.lifelong.frames`` in base64; there
@@ -17,6 +18,7 @@ edges. A map may know of fewer than are there, if its run was killed: the others
 import base64
 import csv
 import io
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import astuple, fields
 from pathlib import Path
@@ -61,6 +63,7 @@ def condensed_record(graph: Graph, first: int, state: BoundedState) -> Record:
         "old": old,
         "places": places,
         "left": left,
+        "accepted": [[first, dict(of)] for first, of in state.accepted.items()],
     }
 
 
@@ -80,6 +83,7 @@ def read_condensed(graph: Graph, record: Mapping[str, Any]) -> tuple[int, Bounde
         setattr(graph, _IDS[name], LastingIds(ids[:-1], int(ids[-1])))
     keyframes, sightings, *frames = record["left"]
     state = BoundedState(keyframes=keyframes, sightings=sightings, frames=frames[0] if frames else 0)
+    state.accepted |= {first: Counter(of) for first, of in record.get("accepted", ())}  # an older map has none
     for cell, edge, visits, strikes in record["places"]:
         state.places.setdefault(tuple(cell), []).append(place_of(graph.edge(edge), visits, dict(strikes)))
     state.old += [OldKeyframe(number, vertex, stamp, tuple(pose)) for number, vertex, stamp, pose in record["old"]]

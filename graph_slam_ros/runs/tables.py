@@ -17,13 +17,13 @@ from graph_slam_ros.messages import results
 from graph_slam_ros.messages.inputs import recorded_uses
 from graph_slam_ros.runs.folder import COVARIANCES, GRAPH, LANDMARKS, ODOMETRY, PATH, PATH_ODOMETRY, SIGHTINGS, VERTICES
 from graph_slam_ros.runs.ledger_file import CHANGES, LEDGER, changes_text, ledger_text
+from graph_slam_ros.runs.whole_path import WholePath
 from graph_slam_ros.slam import Counters, GraphSlam
 from graph_slam_ros.slam.calibration.decision import SIGMAS
 from graph_slam_ros.slam.calibration.parameters import QUANTITIES
 from graph_slam_ros.slam.lifelong.removed import Left, seen_from
 from graph_slam_ros.slam.robust.gating import CANDIDATES
 from graph_slam_ros.slam.robust.ledger import INSIDE, Verdict
-from graph_slam_ros.typing import Array
 
 Name = TypeVar("Name")
 _TANGENT = {3: ("x", "y", "theta"), 6: ("x", "y", "z", "rx", "ry", "rz")}
@@ -33,39 +33,26 @@ _POSE = {3: "x,y,theta", 6: "x,y,z,qx,qy,qz,qw"}
 def result_texts(slam: GraphSlam, left: Left) -> dict[str, str]:
     """All results except the summary, by file name; ``left`` has what has left the map."""
     ids, vertices = numbered(slam)
-    before, keyframes, sightings = removed_path(slam, left), left.keyframes, left.sightings
-    odometry = np.concatenate((keyframes["T_odom"], slam.keyframes.poses))
-    path = np.concatenate((before, slam.trajectory()))
+    whole, sightings = WholePath(slam, left), left.sightings
+    path = whole.poses()
     seen = np.concatenate(
-        (seen_from(slam.space, sightings, before), slam.sighting_trajectory().reshape(-1, path.shape[1]))
+        (seen_from(slam.space, sightings, path), slam.sighting_trajectory().reshape(-1, path.shape[1]))
     )
     seen_odometry = np.concatenate((sightings["T_odom"], slam.sighting_odometry().reshape(-1, path.shape[1])))
     stamps = [*sightings["stamp_ns"].tolist(), *slam.sighting_poses.stamps_ns.tolist()]
-    stamps_ns = [*keyframes["stamp_ns"].tolist(), *slam.keyframes.stamps_ns.tolist()]
+    stamps_ns = whole.stamps_ns.tolist()
     return {
         GRAPH: g2o_text(graph_file(slam, ids), slam.solver.estimate),
         VERTICES: vertices,
         LEDGER: ledger_text(slam, ids),
         CHANGES: changes_text(slam),
         PATH: tum_text(stamps_ns, path),
-        PATH_ODOMETRY: tum_text(stamps_ns, odometry),
-        COVARIANCES: _covariance_table(slam, keyframes["stamp_ns"].tolist()),
+        PATH_ODOMETRY: tum_text(stamps_ns, whole.odometry),
+        COVARIANCES: _covariance_table(slam, left.keyframes["stamp_ns"].tolist()),
         SIGHTINGS: tum_text(stamps, seen),
         ODOMETRY: tum_text(stamps, seen_odometry),
         LANDMARKS: _landmark_table(slam),
     }
-
-
-def removed_path(slam: GraphSlam, left: Left) -> Array:
-    """Return the present poses of the keyframes that have left the map, (n, size)."""
-    if slam.bounded is None:
-        return np.empty((0, slam.space.pose.size))
-    vertices = np.array([*(one.vertex for one in slam.bounded.old), *slam.keyframes.ids.tolist()], dtype=np.int64)
-    order, lasting = np.argsort(vertices), slam.graph.vertex_ids
-    marks = np.sort(np.array([mark.vertex for mark in slam.landmarks.values()], dtype=np.int64))
-    points = slam.solver.estimate(marks)[:, : slam.space.dimensions]
-    ids, poses = lasting.of_all(vertices[order]), slam.solver.estimate(vertices[order])
-    return left.path(slam.space, ids, poses, (lasting.of_all(marks), points))
 
 
 def noise_summary(slam: GraphSlam) -> dict[str, Any]:
@@ -150,6 +137,9 @@ def account(slam: GraphSlam, counters: Counters) -> dict[str, Any]:
     newest_drive = 0 if is_of_map or not slam.drives else slam.drives[-1]
     begins = slam.keyframes[newest_drive].vertex if newest_drive > slam.first_keyframe else 0
     accepted = _accepted_by_input(slam, begins)
+    for drive, condensed in (slam.bounded.accepted if slam.bounded else {}).items():
+        if drive >= newest_drive:
+            accepted.update(condensed)
     inputs = {}
     for name in dict.fromkeys([*slam.config.inputs.names.split(), *counters.used, *accepted]):
         if name in counters.received or counters.used[name] or name in accepted:
@@ -190,7 +180,7 @@ def _times(value: Any) -> int:
     return value
 
 
-def _accepted_by_input(slam: GraphSlam, first: int) -> dict[str, int]:
+def _accepted_by_input(slam: GraphSlam, first: int) -> Counter[str]:
     """Accepted edges of landmarks, fixes and closures by input, from the keyframe of a vertex on."""
     out = Counter[str]()
     inside = [Verdict.NOT_EVALUATED, *INSIDE]
@@ -204,7 +194,7 @@ def _accepted_by_input(slam: GraphSlam, first: int) -> dict[str, int]:
         chosen[judged] = np.isin(verdicts[ids[judged]], inside)
         for code, count in zip(*np.unique(table.at(np.flatnonzero(chosen)).source, return_counts=True), strict=True):
             out[slam.graph.sources[code]] += int(count)
-    return dict(out)
+    return out
 
 
 def _drives(slam: GraphSlam) -> list[dict[str, int]]:

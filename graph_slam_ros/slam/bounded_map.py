@@ -5,6 +5,8 @@ that could change a verdict: no search, no alarm, nothing held back undecided. S
 does.
 """
 
+from bisect import bisect_right
+from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -14,7 +16,7 @@ import numpy as np
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.slam.anchor import Anchor
 from graph_slam_ros.slam.backend import Backend
-from graph_slam_ros.slam.condensed_edges import CondensedEdge, archived
+from graph_slam_ros.slam.condensed_edges import CONDENSED, CondensedEdge, archived
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
 from graph_slam_ros.slam.kidnap_detector import KidnapDetector
 from graph_slam_ros.slam.landmarks.landmark_frontend import LandmarkFrontend
@@ -24,6 +26,7 @@ from graph_slam_ros.slam.lifelong.frames import LONGEST as FRAME
 from graph_slam_ros.slam.lifelong.frames import Frames, frame_of, weight_at
 from graph_slam_ros.slam.lifelong.removed import Left, OldKeyframe, Records, record_type
 from graph_slam_ros.slam.lifelong.surroundings import CLOSURES, FIXES
+from graph_slam_ros.slam.robust.gating import CANDIDATES
 from graph_slam_ros.slam.solution import Solution
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Index, Numbers
@@ -242,12 +245,21 @@ class BoundedMap:
         ]
         self.state.keyframes, self.state.sightings = end, before + len(seen)
         self.state.frames += len(frames)
+        self._note_accepted(out.edges)
         self._landmarks.renumber(new.vertices, new.edges)
         self._anchor.restore()
         self._backend.solver.update()
         self._kidnaps.begin_anew(self._frontend.path.keyframes)
         self._solution.renumber()
         return out
+
+    def _note_accepted(self, edges: Sequence[CondensedEdge]) -> None:
+        """Count the accepted measurements among edges that leave."""
+        drives = self._frontend.path.drives
+        for one in edges:
+            if one.became == CONDENSED and one.label in CANDIDATES:
+                drive = drives[max(bisect_right(drives, one.keyframe) - 1, 0)]
+                self.state.accepted.setdefault(drive, Counter())[one.source] += 1
 
     def _staying(self, window: int) -> tuple[Index, Index]:
         """The vertices and edges that stay; ``window`` is the first keyframe of the window, by its vertex.

@@ -26,7 +26,7 @@ from graph_slam_ros.slam.robust.landmark_support import landmark_of
 from graph_slam_ros.slam.robust.ledger import Reason
 
 SOURCE = "edit"
-_OF_ONE_EDGE = ("remove_edge", "let_in_edge")
+_IF_CONDENSED = ("remove_edge", "let_in_edge", "add_closure", "rename_landmark")  # possible if visits are condensed
 _EDIT = re.compile(r"\s*(edge|landmark)\s+(\S.{0,127}?)\s*", re.DOTALL)
 _ID = re.compile(r"\d{1,18}", re.ASCII)
 
@@ -95,7 +95,7 @@ class Edits:
             raise GraphSlamError(f"edit {edit.name}: the map has an edit of that name already")
         if not self._frontend.path.keyframes:
             raise GraphSlamError(f"edit {edit.name}: there is no map yet")
-        if self._frontend.path.keyframes.first and edit.do not in _OF_ONE_EDGE:
+        if self._frontend.path.keyframes.first and edit.do not in _IF_CONDENSED:
             raise GraphSlamError(f"edit {edit.name}: {self._tools.refusal('condensed_in_map')}")
         backend.gate_new(keyframe)
         edges, changes = backend.graph.edge_count, len(backend.ledger.history)

@@ -68,7 +68,13 @@ class PathEdits:
         return a, b
 
     def _numbered(self, number: int) -> int:
-        ids = self._frontend.path.keyframes.ids
+        ids, first = self._frontend.path.keyframes.ids, self._frontend.path.keyframes.first
+        if first:  # of a map with condensed visits no part can be cut out
+            if number < first:
+                raise GraphSlamError(f"keyframe {number}: {self._tools.refusal('condensed_in_map')}")
+            if number - first >= len(ids):
+                raise GraphSlamError(f"no keyframe {number}: the map has {first} to {first + len(ids) - 1}")
+            return number - first
         known = set(self.numbered)
         self.numbered += [vertex for vertex in ids.tolist() if vertex not in known]
         if number >= len(self.numbered):

@@ -241,7 +241,7 @@ function fillPose() {
 
 // -- what can be done with what is chosen -----------------------------------------------------------------------------
 
-const isInside = (k) => ["accepted", "not judged", "down-weighted"].includes(data.edges.verdicts[column(data.edges.verdict)[k]]);
+const isInside = (k) => ["accepted", "not judged", "down-weighted"].includes(data.edges.verdicts[ofEdge(data.edges.verdict, k)]);
 const pendingOf = (k) => edits.list.findIndex((one) => one.edge === k && (one.do === "remove_edge" || one.do === "let_in_edge"));
 const isOdometry = (k) => ["odometry", "prior"].includes(named(data.edges.label, k));
 

@@ -93,7 +93,7 @@ class Workbench:
         run = self._saved
         if run.space.dimensions == 3:
             return []
-        values: list[float] = np.round(run.slam.solver.estimate(run.keyframes)[:, 2], _DECIMALS).tolist()
+        values: list[float] = np.round(run.whole_path.poses()[:, 2], _DECIMALS).tolist()
         return values
 
     def solve(self, body: bytes) -> dict[str, Any]:
@@ -132,7 +132,7 @@ class Workbench:
         self._check_source(plan.source)
         with self._lock:
             if self._rehearsal is None:
-                self._rehearsal = Rehearsal(self._saved.slam)
+                self._rehearsal = Rehearsal(self._saved.slam, self._run)
             slam, edited = self._rehearsal.attempt(plan.edits)
             return {
                 "places": self._places(slam.solver, set(slam.keyframes.ids.tolist())),
@@ -176,18 +176,19 @@ class Workbench:
         there : vertices that are keyframes in the solution
         """
         run, n = self._saved, self._saved.space.dimensions
-        at = [k for k, vertex in enumerate(run.keyframes) if vertex in there]
-        places = np.full((len(run.keyframes), 3), np.nan)
-        places[at, 2] = 0.0
-        places[at, :n] = solver.estimate([run.keyframes[k] for k in at])[:, :n]
+        path = run.whole_path.poses(solver)
+        places = np.zeros((len(path), 3))
+        places[:, :n] = path[:, :n]
+        gone = [vertex not in there for vertex in run.slam.keyframes.ids.tolist()]
+        places[run.slam.first_keyframe :][gone] = np.nan
         return _columns(places)
 
     def _changes(self, slam: MapView, edited: Edited) -> list[list[Any]]:
         """Edges whose verdict is another afterwards, and which were not named by an edit: id, before and after."""
         by_hand = {edge for one in edited.edits for edge in one.edges}
         ledger, out = slam.ledger, []
-        for e in self._saved.entries:
-            after = ledger.verdict_of(e.edge)
+        for row, e in enumerate(self._saved.entries):
+            after = ledger.verdict_of(row)
             if after is not e.verdict and e.edge not in by_hand:
                 out.append([e.edge, STATES[e.verdict], STATES[after]])
         return out[:_MOST_CHANGES]
@@ -207,7 +208,7 @@ def _verdict(out: Path) -> str:
     """The first sentence of the report on a run that was just written; empty where it cannot be read."""
     losses: list[str] = []
     try:
-        saved = SavedGraph(out, losses)
+        saved = SavedGraph(out, losses, condensed=True)
         return verdict(out, summary_of(out), saved, None, losses)[0]
     except (GraphSlamError, OSError):
         return ""

@@ -1,5 +1,6 @@
 """The state of a condensed map that is not in its graph."""
 
+from collections import Counter
 from dataclasses import dataclass, field
 
 from graph_slam_ros.slam.lifelong.condenser import Cell, PlaceEdge
@@ -15,6 +16,7 @@ class BoundedState:
     places : by cell
     old : the keyframes in the graph that are in no list of keyframes any more, in order of time
     keyframes, sightings, frames : how many have left the map
+    accepted : of each drive, by its first keyframe, how many accepted measurements of each input have left the map
     """
 
     places: dict[Cell, list[PlaceEdge]] = field(default_factory=dict)
@@ -22,3 +24,4 @@ class BoundedState:
     keyframes: int = 0
     sightings: int = 0
     frames: int = 0
+    accepted: dict[int, Counter[str]] = field(default_factory=dict)

@@ -21,8 +21,8 @@ from graph_slam_ros.runs.journal import MAP, parts_of, read_measurements
 from graph_slam_ros.runs.map_journal import read_map
 from graph_slam_ros.runs.recorder import RunRecorder
 from graph_slam_ros.runs.restore import record_run, recover
-from graph_slam_ros.runs.tables import removed_path
 from graph_slam_ros.runs.trajectory import read_tum
+from graph_slam_ros.runs.whole_path import removed_path
 from graph_slam_ros.slam import Config, Control, GraphSlam
 from graph_slam_ros.slam.lifelong.condenser import CHAIN
 from graph_slam_ros.slam.lifelong.removed import Left

@@ -5,7 +5,7 @@ import pytest
 
 from benchmarks.hall import STEP_S, config, hall, measurements, rms
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
-from graph_slam_ros.runs.tables import removed_path
+from graph_slam_ros.runs.whole_path import removed_path
 from graph_slam_ros.slam import Closure, Control, Fix, GraphSlam, Odometry
 from graph_slam_ros.slam.lifelong.carried import carried_closure, fused_closure, inverse
 from graph_slam_ros.slam.lifelong.condenser import CHAIN

@@ -5,12 +5,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from condensed_run import condensed_run
 from faulty import faulty_run
 from pages import HOSTILE, chromium, drive, pages, violations
 
 from graph_slam_ros import cli
 from graph_slam_ros.analysis.explain import Numbers, explain_edge, statements, title
 from graph_slam_ros.analysis.what_if import SavedGraph
+from graph_slam_ros.graph.place import LABEL as PLACES
 from graph_slam_ros.runs.ledger_file import read_ledger
 from graph_slam_ros.runs.recorder import RunRecorder
 from graph_slam_ros.slam import Config
@@ -219,3 +221,31 @@ def test_a_run_in_space_a_merged_and_frozen_one_and_an_empty_one_open(opened, tm
     assert code == 3
     assert page.inner_text("#verdict").startswith("There is no map to show")
     assert not page.is_visible("#map")
+
+
+def test_a_map_with_condensed_visits_opens_at_a_place_an_edge_and_a_condensed_keyframe(opened, tmp_path, capsys):
+    run, slam, _ = condensed_run(tmp_path / "run")
+    saved = SavedGraph(run, [], condensed=True)
+    code, html = reported(run, tmp_path / "run.html")
+    place = next(e for e in saved.entries if e.label == PLACES)
+    page = opened(html, f"#edge={place.edge}")
+    assert code == 0
+    assert why(page).startswith(f"edge {place.edge} edge {place.edge} a place: ")
+    assert all(f"{name} (" in why(page) for name in saved.landmarks_of(place))
+    assert page.evaluate("() => map.notes.length") == 0
+    newest = saved.entries[-1].edge
+    assert newest > len(saved.entries)
+    page.evaluate("k => go('edge', k)", newest)
+    page.wait_for_function("k => byId('why-body').innerText.startsWith(`edge ${k}`)", arg=newest)
+    told = " ".join(" ".join(explain_edge(saved, str(newest))).split())
+    assert told[: told.index(" what if ")] in why(page)
+    page.evaluate("() => go('keyframe', 5)")
+    page.wait_for_function("() => byId('why-body').innerText.startsWith('keyframe 5')")
+    assert "It was condensed" in why(page)
+    gone = next(k for k in range(slam.graph.edge_ids.of(0), newest) if slam.graph.edge_ids.find(k) is None)
+    page.evaluate("k => go('edge', k)", gone)
+    page.wait_for_function("() => byId('why-body').innerText.startsWith('there is no edge')")
+    assert "visits are condensed" in why(page)
+    page.fill("#filter", "landmarks")
+    count = sum(e.label == "landmarks" for e in saved.entries)
+    assert page.inner_text("#count") == f"{count} of {len(saved.entries)} edges"
