@@ -12,21 +12,27 @@ from graph_slam_ros.typing import Array, Index
 
 
 class Column:
-    """An array that grows at its end; ``values`` is a view of what is there."""
+    """An array that grows at its end.
 
-    __slots__ = ("_buffer", "_length")
+    Attributes
+    ----------
+    values : the rows so far, a view
+    """
+
+    __slots__ = ("_buffer", "values")
 
     def __init__(self, dtype: type, *shape: int) -> None:
-        self._buffer: NDArray[Any] = np.empty((16, *shape), dtype=dtype)
-        self._length = 0
+        self.__setstate__(np.empty((0, *shape), dtype=dtype))
+
+    def __getstate__(self) -> NDArray[Any]:
+        return self.values
+
+    def __setstate__(self, values: NDArray[Any]) -> None:
+        self._buffer: NDArray[Any] = values
+        self.values: NDArray[Any] = values[:]
 
     def __len__(self) -> int:
-        return self._length
-
-    @property
-    def values(self) -> NDArray[Any]:
-        """The rows so far, a view."""
-        return self._buffer[: self._length]
+        return len(self.values)
 
     @staticmethod
     def extend(*parts: tuple["Column", ArrayLike, int]) -> None:
@@ -34,21 +40,24 @@ class Column:
 
         Half a record would shift all later ones.
         """
+        longer = []
         for column, rows, count in parts:
-            begin = column._length
+            begin = len(column.values)
             end = begin + count
             if end > len(column._buffer):
                 column._lengthen(end)
             # beyond the end, where nothing is visible yet; a number alone takes a tenth of the time
             column._buffer[begin if isinstance(rows, int | float) and count == 1 else slice(begin, end)] = rows
-        for column, _, count in parts:
-            column._length += count
+            longer.append(column._buffer[:end])
+        for (column, _, _), values in zip(parts, longer, strict=True):
+            column.values = values
 
     def _lengthen(self, rows: int) -> None:
         """Make room for at least so many rows."""
-        grown = np.empty((max(rows, 2 * len(self._buffer)), *self._buffer.shape[1:]), dtype=self._buffer.dtype)
-        grown[: self._length] = self.values
-        self._buffer = grown
+        before = self.values
+        grown = np.empty((max(rows, 16, 2 * len(self._buffer)), *before.shape[1:]), dtype=before.dtype)
+        grown[: len(before)] = before
+        self._buffer, self.values = grown, grown[: len(before)]
 
 
 @dataclass(slots=True, eq=False)

@@ -178,9 +178,22 @@ def chi2_of(graph: Graph, x: Array, edges: Index) -> tuple[Array, Index]:
     """Squared whitened residual of each edge at the stored values x, without loss and weight, and its numbers."""
     chi2, numbers = np.empty(len(edges)), np.empty(len(edges), dtype=np.int64)
     for some, residual, root in residuals_of(graph, x, edges):
-        white = np.einsum("eab,eb->ea", root, residual)
-        chi2[some], numbers[some] = np.einsum("ea,ea->e", white, white), residual.shape[1]
+        chi2[some], numbers[some] = _squares(root, residual), residual.shape[1]
     return chi2, numbers
+
+
+@kernel
+def _squares(root: Array, residual: Array) -> Array:
+    """Return the squared whitened residual of each edge."""
+    n, m = residual.shape
+    out = np.zeros(n)
+    for e in range(n):
+        for a in range(m):
+            white = 0.0
+            for b in range(m):
+                white += root[e, a, b] * residual[e, b]
+            out[e] += white * white
+    return out
 
 
 @kernel
@@ -273,7 +286,8 @@ def rows_of(graph: Graph, edges: Index) -> dict[EdgeTable, Index]:
     if len(graph.tables) == 1:
         return dict.fromkeys(graph.tables.values(), rows)
     codes = graph.table_of_edge.values[edges]
-    return {table: rows[codes == code] for code, table in enumerate(graph.tables.values()) if (codes == code).any()}
+    by_table = ((table, rows[codes == code]) for code, table in enumerate(graph.tables.values()))
+    return {table: of_table for table, of_table in by_table if len(of_table)}
 
 
 def refuse_nonfinite(block: Block) -> None:

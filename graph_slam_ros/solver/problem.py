@@ -18,11 +18,13 @@ from graph_slam_ros.solver.clique_tree.pools import compact
 from graph_slam_ros.solver.clique_tree.storage import (
     ACTIVE,
     BLOCKS_TOP,
+    DEFERRED_COUNT,
     FREE,
     LINKS,
     NOTHING,
     SE2_KIND,
     SE3_KIND,
+    STALE_COUNT,
     SUBSTITUTED,
     TAIL_END,
     TAIL_FIRST,
@@ -213,7 +215,9 @@ class Problem:
 
     def _estimates(self) -> Array:
         """Return the estimates of all vertices, none of them waiting; they stay the tree's."""
-        show_all(self._tree, self._kept, self.settings.tolerance, self.settings.tolerance_sigmas)
+        state = self._tree.state
+        if state[STALE_COUNT] or state[DEFERRED_COUNT]:
+            show_all(self._tree, self._kept, self.settings.tolerance, self.settings.tolerance_sigmas)
         return self._tree.estimate
 
     def _grow(self) -> None:
@@ -274,11 +278,12 @@ class Problem:
 
     def _weighted(self, edges: Index) -> Index:
         """The edges among these that have a weight."""
-        for table, rows in rows_of(self.graph, edges).items():
-            weight = table.weight.values[rows]
-            if np.count_nonzero(weight) < len(weight):  # faster than ``all`` on a few numbers
-                edges = np.setdiff1d(edges, table.id.values[rows[weight == 0.0]])
-        return edges
+        codes, rows = self.graph.table_of_edge.values[edges], self.graph.row_of_edge.values[edges]
+        has_weight = np.ones(len(edges), dtype=bool)
+        for code, table in enumerate(self.graph.tables.values()):
+            of_table = codes == code
+            has_weight[of_table] = table.weight.values[rows[of_table]] != 0.0
+        return edges if np.count_nonzero(has_weight) == len(edges) else edges[has_weight]
 
     def _arriving(self, *, surely: bool = False) -> tuple[Index, Index]:
         """Return the unknowns and edges that enter the problem; nothing is changed.

@@ -44,7 +44,7 @@ class Corrections:
         source, name = key
         if name in _ODOMETRY:
             return float(getattr(self._config.odometry, _ODOMETRY[name]))
-        settings = self._inputs.get(source, InputConfig(source))
+        settings = self._inputs.get(source) or InputConfig(source)
         if name in AXES:
             return (settings.numbers("mount_correction", 6) or (0.0,) * 6)[AXES.index(name)]
         return float(
