@@ -209,6 +209,7 @@ def _load_plane() -> None:
     for method in METHODS:
         solver.start_at(graph.initial.values)
         solver.optimize(Settings(method))
+    gc.freeze()  # what was loaded stays: no collection of garbage has to look at it again
 
 
 @functools.cache

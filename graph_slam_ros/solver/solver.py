@@ -181,7 +181,7 @@ class Solver(Problem):
         wanted = self._with_covariance(ids)
         free = wanted[~self._held[wanted]]
         with self._tree_remade_after_error():
-            numbers = marginals(self._tree, free) if len(free) else np.empty(0)
+            numbers = joint(self._tree, free).ravel() if len(free) == 1 else marginals(self._tree, free)
         out, at = [], 0
         for vertex in wanted.tolist():
             dof = self.graph.kind_of(vertex).dof
