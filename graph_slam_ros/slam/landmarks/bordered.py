@@ -66,10 +66,13 @@ class Factor:
         last = np.linalg.solve(self.corner, b[count:] - self.coupling @ own)
         return np.concatenate([own - self.solved @ last, last])
 
-    def border_covariance(self) -> Array:
-        """The covariance of the border's unknowns."""
-        first = self.coupling.shape[1] + len(self.corner) - self.border
-        return self.solve(np.eye(first + self.border)[:, first:])[first:]
+    def border_covariance(self, some: Index) -> Array:
+        """The covariance of some unknowns of the border, each solved for by itself."""
+        size = self.coupling.shape[1] + len(self.corner)
+        at = size - self.border + some
+        unit = np.zeros((size, len(at)))
+        unit[at, np.arange(len(at))] = 1.0
+        return self.solve(unit)[at]
 
 
 class BorderedEquations:

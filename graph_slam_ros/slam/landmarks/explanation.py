@@ -266,21 +266,26 @@ class Drive:
                 break
         return replace(e, volume=self._volume(e, loss_scale, slips=slips))
 
-    def border_covariance(self, e: Estimate) -> Array | None:
-        """The covariance of all landmarks, then scales and clocks, jointly; None if rounding leaves none."""
+    def landmark_covariances(self, e: Estimate, landmarks: Ids) -> Array | None:
+        """The covariance (k, k, n, n) of some landmarks jointly, in blocks; None if rounding leaves none."""
+        k, n = len(landmarks), self.n
+        covariance = self._border_covariance(e, (n * landmarks[:, None] + np.arange(n)).ravel())
+        return None if covariance is None else covariance.reshape(k, n, k, n).transpose(0, 2, 1, 3)
+
+    def _border_covariance(self, e: Estimate, some: Ids) -> Array | None:
         normal, floor = self._normal(e, self.costs.loss_scale, slips=True)
         try:
-            return normal.factor(floor).border_covariance()
+            return normal.factor(floor).border_covariance(some)
         except np.linalg.LinAlgError:
             return None
 
     def named(self, e: Estimate) -> dict[str, tuple[float, float]]:
         """Odometry's scales, ``distance`` and ``turn``, and the clock of each input [s], with standard deviations."""
-        covariance = self.border_covariance(e)
+        names, values = (*SCALES, *self.topics), [*e.scales.tolist(), *e.clocks.tolist()]
+        covariance = self._border_covariance(e, self.n * len(e.landmarks) + np.arange(len(values)))
         if covariance is None:
             return {}
-        sigmas = np.sqrt(covariance.diagonal()[self.n * len(e.landmarks) :]).tolist()
-        names, values = (*SCALES, *self.topics), [*e.scales.tolist(), *e.clocks.tolist()]
+        sigmas = np.sqrt(covariance.diagonal()).tolist()
         return dict(zip(names, zip(values, sigmas, strict=True), strict=True))
 
     def _volume(self, e: Estimate, loss_scale: float, *, slips: bool) -> float:

@@ -51,16 +51,16 @@ def merged(drive: Drive, e: Estimate) -> Estimate:
 
 def _pairs(drive: Drive, e: Estimate) -> list[tuple[tuple[tuple[float, ...], tuple[float, ...]], int, int]]:
     """Pairs of close landmarks, the nearest first, with their positions. By their covariance they may be one."""
-    n, landmarks, covariance = drive.n, e.landmarks, drive.border_covariance(e)
+    landmarks = e.landmarks
     apart = np.linalg.norm(landmarks[:, None] - landmarks[None], axis=2)
     i, j = np.nonzero(np.tril(apart < _MERGE_M, -1))
-    if covariance is not None and len(i):
-        size = len(landmarks)
-        blocks = covariance[: n * size, : n * size].reshape(size, n, size, n).transpose(0, 2, 1, 3)
+    close = np.unique(np.concatenate([i, j]))
+    if len(i) and (blocks := drive.landmark_covariances(e, close)) is not None:
+        a, b = np.searchsorted(close, i), np.searchsorted(close, j)
         away = landmarks[i] - landmarks[j]
-        between = blocks[i, i] + blocks[j, j] - blocks[i, j] - blocks[j, i]
+        between = blocks[a, a] + blocks[b, b] - blocks[a, b] - blocks[b, a]
         chi2 = (away * np.linalg.solve(between, away[..., None])[..., 0]).sum(axis=1)
-        counts = np.bincount(e.which[e.which >= 0], minlength=size)
+        counts = np.bincount(e.which[e.which >= 0], minlength=len(landmarks))
         most = (counts[i] + counts[j]) * drive.costs.loss_scale**2  # Cauchy's loss, if all clusters share it
         is_near = most * np.log1p(chi2 / most) < _HOPELESS * drive.costs.landmark * (1 + _BOTH_AT_MOST)
         i, j = i[is_near], j[is_near]

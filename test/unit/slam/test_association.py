@@ -346,8 +346,11 @@ def test_the_factor_is_that_of_the_whole_matrix():
     assert np.linalg.eigvalsh(0.5 * (inverse + inverse.T)).min() > 0.0
     assert normal.factor(floor).log_determinant == pytest.approx(-np.linalg.slogdet(inverse)[1])
     assert np.linalg.inv(inverse).diagonal() == pytest.approx(normal.diagonal + floor, rel=1e-4)
-    border = normal.factor(floor).border_covariance()
-    assert border == pytest.approx(inverse[-len(border) :, -len(border) :], abs=1e-9)
+    size = drive.n * len(e.landmarks) + 2 + len(drive.topics)
+    border = normal.factor(floor).border_covariance(np.arange(size))
+    assert border == pytest.approx(inverse[-size:, -size:], abs=1e-9)
+    blocks, n = drive.landmark_covariances(e, np.array([2, 0])), drive.n
+    assert blocks[1, 0] == pytest.approx(border[:n, 2 * n : 3 * n], rel=1e-6)
 
 
 def test_what_was_taken_for_two_is_merged_and_what_was_given_wrongly_is_given_to_another():
@@ -522,6 +525,8 @@ def test_the_equations_of_a_chain_with_a_border_are_solved_as_the_dense_ones(lan
     factor = normal.factor(added)
     assert factor.solve(normal.b) == pytest.approx(np.linalg.solve(dense, -j.T @ r), rel=1e-9, abs=1e-12)
     assert factor.log_determinant == pytest.approx(np.linalg.slogdet(dense)[1], rel=1e-12)
-    assert factor.border_covariance() == pytest.approx(np.linalg.inv(dense)[count:, count:], rel=1e-9, abs=1e-12)
+    some = rng.permutation(size)[: size // 2]
+    inverse = np.linalg.inv(dense)[np.ix_(count + some, count + some)]
+    assert factor.border_covariance(some) == pytest.approx(inverse, rel=1e-9, abs=1e-12)
     with pytest.raises(np.linalg.LinAlgError):
         normal.factor(-1e3 * added)
