@@ -29,21 +29,21 @@ class RelativeCovariances:
 
     def __init__(self, saved: SavedGraph, frame: tuple[int, ...]) -> None:
         self._saved, self._space = saved, saved.space
-        self._frame = [saved.keyframes[k] for k in frame]
+        self._frame = [saved.vertices[k] for k in frame]
         self._at = [self._value(vertex) for vertex in self._frame]
 
     def poses(self, keyframes: Iterable[int]) -> Array:
         """Covariances (n, d, d) of poses in the frame of one keyframe, each in its own tangent space; its own is 0."""
         group, d = self._space.group, self._space.dof
         out = []
-        for vertex in (self._saved.keyframes[k] for k in keyframes):
+        for vertex in (self._saved.vertices[k] for k in keyframes):
             by_frame = -group.adjoint(group.between(self._value(vertex), self._at[0]))
             out.append(self._combined(vertex, by_frame, np.eye(d), np.zeros((d, d))))
         return np.array(out).reshape(-1, d, d)
 
     def positions(self, keyframes: Iterable[int]) -> Array:
         """Covariances (n, dimensions, dimensions) of the positions of keyframes, in the axes of map."""
-        return self._points(self._saved.keyframes[k] for k in keyframes)
+        return self._points(self._saved.vertices[k] for k in keyframes)
 
     def landmarks(self, names: Iterable[str]) -> Array:
         """Covariances (m, dimensions, dimensions) of landmarks' positions in the axes of map; NaN where unknown."""

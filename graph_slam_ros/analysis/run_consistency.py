@@ -62,7 +62,7 @@ def consistency_of(run: Path, known: Truth, keyframes: slice, *, is_first: bool)
     drive = _Compared(run, path, true, landmarks, known)
     if not known.trajectory.has_orientation:
         found, frame = drive.positions()
-    elif np.isfinite(true[0]).all():
+    elif np.isfinite(true[0]).all() and np.isfinite(covariances[0]).all():  # that of a condensed one is not known
         found, frame = drive.poses(0, covariances, [one.covariance for one in landmarks.values()]), ""
     else:
         found, frame = drive.later()
@@ -89,21 +89,22 @@ class _Compared:
 
     def later(self) -> tuple[_All, str]:
         """NEES seen from the first keyframe with truth, where that is not the first."""
-        first = int(self._with_truth[0])
-        frame = RelativeCovariances(SavedGraph(self._run, []), (first,))
-        some = self._some()
+        saved = self._saved()
+        first, some = int(self._with_truth[0]), self._some()
+        frame = RelativeCovariances(saved, (first,))
         of_some = frame.poses(some)
         covariances = np.full((len(self._true) - first, *of_some.shape[1:]), np.nan)
         covariances[some - first] = of_some
         found = self.poses(first, covariances, _in_space(frame.landmarks(self._names)))
-        return found, f"seen from keyframe {first}, the first with a true pose"
+        return found, f"seen from keyframe {first}, the first in the graph with a true pose"
 
     def positions(self) -> tuple[_All, str]:
         """NEES of positions in the plane, seen from the line between two of them."""
         path, true = self._path.poses[:, :2], self._true[:, :2]
+        saved = self._saved()
         first, some = int(self._with_truth[0]), self._some()
         last = int(some[np.argmax(np.linalg.norm(true[some] - true[first], axis=1))])
-        frame = RelativeCovariances(SavedGraph(self._run, []), (first, last))
+        frame = RelativeCovariances(saved, (first, last))
         line, true_line = path[last] - path[first], true[last] - true[first]
         angle = np.arctan2(line[1], line[0]) - np.arctan2(true_line[1], true_line[0])
         turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
@@ -121,6 +122,14 @@ class _Compared:
         )
         text = f"of positions, seen from the line between keyframes {first} and {last}: the truth has no heading"
         return found, text
+
+    def _saved(self) -> SavedGraph:
+        """Return the graph of the run; from now on only keyframes that are in it count."""
+        saved = SavedGraph(self._run, [])
+        self._with_truth = np.intersect1d(self._with_truth, saved.numbers)
+        if not len(self._with_truth):
+            raise GraphSlamError(f"{self._run}: no keyframe with a truth is in the graph: visits were condensed")
+        return saved
 
     def _some(self) -> Array:
         """The keyframes with truth, at most so many as are computed, the first and last among them."""

@@ -65,13 +65,13 @@ class SavedGraph:
     Parameters
     ----------
     losses : a line is added for each part of the run that could not be read
-    condensed : whether a map with condensed visits will do; if not, it is refused
 
     Attributes
     ----------
     slam : the pipeline that holds the map
     keyframes, numbers, stamps_ns : vertices of the keyframes that are in the graph, in order of time, their numbers
         among all keyframes, and stamps
+    vertices : of the keyframes that are in the graph, by number
     segments : numbers of the keyframes at which odometry begins
     entries, changes : their edges have lasting ids; ``entries`` are in the order of the rows of the graph
     edits : by hand, in order
@@ -84,8 +84,8 @@ class SavedGraph:
         There is no map, it cannot be read, or it cannot be solved.
     """
 
-    def __init__(self, folder: Path, losses: list[str], *, condensed: bool = False) -> None:
-        slam = restored(folder, losses, condensed=condensed)
+    def __init__(self, folder: Path, losses: list[str]) -> None:
+        slam = restored(folder, losses)
         if not slam.is_solved:
             raise RunError(f"{folder}: its map cannot be solved: {slam.failing}")
         self.slam, self.folder, self.space, self.config = slam, folder, slam.space, slam.config
@@ -105,6 +105,7 @@ class SavedGraph:
         self.landmarks = {name: mark.vertex for name, mark in slam.landmarks.items() if mark.vertex in joined}
         self.numbers: list[int] = [*(one.number for one in old), *range(slam.first_keyframe, len(slam.keyframes))]
         self._numbers = dict(zip(self.keyframes, self.numbers, strict=True))
+        self.vertices = dict(zip(self.numbers, self.keyframes, strict=True))
 
     @cached_property
     def solver(self) -> Solver:

@@ -21,7 +21,7 @@ def advise(args: argparse.Namespace) -> int:
     from graph_slam_ros.analysis.what_if import SavedGraph
 
     losses: list[str] = []
-    run = SavedGraph(args.run_folder, losses, condensed=True)
+    run = SavedGraph(args.run_folder, losses)
     weakness = Weakness(run)
     advisor = Advisor(weakness, args.survey_sigma)
     everything = advisor.advise()

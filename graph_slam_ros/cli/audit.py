@@ -25,7 +25,7 @@ def explain(args: argparse.Namespace) -> int:
     if args.edge == "calibration":
         console.show(*explain_calibration(args.run_folder))
         return console.DONE
-    run = SavedGraph(args.run_folder, losses, condensed=True)
+    run = SavedGraph(args.run_folder, losses)
     console.show(*(explain_edge(run, args.edge) if args.edge else explain_run(run)))
     if args.edge:
         console.then(f"{console.command('solve', args.run_folder, '--without', 'EDGE')} (the drive without an edge)")
@@ -41,7 +41,7 @@ def solve(args: argparse.Namespace) -> int:
     if not (args.without or args.let_in or args.loss):
         raise GraphSlamError("solve needs --without EDGE, --with EDGE or --loss NAME: what would be otherwise")
     losses: list[str] = []
-    run = SavedGraph(args.run_folder, losses, condensed=True)
+    run = SavedGraph(args.run_folder, losses)
     start = time.process_time()
     solver = run.problem(args.without, args.let_in, args.loss)
     report = solver.optimize()
@@ -58,7 +58,7 @@ def influence(args: argparse.Namespace) -> int:
     from graph_slam_ros.analysis.what_if import SavedGraph
 
     losses: list[str] = []
-    run = SavedGraph(args.run_folder, losses, condensed=True)
+    run = SavedGraph(args.run_folder, losses)
     console.show(
         f"the last pose without each edge, the {args.count} of most influence to first order",
         f"  {'edge':<8s} {'':24s} {'first order':>12s} {'solved again':>12s}",

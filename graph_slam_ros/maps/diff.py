@@ -149,7 +149,7 @@ def diff(a: Path, b: Path, losses: list[str]) -> Difference:
     GraphSlamError
         One of them has no map, or another number of dimensions.
     """
-    one, two = (restored(folder, losses, condensed=True) for folder in (a, b))
+    one, two = (restored(folder, losses) for folder in (a, b))
     refuse_other_space(one, two, a, b)
     common = shared_landmarks(one, two)
     at = _of_one_stamp(*(whole_path(folder, slam) for folder, slam in ((a, one), (b, two))))

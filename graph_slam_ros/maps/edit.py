@@ -22,7 +22,7 @@ from graph_slam_ros.measurements.edits import AppliedEdit, Edit, edit_of
 from graph_slam_ros.runs.folder import CONFIG, RunError, check_room, discard, recording_of, run_config
 from graph_slam_ros.runs.journal import INGEST, MAP, parts_of, read_measurements
 from graph_slam_ros.runs.map_journal import read_map, state_of
-from graph_slam_ros.runs.restore import record_run, restored, stopwatch
+from graph_slam_ros.runs.restore import config_to_go_on, record_run, restored, stopwatch
 from graph_slam_ros.runs.run_check import check_run
 from graph_slam_ros.slam import Control, GraphSlam
 
@@ -246,15 +246,15 @@ def edit(folder: Path, plan: Plan, out: Path | None) -> Edited:
         raise GraphSlamError("the plan has no edits")
     losses: list[str] = []
     counters = Counters()
-    slam = restored(folder, losses, counters, condensed=True)
+    slam = restored(folder, losses, counters)
     rehearsal = Rehearsal(slam, folder)
     edited = rehearsal.attempt(plan.edits, losses)[1]
     if out is None:
         return edited
     options: dict[str, Any] = {"earlier": counters, "took": took, "recording": recording_of(folder)}
     try:
-        measurements = _controls(plan.edits)
-        edited.summary.update(record_run(out, slam.config, measurements, losses, rehearsal.state, **options)[1])
+        config, measurements = config_to_go_on(slam, folder), _controls(plan.edits)
+        edited.summary.update(record_run(out, config, measurements, losses, rehearsal.state, **options)[1])
     except Exception:
         discard(out)
         raise
@@ -334,7 +334,7 @@ class Rehearsal:
 
     def __init__(self, slam: GraphSlam, folder: Path) -> None:
         self.state = state_of(slam, folder)
-        self._config = slam.config.changed({"map.condense": False})  # nothing leaves the map while it is compared
+        self._config = slam.config
 
     def attempt(self, edits: Sequence[Edit], losses: Sequence[str] = ()) -> tuple[GraphSlam, Edited]:
         """Apply edits to a copy of the map; returns it, and what changed. Raises GraphSlamError where one fails."""

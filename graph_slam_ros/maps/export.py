@@ -37,7 +37,7 @@ def export(folder: Path, out: Path, target: str, losses: list[str], *, last_driv
         raise RunError(f"{out}: a run is there, with files of its own")
     if target == "mcap" and out.suffix != ".mcap":
         raise RunError(f"{out}: what reads mcap wants a name that ends in .mcap")
-    slam = restored(folder, losses, condensed=True)
+    slam = restored(folder, losses)
     left = read_left(folder, slam.space, slam.bounded)
     if last_drive:
         if target != "tum":

@@ -1,6 +1,8 @@
 """One map from two sessions: common landmarks align the second with the first, then everything is solved together.
 
 The drive of the second follows as a new segment, as after a jump of time. Only landmarks link it to the first drive.
+Visits of the first map may be condensed. Where those of the second are, its drive is repeated from its journal first:
+then the merged map has all of its keyframes, and condenses them as its configuration says.
 """
 
 from collections.abc import Iterator, Mapping
@@ -20,7 +22,8 @@ from graph_slam_ros.measurements.edit_actions import ALL_FIELDS
 from graph_slam_ros.measurements.edits import AppliedEdit, Value
 from graph_slam_ros.runs.folder import check_room
 from graph_slam_ros.runs.map_journal import MapGrowth, Record, extend, state_of
-from graph_slam_ros.runs.restore import record_run, restored_and_solved, stopwatch
+from graph_slam_ros.runs.restore import config_to_go_on, record_run, restored_and_solved, stopwatch
+from graph_slam_ros.runs.whole_path import WholePath
 from graph_slam_ros.slam import Control, GraphSlam
 from graph_slam_ros.slam.calibration.parameters import QUANTITIES, Parameter
 from graph_slam_ros.slam.edit_tools import HAND_MADE
@@ -65,20 +68,21 @@ def merge(a: Path, b: Path, out: Path, *, force: bool = False) -> Merged:
     for folder in (a, b):
         check_room(out, folder, force=force)
     losses: list[str] = []
-    one, two = restored_and_solved(a, losses), restored_and_solved(b, losses)
+    one, two = restored_and_solved(a, losses), restored_and_solved(b, losses, whole=True)
     refuse_other_space(one, two, a, b)
     _refuse_other_datum(one, two, a, b)
     shared = _shared(one, two, a, b)
     aligned = _aligned(one, two, shared)
     _refuse_same_drive(one, two, a, b)
-    state = state_of(one)
+    state = state_of(one, a)
     first_edge = state.graph.edge_count
     two.backend.use_noise(one.noise_factors)  # the merged map has one factor for each group
     extend(state, _Second(one, two, aligned, shared).record())
     left_out = {name: aligned.distance(k) for k, name in enumerate(shared) if not aligned.fits[k]}
     chi2 = {one.landmarks[name].vertex: float(aligned.chi2[k]) for k, name in enumerate(shared) if name in left_out}
     _leave_out(state, first_edge, chi2, aligned.limit)
-    _, summary = record_run(out, one.config, [Control("optimize")], losses, state, took=took, force=force)
+    config = config_to_go_on(one, a)
+    _, summary = record_run(out, config, [Control("optimize")], losses, state, took=took, force=force)
     return Merged(summary, summary["losses"], len(shared), left_out, list(_calibrations(one, two)))
 
 
@@ -100,10 +104,14 @@ def _refuse_other_datum(one: GraphSlam, two: GraphSlam, a: Path, b: Path) -> Non
 
 def _refuse_same_drive(one: GraphSlam, two: GraphSlam, a: Path, b: Path) -> None:
     """Refuse two maps of one drive, because its measurements would count twice."""
-    driven = {(k.stamp_ns, k.T_odom_base) for k in one.keyframes}
-    same = sum((k.stamp_ns, k.T_odom_base) in driven for k in two.keyframes)
+    driven, again = (_driven(WholePath.of(slam, folder)) for slam, folder in ((one, a), (two, b)))
+    same = len(driven & again)
     if same > 1:  # two robots may begin at one time
         raise GraphSlamError(f"{same} keyframes are of the same drive in {a} and {b}: nothing new is in one of them")
+
+
+def _driven(path: WholePath) -> set[tuple[int, bytes]]:
+    return {(stamp, pose.tobytes()) for stamp, pose in zip(path.stamps_ns.tolist(), path.odometry, strict=True)}
 
 
 def _shared(one: GraphSlam, two: GraphSlam, a: Path, b: Path) -> list[str]:
@@ -181,6 +189,7 @@ class _Second:
         edges = [self._edge(edge) for edge in growth["edges"]]
         kept = [k for k, (_, vertices, *_, label, _) in enumerate(edges) if (label, *vertices) not in known]
         number = {edge: self._one.graph.edge_count + k for k, edge in enumerate(kept)}
+        ids = {edge: self._one.graph.edge_ids.of(row) for edge, row in number.items()}
         return {
             "vertices": [self._value(vertex, growth["vertices"][vertex][0]) for vertex in self._new],
             "edges": [edges[k] for k in kept],
@@ -195,7 +204,7 @@ class _Second:
                 [number[edge], topic, sighting, first + keyframe, self._vertex[vertex], *rest]
                 for edge, topic, sighting, keyframe, vertex, *rest in growth.get("seen", ())
             ],
-            "edits": [self._edit_record(one, number) for one in self._two.edits],
+            "edits": [self._edit_record(one, ids) for one in self._two.edits],
             "datum": growth.get("datum", self._one.datum),
             "offsets": {name: self._vertex[vertex] for name, vertex in growth.get("offsets", {}).items()},
         }

@@ -86,7 +86,7 @@ def read_contents(
     out = Contents(run)
     summary = out.attempt(lambda: summary_of(run)) or {}
     known = read_truth(truth, topic, out.attempt(lambda: input_topics(run)) or set()) if truth else None
-    saved = out.saved = out.attempt(lambda: SavedGraph(run, out.losses, condensed=True))
+    saved = out.saved = out.attempt(lambda: SavedGraph(run, out.losses))
     out.beware += out.attempt(lambda: changed_since(run)) or []
     scores = evaluate(run, known, align=align) if known and saved else None
     out.data["run"] = shown(run.resolve().name)

@@ -200,6 +200,7 @@ class RunRecorder:
     def _record(self, slam: GraphSlam, condensed: Condensation | None) -> None:
         if condensed is not None:
             self._left.write(list(left_records(condensed)))
+            self._map.write(self._grown)  # the map that the run began in may not be written yet, and its part stays
             self._map.begin_anew(kept=int(self._begins_in_a_map))
             self._grown = []
         self._grown += self._growth.of(slam, is_anew=condensed is not None)

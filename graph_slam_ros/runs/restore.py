@@ -102,31 +102,42 @@ def of_all(folder: Path) -> str:
     return f"graph_slam replay {folder} --out WHOLE --set map.condense=false makes a map with all of them"
 
 
-def restored(
-    folder: Path, losses: list[str], counters: Counters | None = None, *, condensed: bool = False
-) -> GraphSlam:
+def restored(folder: Path, losses: list[str], counters: Counters | None = None, *, whole: bool = False) -> GraphSlam:
     """The map of a run, solved; see ``map_of``.
 
     Parameters
     ----------
-    condensed : whether a map with condensed visits will do; if not, it is refused
+    whole : whether all keyframes are needed: where visits were condensed, the drive is repeated from its journal
+
+    Raises
+    ------
+    RunError
+        The whole map is asked for, and the drive began in a map with condensed visits.
     """
     lost = len(losses)
     state = map_of(folder, losses, counters)
-    if state.bounded is not None and not condensed:
-        raise RunError(f"{folder}: visits of its map are condensed, and this needs all keyframes: {of_all(folder)}")
+    if state.bounded is not None and whole:
+        state = _repeated(folder, losses, Counters())
+        if state.bounded is not None:
+            raise RunError(f"{folder}: it began in a map with condensed visits, and this needs all keyframes")
     losses[lost:] = [f"{folder}: {loss}" for loss in losses[lost:]]
-    config = config_of(folder, state).changed({"map.localize": False})  # what is asked of a map is asked of all of it
+    # what is asked of a map is asked of all of it
+    config = config_of(folder, state).changed({"map.localize": False} | _NOTHING_LEAVES)
     slam = GraphSlam(config, start=state)
     losses += [f"{folder}: {source}: {fault}" for source, fault in slam.counters.faults.items()]
     return slam
 
 
+def config_to_go_on(slam: GraphSlam, folder: Path) -> Config:
+    """The configuration of a run that goes on in a map that was restored from a folder: it condenses as that did."""
+    return slam.config.changed({"map.condense": run_config(folder).changed(slam.settings).map.condense})
+
+
 def restored_and_solved(
-    folder: Path, losses: list[str], counters: Counters | None = None, *, condensed: bool = False
+    folder: Path, losses: list[str], counters: Counters | None = None, *, whole: bool = False
 ) -> GraphSlam:
     """The same with all edges judged. Raises GraphSlamError also if it cannot be solved."""
-    slam = restored(folder, losses, counters, condensed=condensed)
+    slam = restored(folder, losses, counters, whole=whole)
     slam.process(Control("optimize"))
     if not slam.is_solved:
         raise RunError(f"{folder}: its map cannot be solved: {slam.failing}")
@@ -221,7 +232,7 @@ def complete(folder: Path) -> Summary:
     try:
         with claimed(folder):
             before, counters = summary_of(folder), Counters()
-            slam = restored_and_solved(folder, losses, counters, condensed=True)
+            slam = restored_and_solved(folder, losses, counters)
             summary = (
                 before | summarize(slam, counters) | took() | {"losses": losses, "ended": True, "is_incomplete": False}
             )
@@ -261,7 +272,8 @@ def freeze(folder: Path, out: Path, *, force: bool = False) -> Summary:
     took = stopwatch()
     check_room(out, folder, force=force)
     losses: list[str] = []
-    slam = restored_and_solved(folder, losses, condensed=True)
+    slam = restored_and_solved(folder, losses)
     state = state_of(slam, folder)
     state.freeze()
-    return record_run(out, slam.config, [Control("optimize")], losses, state, took=took, force=force)[1]
+    config = config_to_go_on(slam, folder)
+    return record_run(out, config, [Control("optimize")], losses, state, took=took, force=force)[1]

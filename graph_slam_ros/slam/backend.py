@@ -202,7 +202,7 @@ class Backend:
         is_due = is_driven if everything is not None else self.noise.is_due(len(keyframes))
         if self._config.noise_scale != "estimated" or self.holds_back or not is_due:
             return None
-        first_edge, report = self._first_free_edge, None
+        first_edge, report = self.first_free_edge, None
         for _ in range(_NOISE_ROUNDS if everything else _NOISE_ROUNDS_ONLINE):
             before = dict(self.noise.factors)
             try:
@@ -225,16 +225,16 @@ class Backend:
         """Estimate the scale of the noise without changing anything."""
         stamps = np.zeros(self.graph.vertex_count, dtype=np.int64)
         stamps[keyframes.ids] = keyframes.stamps_ns
-        edges = range(self._first_free_edge, self.handed_over[1])
+        edges = range(self.first_free_edge, self.handed_over[1])
         return estimate_noise(self.graph, self.solver, self.noise.factors, stamps, edges)
 
     def use_noise(self, factors: Mapping[Key, float]) -> None:
         """Scale the configured noise of edges by other factors than now; groups without one have none."""
-        if self.noise.change(self.noise.neutral() | dict(factors), self._first_free_edge):
+        if self.noise.change(self.noise.neutral() | dict(factors), self.first_free_edge):
             self.solver.rebuild()
 
     @property
-    def _first_free_edge(self) -> int:
+    def first_free_edge(self) -> int:
         """The first edge that is not of a frozen or held map."""
         return max(self.frozen_edges, self.held[1])
 
@@ -258,7 +258,7 @@ class Backend:
         keyframes = rows.ids.copy(), rows.stamps_ns.copy(), tuple(dict.fromkeys(begins))
         problem = solver.vertices, solver.held, solver.values, settings or solver.settings
         track = path.samples.track(path.keyframes.poses, factors)
-        return TrialProblem(space, graph, *problem, origins.copy(), *keyframes, track, self._first_free_edge)
+        return TrialProblem(space, graph, *problem, origins.copy(), *keyframes, track, self.first_free_edge)
 
     @property
     def is_handed_over(self) -> bool:
@@ -269,7 +269,7 @@ class Backend:
     def is_quiet(self) -> bool:
         """Return whether every edge was judged and solved, and nothing that could change a verdict goes on."""
         is_judged = self.is_handed_over and len(self.ledger) == self.graph.edge_count and not self._pending
-        return is_judged and not (self.holds_back or self.held[0] or self._background.is_busy)
+        return is_judged and not (self.holds_back or self._background.is_busy)
 
     def hand_over_condensed(self, keyframe: int) -> None:
         """Note edges that the solver has already: nobody doubts them."""

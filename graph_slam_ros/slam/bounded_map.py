@@ -159,8 +159,10 @@ class BoundedMap:
         return len(ids)
 
     def _is_plain(self, vertex: int) -> bool:
-        """Return whether a keyframe has edges of odometry, sightings of points, closures and fixes alone."""
+        """Return whether a keyframe is free, with edges of odometry, sightings of points, closures and fixes alone."""
         graph, space = self._backend.graph, self._space
+        if self._backend.solver.is_held(vertex):  # it is of a frozen map, or of one that the robot is located in
+            return False
         for edge in self._backend.solver.edges_on(vertex).tolist():
             one = graph.edge(edge)
             is_odometry = one.type is space.relative_pose and one.label in ("odometry", CHAIN)
@@ -264,18 +266,18 @@ class BoundedMap:
     def _staying(self, window: int) -> tuple[Index, Index]:
         """The vertices and edges that stay; ``window`` is the first keyframe of the window, by its vertex.
 
-        Edges stay that count, and those of the window that may count again; all of a frozen map do.
+        Edges stay that count, and those of the window that may count again; all of a frozen or held map do.
         """
         backend, graph = self._backend, self._backend.graph
         is_vertex = np.zeros(graph.vertex_count, dtype=bool)
         is_vertex[backend.solver.vertices] = True
-        is_vertex[: backend.frozen] = True
+        is_vertex[: max(backend.frozen, backend.held[0])] = True
         is_edge = np.zeros(graph.edge_count, dtype=bool)
         for table in graph.tables.values():
             ids, ends = table.id.values, table.vertices.values
             is_young = ((ends >= window) & is_vertex[ends]).any(axis=1)
             is_edge[ids] = is_vertex[ends].all(axis=1) & ((table.weight.values > 0.0) | is_young)
-            is_edge[ids] |= ids < backend.frozen_edges
+            is_edge[ids] |= ids < backend.first_free_edge
         return np.flatnonzero(is_vertex), np.flatnonzero(is_edge)
 
     def _sightings(self, end: int) -> Records:

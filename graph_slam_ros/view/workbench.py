@@ -208,7 +208,7 @@ def _verdict(out: Path) -> str:
     """The first sentence of the report on a run that was just written; empty where it cannot be read."""
     losses: list[str] = []
     try:
-        saved = SavedGraph(out, losses, condensed=True)
+        saved = SavedGraph(out, losses)
         return verdict(out, summary_of(out), saved, None, losses)[0]
     except (GraphSlamError, OSError):
         return ""

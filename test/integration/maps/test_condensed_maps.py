@@ -1,22 +1,31 @@
 """Maps with condensed visits, as a person works with them: judged, shown, asked, edited, and undone."""
 
 import json
+import re
+import shutil
 
 import numpy as np
 import pytest
-from condensed_run import condensed_run
+from condensed_run import SEED, condensed_run
 
+from benchmarks.hall import config, hall, rms
+from graph_slam_ros.analysis.run_consistency import consistency_of
+from graph_slam_ros.analysis.trajectories import Truth
 from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.graph.geometry import PLANAR
 from graph_slam_ros.graph.place import LABEL as PLACES
+from graph_slam_ros.lie import se3
 from graph_slam_ros.maps.edit import Plan, edit_run, plan_text, source_hash, undo_edit
+from graph_slam_ros.maps.merge import merge
 from graph_slam_ros.measurements.edits import edit_of
 from graph_slam_ros.report.contents import read_contents
 from graph_slam_ros.runs import outcome
+from graph_slam_ros.runs.folder import run_config
 from graph_slam_ros.runs.journal import read_measurements
 from graph_slam_ros.runs.map_journal import read_map
-from graph_slam_ros.runs.restore import record_run, recover
-from graph_slam_ros.runs.trajectory import read_tum
+from graph_slam_ros.runs.restore import freeze, record_run, recover
+from graph_slam_ros.runs.trajectory import Trajectory, read_tum
 from graph_slam_ros.view.workbench import Workbench
 
 BASE = {"who": "a test", "when": "2026-01-01T00:00:00Z", "why": "to try it"}
@@ -30,7 +39,7 @@ def run(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def saved(run):
-    return SavedGraph(run[0], [], condensed=True)
+    return SavedGraph(run[0], [])
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +94,7 @@ def test_an_edge_of_the_window_is_taken_out_and_the_path_stays_whole(run, saved,
     assert slam.first_keyframe <= edited.moved[0] < KEYFRAMES
     (fit,) = edited.by_hand
     assert fit.edge == slam.graph.edge_ids.of(slam.graph.edge_count)
-    after = SavedGraph(tmp_path / "edited", [], condensed=True)
+    after = SavedGraph(tmp_path / "edited", [])
     assert not after.edge(edge).is_in
     assert after.edge(fit.edge).is_in
     assert "door" in after.landmarks
@@ -102,7 +111,7 @@ def test_undone_it_is_as_it_was(run, saved, tmp_path):
     edit_run(folder, [{"name": "out", "do": "remove_edge", "edge": newest(saved).edge, **BASE}], tmp_path / "edited")
     undo_edit(tmp_path / "edited", "out", tmp_path / "undone")
     assert positions(tmp_path / "undone") == pytest.approx(positions(folder), abs=1e-6)
-    assert newest(SavedGraph(tmp_path / "undone", [], condensed=True)).edge == newest(saved).edge
+    assert newest(SavedGraph(tmp_path / "undone", [])).edge == newest(saved).edge
 
 
 @pytest.mark.parametrize(
@@ -145,3 +154,89 @@ def test_a_place_is_of_all_its_landmarks(saved):
 
 def newest_place(saved):
     return [e for e in saved.entries if e.label == PLACES][-1]
+
+
+@pytest.fixture(scope="module")
+def two(tmp_path_factory):
+    """Two drives in one hall, by name: A and B, condensed (in lower case) and not."""
+    folder, of = tmp_path_factory.mktemp("two"), {"a": slice(0, 600), "b": slice(600, 1000)}
+    return {
+        name: condensed_run(folder / f"run_{name}{condense}", condense=condense, part=of[name.lower()])[0]
+        for name, condense in (("A", False), ("a", True), ("B", False), ("b", True))
+    }
+
+
+@pytest.mark.parametrize("names", ["aB", "ab", "Ab"])
+def test_merged_they_are_as_good_as_two_maps_of_all_keyframes(two, tmp_path, names):
+    merge(two["A"], two["B"], tmp_path / "whole")
+    done = merge(two[names[0]], two[names[1]], tmp_path / "both")
+    true = np.array([pose[:2] for pose in hall(SEED, 1000).poses[:1000]])
+    errors = [rms(positions(tmp_path / name), true) for name in ("whole", "both")]
+    assert errors[1] < 1.25 * errors[0] < 0.2
+    assert (done.losses, done.left_out, done.summary["keyframes"]) == ([], {}, 1000)
+    assert done.summary["inputs"]["landmarks"]["believed"] == done.summary["inputs"]["landmarks"]["used"]
+    saved = SavedGraph(tmp_path / "both", [])
+    assert (saved.slam.first_keyframe > 800) == (names[0] == "a"), "the merged map condenses as the first did"
+    assert len(saved.slam.drives) == 2
+    with pytest.raises(GraphSlamError, match="are of the same drive"):
+        merge(tmp_path / "both", two[names[0]], tmp_path / "again")
+    frozen = freeze(tmp_path / "both", tmp_path / "frozen")
+    assert frozen["keyframes"] == 1000
+    assert positions(tmp_path / "frozen") == pytest.approx(positions(tmp_path / "both"), abs=1e-3)
+
+
+def test_a_drive_that_began_in_a_condensed_map_cannot_be_the_second(two, tmp_path):
+    freeze(two["a"], tmp_path / "site")
+    with pytest.raises(GraphSlamError, match=r"site: it began in a map with condensed visits"):
+        merge(two["B"], tmp_path / "site", tmp_path / "both")
+    assert not (tmp_path / "both").exists()
+
+
+def test_what_is_due_to_be_condensed_is_not_lost_when_the_map_is_frozen(two, tmp_path):
+    """A map of all keyframes, in a folder whose configuration says that visits are condensed."""
+    folder = shutil.copytree(two["A"], tmp_path / "due")
+    text = (folder / "config.yaml").read_text()
+    assert "condense: false" in text
+    window = re.sub(r"window_keyframes: \d+", "window_keyframes: 60", text.replace("condense: false", "condense: true"))
+    (folder / "config.yaml").write_text(window)
+    freeze(folder, tmp_path / "frozen")
+    assert len(positions(tmp_path / "frozen")) == 600
+    assert len(SavedGraph(tmp_path / "frozen", []).whole_path.stamps_ns) == 600
+    assert run_config(tmp_path / "frozen").map.condense
+
+
+def test_errors_are_compared_with_the_sigmas_of_what_is_in_the_graph(run):
+    folder, slam, _ = run
+    path = read_tum(folder / "path.tum")
+    truth = Trajectory(path.stamps_s, se3.in_space(np.array(hall(SEED, KEYFRAMES).poses[:KEYFRAMES])))
+    found = consistency_of(folder, Truth(truth, {}), slice(None), is_first=True)
+    assert found.frame.endswith("the first in the graph with a true pose")
+    assert len(slam.keyframes.ids) < found.poses.n < 0.6 * KEYFRAMES
+    assert 0.3 * found.poses.dof < found.poses.mean < 3.0 * found.poses.dof
+
+
+@pytest.mark.parametrize("localize", [False, True])
+@pytest.mark.parametrize("name", ["A", "a"])
+def test_a_drive_in_a_frozen_map_is_condensed_and_the_map_stays(two, tmp_path, name, localize):
+    freeze(two[name], tmp_path / "site")
+    before = SavedGraph(tmp_path / "site", [])
+    settings = {"map_condense": True, "map_window_keyframes": 60, "map_localize": localize}
+    drive = [*read_measurements(two["B"], [])]
+    slam, _ = record_run(tmp_path / "on", config(PLANAR, **settings), drive, [], read_map(tmp_path / "site", []))
+    assert slam.first_keyframe > 700
+    true = np.array([pose[:2] for pose in hall(SEED, 1000).poses[600:1000]])
+    assert rms(positions(tmp_path / "on")[600:], true) < 0.1
+    after = SavedGraph(tmp_path / "on", [])
+    for one in set(before.numbers) & set(after.numbers):
+        if one < 600:
+            here, there = (x.slam.solver.estimate([x.vertices[one]]) for x in (before, after))
+            assert here == pytest.approx(there, abs=1e-12)
+    again, _ = record_run(
+        tmp_path / "again",
+        config(PLANAR, **settings),
+        read_measurements(tmp_path / "on", []),
+        [],
+        read_map(tmp_path / "on", [], start_only=True),
+    )
+    assert again.first_keyframe == slam.first_keyframe
+    assert (tmp_path / "again" / "path.tum").read_bytes() == (tmp_path / "on" / "path.tum").read_bytes()

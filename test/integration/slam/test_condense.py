@@ -267,7 +267,7 @@ def test_a_run_without_what_left_its_map_says_so(recorded, tmp_path):
 
 @pytest.fixture(scope="module")
 def saved(recorded):
-    return SavedGraph(recorded[1], [], condensed=True)
+    return SavedGraph(recorded[1], [])
 
 
 def test_each_edge_is_explained_by_its_lasting_id(recorded, saved):
