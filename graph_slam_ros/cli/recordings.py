@@ -227,9 +227,16 @@ def config_of(args: argparse.Namespace) -> "Config":
     file = args.config or (run / "config.yaml" if run is not None else None)
     values = dict(flatten(read_parameters(file, follow=file == args.config))) if file else {}
     try:
-        return Config.from_mapping(values | dict(parse_setting(text) for text in args.set))
+        asked = dict(parse_setting(text) for text in args.set)
+        config = Config.from_mapping(values | asked)
     except GraphSlamError as error:
         raise GraphSlamError(f"{file}: {error}" if file and not args.set else str(error)) from None
+    if asked.get("calibrate.groups") == "association" and not config.uses_found_factors:
+        raise GraphSlamError(
+            "calibrate.groups=association has no effect without landmarks.association=joint: set that, too, "
+            "or calibrate.groups=auto"
+        )
+    return config
 
 
 def _print_summary(source: Path, summary: dict[str, Any]) -> int:

@@ -248,6 +248,10 @@ REFUSED = {
         ["replay", "{bag}", "--out", "{out}", "--set", "a.b=1"],
         "unknown parameter 'a.b'; did you mean",
     ),
+    "setting without effect": (
+        ["replay", "{bag}", "--out", "{out}", "--set", "calibrate.groups=association"],
+        "calibrate.groups=association has no effect without landmarks.association=joint",
+    ),
     "no setting": (["replay", "{bag}", "--out", "{out}", "--set", "a.b"], "'a.b' is not key=value"),
     "missing config": (["replay", "{bag}", "--out", "{out}", "--config", "no.yaml"], "no.yaml: No such file"),
     "foreign folder": (
