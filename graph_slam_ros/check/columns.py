@@ -5,7 +5,7 @@ A ``Collector`` gets each decoded message, and the measurements that the convert
 """
 
 from array import array
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -18,14 +18,14 @@ from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.types import AngularVelocity, Control, Measured, Odometry, Sightings
 from graph_slam_ros.messages.from_msg import TF, TF_STATIC, OwnDecoder
 from graph_slam_ros.messages.inputs import uses
-from graph_slam_ros.messages.inputs.odometry_bytes import OdometryBytes
+from graph_slam_ros.messages.inputs.odometry_bytes import OdometryBytes, OdometryRun
 from graph_slam_ros.messages.inputs.transforms import Transforms, pose
 from graph_slam_ros.typing import Array, Index
 
 MOST = 200_000
 """Messages of each topic that are collected; a replay looks into no more."""
 
-_TWIST = (0, 7, 14, 21, 28, 35)
+_TWIST, _COLUMNS = (0, 7, 14, 21, 28, 35), 19  # places in a covariance; numbers of a message
 Decoder = Callable[[bytes], Any]
 
 
@@ -149,14 +149,13 @@ class _Topic:
     def add(self, log_ns: int, message: Any) -> None:
         header = getattr(message, "header", None)
         if header is not None:
-            self.add_stamp(log_ns, header.stamp.sec * 1_000_000_000 + header.stamp.nanosec, header.frame_id)
+            self.add_stamps([log_ns], [header.stamp.sec * 1_000_000_000 + header.stamp.nanosec], header.frame_id)
 
-    def add_stamp(self, log_ns: int, stamp_ns: int, frame: str) -> None:
-        if len(self.log_ns) >= MOST:
-            return
-        self.log_ns.append(log_ns)
-        self.stamp_ns.append(stamp_ns + self.offset_ns if stamp_ns else 0)
-        self.frames[frame] = self.frames.get(frame, 0) + 1
+    def add_stamps(self, log_ns: Sequence[int], stamps_ns: Sequence[int], frame: str) -> None:
+        if room := min(len(log_ns), MOST - len(self.log_ns)):
+            self.log_ns.extend(log_ns[:room])
+            self.stamp_ns.extend([stamp_ns + self.offset_ns if stamp_ns else 0 for stamp_ns in stamps_ns[:room]])
+            self.frames[frame] = self.frames.get(frame, 0) + room
 
     def columns(self) -> TopicColumns:
         return TopicColumns(
@@ -226,7 +225,6 @@ class Collector:
         self._first: dict[tuple[str, str], se3.Pose] = {}
         self._transforms = Transforms()
         self._last: Any = None
-        self._twist_bytes, self._twist_variances = b"", tuple[float, ...]()
 
     def decoder(self, decode: Decoder) -> Decoder:
         """The same decoder, of which the message is remembered until it is collected."""
@@ -247,7 +245,7 @@ class Collector:
         message, self._last = self._last, None
         heights: dict[str, float] = {}
         if type(message) is OdometryBytes:
-            self._add_bytes(topic, log_ns, message)
+            self._add_read(topic, [log_ns], message.alone())
         elif message is not None:
             self._add_message(topic, names, log_ns, message)
         for m in measured:
@@ -263,6 +261,16 @@ class Collector:
                     heights = heights or _heights(message, self._sightings[m.topic].T_base_frame)
                 self._sightings[m.topic].add(m, heights)
 
+    def add_run(self, topic: str, log_ns: Sequence[int], run: Sequence[Odometry]) -> None:
+        """Collect messages that were converted at once: what was read of them, and the odometry of each."""
+        read, self._last = self._last, None
+        if type(read) is OdometryRun:
+            self._add_read(topic, log_ns, read)
+        if run[0].source == self._main:
+            run = run[: MOST - len(self._path_ns)]
+            self._path_ns.extend([m.stamp_ns for m in run])
+            self._path.extend([x for m in run for x in m.T_odom_base])
+
     def _add_message(self, topic: str, names: Iterable[str], log_ns: int, message: Any) -> None:
         if topic in self._topics:
             self._topics[topic].add(log_ns, message)
@@ -276,28 +284,30 @@ class Collector:
             elif name == self._config.gyro_input and not self._gyro_frame:
                 self._gyro_frame = self._frame_of[name] or _frame(message)
 
-    def _add_bytes(self, topic: str, log_ns: int, m: OdometryBytes) -> None:
+    def _add_read(self, topic: str, log_ns: Sequence[int], read: OdometryRun) -> None:
         """Collect odometry that was not decoded."""
         if topic in self._topics:
-            self._topics[topic].add_stamp(log_ns, m.sec * 1_000_000_000 + m.nanosec, m.frame_id)
-        if topic == self._odometry_topic:
-            if m.twist_covariance != self._twist_bytes:  # drivers repeat the same one
-                flat = np.frombuffer(m.twist_covariance, dtype="<f8")
-                self._twist_bytes, self._twist_variances = m.twist_covariance, tuple(flat[list(_TWIST)].tolist())
-            self._add_numbers(m.frame_id, m.child_frame_id, m.numbers + self._twist_variances)
+            stamps_ns = (read.sec * 1_000_000_000 + read.nanosec).tolist()
+            self._topics[topic].add_stamps(log_ns, stamps_ns, read.frame_id)
+        if topic == self._odometry_topic and (room := MOST - len(self._odometry_ns)):
+            self._note_frames(read.frame_id, read.child_frame_id)
+            rows = np.empty((min(room, len(read.numbers)), _COLUMNS))
+            rows[:, : -len(_TWIST)] = read.numbers[:room]
+            rows[:, -len(_TWIST) :] = np.frombuffer(read.twist_covariance, "<f8")[list(_TWIST)]
+            self._odometry_ns.extend(self._topics[topic].stamp_ns[-len(rows) :])
+            self._numbers.frombytes(rows.tobytes())
 
     def _add_odometry(self, m: Any) -> None:
         p, q, v, w = m.pose.pose.position, m.pose.pose.orientation, m.twist.twist.linear, m.twist.twist.angular
         numbers, c = (p.x, p.y, p.z, q.x, q.y, q.z, q.w, v.x, v.y, v.z, w.x, w.y, w.z), m.twist.covariance
-        self._add_numbers(m.header.frame_id, m.child_frame_id, (*numbers, *(c[k] for k in _TWIST)))
+        if len(self._odometry_ns) < MOST:
+            self._note_frames(m.header.frame_id, m.child_frame_id)
+            self._odometry_ns.append(self._topics[self._odometry_topic].stamp_ns[-1])
+            self._numbers.extend((*numbers, *(c[k] for k in _TWIST)))
 
-    def _add_numbers(self, frame: str, child: str, numbers: tuple[float, ...]) -> None:
-        if len(self._odometry_ns) >= MOST:
-            return
+    def _note_frames(self, frame: str, child: str) -> None:
         if not self._frame:
             self._frame, self._child = frame.lstrip("/"), child.lstrip("/")
-        self._odometry_ns.append(self._topics[self._odometry_topic].stamp_ns[-1])
-        self._numbers.extend(numbers)
 
     def _add_transforms(self, message: Any, *, fixed: bool) -> None:
         for t in message.transforms:
@@ -356,7 +366,7 @@ class Collector:
     def _odometry(self) -> OdometryColumns:
         names = (self._main, self._odometry_topic)
         if len(self._odometry_ns):
-            rows = np.array(self._numbers).reshape(-1, 19)
+            rows = np.array(self._numbers).reshape(-1, _COLUMNS)
             return OdometryColumns(
                 *names, self._frame, self._child, _index(self._odometry_ns), rows[:, :7], rows[:, 7:13], rows[:, 13:]
             )

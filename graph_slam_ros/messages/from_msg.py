@@ -6,7 +6,7 @@ counter by input and reason.
 
 import struct
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -163,6 +163,31 @@ class MessageConverter:
         elif len(self._pending) > self._config.ordering.max_waiting:
             out += self._hurried(*self._pending.popleft())
         return out
+
+    def convert_run(self, name: str, cdrs: Sequence[bytes], after_ns: int) -> list[Odometry]:
+        """Convert messages that follow one another, from the first on, as far as all of them are plain odometry.
+
+        That is what ``convert`` does of nearly all odometry, for many messages at once. It is for the message after
+        those that are returned.
+
+        Parameters
+        ----------
+        after_ns : a stamp that the first must be later than
+        """
+        if name not in self._readers or self._pending:
+            return []
+        (reader, own), source = self._readers[name], self._sources[name]
+        read = reader.read_run(cdrs)
+        run = [] if read is None else odometry.of_run(source, read, after_ns)
+        count = self._publishers[name].accept_run(run)
+        if read is None or not count:
+            return []
+        odometry.count_repairs(source, count)
+        self._count_tally(source)
+        self._counters.received[name] += count
+        self._transforms.now_ns = max(run[count - 1].stamp_ns, self._transforms.now_ns or 0)
+        own.note(read.first(count))
+        return run[:count]
 
     def finish(self, *, is_end: bool = True) -> list[Measured]:
         """Use or refuse what still needs a transform; at the end of all messages also the odometry that is kept."""

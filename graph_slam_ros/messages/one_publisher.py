@@ -8,7 +8,7 @@ second case odometry has jumped.
 
 import math
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 from typing import Any
@@ -131,6 +131,10 @@ class OnePublisher:
             for _, one in self._leap.accept(m.stamp_ns, m, newest_ns, room_ns)
             for out in self._follow_publisher(one)
         ]
+
+    def accept_run(self, run: Sequence[Odometry]) -> int:
+        """Accept messages from the first on, as far as each goes on with the only track; return how many."""
+        return next((k for k, m in enumerate(run) if not self._goes_on(m)), len(run))
 
     def _goes_on(self, m: Odometry) -> bool:
         """Return whether a message, now part of it, goes on with the only track, soon and where it leads.

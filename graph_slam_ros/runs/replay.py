@@ -3,8 +3,8 @@
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby
-from operator import itemgetter
+from itertools import groupby, islice
+from operator import attrgetter, itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ from graph_slam_ros.check.checks import worst_of_replay
 from graph_slam_ros.check.columns import Collector
 from graph_slam_ros.config.inputs import InputConfig, default_input
 from graph_slam_ros.measurements.reasons import warnings as mendable
-from graph_slam_ros.measurements.types import Measured
+from graph_slam_ros.measurements.types import Measured, Odometry
 from graph_slam_ros.messages.from_msg import TF, TF_STATIC, TRANSFORMS, MessageConverter
 from graph_slam_ros.messages.inputs import check_topics, uses
 from graph_slam_ros.messages.survey import with_survey
@@ -30,6 +30,8 @@ from graph_slam_ros.warmup import warmup
 TF_STATIC_TOPIC, TF_TOPIC = "/tf_static", "/tf"
 _OPTIONS = {"odometry": "--odom", "landmarks": "--landmarks"}
 _OPTIONAL = default_input("detections")  # a recording need not have what nobody asked for
+
+_FEWEST, _MOST_TOGETHER = 4, 100  # messages that are converted together
 
 END = Control("end"), Control("optimize")
 """The events at the end of a recording: held measurements are processed, and everything is solved."""
@@ -201,12 +203,25 @@ class RecordedRuns:
         if TF_STATIC in self._inputs.topics:
             for message in bag.messages({self._inputs.topics[TF_STATIC]}):
                 self._collect(message, [TF_STATIC], self._converter.convert(TF_STATIC, message.cdr))
-        for message in bag.messages(set(by_topic)):
-            names = by_topic[message.topic]
-            measured = [m for name in names for m in self._converter.convert(name, message.cdr)]
-            self._collect(message, names, measured)
-            yield from self._passed(measured, names)
+        for messages in _stretches(bag.messages(set(by_topic))):
+            names = by_topic[messages[0].topic]
+            run = self._run(messages, names)
+            for m in self._gate.admit(run, self._on_jump).measured:  # which are no jump
+                yield len(self.counted), [m]
+            for message in messages[len(run) :]:
+                measured = [m for name in names for m in self._converter.convert(name, message.cdr)]
+                self._collect(message, names, measured)
+                yield from self._passed(measured, names)
         yield from self._passed(self._converter.finish(), ())
+
+    def _run(self, messages: Sequence[BagMessage], names: Sequence[str]) -> list[Odometry]:
+        """The odometry of the first messages of a topic, as far as they can be converted at once."""
+        if len(messages) < _FEWEST or len(names) > 1:
+            return []
+        run = self._converter.convert_run(names[0], [m.cdr for m in messages], self._gate.newest_ns(names[0]))
+        if self._columns is not None and run:
+            self._columns.add_run(messages[0].topic, [m.log_ns for m in messages[: len(run)]], run)
+        return run
 
     def _collect(self, message: BagMessage, names: Sequence[str], measured: list[Measured]) -> None:
         if self._columns is not None:
@@ -233,6 +248,13 @@ class RecordedRuns:
         before.update(self._counters)
         before.received.subtract(names)
         return before
+
+
+def _stretches(messages: Iterable[BagMessage]) -> Iterator[list[BagMessage]]:
+    """Messages in order, those of one topic that follow one another together."""
+    for _, of_topic in groupby(messages, key=attrgetter("topic")):
+        while some := list(islice(of_topic, _MOST_TOGETHER)):
+            yield some
 
 
 def replay(

@@ -10,7 +10,7 @@ from graph_slam_ros.measurements.edge_noise import LEAST_M2, LEAST_RAD2
 from graph_slam_ros.typing import Array
 
 _NORM_REPAIRED = 0.1  # a quaternion this far from unit length is normalised, beyond it is refused
-_NORM_EXACT = 1e-6
+_NORM_EXACT, _SQUARE_EXACT = 1e-6, 1.9e-6
 _ASYMMETRY_REPAIRED, _ASYMMETRY_EXACT = 1e-2, 1e-6
 _DEFICIT_REPAIRED = 1e-9  # negative eigenvalues down to this fraction of the largest are rounding
 _FARTHEST_M = 1e9
@@ -32,14 +32,14 @@ def stamp_ns(stamp: Any) -> int:
     return int(out)
 
 
-def is_sound(x: float, y: float, z: float) -> bool:
-    """Return whether ``point`` accepts the coordinates."""
-    return -_FARTHEST_M <= x <= _FARTHEST_M and -_FARTHEST_M <= y <= _FARTHEST_M and -_FARTHEST_M <= z <= _FARTHEST_M
+def is_sound(x: Any, y: Any, z: Any) -> Any:
+    """Return whether ``point`` accepts coordinates, which may be arrays."""
+    return (abs(x) <= _FARTHEST_M) & (abs(y) <= _FARTHEST_M) & (abs(z) <= _FARTHEST_M)
 
 
-def is_unit(x: float, y: float, z: float, w: float) -> bool:
-    """Return whether ``quaternion`` returns the numbers as they are."""
-    return abs(math.sqrt(x * x + y * y + z * z + w * w) - 1.0) <= _NORM_EXACT
+def is_unit(x: Any, y: Any, z: Any, w: Any) -> Any:
+    """Return whether ``quaternion`` surely returns the numbers, which may be arrays, as they are."""
+    return abs(x * x + y * y + z * z + w * w - 1.0) <= _SQUARE_EXACT
 
 
 def point(v: Any) -> tuple[float, float, float]:

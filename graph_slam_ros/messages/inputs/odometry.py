@@ -10,7 +10,7 @@ from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.measurements.types import AngularVelocity, Odometry
 from graph_slam_ros.messages.inputs import checks
 from graph_slam_ros.messages.inputs.checks import MessageError
-from graph_slam_ros.messages.inputs.odometry_bytes import OdometryBytes
+from graph_slam_ros.messages.inputs.odometry_bytes import OdometryBytes, OdometryRun
 from graph_slam_ros.messages.inputs.source import InputContext
 from graph_slam_ros.messages.inputs.transforms import pose
 from graph_slam_ros.typing import Numbers
@@ -34,27 +34,62 @@ def odometry(source: InputContext, m: Any) -> Iterator[Odometry]:
 
 def of_bytes(source: InputContext, read: OdometryBytes) -> Odometry | None:
     """The odometry of a message in which nothing is refused or repaired but its covariance; else None."""
-    frames, parent, child = source.config.frames, source.settings.frame or read.frame_id, read.child_frame_id
-    if parent != frames.odom or child != frames.base or parent == child or child[:1] in _SLASHED or parent[:1] == "/":
+    if not _is_of_base(source, read):
         return None
     stamp_ns = source.valid_stamp_ns(read.sec, read.nanosec)
     x, y, z, qx, qy, qz, qw = numbers = read.numbers[:7]
     if not stamp_ns or not checks.is_sound(x, y, z) or not checks.is_unit(qx, qy, qz, qw):
         return None
     at = source.of_robot_in_plane(numbers)
-    if at is None:
+    if at is None or not _is_judged(source, read.twist_covariance):
         return None
-    twist = None
-    if source.config.odometry.noise == "twist":
-        if read.twist_covariance != source.state.get("raw"):
-            return None  # another than before: it is judged when the message is decoded
-        covariance, repairs = source.state["judged"]
-        if isinstance(covariance, MessageError):
-            return None
-        for repair in repairs:
-            source.count(repair)
-        twist = covariance
-    return Odometry(stamp_ns, at, twist, source.name)
+    count_repairs(source, 1)
+    return Odometry(stamp_ns, at, _twist_judged(source), source.name)
+
+
+@np.errstate(all="ignore")  # of strange numbers, which are decoded and refused by name
+def of_run(source: InputContext, read: OdometryRun, after_ns: int) -> list[Odometry]:
+    """The odometry of the first messages of a run, as far as ``of_bytes`` converts each, and as stamps ascend.
+
+    Their repairs are for ``count_repairs``.
+
+    Parameters
+    ----------
+    after_ns : a stamp that the first is later than
+    """
+    if not _is_of_base(source, read) or not _is_judged(source, read.twist_covariance):
+        return []
+    numbers, stamps = read.numbers[:, :7], source.valid_stamp_ns(read.sec, read.nanosec)
+    are_sound = checks.is_sound(*numbers[:, :3].T) & checks.is_unit(*numbers[:, 3:].T)
+    poses = source.of_robots_in_plane(numbers, are_sound & (np.diff(stamps, prepend=after_ns) > 0))
+    twist = _twist_judged(source)
+    return [Odometry(stamp, at, twist, source.name) for stamp, at in zip(stamps.tolist(), poses, strict=False)]
+
+
+def _is_of_base(source: InputContext, read: OdometryBytes | OdometryRun) -> bool:
+    """Return whether messages are of the base in odometry's frame, by names that need no change."""
+    frames, parent, child = source.config.frames, source.settings.frame or read.frame_id, read.child_frame_id
+    is_of_base = parent == frames.odom and child == frames.base and parent != child
+    return is_of_base and child[:1] not in _SLASHED and parent[:1] != "/"
+
+
+def _is_judged(source: InputContext, raw: bytes) -> bool:
+    """Return whether the twist's covariance is not needed, or was accepted before; else the decoded message tells."""
+    if source.config.odometry.noise != "twist":
+        return True
+    return raw == source.state.get("raw") and not isinstance(source.state["judged"][0], MessageError)
+
+
+def _twist_judged(source: InputContext) -> Numbers | None:
+    """The covariance of the twist that was accepted before."""
+    out: Numbers | None = source.state["judged"][0] if source.config.odometry.noise == "twist" else None
+    return out
+
+
+def count_repairs(source: InputContext, times: int) -> None:
+    """Count the repairs of that covariance for so many messages."""
+    for repair in source.state["judged"][1] if source.config.odometry.noise == "twist" else ():
+        source.count(repair, times)
 
 
 def pose_stamped(source: InputContext, m: Any) -> Iterator[Odometry]:

@@ -5,9 +5,14 @@ the message before.
 """
 
 import struct
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import takewhile
+
+import numpy as np
 
 from graph_slam_ros.formats.cdr import CdrReader
+from graph_slam_ros.typing import Array, Index
 
 _LITTLE_ENDIAN = b"\x00\x01"
 _STAMP = struct.Struct("<iI")
@@ -34,6 +39,33 @@ class OdometryBytes:
     numbers: tuple[float, ...]
     twist_covariance: bytes
 
+    def alone(self) -> "OdometryRun":
+        """The same as a run of one message."""
+        stamp, names = (np.array([self.sec]), np.array([self.nanosec])), (self.frame_id, self.child_frame_id)
+        return OdometryRun(*stamp, *names, np.array([self.numbers]), self.twist_covariance)
+
+
+@dataclass(frozen=True, slots=True)
+class OdometryRun:
+    """The fields of n messages in order, which have the same frames and the same covariance of the twist.
+
+    Attributes
+    ----------
+    sec, nanosec : (n,)
+    numbers : (n, 13), each row as of ``OdometryBytes``
+    """
+
+    sec: Index
+    nanosec: Index
+    frame_id: str
+    child_frame_id: str
+    numbers: Array
+    twist_covariance: bytes
+
+    def first(self, count: int) -> "OdometryRun":
+        """The first so many of them."""
+        return replace(self, sec=self.sec[:count], nanosec=self.nanosec[:count], numbers=self.numbers[:count])
+
 
 class OdometryReader:
     """Reads messages of one topic."""
@@ -41,17 +73,33 @@ class OdometryReader:
     def __init__(self) -> None:
         self._names, self._length, self._at, self._end = b"", -1, 0, 0
         self._frame_id = self._child_frame_id = ""
+        self._row = np.dtype([])  # of a run
 
     def read(self, cdr: bytes) -> OdometryBytes | None:
         """Read a message. None if the decoder has to read it: what it says of its length is not what it is."""
-        is_alike = len(cdr) == self._length and cdr[_NAMES_AT : self._at] == self._names and cdr[:2] == _LITTLE_ENDIAN
-        if not is_alike and not self._learn(cdr):
+        if not self._is_alike(cdr) and not self._learn(cdr):
             return None
         sec, nanosec = _STAMP.unpack_from(cdr, 4)
         numbers = _NUMBERS.unpack_from(cdr, self._at)
-        return OdometryBytes(
-            sec, nanosec, self._frame_id, self._child_frame_id, numbers, cdr[self._end - _COVARIANCE_BYTES : self._end]
-        )
+        return OdometryBytes(sec, nanosec, self._frame_id, self._child_frame_id, numbers, self._covariance(cdr))
+
+    def read_run(self, cdrs: Sequence[bytes]) -> OdometryRun | None:
+        """Read messages from the first on, as far as they are like the one before; None if the first is not."""
+        covariance = self._covariance(cdrs[0])
+        run = list(takewhile(lambda cdr: self._is_alike(cdr) and self._covariance(cdr) == covariance, cdrs))
+        if not run:
+            return None
+        rows = np.frombuffer(b"".join(run), self._row)
+        sec, nanosec = (rows[name].astype(np.int64) for name in ("sec", "nanosec"))
+        numbers = np.concatenate((rows["pose"], rows["twist"]), axis=1)
+        return OdometryRun(sec, nanosec, self._frame_id, self._child_frame_id, numbers, covariance)
+
+    def _is_alike(self, cdr: bytes) -> bool:
+        """Return whether a message has the length and the names of the one before."""
+        return len(cdr) == self._length and cdr[_NAMES_AT : self._at] == self._names and cdr[:2] == _LITTLE_ENDIAN
+
+    def _covariance(self, cdr: bytes) -> bytes:
+        return cdr[self._end - _COVARIANCE_BYTES : self._end]
 
     def _learn(self, cdr: bytes) -> bool:
         """Find the names and the places of the numbers."""
@@ -70,4 +118,7 @@ class OdometryReader:
         if not self._end <= len(cdr) <= self._end + _MOST_PADDING:
             return False
         self._names, self._length = cdr[_NAMES_AT : self._at], len(cdr)
+        at = {"sec": ("<i4", 4), "nanosec": ("<u4", 8), "pose": ("<7f8", self._at), "twist": ("<6f8", self._at + 344)}
+        formats, offsets = zip(*at.values(), strict=True)
+        self._row = np.dtype({"names": list(at), "formats": formats, "offsets": offsets, "itemsize": len(cdr)})
         return True

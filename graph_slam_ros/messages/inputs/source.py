@@ -14,7 +14,7 @@ from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.messages.inputs import checks
 from graph_slam_ros.messages.inputs.checks import MessageError
 from graph_slam_ros.messages.inputs.transforms import Transforms
-from graph_slam_ros.typing import Array, Numbers
+from graph_slam_ros.typing import Array, Mask, Numbers
 
 _PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
 _BEYOND_MEANING = 1e12  # [m^2, rad^2]: larger numbers could not be turned into other axes
@@ -79,12 +79,11 @@ class InputContext:
             raise MessageError("bad_stamp")
         return out
 
-    def valid_stamp_ns(self, sec: int, nanosec: int) -> int:
-        """The same of its two numbers; 0 where it would be refused."""
-        if sec < 0 or not 0 <= nanosec < 1_000_000_000 or not (sec or nanosec):
-            return 0
+    def valid_stamp_ns(self, sec: Any, nanosec: Any) -> Any:
+        """The same of its two numbers, which may be arrays; 0 where it would be refused."""
         out = sec * 1_000_000_000 + nanosec + self._offset_ns
-        return out if 0 < out <= LATEST_NS else 0
+        is_stamp = (sec >= 0) & (nanosec >= 0) & (nanosec < 1_000_000_000) & ((sec > 0) | (nanosec > 0))
+        return out * (is_stamp & (out > 0) & (out <= LATEST_NS))
 
     # -- frames ------------------------------------------------------------------------------------------------------
 
@@ -199,6 +198,19 @@ class InputContext:
             return None
         return self.projected(T)
 
+    def of_robots_in_plane(self, numbers: Array, are_wanted: Mask) -> list[Numbers]:
+        """The same for the first of several poses (n, 7), as far as they are wanted, and surely count as nothing."""
+        if self.space.dimensions == 3:
+            return list(map(tuple, numbers[: _first_false(are_wanted)].tolist()))
+        height = self.state.get("height")
+        if height is None:
+            return []
+        x, y, z, qx, qy, qz, qw = numbers.T
+        count = _first_false(are_wanted & (abs(z - height) <= _LEVEL_M) & (abs(qx) + abs(qy) <= _LITTLE))
+        ahead = so3.act((qx[:count], qy[:count], qz[:count], qw[:count]), (1.0, 0.0, 0.0))
+        headings = map(math.atan2, ahead[1].tolist(), ahead[0].tolist())
+        return list(zip(x[:count].tolist(), y[:count].tolist(), headings, strict=True))
+
     def has_heading(self, T: se3.Pose) -> bool:
         """Return whether a frame has a heading: in space always; in the plane where the x axis does not point up."""
         ahead = so3.act(se3.rotation(T), (1.0, 0.0, 0.0))
@@ -252,6 +264,11 @@ class InputContext:
         for repair in repairs:
             self.count(repair)
         return tuple(covariance.ravel().tolist())
+
+
+def _first_false(mask: Mask) -> int:
+    """The number of leading entries that are true."""
+    return len(mask) if mask.all() else int(mask.argmin())
 
 
 def _mount(settings: InputConfig) -> se3.Pose | None:

@@ -66,6 +66,10 @@ class IngestGate:
             return jump
         return Passage(jump.jump, jump.events, measured)
 
+    def newest_ns(self, source: str) -> int:
+        """Return the newest stamp of an odometry; what is later is no jump back. 0 before the first."""
+        return self._detector.newest_ns(source)
+
     def begin_anew(self, on_jump: str) -> Passage:
         """Decide on a jump of time: the stamps that follow belong to another time."""
         self._detector.forget()
@@ -115,6 +119,10 @@ class TimeJumpDetector:
             if isinstance(m, Odometry) and self._has_jumped(m):
                 jumped = True
         return jumped
+
+    def newest_ns(self, source: str) -> int:
+        """Return the newest stamp of an odometry; 0 before the first."""
+        return self._newest_ns.get(source, 0)
 
     def forget(self) -> None:
         """Forget all stamps, because the next belong to another time."""

@@ -1,4 +1,4 @@
-"""Odometry that is read by the places of its bytes is what a decoder makes of it, with the same counters."""
+"""Odometry read by the places of its bytes, alone or in runs, is what a decoder makes of it, with the same counters."""
 
 import math
 
@@ -44,7 +44,18 @@ def drive(count, **others):
         yield odometry(**({"at": at, "stamp_ns": STAMP_NS + 20_000_000 * k} | others))
 
 
-def converted(messages, monkeypatch, *, decoded, **sections):
+def together(out, messages):
+    """What is made of each message, of as many at once as can be."""
+    measured, newest_ns = [], 0
+    while len(measured) < len(messages):
+        run = out.convert_run("odom", messages[len(measured) :], newest_ns)
+        measured += [[m] for m in run]
+        measured += [out.convert("odom", cdr) for cdr in messages[len(measured) :][:1]]
+        newest_ns = max([newest_ns, *(m.stamp_ns for some in measured for m in some)])
+    return measured
+
+
+def converted(messages, monkeypatch, *, decoded=False, in_runs=False, **sections):
     """What is made of messages and what is counted, read by bytes or all decoded; and how many were decoded."""
     with monkeypatch.context() as patched:
         calls = []
@@ -53,17 +64,36 @@ def converted(messages, monkeypatch, *, decoded, **sections):
         own = decoder(TYPE)
         own.note = lambda message: calls.append(hasattr(message, "header"))
         out = border(decoders={TYPE: own}, **sections)
-        measured = [out.convert("odom", cdr) for cdr in messages]
+        measured = together(out, messages) if in_runs else [out.convert("odom", cdr) for cdr in messages]
         return [*measured, out.finish()], out._counters.as_dict(), sum(calls)
+
+
+def compare(messages, monkeypatch, **sections):
+    """Messages are read by bytes, alone and in runs, as they are decoded."""
+    expected = converted(messages, monkeypatch, decoded=True, **sections)[:2]
+    for in_runs in (False, True):
+        assert converted(messages, monkeypatch, in_runs=in_runs, **sections)[:2] == expected
 
 
 @pytest.mark.parametrize("dimensions", [2, 3])
 @pytest.mark.parametrize("what", ODD)
 def test_a_message_is_read_as_it_is_decoded(what, dimensions, monkeypatch):
     messages = [*drive(5), *drive(1, **ODD[what]), *drive(8), *drive(8, **ODD[what]), *drive(3)]
-    sections = {"world": {"dimensions": dimensions}}
-    by_bytes = converted(messages, monkeypatch, decoded=False, **sections)
-    assert by_bytes[:2] == converted(messages, monkeypatch, decoded=True, **sections)[:2]
+    compare(messages, monkeypatch, world={"dimensions": dimensions})
+
+
+@pytest.mark.parametrize("dimensions", [2, 3])
+@pytest.mark.parametrize("seed", range(20))
+def test_any_messages_are_read_as_they_are_decoded(seed, dimensions, monkeypatch):
+    """Odd ones among plain ones, in any order, with stamps that stand still, leap and go back."""
+    rng = np.random.default_rng(seed)
+    messages, stamp_ns = [], STAMP_NS
+    for _ in range(60):
+        stamp_ns += int(rng.choice([20_000_000] * 12 + [0, -20_000_000, 3_000_000_000, -400_000_000]))
+        odd = list(ODD.values())[rng.integers(len(ODD))] if rng.random() < 0.1 else {}
+        at = pose(0.1 * len(messages), *rng.normal(0.0, 0.02, 2), quaternion(yaw=rng.normal(), **TILTED))
+        messages.append(odometry(**({"stamp_ns": stamp_ns, "at": at} | odd)))
+    compare(messages, monkeypatch, world={"dimensions": dimensions})
 
 
 @pytest.mark.parametrize(
@@ -72,17 +102,19 @@ def test_a_message_is_read_as_it_is_decoded(what, dimensions, monkeypatch):
     ids=str,
 )
 def test_settings_of_the_input_are_followed(sections, monkeypatch):
-    messages = [*drive(5), *drive(5, frame="elsewhere"), *drive(2, child="wheel")]
-    by_bytes = converted(messages, monkeypatch, decoded=False, **sections)
-    assert by_bytes[:2] == converted(messages, monkeypatch, decoded=True, **sections)[:2]
+    compare([*drive(5), *drive(5, frame="elsewhere"), *drive(2, child="wheel")], monkeypatch, **sections)
 
 
 def test_nearly_all_messages_are_not_decoded(monkeypatch):
     messages = [*drive(50)]
-    measured, _, decoded = converted(messages, monkeypatch, decoded=False)
+    measured, _, decoded = converted(messages, monkeypatch)
     assert decoded == 1  # the first: it says how high the robot is, and its covariance is judged
     assert [len(some) for some in measured] == [1] * 50 + [0]
     assert converted(messages, monkeypatch, decoded=True)[2] == 50
+    out = border()
+    assert not out.convert_run("odom", messages, 0)  # the first
+    assert len(out.convert("odom", messages[0])) == 1
+    assert len(out.convert_run("odom", messages[1:], 0)) == 49
 
 
 @pytest.mark.parametrize(
@@ -104,9 +136,7 @@ def test_nearly_all_messages_are_not_decoded(monkeypatch):
 )
 def test_damaged_bytes_are_left_to_the_decoder(damaged, monkeypatch):
     whole = [*drive(4)]
-    messages = [whole[0], damaged(whole[1]), whole[2], damaged(whole[3]), damaged(whole[3])]
-    by_bytes = converted(messages, monkeypatch, decoded=False)
-    assert by_bytes[:2] == converted(messages, monkeypatch, decoded=True)[:2]
+    compare([whole[0], damaged(whole[1]), whole[2], damaged(whole[3]), damaged(whole[3])], monkeypatch)
 
 
 def test_a_recording_whose_messages_have_another_layout_is_decoded(monkeypatch):
