@@ -1,7 +1,7 @@
 """The plane and space: what the pipeline needs to know of where the robot moves, to be written once for both."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,8 @@ class Geometry:
     group : ``lie.se2`` or ``lie.se3``
     turn : rotation matrix of a pose
     sightings, fixes : edge types by the kind of ``Sighting`` and ``Fix``
+    dimensions : 2 or 3
+    dof : degrees of freedom of a pose, 3 or 6
     """
 
     pose: VertexKind
@@ -36,16 +38,12 @@ class Geometry:
     range_with_offset: EdgeType
     sightings: Mapping[str, EdgeType]
     fixes: Mapping[str, EdgeType]
+    dimensions: int = field(init=False)
+    dof: int = field(init=False)
 
-    @property
-    def dimensions(self) -> int:
-        """2 or 3."""
-        return self.point.dof
-
-    @property
-    def dof(self) -> int:
-        """Degrees of freedom of a pose: 3 or 6."""
-        return self.pose.dof
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "dimensions", self.point.dof)
+        object.__setattr__(self, "dof", self.pose.dof)
 
     def sigmas(self, sigma_m: float, sigma_rad: float) -> list[float]:
         """Standard deviations (dof,) of a pose, one for all lengths [m] and one for all angles [rad]."""

@@ -10,7 +10,7 @@ from graph_slam_ros.typing import Array
 
 _ASYMMETRY = 1e-6  # of the largest entry; text files carry 6 digits
 _LEAST_EIGENVALUE = 16.0 * float(np.finfo(float).eps)  # of the correlations; that of a singular matrix is rounding
-
+_SURELY_REGULAR = 1e-6  # root of the determinant of the correlations, which is at most e times their least eigenvalue
 
 _LONG = 120  # characters of a matrix in a message
 
@@ -89,5 +89,7 @@ def _definite_root(matrices: Array) -> Array | None:
     except np.linalg.LinAlgError:
         return None
     sigmas = np.sqrt(np.diagonal(matrices, axis1=-2, axis2=-1))
+    if (np.prod(np.diagonal(root, axis1=-2, axis2=-1) / sigmas, axis=-1) > _SURELY_REGULAR).all():
+        return root
     least = np.linalg.eigvalsh(matrices / sigmas[..., :, None] / sigmas[..., None, :])[..., 0]
     return root if (least > _LEAST_EIGENVALUE).all() else None

@@ -1,6 +1,7 @@
 """Checks of every message, whatever its type."""
 
 import math
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -78,17 +79,14 @@ def covariance(block: Array, lengths: int) -> tuple[Array, list[str]]:
     if not block.any():
         raise MessageError("covariance_not_positive_definite")
     repairs = []
-    variances = np.diag(block)
-    most, least = (
-        np.where(np.arange(len(block)) < lengths, *bounds)
-        for bounds in ((_MOST_M2, _MOST_RAD2), (LEAST_M2, LEAST_RAD2))
-    )
+    variances, (most, least) = block.diagonal(), _bounds(len(block), lengths)
     if (variances > most).any():
         repairs.append("covariance_clamped")
         scale = np.sqrt(most / np.maximum(variances, most))
         block = scale[:, None] * block * scale
     is_tiny = (variances >= 0.0) & (variances < least)
-    block = block + np.diag(np.where(is_tiny, least - variances, 0.0))
+    has_tiny = bool(is_tiny.any())
+    block = block + (np.diag(np.where(is_tiny, least - variances, 0.0)) if has_tiny else 0.0)
     asymmetry = np.abs(block - block.T).max() / np.abs(block).max()
     if asymmetry > _ASYMMETRY_REPAIRED:
         raise MessageError("covariance_asymmetric")
@@ -102,7 +100,14 @@ def covariance(block: Array, lengths: int) -> tuple[Array, list[str]]:
     is_flat = values[0] < 1e-3 * floor
     if is_flat:
         symmetric = (vectors * np.maximum(values, floor)) @ vectors.T
-    return symmetric, repairs + ["covariance_floored"] * bool(is_flat or is_tiny.any())
+    return symmetric, repairs + ["covariance_floored"] * bool(is_flat or has_tiny)
+
+
+@cache
+def _bounds(size: int, lengths: int) -> tuple[Array, Array]:
+    """The most and the least variance (size,) of each number."""
+    of_length = np.arange(size) < lengths
+    return np.where(of_length, _MOST_M2, _MOST_RAD2), np.where(of_length, LEAST_M2, LEAST_RAD2)
 
 
 def direction(azimuth: float, elevation: float = 0.0) -> tuple[tuple[float, float], bool]:
