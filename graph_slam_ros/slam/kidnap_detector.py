@@ -19,7 +19,7 @@ from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.slam.landmarks.anonymous import AnonymousLandmarks
 from graph_slam_ros.slam.robust.displacement import SAME_M, SAME_RAD, DisplacementHypothesis, DisplacementSearch
 from graph_slam_ros.slam.robust.innovation_monitor import InnovationMonitor
-from graph_slam_ros.slam.robust.landmark_history import LandmarkHistory
+from graph_slam_ros.slam.robust.landmark_history import LandmarkHistory, edges_to_replay
 from graph_slam_ros.slam.robust.odometry_hypotheses import Moved
 from graph_slam_ros.slam.slip_detector import SlipDetector
 from graph_slam_ros.slam.slip_review import Slip
@@ -118,7 +118,9 @@ class KidnapDetector:
         self._search.begin(first)
         stamps_ns = dict(zip(newest.ids.tolist(), newest.stamps_ns.tolist(), strict=True))
         graph = self._backend.graph
-        for edge in np.union1d(graph.edges_of("surveyed"), graph.edges_since(int(keyframes.ids[0]))).tolist():
+        for edge in np.union1d(
+            graph.edges_of("surveyed"), edges_to_replay(graph, int(keyframes.ids[0]), first)
+        ).tolist():
             one = graph.edge(edge)
             at = max((vertex for vertex in one.vertices if vertex in stamps_ns), default=-1)
             if one.label == "surveyed":

@@ -1,13 +1,26 @@
 """Losses in stages: an edge that has just arrived is held to the first of its loss, one update later to the last."""
 
 import numpy as np
+from numpy.typing import NDArray
 
 from graph_slam_ros.graph import Graph
 from graph_slam_ros.graph.losses import weight_and_cost
+from graph_slam_ros.lie.jit import kernel
 from graph_slam_ros.solver.batch import Settings
-from graph_slam_ros.solver.linearization import Losses, chi2_of
+from graph_slam_ros.solver.linearization import Losses, chi2_of, rows_of
 from graph_slam_ros.solver.pending import NONE
 from graph_slam_ros.typing import Array, Index
+
+
+@kernel
+def _differ(kind: Index, scale: Array, other_kind: Index, other_scale: Array, square: Array) -> NDArray[np.bool_]:
+    """Return whether two losses give squared residuals (n,) different weights."""
+    out = np.zeros(len(square), dtype=np.bool_)
+    for k in range(len(square)):
+        one, _ = weight_and_cost(kind[k], scale[k], square[k])
+        other, _ = weight_and_cost(other_kind[k], other_scale[k], square[k])
+        out[k] = one != other
+    return out
 
 
 class LossStages:
@@ -51,10 +64,12 @@ class LossStages:
             return
         first, *_, last = self.losses(settings)
         chi2, _ = chi2_of(self._graph, values, self.young)
-        changes = []
-        for edge, fit in zip(self.young.tolist(), chi2.tolist(), strict=True):
-            table, row = self._graph.row(edge)
-            s, (code,) = fit * float(table.weight.values[row]), last.codes(table, np.array([row])).tolist()
-            before, after = (weight_and_cost(one.kind[code], one.scale[code], s)[0] for one in (first, last))
-            changes.append(before != after)
-        self.young = self.young[changes]
+        square, code = np.empty(self._graph.edge_count), np.zeros(self._graph.edge_count, dtype=np.int64)
+        square[self.young] = chi2
+        for table, rows in rows_of(self._graph, self.young).items():
+            ids = table.id.values[rows]
+            square[ids] *= table.weight.values[rows]
+            code[ids] = last.codes(table, rows)
+        of = code[self.young]
+        losses = first.kind[of], first.scale[of], last.kind[of], last.scale[of]
+        self.young = self.young[_differ(*losses, square[self.young])]

@@ -1,7 +1,10 @@
 """The history of landmarks: when each was first seen, and from which keyframe on it is well known."""
 
+import numpy as np
+
 from graph_slam_ros.graph import Graph
 from graph_slam_ros.slam.robust.ledger import Ledger
+from graph_slam_ros.typing import Index
 
 _SUPPORT, _FIRST = 4, 20  # accepted sightings, of the first so many, that make a landmark one to compare with
 _DOUBTED = 0.3  # part of them that may be held back: else the landmark itself stands at the wrong place
@@ -10,6 +13,24 @@ _DOUBTED = 0.3  # part of them that may be held back: else the landmark itself s
 _Judged = tuple[tuple[int, int], list[int], list[int]]
 """Of a landmark's first sightings: changes of the ledger and the number of those judged; keyframes of those that are
 accepted; edges of those that are held back."""
+
+
+def edges_to_replay(graph: Graph, oldest: int, first: int) -> Index:
+    """Return the edges since a keyframe, in order, that whoever begins anew at a later one needs.
+
+    Left out are, from before ``first``, odometry and sightings of landmarks that are older than all keyframes.
+
+    Parameters
+    ----------
+    oldest, first : vertices of the two keyframes
+    """
+    edges, is_old = graph.edges_since(oldest), np.zeros(graph.edge_count, dtype=bool)
+    for table in graph.tables.values():
+        ids, ends = table.id.values, table.vertices.values
+        is_odometry = graph.has_label(ids, ("odometry",)) & (ends < first).all(axis=1)
+        is_sighting = graph.has_label(ids, ("landmarks",)) & (ends[:, 0] < first) & (ends[:, -1] < oldest)
+        is_old[ids] = is_odometry | is_sighting
+    return edges[~is_old[edges]]
 
 
 class LandmarkHistory:
