@@ -108,7 +108,7 @@ _WHY = {
     "needed_edge": "it is odometry or a prior, which is not judged: without it poses are undetermined",
     "held_in_map": "it is part of a frozen map, which never changes",
     "condensed_in_map": (
-        "it is condensed, or not possible in a map with condensed visits: graph_slam replay RUN --set "
+        "it is condensed, or not possible in a map with condensed visits: graph_slam replay RUN --out WHOLE --set "
         "map.condense=false makes the map of all keyframes, which can be edited"
     ),
 }

@@ -17,6 +17,9 @@ _BETTER = 4.0  # chi2 by which another landmark fits a cluster better
 _ROUNDS = 6
 TRIAL = 0.1  # a solve that compares ends where an iteration gains less
 
+_Key = tuple[tuple[float, ...], tuple[float, ...]]
+"""About where the two landmarks of a pair stand [m]."""
+
 
 def refined(drive: Drive, e: Estimate) -> Estimate:
     """Merge and reassign until nothing changes."""
@@ -33,11 +36,9 @@ def refined(drive: Drive, e: Estimate) -> Estimate:
 
 def merged(drive: Drive, e: Estimate) -> Estimate:
     """Merge pairs, the nearest first, if that costs less than the landmark that it saves."""
-    tried: set[tuple[tuple[float, ...], tuple[float, ...]]] = set()
+    tried: set[_Key] = set()
     while True:
-        for key, i, j in _pairs(drive, e):
-            if key in tried:
-                continue
+        for key, i, j in _pairs(drive, e, tried):
             if not drive.may_move:
                 return e
             tried.add(key)
@@ -49,11 +50,17 @@ def merged(drive: Drive, e: Estimate) -> Estimate:
             return e
 
 
-def _pairs(drive: Drive, e: Estimate) -> list[tuple[tuple[tuple[float, ...], tuple[float, ...]], int, int]]:
-    """Pairs of close landmarks, the nearest first, with their positions. By their covariance they may be one."""
+def _pairs(drive: Drive, e: Estimate, tried: set[_Key]) -> list[tuple[_Key, int, int]]:
+    """Pairs of close landmarks, the nearest first, with their positions.
+
+    Those that were tried are left out, and those that by their covariance are surely two are added to them.
+    """
     landmarks = e.landmarks
     apart = np.linalg.norm(landmarks[:, None] - landmarks[None], axis=2)
-    i, j = np.nonzero(np.tril(apart < _MERGE_M, -1))
+    places = [tuple(place) for place in np.round(landmarks, 1).tolist()]
+    near = zip(*(at.tolist() for at in np.nonzero(np.tril(apart < _MERGE_M, -1))), strict=True)
+    pairs = [(a, b) for a, b in near if (places[a], places[b]) not in tried]
+    i, j = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
     close = np.unique(np.concatenate([i, j]))
     if len(i) and (blocks := drive.landmark_covariances(e, close)) is not None:
         a, b = np.searchsorted(close, i), np.searchsorted(close, j)
@@ -63,10 +70,10 @@ def _pairs(drive: Drive, e: Estimate) -> list[tuple[tuple[tuple[float, ...], tup
         counts = np.bincount(e.which[e.which >= 0], minlength=len(landmarks))
         most = (counts[i] + counts[j]) * drive.costs.loss_scale**2  # Cauchy's loss, if all clusters share it
         is_near = most * np.log1p(chi2 / most) < _HOPELESS * drive.costs.landmark * (1 + _BOTH_AT_MOST)
+        tried.update((places[a], places[b]) for a, b in zip(i[~is_near].tolist(), j[~is_near].tolist(), strict=True))
         i, j = i[is_near], j[is_near]
     order = np.argsort(apart[i, j], kind="stable")
-    keys = [tuple(place) for place in np.round(landmarks, 1).tolist()]
-    return [((keys[a], keys[b]), a, b) for a, b in zip(i[order].tolist(), j[order].tolist(), strict=True)]
+    return [((places[a], places[b]), a, b) for a, b in zip(i[order].tolist(), j[order].tolist(), strict=True)]
 
 
 def _merged_pair(drive: Drive, e: Estimate, i: int, j: int) -> Estimate | None:
