@@ -205,8 +205,8 @@ def test_the_fit_finds_what_needs_an_estimate_and_its_settings_mend_it(
 
 def test_a_fit_of_ranges_of_which_many_are_too_long_is_not_trusted(tmp_path):
     bag = tmp_path / "ranges.mcap"
-    world = simulate("warehouse", 3, aisles=2, laps=2, sensor="range")
-    write_faulty_bag(world, bag, [Fault.named("outliers", rate=0.4, most_m=2.0)], 3)
+    world = simulate("warehouse", 2, aisles=2, laps=2, sensor="range")
+    write_faulty_bag(world, bag, [Fault.named("outliers", rate=0.4, most_m=2.0)], 2)
     found = {one.code: one for one in check(bag).findings}
     assert found["fit_unsure"].severity == "warning"
     assert {"clock_offset", "mount_yaw", "odometry_scale", "turn_scale"} & found.keys() == set()
