@@ -42,6 +42,13 @@ _MOST_WINDOWS = 100  # the same of windows
 _MOST_SAMPLED = 200  # edges of a group whose leverage is computed: their joint covariances cost most of all
 
 
+_ONLY_LARGER = {
+    "fixes": "errors of fixes that last leave no residuals",
+    "closures": "closures that fit worst are not among the residuals",
+}
+"""Classes whose sigmas may be larger than configured and not smaller, and the reason."""
+
+
 @dataclass(frozen=True, slots=True)
 class NoiseScale:
     """The scale of the sigmas of a group of residuals.
@@ -292,8 +299,8 @@ def _scale(key: Key, total: _Sums, factor_now: float) -> NoiseScale:
     if total.errors:
         return scale
     factor = float(np.sqrt(per_dof * design_effect))
-    if factor < 1.0 and key[0] == "fixes":
-        return replace(scale, reason="errors of fixes that last leave no residuals: smaller sigmas are not believed")
+    if factor < 1.0 and key[0] in _ONLY_LARGER:
+        return replace(scale, reason=f"{_ONLY_LARGER[key[0]]}: smaller sigmas are not believed")
     if factor < 1.0 and key[0] == "landmarks" and total.passes < LEAST_PASSES:
         few = f"{total.passes} passes by landmarks, fewer than {LEAST_PASSES}: smaller sigmas are not believed"
         return replace(scale, reason=few)

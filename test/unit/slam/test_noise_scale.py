@@ -137,6 +137,34 @@ def test_smaller_sigmas_are_not_believed_without_passes():
     assert far_apart[RANGE].factor == 1.0
 
 
+@pytest.mark.parametrize(("label", "planted"), [("closures", 0.4), ("fixes", 0.4), ("closures", 2.0), ("fixes", 2.0)])
+def test_sigmas_of_closures_and_fixes_may_be_larger_than_stated_and_not_smaller(label, planted):
+    """A gate has left out those that fit worst, and what lasts in fixes leaves no residual."""
+    rng, graph, poses = np.random.default_rng(6), Graph(), 400
+    true = np.stack([0.1 * np.arange(poses), np.zeros(poses), np.zeros(poses)], axis=1)
+    vertices = graph.add_vertices(SE2, true)
+    step, sigmas = np.array(SIGMAS["odometry"]), np.array([0.05, 0.05, 0.02])
+    for k in range(poses - 1):
+        motion = np.array([0.1, 0.0, 0.0]) + step * rng.normal(size=3)
+        graph.add_edge(RELATIVE_POSE, vertices[k : k + 2], motion, Gaussian.from_sigmas(*step), *ODOMETRY[:2])
+    graph.add_edge(POSE_PRIOR, [vertices[0]], true[0], Gaussian.from_sigmas(1e-3, 1e-3, 1e-3), "anchor")
+    for k in range(100, poses):
+        error, noise = planted * sigmas * rng.normal(size=3), Gaussian.from_sigmas(*sigmas)
+        if label == "closures":
+            apart = np.array([10.0, 0.0, 0.0])
+            graph.add_edge(RELATIVE_POSE, vertices[[k - 100, k]], apart + error, noise, label, "seen")
+        else:
+            graph.add_edge(POSE_PRIOR, [vertices[k]], true[k] + error, noise, label, "seen")
+    found = [one for one in converged(graph, np.arange(poses) * STEP_NS).values() if one.label == label]
+    assert found
+    for one in found:
+        if planted < 1.0:
+            assert (one.factor, one.reason.partition(": ")[2]) == (1.0, "smaller sigmas are not believed")
+        else:
+            assert one.factor == pytest.approx(planted, rel=0.25)
+            assert not one.reason
+
+
 def test_a_factor_is_bounded():
     for planted, bound in ((10.0, LARGEST), (0.05, SMALLEST)):
         factors = {"odometry": 1.0, "range": planted, "bearing": 1.0}
