@@ -32,7 +32,7 @@ from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Index, Numbers
 
 LONGEST = 60  # keyframes of a visit
-BATCH = 100  # keyframes that leave the window together
+BATCH = 200  # keyframes that leave the window together
 _PATIENCE = 200  # keyframes that are out of the window while a visit waits
 _SOURCE = "map"  # of what is counted
 _Row = tuple[int, int, Numbers]  # a keyframe's vertex, lasting id of its base or -1 - n of frame n, and pose
