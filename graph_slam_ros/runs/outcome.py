@@ -20,7 +20,8 @@ _OUT_OF_PLANE = 0.05  # of all poses of an odometry: with more, the robot does n
 _JUMPY, _MOST_JUMPS = 0.02, 5  # of all messages of an odometry; with more its motion is hardly used
 _MOSTLY = 0.5
 _MOTION = ("odometry", "gyro")  # uses whose measurements nobody doubts one by one
-_DOUBTED = 0.05  # of an input: as many that are not believed are said
+_DOUBTED = 0.05  # of an input: as many that are not believed are said; so it is of visits to places
+_FEWEST_LOST = 2  # visits that are lost, which are said
 _MENDED = (  # of what is noted, signs of a wrong setting
     *("displaced", "displacement_taken_back", "jump"),
     *("not_in_use", "turn_slips", "gyro_silent", "gyro_doubted", "odometry_contradicted", "odometry_alike"),
@@ -232,7 +233,11 @@ def association_faults(found: Mapping[str, Any]) -> Iterator[str]:
 
 
 def doubts(summary: Summary) -> Iterator[str]:
-    """Return a sentence for each input of which many measurements are rejected, or all motions left out."""
+    """Return a sentence for each input of which many measurements are rejected, or all motions left out.
+
+    Also one where many visits of a condensed map contradict the others: what is left in the map was not better.
+    """
+    yield from _contradicting_visits(summary["counters"].get("map", {}))
     for name, counts in summary.get("inputs", {}).items():
         counted = summary["counters"].get(name, {})
         if alike := counted.get("odometry_alike", 0):
@@ -243,6 +248,17 @@ def doubts(summary: Summary) -> Iterator[str]:
         if _MOSTLY <= accepted < 1.0 - _DOUBTED:
             part, hint = 100.0 * (1.0 - accepted), _CONTRADICT.format(name)
             yield f"{name}: {part:.0f} % of {counts['used']} are not believed: {hint}"
+
+
+def _contradicting_visits(counted: Mapping[str, int]) -> Iterator[str]:
+    lost = counted.get("visit_lost", 0)
+    visits = lost + counted.get("visit_condensed", 0)
+    if lost >= _FEWEST_LOST and lost > _DOUBTED * visits:
+        yield (
+            f"map.condense: {lost} of {visits} visits contradict themselves or the others, so the noise or the "
+            "calibration is wrong, and the map may be much worse than with all keyframes: compare with --set "
+            "map.condense=false, run graph_slam check on the recording, or keep more by map.window_keyframes"
+        )
 
 
 def checked(summary: Summary, severity: str) -> Iterator[str]:

@@ -1,5 +1,7 @@
 """What the end of a run says of its odometries and its gyro."""
 
+import pytest
+
 from graph_slam_ros.runs.outcome import doubts, shortcomings, text
 
 LANDMARKS = {"use": "landmarks", "received": 90, "used": 90, "believed": 90}
@@ -57,3 +59,12 @@ def test_a_solve_that_did_not_converge_is_a_shortcoming_with_the_parameter():
     assert said.startswith("the last solve did not converge (max_iterations): ")
     assert "--set solve.max_iterations=" in said
     assert not [*shortcomings(summary({}) | {"converged": True, "stop": "cost"})]
+
+
+@pytest.mark.parametrize(
+    ("lost", "condensed", "is_said"), [(0, 40, False), (1, 5, False), (2, 60, False), (2, 28, True), (6, 30, True)]
+)
+def test_visits_that_contradict_the_others_are_said(lost, condensed, is_said):
+    said = list(doubts(summary({"map": {"visit_lost": lost, "visit_condensed": condensed}})))
+    assert len(said) == is_said
+    assert all(f"{lost} of {lost + condensed} visits" in one and "map.condense=false" in one for one in said)
