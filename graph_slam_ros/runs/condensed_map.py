@@ -129,7 +129,7 @@ def read_left(folder: Path, space: Geometry, state: BoundedState | None) -> Left
     if state is not None and count != (state.keyframes, state.sightings, state.frames):
         raise FormatError(
             f"{folder}: {CONDENSED}.mcap has {count[0]} keyframes, and {state.keyframes} have left the map: the others "
-            f"are lost; graph_slam replay {folder} makes the map anew"
+            f"are lost; graph_slam replay {folder} --out NEW makes the map anew"
         )
     return out
 
