@@ -196,6 +196,18 @@ class Robot:
         said = self.said("graph")
         return {key: float(value) for key, value in said[-1][1].items()} if said else {}
 
+    def until_graph(self, spin=None, patience_s=PATIENCE_S, **values):
+        """Wait for these numbers of the graph: /diagnostics comes once a second, so later than poses do."""
+
+        def is_so():
+            numbers = self.graph()
+            return all(numbers.get(key) == value for key, value in values.items())
+
+        try:
+            until(is_so, spin or self.spin, f"graph with {values}", patience_s)
+        except AssertionError as error:
+            raise AssertionError(f"{error}, but {self.graph()}") from None
+
     def set(self, values, together=True):
         """Set parameters: whether it was done and why not, of all of them or each."""
         parameters = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]

@@ -47,7 +47,7 @@ def test_a_robot_that_is_elsewhere_is_degraded_until_it_is_found(tmp_path, how):
         r.until_it_says("DEGRADED", "elsewhere", spin=slowly(r, drive))
         r.until_it_says("OK", spin=drive.pace(r))
         until(lambda: drive.off_by(r) < 0.5, drive.pace(r), "the pose that the landmarks show")
-        assert r.graph()["segments"] == 2
+        r.until_graph(drive.pace(r), segments=2)
         told = [s for m in r.heard["events"] for s in m.status if s.name == "graph_slam: displaced"]
         assert any("segment" in {v.key for v in s.values} for s in told)
         finish(n, r)

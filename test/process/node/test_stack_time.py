@@ -89,7 +89,7 @@ def test_B7_when_the_clock_jumps_back_the_map_stays_a_segment_begins_and_transfo
         begin_ns = played.drive.stamp_ns
         until(lambda: len(r.heard["pose"]) > 20, played.step, "poses after the jump")
         r.until_it_says("OK", spin=played.step)
-        assert r.graph()["segments"] == 2
+        r.until_graph(played.step, segments=2)
         assert played.drive.off_by(r) < 1.0, "still in the same map"
         r.settle()
         after = stamps(r)
@@ -167,7 +167,7 @@ def test_B7_where_no_clock_tells_that_stamps_have_gone_back_odometry_does(tmp_pa
             heard.clear()
         until(lambda: len(r.heard["pose"]) > 10 and len(stamps(r)) > 5, drive.pace(r), "poses and transforms")
         r.until_it_says("OK", spin=drive.pace(r))
-        assert r.graph()["segments"] == 2
+        r.until_graph(drive.pace(r), segments=2)
         assert drive.off_by(r) < 1.0, "still in the same map"
         assert is_ascending(stamps(r))
         assert begin_ns < min(stamps(r)) < max(stamps(r)) < drive.stamp_ns + NS
@@ -187,7 +187,7 @@ def test_B14_where_another_clock_is_used_a_segment_begins_and_the_map_stays(tmp_
         r.heard["pose"].clear()
         r.until_it_says("OK", spin=played.step)
         until(lambda: len(r.heard["pose"]) > 10, played.step, "poses by the other clock")
-        assert r.graph()["segments"] == 2
+        r.until_graph(played.step, segments=2)
         assert played.drive.off_by(r) < 1.0, "still in the same map"
         finish(n, r)
     assert replayed(tmp_path / "run", tmp_path) == results(tmp_path / "run")
@@ -345,7 +345,7 @@ def test_B11_a_recording_that_is_played_again_and_again_adds_segments_to_one_map
             until(lambda: played.drive.steps >= 120, played.step, "end of the recording")
             r.until_it_says("OK")
         r.settle()
-        assert r.graph()["segments"] == loops
+        r.until_graph(segments=loops)
         assert played.drive.off_by(r) < 1.0
         finish(n, r)
     told = numbers(tmp_path / "run")
