@@ -10,7 +10,7 @@ import time
 import numpy as np
 import pytest
 from executables import executable
-from live_nodes import ENVIRONMENT, finish, graph_slam, lenient, node, replayed, results, robot, until
+from live_nodes import ENVIRONMENT, completed, finish, graph_slam, lenient, node, replayed, results, robot, until
 from messages import record_drive
 from rclpy.qos import ReliabilityPolicy
 
@@ -354,7 +354,8 @@ def test_a_signal_saves_the_run_and_ends_the_node_with_0_within_3_seconds(messag
     assert code == 0
     assert took_s < lenient(3.0)
     assert "Traceback" not in n.said
-    assert replayed(tmp_path / "run", tmp_path) == results(tmp_path / "run")
+    run = completed(tmp_path / "run", n.said)
+    assert replayed(run, tmp_path) == results(run)
 
 
 def test_a_node_without_output_folder_runs_and_refuses_to_save(messages, tmp_path):

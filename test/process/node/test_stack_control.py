@@ -17,6 +17,7 @@ from live_drive import TAGS, Drive, earlier_run
 from live_nodes import (
     ENVIRONMENT,
     MODULE,
+    completed,
     finish,
     lenient,
     node,
@@ -226,7 +227,7 @@ def test_P6_told_to_stop_at_any_moment_of_a_drive_it_saves_what_it_has_and_ends_
     assert took_s < lenient(3.0), (took_s, meanwhile)
     assert "Traceback" not in said
     for run in list(tmp_path.glob("run*")):
-        assert not accepted(run) or is_repeated(run, tmp_path), (run.name, meanwhile)
+        assert not accepted(run) or is_repeated(completed(run, said), tmp_path), (run.name, meanwhile)
 
 
 def hears_signals(process):

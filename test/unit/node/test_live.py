@@ -265,8 +265,9 @@ def test_P10_a_worker_does_everything_in_order_refuses_what_is_too_much_and_surv
 
 
 def test_a_worker_that_is_stopped_tells_when_what_waits_cannot_be_done_in_time_and_begins_no_more():
-    worker, gate, done = Worker(10, print), threading.Event(), []
-    worker.offer(lambda: gate.wait(10.0) and None)
+    faults = []
+    worker, gate, done = Worker(10, faults.append), threading.Event(), []
+    worker.offer(lambda: gate.wait(10.0) and 1 / 0)
     worker.offer(lambda: done.append(1))
     assert not worker.stop(0.01)
     assert worker.lag_s > 0.0
@@ -274,6 +275,7 @@ def test_a_worker_that_is_stopped_tells_when_what_waits_cannot_be_done_in_time_a
     worker._thread.join(10.0)
     assert not worker.is_alive
     assert done == []
+    assert not faults, "what it uses may be gone"
 
 
 # -- health ------------------------------------------------------------------------------------------------------------
