@@ -108,9 +108,9 @@ class KidnapDetector:
 
     def begin_anew(self, keyframes: StampedPoses[Keyframe]) -> None:
         """Begin anew after the graph was compacted, with the newest keyframes and what was seen from them."""
-        slips = self._slips.slips
+        before = self._slips
         self._begin()
-        self._slips.slips[:] = slips
+        self._slips.slips, self._slips.noise = before.slips, before.noise
         newest = keyframes.since(max(keyframes.first, len(keyframes) - _REMEMBERED))
         begins = [k for k in self._segments if k >= newest.first]
         first = int(newest.ids[begins[-1] - newest.first if begins else 0])

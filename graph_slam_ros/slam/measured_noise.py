@@ -7,7 +7,7 @@ from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.frontend.keyframes import Keyframe
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 
-_EVERY = 100  # keyframes
+_EVERY, _MORE = 100, 0.2  # keyframes since the last time, and as a part of those then: one measurement looks at all
 _PRIOR_DOF = 20.0  # degrees of freedom that would say that odometry's noise is as stated
 _LARGEST = 3.0
 _UNKNOWN, _KNOWN = 1.5, 1.2  # all noise may be larger by this factor, where it is not measured and where it is
@@ -29,7 +29,7 @@ class MeasuredNoise:
 
     def measure(self, keyframes: StampedPoses[Keyframe]) -> None:
         """Measure it, if there are many keyframes more than last time."""
-        if len(keyframes) - self._measured_at < _EVERY:
+        if len(keyframes) - self._measured_at < max(_EVERY, _MORE * self._measured_at):
             return
         self._measured_at, n = len(keyframes), self._space.dimensions
         parts = {"position": slice(n), "rotation": slice(n, None)}

@@ -9,15 +9,15 @@ is taken back, and everything is as before.
 """
 
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 
 from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.config.frontend import OdometryConfig
-from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.errors import GraphSlamError, SingularError
 from graph_slam_ros.graph import Gaussian
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.measurements.counters import Counters
@@ -83,6 +83,7 @@ class SlipDetector:
     Attributes
     ----------
     slips : in order; the last may go on
+    noise : as measured
     """
 
     def __init__(
@@ -101,7 +102,7 @@ class SlipDetector:
         self._new: list[int] = []  # edges that came since the last check, whose innovation is not known yet
         self._replacing: set[int] = set()  # edges that replace others
         self._checked, self._allowed = -1, _BURST
-        self._noise, self._added = MeasuredNoise(space, backend), SlipNoise(space, odometry)
+        self.noise, self._added = MeasuredNoise(space, backend), SlipNoise(space, odometry)
         self.slips: list[Slip] = []
 
     @property
@@ -212,10 +213,6 @@ class SlipDetector:
         """The links since the oldest view."""
         return [link for link in self._links if link.vertices[1] > self._views[0].vertex]
 
-    def _errors(self, links: Sequence[_Link]) -> OdometryErrors:
-        backend = self._backend
-        return odometry_errors(backend.graph, backend.solver, [link.edge for link in links], _FACTOR)
-
     def _begin_slip(self, choice: Choice, keyframe: int, stamp_ns: int) -> None:
         links = self._stretch()[choice.first :]
         began_ns, vertex = links[0].stamps_ns[0], links[0].vertices[0]
@@ -230,15 +227,15 @@ class SlipDetector:
         """Compare the hypotheses on the window: odometry's noise, a slip from each view on, and that it was moved."""
         links = self._stretch()
         first = links[0].vertices[0]
-        seen = {view.vertex: self._known_seen(view, first) for view in self._views if view.vertex > first}
-        self._noise.measure(keyframes)
-        stretch = Stretch([link.edge for link in links], seen, self._noise.of_odometry, self._noise.of_all)
-        without = self._without(edge for of_view in seen.values() for edge, _ in of_view)
-        filtered = OdometryFilter(self._space, self._backend.graph, without, stretch)
+        is_determined = cache(partial(self._is_determined, first=first))
+        seen = {view.vertex: self._known_seen(view, is_determined) for view in self._views if view.vertex > first}
+        self.noise.measure(keyframes)
+        stretch = Stretch([link.edge for link in links], seen, self.noise.of_odometry, self.noise.of_all)
+        edges = [edge for of_view in seen.values() for edge, _ in of_view if self._backend.ledger.is_inside(edge)]
+        filtered = OdometryFilter(self._space, self._backend.graph, partial(self._without, edges), stretch)
         compared = HypothesisTest(filtered, self._space, self._config.doubt_odds)
         firsts = sorted({self._first_of(links, since) for since in _SINCE if since < len(self._views)})
-        for kind in SLIPS:
-            variances, shared = (numbers.reshape(len(links), -1) for numbers in self._added_noise(links, kind))
+        for kind, (variances, shared) in zip(SLIPS, self._added_noise(links, *SLIPS), strict=True):
             for k in firsts:
                 compared.add_slip(kind, k, variances, shared)
         if moved is not None:
@@ -247,13 +244,13 @@ class SlipDetector:
             compared.add_moved(k, there, self._config.jump_sigma_m, self._config.jump_sigma_rad)
         return compared.choice()
 
-    def _known_seen(self, view: View, first: int) -> list[tuple[int, int | str]]:
-        """Edges of a view of what was known at a keyframe, held back or not, and what they are of."""
+    def _known_seen(self, view: View, is_determined: Callable[[int | str], bool]) -> list[tuple[int, int | str]]:
+        """Edges of a view of what is determined without them, held back or not, and what they are of."""
         ledger = self._backend.ledger
         return [
             (edge, what)
             for edge, what in zip(view.edges, view.seen, strict=True)
-            if edge < len(ledger) and not ledger.is_withdrawn(edge) and self._is_determined(what, first)
+            if edge < len(ledger) and not ledger.is_withdrawn(edge) and is_determined(what)
         ]
 
     def _is_determined(self, what: int | str, first: int) -> bool:
@@ -269,44 +266,48 @@ class SlipDetector:
         before = self._views[-since - 1].vertex
         return next((k for k, link in enumerate(links) if link.vertices[0] >= before), len(links) - 1)
 
-    def _added_noise(self, links: Sequence[_Link], kind: str) -> tuple[Array, Array]:
-        """Variances (n dof,) that a slip adds to links, and sigmas (n dof,) of the error that all links share."""
-        variances = [self._added.variances(kind, link.seconds) for link in links]
-        measured = [self._backend.graph.edge(link.edge).measured for link in links]
-        return np.concatenate(variances), np.concatenate([self._added.shared(kind, one) for one in measured])
+    def _added_noise(self, links: Sequence[_Link], *kinds: str) -> list[tuple[Array, Array]]:
+        """Variances (n, dof) that each kind of slip adds to links, and sigmas (n, dof) of the error that they share."""
+        motions = np.stack([self._added.motion(self._backend.graph.edge(link.edge).measured) for link in links])
+        seconds = np.array([link.seconds for link in links])
+        return [(self._added.variances(kind, seconds), self._added.shared(kind, motions)) for kind in kinds]
 
-    def _between(self, added: tuple[Array, Array], first: int, end: int | None = None) -> tuple[Array, Array]:
-        """Return the added noise of the links from ``first`` up to ``end``, and zero for the others."""
-        dof = self._space.dof
-        is_part = np.zeros(len(added[0]), dtype=bool)
-        is_part[first * dof : None if end is None else end * dof] = True
-        return added[0] * is_part, added[1] * is_part
+    def _between(self, added: tuple[Array, Array], first: int, end: int) -> tuple[Array, Array]:
+        """Return the added noise (n dof,) of the links from ``first`` up to ``end``, and zero for the others."""
+        is_part = np.zeros((len(added[0]), 1), dtype=bool)
+        is_part[first:end] = True
+        return (added[0] * is_part).ravel(), (added[1] * is_part).ravel()
 
-    def _without(self, edges: Iterable[int]) -> Solver:
-        """A copy of the problem without some edges; so an alarm alone changes nothing."""
-        solver, ledger, graph = self._backend.solver, self._backend.ledger, self._backend.graph.copy()
-        graph.set_weights(np.array([edge for edge in edges if ledger.is_inside(edge)], dtype=np.int64), 0.0)
+    def _without(self, edges: Sequence[int], vertices: Sequence[int]) -> tuple[Array, Array]:
+        """Stored values of vertices and their joint covariance without some edges; an alarm alone changes nothing."""
+        solver = self._backend.solver
+        try:
+            return solver.joint_marginal_without(vertices, edges)
+        except SingularError:  # a copy is solved anew
+            graph = self._backend.graph.copy()
+        graph.set_weights(np.array(edges, dtype=np.int64), 0.0)
         out = Solver(graph, solver.settings.until_still())
         out.add(solver.vertices, range(self._backend.handed_over[1]))
         out.start_at(solver.values)
         for vertex in solver.held.tolist():
             out.hold(vertex)
-        out.update()
-        return out
+        joint = out.joint_marginal(vertices)
+        return np.concatenate([out.values[graph.vertex(vertex).stored] for vertex in vertices]), joint
 
     # -- the end -----------------------------------------------------------------------------------------------------
 
     def _update_slip(self, now: Slip, keyframe: int, stamp_ns: int) -> None:
         """Move the start of a slip to an earlier keyframe, or end it."""
-        links = self._stretch()
+        links, backend = self._stretch(), self._backend
         is_replaced = [link.edge != link.own for link in links]
         if not any(is_replaced):
             return
-        errors, begin = self._errors(links), is_replaced.index(True)
+        errors = odometry_errors(backend.graph, backend.solver, [link.edge for link in links], _FACTOR)
+        begin = is_replaced.index(True)
         if self._began_earlier(now, links, begin, errors, keyframe):
             return
         firsts = sorted({self._first_of(links, since) for since in _AGAIN if since < len(self._views)})
-        graph, own = self._backend.graph, [link.own for link in links]
+        graph, own = backend.graph, [link.own for link in links]
         gains = [(errors.log_ratio_of(covariance_of(graph, own, first, errors.covariance)), first) for first in firsts]
         gain, first = max(gains, default=(0.0, 0))
         if gain > 0.0:
@@ -315,7 +316,7 @@ class SlipDetector:
     def _began_earlier(
         self, now: Slip, links: Sequence[_Link], begin: int, errors: OdometryErrors, keyframe: int
     ) -> bool:
-        best, added = (_SURELY, 0), self._added_noise(links, now.kind)
+        best, (added,) = (_SURELY, 0), self._added_noise(links, now.kind)
         for count in _EARLIER:
             if count <= begin:
                 best = max(best, (errors.log_ratio(*self._between(added, begin - count, begin)), count))

@@ -18,22 +18,27 @@ class SlipNoise:
     def __init__(self, space: Geometry, config: OdometryConfig) -> None:
         self._space, self._config = space, config
 
-    def variances(self, kind: str, seconds: float) -> Array:
-        """Variances (dof,) that are added to an edge that lasts so long."""
-        n, seconds = self._space.dimensions, min(seconds, _LONGEST_S)
-        sigmas = np.zeros(self._space.dof)
+    def variances(self, kind: str, seconds: float | Array) -> Array:
+        """Variances (..., dof) that are added to edges that last so long (...)."""
+        n, seconds = self._space.dimensions, np.minimum(seconds, _LONGEST_S)
+        per_s = np.zeros(self._space.dof)
         if kind == "translation":
-            sigmas[:n] = self._config.doubt_m_s * seconds * _OTHERS
-            sigmas[0] = self._config.doubt_m_s * seconds
+            per_s[:n] = self._config.doubt_m_s * _OTHERS
+            per_s[0] = self._config.doubt_m_s
         else:
-            sigmas[n:] = self._config.doubt_rad_s * seconds * _OTHERS
-            sigmas[-1] = self._config.doubt_rad_s * seconds
-        return np.asarray(sigmas**2 * max(1.0, _LASTS_S / max(seconds, 1e-9)))
+            per_s[n:] = self._config.doubt_rad_s * _OTHERS
+            per_s[-1] = self._config.doubt_rad_s
+        independent = np.maximum(1.0, _LASTS_S / np.maximum(seconds, 1e-9))
+        return np.asarray((np.asarray(seconds)[..., None] * per_s) ** 2 * independent[..., None])
 
-    def shared(self, kind: str, measured: Array) -> Array:
-        """Sigmas (dof,) of the error that all edges of a slip share, of one that measured so much."""
-        space, out = self._space, np.zeros(self._space.dof)
-        motion = np.asarray(space.group.local(space.identity, tuple(measured.tolist())), dtype=float)
-        of_kind = slice(space.dimensions) if kind == "translation" else slice(space.dimensions, None)
-        out[of_kind] = _SHARED * motion[of_kind]
+    def motion(self, measured: Array) -> Array:
+        """The motion (dof,) in the tangent space that an edge measured."""
+        space = self._space
+        return np.asarray(space.group.local(space.identity, tuple(measured.tolist())), dtype=float)
+
+    def shared(self, kind: str, motions: Array) -> Array:
+        """Sigmas (..., dof) of the error that all edges of a slip share, of motions (..., dof)."""
+        out, n = np.zeros_like(motions), self._space.dimensions
+        of_kind = slice(n) if kind == "translation" else slice(n, None)
+        out[..., of_kind] = _SHARED * motions[..., of_kind]
         return out

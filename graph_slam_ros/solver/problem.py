@@ -35,7 +35,7 @@ from graph_slam_ros.solver.clique_tree.storage import (
 )
 from graph_slam_ros.solver.clique_tree.substitution import forget, show_all
 from graph_slam_ros.solver.gauge import check_gauge, fix_the_whole
-from graph_slam_ros.solver.linearization import rows_of
+from graph_slam_ros.solver.linearization import chi2_of, residuals_of, rows_of
 from graph_slam_ros.solver.pending import NONE, PendingChanges
 from graph_slam_ros.typing import Array, Index
 
@@ -203,6 +203,24 @@ class Problem:
         """The estimates of all vertices, in the layout of ``Graph.initial``; ``start_at`` accepts them."""
         self._grow()
         return self._estimates()[: len(self.graph.initial)].copy()
+
+    def chi2_of(self, edges: ArrayLike) -> tuple[Array, Index]:
+        """Chi2 of each edge at the estimate: r' Omega r without loss and weight, and the size of r."""
+        self._grow()
+        ids = whole_numbers(edges, "edge").ravel()
+        if len(ids):
+            existing(ids, self.graph.edge_count, "edge")
+        return chi2_of(self.graph, self._estimates(), ids)
+
+    def residuals_of(self, edges: ArrayLike) -> Array:
+        """Residuals of edges at the estimate, not whitened, in the units of their types, end to end."""
+        self._grow()
+        ids = whole_numbers(edges, "edge").ravel()
+        out: list[list[float]] = [[]] * len(ids)
+        for some, residual, _ in residuals_of(self.graph, self._estimates(), ids):
+            for k, of_one in zip(some.tolist(), residual.tolist(), strict=True):
+                out[k] = of_one
+        return np.array([x for of_one in out for x in of_one])
 
     def compact(self) -> None:
         """Move the fronts in use together in memory; memory is not returned to the system.

@@ -19,14 +19,13 @@ from graph_slam_ros.solver.clique_tree.substitution import forget, read, show
 from graph_slam_ros.solver.covariance import among, joint, marginals
 from graph_slam_ros.solver.cross_covariance import CrossCovariances
 from graph_slam_ros.solver.gauge import undetermined
+from graph_slam_ros.solver.left_out import without_edges
 from graph_slam_ros.solver.linearization import (
     Losses,
-    chi2_of,
     costs,
     information,
     linearize,
     linearize_into,
-    residuals_of,
     rows_of,
 )
 from graph_slam_ros.solver.loss_stages import LossStages
@@ -133,24 +132,6 @@ class Solver(Problem):
         now = costs(self.graph, linearize(self.graph, where, self._active_rows(), losses))
         return Report("gn", "nothing_to_do", now.chi2, now.chi2, now.cost, now.cost, (), now.classes)
 
-    def chi2_of(self, edges: ArrayLike) -> tuple[Array, Index]:
-        """Chi2 of each edge at the estimate: r' Omega r without loss and weight, and the size of r."""
-        self._grow()
-        ids = whole_numbers(edges, "edge").ravel()
-        if len(ids):
-            existing(ids, self.graph.edge_count, "edge")
-        return chi2_of(self.graph, self._estimates(), ids)
-
-    def residuals_of(self, edges: ArrayLike) -> Array:
-        """Residuals of edges at the estimate, not whitened, in the units of their types, end to end."""
-        self._grow()
-        ids = whole_numbers(edges, "edge").ravel()
-        out: list[list[float]] = [[]] * len(ids)
-        for some, residual, _ in residuals_of(self.graph, self._estimates(), ids):
-            for k, of_one in zip(some.tolist(), residual.tolist(), strict=True):
-                out[k] = of_one
-        return np.array([x for of_one in out for x in of_one])
-
     def estimate(self, ids: ArrayLike) -> Array:
         """Values of vertices of one kind, (n, size)."""
         self._grow()
@@ -206,6 +187,21 @@ class Solver(Problem):
         out = np.zeros((len(free), len(free)))
         out[np.ix_(free, free)] = of_free
         return out
+
+    def joint_marginal_without(self, ids: ArrayLike, edges: ArrayLike) -> tuple[Array, Array]:
+        """Stored values of vertices and their ``joint_marginal``, as they would be without some edges.
+
+        All others stay linearised where they are. Nothing is changed.
+
+        Raises
+        ------
+        GaugeError, SingularError
+            Also where the other edges do not determine these vertices, or so weakly that rounding would decide.
+        """
+        wanted = self._with_covariance(ids)
+        left_out = existing(edges, self.graph.edge_count, "edge")
+        self._estimates()
+        return without_edges(self.graph, self._tree, self.joint_marginal, wanted, left_out)
 
     def edge_marginals(self, ends: Index) -> Array:
         """Covariances (n, D, D) as ``joint_marginal`` has them, of the vertices (n, k) of edges of one type."""

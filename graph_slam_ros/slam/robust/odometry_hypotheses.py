@@ -10,14 +10,14 @@ generalized likelihood ratio approach to the detection and estimation of jumps i
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from math import log
 
 import numpy as np
-from scipy.linalg.lapack import dpotrs
+from scipy.linalg.lapack import dpotrf, dtrtrs
 
 from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.graph import Edge, EdgeType, Graph
 from graph_slam_ros.graph.geometry import Geometry
-from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Index, Numbers
 
 TIGHT, CARRIED = "tight", "carried"
@@ -26,6 +26,8 @@ _LOG_ODDS_MOVED = float(np.log(1e-2))  # of a robot that was moved, relative to 
 _LEAST_FITTING = 0.6  # part of what was seen since then that a slip must explain
 _ROUNDING = 1e-6  # of a cost
 _CAP = 0.9999  # an observation beyond this quantile does not fit
+
+Prior = Callable[[Sequence[int]], tuple[Array, Array]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,10 +85,16 @@ class _State:
 
 @dataclass(frozen=True, slots=True)
 class _Step:
-    """An edge of odometry: its measurement, and the covariance of its noise with the factors."""
+    """An edge of odometry: its measurement, the covariance of its noise with the factors, and what it does to errors.
+
+    Attributes
+    ----------
+    moves : (dof, dof + 1) from errors of the pose before and the shared error to those of the pose after
+    """
 
     measured: Numbers
     covariance: Array
+    moves: Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,22 +125,23 @@ class OdometryFilter:
 
     Parameters
     ----------
-    solver : without the observations of the stretch
+    prior : stored values of vertices, one after the other, and their joint covariance (D, D), without the observations
+        of the stretch
 
     Raises
     ------
     GaugeError, SingularError
-        As for ``Solver.joint_marginal``.
+        From the prior.
     """
 
-    def __init__(self, space: Geometry, graph: Graph, solver: Solver, stretch: Stretch) -> None:
+    def __init__(self, space: Geometry, graph: Graph, prior: Prior, stretch: Stretch) -> None:
         self._space, self._stretch = space, stretch
         links = [graph.edge(link) for link in stretch.links]
         chain = {vertex for link in links for vertex in link.vertices}
         first = links[0].vertices[0]
         edges = [edge for seen in stretch.seen.values() for edge, _ in seen]
         others = sorted({vertex for edge in edges for vertex in graph.edge(edge).vertices} - chain)
-        joint = solver.joint_marginal([first, *others])
+        x, joint = prior([first, *others])
         dof, kinds = space.dof, [graph.kind_of(vertex) for vertex in others]
         begins = dof + 1 + np.concatenate(([0], np.cumsum([kind.dof for kind in kinds], dtype=np.int64)))
         stored = space.pose.size + np.concatenate(([0], np.cumsum([kind.size for kind in kinds], dtype=np.int64)))
@@ -150,26 +159,36 @@ class OdometryFilter:
         kept = np.r_[0:dof, dof + 1 : begins[-1]]
         covariance[np.ix_(kept, kept)] = joint
         covariance[dof, dof] = 1.0 / stretch.noise_factor**2
-        x = np.concatenate([solver.values[graph.vertex(vertex).stored] for vertex in (first, *others)])
         self._start = _State(x, 0.0, covariance)
         scale = np.outer(stretch.factors, stretch.factors)
-        self._steps = [_Step(tuple(link.measured.tolist()), _covariance(link) * scale) for link in links]
+        noises = _noises(links)
+        self._steps = [
+            self._step(link, covariance * scale) for link, (covariance, _) in zip(links, noises, strict=True)
+        ]
         self._ends = [link.vertices[1] for link in links]
-        self._seen = [self._observations(graph, vertex) for vertex in self._ends]
+        self._seen = self._observations(graph)
         self._tight = list[_State]()  # before each edge, with odometry's own noise
 
-    def _observations(self, graph: Graph, pose: int) -> list[_Seen]:
-        """Return what was seen from a keyframe, without what is between two keyframes of the stretch."""
-        out, dof = list[_Seen](), self._space.dof
-        for edge, what in self._stretch.seen.get(pose, ()):
-            one = graph.edge(edge)
-            if any(vertex != pose and vertex not in self._columns for vertex in one.vertices):
-                continue
+    def _step(self, link: Edge, covariance: Array) -> _Step:
+        measured = tuple(link.measured.tolist())
+        return _Step(measured, covariance, self._moves(measured, np.zeros(self._space.dof)))
+
+    def _moves(self, motion: Numbers, shared: Array) -> Array:
+        group = self._space.group
+        return np.column_stack((group.adjoint(group.inverse(motion)), shared))
+
+    def _observations(self, graph: Graph) -> list[list[_Seen]]:
+        """Return what was seen from each keyframe, without what is between two keyframes of the stretch."""
+        dof, seen = self._space.dof, self._stretch.seen
+        every = [(k, what, graph.edge(edge)) for k, v in enumerate(self._ends) for edge, what in seen.get(v, ())]
+        every = [(k, what, one) for k, what, one in every if {*one.vertices} <= {self._ends[k], *self._columns}]
+        out: list[list[_Seen]] = [[] for _ in self._ends]
+        for (k, what, one), (noise, log_root) in zip(every, _noises([one for *_, one in every]), strict=True):
+            pose = self._ends[k]
             at = np.array([[0 if v == pose else self._stored[v][0] for v in one.vertices]])
             columns = np.concatenate([np.arange(dof) if v == pose else self._columns[v] for v in one.vertices])
-            noise, log_root = _covariance(one), float(np.linalg.slogdet(one.sqrt_information)[1])
             cap = quantile(_CAP, len(noise))
-            out.append(_Seen(what, one.type, at, one.measured[None], columns, noise, log_root, cap))
+            out[k].append(_Seen(what, one.type, at, one.measured[None], columns, noise, log_root, cap))
         return out
 
     @property
@@ -229,36 +248,39 @@ class OdometryFilter:
     def _move(self, state: _State, k: int, errors: Errors) -> None:
         """Move the pose along one edge of odometry."""
         space, step, dof, scale = self._space, self._steps[k], self._space.dof, self._stretch.noise_factor**2
-        group, size = space.group, space.pose.size
-        before = tuple(state.x[:size].tolist())
-        slid = tuple((errors.shared[k] * state.shared).tolist())
-        motion = group.retract(step.measured, slid)
-        pose = group.compose(before, motion)
-        added = step.covariance + np.diag(errors.variances[k]) / scale
+        shared, motion, moves = errors.shared[k], step.measured, step.moves
+        if shared.any():
+            motion = space.group.retract(motion, tuple((shared * state.shared).tolist()))
+            moves = self._moves(motion, shared)
+        pose = space.group.compose(tuple(state.x[: space.pose.size].tolist()), motion)
+        variances = errors.variances[k]
         if errors.jump == k and errors.jump_variances is not None:
-            pose = errors.there
-            added += np.diag(errors.jump_variances) / scale
-        moves = np.column_stack((group.adjoint(group.inverse(motion)), errors.shared[k]))  # the pose
-        state.covariance[:dof] = moves @ state.covariance[: dof + 1]
-        state.covariance[:, :dof] = state.covariance[:, : dof + 1] @ moves.T
-        state.covariance[:dof, :dof] += added
-        state.x[:size] = pose
+            pose, variances = errors.there, variances + errors.jump_variances
+        covariance = state.covariance
+        covariance[:dof] = moves @ covariance[: dof + 1]
+        covariance[:, :dof] = covariance[:, : dof + 1] @ moves.T
+        covariance[:dof, :dof] += step.covariance
+        covariance.ravel()[: dof * (len(covariance) + 1) : len(covariance) + 1] += variances / scale  # the diagonal
+        state.x[: space.pose.size] = pose
 
     def _observe(self, state: _State, one: _Seen) -> None:
         """Add an observation. The state follows it if it fits."""
         residuals, jacobians = one.type.linearize(state.x, one.at, one.measured)
         residual, jacobian = residuals[0], jacobians[0]
-        gain = state.covariance[:, one.columns] @ jacobian.T
-        factor = np.linalg.cholesky(jacobian @ gain[one.columns] + one.noise)
-        solved, _ = dpotrs(factor, residual, lower=True)
-        statistic = float(residual @ solved) / self._stretch.noise_factor**2
+        gain = jacobian @ state.covariance[one.columns]
+        factor, failed = dpotrf(gain[:, one.columns] @ jacobian.T + one.noise, lower=True)
+        if failed:
+            raise np.linalg.LinAlgError("the covariance of an innovation is not positive definite")
+        white = dtrtrs(factor, residual, lower=True)[0]
+        statistic = float(white @ white) / self._stretch.noise_factor**2
         if statistic > one.cap:
             state.cost += one.cap
             state.unfit += 1
             return
-        self._correct(state, -gain @ solved)
-        state.covariance -= gain @ dpotrs(factor, gain.T, lower=True)[0]
-        state.cost += statistic + 2.0 * float(np.log(factor.diagonal()).sum() + one.log_root)
+        gain = dtrtrs(factor, gain, lower=True)[0]
+        self._correct(state, -white @ gain)
+        state.covariance -= gain.T @ gain
+        state.cost += statistic + 2.0 * (log(factor.diagonal().prod()) + one.log_root)
 
     def _correct(self, state: _State, step: Array) -> None:
         x, space = state.x, self._space
@@ -268,9 +290,15 @@ class OdometryFilter:
             x[stored] = kind.retract(x[stored], step[columns])
 
 
-def _covariance(edge: Edge) -> Array:
-    """The covariance (m, m) of the noise of an edge."""
-    return np.asarray(np.linalg.inv(edge.sqrt_information.T @ edge.sqrt_information), dtype=float)
+def _noises(edges: Sequence[Edge]) -> list[tuple[Array, float]]:
+    """Return the covariance (m, m) of the noise of each edge, and the logarithm of the determinant of its root."""
+    out: dict[int, tuple[Array, float]] = {}
+    for size in {len(one.sqrt_information) for one in edges}:
+        of_size = [k for k, one in enumerate(edges) if len(one.sqrt_information) == size]
+        roots = np.stack([edges[k].sqrt_information for k in of_size])
+        covariances, logarithms = np.linalg.inv(roots.swapaxes(1, 2) @ roots), np.linalg.slogdet(roots)[1]
+        out |= zip(of_size, zip(covariances, logarithms.tolist(), strict=True), strict=True)
+    return [out[k] for k in range(len(edges))]
 
 
 @dataclass(frozen=True, slots=True)

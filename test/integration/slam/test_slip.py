@@ -14,6 +14,7 @@ from graph_slam_ros.slam import Config, Control, GraphSlam
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict
 from graph_slam_ros.slam.robust.odometry_hypotheses import HypothesisTest, OdometryFilter
 from graph_slam_ros.slam.slip_review import Slip
+from graph_slam_ros.solver import left_out
 
 LONG = times(False, True)
 SLIP = ("odometry", "slip")
@@ -171,6 +172,18 @@ def test_a_burst_of_wrong_identities_and_a_moved_landmark_are_no_slip():
     slam = driven(replace(moved, seen=tuple(map(spoiled, moved.seen))))
     assert slam.counters[SLIP] == 0
     assert slam.segments == [0]
+
+
+def test_a_copy_solved_without_the_sightings_decides_alike(monkeypatch):
+    recording, _ = slipping(world(3))
+    found = [driven(recording).alarms]
+    monkeypatch.setattr(left_out, "_LEAST_PIVOT", 2.0)  # more than there can be
+    found.append(driven(recording).alarms)
+    (fast, copied) = ([one for one in alarms if isinstance(one, Slip)] for alarms in found)
+    assert fast
+    assert [replace(one, evidence=0.0) for one in copied] == [replace(one, evidence=0.0) for one in fast]
+    assert [one.evidence for one in copied] == pytest.approx([one.evidence for one in fast], rel=0.05)
+    assert [one.evidence for one in copied] != [one.evidence for one in fast]
 
 
 def test_a_hypothesis_is_left_only_where_the_best_so_far_is_likelier(monkeypatch):
