@@ -112,7 +112,7 @@ class Worker:
         error = _failure(job, future)
         if not isinstance(error, Exception | None):
             _failure(self._on_exit, None)
-        elif error is not None and future is None and not self._is_left:  # publishers may be gone: the next start says it
+        elif error is not None and future is None and not self._is_left:  # else publishers may be gone
             _failure(partial(self._on_fault, error), None)
 
 
