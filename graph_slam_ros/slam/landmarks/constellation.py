@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 from graph_slam_ros.slam.landmarks.explanation import UNUSED, Drive, Estimate, Ids, compressed
 from graph_slam_ros.slam.landmarks.moves import TRIAL, are_others, merged, reassigned, sorts_of, without_few
 from graph_slam_ros.slam.landmarks.rotations import yaw
-from graph_slam_ros.typing import Array
+from graph_slam_ros.typing import Array, Mask
 
 _SHORT_S, _WEAK = 100.0, 0.15  # a landmark that is seen for less, or in so small a part of the median's scans
 _GAP_S, _LONGEST_S = 5.0, 60.0
@@ -144,19 +144,40 @@ def _candidates(drive: Drive, e: Estimate, inside: Ids, strong: Ids, middle: int
     likely = np.argsort(rough, kind="stable")[:_MOST_SCORED]
     priors = _priors(turns[likely], moves[likely], centre)
     whiten = drive.whiten[inside] @ e.turn[drive.scan[inside]].transpose(0, 2, 1)
+    weakest = np.linalg.eigvalsh(whiten.transpose(0, 2, 1) @ whiten)[:, 0]
+    reach = 1.001 * _NONE / np.maximum(weakest, 1e-12)  # squared [m2]: what is farther away counts as nothing
     is_other = are_others(drive.sort[inside][:, None], sorts_of(drive, e)[strong])
     of_size = drive.size_chi2(e, inside)[:, strong]
     scored = []
     for turn, move, prior in zip(turns[likely], moves[likely], priors.tolist(), strict=True):
-        away = (there[None] - (at @ turn.T + move)[:, None]) @ turn  # in the axes before the turn
-        chi2 = np.square(away @ whiten.transpose(0, 2, 1)).sum(axis=-1) + of_size
-        chi2[is_other] = np.inf
-        least = chi2.min(axis=1)
+        least, best = _nearest(at @ turn.T + move, there, turn, whiten, reach, of_size, is_other)
         score = float(np.minimum(least / 4.0, _MOST_COST).sum()) + prior
-        scored.append((score, np.where(least < _NONE, strong[chi2.argmin(axis=1)], UNUSED), turn, move))
+        scored.append((score, np.where(least < _NONE, strong[best], UNUSED), turn, move))
     as_it_lies = scored[int(np.flatnonzero(likely == 0)[0])][0]
     scored.sort(key=lambda one: one[0])
     return [one[1:] for one in scored if one[0] < as_it_lies + _MOST_PRIOR]
+
+
+def _nearest(
+    at: Array, there: Array, turn: Array, whiten: Array, reach: Array, of_size: Array, is_other: Mask
+) -> tuple[Array, Ids]:
+    """The least chi2 (C,) of moved clusters (C, n) with landmarks (J, n), and of which; infinite if none is in reach.
+
+    Parameters
+    ----------
+    turn : by which the clusters were turned; whiten : (C, n, n) in the axes before
+    reach : (C,) squared distance up to which landmarks are looked at [m2]
+    of_size, is_other : (C, J) chi2 of sizes, and whether the sorts differ
+    """
+    apart = np.zeros((len(at), len(there)))
+    for axis in range(at.shape[1]):
+        apart += np.square(at[:, None, axis] - there[None, :, axis])
+    i, j = np.nonzero((apart < reach[:, None]) & ~is_other)
+    away = (there[j] - at[i]) @ turn  # in the axes before the turn
+    chi2 = np.full(apart.shape, np.inf)
+    chi2[i, j] = np.square((whiten[i] @ away[..., None])[..., 0]).sum(axis=-1) + of_size[i, j]
+    best: Ids = chi2.argmin(axis=1)
+    return chi2[np.arange(len(at)), best], best
 
 
 def _rough_scores(local: Array, there: Array, turns: Array, moves: Array) -> Array:

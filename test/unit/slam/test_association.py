@@ -12,7 +12,7 @@ from graph_slam_ros.measurements.types import Sighting
 from graph_slam_ros.runs.outcome import shortcomings
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
 from graph_slam_ros.slam.frontend.odometry_selector import Step
-from graph_slam_ros.slam.landmarks import hindsight
+from graph_slam_ros.slam.landmarks import constellation, hindsight
 from graph_slam_ros.slam.landmarks.beam import NOTHING, Beam, BeamSettings, Decision, Seed, changes
 from graph_slam_ros.slam.landmarks.bordered import BorderedEquations, Rows
 from graph_slam_ros.slam.landmarks.constellation import laid_on_the_map
@@ -530,3 +530,20 @@ def test_the_equations_of_a_chain_with_a_border_are_solved_as_the_dense_ones(lan
     assert factor.border_covariance(some) == pytest.approx(inverse, rel=1e-9, abs=1e-12)
     with pytest.raises(np.linalg.LinAlgError):
         normal.factor(-1e3 * added)
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_landmarks_out_of_reach_of_a_cluster_are_none_that_fit_it(n):
+    rng = np.random.default_rng(n)
+    at, there = rng.uniform(-10.0, 10.0, (40, n)), rng.uniform(-10.0, 10.0, (25, n))
+    whiten, turn = 0.5 * rng.standard_normal((40, n, n)) + 1.5 * np.eye(n), rotation(rng.standard_normal(2 * n - 3))
+    of_size, is_other = rng.uniform(0.0, 9.0, (40, 25)), rng.random((40, 25)) < 0.3
+    weakest = np.array([np.linalg.svd(one)[1][-1] ** 2 for one in whiten])
+    least, best = constellation._nearest(at, there, turn, whiten, 60.0 / weakest, of_size, is_other)
+    chi2 = np.array([[np.sum((w @ turn.T @ (y - x)) ** 2) for y in there] for w, x in zip(whiten, at, strict=True)])
+    chi2 = np.where(is_other, np.inf, chi2 + of_size)
+    near = chi2.min(axis=1) < 60.0
+    assert 5 < np.count_nonzero(near) < 40
+    assert least[near] == pytest.approx(chi2.min(axis=1)[near], rel=1e-12)
+    assert np.array_equal(best[near], chi2.argmin(axis=1)[near])
+    assert (least[~near] >= 60.0).all()
