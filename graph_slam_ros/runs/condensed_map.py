@@ -34,6 +34,7 @@ from graph_slam_ros.runs.journal import read_records
 from graph_slam_ros.slam.bounded_map import Condensation
 from graph_slam_ros.slam.condensed_edges import CondensedEdge
 from graph_slam_ros.slam.lifelong.condenser import place_of
+from graph_slam_ros.slam.lifelong.fit import VisitScale
 from graph_slam_ros.slam.lifelong.frames import Frames, frame_type, member_type
 from graph_slam_ros.slam.lifelong.removed import Left, OldKeyframe, Records, record_type
 from graph_slam_ros.slam.lifelong.state import BoundedState
@@ -63,6 +64,7 @@ def condensed_record(graph: Graph, first: int, state: BoundedState) -> Record:
         "old": old,
         "places": places,
         "left": left,
+        "scale": astuple(state.scale),
         "accepted": [[first, dict(of)] for first, of in state.accepted.items()],
     }
 
@@ -84,6 +86,7 @@ def read_condensed(graph: Graph, record: Mapping[str, Any]) -> tuple[int, Bounde
     keyframes, sightings, *frames = record["left"]
     state = BoundedState(keyframes=keyframes, sightings=sightings, frames=frames[0] if frames else 0)
     state.accepted |= {first: Counter(of) for first, of in record.get("accepted", ())}  # an older map has none
+    state.scale = VisitScale(*record.get("scale", ()))  # nor this
     for cell, edge, visits, strikes in record["places"]:
         state.places.setdefault(tuple(cell), []).append(place_of(graph.edge(edge), visits, dict(strikes)))
     state.old += [OldKeyframe(number, vertex, stamp, tuple(pose)) for number, vertex, stamp, pose in record["old"]]

@@ -253,9 +253,10 @@ def doubts(summary: Summary) -> Iterator[str]:
 def _contradicting_visits(counted: Mapping[str, int]) -> Iterator[str]:
     lost = counted.get("visit_lost", 0)
     visits = lost + counted.get("visit_condensed", 0)
-    if lost >= _FEWEST_LOST and lost > _DOUBTED * visits:
+    doubted = lost + counted.get("visit_wider", 0)
+    if doubted >= _FEWEST_LOST and doubted > _DOUBTED * visits:
         yield (
-            f"map.condense: {lost} of {visits} visits contradict themselves or the others, so the noise or the "
+            f"map.condense: {doubted} of {visits} visits contradict themselves or the others, so the noise or the "
             "calibration is wrong, and the map may be much worse than with all keyframes: compare with --set "
             "map.condense=false, run graph_slam check on the recording, or keep more by map.window_keyframes"
         )

@@ -9,7 +9,7 @@ from bisect import bisect_right
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -31,7 +31,7 @@ from graph_slam_ros.slam.solution import Solution
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Index, Numbers
 
-LONGEST = 60  # keyframes of a visit
+LONGEST = 200  # keyframes of a visit
 BATCH = 200  # keyframes that leave the window together
 _PATIENCE = 200  # keyframes that are out of the window while a visit waits
 _SOURCE = "map"  # of what is counted
@@ -77,7 +77,7 @@ class BoundedMap:
         self._landmarks, self._anchor, self._kidnaps = landmarks, anchor, kidnaps
         self._solution, self._counters = solution, counters
         self.condenser, self.state = Condenser(self._space, backend.solver), backend.bounded
-        self.condenser.places = self.state.places
+        self.condenser.places, self.condenser.scale = self.state.places, self.state.scale
         self._tried = 0  # keyframes at the last try
 
     @property
@@ -98,7 +98,7 @@ class BoundedMap:
             return None
         backend, keyframes = self._backend, self._frontend.path.keyframes
         graph, values, places = backend.graph.copy(), backend.solver.values, _copies(self.state.places)
-        vertices, self._tried = backend.solver.vertices, len(keyframes)
+        vertices, scale, self._tried = backend.solver.vertices, replace(self.state.scale), len(keyframes)
         try:
             rows, frames, end = self._condensed_visits()
             backend.hand_over_condensed(len(keyframes) - 1)
@@ -107,6 +107,7 @@ class BoundedMap:
             vars(backend.graph).update(vars(graph))
             self.state.places.clear()
             self.state.places.update(places)
+            self.state.scale = self.condenser.scale = scale
             _restart(backend.solver, vertices, values)
             return None
         return self._compacted(rows, frames, end) if end > keyframes.first else None
@@ -136,17 +137,20 @@ class BoundedMap:
             done = self.condenser.condense(visit, int(ids[end]), cells[k], self._ahead(int(ids[end])), waits=waits)
             if done.how == "waits":
                 break
-            self._note_end(done.how)
+            self._note_end(done)
             rows += self._rows(visit, done, frames)
             k = end
+        self.condenser.rescale()
         solver.update()
         return rows, Frames.joined(self._space, frames), first + k
 
-    def _note_end(self, how: str) -> None:
+    def _note_end(self, done: Condensed) -> None:
         """Count how a visit ended."""
-        if how == "kept":
+        if done.wider > 1.0:
+            self._counters.count(_SOURCE, "visit_wider")
+        if done.how == "kept":
             self._counters.count(_SOURCE, "not_condensed")
-        elif how == "composed":
+        elif done.how == "composed":
             self._counters.count(_SOURCE, "visit_lost")
         else:
             self._counters.count(_SOURCE, "visit_condensed")

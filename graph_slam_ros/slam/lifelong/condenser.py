@@ -19,7 +19,8 @@ from graph_slam_ros.slam.lifelong.carried import (
 )
 from graph_slam_ros.slam.lifelong.compaction import Renumbered
 from graph_slam_ros.slam.lifelong.elimination import product, square_root
-from graph_slam_ros.slam.lifelong.place import Fused, Place, fewest_shared, fused, visit_without
+from graph_slam_ros.slam.lifelong.fit import VisitScale, fit_of
+from graph_slam_ros.slam.lifelong.place import Fused, Place, fewest_shared
 from graph_slam_ros.slam.lifelong.surroundings import CLOSURES, Motion, Surroundings, chained, motion_of, surroundings
 from graph_slam_ros.slam.lifelong.visit import Visit, visit_of
 from graph_slam_ros.solver import Solver
@@ -29,7 +30,6 @@ Cell = tuple[int, ...]
 CHAIN = "composed"  # label of edges that are composed of odometry
 _AHEAD = 3  # landmarks of places that the keyframes after a visit must see before odometry to it is cut
 _SHARE = 0.5  # of the odometry of a first visit that is in its place; the rest joins the place to what is around it
-_STRIKES = 2  # visits in a row that contradict a place in the same landmark: then that begins anew
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +88,7 @@ class Condensed:
     why : of ``composed``, ``alone`` and ``kept``
     statistic, degrees : chi2 of the visit against all before in its place
     without, anew : the landmark that contradicts the place and was left out, or that the place has anew
+    wider : factor of the variances of the visit, without which it contradicts its place
     removed : the keyframes that left the problem, in order of time
     seen : (keyframe, landmark) of each sighting that is in the place now
     """
@@ -98,6 +99,7 @@ class Condensed:
     degrees: int = 0
     without: int | None = None
     anew: int | None = None
+    wider: float = 1.0
     removed: tuple[RemovedPose, ...] = ()
     seen: tuple[tuple[int, int], ...] = ()
 
@@ -108,11 +110,13 @@ class Condenser:
     Attributes
     ----------
     places : by cell
+    scale : of the variances of visits
     """
 
     def __init__(self, space: Geometry, solver: Solver, limits: Limits | None = None) -> None:
         self.space, self.solver, self.limits = space, solver, limits or Limits()
         self.places: dict[Cell, list[PlaceEdge]] = {}
+        self.scale = VisitScale()
 
     def condense(
         self, visit: Sequence[int], after: int, cell: Cell, ahead: Collection[int], *, waits: bool = True
@@ -146,6 +150,7 @@ class Condenser:
             one = visit_of(self.space, self.solver.graph, self.solver.estimate, visit, base, factors)
             if one.degrees > 0 and one.chi2 > quantile(self.limits.gate, one.degrees):
                 return self._composed(visit, after, around, "it contradicts itself")
+            one = replace(one, information=one.information / self.scale.factor)
             if is_again and best is not None:
                 return self._again(visit, after, around, one, best)
             return self._first(visit, after, around, one, cell)
@@ -159,6 +164,16 @@ class Condenser:
             one.place = replace(one.place, members=tuple(new.vertices[list(one.place.members)].tolist()))
             strikes = {int(new.vertices[mark]): count for mark, count in one.strikes.items()}
             one.strikes = {mark: count for mark, count in strikes.items() if mark >= 0}
+
+    def rescale(self) -> None:
+        """Scale all places, where visits so far say that their variances are larger or smaller."""
+        by = self.scale.change()
+        for one in (one for in_cell in self.places.values() for one in in_cell if by != 1.0):
+            place = replace(one.place, information=one.place.information / by)
+            now = self._place_edge(one.base, place, square_root(place.information))
+            self.solver.add([], [now.edge])
+            self.solver.set_weight(one.edge, 0.0)
+            one.place, one.edge = now.place, now.edge
 
     # -- what becomes of a visit -------------------------------------------------------------------------------------
 
@@ -209,18 +224,11 @@ class Condenser:
         k = len(visit) // 2
         base, mine = self.solver.estimate([at.base, visit[k]]).tolist()
         guess = tuple(map(float, self.space.group.between(tuple(base), tuple(mine))))
-        done, without, place = self._fused(at.place, one, guess), None, at.place
-        if not self._passes(done):
-            without = self._contradicted(place, one, guess)
-            if without is None:
-                return self._composed(visit, after, around, "it contradicts its place", done)
-        anew = without if without is not None and at.strikes.get(without, 0) + 1 >= _STRIKES else None
-        result, used = done, one
-        if anew is not None:
-            result = self._fused(place.without(anew), one, guess)
-        elif without is not None:
-            used = visit_without(one, without)
-            result = self._fused(place, used, guess)
+        fit = fit_of(self.space, at.place, one, guess, self.limits.gate, at.strikes)
+        self.scale.add(fit.as_is, self.limits.gate)
+        result = fit.result
+        if result is None:
+            return self._composed(visit, after, around, "it contradicts its place", fit.as_is)
         if lonely := self._left_alone(around, result.place.members):
             return Condensed("kept", f"landmark {lonely[0]} would be left without a measurement")
         legs = [motion_of(edge) for edge in around.steps]
@@ -228,15 +236,15 @@ class Condenser:
         now = self._place_edge(at.base, result.place, square_root(result.place.information))
         added, also = self._add_carried(carried)
         removed = self._replace(visit, around, [now.edge, *added], kept=None, seen_from=at.base, also=[at.edge, *also])
-        if without is None:
-            at.strikes = {mark: count for mark, count in at.strikes.items() if mark not in one.members}
-        elif anew is None:
-            at.strikes[without] = at.strikes.get(without, 0) + 1
+        if fit.anew is not None:
+            at.strikes.pop(fit.anew, None)
+        elif fit.without is not None:
+            at.strikes[fit.without] = at.strikes.get(fit.without, 0) + 1
         else:
-            at.strikes.pop(anew, None)
+            at.strikes = {mark: count for mark, count in at.strikes.items() if mark not in one.members}
         at.place, at.edge = now.place, now.edge
-        left_out, seen = None if anew else without, _seen(around, used.members)
-        return Condensed("again", "", done.statistic, done.degrees, left_out, anew, removed, seen)
+        seen, (chi2, degrees) = _seen(around, fit.visit.members), (fit.as_is.statistic, fit.as_is.degrees)
+        return Condensed("again", "", chi2, degrees, fit.without, fit.anew, fit.wider, removed, seen)
 
     def _composed(
         self, visit: Sequence[int], after: int, around: Surroundings, why: str, done: Fused | None = None
@@ -251,23 +259,6 @@ class Condenser:
         removed = self._replace(visit, around, added, kept=None, seen_from=after)
         statistic, degrees = (done.statistic, done.degrees) if done else (0.0, 0)
         return Condensed("composed", why, statistic, degrees, removed=removed)
-
-    def _fused(self, place: Place, visit: Visit, guess: Numbers) -> Fused:
-        return fused(self.space, place, visit, guess)
-
-    def _passes(self, done: Fused) -> bool:
-        return done.degrees < 1 or done.statistic <= quantile(self.limits.gate, done.degrees)
-
-    def _contradicted(self, place: Place, visit: Visit, guess: Numbers) -> int | None:
-        """Return the landmark without which a visit fits its place best; None where it fits without none of them."""
-        shared, found = place.shared(visit), list[tuple[float, int]]()
-        if len(shared) <= fewest_shared(self.space):
-            return None
-        for mark in shared:
-            done = self._fused(place, visit_without(visit, mark), guess)
-            if self._passes(done):
-                found.append((done.statistic, mark))
-        return min(found)[1] if found else None
 
     # -- edits of the graph ------------------------------------------------------------------------------------------
 

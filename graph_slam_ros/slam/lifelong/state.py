@@ -4,6 +4,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 
 from graph_slam_ros.slam.lifelong.condenser import Cell, PlaceEdge
+from graph_slam_ros.slam.lifelong.fit import VisitScale
 from graph_slam_ros.slam.lifelong.removed import OldKeyframe
 
 
@@ -14,12 +15,14 @@ class BoundedState:
     Attributes
     ----------
     places : by cell
+    scale : of the variances of visits
     old : the keyframes in the graph that are in no list of keyframes any more, in order of time
     keyframes, sightings, frames : how many have left the map
     accepted : of each drive, by its first keyframe, how many accepted measurements of each input have left the map
     """
 
     places: dict[Cell, list[PlaceEdge]] = field(default_factory=dict)
+    scale: VisitScale = field(default_factory=VisitScale)
     old: list[OldKeyframe] = field(default_factory=list)
     keyframes: int = 0
     sightings: int = 0

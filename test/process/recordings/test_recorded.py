@@ -32,6 +32,21 @@ def test_a_recorded_robot_is_found_to_a_decimetre_and_so_are_its_landmarks(robot
     assert not done.losses
 
 
+@pytest.mark.skipif(not HAS_MRCLAM, reason=WITHOUT_MRCLAM)
+@pytest.mark.parametrize("robot, seconds", times([(2, 450.0)], [(robot, None) for robot in MOST_M]))
+def test_with_condensed_visits_it_is_nearly_as_good_and_no_surer_than_it_may_be(robot, seconds, tmp_path):
+    """Odometry says a way that is 10 % too long, and the clock is late: the visits' errors are no noise."""
+    bag = mrclam(robot, tmp_path / "bag", seconds=seconds)
+    config = Config.from_mapping({"map.condense": True, "map.window_keyframes": 300})
+    done = replay(bag, tmp_path / "run", config)
+    scores = evaluate(tmp_path / "run", str(bag))
+    assert done.slam.counters["map", "visit_condensed"] >= 3
+    assert not done.slam.counters["map", "visit_lost"]
+    assert scores.estimate.position_m["rmse"] <= MOST_M[robot]
+    assert scores.map_rmse_m <= MOST_MAP_M
+    assert scores.consistency.poses.mean < 4.0
+
+
 def poles_and_landmarks(robot, slam):
     """Positions of the poles, and of the landmarks after the path was laid on the truth."""
     truth = np.loadtxt(SET_7 / f"Robot{robot}_Groundtruth.dat.gz")
