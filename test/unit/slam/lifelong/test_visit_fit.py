@@ -1,4 +1,4 @@
-"""The fit of a visit to its place, as it is, with larger variances, or not at all; and the scale of variances.
+"""The fit of a visit to its place, as it is, with larger variances, or not at all; and the scale of variances."""
 
 from dataclasses import replace
 
