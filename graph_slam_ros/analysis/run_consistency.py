@@ -179,6 +179,6 @@ def _noise(run: Path) -> tuple[bool, tuple[NoiseScale, ...]]:
     """Return whether fixes hold the map, and the noise estimated from residuals, from the summary of a run."""
     try:
         summary = json.loads(read_text(run / SUMMARY))
-        return "fixes" in summary["classes"], tuple(NoiseScale(**one) for one in summary.get("noise", ()))
+        return "fixes" in summary["classes"], tuple(NoiseScale.from_dict(one) for one in summary.get("noise", ()))
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise GraphSlamError(f"{run / SUMMARY}: not a summary of a run ({type(error).__name__}: {error})") from None

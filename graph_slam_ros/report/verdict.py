@@ -245,8 +245,8 @@ def noise(summary: Mapping[str, Any], scores: Any = None) -> list[Row]:
     rows, over_confident = [], scores.consistency.over_confidence if scores is not None and scores.consistency else ""
     for one in summary.get("noise", ()):
         name = " ".join(filter(None, (one["label"], one["source"], one["part"])))
-        per_dof = one["per_dof"] if one["per_dof"] is not None and math.isfinite(one["per_dof"]) else None
-        scale = NoiseScale(**one | {"per_dof": math.nan if per_dof is None else per_dof})
+        scale = NoiseScale.from_dict(one)
+        per_dof = scale.per_dof if math.isfinite(scale.per_dof) else None
         rows.append([shown(name), one["dof"], per_dof, one["design_effect"], should_be(scale, over_confident)])
     return rows
 

@@ -91,6 +91,11 @@ class NoiseScale:
         """Plain values; a number that JSON has not is null."""
         return asdict(self) | {"per_dof": self.per_dof if math.isfinite(self.per_dof) else None}
 
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> "NoiseScale":
+        """Read the values of ``as_dict``."""
+        return cls(**{**values, "per_dof": math.nan if values["per_dof"] is None else values["per_dof"]})
+
 
 def factors_of(scales: Sequence[NoiseScale]) -> dict[Key, float]:
     """The factors and added variances of the groups for which they are known."""

@@ -316,3 +316,11 @@ def test_a_simulated_bag_is_replayed_to_a_run_that_is_near_the_truth_and_knows_i
     assert scores.estimate.position_m["rmse"] < 0.3 * scores.odometry.position_m["rmse"]
     assert scores.map_rmse_m < 0.3
     assert scores.consistency.last_pose.mean < chi2.ppf(0.9999, scores.consistency.last_pose.dof)
+
+
+def test_a_run_by_odometry_alone_is_scored_though_nothing_is_known_of_its_noise(tmp_path):
+    write_bag(simulate("warehouse", 1, laps=1), tmp_path / "bag.mcap")
+    replay(tmp_path / "bag.mcap", tmp_path / "run", Config.from_mapping({"landmarks.association": "none"}))
+    scores = evaluate(tmp_path / "run", str(tmp_path / "bag.mcap"))
+    assert any(np.isnan(one.per_dof) for one in scores.consistency.noise)
+    assert "not known: 0 degrees of freedom" in str(scores)
