@@ -42,6 +42,9 @@ def condensed_lines(run: SavedGraph) -> Iterator[str]:
     places = [one.place for several in run.slam.bounded.places.values() for one in several]
     visits, keyframes = sum(one.visits for one in places), run.slam.first_keyframe
     yield f"condensed: keyframes 0 to {keyframes - 1}, into {len(places)} places of {visits} visits"
+    factor = run.slam.bounded.scale.factor
+    if factor > 1.0:
+        yield f"  visits to a place differ by {np.sqrt(factor):.1f} times their sigmas, which count as so much larger"
     if rows := list(edges_that_left(run)):
         yield f"  their edges: {became(rows)}"
 

@@ -114,8 +114,7 @@ def test_whatever_came_replay_of_the_nodes_own_sequence_equals_what_it_saved(mes
         for half in (messages[: len(messages) // 2], messages[len(messages) // 2 :]):
             r.drive(garbled(half))
             assert r.save().success
-        code, _ = n.stop()
-    assert code == 0
+        finish(n, r)
     counters = (tmp_path / "run" / "run.json").read_text()
     assert all(word in counters for word in ("late", "undecodable", "duplicate"))
     assert '"node"' not in counters, "no message raised an error"

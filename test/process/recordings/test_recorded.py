@@ -9,6 +9,7 @@ from graph_slam_ros.analysis.evaluation import evaluate
 from graph_slam_ros.analysis.path_error import alignment
 from graph_slam_ros.lie import se3
 from graph_slam_ros.runs.replay import replay
+from graph_slam_ros.runs.restore import restored
 from graph_slam_ros.slam import Config
 
 # Batch least squares with known ids reaches 0.107, 0.100, 0.089, 0.187, 0.094 m; robot 4's camera has a bias.
@@ -45,6 +46,8 @@ def test_with_condensed_visits_it_is_nearly_as_good_and_no_surer_than_it_may_be(
     assert scores.estimate.position_m["rmse"] <= MOST_M[robot]
     assert scores.map_rmse_m <= MOST_MAP_M
     assert scores.consistency.poses.mean < 4.0
+    assert done.slam.bounded.scale.degrees > 20
+    assert restored(tmp_path / "run", []).bounded.scale == done.slam.bounded.scale
 
 
 def poles_and_landmarks(robot, slam):
