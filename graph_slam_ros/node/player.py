@@ -44,6 +44,7 @@ _AHEAD = 256  # messages on their way
 _OVERTAKE_NS = 20_000_000  # at most, and well inside the node's ordering window
 _CLOCK_NS = 5_000_000
 _PATIENCE_S = 10.0
+_PARAMETERS_S, _SAVE_S = 1.0, 300.0
 _START_S = 300.0  # the first start of an installation compiles
 _OWN_LAG_S = 60.0  # the player waits for its own node: that it is behind is no fault
 _LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -80,6 +81,7 @@ class Player:
         self._on_the_way: dict[str, tuple[int, int]] = {}  # oldest and newest stamp by topic
         self._clock_ns = 0
         self._clock = self._node.create_publisher(Clock, "/clock", 10)
+        self._saving = self._node.create_client(Trigger, f"{node_name}/save")
         self._publishers = {topic: self._publisher(topic) for topic in set(inputs.topics.values())}
         self._node.create_subscription(UInt64, f"{node_name}/received", self._on_received, _LATCHED)
 
@@ -192,15 +194,34 @@ class Player:
             raise PlayError(f"the node ended with exit code {code}")
 
     def _save(self) -> str:
-        client = self._node.create_client(Trigger, f"{self._name}/save")
-        if not client.wait_for_service(timeout_sec=_PATIENCE_S):
+        if not self._saving.wait_for_service(timeout_sec=_PATIENCE_S):
             raise PlayError(f"no service {self._name}/save")
-        future = client.call_async(Trigger.Request())
-        rclpy.spin_until_future_complete(self._node, future, timeout_sec=300.0)
-        answer = future.result()
+        answer = _answer(self._node, self._saving, Trigger.Request(), _SAVE_S, _PATIENCE_S, self._check_node)
         if answer is None or not answer.success:
             raise PlayError(f"{self._name}/save: {answer.message if answer else 'no answer'}")
         return str(answer.message)
+
+
+def _answer(
+    node: Node, client: Any, request: Any, patience_s: float, again_s: float, check: Callable[[], None] = lambda: None
+) -> Any:
+    """Ask, and ask again, until there is an answer; None if there is none.
+
+    DDS drops an answer while the node does not know who asked, which may be so on a busy machine.
+
+    Parameters
+    ----------
+    again_s : after which it is asked a second time; then twice as long, and so on
+    check : called meanwhile; what it raises ends the wait
+    """
+    deadline, asked = time.monotonic() + patience_s, list[Any]()
+    while not (done := [one for one in asked if one.done()]) and time.monotonic() < deadline:
+        asked.append(client.call_async(request))
+        until, again_s = min(deadline, time.monotonic() + again_s), 2.0 * again_s
+        while time.monotonic() < until and not any(one.done() for one in asked):
+            check()
+            rclpy.spin_once(node, timeout_sec=0.1)
+    return done[0].result() if done else None
 
 
 def config_of(node_name: str) -> Config:
@@ -219,11 +240,10 @@ def config_of(node_name: str) -> Config:
             client = node.create_client(kind, f"{node_name}/{service}")
             if not client.wait_for_service(timeout_sec=_PATIENCE_S):
                 raise PlayError(f"no parameters of {node_name}: is the node running?")
-            future = client.call_async(kind.Request(**fields))
-            rclpy.spin_until_future_complete(node, future, timeout_sec=_PATIENCE_S)
-            if future.result() is None:
+            found = _answer(node, client, kind.Request(**fields), _PATIENCE_S, _PARAMETERS_S)
+            if found is None:
                 raise PlayError(f"{node_name}/{service}: no answer")
-            return future.result()
+            return found
 
         there = set(answer(ListParameters, "list_parameters").result.names)
         (inputs,) = answer(GetParameters, "get_parameters", names=["inputs.names"]).values
