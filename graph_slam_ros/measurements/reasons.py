@@ -329,7 +329,10 @@ REASONS: dict[str, Reason] = {
     "condensed": Reason(_REFUSED, "its landmark was not determined when its keyframe left", "map.window_keyframes"),
     "visit_condensed": Reason(_NOTED, "a visit was added to its place, begins one, or is one keyframe"),
     "visit_wider": Reason(_NOTED, "a visit fits its place with larger sigmas only (up to 3 times)"),
-    "visit_lost": Reason(_NOTED, "a visit that contradicts itself or its place, or sees too little: odometry is kept"),
+    "visit_lost": Reason(_NOTED, "a visit that contradicts itself or its place: its odometry alone is kept"),
+    "visit_unfit": Reason(
+        _NOTED, "a visit that sees too few landmarks for a place: its odometry alone is kept", "map.condense=false"
+    ),
     "not_condensed": Reason(_NOTED, "a keyframe that stays: it has a pose or a range with offset, or is held"),
     "cleared": Reason(_NOTED, "loop closures that ~/clear_closures took out"),
     "displaced": Reason(

@@ -251,14 +251,19 @@ def doubts(summary: Summary) -> Iterator[str]:
 
 
 def _contradicting_visits(counted: Mapping[str, int]) -> Iterator[str]:
-    lost = counted.get("visit_lost", 0)
-    visits = lost + counted.get("visit_condensed", 0)
+    lost, unfit = counted.get("visit_lost", 0), counted.get("visit_unfit", 0)
+    visits = lost + unfit + counted.get("visit_condensed", 0)
     doubted = lost + counted.get("visit_wider", 0)
     if doubted >= _FEWEST_LOST and doubted > _DOUBTED * visits:
         yield (
             f"map.condense: {doubted} of {visits} visits contradict themselves or the others, so the noise or the "
             "calibration is wrong, and the map may be much worse than with all keyframes: compare with --set "
             "map.condense=false, run graph_slam check on the recording, or keep more by map.window_keyframes"
+        )
+    if unfit >= _FEWEST_LOST and unfit > _DOUBTED * visits:
+        yield (
+            f"map.condense: {unfit} of {visits} visits see too few landmarks for a place, so the map has their "
+            "odometry alone: --set map.condense=false keeps all"
         )
 
 

@@ -151,7 +151,7 @@ class BoundedMap:
         if done.how == "kept":
             self._counters.count(_SOURCE, "not_condensed")
         elif done.how == "composed":
-            self._counters.count(_SOURCE, "visit_lost")
+            self._counters.count(_SOURCE, "visit_lost" if done.is_contradiction else "visit_unfit")
         else:
             self._counters.count(_SOURCE, "visit_condensed")
 

@@ -29,6 +29,7 @@ from graph_slam_ros.typing import Array, Numbers
 Cell = tuple[int, ...]
 CHAIN = "composed"  # label of edges that are composed of odometry
 _AHEAD = 3  # landmarks of places that the keyframes after a visit must see before odometry to it is cut
+_ITSELF, _PLACE = "it contradicts itself", "it contradicts its place"
 _SHARE = 0.5  # of the odometry of a first visit that is in its place; the rest joins the place to what is around it
 
 
@@ -103,6 +104,11 @@ class Condensed:
     removed: tuple[RemovedPose, ...] = ()
     seen: tuple[tuple[int, int], ...] = ()
 
+    @property
+    def is_contradiction(self) -> bool:
+        """Return whether the visit contradicts itself or its place."""
+        return self.why in (_ITSELF, _PLACE)
+
 
 class Condenser:
     """Condenses visits in a graph and its solver, in order of time. The caller updates the solver after each.
@@ -149,7 +155,7 @@ class Condenser:
             factors = around.local if is_again else around.local | _halved(around)
             one = visit_of(self.space, self.solver.graph, self.solver.estimate, visit, base, factors)
             if one.degrees > 0 and one.chi2 > quantile(self.limits.gate, one.degrees):
-                return self._composed(visit, after, around, "it contradicts itself")
+                return self._composed(visit, after, around, _ITSELF)
             one = replace(one, information=one.information / self.scale.factor)
             if is_again and best is not None:
                 return self._again(visit, after, around, one, best)
@@ -228,7 +234,7 @@ class Condenser:
         self.scale.add(fit.as_is, self.limits.gate)
         result = fit.result
         if result is None:
-            return self._composed(visit, after, around, "it contradicts its place", fit.as_is)
+            return self._composed(visit, after, around, _PLACE, fit.as_is)
         if lonely := self._left_alone(around, result.place.members):
             return Condensed("kept", f"landmark {lonely[0]} would be left without a measurement")
         legs = [motion_of(edge) for edge in around.steps]

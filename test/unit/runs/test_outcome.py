@@ -68,3 +68,9 @@ def test_visits_that_contradict_the_others_are_said(lost, condensed, is_said):
     said = list(doubts(summary({"map": {"visit_lost": lost, "visit_condensed": condensed}})))
     assert len(said) == is_said
     assert all(f"{lost} of {lost + condensed} visits" in one and "map.condense=false" in one for one in said)
+
+
+def test_visits_that_see_too_little_are_said_as_such():
+    (said,) = doubts(summary({"map": {"visit_unfit": 35, "visit_condensed": 2}}))
+    assert said.startswith("map.condense: 35 of 37 visits see too few landmarks")
+    assert "contradict" not in said
