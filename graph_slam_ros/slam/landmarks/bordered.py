@@ -6,13 +6,13 @@ sparse matrix, and the parameters of the whole drive, which are coupled with eve
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
 from scipy import sparse
 from scipy.linalg import cho_solve_banded, cholesky_banded
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import SuperLU, splu
 
 from graph_slam_ros.typing import Array, Index
 
@@ -37,6 +37,50 @@ class Rows:
     residuals: Array
     first: Index
     border: Index
+
+
+@dataclass(slots=True)
+class Pattern:
+    """The places of the entries of the sparse matrix: the same for equations whose rows differ in their numbers only.
+
+    Attributes
+    ----------
+    is_ordered : whether the order is one with little fill, which the first factorisation finds
+    order : (n,) of elimination
+    corner : places of entries in the part of the border that is factorised
+    source, indices, indptr : of the matrix in that order, by columns: places of its entries among all, and their rows
+    diagonal : (n,) places of the diagonal among these entries
+    """
+
+    is_ordered: bool = False
+    order: Index = field(init=False)
+    corner: Index = field(init=False)
+    source: Index = field(init=False)
+    indices: Index = field(init=False)
+    indptr: Index = field(init=False)
+    diagonal: Index = field(init=False)
+
+    def arrange(self, rows: Index, columns: Index, source: Index, order: Index) -> None:
+        """Arrange entries, by their row, column and place among all, in an order."""
+        place = np.empty_like(order)
+        place[order] = np.arange(len(order))
+        parts = source + 1.0, (place[rows], place[columns])  # no entry is zero
+        matrix = sparse.coo_matrix(parts, (len(order), len(order))).tocsc()
+        matrix.sort_indices()
+        self.order, self.source = order, matrix.data.astype(np.int64) - 1
+        self.indices, self.indptr = matrix.indices, matrix.indptr
+        of_column = np.repeat(np.arange(len(order)), np.diff(matrix.indptr))
+        self.diagonal = np.flatnonzero(matrix.indices == of_column)
+
+    def factor(self, numbers: Array, added: Array, ordering: str) -> SuperLU:
+        """Factorise the matrix with these entries, and with numbers (n,) added to its diagonal."""
+        data = numbers[self.source]
+        data[self.diagonal] += added[self.order]
+        matrix = sparse.csc_matrix((data, self.indices, self.indptr), (len(added), len(added)))
+        try:
+            return splu(matrix, permc_spec=ordering, diag_pivot_thresh=0.0, options=_SYMMETRIC)
+        except RuntimeError as error:  # it is singular
+            raise np.linalg.LinAlgError(str(error)) from None
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,34 +127,37 @@ class BorderedEquations:
     count, size : unknowns of the chain and of the border
     width : of the chain's longest row: so many unknowns that follow one another
     parameters : the last so many unknowns of the border are of the whole drive
+    pattern : of equations whose rows differ in their numbers only, or a new one; it is arranged when it is needed
 
     Attributes
     ----------
     b : (count + size,) right-hand side
     """
 
-    def __init__(self, rows: list[Rows], count: int, size: int, width: int, parameters: int) -> None:
-        self._parameters = parameters
+    def __init__(
+        self, rows: list[Rows], count: int, size: int, width: int, parameters: int, pattern: Pattern | None = None
+    ) -> None:
+        self._rows, self._parameters, self._pattern = rows, parameters, pattern or Pattern()
         self._band, self._corner = np.zeros((width, count)), np.zeros((size, size))
         self.b = np.zeros(count + size)
         at, columns, values = [], [], []
         for one in rows:
-            k, c, d = len(one.first), one.of_chain.shape[2], one.of_border.shape[2]
-            transposed, by_border = one.of_chain.transpose(0, 2, 1), one.of_border.transpose(0, 2, 1)
-            own = transposed @ one.of_chain
+            c, d = one.of_chain.shape[2], one.of_border.shape[2]
+            every = np.concatenate([one.of_chain, one.of_border, one.residuals[..., None]], axis=2)
+            every = np.ascontiguousarray(every.transpose(2, 1, 0))  # a long last axis is fast
             for i in range(c):  # the lower band has the entry (i, j) at [i - j, j]
                 for j in range(i + 1):
-                    self._band[i - j] += np.bincount(one.first + j, own[:, i, j], minlength=count)
-            of_chain = one.first[:, None] + np.arange(c)
-            at.append(np.repeat(of_chain, d, axis=1).ravel())
-            columns.append(np.tile(one.border, (1, c)).ravel())
-            values.append((transposed @ one.of_border).ravel())
-            where = (size * one.border[:, :, None] + one.border[:, None]).reshape(k * d * d)
-            both = np.bincount(where, (by_border @ one.of_border).ravel(), minlength=size * size)
-            self._corner += both.reshape(size, size)
-            r = one.residuals[..., None]
-            self.b[:count] -= np.bincount(of_chain.ravel(), (transposed @ r).ravel(), minlength=count)
-            self.b[count:] -= np.bincount(one.border.ravel(), (by_border @ r).ravel(), minlength=size)
+                    both = (every[i] * every[j]).sum(axis=0)
+                    self._band[i - j] += np.bincount(one.first + j, both, minlength=count)
+                at.append(np.tile(one.first + i, d))
+                values.append((every[i] * every[c:-1]).sum(axis=1).ravel())
+                self.b[:count] -= np.bincount(one.first + i, (every[i] * every[-1]).sum(axis=0), minlength=count)
+            border = np.ascontiguousarray(one.border.T)
+            columns.append(np.tile(border.ravel(), c))
+            where, both = size * border[:, None] + border, (every[c:-1, None] * every[c:-1]).sum(axis=2)
+            corner = np.bincount(where.ravel(), both.ravel(), minlength=size * size)
+            self._corner += corner.reshape(size, size)
+            self.b[count:] -= np.bincount(border.ravel(), (every[c:-1] * every[-1]).sum(axis=1).ravel(), minlength=size)
         parts = np.concatenate(values), (np.concatenate(columns), np.concatenate(at))
         self._coupling = sparse.coo_matrix(parts, (size, count)).tocsr()
 
@@ -148,15 +195,43 @@ class BorderedEquations:
 
     def _sparse(self, added: Array) -> tuple[Callable[[Array], Array], Array]:
         """Factorise the chain with the landmarks. Returns what solves for them, and the pivots."""
+        pattern, size = self._pattern, len(added) - self._band.shape[1]
+        is_new = not pattern.is_ordered or len(pattern.order) != len(added)
+        if is_new:
+            self._arrange(size, np.arange(len(added)))
+        numbers = np.concatenate([self._band.ravel(), self._coupling.data, self._corner.ravel()[pattern.corner]])
+        own, order = pattern.factor(numbers, added, "MMD_AT_PLUS_A" if is_new else "NATURAL"), pattern.order
+        if is_new:
+            self._arrange(size, np.argsort(own.perm_c))
+            pattern.is_ordered = True
+
+        def solved(b: Array) -> Array:
+            out = np.empty_like(b)
+            out[order] = own.solve(b[order])
+            return out
+
+        return solved, own.U.diagonal()
+
+    def _arrange(self, size: int, order: Index) -> None:
+        """Arrange the entries of the chain and of the first unknowns of the border, both triangles, in an order."""
         width, count = self._band.shape
-        size = len(added) - count
-        below = [-i for i in range(1, width)]
-        lower = sparse.diags([self._band[-i, : count + i] for i in below], below, shape=(count, count))
-        chain = lower + lower.T + sparse.diags(self._band[0])
-        seen, corner = self._coupling[:size], sparse.csc_matrix(self._corner[:size, :size])
-        matrix = (sparse.bmat([[chain, seen.T], [seen, corner]]) + sparse.diags(added)).tocsc()
-        try:
-            own = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=_SYMMETRIC)
-        except RuntimeError as error:  # it is singular
-            raise np.linalg.LinAlgError(str(error)) from None
-        return own.solve, own.U.diagonal()
+        is_chain, is_corner = np.zeros((width, count), dtype=bool), np.eye(len(self._corner), dtype=bool)
+        is_chain[0] = True
+        for one in self._rows:
+            c = one.of_chain.shape[2]
+            for j in range(c):
+                is_chain[: c - j, one.first + j] = True
+            is_corner[one.border[:, :, None], one.border[:, None]] = True
+        below, at = np.nonzero(is_chain)
+        one_mark, other = np.nonzero(is_corner[:size, :size])
+        self._pattern.corner = one_mark * len(is_corner) + other
+        ends = self._coupling.indptr[: size + 1]
+        entries = int(ends[-1])
+        mark = np.repeat(count + np.arange(size), np.diff(ends))
+        seen_from = self._coupling.indices[:entries]
+        of_chain, of_seen = below * count + at, width * count + np.arange(entries)
+        of_corner, is_below = width * count + self._coupling.nnz + np.arange(len(other)), below > 0
+        rows = at + below, at[is_below], mark, seen_from, count + one_mark
+        columns = at, (at + below)[is_below], seen_from, mark, count + other
+        source = of_chain, of_chain[is_below], of_seen, of_seen, of_corner
+        self._pattern.arrange(np.concatenate(rows), np.concatenate(columns), np.concatenate(source), order)

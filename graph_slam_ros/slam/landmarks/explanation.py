@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graph_slam_ros.slam.landmarks.beam import LOG_SIZES, SIZE_CHI2, BeamSettings
-from graph_slam_ros.slam.landmarks.bordered import BorderedEquations, Rows
-from graph_slam_ros.slam.landmarks.rotations import lever, rotation, rotation_vector
+from graph_slam_ros.slam.landmarks.bordered import BorderedEquations, Pattern, Rows
+from graph_slam_ros.slam.landmarks.rotations import applied, lever, product, rotation, rotation_vector
 from graph_slam_ros.slam.landmarks.scans import NEARBY_S, Motion, Scan
 from graph_slam_ros.typing import Array, Mask
 
@@ -109,6 +109,7 @@ class Drive:
         self._set_motions(motions)
         self._set_clocks(scans, nearby, clocks or {})
         self.work = self._free = 0
+        self._pattern: tuple[Ids | None, Pattern] = None, Pattern()  # of the equations of an assignment
 
     @property
     def size(self) -> int:
@@ -151,7 +152,7 @@ class Drive:
     def along_odometry(self, position: Array, turn: Array, scales: Array) -> tuple[Array, Array]:
         """Positions and rotations of the scans by odometry alone, from the first."""
         positions, turns = [position], [turn]
-        ways = (rotation(0.5 * self.turned * scales[1]) @ self.way[..., None])[..., 0] * (1.0 + scales[0])
+        ways = applied(rotation(0.5 * self.turned * scales[1]), self.way) * (1.0 + scales[0])
         for way, turned in zip(ways, rotation(self.turned * (1.0 + scales[1])), strict=True):
             positions.append(positions[-1] + turns[-1] @ way)
             turns.append(turns[-1] @ turned)
@@ -160,7 +161,7 @@ class Drive:
     def seen_at(self, e: Estimate, clusters: Ids | slice = slice(None)) -> Array:
         """Positions of clusters in map (m, n)."""
         k = self.scan[clusters]
-        return e.position[k] + (e.turn[k] @ self.points_at(e, clusters)[0][..., None])[..., 0]
+        return e.position[k] + applied(e.turn[k], self.points_at(e, clusters)[0])
 
     def points_at(self, e: Estimate, clusters: Ids | Mask | slice = slice(None)) -> tuple[Array, Array]:
         """Clusters (m, n), from where the robot was at their scan's stamp, and what a second of clock moves them by.
@@ -170,14 +171,14 @@ class Drive:
         points = self.points[clusters]
         after_s = self._part[clusters] @ e.clocks + self._late_s[clusters]
         moved, rate = _interpolated(self._nearby[self.scan[clusters]], after_s)
-        turned = (rotation(moved[:, self.n :]) @ points[..., None])[..., 0]
-        swung = (lever(turned) @ rate[:, self.n :, None])[..., 0]
+        turned = applied(rotation(moved[:, self.n :]), points)
+        swung = applied(lever(turned), rate[:, self.n :])
         return turned + moved[:, : self.n], swung + rate[:, : self.n]
 
     def chi2_with(self, e: Estimate, clusters: Ids | slice = slice(None)) -> Array:
         """chi2 (m, J) of clusters with every landmark."""
         k = self.scan[clusters]
-        whiten = self.whiten[clusters] @ e.turn[k].transpose(0, 2, 1)
+        whiten = product(self.whiten[clusters], e.turn[k].transpose(0, 2, 1))
         away = self.seen_at(e, clusters)[:, None] - e.landmarks[None]
         chi2 = np.square(away @ whiten.transpose(0, 2, 1)).sum(axis=-1)
         return np.asarray(chi2 + self.size_chi2(e, clusters))
@@ -198,7 +199,7 @@ class Drive:
         residual = self._odometry(e)[0]
         tight, slipped = self._both(residual, slips=slips)
         used = e.which >= 0
-        chi2 = np.square((self.whiten[used] @ self._residuals(e, used)[0][..., None])[..., 0]).sum(axis=1)
+        chi2 = np.square(applied(self.whiten[used], self._residuals(e, used)[0])).sum(axis=1)
         square = (loss_scale or self.costs.loss_scale) ** 2
         scales = float(np.square(e.scales).sum()) / self.settings.scale_sigma**2
         scales += float(np.square(e.clocks).sum()) / self.settings.clock_sigma_s**2
@@ -216,25 +217,25 @@ class Drive:
         return e.cost + self.costs.landmark * len(e.landmarks) + e.volume
 
     def _both(self, residual: Array, *, slips: bool) -> tuple[Array, Array]:
-        tight = np.square((self._tight @ residual[..., None])[..., 0]).sum(axis=1)
+        tight = np.square(applied(self._tight, residual)).sum(axis=1)
         if not slips:
             return tight, tight + _NEVER
-        return tight, np.square((self._slipped @ residual[..., None])[..., 0]).sum(axis=1) + self.slip_cost
+        return tight, np.square(applied(self._slipped, residual)).sum(axis=1) + self.slip_cost
 
     def _odometry(self, e: Estimate) -> tuple[Array, Array, Array]:
         """Residuals (N - 1, dof) of odometry; the motion of the estimate, and of odometry without its scale."""
         a = e.turn[:-1]
-        moved = (a.transpose(0, 2, 1) @ (e.position[1:] - e.position[:-1])[..., None])[..., 0]
-        local = (rotation(0.5 * self.turned * e.scales[1]) @ self.way[..., None])[..., 0]
+        moved = applied(a.transpose(0, 2, 1), e.position[1:] - e.position[:-1])
+        local = applied(rotation(0.5 * self.turned * e.scales[1]), self.way)
         back = rotation(-self.turned * (1.0 + e.scales[1]))
-        turned = rotation_vector(back @ a.transpose(0, 2, 1) @ e.turn[1:])
+        turned = rotation_vector(product(product(back, a.transpose(0, 2, 1)), e.turn[1:]))
         return np.concatenate([moved - (1.0 + e.scales[0]) * local, turned], axis=1), moved, local
 
     def _residuals(self, e: Estimate, used: Mask) -> tuple[Array, Array, Array]:
         """Residuals of used clusters, their landmarks' positions relative to the scans, and the rate by the clock."""
         k = self.scan[used]
         away = e.landmarks[e.which[used]] - e.position[k]
-        seen = (e.turn[k].transpose(0, 2, 1) @ away[..., None])[..., 0]
+        seen = applied(e.turn[k].transpose(0, 2, 1), away)
         points, rate = self.points_at(e, used)
         return seen - points, seen, rate
 
@@ -332,7 +333,9 @@ class Drive:
         self.work += self.size + len(self.scan)
         own = np.concatenate([e.scales, e.clocks])
         rows = [self._odometry_rows(e, of_landmarks, slips=slips), self._cluster_rows(e, of_landmarks + 2, loss_scale)]
-        normal = BorderedEquations(rows, count, of_landmarks + len(own), 2 * self._dof, len(own))
+        if self._pattern[0] is not e.which:
+            self._pattern = e.which, Pattern()
+        normal = BorderedEquations(rows, count, of_landmarks + len(own), 2 * self._dof, len(own), self._pattern[1])
         floor = np.zeros(count + of_landmarks + len(own))
         floor[: self._dof], floor[count : count + of_landmarks] = _HELD, _WEAK_PRIOR
         sigmas = [self.settings.scale_sigma] * 2 + [self.settings.clock_sigma_s] * len(e.clocks)
@@ -351,9 +354,9 @@ class Drive:
         j[:, n:, n:dof] = -e.turn[1:].transpose(0, 2, 1) @ e.turn[:-1] if n == 3 else -1.0
         j[:, n:, dof + n :] = np.eye(dof - n)
         by_scale[:, :n, 0], by_scale[:, n:, 0], by_scale[:, n:, 1] = -local, 0.0, -self.turned
-        by_scale[:, :n, 1] = -0.5 * (1.0 + e.scales[0]) * (lever(local) @ self.turned[..., None])[..., 0]
+        by_scale[:, :n, 1] = -0.5 * (1.0 + e.scales[0]) * applied(lever(local), self.turned)
         at, border = dof * np.arange(size - 1), np.tile([first, first + 1], (size - 1, 1))
-        return Rows(whiten @ j, whiten @ by_scale, (whiten @ r[..., None])[..., 0], at, border)
+        return Rows(product(whiten, j), product(whiten, by_scale), applied(whiten, r), at, border)
 
     def _cluster_rows(self, e: Estimate, first_clock: int, loss_scale: float) -> Rows:
         n, dof = self.n, self._dof
@@ -362,12 +365,12 @@ class Drive:
         k, whiten = self.scan[used], self.whiten[used]
         back = e.turn[k].transpose(0, 2, 1)
         by_clock = -rate[..., None] * self._part[used][:, None]
-        j, by_border = whiten @ np.concatenate([-back, -lever(seen)], axis=2), np.concatenate([back, by_clock], axis=2)
-        r = (whiten @ r[..., None])[..., 0]
+        j = product(whiten, np.concatenate([-back, -lever(seen)], axis=2))
+        by_border, r = product(whiten, np.concatenate([back, by_clock], axis=2)), applied(whiten, r)
         weight = 1.0 / np.sqrt(1.0 + np.square(r).sum(axis=1) / loss_scale**2)
         clocks = np.tile(first_clock + np.arange(len(e.clocks)), (len(k), 1))
         border = np.concatenate([n * e.which[used][:, None] + np.arange(n), clocks], axis=1)
-        j, by_border = weight[:, None, None] * j, weight[:, None, None] * (whiten @ by_border)
+        j, by_border = weight[:, None, None] * j, weight[:, None, None] * by_border
         return Rows(j, by_border, weight[:, None] * r, dof * k, border)
 
 

@@ -7,6 +7,27 @@ from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.typing import Array, Numbers
 
 
+def product(a: Array, b: Array) -> Array:
+    """The products (..., i, k) of many small matrices (..., i, j) and (..., j, k), several times as fast as ``@``."""
+    out = np.empty((*np.broadcast_shapes(a.shape[:-2], b.shape[:-2]), a.shape[-2], b.shape[-1]))
+    for i in range(a.shape[-2]):
+        for k in range(b.shape[-1]):
+            out[..., i, k] = _sum_of_products(a[..., i, :], b[..., :, k])
+    return out
+
+
+def applied(matrices: Array, vectors: Array) -> Array:
+    """The products (..., i) of many small matrices (..., i, j) and vectors (..., j), as ``product``."""
+    return product(matrices, vectors[..., None])[..., 0]
+
+
+def _sum_of_products(a: Array, b: Array) -> Array:
+    out: Array = a[..., 0] * b[..., 0]
+    for j in range(1, a.shape[-1]):
+        out += a[..., j] * b[..., j]
+    return out
+
+
 def rotation(vectors: Array) -> Array:
     """Rotation matrices (..., n, n) of rotation vectors (..., 1) or (..., 3)."""
     if vectors.shape[-1] == 3:
