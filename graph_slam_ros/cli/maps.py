@@ -49,6 +49,8 @@ def merge(args: argparse.Namespace) -> int:
     done = merged(args.a, args.b, args.out, force=args.force)
     agree = done.shared - len(done.left_out)
     console.show(*outcome.text(done.summary), f"{agree} of {done.shared} landmarks of both lay B on A")
+    if done.is_repeated:
+        console.show("the drive of B was repeated from its journal, because its visits are condensed")
     console.show(f"results in {args.out}")
     console.then(f"{console.command('freeze', args.out, '--out', 'SITE')} (a map that stays as it is)")
     moved = [

@@ -20,7 +20,9 @@ from graph_slam_ros.maps.alignment import Alignment, align, positions
 from graph_slam_ros.maps.diff import refuse_other_space, shared_landmarks
 from graph_slam_ros.measurements.edit_actions import ALL_FIELDS
 from graph_slam_ros.measurements.edits import AppliedEdit, Value
+from graph_slam_ros.runs.condensed_map import CONDENSED
 from graph_slam_ros.runs.folder import check_room
+from graph_slam_ros.runs.journal import parts_of
 from graph_slam_ros.runs.map_journal import MapGrowth, Record, extend, state_of
 from graph_slam_ros.runs.restore import config_to_go_on, record_run, restored_and_solved, stopwatch
 from graph_slam_ros.runs.whole_path import WholePath
@@ -47,6 +49,7 @@ class Merged:
     shared : landmarks that both know
     left_out : what B saw of those of them that have moved, by name in metres and standard deviations
     calibrations : sentences on parameters that are not the same in both
+    is_repeated : whether the drive of B was repeated from its journal, because its visits are condensed
     """
 
     summary: dict[str, Any]
@@ -54,6 +57,7 @@ class Merged:
     shared: int
     left_out: dict[str, tuple[float, float]]
     calibrations: list[str]
+    is_repeated: bool
 
 
 def merge(a: Path, b: Path, out: Path, *, force: bool = False) -> Merged:
@@ -83,7 +87,8 @@ def merge(a: Path, b: Path, out: Path, *, force: bool = False) -> Merged:
     _leave_out(state, first_edge, chi2, aligned.limit)
     config = config_to_go_on(one, a)
     _, summary = record_run(out, config, [Control("optimize")], losses, state, took=took, force=force)
-    return Merged(summary, summary["losses"], len(shared), left_out, list(_calibrations(one, two)))
+    differ, is_repeated = list(_calibrations(one, two)), bool(parts_of(b, CONDENSED))
+    return Merged(summary, summary["losses"], len(shared), left_out, differ, is_repeated)
 
 
 def _calibrations(one: GraphSlam, two: GraphSlam) -> Iterator[str]:

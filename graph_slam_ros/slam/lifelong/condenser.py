@@ -231,12 +231,11 @@ class Condenser:
         base, mine = self.solver.estimate([at.base, visit[k]]).tolist()
         guess = tuple(map(float, self.space.group.between(tuple(base), tuple(mine))))
         fit = fit_of(self.space, at.place, one, guess, self.limits.gate, at.strikes)
-        self.scale.add(fit.as_is, self.limits.gate)
-        result = fit.result
-        if result is None:
-            return self._composed(visit, after, around, _PLACE, fit.as_is)
-        if lonely := self._left_alone(around, result.place.members):
+        if fit.result is not None and (lonely := self._left_alone(around, fit.result.place.members)):
             return Condensed("kept", f"landmark {lonely[0]} would be left without a measurement")
+        self.scale.add(fit.as_is, self.limits.gate)
+        if (result := fit.result) is None:
+            return self._composed(visit, after, around, _PLACE, fit.as_is)
         legs = [motion_of(edge) for edge in around.steps]
         carried = self._carried(visit, around, at.base, [(guess, result.covariance)], legs)
         now = self._place_edge(at.base, result.place, square_root(result.place.information))

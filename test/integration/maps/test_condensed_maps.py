@@ -170,6 +170,7 @@ def two(tmp_path_factory):
 def test_merged_they_are_as_good_as_two_maps_of_all_keyframes(two, tmp_path, names):
     merge(two["A"], two["B"], tmp_path / "whole")
     done = merge(two[names[0]], two[names[1]], tmp_path / "both")
+    assert done.is_repeated is names[1].islower()
     true = np.array([pose[:2] for pose in hall(SEED, 1000).poses[:1000]])
     errors = [rms(positions(tmp_path / name), true) for name in ("whole", "both")]
     assert errors[1] < 1.25 * errors[0] < 0.2
