@@ -321,12 +321,12 @@ class Robot:
 
     def save_in_turn(self):
         """Save after all that came before; asked again where a busy machine has lost the answer."""
-        asked = [self.ask("save")]
+        asked = []
         for patience_s in (10.0, 20.0, 40.0):
+            asked.append(self.ask("save"))
             with contextlib.suppress(AssertionError):
                 until(lambda: any(one.done() for one in asked), self.spin, "answer of ~/save", patience_s)
                 return
-            asked.append(self.ask("save"))
         raise AssertionError("no answer of ~/save")
 
     def save_all(self, run):

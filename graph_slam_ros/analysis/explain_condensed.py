@@ -44,7 +44,7 @@ def condensed_lines(run: SavedGraph) -> Iterator[str]:
     yield f"condensed: keyframes 0 to {keyframes - 1}, into {len(places)} places of {visits} visits"
     factor = run.slam.bounded.scale.factor
     if factor > 1.0:
-        yield f"  visits to a place differ by {np.sqrt(factor):.1f} times their sigmas, which count as so much larger"
+        yield f"  visits to a place differ by {np.sqrt(factor):.1f} times their sigmas: the sigmas are scaled by that"
     if rows := list(edges_that_left(run)):
         yield f"  their edges: {became(rows)}"
 

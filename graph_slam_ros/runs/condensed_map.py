@@ -87,6 +87,8 @@ def read_condensed(graph: Graph, record: Mapping[str, Any]) -> tuple[int, Bounde
     state = BoundedState(keyframes=keyframes, sightings=sightings, frames=frames[0] if frames else 0)
     state.accepted |= {first: Counter(of) for first, of in record.get("accepted", ())}  # an older map has none
     state.scale = VisitScale(*record.get("scale", ()))  # nor this
+    if not 1.0 <= state.scale.factor < np.inf:
+        raise ValueError(f"condensed: the variances of visits count {state.scale.factor} times")
     for cell, edge, visits, strikes in record["places"]:
         state.places.setdefault(tuple(cell), []).append(place_of(graph.edge(edge), visits, dict(strikes)))
     state.old += [OldKeyframe(number, vertex, stamp, tuple(pose)) for number, vertex, stamp, pose in record["old"]]

@@ -31,8 +31,8 @@ from graph_slam_ros.slam.solution import Solution
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Index, Numbers
 
-LONGEST = 200  # keyframes of a visit
 BATCH = 200  # keyframes that leave the window together
+LONGEST = BATCH  # keyframes of a visit: so all that leave a cell together are one, and as little is cut as can be
 _PATIENCE = 200  # keyframes that are out of the window while a visit waits
 _SOURCE = "map"  # of what is counted
 _Row = tuple[int, int, Numbers]  # a keyframe's vertex, lasting id of its base or -1 - n of frame n, and pose
