@@ -205,6 +205,7 @@ def shortcomings(summary: Summary) -> Iterator[str]:
                 "metres and radians? A robot as fast as that: --set odometry.max_speed_m_s=..."
             )
     yield from _gyro_faults(summary)
+    yield from _unfit_visits(summary["counters"].get("map", {}), _MOSTLY, 1.0)
     yield from association_faults(summary.get("association", {}))
     if not sum(counts["believed"] or 0 for counts in inputs.values()):
         yield (
@@ -237,7 +238,9 @@ def doubts(summary: Summary) -> Iterator[str]:
 
     Also one where many visits of a condensed map contradict the others: what is left in the map was not better.
     """
-    yield from _contradicting_visits(summary["counters"].get("map", {}))
+    condensed = summary["counters"].get("map", {})
+    yield from _contradicting_visits(condensed)
+    yield from _unfit_visits(condensed, _DOUBTED, _MOSTLY)
     for name, counts in summary.get("inputs", {}).items():
         counted = summary["counters"].get(name, {})
         if alike := counted.get("odometry_alike", 0):
@@ -251,20 +254,27 @@ def doubts(summary: Summary) -> Iterator[str]:
 
 
 def _contradicting_visits(counted: Mapping[str, int]) -> Iterator[str]:
-    lost, unfit = counted.get("visit_lost", 0), counted.get("visit_unfit", 0)
-    visits = lost + unfit + counted.get("visit_condensed", 0)
-    doubted = lost + counted.get("visit_wider", 0)
+    doubted, visits = counted.get("visit_lost", 0) + counted.get("visit_wider", 0), _visits(counted)
     if doubted >= _FEWEST_LOST and doubted > _DOUBTED * visits:
         yield (
             f"map.condense: {doubted} of {visits} visits contradict themselves or the others, so the noise or the "
             "calibration is wrong, and the map may be much worse than with all keyframes: compare with --set "
             "map.condense=false, run graph_slam check on the recording, or keep more by map.window_keyframes"
         )
-    if unfit >= _FEWEST_LOST and unfit > _DOUBTED * visits:
+
+
+def _unfit_visits(counted: Mapping[str, int], least: float, most: float) -> Iterator[str]:
+    """Yield a sentence if the part of the visits that are no place is above the least and up to the most."""
+    unfit, visits = counted.get("visit_unfit", 0), _visits(counted)
+    if unfit >= _FEWEST_LOST and least * visits < unfit <= most * visits:
         yield (
             f"map.condense: {unfit} of {visits} visits see too few landmarks for a place, so the map has their "
             "odometry alone: --set map.condense=false keeps all"
         )
+
+
+def _visits(counted: Mapping[str, int]) -> int:
+    return sum(counted.get(name, 0) for name in ("visit_condensed", "visit_lost", "visit_unfit"))
 
 
 def checked(summary: Summary, severity: str) -> Iterator[str]:

@@ -70,7 +70,12 @@ def test_visits_that_contradict_the_others_are_said(lost, condensed, is_said):
     assert all(f"{lost} of {lost + condensed} visits" in one and "map.condense=false" in one for one in said)
 
 
-def test_visits_that_see_too_little_are_said_as_such():
-    (said,) = doubts(summary({"map": {"visit_unfit": 35, "visit_condensed": 2}}))
-    assert said.startswith("map.condense: 35 of 37 visits see too few landmarks")
-    assert "contradict" not in said
+@pytest.mark.parametrize(
+    ("unfit", "condensed", "where"), [(1, 0, None), (1, 2, None), (2, 8, doubts), (35, 2, shortcomings)]
+)
+def test_visits_that_see_too_little_are_said_as_such_and_most_of_them_are_a_shortcoming(unfit, condensed, where):
+    of = summary({"map": {"visit_unfit": unfit, "visit_condensed": condensed}})
+    for found in (doubts, shortcomings):
+        said = [one for one in found(of) if "map.condense" in one]
+        assert len(said) == (found is where)
+        assert all(f"{unfit} of {unfit + condensed} visits see too few landmarks" in one for one in said)
