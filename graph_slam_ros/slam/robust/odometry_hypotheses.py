@@ -26,6 +26,8 @@ _LOG_ODDS_MOVED = float(np.log(1e-2))  # of a robot that was moved, relative to 
 _LEAST_FITTING = 0.6  # part of what was seen since then that a slip must explain
 _ROUNDING = 1e-6  # of a cost
 _CAP = 0.9999  # an observation beyond this quantile does not fit
+_LINEAR_RAD = 0.1  # by which an observation turns the pose: beyond, it is linearised again
+_MOST_LINEARIZATIONS = 5
 
 Prior = Callable[[Sequence[int]], tuple[Array, Array]]
 
@@ -136,6 +138,7 @@ class OdometryFilter:
 
     def __init__(self, space: Geometry, graph: Graph, prior: Prior, stretch: Stretch) -> None:
         self._space, self._stretch = space, stretch
+        self._turns = slice(space.dimensions, space.dof)  # of errors of the newest pose
         links = [graph.edge(link) for link in stretch.links]
         chain = {vertex for link in links for vertex in link.vertices}
         first = links[0].vertices[0]
@@ -264,30 +267,49 @@ class OdometryFilter:
         state.x[: space.pose.size] = pose
 
     def _observe(self, state: _State, one: _Seen) -> None:
-        """Add an observation. The state follows it if it fits."""
-        residuals, jacobians = one.type.linearize(state.x, one.at, one.measured)
-        residual, jacobian = residuals[0], jacobians[0]
-        gain = jacobian @ state.covariance[one.columns]
-        factor, failed = dpotrf(gain[:, one.columns] @ jacobian.T + one.noise, lower=True)
-        if failed:
-            raise np.linalg.LinAlgError("the covariance of an innovation is not positive definite")
-        white = dtrtrs(factor, residual, lower=True)[0]
+        """Add an observation. The state follows it if it fits.
+
+        Where it turns the pose far, it is linearised again at the state to which it leads (an iterated filter).
+        """
+        x, step, tangent, turns = state.x, np.zeros(len(state.covariance)), None, self._turns
+        for _ in range(_MOST_LINEARIZATIONS):
+            residuals, jacobians = one.type.linearize(x, one.at, one.measured)
+            residual, jacobian = residuals[0], jacobians[0]
+            if tangent is not None:
+                pose, jacobian = one.columns < len(tangent), jacobian.copy()
+                jacobian[:, pose] = jacobian[:, pose] @ tangent
+                residual = residual - jacobian @ step[one.columns]
+            gain = jacobian @ state.covariance[one.columns]
+            factor, failed = dpotrf(gain[:, one.columns] @ jacobian.T + one.noise, lower=True)
+            if failed:
+                raise np.linalg.LinAlgError("the covariance of an innovation is not positive definite")
+            white = dtrtrs(factor, residual, lower=True)[0]
+            gain, before = dtrtrs(factor, gain, lower=True)[0], step
+            step = -white @ gain
+            if np.abs(step[turns] - before[turns]).max() <= _LINEAR_RAD:
+                break
+            x = self._stepped(state.x, step)
+            tangent = self._space.group.right_jacobian(tuple(step[: self._space.dof].tolist()))
         statistic = float(white @ white) / self._stretch.noise_factor**2
         if statistic > one.cap:
             state.cost += one.cap
             state.unfit += 1
             return
-        gain = dtrtrs(factor, gain, lower=True)[0]
-        self._correct(state, -white @ gain)
+        state.x, state.shared = self._stepped(state.x, step), state.shared + float(step[self._space.dof])
         state.covariance -= gain.T @ gain
+        if tangent is not None:  # of the pose that it leads to
+            dof, covariance = len(tangent), state.covariance
+            covariance[:dof] = tangent @ covariance[:dof]
+            covariance[:, :dof] = covariance[:, :dof] @ tangent.T
         state.cost += statistic + 2.0 * (log(factor.diagonal().prod()) + one.log_root)
 
-    def _correct(self, state: _State, step: Array) -> None:
-        x, space = state.x, self._space
-        state.shared += float(step[space.dof])
-        x[: space.pose.size] = space.pose.retract(x[None, : space.pose.size], step[None, : space.dof])[0]
+    def _stepped(self, x: Array, step: Array) -> Array:
+        """The values after a step (D,) of errors."""
+        out, pose = x.copy(), self._space.pose
+        out[: pose.size] = pose.retract(x[None, : pose.size], step[None, : self._space.dof])[0]
         for kind, stored, columns in self._kinds:
-            x[stored] = kind.retract(x[stored], step[columns])
+            out[stored] = kind.retract(x[stored], step[columns])
+        return out
 
 
 def _noises(edges: Sequence[Edge]) -> list[tuple[Array, float]]:

@@ -156,6 +156,12 @@ def test_clean_drives_of_ten_minutes_have_no_slip(seed):
     assert slam.counters[SLIP] == 0
 
 
+def test_turns_that_are_as_wrong_as_odometry_says_are_no_slip():
+    """Steps of 2 s whose turn has a sigma of 20 degrees: what is seen at 15 m is not linear in such a turn."""
+    recording = simulate("pythonrobotics", seed=5023, poses=40)
+    assert driven(recording).counters[SLIP] == 0
+
+
 def test_a_burst_of_wrong_identities_and_a_moved_landmark_are_no_slip():
     recording = world(2)
     moved, _ = faulty_recording(recording, [Fault.named("moved_landmarks", at=0.6, distance_m=0.7)], seed=2)
