@@ -5,7 +5,7 @@ The record ``condensed`` of a ``growth`` (``map_journal``) has
 * ``first``: the number of the first keyframe that was not condensed;
 * ``vertices``, ``edges``: the lasting ids of the first rows, and that of the row after these;
 * ``old``: number, vertex, stamp and ``T_odom_base`` of each keyframe before the first that is in the graph;
-* ``places``: cell, edge, visits, and the strikes against its landmarks, by vertex, of each place;
+* ``places``: cell, edge, visits, the strikes against its landmarks, by vertex, and ``at``, of each place;
 * ``left``: how many keyframes, poses at which something was seen, and frames have left the map;
 * ``accepted``: of each drive, by its first keyframe, how many accepted measurements of each input have left the map.
 
@@ -52,7 +52,7 @@ def condensed_record(graph: Graph, first: int, state: BoundedState) -> Record:
     """Return the part of a map besides its graph."""
     ids = ([*of.early.tolist(), of.later] for of in (graph.vertex_ids, graph.edge_ids))
     places = [
-        [list(cell), one.edge, one.place.visits, [list(pair) for pair in one.strikes.items()]]
+        [list(cell), one.edge, one.place.visits, [list(pair) for pair in one.strikes.items()], one.place.at.tolist()]
         for cell, several in state.places.items()
         for one in several
     ]
@@ -89,8 +89,10 @@ def read_condensed(graph: Graph, record: Mapping[str, Any]) -> tuple[int, Bounde
     state.scale = VisitScale(*record.get("scale", ()))  # nor this
     if not 1.0 <= state.scale.factor < np.inf:
         raise ValueError(f"condensed: the variances of visits count {state.scale.factor} times")
-    for cell, edge, visits, strikes in record["places"]:
-        state.places.setdefault(tuple(cell), []).append(place_of(graph.edge(edge), visits, dict(strikes)))
+    for cell, number, visits, strikes, *at in record["places"]:
+        edge = graph.edge(number)
+        where = np.array(at[0]).reshape(len(edge.vertices) - 1, -1) if at else None  # an older map has none
+        state.places.setdefault(tuple(cell), []).append(place_of(edge, where, visits, dict(strikes)))
     state.old += [OldKeyframe(number, vertex, stamp, tuple(pose)) for number, vertex, stamp, pose in record["old"]]
     known = [one.vertex for one in state.old]
     if known and not 0 <= min(known) <= max(known) < graph.vertex_count:

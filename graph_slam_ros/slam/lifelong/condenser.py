@@ -22,7 +22,7 @@ from graph_slam_ros.slam.lifelong.elimination import product, square_root
 from graph_slam_ros.slam.lifelong.fit import VisitScale, fit_of
 from graph_slam_ros.slam.lifelong.place import Fused, Place, fewest_shared
 from graph_slam_ros.slam.lifelong.surroundings import CLOSURES, Motion, Surroundings, chained, motion_of, surroundings
-from graph_slam_ros.slam.lifelong.visit import Visit, visit_of
+from graph_slam_ros.slam.lifelong.visit import Visit, best_known, visit_of
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Numbers
 
@@ -69,11 +69,12 @@ class PlaceEdge:
     strikes: dict[int, int] = field(default_factory=dict)
 
 
-def place_of(edge: Edge, visits: int, strikes: Mapping[int, int] | None = None) -> PlaceEdge:
-    """Return the place of an edge; the edge has all of its numbers."""
+def place_of(edge: Edge, at: Array | None, visits: int, strikes: Mapping[int, int] | None = None) -> PlaceEdge:
+    """Return the place of an edge, which has all of its numbers but ``at`` (by default as those)."""
     base, *members = edge.vertices
     information = product(edge.sqrt_information.T, edge.sqrt_information)
-    place = Place(tuple(members), edge.measured.reshape(len(members), -1), information, visits)
+    points = edge.measured.reshape(len(members), -1)
+    place = Place(tuple(members), points, points if at is None else at, information, visits)
     return PlaceEdge(base, place, edge.id, dict(strikes or {}))
 
 
@@ -151,15 +152,16 @@ class Condenser:
         if not (is_again or has_room):
             return self._composed(visit, after, around, "it sees too few landmarks, or the cell is full")
         try:
-            base = visit[len(visit) // 2]
-            factors = around.local if is_again else around.local | _halved(around)
-            one = visit_of(self.space, self.solver.graph, self.solver.estimate, visit, base, factors)
+            factors, at = around.local if is_again else around.local | _halved(around), len(visit) // 2
+            if not is_again:
+                at = best_known(self.space, self.solver.graph, self.solver.estimate, visit, factors)
+            one = visit_of(self.space, self.solver.graph, self.solver.estimate, visit, visit[at], factors)
             if one.degrees > 0 and one.chi2 > quantile(self.limits.gate, one.degrees):
                 return self._composed(visit, after, around, _ITSELF)
             one = replace(one, information=one.information / self.scale.factor)
             if is_again and best is not None:
                 return self._again(visit, after, around, one, best)
-            return self._first(visit, after, around, one, cell)
+            return self._first(visit, at, after, around, one, cell)
         except SingularError as error:
             return self._composed(visit, after, around, str(error))
 
@@ -183,13 +185,15 @@ class Condenser:
 
     # -- what becomes of a visit -------------------------------------------------------------------------------------
 
-    def _first(self, visit: Sequence[int], after: int, around: Surroundings, one: Visit, cell: Cell) -> Condensed:
+    def _first(
+        self, visit: Sequence[int], at: int, after: int, around: Surroundings, one: Visit, cell: Cell
+    ) -> Condensed:
         """Begin a place: a part of the odometry is in its edge, the rest joins its base to what is around it."""
-        base = visit[len(visit) // 2]
+        base = visit[at]
         if lonely := self._left_alone(around, one.members):
             return Condensed("kept", f"landmark {lonely[0]} would be left without a measurement")
         root = square_root(one.information)
-        added, also = self._joined(visit, after, around, 1.0 - _SHARE)
+        added, also = self._joined(visit, at, after, around, 1.0 - _SHARE)
         begun = self._place_edge(base, Place.begun_by(one), root)
         self.places.setdefault(cell, []).append(begun)
         removed = self._replace(visit, around, [*added, begun.edge], kept=base, seen_from=base, also=also)
@@ -200,13 +204,13 @@ class Condenser:
         base = visit[len(visit) // 2]
         if lonely := self._left_alone(around, ()):
             return Condensed("kept", f"{why}; landmark {lonely[0]} would be left without a measurement")
-        added, also = self._joined(visit, after, around, 1.0)
+        added, also = self._joined(visit, len(visit) // 2, after, around, 1.0)
         return Condensed("alone", why, removed=self._replace(visit, around, added, base, base, also))
 
     def _joined(
-        self, visit: Sequence[int], after: int, around: Surroundings, share: float
+        self, visit: Sequence[int], k: int, after: int, around: Surroundings, share: float
     ) -> tuple[list[int], list[int]]:
-        """Join the middle keyframe to what is around it, and carry closures and fixes to it.
+        """Join keyframe ``k`` of the visit to what is around it, and carry closures and fixes to it.
 
         Parameters
         ----------
@@ -216,7 +220,6 @@ class Condenser:
         -------
         The new edges, and those that they replace.
         """
-        k = len(visit) // 2
         legs = [motion_of(edge, share * around.factors[edge.id]) for edge in around.steps]
         carried = self._carried(visit, around, visit[k], [], [motion_of(edge) for edge in around.steps])
         onward = [motion_of(edge) for edge in around.onward.values()]
@@ -345,7 +348,7 @@ class Condenser:
         kind = place_edge(self.space.pose, len(place.members))
         at = [base, *place.members]
         edge = self.solver.graph.add_edge(kind, at, place.points.ravel(), Gaussian(root), LABEL)
-        return place_of(self.solver.graph.edge(edge), place.visits)
+        return place_of(self.solver.graph.edge(edge), place.at, place.visits)
 
     def _replace(
         self,

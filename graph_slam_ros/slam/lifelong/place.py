@@ -22,18 +22,21 @@ class Place:
     ----------
     members : vertices of the landmarks, ascending
     points : (m, d) their positions in the axes of the pose [m]; information : (m d, m d) of these, given the pose
+    at : (m, d) the same by the whole map when each became a member. Motions of the whole are linearised there for ever:
+        else visits would say how the place is turned, which none of them knows
     visits : how many are in it
     """
 
     members: tuple[int, ...]
     points: Array
+    at: Array
     information: Array
     visits: int = 1
 
     @classmethod
     def begun_by(cls, visit: Visit) -> "Place":
         """Return the place that one visit knows, seen from the pose that the visit is seen from."""
-        return cls(visit.members, visit.points, visit.information)
+        return cls(visit.members, visit.points, visit.at, visit.information)
 
     def shared(self, visit: Visit) -> list[int]:
         """Return the members that a visit saw, too."""
@@ -43,9 +46,8 @@ class Place:
         """Return the place after one of its landmarks was marginalised out."""
         kept = [k for k, one in enumerate(self.members) if one != member]
         information = marginal_information(self.information, _numbers(kept, self.points.shape[1]))
-        return replace(
-            self, members=tuple(self.members[k] for k in kept), points=self.points[kept], information=information
-        )
+        members = tuple(self.members[k] for k in kept)
+        return replace(self, members=members, points=self.points[kept], at=self.at[kept], information=information)
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +70,7 @@ class Fused:
 def visit_without(visit: Visit, member: int) -> Visit:
     """Return a visit after one of its landmarks was marginalised out."""
     rest = Place.begun_by(visit).without(member)
-    return replace(visit, members=rest.members, points=rest.points, information=rest.information)
+    return replace(visit, members=rest.members, points=rest.points, at=rest.at, information=rest.information)
 
 
 def fewest_shared(space: Geometry) -> int:
@@ -80,7 +82,7 @@ def fused(space: Geometry, place: Place, visit: Visit, T_place_visit: Numbers) -
     """Add a visit to a place.
 
     The pose that the visit is seen from is freed, so that it says nothing of where the place is seen from. Before, the
-    visit is laid on the place's own numbers by the motion that fits the shared landmarks best.
+    visit is laid on the place by the motion that fits the shared landmarks best, as the whole map has both.
 
     Parameters
     ----------
@@ -96,15 +98,14 @@ def fused(space: Geometry, place: Place, visit: Visit, T_place_visit: Numbers) -
         raise SingularError(f"the visit shares {len(shared)} landmarks with the place")
     at_place, at_visit = _places(place.members, shared), _places(visit.members, shared)
     weight = marginal_information(visit.information, _numbers(at_visit, size))
-    turn, shift, resists = _motion(place.points[at_place], visit.points[at_visit], weight, space, T_place_visit)
-    there = product(visit.points - shift, turn)  # R' (p - t)
+    turn, shift, resists = _motion(place.at[at_place], visit.at[at_visit], weight, space, T_place_visit)
+    there, where = product(visit.points - shift, turn), product(visit.at - shift, turn)  # R' (p - t)
     blocks = visit.information.reshape(len(there), size, len(there), size)
     turned = np.einsum("ba,ibjc,cd->iajd", turn, blocks, turn, optimize=False).reshape(visit.information.shape)
-    where = there.copy()
-    where[at_visit] = place.points[at_place]
+    where[at_visit] = place.at[at_place]
     shape = without(0.5 * (turned + turned.T), rigid_motions(where))
     degrees = size * len(shared) - rigid_motions(where).shape[1]
-    fusion, statistic = _sum(place, visit.members, there, shape)
+    fusion, statistic = _sum(place, replace(visit, points=there, at=where, information=shape))
     # The place knows its landmarks no worse than one visit does: twice the covariance by the visit alone.
     return Fused(fusion, statistic, max(degrees, 0), np.asarray(2.0 * np.linalg.inv(resists)))
 
@@ -125,13 +126,14 @@ def rigid_motions(points: Array) -> Array:
     return out.reshape(m * size, -1)
 
 
-def _sum(place: Place, members: Sequence[int], points: Array, information: Array) -> tuple[Place, float]:
-    """Add information on some landmarks, in the axes of the place, to what the place has; returns chi2, too."""
-    size = points.shape[1]
+def _sum(place: Place, visit: Visit) -> tuple[Place, float]:
+    """Add a visit in the axes of the place to what the place has; returns chi2, too."""
+    members, points, information, size = visit.members, visit.points, visit.information, visit.points.shape[1]
     all_members = sorted({*place.members, *members})
     mine, new = _places(all_members, place.members), _places(all_members, members)
-    before = np.zeros((len(all_members), size))
+    before, at = np.zeros((2, len(all_members), size))
     before[new], before[mine] = points, place.points
+    at[new], at[mine] = visit.at, place.at
     mine_at, new_at = _numbers(mine, size), _numbers(new, size)
     whole = np.zeros((before.size, before.size))
     whole[np.ix_(mine_at, mine_at)] += place.information
@@ -142,7 +144,7 @@ def _sum(place: Place, members: Sequence[int], points: Array, information: Array
     after = before + step.reshape(before.shape)
     statistic = quadratic(place.information, (after[mine] - place.points).ravel())
     statistic += quadratic(information, (after[new] - points).ravel())
-    return Place(tuple(all_members), after, whole, place.visits + 1), statistic
+    return Place(tuple(all_members), after, at, whole, place.visits + 1), statistic
 
 
 def _motion(

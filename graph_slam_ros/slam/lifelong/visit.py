@@ -14,6 +14,7 @@ from graph_slam_ros.solver import Settings, Solver
 from graph_slam_ros.typing import Array
 
 _SETTINGS = replace(Settings(), step_tolerance=1e-10, cost_tolerance=0.0)
+_ONE_STEP = replace(Settings(), max_iterations=1, cost_tolerance=np.inf)
 _LEAST = 1e-6  # eigenvalue of the correlations of a landmark's position, given the poses: less is no position
 Estimate = Callable[[ArrayLike], Array]
 
@@ -26,12 +27,14 @@ class Visit:
     ----------
     members : vertices of the landmarks, ascending
     points : (m, d) their positions in the axes of one pose of the visit [m]
+    at : (m, d) the same by the whole map: the edges are linearised there
     information : (m d, m d) of these, given that pose; all other poses are marginalised out
     chi2, degrees : of the edges at their own optimum
     """
 
     members: tuple[int, ...]
     points: Array
+    at: Array
     information: Array
     chi2: float
     degrees: int
@@ -42,12 +45,13 @@ def visit_of(
 ) -> Visit:
     """Return what some edges say of the landmarks on them, in the axes of one pose.
 
-    They are brought to their own optimum: no other edge has a say in it. Landmarks whose position these edges alone do
-    not determine are left out, with their sightings.
+    No other edge has a say in it, but they are linearised at the estimate of the whole map: there the visit is compared
+    with others. At its own optimum landmarks may be far from there, where only odometry joins them. Landmarks whose
+    position these edges alone do not determine are left out, with their sightings.
 
     Parameters
     ----------
-    estimate : stored numbers of vertices: where the optimum is looked for
+    estimate : stored numbers of vertices by the whole map
     poses : vertices of the visit; base : one of them
     edges : between these and landmarks, with the factor by which each counts, above 0
 
@@ -68,22 +72,49 @@ def visit_of(
         solver = Solver(local, _SETTINGS)
         solver.add(range(local.vertex_count), range(local.edge_count))
         solver.hold(at[base])
-        size = space.dimensions
+        size, information = space.dimensions, solver.information_matrix()
         whole = {ends[edge][1] for edge in inside if records[edge].type.residual_size >= size}
         if not whole.issuperset(marks):
-            information = solver.information_matrix()
             blocks = [len(information) - size * (len(marks) - k) for k in range(len(marks))]
             sure = [_is_sure(information[low : low + size, low : low + size]) for low in blocks]
             if not all(sure):
                 marks = [mark for mark, is_sure in zip(marks, sure, strict=True) if is_sure]
                 continue
-        report = solver.optimize()
-        information = solver.information_matrix()
         kept = np.arange(len(information) - size * len(marks), len(information))
-        points = solver.estimate([at[mark] for mark in marks])
         marginal = marginal_information(information, kept)
-        return Visit(tuple(marks), points, marginal, report.chi2_final, solver.degrees_of_freedom)
+        numbers = [at[mark] for mark in marks]
+        there = solver.estimate(numbers)
+        solver.optimize(_ONE_STEP)
+        points = solver.estimate(numbers)
+        chi2 = solver.optimize().chi2_final
+        return Visit(tuple(marks), points, there, marginal, chi2, solver.degrees_of_freedom)
     raise SingularError("the visit determines no landmark")
+
+
+def best_known(
+    space: Geometry, graph: Graph, estimate: Estimate, poses: Sequence[int], edges: Mapping[int, float]
+) -> int:
+    """Return which pose of a visit, counted from 0, the landmarks that it sees determine best.
+
+    Parameters are those of ``visit_of``.
+
+    Raises
+    ------
+    SingularError
+        They do not determine them.
+    """
+    records = [(graph.edge(edge), edges[edge]) for edge in sorted(edges)]
+    marks = sorted({v for edge, _ in records for v in edge.vertices} - set(poses))
+    if not marks:
+        raise SingularError("the visit sees no landmark")
+    local, _ = _local_graph(space, estimate, [*poses, *marks], len(marks), records)
+    solver = Solver(local, _SETTINGS)
+    solver.add(range(local.vertex_count), range(local.edge_count))
+    for mark in range(len(poses), local.vertex_count):
+        solver.hold(mark)
+    solver.update()
+    spreads = [np.linalg.slogdet(one)[1] for one in solver.marginal(range(len(poses)))]
+    return int(np.argmin(spreads))
 
 
 def _is_sure(information: Array) -> bool:

@@ -10,7 +10,7 @@ from graph_slam_ros.graph import Gaussian
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
 from graph_slam_ros.slam.lifelong.condenser import LABEL
 
-KEYFRAMES, WINDOW = 700, 40
+KEYFRAMES, WINDOW, SEEDS = 700, 40, range(4)
 
 
 def driven(world, window=0, until=None):
@@ -26,28 +26,44 @@ def both(request):
     return driven(world), driven(world, WINDOW)
 
 
-def test_visits_leave_the_problem_and_the_map_stays_as_good(both):
+def test_visits_leave_the_problem(both):
     whole, bounded = both
     assert bounded.ends["first"] > 5 and bounded.ends["again"] > 5
     assert not bounded.ends.get("kept")
     assert len(bounded.solver.vertices) < WINDOW + 60 + 2 * len(bounded.marks) < 0.5 * len(whole.solver.vertices)
     assert len(bounded.solver.edges) < 0.5 * len(whole.solver.edges)
-    true = np.array([pose[: bounded.world.space.dimensions] for pose in bounded.world.poses])
     assert len(bounded.path()) == KEYFRAMES
-    in_plane = bounded.world.space is PLANAR  # docs/lifelong.md has the limits, in space, too
-    assert rms(bounded.path(), true) < (1.25 if in_plane else 1.5) * rms(whole.path(), true)
-    assert rms(*bounded.landmarks()) < (1.15 if in_plane else 1.5) * rms(*whole.landmarks())
 
 
-def test_it_is_hardly_ever_surer_than_with_all_keyframes(both):
-    marks = sorted(both[0].marks)
-    ids = [[robot.vertices[KEYFRAMES - 1], *(robot.marks[mark] for mark in marks)] for robot in both]
-    all_known, condensed = (robot.solver.joint_marginal(at) for robot, at in zip(both, ids, strict=True))
+@pytest.mark.parametrize("space", [PLANAR, SPATIAL], ids=["plane", "space"])
+def test_the_map_stays_as_good_and_is_hardly_surer_than_with_all_keyframes(space):
+    ratios = np.array([compared(seed, space) for seed in SEEDS])
+    path, landmarks, least, most = np.exp(np.log(ratios).mean(axis=0))  # docs/lifelong.md has these figures
+    in_plane = space is PLANAR
+    assert path < (1.15 if in_plane else 1.25)
+    assert landmarks < (1.15 if in_plane else 1.2)
+    assert least > (0.8 if in_plane else 0.5)
+    assert most < (4.0 if in_plane else 8.0)
+
+
+def compared(seed, space):
+    """Errors of path and landmarks, least and largest variance of any direction, over those with all keyframes."""
+    world = hall(seed, KEYFRAMES, space)
+    whole, bounded = driven(world), driven(world, WINDOW)
+    true = np.array([pose[: space.dimensions] for pose in world.poses])
+    marks = sorted(whole.marks)
+    ids = [[robot.vertices[KEYFRAMES - 1], *(robot.marks[mark] for mark in marks)] for robot in (whole, bounded)]
+    all_known, condensed = (robot.solver.joint_marginal(at) for robot, at in zip((whole, bounded), ids, strict=True))
     root = np.linalg.inv(np.linalg.cholesky(all_known))
-    ratios = np.linalg.eigvalsh(root @ condensed @ root.T)
-    in_plane = both[0].world.space is PLANAR
-    assert ratios[0] > (0.8 if in_plane else 0.5)
-    assert ratios[-1] < (4.0 if in_plane else 8.0)
+    variances = np.linalg.eigvalsh(root @ condensed @ root.T)
+    path, landmarks = (
+        rms(*one) / rms(*other)
+        for one, other in (
+            ((bounded.path(), true), (whole.path(), true)),
+            (bounded.landmarks(), whole.landmarks()),
+        )
+    )
+    return path, landmarks, variances[0], variances[-1]
 
 
 def test_later_visits_agree_with_those_before(both):

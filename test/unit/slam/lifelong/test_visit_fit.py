@@ -29,7 +29,7 @@ class Visits:
         """One with so many times the errors that it states."""
         errors = noise * SIGMA_M * self.rng.standard_normal(self.points.shape)
         information = np.eye(self.points.size) / SIGMA_M**2
-        return Visit(tuple(range(len(self.points))), self.points + errors, information, 0.0, 0)
+        return Visit(tuple(range(len(self.points))), self.points + errors, self.points, information, 0.0, 0)
 
     def fit(self, place, visit):
         return fit_of(self.space, place, visit, self.space.identity, GATE, {})

@@ -11,7 +11,7 @@ from graph_slam_ros.graph import Gaussian, Graph
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
 from graph_slam_ros.slam.lifelong.elimination import marginal_information, square_root, without
 from graph_slam_ros.slam.lifelong.place import Place, fused, rigid_motions, visit_without
-from graph_slam_ros.slam.lifelong.visit import visit_of
+from graph_slam_ros.slam.lifelong.visit import best_known, visit_of
 from graph_slam_ros.solver import Settings, Solver
 
 POSES, SIGMA_ODOMETRY, SIGMA_SIGHTING = 5, 0.02, 0.05
@@ -26,8 +26,9 @@ def space(request):
 class World:
     """Landmarks, and visits that see some of them: in one graph, where the visits are joined by landmarks alone."""
 
-    def __init__(self, space, noise, seed=0, landmarks=6):
+    def __init__(self, space, noise, seed=0, landmarks=6, sigma_odometry=SIGMA_ODOMETRY):
         self.space, self.noise, self.rng = space, noise, np.random.default_rng(seed)
+        self.sigma_odometry = sigma_odometry
         self.points = 4.0 * self.rng.standard_normal((landmarks, space.dimensions))
         self.graph = Graph()
         self.marks = self.graph.add_vertices(space.point, self.points).tolist()
@@ -38,7 +39,7 @@ class World:
         space, group, rng = self.space, self.space.group, self.rng
         pose = group.exp(tuple(rng.standard_normal(space.dof)))
         step = group.exp((0.5, *[0.05] * (space.dof - 2), 0.3))
-        sigmas = space.sigmas(SIGMA_ODOMETRY, SIGMA_ODOMETRY)
+        sigmas = space.sigmas(self.sigma_odometry, self.sigma_odometry)
         poses, edges = [], []
         for k in range(POSES):
             poses.append(self.graph.add_vertex(space.pose, np.array(pose)))
@@ -177,6 +178,41 @@ def test_the_motion_is_found_from_a_poor_guess(space):
     off = group.compose(right, group.exp((0.5, *[-0.2] * (space.dof - 2), 0.3)))
     one, other = (fused(space, place, visit, guess).place for guess in (right, off))
     assert one.points == pytest.approx(other.points, abs=1e-9)
+
+
+def test_visits_whose_odometry_is_weak_agree_in_either_order(space):
+    statistics, degrees = np.zeros(2), 0
+    for seed in range(24):
+        world = World(space, noise=1.0, seed=seed, landmarks=8, sigma_odometry=0.4)
+        several = []
+        for number in (world.visit(range(8)), world.visit(range(8))):
+            factors = {}
+            for edge in world.edges[number]:
+                first, last = world.graph.edge(edge).vertices
+                is_early = world.poses[number].index(first) < 3
+                if last not in world.marks or is_early == (last < world.marks[4]):
+                    factors[edge] = 1.0  # odometry alone says how half of the landmarks lie to the others
+            poses, base = world.poses[number], world.base(number)
+            several.append((visit_of(space, world.graph, world.estimate, poses, base, factors), base))
+        for k, ((first, base), (second, other)) in enumerate((several, several[::-1])):
+            guess = space.group.between(*map(tuple, world.estimate([base, other])))
+            done = fused(space, Place.begun_by(first), second, guess)
+            statistics[k] += done.statistic
+        degrees += done.degrees
+    assert statistics[0] == pytest.approx(statistics[1])
+    assert quantile(1e-4, degrees) < statistics[0] < quantile(1 - 1e-4, degrees)
+
+
+def test_the_pose_that_landmarks_determine_best_sees_them(space):
+    world = World(space, noise=1.0)
+    number = world.visit(range(6))
+    seeing = world.poses[number][3]
+    edges = {edge: world.graph.edge(edge).vertices for edge in world.edges[number]}
+    factors = {edge: 1.0 for edge, (first, last) in edges.items() if last not in world.marks or first == seeing}
+    assert best_known(space, world.graph, world.estimate, world.poses[number], factors) == 3
+    nothing = {edge: 1.0 for edge, (_, last) in edges.items() if last not in world.marks}
+    with pytest.raises(SingularError):
+        best_known(space, world.graph, world.estimate, world.poses[number], nothing)
 
 
 def test_half_of_each_measurement_and_the_other_half_are_the_whole(space):
