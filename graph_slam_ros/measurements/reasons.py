@@ -333,7 +333,12 @@ REASONS: dict[str, Reason] = {
     "visit_unfit": Reason(
         _NOTED, "a visit that sees too few landmarks for a place: its odometry alone is kept", "map.condense=false"
     ),
-    "not_condensed": Reason(_NOTED, "a keyframe that stays: it has a pose or a range with offset, or is held"),
+    "not_condensed": Reason(
+        _NOTED, "a keyframe that stays: it sees a landmark with orientation, or a range with offset"
+    ),
+    "held_keyframe": Reason(
+        _NOTED, "a keyframe that stays: it is of a frozen map, or of one that the robot is located in"
+    ),
     "cleared": Reason(_NOTED, "loop closures that ~/clear_closures took out"),
     "displaced": Reason(
         _NOTED,

@@ -238,6 +238,8 @@ def _faults(facts: Facts, config: Config) -> Iterator[str]:
         yield estimate.displaced
     if estimate and estimate.association:
         yield estimate.association
+    if estimate and estimate.visits:
+        yield estimate.visits
     if estimate and estimate.motion:
         yield estimate.motion
     if estimate and estimate.rivals:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from graph_slam_ros.graph.geometry import Geometry
-from graph_slam_ros.runs.outcome import association_faults
+from graph_slam_ros.runs.outcome import VISITS, association_faults, visit_faults
 from graph_slam_ros.slam import GraphSlam
 from graph_slam_ros.slam.solution import Correction
 from graph_slam_ros.slam.weak_direction import WeakDirection, position_covariance, weakest_position, weakest_turn
@@ -90,6 +90,7 @@ class Estimate:
     rivals : loop closures of other explanations that could not be ruled out
     displaced : that the landmarks say that the robot is elsewhere than odometry; empty where they do not
     association : why the association of sightings without identity is not to be believed; empty if it is
+    visits : why a condensed map is worse, or larger, than it should be; empty if it is not
     motion : why the gyro, or an odometry, has no part in the motion; empty where all have
     gyro : its state and its bias; empty where no input is one
     calibration : settings that calibration has corrected, and a sentence for each parameter that it has fitted
@@ -116,6 +117,7 @@ class Estimate:
     weakest_landmark: str = ""
     displaced: str = ""
     association: str = ""
+    visits: str = ""
     motion: str = ""
     gyro: str = ""
     is_resumed: bool = False
@@ -174,6 +176,7 @@ class Estimate:
             rivals=sum(len(rival.only_here) for rival in slam.backend.rivals),
             displaced=str(slam.displaced or ""),
             association="; ".join(association_faults(slam.association_report)),
+            visits="; ".join(visit_faults({name: slam.counters["map", name] for name in VISITS})),
             motion="; ".join(filter(None, (slam.gyro.fault if slam.gyro else "", slam.backend.odometries.doubted))),
             gyro=str(slam.gyro or ""),
             is_resumed=is_resumed,

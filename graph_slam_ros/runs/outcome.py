@@ -22,6 +22,7 @@ _MOSTLY = 0.5
 _MOTION = ("odometry", "gyro")  # uses whose measurements nobody doubts one by one
 _DOUBTED = 0.05  # of an input: as many that are not believed are said; so it is of visits to places
 _FEWEST_LOST = 2  # visits that are lost, which are said
+VISITS = ("visit_condensed", "visit_lost", "visit_wider", "visit_unfit", "not_condensed")  # in the counters of "map"
 _MENDED = (  # of what is noted, signs of a wrong setting
     *("displaced", "displacement_taken_back", "jump"),
     *("not_in_use", "turn_slips", "gyro_silent", "gyro_doubted", "odometry_contradicted", "odometry_alike"),
@@ -238,9 +239,7 @@ def doubts(summary: Summary) -> Iterator[str]:
 
     Also one where many visits of a condensed map contradict the others: what is left in the map was not better.
     """
-    condensed = summary["counters"].get("map", {})
-    yield from _contradicting_visits(condensed)
-    yield from _unfit_visits(condensed, _DOUBTED, _MOSTLY)
+    yield from _doubtful_visits(summary["counters"].get("map", {}), _MOSTLY)
     for name, counts in summary.get("inputs", {}).items():
         counted = summary["counters"].get(name, {})
         if alike := counted.get("odometry_alike", 0):
@@ -251,6 +250,27 @@ def doubts(summary: Summary) -> Iterator[str]:
         if _MOSTLY <= accepted < 1.0 - _DOUBTED:
             part, hint = 100.0 * (1.0 - accepted), _CONTRADICT.format(name)
             yield f"{name}: {part:.0f} % of {counts['used']} are not believed: {hint}"
+
+
+def visit_faults(counted: Mapping[str, int]) -> Iterator[str]:
+    """Yield why a condensed map is worse, or larger, than it should be; empty if it is not.
+
+    Parameters
+    ----------
+    counted : how often visits ended how, by the names of ``VISITS``
+    """
+    yield from _doubtful_visits(counted, 1.0)
+
+
+def _doubtful_visits(counted: Mapping[str, int], most: float) -> Iterator[str]:
+    yield from _contradicting_visits(counted)
+    yield from _unfit_visits(counted, _DOUBTED, most)
+    kept, visits = counted.get("not_condensed", 0), _visits(counted)
+    if kept > max(visits, _FEWEST_LOST):
+        yield (
+            f"map.condense: {kept} keyframes are not condensed ({visits} visits are): they see landmarks with "
+            "orientation, or ranges with an offset, so the map still grows with the distance"
+        )
 
 
 def _contradicting_visits(counted: Mapping[str, int]) -> Iterator[str]:

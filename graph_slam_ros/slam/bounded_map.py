@@ -129,7 +129,8 @@ class BoundedMap:
                 break
             if end == k:  # it has an edge that cannot be condensed
                 rows.append(self._own(int(ids[k])))
-                self._counters.count(_SOURCE, "not_condensed")
+                is_held = solver.is_held(int(ids[k]))
+                self._counters.count(_SOURCE, "held_keyframe" if is_held else "not_condensed")
                 k += 1
                 continue
             visit = ids[k:end].tolist()

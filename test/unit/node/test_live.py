@@ -427,6 +427,17 @@ def test_A37_what_is_told_seldom_tells_how_often_it_was_left_out(monkeypatch):
     assert told == [0, *[None] * 4, 4, *[None] * 4, 4, *[None] * 3]
 
 
+def test_while_visits_of_a_condensed_map_contradict_one_another_the_node_is_degraded():
+    robot = round_a_curve(2, 3.2)
+    assert not robot.estimate.visits
+    robot.slam.counters.count("map", "visit_condensed", 10)
+    robot.slam.counters.count("map", "visit_lost", 3)
+    robot.ingest([drive(2, k) for k in range(20, 40)])
+    verdict = judge(Facts("active", (odom(received=9, silent_s=0.0),), robot.estimate), Config())
+    assert verdict.state == "DEGRADED"
+    assert "3 of 13 visits contradict themselves or the others" in verdict.reasons[0]
+
+
 @pytest.mark.parametrize("dimensions", [2, 3])
 def test_while_an_association_is_not_to_be_believed_the_node_is_degraded(monkeypatch, dimensions):
     """By what the pipeline reports: the same sentence as at the end of a replay."""

@@ -2,7 +2,7 @@
 
 import pytest
 
-from graph_slam_ros.runs.outcome import doubts, shortcomings, text
+from graph_slam_ros.runs.outcome import doubts, shortcomings, text, visit_faults
 
 LANDMARKS = {"use": "landmarks", "received": 90, "used": 90, "believed": 90}
 ODOMETRY = {"use": "odometry", "received": 100, "used": 100, "believed": None}
@@ -68,6 +68,14 @@ def test_visits_that_contradict_the_others_are_said(lost, condensed, is_said):
     said = list(doubts(summary({"map": {"visit_lost": lost, "visit_condensed": condensed}})))
     assert len(said) == is_said
     assert all(f"{lost} of {lost + condensed} visits" in one and "map.condense=false" in one for one in said)
+
+
+def test_keyframes_that_cannot_be_condensed_are_said_where_they_are_many():
+    few, many = ({"not_condensed": count, "visit_condensed": 20} for count in (20, 134))
+    assert not list(visit_faults(few))
+    (said,) = visit_faults(many)
+    assert said.startswith("map.condense: 134 keyframes are not condensed (20 visits are)")
+    assert said in doubts(summary({"map": many}))
 
 
 @pytest.mark.parametrize(
