@@ -199,7 +199,8 @@ class KidnapDetector:
         found = found and self._search.begun_at(found, self._anonymous.elsewhere.fits_from)
         is_decided = found is not None and self._is_decided(found)
         if self._slips.check(keyframes, stamp_ns, self._moved_to(found), is_decided=is_decided):
-            found = None
+            is_decided = False
+            found = found if self.slips_now is None else None  # too few landmarks say so yet: an alarm
         if found is not None and is_decided:
             last = self._splits[-1] if self._splits else None
             if last and self._is_refuted(last, found, int(vertices[-1])):

@@ -153,6 +153,8 @@ class SlipDetector:
     ) -> bool:
         """Examine the evidence after a solve. Returns whether a slip explains it better than that the robot was moved.
 
+        Such a slip begins if it is sure.
+
         Parameters
         ----------
         stamp_ns : of the newest odometry
@@ -172,7 +174,7 @@ class SlipDetector:
                 choice = self._compare(moved, keyframes)
                 if choice.is_slip:
                     self._begin_slip(choice, keyframe, stamp_ns)
-                return choice.is_slip
+                return choice.kind in SLIPS
             if self.now is None or not is_new:
                 return False
             explains = is_decided and self._compare(moved, keyframes).kind != CARRIED
