@@ -134,18 +134,32 @@ def read_left(folder: Path, space: Geometry, state: BoundedState | None) -> Left
     out = Left.joined(space, found)
     count = len(out.keyframes), len(out.sightings), len(out.frames)
     if state is not None and count != (state.keyframes, state.sightings, state.frames):
-        raise FormatError(
-            f"{folder}: {CONDENSED}.mcap has {count[0]} keyframes, and {state.keyframes} have left the map: the others "
-            f"are lost; graph_slam replay {folder} --out NEW makes the map anew"
-        )
+        raise _incomplete(folder, count[0], state)
     return out
 
 
-def carried(folder: Path, state: BoundedState) -> Iterator[Record]:
-    """Return the records of what has left a map, one by one, for the run that goes on in it."""
+def _incomplete(folder: Path, count: int, state: BoundedState) -> FormatError:
+    return FormatError(
+        f"{folder}: {CONDENSED}.mcap has {count} keyframes, and {state.keyframes} have left the map: the others "
+        f"are lost; graph_slam replay {folder} --out NEW makes the map anew"
+    )
+
+
+def carried(folder: Path, space: Geometry, state: BoundedState) -> Iterator[Record]:
+    """Return the records of what has left a map, one by one, for the run that goes on in it.
+
+    Raises
+    ------
+    FormatError
+        Some of those that the map knows of are missing.
+    """
+    count = 0
     for record in read_records(folder, CONDENSED, []):
         if record["first"] < state.keyframes:
+            count += len(_rows(record.get("keyframes", ""), record_type(space)))
             yield record
+    if count != state.keyframes:
+        raise _incomplete(folder, count, state)
 
 
 def read_left_edges(folder: Path) -> Iterator[dict[str, str]]:

@@ -11,6 +11,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+from graph_slam_ros.errors import FormatError
 from graph_slam_ros.formats.durable import AppendedFile, write_whole
 from graph_slam_ros.formats.parameters import parameters_text
 from graph_slam_ros.measurements.types import Odometry, to_record
@@ -89,19 +90,19 @@ class RunRecorder:
             self._journal.begin()
             self._journal.write([BEGINS_IN_A_MAP] if start is not None else [])
             self._journal.flush()
-            self._carry(start)
+            self._carry(config, start)
             _put(self.folder, CONFIG, parameters_text(config.as_mapping()))
-        except KeyboardInterrupt:
+        except (KeyboardInterrupt, FormatError):
             self.discard()
             raise
         except OSError as error:
             self.abandon()
             raise RunError(f"{self.folder}: {error.strerror}") from None
 
-    def _carry(self, start: MapSnapshot | None) -> None:
+    def _carry(self, config: Config, start: MapSnapshot | None) -> None:
         """Take over what has left the map that the run goes on in."""
         if start is not None and start.bounded is not None and start.folder is not None:
-            for record in carried(start.folder, start.bounded):
+            for record in carried(start.folder, config.space, start.bounded):
                 self._left.write([record])
                 self._left.flush()
 

@@ -1,6 +1,7 @@
 """Maps with condensed visits, as a person works with them: judged, shown, asked, edited, and undone."""
 
 import json
+import os
 import re
 import shutil
 
@@ -12,7 +13,7 @@ from benchmarks.hall import config, hall, rms
 from graph_slam_ros.analysis.run_consistency import consistency_of
 from graph_slam_ros.analysis.trajectories import Truth
 from graph_slam_ros.analysis.what_if import SavedGraph
-from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.errors import FormatError, GraphSlamError
 from graph_slam_ros.graph.geometry import PLANAR
 from graph_slam_ros.graph.place import LABEL as PLACES
 from graph_slam_ros.lie import se3
@@ -104,6 +105,16 @@ def test_an_edge_of_the_window_is_taken_out_and_the_path_stays_whole(run, saved,
     start = read_map(tmp_path / "edited", [], start_only=True)
     record_run(tmp_path / "again", after.config, read_measurements(tmp_path / "edited", []), [], start)
     assert (tmp_path / "again" / "path.tum").read_bytes() == (tmp_path / "edited" / "path.tum").read_bytes()
+
+
+def test_where_what_was_condensed_is_lost_an_edit_names_the_run_and_writes_nothing(run, saved, tmp_path):
+    damaged = tmp_path / "damaged"
+    shutil.copytree(run[0], damaged)
+    os.truncate(damaged / "condensed.mcap", 3000)
+    edits = [{"name": "out", "do": "remove_edge", "edge": newest(saved).edge, **BASE}]
+    with pytest.raises(FormatError, match=rf"{damaged}: condensed.mcap has \d+ keyframes, and .* makes the map anew"):
+        edit_run(damaged, edits, tmp_path / "edited")
+    assert not (tmp_path / "edited").exists()
 
 
 def test_undone_it_is_as_it_was(run, saved, tmp_path):
