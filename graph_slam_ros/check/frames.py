@@ -6,10 +6,10 @@ import numpy as np
 
 from graph_slam_ros.check.columns import Columns, SightingColumns
 from graph_slam_ros.check.finding import Finding, Severity, Where, assignment
+from graph_slam_ros.messages.inputs.transforms import assumed_mount
 
 _OF_CAMERAS = "world"  # which visual odometry calls its frame, too
 _FIXED = ("map", _OF_CAMERAS, "earth", "utm")
-_AT_BASE = "0 0 0 0 0 0"
 _UNKNOWN = ("frame_unknown", "child_frame_unknown", "odom_frame_unknown", "map_frame_unknown")
 _SAME = 1e-6
 _DIFFER_M, _FEW = 0.05, 10
@@ -89,7 +89,7 @@ def _unlinked(c: Columns, known: set[str]) -> Iterator[Finding]:
         if topic is None or not times or topic.name in known:
             continue
         names = ", ".join(list(topic.frames)[:4])
-        key, value = f"{source}.mount", _AT_BASE
+        key, value = f"{source}.mount", assumed_mount(names)
         if "odom_frame_unknown" in counts:
             key, value = "frames.odom", next(iter(topic.frames), "odom")
         severity: Severity = "error" if times > 0.5 * max(c.counters.received[source], 1) else "warning"

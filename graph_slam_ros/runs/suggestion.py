@@ -11,6 +11,7 @@ from graph_slam_ros.formats.parameters import parse_setting
 from graph_slam_ros.messages.from_msg import TRANSFORMS
 from graph_slam_ros.messages.inputs import CONVERTERS, converters, known_types
 from graph_slam_ros.messages.inputs.landmark_types import APRILTAGS, LANDMARK_TYPES
+from graph_slam_ros.messages.inputs.transforms import OPTICAL, assumed_mount
 from graph_slam_ros.recordings.bag import Bag
 from graph_slam_ros.recordings.contents import Recording, TopicContents
 from graph_slam_ros.runs.folder import suggested_out
@@ -38,7 +39,6 @@ _TAG = re.compile(r"((?:.*[/_])?(?:tag|aruco|marker|fiducial).*?)[:_]?\d+", re.I
 _TAG_TOPIC = re.compile(r"(?:tag|aruco|marker|fiducial)[_/:]?(\d+)(?:/pose)?$", re.IGNORECASE)
 _CORNERS = re.compile(r"^(?!.*map).*(tag|aruco|fiducial)", re.IGNORECASE)
 _MAPS = ("map", "earth", "utm")
-_OPTICAL = "0 0 0 -1.5707963 0 -1.5707963"  # z ahead, x to the right
 _OFF_PLANE = 0.05
 _OF_ROS = ("/clock", "/rosout", "/parameter_events", "/diagnostics", "/events/write_split", "/robot_description")
 _MOST_LISTED = 6
@@ -202,7 +202,7 @@ class Suggestion:
             if one.topic.type == APRILTAGS and not one.ids & self._recording.moving.keys():
                 self._corners(one)
             else:
-                self._add(LANDMARK_TYPES[one.topic.type].input_name, one, linked=one.topic.type == APRILTAGS)
+                self._add(LANDMARK_TYPES[one.topic.type].input_name, one)
         for one in self._of_type(POSE, POSE_WITH_COVARIANCE):
             if number := self._tag_number(one):
                 self._add("tag", one, {"use": "landmarks", "id": number})
@@ -351,8 +351,8 @@ class Suggestion:
         """Return the pose of a sensor that TF does not have."""
         if frame and self._recording.is_linked(frame, self._base):
             return {}
-        mount = _OPTICAL if "optical" in frame else "0 0 0 0 0 0"
-        where = "at the base, looking ahead" if mount == _OPTICAL else "at the base"
+        mount = assumed_mount(frame)
+        where = "at the base, looking ahead" if mount == OPTICAL else "at the base"
         self.notes.append(
             f"{topic}: no transform has the pose of {frame or 'its sensor'} on the robot: {where} is assumed"
         )

@@ -13,8 +13,6 @@ from graph_slam_ros.messages.inputs.source import InputContext
 
 _ADD, _DELETE, _DELETEALL = 0, 2, 3
 _NOTHING = np.zeros(36)  # all zero is unknown by custom
-_ORIGIN = SimpleNamespace(x=0.0, y=0.0, z=0.0)
-_UNTURNED = SimpleNamespace(x=0.0, y=0.0, z=0.0, w=1.0)
 
 
 def detections(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
@@ -79,14 +77,22 @@ def markers(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
 
 
 def apriltags(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
-    """apriltag_msgs/AprilTagDetectionArray: poses are on /tf, in frames named by family and id."""
-    settings = source.settings
+    """apriltag_msgs/AprilTagDetectionArray: poses are on /tf below the header's frame, named by family and id."""
+    settings, stamp_ns = source.settings, source.stamp_ns(m.header.stamp)
+    camera = settings.frame or m.header.frame_id.removeprefix("/")
     for one in m.detections:
         if one.hamming > settings.hamming_max or one.decision_margin < settings.decision_margin_min:
             source.count("poor_tag")
             continue
         name = f"{one.family}:{one.id}"
-        yield ObservedLandmark(m.header.stamp, name, name, _ORIGIN, _UNTURNED)
+        try:
+            at = source.T_sensor(camera, name, stamp_ns)
+        except MessageError as reason:
+            source.count(str(reason))
+            continue
+        x, y, z, qx, qy, qz, qw = at
+        position, orientation = SimpleNamespace(x=x, y=y, z=z), SimpleNamespace(x=qx, y=qy, z=qz, w=qw)
+        yield ObservedLandmark(m.header.stamp, m.header.frame_id, name, position, orientation)
 
 
 def aruco_markers(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:

@@ -122,6 +122,21 @@ class InputContext:
             raise self._not_linked("frame_unknown", frame, self.config.frames.base)
         raise NotYet
 
+    def T_sensor(self, sensor: str, seen: str, stamp_ns: int) -> se3.Pose:
+        """Return the pose of a frame that a detector publishes on /tf, in the frame of its sensor.
+
+        Raises
+        ------
+        NotYet
+            TF does not have it, and odometry is not much newer than the stamp.
+        """
+        found = self.transforms.lookup(sensor, seen, stamp_ns)
+        if found is not None:
+            return found
+        if self._may_come(stamp_ns):
+            raise NotYet
+        raise self._not_linked("frame_unknown", seen, sensor)
+
     def mount_position(self, name: str, stamp_ns: int) -> tuple[float, float, float]:
         """The position of a message's sensor on the robot; the base, which is counted, if its frame is unknown.
 

@@ -7,6 +7,14 @@ from typing import Any
 from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.messages.inputs.stamp_leap import StampLeap
 
+OPTICAL = "0 0 0 -1.5707963 0 -1.5707963"
+"""x y z roll pitch yaw of a camera's optical frame at the base, looking ahead: z ahead, x to the right."""
+
+
+def assumed_mount(frame: str) -> str:
+    """The pose on the robot of a sensor that TF does not have: at the base, and of an optical frame looking ahead."""
+    return OPTICAL if "optical" in frame else "0 0 0 0 0 0"
+
 
 def pose(translation: Any, rotation: so3.Quaternion) -> se3.Pose:
     """A pose from a translation or position message and a unit quaternion."""
@@ -20,7 +28,7 @@ class Transforms:
     Parameters
     ----------
     keep_ns : how much older than its newest a transform of /tf may get
-    refuse : called once for each of /tf that is dated farther than that from the others of its frame
+    refuse : called once for each of /tf that is dated farther than that from the others of its frame, and from odometry
 
     Attributes
     ----------
@@ -42,7 +50,7 @@ class Transforms:
         joint = self._moving.get(child)
         if joint is None or joint.parent != parent:
             joint = self._moving[child] = _Joint(parent, self._keep_ns, self._refuse)
-        joint.add(stamp_ns, T_parent_child)
+        joint.add(stamp_ns, T_parent_child, self.now_ns)
 
     def forget_time(self) -> None:
         """Begin anew with the stamps. Static transforms stay."""
@@ -105,8 +113,10 @@ class _Joint:
         self._stamps_ns: list[int] = []
         self._poses: list[se3.Pose] = []
 
-    def add(self, stamp_ns: int, T_parent_child: se3.Pose) -> None:
+    def add(self, stamp_ns: int, T_parent_child: se3.Pose, now_ns: int | None) -> None:
         newest_ns = self._stamps_ns[-1] if self._stamps_ns else stamp_ns
+        if now_ns is not None and abs(stamp_ns - now_ns) < abs(stamp_ns - newest_ns):
+            newest_ns = now_ns  # seen again after a while, such as the frame of a tag: no leap
         for at_ns, pose in self._leap.accept(stamp_ns, T_parent_child, newest_ns, self._keep_ns):
             if self._stamps_ns and at_ns < self._stamps_ns[-1] - self._keep_ns:  # several agree that it is so early
                 self._stamps_ns.clear()

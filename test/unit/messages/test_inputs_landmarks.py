@@ -16,6 +16,7 @@ from messages import (
     counted,
     heard,
     listening,
+    odometry,
     only,
     pose,
     quaternion,
@@ -238,20 +239,14 @@ def with_covariance(at, diagonal):
     return make("geometry_msgs/msg/PoseWithCovariance", pose=at, covariance=covariance)
 
 
-def test_apriltags_are_where_tf_says_at_their_stamp_and_poor_ones_are_left_out():
-    eye = ("base_link", "eye", (1.0, 0.0, 0.0), quaternion())
-    b, message, encoded = foreign(
-        "apriltag_msgs/msg/AprilTagDetectionArray",
-        eye,
-        hamming_max=1,
-        decision_margin_min=30.0,
-        sigma_m=0.2,
-        inputs={"tf": True},
-    )
+TAGS = "apriltag_msgs/msg/AprilTagDetectionArray"
 
-    def tag(number, hamming=0, margin=60.0):
-        corner = message("apriltag_msgs/msg/Point", x=0.0, y=0.0)
-        return message(
+
+def tags_seen(message, encoded, *tags, stamp_ns=STAMP_NS, frame="eye"):
+    """An AprilTagDetectionArray of tags (number, hamming, margin)."""
+    corner = message("apriltag_msgs/msg/Point", x=0.0, y=0.0)
+    parts = [
+        message(
             "apriltag_msgs/msg/AprilTagDetection",
             family="tag36h11",
             id=number,
@@ -262,13 +257,44 @@ def test_apriltags_are_where_tf_says_at_their_stamp_and_poor_ones_are_left_out()
             corners=[corner] * 4,
             homography=np.eye(3).ravel(),
         )
+        for number, hamming, margin in tags
+    ]
+    return encoded(header=header(stamp_ns, frame), detections=parts)
 
-    sent = encoded(header=header(STAMP_NS, "eye"), detections=[tag(3), tag(4, hamming=2), tag(5, margin=29.0)])
+
+def test_apriltags_are_where_tf_says_at_their_stamp_and_poor_ones_are_left_out():
+    eye = ("base_link", "eye", (1.0, 0.0, 0.0), quaternion())
+    settings = {"hamming_max": 1, "decision_margin_min": 30.0, "sigma_m": 0.2}
+    b, message, encoded = foreign(TAGS, eye, **settings, inputs={"tf": True})
+    sent = tags_seen(message, encoded, (3, 0, 60.0), (4, 2, 60.0), (5, 0, 29.0))
     assert heard(b, "seen", sent) is None, "the detector publishes the transforms after the detections"
     m = heard(b, "tf", transforms(("eye", "tag36h11:3", (2.0, 1.0, 0.0), quaternion())))
     assert (only(m).id, only(m).measured) == ("tag36h11:3", pytest.approx((3.0, 1.0)))
     assert only(m).covariance == pytest.approx((0.04, 0, 0, 0.04))
     assert counted(b) == {"seen": {"poor_tag": 2}}
+
+
+def test_the_mount_of_apriltags_is_that_of_the_camera():
+    b, message, encoded = foreign(TAGS, inputs={"tf": True}, mount="0.2 0 0 -1.5707963 0 -1.5707963")
+    heard(b, "tf", transforms(("eye", "tag36h11:3", (-1.0, 0.3, 2.0), quaternion())))
+    m = heard(b, "seen", tags_seen(message, encoded, (3, 0, 60.0)))
+    assert only(m).measured == pytest.approx((2.2, 1.0)), "z of the camera is ahead, x to the right"
+
+
+@pytest.mark.parametrize("later_s", [11, 300])
+def test_a_tag_that_is_seen_again_after_a_while_counts_at_once(later_s):
+    eye = ("base_link", "eye", (1.0, 0.0, 0.0), quaternion())
+    b, message, encoded = foreign(TAGS, eye, inputs={"tf": True})
+    for elapsed_s in range(later_s + 1):
+        stamp_ns = STAMP_NS + elapsed_s * 10**9
+        b.convert("odom", odometry(stamp_ns=stamp_ns))
+        if elapsed_s not in (0, later_s):
+            continue
+        tag = ("eye", "tag36h11:3", (2.0, 1.0, 0.0), quaternion())
+        assert heard(b, "tf", transforms(tag, stamp_ns=stamp_ns)) is None
+        m = heard(b, "seen", tags_seen(message, encoded, (3, 0, 60.0), stamp_ns=stamp_ns))
+        assert (m.stamp_ns, only(m).measured) == (stamp_ns, pytest.approx((3.0, 1.0)))
+    assert "tf" not in counted(b)
 
 
 def test_aruco_markers_have_headers_of_their_own():
