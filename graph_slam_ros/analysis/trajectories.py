@@ -18,6 +18,7 @@ from graph_slam_ros.lie import se3
 from graph_slam_ros.messages.inputs.fixes import east_north_up
 from graph_slam_ros.recordings.bag import Bag, open_bag
 from graph_slam_ros.recordings.definitions import recorded_decoder
+from graph_slam_ros.runs.folder import is_run
 from graph_slam_ros.runs.trajectory import Point, Trajectory, read_tum, trajectory
 from graph_slam_ros.typing import Array
 
@@ -85,6 +86,8 @@ def read_truth(truth: str | Path, topic: str = "", not_these: Collection[str] = 
             raise GraphSlamError(f"{path}: a TUM file has no topics: leave out {topic}")
         known = read_tum(path, follow=True)
         return Truth(replace(known, has_orientation=not _is_empty_heading(known.poses)), {}, source=str(path))
+    if is_run(path):
+        raise GraphSlamError(f"{path}: a run, not the truth: graph_slam evaluate RUN --truth BAG or FILE.tum")
     bag = open_bag(path)
     name, _, frames = (topic or _only_topic(bag, path, not_these)).partition(":")
     if name not in bag.topics or bag.topics[name].type not in (*_POSE_TYPES, _TF):

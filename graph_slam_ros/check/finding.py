@@ -97,8 +97,13 @@ KINDS: dict[str, Kind] = {
     # -- odometry
     "static": Kind("the robot does not move", "choose another topic with --odom, or drive", True),
     "units": Kind("distances or speeds are larger than any robot's", _DRIVER, True),
+    "no_orientation_of_odometry": Kind(
+        "the orientation of odometry never changes, and the robot drives round bends",
+        "have the driver fill in the orientation of the pose",
+        True,
+    ),
     "odometry_jumps": Kind(
-        "odometry jumps", "correct the driver; for a robot that is so fast set odometry.max_speed_m_s"
+        "odometry jumps", "correct the driver; a run begins a segment where it is faster than odometry.max_speed_m_s"
     ),
     "odometry_reset": Kind("odometry goes back to zero: its driver was restarted", "cut the recording there"),
     "corrected": Kind("odometry jumps again and again, as the output of a localiser does", _WHEELS),

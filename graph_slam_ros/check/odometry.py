@@ -14,10 +14,13 @@ LEAST = 10
 """Messages of odometry below which nothing is known of it."""
 
 _FASTEST_M_S = 40.0
+_FASTEST_RAD_S, _LEAST_S = 12.0, 0.02  # of steps that are shorter, noise would pass for a turn
 _STEP_M, _STEP_RAD, _TIMES = 0.1, 0.1, 5.0
 _CORRECTED = 3
+_LIMIT, _LEAST_LIMIT_M_S = 2.5, 0.5  # of the speed above which odometry jumps: times the fastest, and at least
 _AT_ZERO, _AWAY_M = 1e-9, 0.5
 _STILL_M, _STILL_RAD = 0.5, 1.0
+_NO_TURN_RAD, _BENDS = 1e-6, 0.05
 _WINDOW_S, _LONGEST_S = 1.0, 3.0
 _SCALE, _EXPLAINED, _UNEXPLAINED = 0.1, 0.5, 0.7
 _LATERAL, _FITS, _WORSE_M = 0.1, 0.3, 0.02
@@ -62,17 +65,22 @@ class Steps:
         return far | (np.linalg.norm(self.turned, axis=1) > _STEP_RAD + _TIMES * self.fastest_rad_s * dt)
 
 
-def steps_of(o: OdometryColumns) -> Steps | None:
-    """The steps of odometry in order of stamp; None where there are too few."""
+def _usable(o: OdometryColumns) -> Index:
+    """The messages with a stamp and a pose, in order of stamp; of equal stamps the first."""
     norm = np.linalg.norm(o.poses[:, 3:], axis=1)
     usable = np.isfinite(o.poses).all(axis=1) & (np.abs(o.poses[:, :3]).max(axis=1, initial=0.0) < 1e9)
     usable &= (o.stamp_ns != 0) & (np.abs(norm - 1.0) < 0.1)
-    stamp_ns, first = np.unique(o.stamp_ns[usable], return_index=True)
-    if len(stamp_ns) < LEAST:
+    _, first = np.unique(o.stamp_ns[usable], return_index=True)
+    return np.flatnonzero(usable)[first]
+
+
+def steps_of(o: OdometryColumns) -> Steps | None:
+    """The steps of odometry in order of stamp; None where there are too few."""
+    index = _usable(o)
+    if len(index) < LEAST:
         return None
-    index = np.flatnonzero(usable)[first]
-    poses = o.poses[index]
-    poses = np.concatenate([poses[:, :3], poses[:, 3:] / norm[index, None]], axis=1)
+    stamp_ns, poses = o.stamp_ns[index], o.poses[index]
+    poses = np.concatenate([poses[:, :3], poses[:, 3:] / np.linalg.norm(poses[:, 3:], axis=1)[:, None]], axis=1)
     motion = se3.between(tuple(poses[:-1].T), tuple(poses[1:].T))
     moved = np.stack(motion[:3], axis=1)
     turned = np.stack(so3.log(tuple(motion[3:])), axis=1)
@@ -88,16 +96,22 @@ def check_odometry(c: Columns) -> Iterator[Finding]:
     """The odometry that is used, by its own messages alone."""
     o, steps = c.odometry, steps_of(c.odometry)
     if steps is None:
-        text = f"{o.topic or 'odometry'}: {len(np.unique(o.stamp_ns))} usable messages; {LEAST} are needed"
-        yield Finding("no_odometry", "error", len(o.stamp_ns), LEAST, "messages", text, o.topic, count=len(o.stamp_ns))
+        count = len(_usable(o))
+        text = f"{o.topic or 'odometry'}: {count} of {len(o.stamp_ns)} messages are usable; {LEAST} are needed"
+        yield Finding("no_odometry", "error", count, LEAST, "messages", text, o.topic, count=len(o.stamp_ns))
         return
     where: Where = {"topic": o.topic, "first_ns": int(o.stamp_ns[steps.index[0]]), "count": len(steps.index)}
     if steps.fastest_m_s > min(_FASTEST_M_S, c.config.odometry.max_speed_m_s):
-        text = f"{o.topic}: the robot drives at {steps.fastest_m_s:.0f} m/s: are these millimetres?"
+        text = f"{o.topic}: the robot drives at {steps.fastest_m_s:.0f} m/s: is its position in metres?"
         yield Finding("units", "error", steps.fastest_m_s, _FASTEST_M_S, "m/s", text, **where)
         return
+    turns = np.linalg.norm(steps.turned[steps.is_short], axis=1) / np.maximum(steps.dt[steps.is_short], _LEAST_S)
+    if (fastest := float(np.percentile(turns, 99.0))) > _FASTEST_RAD_S:
+        text = f"{o.topic}: the orientation turns at {fastest:.0f} rad/s: are its angles in radians?"
+        yield Finding("units", "error", fastest, _FASTEST_RAD_S, "rad/s", text, **where)
+        return
     jumps = steps.jumps
-    yield from _jumps(o, steps, jumps)
+    yield from _jumps(o, steps, jumps, c.config.odometry.max_speed_m_s)
     smooth = steps.is_short & ~jumps
     total_m = float(np.linalg.norm(steps.moved[smooth], axis=1).sum())
     total_rad = float(np.linalg.norm(steps.turned[smooth], axis=1).sum())
@@ -106,6 +120,10 @@ def check_odometry(c: Columns) -> Iterator[Finding]:
         text = f"{o.topic}: the robot moves {total_m:.2f} m and {np.degrees(total_rad):.0f} degrees in {span_s:.0f} s"
         yield Finding("static", "warning", total_m, _STILL_M, "m", text, **where)
         return
+    if _has_no_orientation(steps, smooth, total_rad):
+        text = f"{o.topic}: its orientation never changes in {total_m:.0f} m, and it drives round bends"
+        yield Finding("no_orientation_of_odometry", "error", total_rad, 0.0, "rad", text, **where)
+        return
     yield from _plane(c, o)
     if np.isfinite(o.twist[steps.index]).all() and o.twist[steps.index].any() and c.config.odometry.noise != "density":
         yield from _twist(o, steps, jumps, where)
@@ -113,7 +131,14 @@ def check_odometry(c: Columns) -> Iterator[Finding]:
         yield from _covariance(o, steps, where)
 
 
-def _jumps(o: OdometryColumns, steps: Steps, jumps: Mask) -> Iterator[Finding]:
+def _has_no_orientation(steps: Steps, smooth: Mask, total_rad: float) -> bool:
+    """Return whether the robot never turns, and its way is no line, straight or to and fro."""
+    moved = steps.moved[smooth, :2]
+    least, most = np.linalg.eigvalsh(moved.T @ moved)
+    return total_rad < _NO_TURN_RAD and bool(least > _BENDS * most)
+
+
+def _jumps(o: OdometryColumns, steps: Steps, jumps: Mask, max_speed_m_s: float) -> Iterator[Finding]:
     poses = o.poses[steps.index]
     at_zero = (np.abs(poses[1:, :6]) < _AT_ZERO).all(axis=1) & (np.linalg.norm(poses[:-1, :3], axis=1) > _AWAY_M)
     for code, is_there in (("odometry_reset", at_zero), ("odometry_jumps", jumps & ~at_zero)):
@@ -124,12 +149,17 @@ def _jumps(o: OdometryColumns, steps: Steps, jumps: Mask) -> Iterator[Finding]:
         most_deg = float(np.degrees(np.linalg.norm(steps.turned[is_there], axis=1).max()))
         first_ns = int(o.stamp_ns[steps.index[1:][is_there][0]])
         by = f"by up to {most_m:.2f} m and {most_deg:.0f} degrees in one step"
-        text = f"{o.topic} jumps {count} times, {by}"
+        often = "once" if count == 1 else f"{count} times"
+        text, settings = f"{o.topic} jumps {often}, {by}", tuple[str, ...]()
+        slowest_m_s = float((np.linalg.norm(steps.moved, axis=1) / steps.dt)[is_there].min())
+        limit_m_s = max(_LEAST_LIMIT_M_S, _LIMIT * steps.fastest_m_s)
+        if code == "odometry_jumps" and limit_m_s < slowest_m_s <= max_speed_m_s:  # else a run finds the jump itself
+            settings = (f"odometry.max_speed_m_s={limit_m_s:.2g}",)
         if code == "odometry_reset":
-            text = f"{o.topic} goes back to zero {count} times: its driver was restarted"
+            text = f"{o.topic} goes back to zero {often}: its driver was restarted"
         elif count >= _CORRECTED:
             code, text = "corrected", f"{o.topic} jumps {count} times, {by}: is it the output of a localiser?"
-        yield Finding(code, "warning", count, 0, "times", text, o.topic, first_ns, count)
+        yield Finding(code, "warning", count, 0, "times", text, o.topic, first_ns, count, settings)
 
 
 def _plane(c: Columns, o: OdometryColumns) -> Iterator[Finding]:

@@ -135,7 +135,7 @@ def _contradictions(c: Columns, s: SightingColumns, path_ns: Index, path: Array)
     distance_m = np.linalg.norm(s.points, axis=1)
     far_m = float(np.median(distance_m[use]))
     if far_m > _FAR_M:
-        text = f"{s.topic}: the median distance of landmarks is {far_m:.0f} m: are these millimetres?"
+        text = f"{s.topic}: the median distance of landmarks is {far_m:.0f} m: are these metres?"
         yield Finding("units", "error", far_m, _FAR_M, "m", text, **where)
         return
     pairs = pairs_of(s, path_ns, path, c.config.world.dimensions)

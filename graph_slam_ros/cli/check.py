@@ -40,8 +40,14 @@ def check(args: argparse.Namespace) -> int:
         mend = [text for one in done.findings if one.severity != "note" for text in one.settings]
         last = {parse_setting(text)[0]: text for text in [*args.set, *mend]}  # of several, the last one counts
         own = [f"--config {shlex.quote(str(args.config))}"] if args.config else []
-        more = [f"--set {shlex.quote(text)}" for text in last.values()]
-        console.then(" ".join([done.command, *own, *more]) if done.command else console.command("info", args.bag))
+        given = shlex.split(done.command)
+        more = [f"--set {shlex.quote(text)}" for text in last.values() if text not in given]
+        if any(one.ends and one.severity == "error" and not one.settings for one in done.findings):
+            console.then(f"correct what is an error, then check again: {console.command('check', args.bag)}")
+        elif done.command:
+            console.then(" ".join([done.command, *own, *more]))
+        else:
+            console.then(console.command("info", args.bag))
     console.report_losses(done.losses, done.warnings)
     return console.DONE if done.is_clean else console.FOUND
 
@@ -62,9 +68,12 @@ def lines(one: Finding) -> Iterator[str]:
     """A finding for a person: its name, its value and limit, and its remedy."""
     first = f"[{one.severity}] {one.code}: {one.text}"
     yield from textwrap.wrap(" ".join(first.splitlines()), _WIDTH, subsequent_indent="    ", break_on_hyphens=False)
-    where = f"; {one.count} in {one.topic}" if one.topic and one.count else ""
+    limit = f", limit {_amount(one.limit, one.unit)}" if one.limit else ""
+    amount = f"{_amount(one.value, one.unit)}{limit}" if one.value or limit else ""
+    where = f"{one.count} in {one.topic}" if one.topic and one.count else ""
     since = f", from {one.first_ns * 1e-9:.3f} s" if where and one.first_ns else ""
-    yield f"    {_amount(one.value, one.unit)}, limit {_amount(one.limit, one.unit)}{where}{since}"
+    if evidence := "; ".join(filter(None, (amount, where))):
+        yield f"    {evidence}{since}"
     if one.settings:
         yield "    remedy: " + " ".join(f"--set {shlex.quote(text)}" for text in one.settings)
     else:

@@ -126,8 +126,8 @@ class Config:
             if name in REMOVED:
                 raise ConfigError(f"parameter {name!r} was removed: {REMOVED[name]}; leave it out")
             if name not in known:
-                near = difflib.get_close_matches(name, known, 1, 0.0)
-                raise ConfigError(f"unknown parameter {name!r}; did you mean {near[0]!r}?{_unlisted(name, names)}")
+                near = _nearest(name, known)
+                raise ConfigError(f"unknown parameter {name!r}; did you mean {near!r}?{_unlisted(name, names)}")
             section, key = name.split(".")
             sections.setdefault(section, {})[key] = known[name].check(value)
         trees = {name: type(default)(**sections.get(name, {})) for name, default in _sections()}
@@ -242,6 +242,21 @@ def _input_names(text: Any) -> list[str]:
             raise ConfigError(f"inputs.names: {name!r} is reserved or given twice")
         used.add(name)
     return names
+
+
+def _nearest(name: str, known: Iterable[str]) -> str:
+    """The known name that is most like another: by its letters, else by the words that both have, in any order."""
+    names = list(known)
+    if near := difflib.get_close_matches(name, names, 1, 0.8):
+        return near[0]
+
+    def words(text: str) -> set[str]:
+        return {word.removesuffix("s") for word in re.split(r"[._]", text.lower())}
+
+    def likeness(one: str) -> tuple[int, float]:
+        return len(words(one) & words(name)), difflib.SequenceMatcher(None, one, name).ratio()
+
+    return max(names, key=likeness)
 
 
 def _unlisted(name: str, names: list[str]) -> str:

@@ -109,15 +109,16 @@ def choose_inputs(bag: Bag, config: Config, odometry: str | None = None, landmar
 
 
 def _choose(bag: Bag, settings: InputConfig, named: str | None, option: str) -> str:
-    listed = sorted(bag.topics.values(), key=lambda t: t.type != settings.type)  # what may be meant comes first
-    there = ", ".join(f"{t.name} ({t.type or 'no type'})" for t in listed)
+    fitting = ", ".join(t.name for t in bag.topics.values() if t.type == settings.type)
+    others = ", ".join(f"{t.name} ({t.type or 'no type'})" for t in bag.topics.values())
+    there = f"of {settings.type} there is {fitting}" if fitting else f"there are {others}"
     usual = f"/{settings.topic.lstrip('/')}"
     if named is None and settings.topic != default_input(settings.name).topic:
         named = usual
     if named is not None:
         topic = bag.topics.get(named)
         if topic is None:
-            raise BagError(f"no topic {named} in the recording; there are {there}")
+            raise BagError(f"no topic {named} in the recording; {there}")
         if not topic.type:
             raise BagError(f"topic {named} has no type: the recording lacks its schema")
         if topic.type != settings.type:
@@ -131,7 +132,7 @@ def _choose(bag: Bag, settings: InputConfig, named: str | None, option: str) -> 
     if found:
         raise BagError(f"several topics of type {settings.type} ({', '.join(found)}): choose one with {option}")
     if settings != _OPTIONAL:
-        raise BagError(f"no topic of type {settings.type} in the recording; there are {there}")
+        raise BagError(f"no topic of type {settings.type} in the recording; {there}")
     return ""
 
 

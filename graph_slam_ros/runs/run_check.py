@@ -4,7 +4,7 @@ import itertools
 import os
 from pathlib import Path
 
-from graph_slam_ros.runs.folder import RunError, is_run
+from graph_slam_ros.runs.folder import RunError, is_recording, is_run
 
 _MOST_SEARCHED, _MOST_NAMED = 200, 3  # folders in one that is not a run
 
@@ -15,9 +15,10 @@ def check_run(folder: Path) -> None:
         return
     if not os.path.lexists(folder):
         raise RunError(f"{folder}: not a run's folder: there is nothing of that name")
-    if not folder.is_dir():
-        made = f"graph_slam replay {folder} --out RUN makes a run of a recording"
-        raise RunError(f"{folder}: not a run's folder, but a file: {made}")
+    if is_recording(folder):
+        what = "a recording" if folder.is_dir() else "a file"
+        made = "graph_slam replay BAG --out RUN makes a run of a recording"
+        raise RunError(f"{folder}: not a run's folder, but {what}: {made}")
     runs = []
     try:
         inside = itertools.islice(sorted(folder.iterdir()), _MOST_SEARCHED)

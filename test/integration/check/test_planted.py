@@ -68,9 +68,16 @@ def shaken(drive):
         m.content.twist.twist.linear.x, m.content.twist.twist.angular.z = map(float, rng.normal(size=2))
 
 
+def unturned(drive):
+    poses = drive.poses
+    poses[:, 3:] = 0.0, 0.0, 0.0, 1.0
+    drive.poses = poses
+
+
 PLANTED = {name: (FAULTS[name][0], FAULTS[name][1].split(), {}) for name in SELECTED} | {
     "half of the landmarks without identity": (half_unnamed, ["no_id"], {}),
     "a ramp": (ramp, ["not_planar"], {"world.dimensions": 2}),
+    "odometry without orientation": (unturned, ["no_orientation_of_odometry"], {}),
     "a twist of noise": (shaken, ["twist_unrelated"], {}),
 }
 

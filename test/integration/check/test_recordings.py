@@ -2,6 +2,7 @@
 
 import json
 
+import numpy as np
 import pytest
 from recordings import TOPICS, read, short_drive, to_ros1, write_mcap
 
@@ -79,6 +80,66 @@ def test_a_frame_that_nothing_links_is_an_error_until_its_mount_is_set(drive, ch
     assert (code, found) == (0, {})
 
 
+def turned_in_degrees(topic, m):
+    if topic == "/odom":
+        q = m.pose.pose.orientation
+        half = 0.5 * np.degrees(2.0 * np.arctan2(q.z, q.w))
+        q.z, q.w = float(np.sin(half)), float(np.cos(half))
+    return m
+
+
+def without_orientation(topic, m):
+    if topic == "/odom":
+        m.pose.pose.orientation.w = m.pose.pose.orientation.z = 0.0
+    return m
+
+
+@pytest.mark.parametrize(
+    "change, said", [(turned_in_degrees, "are its angles in radians?"), (without_orientation, "0 of 671")]
+)
+def test_what_no_setting_mends_names_no_replay(drive, tmp_path, capsys, change, said):
+    bag = copy(drive, tmp_path / "a.mcap", change)
+    assert main(["check", str(bag), "--quick"]) == 4
+    out = capsys.readouterr().out
+    assert said in " ".join(out.split())
+    assert out.splitlines()[-1] == f"next: correct what is an error, then check again: graph_slam check {bag}"
+
+
+def test_a_restart_that_is_slower_than_any_jump_has_a_setting_that_makes_it_one(drive, check, tmp_path):
+    stamps = sorted({m.log_ns for m in open_bag(drive).messages({"/odom"})})
+    away_ns, back_ns = stamps[len(stamps) // 2], stamps[len(stamps) // 2] + 2 * 10**9
+
+    def change(topic, m):
+        if topic == "/odom":
+            stamp_ns = m.header.stamp.sec * 10**9 + m.header.stamp.nanosec
+            if away_ns < stamp_ns < back_ns:
+                return None
+            m.pose.pose.position.x -= 12.0 if stamp_ns >= back_ns else 0.0
+        return m
+
+    bag = copy(drive, tmp_path / "a.mcap", change)
+    _, found, _ = check(bag, "--quick")
+    (setting,) = found["odometry_jumps"]["settings"]
+    _, found, _ = check(bag, "--quick", "--set", setting)
+    assert found["odometry_jumps"]["settings"] == []
+    for words, segments in (((), 0), (("--set", setting), 1)):
+        out = tmp_path / f"run{segments}"
+        main(["replay", str(bag), "--out", str(out), *words])
+        assert json.loads((out / "run.json").read_text())["counters"].get("odom", {}).get("jump", 0) == segments
+
+
+def test_the_command_of_a_frame_that_nothing_links_has_its_mount_once(drive, tmp_path, capsys):
+    def change(topic, m):
+        if topic == "/landmarks":
+            m.header.frame_id = "camera_optical_frame"
+            for one in m.detections:
+                one.header.frame_id = "camera_optical_frame"
+        return m
+
+    main(["check", str(copy(drive, tmp_path / "a.mcap", change)), "--quick"])
+    assert capsys.readouterr().out.splitlines()[-1].count("detections.mount=") == 1
+
+
 @pytest.mark.parametrize("frame, code, severity", [("world", 0, "note"), ("map", 4, "error")])
 def test_odometry_in_the_frame_of_a_map_is_doubted_but_cameras_call_theirs_world(
     drive, check, tmp_path, frame, code, severity
@@ -122,7 +183,7 @@ def test_the_mistakes_of_a_user_are_one_line_or_a_finding(drive, check, tmp_path
     code, _, err = check(drive, "--odom", "/wheel")
     assert code == 2
     assert "no topic /wheel" in err[0]
-    assert "/odom (nav_msgs/msg/Odometry)" in err[0]
+    assert "of nav_msgs/msg/Odometry there is /odom" in err[0]
     code, _, err = check(drive, "--set", "detections.offset=3")
     assert (code, len(err)) == (2, 1)
     assert "did you mean 'detections.offset_s'" in err[0]

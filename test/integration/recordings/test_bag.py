@@ -62,9 +62,7 @@ def test_our_writer_is_read_by_rosbags(tmp_path, messages):
 
 
 def test_an_unknown_topic_is_refused_with_those_there_are(recorded):
-    with pytest.raises(
-        BagError, match=r"no topic /wheel in the recording; there are .*/odom \(nav_msgs/msg/Odometry\)"
-    ):
+    with pytest.raises(BagError, match="no topic /wheel in the recording; of nav_msgs/msg/Odometry there is /odom"):
         choose_inputs(open_bag(recorded), Config(), "/wheel")
 
 

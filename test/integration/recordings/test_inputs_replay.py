@@ -91,13 +91,11 @@ def test_an_input_without_its_topic_takes_the_only_one_of_its_type_and_else_is_r
     bag = open_bag(drive)
     gps = {"inputs.names": "odom gps", "gps.type": "sensor_msgs/msg/NavSatFix"}
     assert choose_inputs(bag, Config.from_mapping(gps)).topics["gps"] == "/fix"
-    with pytest.raises(BagError, match=r"no topic /gnss in the recording; there are .*/fix"):
+    with pytest.raises(BagError, match="no topic /gnss in the recording; of sensor_msgs/msg/NavSatFix there is /fix"):
         choose_inputs(bag, Config.from_mapping(gps | {"gps.topic": "gnss"}))
     with pytest.raises(BagError, match="no topic of type sensor_msgs/msg/Imu in the recording"):
         choose_inputs(bag, Config.from_mapping({"inputs.names": "odom imu", "imu.type": "sensor_msgs/msg/Imu"}))
-    with pytest.raises(
-        BagError, match=r"no topic /wheels in the recording; there are /odom \(nav_msgs/msg/Odometry\), "
-    ):
+    with pytest.raises(BagError, match="no topic /wheels in the recording; of nav_msgs/msg/Odometry there is /odom"):
         choose_inputs(bag, Config.from_mapping({"odom.topic": "wheels"}))
     vo = {"inputs.names": "odom vo", "vo.type": "nav_msgs/msg/Odometry"}
     with pytest.raises(ConfigError, match=r"vo\.topic: /odom is odometry by odom already"):

@@ -238,7 +238,11 @@ REFUSED = {
     "no recording": (["info", "{text}"], "text.mcap: not a readable recording"),
     "unknown topic": (
         ["replay", "{bag}", "--out", "{out}", "--odom", "/wheel"],
-        "no topic /wheel in the recording; there",
+        "no topic /wheel in the recording; of nav_msgs/msg/Odometry there is /odom",
+    ),
+    "topic without a slash": (
+        ["replay", "{bag}", "--out", "{out}", "--odom", "odom"],
+        "no topic odom in the recording; of nav_msgs/msg/Odometry there is /odom",
     ),
     "wrong topic": (
         ["replay", "{bag}", "--out", "{out}", "--landmarks", "/odom"],
@@ -247,6 +251,10 @@ REFUSED = {
     "unknown parameter": (
         ["replay", "{bag}", "--out", "{out}", "--set", "a.b=1"],
         "unknown parameter 'a.b'; did you mean",
+    ),
+    "words of a parameter in another order": (
+        ["replay", "{bag}", "--out", "{out}", "--set", "base_frame=base_footprint"],
+        "unknown parameter 'base_frame'; did you mean 'frames.base'?",
     ),
     "setting without effect": (
         ["replay", "{bag}", "--out", "{out}", "--set", "calibrate.groups=association"],
@@ -279,6 +287,11 @@ REFUSED = {
     "unknown loss": (["optimize", "{text}", "--loss", "hubr"], "loss 'hubr': choose none, huber, cauchy"),
     "unknown format": (["convert", "{text}", "{out}"], "its ending is none of .g2o, .toro, .graph, .gtsam, .tum"),
     "no graph": (["convert", "{text}", "{out}", "--to", "g2o"], "no vertex in it; is it a graph?"),
+    "truth is a run": (["evaluate", "{run}", "--truth", "{run}"], "a run, not the truth: graph_slam evaluate RUN"),
+    "report of a recording": (
+        ["report", "{bag}"],
+        "not a run's folder, but a file: graph_slam replay BAG --out RUN makes a run of a recording",
+    ),
     "evaluate no run": (["evaluate", "none", "--truth", "{bag}"], "none"),
     "no odometry that fits": (
         ["replay", "{bag}", "--out", "{out}", "--set", "frames.odom=world"],
