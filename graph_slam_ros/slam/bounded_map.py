@@ -32,6 +32,7 @@ from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Index, Numbers
 
 BATCH = 200  # keyframes that leave the window together
+_ENOUGH = 3  # landmarks of a visit: with fewer it goes on in the next cell
 LONGEST = BATCH  # keyframes of a visit: so all that leave a cell together are one, and as little is cut as can be
 _PATIENCE = 200  # keyframes that are out of the window while a visit waits
 _SOURCE = "map"  # of what is counted
@@ -157,24 +158,35 @@ class BoundedMap:
             self._counters.count(_SOURCE, "visit_condensed")
 
     def _length(self, ids: Sequence[int], cells: Sequence[tuple[int, ...]]) -> int:
-        """The number of keyframes, from the first of some on, that are in one cell and can be condensed."""
+        """The number of keyframes, from the first of some on, that are one visit.
+
+        They can be condensed, and they are in one cell, or go on in the next until they have seen enough for a place.
+        """
+        seen = set[int]()
         for k, (vertex, cell) in enumerate(zip(ids, cells, strict=True)):
-            if cell != cells[0] or not self._is_plain(vertex):
+            marks = self._seen_from(vertex)
+            if marks is None or (cell != cells[0] and len(seen) >= _ENOUGH):
                 return k
+            seen |= marks
         return len(ids)
 
-    def _is_plain(self, vertex: int) -> bool:
-        """Return whether a keyframe is free, with edges of odometry, sightings of points, closures and fixes alone."""
-        graph, space = self._backend.graph, self._space
+    def _seen_from(self, vertex: int) -> set[int] | None:
+        """The landmarks that are seen from a keyframe; None where it cannot be condensed.
+
+        It can be if it is free, with edges of odometry, sightings of points, closures and fixes alone.
+        """
+        graph, space, out = self._backend.graph, self._space, set[int]()
         if self._backend.solver.is_held(vertex):  # it is of a frozen map, or of one that the robot is located in
-            return False
+            return None
         for edge in self._backend.solver.edges_on(vertex).tolist():
             one = graph.edge(edge)
             is_odometry = one.type is space.relative_pose and one.label in ("odometry", CHAIN)
             is_sighting = len(one.vertices) == 2 and graph.kind_of(one.vertices[1]) is space.point
             if one.weight and not (is_odometry or is_sighting or one.label in (CLOSURES, FIXES)):
-                return False
-        return True
+                return None
+            if one.weight and is_sighting:
+                out.add(one.vertices[1])
+        return out
 
     def _ahead(self, vertex: int) -> set[int]:
         """The landmarks that are seen from a keyframe and later ones."""

@@ -83,6 +83,14 @@ def test_the_map_is_small_and_as_good_and_the_whole_path_is_there(both):
     assert rms(*landmarks(world, small.slam)) < (1.25 if in_plane else 1.4) * rms(*landmarks(world, whole.slam))
 
 
+@pytest.mark.parametrize("space", SPACES)
+def test_a_visit_goes_on_in_the_next_cell_until_it_has_seen_enough(space):
+    world = hall(2, 500, SPACES[space])
+    slam, _ = driven(world, bounded(world.space, map_cell_m=4.0))
+    assert slam.counters["map", "visit_condensed"] > 30
+    assert slam.counters["map", "visit_unfit"] == 0  # 1 in the plane and 13 in space where each cell ends a visit
+
+
 def test_records_of_what_left_have_no_gap_and_each_base_is_there(both):
     _, whole, small = both
     for before, after in pairwise(small.left):
