@@ -91,7 +91,11 @@ def read_condensed(graph: Graph, record: Mapping[str, Any]) -> tuple[int, Bounde
         raise ValueError(f"condensed: the variances of visits count {state.scale.factor} times")
     for cell, number, visits, strikes, *at in record["places"]:
         edge = graph.edge(number)
-        where = np.array(at[0]).reshape(len(edge.vertices) - 1, -1) if at else None  # an older map has none
+        where = (
+            np.array(at[0], dtype=np.float64).reshape(len(edge.vertices) - 1, -1) if at else None
+        )  # as in older maps
+        if where is not None and not np.isfinite(where).all():
+            raise ValueError(f"condensed: place {number} has a landmark that is nowhere")
         state.places.setdefault(tuple(cell), []).append(place_of(edge, where, visits, dict(strikes)))
     state.old += [OldKeyframe(number, vertex, stamp, tuple(pose)) for number, vertex, stamp, pose in record["old"]]
     known = [one.vertex for one in state.old]

@@ -22,6 +22,7 @@ from graph_slam_ros.maps.merge import merge
 from graph_slam_ros.measurements.edits import edit_of
 from graph_slam_ros.report.contents import read_contents
 from graph_slam_ros.runs import outcome
+from graph_slam_ros.runs.condensed_map import condensed_record, read_condensed
 from graph_slam_ros.runs.folder import run_config
 from graph_slam_ros.runs.journal import read_measurements
 from graph_slam_ros.runs.map_journal import read_map
@@ -115,6 +116,22 @@ def test_where_what_was_condensed_is_lost_an_edit_names_the_run_and_writes_nothi
     with pytest.raises(FormatError, match=rf"{damaged}: condensed.mcap has \d+ keyframes, and .* makes the map anew"):
         edit_run(damaged, edits, tmp_path / "edited")
     assert not (tmp_path / "edited").exists()
+
+
+def test_the_record_of_a_condensed_map_comes_back_and_one_that_cannot_be_is_refused(run):
+    slam = run[1]
+    record = json.loads(json.dumps(condensed_record(slam.graph, slam.first_keyframe, slam.bounded)))
+    graph = slam.graph.copy()
+    first, state = read_condensed(graph, record)
+    assert first == slam.first_keyframe
+    assert condensed_record(graph, first, state) == condensed_record(slam.graph, first, slam.bounded)
+    for change, what in (
+        ({"scale": [0.0, 0, 0.5]}, "count 0.5 times"),
+        ({"places": [[*one[:4], one[4][:-1] + [[0.0]]] for one in record["places"]]}, "inhomogeneous"),
+        ({"places": [[*one[:4], np.full_like(one[4], np.nan).tolist()] for one in record["places"]]}, "is nowhere"),
+    ):
+        with pytest.raises(ValueError, match=what):
+            read_condensed(slam.graph.copy(), record | change)
 
 
 def test_undone_it_is_as_it_was(run, saved, tmp_path):
