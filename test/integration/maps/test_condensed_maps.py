@@ -127,7 +127,7 @@ def test_the_record_of_a_condensed_map_comes_back_and_one_that_cannot_be_is_refu
     assert condensed_record(graph, first, state) == condensed_record(slam.graph, first, slam.bounded)
     for change, what in (
         ({"scale": [0.0, 0, 0.5]}, "count 0.5 times"),
-        ({"places": [[*one[:4], one[4][:-1] + [[0.0]]] for one in record["places"]]}, "inhomogeneous"),
+        ({"places": [[*one[:4], [*one[4][:-1], [0.0]]] for one in record["places"]]}, "inhomogeneous"),
         ({"places": [[*one[:4], np.full_like(one[4], np.nan).tolist()] for one in record["places"]]}, "is nowhere"),
     ):
         with pytest.raises(ValueError, match=what):
