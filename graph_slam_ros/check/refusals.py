@@ -10,7 +10,17 @@ from graph_slam_ros.measurements.reasons import Effect, explain, remedy
 
 _MOST = 0.5
 _USUAL = {  # of single messages: detectors err, and a recording begins and ends somewhere
-    *("no_id", "late", "before_odometry", "after_odometry", "overhead", "beyond_max_distance", "no_fix", "no_result"),
+    *(
+        "zero_stamp",
+        "no_id",
+        "late",
+        "before_odometry",
+        "after_odometry",
+        "overhead",
+        "beyond_max_distance",
+        "no_fix",
+        "no_result",
+    ),
     *("other_publisher", "future", "far_in_time", "id_conflict", "poor_tag", "duplicate_stamp", "undecodable"),
 }
 _USUAL_SHARE = 0.05
@@ -18,6 +28,7 @@ ELSEWHERE = {  # those that a check of its own explains better
     *("frame_unknown", "child_frame_unknown", "odom_frame_unknown", "map_frame_unknown", "no_id", "id_merged"),
 }
 _OF_TWIST = ("covariance_not_positive_definite", "nonfinite_covariance")
+_OF_COVARIANCE = {*_OF_TWIST, "covariance_asymmetric"}
 
 
 def check_refusals(c: Columns) -> Iterator[Finding]:
@@ -38,7 +49,9 @@ def check_refusals(c: Columns) -> Iterator[Finding]:
             text = f"{source}: {times} of {received} are refused: {row.meaning}{'; ' if mend else ''}{mend}"
             first_ns = int(topic.stamp_ns[0]) if topic is not None and len(topic.stamp_ns) else 0
             name = source if topic is None else topic.name
-            yield Finding(reason, severity, share, limit, "part", text, name, first_ns, times)
+            is_sighting = any(s.input == source for s in c.sightings)
+            settings = (f"{source}.noise=sigmas",) if reason in _OF_COVARIANCE and is_sighting else ()
+            yield Finding(reason, severity, share, limit, "part", text, name, first_ns, times, settings)
 
 
 def check_unnamed(c: Columns) -> Iterator[Finding]:

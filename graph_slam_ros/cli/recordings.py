@@ -246,7 +246,7 @@ def _print_summary(source: Path, summary: dict[str, Any]) -> int:
     code = _print_shortcomings(summary) if summary["keyframes"] else console.LOSSES
     console.show(*outcome.text(summary))
     if not summary["keyframes"]:
-        why = f": {summary['losses'][0]}" if summary.get("losses") else ", see what was counted and graph_slam info"
+        why = f": {summary['losses'][0]}" if summary.get("losses") else ", see what was counted; graph_slam check BAG"
         raise GraphSlamError(f"{source}: no odometry of it could be used{why}")
     return code
 

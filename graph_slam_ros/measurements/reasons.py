@@ -37,7 +37,7 @@ class Reason:
 
 
 _REFUSED, _REPAIRED, _NOTED = Effect.REFUSED, Effect.REPAIRED, Effect.NOTED
-_COVARIANCE = "correct the driver's covariance, or INPUT.noise=sigmas with INPUT.sigma_m and INPUT.sigma_rad"
+_COVARIANCE = "correct the driver's covariance, or INPUT.noise=sigmas; of odometry odometry.noise=density"
 _SIGMAS = "INPUT.sigma_m, INPUT.sigma_rad: its standard deviations; of closures with INPUT.noise=sigmas"
 _FRAMES = "publish the transform on /tf_static, or INPUT.mount, or frames.base as the messages name it"
 _SPACE = "world.dimensions=3"

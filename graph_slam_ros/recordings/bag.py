@@ -171,7 +171,8 @@ def _part(file: Path) -> "_Part":
             return kind(file)
     for magic, codec in _PACKED.items():
         if begins.startswith(magic):
-            raise BagError(f"{file}: the whole file is compressed with {codec}: unpack it first")
+            mend = f"unpack it first: {codec} -dc < {file.name} > UNPACKED"
+            raise BagError(f"{file}: the whole file is compressed with {codec}: {mend}")
     raise BagError(f"{file}: not a readable recording: it begins as neither mcap, sqlite3 nor a ROS 1 bag")
 
 

@@ -15,6 +15,7 @@ from graph_slam_ros.messages.inputs.transforms import OPTICAL, assumed_mount
 from graph_slam_ros.recordings.bag import Bag
 from graph_slam_ros.recordings.contents import Recording, TopicContents
 from graph_slam_ros.runs.folder import suggested_out
+from graph_slam_ros.runs.namespaces import landmarks_of_other_robots
 from graph_slam_ros.runs.replay import TF_TOPIC, choose_inputs
 from graph_slam_ros.slam import Config
 
@@ -108,6 +109,8 @@ class Suggestion:
         """Topics that can be read and are not the truth."""
         for name, one in self._recording.topics.items():
             if one.topic.type in types and one.topic.count:
+                if name in self.unused:
+                    continue
                 if _TRUTH.search(name):
                     self.unused[name] = "ground truth by its name: graph_slam evaluate RUN --truth compares with it"
                 elif one.trouble:
@@ -134,6 +137,8 @@ class Suggestion:
                 self.unused[one.topic.name] = "another odometry"
         if len(found) > 1:
             self.notes.append(f"{len(found)} odometries: {best.topic.name} is chosen; --odom takes another")
+        seen = [name for name, one in self._recording.topics.items() if one.topic.type in (DETECTIONS, *LANDMARK_TYPES)]
+        self.unused |= landmarks_of_other_robots(best.topic.name, [one.topic.name for one in found], seen)
         self.topics["odom"], self._lag_s = best.topic.name, best.typical_lag_s
         self._frames(best.frame, best.child)
         if best.off_plane > _OFF_PLANE * best.read:

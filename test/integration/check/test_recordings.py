@@ -128,6 +128,36 @@ def test_a_restart_that_is_slower_than_any_jump_has_a_setting_that_makes_it_one(
         assert json.loads((out / "run.json").read_text())["counters"].get("odom", {}).get("jump", 0) == segments
 
 
+def test_covariances_of_minus_one_have_settings_that_replay_all(drive, check, tmp_path):
+    unknown = np.full(36, -1.0)
+
+    def change(topic, m):
+        if topic == "/odom":
+            m.twist.covariance = unknown
+        for one in m.detections if topic == "/landmarks" else []:
+            one.results[0].pose.covariance = unknown
+        return m
+
+    bag = copy(drive, tmp_path / "a.mcap", change)
+    code, found, _ = check(bag, "--quick")
+    settings = [text for one in found.values() for text in one["settings"]]
+    assert (code, sorted(settings)) == (4, ["detections.noise=sigmas", "odometry.noise=density"])
+    assert main(["replay", str(bag), "--out", str(tmp_path / "run"), *(w for s in settings for w in ("--set", s))]) == 0
+
+
+def test_a_first_stamp_of_zero_as_of_simulated_time_is_a_note(drive, check, tmp_path):
+    first = []
+
+    def change(topic, m):
+        if topic == "/odom" and not first:
+            first.append(m)
+            m.header.stamp.sec = m.header.stamp.nanosec = 0
+        return m
+
+    code, found, _ = check(copy(drive, tmp_path / "a.mcap", change), "--quick")
+    assert (code, found["zero_stamp"]["severity"]) == (0, "note")
+
+
 def test_the_command_of_a_frame_that_nothing_links_has_its_mount_once(drive, tmp_path, capsys):
     def change(topic, m):
         if topic == "/landmarks":

@@ -276,6 +276,23 @@ def test_clouds_of_landmarks_are_offered_by_their_fields(info, capsys, fields):
     assert told["inputs"][words[words.index("--set") + 1].split()[-1]]["used"] > 300
 
 
+def test_of_two_robots_the_landmarks_of_one_are_taken(info, capsys):
+    topics = [(f"/{robot}/{name}", kind, made) for robot in ("a", "b") for name, kind, made in
+              (("odom", ODOM, odom()), ("tags", DETECTIONS, seen()))]  # fmt: skip
+    code, lines, words = info(*topics)
+    assert code == 0
+    assert "not used: /b/tags: of the robot of /b/odom: --odom /b/odom --landmarks /b/tags" in " ".join(lines)
+    told, _, _ = run(words, capsys)
+    assert told["inputs"].keys() == {"odom", "detections"}
+
+
+def test_landmarks_beside_another_odometry_are_taken_where_the_chosen_one_has_none(info):
+    _, _, words = info(
+        ("/wheel/odom", ODOM, odom()), ("/zed/odom", ODOM, odom(every=2)), ("/zed/tags", DETECTIONS, seen())
+    )
+    assert (words[words.index("--odom") + 1], words[words.index("--landmarks") + 1]) == ("/wheel/odom", "/zed/tags")
+
+
 def test_a_scan_and_a_picture_are_no_landmarks(info, capsys):
     _code, lines, words = info(ODOMETRY, ("/scan", CLOUD, beacons("x", "y")))
     assert any(line.startswith("not used: /scan: points without ids") for line in lines)

@@ -496,7 +496,9 @@ def test_F5_a_file_that_is_compressed_as_a_whole_is_refused_and_the_codec_named(
     codec = {"gz": "gzip", "bag": "gzip", "zstd": "zstd", "bz2": "bzip2", "lz4": "lz4"}[name.split(".")[-1]]
     packed = pack.get(name.split(".")[-1], lz4.frame.compress)(recorded.read_bytes())
     (tmp_path / name).write_bytes(packed)
-    with pytest.raises(BagError, match=rf"{name}: the whole file is compressed with {codec}: unpack it first"):
+    with pytest.raises(
+        BagError, match=rf"{name}: the whole file is compressed with {codec}: unpack it first: {codec} -dc <"
+    ):
         open_bag(tmp_path / name)
 
 
