@@ -41,17 +41,28 @@ def contents(path: Path) -> Contents:
                 _refuse_computed(database, path, table)
             rows = database.execute("SELECT id, name, type, serialization_format FROM topics").fetchall()
             topics = {int(number): (str(name), str(kind), str(code)) for number, name, kind, code in rows}
-            counts: dict[int, int] = {}
             definitions: dict[str, str] = {}
-            first_ns = 0
-            with suppress(sqlite3.Error, TypeError, ValueError):  # damaged farther on: reading tells
+            try:
                 counts = dict(database.execute("SELECT topic_id, COUNT(*) FROM messages GROUP BY topic_id"))
                 first_ns = int(database.execute("SELECT MIN(timestamp) FROM messages").fetchone()[0])
+            except (sqlite3.Error, TypeError, ValueError):  # empty, or damaged farther on
+                counts, first_ns = _counted(database)
             with suppress(sqlite3.Error):  # before Iron there are none
                 definitions = dict(database.execute(_DEFINITIONS))
     except (sqlite3.Error, TypeError, ValueError) as error:
         raise FormatError(f"{path}: not a readable recording ({error})") from None
     return Contents(topics, counts, definitions, first_ns)
+
+
+def _counted(database: sqlite3.Connection) -> tuple[dict[int, int], int]:
+    """Messages by topic, and the time of the first, up to the first damage."""
+    counts, first_ns = dict[int, int](), 2**64
+    with suppress(sqlite3.Error):
+        for topic, stamp in database.execute("SELECT topic_id, timestamp FROM messages ORDER BY id"):
+            if isinstance(topic, int) and isinstance(stamp, int):
+                counts[topic] = counts.get(topic, 0) + 1
+                first_ns = min(first_ns, stamp)
+    return counts, first_ns if counts else 0
 
 
 def _refuse_computed(database: sqlite3.Connection, path: Path, table: str) -> None:
