@@ -17,7 +17,7 @@ from graph_slam_ros.recordings.decompression import MOST_BYTES
 MAGIC = b"SQLite format 3\x00"
 _DEFINITIONS = "SELECT topic_type, encoded_message_definition FROM message_definitions WHERE encoding = 'ros2msg'"
 _LEAST_LIMIT = 2**20  # bytes of a text or blob; none is longer than the file
-_ROWS = "SELECT topic_id, timestamp, data FROM messages"
+_ROWS = "SELECT topic_id, timestamp, CASE WHEN topic_id IN ({}) THEN data END FROM messages ORDER BY id"
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +81,10 @@ def messages(path: Path, topics: Sequence[int], losses: list[str]) -> Iterator[t
     with closing(_connection(path)) as database:
         marks = ", ".join("?" * len(topics))
         try:
-            for topic, stamp, data in database.execute(f"{_ROWS} WHERE topic_id IN ({marks}) ORDER BY id", topics):
+            # All rows: of a search for some, the last one before the damage is lost, which may be all of /tf_static.
+            for topic, stamp, data in database.execute(_ROWS.format(marks), topics):
+                if topic not in topics:
+                    continue
                 if isinstance(topic, int) and isinstance(stamp, int) and isinstance(data, bytes):
                     read += 1
                     yield topic, stamp, data
