@@ -109,6 +109,7 @@ class MessageConverter:
         self._counters = counters
         self.on_fault: Callable[[str], object] = lambda line: None
         self._transforms = Transforms(round(config.inputs.tf_buffer_s * 1e9), self._is_far_in_time)
+        self._links, self._awaits_stamp = 0, False  # of the last try of what waits
         self._sources: dict[str, InputContext] = {}
         self._convert: dict[str, Callable[[Any], Any]] = {}
         self._publishers: dict[str, OnePublisher] = {}  # of each odometry
@@ -157,12 +158,18 @@ class MessageConverter:
             for m in out:
                 if m.stamp_ns > (self._transforms.now_ns or 0):
                     self._transforms.now_ns = m.stamp_ns
-        if name == TF or source.use == "odometry":
+        if (name == TF or source.use == "odometry") and self._may_be_usable():
+            self._awaits_stamp = False
             for _ in range(len(self._pending)):
                 out += self._converted(*self._pending.popleft())
         elif len(self._pending) > self._config.ordering.max_waiting:
             out += self._hurried(*self._pending.popleft())
         return out
+
+    def _may_be_usable(self) -> bool:
+        """Return whether a message that waits may be usable now: not while odometry and a link are missing."""
+        before, self._links = self._links, self._transforms.links
+        return self._awaits_stamp or self._transforms.now_ns is not None or before != self._links
 
     def convert_run(self, name: str, cdrs: Sequence[bytes], after_ns: int) -> list[Odometry]:
         """Convert messages that follow one another, from the first on, as far as all of them are plain odometry.
@@ -253,7 +260,8 @@ class MessageConverter:
         out: list[Any] = []
         try:
             out += self._convert[source.name](message)
-        except NotYet:
+        except NotYet as why:
+            self._awaits_stamp |= why.is_linked
             source.tally.clear()
             self._pending.append((source, message))
             return []

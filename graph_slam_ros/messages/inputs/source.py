@@ -31,7 +31,16 @@ class Origin:
 
 
 class NotYet(Exception):
-    """A transform of the message may still come: the message is tried again later."""
+    """A transform of the message may still come: the message is tried again later.
+
+    Attributes
+    ----------
+    is_linked : whether its frames are linked at other stamps
+    """
+
+    def __init__(self, is_linked: bool = True) -> None:
+        super().__init__()
+        self.is_linked = is_linked
 
 
 class InputContext:
@@ -120,7 +129,7 @@ class InputContext:
             if self._mount is not None and not self.transforms.are_linked(self.config.frames.base, frame):
                 return self._mount
             raise self._not_linked("frame_unknown", frame, self.config.frames.base)
-        raise NotYet
+        raise NotYet(self.transforms.are_linked(self.config.frames.base, frame))
 
     def T_sensor(self, sensor: str, seen: str, stamp_ns: int) -> se3.Pose:
         """Return the pose of a frame that a detector publishes on /tf, in the frame of its sensor.
@@ -134,7 +143,7 @@ class InputContext:
         if found is not None:
             return found
         if self._may_come(stamp_ns):
-            raise NotYet
+            raise NotYet(self.transforms.are_linked(sensor, seen))
         raise self._not_linked("frame_unknown", seen, sensor)
 
     def mount_position(self, name: str, stamp_ns: int) -> tuple[float, float, float]:

@@ -33,6 +33,7 @@ class Transforms:
     Attributes
     ----------
     now_ns : the newest stamp of odometry, None before the first: what may still come is judged by it
+    links : how often a frame got a parent, or another one
     """
 
     def __init__(self, keep_ns: int = 10_000_000_000, refuse: Callable[[], None] = lambda: None) -> None:
@@ -40,15 +41,18 @@ class Transforms:
         self._fixed: dict[str, tuple[str, se3.Pose]] = {}
         self._moving: dict[str, _Joint] = {}
         self.now_ns: int | None = None
+        self.links = 0
 
     def add(self, parent: str, child: str, T_parent_child: se3.Pose) -> None:
         """Add a static transform. A later one for the same child replaces it."""
+        self.links += 1
         self._fixed[child] = (parent, T_parent_child)
 
     def add_at(self, stamp_ns: int, parent: str, child: str, T_parent_child: se3.Pose) -> None:
         """Add a transform at its stamp."""
         joint = self._moving.get(child)
         if joint is None or joint.parent != parent:
+            self.links += 1
             joint = self._moving[child] = _Joint(parent, self._keep_ns, self._refuse)
         joint.add(stamp_ns, T_parent_child, self.now_ns)
 

@@ -478,6 +478,19 @@ def test_what_is_seen_before_tf_has_told_where_the_sensor_was_waits_for_it():
     assert counted(b) == {}
 
 
+def test_what_no_transform_links_is_not_tried_again_with_each_message(monkeypatch):
+    b, tried = border(**MOVING, frames={"base": "base_lnk"}), []
+    converted = b._converted
+    monkeypatch.setattr(b, "_converted", lambda *args: tried.append(args) or converted(*args))
+    for k in range(20):
+        assert heard(b, "detections", seen_by_turret()) is None
+        b.convert("odom", odometry(stamp_ns=STAMP_NS + k))
+        b.convert("tf", turret(0.1 * k, 0.0))
+    assert len(tried) < 100, "not 20 * 20: a wrong frames.base took 39 s for a recording of two minutes"
+    assert b.finish() == []
+    assert counted(b)["detections"] == {"frame_unknown": 20}
+
+
 def test_a_tag_on_tf_that_waits_for_its_sensors_joint_is_not_taken_for_one_that_is_sent_again():
     b = listening("tags", TF, settings={"use": "landmarks", "frame_prefix": "tag"}, **MOVING)
     b.convert("tf", turret(-0.1, 0.0))
