@@ -28,15 +28,8 @@ from graph_slam_ros.slam.measured_noise import MeasuredNoise
 from graph_slam_ros.slam.odometry_edges import replace_odometry, restore_odometry
 from graph_slam_ros.slam.robust.landmark_history import LandmarkHistory
 from graph_slam_ros.slam.robust.odometry_errors import OdometryErrors, odometry_errors
-from graph_slam_ros.slam.robust.odometry_hypotheses import (
-    CARRIED,
-    SLIPS,
-    Choice,
-    HypothesisTest,
-    Moved,
-    OdometryFilter,
-    Stretch,
-)
+from graph_slam_ros.slam.robust.odometry_filter import OdometryFilter, Stretch
+from graph_slam_ros.slam.robust.odometry_hypotheses import CARRIED, SLIPS, Choice, HypothesisTest, Moved
 from graph_slam_ros.slam.slip_noise import SlipNoise
 from graph_slam_ros.slam.slip_review import Pair, Slip, View, covariance_of, revoke_slip, slipped_pairs
 from graph_slam_ros.solver import Solver

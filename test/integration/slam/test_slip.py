@@ -12,7 +12,8 @@ from graph_slam_ros.runs.restore import map_of, record_run
 from graph_slam_ros.simulation import Fault, faulty_recording, measurements, simulate
 from graph_slam_ros.slam import Config, Control, GraphSlam
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict
-from graph_slam_ros.slam.robust.odometry_hypotheses import HypothesisTest, OdometryFilter
+from graph_slam_ros.slam.robust.odometry_filter import OdometryFilter
+from graph_slam_ros.slam.robust.odometry_hypotheses import HypothesisTest
 from graph_slam_ros.slam.slip_review import Slip
 from graph_slam_ros.solver import left_out
 

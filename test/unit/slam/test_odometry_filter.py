@@ -6,7 +6,7 @@ from scipy.optimize import least_squares
 from graph_slam_ros.graph import Gaussian, Graph
 from graph_slam_ros.graph.geometry import PLANAR
 from graph_slam_ros.lie import se2
-from graph_slam_ros.slam.robust.odometry_hypotheses import Errors, OdometryFilter, Stretch
+from graph_slam_ros.slam.robust.odometry_filter import Errors, OdometryFilter, Stretch
 
 STEP, LANDMARK = (2.0, 0.0, 0.2), (15.0, 4.0)
 ODOMETRY = np.diag([0.2, 0.05, 0.35]) ** 2
