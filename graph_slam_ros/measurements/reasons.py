@@ -396,4 +396,4 @@ def warnings(counts: Mapping[str, Mapping[str, int]]) -> list[str]:
 
 def remedy(source: str, reason: str) -> str:
     """Return the remedy for this input; empty if nothing is to be done."""
-    return explain(reason).remedy.replace("INPUT", source)
+    return explain(reason).remedy.replace("INPUT", source.partition("#")[0])  # a second odometry of the topic is odom#2

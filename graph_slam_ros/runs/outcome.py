@@ -5,6 +5,7 @@ Both are made from ``run.json``. So they are the same for a live run, a replay a
 
 import shlex
 import textwrap
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -199,7 +200,7 @@ def shortcomings(summary: Summary) -> Iterator[str]:
         out_of_plane = summary["counters"].get(name, {}).get("out_of_plane", 0)
         if is_odometry and out_of_plane > _OUT_OF_PLANE * (counts["received"] or counts["used"]):
             yield f"{name} leaves the plane: these are three dimensions: --set world.dimensions=3"
-        jumps = summary["counters"].get(name, {}).get("jump", 0)
+        jumps = sum(of.get("jump", 0) for one, of in summary["counters"].items() if one.partition("#")[0] == name)
         if is_odometry and jumps > max(_MOST_JUMPS, _JUMPY * (counts["received"] or counts["used"])):
             yield (
                 f"{name}: {jumps} jumps, each begins a segment, and the motion across it is not used: odometry in "
@@ -240,6 +241,12 @@ def doubts(summary: Summary) -> Iterator[str]:
     Also one where many visits of a condensed map contradict the others: what is left in the map was not better.
     """
     yield from _doubtful_visits(summary["counters"].get("map", {}), _MOSTLY)
+    for name, count in Counter(name.partition("#")[0] for name in summary.get("inputs", {})).items():
+        if count > 1:
+            yield (
+                f"{name}: {count} odometries are on its topic ({name}, {name}#2, ...), or one that jumps. Each needs a "
+                "topic and an input of its own (inputs.names); one that jumps: is it in metres and radians?"
+            )
     for name, counts in summary.get("inputs", {}).items():
         counted = summary["counters"].get(name, {})
         if alike := counted.get("odometry_alike", 0):

@@ -70,6 +70,18 @@ def test_visits_that_contradict_the_others_are_said(lost, condensed, is_said):
     assert all(f"{lost} of {lost + condensed} visits" in one and "map.condense=false" in one for one in said)
 
 
+def test_several_odometries_on_one_topic_are_said_and_a_remedy_names_the_input():
+    two = summary({"odom#2": {"late": 9}}, **{"odom#2": ODOMETRY | {"received": 10, "used": 1}})
+    (said,) = doubts(two)
+    assert said.startswith("odom: 2 odometries are on its topic")
+    (refused,) = shortcomings(two)
+    assert refused.startswith("odom#2: most of it was refused")
+    assert "odom.offset_s" in refused
+    assert not list(doubts(summary({})))
+    (jumps,) = shortcomings(summary({"odom": {"jump": 40}, "odom#2": {"jump": 9}}, **{"odom#2": ODOMETRY}))
+    assert jumps.startswith("odom: 49 jumps")
+
+
 def test_keyframes_that_cannot_be_condensed_are_said_where_they_are_many():
     few, many = ({"not_condensed": count, "visit_condensed": 20} for count in (20, 134))
     assert not list(visit_faults(few))
