@@ -283,7 +283,9 @@ def test_the_messages_of_every_row_of_landmark_types_are_in_the_tests():
 def test_a_type_of_landmarks_is_read_by_no_other_fields_than_its_row_names(type_name):
     sender = Sender(0, "landmarks")
     sender.length = 3
-    source = listening("any", type_name, decoders=DECODERS)._sources["any"]
+    tags = [f"{family}:{number}" for family in sender.texts for number in range(4)]  # whose poses are on /tf alone
+    links = [("base_link", frame, (1.0, 0.0, 0.0), quaternion()) for frame in ("mast", "turret", *tags)]
+    source = listening("any", type_name, *links, decoders=DECODERS)._sources["any"]
     found = []
     for _ in range(10):
         message = only_used(type_name, sender.message(type_name), fields_used())
