@@ -98,7 +98,7 @@ KINDS: dict[str, Kind] = {
     "static": Kind("the robot does not move", "choose another topic with --odom, or drive", True),
     "units": Kind("distances or speeds are larger than any robot's", _DRIVER, True),
     "no_orientation_of_odometry": Kind(
-        "the orientation of odometry never changes, and the robot drives round bends",
+        "the orientation of odometry never changes, and the robot drives round bends, not sideways",
         "have the driver fill in the orientation of the pose",
         True,
     ),

@@ -21,6 +21,7 @@ _LIMIT, _LEAST_LIMIT_M_S = 2.5, 0.5  # of the speed above which odometry jumps: 
 _AT_ZERO, _AWAY_M = 1e-9, 0.5
 _STILL_M, _STILL_RAD = 0.5, 1.0
 _NO_TURN_RAD, _BENDS = 1e-6, 0.05
+_SIDEWAYS = 0.2  # of the speed ahead: a robot with wheels that cannot has no such twist
 _WINDOW_S, _LONGEST_S = 1.0, 3.0
 _SCALE, _EXPLAINED, _UNEXPLAINED = 0.1, 0.5, 0.7
 _LATERAL, _FITS, _WORSE_M = 0.1, 0.3, 0.02
@@ -120,7 +121,7 @@ def check_odometry(c: Columns) -> Iterator[Finding]:
         text = f"{o.topic}: the robot moves {total_m:.2f} m and {np.degrees(total_rad):.0f} degrees in {span_s:.0f} s"
         yield Finding("static", "warning", total_m, _STILL_M, "m", text, **where)
         return
-    if _has_no_orientation(steps, smooth, total_rad):
+    if _has_no_orientation(steps, smooth, total_rad) and not _drives_sideways(o, steps):
         text = f"{o.topic}: its orientation never changes in {total_m:.0f} m, and it drives round bends"
         yield Finding("no_orientation_of_odometry", "error", total_rad, 0.0, "rad", text, **where)
         return
@@ -136,6 +137,12 @@ def _has_no_orientation(steps: Steps, smooth: Mask, total_rad: float) -> bool:
     moved = steps.moved[smooth, :2]
     least, most = np.linalg.eigvalsh(moved.T @ moved)
     return total_rad < _NO_TURN_RAD and bool(least > _BENDS * most)
+
+
+def _drives_sideways(o: OdometryColumns, steps: Steps) -> bool:
+    """Return whether the robot says that it drives sideways: then it needs no turn to go round a bend."""
+    ahead_m_s, sideways_m_s = np.nanmax(np.abs(o.twist[steps.index, :2]), axis=0, initial=0.0)
+    return bool(sideways_m_s > _SIDEWAYS * max(ahead_m_s, 1e-9))
 
 
 def _jumps(o: OdometryColumns, steps: Steps, jumps: Mask, max_speed_m_s: float) -> Iterator[Finding]:

@@ -105,6 +105,21 @@ def test_what_no_setting_mends_names_no_replay(drive, tmp_path, capsys, change, 
     assert out.splitlines()[-1] == f"next: correct what is an error, then check again: graph_slam check {bag}"
 
 
+@pytest.mark.parametrize(("is_holonomic", "is_said"), [(False, True), (True, False)])
+def test_a_robot_that_drives_sideways_needs_no_turn(drive, check, tmp_path, is_holonomic, is_said):
+    def change(topic, m):
+        if topic == "/odom":
+            q, velocity = m.pose.pose.orientation, m.twist.twist.linear
+            heading = 2.0 * np.arctan2(q.z, q.w)
+            q.z, q.w = 0.0, 1.0
+            if is_holonomic:
+                velocity.x, velocity.y = float(velocity.x * np.cos(heading)), float(velocity.x * np.sin(heading))
+        return m
+
+    _, found, _ = check(copy(drive, tmp_path / "a.mcap", change), "--quick")
+    assert ("no_orientation_of_odometry" in found) == is_said
+
+
 def test_a_restart_that_is_slower_than_any_jump_has_a_setting_that_makes_it_one(drive, check, tmp_path):
     stamps = sorted({m.log_ns for m in open_bag(drive).messages({"/odom"})})
     away_ns, back_ns = stamps[len(stamps) // 2], stamps[len(stamps) // 2] + 2 * 10**9
