@@ -5,7 +5,7 @@ The record ``condensed`` of a ``growth`` (``map_journal``) has
 * ``first``: the number of the first keyframe that was not condensed;
 * ``vertices``, ``edges``: the lasting ids of the first rows, and that of the row after these;
 * ``old``: number, vertex, stamp and ``T_odom_base`` of each keyframe before the first that is in the graph;
-* ``places``: cell, edge, visits, the strikes against its landmarks, by vertex, and ``at``, of each place;
+* ``places``: cell, edge, visits, the strikes against its landmarks, by vertex, and ``linearized_at``, of each place;
 * ``left``: how many keyframes, poses at which something was seen, and frames have left the map;
 * ``accepted``: of each drive, by its first keyframe, how many accepted measurements of each input have left the map.
 
@@ -52,7 +52,13 @@ def condensed_record(graph: Graph, first: int, state: BoundedState) -> Record:
     """Return the part of a map besides its graph."""
     ids = ([*of.early.tolist(), of.later] for of in (graph.vertex_ids, graph.edge_ids))
     places = [
-        [list(cell), one.edge, one.place.visits, [list(pair) for pair in one.strikes.items()], one.place.at.tolist()]
+        [
+            list(cell),
+            one.edge,
+            one.place.visits,
+            [list(pair) for pair in one.strikes.items()],
+            one.place.linearized_at.tolist(),
+        ]
         for cell, several in state.places.items()
         for one in several
     ]

@@ -272,11 +272,11 @@ def visit_faults(counted: Mapping[str, int]) -> Iterator[str]:
 def _doubtful_visits(counted: Mapping[str, int], most: float) -> Iterator[str]:
     yield from _contradicting_visits(counted)
     yield from _unfit_visits(counted, _DOUBTED, most)
-    kept, visits = counted.get("not_condensed", 0), _visits(counted)
-    if kept > max(visits, _FEWEST_LOST):
+    kept = counted.get("not_condensed", 0)
+    if kept > max(_visits(counted), _FEWEST_LOST):
         yield (
-            f"map.condense: {kept} keyframes are not condensed ({visits} visits are): they see landmarks with "
-            "orientation, or ranges with an offset, so the map still grows with the distance"
+            f"map.condense: {kept} keyframes are not condensed: they see landmarks with orientation, or ranges with an "
+            "offset, so the map still grows with the distance"
         )
 
 

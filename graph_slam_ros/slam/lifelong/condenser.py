@@ -69,12 +69,14 @@ class PlaceEdge:
     strikes: dict[int, int] = field(default_factory=dict)
 
 
-def place_of(edge: Edge, at: Array | None, visits: int, strikes: Mapping[int, int] | None = None) -> PlaceEdge:
-    """Return the place of an edge, which has all of its numbers but ``at`` (by default as those)."""
+def place_of(
+    edge: Edge, linearized_at: Array | None, visits: int, strikes: Mapping[int, int] | None = None
+) -> PlaceEdge:
+    """Return the place of an edge, which has its other numbers; without ``linearized_at`` it is linearised at them."""
     base, *members = edge.vertices
     information = product(edge.sqrt_information.T, edge.sqrt_information)
     points = edge.measured.reshape(len(members), -1)
-    place = Place(tuple(members), points, points if at is None else at, information, visits)
+    place = Place(tuple(members), points, points if linearized_at is None else linearized_at, information, visits)
     return PlaceEdge(base, place, edge.id, dict(strikes or {}))
 
 
@@ -348,7 +350,7 @@ class Condenser:
         kind = place_edge(self.space.pose, len(place.members))
         at = [base, *place.members]
         edge = self.solver.graph.add_edge(kind, at, place.points.ravel(), Gaussian(root), LABEL)
-        return place_of(self.solver.graph.edge(edge), place.at, place.visits)
+        return place_of(self.solver.graph.edge(edge), place.linearized_at, place.visits)
 
     def _replace(
         self,

@@ -22,21 +22,21 @@ class Place:
     ----------
     members : vertices of the landmarks, ascending
     points : (m, d) their positions in the axes of the pose [m]; information : (m d, m d) of these, given the pose
-    at : (m, d) the same by the whole map when each became a member. Motions of the whole are linearised there for ever:
-        else visits would say how the place is turned, which none of them knows
+    linearized_at : (m, d) the same by the whole map when each became a member. Motions of the whole place are
+        linearised there for good: at changing points, visits would seem to measure how the place is turned
     visits : how many are in it
     """
 
     members: tuple[int, ...]
     points: Array
-    at: Array
+    linearized_at: Array
     information: Array
     visits: int = 1
 
     @classmethod
     def begun_by(cls, visit: Visit) -> "Place":
         """Return the place that one visit knows, seen from the pose that the visit is seen from."""
-        return cls(visit.members, visit.points, visit.at, visit.information)
+        return cls(visit.members, visit.points, visit.linearized_at, visit.information)
 
     def shared(self, visit: Visit) -> list[int]:
         """Return the members that a visit saw, too."""
@@ -47,7 +47,13 @@ class Place:
         kept = [k for k, one in enumerate(self.members) if one != member]
         information = marginal_information(self.information, _numbers(kept, self.points.shape[1]))
         members = tuple(self.members[k] for k in kept)
-        return replace(self, members=members, points=self.points[kept], at=self.at[kept], information=information)
+        return replace(
+            self,
+            members=members,
+            points=self.points[kept],
+            linearized_at=self.linearized_at[kept],
+            information=information,
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +76,9 @@ class Fused:
 def visit_without(visit: Visit, member: int) -> Visit:
     """Return a visit after one of its landmarks was marginalised out."""
     rest = Place.begun_by(visit).without(member)
-    return replace(visit, members=rest.members, points=rest.points, at=rest.at, information=rest.information)
+    return replace(
+        visit, members=rest.members, points=rest.points, linearized_at=rest.linearized_at, information=rest.information
+    )
 
 
 def fewest_shared(space: Geometry) -> int:
@@ -98,14 +106,16 @@ def fused(space: Geometry, place: Place, visit: Visit, T_place_visit: Numbers) -
         raise SingularError(f"the visit shares {len(shared)} landmarks with the place")
     at_place, at_visit = _places(place.members, shared), _places(visit.members, shared)
     weight = marginal_information(visit.information, _numbers(at_visit, size))
-    turn, shift, resists = _motion(place.at[at_place], visit.at[at_visit], weight, space, T_place_visit)
-    there, where = product(visit.points - shift, turn), product(visit.at - shift, turn)  # R' (p - t)
+    turn, shift, resists = _motion(
+        place.linearized_at[at_place], visit.linearized_at[at_visit], weight, space, T_place_visit
+    )
+    there, where = product(visit.points - shift, turn), product(visit.linearized_at - shift, turn)  # R' (p - t)
     blocks = visit.information.reshape(len(there), size, len(there), size)
     turned = np.einsum("ba,ibjc,cd->iajd", turn, blocks, turn, optimize=False).reshape(visit.information.shape)
-    where[at_visit] = place.at[at_place]
+    where[at_visit] = place.linearized_at[at_place]
     shape = without(0.5 * (turned + turned.T), rigid_motions(where))
     degrees = size * len(shared) - rigid_motions(where).shape[1]
-    fusion, statistic = _sum(place, replace(visit, points=there, at=where, information=shape))
+    fusion, statistic = _sum(place, replace(visit, points=there, linearized_at=where, information=shape))
     # The place knows its landmarks no worse than one visit does: twice the covariance by the visit alone.
     return Fused(fusion, statistic, max(degrees, 0), np.asarray(2.0 * np.linalg.inv(resists)))
 
@@ -131,9 +141,9 @@ def _sum(place: Place, visit: Visit) -> tuple[Place, float]:
     members, points, information, size = visit.members, visit.points, visit.information, visit.points.shape[1]
     all_members = sorted({*place.members, *members})
     mine, new = _places(all_members, place.members), _places(all_members, members)
-    before, at = np.zeros((2, len(all_members), size))
+    before, where = np.zeros((2, len(all_members), size))
     before[new], before[mine] = points, place.points
-    at[new], at[mine] = visit.at, place.at
+    where[new], where[mine] = visit.linearized_at, place.linearized_at
     mine_at, new_at = _numbers(mine, size), _numbers(new, size)
     whole = np.zeros((before.size, before.size))
     whole[np.ix_(mine_at, mine_at)] += place.information
@@ -144,7 +154,7 @@ def _sum(place: Place, visit: Visit) -> tuple[Place, float]:
     after = before + step.reshape(before.shape)
     statistic = quadratic(place.information, (after[mine] - place.points).ravel())
     statistic += quadratic(information, (after[new] - points).ravel())
-    return Place(tuple(all_members), after, at, whole, place.visits + 1), statistic
+    return Place(tuple(all_members), after, where, whole, place.visits + 1), statistic
 
 
 def _motion(

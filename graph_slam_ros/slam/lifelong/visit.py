@@ -27,14 +27,14 @@ class Visit:
     ----------
     members : vertices of the landmarks, ascending
     points : (m, d) their positions in the axes of one pose of the visit [m]
-    at : (m, d) the same by the whole map: the edges are linearised there
+    linearized_at : (m, d) the same by the whole map, where the edges are linearised
     information : (m d, m d) of these, given that pose; all other poses are marginalised out
     chi2, degrees : of the edges at their own optimum
     """
 
     members: tuple[int, ...]
     points: Array
-    at: Array
+    linearized_at: Array
     information: Array
     chi2: float
     degrees: int
@@ -68,9 +68,7 @@ def visit_of(
         known = set(order)
         inside = [edge for edge in ends if known.issuperset(ends[edge])]
         counting = [(records[edge], edges[edge]) for edge in inside]
-        local, at = _local_graph(space, estimate, order, len(marks), counting)
-        solver = Solver(local, _SETTINGS)
-        solver.add(range(local.vertex_count), range(local.edge_count))
+        solver, at = _local_solver(space, estimate, order, len(marks), counting)
         solver.hold(at[base])
         size, information = space.dimensions, solver.information_matrix()
         whole = {ends[edge][1] for edge in inside if records[edge].type.residual_size >= size}
@@ -83,11 +81,11 @@ def visit_of(
         kept = np.arange(len(information) - size * len(marks), len(information))
         marginal = marginal_information(information, kept)
         numbers = [at[mark] for mark in marks]
-        there = solver.estimate(numbers)
+        linearized_at = solver.estimate(numbers)
         solver.optimize(_ONE_STEP)
         points = solver.estimate(numbers)
         chi2 = solver.optimize().chi2_final
-        return Visit(tuple(marks), points, there, marginal, chi2, solver.degrees_of_freedom)
+        return Visit(tuple(marks), points, linearized_at, marginal, chi2, solver.degrees_of_freedom)
     raise SingularError("the visit determines no landmark")
 
 
@@ -107,11 +105,9 @@ def best_known(
     marks = sorted({v for edge, _ in records for v in edge.vertices} - set(poses))
     if not marks:
         raise SingularError("the visit sees no landmark")
-    local, _ = _local_graph(space, estimate, [*poses, *marks], len(marks), records)
-    solver = Solver(local, _SETTINGS)
-    solver.add(range(local.vertex_count), range(local.edge_count))
-    for mark in range(len(poses), local.vertex_count):
-        solver.hold(mark)
+    solver, at = _local_solver(space, estimate, [*poses, *marks], len(marks), records)
+    for mark in marks:
+        solver.hold(at[mark])
     solver.update()
     spreads = [np.linalg.slogdet(one)[1] for one in solver.marginal(range(len(poses)))]
     return int(np.argmin(spreads))
@@ -123,10 +119,15 @@ def _is_sure(information: Array) -> bool:
     return bool(scale.all()) and float(np.linalg.eigvalsh(information / np.outer(scale, scale))[0]) > _LEAST
 
 
-def _local_graph(
+def _local_solver(
     space: Geometry, estimate: Estimate, order: Sequence[int], marks: int, edges: Sequence[tuple[Edge, float]]
-) -> tuple[Graph, dict[int, int]]:
-    """Copy some vertices, the base first and landmarks last, and edges with their factors, in the axes of the base."""
+) -> tuple[Solver, dict[int, int]]:
+    """Return a solver of some edges alone, each with its factor, and the ids that it has of some vertices.
+
+    Parameters
+    ----------
+    order : the vertices; all are in the axes of the first pose, and the last ones, so many ``marks``, are landmarks
+    """
     poses, points = order[: len(order) - marks], order[len(order) - marks :]
     at_poses, at_points = estimate(poses), estimate(points)
     local, group = Graph(), space.group
@@ -140,4 +141,6 @@ def _local_graph(
         ends = [[at[v] for v in edge.vertices] for edge, _ in several]
         noise = Gaussian(np.stack([np.sqrt(factor) * edge.sqrt_information for edge, factor in several]))
         local.add_edges(edge_type, ends, np.stack([edge.measured for edge, _ in several]), noise, several[0][0].label)
-    return local, at
+    solver = Solver(local, _SETTINGS)
+    solver.add(range(local.vertex_count), range(local.edge_count))
+    return solver, at
