@@ -1,6 +1,7 @@
 """A hall of 60 by 40 m that a robot drives through without end: its truth, and what it measures.
 
-Aisles driven at random, a keyframe each 0.5 m, 40 landmarks that are seen within 8 m, every second one.
+Aisles driven at random, a keyframe each 0.5 m, 40 landmarks that are seen within 8 m, every second one. They are
+points, or tags whose orientation is seen, too.
 """
 
 from collections.abc import Iterator, Sequence
@@ -15,10 +16,11 @@ from graph_slam_ros.typing import Array, Numbers
 
 STEP_M, REACH_M, SEEN = 0.5, 8.0, 0.5
 SIGMA_ALONG, SIGMA_TURN, SIGMA_RANGE, SIGMA_BEARING = 0.01, 0.005, 0.05, np.deg2rad(1.0)
+SIGMA_ORIENTATION = 0.05  # of a tag [rad]
 _X, _Y = np.array([6.0, 18.0, 30.0, 42.0, 54.0]), np.array([6.0, 20.0, 34.0])
 STEP_S = 0.2
 Seen = tuple[int, Array, Array]
-"""A sighting: number of the landmark, its position in the axes of the robot [m], and the covariance of that."""
+"""A sighting: number of the landmark, its position or pose in the axes of the robot [m, rad], and the covariance."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,16 +45,20 @@ class Course:
     Attributes
     ----------
     where : true positions (n + 1, 2) of the keyframes and of the one after
-    points : true positions of the landmarks
+    points : true positions of the landmarks; turns : their rotations, where they are tags
     """
 
-    def __init__(self, seed: int, keyframes: int, space: Geometry = PLANAR, landmarks: int = 40) -> None:
+    def __init__(
+        self, seed: int, keyframes: int, space: Geometry = PLANAR, landmarks: int = 40, *, tags: bool = False
+    ) -> None:
         self.space, self._rng, n = space, np.random.default_rng(seed), space.dimensions
         self.where = _driven(self._rng, keyframes + 1)
         grid = np.array([(60 * (i + 0.5) / 8, 40 * (j + 0.5) / 5) for i in range(8) for j in range(5)])[:landmarks]
         self.points = np.zeros((len(grid), n))
         self.points[:, :2] = grid + self._rng.uniform(-2.5, 2.5, grid.shape)
         self.points[:, 2:] = self._rng.uniform(0.0, 3.0, (len(grid), n - 2))
+        angles = self._rng.uniform(-2.0, 2.0, (len(grid), space.dof - n)) if tags else np.empty((0, space.dof - n))
+        self.turns = [space.group.exp((*[0.0] * n, *one))[n:] for one in angles.tolist()]
 
     def pose(self, keyframe: int) -> tuple[float, ...]:
         """The true pose of a keyframe: it looks at the next one."""
@@ -70,13 +76,24 @@ class Course:
                 step = tuple(map(float, group.compose(group.between(before, pose), error)))
             local = np.stack(group.act(group.inverse(pose), tuple(self.points.T)), axis=-1)
             near = (np.hypot(*local.T[:2]) < REACH_M) & (rng.random(len(self.points)) < SEEN)
-            yield pose, step, [(int(m), *_seen(local[m], rng)) for m in np.flatnonzero(near)]
+            yield pose, step, [self._seen(m, pose, *_seen(local[m], rng)) for m in np.flatnonzero(near).tolist()]
             before = pose
 
+    def _seen(self, mark: int, pose: Numbers, position: Array, covariance: Array) -> Seen:
+        """Return a sighting: of a tag with its orientation."""
+        if not self.turns:
+            return mark, position, covariance
+        space, group, n = self.space, self.space.group, self.space.dimensions
+        seen = group.between(pose, (*self.points[mark].tolist(), *self.turns[mark]))
+        error = (*[0.0] * n, *(SIGMA_ORIENTATION * self._rng.standard_normal(space.dof - n)).tolist())
+        whole, turn = SIGMA_ORIENTATION**2 * np.eye(space.dof), space.turn(seen)
+        whole[:n, :n] = turn.T @ covariance @ turn
+        return mark, np.array((*position.tolist(), *group.compose(seen, group.exp(error))[n:])), whole
 
-def hall(seed: int, keyframes: int, space: Geometry = PLANAR, landmarks: int = 40) -> Hall:
+
+def hall(seed: int, keyframes: int, space: Geometry = PLANAR, landmarks: int = 40, *, tags: bool = False) -> Hall:
     """Make a drive."""
-    course = Course(seed, keyframes, space, landmarks)
+    course = Course(seed, keyframes, space, landmarks, tags=tags)
     poses, steps, sightings = zip(*course.keyframes(), strict=True)
     return Hall(space, list(poses), course.points, list(steps[1:]), list(sightings))
 
@@ -144,8 +161,9 @@ def measured(T_odom_base: Numbers, stamp_ns: int, seen: Sequence[tuple[int, Arra
     """What a robot measures at one keyframe."""
     yield Odometry(stamp_ns, T_odom_base, source="odom")
     if seen:
+        kinds = {2: "position", 3: "pose"} if len(T_odom_base) == len(PLANAR.identity) else {3: "position", 6: "pose"}
         sightings = (
-            Sighting(f"m{mark}", "position", tuple(at.tolist()), tuple(noise.ravel().tolist()))
+            Sighting(f"m{mark}", kinds[len(noise)], tuple(at.tolist()), tuple(noise.ravel().tolist()))
             for mark, at, noise in seen
         )
         yield Sightings(stamp_ns, "landmarks", tuple(sightings))

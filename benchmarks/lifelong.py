@@ -85,10 +85,13 @@ class Drive:
         self.slam.process(Control("end"))
 
     def landmarks(self) -> tuple[list[int], Array, Array]:
-        """Vertices of the landmarks, estimated and true positions."""
-        marks = self.slam.landmarks
+        """Vertices of the landmarks, estimated and true positions, or poses."""
+        marks, course = self.slam.landmarks, self.course
         vertices, numbers = [mark.vertex for mark in marks.values()], [int(name[1:]) for name in marks]
-        true = np.stack(self._in_map("act", tuple(self.course.points[numbers].T)), axis=-1)
+        whole = course.points[numbers]
+        if course.turns:
+            whole = np.concatenate((whole, np.array(course.turns)[numbers]), axis=1)
+        true = np.stack(self._in_map("compose" if course.turns else "act", tuple(whole.T)), axis=-1)
         return vertices, self.slam.solver.estimate(vertices), true
 
     def figures(self) -> dict[str, float]:
@@ -97,7 +100,7 @@ class Drive:
         true = np.zeros((len(self.update_s), self.course.space.dimensions))
         true[:, :2] = self.course.where[: len(true)]
         late_ms, slam = 1e3 * np.array(self.update_s[len(self.update_s) // 2 :]), self.slam
-        _, there, right = self.landmarks()
+        there, right = (one[:, : true.shape[1]] for one in self.landmarks()[1:])
         return {
             "vertices": len(slam.solver.vertices),
             "edges": len(slam.solver.edges),
@@ -126,10 +129,11 @@ class Drive:
         newest, (vertices, there, right) = slam.keyframes[-1].vertex, self.landmarks()
         (pose,) = slam.solver.estimate([newest])
         true = self._in_map("compose", self.course.pose(len(slam.keyframes) - 1))
-        turn, shift = fitted(there, right)
+        turn, shift = fitted(there[:, :n], right[:, :n])
         error = float(np.linalg.norm(turn @ pose[:n] + shift - np.array(true[:n])))
         (covariance,) = slam.solver.marginal([newest])
-        off, of_marks = np.array(space.group.log(space.group.between(tuple(pose), true))), (there - right).ravel()
+        off = np.array(space.group.log(space.group.between(tuple(pose), true)))
+        of_marks = slam.graph.kind_of(vertices[0]).local(there, right).ravel()
         joint = slam.solver.joint_marginal(vertices)
         nees = float(off @ np.linalg.solve(covariance, off)) / len(off)
         return error, nees, float(of_marks @ np.linalg.solve(joint, of_marks)) / len(of_marks)
@@ -141,10 +145,10 @@ def _resident_mib() -> float:
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
-def drive(seed: int, keyframes: int, window: int, dimensions: int = 2) -> dict[str, float]:
+def drive(seed: int, keyframes: int, window: int, dimensions: int = 2, tags: bool = False) -> dict[str, float]:
     """Return the figures of one drive."""
     Drive(Course(seed, 60), 0).run()  # what is loaded or compiled at first use is not counted
-    one = Drive(Course(seed, keyframes, PLANAR if dimensions == 2 else SPATIAL), window)
+    one = Drive(Course(seed, keyframes, PLANAR if dimensions == 2 else SPATIAL, tags=tags), window)
     one.run()
     return one.figures()
 
@@ -152,12 +156,14 @@ def drive(seed: int, keyframes: int, window: int, dimensions: int = 2) -> dict[s
 _AGAINST = ("newest m", "path m", "landmarks m", "NEES newest", "NEES landmarks")
 
 
-def measure(keyframes: int, seeds: Sequence[int], windows: Sequence[int], dimensions: int) -> Iterator[table.Row]:
+def measure(
+    keyframes: int, seeds: Sequence[int], windows: Sequence[int], dimensions: int, *, tags: bool
+) -> Iterator[table.Row]:
     """Yield a row for each drive, and one for each window: the means, and errors over those of all keyframes."""
     found: dict[int, list[dict[str, float]]] = {window: [] for window in windows}
     for seed in seeds:
         for window in windows:
-            row = fresh.call(lifelong.drive, seed, keyframes, window, dimensions)
+            row = fresh.call(lifelong.drive, seed, keyframes, window, dimensions, tags)
             found[window].append(row)
             yield {"seed": seed, "window": window or "all", **row}
     for window, rows in found.items():
@@ -176,10 +182,11 @@ def main() -> None:
     options.add_argument("--seeds", type=values.count, default=2, metavar="N", help="drives 0 to N - 1")
     options.add_argument("--windows", type=int, nargs="+", default=[0, 60, 2000], help="keyframes; 0 keeps all")
     options.add_argument("--dimensions", type=int, choices=(2, 3), default=2)
+    options.add_argument("--tags", action="store_true", help="the orientation of landmarks is seen, too")
     options.add_argument("--json", type=Path, metavar="OUT", help="write the results there as well")
     args = options.parse_args()
     rows = []
-    for row in measure(args.keyframes, range(args.seeds), args.windows, args.dimensions):
+    for row in measure(args.keyframes, range(args.seeds), args.windows, args.dimensions, tags=args.tags):
         print(
             "benchmarks:",
             *(f"{k}={v:.4g}" if isinstance(v, float) else f"{k}={v}" for k, v in row.items()),

@@ -42,7 +42,7 @@ from graph_slam_ros.graph import (
     VertexKind,
     place_edge,
 )
-from graph_slam_ros.graph.place import MOST_MEMBERS
+from graph_slam_ros.graph.place import MOST_MEMBERS, members_of
 from graph_slam_ros.plugin_edges import fault_of, isolated, measured_at_stamps, named
 from graph_slam_ros.plugins import EDGES, load, names
 
@@ -82,8 +82,12 @@ EDGE_TAGS: dict[str, EdgeType] = {
     "EDGE_ATTITUDE_SE3": ATTITUDE_PRIOR_3D,
     "EDGE_HEADING_SE3": HEADING_PRIOR_3D,
 }
+_PLACE = re.compile(r"(0|[1-9][0-9]{0,2})(?::([1-9][0-9]{0,2}))?", re.ASCII)
 OFFSET = "PARAMS_SE3OFFSET"
-PLACE_TAGS = {"EDGE_PLACE_SE2_XY": SE2, "EDGE_PLACE_SE3_XYZ": SE3}  # ours; ":" and the number of points follow
+PLACE_TAGS = {
+    "EDGE_PLACE_SE2_XY": SE2,
+    "EDGE_PLACE_SE3_XYZ": SE3,
+}  # ours; ":3" follows, or ":3:1" with a pose
 _BUILT_IN = {edge: tag for tag, edge in EDGE_TAGS.items()} | {INVERSE_RELATIVE_POSE: "EDGE_SE2"}
 _RESERVED = frozenset({*EDGE_TAGS, *VERTEX_TAGS, OFFSET, "FIX"})
 _loaded: dict[str, tuple[EdgeType, EdgeType, EdgeType]] = {}  # of plugins: as given, for files, and for maps
@@ -93,8 +97,9 @@ _tags: dict[EdgeType, str] = {}
 def built_in(tag: str) -> EdgeType | None:
     """Return the edge type of a tag that is built in; None for others."""
     base, _, members = tag.partition(":")
-    if base in PLACE_TAGS and re.fullmatch(r"[1-9][0-9]{0,2}", members, re.ASCII):
-        return place_edge(PLACE_TAGS[base], int(members))
+    if base in PLACE_TAGS and (found := _PLACE.fullmatch(members)):
+        points, poses = int(found[1]), int(found[2] or 0)
+        return place_edge(PLACE_TAGS[base], points, poses) if 0 < points + poses <= MOST_MEMBERS else None
     return EDGE_TAGS.get(tag)
 
 
@@ -135,10 +140,10 @@ def tag_of(edge: EdgeType) -> str:
     FormatError
         It is not built in, and no plugin has it; those that cannot be used are named.
     """
-    for base, pose in PLACE_TAGS.items():
-        members = len(edge.accepts) - 1
-        if pose in edge.accepts[0] and 1 <= members <= MOST_MEMBERS and edge is place_edge(pose, members):
-            return f"{base}:{members}"
+    if members := members_of(edge):
+        points, poses = members
+        base = next(tag for tag, pose in PLACE_TAGS.items() if pose in edge.accepts[0])
+        return f"{base}:{points}" + (f":{poses}" if poses else "")
     faults = []
     if edge not in _BUILT_IN and edge not in _tags:
         for tag in sorted(plugin_tags()):

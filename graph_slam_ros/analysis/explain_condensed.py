@@ -73,15 +73,24 @@ def statements_of_place(run: SavedGraph, e: Entry) -> Iterator[tuple[str, str]]:
     several = ((cell, one) for cell, all_of_it in places.items() for one in all_of_it)
     cell, place = next((cell, one) for cell, one in several if run.graph.edge_ids.of(one.edge) == e.edge)
     base, *members = e.vertices
-    width, n = run.config.map.cell_m, run.space.dimensions
+    width = run.config.map.cell_m
     corner = " ".join(f"{width * c:.4g}" for c in cell)
     visits = f"{place.place.visits} visit{'s' * (place.place.visits > 1)}"
     yield f"edge {e.edge}", f"a place: {visits} to the cell of {width:.4g} m at {corner} m"
     yield "base", f"keyframe {run.keyframe(base)}"
-    sigmas = np.sqrt(np.diagonal(np.linalg.inv(e.information_matrix))).reshape(-1, n).max(axis=1)
-    names = [f"{run.landmark_of(v)} ({sigma:.3f} m)" for v, sigma in zip(members, sigmas.tolist(), strict=True)]
-    yield "members", f"{', '.join(names)}: the sigma of each as seen from the base, along its worst axis"
+    names = map(run.landmark_of, members)
+    texts = [f"{name} ({sigmas})" for name, sigmas in zip(names, _sigmas(run, e, len(members)), strict=True)]
+    yield "members", f"{', '.join(texts)}: the sigma of each as seen from the base, along its worst axis"
     yield "now", f"chi2 {e.chi2:.4g} with {e.dof} degrees of freedom; a place is never judged as a whole"
     strikes = [f"{run.landmark_of(v)} ({count})" for v, count in place.strikes.items()]
     if strikes:
         yield "against", f"the newest visits contradict the place in {', '.join(strikes)}"
+
+
+def _sigmas(run: SavedGraph, e: Entry, members: int) -> list[str]:
+    """Return the sigma of each landmark of a place, of those that are poses also of the rotation."""
+    sigmas, n, space = np.sqrt(np.diagonal(np.linalg.inv(e.information_matrix))), run.space.dimensions, run.space
+    out = [f"{sigma:.3f} m" for sigma in sigmas[: n * members].reshape(-1, n).max(axis=1).tolist()]
+    rotations = np.rad2deg(sigmas[n * members :].reshape(-1, space.dof - n).max(axis=1)).tolist()
+    first = members - len(rotations)
+    return [*out[:first], *(f"{of}, {turn:.2f} deg" for of, turn in zip(out[first:], rotations, strict=True))]

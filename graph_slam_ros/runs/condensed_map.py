@@ -33,9 +33,9 @@ from graph_slam_ros.graph.lasting_ids import LastingIds
 from graph_slam_ros.runs.journal import read_records
 from graph_slam_ros.slam.bounded_map import Condensation
 from graph_slam_ros.slam.condensed_edges import CondensedEdge
-from graph_slam_ros.slam.lifelong.condenser import place_of
 from graph_slam_ros.slam.lifelong.fit import VisitScale
 from graph_slam_ros.slam.lifelong.frames import Frames, frame_type, member_type
+from graph_slam_ros.slam.lifelong.place_edge import place_of
 from graph_slam_ros.slam.lifelong.removed import Left, OldKeyframe, Records, record_type
 from graph_slam_ros.slam.lifelong.state import BoundedState
 
@@ -57,7 +57,7 @@ def condensed_record(graph: Graph, first: int, state: BoundedState) -> Record:
             one.edge,
             one.place.visits,
             [list(pair) for pair in one.strikes.items()],
-            one.place.linearized_at.tolist(),
+            one.place.linearized_at.numbers.tolist(),
         ]
         for cell, several in state.places.items()
         for one in several
@@ -97,9 +97,9 @@ def read_condensed(graph: Graph, record: Mapping[str, Any]) -> tuple[int, Bounde
         raise ValueError(f"condensed: the variances of visits count {state.scale.factor} times")
     for cell, number, visits, strikes, *at in record["places"]:
         edge = graph.edge(number)
-        where = (
-            np.array(at[0], dtype=np.float64).reshape(len(edge.vertices) - 1, -1) if at else None
-        )  # as in older maps
+        where = np.array(at[0], dtype=np.float64).ravel() if at else None  # older maps have rows, or nothing
+        if where is not None and len(where) != edge.type.measured_size:
+            raise ValueError(f"condensed: place {number} is linearised at {len(where)} numbers")
         if where is not None and not np.isfinite(where).all():
             raise ValueError(f"condensed: place {number} has a landmark that is nowhere")
         state.places.setdefault(tuple(cell), []).append(place_of(edge, where, visits, dict(strikes)))
@@ -114,7 +114,7 @@ def left_records(done: Condensation) -> Iterator[Record]:
     """Return the records of what has left a map."""
     left = done.left
     rows = {"keyframes": _text(left.keyframes), "sightings": _text(left.sightings)}
-    rows |= {"frames": _text(left.frames.rows), "members": _text(left.frames.members)}
+    rows |= {"frames": _text(left.frames.rows), "ends": _text(left.frames.members)}
     yield {"type": "left", "first": done.first, "sightings_before": done.sightings_before, **rows}
     if done.edges:
         out = io.StringIO()
@@ -138,9 +138,7 @@ def read_left(folder: Path, space: Geometry, state: BoundedState | None) -> Left
                 break
             keyframes, sightings = (_rows(record[name], record_type(space)) for name in ("keyframes", "sightings"))
             frames = _rows(record.get("frames", ""), frame_type(space))
-            found.append(
-                Left(keyframes, sightings, Frames(frames, _rows(record.get("members", ""), member_type(space))))
-            )
+            found.append(Left(keyframes, sightings, Frames(frames, _frame_members(record, space))))
     out = Left.joined(space, found)
     count = len(out.keyframes), len(out.sightings), len(out.frames)
     if state is not None and count != (state.keyframes, state.sightings, state.frames):
@@ -176,6 +174,18 @@ def read_left_edges(folder: Path) -> Iterator[dict[str, str]]:
     """Return the rows of the edges that have left the map of a run, by column."""
     for record in read_records(folder, CONDENSED, [], "left_edges"):
         yield from csv.DictReader(io.StringIO(record["table"]), COLUMNS)
+
+
+def _frame_members(record: Record, space: Geometry) -> Records:
+    """Return the landmarks of frames; older maps have no axes."""
+    kind = member_type(space)
+    if "ends" in record:
+        return _rows(record["ends"], kind)
+    older = _rows(record.get("members", ""), np.dtype([(name, kind[name]) for name in ("landmark", "point", "weight")]))
+    out = np.zeros(len(older), kind)
+    for name in older.dtype.names or ():
+        out[name] = older[name]
+    return out
 
 
 def _text(rows: Records) -> str:

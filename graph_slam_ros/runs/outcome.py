@@ -275,8 +275,8 @@ def _doubtful_visits(counted: Mapping[str, int], most: float) -> Iterator[str]:
     kept = counted.get("not_condensed", 0)
     if kept > max(_visits(counted), _FEWEST_LOST):
         yield (
-            f"map.condense: {kept} keyframes are not condensed: they see landmarks with orientation, or ranges with an "
-            "offset, so the map still grows with the distance"
+            f"map.condense: {kept} keyframes are not condensed: they see ranges with an offset, or other edges hold "
+            "them, so the map still grows with the distance"
         )
 
 

@@ -21,11 +21,12 @@ from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
 from graph_slam_ros.slam.kidnap_detector import KidnapDetector
 from graph_slam_ros.slam.landmarks.landmark_frontend import LandmarkFrontend
 from graph_slam_ros.slam.lifelong.compaction import compact
-from graph_slam_ros.slam.lifelong.condenser import CHAIN, Cell, Condensed, Condenser, PlaceEdge
+from graph_slam_ros.slam.lifelong.condenser import CHAIN, Cell, Condensed, Condenser
 from graph_slam_ros.slam.lifelong.frames import LONGEST as FRAME
 from graph_slam_ros.slam.lifelong.frames import Frames, frame_of, weight_at
+from graph_slam_ros.slam.lifelong.place_edge import PlaceEdge
 from graph_slam_ros.slam.lifelong.removed import Left, OldKeyframe, Records, record_type
-from graph_slam_ros.slam.lifelong.surroundings import CLOSURES, FIXES
+from graph_slam_ros.slam.lifelong.surroundings import CLOSURES, FIXES, is_sighting
 from graph_slam_ros.slam.robust.gating import CANDIDATES
 from graph_slam_ros.slam.solution import Solution
 from graph_slam_ros.solver import Solver
@@ -86,7 +87,7 @@ class BoundedMap:
         """Return whether so many keyframes are out of the window that some should leave, and nothing else goes on."""
         keyframes, map_ = self._frontend.path.keyframes, self._frontend.config.map
         count = len(keyframes)
-        if not map_.condense or count - keyframes.first < map_.window_keyframes + BATCH or count == self._tried:
+        if not map_.condense or count - keyframes.first < map_.window_keyframes + BATCH or count <= self._tried:
             return False
         return self._backend.is_quiet and self._kidnaps.is_quiet and self._solution.is_whole
 
@@ -105,6 +106,7 @@ class BoundedMap:
             backend.hand_over_condensed(len(keyframes) - 1)
         except Exception as error:
             self._counters.count(_SOURCE, type(error).__name__)
+            self._tried += BATCH - 1  # the same would most likely fail at the next keyframe again
             vars(backend.graph).update(vars(graph))
             self.state.places.clear()
             self.state.places.update(places)
@@ -173,7 +175,7 @@ class BoundedMap:
     def _seen_from(self, vertex: int) -> set[int] | None:
         """The landmarks that are seen from a keyframe; None where it cannot be condensed.
 
-        It can be if it is free, with edges of odometry, sightings of points, closures and fixes alone.
+        It can be if it is free, with edges of odometry, sightings, closures and fixes alone.
         """
         graph, space, out = self._backend.graph, self._space, set[int]()
         if self._backend.solver.is_held(vertex):  # it is of a frozen map, or of one that the robot is located in
@@ -181,10 +183,10 @@ class BoundedMap:
         for edge in self._backend.solver.edges_on(vertex).tolist():
             one = graph.edge(edge)
             is_odometry = one.type is space.relative_pose and one.label in ("odometry", CHAIN)
-            is_sighting = len(one.vertices) == 2 and graph.kind_of(one.vertices[1]) is space.point
-            if one.weight and not (is_odometry or is_sighting or one.label in (CLOSURES, FIXES)):
+            is_seen = is_sighting(space, graph, one)
+            if one.weight and not (is_odometry or is_seen or one.label in (CLOSURES, FIXES)):
                 return None
-            if one.weight and is_sighting:
+            if one.weight and is_seen:
                 out.add(one.vertices[1])
         return out
 
@@ -226,10 +228,10 @@ class BoundedMap:
         solver, lasting, n = self._backend.solver, self._backend.graph.vertex_ids, self._space.dimensions
         landmarks = dict[int, tuple[Numbers, float]]()
         for vertex, mark in (both for both in done.seen if both[0] in stretch):
-            ends = solver.estimate([mark])[0], solver.estimate([vertex])[0]
-            weight = weight_at(float(np.linalg.norm(ends[0] - ends[1][:n])))
+            there, here = (solver.estimate([one])[0] for one in (mark, vertex))
             before = landmarks.get(lasting.of(mark), ((), 0.0))[1]
-            landmarks[lasting.of(mark)] = tuple(ends[0].tolist()), before + weight
+            weight = before + weight_at(float(np.linalg.norm(there[:n] - here[:n])))
+            landmarks[lasting.of(mark)] = tuple(there.tolist()), weight
         base = done.removed[0].base
         return frame_of(self._space, (lasting.of(base), self._solution.pose(base)), at, landmarks)
 

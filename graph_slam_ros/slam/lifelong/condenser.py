@@ -1,15 +1,14 @@
 """Condensing: the keyframes of a visit leave the problem, and an edge of the place has what they measured."""
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.errors import SingularError
-from graph_slam_ros.graph import Edge, Gaussian, place_edge
+from graph_slam_ros.graph import Gaussian
 from graph_slam_ros.graph.geometry import Geometry
-from graph_slam_ros.graph.place import LABEL
 from graph_slam_ros.slam.lifelong.carried import (
     Carried,
     carried_closure,
@@ -18,13 +17,14 @@ from graph_slam_ros.slam.lifelong.carried import (
     motions_from,
 )
 from graph_slam_ros.slam.lifelong.compaction import Renumbered
-from graph_slam_ros.slam.lifelong.elimination import product, square_root
+from graph_slam_ros.slam.lifelong.elimination import square_root
 from graph_slam_ros.slam.lifelong.fit import VisitScale, fit_of
-from graph_slam_ros.slam.lifelong.place import Fused, Place, fewest_shared
+from graph_slam_ros.slam.lifelong.place import Fused, Place
+from graph_slam_ros.slam.lifelong.place_edge import PlaceEdge, added_place
 from graph_slam_ros.slam.lifelong.surroundings import CLOSURES, Motion, Surroundings, chained, motion_of, surroundings
 from graph_slam_ros.slam.lifelong.visit import Visit, best_known, visit_of
 from graph_slam_ros.solver import Solver
-from graph_slam_ros.typing import Array, Numbers
+from graph_slam_ros.typing import Numbers
 
 Cell = tuple[int, ...]
 CHAIN = "composed"  # label of edges that are composed of odometry
@@ -57,27 +57,6 @@ class RemovedPose:
     vertex: int
     base: int
     T_base_vertex: Numbers
-
-
-@dataclass(slots=True)
-class PlaceEdge:
-    """A place, the vertex that it is seen from and its edge; ``strikes`` of each landmark that visits contradict."""
-
-    base: int
-    place: Place
-    edge: int
-    strikes: dict[int, int] = field(default_factory=dict)
-
-
-def place_of(
-    edge: Edge, linearized_at: Array | None, visits: int, strikes: Mapping[int, int] | None = None
-) -> PlaceEdge:
-    """Return the place of an edge, which has its other numbers; without ``linearized_at`` it is linearised at them."""
-    base, *members = edge.vertices
-    information = product(edge.sqrt_information.T, edge.sqrt_information)
-    points = edge.measured.reshape(len(members), -1)
-    place = Place(tuple(members), points, points if linearized_at is None else linearized_at, information, visits)
-    return PlaceEdge(base, place, edge.id, dict(strikes or {}))
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,8 +124,8 @@ class Condenser:
         seen = {edge.vertices[1] for edge in around.sightings.values()}
         best = max(in_cell, key=lambda one: len(seen & set(one.place.members)), default=None)
         fits = best is not None and len(seen | set(best.place.members)) <= self.limits.members
-        is_again = fits and best is not None and len(seen & set(best.place.members)) >= fewest_shared(self.space)
-        has_room = len(in_cell) < self.limits.places and len(seen) >= fewest_shared(self.space)
+        is_again = fits and best is not None and self._lay(seen & set(best.place.members))
+        has_room = len(in_cell) < self.limits.places and self._lay(seen)
         if is_again and len(self._known() & set(ahead)) < _AHEAD:
             if waits or not has_room:
                 return Condensed("waits")
@@ -180,7 +159,7 @@ class Condenser:
         by = self.scale.change()
         for one in (one for in_cell in self.places.values() for one in in_cell if by != 1.0):
             place = replace(one.place, information=one.place.information / by)
-            now = self._place_edge(one.base, place, square_root(place.information))
+            now = added_place(self.space, self.solver.graph, one.base, place, square_root(place.information))
             self.solver.add([], [now.edge])
             self.solver.set_weight(one.edge, 0.0)
             one.place, one.edge = now.place, now.edge
@@ -196,7 +175,7 @@ class Condenser:
             return Condensed("kept", f"landmark {lonely[0]} would be left without a measurement")
         root = square_root(one.information)
         added, also = self._joined(visit, at, after, around, 1.0 - _SHARE)
-        begun = self._place_edge(base, Place.begun_by(one), root)
+        begun = added_place(self.space, self.solver.graph, base, Place.begun_by(one), root)
         self.places.setdefault(cell, []).append(begun)
         removed = self._replace(visit, around, [*added, begun.edge], kept=base, seen_from=base, also=also)
         return Condensed("first", removed=removed, seen=_seen(around, one.members))
@@ -243,7 +222,7 @@ class Condenser:
             return self._composed(visit, after, around, _PLACE, fit.as_is)
         legs = [motion_of(edge) for edge in around.steps]
         carried = self._carried(visit, around, at.base, [(guess, result.covariance)], legs)
-        now = self._place_edge(at.base, result.place, square_root(result.place.information))
+        now = added_place(self.space, self.solver.graph, at.base, result.place, square_root(result.place.information))
         added, also = self._add_carried(carried)
         removed = self._replace(visit, around, [now.edge, *added], kept=None, seen_from=at.base, also=[at.edge, *also])
         if fit.anew is not None:
@@ -323,6 +302,11 @@ class Condenser:
         graph.set_weights(np.array(sorted(replaced & set(added)), dtype=np.int64), 0.0)
         return [edge for edge in added if edge not in replaced], sorted(replaced - set(added))
 
+    def _lay(self, marks: Collection[int]) -> bool:
+        """Return whether landmarks say how a constellation lies: one that is a pose does, or two or three points."""
+        is_pose = any(self.solver.graph.kind_of(mark) is self.space.pose for mark in marks)
+        return is_pose or len(marks) >= self.space.dimensions
+
     def _known(self) -> set[int]:
         return {mark for in_cell in self.places.values() for one in in_cell for mark in one.place.members}
 
@@ -345,12 +329,6 @@ class Condenser:
             edge = self.solver.graph.add_edge(self.space.relative_pose, [first, last], pose, noise, CHAIN)
             out.append(edge)
         return out
-
-    def _place_edge(self, base: int, place: Place, root: Array) -> PlaceEdge:
-        kind = place_edge(self.space.pose, len(place.members))
-        at = [base, *place.members]
-        edge = self.solver.graph.add_edge(kind, at, place.points.ravel(), Gaussian(root), LABEL)
-        return place_of(self.solver.graph.edge(edge), place.linearized_at, place.visits)
 
     def _replace(
         self,

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.graph.geometry import Geometry
-from graph_slam_ros.slam.lifelong.place import Fused, Place, fewest_shared, fused, visit_without
+from graph_slam_ros.slam.lifelong.place import Fused, Place, fused, visit_without
 from graph_slam_ros.slam.lifelong.visit import Visit
 from graph_slam_ros.typing import Numbers
 
@@ -109,9 +109,10 @@ def _passes(done: Fused, gate: float) -> bool:
 def _contradicting(space: Geometry, place: Place, visit: Visit, guess: Numbers, gate: float) -> int | None:
     """Return the landmark without which a visit fits its place best; None where it fits without none of them."""
     shared, found = place.shared(visit), list[tuple[float, int]]()
-    if len(shared) <= fewest_shared(space):
-        return None
-    for mark in shared:
+    for k, mark in enumerate(shared):
+        rest = [place.members.index(one) for one in (*shared[:k], *shared[k + 1 :])]
+        if not place.seen.part(rest).lays(space):
+            continue
         done = fused(space, place, visit_without(visit, mark), guess)
         if _passes(done, gate):
             found.append((done.statistic, mark))

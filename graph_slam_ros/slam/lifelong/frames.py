@@ -2,7 +2,8 @@
 
 A keyframe that left the map is told relative to a *frame*, the pose of a short stretch of keyframes. The frame knows
 where the landmarks that were seen from the stretch were in its axes when it left. So its present pose is the one that
-lays these on the present landmarks best, and an old path becomes as good as the landmarks are now.
+lays these on the present landmarks best, and an old path becomes as good as the landmarks are now. Of a landmark that
+is a pose, the frame knows the ends of its axes, too.
 """
 
 from collections.abc import Mapping, Sequence
@@ -12,15 +13,37 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graph_slam_ros.graph.geometry import Geometry
-from graph_slam_ros.slam.lifelong.place import rigid_motions
+from graph_slam_ros.slam.lifelong.constellation import rigid_motions
 from graph_slam_ros.typing import Array, Index, Numbers
 
 LONGEST = 20  # keyframes of a frame
 _SIGMA, _LEAST_M = 0.05, 0.05  # standard deviation of a sighting: by its distance, and at least
 _ARM_M, _SHARE = 5.0, 0.02  # by the base alone: points so far from the frame, with so much of the weight
-_ROUNDS, _OFF = 6, 3.0  # of the fit; a landmark that is farther off, in standard deviations, counts less
+_TIP_M = 1.0  # length of the axes of a landmark that is a pose
+_OFF = 3.0  # a landmark that is farther off, in standard deviations, counts less
+_ROUNDS = (32.0, 16.0, 8.0, 4.0, 2.0, 1.0, 1.0, 1.0)  # of the fit: so many times as far, as it begins at the base alone
 
 Rows = NDArray[np.void]
+
+
+@dataclass(frozen=True, slots=True)
+class PresentLandmarks:
+    """The landmarks that are in the map.
+
+    Attributes
+    ----------
+    ids : lasting ids, ascending; points : (m, d) positions [m]
+    axes : (m, d, d) rotation matrices of those that are poses, 0 of others
+    """
+
+    ids: Index
+    points: Array
+    axes: Array
+
+    def ends(self, rows: Index, axis: Index) -> Array:
+        """Return the positions (n, d) of some landmarks, or of the end of one of their axes, counted from 1."""
+        tips = np.take_along_axis(self.axes[rows], np.maximum(axis - 1, 0)[:, None, None], axis=2)[:, :, 0]
+        return self.points[rows] + np.where(axis[:, None] > 0, _TIP_M * tips, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,8 +53,8 @@ class Frames:
     Attributes
     ----------
     rows : ``base``, the lasting id of a vertex that stays, ``T_base`` (size,), ``count`` of its landmarks
-    members : of all frames, in order: ``landmark``, its lasting id, ``point`` (d,) in the axes of the frame [m],
-        ``weight`` [1/m^2]
+    members : of all frames, in order: ``landmark``, its lasting id, ``axis``, 0 or the number of an axis of a pose,
+        ``point`` (d,), its position or the end of that axis, in the axes of the frame [m], ``weight`` [1/m^2]
     """
 
     rows: Rows
@@ -51,19 +74,19 @@ class Frames:
     def __len__(self) -> int:
         return len(self.rows)
 
-    def poses(self, space: Geometry, bases: Array, ids: Index, points: Array) -> Array:
+    def poses(self, space: Geometry, bases: Array, landmarks: PresentLandmarks) -> Array:
         """Return the present poses (n, size) of all frames.
 
         Parameters
         ----------
         bases : the present poses of their bases, (n, size)
-        ids, points : lasting ids of the landmarks that are in the map, ascending, and their positions (m, d)
         """
         count, d, group = len(self), space.dimensions, space.group
         out = np.stack(group.compose(tuple(bases.T), tuple(self.rows["T_base"].T)), axis=-1)
-        frame, at = np.repeat(np.arange(count), self.rows["count"]), np.searchsorted(ids, self.members["landmark"])
+        frame, ids = np.repeat(np.arange(count), self.rows["count"]), landmarks.ids
         is_there = np.isin(self.members["landmark"], ids)
-        frame, known, now = frame[is_there], self.members[is_there], points[at[is_there]]
+        frame, known = frame[is_there], self.members[is_there]
+        now = landmarks.ends(np.searchsorted(ids, known["landmark"]), known["axis"])
         # The base counts, too: as if landmarks at these arms had moved with it.
         arms = _ARM_M * np.concatenate((np.eye(d), -np.eye(d)))
         of_arms, share = np.repeat(np.arange(count), len(arms)), np.bincount(frame, known["weight"], minlength=count)
@@ -73,10 +96,10 @@ class Frames:
         here, there = np.concatenate((known["point"], by_base)), np.concatenate((now, moved))
         weight = np.concatenate((known["weight"], (_SHARE / len(arms) * np.maximum(share, 1.0))[of_arms]))
         columns = rigid_motions(here).reshape(len(here), d, -1)
-        for _ in range(_ROUNDS):
+        for times in _ROUNDS:
             seen = np.stack(group.act(group.inverse(tuple(out[frame].T)), tuple(there.T)), axis=-1)
             off = seen - here
-            robust = np.where(is_arm, weight, weight / (1.0 + weight * (off**2).sum(axis=1) / _OFF**2) ** 2)
+            robust = np.where(is_arm, weight, weight / (1.0 + weight * (off**2).sum(axis=1) / (times * _OFF) ** 2) ** 2)
             weighted = robust[:, None, None] * columns
             normal, right = np.zeros((count, space.dof, space.dof)), np.zeros((count, space.dof))
             np.add.at(normal, frame, np.einsum("nik,nil->nkl", weighted, columns))
@@ -94,13 +117,17 @@ def frame_of(
     Parameters
     ----------
     base : lasting id and pose of a vertex that stays; at : pose of the frame
-    landmarks : that were seen from its keyframes: by lasting id the position [m] and the weight [1/m^2]
+    landmarks : that were seen from its keyframes: by lasting id the position or pose [m, rad] and the weight [1/m^2]
     """
-    group = space.group
-    out = Frames(np.empty(1, frame_type(space)), np.empty(len(landmarks), member_type(space)))
-    out.rows[0] = base[0], group.between(base[1], at), len(landmarks)
-    for k, (landmark, (point, weight)) in enumerate(sorted(landmarks.items())):
-        out.members[k] = landmark, group.act(group.inverse(at), point), weight
+    group, d, members = space.group, space.dimensions, list[tuple[int, int, Numbers, float]]()
+    for landmark, (value, weight) in sorted(landmarks.items()):
+        ends = np.array(value[:d])[None]
+        if len(value) == space.pose.size:
+            ends = np.concatenate((ends, ends + _TIP_M * space.turn(value).T))
+        for axis, end in enumerate(ends.tolist()):
+            members.append((landmark, axis, group.act(group.inverse(at), tuple(end)), weight))
+    out = Frames(np.empty(1, frame_type(space)), np.array(members, dtype=member_type(space)))
+    out.rows[0] = base[0], group.between(base[1], at), len(members)
     return out
 
 
@@ -116,4 +143,4 @@ def frame_type(space: Geometry) -> np.dtype[np.void]:
 
 def member_type(space: Geometry) -> np.dtype[np.void]:
     """Return the type of the rows of their landmarks."""
-    return np.dtype([("landmark", "<i8"), ("point", "<f8", (space.dimensions,)), ("weight", "<f8")])
+    return np.dtype([("landmark", "<i8"), ("axis", "<i8"), ("point", "<f8", (space.dimensions,)), ("weight", "<f8")])

@@ -7,9 +7,10 @@ import numpy as np
 
 from graph_slam_ros.errors import SingularError
 from graph_slam_ros.graph.geometry import Geometry
+from graph_slam_ros.slam.lifelong.constellation import Constellation, combined, turned
 from graph_slam_ros.slam.lifelong.elimination import marginal_information, product, quadratic, solution, without
 from graph_slam_ros.slam.lifelong.visit import Visit
-from graph_slam_ros.typing import Array, Index, Numbers
+from graph_slam_ros.typing import Array, Numbers
 
 _STEPS, _STILL = 30, 1e-12  # Gauss-Newton steps of a motion, at most; until it moves by no more [m, rad]
 
@@ -20,39 +21,38 @@ class Place:
 
     Attributes
     ----------
-    members : vertices of the landmarks, ascending
-    points : (m, d) their positions in the axes of the pose [m]; information : (m d, m d) of these, given the pose
-    linearized_at : (m, d) the same by the whole map when each became a member. Motions of the whole place are
-        linearised there for good: at changing points, visits would seem to measure how the place is turned
+    members : vertices of the landmarks: points, ascending, and then poses, ascending
+    seen : how they lie in the axes of the pose; information : (n, n) of a step of that, given the pose
+    linearized_at : the same by the whole map when each became a member. Motions of the whole place are linearised
+        there for good: at changing positions, visits would seem to measure how the place is turned
     visits : how many are in it
     """
 
     members: tuple[int, ...]
-    points: Array
-    linearized_at: Array
+    seen: Constellation
+    linearized_at: Constellation
     information: Array
     visits: int = 1
 
     @classmethod
     def begun_by(cls, visit: Visit) -> "Place":
         """Return the place that one visit knows, seen from the pose that the visit is seen from."""
-        return cls(visit.members, visit.points, visit.linearized_at, visit.information)
+        return cls(visit.members, visit.seen, visit.linearized_at, visit.information)
 
     def shared(self, visit: Visit) -> list[int]:
-        """Return the members that a visit saw, too."""
-        return sorted(set(self.members) & set(visit.members))
+        """Return the members that a visit saw, too, in their order here."""
+        theirs = set(visit.members)
+        return [one for one in self.members if one in theirs]
 
     def without(self, member: int) -> "Place":
         """Return the place after one of its landmarks was marginalised out."""
         kept = [k for k, one in enumerate(self.members) if one != member]
-        information = marginal_information(self.information, _numbers(kept, self.points.shape[1]))
-        members = tuple(self.members[k] for k in kept)
         return replace(
             self,
-            members=members,
-            points=self.points[kept],
-            linearized_at=self.linearized_at[kept],
-            information=information,
+            members=tuple(self.members[k] for k in kept),
+            seen=self.seen.part(kept),
+            linearized_at=self.linearized_at.part(kept),
+            information=marginal_information(self.information, self.seen.indices(kept)),
         )
 
 
@@ -77,13 +77,8 @@ def visit_without(visit: Visit, member: int) -> Visit:
     """Return a visit after one of its landmarks was marginalised out."""
     rest = Place.begun_by(visit).without(member)
     return replace(
-        visit, members=rest.members, points=rest.points, linearized_at=rest.linearized_at, information=rest.information
+        visit, members=rest.members, seen=rest.seen, linearized_at=rest.linearized_at, information=rest.information
     )
-
-
-def fewest_shared(space: Geometry) -> int:
-    """Return how many landmarks lay a visit on a place: 2 in the plane, 3 in space."""
-    return space.dimensions
 
 
 def fused(space: Geometry, place: Place, visit: Visit, T_place_visit: Numbers) -> Fused:
@@ -101,94 +96,76 @@ def fused(space: Geometry, place: Place, visit: Visit, T_place_visit: Numbers) -
     SingularError
         The shared landmarks do not determine that motion.
     """
-    size, shared = space.dimensions, place.shared(visit)
-    if len(shared) < fewest_shared(space):
+    shared = place.shared(visit)
+    at_place, at_visit = _rows(place.members, shared), _rows(visit.members, shared)
+    mine, theirs = place.linearized_at.part(at_place), visit.linearized_at.part(at_visit)
+    if not mine.lays(space):
         raise SingularError(f"the visit shares {len(shared)} landmarks with the place")
-    at_place, at_visit = _places(place.members, shared), _places(visit.members, shared)
-    weight = marginal_information(visit.information, _numbers(at_visit, size))
-    turn, shift, resists = _motion(
-        place.linearized_at[at_place], visit.linearized_at[at_visit], weight, space, T_place_visit
-    )
-    there, where = product(visit.points - shift, turn), product(visit.linearized_at - shift, turn)  # R' (p - t)
-    blocks = visit.information.reshape(len(there), size, len(there), size)
-    turned = np.einsum("ba,ibjc,cd->iajd", turn, blocks, turn, optimize=False).reshape(visit.information.shape)
-    where[at_visit] = place.linearized_at[at_place]
-    shape = without(0.5 * (turned + turned.T), rigid_motions(where))
-    degrees = size * len(shared) - rigid_motions(where).shape[1]
-    fusion, statistic = _sum(place, replace(visit, points=there, linearized_at=where, information=shape))
+    weight = marginal_information(visit.information, visit.seen.indices(at_visit))
+    motion, resists = _motion(mine, theirs, weight, space, T_place_visit)
+    back = space.group.inverse(motion)
+    count, poses = len(visit.members), len(visit.seen.turns)
+    in_place = [(range(count), visit.linearized_at.moved(space, back)), (at_visit, mine)]
+    where = combined(in_place, count, poses, space)
+    columns = where.rigid_motions(space)
+    shape = without(turned(visit.information, space.turn(motion), count), columns)
+    moved = replace(visit, seen=visit.seen.moved(space, back), linearized_at=where, information=shape)
+    fusion, statistic = _sum(space, place, moved)
+    degrees = mine.size - space.dof
     # The place knows its landmarks no worse than one visit does: twice the covariance by the visit alone.
     return Fused(fusion, statistic, max(degrees, 0), np.asarray(2.0 * np.linalg.inv(resists)))
 
 
-def rigid_motions(points: Array) -> Array:
-    """Return how points (m, d) move with the whole, (m d, 3) in the plane and (m d, 6) in space, about the origin."""
-    m, size = points.shape
-    out = np.zeros((m, size, 3 if size == 2 else 6))
-    for axis in range(size):
-        out[:, axis, axis] = 1.0
-    if size == 2:
-        out[:, 0, 2], out[:, 1, 2] = -points[:, 1], points[:, 0]
-    else:
-        x, y, z = points.T
-        out[:, 1, 3], out[:, 2, 3] = -z, y
-        out[:, 0, 4], out[:, 2, 4] = z, -x
-        out[:, 0, 5], out[:, 1, 5] = -y, x
-    return out.reshape(m * size, -1)
-
-
-def _sum(place: Place, visit: Visit) -> tuple[Place, float]:
+def _sum(space: Geometry, place: Place, visit: Visit) -> tuple[Place, float]:
     """Add a visit in the axes of the place to what the place has; returns chi2, too."""
-    members, points, information, size = visit.members, visit.points, visit.information, visit.points.shape[1]
-    all_members = sorted({*place.members, *members})
-    mine, new = _places(all_members, place.members), _places(all_members, members)
-    before, where = np.zeros((2, len(all_members), size))
-    before[new], before[mine] = points, place.points
-    where[new], where[mine] = visit.linearized_at, place.linearized_at
-    mine_at, new_at = _numbers(mine, size), _numbers(new, size)
+    points, poses = (sorted({*one, *other}) for one, other in zip(_by_kind(place), _by_kind(visit), strict=True))
+    members = [*points, *poses]
+    rows = _rows(members, visit.members), _rows(members, place.members)
+    before, where = (
+        combined([*zip(rows, both, strict=True)], len(members), len(poses), space)
+        for both in ((visit.seen, place.seen), (visit.linearized_at, place.linearized_at))
+    )
+    new_at, mine_at = (before.indices(one) for one in rows)
     whole = np.zeros((before.size, before.size))
     whole[np.ix_(mine_at, mine_at)] += place.information
-    whole[np.ix_(new_at, new_at)] += information
+    whole[np.ix_(new_at, new_at)] += visit.information
     right_side = np.zeros(before.size)
-    right_side[new_at] = product(information, (points - before[new]).ravel())
-    step = solution(whole, right_side)
-    after = before + step.reshape(before.shape)
-    statistic = quadratic(place.information, (after[mine] - place.points).ravel())
-    statistic += quadratic(information, (after[new] - points).ravel())
-    return Place(tuple(all_members), after, where, whole, place.visits + 1), statistic
+    right_side[new_at] = product(visit.information, visit.seen.minus(space, before.part(rows[0])))
+    after = before.plus(space, solution(whole, right_side))
+    statistic = quadratic(place.information, after.part(rows[1]).minus(space, place.seen))
+    statistic += quadratic(visit.information, after.part(rows[0]).minus(space, visit.seen))
+    return Place(tuple(members), after, where, whole, place.visits + 1), statistic
 
 
 def _motion(
-    mine: Array, theirs: Array, information: Array, space: Geometry, T_mine_theirs: Numbers
-) -> tuple[Array, Array, Array]:
-    """Return R and t of the motion that lays points best on theirs: ``R p + t``, weighted in the axes of theirs.
+    mine: Constellation, theirs: Constellation, information: Array, space: Geometry, T_mine_theirs: Numbers
+) -> tuple[Numbers, Array]:
+    """Return the motion ``T_theirs_mine`` that lays a constellation best on theirs, weighted in the axes of theirs.
 
-    Also the information of that motion in the tangent space there.
+    Also the information of that motion in the axes of theirs.
     """
-    start = space.group.inverse(T_mine_theirs)
-    turn, shift = space.turn(start), np.array(start[: space.dimensions])
+    group, d = space.group, space.dimensions
+    motion = group.inverse(T_mine_theirs)
     for _ in range(_STEPS):
-        there = product(mine, turn.T) + shift
-        columns = rigid_motions(there)
+        there = mine.moved(space, motion)
+        columns = there.rigid_motions(space)
         along = product(information, columns)
         resists = product(columns.T, along)
-        step = -solution(resists, product(along.T, (there - theirs).ravel()))
-        linear, angular = step[: space.dimensions], step[space.dimensions :]
-        if space.dimensions == 2:
-            added = space.turn((0.0, 0.0, float(angular[0])))
-        else:
-            added = space.turn(space.group.exp((0.0, 0.0, 0.0, *angular.tolist())))
-        turn, shift = product(added, turn), product(added, shift) + linear
+        step = -solution(resists, product(along.T, there.minus(space, theirs)))
+        added = *step[:d].tolist(), *group.exp((*[0.0] * d, *step[d:].tolist()))[d:]
+        motion = space.normalized(tuple(map(float, group.compose(added, motion))))
         if np.abs(step).max() <= _STILL:
             break
-    return turn, shift, resists
+    return motion, resists
 
 
-def _places(among: Sequence[int], wanted: Sequence[int]) -> list[int]:
+def _by_kind(one: Place | Visit) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Return the members that are points, and those that are poses."""
+    first = len(one.members) - len(one.seen.turns)
+    return one.members[:first], one.members[first:]
+
+
+def _rows(among: Sequence[int], wanted: Sequence[int]) -> list[int]:
     """Return where each of some members is among others."""
     at = {member: k for k, member in enumerate(among)}
     return [at[member] for member in wanted]
-
-
-def _numbers(points: Sequence[int], size: int) -> Index:
-    """Return the indices of the coordinates of some points."""
-    return (size * np.asarray(points, dtype=np.int64)[:, None] + np.arange(size)).ravel()

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from graph_slam_ros.errors import FormatError
 from graph_slam_ros.graph.geometry import Geometry
-from graph_slam_ros.slam.lifelong.frames import Frames
+from graph_slam_ros.slam.lifelong.frames import Frames, PresentLandmarks
 from graph_slam_ros.typing import Array, Index, Numbers
 
 Records = NDArray[np.void]
@@ -63,13 +63,12 @@ class Left:
         frames = Frames.joined(space, [one.frames for one in several])
         return cls(np.concatenate(keyframes), np.concatenate(sightings), frames)
 
-    def path(self, space: Geometry, ids: Index, poses: Array, landmarks: tuple[Index, Array]) -> Array:
+    def path(self, space: Geometry, ids: Index, poses: Array, landmarks: PresentLandmarks) -> Array:
         """Return the present poses ``T_map`` of removed keyframes, (n, size).
 
         Parameters
         ----------
         ids, poses : lasting ids of the vertices that are in the graph, ascending, and their estimates
-        landmarks : lasting ids of the landmarks, ascending, and their positions (m, d)
 
         Raises
         ------
@@ -82,7 +81,7 @@ class Left:
             at, is_there = _found(ids, frames.rows["base"])
             if not is_there.all():
                 raise FormatError(f"frame {int(np.argmin(is_there))}: its base is not there")
-            of_frames = frames.poses(space, poses[at], *landmarks)
+            of_frames = frames.poses(space, poses[at], landmarks)
             known = records["base"] < 0
             number = -1 - records["base"][known]
             if len(number) and number.max() >= len(frames):

@@ -3,8 +3,9 @@
 from collections import Counter
 from dataclasses import dataclass, field
 
-from graph_slam_ros.slam.lifelong.condenser import Cell, PlaceEdge
+from graph_slam_ros.slam.lifelong.condenser import Cell
 from graph_slam_ros.slam.lifelong.fit import VisitScale
+from graph_slam_ros.slam.lifelong.place_edge import PlaceEdge
 from graph_slam_ros.slam.lifelong.removed import OldKeyframe
 
 

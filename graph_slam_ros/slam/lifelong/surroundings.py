@@ -6,14 +6,14 @@ from itertools import pairwise
 
 import numpy as np
 
-from graph_slam_ros.graph import Edge
+from graph_slam_ros.graph import Edge, Graph
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.graph.losses import weight_and_cost
 from graph_slam_ros.slam.lifelong.elimination import product
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Numbers
 
-CLOSURES, FIXES = "closures", "fixes"  # labels
+CLOSURES, FIXES, LANDMARKS = "closures", "fixes", "landmarks"  # labels
 Motion = tuple[Numbers, Array]
 """A relative pose and its covariance (dof, dof) in the tangent space at its end."""
 
@@ -24,7 +24,7 @@ class Surroundings:
 
     Attributes
     ----------
-    inside : between its keyframes; sightings : of landmarks that are points
+    inside : between its keyframes; sightings : of landmarks
     into : from elsewhere to the first keyframe; onward : from the last one to the keyframe after the visit
     steps : of each keyframe but the last, the edge of odometry to the next
     closures : from a keyframe to one elsewhere; fixes : of one keyframe
@@ -70,6 +70,8 @@ def surroundings(space: Geometry, solver: Solver, visit: Sequence[int], after: i
             out.closures[number] = edge
         elif edge.label == FIXES:
             out.fixes[number] = edge
+        elif is_sighting(space, graph, edge):
+            out.sightings[number] = edge
         elif edge.type is space.relative_pose:
             if members >= {first, last}:
                 out.inside[number] = edge
@@ -79,8 +81,6 @@ def surroundings(space: Geometry, solver: Solver, visit: Sequence[int], after: i
                 out.into[number] = edge
             else:
                 out.unfit = f"edge {number} leads from the visit to vertex {last if first in members else first}"
-        elif len(edge.vertices) == 2 and graph.kind_of(last) is space.point:
-            out.sightings[number] = edge
         else:
             out.unfit = f"edge {number} is a {edge.type.name}"
     by_ends = {edge.vertices: edge for edge in reversed(out.inside.values()) if edge.label != CLOSURES}
@@ -89,6 +89,13 @@ def surroundings(space: Geometry, solver: Solver, visit: Sequence[int], after: i
         out.unfit = out.unfit or "odometry does not join its keyframes one by one"
     out.factors = _factors(solver, {**out.inside, **out.sightings, **out.closures, **out.fixes})
     return out
+
+
+def is_sighting(space: Geometry, graph: Graph, edge: Edge) -> bool:
+    """Return whether an edge is of a keyframe and a landmark: a point, or a pose that was seen."""
+    if len(edge.vertices) != 2:
+        return False
+    return edge.label == LANDMARKS or graph.kind_of(edge.vertices[1]) is space.point
 
 
 def motion_of(edge: Edge, factor: float | None = None) -> Motion:

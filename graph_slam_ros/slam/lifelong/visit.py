@@ -1,7 +1,8 @@
 """A visit: a stretch of keyframes at one place, and what it measured of the landmarks, as one joint Gaussian."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -9,13 +10,14 @@ from numpy.typing import ArrayLike
 from graph_slam_ros.errors import SingularError
 from graph_slam_ros.graph import Edge, EdgeType, Gaussian, Graph
 from graph_slam_ros.graph.geometry import Geometry
-from graph_slam_ros.slam.lifelong.elimination import marginal_information
+from graph_slam_ros.slam.lifelong.constellation import Constellation
+from graph_slam_ros.slam.lifelong.elimination import marginal_information, product
 from graph_slam_ros.solver import Settings, Solver
 from graph_slam_ros.typing import Array
 
 _SETTINGS = replace(Settings(), step_tolerance=1e-10, cost_tolerance=0.0)
 _ONE_STEP = replace(Settings(), max_iterations=1, cost_tolerance=np.inf)
-_LEAST = 1e-6  # eigenvalue of the correlations of a landmark's position, given the poses: less is no position
+_LEAST = 1e-6  # eigenvalue of the correlations of a landmark, given the poses: with less it is not determined
 Estimate = Callable[[ArrayLike], Array]
 
 
@@ -25,16 +27,16 @@ class Visit:
 
     Attributes
     ----------
-    members : vertices of the landmarks, ascending
-    points : (m, d) their positions in the axes of one pose of the visit [m]
-    linearized_at : (m, d) the same by the whole map, where the edges are linearised
-    information : (m d, m d) of these, given that pose; all other poses are marginalised out
+    members : vertices of the landmarks: points, ascending, and then poses, ascending
+    seen : how they lie in the axes of one pose of the visit
+    linearized_at : the same by the whole map, where the edges are linearised
+    information : (n, n) of a step of that, given that pose; all other poses are marginalised out
     chi2, degrees : of the edges at their own optimum
     """
 
     members: tuple[int, ...]
-    points: Array
-    linearized_at: Array
+    seen: Constellation
+    linearized_at: Constellation
     information: Array
     chi2: float
     degrees: int
@@ -62,30 +64,30 @@ def visit_of(
     """
     records = {edge: graph.edge(edge) for edge in sorted(edges)}
     ends = {number: one.vertices for number, one in records.items()}
-    marks = sorted({v for vertices in ends.values() for v in vertices} - set(poses))
+    marks = _marks(space, graph, ends.values(), poses)
     while marks:
         order = [base, *(v for v in poses if v != base), *marks]
         known = set(order)
         inside = [edge for edge in ends if known.issuperset(ends[edge])]
         counting = [(records[edge], edges[edge]) for edge in inside]
-        solver, at = _local_solver(space, estimate, order, len(marks), counting)
+        solver, at = _local_solver(space, graph, estimate, order, counting)
         solver.hold(at[base])
-        size, information = space.dimensions, solver.information_matrix()
-        whole = {ends[edge][1] for edge in inside if records[edge].type.residual_size >= size}
+        information, sizes = solver.information_matrix(), [graph.kind_of(mark).dof for mark in marks]
+        begins = (len(information) - np.cumsum(sizes[::-1])[::-1]).tolist()
+        whole = {ends[e][1] for e in inside if records[e].type.residual_size >= graph.kind_of(ends[e][1]).dof}
         if not whole.issuperset(marks):
-            blocks = [len(information) - size * (len(marks) - k) for k in range(len(marks))]
-            sure = [_is_sure(information[low : low + size, low : low + size]) for low in blocks]
+            blocks = [information[low : low + n, low : low + n] for low, n in zip(begins, sizes, strict=True)]
+            sure = [_is_sure(block) for block in blocks]
             if not all(sure):
                 marks = [mark for mark, is_sure in zip(marks, sure, strict=True) if is_sure]
                 continue
-        kept = np.arange(len(information) - size * len(marks), len(information))
-        marginal = marginal_information(information, kept)
+        marginal = marginal_information(information, np.arange(begins[0], len(information)))
         numbers = [at[mark] for mark in marks]
-        linearized_at = solver.estimate(numbers)
+        linearized_at = _constellation(space, solver, numbers)
         solver.optimize(_ONE_STEP)
-        points = solver.estimate(numbers)
-        chi2 = solver.optimize().chi2_final
-        return Visit(tuple(marks), points, linearized_at, marginal, chi2, solver.degrees_of_freedom)
+        seen = _constellation(space, solver, numbers)
+        chi2, degrees = solver.optimize().chi2_final, solver.degrees_of_freedom
+        return Visit(tuple(marks), seen, linearized_at, _of_positions(space, marginal, linearized_at), chi2, degrees)
     raise SingularError("the visit determines no landmark")
 
 
@@ -102,10 +104,10 @@ def best_known(
         They do not determine them.
     """
     records = [(graph.edge(edge), edges[edge]) for edge in sorted(edges)]
-    marks = sorted({v for edge, _ in records for v in edge.vertices} - set(poses))
+    marks = _marks(space, graph, (edge.vertices for edge, _ in records), poses)
     if not marks:
         raise SingularError("the visit sees no landmark")
-    solver, at = _local_solver(space, estimate, [*poses, *marks], len(marks), records)
+    solver, at = _local_solver(space, graph, estimate, [*poses, *marks], records)
     for mark in marks:
         solver.hold(at[mark])
     solver.update()
@@ -114,26 +116,57 @@ def best_known(
 
 
 def _is_sure(information: Array) -> bool:
-    """Return whether the information (d, d) of a point is of full rank."""
+    """Return whether the information of a landmark, given the poses, is of full rank."""
     scale = np.sqrt(np.diag(information))
     return bool(scale.all()) and float(np.linalg.eigvalsh(information / np.outer(scale, scale))[0]) > _LEAST
 
 
+def _marks(space: Geometry, graph: Graph, ends: Iterable[Sequence[int]], poses: Sequence[int]) -> list[int]:
+    """Return the landmarks on some edges: points, ascending, and then poses, ascending."""
+    marks = {v for vertices in ends for v in vertices} - set(poses)
+    return sorted(marks, key=lambda mark: (graph.kind_of(mark) is space.pose, mark))
+
+
+def _constellation(space: Geometry, solver: Solver, marks: Sequence[int]) -> Constellation:
+    """Return how some landmarks lie: points, and then poses."""
+    points = [mark for mark in marks if solver.graph.kind_of(mark) is space.point]
+    poses = solver.estimate(marks[len(points) :]).reshape(-1, space.pose.size)
+    return Constellation.from_poses(space, solver.estimate(points), poses)
+
+
+def _of_positions(space: Geometry, information: Array, at: Constellation) -> Array:
+    """Return the information (n, n) of a step of a constellation, given that of steps of its vertices.
+
+    Those of vertices that are poses are in their own axes, position and rotation side by side.
+    """
+    b, d = len(at.turns), space.dimensions
+    first, turn = d * (len(at.points) - b), np.eye(len(information))
+    order = list(range(first))
+    for k, rotation in enumerate(at.turns.tolist()):
+        begin = first + space.dof * k
+        turn[begin : begin + d, begin : begin + d] = space.turn((*space.identity[:d], *rotation))
+        order += range(begin, begin + d)
+    order += [first + space.dof * k + axis for k in range(b) for axis in range(d, space.dof)]
+    if not b:
+        return information
+    return product(product(turn, information), turn.T)[np.ix_(order, order)]
+
+
 def _local_solver(
-    space: Geometry, estimate: Estimate, order: Sequence[int], marks: int, edges: Sequence[tuple[Edge, float]]
+    space: Geometry, graph: Graph, estimate: Estimate, order: Sequence[int], edges: Sequence[tuple[Edge, float]]
 ) -> tuple[Solver, dict[int, int]]:
     """Return a solver of some edges alone, each with its factor, and the ids that it has of some vertices.
 
     Parameters
     ----------
-    order : the vertices; all are in the axes of the first pose, and the last ones, so many ``marks``, are landmarks
+    order : the vertices, in the axes of the first, which is a pose
     """
-    poses, points = order[: len(order) - marks], order[len(order) - marks :]
-    at_poses, at_points = estimate(poses), estimate(points)
     local, group = Graph(), space.group
-    base = tuple(at_poses[0].tolist())
-    local.add_vertices(space.pose, np.stack(group.between(base, tuple(at_poses.T)), axis=-1))
-    local.add_vertices(space.point, np.stack(group.act(group.inverse(base), tuple(at_points.T)), axis=-1))
+    base = tuple(estimate(order[:1])[0].tolist())
+    for kind, alike in groupby(order, graph.kind_of):
+        values = tuple(estimate(list(alike)).T)
+        seen = group.between(base, values) if kind is space.pose else group.act(group.inverse(base), values)
+        local.add_vertices(kind, np.stack(seen, axis=-1))
     at, by_type = {vertex: k for k, vertex in enumerate(order)}, dict[EdgeType, list[tuple[Edge, float]]]()
     for one in edges:
         by_type.setdefault(one[0].type, []).append(one)

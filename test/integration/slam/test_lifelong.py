@@ -8,7 +8,7 @@ from benchmarks.hall import hall, rms
 from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.graph import Gaussian
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
-from graph_slam_ros.slam.lifelong.condenser import LABEL
+from graph_slam_ros.graph.place import LABEL
 
 KEYFRAMES, WINDOW, SEEDS = 700, 40, range(4)
 

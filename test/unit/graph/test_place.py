@@ -21,15 +21,24 @@ def space(request):
 
 
 def test_the_derivative_is_that_of_the_residual(space):
-    for members in (1, 5):
-        g.check_edge(place_edge(space[0], members), tolerance=1e-6)
+    for points, poses in ((1, 0), (5, 0), (0, 1), (2, 3)):
+        edge = place_edge(space[0], points, poses)
+
+        def measured(rng, size=edge.measured_size, poses=poses):
+            numbers = rng.standard_normal(size)
+            if space[0] is g.SE3 and poses:
+                turns = numbers[-4 * poses :].reshape(poses, 4)
+                turns /= np.linalg.norm(turns, axis=1, keepdims=True)
+            return numbers
+
+        g.check_edge(edge, measured, tolerance=1e-6)
 
 
 def test_there_is_one_type_for_so_many_points_of_a_pose_and_none_for_others():
-    assert place_edge(g.SE2, 4) is place_edge(g.SE2, 4)
-    for kind, members in ((g.SE2, 0), (g.R2, 3), (g.SE3, 1000)):
+    assert place_edge(g.SE2, 4) is place_edge(g.SE2, 4, 0)
+    for kind, points, poses in ((g.SE2, 0, 0), (g.R2, 3, 0), (g.SE3, 900, 100), (g.SE2, -1, 2)):
         with pytest.raises(GraphSlamError, match="a place edge of"):
-            place_edge(kind, members)
+            place_edge(kind, points, poses)
 
 
 def solved(space, together, points=9, poses=6):
@@ -84,15 +93,21 @@ def test_it_is_written_to_g2o_and_read_back(space, tmp_path):
     pose, point, _ = space
     rng, graph = np.random.default_rng(1), Graph()
     at = graph.add_vertex(pose, [1.0, 2.0, 0.3] if pose is g.SE2 else [1, 2, 3, 0, 0, 0.6, 0.8])
-    for members in (2, 5):
-        marks = graph.add_vertices(point, rng.standard_normal((members, point.size)))
-        root = rng.standard_normal((members * point.size,) * 2)
+    for points, poses in ((2, 0), (5, 0), (0, 1), (2, 2)):
+        marks = graph.add_vertices(point, rng.standard_normal((points, point.size))).tolist()
+        group = g.GROUPS[pose]
+        tags = [group.exp(tuple(rng.standard_normal(pose.dof))) for _ in range(poses)]
+        marks += [graph.add_vertex(pose, tag) for tag in tags]
+        edge = place_edge(pose, points, poses)
+        root = rng.standard_normal((edge.residual_size,) * 2)
         noise = Gaussian.from_information(root @ root.T + np.eye(len(root)))
-        graph.add_edge(place_edge(pose, members), [at, *marks], rng.standard_normal(len(root)), noise, "places")
+        turns = [number for tag in tags for number in tag[point.size :]]
+        positions = rng.standard_normal(point.size * (points + poses)).tolist()
+        graph.add_edge(edge, [at, *marks], [*positions, *turns], noise, "places")
     write_g2o(tmp_path / "a.g2o", G2oFile(graph, list(range(graph.vertex_count))), Solver(graph).estimate)
     read = read_g2o(tmp_path / "a.g2o")
-    assert not read.unknown and len(read.graph.edges_of("places")) == 2
-    for edge in range(2):
+    assert not read.unknown and len(read.graph.edges_of("places")) == 4
+    for edge in range(4):
         before, after = graph.edge(edge), read.graph.edge(edge)
         assert after.type is before.type
         assert [read.ids[v] for v in after.vertices] == list(before.vertices)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
+from graph_slam_ros.slam.lifelong.constellation import Constellation
 from graph_slam_ros.slam.lifelong.fit import VisitScale, fit_of
 from graph_slam_ros.slam.lifelong.place import Place
 from graph_slam_ros.slam.lifelong.visit import Visit
@@ -24,12 +25,14 @@ class Visits:
     def __init__(self, space, seed=0):
         self.space, self.rng = space, np.random.default_rng(seed)
         self.points = 5.0 * self.rng.standard_normal((8, space.dimensions))
+        self.no_turns = np.empty((0, space.pose.size - space.dimensions))
 
     def visit(self, noise):
         """One with so many times the errors that it states."""
         errors = noise * SIGMA_M * self.rng.standard_normal(self.points.shape)
         information = np.eye(self.points.size) / SIGMA_M**2
-        return Visit(tuple(range(len(self.points))), self.points + errors, self.points, information, 0.0, 0)
+        seen, at = (Constellation(one, self.no_turns) for one in (self.points + errors, self.points))
+        return Visit(tuple(range(len(self.points))), seen, at, information, 0.0, 0)
 
     def fit(self, place, visit):
         return fit_of(self.space, place, visit, self.space.identity, GATE, {})
@@ -46,7 +49,7 @@ def test_the_factor_is_that_of_the_errors(space, noise):
         place = fit.result.place
         place = replace(place, information=place.information / scale.change())
     assert scale.factor == pytest.approx(noise**2, rel=0.25)
-    off = (place.points - place.points.mean(axis=0)) - (visits.points - visits.points.mean(axis=0))
+    off = (place.seen.points - place.seen.points.mean(axis=0)) - (visits.points - visits.points.mean(axis=0))
     stated = np.sqrt(np.diag(np.linalg.pinv(place.information))).mean()
     assert np.sqrt((off**2).mean()) < 1.5 * stated
 

@@ -9,8 +9,9 @@ from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.errors import SingularError
 from graph_slam_ros.graph import Gaussian, Graph
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
+from graph_slam_ros.slam.lifelong.constellation import Constellation
 from graph_slam_ros.slam.lifelong.elimination import marginal_information, square_root, without
-from graph_slam_ros.slam.lifelong.place import Place, fused, rigid_motions, visit_without
+from graph_slam_ros.slam.lifelong.place import Place, fused, visit_without
 from graph_slam_ros.slam.lifelong.visit import best_known, visit_of
 from graph_slam_ros.solver import Settings, Solver
 
@@ -23,15 +24,26 @@ def space(request):
     return request.param
 
 
+@pytest.fixture(params=[0, 2, 6], ids=["points", "both", "poses"])
+def tags(request):
+    """The number of the six landmarks, the last ones, that are poses."""
+    return request.param
+
+
 class World:
     """Landmarks, and visits that see some of them: in one graph, where the visits are joined by landmarks alone."""
 
-    def __init__(self, space, noise, seed=0, landmarks=6, sigma_odometry=SIGMA_ODOMETRY):
+    def __init__(self, space, noise, seed=0, landmarks=6, sigma_odometry=SIGMA_ODOMETRY, tags=0):
         self.space, self.noise, self.rng = space, noise, np.random.default_rng(seed)
         self.sigma_odometry = sigma_odometry
         self.points = 4.0 * self.rng.standard_normal((landmarks, space.dimensions))
         self.graph = Graph()
-        self.marks = self.graph.add_vertices(space.point, self.points).tolist()
+        angles = self.rng.standard_normal((tags, space.dof - space.dimensions))
+        centres = self.points[landmarks - tags :]
+        turns = [space.group.exp((*[0.0] * space.dimensions, *one))[space.dimensions :] for one in angles]
+        self.tags = [(*at, *turn) for at, turn in zip(centres, turns, strict=True)]
+        self.marks = self.graph.add_vertices(space.point, self.points[: landmarks - tags]).tolist()
+        self.marks += [self.graph.add_vertex(space.pose, tag) for tag in self.tags]
         self.poses, self.edges = [], []
 
     def visit(self, sees, moved=None, sighting="position"):
@@ -51,6 +63,9 @@ class World:
             for m in sees:
                 sigma = SIGMA_SIGHTING * (1 + 0.1 * m)
                 there = self.points[m] + (moved[1] if moved and moved[0] == m else 0.0)
+                if (number := m - len(self.points) + len(self.tags)) >= 0:
+                    edges.append(self._tag(pose, poses[-1], m, (*there, *self.tags[number][len(there) :]), sigma))
+                    continue
                 seen = np.array(group.act(group.inverse(pose), tuple(there)))
                 seen = seen + self.noise * sigma * rng.standard_normal(len(seen))
                 noise = Gaussian.from_sigmas(*[sigma] * len(seen))
@@ -63,6 +78,14 @@ class World:
         self.poses.append(poses)
         self.edges.append(edges)
         return len(self.poses) - 1
+
+    def _tag(self, pose, vertex, m, tag, sigma):
+        """Add what was measured of a landmark that is a pose."""
+        space, group = self.space, self.space.group
+        error = tuple(self.noise * sigma * self.rng.standard_normal(space.dof))
+        seen = group.compose(group.between(pose, tag), group.exp(error))
+        noise = Gaussian.from_sigmas(*[sigma] * space.dof)
+        return self.graph.add_edge(space.relative_pose, [vertex, self.marks[m]], seen, noise, "landmarks")
 
     def estimate(self, ids):
         graph = self.graph
@@ -96,66 +119,85 @@ class World:
         solver.add(sorted([*poses, *marks]), edges)
         solver.hold(self.base(numbers[0]))
         solver.optimize()
-        size = self.space.dimensions
-        covariance = np.linalg.inv(solver.information_matrix())[: size * len(marks), : size * len(marks)]
-        base = tuple(self.estimate([self.base(numbers[0])])[0])
-        turn = np.kron(np.eye(len(marks)), self.space.turn(base))
-        points = np.stack(group.act(group.inverse(base), tuple(solver.estimate(marks).T)), axis=-1)
-        return points, turn.T @ np.linalg.inv(covariance) @ turn
+        covariance = np.linalg.inv(solver.information_matrix())
+        sizes = [graph.kind_of(v).dof for v in sorted([*poses, *marks]) if v != self.base(numbers[0])]
+        begins = np.cumsum([0, *sizes[:-1]])
+        space, base = self.space, tuple(self.estimate([self.base(numbers[0])])[0])
+        kept = [v for v in sorted([*poses, *marks]) if v != self.base(numbers[0])]
+        points, turns, places, rotations = [], [], [], []
+        for mark in marks:
+            value, begin = tuple(solver.estimate([mark])[0]), begins[kept.index(mark)]
+            at = np.eye(space.dimensions)
+            if len(value) == space.pose.size:
+                seen = group.between(base, value)
+                points.append(seen[: space.dimensions])
+                turns.append(seen[space.dimensions :])
+                at = space.turn(seen)
+                rotations.append(np.eye(len(covariance))[begin + space.dimensions : begin + space.dof])
+            else:
+                points.append(group.act(group.inverse(base), value))
+                at = space.turn(base).T
+            rows = np.zeros((space.dimensions, len(covariance)))
+            rows[:, begin : begin + space.dimensions] = at
+            places.append(rows)
+        step = np.concatenate([*places, *rotations])
+        seen = Constellation(np.array(points), np.array(turns).reshape(-1, space.pose.size - space.dimensions))
+        return seen, np.linalg.inv(step @ covariance @ step.T)
 
 
-def test_two_visits_are_what_all_their_edges_say_at_once(space):
-    world = World(space, noise=1e-6)
+def test_two_visits_are_what_all_their_edges_say_at_once(space, tags):
+    world = World(space, noise=1e-6, tags=tags)
     world.visit(range(5))
     world.visit(range(1, 6))
     place, _ = world.place(0, 1)
-    points, information = world.batch(0, 1)
+    seen, information = world.batch(0, 1)
     assert place.members == tuple(world.marks)
-    assert place.points == pytest.approx(points, abs=1e-9)
+    assert len(place.seen.turns) == tags
+    assert place.seen.minus(space, seen) == pytest.approx(0.0, abs=1e-9)
     assert place.information == pytest.approx(information, rel=1e-5, abs=1e-5 * np.abs(information).max())
-    exact = World(space, noise=0.0)
+    exact = World(space, noise=0.0, tags=tags)
     exact.visit(range(5))
     exact.visit(range(1, 6))
     information = exact.batch(0, 1)[1]
     assert exact.place(0, 1)[0].information == pytest.approx(information, abs=1e-9 * np.abs(information).max())
 
 
-def test_with_the_noise_of_sensors_it_is_nearly_so(space):
-    world = World(space, noise=1.0, seed=3)
+def test_with_the_noise_of_sensors_it_is_nearly_so(space, tags):
+    world = World(space, noise=1.0, seed=3, tags=tags)
     for sees in (range(5), range(1, 6), range(6)):
         world.visit(sees)
     place, _ = world.place(0, 1, 2)
-    points, information = world.batch(0, 1, 2)
-    sigmas = np.sqrt(np.diag(np.linalg.inv(information))).reshape(points.shape)
-    assert (np.abs(place.points - points) < 0.2 * sigmas).all()
+    seen, information = world.batch(0, 1, 2)
+    sigmas = np.sqrt(np.diag(np.linalg.inv(information)))
+    assert (np.abs(place.seen.minus(space, seen)) < 0.2 * sigmas).all()
     root = np.linalg.inv(np.linalg.cholesky(information))
     ratios = np.linalg.eigvalsh(root @ place.information @ root.T)
     assert ratios[0] > 0.9 and ratios[-1] < 1.1
 
 
-def test_a_later_visit_says_nothing_of_where_it_is_seen_from(space):
-    world = World(space, noise=1.0)
+def test_a_later_visit_says_nothing_of_where_it_is_seen_from(space, tags):
+    world = World(space, noise=1.0, tags=tags)
     visit = world.condensed(world.visit(range(6)))
-    columns = rigid_motions(visit.points)
+    columns = visit.seen.rigid_motions(space)
     shape = without(visit.information, columns)
     assert np.abs(shape @ columns).max() < 1e-9 * np.abs(visit.information).max()
     assert np.linalg.eigvalsh(shape)[columns.shape[1]] > 0.0
 
 
-def test_the_order_of_later_visits_does_not_matter(space):
-    world = World(space, noise=1e-5)
+def test_the_order_of_later_visits_does_not_matter(space, tags):
+    world = World(space, noise=1e-5, tags=tags)
     for sees in (range(5), range(1, 6), (0, 2, 3, 5), range(2, 6)):
         world.visit(sees)
     one, other = world.place(0, 1, 2, 3)[0], world.place(0, 3, 2, 1)[0]
     assert one.members == other.members
-    assert one.points == pytest.approx(other.points, abs=1e-6)
+    assert one.seen.minus(space, other.seen) == pytest.approx(0.0, abs=1e-6)
     assert one.information == pytest.approx(other.information, abs=1e-6 * np.abs(one.information).max())
 
 
-def test_right_visits_pass_the_gate_and_a_landmark_that_moved_does_not(space):
+def test_right_visits_pass_the_gate_and_a_landmark_that_moved_does_not(space, tags):
     statistics = np.zeros(2)
     for seed in range(24):
-        world = World(space, noise=1.0, seed=seed)
+        world = World(space, noise=1.0, seed=seed, tags=tags)
         statistics += world.place(world.visit(range(6)), world.visit(range(6)))[1][0]
     assert quantile(1e-4, int(statistics[1])) < statistics[0] < quantile(1 - 1e-4, int(statistics[1]))
     wrong = world.visit(range(6), moved=(2, 0.5))
@@ -165,11 +207,11 @@ def test_right_visits_pass_the_gate_and_a_landmark_that_moved_does_not(space):
     guess = space.group.between(*(tuple(world.estimate([world.base(n)])[0]) for n in (0, wrong)))
     left = {mark: fused(space, place, visit_without(visit, mark), guess).statistic for mark in visit.members}
     assert min(left, key=left.get) == world.marks[2]
-    assert left[world.marks[2]] < quantile(0.9999, degrees - space.dimensions)
+    assert left[world.marks[2]] < quantile(0.9999, degrees - world.graph.kind_of(world.marks[2]).dof)
 
 
-def test_the_motion_is_found_from_a_poor_guess(space):
-    world = World(space, noise=1.0)
+def test_the_motion_is_found_from_a_poor_guess(space, tags):
+    world = World(space, noise=1.0, tags=tags)
     world.visit(range(6))
     world.visit(range(6))
     place, visit = Place.begun_by(world.condensed(0)), world.condensed(1)
@@ -177,7 +219,7 @@ def test_the_motion_is_found_from_a_poor_guess(space):
     right = group.between(*(tuple(world.estimate([world.base(n)])[0]) for n in (0, 1)))
     off = group.compose(right, group.exp((0.5, *[-0.2] * (space.dof - 2), 0.3)))
     one, other = (fused(space, place, visit, guess).place for guess in (right, off))
-    assert one.points == pytest.approx(other.points, abs=1e-9)
+    assert one.seen.minus(space, other.seen) == pytest.approx(0.0, abs=1e-9)
 
 
 def test_visits_whose_odometry_is_weak_agree_in_either_order(space):
@@ -215,8 +257,8 @@ def test_the_pose_that_landmarks_determine_best_sees_them(space):
         best_known(space, world.graph, world.estimate, world.poses[number], nothing)
 
 
-def test_half_of_each_measurement_and_the_other_half_are_the_whole(space):
-    world = World(space, noise=0.0)
+def test_half_of_each_measurement_and_the_other_half_are_the_whole(space, tags):
+    world = World(space, noise=0.0, tags=tags)
     world.visit(range(6))
     whole = world.condensed(0)
     edges = dict.fromkeys(world.edges[0], 0.5)
@@ -244,11 +286,35 @@ def test_a_visit_that_shares_too_little_is_refused(space):
     world.visit(range(2, 6))
     with pytest.raises(SingularError, match="shares 1 landmarks"):
         world.place(0, 1)
-    nothing = replace(
-        world.condensed(0), members=(), points=np.zeros((0, space.dimensions)), information=np.zeros((0, 0))
-    )
+    whole = world.condensed(0)
+    empty = whole.seen.part(())
+    nothing = replace(whole, members=(), seen=empty, linearized_at=empty, information=np.zeros((0, 0)))
     with pytest.raises(SingularError, match="shares 0"):
         fused(space, Place.begun_by(nothing), world.condensed(1), space.identity)
+
+
+def test_one_landmark_that_is_a_pose_lays_a_visit_on_a_place(space):
+    world = World(space, noise=1e-6, tags=1)
+    world.visit((0, 1, 5))
+    world.visit((5, 2, 3))
+    place, ((_, degrees),) = world.place(0, 1)
+    seen, information = world.batch(0, 1)
+    assert degrees == 0 and place.members == tuple(world.marks[m] for m in (0, 1, 2, 3, 5))
+    assert place.seen.minus(space, seen) == pytest.approx(0.0, abs=1e-8)
+    assert place.information == pytest.approx(information, rel=1e-4, abs=1e-5 * np.abs(information).max())
+
+
+def test_a_tag_of_which_only_positions_were_seen_is_left_out(space):
+    world = World(space, noise=1.0, tags=1)
+    first = world.visit(range(5))
+    poses, tag = world.poses[first], world.marks[5]
+    for pose in poses:
+        seen, noise = (
+            space.tag_position.whole(np.ones(space.dimensions)),
+            Gaussian.from_sigmas(*[0.1] * space.dimensions),
+        )
+        world.edges[first].append(world.graph.add_edge(space.tag_position, [pose, tag], seen, noise, "landmarks"))
+    assert world.condensed(first).members == tuple(world.marks[:5])
 
 
 def test_elimination_is_that_of_the_textbook():
