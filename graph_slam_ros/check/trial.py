@@ -16,6 +16,7 @@ from graph_slam_ros.measurements.types import Control, Measurement, Odometry
 from graph_slam_ros.slam import Config, GraphSlam
 from graph_slam_ros.slam.calibration.decision import Finding as Fitted
 from graph_slam_ros.slam.calibration.fit import TrialFit
+from graph_slam_ros.slam.calibration.uncorrected import CODES, sentence, setting_of
 from graph_slam_ros.slam.noise_scale import LARGEST, NoiseScale
 from graph_slam_ros.typing import Array, Index
 
@@ -26,13 +27,13 @@ _SIGMAS = 4.0
 _TURN_SIGMAS = 6.0  # a wheel's noise that lasts adds up in heading, which neither sigma of a fit knows
 _ABSURD, _BACKWARDS, _SURE = 0.5, 0.35, 0.05
 _DEGREE = np.pi / 180.0
-# By parameter: code, unit, limit, and from which sigma on it is not observable.
+# By parameter: unit, limit, and from which sigma on it is not observable.
 _LIMITS = {
-    "clock": ("clock_offset", "s", 0.03, 0.05),
-    "yaw": ("mount_yaw", "rad", 2.0 * _DEGREE, 3.0 * _DEGREE),
-    "distance": ("odometry_scale", "part", 0.03, 0.05),
-    "turn": ("turn_scale", "part", 0.03, 0.05),
-    "range_factor": ("range_scale", "part", 0.03, 0.05),
+    "clock": ("s", 0.03, 0.05),
+    "yaw": ("rad", 2.0 * _DEGREE, 3.0 * _DEGREE),
+    "distance": ("part", 0.03, 0.05),
+    "turn": ("part", 0.03, 0.05),
+    "range_factor": ("part", 0.03, 0.05),
 }
 _OVER_CONFIDENT, _ODOMETRY_OVER_CONFIDENT, _LEAST_DOF = 2.0, 6.0**0.5, 100.0
 _LOST = 0.25
@@ -114,7 +115,7 @@ def check_trial(c: Columns, slam: GraphSlam) -> Iterator[Finding]:
             yield Finding("fit_unsure", "warning", fit.lost, _LOST, "part", text)
         yield from found
         return
-    off = [found_one for one in fitted for found_one in _fitted(c, one)]
+    off = [found_one for one in fitted for found_one in _fitted(c, slam, one)]
     yield from off
     yield from _clock_jumps(c, fit)
     is_off = any(one.severity == "warning" for one in off)  # a clock or mount that is wrong bends the path in turns
@@ -170,11 +171,11 @@ def _over_confident(c: Columns, noise: NoiseScale, factor: float, limit: float) 
     return Finding(code, "note", factor, limit, "times", text, topic, settings=settings)
 
 
-def _fitted(c: Columns, one: Fitted) -> Iterator[Finding]:
+def _fitted(c: Columns, slam: GraphSlam, one: Fitted) -> Iterator[Finding]:
     """A parameter that is far off by its limit and several sigmas, or that the drive does not tell."""
     if one.parameter.name not in _LIMITS:
         return
-    code, unit, limit, unknown = _LIMITS[one.parameter.name]
+    code, (unit, limit, unknown) = CODES[one.parameter.name], _LIMITS[one.parameter.name]
     sigmas = _TURN_SIGMAS if one.parameter.name == "turn" else _SIGMAS
     topic = next((t for t in c.topics.values() if one.parameter.source in t.inputs), None)
     if topic is None:
@@ -183,8 +184,9 @@ def _fitted(c: Columns, one: Fitted) -> Iterator[Finding]:
     if one.sigma > unknown:
         yield Finding("not_observable", "note", one.sigma, unknown, unit, one.text, **where)
     elif abs(one.value) > max(limit, sigmas * one.sigma) and one.verdict == "admitted":
-        text, settings = _mended(c, one)
-        yield Finding(code, "warning", one.value, limit, unit, f"{topic.name}: {text}", settings=settings, **where)
+        text = f"{topic.name}: {sentence(one.parameter, one.value, one.sigma)}"
+        settings = (assignment(*setting_of(one.parameter, {one.parameter: one.value}, slam.calibrated)),)
+        yield Finding(code, "warning", one.value, limit, unit, text, settings=settings, **where)
 
 
 def _clock_jumps(c: Columns, fit: TrialFit) -> Iterator[Finding]:
@@ -203,34 +205,6 @@ def _clock_jumps(c: Columns, fit: TrialFit) -> Iterator[Finding]:
         )
         where: Where = {"topic": topic.name, "first_ns": int(topic.stamp_ns[:1].sum()), "count": len(topic.stamp_ns)}
         yield Finding("clock_jump", "warning", halves[1] - halves[0], limit, "s", text, **where)
-
-
-def _mended(c: Columns, one: Fitted) -> tuple[str, tuple[str, ...]]:
-    """Return a sentence on what is off, and the settings that mend it."""
-    source, value, sigma = one.parameter.source, one.value, one.sigma
-    if one.parameter.name == "clock":
-        before_s = next(s.offset_s for s in c.config.sources if s.name == source)
-        when, other = ("later", "late") if value > 0.0 else ("earlier", "early")
-        best = f"{abs(value) * 1e3:.0f} ms {when} than stamped (sigma {sigma * 1e3:.0f} ms)"
-        text = f"sightings agree with odometry best {best}, or odometry is stamped as much too {other}"
-        return text, (assignment(f"{source}.offset_s", round(before_s + value, 3)),)
-    if one.parameter.name == "yaw":
-        degrees = (value / _DEGREE, sigma / _DEGREE)
-        text = f"its sensor is turned by {degrees[0]:.1f} degrees on the robot (sigma {degrees[1]:.1f})"
-        before = next(s.numbers("mount_correction", 6) for s in c.config.sources if s.name == source) or (0.0,) * 6
-        numbers = (*before[:5], before[5] + value)
-        return text, (assignment(f"{source}.mount_correction", " ".join(f"{x:.5g}" for x in numbers)),)
-    if one.parameter.name == "range_factor":
-        factor = next(s.range_factor for s in c.config.sources if s.name == source) * (1.0 + value)
-        text = f"ranges are {1.0 / (1.0 + value):.3f} times the distances that odometry says (sigma {sigma:.3f})"
-        return text, (assignment(f"{source}.range_factor", round(factor, 4)),)
-    name = f"{one.parameter.name}_factor"
-    factor = getattr(c.config.odometry, name) * (1.0 + value)
-    what = "drives" if one.parameter.name == "distance" else "turns"
-    text = f"the robot {what} {1.0 + value:.3f} times what odometry says (sigma {sigma:.3f})"
-    if one.parameter.name == "distance":
-        text += ", or ranges are wrong by that factor"
-    return text, (assignment(f"odometry.{name}", round(factor, 4)),)
 
 
 def _places(c: Columns, slam: GraphSlam, path_ns: Index, path: Array, late_s: Mapping[str, float]) -> list[Finding]:

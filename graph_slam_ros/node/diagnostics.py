@@ -240,6 +240,8 @@ def _faults(facts: Facts, config: Config) -> Iterator[str]:
         yield estimate.association
     if estimate and estimate.visits:
         yield estimate.visits
+    if estimate and estimate.uncorrected:
+        yield estimate.uncorrected
     if estimate and estimate.motion:
         yield estimate.motion
     if estimate and estimate.rivals:

@@ -91,6 +91,7 @@ class Estimate:
     displaced : that the landmarks say that the robot is elsewhere than odometry; empty where they do not
     association : why the association of sightings without identity is not to be believed; empty if it is
     visits : why a condensed map is worse, or larger, than it should be; empty if it is not
+    uncorrected : clocks, mounts and scales that are off and not corrected; empty where none is
     motion : why the gyro, or an odometry, has no part in the motion; empty where all have
     gyro : its state and its bias; empty where no input is one
     calibration : settings that calibration has corrected, and a sentence for each parameter that it has fitted
@@ -118,6 +119,7 @@ class Estimate:
     displaced: str = ""
     association: str = ""
     visits: str = ""
+    uncorrected: str = ""
     motion: str = ""
     gyro: str = ""
     is_resumed: bool = False
@@ -177,6 +179,7 @@ class Estimate:
             displaced=str(slam.displaced or ""),
             association="; ".join(association_faults(slam.association_report)),
             visits="; ".join(visit_faults({name: slam.counters["map", name] for name in VISITS})),
+            uncorrected="; ".join(f"{one}: {one.setting[0]}={one.setting[1]}" for one in slam.uncorrected_so_far),
             motion="; ".join(filter(None, (slam.gyro.fault if slam.gyro else "", slam.backend.odometries.doubted))),
             gyro=str(slam.gyro or ""),
             is_resumed=is_resumed,

@@ -238,8 +238,10 @@ def association_faults(found: Mapping[str, Any]) -> Iterator[str]:
 def doubts(summary: Summary) -> Iterator[str]:
     """Return a sentence for each input of which many measurements are rejected, or all motions left out.
 
-    Also one where many visits of a condensed map contradict the others: what is left in the map was not better.
+    Also one where many visits of a condensed map contradict the others: what is left in the map was not better. And one
+    for each clock, mount or scale that is off so far that the covariances are too small.
     """
+    yield from _uncorrected(summary)
     yield from _doubtful_visits(summary["counters"].get("map", {}), _MOSTLY)
     for name, count in Counter(name.partition("#")[0] for name in summary.get("inputs", {})).items():
         if count > 1:
@@ -257,6 +259,14 @@ def doubts(summary: Summary) -> Iterator[str]:
         if _MOSTLY <= accepted < 1.0 - _DOUBTED:
             part, hint = 100.0 * (1.0 - accepted), _CONTRADICT.format(name)
             yield f"{name}: {part:.0f} % of {counts['used']} are not believed: {hint}"
+
+
+def _uncorrected(summary: Summary) -> Iterator[str]:
+    if (summary.get("check") or {}).get("severity") == "error":  # which makes a fit meaningless
+        return
+    for one in summary.get("uncorrected", ()):
+        mend = " ".join(f"--set {shlex.quote(f'{key}={value}')}" for key, value in one["settings"].items())
+        yield f"{one['text']}: {mend} (graph_slam check BAG compares the causes)"
 
 
 def visit_faults(counted: Mapping[str, int]) -> Iterator[str]:

@@ -32,7 +32,7 @@ from graph_slam_ros.runs.folder import (
 from graph_slam_ros.runs.journal import BEGINS_IN_A_MAP, INGEST, MAP, MEASUREMENT, Parts, close_all, part_name, parts_of
 from graph_slam_ros.runs.load import Load
 from graph_slam_ros.runs.map_journal import GROWTH, MapGrowth
-from graph_slam_ros.runs.tables import counted, noise_summary, result_texts, summarize
+from graph_slam_ros.runs.tables import counted, fitted_summary, result_texts, summarize
 from graph_slam_ros.slam import Config, Counters, GraphSlam, Measurement, Update
 from graph_slam_ros.slam.bounded_map import Condensation
 from graph_slam_ros.slam.snapshot import MapSnapshot
@@ -355,8 +355,8 @@ def save_results(
 
     left = read_left(folder, slam.space, slam.bounded)
     files = {name: put(name, text) for name, text in result_texts(slam, left).items()}
-    noise = {} if "noise" in summary else noise_summary(slam)
-    contents = {"format": MARK} | summarize(slam) | summary | noise | {"format": MARK, "files": files}
+    fitted = {} if "noise" in summary else fitted_summary(slam)
+    contents = {"format": MARK} | summarize(slam) | summary | fitted | {"format": MARK, "files": files}
     put(SUMMARY, json.dumps(contents, indent=2) + "\n")
 
 

@@ -360,8 +360,8 @@ def _warnings(slam: GraphSlam, summary: dict[str, Any]) -> list[str]:
     faults = [f"{source}: {fault}" for source, fault in slam.counters.faults.items()]
     return [
         *faults,
-        *map(str, slam.alarms),
         *doubts(summary),
+        *map(str, slam.alarms),
         *unscaled(summary),
         *checked(summary, "warning"),
         *mendable(summary["counters"]),

@@ -22,7 +22,7 @@ from graph_slam_ros.runs.folder import (
 from graph_slam_ros.runs.journal import read_measurements, read_rest
 from graph_slam_ros.runs.map_journal import has_map, read_map, state_of
 from graph_slam_ros.runs.recorder import RunRecorder, save_results
-from graph_slam_ros.runs.tables import counters_of, noise_summary, summarize
+from graph_slam_ros.runs.tables import counters_of, fitted_summary, summarize
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Measurement
 from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.warmup import warmup
@@ -186,7 +186,7 @@ def record_run(
         slam.counters.update(border or Counters())
         summary = summarize(slam, earlier) | took() | {"losses": list(dict.fromkeys(losses))}
         summary |= ({"recording": recording} if recording else {}) | more()
-        summary |= noise_summary(slam)
+        summary |= fitted_summary(slam)
         recorder.save(slam, summary)
     except KeyboardInterrupt:
         if recorder is not None:

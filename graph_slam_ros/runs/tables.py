@@ -55,11 +55,13 @@ def result_texts(slam: GraphSlam, left: Left) -> dict[str, str]:
     }
 
 
-def noise_summary(slam: GraphSlam) -> dict[str, Any]:
-    """The estimated noise, whether it is applied, and the reason if there is none."""
+def fitted_summary(slam: GraphSlam) -> dict[str, Any]:
+    """The estimated noise, whether it is applied, and the reason if there is none; and what nothing corrects."""
     out: dict[str, Any] = {"noise_scale": slam.config.robust.noise_scale, "noise": []}
     if not slam.is_solved:
         return out | {"noise_unknown": "nothing is solved"}
+    if off := slam.uncorrected():
+        out["uncorrected"] = [one.as_dict() for one in off]
     try:
         return out | {"noise": [one.as_dict() for one in slam.noise_scale()]}
     except GraphSlamError as error:  # what cannot be said of a singular map must not cost its results

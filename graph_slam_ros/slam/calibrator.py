@@ -2,10 +2,10 @@
 
 A trial starts at keyframes 50, 100, 200 and so on of this drive, and when everything is solved. It works on a copy, in
 the background if possible. Its outcome is used a fixed number of keyframes later, so that a replay decides as the live
-run did.
+run did. Where nobody asked for calibration, a trial corrects nothing: it tells what is wrong.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -19,9 +19,10 @@ from graph_slam_ros.slam.calibration.decision import Finding, decide, of_associa
 from graph_slam_ros.slam.calibration.drift import DriftWindows
 from graph_slam_ros.slam.calibration.fit import TrialFit, likelier_fit
 from graph_slam_ros.slam.calibration.model import Values
-from graph_slam_ros.slam.calibration.parameters import Parameter
+from graph_slam_ros.slam.calibration.parameters import DEFAULT_GROUPS, Parameter
 from graph_slam_ros.slam.calibration.recalibration import Recalibration
 from graph_slam_ros.slam.calibration.rows import TrialProblem
+from graph_slam_ros.slam.calibration.uncorrected import Uncorrected, sampled, uncorrected
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
 from graph_slam_ros.slam.kidnap_detector import KidnapDetector
 from graph_slam_ros.slam.landmarks.explanation import SCALES
@@ -33,6 +34,7 @@ from graph_slam_ros.typing import Array, Executor, Index
 FIRST_DUE = 50  # keyframes
 _ROUNDS = 3  # when everything is solved
 _STEADY = 3  # trials in a row that move nothing by a sigma end it
+_MOST_POSES = 100  # whose covariances say whether what is not corrected matters
 _DIGITS = 12  # of a corrected measurement, and of an added variance: the last ones of a sine depend on the machine
 
 Trial = Callable[[], "TrialFit | None"]
@@ -70,6 +72,7 @@ class Calibrator:
         self.trials = self.corrected_at = 0
         self._admitted: set[Parameter] = set()
         self._last: TrialFit | None = None
+        self._uncorrected: list[Uncorrected] = []
         self._used: Mapping[str, tuple[float, float]] = landmarks.anonymous.scales
         self._due, self._steady = FIRST_DUE, 0
         self._job: Trial | None = None
@@ -84,23 +87,30 @@ class Calibrator:
         """Start a trial if it is due, and apply the outcome of an earlier one. Returns the report of a solve."""
         if self._backend.holds_back:
             return None
-        if self._config.uses_found_factors:
-            return self._adopt_association(keyframe, everything)
         if not self._config.calibrate.is_on:
-            return None
+            if everything is None:
+                self._start_if_due(keyframe)
+            return self._adopt_association(keyframe, everything) if self._config.uses_found_factors else None
         if everything is not None:
             return self._at_the_end(keyframe, everything)
         if self._job is not None and keyframe >= self._apply_at:
             job, self._job = self._job, None
             self._adopt(self._guarded(job), keyframe, None)
-        driven = keyframe + 1 - self._first_keyframe
-        if driven >= self._due and self._job is None:
-            while driven >= self._due:
-                self._due = self._windows.next_trial(self._due)
-            if (self._steady < _STEADY or self._windows.drifts) and not self._backend.spares_memory:
-                self._job = self._executor(self._trial(self._backend.solver.settings))
-                self._apply_at = keyframe + self._config.robust.apply_after_keyframes
+        if self._job is None:
+            self._start_if_due(keyframe)
         return None
+
+    def _start_if_due(self, keyframe: int) -> None:
+        driven = keyframe + 1 - self._first_keyframe
+        if driven < self._due:
+            return
+        while driven >= self._due:
+            self._due = self._windows.next_trial(self._due)
+        if (self._steady < _STEADY or self._windows.drifts) and not self._backend.spares_memory:
+            self._job = self._executor(
+                self._trial(self._backend.solver.settings, corrects=self._config.calibrate.is_on)
+            )
+            self._apply_at = keyframe + self._config.robust.apply_after_keyframes
 
     def _at_the_end(self, keyframe: int, everything: Settings) -> Report | None:
         self._job, report = None, None
@@ -111,13 +121,16 @@ class Calibrator:
             report = found
         return report
 
-    def _trial(self, settings: Settings) -> Trial:
+    def _trial(self, settings: Settings, *, corrects: bool = True) -> Trial:
         problem, calibrate = self._problem_with_slips(settings), self._config.calibrate
         log_odds = self._config.odometry.log_odds
+        asked, chooses = calibrate.asked, calibrate.chooses
+        if not corrects:
+            asked, chooses = (*asked, *DEFAULT_GROUPS), True
         has_gyro, windows, now_ns = bool(self._config.gyro_input), self._windows, int(problem.stamps_ns[-1])
 
         def run() -> TrialFit | None:
-            wanted = parameters_of(problem, calibrate.asked, chooses=calibrate.chooses)
+            wanted = parameters_of(problem, asked, chooses=chooses)
             if has_gyro:  # odometry's turn is mostly that of the gyro
                 wanted = [one for one in wanted if one.name != "turn"]
             priors = {one: windows.prior(one, calibrate.prior(one.name), now_ns) for one in wanted}
@@ -139,15 +152,7 @@ class Calibrator:
         if found is None:
             return None
         self.trials, self._last = self.trials + 1, found
-        findings = decide(
-            found,
-            self._count_landmarks(),
-            self._admitted,
-            slides=self._config.odometry.slides,
-            drifts=self._windows.drifts,
-            sigma_per_m=self._problem().model().sigma_per_m(),
-            by_association=self._by_association(),
-        )
+        findings = self._decided(found, self._admitted, self._problem().model().sigma_per_m())
         values = {one.parameter: _rounded(one.value) for one in findings if one.verdict == "admitted"}
         moved = any(one.parameter in values and abs(one.value) > one.sigma for one in findings)
         self._steady = 0 if moved else self._steady + bool(self._admitted)
@@ -164,6 +169,17 @@ class Calibrator:
         edges, stamps_ns = self._backend.graph.edge_count, self._frontend.path.keyframes.stamps_ns
         self._windows.close_if_full(keyframe, stamps_ns, edges, findings, self._frontend.corrections.lines())
         return report
+
+    def _decided(self, found: TrialFit, corrected: Collection[Parameter], sigma_per_m: float) -> list[Finding]:
+        return decide(
+            found,
+            self._count_landmarks(),
+            corrected,
+            slides=self._config.odometry.slides,
+            drifts=self._windows.drifts,
+            sigma_per_m=sigma_per_m,
+            by_association=self._by_association(),
+        )
 
     def _without_slips(self, everything: Settings | None) -> Report | None:
         """Take back all slips, if all measurements as they are corrected now are likelier so. Returns a solve's report.
@@ -295,6 +311,31 @@ class Calibrator:
         known = {one: self.findings[one].is_determined for one in found.parameters}
         left = {one: 0.0 if one in self._admitted else found.value(one) for one in known if known[one]}
         return marginal + _exact(found.adds(vertex, len(marginal), left))
+
+    # -- what nothing corrects ---------------------------------------------------------------------------------------
+
+    def uncorrected(self) -> list[Uncorrected]:
+        """Return what a trial fit finds wrong now, on a copy."""
+        return self._off(self._guarded(self._trial(self._backend.solver.settings, corrects=False)))
+
+    def uncorrected_so_far(self) -> Sequence[Uncorrected]:
+        """The same of the newest trial that began some keyframes ago; empty where trials correct what they find."""
+        job = self._job
+        is_over = len(self._frontend.path.keyframes) > self._apply_at
+        if not self._config.calibrate.is_on and job is not None and is_over and self._backend.solver.is_current:
+            self._job = None
+            self._uncorrected = self._off(self._guarded(job))
+        return self._uncorrected
+
+    def _off(self, found: TrialFit | None) -> list[Uncorrected]:
+        if found is None or not self._backend.solver.is_current:
+            return []
+        vertices = sampled(self._frontend.path.keyframes.ids, _MOST_POSES)
+        marginals = zip(vertices.tolist(), self._backend.solver.marginal(vertices), strict=True)
+        covariances = {vertex: self.widened(marginal, vertex) for vertex, marginal in marginals}
+        stated = self._problem().model().sigma_per_m()
+        findings = self._decided(found, (), stated)
+        return uncorrected(found, findings, covariances, lambda *key: self._frontend.corrections.total(key), stated)
 
     # -- what it says ------------------------------------------------------------------------------------------------
 

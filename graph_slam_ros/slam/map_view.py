@@ -15,6 +15,7 @@ from graph_slam_ros.slam.calibration.decision import Finding, decide
 from graph_slam_ros.slam.calibration.fit import TrialFit, likelier_fit
 from graph_slam_ros.slam.calibration.parameters import DEFAULT_GROUPS
 from graph_slam_ros.slam.calibration.recalibration import Recalibration
+from graph_slam_ros.slam.calibration.uncorrected import Uncorrected
 from graph_slam_ros.slam.calibrator import Calibrator
 from graph_slam_ros.slam.frontend.gyro import GyroState, SavedBias
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
@@ -162,6 +163,18 @@ class MapView(PathView):
         found = likelier_fit(problem, priors, self.config.odometry.log_odds)
         stated = problem.model().sigma_per_m()
         return found, decide(found, len(self.landmarks), slides=self.config.odometry.slides, sigma_per_m=stated)
+
+    def uncorrected(self) -> list[Uncorrected]:
+        """A clock, a mount or a scale that is off by so much that the poses are worse than their covariances say.
+
+        A trial fit finds it, on a copy: nothing is changed.
+        """
+        return self._calibrator.uncorrected() if self.is_solved else []
+
+    @property
+    def uncorrected_so_far(self) -> Sequence[Uncorrected]:
+        """The same of the last trial fit in the background."""
+        return self._calibrator.uncorrected_so_far()
 
     @property
     def calibration_report(self) -> dict[str, Any]:

@@ -1,0 +1,168 @@
+"""Findings of a trial fit that nothing corrects: clocks, mounts and scales that are off, and what mends them.
+
+A parameter may be far off and harm nothing, e.g. where sightings at all sides average it. So it is told by its effect:
+the poses would move, and their covariances, which take the parameter for known, do not say so. With the shift b of a
+pose and its covariance P, b' inv(P) b is what the parameter adds to the pose's normalised error squared (NEES), of
+which the degrees of freedom are expected.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from graph_slam_ros.slam.calibration.decision import LEAST_SIGMA_PER_M, SIGMAS, Finding
+from graph_slam_ros.slam.calibration.fit import TrialFit
+from graph_slam_ros.slam.calibration.model import Values
+from graph_slam_ros.slam.calibration.parameters import OF_ODOMETRY, Parameter
+from graph_slam_ros.slam.frontend.corrections import AXES
+from graph_slam_ros.typing import Array, Index
+
+CODES = {
+    "clock": "clock_offset",
+    **dict.fromkeys(("roll", "pitch", "yaw"), "mount_yaw"),
+    "distance": "odometry_scale",
+    "turn": "turn_scale",
+    "range_factor": "range_scale",
+    "range_offset": "range_scale",
+}
+"""The finding of ``graph_slam check`` by parameter."""
+
+MOST_SHIFT = 2.0**0.5  # sigmas of the poses: with more, their NEES is three times what is expected
+_DEGREE = np.pi / 180.0
+_AXIS = {"roll": "about the axis ahead ", "pitch": "about the axis to the left ", "yaw": ""}
+
+Total = Callable[[str, str], float]
+"""The value of a parameter of an input that measurements are corrected by at present."""
+
+
+@dataclass(frozen=True, slots=True)
+class Uncorrected:
+    """A parameter that is off, or a noise that is too small, so that the estimate is worse than it says.
+
+    Attributes
+    ----------
+    code : the finding of ``graph_slam check``
+    value, sigma : of the correction, in s, rad, m, or as a part; of a noise, the stated one [m for each metre], and 0
+    shift : root mean square by which it moves the poses, in their sigmas
+    setting : a parameter of the configuration, and the value that mends it
+    """
+
+    code: str
+    source: str
+    value: float
+    sigma: float
+    shift: float
+    text: str
+    setting: tuple[str, Any]
+
+    def __str__(self) -> str:
+        return f"{self.code}: {self.source}: {self.text}; by it the poses are off by {self.shift:.1f} of their sigmas"
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values with six digits, because the last ones depend on the memory alignment of an array."""
+        numbers = {name: float(f"{getattr(self, name):.6g}") for name in ("value", "sigma", "shift")}
+        key, value = self.setting
+        return {"code": self.code, **numbers, "text": str(self), "settings": {key: value}}
+
+
+def uncorrected(
+    found: TrialFit,
+    findings: Sequence[Finding],
+    covariances: Mapping[int, Array],
+    total: Total,
+    sigma_per_m: float,
+) -> list[Uncorrected]:
+    """Return what is off by more than the poses' sigmas allow, the worst first.
+
+    Parameters
+    ----------
+    findings : of each parameter of the fit
+    covariances : (dof, dof) of poses in their tangent space, by vertex
+    sigma_per_m : of odometry's position for each metre, as stated
+    """
+    shifts = pose_shifts(found, covariances)
+    if sigma_per_m < LEAST_SIGMA_PER_M:
+        return _too_sure(found, shifts, sigma_per_m)
+    off = [k for k, one in enumerate(findings) if one.verdict == "admitted" and shifts[k] > MOST_SHIFT]
+    off = [k for k in off if found.parameters[k].name in CODES]
+    values = {found.parameters[k]: float(found.values[k]) for k in off}
+    out = []
+    for k in off:
+        one, sigma = found.parameters[k], float(found.sigmas[k])
+        text = sentence(one, values[one], sigma)
+        text += ", more than its stated noise allows for (odometry.noise)" * (one.name in OF_ODOMETRY)
+        more = (CODES[one.name], one.source, values[one], sigma, float(shifts[k]), text)
+        out.append(Uncorrected(*more, setting_of(one, values, total)))
+    return sorted(out, key=lambda one: -one.shift)
+
+
+def pose_shifts(found: TrialFit, covariances: Mapping[int, Array]) -> Array:
+    """Root mean square (p,) by which each parameter's correction moves the poses, in their sigmas."""
+    known = {vertex: of for vertex, of in covariances.items() if vertex < len(found.column) and _at(found, vertex) >= 0}
+    if not known:
+        return np.zeros(len(found.parameters))
+    every = np.array(list(known.values()))
+    rows = np.array([_at(found, vertex) for vertex in known])[:, None] + np.arange(every.shape[1])
+    moved = found.sensitivity[rows] * found.values
+    square = np.einsum("nip,nij,njp->np", moved, np.linalg.pinv(every, hermitian=True), moved)
+    return np.asarray(np.sqrt(np.maximum(square, 0.0).mean(axis=0) / every.shape[1]))
+
+
+def _at(found: TrialFit, vertex: int) -> int:
+    return int(found.column[vertex])
+
+
+def _too_sure(found: TrialFit, shifts: Array, sigma_per_m: float) -> list[Uncorrected]:
+    """Odometry whose noise is so small that the fit of its factors is not believed, if it matters."""
+    far = np.abs(found.values) > SIGMAS * found.sigmas
+    of_odometry = [k for k, one in enumerate(found.parameters) if one.name in OF_ODOMETRY and far[k]]
+    worst = max(of_odometry, key=lambda k: float(shifts[k]), default=-1)
+    if worst < 0 or shifts[worst] <= MOST_SHIFT:
+        return []
+    source = found.parameters[worst].source
+    text = f"odometry states {sigma_per_m:.1g} m of noise for each metre, no wheels are so good"
+    more = ("odometry_over_confident", source, sigma_per_m, 0.0, float(shifts[worst]), text)
+    return [Uncorrected(*more, ("odometry.noise", "motion"))]
+
+
+def sentence(one: Parameter, value: float, sigma: float) -> str:
+    """Say what is off, with its sigma."""
+    if one.name == "clock":
+        when, other = ("later", "late") if value > 0.0 else ("earlier", "early")
+        best = f"{abs(value) * 1e3:.0f} ms {when} than stamped (sigma {sigma * 1e3:.0f} ms)"
+        return f"sightings agree with odometry best {best}, or odometry is stamped as much too {other}"
+    if one.name in _AXIS:
+        return (
+            f"its sensor is turned by {value / _DEGREE:.1f} degrees {_AXIS[one.name]}on the robot "
+            f"(sigma {sigma / _DEGREE:.1f})"
+        )
+    if one.name == "range_factor":
+        return f"ranges are {1.0 / (1.0 + value):.3f} times the distances that odometry says (sigma {sigma:.3f})"
+    if one.name == "range_offset":
+        return f"ranges are {abs(value):.2f} m too {'short' if value > 0.0 else 'long'} (sigma {sigma:.2f} m)"
+    what = "drives" if one.name == "distance" else "turns"
+    text = f"the robot {what} {1.0 + value:.3f} times what odometry says (sigma {sigma:.3f})"
+    return f"{text}, or ranges are wrong by that factor" if one.name == "distance" else text
+
+
+def setting_of(one: Parameter, values: Values, total: Total) -> tuple[str, Any]:
+    """The parameter of the configuration, and its value with corrections; axes of one mount are corrected together."""
+    source, value, before = one.source, values[one], total(one.source, one.name)
+    if one.name == "clock":
+        return f"{source}.offset_s", round(before + value, 3)
+    if one.name in AXES:
+        numbers = (total(source, axis) + values.get(Parameter(source, axis), 0.0) for axis in AXES)
+        return f"{source}.mount_correction", " ".join(f"{x:.5g}" for x in numbers)
+    if one.name == "range_factor":
+        return f"{source}.range_factor", round(before * (1.0 + value), 4)
+    if one.name == "range_offset":
+        factor = 1.0 + values.get(Parameter(source, "range_factor"), 0.0)
+        return f"{source}.range_offset_m", round(before * factor + value, 3)
+    return f"odometry.{one.name}_factor", round(before * (1.0 + value), 4)
+
+
+def sampled(vertices: Index, most: int) -> Index:
+    """Some of the vertices, evenly, at most so many."""
+    return vertices[:: max(1, -(-len(vertices) // most))]

@@ -1,0 +1,96 @@
+"""A clock, a mount or a scale that is off and that nothing corrects is told, and its setting mends it."""
+
+import json
+
+import numpy as np
+import pytest
+from imperfect import Faults, driven, imperfect_drive_and_truth
+from planted_faults import planted
+
+from graph_slam_ros.cli import main
+from graph_slam_ros.messages.to_msg import WARN
+from graph_slam_ros.node.diagnostics import Facts, judge
+from graph_slam_ros.node.estimate import Estimate, UnseenWay
+from graph_slam_ros.runs.outcome import doubts
+from graph_slam_ros.simulation import simulate, write_bag
+from graph_slam_ros.slam import Config
+
+SURE = {"odometry.translation_density": 1e-3, "odometry.lateral_density": 1e-3}
+WRONG = [
+    (Faults(clock_s=0.2), {}, "clock_offset", 0.2, "detections.offset_s"),
+    (Faults(yaw=np.deg2rad(10.0)), {}, "mount_yaw", np.deg2rad(10.0), "detections.mount_correction"),
+    (Faults(distance=0.96), SURE, "odometry_scale", -0.04, "odometry.distance_factor"),
+]
+
+
+def nees(slam, truth):
+    """Mean of the poses' normalised errors squared, the frame of the map being that of the first pose."""
+    true = np.array([truth.at(int(stamp)) for stamp in slam.keyframes.stamps_ns])
+    error = slam.space.group.log(slam.space.group.between(tuple(true.T), tuple(slam.trajectory().T)))
+    every = np.stack(error, axis=-1)
+    return float(np.mean(np.einsum("ni,nij,nj->n", every, np.linalg.pinv(slam.keyframe_covariances()), every)))
+
+
+@pytest.mark.parametrize(("faults", "settings", "code", "value", "key"), WRONG)
+def test_what_is_off_is_told_with_its_sigma_and_the_setting_mends_it(faults, settings, code, value, key):
+    drive, truth = imperfect_drive_and_truth(faults, seconds=60.0)
+    slam = driven(drive, settings)
+    (one,) = slam.uncorrected()
+    assert (one.code, one.setting[0]) == (code, key)
+    assert one.value == pytest.approx(value, abs=max(0.015, 4.0 * one.sigma))
+    assert code in str(one)
+    if key == "detections.offset_s":  # which is applied where messages are read
+        drive, truth = imperfect_drive_and_truth(Faults(clock_s=faults.clock_s - one.value), seconds=60.0)
+        mended = driven(drive, settings)
+    else:
+        mended = driven(drive, settings | dict([one.setting]))
+    assert not mended.uncorrected()
+    assert nees(mended, truth) < 0.5 * nees(slam, truth)
+
+
+@pytest.mark.parametrize("kind", ["range_bearing", "position", "range"])
+@pytest.mark.parametrize("seed", range(4))
+def test_nothing_is_told_of_a_drive_with_nothing_wrong(kind, seed):
+    assert not driven(imperfect_drive_and_truth(Faults(), seed=seed, seconds=40.0, kind=kind)[0]).uncorrected()
+
+
+def test_the_node_is_degraded_by_the_same_words():
+    """Trials begin at keyframes 50, 100, 200; what they find is told 20 keyframes later, and corrects nothing."""
+    slam = driven(imperfect_drive_and_truth(Faults(clock_s=0.2), seconds=60.0)[0])
+    (one,) = slam.uncorrected_so_far
+    assert one.code == "clock_offset"
+    assert not slam.corrected
+    of = {"is_confirmed": True, "is_resumed": False, "solve_s": 0.0, "slowest_solve_s": 0.0, "fit": 1.0}
+    estimate = Estimate.of(slam, slam.correction, unseen=UnseenWay(0, 0), **of)
+    health = judge(Facts("active", estimate=estimate), Config())
+    assert (health.state, health.level) == ("DEGRADED", WARN)
+    assert str(one) in health.reasons[0]
+    assert "detections.offset_s=0." in health.reasons[0]
+
+
+@pytest.fixture(scope="module")
+def laps(tmp_path_factory):
+    file = tmp_path_factory.mktemp("laps") / "laps.mcap"
+    write_bag(simulate("warehouse", 3, aisles=2, aisle_m=6.0, laps=2), file)
+    return file
+
+
+def test_the_end_of_a_replay_names_a_wrong_mount(laps, tmp_path, capsys):
+    bag, run = planted(laps, tmp_path / "turned.mcap", "mount turned -10 degrees"), tmp_path / "run"
+    assert main(["replay", str(bag), "--out", str(run)]) in (0, 3)
+    said = [line for line in capsys.readouterr().err.splitlines() if "mount_yaw" in line]
+    assert len(said) == 1
+    assert "beware: mount_yaw: detections: its sensor is turned by -10." in said[0]
+    (one,) = json.loads((run / "run.json").read_text())["uncorrected"]
+    ((key, value),) = one["settings"].items()
+    assert f"--set '{key}={value}'" in said[0]
+    assert main(["replay", str(bag), "--out", str(run), "--force", "--set", f"{key}={value}"]) == 0
+    assert "uncorrected" not in json.loads((run / "run.json").read_text())
+    assert "mount_yaw" not in capsys.readouterr().err
+
+
+def test_an_error_of_the_recording_makes_a_fit_meaningless():
+    off = {"text": "clock_offset: ...", "settings": {"detections.offset_s": 0.1}}
+    summary = {"counters": {}, "inputs": {}, "uncorrected": [off]}
+    assert len(list(doubts(summary))) == 1
+    assert not list(doubts(summary | {"check": {"severity": "error"}}))
