@@ -29,6 +29,7 @@ CHECKS: tuple[Check, ...] = (
 OF_A_REPLAY: tuple[Check, ...] = (check_frames, check_times, check_odometry, check_pairs)
 """Those that a replay does by itself; its own table has the refusals."""
 
+_FROM_THE_BEGINNING = ("units", "mirrored", "axes", "unrelated")  # what is read later does not make it right
 _IN_OUTCOME = ("not_planar", "no_landmarks")
 
 
@@ -51,6 +52,17 @@ def check_columns(c: Columns, checks: tuple[Check, ...] = CHECKS) -> list[Findin
 def worst_of_replay(c: Columns) -> Finding | None:
     """The worst error or warning beyond what the end of a replay says anyway; None where there is none."""
     return worst([one for one in check_columns(c, OF_A_REPLAY) if one.code not in _IN_OUTCOME])
+
+
+def first_of_replay(c: Columns, *, is_whole: bool) -> Finding | None:
+    """The worst error that makes the result meaningless, as far as the recording was read; None where there is none.
+
+    Nor is there one without odometry: then there will be no result.
+    """
+    if not len(c.path_ns):
+        return None
+    errors = [one for one in check_columns(c, OF_A_REPLAY) if one.severity == "error" and one.code not in _IN_OUTCOME]
+    return next((one for one in errors if is_whole or one.code in _FROM_THE_BEGINNING), None)
 
 
 def _nothing_corrects(c: Columns) -> Iterator[Finding]:

@@ -28,7 +28,8 @@ def replay(args: argparse.Namespace) -> int:
         raise GraphSlamError("replay needs --out DIR, the folder for the results")
     own = config if args.config or args.set or not is_run(args.bag) else None
     topics = {"odometry": args.odom, "landmarks": args.landmarks, "map_folder": args.map}
-    done = replayed(args.bag, args.out, own, **topics, force=args.force, progress=console.progress("replay"))
+    shown = {"progress": console.progress("replay"), "warn": lambda text: console.warn(text, most=console.SENTENCE)}
+    done = replayed(args.bag, args.out, own, **topics, force=args.force, **shown)
     code = max([_print_earlier(run.folder, run.summary) for run in done.earlier], default=console.DONE)
     code = max(code, _print_summary(args.bag, done.summary))
     console.show(f"results in {args.out}")

@@ -3,12 +3,12 @@
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby, islice
+from itertools import chain, groupby, islice
 from operator import attrgetter, itemgetter
 from pathlib import Path
 from typing import Any
 
-from graph_slam_ros.check.checks import worst_of_replay
+from graph_slam_ros.check.checks import first_of_replay, worst_of_replay
 from graph_slam_ros.check.columns import Collector
 from graph_slam_ros.config.inputs import InputConfig, default_input
 from graph_slam_ros.measurements.reasons import warnings as mendable
@@ -32,6 +32,7 @@ _OPTIONS = {"odometry": "--odom", "landmarks": "--landmarks"}
 _OPTIONAL = default_input("detections")  # a recording need not have what nobody asked for
 
 _FEWEST, _MOST_TOGETHER = 4, 100  # messages that are converted together
+_READ_AHEAD = 20_000  # messages that are checked before anything is processed: minutes, and some megabytes
 
 END = Control("end"), Control("optimize")
 """The events at the end of a recording: held measurements are processed, and everything is solved."""
@@ -268,6 +269,7 @@ def replay(
     map_folder: Path | str | None = None,
     force: bool = False,
     progress: Progress = lambda items, total: items,
+    warn: Callable[[str], None] = lambda text: None,
 ) -> Replayed:
     """Run a recording, or the journal of a run, and save a run folder.
 
@@ -280,6 +282,7 @@ def replay(
     map_folder : a run whose map is loaded first; the robot's pose in it is unknown until a landmark is recognised
     force : replace a run in ``out``
     progress : wraps the sequence of measurements, for a progress bar; its second argument is their number, or 0
+    warn : is told before the work what makes its result meaningless
 
     Returns
     -------
@@ -295,7 +298,7 @@ def replay(
     check_room(out, source, force=force)
     if not is_run(source):
         map_folder = None if map_folder is None else Path(map_folder)
-        return _recorded(source, out, config, (odometry, landmarks), map_folder, took, progress, force=force)
+        return _recorded(source, out, config, (odometry, landmarks), map_folder, took, progress, warn, force=force)
     if map_folder is not None:
         raise RunError(f"{source}: a run is repeated in the map that it began in; a map is for a recording")
     config, own = with_survey(config or run_config(source)), run_config(source)
@@ -319,6 +322,7 @@ def _recorded(
     map_folder: Path | None,
     took: Stopwatch,
     progress: Progress,
+    warn: Callable[[str], None],
     *,
     force: bool,
 ) -> Replayed:
@@ -334,11 +338,16 @@ def _recorded(
     runs = RecordedRuns(bag, inputs, config, counters, state.datum if state is not None else (), columns)
     total = sum(bag.topics[topic].count for topic in inputs.by_topic()) + 3
     bag.losses += losses
+    read = iter(runs)
+    ahead = list(islice(read, _READ_AHEAD))
+    if found := first_of_replay(columns.columns(counters), is_whole=len(ahead) < _READ_AHEAD):
+        (sentence,) = checked({"check": found.as_dict()}, "error")
+        warn(f"the result will mean nothing: {sentence}")
     warmup(dimensions=config.world.dimensions)
     earlier: list[EarlierRun] = []
     warnings: list[str] = []
     summary: dict[str, Any] = {}
-    for number, run in groupby(progress(_with_end(runs), total), key=itemgetter(0)):
+    for number, run in groupby(progress(chain(ahead, read, _end(runs)), total), key=itemgetter(0)):
         if number:
             earlier.append(EarlierRun(_kept(out), summary))
             state, took = None, stopwatch()
@@ -384,7 +393,6 @@ def _measured(
     refused.update(runs.counted_in(number))
 
 
-def _with_end(runs: RecordedRuns) -> Iterator[tuple[int, Sequence[Measurement]]]:
-    """All runs of a recording, the last with its end."""
-    yield from runs
+def _end(runs: RecordedRuns) -> Iterator[tuple[int, Sequence[Measurement]]]:
+    """The events at the end of the last run of a recording."""
     yield from ((len(runs.counted), [event]) for event in END)

@@ -330,8 +330,10 @@ class Calibrator:
     def _off(self, found: TrialFit | None) -> list[Uncorrected]:
         if found is None or not self._backend.solver.is_current:
             return []
-        vertices = sampled(self._frontend.path.keyframes.ids, _MOST_POSES)
-        marginals = zip(vertices.tolist(), self._backend.solver.marginal(vertices), strict=True)
+        solver = self._backend.solver
+        keyframes = self._frontend.path.keyframes.ids
+        vertices = sampled(keyframes[np.isin(keyframes, solver.vertices)], _MOST_POSES)
+        marginals = zip(vertices.tolist(), solver.marginal(vertices), strict=True)
         covariances = {vertex: self.widened(marginal, vertex) for vertex, marginal in marginals}
         stated = self._problem().model().sigma_per_m()
         findings = self._decided(found, (), stated)

@@ -13,9 +13,11 @@ from graph_slam_ros.cli import main
 from graph_slam_ros.formats.parameters import parse_setting
 from graph_slam_ros.recordings.bag import open_bag
 from graph_slam_ros.runs.check import check
+from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.simulation import Drive, Fault, simulate, spoil_messages, write_bag, write_faulty_bag
 from graph_slam_ros.simulation.drive import Sightings
 from graph_slam_ros.simulation.message_faults import MESSAGE_KINDS
+from graph_slam_ros.slam import Config
 
 SELECTED = (
     "landmark clock +400 ms",
@@ -235,6 +237,32 @@ def test_each_finding_is_said_once(laps, tmp_path):
     drive.write(tmp_path / "faulty.mcap")
     found = check(tmp_path / "faulty.mcap").findings
     assert len(found) == len(set(found)) > 0
+
+
+@pytest.mark.parametrize("read_ahead", [20_000, 3_000], ids=["all is read", "a part is read"])
+def test_a_replay_says_before_the_work_what_makes_its_result_meaningless(laps, tmp_path, monkeypatch, read_ahead):
+    monkeypatch.setattr("graph_slam_ros.runs.replay._READ_AHEAD", read_ahead)
+    bag, run, said = planted(laps, tmp_path / "mirrored.mcap", "bearings mirrored"), tmp_path / "run", []
+
+    def warn(text):
+        assert not run.exists()
+        said.append(text)
+
+    done = replay(bag, run, Config(), warn=warn)
+    (one,) = said
+    assert one.startswith("the result will mean nothing: mirrored: ")
+    assert done.summary["check"]["code"] == "mirrored"
+    replay(laps, tmp_path / "clean", Config(), warn=said.append)
+    assert len(said) == 1
+
+
+@pytest.mark.parametrize(("read_ahead", "says"), [(20_000, True), (3_000, False)])
+def test_of_a_part_only_is_said_what_the_rest_does_not_make_right(laps, tmp_path, monkeypatch, read_ahead, says):
+    """A transform may still come."""
+    monkeypatch.setattr("graph_slam_ros.runs.replay._READ_AHEAD", read_ahead)
+    bag, said = planted(laps, tmp_path / "unlinked.mcap", "sensor frame without TF"), []
+    replay(bag, tmp_path / "run", Config(), warn=said.append)
+    assert ["frame_unlinked" in text for text in said] == [True] * says
 
 
 def test_each_finding_is_planted():
