@@ -3,6 +3,7 @@
 import numpy as np
 
 from graph_slam_ros.graph import R1, R2, SE2, EdgeType
+from graph_slam_ros.graph.records import TABLES
 from graph_slam_ros.solver.clique_tree import storage as t
 from graph_slam_ros.solver.clique_tree.pointers import pointers_of
 
@@ -46,6 +47,16 @@ def _listed(first, following, most, what):
     return out
 
 
+def check_pointers(graph):
+    """Assert that compiled code is given the places where the columns of a graph are."""
+    columns = graph.kind, graph.offset, graph.initial, graph.table_of_edge, graph.row_of_edge
+    assert graph.pointers[: len(columns)].tolist() == [column.values.ctypes.data for column in columns]
+    tables = list(graph.tables.values())
+    assert graph.pointers[TABLES:].tolist() == [table.pointers.ctypes.data for table in tables]
+    for table in tables:
+        assert table.pointers[: len(table.columns)].tolist() == [c.values.ctypes.data for c in table.columns]
+
+
 def check_tree(solver, *, regions_separate=False):
     """Walk the clique tree and the regions, and assert what must hold between updates.
 
@@ -53,7 +64,9 @@ def check_tree(solver, *, regions_separate=False):
     """
     tree = solver._tree
     vertex, clique, state = tree.vertex, tree.clique, tree.state
-    assert np.array_equal(solver._pointers, pointers_of(tree)), "kernels get arrays that are gone"
+    of_problem = solver._kept, solver._inside, solver._held, solver._edge_inside, solver._shapes
+    assert np.array_equal(solver._pointers, pointers_of(tree, *of_problem)), "kernels get arrays that are gone"
+    check_pointers(solver.graph)
     assert min(map(len, (tree.vertex, tree.listed, solver._inside, solver._held))) >= solver._vertices
     assert min(map(len, (tree.edge, solver._edge_inside))) >= solver.graph.edge_count
     free = np.flatnonzero(vertex[: solver._vertices, t.FREE] == 1).tolist()

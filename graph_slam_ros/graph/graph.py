@@ -11,10 +11,11 @@ from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph.edge_type import EdgeType
 from graph_slam_ros.graph.lasting_ids import LastingIds
 from graph_slam_ros.graph.noise import Gaussian
+from graph_slam_ros.graph.records import FITS, ITSELF, LINEARIZE, MISSING, NOT_FINITE, append_edges, append_vertices
 from graph_slam_ros.graph.tables import Column, Edge, EdgeTable, Vertex
 from graph_slam_ros.graph.vertices import VertexKind
-from graph_slam_ros.lie.jit import kernel
-from graph_slam_ros.typing import Array, Index
+from graph_slam_ros.lie.addresses import address_of
+from graph_slam_ros.typing import Array, Index, Mask
 
 
 def whole_numbers(ids: ArrayLike, what: str) -> Index:
@@ -35,6 +36,7 @@ class Graph:
     kind : code of each vertex's kind, an index into ``kinds``
     offset : where each vertex begins in ``initial``, the stored numbers of all vertices end to end
     table_of_edge, row_of_edge : of each edge, its table (counted in the order of ``tables``) and row
+    pointers : where all of it is in memory, for compiled code (``records``)
     vertex_ids, edge_ids : the ids that last, where rows were removed (``kept_part``); until then they are the same
     """
 
@@ -44,13 +46,21 @@ class Graph:
         self.offset = Column(np.int64)
         self.initial = Column(np.float64)
         self.tables: dict[EdgeType, EdgeTable] = {}
-        self._accepted: dict[EdgeType, NDArray[np.bool_]] = {}  # (slots, kinds): whether a slot takes a kind
+        self._accepted: dict[EdgeType, Mask] = {}  # (slots, kinds): whether a slot takes a kind
         self._in_order: list[EdgeTable] = []
         self.labels: list[str] = []
         self.sources: list[str] = []
         self.table_of_edge = Column(np.int64)
         self.row_of_edge = Column(np.int64)
         self.vertex_ids, self.edge_ids = LastingIds(), LastingIds()
+        self.locate()
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        for table in self.tables.values():
+            table.pointers[LINEARIZE] = 0  # it may be another process
+            table.locate()
+        self.locate()
 
     def __repr__(self) -> str:
         codes, counts = np.unique(self.kind.values, return_counts=True)
@@ -62,12 +72,12 @@ class Graph:
     @property
     def vertex_count(self) -> int:
         """Number of vertices; their ids are below it."""
-        return len(self.kind)
+        return self.kind.count
 
     @property
     def edge_count(self) -> int:
         """Number of edges; their ids are below it."""
-        return len(self.row_of_edge)
+        return self.row_of_edge.count
 
     def add_vertices(self, kind: VertexKind, values: ArrayLike) -> Index:
         """Add n vertices with initial values (n, size), or (n,) where one number is stored; returns their ids."""
@@ -76,21 +86,22 @@ class Graph:
             rows = rows[:, None]
         if rows.shape != (len(rows) if rows.ndim else 0, kind.size):
             raise GraphSlamError(f"{kind.name}: values of shape {rows.shape}, not (n, {kind.size})")
-        fault = kind.fault(rows)
-        if fault is not None:
-            row, why = fault
-            raise GraphSlamError(f"initial value {rows[row].tolist()} of vertex {self.vertex_count + row} {why}")
-        count, start = len(rows), len(self.initial)
-        first = self.vertex_count
-        ids = np.arange(first, first + count)
-        if kind not in self.kinds:
+        count, first, numbers = len(rows), self.kind.count, self.initial.count
+        if first + count > self.kind.room or numbers + rows.size > self.initial.room:
+            vertices = (self.kind, first + count), (self.offset, first + count)
+            self._lengthen(*vertices, (self.initial, numbers + rows.size))
+        code = _code(self.kinds, kind)
+        unfit = append_vertices(self.pointers, first, numbers, _plain(rows), code)
+        if unfit >= 0 or kind.holds is not None:
+            fault = kind.fault(rows)
+            if fault is not None:
+                row, why = fault
+                raise GraphSlamError(f"initial value {rows[row].tolist()} of vertex {first + row} {why}")
+        if code == len(self.kinds):
             self.kinds.append(kind)
-        Column.extend(
-            (self.kind, self.kinds.index(kind), count),
-            (self.offset, start if count == 1 else start + kind.size * np.arange(count), count),
-            (self.initial, rows.ravel(), rows.size),
-        )
-        return ids
+        self.initial.count += rows.size
+        self.kind.count = self.offset.count = first + count
+        return np.arange(first, first + count)
 
     def add_vertex(self, kind: VertexKind, value: ArrayLike) -> int:
         """Add one vertex with its initial value (size,); returns its id."""
@@ -116,26 +127,26 @@ class Graph:
         source : the input that measured it
         """
         at, z = whole_numbers(vertices, edge.name), edge.whole(measured)
-        self._check(edge, at, z, noise)
+        self._check_shapes(edge, at, z, noise)
         table = self.tables.get(edge)
         if table is None:
             table = EdgeTable(edge, len(self.tables))
-            self._in_order[table.code :] = [table]  # also where this was interrupted before
-            self.tables[edge] = table
-        first, row, count = self.edge_count, len(table), len(at)
-        ids = np.arange(first, first + count)
-        Column.extend(
-            (self.table_of_edge, table.code, count),
-            (self.row_of_edge, row if count == 1 else np.arange(row, row + count), count),
-            (table.id, first if count == 1 else ids, count),
-            (table.vertices, at, count),
-            (table.measured, z, count),
-            (table.sqrt_information, noise.sqrt_information, count),
-            (table.label, _code(self.labels, label), count),
-            (table.source, _code(self.sources, source), count),
-            (table.weight, 1.0, count),
-        )
-        return ids
+        first, row, count = self.row_of_edge.count, table.id.count, len(at)
+        if row + count > table.id.room:
+            table.lengthen(row + count)
+        if first + count > self.row_of_edge.room:
+            self._lengthen((self.table_of_edge, first + count), (self.row_of_edge, first + count))
+        there = self.kind.count, first, row
+        codes = table.code, _code(self.labels, label), _code(self.sources, source)
+        given = _plain(at), _plain(z), np.asarray(noise.sqrt_information, dtype=np.float64).ravel()
+        fault, *where = append_edges(self.pointers, table.pointers, there, *given, self._accepted_by(edge), codes)
+        if fault != FITS:
+            self._refuse_unfit(edge, at, z, fault, *where)
+        self._register(table, label, source)
+        for column in table.columns:
+            column.count = row + count
+        self.table_of_edge.count = self.row_of_edge.count = first + count
+        return np.arange(first, first + count)
 
     def add_edge(
         self,
@@ -225,62 +236,64 @@ class Graph:
             found.append(table.id.values[(table.vertices.values >= vertex).any(axis=1)])
         return np.sort(np.concatenate(found))
 
-    def _check(self, edge: EdgeType, at: Index, measured: Array, noise: Gaussian) -> None:
+    def _register(self, table: EdgeTable, label: str, source: str) -> None:
+        """Append what is new: a table, the name of a class, that of an input."""
+        if table.code == len(self.tables):
+            self._in_order[table.code :] = [table]  # also where this was interrupted before
+            self.tables[table.type] = table
+            self.locate()
+        for names, name in ((self.labels, label), (self.sources, source)):
+            if name not in names:
+                names.append(name)
+
+    def _lengthen(self, *columns: tuple[Column, int]) -> None:
+        """Make room for so many rows."""
+        try:
+            for column, rows in columns:
+                column.lengthen(rows)
+        finally:
+            self.locate()
+
+    def locate(self) -> None:
+        """Note where all columns are, after they moved in memory or a table was added."""
+        columns = self.kind, self.offset, self.initial, self.table_of_edge, self.row_of_edge
+        room = min(self.table_of_edge.room, self.row_of_edge.room)
+        tables = (address_of(table.pointers) for table in self.tables.values())
+        self.pointers = np.array([*(column.address for column in columns), room, *tables], dtype=np.int64)
+
+    @staticmethod
+    def _check_shapes(edge: EdgeType, at: Index, measured: Array, noise: Gaussian) -> None:
         for what, given, size in (("vertices", at, len(edge.accepts)), ("measurements", measured, edge.measured_size)):
             if given.ndim != 2 or given.shape[1] != size:
                 shape = tuple(given.shape)
                 raise GraphSlamError(f"{edge.name}: {what} of shape {shape}, not (n, {size})")
         if len(at) != len(measured):
             raise GraphSlamError(f"{edge.name}: {len(at)} edges but {len(measured)} measurements")
-        if noise.sqrt_information.shape[-1] != edge.residual_size or (
-            len(noise.sqrt_information.shape) == 3 and len(noise.sqrt_information) != len(at)
-        ):
-            raise GraphSlamError(f"{edge.name}: noise of shape {noise.sqrt_information.shape} does not fit")
-        fault, row, slot = _misfit(_plain(at), _plain(measured), self.kind.values, self._accepted_by(edge))
-        if fault == _FITS:
-            return
+        shape = noise.sqrt_information.shape
+        if shape[-1] != edge.residual_size or (len(shape) == 3 and shape[0] != len(at)):
+            raise GraphSlamError(f"{edge.name}: noise of shape {shape} does not fit")
+
+    def _refuse_unfit(self, edge: EdgeType, at: Index, measured: Array, fault: int, row: int, slot: int) -> None:
+        """Raise GraphSlamError for an edge (``misfit``)."""
         vertex = int(at[row, slot])
-        if fault == _NOT_FINITE:
+        if fault == NOT_FINITE:
             raise GraphSlamError(
                 f"{edge.name}: measurement {measured[row].tolist()} at vertices {at[row].tolist()} is not finite"
             )
-        if fault == _MISSING:
+        if fault == MISSING:
             raise GraphSlamError(f"{edge.name}: vertex {vertex} does not exist")
-        if fault == _ITSELF:
+        if fault == ITSELF:
             raise GraphSlamError(f"{edge.name}: edge from vertex {vertex} to itself")
         kind = edge.accepts[slot][0].name
         raise GraphSlamError(f"{edge.name}: vertex {vertex} is {self.kind_of(vertex).name}, not {kind}")
 
-    def _accepted_by(self, edge: EdgeType) -> NDArray[np.bool_]:
+    def _accepted_by(self, edge: EdgeType) -> Mask:
         """Return whether each slot of an edge takes each kind, (slots, kinds)."""
         found = self._accepted.get(edge)
         if found is None or found.shape[1] != len(self.kinds):
             rows = [[kind in kinds for kind in self.kinds] for kinds in edge.accepts]
             found = self._accepted[edge] = np.array(rows, dtype=bool)
         return found
-
-
-_FITS, _NOT_FINITE, _MISSING, _ITSELF, _OF_ANOTHER_KIND = range(5)
-
-
-@kernel
-def _misfit(at: Index, measured: Array, kind: Index, accepted: NDArray[np.bool_]) -> tuple[int, int, int]:
-    """Return what the first edge that cannot be is refused for, its row, and the slot of the vertex."""
-    count, slots = at.shape
-    for row in range(count):
-        for k in range(measured.shape[1]):
-            if not np.isfinite(measured[row, k]):
-                return _NOT_FINITE, row, 0
-        for slot in range(slots):
-            if at[row, slot] < 0 or at[row, slot] >= len(kind):
-                return _MISSING, row, slot
-            for other in range(slot):
-                if at[row, slot] == at[row, other]:
-                    return _ITSELF, row, slot
-        for slot in range(slots):
-            if not accepted[slot, kind[at[row, slot]]]:
-                return _OF_ANOTHER_KIND, row, slot
-    return _FITS, 0, 0
 
 
 def _plain(array: NDArray[Any]) -> NDArray[Any]:
@@ -294,8 +307,6 @@ def _one(one: int, count: int, what: str) -> int:
     return one
 
 
-def _code(names: list[str], name: str) -> int:
-    """Its place among the names, the last if it is new."""
-    if name not in names:
-        names.append(name)
-    return names.index(name)
+def _code(names: list[Any], name: Any) -> int:
+    """Its place among the names, that behind the last if it is new."""
+    return names.index(name) if name in names else len(names)

@@ -45,6 +45,9 @@ def kept_part(graph: Graph, vertices: Index, edges: Index, values: Array) -> Gra
     Column.extend((out.table_of_edge, code_of_edge, count), (out.row_of_edge, row_of_edge, count))
     out.vertex_ids = graph.vertex_ids.kept(vertices, graph.vertex_count)
     out.edge_ids = graph.edge_ids.kept(edges, graph.edge_count)
+    for table in out.tables.values():
+        table.locate()
+    out.locate()
     return out
 
 

@@ -6,8 +6,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from graph_slam_ros.graph import records
 from graph_slam_ros.graph.edge_type import EdgeType
 from graph_slam_ros.graph.vertices import VertexKind
+from graph_slam_ros.lie.addresses import address_of
 from graph_slam_ros.typing import Array, Index
 
 
@@ -16,10 +18,10 @@ class Column:
 
     Attributes
     ----------
-    values : the rows so far, a view
+    count : rows so far; room : rows that it can have before it moves in memory
     """
 
-    __slots__ = ("_buffer", "values")
+    __slots__ = ("_buffer", "_values", "count", "room")
 
     def __init__(self, dtype: type, *shape: int) -> None:
         self.__setstate__(np.empty((0, *shape), dtype=dtype))
@@ -29,10 +31,23 @@ class Column:
 
     def __setstate__(self, values: NDArray[Any]) -> None:
         self._buffer: NDArray[Any] = values
-        self.values: NDArray[Any] = values[:]
+        self._values: NDArray[Any] = values[:]
+        self.count = self.room = len(values)
 
     def __len__(self) -> int:
-        return len(self.values)
+        return self.count
+
+    @property
+    def values(self) -> NDArray[Any]:
+        """The rows so far, a view."""
+        if len(self._values) != self.count:
+            self._values = self._buffer[: self.count]
+        return self._values
+
+    @property
+    def address(self) -> int:
+        """The place in memory where it begins."""
+        return address_of(self._buffer)
 
     @staticmethod
     def extend(*parts: tuple["Column", ArrayLike, int]) -> None:
@@ -40,24 +55,23 @@ class Column:
 
         Half a record would shift all later ones.
         """
-        longer = []
         for column, rows, count in parts:
-            begin = len(column.values)
+            begin = column.count
             end = begin + count
-            if end > len(column._buffer):
-                column._lengthen(end)
+            column.lengthen(end)
             # beyond the end, where nothing is visible yet; a number alone takes a tenth of the time
             column._buffer[begin if isinstance(rows, int | float) and count == 1 else slice(begin, end)] = rows
-            longer.append(column._buffer[:end])
-        for (column, _, _), values in zip(parts, longer, strict=True):
-            column.values = values
+        for column, _, count in parts:
+            column.count += count
 
-    def _lengthen(self, rows: int) -> None:
+    def lengthen(self, rows: int) -> None:
         """Make room for at least so many rows."""
+        if rows <= self.room:
+            return
         before = self.values
-        grown = np.empty((max(rows, 16, 2 * len(self._buffer)), *before.shape[1:]), dtype=before.dtype)
+        grown = np.empty((max(rows, 16, 2 * self.room), *before.shape[1:]), dtype=before.dtype)
         grown[: len(before)] = before
-        self._buffer, self.values = grown, grown[: len(before)]
+        self._buffer, self._values, self.room = grown, grown[: len(before)], len(grown)
 
 
 @dataclass(slots=True, eq=False)
@@ -70,10 +84,13 @@ class EdgeTable:
     id : edge ids; vertices : (n, k) vertex ids; measured : (n, p); sqrt_information : (n, m, m)
     label, source : codes into ``Graph.labels`` and ``Graph.sources``
     weight : a factor on the information, 0 = out of the problem
+    pointers : where all of it is in memory, for compiled code (``records``)
     """
 
     type: EdgeType
     code: int
+    pointers: Index = field(init=False)
+    columns: tuple[Column, ...] = field(init=False)
     width: int = field(init=False)
     id: Column = field(init=False)
     vertices: Column = field(init=False)
@@ -92,9 +109,31 @@ class EdgeTable:
         self.sqrt_information = Column(np.float64, m, m)
         self.label, self.source = Column(np.int64), Column(np.int64)
         self.weight = Column(np.float64)
+        self.columns = (
+            *(self.id, self.vertices, self.measured, self.sqrt_information),
+            *(self.label, self.source, self.weight),
+        )
+        self.pointers = np.zeros(records.TABLE_COLUMNS, dtype=np.int64)
+        sizes = len(self.type.accepts), self.type.measured_size, m, self.width
+        self.pointers[records.ENDS : records.LINEARIZE] = sizes
+        self.locate()
 
     def __len__(self) -> int:
-        return len(self.id)
+        return self.id.count
+
+    def lengthen(self, rows: int) -> None:
+        """Make room for at least so many rows."""
+        try:
+            for column in self.columns:
+                column.lengthen(rows)
+        finally:
+            self.locate()
+
+    def locate(self) -> None:
+        """Note where the columns are, after they moved in memory."""
+        for k, column in enumerate(self.columns):
+            self.pointers[k] = column.address
+        self.pointers[records.ROOM] = min(column.room for column in self.columns)
 
     def at(self, rows: Index) -> "EdgeRows":
         """Some rows, as arrays."""

@@ -26,7 +26,7 @@ from numba.extending import register_jitable
 
 from graph_slam_ros.errors import GraphSlamError
 
-__all__ = ["CACHE_DIR", "jitable", "kernel"]
+__all__ = ["CACHE_DIR", "inner", "jitable", "kernel"]
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 _KERNEL_FOLDERS = ("lie", "graph", "solver")
@@ -171,6 +171,14 @@ def kernel(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
     if compiled is not function:  # it is where compilation is switched off
         compiled._cache = _Cache(function)  # type: ignore[no-untyped-call]
     return cast(Callable[..., Any], compiled)
+
+
+def inner(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile a kernel that kernels alone call: a call from Python would crash.
+
+    What Python would call it by takes a tenth of a second to compile where it gets a tuple of arrays.
+    """
+    return kernel(function, no_cpython_wrapper=True)
 
 
 def jitable(function: Callable[..., Any]) -> Callable[..., Any]:

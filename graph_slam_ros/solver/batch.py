@@ -9,6 +9,7 @@ import numpy as np
 from graph_slam_ros.errors import GraphSlamError, SingularError
 from graph_slam_ros.graph import Graph, Loss
 from graph_slam_ros.graph.tables import EdgeTable
+from graph_slam_ros.solver.blocks import store_first
 from graph_slam_ros.solver.clique_tree.numeric import (
     accept_steps,
     curvature,
@@ -20,7 +21,7 @@ from graph_slam_ros.solver.clique_tree.storage import NOTHING, Tree
 from graph_slam_ros.solver.clique_tree.substitution import forget, step_all
 from graph_slam_ros.solver.clique_tree.symbolic import mark
 from graph_slam_ros.solver.gauge import undetermined
-from graph_slam_ros.solver.linearization import Losses, LossKey, costs, linearize, refuse_nonfinite, store_first
+from graph_slam_ros.solver.linearization import Losses, LossKey, costs, linearize, refuse_nonfinite
 from graph_slam_ros.solver.report import Iteration, Report
 from graph_slam_ros.typing import Array, Index
 

@@ -5,7 +5,7 @@ After Kaess and Dellaert, "Covariance recovery from a square root information ma
 
 import numpy as np
 
-from graph_slam_ros.lie.jit import kernel
+from graph_slam_ros.lie.jit import inner, kernel
 from graph_slam_ros.solver.clique_tree.indices import ascending, chosen
 from graph_slam_ros.solver.clique_tree.storage import (
     CLIQUE,
@@ -90,7 +90,7 @@ def among(t: Tree, ends: Index) -> Array:
     return out
 
 
-@kernel
+@inner
 def _of_cliques(t: Tree, cliques: Index) -> tuple[Index, Array]:
     """Return where each clique's covariance begins, and all of them; the cliques' marks count them until reset.
 
@@ -114,7 +114,7 @@ def _of_cliques(t: Tree, cliques: Index) -> tuple[Index, Array]:
     return start, pool
 
 
-@kernel
+@inner
 def _place_in(vertex: Index, clique: Index, members: Index, c: int, v: int) -> int:
     """The row where a member begins in a clique's front."""
     at = 0
@@ -125,7 +125,7 @@ def _place_in(vertex: Index, clique: Index, members: Index, c: int, v: int) -> i
     return at
 
 
-@kernel
+@inner
 def _inherit(t: Tree, c: int, above: Array, covariance: Array) -> None:
     """Copy the covariance of a separator out of the parent's."""
     vertex, clique, members = t.vertex, t.clique, t.members
@@ -148,7 +148,7 @@ def _inherit(t: Tree, c: int, above: Array, covariance: Array) -> None:
             covariance[frontal + i, frontal + j] = above[place[i], place[j]]
 
 
-@kernel
+@inner
 def _complete(front: Array, frontal: int, covariance: Array) -> None:
     """Complete the covariance from the separator's block: ``U11 X = [1 / U11', 0] - U12 Sigma``, column by column."""
     full = len(covariance)
@@ -209,7 +209,7 @@ def joint(t: Tree, vertices: Index) -> Array:
     return _in_order_asked_for(vertex, vertices, ordered)
 
 
-@kernel
+@inner
 def _by_key(vertex: Index, vertices: Index) -> Index:
     """Return the indices that sort vertices by their order of elimination."""
     key = np.empty(len(vertices), np.int64)
@@ -218,7 +218,7 @@ def _by_key(vertex: Index, vertices: Index) -> Index:
     return ascending(key)
 
 
-@kernel
+@inner
 def _in_order_asked_for(vertex: Index, vertices: Index, ordered: Array) -> Array:
     """Return a symmetric matrix in the order of ``vertices``, from one in order of elimination."""
     begin = np.empty(len(vertices), np.int64)

@@ -8,17 +8,16 @@ from typing import TypeAlias
 import numpy as np
 
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.graph import EdgeType, Graph, Loss
-from graph_slam_ros.graph.losses import weight_and_cost
+from graph_slam_ros.graph import EdgeType, Graph, Loss, records
+from graph_slam_ros.graph.native import native_address
 from graph_slam_ros.graph.tables import EdgeTable
+from graph_slam_ros.lie.addresses import address_of
 from graph_slam_ros.lie.jit import kernel
-from graph_slam_ros.solver.clique_tree.numeric import add_to_diagonal, clear_block
-from graph_slam_ros.solver.clique_tree.pointers import tree_of
-from graph_slam_ros.solver.clique_tree.storage import BLOCK, NOTHING, Tree
+from graph_slam_ros.solver.blocks import CHUNK, gather, store_linearized, whiten, whiten_and_store
+from graph_slam_ros.solver.clique_tree.storage import NOTHING
 from graph_slam_ros.solver.report import ClassCost
 from graph_slam_ros.typing import Array, Index
 
-CHUNK = 512  # edges
 LossKey: TypeAlias = str | tuple[str, str]
 
 
@@ -55,63 +54,12 @@ class Losses:
         self.kind = np.array([loss.kind for loss in losses], dtype=np.int64)
         self.scale = np.array([loss.scale for loss in losses])
         self._sources = len(sources) if sources != [""] else 0
+        self.pointers = np.array([address_of(self.kind), address_of(self.scale), len(losses), self._sources])
 
     def codes(self, table: EdgeTable, rows: Index) -> Index:
         """Return the indices (n,) of the losses of some edges in ``kind`` and ``scale``."""
         label: Index = table.label.values[rows]
         return label * self._sources + table.source.values[rows] if self._sources else label
-
-
-@kernel
-def _gather(rows: Index, vertices: Index, offset: Index, measured: Array) -> tuple[Index, Array]:
-    """Return offsets (n, k) of the vertices of some edges, and their measurements (n, p)."""
-    n, ends = len(rows), vertices.shape[1]
-    at, z = np.empty((n, ends), np.int64), np.empty((n, measured.shape[1]))
-    for k in range(n):
-        for s in range(ends):
-            at[k, s] = offset[vertices[rows[k], s]]
-        for c in range(measured.shape[1]):
-            z[k, c] = measured[rows[k], c]
-    return at, z
-
-
-@kernel
-def _whiten(
-    rows: Index,
-    residual: Array,
-    jacobian: Array,
-    sqrt_information: Array,
-    weight: Array,
-    loss: Index,
-    loss_kind: Index,
-    loss_scale: Array,
-) -> tuple[Array, Array]:
-    """Multiply residuals and Jacobians by sqrt(weight * rho') R in place; returns chi2 and cost of each edge."""
-    n, m, width = jacobian.shape
-    chi2, cost = np.zeros(n), np.zeros(n)
-    r, j = np.zeros(m), np.zeros((m, width))
-    for e in range(n):
-        row = rows[e]
-        s = 0.0
-        for a in range(m):
-            r[a] = 0.0
-            for c in range(width):
-                j[a, c] = 0.0
-            for b in range(m):
-                root = sqrt_information[row, a, b]
-                r[a] += root * residual[e, b]
-                for c in range(width):
-                    j[a, c] += root * jacobian[e, b, c]
-            s += r[a] * r[a]
-        s *= weight[row]
-        slope, rho = weight_and_cost(loss_kind[loss[e]], loss_scale[loss[e]], s)
-        chi2[e], cost[e] = s, rho
-        factor = np.sqrt(weight[row] * slope)
-        for a in range(m):
-            residual[e, a] = factor * r[a]
-            for c in range(width):
-                jacobian[e, a, c] = factor * j[a, c]
-    return chi2, cost
 
 
 def linearize(graph: Graph, x: Array, rows: Mapping[EdgeTable, Index], losses: Losses) -> Iterator[Block]:
@@ -123,13 +71,13 @@ def linearize(graph: Graph, x: Array, rows: Mapping[EdgeTable, Index], losses: L
         for first in range(0, len(chosen), CHUNK):
             some = chosen[first : first + CHUNK]
             residual, jacobian = given = _evaluate(graph, x, table, some)
-            chi2, cost = _whiten(some, *given, *_weights(table, some, losses))
+            chi2, cost = whiten(some, *given, *_weights(table, some, losses))
             yield Block(table, some, residual, jacobian, chi2, cost)
 
 
 def _evaluate(graph: Graph, x: Array, table: EdgeTable, rows: Index) -> tuple[Array, Array]:
     """Return residuals (n, m) and Jacobians (n, m, width) of rows of a table at the stored values x."""
-    at, measured = _gather(rows, table.vertices.values, graph.offset.values, table.measured.values)
+    at, measured = gather(rows, table.vertices.values, graph.offset.values, table.measured.values)
     return table.type.linearize(x, at, measured)
 
 
@@ -139,21 +87,36 @@ def _weights(table: EdgeTable, rows: Index, losses: Losses) -> tuple[Array, Arra
     return table.sqrt_information.values, table.weight.values, of_each, losses.kind, losses.scale
 
 
-def linearize_into(pointers: Index, graph: Graph, x: Array, rows: Mapping[EdgeTable, Index], losses: Losses) -> None:
-    """Linearise rows of tables at the stored values x, and put them into the tree (``pointers_of``).
+def linearize_into(
+    pointers: Index, graph: Graph, x: Array, edges: Index, losses: Losses, young: Index, first: Losses
+) -> None:
+    """Linearise edges at the stored values x, and put them into the tree (``pointers_of``).
+
+    Parameters
+    ----------
+    young, first : those of the edges whose loss is not of ``losses`` but of these
 
     Raises
     ------
     GraphSlamError
         The cost of an edge is not finite.
     """
-    for table, chosen in rows.items():
-        for first in range(0, len(chosen), CHUNK):
-            some = chosen[first : first + CHUNK] if len(chosen) > CHUNK else chosen
-            given = *_evaluate(graph, x, table, some), *_weights(table, some, losses)
-            bad = _whiten_and_store(pointers, table.id.values, some, *given)
-            if bad != NOTHING:
-                _refuse_row(table, bad)
+    code, row = store_linearized(graph.pointers, pointers, edges, losses.pointers, young, first.pointers)
+    if code == NOTHING:
+        return
+    if row != NOTHING:
+        _refuse_row(list(graph.tables.values())[code], row)
+    known = np.sort(young)  # not all edge types are compiled: one after the other
+    is_young = np.isin(edges, known)
+    for some, of_some in ((edges[is_young], first), (edges[~is_young], losses)):
+        for table, chosen in rows_of(graph, some).items():
+            for begin in range(0, len(chosen), CHUNK):
+                rows = chosen[begin : begin + CHUNK]
+                given = _evaluate(graph, x, table, rows)
+                bad = whiten_and_store(pointers, table.pointers, rows, *given, of_some.pointers)
+                if bad != NOTHING:
+                    _refuse_row(table, bad)
+            table.pointers[records.LINEARIZE] = native_address(table.type.linearize)
 
 
 def linearized(graph: Graph, x: Array, edge: EdgeType, vertices: Sequence[int], measured: Array) -> tuple[Array, Array]:
@@ -194,73 +157,6 @@ def _squares(root: Array, residual: Array) -> Array:
                 white += root[e, a, b] * residual[e, b]
             out[e] += white * white
     return out
-
-
-@kernel
-def store(t: Tree, rows: Index, ids: Index, residual: Array, jacobian: Array) -> None:
-    """Put whitened edges into the tree: J'J and J'r, and the diagonal of H, instead of what they had there."""
-    vertex, edge, link, blocks, diagonal = t.vertex, t.edge, t.link, t.blocks, t.diagonal
-    for k in range(len(rows)):
-        clear_block(vertex, edge, link, ids[rows[k]], blocks, diagonal)
-    store_first(t, rows, ids, residual, jacobian)
-
-
-@kernel
-def store_first(t: Tree, rows: Index, ids: Index, residual: Array, jacobian: Array) -> None:
-    """Put whitened edges into the tree that have nothing there yet."""
-    vertex, edge, link, blocks, diagonal = t.vertex, t.edge, t.link, t.blocks, t.diagonal
-    n, m, width = jacobian.shape
-    for k in range(n):
-        e = ids[rows[k]]
-        at = edge[e, BLOCK]
-        for p in range(width):
-            if m == 2:  # the usual sizes by themselves: short loops take most of the time
-                x, y = jacobian[k, 0, p], jacobian[k, 1, p]
-                for c in range(width):
-                    blocks[at + c] = x * jacobian[k, 0, c] + y * jacobian[k, 1, c]
-                blocks[at + width] = x * residual[k, 0] + y * residual[k, 1]
-            elif m == 3:
-                x, y, z = jacobian[k, 0, p], jacobian[k, 1, p], jacobian[k, 2, p]
-                for c in range(width):
-                    blocks[at + c] = x * jacobian[k, 0, c] + y * jacobian[k, 1, c] + z * jacobian[k, 2, c]
-                blocks[at + width] = x * residual[k, 0] + y * residual[k, 1] + z * residual[k, 2]
-            else:
-                blocks[at : at + width + 1] = 0.0
-                for a in range(m):
-                    x = jacobian[k, a, p]
-                    for c in range(width):
-                        blocks[at + c] += x * jacobian[k, a, c]
-                    blocks[at + width] += x * residual[k, a]
-            at += width + 1
-        add_to_diagonal(vertex, edge, link, e, blocks, diagonal)
-
-
-@kernel
-def _whiten_and_store(
-    pointers: Index,
-    ids: Index,
-    rows: Index,
-    residual: Array,
-    jacobian: Array,
-    sqrt_information: Array,
-    weight: Array,
-    loss: Index,
-    loss_kind: Index,
-    loss_scale: Array,
-) -> int:
-    """Whiten edges and add them to the tree; or add none, and return the row of one whose cost is not finite."""
-    _, cost = _whiten(rows, residual, jacobian, sqrt_information, weight, loss, loss_kind, loss_scale)
-    total, worst = 0.0, 0
-    for k in range(len(cost)):
-        total += cost[k]
-        if not np.isfinite(cost[k]):
-            return rows[k]
-        if cost[k] > cost[worst]:
-            worst = k
-    if not np.isfinite(total):
-        return rows[worst]
-    store(tree_of(pointers), rows, ids, residual, jacobian)
-    return NOTHING
 
 
 def information(graph: Graph, x: Array, rows: Mapping[EdgeTable, Index], free: Index, losses: Losses) -> Array:

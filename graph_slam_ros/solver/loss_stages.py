@@ -39,20 +39,12 @@ class LossStages:
 
     def losses(self, settings: Settings) -> list[Losses]:
         """The losses of each stage."""
-        key = len(self._graph.labels), len(self._graph.sources), settings
-        if self._made_for[:2] != key[:2] or self._made_for[2] is not settings:
-            self._made_for = key
+        labels, sources, made_for = self._made_for
+        graph = self._graph
+        if len(graph.labels) != labels or len(graph.sources) != sources or made_for is not settings:
+            self._made_for = len(graph.labels), len(graph.sources), settings
             self._losses = [Losses(self._graph, given) for given in settings.stages()]
         return self._losses
-
-    def of(self, edges: Index, settings: Settings) -> list[tuple[Index, Losses]]:
-        """Return the edges grouped by their present loss."""
-        stages = self.losses(settings)
-        if not len(self.young):
-            return [(edges, stages[-1])]
-        known = np.sort(self.young)
-        young = known[np.minimum(np.searchsorted(known, edges), len(known) - 1)] == edges  # faster than ``isin``
-        return [(edges[young], stages[0]), (edges[~young], stages[-1])]
 
     def begin(self, edges: Index, settings: Settings) -> None:
         """Begin the first stage of new edges; earlier young edges are no longer young."""

@@ -1,7 +1,5 @@
 """Changes of a problem since its last update."""
 
-from dataclasses import dataclass, field
-
 import numpy as np
 
 from graph_slam_ros.typing import Index
@@ -9,11 +7,6 @@ from graph_slam_ros.typing import Index
 NONE = np.empty(0, dtype=np.int64)
 
 
-def _none() -> Index:
-    return NONE
-
-
-@dataclass(slots=True)
 class PendingChanges:
     """Changes that the next update integrates.
 
@@ -26,12 +19,12 @@ class PendingChanges:
     broken : whether the tree must be made anew
     """
 
-    vertices: Index = field(default_factory=_none)
-    new: Index = field(default_factory=_none)
-    back: list[Index] = field(default_factory=list)
-    touched: Index = field(default_factory=_none)
-    may_float: bool = False
-    broken: bool = False
+    __slots__ = ("back", "broken", "may_float", "new", "touched", "vertices")
+
+    def __init__(self) -> None:
+        self.vertices = self.new = self.touched = NONE
+        self.back: list[Index] = []
+        self.may_float = self.broken = False
 
     def __bool__(self) -> bool:
         return bool(len(self.vertices) or len(self.new) or self.back or len(self.touched) or self.broken)

@@ -17,11 +17,8 @@ from graph_slam_ros.solver.clique_tree.pointers import pointers_of
 from graph_slam_ros.solver.clique_tree.pools import compact
 from graph_slam_ros.solver.clique_tree.storage import (
     ACTIVE,
-    BLOCKS_TOP,
     DEFERRED_COUNT,
     FREE,
-    LINKS,
-    NOTHING,
     SE2_KIND,
     SE3_KIND,
     STALE_COUNT,
@@ -34,6 +31,17 @@ from graph_slam_ros.solver.clique_tree.storage import (
     with_room,
 )
 from graph_slam_ros.solver.clique_tree.substitution import forget, show_all
+from graph_slam_ros.solver.entry import (
+    ANCHORED,
+    LEFT_OUT,
+    NO_ROOM,
+    RECORDED,
+    UNFIT_EDGE,
+    UNFIT_VERTEX,
+    anchorage,
+    enter_newest,
+    record,
+)
 from graph_slam_ros.solver.gauge import check_gauge, fix_the_whole
 from graph_slam_ros.solver.linearization import chi2_of, residuals_of, rows_of
 from graph_slam_ros.solver.pending import NONE, PendingChanges
@@ -52,38 +60,22 @@ class Problem:
         self.graph = graph
         self.settings = settings or Settings()
         self._tree = empty_tree()
-        self._pointers = pointers_of(self._tree)
         self._shapes = np.zeros((0, 3), dtype=np.int64)  # of the graph's kinds
-        self._room = 0, 0  # for vertices and their numbers
+        self._room = 0, 0, 0  # for vertices, their numbers, and edges
         self._vertices = 0  # of the graph, that have a record in the tree
         self._inside = np.zeros(0, dtype=bool)  # vertices of the problem
         self._held = np.zeros(0, dtype=bool)
         self._edge_inside = np.zeros(0, dtype=bool)  # edges of the problem
         self._pending = PendingChanges()
         self._kept = np.zeros(0)  # the estimate that the last call left, of what was read since it changed
+        self._locate()
 
     def add(self, vertices: ArrayLike, edges: ArrayLike) -> None:
         """Add vertices (at their initial values) and edges of the graph to the problem, by id, each once."""
-        self._grow()
         new, new_edges = whole_numbers(vertices, "vertex").ravel(), whole_numbers(edges, "edge").ravel()
-        inside, edge_inside = self._inside, self._edge_inside
-        unfit, unfit_edge, there = incremental.unfit(
-            self._pointers, new, inside, self._vertices, new_edges, edge_inside, self.graph.edge_count
-        )
-        if unfit != NOTHING:
-            _refuse_unfit(new, unfit, self._vertices, "vertex")
-        if unfit_edge != NOTHING:
-            _refuse_unfit(new_edges, unfit_edge, self.graph.edge_count, "edge")
-        rows = rows_of(self.graph, new_edges)
-        for table, chosen in rows.items():
-            missing = incremental.outside(chosen, table.vertices.values, table.weight.values, self._inside, new)
-            if missing != NOTHING:
-                raise GraphSlamError(f"an edge needs vertex {missing}, which was not added")
-        for table, chosen in rows.items():
-            self._record(table, chosen)
-        self._pending.broken |= there  # removed before: they are in the order still
+        self._pending.broken |= self._record(new, new_edges)  # removed before: they are in the order still
         self._pending.add(new, new_edges)
-        inside[new], edge_inside[new_edges] = True, True
+        self._inside[new], self._edge_inside[new_edges] = True, True
 
     def start_at(self, values: Array) -> None:
         """Start from other values than the graph's initial ones: the stored numbers of all vertices in one array."""
@@ -240,50 +232,68 @@ class Problem:
 
     def _grow(self) -> None:
         """Follow the graph's growth: new vertices start at their initial values."""
-        graph, known = self.graph, self._vertices
-        count = len(graph.kind)
-        if count > known:
-            size = len(graph.initial)
-            if count > self._room[0] or size > self._room[1]:
-                self._make_room(vertex=count, region=2 * count, tail=2 * count, listed=count)
-                self._make_room(diagonal=size, step=size, reference=size, value=size, estimate=size)
-                self._inside, self._held = longer(self._inside, count), longer(self._held, count)
-                self._kept = longer(self._kept, len(self._tree.estimate))
-                self._room = self._room_now()
-            first = int(graph.offset.values[known])
-            self._kept[first:size] = graph.initial.values[first:]
-            if len(self._shapes) != len(graph.kinds):
-                self._shapes = np.array([(k.dof, k.size, _KINDS.get(k, VECTOR)) for k in graph.kinds])
-            shapes = self._shapes[graph.kind.values[known:]]
-            incremental.append_vertices(
-                self._pointers, known, graph.offset.values[known:], graph.initial.values, shapes
-            )
-            self._vertices = count
-        if len(graph.row_of_edge) > min(len(self._edge_inside), len(self._tree.edge)):
-            self._make_room(edge=graph.edge_count)
-            self._edge_inside = longer(self._edge_inside, graph.edge_count)
+        graph = self.graph
+        if graph.kind.count > self._vertices or graph.row_of_edge.count > self._room[2]:
+            self._record(NONE, NONE)
 
-    def _room_now(self) -> tuple[int, int]:
-        """Return for how many vertices, and numbers of theirs, there is room."""
+    def _record(self, new: Index, new_edges: Index) -> bool:
+        """Follow the graph's growth, and record what is added to the problem; nothing where some of it is unfit.
+
+        Returns whether one of the vertices is in the order of the tree still.
+        """
+        graph = self.graph
+        now = graph.kind.count, graph.initial.count, graph.row_of_edge.count
+        room = self._room
+        if now[0] > room[0] or now[1] > room[1] or now[2] > room[2] or len(self._shapes) != len(graph.kinds):
+            self._follow(*now)
+        how, what, blocks = record(graph.pointers, self._pointers, (self._vertices, *now), new, new_edges)
+        while how == NO_ROOM:
+            self._make_room(link=what, blocks=blocks)
+            how, what, blocks = record(graph.pointers, self._pointers, (self._vertices, *now), new, new_edges)
+        self._vertices = now[0]
+        if how == RECORDED:
+            return bool(what)
+        if how == UNFIT_VERTEX:
+            _refuse_unfit(new, what, self._vertices, "vertex")
+        if how == UNFIT_EDGE:
+            _refuse_unfit(new_edges, what, graph.edge_count, "edge")
+        raise GraphSlamError(f"an edge needs vertex {what}, which was not added")
+
+    def _follow(self, count: int, size: int, edges: int) -> None:
+        """Make room for so many vertices, their stored numbers, and edges."""
+        try:
+            self._tree = with_room(
+                self._tree,
+                vertex=count, region=2 * count, tail=2 * count, listed=count, edge=edges,
+                diagonal=size, step=size, reference=size, value=size, estimate=size,
+            )  # fmt: skip
+            self._inside, self._held = longer(self._inside, count), longer(self._held, count)
+            self._edge_inside = longer(self._edge_inside, edges)
+            self._kept = longer(self._kept, len(self._tree.estimate))
+            if len(self._shapes) != len(self.graph.kinds):
+                self._shapes = np.array([(k.dof, k.size, _KINDS.get(k, VECTOR)) for k in self.graph.kinds])
+        finally:  # some may have grown in place
+            self._locate()
+        self._room = self._room_now()
+
+    def _locate(self) -> None:
+        """Note where the arrays are, after they moved in memory."""
+        more = self._kept, self._inside, self._held, self._edge_inside, self._shapes
+        self._pointers = pointers_of(self._tree, *more)
+
+    def _room_now(self) -> tuple[int, int, int]:
+        """Return for how many vertices, numbers of theirs, and edges there is room."""
         t = self._tree
         vertices = t.vertex, t.listed, self._inside, self._held, t.tail[::2], t.region[::2]
-        return min(map(len, vertices)), min(map(len, (t.diagonal, t.step, t.reference, t.value, t.estimate)))
+        numbers = t.diagonal, t.step, t.reference, t.value, t.estimate, self._kept
+        return min(map(len, vertices)), min(map(len, numbers)), min(len(t.edge), len(self._edge_inside))
 
     def _make_room(self, **lengths: int) -> None:
         """Let arrays of the tree have at least so many rows."""
         try:
             self._tree = with_room(self._tree, **lengths)
         finally:  # some may have grown in place
-            self._pointers = pointers_of(self._tree)
-
-    def _record(self, table: EdgeTable, rows: Index) -> None:
-        """Link edges to their vertices; they are not in the structure yet."""
-        state, width = self._tree.state, table.width
-        links = int(state[LINKS]) + len(rows) * len(table.type.accepts)
-        blocks = int(state[BLOCKS_TOP]) + len(rows) * width * (width + 1)
-        if links > len(self._tree.link) or blocks > len(self._tree.blocks):
-            self._make_room(link=links, blocks=blocks)
-        incremental.append_edges(self._pointers, rows, table.id.values, table.vertices.values)
+            self._locate()
 
     def _unknowns(self) -> Index:
         return np.flatnonzero(self._tree.vertex[: self._vertices, FREE])
@@ -312,17 +322,13 @@ class Problem:
             Nothing would fix a part of the problem. This is checked if it may be so, or if ``surely``.
         """
         self._grow()
-        pending, tree = self._pending, self._tree
-        vertices, edges = pending.vertices, self._weighted(pending.edges())
-        wanted = self._inside[vertices] & ~self._held[vertices]
-        if np.count_nonzero(wanted) < len(wanted):
-            vertices = vertices[wanted]
-        if (
-            surely
-            or pending.may_float
-            or pending.broken
-            or not incremental.anchored(tree.vertex, tree.edge, tree.link, vertices, edges)
-        ):
+        pending, graph = self._pending, self.graph
+        vertices, edges = pending.vertices, pending.edges()
+        found = anchorage(graph.pointers, self._pointers, vertices, edges)
+        if found == LEFT_OUT:
+            vertices, edges = vertices[self._inside[vertices] & ~self._held[vertices]], self._weighted(edges)
+            found = anchorage(graph.pointers, self._pointers, vertices, edges)
+        if surely or pending.may_float or pending.broken or found != ANCHORED:
             self._refuse_floating()
         return vertices, edges
 
@@ -332,22 +338,26 @@ class Problem:
 
         After an error the tree is rebuilt at the next update, because its numbers are half old and half new.
         """
-        pending, tree = self._pending, self._tree
-        substituted = int(tree.state[SUBSTITUTED])
+        substituted = int(self._tree.state[SUBSTITUTED])
         try:
-            incremental.enter_newest(self._pointers, vertices, edges)
+            enter_newest(self._pointers, vertices, edges)
             yield
         except BaseException:
-            pending.broken = True
-            if tree.state[SUBSTITUTED] == substituted:
-                with suppress(MemoryError):
-                    self._estimates()  # what waits still can be solved
-            tree.state[TAIL_FIRST] = tree.state[TAIL_END] = 0  # it is filled anew with the tree
-            self._set_estimate(self._kept)
-            self._after_error()
-            incremental.leave(self._tree, vertices, edges)  # the last: it needs memory
+            self._undo(substituted, vertices, edges)
             raise
         self._pending = PendingChanges()
+
+    def _undo(self, substituted: int, vertices: Index, edges: Index) -> None:
+        """Undo what a transaction did since there were so many substitutions."""
+        self._pending.broken = True
+        state = self._tree.state
+        if state[SUBSTITUTED] == substituted:
+            with suppress(MemoryError):
+                self._estimates()  # what waits still can be solved
+        state[TAIL_FIRST] = state[TAIL_END] = 0  # it is filled anew with the tree
+        self._set_estimate(self._kept)
+        self._after_error()
+        incremental.leave(self._tree, vertices, edges)  # the last: it needs memory
 
     def _after_error(self) -> None:
         """Undo what a solution keeps besides."""

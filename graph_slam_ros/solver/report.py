@@ -1,6 +1,7 @@
 """Results of an update and of a batch optimisation, and why it stopped."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,8 +23,7 @@ class ClassCost:
     residuals: int
 
 
-@dataclass(frozen=True, slots=True)
-class Change:
+class Change(NamedTuple):
     """Result of ``Solver.update``: what one increment cost, counted once more in each pass that linearises anew.
 
     Attributes

@@ -13,7 +13,6 @@ from graph_slam_ros.solver.batch import BatchProblem, Settings, minimise
 from graph_slam_ros.solver.clique_tree import incremental
 from graph_slam_ros.solver.clique_tree.advance import DISSECT, DONE, advance, more_room, restructure
 from graph_slam_ros.solver.clique_tree.ordering import dissect
-from graph_slam_ros.solver.clique_tree.pointers import pointers_of
 from graph_slam_ros.solver.clique_tree.storage import AFFECTED, CLIQUE, DOF, NOTHING, SUBSTITUTED
 from graph_slam_ros.solver.clique_tree.substitution import forget, read, show
 from graph_slam_ros.solver.covariance import among, joint, marginals
@@ -74,22 +73,24 @@ class Solver(Problem):
             The estimate stays; what was added since the last update is not in it, and stays pending. So it is with
             any other exception, e.g. of a residual of one's own.
         """
-        eliminated = int(self._tree.state[AFFECTED])
+        state = self._tree.state
+        eliminated = int(state[AFFECTED])
         arriving = self._arriving()
         with self._transaction(*arriving):
             solved, far, linearized = self._integrate(*arriving)
             if self._unfinished:
                 solved, far = self._continue_batch()
             found = [solved]
-            for edges, these in self._relinearized(far):
-                linearized += edges
-                found.append(these)
+            if len(far):
+                for edges, these in self._relinearized(far):
+                    linearized += edges
+                    found.append(these)
         if self.settings.at_once:
             self._estimates()
         elif len(found) > 1:
             for these in found:
                 show(self._tree, self._kept, these)
-        return Change(int(self._tree.state[AFFECTED]) - eliminated, linearized, sum(map(len, found)))
+        return Change(int(state[AFFECTED]) - eliminated, linearized, sum(map(len, found)))
 
     def optimize(self, settings: Settings | None = None) -> Report:
         """Minimise the cost over everything, from the present estimate, until converged.
@@ -141,9 +142,9 @@ class Solver(Problem):
         graph, first = self.graph, int(at[0])
         if not 0 <= first < self._vertices:
             existing(at, self._vertices, "vertex")
-        size = graph.kind_of(first).size
-        tolerances = self.settings.tolerance, self.settings.tolerance_sigmas
-        unfit, out = read(self._pointers, self._kept, graph.kind.values, graph.offset.values, at, size, *tolerances)
+        kinds, settings = graph.kind.values, self.settings
+        size, tolerances = graph.kinds[kinds[first]].size, (settings.tolerance, settings.tolerance_sigmas)
+        unfit, out = read(self._pointers, kinds, at, size, *tolerances)
         if unfit != NOTHING:
             existing(at, self._vertices, "vertex")
             raise GraphSlamError("estimate: the vertices are not of one kind")
@@ -307,7 +308,7 @@ class Solver(Problem):
         tail = True
         while True:
             how, touched, failed, solved, far = advance(
-                self._pointers, edges, touched, vertices, tail, again, unseen, self._kept, *limits
+                self._pointers, edges, touched, vertices, tail, again, unseen, *limits
             )
             if how == DONE:
                 return failed, solved, far
@@ -318,7 +319,7 @@ class Solver(Problem):
                 try:
                     self._tree = more_room(self._tree)
                 finally:  # some arrays may have grown in place
-                    self._pointers = pointers_of(self._tree)
+                    self._locate()
 
     def _continue_batch(self) -> tuple[Index, Index]:
         """Step on from where a batch stopped before the optimum; returns what was solved, and edges that are far."""
@@ -333,7 +334,7 @@ class Solver(Problem):
         """Search all vertices for large steps, if it is time before these edges enter; return edges to linearise."""
         settings, pending = self.settings, self._pending
         due = self._schedule.is_due(settings.relinearize_every)
-        if due == MAYBE and len(edges) and not pending.broken and incremental.reach_back(self._tree, edges):
+        if due == MAYBE and len(edges) and not pending.broken and incremental.reach_back(self._pointers, edges):
             due = SURELY
         if due != SURELY:
             return NONE
@@ -341,7 +342,7 @@ class Solver(Problem):
         if pending.broken:
             return NONE
         tolerances, limits = self._limits()[:2], (settings.relinearize_above, settings.relinearize_error)
-        return incremental.relinearize_changed(self._tree, *tolerances, *limits)
+        return incremental.relinearize_changed(self._pointers, *tolerances, *limits)
 
     def _limits(self) -> tuple[float, float, float, float]:
         """The tolerances of steps, and the limits above which a step is far (``substitute``)."""
@@ -353,7 +354,7 @@ class Solver(Problem):
     def _relinearized(self, far: Index) -> Iterator[tuple[int, Index]]:
         """Linearise edges that are far, pass after pass; yields how many were, and the vertices that were solved."""
         limits, passes = self._limits(), self.settings.relinearize_passes
-        for k in range(passes if len(far) else 0):
+        for k in range(passes):
             self._linearize(far)
             failed, solved = incremental.renumber(self._tree, far, *limits)
             if failed != NOTHING:
@@ -379,7 +380,7 @@ class Solver(Problem):
         try:
             self._tree = restructure(self._tree, edges, self._pending.touched, vertices, *self._limits()[:2])
         finally:
-            self._pointers = pointers_of(self._tree)
+            self._locate()
 
     def _renumber_after_batch(self) -> None:
         """Compute the numbers of the tree at the result of a batch. The result stays."""
@@ -391,5 +392,5 @@ class Solver(Problem):
 
     def _linearize(self, edges: Index) -> None:
         """Put the blocks of edges at the linearisation points into the tree."""
-        for ids, losses in self._stages.of(edges, self.settings):
-            linearize_into(self._pointers, self.graph, self._tree.value, rows_of(self.graph, ids), losses)
+        first, *_, last = 2 * self._stages.losses(self.settings)
+        linearize_into(self._pointers, self.graph, self._tree.value, edges, last, self._stages.young, first)

@@ -6,7 +6,7 @@ from graph_slam_ros.lie.jit import kernel
 from graph_slam_ros.solver.clique_tree.incremental import relinearize, solve, with_those_of
 from graph_slam_ros.solver.clique_tree.indices import joined
 from graph_slam_ros.solver.clique_tree.ordering import dissect, move_tail
-from graph_slam_ros.solver.clique_tree.pointers import tree_of
+from graph_slam_ros.solver.clique_tree.pointers import kept_of, tree_of
 from graph_slam_ros.solver.clique_tree.pools import compact, release, room_for
 from graph_slam_ros.solver.clique_tree.storage import (
     AFFECTED,
@@ -24,9 +24,11 @@ from graph_slam_ros.solver.clique_tree.storage import (
 )
 from graph_slam_ros.solver.clique_tree.substitution import show, solve_marked
 from graph_slam_ros.solver.clique_tree.symbolic import build, cliques_of, collect, mark, structure
-from graph_slam_ros.typing import Array, Index
+from graph_slam_ros.typing import Index
 
 SPARSE = 1.2  # of the memory of fronts, as a multiple of those in use: then it is compacted, not lengthened
+SPARE = 1 << 16  # numbers of fronts for which that does not pay
+STRETCH = 1 << 13  # numbers of fronts by which it is lengthened at least
 DONE, ROOM, DISSECT = range(3)  # how ``advance`` ends
 
 
@@ -92,7 +94,6 @@ def advance(
     tail: bool,
     again: Index,
     unseen: Index,
-    kept: Array,
     tolerance: float,
     sigmas: float,
     far: float,
@@ -100,13 +101,14 @@ def advance(
 ) -> tuple[int, Index, int, Index, Index]:
     """Apply changes of the structure to the tree, solve, and relinearise what is far (``substitute``).
 
+    If nothing is far, the estimates of what was solved are kept.
+
     Parameters
     ----------
     edges : that are new or have changed; touched : other vertices whose surroundings changed
     new : vertices that are not in the tree yet
     tail : whether its older part may move down
     again : edges that were linearised again; unseen : more vertices to search for far steps
-    kept : gets the estimates of what was solved, if nothing is far
 
     Returns
     -------
@@ -129,14 +131,14 @@ def advance(
         return DONE, touched, failed, none, none
     found = relinearize(t, joined(solved, unseen), far, error)
     if not len(found):
-        show(t, kept, solved)
+        show(t, kept_of(pointers), solved)
     return DONE, touched, NOTHING, solved, found
 
 
 def more_room(tree: Tree) -> Tree:
     """Return the tree with room for what ``advance`` could not place: compacted, or with longer pools."""
     state = tree.state
-    if state[FRONTS_TOP] > SPARSE * state[LIVE]:
+    if state[FRONTS_TOP] > max(SPARSE * state[LIVE], state[LIVE] + SPARE):
         compact(tree)
         return tree
     return with_room(
@@ -144,5 +146,5 @@ def more_room(tree: Tree) -> Tree:
         clique=state[CLIQUES_WANTED],
         listed=state[CLIQUES_WANTED],
         members=state[MEMBERS_WANTED],
-        fronts=state[FRONTS_WANTED],
+        fronts=state[FRONTS_WANTED] + (STRETCH if state[FRONTS_WANTED] > len(tree.fronts) else 0),
     )

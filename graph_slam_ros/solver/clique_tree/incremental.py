@@ -1,21 +1,16 @@
 """One update of the clique tree: from changes of the graph to the steps of the vertices that they move."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-from graph_slam_ros.lie.jit import kernel
+from graph_slam_ros.lie.jit import inner, kernel
 from graph_slam_ros.solver.clique_tree.indices import in_order, joined, lengthened
 from graph_slam_ros.solver.clique_tree.numeric import accept_steps, clear_block, eliminate
 from graph_slam_ros.solver.clique_tree.ordering import ends_of, key_of, neighbourhood
 from graph_slam_ros.solver.clique_tree.pointers import tree_of
 from graph_slam_ros.solver.clique_tree.storage import (
     ACTIVE,
-    BLOCK,
-    BLOCKS_TOP,
-    CHANGED,
     CLIQUE,
     CLIQUES,
-    COUNT,
     DEFERRED_COUNT,
     DOF,
     FLOPS,
@@ -27,13 +22,9 @@ from graph_slam_ros.solver.clique_tree.storage import (
     FULL_DOF,
     IN_DEFERRED,
     KEY,
-    KIND,
     LINK,
     LINK_EDGE,
-    LINK_END,
     LINK_NEXT,
-    LINKED,
-    LINKS,
     LIVE,
     LIVE_MADE,
     LOCAL,
@@ -41,7 +32,6 @@ from graph_slam_ros.solver.clique_tree.storage import (
     MARKED,
     MEMBERS_TOP,
     NEXT,
-    NOTED,
     NOTHING,
     OWNER,
     R_COUNT,
@@ -52,115 +42,14 @@ from graph_slam_ros.solver.clique_tree.storage import (
     STEP,
     TAIL_END,
     TAIL_FIRST,
-    VALUE,
-    WIDTH,
     ZERO,
     Tree,
 )
 from graph_slam_ros.solver.clique_tree.substitution import find_changed, is_large, substitute
 from graph_slam_ros.solver.clique_tree.symbolic import mark
-from graph_slam_ros.typing import Array, Index
+from graph_slam_ros.typing import Index
 
 MUCH = 0.2  # of the threshold above which a vertex is linearised anew: changes below are not followed for that
-FEW = 64  # new vertices whose anchorage is looked for; more are said to be loose, which is then looked into
-
-
-@kernel
-def append_vertices(pointers: Index, first: int, offset: Index, initial: Array, shapes: Index) -> None:
-    """Append the records of new vertices with their initial values. They are not unknowns yet."""
-    t = tree_of(pointers)
-    vertex, t_step, value, estimate = t.vertex, t.step, t.value, t.estimate
-    step = 0 if first == 0 else vertex[first - 1, STEP] + vertex[first - 1, DOF]
-    for k in range(len(offset)):
-        v = first + k
-        vertex[v, :] = NOTHING
-        vertex[v, FREE] = vertex[v, CHANGED] = vertex[v, NOTED] = 0
-        dof, size, kind = shapes[k]
-        vertex[v, DOF], vertex[v, KIND] = dof, kind
-        vertex[v, STEP], vertex[v, VALUE] = step, offset[k]
-        for i in range(dof):
-            t_step[step + i] = 0.0
-        for i in range(size):
-            x = initial[offset[k] + i]
-            value[offset[k] + i] = x
-            estimate[offset[k] + i] = x
-        step += dof
-
-
-@kernel
-def unfit(
-    pointers: Index,
-    new: Index,
-    inside: NDArray[np.bool_],
-    count: int,
-    edges: Index,
-    edge_inside: NDArray[np.bool_],
-    edge_count: int,
-) -> tuple[int, int, bool]:
-    """Return the indices of a new vertex and of an edge that cannot be added, or NOTHING (``_unfit``).
-
-    Then, where both are NOTHING, whether one of the vertices is in the order of the tree still.
-    """
-    bad, bad_edge, there = _unfit(new, inside, count), _unfit(edges, edge_inside, edge_count), False
-    if bad == NOTHING and bad_edge == NOTHING:
-        vertex = tree_of(pointers).vertex
-        for v in new:
-            there = there or vertex[v, KEY] != NOTHING
-    return bad, bad_edge, there
-
-
-@kernel
-def _unfit(ids: Index, inside: NDArray[np.bool_], count: int) -> int:
-    """Return the index in ``ids`` of an id that is too large, already in the problem or repeated; or NOTHING."""
-    found, marked = NOTHING, 0
-    for k in range(len(ids)):
-        if ids[k] < 0 or ids[k] >= count or inside[ids[k]]:
-            found = k
-            break
-        inside[ids[k]] = True
-        marked += 1
-    for k in range(marked):
-        inside[ids[k]] = False
-    return found
-
-
-@kernel
-def outside(rows: Index, ends: Index, weight: Array, inside: NDArray[np.bool_], new: Index) -> int:
-    """Return a vertex that weighted edges need and that is neither in the problem nor new; or NOTHING."""
-    found = NOTHING
-    for v in new:
-        inside[v] = True
-    for row in rows:
-        for s in range(ends.shape[1]):
-            if found == NOTHING and weight[row] != 0.0 and not inside[ends[row, s]]:
-                found = ends[row, s]
-    for v in new:
-        inside[v] = False
-    return found
-
-
-@kernel
-def append_edges(pointers: Index, rows: Index, all_ids: Index, all_ends: Index) -> None:
-    """Append the records of edges, and link them to their vertices. They are not in the structure yet."""
-    t = tree_of(pointers)
-    vertex, edge, t_link, state, blocks = t.vertex, t.edge, t.link, t.state, t.blocks
-    for row in rows:
-        e = all_ids[row]
-        if edge[e, COUNT] > 0:  # by a call that was interrupted
-            continue
-        width = 0
-        edge[e, COUNT], edge[e, LINKED] = all_ends.shape[1], state[LINKS]
-        for s in range(all_ends.shape[1]):
-            v = all_ends[row, s]
-            width += vertex[v, DOF]
-            link = state[LINKS]
-            state[LINKS] += 1
-            t_link[link, LINK_EDGE], t_link[link, LINK_END], t_link[link, LINK_NEXT] = e, v, vertex[v, LINK]
-            vertex[v, LINK] = link
-        edge[e, BLOCK] = state[BLOCKS_TOP]
-        state[BLOCKS_TOP] += width * (width + 1)
-        edge[e, WIDTH], edge[e, ACTIVE], edge[e, OWNER], edge[e, MARKED] = width, 0, NOTHING, 0
-        blocks[edge[e, BLOCK] : state[BLOCKS_TOP]] = 0.0
 
 
 @kernel
@@ -180,12 +69,6 @@ def enter(t: Tree, vertices: Index, edges: Index) -> None:
         state[TAIL_END] += 1
     for e in edges:
         t.edge[e, ACTIVE] = 1
-
-
-@kernel
-def enter_newest(pointers: Index, vertices: Index, edges: Index) -> None:
-    """Call ``enter`` for the tree of some pointers."""
-    enter(tree_of(pointers), vertices, edges)
 
 
 @kernel
@@ -227,37 +110,6 @@ def reset(t: Tree, unknowns: Index) -> None:
 
 
 @kernel
-def anchored(vertex: Index, edge: Index, link: Index, new: Index, edges: Index) -> bool:
-    """Return whether edges join each new vertex, by a chain, to an older one or to an edge on one vertex alone."""
-    for v in new:
-        vertex[v, LOCAL] = 0
-    for e in edges:
-        edge[e, MARKED] = 1
-    count, gained = 0, len(new) <= FEW
-    while gained and count < len(new):
-        gained = False
-        for v in new:
-            a = vertex[v, LINK]
-            while a != NOTHING and vertex[v, LOCAL] == 0:
-                e = link[a, LINK_EDGE]
-                a = link[a, LINK_NEXT]
-                if edge[e, MARKED] == 0:
-                    continue
-                fixed = edge[e, COUNT] == 1
-                for s in range(edge[e, COUNT]):
-                    fixed = fixed or vertex[link[edge[e, LINKED] + s, LINK_END], LOCAL] != 0
-                if fixed:
-                    vertex[v, LOCAL] = 1
-                    count += 1
-                    gained = True
-    for v in new:
-        vertex[v, LOCAL] = NOTHING
-    for e in edges:
-        edge[e, MARKED] = 0
-    return count == len(new)
-
-
-@kernel
 def edges_of(vertex: Index, link: Index, v: int) -> Index:
     """All edges on a vertex, also those that are not in the structure, in order."""
     out, count = np.empty(16, np.int64), ZERO
@@ -286,7 +138,7 @@ def solve(t: Tree, cliques: Index, tolerance: float, sigmas: float, far: float, 
     return failed, substitute(t, cliques, tolerance, sigmas, far, error)
 
 
-@kernel
+@inner
 def with_those_of(t: Tree, cliques: Index, edges: Index) -> Index:
     """Return new cliques, and before them those whose numbers depend on edges, children before parents."""
     clique = t.clique
@@ -335,16 +187,17 @@ def relinearize(t: Tree, searched: Index, threshold: float, error: float) -> Ind
 
 
 @kernel
-def relinearize_changed(t: Tree, tolerance: float, sigmas: float, threshold: float, error: float) -> Index:
+def relinearize_changed(pointers: Index, tolerance: float, sigmas: float, threshold: float, error: float) -> Index:
     """Search all vertices that have moved much since the last time, and relinearise: return the edges."""
+    t = tree_of(pointers)
     much = find_changed(t, tolerance, sigmas, MUCH * threshold, MUCH * MUCH * error)
     return relinearize(t, much, threshold, error)
 
 
 @kernel
-def reach_back(t: Tree, edges: Index) -> bool:
+def reach_back(pointers: Index, edges: Index) -> bool:
     """Return whether one of the edges reaches a vertex that has left the tail: it closes a loop."""
-    back = False
+    t, back = tree_of(pointers), False
     for v in ends_of(t, edges):
         back = back or t.vertex[v, REGION] != NOTHING
     return back

@@ -6,7 +6,7 @@ Kernels take the arrays out of the tree once: each access through the tuple woul
 import numpy as np
 
 from graph_slam_ros.lie import se2, se3
-from graph_slam_ros.lie.jit import kernel
+from graph_slam_ros.lie.jit import inner, kernel
 from graph_slam_ros.solver.clique_tree.dense import partial_cholesky
 from graph_slam_ros.solver.clique_tree.rounding import JUST_MADE, UNKNOWN, is_rounding, suspect_row
 from graph_slam_ros.solver.clique_tree.storage import (
@@ -88,7 +88,7 @@ def eliminate(t: Tree, cliques: Index, damping: float) -> int:
     return failed
 
 
-@kernel
+@inner
 def _member_at(vertex: Index, clique: Index, members: Index, c: int, row: int) -> int:
     for m in range(clique[c, MEMBERS], clique[c, MEMBERS] + clique[c, FRONTALS]):
         if row < vertex[members[m], LOCAL] + vertex[members[m], DOF]:
@@ -126,7 +126,7 @@ def _add_edges(vertex: Index, edge: Index, link: Index, blocks: Array, v: int, f
             row += dof * (width + 1)
 
 
-@kernel
+@inner
 def _add_contribution(vertex: Index, clique: Index, members: Index, fronts: Array, child: int, front: Array) -> None:
     """Add a child's contribution to its separator."""
     of_child = front_of(clique, fronts, child)
@@ -178,7 +178,7 @@ def retract(vertex: Index, value: Array, step: Array, estimate: Array, v: int) -
             estimate[x + i] = value[x + i] + step[d + i]
 
 
-@kernel
+@inner
 def add_to_diagonal(vertex: Index, edge: Index, link: Index, e: int, blocks: Array, diagonal: Array) -> None:
     """Add the diagonal of an edge's block to that of the information matrix."""
     at, across = edge[e, BLOCK], edge[e, WIDTH] + 2  # from one number of a diagonal to the next
@@ -210,7 +210,7 @@ def clear_block(vertex: Index, edge: Index, link: Index, e: int, blocks: Array, 
             _add_up_diagonal(vertex, edge, link, link[edge[e, LINKED] + s, LINK_END], blocks, diagonal)
 
 
-@kernel
+@inner
 def _add_up_diagonal(vertex: Index, edge: Index, link: Index, v: int, blocks: Array, diagonal: Array) -> None:
     own = diagonal[vertex[v, STEP] : vertex[v, STEP] + vertex[v, DOF]]
     own[:] = 0.0

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from graph_slam_ros.lie.jit import kernel
+from graph_slam_ros.lie.jit import inner, kernel
 from graph_slam_ros.solver.clique_tree.indices import in_order, joined
 from graph_slam_ros.solver.clique_tree.separator import separate
 from graph_slam_ros.solver.clique_tree.storage import (
@@ -66,7 +66,7 @@ SLACK_WITHOUT = 56  # as long as none comes
 INSIDE = 0.9  # share of the recent closures that a longer tail must hold
 
 
-@kernel
+@inner
 def key_of(depth: int, region: int, vertex: int) -> int:
     """Return the sorting key: deeper regions are eliminated first, then the older vertex; the tail (depth -1) last."""
     return ((DEEPEST - depth) << 54) | (region << 31) | vertex
@@ -124,7 +124,7 @@ def move_tail(t: Tree, edges: Index, touched: Index) -> tuple[Index, int]:
     return joined(touched, neighbourhood(t, moving)), overgrown
 
 
-@kernel
+@inner
 def _decide_length(t: Tree, back: int) -> None:
     """Decide how many vertices the tail keeps after a closure that reaches further back.
 
@@ -165,7 +165,7 @@ def ends_of(t: Tree, edges: Index) -> Index:
     return out
 
 
-@kernel
+@inner
 def neighbourhood(t: Tree, vertices: Index) -> Index:
     """Return the vertices and their neighbours; some occur more than once."""
     vertex, edge, link = t.vertex, t.edge, t.link
@@ -191,7 +191,7 @@ def neighbourhood(t: Tree, vertices: Index) -> Index:
     return out
 
 
-@kernel
+@inner
 def _enter(t: Tree, v: int, region: int) -> None:
     """Put a vertex into a region."""
     vertex, t_region = t.vertex, t.region
@@ -204,7 +204,7 @@ def _enter(t: Tree, v: int, region: int) -> None:
         region = t_region[region, R_PARENT]
 
 
-@kernel
+@inner
 def _deepest_place(t: Tree, v: int) -> int:
     """Return the deepest region that is on one path to the root with the region of each neighbour of v."""
     vertex, region = t.vertex, t.region
@@ -235,7 +235,7 @@ def _deepest_place(t: Tree, v: int) -> int:
     return place
 
 
-@kernel
+@inner
 def _new_region(t: Tree, parent: int) -> int:
     region, state = t.region, t.state
     r = state[FREE_REGION]
@@ -334,7 +334,7 @@ def _parted(mine: Index, side: Index, part: Index, low: int) -> tuple[int, int]:
     return middle, at
 
 
-@kernel
+@inner
 def _graph_of(t: Tree, vertices: Index) -> tuple[Index, Index, Index, Index]:
     """Return the graph of the active edges among some vertices, numbered in their order (see ``separator``)."""
     vertex, edge, link = t.vertex, t.edge, t.link
@@ -372,7 +372,7 @@ def _graph_of(t: Tree, vertices: Index) -> tuple[Index, Index, Index, Index]:
     return start, neighbour[:top], strength[:top], weight
 
 
-@kernel
+@inner
 def _induced(
     part: Index, start: Index, neighbour: Index, strength: Index, weight: Index, place: Index
 ) -> tuple[Index, Index, Index, Index]:

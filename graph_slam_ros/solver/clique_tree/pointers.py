@@ -1,18 +1,12 @@
-"""The clique tree as one array of pointers.
+"""The clique tree as one array of pointers (``lie/addresses``)."""
 
-Numba unpacks a tuple of arrays at each call of a kernel, which costs more than a small update computes. Kernels that an
-update calls get the places of the arrays in memory instead, and make the tuple themselves.
-"""
-
-from collections.abc import Callable
-from ctypes import POINTER, c_double, c_int64, cast
 from typing import Any
 
 import numpy as np
-from numba import carray, types  # type: ignore[attr-defined]
-from numba.extending import intrinsic, overload
+from numpy.typing import NDArray
 
-from graph_slam_ros.lie.jit import kernel
+from graph_slam_ros.lie.addresses import address_of, integers, reals
+from graph_slam_ros.lie.jit import inner, kernel
 from graph_slam_ros.solver.clique_tree.storage import (
     CLIQUE_COLUMNS,
     EDGE_COLUMNS,
@@ -24,49 +18,26 @@ from graph_slam_ros.solver.clique_tree.storage import (
 )
 from graph_slam_ros.typing import Array, Index
 
-
-def pointers_of(tree: Tree) -> Index:
-    """Return where each array begins, and how many rows it has. An array that is replaced or grows is elsewhere."""
-    return np.array([number for array in tree for number in (array.ctypes.data, len(array))], dtype=np.int64)
-
-
-def _integers(address: int, count: int) -> Index:
-    """Return the integers at an address."""
-    return np.ctypeslib.as_array(cast(int(address), POINTER(c_int64)), (int(count),))
+# behind those of the tree, the arrays of the problem: the estimate that the last call left; which vertices are in it,
+# which are held, which edges are in it; the shapes of the graph's kinds (degrees of freedom, stored numbers, kind)
+KEPT, INSIDE, HELD, EDGE_INSIDE, SHAPES = range(2 * len(Tree._fields), 2 * len(Tree._fields) + 10, 2)
 
 
-def _reals(address: int, count: int) -> Array:
-    """Return the numbers at an address."""
-    return np.ctypeslib.as_array(cast(int(address), POINTER(c_double)), (int(count),))
+def pointers_of(tree: Tree, *more: NDArray[Any]) -> Index:
+    """Return where each array begins, and how many rows it has; then those of more arrays."""
+    numbers = [number for array in (*tree, *more) for number in (address_of(array), len(array))]
+    return np.array(numbers, dtype=np.int64)
 
 
-@intrinsic
-def _pointer(_: Any, address: Any) -> tuple[Any, Callable[..., Any]]:
-    def generated(context: Any, builder: Any, _: Any, arguments: Any) -> Any:
-        return builder.inttoptr(arguments[0], context.get_value_type(types.voidptr))
-
-    return types.voidptr(types.int64), generated
-
-
-@overload(_integers, jit_options={"error_model": "numpy"})
-def _compiled_integers(address: Any, count: Any) -> Callable[..., Any]:
-    def compiled(address: Any, count: Any) -> Any:
-        return carray(_pointer(address), count, np.int64)  # type: ignore[call-arg]
-
-    return compiled
-
-
-@overload(_reals, jit_options={"error_model": "numpy"})
-def _compiled_reals(address: Any, count: Any) -> Callable[..., Any]:
-    def compiled(address: Any, count: Any) -> Any:
-        return carray(_pointer(address), count, np.float64)  # type: ignore[call-arg]
-
-    return compiled
+@inner
+def kept_of(p: Index) -> Array:
+    """Return the estimate that the last call left."""
+    return reals(p[KEPT], p[KEPT + 1])
 
 
 @kernel
 def _table(p: Index, k: int, columns: int) -> Index:
-    return _integers(p[2 * k], p[2 * k + 1] * columns).reshape(p[2 * k + 1], columns)
+    return integers(p[2 * k], p[2 * k + 1] * columns).reshape(p[2 * k + 1], columns)
 
 
 @kernel
@@ -78,17 +49,17 @@ def tree_of(p: Index) -> Tree:
         _table(p, 2, LINK_COLUMNS),
         _table(p, 3, CLIQUE_COLUMNS),
         _table(p, 4, REGION_COLUMNS),
-        _integers(p[10], p[11]),
-        _integers(p[12], p[13]),
-        _integers(p[14], p[15]),
-        _integers(p[16], p[17]),
-        _integers(p[18], p[19]),
+        integers(p[10], p[11]),
+        integers(p[12], p[13]),
+        integers(p[14], p[15]),
+        integers(p[16], p[17]),
+        integers(p[18], p[19]),
         _table(p, 10, LIST_COLUMNS),
-        _reals(p[22], p[23]),
-        _reals(p[24], p[25]),
-        _reals(p[26], p[27]),
-        _reals(p[28], p[29]),
-        _reals(p[30], p[31]),
-        _reals(p[32], p[33]),
-        _reals(p[34], p[35]),
+        reals(p[22], p[23]),
+        reals(p[24], p[25]),
+        reals(p[26], p[27]),
+        reals(p[28], p[29]),
+        reals(p[30], p[31]),
+        reals(p[32], p[33]),
+        reals(p[34], p[35]),
     )

@@ -5,7 +5,7 @@ The place of a clique that leaves is reused by the next one of its class. It is 
 
 import numpy as np
 
-from graph_slam_ros.lie.jit import kernel
+from graph_slam_ros.lie.jit import inner, kernel
 from graph_slam_ros.solver.clique_tree.indices import ascending
 from graph_slam_ros.solver.clique_tree.storage import (
     CAPACITIES,
@@ -28,7 +28,7 @@ from graph_slam_ros.solver.clique_tree.storage import (
 from graph_slam_ros.typing import Index
 
 
-@kernel
+@inner
 def capacity_class(size: int) -> int:
     """The least size class that has room for so many degrees of freedom."""
     low, high = 0, len(CAPACITIES)
@@ -41,13 +41,13 @@ def capacity_class(size: int) -> int:
     return low
 
 
-@kernel
+@inner
 def numbers_of(size_class: int) -> int:
     """The numbers of a front."""
     return CAPACITIES[size_class] * (CAPACITIES[size_class] + 1)
 
 
-@kernel
+@inner
 def room_for(t: Tree, size: Index, leaving: Index) -> tuple[int, int, int]:
     """Return how much new cliques of these sizes add to the pools: cliques, members, numbers of fronts.
 
@@ -87,7 +87,7 @@ def release(t: Tree, cliques: Index) -> None:
         clique[c, SIZE] = clique[c, FRONTALS] = 0  # it may be in the list of those that wait still
 
 
-@kernel
+@inner
 def allocate(t: Tree, size: int) -> int:
     """Allocate the place of a clique of that many degrees of freedom."""
     clique, vacant, state = t.clique, t.vacant, t.state

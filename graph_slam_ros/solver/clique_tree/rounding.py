@@ -10,7 +10,7 @@ front below the diagonal, which is not used otherwise.
 
 import numpy as np
 
-from graph_slam_ros.lie.jit import kernel
+from graph_slam_ros.lie.jit import inner, kernel
 from graph_slam_ros.solver.clique_tree.storage import (
     CHECKED,
     CHILD,
@@ -37,7 +37,7 @@ ROUNDING = 2.0**-52  # of the magnitudes that cancelled: a pivot below cannot be
 JUST_MADE, UNKNOWN, KEPT = range(3)  # the magnitudes of a clique's subtree
 
 
-@kernel
+@inner
 def suspect_row(front: Array, frontal: int, diagonal: Array) -> int:
     """The row of the least pivot, as a part of its diagonal entry, if it is suspiciously small, or NOTHING."""
     found, least = NOTHING, 1.0 / SUSPECT
@@ -47,7 +47,7 @@ def suspect_row(front: Array, frontal: int, diagonal: Array) -> int:
     return found
 
 
-@kernel
+@inner
 def is_rounding(t: Tree, c: int, row: int) -> bool:
     """Return whether the pivot in a row of a clique's front may be rounding alone."""
     front = front_of(t.clique, t.fronts, c)
@@ -112,7 +112,7 @@ def _follow(front: Array, first: int, x: Array) -> None:
         x[a] = s * front[a, a]
 
 
-@kernel
+@inner
 def _kept_magnitude(front: Array, frontal: int, x: Array) -> float:
     """Return ``s'Ms`` of a clique that stores it: M below the diagonal of the separator's block, its diagonal first."""
     total = 0.0
@@ -124,7 +124,7 @@ def _kept_magnitude(front: Array, frontal: int, x: Array) -> float:
     return total
 
 
-@kernel
+@inner
 def _keep_magnitudes(
     vertex: Index, clique: Index, members: Index, fronts: Array, diagonal: Array, c: int, place: Index
 ) -> None:
@@ -160,7 +160,7 @@ def _keep_magnitudes(
     clique[c, MAGNITUDES] = KEPT
 
 
-@kernel
+@inner
 def _add_kept(
     vertex: Index, clique: Index, members: Index, fronts: Array, child: int, place: Index, form: Array
 ) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from graph_slam_ros.lie.jit import kernel
+from graph_slam_ros.lie.jit import inner, kernel
 from graph_slam_ros.solver.clique_tree.indices import ascending, chosen
 from graph_slam_ros.solver.clique_tree.storage import NOTHING, ZERO
 from graph_slam_ros.typing import Array, Index
@@ -47,7 +47,7 @@ def separate(start: Index, neighbour: Index, strength: Index, weight: Index) -> 
     return side
 
 
-@kernel
+@inner
 def _match(start: Index, neighbour: Index, strength: Index, weight: Index) -> tuple[Index, int]:
     """Pair each vertex with the neighbour that most edges join it to; return each vertex's pair, and their count."""
     n = len(weight)
@@ -72,7 +72,7 @@ def _match(start: Index, neighbour: Index, strength: Index, weight: Index) -> tu
     return pair, count
 
 
-@kernel
+@inner
 def _contract(
     start: Index, neighbour: Index, strength: Index, weight: Index, pair: Index, count: int
 ) -> tuple[Index, Index, Index, Index]:
@@ -128,7 +128,7 @@ def _first(start: Index, neighbour: Index, weight: Index) -> Index:
     return lightest
 
 
-@kernel
+@inner
 def _by_distance(first: int, start: Index, neighbour: Index) -> Index:
     """Return a breadth-first order from a vertex; parts that it does not reach follow, one by one."""
     n = len(start) - 1
@@ -152,7 +152,7 @@ def _by_distance(first: int, start: Index, neighbour: Index) -> Index:
     return order
 
 
-@kernel
+@inner
 def _sweep(order: Index, start: Index, neighbour: Index, weight: Index) -> Index:
     """Cut an order in two; vertices of one part with a neighbour in the other separate. The lightest such cut."""
     n = len(order)
@@ -191,7 +191,7 @@ def _sweep(order: Index, start: Index, neighbour: Index, weight: Index) -> Index
     return side
 
 
-@kernel
+@inner
 def _refine(side: Index, start: Index, neighbour: Index, weight: Index) -> float:
     """Lighten a separator by moving its vertices to a side, best first, even where it gets heavier for a while.
 
@@ -241,7 +241,7 @@ def _refine(side: Index, start: Index, neighbour: Index, weight: Index) -> float
     return score
 
 
-@kernel
+@inner
 def _best_move(
     members: Index,
     count: int,
@@ -274,14 +274,14 @@ def _best_move(
     return pick, to, live
 
 
-@kernel
+@inner
 def _shift(u: int, to: int, side: Index, total: Array, weight: Index) -> None:
     total[side[u]] -= weight[u]
     side[u] = to
     total[to] += weight[u]
 
 
-@kernel
+@inner
 def _score(total: Array) -> float:
     return total[2] * (1.0 + abs(total[0] - total[1]) / (total[0] + total[1] + total[2])) + 1e-3 * abs(
         total[0] - total[1]

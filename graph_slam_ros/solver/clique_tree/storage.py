@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from graph_slam_ros.lie.jit import kernel
+from graph_slam_ros.lie.jit import inner
 from graph_slam_ros.solver.clique_tree.indices import lengthened
 from graph_slam_ros.typing import Array, Index
 
@@ -154,14 +154,14 @@ class Tree(NamedTuple):
     estimate: Array
 
 
-@kernel
+@inner
 def front_of(clique: Index, fronts: Array, c: int) -> Array:
     """The front (full, full + 1): an upper triangle, and the right side as its last column."""
     full, base = clique[c, FULL_DOF], clique[c, FRONT]
     return fronts[base : base + full * (full + 1)].reshape(full, full + 1)
 
 
-@kernel
+@inner
 def with_children(clique: Index, c: int, cliques: Index, count: int) -> tuple[Index, int]:
     """Append the children of a clique to the first ``count`` of a list; returns it, perhaps longer, and the count."""
     k = clique[c, CHILD]

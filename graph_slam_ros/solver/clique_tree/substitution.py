@@ -8,11 +8,11 @@ A clique waits if a step of its separator changed after its own solution.
 
 import numpy as np
 
-from graph_slam_ros.lie.jit import kernel
+from graph_slam_ros.lie.jit import inner, kernel
 from graph_slam_ros.solver.clique_tree.dense import solve_upper
 from graph_slam_ros.solver.clique_tree.indices import in_order, lengthened
 from graph_slam_ros.solver.clique_tree.numeric import retract
-from graph_slam_ros.solver.clique_tree.pointers import tree_of
+from graph_slam_ros.solver.clique_tree.pointers import kept_of, tree_of
 from graph_slam_ros.solver.clique_tree.storage import (
     CHANGED,
     CHILD,
@@ -70,9 +70,9 @@ def substitute(t: Tree, cliques: Index, tolerance: float, sigmas: float, far: fl
         measurement (``relinearize``)
     """
     vertex, clique, members, step, diagonal = t.vertex, t.clique, t.members, t.step, t.diagonal
-    solved, count = np.empty(256, np.int64), ZERO
-    stack, top = np.empty(256, np.int64), ZERO
-    x = np.empty(256)
+    solved, count = np.empty(64, np.int64), ZERO
+    stack, top = np.empty(64, np.int64), ZERO
+    x = np.empty(64)
     t.state[SUBSTITUTED] += 1
     for c in cliques:
         clique[c, MARK] = 1
@@ -172,7 +172,7 @@ def needs(vertex: Index, clique: Index, members: Index, c: int) -> bool:
     return False
 
 
-@kernel
+@inner
 def _is_noted(vertex: Index, clique: Index, members: Index, c: int, bit: int) -> bool:
     """Return whether a vertex of a clique's separator has a bit of ``NOTED``."""
     for m in range(clique[c, MEMBERS] + clique[c, FRONTALS], clique[c, MEMBERS] + clique[c, SIZE]):
@@ -181,7 +181,7 @@ def _is_noted(vertex: Index, clique: Index, members: Index, c: int, bit: int) ->
     return False
 
 
-@kernel
+@inner
 def _defer(t: Tree, c: int) -> None:
     """Let a clique wait."""
     if t.clique[c, IN_DEFERRED] == 0:
@@ -190,12 +190,12 @@ def _defer(t: Tree, c: int) -> None:
         t.state[DEFERRED_COUNT] += 1
 
 
-@kernel
+@inner
 def solve_deferred(t: Tree, tolerance: float, sigmas: float) -> None:
     """Solve all cliques that wait, and what is below them where it matters."""
     vertex, clique, members, listed, state = t.vertex, t.clique, t.members, t.listed, t.state
-    stack, top = np.empty(256, np.int64), ZERO
-    x = np.empty(256)
+    stack, top = np.empty(64, np.int64), ZERO
+    x = np.empty(64)
     for i in range(state[DEFERRED_COUNT] - 1, -1, -1):  # the last first: it may be above an earlier one
         stack[0], top = listed[i, DEFERRED], ZERO + 1
         clique[stack[0], IN_DEFERRED] = 0
@@ -211,7 +211,7 @@ def solve_deferred(t: Tree, tolerance: float, sigmas: float) -> None:
     state[DEFERRED_COUNT] = 0
 
 
-@kernel
+@inner
 def solve_way(t: Tree, c: int, way: Index, tolerance: float, sigmas: float) -> Index:
     """Solve what waits from the root down to a clique; ``way`` is scratch, which is returned, perhaps longer."""
     vertex, clique, members = t.vertex, t.clique, t.members
@@ -226,7 +226,7 @@ def solve_way(t: Tree, c: int, way: Index, tolerance: float, sigmas: float) -> I
         c = clique[c, PARENT]
     if first == NOTHING:
         return way
-    x = np.empty(256)
+    x = np.empty(64)
     for i in range(first, -1, -1):
         c = way[i]
         if not needs(vertex, clique, members, c):
@@ -242,7 +242,7 @@ def solve_way(t: Tree, c: int, way: Index, tolerance: float, sigmas: float) -> I
     return way
 
 
-@kernel
+@inner
 def solve_marked(t: Tree, marked: Index, tolerance: float, sigmas: float) -> None:
     """Solve those of marked cliques (children before parents) that wait, before they are eliminated again."""
     way = np.empty(64, np.int64)
@@ -276,11 +276,9 @@ def show_all(t: Tree, kept: Array, tolerance: float, sigmas: float) -> None:
 
 
 @kernel
-def read(
-    pointers: Index, kept: Array, kind: Index, offset: Index, ids: Index, size: int, tolerance: float, sigmas: float
-) -> tuple[int, Array]:
+def read(pointers: Index, kind: Index, ids: Index, size: int, tolerance: float, sigmas: float) -> tuple[int, Array]:
     """Return stored numbers (n, size) of vertices of the first one's kind, and the index of an unfit id or NOTHING."""
-    t = tree_of(pointers)
+    t, kept = tree_of(pointers), kept_of(pointers)
     vertex, estimate = t.vertex, t.estimate
     out = np.empty((len(ids), size))
     for k in range(len(ids)):
@@ -295,13 +293,13 @@ def read(
             if vertex[v, NOTED] & IS_STALE:  # and stays in the list
                 show(t, kept, np.full(1, v, np.int64))
     for k in range(len(ids)):
-        at = offset[ids[k]]
+        at = vertex[ids[k], VALUE]
         for i in range(size):
             out[k, i] = estimate[at + i]
     return NOTHING, out
 
 
-@kernel
+@inner
 def find_changed(t: Tree, tolerance: float, sigmas: float, threshold: float, error: float) -> Index:
     """Return the vertices, in order, whose steps have changed much since they were last returned.
 
@@ -315,7 +313,7 @@ def find_changed(t: Tree, tolerance: float, sigmas: float, threshold: float, err
     step, reference = t.step, t.reference
     for k in range(state[SHIFTED_COUNT]):
         _note_if_much(vertex, step, reference, t.diagonal, listed[k, SHIFTED], threshold, error)
-    stack, top, x = np.empty(256, np.int64), ZERO, np.empty(256)
+    stack, top, x = np.empty(64, np.int64), ZERO, np.empty(64)
     for k in range(state[DEFERRED_COUNT]):
         stack[0], top = listed[k, DEFERRED], ZERO + 1
         while top:
@@ -357,7 +355,7 @@ def find_changed(t: Tree, tolerance: float, sigmas: float, threshold: float, err
     return in_order(out[:count])
 
 
-@kernel
+@inner
 def _note_if_much(
     vertex: Index, step: Array, reference: Array, diagonal: Array, v: int, threshold: float, error: float
 ) -> None:
@@ -372,7 +370,7 @@ def _note_if_much(
 @kernel
 def step_all(t: Tree, cliques: Index) -> None:
     """Solve cliques (children before parents) from the root down, to the last digit; estimates are not computed."""
-    x = np.empty(256)
+    x = np.empty(64)
     for c in cliques[::-1]:
         if len(x) < t.clique[c, FULL_DOF]:
             x = np.empty(2 * t.clique[c, FULL_DOF])

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from graph_slam_ros.lie.jit import kernel
+from graph_slam_ros.lie.jit import inner, kernel
 from graph_slam_ros.solver.clique_tree.indices import ascending, chosen, lengthened
 from graph_slam_ros.solver.clique_tree.pools import allocate
 from graph_slam_ros.solver.clique_tree.storage import (
@@ -114,7 +114,7 @@ def collect(t: Tree, marked: Index, new: Index) -> tuple[Index, Index]:
     return chosen(affected, ascending(key)), orphans
 
 
-@kernel
+@inner
 def structure(t: Tree, order: Index, orphans: Index) -> tuple[Index, Index]:
     """Find what each eliminated vertex leaves connected: of the k-th, indices in ``order``, later ones, nearest first.
 
@@ -160,7 +160,7 @@ def structure(t: Tree, order: Index, orphans: Index) -> tuple[Index, Index]:
     return start, later
 
 
-@kernel
+@inner
 def _by_first(t: Tree, orphans: Index, n: int) -> tuple[Index, Index]:
     """Linked lists of the orphans by the vertex of their separator that is eliminated first."""
     vertex, clique, members = t.vertex, t.clique, t.members
@@ -185,7 +185,7 @@ def _note(u: int, k: int, seen: Index, later: Index, top: int) -> int:
     return top
 
 
-@kernel
+@inner
 def _joined_by_edges(t: Tree, v: int, k: int, seen: Index, later: Index, top: int) -> int:
     """Note the vertices that edges connect to v; v owns those edges of which it is eliminated first."""
     vertex, edge, link = t.vertex, t.edge, t.link
@@ -206,7 +206,7 @@ def _joined_by_edges(t: Tree, v: int, k: int, seen: Index, later: Index, top: in
     return top
 
 
-@kernel
+@inner
 def _joined_by_orphan(t: Tree, c: int, k: int, seen: Index, later: Index, top: int) -> int:
     """Note the vertices that an orphan's separator connects."""
     vertex, clique, members = t.vertex, t.clique, t.members
@@ -215,7 +215,7 @@ def _joined_by_orphan(t: Tree, c: int, k: int, seen: Index, later: Index, top: i
     return top
 
 
-@kernel
+@inner
 def cliques_of(t: Tree, order: Index, start: Index, later: Index) -> tuple[Index, Index, Index]:
     """Group vertices into cliques, parents before children.
 
@@ -296,7 +296,7 @@ def build(
     return upwards
 
 
-@kernel
+@inner
 def _hang(t: Tree, c: int, parent: int) -> None:
     clique = t.clique
     clique[c, PARENT] = parent

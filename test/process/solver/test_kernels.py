@@ -1,5 +1,6 @@
 """Compiled loops: with bounds checked, without compilation, and all compiled by the warm-up."""
 
+import ast
 import os
 import shutil
 import subprocess
@@ -187,3 +188,24 @@ def test_the_warm_up_compiles_all_that_solving_a_graph_needs():
     graphs = [str(TEST.parent / "data" / name) for name in ("city.g2o", "landmarks.g2o")]
     done = python("-c", COMPILED_LATER, *graphs)
     assert done.stdout.splitlines() == ["[]"], done.stdout + done.stderr
+
+
+def _is_made_by(node, *names):
+    return isinstance(node, ast.FunctionDef) and any(ast.unparse(by).startswith(names) for by in node.decorator_list)
+
+
+def _names(node):
+    """Names that are used outside kernels."""
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.Name | ast.Attribute):
+            yield child.id if isinstance(child, ast.Name) else child.attr
+        if not _is_made_by(child, "kernel", "inner", "dense", "jitable"):
+            yield from _names(child)
+
+
+def test_kernels_that_python_cannot_call_are_called_by_kernels_alone():
+    files = (path for folder in ("graph_slam_ros", "benchmarks", "test") for path in (ROOT / folder).rglob("*.py"))
+    trees = [ast.parse(path.read_text()) for path in files]
+    inner = {f.name for tree in trees for f in tree.body if _is_made_by(f, "inner")}
+    assert len(inner) > 40
+    assert not inner & {name for tree in trees for name in _names(tree)}

@@ -1,0 +1,43 @@
+"""Calls of an edge type's compiled linearisation by its address, from compiled code that does not know which it is."""
+
+from collections.abc import Callable
+from typing import Any
+
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+from graph_slam_ros.lie.jit import jitable
+from graph_slam_ros.typing import Array, Index
+
+_ARRAYS = types.float64[::1], types.int64[:, ::1], types.float64[:, ::1]
+_RETURNED: Any = types.Tuple((types.float64[:, ::1], types.float64[:, :, ::1]))  # type: ignore[no-untyped-call]
+
+
+def native_address(linearize: Callable[..., Any]) -> int:
+    """Return where the machine code of ``EdgeType.linearize`` is; 0 if it is not compiled, or was never called."""
+    for compiled in getattr(linearize, "overloads", {}).values():
+        if tuple(compiled.signature.args) == _ARRAYS and compiled.signature.return_type == _RETURNED:
+            address: int = compiled.library.get_pointer_to_function(compiled.fndesc.llvm_func_name)
+            return address
+    return 0
+
+
+@jitable
+def call_native(address: int, x: Array, at: Index, measured: Array) -> tuple[Array, Array]:
+    """Call the linearisation at an address; compiled code alone can."""
+    return _call(address, x, at, measured)  # type: ignore[call-arg]
+
+
+@intrinsic
+def _call(_: Any, address: Any, x: Any, at: Any, measured: Any) -> tuple[Any, Callable[..., Any]]:
+    def generated(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        convention = context.call_conv
+        of = convention.get_function_type(_RETURNED, _ARRAYS).as_pointer()
+        function = builder.inttoptr(arguments[0], of)
+        status, returned = convention.call_function(builder, function, _RETURNED, _ARRAYS, arguments[1:])
+        with cgutils.if_unlikely(builder, status.is_error):  # type: ignore[no-untyped-call]
+            convention.return_status_propagate(builder, status)
+        return returned
+
+    return _RETURNED(types.int64, x, at, measured), generated

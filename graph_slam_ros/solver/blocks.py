@@ -1,0 +1,185 @@
+"""Blocks of edges in the tree: gathered, linearised, whitened and stored by compiled code."""
+
+import numpy as np
+
+from graph_slam_ros.graph import records
+from graph_slam_ros.graph.losses import weight_and_cost
+from graph_slam_ros.graph.native import call_native
+from graph_slam_ros.graph.records import table_at
+from graph_slam_ros.lie.addresses import integers, reals
+from graph_slam_ros.lie.jit import inner, kernel
+from graph_slam_ros.solver.clique_tree.numeric import add_to_diagonal, clear_block
+from graph_slam_ros.solver.clique_tree.pointers import tree_of
+from graph_slam_ros.solver.clique_tree.storage import BLOCK, MARKED, NOTHING, ZERO, Tree
+from graph_slam_ros.typing import Array, Index
+
+CHUNK = 512  # edges that are linearised together: arrays of that size stay in the cache and in the process
+
+
+@kernel
+def gather(rows: Index, vertices: Index, offset: Index, measured: Array) -> tuple[Index, Array]:
+    """Return offsets (n, k) of the vertices of some edges, and their measurements (n, p)."""
+    n, ends = len(rows), vertices.shape[1]
+    at, z = np.empty((n, ends), np.int64), np.empty((n, measured.shape[1]))
+    for k in range(n):
+        for s in range(ends):
+            at[k, s] = offset[vertices[rows[k], s]]
+        for c in range(measured.shape[1]):
+            z[k, c] = measured[rows[k], c]
+    return at, z
+
+
+@kernel
+def whiten(
+    rows: Index,
+    residual: Array,
+    jacobian: Array,
+    sqrt_information: Array,
+    weight: Array,
+    loss: Index,
+    loss_kind: Index,
+    loss_scale: Array,
+) -> tuple[Array, Array]:
+    """Multiply residuals and Jacobians by sqrt(weight * rho') R in place; returns chi2 and cost of each edge."""
+    n, m, width = jacobian.shape
+    chi2, cost = np.zeros(n), np.zeros(n)
+    r, j = np.zeros(m), np.zeros((m, width))
+    for e in range(n):
+        row = rows[e]
+        s = 0.0
+        for a in range(m):
+            r[a] = 0.0
+            for c in range(width):
+                j[a, c] = 0.0
+            for b in range(m):
+                root = sqrt_information[row, a, b]
+                r[a] += root * residual[e, b]
+                for c in range(width):
+                    j[a, c] += root * jacobian[e, b, c]
+            s += r[a] * r[a]
+        s *= weight[row]
+        slope, rho = weight_and_cost(loss_kind[loss[e]], loss_scale[loss[e]], s)
+        chi2[e], cost[e] = s, rho
+        factor = np.sqrt(weight[row] * slope)
+        for a in range(m):
+            residual[e, a] = factor * r[a]
+            for c in range(width):
+                jacobian[e, a, c] = factor * j[a, c]
+    return chi2, cost
+
+
+@kernel
+def store(t: Tree, rows: Index, ids: Index, residual: Array, jacobian: Array) -> None:
+    """Put whitened edges into the tree: J'J and J'r, and the diagonal of H, instead of what they had there."""
+    vertex, edge, link, blocks, diagonal = t.vertex, t.edge, t.link, t.blocks, t.diagonal
+    for k in range(len(rows)):
+        clear_block(vertex, edge, link, ids[rows[k]], blocks, diagonal)
+    store_first(t, rows, ids, residual, jacobian)
+
+
+@kernel
+def store_first(t: Tree, rows: Index, ids: Index, residual: Array, jacobian: Array) -> None:
+    """Put whitened edges into the tree that have nothing there yet."""
+    vertex, edge, link, blocks, diagonal = t.vertex, t.edge, t.link, t.blocks, t.diagonal
+    n, m, width = jacobian.shape
+    for k in range(n):
+        e = ids[rows[k]]
+        at = edge[e, BLOCK]
+        for p in range(width):
+            if m == 2:  # the usual sizes by themselves: short loops take most of the time
+                x, y = jacobian[k, 0, p], jacobian[k, 1, p]
+                for c in range(width):
+                    blocks[at + c] = x * jacobian[k, 0, c] + y * jacobian[k, 1, c]
+                blocks[at + width] = x * residual[k, 0] + y * residual[k, 1]
+            elif m == 3:
+                x, y, z = jacobian[k, 0, p], jacobian[k, 1, p], jacobian[k, 2, p]
+                for c in range(width):
+                    blocks[at + c] = x * jacobian[k, 0, c] + y * jacobian[k, 1, c] + z * jacobian[k, 2, c]
+                blocks[at + width] = x * residual[k, 0] + y * residual[k, 1] + z * residual[k, 2]
+            else:
+                blocks[at : at + width + 1] = 0.0
+                for a in range(m):
+                    x = jacobian[k, a, p]
+                    for c in range(width):
+                        blocks[at + c] += x * jacobian[k, a, c]
+                    blocks[at + width] += x * residual[k, a]
+            at += width + 1
+        add_to_diagonal(vertex, edge, link, e, blocks, diagonal)
+
+
+@kernel
+def whiten_and_store(
+    pointers: Index, table: Index, rows: Index, residual: Array, jacobian: Array, losses: Index
+) -> int:
+    """Whiten edges and add them to the tree; or add none, and return the row of one whose cost is not finite."""
+    m, room = table[records.RESIDUAL_SIZE], table[records.ROOM]
+    root = reals(table[records.SQRT_INFORMATION], room * m * m).reshape(room, m, m)
+    label, source = integers(table[records.LABEL], room), integers(table[records.SOURCE], room)
+    loss, sources = np.empty(len(rows), np.int64), losses[3]
+    for k in range(len(rows)):
+        loss[k] = label[rows[k]] * sources + source[rows[k]] if sources else label[rows[k]]
+    kind, scale = integers(losses[0], losses[2]), reals(losses[1], losses[2])
+    _, cost = whiten(rows, residual, jacobian, root, reals(table[records.WEIGHT], room), loss, kind, scale)
+    total, worst = 0.0, 0
+    for k in range(len(cost)):
+        total += cost[k]
+        if not np.isfinite(cost[k]):
+            return rows[k]
+        if cost[k] > cost[worst]:
+            worst = k
+    if not np.isfinite(total):
+        return rows[worst]
+    store(tree_of(pointers), rows, integers(table[records.ID], room), residual, jacobian)
+    return NOTHING
+
+
+@kernel
+def store_linearized(
+    graph: Index, pointers: Index, edges: Index, losses: Index, young: Index, first: Index
+) -> tuple[int, int]:
+    """Linearise edges at the linearisation points of the tree, and put them into it (``linearize_into``).
+
+    Returns NOTHING; the table of an edge that is not compiled, and then none is put into the tree; or the table and the
+    row of one whose cost is not finite.
+    """
+    t, room = tree_of(pointers), graph[records.EDGE_ROOM]
+    table_of, row_of = integers(graph[records.TABLE_OF_EDGE], room), integers(graph[records.ROW_OF_EDGE], room)
+    for e in edges:
+        if table_at(graph, table_of[e])[records.LINEARIZE] == 0:
+            return table_of[e], NOTHING
+    for e in edges:
+        t.edge[e, MARKED] = 0  # an error may have left it
+    for e in young:
+        t.edge[e, MARKED] = 1
+    bad, of_bad = ZERO + NOTHING, ZERO + NOTHING
+    for is_old in range(0 if len(young) else 1, 2):
+        for code in range(len(graph) - records.TABLES if bad == NOTHING else 0):
+            count, rows = ZERO, np.empty(len(edges), np.int64)
+            for e in edges:
+                if table_of[e] == code and t.edge[e, MARKED] != is_old:
+                    rows[count] = row_of[e]
+                    count += 1
+            bad = _linearize_rows(graph, pointers, table_at(graph, code), rows[:count], losses if is_old else first)
+            if bad != NOTHING:
+                of_bad = code
+                break
+    for e in young:
+        t.edge[e, MARKED] = 0
+    return of_bad, bad
+
+
+@inner
+def _linearize_rows(graph: Index, pointers: Index, table: Index, rows: Index, losses: Index) -> int:
+    """Linearise rows of a table and put them into the tree; or return the row of one whose cost is not finite."""
+    t, room, slots, size = tree_of(pointers), table[records.ROOM], table[records.ENDS], table[records.MEASURED_SIZE]
+    vertices = integers(table[records.VERTICES], room * slots).reshape(room, slots)
+    measured = reals(table[records.MEASURED], room * size).reshape(room, size)
+    offset = integers(graph[records.OFFSET], len(t.vertex))
+    for begin in range(0, len(rows), CHUNK):
+        some = rows[begin : begin + CHUNK]
+        at, z = gather(some, vertices, offset, measured)
+        residual, jacobian = call_native(table[records.LINEARIZE], t.value, at, z)
+        bad = whiten_and_store(pointers, table, some, residual, jacobian, losses)
+        if bad != NOTHING:
+            return bad
+    return ZERO + NOTHING
