@@ -17,10 +17,14 @@ from graph_slam_ros.graph.vertices import VertexKind
 from graph_slam_ros.lie.addresses import address_of
 from graph_slam_ros.typing import Array, Index, Mask
 
+_INT64 = np.dtype(np.int64)
+
 
 def whole_numbers(ids: ArrayLike, what: str) -> Index:
     """Return ids as an array. Numbers with a fraction are refused."""
     given = np.asarray(ids)
+    if given.dtype is _INT64:
+        return given
     if given.dtype.kind not in "iu" and given.size:
         raise GraphSlamError(f"{what}: ids must be whole numbers, got {given.ravel()[:5].tolist()}")
     return given.astype(np.int64, copy=False)
@@ -127,11 +131,15 @@ class Graph:
         source : the input that measured it
         """
         at, z = whole_numbers(vertices, edge.name), edge.whole(measured)
-        self._check_shapes(edge, at, z, noise)
+        if z.ndim != 2 or z.shape[1] != edge.measured_size or at.shape != (len(z), len(edge.accepts)):
+            self._refuse_shapes(edge, at, z)
+        shape, count = noise.sqrt_information.shape, len(at)
+        if shape[-1] != edge.residual_size or (len(shape) == 3 and shape[0] != count):
+            raise GraphSlamError(f"{edge.name}: noise of shape {shape} does not fit")
         table = self.tables.get(edge)
         if table is None:
             table = EdgeTable(edge, len(self.tables))
-        first, row, count = self.row_of_edge.count, table.id.count, len(at)
+        first, row = self.row_of_edge.count, table.id.count
         if row + count > table.id.room:
             table.lengthen(row + count)
         if first + count > self.row_of_edge.room:
@@ -142,7 +150,8 @@ class Graph:
         fault, *where = append_edges(self.pointers, table.pointers, there, *given, self._accepted_by(edge), codes)
         if fault != FITS:
             self._refuse_unfit(edge, at, z, fault, *where)
-        self._register(table, label, source)
+        if codes[0] == len(self.tables) or codes[1] == len(self.labels) or codes[2] == len(self.sources):
+            self._register(table, label, source)
         for column in table.columns:
             column.count = row + count
         self.table_of_edge.count = self.row_of_edge.count = first + count
@@ -262,16 +271,13 @@ class Graph:
         self.pointers = np.array([*(column.address for column in columns), room, *tables], dtype=np.int64)
 
     @staticmethod
-    def _check_shapes(edge: EdgeType, at: Index, measured: Array, noise: Gaussian) -> None:
+    def _refuse_shapes(edge: EdgeType, at: Index, measured: Array) -> None:
+        """Raise GraphSlamError for vertices and measurements that are not (n, k) and (n, p)."""
         for what, given, size in (("vertices", at, len(edge.accepts)), ("measurements", measured, edge.measured_size)):
             if given.ndim != 2 or given.shape[1] != size:
                 shape = tuple(given.shape)
                 raise GraphSlamError(f"{edge.name}: {what} of shape {shape}, not (n, {size})")
-        if len(at) != len(measured):
-            raise GraphSlamError(f"{edge.name}: {len(at)} edges but {len(measured)} measurements")
-        shape = noise.sqrt_information.shape
-        if shape[-1] != edge.residual_size or (len(shape) == 3 and shape[0] != len(at)):
-            raise GraphSlamError(f"{edge.name}: noise of shape {shape} does not fit")
+        raise GraphSlamError(f"{edge.name}: {len(at)} edges but {len(measured)} measurements")
 
     def _refuse_unfit(self, edge: EdgeType, at: Index, measured: Array, fault: int, row: int, slot: int) -> None:
         """Raise GraphSlamError for an edge (``misfit``)."""

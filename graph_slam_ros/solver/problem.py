@@ -1,7 +1,6 @@
 """The problem: which vertices and edges of a graph are solved for, and the edits that the next update integrates."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -39,12 +38,12 @@ from graph_slam_ros.solver.entry import (
     UNFIT_EDGE,
     UNFIT_VERTEX,
     anchorage,
-    enter_newest,
     record,
 )
 from graph_slam_ros.solver.gauge import check_gauge, fix_the_whole
 from graph_slam_ros.solver.linearization import chi2_of, residuals_of, rows_of
 from graph_slam_ros.solver.pending import NONE, PendingChanges
+from graph_slam_ros.solver.transaction import Transaction
 from graph_slam_ros.typing import Array, Index
 
 _KINDS = {SE2: SE2_KIND, SE3: SE3_KIND}
@@ -332,20 +331,12 @@ class Problem:
             self._refuse_floating()
         return vertices, edges
 
-    @contextmanager
-    def _transaction(self, vertices: Index, edges: Index) -> Iterator[None]:
+    def _transaction(self, vertices: Index, edges: Index) -> Transaction:
         """Solve with vertices and edges that enter; an error undoes it: they are pending again, and the estimate stays.
 
         After an error the tree is rebuilt at the next update, because its numbers are half old and half new.
         """
-        substituted = int(self._tree.state[SUBSTITUTED])
-        try:
-            enter_newest(self._pointers, vertices, edges)
-            yield
-        except BaseException:
-            self._undo(substituted, vertices, edges)
-            raise
-        self._pending = PendingChanges()
+        return Transaction(self, vertices, edges)
 
     def _undo(self, substituted: int, vertices: Index, edges: Index) -> None:
         """Undo what a transaction did since there were so many substitutions."""

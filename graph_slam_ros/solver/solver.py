@@ -50,6 +50,8 @@ class Solver(Problem):
         self._unfinished = False  # a batch stopped before the optimum
         self._schedule = RelinearizationSchedule()
         self._solved_with: Settings | None = None
+        self._limits_of: Settings | None = None
+        self._limited = 0.0, 0.0, 0.0, 0.0
 
     def release(self, vertices: ArrayLike) -> None:
         """Estimate held vertices again. The whole structure is rebuilt."""
@@ -75,15 +77,15 @@ class Solver(Problem):
         """
         state = self._tree.state
         eliminated = int(state[AFFECTED])
-        arriving = self._arriving()
-        with self._transaction(*arriving):
-            solved, far, linearized = self._integrate(*arriving)
+        vertices, edges = self._arriving()
+        with self._transaction(vertices, edges):
+            solved, far, linearized = self._integrate(vertices, edges)
             if self._unfinished:
                 solved, far = self._continue_batch()
             found = [solved]
             if len(far):
-                for edges, these in self._relinearized(far):
-                    linearized += edges
+                for again, these in self._relinearized(far):
+                    linearized += again
                     found.append(these)
         if self.settings.at_once:
             self._estimates()
@@ -347,9 +349,11 @@ class Solver(Problem):
     def _limits(self) -> tuple[float, float, float, float]:
         """The tolerances of steps, and the limits above which a step is far (``substitute``)."""
         s = self.settings
-        if not s.relinearize_passes:
-            return s.tolerance, s.tolerance_sigmas, np.inf, np.inf
-        return s.tolerance, s.tolerance_sigmas, BY_FAR * s.relinearize_above, BY_FAR**2 * s.relinearize_error
+        if s is not self._limits_of:
+            far = BY_FAR * s.relinearize_above, BY_FAR**2 * s.relinearize_error
+            limits = far if s.relinearize_passes else (np.inf, np.inf)
+            self._limits_of, self._limited = s, (s.tolerance, s.tolerance_sigmas, *limits)
+        return self._limited
 
     def _relinearized(self, far: Index) -> Iterator[tuple[int, Index]]:
         """Linearise edges that are far, pass after pass; yields how many were, and the vertices that were solved."""

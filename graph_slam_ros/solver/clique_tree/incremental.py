@@ -163,6 +163,11 @@ def relinearize(t: Tree, searched: Index, threshold: float, error: float) -> Ind
     A step is too large above the threshold, or where the neglected term of the linearisation is (``is_large``).
     """
     vertex, edge, link, step, diagonal = t.vertex, t.edge, t.link, t.step, t.diagonal
+    large = False
+    for v in searched:
+        large = large or is_large(step, diagonal, vertex[v, STEP], vertex[v, DOF], threshold, error)
+    if not large:  # as nearly always
+        return np.empty(0, np.int64)
     edges, moving = np.empty(64, np.int64), np.empty(len(searched), np.int64)
     count, many = ZERO, 0
     for v in searched:
