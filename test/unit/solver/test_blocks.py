@@ -1,0 +1,88 @@
+"""Edges that compiled code linearises by the address of their function, and the same one table after the other."""
+
+import dataclasses
+import pickle
+
+import numba
+import numpy as np
+import pytest
+from online import check_pointers, check_tree
+
+from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.graph import CAUCHY, HUBER, LANDMARK_POSITION, R2, RELATIVE_POSE, SE2, Gaussian, Graph, Loss
+from graph_slam_ros.graph.kept_part import kept_part
+from graph_slam_ros.graph.records import LINEARIZE
+from graph_slam_ros.solver import Settings, Solver
+
+PLANAR, FLAT = Gaussian.from_sigmas(0.1, 0.1, 0.05), Gaussian.from_sigmas(0.2, 0.2)
+STAGES = {"landmarks": [Loss(HUBER, 2.0), Loss(CAUCHY, 1.0)], ("odometry", "wheels"): [Loss(HUBER), Loss()]}
+
+
+def in_python(edge):
+    """The same edge type, whose linearisation is a Python function."""
+    return dataclasses.replace(edge, linearize=lambda x, at, measured: edge.linearize(x, at, measured))
+
+
+def drive(relative, sighting, *, poses=60, more=0.0):
+    """A winding drive past landmarks, with two losses in stages and a sighting that is off by ``more``."""
+    graph, noise, path, points = Graph(), np.random.default_rng(4), [], []
+    solver = Solver(graph, Settings(losses=STAGES, at_once=True))
+    for k in range(poses):
+        new, edges = [graph.add_vertex(SE2, [k, np.sin(k), 0.1 * k])], []
+        for back in {1, 7} if k > 7 and k % 8 == 1 else {1} if k else ():
+            moved = noise.normal([back, 0.0, 0.1 * back], 0.1)
+            edges.append(graph.add_edge(relative, [path[-back], new[0]], moved, PLANAR, "odometry", "wheels"))
+        path.append(new[0])
+        if k % 8 == 0:
+            new.append(graph.add_vertex(R2, [k, 3.0]))
+            points.append(new[-1])
+        for point in points[-2:]:
+            seen = noise.normal([0.0, 3.0], 0.3) + more * (k == poses - 1)
+            edges.append(graph.add_edge(sighting, [path[-1], point], seen, FLAT, "landmarks"))
+        solver.add(new, edges)
+        if not k:
+            solver.hold(0)
+        solver.update()
+        yield solver
+
+
+@pytest.mark.skipif(numba.config.DISABLE_JIT, reason="nothing is compiled")
+def test_edges_are_the_same_bytes_compiled_and_one_table_after_the_other():
+    compiled = drive(RELATIVE_POSE, LANDMARK_POSITION)
+    for fast, slow in zip(compiled, drive(in_python(RELATIVE_POSE), in_python(LANDMARK_POSITION)), strict=True):
+        check_tree(fast)
+        assert fast.values.tobytes() == slow.values.tobytes()
+        assert fast._tree.blocks.tobytes() == slow._tree.blocks.tobytes()
+    assert [bool(table.pointers[LINEARIZE]) for table in fast.graph.tables.values()] == [True, True]
+    assert [bool(table.pointers[LINEARIZE]) for table in slow.graph.tables.values()] == [False, False]
+
+
+@pytest.mark.parametrize("types", [(RELATIVE_POSE, LANDMARK_POSITION), (in_python(RELATIVE_POSE), LANDMARK_POSITION)])
+def test_an_edge_whose_cost_is_not_finite_is_named_and_the_estimate_stays(types):
+    driving = drive(*types, more=1e200)
+    with pytest.raises(GraphSlamError, match=r"edge \d+ \(landmark position\) .*not finite"):
+        for solver in driving:
+            before = solver.values
+    assert np.array_equal(solver.values[: len(before)], before)
+    for edge in range(solver.graph.edge_count - 2, solver.graph.edge_count):
+        solver.set_weight(edge, 0.0)
+    solver.update()
+    check_tree(solver)
+
+
+@pytest.mark.parametrize("way", [Graph.copy, lambda graph: pickle.loads(pickle.dumps(graph)), lambda graph: kept_part(
+    graph, np.arange(graph.vertex_count), np.arange(graph.edge_count), graph.initial.values)])  # fmt: skip
+def test_a_copy_of_a_graph_is_where_its_own_columns_are(way):
+    graph = Graph()
+    poses = graph.add_vertices(SE2, np.zeros((40, 3)))
+    graph.add_edges(RELATIVE_POSE, np.column_stack([poses[:-1], poses[1:]]), np.ones((39, 3)), PLANAR, "odometry")
+    same = way(graph)
+    check_pointers(same)
+    same.add_edge(next(iter(same.tables)), [0, 39], [1.0, 2.0, 3.0], PLANAR, "closures")
+    check_pointers(same)
+    assert (graph.edge_count, same.edge_count) == (39, 40)
+    solver = Solver(same)
+    solver.add(range(40), range(40))
+    solver.hold(0)
+    solver.update()
+    check_tree(solver)
