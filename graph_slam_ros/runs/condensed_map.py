@@ -114,7 +114,7 @@ def left_records(done: Condensation) -> Iterator[Record]:
     """Return the records of what has left a map."""
     left = done.left
     rows = {"keyframes": _text(left.keyframes), "sightings": _text(left.sightings)}
-    rows |= {"frames": _text(left.frames.rows), "ends": _text(left.frames.members)}
+    rows |= {"linked_frames": _text(left.frames.rows), "ends": _text(left.frames.members)}
     yield {"type": "left", "first": done.first, "sightings_before": done.sightings_before, **rows}
     if done.edges:
         out = io.StringIO()
@@ -137,8 +137,7 @@ def read_left(folder: Path, space: Geometry, state: BoundedState | None) -> Left
             if record["first"] >= state.keyframes:
                 break
             keyframes, sightings = (_rows(record[name], record_type(space)) for name in ("keyframes", "sightings"))
-            frames = _rows(record.get("frames", ""), frame_type(space))
-            found.append(Left(keyframes, sightings, Frames(frames, _frame_members(record, space))))
+            found.append(Left(keyframes, sightings, _frames(record, space)))
     out = Left.joined(space, found)
     count = len(out.keyframes), len(out.sightings), len(out.frames)
     if state is not None and count != (state.keyframes, state.sightings, state.frames):
@@ -176,15 +175,22 @@ def read_left_edges(folder: Path) -> Iterator[dict[str, str]]:
         yield from csv.DictReader(io.StringIO(record["table"]), COLUMNS)
 
 
-def _frame_members(record: Record, space: Geometry) -> Records:
-    """Return the landmarks of frames; older maps have no axes."""
-    kind = member_type(space)
-    if "ends" in record:
-        return _rows(record["ends"], kind)
-    older = _rows(record.get("members", ""), np.dtype([(name, kind[name]) for name in ("landmark", "point", "weight")]))
-    out = np.zeros(len(older), kind)
-    for name in older.dtype.names or ():
-        out[name] = older[name]
+def _frames(record: Record, space: Geometry) -> Frames:
+    """Return frames; in older maps they have no links, and their landmarks no axes."""
+    links, axes = ("base", "T_base", "count"), ("landmark", "point", "weight")
+    rows = _now_or_older(record, ("linked_frames", "frames"), frame_type(space), links)
+    rows["T_before"][~rows["information"].any(axis=1)] = space.identity
+    return Frames(rows, _now_or_older(record, ("ends", "members"), member_type(space), axes))
+
+
+def _now_or_older(record: Record, names: tuple[str, str], kind: np.dtype[np.void], older: tuple[str, ...]) -> Records:
+    """Return rows that a record has under the first name, or those of fewer columns under the second; others are 0."""
+    if names[0] in record:
+        return _rows(record[names[0]], kind).copy()
+    rows = _rows(record.get(names[1], ""), np.dtype([(name, kind[name]) for name in older]))
+    out = np.zeros(len(rows), kind)
+    for name in older:
+        out[name] = rows[name]
     return out
 
 

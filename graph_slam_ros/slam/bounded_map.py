@@ -23,7 +23,7 @@ from graph_slam_ros.slam.landmarks.landmark_frontend import LandmarkFrontend
 from graph_slam_ros.slam.lifelong.compaction import compact
 from graph_slam_ros.slam.lifelong.condenser import CHAIN, Cell, Condensed, Condenser
 from graph_slam_ros.slam.lifelong.frames import LONGEST as FRAME
-from graph_slam_ros.slam.lifelong.frames import Frames, frame_of, weight_at
+from graph_slam_ros.slam.lifelong.frames import Frames, chained, frame_of, weight_at
 from graph_slam_ros.slam.lifelong.place_edge import PlaceEdge
 from graph_slam_ros.slam.lifelong.removed import Left, OldKeyframe, Records, record_type
 from graph_slam_ros.slam.lifelong.surroundings import CLOSURES, FIXES, is_sighting
@@ -123,7 +123,7 @@ class BoundedMap:
         keyframes, map_ = path.keyframes, self._frontend.config.map
         ids, first = keyframes.ids, keyframes.first
         limit = min(len(keyframes) - map_.window_keyframes, path.remembered_from) - first
-        at, rows, frames = solver.estimate(ids), list[_Row](), list[Frames]()
+        at, rows, frames = solver.estimate(ids), list[_Row](), list[tuple[Frames, range]]()
         cells = list(map(tuple, np.floor(at[:, : self._space.dimensions] / map_.cell_m).astype(np.int64).tolist()))
         k = 0
         while k < limit:
@@ -142,11 +142,11 @@ class BoundedMap:
             if done.how == "waits":
                 break
             self._note_end(done)
-            rows += self._rows(visit, done, frames)
+            rows += self._rows(visit, k, done, frames)
             k = end
         self.condenser.rescale()
         solver.update()
-        return rows, Frames.joined(self._space, frames), first + k
+        return rows, chained(self._space, frames, at), first + k
 
     def _note_end(self, done: Condensed) -> None:
         """Count how a visit ended."""
@@ -206,8 +206,15 @@ class BoundedMap:
     def _own(self, vertex: int) -> _Row:
         return vertex, self._backend.graph.vertex_ids.of(vertex), self._space.identity
 
-    def _rows(self, visit: Sequence[int], done: Condensed, frames: list[Frames]) -> list[_Row]:
-        """Return what left of a visit; frames that it moves with are added."""
+    def _rows(
+        self, visit: Sequence[int], first: int, done: Condensed, frames: list[tuple[Frames, range]]
+    ) -> list[_Row]:
+        """Return what left of a visit; frames that it moves with are added, each with its stretch of keyframes.
+
+        Parameters
+        ----------
+        first : row of the first keyframe of the visit
+        """
         lasting, out = self._backend.graph.vertex_ids, {vertex: self._own(vertex) for vertex in visit}
         for one in done.removed:
             out[one.vertex] = one.vertex, lasting.of(one.base), one.T_base_vertex
@@ -216,7 +223,7 @@ class BoundedMap:
             gone = [vertex for vertex in stretch if done.seen and out[vertex][1] != lasting.of(vertex)]
             if gone:
                 at = self._solution.pose(stretch[len(stretch) // 2])
-                frames.append(self._frame(done, stretch, at))
+                frames.append((self._frame(done, stretch, at), range(first + k, first + k + len(stretch))))
                 number = -self.state.frames - len(frames)
                 for vertex in gone:
                     pose = self._space.group.between(at, self._solution.pose(vertex))
@@ -230,7 +237,7 @@ class BoundedMap:
         for vertex, mark in (both for both in done.seen if both[0] in stretch):
             there, here = (solver.estimate([one])[0] for one in (mark, vertex))
             before = landmarks.get(lasting.of(mark), ((), 0.0))[1]
-            weight = before + weight_at(float(np.linalg.norm(there[:n] - here[:n])))
+            weight = max(before, weight_at(float(np.linalg.norm(there[:n] - here[:n]))))  # their errors are alike
             landmarks[lasting.of(mark)] = tuple(there.tolist()), weight
         base = done.removed[0].base
         return frame_of(self._space, (lasting.of(base), self._solution.pose(base)), at, landmarks)

@@ -3,14 +3,17 @@
 A keyframe that left the map is told relative to a *frame*, the pose of a short stretch of keyframes. The frame knows
 where the landmarks that were seen from the stretch were in its axes when it left. So its present pose is the one that
 lays these on the present landmarks best, and an old path becomes as good as the landmarks are now. Of a landmark that
-is a pose, the frame knows the ends of its axes, too.
+is a pose, the frame knows the ends of its axes, too. A frame that saw little is held by the frames before and after it:
+their relative pose is known as well. So all frames of a path are solved together.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solveh_banded
 
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.slam.lifelong.constellation import rigid_motions
@@ -18,7 +21,8 @@ from graph_slam_ros.typing import Array, Index, Numbers
 
 LONGEST = 20  # keyframes of a frame
 _SIGMA, _LEAST_M = 0.05, 0.05  # standard deviation of a sighting: by its distance, and at least
-_ARM_M, _SHARE = 5.0, 0.02  # by the base alone: points so far from the frame, with so much of the weight
+_ARM_M, _SHARE = 5.0, 0.0002  # by the base alone: points so far from the frame, with so much of the weight
+_DRIFT, _DRIFT_RAD_M, _STEP_SIGMA = 0.05, 0.01, 0.01  # from a frame to the next, of what is driven or turned; least
 _TIP_M = 1.0  # length of the axes of a landmark that is a pose
 _OFF = 3.0  # a landmark that is farther off, in standard deviations, counts less
 _ROUNDS = (32.0, 16.0, 8.0, 4.0, 2.0, 1.0, 1.0, 1.0)  # of the fit: so many times as far, as it begins at the base alone
@@ -52,7 +56,9 @@ class Frames:
 
     Attributes
     ----------
-    rows : ``base``, the lasting id of a vertex that stays, ``T_base`` (size,), ``count`` of its landmarks
+    rows : ``base``, the lasting id of a vertex that stays, ``T_base`` (size,), ``count`` of its landmarks; of the pose
+        in the axes of the frame before, ``T_before`` (size,), and of that the ``information`` (dof,), 0 where there is
+        no frame right before
     members : of all frames, in order: ``landmark``, its lasting id, ``axis``, 0 or the number of an axis of a pose,
         ``point`` (d,), its position or the end of that axis, in the axes of the frame [m], ``weight`` [1/m^2]
     """
@@ -96,6 +102,7 @@ class Frames:
         here, there = np.concatenate((known["point"], by_base)), np.concatenate((now, moved))
         weight = np.concatenate((known["weight"], (_SHARE / len(arms) * np.maximum(share, 1.0))[of_arms]))
         columns = rigid_motions(here).reshape(len(here), d, -1)
+        links = np.flatnonzero(self.rows["information"].any(axis=1))
         for times in _ROUNDS:
             seen = np.stack(group.act(group.inverse(tuple(out[frame].T)), tuple(there.T)), axis=-1)
             off = seen - here
@@ -104,9 +111,67 @@ class Frames:
             normal, right = np.zeros((count, space.dof, space.dof)), np.zeros((count, space.dof))
             np.add.at(normal, frame, np.einsum("nik,nil->nkl", weighted, columns))
             np.add.at(right, frame, np.einsum("nik,ni->nk", weighted, off))
-            step = np.linalg.solve(normal, right[:, :, None])[:, :, 0]
+            step = _chain_step(normal, right, *self._links(space, out, links), links)
             out = np.stack(group.compose(tuple(out.T), group.exp(tuple(step.T))), axis=-1)
         return out
+
+    def _links(self, space: Geometry, poses: Array, links: Index) -> tuple[Array, Array, Array]:
+        """Return residuals (k, dof), their derivative by the frame before (k, dof, dof), and the information (k, dof).
+
+        That by the frame itself is the identity: residuals are small where it counts.
+        """
+        group, known = space.group, self.rows[links]
+        between = group.between(tuple(poses[links - 1].T), tuple(poses[links].T))
+        off = np.stack(group.log(group.between(tuple(known["T_before"].T), between)), axis=-1)
+        back = np.stack(group.inverse(between), axis=-1)
+        by_before = np.array([-group.adjoint(tuple(one)) for one in back.tolist()])
+        return off, by_before.reshape(-1, space.dof, space.dof), known["information"]
+
+
+def _chain_step(normal: Array, right: Array, off: Array, by_before: Array, information: Array, links: Index) -> Array:
+    """Return the Gauss-Newton step (n, dof) of frames, some of which are linked to the one before.
+
+    Parameters
+    ----------
+    normal, right : (n, dof, dof) and (n, dof), of what each frame knows by itself
+    """
+    n, dof = right.shape
+    normal, right, across = normal.copy(), right.copy(), np.zeros((n, dof, dof))
+    weighted = information[:, :, None] * by_before
+    normal[links] += information[:, :, None] * np.eye(dof)
+    right[links] -= information * off
+    normal[links - 1] += np.einsum("nki,nkj->nij", by_before, weighted)
+    right[links - 1] -= np.einsum("nki,nk->ni", weighted, off)
+    across[links] = weighted.transpose(0, 2, 1)  # rows of the frame before, columns of the frame
+    banded = np.zeros((2 * dof, n, dof))  # upper diagonals, as solveh_banded has them
+    for i in range(dof):
+        for j in range(dof):
+            if i <= j:
+                banded[2 * dof - 1 + i - j, :, j] = normal[:, i, j]
+            banded[dof - 1 + i - j, :, j] = across[:, i, j]
+    return np.asarray(solveh_banded(banded.reshape(2 * dof, -1), right.ravel())).reshape(n, dof)
+
+
+def chained(space: Geometry, several: Sequence[tuple["Frames", range]], poses: Array) -> "Frames":
+    """Return frames one after the other, each linked to the one before where no keyframe is between them.
+
+    Parameters
+    ----------
+    several : each a frame, and which keyframes are its stretch
+    poses : (n, size) of all keyframes; a frame is at the middle one of its stretch
+    """
+    out, group, n = Frames.joined(space, [frame for frame, _ in several]), space.group, space.dimensions
+    for k, ((_, before), (_, stretch)) in enumerate(pairwise(several), start=1):
+        if before.stop != stretch.start:
+            continue
+        first, last = before[len(before) // 2], stretch[len(stretch) // 2]
+        way = np.stack(group.between(tuple(poses[first:last].T), tuple(poses[first + 1 : last + 1].T)), axis=-1)
+        driven = float(np.linalg.norm(way[:, :n], axis=1).sum())
+        turned = sum(space.angle(tuple(one)) for one in way.tolist())
+        sigmas = _STEP_SIGMA + _DRIFT * driven, _STEP_SIGMA + _DRIFT * turned + _DRIFT_RAD_M * driven
+        out.rows["T_before"][k] = group.between(tuple(poses[first].tolist()), tuple(poses[last].tolist()))
+        out.rows["information"][k] = np.square(space.sigmas(*sigmas)) ** -1.0
+    return out
 
 
 def frame_of(
@@ -127,7 +192,7 @@ def frame_of(
         for axis, end in enumerate(ends.tolist()):
             members.append((landmark, axis, group.act(group.inverse(at), tuple(end)), weight))
     out = Frames(np.empty(1, frame_type(space)), np.array(members, dtype=member_type(space)))
-    out.rows[0] = base[0], group.between(base[1], at), len(members)
+    out.rows[0] = base[0], group.between(base[1], at), len(members), space.identity, np.zeros(space.dof)
     return out
 
 
@@ -138,7 +203,8 @@ def weight_at(distance_m: float) -> float:
 
 def frame_type(space: Geometry) -> np.dtype[np.void]:
     """Return the type of the rows of frames."""
-    return np.dtype([("base", "<i8"), ("T_base", "<f8", (space.pose.size,)), ("count", "<i8")])
+    poses = [(name, "<f8", (space.pose.size,)) for name in ("T_base", "T_before")]
+    return np.dtype([("base", "<i8"), poses[0], ("count", "<i8"), poses[1], ("information", "<f8", (space.dof,))])
 
 
 def member_type(space: Geometry) -> np.dtype[np.void]:

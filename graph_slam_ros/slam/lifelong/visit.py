@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from graph_slam_ros.errors import SingularError
 from graph_slam_ros.graph import Edge, EdgeType, Gaussian, Graph
 from graph_slam_ros.graph.geometry import Geometry
-from graph_slam_ros.slam.lifelong.constellation import Constellation
+from graph_slam_ros.slam.lifelong.constellation import Constellation, rigid_motions
 from graph_slam_ros.slam.lifelong.elimination import marginal_information, product
 from graph_slam_ros.solver import Settings, Solver
 from graph_slam_ros.typing import Array
@@ -94,7 +94,7 @@ def visit_of(
 def best_known(
     space: Geometry, graph: Graph, estimate: Estimate, poses: Sequence[int], edges: Mapping[int, float]
 ) -> int:
-    """Return which pose of a visit, counted from 0, the landmarks that it sees determine best.
+    """Return which pose of a visit, counted from 0, knows best where the landmarks that it sees are, all of them.
 
     Parameters are those of ``visit_of``.
 
@@ -111,7 +111,11 @@ def best_known(
     for mark in marks:
         solver.hold(at[mark])
     solver.update()
-    spreads = [np.linalg.slogdet(one)[1] for one in solver.marginal(range(len(poses)))]
+    there, spreads = _constellation(space, solver, [at[mark] for mark in marks]), list[float]()
+    ids = range(len(poses))
+    for pose, covariance in zip(solver.estimate(ids).tolist(), solver.marginal(ids), strict=True):
+        columns = rigid_motions(there.moved(space, space.group.inverse(tuple(pose))).points)
+        spreads.append(float(np.einsum("ni,ij,nj->", columns, covariance, columns, optimize=False)))
     return int(np.argmin(spreads))
 
 

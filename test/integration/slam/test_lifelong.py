@@ -10,7 +10,7 @@ from graph_slam_ros.graph import Gaussian
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
 from graph_slam_ros.graph.place import LABEL
 
-KEYFRAMES, WINDOW, SEEDS = 700, 40, range(4)
+KEYFRAMES, WINDOW, SEEDS = 700, 40, range(8)
 
 
 def driven(world, window=0, until=None):

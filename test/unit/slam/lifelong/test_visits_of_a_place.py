@@ -1,6 +1,7 @@
 """Visits to a place condensed to one Gaussian, compared with everything solved at once."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -255,6 +256,27 @@ def test_the_pose_that_landmarks_determine_best_sees_them(space):
     nothing = {edge: 1.0 for edge, (_, last) in edges.items() if last not in world.marks}
     with pytest.raises(SingularError):
         best_known(space, world.graph, world.estimate, world.poses[number], nothing)
+
+
+def test_a_pose_that_knows_its_position_but_not_its_heading_is_no_base():
+    space, graph = PLANAR, Graph()
+    close, wide = [(1.4, -0.1), (1.4, 0.1)], [(8.0, -5.0), (8.0, 5.0)]
+    poses = [graph.add_vertex(space.pose, [0.5 * k, 0.0, 0.0]) for k in range(5)]
+    factors, at = {}, {}
+    for k, seen in ((0, close), (4, wide)):
+        for point in seen:
+            mark = at.setdefault(point, graph.add_vertex(space.point, point))
+            sighting = [point[0] - 0.5 * k, point[1]]
+            noise = Gaussian.from_sigmas(*[0.02 * np.hypot(*sighting)] * 2)
+            factors[graph.add_edge(space.sightings["position"], [poses[k], mark], sighting, noise, "landmarks")] = 1.0
+    for pair in pairwise(poses):
+        noise = Gaussian.from_sigmas(0.05, 0.05, 0.2)
+        factors[graph.add_edge(space.relative_pose, pair, [0.5, 0.0, 0.0], noise, "odometry")] = 1.0
+
+    def estimate(ids):
+        return np.array([graph.vertex(int(v)).initial for v in ids])
+
+    assert best_known(space, graph, estimate, poses, factors) == 4
 
 
 def test_half_of_each_measurement_and_the_other_half_are_the_whole(space, tags):
