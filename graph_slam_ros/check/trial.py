@@ -1,6 +1,7 @@
 """A trial of a recording: a replay in memory, then a fit of clock, mount and scales that starts at its estimate."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from graph_slam_ros.check.outliers import check_outliers
 from graph_slam_ros.check.pairs import noisier, pairs_of, path_of, poses_at, turned_mount
 from graph_slam_ros.check.slips import check_slips
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.lie import se3
+from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.measurements.types import Control, Measurement, Odometry
 from graph_slam_ros.slam import Config, GraphSlam
 from graph_slam_ros.slam.calibration.decision import Finding as Fitted
@@ -65,9 +66,17 @@ def replayed(config: Config, measured: Iterable[Measurement]) -> GraphSlam:
     return slam
 
 
-def poses_in_map(slam: GraphSlam, stamp_ns: Index, path_ns: Index, path: Array) -> Array:
-    """Estimated poses (k, 7) at stamps; the correction between two keyframes is spread over the time between them."""
-    keyframes, estimate = slam.keyframes, se3.in_space(slam.trajectory()).reshape(-1, 7)
+def poses_in_map(
+    slam: GraphSlam, stamp_ns: Index, path_ns: Index, path: Array, trajectory: Array | None = None
+) -> Array:
+    """Estimated poses (k, 7) at stamps; the correction between two keyframes is spread over the time between them.
+
+    Parameters
+    ----------
+    trajectory : poses of the keyframes, instead of those of the estimate
+    """
+    keyframes = slam.keyframes
+    estimate = se3.in_space(slam.trajectory() if trajectory is None else trajectory).reshape(-1, 7)
     own, at_ns = se3.in_space(keyframes.poses).reshape(-1, 7), keyframes.stamps_ns
     order = np.argsort(at_ns, kind="stable")
     at_ns = at_ns[order]
@@ -108,6 +117,9 @@ def check_trial(c: Columns, slam: GraphSlam) -> Iterator[Finding]:
     clocks = [one for one in fitted if one.parameter.name == "clock" and one.verdict == "admitted"]
     late_s = {} if fit.lost > _LOST else {one.parameter.source: one.value for one in clocks}
     found = [] if _goes_back(c) else _places(c, slam, path_ns, path, late_s)
+    turned = {one.parameter.source: one.value for one in fitted if one.parameter.name == "yaw" and _is_off(one)}
+    if turned and found:
+        found = list(_places_of_fit(c, slam, fit, turned, path_ns, path))
     if fit.lost > _LOST:
         found += [one for s in c.sightings for one in noisier(s, pairs_of(s, path_ns, path, c.config.world.dimensions))]
         if not found:
@@ -171,19 +183,26 @@ def _over_confident(c: Columns, noise: NoiseScale, factor: float, limit: float) 
     return Finding(code, "note", factor, limit, "times", text, topic, settings=settings)
 
 
+def _is_off(one: Fitted) -> bool:
+    """Return whether a parameter is far off by its limit and several sigmas."""
+    _, limit, unknown = _LIMITS[one.parameter.name]
+    sigmas = _TURN_SIGMAS if one.parameter.name == "turn" else _SIGMAS
+    is_known = one.sigma <= unknown and one.verdict == "admitted"
+    return is_known and abs(one.value) > max(limit, sigmas * one.sigma)
+
+
 def _fitted(c: Columns, slam: GraphSlam, one: Fitted) -> Iterator[Finding]:
     """A parameter that is far off by its limit and several sigmas, or that the drive does not tell."""
     if one.parameter.name not in _LIMITS:
         return
     code, (unit, limit, unknown) = CODES[one.parameter.name], _LIMITS[one.parameter.name]
-    sigmas = _TURN_SIGMAS if one.parameter.name == "turn" else _SIGMAS
     topic = next((t for t in c.topics.values() if one.parameter.source in t.inputs), None)
     if topic is None:
         return
     where: Where = {"topic": topic.name, "first_ns": int(topic.stamp_ns[:1].sum()), "count": len(topic.stamp_ns)}
     if one.sigma > unknown:
         yield Finding("not_observable", "note", one.sigma, unknown, unit, one.text, **where)
-    elif abs(one.value) > max(limit, sigmas * one.sigma) and one.verdict == "admitted":
+    elif _is_off(one):
         text = f"{topic.name}: {sentence(one.parameter, one.value, one.sigma)}"
         settings = (assignment(*setting_of(one.parameter, {one.parameter: one.value}, slam.calibrated)),)
         yield Finding(code, "warning", one.value, limit, unit, text, settings=settings, **where)
@@ -205,6 +224,28 @@ def _clock_jumps(c: Columns, fit: TrialFit) -> Iterator[Finding]:
         )
         where: Where = {"topic": topic.name, "first_ns": int(topic.stamp_ns[:1].sum()), "count": len(topic.stamp_ns)}
         yield Finding("clock_jump", "warning", halves[1] - halves[0], limit, "s", text, **where)
+
+
+def _places_of_fit(
+    c: Columns, slam: GraphSlam, fit: TrialFit, turned: Mapping[str, float], path_ns: Index, path: Array
+) -> Iterator[Finding]:
+    """Findings of places by the estimate of the fit: a sensor that is turned bends the map that it began with.
+
+    Parameters
+    ----------
+    turned : by input: by how much its sensor is turned
+    """
+    at = slam.graph.offset.values[slam.keyframes.ids][:, None] + np.arange(slam.space.pose.size)
+    for s in c.sightings:
+        origin = np.array(s.T_base_frame[:3])
+        turn = so3.exp((0.0, 0.0, turned.get(s.input, 0.0)))
+        points = np.stack(so3.act(turn, tuple((s.points - origin).T)), axis=1) + origin
+        stamp_ns = np.clip(s.stamp_ns, path_ns[0], path_ns[-1])
+        poses = poses_in_map(slam, stamp_ns, path_ns, path, fit.path[at])
+        straight = points_in_map(replace(s, points=points), poses)
+        two = at_two_places(s, straight, path_ns, c.config.world.dimensions)
+        yield from check_identities(s, two)
+        yield from check_outliers(s, straight, stamp_ns == s.stamp_ns, c.config, {one.name for one in two})
 
 
 def _places(c: Columns, slam: GraphSlam, path_ns: Index, path: Array, late_s: Mapping[str, float]) -> list[Finding]:

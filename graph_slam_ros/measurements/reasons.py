@@ -396,4 +396,6 @@ def warnings(counts: Mapping[str, Mapping[str, int]]) -> list[str]:
 
 def remedy(source: str, reason: str) -> str:
     """Return the remedy for this input; empty if nothing is to be done."""
+    if source in ("tf", "tf_static") and reason == "frame_empty":  # no parameter names the frames of a transform
+        return "have the node that publishes the transform name both frames (header.frame_id and child_frame_id)"
     return explain(reason).remedy.replace("INPUT", source.partition("#")[0])  # a second odometry of the topic is odom#2

@@ -23,6 +23,7 @@ from graph_slam_ros.slam.robust.gating import OutlierGate
 from graph_slam_ros.slam.robust.hypotheses import Alternative, FrozenGraph, Outcome, search_alternatives
 from graph_slam_ros.slam.robust.ledger import FINAL, Ledger, Reason
 from graph_slam_ros.slam.robust.odometry_judge import OdometryJudge
+from graph_slam_ros.slam.robust.patience import Patience
 from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.solver import Report, Settings, Solver
 from graph_slam_ros.typing import Array, Executor, Index, Numbers
@@ -69,7 +70,8 @@ class Backend:
         self.noise = NoiseScales(self.graph, start.noise_factors)
         self.solver = Solver(self.graph, settings)
         self.decisions = OutlierGate(config, self.graph, self.solver, start.ledger)
-        self._admission = Admission(self.graph, self.solver, self.decisions)
+        self.patience = Patience(self.solver)
+        self._admission = Admission(self.graph, self.solver, self.decisions, self.patience)
         self.handed_over, self.frozen = (0, 0), start.frozen
         self.frozen_edges = start.ledger.final
         self.held = (0, 0)
