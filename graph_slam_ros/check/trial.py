@@ -17,7 +17,7 @@ from graph_slam_ros.measurements.types import Control, Measurement, Odometry
 from graph_slam_ros.slam import Config, GraphSlam
 from graph_slam_ros.slam.calibration.decision import Finding as Fitted
 from graph_slam_ros.slam.calibration.fit import TrialFit
-from graph_slam_ros.slam.calibration.uncorrected import CODES, sentence, setting_of
+from graph_slam_ros.slam.calibration.uncorrected import CODES, clock_jumps, jump_sentence, sentence, setting_of
 from graph_slam_ros.slam.noise_scale import LARGEST, NoiseScale
 from graph_slam_ros.typing import Array, Index
 
@@ -38,7 +38,6 @@ _LIMITS = {
 }
 _OVER_CONFIDENT, _ODOMETRY_OVER_CONFIDENT, _LEAST_DOF = 2.0, 6.0**0.5, 100.0
 _LOST = 0.25
-_JUMPED_S = 0.08
 _OF_A_BREAK = (
     "ids_unsure",
     "map_breaks",
@@ -210,20 +209,16 @@ def _fitted(c: Columns, slam: GraphSlam, one: Fitted) -> Iterator[Finding]:
 
 def _clock_jumps(c: Columns, fit: TrialFit) -> Iterator[Finding]:
     """Clocks that are not the same in both halves of the drive, beyond a limit and the sigma of either half."""
-    sigmas = np.sqrt(np.diag(fit.covariance))
-    for k, parameter in enumerate(fit.parameters):
-        halves, sigma = (float(fit.first[k]), float(fit.second[k])), 2.0**0.5 * float(sigmas[k])
-        limit = max(_JUMPED_S, 2.0**0.5 * _SIGMAS * sigma)
+    for parameter, before, after, sigma, limit in clock_jumps(fit):
         topic = next((t for t in c.topics.values() if parameter.source in t.inputs), None)
-        if parameter.name != "clock" or topic is None or abs(halves[1] - halves[0]) <= limit:
-            continue
-        before, after = (f"{half * 1e3:+.0f} ms" for half in halves)
-        text = (
-            f"{topic.name}: sightings agree with odometry best {before} from their stamps in one half of the drive, "
-            f"{after} in the other (sigma {sigma * 1e3:.0f} ms)"
-        )
-        where: Where = {"topic": topic.name, "first_ns": int(topic.stamp_ns[:1].sum()), "count": len(topic.stamp_ns)}
-        yield Finding("clock_jump", "warning", halves[1] - halves[0], limit, "s", text, **where)
+        if topic is not None:
+            text = f"{topic.name}: {jump_sentence(before, after, sigma)}"
+            where: Where = {
+                "topic": topic.name,
+                "first_ns": int(topic.stamp_ns[:1].sum()),
+                "count": len(topic.stamp_ns),
+            }
+            yield Finding("clock_jump", "warning", after - before, limit, "s", text, **where)
 
 
 def _places_of_fit(

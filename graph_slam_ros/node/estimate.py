@@ -9,6 +9,7 @@ import numpy as np
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.runs.outcome import VISITS, association_faults, visit_faults
 from graph_slam_ros.slam import GraphSlam
+from graph_slam_ros.slam.calibration.uncorrected import Uncorrected
 from graph_slam_ros.slam.solution import Correction
 from graph_slam_ros.slam.weak_direction import WeakDirection, position_covariance, weakest_position, weakest_turn
 from graph_slam_ros.typing import Numbers
@@ -179,12 +180,16 @@ class Estimate:
             displaced=str(slam.displaced or ""),
             association="; ".join(association_faults(slam.association_report)),
             visits="; ".join(visit_faults({name: slam.counters["map", name] for name in VISITS})),
-            uncorrected="; ".join(f"{one}: {one.setting[0]}={one.setting[1]}" for one in slam.uncorrected_so_far),
+            uncorrected="; ".join(": ".join([str(one), *_settings(one)]) for one in slam.uncorrected_so_far),
             motion="; ".join(filter(None, (slam.gyro.fault if slam.gyro else "", slam.backend.odometries.doubted))),
             gyro=str(slam.gyro or ""),
             is_resumed=is_resumed,
             calibration=_calibration(slam.calibration_report),
         )
+
+
+def _settings(one: Uncorrected) -> list[str]:
+    return [f"{key}={value}" for key, value in one.as_dict()["settings"].items()]
 
 
 def _calibration(report: Mapping[str, Any]) -> dict[str, str]:

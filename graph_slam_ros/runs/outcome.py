@@ -266,7 +266,7 @@ def _uncorrected(summary: Summary) -> Iterator[str]:
         return
     for one in summary.get("uncorrected", ()):
         mend = " ".join(f"--set {shlex.quote(f'{key}={value}')}" for key, value in one["settings"].items())
-        yield f"{one['text']}: {mend} (graph_slam check BAG compares the causes)"
+        yield f"{one['text']}{mend and ': '}{mend} (graph_slam check BAG compares the causes)"
 
 
 def visit_faults(counted: Mapping[str, int]) -> Iterator[str]:

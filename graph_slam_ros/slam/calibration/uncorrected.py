@@ -6,7 +6,7 @@ pose and its covariance P, b' inv(P) b is what the parameter adds to the pose's 
 which the degrees of freedom are expected.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -31,6 +31,7 @@ CODES = {
 
 MOST_SHIFT = 2.0**0.5  # sigmas of the poses: with more, their NEES is three times what is expected
 _DEGREE = np.pi / 180.0
+_JUMPED_S = 0.08
 _AXIS = {"roll": "about the axis ahead ", "pitch": "about the axis to the left ", "yaw": ""}
 
 Total = Callable[[str, str], float]
@@ -46,7 +47,7 @@ class Uncorrected:
     code : the finding of ``graph_slam check``
     value, sigma : of the correction, in s, rad, m, or as a part; of a noise, the stated one [m for each metre], and 0
     shift : root mean square by which it moves the poses, in their sigmas
-    setting : a parameter of the configuration, and the value that mends it
+    setting : a parameter of the configuration, and the value that mends it; empty where none does
     """
 
     code: str
@@ -55,16 +56,21 @@ class Uncorrected:
     sigma: float
     shift: float
     text: str
-    setting: tuple[str, Any]
+    setting: tuple[str, Any] | tuple[()]
 
     def __str__(self) -> str:
-        return f"{self.code}: {self.source}: {self.text}; by it the poses are off by {self.shift:.1f} of their sigmas"
+        by = f"; by it the poses are off by {self.shift:.1f} of their sigmas" if self.setting else ""
+        return f"{self.code}: {self.source}: {self.text}{by}"
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values with six digits, because the last ones depend on the memory alignment of an array."""
         numbers = {name: float(f"{getattr(self, name):.6g}") for name in ("value", "sigma", "shift")}
-        key, value = self.setting
-        return {"code": self.code, **numbers, "text": str(self), "settings": {key: value}}
+        return {
+            "code": self.code,
+            **numbers,
+            "text": str(self),
+            "settings": dict([self.setting] if self.setting else []),
+        }
 
 
 def uncorrected(
@@ -95,7 +101,34 @@ def uncorrected(
         text += ", more than its stated noise allows for (odometry.noise)" * (one.name in OF_ODOMETRY)
         more = (CODES[one.name], one.source, values[one], sigma, float(shifts[k]), text)
         out.append(Uncorrected(*more, setting_of(one, values, total)))
-    return sorted(out, key=lambda one: -one.shift)
+    jumps = [
+        Uncorrected("clock_jump", one.source, after - before, sigma, 0.0, jump_sentence(before, after, sigma), ())
+        for one, before, after, sigma, _ in clock_jumps(found)
+    ]
+    return [*jumps, *sorted(out, key=lambda one: -one.shift)]
+
+
+def clock_jumps(found: TrialFit) -> Iterator[tuple[Parameter, float, float, float, float]]:
+    """Yield the clocks that are not the same in both halves of the drive, beyond a limit and the sigma of either half.
+
+    Yields
+    ------
+    The parameter, its value in either half, the sigma of one, and the limit of their difference [s].
+    """
+    sigmas = np.sqrt(np.diag(found.covariance))
+    for k, one in enumerate(found.parameters):
+        before, after, sigma = float(found.first[k]), float(found.second[k]), 2.0**0.5 * float(sigmas[k])
+        limit = max(_JUMPED_S, 2.0**0.5 * SIGMAS * sigma)
+        if one.name == "clock" and abs(after - before) > limit:
+            yield one, before, after, sigma, limit
+
+
+def jump_sentence(before: float, after: float, sigma: float) -> str:
+    """Say what a clock is in either half of the drive."""
+    return (
+        f"sightings agree with odometry best {before * 1e3:+.0f} ms from their stamps in one half of the drive, "
+        f"{after * 1e3:+.0f} ms in the other (sigma {sigma * 1e3:.0f} ms)"
+    )
 
 
 def pose_shifts(found: TrialFit, covariances: Mapping[int, Array]) -> Array:

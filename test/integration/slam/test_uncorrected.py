@@ -1,6 +1,7 @@
 """A clock, a mount or a scale that is off and that nothing corrects is told, and its setting mends it."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from graph_slam_ros.node.diagnostics import Facts, judge
 from graph_slam_ros.node.estimate import Estimate, UnseenWay
 from graph_slam_ros.runs.outcome import doubts
 from graph_slam_ros.simulation import simulate, write_bag
-from graph_slam_ros.slam import Config
+from graph_slam_ros.slam import Config, Sightings
 
 SURE = {"odometry.translation_density": 1e-3, "odometry.lateral_density": 1e-3}
 WRONG = [
@@ -87,6 +88,21 @@ def test_the_end_of_a_replay_names_a_wrong_mount(laps, tmp_path, capsys):
     assert main(["replay", str(bag), "--out", str(run), "--force", "--set", f"{key}={value}"]) == 0
     assert "uncorrected" not in json.loads((run / "run.json").read_text())
     assert "mount_yaw" not in capsys.readouterr().err
+
+
+def test_a_clock_that_was_set_on_the_way_is_told():
+    drive, _ = imperfect_drive_and_truth(Faults(), seconds=90.0)
+    middle_ns = drive[len(drive) // 2].stamp_ns
+    late = [
+        replace(m, stamp_ns=m.stamp_ns + 300_000_000) if isinstance(m, Sightings) and m.stamp_ns > middle_ns else m
+        for m in drive
+    ]
+    slam = driven(sorted(late, key=lambda m: m.stamp_ns))
+    (one,) = [one for one in slam.uncorrected() if one.code == "clock_jump"]
+    assert abs(one.value) > 0.15
+    assert "in one half of the drive" in str(one)
+    assert one.as_dict()["settings"] == {}
+    assert len(list(doubts({"counters": {}, "inputs": {}, "uncorrected": [one.as_dict()]}))) == 1
 
 
 def test_an_error_of_the_recording_makes_a_fit_meaningless():
