@@ -92,8 +92,6 @@ class Config:
                 "calibrate.groups: factors and range_factor are one scale: leave one out, or survey landmarks "
                 "(landmarks.surveyed)"
             )
-        if self.map.condense and (not_yet := self._not_condensed):
-            raise ConfigError(f"map.condense: not with {not_yet} yet: set map.condense=false, or change that")
 
     @property
     def uses_found_factors(self) -> bool:
@@ -101,7 +99,12 @@ class Config:
         return self.landmarks.association == "joint" and self.calibrate.groups == "association"
 
     @property
-    def _not_condensed(self) -> str:
+    def condenses(self) -> bool:
+        """Return whether old visits are condensed: where that is wanted, and nothing forbids it."""
+        return self.map.condense and not self.not_condensed
+
+    @property
+    def not_condensed(self) -> str:
         """Return the parameter with which nothing is condensed yet; empty if there is none."""
         if self.landmarks.association in ("nearest", "joint"):
             return f"landmarks.association={self.landmarks.association}"

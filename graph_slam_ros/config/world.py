@@ -69,7 +69,7 @@ class MapConfig:
         live=True,
     )
     condense: bool = setting(
-        False,
+        True,
         "true: what was driven long ago is condensed to one measurement of each place, so that memory and time follow "
         "the area and not the distance driven; false: every keyframe is kept",
     )

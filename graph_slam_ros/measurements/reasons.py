@@ -330,8 +330,7 @@ REASONS: dict[str, Reason] = {
     "visit_condensed": Reason(_NOTED, "a visit was added to its place, begins one, or is one keyframe"),
     "visit_wider": Reason(_NOTED, "a visit fits its place with larger sigmas only (up to 3 times)"),
     "visit_lost": Reason(_NOTED, "a visit that contradicts itself or its place: its odometry alone is kept"),
-    "visit_unfit": Reason(_NOTED, "a visit that sees too few landmarks: only odometry is kept", "map.condense=false"),
-    "not_condensed": Reason(_NOTED, "a keyframe that stays: the first, or one that sees a range with an offset"),
+    "not_condensed": Reason(_NOTED, "a keyframe that stays, for its edges or as too little is seen around it"),
     "held_keyframe": Reason(_NOTED, "a keyframe that stays: its map is frozen, or held by map.localize"),
     "cleared": Reason(_NOTED, "loop closures that ~/clear_closures took out"),
     "displaced": Reason(

@@ -23,7 +23,7 @@ _MOSTLY = 0.5
 _MOTION = ("odometry", "gyro")  # uses whose measurements nobody doubts one by one
 _DOUBTED = 0.05  # of an input: as many that are not believed are said; so it is of visits to places
 _FEWEST_LOST = 2  # visits that are lost, which are said
-VISITS = ("visit_condensed", "visit_lost", "visit_wider", "visit_unfit", "not_condensed")  # in the counters of "map"
+VISITS = ("visit_condensed", "visit_lost", "visit_wider")  # in the counters of "map"
 _MENDED = (  # of what is noted, signs of a wrong setting
     *("displaced", "displacement_taken_back", "jump"),
     *("not_in_use", "turn_slips", "gyro_silent", "gyro_doubted", "odometry_contradicted", "odometry_alike"),
@@ -53,6 +53,10 @@ def text(summary: Summary) -> list[str]:
         f"edges      {summary['edges']:8d}",
         f"chi2       {summary['chi2']:12.3f}   {_solves(summary)}",
     ]
+    if count := summary.get("condensed"):
+        lines.append(f"condensed  keyframes 0 to {count - 1}, into places: --set map.condense=false keeps all")
+    elif why := summary.get("not_condensed"):
+        lines.append(f"condensed  nothing: not with {why} yet, so the map grows with the distance driven")
     if "time_s" in summary:
         cpu = f", {summary['cpu_s']:.1f} s of CPU time" if "cpu_s" in summary else ""
         lines.append(f"took       {summary['time_s']:10.1f} s{cpu}")
@@ -207,7 +211,6 @@ def shortcomings(summary: Summary) -> Iterator[str]:
                 "metres and radians? A robot as fast as that: --set odometry.max_speed_m_s=..."
             )
     yield from _gyro_faults(summary)
-    yield from _unfit_visits(summary["counters"].get("map", {}), _MOSTLY, 1.0)
     yield from association_faults(summary.get("association", {}))
     if not sum(counts["believed"] or 0 for counts in inputs.values()):
         yield (
@@ -242,7 +245,7 @@ def doubts(summary: Summary) -> Iterator[str]:
     for each clock, mount or scale that is off so far that the covariances are too small.
     """
     yield from _uncorrected(summary)
-    yield from _doubtful_visits(summary["counters"].get("map", {}), _MOSTLY)
+    yield from visit_faults(summary["counters"].get("map", {}))
     for name, count in Counter(name.partition("#")[0] for name in summary.get("inputs", {})).items():
         if count > 1:
             yield (
@@ -270,27 +273,12 @@ def _uncorrected(summary: Summary) -> Iterator[str]:
 
 
 def visit_faults(counted: Mapping[str, int]) -> Iterator[str]:
-    """Yield why a condensed map is worse, or larger, than it should be; empty if it is not.
+    """Yield why a condensed map is worse than it should be; empty if it is not.
 
     Parameters
     ----------
     counted : how often visits ended how, by the names of ``VISITS``
     """
-    yield from _doubtful_visits(counted, 1.0)
-
-
-def _doubtful_visits(counted: Mapping[str, int], most: float) -> Iterator[str]:
-    yield from _contradicting_visits(counted)
-    yield from _unfit_visits(counted, _DOUBTED, most)
-    kept = counted.get("not_condensed", 0)
-    if kept > max(_visits(counted), _FEWEST_LOST):
-        yield (
-            f"map.condense: {kept} keyframes are not condensed: they see ranges with an offset, or other edges hold "
-            "them, so the map still grows with the distance"
-        )
-
-
-def _contradicting_visits(counted: Mapping[str, int]) -> Iterator[str]:
     doubted, visits = counted.get("visit_lost", 0) + counted.get("visit_wider", 0), _visits(counted)
     if doubted >= _FEWEST_LOST and doubted > _DOUBTED * visits:
         yield (
@@ -300,18 +288,8 @@ def _contradicting_visits(counted: Mapping[str, int]) -> Iterator[str]:
         )
 
 
-def _unfit_visits(counted: Mapping[str, int], least: float, most: float) -> Iterator[str]:
-    """Yield a sentence if the part of the visits that are no place is above the least and up to the most."""
-    unfit, visits = counted.get("visit_unfit", 0), _visits(counted)
-    if unfit >= _FEWEST_LOST and least * visits < unfit <= most * visits:
-        yield (
-            f"map.condense: {unfit} of {visits} visits see too few landmarks for a place, so the map has their "
-            "odometry alone: --set map.condense=false keeps all"
-        )
-
-
 def _visits(counted: Mapping[str, int]) -> int:
-    return sum(counted.get(name, 0) for name in ("visit_condensed", "visit_lost", "visit_unfit"))
+    return sum(counted.get(name, 0) for name in ("visit_condensed", "visit_lost"))
 
 
 def checked(summary: Summary, severity: str) -> Iterator[str]:

@@ -97,11 +97,21 @@ def summarize(slam: GraphSlam, earlier: Counters | None = None) -> dict[str, Any
             "displacements": [asdict(alarm) | {"text": str(alarm)} for alarm in slam.alarms],
             "span_s": (slam.keyframes[-1].stamp_ns - slam.began_ns) * 1e-9 if slam.keyframes else 0.0,
         }
+        | _condensed(slam)
         | ({"gyro": asdict(gyro)} if (gyro := slam.gyro) else {})
         | ({"calibration": report} if (report := slam.calibration_report) else {})
         | ({"association": found} if (found := _association(slam)) else {})
         | account(slam, counters)
     )
+
+
+def _condensed(slam: GraphSlam) -> dict[str, Any]:
+    """Return how many keyframes have left the map, or why none does where some should."""
+    settings = slam.config.map
+    if slam.first_keyframe:
+        return {"condensed": slam.first_keyframe}
+    is_long = settings.condense and len(slam.keyframes) > settings.window_keyframes
+    return {"not_condensed": why} if is_long and (why := slam.config.not_condensed) else {}
 
 
 def _association(slam: GraphSlam) -> dict[str, Any]:

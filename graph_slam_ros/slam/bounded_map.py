@@ -87,7 +87,11 @@ class BoundedMap:
         """Return whether so many keyframes are out of the window that some should leave, and nothing else goes on."""
         keyframes, map_ = self._frontend.path.keyframes, self._frontend.config.map
         count = len(keyframes)
-        if not map_.condense or count - keyframes.first < map_.window_keyframes + BATCH or count <= self._tried:
+        if (
+            not self._frontend.config.condenses
+            or count - keyframes.first < map_.window_keyframes + BATCH
+            or count <= self._tried
+        ):
             return False
         return self._backend.is_quiet and self._kidnaps.is_quiet and self._solution.is_whole
 
@@ -141,23 +145,21 @@ class BoundedMap:
             done = self.condenser.condense(visit, int(ids[end]), cells[k], self._ahead(int(ids[end])), waits=waits)
             if done.how == "waits":
                 break
-            self._note_end(done)
+            self._note_end(done, end - k)
             rows += self._rows(visit, k, done, frames)
             k = end
         self.condenser.rescale()
         solver.update()
         return rows, chained(self._space, frames, at), first + k
 
-    def _note_end(self, done: Condensed) -> None:
-        """Count how a visit ended."""
+    def _note_end(self, done: Condensed, keyframes: int) -> None:
+        """Count how a visit of so many keyframes ended."""
         if done.wider > 1.0:
             self._counters.count(_SOURCE, "visit_wider")
         if done.how == "kept":
-            self._counters.count(_SOURCE, "not_condensed")
-        elif done.how == "composed":
-            self._counters.count(_SOURCE, "visit_lost" if done.is_contradiction else "visit_unfit")
+            self._counters.count(_SOURCE, "not_condensed", keyframes)
         else:
-            self._counters.count(_SOURCE, "visit_condensed")
+            self._counters.count(_SOURCE, "visit_lost" if done.is_contradiction else "visit_condensed")
 
     def _length(self, ids: Sequence[int], cells: Sequence[tuple[int, ...]]) -> int:
         """The number of keyframes, from the first of some on, that are one visit.

@@ -65,9 +65,9 @@ class Condensed:
 
     Attributes
     ----------
-    how : ``first`` (of a place), ``again`` (added to a place), ``composed`` (odometry is kept, sightings are lost),
-        ``alone`` (one keyframe is kept with all closures and fixes, sightings are lost), ``waits`` (until the keyframes
-        after it see enough places), ``kept`` (it cannot be condensed)
+    how : ``first`` (of a place), ``again`` (added to a place), ``composed`` (odometry is kept; sightings, if any,
+        contradicted something and are lost), ``alone`` (the same, with one keyframe for closures and fixes), ``waits``
+        (until the keyframes after it see enough places), ``kept`` (it cannot be condensed)
     why : of ``composed``, ``alone`` and ``kept``
     statistic, degrees : chi2 of the visit against all before in its place
     without, anew : the landmark that contradicts the place and was left out, or that the place has anew
@@ -131,7 +131,7 @@ class Condenser:
                 return Condensed("waits")
             is_again = False
         if not (is_again or has_room):
-            return self._composed(visit, after, around, "it sees too few landmarks, or the cell is full")
+            return self._without_place(visit, after, around, "it sees too few landmarks, or the cell is full")
         try:
             factors, at = around.local if is_again else around.local | _halved(around), len(visit) // 2
             if not is_again:
@@ -144,7 +144,7 @@ class Condenser:
                 return self._again(visit, after, around, one, best)
             return self._first(visit, at, after, around, one, cell)
         except SingularError as error:
-            return self._composed(visit, after, around, str(error))
+            return self._without_place(visit, after, around, str(error))
 
     def renumber(self, new: Renumbered) -> None:
         """Take over new ids after a compaction."""
@@ -234,6 +234,10 @@ class Condenser:
         at.place, at.edge = now.place, now.edge
         seen, (chi2, degrees) = _seen(around, fit.visit.members), (fit.as_is.statistic, fit.as_is.degrees)
         return Condensed("again", "", chi2, degrees, fit.without, fit.anew, fit.wider, removed, seen)
+
+    def _without_place(self, visit: Sequence[int], after: int, around: Surroundings, why: str) -> Condensed:
+        """Keep a visit that cannot be in a place if it sees a landmark, else its odometry alone: nothing is lost."""
+        return Condensed("kept", why) if around.sightings else self._composed(visit, after, around, why)
 
     def _composed(
         self, visit: Sequence[int], after: int, around: Surroundings, why: str, done: Fused | None = None

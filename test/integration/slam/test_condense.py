@@ -11,7 +11,7 @@ from graph_slam_ros.analysis.advice import Advisor
 from graph_slam_ros.analysis.explain import explain_edge, explain_run
 from graph_slam_ros.analysis.weakness import Weakness
 from graph_slam_ros.analysis.what_if import SavedGraph
-from graph_slam_ros.errors import ConfigError, GraphSlamError
+from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
 from graph_slam_ros.graph.place import LABEL
 from graph_slam_ros.maps.diff import diff
@@ -19,8 +19,10 @@ from graph_slam_ros.runs.condensed_map import read_left, read_left_edges
 from graph_slam_ros.runs.folder import changed_since
 from graph_slam_ros.runs.journal import MAP, parts_of, read_measurements
 from graph_slam_ros.runs.map_journal import read_map
+from graph_slam_ros.runs.outcome import text
 from graph_slam_ros.runs.recorder import RunRecorder
 from graph_slam_ros.runs.restore import record_run, recover
+from graph_slam_ros.runs.tables import summarize
 from graph_slam_ros.runs.trajectory import read_tum
 from graph_slam_ros.runs.whole_path import removed_path
 from graph_slam_ros.slam import Config, Control, GraphSlam
@@ -92,7 +94,9 @@ def test_a_visit_goes_on_in_the_next_cell_until_it_has_seen_enough(space):
     world = hall(2, 500, SPACES[space])
     slam, _ = driven(world, bounded(world.space, map_cell_m=4.0))
     assert slam.counters["map", "visit_condensed"] > 30
-    assert slam.counters["map", "visit_unfit"] == 0  # 1 in the plane and 13 in space where each cell ends a visit
+    assert (
+        slam.counters["map", "not_condensed"] == 1
+    )  # where each cell ends a visit, some see too little to be in a place
 
 
 def test_records_of_what_left_have_no_gap_and_each_base_is_there(both):
@@ -260,14 +264,30 @@ def test_a_map_that_is_taken_up_again_goes_on_condensing(recorded, tmp_path):
     assert losses == []
 
 
-def test_what_cannot_be_condensed_yet_is_refused_by_name():
-    for name, value in (
-        ("landmarks.association", "joint"),
-        ("odometry.fusion", "parallel"),
-        ("calibrate.groups", "auto"),
-    ):
-        with pytest.raises(ConfigError, match=f"map.condense: not with {name}={value} yet"):
-            Config.from_mapping({"map.condense": True, name: value})
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("odometry.fusion", "parallel"), ("calibrate.groups", "auto"), ("landmarks.association", "joint")],
+)
+def test_what_cannot_be_condensed_yet_is_kept_and_the_end_says_why(name, value):
+    assert Config().condenses
+    assert not Config.from_mapping({name: value}).condenses
+    if value != "joint":  # whose hall would be another
+        world = hall(4, WINDOW + 300)
+        slam, left = driven(world, bounded(**{name.replace(".", "_", 1): value}))
+        assert not left and not slam.first_keyframe
+        assert f"condensed  nothing: not with {name}={value} yet" in "\n".join(text(summarize(slam)))
+
+
+def test_a_condensed_map_goes_on_without_condensing_where_that_is_not_possible(recorded):
+    _, folder, slam, _ = recorded
+    more = GraphSlam(bounded(calibrate_groups="auto"), start=read_map(folder, []))
+    for m in measurements(hall(3, 800)):
+        if m.stamp_ns > slam.keyframes[-1].stamp_ns:
+            more.process(m)
+    more.process(Control("end"))
+    assert more.first_keyframe == slam.first_keyframe
+    assert len(more.keyframes) > len(slam.keyframes) + 250
+    assert not [reason for of in more.counters.as_dict().values() for reason in of if "Error" in reason]
 
 
 def test_a_run_without_what_left_its_map_says_so(recorded, tmp_path):

@@ -2,7 +2,7 @@
 
 import pytest
 
-from graph_slam_ros.runs.outcome import doubts, shortcomings, text, visit_faults
+from graph_slam_ros.runs.outcome import doubts, shortcomings, text
 
 LANDMARKS = {"use": "landmarks", "received": 90, "used": 90, "believed": 90}
 ODOMETRY = {"use": "odometry", "received": 100, "used": 100, "believed": None}
@@ -80,22 +80,3 @@ def test_several_odometries_on_one_topic_are_said_and_a_remedy_names_the_input()
     assert not list(doubts(summary({})))
     (jumps,) = shortcomings(summary({"odom": {"jump": 40}, "odom#2": {"jump": 9}}, **{"odom#2": ODOMETRY}))
     assert jumps.startswith("odom: 49 jumps")
-
-
-def test_keyframes_that_cannot_be_condensed_are_said_where_they_are_many():
-    few, many = ({"not_condensed": count, "visit_condensed": 20} for count in (20, 134))
-    assert not list(visit_faults(few))
-    (said,) = visit_faults(many)
-    assert said.startswith("map.condense: 134 keyframes are not condensed: ")
-    assert said in doubts(summary({"map": many}))
-
-
-@pytest.mark.parametrize(
-    ("unfit", "condensed", "where"), [(1, 0, None), (1, 2, None), (2, 8, doubts), (35, 2, shortcomings)]
-)
-def test_visits_that_see_too_little_are_said_as_such_and_most_of_them_are_a_shortcoming(unfit, condensed, where):
-    of = summary({"map": {"visit_unfit": unfit, "visit_condensed": condensed}})
-    for found in (doubts, shortcomings):
-        said = [one for one in found(of) if "map.condense" in one]
-        assert len(said) == (found is where)
-        assert all(f"{unfit} of {unfit + condensed} visits see too few landmarks" in one for one in said)
