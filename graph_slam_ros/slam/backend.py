@@ -72,9 +72,8 @@ class Backend:
         self.decisions = OutlierGate(config, self.graph, self.solver, start.ledger)
         self.patience = Patience(self.solver)
         self._admission = Admission(self.graph, self.solver, self.decisions, self.patience)
-        self.handed_over, self.frozen = (0, 0), start.frozen
-        self.frozen_edges = start.ledger.final
-        self.held = (0, 0)
+        self.handed_over, self.held = (0, 0), (0, 0)
+        self.frozen, self.frozen_edges = start.frozen, start.ledger.final
         self.edits, self.bounded = list(start.edits), start.bounded or BoundedState()
         self.odometries = OdometryJudge(config.odometry_gate, self.graph, self.solver, self.ledger, self._counters)
         self._background = Background(config, executor)
@@ -397,6 +396,5 @@ class Backend:
         return tuple(one for one in rivals if not np.isin(reason[list(one.only_here)], FINAL).any())
 
     def _frozen(self, keyframe: int, settings: Settings) -> FrozenGraph:
-        solver = self.solver
-        problem = self.graph.copy(), solver.vertices, solver.held, solver.values
+        problem = self.graph.copy(), self.solver.vertices, self.solver.held, self.solver.values
         return FrozenGraph(keyframe, *problem, settings, self.ledger.copy())

@@ -126,7 +126,7 @@ WITHIN = {
     "fleet": {"graph", "solver", "formats", "config", "slam", "runs", "analysis", "report", "simulation"},
     "node": {
         *("graph", "warmup", "formats", "measurements", "config", "slam", "slam/frontend", "slam/robust"),
-        *("messages", "messages/inputs", "recordings", "runs"),
+        *("slam/calibration", "messages", "messages/inputs", "recordings", "runs"),
     },
     "cli": {
         *("progress", "warmup", "graph", "solver", "optimization", "certificate", "formats", "config"),
@@ -231,7 +231,7 @@ BULK = {  # the stored numbers of many vertices, or the noise of many edges, at 
     *("slam/calibration/model.py", "slam/calibration/rows.py"),
     *("slam/backend.py", "slam/robust/pairwise_consistency.py", "slam/robust/landmark_support.py"),
     *("runs/map_growth.py", "runs/ledger_file.py", "analysis/what_if.py", "simulation/pose_graph.py"),
-    "fleet/held_out.py",
+    *("fleet/held_out.py", "check/trial.py"),
 }
 
 
