@@ -1,4 +1,4 @@
-"""Everything, into docs/benchmarks.md and docs/accuracy.md: ``make bench``.
+"""Everything, into docs/benchmarks.md, docs/accuracy.md and docs/lifelong.md: ``make bench``.
 
 What follows on the command line goes to each programme that races, e.g. ``python -m benchmarks --poses 400`` for a
 short look.
@@ -17,7 +17,8 @@ _RESULTS = ROOT / "benchmarks/results"
 def main() -> None:
     """One programme after the other; what is done is in the document even if the next is stopped."""
     races = (["batch"], ["online"], ["online", "--no-path"], ["memory"], ["growth"])
-    for programme in (*races, ["consistency"], ["marginals"]):
+    lifelong = ["lifelong", "--keyframes", "50000", "--seeds", "1", "--windows", "60"]
+    for programme in (*races, ["consistency"], ["marginals"], lifelong):
         asked = sys.argv[1:] if programme in races else []
         path = _RESULTS / f"{''.join(programme)}.json"
         subprocess.run(

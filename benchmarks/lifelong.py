@@ -36,6 +36,7 @@ from graph_slam_ros.slam import Control, GraphSlam
 from graph_slam_ros.slam.lifelong.removed import Left
 from graph_slam_ros.typing import Array, Numbers
 
+_FLAT = 1.05  # of the memory after a tenth of a drive: more is not flat
 _WARM, _LOOK = 640, 40  # keyframes: before errors of the newest pose are taken, and from one to the next
 
 
@@ -183,6 +184,7 @@ def main() -> None:
     options.add_argument("--windows", type=int, nargs="+", default=[0, 60, 2000], help="keyframes; 0 keeps all")
     options.add_argument("--dimensions", type=int, choices=(2, 3), default=2)
     options.add_argument("--tags", action="store_true", help="the orientation of landmarks is seen, too")
+    options.add_argument("--flat", action="store_true", help="fail where memory grows after a tenth of the drive")
     options.add_argument("--json", type=Path, metavar="OUT", help="write the results there as well")
     args = options.parse_args()
     rows = []
@@ -197,6 +199,8 @@ def main() -> None:
     table.finish(
         table.results("lifelong", rows, f"{args.keyframes} keyframes, {args.dimensions} dimensions"), args.json
     )
+    if args.flat and any(row["late MiB"] > _FLAT * row["early MiB"] for row in rows if "late MiB" in row):
+        sys.exit("benchmarks: memory grows with the distance driven")
 
 
 if __name__ == "__main__":

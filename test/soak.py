@@ -34,6 +34,10 @@ DRIVES = (
     *("nees", "simulation", "slip", "unnamed"),
 )
 PROGRAMMES = {
+    "lifelong": [
+        *(sys.executable, "-m", "benchmarks.lifelong", "--keyframes", "1000000", "--seeds", "1"),
+        *("--windows", "60", "--flat"),
+    ],
     "lives": tests("test_life.py"),
     "mutated_bags": tests("test_mutated_recordings.py"),
     "soak": tests("test_soak.py"),

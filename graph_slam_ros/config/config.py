@@ -110,6 +110,9 @@ class Config:
             return f"landmarks.association={self.landmarks.association}"
         if self.odometry.fusion == "parallel":
             return "odometry.fusion=parallel"
+        for one in self.sources:  # closures and edges may begin at any keyframe
+            if one.use in ("closure", "edges"):
+                return f"{one.name}.use={one.use}"
         return f"calibrate.groups={self.calibrate.groups}" if self.calibrate.is_on else ""
 
     @classmethod

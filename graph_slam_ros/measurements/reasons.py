@@ -303,6 +303,7 @@ REASONS: dict[str, Reason] = {
     "from_where_there_was_no_odometry": Reason(
         _REFUSED, "the earlier stamp of a closure or edge is outside the odometry", "stamps by the robot's clock"
     ),
+    "from_condensed_keyframe": Reason(_REFUSED, "a closure's or edge's start has left the map", "map.condense=false"),
     # -- the map
     "not_in_map": Reason(
         _NOTED, "a landmark that the map does not have, while map.localize is true", "map.localize=false to add it"
@@ -315,9 +316,7 @@ REASONS: dict[str, Reason] = {
     "split": Reason(_NOTED, "a landmark of which a plan of edits made two"),
     "moved_by_hand": Reason(_NOTED, "a plan of edits moved the map rigidly, and anchored it"),
     "cut_out": Reason(_NOTED, "a part of the drive that a plan of edits cut out"),
-    "unknown_edge": Reason(
-        _NOTED, "~/remove named an edge that is not in the graph", "graph_slam explain RUN lists ids"
-    ),
+    "unknown_edge": Reason(_NOTED, "~/remove named an edge that is not there", "graph_slam explain RUN lists ids"),
     "unknown_landmark": Reason(
         _NOTED, "~/remove named a landmark that is not in the map", "ros2 topic echo ~/landmarks_estimate lists names"
     ),

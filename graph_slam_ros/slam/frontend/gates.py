@@ -81,13 +81,14 @@ class DatumGate:
 class ClosureStart:
     """Refuses a loop closure or a custom edge if one of its stamps is outside the time that odometry covers."""
 
-    reason = "from_where_there_was_no_odometry"
-
     def __init__(self, path: KeyframeList, odometry: OdometrySelector) -> None:
         self._path, self._odometry = path, odometry
+        self.reason = ""
 
     def admit(self, m: Observation) -> Observation | None:
         """Return the observation, or None for such a closure or edge."""
         stamps_ns = (m.from_stamp_ns,) if isinstance(m, Closure) else m.stamps_ns if isinstance(m, CustomEdge) else ()
-        newest_ns = self._odometry.newest_ns or 0
-        return m if all(self._path.oldest_ns <= stamp_ns <= newest_ns for stamp_ns in stamps_ns) else None
+        newest_ns, oldest_ns = self._odometry.newest_ns or 0, self._path.oldest_ns
+        is_left = self._path.keyframes.first > 0 and min(stamps_ns, default=oldest_ns) < oldest_ns
+        self.reason = "from_condensed_keyframe" if is_left else "from_where_there_was_no_odometry"
+        return m if all(oldest_ns <= stamp_ns <= newest_ns for stamp_ns in stamps_ns) else None

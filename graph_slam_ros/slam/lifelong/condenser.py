@@ -2,6 +2,7 @@
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -65,10 +66,10 @@ class Condensed:
 
     Attributes
     ----------
-    how : ``first`` (of a place), ``again`` (added to a place), ``composed`` (odometry is kept; sightings, if any,
-        contradicted something and are lost), ``alone`` (the same, with one keyframe for closures and fixes), ``waits``
-        (until the keyframes after it see enough places), ``kept`` (it cannot be condensed)
-    why : of ``composed``, ``alone`` and ``kept``
+    how : ``first`` (of a place), ``again`` (added to a place), ``composed`` (odometry is kept, with the keyframes that
+        have closures or fixes; sightings, if any, contradicted something and are lost), ``waits`` (until the keyframes
+        after it see enough places), ``kept`` (it cannot be condensed)
+    why : of ``composed`` and ``kept``
     statistic, degrees : chi2 of the visit against all before in its place
     without, anew : the landmark that contradicts the place and was left out, or that the place has anew
     wider : factor of the variances of the visit, without which it contradicts its place
@@ -177,16 +178,8 @@ class Condenser:
         added, also = self._joined(visit, at, after, around, 1.0 - _SHARE)
         begun = added_place(self.space, self.solver.graph, base, Place.begun_by(one), root)
         self.places.setdefault(cell, []).append(begun)
-        removed = self._replace(visit, around, [*added, begun.edge], kept=base, seen_from=base, also=also)
+        removed = self._replace(dict.fromkeys(visit, base), [*around.all, *also], [*added, begun.edge])
         return Condensed("first", removed=removed, seen=_seen(around, one.members))
-
-    def _alone(self, visit: Sequence[int], after: int, around: Surroundings, why: str) -> Condensed:
-        """Keep the middle keyframe with its closures and fixes, joined by all of the odometry."""
-        base = visit[len(visit) // 2]
-        if lonely := self._left_alone(around, ()):
-            return Condensed("kept", f"{why}; landmark {lonely[0]} would be left without a measurement")
-        added, also = self._joined(visit, len(visit) // 2, after, around, 1.0)
-        return Condensed("alone", why, removed=self._replace(visit, around, added, base, base, also))
 
     def _joined(
         self, visit: Sequence[int], k: int, after: int, around: Surroundings, share: float
@@ -224,7 +217,8 @@ class Condenser:
         carried = self._carried(visit, around, at.base, [(guess, result.covariance)], legs)
         now = added_place(self.space, self.solver.graph, at.base, result.place, square_root(result.place.information))
         added, also = self._add_carried(carried)
-        removed = self._replace(visit, around, [now.edge, *added], kept=None, seen_from=at.base, also=[at.edge, *also])
+        bases = dict.fromkeys(visit, at.base)
+        removed = self._replace(bases, [*around.all, at.edge, *also], [now.edge, *added])
         if fit.anew is not None:
             at.strikes.pop(fit.anew, None)
         elif fit.without is not None:
@@ -242,14 +236,22 @@ class Condenser:
     def _composed(
         self, visit: Sequence[int], after: int, around: Surroundings, why: str, done: Fused | None = None
     ) -> Condensed:
-        """Join what is before the visit to what is after it by its odometry alone."""
-        if around.closures or around.fixes:
-            return self._alone(visit, after, around, why)
+        """Compose the odometry between keyframes with closures or fixes, which stay; sightings are lost."""
+        held = around.closures_and_fixes
+        ends = {vertex for edge in held.values() for vertex in edge.vertices}
+        stops = [k for k, vertex in enumerate(visit) if vertex in ends]
+        if len(stops) == len(visit):
+            return Condensed("kept", f"{why}; all of its keyframes have closures or fixes")
         if lonely := self._left_alone(around, ()):
             return Condensed("kept", f"{why}; landmark {lonely[0]} would be left without a measurement")
-        legs = [motion_of(edge) for edge in (*around.steps, *around.onward.values())]
-        added = self._join([(edge.vertices[0], after, [motion_of(edge), *legs]) for edge in around.into.values()])
-        removed = self._replace(visit, around, added, kept=None, seen_from=after)
+        legs, way = [motion_of(edge) for edge in (*around.steps, *around.onward.values())], [*visit, after]
+        first = stops[0] if stops else len(visit)
+        joins = [(edge.vertices[0], way[first], [motion_of(edge), *legs[:first]]) for edge in around.into.values()]
+        joins += [(way[k], way[end], legs[k:end]) for k, end in pairwise([*stops, len(visit)])]
+        before = [max((stop for stop in stops if stop <= k), default=first) for k in range(len(visit))]
+        bases = {vertex: way[stop] for vertex, stop in zip(visit, before, strict=True)}
+        edges = [edge for edge in around.all if edge not in held]
+        removed = self._replace(bases, edges, self._join(joins))
         statistic, degrees = (done.statistic, done.degrees) if done else (0.0, 0)
         return Condensed("composed", why, statistic, degrees, removed=removed)
 
@@ -334,25 +336,25 @@ class Condenser:
             out.append(edge)
         return out
 
-    def _replace(
-        self,
-        visit: Sequence[int],
-        around: Surroundings,
-        added: Sequence[int],
-        kept: int | None,
-        seen_from: int,
-        also: Sequence[int] = (),
-    ) -> tuple[RemovedPose, ...]:
-        """Put edges in place of those of a visit, and remove its keyframes but ``kept``."""
-        gone = [vertex for vertex in visit if vertex != kept]
-        group, (base, *poses) = self.space.group, self.solver.estimate([seen_from, *gone]).tolist()
-        motions = [tuple(map(float, group.between(tuple(base), tuple(pose)))) for pose in poses]
+    def _replace(self, bases: Mapping[int, int], edges: Sequence[int], added: Sequence[int]) -> tuple[RemovedPose, ...]:
+        """Put edges in place of others, and remove keyframes.
+
+        Parameters
+        ----------
+        bases : of each keyframe of a visit, in order of time, the vertex relative to which it is known from now on; one
+            that is its own base stays
+        """
+        gone = {vertex: base for vertex, base in bases.items() if vertex != base}
+        group, out = self.space.group, list[RemovedPose]()
+        seen_from, poses = self.solver.estimate(list(gone.values())).tolist(), self.solver.estimate(list(gone)).tolist()
+        for (vertex, base), begin, pose in zip(gone.items(), seen_from, poses, strict=True):
+            out.append(RemovedPose(vertex, base, tuple(map(float, group.between(tuple(begin), tuple(pose))))))
         self.solver.add([], added)
-        for edge in (*around.all, *also):
+        for edge in edges:
             self.solver.set_weight(edge, 0.0)
         for vertex in gone:
             self.solver.remove(vertex)
-        return tuple(RemovedPose(vertex, seen_from, motion) for vertex, motion in zip(gone, motions, strict=True))
+        return tuple(out)
 
 
 def poses_of(space: Geometry, removed: Sequence[RemovedPose], kept: Mapping[int, Numbers]) -> dict[int, Numbers]:

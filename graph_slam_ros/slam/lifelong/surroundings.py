@@ -48,6 +48,12 @@ class Surroundings:
         return sorted({*self.inside, *self.sightings, *self.into, *self.onward, *self.closures, *self.fixes})
 
     @property
+    def closures_and_fixes(self) -> dict[int, Edge]:
+        """Those that are no odometry and no sighting."""
+        inside = {number: edge for number, edge in self.inside.items() if edge.label == CLOSURES}
+        return inside | self.closures | self.fixes
+
+    @property
     def local(self) -> dict[int, float]:
         """The factors of the edges that are within the visit and its landmarks."""
         return {number: self.factors[number] for number in (*self.inside, *self.sightings)}

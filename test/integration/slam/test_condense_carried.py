@@ -6,7 +6,7 @@ import pytest
 from benchmarks.hall import STEP_S, config, hall, measurements, rms
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
 from graph_slam_ros.runs.whole_path import removed_path
-from graph_slam_ros.slam import Closure, Control, Fix, GraphSlam, Odometry
+from graph_slam_ros.slam import Closure, Config, Control, Fix, GraphSlam, Odometry
 from graph_slam_ros.slam.lifelong.carried import carried_closure, fused_closure, inverse
 from graph_slam_ros.slam.lifelong.condenser import CHAIN
 from graph_slam_ros.slam.lifelong.removed import Left
@@ -125,6 +125,40 @@ def test_a_false_closure_that_was_condensed_is_outvoted_as_a_whole():
     assert int(reason)
     for one, other in zip(errors(world, slam, parts), errors(world, *clean), strict=True):
         assert one < 1.2 * other
+
+
+@pytest.mark.parametrize("space", SPACES)
+@pytest.mark.parametrize("given", [with_closures, with_fixes])
+def test_without_landmarks_keyframes_with_closures_or_fixes_stay_and_nothing_is_lost(given, space):
+    world = hall(1, KEYFRAMES, SPACES[space])
+    world.sightings[:] = [[] for _ in world.sightings]
+    whole = driven(world, given)
+    small = driven(world, given, map_condense=True, map_window_keyframes=WINDOW)
+    slam = small[0]
+    assert slam.first_keyframe > 0.5 * KEYFRAMES
+    assert len(slam.solver.vertices) < 0.75 * len(whole[0].solver.vertices)
+    counted = slam.counters.as_dict()["map"]
+    assert counted.get("visit_lost", 0) == 0 < counted["visit_condensed"]
+    label = "closures" if given is with_closures else "fixes"
+    assert len(slam.graph.edges_of(label)) == len(whole[0].graph.edges_of(label))
+    true = np.array([pose[: world.space.dimensions] for pose in world.poses])
+    one, other = (rms(path, true[: len(path)]) for path in (path_of(*small), path_of(*whole)))
+    assert one < 1.03 * other
+    newest = [slam.solver.marginal([slam.keyframes[-1].vertex])[0] for slam in (small[0], whole[0])]
+    assert newest[0] == pytest.approx(newest[1], abs=0.05 * np.abs(newest[1]).max())
+
+
+def test_a_closure_to_a_keyframe_that_has_left_is_refused_by_name_and_an_input_of_closures_keeps_all():
+    world, slam = hall(1, KEYFRAMES), GraphSlam(config(PLANAR, map_condense=True, map_window_keyframes=WINDOW))
+    for m in measurements(world):
+        slam.process(m)
+    assert slam.first_keyframe > 100
+    covariance = tuple((0.01 * np.eye(3)).ravel().tolist())
+    slam.process(Closure(m.stamp_ns, round(50 * STEP_S * 1e9), "loops", (1.0, 0.0, 0.0), covariance))
+    slam.process(Control("end"))
+    assert slam.counters["loops", "from_condensed_keyframe"] == 1
+    asked = {"inputs.names": "odom loops", "loops.use": "closure", "loops.topic": "/loops"}
+    assert Config.from_mapping(asked).not_condensed == "loops.use=closure"
 
 
 @pytest.mark.parametrize("space", SPACES)
