@@ -49,7 +49,7 @@ class Surroundings:
 
     @property
     def closures_and_fixes(self) -> dict[int, Edge]:
-        """Those that are no odometry and no sighting."""
+        """All edges that are closures, also within the visit, or fixes."""
         inside = {number: edge for number, edge in self.inside.items() if edge.label == CLOSURES}
         return inside | self.closures | self.fixes
 
