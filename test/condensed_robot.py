@@ -11,6 +11,7 @@ from graph_slam_ros.slam.lifelong.condenser import Condenser, RemovedPose, poses
 from graph_slam_ros.solver import Solver
 
 CELL_M, LONGEST = 10.0, 60
+ENOUGH = 3  # landmarks of a visit: with fewer it goes on in the next cell, as in the pipeline
 DEAD = 8  # edges in the tables for each that counts: then these are made anew
 
 
@@ -75,7 +76,9 @@ class Robot:
         first = self.first
         at = self.solver.estimate([self.vertices[k] for k in range(first, min(first + LONGEST, newest))])
         cells = list(map(tuple, np.floor(at[:, : self.world.space.dimensions] / CELL_M).tolist()))
-        length = next((k for k, cell in enumerate(cells) if cell != cells[0]), len(cells))
+        seen = [{one[0] for one in self.world.sightings[first + k]} for k in range(len(cells))]
+        enough = [len(set().union(*seen[:k])) >= ENOUGH for k in range(len(cells))]
+        length = next((k for k, cell in enumerate(cells) if cell != cells[0] and enough[k]), len(cells))
         end = first + length
         if end + self.window > newest:
             return
