@@ -98,7 +98,8 @@ def _moments(run: Path, frames: int, losses: list[str]) -> Iterator[_Moment]:
     if not len(stamps_s):
         return
     due_s = list(np.linspace(stamps_s[0], stamps_s[-1], frames)[1:])
-    slam = GraphSlam(run_config(run), start=read_map(run, losses, start_only=True))
+    config = run_config(run).changed({"map.condense": False})  # all of the path is drawn
+    slam = GraphSlam(config, start=read_map(run, losses, start_only=True))
     for measurement in read_measurements(run, losses):
         slam.process(measurement)
         if due_s and len(slam.keyframes) > 1 and 1e-9 * slam.keyframes[-1].stamp_ns >= due_s[0]:

@@ -23,7 +23,10 @@ from graph_slam_ros.typing import Array, Index
 
 _THIN_NS = 80_000_000
 _APART_S = 1.0
-_COARSE = {"solve.every_keyframes": 20, "robust.rounds": 3, "odometry.doubt": False, "calibrate.groups": "none"}
+_COARSE = {
+    **{"solve.every_keyframes": 20, "robust.rounds": 3, "odometry.doubt": False, "calibrate.groups": "none"},
+    "map.condense": False,  # the fit is of all keyframes
+}
 _SIGMAS = 4.0
 _TURN_SIGMAS = 6.0  # a wheel's noise that lasts adds up in heading, which neither sigma of a fit knows
 _ABSURD, _BACKWARDS, _SURE = 0.5, 0.35, 0.05

@@ -23,7 +23,6 @@ from graph_slam_ros.slam.robust.gating import OutlierGate
 from graph_slam_ros.slam.robust.hypotheses import Alternative, FrozenGraph, Outcome, search_alternatives
 from graph_slam_ros.slam.robust.ledger import FINAL, Ledger, Reason
 from graph_slam_ros.slam.robust.odometry_judge import OdometryJudge
-from graph_slam_ros.slam.robust.patience import Patience
 from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.solver import Report, Settings, Solver
 from graph_slam_ros.typing import Array, Executor, Index, Numbers
@@ -70,8 +69,7 @@ class Backend:
         self.noise = NoiseScales(self.graph, start.noise_factors)
         self.solver = Solver(self.graph, settings)
         self.decisions = OutlierGate(config, self.graph, self.solver, start.ledger)
-        self.patience = Patience(self.solver)
-        self._admission = Admission(self.graph, self.solver, self.decisions, self.patience)
+        self._admission = Admission(self.graph, self.solver, self.decisions)
         self.handed_over, self.held = (0, 0), (0, 0)
         self.frozen, self.frozen_edges = start.frozen, start.ledger.final
         self.edits, self.bounded = list(start.edits), start.bounded or BoundedState()

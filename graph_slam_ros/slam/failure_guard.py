@@ -89,7 +89,7 @@ class FailureGuard:
             if not again:
                 raise
             self.go_back()
-            self._backend.patience.optimize()
+            self._solver.optimize()
             return self._done(work)
         self.note_good()
         return done
@@ -188,7 +188,7 @@ class FailureGuard:
 
     def _is_solvable(self) -> bool:
         try:
-            self._backend.patience.optimize()
+            self._solver.optimize()
             self._refuse_absurd()
         except Exception:
             self.go_back()

@@ -12,7 +12,6 @@ import numpy as np
 
 from graph_slam_ros.graph import Graph, Loss
 from graph_slam_ros.slam.robust.gating import OutlierGate
-from graph_slam_ros.slam.robust.patience import Patience
 from graph_slam_ros.solver import Settings, Solver
 from graph_slam_ros.typing import Array
 
@@ -22,8 +21,8 @@ _UPDATES = 6  # until what was let in fits, before everything is solved for it
 class Admission:
     """Solves for edges that were accepted, and rejects those that still do not fit."""
 
-    def __init__(self, graph: Graph, solver: Solver, decisions: OutlierGate, patience: Patience) -> None:
-        self._graph, self._solver, self._decisions, self._patience = graph, solver, decisions, patience
+    def __init__(self, graph: Graph, solver: Solver, decisions: OutlierGate) -> None:
+        self._graph, self._solver, self._decisions = graph, solver, decisions
 
     def make_fit(self, admitted: Sequence[int], keyframe: int, *, by_innovation: bool = False) -> None:
         """Solve until edges that were accepted despite a bad fit do fit. Those that still do not are rejected.
@@ -52,7 +51,7 @@ class Admission:
                 return
         pulling = [] if decisions.is_calibrated else [Loss()]
         losses = {key: [*pulling, stages[-1]] for key, stages in solver.settings.losses.items()}
-        self._patience.optimize(replace(solver.settings, losses=losses))
+        solver.optimize(replace(solver.settings, losses=losses))
         if decisions.refuse_unfit(admitted, keyframe):
             solver.update()
 
@@ -70,7 +69,7 @@ class Admission:
         for edge in others:
             solver.set_weight(edge, 0.0)
         before, without = solver.values, self._truncated_cost()
-        self._patience.optimize(self._without_loss(expected))
+        solver.optimize(self._without_loss(expected))
         if self._truncated_cost() > without:
             solver.start_at(before)
         for edge in others:
