@@ -19,6 +19,7 @@ from graph_slam_ros.simulation import simulate, write_bag
 
 WORLDS = {
     "warehouse, tags": ("warehouse", {"aisles": 2}),
+    "warehouse, tags, 12 laps": ("warehouse", {"laps": 12}),
     "warehouse, range and bearing": ("warehouse", {"aisles": 2, "sensor": "range_bearing"}),
     "warehouse, bearings": ("warehouse", {"aisles": 2, "sensor": "bearing"}),
     "warehouse, positions, GNSS, IMU": ("warehouse", {"aisles": 2, "sensor": "position", "gnss": 5, "imu": 50}),
