@@ -8,6 +8,7 @@ from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.g2o import read_g2o
 from graph_slam_ros.graph import (
     ATTITUDE_PRIOR_3D,
+    CAUCHY,
     HEADING_PRIOR,
     HUBER,
     LANDMARK_POSITION,
@@ -27,7 +28,7 @@ from graph_slam_ros.graph import (
 )
 from graph_slam_ros.lie import se3
 from graph_slam_ros.optimization import optimize
-from graph_slam_ros.solver import Settings, initial_values
+from graph_slam_ros.solver import Settings, Solver, initial_values
 
 CITY = ROOT / "data/city.g2o"
 STARTS = ["file", "tree", "chordal", "online"]
@@ -216,3 +217,16 @@ def test_a_start_that_fails_is_told_and_the_first_result_stays():
     assert solution.start == "file"
     assert "far" in solution.suspicion
     assert [bool(one.failure) for one in solution.attempts] == [False, True, True]
+
+
+def test_Q2_a_loss_whose_weights_follow_the_steps_needs_no_more_iterations():
+    graph = Graph()
+    vertex = graph.add_vertex(R1, [0.5])
+    for x in (-0.98, 0.98):  # the curvature of their costs together is a fiftieth of what their weights say
+        graph.add_edge(POINT_PRIOR[R1], [vertex], [x], unit(1), "range")
+    solver = Solver(graph, Settings(losses={"range": [Loss(CAUCHY, 1.0)]}, step_tolerance=1e-8, cost_tolerance=0.0))
+    solver.add([vertex], [0, 1])
+    report = solver.optimize()
+    assert report.converged
+    assert report.method == "gn"  # nor with damping
+    assert solver.estimate([vertex])[0, 0] == pytest.approx(0.0, abs=1e-4)
