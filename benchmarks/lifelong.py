@@ -2,7 +2,8 @@
 
 ``python -m benchmarks.lifelong``. A hall of 60 by 40 m, aisles driven at random, a keyframe each 0.5 m, 40 landmarks
 that are seen within 8 m, every second one. ``GraphSlam`` gets the measurements as from a robot; each drive has a
-process of its own. What is printed of a drive:
+process of its own. With ``--blocks`` it is a city that is known by closures alone, a keyframe each metre. What is
+printed of a drive:
 
 * sizes of the graph at the end, and resident memory after a tenth of the drive and at the end;
 * errors: of the newest pose (in the frame of the landmarks), of the whole path (keyframes that left the map included)
@@ -28,14 +29,17 @@ if not __package__:  # run as a script: what it imports is in the repository, no
     sys.path[0] = str(Path(__file__).resolve().parents[1])
 
 from benchmarks import fresh, lifelong, table
+from benchmarks.city import City
+from benchmarks.city import config as in_city
 from benchmarks.hall import STEP_S, Course, config, fitted, measured, rms
 from graph_slam_ros.cli import values
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
 from graph_slam_ros.runs.whole_path import removed_path
-from graph_slam_ros.slam import Control, GraphSlam
+from graph_slam_ros.slam import Control, GraphSlam, Measurement
 from graph_slam_ros.slam.lifelong.removed import Left
 from graph_slam_ros.typing import Array, Numbers
 
+Figures = dict[str, float]
 _FLAT = 1.05  # of the memory after a tenth of a drive: more is not flat
 _WARM, _LOOK = 640, 40  # keyframes: before errors of the newest pose are taken, and from one to the next
 
@@ -48,13 +52,14 @@ class Drive:
     window : keyframes that stay as they were measured; 0: all of them
     """
 
-    def __init__(self, course: Course, window: int, **settings: Any) -> None:
-        if window:
-            settings |= {"map_condense": True, "map_window_keyframes": window}
-        self.course, self.slam = course, GraphSlam(config(course.space, **settings))
-        self.update_s = array("d", bytes(8 * (len(course.where) - 1)))
-        self.looks, self.memory_mib = list[tuple[float, float, float]](), [0.0, 0.0]
-        self.path = np.empty((0, course.space.dimensions))  # estimated positions of all keyframes, at the end
+    def __init__(self, course: Course, window: int) -> None:
+        self.course, self.slam = course, GraphSlam(config(course.space, **_settings(window)))
+        self._begin(len(course.where) - 1)
+
+    def _begin(self, keyframes: int) -> None:
+        self.update_s = array("d", bytes(8 * keyframes))
+        self.looks, self.memory_mib = list[tuple[float, ...]](), [0.0, 0.0]
+        self.path = np.empty((0, self.slam.space.dimensions))  # estimated positions of all keyframes, at the end
 
     def run(self) -> None:
         """Drive to the end."""
@@ -64,16 +69,14 @@ class Drive:
             parts = list[Left]()
             while left.peek(1):
                 parts.append(pickle.load(left))
-        before = removed_path(self.slam, Left.joined(self.course.space, parts))
+        before = removed_path(self.slam, Left.joined(self.slam.space, parts))
         whole = np.concatenate((before, self.slam.trajectory()))
-        self.path = whole[:, : self.course.space.dimensions]
+        self.path = whole[:, : self.slam.space.dimensions]
 
     def _run(self, left: IO[bytes]) -> None:
-        count, space, at = len(self.course.where) - 1, self.course.space, self.course.space.identity
+        count = len(self.update_s)
         tenth = max(count // 10, 1)
-        for k, (_, step, seen) in enumerate(self.course.keyframes()):
-            at = space.normalized(space.group.compose(at, step)) if step else at
-            given = list(measured(tuple(map(float, at)), round((k + 5) * STEP_S * 1e9), seen))
+        for k, given in enumerate(self.measurements()):
             began = time.thread_time()
             updates = [self.slam.process(m) for m in given]
             self.update_s[k] = time.thread_time() - began
@@ -84,6 +87,13 @@ class Drive:
             if (k + 1) in (tenth, count):
                 self.memory_mib[(k + 1) == count] = _resident_mib()
         self.slam.process(Control("end"))
+
+    def measurements(self) -> Iterator[list[Measurement]]:
+        """Return what the robot measures at each keyframe; once."""
+        space, at = self.course.space, self.course.space.identity
+        for k, (_, step, seen) in enumerate(self.course.keyframes()):
+            at = space.normalized(space.group.compose(at, step)) if step else at
+            yield list(measured(tuple(map(float, at)), round((k + 5) * STEP_S * 1e9), seen))
 
     def landmarks(self) -> tuple[list[int], Array, Array]:
         """Vertices of the landmarks, estimated and true positions, or poses."""
@@ -98,20 +108,34 @@ class Drive:
     def figures(self) -> dict[str, float]:
         """What was measured."""
         error, nees, of_marks = np.array(self.looks).T
-        true = np.zeros((len(self.update_s), self.course.space.dimensions))
-        true[:, :2] = self.course.where[: len(true)]
-        late_ms, slam = 1e3 * np.array(self.update_s[len(self.update_s) // 2 :]), self.slam
-        there, right = (one[:, : true.shape[1]] for one in self.landmarks()[1:])
+        there, right = (one[:, : self.slam.space.dimensions] for one in self.landmarks()[1:])
         return {
-            "vertices": len(slam.solver.vertices),
-            "edges": len(slam.solver.edges),
-            "early MiB": self.memory_mib[0],
-            "late MiB": self.memory_mib[1],
+            **self._sizes(),
             "newest m": float(np.sqrt((error**2).mean())),
-            "path m": rms(self.path, true),
+            "path m": rms(self.path, self._true()),
             "landmarks m": rms(there, right),
             "NEES newest": float(nees.mean()),
             "NEES landmarks": float(of_marks.mean()),
+            **self._times(),
+        }
+
+    def _true(self) -> Array:
+        """True positions of the keyframes."""
+        out = np.zeros((len(self.update_s), self.slam.space.dimensions))
+        out[:, :2] = self.course.where[: len(out)]
+        return out
+
+    def _sizes(self) -> dict[str, float]:
+        return {
+            "vertices": len(self.slam.solver.vertices),
+            "edges": len(self.slam.solver.edges),
+            "early MiB": self.memory_mib[0],
+            "late MiB": self.memory_mib[1],
+        }
+
+    def _times(self) -> dict[str, float]:
+        late_ms = 1e3 * np.array(self.update_s[len(self.update_s) // 2 :])
+        return {
             "median ms": float(np.median(late_ms)),
             "p99 ms": float(np.quantile(late_ms, 0.99)),
             "worst ms": float(late_ms.max()),
@@ -124,7 +148,7 @@ class Drive:
         out: Numbers = getattr(group, name)(group.inverse(self.course.pose(0)), of)
         return out
 
-    def _newest(self) -> tuple[float, float, float]:
+    def _newest(self) -> tuple[float, ...]:
         """Return the error of the newest pose [m], its NEES, and that of the landmarks."""
         slam, space, n = self.slam, self.course.space, self.course.space.dimensions
         newest, (vertices, there, right) = slam.keyframes[-1].vertex, self.landmarks()
@@ -140,31 +164,76 @@ class Drive:
         return error, nees, float(of_marks @ np.linalg.solve(joint, of_marks)) / len(of_marks)
 
 
+class CityDrive(Drive):
+    """The same in a city that is known by closures alone, in the frame of the first pose."""
+
+    def __init__(self, city: City, window: int) -> None:
+        self.city, self.slam = city, GraphSlam(in_city(city.space, **_settings(window)))
+        self._begin(len(city.where))
+
+    def measurements(self) -> Iterator[list[Measurement]]:
+        """Return what the robot measures at each keyframe; once."""
+        return self.city.measurements()
+
+    def figures(self) -> dict[str, float]:
+        """What was measured."""
+        error, nees = np.array(self.looks).T
+        return {
+            **self._sizes(),
+            "newest m": float(np.sqrt((error**2).mean())),
+            "path m": rms(self.path, self._true()[: len(self.path)]),
+            "NEES newest": float(nees.mean()),
+            **self._times(),
+        }
+
+    def _true(self) -> Array:
+        out = np.zeros((len(self.city.where), self.slam.space.dimensions))
+        out[:, :2] = self.city.where
+        return out
+
+    def _newest(self) -> tuple[float, ...]:
+        slam, group = self.slam, self.slam.space.group
+        newest = slam.keyframes[-1].vertex
+        (pose,), (covariance,) = slam.solver.estimate([newest]), slam.solver.marginal([newest])
+        off = np.array(group.log(group.between(tuple(pose), self.city.in_map(len(slam.keyframes) - 1))))
+        error = float(np.linalg.norm(off[: slam.space.dimensions]))
+        return error, float(off @ np.linalg.solve(covariance, off)) / len(off)
+
+
+def _settings(window: int) -> dict[str, Any]:
+    return {"map_condense": True, "map_window_keyframes": window} if window else {"map_condense": False}
+
+
 def _resident_mib() -> float:
     """Return the resident memory of this process."""
     pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
-def drive(seed: int, keyframes: int, window: int, dimensions: int = 2, tags: bool = False) -> dict[str, float]:
-    """Return the figures of one drive."""
+def drive(seed: int, keyframes: int, window: int, dimensions: int = 2, tags: bool = False, blocks: int = 0) -> Figures:
+    """Return the figures of one drive: in a hall, or in a city of so many blocks."""
     Drive(Course(seed, 60), 0).run()  # what is loaded or compiled at first use is not counted
-    one = Drive(Course(seed, keyframes, PLANAR if dimensions == 2 else SPATIAL, tags=tags), window)
+    space = PLANAR if dimensions == 2 else SPATIAL
+    one = (
+        CityDrive(City(seed, keyframes, space, blocks), window)
+        if blocks
+        else Drive(Course(seed, keyframes, space, tags=tags), window)
+    )
     one.run()
     return one.figures()
 
 
-_AGAINST = ("newest m", "path m", "landmarks m", "NEES newest", "NEES landmarks")
+_AGAINST = ("newest m", "path m", "landmarks m")
 
 
 def measure(
-    keyframes: int, seeds: Sequence[int], windows: Sequence[int], dimensions: int, *, tags: bool
+    keyframes: int, seeds: Sequence[int], windows: Sequence[int], dimensions: int, *, tags: bool, blocks: int
 ) -> Iterator[table.Row]:
     """Yield a row for each drive, and one for each window: the means, and errors over those of all keyframes."""
-    found: dict[int, list[dict[str, float]]] = {window: [] for window in windows}
+    found: dict[int, list[Figures]] = {window: [] for window in windows}
     for seed in seeds:
         for window in windows:
-            row = fresh.call(lifelong.drive, seed, keyframes, window, dimensions, tags)
+            row = fresh.call(lifelong.drive, seed, keyframes, window, dimensions, tags, blocks)
             found[window].append(row)
             yield {"seed": seed, "window": window or "all", **row}
     for window, rows in found.items():
@@ -172,7 +241,7 @@ def measure(
         yield {"seed": "mean", "window": window or "all", **mean}
         if window and 0 in found:
             pairs = list(zip(rows, found[0], strict=True))
-            ratios = {name: float(np.mean([a[name] / b[name] for a, b in pairs])) for name in _AGAINST[:3]}
+            ratios = {name: float(np.mean([a[name] / b[name] for a, b in pairs])) for name in _AGAINST if name in mean}
             yield {"seed": "over all", "window": window, **ratios}
 
 
@@ -184,11 +253,14 @@ def main() -> None:
     options.add_argument("--windows", type=int, nargs="+", default=[0, 60, 2000], help="keyframes; 0 keeps all")
     options.add_argument("--dimensions", type=int, choices=(2, 3), default=2)
     options.add_argument("--tags", action="store_true", help="the orientation of landmarks is seen, too")
+    options.add_argument("--blocks", type=values.count, default=0, metavar="N", help="a city of N by N blocks")
     options.add_argument("--flat", action="store_true", help="fail where memory grows after a tenth of the drive")
     options.add_argument("--json", type=Path, metavar="OUT", help="write the results there as well")
     args = options.parse_args()
     rows = []
-    for row in measure(args.keyframes, range(args.seeds), args.windows, args.dimensions, tags=args.tags):
+    for row in measure(
+        args.keyframes, range(args.seeds), args.windows, args.dimensions, tags=args.tags, blocks=args.blocks
+    ):
         print(
             "benchmarks:",
             *(f"{k}={v:.4g}" if isinstance(v, float) else f"{k}={v}" for k, v in row.items()),
@@ -197,7 +269,10 @@ def main() -> None:
         )
         rows.append(row)
     table.finish(
-        table.results("lifelong", rows, f"{args.keyframes} keyframes, {args.dimensions} dimensions"), args.json
+        table.results(
+            "city" if args.blocks else "lifelong", rows, f"{args.keyframes} keyframes, {args.dimensions} dimensions"
+        ),
+        args.json,
     )
     if args.flat and any(row["late MiB"] > _FLAT * row["early MiB"] for row in rows if "late MiB" in row):
         sys.exit("benchmarks: memory grows with the distance driven")

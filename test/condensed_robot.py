@@ -7,7 +7,8 @@ import numpy as np
 from benchmarks.hall import Hall
 from graph_slam_ros.graph import Gaussian, Graph
 from graph_slam_ros.slam.lifelong.compaction import compact
-from graph_slam_ros.slam.lifelong.condenser import Condenser, RemovedPose, poses_of
+from graph_slam_ros.slam.lifelong.condenser import Condenser
+from graph_slam_ros.slam.lifelong.outcome import RemovedPose, poses_of
 from graph_slam_ros.solver import Solver
 
 CELL_M, LONGEST = 10.0, 60

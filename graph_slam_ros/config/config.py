@@ -104,14 +104,19 @@ class Config:
         return self.map.condense and not self.not_condensed
 
     @property
+    def has_closures(self) -> bool:
+        """Return whether an input is one of closures."""
+        return any(one.use == "closure" for one in self.sources)
+
+    @property
     def not_condensed(self) -> str:
         """Return the parameter with which nothing is condensed yet; empty if there is none."""
         if self.landmarks.association in ("nearest", "joint"):
             return f"landmarks.association={self.landmarks.association}"
         if self.odometry.fusion == "parallel":
             return "odometry.fusion=parallel"
-        for one in self.sources:  # closures and edges may begin at any keyframe
-            if one.use in ("closure", "edges"):
+        for one in self.sources:  # its edges may begin at any keyframe
+            if one.use == "edges":
                 return f"{one.name}.use={one.use}"
         return f"calibrate.groups={self.calibrate.groups}" if self.calibrate.is_on else ""
 

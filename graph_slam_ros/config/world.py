@@ -71,8 +71,8 @@ class MapConfig:
     condense: bool = setting(
         True,
         "true: what was driven long ago is condensed to one measurement of each place, so that memory and time follow "
-        "the area and not the distance driven; false: every keyframe is kept, as it always is with closures, "
-        "calibration, parallel odometry, or landmarks without identities",
+        "the area and not the distance driven; false: every keyframe is kept, as it always is with "
+        "calibration, parallel odometry, edges of plugins, or landmarks without identities",
     )
     window_keyframes: int = setting(
         2000,

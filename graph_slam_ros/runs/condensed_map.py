@@ -6,12 +6,15 @@ The record ``condensed`` of a ``growth`` (``map_journal``) has
 * ``vertices``, ``edges``: the lasting ids of the first rows, and that of the row after these;
 * ``old``: number, vertex, stamp and ``T_odom_base`` of each keyframe before the first that is in the graph;
 * ``places``: cell, edge, visits, the strikes against its landmarks, by vertex, and ``linearized_at``, of each place;
+* ``skeleton``: cells and directions in which a keyframe of a visit that is in no place has stayed;
+* ``attached``: the number of the first keyframe that has left and at which closures can begin; null if there is none;
 * ``left``: how many keyframes, poses at which something was seen, and frames have left the map;
 * ``accepted``: of each drive, by its first keyframe, how many accepted measurements of each input have left the map.
 
 What has left is in ``condensed.mcap``, a record ``left`` each time: the number of its first keyframe, how many poses
 had left before, and the rows of ``slam.lifelong.removed.record_type`` and of ``slam.lifelong.frames`` in base64; there
-are no frames in a map that an older version made. ``left_edges`` has the table of the
+are no frames in a map that an older version made. Where closures can begin at these keyframes it has rows of
+``slam.frontend.attached.attached_type`` as well. ``left_edges`` has the table of the
 edges. A map may know of fewer than are there, if its run was killed: the others do not count.
 """
 
@@ -33,6 +36,7 @@ from graph_slam_ros.graph.lasting_ids import LastingIds
 from graph_slam_ros.runs.journal import read_records
 from graph_slam_ros.slam.bounded_map import Condensation
 from graph_slam_ros.slam.condensed_edges import CondensedEdge
+from graph_slam_ros.slam.frontend.attached import AttachedKeyframes, attached_type
 from graph_slam_ros.slam.lifelong.fit import VisitScale
 from graph_slam_ros.slam.lifelong.frames import Frames, frame_type, member_type
 from graph_slam_ros.slam.lifelong.place_edge import place_of
@@ -72,6 +76,8 @@ def condensed_record(graph: Graph, first: int, state: BoundedState) -> Record:
         "left": left,
         "scale": astuple(state.scale),
         "accepted": [[first, dict(of)] for first, of in state.accepted.items()],
+        "skeleton": sorted(map(list, state.skeleton)),
+        "attached": state.attached.first if state.attached.end == state.keyframes else None,
     }
 
 
@@ -92,6 +98,9 @@ def read_condensed(graph: Graph, record: Mapping[str, Any]) -> tuple[int, Bounde
     keyframes, sightings, *frames = record["left"]
     state = BoundedState(keyframes=keyframes, sightings=sightings, frames=frames[0] if frames else 0)
     state.accepted |= {first: Counter(of) for first, of in record.get("accepted", ())}  # an older map has none
+    state.skeleton |= set(map(tuple, record.get("skeleton", ())))
+    first = record.get("attached")
+    state.attached = AttachedKeyframes(keyframes if first is None else int(first))
     state.scale = VisitScale(*record.get("scale", ()))  # nor this
     if not 1.0 <= state.scale.factor < np.inf:
         raise ValueError(f"condensed: the variances of visits count {state.scale.factor} times")
@@ -114,6 +123,8 @@ def left_records(done: Condensation) -> Iterator[Record]:
     """Return the records of what has left a map."""
     left = done.left
     rows = {"keyframes": _text(left.keyframes), "sightings": _text(left.sightings)}
+    if left.attached is not None:
+        rows["attached"] = _text(left.attached)
     rows |= {"linked_frames": _text(left.frames.rows), "ends": _text(left.frames.members)}
     yield {"type": "left", "first": done.first, "sightings_before": done.sightings_before, **rows}
     if done.edges:
@@ -143,6 +154,26 @@ def read_left(folder: Path, space: Geometry, state: BoundedState | None) -> Left
     if state is not None and count != (state.keyframes, state.sightings, state.frames):
         raise _incomplete(folder, count[0], state)
     return out
+
+
+def attach(folder: Path, space: Geometry, state: BoundedState) -> None:
+    """Read how the keyframes that have left a map are joined to it, for closures that begin at them.
+
+    Raises
+    ------
+    FormatError
+        Some are missing.
+    """
+    first = state.attached.first
+    for record in read_records(folder, CONDENSED, [], "left") if first < state.keyframes else ():
+        if first <= record["first"] < state.keyframes:
+            keyframes = _rows(record["keyframes"], record_type(space))
+            rows = _rows(record.get("attached", ""), attached_type(space))
+            if len(rows) != len(keyframes):
+                raise _incomplete(folder, len(rows), state)
+            state.attached.add(space, record["first"], keyframes, rows)
+    if state.attached.end != state.keyframes:
+        raise _incomplete(folder, state.attached.end, state)
 
 
 def _incomplete(folder: Path, count: int, state: BoundedState) -> FormatError:

@@ -56,7 +56,7 @@ def city_graph(seed: int, **values: float) -> tuple[Graph, Array]:
     cells, ways = stroll(rng, options.poses - 1, options.blocks)
     headings = 0.5 * np.pi * np.concatenate([ways[:1], ways])
     truth = np.column_stack([STEP_M * cells, se2.wrap(headings)])
-    closures = _closures(rng, cells)
+    closures = closure_pairs(rng, cells)
     sigmas = np.array([options.sigma_m, options.sigma_m, options.sigma_rad])
     coarse = options.odometry_noise_factor * sigmas
     steps = np.column_stack([np.arange(options.poses - 1), np.arange(1, options.poses)])
@@ -70,7 +70,7 @@ def city_graph(seed: int, **values: float) -> tuple[Graph, Array]:
     return graph, truth
 
 
-def _closures(rng: Generator, cells: Index) -> Index:
+def closure_pairs(rng: Generator, cells: Index) -> Index:
     """Pairs (earlier, later), at most one per later pose, chosen evenly among the earlier ones around it.
 
     While streets are new there is nothing to close. The missing closures are added when streets are revisited.

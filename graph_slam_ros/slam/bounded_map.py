@@ -17,16 +17,19 @@ from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.slam.anchor import Anchor
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.condensed_edges import CONDENSED, CondensedEdge, archived
+from graph_slam_ros.slam.frontend.attached import NOWHERE, attached_type
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
 from graph_slam_ros.slam.kidnap_detector import KidnapDetector
 from graph_slam_ros.slam.landmarks.landmark_frontend import LandmarkFrontend
 from graph_slam_ros.slam.lifelong.compaction import compact
-from graph_slam_ros.slam.lifelong.condenser import CHAIN, Cell, Condensed, Condenser
+from graph_slam_ros.slam.lifelong.condenser import Cell, Condenser
 from graph_slam_ros.slam.lifelong.frames import LONGEST as FRAME
 from graph_slam_ros.slam.lifelong.frames import Frames, chained, frame_of, weight_at
+from graph_slam_ros.slam.lifelong.outcome import Condensed
 from graph_slam_ros.slam.lifelong.place_edge import PlaceEdge
 from graph_slam_ros.slam.lifelong.removed import Left, OldKeyframe, Records, record_type
 from graph_slam_ros.slam.lifelong.surroundings import CLOSURES, FIXES, is_sighting
+from graph_slam_ros.slam.lifelong.thinned import CHAIN
 from graph_slam_ros.slam.robust.gating import CANDIDATES
 from graph_slam_ros.slam.solution import Solution
 from graph_slam_ros.solver import Solver
@@ -37,7 +40,24 @@ _ENOUGH = 3  # landmarks of a visit: with fewer it goes on in the next cell
 LONGEST = BATCH  # keyframes of a visit: so all that leave a cell together are one, and as little is cut as can be
 _PATIENCE = 200  # keyframes that are out of the window while a visit waits
 _SOURCE = "map"  # of what is counted
-_Row = tuple[int, int, Numbers]  # a keyframe's vertex, lasting id of its base or -1 - n of frame n, and pose
+_THIN = 0.1  # of the width of a cell: so far apart keyframes stay that are in no place
+
+
+@dataclass(frozen=True, slots=True)
+class _Row:
+    """A keyframe that leaves: its vertex, lasting id of its base or -1 - n of frame n, and pose relative to that.
+
+    Attributes
+    ----------
+    joined, T_joined, covariance : lasting id of the vertex that closures to it lead to, and the motion from there
+    """
+
+    vertex: int
+    base: int
+    T_base: Numbers
+    joined: int
+    T_joined: Numbers
+    covariance: Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,9 +98,14 @@ class BoundedMap:
         self._space, self._backend, self._frontend = frontend.config.space, backend, frontend
         self._landmarks, self._anchor, self._kidnaps = landmarks, anchor, kidnaps
         self._solution, self._counters = solution, counters
-        self.condenser, self.state = Condenser(self._space, backend.solver), backend.bounded
+        config, self.state = frontend.config, backend.bounded
+        self.condenser = Condenser(self._space, backend.solver, thin_m=_THIN * config.map.cell_m)
         self.condenser.places, self.condenser.scale = self.state.places, self.state.scale
+        self.condenser.skeleton = self.state.skeleton
+        frontend.path.attached = self.state.attached
+        frontend.path.vertex_of = lambda lasting: backend.graph.vertex_ids.find(lasting)
         self._tried = 0  # keyframes at the last try
+        self._nothing = np.zeros((self._space.dof, self._space.dof))
 
     @property
     def _is_due(self) -> bool:
@@ -104,10 +129,14 @@ class BoundedMap:
             return None
         backend, keyframes = self._backend, self._frontend.path.keyframes
         graph, values, places = backend.graph.copy(), backend.solver.values, _copies(self.state.places)
-        vertices, scale, self._tried = backend.solver.vertices, replace(self.state.scale), len(keyframes)
+        vertices, scale, skeleton = backend.solver.vertices, replace(self.state.scale), set(self.state.skeleton)
+        self._tried = len(keyframes)
+        self.condenser.serves_closures = self._frontend.config.has_closures or CLOSURES in backend.graph.labels
         try:
             rows, frames, end = self._condensed_visits()
             backend.hand_over_condensed(len(keyframes) - 1)
+            left = self._left(rows)
+            attached = self._attach(left, rows) if self.condenser.serves_closures else None
         except Exception as error:
             self._counters.count(_SOURCE, type(error).__name__)
             self._tried += BATCH - 1  # the same would most likely fail at the next keyframe again
@@ -115,9 +144,10 @@ class BoundedMap:
             self.state.places.clear()
             self.state.places.update(places)
             self.state.scale = self.condenser.scale = scale
+            self.state.skeleton = self.condenser.skeleton = skeleton
             _restart(backend.solver, vertices, values)
             return None
-        return self._compacted(rows, frames, end) if end > keyframes.first else None
+        return self._compacted(rows, Left(left, self._sightings(end), frames, attached), end) if rows else None
 
     # -- visits ------------------------------------------------------------------------------------------------------
 
@@ -206,7 +236,8 @@ class BoundedMap:
         return out
 
     def _own(self, vertex: int) -> _Row:
-        return vertex, self._backend.graph.vertex_ids.of(vertex), self._space.identity
+        own = self._backend.graph.vertex_ids.of(vertex)
+        return _Row(vertex, own, self._space.identity, own, self._space.identity, self._nothing)
 
     def _rows(
         self, visit: Sequence[int], first: int, done: Condensed, frames: list[tuple[Frames, range]]
@@ -219,17 +250,20 @@ class BoundedMap:
         """
         lasting, out = self._backend.graph.vertex_ids, {vertex: self._own(vertex) for vertex in visit}
         for one in done.removed:
-            out[one.vertex] = one.vertex, lasting.of(one.base), one.T_base_vertex
+            base = lasting.of(one.base)
+            joined = NOWHERE if one.covariance is None else base
+            covariance = self._nothing if one.covariance is None else one.covariance
+            out[one.vertex] = _Row(one.vertex, base, one.T_base_vertex, joined, one.T_base_vertex, covariance)
         for k in range(0, len(visit), FRAME if done.seen else len(visit)):
             stretch = visit[k : k + FRAME]
-            gone = [vertex for vertex in stretch if done.seen and out[vertex][1] != lasting.of(vertex)]
+            gone = [vertex for vertex in stretch if done.seen and out[vertex].base != lasting.of(vertex)]
             if gone:
                 at = self._solution.pose(stretch[len(stretch) // 2])
                 frames.append((self._frame(done, stretch, at), range(first + k, first + k + len(stretch))))
                 number = -self.state.frames - len(frames)
                 for vertex in gone:
                     pose = self._space.group.between(at, self._solution.pose(vertex))
-                    out[vertex] = vertex, number, tuple(map(float, pose))
+                    out[vertex] = replace(out[vertex], base=number, T_base=tuple(map(float, pose)))
         return [out[vertex] for vertex in visit]
 
     def _frame(self, done: Condensed, stretch: Sequence[int], at: Numbers) -> Frames:
@@ -244,23 +278,38 @@ class BoundedMap:
         base = done.removed[0].base
         return frame_of(self._space, (lasting.of(base), self._solution.pose(base)), at, landmarks)
 
+    def _left(self, rows: Sequence[_Row]) -> Records:
+        """Return the records of the keyframes that leave."""
+        keyframes, lasting = self._frontend.path.keyframes, self._backend.graph.vertex_ids.of
+        left = np.zeros(len(rows), dtype=record_type(self._space))
+        for k, row in enumerate(rows):
+            one = keyframes[keyframes.first + k]
+            left[k] = one.stamp_ns, lasting(row.vertex), row.base, row.T_base, one.T_odom_base
+        return left
+
+    def _attach(self, left: Records, rows: Sequence[_Row]) -> Records:
+        """Note how the keyframes that leave are joined to the graph, for closures that come to them."""
+        out = np.zeros(len(rows), dtype=attached_type(self._space))
+        for k, row in enumerate(rows):
+            out[k] = row.joined, row.T_joined, row.covariance
+        self.state.attached.add(self._space, self._frontend.path.keyframes.first, left, out)
+        return out
+
     # -- compaction --------------------------------------------------------------------------------------------------
 
-    def _compacted(self, rows: list[_Row], frames: Frames, end: int) -> Condensation:
+    def _compacted(self, rows: Sequence[_Row], left: Left, end: int) -> Condensation:
         """Remove what has left from the graph, and give all parts the new ids."""
         keyframes, graph = self._frontend.path.keyframes, self._backend.graph
         lasting = graph.vertex_ids.of
-        left = np.zeros(len(rows), dtype=record_type(self._space))
-        for k, (vertex, base, pose) in enumerate(rows):
-            one = keyframes[keyframes.first + k]
-            left[k] = one.stamp_ns, lasting(vertex), base, pose, one.T_odom_base
-            if base == lasting(vertex):
-                self.state.old.append(OldKeyframe(keyframes.first + k, vertex, one.stamp_ns, one.T_odom_base))
-        seen, before = self._sightings(end), self.state.sightings
+        for k, row in enumerate(rows):
+            if row.base == lasting(row.vertex):
+                one = keyframes[keyframes.first + k]
+                self.state.old.append(OldKeyframe(keyframes.first + k, row.vertex, one.stamp_ns, one.T_odom_base))
+        before = self.state.sightings
         vertices, edges = self._staying(int(keyframes.ids[end - keyframes.first]))
         gone = np.setdiff1d(np.arange(graph.edge_count), edges)
         out = Condensation(
-            Left(left, seen, frames),
+            left,
             keyframes.first,
             before,
             archived(self._backend, keyframes, gone, self._landmarks.map.names()),
@@ -273,8 +322,8 @@ class BoundedMap:
             OldKeyframe(one.number, int(new.vertices[one.vertex]), one.stamp_ns, one.T_odom_base)
             for one in self.state.old
         ]
-        self.state.keyframes, self.state.sightings = end, before + len(seen)
-        self.state.frames += len(frames)
+        self.state.keyframes, self.state.sightings = end, before + len(left.sightings)
+        self.state.frames += len(left.frames)
         self._note_accepted(out.edges)
         self._landmarks.renumber(new.vertices, new.edges)
         self._anchor.restore()

@@ -9,7 +9,7 @@ from graph_slam_ros.graph.place import LABEL as PLACES
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.frontend.keyframes import Keyframe
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
-from graph_slam_ros.slam.lifelong.condenser import CHAIN
+from graph_slam_ros.slam.lifelong.thinned import CHAIN
 from graph_slam_ros.slam.robust.ledger import INSIDE, Reason, Verdict
 from graph_slam_ros.typing import Index
 

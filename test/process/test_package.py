@@ -56,7 +56,7 @@ WITHIN = {
         "slam/landmarks",
     },
     "slam/calibration": {"lie", "graph", "solver", "slam/frontend"},
-    "slam/lifelong": {"chi_square", "lie", "graph", "solver", "solver/clique_tree"},
+    "slam/lifelong": {"chi_square", "lie", "graph", "solver", "solver/clique_tree", "slam/frontend"},
     "slam": {
         "chi_square",
         *("plugin_edges", "edge_tags", "lie", "graph", "solver", "measurements", "config"),

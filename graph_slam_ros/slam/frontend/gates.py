@@ -88,8 +88,9 @@ class ClosureStart:
     def admit(self, m: Observation) -> Observation | None:
         """Return the observation, or None for such a closure or edge."""
         stamps_ns = (m.from_stamp_ns,) if isinstance(m, Closure) else m.stamps_ns if isinstance(m, CustomEdge) else ()
-        newest_ns, oldest_ns = self._odometry.newest_ns or 0, self._path.oldest_ns
-        is_left = self._path.keyframes.first > 0 and min(stamps_ns, default=oldest_ns) < oldest_ns
+        newest_ns, path, oldest_ns = self._odometry.newest_ns or 0, self._path, self._path.oldest_ns
+        is_left = path.keyframes.first > 0 and min(stamps_ns, default=oldest_ns) < oldest_ns
         reason = "from_condensed_keyframe" if is_left else "from_where_there_was_no_odometry"
         self.reason = reason
-        return m if all(oldest_ns <= stamp_ns <= newest_ns for stamp_ns in stamps_ns) else None
+        is_known = path.reaches if isinstance(m, Closure) else lambda stamp_ns: stamp_ns >= oldest_ns
+        return m if all(stamp_ns <= newest_ns and is_known(stamp_ns) for stamp_ns in stamps_ns) else None

@@ -40,14 +40,14 @@ def inverse(space: Geometry, motion: Motion) -> Motion:
     return tuple(map(float, space.group.inverse(pose))), product(product(turn, covariance), turn.T)
 
 
-def motions_from(space: Geometry, visit: Sequence[int], legs: Sequence[Motion]) -> dict[int, Motion]:
-    """Return the covariance of each keyframe of a visit given its middle one, by odometry alone; with that motion.
+def motions_from(space: Geometry, visit: Sequence[int], legs: Sequence[Motion], k: int) -> dict[int, Motion]:
+    """Return the motion to each keyframe of a visit from keyframe ``k`` of it, by odometry alone.
 
     Parameters
     ----------
     legs : from each keyframe but the last to the next
     """
-    k, nothing = len(visit) // 2, (space.identity, np.zeros((space.dof, space.dof)))
+    nothing = space.identity, np.zeros((space.dof, space.dof))
     out: dict[int, Motion] = {visit[k]: nothing}
     for n in range(k + 1, len(visit)):
         out[visit[n]] = chained(space, [*legs[k:n]])
@@ -65,25 +65,25 @@ def carried_closure(space: Geometry, edge: Edge, base: int, motions: Mapping[int
     """
     first, last = edge.vertices
     information = weight * product(edge.sqrt_information.T, edge.sqrt_information)
-    measured: Motion = tuple(edge.measured.tolist()), _inverted(information)
+    measured: Motion = tuple(edge.measured.tolist()), inverted(information)
     if first in motions:
         whole, ends = chained(space, [motions[first], measured]), (base, last)
     else:
         whole, ends = chained(space, [measured, inverse(space, motions[last])]), (first, base)
-    return Carried(ends, whole[0], square_root(symmetric(_inverted(whole[1]))), edge.label, edge.source)
+    return Carried(ends, whole[0], square_root(symmetric(inverted(whole[1]))), edge.label, edge.source)
 
 
 def fused_closure(space: Geometry, one: Carried, several: Sequence[Edge], gate: float) -> Carried | None:
     """Return a carried closure together with the first of some others between its two vertices that it agrees with."""
     group = space.group
     for edge in several:
-        motion: Motion = one.measured, _inverted(product(one.root.T, one.root))
+        motion: Motion = one.measured, inverted(product(one.root.T, one.root))
         if edge.vertices != one.vertices:
             motion = inverse(space, motion)
         before = edge.weight * product(edge.sqrt_information.T, edge.sqrt_information)
-        added = symmetric(_inverted(motion[1]))
+        added = symmetric(inverted(motion[1]))
         off = np.array(group.log(group.between(tuple(edge.measured.tolist()), motion[0])))
-        apart = symmetric(_inverted(_inverted(before) + motion[1]))
+        apart = symmetric(inverted(inverted(before) + motion[1]))
         if quadratic(apart, off) <= quantile(gate, space.dof):
             both = symmetric(before + added)
             step = np.linalg.solve(both, product(added, off))
@@ -114,10 +114,10 @@ def carried_fixes(
     for number, edge in fixes.items():
         pose, covariance = motions[edge.vertices[0]]
         residual, jacobian = linearized(solver.graph, values, edge.type, edge.vertices, edge.measured)
-        noise = _inverted(factors[number] * product(edge.sqrt_information.T, edge.sqrt_information))
+        noise = inverted(factors[number] * product(edge.sqrt_information.T, edge.sqrt_information))
         noise += product(product(jacobian, covariance), jacobian.T)
         of_base = product(jacobian, group.adjoint(group.inverse(pose)))
-        weighted = product(_inverted(noise), of_base)
+        weighted = product(inverted(noise), of_base)
         normal, right = normal + product(of_base.T, weighted), right + product(weighted.T, residual)
     if prior is not None:
         residual, jacobian = linearized(solver.graph, values, prior.type, prior.vertices, prior.measured)
@@ -134,5 +134,6 @@ def carried_fixes(
     return Carried((base,), measured, root, "fixes", source, prior.id if prior is not None else None)
 
 
-def _inverted(matrix: Array) -> Array:
+def inverted(matrix: Array) -> Array:
+    """Return the inverse of a matrix."""
     return np.asarray(np.linalg.inv(matrix), dtype=np.float64)

@@ -1,14 +1,13 @@
 """Condensing: the keyframes of a visit leave the problem, and an edge of the place has what they measured."""
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import pairwise
+from dataclasses import replace
 
 import numpy as np
 
 from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.errors import SingularError
-from graph_slam_ros.graph import Gaussian
+from graph_slam_ros.graph import Edge, Gaussian
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.slam.lifelong.carried import (
     Carried,
@@ -20,77 +19,18 @@ from graph_slam_ros.slam.lifelong.carried import (
 from graph_slam_ros.slam.lifelong.compaction import Renumbered
 from graph_slam_ros.slam.lifelong.elimination import square_root
 from graph_slam_ros.slam.lifelong.fit import VisitScale, fit_of
+from graph_slam_ros.slam.lifelong.outcome import ITSELF, PLACE, Condensed, Limits, RemovedPose
 from graph_slam_ros.slam.lifelong.place import Fused, Place
 from graph_slam_ros.slam.lifelong.place_edge import PlaceEdge, added_place
 from graph_slam_ros.slam.lifelong.surroundings import CLOSURES, Motion, Surroundings, chained, motion_of, surroundings
+from graph_slam_ros.slam.lifelong.thinned import CHAIN, Thinning, cell_of
 from graph_slam_ros.slam.lifelong.visit import Visit, best_known, visit_of
 from graph_slam_ros.solver import Solver
-from graph_slam_ros.typing import Numbers
+from graph_slam_ros.typing import Array, Numbers
 
 Cell = tuple[int, ...]
-CHAIN = "composed"  # label of edges that are composed of odometry
 _AHEAD = 3  # landmarks of places that the keyframes after a visit must see before odometry to it is cut
-_ITSELF, _PLACE = "it contradicts itself", "it contradicts its place"
 _SHARE = 0.5  # of the odometry of a first visit that is in its place; the rest joins the place to what is around it
-
-
-@dataclass(frozen=True, slots=True)
-class Limits:
-    """Limits of the size of places, and of what is believed.
-
-    Attributes
-    ----------
-    members : landmarks of one place, at most; places : of one cell, at most
-    closures : between the same two bases, at most: those that agree are one
-    gate : quantile of chi2 above which a visit contradicts itself or its place
-    """
-
-    members: int = 48
-    places: int = 8
-    closures: int = 4
-    gate: float = 0.9999
-
-
-@dataclass(frozen=True, slots=True)
-class RemovedPose:
-    """A removed keyframe relative to another vertex, which may be removed later."""
-
-    vertex: int
-    base: int
-    T_base_vertex: Numbers
-
-
-@dataclass(frozen=True, slots=True)
-class Condensed:
-    """The end of one visit.
-
-    Attributes
-    ----------
-    how : ``first`` (of a place), ``again`` (added to a place), ``composed`` (odometry is kept, with the keyframes that
-        have closures or fixes; sightings, if any, contradicted something and are lost), ``waits`` (until the keyframes
-        after it see enough places), ``kept`` (it cannot be condensed)
-    why : of ``composed`` and ``kept``
-    statistic, degrees : chi2 of the visit against all before in its place
-    without, anew : the landmark that contradicts the place and was left out, or that the place has anew
-    wider : factor of the variances of the visit, without which it contradicts its place
-    removed : the keyframes that left the problem, in order of time
-    seen : (keyframe, landmark) of each sighting that is in the place now
-    """
-
-    how: str
-    why: str = ""
-    statistic: float = 0.0
-    degrees: int = 0
-    without: int | None = None
-    anew: int | None = None
-    wider: float = 1.0
-    removed: tuple[RemovedPose, ...] = ()
-    seen: tuple[tuple[int, int], ...] = ()
-
-    @property
-    def is_contradiction(self) -> bool:
-        """Return whether the visit contradicts itself or its place."""
-        return self.why in (_ITSELF, _PLACE)
 
 
 class Condenser:
@@ -100,12 +40,24 @@ class Condenser:
     ----------
     places : by cell
     scale : of the variances of visits
+    skeleton : cells and directions in which a keyframe of a visit that is in no place stays
+    thin_m : width of these cells
+    serves_closures : whether closures may come that begin at removed keyframes
     """
 
-    def __init__(self, space: Geometry, solver: Solver, limits: Limits | None = None) -> None:
+    def __init__(
+        self,
+        space: Geometry,
+        solver: Solver,
+        limits: Limits | None = None,
+        *,
+        thin_m: float = 2.0,
+        serves_closures: bool = False,
+    ) -> None:
         self.space, self.solver, self.limits = space, solver, limits or Limits()
+        self.thin_m, self.serves_closures = thin_m, serves_closures
         self.places: dict[Cell, list[PlaceEdge]] = {}
-        self.scale = VisitScale()
+        self.scale, self.skeleton = VisitScale(), set[Cell]()
 
     def condense(
         self, visit: Sequence[int], after: int, cell: Cell, ahead: Collection[int], *, waits: bool = True
@@ -139,7 +91,7 @@ class Condenser:
                 at = best_known(self.space, self.solver.graph, self.solver.estimate, visit, factors)
             one = visit_of(self.space, self.solver.graph, self.solver.estimate, visit, visit[at], factors)
             if one.degrees > 0 and one.chi2 > quantile(self.limits.gate, one.degrees):
-                return self._composed(visit, after, around, _ITSELF)
+                return self._thinned(visit, after, around, ITSELF)
             one = replace(one, information=one.information / self.scale.factor)
             if is_again and best is not None:
                 return self._again(visit, after, around, one, best)
@@ -175,15 +127,15 @@ class Condenser:
         if lonely := self._left_alone(around, one.members):
             return Condensed("kept", f"landmark {lonely[0]} would be left without a measurement")
         root = square_root(one.information)
-        added, also = self._joined(visit, at, after, around, 1.0 - _SHARE)
+        added, also, motions = self._joined(visit, at, after, around, 1.0 - _SHARE)
         begun = added_place(self.space, self.solver.graph, base, Place.begun_by(one), root)
         self.places.setdefault(cell, []).append(begun)
-        removed = self._replace(dict.fromkeys(visit, base), [*around.all, *also], [*added, begun.edge])
+        removed = self._replace(_all_from(base, visit, motions), [*around.all, *also], [*added, begun.edge])
         return Condensed("first", removed=removed, seen=_seen(around, one.members))
 
     def _joined(
         self, visit: Sequence[int], k: int, after: int, around: Surroundings, share: float
-    ) -> tuple[list[int], list[int]]:
+    ) -> tuple[list[int], list[int], dict[int, Motion]]:
         """Join keyframe ``k`` of the visit to what is around it, and carry closures and fixes to it.
 
         Parameters
@@ -192,15 +144,16 @@ class Condenser:
 
         Returns
         -------
-        The new edges, and those that they replace.
+        The new edges, those that they replace, and the motions from ``k`` to the keyframes of the visit.
         """
         legs = [motion_of(edge, share * around.factors[edge.id]) for edge in around.steps]
-        carried = self._carried(visit, around, visit[k], [], [motion_of(edge) for edge in around.steps])
+        motions = self._motions(visit, around, visit[k], k, None)
+        carried = self._carried(around, visit[k], motions, [])
         onward = [motion_of(edge) for edge in around.onward.values()]
         joins = [(edge.vertices[0], visit[k], [motion_of(edge), *legs[:k]]) for edge in around.into.values()]
         added = self._join([*joins, (visit[k], after, [*legs[k:], *onward])])
         more, also = self._add_carried(carried)
-        return [*added, *more], also
+        return [*added, *more], also, motions
 
     def _again(self, visit: Sequence[int], after: int, around: Surroundings, one: Visit, at: PlaceEdge) -> Condensed:
         """Add a visit to a place, and cut the odometry on both sides of it."""
@@ -212,13 +165,14 @@ class Condenser:
             return Condensed("kept", f"landmark {lonely[0]} would be left without a measurement")
         self.scale.add(fit.as_is, self.limits.gate)
         if (result := fit.result) is None:
-            return self._composed(visit, after, around, _PLACE, fit.as_is)
-        legs = [motion_of(edge) for edge in around.steps]
-        carried = self._carried(visit, around, at.base, [(guess, result.covariance)], legs)
+            return self._thinned(visit, after, around, PLACE, fit.as_is)
+        bases = {one.base for in_cell in self.places.values() for one in in_cell}
+        from_kept = [edge for edge in around.into.values() if edge.vertices[0] not in bases]
+        motions = self._motions(visit, around, at.base, k, (guess, result.covariance), also=bool(from_kept))
+        carried = self._carried(around, at.base, motions, from_kept)
         now = added_place(self.space, self.solver.graph, at.base, result.place, square_root(result.place.information))
         added, also = self._add_carried(carried)
-        bases = dict.fromkeys(visit, at.base)
-        removed = self._replace(bases, [*around.all, at.edge, *also], [now.edge, *added])
+        removed = self._replace(_all_from(at.base, visit, motions), [*around.all, at.edge, *also], [now.edge, *added])
         if fit.anew is not None:
             at.strikes.pop(fit.anew, None)
         elif fit.without is not None:
@@ -231,62 +185,89 @@ class Condenser:
 
     def _without_place(self, visit: Sequence[int], after: int, around: Surroundings, why: str) -> Condensed:
         """Keep a visit that cannot be in a place if it sees a landmark, else its odometry alone: nothing is lost."""
-        return Condensed("kept", why) if around.sightings else self._composed(visit, after, around, why)
+        return Condensed("kept", why) if around.sightings else self._thinned(visit, after, around, why)
 
-    def _composed(
+    def _thinned(
         self, visit: Sequence[int], after: int, around: Surroundings, why: str, done: Fused | None = None
     ) -> Condensed:
-        """Compose the odometry between keyframes with closures or fixes, which stay; sightings are lost."""
-        held = around.closures_and_fixes
-        ends = {vertex for edge in held.values() for vertex in edge.vertices}
-        stops = [k for k, vertex in enumerate(visit) if vertex in ends]
-        if len(stops) == len(visit):
-            return Condensed("kept", f"{why}; all of its keyframes have closures or fixes")
+        """Compose odometry and closures; a keyframe of each cell and direction may stay. Sightings are lost."""
         if lonely := self._left_alone(around, ()):
             return Condensed("kept", f"{why}; landmark {lonely[0]} would be left without a measurement")
-        legs, way = [motion_of(edge) for edge in (*around.steps, *around.onward.values())], [*visit, after]
-        first = stops[0] if stops else len(visit)
-        joins = [(edge.vertices[0], way[first], [motion_of(edge), *legs[:first]]) for edge in around.into.values()]
-        joins += [(way[k], way[end], legs[k:end]) for k, end in pairwise([*stops, len(visit)])]
-        before = [max((stop for stop in stops if stop <= k), default=first) for k in range(len(visit))]
-        bases = {vertex: way[stop] for vertex, stop in zip(visit, before, strict=True)}
-        edges = [edge for edge in around.all if edge not in held]
-        removed = self._replace(bases, edges, self._join(joins))
+        poses = dict(zip(visit, self.solver.estimate(list(visit)).tolist(), strict=True))
+        keeps = self.serves_closures or bool(around.closures_and_fixes)
+
+        def is_kept(vertex: int) -> bool:
+            key, before = cell_of(self.space, poses[vertex], self.thin_m), len(self.skeleton)
+            if keeps:
+                self.skeleton.add(key)
+            return len(self.skeleton) > before
+
+        thin = Thinning(self.space, visit, after, around, is_kept, self.thin_m, self.limits.gate).run()
+        carried = [*thin.added]
+        for base, fixes in thin.fixes.items():
+            (begin,) = self.solver.estimate([base]).tolist()
+            of = {self.solver.graph.edge(fix).vertices[0] for fix in fixes}
+            motions = {one: (self._between(begin, poses[one]), thin.shares[one]) for one in of}
+            some = {fix: around.fixes[fix] for fix in fixes}
+            carried.append(
+                carried_fixes(self.space, self.solver, base, some, around.factors, motions, self._prior_of(base))
+            )
+        added, also = self._add_carried(carried)
+        removed = self._replace(thin.centres, [*(edge for edge in around.all if edge not in thin.stay), *also], added)
         statistic, degrees = (done.statistic, done.degrees) if done else (0.0, 0)
         return Condensed("composed", why, statistic, degrees, removed=removed)
 
     # -- edits of the graph ------------------------------------------------------------------------------------------
 
-    def _carried(
-        self, visit: Sequence[int], around: Surroundings, base: int, to_visit: Sequence[Motion], legs: Sequence[Motion]
-    ) -> list[Carried]:
-        """Return the closures and fixes of a visit as edges of a base, and odometry from a keyframe that has no place.
+    def _motions(
+        self, visit: Sequence[int], around: Surroundings, base: int, k: int, to_k: Motion | None, *, also: bool = False
+    ) -> dict[int, Motion]:
+        """Return the motions from a base to the keyframes of a visit, if something is carried to it, or may be later.
 
         Parameters
         ----------
-        to_visit : the motion from the base to the middle keyframe, where that is another one
-        legs : odometry from each keyframe but the last to the next
+        k : the keyframe of the visit that the others are joined to by odometry
+        to_k : the motion from the base to this one, where the base is another
+        also : whether something else is carried
         """
-        bases = {one.base for in_cell in self.places.values() for one in in_cell}
-        from_kept = [edge for edge in around.into.values() if to_visit and edge.vertices[0] not in bases]
-        if not (around.closures or around.fixes or from_kept):
-            return []
-        space, out = self.space, list[Carried]()
+        if not (self.serves_closures or around.closures or around.fixes or also):
+            return {}
         begin, *poses = self.solver.estimate([base, *visit]).tolist()
-        by_odometry, motions = motions_from(space, visit, legs), dict[int, Motion]()
+        by_odometry = motions_from(self.space, visit, [motion_of(edge) for edge in around.steps], k)
+        out = dict[int, Motion]()
         for vertex, pose in zip(visit, poses, strict=True):
-            _, covariance = chained(space, [*to_visit, by_odometry[vertex]])
-            motions[vertex] = tuple(map(float, space.group.between(tuple(begin), tuple(pose)))), covariance
+            _, covariance = chained(self.space, [*([to_k] if to_k else ()), by_odometry[vertex]])
+            out[vertex] = self._between(begin, pose), covariance
+        return out
+
+    def _between(self, begin: Sequence[float], pose: Sequence[float]) -> Numbers:
+        return tuple(map(float, self.space.group.between(tuple(begin), tuple(pose))))
+
+    def _carried(
+        self, around: Surroundings, base: int, motions: Mapping[int, Motion], from_kept: Sequence[Edge]
+    ) -> list[Carried]:
+        """Return the closures and fixes of a visit as edges of a base.
+
+        Parameters
+        ----------
+        motions : from the base to the keyframes of the visit
+        from_kept : odometry from a keyframe that has no place
+        """
+        space, out = self.space, list[Carried]()
         out += [replace(carried_closure(space, edge, base, motions, edge.weight), label=CHAIN) for edge in from_kept]
         for number, edge in around.closures.items():
             one = carried_closure(space, edge, base, motions, around.factors[number])
             if len(set(one.vertices)) > 1:  # else the place knows it
                 out.append(one)
         if around.fixes:
-            on_it = [self.solver.graph.edge(int(edge)) for edge in self.solver.edges_on(base)]
-            prior = next((one for one in on_it if one.weight and one.label == CHAIN and len(one.vertices) == 1), None)
+            prior = self._prior_of(base)
             out.append(carried_fixes(space, self.solver, base, around.fixes, around.factors, motions, prior))
         return out
+
+    def _prior_of(self, base: int) -> Edge | None:
+        """Return the prior that a base has of fixes that were carried to it."""
+        on_it = [self.solver.graph.edge(int(edge)) for edge in self.solver.edges_on(base)]
+        return next((one for one in on_it if one.weight and one.label == CHAIN and len(one.vertices) == 1), None)
 
     def _add_carried(self, carried: Sequence[Carried]) -> tuple[list[int], list[int]]:
         """Add closures and fixes of a base; returns the new edges and those that they replace."""
@@ -336,19 +317,22 @@ class Condenser:
             out.append(edge)
         return out
 
-    def _replace(self, bases: Mapping[int, int], edges: Sequence[int], added: Sequence[int]) -> tuple[RemovedPose, ...]:
+    def _replace(
+        self, bases: Mapping[int, tuple[int, Array | None]], edges: Sequence[int], added: Sequence[int]
+    ) -> tuple[RemovedPose, ...]:
         """Put edges in place of others, and remove keyframes.
 
         Parameters
         ----------
-        bases : of each keyframe of a visit, in order of time, the vertex relative to which it is known from now on; one
-            that is its own base stays
+        bases : of each keyframe of a visit, in order of time, the vertex relative to which it is known from now on, and
+            the covariance of the motion from there; one that is its own base stays
         """
-        gone = {vertex: base for vertex, base in bases.items() if vertex != base}
-        group, out = self.space.group, list[RemovedPose]()
+        gone = {vertex: base for vertex, (base, _) in bases.items() if vertex != base}
         seen_from, poses = self.solver.estimate(list(gone.values())).tolist(), self.solver.estimate(list(gone)).tolist()
-        for (vertex, base), begin, pose in zip(gone.items(), seen_from, poses, strict=True):
-            out.append(RemovedPose(vertex, base, tuple(map(float, group.between(tuple(begin), tuple(pose))))))
+        out = [
+            RemovedPose(vertex, base, self._between(begin, pose), bases[vertex][1])
+            for (vertex, base), begin, pose in zip(gone.items(), seen_from, poses, strict=True)
+        ]
         self.solver.add([], added)
         for edge in edges:
             self.solver.set_weight(edge, 0.0)
@@ -357,17 +341,9 @@ class Condenser:
         return tuple(out)
 
 
-def poses_of(space: Geometry, removed: Sequence[RemovedPose], kept: Mapping[int, Numbers]) -> dict[int, Numbers]:
-    """Return the present poses of keyframes, removed ones included.
-
-    Parameters
-    ----------
-    removed : in the order of their removal; kept : the present poses of all others that are a base
-    """
-    out = dict(kept)
-    for one in reversed(removed):
-        out[one.vertex] = tuple(map(float, space.group.compose(out[one.base], one.T_base_vertex)))
-    return out
+def _all_from(base: int, visit: Sequence[int], motions: Mapping[int, Motion]) -> dict[int, tuple[int, Array | None]]:
+    """Return one base for all keyframes of a visit, with the covariances of the motions from there that are known."""
+    return {vertex: (base, motions[vertex][1] if vertex in motions else None) for vertex in visit}
 
 
 def _halved(around: Surroundings) -> dict[int, float]:

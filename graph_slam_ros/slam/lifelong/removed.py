@@ -49,11 +49,17 @@ class OldKeyframe:
 
 @dataclass(frozen=True, slots=True)
 class Left:
-    """The part that has left a map: keyframes, poses at which something was seen from them, and their frames."""
+    """The part that has left a map: keyframes, poses at which something was seen from them, and their frames.
+
+    Attributes
+    ----------
+    attached : of each keyframe a row of ``attached.attached_type``; None where no closure may begin at them
+    """
 
     keyframes: Records
     sightings: Records
     frames: Frames
+    attached: Records | None = None
 
     @classmethod
     def joined(cls, space: Geometry, several: Sequence["Left"]) -> "Left":

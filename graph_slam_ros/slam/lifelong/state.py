@@ -3,6 +3,7 @@
 from collections import Counter
 from dataclasses import dataclass, field
 
+from graph_slam_ros.slam.frontend.attached import AttachedKeyframes
 from graph_slam_ros.slam.lifelong.condenser import Cell
 from graph_slam_ros.slam.lifelong.fit import VisitScale
 from graph_slam_ros.slam.lifelong.place_edge import PlaceEdge
@@ -18,6 +19,8 @@ class BoundedState:
     places : by cell
     scale : of the variances of visits
     old : the keyframes in the graph that are in no list of keyframes any more, in order of time
+    skeleton : cells and directions in which a keyframe of a visit that is in no place has stayed
+    attached : the keyframes that have left the map, where closures may begin at them
     keyframes, sightings, frames : how many have left the map
     accepted : of each drive, by its first keyframe, how many accepted measurements of each input have left the map
     """
@@ -25,6 +28,8 @@ class BoundedState:
     places: dict[Cell, list[PlaceEdge]] = field(default_factory=dict)
     scale: VisitScale = field(default_factory=VisitScale)
     old: list[OldKeyframe] = field(default_factory=list)
+    skeleton: set[Cell] = field(default_factory=set)
+    attached: AttachedKeyframes = field(default_factory=AttachedKeyframes)
     keyframes: int = 0
     sightings: int = 0
     frames: int = 0
