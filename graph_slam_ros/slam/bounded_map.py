@@ -108,7 +108,7 @@ class BoundedMap:
         self._nothing = np.zeros((self._space.dof, self._space.dof))
 
     @property
-    def _is_due(self) -> bool:
+    def is_due(self) -> bool:
         """Return whether so many keyframes are out of the window that some should leave, and nothing else goes on."""
         keyframes, map_ = self._frontend.path.keyframes, self._frontend.config.map
         count = len(keyframes)
@@ -125,7 +125,7 @@ class BoundedMap:
 
         A failure is counted, and changes nothing.
         """
-        if not self._is_due:
+        if not self.is_due:
             return None
         backend, keyframes = self._backend, self._frontend.path.keyframes
         graph, values, places = backend.graph.copy(), backend.solver.values, _copies(self.state.places)

@@ -41,6 +41,7 @@ from graph_slam_ros.slam.kidnap_detector import KidnapDetector
 from graph_slam_ros.slam.landmarks.assignments import Assigned
 from graph_slam_ros.slam.landmarks.landmark_frontend import LandmarkFrontend
 from graph_slam_ros.slam.map_view import MapView
+from graph_slam_ros.slam.motion_only import MotionOnly
 from graph_slam_ros.slam.robust.background import Executor, run_when_asked
 from graph_slam_ros.slam.robust.ledger import Reason
 from graph_slam_ros.slam.snapshot import MapSnapshot
@@ -98,7 +99,7 @@ class GraphSlam(MapView):
             if self._custom.withdraw(failed.values(), len(self.keyframes) - 1):
                 self._solve(self.config.solver_settings())
         bounded = BoundedMap(backend, frontend, landmarks, self._anchor, kidnaps, solution, counters)
-        self._updates = UpdateLog(self, bounded)
+        self._updates = UpdateLog(self, bounded, MotionOnly(frontend, landmarks, bounded))
 
     @property
     def processed(self) -> int:
@@ -111,10 +112,10 @@ class GraphSlam(MapView):
         Of several exceptions the first is raised after everything else was processed; the others are counted.
         """
         self._sink(measurement)
-        self._updates.begin()
-        with self._faults:
-            self._process(measurement)
-        self._faults.raise_first()
+        if self._updates.begin(measurement):
+            with self._faults:
+                self._process(measurement)
+            self._faults.raise_first()
         return self._updates.update()
 
     def _process(self, m: Measurement) -> None:
@@ -236,12 +237,11 @@ class GraphSlam(MapView):
 
     def _on_event(self, event: Event, values: dict[str, Value]) -> None:
         match event:
-            case "flush":
+            case "flush" | "end" | "time_jump":
                 self._use(self._frontend.order.flush())
-            case "end" | "time_jump":
-                self._use(self._frontend.order.flush())
-                self._frontend.drop_pending()
-                self._add_assigned(self._landmarks.end_scan())
+                if event != "flush":
+                    self._frontend.drop_pending()
+                    self._add_assigned(self._landmarks.end_scan())
                 if event == "time_jump":
                     self._frontend.forget_time()
             case "optimize":

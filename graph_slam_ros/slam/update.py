@@ -2,11 +2,13 @@
 
 from dataclasses import dataclass
 
+from graph_slam_ros.measurements.types import Measurement, Odometry
 from graph_slam_ros.slam.alarm import Alarm
 from graph_slam_ros.slam.bounded_map import BoundedMap, Condensation
 from graph_slam_ros.slam.calibration.decision import Finding
 from graph_slam_ros.slam.landmarks.lifetimes import LandmarkEvent
 from graph_slam_ros.slam.map_view import MapView
+from graph_slam_ros.slam.motion_only import MotionOnly
 from graph_slam_ros.slam.robust.ledger import VerdictChange
 from graph_slam_ros.slam.slip_review import Slip
 from graph_slam_ros.slam.solution import Correction
@@ -66,14 +68,16 @@ class UpdateLog:
     Parameters
     ----------
     bounded : condenses what has left the window before an update begins
+    motion : adds odometry that changes nothing else
 
     Attributes
     ----------
     begun : the number of updates that were begun
     """
 
-    def __init__(self, view: MapView, bounded: BoundedMap) -> None:
+    def __init__(self, view: MapView, bounded: BoundedMap, motion: MotionOnly) -> None:
         self._view, self._bounded, self.begun = view, bounded, 0
+        self._motion, self._only_moves = motion, False
         self._keyframes = self._edges = self._solves = 0
         self._report: Report | None = None
         self._changes = len(view.ledger.history)  # of verdicts, that updates have reported
@@ -81,18 +85,25 @@ class UpdateLog:
         self._landmarks = len(view.landmark_events)
         self._condensed: Condensation | None = None
 
-    def begin(self) -> None:
-        """Mark the start of the next update, before which something may be condensed."""
+    def begin(self, m: Measurement) -> bool:
+        """Begin the next update, before which something may be condensed. Returns whether more is to be processed."""
         view = self._view
         self.begun += 1
+        self._only_moves = isinstance(m, Odometry) and self._motion.add(m)
+        if self._only_moves:
+            return False
+        self._motion.forget()
         self._condensed = self._bounded.condense()
         if self._condensed is not None:
             self._changes = len(view.ledger.history)
         self._keyframes, self._edges = len(view.keyframes), view.backend.handed_over[1]
         self._solves, self._report = view.solves, view.report
+        return True
 
     def update(self) -> Update:
         """The changes since ``begin``; of verdicts and alarms, since the last update."""
+        if self._only_moves:
+            return NOTHING
         view = self._view
         solved, keyframes = view.solves > self._solves, range(self._keyframes, len(view.keyframes))
         if not solved and not keyframes:

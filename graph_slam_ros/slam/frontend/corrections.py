@@ -125,6 +125,12 @@ class Corrections:
         return self._of_odometry("distance"), self._of_odometry("turn")
 
     @property
+    def leave_odometry(self) -> bool:
+        """Return whether odometry is used as it comes."""
+        self._refresh()
+        return self._factors == (1.0, 1.0, 0.0)
+
+    @property
     def are_configured(self) -> bool:
         """Return whether the configuration corrects odometry."""
         c = self._config.odometry

@@ -63,6 +63,7 @@ class KeyframeFrontend:
     edges : adds fixes, loop closures and poses that are given
     corrections : of odometry and sightings
     gyro : as part of odometry; None where no input is one
+    T_odom_base : of the last step of odometry, as its messages have it
     covariance : (dof, dof) of the newest keyframe's pose, by the last solve and the odometry since
     initial_pose : the pose that is given for the next odometry
     held_covariance : (dof, dof) of the newest pose when the map was held, for the next odometry
@@ -99,7 +100,7 @@ class KeyframeFrontend:
         self.covariance = np.zeros((self._space.dof, self._space.dof))
         self.gyro = GyroFusion(config, self._noise, counters) if config.gyro_input else None
         self._sigma_factors = {one.name: one.sigma_factor for one in config.sources}
-        self._T_odom_base = self._space.identity  # of the last step of odometry, as its messages have it
+        self.T_odom_base: Numbers = self._space.identity
         self.initial_pose: InitialPose | None = None
         self.held_covariance: Array | None = None
         self.custom_noise_dominates: Callable[[CustomEdge, PoseAtStamp, float], bool] = lambda m, where, most: False
@@ -184,12 +185,17 @@ class KeyframeFrontend:
         self._add_parallel()
         for step in self.odometry.steps(m):
             seconds = 0.0 if before_ns is None else (step.stamp_ns - before_ns) * 1e-9
-            before_ns, self._T_odom_base = step.stamp_ns, step.T_odom_base
+            before_ns, self.T_odom_base = step.stamp_ns, step.T_odom_base
             if self.gyro is None:
                 yield self.corrections.step(step, seconds)
                 continue
             fused = self.gyro.fuse(self.corrections.without_bias(step), seconds, m.source)
             yield self.corrections.with_bias(fused, seconds)
+
+    @property
+    def uses_odometry_alone(self) -> bool:
+        """Return whether steps are those of the odometry in use, as it reports them: no gyro, nothing corrected."""
+        return self.gyro is None and self._parallel is None and self.corrections.leave_odometry
 
     def _add_parallel(self) -> None:
         """Add the complete motions of the other odometries as edges between keyframes."""
@@ -229,12 +235,18 @@ class KeyframeFrontend:
 
     def is_due(self) -> bool:
         """Return whether the motion since the last keyframe is large enough for another."""
-        motion, due, space = self.path.motion, self.config.keyframes, self._space
+        motion, longest_ns = self.path.motion, self.config.keyframes.max_interval_s * 1e9
         if motion is None or self.held_covariance is not None:
             return motion is not None
         at = motion.now.T_keyframe_base
-        far = space.square(at) >= due.min_distance_m**2 or space.angle(at) >= due.min_angle_rad
-        return far or motion.is_long or (motion.moving_ns >= due.max_interval_s * 1e9 and not self._noise.is_jitter(at))
+        return self.is_far(at) or motion.is_long() or (motion.moving_ns >= longest_ns and not self._noise.is_jitter(at))
+
+    def is_far(self, T_keyframe_base: Numbers) -> bool:
+        """Return whether a motion since the last keyframe is so large that another is due."""
+        due, space = self.config.keyframes, self._space
+        return (
+            space.square(T_keyframe_base) >= due.min_distance_m**2 or space.angle(T_keyframe_base) >= due.min_angle_rad
+        )
 
     # -- keyframes -------------------------------------------------------------------------------------------------
 
@@ -367,7 +379,7 @@ class KeyframeFrontend:
             self.gyro or self.corrections.found or self.corrections.are_configured
         ):  # odometry's own frame has no part in them
             left = self.corrections.uncorrected(rest.T_last_base) if rest is not None else self._space.identity
-            T_odom_base = tuple(map(float, group.compose(self._T_odom_base, group.inverse(left))))
+            T_odom_base = tuple(map(float, group.compose(self.T_odom_base, group.inverse(left))))
         self._append(
             Step(where.stamp_ns, self._space.identity, T_odom_base), motion.now.T_keyframe_base, where.covariance
         )

@@ -35,7 +35,18 @@ class OdometryNoise:
     each step. A robot at rest adds none.
     """
 
-    __slots__ = ("_by_motion", "_by_twist", "_config", "_density", "_flat", "_heading", "_space", "_square", "_way")
+    __slots__ = (
+        "_by_motion",
+        "_by_twist",
+        "_config",
+        "_density",
+        "_flat",
+        "_heading",
+        "_none",
+        "_space",
+        "_square",
+        "_way",
+    )
 
     def __init__(self, config: OdometryConfig, space: Geometry) -> None:
         self._config, self._space = config, space
@@ -50,6 +61,7 @@ class OdometryNoise:
         # other directions are to the first, and to heading, as the densities are
         self._way = np.diag([(one / c.translation_density) ** 2 for one in sigmas[:n]] + [0.0] * (len(sigmas) - n))
         self._heading = np.diag([0.0] * n + [(one / c.rotation_density) ** 2 for one in sigmas[n:]])
+        self._none = np.zeros_like(self._density)
         self._flat: Numbers = ()
         self._square: Array = self._density
 
@@ -70,7 +82,7 @@ class OdometryNoise:
     def of(
         self, step: Numbers, dt: float, twist_covariance: Numbers | None, turn_variance: Numbers | None = None
     ) -> Array:
-        """Return the covariance (dof, dof) that a step of dt seconds adds.
+        """Return the covariance (dof, dof) that a step of dt seconds adds. It is read only: it may be that of others.
 
         Parameters
         ----------
@@ -89,7 +101,7 @@ class OdometryNoise:
 
     def _motion(self, step: Numbers, dt: float) -> Array:
         if dt == 0.0:
-            return np.zeros_like(self._density)
+            return self._none
         c = self._config
         way, turned = math.hypot(*step[: self._space.dimensions]), self._space.angle(step)
         heading = c.turn_per_rad * turned + c.turn_per_m * way + c.turn_per_s * dt
@@ -162,16 +174,28 @@ class IntegratedOdometry:
         """Stamp of the keyframe."""
         return self._moved[0].stamp_ns
 
-    def step(self, step: Step) -> None:
-        """Append one step of odometry."""
-        self._extend(step, self._rest.update(step, (step.stamp_ns - self.now.stamp_ns) * 1e-9))
+    def after(self, T_keyframe_base: Numbers, motion: Numbers) -> Numbers:
+        """Return ``T_keyframe_base`` after one more motion."""
+        out: Numbers = self._space.group.compose_one(T_keyframe_base, motion)
+        return out
+
+    def step(self, step: Step, to: Numbers | None = None) -> None:
+        """Append one step of odometry.
+
+        Parameters
+        ----------
+        to : where it leads to, if that is known (``after``)
+        """
+        stands = self._rest.update(step, (step.stamp_ns - self._moved[-1].stamp_ns) * 1e-9)
+        self._extend(step, to or self.after(self._moved[-1].T_keyframe_base, step.T_last_base), stands)
 
     def resume_after_cut(self, rest: Step, stood: bool) -> None:
         """Append what ``cut`` left over of the motion before, in which the robot stood or not."""
-        self._extend(rest, stood)
+        self._extend(rest, self.after(self._moved[-1].T_keyframe_base, rest.T_last_base), stood)
 
-    def _extend(self, step: Step, stands: bool) -> None:
-        before, moved = self.now, self._after(step, stands)
+    def _extend(self, step: Step, to: Numbers, stands: bool) -> None:
+        before = self._moved[-1]
+        moved = self._extended(before, to, step, stands)
         self.moving_ns += (moved.stamp_ns - before.stamp_ns) * (not moved.stands)
         if before.stands and moved.stands:  # of a robot that stands for hours, only the last is remembered
             self._moved[-1] = moved
@@ -201,19 +225,14 @@ class IntegratedOdometry:
         self._moved[-1] = at
         return Step(last.stamp_ns, rest, rest, last.twist_covariance, turn_variance=last.turn_variance)
 
-    @property
-    def is_long(self) -> bool:
-        """Return whether too many messages are remembered, so that another keyframe is needed."""
-        return len(self._moved) >= _MOST
+    def is_long(self, more: int = 0) -> bool:
+        """Return whether, with some more, too many messages are remembered, so that a keyframe is needed."""
+        return len(self._moved) + more >= _MOST
 
     @property
     def before_last_ns(self) -> int:
         """Stamp of the last odometry but one, or of the keyframe."""
         return self._moved[-2].stamp_ns if len(self._moved) > 1 else self.start_ns
-
-    def _after(self, step: Step, stands: bool) -> OdometrySample:
-        to = self._space.group.compose_one(self.now.T_keyframe_base, step.T_last_base)
-        return self._extended(self.now, to, step, stands)
 
     def _extended(self, a: OdometrySample, to: Numbers, step: Step, stands: bool) -> OdometrySample:
         moving_ns = (step.stamp_ns - a.stamp_ns) * (not stands)

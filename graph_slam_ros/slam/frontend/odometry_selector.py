@@ -100,6 +100,27 @@ class OdometrySelector:
         self._leave_out(m)
         return []
 
+    def motions(self, following: Sequence[Odometry]) -> list[Numbers] | None:
+        """The motion to each of some messages, if all are new, of the odometry in use and no jump; else None."""
+        if self._used is None or not self._past.get(self._used.source):
+            return None
+        at, last_ns, out = self._used, self._past[self._used.source][-1].stamp_ns, list[Numbers]()
+        for m in following:
+            if m.source != at.source or m.stamp_ns == last_ns or int in map(type, m.T_odom_base):
+                return None
+            motion = self._space.group.between_one(at.T_odom_base, m.T_odom_base)
+            last = out[-1] if out else self._last_step
+            if self._is_reset(motion, m, last) or self._jumps(motion, (m.stamp_ns - at.stamp_ns) * 1e-9):
+                return None
+            at, last_ns = m, m.stamp_ns
+            out.append(motion)
+        return out
+
+    def follow(self, m: Odometry, motion: Numbers) -> Step:
+        """Return the step to a message by its motion (``motions``)."""
+        self._past[m.source].append(m)
+        return self._use(m, motion, broken="")
+
     def _leave_out(self, m: Odometry) -> None:
         if self._config.fusion == "parallel":
             self._counters.used[m.source] += 1
@@ -139,7 +160,7 @@ class OdometrySelector:
 
     def _follow(self, a: Odometry, b: Odometry) -> Step:
         step = self._space.group.between_one(a.T_odom_base, b.T_odom_base)
-        if self._is_reset(step, b):
+        if self._is_reset(step, b, self._last_step):
             return self._use(b, step, broken="reset_to_zero")
         return self._use(b, step, broken="jump" if self._jumps(step, (b.stamp_ns - a.stamp_ns) * 1e-9) else "")
 
@@ -151,14 +172,14 @@ class OdometrySelector:
         self._used, self._last_step = m, self._space.identity if broken else step
         return Step(m.stamp_ns, step, m.T_odom_base, m.twist_covariance, bool(broken))
 
-    def _is_reset(self, step: Numbers, to: Odometry) -> bool:
+    def _is_reset(self, step: Numbers, to: Odometry, last: Numbers) -> bool:
         """Return whether the driver restarted: odometry is at the origin, farther away than robots move in a step.
 
         The pause may have any length, because nothing arrives while a driver starts.
         """
         if abs(to.T_odom_base[0]) > _AT_ZERO or max(self._size(to.T_odom_base)) > _AT_ZERO:
             return False
-        (far_m, far_rad), (usual_m, usual_rad) = self._size(step), self._size(self._last_step)
+        (far_m, far_rad), (usual_m, usual_rad) = self._size(step), self._size(last)
         return far_m > max(_RESET_M, _UNUSUAL * usual_m) or far_rad > max(_RESET_RAD, _UNUSUAL * usual_rad)
 
     def _size(self, pose: Numbers) -> tuple[float, float]:

@@ -1,16 +1,15 @@
 """Odometry between the keyframes, in its own frame: kept for trial fits of a calibration."""
 
+from array import array
 from dataclasses import dataclass
 
 import numpy as np
 
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.slam.frontend.odometry_selector import Step
-from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.typing import Array, Index, Numbers
 
 _SAMPLED_NS = 50_000_000
-Sample = tuple[int, int, Numbers]
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,14 +39,14 @@ class OdometrySamples:
 
     def forget(self) -> None:
         """Start over, for stamps of another time."""
-        self._kept = StampedPoses[Sample](lambda *sample: sample, self._space.pose.size)
+        self._stamps_ns, self._poses = array("q"), array("d")
         self._last: Step | None = None
         self._kept_ns, self._there = 0, self._space.identity  # of the newest that is kept
 
     def forget_before(self, stamp_ns: int) -> None:
         """Forget the samples before a stamp."""
-        first = int(np.searchsorted(self._kept.stamps_ns, stamp_ns))
-        self._kept = self._kept.without(np.arange(first))
+        first = int(np.searchsorted(self._stamps_ns, stamp_ns))
+        del self._stamps_ns[:first], self._poses[: first * self._space.pose.size]
 
     def add(self, step: Step) -> None:
         """Keep a step if the next sample is due, and the one before where the robot begins to move."""
@@ -56,10 +55,15 @@ class OdometrySamples:
             if step.stamp_ns - self._kept_ns < _SAMPLED_NS or step.T_odom_base == self._there:
                 return
             if last.stamp_ns > self._kept_ns and last.T_odom_base == self._there:
-                self._kept.append(0, last.stamp_ns, self._there)
-        self._kept.append(0, step.stamp_ns, step.T_odom_base)
+                self._keep(last.stamp_ns, self._there)
+        self._keep(step.stamp_ns, step.T_odom_base)
         self._kept_ns, self._there = step.stamp_ns, step.T_odom_base
+
+    def _keep(self, stamp_ns: int, T_odom_base: Numbers) -> None:
+        self._stamps_ns.append(stamp_ns)
+        self._poses.extend(T_odom_base)
 
     def track(self, keyframes: Array, factors: tuple[float, float]) -> OdometryTrack:
         """Return copies of all samples, with odometry at the keyframes and the factors of distance and turn."""
-        return OdometryTrack(keyframes.copy(), self._kept.stamps_ns.copy(), self._kept.poses.copy(), *factors)
+        stamps_ns, poses = np.array(self._stamps_ns, dtype=np.int64), np.array(self._poses)
+        return OdometryTrack(keyframes.copy(), stamps_ns, poses.reshape(-1, self._space.pose.size), *factors)

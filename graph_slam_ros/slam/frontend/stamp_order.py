@@ -8,7 +8,8 @@ A sensor whose clock is corrected to an earlier time comes late by that: odometr
 without the correction. Else no keyframe could be made where a sighting was.
 """
 
-import heapq
+from bisect import insort
+from collections.abc import Sequence
 
 from graph_slam_ros.config.frontend import OrderingConfig
 from graph_slam_ros.measurements.counters import Counters
@@ -35,7 +36,7 @@ class StampOrder:
         self._window_ns = round(config.window_s * NS)
         self._max_pending = config.max_waiting
         self._counters = counters
-        self._heap: list[tuple[int, int, str, int, Odometry | Observation]] = []
+        self._queue: list[tuple[int, int, str, int, Odometry | Observation]] = []  # ascending
         self._recent: dict[str, dict[Observation, None]] = {}  # in the order they came
         self._arrivals = 0
         self._newest_odometry_ns: int | None = None
@@ -67,15 +68,12 @@ class StampOrder:
 
     def _has_room(self, stamp_ns: int) -> bool:
         """Return whether the queue has room, or the measurement with the latest stamp of all can make room."""
-        if len(self._heap) < self._max_pending:
+        if len(self._queue) < self._max_pending:
             return True
-        latest = max(range(len(self._heap)), key=self._heap.__getitem__)
-        at_ns, _, _, _, m = self._heap[latest]
+        at_ns, _, _, _, m = self._queue[-1]
         if at_ns <= stamp_ns or isinstance(m, Odometry):
             return False
-        self._heap[latest] = self._heap[-1]
-        self._heap.pop()
-        heapq.heapify(self._heap)
+        self._queue.pop()
         self._counters.count(m.topic, "overflow", size_of(m))
         return True
 
@@ -92,7 +90,7 @@ class StampOrder:
     def push(self, m: Odometry | Observation) -> list[Odometry | Observation]:
         """Queue one measurement; return those that are released."""
         rank, topic = (0, "") if isinstance(m, Odometry) else (1, m.topic)
-        heapq.heappush(self._heap, (self._corrections.stamp_ns(m), rank, topic, self._arrivals, m))
+        insort(self._queue, (self._corrections.stamp_ns(m), rank, topic, self._arrivals, m))
         self._arrivals += 1
         if isinstance(m, Odometry):
             self._newest_odometry_ns = max(m.stamp_ns, self._newest_odometry_ns or m.stamp_ns)
@@ -102,22 +100,43 @@ class StampOrder:
 
     def flush(self) -> list[Odometry | Observation]:
         """Release all that is queued."""
-        return self._release(max((entry[0] for entry in self._heap), default=0))
+        return self._release(self._queue[-1][0] if self._queue else 0)
 
     def forget(self) -> None:
         """Start over, for stamps of another time."""
-        self._heap.clear()
+        self._queue.clear()
         self._recent.clear()
         self._newest_odometry_ns = self._released_ns = None
 
     def _release(self, until_ns: int) -> list[Odometry | Observation]:
-        out = []
-        while self._heap and self._heap[0][0] <= until_ns:
-            stamp_ns, _, _, _, m = heapq.heappop(self._heap)
-            if self._newest_odometry_ns is not None:  # a landmark message of the future is not what others are late for
-                self._released_ns = max(self._released_ns or 0, min(stamp_ns, self._newest_odometry_ns))
-            out.append(m)
+        count = next((k for k, entry in enumerate(self._queue) if entry[0] > until_ns), len(self._queue))
+        out, self._queue = self._queue[:count], self._queue[count:]
+        if out and self._newest_odometry_ns is not None:  # what is of the future is not what others are late for
+            self._released_ns = max(self._released_ns or 0, min(out[-1][0], self._newest_odometry_ns))
+        return [entry[-1] for entry in out]
+
+    def next_odometry(self, m: Odometry) -> list[Odometry] | None:
+        """Return the odometry that newer odometry releases; None if it is not newer, or releases more than that."""
+        newest_ns, out = self._newest_odometry_ns, list[Odometry]()
+        until_ns = m.stamp_ns - self._window_ns - self._corrections.lag_ns()
+        if newest_ns is None or m.stamp_ns <= newest_ns or m.stamp_ns <= until_ns:
+            return None
+        for stamp_ns, rank, _, _, queued in self._queue:
+            if stamp_ns > until_ns:
+                break
+            if rank or not isinstance(queued, Odometry):
+                return None
+            out.append(queued)
         return out
+
+    def exchange(self, m: Odometry, released: Sequence[Odometry]) -> None:
+        """Queue the odometry that ``next_odometry`` was asked with, and release what that has returned."""
+        if released:
+            del self._queue[: len(released)]
+            self._released_ns = max(self._released_ns or 0, released[-1].stamp_ns)
+        insort(self._queue, (m.stamp_ns, 0, "", self._arrivals, m))
+        self._arrivals += 1
+        self._newest_odometry_ns = m.stamp_ns
 
 
 class PendingObservations:
@@ -152,6 +171,9 @@ class PendingObservations:
         else:
             self._pending.append(m)
         return False
+
+    def __len__(self) -> int:
+        return len(self._pending)
 
     def reached(self, until_ns: int) -> list[Observation]:
         """Return the pending observations that odometry has reached."""

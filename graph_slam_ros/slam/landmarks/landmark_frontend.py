@@ -143,7 +143,7 @@ class LandmarkFrontend:
 
     def travel(self, step: Step) -> list[Assigned]:
         """Add a step of odometry. Returns the sightings of earlier scans that can be used now."""
-        return self._passed(self.anonymous.travel(step)) if self._is_anonymous else []
+        return self._passed(self.anonymous.travel(step)) if self.is_anonymous else []
 
     def forget_where(self) -> None:
         """Forget what depends on the axes of the map, because it has moved."""
@@ -155,7 +155,8 @@ class LandmarkFrontend:
         return self._passed(self.anonymous.end_scan())
 
     @property
-    def _is_anonymous(self) -> bool:
+    def is_anonymous(self) -> bool:
+        """Return whether landmarks are told apart without identities, so that they need each step of odometry."""
         return self._config.association in ("nearest", "joint")
 
     def _passed(self, named: Sequence[Assigned]) -> list[Assigned]:
@@ -169,7 +170,7 @@ class LandmarkFrontend:
     def review(self, keyframes: StampedPoses[Keyframe], *, everything: bool) -> None:
         """Review the landmarks: which are gone, and those without id. The next solve includes the changes."""
         self.lifetimes.review(keyframes)
-        if self._is_anonymous and everything:
+        if self.is_anonymous and everything:
             self.anonymous.explain_all(keyframes)
-        elif self._is_anonymous:
+        elif self.is_anonymous:
             self.anonymous.review(keyframes)
