@@ -3,6 +3,7 @@
 All of it is told by the ingest sequence: a replay fails where the live run did, and recovers as it did.
 """
 
+from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -11,18 +12,19 @@ from typing import TypeVar
 import numpy as np
 
 from graph_slam_ros.errors import DivergedError, message_of
-from graph_slam_ros.graph import GROUPS
+from graph_slam_ros.graph import GROUPS, SE2
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.robust.gating import CANDIDATES
 from graph_slam_ros.slam.robust.landmark_support import landmark_of
 from graph_slam_ros.slam.robust.ledger import Reason
-from graph_slam_ros.typing import Array
+from graph_slam_ros.typing import Array, Index
 
 Result = TypeVar("Result")
 
 _FAR = 1.0  # m, rad: whoever moves no farther has not gone astray
 _RISE = 10.0  # times the cost before, or of residuals as large as their noise: more is no solution
+_MOST_WRAPPED = 10  # headings that are looked for, each by its place
 _TRIALS = 30  # solves in search of what is to blame
 
 
@@ -122,7 +124,9 @@ class FailureGuard:
         values, before = self._solver.values, self._last_good()
         if not np.isfinite(values).all():
             raise DivergedError("the estimate is not finite")
-        if np.abs(values - before).max(initial=0.0) <= _FAR:
+        moved = np.abs(values - before)
+        far = np.flatnonzero(~(moved <= _FAR))
+        if self._are_wrapped(far, moved[far]):
             return
         now = self._solver.evaluate()
         if now.cost_final <= _RISE * sum(one.residuals for one in now.classes.values()):
@@ -130,6 +134,18 @@ class FailureGuard:
         then = self._solver.evaluate(at=before)
         if not now.cost_final <= _RISE * then.cost_final:
             raise DivergedError(f"the cost rose from {then.cost_final:.3g} to {now.cost_final:.3g}")
+
+    def _are_wrapped(self, far: Index, moved: Array) -> bool:
+        """Return whether all numbers that changed far, by their place, are headings that passed pi."""
+        is_turn = np.abs(moved - 2.0 * np.pi) <= _FAR
+        return len(far) <= _MOST_WRAPPED and bool(is_turn.all()) and all(map(self._is_heading, far.tolist()))
+
+    def _is_heading(self, place: int) -> bool:
+        """Return whether a stored number is the heading of a pose in the plane."""
+        graph = self._graph
+        after = bisect_right(range(graph.vertex_count), place, key=lambda vertex: graph.vertex(vertex).stored.start)
+        one = graph.vertex(after - 1)
+        return one.kind is SE2 and place == one.stored.stop - 1
 
     # -- quarantine --------------------------------------------------------------------------------------------------
 
