@@ -12,6 +12,7 @@ os.environ["MPLBACKEND"] = (
     "agg"  # pictures go into files: what a shell says of windows is not for them, and may be wrong
 )
 
+import gc
 import io
 import signal
 import sys
@@ -22,11 +23,13 @@ from graph_slam_ros import progress
 from graph_slam_ros.cli import console
 from graph_slam_ros.errors import GraphSlamError
 
+_OBJECTS = 50_000  # that are new before cycles are searched for: there are hardly any, and a run makes many objects
 _COMPUTES = {"optimize", "solve", "influence"}  # with kernels, and without a warm-up of their own
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns its exit code."""
+    gc.set_threshold(_OBJECTS, 20, 50)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # what the terminal's encoding lacks is shown escaped
             stream.reconfigure(errors="backslashreplace")

@@ -37,6 +37,7 @@ own that takes the place of all parts before. Where a run was killed before it d
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import astuple
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -120,7 +121,7 @@ class MapGrowth:
         out: Record = {"type": "growth"}
         out["vertices"] = [_vertex(graph, v) for v in range(self._vertices, graph.vertex_count)]
         out["edges"] = [_edge(graph, edge) for edge in range(first_edge, graph.edge_count)]
-        out["judged"] = [_judgement(a.ledger, edge) for edge in range(self._judged, len(a.ledger))]
+        out["judged"] = _judgements(a.ledger, self._judged)
         out["changes"] = [_change(change) for change in a.ledger.history[self._changes :]]
         if not self._keyframes and a.bounded is not None:
             out["condensed"] = condensed_record(graph, a.first_keyframe, a.bounded)
@@ -266,14 +267,19 @@ def _edge(graph: Graph, edge: int) -> list[Any]:
     return [tag_of(one.type), list(one.vertices), measured, root, one.label, one.source]
 
 
-def _judgement(ledger: Ledger, edge: int) -> list[Any]:
-    first, numbers = int(ledger.keyframe.values[edge]), int(ledger.numbers.values[edge])
-    verdict, reason = Verdict(int(ledger.verdict.values[edge])), Reason(int(ledger.reason.values[edge]))
-    statistic, threshold = (
-        _as_json(float(ledger.statistic.values[edge])),
-        _as_json(float(ledger.threshold.values[edge])),
-    )
-    return [first, statistic, threshold, numbers, ledger.residual(edge).tolist(), *_named(verdict, reason)]
+def _judgements(ledger: Ledger, first: int) -> list[list[Any]]:
+    """The verdicts from an edge on, as JSON."""
+    columns = ledger.keyframe, ledger.statistic, ledger.threshold, ledger.numbers, ledger.verdict, ledger.reason
+    rows = zip(*(column.values[first:].tolist() for column in columns), strict=True)
+    return [
+        [keyframe, _as_json(statistic), _as_json(threshold), numbers, ledger.residual(edge).tolist(), *_words(*codes)]
+        for edge, (keyframe, statistic, threshold, numbers, *codes) in enumerate(rows, first)
+    ]
+
+
+@cache
+def _words(verdict: int, reason: int) -> tuple[str, str]:
+    return _named(Verdict(verdict), Reason(reason))
 
 
 def _change(c: VerdictChange) -> list[Any]:
