@@ -50,6 +50,11 @@ def configured_variance(now: Array, part: str, of_group: Mapping[str, float], me
     return np.maximum(own, _LEAST_OWN * now) / of_group.get(part, 1.0) ** 2
 
 
+def depends_on_place(edge: EdgeType, label: str) -> bool:
+    """Return whether the parts of the residual are along the line of sight, and across it."""
+    return label != "custom" and edge.name.removesuffix(" 3D") in ("landmark position", "tag position")
+
+
 def parts_of(edge: EdgeType, label: str, measured: Array) -> dict[str, Array]:
     """Split the residual of edges into parts: orthonormal directions (n, m, k) of each.
 
@@ -62,7 +67,7 @@ def parts_of(edge: EdgeType, label: str, measured: Array) -> dict[str, Array]:
     name = edge.name.removesuffix(" 3D")
     if label == "custom":  # nobody knows what its numbers are
         return {"all": axes}
-    if name in ("landmark position", "tag position"):
+    if depends_on_place(edge, label):
         return _sight_parts(measured[:, :m])
     if name == "range and bearing":
         return {"range": axes[:, :, :1], "bearing": axes[:, :, 1:]}
@@ -161,6 +166,7 @@ class NoiseScales:
         self.factors: dict[Key, float] = dict(factors or {})
         self.history: list[Rescaling] = []
         self._due = FIRST_DUE
+        self._narrower: dict[tuple[EdgeType, str, str], Array] = {}  # where it does not depend on what is measured
 
     def is_due(self, keyframes: int) -> bool:
         """Return whether the number of keyframes has doubled since the last estimate."""
@@ -176,9 +182,25 @@ class NoiseScales:
         label, source = (*names, "")[:2]
         factors = _of(self.factors, label, source)
         if factors:
-            z = edge.whole(np.asarray(measured, dtype=float)[None])
-            noise = Gaussian(_rescaled(edge, label, z, noise.sqrt_information[None], {}, factors)[0])
+            noise = Gaussian(self._scaled(edge, label, source, measured, noise.sqrt_information[None], factors)[0])
         return self.graph.add_edge(edge, vertices, measured, noise, label, source)
+
+    def _scaled(
+        self,
+        edge: EdgeType,
+        label: str,
+        source: str,
+        measured: Sequence[float] | Array,
+        root: Array,
+        factors: Mapping[str, float],
+    ) -> Array:
+        """Return the square root (1, m, m) of the information of one edge, scaled by the factors of its group."""
+        z = edge.whole(np.asarray(measured, dtype=float)[None])
+        if grows(edge, label) or depends_on_place(edge, label):
+            return _rescaled(edge, label, z, root, {}, factors)
+        if (edge, label, source) not in self._narrower:
+            self._narrower[edge, label, source] = _narrower(edge, label, z, {}, factors)
+        return root @ self._narrower[edge, label, source]
 
     def change(self, factors: Mapping[Key, float], first_edge: int) -> bool:
         """Scale the edges from a number on, and all later ones, by these factors; return whether an edge changed."""
@@ -188,6 +210,7 @@ class NoiseScales:
         rescaling = Rescaling(first_edge, self.graph.edge_count, before, dict(factors))
         rescaling.apply(self.graph)
         self.factors |= factors
+        self._narrower.clear()
         self.history.append(rescaling)
         return True
 
@@ -214,11 +237,18 @@ def _rescaled(
 ) -> Array:
     if grows(edge, label):
         return _regrown(edge, label, measured, roots, before, after)
+    return roots @ _narrower(edge, label, measured, before, after)
+
+
+def _narrower(
+    edge: EdgeType, label: str, measured: Array, before: Mapping[str, float], after: Mapping[str, float]
+) -> Array:
+    """Return what scales the square roots (n, m, m) of edges whose noise does not grow with the measured motion."""
     narrower = np.zeros((len(measured), edge.residual_size, edge.residual_size))
     for part, axes in parts_of(edge, label, measured).items():
         ratio = after.get(part, 1.0) / before.get(part, 1.0)
         narrower += axes @ np.swapaxes(axes, 1, 2) / ratio
-    return roots @ narrower
+    return narrower
 
 
 def _regrown(

@@ -156,8 +156,8 @@ class DisplacementSearch:
     def _drift_of(self, edge: int) -> Array:
         """Variances [m^2, rad^2] of one step of odometry, the largest of any direction."""
         root, n = self._graph.edge(edge).sqrt_information, self._space.dimensions
-        covariance = np.linalg.inv(root.T @ root)
-        return np.array([np.diag(covariance)[:n].max(), np.diag(covariance)[n:].max()])
+        variances = np.linalg.inv(root.T @ root).diagonal()
+        return np.array([variances[:n].max(), variances[n:].max()])
 
     def add_initial_pose(self, edge: int, keyframe: int) -> None:
         """A pose that was given at a keyframe."""
@@ -211,9 +211,8 @@ class DisplacementSearch:
         return replace(best, rival=int(max(rivals, default=0)))
 
     def _standing(self) -> list[_Seen]:
-        ledger = self._ledger
-        count = len(ledger)
-        return [one for one in self._seen if one.edge < count and not ledger.is_withdrawn(one.edge)]
+        is_standing = self._ledger.is_standing()
+        return [one for one in self._seen if is_standing(one.edge)]
 
     def _window(self) -> _Window | None:
         seen = self._standing()

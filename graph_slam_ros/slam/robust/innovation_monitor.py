@@ -8,7 +8,7 @@ as many as the rate of such errors in this drive explains. Ranges and bearings a
 
 from collections import deque
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import lru_cache
 
 import numpy as np
 from scipy.special import bdtr, betaincinv
@@ -83,25 +83,27 @@ class InnovationMonitor:
         self._seen.append(_Seen(edge, keyframe, landmark, stamp_ns))
 
     def _leave_behind(self, one: _Seen) -> None:
-        if self._is_standing(one) and self._known_from(one.landmark) < one.keyframe:
+        if self._ledger.is_standing()(one.edge) and self._known_from(one.landmark) < one.keyframe:
             self._count += 1
             self._held_back += not self._ledger.is_inside(one.edge)
-
-    def _is_standing(self, one: _Seen) -> bool:
-        return one.edge < len(self._ledger) and not self._ledger.is_withdrawn(one.edge)
 
     def _known_from(self, landmark: int) -> int:
         return self._history.known_from(landmark, self._seen[0].edge)
 
     def _window(self) -> list[_Seen]:
         """The newest, the newest first."""
-        out, times, known_from = list[_Seen](), dict[int, int](), cache(self._known_from)
+        out, times, known_from = list[_Seen](), dict[int, int](), dict[int, int]()
+        is_standing = self._ledger.is_standing()
         for one in reversed(self._seen):
             if len(out) == _WINDOW or (self._seen[-1].stamp_ns - one.stamp_ns) * 1e-9 > _REACH_S:
                 break
-            is_full = times.get(one.landmark, 0) == _PER_LANDMARK
-            if not is_full and self._is_standing(one) and known_from(one.landmark) < one.keyframe:
-                times[one.landmark] = times.get(one.landmark, 0) + 1
+            landmark, count = one.landmark, times.get(one.landmark, 0)
+            if count == _PER_LANDMARK or not is_standing(one.edge):
+                continue
+            if landmark not in known_from:
+                known_from[landmark] = self._known_from(landmark)
+            if known_from[landmark] < one.keyframe:
+                times[landmark] = count + 1
                 out.append(one)
         return out
 

@@ -1,6 +1,6 @@
 """The ledger: all decisions on every measurement that may be wrong, with keyframe and reason."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from copy import copy, deepcopy
 from dataclasses import dataclass, replace
 from enum import IntEnum
@@ -207,6 +207,11 @@ class Ledger:
     def is_withdrawn(self, edge: int) -> bool:
         """Return whether an edge was removed permanently."""
         return edge < len(self) and self.reason.values.item(edge) in _FINAL and self.verdict.values.item(edge) != 0
+
+    def is_standing(self) -> Callable[[int], bool]:
+        """Return a function of an edge: whether it is judged and was not removed permanently, as it is now."""
+        count, reason, verdict = len(self), self.reason.values.item, self.verdict.values.item
+        return lambda edge: edge < count and not (reason(edge) in _FINAL and verdict(edge) != 0)
 
     @property
     def inside(self) -> Index:
