@@ -280,7 +280,9 @@ class Condenser:
                 others = [edge for edge in map(graph.edge, sorted(on_it)) if edge.label == CLOSURES and edge.weight]
                 others = [edge for edge in others if set(edge.vertices) == set(one.vertices)]
                 found = fused_closure(space, one, others, self.limits.gate) if label == CLOSURES else None
-                if found is None and label == CLOSURES and len(others) >= self.limits.closures:
+                if found is None and label == CLOSURES and (
+                    len(others) >= self.limits.closures or (not others and self._have_enough(one.vertices))
+                ):
                     continue
                 fusion = found or one
             noise, ends = Gaussian(fusion.root), list(fusion.vertices)
@@ -288,6 +290,16 @@ class Condenser:
             replaced |= set() if fusion.replaces is None else {fusion.replaces}
         graph.set_weights(np.array(sorted(replaced & set(added)), dtype=np.int64), 0.0)
         return [edge for edge in added if edge not in replaced], sorted(replaced - set(added))
+
+    def _have_enough(self, vertices: Collection[int]) -> bool:
+        """Return whether vertices that no closure joins have closures to so many others that one more says little."""
+        graph = self.solver.graph
+        for vertex in vertices:
+            edges = map(graph.edge, self.solver.edges_on(vertex).tolist())
+            others = {v for edge in edges if edge.label == CLOSURES and edge.weight for v in edge.vertices}
+            if len(others) <= self.limits.others:  # one of these is the vertex itself
+                return False
+        return True
 
     def _lay(self, marks: Collection[int]) -> bool:
         """Return whether landmarks say how a constellation lies: one that is a pose does, or two or three points."""

@@ -18,12 +18,14 @@ class Limits:
     ----------
     members : landmarks of one place, at most; places : of one cell, at most
     closures : between the same two bases, at most: those that agree are one
+    others : to so many vertices each vertex has closures; two that both have more are not joined any more
     gate : quantile of chi2 above which a visit contradicts itself or its place
     """
 
     members: int = 48
     places: int = 8
     closures: int = 4
+    others: int = 5
     gate: float = 0.9999
 
 
