@@ -1,4 +1,4 @@
-"""Writes mcap in chunks, compressed, with the bytes of the library's writer, in a quarter of its time per message."""
+"""Writes mcap in chunks, compressed, with the bytes of the library's writer, in half of its time for a message."""
 
 import struct
 import zlib
