@@ -6,7 +6,7 @@ The record ``condensed`` of a ``growth`` (``map_journal``) has
 * ``vertices``, ``edges``: the lasting ids of the first rows, and that of the row after these;
 * ``old``: number, vertex, stamp and ``T_odom_base`` of each keyframe before the first that is in the graph;
 * ``places``: cell, edge, visits, the strikes against its landmarks, by vertex, and ``linearized_at``, of each place;
-* ``skeleton``: cells and directions in which a keyframe of a visit that is in no place has stayed;
+* ``skeleton``: position, axis and sign of each keyframe of a visit that is in no place which has stayed;
 * ``attached``: the number of the first keyframe that has left and at which closures can begin; null if there is none;
 * ``left``: how many keyframes, poses at which something was seen, and frames have left the map;
 * ``accepted``: of each drive, by its first keyframe, how many accepted measurements of each input have left the map.
@@ -76,7 +76,7 @@ def condensed_record(graph: Graph, first: int, state: BoundedState) -> Record:
         "left": left,
         "scale": astuple(state.scale),
         "accepted": [[first, dict(of)] for first, of in state.accepted.items()],
-        "skeleton": sorted(map(list, state.skeleton)),
+        "skeleton": list(state.skeleton.rows()),
         "attached": state.attached.first if state.attached.end == state.keyframes else None,
     }
 
@@ -98,7 +98,8 @@ def read_condensed(graph: Graph, record: Mapping[str, Any]) -> tuple[int, Bounde
     keyframes, sightings, *frames = record["left"]
     state = BoundedState(keyframes=keyframes, sightings=sightings, frames=frames[0] if frames else 0)
     state.accepted |= {first: Counter(of) for first, of in record.get("accepted", ())}  # an older map has none
-    state.skeleton |= set(map(tuple, record.get("skeleton", ())))
+    rows = record.get("skeleton", ())
+    state.skeleton.restore(rows, len(rows[0]) - 2 if rows else 0)
     first = record.get("attached")
     state.attached = AttachedKeyframes(keyframes if first is None else int(first))
     state.scale = VisitScale(*record.get("scale", ()))  # nor this

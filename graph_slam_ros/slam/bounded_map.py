@@ -99,8 +99,9 @@ class BoundedMap:
         self._landmarks, self._anchor, self._kidnaps = landmarks, anchor, kidnaps
         self._solution, self._counters = solution, counters
         config, self.state = frontend.config, backend.bounded
-        self.condenser = Condenser(self._space, backend.solver, thin_m=_THIN * config.map.cell_m)
+        self.condenser = Condenser(self._space, backend.solver)
         self.condenser.places, self.condenser.scale = self.state.places, self.state.scale
+        self.state.skeleton.spread(_THIN * config.map.cell_m)
         self.condenser.skeleton = self.state.skeleton
         frontend.path.attached = self.state.attached
         frontend.path.vertex_of = lambda lasting: backend.graph.vertex_ids.find(lasting)
@@ -129,7 +130,7 @@ class BoundedMap:
             return None
         backend, keyframes = self._backend, self._frontend.path.keyframes
         graph, values, places = backend.graph.copy(), backend.solver.values, _copies(self.state.places)
-        vertices, scale, skeleton = backend.solver.vertices, replace(self.state.scale), set(self.state.skeleton)
+        vertices, scale, skeleton = backend.solver.vertices, replace(self.state.scale), self.state.skeleton.copy()
         self._tried = len(keyframes)
         self.condenser.serves_closures = self._frontend.config.has_closures or CLOSURES in backend.graph.labels
         try:

@@ -22,8 +22,9 @@ from graph_slam_ros.slam.lifelong.fit import VisitScale, fit_of
 from graph_slam_ros.slam.lifelong.outcome import ITSELF, PLACE, Condensed, Limits, RemovedPose
 from graph_slam_ros.slam.lifelong.place import Fused, Place
 from graph_slam_ros.slam.lifelong.place_edge import PlaceEdge, added_place
+from graph_slam_ros.slam.lifelong.skeleton import Skeleton
 from graph_slam_ros.slam.lifelong.surroundings import CLOSURES, Motion, Surroundings, chained, motion_of, surroundings
-from graph_slam_ros.slam.lifelong.thinned import CHAIN, Thinning, cell_of
+from graph_slam_ros.slam.lifelong.thinned import CHAIN, Thinning
 from graph_slam_ros.slam.lifelong.visit import Visit, best_known, visit_of
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Numbers
@@ -40,8 +41,7 @@ class Condenser:
     ----------
     places : by cell
     scale : of the variances of visits
-    skeleton : cells and directions in which a keyframe of a visit that is in no place stays
-    thin_m : width of these cells
+    skeleton : where keyframes of visits that are in no place stay
     serves_closures : whether closures may come that begin at removed keyframes
     """
 
@@ -51,13 +51,12 @@ class Condenser:
         solver: Solver,
         limits: Limits | None = None,
         *,
-        thin_m: float = 2.0,
         serves_closures: bool = False,
     ) -> None:
         self.space, self.solver, self.limits = space, solver, limits or Limits()
-        self.thin_m, self.serves_closures = thin_m, serves_closures
+        self.serves_closures = serves_closures
         self.places: dict[Cell, list[PlaceEdge]] = {}
-        self.scale, self.skeleton = VisitScale(), set[Cell]()
+        self.scale, self.skeleton = VisitScale(), Skeleton()
 
     def condense(
         self, visit: Sequence[int], after: int, cell: Cell, ahead: Collection[int], *, waits: bool = True
@@ -197,12 +196,10 @@ class Condenser:
         keeps = self.serves_closures or bool(around.closures_and_fixes)
 
         def is_kept(vertex: int) -> bool:
-            key, before = cell_of(self.space, poses[vertex], self.thin_m), len(self.skeleton)
-            if keeps:
-                self.skeleton.add(key)
-            return len(self.skeleton) > before
+            return keeps and self.skeleton.adds(self.space, poses[vertex])
 
-        thin = Thinning(self.space, visit, after, around, is_kept, self.thin_m, self.limits.gate).run()
+        reach_m = self.skeleton.apart_m
+        thin = Thinning(self.space, visit, after, around, is_kept, reach_m, self.limits.gate).run()
         carried = [*thin.added]
         for base, fixes in thin.fixes.items():
             (begin,) = self.solver.estimate([base]).tolist()
@@ -280,8 +277,10 @@ class Condenser:
                 others = [edge for edge in map(graph.edge, sorted(on_it)) if edge.label == CLOSURES and edge.weight]
                 others = [edge for edge in others if set(edge.vertices) == set(one.vertices)]
                 found = fused_closure(space, one, others, self.limits.gate) if label == CLOSURES else None
-                if found is None and label == CLOSURES and (
-                    len(others) >= self.limits.closures or (not others and self._have_enough(one.vertices))
+                if (
+                    found is None
+                    and label == CLOSURES
+                    and (len(others) >= self.limits.closures or (not others and self._have_enough(one.vertices)))
                 ):
                     continue
                 fusion = found or one

@@ -25,7 +25,7 @@ class Limits:
     members: int = 48
     places: int = 8
     closures: int = 4
-    others: int = 5
+    others: int = 10
     gate: float = 0.9999
 
 

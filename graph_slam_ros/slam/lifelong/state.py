@@ -8,6 +8,7 @@ from graph_slam_ros.slam.lifelong.condenser import Cell
 from graph_slam_ros.slam.lifelong.fit import VisitScale
 from graph_slam_ros.slam.lifelong.place_edge import PlaceEdge
 from graph_slam_ros.slam.lifelong.removed import OldKeyframe
+from graph_slam_ros.slam.lifelong.skeleton import Skeleton
 
 
 @dataclass(slots=True)
@@ -19,7 +20,7 @@ class BoundedState:
     places : by cell
     scale : of the variances of visits
     old : the keyframes in the graph that are in no list of keyframes any more, in order of time
-    skeleton : cells and directions in which a keyframe of a visit that is in no place has stayed
+    skeleton : where keyframes of visits that are in no place have stayed
     attached : the keyframes that have left the map, where closures may begin at them
     keyframes, sightings, frames : how many have left the map
     accepted : of each drive, by its first keyframe, how many accepted measurements of each input have left the map
@@ -28,7 +29,7 @@ class BoundedState:
     places: dict[Cell, list[PlaceEdge]] = field(default_factory=dict)
     scale: VisitScale = field(default_factory=VisitScale)
     old: list[OldKeyframe] = field(default_factory=list)
-    skeleton: set[Cell] = field(default_factory=set)
+    skeleton: Skeleton = field(default_factory=Skeleton)
     attached: AttachedKeyframes = field(default_factory=AttachedKeyframes)
     keyframes: int = 0
     sightings: int = 0

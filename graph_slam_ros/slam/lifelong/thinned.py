@@ -236,16 +236,3 @@ class Thinning:
 def _scaled(edge: Edge, factor: float) -> Motion | None:
     """Return what a closure measured, with its information times a factor; None where that is nearly nothing."""
     return motion_of(edge, factor) if factor > _COUNTS else None
-
-
-def sector(space: Geometry, pose: Sequence[float]) -> tuple[int, ...]:
-    """Return which axis of the map a pose looks along, as its number and its sign."""
-    forward = space.turn(tuple(pose))[:, 0]
-    axis = int(np.argmax(np.abs(forward)))
-    return axis, int(np.sign(forward[axis]))
-
-
-def cell_of(space: Geometry, pose: Sequence[float], width_m: float) -> tuple[int, ...]:
-    """Return the cell of a grid and the direction of a pose."""
-    cell = np.floor(np.array(pose[: space.dimensions]) / width_m).astype(np.int64).tolist()
-    return (*cell, *sector(space, pose))

@@ -117,7 +117,7 @@ def test_a_replay_gives_the_same_bytes(recorded, tmp_path):
 def test_closures_to_keyframes_that_left_before_a_restart_are_used(recorded, tmp_path):
     folder, slam, _ = recorded
     start = read_map(folder, [])
-    assert start.bounded.skeleton == slam.bounded.skeleton
+    assert start.bounded.skeleton.positions == slam.bounded.skeleton.positions
     rows = range(slam.bounded.attached.first, slam.bounded.attached.end)
     assert len(rows) == slam.first_keyframe
     assert all(start.bounded.attached.read(k).tobytes() == slam.bounded.attached.read(k).tobytes() for k in rows)

@@ -6,8 +6,9 @@ import pytest
 from graph_slam_ros.graph import Gaussian, Graph
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
 from graph_slam_ros.slam.lifelong.elimination import marginal_information
+from graph_slam_ros.slam.lifelong.skeleton import Skeleton
 from graph_slam_ros.slam.lifelong.surroundings import surroundings
-from graph_slam_ros.slam.lifelong.thinned import CHAIN, Thinning, cell_of
+from graph_slam_ros.slam.lifelong.thinned import CHAIN, Thinning
 from graph_slam_ros.solver import Solver
 
 BASES, POSES = 3, 6
@@ -120,7 +121,20 @@ def test_a_visit_without_closures_is_one_edge_and_one_that_nothing_leads_to_none
     assert {centre for centre, _ in thin.centres.values()} == {loose.after}
 
 
-def test_the_cell_of_a_pose_has_its_direction():
-    assert cell_of(PLANAR, (3.9, -0.1, 0.1), 2.0) == (1, -1, 0, 1)
-    assert cell_of(PLANAR, (3.9, -0.1, 3.1), 2.0) == (1, -1, 0, -1)
-    assert cell_of(SPATIAL, (0.0, 0.0, 5.0, 0.0, 0.0, np.sin(np.pi / 4), np.cos(np.pi / 4)), 2.0) == (0, 0, 2, 1, 1)
+def test_keyframes_stay_apart_unless_they_look_another_way():
+    skeleton, east, west = Skeleton(2.0), (3.9, -0.1, 0.1), (3.9, -0.1, 3.1)
+    assert skeleton.adds(PLANAR, east)
+    assert not skeleton.adds(PLANAR, (4.1, 1.0, -0.3))  # in the next cell, and near
+    assert skeleton.adds(PLANAR, west)
+    assert skeleton.adds(PLANAR, (6.0, -0.1, 0.1))
+    saved = Skeleton(2.0)
+    saved.restore(list(skeleton.rows()), 2)
+    assert saved.positions == skeleton.positions
+    assert len(saved) == 3
+    saved.spread(5.0)
+    assert len(saved) == 3
+    assert not saved.adds(PLANAR, (1.0, -0.1, 0.1))
+    space = Skeleton(2.0)
+    assert space.adds(SPATIAL, (0.0, 0.0, 5.0, 0.0, 0.0, 0.0, 1.0))
+    assert not space.adds(SPATIAL, (0.0, 0.0, 6.5, 0.0, 0.0, 0.0, 1.0))
+    assert space.adds(SPATIAL, (0.0, 0.0, 5.0, 0.0, 0.0, np.sin(np.pi / 4), np.cos(np.pi / 4)))
