@@ -13,6 +13,7 @@ from types import TracebackType
 from typing import Any, Protocol
 
 from mcap.records import Channel, Message, Schema
+from mcap.writer import CompressionType, Writer
 from rosbags.typesys.store import Typestore
 
 from graph_slam_ros.errors import FormatError, GraphSlamError
@@ -21,7 +22,6 @@ from graph_slam_ros.formats.files import opened
 from graph_slam_ros.messages.interfaces import typestore
 from graph_slam_ros.recordings import mcap_records, ros1_records, sqlite_records
 from graph_slam_ros.recordings.decompression import ZSTD_MAGIC, zstd_message
-from graph_slam_ros.recordings.mcap_writer import McapWriter
 from graph_slam_ros.recordings.recorded_types import ros1_store
 
 _SUFFIXES = (".mcap", ".db3", ".bag", ".bag.active", ".mcap.zstd", ".db3.zstd")
@@ -334,7 +334,8 @@ class BagWriter:
 
     def __init__(self, path: Path | str) -> None:
         self._file = AppendedFile(Path(path))
-        self._writer = McapWriter(self._file, "ros2", chunk_bytes=2**20)
+        self._writer = Writer(self._file, compression=CompressionType.ZSTD)  # type: ignore[arg-type]
+        self._writer.start(profile="ros2", library=mcap_records.LIBRARY)
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
         self._sequence: dict[str, int] = {}
@@ -354,7 +355,7 @@ class BagWriter:
 
     def end(self) -> AppendedFile:
         """Append the index. Returns the file, which the caller closes."""
-        self._writer.finish()
+        self._writer.finish()  # type: ignore[no-untyped-call]
         return self._file
 
     def abandon(self) -> None:

@@ -13,13 +13,13 @@ from pathlib import Path
 from typing import Any
 
 from mcap.records import Channel, Message
+from mcap.writer import CompressionType, Writer
 
 from graph_slam_ros.edge_tags import map_edge_of
 from graph_slam_ros.errors import FormatError
 from graph_slam_ros.formats.durable import AppendedFile
 from graph_slam_ros.measurements.types import EVENTS, CustomEdge, Measurement, Odometry, from_record, to_record
-from graph_slam_ros.recordings.mcap_records import records
-from graph_slam_ros.recordings.mcap_writer import McapWriter
+from graph_slam_ros.recordings.mcap_records import LIBRARY, records
 
 _ENCODE = json.JSONEncoder(separators=(",", ":"), check_circular=False, allow_nan=False).encode
 _text = cache(_ENCODE)
@@ -37,7 +37,9 @@ class RecordWriter:
 
     def __init__(self, path: Path, schema: str = MEASUREMENT) -> None:
         self.file = AppendedFile(path)
-        self._writer = McapWriter(self.file)
+        self._chunk = _Chunk()
+        self._writer = Writer(self.file, chunk_size=self._chunk, compression=CompressionType.ZSTD)  # type: ignore[arg-type]
+        self._writer.start(profile="", library=LIBRARY)
         self._schema = self._writer.register_schema(schema, "jsonschema", _SCHEMA)
         self._channels: dict[str, int] = {}
         self._sequence = 0
@@ -47,18 +49,21 @@ class RecordWriter:
 
     def write(self, several: Iterable[Mapping[str, Any] | Odometry]) -> None:
         """Append records, and odometry as it is, as one chunk. A record without a stamp gets the last stamp."""
-        for record in several:
+        *others, last = several
+        for record in others:
             self._add(record)
-        self._writer.end_chunk()
+        self._add(last, is_last=True)
 
-    def _add(self, record: Mapping[str, Any] | Odometry) -> None:
+    def _add(self, record: Mapping[str, Any] | Odometry, *, is_last: bool = False) -> None:
         if isinstance(record, Odometry):
             kind, self._stamp_ns, text = "odometry", record.stamp_ns, self._odometry_text(record)
         else:
             kind, self._stamp_ns, text = record["type"], record.get("stamp_ns", self._stamp_ns), _ENCODE(record)
         if kind not in self._channels:
             self._channels[kind] = self._writer.register_channel(kind, "json", self._schema)
+        self._chunk.is_full = is_last  # not before: a channel, too, ends a chunk that is full
         self._writer.add_message(self._channels[kind], self._stamp_ns, text.encode(), self._stamp_ns, self._sequence)
+        self._chunk.is_full = False
         self._sequence += 1
 
     def _odometry_text(self, m: Odometry) -> str:
@@ -77,7 +82,7 @@ class RecordWriter:
 
     def end(self) -> AppendedFile:
         """Append the index. Returns the file, which the caller closes."""
-        self._writer.finish()
+        self._writer.finish()  # type: ignore[no-untyped-call]
         return self.file
 
     def close(self) -> None:
@@ -177,6 +182,15 @@ def close_all(files: list[AppendedFile]) -> None:
     while files:
         files[0].close()
         del files[0]
+
+
+class _Chunk(int):
+    """The size at which the library ends a chunk: unlimited, until the last record of a flush."""
+
+    is_full = False
+
+    def __lt__(self, size: int) -> bool:
+        return self.is_full
 
 
 def part_name(name: str, part: int) -> str:

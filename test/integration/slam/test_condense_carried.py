@@ -142,7 +142,7 @@ def test_without_landmarks_a_keyframe_of_each_cell_stays_and_has_what_was_measur
     assert {e.became for part in small[1] for e in part.edges if e.label != "anchor"} == {"condensed"}
     true = np.array([pose[: world.space.dimensions] for pose in world.poses])
     one, other = (rms(path, true[: len(path)]) for path in (path_of(*small), path_of(*whole)))
-    assert one < 1.1 * other
+    assert one < (1.1 if given is with_closures else 1.25) * other
     now, before = (of.solver.marginal([of.keyframes[-1].vertex])[0] for of in (slam, whole[0]))
     root = np.linalg.inv(np.linalg.cholesky(before))
     ratios = np.linalg.eigvalsh(root @ now @ root.T)
