@@ -281,7 +281,8 @@ def statuses(facts: Facts, verdict: Health, node: str) -> Iterator[Status]:
             yield Status(OK, f"{node}: calibration", corrected or "nothing corrected", node, dict(calibration))
         if gyro := facts.estimate.gyro:
             yield Status(OK, f"{node}: gyro", gyro, node, {"gyro": gyro})
-        yield Status(OK, f"{node}: graph", f"{facts.estimate.keyframes} keyframes", node, values)
+        condensed = f"; condensed: {facts.estimate.condensed}" if facts.estimate.condensed else ""
+        yield Status(OK, f"{node}: graph", f"{facts.estimate.keyframes} keyframes{condensed}", node, values)
 
 
 def _weakness(facts: Facts, estimate: Estimate) -> str:

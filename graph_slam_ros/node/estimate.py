@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from graph_slam_ros.graph.geometry import Geometry
-from graph_slam_ros.runs.outcome import VISITS, association_faults, visit_faults
+from graph_slam_ros.runs.outcome import VISITS, association_faults, condensed_text, visit_faults
+from graph_slam_ros.runs.tables import condensed_part
 from graph_slam_ros.slam import GraphSlam
 from graph_slam_ros.slam.calibration.uncorrected import Uncorrected
 from graph_slam_ros.slam.solution import Correction
@@ -91,6 +92,7 @@ class Estimate:
     rivals : loop closures of other explanations that could not be ruled out
     displaced : that the landmarks say that the robot is elsewhere than odometry; empty where they do not
     association : why the association of sightings without identity is not to be believed; empty if it is
+    condensed : which keyframes were condensed, or why none was in a long drive; empty in a short one
     visits : why a condensed map is worse, or larger, than it should be; empty if it is not
     uncorrected : clocks, mounts and scales that are off and not corrected; empty where none is
     motion : why the gyro, or an odometry, has no part in the motion; empty where all have
@@ -119,6 +121,7 @@ class Estimate:
     weakest_landmark: str = ""
     displaced: str = ""
     association: str = ""
+    condensed: str = ""
     visits: str = ""
     uncorrected: str = ""
     motion: str = ""
@@ -179,6 +182,7 @@ class Estimate:
             rivals=sum(len(rival.only_here) for rival in slam.backend.rivals),
             displaced=str(slam.displaced or ""),
             association="; ".join(association_faults(slam.association_report)),
+            condensed=condensed_text(condensed_part(slam)),
             visits="; ".join(visit_faults({name: slam.counters["map", name] for name in VISITS})),
             uncorrected="; ".join(": ".join([str(one), *_settings(one)]) for one in slam.uncorrected_so_far),
             motion="; ".join(filter(None, (slam.gyro.fault if slam.gyro else "", slam.backend.odometries.doubted))),

@@ -53,10 +53,9 @@ def text(summary: Summary) -> list[str]:
         f"edges      {summary['edges']:8d}",
         f"chi2       {summary['chi2']:12.3f}   {_solves(summary)}",
     ]
-    if count := summary.get("condensed"):
-        lines.append(f"condensed  keyframes 0 to {count - 1}, into places: --set map.condense=false keeps all")
-    elif why := summary.get("not_condensed"):
-        lines.append(f"condensed  nothing: not with {why} yet, so the map grows with the distance driven")
+    if what := condensed_text(summary):
+        all_ = ": --set map.condense=false keeps all" if "condensed" in summary else ""
+        lines.append(f"condensed  {what}{all_}")
     if "time_s" in summary:
         cpu = f", {summary['cpu_s']:.1f} s of CPU time" if "cpu_s" in summary else ""
         lines.append(f"took       {summary['time_s']:10.1f} s{cpu}")
@@ -270,6 +269,14 @@ def _uncorrected(summary: Summary) -> Iterator[str]:
     for one in summary.get("uncorrected", ()):
         mend = " ".join(f"--set {shlex.quote(f'{key}={value}')}" for key, value in one["settings"].items())
         yield f"{one['text']}{mend and ': '}{mend} (graph_slam check BAG compares the causes)"
+
+
+def condensed_text(summary: Mapping[str, Any]) -> str:
+    """Return which keyframes were condensed, or why none was in a long drive; empty in a short one."""
+    if count := summary.get("condensed"):
+        return f"keyframes 0 to {count - 1}, into places"
+    why = summary.get("not_condensed", "")
+    return f"nothing: not with {why} yet, so the map grows with the distance driven" if why else ""
 
 
 def visit_faults(counted: Mapping[str, int]) -> Iterator[str]:

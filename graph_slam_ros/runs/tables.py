@@ -97,7 +97,7 @@ def summarize(slam: GraphSlam, earlier: Counters | None = None) -> dict[str, Any
             "displacements": [asdict(alarm) | {"text": str(alarm)} for alarm in slam.alarms],
             "span_s": (slam.keyframes[-1].stamp_ns - slam.began_ns) * 1e-9 if slam.keyframes else 0.0,
         }
-        | _condensed(slam)
+        | condensed_part(slam)
         | ({"gyro": asdict(gyro)} if (gyro := slam.gyro) else {})
         | ({"calibration": report} if (report := slam.calibration_report) else {})
         | ({"association": found} if (found := _association(slam)) else {})
@@ -105,7 +105,7 @@ def summarize(slam: GraphSlam, earlier: Counters | None = None) -> dict[str, Any
     )
 
 
-def _condensed(slam: GraphSlam) -> dict[str, Any]:
+def condensed_part(slam: GraphSlam) -> dict[str, Any]:
     """Return how many keyframes have left the map, or why none does where some should."""
     settings = slam.config.map
     if slam.first_keyframe:

@@ -10,9 +10,9 @@ from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
 from graph_slam_ros.runs.condensed_map import read_left
 from graph_slam_ros.runs.journal import read_measurements
 from graph_slam_ros.runs.map_journal import read_map
-from graph_slam_ros.runs.outcome import text
+from graph_slam_ros.runs.outcome import condensed_text, text
 from graph_slam_ros.runs.restore import record_run
-from graph_slam_ros.runs.tables import summarize
+from graph_slam_ros.runs.tables import condensed_part, summarize
 from graph_slam_ros.runs.whole_path import removed_path
 from graph_slam_ros.slam import Control, GraphSlam
 from graph_slam_ros.slam.lifelong.removed import Left
@@ -149,3 +149,4 @@ def test_edges_of_plugins_keep_all_keyframes_and_the_end_says_so():
     slam, left, *_ = driven(City(3, 440, PLANAR, BLOCKS), settings)
     assert not left
     assert "condensed  nothing: not with mine.use=edges yet" in "\n".join(text(summarize(slam)))
+    assert condensed_text(condensed_part(slam)).startswith("nothing: not with mine.use=edges yet")
