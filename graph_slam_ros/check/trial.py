@@ -15,6 +15,7 @@ from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.measurements.types import Control, Measurement, Odometry
 from graph_slam_ros.slam import Config, GraphSlam
+from graph_slam_ros.slam.calibration.decision import MOST_LOST
 from graph_slam_ros.slam.calibration.decision import Finding as Fitted
 from graph_slam_ros.slam.calibration.fit import TrialFit
 from graph_slam_ros.slam.calibration.uncorrected import CODES, clock_jumps, jump_sentence, sentence, setting_of
@@ -40,7 +41,6 @@ _LIMITS = {
     "range_factor": ("part", 0.03, 0.05),
 }
 _OVER_CONFIDENT, _ODOMETRY_OVER_CONFIDENT, _LEAST_DOF = 2.0, 6.0**0.5, 100.0
-_LOST = 0.25
 _OF_A_BREAK = (
     "ids_unsure",
     "map_breaks",
@@ -117,16 +117,16 @@ def check_trial(c: Columns, slam: GraphSlam) -> Iterator[Finding]:
         yield _absurd(c, 1.0 + scale.value)
         return
     clocks = [one for one in fitted if one.parameter.name == "clock" and one.verdict == "admitted"]
-    late_s = {} if fit.lost > _LOST else {one.parameter.source: one.value for one in clocks}
+    late_s = {} if fit.lost > MOST_LOST else {one.parameter.source: one.value for one in clocks}
     found = [] if _goes_back(c) else _places(c, slam, path_ns, path, late_s)
     turned = {one.parameter.source: one.value for one in fitted if one.parameter.name == "yaw" and _is_off(one)}
     if turned and found:
         found = list(_places_of_fit(c, slam, fit, turned, path_ns, path))
-    if fit.lost > _LOST:
+    if fit.lost > MOST_LOST:
         found += [one for s in c.sightings for one in noisier(s, pairs_of(s, path_ns, path, c.config.world.dimensions))]
         if not found:
             text = f"{fit.lost:.0%} of the sightings do not fit: clock, mount and scale cannot be checked"
-            yield Finding("fit_unsure", "warning", fit.lost, _LOST, "part", text)
+            yield Finding("fit_unsure", "warning", fit.lost, MOST_LOST, "part", text)
         yield from found
         return
     off = [found_one for one in fitted for found_one in _fitted(c, slam, one)]

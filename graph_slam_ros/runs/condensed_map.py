@@ -77,7 +77,7 @@ def condensed_record(graph: Graph, first: int, state: BoundedState) -> Record:
         "scale": astuple(state.scale),
         "accepted": [[first, dict(of)] for first, of in state.accepted.items()],
         "skeleton": list(state.skeleton.rows()),
-        "attached": state.attached.first if state.attached.end == state.keyframes else None,
+        "attached": state.attached.first if state.attached.first < state.attached.end == state.keyframes else None,
     }
 
 
