@@ -156,7 +156,10 @@ def account(slam: GraphSlam, counters: Counters) -> dict[str, Any]:
     for name in dict.fromkeys([*slam.config.inputs.names.split(), *counters.used, *accepted]):
         if name in counters.received or counters.used[name] or name in accepted:
             used = max(counters.used[name], accepted.get(name, 0) if is_of_map else 0)
-            of_input = {"received": counters.received.get(name), "used": used, "believed": accepted.get(name)}
+            count = accepted.get(name)
+            if count is not None and slam.bounded:  # closures that condensing has composed are counted, too
+                count = min(count, used)
+            of_input = {"received": counters.received.get(name), "used": used, "believed": count}
             inputs[name] = {"use": used_as.get(name, "")} | of_input
     return {"counters": counters.as_dict(), "inputs": inputs}
 

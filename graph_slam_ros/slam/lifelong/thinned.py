@@ -32,12 +32,12 @@ class Arm:
 
     Attributes
     ----------
-    source : of the closure that is in it; empty where it is of odometry alone
+    source : of the closure that is in it; None where it is of odometry alone
     """
 
     vertex: int
     motion: Motion
-    source: str = ""
+    source: str | None = None
 
 
 @dataclass(slots=True)
@@ -130,7 +130,7 @@ class Thinning:
             later = max((v for v in (first, last) if v in self._at), key=self._at.__getitem__)
             other = first if later == last else last
             way = motion if later == last else inverse(self._space, motion)
-            out.setdefault(later, []).append((number, Arm(other, way, edge.source or CLOSURES)))
+            out.setdefault(later, []).append((number, Arm(other, way, edge.source)))
         return out
 
     def _carried(self, vertex: int) -> list[Arm]:
@@ -163,7 +163,7 @@ class Thinning:
         for arm in others:
             if arm.vertex != centre.vertex:
                 way = chained(self._space, [share, inverse(self._space, arm.motion)])
-                self._add(centre.vertex, arm.vertex, way, arm.source or centre.source)
+                self._add(centre.vertex, arm.vertex, way, centre.source if arm.source is None else arm.source)
         if fixes:
             self.out.fixes.setdefault(centre.vertex, []).extend(fixes)
             self.out.shares[vertex] = share[1]
@@ -192,17 +192,16 @@ class Thinning:
     def _lead(self, arm: Arm, vertex: int) -> None:
         """Add an edge to a vertex that stays. If it has a closure in it, it may be doubted: a part holds the path."""
         pose, covariance = arm.motion
-        if arm.source:
+        if arm.source is not None:
             self._add(arm.vertex, vertex, (pose, covariance / (1.0 - _HELD)), arm.source)
             covariance = covariance / _HELD
-        self._add(arm.vertex, vertex, (pose, covariance), "")
+        self._add(arm.vertex, vertex, (pose, covariance), None)
 
-    def _add(self, first: int, last: int, motion: Motion, source: str) -> None:
-        label = CLOSURES if source else CHAIN
+    def _add(self, first: int, last: int, motion: Motion, source: str | None) -> None:
+        label = CHAIN if source is None else CLOSURES
         pose, covariance = motion
         root = square_root(symmetric(inverted(covariance)))
-        source = "" if source == CLOSURES else source
-        self.out.added.append(Carried((first, last), self._space.normalized(pose), root, label, source))
+        self.out.added.append(Carried((first, last), self._space.normalized(pose), root, label, source or ""))
 
     def _merged(self, arms: Sequence[Arm]) -> list[Arm]:
         """Return edges of a keyframe, with those to one vertex that agree as one."""
@@ -226,7 +225,7 @@ class Thinning:
         together = symmetric(inverted(symmetric(inverted(covariance)) + information))
         step = product(together, product(information, off))
         now = self._space.normalized(tuple(map(float, group.compose(pose, group.exp(tuple(step))))))
-        return Arm(one.vertex, (now, together), one.source or other.source)
+        return Arm(one.vertex, (now, together), other.source if one.source is None else one.source)
 
     def _size(self, covariance: Array) -> float:
         n = self._space.dimensions

@@ -1,5 +1,7 @@
 """A map that is known by closures alone follows its area, and closures may begin at keyframes that have left it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -12,9 +14,9 @@ from graph_slam_ros.runs.journal import read_measurements
 from graph_slam_ros.runs.map_journal import read_map
 from graph_slam_ros.runs.outcome import condensed_text, text
 from graph_slam_ros.runs.restore import record_run
-from graph_slam_ros.runs.tables import condensed_part, summarize
+from graph_slam_ros.runs.tables import account, condensed_part, summarize
 from graph_slam_ros.runs.whole_path import removed_path
-from graph_slam_ros.slam import Control, GraphSlam
+from graph_slam_ros.slam import Closure, Control, GraphSlam
 from graph_slam_ros.slam.lifelong.removed import Left
 from graph_slam_ros.slam.robust.ledger import Verdict
 
@@ -102,6 +104,28 @@ def recorded(tmp_path_factory):
     drive = [m for given in city.measurements() for m in given]
     slam, _ = record_run(folder, bounded(), [*drive, Control("end"), Control("optimize")], [])
     return folder, slam, drive
+
+
+def test_an_input_of_any_name_is_accounted_for(recorded):
+    """Also one that is called as the label of its edges."""
+    inputs = {"inputs_names": "odom closures", "closures_use": "closure", "closures_topic": "/loops"}
+    drive = [replace(m, topic="closures") if isinstance(m, Closure) else m for m in recorded[2]]
+    settings = Config.from_mapping(
+        {name: value for name, value in flat(bounded()) if not name.startswith(("loops.", "inputs."))}
+        | {name.replace("_", ".", 1): value for name, value in inputs.items()}
+    )
+    slam = GraphSlam(settings)
+    for m in [*drive, Control("end")]:
+        slam.process(m)
+    assert slam.first_keyframe > 300
+    counts = account(slam, slam.counters)["inputs"]
+    assert set(counts) == {"odom", "closures"}
+    assert counts["closures"]["used"] == sum(isinstance(m, Closure) for m in drive)
+    assert 0.99 * counts["closures"]["used"] <= counts["closures"]["believed"] <= counts["closures"]["used"]
+
+
+def flat(settings):
+    return ((f"{a}.{b}", value) for a, of in settings.as_mapping().items() for b, value in of.items())
 
 
 def test_a_replay_gives_the_same_bytes(recorded, tmp_path):
