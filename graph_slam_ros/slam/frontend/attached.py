@@ -45,9 +45,14 @@ class AttachedKeyframes:
         ----------
         first : number of the first of them
         keyframes : rows of ``removed.record_type``; attached : of ``attached_type``
+
+        Raises
+        ------
+        OSError
+            They cannot be written. Those before them can still be read.
         """
         if self._file is None:
-            self._file = tempfile.TemporaryFile()  # noqa: SIM115  it lives as long as this
+            self._file = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115  it lives as long as this
             pose = ("<f8", (space.pose.size,))
             self._kind = np.dtype([("stamp_ns", "<i8"), ("T_odom", *pose), *attached_type(space).descr])
         if first != self.end:
@@ -57,8 +62,8 @@ class AttachedKeyframes:
             for name in of.dtype.names or ():
                 rows[name] = of[name]
         self._file.seek((first - self.first) * self._kind.itemsize)
-        self._file.write(rows.tobytes())
-        self._file.flush()
+        if self._file.write(rows.tobytes()) != rows.nbytes:
+            raise OSError("the disk of temporary files is full")
         self.end = first + len(rows)
 
     def read(self, number: int) -> np.void:
@@ -70,7 +75,7 @@ class AttachedKeyframes:
         return np.void(np.frombuffer(self._file.read(size), self._kind)[0])
 
     def before(self, stamp_ns: int, since: int) -> int | None:
-        """Return the number of the last keyframe that is no younger than a stamp; None if there is none.
+        """Return the number of the last keyframe at or before a stamp; None if there is none.
 
         Parameters
         ----------

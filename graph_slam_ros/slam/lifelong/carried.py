@@ -75,22 +75,33 @@ def carried_closure(space: Geometry, edge: Edge, base: int, motions: Mapping[int
 
 def fused_closure(space: Geometry, one: Carried, several: Sequence[Edge], gate: float) -> Carried | None:
     """Return a carried closure together with the first of some others between its two vertices that it agrees with."""
-    group = space.group
     for edge in several:
         motion: Motion = one.measured, inverted(product(one.root.T, one.root))
         if edge.vertices != one.vertices:
             motion = inverse(space, motion)
         before = edge.weight * product(edge.sqrt_information.T, edge.sqrt_information)
-        added = symmetric(inverted(motion[1]))
-        off = np.array(group.log(group.between(tuple(edge.measured.tolist()), motion[0])))
-        apart = symmetric(inverted(inverted(before) + motion[1]))
-        if quadratic(apart, off) <= quantile(gate, space.dof):
-            both = symmetric(before + added)
-            step = np.linalg.solve(both, product(added, off))
-            measured = group.compose(tuple(edge.measured.tolist()), group.exp(tuple(step)))
-            pose = space.normalized(tuple(map(float, measured)))
-            return Carried(edge.vertices, pose, square_root(both), edge.label, one.source, edge.id)
+        both = fused_motion(space, (tuple(edge.measured.tolist()), inverted(before)), motion, gate)
+        if both is not None:
+            root = square_root(symmetric(inverted(both[1])))
+            return Carried(edge.vertices, both[0], root, edge.label, one.source, edge.id)
     return None
+
+
+def fused_motion(space: Geometry, one: Motion, other: Motion, gate: float) -> Motion | None:
+    """Return two independent measurements of one motion as one; None if they do not agree.
+
+    Parameters
+    ----------
+    gate : quantile of chi2 above which they do not
+    """
+    group, (pose, covariance), (seen, added) = space.group, one, other
+    off = np.array(group.log(group.between(pose, seen)))
+    if quadratic(symmetric(inverted(covariance + added)), off) > quantile(gate, space.dof):
+        return None
+    information = symmetric(inverted(added))
+    both = symmetric(symmetric(inverted(covariance)) + information)
+    step = np.linalg.solve(both, product(information, off))
+    return space.normalized(tuple(map(float, group.compose(pose, group.exp(tuple(step)))))), symmetric(inverted(both))
 
 
 def carried_fixes(

@@ -13,11 +13,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.graph import Edge
 from graph_slam_ros.graph.geometry import Geometry
-from graph_slam_ros.slam.lifelong.carried import Carried, inverse, inverted
-from graph_slam_ros.slam.lifelong.elimination import product, quadratic, square_root, symmetric
+from graph_slam_ros.slam.lifelong.carried import Carried, fused_motion, inverse, inverted
+from graph_slam_ros.slam.lifelong.elimination import square_root, symmetric
 from graph_slam_ros.slam.lifelong.surroundings import CLOSURES, Motion, Surroundings, chained, motion_of
 from graph_slam_ros.typing import Array
 
@@ -209,23 +208,13 @@ class Thinning:
         apart = list[Arm]()
         for arm in arms:
             before = out.get(arm.vertex)
-            both = self._both(before, arm) if before else arm
-            if both is None:
+            if before is None:
+                out[arm.vertex] = arm
+            elif (both := fused_motion(self._space, before.motion, arm.motion, self._gate)) is None:
                 apart.append(arm)
             else:
-                out[arm.vertex] = both
+                out[arm.vertex] = Arm(arm.vertex, both, arm.source if before.source is None else before.source)
         return [*out.values(), *apart]
-
-    def _both(self, one: Arm, other: Arm) -> Arm | None:
-        group, (pose, covariance), (seen, added) = self._space.group, one.motion, other.motion
-        off = np.array(group.log(group.between(pose, seen)))
-        if quadratic(symmetric(inverted(covariance + added)), off) > quantile(self._gate, self._space.dof):
-            return None
-        information = symmetric(inverted(added))
-        together = symmetric(inverted(symmetric(inverted(covariance)) + information))
-        step = product(together, product(information, off))
-        now = self._space.normalized(tuple(map(float, group.compose(pose, group.exp(tuple(step))))))
-        return Arm(one.vertex, (now, together), other.source if one.source is None else one.source)
 
     def _size(self, covariance: Array) -> float:
         n = self._space.dimensions
