@@ -168,10 +168,13 @@ def attach(folder: Path, space: Geometry, state: BoundedState) -> None:
     first = state.attached.first
     for record in read_records(folder, CONDENSED, [], "left") if first < state.keyframes else ():
         if first <= record["first"] < state.keyframes:
-            keyframes = _rows(record["keyframes"], record_type(space))
-            rows = _rows(record.get("attached", ""), attached_type(space))
+            try:
+                keyframes = _rows(record["keyframes"], record_type(space))
+                rows = _rows(record.get("attached", ""), attached_type(space))
+            except (LookupError, TypeError, ValueError):
+                raise _incomplete(folder, state.attached.end, state) from None
             if len(rows) != len(keyframes):
-                raise _incomplete(folder, len(rows), state)
+                raise _incomplete(folder, state.attached.end, state)
             state.attached.add(space, record["first"], keyframes, rows)
     if state.attached.end != state.keyframes:
         raise _incomplete(folder, state.attached.end, state)

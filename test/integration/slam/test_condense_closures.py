@@ -1,5 +1,6 @@
 """A map that is known by closures alone follows its area, and closures may begin at keyframes that have left it."""
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -8,9 +9,10 @@ import pytest
 from benchmarks.city import City, config
 from benchmarks.hall import rms
 from graph_slam_ros.config.config import Config
+from graph_slam_ros.errors import FormatError
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
-from graph_slam_ros.runs.condensed_map import read_left
-from graph_slam_ros.runs.journal import read_measurements
+from graph_slam_ros.runs.condensed_map import LEFT, read_left
+from graph_slam_ros.runs.journal import RecordWriter, read_measurements, read_records
 from graph_slam_ros.runs.map_journal import read_map
 from graph_slam_ros.runs.outcome import condensed_text, text
 from graph_slam_ros.runs.restore import record_run
@@ -163,6 +165,21 @@ def test_a_restart_without_what_left_says_so(recorded, tmp_path):
         if file.name != "condensed.mcap":
             (copy / file.name).write_bytes(file.read_bytes())
     with pytest.raises(Exception, match=r"condensed\.mcap has 0 keyframes"):
+        read_map(copy, [])
+
+
+@pytest.mark.parametrize("damage", ["", "AAAA", "not base64!", 7])
+def test_rows_that_cannot_be_read_are_said_in_a_line(recorded, tmp_path, damage):
+    folder, *_ = recorded
+    copy = tmp_path / "copy"
+    shutil.copytree(folder, copy)
+    records = list(read_records(folder, "condensed", []))
+    (copy / "condensed.mcap").unlink()
+    writer = RecordWriter(copy / "condensed.mcap", LEFT)
+    for k, record in enumerate(records):
+        writer.write([record | ({"attached": damage} if k == 0 else {})])
+    writer.close()
+    with pytest.raises(FormatError, match=r"condensed\.mcap has 0 keyframes"):
         read_map(copy, [])
 
 
