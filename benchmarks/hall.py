@@ -5,7 +5,7 @@ points, or tags whose orientation is seen, too.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -167,6 +167,11 @@ def measured(T_odom_base: Numbers, stamp_ns: int, seen: Sequence[tuple[int, Arra
             for mark, at, noise in seen
         )
         yield Sightings(stamp_ns, "landmarks", tuple(sightings))
+
+
+def without_ids(m: Sightings) -> Sightings:
+    """Return the sightings without the ids of their landmarks."""
+    return replace(m, sightings=tuple(replace(one, id="") for one in m.sightings))
 
 
 def fitted(estimated: Array, true: Array) -> tuple[Array, Array]:

@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
+from scipy.spatial import KDTree
 
 if not __package__:  # run as a script: what it imports is in the repository, not in its folder
     sys.path[0] = str(Path(__file__).resolve().parents[1])
@@ -31,15 +32,16 @@ if not __package__:  # run as a script: what it imports is in the repository, no
 from benchmarks import fresh, lifelong, table
 from benchmarks.city import City
 from benchmarks.city import config as in_city
-from benchmarks.hall import STEP_S, Course, config, fitted, measured, rms
+from benchmarks.hall import STEP_S, Course, config, fitted, measured, rms, without_ids
 from graph_slam_ros.cli import values
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
 from graph_slam_ros.runs.whole_path import removed_path
-from graph_slam_ros.slam import Control, GraphSlam, Measurement
+from graph_slam_ros.slam import Control, GraphSlam, Measurement, Sightings
 from graph_slam_ros.slam.lifelong.removed import Left
 from graph_slam_ros.typing import Array, Numbers
 
 Figures = dict[str, float]
+_WRONG_M = 1.0  # farther than that from its place a landmark without id is wrong
 _FLAT = 1.05  # of the memory after a tenth of a drive: more is not flat
 _WARM, _LOOK = 640, 40  # keyframes: before errors of the newest pose are taken, and from one to the next
 
@@ -164,6 +166,35 @@ class Drive:
         return error, nees, float(of_marks @ np.linalg.solve(joint, of_marks)) / len(of_marks)
 
 
+class UnnamedDrive(Drive):
+    """The same with sightings that do not tell which landmark they are of."""
+
+    def __init__(self, course: Course, window: int) -> None:
+        super().__init__(course, window)
+        values = {"landmarks_association": "joint", **_settings(window)}
+        self.slam = GraphSlam(config(course.space, **values))
+
+    def measurements(self) -> Iterator[list[Measurement]]:
+        """Return what the robot measures at each keyframe; once."""
+        for given in super().measurements():
+            yield [without_ids(m) if isinstance(m, Sightings) else m for m in given]
+
+    def landmarks(self) -> tuple[list[int], Array, Array]:
+        """Vertices of the confirmed landmarks, estimated positions, and the nearest true ones."""
+        vertices = [mark.vertex for mark in self.slam.landmarks.values() if not mark.is_tentative]
+        there = self.slam.solver.estimate(vertices)
+        places = np.stack(self._in_map("act", tuple(self.course.points.T)), axis=-1)
+        return vertices, there, places[KDTree(places).query(there)[1]]
+
+    def figures(self) -> Figures:
+        """What was measured, and how many landmarks are not where one is, or where another is already."""
+        _, there, right = self.landmarks()
+        is_near = np.linalg.norm(there - right, axis=1) < _WRONG_M
+        found = len(np.unique(right[is_near], axis=0))
+        wrong = {"landmarks": float(found), "wrong": float(len(there) - found)}
+        return super().figures() | wrong
+
+
 class CityDrive(Drive):
     """The same in a city that is known by closures alone, in the frame of the first pose."""
 
@@ -210,15 +241,17 @@ def _resident_mib() -> float:
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
-def drive(seed: int, keyframes: int, window: int, dimensions: int = 2, tags: bool = False, blocks: int = 0) -> Figures:
-    """Return the figures of one drive: in a hall, or in a city of so many blocks."""
+def drive(
+    seed: int, keyframes: int, window: int, dimensions: int = 2, world: str = "points", blocks: int = 0
+) -> Figures:
+    """Return the figures of one drive: in a hall with a kind of landmarks, or in a city of so many blocks."""
     Drive(Course(seed, 60), 0).run()  # what is loaded or compiled at first use is not counted
     space = PLANAR if dimensions == 2 else SPATIAL
-    one = (
-        CityDrive(City(seed, keyframes, space, blocks), window)
-        if blocks
-        else Drive(Course(seed, keyframes, space, tags=tags), window)
-    )
+    if blocks:
+        one: Drive = CityDrive(City(seed, keyframes, space, blocks), window)
+    else:
+        kind = UnnamedDrive if world == "unnamed" else Drive
+        one = kind(Course(seed, keyframes, space, tags=world == "tags"), window)
     one.run()
     return one.figures()
 
@@ -227,13 +260,13 @@ _AGAINST = ("newest m", "path m", "landmarks m")
 
 
 def measure(
-    keyframes: int, seeds: Sequence[int], windows: Sequence[int], dimensions: int, *, tags: bool, blocks: int
+    keyframes: int, seeds: Sequence[int], windows: Sequence[int], dimensions: int, *, world: str, blocks: int
 ) -> Iterator[table.Row]:
     """Yield a row for each drive, and one for each window: the means, and errors over those of all keyframes."""
     found: dict[int, list[Figures]] = {window: [] for window in windows}
     for seed in seeds:
         for window in windows:
-            row = fresh.call(lifelong.drive, seed, keyframes, window, dimensions, tags, blocks)
+            row = fresh.call(lifelong.drive, seed, keyframes, window, dimensions, world, blocks)
             found[window].append(row)
             yield {"seed": seed, "window": window or "all", **row}
     for window, rows in found.items():
@@ -252,14 +285,19 @@ def main() -> None:
     options.add_argument("--seeds", type=values.count, default=2, metavar="N", help="drives 0 to N - 1")
     options.add_argument("--windows", type=int, nargs="+", default=[0, 60, 2000], help="keyframes; 0 keeps all")
     options.add_argument("--dimensions", type=int, choices=(2, 3), default=2)
-    options.add_argument("--tags", action="store_true", help="the orientation of landmarks is seen, too")
+    options.add_argument(
+        "--landmarks",
+        choices=("points", "tags", "unnamed"),
+        default="points",
+        help="points with ids, tags whose orientation is seen, too, or points without ids",
+    )
     options.add_argument("--blocks", type=values.count, default=0, metavar="N", help="a city of N by N blocks")
     options.add_argument("--flat", action="store_true", help="fail where memory grows after a tenth of the drive")
     options.add_argument("--json", type=Path, metavar="OUT", help="write the results there as well")
     args = options.parse_args()
     rows = []
     for row in measure(
-        args.keyframes, range(args.seeds), args.windows, args.dimensions, tags=args.tags, blocks=args.blocks
+        args.keyframes, range(args.seeds), args.windows, args.dimensions, world=args.landmarks, blocks=args.blocks
     ):
         print(
             "benchmarks:",

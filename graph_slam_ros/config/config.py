@@ -111,8 +111,6 @@ class Config:
     @property
     def not_condensed(self) -> str:
         """Return the parameter with which nothing is condensed yet; empty if there is none."""
-        if self.landmarks.association in ("nearest", "joint"):
-            return f"landmarks.association={self.landmarks.association}"
         if self.odometry.fusion == "parallel":
             return "odometry.fusion=parallel"
         for one in self.sources:  # its edges may begin at any keyframe

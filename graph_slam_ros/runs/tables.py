@@ -111,7 +111,9 @@ def condensed_part(slam: GraphSlam) -> dict[str, Any]:
     if slam.first_keyframe:
         return {"condensed": slam.first_keyframe}
     is_long = settings.condense and len(slam.keyframes) > settings.window_keyframes
-    return {"not_condensed": why} if is_long and (why := slam.config.not_condensed) else {}
+    is_doubtful = slam.association_report.get("is_doubtful", False)
+    why = slam.config.not_condensed or ("a doubtful map of landmarks without ids" if is_doubtful else "")
+    return {"not_condensed": why} if is_long and why else {}
 
 
 def _association(slam: GraphSlam) -> dict[str, Any]:

@@ -39,6 +39,7 @@ BATCH = 200  # keyframes that leave the window together
 _ENOUGH = 3  # landmarks of a visit: with fewer it goes on in the next cell
 LONGEST = BATCH  # keyframes of a visit: so all that leave a cell together are one, and as little is cut as can be
 _PATIENCE = 200  # keyframes that are out of the window while a visit waits
+_AGAIN = 20  # keyframes until it is tried again, where sightings without ids are not explained yet
 _SOURCE = "map"  # of what is counted
 _THIN = 0.1  # of the width of a cell: so far apart keyframes stay that are in no place
 
@@ -121,6 +122,12 @@ class BoundedMap:
             return False
         return self._backend.is_quiet and self._kidnaps.is_quiet and self._solution.is_whole
 
+    @property
+    def _limit(self) -> int:
+        """The number of the first keyframe that may not leave."""
+        path, window = self._frontend.path, self._frontend.config.map.window_keyframes
+        return min(len(path.keyframes) - window, path.remembered_from)
+
     def condense(self) -> Condensation | None:
         """Condense what has left the window, if that is due; returns what has left the map.
 
@@ -129,6 +136,10 @@ class BoundedMap:
         if not self.is_due:
             return None
         backend, keyframes = self._backend, self._frontend.path.keyframes
+        if not self._landmarks.anonymous.may_forget_before(self._limit):
+            self._tried = len(keyframes) + _AGAIN
+            return None
+        self._landmarks.map.withdraw_tentative(self._limit)
         graph, values, places = backend.graph.copy(), backend.solver.values, _copies(self.state.places)
         vertices, scale, skeleton = backend.solver.vertices, replace(self.state.scale), self.state.skeleton.copy()
         self._tried = len(keyframes)
@@ -155,11 +166,10 @@ class BoundedMap:
     def _condensed_visits(self) -> tuple[list[_Row], Frames, int]:
         """Condense; returns what left, in order of time, its frames, and the first number that stays."""
         path, solver = self._frontend.path, self._backend.solver
-        keyframes, map_ = path.keyframes, self._frontend.config.map
-        ids, first = keyframes.ids, keyframes.first
-        limit = min(len(keyframes) - map_.window_keyframes, path.remembered_from) - first
+        ids, first, width = path.keyframes.ids, path.keyframes.first, self._frontend.config.map.cell_m
+        limit = self._limit - first
         at, rows, frames = solver.estimate(ids), list[_Row](), list[tuple[Frames, range]]()
-        cells = list(map(tuple, np.floor(at[:, : self._space.dimensions] / map_.cell_m).astype(np.int64).tolist()))
+        cells = list(map(tuple, np.floor(at[:, : self._space.dimensions] / width).astype(np.int64).tolist()))
         k = 0
         while k < limit:
             end = k + self._length(ids[k : k + LONGEST].tolist(), cells[k : k + LONGEST])
@@ -326,7 +336,7 @@ class BoundedMap:
         self.state.keyframes, self.state.sightings = end, before + len(left.sightings)
         self.state.frames += len(left.frames)
         self._note_accepted(out.edges)
-        self._landmarks.renumber(new.vertices, new.edges)
+        self._landmarks.forget_before(end, new.vertices, new.edges)
         self._anchor.restore()
         self._backend.solver.update()
         self._kidnaps.begin_anew(self._frontend.path.keyframes)

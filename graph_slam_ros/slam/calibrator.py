@@ -73,7 +73,7 @@ class Calibrator:
         self._admitted: set[Parameter] = set()
         self._last: TrialFit | None = None
         self._uncorrected: list[Uncorrected] = []
-        self._used: Mapping[str, tuple[float, float]] = landmarks.anonymous.scales
+        self._used: Mapping[str, tuple[float, float]] = landmarks.anonymous.hindsight.found_scales
         self._due, self._steady = FIRST_DUE, 0
         self._job: Trial | None = None
         self._apply_at = 0  # the keyframe
@@ -194,7 +194,7 @@ class Calibrator:
 
     def _adopt_association(self, keyframe: int, everything: Settings | None) -> Report | None:
         """Apply the factors of odometry that the last explanation of all scans has found. Returns a solve's report."""
-        scales = self._anonymous.scales
+        scales = self._anonymous.hindsight.found_scales
         if scales is self._used or self._first_keyframe:
             return None
         self._used, report = scales, None
@@ -224,7 +224,7 @@ class Calibrator:
         known = [mark.is_unnamed for mark in self._landmarks.known.values() if not mark.is_tentative]
         is_asked = "factors" in self._config.calibrate.groups.split()
         is_needed = not is_asked and not self._first_keyframe and 2 * sum(known) > len(known)
-        return self._anonymous.scales if is_needed else None
+        return self._anonymous.hindsight.found_scales if is_needed else None
 
     def _correct(self, values: Values, keyframe: int, everything: Settings | None, x: Array | None) -> Report | None:
         """Correct all measurements, present and future, and solve. A failure is undone.

@@ -184,7 +184,7 @@ class MapView(PathView):
     @property
     def association_report(self) -> dict[str, Any]:
         """The report on the last explanation of all sightings without identity; empty if there was none."""
-        return self._landmarks.anonymous.report
+        return self._landmarks.anonymous.hindsight.report
 
     @property
     def calibration(self) -> dict[tuple[str, str], float]:

@@ -8,7 +8,6 @@ result is used a fixed number of keyframes later.
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -17,8 +16,7 @@ from graph_slam_ros.config.config import Config
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.edge_noise import LEAST_M2
-from graph_slam_ros.measurements.types import Sighting, Sightings
-from graph_slam_ros.slam.frontend import motion_compensation
+from graph_slam_ros.measurements.types import Sightings
 from graph_slam_ros.slam.frontend.keyframes import Keyframe
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
 from graph_slam_ros.slam.frontend.odometry_integration import OdometryNoise
@@ -30,7 +28,9 @@ from graph_slam_ros.slam.landmarks.belief import SolverBelief
 from graph_slam_ros.slam.landmarks.elsewhere import Seen as AllSeen
 from graph_slam_ros.slam.landmarks.elsewhere import UnnamedDisplacement
 from graph_slam_ros.slam.landmarks.hindsight import Found, FrozenScans, Hindsight
+from graph_slam_ros.slam.landmarks.known_map import with_map
 from graph_slam_ros.slam.landmarks.landmark_map import Landmarks
+from graph_slam_ros.slam.landmarks.renumbered import first_of_later, with_vertices
 from graph_slam_ros.slam.landmarks.scans import (
     NEARBY_NS,
     SCAN_NS,
@@ -43,8 +43,9 @@ from graph_slam_ros.slam.landmarks.scans import (
     motion_between,
     rescaled_nearby,
 )
+from graph_slam_ros.slam.landmarks.sighted_point import sighted_point, with_extent
 from graph_slam_ros.solver import Solver
-from graph_slam_ros.typing import Array, Executor
+from graph_slam_ros.typing import Array, Executor, Index
 
 _POSITIONED = ("position", "pose", "range_bearing")
 
@@ -60,6 +61,7 @@ class AnonymousLandmarks:
     Attributes
     ----------
     clusters : with their landmarks
+    hindsight : explains all scans at once
     elsewhere : whether the newest scans contradict the pose
     """
 
@@ -89,7 +91,7 @@ class AnonymousLandmarks:
             clock_sigma_s=config.calibrate.clock_sigma_s,
         )
         self._belief = SolverBelief(space, solver, landmarks)
-        self._hindsight = Hindsight(config, self._settings, executor)
+        self.hindsight = Hindsight(config, self._settings, executor)
         self.clusters = Assignments(c, landmarks, counters, hand_over)
         self._beam: Beam | None = None
         self._sorts, self._sizes = dict[int, str](), dict[int, float]()  # of landmarks, whatever beam began them
@@ -107,7 +109,7 @@ class AnonymousLandmarks:
 
     def restore(self) -> None:
         """Continue with the landmarks of a map."""
-        self._hindsight.is_on = not self.clusters.restore()
+        self.hindsight.is_on = not self.clusters.restore()
 
     # -- odometry and sightings become scans -------------------------------------------------------------------------
 
@@ -126,19 +128,9 @@ class AnonymousLandmarks:
                 break
             self._nearby.append(self._reckoning.nearby(scan.at.stamp_ns))
 
-    @property
-    def report(self) -> dict[str, Any]:
-        """The report on the last explanation of all scans; empty if there was none."""
-        return self._hindsight.report
-
     def forget_belief(self) -> None:
         """Restart the beam from the solver's estimate, because the map has moved."""
         self._beam = None
-
-    @property
-    def scales(self) -> dict[str, tuple[float, float]]:
-        """The scales of odometry by the last explanation, less 1, with standard deviations; empty if there was none."""
-        return self._hindsight.found_scales
 
     def recalibrate(self, factors: tuple[float, float], clocks: Mapping[str, float]) -> None:
         """Take over that odometry's distance and turn were multiplied, and seconds added to the clocks of inputs.
@@ -154,7 +146,7 @@ class AnonymousLandmarks:
         self._builder.reckon_anew(at)
         known = [self._reckoning.remembers(scan.at.stamp_ns) for scan in self._scans]
         self._scans = [replace(s, at=at(s.at.stamp_ns)) if k else s for s, k in zip(self._scans, known, strict=True)]
-        self._hindsight.rescale(factors)
+        self.hindsight.rescale(factors)
         self.forget_belief()
 
     def see(self, m: Sightings, where: PoseAtStamp) -> list[Assigned]:
@@ -162,8 +154,9 @@ class AnonymousLandmarks:
         at = self._reckoning.at(m.stamp_ns)
         out = self.end_scan() if self._builder.is_full(at) else []
         for s in m.sightings:
-            point, covariance = self._point(s)
-            seen = Seen(m.topic, self._widened(s, where), where, self._clocks.get(m.topic, 0.0))
+            point, covariance = sighted_point(self._space, s)
+            whole = with_extent(self._space, s, self._config.unnamed_sigma_m)
+            seen = Seen(m.topic, whole, where, self._clocks.get(m.topic, 0.0))
             self._builder.add(at, point, covariance, seen, s.sort)
         return out
 
@@ -178,31 +171,6 @@ class AnonymousLandmarks:
         if len(named) + len(unnamed) < len(m.sightings):
             self._counters.count(m.topic, "no_id", len(m.sightings) - len(named) - len(unnamed))
         return out + (self.see(replace(m, sightings=unnamed), where) if unnamed else [])
-
-    def _point(self, s: Sighting) -> tuple[Array, Array]:
-        """The observed point (n,) in the base frame, and its covariance (n, n)."""
-        space, n = self._space, self._space.dimensions
-        own = motion_compensation.as_matrix(s.covariance)
-        if s.kind == "range_bearing":
-            T_base_sensor = s.T_base_sensor or space.identity
-            point = tuple(motion_compensation.point_of(space, s.measured).tolist())
-            to_base = space.turn(T_base_sensor) @ motion_compensation.polar_derivative(space, s.measured)
-            point, own = tuple(map(float, space.group.act(T_base_sensor, point))), to_base @ own @ to_base.T
-        else:
-            point = s.measured[:n]
-            own = space.in_parent_axes(s.measured, own)[:n, :n] if s.kind == "pose" else own
-        rounding = motion_compensation.ROUNDING * (float(np.trace(own)) + sum(x * x for x in point))
-        return np.array(point), own + rounding * np.eye(n)
-
-    def _widened(self, s: Sighting, where: PoseAtStamp) -> Sighting:
-        """The sighting with a covariance that includes the extent of the landmark."""
-        n, covariance = self._space.dimensions, motion_compensation.as_matrix(s.covariance)
-        axes = np.eye(n)
-        if s.kind == "range_bearing":
-            point = motion_compensation.point_of(self._space, s.measured)
-            axes = motion_compensation.gradient(self._space, s.kind, point)
-        covariance[:n, :n] += self._config.unnamed_sigma_m**2 * axes @ axes.T
-        return replace(s, covariance=tuple(covariance.ravel().tolist()))
 
     # -- scans are explained -----------------------------------------------------------------------------------------
 
@@ -231,7 +199,7 @@ class AnonymousLandmarks:
         self._hand_over()
         beam, names = self._beam, self.clusters.names
         if beam is None or motion is None or motion.is_broken:
-            scales, sigma = self._hindsight.scales
+            scales, sigma = self.hindsight.scales
             seed = self._belief.seed(scan, names, scales if beam is None else beam.scales[0], sigma)
             beam, self._leader = Beam(self._settings, seed), None
             beam.sorts, beam.sizes = self._features()
@@ -276,21 +244,16 @@ class AnonymousLandmarks:
 
     def _propose(self) -> None:
         """Assign the newest scans, where they contradict the pose, to the landmarks that they fit elsewhere."""
-        elsewhere, thought = self.elsewhere, np.array(self.clusters.given, dtype=np.int64)
-        if len(self._scans) in (0, self._compared):
-            return
-        self._compared = len(self._scans)
-        thought[list(elsewhere.proposed)] = list(elsewhere.proposed.values())
-        seen = AllSeen(self._scans, self._firsts, thought, self.clusters.names)
-        elsewhere.update(seen)
-        proposed = elsewhere.proposal(seen)
-        elsewhere.proposed |= {cluster: int(thought[cluster]) for cluster in proposed}
-        self.clusters.give(proposed)
+        if len(self._scans) not in (0, self._compared):
+            self._compared = len(self._scans)
+            given = np.array(self.clusters.given, dtype=np.int64)
+            seen = AllSeen(self._scans, self._firsts, given, self.clusters.names, self.clusters.before)
+            self.clusters.give(self.elsewhere.propose(seen))
 
     def displaced(self, first: int) -> None:
         """Begin anew at a keyframe, by its vertex: the robot was moved there."""
         self._beam = None
-        self._hindsight.restart()
+        self.hindsight.restart()
         k = next((k for k, scan in enumerate(self._scans) if scan.where.vertex >= first), len(self._scans))
         if 0 < k < len(self._scans):
             m = self._motions[k - 1]
@@ -310,7 +273,7 @@ class AnonymousLandmarks:
     def _explain_from(self, first: int) -> None:
         """Explain the scans anew from one on, by the map and the path as they are."""
         clusters = range(self._firsts[first], len(self.clusters.given))
-        self._hindsight.restart()
+        self.hindsight.restart()
         self._beam = self._leader = now = None
         try:
             for k in range(first, len(self._scans)):
@@ -319,6 +282,47 @@ class AnonymousLandmarks:
         except (GraphSlamError, np.linalg.LinAlgError):  # as when they were new
             self._beam = self._leader = None
         self.clusters.give({c: self._same.get(k, k) for c, k in changes(None, now).items() if c in clusters})
+
+    # -- keyframes leave ---------------------------------------------------------------------------------------------
+
+    def may_forget_before(self, keyframe: int) -> bool:
+        """Return whether keyframes before a number may leave the graph: all was explained that was seen from them.
+
+        If that was not explained yet, it will be soon.
+        """
+        oldest = self._builder.oldest_keyframe
+        if self.elsewhere.since is not None or self._displaced is not None or (oldest or keyframe) < keyframe:
+            return False
+        if not self.hindsight.is_on or not self._scans:
+            return True
+        return self.hindsight.covers(first_of_later(self._scans, keyframe)) and not self.hindsight.is_doubtful
+
+    def forget_before(self, keyframe: int, vertices: Index) -> None:
+        """Forget the scans from keyframes before a number, which have left the graph: their landmarks are final.
+
+        Parameters
+        ----------
+        vertices : new ids by old ones
+        """
+        k = first_of_later(self._scans, keyframe)
+        self.hindsight.forget(k)
+        clusters = self._firsts[k] if k < len(self._scans) else len(self.clusters.given)
+        self._scans = [with_vertices(scan, vertices) for scan in self._scans[k:]]
+        self._motions, self._nearby = self._motions[k:], self._nearby[k:]
+        self._firsts, self._compared = [one - clusters for one in self._firsts[k:]], self._compared - k
+        new = self.clusters.forget(clusters, (c for scan in self._scans for c in scan.clusters))
+        beam = self._beam
+        self._leader, *last = new.histories([self._leader, *(beam.history if beam else ())])
+        self._same = {new.landmark(one): new.landmark(other) for one, other in self._same.items()}
+        kept = {*self.clusters.names, *self.clusters.given}
+        if beam is not None:
+            beam.history = last
+            beam.renumber(new.landmark, new.landmarks(beam.ids))
+            kept |= set(beam.ids.ravel().tolist())
+        self._sorts, self._sizes = new.kept(self._sorts, kept), new.kept(self._sizes, kept)
+        if beam is not None:
+            beam.sorts, beam.sizes = self._sorts, self._sizes
+        self._builder.renumber(vertices)
 
     # -- afterwards --------------------------------------------------------------------------------------------------
 
@@ -332,16 +336,16 @@ class AnonymousLandmarks:
             self._explain_from(self._displaced)
             self._displaced = None
         self._propose()
-        self._adopt(self._guarded(lambda: self._hindsight.outcome(count)), keyframes)
-        if self._hindsight.is_due(len(self._scans)):
-            self._hindsight.start(self._frozen(), count)
+        self._adopt(self._guarded(lambda: self.hindsight.outcome(count)), keyframes)
+        if self.hindsight.is_due(len(self._scans)):
+            self._guarded(lambda: self.hindsight.start(self._frozen(), count))
         if count % self._config.review_every_keyframes == 0:
             self.clusters.judge(keyframes[-1].stamp_ns)
 
     def explain_all(self, keyframes: StampedPoses[Keyframe]) -> None:
         """Explain all scans at once, now."""
         if self._landmarks.begins_new and self._scans:
-            self._adopt(self._guarded(lambda: self._hindsight.found(self._frozen)), keyframes)
+            self._adopt(self._guarded(lambda: self.hindsight.found(self._frozen)), keyframes)
             self.clusters.judge(keyframes[-1].stamp_ns)
 
     def _guarded(self, search: Callable[[], Found | None]) -> Found | None:
@@ -358,14 +362,15 @@ class AnonymousLandmarks:
         moved = np.array([scan.where.T_keyframe_base for scan in scans])
         at = self._solver.estimate([scan.where.vertex for scan in scans])
         poses = np.stack(group.compose(tuple(at.T), tuple(moved.T)), axis=-1)
-        scales = self._beam.scales[0] if self._beam else self._hindsight.scales[0]
+        scales = self._beam.scales[0] if self._beam else self.hindsight.scales[0]
         given = np.array(self.clusters.given)
         leader = given.copy()
         for cluster, landmark in changes(None, self._leader).items():
             leader[cluster] = landmark
         nearby = self._nearby + [self._reckoning.nearby(scan.at.stamp_ns) for scan in scans[len(self._nearby) :]]
         motions, clocks = tuple(self._motions), dict(self._clocks)
-        return FrozenScans(tuple(scans), motions, np.array(nearby), poses, scales.copy(), given, leader, clocks)
+        frozen = FrozenScans(tuple(scans), motions, np.array(nearby), poses, scales.copy(), given, leader, clocks)
+        return with_map(frozen, self._belief, self.clusters.final)
 
     def _adopt(self, found: Found | None, keyframes: StampedPoses[Keyframe]) -> None:
         """Use an explanation of all scans up to one."""
@@ -383,7 +388,7 @@ class AnonymousLandmarks:
             places = dict(zip(numbers.tolist(), found.estimate.landmarks.tolist(), strict=True))
             self._solver.start_at(self._landmarks.placed(self._with_new(values), self._named(places)))
             self._solver.optimize()
-        self._hindsight.note(self.clusters.given)
+        self.hindsight.note(self.clusters.given)
 
     def _with_new(self, values: Array) -> Array:
         """Stored numbers, extended by those of vertices that were added since."""

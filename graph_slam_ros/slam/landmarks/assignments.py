@@ -13,8 +13,10 @@ from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.types import Sighting
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
 from graph_slam_ros.slam.landmarks.beam import NOTHING
+from graph_slam_ros.slam.landmarks.landmark import Landmark
 from graph_slam_ros.slam.landmarks.landmark_map import Landmarks
 from graph_slam_ros.slam.landmarks.moves import LEAST_SCANS
+from graph_slam_ros.slam.landmarks.renumbered import Renumbered
 from graph_slam_ros.slam.landmarks.scans import Cluster, Seen
 
 NOT_IN_MAP = ""  # in place of a name, where the map is held and nothing in it fits
@@ -52,6 +54,7 @@ class Assignments:
     given : of each cluster the number of its landmark, or ``NOTHING``
     seen : of each cluster its sightings
     names : of landmarks by number
+    before : of landmarks by number how many clusters there were that have left
     """
 
     def __init__(
@@ -65,6 +68,7 @@ class Assignments:
         self._begun, self._fresh = 0, _FROM_MAP
         self._final = 0  # clusters whose landmarks stay
         self._given_up: dict[int, list[int]] = {}  # landmarks that were, with their clusters
+        self.before: Counter[int] = Counter()
 
     def restore(self) -> bool:
         """Continue with the landmarks of a map, if there are any. New names differ from theirs."""
@@ -72,6 +76,12 @@ class Assignments:
         self._begun = last_number(unnamed)
         self.names = {self.fresh(): name for name in unnamed}
         return bool(unnamed)
+
+    @property
+    def final(self) -> dict[int, Landmark]:
+        """The landmarks that have sightings which cannot be taken back, by number."""
+        marks = {k: self._landmarks.known[name] for k, name in self.names.items() if self._landmarks.is_there(name)}
+        return {k: mark for k, mark in marks.items() if len(mark.seen) < mark.sightings}
 
     def fresh(self) -> int:
         """A number for a landmark that no cluster has begun."""
@@ -81,6 +91,25 @@ class Assignments:
     def finish(self) -> None:
         """Fix the assignment of all present clusters."""
         self._final = len(self.given)
+
+    def forget(self, gone: int, stay: Iterable[Cluster]) -> Renumbered:
+        """Forget the oldest clusters: their landmarks are final. Returns the new numbers.
+
+        Parameters
+        ----------
+        gone : how many leave; stay : the others
+        """
+        new, known = Renumbered(gone, self.fresh), self._landmarks.known
+        self.before.update(k for k in self.given[:gone] if k != NOTHING)
+        self.given = [new.landmark(k) for k in self.given[gone:]]
+        self.seen = [cluster.seen for cluster in stay]
+        up = {k: [c - gone for c in clusters if c >= gone] for k, clusters in self._given_up.items()}
+        self._given_up = {new.landmark(k): clusters for k, clusters in up.items() if clusters}
+        numbers = {*self.given, *self._given_up, *(new.landmark(k) for k, one in self.names.items() if one in known)}
+        self.names = new.kept(self.names, numbers)
+        self._scans, self.before = (Counter(new.kept(one, numbers)) for one in (self._scans, self.before))
+        self._final = max(self._final - gone, 0)
+        return new
 
     def append(self, clusters: Sequence[Cluster]) -> int:
         """Add clusters without a landmark. Returns the number of the first."""
@@ -157,6 +186,7 @@ class Assignments:
             for_long = mark.last_seen_ns - mark.first_seen_ns >= round(c.confirm_s * 1e9)
             often = number < _FROM_MAP or self._scans[number] >= least
             is_sure = mark.sightings >= c.confirm_sightings and for_long and often
+            is_sure |= len(mark.seen) < mark.sightings and not mark.is_tentative  # some cannot be taken back any more
             if is_sure == mark.is_tentative:
                 self._landmarks.confirm(name, is_sure=is_sure)
             if not is_sure and now_ns - mark.last_seen_ns > round(c.give_up_s * 1e9):

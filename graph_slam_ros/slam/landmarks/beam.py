@@ -6,6 +6,7 @@ another with the joint covariance, so that the assignments are jointly compatibl
 likeliest are kept. Of hypotheses with the same recent decisions only the best is kept. The first one is the leader.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -335,6 +336,11 @@ class Beam:
             own,
             number,
         )
+
+    def renumber(self, new: Callable[[int], int], ids: Ids) -> None:
+        """Take over new numbers of landmarks, also as ``ids``."""
+        self.ids = ids
+        self._signs = [tuple(map(new, sign)) for sign in self._signs]
 
     @property
     def is_sound(self) -> bool:

@@ -65,6 +65,25 @@ class SolverBelief:
         for k in out[apart < _REACH_SIGMA * spread + _REACH_M].tolist():
             self._recall(beam, scan, k, names)
 
+    def seen_from(self, scan: Scan, names: list[str]) -> tuple[Array, Array]:
+        """Landmarks (k, n) as they should be seen from a scan, and the covariance (k, n, n) of each.
+
+        Raises
+        ------
+        GraphSlamError
+            The solver has no covariance.
+        """
+        n, dof = self._space.dimensions, self._space.dof
+        position, turn, _ = self._pose(scan)
+        marks = [self._landmarks.known[name] for name in names]
+        points = (self._landmarks.positions([mark.vertex for mark in marks]) - position) @ turn
+        joint, covariances = self._joint(scan, names), np.empty((len(points), n, n))
+        for k, point in enumerate(points):
+            at = np.r_[:dof, dof + n * k : dof + n * (k + 1)]
+            j = np.concatenate([-turn.T, -lever(point), turn.T], axis=1)
+            covariances[k] = j @ joint[np.ix_(at, at)] @ j.T
+        return points, covariances
+
     def _recall(self, beam: Beam, scan: Scan, number: int, names: Mapping[int, str]) -> None:
         """Bring back a landmark: the solver's conditional given what it shares with each hypothesis."""
         n, dof = self._space.dimensions, self._space.dof

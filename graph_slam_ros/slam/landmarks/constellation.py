@@ -55,7 +55,7 @@ def stretches(drive: Drive, e: Estimate) -> list[tuple[int, int, int]]:
     First those around landmarks that were seen in a single stretch of time, or rarely, each with its landmark. Then
     those between two gaps, in which nothing was seen, and the pairs of these: in a gap odometry may have erred.
     """
-    stamps, counts = drive.stamps_s, np.bincount(e.which[e.which >= 0], minlength=len(e.landmarks))
+    stamps, counts = drive.stamps_s, drive.counts(e)
     out: list[tuple[int, int, int]] = []
     ends = np.flatnonzero(np.diff(stamps) > _GAP_S)
     runs = list(zip(np.r_[0, ends + 1].tolist(), np.r_[ends, len(stamps) - 1].tolist(), strict=True))
@@ -92,7 +92,7 @@ def _laid(drive: Drive, e: Estimate, landmark: int, first: int, last: int) -> Es
     Returns ``e`` itself if two such motions cost nearly the same.
     """
     is_inside = (drive.scan >= first) & (drive.scan <= last)
-    outside = np.bincount(e.which[(e.which >= 0) & ~is_inside], minlength=len(e.landmarks))
+    outside = drive.counts(e, ~is_inside)
     least = max(_LEAST_STRONG, _WEAK * float(np.median(outside[outside > 0])) if outside.any() else 0.0)
     was_seen = np.isin(np.arange(len(outside)), e.which[drive.scan < first])
     strong = np.flatnonzero((outside >= least) & was_seen & (np.arange(len(outside)) != landmark))

@@ -6,8 +6,9 @@ not by chance, their clusters are proposed to be of the landmarks there. Whether
 decides, as for landmarks with identities.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -50,12 +51,14 @@ class Seen:
     firsts : the first cluster of each scan
     thought : (M,) the number of each cluster's landmark, by the beam
     names : of landmarks by number
+    before : of landmarks by number how many clusters there were before these
     """
 
     scans: Sequence[Scan]
     firsts: Sequence[int]
     thought: Index
     names: dict[int, str]
+    before: Mapping[int, int]
 
 
 class UnnamedDisplacement:
@@ -81,6 +84,16 @@ class UnnamedDisplacement:
         self.since = self.keeps_from = self.fits_from = None
         self.proposed = {}
 
+    def propose(self, seen: Seen) -> dict[int, int]:
+        """Compare the newest scans with the map; returns what fits elsewhere, as landmark by cluster."""
+        thought = seen.thought.copy()
+        thought[list(self.proposed)] = list(self.proposed.values())
+        seen = replace(seen, thought=thought)
+        self.update(seen)
+        proposed = self.proposal(seen)
+        self.proposed |= {cluster: int(thought[cluster]) for cluster in proposed}
+        return proposed
+
     def update(self, seen: Seen) -> None:
         """Compare the newest scans with the map."""
         if len(seen.scans) <= 2 * _SCANS:
@@ -99,12 +112,11 @@ class UnnamedDisplacement:
 
     def _known(self, seen: Seen, before: int) -> tuple[Index, Array]:
         """Numbers and places (L, n) of the landmarks that were well known before a cluster."""
-        numbers, counts = np.unique(seen.thought[:before], return_counts=True)
-        known = self._landmarks.known
-        numbers = np.array(
-            [k for k in numbers[counts >= _KNOWN].tolist() if k != NOTHING and seen.names.get(k) in known],
-            dtype=np.int64,
-        )
+        counts, known = Counter(seen.before), self._landmarks.known
+        for number, count in zip(*np.unique(seen.thought[:before], return_counts=True), strict=True):
+            counts[int(number)] += int(count)
+        often = sorted(k for k, count in counts.items() if count >= _KNOWN and k != NOTHING)
+        numbers = np.array([k for k in often if seen.names.get(k) in known], dtype=np.int64)
         return numbers, self._landmarks.positions([known[seen.names[k]].vertex for k in numbers.tolist()])
 
     def _are_missing(self, seen: Seen, places: Array) -> bool:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from graph_slam_ros.slam.landmarks.beam import LOG_SIZES, SIZE_CHI2, BeamSettings
 from graph_slam_ros.slam.landmarks.bordered import BorderedEquations, Pattern, Rows
 from graph_slam_ros.slam.landmarks.rotations import applied, lever, product, rotation, rotation_vector
-from graph_slam_ros.slam.landmarks.scans import NEARBY_S, Motion, Scan
+from graph_slam_ros.slam.landmarks.scans import Motion, Scan, interpolated_nearby
 from graph_slam_ros.typing import Array, Mask
 
 UNUSED = -1
@@ -84,6 +84,7 @@ class Drive:
     points : (M, n) clusters, from their scans
     topics : (T,) inputs; ``clocks`` are the corrections that stamps have by now
     whiten : (M, n, n)
+    times : (M,) how often the robot has seen what a cluster stands for
     work : rows of odometry and clusters that were linearised by now
     """
 
@@ -95,12 +96,14 @@ class Drive:
         settings: BeamSettings,
         costs: Costs,
         clocks: Mapping[str, float] | None = None,
+        times: Array | None = None,
     ) -> None:
         self.settings = settings
         self.stamps_s = np.array([one.at.stamp_ns for one in scans]) * 1e-9
         self.scan = np.array([k for k, one in enumerate(scans) for _ in one.clusters], dtype=np.int64)
         self.points = np.array([c.point for one in scans for c in one.clusters])
         self.n = self.points.shape[1]
+        self.times = np.ones(len(self.points)) if times is None or not len(times) else times
         self.sort = np.array([c.sort for one in scans for c in one.clusters])
         self._size = np.array([c.size for one in scans for c in one.clusters])
         self._has_sizes = settings.size_sigma_m > 0.0 and bool(self._size.any())
@@ -141,7 +144,7 @@ class Drive:
         """Note of which input each cluster is, what its stamps lack, and how the robot moved around each scan."""
         of = [[seen.topic for seen in c.seen] for one in scans for c in one.clusters]
         self.topics = tuple(sorted({topic for names in of for topic in names}))
-        parts = [[names.count(topic) / len(names) for topic in self.topics] for names in of]
+        parts = [[names.count(topic) / max(len(names), 1) for topic in self.topics] for names in of]
         self._part = np.array(parts).reshape(len(of), len(self.topics))
         lacks = [[clocks.get(s.topic, 0.0) - s.clock_s for s in c.seen] for one in scans for c in one.clusters]
         self._late_s = np.array([np.mean(one) if one else 0.0 for one in lacks])
@@ -170,7 +173,7 @@ class Drive:
         """
         points = self.points[clusters]
         after_s = self._part[clusters] @ e.clocks + self._late_s[clusters]
-        moved, rate = _interpolated(self._nearby[self.scan[clusters]], after_s)
+        moved, rate = interpolated_nearby(self._nearby[self.scan[clusters]], after_s)
         turned = applied(rotation(moved[:, self.n :]), points)
         swung = applied(lever(turned), rate[:, self.n :])
         return turned + moved[:, : self.n], swung + rate[:, : self.n]
@@ -303,6 +306,11 @@ class Drive:
         e = self.solve(e, 15, enough=0.1, loss_scale=10.0)
         return self.solve(e, 40)
 
+    def counts(self, e: Estimate, which: Mask | slice = slice(None)) -> Array:
+        """How often each landmark was seen (J,), in some of the clusters."""
+        of, times = e.which[which], self.times[which]
+        return np.bincount(of[of >= 0], times[of >= 0], minlength=len(e.landmarks)).astype(np.float64)
+
     def landmarks_of(self, e: Estimate) -> Array:
         """The median of the observed positions of each landmark."""
         seen = self.seen_at(e)
@@ -372,18 +380,6 @@ class Drive:
         border = np.concatenate([n * e.which[used][:, None] + np.arange(n), clocks], axis=1)
         j, by_border = weight[:, None, None] * j, weight[:, None, None] * by_border
         return Rows(j, by_border, weight[:, None] * r, dof * k, border)
-
-
-def _interpolated(nearby: Array, at_s: Array) -> tuple[Array, Array]:
-    """Motions (m, dof) at times relative to the stamps, from those (m, S, dof) at ``NEARBY_S``, and their rates.
-
-    Beyond these times the motion goes on as at the end.
-    """
-    k = np.clip(np.searchsorted(NEARBY_S, at_s, side="right") - 1, 0, len(NEARBY_S) - 2)
-    rows = np.arange(len(k))
-    before, after = nearby[rows, k], nearby[rows, k + 1]
-    rate = (after - before) / (NEARBY_S[k + 1] - NEARBY_S[k])[:, None]
-    return before + (at_s - NEARBY_S[k])[:, None] * rate, rate
 
 
 def _whitening(covariances: Array) -> Array:

@@ -41,6 +41,8 @@ class FrozenScans:
     leader : (M,) the same, by the beam alone
     nearby : (N, S, dof) how the robot moved around each scan, by odometry
     clocks : of each input the correction that its stamps have by now [s]
+    of_map : the first so many scans stand for the map (``known_map.py``); clusters_of_map : theirs
+    times : (M,) how often the robot has seen what a cluster stands for; empty: once each
     """
 
     scans: tuple[Scan, ...]
@@ -51,6 +53,14 @@ class FrozenScans:
     given: Ids
     leader: Ids
     clocks: Mapping[str, float] = field(default_factory=dict)
+    of_map: int = 0
+    clusters_of_map: int = 0
+    times: Array = field(default_factory=lambda: np.empty(0))
+
+    @property
+    def count(self) -> int:
+        """The number of scans of the robot."""
+        return len(self.scans) - self.of_map
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,10 +84,12 @@ class Found:
     presence: Presence = NOTHING_SEEN
 
     def numbers(self, given: Sequence[int], fresh: Callable[[], int]) -> Ids:
-        """The number of each landmark: that of most of its clusters, each used once, or a fresh one."""
-        which = self.estimate.which
-        before = np.array(given)[: len(which)]
-        pairs, sizes = np.unique(np.stack([which, before])[:, which >= 0], axis=1, return_counts=True)
+        """The number of each landmark: that of the map or of most of its clusters, each used once, or a fresh one."""
+        which, of_map = self.estimate.which, self.frozen.clusters_of_map
+        before = np.concatenate([self.frozen.given[:of_map], np.array(given)[: len(which) - of_map]])
+        both = np.stack([which, before])[:, which >= 0]
+        pairs, of = np.unique(both, axis=1, return_inverse=True)
+        sizes = np.bincount(of.ravel(), np.where(np.arange(len(which)) < of_map, len(which), 1)[which >= 0])
         out, used = np.full(len(self.estimate.landmarks), NOTHING), {NOTHING}
         for landmark, number in pairs[:, np.argsort(-sizes, kind="stable")].T.tolist():
             if out[landmark] == NOTHING and number not in used:
@@ -89,7 +101,7 @@ class Found:
 
     def changes(self, given: Sequence[int], numbers: Ids) -> tuple[dict[int, int], dict[int, int]]:
         """The new landmark of each changed cluster, later clusters included, and the successor of each removed one."""
-        which, before = self.estimate.which, np.array(given)
+        which, before = self.estimate.which[self.frozen.clusters_of_map :], np.array(given)
         after, frozen = before.copy(), before[: len(which)]
         of_none = np.where(np.isin(frozen, _indices(frozen)[0]), NOTHING, frozen)
         after[: len(which)] = np.where(which >= 0, numbers[which], of_none)
@@ -107,10 +119,10 @@ class Found:
         n, scans = space.dimensions, self.frozen.scans
         found = tuple(poses_of(space, self.estimate.position, self.estimate.turn).T)
         correction = np.stack(group.compose(found, group.inverse(tuple(self.frozen.poses.T))), axis=-1)
-        at = np.array([scan.where.keyframe for scan in scans])
+        at = np.array([scan.where.keyframe for scan in scans]) - keyframes.first
         at, last = np.unique(at[::-1], return_index=True)
         correction = correction[::-1][last]
-        k = np.arange(len(keyframes))
+        k = np.arange(len(keyframes.ids))
         after = np.clip(np.searchsorted(at, k), 0, len(at) - 1)
         before = np.clip(np.searchsorted(at, k, side="right") - 1, 0, len(at) - 1)
         stamps = keyframes.stamps_ns
@@ -143,6 +155,7 @@ class Hindsight:
         self._costs = Costs(max(-2.0 * settings.log_new, _LEAST_LANDMARK), unused, c.ambiguity_chi2)
         self._after = config.robust.apply_after_keyframes
         self._next = _FIRST
+        self._explained = 0  # scans of the last explanation that was begun
         self._job: tuple[int, Callable[[], Found | None]] | None = None
         self._last: Ids | None = None
         self.is_on = True
@@ -156,7 +169,7 @@ class Hindsight:
 
     def start(self, frozen: FrozenScans, keyframes: int) -> None:
         """Start with the present scans."""
-        self._next = round(_MORE * len(frozen.scans))
+        self._next, self._explained = round(_MORE * frozen.count), frozen.count
         work = self._executor(lambda: explained(self._space, frozen, self._settings, self._costs))
         self._job = keyframes + self._after, work
 
@@ -175,6 +188,21 @@ class Hindsight:
                 value, own = self.found_scales[name]
                 self.found_scales[name] = (1.0 + value) / factor - 1.0, own / factor
 
+    def covers(self, scans: int) -> bool:
+        """Return whether so many scans were explained, and the result used. If not, that is due."""
+        if self._job is None and self._explained < scans:
+            self._next = 0
+        return self._job is None and self._explained >= scans
+
+    @property
+    def is_doubtful(self) -> bool:
+        """Return whether the last explanation has landmarks where none are seen."""
+        return self.newest is not None and self.newest.presence.is_doubtful
+
+    def forget(self, scans: int) -> None:
+        """Note that the oldest scans have left."""
+        self._next, self._explained, self._last = self._next - scans, self._explained - scans, None
+
     def outcome(self, keyframes: int) -> Found | None:
         """The explanation that is due at a keyframe. It waits for it."""
         if self._job is None or keyframes < self._job[0]:
@@ -188,8 +216,9 @@ class Hindsight:
         if not self.is_on:
             return None
         frozen = freeze()
-        if self._last is not None and np.array_equal(self._last, frozen.given):
+        if self._last is not None and np.array_equal(self._last, frozen.given[frozen.clusters_of_map :]):
             return None
+        self._explained = frozen.count
         return self._noted(explained(self._space, frozen, self._settings, self._costs))
 
     def note(self, given: Sequence[int]) -> None:
@@ -202,7 +231,7 @@ class Hindsight:
         if self.newest is None:
             return {}
         return {
-            "scans": len(self.newest.frozen.scans),
+            "scans": self.newest.frozen.count,
             "is_whole": self.newest.is_whole,
             "undecided": self.newest.undecided,
             "missing_part": self.newest.presence.missing_part,
@@ -213,14 +242,17 @@ class Hindsight:
 
     def _noted(self, found: Found | None) -> Found | None:
         if found is not None:
+            if found.frozen.of_map:  # a part of the drive determines scales and clocks worse than the whole did
+                found = replace(found, clocks=self.newest.clocks if self.newest else {})
+            else:
+                self.found_scales = {} if found.presence.is_doubtful else dict(found.scales)
             self.scales, self.newest = (found.estimate.scales, _SCALE_SIGMA), found
-            self.found_scales = {} if found.presence.is_doubtful else dict(found.scales)
         return found
 
 
 def explained(space: Geometry, frozen: FrozenScans, settings: BeamSettings, costs: Costs) -> Found | None:
     """Explain all scans, from the graph's assignment and from the beam's; None if too little was seen."""
-    drive = Drive(frozen.scans, frozen.motions, frozen.nearby, settings, costs, frozen.clocks)
+    drive = Drive(frozen.scans, frozen.motions, frozen.nearby, settings, costs, frozen.clocks, frozen.times)
     here = matrices_of(space, frozen.poses)
     paths = here, drive.along_odometry(here[0][0], here[1][0], frozen.scales)
     found: list[Found] = []
@@ -247,7 +279,7 @@ def explained(space: Geometry, frozen: FrozenScans, settings: BeamSettings, cost
         is_whole=is_whole,
         scales={name: one for name, one in unknowns.items() if name in SCALES},
         clocks={name: one for name, one in unknowns.items() if name not in SCALES},
-        presence=presence(drive, estimate),
+        presence=presence(drive, estimate, frozen.of_map),
     )
 
 

@@ -122,10 +122,11 @@ class LandmarkFrontend:
         self.lifetimes.restore(passes)
         self.anonymous.restore()
 
-    def renumber(self, vertices: Index, edges: Index) -> None:
-        """Take over new ids of vertices and edges, by old ones; -1: it was removed."""
+    def forget_before(self, keyframe: int, vertices: Index, edges: Index) -> None:
+        """Take over new ids, by old ones, after the keyframes before a number have left; -1: it was removed."""
         self.map.renumber(vertices, edges)
         self.lifetimes.renumber(vertices, edges)
+        self.anonymous.forget_before(keyframe, vertices)
 
     def identified(self, m: Sightings, where: PoseAtStamp) -> list[Assigned]:
         """The sightings that can be used now, each with its landmark. The others are counted."""

@@ -121,6 +121,8 @@ class Landmarks:
         """
         for landmark in self.known.values():
             landmark.vertex = int(vertices[landmark.vertex])
+            landmark.seen = [one.renumbered(vertices, edges) for one in landmark.seen if edges[one.edge] >= 0]
+            landmark.stamps = {one.where.stamp_ns for one in landmark.seen}
         self.offsets = {name: int(vertices[vertex]) for name, vertex in self.offsets.items()}
         self.touched_before += len(self.touched) - len(self.known)
         self.touched[:] = self.known
@@ -262,6 +264,15 @@ class Landmarks:
             landmark.reset_features()
         self._withdraw_sightings(gone)
         self.touched.append(name)
+
+    def withdraw_tentative(self, keyframe: int) -> None:
+        """Withdraw what was seen of tentative landmarks before a keyframe, and count it."""
+        for name, mark in [both for both in self.known.items() if both[1].is_tentative]:
+            old = [one for one in mark.seen if one.where.keyframe < keyframe]
+            for one in old:
+                self._counters.count(one.topic, "condensed")
+            if old:
+                self.remove_sightings(name, {(one.where.stamp_ns, one.topic, one.sighting) for one in old})
 
     def confirm(self, name: str, *, is_sure: bool) -> None:
         """Mark a landmark as accepted, or as tentative again."""

@@ -51,17 +51,17 @@ class Presence:
 NOTHING_SEEN = Presence(0, 0, 0, 0)
 
 
-def presence(drive: Drive, e: Estimate) -> Presence:
-    """Count which landmarks in view were seen, over all scans."""
-    begins = np.searchsorted(drive.scan, np.arange(drive.size + 1)).tolist()
+def presence(drive: Drive, e: Estimate, first: int = 0) -> Presence:
+    """Count which landmarks in view were seen, over all scans from one on."""
+    begins = np.searchsorted(drive.scan, np.arange(first, drive.size + 1)).tolist()
     names = [set(e.which[a:b].tolist()) - {UNUSED} for a, b in itertools.pairwise(begins)]
     missing = 0
-    for k, (a, b) in enumerate(itertools.pairwise(begins)):
+    for k, (a, b) in enumerate(itertools.pairwise(begins), first):
         if a == b or not len(e.landmarks):
             continue
         points = drive.points[a:b]
         is_absent = is_missing((e.landmarks - e.position[k]) @ e.turn[k], points, points)
-        is_absent[list(names[k])] = False
+        is_absent[list(names[k - first])] = False
         missing += int(np.count_nonzero(is_absent))
     both = [(before & after, between) for before, between, after in zip(names, names[1:], names[2:], strict=False)]
     followed, lost = sum(len(one) for one, _ in both), sum(len(one - between) for one, between in both)

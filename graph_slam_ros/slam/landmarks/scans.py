@@ -18,7 +18,7 @@ from graph_slam_ros.measurements.types import Sighting
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
 from graph_slam_ros.slam.frontend.odometry_selector import Step
 from graph_slam_ros.slam.landmarks.rotations import lever, rotation, turn_of
-from graph_slam_ros.typing import Array, Numbers
+from graph_slam_ros.typing import Array, Index, Numbers
 
 SCAN_NS, _SCAN_RAD = 500_000_000, 0.15
 NEARBY_S = np.linspace(-0.5, 0.5, 21)
@@ -173,6 +173,18 @@ def rescaled_nearby(space: Geometry, nearby: Array, factors: tuple[float, float]
     return np.concatenate([way, factors[1] * turn], axis=1)
 
 
+def interpolated_nearby(nearby: Array, at_s: Array) -> tuple[Array, Array]:
+    """Motions (m, dof) at times relative to the stamps, from those (m, S, dof) at ``NEARBY_S``, and their rates.
+
+    Beyond these times the motion goes on as at the end.
+    """
+    k = np.clip(np.searchsorted(NEARBY_S, at_s, side="right") - 1, 0, len(NEARBY_S) - 2)
+    rows = np.arange(len(k))
+    before, after = nearby[rows, k], nearby[rows, k + 1]
+    rate = (after - before) / (NEARBY_S[k + 1] - NEARBY_S[k])[:, None]
+    return before + (at_s - NEARBY_S[k])[:, None] * rate, rate
+
+
 def motion_between(space: Geometry, noise: MotionNoise, a: Reckoned, b: Reckoned, jump: Array) -> Motion:
     """The motion from one instant to another.
 
@@ -274,6 +286,17 @@ class ScanBuilder:
         first = self._glimpses[0].at
         is_over = at.stamp_ns - first.stamp_ns >= SCAN_NS or at.turned - first.turned >= _SCAN_RAD
         return is_over or at.segment != first.segment
+
+    @property
+    def oldest_keyframe(self) -> int | None:
+        """The number of the oldest keyframe that something was seen from; None if nothing was."""
+        return min((one.seen.where.keyframe for one in self._glimpses), default=None)
+
+    def renumber(self, vertices: Index) -> None:
+        """Take over new vertices of keyframes, by old ones."""
+        for k, one in enumerate(self._glimpses):
+            where = replace(one.seen.where, vertex=int(vertices[one.seen.where.vertex]))
+            self._glimpses[k] = replace(one, seen=replace(one.seen, where=where))
 
     def reckon_anew(self, at: Callable[[int], Reckoned]) -> None:
         """Take over dead reckoning that was corrected."""
