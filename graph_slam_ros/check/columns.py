@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from graph_slam_ros.check.located import located
+from graph_slam_ros.check.located import located, mount_corrections, moved
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.lie import se3
 from graph_slam_ros.measurements.counters import Counters
@@ -20,7 +20,7 @@ from graph_slam_ros.messages.from_msg import TF, TF_STATIC, OwnDecoder
 from graph_slam_ros.messages.inputs import uses
 from graph_slam_ros.messages.inputs.odometry_bytes import OdometryBytes, OdometryRun
 from graph_slam_ros.messages.inputs.transforms import Transforms, pose
-from graph_slam_ros.typing import Array, Index
+from graph_slam_ros.typing import Array, Index, Numbers
 
 MOST = 200_000
 """Messages of each topic that are collected; a replay looks into no more."""
@@ -164,8 +164,8 @@ class _Topic:
 
 
 class _Sightings:
-    def __init__(self, name: str, topic: str) -> None:
-        self.input, self.topic = name, topic
+    def __init__(self, name: str, topic: str, mount: Numbers) -> None:
+        self.input, self.topic, self._mount = name, topic, mount
         self.frame, self.T_base_frame = "", se3.IDENTITY
         self.stamp_ns, self.message, self.name = array("q"), array("q"), array("q")
         self.points, self.sigmas = array("d"), array("d")
@@ -188,7 +188,7 @@ class _Sightings:
 
     def columns(self) -> SightingColumns:
         numbers = (_index(self.stamp_ns), _index(self.message), tuple(self.names), _index(self.name))
-        points = np.array(self.points).reshape(-1, 3)
+        points = moved(np.array(self.points).reshape(-1, 3), self.T_base_frame, self._mount)
         return SightingColumns(
             self.input, self.topic, *numbers, points, np.array(self.sigmas), self.frame, self.T_base_frame
         )
@@ -213,7 +213,8 @@ class Collector:
             names = tuple(name for name in used if topics[name] == topic)
             first = by_name[names[0]]
             self._topics[topic] = _Topic(topic, first.type, names, used[names[0]], round(first.offset_s * 1e9))
-        self._sightings = {name: _Sightings(name, topics[name]) for name, use in used.items() if use == "landmarks"}
+        seen, mounts = (name for name, use in used.items() if use == "landmarks"), mount_corrections(config)
+        self._sightings = {name: _Sightings(name, topics[name], mounts[name]) for name in seen}
         self._frame_of = {name: by_name[name].frame for name in used}
         self._odometry_topic = topics.get(self._main, "")
         self._frame, self._child = "", ""

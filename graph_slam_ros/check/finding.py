@@ -150,6 +150,10 @@ KINDS: dict[str, Kind] = {
     ),
     # -- a replay in memory, and a fit that begins at its estimate
     "clock_offset": Kind("sightings agree with odometry better at other stamps", f"set INPUT.offset_s; {_ONE_CLOCK}"),
+    "mount_place": Kind(
+        "the sensor is at another place on the robot",
+        "measure it, and correct its transform; or set INPUT.mount_correction",
+    ),
     "mount_yaw": Kind("the sensor is turned on the robot", "correct its transform, or set INPUT.mount_correction"),
     "odometry_scale": Kind(
         "the robot drives more or less than odometry says", "correct the wheel radius, or set odometry.distance_factor"

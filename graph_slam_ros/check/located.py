@@ -2,8 +2,10 @@
 
 import numpy as np
 
-from graph_slam_ros.lie import se3
+from graph_slam_ros.config.config import Config
+from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.measurements.types import Sighting
+from graph_slam_ros.typing import Array, Numbers
 
 
 def located(one: Sighting) -> tuple[tuple[float, float, float], float]:
@@ -25,3 +27,21 @@ def located(one: Sighting) -> tuple[tuple[float, float, float], float]:
         seen = se3.act(T, seen)
     sigma = ((c[0] + m[0] ** 2 * sum(c[i * (size + 1)] for i in range(1, size))) / size) ** 0.5
     return (float(seen[0]), float(seen[1]), float(seen[2])), float(sigma)
+
+
+def mount_corrections(config: Config) -> dict[str, Numbers]:
+    """x, y, z, roll, pitch, yaw by which the mount of each input is corrected; in the plane only x, y and yaw."""
+    out: dict[str, Numbers] = {}
+    for one in config.sources:
+        mount = one.numbers("mount_correction", 6) or (0.0,) * 6
+        out[one.name] = mount if config.world.dimensions == 3 else (*mount[:2], 0.0, 0.0, 0.0, mount[5])
+    return out
+
+
+def moved(points: Array, T_base_frame: se3.Pose, mount: Numbers) -> Array:
+    """Points (k, 3) in the base frame, after their sensor was turned about its origin and moved."""
+    if not any(mount):
+        return points
+    origin = np.array(T_base_frame[:3])
+    turned = np.stack(so3.act(so3.exp(tuple(mount[3:])), tuple((points - origin).T)), axis=1)
+    return np.asarray(turned + origin + mount[:3])

@@ -8,17 +8,20 @@ import numpy as np
 from graph_slam_ros.check.columns import Columns
 from graph_slam_ros.check.finding import Finding, Where, assignment
 from graph_slam_ros.check.identities import at_two_places, check_identities, points_in_map
+from graph_slam_ros.check.located import moved
 from graph_slam_ros.check.outliers import check_outliers
 from graph_slam_ros.check.pairs import noisier, pairs_of, path_of, poses_at, turned_mount
 from graph_slam_ros.check.slips import check_slips
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.lie import se3, so3
+from graph_slam_ros.lie import se3
 from graph_slam_ros.measurements.types import Control, Measurement, Odometry
 from graph_slam_ros.slam import Config, GraphSlam
 from graph_slam_ros.slam.calibration.decision import MOST_LOST
 from graph_slam_ros.slam.calibration.decision import Finding as Fitted
 from graph_slam_ros.slam.calibration.fit import TrialFit
-from graph_slam_ros.slam.calibration.uncorrected import CODES, clock_jumps, jump_sentence, sentence, setting_of
+from graph_slam_ros.slam.calibration.parameters import Parameter
+from graph_slam_ros.slam.calibration.places import LEAST_M
+from graph_slam_ros.slam.calibration.uncorrected import CODES, clock_jumps, is_off, jump_sentence, sentence, setting_of
 from graph_slam_ros.slam.noise_scale import LARGEST, NoiseScale
 from graph_slam_ros.typing import Array, Index
 
@@ -30,12 +33,15 @@ _COARSE = {
 }
 _SIGMAS = 4.0
 _TURN_SIGMAS = 6.0  # a wheel's noise that lasts adds up in heading, which neither sigma of a fit knows
+_OF_MOUNT = ("x", "y", "yaw")
 _ABSURD, _BACKWARDS, _SURE = 0.5, 0.35, 0.05
 _DEGREE = np.pi / 180.0
 # By parameter: unit, limit, and from which sigma on it is not observable.
 _LIMITS = {
     "clock": ("s", 0.03, 0.05),
-    "yaw": ("rad", 2.0 * _DEGREE, 3.0 * _DEGREE),
+    "yaw": ("rad", 3.0 * _DEGREE, 3.0 * _DEGREE),
+    "x": ("m", LEAST_M, np.inf),
+    "y": ("m", LEAST_M, np.inf),
     "distance": ("part", 0.03, 0.05),
     "turn": ("part", 0.03, 0.05),
     "range_factor": ("part", 0.03, 0.05),
@@ -107,7 +113,7 @@ def check_trial(c: Columns, slam: GraphSlam) -> Iterator[Finding]:
     if len(slam.keyframes) < 3 or len(path_ns) < 2 or not slam.landmarks:
         return
     try:
-        fit, fitted = slam.trial_fit(chooses=True)
+        fit, fitted = slam.trial_fit(chooses=True, places=True)
     except GraphSlamError as error:
         yield Finding("fit_unsure", "note", 1, 0, "fits", f"the trial fit failed: {error}")
         return
@@ -119,9 +125,9 @@ def check_trial(c: Columns, slam: GraphSlam) -> Iterator[Finding]:
     clocks = [one for one in fitted if one.parameter.name == "clock" and one.verdict == "admitted"]
     late_s = {} if fit.lost > MOST_LOST else {one.parameter.source: one.value for one in clocks}
     found = [] if _goes_back(c) else _places(c, slam, path_ns, path, late_s)
-    turned = {one.parameter.source: one.value for one in fitted if one.parameter.name == "yaw" and _is_off(one)}
-    if turned and found:
-        found = list(_places_of_fit(c, slam, fit, turned, path_ns, path))
+    off = {one.parameter: one.value for one in fitted if one.parameter.name in _LIMITS and _is_far_off(fit, one)}
+    if found and any(one.name in _OF_MOUNT for one in off):
+        found = list(_places_of_fit(c, slam, fit, off, path_ns, path))
     if fit.lost > MOST_LOST:
         found += [one for s in c.sightings for one in noisier(s, pairs_of(s, path_ns, path, c.config.world.dimensions))]
         if not found:
@@ -129,11 +135,9 @@ def check_trial(c: Columns, slam: GraphSlam) -> Iterator[Finding]:
             yield Finding("fit_unsure", "warning", fit.lost, MOST_LOST, "part", text)
         yield from found
         return
-    off = [found_one for one in fitted for found_one in _fitted(c, slam, one)]
-    yield from off
+    yield from (found_one for one in fitted for found_one in _fitted(c, slam, one, off))
     yield from _clock_jumps(c, fit)
-    is_off = any(one.severity == "warning" for one in off)  # a clock or mount that is wrong bends the path in turns
-    slips = [] if is_off else list(check_slips(c, slam))
+    slips = [] if off else list(check_slips(c, slam))  # a clock or mount that is wrong bends the path in turns
     is_displaced = any(one.severity == "warning" for one in slips)
     yield from slips
     yield from (one for one in found if not (is_displaced and one.code in _OF_A_BREAK))
@@ -185,16 +189,20 @@ def _over_confident(c: Columns, noise: NoiseScale, factor: float, limit: float) 
     return Finding(code, "note", factor, limit, "times", text, topic, settings=settings)
 
 
-def _is_off(one: Fitted) -> bool:
+def _is_far_off(fit: TrialFit, one: Fitted) -> bool:
     """Return whether a parameter is far off by its limit and several sigmas."""
-    _, limit, unknown = _LIMITS[one.parameter.name]
+    limit = _LIMITS[one.parameter.name][1]
     sigmas = _TURN_SIGMAS if one.parameter.name == "turn" else _SIGMAS
-    is_known = one.sigma <= unknown and one.verdict == "admitted"
-    return is_known and abs(one.value) > max(limit, sigmas * one.sigma)
+    return is_off(fit, one) and abs(one.value) > max(limit, sigmas * one.sigma)
 
 
-def _fitted(c: Columns, slam: GraphSlam, one: Fitted) -> Iterator[Finding]:
-    """A parameter that is far off by its limit and several sigmas, or that the drive does not tell."""
+def _fitted(c: Columns, slam: GraphSlam, one: Fitted, off: Mapping[Parameter, float]) -> Iterator[Finding]:
+    """A parameter that is far off by its limit and several sigmas, or that the drive does not tell.
+
+    Parameters
+    ----------
+    off : all that are far off
+    """
     if one.parameter.name not in _LIMITS:
         return
     code, (unit, limit, unknown) = CODES[one.parameter.name], _LIMITS[one.parameter.name]
@@ -202,12 +210,12 @@ def _fitted(c: Columns, slam: GraphSlam, one: Fitted) -> Iterator[Finding]:
     if topic is None:
         return
     where: Where = {"topic": topic.name, "first_ns": int(topic.stamp_ns[:1].sum()), "count": len(topic.stamp_ns)}
-    if one.sigma > unknown:
-        yield Finding("not_observable", "note", one.sigma, unknown, unit, one.text, **where)
-    elif _is_off(one):
+    if one.parameter in off:
         text = f"{topic.name}: {sentence(one.parameter, one.value, one.sigma)}"
-        settings = (assignment(*setting_of(one.parameter, {one.parameter: one.value}, slam.calibrated)),)
+        settings = (assignment(*setting_of(one.parameter, off, slam.calibrated)),)
         yield Finding(code, "warning", one.value, limit, unit, text, settings=settings, **where)
+    elif one.sigma > unknown:
+        yield Finding("not_observable", "note", one.sigma, unknown, unit, one.text, **where)
 
 
 def _clock_jumps(c: Columns, fit: TrialFit) -> Iterator[Finding]:
@@ -225,19 +233,18 @@ def _clock_jumps(c: Columns, fit: TrialFit) -> Iterator[Finding]:
 
 
 def _places_of_fit(
-    c: Columns, slam: GraphSlam, fit: TrialFit, turned: Mapping[str, float], path_ns: Index, path: Array
+    c: Columns, slam: GraphSlam, fit: TrialFit, off: Mapping[Parameter, float], path_ns: Index, path: Array
 ) -> Iterator[Finding]:
-    """Findings of places by the estimate of the fit: a sensor that is turned bends the map that it began with.
+    """Findings of places by the estimate of the fit: a mount that is wrong bends the map that it began with.
 
     Parameters
     ----------
-    turned : by input: by how much its sensor is turned
+    off : what is far off, and by how much
     """
     at = slam.graph.offset.values[slam.keyframes.ids][:, None] + np.arange(slam.space.pose.size)
     for s in c.sightings:
-        origin = np.array(s.T_base_frame[:3])
-        turn = so3.exp((0.0, 0.0, turned.get(s.input, 0.0)))
-        points = np.stack(so3.act(turn, tuple((s.points - origin).T)), axis=1) + origin
+        x, y, yaw = (off.get(Parameter(s.input, name), 0.0) for name in _OF_MOUNT)
+        points = moved(s.points, s.T_base_frame, (x, y, 0.0, 0.0, 0.0, yaw))
         stamp_ns = np.clip(s.stamp_ns, path_ns[0], path_ns[-1])
         poses = poses_in_map(slam, stamp_ns, path_ns, path, fit.path[at])
         straight = points_in_map(replace(s, points=points), poses)

@@ -22,6 +22,7 @@ from graph_slam_ros.runs.suggestion import Suggestion
 from graph_slam_ros.runs.tables import account
 from graph_slam_ros.slam import Config, Counters, GraphSlam
 from graph_slam_ros.slam.calibration.parameters import OF_ODOMETRY, QUANTITIES, Parameter
+from graph_slam_ros.slam.calibration.uncorrected import CODES
 from graph_slam_ros.warmup import warmup
 
 _ROUNDS = 4  # replays; a large clock needs two or three
@@ -105,6 +106,9 @@ def calibrate(
         if fault is not None and fault.severity == "error":  # what is fitted to it means nothing
             refused, report = f"nothing is calibrated: mend {fault.code} first", {"settings": {}, "parameters": []}
             break
+        if refused := _misplaced(slam, now):
+            report, found = {"settings": {}, "parameters": []}, {}
+            break
         found |= report["settings"]
         part = (slam.calibrated_since + 1) / len(slam.keyframes)
         if report["settings"] and rounds < _ROUNDS and part < _MOST_REPEATED:
@@ -177,6 +181,18 @@ def _replayed(runs: Iterable[Any], config: Config, most: int | None = None) -> G
     for event in END:
         slam.process(event)
     return slam
+
+
+def _misplaced(slam: GraphSlam, config: Config) -> str:
+    """Return why nothing is used where a sensor is elsewhere on the robot: that passes for scale and yaw."""
+    off = next((one for one in slam.uncorrected() if one.code == CODES["x"]), None)
+    if off is None or not off.setting:
+        return ""
+    source = next(one for one in config.sources if one.name == off.source)
+    key, value = off.setting
+    turn = source.numbers("mount_correction", 6)[3:] or (0.0, 0.0, 0.0)
+    mount = " ".join((*str(value).split()[:3], *(f"{angle:.5g}" for angle in turn)))
+    return f"nothing is calibrated, for what is found hides this: {off}. Measure it, or --set {key}='{mount}'"
 
 
 def _accepted(slam: GraphSlam) -> tuple[int, int]:

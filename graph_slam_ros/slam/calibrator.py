@@ -20,6 +20,7 @@ from graph_slam_ros.slam.calibration.drift import DriftWindows
 from graph_slam_ros.slam.calibration.fit import TrialFit, likelier_fit
 from graph_slam_ros.slam.calibration.model import Values
 from graph_slam_ros.slam.calibration.parameters import DEFAULT_GROUPS, Parameter
+from graph_slam_ros.slam.calibration.places import fit_with_places
 from graph_slam_ros.slam.calibration.recalibration import Recalibration
 from graph_slam_ros.slam.calibration.rows import TrialProblem
 from graph_slam_ros.slam.calibration.uncorrected import Uncorrected, sampled, uncorrected
@@ -133,8 +134,12 @@ class Calibrator:
             wanted = parameters_of(problem, asked, chooses=chooses)
             if has_gyro:  # odometry's turn is mostly that of the gyro
                 wanted = [one for one in wanted if one.name != "turn"]
-            priors = {one: windows.prior(one, calibrate.prior(one.name), now_ns) for one in wanted}
-            return likelier_fit(problem, priors, log_odds) if wanted else None
+            priors = {one: calibrate.prior(one.name) for one in wanted}
+            if not corrects:  # what is told is not hidden by a prior that contradicts
+                priors = {one: max(prior, one.quantity.prior) for one, prior in priors.items()}
+            priors = {one: windows.prior(one, prior, now_ns) for one, prior in priors.items()}
+            fit = likelier_fit if corrects else fit_with_places
+            return fit(problem, priors, log_odds) if wanted else None
 
         return run
 

@@ -14,6 +14,7 @@ from graph_slam_ros.slam.calibration.choice import parameters_of
 from graph_slam_ros.slam.calibration.decision import Finding, decide
 from graph_slam_ros.slam.calibration.fit import TrialFit, likelier_fit
 from graph_slam_ros.slam.calibration.parameters import DEFAULT_GROUPS
+from graph_slam_ros.slam.calibration.places import fit_with_places
 from graph_slam_ros.slam.calibration.recalibration import Recalibration
 from graph_slam_ros.slam.calibration.uncorrected import Uncorrected
 from graph_slam_ros.slam.calibrator import Calibrator
@@ -137,7 +138,7 @@ class MapView(PathView):
         return self.backend.noise_scale(self.keyframes)
 
     def trial_fit(
-        self, groups: Collection[str] = DEFAULT_GROUPS, *, chooses: bool = False
+        self, groups: Collection[str] = DEFAULT_GROUPS, *, chooses: bool = False, places: bool = False
     ) -> tuple[TrialFit, list[Finding]]:
         """Fit the calibration of odometry and sensors with the map, on a copy: nothing is changed.
 
@@ -145,6 +146,7 @@ class MapView(PathView):
         ----------
         groups : of ``slam.calibration.parameters.GROUPS``
         chooses : where all landmarks are observed by ranges alone, fit these instead of odometry's distance
+        places : fit the places of sensors, too, where one is so far off that it passes for other parameters
 
         Returns
         -------
@@ -160,7 +162,8 @@ class MapView(PathView):
         problem = self.backend.trial_problem(self.space, frontend.path, origins, factors=frontend.corrections.factors)
         problem = replace(problem, slips=self._kidnaps.slipped(self.keyframes))
         priors = {one: one.quantity.prior for one in parameters_of(problem, groups, chooses=chooses)}
-        found = likelier_fit(problem, priors, self.config.odometry.log_odds)
+        fit = fit_with_places if places else likelier_fit
+        found = fit(problem, priors, self.config.odometry.log_odds)
         stated = problem.model().sigma_per_m()
         return found, decide(found, len(self.landmarks), slides=self.config.odometry.slides, sigma_per_m=stated)
 

@@ -47,6 +47,14 @@ def parameters_of(problem: TrialProblem, groups: Collection[str], *, chooses: bo
     return found
 
 
+def places_of(problem: TrialProblem) -> list[Parameter]:
+    """The place (x, y) on the robot of each sensor whose sightings have a direction."""
+    kinds: dict[str, set[str]] = {}
+    for edges in problem.model().sightings:
+        kinds.setdefault(edges.source, set()).add(edges.kind)
+    return [Parameter(source, axis) for source, some in kinds.items() if not only_ranges(some) for axis in ("x", "y")]
+
+
 def only_ranges(kinds: Collection[str]) -> bool:
     """Return whether kinds of edges measure distances alone."""
     return all(kind.startswith("range") and kind != "range and bearing" for kind in kinds)

@@ -93,6 +93,14 @@ def decide(
     ]
 
 
+def is_certain(found: TrialFit, parameter: Parameter) -> bool:
+    """Return whether a parameter is off beyond doubt, however large its sigma is: the last three questions."""
+    k = found.parameters.index(parameter)
+    is_far = SIGMAS * found.sigmas[k] < abs(found.values[k]) <= PRIOR_SIGMAS * found.priors[k]
+    is_alone = found.worst_correlation(k)[0] <= MOST_CORRELATED
+    return bool(is_far and is_alone and _agree(float(found.first[k]), float(found.second[k])))
+
+
 def of_association(parameter: Parameter, value: float, sigma: float, is_corrected: bool) -> Finding:
     """Judge a factor of odometry that the association of landmarks without identities has left open and found.
 

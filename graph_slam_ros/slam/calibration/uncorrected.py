@@ -12,16 +12,18 @@ from typing import Any
 
 import numpy as np
 
-from graph_slam_ros.slam.calibration.decision import LEAST_SIGMA_PER_M, SIGMAS, Finding
+from graph_slam_ros.slam.calibration.decision import LEAST_SIGMA_PER_M, SIGMAS, Finding, is_certain
 from graph_slam_ros.slam.calibration.fit import TrialFit
 from graph_slam_ros.slam.calibration.model import Values
 from graph_slam_ros.slam.calibration.parameters import OF_ODOMETRY, Parameter
+from graph_slam_ros.slam.calibration.places import LEAST_M
 from graph_slam_ros.slam.frontend.corrections import AXES
 from graph_slam_ros.typing import Array, Index
 
 CODES = {
     "clock": "clock_offset",
     **dict.fromkeys(("roll", "pitch", "yaw"), "mount_yaw"),
+    **dict.fromkeys(("x", "y"), "mount_place"),
     "distance": "odometry_scale",
     "turn": "turn_scale",
     "range_factor": "range_scale",
@@ -32,6 +34,7 @@ CODES = {
 MOST_SHIFT = 2.0**0.5  # sigmas of the poses: with more, their NEES is three times what is expected
 _DEGREE = np.pi / 180.0
 _JUMPED_S = 0.08
+_SIDES = {"x": ("ahead", "back"), "y": ("to the left", "to the right")}
 _AXIS = {"roll": "about the axis ahead ", "pitch": "about the axis to the left ", "yaw": ""}
 
 Total = Callable[[str, str], float]
@@ -91,7 +94,7 @@ def uncorrected(
     shifts = pose_shifts(found, covariances)
     if sigma_per_m < LEAST_SIGMA_PER_M:
         return _too_sure(found, shifts, sigma_per_m)
-    off = [k for k, one in enumerate(findings) if one.verdict == "admitted" and shifts[k] > MOST_SHIFT]
+    off = [k for k, one in enumerate(findings) if is_off(found, one) and shifts[k] > MOST_SHIFT]
     off = [k for k in off if found.parameters[k].name in CODES]
     values = {found.parameters[k]: float(found.values[k]) for k in off}
     out = []
@@ -106,6 +109,12 @@ def uncorrected(
         for one, before, after, sigma, _ in clock_jumps(found)
     ]
     return [*jumps, *sorted(out, key=lambda one: -one.shift)]
+
+
+def is_off(found: TrialFit, one: Finding) -> bool:
+    """Return whether a parameter is off beyond doubt, though its sigma may be too large to correct it."""
+    is_known = one.verdict == "admitted" or (one.verdict == "not_determined" and is_certain(found, one.parameter))
+    return is_known and (one.parameter.name not in _SIDES or abs(one.value) >= LEAST_M)
 
 
 def clock_jumps(found: TrialFit) -> Iterator[tuple[Parameter, float, float, float, float]]:
@@ -171,6 +180,9 @@ def sentence(one: Parameter, value: float, sigma: float) -> str:
             f"its sensor is turned by {value / _DEGREE:.1f} degrees {_AXIS[one.name]}on the robot "
             f"(sigma {sigma / _DEGREE:.1f})"
         )
+    if one.name in _SIDES:
+        where = _SIDES[one.name][value < 0.0]
+        return f"its sensor is {abs(value):.2f} m further {where} than its mount says (sigma {sigma:.2f} m)"
     if one.name == "range_factor":
         return f"ranges are {1.0 / (1.0 + value):.3f} times the distances that odometry says (sigma {sigma:.3f})"
     if one.name == "range_offset":

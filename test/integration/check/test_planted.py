@@ -180,6 +180,8 @@ def laps(tmp_path_factory):
 FITTED = (
     ("landmark clock +100 ms", "clock_offset", -0.1, 0.02, {}),
     ("mount turned 5 degrees", "mount_yaw", 0.0873, 0.01, {}),
+    ("sensor 0.3 m to the left of its mount", "mount_place", 0.3, 0.04, {}),
+    ("sensor 0.4 m behind its mount", "mount_place", -0.4, 0.04, {}),
     ("odometry scaled 0.9", "odometry_scale", 0.111, 0.02, {}),
     ("two landmarks share an identity", "id_reused", None, None, {}),
     ("track width 8 % wrong", "turn_scale", -0.074, 0.02, {}),
@@ -210,6 +212,14 @@ def test_the_fit_finds_what_needs_an_estimate_and_its_settings_mend_it(
     if value is not None:
         assert found.value == pytest.approx(value, abs=within)
     assert code not in mended
+
+
+def test_a_corrected_mount_is_where_identities_are_looked_for_too(tmp_path):
+    """Sightings 0.3 m to the side put a landmark at two places, on the way there and back."""
+    write_bag(simulate("warehouse", 3, aisles=3, laps=2, sensor="range_bearing"), tmp_path / "drive.mcap")
+    bag = planted(tmp_path / "drive.mcap", tmp_path / "faulty.mcap", "sensor 0.3 m to the left of its mount")
+    found = check(bag, {"ranges.mount_correction": "0 0.3 0 0 0 0"}).findings
+    assert {one.code for one in found if one.severity != "note"} == set()
 
 
 def test_a_fit_of_ranges_of_which_many_are_too_long_is_not_trusted(tmp_path):

@@ -1,8 +1,10 @@
 """A sensor that is turned on the robot is named alone: it explains sightings that do not agree with one place."""
 
 import numpy as np
+import pytest
 from planted_faults import reused
 
+from graph_slam_ros.formats.parameters import parse_setting
 from graph_slam_ros.lie import se2
 from graph_slam_ros.runs.check import check
 from graph_slam_ros.simulation import Drive, write_bag
@@ -48,8 +50,18 @@ def codes(file):
 
 
 def test_a_turned_sensor_is_no_reason_to_doubt_identities(tmp_path):
-    write_bag(four_loops(0, -12.0), tmp_path / "turned.mcap")
+    write_bag(four_loops(0, -12.0, ahead_m=0.0), tmp_path / "turned.mcap")
     assert codes(tmp_path / "turned.mcap") == {"mount_yaw"}
+
+
+def test_a_sensor_that_is_turned_and_elsewhere_has_one_setting_that_mends_both(tmp_path):
+    write_bag(four_loops(0, -8.0, ahead_m=0.3), tmp_path / "both.mcap")
+    found = {one.code: one for one in check(tmp_path / "both.mcap").findings if one.severity != "note"}
+    assert found.keys() == {"mount_yaw", "mount_place"}
+    assert found["mount_place"].value == pytest.approx(0.3, abs=0.1)
+    (setting,) = {text for one in found.values() for text in one.settings}
+    mended = check(tmp_path / "both.mcap", dict([parse_setting(setting)])).findings
+    assert not found.keys() & {one.code for one in mended}
 
 
 def test_an_identity_of_two_landmarks_is_found_with_a_turned_sensor_too(tmp_path):

@@ -1,6 +1,7 @@
 """The command ``calibrate``: settings that are wrong come back right, and applied they leave nothing to correct."""
 
 import json
+import re
 
 import pytest
 from places import ROOT
@@ -72,6 +73,22 @@ def test_settings_with_which_less_is_believed_are_not_printed(tmp_path, monkeypa
     out, err = capsys.readouterr()
     assert "mount_correction" not in out
     assert "not used: detections.mount_correction=0 0 0 0 0 2.0: with it " in err
+
+
+def test_a_sensor_that_is_elsewhere_is_said_instead_of_what_would_hide_it(tmp_path, capsys):
+    """A camera 0.3 m to the side makes odometry seem to be of another scale."""
+    bag = str(tmp_path / "drive.mcap")
+    write_bag(simulate("warehouse", 3, aisles=2, aisle_m=6.0, laps=2), bag)
+    assert main(["calibrate", bag, "--set", "detections.mount_correction=0 0.3 0 0 0 0.1", "--json"]) == 3
+    found = json.loads(capsys.readouterr().out)
+    assert (found["settings"], found["parameters"]) == ({}, [])
+    assert "mount_place: detections: its sensor is 0." in found["refused"]
+    mount = re.search("--set detections.mount_correction='(.*)'", found["refused"])[1].split()
+    assert float(mount[1]) == pytest.approx(0.0, abs=0.05)
+    assert float(mount[5]) == 0.1, "which is calibrated next"
+    assert main(["calibrate", bag, "--set", f"detections.mount_correction={' '.join(mount)}", "--json"]) == 4
+    found = json.loads(capsys.readouterr().out)
+    assert float(found["settings"]["detections.mount_correction"].split()[5]) == pytest.approx(0.0, abs=0.02)
 
 
 @pytest.mark.parametrize(("how", "code"), [("mirrored", "mirrored"), ("backwards", "axes")])

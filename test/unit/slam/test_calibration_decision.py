@@ -7,7 +7,7 @@ import pytest
 
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.errors import ConfigError
-from graph_slam_ros.slam.calibration.decision import decide
+from graph_slam_ros.slam.calibration.decision import decide, is_certain
 from graph_slam_ros.slam.calibration.drift import WINDOW, DriftWindows
 from graph_slam_ros.slam.calibration.fit import TrialFit
 from graph_slam_ros.slam.calibration.parameters import Parameter
@@ -28,6 +28,13 @@ def verdict(value, sigma, corrected=()):
 def test_a_value_that_is_not_determined_is_not_used():
     assert verdict(0.3, 0.035) == "not_determined"
     assert verdict(0.3, 0.025) == "admitted"
+
+
+def test_what_is_off_by_four_sigmas_is_certain_however_large_they_are():
+    assert is_certain(fitted(0.3, 0.035), CLOCK)
+    assert not is_certain(fitted(0.1, 0.035), CLOCK)
+    assert not is_certain(fitted(1.6, 0.035), CLOCK), "beyond its prior"
+    assert not is_certain(replace(fitted(0.3, 0.035), second=np.array([-0.1])), CLOCK), "not in either half"
 
 
 def test_what_was_corrected_is_followed_although_it_is_known_to_be_less_certain():
