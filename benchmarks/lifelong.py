@@ -180,19 +180,24 @@ class UnnamedDrive(Drive):
             yield [without_ids(m) if isinstance(m, Sightings) else m for m in given]
 
     def landmarks(self) -> tuple[list[int], Array, Array]:
-        """Vertices of the confirmed landmarks, estimated positions, and the nearest true ones."""
+        """Vertices of the confirmed landmarks, estimated positions, and the true ones that these are of."""
         vertices = [mark.vertex for mark in self.slam.landmarks.values() if not mark.is_tentative]
         there = self.slam.solver.estimate(vertices)
         places = np.stack(self._in_map("act", tuple(self.course.points.T)), axis=-1)
-        return vertices, there, places[KDTree(places).query(there)[1]]
+        return vertices, there, places[self._nearest(there, places)]
 
     def figures(self) -> Figures:
         """What was measured, and how many landmarks are not where one is, or where another is already."""
         _, there, right = self.landmarks()
-        is_near = np.linalg.norm(there - right, axis=1) < _WRONG_M
+        turn, shift = fitted(there, right)
+        is_near = np.linalg.norm(there @ turn.T + shift - right, axis=1) < _WRONG_M
         found = len(np.unique(right[is_near], axis=0))
-        wrong = {"landmarks": float(found), "wrong": float(len(there) - found)}
-        return super().figures() | wrong
+        return super().figures() | {"landmarks": float(found), "wrong": float(len(there) - found)}
+
+    def _nearest(self, there: Array, places: Array) -> Array:
+        """Return which place is nearest to each landmark, after they were laid on those that are nearest at first."""
+        turn, shift = fitted(there, places[KDTree(places).query(there)[1]])
+        return np.asarray(KDTree(places).query(there @ turn.T + shift)[1])
 
 
 class CityDrive(Drive):
