@@ -27,6 +27,7 @@ from graph_slam_ros.typing import Array, Executor
 
 _FIRST, _MORE = 100, 2.0  # scans at the first time; then times as many
 _LEAST_LANDMARK = 1.0
+_SURE = 0.015  # standard deviation of a scale of odometry below which a part of a drive corrects it
 _SCALE_SIGMA = 0.02  # of odometry's scales, once they were found
 
 
@@ -242,11 +243,11 @@ class Hindsight:
 
     def _noted(self, found: Found | None) -> Found | None:
         if found is not None:
-            if found.frozen.of_map:  # a part of the drive determines scales and clocks worse than the whole did
-                found = replace(found, clocks=self.newest.clocks if self.newest else {})
-            else:
-                self.found_scales = {} if found.presence.is_doubtful else dict(found.scales)
             self.scales, self.newest = (found.estimate.scales, _SCALE_SIGMA), found
+            scales = {} if found.presence.is_doubtful else dict(found.scales)
+            if found.frozen.of_map:  # a part of the drive has few passes, whose errors are alike
+                scales = {name: one for name, one in scales.items() if one[1] < _SURE} or self.found_scales
+            self.found_scales = scales
         return found
 
 
