@@ -264,11 +264,15 @@ def _best_move(
         live += 1
         if locked[u]:
             continue
-        drawn = np.zeros(3)
+        on_0 = on_1 = ZERO  # weight of its neighbours on each side
         for a in range(start[u], start[u + 1]):
-            drawn[side[neighbour[a]]] += weight[neighbour[a]]
+            w = neighbour[a]
+            if side[w] == 0:
+                on_0 += weight[w]
+            elif side[w] == 1:
+                on_1 += weight[w]
         for s in range(2):
-            gain = weight[u] - drawn[1 - s]
+            gain = weight[u] - (on_1 if s == 0 else on_0)
             if total[s] + weight[u] <= most and (gain > best or (gain == best and total[s] < total[to])):
                 pick, to, best = u, s, gain
     return pick, to, live
