@@ -307,7 +307,7 @@ class Drive:
         return self.solve(e, 40)
 
     def counts(self, e: Estimate, which: Mask | slice = slice(None)) -> Array:
-        """How often each landmark was seen (J,), in some of the clusters."""
+        """Return the times that each landmark was seen (J,), in some of the clusters."""
         of, times = e.which[which], self.times[which]
         return np.bincount(of[of >= 0], times[of >= 0], minlength=len(e.landmarks)).astype(np.float64)
 

@@ -29,7 +29,7 @@ class Renumbered:
     _of_gone: dict[int, int] = field(default_factory=dict)
 
     def landmark(self, number: int) -> int:
-        """The new number of a landmark. A negative number stays."""
+        """Return the new number of a landmark. A negative number stays."""
         if number < 0:
             return number
         if number >= self.gone:
@@ -44,7 +44,7 @@ class Renumbered:
         return np.array([self.landmark(one) for one in old.tolist()], dtype=np.int64)[where].reshape(numbers.shape)
 
     def kept(self, by_landmark: Mapping[int, T], which: Collection[int]) -> dict[int, T]:
-        """What is known by landmark, by new number, of some new numbers."""
+        """Return what is known of landmarks, by their new numbers, of some of these."""
         return {number: one for k, one in by_landmark.items() if (number := self.landmark(k)) in which}
 
     def histories(self, last: Sequence[Decision | None]) -> list[Decision | None]:
