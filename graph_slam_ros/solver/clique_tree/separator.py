@@ -1,8 +1,8 @@
 """Vertex separators of a graph: a light set of vertices without which it falls into two parts of about equal weight.
 
 Multilevel, as METIS does it (Karypis and Kumar, "A fast and high quality multilevel scheme for partitioning irregular
-graphs", SIAM J. Sci. Comput. 1998): contract pairs of neighbours until the graph is small, separate that in several
-ways, and carry the lightest separator back level after level, refining it on each (Fiduccia and Mattheyses 1982).
+graphs", SIAM J. Sci. Comput. 1998): contract pairs of neighbours until the graph is small, separate that in two
+ways, and carry the lighter separator back level after level, refining it on each (Fiduccia and Mattheyses 1982).
 
 A graph is (start, neighbour, strength, weight): the neighbours of u are neighbour[start[u]:start[u + 1]], each once,
 joined by so many edges of the original graph; weight is a vertex's degrees of freedom.
@@ -18,7 +18,6 @@ from graph_slam_ros.solver.clique_tree.storage import NOTHING, ZERO
 from graph_slam_ros.typing import Array, Index
 
 COARSE = 40  # vertices of the graph that is separated first
-ATTEMPTS = 6  # from different ends
 PASSES = 6  # of refinement on each level, at most
 PATIENCE = 40  # moves without gain before a pass ends
 HEAVIEST = 0.62  # share of one side
@@ -110,22 +109,12 @@ def _contract(
 
 @kernel
 def _first(start: Index, neighbour: Index, weight: Index) -> Index:
-    """Return the lightest of several separators: by the given order, and by the distances from several vertices."""
-    n = len(weight)
-    best, lightest = np.inf, np.zeros(n, np.int64)
-    order = np.arange(n)
-    seed = 0
-    for attempt in range(ATTEMPTS):
-        side = _sweep(order, start, neighbour, weight)
-        score = _refine(side, start, neighbour, weight)
-        if score < best:
-            best, lightest = score, side
-        if attempt % 2 == 0:
-            order = _by_distance(order[n - 1], start, neighbour)
-        else:
-            seed = (seed * 5 + 3 * n // 7 + 1) % n
-            order = _by_distance(seed, start, neighbour)
-    return lightest
+    """Return the lighter of two separators: by the given order, and by the distance from its last vertex."""
+    order = np.arange(len(weight))
+    side = _sweep(order, start, neighbour, weight)
+    score = _refine(side, start, neighbour, weight)
+    other = _sweep(_by_distance(order[-1], start, neighbour), start, neighbour, weight)
+    return other if _refine(other, start, neighbour, weight) < score else side
 
 
 @inner
