@@ -101,12 +101,8 @@ def calibrate(
             refused, found = _harm(found, kept, before, accepted), kept
             break
         report, kept, before = slam.calibration_report, dict(found), accepted
-        if rounds == 1:
-            fault = worst_of_replay(columns.columns(counters))
-        if fault is not None and fault.severity == "error":  # what is fitted to it means nothing
-            refused, report = f"nothing is calibrated: mend {fault.code} first", {"settings": {}, "parameters": []}
-            break
-        if refused := _misplaced(slam, now):
+        fault = worst_of_replay(columns.columns(counters)) if rounds == 1 else fault
+        if refused := _wrong(fault) or _misplaced(slam, now):
             report, found = {"settings": {}, "parameters": []}, {}
             break
         found |= report["settings"]
@@ -181,6 +177,13 @@ def _replayed(runs: Iterable[Any], config: Config, most: int | None = None) -> G
     for event in END:
         slam.process(event)
     return slam
+
+
+def _wrong(fault: Finding | None) -> str:
+    """Return why nothing is used of a recording that has an error: what is fitted to it means nothing."""
+    if fault is None or fault.severity != "error":
+        return ""
+    return f"nothing is calibrated: mend {fault.code} first"
 
 
 def _misplaced(slam: GraphSlam, config: Config) -> str:
