@@ -325,7 +325,7 @@ REASONS: dict[str, Reason] = {
         _NOTED, "~/remove named a part of a map that is held", "map.localize=false; a frozen map never changes"
     ),
     "condensed_in_map": Reason(_NOTED, "it is of a map with condensed visits", "edit a replay with map.condense=false"),
-    "condensed": Reason(_REFUSED, "its landmark was not confirmed when its keyframe left", "map.window_keyframes"),
+    "condensed": Reason(_REFUSED, "it left before its landmark was determined or confirmed", "map.window_keyframes"),
     "visit_condensed": Reason(_NOTED, "a visit was added to its place, begins one, or is one keyframe"),
     "visit_wider": Reason(_NOTED, "a visit fits its place with larger sigmas only (up to 3 times)"),
     "visit_lost": Reason(_NOTED, "a visit that contradicts itself or its place: its odometry alone is kept"),
