@@ -98,8 +98,9 @@ class Drive:
             yield list(measured(tuple(map(float, at)), round((k + 5) * STEP_S * 1e9), seen))
 
     def landmarks(self) -> tuple[list[int], Array, Array]:
-        """Vertices of the landmarks, estimated and true positions, or poses."""
-        marks, course = self.slam.landmarks, self.course
+        """Vertices of the landmarks that are in the problem, estimated and true positions, or poses."""
+        known, course = set(self.slam.solver.vertices.tolist()), self.course
+        marks = {name: mark for name, mark in self.slam.landmarks.items() if mark.vertex in known}
         vertices, numbers = [mark.vertex for mark in marks.values()], [int(name[1:]) for name in marks]
         whole = course.points[numbers]
         if course.turns:

@@ -72,8 +72,8 @@ def text(summary: Summary) -> list[str]:
         if source not in inputs or explain(reason).effect is not Effect.REFUSED
         for line in _counted_lines(source, reason, times)
     ]
-    more = [*_gyro(summary), *noise(summary), *calibration(summary), *_clocks(summary), *table(summary)]
-    return [*lines, *undetermined, *others, *more]
+    found = [*_gyro(summary), *noise(summary), *calibration(summary), *_contradicted(summary), *_clocks(summary)]
+    return [*lines, *undetermined, *others, *found, *table(summary)]
 
 
 def _gyro(summary: Summary) -> Iterator[str]:
@@ -126,6 +126,13 @@ def calibration(summary: Summary) -> Iterator[str]:
     for one in report["parameters"]:
         if one["verdict"] not in ("admitted", "nothing_to_correct"):
             yield from _wrapped(f"calibrated {one['text']}", 11)
+
+
+def _contradicted(summary: Summary) -> Iterator[str]:
+    """Yield what is off in a calibration that nothing corrects, where covariances contain it."""
+    if off := summary.get("contradicted"):
+        text = f"not corrected, so the covariances contain it: {', '.join(off)} (graph_slam calibrate BAG)"
+        yield from _wrapped(f"off        {text}", 11)
 
 
 def _clocks(summary: Summary) -> Iterator[str]:

@@ -62,6 +62,8 @@ def fitted_summary(slam: GraphSlam) -> dict[str, Any]:
         return out | {"noise_unknown": "nothing is solved"}
     if off := slam.uncorrected():
         out["uncorrected"] = [one.as_dict() for one in off]
+    if contradicted := slam.contradicted:
+        out["contradicted"] = contradicted
     try:
         return out | {"noise": [one.as_dict() for one in slam.noise_scale()]}
     except GraphSlamError as error:  # what cannot be said of a singular map must not cost its results

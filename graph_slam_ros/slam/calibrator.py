@@ -7,7 +7,7 @@ run did. Where nobody asked for calibration, a trial corrects nothing: it tells 
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -23,7 +23,8 @@ from graph_slam_ros.slam.calibration.parameters import DEFAULT_GROUPS, Parameter
 from graph_slam_ros.slam.calibration.places import fit_with_places
 from graph_slam_ros.slam.calibration.recalibration import Recalibration
 from graph_slam_ros.slam.calibration.rows import TrialProblem
-from graph_slam_ros.slam.calibration.uncorrected import Uncorrected, sampled, uncorrected
+from graph_slam_ros.slam.calibration.uncorrected import Uncorrected
+from graph_slam_ros.slam.calibration.watch import CalibrationWatch, Fits, Watching
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
 from graph_slam_ros.slam.kidnap_detector import KidnapDetector
 from graph_slam_ros.slam.landmarks.explanation import SCALES
@@ -35,10 +36,10 @@ from graph_slam_ros.typing import Array, Executor, Index
 FIRST_DUE = 50  # keyframes
 _ROUNDS = 3  # when everything is solved
 _STEADY = 3  # trials in a row that move nothing by a sigma end it
-_MOST_POSES = 100  # whose covariances say whether what is not corrected matters
 _DIGITS = 12  # of a corrected measurement, and of an added variance: the last ones of a sine depend on the machine
 
 Trial = Callable[[], "TrialFit | None"]
+Outcome = TypeVar("Outcome")
 
 
 class Calibrator:
@@ -51,6 +52,7 @@ class Calibrator:
     history : all corrections of measurements that were there, in order
     trials : how many there were
     corrected_at : the keyframe at which a parameter was last corrected by more than its sigma
+    watch : of trials that correct nothing
     """
 
     def __init__(
@@ -73,7 +75,13 @@ class Calibrator:
         self.trials = self.corrected_at = 0
         self._admitted: set[Parameter] = set()
         self._last: TrialFit | None = None
-        self._uncorrected: list[Uncorrected] = []
+        self.watch = CalibrationWatch(
+            backend,
+            lambda: frontend.path.keyframes,
+            lambda found: (self._decided(found, (), stated := self._stated()), stated),
+            self._with_corrected,
+            lambda *key: frontend.corrections.total(key),
+        )
         self._used: Mapping[str, tuple[float, float]] = landmarks.anonymous.hindsight.found_scales
         self._due, self._steady = FIRST_DUE, 0
         self._job: Trial | None = None
@@ -91,6 +99,8 @@ class Calibrator:
         if not self._config.calibrate.is_on:
             if everything is None:
                 self._start_if_due(keyframe)
+            elif not self._backend.spares_memory:
+                self.watch.start(self._executor(self._watching()), keyframe, is_of_everything=True)
             return self._adopt_association(keyframe, everything) if self._config.uses_found_factors else None
         if everything is not None:
             return self._at_the_end(keyframe, everything)
@@ -108,10 +118,11 @@ class Calibrator:
         while driven >= self._due:
             self._due = self._windows.next_trial(self._due)
         if (self._steady < _STEADY or self._windows.drifts) and not self._backend.spares_memory:
-            self._job = self._executor(
-                self._trial(self._backend.solver.settings, corrects=self._config.calibrate.is_on)
-            )
-            self._apply_at = keyframe + self._config.robust.apply_after_keyframes
+            apply_at = keyframe + self._config.robust.apply_after_keyframes
+            if self._config.calibrate.is_on:
+                self._job, self._apply_at = self._executor(self._trial(self._backend.solver.settings)), apply_at
+            else:
+                self.watch.start(self._executor(self._watching()), apply_at, is_of_everything=False)
 
     def _at_the_end(self, keyframe: int, everything: Settings) -> Report | None:
         self._job, report = None, None
@@ -122,28 +133,42 @@ class Calibrator:
             report = found
         return report
 
-    def _trial(self, settings: Settings, *, corrects: bool = True) -> Trial:
+    def _trial(self, settings: Settings) -> Trial:
         problem, calibrate = self._problem_with_slips(settings), self._config.calibrate
-        log_odds = self._config.odometry.log_odds
-        asked, chooses = calibrate.asked, calibrate.chooses
-        if not corrects:
-            asked, chooses = (*asked, *DEFAULT_GROUPS), True
-        has_gyro, windows, now_ns = bool(self._config.gyro_input), self._windows, int(problem.stamps_ns[-1])
+        log_odds, priors_of = self._config.odometry.log_odds, self._priors_of(problem)
 
         def run() -> TrialFit | None:
-            wanted = parameters_of(problem, asked, chooses=chooses)
-            if has_gyro:  # odometry's turn is mostly that of the gyro
-                wanted = [one for one in wanted if one.name != "turn"]
-            priors = {one: calibrate.prior(one.name) for one in wanted}
-            if not corrects:  # what is told is not hidden by a prior that contradicts
-                priors = {one: max(prior, one.quantity.prior) for one, prior in priors.items()}
-            priors = {one: windows.prior(one, prior, now_ns) for one, prior in priors.items()}
-            fit = likelier_fit if corrects else fit_with_places
-            return fit(problem, priors, log_odds) if wanted else None
+            priors = priors_of(calibrate.asked, calibrate.chooses)
+            return likelier_fit(problem, priors, log_odds) if priors else None
 
         return run
 
-    def _guarded(self, job: Trial) -> TrialFit | None:
+    def _watching(self) -> Watching:
+        """A trial that corrects nothing: what is said is not hidden by a prior that contradicts."""
+        problem, asked = self._problem_with_slips(self._backend.solver.settings), self._config.calibrate.asked
+        log_odds, priors_of = self._config.odometry.log_odds, self._priors_of(problem)
+
+        def run() -> Fits | None:
+            priors = priors_of((*asked, *DEFAULT_GROUPS), True)
+            priors = {one: max(prior, one.quantity.prior) for one, prior in priors.items()}
+            return fit_with_places(problem, priors, log_odds) if priors else None
+
+        return lambda: self._guarded(run)
+
+    def _priors_of(self, problem: TrialProblem) -> "Callable[[Sequence[str], bool], dict[Parameter, float]]":
+        """The parameters of groups, with their priors."""
+        calibrate, has_gyro = self._config.calibrate, bool(self._config.gyro_input)
+        windows, now_ns = self._windows, int(problem.stamps_ns[-1])
+
+        def priors(groups: Sequence[str], chooses: bool) -> dict[Parameter, float]:
+            wanted = parameters_of(problem, groups, chooses=chooses)
+            if has_gyro:  # odometry's turn is mostly that of the gyro
+                wanted = [one for one in wanted if one.name != "turn"]
+            return {one: windows.prior(one, calibrate.prior(one.name), now_ns) for one in wanted}
+
+        return priors
+
+    def _guarded(self, job: Callable[[], Outcome | None]) -> Outcome | None:
         try:
             return job()
         except Exception as error:
@@ -157,7 +182,7 @@ class Calibrator:
         if found is None:
             return None
         self.trials, self._last = self.trials + 1, found
-        findings = self._decided(found, self._admitted, self._problem().model().sigma_per_m())
+        findings = self._decided(found, self._admitted, self._stated())
         values = {one.parameter: _rounded(one.value) for one in findings if one.verdict == "admitted"}
         moved = any(one.parameter in values and abs(one.value) > one.sigma for one in findings)
         self._steady = 0 if moved else self._steady + bool(self._admitted)
@@ -302,47 +327,33 @@ class Calibrator:
         return replace(self._problem(settings), slips=self._kidnaps.slipped(self._frontend.path.keyframes))
 
     def widened(self, marginal: Array, vertex: int) -> Array:
-        """The marginal of a vertex with the uncertainty of the parameters; the same where none was corrected.
+        """The marginal of a vertex with the uncertainty of the parameters, where one was corrected or is off.
 
-        A pose after the last trial is as uncertain by them as the last one before. What is found but not used, because
-        it is small, counts as an error.
+        A pose after the last trial is as uncertain by them as the last one before.
         """
-        found, keyframes = self._last, self._frontend.path.keyframes.ids
+        if self._admitted and self._last is not None:
+            return self._with_corrected(marginal, vertex)
+        added = self.watch.adds(vertex, len(marginal))
+        return marginal if added is None else marginal + _exact(added)
+
+    def _with_corrected(self, marginal: Array, vertex: int) -> Array:
+        """The same of parameters that were corrected. What is found but not used, because it is small, is an error."""
+        found = self._last
         if found is None or not self._admitted:
             return marginal
-        if vertex >= len(found.column) and len(marginal) == self._config.space.dof:
-            earlier = keyframes[keyframes < len(found.column)]
-            vertex = int(earlier[-1]) if len(earlier) else vertex
         known = {one: self.findings[one].is_determined for one in found.parameters}
         left = {one: 0.0 if one in self._admitted else found.value(one) for one in known if known[one]}
-        return marginal + _exact(found.adds(vertex, len(marginal), left))
+        vertex, dof = self.watch.known(vertex, len(marginal), found.column), len(marginal)
+        return marginal + _exact(found.adds(vertex, dof, left))
 
     # -- what nothing corrects ---------------------------------------------------------------------------------------
 
     def uncorrected(self) -> list[Uncorrected]:
         """Return what a trial fit finds wrong now, on a copy."""
-        return self._off(self._guarded(self._trial(self._backend.solver.settings, corrects=False)))
+        return self.watch.uncorrected(self._watching)
 
-    def uncorrected_so_far(self) -> Sequence[Uncorrected]:
-        """The same of the newest trial that began some keyframes ago; empty where trials correct what they find."""
-        job = self._job
-        is_over = len(self._frontend.path.keyframes) > self._apply_at
-        if not self._config.calibrate.is_on and job is not None and is_over and self._backend.solver.is_current:
-            self._job = None
-            self._uncorrected = self._off(self._guarded(job))
-        return self._uncorrected
-
-    def _off(self, found: TrialFit | None) -> list[Uncorrected]:
-        if found is None or not self._backend.solver.is_current:
-            return []
-        solver = self._backend.solver
-        keyframes = self._frontend.path.keyframes.ids
-        vertices = sampled(keyframes[np.isin(keyframes, solver.vertices)], _MOST_POSES)
-        marginals = zip(vertices.tolist(), solver.marginal(vertices), strict=True)
-        covariances = {vertex: self.widened(marginal, vertex) for vertex, marginal in marginals}
-        stated = self._problem().model().sigma_per_m()
-        findings = self._decided(found, (), stated)
-        return uncorrected(found, findings, covariances, lambda *key: self._frontend.corrections.total(key), stated)
+    def _stated(self) -> float:
+        return self._problem().model().sigma_per_m()
 
     # -- what it says ------------------------------------------------------------------------------------------------
 

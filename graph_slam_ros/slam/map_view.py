@@ -162,8 +162,8 @@ class MapView(PathView):
         problem = self.backend.trial_problem(self.space, frontend.path, origins, factors=frontend.corrections.factors)
         problem = replace(problem, slips=self._kidnaps.slipped(self.keyframes))
         priors = {one: one.quantity.prior for one in parameters_of(problem, groups, chooses=chooses)}
-        fit = fit_with_places if places else likelier_fit
-        found = fit(problem, priors, self.config.odometry.log_odds)
+        log_odds = self.config.odometry.log_odds
+        found = fit_with_places(problem, priors, log_odds)[0] if places else likelier_fit(problem, priors, log_odds)
         stated = problem.model().sigma_per_m()
         return found, decide(found, len(self.landmarks), slides=self.config.odometry.slides, sigma_per_m=stated)
 
@@ -177,7 +177,12 @@ class MapView(PathView):
     @property
     def uncorrected_so_far(self) -> Sequence[Uncorrected]:
         """The same of the last trial fit in the background."""
-        return self._calibrator.uncorrected_so_far()
+        return self._calibrator.watch.uncorrected_so_far()
+
+    @property
+    def contradicted(self) -> list[str]:
+        """What is off in a calibration that nothing corrects, a line for each parameter: covariances contain it."""
+        return self._calibrator.watch.sentences()
 
     @property
     def calibration_report(self) -> dict[str, Any]:

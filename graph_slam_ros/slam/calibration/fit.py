@@ -45,7 +45,8 @@ class TrialFit:
     lost : part of the sightings that have less than a tenth of their weight
     path : stored numbers of all vertices
     sensitivity : (unknowns, p) steps of all unknowns with each parameter
-    column : (vertices,) first row of each vertex in ``sensitivity``, or -1
+    shift : (unknowns,) steps from the estimate that the fit began at to ``path``
+    column : (vertices,) first row of each vertex in ``sensitivity`` and ``shift``, or -1
     evidence : logarithm of the likelihood of all measurements, whatever unknowns and parameters are, but for a constant
     slips : whether odometry counts for less where slips were found
     """
@@ -60,6 +61,7 @@ class TrialFit:
     lost: float
     path: Array
     sensitivity: Array
+    shift: Array
     column: Index
     evidence: float
     slips: bool = True
@@ -71,12 +73,24 @@ class TrialFit:
         ----------
         left : those that the drive determines, and what of each is not corrected
         """
-        at = int(self.column[vertex]) if vertex < len(self.column) else -1
-        if at < 0:
-            return np.zeros((dof, dof))
         of = [self.parameters.index(one) for one in left]
-        bias, steps = np.array(list(left.values())), self.sensitivity[at : at + dof, of]
-        return np.asarray(steps @ (self.covariance[np.ix_(of, of)] + np.outer(bias, bias)) @ steps.T)
+        steps = self._of(self.sensitivity, vertex, dof)[:, of]
+        return self._spread(steps, of) + np.outer(bias := steps @ np.array(list(left.values())), bias)
+
+    def adds_all(self, vertex: int, dof: int) -> Array:
+        """The same where no parameter is corrected: the error is how far the fit moves the vertex."""
+        steps, bias = self._of(self.sensitivity, vertex, dof), self._of(self.shift, vertex, dof)
+        return self._spread(steps, list(range(len(self.parameters)))) + np.outer(bias, bias)
+
+    def _of(self, rows: Array, vertex: int, dof: int) -> Array:
+        """The rows of a vertex; 0 for one that the fit did not have."""
+        at = int(self.column[vertex]) if vertex < len(self.column) else -1
+        return rows[at : at + dof] if at >= 0 else np.zeros((dof, *rows.shape[1:]))
+
+    def _spread(self, steps: Array, of: list[int]) -> Array:
+        """The covariance of steps (dof, p) with some of the parameters."""
+        sigmas = self.sigmas[of]
+        return np.asarray(steps @ (self.correlation[np.ix_(of, of)] * np.outer(sigmas, sigmas)) @ steps.T)
 
     @property
     def sigmas(self) -> Array:
@@ -207,7 +221,15 @@ class _Fit:
         found = self._parameters, theta, self._priors, covariance, robust, first, second, lost, x
         curvature = float(np.log(np.abs(factor.U.diagonal())).sum() + np.linalg.slogdet(information)[1])
         evidence = -0.5 * (float(np.sum(rows.cost) + np.sum((theta / self._priors) ** 2)) + curvature)
-        return TrialFit(*found, -border, self._linear.column, evidence)
+        return TrialFit(*found, -border, self._shift(x), self._linear.column, evidence)
+
+    def _shift(self, x: Array) -> Array:
+        """Steps (unknowns,) of all unknowns from where the fit began."""
+        out, graph = np.zeros(self._linear.unknowns), self._p.graph
+        for kind, vertices, _ in self._steps(graph, out):
+            at = graph.offset.values[vertices][:, None] + np.arange(kind.size)
+            out[self._linear.column[vertices][:, None] + np.arange(kind.dof)] = kind.local(self._p.values[at], x[at])
+        return out
 
     def _meat(self, scores: Array, rows: Rows) -> Array:
         """The scatter of scores, grouped by landmark or by half a minute, whichever is larger relative to them."""

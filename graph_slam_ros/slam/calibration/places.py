@@ -19,8 +19,14 @@ LEAST_M = 0.2  # errors that last, as a robot that follows its commands late, ar
 _SIGMA_M = 0.5
 
 
-def fit_with_places(problem: TrialProblem, priors: Mapping[Parameter, float], log_odds: float) -> TrialFit:
+def fit_with_places(
+    problem: TrialProblem, priors: Mapping[Parameter, float], log_odds: float
+) -> tuple[TrialFit, TrialFit]:
     """Fit parameters as ``likelier_fit`` does, with the places of sensors where one is off by ``LEAST_M`` or more.
+
+    Returns
+    -------
+    That fit, and the one that always has the places; without any, or where it is singular, the same.
 
     Raises
     ------
@@ -30,10 +36,10 @@ def fit_with_places(problem: TrialProblem, priors: Mapping[Parameter, float], lo
     again, places = replace(problem, graph=problem.graph.copy()), places_of(problem)
     found = likelier_fit(problem, priors, log_odds)  # which overwrites the graph of its problem
     if not places:
-        return found
+        return found, found
     try:
         every = likelier_fit(again, {**priors, **dict.fromkeys(places, _SIGMA_M)}, log_odds)
     except SingularError:
-        return found
+        return found, found
     is_misplaced = any(abs(every.value(one)) >= LEAST_M and is_certain(every, one) for one in places)
-    return every if is_misplaced else found
+    return every if is_misplaced else found, every

@@ -1,9 +1,9 @@
 """Findings of a trial fit that nothing corrects: clocks, mounts and scales that are off, and what mends them.
 
 A parameter may be far off and harm nothing, e.g. where sightings at all sides average it. So it is told by its effect:
-the poses would move, and their covariances, which take the parameter for known, do not say so. With the shift b of a
-pose and its covariance P, b' inv(P) b is what the parameter adds to the pose's normalised error squared (NEES), of
-which the degrees of freedom are expected.
+the poses would move. With the shift b of a pose and its covariance P, which takes the parameter for known,
+b' inv(P) b is what the parameter adds to the pose's normalised error squared (NEES), of which the degrees of freedom
+are expected.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -62,7 +62,7 @@ class Uncorrected:
     setting: tuple[str, Any] | tuple[()]
 
     def __str__(self) -> str:
-        by = f"; by it the poses are off by {self.shift:.1f} of their sigmas" if self.setting else ""
+        by = f"; by it the poses are off by {self.shift:.1f} times what noise does to them" if self.setting else ""
         return f"{self.code}: {self.source}: {self.text}{by}"
 
     def as_dict(self) -> dict[str, Any]:

@@ -25,12 +25,12 @@ WRONG = [
 ]
 
 
-def nees(slam, truth):
+def nees(slam, truth, covariances):
     """Mean of the poses' normalised errors squared, the frame of the map being that of the first pose."""
     true = np.array([truth.at(int(stamp)) for stamp in slam.keyframes.stamps_ns])
     error = slam.space.group.log(slam.space.group.between(tuple(true.T), tuple(slam.trajectory().T)))
     every = np.stack(error, axis=-1)
-    return float(np.mean(np.einsum("ni,nij,nj->n", every, np.linalg.pinv(slam.keyframe_covariances()), every)))
+    return float(np.mean(np.einsum("ni,nij,nj->n", every, np.linalg.pinv(covariances), every)))
 
 
 @pytest.mark.parametrize(("faults", "settings", "code", "value", "key"), WRONG)
@@ -47,7 +47,28 @@ def test_what_is_off_is_told_with_its_sigma_and_the_setting_mends_it(faults, set
     else:
         mended = driven(drive, settings | dict([one.setting]))
     assert not mended.uncorrected()
-    assert nees(mended, truth) < 0.5 * nees(slam, truth)
+    assert not mended.contradicted
+    assert nees(mended, truth, of_noise(mended)) < 0.5 * nees(slam, truth, of_noise(slam))
+
+
+def of_noise(slam):
+    """Covariances (n, 3, 3) of the keyframes that take all parameters for known."""
+    return np.array(slam.solver.marginal(slam.keyframes.ids))
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(("faults", "settings"), [one[:2] for one in WRONG])
+def test_covariances_contain_what_is_off(faults, settings, seed):
+    drive, truth = imperfect_drive_and_truth(faults, seed=seed, seconds=60.0)
+    slam = driven(drive, settings)
+    off = {sentence.split(" of ")[0] for sentence in slam.contradicted}
+    assert off == {"distance", "turn", "clock", "yaw", "x", "y"}
+    assert not slam.corrected
+    of_said = nees(slam, truth, slam.keyframe_covariances())
+    assert of_said < min(6.0, 0.2 * nees(slam, truth, of_noise(slam)))  # 3 is expected
+    wider = np.linalg.eigvalsh(slam.keyframe_covariances() - of_noise(slam))
+    assert wider.min() > -1e-9
+    assert slam.pose_covariance == pytest.approx(slam.keyframe_covariances()[-1])
 
 
 def test_a_clock_that_is_off_beyond_doubt_is_told_though_its_sigma_is_too_large_to_correct_it():
@@ -76,12 +97,16 @@ def test_a_prior_that_contradicts_does_not_hide_what_is_off():
 @pytest.mark.parametrize("kind", ["range_bearing", "position", "range"])
 @pytest.mark.parametrize("seed", range(4))
 def test_nothing_is_told_of_a_drive_with_nothing_wrong(kind, seed):
-    assert not driven(imperfect_drive_and_truth(Faults(), seed=seed, seconds=40.0, kind=kind)[0]).uncorrected()
+    slam = driven(imperfect_drive_and_truth(Faults(), seed=seed, seconds=40.0, kind=kind)[0])
+    assert not slam.uncorrected()
+    assert not slam.contradicted
+    np.testing.assert_array_equal(slam.keyframe_covariances(), of_noise(slam))
 
 
 def test_the_node_is_degraded_by_the_same_words():
     """Trials begin at keyframes 50, 100, 200; what they find is told 20 keyframes later, and corrects nothing."""
     slam = driven(imperfect_drive_and_truth(Faults(clock_s=0.2), seconds=60.0)[0])
+    assert np.trace(slam.pose_covariance) > 2.0 * np.trace(slam.solver.marginal(slam.keyframes.ids[-1:])[0])
     (one,) = slam.uncorrected_so_far
     assert one.code == "clock_offset"
     assert not slam.corrected

@@ -1,0 +1,136 @@
+"""Trial fits that correct nothing: what they find is said, and covariances contain what is off.
+
+Covariances that take a wrong parameter for known are too small. A drive that contradicts one parameter of the
+configuration says that nobody has calibrated this robot. So all parameters count then: the error is how far the fit
+moves the estimate, and the sigmas of all parameters add to it (S. F. Schmidt, "Application of state-space methods to
+navigation problems", Advances in Control Systems 3, 1966: parameters that are considered, not estimated).
+"""
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from graph_slam_ros.slam.calibration.decision import Finding, amount
+from graph_slam_ros.slam.calibration.fit import TrialFit
+from graph_slam_ros.slam.calibration.uncorrected import Total, Uncorrected, is_off, sampled, uncorrected
+from graph_slam_ros.slam.frontend.keyframes import Keyframe
+from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
+from graph_slam_ros.typing import Array, Index
+
+if TYPE_CHECKING:
+    from graph_slam_ros.slam.backend import Backend
+
+_MOST_POSES = 100  # whose covariances say whether what is not corrected matters
+
+Fits = tuple[TrialFit, TrialFit]
+"""The fit whose findings are said, and the one that always has the places of all sensors."""
+
+Watching = Callable[[], "Fits | None"]
+Judge = Callable[[TrialFit], tuple[list[Finding], float]]
+"""The finding of each parameter of a fit, and the stated noise of odometry's position for each metre."""
+
+
+class CalibrationWatch:
+    """The newest outcome of trial fits that correct nothing. Each is computed when somebody asks.
+
+    Parameters
+    ----------
+    keyframes : returns those of the drive
+    corrected : adds to a marginal of a vertex what corrected parameters do
+    """
+
+    def __init__(
+        self,
+        backend: "Backend",
+        keyframes: Callable[[], StampedPoses[Keyframe]],
+        judge: Judge,
+        corrected: Callable[[Array, int], Array],
+        total: Total,
+    ) -> None:
+        self._backend, self._keyframes = backend, keyframes
+        self._judge, self._corrected, self._total = judge, corrected, total
+        self._jobs = list[tuple[int, Watching]]()
+        self._fits: Fits | None = None
+        self._contradicting: TrialFit | None = None
+        self._fits_so_far: Fits | None = None
+        self._so_far: list[Uncorrected] = []
+        self._of_edges = -1  # the map that the newest trial of everything was of
+
+    def start(self, job: Watching, from_keyframe: int, *, is_of_everything: bool) -> None:
+        """Add a trial, whose outcome counts from a keyframe on.
+
+        Parameters
+        ----------
+        is_of_everything : whether all that was measured was solved before
+        """
+        self._jobs.append((from_keyframe, job))
+        if is_of_everything:
+            self._of_edges = self._backend.graph.edge_count
+
+    def adds(self, vertex: int, dof: int) -> Array | None:
+        """The covariance (dof, dof) that wrong parameters add to a vertex; None where nothing contradicts them."""
+        self._take()
+        found = self._contradicting
+        return None if found is None else found.adds_all(self.known(vertex, dof, found.column), dof)
+
+    def known(self, vertex: int, dof: int, column: Index) -> int:
+        """A vertex that a trial had: a pose after it counts as the last keyframe before."""
+        keyframes = self._keyframes().ids
+        if vertex < len(column) or dof != self._backend.graph.kind_of(int(keyframes[-1])).dof:
+            return vertex
+        earlier = keyframes[keyframes < len(column)]
+        return int(earlier[-1]) if len(earlier) else vertex
+
+    def sentences(self) -> list[str]:
+        """Say what each parameter is off by, with its sigma; empty where nothing contradicts the configuration."""
+        self._take()
+        found = self._contradicting
+        if found is None:
+            return []
+        values = zip(found.parameters, found.values.tolist(), found.sigmas.tolist(), strict=True)
+        return [f"{one} {amount(one, value, 3)} (sigma {amount(one, sigma)})" for one, value, sigma in values]
+
+    def uncorrected(self, trial: Callable[[], Watching]) -> list[Uncorrected]:
+        """Return what is wrong in the map as it is now.
+
+        Parameters
+        ----------
+        trial : begins a trial, where the newest was not of this map
+        """
+        if self._of_edges == self._backend.graph.edge_count:
+            self._take()
+            return self._off(self._fits)
+        return self._off(trial()())
+
+    def uncorrected_so_far(self) -> Sequence[Uncorrected]:
+        """Return what was wrong in the map at the newest trial; empty where trials correct what they find."""
+        if self._backend.solver.is_current:
+            self._take()
+            if self._fits is not self._fits_so_far:
+                self._fits_so_far, self._so_far = self._fits, self._off(self._fits)
+        return self._so_far
+
+    def _take(self) -> None:
+        """Compute the newest trial whose outcome counts."""
+        keyframe = len(self._keyframes()) - 1
+        ready = [job for begins, job in self._jobs if begins <= keyframe]
+        if not ready:
+            return
+        self._jobs = [one for one in self._jobs if one[0] > keyframe]
+        self._fits = ready[-1]()
+        self._contradicting = None
+        if self._fits is not None:
+            said, whole = self._fits
+            self._contradicting = whole if any(is_off(said, one) for one in self._judge(said)[0]) else None
+
+    def _off(self, fits: Fits | None) -> list[Uncorrected]:
+        solver = self._backend.solver
+        if fits is None or not solver.is_current:
+            return []
+        keyframes = self._keyframes().ids
+        vertices = sampled(keyframes[np.isin(keyframes, solver.vertices)], _MOST_POSES)
+        marginals = zip(vertices.tolist(), solver.marginal(vertices), strict=True)
+        covariances = {vertex: self._corrected(marginal, vertex) for vertex, marginal in marginals}
+        findings, stated = self._judge(fits[0])
+        return uncorrected(fits[0], findings, covariances, self._total, stated)
