@@ -4,6 +4,10 @@ An edge of odometry between two keyframes is ``Exp(S Log z)``, with the factors 
 motion is taken for one of constant velocity. A sighting is brought to the stamp plus the clock's correction along the
 estimated path, never by single twists: their noise would be taken for signal; and its sensor is turned about its own
 origin and moved, in the axes of the base. A range becomes ``factor * range + offset``.
+
+The noise of odometry is that of the motion: the robot does not do exactly what was commanded (Berkson). If it is that
+of z instead, as with encoders, a fitted factor is too small by noise over motion, both squared (Fuller, "Measurement
+error models", 1987, section 1.1: attenuation). With ``is_noise_measured`` noise grows with the factors, which mends it.
 """
 
 from collections.abc import Mapping
@@ -34,6 +38,7 @@ class OdometryEdges:
     Attributes
     ----------
     measured : (n, size)
+    roots : (n, m, m) square roots of the information of what was measured
     seconds : (n,) that each lasts
     """
 
@@ -41,6 +46,7 @@ class OdometryEdges:
     rows: Index
     source: str
     measured: Array
+    roots: Array
     seconds: Array
 
 
@@ -78,10 +84,20 @@ class MeasurementModel:
     origins : of the sightings
     stamp_of : (vertices,) nanoseconds of each pose
     edges : whose measurements may be corrected
+    is_noise_measured : whether the noise of odometry is that of what was measured, and not of the motion
     """
 
-    def __init__(self, space: Geometry, graph: Graph, origins: SightingEdges, stamp_of: Index, edges: range) -> None:
-        self._space = space
+    def __init__(
+        self,
+        space: Geometry,
+        graph: Graph,
+        origins: SightingEdges,
+        stamp_of: Index,
+        edges: range,
+        *,
+        is_noise_measured: bool = False,
+    ) -> None:
+        self._space, self.is_noise_measured = space, is_noise_measured
         self.odometry: list[OdometryEdges] = []
         self.sightings: list[Sightings] = []
         for table in graph.tables.values():
@@ -89,8 +105,8 @@ class MeasurementModel:
                 ends = table.vertices.values[rows]
                 if label == "odometry":
                     seconds = (stamp_of[ends[:, 1]] - stamp_of[ends[:, 0]]) * 1e-9
-                    measured = table.measured.values[rows].copy()
-                    self.odometry.append(OdometryEdges(table, rows, source, measured, seconds))
+                    measured, roots = table.measured.values[rows].copy(), table.sqrt_information.values[rows].copy()
+                    self.odometry.append(OdometryEdges(table, rows, source, measured, roots, seconds))
                 else:
                     self.sightings.append(self._sightings(table, rows, source, origins, stamp_of[ends[:, 0]]))
 
@@ -138,14 +154,21 @@ class MeasurementModel:
             out = group.exp(tuple(tangent))
         return np.stack(out, axis=-1)
 
+    def odometry_roots(self, edges: OdometryEdges, values: Values) -> Array:
+        """Square roots (n, m, m) of the information of odometry with other factors."""
+        return edges.roots / self._factors(values) if self.is_noise_measured else edges.roots
+
     def scaled(self, pose: Numbers, values: Values) -> Numbers:
         """A motion by odometry with other factors."""
-        named, n = _of(values, None, OF_ODOMETRY), self._space.dimensions
-        factors = [1.0 + named.get("distance", 0.0)] * n
-        factors += [1.0 + named.get("turn", 0.0)] * (self._space.dof - n)
         group = self._space.group
-        out: Numbers = group.exp(tuple(f * x for f, x in zip(factors, group.log(pose), strict=True)))
+        out: Numbers = group.exp(tuple(f * x for f, x in zip(self._factors(values), group.log(pose), strict=True)))
         return out
+
+    def _factors(self, values: Values) -> Array:
+        """The factor (dof,) of each component of a motion."""
+        named, n = _of(values, None, OF_ODOMETRY), self._space.dimensions
+        distance, turn = (1.0 + named.get(name, 0.0) for name in ("distance", "turn"))
+        return np.array([distance] * n + [turn] * (self._space.dof - n))
 
     def base(self, edges: Sightings, values: Values, path: EstimatedPath, own: Array) -> Array:
         """Poses (n, size) of the base from the keyframes (n, size), at the corrected stamps."""

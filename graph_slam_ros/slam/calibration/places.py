@@ -1,22 +1,29 @@
-"""The places of sensors on the robot, which are fitted, too, where one is far off.
+"""Trial fits whose findings are said: of the places of sensors, too, and not of what noise alone explains.
 
 A sensor that is further to the side, or further ahead, than its mount says passes for another scale of odometry, or for
 a sensor that is turned. So all are fitted once more together with the places. That fit is taken where a place is off
 beyond doubt. Elsewhere the places would only make the other parameters less certain.
+
+Where noise of odometry is as large as its motion, a factor is too small by that alone. So a factor that is off must be
+off, too, in a fit in which noise grows with it. If it is not, nothing is known of it.
 """
 
 from collections.abc import Mapping
 from dataclasses import replace
 
+import numpy as np
+
 from graph_slam_ros.errors import SingularError
 from graph_slam_ros.slam.calibration.choice import places_of
-from graph_slam_ros.slam.calibration.decision import is_certain
-from graph_slam_ros.slam.calibration.fit import TrialFit, likelier_fit
+from graph_slam_ros.slam.calibration.decision import SIGMAS, is_certain
+from graph_slam_ros.slam.calibration.fit import TrialFit, fit, likelier_fit
 from graph_slam_ros.slam.calibration.parameters import Parameter
 from graph_slam_ros.slam.calibration.rows import TrialProblem
 
 LEAST_M = 0.2  # errors that last, as a robot that follows its commands late, are up to 0.14 m in recorded drives
 _SIGMA_M = 0.5
+_FACTORS = ("distance", "turn")
+_AGREEING, _PART = 2.0, 1.0 / 3.0  # a factor is off by so many sigmas, and so much of it, whatever its noise is of
 
 
 def fit_with_places(
@@ -35,11 +42,34 @@ def fit_with_places(
     """
     again, places = replace(problem, graph=problem.graph.copy()), places_of(problem)
     found = likelier_fit(problem, priors, log_odds)  # which overwrites the graph of its problem
-    if not places:
-        return found, found
+    every = found
+    if places:
+        wider = {**priors, **dict.fromkeys(places, _SIGMA_M)}
+        try:
+            every = likelier_fit(replace(again, graph=again.graph.copy()), wider, log_odds)
+        except SingularError:
+            every = found
+        else:
+            if any(abs(every.value(one)) >= LEAST_M and is_certain(every, one) for one in places):
+                found, priors = every, wider
+    return _without_noise(again, found, priors), every
+
+
+def _without_noise(problem: TrialProblem, found: TrialFit, priors: Mapping[Parameter, float]) -> TrialFit:
+    """The same; or a fit without the factors of odometry that are not off where its noise is of what was measured."""
+    far = np.abs(found.values) > SIGMAS * found.sigmas
+    factors = [one for one, is_far in zip(found.parameters, far, strict=True) if is_far and one.name in _FACTORS]
+    if not factors:
+        return found
+    problem = problem if found.slips else problem.without_slips()
+    start = {one: found.value(one) for one in found.parameters}
+    copy = replace(problem, graph=problem.graph.copy(), is_noise_measured=True)
     try:
-        every = likelier_fit(again, {**priors, **dict.fromkeys(places, _SIGMA_M)}, log_odds)
+        other = fit(copy, priors, start)
+        sigmas = dict(zip(other.parameters, other.sigmas.tolist(), strict=True))
+        parts = {one: other.value(one) / found.value(one) for one in factors}
+        of_noise = {one for one in factors if parts[one] < max(_PART, _AGREEING * sigmas[one] / abs(found.value(one)))}
+        left = {one: prior for one, prior in priors.items() if one not in of_noise}
+        return replace(fit(problem, left, start), slips=found.slips) if of_noise and left else found
     except SingularError:
-        return found, found
-    is_misplaced = any(abs(every.value(one)) >= LEAST_M and is_certain(every, one) for one in places)
-    return every if is_misplaced else found, every
+        return found

@@ -37,6 +37,7 @@ class TrialProblem:
     track : odometry between the keyframes
     first_edge : edges before are of a map that is held, and not corrected
     slips : of each stretch in which odometry counts for less, its edges, each with the one that replaces it
+    is_noise_measured : as of ``MeasurementModel``
     """
 
     space: Geometry
@@ -52,6 +53,7 @@ class TrialProblem:
     track: OdometryTrack
     first_edge: int
     slips: tuple[tuple[tuple[int, int], ...], ...] = ()
+    is_noise_measured: bool = False
 
     def without_slips(self) -> "TrialProblem":
         """The same with odometry as it was stated, in a copy of the graph."""
@@ -65,7 +67,8 @@ class TrialProblem:
         stamp_of = np.zeros(self.graph.vertex_count, dtype=np.int64)
         stamp_of[self.keyframes] = self.stamps_ns
         edges = range(self.first_edge, self.graph.edge_count)
-        return MeasurementModel(self.space, self.graph, self.origins, stamp_of, edges)
+        of = self.space, self.graph, self.origins, stamp_of, edges
+        return MeasurementModel(*of, is_noise_measured=self.is_noise_measured)
 
     def path(self, x: Array, values: Values) -> EstimatedPath:
         """The path at stored values x and with other parameters."""
@@ -183,6 +186,8 @@ class Linearization:
         for eyes, edges in zip(self._eyes, self._model.sightings, strict=True):
             self._stamp_of[eyes.ids] = edges.stamps_ns
         self._known = known
+        tables = graph.tables.values()  # how likely what odometry measured is does not change with its factors
+        self._log_roots = {one.code: np.linalg.slogdet(one.sqrt_information.values)[1] for one in tables}
 
     def rows(self, x: Array, theta: Array, losses: Mapping[LossKey, Loss]) -> Rows:
         """The rows at stored values x of the vertices, and corrections theta (p,)."""
@@ -213,9 +218,13 @@ class Linearization:
                     out.setdefault(key, np.zeros((len(edges.table), edges.table.type.residual_size)))
                     out[key][edges.rows] = self._derivative(edges, parameter, values, x)
             edges.table.measured.values[edges.rows] = self._measured(edges, values)
-            if isinstance(edges, Sightings):
-                edges.table.sqrt_information.values[edges.rows] = self._model.roots(edges, values)
+            edges.table.sqrt_information.values[edges.rows] = self._roots(edges, values)
         return out
+
+    def _roots(self, edges: OdometryEdges | Sightings, values: Values) -> Array:
+        if isinstance(edges, OdometryEdges):
+            return self._model.odometry_roots(edges, values)
+        return self._model.roots(edges, values)
 
     def _measured(self, edges: OdometryEdges | Sightings, values: Values) -> Array:
         if isinstance(edges, OdometryEdges):
@@ -223,7 +232,10 @@ class Linearization:
         return self._model.seen(edges, values)
 
     def _derivative(self, edges: OdometryEdges | Sightings, parameter: Parameter, values: Values, x: Array) -> Array:
-        """Central difference of the residuals (n, m) with respect to one parameter."""
+        """Central difference of the residuals (n, m) with respect to one parameter.
+
+        Of a factor by which noise grows, also what it makes of them.
+        """
         at = self._p.graph.offset.values[edges.table.vertices.values[edges.rows]]
         probe, sides = parameter.quantity.probe, []
         for side in (probe, -probe):
@@ -231,7 +243,13 @@ class Linearization:
             sides.append(edges.table.type.linearize(x, at, self._measured(edges, there))[0])
         difference = sides[0] - sides[1]
         wrapped = np.abs(difference) > np.pi
-        return np.asarray((difference - wrapped * np.sign(difference) * 2.0 * np.pi) / (2.0 * probe))
+        out = np.asarray((difference - wrapped * np.sign(difference) * 2.0 * np.pi) / (2.0 * probe))
+        is_factor = isinstance(edges, OdometryEdges) and parameter.name in ("distance", "turn")
+        if is_factor and self._model.is_noise_measured:
+            n, factor = self._p.space.dimensions, 1.0 + values.get(parameter, 0.0)
+            scaled = slice(0, n) if parameter.name == "distance" else slice(n, None)
+            out[:, scaled] -= 0.5 * (sides[0] + sides[1])[:, scaled] / factor
+        return out
 
     # -- blocks to rows --------------------------------------------------------------------------------------------
 
@@ -251,7 +269,7 @@ class Linearization:
             ends, jacobian = self._through_eyes(ends, jacobian, columns, x)
             dofs, landmark = (dofs[0], *dofs), np.where(is_seen, ends[:, 2], -1)
         each = [np.repeat(one, m) for one in (landmark, stamps, slope)]
-        each.append(block.cost - 2.0 * np.linalg.slogdet(table.sqrt_information.values[rows])[1])
+        each.append(block.cost - 2.0 * self._log_roots[table.code][rows])
         here = self._sparse(ends, jacobian, dofs), columns.reshape(n * m, -1), block.residual.ravel()
         return Rows(*here, *each)
 
