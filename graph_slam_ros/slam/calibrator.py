@@ -122,7 +122,8 @@ class Calibrator:
             if self._config.calibrate.is_on:
                 self._job, self._apply_at = self._executor(self._trial(self._backend.solver.settings)), apply_at
             else:
-                self.watch.start(self._executor(self._watching()), apply_at, is_of_everything=False)
+                trial = self._watching(is_thorough=False)
+                self.watch.start(self._executor(trial), apply_at, is_of_everything=False)
 
     def _at_the_end(self, keyframe: int, everything: Settings) -> Report | None:
         self._job, report = None, None
@@ -143,7 +144,7 @@ class Calibrator:
 
         return run
 
-    def _watching(self) -> Watching:
+    def _watching(self, *, is_thorough: bool = True) -> Watching:
         """A trial that corrects nothing: what is said is not hidden by a prior that contradicts."""
         problem, asked = self._problem_with_slips(self._backend.solver.settings), self._config.calibrate.asked
         log_odds, priors_of = self._config.odometry.log_odds, self._priors_of(problem)
@@ -151,7 +152,7 @@ class Calibrator:
         def run() -> Fits | None:
             priors = priors_of((*asked, *DEFAULT_GROUPS), True)
             priors = {one: max(prior, one.quantity.prior) for one, prior in priors.items()}
-            return fit_with_places(problem, priors, log_odds) if priors else None
+            return fit_with_places(problem, priors, log_odds, is_thorough=is_thorough) if priors else None
 
         return lambda: self._guarded(run)
 

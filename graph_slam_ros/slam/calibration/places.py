@@ -27,13 +27,17 @@ _AGREEING, _PART = 2.0, 1.0 / 3.0  # a factor is off by so many sigmas, and so m
 
 
 def fit_with_places(
-    problem: TrialProblem, priors: Mapping[Parameter, float], log_odds: float
+    problem: TrialProblem, priors: Mapping[Parameter, float], log_odds: float, *, is_thorough: bool = True
 ) -> tuple[TrialFit, TrialFit]:
     """Fit parameters as ``likelier_fit`` does, with the places of sensors where one is off by ``LEAST_M`` or more.
 
+    Parameters
+    ----------
+    is_thorough : fit the places also where no other parameter is off
+
     Returns
     -------
-    That fit, and the one that always has the places; without any, or where it is singular, the same.
+    That fit, and the one with the places; the same without any, or where that is singular or not asked for.
 
     Raises
     ------
@@ -42,8 +46,8 @@ def fit_with_places(
     """
     again, places = replace(problem, graph=problem.graph.copy()), places_of(problem)
     found = likelier_fit(problem, priors, log_odds)  # which overwrites the graph of its problem
-    every = found
-    if places:
+    every, is_off = found, bool((np.abs(found.values) > SIGMAS * found.sigmas).any())
+    if places and (is_off or is_thorough):
         wider = {**priors, **dict.fromkeys(places, _SIGMA_M)}
         try:
             every = likelier_fit(replace(again, graph=again.graph.copy()), wider, log_odds)
