@@ -67,14 +67,15 @@ class Stretch:
 class _State:
     """The newest pose, the shared error and all that was seen: stored values, and the joint covariance of errors.
 
-    ``x`` begins with the pose. The cost is minus twice the logarithm of the likelihood so far; observations that do not
-    fit are counted.
+    ``x`` begins with the pose. The cost is minus twice the logarithm of the likelihood so far; ``spread`` is the part
+    of it that would be left if all were seen where it was expected. Observations that do not fit are counted.
     """
 
     x: Array
     shared: float
     covariance: Array
     cost: float = 0.0
+    spread: float = 0.0
     unfit: int = 0
 
 
@@ -163,7 +164,7 @@ class OdometryFilter:
         ]
         self._ends = [link.vertices[1] for link in links]
         self._seen = self._observations(graph)
-        self._tight = list[_State]()  # before each edge, with odometry's own noise
+        self._tight = list[_State]()  # before each edge and at the end, with odometry's own noise
 
     def _step(self, link: Edge, covariance: Array) -> _Step:
         measured = tuple(link.measured.tolist())
@@ -210,7 +211,17 @@ class OdometryFilter:
         state, begin = self._start, 0
         if without is None and len(self._tight) > first:
             state, begin = self._tight[first], first
+            if self._least_cost(first) > -2.0 * above + _ROUNDING:
+                return -np.inf
         return -0.5 * self._filtered(state, begin, errors, first, without, -2.0 * above).cost
+
+    def _least_cost(self, first: int) -> float:
+        """A bound of the cost if odometry has more errors from an edge on, where all that was seen since then fits.
+
+        At best all was seen where it was expected. The spread of what is expected is not smaller then.
+        """
+        before, end = self._tight[first], self._tight[-1]
+        return before.cost + end.spread - before.spread if end.unfit == before.unfit else -np.inf
 
     def fitting(self, errors: Errors, first: int) -> float:
         """Return the part of what was seen after an edge that fits."""
@@ -239,6 +250,8 @@ class OdometryFilter:
             for one in self._seen[k]:
                 if one.what != without:
                     self._observe(state, one)
+        if without is None and first == len(self._steps):
+            self._tight.append(state)
         return state
 
     def _move(self, state: _State, k: int, errors: Errors) -> None:
@@ -294,7 +307,9 @@ class OdometryFilter:
             dof, covariance = len(tangent), state.covariance
             covariance[:dof] = tangent @ covariance[:dof]
             covariance[:, :dof] = covariance[:, :dof] @ tangent.T
-        state.cost += statistic + 2.0 * (log(factor.diagonal().prod()) + one.log_root)
+        spread = 2.0 * (log(factor.diagonal().prod()) + one.log_root)
+        state.cost += statistic + spread
+        state.spread += spread
 
     def _stepped(self, x: Array, step: Array) -> Array:
         """The values after a step (D,) of errors."""
