@@ -7,6 +7,7 @@ import numpy as np
 
 from graph_slam_ros.check.columns import Columns, OdometryColumns
 from graph_slam_ros.check.finding import Finding, Severity, Where
+from graph_slam_ros.config.frontend import OdometryConfig
 from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.typing import Array, Index, Mask
 
@@ -160,12 +161,14 @@ def _jumps(o: OdometryColumns, steps: Steps, jumps: Mask, max_speed_m_s: float) 
         text, settings = f"{o.topic} jumps {often}, {by}", tuple[str, ...]()
         slowest_m_s = float((np.linalg.norm(steps.moved, axis=1) / steps.dt)[is_there].min())
         limit_m_s = max(_LEAST_LIMIT_M_S, _LIMIT * steps.fastest_m_s)
-        if code == "odometry_jumps" and limit_m_s < slowest_m_s <= max_speed_m_s:  # else a run finds the jump itself
-            settings = (f"odometry.max_speed_m_s={limit_m_s:.2g}",)
         if code == "odometry_reset":
             text = f"{o.topic} goes back to zero {often}: its driver was restarted"
         elif count >= _CORRECTED:
             code, text = "corrected", f"{o.topic} jumps {count} times, {by}: is it the output of a localiser?"
+        elif limit_m_s < slowest_m_s <= max_speed_m_s:  # else a run finds the jump itself
+            settings = (f"odometry.max_speed_m_s={limit_m_s:.2g}",)
+        elif max_speed_m_s < min(slowest_m_s, OdometryConfig().max_speed_m_s):
+            continue  # somebody has set the limit, so that a run begins anew there
         yield Finding(code, "warning", count, 0, "times", text, o.topic, first_ns, count, settings)
 
 

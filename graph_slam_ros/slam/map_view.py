@@ -181,7 +181,7 @@ class MapView(PathView):
 
     @property
     def contradicted(self) -> list[str]:
-        """What is off in a calibration that nothing corrects, a line for each parameter: covariances contain it."""
+        """Return what is off in a calibration that nothing corrects, by parameter: covariances contain it."""
         return self._calibrator.watch.sentences()
 
     @property

@@ -70,7 +70,7 @@ class CalibrationWatch:
 
     def adds(self, vertex: int, dof: int) -> Array | None:
         """The covariance (dof, dof) that wrong parameters add to a vertex; None where nothing contradicts them."""
-        self._take()
+        self._compute()
         found = self._contradicting
         return None if found is None else found.adds_all(self.known(vertex, dof, found.column), dof)
 
@@ -84,7 +84,7 @@ class CalibrationWatch:
 
     def sentences(self) -> list[str]:
         """Say what each parameter is off by, with its sigma; empty where nothing contradicts the configuration."""
-        self._take()
+        self._compute()
         found = self._contradicting
         if found is None:
             return []
@@ -99,19 +99,19 @@ class CalibrationWatch:
         trial : begins a trial, where the newest was not of this map
         """
         if self._of_edges == self._backend.graph.edge_count:
-            self._take()
+            self._compute()
             return self._off(self._fits)
         return self._off(trial()())
 
     def uncorrected_so_far(self) -> Sequence[Uncorrected]:
         """Return what was wrong in the map at the newest trial; empty where trials correct what they find."""
         if self._backend.solver.is_current:
-            self._take()
+            self._compute()
             if self._fits is not self._fits_so_far:
                 self._fits_so_far, self._so_far = self._fits, self._off(self._fits)
         return self._so_far
 
-    def _take(self) -> None:
+    def _compute(self) -> None:
         """Compute the newest trial whose outcome counts."""
         keyframe = len(self._keyframes()) - 1
         ready = [job for begins, job in self._jobs if begins <= keyframe]
@@ -121,8 +121,8 @@ class CalibrationWatch:
         self._fits = ready[-1]()
         self._contradicting = None
         if self._fits is not None:
-            said, whole = self._fits
-            self._contradicting = whole if any(is_off(said, one) for one in self._judge(said)[0]) else None
+            chosen, whole = self._fits
+            self._contradicting = whole if any(is_off(chosen, one) for one in self._judge(chosen)[0]) else None
 
     def _off(self, fits: Fits | None) -> list[Uncorrected]:
         solver = self._backend.solver

@@ -109,6 +109,14 @@ def test_a_planted_fault_is_found_and_its_settings_mend_it(drive, tmp_path, name
             assert one.code not in {other.code for other in mended}
 
 
+def test_the_output_of_a_localiser_has_no_setting_that_mends_it(tmp_path):
+    write_bag(simulate("warehouse", 3, aisles=2, laps=2), tmp_path / "long.mcap")
+    bag = planted(tmp_path / "long.mcap", tmp_path / "faulty.mcap", "odometry corrected every 20 s")
+    (one,) = [one for one in check(bag, quick=True).findings if one.code == "corrected"]
+    assert one.count >= 3
+    assert not one.settings
+
+
 def test_each_finding_that_prints_a_setting_is_planted():
     sources = [file.read_text() for file in (ROOT / "graph_slam_ros/check").glob("*.py")]
     printing = {"frame_unlinked", "axes", "odometry_scale", "turn_scale", "mount_yaw", "clock_offset", "over_confident"}

@@ -136,7 +136,7 @@ def test_a_restart_that_is_slower_than_any_jump_has_a_setting_that_makes_it_one(
     _, found, _ = check(bag, "--quick")
     (setting,) = found["odometry_jumps"]["settings"]
     _, found, _ = check(bag, "--quick", "--set", setting)
-    assert found["odometry_jumps"]["settings"] == []
+    assert "odometry_jumps" not in found
     for words, segments in (((), 0), (("--set", setting), 1)):
         out = tmp_path / f"run{segments}"
         main(["replay", str(bag), "--out", str(out), *words])

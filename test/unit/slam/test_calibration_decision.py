@@ -18,7 +18,7 @@ CLOCK = Parameter("detections", "clock")
 def fitted(value, sigma):
     one, variance = np.array([value]), np.array([[sigma**2]])
     outcome = one, np.array([0.5]), variance, variance, one, one, 0.0
-    return TrialFit((CLOCK,), *outcome, np.zeros(0), np.zeros((0, 1)), np.zeros(0, dtype=np.int64), 0.0)
+    return TrialFit((CLOCK,), *outcome, np.zeros(0), np.zeros((0, 1)), np.zeros(0), np.zeros(0, dtype=np.int64), 0.0)
 
 
 def verdict(value, sigma, corrected=()):
