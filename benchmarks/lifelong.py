@@ -7,8 +7,8 @@ printed of a drive:
 
 * sizes of the graph at the end, and resident memory after a tenth of the drive and at the end;
 * errors: of the newest pose (in the frame of the landmarks), of the whole path (keyframes that left the map included)
-  and of the landmarks; NEES of one degree of freedom of the newest pose and of the landmarks: 1 is right, more is too
-  sure;
+  and of the landmarks; NEES of one degree of freedom of the newest pose, and of the landmarks among each other: 1 is
+  right, more is too sure;
 * CPU time: of all updates by a keyframe's measurements in the second half (median, p99, worst), and for each keyframe.
 """
 
@@ -43,6 +43,7 @@ from graph_slam_ros.typing import Array, Numbers
 Figures = dict[str, float]
 _WRONG_M = 1.0  # farther than that from its place a landmark without id is wrong
 _FLAT = 1.05  # of the memory after a tenth of a drive: more is not flat
+_PROBE = 1e-6  # of a derivative [m, rad]
 _WARM, _LOOK = 640, 40  # keyframes: before errors of the newest pose are taken, and from one to the next
 
 
@@ -161,10 +162,28 @@ class Drive:
         error = float(np.linalg.norm(turn @ pose[:n] + shift - np.array(true[:n])))
         (covariance,) = slam.solver.marginal([newest])
         off = np.array(space.group.log(space.group.between(tuple(pose), true)))
-        of_marks = slam.graph.kind_of(vertices[0]).local(there, right).ravel()
-        joint = slam.solver.joint_marginal(vertices)
         nees = float(off @ np.linalg.solve(covariance, off)) / len(off)
-        return error, nees, float(of_marks @ np.linalg.solve(joint, of_marks)) / len(of_marks)
+        return error, nees, self._shape_nees(vertices, there, right, (turn, shift))
+
+    def _shape_nees(self, vertices: list[int], there: Array, right: Array, laid: tuple[Array, Array]) -> float:
+        """NEES of the landmarks among each other: a turn of the whole map by 0.05 rad moves them by metres.
+
+        Parameters
+        ----------
+        laid : rotation and shift by which they lie on the true ones
+        """
+        group, kind = self.course.space.group, self.slam.graph.kind_of(vertices[0])
+        act = group.compose if self.course.turns else group.act
+        onto = np.eye(len(laid[1]) + 1)
+        onto[:-1, :-1], onto[:-1, -1] = laid
+        whole = np.eye(self.course.space.dof) * _PROBE
+        moves = [np.stack(act(group.exp(tuple(one)), tuple(there.T)), axis=-1) for one in whole]
+        gauge = np.stack([kind.local(there, one).ravel() / _PROBE for one in moves], axis=-1)
+        off = kind.local(there, np.stack(act(group.inverse(group.from_matrix(onto)), tuple(right.T)), axis=-1)).ravel()
+        off_, gauge_ = np.split(np.linalg.solve(self.slam.solver.joint_marginal(vertices), np.c_[off, gauge]), [1], 1)
+        pull = gauge.T @ off_[:, 0]
+        chi2 = off @ off_[:, 0] - pull @ np.linalg.solve(gauge.T @ gauge_, pull)
+        return float(chi2) / (len(off) - len(pull))
 
 
 class UnnamedDrive(Drive):
