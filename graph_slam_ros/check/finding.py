@@ -103,7 +103,9 @@ KINDS: dict[str, Kind] = {
         True,
     ),
     "odometry_jumps": Kind(
-        "odometry jumps", "correct the driver; a run begins a segment where it is faster than odometry.max_speed_m_s"
+        "odometry jumps",
+        "correct the driver; a run begins a segment where it is faster than odometry.max_speed_m_s, and with that set "
+        "nothing is said",
     ),
     "odometry_reset": Kind("odometry goes back to zero: its driver was restarted", "cut the recording there"),
     "corrected": Kind("odometry jumps again and again, as the output of a localiser does", _WHEELS),

@@ -76,7 +76,8 @@ class Calibrator:
         self._admitted: set[Parameter] = set()
         self._last: TrialFit | None = None
         self.watch = CalibrationWatch(
-            backend,
+            backend.graph,
+            backend.solver,
             lambda: frontend.path.keyframes,
             lambda found: (self._decided(found, (), stated := self._stated()), stated),
             self._with_corrected,
@@ -100,7 +101,7 @@ class Calibrator:
             if everything is None:
                 self._start_if_due(keyframe)
             elif not self._backend.spares_memory:
-                self.watch.start(self._executor(self._watching()), keyframe, is_of_everything=True)
+                self._guarded(lambda: self._watch_from(keyframe, is_of_everything=True))
             return self._adopt_association(keyframe, everything) if self._config.uses_found_factors else None
         if everything is not None:
             return self._at_the_end(keyframe, everything)
@@ -120,10 +121,14 @@ class Calibrator:
         if (self._steady < _STEADY or self._windows.drifts) and not self._backend.spares_memory:
             apply_at = keyframe + self._config.robust.apply_after_keyframes
             if self._config.calibrate.is_on:
-                self._job, self._apply_at = self._executor(self._trial(self._backend.solver.settings)), apply_at
+                settings = self._backend.solver.settings
+                self._job, self._apply_at = self._guarded(lambda: self._executor(self._trial(settings))), apply_at
             else:
-                trial = self._watching(is_thorough=False)
-                self.watch.start(self._executor(trial), apply_at, is_of_everything=False)
+                self._guarded(lambda: self._watch_from(apply_at, is_of_everything=False))
+
+    def _watch_from(self, keyframe: int, *, is_of_everything: bool) -> None:
+        trial = self._executor(self._watching(is_thorough=is_of_everything))
+        self.watch.start(trial, keyframe, is_of_everything=is_of_everything)
 
     def _at_the_end(self, keyframe: int, everything: Settings) -> Report | None:
         self._job, report = None, None

@@ -221,9 +221,9 @@ class _Fit:
         found = self._parameters, theta, self._priors, covariance, robust, first, second, lost, x
         curvature = float(np.log(np.abs(factor.U.diagonal())).sum() + np.linalg.slogdet(information)[1])
         evidence = -0.5 * (float(np.sum(rows.cost) + np.sum((theta / self._priors) ** 2)) + curvature)
-        return TrialFit(*found, -border, self._shift(x), self._linear.column, evidence)
+        return TrialFit(*found, -border, self._way(x), self._linear.column, evidence)
 
-    def _shift(self, x: Array) -> Array:
+    def _way(self, x: Array) -> Array:
         """Steps (unknowns,) of all unknowns from where the fit began."""
         out, graph = np.zeros(self._linear.unknowns), self._p.graph
         for kind, vertices, _ in self._steps(graph, out):

@@ -7,19 +7,17 @@ navigation problems", Advances in Control Systems 3, 1966: parameters that are c
 """
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from graph_slam_ros.graph import Graph
 from graph_slam_ros.slam.calibration.decision import Finding, amount
 from graph_slam_ros.slam.calibration.fit import TrialFit
 from graph_slam_ros.slam.calibration.uncorrected import Total, Uncorrected, is_off, sampled, uncorrected
 from graph_slam_ros.slam.frontend.keyframes import Keyframe
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
+from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Index
-
-if TYPE_CHECKING:
-    from graph_slam_ros.slam.backend import Backend
 
 _MOST_POSES = 100  # whose covariances say whether what is not corrected matters
 
@@ -42,13 +40,14 @@ class CalibrationWatch:
 
     def __init__(
         self,
-        backend: "Backend",
+        graph: Graph,
+        solver: Solver,
         keyframes: Callable[[], StampedPoses[Keyframe]],
         judge: Judge,
         corrected: Callable[[Array, int], Array],
         total: Total,
     ) -> None:
-        self._backend, self._keyframes = backend, keyframes
+        self._graph, self._solver, self._keyframes = graph, solver, keyframes
         self._judge, self._corrected, self._total = judge, corrected, total
         self._jobs = list[tuple[int, Watching]]()
         self._fits: Fits | None = None
@@ -64,9 +63,9 @@ class CalibrationWatch:
         ----------
         is_of_everything : whether all that was measured was solved before
         """
-        self._jobs.append((from_keyframe, job))
         if is_of_everything:
-            self._of_edges = self._backend.graph.edge_count
+            self._jobs, self._of_edges = [], self._graph.edge_count
+        self._jobs = [*self._jobs[-1:], (from_keyframe, job)]  # each holds a copy of the map
 
     def adds(self, vertex: int, dof: int) -> Array | None:
         """The covariance (dof, dof) that wrong parameters add to a vertex; None where nothing contradicts them."""
@@ -77,7 +76,7 @@ class CalibrationWatch:
     def known(self, vertex: int, dof: int, column: Index) -> int:
         """A vertex that a trial had: a pose after it counts as the last keyframe before."""
         keyframes = self._keyframes().ids
-        if vertex < len(column) or dof != self._backend.graph.kind_of(int(keyframes[-1])).dof:
+        if vertex < len(column) or dof != self._graph.kind_of(int(keyframes[-1])).dof:
             return vertex
         earlier = keyframes[keyframes < len(column)]
         return int(earlier[-1]) if len(earlier) else vertex
@@ -98,14 +97,14 @@ class CalibrationWatch:
         ----------
         trial : begins a trial, where the newest was not of this map
         """
-        if self._of_edges == self._backend.graph.edge_count:
+        if self._of_edges == self._graph.edge_count:
             self._compute()
             return self._off(self._fits)
         return self._off(trial()())
 
     def uncorrected_so_far(self) -> Sequence[Uncorrected]:
         """Return what was wrong in the map at the newest trial; empty where trials correct what they find."""
-        if self._backend.solver.is_current:
+        if self._solver.is_current:
             self._compute()
             if self._fits is not self._fits_so_far:
                 self._fits_so_far, self._so_far = self._fits, self._off(self._fits)
@@ -125,7 +124,7 @@ class CalibrationWatch:
             self._contradicting = whole if any(is_off(chosen, one) for one in self._judge(chosen)[0]) else None
 
     def _off(self, fits: Fits | None) -> list[Uncorrected]:
-        solver = self._backend.solver
+        solver = self._solver
         if fits is None or not solver.is_current:
             return []
         keyframes = self._keyframes().ids

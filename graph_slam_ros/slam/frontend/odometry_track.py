@@ -60,10 +60,12 @@ class OdometrySamples:
         self._kept_ns, self._there = step.stamp_ns, step.T_odom_base
 
     def _keep(self, stamp_ns: int, T_odom_base: Numbers) -> None:
-        self._stamps_ns.append(stamp_ns)
+        del self._poses[len(self._stamps_ns) * self._space.pose.size :]  # of one that there was no memory for
         self._poses.extend(T_odom_base)
+        self._stamps_ns.append(stamp_ns)
 
     def track(self, keyframes: Array, factors: tuple[float, float]) -> OdometryTrack:
         """Return copies of all samples, with odometry at the keyframes and the factors of distance and turn."""
-        stamps_ns, poses = np.array(self._stamps_ns, dtype=np.int64), np.array(self._poses)
-        return OdometryTrack(keyframes.copy(), stamps_ns, poses.reshape(-1, self._space.pose.size), *factors)
+        stamps_ns, size = np.array(self._stamps_ns, dtype=np.int64), self._space.pose.size
+        poses = np.array(self._poses)[: len(stamps_ns) * size].reshape(-1, size)
+        return OdometryTrack(keyframes.copy(), stamps_ns, poses, *factors)

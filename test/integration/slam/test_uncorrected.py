@@ -168,3 +168,18 @@ def test_an_error_of_the_recording_makes_a_fit_meaningless():
     summary = {"counters": {}, "inputs": {}, "uncorrected": [off]}
     assert len(list(doubts(summary))) == 1
     assert not list(doubts(summary | {"check": {"severity": "error"}}))
+
+
+def test_trials_that_nobody_asks_for_are_not_kept():
+    drive, _ = imperfect_drive_and_truth(Faults(clock_s=0.2), seconds=60.0)
+    slam, asked = GraphSlam(Config()), GraphSlam(Config())
+    for k, measurement in enumerate(drive):
+        for one in (slam, asked):
+            one.process(measurement)
+            if k % 400 == 0:
+                one.process(Control("optimize"))
+        if asked.keyframes:
+            assert asked.pose_covariance is not None
+    assert len(slam._calibrator.watch._jobs) <= 2
+    np.testing.assert_array_equal(slam.pose_covariance, asked.pose_covariance)
+    assert slam.contradicted == asked.contradicted != []
