@@ -59,7 +59,8 @@ QUANTITIES = {
     "range_factor": Quantity("range_factor", *_SCALE, "pass landmarks near and far, within one drive"),
 }
 GROUPS = tuple(dict.fromkeys(quantity.group for quantity in QUANTITIES.values()))
-OF_ODOMETRY = ("distance", "turn", "turn_bias")
+FACTORS = ("distance", "turn")
+OF_ODOMETRY = (*FACTORS, "turn_bias")
 
 
 @dataclass(frozen=True, slots=True)

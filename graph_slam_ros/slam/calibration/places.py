@@ -17,12 +17,11 @@ from graph_slam_ros.errors import SingularError
 from graph_slam_ros.slam.calibration.choice import places_of
 from graph_slam_ros.slam.calibration.decision import SIGMAS, is_certain
 from graph_slam_ros.slam.calibration.fit import TrialFit, fit, likelier_fit
-from graph_slam_ros.slam.calibration.parameters import Parameter
+from graph_slam_ros.slam.calibration.parameters import FACTORS, Parameter
 from graph_slam_ros.slam.calibration.rows import TrialProblem
 
 LEAST_M = 0.2  # errors that last, as a robot that follows its commands late, are up to 0.14 m in recorded drives
 _SIGMA_M = 0.5
-_FACTORS = ("distance", "turn")
 _AGREEING, _PART = 2.0, 1.0 / 3.0  # a factor is off by so many sigmas, and so much of it, whatever its noise is of
 
 
@@ -62,7 +61,7 @@ def fit_with_places(
 def _without_noise(problem: TrialProblem, found: TrialFit, priors: Mapping[Parameter, float]) -> TrialFit:
     """The same; or a fit without the factors of odometry that are not off where its noise is of what was measured."""
     far = np.abs(found.values) > SIGMAS * found.sigmas
-    factors = [one for one, is_far in zip(found.parameters, far, strict=True) if is_far and one.name in _FACTORS]
+    factors = [one for one, is_far in zip(found.parameters, far, strict=True) if is_far and one.name in FACTORS]
     if not factors:
         return found
     problem = problem if found.slips else problem.without_slips()

@@ -14,7 +14,7 @@ from scipy import sparse
 from graph_slam_ros.graph import Graph, Loss
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.slam.calibration.model import MeasurementModel, OdometryEdges, Sightings, Values, clock_of
-from graph_slam_ros.slam.calibration.parameters import OF_ODOMETRY, Parameter
+from graph_slam_ros.slam.calibration.parameters import FACTORS, OF_ODOMETRY, Parameter
 from graph_slam_ros.slam.calibration.path import EstimatedPath
 from graph_slam_ros.slam.frontend.odometry_track import OdometryTrack
 from graph_slam_ros.slam.frontend.sighting_edges import SightingEdges
@@ -136,7 +136,7 @@ class _Eyes:
         self.first, self.second, self.fraction = self._own.copy(), self._own.copy(), np.zeros(len(self._own))
         self.steps[:] = 0.0
         for k, parameter in enumerate(parameters):
-            if parameter.name in ("distance", "turn"):
+            if parameter.name in FACTORS:
                 self.steps[:, :, k] = self._scaled_steps(parameter, values, model)
             elif parameter.name == "clock" and parameter.source == self._edges.source:
                 clock = clock_of(values, self._edges.source)
@@ -244,7 +244,7 @@ class Linearization:
         difference = sides[0] - sides[1]
         wrapped = np.abs(difference) > np.pi
         out = np.asarray((difference - wrapped * np.sign(difference) * 2.0 * np.pi) / (2.0 * probe))
-        is_factor = isinstance(edges, OdometryEdges) and parameter.name in ("distance", "turn")
+        is_factor = isinstance(edges, OdometryEdges) and parameter.name in FACTORS
         if is_factor and self._model.is_noise_measured:
             n, factor = self._p.space.dimensions, 1.0 + values.get(parameter, 0.0)
             scaled = slice(0, n) if parameter.name == "distance" else slice(n, None)
