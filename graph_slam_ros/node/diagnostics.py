@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.measurements.reasons import explain, remedy
 from graph_slam_ros.messages.to_msg import ERROR, OK, WARN, Status
-from graph_slam_ros.node.estimate import Estimate
+from graph_slam_ros.node.estimate import OFF, Estimate
 from graph_slam_ros.node.recent import WINDOW_S, Recent
 from graph_slam_ros.runs.tables import INPUT_COLUMNS
 
@@ -277,8 +277,9 @@ def statuses(facts: Facts, verdict: Health, node: str) -> Iterator[Status]:
         values = _graph(facts.estimate) | {"path updates sent": str(facts.path_version)}
         yield Status(OK, f"{node}: weak directions", _weakness(facts, facts.estimate), node, facts.weakest)
         if calibration := facts.estimate.calibration:
-            corrected = ", ".join(name for name in calibration if name.startswith("corrected "))
-            yield Status(OK, f"{node}: calibration", corrected or "nothing corrected", node, dict(calibration))
+            found = [name for name in calibration if name.startswith("corrected ")] or ["nothing corrected"]
+            found += [f"{OFF}: {calibration[OFF]}"] if OFF in calibration else []
+            yield Status(OK, f"{node}: calibration", "; ".join(found), node, dict(calibration))
         if gyro := facts.estimate.gyro:
             yield Status(OK, f"{node}: gyro", gyro, node, {"gyro": gyro})
         condensed = f"; condensed: {facts.estimate.condensed}" if facts.estimate.condensed else ""

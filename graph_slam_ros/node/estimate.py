@@ -1,6 +1,6 @@
 """The estimate that the worker's thread publishes to the other threads."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,6 +15,7 @@ from graph_slam_ros.slam.solution import Correction
 from graph_slam_ros.slam.weak_direction import WeakDirection, position_covariance, weakest_position, weakest_turn
 from graph_slam_ros.typing import Numbers
 
+OFF = "off, not corrected, in the covariances"
 _IN_TURN = 4  # landmarks whose covariance is computed anew at an update
 
 
@@ -97,7 +98,8 @@ class Estimate:
     uncorrected : clocks, mounts and scales that are off and not corrected; empty where none is
     motion : why the gyro, or an odometry, has no part in the motion; empty where all have
     gyro : its state and its bias; empty where no input is one
-    calibration : settings that calibration has corrected, and a sentence for each parameter that it has fitted
+    calibration : settings that calibration has corrected, a sentence for each parameter that it has fitted, and what is
+        off without being corrected
     is_resumed : whether a drive that was cut off goes on by odometry alone: nothing was recognised since
     """
 
@@ -188,7 +190,7 @@ class Estimate:
             motion="; ".join(filter(None, (slam.gyro.fault if slam.gyro else "", slam.backend.odometries.doubted))),
             gyro=str(slam.gyro or ""),
             is_resumed=is_resumed,
-            calibration=_calibration(slam.calibration_report),
+            calibration=_calibration(slam.calibration_report, slam.contradicted),
         )
 
 
@@ -196,6 +198,7 @@ def _settings(one: Uncorrected) -> list[str]:
     return [f"{key}={value}" for key, value in one.as_dict()["settings"].items()]
 
 
-def _calibration(report: Mapping[str, Any]) -> dict[str, str]:
+def _calibration(report: Mapping[str, Any], contradicted: Sequence[str]) -> dict[str, str]:
     settings = {f"corrected {name}": str(value) for name, value in report.get("settings", {}).items()}
-    return settings | {f"{one['name']} of {one['source']}": one["text"] for one in report.get("parameters", ())}
+    off = {OFF: ", ".join(contradicted)} if contradicted else {}
+    return settings | off | {f"{one['name']} of {one['source']}": one["text"] for one in report.get("parameters", ())}

@@ -13,6 +13,7 @@ import numpy as np
 from graph_slam_ros.graph import Graph
 from graph_slam_ros.slam.calibration.decision import Finding, amount
 from graph_slam_ros.slam.calibration.fit import TrialFit
+from graph_slam_ros.slam.calibration.parameters import FACTORS
 from graph_slam_ros.slam.calibration.uncorrected import Total, Uncorrected, is_off, sampled, uncorrected
 from graph_slam_ros.slam.frontend.keyframes import Keyframe
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
@@ -82,13 +83,22 @@ class CalibrationWatch:
         return int(earlier[-1]) if len(earlier) else vertex
 
     def sentences(self) -> list[str]:
-        """Say what each parameter is off by, with its sigma; empty where nothing contradicts the configuration."""
+        """Say what each parameter is off by, with its sigma; empty where nothing contradicts the configuration.
+
+        Covariances contain a factor of odometry that noise explains, too: its noise is no worse said by it. But that is
+        no error of the configuration.
+        """
         self._compute()
         found = self._contradicting
-        if found is None:
+        if found is None or self._fits is None:
             return []
+        known = self._fits[0].parameters
         values = zip(found.parameters, found.values.tolist(), found.sigmas.tolist(), strict=True)
-        return [f"{one} {amount(one, value, 3)} (sigma {amount(one, sigma)})" for one, value, sigma in values]
+        return [
+            f"{one} {amount(one, value, 3)} (sigma {amount(one, sigma)})"
+            for one, value, sigma in values
+            if one in known or one.name not in FACTORS
+        ]
 
     def uncorrected(self, trial: Callable[[], Watching]) -> list[Uncorrected]:
         """Return what is wrong in the map as it is now.

@@ -11,7 +11,7 @@ from random_drives import random_drive
 
 from graph_slam_ros.cli import main
 from graph_slam_ros.messages.to_msg import WARN
-from graph_slam_ros.node.diagnostics import Facts, judge
+from graph_slam_ros.node.diagnostics import Facts, judge, statuses
 from graph_slam_ros.node.estimate import Estimate, UnseenWay
 from graph_slam_ros.runs.outcome import doubts
 from graph_slam_ros.simulation import simulate, write_bag
@@ -116,6 +116,21 @@ def test_the_node_is_degraded_by_the_same_words():
     assert (health.state, health.level) == ("DEGRADED", WARN)
     assert str(one) in health.reasons[0]
     assert "detections.offset_s=0." in health.reasons[0]
+    (calibration,) = [
+        one for one in statuses(Facts("active", estimate=estimate), health, "slam") if "calib" in one.name
+    ]
+    assert calibration.message.startswith("nothing corrected; off, not corrected, in the covariances: distance of odom")
+    assert "clock of detections 0.2" in calibration.message
+
+
+def test_a_factor_that_noise_explains_is_no_error_of_the_configuration(tmp_path):
+    """Headings are wrong by 0.3 rad a step, so the fit with the places of sensors has half of each turn."""
+    bag, run = tmp_path / "drive.mcap", tmp_path / "run"
+    write_bag(simulate("pythonrobotics", 1, poses=100), bag)
+    bag = planted(bag, tmp_path / "turned.mcap", "mount turned -10 degrees")
+    assert main(["replay", str(bag), "--out", str(run)]) in (0, 3)
+    off = json.loads((run / "run.json").read_text())["contradicted"]
+    assert [one.split(" of ")[0] for one in off] == ["distance", "clock", "yaw", "x", "y"]
 
 
 @pytest.fixture(scope="module")
