@@ -68,7 +68,7 @@ class RunRecorder:
         self.folder = Path(folder)
         self._sync_s, self._due_s = sync_s, 0.0
         self._disk: ThreadPoolExecutor | None = None
-        self._writing = threading.RLock()
+        self._writing, self._starting = threading.RLock(), threading.Lock()
         self._is_ended = False
         self._flushing: Future[None] | None = None
         self.accepted = 0  # measurements, written or not
@@ -115,7 +115,7 @@ class RunRecorder:
         """Write accepted measurements in a thread, because the thread that processes them may be busy for long."""
         if self._accepted and not self._is_ended and (self._flushing is None or self._flushing.done()):
             with contextlib.suppress(RuntimeError):  # the recording has just been ended
-                self._flushing = self._writer_thread().submit(self._flush_journal)
+                self._flushing = self._in_background(self._flush_journal)
 
     def _flush_journal(self) -> None:
         with contextlib.suppress(OSError), self._writing:  # it waits, and the next flush raises that again
@@ -125,10 +125,21 @@ class RunRecorder:
                 if self._syncing is None or (self._syncing.done() and not self._syncing.exception()):
                     self._syncing = self._sync_if_due()
 
-    def _writer_thread(self) -> ThreadPoolExecutor:
-        with self._writing:
-            self._disk = self._disk or ThreadPoolExecutor(1, "journal")
-            return self._disk
+    def _in_background(self, work: Callable[[], None]) -> Future[None]:
+        """Start work in a thread: one for a flush, and one for a sync.
+
+        The flush may wait for somebody who waits for the sync.
+        """
+        with self._starting:
+            self._disk = self._disk or ThreadPoolExecutor(2, "journal")
+            return self._disk.submit(work)
+
+    def _end_threads(self) -> None:
+        """Let the threads end after their work; others come with the next."""
+        with self._starting:
+            disk, self._disk = self._disk, None
+        if disk is not None:
+            disk.shutdown(wait=False)
 
     def sink(self, measurement: Measurement) -> None:
         """Append to the journal: the sink of ``GraphSlam``. Raises OSError as ``flush`` does."""
@@ -176,7 +187,7 @@ class RunRecorder:
         if not self._sync_s or now < self._due_s:
             return None
         self._due_s = now + self._sync_s
-        return self._writer_thread().submit(self._sync)
+        return self._in_background(self._sync)
 
     def join_sync(self) -> None:
         """Wait until the disk has synced. Raises OSError once if it failed."""
@@ -293,8 +304,7 @@ class RunRecorder:
             self._room.close()
 
     def _abandon(self) -> None:
-        if self._disk is not None:
-            self._disk.shutdown(wait=False)
+        self._end_threads()
         self._journal.abandon()
         self._left.abandon()
         self._map.abandon()
@@ -315,9 +325,7 @@ class RunRecorder:
         self._fill()
         failed = self._syncing.exception() if self._syncing is not None else None
         self._syncing = None
-        if self._disk is not None:  # its thread ends; another comes with the next sync
-            self._disk.shutdown(wait=False)
-            self._disk = None
+        self._end_threads()
         if self._bag is not None:
             self._ended_bags.append(self._bag.end())
             self._bag, self._bags = None, self._bags + 1

@@ -324,6 +324,61 @@ def test_P4_that_the_disk_did_not_take_it_in_time_is_told_and_does_not_keep_it_f
     assert len(list(read_ingest(tmp_path / "run", []))) > 60
 
 
+def in_time(work):
+    """Whether something ends in another thread."""
+    thread = threading.Thread(target=work, daemon=True)
+    thread.start()
+    thread.join(10.0)
+    return not thread.is_alive()
+
+
+@pytest.mark.parametrize("end", ["save", "leave", "close"])
+def test_P3_a_run_ends_while_a_flush_in_the_background_waits_for_its_turn(tmp_path, end):
+    """The end waits for the disk, which has to be asked while the flush waits for the end."""
+    recorder, slam = RunRecorder(tmp_path / "run", Config(), 1e-9), GraphSlam(Config())
+
+    def ends():
+        with recorder._writing:  # as an update holds it that ends just before
+            recorder.accept(recorded()[0])
+            recorder.flush_in_background()
+            recorder.flush()
+            {"save": lambda: recorder.save(slam), "leave": lambda: recorder.leave(0, 0, Counters())}.get(
+                end, recorder.close
+            )()
+
+    assert in_time(ends)
+    assert len(list(read_ingest(tmp_path / "run", []))) == 1
+
+
+def test_P3_who_accepts_measurements_does_not_wait_for_a_disk_that_is_slow_at_a_save(tmp_path, monkeypatch):
+    fsync, asked, goes_on = os.fsync, threading.Event(), threading.Event()
+
+    def slow(fd):
+        if threading.current_thread().name.startswith("journal"):
+            asked.set()
+            goes_on.wait(60.0)
+        fsync(fd)
+
+    monkeypatch.setattr(os, "fsync", slow)
+    recorder, slam = RunRecorder(tmp_path / "run", Config(), 1e-9), GraphSlam(Config())
+    recorder.sink(recorded()[0])
+    assert asked.wait(10.0)
+    saves = threading.Thread(target=recorder.save, args=(slam,), daemon=True)
+    saves.start()
+    until_it_waits = threading.Event()
+    while recorder._writing.acquire(blocking=False):
+        recorder._writing.release()
+        until_it_waits.wait(0.01)
+    recorder.accept(recorded()[1])
+    assert in_time(recorder.flush_in_background)
+    assert saves.is_alive()
+    goes_on.set()
+    saves.join(10.0)
+    assert not saves.is_alive()
+    recorder.close()
+    assert len(list(read_ingest(tmp_path / "run", []))) == 2
+
+
 def test_P3_a_part_that_begins_while_the_disk_is_still_busy_with_another_is_not_asked_for_too_soon(
     tmp_path, monkeypatch
 ):
