@@ -116,23 +116,25 @@ class TrialFit:
         return float(row[other]), self.parameters[other] if row[other] > 0.0 else None
 
 
-def fit(problem: TrialProblem, priors: Mapping[Parameter, float], start: Values | None = None) -> TrialFit:
+def fit(problem: TrialProblem, priors: Mapping[Parameter, float], start: TrialFit | None = None) -> TrialFit:
     """Fit parameters together with all unknowns of a graph, starting at its estimate.
 
     Parameters
     ----------
     priors : sigma of each parameter
-    start : corrections to begin with
+    start : the outcome of a fit of the same graph with other parameters: start there
 
     Raises
     ------
     SingularError
         The edges do not determine the estimate.
     """
-    return _Fit(problem, priors).run(start or {})
+    return _Fit(problem, priors).run(start)
 
 
-def likelier_fit(problem: TrialProblem, priors: Mapping[Parameter, float], log_odds: float) -> TrialFit:
+def likelier_fit(
+    problem: TrialProblem, priors: Mapping[Parameter, float], log_odds: float, start: TrialFit | None = None
+) -> TrialFit:
     """Fit parameters with the slips that were found and, if there are any, without: what is wrong passes for slips.
 
     Returns the fit of more evidence (MacKay, "Bayesian interpolation", 1992).
@@ -140,6 +142,7 @@ def likelier_fit(problem: TrialProblem, priors: Mapping[Parameter, float], log_o
     Parameters
     ----------
     log_odds : logarithm of the odds of a slip before anything is seen
+    start : as of ``fit``
 
     Raises
     ------
@@ -147,9 +150,9 @@ def likelier_fit(problem: TrialProblem, priors: Mapping[Parameter, float], log_o
         The edges do not determine the estimate.
     """
     if not problem.slips:
-        return fit(problem, priors)
-    without = fit(problem.without_slips(), priors)
-    found = fit(problem, priors)
+        return fit(problem, priors, start)
+    without = fit(problem.without_slips(), priors, start)
+    found = fit(problem, priors, start)
     return replace(without, slips=False) if without.evidence > found.evidence + log_odds * len(problem.slips) else found
 
 
@@ -160,12 +163,14 @@ class _Fit:
         self._free = np.setdiff1d(problem.vertices, problem.held)
         self._linear = Linearization(problem, self._parameters, self._free)
 
-    def run(self, start: Values) -> TrialFit:
+    def run(self, start: TrialFit | None) -> TrialFit:
         """Iterate until the parameters converge."""
-        x, theta = self._p.values.copy(), np.array([start.get(p, 0.0) for p in self._parameters])
+        x, theta, cautious = self._p.values.copy(), np.zeros(len(self._parameters)), _CAUTIOUS
+        if start is not None:
+            x, theta, cautious = start.path.copy(), np.array([start.value(one) for one in self._parameters]), 0
         stages = self._p.settings.stages()
         for k in range(_ITERATIONS):
-            rows = self._linear.rows(x, theta, stages[0 if k < _CAUTIOUS else -1])
+            rows = self._linear.rows(x, theta, stages[0 if k < cautious else -1])
             factor, border = _factor(rows)
             information = self._information(rows.columns - rows.jacobian @ border)
             pull = rows.jacobian.T @ rows.residual
@@ -175,7 +180,7 @@ class _Fit:
             part = self._stride(move, step)
             x, theta = self._moved(x, part * move), theta + part * step
             sigmas = np.sqrt(np.diag(np.linalg.inv(information)))
-            if k >= _CAUTIOUS and part == 1.0 and (np.abs(step) < _STILL * sigmas).all():
+            if k >= cautious and part == 1.0 and (np.abs(step) < _STILL * sigmas).all():
                 break
         return self._outcome(x, theta, self._linear.rows(x, theta, stages[-1]))
 

@@ -49,7 +49,7 @@ def fit_with_places(
     if places and (is_off or is_thorough):
         wider = {**priors, **dict.fromkeys(places, _SIGMA_M)}
         try:
-            every = likelier_fit(replace(again, graph=again.graph.copy()), wider, log_odds)
+            every = likelier_fit(replace(again, graph=again.graph.copy()), wider, log_odds, found)
         except SingularError:
             every = found
         else:
@@ -65,14 +65,13 @@ def _without_noise(problem: TrialProblem, found: TrialFit, priors: Mapping[Param
     if not factors:
         return found
     problem = problem if found.slips else problem.without_slips()
-    start = {one: found.value(one) for one in found.parameters}
     copy = replace(problem, graph=problem.graph.copy(), is_noise_measured=True)
     try:
-        other = fit(copy, priors, start)
+        other = fit(copy, priors, found)
         sigmas = dict(zip(other.parameters, other.sigmas.tolist(), strict=True))
         parts = {one: other.value(one) / found.value(one) for one in factors}
         of_noise = {one for one in factors if parts[one] < max(_PART, _AGREEING * sigmas[one] / abs(found.value(one)))}
         left = {one: prior for one, prior in priors.items() if one not in of_noise}
-        return replace(fit(problem, left, start), slips=found.slips) if of_noise and left else found
+        return replace(fit(problem, left, found), slips=found.slips) if of_noise and left else found
     except SingularError:
         return found
