@@ -11,7 +11,16 @@ from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph.edge_type import EdgeType
 from graph_slam_ros.graph.lasting_ids import LastingIds
 from graph_slam_ros.graph.noise import Gaussian
-from graph_slam_ros.graph.records import FITS, ITSELF, LINEARIZE, MISSING, NOT_FINITE, append_edges, append_vertices
+from graph_slam_ros.graph.records import (
+    FITS,
+    ITSELF,
+    LINEARIZE,
+    MISSING,
+    NOT_FINITE,
+    append_edges,
+    append_vertices,
+    labels_of,
+)
 from graph_slam_ros.graph.tables import Column, Edge, EdgeTable, Vertex
 from graph_slam_ros.graph.vertices import VertexKind
 from graph_slam_ros.lie.addresses import address_of
@@ -223,11 +232,7 @@ class Graph:
     def has_label(self, edges: Index, labels: Sequence[str]) -> NDArray[np.bool_]:
         """Return whether each of some edges is of one of these classes, (n,)."""
         wanted = np.array([label in labels for label in self.labels], dtype=bool)
-        out = np.zeros(len(edges), dtype=bool)
-        codes = self.table_of_edge.values[edges]
-        for code, table in enumerate(self.tables.values()):
-            of_table = codes == code
-            out[of_table] = wanted[table.label.values[self.row_of_edge.values[edges[of_table]]]]
+        out: NDArray[np.bool_] = wanted[labels_of(self.pointers, edges)]
         return out
 
     def edges_of(self, label: str) -> Index:

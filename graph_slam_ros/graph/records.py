@@ -41,6 +41,28 @@ def table_at(graph: Index, table: int) -> Index:
 
 
 @kernel
+def labels_of(graph: Index, edges: Index) -> Index:
+    """Return the codes (n,) of the classes of edges that exist."""
+    table_of, row_of = integers(graph[TABLE_OF_EDGE], graph[EDGE_ROOM]), integers(graph[ROW_OF_EDGE], graph[EDGE_ROOM])
+    out = np.empty(len(edges), np.int64)
+    for k in range(len(edges)):
+        table = table_at(graph, table_of[edges[k]])
+        out[k] = integers(table[LABEL], table[ROOM])[row_of[edges[k]]]
+    return out
+
+
+@kernel
+def weights_of(graph: Index, edges: Index) -> Array:
+    """Return the weights (n,) of edges that exist."""
+    table_of, row_of = integers(graph[TABLE_OF_EDGE], graph[EDGE_ROOM]), integers(graph[ROW_OF_EDGE], graph[EDGE_ROOM])
+    out = np.empty(len(edges))
+    for k in range(len(edges)):
+        table = table_at(graph, table_of[edges[k]])
+        out[k] = reals(table[WEIGHT], table[ROOM])[row_of[edges[k]]]
+    return out
+
+
+@kernel
 def append_vertices(pointers: Index, first: int, numbers: int, values: Array, kind: int) -> int:
     """Append vertices of one kind with their values; or none, and return the row of one that is not finite.
 

@@ -69,6 +69,84 @@ def whiten(
 
 
 @kernel
+def squares(root: Array, rows: Index, residual: Array) -> Array:
+    """Return the squared whitened residual of each edge, without its weight.
+
+    Parameters
+    ----------
+    root : square root informations of the whole table; rows : (n,) those of the edges
+    """
+    n, m = residual.shape
+    out = np.zeros(n)
+    for e in range(n):
+        for a in range(m):
+            white = 0.0
+            for b in range(m):
+                white += root[rows[e], a, b] * residual[e, b]
+            out[e] += white * white
+    return out
+
+
+@kernel
+def evaluate(graph: Index, values: Array, vertices: int, edges: Index) -> tuple[int, Array, Array, Index]:
+    """Evaluate edges at stored values.
+
+    Parameters
+    ----------
+    vertices : how many the graph has
+
+    Returns
+    -------
+    NOTHING, or the table of an edge that is not compiled, and then the rest is empty; residuals, end to end; chi2 (n,)
+    without loss and weight; and the numbers (n,) of each residual.
+    """
+    room, n = graph[records.EDGE_ROOM], len(edges)
+    table_of, row_of = integers(graph[records.TABLE_OF_EDGE], room), integers(graph[records.ROW_OF_EDGE], room)
+    offset = integers(graph[records.OFFSET], vertices)
+    chi2, numbers, begin, total = np.empty(n), np.empty(n, np.int64), np.empty(n, np.int64), ZERO
+    many = np.zeros(len(graph) - records.TABLES, np.int64)
+    for k in range(n):
+        table = table_at(graph, table_of[edges[k]])
+        if table[records.LINEARIZE] == 0:
+            return table_of[edges[k]], chi2[:0], chi2[:0], numbers[:0]
+        numbers[k], begin[k] = table[records.RESIDUAL_SIZE], total
+        total += numbers[k]
+        many[table_of[edges[k]]] += 1
+    out = np.empty(total)
+    for code in range(len(many)):
+        if many[code] == 0:
+            continue
+        table = table_at(graph, code)
+        rows, where, count = np.empty(many[code], np.int64), np.empty(many[code], np.int64), ZERO
+        for k in range(n):
+            if table_of[edges[k]] == code:
+                rows[count], where[count] = row_of[edges[k]], k
+                count += 1
+        for first in range(0, count, CHUNK):
+            some = rows[first : first + CHUNK]
+            residual = _rows_residuals(table, offset, values, some)
+            m, long = residual.shape[1], table[records.ROOM]
+            of_each = squares(reals(table[records.SQRT_INFORMATION], long * m * m).reshape(long, m, m), some, residual)
+            for k in range(len(some)):
+                at = where[first + k]
+                chi2[at] = of_each[k]
+                for i in range(m):
+                    out[begin[at] + i] = residual[k, i]
+    return ZERO + NOTHING, out, chi2, numbers
+
+
+@inner
+def _rows_residuals(table: Index, offset: Index, values: Array, rows: Index) -> Array:
+    """Return the residuals (n, m) of rows of a table at stored values."""
+    room, slots, size = table[records.ROOM], table[records.ENDS], table[records.MEASURED_SIZE]
+    vertices = integers(table[records.VERTICES], room * slots).reshape(room, slots)
+    measured = reals(table[records.MEASURED], room * size).reshape(room, size)
+    at, z = gather(rows, vertices, offset, measured)
+    residual, _ = call_native(table[records.LINEARIZE], values, at, z)
+    return residual
+
+
+@kernel
 def store(t: Tree, rows: Index, ids: Index, residual: Array, jacobian: Array) -> None:
     """Put whitened edges into the tree: J'J and J'r, and the diagonal of H, instead of what they had there."""
     vertex, edge, link, blocks, diagonal = t.vertex, t.edge, t.link, t.blocks, t.diagonal

@@ -12,8 +12,15 @@ from graph_slam_ros.graph import EdgeType, Graph, Loss, records
 from graph_slam_ros.graph.native import native_address
 from graph_slam_ros.graph.tables import EdgeTable
 from graph_slam_ros.lie.addresses import address_of
-from graph_slam_ros.lie.jit import kernel
-from graph_slam_ros.solver.blocks import CHUNK, gather, store_linearized, whiten, whiten_and_store
+from graph_slam_ros.solver.blocks import (
+    CHUNK,
+    evaluate,
+    gather,
+    squares,
+    store_linearized,
+    whiten,
+    whiten_and_store,
+)
 from graph_slam_ros.solver.clique_tree.storage import NOTHING
 from graph_slam_ros.solver.report import ClassCost
 from graph_slam_ros.typing import Array, Index
@@ -125,8 +132,21 @@ def linearized(graph: Graph, x: Array, edge: EdgeType, vertices: Sequence[int], 
     return residual[0], jacobian[0]
 
 
-def residuals_of(graph: Graph, x: Array, edges: Index) -> Iterator[tuple[Index, Array, Array]]:
-    """Places among these edges, their residuals (n, m) at the stored values x, and square root informations."""
+def evaluated(graph: Graph, x: Array, edges: Index) -> tuple[Array, Array, Index]:
+    """Evaluate edges at the stored values x.
+
+    Returns
+    -------
+    Residuals, not whitened, end to end; squared whitened residuals (n,), without loss and weight; the numbers (n,) of
+    each residual.
+    """
+    code, residual, chi2, numbers = evaluate(graph.pointers, x, graph.vertex_count, edges)
+    return (residual, chi2, numbers) if code == NOTHING else _evaluated_by_table(graph, x, edges)
+
+
+def _evaluated_by_table(graph: Graph, x: Array, edges: Index) -> tuple[Array, Array, Index]:
+    """The same where not all edge types are compiled, or some were never called."""
+    chi2, numbers, out = np.empty(len(edges)), np.empty(len(edges), dtype=np.int64), [np.empty(0)] * len(edges)
     codes = graph.table_of_edge.values[edges]
     for code, table in enumerate(graph.tables.values()):
         of_table = np.flatnonzero(codes == code)
@@ -134,29 +154,18 @@ def residuals_of(graph: Graph, x: Array, edges: Index) -> Iterator[tuple[Index, 
             some = of_table[first : first + CHUNK]
             rows = graph.row_of_edge.values[edges[some]]
             residual, _ = _evaluate(graph, x, table, rows)
-            yield some, residual, table.sqrt_information.values[rows]
+            chi2[some], numbers[some] = squares(table.sqrt_information.values, rows, residual), residual.shape[1]
+            for k, of_one in zip(some.tolist(), residual, strict=True):
+                out[k] = of_one
+        if len(of_table):
+            table.pointers[records.LINEARIZE] = native_address(table.type.linearize)
+    return np.concatenate((np.empty(0), *out)), chi2, numbers
 
 
 def chi2_of(graph: Graph, x: Array, edges: Index) -> tuple[Array, Index]:
     """Squared whitened residual of each edge at the stored values x, without loss and weight, and its numbers."""
-    chi2, numbers = np.empty(len(edges)), np.empty(len(edges), dtype=np.int64)
-    for some, residual, root in residuals_of(graph, x, edges):
-        chi2[some], numbers[some] = _squares(root, residual), residual.shape[1]
+    _, chi2, numbers = evaluated(graph, x, edges)
     return chi2, numbers
-
-
-@kernel
-def _squares(root: Array, residual: Array) -> Array:
-    """Return the squared whitened residual of each edge."""
-    n, m = residual.shape
-    out = np.zeros(n)
-    for e in range(n):
-        for a in range(m):
-            white = 0.0
-            for b in range(m):
-                white += root[e, a, b] * residual[e, b]
-            out[e] += white * white
-    return out
 
 
 def information(graph: Graph, x: Array, rows: Mapping[EdgeTable, Index], free: Index, losses: Losses) -> Array:

@@ -1,26 +1,40 @@
 """Losses in stages: an edge that has just arrived is held to the first of its loss, one update later to the last."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-from graph_slam_ros.graph import Graph
+from graph_slam_ros.graph import Graph, records
 from graph_slam_ros.graph.losses import weight_and_cost
+from graph_slam_ros.graph.records import table_at
+from graph_slam_ros.lie.addresses import integers, reals
 from graph_slam_ros.lie.jit import kernel
 from graph_slam_ros.solver.batch import Settings
-from graph_slam_ros.solver.linearization import Losses, chi2_of, rows_of
+from graph_slam_ros.solver.linearization import Losses, chi2_of
 from graph_slam_ros.solver.pending import NONE
 from graph_slam_ros.typing import Array, Index
 
 
 @kernel
-def _differ(kind: Index, scale: Array, other_kind: Index, other_scale: Array, square: Array) -> NDArray[np.bool_]:
-    """Return whether two losses give squared residuals (n,) different weights."""
-    out = np.zeros(len(square), dtype=np.bool_)
-    for k in range(len(square)):
-        one, _ = weight_and_cost(kind[k], scale[k], square[k])
-        other, _ = weight_and_cost(other_kind[k], other_scale[k], square[k])
-        out[k] = one != other
-    return out
+def _differing(graph: Index, edges: Index, chi2: Array, losses: Index, others: Index) -> Index:
+    """Return those of some edges that have different weights by two sets of losses (``Losses.pointers``)."""
+    room = graph[records.EDGE_ROOM]
+    table_of, row_of = integers(graph[records.TABLE_OF_EDGE], room), integers(graph[records.ROW_OF_EDGE], room)
+    kind, scale = integers(losses[0], losses[2]), reals(losses[1], losses[2])
+    other_kind, other_scale = integers(others[0], others[2]), reals(others[1], others[2])
+    out, count = np.empty(len(edges), np.int64), 0
+    for k in range(len(edges)):
+        table, row = table_at(graph, table_of[edges[k]]), row_of[edges[k]]
+        label = integers(table[records.LABEL], table[records.ROOM])[row]
+        source = integers(table[records.SOURCE], table[records.ROOM])[row]
+        square = chi2[k] * reals(table[records.WEIGHT], table[records.ROOM])[row]
+        of, of_other = label * max(losses[3], 1), label * max(others[3], 1)
+        of += source if losses[3] else 0
+        of_other += source if others[3] else 0
+        one, _ = weight_and_cost(kind[of], scale[of], square)
+        other, _ = weight_and_cost(other_kind[of_other], other_scale[of_other], square)
+        if one != other:
+            out[count] = edges[k]
+            count += 1
+    return out[:count].copy()
 
 
 class LossStages:
@@ -56,12 +70,4 @@ class LossStages:
             return
         first, *_, last = self.losses(settings)
         chi2, _ = chi2_of(self._graph, values, self.young)
-        square, code = np.empty(self._graph.edge_count), np.zeros(self._graph.edge_count, dtype=np.int64)
-        square[self.young] = chi2
-        for table, rows in rows_of(self._graph, self.young).items():
-            ids = table.id.values[rows]
-            square[ids] *= table.weight.values[rows]
-            code[ids] = last.codes(table, rows)
-        of = code[self.young]
-        losses = first.kind[of], first.scale[of], last.kind[of], last.scale[of]
-        self.young = self.young[_differ(*losses, square[self.young])]
+        self.young = _differing(self._graph.pointers, self.young, chi2, first.pointers, last.pointers)

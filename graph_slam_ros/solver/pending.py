@@ -47,6 +47,7 @@ class PendingChanges:
         """Append vertices that lost an edge or a neighbour."""
         self.touched = np.concatenate((self.touched, vertices))
 
-    def forget(self, vertex: int) -> None:
-        """Drop a vertex that was removed before an update integrated it."""
-        self.vertices = self.vertices[self.vertices != vertex]
+    def forget(self, vertices: Index) -> None:
+        """Drop vertices that were removed before an update integrated them."""
+        if len(self.vertices):
+            self.vertices = self.vertices[~np.isin(self.vertices, vertices)]

@@ -8,10 +8,12 @@ from numpy.typing import ArrayLike
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import SE2, SE3, Graph
 from graph_slam_ros.graph.graph import whole_numbers
+from graph_slam_ros.graph.records import weights_of
 from graph_slam_ros.graph.tables import EdgeTable
 from graph_slam_ros.solver.batch import Settings
 from graph_slam_ros.solver.clique_tree import incremental
 from graph_slam_ros.solver.clique_tree.numeric import accept_steps
+from graph_slam_ros.solver.clique_tree.ordering import ends_of
 from graph_slam_ros.solver.clique_tree.pointers import pointers_of
 from graph_slam_ros.solver.clique_tree.pools import compact
 from graph_slam_ros.solver.clique_tree.storage import (
@@ -41,7 +43,7 @@ from graph_slam_ros.solver.entry import (
     record,
 )
 from graph_slam_ros.solver.gauge import check_gauge, fix_the_whole
-from graph_slam_ros.solver.linearization import chi2_of, residuals_of, rows_of
+from graph_slam_ros.solver.linearization import chi2_of, evaluated, rows_of
 from graph_slam_ros.solver.pending import NONE, PendingChanges
 from graph_slam_ros.solver.transaction import Transaction
 from graph_slam_ros.typing import Array, Index
@@ -120,6 +122,17 @@ class Problem:
             self._pending.may_float = True
             incremental.deactivate(self._tree, one)
 
+    def leave_out(self, edges: ArrayLike) -> None:
+        """Set the weight of edges to 0, as ``set_weight`` does one by one."""
+        self._grow()
+        ids = existing(edges, self.graph.edge_count, "edge")
+        self.graph.set_weights(ids, 0.0)
+        active = ids[self._edge_inside[ids] & (self._tree.edge[ids, ACTIVE] == 1)]
+        if len(active):
+            self._pending.touch(ends_of(self._tree, active))
+            self._pending.may_float = True
+            incremental.deactivate(self._tree, active)
+
     def hold(self, vertex: int) -> None:
         """Keep a vertex at its present estimate."""
         self._grow()
@@ -140,19 +153,19 @@ class Problem:
         """Return whether a vertex stays at its value."""
         return vertex < len(self._held) and bool(self._held[vertex])
 
-    def remove(self, vertex: int) -> None:
-        """Remove a vertex from the problem; all its edges must have weight 0 before."""
+    def remove(self, vertices: ArrayLike) -> None:
+        """Remove vertices from the problem; all their edges must have weight 0 before."""
         self._grow()
-        one = existing([vertex], self._vertices, "vertex")
-        if not self._inside[vertex]:
-            raise GraphSlamError(f"vertex {vertex} is not in the problem")
-        for edge in self.edges_on(vertex).tolist():
-            table, row = self.graph.row(edge)
-            if table.weight.values[row]:
-                raise GraphSlamError(f"vertex {vertex} is needed by edge {edge}")
-        self._inside[vertex] = self._held[vertex] = False
-        self._pending.forget(vertex)
-        self._fix_at_estimate(one)
+        ids = existing(vertices, self._vertices, "vertex")
+        if not self._inside[ids].all():
+            raise GraphSlamError(f"vertex {int(ids[~self._inside[ids]][0])} is not in the problem")
+        for vertex in ids.tolist():
+            needed = self._weighted(incremental.edges_of(self._tree.vertex, self._tree.link, vertex))
+            if len(needed):
+                raise GraphSlamError(f"vertex {vertex} is needed by edge {int(needed[0])}")
+        self._inside[ids] = self._held[ids] = False
+        self._pending.forget(ids)
+        self._fix_at_estimate(ids)
 
     def edges_on(self, vertex: int) -> Index:
         """Ids of the edges of the problem on one vertex, also those of weight 0."""
@@ -207,11 +220,7 @@ class Problem:
         """Residuals of edges at the estimate, not whitened, in the units of their types, end to end."""
         self._grow()
         ids = whole_numbers(edges, "edge").ravel()
-        out: list[list[float]] = [[]] * len(ids)
-        for some, residual, _ in residuals_of(self.graph, self._estimates(), ids):
-            for k, of_one in zip(some.tolist(), residual.tolist(), strict=True):
-                out[k] = of_one
-        return np.array([x for of_one in out for x in of_one])
+        return evaluated(self.graph, self._estimates(), ids)[0]
 
     def compact(self) -> None:
         """Move the fronts in use together in memory; memory is not returned to the system.
@@ -305,11 +314,7 @@ class Problem:
 
     def _weighted(self, edges: Index) -> Index:
         """The edges among these that have a weight."""
-        codes, rows = self.graph.table_of_edge.values[edges], self.graph.row_of_edge.values[edges]
-        has_weight = np.ones(len(edges), dtype=bool)
-        for code, table in enumerate(self.graph.tables.values()):
-            of_table = codes == code
-            has_weight[of_table] = table.weight.values[rows[of_table]] != 0.0
+        has_weight = weights_of(self.graph.pointers, edges) != 0.0
         return edges if np.count_nonzero(has_weight) == len(edges) else edges[has_weight]
 
     def _arriving(self, *, surely: bool = False) -> tuple[Index, Index]:
@@ -353,12 +358,13 @@ class Problem:
     def _after_error(self) -> None:
         """Undo what a solution keeps besides."""
 
-    def _fix_at_estimate(self, one: Index) -> None:
-        """Remove a vertex from the unknowns; it stays at its estimate."""
+    def _fix_at_estimate(self, vertices: Index) -> None:
+        """Remove vertices from the unknowns; they stay at their estimates."""
         self._estimates()
-        accept_steps(self._tree, one)
-        if self._tree.vertex[one[0], FREE]:
-            self._pending.touch(incremental.leave(self._tree, one, NONE))
+        accept_steps(self._tree, vertices)
+        free = vertices[self._tree.vertex[vertices, FREE] == 1]
+        if len(free):
+            self._pending.touch(incremental.leave(self._tree, free, NONE))
 
     def _set_estimate(self, values: Array) -> None:
         for array in (self._tree.value, self._tree.estimate, self._kept):

@@ -106,7 +106,7 @@ class Solver(Problem):
         self._grow()
         if self._solved_with == settings and not self._pending:
             return self.evaluate(settings)
-        arriving = self._arriving(surely=True)
+        arriving = self._arriving(surely=bool(self._pending))
         self._estimates()
         with self._transaction(*arriving):
             self._tree.state[SUBSTITUTED] += 1  # from here on, steps are those of the batch

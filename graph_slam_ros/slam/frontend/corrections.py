@@ -38,6 +38,7 @@ class Corrections:
         self.found: dict[Key, float] = {}
         self._of: dict[Key, float] | None = None  # what was found when these two were computed
         self._factors, self._lag_ns = (1.0, 1.0, 0.0), 0
+        self._of_sensor: dict[str, tuple[list[float], Numbers, float, float]] = {}  # by input, with what was found
 
     def configured(self, key: Key) -> float:
         """Return the configured value of a parameter that calibration corrects."""
@@ -148,6 +149,7 @@ class Corrections:
         """Compute anew what each message needs, where something else was found since."""
         if self.found != self._of:
             self._of = dict(self.found)
+            self._of_sensor.clear()
             distance, turn, bias = (self._of_odometry(name) for name in _ODOMETRY)
             self._factors, self._lag_ns = (distance, turn, bias), self._lag()
 
@@ -177,15 +179,21 @@ class Corrections:
         """Return an observation with its corrections."""
         if not isinstance(m, Sightings):
             return m
-        mount = [self.total((m.topic, axis)) for axis in AXES]
-        scale = self.total((m.topic, "range_factor"))
-        offset = self.total((m.topic, "range_offset"))
+        mount, turned, scale, offset = self._sensor(m.topic)
         stamp_ns = self.stamp_ns(m)
         if stamp_ns == m.stamp_ns and not any(mount) and (scale, offset) == (1.0, 0.0):
             return m
-        turned = self._turn(mount)
         sightings = tuple(self._sighting(s, mount, turned, scale, offset) for s in m.sightings)
         return replace(m, stamp_ns=stamp_ns, sightings=sightings)
+
+    def _sensor(self, source: str) -> tuple[list[float], Numbers, float, float]:
+        """Return the correction of a sensor's mount and its turn, and the factor and offset of its ranges."""
+        self._refresh()
+        if source not in self._of_sensor:
+            mount = [self.total((source, axis)) for axis in AXES]
+            ranges = self.total((source, "range_factor")), self.total((source, "range_offset"))
+            self._of_sensor[source] = mount, self._turn(mount), *ranges
+        return self._of_sensor[source]
 
     def _turn(self, mount: list[float]) -> Numbers:
         if self._space.dimensions == 2:

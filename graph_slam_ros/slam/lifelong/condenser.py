@@ -345,10 +345,8 @@ class Condenser:
             for (vertex, base), begin, pose in zip(gone.items(), seen_from, poses, strict=True)
         ]
         self.solver.add([], added)
-        for edge in edges:
-            self.solver.set_weight(edge, 0.0)
-        for vertex in gone:
-            self.solver.remove(vertex)
+        self.solver.leave_out(list(edges))
+        self.solver.remove(list(gone))
         return tuple(out)
 
 
