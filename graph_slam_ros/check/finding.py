@@ -145,7 +145,10 @@ KINDS: dict[str, Kind] = {
         "most ids are seen less than three times: are they numbers of tracks, not of landmarks?",
         "let the detector give each landmark its own id; without ids set landmarks.association=joint",
     ),
-    "no_closure": Kind("no landmark is seen again later in the drive", "record a drive with a loop"),
+    "no_closure": Kind(
+        "no landmark is seen again later in the drive, or none over more than a tenth of it",
+        "record a drive with a loop; where there was one, ids change: let the detector give each landmark its own",
+    ),
     "no_parallax": Kind(
         "landmarks are not seen again after the robot has moved, so neither mount nor clock can be checked",
         "record a drive past landmarks, with turns in sight of them",

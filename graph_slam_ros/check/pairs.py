@@ -23,6 +23,7 @@ _UNRELATED, _UNRELATED_NOISES, _UNRELATED_PAIRS = 0.6, 4.0, 100
 _TWICE, _FEW = 0.002, 30
 _ONCE, _SELDOM = 0.5, 3
 _AGAIN_S, _AGAIN_M, _SPAN = 10.0, 3.0, 0.25
+_LOOP = 0.1  # of the way: landmarks that come back within less close no loop of the drive
 _SILENT, _TYPICAL_M = 0.5, 0.05
 _QUARTER = 0.5**0.5
 _CORRECTED = "_corrected"
@@ -285,23 +286,22 @@ def _coverage(s: SightingColumns, path_ns: Index, path: Array) -> Iterator[Findi
         yield Finding("seen_once", "warning", seldom, _ONCE, "part", text, **where)
     driven = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path[:, :3], axis=0), axis=1))])
     seconds = (path_ns - path_ns[0]) * 1e-9
-    reach_m = _reach(s, chosen, path_ns[0], seconds, driven)
-    if reach_m < _SPAN * driven[-1] and driven[-1] > _AGAIN_M:
-        text = (
-            f"{s.topic}: no landmark is seen again later; each is seen over at most {reach_m:.1f} of {driven[-1]:.0f} m"
-        )
-        yield Finding("no_closure", "warning", reach_m, _SPAN * float(driven[-1]), "m", text, **where)
+    reach_m, comes_back = _reach(s, chosen, path_ns[0], seconds, driven)
+    least_m = float((_LOOP if comes_back else _SPAN) * driven[-1])
+    if reach_m < least_m and driven[-1] > _AGAIN_M:
+        again = "nothing joins its parts that are farther apart" if comes_back else "no landmark is seen again later"
+        text = f"{s.topic}: each landmark is seen over at most {reach_m:.1f} of {driven[-1]:.0f} m: {again}"
+        yield Finding("no_closure", "warning", reach_m, least_m, "m", text, **where)
 
 
-def _reach(s: SightingColumns, chosen: Index, first_ns: int, seconds: Array, driven: Array) -> float:
-    """The longest way over which one landmark is seen, infinite where one is seen again after a pause."""
+def _reach(s: SightingColumns, chosen: Index, first_ns: int, seconds: Array, driven: Array) -> tuple[float, bool]:
+    """Return the longest way over which one landmark is seen, and whether one is seen again after a pause."""
     t = (s.stamp_ns[chosen] - first_ns) * 1e-9
     at_m = np.interp(t, seconds, driven)
     order = np.lexsort((t, s.name[chosen]))
     name, t, at_m = s.name[chosen][order], t[order], at_m[order]
     same = name[1:] == name[:-1]
-    if (same & (np.diff(t) > _AGAIN_S) & (np.diff(at_m) > _AGAIN_M)).any():
-        return float(np.inf)
+    comes_back = (same & (np.diff(t) > _AGAIN_S) & (np.diff(at_m) > _AGAIN_M)).any()
     begins = np.concatenate([[True], ~same])
     ends = np.concatenate([~same, [True]])
-    return float((at_m[ends] - at_m[begins]).max())
+    return float((at_m[ends] - at_m[begins]).max()), bool(comes_back)

@@ -16,7 +16,7 @@ from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.lie import se3
 from graph_slam_ros.measurements.types import Control, Measurement, Odometry
 from graph_slam_ros.slam import Config, GraphSlam
-from graph_slam_ros.slam.calibration.decision import MOST_LOST
+from graph_slam_ros.slam.calibration.decision import MOST_LOST, PRIOR_SIGMAS, absurd_range, absurd_text
 from graph_slam_ros.slam.calibration.decision import Finding as Fitted
 from graph_slam_ros.slam.calibration.fit import TrialFit
 from graph_slam_ros.slam.calibration.parameters import Parameter
@@ -123,17 +123,15 @@ def check_trial(c: Columns, slam: GraphSlam) -> Iterator[Finding]:
         yield _absurd(c, 1.0 + scale.value)
         return
     clocks = [one for one in fitted if one.parameter.name == "clock" and one.verdict == "admitted"]
-    late_s = {} if fit.lost > MOST_LOST else {one.parameter.source: one.value for one in clocks}
+    is_void = fit.lost > MOST_LOST or absurd_range(fit) is not None
+    late_s = {} if is_void else {one.parameter.source: one.value for one in clocks}
     found = [] if _goes_back(c) else _places(c, slam, path_ns, path, late_s)
     off = {one.parameter: one.value for one in fitted if one.parameter.name in _LIMITS and _is_far_off(fit, one)}
     if found and any(one.name in _OF_MOUNT for one in off):
         found = list(_places_of_fit(c, slam, fit, off, path_ns, path))
-    if fit.lost > MOST_LOST:
+    if is_void:
         found += [one for s in c.sightings for one in noisier(s, pairs_of(s, path_ns, path, c.config.world.dimensions))]
-        if not found:
-            text = f"{fit.lost:.0%} of the sightings do not fit: clock, mount and scale cannot be checked"
-            yield Finding("fit_unsure", "warning", fit.lost, MOST_LOST, "part", text)
-        yield from found
+        yield from found or [_void(fit)]
         return
     yield from (found_one for one in fitted for found_one in _fitted(c, slam, one, off))
     yield from _clock_jumps(c, fit)
@@ -148,6 +146,16 @@ def check_trial(c: Columns, slam: GraphSlam) -> Iterator[Finding]:
         factor = float(np.sqrt(noise.per_dof))
         if factor > limit and noise.dof > _LEAST_DOF and not noise.reason:
             yield _over_confident(c, noise, factor, limit)
+
+
+def _void(fit: TrialFit) -> Finding:
+    """A fit of which nothing is believed."""
+    k, unchecked = absurd_range(fit), "clock, mount and scale cannot be checked"
+    if fit.lost > MOST_LOST or k is None:
+        text = f"{fit.lost:.0%} of the sightings do not fit: {unchecked}"
+        return Finding("fit_unsure", "warning", fit.lost, MOST_LOST, "part", text)
+    text = f"{absurd_text(fit, k)}: many ranges are wrong, or it is so and to be configured; {unchecked}"
+    return Finding("fit_unsure", "warning", abs(float(fit.values[k])) / fit.priors[k], PRIOR_SIGMAS, "sigmas", text)
 
 
 def _goes_back(c: Columns) -> bool:

@@ -22,6 +22,8 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+
 from graph_slam_ros.slam.calibration.fit import TrialFit
 from graph_slam_ros.slam.calibration.parameters import OF_ODOMETRY, Parameter
 
@@ -130,10 +132,30 @@ def _void(found: TrialFit, landmarks: int, sigma_per_m: float) -> str:
         return f"{landmarks} landmark{' was' if landmarks == 1 else 's were'} seen, {LEAST_LANDMARKS} are needed"
     if found.lost > MOST_LOST:
         return f"{found.lost:.0%} of the sightings do not fit, more than {MOST_LOST:.0%}: check their ids and noise"
+    if (k := absurd_range(found)) is not None:
+        return f"{absurd_text(found, k)}: check ids and noise, or configure it"
     if sigma_per_m < LEAST_SIGMA_PER_M:
         stated = f"odometry states {sigma_per_m:.1g} m of noise for each metre"
         return f"{stated}, no wheels are so good: set odometry.noise=motion"
     return ""
+
+
+def absurd_range(found: TrialFit) -> int | None:
+    """Return a parameter of ranges, by its place, that is far beyond its prior; None where none is.
+
+    Of ranges alone, many of which are wrong, the likeliest map may be shrunk to next to nothing. All else follows it.
+    """
+    of_ranges = np.array([one.name.startswith("range") for one in found.parameters], dtype=bool)
+    priors = np.maximum(found.priors, [one.quantity.prior for one in found.parameters])
+    far = of_ranges * np.abs(found.values) / priors
+    return int(far.argmax()) if len(far) and far.max() > PRIOR_SIGMAS else None
+
+
+def absurd_text(found: TrialFit, k: int) -> str:
+    """Say how far off a parameter would be."""
+    one, value = found.parameters[k], float(found.values[k])
+    most = PRIOR_SIGMAS * max(float(found.priors[k]), one.quantity.prior)
+    return f"{one} would be off by {amount(one, value, 3)}, more than {amount(one, most)}"
 
 
 def _finding(found: TrialFit, k: int, void: str, remedy: str, slides: str, is_corrected: bool) -> Finding:
