@@ -26,7 +26,8 @@ from graph_slam_ros.analysis.path_error import interpolated
 from graph_slam_ros.analysis.trajectories import read_truth
 from graph_slam_ros.lie import se3
 from graph_slam_ros.recordings.bag import open_bag
-from graph_slam_ros.runs.replay import choose_inputs, measurements
+from graph_slam_ros.runs.chosen_inputs import choose_inputs
+from graph_slam_ros.runs.replay import measurements
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam
 
 WRONG = {

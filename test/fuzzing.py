@@ -30,7 +30,8 @@ from graph_slam_ros.formats.g2o import read_g2o
 from graph_slam_ros.formats.parameters import read_parameters
 from graph_slam_ros.optimization import started
 from graph_slam_ros.recordings.bag import open_bag
-from graph_slam_ros.runs.replay import choose_inputs, measurements
+from graph_slam_ros.runs.chosen_inputs import choose_inputs
+from graph_slam_ros.runs.replay import measurements
 from graph_slam_ros.slam import Config, Counters
 
 ROOT = Path(__file__).resolve().parents[1]

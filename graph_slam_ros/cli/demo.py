@@ -11,8 +11,9 @@ from graph_slam_ros.analysis.evaluation import evaluate
 from graph_slam_ros.analysis.plots import draw_run
 from graph_slam_ros.formats.files import read_text
 from graph_slam_ros.recordings.bag import open_bag
+from graph_slam_ros.runs.chosen_inputs import choose_inputs
 from graph_slam_ros.runs.folder import SUMMARY, check_room
-from graph_slam_ros.runs.replay import choose_inputs, replay
+from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.simulation import simulate, write_bag
 from graph_slam_ros.slam import Config
 from graph_slam_ros.warmup import compile_all

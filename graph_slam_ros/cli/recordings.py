@@ -3,6 +3,7 @@
 import argparse
 import importlib.util
 import json
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,9 +20,10 @@ def replay(args: argparse.Namespace) -> int:
     """Run a recording, or an earlier run, through the pipeline, or play it into a live ROS graph."""
     from graph_slam_ros.runs.folder import is_run
     from graph_slam_ros.runs.replay import replay as replayed
+    from graph_slam_ros.slam import Config
 
     _refuse_idle_options(args, is_run(args.bag))
-    config = config_of(args)
+    config = _with_landmarks(args, config_of(args))
     if args.ros:
         return _replay_live(args, config)
     if args.out is None:
@@ -32,6 +34,8 @@ def replay(args: argparse.Namespace) -> int:
     done = replayed(args.bag, args.out, own, **topics, force=args.force, **shown)
     code = max([_print_earlier(run.folder, run.summary) for run in done.earlier], default=console.DONE)
     code = max(code, _print_summary(args.bag, done.summary))
+    if done.topics and config.inputs.names == Config().inputs.names:
+        _print_unused(args.bag, done.topics)
     console.show(f"results in {args.out}")
     _draw(args.out)
     code = console.report_losses(done.losses, done.warnings) or code
@@ -39,10 +43,25 @@ def replay(args: argparse.Namespace) -> int:
     return code
 
 
+def _with_landmarks(args: argparse.Namespace, config: "Config") -> "Config":
+    """The configuration, with inputs that ``info`` suggests where the recording has no usual topic of landmarks."""
+    from graph_slam_ros.runs.folder import is_run
+    from graph_slam_ros.runs.other_inputs import suggestion_without_landmarks
+
+    if args.config or args.landmarks or args.map or (args.ros and args.out is None) or is_run(args.bag):
+        return config
+    found = suggestion_without_landmarks(args.bag, config, args.odom)
+    if found is None:
+        return config
+    args.odom, args.landmarks = args.odom or found.topics.get("odom"), found.topics.get("detections")
+    console.warn(f"there are no landmarks of the usual type, so this is: {found.command()}", most=console.SENTENCE)
+    return config_of(args, found.settings)
+
+
 def _replay_live(args: argparse.Namespace, config: "Config") -> int:
     from graph_slam_ros.formats.files import read_text
     from graph_slam_ros.recordings.bag import open_bag
-    from graph_slam_ros.runs.replay import choose_inputs
+    from graph_slam_ros.runs.chosen_inputs import choose_inputs
 
     if not console.has_ros():
         raise GraphSlamError("--ros needs ROS 2 (no rclpy here); without --ros the same replay runs without it")
@@ -215,8 +234,8 @@ def _refuse_idle_options(args: argparse.Namespace, of_run: bool) -> None:
             raise GraphSlamError(f"replay: no use for {what}")
 
 
-def config_of(args: argparse.Namespace) -> "Config":
-    """The configuration: defaults, then the run's own or the given file, then single settings."""
+def config_of(args: argparse.Namespace, suggested: Mapping[str, Any] | None = None) -> "Config":
+    """The configuration: defaults, then what is suggested, the run's own or the given file, then single settings."""
     from graph_slam_ros.config.config import flatten
     from graph_slam_ros.formats.parameters import parse_setting, read_parameters
     from graph_slam_ros.runs.folder import is_run
@@ -229,7 +248,7 @@ def config_of(args: argparse.Namespace) -> "Config":
     values = dict(flatten(read_parameters(file, follow=file == args.config))) if file else {}
     try:
         asked = dict(parse_setting(text) for text in args.set)
-        config = Config.from_mapping(values | asked)
+        config = Config.from_mapping(dict(suggested or {}) | values | asked)
     except GraphSlamError as error:
         raise GraphSlamError(f"{file}: {error}" if file and not args.set else str(error)) from None
     if asked.get("calibrate.groups") == "association" and not config.uses_found_factors:
@@ -250,6 +269,16 @@ def _print_summary(source: Path, summary: dict[str, Any]) -> int:
         why = f": {summary['losses'][0]}" if summary.get("losses") else ", see what was counted; graph_slam check BAG"
         raise GraphSlamError(f"{source}: no odometry of it could be used{why}")
     return code
+
+
+def _print_unused(source: Path, topics: Collection[str]) -> None:
+    """Name the topics of a recording that could be inputs and are none, where nobody has chosen inputs."""
+    from graph_slam_ros.runs.other_inputs import unused_topics
+
+    if unused := unused_topics(source, topics):
+        console.show(
+            f"not used   {', '.join(unused)}: {console.command('info', source)} prints the command, or says why"
+        )
 
 
 def _print_earlier(folder: Path, summary: dict[str, Any]) -> int:

@@ -17,7 +17,8 @@ from graph_slam_ros.messages.inputs import recorded_uses
 from graph_slam_ros.messages.survey import with_survey
 from graph_slam_ros.recordings.bag import Bag, open_bag
 from graph_slam_ros.recordings.contents import recording_of
-from graph_slam_ros.runs.replay import END, Inputs, RecordedRuns, choose_inputs
+from graph_slam_ros.runs.chosen_inputs import Inputs, choose_inputs
+from graph_slam_ros.runs.replay import END, RecordedRuns
 from graph_slam_ros.runs.suggestion import Suggestion
 from graph_slam_ros.runs.tables import account
 from graph_slam_ros.slam import Config, Counters, GraphSlam

@@ -18,7 +18,8 @@ from graph_slam_ros.messages.inputs import known_types
 from graph_slam_ros.messages.inputs.landmark_types import LANDMARK_TYPES
 from graph_slam_ros.recordings.bag import Bag, open_bag
 from graph_slam_ros.recordings.contents import Recording, TopicContents, recording_of
-from graph_slam_ros.runs.replay import RecordedRuns, choose_inputs
+from graph_slam_ros.runs.chosen_inputs import choose_inputs
+from graph_slam_ros.runs.replay import RecordedRuns
 from graph_slam_ros.runs.suggestion import CLOUD, DETECTIONS, ODOMETRY, Suggestion
 from graph_slam_ros.slam import Config, Control, Counters
 from graph_slam_ros.warmup import warmup

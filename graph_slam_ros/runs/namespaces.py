@@ -1,6 +1,18 @@
-"""Topics of several robots in one recording, told apart by their namespaces."""
+"""Names of topics tell which robot of a recording they are of, and which are the truth."""
 
+import re
 from collections.abc import Sequence
+
+WORD = r"(^|[/_])({})([/_\d]|$)"
+_TRUTH = re.compile(
+    WORD.format(r"ground_?truth|groundtruth|truth|true|gt|reference|vicon|vrpn\w*|mocap|optitrack|qualisys|p3d|leica"),
+    re.IGNORECASE,
+)
+
+
+def is_truth(topic: str) -> bool:
+    """Return whether a topic has the truth, by its name: no sensor of the robot measured it."""
+    return _TRUTH.search(topic) is not None
 
 
 def landmarks_of_other_robots(odometry: str, odometries: Sequence[str], landmarks: Sequence[str]) -> dict[str, str]:

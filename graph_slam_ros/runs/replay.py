@@ -1,7 +1,7 @@
 """Replay: a recording, or the ingest sequence of an earlier run, through ``GraphSlam`` as fast as the CPU allows."""
 
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain, groupby, islice
 from operator import attrgetter, itemgetter
@@ -10,14 +10,13 @@ from typing import Any
 
 from graph_slam_ros.check.checks import first_of_replay, worst_of_replay
 from graph_slam_ros.check.columns import Collector
-from graph_slam_ros.config.inputs import InputConfig, default_input
 from graph_slam_ros.measurements.reasons import warnings as mendable
 from graph_slam_ros.measurements.types import Measured, Odometry
-from graph_slam_ros.messages.from_msg import TF, TF_STATIC, TRANSFORMS, MessageConverter
-from graph_slam_ros.messages.inputs import check_topics, uses
+from graph_slam_ros.messages.from_msg import TF_STATIC, MessageConverter
 from graph_slam_ros.messages.survey import with_survey
-from graph_slam_ros.recordings.bag import Bag, BagError, BagMessage, open_bag
+from graph_slam_ros.recordings.bag import Bag, BagMessage, open_bag
 from graph_slam_ros.recordings.definitions import recorded_decoder
+from graph_slam_ros.runs.chosen_inputs import Inputs, choose_inputs
 from graph_slam_ros.runs.folder import RunError, check_room, is_run, keep_earlier, missing, recording_of, run_config
 from graph_slam_ros.runs.journal import read_measurements
 from graph_slam_ros.runs.map_journal import read_map
@@ -27,10 +26,6 @@ from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Measuremen
 from graph_slam_ros.slam.frontend.ingest_gate import IngestGate
 from graph_slam_ros.warmup import warmup
 
-TF_STATIC_TOPIC, TF_TOPIC = "/tf_static", "/tf"
-_OPTIONS = {"odometry": "--odom", "landmarks": "--landmarks"}
-_OPTIONAL = default_input("detections")  # a recording need not have what nobody asked for
-
 _FEWEST, _MOST_TOGETHER = 4, 100  # messages that are converted together
 _READ_AHEAD = 20_000  # messages that are checked before anything is processed: minutes, and some megabytes
 
@@ -38,21 +33,6 @@ END = Control("end"), Control("optimize")
 """The events at the end of a recording: held measurements are processed, and everything is solved."""
 
 Progress = Callable[[Iterable[Any], int], Iterable[Any]]
-
-
-@dataclass(frozen=True, slots=True)
-class Inputs:
-    """The topics of a recording that are used, by name of the input, with ``tf_static`` and ``tf``."""
-
-    topics: Mapping[str, str]
-
-    def by_topic(self) -> dict[str, list[str]]:
-        """Names of the inputs of each topic that is read in order of recording; ``tf`` is the first of its own."""
-        out: dict[str, list[str]] = {}
-        for name in sorted(self.topics, key=lambda name: name != TF):
-            if name != TF_STATIC:
-                out.setdefault(self.topics[name], []).append(name)
-        return out
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +50,7 @@ class Replayed:
     Attributes
     ----------
     earlier : the runs before the last, which were ended by ``time.on_jump: reset``
+    topics : of the recording that were read
     """
 
     slam: GraphSlam
@@ -77,64 +58,7 @@ class Replayed:
     losses: list[str]
     warnings: list[str]
     earlier: tuple[EarlierRun, ...] = ()
-
-
-def choose_inputs(bag: Bag, config: Config, odometry: str | None = None, landmarks: str | None = None) -> Inputs:
-    """The topic of each input: the named one, else the configured one, else the only one of its type.
-
-    Parameters
-    ----------
-    odometry, landmarks : topics of the first input that is used so, whatever is configured
-
-    Raises
-    ------
-    BagError
-        A named topic does not exist or has another type, or there is none; the topics that exist are listed.
-    """
-    named = {"odometry": odometry, "landmarks": landmarks}
-    by_name = {settings.name: settings for settings in config.sources}
-    topics = {}
-    for name, use in uses(config).items():
-        option, topic = _OPTIONS.get(use) if use in named else None, named.pop(use, None)
-        found = _choose(bag, by_name[name], topic, option or f"--set {name}.topic=")
-        if found:
-            topics[name] = found
-    check_topics(config, uses(config), topics)
-    if named.get("landmarks"):
-        raise BagError(f"no input is used as landmarks: {landmarks} cannot be one")
-    if TF_STATIC_TOPIC in bag.topics:
-        topics[TF_STATIC] = TF_STATIC_TOPIC
-    if config.inputs.tf and TF_TOPIC in bag.topics and bag.topics[TF_TOPIC].type == TRANSFORMS:
-        topics[TF] = TF_TOPIC
-    return Inputs(topics)
-
-
-def _choose(bag: Bag, settings: InputConfig, named: str | None, option: str) -> str:
-    fitting = ", ".join(t.name for t in bag.topics.values() if t.type == settings.type)
-    others = ", ".join(f"{t.name} ({t.type or 'no type'})" for t in bag.topics.values())
-    there = f"of {settings.type} there is {fitting}" if fitting else f"there are {others}"
-    usual = f"/{settings.topic.lstrip('/')}"
-    if named is None and settings.topic != default_input(settings.name).topic:
-        named = usual
-    if named is not None:
-        topic = bag.topics.get(named)
-        if topic is None:
-            raise BagError(f"no topic {named} in the recording; {there}")
-        if not topic.type:
-            raise BagError(f"topic {named} has no type: the recording lacks its schema")
-        if topic.type != settings.type:
-            raise BagError(f"topic {named} is {topic.type}, not {settings.type}")
-        return named
-    found = [t.name for t in bag.topics.values() if t.type == settings.type and t.name != TF_STATIC_TOPIC]
-    if usual in found:
-        return usual
-    if len(found) == 1:
-        return found[0]
-    if found:
-        raise BagError(f"several topics of type {settings.type} ({', '.join(found)}): choose one with {option}")
-    if settings != _OPTIONAL:
-        raise BagError(f"no topic of type {settings.type} in the recording; {there}")
-    return ""
+    topics: tuple[str, ...] = ()
 
 
 def measurements(
@@ -356,7 +280,9 @@ def _recorded(
         options: dict[str, Any] = {"recording": name, "took": took, "more": lambda: _checked(columns, counters)}
         slam, summary = record_run(out, config, measured, bag.losses, state, border=refused, force=force, **options)
         warnings += _warnings(slam, summary)
-    return Replayed(slam, summary, summary["losses"], [*bag.warnings, *warnings], tuple(earlier))
+    return Replayed(
+        slam, summary, summary["losses"], [*bag.warnings, *warnings], tuple(earlier), tuple(inputs.by_topic())
+    )
 
 
 def _checked(columns: Collector, counters: Counters) -> dict[str, Any]:

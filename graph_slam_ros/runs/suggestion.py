@@ -14,22 +14,17 @@ from graph_slam_ros.messages.inputs.landmark_types import APRILTAGS, LANDMARK_TY
 from graph_slam_ros.messages.inputs.transforms import OPTICAL, assumed_mount
 from graph_slam_ros.recordings.bag import Bag
 from graph_slam_ros.recordings.contents import Recording, TopicContents
+from graph_slam_ros.runs.chosen_inputs import TF_TOPIC, choose_inputs
 from graph_slam_ros.runs.folder import suggested_out
-from graph_slam_ros.runs.namespaces import landmarks_of_other_robots
-from graph_slam_ros.runs.replay import TF_TOPIC, choose_inputs
+from graph_slam_ros.runs.namespaces import WORD, is_truth, landmarks_of_other_robots
 from graph_slam_ros.slam import Config
 
 ODOMETRY, DETECTIONS = "nav_msgs/msg/Odometry", "vision_msgs/msg/Detection3DArray"
 CLOUD, GNSS, IMU = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/Imu"
 POSE, POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped"
 
-_WORD = r"(^|[/_])({})([/_\d]|$)"
-_TRUTH = re.compile(
-    _WORD.format(r"ground_?truth|groundtruth|truth|true|gt|reference|vicon|vrpn\w*|mocap|optitrack|qualisys|p3d|leica"),
-    re.IGNORECASE,
-)
 _ESTIMATE = re.compile(
-    _WORD.format(
+    WORD.format(
         r"amcl\w*|\w*slam\w*|cartographer|rtabmap|locali[sz]\w*|mcl|tracked_pose|initialpose|goal\w*|pose_est\w*"
     ),
     re.IGNORECASE,
@@ -111,7 +106,7 @@ class Suggestion:
             if one.topic.type in types and one.topic.count:
                 if name in self.unused:
                     continue
-                if _TRUTH.search(name):
+                if is_truth(name):
                     self.unused[name] = "ground truth by its name: graph_slam evaluate RUN --truth compares with it"
                 elif one.trouble:
                     self.unused[name] = one.trouble
@@ -227,7 +222,7 @@ class Suggestion:
         for name, one in self._recording.topics.items():
             if _CORNERS.search(one.topic.type) and one.topic.type not in known:
                 self._corners(one)
-            elif one.topic.type == "visualization_msgs/msg/MarkerArray" and not _TRUTH.search(name):
+            elif one.topic.type == "visualization_msgs/msg/MarkerArray" and not is_truth(name):
                 self.unused[name] = "markers are mostly pictures; an input of this type and topic takes them"
 
     def _tag_number(self, one: TopicContents) -> str:

@@ -12,7 +12,8 @@ from recordings import DETECTIONS, ODOMETRY, TOPICS, read, short_drive, write_mc
 from graph_slam_ros.formats.g2o import read_g2o
 from graph_slam_ros.recordings import bag
 from graph_slam_ros.recordings.bag import BagError, BagWriter, open_bag
-from graph_slam_ros.runs.replay import choose_inputs, replay
+from graph_slam_ros.runs.chosen_inputs import choose_inputs
+from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.simulation import simulate, write_bag
 from graph_slam_ros.slam import Config
 

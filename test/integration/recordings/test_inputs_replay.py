@@ -19,8 +19,9 @@ from graph_slam_ros.messages.inputs import CONVERTERS, uses
 from graph_slam_ros.messages.interfaces import typestore
 from graph_slam_ros.messages.to_msg import header, make, vector
 from graph_slam_ros.recordings.bag import BagError, BagWriter, open_bag
+from graph_slam_ros.runs.chosen_inputs import choose_inputs
 from graph_slam_ros.runs.journal import read_ingest
-from graph_slam_ros.runs.replay import choose_inputs, replay
+from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.slam import Config, Fix, Odometry, Sightings
 
 TF = "tf2_msgs/msg/TFMessage"

@@ -7,7 +7,7 @@ from graph_slam_ros.cli import main
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.recordings.bag import open_bag
-from graph_slam_ros.runs.replay import choose_inputs
+from graph_slam_ros.runs.chosen_inputs import choose_inputs
 from graph_slam_ros.runs.replay import measurements as measured
 from graph_slam_ros.simulation import simulate, write_bag
 from graph_slam_ros.simulation.instruments import ANTENNA_M, DATUM, geodetic

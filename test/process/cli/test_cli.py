@@ -108,6 +108,36 @@ def test_the_command_that_info_prints_works_as_it_is(bag, run, tmp_path, capsys,
     assert results(tmp_path / words[-1]) == results(run)
 
 
+def test_replay_takes_the_inputs_that_info_suggests_where_no_topic_is_usual(tmp_path, capsys, monkeypatch):
+    """Landmarks in a cloud, and a truth that looks like landmarks: without that it would be odometry alone."""
+    monkeypatch.chdir(tmp_path)
+    world = ("simulate", "warehouse", "--set", "aisles=2", "--set", "laps=1", "--set", "sensor=range_bearing")
+    assert told(capsys, *world, "--out", "drive.mcap")[0] == 0
+    code, out, (said,) = told(capsys, "replay", "drive.mcap", "--out", "run")
+    assert code == 0
+    assert "not used" not in out
+    begin = "graph_slam: there are no landmarks of the usual type, so this is: "
+    assert said.startswith(begin)
+    program, *words = shlex.split(said.removeprefix(begin))
+    assert program == "graph_slam"
+    assert told(capsys, *words)[::2] == (0, [])
+    assert results(tmp_path / "drive_run") == results(tmp_path / "run")
+    code, _, err = told(capsys, "replay", "drive.mcap", "--out", "alone", "--set", "inputs.names=odom")
+    assert code == 3
+    assert "this is odometry alone" in err[0]
+
+
+def test_replay_names_what_could_be_an_input_and_is_none(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    world = ("simulate", "warehouse", "--set", "aisles=2", "--set", "laps=1", "--set", "gnss=1", "--set", "imu=10")
+    assert told(capsys, *world, "--out", "drive.mcap")[0] == 0
+    code, out, err = told(capsys, "replay", "drive.mcap", "--out", "run")
+    assert (code, err) == (0, [])
+    assert "not used   /gps/fix (sensor_msgs/msg/NavSatFix): graph_slam info drive.mcap prints the command" in out
+    _, *words = shlex.split(told(capsys, "info", "drive.mcap")[1].splitlines()[-1])
+    assert "not used" not in told(capsys, *words)[1]
+
+
 def test_simulate_replay_evaluate_end_to_end(bag, run, capsys):
     code, out, err = told(capsys, "evaluate", run, "--truth", bag, "--json")
     assert (code, err) == (0, [])

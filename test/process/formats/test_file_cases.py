@@ -49,7 +49,8 @@ from graph_slam_ros.recordings import mcap_records
 from graph_slam_ros.recordings.bag import BagError, Topic, open_bag
 from graph_slam_ros.recordings.definitions import recorded_decoder
 from graph_slam_ros.recordings.recorded_types import ros1_store
-from graph_slam_ros.runs.replay import choose_inputs, replay
+from graph_slam_ros.runs.chosen_inputs import choose_inputs
+from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.slam import Config
 
 

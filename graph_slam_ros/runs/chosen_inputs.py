@@ -1,0 +1,90 @@
+"""The topics of a recording that inputs are read from: named, configured, or the only ones of their type."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from graph_slam_ros.config.inputs import InputConfig, default_input
+from graph_slam_ros.messages.from_msg import TF, TF_STATIC, TRANSFORMS
+from graph_slam_ros.messages.inputs import check_topics, uses
+from graph_slam_ros.recordings.bag import Bag, BagError
+from graph_slam_ros.runs.namespaces import is_truth
+from graph_slam_ros.slam import Config
+
+TF_STATIC_TOPIC, TF_TOPIC = "/tf_static", "/tf"
+_OPTIONS = {"odometry": "--odom", "landmarks": "--landmarks"}
+_OPTIONAL = default_input("detections")  # a recording need not have what nobody asked for
+
+
+@dataclass(frozen=True, slots=True)
+class Inputs:
+    """The topics of a recording that are used, by name of the input, with ``tf_static`` and ``tf``."""
+
+    topics: Mapping[str, str]
+
+    def by_topic(self) -> dict[str, list[str]]:
+        """Names of the inputs of each topic that is read in order of recording; ``tf`` is the first of its own."""
+        out: dict[str, list[str]] = {}
+        for name in sorted(self.topics, key=lambda name: name != TF):
+            if name != TF_STATIC:
+                out.setdefault(self.topics[name], []).append(name)
+        return out
+
+
+def choose_inputs(bag: Bag, config: Config, odometry: str | None = None, landmarks: str | None = None) -> Inputs:
+    """The topic of each input: the named one, else the configured one, else the only one of its type.
+
+    Parameters
+    ----------
+    odometry, landmarks : topics of the first input that is used so, whatever is configured
+
+    Raises
+    ------
+    BagError
+        A named topic does not exist or has another type, or there is none; the topics that exist are listed.
+    """
+    named = {"odometry": odometry, "landmarks": landmarks}
+    by_name = {settings.name: settings for settings in config.sources}
+    topics = {}
+    for name, use in uses(config).items():
+        option, topic = _OPTIONS.get(use) if use in named else None, named.pop(use, None)
+        found = _choose(bag, by_name[name], topic, option or f"--set {name}.topic=")
+        if found:
+            topics[name] = found
+    check_topics(config, uses(config), topics)
+    if named.get("landmarks"):
+        raise BagError(f"no input is used as landmarks: {landmarks} cannot be one")
+    if TF_STATIC_TOPIC in bag.topics:
+        topics[TF_STATIC] = TF_STATIC_TOPIC
+    if config.inputs.tf and TF_TOPIC in bag.topics and bag.topics[TF_TOPIC].type == TRANSFORMS:
+        topics[TF] = TF_TOPIC
+    return Inputs(topics)
+
+
+def _choose(bag: Bag, settings: InputConfig, named: str | None, option: str) -> str:
+    fitting = ", ".join(t.name for t in bag.topics.values() if t.type == settings.type)
+    others = ", ".join(f"{t.name} ({t.type or 'no type'})" for t in bag.topics.values())
+    there = f"of {settings.type} there is {fitting}" if fitting else f"there are {others}"
+    usual = f"/{settings.topic.lstrip('/')}"
+    if named is None and settings.topic != default_input(settings.name).topic:
+        named = usual
+    if named is not None:
+        topic = bag.topics.get(named)
+        if topic is None:
+            raise BagError(f"no topic {named} in the recording; {there}")
+        if not topic.type:
+            raise BagError(f"topic {named} has no type: the recording lacks its schema")
+        if topic.type != settings.type:
+            raise BagError(f"topic {named} is {topic.type}, not {settings.type}")
+        return named
+    found = [t.name for t in bag.topics.values() if t.type == settings.type and t.name != TF_STATIC_TOPIC]
+    if usual in found:
+        return usual
+    found = [name for name in found if not is_truth(name)]
+    if len(found) == 1:
+        return found[0]
+    if found:
+        raise BagError(f"several topics of type {settings.type} ({', '.join(found)}): choose one with {option}")
+    if settings != _OPTIONAL:
+        why = f"{there}, the truth by its name: {option} takes it all the same" if fitting else there
+        raise BagError(f"no topic of type {settings.type} in the recording; {why}")
+    return ""
