@@ -232,7 +232,7 @@ class Graph:
     def has_label(self, edges: Index, labels: Sequence[str]) -> NDArray[np.bool_]:
         """Return whether each of some edges is of one of these classes, (n,)."""
         wanted = np.array([label in labels for label in self.labels], dtype=bool)
-        out: NDArray[np.bool_] = wanted[labels_of(self.pointers, edges)]
+        out: NDArray[np.bool_] = wanted[labels_of(self.pointers, np.ascontiguousarray(edges))]
         return out
 
     def edges_of(self, label: str) -> Index:

@@ -18,7 +18,12 @@ _MEASURED = (ODOMETRY, DETECTIONS, GNSS, *LANDMARK_TYPES)
 def suggestion_without_landmarks(path: Path, config: Config, odometry: str | None) -> Suggestion | None:
     """Return how to replay a recording that has no landmarks of the usual type, but others, or fixes.
 
-    None where it has, where other inputs are configured, or where there is nothing else in it.
+    None where it has, where other inputs are configured, where there is nothing else in it, or where it would be with
+    another odometry.
+
+    Parameters
+    ----------
+    odometry : its topic; None: the suggested one
 
     Raises
     ------
@@ -34,7 +39,8 @@ def suggestion_without_landmarks(path: Path, config: Config, odometry: str | Non
     except BagError:  # which the replay says
         return None
     found = Suggestion(bag, recording_of(bag), path)
-    return None if found.trouble or len(found.names) < 2 else found
+    is_other = odometry is not None and found.topics.get("odom") != odometry  # its frames are those of another
+    return None if found.trouble or len(found.names) < 2 or is_other else found
 
 
 def unused_topics(path: Path, used: Collection[str]) -> list[str]:
