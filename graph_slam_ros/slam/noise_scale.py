@@ -38,6 +38,7 @@ LEAST_DOF_OF_MOTION = 20.0  # of odometry, whose estimate changes the less the l
 MOST_OUTLIERS = 0.05
 LEAST_WEIGHT = 0.1  # by the loss: an edge with less is an outlier
 SMALLEST, LARGEST = 0.3, 3.0  # factor of a sigma
+_ROUNDING = 1e-6  # degrees of freedom, less of which are rounding: another processor has none
 _MOST_WINDOWS = 100  # the same of windows
 _MOST_SAMPLED = 200  # edges of a group whose leverage is computed: their joint covariances cost most of all
 
@@ -291,7 +292,7 @@ def _passes(ends: Index, stamp_of: Index) -> list[Index]:
 
 def _scale(key: Key, total: _Sums, factor_now: float) -> NoiseScale:
     dof = max(total.residuals - total.leverage, 0.0)
-    per_dof = total.chi2 / dof if dof > 0.0 else float("nan")
+    per_dof = total.chi2 / dof if dof > _ROUNDING else float("nan")
     design_effect = 1.0
     if total.passes >= LEAST_PASSES and total.of_singles > 0.0:
         design_effect = max(1.0, total.of_means / total.of_singles)
