@@ -230,7 +230,10 @@ class Graph:
         return deepcopy(self, {id(one): one for one in same})
 
     def has_label(self, edges: Index, labels: Sequence[str]) -> NDArray[np.bool_]:
-        """Return whether each of some edges is of one of these classes, (n,)."""
+        """Return whether each of some edges is of one of these classes, (n,); a GraphSlamError where one is missing."""
+        if len(edges):  # compiled code does not look
+            _one(int(edges.min()), self.edge_count, "edge")
+            _one(int(edges.max()), self.edge_count, "edge")
         wanted = np.array([label in labels for label in self.labels], dtype=bool)
         out: NDArray[np.bool_] = wanted[labels_of(self.pointers, np.ascontiguousarray(edges))]
         return out

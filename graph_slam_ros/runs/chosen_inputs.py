@@ -85,6 +85,7 @@ def _choose(bag: Bag, settings: InputConfig, named: str | None, option: str) -> 
     if found:
         raise BagError(f"several topics of type {settings.type} ({', '.join(found)}): choose one with {option}")
     if settings != _OPTIONAL:
-        why = f"{there}, the truth by its name: {option} takes it all the same" if fitting else there
+        truth = f", the truth by its name: {option} takes it all the same, and graph_slam info prints what fits better"
+        why = there + truth * bool(fitting)
         raise BagError(f"no topic of type {settings.type} in the recording; {why}")
     return ""

@@ -219,8 +219,7 @@ class Problem:
     def residuals_of(self, edges: ArrayLike) -> Array:
         """Residuals of edges at the estimate, not whitened, in the units of their types, end to end."""
         self._grow()
-        ids = whole_numbers(edges, "edge").ravel()
-        return evaluated(self.graph, self._estimates(), ids)[0]
+        return evaluated(self.graph, self._estimates(), existing(edges, self.graph.edge_count, "edge"))[0]
 
     def compact(self) -> None:
         """Move the fronts in use together in memory; memory is not returned to the system.
