@@ -46,7 +46,7 @@ def replay(args: argparse.Namespace) -> int:
 def _with_landmarks(args: argparse.Namespace, config: "Config") -> "Config":
     """The configuration, with inputs that ``info`` suggests where the recording has no usual topic of landmarks."""
     from graph_slam_ros.runs.folder import is_run
-    from graph_slam_ros.runs.other_inputs import suggestion_without_landmarks
+    from graph_slam_ros.runs.suggested_inputs import suggestion_without_landmarks
 
     if args.config or args.landmarks or args.map or (args.ros and args.out is None) or is_run(args.bag):
         return config
@@ -273,7 +273,7 @@ def _print_summary(source: Path, summary: dict[str, Any]) -> int:
 
 def _print_unused(source: Path, topics: Collection[str]) -> None:
     """Name the topics of a recording that could be inputs and are none, where nobody has chosen inputs."""
-    from graph_slam_ros.runs.other_inputs import unused_topics
+    from graph_slam_ros.runs.suggested_inputs import unused_topics
 
     if unused := unused_topics(source, topics):
         console.show(

@@ -40,6 +40,7 @@ from graph_slam_ros.fleet.worlds import world_of
 from graph_slam_ros.formats.files import read_bytes
 
 if TYPE_CHECKING:
+    from graph_slam_ros.config import Config
     from graph_slam_ros.slam import GraphSlam
 
 _HASHED = ("graph.g2o", "ledger.csv", "path.tum", "landmarks.csv")
@@ -188,7 +189,6 @@ def _status_bytes(name: str) -> int:
 
 def _results(job: Job, made: Path) -> Row:
     """Replay, score and report; the columns of the row."""
-    from graph_slam_ros.config import Config
     from graph_slam_ros.runs.outcome import shortcomings
     from graph_slam_ros.runs.replay import replay
 
@@ -197,7 +197,8 @@ def _results(job: Job, made: Path) -> Row:
     begun = time.process_time()
     with tempfile.TemporaryDirectory(prefix="graph_slam_fleet_") as scratch:
         source = local_copy(job.url, Path(scratch))
-        done = replay(source, made / RUN, Config.from_mapping(dict(job.values)))
+        config, (odometry, landmarks) = _inputs(job, source)
+        done = replay(source, made / RUN, config, odometry=odometry, landmarks=landmarks)
         row, lost = columns(done.summary), [*shortcomings(done.summary), *done.losses]
         if job.truth:
             try:
@@ -218,10 +219,25 @@ def _results(job: Job, made: Path) -> Row:
     return row | {
         "state": "incomplete" if lost else "done",
         "reason": " ".join(lost[0].split()) if lost else "",
+        "inputs": config.inputs.names,
         "cpu_s": time.process_time() - begun,
         "memory_mib": _status_bytes("VmHWM") / 2**20,
         "map_hash": _map_hash(made / RUN),
     }
+
+
+def _inputs(job: Job, recording: Path) -> tuple["Config", tuple[str | None, str | None]]:
+    """The configuration, and topics of odometry and landmarks where ``info`` suggests other inputs than the usual."""
+    from graph_slam_ros.config import Config
+    from graph_slam_ros.runs.suggested_inputs import suggestion_without_landmarks
+
+    config = Config.from_mapping(dict(job.values))
+    found = suggestion_without_landmarks(recording, config)
+    if found is None:
+        return config, (None, None)
+    defaults = dict(flatten(Config().as_mapping()))
+    chosen = {name: value for name, value in job.values.items() if value != defaults[name]}
+    return Config.from_mapping(found.settings | chosen), (found.topics.get("odom"), found.topics.get("detections"))
 
 
 def _held_out(slam: "GraphSlam") -> Row:

@@ -15,11 +15,9 @@ from graph_slam_ros.check.finding import Finding
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.messages.inputs import recorded_uses
 from graph_slam_ros.messages.survey import with_survey
-from graph_slam_ros.recordings.bag import Bag, open_bag
-from graph_slam_ros.recordings.contents import recording_of
-from graph_slam_ros.runs.chosen_inputs import Inputs, choose_inputs
+from graph_slam_ros.recordings.bag import open_bag
 from graph_slam_ros.runs.replay import END, RecordedRuns
-from graph_slam_ros.runs.suggestion import Suggestion
+from graph_slam_ros.runs.suggested_inputs import SuggestedInputs
 from graph_slam_ros.runs.tables import account
 from graph_slam_ros.slam import Config, Counters, GraphSlam
 from graph_slam_ros.slam.calibration.parameters import OF_ODOMETRY, QUANTITIES, Parameter
@@ -83,8 +81,9 @@ def calibrate(
         The recording or an input cannot be used, or has no keyframe.
     """
     path, bag, found = Path(path), open_bag(Path(path)), dict[str, float | str]()
-    chosen = Suggestion(bag, recording_of(bag), path)
-    config, inputs = _inputs(bag, chosen, {"calibrate.groups": "auto"} | dict(settings or {}), odometry, landmarks)
+    suggested = SuggestedInputs(bag, path, {"calibrate.groups": "auto"} | dict(settings or {}), odometry, landmarks)
+    config = _config(suggested.settings)
+    inputs = suggested.inputs(config)
     warmup(dimensions=config.world.dimensions)
     total = sum(bag.topics[topic].count for topic in inputs.by_topic())
     report: Mapping[str, Any] = {"settings": {"": 0.0}}
@@ -115,21 +114,10 @@ def calibrate(
             if has_nothing_left := _leaves_nothing(begun, accepted):
                 break
     parameters = report["parameters"] or ([] if refused else list(_undriven(config, len(slam.keyframes))))
-    command = chosen.command(found | dict(settings or {}) | found)
+    command = suggested.suggestion.command(found | dict(settings or {}) | found)
     complete = (has_nothing_left or not report["settings"]) and not refused
     notes = _once(bag.losses), _once(bag.warnings)
     return Calibrated(found, parameters, command, rounds, complete, refused, fault, *notes)
-
-
-def _inputs(
-    bag: Bag, chosen: Suggestion, given: dict[str, Any], odometry: str | None, landmarks: str | None
-) -> tuple[Config, Inputs]:
-    """The configuration and the inputs that are given, or else suggested."""
-    if not chosen.trouble and "inputs.names" not in given:
-        given = chosen.settings | given
-        odometry, landmarks = odometry or chosen.topics.get("odom"), landmarks or chosen.topics.get("detections")
-    config = _config(given)
-    return config, choose_inputs(bag, config, odometry, landmarks)
 
 
 def _once(lines: Iterable[str]) -> list[str]:

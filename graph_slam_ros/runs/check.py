@@ -1,7 +1,7 @@
 """The check of a recording: choose its inputs, read it once, collect all findings."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +15,14 @@ from graph_slam_ros.check.trial import check_trial, replayed
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.measurements.types import Measured
 from graph_slam_ros.messages.inputs import known_types
-from graph_slam_ros.messages.inputs.landmark_types import LANDMARK_TYPES
 from graph_slam_ros.recordings.bag import Bag, open_bag
-from graph_slam_ros.recordings.contents import Recording, TopicContents, recording_of
-from graph_slam_ros.runs.chosen_inputs import choose_inputs
+from graph_slam_ros.recordings.contents import Recording, TopicContents
 from graph_slam_ros.runs.replay import RecordedRuns
-from graph_slam_ros.runs.suggestion import CLOUD, DETECTIONS, ODOMETRY, Suggestion
+from graph_slam_ros.runs.suggested_inputs import OF_LANDMARKS, SuggestedInputs
+from graph_slam_ros.runs.suggestion import ODOMETRY, Suggestion
 from graph_slam_ros.slam import Config, Control, Counters
 from graph_slam_ros.warmup import warmup
 
-_LANDMARKS = (DETECTIONS, CLOUD, *LANDMARK_TYPES)
 _MAPS = ("map", "world", "earth", "utm")
 _UNNAMED_NS = 120_000_000_000
 Measurements = list[Measured | Control]
@@ -78,22 +76,16 @@ def check(
     """
     path, settings = Path(path), dict(settings or {})
     bag = open_bag(path)
-    recording = recording_of(bag)
-    suggestion = _suggestion(bag, recording, path, odometry, landmarks)
-    found = list(_unused(recording, suggestion, has_landmarks=landmarks is not None))
+    suggested = SuggestedInputs(bag, path, settings, odometry, landmarks)
+    suggestion = suggested.suggestion
+    found = list(_unused(suggested.recording, suggestion, has_landmarks=landmarks is not None))
     if suggestion.trouble and odometry is None and not settings:
         text = f"not ready for replay: {suggestion.trouble}"
         found.append(Finding("no_odometry", "error", 0, 1, "topics", text))
         return Checked(in_order(found), "", bag.losses, bag.warnings)
-    assumed = {} if suggestion.trouble else {k: v for k, v in suggestion.settings.items() if k not in settings}
-    if "inputs.names" in settings:
-        assumed = {}
-    config = Config.from_mapping(assumed | settings)
-    chosen = {} if suggestion.trouble else suggestion.topics
-    inputs = choose_inputs(
-        bag, config, odometry or _topic(chosen, "odom", config), landmarks or _topic(chosen, "detections", config)
-    )
-    collector, counters = Collector(config, inputs.topics, assumed), Counters()
+    config = Config.from_mapping(suggested.settings)
+    inputs = suggested.inputs(config)
+    collector, counters = Collector(config, inputs.topics, suggested.assumed), Counters()
     runs = RecordedRuns(bag, inputs, config, counters, columns=collector)
     total = sum(bag.topics[topic].count for topic in inputs.by_topic())
     measured: list[tuple[int, Measurements]] = []
@@ -105,7 +97,8 @@ def check(
     found += check_columns(columns)
     if not quick and not any(one.ends for one in found):
         found += _trial(columns, _in_time(columns, [some for number, some in measured if number == 0]))
-    command = "" if suggestion.trouble else suggestion.command(without=suggestion.settings.keys() - assumed.keys())
+    others = suggestion.settings.keys() - suggested.assumed.keys()
+    command = "" if suggestion.trouble else suggestion.command(without=others)
     found = of_gyro_or_wheels(found, config.gyro_input)
     return Checked(with_one_value(in_order(list(dict.fromkeys(found)))), command, bag.losses, bag.warnings)
 
@@ -130,26 +123,12 @@ def _trial(columns: Columns, measured: list[Measurements]) -> list[Finding]:
         return [Finding("fit_unsure", "warning", 1, 0, "replays", f"a replay fails: {error}")]
 
 
-def _topic(chosen: Mapping[str, str], name: str, config: Config) -> str | None:
-    return chosen.get(name) if any(one.name == name and one.use != "none" for one in config.sources) else None
-
-
-def _suggestion(bag: Bag, recording: Recording, path: Path, odometry: str | None, landmarks: str | None) -> Suggestion:
-    """The choice of ``info`` if the named topics were the only ones of their kinds."""
-    topics = dict(recording.topics)
-    if odometry in topics:
-        topics = {n: one for n, one in topics.items() if n == odometry or one.topic.type != topics[odometry].topic.type}
-    if landmarks in topics:
-        topics = {n: one for n, one in topics.items() if n == landmarks or one.topic.type not in _LANDMARKS}
-    return Suggestion(bag, replace(recording, topics=topics), path)
-
-
 def _unused(recording: Recording, suggestion: Suggestion, *, has_landmarks: bool) -> Iterator[Finding]:
     """Topics that are meant as landmarks or odometry, and that cannot be used."""
     has_landmarks = has_landmarks or any(name not in ("odom", "gps", "imu", "pose") for name in suggestion.names)
     for name, why in suggestion.unused.items():
         one = recording.topics[name]
-        is_landmark = one.topic.type in _LANDMARKS and one.topic.type in known_types()
+        is_landmark = one.topic.type in OF_LANDMARKS and one.topic.type in known_types()
         if one.topic.type == ODOMETRY and one.frame in _MAPS:
             text = f"{name} is {why}"
             severity: Severity = "note" if "odom" in suggestion.topics else "error"

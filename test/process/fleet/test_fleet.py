@@ -91,6 +91,18 @@ def test_one_command_replays_all_and_the_second_time_nothing(drives, serial, tmp
     assert fleet("compare", out, out, "--fail", "rmse>1.02x").returncode == 0
 
 
+def test_a_job_takes_the_inputs_that_info_suggests_where_no_topic_is_usual(tmp_path):
+    """As ``replay`` does: without them it would be odometry alone."""
+    drive, run, out = tmp_path / "drive.mcap", tmp_path / "run", tmp_path / "out"
+    world = ("--set", "aisles=2", "--set", "laps=1", "--set", "sensor=range_bearing")
+    assert cli.main(["simulate", "warehouse", *world, "--out", str(drive)]) == 0
+    assert cli.main(["replay", str(drive), "--out", str(run)]) == 0
+    (row,) = replay_all(Fleet([str(drive)], out), Workers(count=1)).rows
+    assert (row["state"], row["reason"]) == ("done", "")
+    assert row["inputs"] == "odom ranges"
+    assert contents(out / "jobs" / row["key"] / "run") == contents(run)
+
+
 def test_over_tcp_a_worker_that_is_killed_changes_nothing(drives, serial, tmp_path):
     out = tmp_path / "out"
     with scheduler(tmp_path, 2) as address:

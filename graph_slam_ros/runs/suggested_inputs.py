@@ -1,0 +1,112 @@
+"""The inputs of a recording as ``graph_slam info`` suggests them, with what the user has chosen."""
+
+from collections.abc import Collection, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from graph_slam_ros.messages.from_msg import TF, TF_STATIC
+from graph_slam_ros.messages.inputs.landmark_types import LANDMARK_TYPES
+from graph_slam_ros.recordings.bag import Bag, BagError, open_bag
+from graph_slam_ros.recordings.contents import recording_of
+from graph_slam_ros.runs.chosen_inputs import Inputs, choose_inputs
+from graph_slam_ros.runs.namespaces import is_truth
+from graph_slam_ros.runs.suggestion import CLOUD, DETECTIONS, GNSS, ODOMETRY, Suggestion
+from graph_slam_ros.slam import Config
+
+OF_LANDMARKS = frozenset({DETECTIONS, CLOUD, *LANDMARK_TYPES})
+"""Types of messages that have landmarks."""
+
+_MEASURED = (ODOMETRY, DETECTIONS, GNSS, *LANDMARK_TYPES)
+
+
+class SuggestedInputs:
+    """The suggestion for a recording, and what of it holds where the user has chosen some parameters and topics.
+
+    Parameters
+    ----------
+    given : parameters by dotted name, which come before those that are suggested
+    odometry, landmarks : topics; the suggestion is that for a recording in which they are the only ones of their kinds
+
+    Attributes
+    ----------
+    suggestion : for the recording
+    assumed : the suggested parameters that the user has not chosen; none where the inputs are given
+    settings : these and the given ones
+    """
+
+    def __init__(
+        self,
+        bag: Bag,
+        path: Path,
+        given: Mapping[str, Any] | None = None,
+        odometry: str | None = None,
+        landmarks: str | None = None,
+    ) -> None:
+        given, self._bag, self._odometry, self._landmarks = given or {}, bag, odometry, landmarks
+        self.recording = recording_of(bag)
+        topics = dict(self.recording.topics)
+        if odometry in topics:
+            kind = topics[odometry].topic.type
+            topics = {name: one for name, one in topics.items() if name == odometry or one.topic.type != kind}
+        if landmarks in topics:
+            topics = {n: one for n, one in topics.items() if n == landmarks or one.topic.type not in OF_LANDMARKS}
+        self.suggestion = Suggestion(bag, replace(self.recording, topics=topics), path)
+        is_suggested = not self.suggestion.trouble and "inputs.names" not in given
+        suggested = self.suggestion.settings if is_suggested else {}
+        self.assumed = {name: value for name, value in suggested.items() if name not in given}
+        self.settings = self.assumed | dict(given)
+
+    def inputs(self, config: Config) -> Inputs:
+        """The topics of the inputs of a configuration: named, suggested, configured, or the only ones of their types.
+
+        Raises
+        ------
+        BagError
+            A topic does not exist or has another type, or there is none.
+        """
+        odometry, landmarks = self._odometry or self._topic("odom", config), self._topic("detections", config)
+        return choose_inputs(self._bag, config, odometry, self._landmarks or landmarks)
+
+    def _topic(self, name: str, config: Config) -> str | None:
+        is_used = not self.suggestion.trouble and any(one.name == name and one.use != "none" for one in config.sources)
+        return self.suggestion.topics.get(name) if is_used else None
+
+
+def suggestion_without_landmarks(path: Path, config: Config, odometry: str | None = None) -> Suggestion | None:
+    """Return how to replay a recording that has no landmarks of the usual type, but others, or fixes.
+
+    None where it has, where other inputs are configured, where there is nothing else in it, or where it would be with
+    another odometry.
+
+    Parameters
+    ----------
+    odometry : its topic; None: the suggested one
+
+    Raises
+    ------
+    BagError
+        It cannot be read.
+    """
+    if config.inputs.names != Config().inputs.names:
+        return None
+    bag = open_bag(path)
+    try:
+        if any(name not in ("odom", TF, TF_STATIC) for name in choose_inputs(bag, config, odometry).topics):
+            return None
+    except BagError:  # which the replay says
+        return None
+    found = Suggestion(bag, recording_of(bag), path)
+    is_other = odometry is not None and found.topics.get("odom") != odometry  # its frames are those of another
+    return None if found.trouble or len(found.names) < 2 or is_other else found
+
+
+def unused_topics(path: Path, used: Collection[str]) -> list[str]:
+    """Topics of a recording that have odometry, landmarks or fixes by their type, and that no input was read from.
+
+    Parameters
+    ----------
+    used : topics of the inputs
+    """
+    topics = (one for one in open_bag(path).topics.values() if one.count and one.type in _MEASURED)
+    return sorted(f"{one.name} ({one.type})" for one in topics if one.name not in used and not is_truth(one.name))
