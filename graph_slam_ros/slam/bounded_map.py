@@ -7,7 +7,7 @@ does.
 
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -28,8 +28,7 @@ from graph_slam_ros.slam.lifelong.frames import Frames, chained, frame_of, weigh
 from graph_slam_ros.slam.lifelong.outcome import Condensed
 from graph_slam_ros.slam.lifelong.place_edge import PlaceEdge
 from graph_slam_ros.slam.lifelong.removed import Left, OldKeyframe, Records, record_type
-from graph_slam_ros.slam.lifelong.surroundings import CLOSURES, FIXES, is_sighting
-from graph_slam_ros.slam.lifelong.thinned import CHAIN
+from graph_slam_ros.slam.lifelong.surroundings import CLOSURES, seen_from
 from graph_slam_ros.slam.robust.gating import CANDIDATES
 from graph_slam_ros.slam.solution import Solution
 from graph_slam_ros.solver import Solver
@@ -170,9 +169,9 @@ class BoundedMap:
         limit = self._limit - first
         at, rows, frames = solver.estimate(ids), list[_Row](), list[tuple[Frames, range]]()
         cells = list(map(tuple, np.floor(at[:, : self._space.dimensions] / width).astype(np.int64).tolist()))
-        k = 0
+        marks, k = seen_from(self._space, solver, ids), 0
         while k < limit:
-            end = k + self._length(ids[k : k + LONGEST].tolist(), cells[k : k + LONGEST])
+            end = k + _length(marks[k : k + LONGEST], cells[k : k + LONGEST])
             if max(end, k + 1) > limit:
                 break
             if end == k:  # it has an edge that cannot be condensed
@@ -201,37 +200,6 @@ class BoundedMap:
             self._counters.count(_SOURCE, "not_condensed", keyframes)
         else:
             self._counters.count(_SOURCE, "visit_lost" if done.is_contradiction else "visit_condensed")
-
-    def _length(self, ids: Sequence[int], cells: Sequence[tuple[int, ...]]) -> int:
-        """The number of keyframes, from the first of some on, that are one visit.
-
-        They can be condensed, and they are in one cell, or go on in the next until they have seen enough for a place.
-        """
-        seen = set[int]()
-        for k, (vertex, cell) in enumerate(zip(ids, cells, strict=True)):
-            marks = self._seen_from(vertex)
-            if marks is None or (cell != cells[0] and len(seen) >= _ENOUGH):
-                return k
-            seen |= marks
-        return len(ids)
-
-    def _seen_from(self, vertex: int) -> set[int] | None:
-        """The landmarks that are seen from a keyframe; None where it cannot be condensed.
-
-        It can be if it is free, with edges of odometry, sightings, closures and fixes alone.
-        """
-        graph, space, out = self._backend.graph, self._space, set[int]()
-        if self._backend.solver.is_held(vertex):  # it is of a frozen map, or of one that the robot is located in
-            return None
-        for edge in self._backend.solver.edges_on(vertex).tolist():
-            one = graph.edge(edge)
-            is_odometry = one.type is space.relative_pose and one.label in ("odometry", CHAIN)
-            is_seen = is_sighting(space, graph, one)
-            if one.weight and not (is_odometry or is_seen or one.label in (CLOSURES, FIXES)):
-                return None
-            if one.weight and is_seen:
-                out.add(one.vertices[1])
-        return out
 
     def _ahead(self, vertex: int) -> set[int]:
         """The landmarks that are seen from a keyframe and later ones."""
@@ -265,27 +233,30 @@ class BoundedMap:
             joined = NOWHERE if one.covariance is None else base
             covariance = self._nothing if one.covariance is None else one.covariance
             out[one.vertex] = _Row(one.vertex, base, one.T_base_vertex, joined, one.T_base_vertex, covariance)
+        poses = dict(zip(visit, self._backend.solver.estimate(list(visit)), strict=True))
         for k in range(0, len(visit), FRAME if done.seen else len(visit)):
             stretch = visit[k : k + FRAME]
             gone = [vertex for vertex in stretch if done.seen and out[vertex].base != lasting.of(vertex)]
             if gone:
-                at = self._solution.pose(stretch[len(stretch) // 2])
-                frames.append((self._frame(done, stretch, at), range(first + k, first + k + len(stretch))))
+                at = tuple(poses[stretch[len(stretch) // 2]].tolist())
+                of_stretch = {vertex: poses[vertex] for vertex in stretch}
+                frames.append((self._frame(done, of_stretch, at), range(first + k, first + k + len(stretch))))
                 number = -self.state.frames - len(frames)
                 for vertex in gone:
-                    pose = self._space.group.between(at, self._solution.pose(vertex))
+                    pose = self._space.group.between(at, tuple(poses[vertex].tolist()))
                     out[vertex] = replace(out[vertex], base=number, T_base=tuple(map(float, pose)))
         return [out[vertex] for vertex in visit]
 
-    def _frame(self, done: Condensed, stretch: Sequence[int], at: Numbers) -> Frames:
-        """Return the frame of a stretch of a visit."""
+    def _frame(self, done: Condensed, poses: Mapping[int, Array], at: Numbers) -> Frames:
+        """Return the frame of a stretch of a visit, whose keyframes have these poses."""
         solver, lasting, n = self._backend.solver, self._backend.graph.vertex_ids, self._space.dimensions
-        landmarks = dict[int, tuple[Numbers, float]]()
-        for vertex, mark in (both for both in done.seen if both[0] in stretch):
-            there, here = (solver.estimate([one])[0] for one in (mark, vertex))
-            before = landmarks.get(lasting.of(mark), ((), 0.0))[1]
-            weight = max(before, weight_at(float(np.linalg.norm(there[:n] - here[:n]))))  # their errors are alike
-            landmarks[lasting.of(mark)] = tuple(there.tolist()), weight
+        pairs = [both for both in done.seen if both[0] in poses]
+        there = {mark: solver.estimate([mark])[0] for mark in dict.fromkeys(mark for _, mark in pairs)}
+        weights = dict[int, float]()
+        for vertex, mark in pairs:
+            distance_m = float(np.linalg.norm(there[mark][:n] - poses[vertex][:n]))
+            weights[mark] = max(weights.get(mark, 0.0), weight_at(distance_m))  # their errors are alike
+        landmarks = {lasting.of(mark): (tuple(there[mark].tolist()), weights[mark]) for mark in weights}
         base = done.removed[0].base
         return frame_of(self._space, (lasting.of(base), self._solution.pose(base)), at, landmarks)
 
@@ -379,6 +350,23 @@ class BoundedMap:
         if len(rows):
             out["T_odom"] = np.stack(self._space.group.compose(tuple(odom.T), tuple(poses.poses[rows].T)), axis=-1)
         return out
+
+
+def _length(marks: Sequence[set[int] | None], cells: Sequence[Cell]) -> int:
+    """The number of keyframes, from the first of some on, that are one visit.
+
+    They can be condensed, and they are in one cell, or go on in the next until they have seen enough for a place.
+
+    Parameters
+    ----------
+    marks : the landmarks that are seen from each, or None where it cannot be condensed
+    """
+    seen = set[int]()
+    for k, (some, cell) in enumerate(zip(marks, cells, strict=True)):
+        if some is None or (cell != cells[0] and len(seen) >= _ENOUGH):
+            return k
+        seen |= some
+    return len(marks)
 
 
 def _copies(places: dict[Cell, list[PlaceEdge]]) -> dict[Cell, list[PlaceEdge]]:

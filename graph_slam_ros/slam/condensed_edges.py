@@ -9,7 +9,7 @@ from graph_slam_ros.graph.place import LABEL as PLACES
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.frontend.keyframes import Keyframe
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
-from graph_slam_ros.slam.lifelong.thinned import CHAIN
+from graph_slam_ros.slam.lifelong.surroundings import CHAIN
 from graph_slam_ros.slam.robust.ledger import INSIDE, Reason, Verdict
 from graph_slam_ros.typing import Index
 
@@ -55,25 +55,37 @@ def archived(
     """
     graph, ledger, out = backend.graph, backend.ledger, []
     edges = edges[~graph.has_label(edges, (PLACES, CHAIN))]
-    ids, stamps_ns = keyframes.ids, keyframes.stamps_ns
-    lasting = graph.edge_ids.of_all(edges).tolist()
-    for edge, number in zip(edges.tolist(), lasting, strict=True):
-        one, verdict = graph.edge(edge), Verdict(ledger.verdict.values.item(edge))
-        newest = int(np.searchsorted(ids, one.vertices, side="right").max()) - 1  # landmarks came after it
+    labels, sources, newest = (np.zeros(len(edges), dtype=np.int64) for _ in range(3))
+    landmarks = [""] * len(edges)
+    for code, table in enumerate(graph.tables.values()):
+        at = np.flatnonzero(graph.table_of_edge.values[edges] == code)
+        rows = graph.row_of_edge.values[edges[at]]
+        ends = table.vertices.values[rows]
+        labels[at], sources[at] = table.label.values[rows], table.source.values[rows]
+        newest[at] = np.searchsorted(keyframes.ids, ends, side="right").max(axis=1) - 1  # landmarks came after it
+        for k, vertices in zip(at.tolist(), ends.tolist(), strict=True):
+            landmarks[k] = next((names[v] for v in vertices if v in names), "")
+    columns = ledger.keyframe, ledger.statistic, ledger.numbers, ledger.threshold, ledger.verdict, ledger.reason
+    judged = zip(*(column.values[edges].tolist() for column in columns), strict=True)
+    stamps_ns = keyframes.stamps_ns[np.maximum(newest, 0)].tolist()
+    of_graph = zip(graph.edge_ids.of_all(edges).tolist(), labels.tolist(), sources.tolist(), landmarks, strict=True)
+    for (number, label, source, landmark), stamp_ns, one in zip(of_graph, stamps_ns, judged, strict=True):
+        keyframe, statistic, dof, threshold, code_of_verdict, reason = one
+        verdict = Verdict(code_of_verdict)
         is_in = verdict in INSIDE or verdict is Verdict.NOT_EVALUATED
         out.append(
             CondensedEdge(
                 number,
-                one.label,
-                one.source,
-                next((names[v] for v in one.vertices if v in names), ""),
-                ledger.keyframe.values.item(edge),
-                int(stamps_ns[max(newest, 0)]),
-                ledger.statistic.values.item(edge),
-                ledger.numbers.values.item(edge),
-                ledger.threshold.values.item(edge),
+                graph.labels[label],
+                graph.sources[source],
+                landmark,
+                keyframe,
+                stamp_ns,
+                statistic,
+                dof,
+                threshold,
                 verdict,
-                Reason(ledger.reason.values.item(edge)),
+                Reason(reason),
                 CONDENSED if is_in else EXPIRED,
             )
         )

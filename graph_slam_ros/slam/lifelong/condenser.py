@@ -23,8 +23,16 @@ from graph_slam_ros.slam.lifelong.outcome import ITSELF, PLACE, Condensed, Limit
 from graph_slam_ros.slam.lifelong.place import Fused, Place
 from graph_slam_ros.slam.lifelong.place_edge import PlaceEdge, added_place
 from graph_slam_ros.slam.lifelong.skeleton import Skeleton
-from graph_slam_ros.slam.lifelong.surroundings import CLOSURES, Motion, Surroundings, chained, motion_of, surroundings
-from graph_slam_ros.slam.lifelong.thinned import CHAIN, Thinning
+from graph_slam_ros.slam.lifelong.surroundings import (
+    CHAIN,
+    CLOSURES,
+    Motion,
+    Surroundings,
+    chained,
+    motion_of,
+    surroundings,
+)
+from graph_slam_ros.slam.lifelong.thinned import Thinning
 from graph_slam_ros.slam.lifelong.visit import Visit, best_known, visit_of
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Numbers

@@ -11,9 +11,10 @@ from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.graph.losses import weight_and_cost
 from graph_slam_ros.slam.lifelong.elimination import product
 from graph_slam_ros.solver import Solver
-from graph_slam_ros.typing import Array, Numbers
+from graph_slam_ros.typing import Array, Index, Numbers
 
 CLOSURES, FIXES, LANDMARKS = "closures", "fixes", "landmarks"  # labels
+CHAIN = "composed"  # label of edges that are composed of odometry
 Motion = tuple[Numbers, Array]
 """A relative pose and its covariance (dof, dof) in the tangent space at its end."""
 
@@ -94,6 +95,37 @@ def surroundings(space: Geometry, solver: Solver, visit: Sequence[int], after: i
     if len(out.steps) < len(visit) - 1 or len(out.onward) != 1:
         out.unfit = out.unfit or "odometry does not join its keyframes one by one"
     out.factors = _factors(solver, {**out.inside, **out.sightings, **out.closures, **out.fixes})
+    return out
+
+
+def seen_from(space: Geometry, solver: Solver, keyframes: Index) -> list[set[int] | None]:
+    """Return the landmarks that are seen from each keyframe, by vertices; None for one that cannot be condensed.
+
+    One can be if it is free, with edges of odometry, sightings, closures and fixes alone. One that is not free is of a
+    frozen map, or of a map that the robot is located in.
+    """
+    graph = solver.graph
+    out: list[set[int] | None] = [None if solver.is_held(vertex) else set() for vertex in keyframes.tolist()]
+    row_of = np.full(graph.vertex_count, -1)
+    row_of[keyframes] = np.arange(len(keyframes))
+    edges = np.unique(np.concatenate([solver.edges_on(vertex) for vertex in keyframes.tolist()]))
+    is_point = np.array([kind is space.point for kind in graph.kinds])
+    for code, table in enumerate(graph.tables.values()):
+        rows = graph.row_of_edge.values[edges[graph.table_of_edge.values[edges] == code]]
+        rows = rows[table.weight.values[rows] != 0.0]
+        ends, numbers = table.vertices.values[rows], table.id.values[rows]
+        is_fit = graph.has_label(numbers, (CLOSURES, FIXES))
+        if table.type is space.relative_pose:
+            is_fit |= graph.has_label(numbers, ("odometry", CHAIN))
+        if ends.shape[1] == 2:
+            is_seen = graph.has_label(numbers, (LANDMARKS,)) | is_point[graph.kind.values[ends[:, 1]]]
+            is_fit |= is_seen
+            for row, mark in zip(row_of[ends[is_seen, 0]].tolist(), ends[is_seen, 1].tolist(), strict=True):
+                if row >= 0 and (of_row := out[row]) is not None:
+                    of_row.add(mark)
+        for row in row_of[ends[~is_fit]].ravel().tolist():
+            if row >= 0:
+                out[row] = None
     return out
 
 

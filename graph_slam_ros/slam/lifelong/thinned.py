@@ -17,10 +17,9 @@ from graph_slam_ros.graph import Edge
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.slam.lifelong.carried import Carried, fused_motion, inverse, inverted
 from graph_slam_ros.slam.lifelong.elimination import square_root, symmetric
-from graph_slam_ros.slam.lifelong.surroundings import CLOSURES, Motion, Surroundings, chained, motion_of
+from graph_slam_ros.slam.lifelong.surroundings import CHAIN, CLOSURES, Motion, Surroundings, chained, motion_of
 from graph_slam_ros.typing import Array
 
-CHAIN = "composed"  # label of edges that are composed of odometry
 _HELD = 1e-3  # of the information of a composed closure: so much holds the path where the closure is doubted
 _COUNTS = 1e-9  # factor of a closure below which it says nothing
 

@@ -27,7 +27,7 @@ from graph_slam_ros.runs.trajectory import read_tum
 from graph_slam_ros.runs.whole_path import removed_path
 from graph_slam_ros.slam import Config, Control, GraphSlam
 from graph_slam_ros.slam.lifelong.removed import Left
-from graph_slam_ros.slam.lifelong.thinned import CHAIN
+from graph_slam_ros.slam.lifelong.surroundings import CHAIN
 from graph_slam_ros.slam.robust.ledger import Verdict
 
 KEYFRAMES, WINDOW = 700, 60

@@ -9,7 +9,7 @@ from graph_slam_ros.runs.whole_path import removed_path
 from graph_slam_ros.slam import Closure, Control, Fix, GraphSlam, Odometry
 from graph_slam_ros.slam.lifelong.carried import carried_closure, fused_closure, inverse
 from graph_slam_ros.slam.lifelong.removed import Left
-from graph_slam_ros.slam.lifelong.thinned import CHAIN
+from graph_slam_ros.slam.lifelong.surroundings import CHAIN
 from graph_slam_ros.slam.robust.ledger import INSIDE
 
 KEYFRAMES, WINDOW, NEAR_M, SIGMA_FIX_M = 900, 160, 3.0, 0.2

@@ -7,8 +7,8 @@ from graph_slam_ros.graph import Gaussian, Graph
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
 from graph_slam_ros.slam.lifelong.elimination import marginal_information
 from graph_slam_ros.slam.lifelong.skeleton import Skeleton
-from graph_slam_ros.slam.lifelong.surroundings import surroundings
-from graph_slam_ros.slam.lifelong.thinned import CHAIN, Thinning
+from graph_slam_ros.slam.lifelong.surroundings import CHAIN, surroundings
+from graph_slam_ros.slam.lifelong.thinned import Thinning
 from graph_slam_ros.solver import Solver
 
 BASES, POSES = 3, 6
