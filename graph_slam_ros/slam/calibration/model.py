@@ -8,6 +8,7 @@ origin and moved, in the axes of the base. A range becomes ``factor * range + of
 The noise of odometry is that of the motion: the robot does not do exactly what was commanded (Berkson). If it is that
 of z instead, as with encoders, a fitted factor is too small by noise over motion, both squared (Fuller, "Measurement
 error models", 1987, section 1.1: attenuation). With ``is_noise_measured`` noise grows with the factors, which mends it.
+The noise of a range is always that of what was measured.
 """
 
 from collections.abc import Mapping
@@ -202,7 +203,7 @@ class MeasurementModel:
         turned = self._space.group.compose(turn, around)
         z[:, tail:] = np.stack((*(turned[k] + sensor[k] + shift[k] for k in range(n)), *turned[n:]), axis=-1)
         if edges.kind.startswith("range"):
-            z[:, 0] = (1.0 + named.get("range_factor", 0.0)) * z[:, 0] + named.get("range_offset", 0.0)
+            z[:, 0] = _range_factor(values, edges.source) * z[:, 0] + named.get("range_offset", 0.0)
         return z
 
     def roots(self, edges: Sightings, values: Values, T_a_b: Numbers | None = None) -> Array:
@@ -212,6 +213,18 @@ class MeasurementModel:
         turn, _ = self._mount(_of(values, edges.source))
         out = edges.roots @ self._turns(tuple(np.atleast_1d(x) for x in turn)).swapaxes(1, 2)
         return out if T_a_b is None else out @ self._turns(T_a_b).swapaxes(1, 2)
+
+    def fitted_roots(self, edges: Sightings, values: Values) -> Array:
+        """The same where the factor of ranges is fitted: the noise is of what was measured, and grows with it."""
+        out = self.roots(edges, values)
+        if edges.kind.startswith("range") and (factor := _range_factor(values, edges.source)) != 1.0:
+            out = out.copy()
+            out[:, :, 0] /= factor
+        return out
+
+    def of_growing_noise(self, edges: Sightings, values: Values, residuals: Array) -> Array:
+        """The derivative (n,) of ranges with respect to their factor, by the noise that grows with it."""
+        return residuals[:, 0] / _range_factor(values, edges.source)
 
     def _turns(self, poses: Any) -> Array:
         """Rotation matrices (n, d, d) of poses that are arrays."""
@@ -237,6 +250,10 @@ class MeasurementModel:
             tail = z.shape[1] - self._space.pose.size
             out[:, tail:] = np.stack(group.compose(T_a_b, tuple(z[:, tail:].T)), axis=-1)
         return out
+
+
+def _range_factor(values: Values, source: str) -> float:
+    return 1.0 + _of(values, source).get("range_factor", 0.0)
 
 
 def clock_of(values: Values, source: str) -> float:

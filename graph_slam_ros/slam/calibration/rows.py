@@ -224,7 +224,7 @@ class Linearization:
     def _roots(self, edges: OdometryEdges | Sightings, values: Values) -> Array:
         if isinstance(edges, OdometryEdges):
             return self._model.odometry_roots(edges, values)
-        return self._model.roots(edges, values)
+        return self._model.fitted_roots(edges, values)
 
     def _measured(self, edges: OdometryEdges | Sightings, values: Values) -> Array:
         if isinstance(edges, OdometryEdges):
@@ -249,6 +249,8 @@ class Linearization:
             n, factor = self._p.space.dimensions, 1.0 + values.get(parameter, 0.0)
             scaled = slice(0, n) if parameter.name == "distance" else slice(n, None)
             out[:, scaled] -= 0.5 * (sides[0] + sides[1])[:, scaled] / factor
+        elif not isinstance(edges, OdometryEdges) and parameter.name == "range_factor":
+            out[:, 0] -= self._model.of_growing_noise(edges, values, 0.5 * (sides[0] + sides[1]))
         return out
 
     # -- blocks to rows --------------------------------------------------------------------------------------------

@@ -269,7 +269,7 @@ def test_ranges_alone_that_are_too_long_are_mended_by_their_own_factor(tmp_path,
     assert "odometry_scale" not in found
     key, value = found["range_scale"]["settings"][0].split("=")
     assert key == "ranges.range_factor"
-    assert float(value) == pytest.approx(1.0, abs=0.01)
+    assert float(value) == pytest.approx(1.0, abs=0.02)  # three of its sigmas
 
 
 def test_a_clean_drive_of_ranges_alone_needs_the_search_for_other_hypotheses(tmp_path, check, capsys):
