@@ -20,7 +20,7 @@ from graph_slam_ros.slam.robust.admission import Admission
 from graph_slam_ros.slam.robust.background import Background, Work, run_when_asked
 from graph_slam_ros.slam.robust.displacement import DisplacementHypothesis
 from graph_slam_ros.slam.robust.gating import OutlierGate
-from graph_slam_ros.slam.robust.hypotheses import Alternative, FrozenGraph, Outcome, search_alternatives
+from graph_slam_ros.slam.robust.hypotheses import MIRRORED, Alternative, FrozenGraph, Outcome, search_alternatives
 from graph_slam_ros.slam.robust.ledger import FINAL, Ledger, Reason
 from graph_slam_ros.slam.robust.odometry_judge import OdometryJudge
 from graph_slam_ros.slam.snapshot import MapSnapshot
@@ -170,7 +170,7 @@ class Backend:
         if self.odometries.decide(keyframe):
             self.solver.update()
         out = self.ledger.outside_count
-        if self._config.decide and not self.spares_memory and self._background.is_due(out):
+        if self._config.decide and not self.spares_memory and self._background.is_due(out, keyframe, self.graph):
             self._background.start(self._frozen(keyframe, self.solver.settings), out)
 
     def optimize(self, keyframe: int, settings: Settings) -> Report:
@@ -383,7 +383,7 @@ class Backend:
     def _adopt(self, outcome: Outcome, keyframe: int) -> bool:
         """Use the outcome of a search. Returns whether it differs from the present verdicts."""
         self.rivals = self._standing(outcome.rivals)
-        if not self.decisions.adopt_verdicts(outcome.ledger, keyframe):
+        if not self.decisions.adopt_verdicts(outcome.ledger, keyframe) and outcome.start != MIRRORED:
             return False
         self.solver.start_at(outcome.carried_to(self.graph, self.solver.values))
         return True

@@ -1,10 +1,10 @@
 """Search for the best explanation: solve, judge, solve again, from several starts; the lowest cost wins.
 
 The first verdicts of an online run may rest on a false closure that came before the true ones. So there are several
-starts: the online estimate with its verdicts; the candidates that agree with a neighbour, at that estimate and at
-odometry alone; and the largest group of rejected candidates. From each start, everything is solved and every candidate
-is judged by its residual, until no verdict changes. A rejected candidate costs the limit of its gate (truncated least
-squares).
+starts: the online estimate with its verdicts; of a map of ranges, also its mirror image; the candidates that agree with
+a neighbour, at the online estimate and at odometry alone; and the largest group of rejected candidates. From each
+start, everything is solved and every candidate is judged by its residual, until no verdict changes. A rejected
+candidate costs the limit of its gate (truncated least squares).
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -18,6 +18,7 @@ from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import GROUPS, SE2, Graph, Loss
 from graph_slam_ros.slam.robust.gating import OutlierGate
 from graph_slam_ros.slam.robust.ledger import Ledger
+from graph_slam_ros.slam.robust.mirrored import is_of_ranges, mirror_images
 from graph_slam_ros.slam.robust.pairwise_consistency import consistent_groups
 from graph_slam_ros.solver import Settings, Solver
 from graph_slam_ros.typing import Array, Index
@@ -25,6 +26,8 @@ from graph_slam_ros.typing import Array, Index
 _ITERATIONS = 20  # of each stage of the losses, from another start
 _HOPELESS = 2.0  # times the least cost that was found: another explanation is none
 _SAME = 1e-4  # of a cost, that one explanation may differ by from itself: solves end a little off the optimum
+MIRRORED = "mirrored"  # a start
+_LIKELIER = 9.0  # of the cost: by so much a mirror image must be likelier
 _STORY = 5  # closures that agree with one another and not with the map
 
 
@@ -111,15 +114,15 @@ def search_alternatives(config: RobustConfig, frozen: FrozenGraph, wanted: Cance
     for name, start, inliers in _starts(frozen):
         if wanted is not None and not wanted.still:
             return None
+        if inliers is not None and any(one.start == "online" and not len(one.ledger.outside) for one in found):
+            break
         with suppress(GraphSlamError, np.linalg.LinAlgError):  # what is believed there does not hold together
             hopeless = _HOPELESS * min((outcome.cost for outcome in found), default=np.inf)
             found.append(_explained(name, config, frozen, start, inliers, hopeless, found))
-        if name == "online" and found and not len(found[0].ledger.outside):
-            break
     found = [outcome for outcome in found if np.isfinite(outcome.cost)]
     if not found:
         return None
-    best = min(found, key=lambda outcome: outcome.cost)
+    best = min(found, key=lambda outcome: outcome.cost + _LIKELIER * (outcome.start == MIRRORED))
     rivals = {rival.only_here: rival for rival in (_rival(one, best) for one in found) if rival is not None}
     return replace(best, rivals=tuple(rivals.values()))
 
@@ -142,6 +145,9 @@ def _starts(frozen: FrozenGraph) -> Iterator[tuple[str, Array, Index | None]]:
     """
     yield "online", frozen.values, None
     ledger, graph = frozen.ledger, frozen.graph
+    if not len(frozen.held) and is_of_ranges(graph):
+        for values in mirror_images(graph, frozen.values):
+            yield MIRRORED, values, None
     candidates = np.sort(np.concatenate((ledger.inside, ledger.outside)))
     is_closure = graph.has_label(candidates, ("closures",))
     closures, others = candidates[is_closure], candidates[~is_closure]
