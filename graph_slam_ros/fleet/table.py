@@ -15,18 +15,8 @@ from graph_slam_ros.formats.durable import write_whole
 
 FIRST = ("recording", "setting", "state", "rmse_m", "rpe_m_per_m", "nees", "keyframes", "cpu_s", "memory_mib", "reason")
 _TEXTS = {
-    "key",
-    "recording",
-    "setting",
-    "url",
-    "truth",
-    "state",
-    "reason",
-    "worker",
-    "map_hash",
-    "world",
-    "fault",
-    "inputs",
+    *("key", "recording", "setting", "url", "truth", "state"),
+    *("reason", "worker", "map_hash", "world", "fault", "inputs"),
 }
 _NO_COLUMNS = {"retry", ERRORS}
 _TOGETHER = 10_000
