@@ -78,11 +78,8 @@ class Config:
     sources: tuple[InputConfig, ...] = DEFAULT_INPUTS
 
     def __repr__(self) -> str:
-        """The parameters that differ from their defaults, as ``from_mapping`` takes them."""
-        given = dict(flatten(self.as_mapping()))
-        usual = {p.name: p.default for p in parameters(one.name for one in self.sources)}
-        changed = [f"{name}={value!r}" for name, value in given.items() if value != usual[name]]
-        return f"Config({', '.join(changed)})"
+        """The parameters that differ from their defaults."""
+        return f"Config({', '.join(f'{name}={value!r}' for name, value in self.differing.items())})"
 
     def __post_init__(self) -> None:
         _ = self.start_pose, self.load_pose, self.survey, self.gyro_input  # a wrong one is refused here, not later
@@ -92,6 +89,12 @@ class Config:
                 "calibrate.groups: factors and range_factor are one scale: leave one out, or survey landmarks "
                 "(landmarks.surveyed)"
             )
+
+    @property
+    def differing(self) -> dict[str, Any]:
+        """The parameters that differ from their defaults, as ``from_mapping`` takes them."""
+        usual = {p.name: p.default for p in parameters(one.name for one in self.sources)}
+        return {name: value for name, value in flatten(self.as_mapping()) if value != usual[name]}
 
     @property
     def uses_found_factors(self) -> bool:

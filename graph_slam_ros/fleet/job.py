@@ -235,9 +235,10 @@ def _inputs(job: Job, recording: Path) -> tuple["Config", tuple[str | None, str 
     found = suggestion_without_landmarks(recording, config)
     if found is None:
         return config, (None, None)
-    defaults = dict(flatten(Config().as_mapping()))
-    chosen = {name: value for name, value in job.values.items() if value != defaults[name]}
-    return Config.from_mapping(found.settings | chosen), (found.topics.get("odom"), found.topics.get("detections"))
+    return Config.from_mapping(found.settings | config.differing), (
+        found.topics.get("odom"),
+        found.topics.get("detections"),
+    )
 
 
 def _held_out(slam: "GraphSlam") -> Row:
