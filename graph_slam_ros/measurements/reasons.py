@@ -293,7 +293,7 @@ REASONS: dict[str, Reason] = {
         _REFUSED, "the IMU says that it has no orientation", "an IMU with a filter; its gyro alone: INPUT.use=gyro"
     ),
     "not_in_this_space": Reason(
-        _REFUSED, "such a fix or edge does not exist in this many dimensions", "world.dimensions"
+        _REFUSED, "such a fix or edge does not exist in so many dimensions", "world.dimensions"
     ),
     # -- closures
     "id_not_a_stamp": Reason(_REFUSED, "a closure's id is not the earlier stamp in nanoseconds", "see docs/node.md"),
@@ -331,6 +331,7 @@ REASONS: dict[str, Reason] = {
     "visit_lost": Reason(_NOTED, "a visit that contradicts itself or its place: its odometry alone is kept"),
     "not_condensed": Reason(_NOTED, "a keyframe that stays, for its edges or as too little is seen around it"),
     "held_keyframe": Reason(_NOTED, "a keyframe that stays: its map is frozen, or held by map.localize"),
+    "turned_over": Reason(_NOTED, "a map of ranges was its mirror image: odometry's turns are likelier the other way"),
     "cleared": Reason(_NOTED, "loop closures that ~/clear_closures took out"),
     "displaced": Reason(
         _NOTED,
@@ -359,9 +360,7 @@ REASONS: dict[str, Reason] = {
         "a landmark that is not known, while ranges or bearings contradict odometry: where the robot is, nobody knows",
         "give initialpose",
     ),
-    "quarantined": Reason(
-        _REFUSED, "the solver failed with these measurements and works without them", "graph_slam explain RUN"
-    ),
+    "quarantined": Reason(_REFUSED, "the solver works without these measurements only", "graph_slam explain RUN"),
     # -- the node and its solver
     "memory": Reason(_REFUSED, "a closure, while memory is short", "health.memory_mib"),
     "paused": Reason(_NOTED, "it came while the node was paused", "~/resume"),

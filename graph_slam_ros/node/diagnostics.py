@@ -244,8 +244,8 @@ def _faults(facts: Facts, config: Config) -> Iterator[str]:
         yield estimate.uncorrected
     if estimate and estimate.motion:
         yield estimate.motion
-    if estimate and estimate.rivals:
-        yield f"ambiguous: {estimate.rivals} loop closures that are not believed agree with one another as well"
+    if estimate and estimate.ambiguity:
+        yield estimate.ambiguity
     if estimate and health.chi2_per_dof and estimate.fit > health.chi2_per_dof:
         yield f"the measurements contradict each other: chi2 per degree of freedom is {estimate.fit:.1f}"
 

@@ -1,13 +1,13 @@
 """The estimate that the worker's thread publishes to the other threads."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
 
 from graph_slam_ros.graph.geometry import Geometry
-from graph_slam_ros.runs.outcome import VISITS, association_faults, condensed_text, visit_faults
+from graph_slam_ros.runs.outcome import VISITS, ambiguities, association_faults, condensed_text, visit_faults
 from graph_slam_ros.runs.tables import condensed_part
 from graph_slam_ros.slam import GraphSlam
 from graph_slam_ros.slam.calibration.uncorrected import Uncorrected
@@ -90,7 +90,7 @@ class Estimate:
     unseen : the way since a landmark was seen
     weakest_landmark : the landmark that is known least, with its weakest direction; empty where none is known
     fit : chi2 per degree of freedom; NaN before it was looked at
-    rivals : loop closures of other explanations that could not be ruled out
+    ambiguity : other explanations of the same measurements that could not be ruled out; empty where there is none
     displaced : that the landmarks say that the robot is elsewhere than odometry; empty where they do not
     association : why the association of sightings without identity is not to be believed; empty if it is
     condensed : which keyframes were condensed, or why none was in a long drive; empty in a short one
@@ -119,7 +119,6 @@ class Estimate:
     slowest_solve_s: float
     fit: float
     unseen: UnseenWay
-    rivals: int
     weakest_landmark: str = ""
     displaced: str = ""
     association: str = ""
@@ -127,6 +126,7 @@ class Estimate:
     visits: str = ""
     uncorrected: str = ""
     motion: str = ""
+    ambiguity: str = ""
     gyro: str = ""
     is_resumed: bool = False
     calibration: Mapping[str, str] = field(default_factory=dict)
@@ -181,13 +181,13 @@ class Estimate:
             fit=fit,
             unseen=unseen,
             weakest_landmark=weakest_landmark,
-            rivals=sum(len(rival.only_here) for rival in slam.backend.rivals),
             displaced=str(slam.displaced or ""),
             association="; ".join(association_faults(slam.association_report)),
             condensed=condensed_text(condensed_part(slam)),
             visits="; ".join(visit_faults({name: slam.counters["map", name] for name in VISITS})),
             uncorrected="; ".join(": ".join([str(one), *_settings(one)]) for one in slam.uncorrected_so_far),
             motion="; ".join(filter(None, (slam.gyro.fault if slam.gyro else "", slam.backend.odometries.doubted))),
+            ambiguity="; ".join(ambiguities([asdict(one) for one in slam.backend.rivals])),
             gyro=str(slam.gyro or ""),
             is_resumed=is_resumed,
             calibration=_calibration(slam.calibration_report, slam.contradicted),

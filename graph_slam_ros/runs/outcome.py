@@ -6,7 +6,7 @@ Both are made from ``run.json``. So they are the same for a live run, a replay a
 import shlex
 import textwrap
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
 from graph_slam_ros.measurements.reasons import Effect, Reason, explain, remedy
@@ -41,6 +41,10 @@ _ON_JUMP = "--set time.on_jump=segment goes on in the same map, reset in another
 _NOT_CONVERGED = (
     "the estimate is not at its optimum: --set solve.max_iterations=1000. If that does not help, measurements that are "
     "believed contradict each other: graph_slam explain RUN lists those that fit worst"
+)
+_MIRRORED = (
+    "ambiguous: the mirror image of this map explains its ranges as well: odometry's turns do not decide between the "
+    "two. Drive more turns, or add bearings, fixes or surveyed landmarks (landmarks.surveyed)"
 )
 _EXTREME = "distances or noise that no robot means do that: --set INPUT.max_distance_m=... or INPUT.noise=sigmas"
 
@@ -244,12 +248,28 @@ def association_faults(found: Mapping[str, Any]) -> Iterator[str]:
         yield f"sightings without identity: landmarks may still be two that are one (moves_left). {_CONFUSED}"
 
 
+def ambiguities(rivals: Collection[Mapping[str, Any]]) -> Iterator[str]:
+    """Yield other explanations of the measurements that could not be ruled out.
+
+    Parameters
+    ----------
+    rivals : ``Backend.rivals`` as dictionaries
+    """
+    if any(rival.get("is_mirror_image") for rival in rivals):
+        yield _MIRRORED
+    if count := sum(len(rival["only_here"]) for rival in rivals):
+        yield f"ambiguous: {count} loop closures that are not believed agree with one another as well"
+
+
 def doubts(summary: Summary) -> Iterator[str]:
     """Return a sentence for each input of which many measurements are rejected, or all motions left out.
 
     Also one where many visits of a condensed map contradict the others: what is left in the map was not better. And one
-    for each clock, mount or scale that is off so far that the covariances are too small.
+    for each clock, mount or scale that is off so far that the covariances are too small, and for each other explanation
+    of the measurements.
     """
+    for text in ambiguities(summary.get("rivals", ())):
+        yield f"{text} (graph_slam explain RUN)"
     yield from _uncorrected(summary)
     yield from visit_faults(summary["counters"].get("map", {}))
     for name, count in Counter(name.partition("#")[0] for name in summary.get("inputs", {})).items():

@@ -76,8 +76,7 @@ class SuggestedInputs:
 def suggestion_without_landmarks(path: Path, config: Config, odometry: str | None = None) -> Suggestion | None:
     """Return how to replay a recording that has no landmarks of the usual type, but others, or fixes.
 
-    None where it has, where other inputs are configured, where there is nothing else in it, or where it would be with
-    another odometry.
+    None where it has, where other inputs are configured, or where there is nothing else in it.
 
     Parameters
     ----------
@@ -96,9 +95,8 @@ def suggestion_without_landmarks(path: Path, config: Config, odometry: str | Non
             return None
     except BagError:  # which the replay says
         return None
-    found = Suggestion(bag, recording_of(bag), path)
-    is_other = odometry is not None and found.topics.get("odom") != odometry  # its frames are those of another
-    return None if found.trouble or len(found.names) < 2 or is_other else found
+    found = SuggestedInputs(bag, path, odometry=odometry).suggestion
+    return None if found.trouble or len(found.names) < 2 else found
 
 
 def unused_topics(path: Path, used: Collection[str]) -> list[str]:

@@ -21,7 +21,7 @@ from graph_slam_ros.slam.robust.background import Background, Work, run_when_ask
 from graph_slam_ros.slam.robust.displacement import DisplacementHypothesis
 from graph_slam_ros.slam.robust.gating import OutlierGate
 from graph_slam_ros.slam.robust.hypotheses import MIRRORED, Alternative, FrozenGraph, Outcome, search_alternatives
-from graph_slam_ros.slam.robust.ledger import FINAL, Ledger, Reason
+from graph_slam_ros.slam.robust.ledger import Ledger, Reason
 from graph_slam_ros.slam.robust.odometry_judge import OdometryJudge
 from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.solver import Report, Settings, Solver
@@ -50,7 +50,6 @@ class Backend:
     spares_memory : whether no second look is begun
     holds_back : whether what does not fit stays out, and verdicts stay as they are, until somebody has decided
     trusts_sightings : whether a new sighting that fits is believed; else it waits until it is compared with all else
-    rivals : other explanations of the same measurements that the last second look could not rule out
     edits : by hand, in order
     bounded : what has been condensed
     """
@@ -75,7 +74,7 @@ class Backend:
         self.edits, self.bounded = list(start.edits), start.bounded or BoundedState()
         self.odometries = OdometryJudge(config.odometry_gate, self.graph, self.solver, self.ledger, self._counters)
         self._background = Background(config, executor)
-        self.rivals: tuple[Alternative, ...] = ()
+        self._rivals: tuple[Alternative, ...] = ()
         self.spares_memory = self.holds_back = False
         self.trusts_sightings = True
         self._reviewed = 0  # the keyframe of the last review
@@ -90,6 +89,11 @@ class Backend:
     def ledger(self) -> Ledger:
         """The ledger of decisions on all edges."""
         return self.decisions.ledger
+
+    @property
+    def rivals(self) -> tuple[Alternative, ...]:
+        """Other explanations of the same measurements that the last second look could not rule out."""
+        return tuple(one for one in self._rivals if one.stands(self.graph, self.ledger))
 
     def restore(self, vertices: Sequence[int], values: Array, held: tuple[int, int] = (0, 0)) -> Report:
         """Solve all accepted edges of a loaded graph: some of its vertices, from given values.
@@ -162,6 +166,7 @@ class Backend:
             self.decisions.review(keyframe)
         outcome = self._guarded(lambda: self._background.outcome(keyframe))
         if outcome is not None and self._adopt(outcome, keyframe):
+            self.solver.start_at(outcome.carried_to(self.graph, self.solver.values))
             self.solver.optimize()
         self.solver.update()
         self._admit(keyframe)
@@ -184,8 +189,7 @@ class Backend:
             report = self.solver.optimize(settings)
         outcome = self._guarded(lambda: search_alternatives(self._config, self._frozen(keyframe, settings)))
         if outcome is not None:
-            self.rivals = self._standing(outcome.rivals)
-            self.decisions.adopt_verdicts(outcome.ledger, keyframe)
+            self._adopt(outcome, keyframe)
             self.solver.start_at(outcome.values)
             report = self.solver.optimize(settings)
         self._background.cancel(self.ledger.outside_count)
@@ -281,7 +285,7 @@ class Backend:
         self.frozen_edges = self.ledger.final
         self.odometries.forget()
         self.handed_over = self.graph.vertex_count, self.graph.edge_count
-        self.rivals = ()
+        self._rivals = ()
         self._background.cancel(self.ledger.outside_count)
 
     def cancel_search(self) -> None:
@@ -305,7 +309,6 @@ class Backend:
         """Remove edges permanently."""
         self.decisions.withdraw(edges, keyframe, reason)
         self._pending = [edge for edge in self._pending if edge not in edges]
-        self.rivals = self._standing(self.rivals)
 
     def split(
         self,
@@ -381,17 +384,11 @@ class Backend:
             return None
 
     def _adopt(self, outcome: Outcome, keyframe: int) -> bool:
-        """Use the outcome of a search. Returns whether it differs from the present verdicts."""
-        self.rivals = self._standing(outcome.rivals)
-        if not self.decisions.adopt_verdicts(outcome.ledger, keyframe) and outcome.start != MIRRORED:
-            return False
-        self.solver.start_at(outcome.carried_to(self.graph, self.solver.values))
-        return True
-
-    def _standing(self, rivals: Sequence[Alternative]) -> tuple[Alternative, ...]:
-        """Explanations of which no edge was withdrawn."""
-        reason = self.ledger.reason.values
-        return tuple(one for one in rivals if not np.isin(reason[list(one.only_here)], FINAL).any())
+        """Use the verdicts of a search. Returns whether it explains the measurements in another way than now."""
+        self._rivals = outcome.rivals
+        if is_turned := outcome.start == MIRRORED:
+            self._counters.count("map", "turned_over")
+        return self.decisions.adopt_verdicts(outcome.ledger, keyframe) or is_turned
 
     def _frozen(self, keyframe: int, settings: Settings) -> FrozenGraph:
         problem = self.graph.copy(), self.solver.vertices, self.solver.held, self.solver.values

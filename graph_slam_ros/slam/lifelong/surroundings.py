@@ -1,6 +1,6 @@
 """The edges on the keyframes of a visit, by what becomes of them when the visit is condensed."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 
@@ -9,9 +9,10 @@ import numpy as np
 from graph_slam_ros.graph import Edge, Graph
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.graph.losses import weight_and_cost
+from graph_slam_ros.graph.tables import EdgeTable
 from graph_slam_ros.slam.lifelong.elimination import product
 from graph_slam_ros.solver import Solver
-from graph_slam_ros.typing import Array, Index, Numbers
+from graph_slam_ros.typing import Array, Index, Mask, Numbers
 
 CLOSURES, FIXES, LANDMARKS = "closures", "fixes", "landmarks"  # labels
 CHAIN = "composed"  # label of edges that are composed of odometry
@@ -70,14 +71,14 @@ def surroundings(space: Geometry, solver: Solver, visit: Sequence[int], after: i
     graph, out = solver.graph, Surroundings()
     on_it = sorted({int(edge) for vertex in visit for edge in solver.edges_on(vertex)})
     edges = {number: edge for number in on_it if (edge := graph.edge(number)).weight}
-    members = set(visit)
+    members, seen = set(visit), _sightings(space, graph, on_it)
     for number, edge in edges.items():
         first, last = edge.vertices[0], edge.vertices[-1]
         if edge.label == CLOSURES and not members >= {first, last}:
             out.closures[number] = edge
         elif edge.label == FIXES:
             out.fixes[number] = edge
-        elif is_sighting(space, graph, edge):
+        elif number in seen:
             out.sightings[number] = edge
         elif edge.type is space.relative_pose:
             if members >= {first, last}:
@@ -109,16 +110,14 @@ def seen_from(space: Geometry, solver: Solver, keyframes: Index) -> list[set[int
     row_of = np.full(graph.vertex_count, -1)
     row_of[keyframes] = np.arange(len(keyframes))
     edges = np.unique(np.concatenate([solver.edges_on(vertex) for vertex in keyframes.tolist()]))
-    is_point = np.array([kind is space.point for kind in graph.kinds])
-    for code, table in enumerate(graph.tables.values()):
-        rows = graph.row_of_edge.values[edges[graph.table_of_edge.values[edges] == code]]
+    for table, rows in _tables_of(graph, edges):
         rows = rows[table.weight.values[rows] != 0.0]
         ends, numbers = table.vertices.values[rows], table.id.values[rows]
         is_fit = graph.has_label(numbers, (CLOSURES, FIXES))
         if table.type is space.relative_pose:
             is_fit |= graph.has_label(numbers, ("odometry", CHAIN))
         if ends.shape[1] == 2:
-            is_seen = graph.has_label(numbers, (LANDMARKS,)) | is_point[graph.kind.values[ends[:, 1]]]
+            is_seen = _is_sighting(space, graph, ends, numbers)
             is_fit |= is_seen
             for row, mark in zip(row_of[ends[is_seen, 0]].tolist(), ends[is_seen, 1].tolist(), strict=True):
                 if row >= 0 and (of_row := out[row]) is not None:
@@ -129,11 +128,25 @@ def seen_from(space: Geometry, solver: Solver, keyframes: Index) -> list[set[int
     return out
 
 
-def is_sighting(space: Geometry, graph: Graph, edge: Edge) -> bool:
-    """Return whether an edge is of a keyframe and a landmark: a point, or a pose that was seen."""
-    if len(edge.vertices) != 2:
-        return False
-    return edge.label == LANDMARKS or graph.kind_of(edge.vertices[1]) is space.point
+def _tables_of(graph: Graph, edges: Index) -> Iterator[tuple[EdgeTable, Index]]:
+    """Yield each table with its rows that these edges have."""
+    for code, table in enumerate(graph.tables.values()):
+        yield table, graph.row_of_edge.values[edges[graph.table_of_edge.values[edges] == code]]
+
+
+def _is_sighting(space: Geometry, graph: Graph, ends: Index, edges: Index) -> Mask:
+    """Return which edges (n) with two ends (n, 2) are of a keyframe and a landmark: a point, or a seen pose."""
+    is_point = np.array([kind is space.point for kind in graph.kinds])
+    return graph.has_label(edges, (LANDMARKS,)) | is_point[graph.kind.values[ends[:, 1]]]
+
+
+def _sightings(space: Geometry, graph: Graph, edges: Sequence[int]) -> set[int]:
+    out = set[int]()
+    for table, rows in _tables_of(graph, np.array(edges, dtype=np.int64)):
+        ends, numbers = table.vertices.values[rows], table.id.values[rows]
+        if ends.shape[1] == 2:
+            out.update(numbers[_is_sighting(space, graph, ends, numbers)].tolist())
+    return out
 
 
 def motion_of(edge: Edge, factor: float | None = None) -> Motion:

@@ -17,7 +17,7 @@ from graph_slam_ros.config.robust import RobustConfig
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import GROUPS, SE2, Graph, Loss
 from graph_slam_ros.slam.robust.gating import OutlierGate
-from graph_slam_ros.slam.robust.ledger import Ledger
+from graph_slam_ros.slam.robust.ledger import FINAL, Ledger
 from graph_slam_ros.slam.robust.mirrored import is_of_ranges, mirror_images
 from graph_slam_ros.slam.robust.pairwise_consistency import consistent_groups
 from graph_slam_ros.solver import Settings, Solver
@@ -27,7 +27,8 @@ _ITERATIONS = 20  # of each stage of the losses, from another start
 _HOPELESS = 2.0  # times the least cost that was found: another explanation is none
 _SAME = 1e-4  # of a cost, that one explanation may differ by from itself: solves end a little off the optimum
 MIRRORED = "mirrored"  # a start
-_LIKELIER = 9.0  # of the cost: by so much a mirror image must be likelier
+_LIKELIER = 9.0  # of the cost: by so much a mirror image must be likelier, and by so much less the other is ruled out
+_OTHER = 0.1  # m: another image differs by more, somewhere
 _STORY = 5  # closures that agree with one another and not with the map
 
 
@@ -60,12 +61,20 @@ class Alternative:
     ----------
     cost, best_cost : truncated cost of this one, and of the one that is believed
     only_here, only_there : closures that this one believes and the other does not, and the other way round
+    is_mirror_image : whether it is the mirror image of a map of ranges
     """
 
     cost: float
     best_cost: float
-    only_here: tuple[int, ...]
-    only_there: tuple[int, ...]
+    only_here: tuple[int, ...] = ()
+    only_there: tuple[int, ...] = ()
+    is_mirror_image: bool = False
+
+    def stands(self, graph: Graph, ledger: Ledger) -> bool:
+        """Return whether it is still possible: none of its edges was withdrawn, or only ranges tell the sides."""
+        if self.is_mirror_image:
+            return is_of_ranges(graph)
+        return not np.isin(ledger.reason.values[list(self.only_here)], FINAL).any()
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,8 +137,10 @@ def search_alternatives(config: RobustConfig, frozen: FrozenGraph, wanted: Cance
 
 
 def _rival(one: Outcome, best: Outcome) -> Alternative | None:
-    """Another explanation as an alternative to the best, if a whole group of closures differs."""
+    """Another explanation as an alternative to the best, if a whole group of closures differs, or all is mirrored."""
     graph = best.frozen.graph
+    if MIRRORED in (one.start, best.start) and np.abs(one.values - best.values).max() > _OTHER:
+        return Alternative(one.cost, best.cost, is_mirror_image=True) if one.cost < best.cost + _LIKELIER else None
     here, there = (outcome.ledger.inside for outcome in (one, best))
     only_here, only_there = np.setdiff1d(here, there), np.setdiff1d(there, here)
     is_story = np.count_nonzero(graph.has_label(only_here, ("closures",))) >= _STORY

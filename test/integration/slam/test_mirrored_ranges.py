@@ -1,11 +1,13 @@
 """A map of ranges that is the mirror image of the truth is turned over: odometry's turns say that it is likelier so."""
 
+from dataclasses import asdict
 from itertools import combinations
 
 import numpy as np
 import pytest
 from reliability import times
 
+from graph_slam_ros.runs.outcome import ambiguities
 from graph_slam_ros.simulation import measurements, simulate
 from graph_slam_ros.slam import Config, Control, GraphSlam
 from graph_slam_ros.slam.robust import background
@@ -71,6 +73,22 @@ def test_a_mirror_image_has_the_same_ranges_and_turns_the_other_way(world, optio
         first = graph.vertex(int(slam.keyframes.ids[0])).stored
         assert np.allclose(image[first], values[first])
         assert any(np.allclose(again, values) for again in mirror_images(graph, image))
+
+
+def test_where_odometry_does_not_decide_the_map_is_called_ambiguous():
+    """Of the first keyframes both images fit; later turns decide, and nothing is said any more."""
+    recording, slam, said = simulate("pythonrobotics", seed=10, sensor="range"), GraphSlam(Config()), []
+    for m in [*measurements(recording), Control("end"), Control("optimize")]:
+        slam.process(m)
+        said.append(list(ambiguities([asdict(rival) for rival in slam.backend.rivals])))
+    assert any("mirror image" in text for text, *_ in filter(None, said))
+    assert not said[-1]
+
+
+def test_turning_over_is_counted():
+    slam, _ = driven("pythonrobotics", 3, {}, {})
+    slam.process(Control("optimize"))
+    assert slam.counters["map", "turned_over"] == 1
 
 
 def test_only_ranges_and_odometry_are_mirrored():
