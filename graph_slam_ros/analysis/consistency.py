@@ -17,6 +17,7 @@ from graph_slam_ros.slam import Config
 from graph_slam_ros.slam.noise_scale import NoiseScale
 from graph_slam_ros.typing import Array
 
+_TINY = 1e-300  # m
 _PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
 _BAND = (0.025, 0.975)
 _ESTIMATED = "robust.noise_scale=estimated"
@@ -183,6 +184,9 @@ def landmark_errors(
 ) -> tuple[Array, Array]:
     """Errors (m, d) of landmarks' positions in the axes of map, and their covariances (m, d, d), as ``pose_errors``.
 
+    An error is measured along the arc around the first pose. To the first order that is the difference of positions.
+    It stays right where the first orientation is known badly: what that turns lies on an arc, not on a line.
+
     Parameters
     ----------
     positions, truth : (m, 3) in map and in world, of the latter NaN where unknown
@@ -197,7 +201,18 @@ def landmark_errors(
         seen = se3.act(se3.inverse(tuple(first)), tuple(position))
         by_first = turn @ np.hstack([np.eye(3), -so3.hat(tuple(map(float, seen)))])
         relative[k] = (covariances[k] - by_first @ inherited @ by_first.T)[:dimensions, :dimensions]
-    return (true - positions)[:, :dimensions], relative
+    return _along_arcs(positions - first[:3], true - first[:3])[:, :dimensions], relative
+
+
+def _along_arcs(estimate: Array, truth: Array) -> Array:
+    """Errors (m, 3) from points to true ones (m, 3): of their distance from 0, and along the arc around it."""
+    far, true_far = (np.linalg.norm(points, axis=1, keepdims=True) for points in (estimate, truth))
+    ahead = estimate / np.maximum(far, _TINY)
+    along = np.sum(truth * ahead, axis=1, keepdims=True)
+    aside = truth - along * ahead
+    width = np.linalg.norm(aside, axis=1, keepdims=True)
+    arc = far * np.arctan2(width, along) * aside / np.maximum(width, _TINY)
+    return np.where(far > _TINY, (true_far - far) * ahead + arc, truth)
 
 
 def over_confidence(last_pose: Nees | None, poses: Nees | None, landmarks: Nees | None) -> str:

@@ -8,7 +8,7 @@ import pytest
 from reliability import times
 from scipy.stats import chi2
 
-from graph_slam_ros.analysis.consistency import Nees, landmark_nees, pose_nees
+from graph_slam_ros.analysis.consistency import Nees, landmark_errors, landmark_nees, pose_nees
 from graph_slam_ros.analysis.evaluation import evaluate
 from graph_slam_ros.analysis.path_error import interpolated
 from graph_slam_ros.analysis.relative_covariance import RelativeCovariances
@@ -75,7 +75,7 @@ def test_poses_and_landmarks_are_compared_from_the_first_pose_on_wherever_the_ma
     assert axes == pytest.approx(np.eye(dof))
     size = dof // 2 + (dof == 3)
     spot = np.zeros((3, 3))
-    spot[:size, :size] = spread(rng, size)
+    spot[:size, :size] = 1e-6 * spread(rng, size)
     turned, h = [], 1e-6
     for e in np.eye(dof):
         ends = [group.compose(group.retract(first, tuple(h * sign * e)), step)[:size] for sign in (1, -1)]
@@ -90,7 +90,23 @@ def test_poses_and_landmarks_are_compared_from_the_first_pose_on_wherever_the_ma
     landmarks = landmark_nees(at, true_at, np.tile(spot + inherited, (n, 1, 1)), estimate[0], truth[0], anchor)
     assert (landmarks.n, landmarks.dof) == (n, size)
     whitened = np.einsum("ni,ni->n", off[:, :size], np.linalg.solve(spot[:size, :size], off[:, :size].T).T)
-    assert landmarks.mean == pytest.approx(whitened.mean(), rel=1e-6)
+    assert landmarks.mean == pytest.approx(whitened.mean(), rel=1e-2)
+
+
+@pytest.mark.parametrize("heading", [0.1, 1.0])
+def test_landmarks_that_a_wrong_first_heading_turns_away_are_off_by_as_much_as_that(heading):
+    """Far landmarks lie on an arc, and not on the line that their covariance is long in."""
+    sigma, at = 0.5, np.array([[10.0, 0.0, 0.0], [0.0, 20.0, 0.0], [0.0, 0.0, 0.0]])
+    across = [np.array([-y, x]) for x, y, _ in at]
+    covariances = np.zeros((3, 3, 3))
+    covariances[:, :2, :2] = [sigma**2 * np.outer(one, one) + 1e-4 * np.eye(2) for one in across]
+    truth = np.stack(se2.act((0.0, 0.0, heading), tuple(at[:, :2].T)), axis=1)
+    truth = np.column_stack([truth, [0.0, 0.0, 0.0]])
+    truth[2, 0] = 0.02
+    first = np.array(se3.IDENTITY)
+    errors, relative = landmark_errors(at, truth, covariances, first, first, np.zeros((3, 3)))
+    found = [e @ np.linalg.solve(c, e) for e, c in zip(errors, relative, strict=True)]
+    assert found == pytest.approx([(heading / sigma) ** 2, (heading / sigma) ** 2, 4.0], rel=1e-4)
 
 
 def test_without_the_truth_of_the_first_pose_nothing_is_said_of_poses():
