@@ -114,9 +114,9 @@ BUGS = (
         "one landmark by bearing alone makes the whole problem singular",
         (
             Change(
-                "slam/landmarks/landmark_map.py",
-                "Landmarks._why_not",
-                "return '' if places else original(self, places, glances)",
+                "slam/landmarks/determination.py",
+                "why_undetermined",
+                "return '' if candidate.places else original(config, space, solver, candidate, glances)",
             ),
         ),
         ("test_pipeline_kinds.py::test_G3_a_landmark_seen_by_bearing_from_one_place_waits_and_says_why",),

@@ -149,6 +149,10 @@ class Problem:
         """Ids of the vertices that stay at their values."""
         return np.flatnonzero(self._held)
 
+    def has(self, vertex: int) -> bool:
+        """Return whether a vertex is part of the problem."""
+        return vertex < len(self._inside) and bool(self._inside[vertex])
+
     def is_held(self, vertex: int) -> bool:
         """Return whether a vertex stays at its value."""
         return vertex < len(self._held) and bool(self._held[vertex])

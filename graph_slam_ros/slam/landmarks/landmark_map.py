@@ -17,8 +17,9 @@ from graph_slam_ros.slam.frontend.motion_compensation import KeyframeMeasurement
 from graph_slam_ros.slam.frontend.noise_factors import NoiseScales
 from graph_slam_ros.slam.frontend.sighting_edges import SightingEdges
 from graph_slam_ros.slam.landmarks import triangulation
+from graph_slam_ros.slam.landmarks.determination import why_undetermined
 from graph_slam_ros.slam.landmarks.landmark import Landmark, LandmarkEdge, UndeterminedLandmark
-from graph_slam_ros.slam.landmarks.triangulation import PartialObservation, PositionHypothesis
+from graph_slam_ros.slam.landmarks.triangulation import PartialObservation
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Index, Numbers
 
@@ -348,33 +349,13 @@ class Landmarks:
             covariance = motion_compensation.as_matrix(s.covariance) + LEAST_RAD2 * np.eye(len(s.measured))
             glances.append(PartialObservation(self._sensor_pose(s, where), s.kind, s.measured, covariance))
         candidate.places = triangulation.places(self._space, glances, self._config.landmarks.range_offset_sigma_m)
-        candidate.reason = self._why_not(candidate.places, glances)
+        candidate.reason = why_undetermined(self._config.landmarks, self._space, self._solver, candidate, glances)
         if not candidate.reason:
             del self.undetermined[name]
             at = tuple(candidate.places[0].position.tolist())
             landmark = self.known[name] = Landmark(name, self._graph.add_vertex(self._space.point, at))
             for where, s in candidate.seen:
                 self._add_edge(candidate.topic, landmark, s, where)
-
-    def _why_not(self, places: list[PositionHypothesis], glances: list[PartialObservation]) -> str:
-        """Return why a landmark is not determined; empty if it is."""
-        settings, count = self._config.landmarks, len(glances)
-        if count <= self._space.dimensions - (glances[0].kind != "range"):
-            return f"{count} {'sightings' if count > 1 else 'sighting'} by {glances[0].kind}: too few"
-        if not places:
-            return f"no place fits {count} sightings by {glances[0].kind}"
-        best = places[0]
-        others = [p for p in places[1:] if p.chi2 < best.chi2 + settings.mirror_chi2]
-        if others:
-            fits = " and ".join("(" + ", ".join(f"{x:.2f}" for x in p.position) + ")" for p in [best, *others[:2]])
-            return f"{1 + len(others)} places fit: {fits}"
-        n = self._space.dimensions
-        distance = min(float(np.linalg.norm(best.position - np.array(g.T_map_sensor[:n]))) for g in glances)
-        is_finite = np.isfinite(best.covariance).all()
-        sigma = float(np.sqrt(np.linalg.eigvalsh(best.covariance)[-1])) if is_finite else np.inf
-        if sigma > settings.determined_below * distance:
-            return f"sigma {sigma:.2f} m at {distance:.2f} m: more than {settings.determined_below:g} of the distance"
-        return ""
 
     # -- where things are ----------------------------------------------------------------------------------------
 

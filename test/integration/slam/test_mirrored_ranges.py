@@ -15,7 +15,7 @@ from graph_slam_ros.slam.robust.mirrored import is_of_ranges, mirror_images
 
 KINDS = [  # the sensor of the second is ahead of the base, so its ranges are only nearly the same
     ("pythonrobotics", {}, {}, 1e-6),
-    ("flight", {"laps": 1}, {"world.dimensions": 3}, 3.0),
+    ("flight", {"laps": 1}, {"world.dimensions": 3}, 4.0),
 ]
 
 
@@ -86,7 +86,7 @@ def test_where_odometry_does_not_decide_the_map_is_called_ambiguous():
 
 
 def test_turning_over_is_counted():
-    slam, _ = driven("pythonrobotics", 3, {}, {})
+    slam, _ = driven("pythonrobotics", 20, {}, {})
     slam.process(Control("optimize"))
     assert slam.counters["map", "turned_over"] == 1
 
