@@ -205,7 +205,7 @@ def shortcomings(summary: Summary) -> Iterator[str]:
         counted = _counted(summary, name, Effect.REFUSED)
         refused = sum(counted.values())
         is_odometry = counts["use"] in _MOTION
-        if not counts["used"] and counts["use"] != "odometry":
+        if not counts["used"] and (counts["use"] != "odometry" or counts["received"] == 0):
             yield _unused(summary, name, counts["received"])
         elif refused > _MOSTLY * (refused + counts["used"]):
             yield f"{name}: most of it was refused: {_because(name, counted)}"

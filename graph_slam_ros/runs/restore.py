@@ -29,6 +29,9 @@ from graph_slam_ros.warmup import warmup
 
 Summary = dict[str, Any]
 _NOTHING_LEAVES = {"map.condense": False}  # what left while a map is made again would be in no file
+_OF_RECORDING = ("recording", "parts", "recorded", "unprocessed", "load", "check")
+"""Keys of a summary that a repeated computation does not change."""
+
 Stopwatch = Callable[[], dict[str, float]]
 
 
@@ -233,9 +236,9 @@ def complete(folder: Path) -> Summary:
         with claimed(folder):
             before, counters = summary_of(folder), Counters()
             slam = restored_and_solved(folder, losses, counters)
-            summary = (
-                before | summarize(slam, counters) | took() | {"losses": losses, "ended": True, "is_incomplete": False}
-            )
+            kept = {key: before[key] for key in _OF_RECORDING if key in before}
+            now = summarize(slam, counters) | fitted_summary(slam) | took()
+            summary = kept | now | {"losses": losses, "ended": True, "is_incomplete": False}
             save_results(folder, slam, summary)
     except OSError as error:
         raise RunError(f"{error.filename or folder}: {error.strerror}") from None

@@ -43,7 +43,11 @@ class SuggestedInputs:
         odometry: str | None = None,
         landmarks: str | None = None,
     ) -> None:
-        given, self._bag, self._odometry, self._landmarks = given or {}, bag, odometry, landmarks
+        given = given or {}
+        self._bag, self._has_names = bag, "inputs.names" in given
+        if not self._has_names:
+            odometry, landmarks = odometry or _topic_of(given, "odom"), landmarks or _topic_of(given, "detections")
+        self._odometry, self._landmarks = odometry, landmarks
         self.recording = recording_of(bag)
         topics = dict(self.recording.topics)
         if odometry in topics:
@@ -52,7 +56,7 @@ class SuggestedInputs:
         if landmarks in topics:
             topics = {n: one for n, one in topics.items() if n == landmarks or one.topic.type not in OF_LANDMARKS}
         self.suggestion = Suggestion(bag, replace(self.recording, topics=topics), path)
-        is_suggested = not self.suggestion.trouble and "inputs.names" not in given
+        is_suggested = not self.suggestion.trouble and not self._has_names
         suggested = self.suggestion.settings if is_suggested else {}
         self.assumed = {name: value for name, value in suggested.items() if name not in given}
         self.settings = self.assumed | dict(given)
@@ -69,8 +73,16 @@ class SuggestedInputs:
         return choose_inputs(self._bag, config, odometry, self._landmarks or landmarks)
 
     def _topic(self, name: str, config: Config) -> str | None:
-        is_used = not self.suggestion.trouble and any(one.name == name and one.use != "none" for one in config.sources)
+        if self._has_names or self.suggestion.trouble:
+            return None
+        is_used = any(one.name == name and one.use != "none" for one in config.sources)
         return self.suggestion.topics.get(name) if is_used else None
+
+
+def _topic_of(given: Mapping[str, Any], name: str) -> str | None:
+    """The topic that somebody has given an input, with its slash."""
+    topic = given.get(f"{name}.topic")
+    return None if topic is None else f"/{str(topic).lstrip('/')}"
 
 
 def suggestion_without_landmarks(path: Path, config: Config, odometry: str | None = None) -> Suggestion | None:

@@ -87,7 +87,7 @@ class Calibrator:
         self._due, self._steady = FIRST_DUE, 0
         self._job: Trial | None = None
         self._apply_at = 0  # the keyframe
-        self._first_keyframe = 0 if start is None else len(start.keyframes)  # of what is driven now
+        self._first_keyframe = 0 if start is None else start.keyframe_count  # of what is driven now
         self._windows = DriftWindows(config.calibrate.drift, backend.graph.edge_count, self._first_keyframe)
         if start is not None:
             frontend.corrections.restore(start.calibration)
@@ -202,8 +202,9 @@ class Calibrator:
                 report = self._without_slips(everything) or report
         for one in findings:
             self.findings[one.parameter] = one
-        edges, stamps_ns = self._backend.graph.edge_count, self._frontend.path.keyframes.stamps_ns
-        self._windows.close_if_full(keyframe, stamps_ns, edges, findings, self._frontend.corrections.lines())
+        edges, keyframes = self._backend.graph.edge_count, self._frontend.path.keyframes
+        settings = self._frontend.corrections.lines()
+        self._windows.close_if_full(keyframe, keyframes.stamps_ns, edges, findings, settings, keyframes.first)
         return report
 
     def _decided(self, found: TrialFit, corrected: Collection[Parameter], sigma_per_m: float) -> list[Finding]:

@@ -152,8 +152,9 @@ class KidnapDetector:
         self._slips.begin(stamp_ns)
         self._splits.clear()
         self._refuted.clear()
-        if (now := self.now) is not None and now.segment is None:
-            self.alarms[-1] = replace(now, ended_ns=stamp_ns, outcome="then a segment began")
+        if (now := self.now) is not None:
+            outcome = "then a segment began" if now.segment is None else now.outcome
+            self.alarms[-1] = replace(now, ended_ns=max(stamp_ns, now.began_ns), outcome=outcome)
             self._protect()
 
     def add(self, count: int, stamp_ns: int, keyframes: StampedPoses[Keyframe]) -> None:
@@ -294,9 +295,8 @@ class KidnapDetector:
 
     def _is_calm(self, now: Alarm, stamp_ns: int) -> bool:
         """Return whether the alarm may end: where it was decided, the landmarks must have agreed for a while."""
-        if now.segment is not None and (stamp_ns - now.began_ns) * 1e-9 < _CALM_S:
-            return False
-        return self._monitor.is_calm
+        is_early = now.segment is not None and (stamp_ns - now.began_ns) * 1e-9 < _CALM_S
+        return self._monitor.is_calm and not is_early
 
     def _decide(self, found: DisplacementHypothesis, keyframes: StampedPoses[Keyframe], stamp_ns: int) -> None:
         """Begin a segment where the landmarks say that the robot is."""

@@ -110,13 +110,14 @@ class SlipDetector:
 
     def begin(self, stamp_ns: int, vertex: int | None = None) -> None:
         """Begin a segment, by default at the next keyframe: earlier odometry is not examined any more."""
+        last_ns = self._links[-1].stamps_ns[1] if self._links else stamp_ns  # of the segment that ends
         self._links = deque(
             (one for one in self._links if vertex is not None and one.vertices[0] >= vertex), _MOST_EDGES
         )
         self._views = deque((one for one in self._views if vertex is not None and one.vertex >= vertex), _VIEWS + 1)
         self._new = [edge for edge in self._new if any(edge in view.edges for view in self._views)]
         if (now := self.now) is not None:
-            self.slips[-1] = replace(now, ended_ns=stamp_ns)
+            self.slips[-1] = replace(now, ended_ns=stamp_ns if stamp_ns >= now.began_ns else last_ns)
             self._doubt(stamp_ns, None)
 
     def add_odometry(self, edge: int, vertices: Sequence[int], stamps_ns: tuple[int, int], keyframe: int) -> None:

@@ -58,19 +58,20 @@ class DriftWindows:
         edges: int,
         findings: list[Finding],
         settings: dict[str, float | str],
+        first: int = 0,
     ) -> None:
         """Begin a window after a keyframe, if the newest has enough of them.
 
         Parameters
         ----------
-        stamps_ns : (n,) of all keyframes
+        stamps_ns : (n,) of the keyframes in the map, of which the first has the number ``first``
         edges : of the graph
         findings, settings : of the trial, and what is corrected with it
         """
         if not self.drifts or keyframe + 1 - self._first_keyframe < WINDOW:
             return
         self.closed.append((self._first_keyframe, settings))
-        self._before_ns = int(stamps_ns[self._first_keyframe])
+        self._before_ns = int(stamps_ns[max(self._first_keyframe - first, 0)])
         self._first_keyframe, self.first_edge = keyframe + 1, edges
         for one in findings:
             unused = 0.0 if one.verdict == "admitted" else one.value

@@ -19,7 +19,7 @@ from graph_slam_ros.graph import GROUPS, SE2, Graph, Loss
 from graph_slam_ros.slam.robust.gating import OutlierGate
 from graph_slam_ros.slam.robust.ledger import FINAL, Ledger
 from graph_slam_ros.slam.robust.mirrored import is_of_ranges, mirror_images
-from graph_slam_ros.slam.robust.pairwise_consistency import consistent_groups
+from graph_slam_ros.slam.robust.pairwise_consistency import consistent_groups, odometry_in_use
 from graph_slam_ros.solver import Settings, Solver
 from graph_slam_ros.typing import Array, Index
 
@@ -264,7 +264,7 @@ def _cost(solver: Solver, ledger: Ledger) -> float:
 def _along_odometry(graph: Graph, values: Array, held: set[int]) -> Array:
     """Return the path by odometry alone. Landmarks and fixed vertices stay where they are."""
     out = values.copy()
-    for edge in graph.edges_of("odometry").tolist():
+    for edge in odometry_in_use(graph).tolist():
         one = graph.edge(edge)
         last, new = (graph.vertex(v) for v in one.vertices)
         if new.id not in held:

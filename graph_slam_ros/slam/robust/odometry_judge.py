@@ -304,8 +304,9 @@ class OdometryJudge:
 
     def _weigh(self, one: Contradiction, *, trusts_used: bool) -> None:
         for pair in one.pairs:
-            self._solver.set_weight(pair.used, float(trusts_used))
-            self._solver.set_weight(pair.other, float(not trusts_used))
+            for edge, is_in in ((pair.used, trusts_used), (pair.other, not trusts_used)):
+                if self._ledger.verdict_of(edge) is not Verdict.REJECTED or self._is_contradicted(edge):
+                    self._solver.set_weight(edge, float(is_in))
 
     def _apply(self, one: Contradiction, keyframe: int) -> None:
         """Have the ledger and the weights say what is believed."""
@@ -322,6 +323,10 @@ class OdometryJudge:
         self._ledger.note(edge, keyframe, Verdict.REJECTED, reason, statistic, limit)
         source, is_alike = self._graph.source_of(edge), reason is Reason.WITHDRAWN
         self._counters.count(source, "odometry_alike" if is_alike else "odometry_contradicted")
+
+    def _is_contradicted(self, edge: int) -> bool:
+        """Return whether an edge is out because of another odometry, and not as a slip or by hand."""
+        return bool(self._ledger.reason.values.item(edge) == Reason.CONTRADICTED)
 
     def _include(self, edge: int, keyframe: int, statistic: float, after: Reason = Reason.CONTRADICTED) -> None:
         if self._ledger.verdict_of(edge) is Verdict.REJECTED and self._ledger.reason.values.item(edge) == after:

@@ -66,10 +66,22 @@ def consistent_groups(graph: Graph, values: Array, closures: Index, limits: Arra
     return [closures[some[group_of[some] == one]] for one in np.unique(group_of[some])]
 
 
-def _along_odometry(graph: Graph, table: EdgeTable) -> tuple[Index, Array]:
-    """The place of each vertex along odometry, -1 if none; and for each place the noise of all steps before it."""
+def odometry_in_use(graph: Graph) -> Index:
+    """Return one edge of odometry to each keyframe, in order: where several lead there, the newest with weight."""
+    table = graph.tables.get(RELATIVE_POSE if SE2 in graph.kinds else RELATIVE_POSE_3D)
+    if table is None:
+        return np.empty(0, dtype=np.int64)
     code = graph.labels.index("odometry") if "odometry" in graph.labels else -1
     rows = np.flatnonzero(table.label.values == code)
+    to, weight = table.vertices.values[rows, 1], table.weight.values[rows]
+    rows = rows[np.lexsort((rows, weight > 0.0, to))]
+    to = table.vertices.values[rows, 1]
+    return table.id.values[rows[np.append(to[1:] != to[:-1], True)]] if len(rows) else rows
+
+
+def _along_odometry(graph: Graph, table: EdgeTable) -> tuple[Index, Array]:
+    """The place of each vertex along odometry, -1 if none; and for each place the noise of all steps before it."""
+    rows = graph.row_of_edge.values[odometry_in_use(graph)]
     order = np.full(graph.vertex_count, -1)
     vertices = table.at(rows).vertices
     order[vertices[:, 0]] = np.arange(len(rows))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from condensed_run import SEED, condensed_run
 
-from benchmarks.hall import config, hall, rms
+from benchmarks.hall import STEP_S, config, hall, measurements, rms
 from graph_slam_ros.analysis.run_consistency import consistency_of
 from graph_slam_ros.analysis.trajectories import Truth
 from graph_slam_ros.analysis.what_if import SavedGraph
@@ -26,8 +26,10 @@ from graph_slam_ros.runs.condensed_map import condensed_record, read_condensed
 from graph_slam_ros.runs.folder import run_config
 from graph_slam_ros.runs.journal import read_measurements
 from graph_slam_ros.runs.map_journal import read_map
-from graph_slam_ros.runs.restore import freeze, record_run, recover
+from graph_slam_ros.runs.restore import freeze, map_of, record_run, recover
 from graph_slam_ros.runs.trajectory import Trajectory, read_tum
+from graph_slam_ros.slam import GraphSlam
+from graph_slam_ros.slam.calibrator import Calibrator
 from graph_slam_ros.view.workbench import Workbench
 
 BASE = {"who": "a test", "when": "2026-01-01T00:00:00Z", "why": "to try it"}
@@ -268,3 +270,26 @@ def test_a_drive_in_a_frozen_map_is_condensed_and_the_map_stays(two, tmp_path, n
     )
     assert again.first_keyframe == slam.first_keyframe
     assert (tmp_path / "again" / "path.tum").read_bytes() == (tmp_path / "on" / "path.tum").read_bytes()
+
+
+@pytest.mark.parametrize("drift", [0.0, 1.0])
+def test_calibration_counts_the_keyframes_of_the_new_drive(tmp_path, monkeypatch, drift):
+    """Keyframes that have left the map are none of them."""
+    folder, *_ = condensed_run(tmp_path / "run", part=slice(0, 500), longest=730)
+    start, due, trial = map_of(folder, []), [], Calibrator._trial
+    assert start.first_keyframe > 200
+    settings = {"map_condense": True, "map_window_keyframes": 60, "calibrate_groups": "auto", "calibrate_drift": drift}
+    slam = GraphSlam(config(PLANAR, **settings), start=start)
+    before = len(slam.keyframes)
+
+    def noted(self, *given):
+        due.append(len(slam.keyframes) - before)
+        return trial(self, *given)
+
+    monkeypatch.setattr(Calibrator, "_trial", noted)
+    drive = list(measurements(hall(SEED, 730)))
+    for m in drive:
+        if m.stamp_ns >= drive[0].stamp_ns + round(500 * STEP_S * 1e9):
+            slam.process(m)
+    assert due[:2] == [50, 100]
+    assert "solver" not in slam.counters.as_dict()

@@ -22,6 +22,7 @@ from graph_slam_ros.recordings.bag import BagError, BagWriter, open_bag
 from graph_slam_ros.runs.chosen_inputs import choose_inputs
 from graph_slam_ros.runs.journal import read_ingest
 from graph_slam_ros.runs.replay import replay
+from graph_slam_ros.runs.suggested_inputs import SuggestedInputs
 from graph_slam_ros.slam import Config, Fix, Odometry, Sightings
 
 TF = "tf2_msgs/msg/TFMessage"
@@ -204,3 +205,21 @@ def test_the_page_of_inputs_has_a_row_for_every_type_with_what_it_becomes_and_it
         (tmp_path / "example.yaml").write_text(whole)
         configs.append(Config.from_mapping(read_parameters(tmp_path / "example.yaml")))
     assert uses(configs[0]) == {"odom": "odometry", "detections": "landmarks", "gps": "fix", "tags": "landmarks"}
+
+
+def test_check_and_calibrate_read_the_topics_that_a_replay_reads(tmp_path):
+    """A suggestion never comes before a topic that somebody has given."""
+    path = tmp_path / "a.mcap"
+    with BagWriter(path) as bag:
+        for k in range(20):
+            for topic in ("/odom", "/wheel/odom"):
+                stamp_ns = STAMP_NS + k * 10**8
+                bag.write(topic, "nav_msgs/msg/Odometry", stamp_ns, odometry(pose(0.1 * k), stamp_ns=stamp_ns))
+    bag = open_bag(path)
+    names = {"inputs.names": "wheels odom", "wheels.type": "nav_msgs/msg/Odometry", "wheels.topic": "wheel/odom"}
+    for given in ({"odom.topic": "wheel/odom"}, {"odom.topic": "/wheel/odom"}, names | {"odom.topic": "/odom"}):
+        suggested = SuggestedInputs(bag, path, given)
+        expected = choose_inputs(bag, Config.from_mapping(given)).topics
+        assert suggested.inputs(Config.from_mapping(suggested.settings)).topics == expected
+    with pytest.raises(BagError, match="no topic /nothing"):
+        SuggestedInputs(bag, path, {"odom.topic": "/nothing"}).inputs(Config.from_mapping({"odom.topic": "/nothing"}))

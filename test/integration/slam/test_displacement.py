@@ -12,6 +12,7 @@ from graph_slam_ros.measurements.types import InitialPose
 from graph_slam_ros.runs.restore import map_of, record_run
 from graph_slam_ros.simulation import Fault, faulty_recording, measurements, simulate
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry
+from graph_slam_ros.slam.alarm import Alarm
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict
 from graph_slam_ros.slam.snapshot import MapSnapshot
 
@@ -258,3 +259,14 @@ def test_drift_that_the_stated_noise_explains_is_no_displacement_though_odometry
     assert slam.backend.decisions.gate_scale < 0.2 * slam.backend.decisions.stated_scale
     assert not slam.alarms
     assert not slam.ledger.outside_count
+
+
+def test_an_alarm_ends_where_the_clock_jumps_back():
+    """What was decided then is no alarm of the next drive: it would hold condensing back until the old time returns."""
+    slam = GraphSlam(Config())
+    detector = slam._kidnaps
+    detector.alarms.append(Alarm(100 * 10**9, 12, segment=3, distance_m=5.0))
+    detector.begin_segment(7, 5 * 10**9)
+    assert detector.now is None
+    assert detector.is_quiet
+    assert detector.alarms[-1].ended_ns == 100 * 10**9

@@ -80,3 +80,9 @@ def test_several_odometries_on_one_topic_are_said_and_a_remedy_names_the_input()
     assert not list(doubts(summary({})))
     (jumps,) = shortcomings(summary({"odom": {"jump": 40}, "odom#2": {"jump": 9}}, **{"odom#2": ODOMETRY}))
     assert jumps.startswith("odom: 49 jumps")
+
+
+def test_an_odometry_without_any_message_is_one_and_a_spare_one_is_none():
+    silent = {"use": "odometry", "received": 0, "used": 0, "believed": None}
+    assert [*shortcomings(summary({}, vo=silent))] == ["vo: no message came"]
+    assert not [*shortcomings(summary({}, vo=silent | {"received": 90}))]

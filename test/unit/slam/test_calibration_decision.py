@@ -109,3 +109,10 @@ def test_the_factors_of_an_association_are_used_by_default_where_there_is_one():
         assert not Config.from_mapping({"landmarks.association": "joint"} | other).uses_found_factors
     with pytest.raises(ConfigError, match="is association and some"):
         Config.from_mapping({"calibrate.groups": "association clock"})
+
+
+def test_a_window_begins_at_its_keyframe_where_the_first_have_left_the_map():
+    windows, stamps_ns = DriftWindows(0.2, 7, 700), np.arange(600, 700 + WINDOW + 1) * 10**9
+    windows.close_if_full(700 + WINDOW, stamps_ns, 90, decide(fitted(0.003, 0.004), 10), {}, 600)
+    hour_ns = 3600 * 10**9
+    assert windows.prior(CLOCK, 0.5, 700 * 10**9 + hour_ns) == pytest.approx(np.hypot(0.005, 0.2 * 0.5 * np.sqrt(0.5)))
