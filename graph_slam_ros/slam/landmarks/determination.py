@@ -67,6 +67,8 @@ def _why_unsure(config: LandmarksConfig, space: Geometry, solver: Solver, candid
     """Return that another place fits if the path errs as much as it may; empty if none does."""
     places = [one.position for one in candidate.places]
     seen = [one for one in candidate.seen if solver.has(one[0].vertex)]  # all but what has just come
+    if 2 * len(seen) < len(candidate.seen):
+        return ""  # nothing is solved yet, so nobody knows how well the path is known
     try:
         first, *chi2 = least_chi2(space, solver, seen, places, config.range_offset_sigma_m)
     except (GraphSlamError, np.linalg.LinAlgError) as error:
