@@ -4,7 +4,6 @@ docs/check.md explains each row of ``KINDS``. A refusal that is counted is a fin
 ``measurements/reasons.py`` explains it.
 """
 
-import json
 import math
 from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeAlias
@@ -241,12 +240,6 @@ class Finding:
         evidence = {"topic": self.topic, "first_ns": self.first_ns, "count": self.count}
         first = {"code": self.code, "severity": self.severity, **finite, "unit": self.unit}
         return first | {"evidence": evidence, "text": self.text, "settings": list(self.settings)}
-
-
-def assignment(key: str, value: str | float) -> str:
-    """``KEY=VALUE`` as ``--set`` takes it, which stays text where it is one."""
-    text = f"{key}={value}"
-    return text if parse_setting(text) == (key, value) else f"{key}={json.dumps(value)}"
 
 
 def in_order(findings: list[Finding]) -> list[Finding]:

@@ -5,11 +5,12 @@ from collections.abc import Iterator
 import numpy as np
 
 from graph_slam_ros.check.columns import Columns, SightingColumns
-from graph_slam_ros.check.finding import Finding, Severity, Where, assignment
-from graph_slam_ros.messages.inputs.transforms import assumed_mount
+from graph_slam_ros.check.finding import Finding, Severity, Where
+from graph_slam_ros.formats.parameters import assignment
+from graph_slam_ros.messages.inputs.transforms import MAP_FRAMES, assumed_mount
 
 _OF_CAMERAS = "world"  # which visual odometry calls its frame, too
-_FIXED = ("map", _OF_CAMERAS, "earth", "utm")
+_FIXED = (*MAP_FRAMES, _OF_CAMERAS)
 _UNKNOWN = ("frame_unknown", "child_frame_unknown", "odom_frame_unknown", "map_frame_unknown")
 _SAME = 1e-6
 _DIFFER_M, _FEW = 0.05, 10

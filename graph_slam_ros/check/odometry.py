@@ -203,7 +203,7 @@ def _twist(o: OdometryColumns, steps: Steps, jumps: Mask, where: Where) -> Itera
         driven, rotated = (sums(part * steps.dt[:, None]) for part in (rows[:, :3], rows[:, 3:]))
         fits.append((ratio(driven, moved), ratio(rotated, turned)))
     speed, rate = min(fits, key=lambda pair: pair[0][1] + pair[1][1])
-    if _in_odom(o, steps, jumps, sums, moved, twist[1:]):
+    if _in_odom(o, steps, sums, moved, twist[1:]):
         text = (
             f"{o.topic}: the twist is given along the axes of {o.frame}; nav_msgs/Odometry defines those of {o.child}"
         )
@@ -224,9 +224,7 @@ def _twist(o: OdometryColumns, steps: Steps, jumps: Mask, where: Where) -> Itera
             yield Finding("twist_unrelated", "warning", left, _UNEXPLAINED, "part", text, settings=_DENSITY, **where)
 
 
-def _in_odom(
-    o: OdometryColumns, steps: Steps, jumps: Mask, sums: Callable[[Array], Array], moved: Array, twist: Array
-) -> bool:
+def _in_odom(o: OdometryColumns, steps: Steps, sums: Callable[[Array], Array], moved: Array, twist: Array) -> bool:
     """Return whether the linear twist fits the motion along the axes of the odometry frame far better."""
     turns = o.poses[steps.index[:-1], 3:]
     along = np.stack(so3.act(tuple(turns.T), tuple(steps.moved.T)), axis=1)

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from graph_slam_ros.check.columns import Columns, SightingColumns
-from graph_slam_ros.check.finding import Finding, Where, assignment
+from graph_slam_ros.check.finding import Finding, Where
+from graph_slam_ros.formats.parameters import assignment
 from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.typing import Array, Index, Mask
 

@@ -5,8 +5,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from graph_slam_ros.check.columns import Columns, TopicColumns
-from graph_slam_ros.check.finding import Finding, Severity, Where, assignment
+from graph_slam_ros.check.finding import Finding, Severity, Where
 from graph_slam_ros.config.node import TimeConfig
+from graph_slam_ros.formats.parameters import assignment
 from graph_slam_ros.typing import Array, Index
 
 _FEW, _BACK_NS = 3, 1_000_000_000

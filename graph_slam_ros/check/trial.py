@@ -6,13 +6,14 @@ from dataclasses import replace
 import numpy as np
 
 from graph_slam_ros.check.columns import Columns
-from graph_slam_ros.check.finding import Finding, Where, assignment
+from graph_slam_ros.check.finding import Finding, Where
 from graph_slam_ros.check.identities import at_two_places, check_identities, points_in_map
 from graph_slam_ros.check.located import moved
 from graph_slam_ros.check.outliers import check_outliers
 from graph_slam_ros.check.pairs import noisier, pairs_of, path_of, poses_at, turned_mount
 from graph_slam_ros.check.slips import check_slips
 from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.formats.parameters import assignment
 from graph_slam_ros.lie import se3
 from graph_slam_ros.measurements.types import Control, Measurement, Odometry
 from graph_slam_ros.slam import Config, GraphSlam

@@ -130,6 +130,12 @@ def _unwrapped(path: Path, values: dict[Any, Any]) -> dict[str, Any]:
     return inner
 
 
+def assignment(key: str, value: Any) -> str:
+    """Return ``KEY=VALUE`` as ``parse_setting`` reads it: a text that looks like a number stays one."""
+    text = f"{key}={value}"
+    return text if parse_setting(text) == (key, value) else f"{key}={json.dumps(value)}"
+
+
 def parse_setting(text: str) -> tuple[str, Any]:
     """``key=value`` of a command line, the value read as YAML reads it."""
     key, separator, value = text.partition("=")

@@ -238,7 +238,7 @@ REASONS: dict[str, Reason] = {
     "cut_off": Reason(_REFUSED, "the cloud has fewer bytes than it says", "correct the driver"),
     "undecided": Reason(_NOTED, "a stretch of the drive may be of several places that look alike: it is left as it is"),
     "moves_left": Reason(
-        _NOTED, "the search for landmarks that are one reached its limit of work: some of them may still be two"
+        _NOTED, "the search for landmarks that are in the map twice reached its limit of work: some may be left"
     ),
     "reassigned": Reason(_NOTED, "what was seen without identity turned out to be of another landmark"),
     "given_up": Reason(_NOTED, "a new unnamed landmark was not seen again in landmarks.give_up_s"),

@@ -234,18 +234,9 @@ def _faults(facts: Facts, config: Config) -> Iterator[str]:
         )
     elif estimate and not estimate.is_confirmed:
         yield "where the robot is in the loaded map is not known yet"
-    if estimate and estimate.displaced:
-        yield estimate.displaced
-    if estimate and estimate.association:
-        yield estimate.association
-    if estimate and estimate.visits:
-        yield estimate.visits
-    if estimate and estimate.uncorrected:
-        yield estimate.uncorrected
-    if estimate and estimate.motion:
-        yield estimate.motion
-    if estimate and estimate.ambiguity:
-        yield estimate.ambiguity
+    if estimate:
+        reasons = estimate.displaced, estimate.association, estimate.visits, estimate.uncorrected, estimate.motion
+        yield from filter(None, (*reasons, estimate.ambiguity))
     if estimate and health.chi2_per_dof and estimate.fit > health.chi2_per_dof:
         yield f"the measurements contradict each other: chi2 per degree of freedom is {estimate.fit:.1f}"
 

@@ -96,7 +96,7 @@ class Ingest:
 
     def finish(self) -> None:
         """Pass on or refuse all held messages, and unsubscribe."""
-        for measured in self._future_stamps.drain():
+        for measured in self._future_stamps.due(patience_s=0.0):
             self.hand_over(measured)
         for subscription in self._subscriptions:
             self._node.destroy_subscription(subscription)
@@ -229,7 +229,7 @@ class FutureStamps:
 
     Parameters
     ----------
-    most_s : how far ahead is not ahead; 0: everything passes
+    most_s : a stamp may be this far ahead of the clock; 0: any stamp passes
     now_ns : the clock; 0 where there is none, then everything passes
     on_refused : called with each message that has waited too long
     """
@@ -238,7 +238,7 @@ class FutureStamps:
         self, most_s: float, now_ns: Callable[[], int], on_refused: Callable[[Sequence[Measured]], None]
     ) -> None:
         self._most_ns, self._now_ns, self._on_refused = round(most_s * 1e9), now_ns, on_refused
-        self._until_ns = 0  # what is older passes without a look at the clock
+        self._until_ns = 0  # stamps up to here pass without a look at the clock
         self._held: deque[tuple[float, Sequence[Measured]]] = deque()
 
     def pass_on(self, messages: Sequence[Measured]) -> Iterable[Sequence[Measured]]:
@@ -248,14 +248,14 @@ class FutureStamps:
         self._held.append((time.monotonic(), messages))
         return self.due()
 
-    def due(self) -> list[Sequence[Measured]]:
+    def due(self, patience_s: float = _PATIENCE_S) -> list[Sequence[Measured]]:
         """The held measurements that are due now. Those held for too long are refused."""
         out = []
         while self._held:
             since_s, messages = self._held[0]
             if not self.is_ahead(messages):
                 out.append(messages)
-            elif time.monotonic() - since_s < _PATIENCE_S:
+            elif time.monotonic() - since_s < patience_s:
                 break
             else:
                 self._on_refused(messages)
@@ -270,17 +270,6 @@ class FutureStamps:
         now_ns = self._now_ns()
         self._until_ns = now_ns + self._most_ns if now_ns else 0
         return bool(now_ns) and newest_ns > self._until_ns
-
-    def drain(self) -> list[Sequence[Measured]]:
-        """Stop holding: refuse measurements ahead of the clock, and return the others."""
-        out: list[Sequence[Measured]] = []
-        for _, messages in self._held:
-            if self.is_ahead(messages):
-                self._on_refused(messages)
-            else:
-                out.append(messages)
-        self._held.clear()
-        return out
 
     def forget_time(self) -> None:
         """Begin anew with the clock."""

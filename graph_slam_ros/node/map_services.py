@@ -42,7 +42,7 @@ def loaded_from(request: Any, dimensions: int) -> Values:
 
 
 def serve_maps(node: MapServer, serve_later: Callable[..., None]) -> None:
-    """Serve ``~/serialize_map`` and ``~/deserialize_map`` if slam_toolbox is installed, by ``deferred.serve_later``."""
+    """Serve ``~/serialize_map`` and ``~/deserialize_map`` if slam_toolbox is installed, by ``services.serve_later``."""
     try:
         types = import_module("slam_toolbox.srv")
     except ImportError:

@@ -142,23 +142,18 @@ class GraphSlamNode(LifecycleNode):
                 run.in_background(run.load())
 
     def _activate(self) -> None:
-        self._configured().activate()
+        self.configured().activate()
         if self._bond is None and not self.config.node.autostart and bond.is_installed():
             self._bond = bond.Bond(self)
 
     def _deactivate(self) -> None:
         self._end_bond()
-        self._configured().deactivate()
+        self.configured().deactivate()
 
     def _end_bond(self) -> None:
         if self._bond is not None:
             self._bond.end()
             self._bond = None
-
-    def _configured(self) -> "Runtime":
-        if self._run is None:
-            raise GraphSlamError("not configured")
-        return self._run
 
     def finish(self, patience_s: float | None = None) -> None:
         """Save what was not saved yet, and remove everything.
@@ -232,7 +227,7 @@ class GraphSlamNode(LifecycleNode):
     def configured(self) -> Runtime:
         """The runtime, from configuration on. Raises GraphSlamError before."""
         if self._run is None:
-            raise GraphSlamError(f"not active: the node is {self._state}")
+            raise GraphSlamError(f"not configured: the node is {self._state}")
         return self._run
 
     def acknowledge(self, count: int) -> None:

@@ -15,6 +15,7 @@ from graph_slam_ros.check.trial import check_trial, replayed
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.measurements.types import Measured
 from graph_slam_ros.messages.inputs import known_types
+from graph_slam_ros.messages.inputs.transforms import MAP_FRAMES
 from graph_slam_ros.recordings.bag import Bag, open_bag
 from graph_slam_ros.recordings.contents import Recording, TopicContents
 from graph_slam_ros.runs.replay import RecordedRuns
@@ -23,7 +24,6 @@ from graph_slam_ros.runs.suggestion import ODOMETRY, Suggestion
 from graph_slam_ros.slam import Config, Control, Counters
 from graph_slam_ros.warmup import warmup
 
-_MAPS = ("map", "world", "earth", "utm")
 _UNNAMED_NS = 120_000_000_000
 Measurements = list[Measured | Control]
 Progress = Callable[[Iterable[Any], int], Iterable[Any]]
@@ -129,7 +129,7 @@ def _unused(recording: Recording, suggestion: Suggestion, *, has_landmarks: bool
     for name, why in suggestion.unused.items():
         one = recording.topics[name]
         is_landmark = one.topic.type in OF_LANDMARKS and one.topic.type in known_types()
-        if one.topic.type == ODOMETRY and one.frame in _MAPS:
+        if one.topic.type == ODOMETRY and one.frame in MAP_FRAMES:
             text = f"{name} is {why}"
             severity: Severity = "note" if "odom" in suggestion.topics else "error"
             yield Finding("odometry_in_map", severity, 1, 0, "topics", text, name, count=one.topic.count)

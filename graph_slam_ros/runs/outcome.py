@@ -245,7 +245,10 @@ def association_faults(found: Mapping[str, Any]) -> Iterator[str]:
             f"misses {lost:.1f} %: the map is probably wrong. {_CONFUSED}"
         )
     if not found.get("is_whole", True):
-        yield f"sightings without identity: landmarks may still be two that are one (moves_left). {_CONFUSED}"
+        yield (
+            "sightings without identity: landmarks may be in the map twice, the search for those reached its limit "
+            f"(moves_left). {_CONFUSED}"
+        )
 
 
 def ambiguities(rivals: Collection[Mapping[str, Any]]) -> Iterator[str]:

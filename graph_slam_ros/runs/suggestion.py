@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.formats.parameters import parse_setting
+from graph_slam_ros.formats.parameters import assignment
 from graph_slam_ros.messages.from_msg import TRANSFORMS
 from graph_slam_ros.messages.inputs import CONVERTERS, converters, known_types
 from graph_slam_ros.messages.inputs.landmark_types import APRILTAGS, LANDMARK_TYPES
-from graph_slam_ros.messages.inputs.transforms import OPTICAL, assumed_mount
+from graph_slam_ros.messages.inputs.transforms import MAP_FRAMES, OPTICAL, assumed_mount
 from graph_slam_ros.recordings.bag import Bag
 from graph_slam_ros.recordings.contents import Recording, TopicContents
 from graph_slam_ros.runs.chosen_inputs import TF_TOPIC, choose_inputs
@@ -34,7 +34,6 @@ _NOT_MEASURED = re.compile(r"raw|cmd|desired|target|set_?point|plan", re.IGNOREC
 _TAG = re.compile(r"((?:.*[/_])?(?:tag|aruco|marker|fiducial).*?)[:_]?\d+", re.IGNORECASE)
 _TAG_TOPIC = re.compile(r"(?:tag|aruco|marker|fiducial)[_/:]?(\d+)(?:/pose)?$", re.IGNORECASE)
 _CORNERS = re.compile(r"^(?!.*map).*(tag|aruco|fiducial)", re.IGNORECASE)
-_MAPS = ("map", "earth", "utm")
 _OFF_PLANE = 0.05
 _OF_ROS = ("/clock", "/rosout", "/parameter_events", "/diagnostics", "/events/write_split", "/robot_description")
 _MOST_LISTED = 6
@@ -77,7 +76,7 @@ class Suggestion:
             words += [option, self.topics[name]] if name in self.topics else []
         own = {key: value for key, value in self.settings.items() if key not in without}
         for key, value in (own | dict(more or {})).items():
-            words += ["--set", _assignment(key, value)]
+            words += ["--set", assignment(key, value)]
         return shlex.join([*words, "--out", str(suggested_out(self._path))])
 
     def _refused(self, bag: Bag) -> str:
@@ -118,7 +117,7 @@ class Suggestion:
     def _choose_odometry(self) -> str:
         found = []
         for one in self._of_type(ODOMETRY):
-            if one.frame in _MAPS:
+            if one.frame in MAP_FRAMES:
                 self.unused[one.topic.name] = f"in frame {one.frame}: somebody's estimate, not odometry"
             elif one.is_zero:
                 self.unused[one.topic.name] = "its stamps are zero: have the driver fill in header.stamp"
@@ -151,7 +150,7 @@ class Suggestion:
         return is_whole, one.path_m > 0.05, fused, is_odom, one.topic.count
 
     def _odometry_of_tf(self) -> str:
-        links = [(p, c) for c, p in self._recording.moving.items() if p not in _MAPS]
+        links = [(p, c) for c, p in self._recording.moving.items() if p not in MAP_FRAMES]
         links = [(p, c) for p, c in links if "odom" in p.lower() or c.startswith("base")]
         if not links or TF_TOPIC not in self._recording.topics:
             there = ", ".join(f"{name} ({one.topic.type or 'no type'})" for name, one in self._recording.topics.items())
@@ -228,7 +227,7 @@ class Suggestion:
     def _tag_number(self, one: TopicContents) -> str:
         """The number of the tag whose pose in the camera's frame a topic has; empty for any other topic."""
         found = _TAG_TOPIC.search(one.topic.name)
-        return found[1] if found and one.frame not in (*_MAPS, "world", self._odom) else ""
+        return found[1] if found and one.frame not in (*MAP_FRAMES, "world", self._odom) else ""
 
     def _corners(self, one: TopicContents) -> None:
         self.unused[one.topic.name] = (
@@ -383,8 +382,3 @@ class Suggestion:
             note = f"no input reads {', '.join(found[:_MOST_LISTED])}{more}: their types are none of docs/inputs.md"
             own = "; landmarks in a type of your own: a plugin (docs/inputs.md), or publish them as Detection3DArray"
             self.notes.append(note + own * (self.names == ["odom"]))
-
-
-def _assignment(key: str, value: Any) -> str:
-    text = f"{key}={value}"
-    return text if parse_setting(text) == (key, value) else f"{key}='{value}'"

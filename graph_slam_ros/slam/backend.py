@@ -41,7 +41,7 @@ class Backend:
 
     Attributes
     ----------
-    graph, solver, decisions
+    graph, solver : the problem; decisions : the outlier gate, which judges edges
     odometries : judges odometries that contradict each other
     noise : adds edges to the graph, with noise in scale
     handed_over : vertices and edges of the graph that the solver has
@@ -114,13 +114,13 @@ class Backend:
         self.handed_over = self.graph.vertex_count, self.graph.edge_count
         report = self.solver.optimize(self.solver.settings.until_still())  # what is believed was decided before
         self.decisions.recalibrate()
-        self._background.cancel(self.ledger.outside_count)
+        self.cancel_search()
         return report
 
     def hold_map(self) -> None:
         """Fix all present vertices, and the verdicts on all present edges."""
         self.hand_over()
-        self._background.cancel(self.ledger.outside_count)
+        self.cancel_search()
         self._hold(self.graph.vertex_count, len(self.ledger))
 
     def _hold(self, vertices: int, edges: int) -> None:
@@ -136,7 +136,7 @@ class Backend:
         held, self.held = self.solver.held, (0, 0)
         self.solver.release(held[held >= self.frozen])
         self.ledger.finish(self.frozen_edges)
-        self._background.cancel(self.ledger.outside_count)
+        self.cancel_search()
 
     def hand_over(self) -> None:
         """Pass new vertices and edges to the solver."""
@@ -192,7 +192,7 @@ class Backend:
             self._adopt(outcome, keyframe)
             self.solver.start_at(outcome.values)
             report = self.solver.optimize(settings)
-        self._background.cancel(self.ledger.outside_count)
+        self.cancel_search()
         return report
 
     def scale_noise(self, keyframes: StampedPoses[Keyframe], everything: Settings | None) -> Report | None:
@@ -221,7 +221,7 @@ class Backend:
                 break
         if report is not None:
             self.decisions.recalibrate()
-            self._background.cancel(self.ledger.outside_count)
+            self.cancel_search()
         return report if everything else None
 
     def noise_scale(self, keyframes: StampedPoses[Keyframe]) -> list[NoiseScale]:
@@ -286,10 +286,10 @@ class Backend:
         self.odometries.forget()
         self.handed_over = self.graph.vertex_count, self.graph.edge_count
         self._rivals = ()
-        self._background.cancel(self.ledger.outside_count)
+        self.cancel_search()
 
     def cancel_search(self) -> None:
-        """Cancel a running search, because everything was reviewed."""
+        """Cancel a running search: the problem that it began with has changed."""
         self._background.cancel(self.ledger.outside_count)
 
     def move(self, T_new_old: Numbers, space: Geometry) -> None:
@@ -303,7 +303,7 @@ class Backend:
             move = space.group.compose if kind is space.pose else space.group.act
             values[at] = np.stack(move(T_new_old, tuple(values[at].T)), axis=-1)
         self.solver.start_at(values)
-        self._background.cancel(self.ledger.outside_count)
+        self.cancel_search()
 
     def withdraw(self, edges: Sequence[int], keyframe: int, reason: Reason = Reason.WITHDRAWN) -> None:
         """Remove edges permanently."""
@@ -362,7 +362,7 @@ class Backend:
         self._admit(keyframe)
 
     def _go_on(self, found: DisplacementHypothesis, keyframe: int) -> None:
-        self._background.cancel(self.ledger.outside_count)
+        self.cancel_search()
         self.holds_back = False
         self._admission.make_fit(list(found.fitting), keyframe)
 

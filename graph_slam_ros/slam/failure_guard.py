@@ -1,6 +1,6 @@
 """Recovery from a solve that fails: the last good estimate stays, and soon what has come since is doubted.
 
-All of it is told by the ingest sequence: a replay fails where the live run did, and recovers as it did.
+All of it follows from the ingest sequence: a replay fails where the live run did, and recovers as it did.
 """
 
 from bisect import bisect_right
@@ -22,7 +22,7 @@ from graph_slam_ros.typing import Array, Index
 
 Result = TypeVar("Result")
 
-_FAR = 1.0  # m, rad: whoever moves no farther has not gone astray
+_FAR = 1.0  # m, rad: a number that changed by less has not diverged
 _RISE = 10.0  # times the cost before, or of residuals as large as their noise: more is no solution
 _MOST_WRAPPED = 10  # headings that are looked for, each by its place
 _TRIALS = 30  # solves in search of what is to blame
@@ -39,10 +39,13 @@ class _Suspect:
 class FailureGuard:
     """Runs solves of a back-end, and restores the last good estimate after a failure.
 
+    Parameters
+    ----------
+    on_gone : called with the vertices of landmarks that are no part of the problem any more
+
     Attributes
     ----------
     failing : why the last solve failed; empty where it did not
-    on_gone : told of landmarks that are no part of the problem any more, by their vertices
     """
 
     def __init__(self, backend: Backend, counters: Counters, on_gone: Callable[[set[int]], None]) -> None:

@@ -45,7 +45,7 @@ class _Split:
     ----------
     first : vertex of the keyframe at which the segment begins
     index : of that keyframe; None where a segment began there before
-    link, loose : odometry's edge to it, which is out, and that with next to no trust in its place
+    link, replacement : odometry's edge to it, which is out, and the edge with very large noise that replaces it
     T_map_chain_before, T_map_chain : where the frame of odometry lay before, and lies since
     chain, drift : where that frame had the keyframe, and the variances [m^2, rad^2] of odometry up to it
     alarm : its index

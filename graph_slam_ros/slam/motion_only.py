@@ -1,6 +1,6 @@
-"""Odometry that only adds to the motion since the last keyframe, as nearly all of it does.
+"""A fast path for odometry that only adds to the motion since the last keyframe, as nearly all of it does.
 
-It takes two thirds of what the front end needs for a message that may do more, and comes to the same.
+It gives the same result as the whole path, in two thirds of its time.
 """
 
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from graph_slam_ros.typing import Numbers
 
 
 class MotionOnly:
-    """Adds such odometry.
+    """Processes odometry that adds no keyframe and no edge.
 
     Parameters
     ----------
@@ -26,7 +26,7 @@ class MotionOnly:
         self._is_possible = False
 
     def forget(self) -> None:
-        """Forget that odometry may do nothing else, because another measurement comes."""
+        """Examine at the next odometry whether the fast path applies, because another measurement comes."""
         self._is_possible = False
 
     def add(self, m: Odometry) -> bool:

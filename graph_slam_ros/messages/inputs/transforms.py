@@ -7,6 +7,8 @@ from typing import Any
 from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.messages.inputs.stamp_leap import StampLeap
 
+MAP_FRAMES = ("map", "earth", "utm")
+"""Frames of maps: odometry in one of them is the output of a localiser. Visual odometry calls its own frame "world"."""
 OPTICAL = "0 0 0 -1.5707963 0 -1.5707963"
 """x y z roll pitch yaw of a camera's optical frame at the base, looking ahead: z ahead, x to the right."""
 

@@ -11,7 +11,7 @@ from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.types import Control, Measured, Odometry, Sightings
 
 _SURE_NS, _SURE = 1_000_000_000, 3  # of stamps, and messages: a burst that was held up is shorter
-_AGAIN_NS = 10_000_000_000  # what has been told not longer ago is told again where nothing new comes
+_AGAIN_NS = 10_000_000_000  # of stamps: an older stamp that came within this time is a repetition, and no jump
 
 
 @dataclass(slots=True)
@@ -103,7 +103,7 @@ class TimeJumpDetector:
 
     Parameters
     ----------
-    back_s : what is less is messages out of order
+    back_s : a smaller step back is a message out of order
     """
 
     def __init__(self, back_s: float) -> None:

@@ -16,11 +16,6 @@ class Renumbered:
     vertices: Index
     edges: Index
 
-    def edges_left(self, edges: Index) -> Index:
-        """Return the new ids of those of some edges that are left."""
-        new = self.edges[edges]
-        return new[new >= 0]
-
 
 def compact(solver: Solver, vertices: Index | None = None, edges: Index | None = None) -> Renumbered:
     """Remove all other vertices and edges from a graph and its solver, in place. The estimate stays.

@@ -33,7 +33,7 @@ class Reason(IntEnum):
     WITHDRAWN = 4  # somebody, or association, took it out
     QUARANTINED = 5  # nothing could be solved with it
     DISPLACED = 6  # odometry, where the landmarks showed that the robot was moved without its noticing
-    REVOKED = 7  # what stood in its place, after later sightings showed that it was not
+    REVOKED = 7  # what replaced a displaced or slipped edge of odometry, which is used again
     FAILED = 8  # the plugin of its edge type failed at it
     BY_HAND = 9  # somebody decided so: taken out for good, or in and never judged
     CONTRADICTED = 10  # odometry, where another odometry contradicts it; its judge lets it in again

@@ -139,7 +139,7 @@ def test_P22_a_transition_out_of_turn_is_refused_by_name_and_by_number_and_the_n
             assert r.change(wanted)
         for name in SERVICES:
             answer = r.call(name)
-            assert (answer.success, answer.message) == (False, "not active: the node is unconfigured"), name
+            assert (answer.success, answer.message) == (False, "not configured: the node is unconfigured"), name
         assert r.change("configure")
         assert r.change("activate")
         r.until_it_says("OK", spin=Drive().pace(r))
