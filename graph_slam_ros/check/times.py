@@ -8,6 +8,7 @@ from graph_slam_ros.check.columns import Columns, TopicColumns
 from graph_slam_ros.check.finding import Finding, Severity, Where
 from graph_slam_ros.config.node import TimeConfig
 from graph_slam_ros.formats.parameters import assignment
+from graph_slam_ros.messages.receive_times import clock_offset_s
 from graph_slam_ros.typing import Array, Index
 
 _FEW, _BACK_NS = 3, 1_000_000_000
@@ -53,10 +54,11 @@ def _clocks(c: Columns, topics: dict[str, TopicColumns]) -> Iterator[Finding]:
     of_odometry = topics.get(c.odometry.topic)
     if of_odometry is None or any((np.diff(t.stamp_ns[t.stamp_ns != 0]) < -_BACK_NS).any() for t in topics.values()):
         return
-    typical_s = float(np.median(_lags(of_odometry)[0]))
+    odometry_lag_s, odometry_log_ns, _ = _lags(of_odometry)
+    typical_s = float(np.median(odometry_lag_s))
     for topic in topics.values():
         lag_s, log_ns, stamp_ns = _lags(topic)
-        apart_s = float(np.median(lag_s)) - typical_s
+        apart_s = clock_offset_s(log_ns, lag_s, odometry_log_ns, odometry_lag_s)
         where: Where = {"topic": topic.name, "first_ns": int(stamp_ns[0]), "count": len(stamp_ns)}
         if abs(apart_s) > _CLOCKS_DIFFER_S:
             settings = (_offset(c, topic, apart_s),) if abs(apart_s) < 3600.0 else ()

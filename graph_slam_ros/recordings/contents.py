@@ -4,7 +4,6 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import islice
-from statistics import median
 from typing import Any
 
 from graph_slam_ros.errors import ConfigError
@@ -12,11 +11,12 @@ from graph_slam_ros.lie import so3
 from graph_slam_ros.messages.from_msg import TRANSFORMS
 from graph_slam_ros.messages.inputs import known_types
 from graph_slam_ros.messages.inputs.landmark_types import APRILTAGS
+from graph_slam_ros.messages.receive_times import clock_offset_s
 from graph_slam_ros.recordings.bag import Bag, BagError, Topic
 from graph_slam_ros.recordings.definitions import recorded_decoder
 
 _SAMPLED, _EVERY = 2000, 8  # the first messages of each topic; of odometry then every so many
-_MOST_NAMES, _LAGS = 1000, 100
+_MOST_NAMES, _LAGS = 1000, 100  # lags: at least so many of a longer topic
 _LEVEL_M, _UPRIGHT = 0.5, math.cos(math.radians(20.0))  # as for what is counted as out of the plane
 
 
@@ -28,7 +28,7 @@ class TopicContents:
     ----------
     trouble : why its messages cannot be read; empty where they can
     first_ns, last_ns : of its messages, by the time they were received
-    lag_s : receive time less header stamp of the first messages
+    received_ns, lag_s : receive time, and that less the header stamp, of messages evenly over all that were read
     is_stamped : whether any header has a stamp
     frame, child : of the first header that names them
     items, without_id : what its messages hold (detections, points, transforms), and how many of these have no identity
@@ -45,7 +45,10 @@ class TopicContents:
     last_ns: int = 0
     read: int = 0
     skipped: int = 0
+    received_ns: list[int] = field(default_factory=list)
     lag_s: list[float] = field(default_factory=list)
+    headers: int = 0
+    every: int = 1
     is_stamped: bool = False
     frame: str = ""
     child: str = ""
@@ -62,10 +65,20 @@ class TopicContents:
     last_at: tuple[float, float, float] | None = None
     height_m: float = 0.0
 
-    @property
-    def typical_lag_s(self) -> float:
-        """Median of ``lag_s``."""
-        return median(self.lag_s) if self.lag_s else 0.0
+    def add_lag(self, received_ns: int, stamp_ns: int) -> None:
+        """Add the lag of a message, if it is its turn."""
+        self.headers += 1
+        if self.headers % self.every:
+            return
+        self.received_ns.append(received_ns)
+        self.lag_s.append((received_ns - stamp_ns) * 1e-9)
+        if len(self.lag_s) >= 2 * _LAGS:
+            del self.received_ns[1::2], self.lag_s[1::2]
+            self.every *= 2
+
+    def clock_offset_s(self, other: "TopicContents") -> float:
+        """Return what must be added to its stamps to have the clock of another topic [s]; 0 where that is not known."""
+        return clock_offset_s(self.received_ns, self.lag_s, other.received_ns, other.lag_s)
 
     @property
     def is_zero(self) -> bool:
@@ -145,8 +158,7 @@ def _add(recording: Recording, one: TopicContents, m: Any, log_ns: int) -> None:
         one.child = one.child or _plain(getattr(m, "child_frame_id", ""))
         stamp_ns = header.stamp.sec * 10**9 + header.stamp.nanosec
         one.is_stamped |= stamp_ns != 0
-        if len(one.lag_s) < _LAGS:
-            one.lag_s.append((log_ns - stamp_ns) * 1e-9)
+        one.add_lag(log_ns, stamp_ns)
     _OF_TYPE.get(one.topic.type, _any)(one, m)
 
 

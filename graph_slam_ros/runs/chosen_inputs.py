@@ -1,6 +1,6 @@
 """The topics of a recording that inputs are read from: named, configured, or the only ones of their type."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from graph_slam_ros.config.inputs import InputConfig, default_input
@@ -53,11 +53,19 @@ def choose_inputs(bag: Bag, config: Config, odometry: str | None = None, landmar
     check_topics(config, uses(config), topics)
     if named.get("landmarks"):
         raise BagError(f"no input is used as landmarks: {landmarks} cannot be one")
-    if TF_STATIC_TOPIC in bag.topics:
-        topics[TF_STATIC] = TF_STATIC_TOPIC
-    if config.inputs.tf and TF_TOPIC in bag.topics and bag.topics[TF_TOPIC].type == TRANSFORMS:
-        topics[TF] = TF_TOPIC
+    namespaces = [topics[name].rpartition("/")[0] for name, use in uses(config).items() if name in topics]
+    if found := _of_namespace(bag, TF_STATIC_TOPIC, namespaces):
+        topics[TF_STATIC] = found
+    if config.inputs.tf and (found := _of_namespace(bag, TF_TOPIC, namespaces)):
+        topics[TF] = found
     return Inputs(topics)
+
+
+def _of_namespace(bag: Bag, topic: str, namespaces: Sequence[str]) -> str:
+    """Return a topic of transforms, else that in the namespace of an input; empty if there is none."""
+    names = (topic, *(f"{namespace}{topic}" for namespace in namespaces))
+    there = [name for name in names if name in bag.topics]
+    return next((name for name in there if name == TF_STATIC_TOPIC or bag.topics[name].type == TRANSFORMS), "")
 
 
 def _choose(bag: Bag, settings: InputConfig, named: str | None, option: str) -> str:

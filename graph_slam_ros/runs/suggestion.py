@@ -60,7 +60,7 @@ class Suggestion:
         self.topics: dict[str, str] = {}  # of odom and detections
         self.names: list[str] = []
         self._base, self._odom = "base_link", "odom"
-        self._lag_s: float | None = None
+        self._odometry: TopicContents | None = None
         self.trouble = self._of_a_result() or self._choose_odometry()
         if not self.trouble:
             self._choose_landmarks()
@@ -133,7 +133,7 @@ class Suggestion:
             self.notes.append(f"{len(found)} odometries: {best.topic.name} is chosen; --odom takes another")
         seen = [name for name, one in self._recording.topics.items() if one.topic.type in (DETECTIONS, *LANDMARK_TYPES)]
         self.unused |= landmarks_of_other_robots(best.topic.name, [one.topic.name for one in found], seen)
-        self.topics["odom"], self._lag_s = best.topic.name, best.typical_lag_s
+        self.topics["odom"], self._odometry = best.topic.name, best
         self._frames(best.frame, best.child)
         if best.off_plane > _OFF_PLANE * best.read:
             self.settings["world.dimensions"] = 3
@@ -325,11 +325,10 @@ class Suggestion:
         if one.is_zero:
             self.unused[topic] = "its stamps are zero: have the driver fill in header.stamp"
             return
-        offset_s = 0.0
-        if self._lag_s is not None and one.lag_s:
-            offset_s = one.typical_lag_s - self._lag_s
+        offset_s = 0.0 if self._odometry is None else one.clock_offset_s(self._odometry)
         if abs(offset_s) > _MOST_OFFSET_S:
-            self.unused[topic] = f"its stamps are {offset_s:.0f} s from those of odometry: another clock"
+            mend = f" (--landmarks {topic} --set {name}.offset_s={offset_s:.3f})" if name == "detections" else ""
+            self.unused[topic] = f"its stamps are {offset_s:.0f} s from those of odometry: another clock{mend}"
             return
         settings = dict(chosen or {}) | ({} if linked else self._mount(topic, one.frame))
         if abs(offset_s) > _CLOCKS_DIFFER_S:

@@ -223,3 +223,17 @@ def test_check_and_calibrate_read_the_topics_that_a_replay_reads(tmp_path):
         assert suggested.inputs(Config.from_mapping(suggested.settings)).topics == expected
     with pytest.raises(BagError, match="no topic /nothing"):
         SuggestedInputs(bag, path, {"odom.topic": "/nothing"}).inputs(Config.from_mapping({"odom.topic": "/nothing"}))
+
+
+def test_transforms_in_the_namespace_of_the_robot_are_read_where_there_are_no_others(tmp_path):
+    def topics(*names):
+        path = tmp_path / f"{len(names)}.mcap"
+        with BagWriter(path) as bag:
+            for name in ("/robot1/odom", *names):
+                type_name = "nav_msgs/msg/Odometry" if name.endswith("odom") else TF
+                bag.write(name, type_name, STAMP_NS, odometry(pose(0.0)))
+        return choose_inputs(open_bag(path), Config()).topics
+
+    assert topics("/robot1/tf_static")["tf_static"] == "/robot1/tf_static"
+    assert topics("/robot1/tf_static", "/tf_static")["tf_static"] == "/tf_static"
+    assert "tf_static" not in topics("/robot2/tf_static", "/robot2/tf", "/robot3/tf_static")
