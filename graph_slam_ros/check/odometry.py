@@ -1,7 +1,7 @@
 """Checks of odometry alone: whether it moves, jumps, leaves the plane, and agrees with its twist."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -222,6 +222,24 @@ def _twist(o: OdometryColumns, steps: Steps, jumps: Mask, where: Where) -> Itera
         elif left > _UNEXPLAINED and total > 5.0:
             text = f"{o.topic}: the {what} of the twist does not explain {left:.0%} of the motion of the pose"
             yield Finding("twist_unrelated", "warning", left, _UNEXPLAINED, "part", text, settings=_DENSITY, **where)
+
+
+def of_pose_or_twist(findings: list[Finding]) -> list[Finding]:
+    """Findings in which landmarks have decided whether the pose or the twist of odometry is wrong.
+
+    Where the two differ, and landmarks seem far too noisy by the pose, the pose is wrong. Larger noise of landmarks
+    would only hide that.
+    """
+    twists = [one for one in findings if one.code == "twist_scale"]
+    noisy = [one for one in findings if one.code == "over_confident" and one.severity == "warning"]
+    if not (twists and noisy):
+        return findings
+    why = (
+        f"by the pose two sightings of a landmark differ by {max(one.value for one in noisy):.0f} times their noise, "
+        "so the pose is wrong: correct it, or odometry.distance_factor and odometry.turn_factor"
+    )
+    mended = {id(one): replace(one, severity="error", text=f"{one.text}; {why}", settings=()) for one in twists}
+    return [mended.get(id(one), one) for one in findings if one not in noisy]
 
 
 def _in_odom(o: OdometryColumns, steps: Steps, sums: Callable[[Array], Array], moved: Array, twist: Array) -> bool:

@@ -11,6 +11,7 @@ from graph_slam_ros.check.checks import check_columns
 from graph_slam_ros.check.columns import Collector, Columns
 from graph_slam_ros.check.finding import Finding, Severity, in_order, with_one_value
 from graph_slam_ros.check.gyro import of_gyro_or_wheels
+from graph_slam_ros.check.odometry import of_pose_or_twist
 from graph_slam_ros.check.trial import check_trial, replayed
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.measurements.types import Measured
@@ -99,7 +100,7 @@ def check(
         found += _trial(columns, _in_time(columns, [some for number, some in measured if number == 0]))
     others = suggestion.settings.keys() - suggested.assumed.keys()
     command = "" if suggestion.trouble else suggestion.command(without=others)
-    found = of_gyro_or_wheels(found, config.gyro_input)
+    found = of_pose_or_twist(of_gyro_or_wheels(found, config.gyro_input))
     return Checked(with_one_value(in_order(list(dict.fromkeys(found)))), command, bag.losses, bag.warnings)
 
 
