@@ -134,7 +134,8 @@ def evaluate(args: argparse.Namespace) -> int:
     _draw(args.run_folder, truth, args.plot, align=not args.no_align, quiet=args.json)
     code = console.report_losses(scores.losses, [*scores.warnings, *changed_since(args.run_folder)])
     if not args.json:
-        with_truth = console.command("report", args.run_folder, "--truth", args.truth)
+        same = [*(("--topic", args.topic) if args.topic else ()), *(("--no-align",) if args.no_align else ())]
+        with_truth = console.command("report", args.run_folder, "--truth", args.truth, *same)
         console.then(f"{with_truth} (one page: the map, its errors, and why each edge is in or out)")
     return code
 

@@ -93,7 +93,7 @@ def uses(config: Config) -> dict[str, str]:
     out = {settings.name: _use(settings) for settings in config.sources if settings.use != "none"}
     check_topics(config, out, {one.name: one.topic for one in config.sources})
     if "odometry" not in out.values():
-        raise ConfigError(f"inputs.names: none of {config.inputs.names!r} is used as odometry")
+        raise ConfigError(f"inputs.names: none of {config.inputs.names!r} is used as odometry (INPUT.use=odometry)")
     return out
 
 
