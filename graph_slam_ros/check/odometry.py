@@ -225,18 +225,18 @@ def _twist(o: OdometryColumns, steps: Steps, jumps: Mask, where: Where) -> Itera
 
 
 def of_pose_or_twist(findings: list[Finding]) -> list[Finding]:
-    """Findings in which landmarks have decided whether the pose or the twist of odometry is wrong.
+    """Findings of a pose of odometry that contradicts its twist, and by which landmarks seem far too noisy.
 
-    Where the two differ, and landmarks seem far too noisy by the pose, the pose is wrong. Larger noise of landmarks
-    would only hide that.
+    Then the pose is likely to be wrong. Larger noise of landmarks would only hide that, so it is not offered.
     """
     twists = [one for one in findings if one.code == "twist_scale"]
     noisy = [one for one in findings if one.code == "over_confident" and one.severity == "warning"]
     if not (twists and noisy):
         return findings
     why = (
-        f"by the pose two sightings of a landmark differ by {max(one.value for one in noisy):.0f} times their noise, "
-        "so the pose is wrong: correct it, or odometry.distance_factor and odometry.turn_factor"
+        f"by the pose two sightings of a landmark differ by {max(one.value for one in noisy):.0f} times their noise. "
+        "Is the pose wrong? Correct it, or odometry.distance_factor and odometry.turn_factor. If the twist alone is "
+        "wrong, so is the noise of the landmarks"
     )
     mended = {id(one): replace(one, severity="error", text=f"{one.text}; {why}", settings=()) for one in twists}
     return [mended.get(id(one), one) for one in findings if one not in noisy]

@@ -327,8 +327,7 @@ class Suggestion:
             return
         offset_s = 0.0 if self._odometry is None else one.clock_offset_s(self._odometry)
         if abs(offset_s) > _MOST_OFFSET_S:
-            mend = f" (--landmarks {topic} --set {name}.offset_s={offset_s:.3f})" if name == "detections" else ""
-            self.unused[topic] = f"its stamps are {offset_s:.0f} s from those of odometry: another clock{mend}"
+            self.unused[topic] = f"its stamps are {offset_s:.0f} s from those of odometry: another clock"
             return
         settings = dict(chosen or {}) | ({} if linked else self._mount(topic, one.frame))
         if abs(offset_s) > _CLOCKS_DIFFER_S:

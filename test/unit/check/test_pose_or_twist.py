@@ -1,4 +1,4 @@
-"""Odometry whose pose and twist differ: landmarks decide which of the two is wrong."""
+"""Odometry whose pose and twist differ, and landmarks that seem too noisy by the pose."""
 
 from graph_slam_ros.check.finding import Finding
 from graph_slam_ros.check.odometry import of_pose_or_twist
@@ -11,7 +11,7 @@ OTHER = Finding("outliers", "note", 0.1, 0.02, "part", "some are far from their 
 def test_landmarks_that_contradict_the_pose_make_it_an_error_without_a_setting_that_hides_it():
     found, other = of_pose_or_twist([TWIST, NOISY, OTHER])
     assert (found.code, found.severity, found.settings) == ("twist_scale", "error", ())
-    assert "the pose is wrong" in found.text
+    assert "Is the pose wrong?" in found.text
     assert other is OTHER
 
 
