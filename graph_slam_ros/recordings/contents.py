@@ -29,6 +29,7 @@ class TopicContents:
     trouble : why its messages cannot be read; empty where they can
     first_ns, last_ns : of its messages, by the time they were received
     received_ns, lag_s : receive time, and that less the header stamp, of messages evenly over all that were read
+    headers, every : headers so far; of so many one has its lag here
     is_stamped : whether any header has a stamp
     frame, child : of the first header that names them
     items, without_id : what its messages hold (detections, points, transforms), and how many of these have no identity
@@ -66,9 +67,9 @@ class TopicContents:
     height_m: float = 0.0
 
     def add_lag(self, received_ns: int, stamp_ns: int) -> None:
-        """Add the lag of a message, if it is its turn."""
+        """Add the lag of a message, if it is its turn. A stamp of zero has none."""
         self.headers += 1
-        if self.headers % self.every:
+        if self.headers % self.every or not stamp_ns:
             return
         self.received_ns.append(received_ns)
         self.lag_s.append((received_ns - stamp_ns) * 1e-9)
@@ -83,7 +84,7 @@ class TopicContents:
     @property
     def is_zero(self) -> bool:
         """Return whether all its stamps are zero."""
-        return bool(self.lag_s) and not self.is_stamped
+        return self.headers > 0 and not self.is_stamped
 
 
 @dataclass(slots=True)
