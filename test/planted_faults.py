@@ -173,6 +173,7 @@ FAULTS = {
     "x and y exchanged": (of("wrong_axes:how=exchanged"), "axes mirrored"),
     "optical frame called base_link": (of("wrong_axes:how=optical"), "axes"),
     "landmarks in millimetres": (of("wrong_units"), "units"),
+    "landmark sigma 1e-6": (of("tiny_covariance"), "noise_zero"),
     "sensor frame without TF": (of("wrong_frames"), "frame_unlinked"),
     "sensor frame with two parents": (of("two_parents"), "two_parents"),
     "sightings given in odom": (of("wrong_frames:landmarks=odom"), "seen_in_fixed_frame"),

@@ -5,11 +5,11 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from graph_slam_ros.check.columns import Columns
+from graph_slam_ros.check.contradictions import check_contradictions
 from graph_slam_ros.check.finding import Finding, in_order, worst
 from graph_slam_ros.check.frames import check_frames
 from graph_slam_ros.check.gyro import check_gyro
 from graph_slam_ros.check.odometry import check_odometry
-from graph_slam_ros.check.pairs import check_pairs
 from graph_slam_ros.check.refusals import check_refusals, check_unnamed
 from graph_slam_ros.check.times import check_times
 
@@ -22,11 +22,11 @@ CHECKS: tuple[Check, ...] = (
     check_odometry,
     check_gyro,
     check_unnamed,
-    check_pairs,
+    check_contradictions,
 )
 """They need no fit: milliseconds for each minute of a recording."""
 
-OF_A_REPLAY: tuple[Check, ...] = (check_frames, check_times, check_odometry, check_pairs)
+OF_A_REPLAY: tuple[Check, ...] = (check_frames, check_times, check_odometry, check_contradictions)
 """Those that a replay does by itself; its own table has the refusals."""
 
 _FROM_THE_BEGINNING = ("units", "mirrored", "axes", "unrelated")  # what is read later does not make it right

@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from graph_slam_ros.check.located import located, mount_corrections, moved
+from graph_slam_ros.check.located import mount_corrections
+from graph_slam_ros.check.sightings import MOST, SightingCollector, SightingColumns, index
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.lie import se3
 from graph_slam_ros.measurements.counters import Counters
@@ -20,10 +21,7 @@ from graph_slam_ros.messages.from_msg import TF, TF_STATIC, OwnDecoder
 from graph_slam_ros.messages.inputs import uses
 from graph_slam_ros.messages.inputs.odometry_bytes import OdometryBytes, OdometryRun
 from graph_slam_ros.messages.inputs.transforms import Transforms, pose
-from graph_slam_ros.typing import Array, Index, Numbers
-
-MOST = 200_000
-"""Messages of each topic that are collected; a replay looks into no more."""
+from graph_slam_ros.typing import Array, Index
 
 _TWIST, _COLUMNS = (0, 7, 14, 21, 28, 35), 19  # places in a covariance; numbers of a message
 Decoder = Callable[[bytes], Any]
@@ -67,31 +65,6 @@ class OdometryColumns:
     poses: Array
     twist: Array
     variances: Array
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SightingColumns:
-    """The sightings of one input, as a replay uses them.
-
-    Attributes
-    ----------
-    stamp_ns, message : (k,) stamp, and number of the message
-    names, name : identities, and (k,) the number of each sighting's; the empty one is of those without
-    points : (k, 3) in the base frame; NaN of a range or bearing alone
-    sigmas : (k,) of the position, in metres
-    frame, T_base_frame : the frame of the first message, and where it is on the robot
-    """
-
-    input: str
-    topic: str
-    stamp_ns: Index
-    message: Index
-    names: tuple[str, ...]
-    name: Index
-    points: Array
-    sigmas: Array
-    frame: str
-    T_base_frame: se3.Pose
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -159,38 +132,7 @@ class _Topic:
 
     def columns(self) -> TopicColumns:
         return TopicColumns(
-            self.name, self.type, self.inputs, self.use, _index(self.log_ns), _index(self.stamp_ns), self.frames
-        )
-
-
-class _Sightings:
-    def __init__(self, name: str, topic: str, mount: Numbers) -> None:
-        self.input, self.topic, self._mount = name, topic, mount
-        self.frame, self.T_base_frame = "", se3.IDENTITY
-        self.stamp_ns, self.message, self.name = array("q"), array("q"), array("q")
-        self.points, self.sigmas = array("d"), array("d")
-        self.names: dict[str, int] = {}
-        self._messages = 0
-
-    def add(self, m: Sightings, heights: Mapping[str, float]) -> None:
-        if len(self.stamp_ns) >= MOST:
-            return
-        self._messages += 1
-        for one in m.sightings:
-            point, sigma = located(one)
-            if one.id in heights:
-                point = point[0], point[1], heights[one.id]
-            self.stamp_ns.append(m.stamp_ns)
-            self.message.append(self._messages)
-            self.name.append(self.names.setdefault(one.id, len(self.names)))
-            self.points.extend(point)
-            self.sigmas.append(sigma)
-
-    def columns(self) -> SightingColumns:
-        numbers = (_index(self.stamp_ns), _index(self.message), tuple(self.names), _index(self.name))
-        points = moved(np.array(self.points).reshape(-1, 3), self.T_base_frame, self._mount)
-        return SightingColumns(
-            self.input, self.topic, *numbers, points, np.array(self.sigmas), self.frame, self.T_base_frame
+            self.name, self.type, self.inputs, self.use, index(self.log_ns), index(self.stamp_ns), self.frames
         )
 
 
@@ -214,7 +156,7 @@ class Collector:
             first = by_name[names[0]]
             self._topics[topic] = _Topic(topic, first.type, names, used[names[0]], round(first.offset_s * 1e9))
         seen, mounts = (name for name, use in used.items() if use == "landmarks"), mount_corrections(config)
-        self._sightings = {name: _Sightings(name, topics[name], mounts[name]) for name in seen}
+        self._sightings = {name: SightingCollector(name, topics[name], mounts[name]) for name in seen}
         self._frame_of = {name: by_name[name].frame for name in used}
         self._odometry_topic = topics.get(self._main, "")
         self._frame, self._child = "", ""
@@ -327,7 +269,7 @@ class Collector:
                 count = 1 if link is None else link.count + 1
                 self._links[parent, child, fixed] = Link(parent, child, fixed, count, change)
 
-    def _place(self, found: _Sightings, message: Any) -> None:
+    def _place(self, found: SightingCollector, message: Any) -> None:
         """Find the place of an input's sensor on the robot, by its first message that names a frame."""
         own = self._frame_of[found.input] or _frame(message)
         if not own:
@@ -346,15 +288,15 @@ class Collector:
             self._config,
             {name: one.columns() for name, one in self._topics.items()},
             self._odometry(),
-            _index(self._path_ns),
+            index(self._path_ns),
             self._poses(self._path),
             tuple(one.columns() for one in self._sightings.values()),
             tuple(self._links.values()),
-            _index(self._tf_ns),
+            index(self._tf_ns),
             np.array(self._tf_path).reshape(-1, 7),
             counters,
             self._assumed,
-            _index(self._gyro_ns),
+            index(self._gyro_ns),
             np.array(self._gyro),
             self._gyro_frame,
             self._T_base(self._config.gyro_input, self._gyro_frame),
@@ -369,11 +311,11 @@ class Collector:
         if len(self._odometry_ns):
             rows = np.array(self._numbers).reshape(-1, _COLUMNS)
             return OdometryColumns(
-                *names, self._frame, self._child, _index(self._odometry_ns), rows[:, :7], rows[:, 7:13], rows[:, 13:]
+                *names, self._frame, self._child, index(self._odometry_ns), rows[:, :7], rows[:, 7:13], rows[:, 13:]
             )
         frames, poses = self._config.frames, self._poses(self._path)
         unknown = np.full((len(poses), 6), np.nan)
-        return OdometryColumns(*names, frames.odom, frames.base, _index(self._path_ns), poses, unknown, unknown)
+        return OdometryColumns(*names, frames.odom, frames.base, index(self._path_ns), poses, unknown, unknown)
 
 
 def _heights(message: Any, T_base_frame: se3.Pose) -> dict[str, float]:
@@ -392,7 +334,3 @@ def _frame(message: Any) -> str:
     headers = [getattr(message, "header", None), *(getattr(one, "header", None) for one in several[:1])]
     names = (one.frame_id.lstrip("/") for one in headers if one is not None)
     return next(filter(None, names), "")
-
-
-def _index(numbers: "array[int]") -> Index:
-    return np.array(numbers, dtype=np.int64)

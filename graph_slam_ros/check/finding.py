@@ -139,6 +139,11 @@ KINDS: dict[str, Kind] = {
         "sightings do not agree with odometry at all", "check the topic, the ids and the units of both", True
     ),
     "id_twice": Kind("one message has the same id twice", _ID),
+    "noise_zero": Kind(
+        "the covariance of sightings is nearly zero: no sensor is so exact",
+        "correct the driver; or set INPUT.noise=sigmas with INPUT.sigma_m",
+        True,
+    ),
     "few_sightings": Kind("there are hardly any sightings", "record a drive past more landmarks"),
     "seen_once": Kind(
         "most ids are seen less than three times: are they numbers of tracks, not of landmarks?",
@@ -232,6 +237,12 @@ class Finding:
     def ends(self) -> bool:
         """Return whether other findings mean nothing while it is there."""
         return self.code in KINDS and KINDS[self.code].ends
+
+    @property
+    def forbids_replay(self) -> bool:
+        """Return whether a replay is of no use until the cause is corrected: no setting mends it."""
+        is_refusal = self.code not in KINDS
+        return self.severity == "error" and not self.settings and (self.ends or is_refusal)
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values; a number that JSON has not is null."""

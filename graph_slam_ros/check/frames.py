@@ -4,8 +4,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from graph_slam_ros.check.columns import Columns, SightingColumns
+from graph_slam_ros.check.columns import Columns
 from graph_slam_ros.check.finding import Finding, Severity, Where
+from graph_slam_ros.check.sightings import SightingColumns
 from graph_slam_ros.formats.parameters import assignment
 from graph_slam_ros.messages.inputs.transforms import MAP_FRAMES, assumed_mount
 
@@ -92,7 +93,9 @@ def _unlinked(c: Columns, known: set[str]) -> Iterator[Finding]:
         names = ", ".join(list(topic.frames)[:4])
         key, value = f"{source}.mount", assumed_mount(names)
         if "odom_frame_unknown" in counts:
-            key, value = "frames.odom", next(iter(topic.frames), "odom")
+            named = next(iter(topic.frames), "odom")
+            frames = c.config.frames
+            key, value = ("frames.odom", named) if named != frames.map else (f"{source}.frame", frames.odom)
         severity: Severity = "error" if times > 0.5 * max(c.counters.received[source], 1) else "warning"
         text = f"{topic.name}: {times} messages are refused: no transform links frame {names} to {c.config.frames.base}"
         first_ns = int(topic.stamp_ns[0]) if len(topic.stamp_ns) else 0

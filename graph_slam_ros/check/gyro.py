@@ -6,8 +6,9 @@ from dataclasses import replace
 import numpy as np
 
 from graph_slam_ros.check.columns import Columns
+from graph_slam_ros.check.contradictions import turned_mount
 from graph_slam_ros.check.finding import Finding, Severity, Where
-from graph_slam_ros.check.pairs import path_of, poses_at, turned_mount
+from graph_slam_ros.check.pairs import path_of, poses_at
 from graph_slam_ros.formats.parameters import assignment
 from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.typing import Array

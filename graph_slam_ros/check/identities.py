@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from graph_slam_ros.check.columns import SightingColumns
 from graph_slam_ros.check.finding import Finding
 from graph_slam_ros.check.pairs import usable
+from graph_slam_ros.check.sightings import SightingColumns
 from graph_slam_ros.lie import se3
 from graph_slam_ros.typing import Array, Index, Mask
 

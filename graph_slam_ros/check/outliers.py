@@ -7,8 +7,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import bdtrc
 
-from graph_slam_ros.check.columns import SightingColumns
 from graph_slam_ros.check.finding import Finding, Severity, Where
+from graph_slam_ros.check.sightings import SightingColumns
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.lie import se3
 from graph_slam_ros.typing import Array, Index, Mask

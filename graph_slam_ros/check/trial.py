@@ -6,11 +6,13 @@ from dataclasses import replace
 import numpy as np
 
 from graph_slam_ros.check.columns import Columns
+from graph_slam_ros.check.contradictions import turned_mount
 from graph_slam_ros.check.finding import Finding, Where
 from graph_slam_ros.check.identities import at_two_places, check_identities, points_in_map
 from graph_slam_ros.check.located import moved
+from graph_slam_ros.check.noise import noisier
 from graph_slam_ros.check.outliers import check_outliers
-from graph_slam_ros.check.pairs import noisier, pairs_of, path_of, poses_at, turned_mount
+from graph_slam_ros.check.pairs import pairs_of, path_of, poses_at
 from graph_slam_ros.check.slips import check_slips
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.parameters import assignment

@@ -42,7 +42,7 @@ def check(args: argparse.Namespace) -> int:
         own = [f"--config {shlex.quote(str(args.config))}"] if args.config else []
         given = shlex.split(done.command)
         more = [f"--set {shlex.quote(text)}" for text in last.values() if text not in given]
-        if any(one.ends and one.severity == "error" and not one.settings for one in done.findings):
+        if any(one.forbids_replay for one in done.findings):
             console.then(f"correct what is an error, then check again: {console.command('check', args.bag)}")
         elif done.command:
             console.then(" ".join([done.command, *own, *more]))

@@ -16,6 +16,16 @@ class FramesConfig:
     odom: str = setting("odom", "frame of the odometry")
     base: str = setting("base_link", "frame of the robot")
 
+    def __post_init__(self) -> None:
+        names = {"map": self.map, "odom": self.odom, "base": self.base}
+        for key, name in names.items():
+            for other in names:
+                if other != key and names[other] == name:
+                    raise ConfigError(
+                        f"frames.{key}: {name!r} is frames.{other}, too: each needs a name of its own; for messages of "
+                        "odometry that name another frame, set frame of their input, for example odom.frame=odom"
+                    )
+
 
 @dataclass(frozen=True, slots=True)
 class WorldConfig:

@@ -37,7 +37,7 @@ class TopicContents:
     is_repeated : whether one message has a class id twice
     has_noise : whether the first message tells its covariance
     usable : messages that can be used at all: with a fix, with an orientation
-    path_m, off_plane : of odometry: length of the path, and messages above, below or tilted against the first
+    path_m, off_plane : of odometry and poses: length of the path, and messages above, below or tilted against the first
     """
 
     topic: Topic
@@ -179,10 +179,17 @@ def _any(one: TopicContents, m: Any) -> None:
 
 
 def _odometry(one: TopicContents, m: Any) -> None:
-    p, q = m.pose.pose.position, m.pose.pose.orientation
+    if one.last_at is None:
+        one.has_noise = bool(m.twist.covariance.any())
+    _moved(one, m.pose.pose)
+
+
+def _moved(one: TopicContents, pose: Any) -> None:
+    """The robot is at this pose."""
+    p, q = pose.position, pose.orientation
     at = float(p.x), float(p.y), float(p.z)
     if one.last_at is None:
-        one.height_m, one.has_noise = at[2], bool(m.twist.covariance.any())
+        one.height_m = at[2]
     else:
         step = math.dist(at, one.last_at)
         one.path_m += step if math.isfinite(step) else 0.0
@@ -225,6 +232,7 @@ def _imu(one: TopicContents, m: Any) -> None:
 
 def _pose(one: TopicContents, m: Any) -> None:
     one.has_noise |= hasattr(m.pose, "covariance") and bool(m.pose.covariance[:8:7].all())
+    _moved(one, m.pose.pose if hasattr(m.pose, "covariance") else m.pose)
 
 
 def _apriltags(one: TopicContents, m: Any) -> None:

@@ -21,7 +21,8 @@ from graph_slam_ros.recordings.bag import Bag, open_bag
 from graph_slam_ros.recordings.contents import Recording, TopicContents
 from graph_slam_ros.runs.replay import RecordedRuns
 from graph_slam_ros.runs.suggested_inputs import OF_LANDMARKS, SuggestedInputs
-from graph_slam_ros.runs.suggestion import ODOMETRY, Suggestion
+from graph_slam_ros.runs.suggested_odometry import ODOMETRY
+from graph_slam_ros.runs.suggestion import Suggestion
 from graph_slam_ros.slam import Config, Control, Counters
 from graph_slam_ros.warmup import warmup
 

@@ -11,7 +11,8 @@ from graph_slam_ros.recordings.bag import Bag, BagError, open_bag
 from graph_slam_ros.recordings.contents import recording_of
 from graph_slam_ros.runs.chosen_inputs import Inputs, choose_inputs
 from graph_slam_ros.runs.namespaces import is_truth
-from graph_slam_ros.runs.suggestion import CLOUD, DETECTIONS, GNSS, ODOMETRY, Suggestion
+from graph_slam_ros.runs.suggested_odometry import DETECTIONS, ODOMETRY
+from graph_slam_ros.runs.suggestion import CLOUD, GNSS, Suggestion
 from graph_slam_ros.slam import Config
 
 OF_LANDMARKS = frozenset({DETECTIONS, CLOUD, *LANDMARK_TYPES})

@@ -16,25 +16,16 @@ from graph_slam_ros.recordings.bag import Bag
 from graph_slam_ros.recordings.contents import Recording, TopicContents
 from graph_slam_ros.runs.chosen_inputs import TF_TOPIC, choose_inputs
 from graph_slam_ros.runs.folder import suggested_out
-from graph_slam_ros.runs.namespaces import WORD, is_truth, landmarks_of_other_robots
+from graph_slam_ros.runs.namespaces import is_truth
+from graph_slam_ros.runs.suggested_odometry import DETECTIONS, ESTIMATE, OdometryChoice, readable
 from graph_slam_ros.slam import Config
 
-ODOMETRY, DETECTIONS = "nav_msgs/msg/Odometry", "vision_msgs/msg/Detection3DArray"
 CLOUD, GNSS, IMU = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/Imu"
 POSE, POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped"
 
-_ESTIMATE = re.compile(
-    WORD.format(
-        r"amcl\w*|\w*slam\w*|cartographer|rtabmap|locali[sz]\w*|mcl|tracked_pose|initialpose|goal\w*|pose_est\w*"
-    ),
-    re.IGNORECASE,
-)
-_FUSED = re.compile(r"filtered|fused|[eu]kf|combined", re.IGNORECASE)
-_NOT_MEASURED = re.compile(r"raw|cmd|desired|target|set_?point|plan", re.IGNORECASE)
 _TAG = re.compile(r"((?:.*[/_])?(?:tag|aruco|marker|fiducial).*?)[:_]?\d+", re.IGNORECASE)
 _TAG_TOPIC = re.compile(r"(?:tag|aruco|marker|fiducial)[_/:]?(\d+)(?:/pose)?$", re.IGNORECASE)
 _CORNERS = re.compile(r"^(?!.*map).*(tag|aruco|fiducial)", re.IGNORECASE)
-_OFF_PLANE = 0.05
 _OF_ROS = ("/clock", "/rosout", "/parameter_events", "/diagnostics", "/events/write_split", "/robot_description")
 _MOST_LISTED = 6
 _CLOCKS_DIFFER_S, _MOST_OFFSET_S = 2.0, 3600.0
@@ -59,10 +50,18 @@ class Suggestion:
         self.unused: dict[str, str] = {}
         self.topics: dict[str, str] = {}  # of odom and detections
         self.names: list[str] = []
-        self._base, self._odom = "base_link", "odom"
-        self._odometry: TopicContents | None = None
-        self.trouble = self._of_a_result() or self._choose_odometry()
+        self.trouble = self._of_a_result()
+        if self.trouble:
+            return
+        chosen = OdometryChoice(recording, self.unused)
+        self._odometry, self._base, self._odom = chosen.contents, chosen.base, chosen.odom
+        self.settings |= chosen.settings
+        self.notes += chosen.notes
+        self.trouble = chosen.trouble
         if not self.trouble:
+            self.names.append("odom")
+            if chosen.topic:
+                self.topics["odom"] = chosen.topic
             self._choose_landmarks()
             self._choose_fixes()
             self._finish()
@@ -99,110 +98,19 @@ class Suggestion:
             )
         return ""
 
-    def _of_type(self, *types: str) -> Iterator[TopicContents]:
-        """Topics that can be read and are not the truth."""
-        for name, one in self._recording.topics.items():
-            if one.topic.type in types and one.topic.count:
-                if name in self.unused:
-                    continue
-                if is_truth(name):
-                    self.unused[name] = "ground truth by its name: graph_slam evaluate RUN --truth compares with it"
-                elif one.trouble:
-                    self.unused[name] = one.trouble
-                else:
-                    yield one
-
-    # -- odometry ------------------------------------------------------------------------------------------------
-
-    def _choose_odometry(self) -> str:
-        found = []
-        for one in self._of_type(ODOMETRY):
-            if one.frame in MAP_FRAMES:
-                self.unused[one.topic.name] = f"in frame {one.frame}: somebody's estimate, not odometry"
-            elif one.is_zero:
-                self.unused[one.topic.name] = "its stamps are zero: have the driver fill in header.stamp"
-            else:
-                found.append(one)
-        if not found:
-            return self._odometry_of_tf()
-        best = max(found, key=self._merit)
-        for one in found:
-            if one is not best:
-                self.unused[one.topic.name] = "another odometry"
-        if len(found) > 1:
-            self.notes.append(f"{len(found)} odometries: {best.topic.name} is chosen; --odom takes another")
-        seen = [name for name, one in self._recording.topics.items() if one.topic.type in (DETECTIONS, *LANDMARK_TYPES)]
-        self.unused |= landmarks_of_other_robots(best.topic.name, [one.topic.name for one in found], seen)
-        self.topics["odom"], self._odometry = best.topic.name, best
-        self._frames(best.frame, best.child)
-        if best.off_plane > _OFF_PLANE * best.read:
-            self.settings["world.dimensions"] = 3
-            self.notes.append(f"{best.topic.name} leaves the plane: these are three dimensions")
-        return ""
-
-    def _merit(self, one: TopicContents) -> tuple[Any, ...]:
-        """The order of preference: complete and moving, then fused, then in a frame of odometry, then most messages."""
-        longest = max(other.last_ns - other.first_ns for other in self._recording.topics.values())
-        is_whole = one.last_ns - one.first_ns >= 0.5 * longest
-        name = one.topic.name
-        is_odom = "odom" in one.frame.lower()
-        fused = bool(_FUSED.search(name)) - bool(_NOT_MEASURED.search(name))
-        return is_whole, one.path_m > 0.05, fused, is_odom, one.topic.count
-
-    def _odometry_of_tf(self) -> str:
-        links = [(p, c) for c, p in self._recording.moving.items() if p not in MAP_FRAMES]
-        links = [(p, c) for p, c in links if "odom" in p.lower() or c.startswith("base")]
-        if not links or TF_TOPIC not in self._recording.topics:
-            there = ", ".join(f"{name} ({one.topic.type or 'no type'})" for name, one in self._recording.topics.items())
-            why = "".join(f"; {name}: {reason}" for name, reason in self.unused.items())
-            return f"no odometry (nav_msgs/msg/Odometry, or odom -> base_link on /tf); there are {there}{why}"
-        parent, child = min(links, key=lambda link: ("odom" not in link[0].lower(), not link[1].startswith("base")))
-        self.settings |= {"odom.type": TRANSFORMS, "odom.topic": TF_TOPIC}
-        self.notes.append(f"odometry is {parent} -> {child} of /tf: there is no topic with it")
-        self._frames(parent, child)
-        return ""
-
-    def _frames(self, parent: str, child: str) -> None:
-        self.names.append("odom")
-        if not parent:
-            self.settings["odom.frame"] = self._odom
-        elif parent != self._odom:
-            self.settings["frames.odom"] = self._odom = parent
-        if not child:
-            self.settings["odom.mount"] = "0 0 0 0 0 0"
-            self.notes.append("odometry names no child frame: that of the robot's base is assumed")
-        elif base := self._unlinked_base(child):
-            self.settings["odom.mount"] = "0 0 0 0 0 0"
-            self.notes.append(
-                f"no transform links {child}, which odometry names, to {base}, which carries the sensors: "
-                "they are taken for one place (odom.mount)"
-            )
-            if base != self._base:
-                self.settings["frames.base"] = self._base = base
-        elif child != self._base:
-            self.settings["frames.base"] = self._base = child
-
-    def _unlinked_base(self, child: str) -> str:
-        """The base that carries the sensors on /tf_static if odometry's child is not linked to it, else empty."""
-        fixed = self._recording.fixed
-        if child in fixed or child in fixed.values():
-            return ""
-        roots = {parent for parent in fixed.values() if parent not in fixed and "base" in parent}
-        return roots.pop() if len(roots) == 1 else ""
-
     # -- landmarks -----------------------------------------------------------------------------------------------
 
     def _choose_landmarks(self) -> None:
-        for one in self._of_type(DETECTIONS):
+        for one in readable(self._recording, self.unused, DETECTIONS):
             self._detections(one)
-        for one in self._of_type(CLOUD):
+        for one in readable(self._recording, self.unused, CLOUD):
             self._cloud(one)
-        for one in self._of_type(*LANDMARK_TYPES):
+        for one in readable(self._recording, self.unused, *LANDMARK_TYPES):
             if one.topic.type == APRILTAGS and not one.ids & self._recording.moving.keys():
                 self._corners(one)
             else:
                 self._add(LANDMARK_TYPES[one.topic.type].input_name, one)
-        for one in self._of_type(POSE, POSE_WITH_COVARIANCE):
+        for one in readable(self._recording, self.unused, POSE, POSE_WITH_COVARIANCE):
             if number := self._tag_number(one):
                 self._add("tag", one, {"use": "landmarks", "id": number})
         prefixes = {found[1] for found in map(_TAG.fullmatch, self._recording.moving) if found}
@@ -212,7 +120,7 @@ class Suggestion:
                 frame = next(p for c, p in self._recording.moving.items() if c.startswith(prefix))
                 self._set(self._free("tags"), chosen | self._mount(TF_TOPIC, frame))
         known = known_types()
-        for one in self._of_type(*(known - CONVERTERS.keys())):
+        for one in readable(self._recording, self.unused, *(known - CONVERTERS.keys())):
             try:
                 converters(one.topic.type)
                 self._add("plugin", one)
@@ -275,7 +183,7 @@ class Suggestion:
 
     def _choose_fixes(self) -> None:
         has_landmarks = len(self.names) > 1
-        receivers = sorted(self._of_type(GNSS), key=lambda one: -one.usable)
+        receivers = sorted(readable(self._recording, self.unused, GNSS), key=lambda one: -one.usable)
         for one in receivers[1:]:
             self.unused[one.topic.name] = "another receiver"
         for one in receivers[:1]:
@@ -286,12 +194,12 @@ class Suggestion:
             self._mount(one.topic.name, one.frame)  # says what is assumed; the input itself assumes and counts it
             if not one.has_noise:
                 self.notes.append(f"{one.topic.name} has no covariance: 2 m is assumed")
-        self._choose_imu(self._of_type(IMU), is_needed=len(self.names) == 1)
-        for one in self._of_type(POSE, POSE_WITH_COVARIANCE):
+        self._choose_imu(readable(self._recording, self.unused, IMU), is_needed=len(self.names) == 1)
+        for one in readable(self._recording, self.unused, POSE, POSE_WITH_COVARIANCE):
             name = one.topic.name
-            if self._tag_number(one):
-                pass  # a landmark
-            elif _ESTIMATE.search(name):
+            if self._tag_number(one) or name == self.topics.get("odom"):
+                pass  # a landmark, or odometry
+            elif ESTIMATE.search(name):
                 self.unused[name] = "the output of a localiser, or a goal: no measurement"
             elif one.frame == self._odom:
                 self.unused[name] = "in the frame of the odometry: it says the same"

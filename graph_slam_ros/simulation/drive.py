@@ -167,29 +167,53 @@ class Sightings:
             self.points = np.array([(p.x, p.y, p.z) for p in at]).reshape(-1, 3)
             return
         names = [f.name for f in self._content.fields]
-        if any(f.datatype != _DOUBLE for f in self._content.fields) or not {"id", "range", "bearing"} <= set(names):
-            raise GraphSlamError("faults need points with id, range and bearing as doubles")
+        if any(f.datatype != _DOUBLE for f in self._content.fields) or not (
+            "id" in names and {"range", "bearing"} & set(names)
+        ):
+            raise GraphSlamError("faults need points with an id and a range or a bearing, as doubles")
         self._rows = np.frombuffer(self._content.data.tobytes(), dtype="<f8").reshape(-1, len(names)).copy()
         self._column = {name: self._rows[:, k] for k, name in enumerate(names)}
         self.ids = [str(int(number)) for number in self._column["id"]]
-        up = self._column.get("elevation", np.zeros(len(self._rows)))
-        r, b = self._column["range"], self._column["bearing"]
+        none = np.zeros(len(self._rows))
+        r, b, up = (self._column.get(*of) for of in (("range", none + 1.0), ("bearing", none), ("elevation", none)))
         self.points = np.stack([r * np.cos(up) * np.cos(b), r * np.cos(up) * np.sin(b), r * np.sin(up)], axis=1)
 
     @property
     def sigmas(self) -> Array:
-        """The standard deviation (k,) of the position along x, or of the range."""
+        """The standard deviation (k,) of the position along x, or of what is measured first."""
         if hasattr(self, "_rows"):
             return np.array(self._column["sigma"])
         return np.array([max(float(one.results[0].pose.covariance[0]), 0.0) ** 0.5 for one in self._content.detections])
+
+    def scale_bearings(self, factor: float) -> None:
+        """Multiply bearings, also beyond half a turn."""
+        bearings = [name for name in getattr(self, "_column", {}) if name in ("bearing", "elevation")]
+        if not bearings:
+            raise GraphSlamError("the landmarks of this recording have no bearings")
+        for name in bearings:
+            self._column[name][:] *= factor
+        self._content.data = self._rows.ravel().view(np.uint8)
+
+    def set_noise(self, sigma: float) -> None:
+        """Set the standard deviations of everything [m, rad]."""
+        if hasattr(self, "_rows"):
+            for name in (name for name in self._column if name.startswith("sigma")):
+                self._column[name][:] = sigma
+            self._content.data = self._rows.ravel().view(np.uint8)
+            return
+        for one in self._content.detections:
+            for result in one.results:
+                result.pose.covariance = (sigma**2 * np.eye(6)).ravel()
 
     def store(self, turn: Array | None = None) -> None:
         """Write ids and points back. Orientations are turned by an orthogonal matrix (3, 3)."""
         if hasattr(self, "_rows"):
             x, y, z = self.points.T
             self._column["id"][:] = [float(name) for name in self.ids]
-            self._column["range"][:] = np.sqrt(x**2 + y**2 + (z**2 if "elevation" in self._column else 0.0))
-            self._column["bearing"][:] = np.arctan2(y, x)
+            if "range" in self._column:
+                self._column["range"][:] = np.sqrt(x**2 + y**2 + (z**2 if "elevation" in self._column else 0.0))
+            if "bearing" in self._column:
+                self._column["bearing"][:] = np.arctan2(y, x)
             if "elevation" in self._column:
                 self._column["elevation"][:] = np.arctan2(z, np.hypot(x, y))
             self._content.data = self._rows.ravel().view(np.uint8)

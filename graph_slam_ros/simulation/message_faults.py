@@ -95,9 +95,17 @@ class WrongAxes:
 
 @dataclass(frozen=True, slots=True)
 class WrongUnits:
-    """Landmarks in other units than metres."""
+    """Landmarks in other units than metres or radians."""
 
-    factor: float = option(1000.0, "so many for each metre", "", 1e-6, 1e6)
+    factor: float = option(1000.0, "so many for each metre or radian", "", 1e-6, 1e6)
+    of: str = option("lengths", "which numbers", choices=("lengths", "bearings"))
+
+
+@dataclass(frozen=True, slots=True)
+class TinyCovariance:
+    """Landmarks whose covariance is smaller than any sensor's."""
+
+    sigma: float = option(1e-6, "its standard deviations", "m, rad", 0, 1e3)
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,10 +218,18 @@ def _wrong_axes(drive: Drive, fault: WrongAxes, _rng: Generator) -> None:
 
 
 def _wrong_units(drive: Drive, fault: WrongUnits, _rng: Generator) -> None:
-    def change(seen: Sightings, _: Message) -> None:
-        seen.points = seen.points * fault.factor
+    for m in drive.landmarks:
+        seen = Sightings(m)
+        if fault.of == "bearings":
+            seen.scale_bearings(fault.factor)
+        else:
+            seen.points = seen.points * fault.factor
+            seen.store()
 
-    _each(drive, change)
+
+def _tiny_covariance(drive: Drive, fault: TinyCovariance, _rng: Generator) -> None:
+    for m in drive.landmarks:
+        Sightings(m).set_noise(fault.sigma)
 
 
 def _noisy(drive: Drive, fault: Noisy, rng: Generator) -> None:
@@ -294,6 +310,7 @@ MESSAGE_KINDS: dict[str, Kind] = {
     "wrong_mount": Kind(WrongMount, _wrong_mount),
     "wrong_axes": Kind(WrongAxes, _wrong_axes),
     "wrong_units": Kind(WrongUnits, _wrong_units),
+    "tiny_covariance": Kind(TinyCovariance, _tiny_covariance),
     "noisy": Kind(Noisy, _noisy),
     "track_ids": Kind(TrackIds, _track_ids),
     "random_ids": Kind(RandomIds, _random_ids),

@@ -46,6 +46,7 @@ SELECTED = (
     "sensor's transform changes",
     "an id twice in a message",
     "twist variance 0",
+    "landmark sigma 1e-6",
     "an id for each sighting",
     "nothing seen after a fiftieth",
 )
@@ -107,6 +108,34 @@ def test_a_planted_fault_is_found_and_its_settings_mend_it(drive, tmp_path, name
         if one.settings:
             mended = check(bag, settings | dict(parse_setting(text) for text in one.settings), quick=True).findings
             assert one.code not in {other.code for other in mended}
+
+
+@pytest.mark.parametrize(
+    ("sensor", "fault", "code"),
+    [
+        ("range", "wrong_units", "units"),
+        ("range", "wrong_units:factor=100.0", "units"),
+        ("bearing", "wrong_units:of=bearings,factor=57.29578", "bearing_out_of_range"),
+    ],
+)
+def test_other_units_of_ranges_or_bearings_alone_are_found_and_no_replay_is_offered(
+    tmp_path, capsys, sensor, fault, code
+):
+    drive, bag = simulate("warehouse", 3, aisles=2, aisle_m=4.0, laps=1, sensor=sensor), tmp_path / "right.mcap"
+    write_bag(drive, bag)
+    assert not [one for one in check(bag, quick=True).findings if one.severity != "note"]
+    assert main(["simulate", str(bag), "--out", str(tmp_path / "wrong.mcap"), "--fault", fault]) == 0
+    capsys.readouterr()
+    assert main(["check", str(tmp_path / "wrong.mcap")]) == 4
+    said = capsys.readouterr().out
+    assert f"[error] {code}: " in said
+    assert "next: correct what is an error, then check again" in said
+
+
+def test_bearings_of_a_recording_without_any_cannot_be_wrong(drive, tmp_path, capsys):
+    fault = "wrong_units:of=bearings"
+    assert main(["simulate", str(drive), "--out", str(tmp_path / "wrong.mcap"), "--fault", fault]) == 2
+    assert "the landmarks of this recording have no bearings" in capsys.readouterr().err
 
 
 def test_the_output_of_a_localiser_has_no_setting_that_mends_it(tmp_path):

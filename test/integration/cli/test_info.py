@@ -190,6 +190,36 @@ def test_without_odometry_there_is_no_command_and_the_code_is_3(info, topics):
     assert lines[-1].startswith("not ready for replay: no odometry")
 
 
+@pytest.mark.parametrize("frame, name", [("odom", "/camera/pose"), ("start", "/vio/pose")])
+def test_poses_that_are_odometry_by_a_name_are_offered_where_there_is_no_other(info, capsys, frame, name):
+    def posed_at(k, stamp_ns, truth, drifting):
+        x, y, yaw = drifting
+        return posed("PoseStamped", pose(x, y, 0.02 * k, quaternion(yaw=yaw)), frame, None, stamp_ns)
+
+    code, lines, words = info((name, POSE, posed_at), SEEN)
+    assert code == 0
+    assert {"odom.use=odometry", f"odom.type={POSE}", "world.dimensions=3"} <= set(words)
+    assert any(line.startswith(f"note: odometry is {name}, poses without a child frame") for line in lines)
+    summary, _, _ = run(words, capsys)
+    assert summary["landmarks"] == 3
+    main(["check", words[2], "--quick"])
+    assert f"--odom {name}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "frame, name, says",
+    [
+        ("map", "/vio/pose", "/vio/pose: in frame map: somebody's estimate, not odometry"),
+        ("odom", "/amcl_pose", "/amcl_pose: the output of a localiser, or a goal, not odometry"),
+        ("start", "/camera/pose", f"if /camera/pose is odometry: --set odom.type={POSE} --set odom.topic=/camera/pose"),
+    ],
+)
+def test_poses_that_may_be_anything_are_not_offered_and_it_is_said_how_to_use_them(info, frame, name, says):
+    code, lines, _ = info((name, POSE, at(frame=frame)), SEEN)
+    assert code == 3
+    assert says in lines[-1]
+
+
 # -- landmarks ---------------------------------------------------------------------------------------------------------
 
 

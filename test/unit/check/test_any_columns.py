@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from graph_slam_ros.check.checks import check_columns
-from graph_slam_ros.check.columns import Columns, Link, OdometryColumns, SightingColumns, TopicColumns
+from graph_slam_ros.check.columns import Columns, Link, OdometryColumns, TopicColumns
 from graph_slam_ros.check.finding import KINDS, SEVERITIES
+from graph_slam_ros.check.sightings import SightingColumns
 from graph_slam_ros.cli.check import lines
 from graph_slam_ros.formats.parameters import parse_setting
 from graph_slam_ros.lie import se3
@@ -68,6 +69,7 @@ def columns(seed):
         names,
         rng.integers(0, len(names), k),
         numbers(rng, k, 3),
+        np.abs(numbers(rng, k)) if rng.random() < 0.3 else np.full(k, np.nan),
         np.abs(numbers(rng, k)),
         pick(),
         tuple(rng.choice([0.0, 1.0], 3)) + tuple(se3.IDENTITY[3:]),

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from graph_slam_ros.check.columns import SightingColumns
 from graph_slam_ros.check.outliers import check_outliers
+from graph_slam_ros.check.sightings import SightingColumns
 from graph_slam_ros.lie import se3
 from graph_slam_ros.slam import Config
 
@@ -36,6 +36,7 @@ def seen(random, *, wrong=0.0, far=0.0, burst=1):
         tuple(map(str, range(LANDMARKS))),
         given,
         np.column_stack((points, np.zeros(len(name)))),
+        np.full(len(name), np.nan),
         np.full(len(name), SIGMA_M),
         "base_link",
         se3.IDENTITY,

@@ -138,6 +138,7 @@ def test_F28_an_unknown_key_is_refused_with_the_nearest_known_one(name, nearest)
         ("anchor.sigma_m", 1e300, r"1e\+300 is not in \[0, 1e\+09\]"),
         ("anchor.sigma_rad", 1e-12, r"1e-12 is not 0 or in \[1e-06, 1e\+09\]"),
         ("frames.map", 3, "3 is not a text"),
+        ("frames.odom", "base_link", "is frames.base, too: each needs a name of its own"),
         ("solve.method", "newton", "'newton' is not one of gn, lm"),
         ("landmarks.id_from", "name", "'name' is not one of id, class_id"),
     ],

@@ -1,0 +1,218 @@
+"""Checks of sightings against odometry without a fit: the same landmark, seen twice within a few seconds."""
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from graph_slam_ros.check.columns import Columns
+from graph_slam_ros.check.finding import Finding, Where
+from graph_slam_ros.check.noise import TYPICAL_M, check_noise, noisier
+from graph_slam_ros.check.pairs import LATER_S, Pairs, pairs_of, path_of, usable
+from graph_slam_ros.check.ranges import check_ranges
+from graph_slam_ros.check.sightings import SightingColumns
+from graph_slam_ros.formats.parameters import assignment
+from graph_slam_ros.lie import se3, so3
+from graph_slam_ros.typing import Array, Index, Mask
+
+_LEAST_PAIRS = 30
+_TURNED_RAD, _LEAST_TURNED = 0.25, 25
+_FAR_M = 200.0
+_HALF, _NOISES, _NEARLY = 0.5, 2.0, 1.2
+_RELATED = 0.7
+_UNRELATED, _UNRELATED_NOISES, _UNRELATED_PAIRS = 0.6, 4.0, 100
+_TWICE, _FEW = 0.002, 30
+_ONCE, _SELDOM = 0.5, 3
+_AGAIN_S, _AGAIN_M, _SPAN = 10.0, 3.0, 0.25
+_LOOP = 0.1  # of the way: landmarks that come back within less close no loop of the drive
+_SILENT = 0.5
+_QUARTER = 0.5**0.5
+_CORRECTED = "_corrected"
+
+# Where a sensor would be turned on the robot, if its positions are in other axes: R_frame_true.
+TURNS: Mapping[str, so3.Quaternion] = {
+    "turned by 90 degrees": (0.0, 0.0, _QUARTER, _QUARTER),
+    "turned by -90 degrees": (0.0, 0.0, -_QUARTER, _QUARTER),
+    "turned by 180 degrees": (0.0, 0.0, 1.0, 0.0),
+    "those of an optical frame (z ahead, x to the right)": (-0.5, 0.5, -0.5, 0.5),
+}
+EXCHANGED, MIRRORED = "x and y exchanged", "y to the right"
+
+
+def check_contradictions(c: Columns) -> Iterator[Finding]:
+    """Each input of landmarks against odometry: units, axes, mirrors, identities, and what is seen again."""
+    path_ns, path = path_of(c)
+    if len(path_ns) < 2:
+        return
+    for s in c.sightings:
+        if not len(s.stamp_ns):
+            continue
+        found = list(check_ranges(s, path_ns, path)) + list(_contradictions(c, s, path_ns, path))
+        yield from found
+        yield from _identities(c, s)
+        if not any(one.ends for one in found):
+            yield from _coverage(s, path_ns, path)
+
+
+def _contradictions(c: Columns, s: SightingColumns, path_ns: Index, path: Array) -> Iterator[Finding]:
+    use = usable(s, path_ns)
+    where: Where = {"topic": s.topic, "first_ns": int(s.stamp_ns[0]), "count": int(use.sum())}
+    if not use.any():
+        return
+    distance_m = np.linalg.norm(s.points, axis=1)
+    far_m = float(np.median(distance_m[use]))
+    if far_m > _FAR_M:
+        text = f"{s.topic}: the median distance of landmarks is {far_m:.0f} m: are these metres?"
+        yield Finding("units", "error", far_m, _FAR_M, "m", text, **where)
+        return
+    pairs = pairs_of(s, path_ns, path, c.config.world.dimensions)
+    if len(pairs.a) < _LEAST_PAIRS:
+        text = f"{s.topic}: landmarks are seen again within {LATER_S:.0f} s of motion only {len(pairs.a)} times"
+        yield Finding("no_parallax", "note", len(pairs.a), _LEAST_PAIRS, "pairs", text, **where)
+        return
+    where["count"] = len(pairs.a)
+    noise_m = 1.5 * (float(np.median(s.sigmas[pairs.a])) * 2.0**0.5 + TYPICAL_M)
+    found = _mirrored(c, s, pairs, noise_m, where) or _axes(s, pairs, noise_m, use, where)
+    if found is not None:
+        yield found
+        return
+    noises = list(check_noise(c, s, pairs))
+    yield from noises
+    if noises:
+        return
+    residual_m = float(np.median(pairs.residuals(s.points)))
+    lever_m = np.linalg.norm(pairs.motion[:, :3], axis=1) + pairs.turned * np.minimum(distance_m[pairs.a], 1e3)
+    share = residual_m / float(np.median(lever_m))
+    if share > _UNRELATED and residual_m > _UNRELATED_NOISES * noise_m and len(pairs.a) > _UNRELATED_PAIRS:
+        if residual_m < _RELATED * _of_others(s.points, pairs, use):
+            yield from noisier(s, pairs)
+            return
+        text = f"{s.topic}: odometry does not explain {share:.0%} of the motion between two sightings of a landmark"
+        yield Finding("unrelated", "error", share, _UNRELATED, "part", text, **where)
+
+
+def _of_others(points: Array, pairs: Pairs, use: Mask) -> float:
+    """The median distance between two landmarks, whatever their identities: what chance would give."""
+    chosen = np.flatnonzero(use)
+    shifted = Pairs(pairs.a, np.roll(chosen, len(chosen) // 2)[np.searchsorted(chosen, pairs.b)], pairs.motion)
+    return float(np.median(Pairs(shifted.a, shifted.b, shifted.motion, pairs.dimensions).residuals(points)))
+
+
+def _hypotheses(s: SightingColumns) -> dict[str, Array]:
+    """Points (k, 3) in the base frame, if those of the sensor are in other axes."""
+    base_frame = tuple(s.T_base_frame)
+    seen = np.stack(se3.act(se3.inverse(base_frame), tuple(s.points.T)), axis=1)
+
+    def placed(points: Array) -> Array:
+        return np.stack(se3.act(base_frame, tuple(points.T)), axis=1)
+
+    turned = {what: placed(np.stack(so3.act(q, tuple(seen.T)), axis=1)) for what, q in TURNS.items()}
+    return turned | {EXCHANGED: placed(seen[:, [1, 0, 2]]), MIRRORED: placed(seen * [1.0, -1.0, 1.0])}
+
+
+def _mirrored(c: Columns, s: SightingColumns, pairs: Pairs, noise_m: float, where: Where) -> Finding | None:
+    """A mirror shows only where the robot turns."""
+    at = pairs.turned > _TURNED_RAD
+    if at.sum() < _LEAST_TURNED:
+        return None
+    turning = Pairs(pairs.a[at], pairs.b[at], pairs.motion[at], pairs.dimensions)
+    now_m = float(np.median(turning.residuals(s.points)))
+    others = {what: float(np.median(turning.residuals(points))) for what, points in _hypotheses(s).items()}
+    mirror_m = others.pop(MIRRORED)
+    if c.config.world.dimensions == 2:
+        back = turning.motion * [1.0, -1.0, 1.0, 1.0, 1.0, -1.0, 1.0]  # odometry that turns the other way
+        mirror_m = min(mirror_m, float(np.median(turning.residuals(s.points, back))))
+    if mirror_m < _HALF * now_m and now_m > _NOISES * noise_m and mirror_m < _NEARLY * min(others.values()):
+        text = (
+            f"{s.topic}: in turns, two sightings of a landmark differ by {now_m:.2f} m, but by {mirror_m:.2f} m if y "
+            f"or bearings count to the right, or if {c.odometry.topic} turns the other way"
+        )
+        return Finding("mirrored", "error", now_m / max(mirror_m, 1e-9), 1.0 / _HALF, "times", text, **where)
+    return None
+
+
+def _axes(s: SightingColumns, pairs: Pairs, noise_m: float, use: Mask, where: Where) -> Finding | None:
+    now_m, hypotheses = float(np.median(pairs.residuals(s.points))), _hypotheses(s)
+    others = {what: float(np.median(pairs.residuals(points))) for what, points in hypotheses.items()}
+    del others[MIRRORED]
+    what = min(others, key=lambda one: others[one])
+    if others[what] >= _HALF * now_m or now_m <= _NOISES * noise_m:
+        return None
+    if others[what] >= _RELATED * _of_others(hypotheses[what], pairs, use):  # in the plane some axes hide any distance
+        return None
+    if_so = f"but by {others[what]:.2f} m if the axes are {what}"
+    text = f"{s.topic}: two sightings of a landmark differ by {now_m:.2f} m, {if_so}"
+    settings = (
+        () if what == EXCHANGED else turned_mount(s.input, s.frame, s.T_base_frame, (0.0, 0.0, 0.0, *TURNS[what]))
+    )
+    value = now_m / max(others[what], 1e-9)
+    return Finding("axes", "error", value, 1.0 / _HALF, "times", text, settings=settings, **where)
+
+
+def turned_mount(name: str, frame: str, T_base_frame: se3.Pose, T_frame_true: se3.Pose) -> tuple[str, ...]:
+    """Settings that place an input's sensor elsewhere than its frame is, by a frame of its own name."""
+    T = se3.compose(tuple(T_base_frame), T_frame_true)
+    numbers = " ".join(f"{0.0 if abs(x) < 5e-7 else x:.6g}" for x in (*T[:3], *_rpy(tuple(T[3:]))))
+    corrected = frame if frame.endswith(_CORRECTED) else f"{frame or 'sensor'}{_CORRECTED}"
+    return assignment(f"{name}.frame", corrected), assignment(f"{name}.mount", numbers)
+
+
+def _rpy(q: so3.Quaternion) -> tuple[float, float, float]:
+    """Roll, pitch and yaw about fixed axes, as ``se3.from_xyz_rpy`` takes them."""
+    R = so3.matrix(q)
+    pitch = float(np.arcsin(np.clip(-R[2, 0], -1.0, 1.0)))
+    if abs(R[2, 0]) > 1.0 - 1e-9:  # only the sum of the others is determined
+        return 0.0, pitch, float(np.arctan2(-R[0, 1], R[1, 1]))
+    return float(np.arctan2(R[2, 1], R[2, 2])), pitch, float(np.arctan2(R[1, 0], R[0, 0]))
+
+
+def _identities(c: Columns, s: SightingColumns) -> Iterator[Finding]:
+    counts = c.counters.as_dict().get(s.input, {})
+    twice = counts.get("id_merged", 0) + counts.get("id_conflict", 0)
+    share = twice / (len(s.stamp_ns) + twice)
+    if share > _TWICE:
+        text = f"{s.topic}: {share:.1%} of the sightings have an id that is twice in their message"
+        yield Finding("id_twice", "warning", share, _TWICE, "part", text, s.topic, int(s.stamp_ns[0]), twice)
+
+
+def _coverage(s: SightingColumns, path_ns: Index, path: Array) -> Iterator[Finding]:
+    where: Where = {"topic": s.topic, "first_ns": int(s.stamp_ns[0]), "count": len(s.stamp_ns)}
+    span_s = float(path_ns[-1] - path_ns[0]) * 1e-9
+    inside = (s.stamp_ns >= path_ns[0]) & (s.stamp_ns <= path_ns[-1])
+    if inside.sum() < _FEW:
+        text = f"{s.topic}: only {int(inside.sum())} sightings in {span_s:.0f} s"
+        yield Finding("few_sightings", "note", int(inside.sum()), _FEW, "sightings", text, **where)
+    ends = np.concatenate([[path_ns[0]], np.sort(s.stamp_ns[inside]), [path_ns[-1]]])
+    silent_s = float(np.diff(ends).max()) * 1e-9
+    if silent_s > _SILENT * span_s:
+        text = f"{s.topic}: nothing is seen for {silent_s:.0f} of {span_s:.0f} s"
+        yield Finding("silent", "warning", silent_s, _SILENT * span_s, "s", text, **where)
+    is_named = np.array([bool(name) for name in s.names], dtype=bool)[s.name]
+    chosen = np.flatnonzero(is_named & inside)
+    if not len(chosen):
+        return
+    times = np.bincount(s.name[chosen])
+    seldom = float((times[times > 0] < _SELDOM).mean())
+    if seldom > _ONCE:
+        text = f"{s.topic}: {seldom:.0%} of {int((times > 0).sum())} ids are seen less than {_SELDOM} times"
+        yield Finding("seen_once", "warning", seldom, _ONCE, "part", text, **where)
+    driven = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path[:, :3], axis=0), axis=1))])
+    seconds = (path_ns - path_ns[0]) * 1e-9
+    reach_m, comes_back = _reach(s, chosen, path_ns[0], seconds, driven)
+    least_m = float((_LOOP if comes_back else _SPAN) * driven[-1])
+    if reach_m < least_m and driven[-1] > _AGAIN_M:
+        again = "nothing joins its parts that are farther apart" if comes_back else "no landmark is seen again later"
+        text = f"{s.topic}: each landmark is seen over at most {reach_m:.1f} of {driven[-1]:.0f} m: {again}"
+        yield Finding("no_closure", "warning", reach_m, least_m, "m", text, **where)
+
+
+def _reach(s: SightingColumns, chosen: Index, first_ns: int, seconds: Array, driven: Array) -> tuple[float, bool]:
+    """Return the longest way over which one landmark is seen, and whether one is seen again after a pause."""
+    t = (s.stamp_ns[chosen] - first_ns) * 1e-9
+    at_m = np.interp(t, seconds, driven)
+    order = np.lexsort((t, s.name[chosen]))
+    name, t, at_m = s.name[chosen][order], t[order], at_m[order]
+    same = name[1:] == name[:-1]
+    comes_back = (same & (np.diff(t) > _AGAIN_S) & (np.diff(at_m) > _AGAIN_M)).any()
+    begins = np.concatenate([[True], ~same])
+    ends = np.concatenate([~same, [True]])
+    return float((at_m[ends] - at_m[begins]).max()), bool(comes_back)

@@ -1,0 +1,52 @@
+"""Checks of the noise that sightings state, by pairs of sightings."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from graph_slam_ros.check.columns import Columns
+from graph_slam_ros.check.finding import Finding, Where
+from graph_slam_ros.check.pairs import Pairs
+from graph_slam_ros.check.sightings import SightingColumns
+
+TYPICAL_M = 0.05
+"""What odometry and a detector err within a few seconds, at most, where nothing is wrong."""
+_QUARTILE, _OF_RAYLEIGH, _WORSE = 0.25, 0.7585, 3.0
+_RAISED, _TINY_M, _TOO_SMALL = 0.5, 1e-3, 10.0
+
+
+def noisier(s: SightingColumns, pairs: Pairs) -> Iterator[Finding]:
+    """Sightings that are far worse than their noise says, by the smaller residuals of pairs, which no outlier has."""
+    if not len(pairs.a):  # ranges or bearings alone
+        return
+    sigmas = np.hypot(s.sigmas[pairs.a], TYPICAL_M) * 2.0**0.5
+    factor = float(np.quantile(pairs.residuals(s.points) / sigmas, _QUARTILE)) / _OF_RAYLEIGH
+    if factor > _WORSE:
+        text = f"{s.topic}: two sightings of a landmark differ by {factor:.1f} times what their noise says"
+        where: Where = {"topic": s.topic, "first_ns": int(s.stamp_ns[0]), "count": len(pairs.a)}
+        yield Finding("over_confident", "warning", factor, _WORSE, "times", text, settings=_sigmas(s, pairs), **where)
+
+
+def check_noise(c: Columns, s: SightingColumns, pairs: Pairs) -> Iterator[Finding]:
+    """A covariance that nobody has measured: it was raised to the least that a replay allows, and that is too small."""
+    raised = c.counters.as_dict().get(s.input, {}).get("covariance_floored", 0)
+    sigma_m = float(np.median(s.sigmas))
+    if raised < _RAISED * len(s.stamp_ns) or sigma_m > _TINY_M or not len(pairs.a):
+        return
+    factor = float(np.median(pairs.residuals(s.points) / s.sigmas[pairs.a]))
+    if factor > _TOO_SMALL:
+        text = (
+            f"{s.topic}: the covariance of {raised} of {len(s.stamp_ns)} sightings is nearly zero, and two sightings "
+            f"of a landmark differ by {factor * sigma_m:.2g} m"
+        )
+        where: Where = {"topic": s.topic, "first_ns": int(s.stamp_ns[0]), "count": raised}
+        settings = _sigmas(s, pairs)
+        yield Finding("noise_zero", "warning", factor, _TOO_SMALL, "sigmas", text, settings=settings, **where)
+
+
+def _sigmas(s: SightingColumns, pairs: Pairs) -> tuple[str, ...]:
+    """Settings that state the noise as pairs have it."""
+    sigma_m = float(np.quantile(pairs.residuals(s.points), _QUARTILE)) / _OF_RAYLEIGH / 2.0**0.5
+    sigma_rad = sigma_m / max(float(np.median(np.linalg.norm(s.points[pairs.a], axis=1))), sigma_m)
+    settings = ("noise=sigmas", f"sigma_m={round(sigma_m, 3)}", f"sigma_rad={round(sigma_rad, 4)}")
+    return tuple(f"{s.input}.{setting}" for setting in settings)
