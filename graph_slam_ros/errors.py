@@ -14,7 +14,16 @@ class GaugeError(GraphSlamError):
 
 
 class SingularError(GraphSlamError):
-    """The edges do not determine a vertex."""
+    """The edges do not determine a vertex.
+
+    Attributes
+    ----------
+    vertex : which; None where it has no number
+    """
+
+    def __init__(self, message: str, vertex: int | None = None) -> None:
+        super().__init__(message)
+        self.vertex = vertex
 
 
 class DivergedError(GraphSlamError):

@@ -112,6 +112,10 @@ class Columns:
     gyro_frame: str = ""
     T_base_gyro: se3.Pose | None = None
 
+    def topic_of(self, source: str) -> TopicColumns | None:
+        """The topic of an input; None where nothing was collected of it."""
+        return next((topic for topic in self.topics.values() if source in topic.inputs), None)
+
 
 class _Topic:
     def __init__(self, name: str, type_name: str, inputs: tuple[str, ...], use: str, offset_ns: int) -> None:

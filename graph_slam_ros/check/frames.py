@@ -86,7 +86,7 @@ def _of_sensor(c: Columns, s: SightingColumns) -> Iterator[Finding]:
 def _unlinked(c: Columns, known: set[str]) -> Iterator[Finding]:
     """Messages that were refused since nothing links their frame, and odometry whose child frame is assumed."""
     for source, counts in c.counters.as_dict().items():
-        topic = next((t for t in c.topics.values() if source in t.inputs), None)
+        topic = c.topic_of(source)
         times = sum(counts.get(reason, 0) for reason in _UNKNOWN)
         if topic is None or not times or topic.name in known:
             continue

@@ -25,7 +25,7 @@ _MOST_BIAS = 1.0  # [rad/s] that gyro.bias_sigma may be
 
 def check_gyro(c: Columns) -> Iterator[Finding]:
     """Scale, sign, axis and bias of a gyro: both must turn alike over each second."""
-    topic = next((t for t in c.topics.values() if c.config.gyro_input in t.inputs), None)
+    topic = c.topic_of(c.config.gyro_input)
     odometry, gyro = _turns(c)
     if topic is None or not len(c.gyro_ns):
         return

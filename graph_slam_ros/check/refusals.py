@@ -35,7 +35,7 @@ def check_refusals(c: Columns) -> Iterator[Finding]:
     """Every refusal that a replay would count; of few, where a few are usual, a note."""
     items = {s.input: len(s.stamp_ns) for s in c.sightings}
     for source, counts in c.counters.as_dict().items():
-        topic = next((t for t in c.topics.values() if source in t.inputs), None)
+        topic = c.topic_of(source)
         for reason, times in counts.items():
             row = explain(reason)
             is_of_twist = source == c.odometry.input and reason in _OF_TWIST

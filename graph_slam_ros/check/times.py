@@ -31,10 +31,9 @@ def check_times(c: Columns) -> Iterator[Finding]:
             text = (
                 f"{name}: its clock differs from that of odometry by {-float(value):.3f} s, by the times of recording"
             )
-            of = next((t.name for t in c.topics.values() if name in t.inputs), "")
-            yield Finding(
-                "clock_domains", "error", -value, _CLOCKS_DIFFER_S, "s", text, of, settings=(assignment(key, value),)
-            )
+            topic = c.topic_of(name)
+            where: Where = {"topic": "" if topic is None else topic.name, "settings": (assignment(key, value),)}
+            yield Finding("clock_domains", "error", -value, _CLOCKS_DIFFER_S, "s", text, **where)
     stamped = {name: topic for name, topic in c.topics.items() if np.count_nonzero(topic.stamp_ns) >= _FEW}
     yield from _clocks(c, stamped)
     for topic in stamped.values():
@@ -61,7 +60,7 @@ def _clocks(c: Columns, topics: dict[str, TopicColumns]) -> Iterator[Finding]:
         apart_s = clock_offset_s(log_ns, lag_s, odometry_log_ns, odometry_lag_s)
         where: Where = {"topic": topic.name, "first_ns": int(stamp_ns[0]), "count": len(stamp_ns)}
         if abs(apart_s) > _CLOCKS_DIFFER_S:
-            settings = (_offset(c, topic, apart_s),) if abs(apart_s) < 3600.0 else ()
+            settings = (_offset(c, topic, apart_s),)
             text = f"{topic.name}: its stamps are {-apart_s:.1f} s away from those of {c.odometry.topic}: another clock"
             yield Finding("clock_domains", "error", -apart_s, _CLOCKS_DIFFER_S, "s", text, settings=settings, **where)
         elif apart_s < -_EARLY_S:

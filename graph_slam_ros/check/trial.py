@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from graph_slam_ros.check.columns import Columns
+from graph_slam_ros.check.columns import Columns, TopicColumns
 from graph_slam_ros.check.contradictions import turned_mount
 from graph_slam_ros.check.finding import Finding, Where
 from graph_slam_ros.check.identities import at_two_places, check_identities, points_in_map
@@ -17,7 +17,7 @@ from graph_slam_ros.check.slips import check_slips
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.parameters import assignment
 from graph_slam_ros.lie import se3
-from graph_slam_ros.measurements.types import Control, Measurement, Odometry
+from graph_slam_ros.measurements.types import END, Measurement, Odometry
 from graph_slam_ros.slam import Config, GraphSlam
 from graph_slam_ros.slam.calibration.decision import MOST_LOST, PRIOR_SIGMAS, absurd_range, absurd_text
 from graph_slam_ros.slam.calibration.decision import Finding as Fitted
@@ -72,8 +72,8 @@ def replayed(config: Config, measured: Iterable[Measurement]) -> GraphSlam:
                 continue
             last_ns = m.stamp_ns
         slam.process(m)
-    slam.process(Control("end"))
-    slam.process(Control("optimize"))
+    for event in END:
+        slam.process(event)
     return slam
 
 
@@ -186,7 +186,8 @@ def _absurd(c: Columns, factor: float) -> Finding:
 def _over_confident(c: Columns, noise: NoiseScale, factor: float, limit: float) -> Finding:
     """Noise that is too small: a note where the run allows for it."""
     code = "odometry_over_confident" if noise.label == "odometry" else "over_confident"
-    topic = next((t.name for t in c.topics.values() if noise.source in t.inputs), noise.source)
+    of = c.topic_of(noise.source)
+    topic = noise.source if of is None else of.name
     what = " ".join(filter(None, (noise.label, noise.part)))
     text = f"{topic}: residuals ({what}) are {factor:.1f} times as large as its noise says"
     if c.config.robust.noise_scale != "estimated":
@@ -217,10 +218,10 @@ def _fitted(c: Columns, slam: GraphSlam, one: Fitted, off: Mapping[Parameter, fl
     if one.parameter.name not in _LIMITS:
         return
     code, (unit, limit, unknown) = CODES[one.parameter.name], _LIMITS[one.parameter.name]
-    topic = next((t for t in c.topics.values() if one.parameter.source in t.inputs), None)
+    topic = c.topic_of(one.parameter.source)
     if topic is None:
         return
-    where: Where = {"topic": topic.name, "first_ns": int(topic.stamp_ns[:1].sum()), "count": len(topic.stamp_ns)}
+    where = _where(topic)
     if one.parameter in off:
         text = f"{topic.name}: {sentence(one.parameter, one.value, one.sigma)}"
         settings = (assignment(*setting_of(one.parameter, off, slam.calibrated)),)
@@ -232,15 +233,14 @@ def _fitted(c: Columns, slam: GraphSlam, one: Fitted, off: Mapping[Parameter, fl
 def _clock_jumps(c: Columns, fit: TrialFit) -> Iterator[Finding]:
     """Clocks that are not the same in both halves of the drive, beyond a limit and the sigma of either half."""
     for parameter, before, after, sigma, limit in clock_jumps(fit):
-        topic = next((t for t in c.topics.values() if parameter.source in t.inputs), None)
+        topic = c.topic_of(parameter.source)
         if topic is not None:
             text = f"{topic.name}: {jump_sentence(before, after, sigma)}"
-            where: Where = {
-                "topic": topic.name,
-                "first_ns": int(topic.stamp_ns[:1].sum()),
-                "count": len(topic.stamp_ns),
-            }
-            yield Finding("clock_jump", "warning", after - before, limit, "s", text, **where)
+            yield Finding("clock_jump", "warning", after - before, limit, "s", text, **_where(topic))
+
+
+def _where(topic: TopicColumns) -> Where:
+    return {"topic": topic.name, "first_ns": int(topic.stamp_ns[:1].sum()), "count": len(topic.stamp_ns)}
 
 
 def _places_of_fit(

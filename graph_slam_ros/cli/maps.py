@@ -36,8 +36,9 @@ def diff(args: argparse.Namespace) -> int:
     found = compared(args.a, args.b, losses)
     console.show(*([json.dumps(found.as_dict())] if args.json else found.lines()))
     if not args.json:
-        merged = console.command("merge", args.a, args.b, "--out", "MERGED")
-        console.then("nothing: they are the same" if found.is_same else f"{merged} (one map of both)")
+        merged = f"{console.command('merge', args.a, args.b, '--out', 'MERGED')} (one map of both)"
+        cannot = f"nothing: they cannot be merged: {found.merge_trouble}" if found.merge_trouble else ""
+        console.then("nothing: they are the same" if found.is_same else cannot or merged)
     return console.report_losses(losses) or (console.DONE if found.is_same else console.DIFFERENT)
 
 

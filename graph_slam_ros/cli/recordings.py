@@ -23,7 +23,7 @@ def replay(args: argparse.Namespace) -> int:
     from graph_slam_ros.slam import Config
 
     _refuse_idle_options(args, is_run(args.bag))
-    config = _with_landmarks(args, config_of(args))
+    config = _with_suggestion(args, config_of(args))
     if args.ros:
         return _replay_live(args, config)
     if args.out is None:
@@ -43,18 +43,19 @@ def replay(args: argparse.Namespace) -> int:
     return code
 
 
-def _with_landmarks(args: argparse.Namespace, config: "Config") -> "Config":
-    """The configuration, with inputs that ``info`` suggests where the recording has no usual topic of landmarks."""
+def _with_suggestion(args: argparse.Namespace, config: "Config") -> "Config":
+    """The configuration, with inputs that ``info`` suggests where a recording has no usual odometry or landmarks."""
     from graph_slam_ros.runs.folder import is_run
-    from graph_slam_ros.runs.suggested_inputs import suggestion_without_landmarks
+    from graph_slam_ros.runs.suggested_inputs import suggestion_for_other_types
 
     if args.config or args.landmarks or args.map or (args.ros and args.out is None) or is_run(args.bag):
         return config
-    found = suggestion_without_landmarks(args.bag, config, args.odom)
+    found = suggestion_for_other_types(args.bag, config, args.odom)
     if found is None:
         return config
     args.odom, args.landmarks = args.odom or found.topics.get("odom"), found.topics.get("detections")
-    console.warn(f"there are no landmarks of the usual type, so this is: {found.command()}", most=console.SENTENCE)
+    what = "is no odometry" if "odom.type" in found.settings else "are no landmarks"
+    console.warn(f"there {what} of the usual type, so this is: {found.command()}", most=console.SENTENCE)
     return config_of(args, found.settings)
 
 

@@ -74,8 +74,8 @@ class InputConfig:
         0.0,
         "time added to the stamps of the input: how far its clock is behind",
         "s",
-        low=-3600.0,
-        high=3600.0,
+        low=-4e9,  # the stamps of a clock that counts from its start
+        high=4e9,
     )
     mount_correction: str = setting(
         "",

@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 
 from graph_slam_ros.edge_tags import tag_of
-from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.maps.alignment import Alignment, align, as_they_are, laid_on, positions
+from graph_slam_ros.maps.compatibility import merge_trouble, refuse_other_space, shared_landmarks
 from graph_slam_ros.runs.restore import restored
 from graph_slam_ros.runs.whole_path import WholePath
 from graph_slam_ros.slam import GraphSlam
-from graph_slam_ros.slam.landmarks.lifetimes import has_identity
 from graph_slam_ros.typing import Array, Index, Numbers
 
 _SAME_M = 1e-3  # nobody calls that moved
@@ -66,6 +65,7 @@ class Difference:
     moved : landmarks, the farthest in standard deviations first
     edits_a, edits_b : edits by hand that only one of them has
     condensed : how many keyframes of each have left it, or are in a place: their edges are compared no more
+    merge_trouble : why they cannot be merged; empty where they can
     """
 
     keyframes: Counts
@@ -82,6 +82,7 @@ class Difference:
     edits_a: list[str]
     edits_b: list[str]
     condensed: tuple[int, int] = (0, 0)
+    merge_trouble: str = ""
 
     @property
     def is_same(self) -> bool:
@@ -173,21 +174,8 @@ def diff(a: Path, b: Path, losses: list[str]) -> Difference:
         [edit.text for edit in one.edits if edit.edit not in [other.edit for other in two.edits]],
         [edit.text for edit in two.edits if edit.edit not in [other.edit for other in one.edits]],
         (one.first_keyframe, two.first_keyframe),
+        merge_trouble(one, two, a, b),
     )
-
-
-def refuse_other_space(one: GraphSlam, two: GraphSlam, a: Path, b: Path) -> None:
-    """Raise GraphSlamError if one is in the plane and one in space."""
-    if one.space is not two.space:
-        dimensions = (slam.space.dimensions for slam in (one, two))
-        counts = " and ".join(f"{folder}: {n}" for folder, n in zip((a, b), dimensions, strict=True))
-        raise GraphSlamError(f"world.dimensions differ ({counts})")
-
-
-def shared_landmarks(one: GraphSlam, two: GraphSlam) -> list[str]:
-    """The landmarks with the same id in both, but for old places of those that moved."""
-    named = [{name for name, mark in slam.landmarks.items() if has_identity(mark)} for slam in (one, two)]
-    return [name for name in one.landmarks if name in named[0] & named[1]]
 
 
 def _aligned(

@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 
 from graph_slam_ros.edge_tags import tag_of
-from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import Gaussian
-from graph_slam_ros.maps.alignment import Alignment, align, positions
-from graph_slam_ros.maps.diff import refuse_other_space, shared_landmarks
+from graph_slam_ros.maps.alignment import Alignment
+from graph_slam_ros.maps.compatibility import aligned_for_merge, refuse_other_space
 from graph_slam_ros.measurements.edit_actions import ALL_FIELDS
 from graph_slam_ros.measurements.edits import AppliedEdit, Value
 from graph_slam_ros.runs.condensed_map import CONDENSED
@@ -25,7 +24,6 @@ from graph_slam_ros.runs.folder import check_room
 from graph_slam_ros.runs.journal import parts_of
 from graph_slam_ros.runs.map_journal import MapGrowth, Record, extend, state_of
 from graph_slam_ros.runs.restore import config_to_go_on, record_run, restored_and_solved, stopwatch
-from graph_slam_ros.runs.whole_path import WholePath
 from graph_slam_ros.slam import Control, GraphSlam
 from graph_slam_ros.slam.calibration.parameters import QUANTITIES, Parameter
 from graph_slam_ros.slam.edit_tools import HAND_MADE
@@ -35,8 +33,6 @@ from graph_slam_ros.slam.robust.landmark_support import landmark_of
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict
 from graph_slam_ros.slam.snapshot import MapSnapshot
 
-_ABSOLUTE = ("fixes", "surveyed")  # told in the axes of map, whoever tells them
-_SAME = 1e-6  # of chi2
 _ONCE = ("surveyed", "range_offset")  # what both sessions were told is told once
 
 
@@ -74,10 +70,7 @@ def merge(a: Path, b: Path, out: Path, *, force: bool = False) -> Merged:
     losses: list[str] = []
     one, two = restored_and_solved(a, losses), restored_and_solved(b, losses, whole=True)
     refuse_other_space(one, two, a, b)
-    _refuse_other_datum(one, two, a, b)
-    shared = _shared(one, two, a, b)
-    aligned = _aligned(one, two, shared)
-    _refuse_same_drive(one, two, a, b)
+    shared, aligned = aligned_for_merge(one, two, a, b)
     state = state_of(one, a)
     first_edge = state.graph.edge_count
     two.backend.use_noise(one.noise_factors)  # the merged map has one factor for each group
@@ -98,69 +91,6 @@ def _calibrations(one: GraphSlam, two: GraphSlam) -> Iterator[str]:
         if abs(a - b) >= QUANTITIES[name].least:
             what = Parameter(source, name)
             yield f"{what} is {a:.4g} in A and {b:.4g} in B: the merged map goes on with that of A"
-
-
-def _refuse_other_datum(one: GraphSlam, two: GraphSlam, a: Path, b: Path) -> None:
-    if one.datum and two.datum and one.datum != two.datum:
-        raise GraphSlamError(
-            f"fixes of {a} are from {one.datum}, of {b} from {two.datum}: configure one datum for both"
-        )
-
-
-def _refuse_same_drive(one: GraphSlam, two: GraphSlam, a: Path, b: Path) -> None:
-    """Refuse two maps of one drive, because its measurements would count twice."""
-    driven, again = (_driven(WholePath.of(slam, folder)) for slam, folder in ((one, a), (two, b)))
-    same = len(driven & again)
-    if same > 1:  # two robots may begin at one time
-        raise GraphSlamError(f"{same} keyframes are of the same drive in {a} and {b}: nothing new is in one of them")
-
-
-def _driven(path: WholePath) -> set[tuple[int, bytes]]:
-    return {(stamp, pose.tobytes()) for stamp, pose in zip(path.stamps_ns.tolist(), path.odometry, strict=True)}
-
-
-def _shared(one: GraphSlam, two: GraphSlam, a: Path, b: Path) -> list[str]:
-    """Landmarks in both maps. Raises GraphSlamError if a pair cannot be the same landmark."""
-    for name, mark in two.landmarks.items():
-        other = one.landmarks.get(name)
-        if other is None or (mark.is_unnamed and other.is_unnamed):
-            continue
-        if mark.is_unnamed is not other.is_unnamed:
-            raise GraphSlamError(f"landmark {name} has an identity in one of {a} and {b}, and none in the other")
-        if one.graph.kind_of(other.vertex) is not two.graph.kind_of(mark.vertex):
-            raise GraphSlamError(f"landmark {name} is a point in one of {a} and {b}, and a pose in the other")
-    for label in _absolute(two):
-        if not _absolute(one):
-            raise GraphSlamError(f"{b} has {label}, which say where its map is, and {a} has none: merge {b} {a}")
-    return shared_landmarks(one, two)
-
-
-def _absolute(slam: GraphSlam) -> list[str]:
-    """The classes of edges that are absolute in the map; of custom edges those whose chi2 changes if all is moved."""
-    space, values, here = slam.space, slam.solver.values, slam.solver.evaluate().classes.get("custom")
-    found = [label for label in _ABSOLUTE if len(slam.graph.edges_of(label))]
-    if here is None:
-        return found
-    T_new_old = space.group.exp(tuple(1.0 + 0.3 * k for k in range(space.dof)))
-    for vertex in range(slam.graph.vertex_count):
-        one = slam.graph.vertex(vertex)
-        move = {space.pose: space.group.compose, space.point: space.group.act}.get(one.kind)
-        if move is not None:
-            values[one.stored] = move(T_new_old, tuple(values[one.stored].tolist()))
-    there = slam.solver.evaluate(at=values).classes["custom"]
-    return [*found, *["custom"] * (abs(there.chi2 - here.chi2) > _SAME * max(1.0, here.chi2))]
-
-
-def _aligned(one: GraphSlam, two: GraphSlam, shared: list[str]) -> Alignment:
-    needed, robust = one.space.dimensions, one.config.robust
-    if len(shared) < needed:
-        raise GraphSlamError(f"{len(shared)} landmarks are in both maps: it takes {needed} to lay one on the other")
-    found = align(one.space, positions(one, shared), positions(two, shared), robust.gate, robust.noise_factor)
-    agree = 0 if found is None else int(found.fits.sum())
-    if found is None or 2 * agree < len(shared):
-        why = f"{agree} of them agree" if agree else "too few agree, or they stand too close together"
-        raise GraphSlamError(f"{len(shared)} landmarks are in both maps, and {why} on how one lies on the other")
-    return found
 
 
 def _leave_out(state: MapSnapshot, first_edge: int, chi2: Mapping[int, float], limit: float) -> None:

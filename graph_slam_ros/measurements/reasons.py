@@ -283,6 +283,7 @@ REASONS: dict[str, Reason] = {
         "no transform has the position of the antenna on the robot: the base is assumed",
         '--set INPUT.mount="X Y Z 0 0 0", its place from the base in metres; zeros say that it is there',
     ),
+    "mount_at_base": Reason(_NOTED, "INPUT.mount puts the sensor at the base, as no transform has its place"),
     "map_moved": Reason(
         _NOTED,
         "the first to measure where the map lies, a fix or a surveyed landmark: the map was laid onto it",

@@ -243,6 +243,10 @@ class Control:
             raise FormatError(f"Control: {self.event} has {dict(self.values)}; it needs {needed}")
 
 
+END = Control("end"), Control("optimize")
+"""The end of a run: what is held is processed, nothing more comes, and everything is solved."""
+
+
 Observation: TypeAlias = Sightings | Fix | Closure | CustomEdge
 Measured: TypeAlias = Odometry | AngularVelocity | Observation
 Measurement: TypeAlias = Measured | InitialPose | Control

@@ -1,6 +1,6 @@
 """The memory of the process."""
 
-from graph_slam_ros.runs.load import resident_mib
+from graph_slam_ros.runs.resource_log import resident_mib
 
 _ENOUGH = 0.95  # of the limit: less, and there is room again
 

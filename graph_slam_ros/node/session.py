@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.measurements.types import InitialPose
+from graph_slam_ros.measurements.types import END, InitialPose
 from graph_slam_ros.node.estimate import Estimate, UnseenWay, WeakestLandmark
 from graph_slam_ros.node.resumption import Resumption
 from graph_slam_ros.node.threads import run_in_thread
@@ -349,7 +349,7 @@ class Session:
         folder, recorder = "", self._recorder
         if not self._is_saved or (self.slam.keyframes and not self._is_ended):
             self._recorded(RunRecorder.join_sync)
-            for event in (Control("end"), Control("optimize")) if not self._is_saved else ():
+            for event in END if not self._is_saved else ():
                 recorder.accept(event)
                 self._process(event)
             folder = self._write(ended=True)

@@ -13,10 +13,12 @@ from graph_slam_ros.check.checks import worst_of_replay
 from graph_slam_ros.check.columns import Collector
 from graph_slam_ros.check.finding import Finding
 from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.measurements.types import END
 from graph_slam_ros.messages.inputs import recorded_uses
 from graph_slam_ros.messages.survey import with_survey
-from graph_slam_ros.recordings.bag import open_bag
-from graph_slam_ros.runs.replay import END, RecordedRuns
+from graph_slam_ros.recordings.bag import Bag, open_bag
+from graph_slam_ros.runs.chosen_inputs import Inputs
+from graph_slam_ros.runs.replay import RecordedRuns
 from graph_slam_ros.runs.suggested_inputs import SuggestedInputs
 from graph_slam_ros.runs.tables import account
 from graph_slam_ros.slam import Config, Counters, GraphSlam
@@ -80,54 +82,90 @@ def calibrate(
     GraphSlamError
         The recording or an input cannot be used, or has no keyframe.
     """
-    path, bag, found = Path(path), open_bag(Path(path)), dict[str, float | str]()
+    path, bag = Path(path), open_bag(Path(path))
     suggested = SuggestedInputs(bag, path, {"calibrate.groups": "auto"} | dict(settings or {}), odometry, landmarks)
     config = _config(suggested.settings)
-    inputs = suggested.inputs(config)
     warmup(dimensions=config.world.dimensions)
-    total = sum(bag.topics[topic].count for topic in inputs.by_topic())
-    report: Mapping[str, Any] = {"settings": {"": 0.0}}
-    fault: Finding | None = None
-    rounds, kept, before, refused, has_nothing_left = 0, dict[str, float | str](), (0, 0), "", False
-    columns, counters = Collector(config, inputs.topics), Counters()
-    while report["settings"] and rounds < _ROUNDS:
-        rounds, now = rounds + 1, config.changed(found)
-        counted, collected = (counters, columns) if rounds == 1 else (Counters(), None)
-        slam = _replayed(progress(RecordedRuns(bag, inputs, now, counted, columns=collected), total), now)
-        if not slam.keyframes:
-            raise GraphSlamError(f"{path}: no odometry of it could be used: graph_slam info {path}")
-        accepted = _accepted(slam)
-        if _is_less(accepted, before):
-            refused, found = _harm(found, kept, before, accepted), kept
-            break
-        report, kept, before = slam.calibration_report, dict(found), accepted
-        fault = worst_of_replay(columns.columns(counters)) if rounds == 1 else fault
-        if refused := _wrong(fault) or _misplaced(slam, now):
-            report, found = {"settings": {}, "parameters": []}, {}
-            break
-        found |= report["settings"]
-        part = (slam.calibrated_since + 1) / len(slam.keyframes)
-        if report["settings"] and rounds < _ROUNDS and part < _MOST_REPEATED:
-            rounds, again = rounds + 1, config.changed(found)
-            runs = progress(RecordedRuns(bag, inputs, again, Counters()), round(part * total))
-            begun = _replayed(runs, again, slam.calibrated_since + 1)
-            if has_nothing_left := _leaves_nothing(begun, accepted):
-                break
-    parameters = report["parameters"] or ([] if refused else list(_undriven(config, len(slam.keyframes))))
+    rounds = _Rounds(bag, suggested.inputs(config), config, progress)
+    rounds.run()
+    if not rounds.keyframes:
+        raise GraphSlamError(f"{path}: no odometry of it could be used: graph_slam info {path}")
+    found, refused = rounds.found, rounds.refused
+    parameters = rounds.parameters or ([] if refused else list(_undriven(config, rounds.keyframes)))
     command = suggested.suggestion.command(found | dict(settings or {}) | found)
-    complete = (has_nothing_left or not report["settings"]) and not refused
-    notes = _once(bag.losses), _once(bag.warnings)
-    return Calibrated(found, parameters, command, rounds, complete, refused, fault, *notes)
+    outcome = parameters, command, rounds.count, rounds.is_complete, refused, rounds.fault
+    return Calibrated(found, *outcome, _once(bag.losses), _once(bag.warnings))
+
+
+class _Rounds:
+    """Replays, each with the corrections that were found so far.
+
+    Attributes
+    ----------
+    found, parameters, refused, fault, is_complete : as of ``Calibrated``
+    count : replays so far
+    keyframes : of the last replay of the whole recording
+    """
+
+    def __init__(self, bag: Bag, inputs: Inputs, config: Config, progress: Progress) -> None:
+        self.found: dict[str, float | str] = {}
+        self.parameters: list[dict[str, Any]] = []
+        self.refused, self.is_complete = "", False
+        self.fault: Finding | None = None
+        self.count = self.keyframes = 0
+        self._bag, self._inputs, self._config, self._progress = bag, inputs, config, progress
+        self._total = sum(bag.topics[topic].count for topic in inputs.by_topic())
+
+    def run(self) -> None:
+        """Replay until nothing more is found, or what was found does harm, or is refused."""
+        kept, before = dict[str, float | str](), (0, 0)
+        while not self.is_complete and self.count < _ROUNDS:
+            slam = self._replayed()
+            if not self.keyframes:
+                return
+            accepted = _accepted(slam)
+            if _is_less(accepted, before):
+                self.refused, self.found = _harm(self.found, kept, before, accepted), kept
+                return
+            self.refused = _wrong(self.fault) or _misplaced(slam, slam.config)
+            if self.refused:
+                self.found, self.parameters = {}, []
+                return
+            report, kept, before = slam.calibration_report, dict(self.found), accepted
+            self.parameters = report["parameters"]
+            self.found |= report["settings"]
+            self.is_complete = not report["settings"] or self._finds_nothing_in(slam.calibrated_since + 1, accepted)
+
+    def _replayed(self) -> GraphSlam:
+        """Replay the whole recording. The first replay collects what ``check`` needs."""
+        self.count += 1
+        config, counters = self._config.changed(self.found), Counters()
+        columns = Collector(config, self._inputs.topics) if self.count == 1 else None
+        runs = RecordedRuns(self._bag, self._inputs, config, counters, columns=columns)
+        slam = _replayed(self._progress(runs, self._total), config)
+        self.keyframes = len(slam.keyframes)
+        if columns is not None and self.keyframes:
+            self.fault = worst_of_replay(columns.columns(counters))
+        return slam
+
+    def _finds_nothing_in(self, keyframes: int, accepted: tuple[int, int]) -> bool:
+        """Return whether a replay of the beginning, which ends where the last correction was made, is enough.
+
+        It is where that part finds nothing more, and accepts at least as much as all did.
+        """
+        part = keyframes / self.keyframes
+        if self.count >= _ROUNDS or part >= _MOST_REPEATED:
+            return False
+        self.count += 1
+        config = self._config.changed(self.found)
+        runs = RecordedRuns(self._bag, self._inputs, config, Counters())
+        slam = _replayed(self._progress(runs, round(part * self._total)), config, keyframes)
+        return not slam.calibration_report["settings"] and not _is_less(_accepted(slam), accepted)
 
 
 def _once(lines: Iterable[str]) -> list[str]:
     """Return lines without repetitions."""
     return list(dict.fromkeys(lines))
-
-
-def _leaves_nothing(slam: GraphSlam, accepted: tuple[int, int]) -> bool:
-    """Return whether a replay with corrections finds no others, and accepts at least as much."""
-    return not slam.calibration_report["settings"] and not _is_less(_accepted(slam), accepted)
 
 
 def _undriven(config: Config, keyframes: int) -> Iterator[dict[str, Any]]:

@@ -18,7 +18,7 @@ from graph_slam_ros.measurements.types import Measured
 from graph_slam_ros.messages.inputs import known_types
 from graph_slam_ros.messages.inputs.transforms import MAP_FRAMES
 from graph_slam_ros.recordings.bag import Bag, open_bag
-from graph_slam_ros.recordings.contents import Recording, TopicContents
+from graph_slam_ros.recordings.contents import Recording
 from graph_slam_ros.runs.replay import RecordedRuns
 from graph_slam_ros.runs.suggested_inputs import OF_LANDMARKS, SuggestedInputs
 from graph_slam_ros.runs.suggested_odometry import ODOMETRY
@@ -98,14 +98,14 @@ def check(
     found += _damage(bag)
     found += check_columns(columns)
     if not quick and not any(one.ends for one in found):
-        found += _trial(columns, _in_time(columns, [some for number, some in measured if number == 0]))
+        found += _trial(columns, _for_trial(columns, [some for number, some in measured if number == 0]))
     others = suggestion.settings.keys() - suggested.assumed.keys()
     command = "" if suggestion.trouble else suggestion.command(without=others)
     found = of_pose_or_twist(of_gyro_or_wheels(found, config.gyro_input))
     return Checked(with_one_value(in_order(list(dict.fromkeys(found)))), command, bag.losses, bag.warnings)
 
 
-def _in_time(columns: Columns, measured: list[Measurements]) -> list[Measurements]:
+def _for_trial(columns: Columns, measured: list[Measurements]) -> list[Measurements]:
     """Return what is replayed in memory: the beginning, where landmarks have no identity and association is slow."""
     seen = [s for s in columns.sightings if len(s.name)]
     unnamed = sum(np.count_nonzero(s.name == s.names.index("")) for s in seen if "" in s.names)
@@ -135,16 +135,11 @@ def _unused(recording: Recording, suggestion: Suggestion, *, has_landmarks: bool
             text = f"{name} is {why}"
             severity: Severity = "note" if "odom" in suggestion.topics else "error"
             yield Finding("odometry_in_map", severity, 1, 0, "topics", text, name, count=one.topic.count)
-        elif (is_landmark or one.topic.type == ODOMETRY) and _is_defect(one, why):
-            code = "zero_stamp" if one.is_zero else "clock_domains" if "another clock" in why else "input_unused"
+        elif (is_landmark or one.topic.type == ODOMETRY) and (one.trouble or one.is_zero):
+            code = "zero_stamp" if one.is_zero else "input_unused"
             text = f"{name} is not used: {why}"
             severity = "note" if has_landmarks and is_landmark else "error"
             yield Finding(code, severity, 1, 0, "topics", text, name, count=one.topic.count)
-
-
-def _is_defect(one: TopicContents, why: str) -> bool:
-    """Return whether a topic is unused because something is wrong with it, not because another one is better."""
-    return bool(one.trouble) or one.is_zero or "another clock" in why
 
 
 def _damage(bag: Bag) -> Iterator[Finding]:

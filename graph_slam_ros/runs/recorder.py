@@ -30,8 +30,8 @@ from graph_slam_ros.runs.folder import (
     summary_of,
 )
 from graph_slam_ros.runs.journal import BEGINS_IN_A_MAP, INGEST, MAP, MEASUREMENT, Parts, close_all, part_name, parts_of
-from graph_slam_ros.runs.load import Load
 from graph_slam_ros.runs.map_journal import GROWTH, MapGrowth
+from graph_slam_ros.runs.resource_log import ResourceLog
 from graph_slam_ros.runs.tables import counted, fitted_summary, result_texts, summarize
 from graph_slam_ros.slam import Config, Counters, GraphSlam, Measurement, Update
 from graph_slam_ros.slam.bounded_map import Condensation
@@ -83,7 +83,7 @@ class RunRecorder:
         self._bags = 0
         self._ended_bags: list[AppendedFile] = []
         self._next_path_at = 1.0
-        self._load = Load()
+        self._load = ResourceLog()
         self._room = ExitStack()
         self._room.enter_context(room(self.folder, force=force))
         try:

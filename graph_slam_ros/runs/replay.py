@@ -11,7 +11,7 @@ from typing import Any
 from graph_slam_ros.check.checks import first_of_replay, worst_of_replay
 from graph_slam_ros.check.columns import Collector
 from graph_slam_ros.measurements.reasons import warnings as mendable
-from graph_slam_ros.measurements.types import Measured, Odometry
+from graph_slam_ros.measurements.types import END, Measured, Odometry
 from graph_slam_ros.messages.from_msg import TF_STATIC, MessageConverter
 from graph_slam_ros.messages.survey import with_survey
 from graph_slam_ros.recordings.bag import Bag, BagMessage, open_bag
@@ -28,9 +28,6 @@ from graph_slam_ros.warmup import warmup
 
 _FEWEST, _MOST_TOGETHER = 4, 100  # messages that are converted together
 _READ_AHEAD = 20_000  # messages that are checked before anything is processed: minutes, and some megabytes
-
-END = Control("end"), Control("optimize")
-"""The events at the end of a recording: held measurements are processed, and everything is solved."""
 
 Progress = Callable[[Iterable[Any], int], Iterable[Any]]
 

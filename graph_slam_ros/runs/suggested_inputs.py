@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from graph_slam_ros.config.inputs import default_input
 from graph_slam_ros.messages.from_msg import TF, TF_STATIC
 from graph_slam_ros.messages.inputs.landmark_types import LANDMARK_TYPES
 from graph_slam_ros.recordings.bag import Bag, BagError, open_bag
@@ -86,10 +87,10 @@ def _topic_of(given: Mapping[str, Any], name: str) -> str | None:
     return None if topic is None else f"/{str(topic).lstrip('/')}"
 
 
-def suggestion_without_landmarks(path: Path, config: Config, odometry: str | None = None) -> Suggestion | None:
-    """Return how to replay a recording that has no landmarks of the usual type, but others, or fixes.
+def suggestion_for_other_types(path: Path, config: Config, odometry: str | None = None) -> Suggestion | None:
+    """Return how to replay a recording whose odometry or landmarks are of other types than the usual, or are fixes.
 
-    None where it has, where other inputs are configured, or where there is nothing else in it.
+    None where they are usual, where other inputs are configured, or where there is nothing else in it.
 
     Parameters
     ----------
@@ -107,7 +108,9 @@ def suggestion_without_landmarks(path: Path, config: Config, odometry: str | Non
         if any(name not in ("odom", TF, TF_STATIC) for name in choose_inputs(bag, config, odometry).topics):
             return None
     except BagError:  # which the replay says
-        return None
+        is_usual = next(one for one in config.sources if one.name == "odom") == default_input("odom")
+        if odometry or not is_usual or any(topic.type == ODOMETRY for topic in bag.topics.values()):
+            return None
     found = SuggestedInputs(bag, path, odometry=odometry).suggestion
     return None if found.trouble or len(found.names) < 2 else found
 

@@ -14,7 +14,7 @@ from graph_slam_ros.messages.inputs.landmark_types import APRILTAGS, LANDMARK_TY
 from graph_slam_ros.messages.inputs.transforms import MAP_FRAMES, OPTICAL, assumed_mount
 from graph_slam_ros.recordings.bag import Bag
 from graph_slam_ros.recordings.contents import Recording, TopicContents
-from graph_slam_ros.runs.chosen_inputs import TF_TOPIC, choose_inputs
+from graph_slam_ros.runs.chosen_inputs import TF_STATIC_TOPIC, TF_TOPIC, choose_inputs
 from graph_slam_ros.runs.folder import suggested_out
 from graph_slam_ros.runs.namespaces import is_truth
 from graph_slam_ros.runs.suggested_odometry import DETECTIONS, ESTIMATE, OdometryChoice, readable
@@ -28,7 +28,7 @@ _TAG_TOPIC = re.compile(r"(?:tag|aruco|marker|fiducial)[_/:]?(\d+)(?:/pose)?$", 
 _CORNERS = re.compile(r"^(?!.*map).*(tag|aruco|fiducial)", re.IGNORECASE)
 _OF_ROS = ("/clock", "/rosout", "/parameter_events", "/diagnostics", "/events/write_split", "/robot_description")
 _MOST_LISTED = 6
-_CLOCKS_DIFFER_S, _MOST_OFFSET_S = 2.0, 3600.0
+_CLOCKS_DIFFER_S = 2.0
 
 
 class Suggestion:
@@ -234,9 +234,6 @@ class Suggestion:
             self.unused[topic] = "its stamps are zero: have the driver fill in header.stamp"
             return
         offset_s = 0.0 if self._odometry is None else one.clock_offset_s(self._odometry)
-        if abs(offset_s) > _MOST_OFFSET_S:
-            self.unused[topic] = f"its stamps are {offset_s:.0f} s from those of odometry: another clock"
-            return
         settings = dict(chosen or {}) | ({} if linked else self._mount(topic, one.frame))
         if abs(offset_s) > _CLOCKS_DIFFER_S:
             settings["offset_s"] = round(offset_s, 3)
@@ -276,7 +273,12 @@ class Suggestion:
         self._not_read()
 
     def _not_read(self) -> None:
-        """Topics of types that no input reads, one of which the user may expect to be used."""
+        """Topics that no input reads, one of which the user may expect to be used."""
+        for name, one in self._recording.topics.items():
+            usual = f"/{name.rpartition('/')[2]}"
+            is_usual = usual in (TF_TOPIC, TF_STATIC_TOPIC) and usual in self._recording.topics
+            if one.topic.type == TRANSFORMS and is_usual and name != usual:
+                self.unused[name] = f"{usual} is there, and it alone is read"
         known = known_types()
         found = [
             f"{name} ({one.topic.type or 'no type'})"

@@ -176,7 +176,7 @@ class Backend:
             self.solver.update()
         out = self.ledger.outside_count
         if self._config.decide and not self.spares_memory and self._background.is_due(out, keyframe, self.graph):
-            self._background.start(self._frozen(keyframe, self.solver.settings), out)
+            self._background.start(self._frozen_graph(keyframe, self.solver.settings), out)
 
     def optimize(self, keyframe: int, settings: Settings) -> Report:
         """Solve everything, and search for a better explanation."""
@@ -187,7 +187,7 @@ class Backend:
         self._admit(keyframe)
         if self.odometries.decide(keyframe, everything=True):
             report = self.solver.optimize(settings)
-        outcome = self._guarded(lambda: search_alternatives(self._config, self._frozen(keyframe, settings)))
+        outcome = self._guarded(lambda: search_alternatives(self._config, self._frozen_graph(keyframe, settings)))
         if outcome is not None:
             self._adopt(outcome, keyframe)
             self.solver.start_at(outcome.values)
@@ -274,7 +274,7 @@ class Backend:
         is_judged = self.is_handed_over and len(self.ledger) == self.graph.edge_count and not self._pending
         return is_judged and not (self.holds_back or self._background.is_busy)
 
-    def hand_over_condensed(self, keyframe: int) -> None:
+    def note_condensed(self, keyframe: int) -> None:
         """Note edges that the solver has already: nobody doubts them."""
         self.handed_over = self.graph.vertex_count, self.graph.edge_count
         self.decisions.gate_new(self.handed_over[1], keyframe)
@@ -390,6 +390,6 @@ class Backend:
             self._counters.count("map", "turned_over")
         return self.decisions.adopt_verdicts(outcome.ledger, keyframe) or is_turned
 
-    def _frozen(self, keyframe: int, settings: Settings) -> FrozenGraph:
+    def _frozen_graph(self, keyframe: int, settings: Settings) -> FrozenGraph:
         problem = self.graph.copy(), self.solver.vertices, self.solver.held, self.solver.values
         return FrozenGraph(keyframe, *problem, settings, self.ledger.copy())

@@ -145,7 +145,7 @@ class BoundedMap:
         self.condenser.serves_closures = self._frontend.config.has_closures or CLOSURES in backend.graph.labels
         try:
             rows, frames, end = self._condensed_visits()
-            backend.hand_over_condensed(len(keyframes) - 1)
+            backend.note_condensed(len(keyframes) - 1)
             left = self._left(rows)
             attached = self._attach(left, rows) if self.condenser.serves_closures else None
         except Exception as error:

@@ -11,7 +11,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from graph_slam_ros.errors import DivergedError, message_of
+from graph_slam_ros.errors import DivergedError, SingularError, message_of
 from graph_slam_ros.graph import GROUPS, SE2
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.slam.backend import Backend
@@ -30,7 +30,7 @@ _TRIALS = 30  # solves in search of what is to blame
 
 @dataclass(frozen=True, slots=True)
 class _Suspect:
-    """Edges that are accepted or rejected together: one, or all of a new landmark."""
+    """Edges that are accepted or rejected together: one, or all of a landmark that is new or not determined."""
 
     edges: tuple[int, ...]
     landmark: int | None = None
@@ -55,6 +55,7 @@ class FailureGuard:
         self._good = np.empty(0)  # stored numbers of all vertices after the last solve that succeeded
         self._good_vertices = self._good_edges = 0  # that it had
         self._in_a_row = 0  # failures since
+        self._undetermined = set[int]()  # vertices that these named
 
     def solve(self, work: Callable[[], Result], keyframe: int) -> Result | None:
         """Solve by ``work`` and return its result; None if it fails, or if its result is impossible."""
@@ -62,7 +63,8 @@ class FailureGuard:
             return self._done(work, again=True)
         except Exception as error:
             self._fail(error)
-        if self._in_a_row == 1 or self._in_a_row.bit_count() > 1:  # then at 2, 4, 8, ...: it costs some solves
+        is_new = all(vertex >= self._good_vertices for vertex in self._undetermined)
+        if (is_new and self._in_a_row == 1) or self._in_a_row.bit_count() > 1:  # at 2, 4, 8, ...: it costs some solves
             return None
         try:
             return self._done(work) if self._quarantine(keyframe) else None
@@ -74,6 +76,7 @@ class FailureGuard:
         """Remember the present estimate as good."""
         self._good, self._good_vertices = self._solver.values, self._graph.vertex_count
         self._good_edges, self._in_a_row, self.failing = self._graph.edge_count, 0, ""
+        self._undetermined.clear()
 
     def note_moved(self) -> None:
         """Move the remembered estimate with the map."""
@@ -103,8 +106,13 @@ class FailureGuard:
         self._counters.count("solver", type(error).__name__)
         self.failing = message_of(error)
         self._in_a_row += 1
+        self._note_undetermined(error)
         self.go_back()
         self._drop_unmeasured()
+
+    def _note_undetermined(self, error: Exception) -> None:
+        if isinstance(error, SingularError) and error.vertex is not None:
+            self._undetermined.add(error.vertex)
 
     def _drop_unmeasured(self) -> None:
         """Remove vertices that lost their edges by a fault, and are undetermined."""
@@ -153,12 +161,19 @@ class FailureGuard:
     # -- quarantine --------------------------------------------------------------------------------------------------
 
     def _quarantine(self, keyframe: int) -> bool:
-        """Remove new candidates permanently without which the problem can be solved. Returns whether it can."""
-        suspects = self._suspects()
-        self._exclude(suspects)
-        if not self._is_solvable():
+        """Remove candidates permanently without which the problem can be solved. Returns whether it can.
+
+        They are those that are new, and those on landmarks that the failures named: a landmark can move so far away in
+        later solves that nothing determines it any more.
+        """
+        while True:
+            named, suspects = set(self._undetermined), self._suspects()
+            self._exclude(suspects)
+            if self._is_solvable():
+                break
             self._include(suspects)
-            return False
+            if self._undetermined <= named:
+                return False
         blamed = self._to_blame(suspects)
         for one in blamed:
             self._counters.count(self._graph.label_of(one.edges[0]), "quarantined", len(one.edges))
@@ -168,9 +183,13 @@ class FailureGuard:
         return True
 
     def _suspects(self) -> list[_Suspect]:
-        new = self._solver.edges
-        new = new[new >= self._good_edges]
+        edges = self._solver.edges
         found: dict[tuple[bool, int], _Suspect] = {}
+        for vertex in sorted(self._undetermined & set(self._solver.vertices.tolist())):
+            on = np.intersect1d(self._solver.edges_on(vertex), edges)
+            if self._graph.kind_of(vertex) not in GROUPS and self._graph.has_label(on, CANDIDATES).all():
+                found[True, vertex] = _Suspect(tuple(on.tolist()), vertex)
+        new = np.setdiff1d(edges[edges >= self._good_edges], [edge for one in found.values() for edge in one.edges])
         for edge in new[self._graph.has_label(new, CANDIDATES)].tolist():
             landmark = landmark_of(self._graph, edge) or self._new_landmark_of(edge)
             if landmark is None or landmark < self._good_vertices:
@@ -209,7 +228,8 @@ class FailureGuard:
         try:
             self._solver.optimize()
             self._refuse_absurd()
-        except Exception:
+        except Exception as error:
+            self._note_undetermined(error)
             self.go_back()
             return False
         return True

@@ -19,7 +19,7 @@ _LEAST_EIGENVALUE = 1e-9  # of correlations: less is no information
 
 def undetermined(vertex: int) -> SingularError:
     """Return the error for a vertex that the edges do not determine."""
-    return SingularError(f"a pivot cannot be told from rounding: the edges do not determine vertex {vertex}")
+    return SingularError(f"a pivot cannot be told from rounding: the edges do not determine vertex {vertex}", vertex)
 
 
 def check_gauge(graph: Graph, free: Index, held: Index, rows: Mapping[EdgeTable, Index]) -> None:

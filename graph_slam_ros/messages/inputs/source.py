@@ -124,12 +124,18 @@ class InputContext:
         if found is not None:
             return found
         if self._mount is not None and not self.transforms.knows(frame):
-            return self._mount
+            return self._mounted(self._mount)
         if not self._may_come(stamp_ns):
             if self._mount is not None and not self.transforms.are_linked(self.config.frames.base, frame):
-                return self._mount
+                return self._mounted(self._mount)
             raise self._not_linked("frame_unknown", frame, self.config.frames.base)
         raise NotYet(self.transforms.are_linked(self.config.frames.base, frame))
+
+    def _mounted(self, mount: se3.Pose) -> se3.Pose:
+        """Return the configured mount. It is counted where it puts a sensor of landmarks at the base, as if assumed."""
+        if self.use == "landmarks" and not any(se3.position(mount)):
+            self.count("mount_at_base")
+        return mount
 
     def T_sensor(self, sensor: str, seen: str, stamp_ns: int) -> se3.Pose:
         """Return the pose of a frame that a detector publishes on /tf, in the frame of its sensor.

@@ -173,6 +173,17 @@ def test_odometry_may_be_on_tf_alone_in_any_frames(info, capsys):
     assert run(words, capsys)[0]["landmarks"] == 3
 
 
+def test_a_replay_without_options_takes_odometry_of_other_types_and_says_so(info, capsys):
+    def moving(k, stamp_ns, truth, drifting):
+        x, y, yaw = drifting
+        return transforms(("odom", "base_link", (x, y, 0.0), quaternion(yaw=yaw)), stamp_ns=stamp_ns)
+
+    info(("/tf", TF, moving), SEEN)
+    summary, _, err = run(["graph_slam", "replay", "drive.mcap", "--out", "out"], capsys)
+    assert "there is no odometry of the usual type, so this is: graph_slam replay drive.mcap --landmarks /tags" in err
+    assert summary["landmarks"] == 3
+
+
 def test_odometry_that_leaves_the_plane_is_offered_in_three_dimensions_and_a_replay_in_two_says_so(info, capsys):
     code, lines, words = info(("/odom", ODOM, odom(height=0.02)), SEEN)
     assert code == 0
@@ -285,6 +296,14 @@ def test_odometry_of_a_frame_that_tf_does_not_link_to_the_base_of_the_sensors_is
     assert "odom.mount=0 0 0 0 0 0" in words
     assert f"note: no transform links chassis, which odometry names, to {base}" in " ".join(lines)
     assert run(words, capsys)[0]["landmarks"] == 3
+
+
+def test_transforms_of_a_robot_that_are_not_read_are_named(info):
+    def standing(k, stamp_ns, truth, drifting):
+        return transforms(("base_link", "camera", (0.1, 0.0, 0.0), quaternion(yaw=0.0)), stamp_ns=stamp_ns)
+
+    _, lines, _ = info(ODOMETRY, SEEN, ("/tf_static", TF, standing), ("/robot1/tf_static", TF, standing))
+    assert "not used: /robot1/tf_static: /tf_static is there, and it alone is read" in lines
 
 
 def test_topics_of_types_that_no_input_reads_are_named(info, capsys):

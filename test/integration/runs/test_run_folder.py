@@ -353,7 +353,7 @@ OF_FILES = {
     "node/player.py": {"parameters.write_text", "subprocess.Popen"},
     "lie/jit.py": None,
     "warmup.py": {"(CACHE_DIR / _SHARED).touch", "(CACHE_DIR / f'complete-{sys.argv[1]}').touch", "subprocess.Popen"},
-    "runs/load.py": {"_STATM.read_text"},
+    "runs/resource_log.py": {"_STATM.read_text"},
     "analysis/plots.py": {"figure.savefig"},  # into memory
     "solver/problem.py": {"self._pending.touch"},
     "report/page.py": {f"(_HERE / 'page.{kind}').read_text" for kind in ("css", "html", "js")} | {"file.read_text"},

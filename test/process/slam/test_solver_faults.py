@@ -18,6 +18,7 @@ from reliability import tell, times
 from graph_slam_ros.errors import GaugeError, GraphSlamError, SingularError
 from graph_slam_ros.lie import se2
 from graph_slam_ros.measurements.types import Closure
+from graph_slam_ros.simulation import measurements, simulate
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict
 from graph_slam_ros.solver.clique_tree.storage import LOCAL, MARKED, NOTHING
@@ -210,6 +211,23 @@ def test_G7_what_a_solve_fails_with_again_and_again_is_quarantined_and_nothing_e
     run(p, END)
     assert edge not in p.solver.edges
     assert p.trajectory() == pytest.approx(clean[0].trajectory(), abs=0.1)
+
+
+@pytest.mark.parametrize("seed", [2, 6])
+def test_G7_an_old_landmark_that_later_solves_do_not_determine_is_quarantined(seed):
+    """Bearings in degrees: a landmark that they put somewhere moves farther and farther away."""
+    p = GraphSlam(Config())
+    for m in measurements(simulate("warehouse", seed, aisles=2, aisle_m=4.0, laps=1, sensor="bearing")):
+        p.process(replace(m, sightings=tuple(map(in_degrees, m.sightings))) if isinstance(m, Sightings) else m)
+    run(p, END)
+    failures = p.counters.as_dict()["solver"]["SingularError"]
+    assert 0 < failures < 0.1 * len(p.keyframes)
+    assert p.counters.as_dict()["landmarks"]["quarantined"] > 5
+    assert not p.failing
+
+
+def in_degrees(one):
+    return replace(one, measured=(float(se2.wrap(math.degrees(one.measured[0]))),))
 
 
 @pytest.mark.parametrize("at", [5, 40, 70])

@@ -5,12 +5,12 @@ import json
 import numpy as np
 import pytest
 
-from graph_slam_ros.runs.load import COLUMNS, Load, resident_mib
+from graph_slam_ros.runs.resource_log import COLUMNS, ResourceLog, resident_mib
 
 
 @pytest.mark.parametrize("count", [1, 2, 199, 200, 201, 12_345])
 def test_samples_are_few_and_spread_over_the_whole_run(count):
-    load = Load()
+    load = ResourceLog()
     for keyframe in range(1, count + 1):
         load.add(keyframe, 0)
     at = load.as_dict()["keyframes"]
@@ -20,14 +20,14 @@ def test_samples_are_few_and_spread_over_the_whole_run(count):
 
 
 def test_no_peak_of_the_backlog_is_lost():
-    load = Load()
+    load = ResourceLog()
     for keyframe in range(1, 5001):
         load.add(keyframe, 70 if keyframe in (1, 777) else 0)
     assert load.as_dict()["backlog"].count(70) == 2
 
 
 def test_its_columns_are_those_of_the_process():
-    load = Load()
+    load = ResourceLog()
     assert load.as_dict() == {}
     before = resident_mib()
     load.add(3, 2)

@@ -19,7 +19,7 @@ def resident_mib() -> float:
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
-class Load:
+class ResourceLog:
     """Samples at updates, evenly spaced over the run, whatever its length.
 
     The backlog of a sample is the largest since the sample before: measurements accepted and not processed.
