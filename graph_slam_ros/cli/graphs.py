@@ -78,7 +78,7 @@ def _after(args: argparse.Namespace, converged: bool) -> str:
 
 
 def _options(args: argparse.Namespace) -> Iterable[str]:
-    """Return the options of the solution as they were typed."""
+    """Yield the options of the solution as they were typed."""
     from graph_slam_ros.cli.parser import parser
 
     usual = parser().parse_args(["optimize", "GRAPH"])

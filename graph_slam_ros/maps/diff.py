@@ -101,7 +101,7 @@ class Difference:
         return "\n".join(self.lines())
 
     def lines(self) -> Iterator[str]:
-        """Return what differs, for people."""
+        """Yield what differs, for people."""
         yield f"{'':10s}{'A':>14s}{'B':>14s}{'both':>14s}"
         for name in ("keyframes", "landmarks", "edges"):
             one: Counts = getattr(self, name)

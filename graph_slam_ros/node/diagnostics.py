@@ -242,7 +242,7 @@ def _faults(facts: Facts, config: Config) -> Iterator[str]:
 
 
 def statuses(facts: Facts, verdict: Health, node: str) -> Iterator[Status]:
-    """Return the statuses of /diagnostics: the verdict, each input, and the graph."""
+    """Yield the statuses of /diagnostics: the verdict, each input, and the graph."""
     message = "; ".join((verdict.state, *verdict.reasons))
     healthy = {"healthy": str(verdict.is_healthy), "state": verdict.state}
     reasons = {f"reason {k}": reason for k, reason in enumerate(verdict.reasons, 1)}

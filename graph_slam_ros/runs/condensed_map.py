@@ -121,7 +121,7 @@ def read_condensed(graph: Graph, record: Mapping[str, Any]) -> tuple[int, Bounde
 
 
 def left_records(done: Condensation) -> Iterator[Record]:
-    """Return the records of what has left a map."""
+    """Yield the records of what has left a map."""
     left = done.left
     rows = {"keyframes": _text(left.keyframes), "sightings": _text(left.sightings)}
     if left.attached is not None:
@@ -188,7 +188,7 @@ def _incomplete(folder: Path, count: int, state: BoundedState) -> FormatError:
 
 
 def carried(folder: Path, space: Geometry, state: BoundedState) -> Iterator[Record]:
-    """Return the records of what has left a map, one by one, for the run that goes on in it.
+    """Yield the records of what has left a map, one by one, for the run that goes on in it.
 
     Raises
     ------
@@ -205,7 +205,7 @@ def carried(folder: Path, space: Geometry, state: BoundedState) -> Iterator[Reco
 
 
 def read_left_edges(folder: Path) -> Iterator[dict[str, str]]:
-    """Return the rows of the edges that have left the map of a run, by column."""
+    """Yield the rows of the edges that have left the map of a run, by column."""
     for record in read_records(folder, CONDENSED, [], "left_edges"):
         yield from csv.DictReader(io.StringIO(record["table"]), COLUMNS)
 

@@ -156,7 +156,7 @@ def _solves(summary: Summary) -> str:
 
 
 def _counted_lines(source: str, reason: str, times: int) -> Iterator[str]:
-    """Return what was repaired or noted, with the remedy if it was frequent."""
+    """Yield what was repaired or noted, with the remedy if it was frequent."""
     yield from _wrapped(f"counted    {source}: {reason} {times} ({explain(reason).meaning})", 11)
     if times > 1 and reason in _MENDED and (mend := remedy(source, reason)):
         yield from textwrap.wrap(f"-> {mend}", _WIDTH, initial_indent=" " * 11, subsequent_indent=" " * 14)
@@ -192,7 +192,7 @@ def table(summary: Summary) -> list[str]:
 
 
 def shortcomings(summary: Summary) -> Iterator[str]:
-    """Return the reasons why the result is incomplete, one sentence each; empty if it is complete."""
+    """Yield the reasons why the result is incomplete, one sentence each; empty if it is complete."""
     inputs: Mapping[str, Any] = summary.get("inputs", {})
     yield from checked(summary, "error")
     if summary.get("failing"):
@@ -265,7 +265,7 @@ def ambiguities(rivals: Collection[Mapping[str, Any]]) -> Iterator[str]:
 
 
 def doubts(summary: Summary) -> Iterator[str]:
-    """Return a sentence for each input of which many measurements are rejected, or all motions left out.
+    """Yield a sentence for each input of which many measurements are rejected, or all motions left out.
 
     Also one where many visits of a condensed map contradict the others: what is left in the map was not better. And one
     for each clock, mount or scale that is off so far that the covariances are too small, and for each other explanation
@@ -330,7 +330,7 @@ def _visits(counted: Mapping[str, int]) -> int:
 
 
 def checked(summary: Summary, severity: str) -> Iterator[str]:
-    """Return the worst finding of the recording if it is severe enough; ``graph_slam check`` lists all."""
+    """Yield the worst finding of the recording if it is severe enough; ``graph_slam check`` lists all."""
     found = summary.get("check")
     if found is not None and found["severity"] == severity:
         mend = " ".join(f"--set {shlex.quote(text)}" for text in found["settings"])
@@ -338,7 +338,7 @@ def checked(summary: Summary, severity: str) -> Iterator[str]:
 
 
 def unscaled(summary: Summary) -> Iterator[str]:
-    """Return why noise that should be estimated is as configured, though something was solved."""
+    """Yield why noise that should be estimated is as configured, though something was solved."""
     why = summary.get("noise_unknown")
     if why and summary.get("noise_scale") == "estimated" and summary["landmarks"]:
         yield f"robust.noise_scale=estimated: no noise could be estimated at the end: {why}"

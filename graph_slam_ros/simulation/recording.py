@@ -101,7 +101,7 @@ class Recording:
 
 
 def measurements(recording: Recording) -> Iterator[Odometry | Sightings | Closure]:
-    """Return the input of ``GraphSlam.process`` in order of stamp; at one stamp odometry comes first.
+    """Yield the input of ``GraphSlam.process`` in order of stamp; at one stamp odometry comes first.
 
     Measurements of a satellite receiver or an IMU are not among it: converters make fixes of them, from a bag.
     """
