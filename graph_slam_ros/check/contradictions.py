@@ -6,7 +6,7 @@ import numpy as np
 
 from graph_slam_ros.check.columns import Columns
 from graph_slam_ros.check.finding import Finding, Where
-from graph_slam_ros.check.noise import TYPICAL_M, check_noise, noisier
+from graph_slam_ros.check.noise import TYPICAL_M, check_noise, check_noise_alone, noisier
 from graph_slam_ros.check.pairs import LATER_S, Pairs, pairs_of, path_of, usable
 from graph_slam_ros.check.ranges import check_ranges
 from graph_slam_ros.check.sightings import SightingColumns
@@ -46,7 +46,7 @@ def check_contradictions(c: Columns) -> Iterator[Finding]:
     for s in c.sightings:
         if not len(s.stamp_ns):
             continue
-        found = list(check_ranges(s, path_ns, path)) + list(_contradictions(c, s, path_ns, path))
+        found = [*check_ranges(s, path_ns, path), *check_noise_alone(c, s), *_contradictions(c, s, path_ns, path)]
         yield from found
         yield from _identities(c, s)
         if not any(one.ends for one in found):

@@ -6,6 +6,7 @@ from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from graph_slam_ros.check.noise import ASSUMED_BEARING_RAD, ASSUMED_RANGE_M
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.parameters import assignment
 from graph_slam_ros.messages.from_msg import TRANSFORMS
@@ -169,12 +170,12 @@ class Suggestion:
             self.unused[one.topic.name] = "bearings without elevation, in three dimensions"
         else:
             has_sigma = one.fields & {"sigma_bearing"} or (one.fields & {"sigma"} and "range" not in one.fields)
-            chosen: dict[str, Any] = {"sigma_rad": 0.02} if is_bearing and not has_sigma else {}
+            chosen: dict[str, Any] = {"sigma_rad": ASSUMED_BEARING_RAD} if is_bearing and not has_sigma else {}
             if chosen:
-                self.notes.append(f"{one.topic.name} has no noise of bearings: 0.02 rad is assumed")
+                self.notes.append(f"{one.topic.name} has no noise of bearings: {ASSUMED_BEARING_RAD} rad is assumed")
             if "range" in one.fields and "sigma" not in one.fields:
-                chosen["sigma_m"] = 0.5
-                self.notes.append(f"{one.topic.name} has no noise of ranges: 0.5 m is assumed")
+                chosen["sigma_m"] = ASSUMED_RANGE_M
+                self.notes.append(f"{one.topic.name} has no noise of ranges: {ASSUMED_RANGE_M} m is assumed")
             if "id" not in one.fields:
                 self._join(one)
             self._add("ranges" if "range" in one.fields else "points", one, chosen)

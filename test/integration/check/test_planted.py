@@ -132,6 +132,17 @@ def test_other_units_of_ranges_or_bearings_alone_are_found_and_no_replay_is_offe
     assert "next: correct what is an error, then check again" in said
 
 
+@pytest.mark.parametrize(("sensor", "setting"), [("range", "ranges.sigma_m=0.5"), ("bearing", "points.sigma_rad=0.02")])
+def test_ranges_or_bearings_alone_whose_covariance_is_nearly_zero_are_found_and_mended(tmp_path, sensor, setting):
+    drive, bag = simulate("warehouse", 3, aisles=2, aisle_m=4.0, laps=1, sensor=sensor), tmp_path / "right.mcap"
+    write_bag(drive, bag)
+    faulty = planted(bag, tmp_path / "wrong.mcap", "landmark sigma 1e-6")
+    (one,) = check(faulty, quick=True).findings
+    assert one.code == "noise_zero"
+    assert setting in one.settings
+    assert check(faulty, dict(parse_setting(text) for text in one.settings), quick=True).findings == []
+
+
 def test_bearings_of_a_recording_without_any_cannot_be_wrong(drive, tmp_path, capsys):
     fault = "wrong_units:of=bearings"
     assert main(["simulate", str(drive), "--out", str(tmp_path / "wrong.mcap"), "--fault", fault]) == 2
