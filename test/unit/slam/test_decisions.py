@@ -281,7 +281,7 @@ def test_a_search_ends_where_a_candidate_on_trial_does_not_fit_after_all(monkeyp
     monkeypatch.setattr(OutlierGate, "readmit_next", tried)
     monkeypatch.setattr(Solver, "optimize", solved)
     backend = drive.backend
-    outcome = search_alternatives(Config().robust, backend._frozen(59, drive.settings))
+    outcome = search_alternatives(Config().robust, backend._frozen_graph(59, drive.settings))
     assert len(solves) <= 8, "the same two sets of verdicts were solved again and again"
     assert outcome is not None and wrong in outcome.ledger.outside and set(drive.closures) <= {*outcome.ledger.inside}
     without = Solver(outcome.frozen.graph, drive.settings.until_still())
