@@ -71,7 +71,11 @@ def statements_of_place(run: SavedGraph, e: Entry) -> Iterator[tuple[str, str]]:
     """Sentences on the edge of a place, each with its name."""
     places = run.slam.bounded.places if run.slam.bounded else {}
     several = ((cell, one) for cell, all_of_it in places.items() for one in all_of_it)
-    cell, place = next((cell, one) for cell, one in several if run.graph.edge_ids.of(one.edge) == e.edge)
+    found = next(((cell, one) for cell, one in several if run.graph.edge_ids.of(one.edge) == e.edge), None)
+    if found is None:
+        yield f"edge {e.edge}", "an earlier place: what it measured is in the place that took over from it"
+        return
+    cell, place = found
     base, *members = e.vertices
     width = run.config.map.cell_m
     corner = " ".join(f"{width * c:.4g}" for c in cell)

@@ -11,6 +11,7 @@ from graph_slam_ros.lie import se2, se3, so3
 from graph_slam_ros.runs.ledger_file import Entry
 
 _DEGREES = 180.0 / math.pi
+_LEAST = 1e-12  # of the largest eigenvalue: less is no information
 _XY, _XYZ = ("x m", "y m"), ("x m", "y m", "z m")
 _POSE, _POSE_3D = (*_XY, "heading rad"), (*_XYZ, "turn x rad", "turn y rad", "turn z rad")
 _NAMES = {
@@ -97,5 +98,10 @@ def sigmas(entry: Entry) -> tuple[float, ...]:
 
 
 def sigmas_of(information: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Standard deviations (..., m) of information matrices (..., m, m)."""
-    return np.sqrt(np.diagonal(np.linalg.inv(information), axis1=-2, axis2=-1))
+    """Standard deviations (..., m) of information matrices (..., m, m); infinite where they determine nothing."""
+    values, vectors = np.linalg.eigh(information)
+    is_known = values > _LEAST * np.abs(values).max(axis=-1, keepdims=True)
+    variances = np.where(is_known, 1.0 / np.where(is_known, values, 1.0), 0.0)
+    out = np.sqrt(np.einsum("...ij,...j,...ij->...i", vectors, variances, vectors))
+    unknown = np.einsum("...ij,...j,...ij->...i", vectors, np.where(is_known, 0.0, 1.0), vectors)
+    return np.where(unknown > _LEAST, np.inf, out)

@@ -176,9 +176,10 @@ def _left_out(
 
 
 def _noise(run: Path) -> tuple[bool, tuple[NoiseScale, ...]]:
-    """Return whether fixes hold the map, and the noise estimated from residuals, from the summary of a run."""
+    """Return whether fixes or surveyed landmarks hold the map, and the noise estimated, by the summary of a run."""
     try:
         summary = json.loads(read_text(run / SUMMARY))
-        return "fixes" in summary["classes"], tuple(NoiseScale.from_dict(one) for one in summary.get("noise", ()))
+        is_held = bool({"fixes", "surveyed"} & set(summary["classes"]))
+        return is_held, tuple(NoiseScale.from_dict(one) for one in summary.get("noise", ()))
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise GraphSlamError(f"{run / SUMMARY}: not a summary of a run ({type(error).__name__}: {error})") from None

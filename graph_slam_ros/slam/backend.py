@@ -283,6 +283,7 @@ class Backend:
         """Take over new ids of edges, by old ones, after graph and solver were compacted."""
         self.decisions.renumber(new)
         self.frozen_edges = self.ledger.final
+        self.held = self.held[0], int(np.count_nonzero(new[: self.held[1]] >= 0))
         self.odometries.forget()
         self.handed_over = self.graph.vertex_count, self.graph.edge_count
         self._rivals = ()

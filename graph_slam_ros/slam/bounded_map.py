@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from graph_slam_ros.graph.place import LABEL as PLACES
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.slam.anchor import Anchor
 from graph_slam_ros.slam.backend import Backend
@@ -28,7 +29,7 @@ from graph_slam_ros.slam.lifelong.frames import Frames, chained, frame_of, weigh
 from graph_slam_ros.slam.lifelong.outcome import Condensed
 from graph_slam_ros.slam.lifelong.place_edge import PlaceEdge
 from graph_slam_ros.slam.lifelong.removed import Left, OldKeyframe, Records, record_type
-from graph_slam_ros.slam.lifelong.surroundings import CLOSURES, seen_from
+from graph_slam_ros.slam.lifelong.surroundings import CHAIN, CLOSURES, seen_from
 from graph_slam_ros.slam.robust.gating import CANDIDATES
 from graph_slam_ros.slam.solution import Solution
 from graph_slam_ros.solver import Solver
@@ -40,6 +41,7 @@ LONGEST = BATCH  # keyframes of a visit: so all that leave a cell together are o
 _PATIENCE = 200  # keyframes that are out of the window while a visit waits
 _AGAIN = 20  # keyframes until it is tried again, where sightings without ids are not explained yet
 _SOURCE = "map"  # of what is counted
+_SUMMED = (PLACES, CHAIN)  # edges that a later one contains, when it takes their place
 _THIN = 0.1  # of the width of a cell: so far apart keyframes stay that are in no place
 
 
@@ -325,7 +327,8 @@ class BoundedMap:
     def _staying(self, window: int) -> tuple[Index, Index]:
         """The vertices and edges that stay; ``window`` is the first keyframe of the window, by its vertex.
 
-        Edges stay that count, and those of the window that may count again; all of a frozen or held map do.
+        Edges stay that count, and those of the window that may count again; all of a frozen or held map do, but for
+        those in whose place another has come.
         """
         backend, graph = self._backend, self._backend.graph
         is_vertex = np.zeros(graph.vertex_count, dtype=bool)
@@ -336,7 +339,8 @@ class BoundedMap:
             ids, ends = table.id.values, table.vertices.values
             is_young = ((ends >= window) & is_vertex[ends]).any(axis=1)
             is_edge[ids] = is_vertex[ends].all(axis=1) & ((table.weight.values > 0.0) | is_young)
-            is_edge[ids] |= ids < backend.first_free_edge
+            is_superseded = (table.weight.values == 0.0) & graph.has_label(ids, _SUMMED)
+            is_edge[ids] |= (ids < backend.first_free_edge) & ~is_superseded
         return np.flatnonzero(is_vertex), np.flatnonzero(is_edge)
 
     def _sightings(self, end: int) -> Records:

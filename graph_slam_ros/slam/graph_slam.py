@@ -297,4 +297,5 @@ class GraphSlam(MapView):
         (frontend.covariance,) = self.solver.marginal([self.keyframes[-1].vertex])
         if localizes:
             self.backend.hold_map()
+            self.solver.update()
             self._landmarks.map.begins_new = False

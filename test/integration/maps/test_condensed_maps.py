@@ -261,6 +261,10 @@ def test_a_drive_in_a_frozen_map_is_condensed_and_the_map_stays(two, tmp_path, n
         if one < 600:
             here, there = (x.slam.solver.estimate([x.vertices[one]]) for x in (before, after))
             assert here == pytest.approx(there, abs=1e-12)
+    counting = {one.edge for cell in after.slam.bounded.places.values() for one in cell}
+    assert set(after.graph.edges_of(PLACES).tolist()) == counting, "a place that another took over is gone"
+    recover(tmp_path / "on", tmp_path / "recovered")
+    assert "nan" not in (tmp_path / "recovered" / "covariances.csv").read_text().splitlines()[-1]
     again, _ = record_run(
         tmp_path / "again",
         config(PLANAR, **settings),
