@@ -27,7 +27,7 @@ from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.files import is_empty
 from graph_slam_ros.lie import se3
 from graph_slam_ros.runs.folder import is_recording, is_run, run_config, summary_of
-from graph_slam_ros.runs.trajectory import Point, Trajectory, read_landmarks, read_tum
+from graph_slam_ros.runs.trajectory import Point, Trajectory, read_landmarks, read_rows
 
 _KEYFRAMES = ("path.tum", "path_odometry.tum")  # estimate and dead reckoning
 _SIGHTINGS = ("sightings.tum", "odometry.tum")
@@ -211,14 +211,20 @@ def scored_drive(run: Path, truth: Trajectory | None, estimate: str = "") -> Dri
     GraphSlamError
         The path of the run cannot be read.
     """
-    of_sightings = estimate == _SIGHTINGS[0] or (not estimate and not is_empty(run / _SIGHTINGS[0]))
+    drives = _drives(run)
+    is_split = all(one["sighting"] for one in drives[1:])  # else condensed
+    if estimate in _SIGHTINGS and not is_split:
+        raise GraphSlamError(
+            f"{run / estimate}: where its drives begin is not known, since they are condensed: --estimate path.tum"
+        )
+    of_sightings = estimate == _SIGHTINGS[0] or (not estimate and is_split and not is_empty(run / _SIGHTINGS[0]))
     default, odometry = _SIGHTINGS if of_sightings else _KEYFRAMES
     name = estimate or default
     if is_empty(run / odometry):
         odometry = _SIGHTINGS[1]
-    whole = read_tum(run / name)
-    odometry_path = None if is_empty(run / odometry) else read_tum(run / odometry)
-    drives = _drives(run) if name in (*_SIGHTINGS, *_KEYFRAMES) else _ONE_DRIVE
+    whole = read_rows(run / name)
+    odometry_path = None if is_empty(run / odometry) else read_rows(run / odometry)
+    drives = drives if name in (*_SIGHTINGS, *_KEYFRAMES) else _ONE_DRIVE
     chosen = None
     for k in reversed(range(len(drives))):
         follows = drives[k + 1] if k + 1 < len(drives) else {}
@@ -228,12 +234,18 @@ def scored_drive(run: Path, truth: Trajectory | None, estimate: str = "") -> Dri
         if not len(estimated.stamps_s):
             continue
         part = Drive(
-            estimated, reckoned, (name, odometry), k + 1, len(drives), drives[k]["keyframe"], follows.get("keyframe")
+            estimated.in_order(),
+            reckoned and reckoned.in_order(),
+            (name, odometry),
+            k + 1,
+            len(drives),
+            drives[k]["keyframe"],
+            follows.get("keyframe"),
         )
         chosen = chosen or part
-        if truth is None or _overlap(estimated, truth):
+        if truth is None or _overlap(part.estimate, truth):
             return part
-    return chosen or Drive(whole, odometry_path, (name, odometry))
+    return chosen or Drive(whole.in_order(), odometry_path and odometry_path.in_order(), (name, odometry))
 
 
 def _drives(run: Path) -> list[dict[str, int]]:

@@ -18,7 +18,7 @@ from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.durable import write_whole
 from graph_slam_ros.lie import se3
 from graph_slam_ros.runs.folder import COVARIANCES, recording_of
-from graph_slam_ros.runs.trajectory import Landmark, Trajectory, read_covariances, read_landmarks, read_tum
+from graph_slam_ros.runs.trajectory import Landmark, Trajectory, read_covariances, read_landmarks, read_rows
 from graph_slam_ros.typing import Array, Index
 
 _TRUTH, _ODOMETRY, _ESTIMATE = (LIGHT[name] for name in ("truth", "odometry", "estimate"))
@@ -54,7 +54,7 @@ def draw_run(
     dimensions = dimensions_of(run)
     known = truth if isinstance(truth, Truth) or truth is None else read_truth(truth, topic, input_topics(run))
     drive = scored_drive(run, known.trajectory if known else None)
-    whole = read_tum(run / "path.tum")
+    whole = read_rows(run / "path.tum")
     found = _placed(drive, whole.at(drive.keyframes), known, dimensions, align=align)
     landmarks = read_landmarks(run / "landmarks.csv")
     points = np.array([landmark.position for landmark in landmarks.values()]).reshape(-1, 3)

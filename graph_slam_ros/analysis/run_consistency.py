@@ -25,7 +25,7 @@ from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.files import read_text
 from graph_slam_ros.runs.folder import COVARIANCES, SUMMARY, run_config
-from graph_slam_ros.runs.trajectory import Landmark, Trajectory, read_covariances, read_landmarks, read_tum
+from graph_slam_ros.runs.trajectory import Landmark, Trajectory, read_covariances, read_landmarks, read_rows
 from graph_slam_ros.slam.noise_scale import NoiseScale
 from graph_slam_ros.typing import Array
 
@@ -43,7 +43,7 @@ def consistency_of(run: Path, known: Truth, keyframes: slice, *, is_first: bool)
     """
     if not os.path.lexists(run / COVARIANCES):
         return None
-    path, covariances = read_tum(run / "path.tum"), read_covariances(run / COVARIANCES)
+    path, covariances = read_rows(run / "path.tum"), read_covariances(run / COVARIANCES)
     if len(covariances) != len(path.stamps_s):
         raise GraphSlamError(
             f"{run / COVARIANCES}: {len(covariances)} rows, and path.tum has {len(path.stamps_s)} poses"

@@ -27,7 +27,7 @@ from graph_slam_ros.runs.folder import COVARIANCES, changed_since, run_config, s
 from graph_slam_ros.runs.ledger_file import Entry
 from graph_slam_ros.runs.run_check import check_run
 from graph_slam_ros.runs.tables import INPUT_COLUMNS
-from graph_slam_ros.runs.trajectory import read_covariances, read_tum
+from graph_slam_ros.runs.trajectory import read_covariances, read_rows
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict
 
 _BINS, _SHOWN = 60, 25
@@ -235,7 +235,7 @@ def _nees(out: Contents, known: Truth) -> dict[str, Any]:
     """NEES of each keyframe that has a truth, and the band of single ones."""
     run, drive_of = out.run, scored_drive(out.run, known.trajectory)
     path, covariances = (
-        read_tum(run / "path.tum").at(drive_of.keyframes),
+        read_rows(run / "path.tum").at(drive_of.keyframes),
         read_covariances(run / COVARIANCES)[drive_of.keyframes],
     )
     truth = known.trajectory if covariances.shape[1] == 6 else known.trajectory.in_plane()

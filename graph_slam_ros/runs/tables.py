@@ -217,7 +217,10 @@ def _accepted_by_input(slam: GraphSlam, first: int) -> Counter[str]:
 
 
 def _drives(slam: GraphSlam) -> list[dict[str, int]]:
-    """Return the first row of each drive in ``path.tum`` and in ``sightings.tum``, from 0."""
+    """Return the first row of each drive in ``path.tum`` and in ``sightings.tum``, from 0.
+
+    That in ``sightings.tum`` is 0 for a later drive whose first keyframes are condensed: it is not known any more.
+    """
     of, before = slam.sighting_poses.ids, slam.bounded.sightings if slam.bounded else 0
     return [
         {"keyframe": first, "sighting": before + int(np.sum(of < first)) if first >= slam.first_keyframe else 0}

@@ -22,7 +22,7 @@ class Trajectory:
 
     Attributes
     ----------
-    stamps_s : (n,) seconds, increasing
+    stamps_s : (n,) seconds, increasing, but where rows of a file are asked for
     poses : (n, 7) x, y, z [m], qx, qy, qz, qw
     has_orientation : False where only positions are known: the quaternions then mean nothing
     """
@@ -38,6 +38,10 @@ class Trajectory:
     def in_plane(self) -> "Trajectory":
         """The trajectory in the plane, without height, roll and pitch."""
         return replace(self, poses=se3.in_space(se3.in_plane(self.poses)))
+
+    def in_order(self) -> "Trajectory":
+        """The same poses in order of stamp."""
+        return self.at(np.argsort(self.stamps_s, kind="stable"))
 
     def at(self, index: Any) -> "Trajectory":
         """The part with these indices: a slice, numbers or a mask."""
@@ -59,7 +63,18 @@ class Landmark:
 
 
 def read_tum(path: Path, *, follow: bool = False) -> Trajectory:
-    """Poses of a TUM file (stamp x y z qx qy qz qw); ``follow``: it may be a symbolic link.
+    """Poses of a TUM file (stamp x y z qx qy qz qw) in order of stamp; ``follow``: it may be a symbolic link.
+
+    Raises
+    ------
+    GraphSlamError
+        As ``read_rows``.
+    """
+    return read_rows(path, follow=follow).in_order()
+
+
+def read_rows(path: Path, *, follow: bool = False) -> Trajectory:
+    """Poses of a TUM file in the order of its rows, which in a run's files are in the order of its keyframes.
 
     Raises
     ------
@@ -86,16 +101,19 @@ def read_tum(path: Path, *, follow: bool = False) -> Trajectory:
     if not found:
         raise GraphSlamError(f"{path}: no pose in it")
     rows = np.array(found)
-    return trajectory(rows[:, 0], rows[:, 1:], str(path))
+    return _normalized(rows[:, 0], rows[:, 1:], str(path))
 
 
 def trajectory(stamps_s: Array, poses: Array, source: str) -> Trajectory:
     """Poses in order of stamp, with unit quaternions, because files contain rounded ones."""
+    return _normalized(stamps_s, poses, source).in_order()
+
+
+def _normalized(stamps_s: Array, poses: Array, source: str) -> Trajectory:
     norm = np.linalg.norm(poses[:, 3:], axis=1, keepdims=True)
     if not (norm > 0.0).all():
         raise GraphSlamError(f"{source}: a quaternion of zeros is no rotation")
-    order = np.argsort(stamps_s, kind="stable")
-    return Trajectory(stamps_s[order], np.hstack([poses[:, :3], poses[:, 3:] / norm])[order])
+    return Trajectory(stamps_s, np.hstack([poses[:, :3], poses[:, 3:] / norm]))
 
 
 def read_landmarks(path: Path) -> dict[str, Landmark]:

@@ -523,12 +523,14 @@ def test_a_run_that_saw_nothing_is_scored_at_its_keyframes(run, tmp_path):
     assert scores.scored["estimate"] == "path.tum"
 
 
-def test_of_a_run_in_a_loaded_map_the_drive_of_the_truth_alone_is_scored(tmp_path):
+@pytest.mark.parametrize("hours", [1, -1])
+def test_of_a_run_in_a_loaded_map_the_drive_of_the_truth_alone_is_scored(tmp_path, hours):
+    """Also where the drive is older than the map."""
     world = simulate("pythonrobotics", 0, poses=40)
     write_bag(world, tmp_path / "bag.mcap")
     replay(tmp_path / "bag.mcap", tmp_path / "before")
     before = map_of(tmp_path / "before", [])
-    hour_ns = 3_600_000_000_000
+    hour_ns = hours * 3_600_000_000_000
     record_run(tmp_path / "after", Config(), [*later(measurements(world), hour_ns), Control("end")], [], before)
     truth = Trajectory((world.stamps_ns + hour_ns) / 1e9, se3.in_space(world.T_world_base))
     write_tum(tmp_path / "truth.tum", truth.stamps_s, truth.poses)
@@ -541,6 +543,14 @@ def test_of_a_run_in_a_loaded_map_the_drive_of_the_truth_alone_is_scored(tmp_pat
     assert old.consistency.poses.n > 0
     whole = read_tum(tmp_path / "after" / "sightings.tum")
     assert new.estimate.of + old.estimate.of == len(whole.stamps_s)
+    assert new.estimate.position_m["rmse"] < 0.5 * new.odometry.position_m["rmse"]
+    summary = json.loads((tmp_path / "after" / "run.json").read_text())
+    summary["drives"][1]["sighting"] = 0  # as where the first keyframes of the drive are condensed
+    (tmp_path / "after" / "run.json").write_text(json.dumps(summary))
+    condensed = evaluate(tmp_path / "after", tmp_path / "truth.tum")
+    assert condensed.scored["estimate"].startswith("path.tum, drive 2 of 2 alone")
+    with pytest.raises(GraphSlamError, match="where its drives begin is not known"):
+        evaluate(tmp_path / "after", tmp_path / "truth.tum", "sightings.tum")
 
 
 def later(items, by_ns):
