@@ -58,7 +58,7 @@ def check_noise_alone(c: Columns, s: SightingColumns) -> Iterator[Finding]:
 
 
 def _raised(c: Columns, s: SightingColumns) -> int:
-    """How many variances of an input were raised; 0 unless it is most, and they are nearly zero."""
+    """The number of variances of an input that were raised; 0 unless it is most, and they are nearly zero."""
     raised = c.counters.as_dict().get(s.input, {}).get("covariance_floored", 0)
     return raised if raised >= _RAISED * len(s.stamp_ns) and float(np.median(s.sigmas)) <= _TINY else 0
 

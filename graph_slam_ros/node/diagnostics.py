@@ -256,14 +256,11 @@ def statuses(facts: Facts, verdict: Health, node: str) -> Iterator[Status]:
         values |= {"silent [s]": f"{one.silent_s:.1f}", "publishers": ", ".join(one.publishers)}
         values |= {f"counted: {reason}": str(times) for reason, times in sorted(one.counts.items())}
         is_wrong = one.mismatch or one.is_contested or one.recent.is_bad
-        level = WARN if is_wrong or (one.use == "odometry" and not one.received) else OK
-        yield Status(
-            level,
-            f"{node}: input {one.name}",
-            one.mismatch or f"{one.received} {INPUT_COLUMNS['received']}",
-            node,
-            values,
-        )
+        is_absent = not one.received and (one.use == "odometry" or not one.publishers)
+        level = WARN if is_wrong or is_absent else OK
+        nobody = f"nobody publishes {one.topic}" if is_absent and not one.publishers else ""
+        message = one.mismatch or nobody or f"{one.received} {INPUT_COLUMNS['received']}"
+        yield Status(level, f"{node}: input {one.name}", message, node, values)
     if facts.estimate:
         values = _graph(facts.estimate) | {"path updates sent": str(facts.path_version)}
         yield Status(OK, f"{node}: weak directions", _weakness(facts, facts.estimate), node, facts.weakest)

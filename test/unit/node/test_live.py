@@ -404,6 +404,18 @@ def test_at_work_it_is_well_or_degraded_with_the_reason(values, inputs, reason):
     assert told[-1].values["keyframes"] == str(estimate.keyframes)
 
 
+def test_a_topic_that_nobody_publishes_is_a_warning_of_its_input():
+    estimate = round_a_curve(2, 3.2).estimate
+    for one, level, message in (
+        (tags(), diagnostics.OK, "0 messages received"),
+        (tags(publishers=()), diagnostics.WARN, "nobody publishes /tags"),
+        (tags(publishers=(), received=3, silent_s=1.0), diagnostics.OK, "3 messages received"),
+    ):
+        facts = Facts("active", (odom(received=9, silent_s=0.0), one), estimate)
+        (status,) = (s for s in statuses(facts, judge(facts, Config()), "slam") if s.name == "slam: input tags")
+        assert (status.level, status.message) == (level, message)
+
+
 def test_A35_what_is_refused_is_judged_by_the_last_seconds_wherever_it_was_refused():
     recent, accepted, before, after = RecentInputs(), {}, {"tags": {}}, {"tags": {}}
 
