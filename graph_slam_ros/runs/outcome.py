@@ -68,6 +68,10 @@ def text(summary: Summary) -> list[str]:
         undetermined[_MAX_UNDETERMINED:] = [
             f"waiting    and {len(undetermined) - _MAX_UNDETERMINED} more, see run.json"
         ]
+    if unseen := summary.get("survey_unseen"):
+        more = f" and {len(unseen) - _MAX_UNDETERMINED} more" if len(unseen) > _MAX_UNDETERMINED else ""
+        names = ", ".join(unseen[:_MAX_UNDETERMINED])
+        lines += _wrapped(f"survey     not in the map, because it was not seen, or too little: {names}{more}", 11)
     inputs = summary.get("inputs", {})
     others = [
         line

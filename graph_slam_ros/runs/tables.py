@@ -100,6 +100,7 @@ def summarize(slam: GraphSlam, earlier: Counters | None = None) -> dict[str, Any
             "span_s": (slam.keyframes[-1].stamp_ns - slam.began_ns) * 1e-9 if slam.keyframes else 0.0,
         }
         | condensed_part(slam)
+        | ({"survey_unseen": unseen} if (unseen := sorted(slam.config.survey.keys() - slam.landmarks.keys())) else {})
         | ({"gyro": asdict(gyro)} if (gyro := slam.gyro) else {})
         | ({"calibration": report} if (report := slam.calibration_report) else {})
         | ({"association": found} if (found := _association(slam)) else {})

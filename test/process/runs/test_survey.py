@@ -11,8 +11,10 @@ from graph_slam_ros.errors import ConfigError, FormatError, GraphSlamError
 from graph_slam_ros.graph import POINT_PRIOR, POSITION_PRIOR, R2, R3, SE2
 from graph_slam_ros.lie import se2, se3, so3
 from graph_slam_ros.messages.survey import with_survey
+from graph_slam_ros.runs import outcome
 from graph_slam_ros.runs.folder import run_config
 from graph_slam_ros.runs.replay import replay
+from graph_slam_ros.runs.tables import summarize
 from graph_slam_ros.simulation import measurements, simulate, write_bag
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
 
@@ -137,6 +139,9 @@ def test_a_surveyed_point_has_a_prior_of_its_own_from_when_it_is_first_seen():
     assert priors.sqrt_information.values[0] == pytest.approx(2.0 * np.eye(2))
     slam.process(Control("optimize"))
     assert list(slam.landmarks) == ["a"]
+    summary = summarize(slam)
+    assert summary["survey_unseen"] == ["never seen"]
+    assert "because it was not seen, or too little: never seen" in " ".join("\n".join(outcome.text(summary)).split())
     # two sightings at 2.2 and the survey at 2.0, all alike
     assert slam.solver.estimate([slam.landmarks["a"].vertex])[0] == pytest.approx([2.0 + 0.4 / 3, 1.0], abs=1e-3)
 
