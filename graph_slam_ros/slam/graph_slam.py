@@ -286,16 +286,15 @@ class GraphSlam(MapView):
 
     def _restore(self, start: MapSnapshot) -> None:
         """Solve a loaded map. The robot's pose in it is not known yet."""
-        frontend, localizes = self._frontend, self.config.map.localize
         if self.graph.kind_of(start.keyframes[0].vertex) is not self.space.pose:
             raise GraphSlamError(f"the map is not in {self.space.dimensions} dimensions")
-        frontend.restore(*start.path, start.continues_with, start.gyro_bias, start.first_keyframe)
+        self._frontend.restore(*start.path, start.continues_with, start.gyro_bias, start.first_keyframe)
         self._anchor.restore()
         self._landmarks.restore(start.landmarks, start.range_offsets, start.passes)
-        report = self.backend.restore(start.vertices, start.values, start.held if localizes else (0, 0))
+        report = self.backend.restore(start.vertices, start.values, start.held if self.config.map.localize else (0, 0))
         self._solution.restore(report, self.keyframes[-1], len(self.keyframes))
-        (frontend.covariance,) = self.solver.marginal([self.keyframes[-1].vertex])
-        if localizes:
+        (self._frontend.covariance,) = self.solver.marginal([self.keyframes[-1].vertex])
+        if self.config.map.localize:
             self.backend.hold_map()
             self.solver.update()
             self._landmarks.map.begins_new = False
