@@ -18,11 +18,11 @@ from graph_slam_ros.recordings.contents import Recording, TopicContents
 from graph_slam_ros.runs.chosen_inputs import TF_STATIC_TOPIC, TF_TOPIC, choose_inputs
 from graph_slam_ros.runs.folder import suggested_out
 from graph_slam_ros.runs.namespaces import is_truth
-from graph_slam_ros.runs.suggested_odometry import DETECTIONS, ESTIMATE, OdometryChoice, readable
+from graph_slam_ros.runs.suggested_odometry import DETECTIONS, ESTIMATE, POSES, OdometryChoice, readable
 from graph_slam_ros.slam import Config
 
 CLOUD, GNSS, IMU = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/Imu"
-POSE, POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped"
+POSE, POSE_WITH_COVARIANCE = POSES
 
 _TAG = re.compile(r"((?:.*[/_])?(?:tag|aruco|marker|fiducial).*?)[:_]?\d+", re.IGNORECASE)
 _TAG_TOPIC = re.compile(r"(?:tag|aruco|marker|fiducial)[_/:]?(\d+)(?:/pose)?$", re.IGNORECASE)
