@@ -17,6 +17,7 @@ from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.frontend.keyframes import Keyframe
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.slam.landmarks.anonymous import AnonymousLandmarks
+from graph_slam_ros.slam.robust.connections import moved_values
 from graph_slam_ros.slam.robust.displacement import SAME_M, SAME_RAD, DisplacementHypothesis, DisplacementSearch
 from graph_slam_ros.slam.robust.innovation_monitor import InnovationMonitor
 from graph_slam_ros.slam.robust.landmark_history import LandmarkHistory, edges_to_replay
@@ -168,7 +169,7 @@ class KidnapDetector:
         vertices = one.vertices
         match one.label:
             case "odometry":
-                search.add_odometry(edge, vertices, tuple(one.measured.tolist()), stamp_ns)
+                search.chain.add(edge, vertices, tuple(one.measured.tolist()), stamp_ns)
                 first, last = keyframes.stamps_ns[np.searchsorted(keyframes.ids, vertices)].tolist()
                 self._slips.add_odometry(edge, vertices, (first, last), len(keyframes) - 1)
             case "initialpose":
@@ -195,7 +196,6 @@ class KidnapDetector:
         vertices = keyframes.ids
         if not self._backend.decides:
             return
-        self._search.keeps_from = self._anonymous.elsewhere.keeps_from
         found = self._significant(int(vertices[-1]))
         found = found and self._search.begun_at(found, self._anonymous.elsewhere.fits_from)
         is_decided = found is not None and self._is_decided(found)
@@ -236,7 +236,9 @@ class KidnapDetector:
         if found is None:
             return None
         T_map_chain = found.T_map_chain
-        return Moved(found.first, lambda vertex: self._space.group.compose(T_map_chain, self._search.chain(vertex)))
+        return Moved(
+            found.first, lambda vertex: self._space.group.compose(T_map_chain, self._search.chain.pose(vertex))
+        )
 
     def _is_refuted(self, split: _Split, found: DisplacementHypothesis, newest: int) -> bool:
         """Return whether the robot is where it would be without a segment, but for odometry's drift since it began."""
@@ -302,16 +304,17 @@ class KidnapDetector:
         """Begin a segment where the landmarks say that the robot is."""
         index = keyframes.first + int(np.searchsorted(keyframes.ids, found.first))
         group, before = self._space.group, self._estimate(found.first)
-        there = group.compose(found.T_map_chain, self._search.chain(found.first))
+        motions = self._motions(found)
+        there = group.compose(motions[found.first], before)
         moved = group.between(before, there)
         distance_m = float(np.linalg.norm(moved[: self._space.dimensions]))
         angle_rad = float(self._space.angle(moved))
-        T_map_chain_before = group.compose(before, group.inverse(self._search.chain(found.first)))
+        T_map_chain_before = group.compose(before, group.inverse(self._search.chain.pose(found.first)))
         link, motion, noise = self._replacement(found.first, there)
         replacement = self._backend.split(
             (link, motion, noise),
             self._search.initial_poses(found.first),
-            self._moved(self._motions(found)),
+            moved_values(self._space, self._backend.solver, motions),
             found,
             len(keyframes) - 1,
         )
@@ -338,8 +341,8 @@ class KidnapDetector:
                 replacement,
                 T_map_chain_before,
                 found.T_map_chain,
-                self._search.chain(found.first),
-                self._search.drift_of(found.first),
+                self._search.chain.pose(found.first),
+                self._search.chain.drift(found.first),
                 len(self.alarms) - 1,
             )
         )
@@ -348,7 +351,7 @@ class KidnapDetector:
         """Believe odometry again where the last segment begins: the landmarks show that it was right."""
         group = self._space.group
         back = group.compose(split.T_map_chain_before, group.inverse(split.T_map_chain))
-        values = self._moved({split.first: back})
+        values = moved_values(self._space, self._backend.solver, {split.first: back})
         self._backend.rejoin(split.link, split.replacement, values, found, keyframe)
         self._counters.count("odometry", "displacement_taken_back")
         if split.index is not None:
@@ -369,32 +372,21 @@ class KidnapDetector:
 
     def _replacement(self, first: int, there: Numbers) -> tuple[int, Numbers, Gaussian]:
         """Odometry's edge to a keyframe, the motion that the landmarks show instead, and next to no trust in it."""
-        link, c = self._slips.active(self._search.link(first)), self._odometry
+        link, c = self._slips.active(self._search.chain.edge(first)), self._odometry
         before = self._estimate(self._backend.graph.edge(link).vertices[0])
         motion = tuple(map(float, self._space.group.between(before, there)))
         return link, motion, Gaussian.from_sigmas(*self._space.sigmas(c.jump_sigma_m, c.jump_sigma_rad))
 
     def _motions(self, found: DisplacementHypothesis) -> dict[int, Numbers]:
-        """Return how each keyframe from the first displaced one on is moved in map, by its vertex."""
-        group, motions = self._space.group, dict[int, Numbers]()
-        for vertex in self._search.chained(found.first):
-            there = group.compose(found.T_map_chain, self._search.chain(vertex))
-            motions[vertex] = group.compose(there, group.inverse(self._estimate(vertex)))
-        return motions
+        """Return how each keyframe from the first displaced one on is moved in map, by its vertex.
 
-    def _moved(self, motions: dict[int, Numbers]) -> Array:
-        """The stored numbers of all vertices, with each from the first of these on moved as the last of these before.
-
-        The robot is moved, and what it saw first since then with it.
+        Those before the oldest sighting that was compared stay as they are to it, which landmarks may have measured.
         """
-        graph, space = self._backend.graph, self._space
-        values, newest = self._backend.solver.values, min(motions)
-        for vertex in range(newest, graph.vertex_count):
-            newest = vertex if vertex in motions else newest
-            one = graph.vertex(vertex)
-            numbers = tuple(values[one.stored].tolist())
-            if one.kind is space.pose:
-                values[one.stored] = space.group.compose(motions[newest], numbers)
-            elif one.kind is space.point:
-                values[one.stored] = space.group.act(motions[newest], numbers)
-        return values
+        group, chain, motions = self._space.group, self._search.chain, dict[int, Numbers]()
+        vertices = chain.vertices[chain.vertices >= found.first].tolist()
+        oldest = next(vertex for vertex in vertices if vertex >= found.seen_from)
+        for vertex in vertices:
+            at = max(vertex, oldest)
+            there = group.compose(found.T_map_chain, chain.pose(at))
+            motions[vertex] = group.compose(there, group.inverse(self._estimate(at)))
+        return motions

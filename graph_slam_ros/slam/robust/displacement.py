@@ -7,7 +7,7 @@ evidence is a count: held-back sightings that fit the other pose, minus believed
 
 from bisect import insort
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import combinations
@@ -21,8 +21,10 @@ from graph_slam_ros.graph import Graph
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.lie import se2
 from graph_slam_ros.slam.landmarks.rigid_alignment import aligned, are_spread
+from graph_slam_ros.slam.robust.connections import Connections, connections_across
 from graph_slam_ros.slam.robust.landmark_history import LandmarkHistory
 from graph_slam_ros.slam.robust.ledger import Ledger
+from graph_slam_ros.slam.robust.odometry_chain import OdometryChain
 from graph_slam_ros.slam.robust.seen_point import seen_heading, seen_point, seen_variance
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Index, Numbers
@@ -46,6 +48,7 @@ class DisplacementHypothesis:
     Attributes
     ----------
     first : the keyframe's vertex from which on the robot is there
+    seen_from : that of the oldest sighting that was compared; from ``first`` to there landmarks tell nothing
     T_map_chain : where the evidence's own frame of odometry lies then in map
     evidence : sightings that are held back and fit it, minus those that are believed and do not
     landmarks, keyframes : how many are in agreement
@@ -55,6 +58,7 @@ class DisplacementHypothesis:
     """
 
     first: int
+    seen_from: int
     T_map_chain: Numbers
     evidence: int
     landmarks: int
@@ -111,20 +115,16 @@ class DisplacementSearch:
 
     Attributes
     ----------
-    keeps_from : the keyframe, by its vertex, from which on odometry is remembered, however much was seen since
+    chain : the newest keyframes by odometry alone
     """
 
     def __init__(self, space: Geometry, graph: Graph, solver: Solver, ledger: Ledger, history: LandmarkHistory) -> None:
         self._space, self._history = space, history
         self._graph, self._solver, self._ledger = graph, solver, ledger
         self._seen: deque[_Seen] = deque()  # in order of keyframes; they may come in another
-        self._chain: dict[int, Numbers] = {}  # of each keyframe since the segment began
-        self._stamps_ns: dict[int, int] = {}
-        self._drift: dict[int, Array] = {}
-        self._links: dict[int, int] = {}  # odometry's edge to each of them
+        self.chain = OdometryChain(space, graph)
         self._poses: dict[int, list[int]] = {}  # edges of initial poses, by their keyframe
         self._first = 0  # vertex of the segment's first keyframe
-        self.keeps_from: int | None = None
         self._is_supported = False  # whether a sighting of a landmark that was known is believed since then
 
     # -- what came -----------------------------------------------------------------------------------------------
@@ -134,30 +134,7 @@ class DisplacementSearch:
         self._first, self._is_supported = vertex, False
         while self._seen and self._seen[0].keyframe < vertex:
             self._seen.popleft()
-        self._forget_before(vertex)
-
-    def add_odometry(self, edge: int, vertices: Sequence[int], T_last_now: Numbers, stamp_ns: int) -> None:
-        """The motion from one keyframe to the next, whose stamp it is."""
-        self._links[vertices[1]] = edge
-        if vertices[1] not in self._chain:
-            before = self._chain.get(vertices[0], self._space.identity)
-            self._chain[vertices[1]] = tuple(map(float, self._space.group.compose(before, T_last_now)))
-            self._drift[vertices[1]] = self._drift.get(vertices[0], np.zeros(2)) + self._drift_of(edge)
-            self._stamps_ns[vertices[1]] = stamp_ns
-        if len(self._seen) == WINDOW:
-            oldest = self._seen[0].keyframe
-            self._forget_before(oldest if self.keeps_from is None else min(oldest, self.keeps_from))
-
-    def _forget_before(self, keyframe: int) -> None:
-        """Only what is compared is kept."""
-        while self._chain and (oldest := next(iter(self._chain))) < keyframe:
-            del self._chain[oldest], self._stamps_ns[oldest], self._drift[oldest], self._links[oldest]
-
-    def _drift_of(self, edge: int) -> Array:
-        """Variances [m^2, rad^2] of one step of odometry, the largest of any direction."""
-        root, n = self._graph.edge(edge).sqrt_information, self._space.dimensions
-        variances = np.linalg.inv(root.T @ root).diagonal()
-        return np.array([variances[:n].max(), variances[n:].max()])
+        self.chain.forget_before(vertex)
 
     def add_initial_pose(self, edge: int, keyframe: int) -> None:
         """A pose that was given at a keyframe."""
@@ -165,14 +142,14 @@ class DisplacementSearch:
 
     def add_sighting(self, edge: int, keyframe: int, landmark: int) -> None:
         """A sighting of a landmark; of use is one that tells a position."""
-        base, one = self._chain.get(keyframe), self._graph.edge(edge)
+        one, n = self._graph.edge(edge), self._space.dimensions
         point = seen_point(self._space, one)
-        if base is None or point is None or keyframe < self._first:
+        if keyframe not in self.chain or point is None or keyframe < self._first:
             return
-        n = self._space.dimensions
+        base = self.chain.pose(keyframe)
         in_chain = np.array(self._space.group.act(base, tuple(point.tolist())))
-        stamp_ns, variance = self._stamps_ns[keyframe], seen_variance(self._space, one, point)
-        drift, heading = self._drift[keyframe], seen_heading(self._space, one, base)
+        stamp_ns, variance = self.chain.stamp_ns(keyframe), seen_variance(self._space, one, point)
+        drift, heading = self.chain.drift(keyframe), seen_heading(self._space, one, base)
         seen = _Seen(edge, keyframe, landmark, stamp_ns, in_chain, np.array(base[:n]), variance, drift, *heading)
         insort(self._seen, seen, key=lambda other: other.keyframe)
         if len(self._seen) > WINDOW:
@@ -194,10 +171,10 @@ class DisplacementSearch:
         window = self._window()
         if window is None:
             return None
-        found = list[tuple[DisplacementHypothesis, Flags]]()
+        found, earlier = list[tuple[DisplacementHypothesis, Flags]](), self._earlier(window)
         for motion, at in self._motions(window):
             fits = self._fits(window, motion, at)
-            one = self._evidence(window, fits, motion)
+            one = self._evidence(window, fits, motion, earlier)
             found += [(one, fits & ~window.is_in)] if one else []
         if not found:
             return None
@@ -209,6 +186,17 @@ class DisplacementSearch:
             if self.are_apart(best.T_map_chain, one.T_map_chain, newest)
         ]
         return replace(best, rival=int(max(rivals, default=0)))
+
+    def _earlier(self, window: _Window) -> Connections | None:
+        """The accepted edges that connect across the keyframes before the window.
+
+        None where the window has all that was seen since the segment began.
+        """
+        vertices = self.chain.vertices
+        vertices = vertices[(vertices > self._first) & (vertices < window.keyframes[0])]
+        if len(self._seen) < WINDOW or not len(vertices):
+            return None
+        return connections_across(self._graph, self._solver.held, vertices, int(window.keyframes[0]))
 
     def _standing(self) -> list[_Seen]:
         is_standing = self._ledger.is_standing()
@@ -240,7 +228,7 @@ class DisplacementSearch:
         )
 
     def _fits_now(self, one: _Seen, place: Array) -> bool:
-        group, chain = self._space.group, self._chain[one.keyframe]
+        group, chain = self._space.group, self.chain.pose(one.keyframe)
         now = tuple(self._solver.estimate([one.keyframe])[0].tolist())
         point = group.act(group.compose(now, group.inverse(chain)), tuple(one.point.tolist()))
         allowed = quantile(_FIT, self._space.dimensions) * (one.variance + _MAP_SIGMA_M**2)
@@ -295,25 +283,42 @@ class DisplacementSearch:
     def _known_from(self, landmark: int) -> int:
         return self._history.known_from(landmark, min(one.edge for one in self._seen))
 
-    def _evidence(self, window: _Window, fits: Flags, motion: tuple[Array, Array]) -> DisplacementHypothesis | None:
-        """The evidence from the keyframe on that has most: landmarks that are newer than it tell nothing."""
+    def _evidence(
+        self, window: _Window, fits: Flags, motion: tuple[Array, Array], earlier: Connections | None
+    ) -> DisplacementHypothesis | None:
+        """The evidence from the keyframe on that has most: landmarks that are newer than it tell nothing.
+
+        One before the window may be the first, too.
+        """
         for_it, against = fits & ~window.is_in & ~window.fits_now, ~fits & window.is_in
-        starts = np.flatnonzero(np.diff(window.keyframes, prepend=-1) != 0)
-        known = window.supports[None, :] < window.keyframes[starts][:, None]
-        since = window.keyframes[None, :] >= window.keyframes[starts][:, None]
-        counted = (known & since) @ (for_it.astype(int) - against.astype(int))
-        best = len(starts) - 1 - int(np.argmax(counted[::-1]))
+        firsts = window.keyframes[np.flatnonzero(np.diff(window.keyframes, prepend=-1) != 0)]
+        connecting = explained = 0
+        if earlier is not None:
+            of, which = np.unique(window.landmarks, return_inverse=True)
+            fitting = of[np.bincount(which, weights=fits) > np.bincount(which, weights=against)]
+            before, connecting, explained = earlier.likeliest(fitting)
+            firsts = np.r_[before, firsts]
+        known = window.supports[None, :] < firsts[:, None]
+        since = window.keyframes[None, :] >= firsts[:, None]
+        contradicted = (known & since) @ against.astype(int)
+        if earlier is not None:
+            contradicted[0] = connecting
+        counted = (known & since) @ for_it.astype(int) - contradicted
+        is_earlier = earlier is not None and counted[0] > 0 and counted[0] + explained > counted.max()
+        best = 0 if is_earlier else len(firsts) - 1 - int(np.argmax(counted[::-1]))
         if counted[best] <= 0:
             return None
-        first = int(window.keyframes[starts[best]])
+        first = int(firsts[best])
         is_all = len(self._seen) < WINDOW
         if not self._is_supported or (is_all and not window.is_in[window.keyframes < first].any()):
             first = self._first  # nothing supports what came before in this segment
         else:
             first = self._after_the_longest_link(first)
-        agreeing, both = since[best] & known[best] & for_it, since[best] & known[best]
+        both = since[best] & known[best]
+        agreeing = both & (fits if is_earlier else for_it)  # the first that is seen again may fit both poses
         return DisplacementHypothesis(
             first,
+            max(first, int(window.keyframes[0])),
             self._pose(motion),
             int(counted[best]),
             len(set(window.landmarks[agreeing].tolist())),
@@ -329,13 +334,13 @@ class DisplacementSearch:
         Nothing tells in which of these links the robot was moved: most probably in the one that took longest.
         """
         seen = {one.keyframe for one in self._seen}
-        vertices = list(self._chain)
-        k = vertices.index(first)
-        stamps_ns, best = self._stamps_ns, k
+        vertices = self.chain.vertices.tolist()
+        stamp_ns = self.chain.stamp_ns
+        best = k = vertices.index(first)
         while k > 1 and vertices[k - 1] not in seen and not self._is_measured(vertices[k - 1]):
             k -= 1
-            longest_ns = stamps_ns[vertices[best]] - stamps_ns[vertices[best - 1]]
-            if stamps_ns[vertices[k]] - stamps_ns[vertices[k - 1]] > longest_ns:
+            longest_ns = stamp_ns(vertices[best]) - stamp_ns(vertices[best - 1])
+            if stamp_ns(vertices[k]) - stamp_ns(vertices[k - 1]) > longest_ns:
                 best = k
         return vertices[best]
 
@@ -352,13 +357,9 @@ class DisplacementSearch:
 
     # -- for whoever acts on it ----------------------------------------------------------------------------------
 
-    def chain(self, keyframe: int) -> Numbers:
-        """Return where the evidence's own frame of odometry has a keyframe, by its vertex."""
-        return self._chain[keyframe]
-
     def difference(self, T_map_chain: Numbers, other: Numbers, keyframe: int) -> tuple[float, float]:
         """Distance [m] and angle [rad] of a keyframe, by its vertex, by two places of the evidence's own frame."""
-        group, chain = self._space.group, self._chain[keyframe]
+        group, chain = self._space.group, self.chain.pose(keyframe)
         difference = group.between(group.compose(T_map_chain, chain), group.compose(other, chain))
         return float(np.linalg.norm(difference[: self._space.dimensions])), float(self._space.angle(difference))
 
@@ -367,29 +368,17 @@ class DisplacementSearch:
         far_m, turned_rad = self.difference(T_map_chain, other, keyframe)
         return far_m > SAME_M or turned_rad > SAME_RAD
 
-    def drift_of(self, keyframe: int) -> Array:
-        """Variances [m^2, rad^2] of odometry since the evidence's own frame began."""
-        return self._drift[keyframe]
-
     def drift(self, variances: Array, chain: Numbers, keyframe: int) -> tuple[float, float]:
         """Sigmas [m, rad] of odometry up to a keyframe, since there were these variances and it was there."""
-        since, n = self._drift[keyframe] - variances, self._space.dimensions
-        lever = float(np.linalg.norm(np.subtract(self._chain[keyframe][:n], chain[:n])))
+        since, n = self.chain.drift(keyframe) - variances, self._space.dimensions
+        lever = float(np.linalg.norm(np.subtract(self.chain.pose(keyframe)[:n], chain[:n])))
         return float(np.sqrt(since[0] + since[1] * lever**2)), float(np.sqrt(since[1]))
 
     def begun_at(self, found: DisplacementHypothesis, first: int | None) -> DisplacementHypothesis:
         """Return a hypothesis that begins at an earlier keyframe, by its vertex, if odometry since is remembered."""
-        if first is None or first >= found.first or not self._chain:
+        if first is None or first >= found.first or not self.chain:
             return found
-        return replace(found, first=max(first, self._first, next(iter(self._chain))))
-
-    def chained(self, first: int) -> list[int]:
-        """Vertices of the keyframes from one on, in order."""
-        return [vertex for vertex in self._chain if vertex >= first]
-
-    def link(self, keyframe: int) -> int:
-        """The edge of odometry to a keyframe."""
-        return self._links[keyframe]
+        return replace(found, first=max(first, self._first, int(self.chain.vertices[0])))
 
     def initial_poses(self, first: int) -> list[int]:
         """Edges of initial poses from a keyframe on."""

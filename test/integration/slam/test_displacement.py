@@ -103,6 +103,20 @@ def test_G23_a_robot_that_was_carried_is_found_and_the_path_before_stays(recordi
     assert slam.ledger.verdict_of(out[0]) is Verdict.REJECTED
 
 
+@pytest.mark.parametrize("seed", times([3], [3, 5]))
+def test_G23_a_robot_that_was_carried_to_new_ground_is_found_where_it_was_carried(seed):
+    """Landmarks were begun at wrong places before it sees known ground again: they move with it."""
+    recording = simulate("manhattan", seed=seed)
+    faulty, event_ns = carried(recording, at=0.3, metres=25.0)
+    slam = Driven(faulty, event_ns).slam
+    assert (slam.counters[DISPLACED], slam.counters["odometry", "displacement_taken_back"]) == (1, 0)
+    (_, segment) = slam.segments
+    begin_ns = int(slam.keyframes.stamps_ns[segment])
+    assert abs(begin_ns - event_ns) < 2 * 10**9
+    clean = errors(Driven(recording, 0).slam, recording)
+    assert errors(slam, faulty).max() < 1.5 * clean.max()
+
+
 def test_G23_slipping_wheels_are_found_and_the_path_before_stays(recording):
     fault = Fault.named("slip", at=0.7, lasting=0.14, factor=1.5)
     faulty, _ = faulty_recording(recording, [fault], seed=1)

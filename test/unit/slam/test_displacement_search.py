@@ -27,7 +27,7 @@ def test_a_sighting_of_an_older_keyframe_that_comes_late_is_compared_with_the_ot
             poses.append(graph.add_vertex(PLANAR.pose, (0.5 * len(poses), 0.0, 0.0)))
             if len(poses) > 1:
                 edge = graph.add_edge(PLANAR.relative_pose, poses[-2:], STEP, NOISE[3], "odometry")
-                search.add_odometry(edge, poses[-2:], STEP, len(poses) * 10**9)
+                search.chain.add(edge, poses[-2:], STEP, len(poses) * 10**9)
 
     def see(keyframe, landmark):
         away = np.subtract((3.0 * landmark, 2.0), (0.5 * keyframe, 0.0))
