@@ -9,7 +9,8 @@ The record ``condensed`` of a ``growth`` (``map_journal``) has
 * ``skeleton``: position, axis and sign of each keyframe of a visit that is in no place which has stayed;
 * ``attached``: the number of the first keyframe that has left and at which closures can begin; null if there is none;
 * ``left``: how many keyframes, poses at which something was seen, and frames have left the map;
-* ``accepted``: of each drive, by its first keyframe, how many accepted measurements of each input have left the map.
+* ``accepted``: of each drive, by its first keyframe, how many accepted measurements of each input have left the map;
+* ``made``: the lasting ids of the closures that condensing has made of others.
 
 What has left is in ``condensed.mcap``, a record ``left`` each time: the number of its first keyframe, how many poses
 had left before, and the rows of ``slam.lifelong.removed.record_type`` and of ``slam.lifelong.frames`` in base64; there
@@ -76,6 +77,7 @@ def condensed_record(graph: Graph, first: int, state: BoundedState) -> Record:
         "left": left,
         "scale": astuple(state.scale),
         "accepted": [[first, dict(of)] for first, of in state.accepted.items()],
+        "made": sorted(state.made),
         "skeleton": list(state.skeleton.rows()),
         "attached": state.attached.first if state.attached.first < state.attached.end == state.keyframes else None,
     }
@@ -98,6 +100,7 @@ def read_condensed(graph: Graph, record: Mapping[str, Any]) -> tuple[int, Bounde
     keyframes, sightings, *frames = record["left"]
     state = BoundedState(keyframes=keyframes, sightings=sightings, frames=frames[0] if frames else 0)
     state.accepted |= {first: Counter(of) for first, of in record.get("accepted", ())}  # an older map has none
+    state.made = set(record.get("made", ()))  # nor these
     rows = record.get("skeleton", ())
     state.skeleton.restore(rows, len(rows[0]) - 2 if rows else 0)
     first = record.get("attached")

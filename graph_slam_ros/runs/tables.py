@@ -152,8 +152,7 @@ def account(slam: GraphSlam, counters: Counters) -> dict[str, Any]:
     used_as = odometries | recorded_uses(slam.config)
     is_of_map = not slam.counters.used  # nothing was measured since: a run that is written from its map
     newest_drive = 0 if is_of_map or not slam.drives else slam.drives[-1]
-    begins = slam.keyframes[newest_drive].vertex if newest_drive > slam.first_keyframe else 0
-    accepted = _accepted_by_input(slam, begins)
+    accepted = _accepted_by_input(slam, newest_drive)
     for drive, condensed in (slam.bounded.accepted if slam.bounded else {}).items():
         if drive >= newest_drive:
             accepted.update(condensed)
@@ -161,10 +160,7 @@ def account(slam: GraphSlam, counters: Counters) -> dict[str, Any]:
     for name in dict.fromkeys([*slam.config.inputs.names.split(), *counters.used, *accepted]):
         if name in counters.received or counters.used[name] or name in accepted:
             used = max(counters.used[name], accepted.get(name, 0) if is_of_map else 0)
-            count = accepted.get(name)
-            if count is not None and slam.bounded:  # closures that condensing has composed are counted, too
-                count = min(count, used)
-            of_input = {"received": counters.received.get(name), "used": used, "believed": count}
+            of_input = {"received": counters.received.get(name), "used": used, "believed": accepted.get(name)}
             inputs[name] = {"use": used_as.get(name, "")} | of_input
     return {"counters": counters.as_dict(), "inputs": inputs}
 
@@ -201,17 +197,17 @@ def _times(value: Any) -> int:
 
 
 def _accepted_by_input(slam: GraphSlam, first: int) -> Counter[str]:
-    """Accepted edges of landmarks, fixes and closures by input, from the keyframe of a vertex on."""
+    """Accepted edges of landmarks, fixes and closures by input that were judged first at a keyframe or later."""
     out = Counter[str]()
     inside = [Verdict.NOT_EVALUATED, *INSIDE]
-    verdicts = slam.ledger.verdict.values
+    verdicts, keyframes = slam.ledger.verdict.values, slam.ledger.keyframe.values
+    made = list(slam.bounded.made) if slam.bounded else []
     for table in slam.graph.tables.values():
         labels = np.array([label in CANDIDATES for label in slam.graph.labels], dtype=bool)
         ids = table.id.values
-        first_end, *_ = table.vertices.values.T
-        chosen = labels[table.label.values] & (first_end >= first)  # measured from there
+        chosen = labels[table.label.values] & ~np.isin(slam.graph.edge_ids.of_all(ids), made)
         judged = chosen & (ids < len(verdicts))
-        chosen[judged] = np.isin(verdicts[ids[judged]], inside)
+        chosen[judged] = np.isin(verdicts[ids[judged]], inside) & (keyframes[ids[judged]] >= first)
         for code, count in zip(*np.unique(table.at(np.flatnonzero(chosen)).source, return_counts=True), strict=True):
             out[slam.graph.sources[code]] += int(count)
     return out

@@ -160,6 +160,9 @@ class BoundedMap:
             self.state.skeleton = self.condenser.skeleton = skeleton
             _restart(backend.solver, vertices, values)
             return None
+        added = np.arange(graph.edge_count, backend.graph.edge_count)
+        closures = added[backend.graph.has_label(added, (CLOSURES,))]
+        self.state.made.update(backend.graph.edge_ids.of_all(closures).tolist())
         return self._compacted(rows, Left(left, self._sightings(end), frames, attached), end) if rows else None
 
     # -- visits ------------------------------------------------------------------------------------------------------
@@ -317,12 +320,13 @@ class BoundedMap:
         return out
 
     def _note_accepted(self, edges: Sequence[CondensedEdge]) -> None:
-        """Count the accepted measurements among edges that leave."""
-        drives = self._frontend.path.drives
+        """Count the accepted measurements among edges that leave; a closure that was made of others is none."""
+        drives, made = self._frontend.path.drives, self.state.made
         for one in edges:
-            if one.became == CONDENSED and one.label in CANDIDATES:
+            if one.became == CONDENSED and one.label in CANDIDATES and one.edge not in made:
                 drive = drives[max(bisect_right(drives, one.keyframe) - 1, 0)]
                 self.state.accepted.setdefault(drive, Counter())[one.source] += 1
+        made.difference_update(one.edge for one in edges)
 
     def _staying(self, window: int) -> tuple[Index, Index]:
         """The vertices and edges that stay; ``window`` is the first keyframe of the window, by its vertex.

@@ -1,10 +1,14 @@
 """Closures and fixes of keyframes that were condensed are carried to the bases of places, and can be doubted still."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from benchmarks.hall import STEP_S, config, hall, measurements, rms
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
+from graph_slam_ros.runs.condensed_map import condensed_record, read_condensed
+from graph_slam_ros.runs.tables import account
 from graph_slam_ros.runs.whole_path import removed_path
 from graph_slam_ros.slam import Closure, Control, Fix, GraphSlam, Odometry
 from graph_slam_ros.slam.lifelong.carried import carried_closure, fused_closure, inverse
@@ -125,6 +129,26 @@ def test_a_false_closure_that_was_condensed_is_outvoted_as_a_whole():
     assert int(reason)
     for one, other in zip(errors(world, slam, parts), errors(world, *clean), strict=True):
         assert one < 1.2 * other
+
+
+def test_a_closure_that_was_condensed_counts_once_and_a_false_one_never():
+    """Closures are carried again and again, and made into one; those that were rejected leave with their drive."""
+    world, inputs = hall(1, KEYFRAMES), {"inputs_names": "odom marks loops", "loops_use": "closure"}
+
+    def some_false(world):
+        for k, m in enumerate(with_closures(world)):
+            is_false = isinstance(m, Closure) and k % 5 == 0
+            yield replace(m, T_from_base=(m.T_from_base[0] + 9.0, *m.T_from_base[1:])) if is_false else m
+
+    settings = inputs | {"loops_topic": "/loops"}
+    whole, _ = driven(world, some_false, **settings)
+    small, _ = driven(world, some_false, map_condense=True, map_window_keyframes=WINDOW, **settings)
+    counts, wanted = (account(one, one.counters)["inputs"]["loops"] for one in (small, whole))
+    assert 0 < wanted["believed"] < wanted["used"] - 5
+    assert counts == wanted
+    assert small.bounded.made
+    again = read_condensed(small.graph.copy(), condensed_record(small.graph, small.first_keyframe, small.bounded))[1]
+    assert again.made == small.bounded.made
 
 
 @pytest.mark.parametrize("space", SPACES)
