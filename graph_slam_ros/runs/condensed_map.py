@@ -10,6 +10,7 @@ The record ``condensed`` of a ``growth`` (``map_journal``) has
 * ``attached``: the number of the first keyframe that has left and at which closures can begin; null if there is none;
 * ``left``: how many keyframes, poses at which something was seen, and frames have left the map;
 * ``accepted``: of each drive, by its first keyframe, how many accepted measurements of each input have left the map;
+* ``begins``: of each drive whose first keyframe has left, that and the number of poses of sightings before it;
 * ``made``: the lasting ids of the closures that condensing has made of others.
 
 What has left is in ``condensed.mcap``, a record ``left`` each time: the number of its first keyframe, how many poses
@@ -77,6 +78,7 @@ def condensed_record(graph: Graph, first: int, state: BoundedState) -> Record:
         "left": left,
         "scale": astuple(state.scale),
         "accepted": [[first, dict(of)] for first, of in state.accepted.items()],
+        "begins": list(state.begins.items()),
         "made": sorted(state.made),
         "skeleton": list(state.skeleton.rows()),
         "attached": state.attached.first if state.attached.first < state.attached.end == state.keyframes else None,
@@ -100,7 +102,8 @@ def read_condensed(graph: Graph, record: Mapping[str, Any]) -> tuple[int, Bounde
     keyframes, sightings, *frames = record["left"]
     state = BoundedState(keyframes=keyframes, sightings=sightings, frames=frames[0] if frames else 0)
     state.accepted |= {first: Counter(of) for first, of in record.get("accepted", ())}  # an older map has none
-    state.made = set(record.get("made", ()))  # nor these
+    state.begins |= dict(record.get("begins", ()))  # nor these
+    state.made = set(record.get("made", ()))
     rows = record.get("skeleton", ())
     state.skeleton.restore(rows, len(rows[0]) - 2 if rows else 0)
     first = record.get("attached")

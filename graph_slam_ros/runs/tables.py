@@ -22,6 +22,7 @@ from graph_slam_ros.slam import Counters, GraphSlam
 from graph_slam_ros.slam.calibration.decision import SIGMAS
 from graph_slam_ros.slam.calibration.parameters import QUANTITIES
 from graph_slam_ros.slam.lifelong.removed import Left, seen_from
+from graph_slam_ros.slam.lifelong.state import BoundedState
 from graph_slam_ros.slam.robust.gating import CANDIDATES
 from graph_slam_ros.slam.robust.ledger import INSIDE, Verdict
 
@@ -216,13 +217,11 @@ def _accepted_by_input(slam: GraphSlam, first: int) -> Counter[str]:
 def _drives(slam: GraphSlam) -> list[dict[str, int]]:
     """Return the first row of each drive in ``path.tum`` and in ``sightings.tum``, from 0.
 
-    That in ``sightings.tum`` is 0 for a later drive whose first keyframes are condensed: it is not known any more.
+    That in ``sightings.tum`` is 0 for a later drive whose first keyframes an older version has condensed.
     """
-    of, before = slam.sighting_poses.ids, slam.bounded.sightings if slam.bounded else 0
-    return [
-        {"keyframe": first, "sighting": before + int(np.sum(of < first)) if first >= slam.first_keyframe else 0}
-        for first in slam.drives
-    ]
+    of, state = slam.sighting_poses.ids, slam.bounded or BoundedState()
+    rows = {first: state.sightings + int(np.sum(of < first)) for first in slam.drives if first >= slam.first_keyframe}
+    return [{"keyframe": first, "sighting": rows.get(first, state.begins.get(first, 0))} for first in slam.drives]
 
 
 def numbered(slam: GraphSlam) -> tuple[list[int], str]:

@@ -309,6 +309,9 @@ class BoundedMap:
             OldKeyframe(one.number, int(new.vertices[one.vertex]), one.stamp_ns, one.T_odom_base)
             for one in self.state.old
         ]
+        for drive in self._frontend.path.drives:
+            if out.first <= drive < end:
+                self.state.begins[drive] = before + int(np.sum(left.sightings["of"] < drive))
         self.state.keyframes, self.state.sightings = end, before + len(left.sightings)
         self.state.frames += len(left.frames)
         self._note_accepted(out.edges)

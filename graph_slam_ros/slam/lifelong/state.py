@@ -24,6 +24,7 @@ class BoundedState:
     attached : the keyframes that have left the map, where closures may begin at them
     keyframes, sightings, frames : how many have left the map
     accepted : of each drive, by its first keyframe, how many accepted measurements of each input have left the map
+    begins : of each drive, by its first keyframe, if that has left: how many poses of sightings are before it
     made : lasting ids of the closures in the graph that condensing has made of others: they are no measurements
     """
 
@@ -36,4 +37,5 @@ class BoundedState:
     sightings: int = 0
     frames: int = 0
     accepted: dict[int, Counter[str]] = field(default_factory=dict)
+    begins: dict[int, int] = field(default_factory=dict)
     made: set[int] = field(default_factory=set)

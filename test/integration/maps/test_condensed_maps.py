@@ -23,7 +23,7 @@ from graph_slam_ros.measurements.edits import edit_of
 from graph_slam_ros.report.contents import read_contents
 from graph_slam_ros.runs import outcome
 from graph_slam_ros.runs.condensed_map import condensed_record, read_condensed
-from graph_slam_ros.runs.folder import run_config
+from graph_slam_ros.runs.folder import run_config, summary_of
 from graph_slam_ros.runs.journal import read_measurements
 from graph_slam_ros.runs.map_journal import read_map
 from graph_slam_ros.runs.restore import freeze, map_of, record_run, recover
@@ -265,6 +265,9 @@ def test_a_drive_in_a_frozen_map_is_condensed_and_the_map_stays(two, tmp_path, n
     assert set(after.graph.edges_of(PLACES).tolist()) == counting, "a place that another took over is gone"
     recover(tmp_path / "on", tmp_path / "recovered")
     assert "nan" not in (tmp_path / "recovered" / "covariances.csv").read_text().splitlines()[-1]
+    of_map = len(read_tum(tmp_path / "site" / "sightings.tum").stamps_s)
+    for run in ("on", "recovered"):  # the begin of the drive is condensed
+        assert summary_of(tmp_path / run)["drives"][1] == {"keyframe": 600, "sighting": of_map}
     again, _ = record_run(
         tmp_path / "again",
         config(PLANAR, **settings),
