@@ -249,5 +249,5 @@ class SavedGraph:
 
 def _accepted(graph: Graph, row: int, entry: Entry) -> int:
     """Add a rejected edge again, as one that is never rejected."""
-    noise = Gaussian.from_information(entry.information_matrix)
-    return graph.add_edge(graph.edge(row).type, entry.vertices, entry.measured, noise, _ACCEPTED)
+    edge = graph.edge(row)
+    return graph.add_edge(edge.type, entry.vertices, entry.measured, Gaussian(edge.sqrt_information), _ACCEPTED)

@@ -11,6 +11,7 @@ files without vertex lines.
 import itertools
 import re
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -230,28 +231,16 @@ class _Reader:
         information = _symmetric(np.array([e.information for e in edges]), edge_type.residual_size)
         if edge_type in HALVED and not self.text.raw:
             information *= np.outer(HALVED[edge_type], HALVED[edge_type])
-        good = list(range(len(edges)))
-        kinds = edge_type.accepts
+        good, kinds = list(range(len(edges))), edge_type.accepts
         lengths = edge_type.residual_size - (0 if kinds[-1][0] not in (SE2, SE3) else 1 if SE2 in kinds[-1] else 3)
         try:
             noise = Gaussian.from_information(information)
         except NoiseError:
-            good = []
-            for k, edge in enumerate(edges):
-                try:
-                    Gaussian.from_information(information[k])
-                    good.append(k)
-                except NoiseError as error:
-                    weighted = by_traces(information[k], lengths)
-                    if weighted is not None:
-                        information[k] = weighted
-                        self.repaired.append(edge.line)
-                        good.append(k)
-                        continue
-                    self.refuse(edge.line, str(error).replace("information 0", "information", 1))
+            roots = [self._root(edge, information[k], lengths, len(kinds) == 1) for k, edge in enumerate(edges)]
+            good = [k for k, root in enumerate(roots) if root is not None]
             if not good:
                 return {}
-            noise = Gaussian.from_information(information[good])
+            noise = Gaussian(np.stack([root for root in roots if root is not None]))
         edges = [edges[k] for k in good]
         measured = np.array([edge.measured for edge in edges])
         if edge_type is LANDMARK_POSITION_3D:
@@ -260,6 +249,24 @@ class _Reader:
         ids = graph.add_edges(edge_type, [[at[v] for v in edge.vertices] for edge in edges], measured, noise, label)
         seen_from = zip(ids.tolist(), edges, strict=True)
         return {edge_id: edge.offset for edge_id, edge in seen_from if edge.offset is not None}
+
+    def _root(self, edge: _Edge, information: Array, lengths: int, is_prior: bool) -> Array | None:
+        """The root of one information matrix, repaired where print has rounded it; None if the edge is left out.
+
+        A prior may say nothing in some directions, as a sum of fixes does.
+        """
+        try:
+            return Gaussian.from_information(information).sqrt_information
+        except NoiseError as error:
+            if is_prior:
+                with suppress(NoiseError):
+                    return Gaussian.from_semidefinite(information).sqrt_information
+            weighted = by_traces(information, lengths)
+            if weighted is None:
+                self.refuse(edge.line, str(error).replace("information 0", "information", 1))
+                return None
+        self.repaired.append(edge.line)
+        return Gaussian.from_information(weighted).sqrt_information
 
 
 def read_g2o(

@@ -10,6 +10,7 @@ from graph_slam_ros.typing import Array
 
 _ASYMMETRY = 1e-6  # of the largest entry; text files carry 6 digits
 _LEAST_EIGENVALUE = 16.0 * float(np.finfo(float).eps)  # of the correlations; that of a singular matrix is rounding
+_ZERO = 1e-12  # eigenvalues of the correlations of what may be singular that are rounding
 _SURELY_REGULAR = 1e-6  # root of the determinant of the correlations, which is at most e times their least eigenvalue
 
 _LONG = 120  # characters of a matrix in a message
@@ -30,6 +31,17 @@ class Gaussian:
     def from_information(cls, information: ArrayLike) -> "Gaussian":
         """Make it from Omega, (m, m) or (n, m, m). Raises NoiseError naming the first matrix that is not SPD."""
         return cls(np.swapaxes(_cholesky(information, "information"), -1, -2))
+
+    @classmethod
+    def from_semidefinite(cls, information: Array) -> "Gaussian":
+        """Make it from Omega, (m, m), which may be singular. Raises NoiseError if it is not positive semidefinite."""
+        scale = np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
+        if not np.isfinite(information).all():
+            raise NoiseError(_fault(information[None], "information"))
+        size, axes = np.linalg.eigh(information / scale[:, None] / scale)
+        if size[0] < -_ZERO or size[-1] < _ZERO:
+            raise NoiseError(_fault(information[None], "information"))
+        return cls(np.where(size > _ZERO, np.sqrt(np.maximum(size, 0.0)), 0.0)[:, None] * axes.T * scale)
 
     @classmethod
     def from_covariance(cls, covariance: ArrayLike) -> "Gaussian":

@@ -271,6 +271,21 @@ def test_an_unknown_error_map_is_refused_with_the_choices(read):
         read(FINE, error_map="other")
 
 
+@pytest.mark.parametrize("upper", ["4 0 0 4 0 0", "4 2 2 1 1 1", "4 0 0 0 0 0"])
+def test_a_prior_may_say_nothing_in_some_directions(tmp_path, upper):
+    path = tmp_path / "prior.g2o"
+    path.write_text(f"VERTEX_SE2 0 0 0 0\nEDGE_PRIOR_SE2 0 1 2 0 {upper}\n")
+    file = read_g2o(path)
+    (table,) = file.graph.tables.values()
+    root, numbers = table.sqrt_information.values[0], [float(word) for word in upper.split()]
+    assert (root.T @ root)[np.triu_indices(3)] == pytest.approx(numbers, abs=1e-12)
+    assert not file.notes
+    for none in ("0 0 0 0 0 0", "4 0 0 4 0 -1", "4 5 0 4 0 0"):
+        path.write_text(f"VERTEX_SE2 0 0 0 0\nEDGE_PRIOR_SE2 0 1 2 0 {none}\n")
+        with pytest.raises(FormatError, match="is not positive definite"):
+            read_g2o(path)
+
+
 @pytest.mark.parametrize(
     "tag, measured, printed, expected",
     [
