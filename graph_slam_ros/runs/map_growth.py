@@ -110,6 +110,7 @@ def _set(state: MapSnapshot, record: Growth) -> None:
         name, bias, variance, stamp_ns = record["gyro"]
         state.gyro_bias = SavedBias(name, tuple(bias), tuple(variance), stamp_ns)
     state.settings.update(record.get("settings", {}))
+    state.displacements = record.get("displacements", state.displacements)
     state.processed = _count(record.get("processed"))
     state.used_ns, state.source = record.get("used", (None, ""))
     for name in ("frozen", "held"):

@@ -15,6 +15,7 @@ JSON records in mcap, as in the journal. The first is ``map`` with the version o
   sighting and its edge; ``passes``: by vertex, what is known of when a landmark is seen (``Presence.record``);
   ``offsets``: by input, the vertex of what its ranges have in common;
 * ``datum``: latitude, longitude and height that fixes are from; ``settings``: parameters that were changed on the way;
+  ``displacements``: all alarms of the run by then, as in ``run.json``;
 * ``processed``: records of the ingest sequence that all of it came of; ``used``: stamp and input of the last odometry
   that was used by then;
 * ``noise``: factors of the configured sigmas that the edges have from now on, ``[class, input, part, factor]`` each;
@@ -92,6 +93,7 @@ class MapGrowth:
         self._datum: tuple[float, ...] = ()
         self._gyro: SavedBias | None = None
         self._settings: dict[str, Any] = {}
+        self._displacements: list[dict[str, Any]] = []
         self._estimated = 0  # keyframes at the last estimate
 
     def of(self, slam: GraphSlam, *, is_anew: bool = False) -> Iterator[Record]:
@@ -105,8 +107,10 @@ class MapGrowth:
             self._begin()
             version = _CUT if slam.bounded is None else VERSION
             yield from ({"type": "map", "version": version}, {"type": ANEW})
-        changed = {"settings": dict(slam.settings)} if slam.settings != self._settings else {}
+        changed: Record = {"settings": dict(slam.settings)} if slam.settings != self._settings else {}
         self._settings = dict(slam.settings)
+        if (alarms := slam.displacements) != self._displacements:
+            changed["displacements"] = self._displacements = alarms
         used = {"used": [slam.newest_odometry_ns, slam.odometry_source]} if slam.odometry_source else {}
         yield self.since(slam) | changed | {"processed": slam.processed} | used
         count = len(slam.keyframes)
@@ -236,7 +240,7 @@ def state_of(slam: GraphSlam, folder: Path | None = None) -> MapSnapshot:
     """
     state = MapSnapshot(folder=folder)
     extend(state, MapGrowth().since(slam))
-    state.values, state.settings = slam.solver.values, dict(slam.settings)
+    state.values, state.settings, state.displacements = slam.solver.values, dict(slam.settings), slam.displacements
     if slam.bounded is not None and state.bounded is not None:
         state.bounded.attached = slam.bounded.attached
     state.used_ns, state.source = slam.newest_odometry_ns, slam.odometry_source

@@ -50,15 +50,16 @@ def map_of(folder: Path, losses: list[str], counters: Counters | None = None) ->
     space = run_config(folder).space
     warmup(dimensions=space.dimensions)
     losses += missing(folder)
-    counters = Counters() if counters is None else counters
+    counters, before = Counters() if counters is None else counters, summary_of(folder)
     try:
-        counters.update(counters_of(summary_of(folder)))
+        counters.update(counters_of(before))
     except ValueError as error:
         losses.append(f"{folder / SUMMARY}: what it had counted: {error}")
     state = read_map(folder, losses) if has_map(folder) else None
     state = _repeated(folder, losses, counters) if state is None else _with_rest(folder, state, losses, counters)
     if not state.keyframes:
         raise RunError(f"{folder}: no keyframe, so there is no map")
+    state.displacements = state.displacements or before.get("displacements", [])  # the map of an older version has none
     if state.graph.kind_of(state.keyframes[0].vertex) is not space.pose:
         raise RunError(f"{folder}: its map is not in {space.dimensions} dimensions, as its configuration says")
     return state
@@ -90,13 +91,13 @@ def _with_rest(folder: Path, state: MapSnapshot, losses: list[str], counters: Co
     if not rest:
         return state
     state.continues_with = state.source if state.used_ns is not None else ""
-    settings = dict(state.settings)
+    settings, displacements = dict(state.settings), state.displacements
     slam = GraphSlam(config_of(folder, state).changed(_NOTHING_LEAVES), start=state)
     for measurement in [*rest, Control("end")]:
         slam.process(measurement)
     counters.update(slam.counters)
     out = state_of(slam, folder)
-    out.settings = settings | out.settings
+    out.settings, out.displacements = settings | out.settings, [*displacements, *out.displacements]
     return out
 
 
@@ -105,12 +106,20 @@ def of_all(folder: Path) -> str:
     return f"graph_slam replay {folder} --out WHOLE --set map.condense=false makes a map with all of them"
 
 
-def restored(folder: Path, losses: list[str], counters: Counters | None = None, *, whole: bool = False) -> GraphSlam:
+def restored(
+    folder: Path,
+    losses: list[str],
+    counters: Counters | None = None,
+    *,
+    whole: bool = False,
+    displacements: list[dict[str, Any]] | None = None,
+) -> GraphSlam:
     """The map of a run, solved; see ``map_of``.
 
     Parameters
     ----------
     whole : whether all keyframes are needed: where visits were condensed, the drive is repeated from its journal
+    displacements : added to them are those of the run
 
     Raises
     ------
@@ -123,6 +132,8 @@ def restored(folder: Path, losses: list[str], counters: Counters | None = None, 
         state = _repeated(folder, losses, Counters())
         if state.bounded is not None:
             raise RunError(f"{folder}: it began in a map with condensed visits, and this needs all keyframes")
+    if displacements is not None:
+        displacements += state.displacements
     losses[lost:] = [f"{folder}: {loss}" for loss in losses[lost:]]
     # what is asked of a map is asked of all of it
     config = config_of(folder, state).changed({"map.localize": False} | _NOTHING_LEAVES)
@@ -137,10 +148,15 @@ def config_to_go_on(slam: GraphSlam, folder: Path) -> Config:
 
 
 def restored_and_solved(
-    folder: Path, losses: list[str], counters: Counters | None = None, *, whole: bool = False
+    folder: Path,
+    losses: list[str],
+    counters: Counters | None = None,
+    *,
+    whole: bool = False,
+    displacements: list[dict[str, Any]] | None = None,
 ) -> GraphSlam:
     """The same with all edges judged. Raises GraphSlamError also if it cannot be solved."""
-    slam = restored(folder, losses, counters, whole=whole)
+    slam = restored(folder, losses, counters, whole=whole, displacements=displacements)
     slam.process(Control("optimize"))
     if not slam.is_solved:
         raise RunError(f"{folder}: its map cannot be solved: {slam.failing}")
@@ -219,6 +235,7 @@ def recover(folder: Path, out: Path, *, force: bool = False) -> Summary:
     counters = Counters()
     state = map_of(folder, losses, counters)
     options: dict[str, Any] = {"earlier": counters, "took": took, "recording": recording_of(folder)}
+    options["more"] = lambda: {"displacements": state.displacements}
     return record_run(out, config_of(folder, state), (), losses, state, force=force, **options)[1]
 
 
@@ -234,11 +251,12 @@ def complete(folder: Path) -> Summary:
     losses: list[str] = []
     try:
         with claimed(folder):
-            before, counters = summary_of(folder), Counters()
-            slam = restored_and_solved(folder, losses, counters)
+            before, counters, displacements = summary_of(folder), Counters(), list[dict[str, Any]]()
+            slam = restored_and_solved(folder, losses, counters, displacements=displacements)
             kept = {key: before[key] for key in _OF_RECORDING if key in before}
             now = summarize(slam, counters) | fitted_summary(slam) | took()
-            summary = kept | now | {"losses": losses, "ended": True, "is_incomplete": False}
+            now |= {"displacements": displacements, "losses": losses, "ended": True, "is_incomplete": False}
+            summary = kept | now
             save_results(folder, slam, summary)
     except OSError as error:
         raise RunError(f"{error.filename or folder}: {error.strerror}") from None

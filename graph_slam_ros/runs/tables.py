@@ -97,7 +97,7 @@ def summarize(slam: GraphSlam, earlier: Counters | None = None) -> dict[str, Any
             "failing": slam.failing,
             "classes": {name: asdict(share) for name, share in (last.classes if last else {}).items()},
             "rivals": [asdict(rival) for rival in slam.backend.rivals],
-            "displacements": [asdict(alarm) | {"text": str(alarm)} for alarm in slam.alarms],
+            "displacements": slam.displacements,
             "span_s": (slam.keyframes[-1].stamp_ns - slam.began_ns) * 1e-9 if slam.keyframes else 0.0,
         }
         | condensed_part(slam)

@@ -1,7 +1,7 @@
 """The read-only part of the pipeline: path, landmarks, covariances, statistics and health."""
 
 from collections.abc import Collection, Sequence, Set
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -341,6 +341,11 @@ class MapView(PathView):
     def alarms(self) -> tuple[Alarm | Slip, ...]:
         """The times when the landmarks contradicted odometry, in order: displacements and slips. Some may go on."""
         return tuple(sorted([*self._kidnaps.alarms, *self._kidnaps.slips], key=lambda one: one.began_ns))
+
+    @property
+    def displacements(self) -> list[dict[str, Any]]:
+        """The same as records for files, each with its sentence."""
+        return [asdict(alarm) | {"text": str(alarm)} for alarm in self.alarms]
 
     @property
     def displaced(self) -> Alarm | Slip | None:

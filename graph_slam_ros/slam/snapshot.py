@@ -29,6 +29,7 @@ class MapSnapshot:
     held : so many vertices and edges were held when localization began (``map.localize``); zeros where the map grows
     datum : of fixes on earth, as in ``Fix``
     settings : parameters that were changed on the way, by name
+    displacements : alarms of the run by then, as in ``run.json``
     processed : records of the ingest sequence that it came of; None where it does not tell
     used_ns : stamp of the last odometry that was used by then; None before the first
     source : the input of that odometry
@@ -56,6 +57,7 @@ class MapSnapshot:
     held: tuple[int, int] = (0, 0)
     datum: tuple[float, ...] = ()
     settings: dict[str, Any] = field(default_factory=dict)
+    displacements: list[dict[str, Any]] = field(default_factory=list)
     processed: int | None = 0
     used_ns: int | None = None
     source: str = ""

@@ -1,5 +1,6 @@
 """The robot is elsewhere than odometry says: it slipped, was carried, or somebody gave a wrong pose."""
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +10,7 @@ from reliability import times
 
 from graph_slam_ros.lie import se2
 from graph_slam_ros.measurements.types import InitialPose
-from graph_slam_ros.runs.restore import map_of, record_run
+from graph_slam_ros.runs.restore import complete, map_of, record_run, recover
 from graph_slam_ros.simulation import Fault, faulty_recording, measurements, simulate
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry
 from graph_slam_ros.slam.alarm import Alarm
@@ -211,6 +212,19 @@ def test_an_alarm_is_in_the_summary_and_a_map_with_a_segment_in_the_past_is_take
     assert state.segments == slam.segments
     again = GraphSlam(Config(), start=state)
     assert np.abs((again.trajectory() - slam.trajectory())[:, :2]).max() < 0.05  # solved anew, all of it
+
+
+def test_a_recovered_run_has_its_alarms(recording, tmp_path):
+    """Also one that was cut off, and has no summary; one of an older version has them in its summary alone."""
+    faulty, _ = carried(recording)
+    _, summary = record_run(tmp_path / "run", Config(), [*measurements(faulty), Control("end")], [])
+    assert len(summary["displacements"]) == 1
+    shutil.copytree(tmp_path / "run", tmp_path / "cut")
+    (tmp_path / "cut" / "run.json").unlink()
+    for name in ("run", "cut"):
+        assert recover(tmp_path / name, tmp_path / f"{name} again")["displacements"] == summary["displacements"]
+        assert complete(tmp_path / name)["displacements"] == summary["displacements"]
+    assert recover(tmp_path / "run again", tmp_path / "third")["displacements"] == summary["displacements"]
 
 
 def test_a_displacement_that_later_sightings_contradict_is_taken_back(recording):
