@@ -4,7 +4,7 @@ The topics are those of ``write_bag``, or the only one of their type. All other 
 """
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from graph_slam_ros.lie import se3
 from graph_slam_ros.messages.from_msg import decoder
 from graph_slam_ros.messages.to_msg import encode, time, transform
 from graph_slam_ros.recordings.bag import BagWriter, open_bag
-from graph_slam_ros.simulation.bag import ODOMETRY_TOPIC
+from graph_slam_ros.simulation.bag import ODOMETRY_TOPIC, TRUE_LANDMARKS_TOPIC, TRUTH_TOPIC
 from graph_slam_ros.simulation.recording import LANDMARKS_TOPIC
 from graph_slam_ros.typing import Array, Index
 
@@ -34,8 +34,8 @@ class Message:
 
     @property
     def stamp_ns(self) -> int:
-        """The stamp of its header. Setting it also sets the stamps of its detections."""
-        stamp = self.content.header.stamp
+        """The stamp of its header, or of its first transform. Setting it sets all stamps of the message."""
+        stamp = next(self._headers()).stamp
         return int(stamp.sec * NS + stamp.nanosec)
 
     @stamp_ns.setter
@@ -54,8 +54,8 @@ class Message:
             header.frame_id = frame
 
     def _headers(self) -> Iterator[Any]:
-        yield self.content.header
-        yield from (one.header for one in getattr(self.content, "detections", ()))
+        parts = [getattr(self.content, name, ()) for name in ("detections", "transforms")]
+        yield from (one.header for one in (self.content, *parts[0], *parts[1]) if hasattr(one, "header"))
 
 
 class Drive:
@@ -94,6 +94,17 @@ class Drive:
     def landmarks(self) -> list[Message]:
         """The messages of landmarks that can be decoded."""
         return [m for m in self.messages if m.topic == self.landmarks_topic and not isinstance(m.content, bytes)]
+
+    def decoded(self, types: Collection[str]) -> list[Message]:
+        """The messages of some types, decoded, without those of the truth and landmarks that cannot be."""
+        others = {TRUTH_TOPIC, TRUE_LANDMARKS_TOPIC, self.landmarks_topic}
+        found = [*self.landmarks] if {DETECTIONS, POINTS} & {*types} else []
+        found += [m for m in self.messages if m.type in types and m.topic not in others]
+        decode = {name: decoder(name) for name in {m.type for m in found if isinstance(m.content, bytes)}}
+        for m in found:
+            if isinstance(m.content, bytes):
+                m.content = decode[m.type](m.content)
+        return found
 
     @property
     def poses(self) -> Array:

@@ -10,14 +10,16 @@ from numpy.random import Generator
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.cdr import NS
 from graph_slam_ros.lie import se3
-from graph_slam_ros.messages.from_msg import decoder
-from graph_slam_ros.simulation.drive import Drive, Message, Sightings
+from graph_slam_ros.simulation.drive import DETECTIONS, POINTS, TRANSFORMS, Drive, Message, Sightings
 from graph_slam_ros.simulation.odometry_faults import AT, CHANGED, ODOMETRY_KINDS
 from graph_slam_ros.simulation.options import Kind, option
+from graph_slam_ros.simulation.recording import CLOSURES_TOPIC
 from graph_slam_ros.simulation.recording_faults import RECORDING_KINDS
 from graph_slam_ros.typing import Array
 
 _IMU = "sensor_msgs/msg/Imu"
+_POSES = ("nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
+_OF_THE_ROBOT = (_IMU, "sensor_msgs/msg/NavSatFix", DETECTIONS, POINTS, TRANSFORMS, *_POSES)
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,9 +162,15 @@ def _stamped(change: Callable[[Any, Any, Generator], Any]) -> Callable[[Drive, A
 
 
 def _clock_set_back(drive: Drive, fault: ClockSetBack, _rng: Generator) -> None:
-    at_ns = np.quantile(drive.odometry_ns, fault.at)
-    for messages in (drive.odometry, drive.landmarks):
-        drive.restamp(messages, lambda t: np.where(t > at_ns, t - round(fault.seconds * NS), t))
+    """All that the robot stamps; closures name an earlier stamp as well. The truth is of another clock."""
+    at_ns, back_ns = np.quantile(drive.odometry_ns, fault.at), round(fault.seconds * NS)
+    drive.restamp(drive.decoded(_OF_THE_ROBOT), lambda t: np.where(t > at_ns, t - back_ns, t))
+    for m in drive.messages:
+        for one in m.content.detections if m.topic == CLOSURES_TOPIC else ():
+            if one.id.isdecimal() and int(one.id) > at_ns:
+                one.id = str(int(one.id) - back_ns)
+                for result in one.results:
+                    result.hypothesis.class_id = one.id
 
 
 def _wrong_frames(drive: Drive, fault: WrongFrames, _rng: Generator) -> None:
@@ -275,12 +283,11 @@ def _new_ids(drive: Drive, fault: NewIds, _rng: Generator) -> None:
 
 
 def _wrong_gyro(drive: Drive, fault: WrongGyro, rng: Generator) -> None:
-    decode, found = decoder(_IMU), [m for m in drive.messages if m.type == _IMU]
+    found = drive.decoded((_IMU,))
     if not found:
         raise GraphSlamError("wrong_gyro: needs an IMU")
     errors: dict[int, float] = {}
     for m in found:
-        m.content = decode(m.content) if isinstance(m.content, bytes) else m.content
         w = m.content.angular_velocity
         rates = (w.x, w.y, w.z) if fault.axes == "kept" else (w.z, w.x, w.y)
         second, error = m.log_ns // NS, fault.noise_rad_s * rng.standard_normal() if fault.noise_rad_s else 0.0

@@ -6,13 +6,17 @@ import pytest
 from graph_slam_ros.cli import main
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.lie import se3, so3
+from graph_slam_ros.messages.to_msg import transform
 from graph_slam_ros.recordings.bag import open_bag
 from graph_slam_ros.runs.chosen_inputs import choose_inputs
 from graph_slam_ros.runs.replay import measurements as measured
-from graph_slam_ros.simulation import simulate, write_bag
+from graph_slam_ros.simulation import measurements, simulate, with_closures, write_bag
+from graph_slam_ros.simulation.bag import TRUE_LANDMARKS_TOPIC, TRUTH_TOPIC
+from graph_slam_ros.simulation.drive import TRANSFORMS, Drive, Message
 from graph_slam_ros.simulation.instruments import ANTENNA_M, DATUM, geodetic
+from graph_slam_ros.simulation.message_faults import MESSAGE_KINDS
 from graph_slam_ros.simulation.motion import space_of
-from graph_slam_ros.slam import Config, Counters, Fix
+from graph_slam_ros.slam import Closure, Config, Counters, Fix
 
 SMALL = {"warehouse": {"aisles": 2, "aisle_m": 8.0, "laps": 1}, "flight": {"laps": 1}}
 INPUTS = {
@@ -96,3 +100,28 @@ def test_what_does_not_fit_an_instrument_is_refused_by_name(tmp_path, capsys):
         main(["simulate", "--help"])
     said = capsys.readouterr().out
     assert "gnss_outage_s=0.0 [s]" in said and "aisle_m=12.0 [m]" in said
+
+
+def test_a_clock_that_is_set_back_is_that_of_everything_but_the_truth(tmp_path):
+    recording = with_closures(simulate("warehouse", 3, **SMALL["warehouse"], gnss=5, imu=20), 20, seed=1)
+    write_bag(recording, tmp_path / "a.mcap")
+    drive, last = Drive(tmp_path / "a.mcap"), int(recording.stamps_ns[-1])
+    drive.messages.append(Message("/tf", TRANSFORMS, last, transform(last, "odom", "base_link", se3.IDENTITY)))
+    fault = MESSAGE_KINDS["clock_set_back"]
+    fault.put(drive, fault.options(at=0.1), np.random.default_rng(0))
+    at_ns, back_ns = np.quantile(recording.stamps_ns, 0.1), 30_000_000_000
+    names = set()
+    for m in drive.messages:
+        if m.topic in (TRUTH_TOPIC, TRUE_LANDMARKS_TOPIC):
+            assert isinstance(m.content, bytes)
+        elif m.log_ns > at_ns:
+            names.add(m.topic)
+            assert m.stamp_ns == m.log_ns - back_ns
+        else:
+            assert m.stamp_ns == m.log_ns
+    assert names == {"/odom", "/landmarks", "/gps/fix", "/imu/data", "/closures", "/tf"}
+    earlier = {int(one.id) for m in drive.messages if m.topic == "/closures" for one in m.content.detections}
+    closures = [m for m in measurements(recording) if isinstance(m, Closure)]
+    assert earlier == {m.from_stamp_ns - back_ns * (m.from_stamp_ns > at_ns) for m in closures}
+    assert any(m.from_stamp_ns > at_ns for m in closures)
+    drive.write(tmp_path / "b.mcap")
