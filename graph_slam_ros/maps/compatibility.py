@@ -35,10 +35,9 @@ def aligned_for_merge(one: GraphSlam, two: GraphSlam, a: Path, b: Path) -> tuple
         They cannot become one map.
     """
     _refuse_other_datum(one, two, a, b)
-    shared = _shared(one, two, a, b)
-    aligned = _aligned(one, two, shared)
     _refuse_same_drive(one, two, a, b)
-    return shared, aligned
+    shared = _shared(one, two, a, b)
+    return shared, _aligned(one, two, shared)
 
 
 def merge_trouble(one: GraphSlam, two: GraphSlam, a: Path, b: Path) -> str:

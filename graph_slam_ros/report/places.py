@@ -20,7 +20,7 @@ from graph_slam_ros.formats.files import read_bytes, read_text
 from graph_slam_ros.lie import se3
 from graph_slam_ros.report.packing import Packing, shown
 from graph_slam_ros.runs.folder import LANDMARKS, PATH, PATH_ODOMETRY
-from graph_slam_ros.runs.trajectory import Landmark, Trajectory, read_landmarks, read_tum
+from graph_slam_ros.runs.trajectory import Landmark, Trajectory, read_landmarks, read_rows
 from graph_slam_ros.typing import Array
 
 MOST_KEYFRAMES, MOST_TRUTH = 20_000, 8_000  # of a path: more are thinned
@@ -51,7 +51,7 @@ def paths(
         T_map_truth = se3.inverse(one.T_truth_path)
         drawn["truth"] = _thinned(known.trajectory, MOST_TRUTH).moved(T_map_truth)
     if other is not None:
-        drawn["other"] = read_tum(other / "path.tum")
+        drawn["other"] = read_rows(other / "path.tum")
     every = max(1, math.ceil(len(path.stamps_s) / MOST_KEYFRAMES))
     out["every"] = every
     out["paths"] = {}
@@ -68,7 +68,7 @@ def keyframe_paths(run: Path, saved: SavedGraph) -> tuple[Trajectory, Trajectory
 
     def of(name: str, poses: Array) -> Trajectory:
         with suppress(GraphSlamError):
-            path = read_tum(run / name)
+            path = read_rows(run / name)
             if len(path.stamps_s) == len(whole.stamps_ns):
                 return path
         return Trajectory(whole.stamps_ns / 1e9, se3.in_space(poses))

@@ -13,7 +13,7 @@ from graph_slam_ros.formats.files import read_text
 from graph_slam_ros.runs.folder import COVARIANCES, SUMMARY, RunError, changed_since, run_config
 from graph_slam_ros.runs.ledger_file import Entry, read_ledger
 from graph_slam_ros.runs.run_check import check_run
-from graph_slam_ros.runs.trajectory import Trajectory, read_covariances, read_landmarks, read_tum
+from graph_slam_ros.runs.trajectory import Trajectory, read_covariances, read_landmarks, read_rows
 from graph_slam_ros.slam import Config
 from graph_slam_ros.typing import Array
 
@@ -69,16 +69,16 @@ class SavedRun:
         return run_config(self.folder)
 
     def trajectory(self) -> Trajectory:
-        """Estimated poses ``T_map_base`` at the keyframes, with their stamps."""
+        """Estimated poses ``T_map_base`` at the keyframes, in their order, with their stamps."""
         return self._trajectory
 
     def odometry(self) -> Trajectory:
         """Poses of odometry alone at the keyframes, ``T_odom_base``."""
-        return read_tum(self.folder / "path_odometry.tum")
+        return read_rows(self.folder / "path_odometry.tum")
 
     @cached_property
     def _trajectory(self) -> Trajectory:
-        return read_tum(self.folder / "path.tum")
+        return read_rows(self.folder / "path.tum")
 
     @cached_property
     def covariances(self) -> Array:

@@ -22,7 +22,7 @@ class Trajectory:
 
     Attributes
     ----------
-    stamps_s : (n,) seconds, increasing, but where rows of a file are asked for
+    stamps_s : (n,) seconds, increasing, but in the rows of a file where a clock was set back or an old drive came later
     poses : (n, 7) x, y, z [m], qx, qy, qz, qw
     has_orientation : False where only positions are known: the quaternions then mean nothing
     """

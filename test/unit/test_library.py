@@ -3,6 +3,7 @@
 import pydoc
 import re
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,10 +12,13 @@ from places import ROOT
 import graph_slam_ros
 from graph_slam_ros import Config, Control, Graph, GraphSlam, load_run, optimize
 from graph_slam_ros import graph as edge_module
+from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.config.config import parameters
 from graph_slam_ros.edge_tags import EDGE_TAGS
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import EdgeType
+from graph_slam_ros.report.places import keyframe_paths
+from graph_slam_ros.runs.restore import map_of, record_run
 from graph_slam_ros.simulation import measurements, simulate, write_bag
 from graph_slam_ros.slam import Update
 
@@ -47,6 +51,22 @@ def test_replay_takes_texts_and_a_run_is_loaded_with_stamps_names_and_covariance
     assert repr(run).endswith(f"run': {len(slam.keyframes)} keyframes, {len(slam.landmarks)} landmarks)")
     with pytest.raises(KeyError):
         run.landmarks["nowhere"]
+
+
+def test_an_older_drive_in_a_newer_map_is_read_by_keyframe(done, tmp_path):
+    _, folder = done
+    drive, hour_ns = measurements(simulate("warehouse", 1, aisles=2, laps=1, aisle_m=4.0)), 3_600_000_000_000
+    older = [replace(m, stamp_ns=m.stamp_ns - hour_ns) for m in drive]
+    slam, _ = record_run(tmp_path / "run", Config(), [*older, Control("end")], [], map_of(folder, []))
+    stamps_s = slam.keyframes.stamps_ns / 1e9
+    assert np.diff(stamps_s).min() < -3000.0
+    run = load_run(tmp_path / "run")
+    pages = keyframe_paths(tmp_path / "run", SavedGraph(tmp_path / "run", []))
+    for path in (run.trajectory(), pages[0]):
+        assert path.stamps_s == pytest.approx(stamps_s, abs=1e-6)
+        assert path.poses[:, :2] == pytest.approx(slam.trajectory()[:, :2])
+    for path in (run.odometry(), pages[1]):
+        assert path.poses[:, :2] == pytest.approx(slam.keyframes.poses[:, :2])
 
 
 def test_data_frames_have_a_row_for_each(done):

@@ -369,16 +369,20 @@ def test_merge_in_space_and_of_what_shares_an_offset(kind, tmp_path):
 def test_merge_refuses_in_one_line(first, elsewhere, world, tmp_path, capsys):
     few = restored(first, []).landmarks
     keep = next(iter(few))
-    one_only = [
-        replace(m, sightings=tuple(s for s in m.sightings if s.id == keep)) if isinstance(m, Sightings) else m
-        for m in world
-    ]
+    later = [replace(m, stamp_ns=m.stamp_ns + 86_400_000_000_000) for m in world]
+    alike, one_only = (
+        [
+            replace(m, sightings=tuple(s for s in m.sightings if s.id == keep)) if isinstance(m, Sightings) else m
+            for m in some
+        ]
+        for some in (world, later)
+    )
     swapped = dict(zip(few, reversed(list(few)), strict=True))
     confused = [
         replace(m, sightings=tuple(replace(s, id=swapped.get(s.id, s.id)) for s in m.sightings))
         if isinstance(m, Sightings)
         else m
-        for m in world
+        for m in later
     ]
     flight = list(measurements(simulate("flight", 0, laps=1)))[:120]
     surveyed = Config.from_mapping({"landmarks.surveyed": f"id,x,y,sigma\n{keep},1,1,0.1"})
@@ -386,9 +390,10 @@ def test_merge_refuses_in_one_line(first, elsewhere, world, tmp_path, capsys):
         (ended(tmp_path / "few", one_only), "it takes 2"),
         (ended(tmp_path / "confused", confused), "on how one lies on the other"),
         (ended(tmp_path / "flight", flight, Config.from_mapping({"world.dimensions": 3})), "world.dimensions"),
-        (ended(tmp_path / "surveyed", world, surveyed), "merge"),
+        (ended(tmp_path / "surveyed", later, surveyed), "merge"),
         (tmp_path / "none", "none"),
         (first, "of the same drive"),
+        (ended(tmp_path / "alike", alike), "of the same drive"),  # however few landmarks agree
     ):
         assert run("merge", first, other, "--out", tmp_path / "out") == 2
         told = capsys.readouterr().err
