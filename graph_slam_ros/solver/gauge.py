@@ -11,7 +11,7 @@ from graph_slam_ros.graph import R2, R3, SE2, SE3, Graph, VertexKind
 from graph_slam_ros.graph.tables import EdgeTable
 from graph_slam_ros.lie import so3
 from graph_slam_ros.solver.linearization import Losses, linearize
-from graph_slam_ros.typing import Array, Index
+from graph_slam_ros.typing import Array, Index, Mask
 
 _AXES = {SE2: 2, R2: 2, SE3: 3, R3: 3}
 _LEAST_EIGENVALUE = 1e-9  # of correlations: less is no information
@@ -98,3 +98,24 @@ def _motions(kind: VertexKind, values: Array, centre: Array) -> Array:
     return np.concatenate(
         [position, np.concatenate([np.zeros((len(values), len(turned[0]), axes)), turned], 2)], axis=1
     )
+
+
+def degrees_of_freedom(graph: Graph, free: Index, held: Mask) -> int:
+    """Return the measured numbers, without edges of weight 0, less the estimated numbers.
+
+    Held vertices that have an edge among themselves, as those of a frozen map, were estimated by it before.
+
+    Parameters
+    ----------
+    free : vertices that are estimated now; held : of each vertex, whether it is held
+    """
+    is_estimated, measured, any_held = np.zeros(graph.vertex_count, dtype=bool), 0, held.any()
+    is_estimated[free] = True
+    for table in graph.tables.values():
+        rows = np.flatnonzero(table.weight.values)
+        measured += table.type.residual_size * len(rows)
+        if any_held:
+            ends = table.vertices.values[rows]
+            is_estimated[ends[held[ends].all(axis=1)]] = True
+    sizes = np.array([kind.dof for kind in graph.kinds], dtype=np.int64)
+    return measured - int(sizes[graph.kind.values[is_estimated]].sum())

@@ -42,7 +42,7 @@ from graph_slam_ros.solver.entry import (
     anchorage,
     record,
 )
-from graph_slam_ros.solver.gauge import check_gauge, fix_the_whole
+from graph_slam_ros.solver.gauge import check_gauge, degrees_of_freedom, fix_the_whole
 from graph_slam_ros.solver.linearization import chi2_of, evaluated, rows_of
 from graph_slam_ros.solver.pending import NONE, PendingChanges
 from graph_slam_ros.solver.transaction import Transaction
@@ -185,12 +185,9 @@ class Problem:
 
     @property
     def degrees_of_freedom(self) -> int:
-        """The measured numbers, without edges of weight 0, less the estimated numbers."""
+        """The measured numbers, without edges of weight 0, less the estimated numbers, also those of a frozen map."""
         self._grow()
-        graph, tables = self.graph, self.graph.tables.values()
-        measured = sum(table.type.residual_size * int(np.count_nonzero(table.weight.values)) for table in tables)
-        sizes = np.array([kind.dof for kind in graph.kinds], dtype=np.int64)
-        return measured - int(sizes[graph.kind.values[self._unknowns()]].sum())
+        return degrees_of_freedom(self.graph, self._unknowns(), self._held[: self.graph.vertex_count])
 
     @property
     def edges(self) -> Index:

@@ -444,6 +444,8 @@ def another_drive():
 def test_freeze_changes_nothing_and_is_a_run_like_any_other(first, frozen, tmp_path):
     assert run("diff", first, frozen) == 0
     assert run("explain", frozen) == 0
+    of_first, of_frozen = (restored(folder, []).solver.degrees_of_freedom for folder in (first, frozen))
+    assert of_first == of_frozen > 0, "what is held was estimated before"
     assert not np.genfromtxt(frozen / "covariances.csv", delimiter=",", skip_header=1)[:, 1:].any(), "it is held"
     assert run("replay", frozen, "--out", tmp_path / "again") == 0
     for name in RECORDED:
