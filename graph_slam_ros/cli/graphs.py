@@ -120,7 +120,10 @@ def convert(args: argparse.Namespace) -> int:
 
 def _read_graph(args: argparse.Namespace, **options: Any) -> "G2oFile":
     from graph_slam_ros.formats.g2o import read_g2o
+    from graph_slam_ros.runs.folder import GRAPH, is_run
 
+    if is_run(args.graph):
+        raise GraphSlamError(f"{args.graph}: a run folder; its graph is {args.graph / GRAPH}")
     raw = args.information == "raw"
     return read_g2o(args.graph, lenient=args.lenient, raw=raw, dialect=args.source, **options)
 

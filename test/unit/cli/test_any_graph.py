@@ -1,11 +1,13 @@
 """Whatever is in a graph file: it is solved, converted or refused in one line, and nothing else is said."""
 
+import json
 import random
 
 import pytest
 from graph_texts import PLANE, SPACE
 
 from graph_slam_ros.cli import main
+from graph_slam_ros.runs.folder import MARK
 
 MORE = """\
 VERTEX_SE2 12 2.5 0 0.3
@@ -64,3 +66,11 @@ def test_whatever_is_in_a_file_it_is_used_or_refused_in_one_line(tmp_path, capsy
             assert code in (0, 2, 3), said
             assert all(line.startswith("graph_slam: ") for line in said)
             assert code != 2 or len(said) == 1
+
+
+@pytest.mark.parametrize("words", [["optimize"], ["convert", "--to", "toro"]])
+def test_of_a_run_folder_the_graph_is_named(tmp_path, capsys, words):
+    (tmp_path / "run.json").write_text(json.dumps({"format": MARK}))
+    more = [str(tmp_path / "b.toro")] * (words[0] == "convert")
+    assert main([words[0], str(tmp_path), *more, *words[1:]]) == 2
+    assert capsys.readouterr().err == f"graph_slam: {tmp_path}: a run folder; its graph is {tmp_path / 'graph.g2o'}\n"
