@@ -13,11 +13,12 @@ from graph_slam_ros.measurements.reasons import explain, remedy
 from graph_slam_ros.messages.to_msg import ERROR, OK, WARN, Status
 from graph_slam_ros.node.estimate import OFF, Estimate
 from graph_slam_ros.node.recent import WINDOW_S, Recent
+from graph_slam_ros.runs.outcome import MOTION
 from graph_slam_ros.runs.tables import INPUT_COLUMNS
 
 _LEVELS = {"WAITING": WARN, "DEGRADED": WARN, "ERROR": ERROR}  # the others are as somebody wants them
 _TF_BEHIND_S = 1.0
-_UNSEEN_M = 10.0
+_UNSEEN_M, _UNSEEN_S = 10.0, 10.0
 _LONGEST = 80  # of a frame's name
 _UNLINKED = ("frame_unknown", "child_frame_unknown", "odom_frame_unknown", "map_frame_unknown")
 
@@ -28,7 +29,7 @@ class InputFacts:
 
     Attributes
     ----------
-    received, used : messages, and what of them was handed on: of a message that holds several things, each
+    received, used : messages, and what of them the estimate has used: of a message that holds several things, each
     counts : since the start, of what was refused, repaired or noted, by reason
     silent_s : since the last message, by the clock of the node; infinite before the first
     publishers : names of the nodes that publish it
@@ -37,6 +38,7 @@ class InputFacts:
     frames : those of its messages that nothing links to the robot, the last ones, each with the robot's
     recent : what became of it in the last seconds
     not_found : of odometry on /tf, the transform that has never come, and what mends that
+    alternatives : where nobody publishes it, other topics that it could use, each with the parameter that chooses it
     """
 
     name: str
@@ -52,6 +54,12 @@ class InputFacts:
     frames: tuple[tuple[str, str], ...] = ()
     recent: Recent = field(default_factory=Recent)
     not_found: str = ""
+    alternatives: tuple[str, ...] = ()
+
+    @property
+    def unpublished(self) -> str:
+        """Return that nobody publishes it, and what could be used instead; empty if somebody does."""
+        return "" if self.publishers else "; ".join((f"nobody publishes {self.topic}", *self.alternatives))
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,8 +176,8 @@ def _missing(facts: Facts) -> Iterator[str]:
 def _silence(one: InputFacts) -> Iterator[str]:
     if one.mismatch:
         yield f"{one.topic}: {one.mismatch}"
-    elif not one.publishers:
-        yield f"{one.topic}: nobody publishes this {one.use}"
+    elif one.unpublished:
+        yield one.unpublished
     elif not one.received:
         yield f"{one.topic}: {', '.join(one.publishers)} publishes it, but nothing has come yet"
     elif one.recent.times:
@@ -206,6 +214,7 @@ def _faults(facts: Facts, config: Config) -> Iterator[str]:
             yield f"{one.topic}: {one.not_found or f'silent for {one.silent_s:.1f} s'}"
         elif one.recent.is_bad and not (one.is_contested and one.recent.worst == "other_publisher"):
             yield f"{one.topic}: {_refused(one)}"
+    yield from _uncorrected(facts)
     if facts.is_paused:
         yield "paused"
     if facts.tf_behind_s > _TF_BEHIND_S:
@@ -241,6 +250,16 @@ def _faults(facts: Facts, config: Config) -> Iterator[str]:
         yield f"the measurements contradict each other: chi2 per degree of freedom is {estimate.fit:.1f}"
 
 
+def _uncorrected(facts: Facts) -> Iterator[str]:
+    """Yield each input that nobody publishes, once the robot has driven for a while and nothing corrects odometry."""
+    others = [one for one in facts.inputs if one.use not in MOTION]
+    if facts.estimate is None or any(one.used for one in others):
+        return
+    way = facts.estimate.unseen
+    if way.length_m >= _UNSEEN_M and facts.estimate.stamp_ns - way.since_ns >= _UNSEEN_S * 1e9:
+        yield from (f"nothing corrects odometry: {one.unpublished}" for one in others if one.unpublished)
+
+
 def statuses(facts: Facts, verdict: Health, node: str) -> Iterator[Status]:
     """Yield the statuses of /diagnostics: the verdict, each input, and the graph."""
     message = "; ".join((verdict.state, *verdict.reasons))
@@ -258,7 +277,7 @@ def statuses(facts: Facts, verdict: Health, node: str) -> Iterator[Status]:
         is_wrong = one.mismatch or one.is_contested or one.recent.is_bad
         is_absent = not one.received and (one.use == "odometry" or not one.publishers)
         level = WARN if is_wrong or is_absent else OK
-        nobody = f"nobody publishes {one.topic}" if is_absent and not one.publishers else ""
+        nobody = one.unpublished if is_absent else ""
         message = one.mismatch or nobody or f"{one.received} {INPUT_COLUMNS['received']}"
         yield Status(level, f"{node}: input {one.name}", message, node, values)
     if facts.estimate:

@@ -27,12 +27,14 @@ class UnseenWay:
     ----------
     keyframes, changes : keyframes, and changes of landmarks, that are counted already
     length_m : by odometry, from keyframe to keyframe
+    since_ns : stamp of the keyframe at which it began; 0 before the first
     direction : of the last keyframe from the one before, in odometry's frame
     """
 
     keyframes: int
     changes: int
     length_m: float = 0.0
+    since_ns: int = 0
     direction: Numbers = ()
 
     def goes_on(self, slam: GraphSlam) -> "UnseenWay":
@@ -45,7 +47,8 @@ class UnseenWay:
         if len(steps) and slam.segments[-1] < self.keyframes:  # a jump of odometry is no way
             length_m += float(np.linalg.norm(steps, axis=1).sum())
             direction = tuple(steps[-1].tolist())
-        return UnseenWay(count, changes, length_m if changes == self.changes else 0.0, direction)
+        since_ns = self.since_ns if changes == self.changes and self.since_ns else slam.keyframes[-1].stamp_ns
+        return UnseenWay(count, changes, length_m if changes == self.changes else 0.0, since_ns, direction)
 
 
 class WeakestLandmark:

@@ -69,7 +69,7 @@ class FactCollector:
         rivals = broadcaster.candidates() if broadcaster is not None and broadcaster.has_rival else None
         return Facts(
             lifecycle,
-            subscriptions.facts(node.now_ns, counted, recent) if subscriptions is not None else (),
+            subscriptions.facts(node.now_ns, counted, recent, pipeline.used) if subscriptions is not None else (),
             session.estimate,
             weakest=session.estimate.weakest(node.config.space) if session.estimate is not None else {},
             waits_for_clock=node.get_parameter("use_sim_time").value and not node.now_ns,

@@ -97,6 +97,9 @@ class NodeHandle(Protocol):
     def get_node_names_and_namespaces(self) -> list[tuple[str, str]]:
         """Return all nodes of the ROS graph."""
 
+    def get_topic_names_and_types(self) -> list[tuple[str, list[str]]]:
+        """Return all topics of the ROS graph with their types."""
+
     def get_publishers_info_by_topic(self, topic: str) -> list[Any]:
         """Return the endpoints that publish a topic."""
 

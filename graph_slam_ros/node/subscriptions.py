@@ -16,6 +16,7 @@ from graph_slam_ros.measurements.types import Measured
 from graph_slam_ros.messages.from_msg import TF, TF_STATIC, TRANSFORMS, MessageConverter, is_correction
 from graph_slam_ros.messages.inputs import uses
 from graph_slam_ros.messages.message_class import message_class
+from graph_slam_ros.node.alternatives import alternatives
 from graph_slam_ros.node.diagnostics import InputFacts
 from graph_slam_ros.node.handle import NodeHandle
 from graph_slam_ros.node.qos import InputQos, InputTopic
@@ -75,7 +76,7 @@ class Subscriptions:
         self._topics: dict[str, _Received] = {}
         self._of_input: dict[str, InputTopic] = {}
         self._on_tf: dict[str, _Received] = {}  # odometry there
-        self._used: Counter[str] = Counter()
+        self._converted: Counter[str] = Counter()
         used = uses(config)
         for topic in (InputTopic(TRANSFORMS, "/tf_static", [TF_STATIC], _STATIC), *topics):
             self._subscribe(topic)
@@ -104,7 +105,7 @@ class Subscriptions:
             measured: list[Measured] = []
             for name in names:
                 given = converter.convert(name, cdr)
-                self._used[name] += len(given)
+                self._converted[name] += len(given)
                 measured += given
             self._receive(measured, cdr)
 
@@ -132,17 +133,26 @@ class Subscriptions:
         """
         for name, found in self._on_tf.items():
             topic = self._topics[self._of_input[name].name]
-            if (topic.received and found.at_ns is None) or self._used[name] != found.seen:
-                found.seen, found.at_ns = self._used[name], now_ns
+            if (topic.received and found.at_ns is None) or self._converted[name] != found.seen:
+                found.seen, found.at_ns = self._converted[name], now_ns
         for counted in self._topics.values():
             if counted.received != counted.seen:
                 counted.seen, counted.at_ns = counted.received, now_ns
 
     def facts(
-        self, now_ns: int, counted: Mapping[str, Mapping[str, int]], recent: Mapping[str, Recent]
+        self,
+        now_ns: int,
+        counted: Mapping[str, Mapping[str, int]],
+        recent: Mapping[str, Recent],
+        used: Mapping[str, int],
     ) -> tuple[InputFacts, ...]:
-        """The facts of each input, with its counters since the start and in the last seconds."""
-        used = uses(self._config)
+        """The facts of each input, with its counters since the start and in the last seconds.
+
+        Parameters
+        ----------
+        used : by source, the measurements that the pipeline has used
+        """
+        use_of = uses(self._config)
         out = []
         for one in self._config.sources:
             if one.name not in self._of_input:
@@ -158,17 +168,18 @@ class Subscriptions:
                 InputFacts(
                     one.name,
                     topic.name,
-                    used[one.name],
+                    use_of[one.name],
                     on_topic.received,
-                    self._used[one.name],
+                    sum(times for source, times in used.items() if source.partition("#")[0] == one.name),
                     counted.get(one.name, {}),
                     silent_s,
                     names,
-                    used[one.name] == "odometry" and one.type != TRANSFORMS and len(names) > 1,
+                    use_of[one.name] == "odometry" and one.type != TRANSFORMS and len(names) > 1,
                     self._mismatches(topic),
                     self._converter.unlinked(one.name),
                     recent.get(one.name, Recent()),
                     self._converter.not_found(one.name),
+                    () if names else alternatives(self._node, one, use_of[one.name], self._topics),
                 )
             )
         return tuple(out)

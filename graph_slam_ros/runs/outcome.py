@@ -20,7 +20,7 @@ _MOST_REASONS, _MAX_UNDETERMINED = 5, 10  # that are listed
 _OUT_OF_PLANE = 0.05  # of all poses of an odometry: with more, the robot does not move in a plane
 _JUMPY, _MOST_JUMPS = 0.02, 5  # of all messages of an odometry; with more its motion is hardly used
 _MOSTLY = 0.5
-_MOTION = ("odometry", "gyro")  # uses whose measurements nobody doubts one by one
+MOTION = ("odometry", "gyro")  # uses whose measurements nobody doubts one by one
 _DOUBTED = 0.05  # of an input: as many that are not believed are said; so it is of visits to places
 _FEWEST_LOST = 2  # visits that are lost, which are said
 VISITS = ("visit_condensed", "visit_lost", "visit_wider")  # in the counters of "map"
@@ -208,7 +208,7 @@ def shortcomings(summary: Summary) -> Iterator[str]:
     for name, counts in inputs.items():
         counted = _counted(summary, name, Effect.REFUSED)
         refused = sum(counted.values())
-        is_odometry = counts["use"] in _MOTION
+        is_odometry = counts["use"] in MOTION
         if not counts["used"] and (counts["use"] != "odometry" or counts["received"] == 0):
             yield _unused(summary, name, counts["received"])
         elif refused > _MOSTLY * (refused + counts["used"]):
@@ -289,7 +289,7 @@ def doubts(summary: Summary) -> Iterator[str]:
         counted = summary["counters"].get(name, {})
         if alike := counted.get("odometry_alike", 0):
             yield f"{name}: {_because(name, {'odometry_alike': alike})}"
-        if counts["use"] in _MOTION or not counts["used"]:
+        if counts["use"] in MOTION or not counts["used"]:
             continue
         accepted = (counts["believed"] or 0) / counts["used"]
         if _MOSTLY <= accepted < 1.0 - _DOUBTED:

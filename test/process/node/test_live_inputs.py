@@ -11,6 +11,7 @@ from live_nodes import ENVIRONMENT, LATCHED, node, own_domain, robot, until
 from messages import detection, detections, odometry, pose, quaternion, transforms
 from rclpy.qos import ReliabilityPolicy
 from tf2_msgs.msg import TFMessage
+from vision_msgs.msg import Detection3DArray
 
 from graph_slam_ros.lie import se2
 
@@ -87,6 +88,9 @@ def test_A35_an_input_that_is_refused_is_degraded_with_the_remedy_while_it_is_an
         r.until_it_says(
             "DEGRADED", "(no_id): the detection has no identity: landmarks.association=joint", spin=with_tags(ids=False)
         )
+        before, tags = r.said("input detections")[-1][1], lambda: r.said("input detections")[-1][1]
+        until(lambda: int(tags()["counted: no_id"]) > int(before["counted: no_id"]) + 20, with_tags(ids=False), "tags")
+        assert tags()["measurements used"] == before["measurements used"], "what was refused is not used"
         r.until_it_says("OK", spin=with_tags())
         r.until_it_says(
             "DEGRADED", "detections.offset_s", spin=lambda s: with_tags(stamp_ns=drive.stamp_ns - 10**13)(s)
@@ -96,6 +100,18 @@ def test_A35_an_input_that_is_refused_is_degraded_with_the_remedy_while_it_is_an
         until(lambda: len(r.said()) > 4, with_tags(covariance=0.0), "diagnostics")
         assert {values["state"] for _, values in r.said()} == {"OK"}, "a noise that was filled in is no refusal"
         assert int(r.said("input detections")[-1][1]["counted: covariance_unknown"]) > 20
+        assert n.stop()[0] == 0
+
+
+def test_a_topic_that_nobody_publishes_is_named_once_nothing_corrects_odometry_with_one_that_fits():
+    with node("output.folder:=''") as n, robot(hears=("/diagnostics",), sends=("/odom",)) as r:
+        drive, tags = Drive(), r.publisher("/tags", Detection3DArray)
+        drive.sees = False
+        what = "nothing corrects odometry: nobody publishes /landmarks; /tags has this type: detections.topic:=/tags"
+        r.until_it_says("DEGRADED", what, spin=drive.pace(r))
+        nobody = r.publisher("/landmarks", Detection3DArray)
+        r.until_it_says("OK", spin=drive.pace(r))
+        assert tags and nobody, "they are quiet"
         assert n.stop()[0] == 0
 
 

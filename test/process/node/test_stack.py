@@ -100,7 +100,7 @@ def test_who_joins_after_the_drive_gets_path_pose_landmarks_and_graph_and_the_wh
 def test_B23_a_qos_that_does_not_match_and_all_else_that_keeps_odometry_from_coming_is_named(tmp_path):
     parameters = "output.folder:=''", "inputs.reliable:=true"
     with node(*parameters) as n, robot(hears=("/diagnostics",), sends=()) as other:
-        other.until_it_says("WAITING", "/odom: nobody publishes this odometry")
+        other.until_it_says("WAITING", "nobody publishes /odom")
         with robot(name="shy", reliability=ReliabilityPolicy.BEST_EFFORT, hears=()):
             other.until_it_says(
                 "WAITING", "/odom: shy offers best effort, inputs.reliable asks for reliable", patience_s=3.0

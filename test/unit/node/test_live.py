@@ -316,7 +316,7 @@ def refused(came, **reasons):
         (Facts("unconfigured"), "UNCONFIGURED", ""),
         (Facts("inactive"), "INACTIVE", ""),
         (Facts("finalized"), "FINALIZED", ""),
-        (Facts("active", (odom(publishers=()),)), "WAITING", "/odom: nobody publishes this odometry"),
+        (Facts("active", (odom(publishers=()),)), "WAITING", "nobody publishes /odom"),
         (Facts("active", (odom(),)), "WAITING", "/odom: /driver publishes it, but nothing has come yet"),
         (Facts("active", (odom(mismatch="best effort"),)), "WAITING", "/odom: best effort"),
         (
@@ -414,6 +414,39 @@ def test_a_topic_that_nobody_publishes_is_a_warning_of_its_input():
         facts = Facts("active", (odom(received=9, silent_s=0.0), one), estimate)
         (status,) = (s for s in statuses(facts, judge(facts, Config()), "slam") if s.name == "slam: input tags")
         assert (status.level, status.message) == (level, message)
+
+
+def driven(metres, every_s=1.0, sees=()):
+    """A robot that drives east, a metre after another; where it is in ``sees``, it sees a tag."""
+    settings = {"ordering.window_s": 0.0, "output.folder": ""}
+    session = Session(Config.from_mapping(settings), Counters(), lambda slam, update: None, lambda *_: None)
+    for k in range(metres + 1):
+        stamp = STAMP_NS + round(k * every_s * NS)
+        session.ingest([Odometry(stamp, (float(k), 0.0, 0.0), None, "odom")])
+        if k in sees:
+            tag = Sighting("a", "position", (5.0 - k, 1.0), (1e-4, 0.0, 0.0, 1e-4))
+            session.ingest([Sightings(stamp, "tags", (tag,))])
+    return session
+
+
+@pytest.mark.parametrize(
+    "metres, every_s, one, is_said",
+    [
+        (12, 1.0, tags(publishers=(), alternatives=("/seen has this type: tags.topic:=/seen",)), True),
+        (12, 0.5, tags(publishers=()), False),  # for 6 s
+        (8, 2.0, tags(publishers=()), False),  # for 8 m
+        (12, 1.0, tags(), False),  # it has a publisher, which is quiet
+        (12, 1.0, tags(publishers=(), received=9, used=9, silent_s=0.1), False),  # it has corrected odometry
+    ],
+)
+def test_where_nothing_corrects_odometry_for_a_while_a_topic_that_nobody_publishes_is_the_reason(
+    metres, every_s, one, is_said
+):
+    facts = Facts("active", (odom(received=9, silent_s=0.0), one), driven(metres, every_s).estimate)
+    reason = "nothing corrects odometry: nobody publishes /tags; /seen has this type: tags.topic:=/seen"
+    assert judge(facts, Config()) == diagnostics.Health(*(("DEGRADED", (reason,)) if is_said else ("OK",)))
+    other = InputFacts("gps", "/gps", "fix", received=9, used=3, silent_s=0.0)
+    assert judge(replace(facts, inputs=(*facts.inputs, other)), Config()).state == "OK", "the fixes correct it"
 
 
 def test_A35_what_is_refused_is_judged_by_the_last_seconds_wherever_it_was_refused():
