@@ -10,6 +10,7 @@ from graph_slam_ros.config.config import Config
 from graph_slam_ros.measurements.types import Odometry
 from graph_slam_ros.node.estimate import Estimate
 from graph_slam_ros.slam.frontend.odometry_integration import IntegratedOdometry, OdometryNoise, StationaryDetector
+from graph_slam_ros.slam.frontend.odometry_jumps import OdometryJumps
 from graph_slam_ros.slam.frontend.odometry_selector import Step
 from graph_slam_ros.typing import Numbers
 
@@ -17,33 +18,53 @@ _MOST = 2_000  # messages since the newest keyframe: of a robot that stands ther
 
 
 class PoseExtrapolator:
-    """The last estimate composed with the odometry since then. Its covariance grows accordingly."""
+    """The last estimate composed with the odometry since then. Its covariance grows accordingly.
+
+    A jump of odometry is no motion: there is no pose until an estimate has a keyframe after it.
+    """
 
     def __init__(self, config: Config) -> None:
-        self._space, self._max_speed_m_s = config.space, config.odometry.max_speed_m_s
+        self._space, self._jumps = config.space, OdometryJumps(config.odometry, config.space)
         self._noise = OdometryNoise(config.odometry, config.space)
         self._since: deque[Odometry] = deque(maxlen=_MOST)
         self._estimate: Estimate | None = None
         self._motion: IntegratedOdometry | None = None
         self._last: Numbers = self._space.identity
+        self._motion_before: Numbers = self._space.identity
+        self._jumped_ns = 0  # stamp of a jump that no estimate has yet; 0: there is none
 
     @property
     def newest(self) -> Odometry | None:
-        """The newest odometry of the source in use."""
-        return self._since[-1] if self._since else None
+        """The newest odometry of the source in use; None also after a jump that no estimate has yet."""
+        return self._since[-1] if self._since and not self._jumped_ns else None
 
     def on_odometry(self, m: Odometry, estimate: Estimate | None) -> bool:
-        """Add an odometry message. Return whether it is of the source in use, and newer than the last."""
+        """Add an odometry message. Return whether there is a pose at it.
+
+        There is none at a message of a source that is not in use, or that is not newer than the last.
+        """
         if estimate is not None and estimate.source != m.source:
             return False
         if self._since and m.source == self._since[-1].source and m.stamp_ns <= self._since[-1].stamp_ns:
             return False
+        if self._since and m.source == self._since[-1].source and self._is_jump(self._since[-1], m):
+            self._since.clear()
+            self._jumped_ns = m.stamp_ns
+        elif estimate is not None and estimate.stamp_ns >= self._jumped_ns:
+            self._jumped_ns = 0
         self._since.append(m)
-        return True
+        return not self._jumped_ns
+
+    def _is_jump(self, last: Odometry, m: Odometry) -> bool:
+        motion = self._space.group.between(last.T_odom_base, m.T_odom_base)
+        kind = self._jumps.kind(motion, m.T_odom_base, (m.stamp_ns - last.stamp_ns) * 1e-9, self._motion_before)
+        self._motion_before = self._space.identity if kind else motion
+        return bool(kind)
 
     def forget(self) -> None:
         """Begin anew with the stamps or the map."""
         self._since.clear()
+        self._jumped_ns, self._motion_before = 0, self._space.identity
         self._estimate = self._motion = None
 
     def pose(self, estimate: Estimate) -> tuple[Numbers, NDArray[np.float64]]:

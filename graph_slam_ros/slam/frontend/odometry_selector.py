@@ -1,6 +1,5 @@
 """Selects one odometry of several: the first in priority that sends. It returns steps, and marks jumps."""
 
-import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -9,6 +8,7 @@ from graph_slam_ros.config.frontend import OdometryConfig
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.types import Odometry
+from graph_slam_ros.slam.frontend.odometry_jumps import OdometryJumps
 from graph_slam_ros.typing import Numbers
 
 _REMEMBERED = 1000  # messages of a source that is not in use, to take over from where the one in use fell silent
@@ -49,6 +49,7 @@ class OdometrySelector:
 
     def __init__(self, config: OdometryConfig, priority: Sequence[str], space: Geometry, counters: Counters) -> None:
         self._config, self._space, self._counters = config, space, counters
+        self._jumps = OdometryJumps(config, space)
         self._silent_ns = round(config.timeout_s * 1e9)
         self.sources: set[str] = set()
         self._order = list(priority)
@@ -110,7 +111,7 @@ class OdometrySelector:
                 return None
             motion = self._space.group.between_one(at.T_odom_base, m.T_odom_base)
             last = out[-1] if out else self._last_step
-            if self._is_reset(motion, m, last) or self._jumps(motion, (m.stamp_ns - at.stamp_ns) * 1e-9):
+            if self._jumps.kind(motion, m.T_odom_base, (m.stamp_ns - at.stamp_ns) * 1e-9, last):
                 return None
             at, last_ns = m, m.stamp_ns
             out.append(motion)
@@ -160,9 +161,8 @@ class OdometrySelector:
 
     def _follow(self, a: Odometry, b: Odometry) -> Step:
         step = self._space.group.between_one(a.T_odom_base, b.T_odom_base)
-        if self._is_reset(step, b, self._last_step):
-            return self._use(b, step, broken="reset_to_zero")
-        return self._use(b, step, broken="jump" if self._jumps(step, (b.stamp_ns - a.stamp_ns) * 1e-9) else "")
+        dt = (b.stamp_ns - a.stamp_ns) * 1e-9
+        return self._use(b, step, broken=self._jumps.kind(step, b.T_odom_base, dt, self._last_step))
 
     def _use(self, m: Odometry, step: Numbers, *, broken: str) -> Step:
         if broken:
@@ -171,26 +171,3 @@ class OdometrySelector:
         self.sources.add(m.source)
         self._used, self._last_step = m, self._space.identity if broken else step
         return Step(m.stamp_ns, step, m.T_odom_base, m.twist_covariance, bool(broken))
-
-    def _is_reset(self, step: Numbers, to: Odometry, last: Numbers) -> bool:
-        """Return whether the driver restarted: odometry is at the origin, farther away than robots move in a step.
-
-        The pause may have any length, because nothing arrives while a driver starts.
-        """
-        if abs(to.T_odom_base[0]) > _AT_ZERO or max(self._size(to.T_odom_base)) > _AT_ZERO:
-            return False
-        (far_m, far_rad), (usual_m, usual_rad) = self._size(step), self._size(last)
-        return far_m > max(_RESET_M, _UNUSUAL * usual_m) or far_rad > max(_RESET_RAD, _UNUSUAL * usual_rad)
-
-    def _size(self, pose: Numbers) -> tuple[float, float]:
-        """Return the size of a motion in metres and radians."""
-        return math.hypot(*pose[: self._space.dimensions]), self._space.angle(pose)
-
-    def _jumps(self, step: Numbers, dt: float) -> bool:
-        """Return whether no robot moves like this: odometry was reset, or is wrong by a lap."""
-        return self._space.square(step) > (self._config.max_speed_m_s * max(dt, _LEAST_S)) ** 2
-
-
-_AT_ZERO = 1e-9  # [m, rad]
-_RESET_M, _RESET_RAD, _UNUSUAL = 0.1, 0.1, 3.0
-_LEAST_S = 0.02  # stamps of some drivers crowd together: a pair of them says nothing of speed

@@ -143,6 +143,26 @@ def test_another_odometry_or_an_older_message_says_nothing_of_the_robot_in_the_m
     assert reckoning.newest == drive(2, 19)
 
 
+@pytest.mark.parametrize("dimensions", [2, 3])
+def test_a_jump_of_odometry_is_no_motion_and_nothing_is_said_of_the_robot_until_the_estimate_has_it(dimensions):
+    session = round_a_curve(dimensions, 3.2)
+    reckoning, space = PoseExtrapolator(session.config), session.config.space
+    for k in range(10, 20):
+        assert reckoning.on_odometry(drive(dimensions, k), session.estimate)
+    before, _ = reckoning.pose(session.estimate)
+    after = [replace(drive(dimensions, 20 + k), T_odom_base=drive(dimensions, k).T_odom_base) for k in range(4)]
+    for m in after[:2]:
+        assert not reckoning.on_odometry(m, session.estimate), "it began at zero again"
+        assert reckoning.newest is None
+    session.ingest(after[:3])
+    assert session.slam.counters["odometry", "reset_to_zero"] == 1
+    assert session.estimate.stamp_ns == after[0].stamp_ns
+    assert reckoning.on_odometry(after[2], session.estimate)
+    assert reckoning.newest == after[2]
+    pose, _ = reckoning.pose(session.estimate)
+    assert math.hypot(*space.group.between(before, pose)[:dimensions]) == pytest.approx(1.0, abs=0.1), "two messages"
+
+
 # -- messages from the future ------------------------------------------------------------------------------------------
 
 
