@@ -77,7 +77,7 @@ class Facts:
         that died, since the last look
     failing : why the last solve failed; empty where it did not
     memory_is_short : the process has more than ``health.memory_mib``
-    authorities : other nodes that broadcast map -> odom, if somebody does
+    authorities : other nodes that publish /tf, one of which broadcasts map -> odom, if somebody does
     tf_behind_s : how much earlier than the last map -> odom would be dated now, so that it is not sent
     preparing : what keeps the pipeline from beginning: kernels are compiled or loaded; empty when they are ready
     cannot_prepare : why that failed
@@ -147,8 +147,9 @@ def _errors(facts: Facts) -> Iterator[str]:
     if facts.faults >= 100:
         yield f"{facts.faults} faults in callbacks in 10 s"
     if facts.has_other_authority:
-        who = ", ".join(facts.authorities) or "a node without a name"
-        yield f"somebody else broadcasts map -> odom: {who}"
+        who = ", ".join(facts.authorities)
+        several = f": one of {who}, which publish /tf: stop them one by one to find it"
+        yield "somebody else broadcasts map -> odom" + (several if len(facts.authorities) > 1 else who and f": {who}")
     if facts.twins:
         yield "another node has this node's name"
     if facts.is_stopped:

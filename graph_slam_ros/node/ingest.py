@@ -2,7 +2,7 @@
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
 from functools import partial
 from typing import Any
@@ -12,9 +12,10 @@ from rclpy.duration import Duration
 from rclpy.serialization import deserialize_message
 
 from graph_slam_ros.errors import GraphSlamError, message_of
+from graph_slam_ros.measurements.reasons import explain, remedy
 from graph_slam_ros.measurements.types import Closure, InitialPose, Measured
 from graph_slam_ros.messages import results, to_msg
-from graph_slam_ros.messages.from_msg import Decoder, MessageConverter, twist_of
+from graph_slam_ros.messages.from_msg import INITIAL_POSE, Decoder, MessageConverter, twist_of
 from graph_slam_ros.messages.inputs import uses
 from graph_slam_ros.messages.interfaces import typestore
 from graph_slam_ros.messages.message_class import message_class
@@ -26,12 +27,14 @@ from graph_slam_ros.node.publishing_clock import PublishingClock
 from graph_slam_ros.node.session import Session
 from graph_slam_ros.node.worker import Worker
 from graph_slam_ros.slam import Config, Control, Counters, Odometry
+from graph_slam_ros.slam.edits import SOURCE as EDITS
 from graph_slam_ros.slam.edits import removal
 from graph_slam_ros.slam.frontend.ingest_gate import IngestGate, Passage
 
 OnJump = Callable[[Passage, str, str], None]
 
 _PATIENCE_S = 1.0  # for the clock to reach a stamp
+_SHOWN = 80  # characters of a text that somebody has sent
 
 
 class Ingest:
@@ -192,7 +195,11 @@ class Ingest:
         future.add_done_callback(report)
 
     def _on_initial_pose(self, cdr: bytes) -> None:
-        for pose in self.converter.initial_pose(cdr):
+        before = self._counters.as_dict()
+        poses = self.converter.initial_pose(cdr)
+        if not poses:
+            self._log_counted(INITIAL_POSE, "initialpose: not used", before, self._counters)
+        for pose in poses:
             self.in_background(self.in_sequence([pose]))
 
     def _on_remove(self, message: Any) -> None:
@@ -201,7 +208,22 @@ class Ingest:
         except GraphSlamError as error:
             self._node.get_logger().warn(str(error))
             return
-        self.in_background(self.in_sequence([event]))
+        self._session.accept([event])
+
+        def remove() -> None:
+            before = self._session.slam.counters.as_dict()
+            self._session.process([event])
+            self._log_counted(EDITS, f"~/remove: {message.data[:_SHOWN]}", before, self._session.slam.counters)
+
+        self.in_background(self._worker.call(remove))
+
+    def _log_counted(self, source: str, what: str, before: Mapping[str, Mapping[str, int]], counters: Counters) -> None:
+        """Log each reason why not that has been counted since, in one line with its meaning and remedy."""
+        known = before.get(source, {})
+        for reason, times in counters.as_dict().get(source, {}).items():
+            if times > known.get(reason, 0) and reason != "removed":
+                mend = remedy(source, reason)
+                self._node.get_logger().warn(f"{what}: {explain(reason).meaning} ({reason}){mend and ': '}{mend}")
 
     # -- time --------------------------------------------------------------------------------------------------------
 

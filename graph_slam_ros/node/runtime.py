@@ -140,9 +140,10 @@ class Runtime:
         waiting, lost = self._session.leave()
         folder, log = self._node.config.output.folder, self._node.get_logger()
         if folder and (waiting or self._session.slam.processed):
+            what = f"while {waiting} measurements waited" if waiting else "before the last solve had ended"
             log.warn(
-                f"stopped while {waiting} measurements waited: all are in the journal; the next start completes the"
-                f" results, or graph_slam recover {folder}"
+                f"stopped {what}: all are in the journal; the next start completes the results, or graph_slam recover"
+                f" {folder}"
             )
         if lost:
             log.error(f"{lost} measurements are lost: they came while another run was to begin, and it had not yet")

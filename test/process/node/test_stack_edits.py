@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from live_drive import Drive, distance, earlier_run
 from live_nodes import ENVIRONMENT, finish, node, own_domain, replayed, results, robot, until
 from std_msgs.msg import String
@@ -38,6 +39,7 @@ def test_the_map_is_held_and_edited_while_the_node_runs_and_the_run_repeats(tmp_
     hears = "pose", "landmarks_estimate", "/diagnostics"
     with node(f"output.folder:={tmp_path / 'run'}", "inputs.reliable:=true") as n, robot(hears=hears) as r:
         remove = r.publisher("/graph_slam/remove", String)
+        given = r.publisher("initialpose", PoseWithCovarianceStamped)
         r.wait_for_node()
         drive = Drive()
         until(lambda: r.heard["landmarks_estimate"] and r.heard["pose"], drive.pace(r), "landmarks")
@@ -53,7 +55,11 @@ def test_the_map_is_held_and_edited_while_the_node_runs_and_the_run_repeats(tmp_
         at = r.heard["pose"][-1].pose.pose.position
         assert distance((at.x, at.y), drive.truth) < 1.0
         assert r.set({"map.localize": False}) == (True, "")
-        remove.publish(String(data="landmark nobody"))
+        wrong = PoseWithCovarianceStamped()
+        wrong.header.frame_id, wrong.pose.pose.orientation.w = "odom", 1.0
+        for _ in range(2):
+            remove.publish(String(data="landmark nobody"))
+            given.publish(wrong)
         remove.publish(String(data="everything, please"))
         remove.publish(String(data=f"landmark {min(held)}"))
         gone = lambda: min(held) not in places(r.heard["landmarks_estimate"][-1])  # noqa: E731
@@ -62,7 +68,11 @@ def test_the_map_is_held_and_edited_while_the_node_runs_and_the_run_repeats(tmp_
         r.settle()
         finish(n, r)
     assert "neither 'edge ID' nor 'landmark NAME'" in n.said
-    assert counters(tmp_path / "run")["edit"] == {"removed": 1, "unknown_landmark": 1}
+    why = "~/remove named a landmark that is not in the map (unknown_landmark): ros2 topic echo"
+    assert n.said.count(f"~/remove: landmark nobody: {why}") == 2, "each time"
+    assert f"~/remove: landmark {min(held)}" not in n.said
+    assert n.said.count("initialpose: not used: ") == 2, "each time"
+    assert counters(tmp_path / "run")["edit"] == {"removed": 1, "unknown_landmark": 2}
     assert replayed(tmp_path / "run", tmp_path) == results(tmp_path / "run")
 
 

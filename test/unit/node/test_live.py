@@ -362,6 +362,16 @@ def refused(came, **reasons):
             "ERROR",
             "somebody else broadcasts map -> odom: /amcl",
         ),
+        (
+            Facts("active", (odom(),), has_other_authority=True, authorities=("/amcl", "/wheels")),
+            "ERROR",
+            "somebody else broadcasts map -> odom: one of /amcl, /wheels, which publish /tf: stop them one by one",
+        ),
+        (
+            Facts("active", (odom(),), has_other_authority=True, twins=1),
+            "ERROR",
+            "somebody else broadcasts map -> odom; another node has this node's name",
+        ),
         (Facts("active", (odom(),), twins=1), "ERROR", "another node has this node's name"),
         (Facts("active", (odom(),), is_stopped=True), "ERROR", "stopped when the clock jumped back"),
     ],
