@@ -120,6 +120,9 @@ class Columns:
 class _Topic:
     def __init__(self, name: str, type_name: str, inputs: tuple[str, ...], use: str, offset_ns: int) -> None:
         self.name, self.type, self.inputs, self.use, self.offset_ns = name, type_name, inputs, use, offset_ns
+        self.begin_anew()
+
+    def begin_anew(self) -> None:
         self.log_ns, self.stamp_ns = array("q"), array("q")
         self.frames: dict[str, int] = {}
 
@@ -163,15 +166,23 @@ class Collector:
         self._sightings = {name: SightingCollector(name, topics[name], mounts[name]) for name in seen}
         self._frame_of = {name: by_name[name].frame for name in used}
         self._odometry_topic = topics.get(self._main, "")
-        self._frame, self._child = "", ""
-        self._odometry_ns, self._numbers = array("q"), array("d")
-        self._path_ns, self._path = array("q"), array("d")
-        self._tf_ns, self._tf_path = array("q"), array("d")
-        self._gyro_ns, self._gyro, self._gyro_frame = array("q"), array("d"), ""
+        self._frame, self._child, self._gyro_frame = "", "", ""
+        self.begin_anew()
         self._links: dict[tuple[str, str, bool], Link] = {}
         self._first: dict[tuple[str, str], se3.Pose] = {}
         self._transforms = Transforms()
         self._last: Any = None
+
+    def begin_anew(self) -> None:
+        """Drop all numbers; frames, and the places of sensors, stay."""
+        for topic in self._topics.values():
+            topic.begin_anew()
+        for seen in self._sightings.values():
+            seen.begin_anew()
+        self._odometry_ns, self._numbers = array("q"), array("d")
+        self._path_ns, self._path = array("q"), array("d")
+        self._tf_ns, self._tf_path = array("q"), array("d")
+        self._gyro_ns, self._gyro = array("q"), array("d")
 
     def decoder(self, decode: Decoder) -> Decoder:
         """The same decoder, of which the message is remembered until it is collected."""

@@ -53,6 +53,10 @@ class SightingCollector:
     def __init__(self, name: str, topic: str, mount: Numbers) -> None:
         self.input, self.topic, self._mount = name, topic, mount
         self.frame, self.T_base_frame = "", se3.IDENTITY
+        self.begin_anew()
+
+    def begin_anew(self) -> None:
+        """Drop all sightings."""
         self.stamp_ns, self.message, self.name = array("q"), array("q"), array("q")
         self.points, self.ranges, self.sigmas = array("d"), array("d"), array("d")
         self.names: dict[str, int] = {}

@@ -13,7 +13,7 @@ from graph_slam_ros.measurements.reasons import explain, remedy
 from graph_slam_ros.messages.to_msg import ERROR, OK, WARN, Status
 from graph_slam_ros.node.estimate import OFF, Estimate
 from graph_slam_ros.node.recent import WINDOW_S, Recent
-from graph_slam_ros.runs.outcome import MOTION
+from graph_slam_ros.runs.outcome import MOTION, leaves_plane
 from graph_slam_ros.runs.tables import INPUT_COLUMNS
 
 _LEVELS = {"WAITING": WARN, "DEGRADED": WARN, "ERROR": ERROR}  # the others are as somebody wants them
@@ -78,6 +78,7 @@ class Facts:
     failing : why the last solve failed; empty where it did not
     memory_is_short : the process has more than ``health.memory_mib``
     authorities : other nodes that publish /tf, one of which broadcasts map -> odom, if somebody does
+    findings : what is wrong with the inputs by a check that needs no fit, each with what mends it
     tf_behind_s : how much earlier than the last map -> odom would be dated now, so that it is not sent
     preparing : what keeps the pipeline from beginning: kernels are compiled or loaded; empty when they are ready
     cannot_prepare : why that failed
@@ -106,6 +107,7 @@ class Facts:
     has_other_authority: bool = False
     authorities: tuple[str, ...] = ()
     twins: int = 0
+    findings: tuple[str, ...] = ()
     tf_behind_s: float = 0.0
     preparing: str = ""
     cannot_prepare: str = ""
@@ -245,10 +247,24 @@ def _faults(facts: Facts, config: Config) -> Iterator[str]:
     elif estimate and not estimate.is_confirmed:
         yield "where the robot is in the loaded map is not known yet"
     if estimate:
-        reasons = estimate.displaced, estimate.association, estimate.visits, estimate.uncorrected, estimate.motion
-        yield from filter(None, (*reasons, estimate.ambiguity))
-    if estimate and health.chi2_per_dof and estimate.fit > health.chi2_per_dof:
-        yield f"the measurements contradict each other: chi2 per degree of freedom is {estimate.fit:.1f}"
+        yield from map(_without_option, _of_measurements(facts, estimate, health.chi2_per_dof))
+
+
+def _of_measurements(facts: Facts, e: Estimate, chi2_per_dof: float) -> Iterator[str]:
+    """Yield what is wrong with what is measured. Where an input is wrong from the beginning, other faults are its."""
+    counted = ((one.name, one.counts, one.received) for one in facts.inputs if one.use in MOTION)
+    wrong = [*facts.findings, *filter(None, (leaves_plane(*of) for of in counted))]
+    yield from wrong
+    if not wrong:
+        yield from filter(None, (e.displaced, e.association, e.uncorrected, "" if e.displaced else e.doubted))
+    yield from filter(None, (e.visits, e.motion, e.ambiguity))
+    if not wrong and chi2_per_dof and e.fit > chi2_per_dof:
+        yield f"the measurements contradict each other: chi2 per degree of freedom is {e.fit:.1f}"
+
+
+def _without_option(text: str) -> str:
+    """Remove the option of the commands before parameters, which a node does not have."""
+    return text.replace("--set ", "")
 
 
 def _uncorrected(facts: Facts) -> Iterator[str]:

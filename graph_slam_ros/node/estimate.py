@@ -7,8 +7,15 @@ from typing import Any
 import numpy as np
 
 from graph_slam_ros.graph.geometry import Geometry
-from graph_slam_ros.runs.outcome import VISITS, ambiguities, association_faults, condensed_text, visit_faults
-from graph_slam_ros.runs.tables import condensed_part
+from graph_slam_ros.runs.outcome import (
+    VISITS,
+    ambiguities,
+    association_faults,
+    condensed_text,
+    contradicts,
+    visit_faults,
+)
+from graph_slam_ros.runs.tables import accepted_lately, condensed_part
 from graph_slam_ros.slam import GraphSlam
 from graph_slam_ros.slam.calibration.uncorrected import Uncorrected
 from graph_slam_ros.slam.solution import Correction
@@ -17,6 +24,7 @@ from graph_slam_ros.typing import Numbers
 
 OFF = "off, not corrected, in the covariances"
 _IN_TURN = 4  # landmarks whose covariance is computed anew at an update
+_FEWEST_JUDGED = 20  # edges of an input: of fewer nothing is said
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,6 +101,7 @@ class Estimate:
     unseen : the way since a landmark was seen
     weakest_landmark : the landmark that is known least, with its weakest direction; empty where none is known
     fit : chi2 per degree of freedom; NaN before it was looked at
+    doubted : inputs of which most measurements are not believed lately, and why that may be; empty where none is
     ambiguity : other explanations of the same measurements that could not be ruled out; empty where there is none
     displaced : that the landmarks say that the robot is elsewhere than odometry; empty where they do not
     association : why the association of sightings without identity is not to be believed; empty if it is
@@ -122,6 +131,7 @@ class Estimate:
     slowest_solve_s: float
     fit: float
     unseen: UnseenWay
+    doubted: str = ""
     weakest_landmark: str = ""
     displaced: str = ""
     association: str = ""
@@ -161,6 +171,7 @@ class Estimate:
         solve_s: float,
         slowest_solve_s: float,
         fit: float,
+        doubted: str,
         unseen: UnseenWay,
         weakest_landmark: str = "",
     ) -> "Estimate":
@@ -182,6 +193,7 @@ class Estimate:
             solve_s=solve_s,
             slowest_solve_s=slowest_solve_s,
             fit=fit,
+            doubted=doubted,
             unseen=unseen,
             weakest_landmark=weakest_landmark,
             displaced=str(slam.displaced or ""),
@@ -195,6 +207,12 @@ class Estimate:
             is_resumed=is_resumed,
             calibration=_calibration(slam.calibration_report, slam.contradicted),
         )
+
+
+def doubted_lately(slam: GraphSlam) -> str:
+    """Say of which inputs most measurements are not believed lately, and why that may be; empty where of none."""
+    lately = ((name, *of) for name, of in accepted_lately(slam).items() if of[1] >= _FEWEST_JUDGED)
+    return "; ".join(filter(None, (contradicts(*of) for of in lately)))
 
 
 def _settings(one: Uncorrected) -> list[str]:

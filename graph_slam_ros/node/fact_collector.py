@@ -56,6 +56,8 @@ class FactCollector:
         session, node, worker, gate = self._session, self._node, self._worker, self._ingest.gate
         if not worker.waiting and node.now_ns:
             worker.offer(session.evaluate)
+            if (check := self._ingest.check.job()) is not None:
+                worker.offer(check)
         pipeline = Counters()
         pipeline.update(session.slam.counters)
         counters = Counters()
@@ -90,6 +92,7 @@ class FactCollector:
             has_other_authority=rivals is not None,
             authorities=rivals or (),
             twins=node.get_node_names_and_namespaces().count((node.get_name(), node.get_namespace())) - 1,
+            findings=self._ingest.check.findings,
             tf_behind_s=broadcaster.behind_s if broadcaster is not None else 0.0,
             preparing=preparation.status,
             cannot_prepare=preparation.fault,

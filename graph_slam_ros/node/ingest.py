@@ -20,6 +20,7 @@ from graph_slam_ros.messages.inputs import uses
 from graph_slam_ros.messages.interfaces import typestore
 from graph_slam_ros.messages.message_class import message_class
 from graph_slam_ros.node.handle import NodeHandle
+from graph_slam_ros.node.input_check import InputCheck
 from graph_slam_ros.node.memory import is_short
 from graph_slam_ros.node.pose_extrapolator import PoseExtrapolator
 from graph_slam_ros.node.publishers import Publishers
@@ -50,6 +51,7 @@ class Ingest:
 
     Attributes
     ----------
+    check : checks what is measured while the robot drives
     converter : makes measurements of messages
     gate : decides what a jump of time, a pause and a full queue mean
     extrapolator : the pose by the newest odometry
@@ -70,7 +72,9 @@ class Ingest:
         self._node, self._session, self._worker = node, session, worker
         self._publishers, self._clock, self._on_jump = publishers, clock, on_jump
         self._counters = counters
-        self.converter = MessageConverter(config, counters, _installed(config))
+        topics = {one.name: _full_topic(node, one.topic) for one in config.sources if one.name in uses(config)}
+        self.check = InputCheck(config, topics, counters)
+        self.converter = MessageConverter(config, counters, self.check.decoders(_installed(config)))
         self.converter.on_fault = node.get_logger().error
         self.gate = IngestGate(config.time.jump_back_s, counters, lambda: node.now_ns)
         self.extrapolator = PoseExtrapolator(config)
@@ -230,6 +234,7 @@ class Ingest:
     def forget_time(self) -> None:
         """Forget everything that depends on stamps: the next stamps belong to another time."""
         self.converter.forget_time()
+        self.check.forget()
         self.extrapolator.forget()
 
     def _stamp_clock_ns(self) -> int:
@@ -296,6 +301,14 @@ class FutureStamps:
     def forget_time(self) -> None:
         """Begin anew with the clock."""
         self._until_ns = 0
+
+
+def _full_topic(node: NodeHandle, topic: str) -> str:
+    """The full name of a topic; as it is where it is not valid, which the activation refuses."""
+    try:
+        return node.resolve_topic_name(topic)
+    except Exception:  # rclpy raises what differs by version
+        return topic
 
 
 def _installed(config: Config) -> dict[str, Decoder]:

@@ -92,6 +92,7 @@ class Runtime:
             config,
             input_topics(node, config),
             ingest.converter,
+            ingest.check.add,
             ingest.receive,
             node.guarded,
             self._broadcaster.on_correction,

@@ -15,7 +15,7 @@ import numpy as np
 
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.measurements.types import END, InitialPose
-from graph_slam_ros.node.estimate import Estimate, UnseenWay, WeakestLandmark
+from graph_slam_ros.node.estimate import Estimate, UnseenWay, WeakestLandmark, doubted_lately
 from graph_slam_ros.node.resumption import Resumption
 from graph_slam_ros.node.threads import run_in_thread
 from graph_slam_ros.runs.folder import (
@@ -88,6 +88,7 @@ class Session:
         self._unseen, self._weakest = UnseenWay(self._loaded, slam.landmark_changes), WeakestLandmark()
         self._slowest_s = 0.0
         self._fit, self._fitted_at, self._fit_due_s = float("nan"), 0, 0.0
+        self._doubted = ""
 
     def _warn_first(self, source: str, reason: str) -> None:
         """Log a reason when it is first counted, with the error of a plugin if that is the reason."""
@@ -191,6 +192,7 @@ class Session:
             solve_s=solve_s,
             slowest_solve_s=self._slowest_s,
             fit=self._fit,
+            doubted=self._doubted,
             unseen=self._unseen,
             weakest_landmark=self._weakest.goes_on(slam),
         )
@@ -202,15 +204,15 @@ class Session:
         return float(covariance[0, 0] + covariance[1, 1]) ** 0.5 < _CONFIRMED * self.slam.config.odometry.jump_sigma_m
 
     def evaluate(self) -> None:
-        """Compute how well all measurements fit, when idle, in at most a fiftieth of the time."""
+        """Compute how well all measurements fit, and which are not believed, when idle, in a fiftieth of the time."""
         if self.estimate is None or self._fitted_at == self.slam.solves or time.perf_counter() < self._fit_due_s:
             return
         start = time.perf_counter()
         now, dof = self.slam.solver.evaluate(), self.slam.solver.degrees_of_freedom
         self._fit = now.chi2_final / dof if dof > 0 else float("nan")
-        self._fitted_at = self.slam.solves
+        self._doubted, self._fitted_at = doubted_lately(self.slam), self.slam.solves
         self._fit_due_s = start + 50.0 * (time.perf_counter() - start)
-        self.estimate = replace(self.estimate, fit=self._fit)
+        self.estimate = replace(self.estimate, fit=self._fit, doubted=self._doubted)
 
     # -- services ----------------------------------------------------------------------------------------------------
 

@@ -25,6 +25,7 @@ from graph_slam_ros.slam import Config, Counters
 
 Callback = Callable[..., None]
 Guard = Callable[[Callback], Callback]
+Collect = Callable[[str, Sequence[str], int, Sequence[Measured]], None]
 Receive = Callable[[Sequence[Measured], bytes], None]
 _STATIC = InputQos(100, "/tf_static", "/tf_static")
 
@@ -52,6 +53,7 @@ class Subscriptions:
     ----------
     topics : the topics of the inputs, and /tf
     converter : makes measurements of messages
+    collect : is called with each topic, its inputs, the time, and the measurements of each message
     receive : is called with the measurements of each message, which may be none, and the message
     guarded : makes a callback that raises nothing
     on_correction : is called with each transform from map
@@ -64,13 +66,14 @@ class Subscriptions:
         config: Config,
         topics: Sequence[InputTopic],
         converter: MessageConverter,
+        collect: Collect,
         receive: Receive,
         guarded: Guard,
         on_correction: Callable[[bytes], None],
         counters: Counters,
     ) -> None:
         self._node, self._config, self._converter = node, config, converter
-        self._receive, self._guarded, self._on_correction = receive, guarded, on_correction
+        self._collect, self._receive, self._guarded, self._on_correction = collect, receive, guarded, on_correction
         self._counters = counters
         self._subscriptions: list[Any] = []
         self._topics: dict[str, _Received] = {}
@@ -108,6 +111,7 @@ class Subscriptions:
                 self._converted[name] += len(given)
                 measured += given
             self._receive(measured, cdr)
+            self._collect(topic.name, names, self._node.now_ns, measured)
 
         def on_lost(event: Any) -> None:
             if event.total_count_change:  # rclpy reports some events twice

@@ -213,11 +213,11 @@ def shortcomings(summary: Summary) -> Iterator[str]:
             yield _unused(summary, name, counts["received"])
         elif refused > _MOSTLY * (refused + counts["used"]):
             yield f"{name}: most of it was refused: {_because(name, counted)}"
-        elif not is_odometry and (counts["believed"] or 0) < _MOSTLY * counts["used"]:
-            yield f"{name}: only {counts['believed'] or 0} of {counts['used']} are believed: {_CONTRADICT.format(name)}"
-        out_of_plane = summary["counters"].get(name, {}).get("out_of_plane", 0)
-        if is_odometry and out_of_plane > _OUT_OF_PLANE * (counts["received"] or counts["used"]):
-            yield f"{name} leaves the plane: these are three dimensions: --set world.dimensions=3"
+        elif not is_odometry and (why := contradicts(name, counts["believed"] or 0, counts["used"])):
+            yield why
+        if is_odometry:
+            counted = summary["counters"].get(name, {})
+            yield from filter(None, (leaves_plane(name, counted, counts["received"] or counts["used"]),))
         jumps = sum(of.get("jump", 0) for one, of in summary["counters"].items() if one.partition("#")[0] == name)
         if is_odometry and jumps > max(_MOST_JUMPS, _JUMPY * (counts["received"] or counts["used"])):
             yield (
@@ -233,6 +233,20 @@ def shortcomings(summary: Summary) -> Iterator[str]:
         )
     elif summary["landmarks"] and summary["sightings"] == summary["landmarks"]:
         yield "no landmark was seen twice, so they correct nothing: do ids change? --set landmarks.association=joint"
+
+
+def contradicts(name: str, accepted: int, count: int) -> str:
+    """Return why an input is of little use if less than half of its measurements are believed; else empty."""
+    if accepted >= _MOSTLY * count:
+        return ""
+    return f"{name}: only {accepted} of {count} are believed: {_CONTRADICT.format(name)}"
+
+
+def leaves_plane(name: str, counted: Mapping[str, int], received: int) -> str:
+    """Return that an odometry is not of a plane, if many of its poses are outside; else empty."""
+    if counted.get("out_of_plane", 0) <= _OUT_OF_PLANE * received:
+        return ""
+    return f"{name} leaves the plane: these are three dimensions: --set world.dimensions=3"
 
 
 def association_faults(found: Mapping[str, Any]) -> Iterator[str]:

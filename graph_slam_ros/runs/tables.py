@@ -2,7 +2,7 @@
 
 import itertools
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any, TypeVar
 
@@ -13,6 +13,7 @@ from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.g2o_writer import g2o_text
 from graph_slam_ros.formats.graph_file import G2oFile
 from graph_slam_ros.formats.tum import tum_text
+from graph_slam_ros.graph.tables import EdgeTable
 from graph_slam_ros.messages import results
 from graph_slam_ros.messages.inputs import recorded_uses
 from graph_slam_ros.runs.folder import COVARIANCES, GRAPH, LANDMARKS, ODOMETRY, PATH, PATH_ODOMETRY, SIGHTINGS, VERTICES
@@ -25,8 +26,10 @@ from graph_slam_ros.slam.lifelong.removed import Left, seen_from
 from graph_slam_ros.slam.lifelong.state import BoundedState
 from graph_slam_ros.slam.robust.gating import CANDIDATES
 from graph_slam_ros.slam.robust.ledger import INSIDE, Verdict
+from graph_slam_ros.typing import Mask
 
 Name = TypeVar("Name")
+_LATELY = 400  # edges
 _TANGENT = {3: ("x", "y", "theta"), 6: ("x", "y", "z", "rx", "ry", "rz")}
 _POSE = {3: "x,y,theta", 6: "x,y,z,qx,qy,qz,qw"}
 
@@ -197,21 +200,44 @@ def _times(value: Any) -> int:
     return value
 
 
+def accepted_lately(slam: GraphSlam) -> dict[str, tuple[int, int]]:
+    """Return by input how many of its edges among the newest of the graph are believed, and how many there are."""
+    first = slam.graph.edge_count - _LATELY
+    accepted, judged = _by_input(slam, lambda table: np.asarray(table.id.values >= first))
+    return {name: (accepted[name], times) for name, times in judged.items()}
+
+
 def _accepted_by_input(slam: GraphSlam, first: int) -> Counter[str]:
     """Accepted edges of landmarks, fixes and closures by input that were judged first at a keyframe or later."""
-    out = Counter[str]()
+    keyframes = slam.ledger.keyframe.values
+
+    def is_since(table: EdgeTable) -> Mask:
+        ids, out = table.id.values, np.ones(len(table.id.values), dtype=bool)
+        judged = ids < len(keyframes)
+        out[judged] = keyframes[ids[judged]] >= first
+        return out
+
+    accepted, _ = _by_input(slam, is_since)
+    return accepted
+
+
+def _by_input(slam: GraphSlam, chosen: Callable[[EdgeTable], Mask]) -> tuple[Counter[str], Counter[str]]:
+    """Edges of landmarks, fixes and closures by input, of the chosen ones: those that are accepted, and all."""
+    accepted, judged = Counter[str](), Counter[str]()
     inside = [Verdict.NOT_EVALUATED, *INSIDE]
-    verdicts, keyframes = slam.ledger.verdict.values, slam.ledger.keyframe.values
-    made = list(slam.bounded.made) if slam.bounded else []
+    verdicts, sources = slam.ledger.verdict.values, slam.graph.sources
+    is_candidate = np.array([label in CANDIDATES for label in slam.graph.labels], dtype=bool)
+    made = list(slam.bounded.made) if slam.bounded else []  # by condensing, of closures that are counted
     for table in slam.graph.tables.values():
-        labels = np.array([label in CANDIDATES for label in slam.graph.labels], dtype=bool)
-        ids = table.id.values
-        chosen = labels[table.label.values] & ~np.isin(slam.graph.edge_ids.of_all(ids), made)
-        judged = chosen & (ids < len(verdicts))
-        chosen[judged] = np.isin(verdicts[ids[judged]], inside) & (keyframes[ids[judged]] >= first)
-        for code, count in zip(*np.unique(table.at(np.flatnonzero(chosen)).source, return_counts=True), strict=True):
-            out[slam.graph.sources[code]] += int(count)
-    return out
+        is_measured = ~np.isin(slam.graph.edge_ids.of_all(table.id.values), made)
+        rows = np.flatnonzero(is_candidate[table.label.values] & is_measured & chosen(table))
+        ids = table.id.values[rows]
+        is_in = ids >= len(verdicts)
+        is_in[~is_in] = np.isin(verdicts[ids[~is_in]], inside)
+        for counts, some in ((accepted, rows[is_in]), (judged, rows)):
+            for code, count in zip(*np.unique(table.at(some).source, return_counts=True), strict=True):
+                counts[sources[code]] += int(count)
+    return accepted, judged
 
 
 def _drives(slam: GraphSlam) -> list[dict[str, int]]:

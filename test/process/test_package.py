@@ -126,7 +126,7 @@ WITHIN = {
     "fleet": {"graph", "solver", "formats", "config", "slam", "runs", "analysis", "report", "simulation"},
     "node": {
         *("graph", "warmup", "formats", "measurements", "config", "slam", "slam/frontend", "slam/robust"),
-        *("slam/calibration", "messages", "messages/inputs", "recordings", "runs"),
+        *("slam/calibration", "messages", "messages/inputs", "recordings", "check", "runs"),
     },
     "cli": {
         *("progress", "warmup", "graph", "solver", "optimization", "certificate", "formats", "config"),

@@ -56,9 +56,10 @@ def test_A34_two_publishers_of_an_odometry_are_named_and_the_robot_stays_where_i
 # -- what is refused ---------------------------------------------------------------------------------------------------
 
 
-def seen(drive, ids=True, covariance=0.01, **options):
+def seen(drive, ids=True, covariance=0.01, unit=1.0, **options):
     """What a robot sees now of the tags."""
-    here = [(name, se2.act(se2.inverse(drive.truth), at)) for name, at in TAGS.items()]
+    local = {name: se2.act(se2.inverse(drive.truth), at) for name, at in TAGS.items()}
+    here = [(name, (unit * x, unit * y)) for name, (x, y) in local.items()]
     of = [detection(pose(*map(float, at)), np.eye(2) * covariance, name if ids else "") for name, at in here]
     return detections(*of, **{"stamp_ns": drive.stamp_ns, **options})
 
@@ -112,6 +113,22 @@ def test_a_topic_that_nobody_publishes_is_named_once_nothing_corrects_odometry_w
         nobody = r.publisher("/landmarks", Detection3DArray)
         r.until_it_says("OK", spin=drive.pace(r))
         assert tags and nobody, "they are quiet"
+        assert n.stop()[0] == 0
+
+
+def test_landmarks_in_millimetres_are_named_while_the_robot_drives_and_not_what_follows_from_them():
+    with node("output.folder:=''", "inputs.reliable:=true") as n, robot(hears=("/diagnostics",)) as r:
+        r.wait_for_node()
+        drive = Drive()
+        drive.sees = False
+
+        def in_millimetres(seconds):
+            r.send("/landmarks", seen(drive, unit=1000.0))
+            drive.pace(r)(seconds)
+
+        r.until_it_says("DEGRADED", "units: /landmarks: the median distance of landmarks is", spin=in_millimetres)
+        assert "elsewhere" not in str(r.verdict), "they say that the robot was carried"
+        assert "correct the driver (REP 103" in str(r.verdict)
         assert n.stop()[0] == 0
 
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from messages import STAMP_NS
 
-from graph_slam_ros.lie import so3
+from graph_slam_ros.lie import se2, so3
 from graph_slam_ros.node import diagnostics
 from graph_slam_ros.node.diagnostics import Facts, InputFacts, judge, statuses
-from graph_slam_ros.node.estimate import WeakestLandmark
+from graph_slam_ros.node.estimate import WeakestLandmark, doubted_lately
 from graph_slam_ros.node.ingest import FutureStamps
 from graph_slam_ros.node.map_to_odom import MapToOdom
 from graph_slam_ros.node.pose_extrapolator import PoseExtrapolator
@@ -21,6 +21,7 @@ from graph_slam_ros.node.recent import Recent, RecentInputs
 from graph_slam_ros.node.session import Session
 from graph_slam_ros.node.throttle import Throttle
 from graph_slam_ros.node.worker import Worker
+from graph_slam_ros.runs.tables import accepted_lately
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Odometry, Sighting, Sightings
 
 NS = 1_000_000_000
@@ -444,6 +445,38 @@ def test_a_topic_that_nobody_publishes_is_a_warning_of_its_input():
         facts = Facts("active", (odom(received=9, silent_s=0.0), one), estimate)
         (status,) = (s for s in statuses(facts, judge(facts, Config()), "slam") if s.name == "slam: input tags")
         assert (status.level, status.message) == (level, message)
+
+
+def test_where_an_input_is_wrong_from_the_beginning_it_is_the_reason_and_not_what_follows():
+    follows = {"displaced": "elsewhere", "uncorrected": "clock_offset", "doubted": "only 1 of 9", "association": "lost"}
+    estimate = replace(round_a_curve(2, 3.2).estimate, **follows, fit=99.0, visits="3 of 9 visits")
+    facts, at_work = Facts("active", (odom(received=100, silent_s=0.0),), estimate), Config()
+    assert judge(facts, at_work).reasons[:3] == ("elsewhere", "lost", "clock_offset")
+    assert judge(replace(facts, estimate=replace(estimate, displaced="")), at_work).reasons[2] == "only 1 of 9"
+    named = judge(replace(facts, findings=("units: metres?",)), at_work)
+    assert named.reasons == ("units: metres?", "3 of 9 visits")
+    tilted = odom(received=100, silent_s=0.0, counts={"out_of_plane": 6})
+    reasons = judge(replace(facts, inputs=(tilted,)), at_work).reasons
+    assert reasons == ("odom leaves the plane: these are three dimensions: world.dimensions=3", "3 of 9 visits")
+
+
+def test_an_input_of_which_most_is_not_accepted_lately_is_named():
+    robot = round_a_curve(2, 0.4)
+    for k in range(20, 60):
+        at = (5.0, 1.0) if k < 26 else (5.0 + 3.0 * (k % 3), 9.0 - 4.0 * (k % 2))
+        robot.ingest([drive(2, k)])
+        local = se2.act(se2.inverse(drive(2, k).T_odom_base), at)
+        tag = Sighting("a", "position", tuple(map(float, local)), (1e-4, 0.0, 0.0, 1e-4))
+        robot.ingest([Sightings(drive(2, k).stamp_ns, "tags", (tag,))])
+        if k == 26:
+            assert doubted_lately(robot.slam) == "", "of a few nothing is said"
+    believed, count = accepted_lately(robot.slam)["tags"]
+    assert believed < 0.5 * count
+    robot.evaluate()
+    said = robot.estimate.doubted
+    assert said.startswith(f"tags: only {believed} of {count} are believed: graph_slam explain RUN says why. ")
+    (reason,) = (one for one in judge(Facts("active", (), robot.estimate), Config()).reasons if "believed" in one)
+    assert "--set" not in reason and "tags.noise=sigmas tags.sigma_m=..." in reason
 
 
 def driven(metres, every_s=1.0, sees=()):

@@ -1,0 +1,91 @@
+"""The check of the inputs while the robot drives: units, axes and identities that contradict odometry.
+
+It is that of a replay before it begins (``check.checks.first_of_replay``), again and again, of the last minutes.
+"""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+
+from graph_slam_ros.check.checks import first_of_replay
+from graph_slam_ros.check.columns import Collector, Columns
+from graph_slam_ros.check.finding import KINDS, Finding
+from graph_slam_ros.measurements.counters import Counters
+from graph_slam_ros.measurements.types import Measured, Odometry
+from graph_slam_ros.messages.from_msg import TF, TF_STATIC, TRANSFORMS, Decoder, decoder
+from graph_slam_ros.messages.inputs import uses
+from graph_slam_ros.slam import Config
+
+_APART_NS = 50_000_000  # of stamps of odometry that are collected
+_MOST_POSES, _MOST_SIGHTINGS = 3_000, 20_000  # that are checked at once: minutes
+_LEAST = 30  # sightings or pairs of a finding
+_PERIOD_S, _SPARE = 3.0, 50.0  # between two checks; of the worker's time, one part
+
+
+class InputCheck:
+    """Collects what is measured, and checks it while the worker is idle.
+
+    Parameters
+    ----------
+    topics : full names of the topics of the inputs, by input
+
+    Attributes
+    ----------
+    findings : what is wrong with an input, and what mends it; empty where nothing is known to be wrong
+    """
+
+    def __init__(self, config: Config, topics: Mapping[str, str], counters: Counters) -> None:
+        self._collector = Collector(config, {**topics, TF_STATIC: "/tf_static"})
+        self._counters = counters
+        used = uses(config)
+        self._types = {one.type for one in config.sources if used.get(one.name) == "landmarks"} | {TRANSFORMS}
+        self._last_ns: dict[str, int] = {}
+        self._due_s = 0.0
+        self.findings: tuple[str, ...] = ()
+
+    def decoders(self, installed: Mapping[str, Decoder]) -> dict[str, Decoder]:
+        """Return these decoders and those of landmarks, whose messages are collected, too."""
+        seen = {name: self._collector.decoder(installed.get(name) or decoder(name)) for name in self._types}
+        return dict(installed) | seen
+
+    def add(self, topic: str, names: Sequence[str], now_ns: int, measured: Sequence[Measured]) -> None:
+        """Collect what a message of these inputs has measured; of odometry, a part is enough."""
+        some = [m for m in measured if not isinstance(m, Odometry) or self._is_next(m)]
+        self._collector.add(topic, [name for name in names if name != TF], now_ns, some)
+
+    def forget(self) -> None:
+        """Begin anew, with other stamps."""
+        self._collector.begin_anew()
+        self._last_ns.clear()
+
+    def job(self) -> Callable[[], None] | None:
+        """Return the next check, for the worker's thread; None if none is due."""
+        if time.monotonic() < self._due_s:
+            return None
+        self._due_s = time.monotonic() + _PERIOD_S
+        columns = self._collector.columns(self._counters)
+        sightings = sum(len(one.stamp_ns) for one in columns.sightings)
+        is_full = len(columns.path_ns) >= _MOST_POSES or sightings >= _MOST_SIGHTINGS
+        if is_full:
+            self.forget()
+        return partial(self._check, columns, is_full=is_full)
+
+    def _is_next(self, m: Odometry) -> bool:
+        if abs(m.stamp_ns - self._last_ns.get(m.source, 0)) < _APART_NS:
+            return False
+        self._last_ns[m.source] = m.stamp_ns
+        return True
+
+    def _check(self, columns: Columns, *, is_full: bool) -> None:
+        """Replace the findings. That nothing is wrong is believed of a full collection only."""
+        begun = time.monotonic()
+        found = first_of_replay(columns, is_whole=False)
+        if found is not None and found.count >= _LEAST:
+            self.findings = (_text(found),)
+        elif is_full:
+            self.findings = ()
+        self._due_s += _SPARE * (time.monotonic() - begun)
+
+
+def _text(found: Finding) -> str:
+    return f"{found.code}: {found.text}: {' '.join(found.settings) or KINDS[found.code].mend}"
