@@ -20,6 +20,8 @@ _LEVELS = {"WAITING": WARN, "DEGRADED": WARN, "ERROR": ERROR}  # the others are 
 _TF_BEHIND_S = 1.0
 _UNSEEN_M, _UNSEEN_S = 10.0, 10.0
 _LONGEST = 80  # of a frame's name
+_LATE_S, _PLAYED_S = 0.3, 10.0  # later still, a recording is played without /clock
+_NO_CLOCK = "use_sim_time is set and nothing comes on /clock"
 _UNLINKED = ("frame_unknown", "child_frame_unknown", "odom_frame_unknown", "map_frame_unknown")
 
 
@@ -38,6 +40,7 @@ class InputFacts:
     frames : those of its messages that nothing links to the robot, the last ones, each with the robot's
     recent : what became of it in the last seconds
     not_found : of odometry on /tf, the transform that has never come, and what mends that
+    late_s : the least time from a stamp to its arrival, of the last messages; NaN where none came, or no clock runs
     alternatives : where nobody publishes it, other topics that it could use, each with the parameter that chooses it
     """
 
@@ -55,6 +58,7 @@ class InputFacts:
     recent: Recent = field(default_factory=Recent)
     not_found: str = ""
     alternatives: tuple[str, ...] = ()
+    late_s: float = math.nan
 
     @property
     def unpublished(self) -> str:
@@ -167,8 +171,8 @@ def _missing(facts: Facts) -> Iterator[str]:
     if facts.loads:
         yield f"loads the map of {facts.loads}"
         return
-    if facts.waits_for_clock:
-        yield "use_sim_time is set and nothing comes on /clock"
+    if facts.waits_for_clock and facts.estimate is None:
+        yield _NO_CLOCK
     for one in facts.inputs:
         if facts.estimate is None and one.use == "odometry":
             yield from _silence(one)
@@ -217,6 +221,10 @@ def _faults(facts: Facts, config: Config) -> Iterator[str]:
             yield f"{one.topic}: {one.not_found or f'silent for {one.silent_s:.1f} s'}"
         elif one.recent.is_bad and not (one.is_contested and one.recent.worst == "other_publisher"):
             yield f"{one.topic}: {_refused(one)}"
+        if one.use == "odometry" and config.tf.stamp == "odometry" and config.tf.publish_tf:
+            yield from _lateness(one, max(_LATE_S, config.tf.transform_tolerance))
+    if facts.waits_for_clock:
+        yield f"{_NO_CLOCK}: no input counts as silent or late; use_sim_time:=false, or start what publishes /clock"
     yield from _uncorrected(facts)
     if facts.is_paused:
         yield "paused"
@@ -248,6 +256,15 @@ def _faults(facts: Facts, config: Config) -> Iterator[str]:
         yield "where the robot is in the loaded map is not known yet"
     if estimate:
         yield from map(_without_option, _of_measurements(facts, estimate, health.chi2_per_dof))
+
+
+def _lateness(one: InputFacts, most_s: float) -> Iterator[str]:
+    if most_s < one.late_s < _PLAYED_S:
+        yield (
+            f"{one.topic}: comes {one.late_s:.1f} s after its stamps, and so does map -> odom:"
+            f" tf.transform_tolerance:={math.ceil(10.0 * one.late_s + 1.0) / 10.0:.1f} dates it ahead;"
+            f" {one.name}.offset_s for a clock that differs"
+        )
 
 
 def _of_measurements(facts: Facts, e: Estimate, chi2_per_dof: float) -> Iterator[str]:
@@ -290,6 +307,7 @@ def statuses(facts: Facts, verdict: Health, node: str) -> Iterator[Status]:
         values |= {INPUT_COLUMNS["received"]: str(one.received), INPUT_COLUMNS["used"]: str(one.used)}
         values |= {"came in 10 s": str(one.recent.came), "refused in 10 s": str(one.recent.times)}
         values |= {"silent [s]": f"{one.silent_s:.1f}", "publishers": ", ".join(one.publishers)}
+        values |= {"late [s]": f"{one.late_s:.2f}"} if math.isfinite(one.late_s) else {}
         values |= {f"counted: {reason}": str(times) for reason, times in sorted(one.counts.items())}
         is_wrong = one.mismatch or one.is_contested or one.recent.is_bad
         is_absent = not one.received and (one.use == "odometry" or not one.publishers)

@@ -56,8 +56,8 @@ class FactCollector:
         session, node, worker, gate = self._session, self._node, self._worker, self._ingest.gate
         if not worker.waiting and node.now_ns:
             worker.offer(session.evaluate)
-            if (check := self._ingest.check.job()) is not None:
-                worker.offer(check)
+        if not worker.waiting and (check := self._ingest.check.job()) is not None:
+            worker.offer(check)
         pipeline = Counters()
         pipeline.update(session.slam.counters)
         counters = Counters()

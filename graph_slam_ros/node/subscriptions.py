@@ -22,6 +22,7 @@ from graph_slam_ros.node.handle import NodeHandle
 from graph_slam_ros.node.qos import InputQos, InputTopic
 from graph_slam_ros.node.recent import Recent
 from graph_slam_ros.slam import Config, Counters
+from graph_slam_ros.slam.frontend.ingest_gate import input_of
 
 Callback = Callable[..., None]
 Guard = Callable[[Callback], Callback]
@@ -78,6 +79,7 @@ class Subscriptions:
         self._subscriptions: list[Any] = []
         self._topics: dict[str, _Received] = {}
         self._of_input: dict[str, InputTopic] = {}
+        self._late_ns: dict[str, int] = {}  # the least since the last facts
         self._on_tf: dict[str, _Received] = {}  # odometry there
         self._converted: Counter[str] = Counter()
         used = uses(config)
@@ -109,6 +111,7 @@ class Subscriptions:
             for name in names:
                 given = converter.convert(name, cdr)
                 self._converted[name] += len(given)
+                self._note_late(name, given)
                 measured += given
             self._receive(measured, cdr)
             self._collect(topic.name, names, self._node.now_ns, measured)
@@ -119,6 +122,13 @@ class Subscriptions:
                     self._counters.count(name, "lost_in_transport", event.total_count_change)
 
         self._subscriptions.append(self._created(topic, self._guarded(on_message), self._guarded(on_lost)))
+
+    def _note_late(self, name: str, given: Sequence[Measured]) -> None:
+        """Note how late the newest measurement of a message is, by the node's clock."""
+        stamps_ns = [m.stamp_ns for m in given if input_of(m) == name]
+        if stamps_ns and (now_ns := self._node.now_ns):
+            late_ns = now_ns - max(stamps_ns)
+            self._late_ns[name] = min(late_ns, self._late_ns.get(name, late_ns))
 
     def _created(self, topic: InputTopic, on_message: Callback, on_lost: Callback) -> Any:
         """A subscription, with the event of lost messages if the middleware supports it."""
@@ -184,6 +194,7 @@ class Subscriptions:
                     recent.get(one.name, Recent()),
                     self._converter.not_found(one.name),
                     () if names else alternatives(self._node, one, use_of[one.name], self._topics),
+                    self._late_ns.pop(one.name, math.nan) * 1e-9,
                 )
             )
         return tuple(out)

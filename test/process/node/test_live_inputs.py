@@ -132,6 +132,22 @@ def test_landmarks_in_millimetres_are_named_while_the_robot_drives_and_not_what_
         assert n.stop()[0] == 0
 
 
+def test_odometry_that_comes_late_is_named_with_the_tolerance_that_helps():
+    with node("output.folder:=''") as n, robot(hears=("/diagnostics",)) as r:
+        r.wait_for_node()
+        drive = Drive()
+
+        def late(seconds):
+            drive.stamp_ns = time.time_ns() - 2 * 10**9
+            drive.pace(r)(seconds)
+
+        r.until_it_says("DEGRADED", "/odom: comes 2.", "tf.transform_tolerance:=2.", spin=late)
+        assert float(r.said("input odom")[-1][1]["late [s]"]) == pytest.approx(2.0, abs=0.5)
+        assert r.set({"tf.transform_tolerance": 4.0}) == (True, "")
+        r.until_it_says("OK", spin=late)
+        assert n.stop()[0] == 0
+
+
 def test_A39_odometry_on_tf_that_never_comes_or_stops_is_missed_though_tf_goes_on():
     with (
         node("odom.type:=tf2_msgs/msg/TFMessage", "odom.topic:=/tf", "output.folder:=''") as n,

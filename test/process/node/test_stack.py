@@ -183,7 +183,8 @@ def test_B13_a_clock_that_does_not_come_is_named_where_simulated_time_is_used():
     with node("output.folder:=''", "use_sim_time:=true") as n, robot(hears=("/diagnostics", "/tf", "path")) as r:
         r.wait_for_node()
         drive = Drive()
-        r.until_it_says("WAITING", "use_sim_time is set and nothing comes on /clock", spin=drive.pace(r))
+        r.until_it_says("WAITING", "use_sim_time is set and nothing comes on /clock")
+        r.until_it_says("DEGRADED", "use_sim_time is set and nothing comes on /clock", spin=drive.pace(r))
         assert n.stop()[0] == 0
 
 

@@ -413,6 +413,20 @@ def test_what_is_wrong_before_the_first_estimate_is_named(facts, state, reason):
             "/odom: /ekf and /wheels publish it, and one of them is used:"
             " give each odometry a topic and an input of its own (inputs.names)",
         ),
+        ({}, (odom(received=9, silent_s=0.0, late_s=0.2),), ""),
+        (
+            {},
+            (odom(received=9, silent_s=0.0, late_s=0.5),),
+            "/odom: comes 0.5 s after its stamps, and so does map -> odom: tf.transform_tolerance:=0.6 dates it ahead;"
+            " odom.offset_s for a clock that differs",
+        ),
+        ({}, (odom(received=9, silent_s=0.0, late_s=3600.0),), ""),  # a recording that is played without its clock
+        (
+            {"waits_for_clock": True},
+            (),
+            "use_sim_time is set and nothing comes on /clock: no input counts as silent or late; use_sim_time:=false,"
+            " or start what publishes /clock",
+        ),
         ({"is_paused": True}, (), "paused"),
         (
             {"tf_behind_s": 3600.0},
@@ -510,6 +524,16 @@ def test_where_nothing_corrects_odometry_for_a_while_a_topic_that_nobody_publish
     assert judge(facts, Config()) == diagnostics.Health(*(("DEGRADED", (reason,)) if is_said else ("OK",)))
     other = InputFacts("gps", "/gps", "fix", received=9, used=3, silent_s=0.0)
     assert judge(replace(facts, inputs=(*facts.inputs, other)), Config()).state == "OK", "the fixes correct it"
+
+
+def test_odometry_that_is_late_is_no_fault_where_map_to_odom_is_dated_ahead_or_not_sent():
+    late = Facts("active", (odom(received=9, silent_s=0.0, late_s=0.5),), round_a_curve(2, 3.2).estimate)
+    assert judge(late, Config()).state == "DEGRADED"
+    for values in ({"transform_tolerance": 0.6}, {"stamp": "now"}, {"publish_tf": False}):
+        config = Config.from_mapping({f"tf.{name}": value for name, value in values.items()})
+        assert judge(late, config).state == "OK"
+    (status,) = (s for s in statuses(late, judge(late, Config()), "slam") if s.name == "slam: input odom")
+    assert status.values["late [s]"] == "0.50"
 
 
 def test_A35_what_is_refused_is_judged_by_the_last_seconds_wherever_it_was_refused():
