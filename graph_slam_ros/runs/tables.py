@@ -231,7 +231,7 @@ def _by_input(slam: GraphSlam, chosen: Callable[[EdgeTable], Mask]) -> tuple[Cou
     for table in slam.graph.tables.values():
         is_measured = ~np.isin(slam.graph.edge_ids.of_all(table.id.values), made)
         rows = np.flatnonzero(is_candidate[table.label.values] & is_measured & chosen(table))
-        ids = table.id.values[rows]
+        ids = table.at(rows).ids
         is_in = ids >= len(verdicts)
         is_in[~is_in] = np.isin(verdicts[ids[~is_in]], inside)
         for counts, some in ((accepted, rows[is_in]), (judged, rows)):

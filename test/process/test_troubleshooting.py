@@ -101,7 +101,8 @@ def test_the_publisher_of_detections_works_with_a_node_as_it_stands(tmp_path):
                 r.spin(seconds)
 
             def is_seen():
-                return told(r, "input detections", USED) > 8 and told(r, "input odom", USED) > 20
+                # a robot that stands has a keyframe a second, each with one look
+                return told(r, "input detections", USED) > 3 and told(r, "input odom", USED) > 20
 
             live.until(is_seen, stand, "detections that are used")
             assert r.save().success

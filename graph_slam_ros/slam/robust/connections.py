@@ -1,4 +1,4 @@
-"""What a displacement at a keyframe would move, and which accepted edges it would contradict."""
+"""Landmarks that a displacement at a keyframe would move, and accepted edges that it would contradict."""
 
 from bisect import bisect_right
 from collections.abc import Mapping
@@ -63,8 +63,8 @@ def landmarks_begun(graph: Graph, held: Index) -> Index:
     begun, is_sighted, is_tied = np.arange(count), np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
     is_tied[held] = True
     for table in graph.tables.values():
-        used = table.weight.values > 0.0
-        ends, of_landmark = table.vertices.values[used], graph.has_label(table.id.values[used], ("landmarks",))
+        used = table.at(np.flatnonzero(table.weight.values > 0.0))
+        ends, of_landmark = used.vertices, graph.has_label(used.ids, ("landmarks",))
         is_tied[ends[~of_landmark]] = True
         if of_landmark.any():
             keyframes, landmarks = ends[of_landmark, :2].T
@@ -87,12 +87,12 @@ def connections_across(graph: Graph, held: Index, keyframes: Index, end: int) ->
     begun, found = landmarks_begun(graph, held), [np.empty((0, 3), dtype=np.int64)]
     held_back = [np.empty((0, 2), dtype=np.int64)]
     for table in graph.tables.values():
-        used, of_landmark = table.weight.values > 0.0, graph.has_label(table.id.values, ("landmarks",))
+        is_used, of_landmark = table.weight.values > 0.0, graph.has_label(table.id.values, ("landmarks",))
         if of_landmark.any():
-            out = table.vertices.values[of_landmark & ~used, :2]
+            out = table.at(np.flatnonzero(of_landmark & ~is_used)).vertices[:, :2]
             held_back.append(out[(out[:, 0] >= keyframes[0]) & (out[:, 0] < end)])
-        ends, ids = table.vertices.values[used], table.id.values[used]
-        seen, closed = ends[of_landmark[used]], ends[graph.has_label(ids, ("closures",))]
+        used = table.at(np.flatnonzero(is_used))
+        seen, closed = used.vertices[of_landmark[is_used]], used.vertices[graph.has_label(used.ids, ("closures",))]
         if len(seen):
             found.append(np.column_stack([seen[:, 1], begun[seen[:, 1]], seen[:, 0]]))
         if len(closed):

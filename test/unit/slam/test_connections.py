@@ -44,7 +44,8 @@ def test_a_landmark_is_begun_at_its_first_accepted_sighting():
     begun = landmarks_begun(drive.graph, np.empty(0, dtype=np.int64))
     assert begun[[drive.a, drive.b]].tolist() == [drive.keyframes[0], drive.keyframes[6]]
     assert begun[drive.keyframes].tolist() == drive.keyframes
-    drive.graph.add_edge(PLANAR.coordinate_prior, [drive.b], (8.0, 2.0), NOISE[2], "surveyed")
+    ends = [drive.keyframes[0], drive.b]
+    drive.graph.add_edge(PLANAR.sightings["position"], ends, (8.0, 2.0), NOISE[2], "places")  # of a condensed visit
     assert landmarks_begun(drive.graph, np.array([drive.a]))[[drive.a, drive.b]].tolist() == [-1, -1]
 
 
