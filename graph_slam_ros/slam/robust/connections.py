@@ -15,6 +15,21 @@ _CLOSURES = -1
 
 
 @dataclass(frozen=True, slots=True)
+class Begin:
+    """A keyframe at which the robot may have been moved.
+
+    Attributes
+    ----------
+    first : its vertex
+    contradicted, explained : edges that speak against it, and for it
+    """
+
+    first: int
+    contradicted: int
+    explained: int
+
+
+@dataclass(frozen=True, slots=True)
 class Connections:
     """Accepted edges that connect what is before a keyframe with it or a later one.
 
@@ -34,8 +49,8 @@ class Connections:
     counts: Index
     held_back: Index
 
-    def likeliest(self, fitting: Index) -> tuple[int, int, int]:
-        """The last keyframe at which a displacement explains most more edges than it contradicts, and both numbers.
+    def likeliest(self, fitting: Index) -> Begin:
+        """The last keyframe at which a displacement explains most more edges than it contradicts.
 
         It contradicts what connects across the keyframe, and explains why sightings since then are not accepted.
 
@@ -47,7 +62,7 @@ class Connections:
         seen_from = np.sort(self.held_back[np.isin(self.held_back[:, 1], fitting), 0])
         explained = len(seen_from) - np.searchsorted(seen_from, self.keyframes)
         best = len(explained) - 1 - int(np.argmax((explained - contradicted)[::-1]))
-        return int(self.keyframes[best]), int(contradicted[best]), int(explained[best])
+        return Begin(int(self.keyframes[best]), int(contradicted[best]), int(explained[best]))
 
 
 def landmarks_begun(graph: Graph, held: Index) -> Index:

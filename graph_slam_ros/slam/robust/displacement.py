@@ -39,6 +39,7 @@ _MAP_SIGMA_M = 0.1  # error of a landmark of the map, beside its neighbours
 _VAGUE_M, _VAGUE = 0.2, 0.3  # a sighting that fits within more than this, and this part of its distance, tells nothing
 _HEADING_SIGMA_RAD = 0.05  # error of a landmark's heading in the map
 SAME_M, SAME_RAD = 1.0, 0.3  # poses farther from each other are two
+_DRIFT = 2.0  # sigmas of odometry
 
 
 @dataclass(frozen=True, slots=True)
@@ -292,19 +293,23 @@ class DisplacementSearch:
         """
         for_it, against = fits & ~window.is_in & ~window.fits_now, ~fits & window.is_in
         firsts = window.keyframes[np.flatnonzero(np.diff(window.keyframes, prepend=-1) != 0)]
-        connecting = explained = 0
+        before = None
         if earlier is not None:
             of, which = np.unique(window.landmarks, return_inverse=True)
             fitting = of[np.bincount(which, weights=fits) > np.bincount(which, weights=against)]
-            before, connecting, explained = earlier.likeliest(fitting)
-            firsts = np.r_[before, firsts]
+            before = earlier.likeliest(fitting)
+            firsts = np.r_[before.first, firsts]
         known = window.supports[None, :] < firsts[:, None]
         since = window.keyframes[None, :] >= firsts[:, None]
-        contradicted = (known & since) @ against.astype(int)
-        if earlier is not None:
-            contradicted[0] = connecting
-        counted = (known & since) @ for_it.astype(int) - contradicted
-        is_earlier = earlier is not None and counted[0] > 0 and counted[0] + explained > counted.max()
+        counted = (known & since) @ for_it.astype(int) - (known & since) @ against.astype(int)
+        is_earlier = False
+        if before is not None:
+            counted[0] -= before.contradicted
+            most = int(counted[1:].max())
+            is_earlier = counted[0] > most or (
+                counted[0] + before.explained > most
+                and not self._is_drift(before.first, self._pose(motion), int(window.keyframes[-1]))
+            )
         best = 0 if is_earlier else len(firsts) - 1 - int(np.argmax(counted[::-1]))
         if counted[best] <= 0:
             return None
@@ -327,6 +332,14 @@ class DisplacementSearch:
             tuple(window.edges[both & fits].tolist()),
             tuple(window.edges[both & ~fits].tolist()),
         )
+
+    def _is_drift(self, keyframe: int, T_map_chain: Numbers, newest: int) -> bool:
+        """Return whether the noise of odometry since a keyframe explains that its frame lies there in map."""
+        group, chain = self._space.group, self.chain.pose(keyframe)
+        now = tuple(self._solver.estimate([keyframe])[0].tolist())
+        off_m, off_rad = self.difference(group.compose(now, group.inverse(chain)), T_map_chain, newest)
+        drift_m, drift_rad = self.drift(self.chain.drift(keyframe), chain, newest)
+        return off_m < _DRIFT * drift_m and off_rad < _DRIFT * drift_rad
 
     def _after_the_longest_link(self, first: int) -> int:
         """Return a keyframe, or that after the longest of the links before it between which nothing was seen.

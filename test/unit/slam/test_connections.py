@@ -5,7 +5,7 @@ import pytest
 
 from graph_slam_ros.graph import Gaussian, Graph
 from graph_slam_ros.graph.geometry import PLANAR
-from graph_slam_ros.slam.robust.connections import connections_across, landmarks_begun, moved_values
+from graph_slam_ros.slam.robust.connections import Begin, connections_across, landmarks_begun, moved_values
 from graph_slam_ros.solver import Solver
 
 NOISE = {n: Gaussian(0.1 * np.eye(n)) for n in (2, 3)}
@@ -54,8 +54,8 @@ def test_a_displacement_lies_where_nothing_connects_and_what_is_not_accepted_is_
     assert drive.across().counts.sum(axis=0).tolist() == [3, 2, 1, 0, 0, 0, 3, 2, 1]
     drive.see(7, drive.a, weight=0.0)
     drive.see(8, drive.a, weight=0.0)
-    keyframe, contradicted, explained = drive.across().likeliest(np.array([drive.a]))
-    assert (drive.keyframes.index(keyframe), contradicted, explained) == (6, 0, 2)  # the last of three
+    begin = drive.across().likeliest(np.array([drive.a]))
+    assert begin == Begin(drive.keyframes[6], contradicted=0, explained=2)  # the last of three
     end = [drive.keyframes[2], drive.keyframes[8]]
     drive.graph.add_edge(PLANAR.relative_pose, end, (6.0, 0.0, 0.0), NOISE[3], "closures")
     assert drive.across().counts.sum(axis=0).tolist() == [3, 2, 2, 1, 1, 1, 4, 3, 1]
