@@ -1,6 +1,8 @@
 """Collects the facts from which the state of the node is judged."""
 
 import time
+from collections.abc import Callable
+from functools import partial
 
 from graph_slam_ros.node.diagnostics import Facts
 from graph_slam_ros.node.handle import NodeHandle
@@ -12,6 +14,7 @@ from graph_slam_ros.node.recent import RecentInputs
 from graph_slam_ros.node.session import Session
 from graph_slam_ros.node.subscriptions import Subscriptions
 from graph_slam_ros.node.tf_broadcaster import TfBroadcaster
+from graph_slam_ros.node.threads import run_in_thread
 from graph_slam_ros.node.worker import Worker
 from graph_slam_ros.slam import Counters
 
@@ -56,8 +59,8 @@ class FactCollector:
         session, node, worker, gate = self._session, self._node, self._worker, self._ingest.gate
         if not worker.waiting and node.now_ns:
             worker.offer(session.evaluate)
-        if not worker.waiting and (check := self._ingest.check.job()) is not None:
-            worker.offer(check)
+        if (check := self._ingest.check.job()) is not None:  # wrong units may keep the worker busy
+            run_in_thread(partial(_reported, check, node.report_fault))
         pipeline = Counters()
         pipeline.update(session.slam.counters)
         counters = Counters()
@@ -97,3 +100,11 @@ class FactCollector:
             preparing=preparation.status,
             cannot_prepare=preparation.fault,
         )
+
+
+def _reported(work: Callable[[], None], on_fault: Callable[[Exception], None]) -> None:
+    """Do work in a thread, whose exception nobody else would see."""
+    try:
+        work()
+    except Exception as error:
+        on_fault(error)

@@ -19,11 +19,11 @@ from graph_slam_ros.slam import Config
 _APART_NS = 50_000_000  # of stamps of odometry that are collected
 _MOST_POSES, _MOST_SIGHTINGS = 3_000, 20_000  # that are checked at once: minutes
 _LEAST = 30  # sightings or pairs of a finding
-_PERIOD_S, _SPARE = 3.0, 50.0  # between two checks; of the worker's time, one part
+_PERIOD_S, _SPARE = 3.0, 50.0  # between two checks; of the time, one part
 
 
 class InputCheck:
-    """Collects what is measured, and checks it while the worker is idle.
+    """Collects what is measured, and checks it in threads, one after the other.
 
     Parameters
     ----------
@@ -40,7 +40,7 @@ class InputCheck:
         used = uses(config)
         self._types = {one.type for one in config.sources if used.get(one.name) == "landmarks"} | {TRANSFORMS}
         self._last_ns: dict[str, int] = {}
-        self._due_s = 0.0
+        self._due_s, self._goes_on = 0.0, False
         self.findings: tuple[str, ...] = ()
 
     def decoders(self, installed: Mapping[str, Decoder]) -> dict[str, Decoder]:
@@ -59,9 +59,10 @@ class InputCheck:
         self._last_ns.clear()
 
     def job(self) -> Callable[[], None] | None:
-        """Return the next check, for the worker's thread; None if none is due."""
-        if time.monotonic() < self._due_s:
+        """Return the next check, for a thread; None if none is due, or the last goes on."""
+        if self._goes_on or time.monotonic() < self._due_s:
             return None
+        self._goes_on = True
         self._due_s = time.monotonic() + _PERIOD_S
         columns = self._collector.columns(self._counters)
         sightings = sum(len(one.stamp_ns) for one in columns.sightings)
@@ -79,12 +80,15 @@ class InputCheck:
     def _check(self, columns: Columns, *, is_full: bool) -> None:
         """Replace the findings. That nothing is wrong is believed of a full collection only."""
         begun = time.monotonic()
-        found = first_of_replay(columns, is_whole=False)
-        if found is not None and found.count >= _LEAST:
-            self.findings = (_text(found),)
-        elif is_full:
-            self.findings = ()
-        self._due_s += _SPARE * (time.monotonic() - begun)
+        try:
+            found = first_of_replay(columns, is_whole=False)
+            if found is not None and found.count >= _LEAST:
+                self.findings = (_text(found),)
+            elif is_full:
+                self.findings = ()
+        finally:
+            self._due_s += _SPARE * (time.monotonic() - begun)
+            self._goes_on = False
 
 
 def _text(found: Finding) -> str:

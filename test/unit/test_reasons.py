@@ -56,7 +56,7 @@ def test_every_counted_reason_has_a_row_and_every_row_is_counted():
         text = file.read_text()
         if file.parent.name == "check":  # its findings are not counted
             continue
-        if file.name != "reasons.py" and re.search("[Cc]ounters|MessageError|def admit", text):
+        if file.name != "reasons.py" and re.search("[Cc]ounters|MessageError|def admit|class OdometryJumps", text):
             for reason in counted(ast.parse(text)):
                 found.setdefault(reason, set()).add(file.name)
     assert {reason: files for reason, files in found.items() if reason not in REASONS} == {}

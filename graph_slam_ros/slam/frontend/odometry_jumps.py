@@ -27,9 +27,11 @@ class OdometryJumps:
         last : the motion before
         """
         if self._is_reset(motion, T_odom_base, last):
-            return "reset_to_zero"
-        is_jump = self._space.square(motion) > (self._config.max_speed_m_s * max(dt, _LEAST_S)) ** 2
-        return "jump" if is_jump else ""
+            reason = "reset_to_zero"
+        else:
+            is_jump = self._space.square(motion) > (self._config.max_speed_m_s * max(dt, _LEAST_S)) ** 2
+            reason = "jump" if is_jump else ""
+        return reason
 
     def _is_reset(self, motion: Numbers, T_odom_base: Numbers, last: Numbers) -> bool:
         """Return whether the driver restarted: odometry is at the origin, farther away than robots move in a step.
