@@ -244,7 +244,7 @@ class KidnapDetector:
         """Return whether the robot is where it would be without a segment, but for odometry's drift since it began."""
         before_m, before_rad = self._search.difference(split.T_map_chain_before, found.T_map_chain, newest)
         after_m, _ = self._search.difference(split.T_map_chain, found.T_map_chain, newest)
-        drift_m, drift_rad = self._search.drift(split.drift, split.chain, newest)
+        drift_m, drift_rad = self._search.chain.drift_since(split.drift, split.chain, newest)
         return before_m < min(after_m, SAME_M + _DRIFT * drift_m) and before_rad < SAME_RAD + _DRIFT * drift_rad
 
     def _protect(self) -> None:

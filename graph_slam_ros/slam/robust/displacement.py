@@ -127,12 +127,13 @@ class DisplacementSearch:
         self._poses: dict[int, list[int]] = {}  # edges of initial poses, by their keyframe
         self._first = 0  # vertex of the segment's first keyframe
         self._is_supported = False  # whether a sighting of a landmark that was known is believed since then
+        self._forgot = False  # whether sightings were dropped because their keyframes had left the chain
 
     # -- what came -----------------------------------------------------------------------------------------------
 
     def begin(self, vertex: int) -> None:
         """A segment begins at a keyframe: what was seen before tells nothing of where it is."""
-        self._first, self._is_supported = vertex, False
+        self._first, self._is_supported, self._forgot = vertex, False, False
         while self._seen and self._seen[0].keyframe < vertex:
             self._seen.popleft()
         self.chain.forget_before(vertex)
@@ -195,11 +196,19 @@ class DisplacementSearch:
         """
         vertices = self.chain.vertices
         vertices = vertices[(vertices > self._first) & (vertices < window.keyframes[0])]
-        if len(self._seen) < WINDOW or not len(vertices):
+        if self._has_all or not len(vertices):
             return None
         return connections_across(self._graph, self._solver.held, vertices, int(window.keyframes[0]))
 
+    @property
+    def _has_all(self) -> bool:
+        """Return whether the window has all sightings since the segment began."""
+        return len(self._seen) < WINDOW and not self._forgot
+
     def _standing(self) -> list[_Seen]:
+        while self._seen and self._seen[0].keyframe not in self.chain:
+            self._seen.popleft()
+            self._forgot = True
         is_standing = self._ledger.is_standing()
         return [one for one in self._seen if is_standing(one.edge)]
 
@@ -314,9 +323,8 @@ class DisplacementSearch:
         if counted[best] <= 0:
             return None
         first = int(firsts[best])
-        is_all = len(self._seen) < WINDOW
-        if not self._is_supported or (is_all and not window.is_in[window.keyframes < first].any()):
-            first = self._first  # nothing supports what came before in this segment
+        if not self._is_supported or (self._has_all and not window.is_in[window.keyframes < first].any()):
+            first = max(self._first, int(self.chain.vertices[0]))  # nothing supports what came before in this segment
         else:
             first = self._after_the_longest_link(first)
         both = since[best] & known[best]
@@ -338,7 +346,7 @@ class DisplacementSearch:
         group, chain = self._space.group, self.chain.pose(keyframe)
         now = tuple(self._solver.estimate([keyframe])[0].tolist())
         off_m, off_rad = self.difference(group.compose(now, group.inverse(chain)), T_map_chain, newest)
-        drift_m, drift_rad = self.drift(self.chain.drift(keyframe), chain, newest)
+        drift_m, drift_rad = self.chain.drift_since(self.chain.drift(keyframe), chain, newest)
         return off_m < _DRIFT * drift_m and off_rad < _DRIFT * drift_rad
 
     def _after_the_longest_link(self, first: int) -> int:
@@ -380,12 +388,6 @@ class DisplacementSearch:
         """Return whether these are two different poses."""
         far_m, turned_rad = self.difference(T_map_chain, other, keyframe)
         return far_m > SAME_M or turned_rad > SAME_RAD
-
-    def drift(self, variances: Array, chain: Numbers, keyframe: int) -> tuple[float, float]:
-        """Sigmas [m, rad] of odometry up to a keyframe, since there were these variances and it was there."""
-        since, n = self.chain.drift(keyframe) - variances, self._space.dimensions
-        lever = float(np.linalg.norm(np.subtract(self.chain.pose(keyframe)[:n], chain[:n])))
-        return float(np.sqrt(since[0] + since[1] * lever**2)), float(np.sqrt(since[1]))
 
     def begun_at(self, found: DisplacementHypothesis, first: int | None) -> DisplacementHypothesis:
         """Return a hypothesis that begins at an earlier keyframe, by its vertex, if odometry since is remembered."""

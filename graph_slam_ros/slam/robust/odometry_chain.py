@@ -86,6 +86,12 @@ class OdometryChain:
         """Variances [m^2, rad^2] of odometry up to a keyframe."""
         return self._links[keyframe].drift
 
+    def drift_since(self, variances: Array, pose: Numbers, keyframe: int) -> tuple[float, float]:
+        """Sigmas [m, rad] of odometry up to a keyframe, since it had these variances and was there."""
+        since, n = self.drift(keyframe) - variances, self._space.dimensions
+        lever = float(np.linalg.norm(np.subtract(self.pose(keyframe)[:n], pose[:n])))
+        return float(np.sqrt(since[0] + since[1] * lever**2)), float(np.sqrt(since[1]))
+
     def _drift_of(self, edge: int) -> Array:
         """Variances [m^2, rad^2] of one step of odometry, the largest of any direction."""
         root, n = self._graph.edge(edge).sqrt_information, self._space.dimensions

@@ -46,3 +46,26 @@ def test_a_sighting_of_an_older_keyframe_that_comes_late_is_compared_with_the_ot
     count = graph.edge_count
     ledger.enter(0, np.zeros(count), np.zeros(count, dtype=int), np.zeros(count), np.empty(0), np.ones(count, bool))
     assert search.hypothesis() is None
+
+
+def test_sightings_whose_keyframes_have_left_the_chain_are_not_compared():
+    """A robot that sees something once in a hundred keyframes has fewer sightings than the window, of thousands."""
+    graph, ledger = Graph(), Ledger()
+    solver, history = Solver(graph), LandmarkHistory(graph, ledger)
+    search = DisplacementSearch(PLANAR, graph, solver, ledger, history)
+    landmark = graph.add_vertex(PLANAR.point, (0.0, 2.0))
+    poses = [graph.add_vertex(PLANAR.pose, (0.0, 0.0, 0.0))]
+    for k in range(1, 2500):
+        poses.append(graph.add_vertex(PLANAR.pose, (0.5 * k, 0.0, 0.0)))
+        edge = graph.add_edge(PLANAR.relative_pose, poses[-2:], STEP, NOISE[3], "odometry")
+        search.chain.add(edge, poses[-2:], STEP, k * 10**9)
+        if k % 100 == 0:
+            ends = [poses[-1], landmark]
+            edge = graph.add_edge(PLANAR.sightings["position"], ends, (-0.5 * k, 2.0), NOISE[2], "landmarks")
+            search.add_sighting(edge, *ends)
+            history.add(edge, *ends)
+    solver.add(range(graph.vertex_count), [])
+    count = graph.edge_count
+    ledger.enter(0, np.zeros(count), np.zeros(count, dtype=int), np.zeros(count), np.empty(0), np.ones(count, bool))
+    assert search.held_back_count == 0
+    assert search.hypothesis() is None
