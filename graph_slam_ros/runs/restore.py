@@ -106,35 +106,34 @@ def of_all(folder: Path) -> str:
     return f"graph_slam replay {folder} --out WHOLE --set map.condense=false makes a map with all of them"
 
 
-def restored(
-    folder: Path,
-    losses: list[str],
-    counters: Counters | None = None,
-    *,
-    whole: bool = False,
-    displacements: list[dict[str, Any]] | None = None,
-) -> GraphSlam:
+def restored(folder: Path, losses: list[str], counters: Counters | None = None, *, whole: bool = False) -> GraphSlam:
     """The map of a run, solved; see ``map_of``.
 
     Parameters
     ----------
     whole : whether all keyframes are needed: where visits were condensed, the drive is repeated from its journal
-    displacements : added to them are those of the run
 
     Raises
     ------
     RunError
         The whole map is asked for, and the drive began in a map with condensed visits.
     """
+    return _started(folder, _map_with_names(folder, losses, counters, whole=whole), losses)
+
+
+def _map_with_names(folder: Path, losses: list[str], counters: Counters | None, *, whole: bool) -> MapSnapshot:
+    """The map of a run, whose losses name its folder."""
     lost = len(losses)
     state = map_of(folder, losses, counters)
     if state.bounded is not None and whole:
         state = _repeated(folder, losses, Counters())
         if state.bounded is not None:
             raise RunError(f"{folder}: it began in a map with condensed visits, and this needs all keyframes")
-    if displacements is not None:
-        displacements += state.displacements
     losses[lost:] = [f"{folder}: {loss}" for loss in losses[lost:]]
+    return state
+
+
+def _started(folder: Path, state: MapSnapshot, losses: list[str]) -> GraphSlam:
     # what is asked of a map is asked of all of it
     config = config_of(folder, state).changed({"map.localize": False} | _NOTHING_LEAVES)
     slam = GraphSlam(config, start=state)
@@ -148,15 +147,13 @@ def config_to_go_on(slam: GraphSlam, folder: Path) -> Config:
 
 
 def restored_and_solved(
-    folder: Path,
-    losses: list[str],
-    counters: Counters | None = None,
-    *,
-    whole: bool = False,
-    displacements: list[dict[str, Any]] | None = None,
+    folder: Path, losses: list[str], counters: Counters | None = None, *, whole: bool = False
 ) -> GraphSlam:
     """The same with all edges judged. Raises GraphSlamError also if it cannot be solved."""
-    slam = restored(folder, losses, counters, whole=whole, displacements=displacements)
+    return _solved(folder, restored(folder, losses, counters, whole=whole))
+
+
+def _solved(folder: Path, slam: GraphSlam) -> GraphSlam:
     slam.process(Control("optimize"))
     if not slam.is_solved:
         raise RunError(f"{folder}: its map cannot be solved: {slam.failing}")
@@ -251,11 +248,12 @@ def complete(folder: Path) -> Summary:
     losses: list[str] = []
     try:
         with claimed(folder):
-            before, counters, displacements = summary_of(folder), Counters(), list[dict[str, Any]]()
-            slam = restored_and_solved(folder, losses, counters, displacements=displacements)
+            before, counters = summary_of(folder), Counters()
+            state = _map_with_names(folder, losses, counters, whole=False)
+            slam = _solved(folder, _started(folder, state, losses))
             kept = {key: before[key] for key in _OF_RECORDING if key in before}
             now = summarize(slam, counters) | fitted_summary(slam) | took()
-            now |= {"displacements": displacements, "losses": losses, "ended": True, "is_incomplete": False}
+            now |= {"displacements": state.displacements, "losses": losses, "ended": True, "is_incomplete": False}
             summary = kept | now
             save_results(folder, slam, summary)
     except OSError as error:
