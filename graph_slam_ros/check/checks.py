@@ -31,6 +31,10 @@ OF_A_REPLAY: tuple[Check, ...] = (check_frames, check_times, check_odometry, che
 
 _FROM_THE_BEGINNING = ("units", "mirrored", "axes", "unrelated")  # what is read later does not make it right
 _IN_OUTCOME = ("not_planar", "no_landmarks")
+_WHILE_DRIVING = (*_FROM_THE_BEGINNING, "clock_domains", "constant_stamps", "no_orientation_of_odometry", "noise_zero")
+_OF_TWIST = ("twist_scale", "twist_frame", "twist_unrelated", "covariance_tiny", "covariance_useless")
+_LATEST_S = 60.0  # that a message comes by a slow detector, and not by a clock that differs
+_LEAST_WAY_M = 10.0  # before that, the speed of a robot that begins to drive says nothing of its twist
 
 
 def check_columns(c: Columns, checks: tuple[Check, ...] = CHECKS) -> list[Finding]:
@@ -63,6 +67,25 @@ def first_of_replay(c: Columns, *, is_whole: bool) -> Finding | None:
         return None
     errors = [one for one in check_columns(c, OF_A_REPLAY) if one.severity == "error" and one.code not in _IN_OUTCOME]
     return next((one for one in errors if is_whole or one.code in _FROM_THE_BEGINNING), None)
+
+
+def worst_while_driving(c: Columns) -> list[Finding]:
+    """Return what is wrong with the inputs of a robot that drives, by its last minutes.
+
+    It is the worst error that makes the result meaningless; without one, it is what is wrong with odometry's twist.
+    """
+    found = check_columns(c, OF_A_REPLAY)
+    errors = [one for one in found if one.severity == "error" and one.code in _WHILE_DRIVING]
+    errors = [one for one in errors if one.code != "clock_domains" or not _may_be_late(c, one)]
+    if errors:
+        return errors[:1]
+    way_m = float(np.linalg.norm(np.diff(c.path[:, :3], axis=0), axis=1).sum())
+    return [one for one in found if one.severity != "note" and one.code in _OF_TWIST] if way_m > _LEAST_WAY_M else []
+
+
+def _may_be_late(c: Columns, found: Finding) -> bool:
+    """Return whether a clock may be right, and its messages come late: those are refused for that, or used."""
+    return found.topic != c.odometry.topic and -_LATEST_S < found.value < 0.0
 
 
 def _nothing_corrects(c: Columns) -> Iterator[Finding]:

@@ -195,6 +195,10 @@ class Collector:
 
         return decoded
 
+    def leave_out(self) -> None:
+        """Forget the message that was decoded last: it is not collected, but what is measured is."""
+        self._last = None
+
     def _remember(self, message: Any) -> None:
         self._last = message
 

@@ -69,6 +69,9 @@ KINDS: dict[str, Kind] = {
         "stamps step back by more than time.jump_back_s: the clock was set, or two recordings were joined",
         "cut the recording in two; time.on_jump sets what a run does at the step",
     ),
+    "constant_stamps": Kind(
+        "all messages of odometry have one stamp", "stamp each message when it is measured (header.stamp)", True
+    ),
     "duplicates": Kind(
         "messages have the stamp of the message before",
         "let one node publish the topic (ros2 topic info -v TOPIC), and record it once",

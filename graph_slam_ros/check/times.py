@@ -4,14 +4,14 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from graph_slam_ros.check.columns import Columns, TopicColumns
+from graph_slam_ros.check.columns import Columns, OdometryColumns, TopicColumns
 from graph_slam_ros.check.finding import Finding, Severity, Where
 from graph_slam_ros.config.node import TimeConfig
 from graph_slam_ros.formats.parameters import assignment
 from graph_slam_ros.messages.receive_times import clock_offset_s
 from graph_slam_ros.typing import Array, Index
 
-_FEW, _BACK_NS = 3, 1_000_000_000
+_FEW, _MANY, _BACK_NS = 3, 10, 1_000_000_000
 _CLOCKS_DIFFER_S, _EARLY_S, _DAY_S = 10.0, 0.15, 86400.0
 _WINDOWS, _APART, _LEAST_S, _LEAST_MESSAGES = 20, 5, 30.0, 200
 _DRIFT, _DRIFTED_S, _SCATTERS = 1e-4, 0.02, 4.0
@@ -35,11 +35,24 @@ def check_times(c: Columns) -> Iterator[Finding]:
             where: Where = {"topic": "" if topic is None else topic.name, "settings": (assignment(key, value),)}
             yield Finding("clock_domains", "error", -value, _CLOCKS_DIFFER_S, "s", text, **where)
     stamped = {name: topic for name, topic in c.topics.items() if np.count_nonzero(topic.stamp_ns) >= _FEW}
+    if constant := next(_constant(c.odometry), None):
+        yield constant
+        return
     yield from _clocks(c, stamped)
     for topic in stamped.values():
         yield from _order(c, topic)
     yield from _rate(c)
     yield from _overlap(c)
+
+
+def _constant(o: OdometryColumns) -> Iterator[Finding]:
+    """Odometry whose messages all have one stamp."""
+    stamp_ns = o.stamp_ns[o.stamp_ns != 0]
+    if len(stamp_ns) >= _MANY and not np.ptp(stamp_ns):
+        text = f"{o.topic}: all of its {len(stamp_ns)} messages have the stamp {stamp_ns[0] * 1e-9:.3f} s"
+        yield Finding(
+            "constant_stamps", "error", len(stamp_ns), _MANY, "messages", text, o.topic, int(stamp_ns[0]), len(stamp_ns)
+        )
 
 
 def _lags(topic: TopicColumns) -> tuple[Array, Index, Index]:
@@ -60,9 +73,7 @@ def _clocks(c: Columns, topics: dict[str, TopicColumns]) -> Iterator[Finding]:
         apart_s = clock_offset_s(log_ns, lag_s, odometry_log_ns, odometry_lag_s)
         where: Where = {"topic": topic.name, "first_ns": int(stamp_ns[0]), "count": len(stamp_ns)}
         if abs(apart_s) > _CLOCKS_DIFFER_S:
-            settings = (_offset(c, topic, apart_s),)
-            text = f"{topic.name}: its stamps are {-apart_s:.1f} s away from those of {c.odometry.topic}: another clock"
-            yield Finding("clock_domains", "error", -apart_s, _CLOCKS_DIFFER_S, "s", text, settings=settings, **where)
+            yield _other_clock(c, topic, of_odometry, apart_s, where)
         elif apart_s < -_EARLY_S:
             text = (
                 f"{topic.name}: recorded {-apart_s * 1e3:.0f} ms before the time in its stamps, compared with "
@@ -73,6 +84,16 @@ def _clocks(c: Columns, topics: dict[str, TopicColumns]) -> Iterator[Finding]:
         if topic.use in ("odometry", "landmarks") and abs(typical_s) < _DAY_S:  # else simulated time, or played again
             jump = list(_jump(topic, lag_s, stamp_ns))
             yield from jump or _drift(topic, lag_s, log_ns, stamp_ns)
+
+
+def _other_clock(c: Columns, topic: TopicColumns, of_odometry: TopicColumns, apart_s: float, where: Where) -> Finding:
+    """A clock that is not that of odometry. Where odometry's alone is not the receiver's, it is odometry's."""
+    is_right = abs(float(np.median(_lags(topic)[0]))) < _CLOCKS_DIFFER_S / 2.0
+    wrong, right = (of_odometry, topic) if is_right else (topic, of_odometry)
+    by_s = apart_s if wrong is topic else -apart_s
+    text = f"{wrong.name}: its stamps are {-by_s:.1f} s away from those of {right.name}: another clock"
+    settings = (_offset(c, wrong, by_s),)
+    return Finding("clock_domains", "error", -by_s, _CLOCKS_DIFFER_S, "s", text, settings=settings, **where)
 
 
 def _jump(topic: TopicColumns, lag_s: Array, stamp_ns: Index) -> Iterator[Finding]:

@@ -8,8 +8,10 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
+from graph_slam_ros.check.finding import KINDS
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.measurements.reasons import explain, remedy
+from graph_slam_ros.messages.inputs.transforms import MAP_FRAMES
 from graph_slam_ros.messages.to_msg import ERROR, OK, WARN, Status
 from graph_slam_ros.node.estimate import OFF, Estimate
 from graph_slam_ros.node.recent import WINDOW_S, Recent
@@ -21,6 +23,7 @@ _TF_BEHIND_S = 1.0
 _UNSEEN_M, _UNSEEN_S = 10.0, 10.0
 _LONGEST = 80  # of a frame's name
 _LATE_S, _PLAYED_S = 0.3, 10.0  # later still, a recording is played without /clock
+_NEARLY = 0.5  # of the lateness from which on an observation is refused
 _NO_CLOCK = "use_sim_time is set and nothing comes on /clock"
 _UNLINKED = ("frame_unknown", "child_frame_unknown", "odom_frame_unknown", "map_frame_unknown")
 
@@ -175,12 +178,12 @@ def _missing(facts: Facts) -> Iterator[str]:
         yield _NO_CLOCK
     for one in facts.inputs:
         if facts.estimate is None and one.use == "odometry":
-            yield from _silence(one)
+            yield from _silence(one, facts.findings)
     if facts.estimate is None and not facts.inputs:
         yield "no input"
 
 
-def _silence(one: InputFacts) -> Iterator[str]:
+def _silence(one: InputFacts, findings: tuple[str, ...]) -> Iterator[str]:
     if one.mismatch:
         yield f"{one.topic}: {one.mismatch}"
     elif one.unpublished:
@@ -191,6 +194,8 @@ def _silence(one: InputFacts) -> Iterator[str]:
         yield f"{one.topic}: {_refused(one)}"
     elif one.not_found:
         yield f"{one.topic}: {one.not_found}"
+    elif findings:
+        yield from findings
     else:
         yield f"{one.topic}: its first messages wait for their turn"
 
@@ -198,10 +203,11 @@ def _silence(one: InputFacts) -> Iterator[str]:
 def _refused(one: InputFacts) -> str:
     """The fraction of an input that was refused lately, with the most frequent reason and its remedy."""
     recent = one.recent
-    meaning = explain(recent.worst).meaning
+    meaning, mend = explain(recent.worst).meaning, remedy(one.name, recent.worst)
     if recent.worst in _UNLINKED and one.frames:
         meaning = "no transform links " + ", ".join(f"{frame[:_LONGEST]} to {robots}" for frame, robots in one.frames)
-    mend = remedy(one.name, recent.worst)
+    if recent.worst == "odom_frame_unknown" and any(frame in MAP_FRAMES for frame, _ in one.frames):
+        meaning, mend = KINDS["odometry_in_map"].meaning, f"{one.name}.topic:=TOPIC, that of the wheels"
     much = "all" if recent.is_nothing_used else f"{recent.times} of {recent.came}"
     return f"{much} refused in {WINDOW_S:.0f} s ({recent.worst}): {meaning}{mend and ': '}{mend}"
 
@@ -223,6 +229,8 @@ def _faults(facts: Facts, config: Config) -> Iterator[str]:
             yield f"{one.topic}: {_refused(one)}"
         if one.use == "odometry" and config.tf.stamp == "odometry" and config.tf.publish_tf:
             yield from _lateness(one, max(_LATE_S, config.tf.transform_tolerance))
+        elif one.use not in MOTION:
+            yield from _later_than_odometry(one, facts, config.ordering.late_s)
     if facts.waits_for_clock:
         yield f"{_NO_CLOCK}: no input counts as silent or late; use_sim_time:=false, or start what publishes /clock"
     yield from _uncorrected(facts)
@@ -264,6 +272,17 @@ def _lateness(one: InputFacts, most_s: float) -> Iterator[str]:
             f"{one.topic}: comes {one.late_s:.1f} s after its stamps, and so does map -> odom:"
             f" tf.transform_tolerance:={math.ceil(10.0 * one.late_s + 1.0) / 10.0:.1f} dates it ahead;"
             f" {one.name}.offset_s for a clock that differs"
+        )
+
+
+def _later_than_odometry(one: InputFacts, facts: Facts, most_s: float) -> Iterator[str]:
+    """Yield that an observation nearly comes too late to be used. If it does come too late, it is refused for that."""
+    odometry_s = min((other.late_s for other in facts.inputs if other.use == "odometry"), default=math.nan)
+    if _NEARLY * most_s < one.late_s - odometry_s < most_s:
+        yield (
+            f"{one.topic}: comes {one.late_s - odometry_s:.1f} s later than odometry of its time, and is refused if"
+            f" that is ordering.late_s ({most_s:g} s): ordering.late_s:={2.0 * most_s:.1f}, or a faster"
+            f" detector; {one.name}.offset_s for a clock that differs"
         )
 
 

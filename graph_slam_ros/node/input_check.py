@@ -1,13 +1,13 @@
-"""The check of the inputs while the robot drives: units, axes and identities that contradict odometry.
+"""The check of the inputs while the robot drives: their units, axes, clocks, and the twist of odometry.
 
-It is that of a replay before it begins (``check.checks.first_of_replay``), again and again, of the last minutes.
+It is that of a replay (``check.checks.worst_while_driving``), again and again, of the last minutes.
 """
 
 import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
-from graph_slam_ros.check.checks import first_of_replay
+from graph_slam_ros.check.checks import worst_while_driving
 from graph_slam_ros.check.columns import Collector, Columns
 from graph_slam_ros.check.finding import KINDS, Finding
 from graph_slam_ros.measurements.counters import Counters
@@ -17,9 +17,11 @@ from graph_slam_ros.messages.inputs import uses
 from graph_slam_ros.slam import Config
 
 _APART_NS = 50_000_000  # of stamps of odometry that are collected
+_APART_S = 0.045  # of messages of odometry that are collected
 _MOST_POSES, _MOST_SIGHTINGS = 3_000, 20_000  # that are checked at once: minutes
-_LEAST = 30  # sightings or pairs of a finding
-_PERIOD_S, _SPARE = 3.0, 50.0  # between two checks; of the time, one part
+_LEAST = 30  # poses, sightings or pairs of a finding
+_FEW = {"clock_domains": 5}  # messages
+_PERIOD_S, _SOON_S, _SPARE = 3.0, 0.5, 50.0  # between two checks; of the time, one part
 
 
 class InputCheck:
@@ -38,18 +40,25 @@ class InputCheck:
         self._collector = Collector(config, {**topics, TF_STATIC: "/tf_static"})
         self._counters = counters
         used = uses(config)
-        self._types = {one.type for one in config.sources if used.get(one.name) == "landmarks"} | {TRANSFORMS}
+        checked = [one for one in config.sources if used.get(one.name) in ("landmarks", "odometry")]
+        self._types = {one.type for one in checked} | {TRANSFORMS}
+        self._odometry = {topics[one.name] for one in checked if used[one.name] == "odometry"}
         self._last_ns: dict[str, int] = {}
+        self._last_s: dict[str, float] = {}
+        self._messages = 0  # since the last check
         self._due_s, self._goes_on = 0.0, False
         self.findings: tuple[str, ...] = ()
 
     def decoders(self, installed: Mapping[str, Decoder]) -> dict[str, Decoder]:
-        """Return these decoders and those of landmarks, whose messages are collected, too."""
+        """Return these decoders, and those of landmarks and odometry, whose messages are collected, too."""
         seen = {name: self._collector.decoder(installed.get(name) or decoder(name)) for name in self._types}
         return dict(installed) | seen
 
     def add(self, topic: str, names: Sequence[str], now_ns: int, measured: Sequence[Measured]) -> None:
         """Collect what a message of these inputs has measured; of odometry, a part is enough."""
+        if topic in self._odometry and not self._is_due(topic):
+            self._collector.leave_out()
+        self._messages += 1
         some = [m for m in measured if not isinstance(m, Odometry) or self._is_next(m)]
         self._collector.add(topic, [name for name in names if name != TF], now_ns, some)
 
@@ -60,16 +69,25 @@ class InputCheck:
 
     def job(self) -> Callable[[], None] | None:
         """Return the next check, for a thread; None if none is due, or the last goes on."""
-        if self._goes_on or time.monotonic() < self._due_s:
+        if self._goes_on or time.monotonic() < self._due_s or self._messages < _LEAST:
             return None
-        self._goes_on = True
+        self._goes_on, self._messages = True, 0
         self._due_s = time.monotonic() + _PERIOD_S
         columns = self._collector.columns(self._counters)
         sightings = sum(len(one.stamp_ns) for one in columns.sightings)
-        is_full = len(columns.path_ns) >= _MOST_POSES or sightings >= _MOST_SIGHTINGS
+        poses = max(len(columns.path_ns), len(columns.odometry.stamp_ns))
+        is_full = poses >= _MOST_POSES or sightings >= _MOST_SIGHTINGS
         if is_full:
             self.forget()
         return partial(self._check, columns, is_full=is_full)
+
+    def _is_due(self, topic: str) -> bool:
+        """Return whether a message of odometry is collected: some of each second are enough."""
+        now_s = time.monotonic()
+        if now_s - self._last_s.get(topic, 0.0) < _APART_S:
+            return False
+        self._last_s[topic] = now_s
+        return True
 
     def _is_next(self, m: Odometry) -> bool:
         if abs(m.stamp_ns - self._last_ns.get(m.source, 0)) < _APART_NS:
@@ -81,9 +99,11 @@ class InputCheck:
         """Replace the findings. That nothing is wrong is believed of a full collection only."""
         begun = time.monotonic()
         try:
-            found = first_of_replay(columns, is_whole=False)
-            if found is not None and found.count >= _LEAST:
-                self.findings = (_text(found),)
+            found = worst_while_driving(columns)
+            if sure := [one for one in found if one.count >= _FEW.get(one.code, _LEAST)]:
+                self.findings = tuple(map(_text, sure))
+            elif found:
+                self._due_s = begun + _SOON_S
             elif is_full:
                 self.findings = ()
         finally:

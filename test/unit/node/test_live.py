@@ -536,6 +536,26 @@ def test_odometry_that_is_late_is_no_fault_where_map_to_odom_is_dated_ahead_or_n
     assert status.values["late [s]"] == "0.50"
 
 
+@pytest.mark.parametrize("late_s, odometry_s", [(2.0, 0.0), (7.0, 0.0), (7.0, 6.0), (7.0, math.nan), (12.0, 0.0)])
+def test_observations_that_are_nearly_too_late_are_named_before_any_is_refused(late_s, odometry_s):
+    tags = InputFacts("tags", "/tags", "landmarks", 9, 9, silent_s=0.0, publishers=("/camera",), late_s=late_s)
+    main = odom(received=9, silent_s=0.0, late_s=odometry_s)
+    config = Config.from_mapping({"tf.stamp": "now"})
+    verdict = judge(Facts("active", (main, tags), round_a_curve(2, 3.2).estimate), config)
+    expected = (
+        "/tags: comes 7.0 s later than odometry of its time, and is refused if that is ordering.late_s (10 s):"
+        " ordering.late_s:=20.0, or a faster detector; tags.offset_s for a clock that differs"
+    )
+    assert verdict.reasons == ((expected,) if (late_s, odometry_s) == (7.0, 0.0) else ())
+
+
+def test_odometry_in_the_frame_of_a_map_is_the_output_of_a_localiser():
+    recent = Recent(20, {"odom_frame_unknown": 20}, goes_on=True)
+    facts = Facts("active", (odom(received=20, silent_s=0.0, recent=recent, frames=(("map", "odom"),)),))
+    (reason,) = judge(facts, Config()).reasons
+    assert reason.endswith("so it is the output of a localiser: odom.topic:=TOPIC, that of the wheels")
+
+
 def test_A35_what_is_refused_is_judged_by_the_last_seconds_wherever_it_was_refused():
     recent, accepted, before, after = RecentInputs(), {}, {"tags": {}}, {"tags": {}}
 
