@@ -85,6 +85,7 @@ class Facts:
     failing : why the last solve failed; empty where it did not
     memory_is_short : the process has more than ``health.memory_mib``
     authorities : other nodes that publish /tf, one of which broadcasts map -> odom, if somebody does
+    static_authority : the transform to odometry's frame that one of these publishes on /tf_static, if one does
     findings : what is wrong with the inputs by a check that needs no fit, each with what mends it
     tf_behind_s : how much earlier than the last map -> odom would be dated now, so that it is not sent
     preparing : what keeps the pipeline from beginning: kernels are compiled or loaded; empty when they are ready
@@ -113,6 +114,7 @@ class Facts:
     path_version: int = 0
     has_other_authority: bool = False
     authorities: tuple[str, ...] = ()
+    static_authority: str = ""
     twins: int = 0
     findings: tuple[str, ...] = ()
     tf_behind_s: float = 0.0
@@ -156,15 +158,21 @@ def _errors(facts: Facts) -> Iterator[str]:
     if facts.faults >= 100:
         yield f"{facts.faults} faults in callbacks in 10 s"
     if facts.has_other_authority:
-        who = ", ".join(facts.authorities)
-        several = f": one of {who}, which publish /tf: stop them one by one to find it"
-        yield "somebody else broadcasts map -> odom" + (several if len(facts.authorities) > 1 else who and f": {who}")
+        yield _rivals(facts)
     if facts.twins:
         yield "another node has this node's name"
     if facts.is_stopped:
         yield "stopped when the clock jumped back (time.on_jump); ~/reset begins anew"
     if facts.recording_fails:
         yield "the run cannot be written"
+
+
+def _rivals(facts: Facts) -> str:
+    """The reason that somebody else broadcasts map -> odom, or another static parent of odom."""
+    who, static = ", ".join(facts.authorities), facts.static_authority
+    several = f": one of {who}, which publish {'/tf_static' if static else '/tf'}: stop them one by one to find it"
+    what = f"publishes {static} on /tf_static" if static else "broadcasts map -> odom"
+    return f"somebody else {what}{several if len(facts.authorities) > 1 else who and f': {who}'}"
 
 
 def _missing(facts: Facts) -> Iterator[str]:

@@ -71,7 +71,7 @@ class FactCollector:
         overflows = sum(of.get("overflow", 0) for of in counted.values())
         failures, restarts = session.failures, self._counters["node", "worker_restarted"]
         before, self._before = self._before, (overflows, failures, restarts)
-        rivals = broadcaster.candidates() if broadcaster is not None and broadcaster.has_rival else None
+        rivals, static = _rivals(broadcaster) if broadcaster is not None and node.config.tf.publish_tf else (None, "")
         return Facts(
             lifecycle,
             subscriptions.facts(node.now_ns, counted, recent, pipeline.used) if subscriptions is not None else (),
@@ -94,12 +94,21 @@ class FactCollector:
             path_version=self._publishers.path_version,
             has_other_authority=rivals is not None,
             authorities=rivals or (),
+            static_authority=static,
             twins=node.get_node_names_and_namespaces().count((node.get_name(), node.get_namespace())) - 1,
             findings=self._ingest.check.findings,
             tf_behind_s=broadcaster.behind_s if broadcaster is not None else 0.0,
             preparing=preparation.status,
             cannot_prepare=preparation.fault,
         )
+
+
+def _rivals(broadcaster: TfBroadcaster) -> tuple[tuple[str, ...] | None, str]:
+    """The nodes that may broadcast the transform as well, None where nobody does; and the transform if it is static."""
+    broadcaster.static.refresh()
+    if transform := broadcaster.static.transform:
+        return broadcaster.static.candidates(), transform
+    return (broadcaster.candidates() if broadcaster.has_rival else None), ""
 
 
 def _reported(work: Callable[[], None], on_fault: Callable[[Exception], None]) -> None:

@@ -10,6 +10,7 @@ from graph_slam_ros.messages import to_msg
 from graph_slam_ros.node.estimate import Estimate
 from graph_slam_ros.node.handle import NodeHandle
 from graph_slam_ros.node.map_to_odom import MapToOdom
+from graph_slam_ros.node.static_rival import StaticRival
 from graph_slam_ros.node.subscriptions import full_name
 from graph_slam_ros.slam import Config, Odometry
 
@@ -24,6 +25,10 @@ class TfBroadcaster:
     ----------
     guarded : makes a callback that raises nothing
     now : gives the configuration, the last estimate and the newest odometry
+
+    Attributes
+    ----------
+    static : the search for another broadcaster on /tf_static
     """
 
     def __init__(
@@ -39,6 +44,7 @@ class TfBroadcaster:
         self._is_closed = False
         self._ours: deque[bytes] = deque(maxlen=_REMEMBERED)
         self._others_s = -1e9
+        self.static = StaticRival(node, config.frames.odom)
         self._timer = node.create_timer(config.tf.transform_publish_period, guarded(self._tick))
 
     def close(self) -> None:
@@ -46,6 +52,7 @@ class TfBroadcaster:
         self._is_closed = True
         self._node.destroy_timer(self._timer)
         self._node.destroy_publisher(self._publisher)
+        self.static.close()
 
     def forget_time(self) -> None:
         """Begin anew with the stamps."""
@@ -63,7 +70,7 @@ class TfBroadcaster:
 
     @property
     def has_rival(self) -> bool:
-        """Return whether another node has broadcast the transform lately."""
+        """Return whether another node has broadcast the transform lately on /tf."""
         return time.monotonic() - self._others_s < _OTHERS_S
 
     def candidates(self) -> tuple[str, ...]:
@@ -76,7 +83,7 @@ class TfBroadcaster:
         config, estimate, newest = self._now()
         if self._is_closed or estimate is None or newest is None or not config.tf.publish_tf or not estimate.is_located:
             return
-        if config.tf.second_authority == "yield" and self.has_rival:
+        if config.tf.second_authority == "yield" and (self.has_rival or self.static.transform):
             return
         now_ns = self._node.get_clock().now().nanoseconds
         due = self._policy.next(config.tf, now_ns, newest.stamp_ns, newest.T_odom_base, estimate.T_map_odom)

@@ -190,7 +190,7 @@ NEVER = {
 }
 SPEAK_RCLPY = {
     f"node/{name}.py"
-    for name in ("bond", "node", "player", "qos", "ingest", "subscriptions", "publishers", "parameters")
+    for name in ("bond", "node", "player", "qos", "ingest", "subscriptions", "publishers", "parameters", "static_rival")
 }
 SPEAK_MESSAGES = SPEAK_RCLPY | {
     "messages/to_msg.py",

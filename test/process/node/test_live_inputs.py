@@ -148,6 +148,41 @@ def test_odometry_that_comes_late_is_named_with_the_tolerance_that_helps():
         assert n.stop()[0] == 0
 
 
+def test_a_clock_of_odometry_that_is_not_that_of_the_landmarks_is_named_with_its_offset():
+    with node("output.folder:=''") as n, robot(hears=("/diagnostics",)) as r:
+        r.wait_for_node()
+        drive = Drive()
+        drive.sees = False
+
+        def apart(seconds):
+            drive.stamp_ns = time.time_ns() - 3600 * 10**9
+            r.send("/landmarks", seen(drive, stamp_ns=time.time_ns()))
+            drive.pace(r)(seconds)
+
+        r.until_it_says("DEGRADED", "clock_domains: /odom: its stamps are -3600", "odom.offset_s=3600", spin=apart)
+        assert n.stop()[0] == 0
+
+
+def test_a_static_map_to_odom_of_somebody_else_is_named_until_its_publisher_has_gone():
+    with node("output.folder:=''") as n, robot(hears=("/diagnostics",)) as r:
+        r.wait_for_node()
+        drive = Drive()
+        arm = r.publisher("/tf_static", TFMessage, LATCHED)
+        arm.publish(transforms(("base_link", "arm", (0.0, 0.0, 1.0), quaternion())))
+        with robot(name="still", hears=(), sends=()) as other:
+            here = ("map", "odom", (0.0, 0.0, 0.0), quaternion())
+            still = other.publisher("/tf_static", TFMessage, LATCHED)
+            still.publish(transforms(("base_link", "laser", (0.0, 0.0, 1.0), quaternion()), here))
+            what = "somebody else publishes map -> odom on /tf_static: one of /robot, /still, which publish /tf_static"
+            r.until_it_says("ERROR", what, spin=drive.pace(r))
+            assert r.set({"tf.publish_tf": False}) == (True, "")
+            r.until_it_says("OK", spin=drive.pace(r))
+            assert r.set({"tf.publish_tf": True}) == (True, "")
+            r.until_it_says("ERROR", what, spin=drive.pace(r))
+        r.until_it_says("OK", spin=drive.pace(r))
+        assert n.stop()[0] == 0
+
+
 def test_A39_odometry_on_tf_that_never_comes_or_stops_is_missed_though_tf_goes_on():
     with (
         node("odom.type:=tf2_msgs/msg/TFMessage", "odom.topic:=/tf", "output.folder:=''") as n,

@@ -369,6 +369,11 @@ def refused(came, **reasons):
             "somebody else broadcasts map -> odom: one of /amcl, /wheels, which publish /tf: stop them one by one",
         ),
         (
+            Facts("active", has_other_authority=True, authorities=("/rsp", "/still"), static_authority="map -> odom"),
+            "ERROR",
+            "somebody else publishes map -> odom on /tf_static: one of /rsp, /still, which publish /tf_static: ",
+        ),
+        (
             Facts("active", (odom(),), has_other_authority=True, twins=1),
             "ERROR",
             "somebody else broadcasts map -> odom; another node has this node's name",
