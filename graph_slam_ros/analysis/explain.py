@@ -18,7 +18,7 @@ from graph_slam_ros.analysis.explain_condensed import (
 )
 from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.chi_square import quantile
-from graph_slam_ros.errors import FormatError, GaugeError, GraphSlamError, SingularError
+from graph_slam_ros.errors import FormatError, GaugeError, GraphSlamError, SingularError, did_you_mean
 from graph_slam_ros.formats.strict import integer
 from graph_slam_ros.graph.place import LABEL as PLACES
 from graph_slam_ros.runs.folder import SUMMARY, summary_of
@@ -206,7 +206,10 @@ def _landmark(run: SavedGraph, name: str) -> Iterator[str]:
     if not (seen or left):
         names = sorted({e.landmark for e in entries} - {""})
         there = ", ".join(names[:20]) + (", ..." if len(names) > 20 else "")
-        raise GraphSlamError(f"{name}: neither the id of an edge nor a landmark; there are {there or 'no landmarks'}")
+        raise GraphSlamError(
+            f"{name}: neither the id of an edge nor a landmark; there are {there or 'no landmarks'}"
+            f"{did_you_mean(name, names)}"
+        )
     if seen:
         yield from landmark_lines(run.folder, name, seen)
     if left:

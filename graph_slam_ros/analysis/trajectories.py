@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.errors import GraphSlamError, did_you_mean
 from graph_slam_ros.lie import se3
 from graph_slam_ros.messages.inputs.fixes import east_north_up
 from graph_slam_ros.recordings.bag import Bag, open_bag
@@ -91,7 +91,7 @@ def read_truth(truth: str | Path, topic: str = "", not_these: Collection[str] = 
     bag = open_bag(path)
     name, _, frames = (topic or _only_topic(bag, path, not_these)).partition(":")
     if name not in bag.topics or bag.topics[name].type not in (*_POSE_TYPES, _TF):
-        raise GraphSlamError(f"{path}: no topic {name} of poses; {_listed(bag)}")
+        raise GraphSlamError(f"{path}: no topic {name} of poses; {_listed(bag)}{did_you_mean(name, bag.topics)}")
     kind = bag.topics[name].type
     rows = _transforms(bag, path, name, frames) if kind == _TF else list(_rows(bag, name, kind))
     finite = [row for row in rows if all(map(math.isfinite, row[1]))]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from graph_slam_ros.cli import console
-from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.errors import GraphSlamError, did_you_mean, similar_file
 
 if TYPE_CHECKING:
     from graph_slam_ros.formats.graph_file import G2oFile
@@ -27,6 +27,10 @@ def simulate(args: argparse.Namespace) -> int:
         raise GraphSlamError(f"{wrong[0]}: a graph has no messages: --out FILE.mcap")
     if args.scenario not in (*WORLDS, CITY) and _is_recording(Path(args.scenario)) and not as_graph:
         return _spoil_recording(args, faults)
+    if args.scenario not in (*WORLDS, CITY) and not Path(args.scenario).exists():
+        there = [*WORLDS, CITY]
+        near = did_you_mean(args.scenario, there) or similar_file(Path(args.scenario))
+        raise GraphSlamError(f"no world {args.scenario!r}; there are {', '.join(there)}, and no such file{near}")
     of_file = args.scenario not in (*WORLDS, CITY) and Path(args.scenario).is_file()
     if (of_file or args.scenario == CITY) and not as_graph:
         raise GraphSlamError(f"{args.out}: {args.scenario} is a graph: --out FILE.g2o")

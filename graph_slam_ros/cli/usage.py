@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
 from graph_slam_ros.cli import console
+from graph_slam_ros.errors import did_you_mean
 
 CODES = "Exit codes: 0 done, 1 internal error, 2 refused, 3 done but something was lost, 130 interrupted."
 
@@ -33,6 +34,24 @@ class CommandParser(argparse.ArgumentParser):
         shown = [f"Example{'s' * (len(self.examples) > 1)}:", *(f"  {line}" for line in self.examples)]
         self.epilog = "\n".join([self.more(), ""] if self.more else []) + "\n".join([*shown, self.codes])
         return super().format_help()
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        """Refuse what is none of the choices of an argument, with the choice that is close."""
+        try:
+            super()._check_value(action, value)
+        except argparse.ArgumentError as error:
+            near = did_you_mean(str(value), map(str, action.choices or ()))
+            raise argparse.ArgumentError(action, f"{error.message}{near}") from None
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
+        """Refuse options that the command does not have, with the option that is close."""
+        known, rest = super().parse_known_args(args, namespace)
+        options = [word.partition("=")[0] for word in rest if word.startswith("--")]
+        if options:
+            self.error(
+                f"unrecognized arguments: {' '.join(rest)}{did_you_mean(options[0], self._option_string_actions)}"
+            )
+        return known, rest
 
     def error(self, message: str) -> NoReturn:
         """Refuse the command line."""

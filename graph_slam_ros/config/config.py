@@ -5,7 +5,6 @@ types and values out of range are refused with the name of the culprit.
 """
 
 import dataclasses
-import difflib
 import inspect
 import itertools
 import re
@@ -36,7 +35,7 @@ from graph_slam_ros.config.robust import RobustConfig
 from graph_slam_ros.config.solve import SolveConfig
 from graph_slam_ros.config.survey import Surveyed, surveyed
 from graph_slam_ros.config.world import AnchorConfig, FramesConfig, MapConfig, WorldConfig
-from graph_slam_ros.errors import ConfigError
+from graph_slam_ros.errors import ConfigError, nearest
 from graph_slam_ros.graph import Loss
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL, Geometry
 from graph_slam_ros.lie import se3
@@ -138,7 +137,7 @@ class Config:
             if name in REMOVED:
                 raise ConfigError(f"parameter {name!r} was removed: {REMOVED[name]}; leave it out")
             if name not in known:
-                near = _nearest(name, known)
+                near = nearest(name, known)
                 raise ConfigError(f"unknown parameter {name!r}; did you mean {near!r}?{_unlisted(name, names)}")
             section, key = name.split(".")
             sections.setdefault(section, {})[key] = known[name].check(value)
@@ -254,21 +253,6 @@ def _input_names(text: Any) -> list[str]:
             raise ConfigError(f"inputs.names: {name!r} is reserved or given twice")
         used.add(name)
     return names
-
-
-def _nearest(name: str, known: Iterable[str]) -> str:
-    """The known name that is most like another: by its letters, else by the words that both have, in any order."""
-    names = list(known)
-    if near := difflib.get_close_matches(name, names, 1, 0.8):
-        return near[0]
-
-    def words(text: str) -> set[str]:
-        return {word.removesuffix("s") for word in re.split(r"[._]", text.lower())}
-
-    def likeness(one: str) -> tuple[int, float]:
-        return len(words(one) & words(name)), difflib.SequenceMatcher(None, one, name).ratio()
-
-    return max(names, key=likeness)
 
 
 def _unlisted(name: str, names: list[str]) -> str:

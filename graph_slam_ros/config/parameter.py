@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
-from graph_slam_ros.errors import ConfigError
+from graph_slam_ros.errors import ConfigError, did_you_mean
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +30,8 @@ class Parameter:
         if type(value) is not self.type:
             raise ConfigError(f"{self.name}: {value!r} is not {_ARTICLE[self.type]}")
         if self.choices and value not in self.choices:
-            raise ConfigError(f"{self.name}: {value!r} is not one of {', '.join(self.choices)}")
+            near = did_you_mean(value, self.choices) if isinstance(value, str) else ""
+            raise ConfigError(f"{self.name}: {value!r} is not one of {', '.join(self.choices)}{near}")
         if isinstance(value, (int, float)) and not isinstance(value, bool):
             if isinstance(value, float) and not math.isfinite(value):
                 raise ConfigError(f"{self.name}: {value!r} is not finite")

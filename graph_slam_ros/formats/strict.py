@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from graph_slam_ros.errors import FormatError
+from graph_slam_ros.errors import FormatError, similar_file
 from graph_slam_ros.formats.files import opened
 
 # float() also accepts 1_0, inf, nan and digits of other scripts. No part can match what the one before it gave back:
@@ -46,7 +46,7 @@ def lines(path: Path, *, follow: bool = True) -> Iterator[tuple[int, str]]:
     except UnicodeDecodeError:
         raise FormatError(f"{path.name}: not a text file") from None
     except FileNotFoundError:
-        raise FormatError(f"{path}: no such file") from None
+        raise FormatError(f"{path}: no such file{similar_file(path)}") from None
     except OSError as error:
         raise FormatError(f"{path}: {error.strerror}") from None
 

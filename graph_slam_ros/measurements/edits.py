@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from reprlib import repr as shortened
 from typing import Any, TypeAlias
 
-from graph_slam_ros.errors import FormatError
+from graph_slam_ros.errors import FormatError, did_you_mean
 from graph_slam_ros.measurements.edit_actions import ACTIONS, Argument, read_arguments
 
 Value: TypeAlias = Argument
@@ -70,7 +70,10 @@ def edit_of(values: Any) -> Edit:
         raise FormatError(f"{shortened(values)} is not an object with the keys of an edit")
     do = values.get("do")
     if not isinstance(do, str) or do not in ACTIONS:
-        raise FormatError(f"do: {shortened(do)} is none of {', '.join(ACTIONS)}" if "do" in values else "do: missing")
+        near = did_you_mean(do, ACTIONS) if isinstance(do, str) else ""
+        raise FormatError(
+            f"do: {shortened(do)} is none of {', '.join(ACTIONS)}{near}" if "do" in values else "do: missing"
+        )
     for key in COMMON:
         if key not in values:
             raise FormatError(f"{key}: missing; {do} has {', '.join(COMMON)}, {ACTIONS[do].keys_text}")

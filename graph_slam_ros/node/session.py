@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.errors import GraphSlamError, similar_file
 from graph_slam_ros.measurements.types import END, InitialPose
 from graph_slam_ros.node.estimate import Estimate, UnseenWay, WeakestLandmark, doubted_lately
 from graph_slam_ros.node.resumption import Resumption
@@ -341,7 +341,7 @@ class Session:
             return earlier[max(earlier)]
         run = self._folder.parent / name
         if run.is_symlink() or not is_run(run):  # a link may lead anywhere
-            raise RunError(f"{name}: not a run")
+            raise RunError(f"{name}: not a run{similar_file(run)}")
         return run
 
     def finish(self) -> str:

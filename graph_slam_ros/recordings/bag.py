@@ -16,7 +16,7 @@ from mcap.records import Channel, Message, Schema
 from mcap.writer import CompressionType, Writer
 from rosbags.typesys.store import Typestore
 
-from graph_slam_ros.errors import FormatError, GraphSlamError
+from graph_slam_ros.errors import FormatError, GraphSlamError, similar_file
 from graph_slam_ros.formats.durable import AppendedFile
 from graph_slam_ros.formats.files import opened
 from graph_slam_ros.messages.interfaces import typestore
@@ -145,7 +145,7 @@ def _files(path: Path) -> list[Path]:
     if path.is_file():
         return [path]
     if not path.exists():
-        raise BagError(f"{path}: no such file or folder")
+        raise BagError(f"{path}: no such file or folder{similar_file(path)}")
     if not path.is_dir():
         raise BagError(f"{path}: neither a file nor a folder")
     for suffix in _SUFFIXES:

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from graph_slam_ros.config.inputs import InputConfig, default_input
+from graph_slam_ros.errors import did_you_mean
 from graph_slam_ros.messages.from_msg import TF, TF_STATIC, TRANSFORMS
 from graph_slam_ros.messages.inputs import check_topics, uses
 from graph_slam_ros.recordings.bag import Bag, BagError
@@ -78,7 +79,7 @@ def _choose(bag: Bag, settings: InputConfig, named: str | None, option: str) -> 
     if named is not None:
         topic = bag.topics.get(named)
         if topic is None:
-            raise BagError(f"no topic {named} in the recording; {there}")
+            raise BagError(f"no topic {named} in the recording; {there}{did_you_mean(named, bag.topics)}")
         if not topic.type:
             raise BagError(f"topic {named} has no type: the recording lacks its schema")
         if topic.type != settings.type:

@@ -20,7 +20,7 @@ from mcap.records import Channel, Schema
 
 from graph_slam_ros import __version__
 from graph_slam_ros.config.config import REMOVED, flatten
-from graph_slam_ros.errors import ConfigError, FormatError, GraphSlamError
+from graph_slam_ros.errors import ConfigError, FormatError, GraphSlamError, similar_file
 from graph_slam_ros.formats.durable import NEW, claimed, sync_folder, write_whole
 from graph_slam_ros.formats.files import is_regular, opened, read_bytes, read_text
 from graph_slam_ros.formats.parameters import read_parameters
@@ -161,8 +161,8 @@ def is_recording(path: Path) -> bool:
 def run_config(folder: Path) -> Config:
     """The configuration a run was made with. Raises ConfigError naming the file."""
     if not os.path.lexists(folder / CONFIG):
-        mend = f"; of a recording graph_slam replay {folder} --out RUN makes one" if is_recording(folder) else ""
-        raise ConfigError(f"{folder}: not a run: no {CONFIG} in it{mend}")
+        made = f"; of a recording graph_slam replay {folder} --out RUN makes one" * is_recording(folder)
+        raise ConfigError(f"{folder}: not a run: no {CONFIG} in it{made or similar_file(folder)}")
     values = read_parameters(folder / CONFIG, follow=False)
     try:
         return Config.from_mapping({name: value for name, value in flatten(values) if name not in REMOVED})

@@ -4,6 +4,7 @@ import itertools
 import os
 from pathlib import Path
 
+from graph_slam_ros.errors import similar_file
 from graph_slam_ros.runs.folder import RunError, is_recording, is_run
 
 _MOST_SEARCHED, _MOST_NAMED = 200, 3  # folders in one that is not a run
@@ -14,7 +15,7 @@ def check_run(folder: Path) -> None:
     if is_run(folder):
         return
     if not os.path.lexists(folder):
-        raise RunError(f"{folder}: not a run's folder: there is nothing of that name")
+        raise RunError(f"{folder}: not a run's folder: there is nothing of that name{similar_file(folder)}")
     if is_recording(folder):
         what = "a recording" if folder.is_dir() else "a file"
         made = "graph_slam replay BAG --out RUN makes a run of a recording"

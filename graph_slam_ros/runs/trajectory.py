@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.errors import GraphSlamError, similar_file
 from graph_slam_ros.formats.files import read_text
 from graph_slam_ros.lie import se3
 from graph_slam_ros.typing import Array
@@ -84,7 +84,7 @@ def read_rows(path: Path, *, follow: bool = False) -> Trajectory:
     try:
         lines = read_text(path, follow=follow).splitlines()
     except FileNotFoundError:
-        raise GraphSlamError(f"{path}: no such file") from None
+        raise GraphSlamError(f"{path}: no such file{similar_file(path)}") from None
     except OSError as error:
         raise GraphSlamError(f"{path}: {error.strerror}") from None
     except UnicodeDecodeError as error:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.errors import GraphSlamError, did_you_mean
 from graph_slam_ros.simulation import flight, manhattan, pythonrobotics, warehouse
 from graph_slam_ros.simulation.bag import write_bag
 from graph_slam_ros.simulation.draft import WrongLine, WrongMessage, write_table
@@ -58,7 +58,7 @@ def simulate(world: str, /, seed: int, **options: Any) -> Recording:
 def check_options(world: str, seed: int, options: Mapping[str, Any]) -> tuple[Any, Instruments]:
     """Return the options of a world and of its instruments; as ``simulate``, which drives through it."""
     if world not in WORLDS:
-        raise GraphSlamError(f"no world {world!r}; there are {', '.join(WORLDS)}")
+        raise GraphSlamError(f"no world {world!r}; there are {', '.join(WORLDS)}{did_you_mean(world, WORLDS)}")
     if seed < 0:
         raise GraphSlamError(f"seed {seed} is negative")
     of_instruments = {o.name for o in options_of(Instruments)}

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.random import PCG64, Generator, SeedSequence
 
-from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.errors import GraphSlamError, did_you_mean
 from graph_slam_ros.formats.parameters import parse_setting
 from graph_slam_ros.simulation.draft import Draft
 from graph_slam_ros.simulation.drive import Drive
@@ -298,7 +298,7 @@ class Fault:
         """
         known: dict[str, Any] = {**KINDS, **MESSAGE_KINDS}
         if kind not in known:
-            raise GraphSlamError(f"no fault {kind!r}; there are {', '.join(known)}")
+            raise GraphSlamError(f"no fault {kind!r}; there are {', '.join(known)}{did_you_mean(kind, known)}")
         return cls(kind, fill(kind, known[kind].options, options))
 
     @property

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 from numpy.random import Generator
 
-from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.errors import GraphSlamError, did_you_mean
 
 Options = TypeVar("Options")
 
@@ -34,7 +34,10 @@ class Option:
             raise GraphSlamError(f"{world}: {self.name}: {value!r} is not {_ARTICLE[kind]}")
         if kind is str:
             if value not in self.choices:
-                raise GraphSlamError(f"{world}: {self.name}: {value!r} is not one of {', '.join(self.choices)}")
+                raise GraphSlamError(
+                    f"{world}: {self.name}: {value!r} is not one of {', '.join(self.choices)}"
+                    f"{did_you_mean(value, self.choices)}"
+                )
         elif kind is not bool and not (self.low <= value <= self.high and value != math.inf):
             raise GraphSlamError(f"{world}: {self.name}: {value!r} is not in [{self.low:g}, {self.high:g}]")
         return value
@@ -84,5 +87,6 @@ def fill(world: str, cls: type[Options], values: Mapping[str, Any], others: Sequ
     known = {o.name: o for o in options_of(cls)}
     for name in values:
         if name not in known:
-            raise GraphSlamError(f"{world}: no option {name!r}; it has {', '.join([*known, *others])}")
+            there = [*known, *others]
+            raise GraphSlamError(f"{world}: no option {name!r}; it has {', '.join(there)}{did_you_mean(name, there)}")
     return cls(**{name: known[name].check(world, value) for name, value in values.items()})

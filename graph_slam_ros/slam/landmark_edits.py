@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.errors import GraphSlamError, did_you_mean
 from graph_slam_ros.slam.edit_tools import EditTools
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
 from graph_slam_ros.slam.landmarks.landmark import Landmark
@@ -45,7 +45,7 @@ class LandmarkEdits:
         backend, known, tools = self._backend, self._landmarks.known, self._tools
         b = self._known(name)
         if into not in known:
-            raise GraphSlamError(f"landmark {into} is not in the map")
+            raise GraphSlamError(f"landmark {into} is not in the map{did_you_mean(into, known)}")
         a = known[into]
         tools.refuse_held(b.vertex)
         if fault := self._cannot_be_one(a, b):
@@ -133,7 +133,7 @@ class LandmarkEdits:
     def _known(self, name: str) -> Landmark:
         if name not in self._landmarks.known:
             self._tools.counters.count("edit", "unknown_landmark")
-            raise GraphSlamError("it is not in the map")
+            raise GraphSlamError(f"it is not in the map{did_you_mean(name, self._landmarks.known)}")
         return self._landmarks.known[name]
 
     def _refuse_known(self, to: str) -> None:

@@ -259,6 +259,19 @@ def test_each_command_ends_with_a_line_of_what_to_do_next(bag, run, tmp_path, ca
 REFUSED = {
     "no command": ([], "graph_slam: the following arguments are required: COMMAND"),
     "unknown command": (["fly"], "invalid choice: 'fly'"),
+    "command with a typo": (["replya", "{bag}"], "did you mean 'replay'?"),
+    "option with a typo": (["replay", "{bag}", "--frce"], "arguments: --frce; did you mean '--force'?"),
+    "recording with a typo": (["info", "{bag}x"], "no such file or folder; did you mean 'drive it.mcap'?"),
+    "topic with a typo": (["replay", "{bag}", "--odom", "/odm", "--out", "{out}"], "did you mean '/odom'?"),
+    "choice with a typo": (
+        ["replay", "{bag}", "--out", "{out}", "--set", "tf.stamp=odometri"],
+        "did you mean 'odometry'?",
+    ),
+    "run with a typo": (["explain", "{bag}s"], "did you mean 'drive it.mcap'?"),
+    "fault with a typo": (
+        ["simulate", "warehouse", "--out", "{out}.mcap", "--fault", "wrong_mout"],
+        "did you mean 'wrong_mount'?",
+    ),
     "unknown option": (["info", "{bag}", "--fast"], "unrecognized arguments: --fast"),
     "no bag": (["replay"], "graph_slam replay: the following arguments are required: BAG"),
     "no out": (["replay", "{bag}"], "replay needs --out DIR"),
@@ -306,6 +319,7 @@ REFUSED = {
     "own source": (["replay", "{run}", "--out", "{run}"], "cannot be read from and written to at once"),
     "rate": (["replay", "{bag}", "--ros", "--rate", "-1"], "argument --rate: -1 is not a positive number"),
     "unknown world": (["simulate", "mars", "--out", "{out}"], "no world 'mars'; there are pythonrobotics"),
+    "world with a typo": (["simulate", "warehous", "--out", "{out}"], "did you mean 'warehouse'?"),
     "seed as an option": (["simulate", "manhattan", "--out", "{out}", "--set", "seed=3"], "--set seed: no option of a"),
     "a huge number": (
         ["simulate", "manhattan", "--out", "{out}", "--set", f"poses={10**400}"],
