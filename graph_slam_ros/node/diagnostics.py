@@ -70,6 +70,14 @@ class InputFacts:
 
 
 @dataclass(frozen=True, slots=True)
+class Outcome:
+    """The outcome of something that was asked for on a topic."""
+
+    text: str
+    is_done: bool
+
+
+@dataclass(frozen=True, slots=True)
 class Facts:
     """The facts of the verdict.
 
@@ -87,6 +95,7 @@ class Facts:
     authorities : other nodes that publish /tf, one of which broadcasts map -> odom, if somebody does
     static_authority : the transform to odometry's frame that one of these publishes on /tf_static, if one does
     findings : what is wrong with the inputs by a check that needs no fit, each with what mends it
+    outcome : what became of what was asked for last on a topic; None where nothing was
     tf_behind_s : how much earlier than the last map -> odom would be dated now, so that it is not sent
     preparing : what keeps the pipeline from beginning: kernels are compiled or loaded; empty when they are ready
     cannot_prepare : why that failed
@@ -117,6 +126,7 @@ class Facts:
     static_authority: str = ""
     twins: int = 0
     findings: tuple[str, ...] = ()
+    outcome: Outcome | None = None
     tf_behind_s: float = 0.0
     preparing: str = ""
     cannot_prepare: str = ""
@@ -342,6 +352,8 @@ def statuses(facts: Facts, verdict: Health, node: str) -> Iterator[Status]:
         nobody = one.unpublished if is_absent else ""
         message = one.mismatch or nobody or f"{one.received} {INPUT_COLUMNS['received']}"
         yield Status(level, f"{node}: input {one.name}", message, node, values)
+    if facts.outcome is not None:
+        yield Status(OK if facts.outcome.is_done else WARN, f"{node}: asked", facts.outcome.text, node, {})
     if facts.estimate:
         values = _graph(facts.estimate) | {"path updates sent": str(facts.path_version)}
         yield Status(OK, f"{node}: weak directions", _weakness(facts, facts.estimate), node, facts.weakest)

@@ -97,6 +97,7 @@ class FactCollector:
             static_authority=static,
             twins=node.get_node_names_and_namespaces().count((node.get_name(), node.get_namespace())) - 1,
             findings=self._ingest.check.findings,
+            outcome=self._ingest.outcome,
             tf_behind_s=broadcaster.behind_s if broadcaster is not None else 0.0,
             preparing=preparation.status,
             cannot_prepare=preparation.fault,

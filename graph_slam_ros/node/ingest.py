@@ -11,7 +11,7 @@ from rclpy.clock import JumpThreshold
 from rclpy.duration import Duration
 from rclpy.serialization import deserialize_message
 
-from graph_slam_ros.errors import GraphSlamError, message_of
+from graph_slam_ros.errors import GraphSlamError, did_you_mean, message_of
 from graph_slam_ros.measurements.reasons import explain, remedy
 from graph_slam_ros.measurements.types import Closure, InitialPose, Measured
 from graph_slam_ros.messages import results, to_msg
@@ -19,6 +19,9 @@ from graph_slam_ros.messages.from_msg import INITIAL_POSE, Decoder, MessageConve
 from graph_slam_ros.messages.inputs import uses
 from graph_slam_ros.messages.interfaces import typestore
 from graph_slam_ros.messages.message_class import message_class
+from graph_slam_ros.messages.to_msg import OK, WARN
+from graph_slam_ros.node import events
+from graph_slam_ros.node.diagnostics import Outcome
 from graph_slam_ros.node.handle import NodeHandle
 from graph_slam_ros.node.input_check import InputCheck
 from graph_slam_ros.node.memory import is_short
@@ -56,6 +59,7 @@ class Ingest:
     gate : decides what a jump of time, a pause and a full queue mean
     extrapolator : the pose by the newest odometry
     memory_is_short : whether the process has more memory than it should
+    outcome : what became of the last ~/remove or initialpose that was not used; None before the first
     """
 
     def __init__(
@@ -79,6 +83,7 @@ class Ingest:
         self.gate = IngestGate(config.time.jump_back_s, counters, lambda: node.now_ns)
         self.extrapolator = PoseExtrapolator(config)
         self.memory_is_short = False
+        self.outcome: Outcome | None = None
         self._future_stamps = FutureStamps(config.time.future_s, self._stamp_clock_ns, partial(self.refuse, "future"))
         self._publishes_odometry = False
         self._with_twist = {one.name for one in config.sources if one.type == results.ODOMETRY}
@@ -202,32 +207,46 @@ class Ingest:
         before = self._counters.as_dict()
         poses = self.converter.initial_pose(cdr)
         if not poses:
-            self._log_counted(INITIAL_POSE, "initialpose: not used", before, self._counters)
+            self._report(INITIAL_POSE, "initialpose: not used", before, self._counters)
         for pose in poses:
+            self._publish_outcome("initialpose: used", is_done=True)
             self.in_background(self.in_sequence([pose]))
 
     def _on_remove(self, message: Any) -> None:
         try:
             event = removal(message.data)
         except GraphSlamError as error:
-            self._node.get_logger().warn(str(error))
+            self._publish_outcome(str(error), is_done=False)
             return
         self._session.accept([event])
 
         def remove() -> None:
-            before = self._session.slam.counters.as_dict()
+            slam = self._session.slam
+            before, known = slam.counters.as_dict(), list(slam.landmarks)
             self._session.process([event])
-            self._log_counted(EDITS, f"~/remove: {message.data[:_SHOWN]}", before, self._session.slam.counters)
+            near = did_you_mean(str(dict(event.values).get("landmark", "")), known)
+            self._report(EDITS, f"~/remove: {message.data[:_SHOWN]}", before, slam.counters, near)
 
         self.in_background(self._worker.call(remove))
 
-    def _log_counted(self, source: str, what: str, before: Mapping[str, Mapping[str, int]], counters: Counters) -> None:
-        """Log each reason why not that has been counted since, in one line with its meaning and remedy."""
-        known = before.get(source, {})
+    def _report(
+        self, source: str, what: str, before: Mapping[str, Mapping[str, int]], counters: Counters, near: str = ""
+    ) -> None:
+        """Say what became of what was asked for on a topic, by what has been counted since."""
+        known, why = before.get(source, {}), list[str]()
         for reason, times in counters.as_dict().get(source, {}).items():
             if times > known.get(reason, 0) and reason != "removed":
                 mend = remedy(source, reason)
-                self._node.get_logger().warn(f"{what}: {explain(reason).meaning} ({reason}){mend and ': '}{mend}")
+                near = near * (reason == "unknown_landmark")
+                why.append(f"{explain(reason).meaning} ({reason}){mend and ': '}{mend}{near}")
+        self._publish_outcome(f"{what}: {'; '.join(why) or 'done'}", is_done=not why)
+
+    def _publish_outcome(self, text: str, *, is_done: bool) -> None:
+        """Log what became of it; say it on ~/events and, as the last, on /diagnostics: a topic has no answer."""
+        self.outcome = Outcome(text, is_done=is_done)
+        if not is_done:
+            self._node.get_logger().warn(text)
+        self._publishers.publish_events(self._node.now_ns, [events.happened("asked", text, OK if is_done else WARN)])
 
     # -- time --------------------------------------------------------------------------------------------------------
 

@@ -36,7 +36,7 @@ def places(message):
 
 
 def test_the_map_is_held_and_edited_while_the_node_runs_and_the_run_repeats(tmp_path):
-    hears = "pose", "landmarks_estimate", "/diagnostics"
+    hears = "pose", "landmarks_estimate", "/diagnostics", "events"
     with node(f"output.folder:={tmp_path / 'run'}", "inputs.reliable:=true") as n, robot(hears=hears) as r:
         remove = r.publisher("/graph_slam/remove", String)
         given = r.publisher("initialpose", PoseWithCovarianceStamped)
@@ -60,19 +60,25 @@ def test_the_map_is_held_and_edited_while_the_node_runs_and_the_run_repeats(tmp_
         for _ in range(2):
             remove.publish(String(data="landmark nobody"))
             given.publish(wrong)
+        remove.publish(String(data="landmark nort"))
         remove.publish(String(data="everything, please"))
         remove.publish(String(data=f"landmark {min(held)}"))
         gone = lambda: min(held) not in places(r.heard["landmarks_estimate"][-1])  # noqa: E731
         until(gone, r.spin, "the landmark to be removed")
         drive.go(r, 30, every=2)
         r.settle()
+        until(lambda: r.said("asked"), r.spin, "answer on /diagnostics")
         finish(n, r)
+    asked = [s.message for m in r.heard["events"] for s in m.status if s.name == "graph_slam: asked"]
+    assert f"~/remove: landmark {min(held)}: done" in asked
+    assert sum(one.startswith("initialpose: not used: ") for one in asked) == 2
+    assert any(one.startswith("~/remove: landmark nort: ") and "did you mean 'north'?" in one for one in asked)
     assert "neither 'edge ID' nor 'landmark NAME'" in n.said
     why = "~/remove named a landmark that is not in the map (unknown_landmark): ros2 topic echo"
     assert n.said.count(f"~/remove: landmark nobody: {why}") == 2, "each time"
     assert f"~/remove: landmark {min(held)}" not in n.said
     assert n.said.count("initialpose: not used: ") == 2, "each time"
-    assert counters(tmp_path / "run")["edit"] == {"removed": 1, "unknown_landmark": 2}
+    assert counters(tmp_path / "run")["edit"] == {"removed": 1, "unknown_landmark": 3}
     assert replayed(tmp_path / "run", tmp_path) == results(tmp_path / "run")
 
 
