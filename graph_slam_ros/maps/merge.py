@@ -6,7 +6,7 @@ then the merged map has all of its keyframes, and condenses them as its configur
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import chain, count
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ from graph_slam_ros.runs.journal import parts_of
 from graph_slam_ros.runs.map_journal import MapGrowth, Record, extend, state_of
 from graph_slam_ros.runs.restore import config_to_go_on, record_run, restored_and_solved, stopwatch
 from graph_slam_ros.slam import Control, GraphSlam
+from graph_slam_ros.slam.alarm import Alarm
 from graph_slam_ros.slam.calibration.parameters import QUANTITIES, Parameter
 from graph_slam_ros.slam.edit_tools import HAND_MADE
 from graph_slam_ros.slam.landmarks.assignments import NAME, last_number
@@ -140,6 +141,7 @@ class _Second:
                 for edge, topic, sighting, keyframe, vertex, *rest in growth.get("seen", ())
             ],
             "edits": [self._edit_record(one, ids) for one in self._two.edits],
+            "displacements": [*self._one.displacements, *map(self._displacement, self._two.displacements)],
             "datum": growth.get("datum", self._one.datum),
             "offsets": {name: self._vertex[vertex] for name, vertex in growth.get("offsets", {}).items()},
         }
@@ -171,6 +173,14 @@ class _Second:
         arguments = {key: self._argument(key, x, number) for key, x in one.edit.arguments.items()}
         edit = replace(one.edit, name=name, arguments=arguments)
         return AppliedEdit(edit, self._keyframes + one.keyframe, edges, added).record
+
+    def _displacement(self, one: dict[str, Any]) -> dict[str, Any]:
+        """An alarm of the second map, with the keyframe of the merged map at which its segment begins."""
+        if one.get("segment") is None:
+            return one
+        fields = {key: value for key, value in one.items() if key != "text"}
+        alarm = Alarm(**fields | {"segment": self._keyframes + one["segment"]})
+        return asdict(alarm) | {"text": str(alarm)}
 
     def _argument(self, key: str, value: Value, number: Mapping[int, int]) -> Value:
         """A value of an edit, with the ids and keyframes of the merged map."""

@@ -15,7 +15,7 @@ JSON records in mcap, as in the journal. The first is ``map`` with the version o
   sighting and its edge; ``passes``: by vertex, what is known of when a landmark is seen (``Presence.record``);
   ``offsets``: by input, the vertex of what its ranges have in common;
 * ``datum``: latitude, longitude and height that fixes are from; ``settings``: parameters that were changed on the way;
-  ``displacements``: all alarms of the run by then, as in ``run.json``;
+  ``displacements``: all alarms by then, of all drives, as in ``run.json``;
 * ``processed``: records of the ingest sequence that all of it came of; ``used``: stamp and input of the last odometry
   that was used by then;
 * ``noise``: factors of the configured sigmas that the edges have from now on, ``[class, input, part, factor]`` each;
@@ -77,10 +77,13 @@ class MapGrowth:
     """
 
     def __init__(self, start: MapSnapshot | None = None) -> None:
+        self._displacements: list[dict[str, Any]] = []
         self._begin()
         self.first: list[Record] = [{"type": "map", "version": _FIRST}]
         if start is not None:
-            self.first += [self.since(start), _estimate(start.values), {"type": "start"}]
+            known = {"displacements": start.displacements} if start.displacements else {}
+            self._displacements = start.displacements
+            self.first += [self.since(start) | known, _estimate(start.values), {"type": "start"}]
 
     def _begin(self) -> None:
         self._vertices = self._edges = self._judged = self._changes = 0
@@ -93,7 +96,7 @@ class MapGrowth:
         self._datum: tuple[float, ...] = ()
         self._gyro: SavedBias | None = None
         self._settings: dict[str, Any] = {}
-        self._displacements: list[dict[str, Any]] = []
+        self._displacements = []
         self._estimated = 0  # keyframes at the last estimate
 
     def of(self, slam: GraphSlam, *, is_anew: bool = False) -> Iterator[Record]:

@@ -91,13 +91,13 @@ def _with_rest(folder: Path, state: MapSnapshot, losses: list[str], counters: Co
     if not rest:
         return state
     state.continues_with = state.source if state.used_ns is not None else ""
-    settings, displacements = dict(state.settings), state.displacements
+    settings = dict(state.settings)
     slam = GraphSlam(config_of(folder, state).changed(_NOTHING_LEAVES), start=state)
     for measurement in [*rest, Control("end")]:
         slam.process(measurement)
     counters.update(slam.counters)
     out = state_of(slam, folder)
-    out.settings, out.displacements = settings | out.settings, [*displacements, *out.displacements]
+    out.settings = settings | out.settings
     return out
 
 
@@ -232,7 +232,6 @@ def recover(folder: Path, out: Path, *, force: bool = False) -> Summary:
     counters = Counters()
     state = map_of(folder, losses, counters)
     options: dict[str, Any] = {"earlier": counters, "took": took, "recording": recording_of(folder)}
-    options["more"] = lambda: {"displacements": state.displacements}
     return record_run(out, config_of(folder, state), (), losses, state, force=force, **options)[1]
 
 
@@ -253,7 +252,7 @@ def complete(folder: Path) -> Summary:
             slam = _solved(folder, _started(folder, state, losses))
             kept = {key: before[key] for key in _OF_RECORDING if key in before}
             now = summarize(slam, counters) | fitted_summary(slam) | took()
-            now |= {"displacements": state.displacements, "losses": losses, "ended": True, "is_incomplete": False}
+            now |= {"losses": losses, "ended": True, "is_incomplete": False}
             summary = kept | now
             save_results(folder, slam, summary)
     except OSError as error:

@@ -288,6 +288,7 @@ class GraphSlam(MapView):
         """Solve a loaded map. The robot's pose in it is not known yet."""
         if self.graph.kind_of(start.keyframes[0].vertex) is not self.space.pose:
             raise GraphSlamError(f"the map is not in {self.space.dimensions} dimensions")
+        self._earlier_displacements = start.displacements
         self._frontend.restore(*start.path, start.continues_with, start.gyro_bias, start.first_keyframe)
         self._anchor.restore()
         self._landmarks.restore(start.landmarks, start.range_offsets, start.passes)

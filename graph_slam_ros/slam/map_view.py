@@ -56,6 +56,7 @@ class MapView(PathView):
         self.config, self.backend = config, backend
         self._frontend, self._landmarks = frontend, landmarks
         self._kidnaps, self._solution = kidnaps, solution
+        self._earlier_displacements: list[dict[str, Any]] = []
 
     _calibrator: Calibrator
 
@@ -344,8 +345,9 @@ class MapView(PathView):
 
     @property
     def displacements(self) -> list[dict[str, Any]]:
-        """The same as records for files, each with its sentence."""
-        return [asdict(alarm) | {"text": str(alarm)} for alarm in self.alarms]
+        """The same as records for files, each with its sentence; first those of the map that it began in."""
+        own = [asdict(alarm) | {"text": str(alarm)} for alarm in self.alarms]
+        return [*self._earlier_displacements, *own]
 
     @property
     def displaced(self) -> Alarm | Slip | None:

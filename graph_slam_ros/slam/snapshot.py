@@ -29,7 +29,7 @@ class MapSnapshot:
     held : so many vertices and edges were held when localization began (``map.localize``); zeros where the map grows
     datum : of fixes on earth, as in ``Fix``
     settings : parameters that were changed on the way, by name
-    displacements : alarms of the run by then, as in ``run.json``
+    displacements : alarms by then, of all drives, as in ``run.json``
     processed : records of the ingest sequence that it came of; None where it does not tell
     used_ns : stamp of the last odometry that was used by then; None before the first
     source : the input of that odometry
