@@ -19,7 +19,7 @@ from graph_slam_ros.lie import se3
 from graph_slam_ros.runs.folder import recording_of, run_config
 from graph_slam_ros.runs.journal import read_measurements
 from graph_slam_ros.runs.map_journal import read_map
-from graph_slam_ros.runs.trajectory import Trajectory, read_tum
+from graph_slam_ros.runs.trajectory import Trajectory, read_rows
 from graph_slam_ros.slam import GraphSlam
 from graph_slam_ros.typing import Array
 
@@ -93,17 +93,22 @@ def _truth(run: Path, truth: str, topic: str, *, align: bool) -> Trajectory:
 
 
 def _moments(run: Path, frames: int, losses: list[str]) -> Iterator[_Moment]:
-    """The estimate at so many stamps, and at the end."""
-    stamps_s = read_tum(run / "path.tum").stamps_s
-    if not len(stamps_s):
-        return
-    due_s = list(np.linspace(stamps_s[0], stamps_s[-1], frames)[1:])
+    """The estimate after equal times, and at the end. Time goes on from keyframe to keyframe, also of a set clock."""
     config = run_config(run).changed({"map.condense": False})  # all of the path is drawn
-    slam = GraphSlam(config, start=read_map(run, losses, start_only=True))
+    start = read_map(run, losses, start_only=True)
+    stamps_s = read_rows(run / "path.tum").stamps_s[max(len(start.keyframes) - 1, 0) if start else 0 :]
+    step_s = float(np.maximum(np.diff(stamps_s), 0.0).sum()) / max(frames - 1, 1)
+    slam = GraphSlam(config, start=start)
+    last_ns, passed_s, due_s = slam.keyframes[-1].stamp_ns if slam.keyframes else 0, 0.0, step_s
     for measurement in read_measurements(run, losses):
         slam.process(measurement)
-        if due_s and len(slam.keyframes) > 1 and 1e-9 * slam.keyframes[-1].stamp_ns >= due_s[0]:
-            due_s = [t for t in due_s if t > 1e-9 * slam.keyframes[-1].stamp_ns]
+        if not slam.keyframes or slam.keyframes[-1].stamp_ns == last_ns:
+            continue
+        now_ns = slam.keyframes[-1].stamp_ns
+        passed_s += max(1e-9 * (now_ns - last_ns), 0.0) if last_ns else 0.0
+        last_ns = now_ns
+        if passed_s >= due_s and len(slam.keyframes) > 1:
+            due_s = (passed_s // step_s + 1.0) * step_s if step_s else 0.0
             yield _now(slam)
     if len(slam.keyframes) > 1:
         yield _now(slam)
@@ -140,8 +145,10 @@ def _drawn(moments: list[_Moment], title: str, truth: Trajectory | None) -> Iter
     (landmarks,) = axes.plot([], [], "*", color=LIGHT["landmarks"], label="landmarks")
     (robot,) = axes.plot([], [], "o", color=LIGHT["estimate"])
     axes.legend(loc="upper right", fontsize=8, framealpha=0.8)
+    newest_s = -np.inf
     for moment in moments:
-        so_far = 0 if truth is None else int(np.searchsorted(truth.stamps_s, moment.stamp_s, side="right"))
+        newest_s = max(newest_s, moment.stamp_s)  # a clock that is set back takes nothing of the truth back
+        so_far = 0 if truth is None else int(np.searchsorted(truth.stamps_s, newest_s, side="right"))
         for line, points in (
             (known, true[:so_far]),
             (odometry, moment.odometry),

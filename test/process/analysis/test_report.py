@@ -1,8 +1,10 @@
 import subprocess
 import sys
+from itertools import pairwise
 
 import numpy as np
 import pytest
+import small_drive
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.image import imread
@@ -15,9 +17,10 @@ from graph_slam_ros.cli import main
 from graph_slam_ros.formats.parameters import parameters_text
 from graph_slam_ros.formats.tum import tum_text
 from graph_slam_ros.lie import se3
+from graph_slam_ros.runs.restore import record_run
 from graph_slam_ros.runs.trajectory import Trajectory, read_tum
 from graph_slam_ros.simulation import simulate, write_bag
-from graph_slam_ros.slam import Config
+from graph_slam_ros.slam import Config, Control
 
 COLUMNS = "id,kind,x,y,theta,sightings,cov_xx,cov_xy,cov_yy"
 
@@ -274,6 +277,17 @@ def test_the_animation_repeats_the_drive_and_ends_with_the_solved_path(tmp_path,
     (run / "ingest.mcap").unlink()
     assert main(["plot", str(run), "--animate", str(gif), "--force"]) == 2
     assert "ingest.mcap" in capsys.readouterr().err
+
+
+def test_the_pictures_of_the_animation_follow_the_drive_where_a_clock_was_set_back(tmp_path):
+    def stretch(start_s, first):
+        return [m for m in small_drive.drive(start_s=start_s, first=first) if not isinstance(m, Control)]
+
+    parts = [*stretch(1000, 0), Control("time_jump"), *stretch(1010, 24), Control("end"), Control("optimize")]
+    record_run(tmp_path / "run", small_drive.config(), parts, [])
+    counts = [len(moment.path) for moment in animation._moments(tmp_path / "run", 12, [])]
+    assert counts == sorted(counts)
+    assert max(b - a for a, b in pairwise(counts)) <= 6, "no part of the drive is left out"
 
 
 def test_a_graph_is_drawn_before_and_after_with_closures_unlike_odometry(tmp_path, figures):
