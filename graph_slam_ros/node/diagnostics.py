@@ -14,17 +14,22 @@ from graph_slam_ros.measurements.reasons import explain, remedy
 from graph_slam_ros.messages.inputs.transforms import MAP_FRAMES
 from graph_slam_ros.messages.to_msg import ERROR, OK, WARN, Status
 from graph_slam_ros.node.estimate import OFF, Estimate
+from graph_slam_ros.node.events import Outcome
 from graph_slam_ros.node.recent import WINDOW_S, Recent
 from graph_slam_ros.runs.outcome import MOTION, leaves_plane
 from graph_slam_ros.runs.tables import INPUT_COLUMNS
 
 _LEVELS = {"WAITING": WARN, "DEGRADED": WARN, "ERROR": ERROR}  # the others are as somebody wants them
 _TF_BEHIND_S = 1.0
-_UNSEEN_M, _UNSEEN_S = 10.0, 10.0
+_UNSEEN_M, _UNSEEN_S, _NEVER_SEEN = 10.0, 10.0, 3.0
 _LONGEST = 80  # of a frame's name
 _LATE_S, _PLAYED_S = 0.3, 10.0  # later still, a recording is played without /clock
 _NEARLY = 0.5  # of the lateness from which on an observation is refused
 _NO_CLOCK = "use_sim_time is set and nothing comes on /clock"
+_TRANSITIONS = {
+    "unconfigured": "waits for ros2 lifecycle set NODE configure, or a lifecycle manager, or node.autostart:=true",
+    "inactive": "waits for ros2 lifecycle set NODE activate, or a lifecycle manager",
+}
 _UNLINKED = ("frame_unknown", "child_frame_unknown", "odom_frame_unknown", "map_frame_unknown")
 
 
@@ -67,14 +72,6 @@ class InputFacts:
     def unpublished(self) -> str:
         """Return that nobody publishes it, and what could be used instead; empty if somebody does."""
         return "" if self.publishers else "; ".join((f"nobody publishes {self.topic}", *self.alternatives))
-
-
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """The outcome of something that was asked for on a topic."""
-
-    text: str
-    is_done: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,7 +150,8 @@ class Health:
 def judge(facts: Facts, config: Config) -> Health:
     """The verdict."""
     if facts.lifecycle != "active":
-        return Health(facts.lifecycle.upper(), tuple(filter(None, (facts.cannot_prepare or facts.preparing,))))
+        why = facts.cannot_prepare or facts.preparing or _TRANSITIONS.get(facts.lifecycle, "")
+        return Health(facts.lifecycle.upper(), tuple(filter(None, (why,))))
     for state, found in (("ERROR", _errors(facts)), ("WAITING", _missing(facts)), ("DEGRADED", _faults(facts, config))):
         if reasons := tuple(found):
             return Health(state, reasons)
@@ -322,13 +320,17 @@ def _without_option(text: str) -> str:
 
 
 def _uncorrected(facts: Facts) -> Iterator[str]:
-    """Yield each input that nobody publishes, once the robot has driven for a while and nothing corrects odometry."""
+    """Yield why each input is not used, once the robot has driven for a while and nothing corrects odometry."""
     others = [one for one in facts.inputs if one.use not in MOTION]
     if facts.estimate is None or any(one.used for one in others):
         return
     way = facts.estimate.unseen
     if way.length_m >= _UNSEEN_M and facts.estimate.stamp_ns - way.since_ns >= _UNSEEN_S * 1e9:
         yield from (f"nothing corrects odometry: {one.unpublished}" for one in others if one.unpublished)
+    if way.length_m >= _NEVER_SEEN * _UNSEEN_M and not facts.findings:
+        for one in (one for one in others if one.publishers):
+            came = f"{one.topic}: {one.received} messages came, and nothing in them was used"
+            yield f"nothing corrects odometry: {came if one.received else next(_silence(one, ()))}"
 
 
 def statuses(facts: Facts, verdict: Health, node: str) -> Iterator[Status]:

@@ -1,6 +1,7 @@
 """Messages of ``~/events``: one status for each event, with its numbers as values."""
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 from graph_slam_ros.messages.to_msg import ERROR, OK, WARN, Status
 from graph_slam_ros.slam import GraphSlam, Update
@@ -9,6 +10,14 @@ from graph_slam_ros.slam.robust.ledger import Verdict, VerdictChange
 from graph_slam_ros.slam.slip_review import Slip
 
 _EDGES = 1000  # of one update that are moved one by one
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """The outcome of something that was asked for on a topic."""
+
+    text: str
+    is_done: bool
 
 
 def happened(what: str, message: str, level: int = OK, **values: object) -> Status:

@@ -21,7 +21,7 @@ from graph_slam_ros.messages.interfaces import typestore
 from graph_slam_ros.messages.message_class import message_class
 from graph_slam_ros.messages.to_msg import OK, WARN
 from graph_slam_ros.node import events
-from graph_slam_ros.node.diagnostics import Outcome
+from graph_slam_ros.node.events import Outcome
 from graph_slam_ros.node.handle import NodeHandle
 from graph_slam_ros.node.input_check import InputCheck
 from graph_slam_ros.node.memory import is_short

@@ -29,7 +29,7 @@ from graph_slam_ros.messages import to_msg
 from graph_slam_ros.messages.message_class import message_class
 from graph_slam_ros.node import bond, diagnostics
 from graph_slam_ros.node.map_services import serve_maps
-from graph_slam_ros.node.parameters import changed, declare_parameters
+from graph_slam_ros.node.parameters import changed, declare_parameters, files_for_others
 from graph_slam_ros.node.publishers import LATCHED
 from graph_slam_ros.node.runtime import Runtime
 from graph_slam_ros.node.services import serve_later
@@ -56,13 +56,15 @@ class GraphSlamNode(LifecycleNode):
     def __init__(self, is_stop_requested: Callable[[], bool] = lambda: False, **options: Any) -> None:
         super().__init__("graph_slam", **options)
         self._is_stop_requested = is_stop_requested
+        for sentence in files_for_others(sys.argv, self.get_fully_qualified_name()):
+            self.get_logger().warn(sentence)
         self.config = declare_parameters(self)
         self.add_on_set_parameters_callback(self._on_set)
         self._run: Runtime | None = None
         self._bond: bond.Bond | None = None
         self._faults: deque[float] = deque(maxlen=1000)
         self._logged: set[str] = set()
-        self._verdict = diagnostics.Health("UNCONFIGURED")
+        self._verdict = diagnostics.Health("")
         self._logged_s = 0.0
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # whatever becomes of /clock
         self._acknowledge = self.create_publisher(UInt64, "~/received", LATCHED)

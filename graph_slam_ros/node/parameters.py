@@ -1,14 +1,19 @@
 """ROS parameters, declared from the configuration tree with description, unit and range, and read back into it."""
 
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
+from fnmatch import fnmatchcase
+from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
+import yaml
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 
 from graph_slam_ros.config.config import Config, flatten, parameters
 from graph_slam_ros.config.parameter import Parameter
 from graph_slam_ros.errors import ConfigError
+from graph_slam_ros.formats.files import read_text
 
 _NODE = "{node}"  # in output.folder
 _OTHERS = {"use_sim_time", "start_type_description_service"}  # rclpy's own
@@ -37,6 +42,35 @@ def declare_parameters(node: Any) -> Config:
     for p in parameters(one.name for one in config.sources):
         node.declare_parameter(p.name, used[p.name], _descriptor(p), ignore_override=True)
     return config
+
+
+def files_for_others(arguments: Sequence[str], name: str) -> Iterator[str]:
+    """Yield a sentence on each parameter file of which nothing is for the node: ROS ignores it.
+
+    Parameters
+    ----------
+    arguments : of the process
+    name : full name of the node
+    """
+    for option, file in pairwise(arguments):
+        if option != "--params-file":
+            continue
+        try:
+            names = list(_sections_of(yaml.safe_load(read_text(Path(file), follow=True))))
+        except (OSError, ValueError, yaml.YAMLError):  # rclpy says why it cannot be read
+            continue
+        if names and not any(fnmatchcase(name, one) for one in names):
+            yield f"{file}: nothing in it is for {name}: it has {', '.join(names[:5])}; /** is for any node"
+
+
+def _sections_of(values: Any, path: str = "") -> Iterator[str]:
+    """Names of the nodes, perhaps with wildcards, for which a parameter file has parameters."""
+    for key, value in values.items() if isinstance(values, dict) else ():
+        inside = f"{path}/{str(key).strip('/')}"
+        if isinstance(value, dict) and "ros__parameters" in value:
+            yield inside
+        else:
+            yield from _sections_of(value, inside)
 
 
 def changed(config: Config, given: Iterable[Any], *, is_configured: bool) -> tuple[Config, dict[str, Any]]:

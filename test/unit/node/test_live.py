@@ -16,6 +16,7 @@ from graph_slam_ros.node.diagnostics import Facts, InputFacts, judge, statuses
 from graph_slam_ros.node.estimate import WeakestLandmark, doubted_lately
 from graph_slam_ros.node.ingest import FutureStamps
 from graph_slam_ros.node.map_to_odom import MapToOdom
+from graph_slam_ros.node.parameters import files_for_others
 from graph_slam_ros.node.pose_extrapolator import PoseExtrapolator
 from graph_slam_ros.node.recent import Recent, RecentInputs
 from graph_slam_ros.node.session import Session
@@ -334,8 +335,8 @@ def refused(came, **reasons):
 @pytest.mark.parametrize(
     "facts, state, reason",
     [
-        (Facts("unconfigured"), "UNCONFIGURED", ""),
-        (Facts("inactive"), "INACTIVE", ""),
+        (Facts("unconfigured"), "UNCONFIGURED", "waits for ros2 lifecycle set NODE configure"),
+        (Facts("inactive"), "INACTIVE", "waits for ros2 lifecycle set NODE activate"),
         (Facts("finalized"), "FINALIZED", ""),
         (Facts("active", (odom(publishers=()),)), "WAITING", "nobody publishes /odom"),
         (Facts("active", (odom(),)), "WAITING", "/odom: /driver publishes it, but nothing has come yet"),
@@ -552,6 +553,38 @@ def test_observations_that_are_nearly_too_late_are_named_before_any_is_refused(l
         " ordering.late_s:=20.0, or a faster detector; tags.offset_s for a clock that differs"
     )
     assert verdict.reasons == ((expected,) if (late_s, odometry_s) == (7.0, 0.0) else ())
+
+
+def test_a_detector_that_is_silent_or_sees_nothing_is_named_once_the_robot_has_driven_far():
+    estimate = round_a_curve(2, 3.2).estimate
+    way = replace(estimate.unseen, length_m=40.0, since_ns=1)
+    blind = tags(silent_s=0.0)
+    for far, one, reason in (
+        (True, replace(blind, received=50), "nothing corrects odometry: /tags: 50 messages came, and nothing in them"),
+        (True, blind, "nothing corrects odometry: /tags: /eye publishes it, but nothing has come yet"),
+        (True, replace(blind, received=50, used=1), ""),
+        (False, blind, ""),
+    ):
+        facts = Facts("active", (odom(received=9, silent_s=0.0), one), replace(estimate, unseen=way))
+        facts = facts if far else replace(facts, estimate=replace(estimate, unseen=replace(way, length_m=20.0)))
+        verdict = judge(facts, Config())
+        assert verdict.reasons[0].startswith(reason) if reason else verdict.state == "OK", verdict
+
+
+def test_a_parameter_file_for_other_nodes_is_named(tmp_path):
+    file = tmp_path / "p.yaml"
+    for text, is_ours in (
+        ("graph_slam: {ros__parameters: {}}", True),
+        ("/**: {ros__parameters: {}}", True),
+        ("/*: {ros__parameters: {}}", True),
+        ("slam: {ros__parameters: {}}", False),
+        ("robot1: {graph_slam: {ros__parameters: {}}}", False),
+        ("- what", True),
+    ):
+        file.write_text(text)
+        said = list(files_for_others(["--ros-args", "--params-file", str(file)], "/graph_slam"))
+        assert len(said) == (not is_ours), text
+    assert not list(files_for_others(["--params-file", "nothing.yaml"], "/graph_slam"))
 
 
 def test_odometry_in_the_frame_of_a_map_is_the_output_of_a_localiser():
