@@ -95,7 +95,7 @@ class Facts:
     outcome : what became of what was asked for last on a topic; None where nothing was
     tf_behind_s : how much earlier than the last map -> odom would be dated now, so that it is not sent
     preparing : what keeps the pipeline from beginning: kernels are compiled or loaded; empty when they are ready
-    cannot_prepare : why that failed
+    cannot_prepare : why that failed, or why the map to begin in cannot be loaded
     """
 
     lifecycle: str

@@ -2,8 +2,10 @@
 
 import time
 from collections.abc import Callable
+from concurrent.futures import Future
 from functools import partial
 
+from graph_slam_ros.errors import message_of
 from graph_slam_ros.node.diagnostics import Facts
 from graph_slam_ros.node.handle import NodeHandle
 from graph_slam_ros.node.ingest import Ingest
@@ -40,7 +42,13 @@ class FactCollector:
         self._node, self._counters, self._session = node, counters, session
         self._worker, self._ingest, self._publishers, self._clock = worker, ingest, publishers, clock
         self._recent = RecentInputs()
+        self._not_loaded = ""
         self._before = 0, 0, 0  # overflows, failures and restarts until the last time
+
+    def note_load(self, loaded: "Future[str]") -> None:
+        """Note why the map that is to be loaded at the start cannot be."""
+        if (error := loaded.exception()) is not None:
+            self._not_loaded = f"output.load: the map was not loaded: {message_of(error)}"
 
     def collect(
         self,
@@ -100,7 +108,7 @@ class FactCollector:
             outcome=self._ingest.outcome,
             tf_behind_s=broadcaster.behind_s if broadcaster is not None else 0.0,
             preparing=preparation.status,
-            cannot_prepare=preparation.fault,
+            cannot_prepare=preparation.fault or ("" if session.loaded_keyframes else self._not_loaded),
         )
 
 

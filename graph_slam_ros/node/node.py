@@ -141,7 +141,7 @@ class GraphSlamNode(LifecycleNode):
                 self.get_logger().warn(f"the last run was never ended: going on in its map{unused}")
                 run.in_background(run.resume())
             elif self.config.output.load_at_start:
-                run.in_background(run.load())
+                run.load_at_start()
 
     def _activate(self) -> None:
         self.configured().activate()

@@ -213,6 +213,12 @@ class Runtime:
         config = config or self._node.config
         return self._begin_run(partial(self._session.load, config.output.load, config.load_pose))
 
+    def load_at_start(self) -> None:
+        """Load the configured map. If it cannot be loaded, that is a state until another is."""
+        loaded = self.load()
+        loaded.add_done_callback(self._facts.note_load)
+        self.in_background(loaded)
+
     def resume(self) -> "Future[str]":
         """Continue from the last run, which never ended."""
         return self._begin_run(self._session.resume)

@@ -82,10 +82,10 @@ class Session:
         self._refused_before.update(self._border)
         self.estimate = None
         self._is_saved, self._is_ended = True, False
-        self._loaded = len(self.slam.keyframes)
-        self._is_confirmed = not self._loaded
+        self.loaded_keyframes = len(self.slam.keyframes)
+        self._is_confirmed = not self.loaded_keyframes
         self._resumption: Resumption | None = None
-        self._unseen, self._weakest = UnseenWay(self._loaded, slam.landmark_changes), WeakestLandmark()
+        self._unseen, self._weakest = UnseenWay(self.loaded_keyframes, slam.landmark_changes), WeakestLandmark()
         self._slowest_s = 0.0
         self._fit, self._fitted_at, self._fit_due_s = float("nan"), 0, 0.0
         self._doubted = ""
@@ -181,7 +181,7 @@ class Session:
 
     def _update_estimate(self, update: Update, solve_s: float) -> None:
         slam = self.slam
-        if update.solved and not self._is_confirmed and len(slam.keyframes) > self._loaded:
+        if update.solved and not self._is_confirmed and len(slam.keyframes) > self.loaded_keyframes:
             self._is_confirmed = self._is_sure
         self._unseen = self._unseen.goes_on(slam)
         self.estimate = Estimate.of(

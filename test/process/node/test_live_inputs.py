@@ -210,6 +210,17 @@ def test_A39_odometry_on_tf_that_never_comes_or_stops_is_missed_though_tf_goes_o
         assert n.stop()[0] == 0
 
 
+def test_a_map_that_cannot_be_loaded_at_the_start_is_an_error_until_another_is(tmp_path):
+    earlier_run(tmp_path / "life", 100)
+    parameters = f"output.folder:={tmp_path / 'run'}", "output.load:=lief", "output.load_at_start:=true"
+    with node(*parameters) as n, robot(hears=("/diagnostics",)) as r:
+        r.until_it_says("ERROR", "output.load: the map was not loaded: lief: not a run; did you mean 'life'?")
+        assert r.set({"output.load": "life"}) == (True, "")
+        assert r.call("load", patience_s=30.0).success
+        r.until_it_says("DEGRADED", "where the robot is in the loaded map is not known yet")
+        n.process.kill()
+
+
 def test_A36_while_a_map_is_loaded_that_is_what_is_said(tmp_path):
     earlier_run(tmp_path / "life", 2_000)
     parameters = f"output.folder:={tmp_path / 'run'}", "output.load:=life", "solve.every_keyframes:=100"
