@@ -86,7 +86,7 @@ class GraphSlam(MapView):
         )
         solution = Solution(config.space, backend, FailureGuard(backend, counters, landmarks.map.forget))
         frontend = KeyframeFrontend(config, backend.noise, counters, solution.pose, start.datum if start else ())
-        kidnaps = KidnapDetector(config, backend, counters, frontend.path.segments, landmarks.anonymous)
+        kidnaps = KidnapDetector(config, backend, counters, frontend.path.segments, landmarks.anonymous, start)
         super().__init__(config, backend, frontend, landmarks, kidnaps, solution)
         self.settings, self._anchor = dict[str, Value](), Anchor(config, backend)
         self._sink, self._faults = sink or (lambda measurement: None), Faults(counters)
@@ -288,7 +288,6 @@ class GraphSlam(MapView):
         """Solve a loaded map. The robot's pose in it is not known yet."""
         if self.graph.kind_of(start.keyframes[0].vertex) is not self.space.pose:
             raise GraphSlamError(f"the map is not in {self.space.dimensions} dimensions")
-        self._earlier_displacements = start.displacements
         self._frontend.restore(*start.path, start.continues_with, start.gyro_bias, start.first_keyframe)
         self._anchor.restore()
         self._landmarks.restore(start.landmarks, start.range_offsets, start.passes)

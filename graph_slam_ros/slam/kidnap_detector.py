@@ -6,6 +6,7 @@ begins there, at the pose that the landmarks show, and the path before it stays 
 """
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -24,6 +25,7 @@ from graph_slam_ros.slam.robust.landmark_history import LandmarkHistory, edges_t
 from graph_slam_ros.slam.robust.odometry_hypotheses import Moved
 from graph_slam_ros.slam.slip_detector import SlipDetector
 from graph_slam_ros.slam.slip_review import Slip
+from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.solver import Report, Settings
 from graph_slam_ros.typing import Array, Numbers
 
@@ -74,6 +76,7 @@ class KidnapDetector:
     Attributes
     ----------
     alarms : in order; the last may go on
+    earlier : those of the map that it began in, as records of files
     """
 
     def __init__(
@@ -83,10 +86,12 @@ class KidnapDetector:
         counters: Counters,
         segments: list[int],
         anonymous: AnonymousLandmarks,
+        start: MapSnapshot | None = None,
     ) -> None:
         self._space, self._odometry, self._backend, self._counters = config.space, config.odometry, backend, counters
         self._segments, self._anonymous = segments, anonymous
         self.alarms: list[Alarm] = []
+        self.earlier: list[dict[str, Any]] = start.displacements if start else []
         self._begin()
 
     def _begin(self) -> None:

@@ -56,7 +56,6 @@ class MapView(PathView):
         self.config, self.backend = config, backend
         self._frontend, self._landmarks = frontend, landmarks
         self._kidnaps, self._solution = kidnaps, solution
-        self._earlier_displacements: list[dict[str, Any]] = []
 
     _calibrator: Calibrator
 
@@ -347,7 +346,7 @@ class MapView(PathView):
     def displacements(self) -> list[dict[str, Any]]:
         """The same as records for files, each with its sentence; first those of the map that it began in."""
         own = [asdict(alarm) | {"text": str(alarm)} for alarm in self.alarms]
-        return [*self._earlier_displacements, *own]
+        return [*self._kidnaps.earlier, *own]
 
     @property
     def displaced(self) -> Alarm | Slip | None:
