@@ -22,7 +22,7 @@ from graph_slam_ros.slam import Closure, Control, GraphSlam
 from graph_slam_ros.slam.lifelong.removed import Left
 from graph_slam_ros.slam.robust.ledger import Verdict
 
-KEYFRAMES, BLOCKS, WINDOW = 1600, 4, 100
+KEYFRAMES, BLOCKS, WINDOW = 1000, 4, 100
 SPACES = {"plane": PLANAR, "space": SPATIAL}
 
 
@@ -82,7 +82,7 @@ def test_false_closures_that_were_condensed_are_outvoted(both):
 
     def falsify(slam):
         """Five closures between old keyframes were false, and nobody had noticed until they were condensed."""
-        if planted or slam.first_keyframe < 700:
+        if planted or slam.first_keyframe < 450:
             return
         old = {one.vertex for one in slam.bounded.old}
         among = [e for e in slam.graph.edges_of("closures").tolist() if old.issuperset(slam.graph.edge(e).vertices)]
@@ -102,7 +102,7 @@ def test_false_closures_that_were_condensed_are_outvoted(both):
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
-    city, folder = City(5, 700, PLANAR, 3), tmp_path_factory.mktemp("city") / "run"
+    city, folder = City(5, 620, PLANAR, 3), tmp_path_factory.mktemp("city") / "run"
     drive = [m for given in city.measurements() for m in given]
     slam, _ = record_run(folder, bounded(), [*drive, Control("end"), Control("optimize")], [])
     return folder, slam, drive
@@ -148,7 +148,7 @@ def test_closures_to_keyframes_that_left_before_a_restart_are_used(recorded, tmp
     assert len(rows) == slam.first_keyframe
     assert all(start.bounded.attached.read(k).tobytes() == slam.bounded.attached.read(k).tobytes() for k in rows)
     start.continues_with = "odom"
-    longer = [m for given in City(5, 1100, PLANAR, 3).measurements() for m in given]
+    longer = [m for given in City(5, 900, PLANAR, 3).measurements() for m in given]
     rest = [m for m in longer if m.stamp_ns > slam.keyframes[-1].stamp_ns]
     more, _ = record_run(tmp_path / "more", bounded(), [*rest, Control("end")], [], start)
     assert more.first_keyframe > slam.first_keyframe

@@ -129,7 +129,7 @@ def test_a_map_that_is_taken_up_again_goes_on_condensing(world, recorded, tmp_pa
 def test_what_is_seen_too_rarely_is_in_no_place_and_its_sightings_are_counted(world):
     """One sighting in ten is of something that is there only then; it would be given up long after it left."""
     rng, slam = np.random.default_rng(1), GraphSlam(bounded(landmarks_give_up_s=1e6))
-    for m in drive(world):
+    for m in drive(world, 0, 600):
         if isinstance(m, Sightings) and rng.random() < 0.1:
             where = tuple(rng.uniform(-6.0, 6.0, 2).tolist())
             m = replace(m, sightings=(*m.sightings, replace(m.sightings[0], measured=where)))
