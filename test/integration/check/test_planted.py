@@ -7,6 +7,7 @@ import pytest
 from places import ROOT
 from planted_faults import FAULTS, planted
 from recordings import short_drive
+from reliability import times
 
 from graph_slam_ros.check.finding import KINDS
 from graph_slam_ros.cli import main
@@ -270,7 +271,7 @@ def test_a_corrected_mount_is_where_identities_are_looked_for_too(tmp_path):
     assert {one.code for one in found if one.severity != "note"} == set()
 
 
-@pytest.mark.parametrize("seed", [1, 2, 5])
+@pytest.mark.parametrize("seed", times([2], [1, 2, 5]))
 def test_a_fit_of_ranges_of_which_many_are_too_long_is_not_trusted(tmp_path, seed):
     """It may shrink the map to a twelfth: then few ranges do not fit."""
     bag = tmp_path / "ranges.mcap"
@@ -299,10 +300,10 @@ def test_each_finding_is_said_once(laps, tmp_path):
     assert len(found) == len(set(found)) > 0
 
 
-@pytest.mark.parametrize("read_ahead", [20_000, 3_000], ids=["all is read", "a part is read"])
-def test_a_replay_says_before_the_work_what_makes_its_result_meaningless(laps, tmp_path, monkeypatch, read_ahead):
+@pytest.mark.parametrize("read_ahead", [20_000, 1_500], ids=["all is read", "a part is read"])
+def test_a_replay_says_before_the_work_what_makes_its_result_meaningless(drive, tmp_path, monkeypatch, read_ahead):
     monkeypatch.setattr("graph_slam_ros.runs.replay._READ_AHEAD", read_ahead)
-    bag, run, said = planted(laps, tmp_path / "mirrored.mcap", "bearings mirrored"), tmp_path / "run", []
+    bag, run, said = planted(drive, tmp_path / "mirrored.mcap", "bearings mirrored"), tmp_path / "run", []
 
     def warn(text):
         assert not run.exists()
@@ -312,15 +313,15 @@ def test_a_replay_says_before_the_work_what_makes_its_result_meaningless(laps, t
     (one,) = said
     assert one.startswith("the result will mean nothing: mirrored: ")
     assert done.summary["check"]["code"] == "mirrored"
-    replay(laps, tmp_path / "clean", Config(), warn=said.append)
+    replay(drive, tmp_path / "clean", Config(), warn=said.append)
     assert len(said) == 1
 
 
-@pytest.mark.parametrize(("read_ahead", "says"), [(20_000, True), (3_000, False)])
-def test_of_a_part_only_is_said_what_the_rest_does_not_make_right(laps, tmp_path, monkeypatch, read_ahead, says):
+@pytest.mark.parametrize(("read_ahead", "says"), [(20_000, True), (1_500, False)])
+def test_of_a_part_only_is_said_what_the_rest_does_not_make_right(drive, tmp_path, monkeypatch, read_ahead, says):
     """A transform may still come."""
     monkeypatch.setattr("graph_slam_ros.runs.replay._READ_AHEAD", read_ahead)
-    bag, said = planted(laps, tmp_path / "unlinked.mcap", "sensor frame without TF"), []
+    bag, said = planted(drive, tmp_path / "unlinked.mcap", "sensor frame without TF"), []
     replay(bag, tmp_path / "run", Config(), warn=said.append)
     assert ["frame_unlinked" in text for text in said] == [True] * says
 
@@ -378,7 +379,7 @@ def test_a_replay_ends_with_the_worst_finding_and_only_its_summary_differs(drive
     assert '"code": "mirrored"' in (tmp_path / "run" / "run.json").read_text()
 
 
-@pytest.mark.parametrize(("blocks", "poses", "seed"), [(10, 300, 301), (6, 200, 2)])
+@pytest.mark.parametrize(("blocks", "poses", "seed"), times([(6, 200, 2)], [(10, 300, 301), (6, 200, 2)]))
 def test_ids_that_are_new_after_a_while_are_found_where_landmarks_come_back_before(tmp_path, blocks, poses, seed):
     """At a crossing of streets the robot turns round: it sees a landmark again, with its id, and never later."""
     clean = simulate("manhattan", seed, poses=poses, blocks=blocks)

@@ -297,6 +297,12 @@ def seen_by(slam, by):
     return slam
 
 
+@functools.cache
+def taken_for_one():
+    """How many landmarks there are where neither is seen."""
+    return len(seen_by(pipeline("joint", size_sigma_m=0.03), "nothing").landmarks)
+
+
 @pytest.mark.parametrize("by", ["class", "size"])
 def test_landmarks_near_one_another_are_told_apart_by_their_class_or_size_and_a_map_has_them(by, tmp_path):
     slam = seen_by(pipeline("joint", size_sigma_m=0.03), by)
@@ -304,7 +310,7 @@ def test_landmarks_near_one_another_are_told_apart_by_their_class_or_size_and_a_
     apart = np.linalg.norm(at[:, None] - at, axis=2) + 100.0 * np.eye(len(at))
     assert len(at) == 16
     assert apart.min(axis=1).max() < 0.6
-    assert len(seen_by(pipeline("joint", size_sigma_m=0.03), "nothing").landmarks) < 16
+    assert taken_for_one() < 16
 
     marks = slam.landmarks.values()
     assert sorted(map(kind_of, marks)) == ["pole"] * 8 + ["tree"] * 8
@@ -371,7 +377,7 @@ def put_back(recording, from_ns, to_ns):
     ]
 
 
-@pytest.mark.parametrize("seed", [1, 2, 4, 5])
+@pytest.mark.parametrize("seed", times([1, 4], [1, 2, 4, 5]))
 def test_a_robot_that_was_carried_to_new_ground_is_noticed(seed):
     recording = park(seed, laps=1)
     begin_ns = int(recording.stamps_ns[0])
@@ -410,7 +416,7 @@ def test_a_robot_that_was_carried_to_new_ground_is_found_when_it_knows_the_groun
     assert len(slam.landmarks) == len(recording.landmarks)
 
 
-@pytest.mark.parametrize("seed", [40, 51])
+@pytest.mark.parametrize("seed", times([40], [40, 51]))
 def test_a_sensor_that_misses_a_third_raises_no_alarm(seed):
     rng = np.random.default_rng(seed)
     recording = park(seed, laps=1, clutter=lambda t_s: (20.0 * np.cos(t_s / 3.0), 20.0 * np.sin(t_s / 3.0)))
