@@ -17,6 +17,7 @@ from fleet_nodes import scheduler, wait_for
 
 from graph_slam_ros import cli
 from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.fleet import engine
 from graph_slam_ros.fleet.engine import Workers, connected, run_jobs
 from graph_slam_ros.fleet.job import Job
 from graph_slam_ros.fleet.replay import Fleet, replay_all
@@ -58,12 +59,19 @@ def equal_to_serial(out, rows, serial):
     return sum(row["state"] == "done" for row in rows)
 
 
+def here(capsys, *arguments):
+    """Run the command in this process: exit code, and both outputs."""
+    capsys.readouterr()
+    code = cli.main(["fleet", *map(str, arguments)])
+    return code, *capsys.readouterr()
+
+
 def fleet(*arguments):
     command = [sys.executable, "-m", "graph_slam_ros.cli", "fleet", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
 
 
-def test_one_command_replays_all_and_the_second_time_nothing(drives, serial, tmp_path):
+def test_one_command_replays_all_and_the_second_time_nothing(drives, serial, tmp_path, capsys):
     out = tmp_path / "out"
     options = ("--out", out, "--truth", "{path}", "--workers", 2)
     done = fleet("replay", drives, *options)
@@ -85,16 +93,16 @@ def test_one_command_replays_all_and_the_second_time_nothing(drives, serial, tmp
     assert len(list(out.glob("jobs/*/report.html"))) == 3
     assert "of them 4 were there" in again.stdout
     assert {file: file.stat().st_mtime_ns for file in out.glob("jobs/*/row.json")} == stamps
-    shown = fleet("table", out, "--where", "state = 'done'", "--order", "rmse_m DESC")
-    assert shown.stdout.count(".mcap") == 3
-    assert not shown.stderr
-    assert fleet("compare", out, out, "--fail", "rmse>1.02x").returncode == 0
+    _, shown, said = here(capsys, "table", out, "--where", "state = 'done'", "--order", "rmse_m DESC")
+    assert shown.count(".mcap") == 3
+    assert not said
+    assert here(capsys, "compare", out, out, "--fail", "rmse>1.02x")[0] == 0
 
 
 def test_a_job_takes_the_inputs_that_info_suggests_where_no_topic_is_usual(tmp_path):
     """As ``replay`` does: without them it would be odometry alone."""
     drive, run, out = tmp_path / "drive.mcap", tmp_path / "run", tmp_path / "out"
-    world = ("--set", "aisles=2", "--set", "laps=1", "--set", "sensor=range_bearing")
+    world = ("--set", "aisles=2", "--set", "laps=1", "--set", "aisle_m=4.0", "--set", "sensor=range_bearing")
     assert cli.main(["simulate", "warehouse", *world, "--out", str(drive)]) == 0
     assert cli.main(["replay", str(drive), "--out", str(run)]) == 0
     (row,) = replay_all(Fleet([str(drive)], out), Workers(count=1)).rows
@@ -165,7 +173,8 @@ def test_stopped_by_a_signal_it_goes_on_where_it_was(drives, serial, tmp_path):
 
 
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "nonsense"])
-def test_a_scheduler_that_does_not_answer_is_named(address):
+def test_a_scheduler_that_does_not_answer_is_named(address, monkeypatch):
+    monkeypatch.setattr(engine, "Client", lambda at, **options: Client(at, **options | {"timeout": "1s"}))
     with pytest.raises(GraphSlamError, match="no Dask scheduler answers"), connected(Workers(address)):
         pass
 
@@ -210,7 +219,7 @@ def test_a_worker_has_no_job_but_the_one_that_it_runs():
     assert most <= 1
 
 
-def test_mistakes_are_refused_in_one_line(drives, tmp_path):
+def test_mistakes_are_refused_in_one_line(drives, tmp_path, capsys):
     for arguments, says in (
         (("replay", tmp_path / "none", "--out", tmp_path / "o"), "no such file"),
         (("replay", drives, "--out", tmp_path / "o", "--set", "keyframes.x=1"), "unknown parameter"),
@@ -223,8 +232,8 @@ def test_mistakes_are_refused_in_one_line(drives, tmp_path):
         (("table", drives), "not the folder of a fleet"),
         (("compare", drives, drives), "no table.parquet"),
     ):
-        done = fleet(*arguments)
-        assert done.returncode == 2, done
-        assert says in done.stderr
-        assert len(done.stderr.splitlines()) == 1
+        code, _, said = here(capsys, *arguments)
+        assert code == 2, said
+        assert says in said
+        assert len(said.splitlines()) == 1
     assert not Path(tmp_path / "o").exists(), "nothing was begun"
