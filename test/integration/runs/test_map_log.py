@@ -5,7 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
-from driven import drive, with_a_wrong_sighting, without_names
+from driven import drive, seldom, with_a_wrong_sighting, without_names
 from places import ROOT
 
 from graph_slam_ros import cli
@@ -41,7 +41,7 @@ def run(request, tmp_path_factory):
             folder, Config.from_mapping({"world.dimensions": 3}), measurements(simulate("flight", 0, laps=1))
         )
     settings, options = WORLDS[request.param]
-    world = measurements(simulate("warehouse", 0, aisles=2, laps=2, aisle_m=4.0, **options))
+    world = measurements(simulate("warehouse", 0, aisles=2, laps=1, aisle_m=4.0, **options))
     return folder, drive(
         folder, Config.from_mapping(settings), without_names(world) if request.param == "unnamed" else world
     )
@@ -94,7 +94,7 @@ def test_a_map_that_is_taken_up_is_written_down_as_it_was_read(run):
 
 
 def test_a_run_that_goes_on_in_a_map_knows_its_landmarks_and_is_repeated_byte_by_byte(tmp_path):
-    world = list(measurements(simulate("warehouse", 0, aisles=2, laps=1, aisle_m=6.0)))
+    world = list(seldom(measurements(simulate("warehouse", 0, aisles=2, laps=1, aisle_m=6.0))))
     before = drive(tmp_path / "before", Config(), world)
     start = map_of(tmp_path / "before", [])
     recorder = RunRecorder(tmp_path / "after", Config(), start=start)

@@ -62,7 +62,7 @@ def run(config, drive, folder, monkeypatch, *, is_short):
 )
 def test_the_short_way_of_odometry_gives_the_same_files(world, settings, least, tmp_path, monkeypatch):
     config = Config.from_mapping(settings)
-    drive = disturbed(measurements(simulate(world, seed=5)), seed=7)[:3000]
+    drive = disturbed(measurements(simulate(world, seed=5)), seed=7)[:1600]
     if world == "warehouse":
         drive.insert(len(drive) // 2, InitialPose((1.0, 2.0, 0.3), (0.01, 0.0, 0.0, 0.0, 0.01, 0.0, 0.0, 0.0, 0.01)))
     drive.insert(len(drive) * 3 // 4, Control("time_jump"))

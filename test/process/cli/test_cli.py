@@ -19,6 +19,7 @@ from graph_slam_ros.recordings.bag import BagWriter, open_bag
 
 RESULTS = ("graph.g2o", "path.tum", "sightings.tum", "landmarks.csv", "ledger.csv", "ledger_changes.csv")
 COMMAND = executable("graph_slam")
+SIMULATE = ("simulate", "warehouse", "--set", "aisles=2", "--set", "laps=1", "--set", "aisle_m=4")
 
 
 @pytest.fixture(scope="module")
@@ -111,8 +112,7 @@ def test_the_command_that_info_prints_works_as_it_is(bag, run, tmp_path, capsys,
 def test_replay_takes_the_inputs_that_info_suggests_where_no_topic_is_usual(tmp_path, capsys, monkeypatch):
     """Landmarks in a cloud, and a truth that looks like landmarks: without that it would be odometry alone."""
     monkeypatch.chdir(tmp_path)
-    world = ("simulate", "warehouse", "--set", "aisles=2", "--set", "laps=1", "--set", "sensor=range_bearing")
-    assert told(capsys, *world, "--out", "drive.mcap")[0] == 0
+    assert told(capsys, *SIMULATE, "--set", "sensor=range_bearing", "--out", "drive.mcap")[0] == 0
     code, out, (said,) = told(capsys, "replay", "drive.mcap", "--out", "run")
     assert code == 0
     assert "not used" not in out
@@ -129,8 +129,7 @@ def test_replay_takes_the_inputs_that_info_suggests_where_no_topic_is_usual(tmp_
 
 def test_replay_names_what_could_be_an_input_and_is_none(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    world = ("simulate", "warehouse", "--set", "aisles=2", "--set", "laps=1", "--set", "gnss=1", "--set", "imu=10")
-    assert told(capsys, *world, "--out", "drive.mcap")[0] == 0
+    assert told(capsys, *SIMULATE, "--set", "gnss=1", "--set", "imu=10", "--out", "drive.mcap")[0] == 0
     code, out, err = told(capsys, "replay", "drive.mcap", "--out", "run")
     assert (code, err) == (0, [])
     assert "not used   /gps/fix (sensor_msgs/msg/NavSatFix): graph_slam info drive.mcap prints the command" in out
