@@ -246,13 +246,6 @@ class Graph:
         found = [table.id.values[table.label.values == code] for table in self.tables.values()]
         return np.sort(np.concatenate(found))
 
-    def edges_since(self, vertex: int) -> Index:
-        """Ids of the edges with an end at a vertex or a later one, in order."""
-        found = [np.empty(0, dtype=np.int64)]
-        for table in self.tables.values():
-            found.append(table.id.values[(table.vertices.values >= vertex).any(axis=1)])
-        return np.sort(np.concatenate(found))
-
     def _register(self, table: EdgeTable, label: str, source: str) -> None:
         """Append what is new: a table, the name of a class, that of an input."""
         if table.code == len(self.tables):

@@ -18,7 +18,7 @@ from graph_slam_ros.slam.lifelong.state import BoundedState
 from graph_slam_ros.slam.noise_scale import NoiseScale, estimate_noise, factors_of
 from graph_slam_ros.slam.robust.admission import Admission
 from graph_slam_ros.slam.robust.background import Background, Work, run_when_asked
-from graph_slam_ros.slam.robust.displacement import DisplacementHypothesis
+from graph_slam_ros.slam.robust.displacement_hypothesis import DisplacementHypothesis
 from graph_slam_ros.slam.robust.gating import OutlierGate
 from graph_slam_ros.slam.robust.hypotheses import MIRRORED, Alternative, FrozenGraph, Outcome, search_alternatives
 from graph_slam_ros.slam.robust.ledger import Ledger, Reason

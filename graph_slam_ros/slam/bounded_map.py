@@ -173,28 +173,30 @@ class BoundedMap:
         ids, first, width = path.keyframes.ids, path.keyframes.first, self._frontend.config.map.cell_m
         limit = self._limit - first
         at, rows, frames = solver.estimate(ids), list[_Row](), list[tuple[Frames, range]]()
+        begins = [*(begin - first for begin in sorted(path.segments) if begin > first), len(ids)]
         cells = list(map(tuple, np.floor(at[:, : self._space.dimensions] / width).astype(np.int64).tolist()))
         marks, k = seen_from(self._space, solver, ids), 0
         while k < limit:
-            end = k + _length(marks[k : k + LONGEST], cells[k : k + LONGEST])
+            longest = min(k + LONGEST, begins[bisect_right(begins, k)])  # a visit is of one segment
+            end = k + _length(marks[k:longest], cells[k:longest])
             if max(end, k + 1) > limit:
                 break
             if end == k:  # it has an edge that cannot be condensed
                 rows.append(self._own(int(ids[k])))
-                is_held = solver.is_held(int(ids[k]))
-                self._counters.count(_SOURCE, "held_keyframe" if is_held else "not_condensed")
+                self._counters.count(_SOURCE, "held_keyframe" if solver.is_held(int(ids[k])) else "not_condensed")
                 k += 1
                 continue
             visit = ids[k:end].tolist()
             waits = limit - end < _PATIENCE
-            done = self.condenser.condense(visit, int(ids[end]), cells[k], self._ahead(int(ids[end])), waits=waits)
+            ahead = self._seen_between(*ids[[end, begins[bisect_right(begins, end)] - 1]].tolist())
+            done = self.condenser.condense(visit, int(ids[end]), cells[k], ahead, waits=waits)
             if done.how == "waits":
                 break
             self._note_end(done, end - k)
             rows += self._rows(visit, k, done, frames)
             k = end
         self.condenser.rescale()
-        solver.update()
+        self._solution.guard.checked(solver.update)
         return rows, chained(self._space, frames, at), first + k
 
     def _note_end(self, done: Condensed, keyframes: int) -> None:
@@ -206,8 +208,8 @@ class BoundedMap:
         else:
             self._counters.count(_SOURCE, "visit_lost" if done.is_contradiction else "visit_condensed")
 
-    def _ahead(self, vertex: int) -> set[int]:
-        """The landmarks that are seen from a keyframe and later ones."""
+    def _seen_between(self, first: int, last: int) -> set[int]:
+        """Return the landmarks that are seen from a keyframe and later ones up to another."""
         graph, out = self._backend.graph, set[int]()
         if "landmarks" not in graph.labels:
             return out
@@ -215,8 +217,8 @@ class BoundedMap:
         for table in graph.tables.values():
             ends = table.vertices.values
             if ends.shape[1] > 1:
-                is_one = (table.label.values == code) & (ends[:, 0] >= vertex) & (table.weight.values > 0.0)
-                out.update(ends[is_one, 1].tolist())
+                is_one = (table.label.values == code) & (table.weight.values > 0.0)
+                out.update(ends[is_one & (ends[:, 0] >= first) & (ends[:, 0] <= last), 1].tolist())
         return out
 
     def _own(self, vertex: int) -> _Row:
@@ -317,8 +319,7 @@ class BoundedMap:
         self._note_accepted(out.edges)
         self._landmarks.forget_before(end, new.vertices, new.edges)
         self._anchor.restore()
-        self._backend.solver.update()
-        self._kidnaps.begin_anew(self._frontend.path.keyframes)
+        self._kidnaps.renumber(new.vertices, new.edges, int(self._frontend.path.keyframes.ids[0]))
         self._solution.renumber()
         return out
 

@@ -60,17 +60,41 @@ class FailureGuard:
     def solve(self, work: Callable[[], Result], keyframe: int) -> Result | None:
         """Solve by ``work`` and return its result; None if it fails, or if its result is impossible."""
         try:
-            return self._done(work, again=True)
+            return self.checked(work)
         except Exception as error:
             self._fail(error)
         is_new = all(vertex >= self._good_vertices for vertex in self._undetermined)
         if (is_new and self._in_a_row == 1) or self._in_a_row.bit_count() > 1:  # at 2, 4, 8, ...: it costs some solves
             return None
         try:
-            return self._done(work) if self._quarantine(keyframe) else None
+            return self.checked(work, again=False) if self._quarantine(keyframe) else None
         except Exception:  # it is the same solve: counted already
             self.go_back()
             return None
+
+    def checked(self, work: Callable[[], Result], *, again: bool = True) -> Result:
+        """Run the work, and check the estimate. If steps overshoot, it is repeated after a damped solve of everything.
+
+        Raises
+        ------
+        DivergedError
+            The estimate is impossible, and stays so. So it is with any exception of the work.
+
+        Parameters
+        ----------
+        again : whether it may be repeated
+        """
+        done = work()
+        try:
+            self._refuse_absurd()
+        except DivergedError:
+            if not again:
+                raise
+            self.go_back()
+            self._solver.optimize()
+            return self.checked(work, again=False)
+        self.note_good()
+        return done
 
     def note_good(self) -> None:
         """Remember the present estimate as good."""
@@ -87,20 +111,6 @@ class FailureGuard:
         self._solver.start_at(self._last_good())
         with suppress(Exception):  # e.g. no memory for it: the estimate is good without
             self._solver.rebuild()
-
-    def _done(self, work: Callable[[], Result], *, again: bool = False) -> Result:
-        """Run the work. If its steps overshoot, it may be repeated, once, after a damped solve of everything."""
-        done = work()
-        try:
-            self._refuse_absurd()
-        except DivergedError:
-            if not again:
-                raise
-            self.go_back()
-            self._solver.optimize()
-            return self._done(work)
-        self.note_good()
-        return done
 
     def _fail(self, error: Exception) -> None:
         self._counters.count("solver", type(error).__name__)

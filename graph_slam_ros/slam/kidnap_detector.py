@@ -19,15 +19,16 @@ from graph_slam_ros.slam.frontend.keyframes import Keyframe
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.slam.landmarks.anonymous import AnonymousLandmarks
 from graph_slam_ros.slam.robust.connections import moved_values
-from graph_slam_ros.slam.robust.displacement import SAME_M, SAME_RAD, DisplacementHypothesis, DisplacementSearch
+from graph_slam_ros.slam.robust.displacement import SAME_M, SAME_RAD, DisplacementSearch
+from graph_slam_ros.slam.robust.displacement_hypothesis import DisplacementHypothesis
 from graph_slam_ros.slam.robust.innovation_monitor import InnovationMonitor
-from graph_slam_ros.slam.robust.landmark_history import LandmarkHistory, edges_to_replay
+from graph_slam_ros.slam.robust.landmark_history import LandmarkHistory
 from graph_slam_ros.slam.robust.odometry_hypotheses import Moved
 from graph_slam_ros.slam.slip_detector import SlipDetector
 from graph_slam_ros.slam.slip_review import Slip
 from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.solver import Report, Settings
-from graph_slam_ros.typing import Array, Numbers
+from graph_slam_ros.typing import Array, Index, Numbers
 
 _ALARM = 4  # sightings more for another pose than for odometry's
 _ALARM_LANDMARKS, _ALARM_KEYFRAMES = 2, 2
@@ -36,7 +37,6 @@ _DECIDED_LANDMARKS, _DECIDED_KEYFRAMES = 3, 4  # two landmarks with headings tel
 _TRIED = 5  # sightings that are compared with odometry's noise
 _MOST = 0.8  # part of the sightings since then that fit the other pose
 _DRIFT = 3.0  # sigmas
-_REMEMBERED = 64  # keyframes that are compared again after a compaction
 _CALM_S = 5.0  # after the decision the alarm goes on for so long at least
 
 
@@ -92,17 +92,11 @@ class KidnapDetector:
         self._segments, self._anonymous = segments, anonymous
         self.alarms: list[Alarm] = []
         self.earlier: list[dict[str, Any]] = start.displacements if start else []
-        self._begin()
-
-    def _begin(self) -> None:
-        """Begin with what is in the graph, and nothing seen lately."""
-        backend, space = self._backend, self._space
-        graph, solver = backend.graph, backend.solver
+        space, graph, solver = config.space, backend.graph, backend.solver
         self._history = LandmarkHistory(graph, backend.ledger)
         self._search = DisplacementSearch(space, graph, solver, backend.ledger, self._history)
         self._monitor = InnovationMonitor(solver, backend.decisions, self._history)
-        doubt = self._anonymous.doubt
-        self._slips = SlipDetector(space, self._odometry, backend, self._counters, self._history, doubt)
+        self._slips = SlipDetector(space, config.odometry, backend, counters, self._history, anonymous.doubt)
         self._next = graph.edge_count
         self._splits: list[_Split] = []  # of the present frame of odometry
         self._refuted: list[Numbers] = []  # where that frame does not lie: it was decided and taken back
@@ -112,29 +106,30 @@ class KidnapDetector:
         """Return whether no alarm goes on."""
         return self.now is None and self.slips_now is None
 
-    def begin_anew(self, keyframes: StampedPoses[Keyframe]) -> None:
-        """Begin anew after the graph was compacted, with the newest keyframes and what was seen from them."""
-        before = self._slips
-        self._begin()
-        self._slips.slips, self._slips.noise = before.slips, before.noise
-        newest = keyframes.since(max(keyframes.first, len(keyframes) - _REMEMBERED))
-        begins = [k for k in self._segments if k >= newest.first]
-        first = int(newest.ids[begins[-1] - newest.first if begins else 0])
-        self._history.begin_at(int(keyframes.ids[0]))
-        self._search.begin(first)
-        stamps_ns = dict(zip(newest.ids.tolist(), newest.stamps_ns.tolist(), strict=True))
+    def renumber(self, vertices: Index, edges: Index, first: int) -> None:
+        """Take over new ids of all vertices and edges, by old ones; -1: it was removed.
+
+        Edges that came since an edge was noted last took the place of others: closures alone matter.
+
+        Parameters
+        ----------
+        first : the first keyframe that stays, by its new vertex
+        """
         graph = self._backend.graph
-        for edge in np.union1d(
-            graph.edges_of("surveyed"), edges_to_replay(graph, int(keyframes.ids[0]), first)
-        ).tolist():
-            one = graph.edge(edge)
-            at = max((vertex for vertex in one.vertices if vertex in stamps_ns), default=-1)
-            if one.label == "surveyed":
-                self._history.add_survey(one.vertices[0])
-            elif one.label == "landmarks" and at < first:
-                self._history.add(edge, *one.vertices[:2])
-            elif at >= first and (one.label != "odometry" or (one.weight and min(one.vertices) >= first)):
-                self._add(edge, stamps_ns[at], newest)
+        self._history.renumber(vertices, edges, first)
+        self._search.renumber(vertices, edges, first)
+        self._monitor.renumber(vertices, edges)
+        self._slips.renumber(vertices, edges)
+        of, edge = vertices.tolist(), edges.tolist()
+        splits = [
+            replace(one, first=of[one.first], link=edge[one.link], replacement=edge[one.replacement])
+            for one in self._splits
+        ]
+        self._splits = [one for one in splits if one.first > first and min(one.link, one.replacement) >= 0]
+        noted, self._next = edges[: self._next], graph.edge_count
+        for number in range(int(np.count_nonzero(noted >= 0)), graph.edge_count):
+            if (one := graph.edge(number)).label == "closures":
+                self._slips.add_seen(number, max(one.vertices), one.label)
 
     @property
     def slips(self) -> list[Slip]:

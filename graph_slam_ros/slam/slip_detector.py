@@ -10,7 +10,7 @@ is taken back, and everything is as before.
 
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache, partial
 
 import numpy as np
@@ -31,9 +31,9 @@ from graph_slam_ros.slam.robust.odometry_errors import OdometryErrors, odometry_
 from graph_slam_ros.slam.robust.odometry_filter import OdometryFilter, Stretch
 from graph_slam_ros.slam.robust.odometry_hypotheses import CARRIED, SLIPS, Choice, HypothesisTest, Moved
 from graph_slam_ros.slam.slip_noise import SlipNoise
-from graph_slam_ros.slam.slip_review import Pair, Slip, View, covariance_of, revoke_slip, slipped_pairs
+from graph_slam_ros.slam.slip_review import Link, Pair, Slip, View, covariance_of, revoke_slip, slipped_pairs
 from graph_slam_ros.solver import Solver
-from graph_slam_ros.typing import Array
+from graph_slam_ros.typing import Array, Index
 
 _VIEWS = 16
 _SUMS = (1, 2, 4, 8, 16)  # views whose innovations are summed
@@ -49,20 +49,6 @@ _BURST = 20.0
 _FACTOR = 1.5  # all noise may be larger than stated by this factor
 
 Doubt = Callable[[int, Callable[[float], Array] | None], None]
-
-
-@dataclass(slots=True)
-class _Link:
-    """An odometry edge of the problem: the original ``own``, or ``edge`` that replaces it."""
-
-    edge: int
-    own: int
-    vertices: tuple[int, int]
-    stamps_ns: tuple[int, int]
-
-    @property
-    def seconds(self) -> float:
-        return (self.stamps_ns[1] - self.stamps_ns[0]) * 1e-9
 
 
 class SlipDetector:
@@ -90,7 +76,7 @@ class SlipDetector:
     ) -> None:
         self._space, self._config, self._backend, self._counters = space, odometry, backend, counters
         self._history, self._doubt = history, doubt
-        self._links: deque[_Link] = deque(maxlen=_MOST_EDGES)
+        self._links: deque[Link] = deque(maxlen=_MOST_EDGES)
         self._views: deque[View] = deque(maxlen=_VIEWS + 1)
         self._new: list[int] = []  # edges that came since the last check, whose innovation is not known yet
         self._replacing: set[int] = set()  # edges that replace others
@@ -120,9 +106,19 @@ class SlipDetector:
             self.slips[-1] = replace(now, ended_ns=stamp_ns if stamp_ns >= now.began_ns else last_ns)
             self._doubt(stamp_ns, None)
 
+    def renumber(self, vertices: Index, edges: Index) -> None:
+        """Take over new ids of all vertices and edges, by old ones; -1: it was removed."""
+        links = [one.renumbered(vertices, edges) for one in self._links]
+        self._links = deque((one for one in links if min(one.edge, one.own, *one.vertices) >= 0), _MOST_EDGES)
+        views = [one.renumbered(vertices, edges) for one in self._views]
+        self._views = deque((one for one in views if one.vertex >= 0 and one.edges), _VIEWS + 1)
+        self._new = [int(edges[edge]) for edge in self._new if edges[edge] >= 0]
+        self._replacing = {int(edges[edge]) for edge in self._replacing if edges[edge] >= 0}
+        self._checked = int(vertices[self._checked]) if self._checked >= 0 else -1
+
     def add_odometry(self, edge: int, vertices: Sequence[int], stamps_ns: tuple[int, int], keyframe: int) -> None:
         """Add the odometry edge from one keyframe to the next. During a slip it gets more noise."""
-        link = _Link(edge, edge, (vertices[0], vertices[1]), stamps_ns)
+        link = Link(edge, edge, (vertices[0], vertices[1]), stamps_ns)
         if edge in self._replacing or (self._links and self._links[-1].vertices == link.vertices):
             self._replacing.discard(edge)  # it replaces another, or another odometry measured the same motion
             return
@@ -205,7 +201,7 @@ class SlipDetector:
 
     # -- evidence --------------------------------------------------------------------------------------------------
 
-    def _stretch(self) -> list[_Link]:
+    def _stretch(self) -> list[Link]:
         """The links since the oldest view."""
         return [link for link in self._links if link.vertices[1] > self._views[0].vertex]
 
@@ -257,12 +253,12 @@ class SlipDetector:
         inside = (edge for edge in self._backend.solver.edges_on(what).tolist() if ledger.is_inside(edge))
         return any(one.vertices[0] <= first and one.type.residual_size >= dof for one in map(graph.edge, inside))
 
-    def _first_of(self, links: Sequence[_Link], since: int) -> int:
+    def _first_of(self, links: Sequence[Link], since: int) -> int:
         """The first link after the view that precedes the last ``since`` views."""
         before = self._views[-since - 1].vertex
         return next((k for k, link in enumerate(links) if link.vertices[0] >= before), len(links) - 1)
 
-    def _added_noise(self, links: Sequence[_Link], *kinds: str) -> list[tuple[Array, Array]]:
+    def _added_noise(self, links: Sequence[Link], *kinds: str) -> list[tuple[Array, Array]]:
         """Variances (n, dof) that each kind of slip adds to links, and sigmas (n, dof) of the error that they share."""
         motions = np.stack([self._added.motion(self._backend.graph.edge(link.edge).measured) for link in links])
         seconds = np.array([link.seconds for link in links])
@@ -310,7 +306,7 @@ class SlipDetector:
             self._end(now, links[first:], gain, keyframe, stamp_ns)
 
     def _began_earlier(
-        self, now: Slip, links: Sequence[_Link], begin: int, errors: OdometryErrors, keyframe: int
+        self, now: Slip, links: Sequence[Link], begin: int, errors: OdometryErrors, keyframe: int
     ) -> bool:
         best, (added,) = (_SURELY, 0), self._added_noise(links, now.kind)
         for count in _EARLIER:
@@ -323,7 +319,7 @@ class SlipDetector:
             self._backend.solver.update()
         return count > 0
 
-    def _end(self, now: Slip, links: Sequence[_Link], gain: float, keyframe: int, stamp_ns: int) -> None:
+    def _end(self, now: Slip, links: Sequence[Link], gain: float, keyframe: int, stamp_ns: int) -> None:
         """Use odometry with its own noise again, for these links."""
         pairs = [(link.own, link.edge) for link in links if link.edge != link.own]
         restore_odometry(self._backend, pairs, keyframe, -2.0 * gain)
@@ -373,7 +369,7 @@ class SlipDetector:
 
     # -- the graph ---------------------------------------------------------------------------------------------------
 
-    def _replace(self, links: Sequence[_Link], slip: Slip, keyframe: int) -> None:
+    def _replace(self, links: Sequence[Link], slip: Slip, keyframe: int) -> None:
         """Replace odometry edges by edges with more noise."""
         graph, threshold = self._backend.graph, -2.0 * self._config.log_odds
         own = [link.edge for link in links]

@@ -14,7 +14,7 @@ from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.slam.odometry_edges import restore_odometry
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict
 from graph_slam_ros.slam.robust.odometry_errors import odometry_errors
-from graph_slam_ros.typing import Array
+from graph_slam_ros.typing import Array, Index
 
 Pair = tuple[int, int]
 
@@ -55,6 +55,26 @@ class Slip:
 
 
 @dataclass(slots=True)
+class Link:
+    """An odometry edge of the problem: the original ``own``, or ``edge`` that replaces it."""
+
+    edge: int
+    own: int
+    vertices: tuple[int, int]
+    stamps_ns: tuple[int, int]
+
+    @property
+    def seconds(self) -> float:
+        """The time that it took."""
+        return (self.stamps_ns[1] - self.stamps_ns[0]) * 1e-9
+
+    def renumbered(self, vertices: Index, edges: Index) -> "Link":
+        """Return the same with new ids of vertices and edges, by old ones; -1: it was removed."""
+        first, last = vertices[list(self.vertices)].tolist()
+        return Link(int(edges[self.edge]), int(edges[self.own]), (first, last), self.stamps_ns)
+
+
+@dataclass(slots=True)
 class View:
     """The edges that were measured from one keyframe, their landmarks or classes, and the sum of their innovations."""
 
@@ -63,6 +83,17 @@ class View:
     seen: list[int | str]
     statistic: float = 0.0
     numbers: int = 0
+
+    def renumbered(self, vertices: Index, edges: Index) -> "View":
+        """Return the same with new ids of vertices and edges, by old ones; what was removed is not in it any more."""
+        both = [
+            (int(edges[edge]), what if isinstance(what, str) else int(vertices[what]))
+            for edge, what in zip(self.edges, self.seen, strict=True)
+            if edges[edge] >= 0
+        ]
+        seen = [(edge, what) for edge, what in both if isinstance(what, str) or what >= 0]
+        own, of = [edge for edge, _ in seen], [what for _, what in seen]
+        return View(int(vertices[self.vertex]), own, of, self.statistic, self.numbers)
 
 
 def revoke_slip(backend: Backend, pairs: Sequence[Pair], keyframe: int, noise_factor: float) -> bool:

@@ -104,9 +104,10 @@ class Solution:
         return (self.vertices, self._edges) == self._backend.handed_over and self._backend.solver.is_current
 
     def renumber(self) -> None:
-        """Take over the ids of a graph that was compacted; all of it is solved."""
+        """Take over the ids of a graph that was compacted, and solve it."""
         self.guard.note_good()
         self.vertices, self._edges = self._backend.handed_over
+        self.guard.solve(self._backend.solver.update, self._keyframes - 1)
 
     def is_due(self, keyframes: int, every_keyframes: int) -> bool:
         """Return whether enough is unsolved."""

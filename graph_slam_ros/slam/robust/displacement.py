@@ -22,6 +22,7 @@ from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.lie import se2
 from graph_slam_ros.slam.landmarks.rigid_alignment import aligned, are_spread
 from graph_slam_ros.slam.robust.connections import Connections, connections_across
+from graph_slam_ros.slam.robust.displacement_hypothesis import DisplacementHypothesis
 from graph_slam_ros.slam.robust.landmark_history import LandmarkHistory
 from graph_slam_ros.slam.robust.ledger import Ledger
 from graph_slam_ros.slam.robust.odometry_chain import OdometryChain
@@ -40,34 +41,6 @@ _VAGUE_M, _VAGUE = 0.2, 0.3  # a sighting that fits within more than this, and t
 _HEADING_SIGMA_RAD = 0.05  # error of a landmark's heading in the map
 SAME_M, SAME_RAD = 1.0, 0.3  # poses farther from each other are two
 _DRIFT = 2.0  # sigmas of odometry
-
-
-@dataclass(frozen=True, slots=True)
-class DisplacementHypothesis:
-    """Another pose of the robot, and the evidence for it.
-
-    Attributes
-    ----------
-    first : the keyframe's vertex from which on the robot is there
-    seen_from : that of the oldest sighting that was compared; from ``first`` to there landmarks tell nothing
-    T_map_chain : where the evidence's own frame of odometry lies then in map
-    evidence : sightings that are held back and fit it, minus those that are believed and do not
-    landmarks, keyframes : how many are in agreement
-    has_headings : whether the landmarks were seen with their headings, which agree, too
-    fitting, contradicting : edges of sightings from ``first`` on that fit and that do not
-    rival : the evidence for a pose that differs from it
-    """
-
-    first: int
-    seen_from: int
-    T_map_chain: Numbers
-    evidence: int
-    landmarks: int
-    keyframes: int
-    has_headings: bool
-    fitting: tuple[int, ...]
-    contradicting: tuple[int, ...]
-    rival: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,6 +129,25 @@ class DisplacementSearch:
         insort(self._seen, seen, key=lambda other: other.keyframe)
         if len(self._seen) > WINDOW:
             self._seen.popleft()
+
+    def renumber(self, vertices: Index, edges: Index, first: int) -> None:
+        """Take over new ids of all vertices and edges, by old ones; -1: it was removed.
+
+        Parameters
+        ----------
+        first : the first keyframe that stays, by its new vertex
+        """
+        self.chain.renumber(vertices, edges, first)
+        count = len(self._seen)
+        self._seen = deque(
+            replace(one, edge=int(edges[one.edge]), keyframe=int(vertices[one.keyframe]), landmark=landmark)
+            for one in self._seen
+            if edges[one.edge] >= 0 and (landmark := int(vertices[one.landmark])) >= 0
+        )
+        self._forgot |= len(self._seen) < count
+        self._first = max(int(vertices[self._first]), first)
+        poses = {int(vertices[vertex]): edges[given] for vertex, given in self._poses.items()}
+        self._poses = {vertex: given[given >= 0].tolist() for vertex, given in poses.items() if vertex >= first}
 
     # -- what it tells -------------------------------------------------------------------------------------------
 

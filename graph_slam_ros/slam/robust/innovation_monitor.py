@@ -17,6 +17,7 @@ from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.slam.robust.gating import OutlierGate
 from graph_slam_ros.slam.robust.landmark_history import LandmarkHistory
 from graph_slam_ros.solver import Solver
+from graph_slam_ros.typing import Index
 
 _SURE = 1.0 - 1e-6  # probability with which clean measurements raise no alarm
 _WINDOW, _LEAST = 20, 6  # sightings that are compared
@@ -75,6 +76,14 @@ class InnovationMonitor:
     def begin(self, vertex: int) -> None:
         """A segment begins at a keyframe: what was seen before tells nothing of where it is."""
         self._seen = deque((one for one in self._seen if one.keyframe >= vertex), self._seen.maxlen)
+
+    def renumber(self, vertices: Index, edges: Index) -> None:
+        """Take over new ids of all vertices and edges, by old ones; -1: it was removed."""
+        new = [
+            _Seen(int(edges[one.edge]), int(vertices[one.keyframe]), int(vertices[one.landmark]), one.stamp_ns)
+            for one in self._seen
+        ]
+        self._seen = deque((one for one in new if one.edge >= 0 and one.landmark >= 0), self._seen.maxlen)
 
     def add(self, edge: int, keyframe: int, landmark: int, stamp_ns: int) -> None:
         """A sighting of a landmark."""

@@ -1,7 +1,5 @@
 """The history of landmarks: when each was first seen, and from which keyframe on it is well known."""
 
-import numpy as np
-
 from graph_slam_ros.graph import Graph
 from graph_slam_ros.slam.robust.ledger import Ledger
 from graph_slam_ros.typing import Index
@@ -13,24 +11,6 @@ _DOUBTED = 0.3  # part of them that may be held back: else the landmark itself s
 _Judged = tuple[tuple[int, int], list[int], list[int]]
 """Of a landmark's first sightings: changes of the ledger and the number of those judged; keyframes of those that are
 accepted; edges of those that are held back."""
-
-
-def edges_to_replay(graph: Graph, oldest: int, first: int) -> Index:
-    """Return the edges since a keyframe, in order, that whoever begins anew at a later one needs.
-
-    Left out are, from before ``first``, odometry and sightings of landmarks that are older than all keyframes.
-
-    Parameters
-    ----------
-    oldest, first : vertices of the two keyframes
-    """
-    edges, is_old = graph.edges_since(oldest), np.zeros(graph.edge_count, dtype=bool)
-    for table in graph.tables.values():
-        ids, ends = table.id.values, table.vertices.values
-        is_odometry = graph.has_label(ids, ("odometry",)) & (ends < first).all(axis=1)
-        is_sighting = graph.has_label(ids, ("landmarks",)) & (ends[:, 0] < first) & (ends[:, -1] < oldest)
-        is_old[ids] = is_odometry | is_sighting
-    return edges[~is_old[edges]]
 
 
 class LandmarkHistory:
@@ -48,9 +28,21 @@ class LandmarkHistory:
         self._earliest: dict[int, list[tuple[int, int]]] = {}  # (edge, keyframe) of each landmark's first sightings
         self._known: dict[int, _Judged] = {}
 
-    def begin_at(self, vertex: int) -> None:
-        """Note that the landmarks before a vertex are known, and that sightings of later ones follow."""
-        self._start = vertex
+    def renumber(self, vertices: Index, edges: Index, first: int) -> None:
+        """Take over new ids of all vertices and edges, by old ones; -1: it was removed.
+
+        Parameters
+        ----------
+        first : the first keyframe that stays, by its new vertex; landmarks before it are known
+        """
+        self._start = first
+        self._surveyed = {int(vertices[landmark]) for landmark in self._surveyed if vertices[landmark] >= 0}
+        self._earliest = {
+            int(vertices[landmark]): [(int(edges[e]), int(vertices[k])) for e, k in earliest if edges[e] >= 0]
+            for landmark, earliest in self._earliest.items()
+            if vertices[landmark] >= first
+        }
+        self._known.clear()
 
     def add_survey(self, landmark: int) -> None:
         """Note a landmark, by its vertex, whose position is surveyed."""

@@ -1,7 +1,7 @@
 """The newest keyframes along odometry alone: the frame in which the search for a displacement lays out sightings."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -55,8 +55,7 @@ class OdometryChain:
         """Add the motion from one keyframe to the next, whose stamp it is. A second edge there replaces the first."""
         last, now = vertices
         if now in self._links:
-            known = self._links[now]
-            self._links[now] = _Link(edge, known.stamp_ns, known.pose, known.drift)
+            self._links[now] = replace(self._links[now], edge=edge)
             return
         before = self._links.get(last)
         pose = self._space.group.compose(before.pose if before else self._space.identity, T_last_now)
@@ -69,6 +68,19 @@ class OdometryChain:
         """Forget older keyframes."""
         while self._links and (oldest := next(iter(self._links))) < keyframe:
             del self._links[oldest]
+
+    def renumber(self, vertices: Index, edges: Index, first: int) -> None:
+        """Take over new ids of all vertices and edges, by old ones.
+
+        Parameters
+        ----------
+        first : the first keyframe that stays, by its new vertex: motions from it on are kept
+        """
+        self._links = {
+            int(vertices[keyframe]): replace(link, edge=int(edges[link.edge]))
+            for keyframe, link in self._links.items()
+            if vertices[keyframe] > first
+        }
 
     def pose(self, keyframe: int) -> Numbers:
         """Return where odometry alone has a keyframe."""

@@ -11,7 +11,7 @@ from graph_slam_ros.analysis.advice import Advisor
 from graph_slam_ros.analysis.explain import explain_edge, explain_run
 from graph_slam_ros.analysis.weakness import Weakness
 from graph_slam_ros.analysis.what_if import SavedGraph
-from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.errors import GraphSlamError, SingularError
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
 from graph_slam_ros.graph.place import LABEL
 from graph_slam_ros.maps.diff import diff
@@ -25,10 +25,12 @@ from graph_slam_ros.runs.restore import record_run, recover
 from graph_slam_ros.runs.tables import summarize
 from graph_slam_ros.runs.trajectory import read_tum
 from graph_slam_ros.runs.whole_path import removed_path
-from graph_slam_ros.slam import Config, Control, GraphSlam
+from graph_slam_ros.slam import Config, Control, GraphSlam, bounded_map
+from graph_slam_ros.slam.lifelong.condenser import Condenser
 from graph_slam_ros.slam.lifelong.removed import Left
 from graph_slam_ros.slam.lifelong.surroundings import CHAIN
 from graph_slam_ros.slam.robust.ledger import Verdict
+from graph_slam_ros.solver import Solver
 
 KEYFRAMES, WINDOW = 700, 60
 SPACES = {"plane": PLANAR, "space": SPATIAL}
@@ -78,7 +80,7 @@ class GraphSlamAfter:
 def test_the_map_is_small_and_as_good_and_the_whole_path_is_there(both):
     world, whole, small = both
     assert small.slam.first_keyframe > 0.6 * KEYFRAMES
-    assert len(small.slam.solver.vertices) < 0.35 * len(whole.slam.solver.vertices)
+    assert len(small.slam.solver.vertices) < 0.4 * len(whole.slam.solver.vertices)
     graph, waiting = small.slam.graph, whole.slam.graph.edge_count - len(whole.slam.ledger)
     assert graph.edge_count == len(small.slam.ledger) + waiting < 0.35 * whole.slam.graph.edge_count
     path = whole_path(small.slam, small.left)
@@ -170,18 +172,45 @@ def test_a_landmark_that_moves_is_found_and_the_old_path_stays():
     assert rms(whole_path(slam, left)[:moved_at], true_path(world, moved_at)) < 0.05
 
 
+@pytest.mark.parametrize(
+    ("home", "name", "input_"), [(Condenser, "rescale", "map"), (bounded_map, "compact", "solver")]
+)
+def test_a_solve_that_fails_before_or_after_the_compaction_is_counted_and_the_drive_goes_on(
+    monkeypatch, home, name, input_
+):
+    """Before, nothing has changed, and it is tried again; after, the estimate stays until the next solve."""
+    world, step, solve, state = hall(3, 600), getattr(home, name), Solver.update, {"fails": False}
+
+    def step_then_fail(*args):
+        state["fails"] = "failed" not in state
+        return step(*args)
+
+    def update(solver):
+        if state["fails"]:
+            state.update(fails=False, failed=True)
+            raise SingularError("planted", 5)
+        return solve(solver)
+
+    monkeypatch.setattr(home, name, step_then_fail)
+    monkeypatch.setattr(Solver, "update", update)
+    slam, left = driven(world, bounded())
+    assert slam.counters[input_, "SingularError"] == 1
+    assert left
+    assert rms(slam.trajectory()[:, :2], true_path(world, len(slam.keyframes))[slam.keyframes.first :]) < 0.05
+
+
 def test_memory_follows_the_area():
-    """From keyframes 350 to 500 to 800 to 900; without condensing, a keyframe takes several kilobytes."""
-    world, slam, early, late = hall(1, 900), GraphSlam(bounded()), [], []
+    """From keyframes 500 to 700 to 1,200 to 1,400; without condensing, a keyframe takes several kilobytes."""
+    world, slam, early, late = hall(1, 1400), GraphSlam(bounded()), [], []
     tracemalloc.start()
     try:
         for m in measurements(world):
             slam.process(m)
-            among = early if 350 < len(slam.keyframes) < 500 else late if len(slam.keyframes) > 800 else []
+            among = early if 500 < len(slam.keyframes) < 700 else late if len(slam.keyframes) > 1200 else []
             among.append(tracemalloc.get_traced_memory()[0])
     finally:
         tracemalloc.stop()
-    assert min(late) - min(early) < 450 * 1000
+    assert min(late) - min(early) < 700 * 1000
 
 
 @pytest.fixture(scope="module")
