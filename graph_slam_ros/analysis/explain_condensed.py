@@ -82,7 +82,7 @@ def statements_of_place(run: SavedGraph, e: Entry) -> Iterator[tuple[str, str]]:
     visits = f"{place.place.visits} visit{'s' * (place.place.visits > 1)}"
     yield f"edge {e.edge}", f"a place: {visits} to the cell of {width:.4g} m at {corner} m"
     yield "base", f"keyframe {run.keyframe(base)}"
-    names = map(run.landmark_of, members)
+    names = (run.landmark_of(v) or f"keyframe {run.keyframe(v)}" for v in members)
     texts = [f"{name} ({sigmas})" for name, sigmas in zip(names, _sigmas(run, e, len(members)), strict=True)]
     yield "members", f"{', '.join(texts)}: the sigma of each as seen from the base, along its worst axis"
     yield "now", f"chi2 {e.chi2:.4g} with {e.dof} degrees of freedom; a place is never judged as a whole"

@@ -39,7 +39,6 @@ from graph_slam_ros.typing import Array, Numbers
 
 Cell = tuple[int, ...]
 _AHEAD = 3  # landmarks of places that the keyframes after a visit must see before odometry to it is cut
-_SHARE = 0.5  # of the odometry of a first visit that is in its place; the rest joins the place to what is around it
 
 
 class Condenser:
@@ -74,7 +73,7 @@ class Condenser:
         Parameters
         ----------
         visit : vertices of its keyframes, in order of time; after : the keyframe that follows
-        ahead : landmarks that the keyframes after the visit see
+        ahead : landmarks that the keyframes after the visit see, as far as odometry joins them
         waits : whether it may wait until these see enough places; if not, it begins a place instead, if it can
         """
         around = surroundings(self.space, self.solver, visit, after)
@@ -93,16 +92,18 @@ class Condenser:
         if not (is_again or has_room):
             return self._without_place(visit, after, around, "it sees too few landmarks, or the cell is full")
         try:
-            factors, at = around.local if is_again else around.local | _halved(around), len(visit) // 2
+            at, inside = len(visit) // 2, list(visit)
             if not is_again:
-                at = best_known(self.space, self.solver.graph, self.solver.estimate, visit, factors)
-            one = visit_of(self.space, self.solver.graph, self.solver.estimate, visit, visit[at], factors)
+                at = best_known(self.space, self.solver.graph, self.solver.estimate, visit, around.local)
+                ends = {visit[-1], *([visit[0]] if around.into else [])} - {visit[at]}
+                inside = [vertex for vertex in visit if vertex not in ends]
+            one = visit_of(self.space, self.solver.graph, self.solver.estimate, inside, visit[at], around.local)
             if one.degrees > 0 and one.chi2 > quantile(self.limits.gate, one.degrees):
                 return self._thinned(visit, after, around, ITSELF)
             one = replace(one, information=one.information / self.scale.factor)
             if is_again and best is not None:
                 return self._again(visit, after, around, one, best)
-            return self._first(visit, at, after, around, one, cell)
+            return self._first(visit, at, around, one, cell)
         except SingularError as error:
             return self._without_place(visit, after, around, str(error))
 
@@ -126,41 +127,21 @@ class Condenser:
 
     # -- what becomes of a visit -------------------------------------------------------------------------------------
 
-    def _first(
-        self, visit: Sequence[int], at: int, after: int, around: Surroundings, one: Visit, cell: Cell
-    ) -> Condensed:
-        """Begin a place: a part of the odometry is in its edge, the rest joins its base to what is around it."""
-        base = visit[at]
+    def _first(self, visit: Sequence[int], at: int, around: Surroundings, one: Visit, cell: Cell) -> Condensed:
+        """Begin a place, which has the ends of the visit as well: the odometry to what is around it stays as it is."""
+        base, ends = visit[at], set(one.members).intersection(visit)
         if lonely := self._left_alone(around, one.members):
             return Condensed("kept", f"landmark {lonely[0]} would be left without a measurement")
-        root = square_root(one.information)
-        added, also, motions = self._joined(visit, at, after, around, 1.0 - _SHARE)
-        begun = added_place(self.space, self.solver.graph, base, Place.begun_by(one), root)
+        closures = {number: edge for number, edge in around.closures.items() if ends.isdisjoint(edge.vertices)}
+        around = replace(around, closures=closures)  # those of the ends stay as well
+        motions = self._motions(visit, around, base, at, None)
+        added, also = self._add_carried(self._carried(around, base, motions, []))
+        begun = added_place(self.space, self.solver.graph, base, Place.begun_by(one), square_root(one.information))
         self.places.setdefault(cell, []).append(begun)
-        removed = self._replace(_all_from(base, visit, motions), [*around.all, *also], [*added, begun.edge])
+        bases = _all_from(base, visit, motions) | {end: (end, None) for end in ends}
+        replaced = sorted({*around.all, *also} - {*around.into, *around.onward})
+        removed = self._replace(bases, replaced, [*added, begun.edge])
         return Condensed("first", removed=removed, seen=_seen(around, one.members))
-
-    def _joined(
-        self, visit: Sequence[int], k: int, after: int, around: Surroundings, share: float
-    ) -> tuple[list[int], list[int], dict[int, Motion]]:
-        """Join keyframe ``k`` of the visit to what is around it, and carry closures and fixes to it.
-
-        Parameters
-        ----------
-        share : part of the odometry inside the visit that joins it
-
-        Returns
-        -------
-        The new edges, those that they replace, and the motions from ``k`` to the keyframes of the visit.
-        """
-        legs = [motion_of(edge, share * around.factors[edge.id]) for edge in around.steps]
-        motions = self._motions(visit, around, visit[k], k, None)
-        carried = self._carried(around, visit[k], motions, [])
-        onward = [motion_of(edge) for edge in around.onward.values()]
-        joins = [(edge.vertices[0], visit[k], [motion_of(edge), *legs[:k]]) for edge in around.into.values()]
-        added = self._join([*joins, (visit[k], after, [*legs[k:], *onward])])
-        more, also = self._add_carried(carried)
-        return [*added, *more], also, motions
 
     def _again(self, visit: Sequence[int], after: int, around: Surroundings, one: Visit, at: PlaceEdge) -> Condensed:
         """Add a visit to a place, and cut the odometry on both sides of it."""
@@ -173,7 +154,7 @@ class Condenser:
         self.scale.add(fit.as_is, self.limits.gate)
         if (result := fit.result) is None:
             return self._thinned(visit, after, around, PLACE, fit.as_is)
-        bases = {one.base for in_cell in self.places.values() for one in in_cell}
+        bases = {v for in_cell in self.places.values() for one in in_cell for v in (one.base, *one.place.members)}
         from_kept = [edge for edge in around.into.values() if edge.vertices[0] not in bases]
         motions = self._motions(visit, around, at.base, k, (guess, result.covariance), also=bool(from_kept))
         carried = self._carried(around, at.base, motions, from_kept)
@@ -326,16 +307,6 @@ class Condenser:
                 out.append(mark)
         return out
 
-    def _join(self, joins: Sequence[tuple[int, int, Sequence[Motion]]]) -> list[int]:
-        """Add edges of odometry, each of several motions."""
-        out = []
-        for first, last, motions in joins:
-            pose, covariance = chained(self.space, motions)
-            noise = Gaussian.from_covariance(covariance)
-            edge = self.solver.graph.add_edge(self.space.relative_pose, [first, last], pose, noise, CHAIN)
-            out.append(edge)
-        return out
-
     def _replace(
         self, bases: Mapping[int, tuple[int, Array | None]], edges: Sequence[int], added: Sequence[int]
     ) -> tuple[RemovedPose, ...]:
@@ -361,12 +332,6 @@ class Condenser:
 def _all_from(base: int, visit: Sequence[int], motions: Mapping[int, Motion]) -> dict[int, tuple[int, Array | None]]:
     """Return one base for all keyframes of a visit, with the covariances of the motions from there that are known."""
     return {vertex: (base, motions[vertex][1] if vertex in motions else None) for vertex in visit}
-
-
-def _halved(around: Surroundings) -> dict[int, float]:
-    """Return the factors of the odometry inside a visit, half of which joins the place to what is around it."""
-    steps = {edge.id for edge in around.steps}
-    return {number: _SHARE * around.factors[number] for number in steps}
 
 
 def _seen(around: Surroundings, members: Collection[int]) -> tuple[tuple[int, int], ...]:
