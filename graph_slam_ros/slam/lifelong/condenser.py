@@ -38,6 +38,7 @@ from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Numbers
 
 Cell = tuple[int, ...]
+_TOGETHER = 3  # ranges or bearings that determine a landmark, as a rule
 _AHEAD = 3  # landmarks of places that the keyframes after a visit must see before odometry to it is cut
 
 
@@ -98,6 +99,8 @@ class Condenser:
                 ends = {visit[-1], *([visit[0]] if around.into else [])} - {visit[at]}
                 inside = [vertex for vertex in visit if vertex not in ends]
             one = visit_of(self.space, self.solver.graph, self.solver.estimate, inside, visit[at], around.local)
+            if not is_again and not ends <= set(one.members):
+                raise SingularError("odometry does not determine the visit")
             if one.degrees > 0 and one.chi2 > quantile(self.limits.gate, one.degrees):
                 return self._thinned(visit, after, around, ITSELF)
             one = replace(one, information=one.information / self.scale.factor)
@@ -298,12 +301,13 @@ class Condenser:
         return {mark for in_cell in self.places.values() for one in in_cell for mark in one.place.members}
 
     def _left_alone(self, around: Surroundings, members: Collection[int]) -> list[int]:
-        """Return the landmarks of a visit that would have no edge without it and are not among the members."""
+        """Return the landmarks of a visit that are not among the members, and that little else measures."""
         seen = {edge.vertices[1] for edge in around.sightings.values()} - set(members) - self._known()
         graph, out = self.solver.graph, []
         for mark in sorted(seen):
-            others = (int(edge) for edge in self.solver.edges_on(mark) if int(edge) not in around.sightings)
-            if not any(graph.edge(edge).weight for edge in others):
+            others = (graph.edge(int(edge)) for edge in self.solver.edges_on(mark) if int(edge) not in around.sightings)
+            sizes = [edge.type.residual_size for edge in others if edge.weight]
+            if max(sizes, default=0) < graph.kind_of(mark).dof and len(sizes) < _TOGETHER:
                 out.append(mark)
         return out
 

@@ -84,9 +84,15 @@ def visit_of(
         marginal = marginal_information(information, np.arange(begins[0], len(information)))
         numbers = [at[mark] for mark in marks]
         linearized_at = _constellation(space, solver, numbers)
-        solver.optimize(_ONE_STEP)
-        seen = _constellation(space, solver, numbers)
-        chi2, degrees = solver.optimize().chi2_final, solver.degrees_of_freedom
+        try:
+            solver.optimize(_ONE_STEP)
+            seen = _constellation(space, solver, numbers)
+            chi2, degrees = solver.optimize().chi2_final, solver.degrees_of_freedom
+        except SingularError as error:  # at the own optimum of bearings a landmark may be at infinity
+            if error.vertex is None or order[error.vertex] not in marks:
+                raise
+            marks = [mark for mark in marks if mark != order[error.vertex]]
+            continue
         return Visit(tuple(marks), seen, linearized_at, _of_positions(space, marginal, linearized_at), chi2, degrees)
     raise SingularError("the visit determines no landmark")
 

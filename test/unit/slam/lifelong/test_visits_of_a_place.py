@@ -349,3 +349,19 @@ def test_elimination_is_that_of_the_textbook():
     assert square_root(information).T @ square_root(information) == pytest.approx(information)
     with pytest.raises(SingularError, match="is not determined"):
         square_root(np.diag([1.0, 0.0]))
+
+
+def test_a_landmark_that_a_visit_alone_puts_at_infinity_is_left_out():
+    """Its bearings diverge, by errors; the whole map has it at 20 m."""
+    world = World(PLANAR, noise=0.0)
+    first = world.visit(range(3))
+    poses = [np.array(world.graph.vertex(one).initial) for one in world.poses[first]]
+    middle = np.mean([pose[:2] for pose in poses], axis=0)
+    left = np.array([-np.sin(poses[2][2]), np.cos(poses[2][2])])
+    far = world.graph.add_vertex(PLANAR.point, middle - 20.0 * left)
+    for vertex, pose in zip(world.poses[first], poses, strict=True):
+        x, y = pose[:2] - (middle + 8.0 * left)  # as from a point behind the robot
+        measured, noise = [float(np.arctan2(y, x) - pose[2]), 0.0, 0.0, 0.0], Gaussian.from_sigmas(0.05)
+        edge = world.graph.add_edge(PLANAR.sightings["bearing"], [vertex, far], measured, noise, "landmarks")
+        world.edges[first].append(edge)
+    assert world.condensed(first).members == tuple(world.marks[:3])
