@@ -392,6 +392,7 @@ def test_a_reader_of_a_run_folder_follows_no_link():
                 if value == "True":
                     found.add(f"{path.relative_to(PACKAGE).as_posix()}: {ast.unparse(node.args[0])}")
     assert found == {
+        "node/parameters.py: Path(file)",  # of the command line
         "recordings/ros1_records.py: path",
         "recordings/bag.py: file",
         "analysis/trajectories.py: path",

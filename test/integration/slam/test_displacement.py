@@ -119,7 +119,7 @@ def test_G23_a_robot_that_was_carried_to_new_ground_is_found_where_it_was_carrie
 
 
 def test_what_was_condensed_meanwhile_hides_no_displacement_in_the_window():
-    """The graph is compacted twice between the displacement and the sightings that show it."""
+    """The graph is compacted more than once between the displacement and the sightings that show it."""
     faulty, event_ns = carried(simulate("manhattan", seed=3), at=0.3, metres=25.0)
     config, condensed = Config(), 0
     slam = GraphSlam(replace(config, map=replace(config.map, window_keyframes=700)))
@@ -128,7 +128,7 @@ def test_what_was_condensed_meanwhile_hides_no_displacement_in_the_window():
         if slam.counters[DISPLACED]:
             break
     (_, segment) = slam.segments
-    assert condensed == 2
+    assert condensed >= 2
     begin_ns = int(slam.keyframes.stamps_ns[segment - slam.keyframes.first])
     assert abs(begin_ns - event_ns) < 2 * 10**9
 

@@ -239,8 +239,11 @@ def test_a_map_with_condensed_visits_opens_at_a_place_an_edge_and_a_condensed_ke
     page.wait_for_function("k => byId('why-body').innerText.startsWith(`edge ${k}`)", arg=newest)
     told = " ".join(" ".join(explain_edge(saved, str(newest))).split())
     assert told[: told.index(" what if ")] in why(page)
-    page.evaluate("() => go('keyframe', 5)")
-    page.wait_for_function("() => byId('why-body').innerText.startsWith('keyframe 5')")
+    for k in range(1, 5):  # among them may be a base, which stays
+        page.evaluate("k => go('keyframe', k)", k)
+        page.wait_for_function("k => byId('why-body').innerText.startsWith(`keyframe ${k}`)", arg=k)
+        if "It was condensed" in why(page):
+            break
     assert "It was condensed" in why(page)
     gone = next(k for k in range(slam.graph.edge_ids.of(0), newest) if slam.graph.edge_ids.find(k) is None)
     page.evaluate("k => go('edge', k)", gone)
