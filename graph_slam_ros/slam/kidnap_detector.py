@@ -109,7 +109,7 @@ class KidnapDetector:
     def renumber(self, vertices: Index, edges: Index, first: int) -> None:
         """Take over new ids of all vertices and edges, by old ones; -1: it was removed.
 
-        Edges that came since an edge was noted last took the place of others: closures alone matter.
+        New edges took the place of others in the compaction. Of these, closures are noted.
 
         Parameters
         ----------

@@ -38,7 +38,7 @@ from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Numbers
 
 Cell = tuple[int, ...]
-_TOGETHER = 3  # ranges or bearings that determine a landmark, as a rule
+_FEWEST = 3  # ranges or bearings that are enough for a landmark whose visit is condensed
 _AHEAD = 3  # landmarks of places that the keyframes after a visit must see before odometry to it is cut
 
 
@@ -93,13 +93,13 @@ class Condenser:
         if not (is_again or has_room):
             return self._without_place(visit, after, around, "it sees too few landmarks, or the cell is full")
         try:
-            at, inside = len(visit) // 2, list(visit)
+            at, ends = len(visit) // 2, set[int]()
             if not is_again:
                 at = best_known(self.space, self.solver.graph, self.solver.estimate, visit, around.local)
                 ends = {visit[-1], *([visit[0]] if around.into else [])} - {visit[at]}
-                inside = [vertex for vertex in visit if vertex not in ends]
+            inside = [vertex for vertex in visit if vertex not in ends]
             one = visit_of(self.space, self.solver.graph, self.solver.estimate, inside, visit[at], around.local)
-            if not is_again and not ends <= set(one.members):
+            if not ends <= set(one.members):
                 raise SingularError("odometry does not determine the visit")
             if one.degrees > 0 and one.chi2 > quantile(self.limits.gate, one.degrees):
                 return self._thinned(visit, after, around, ITSELF)
@@ -307,7 +307,7 @@ class Condenser:
         for mark in sorted(seen):
             others = (graph.edge(int(edge)) for edge in self.solver.edges_on(mark) if int(edge) not in around.sightings)
             sizes = [edge.type.residual_size for edge in others if edge.weight]
-            if max(sizes, default=0) < graph.kind_of(mark).dof and len(sizes) < _TOGETHER:
+            if max(sizes, default=0) < graph.kind_of(mark).dof and len(sizes) < _FEWEST:
                 out.append(mark)
         return out
 

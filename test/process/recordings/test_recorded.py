@@ -35,7 +35,7 @@ def test_a_recorded_robot_is_found_to_a_decimetre_and_so_are_its_landmarks(robot
 
 @pytest.mark.skipif(not HAS_MRCLAM, reason=WITHOUT_MRCLAM)
 @pytest.mark.parametrize("robot, seconds", times([(2, 450.0)], [(robot, None) for robot in MOST_M]))
-def test_with_condensed_visits_it_is_nearly_as_good_and_hardly_surer_than_with_all_keyframes(robot, seconds, tmp_path):
+def test_with_condensed_visits_it_is_nearly_as_good(robot, seconds, tmp_path):
     """Odometry says a way that is 10 % too long, and the clock is late: the visits' errors are no noise."""
     bag = mrclam(robot, tmp_path / "bag", seconds=seconds)
     config = Config.from_mapping({"map.condense": True, "map.window_keyframes": 300})
