@@ -62,3 +62,5 @@ if __name__ == "__main__":
     manager = Manager(sys.argv[1], float(sys.argv[2]))
     while manager.state != DEAD:
         manager.turn()
+    manager.destroy_node()
+    rclpy.shutdown()

@@ -417,6 +417,12 @@ class Started:
 
 @contextlib.contextmanager
 def node(*parameters, **options):
+    """A node; what still runs at the end is killed. A test that wants it killed leaves it running, and kills none.
+
+    For each robot has to be closed before. Fast DDS 2.14 makes a port in shared memory anew up to three seconds after
+    a process that had it was killed, in a thread of its own; a participant that is closed meanwhile may read memory
+    that is gone, and end the whole process.
+    """
     started = Started(*parameters, **options)
     try:
         yield started

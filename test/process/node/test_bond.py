@@ -5,10 +5,11 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 
 import built_packages
 import pytest
-from live_nodes import ENVIRONMENT, lenient, node, own_domain, robot, until
+from live_nodes import ENVIRONMENT, PATIENCE_S, lenient, node, own_domain, robot, until
 from places import ROOT
 
 from graph_slam_ros.node.bond import MISSING, is_installed
@@ -45,6 +46,8 @@ def manager(timeout_s):
     try:
         yield process, said
     finally:
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(lenient(PATIENCE_S))  # it ends by itself once the bond is broken
         process.kill()
         process.wait()
         reader.join()
@@ -86,14 +89,15 @@ def test_P14_a_bond_forms_when_active_and_breaks_with_whoever_goes(tmp_path, wit
 
 
 def test_P14_the_manager_notices_a_node_that_has_crashed(tmp_path, with_bond):
-    with managed(tmp_path / "run") as n, robot(hears=()) as r, manager(lenient(1.0)) as (_, said):
-        assert r.change("configure", lenient(30.0))
-        r.settle()
-        assert not said, "there is no bond before it is active"
-        assert r.change("activate")
-        until(lambda: said == ["formed\n"], r.spin, "bond")
-        n.process.kill()
-        until(lambda: said[1:] == ["broken: silent\n"], r.spin, "silence")
+    with manager(lenient(1.0)) as (_, said):
+        with managed(tmp_path / "run") as n, robot(hears=()) as r:
+            assert r.change("configure", lenient(30.0))
+            r.settle()
+            assert not said, "there is no bond before it is active"
+            assert r.change("activate")
+            until(lambda: said == ["formed\n"], r.spin, "bond")
+        assert n.process.returncode == -signal.SIGKILL
+        until(lambda: said[1:] == ["broken: silent\n"], time.sleep, "silence")
 
 
 @pytest.mark.skipif(is_installed(), reason="bond is installed")

@@ -213,18 +213,17 @@ def test_A39_odometry_on_tf_that_never_comes_or_stops_is_missed_though_tf_goes_o
 def test_a_map_that_cannot_be_loaded_at_the_start_is_an_error_until_another_is(tmp_path):
     earlier_run(tmp_path / "life", 100)
     parameters = f"output.folder:={tmp_path / 'run'}", "output.load:=lief", "output.load_at_start:=true"
-    with node(*parameters) as n, robot(hears=("/diagnostics",)) as r:
+    with node(*parameters), robot(hears=("/diagnostics",)) as r:
         r.until_it_says("ERROR", "output.load: the map was not loaded: lief: not a run; did you mean 'life'?")
         assert r.set({"output.load": "life"}) == (True, "")
         assert r.call("load", patience_s=30.0).success
         r.until_it_says("DEGRADED", "where the robot is in the loaded map is not known yet")
-        n.process.kill()
 
 
 def test_A36_while_a_map_is_loaded_that_is_what_is_said(tmp_path):
     earlier_run(tmp_path / "life", 2_000)
     parameters = f"output.folder:={tmp_path / 'run'}", "output.load:=life", "solve.every_keyframes:=100"
-    with node(*parameters) as n, robot(hears=("/diagnostics",)) as r:
+    with node(*parameters), robot(hears=("/diagnostics",)) as r:
         r.wait_for_node()
         r.heard["diagnostics"].clear()
         loaded = r.ask("load")
@@ -233,7 +232,6 @@ def test_A36_while_a_map_is_loaded_that_is_what_is_said(tmp_path):
         said = [values for _, values in r.said()]
         assert any(values.get("reason 1") == "loads the map of life" for values in said), said
         assert not any("ERROR" in values["state"] for values in said), said
-        n.process.kill()
 
 
 # -- a node that is behind, and messages that do not arrive ------------------------------------------------------------
@@ -266,7 +264,6 @@ def test_A37_path_landmarks_and_graph_come_while_messages_wait_and_jumps_are_tol
         until(lambda: r.graph()["solves"] > 100, go_on, "solves")
         sigmas = np.sqrt(np.diag(r.heard["pose"][-1].pose.covariance.reshape(6, 6)))
         assert sigmas[[2, 3, 4]] == pytest.approx(0.5), "what the plane leaves open can be drawn"
-        n.process.kill()
 
 
 def test_A38_what_the_middleware_loses_before_the_node_is_counted_and_degrades():

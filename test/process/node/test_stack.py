@@ -445,7 +445,7 @@ def veteran(tmp_path_factory):
     stamps = earlier_run(folder / "life", keyframes)
     parameters = f"output.folder:={folder / 'run'}", "output.load:=life", "solve.every_keyframes:=200", PATH_AT_MOST
     hears = "path", "odometry", "/tf", "/diagnostics"
-    with node(*parameters) as n, robot(hears=hears, raw=("path",)) as r:
+    with node(*parameters), robot(hears=hears, raw=("path",)) as r:
         r.wait_for_node()
         answer = r.call("load", patience_s=keyframes / 200)
         assert answer.success, answer.message
@@ -456,7 +456,6 @@ def veteran(tmp_path_factory):
         drive = Drive()
         until(lambda: r.heard["tf"], drive.pace(r), "a place in the old map")
         yield r, drive, (stamps[0], stamps[-1])
-        n.process.kill()  # to save all of it takes a while
 
 
 def test_P8_of_a_path_that_is_too_long_some_poses_are_published_the_first_and_last_among_them(veteran):

@@ -1,6 +1,7 @@
 """The map of a running node: held while the robot is located in it, edited by hand; recordings in a saved map."""
 
 import json
+import signal
 
 import numpy as np
 import pytest
@@ -147,8 +148,7 @@ def test_a_map_is_loaded_at_the_start_with_the_pose_of_the_robot(tmp_path, use):
         drive.sees = True
         drive.go(r, 60, every=3)
         r.until_it_says("OK", spin=drive.pace(r))
-        n.process.kill()
-        n.ended()
+    assert n.process.returncode == -signal.SIGKILL
     with node(*at, *given) as n, robot(hears=("pose", "/diagnostics")) as r:
         r.wait_for_node()
         assert n.stop()[0] == 0
