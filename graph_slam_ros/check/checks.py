@@ -33,6 +33,7 @@ _FROM_THE_BEGINNING = ("units", "mirrored", "axes", "unrelated")  # what is read
 _IN_OUTCOME = ("not_planar", "no_landmarks")
 _WHILE_DRIVING = (*_FROM_THE_BEGINNING, "clock_domains", "constant_stamps", "no_orientation_of_odometry", "noise_zero")
 _OF_TWIST = ("twist_scale", "twist_frame", "twist_unrelated", "covariance_tiny", "covariance_useless")
+_ONCE_IT_MOVES = (*_OF_TWIST, "slow_odometry")
 _LATEST_S = 60.0  # that a message comes by a slow detector, and not by a clock that differs
 _MANY_IDS_M = 20.0  # before that, a landmark may be seen for the first time just now
 _LEAST_WAY_M = 10.0  # before that, the speed of a robot that begins to drive says nothing of its twist
@@ -73,8 +74,8 @@ def first_of_replay(c: Columns, *, is_whole: bool) -> Finding | None:
 def worst_while_driving(c: Columns) -> list[Finding]:
     """Return what is wrong with the inputs of a robot that drives, by its last minutes.
 
-    It is the worst error that makes the result meaningless; without one, it is what is wrong with odometry's twist,
-    and ids that are those of tracks.
+    It is the worst error that makes the result meaningless; without one, it is what is wrong with odometry's twist
+    or rate, and ids that are those of tracks.
     """
     found = check_columns(c, OF_A_REPLAY)
     errors = [one for one in found if one.severity == "error" and one.code in _WHILE_DRIVING]
@@ -82,7 +83,7 @@ def worst_while_driving(c: Columns) -> list[Finding]:
     if errors:
         return errors[:1]
     way_m = float(np.linalg.norm(np.diff(c.path[:, :3], axis=0), axis=1).sum())
-    codes = (*_OF_TWIST, *(["seen_once"] if way_m > _MANY_IDS_M else []))
+    codes = (*_ONCE_IT_MOVES, *(["seen_once"] if way_m > _MANY_IDS_M else []))
     return [one for one in found if one.severity != "note" and one.code in codes] if way_m > _LEAST_WAY_M else []
 
 

@@ -1,4 +1,4 @@
-"""The check of the inputs while the robot drives: their units, axes, clocks, and the twist of odometry.
+"""The check of the inputs while the robot drives: their units, axes, clocks, and the twist and rate of odometry.
 
 It is that of a replay (``check.checks.worst_while_driving``), again and again, of the last minutes.
 """
@@ -21,6 +21,7 @@ _APART_S = 0.045  # of messages of odometry that are collected
 _MOST_POSES, _MOST_SIGHTINGS = 3_000, 20_000  # that are checked at once: minutes
 _LEAST = 30  # poses, sightings or pairs of a finding
 _FEW = {"clock_domains": 5}  # messages
+_FEW_LEFT_OUT = 10  # one of so many messages
 _PERIOD_S, _SOON_S, _SPARE = 3.0, 0.5, 50.0  # between two checks; of the time, one part
 
 
@@ -46,6 +47,7 @@ class InputCheck:
         self._last_ns: dict[str, int] = {}
         self._last_s: dict[str, float] = {}
         self._messages = 0  # since the last check
+        self._kept, self._left_out = 0, 0  # messages of odometry in this collection, and between them
         self._due_s, self._goes_on = 0.0, False
         self.findings: tuple[str, ...] = ()
 
@@ -58,6 +60,9 @@ class InputCheck:
         """Collect what a message of these inputs has measured; of odometry, a part is enough."""
         if topic in self._odometry and not self._is_due(topic):
             self._collector.leave_out()
+            self._left_out += 1
+        elif topic in self._odometry:
+            self._kept += 1
         self._messages += 1
         some = [m for m in measured if not isinstance(m, Odometry) or self._is_next(m)]
         self._collector.add(topic, [name for name in names if name != TF], now_ns, some)
@@ -66,6 +71,7 @@ class InputCheck:
         """Begin anew, with other stamps."""
         self._collector.begin_anew()
         self._last_ns.clear()
+        self._kept = self._left_out = 0
 
     def job(self) -> Callable[[], None] | None:
         """Return the next check, for a thread; None if none is due, or the last goes on."""
@@ -76,10 +82,11 @@ class InputCheck:
         columns = self._collector.columns(self._counters)
         sightings = sum(len(one.stamp_ns) for one in columns.sightings)
         poses = max(len(columns.path_ns), len(columns.odometry.stamp_ns))
+        is_thinned = self._left_out * _FEW_LEFT_OUT > self._kept
         is_full = poses >= _MOST_POSES or sightings >= _MOST_SIGHTINGS
         if is_full:
             self.forget()
-        return partial(self._check, columns, is_full=is_full)
+        return partial(self._check, columns, is_full=is_full, is_thinned=is_thinned)
 
     def _is_due(self, topic: str) -> bool:
         """Return whether a message of odometry is collected: some of each second are enough."""
@@ -95,11 +102,14 @@ class InputCheck:
         self._last_ns[m.source] = m.stamp_ns
         return True
 
-    def _check(self, columns: Columns, *, is_full: bool) -> None:
-        """Replace the findings. That nothing is wrong is believed of a full collection only."""
+    def _check(self, columns: Columns, *, is_full: bool, is_thinned: bool) -> None:
+        """Replace the findings. That nothing is wrong is believed of a full collection only.
+
+        Messages that come in bursts are thinned, so what is collected does not say how often they are sent.
+        """
         begun = time.monotonic()
         try:
-            found = worst_while_driving(columns)
+            found = [m for m in worst_while_driving(columns) if m.code != "slow_odometry" or not is_thinned]
             if sure := [one for one in found if one.count >= _FEW.get(one.code, _LEAST)]:
                 self.findings = tuple(map(_text, sure))
             elif found:

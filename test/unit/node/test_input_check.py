@@ -117,6 +117,25 @@ def test_odometry_is_checked_by_itself_with_its_twist(wrong, text, monkeypatch):
         assert one.startswith(text)
 
 
+@pytest.mark.parametrize("burst, is_named", [(1, True), (10, False)])
+def test_slow_odometry_is_named_and_not_what_comes_in_bursts(burst, is_named, monkeypatch):
+    """Two poses a second, or twenty of which each ten come at once; sightings between them."""
+    now_s = [0.0]
+    monkeypatch.setattr(input_check.time, "monotonic", lambda: now_s[0])
+    check = InputCheck(Config(), {"odom": "/odom", "detections": "/tags"}, Counters())
+    converter = MessageConverter(Config.from_mapping({"inputs.tf": False}), Counters(), check.decoders({}))
+    for k in range(0, 1000, 10):
+        now_s[0] += 0.5
+        for j in range(k, k + 10, 10 // burst):
+            check.add("/odom", ["odom"], 10**15 + j * NS // 20, converter.convert("odom", odometry(j)))
+        stamp_ns = 10**15 + (2 * k + 5) * NS // 40
+        cdr = detections(detection(pose(3.0, 1.0)), stamp_ns=stamp_ns)
+        check.add("/tags", ["detections"], stamp_ns, converter.convert("detections", cdr))
+    run_job(check)
+    assert len(check.findings) == is_named, check.findings
+    assert all(one.startswith("slow_odometry: /odom comes at 2.0 Hz: ") for one in check.findings)
+
+
 @pytest.mark.parametrize("late_s, setting", [(0.1, None), (3600.0, "odom.offset_s=3600.")])
 def test_a_clock_of_odometry_that_is_not_that_of_all_others_is_named_with_its_offset(late_s, setting, monkeypatch):
     monkeypatch.setattr(input_check, "_APART_S", 0.0)
