@@ -162,6 +162,7 @@ FAULTS = {
     "turn rate mirrored": (of("wrong_scale:distance=1.0,turn=-1.0"), "mirrored"),
     "twist mirrored, pose right": (of("wrong_twist:angular=-1.0"), "twist_scale"),
     "twist in degrees": (of("wrong_twist:angular=57.29578"), "twist_scale"),
+    "two publishers of odometry": (of("other_publisher"), "other_publisher"),
     "odometry in millimetres": (of("wrong_scale:distance=1000.0"), "units"),
     "twist in the odom frame": (of("wrong_twist:axes=odom"), "twist_frame"),
     "mount turned 5 degrees": (of("wrong_mount:yaw_deg=5.0"), "mount_yaw"),

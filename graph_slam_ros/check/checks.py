@@ -9,7 +9,7 @@ from graph_slam_ros.check.contradictions import check_contradictions
 from graph_slam_ros.check.finding import Finding, in_order, worst
 from graph_slam_ros.check.frames import check_frames
 from graph_slam_ros.check.gyro import check_gyro
-from graph_slam_ros.check.odometry import check_odometry
+from graph_slam_ros.check.odometry import check_odometry, of_one_publisher
 from graph_slam_ros.check.refusals import check_refusals, check_unnamed
 from graph_slam_ros.check.times import check_times
 
@@ -46,6 +46,7 @@ def check_columns(c: Columns, checks: tuple[Check, ...] = CHECKS) -> list[Findin
     """
     found: list[Finding] = []
     with np.errstate(all="ignore"):
+        c = of_one_publisher(c)
         for check in checks:
             found += check(c)
             if any(one.ends for one in found):

@@ -21,7 +21,7 @@ from graph_slam_ros.messages.from_msg import TF, TF_STATIC, OwnDecoder
 from graph_slam_ros.messages.inputs import uses
 from graph_slam_ros.messages.inputs.odometry_bytes import OdometryBytes, OdometryRun
 from graph_slam_ros.messages.inputs.transforms import Transforms, pose
-from graph_slam_ros.typing import Array, Index
+from graph_slam_ros.typing import Array, Index, Mask
 
 _TWIST, _COLUMNS = (0, 7, 14, 21, 28, 35), 19  # places in a covariance; numbers of a message
 Decoder = Callable[[bytes], Any]
@@ -65,6 +65,11 @@ class OdometryColumns:
     poses: Array
     twist: Array
     variances: Array
+
+    def some(self, which: Mask) -> "OdometryColumns":
+        """Return the columns of some of the messages."""
+        rows = (self.stamp_ns[which], self.poses[which], self.twist[which], self.variances[which])
+        return OdometryColumns(self.input, self.topic, self.frame, self.child, *rows)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

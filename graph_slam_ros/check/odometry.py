@@ -60,6 +60,12 @@ class Steps:
     fastest_rad_s: float
 
     @property
+    def fastest_turn_rad_s(self) -> float:
+        """The 99 % quantile of the turn rates, without what noise makes of the shortest steps."""
+        turned = np.linalg.norm(self.turned[self.is_short], axis=1)
+        return float(np.percentile(turned / np.maximum(self.dt[self.is_short], _LEAST_S), 99.0))
+
+    @property
     def jumps(self) -> Mask:
         """(n,) Steps that are far longer than the others."""
         dt = np.maximum(self.dt, float(np.median(self.dt)))
@@ -94,6 +100,22 @@ def steps_of(o: OdometryColumns) -> Steps | None:
     return Steps(index, dt, moved, turned, is_short, float(fastest[0]), float(fastest[1]))
 
 
+def of_one_publisher(c: Columns) -> Columns:
+    """Return these columns without the odometry that other publishers on its topic have sent.
+
+    It was refused because it does not continue the odometry in use, and is by itself the motion of a robot. What is
+    not is an outlier, or of the wrong unit, and stays.
+    """
+    o = c.odometry
+    if c.counters[o.input, "other_publisher"] < LEAST:
+        return c
+    is_used = np.isin(o.stamp_ns, c.path_ns)
+    others = steps_of(o.some(~is_used))
+    if others is None or others.fastest_m_s > _FASTEST_M_S or others.fastest_turn_rad_s > _FASTEST_RAD_S:
+        return c
+    return replace(c, odometry=o.some(is_used))
+
+
 def check_odometry(c: Columns) -> Iterator[Finding]:
     """The odometry that is used, by its own messages alone."""
     o, steps = c.odometry, steps_of(c.odometry)
@@ -107,8 +129,7 @@ def check_odometry(c: Columns) -> Iterator[Finding]:
         text = f"{o.topic}: the robot drives at {steps.fastest_m_s:.0f} m/s: is its position in metres?"
         yield Finding("units", "error", steps.fastest_m_s, _FASTEST_M_S, "m/s", text, **where)
         return
-    turns = np.linalg.norm(steps.turned[steps.is_short], axis=1) / np.maximum(steps.dt[steps.is_short], _LEAST_S)
-    if (fastest := float(np.percentile(turns, 99.0))) > _FASTEST_RAD_S:
+    if (fastest := steps.fastest_turn_rad_s) > _FASTEST_RAD_S:
         text = f"{o.topic}: the orientation turns at {fastest:.0f} rad/s: are its angles in radians?"
         yield Finding("units", "error", fastest, _FASTEST_RAD_S, "rad/s", text, **where)
         return

@@ -58,13 +58,14 @@ class InputCheck:
 
     def add(self, topic: str, names: Sequence[str], now_ns: int, measured: Sequence[Measured]) -> None:
         """Collect what a message of these inputs has measured; of odometry, a part is enough."""
-        if topic in self._odometry and not self._is_due(topic):
-            self._collector.leave_out()
-            self._left_out += 1
-        elif topic in self._odometry:
-            self._kept += 1
-        self._messages += 1
         some = [m for m in measured if not isinstance(m, Odometry) or self._is_next(m)]
+        if topic in self._odometry:
+            if self._is_due(topic) and (some or not measured):  # of what was used both are collected, or none
+                self._kept += 1
+            else:
+                self._collector.leave_out()
+                self._left_out += 1
+        self._messages += 1
         self._collector.add(topic, [name for name in names if name != TF], now_ns, some)
 
     def forget(self) -> None:

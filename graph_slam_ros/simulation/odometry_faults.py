@@ -1,6 +1,7 @@
 """Faults of the driver of odometry, put into the messages of a recording."""
 
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,7 +9,7 @@ from numpy.random import Generator
 
 from graph_slam_ros.formats.cdr import NS
 from graph_slam_ros.lie import se3, so3
-from graph_slam_ros.simulation.drive import Drive
+from graph_slam_ros.simulation.drive import Drive, Message
 from graph_slam_ros.simulation.options import Kind, option
 from graph_slam_ros.typing import Array
 
@@ -96,6 +97,15 @@ class Corrected:
     every_s: float = option(20.0, "how often", "s", 0.1, 1e6)
     sigma_m: float = option(0.3, "by how much", "m", 0, 1e3)
     sigma_rad: float = option(0.05, "and how much it is turned", "rad", 0, 3.0)
+
+
+@dataclass(frozen=True, slots=True)
+class OtherPublisher:
+    """Odometry that a second node publishes on the same topic, a little later, from an origin of its own."""
+
+    seconds: float = option(0.01, "how much later", "s", 1e-6, 100)
+    x_m: float = option(8.0, "where the robot of the first is in the odometry of the second", "m", -1e6, 1e6)
+    distance: float = option(0.98, "its distance for each metre of the first", "", 1e-3, 1e3)
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,6 +230,21 @@ def _corrected(drive: Drive, fault: Corrected, rng: Generator) -> None:
     drive.poses = poses
 
 
+def _other_publisher(drive: Drive, fault: OtherPublisher, _rng: Generator) -> None:
+    messages = []
+    for m in drive.messages:
+        messages.append(m)
+        if m.topic == drive.odometry_topic:
+            later_ns = round(fault.seconds * NS)
+            other = Message(m.topic, m.type, m.log_ns + later_ns, deepcopy(m.content))
+            other.stamp_ns = m.stamp_ns + later_ns
+            at, twist = other.content.pose.pose.position, other.content.twist.twist.linear
+            at.x, at.y = fault.x_m + fault.distance * at.x, fault.distance * at.y
+            twist.x, twist.y = fault.distance * twist.x, fault.distance * twist.y
+            messages.append(other)
+    drive.messages = sorted(messages, key=lambda m: m.log_ns)
+
+
 def _not_a_number(drive: Drive, fault: NotANumber, rng: Generator) -> None:
     for m in drive.odometry:
         if rng.random() < fault.rate:
@@ -238,5 +263,6 @@ ODOMETRY_KINDS: dict[str, Kind] = {
     "standing": Kind(Standing, _standing),
     "restarted": Kind(Restarted, _restarted),
     "corrected": Kind(Corrected, _corrected),
+    "other_publisher": Kind(OtherPublisher, _other_publisher),
     "not_a_number": Kind(NotANumber, _not_a_number),
 }

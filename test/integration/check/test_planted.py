@@ -334,6 +334,14 @@ def test_each_finding_is_planted():
     assert KINDS.keys() - {code for _, codes in FAULTS.values() for code in codes.split()} - tested == elsewhere
 
 
+def test_of_two_publishers_of_odometry_each_is_a_robot_that_drives(drive, tmp_path):
+    bag, said = planted(drive, tmp_path / "two.mcap", "two publishers of odometry"), []
+    (found,) = check(bag).findings
+    assert (found.code, found.severity) == ("other_publisher", "warning"), found
+    replay(bag, tmp_path / "run", Config(), warn=said.append)
+    assert not said
+
+
 @pytest.mark.parametrize("seconds", [0.2, -0.2])
 def test_a_clock_that_is_set_on_the_way_is_found_by_the_fit_and_by_the_times_of_recording(laps, tmp_path, seconds):
     faulty = Drive(laps)

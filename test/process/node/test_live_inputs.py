@@ -25,18 +25,19 @@ def domain(monkeypatch):
 
 
 def test_A34_two_publishers_of_an_odometry_are_named_and_the_robot_stays_where_it_is(tmp_path):
-    hears = "/diagnostics", "pose", "path"
-    with node("output.folder:=''", "inputs.reliable:=true") as n, robot(name="wheels", hears=hears) as r:
+    """On a busy machine DDS loses messages and sends them again later: until then the other goes on alone."""
+    hears, patient = ("/diagnostics", "pose", "path"), ("inputs.reliable:=true", "odometry.timeout_s:=10.0")
+    with node("output.folder:=''", *patient) as n, robot(name="wheels", hears=hears) as r:
         r.wait_for_node()
-        drive, at = Drive(), (8.0, -3.0, 1.0)
+        drive, at = Drive(step_s=0.03), (80.0, -30.0, 1.0)  # stamps go as time does
         r.until_it_says("OK", spin=drive.pace(r))
         with robot(name="ekf", hears=(), sends=("/odom",)) as other:
-            until(other.publishers["/odom"].get_subscription_count, r.spin, "subscriber of the other")
+            until(other.publishers["/odom"].get_subscription_count, drive.pace(r), "its subscriber")
 
             def both(seconds):
                 nonlocal at
                 x, y, yaw = at = tuple(map(float, se2.compose(at, (0.1, 0.0, 0.98 * drive.turn))))
-                stamp_ns = drive.stamp_ns + 30_000_000
+                stamp_ns = drive.stamp_ns + 10_000_000
                 other.send("/odom", odometry(pose(x, y, 0.0, quaternion(yaw=yaw)), stamp_ns=stamp_ns))
                 drive.step(r)
                 r.spin(seconds)
@@ -47,7 +48,7 @@ def test_A34_two_publishers_of_an_odometry_are_named_and_the_robot_stays_where_i
         r.until_it_says("OK", spin=drive.pace(r))
         r.settle()
         until(lambda: int(r.said("input odom")[-1][1]["counted: other_publisher"]) > 100, r.spin, "count of the others")
-        assert r.graph()["segments"] == 1
+        assert r.graph()["segments"] == 1, f"{r.said('input odom')[-1][1]}, {n.said}"
         newest = r.heard["pose"][-1].pose.pose.position
         assert math.dist((newest.x, newest.y), drive.truth[:2]) < 0.5
         assert n.stop()[0] == 0
@@ -99,7 +100,8 @@ def test_A35_an_input_that_is_refused_is_degraded_with_the_remedy_while_it_is_an
         r.until_it_says("OK", spin=with_tags())
         r.heard["diagnostics"].clear()
         until(lambda: len(r.said()) > 4, with_tags(covariance=0.0), "diagnostics")
-        assert {values["state"] for _, values in r.said()} == {"OK"}, "a noise that was filled in is no refusal"
+        reasons = {text for _, values in r.said() for key, text in values.items() if key.startswith("reason ")}
+        assert not [text for text in reasons if "/landmarks" in text], "a noise that was filled in is no refusal"
         assert int(r.said("input detections")[-1][1]["counted: covariance_unknown"]) > 20
         assert n.stop()[0] == 0
 
