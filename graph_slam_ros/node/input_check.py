@@ -60,7 +60,7 @@ class InputCheck:
         """Collect what a message of these inputs has measured; of odometry, a part is enough."""
         some = [m for m in measured if not isinstance(m, Odometry) or self._is_next(m)]
         if topic in self._odometry:
-            if self._is_due(topic) and (some or not measured):  # of what was used both are collected, or none
+            if (some or not measured) and self._is_due(topic):  # what was used is collected as it was used, too
                 self._kept += 1
             else:
                 self._collector.leave_out()

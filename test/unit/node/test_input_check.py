@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 from messages import TWIST, covariance6, detection, detections, encode, header, make, pose, quaternion, vector
 
@@ -66,6 +67,22 @@ def test_of_a_few_sightings_nothing_is_said_and_a_driver_that_was_corrected_is_b
     check.forget()
     assert checked(3100, check=check).findings == ()
     assert not len(check._collector.columns(Counters()).path_ns), "it has begun anew"
+
+
+@pytest.mark.parametrize("late_ms", range(0, 60, 10))
+def test_a_message_is_collected_now_and_then_however_arrival_and_stamps_go(late_ms, monkeypatch):
+    """Of every 20 ms; the first is late, or the stamps go on before the first arrival."""
+    now_s = [100.0]
+    monkeypatch.setattr(input_check.time, "monotonic", lambda: now_s[0])
+    check = InputCheck(Config(), {"odom": "/odom", "detections": "/tags"}, Counters())
+    converter = MessageConverter(Config.from_mapping({"inputs.tf": False}), Counters(), check.decoders({}))
+    for k in range(300):
+        now_s[0] = 100.0 + 0.02 * k + (0.001 * late_ms if k else 0.0)
+        cdr = odometry(0.4 * k, stamp_ns=10**15 + k * NS // 50)
+        check.add("/odom", ["odom"], 10**15 + k * NS // 50, converter.convert("odom", cdr))
+    columns = check._collector.columns(Counters())
+    assert len(columns.odometry.stamp_ns) > 90
+    assert np.isin(columns.odometry.stamp_ns[1:], columns.path_ns).all()
 
 
 def test_of_odometry_at_a_high_rate_a_part_is_collected():
