@@ -19,6 +19,7 @@ _FASTEST_RAD_S, _LEAST_S = 12.0, 0.02  # of steps that are shorter, noise would 
 _STEP_M, _STEP_RAD, _TIMES = 0.1, 0.1, 5.0
 _CORRECTED = 3
 _LIMIT, _LEAST_LIMIT_M_S = 2.5, 0.5  # of the speed above which odometry jumps: times the fastest, and at least
+_IRREGULAR = 2.5  # spread of the times between messages, in medians; 3.2 where they come at random
 _AT_ZERO, _AWAY_M = 1e-9, 0.5
 _STILL_M, _STILL_RAD = 0.5, 1.0
 _NO_TURN_RAD, _BENDS = 1e-6, 0.05
@@ -103,8 +104,8 @@ def steps_of(o: OdometryColumns) -> Steps | None:
 def of_one_publisher(c: Columns) -> Columns:
     """Return these columns without the odometry that other publishers on its topic have sent.
 
-    It was refused because it does not continue the odometry in use, and is by itself the motion of a robot. What is
-    not is an outlier, or of the wrong unit, and stays.
+    It was refused because it does not continue the odometry in use, and is by itself the motion of a robot that is
+    measured again and again. What is not is an outlier, or of the wrong unit, and stays.
     """
     o = c.odometry
     if c.counters[o.input, "other_publisher"] < LEAST:
@@ -112,6 +113,9 @@ def of_one_publisher(c: Columns) -> Columns:
     is_used = np.isin(o.stamp_ns, c.path_ns)
     others = steps_of(o.some(~is_used))
     if others is None or others.fastest_m_s > _FASTEST_M_S or others.fastest_turn_rad_s > _FASTEST_RAD_S:
+        return c
+    early_s, usual_s, late_s = np.percentile(others.dt, [10.0, 50.0, 90.0])
+    if late_s - early_s > _IRREGULAR * usual_s:
         return c
     return replace(c, odometry=o.some(is_used))
 
