@@ -87,6 +87,10 @@ KINDS: dict[str, Kind] = {
     "jitter": Kind("the times between stamps vary a lot", "stamp messages when they are measured, not on arrival"),
     # -- frames
     "frame_unlinked": Kind("no transform links a sensor's frame to the robot", _MOUNT),
+    "transform_gaps": Kind(
+        "a moving sensor's transform on /tf comes too rarely, too late, or not all the time",
+        "publish it at 10 Hz or more, from the start to the end; where it comes late, set inputs.tf_wait_s",
+    ),
     "two_parents": Kind("a frame has two parents, so transforms through it are arbitrary", _PUBLISHER),
     "static_changes": Kind("a static transform is published twice, with different values", _PUBLISHER),
     "seen_in_fixed_frame": Kind(

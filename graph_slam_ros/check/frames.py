@@ -1,10 +1,10 @@
 """Checks of the frames of a recording: which are linked to the robot, and by how many publishers."""
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Sequence
 
 import numpy as np
 
-from graph_slam_ros.check.columns import Columns
+from graph_slam_ros.check.columns import Columns, Link
 from graph_slam_ros.check.finding import Finding, Severity, Where
 from graph_slam_ros.check.sightings import SightingColumns
 from graph_slam_ros.formats.parameters import assignment
@@ -90,23 +90,49 @@ def _unlinked(c: Columns, known: set[str]) -> Iterator[Finding]:
         times = sum(counts.get(reason, 0) for reason in _UNKNOWN)
         if topic is None or not times or topic.name in known:
             continue
-        names = ", ".join(list(topic.frames)[:4])
-        key, value = f"{source}.mount", assumed_mount(names)
-        if "odom_frame_unknown" in counts:
-            named = next(iter(topic.frames), "odom")
-            frames = c.config.frames
-            key, value = ("frames.odom", named) if named != frames.map else (f"{source}.frame", frames.odom)
+        code, frames, base = "frame_unlinked", tuple(topic.frames), c.config.frames.base
+        linked = [frame for frame in frames if frame and _root(frame, c.links) == _root(base, c.links)]
+        if "frame_unknown" not in counts:  # but that of odometry, or of a map
+            linked = []
+        lost = ", ".join([frame for frame in frames if frame not in linked][:4])
+        others = ", ".join(linked[:4])
+        text = f"{topic.name}: {times} measurements are refused: no transform links frame {lost} to {base}"
+        settings = _place(c, source, frames, lost, "odom_frame_unknown" in counts)
+        if linked and lost:  # at a mount, what another robot sees would be seen by this one
+            text += f"; the others are of {others}: is it another robot's frame, or a sensor without a transform?"
+            settings = ()
+        elif linked:  # a mount is not used for them
+            text = (
+                f"{topic.name}: {times} measurements are refused: /tf links {others} to {base}, but not at their stamps"
+            )
+            code, settings = "transform_gaps", ()
         severity: Severity = "error" if times > 0.5 * max(c.counters.received[source], 1) else "warning"
-        text = f"{topic.name}: {times} messages are refused: no transform links frame {names} to {c.config.frames.base}"
         first_ns = int(topic.stamp_ns[0]) if len(topic.stamp_ns) else 0
-        setting = assignment(key, value)
-        yield Finding("frame_unlinked", severity, times, 0, "messages", text, topic.name, first_ns, times, (setting,))
+        yield Finding(code, severity, times, 0, "measurements", text, topic.name, first_ns, times, settings)
     key = f"{c.odometry.input}.mount"
     if key in c.assumed:
         named = c.odometry.child or "its child frame, which is empty,"
         text = f"{c.odometry.topic}: no transform links {named} to {c.config.frames.base}: one place is assumed"
         setting = assignment(key, c.assumed[key])
         yield Finding("frame_unlinked", "warning", 1, 0, "frames", text, c.odometry.topic, settings=(setting,))
+
+
+def _place(c: Columns, source: str, names: Sequence[str], lost: str, is_odometry: bool) -> tuple[str, ...]:
+    """The setting that gives an input its place: a mount, or where it is the frame of odometry, that."""
+    if not is_odometry:
+        return (assignment(f"{source}.mount", assumed_mount(lost)),)
+    named, frames = next(iter(names), "odom"), c.config.frames
+    return (assignment("frames.odom", named) if named != frames.map else assignment(f"{source}.frame", frames.odom),)
+
+
+def _root(frame: str, links: Collection[Link]) -> str:
+    """The frame that the tree of a frame begins with, whatever the stamps."""
+    above, frame = {link.child: link.parent for link in links}, frame.lstrip("/")
+    seen = {frame}
+    while frame in above and above[frame] not in seen:
+        frame = above[frame]
+        seen.add(frame)
+    return frame
 
 
 def _tf(c: Columns) -> Iterator[Finding]:

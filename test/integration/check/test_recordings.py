@@ -1,6 +1,7 @@
 """``graph_slam check`` on whole recordings: what a person sees, and the mistakes that people make."""
 
 import json
+from itertools import count
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from recordings import TOPICS, read, short_drive, to_ros1, write_mcap
 
 from graph_slam_ros.cli import main
 from graph_slam_ros.messages.from_msg import decoder
-from graph_slam_ros.messages.to_msg import encode
+from graph_slam_ros.messages.to_msg import encode, transform
 from graph_slam_ros.recordings.bag import BagWriter, open_bag
 from graph_slam_ros.runs import check as runs_check
 
@@ -78,6 +79,52 @@ def test_a_frame_that_nothing_links_is_an_error_until_its_mount_is_set(drive, ch
     assert (code, found["frame_unlinked"]["severity"]) == (4, "error")
     code, found, _ = check(bag, *(w for text in found["frame_unlinked"]["settings"] for w in ("--set", text)))
     assert (code, found) == (0, {})
+
+
+def in_frame(m, frame):
+    """Give landmarks this frame."""
+    for one in (m, *m.detections):
+        one.header.frame_id = frame
+
+
+def on_a_joint(source, target, every_s):
+    """Write a drive again, whose sensor is on a joint that /tf has once in that time."""
+    bag, due_ns = open_bag(source), 0
+    with BagWriter(target) as out:
+        for m in bag.messages(set(bag.topics)):
+            message = decoder(bag.topics[m.topic].type)(m.cdr)
+            if m.topic == "/odom" and m.log_ns >= due_ns:
+                due_ns = m.log_ns + round(every_s * 1e9)
+                joint = transform(m.log_ns, "base_link", "joint", (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0))
+                out.write("/tf", "tf2_msgs/msg/TFMessage", m.log_ns, joint)
+            if m.topic == "/landmarks":
+                in_frame(message, "joint")
+            out.write(m.topic, bag.topics[m.topic].type, m.log_ns, encode(message))
+    return target
+
+
+def test_a_transform_that_comes_too_rarely_is_not_called_missing(drive, check, tmp_path):
+    assert check(on_a_joint(drive, tmp_path / "often.mcap", 0.1))[:2] == (0, {})
+    rarely = on_a_joint(drive, tmp_path / "rarely.mcap", 1.5)
+    code, found, _ = check(rarely)
+    assert (code, found.keys()) == (4, {"transform_gaps"})
+    assert (found["transform_gaps"]["severity"], found["transform_gaps"]["settings"]) == ("error", [])
+    assert "/tf links joint to base_link, but not at their stamps" in found["transform_gaps"]["text"]
+    _, waited, _ = check(rarely, "--set", "inputs.tf_wait_s=2")
+    assert waited.get("transform_gaps", {"value": 0})["value"] < 0.1 * found["transform_gaps"]["value"]
+
+
+def test_what_another_robot_sees_gets_no_place_on_this_one(drive, check, tmp_path):
+    seen = count()
+
+    def change(topic, m):
+        if topic == "/landmarks" and next(seen) % 2:
+            in_frame(m, "robot2/base_link")
+        return m
+
+    code, found, _ = check(copy(drive, tmp_path / "two.mcap", change))
+    assert (code, found["frame_unlinked"]["settings"]) == (4, [])
+    assert "links frame robot2/base_link to base_link; the others are of base_link" in found["frame_unlinked"]["text"]
 
 
 def turned_in_degrees(topic, m):
