@@ -26,6 +26,7 @@ _NO_TURN_RAD, _BENDS = 1e-6, 0.05
 _SIDEWAYS = 0.2  # of the speed ahead: a robot with wheels that cannot has no such twist
 _WINDOW_S, _LONGEST_S = 1.0, 3.0
 _SCALE, _EXPLAINED, _UNEXPLAINED = 0.1, 0.5, 0.7
+_AT_REST = 0.05  # of the root mean square
 _LATERAL, _FITS, _WORSE_M = 0.1, 0.3, 0.02
 _TINY, _USELESS, _UNUSED_M_S, _SLOWEST_M_S, _TINY_RAD_S = 1e-3, 3.0, 1e3, 0.05, 1e-4
 _OFF_PLANE, _LEVEL_M = 0.05, 0.5
@@ -280,10 +281,15 @@ def _in_odom(o: OdometryColumns, steps: Steps, sums: Callable[[Array], Array], m
 
 
 def ratio(x: Array, y: Array) -> tuple[float, float]:
-    """Robust factor from x to y (both (n, 3)), and the part of y that it leaves unexplained."""
+    """Robust factor from x to y (both (n, 3)), and the part of y that it leaves unexplained.
+
+    Rows in which both are next to zero are left out: a robot that stands for half of the time has medians of zero.
+    """
     size = np.linalg.norm(y, axis=1)
     if np.abs(x).sum() < 1e-9 or not size.any():
         return np.nan, 1.0
+    moves = np.any([row > _AT_REST * np.sqrt((row**2).mean()) for row in (size, np.linalg.norm(x, axis=1))], axis=0)
+    x, y, size = x[moves], y[moves], size[moves]
     weight, factor = np.ones(len(x)), 1.0
     for _ in range(15):
         factor = float((weight[:, None] * x * y).sum() / max(float((weight[:, None] * x * x).sum()), 1e-15))

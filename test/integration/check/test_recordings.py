@@ -127,6 +127,22 @@ def test_what_another_robot_sees_gets_no_place_on_this_one(drive, check, tmp_pat
     assert "links frame robot2/base_link to base_link; the others are of base_link" in found["frame_unlinked"]["text"]
 
 
+def test_a_twist_is_compared_where_the_robot_moves_though_it_stands_most_of_the_time(drive, check, tmp_path):
+    bag, last = open_bag(drive), None
+    standing = tmp_path / "standing.mcap"
+    with BagWriter(standing) as out:
+        for m in bag.messages(set(bag.topics)):
+            out.write(m.topic, bag.topics[m.topic].type, m.log_ns, m.cdr)
+            last = m if m.topic == "/odom" else last
+        message = decoder(bag.topics["/odom"].type)(last.cdr)
+        message.twist.twist.linear.x = message.twist.twist.linear.y = 0.005
+        for k in range(1, 1500):
+            stamp_ns = last.log_ns + k * 100_000_000
+            message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 1_000_000_000)
+            out.write("/odom", bag.topics["/odom"].type, stamp_ns, encode(message))
+    assert "twist_unrelated" not in check(standing)[1]
+
+
 def turned_in_degrees(topic, m):
     if topic == "/odom":
         q = m.pose.pose.orientation
