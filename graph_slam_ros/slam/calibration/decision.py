@@ -14,12 +14,14 @@ is refused, unless the association of these landmarks, which leaves it open, has
 is asked for by name, or the map was there before.
 
 A yaw (in space a pitch, too) is measured against the direction in which odometry moves. So it is refused for a robot
-that is configured to slide across that direction.
+that is configured to slide across that direction, and for one that only turned on the spot: there the errors of other
+parameters make a direction.
 """
 
 import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -35,6 +37,7 @@ MOST_LOST = 0.2
 LEAST_LANDMARKS = 3
 MOST_SLIDING = 0.3  # of odometry's noise ahead: with more sideways, a turned sensor and a robot that slides are one
 LEAST_SIGMA_PER_M = 1e-3  # of odometry: the noise of its position [m] for each metre
+_OF_MOTION = {"yaw": 0, "pitch": 1}  # angles that are measured against the motion, and the direction across it
 FOLLOWED = 0.1  # of a sigma: what is left of a correction that is used is followed from there on
 
 Verdict = Literal["admitted", "nothing_to_correct", "not_determined", "not_reproducible", "not_separable", "refused"]
@@ -70,7 +73,7 @@ def decide(
     *,
     slides: tuple[float, float] = (0.0, 0.0),
     drifts: bool = False,
-    sigma_per_m: float = float("inf"),
+    sigma_per_m: float = 1.0,
     by_association: Mapping[str, tuple[float, float]] | None = None,
 ) -> list[Finding]:
     """Answer the four questions for each parameter of a trial fit.
@@ -81,7 +84,7 @@ def decide(
     corrected : parameters that were let in before: what is left of them is followed
     slides : configured noise of odometry sideways and upwards, relative to that ahead
     drifts : whether parameters may change on the way
-    sigma_per_m : of odometry's position for each metre, as stated; in the middle of all steps
+    sigma_per_m : of odometry's position for each metre, as stated, in the middle of all steps; infinite if none moves
     by_association : odometry's factors less 1 with sigmas, as far as the association of landmarks without identities
         found them; None where landmarks have identities
     """
@@ -89,8 +92,9 @@ def decide(
         _void(found, landmarks, sigma_per_m),
         "raise calibrate.drift, or " * drifts + "correct the configuration first",
     )
+    moves, unnamed = math.isfinite(sigma_per_m), partial(_unnamed, found, by_association)
     return [
-        _finding(found, k, void, remedy, _slides(one, slides) or _unnamed(found, k, by_association), one in corrected)
+        _finding(found, k, void or _stands(one, moves), remedy, _slides(one, slides) or unnamed(k), one in corrected)
         for k, one in enumerate(found.parameters)
     ]
 
@@ -192,9 +196,16 @@ def _verdict(found: TrialFit, k: int, void: str, remedy: str, slides: str, is_co
     return "admitted", shown
 
 
+def _stands(parameter: Parameter, moves: bool) -> str:
+    """Return why an angle is not measured where odometry only turns; empty if it is."""
+    if moves or parameter.name not in _OF_MOTION:
+        return ""
+    return f"odometry does not move: {parameter.quantity.manoeuvre}"
+
+
 def _slides(parameter: Parameter, slides: tuple[float, float]) -> str:
     """Return why an angle cannot be told from a slide across the direction of motion; empty if it can."""
-    axis = {"yaw": 0, "pitch": 1}.get(parameter.name)
+    axis = _OF_MOTION.get(parameter.name)
     if axis is None or slides[axis] <= MOST_SLIDING:
         return ""
     across, density = ("sideways", "lateral") if axis == 0 else ("upwards", "vertical")
@@ -205,7 +216,7 @@ def _slides(parameter: Parameter, slides: tuple[float, float]) -> str:
     )
 
 
-def _unnamed(found: TrialFit, k: int, by_association: Mapping[str, tuple[float, float]] | None) -> str:
+def _unnamed(found: TrialFit, by_association: Mapping[str, tuple[float, float]] | None, k: int) -> str:
     """Return why a factor of odometry is not believed of landmarks without identities; empty if it may be."""
     parameter = found.parameters[k]
     if by_association is None or parameter.name not in OF_ODOMETRY:

@@ -76,6 +76,16 @@ def test_nothing_is_let_in_where_odometry_states_less_noise_than_any_wheels_have
     assert decide(fitted(0.3, 0.025), 10, sigma_per_m=2e-3)[0].verdict == "admitted"
 
 
+def test_a_yaw_is_not_measured_by_a_robot_that_only_turns():
+    """By what a wrong track width does to its place, it seemed to be off by 10 degrees, at four sigmas."""
+    yaw = replace(fitted(-0.17, 0.038), parameters=(Parameter("detections", "yaw"),))
+    (one,) = decide(yaw, 10, sigma_per_m=float("inf"))
+    assert one.verdict == "refused"
+    assert "odometry does not move: drive " in one.text
+    assert decide(yaw, 10)[0].verdict != "refused"
+    assert decide(fitted(0.3, 0.025), 10, sigma_per_m=float("inf"))[0].verdict == "admitted", "a clock"
+
+
 def test_factors_are_refused_where_odometry_told_the_landmarks_apart():
     distance = Parameter("odom", "distance")
     found = replace(fitted(-0.11, 0.01), parameters=(distance,))
