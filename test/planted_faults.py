@@ -195,6 +195,7 @@ FAULTS = {
     "odometry corrected every 20 s": (of("corrected"), "corrected"),
     "odometry in frame map": (of("wrong_frames:odometry=map,landmarks=kept"), "odometry_in_map"),
     "all ids new each 15 s": (of("new_ids"), "no_closure"),
+    "all ids new after 60 s": (of("new_ids:seconds=60"), "ids_renewed no_closure"),
     "nothing seen after a quarter": (of("blind"), "silent"),
     "NaN in odometry": (of("not_a_number"), "nonfinite"),
     "a tenth of the drive": (of("brief"), "not_observable"),

@@ -199,6 +199,10 @@ KINDS: dict[str, Kind] = {
         "many ids are seen at more than one place", "correct the detector, or set landmarks.association=joint"
     ),
     "ids_exchanged": Kind("two landmarks exchange their ids", _ID),
+    "ids_renewed": Kind(
+        "the ids of all landmarks are new from some time on",
+        "let the detector keep its ids when it begins anew; without ids set landmarks.association=joint",
+    ),
     "landmark_moved": Kind("a landmark was moved during the drive", "use landmarks that nobody moves"),
     "map_breaks": Kind(
         "many landmarks are elsewhere after some time, so the robot's path has a break there",

@@ -13,6 +13,7 @@ from graph_slam_ros.check.located import moved
 from graph_slam_ros.check.noise import noisier
 from graph_slam_ros.check.outliers import check_outliers
 from graph_slam_ros.check.pairs import pairs_of, path_of, poses_at
+from graph_slam_ros.check.renewed_ids import check_renewed
 from graph_slam_ros.check.slips import check_slips
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.parameters import assignment
@@ -284,6 +285,7 @@ def _places(c: Columns, slam: GraphSlam, path_ns: Index, path: Array, late_s: Ma
         shift = shift[np.isfinite(shift)]  # ranges and bearings alone have no point
         shift_m = float(np.quantile(shift, _MOST)) if len(shift) else 0.0
         found += check_identities(s, [one for one in two if one.apart_m > _SHIFTS * shift_m])
+        found += check_renewed(s, points, path_ns, c.config.world.dimensions)
         elsewhere = {one.name for one in two}
         found += check_outliers(s, points, inside, c.config, elsewhere)
     return found
