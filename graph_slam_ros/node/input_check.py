@@ -110,7 +110,7 @@ class InputCheck:
         """
         begun = time.monotonic()
         try:
-            found = [m for m in worst_while_driving(columns) if m.code != "slow_odometry" or not is_thinned]
+            found = [one for one in worst_while_driving(columns) if one.code != "slow_odometry" or not is_thinned]
             if sure := [one for one in found if one.count >= _FEW.get(one.code, _LEAST)]:
                 self.findings = tuple(map(_text, sure))
             elif found:
