@@ -87,10 +87,6 @@ KINDS: dict[str, Kind] = {
     "jitter": Kind("the times between stamps vary a lot", "stamp messages when they are measured, not on arrival"),
     # -- frames
     "frame_unlinked": Kind("no transform links a sensor's frame to the robot", _MOUNT),
-    "transform_gaps": Kind(
-        "a moving sensor's transform on /tf comes too rarely, too late, or not all the time",
-        "publish it at 10 Hz or more, from the start to the end; where it comes late, set inputs.tf_wait_s",
-    ),
     "two_parents": Kind("a frame has two parents, so transforms through it are arbitrary", _PUBLISHER),
     "static_changes": Kind("a static transform is published twice, with different values", _PUBLISHER),
     "seen_in_fixed_frame": Kind(
@@ -251,9 +247,11 @@ class Finding:
 
     @property
     def forbids_replay(self) -> bool:
-        """Return whether a replay is of no use until the cause is corrected: no setting mends it."""
-        is_refusal = self.code not in KINDS
-        return self.severity == "error" and not self.settings and (self.ends or is_refusal)
+        """Return whether a replay is of no use until the cause is corrected: no setting mends it.
+
+        Of a damaged recording, what can be read is of use.
+        """
+        return self.severity == "error" and not self.settings and self.code != "damaged"
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values; a number that JSON has not is null."""

@@ -90,7 +90,7 @@ def _unlinked(c: Columns, known: set[str]) -> Iterator[Finding]:
         times = sum(counts.get(reason, 0) for reason in _UNKNOWN)
         if topic is None or not times or topic.name in known:
             continue
-        code, frames, base = "frame_unlinked", tuple(topic.frames), c.config.frames.base
+        frames, base = tuple(topic.frames), c.config.frames.base
         linked = [frame for frame in frames if frame and _root(frame, c.links) == _root(base, c.links)]
         if "frame_unknown" not in counts:  # but that of odometry, or of a map
             linked = []
@@ -102,13 +102,11 @@ def _unlinked(c: Columns, known: set[str]) -> Iterator[Finding]:
             text += f"; the others are of {others}: is it another robot's frame, or a sensor without a transform?"
             settings = ()
         elif linked:  # a mount is not used for them
-            text = (
-                f"{topic.name}: {times} measurements are refused: /tf links {others} to {base}, but not at their stamps"
-            )
-            code, settings = "transform_gaps", ()
+            text = f"{topic.name}: {times} measurements are refused: they come before /tf links {others} to {base}"
+            settings = ()
         severity: Severity = "error" if times > 0.5 * max(c.counters.received[source], 1) else "warning"
         first_ns = int(topic.stamp_ns[0]) if len(topic.stamp_ns) else 0
-        yield Finding(code, severity, times, 0, "measurements", text, topic.name, first_ns, times, settings)
+        yield Finding("frame_unlinked", severity, times, 0, "measurements", text, topic.name, first_ns, times, settings)
     key = f"{c.odometry.input}.mount"
     if key in c.assumed:
         named = c.odometry.child or "its child frame, which is empty,"

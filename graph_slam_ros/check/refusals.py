@@ -22,6 +22,7 @@ _USUAL = {  # of single messages: detectors err, and a recording begins and ends
         "no_result",
     ),
     *("other_publisher", "future", "far_in_time", "id_conflict", "poor_tag", "duplicate_stamp", "undecodable"),
+    "transform_gaps",
 }
 _USUAL_SHARE = 0.05
 ELSEWHERE = {  # those that a check of its own explains better

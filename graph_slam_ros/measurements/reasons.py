@@ -90,6 +90,11 @@ REASONS: dict[str, Reason] = {
     "frame_empty": Reason(_REFUSED, "the message names no frame", "INPUT.frame, or INPUT.mount"),
     "frame_in_itself": Reason(_REFUSED, "a frame is its own parent", "correct the driver's frame names"),
     "frame_unknown": Reason(_REFUSED, "no transform links the message's frame to the robot", _FRAMES),
+    "transform_gaps": Reason(
+        _REFUSED,
+        "/tf links the message's frame to the robot, but not at its stamp",
+        "publish the moving transform at 10 Hz or more, all the time; inputs.tf_wait_s where it comes late",
+    ),
     "odom_frame_unknown": Reason(
         _REFUSED,
         "no transform links the odometry's frame to frames.odom",

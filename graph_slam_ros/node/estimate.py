@@ -13,6 +13,7 @@ from graph_slam_ros.runs.outcome import (
     association_faults,
     condensed_text,
     contradicts,
+    renewed_text,
     visit_faults,
 )
 from graph_slam_ros.runs.tables import accepted_lately, condensed_part
@@ -101,7 +102,8 @@ class Estimate:
     unseen : the way since a landmark was seen
     weakest_landmark : the landmark that is known least, with its weakest direction; empty where none is known
     fit : chi2 per degree of freedom; NaN before it was looked at
-    doubted : inputs of which most measurements are not believed lately, and why that may be; empty where none is
+    doubted : inputs of which most measurements are not believed lately, and why that may be, and ids that are all new
+        from some time on; empty where nothing is doubted
     ambiguity : other explanations of the same measurements that could not be ruled out; empty where there is none
     displaced : that the landmarks say that the robot is elsewhere than odometry; empty where they do not
     association : why the association of sightings without identity is not to be believed; empty if it is
@@ -210,9 +212,10 @@ class Estimate:
 
 
 def doubted_lately(slam: GraphSlam) -> str:
-    """Say of which inputs most measurements are not believed lately, and why that may be; empty where of none."""
+    """Say of which inputs most measurements are not believed lately, and of ids that are new; empty where of none."""
     lately = ((name, *of) for name, of in accepted_lately(slam).items() if of[1] >= _FEWEST_JUDGED)
-    return "; ".join(filter(None, (contradicts(*of) for of in lately)))
+    renewed = [renewed_text(str(one))] if (one := slam.renewed_ids()) else []
+    return "; ".join(filter(None, (*(contradicts(*of) for of in lately), *renewed)))
 
 
 def _settings(one: Uncorrected) -> list[str]:

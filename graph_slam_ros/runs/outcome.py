@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
+from graph_slam_ros.check.finding import KINDS
 from graph_slam_ros.measurements.reasons import Effect, Reason, explain, remedy
 from graph_slam_ros.runs.tables import INPUT_COLUMNS
 from graph_slam_ros.slam.frontend.gyro import GyroState
@@ -292,6 +293,8 @@ def doubts(summary: Summary) -> Iterator[str]:
     for text in ambiguities(summary.get("rivals", ())):
         yield f"{text} (graph_slam explain RUN)"
     yield from _uncorrected(summary)
+    if renewed := summary.get("renewed_ids"):
+        yield renewed_text(renewed)
     yield from visit_faults(summary["counters"].get("map", {}))
     for name, count in Counter(name.partition("#")[0] for name in summary.get("inputs", {})).items():
         if count > 1:
@@ -317,6 +320,11 @@ def _uncorrected(summary: Summary) -> Iterator[str]:
     for one in summary.get("uncorrected", ()):
         mend = " ".join(f"--set {shlex.quote(f'{key}={value}')}" for key, value in one["settings"].items())
         yield f"{one['text']}{mend and ': '}{mend} (graph_slam check BAG compares the causes)"
+
+
+def renewed_text(found: str) -> str:
+    """Return that all ids are new from some time on, and what mends it."""
+    return f"ids_renewed: {found} {KINDS['ids_renewed'].mend}"
 
 
 def condensed_text(summary: Mapping[str, Any]) -> str:

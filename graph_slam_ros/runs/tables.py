@@ -66,6 +66,8 @@ def fitted_summary(slam: GraphSlam) -> dict[str, Any]:
         return out | {"noise_unknown": "nothing is solved"}
     if off := slam.uncorrected():
         out["uncorrected"] = [one.as_dict() for one in off]
+    if renewed := slam.renewed_ids():
+        out["renewed_ids"] = str(renewed)
     if contradicted := slam.contradicted:
         out["contradicted"] = contradicted
     try:

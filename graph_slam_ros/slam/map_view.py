@@ -26,6 +26,7 @@ from graph_slam_ros.slam.kidnap_detector import KidnapDetector
 from graph_slam_ros.slam.landmarks.landmark import Landmark
 from graph_slam_ros.slam.landmarks.landmark_frontend import LandmarkFrontend
 from graph_slam_ros.slam.landmarks.lifetimes import LandmarkEvent
+from graph_slam_ros.slam.landmarks.renewed_ids import LEAST, RenewedIds, renewed_ids
 from graph_slam_ros.slam.noise_scale import NoiseScale
 from graph_slam_ros.slam.path_view import PathView
 from graph_slam_ros.slam.robust.ledger import Ledger
@@ -193,6 +194,14 @@ class MapView(PathView):
     def association_report(self) -> dict[str, Any]:
         """The report on the last explanation of all sightings without identity; empty if there was none."""
         return self._landmarks.anonymous.hindsight.report
+
+    def renewed_ids(self) -> RenewedIds | None:
+        """Return which ids are new from some time on though landmarks are not, as after a detector began anew."""
+        named = [one for one in self.landmarks.values() if not one.is_unnamed and one.sightings >= LEAST]
+        if len(named) < 2 * LEAST or not self.is_solved:
+            return None
+        at = self._landmarks.map.positions([one.vertex for one in named])
+        return renewed_ids(at, *np.array([(one.first_seen_ns, one.last_seen_ns) for one in named]).T)
 
     @property
     def calibration(self) -> dict[tuple[str, str], float]:

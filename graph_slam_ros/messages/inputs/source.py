@@ -125,11 +125,12 @@ class InputContext:
             return found
         if self._mount is not None and not self.transforms.knows(frame):
             return self._mounted(self._mount)
-        if not self._may_come(stamp_ns):
-            if self._mount is not None and not self.transforms.are_linked(self.config.frames.base, frame):
-                return self._mounted(self._mount)
-            raise self._not_linked("frame_unknown", frame, self.config.frames.base)
-        raise NotYet(self.transforms.are_linked(self.config.frames.base, frame))
+        are_linked = self.transforms.are_linked(self.config.frames.base, frame)
+        if self._may_come(stamp_ns):
+            raise NotYet(are_linked)
+        if self._mount is not None and not are_linked:
+            return self._mounted(self._mount)
+        raise self._not_linked("transform_gaps" if are_linked else "frame_unknown", frame, self.config.frames.base)
 
     def _mounted(self, mount: se3.Pose) -> se3.Pose:
         """Return the configured mount. It is counted where it puts a sensor of landmarks at the base, as if assumed."""
@@ -148,9 +149,10 @@ class InputContext:
         found = self.transforms.lookup(sensor, seen, stamp_ns)
         if found is not None:
             return found
+        are_linked = self.transforms.are_linked(sensor, seen)
         if self._may_come(stamp_ns):
-            raise NotYet(self.transforms.are_linked(sensor, seen))
-        raise self._not_linked("frame_unknown", seen, sensor)
+            raise NotYet(are_linked)
+        raise self._not_linked("transform_gaps" if are_linked else "frame_unknown", seen, sensor)
 
     def mount_position(self, name: str, stamp_ns: int) -> tuple[float, float, float]:
         """The position of a message's sensor on the robot; the base, which is counted, if its frame is unknown.

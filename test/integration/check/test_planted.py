@@ -328,7 +328,7 @@ def test_of_a_part_only_is_said_what_the_rest_does_not_make_right(drive, tmp_pat
 
 def test_each_finding_is_planted():
     elsewhere = {"gyro_scale", "gyro_bias", "gyro_unrelated", "gyro_unchecked"}  # test_gyro_findings.py
-    elsewhere |= {"range_scale", "fit_unsure", "transform_gaps", ROUGH}  # test_recordings.py, and above
+    elsewhere |= {"range_scale", "fit_unsure", ROUGH}  # test_recordings.py, and above
     elsewhere |= {"constant_stamps"}  # test_input_check.py
     tested = {code for _, codes, _ in PLANTED.values() for code in codes}
     assert KINDS.keys() - {code for _, codes in FAULTS.values() for code in codes.split()} - tested == elsewhere
@@ -400,7 +400,7 @@ def test_ids_that_are_new_after_a_while_are_found_where_landmarks_come_back_befo
     assert by["no_closure"].value < by["no_closure"].limit
 
 
-def test_a_detector_that_begins_anew_half_way_is_found_where_each_half_has_loops_of_its_own(laps, tmp_path):
+def test_a_detector_that_begins_anew_half_way_is_found_where_each_half_has_loops_of_its_own(laps, tmp_path, capsys):
     end_ns = [m.stamp_ns for m in Drive(laps).landmarks]
     half_s = 0.5 * (end_ns[-1] - end_ns[0]) * 1e-9
     faulty = Drive(laps)
@@ -408,3 +408,9 @@ def test_a_detector_that_begins_anew_half_way_is_found_where_each_half_has_loops
     faulty.write(tmp_path / "new.mcap")
     (found,) = [one for one in check(tmp_path / "new.mcap").findings if one.code == "ids_renewed"]
     assert found.count / 2 <= found.value <= found.count
+    assert main(["replay", str(tmp_path / "new.mcap"), "--out", str(tmp_path / "run")]) == 0
+    said = " ".join(capsys.readouterr().err.split())
+    assert f"ids_renewed: from {found.first_ns * 1e-9:.3f} s on all ids are new" in said
+    assert "let the detector keep its ids when it begins anew" in said
+    assert main(["replay", str(laps), "--out", str(tmp_path / "clean")]) == 0
+    assert "ids_renewed" not in capsys.readouterr().err

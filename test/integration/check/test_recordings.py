@@ -109,7 +109,7 @@ def test_a_transform_that_comes_too_rarely_is_not_called_missing(drive, check, t
     code, found, _ = check(rarely)
     assert (code, found.keys()) == (4, {"transform_gaps"})
     assert (found["transform_gaps"]["severity"], found["transform_gaps"]["settings"]) == ("error", [])
-    assert "/tf links joint to base_link, but not at their stamps" in found["transform_gaps"]["text"]
+    assert "/tf links the message's frame to the robot, but not at its stamp" in found["transform_gaps"]["text"]
     _, waited, _ = check(rarely, "--set", "inputs.tf_wait_s=2")
     assert waited.get("transform_gaps", {"value": 0})["value"] < 0.1 * found["transform_gaps"]["value"]
 

@@ -518,14 +518,14 @@ def test_what_tf_never_tells_of_is_refused_when_odometry_has_moved_on_or_ends():
     b = border(**MOVING)
     b.convert("tf", turret(-0.1, 0.0))
     assert heard(b, "detections", seen_by_turret()) is None
-    for at_s, refused in ((0.2, {}), (0.21, {"detections": {"frame_unknown": 1}})):
+    for at_s, refused in ((0.2, {}), (0.21, {"detections": {"transform_gaps": 1}})):
         assert isinstance(heard(b, "odom", odometry(stamp_ns=STAMP_NS + round(at_s * 1e9))), Odometry)
         assert counted(b) == refused
     assert heard(b, "detections", seen_by_turret(-5.0)) is None, "older than all that is known: refused at once"
-    assert counted(b) == {"detections": {"frame_unknown": 2}}
+    assert counted(b) == {"detections": {"transform_gaps": 2}}
     assert heard(b, "detections", seen_by_turret(0.5)) is None
     assert b.finish() == []
-    assert counted(b) == {"detections": {"frame_unknown": 3}}
+    assert counted(b) == {"detections": {"transform_gaps": 3}}
 
 
 def test_of_what_waits_for_tf_only_so_much_is_kept():

@@ -480,6 +480,25 @@ def test_where_an_input_is_wrong_from_the_beginning_it_is_the_reason_and_not_wha
     assert reasons == ("odom leaves the plane: these are three dimensions: world.dimensions=3", "3 of 9 visits")
 
 
+@pytest.mark.parametrize("names", ["a{}", "b{}"], ids=["the same ids", "new ids"])
+def test_a_detector_that_begins_anew_is_named(names):
+    def seen(at, k):
+        return tuple(map(float, se2.act(se2.inverse(drive(2, k).T_odom_base), at)))
+
+    robot, trees = round_a_curve(2, 0.4), [(4.0 * k, 3.0 + k % 2) for k in range(6)]
+    for k in range(20, 60):
+        robot.ingest([drive(2, k)])
+        some = tuple(
+            Sighting(("a{}" if k < 40 else names).format(j), "position", seen(at, k), (1e-4, 0.0, 0.0, 1e-4))
+            for j, at in enumerate(trees)
+        )
+        robot.ingest([Sightings(drive(2, k).stamp_ns, "tags", some)])
+    robot.evaluate()
+    reasons = judge(Facts("active", (), robot.estimate), Config()).reasons
+    said = "all ids are new, and 6 of 6 landmarks lie where others were"
+    assert [said in one for one in reasons if one.startswith("ids_renewed: ")] == [True] * (names == "b{}")
+
+
 def test_an_input_of_which_most_is_not_accepted_lately_is_named():
     robot = round_a_curve(2, 0.4)
     for k in range(20, 60):
