@@ -25,6 +25,7 @@ _STILL_M, _STILL_RAD = 0.5, 1.0
 _NO_TURN_RAD, _BENDS = 1e-6, 0.05
 _SIDEWAYS = 0.2  # of the speed ahead: a robot with wheels that cannot has no such twist
 _WINDOW_S, _LONGEST_S = 1.0, 3.0
+_LEAST_WIDTH = 4  # messages in a window: between fewer, the speed may be any
 _SCALE, _EXPLAINED, _UNEXPLAINED = 0.1, 0.5, 0.7
 _AT_REST = 0.05  # of the root mean square
 _LATERAL, _FITS, _WORSE_M = 0.1, 0.3, 0.02
@@ -245,7 +246,7 @@ def _twist(o: OdometryColumns, steps: Steps, jumps: Mask, where: Where) -> Itera
             unit = next((why for k, why in _UNITS.items() if abs(factor / k - 1.0) < _SCALE), "another scale")
             text = f"{o.topic}: the pose moves {factor:.3g} times as far as the {what} of the twist says ({unit})"
             yield Finding("twist_scale", "warning", factor, _SCALE, "times", text, settings=_DENSITY, **where)
-        elif left > _UNEXPLAINED and total > 5.0:
+        elif left > _UNEXPLAINED and total > 5.0 and width >= _LEAST_WIDTH:
             text = f"{o.topic}: the {what} of the twist does not explain {left:.0%} of the motion of the pose"
             yield Finding("twist_unrelated", "warning", left, _UNEXPLAINED, "part", text, settings=_DENSITY, **where)
 

@@ -38,6 +38,7 @@ _COARSE = {
 _SIGMAS = 4.0
 _TURN_SIGMAS = 6.0  # a wheel's noise that lasts adds up in heading, which neither sigma of a fit knows
 _OF_MOUNT = ("x", "y", "yaw")
+_OF_STEP = 0.25  # of the time between two poses of odometry
 _ABSURD, _BACKWARDS, _SURE = 0.5, 0.35, 0.05
 _DEGREE = np.pi / 180.0
 # By parameter: unit, limit, and from which sigma on it is not observable.
@@ -130,7 +131,9 @@ def check_trial(c: Columns, slam: GraphSlam) -> Iterator[Finding]:
     is_void = fit.lost > MOST_LOST or absurd_range(fit) is not None
     late_s = {} if is_void else {one.parameter.source: one.value for one in clocks}
     found = [] if _goes_back(c) else _places(c, slam, path_ns, path, late_s)
-    off = {one.parameter: one.value for one in fitted if one.parameter.name in _LIMITS and _is_far_off(fit, one)}
+    step_s = float(np.median(np.diff(path_ns))) * 1e-9
+    known = [one for one in fitted if one.parameter.name in _LIMITS]
+    off = {one.parameter: one.value for one in known if _is_far_off(fit, one, step_s)}
     if found and any(one.name in _OF_MOUNT for one in off):
         found = list(_places_of_fit(c, slam, fit, off, path_ns, path))
     if is_void:
@@ -202,9 +205,16 @@ def _over_confident(c: Columns, noise: NoiseScale, factor: float, limit: float) 
     return Finding(code, "note", factor, limit, "times", text, topic, settings=settings)
 
 
-def _is_far_off(fit: TrialFit, one: Fitted) -> bool:
-    """Return whether a parameter is far off by its limit and several sigmas."""
+def _is_far_off(fit: TrialFit, one: Fitted, step_s: float) -> bool:
+    """Return whether a parameter is far off by its limit and several sigmas.
+
+    Parameters
+    ----------
+    step_s : between two poses of odometry; what is interpolated between them is no proof of a clock
+    """
     limit = _LIMITS[one.parameter.name][1]
+    if one.parameter.name == "clock":
+        limit = max(limit, _OF_STEP * step_s)
     sigmas = _TURN_SIGMAS if one.parameter.name == "turn" else _SIGMAS
     return is_off(fit, one) and abs(one.value) > max(limit, sigmas * one.sigma)
 

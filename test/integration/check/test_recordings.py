@@ -6,12 +6,14 @@ from itertools import count
 import numpy as np
 import pytest
 from recordings import TOPICS, read, short_drive, to_ros1, write_mcap
+from reliability import times
 
 from graph_slam_ros.cli import main
 from graph_slam_ros.messages.from_msg import decoder
 from graph_slam_ros.messages.to_msg import encode, transform
 from graph_slam_ros.recordings.bag import BagWriter, open_bag
 from graph_slam_ros.runs import check as runs_check
+from graph_slam_ros.simulation import Fault, simulate, write_faulty_bag
 
 
 @pytest.fixture(scope="module")
@@ -112,6 +114,17 @@ def test_a_transform_that_comes_too_rarely_is_not_called_missing(drive, check, t
     assert "/tf links the message's frame to the robot, but not at its stamp" in found["transform_gaps"]["text"]
     _, waited, _ = check(rarely, "--set", "inputs.tf_wait_s=2")
     assert waited.get("transform_gaps", {"value": 0})["value"] < 0.1 * found["transform_gaps"]["value"]
+
+
+@pytest.mark.parametrize(
+    "fault, code",
+    [(Fault.named("slow_odometry", hz=1.0), "slow_odometry"), (Fault.named("restarted"), "odometry_reset")],
+)
+@pytest.mark.parametrize("seed", times([8], [7, 9]))
+def test_what_comes_of_slow_or_restarted_odometry_is_no_finding_of_its_own(check, tmp_path, seed, fault, code):
+    write_faulty_bag(simulate("warehouse", seed), tmp_path / "a.mcap", [fault], seed=seed)
+    _, found, _ = check(tmp_path / "a.mcap")
+    assert [name for name, one in found.items() if one["severity"] != "note"] == [code]
 
 
 def test_what_another_robot_sees_gets_no_place_on_this_one(drive, check, tmp_path):
