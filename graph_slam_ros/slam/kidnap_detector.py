@@ -359,6 +359,7 @@ class KidnapDetector:
         self._search.begin(found.first)
         self._monitor.begin(found.first)
         self._slips.begin(stamp_ns, found.first)
+        self._anonymous.rejoined(split.first)
         wrong = self.alarms[split.alarm]
         if self.now is not None and self.now != wrong:
             self.alarms[-1] = replace(self.now, ended_ns=stamp_ns, outcome="the displacement before is taken back")

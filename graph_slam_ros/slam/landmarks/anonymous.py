@@ -30,18 +30,15 @@ from graph_slam_ros.slam.landmarks.elsewhere import UnnamedDisplacement
 from graph_slam_ros.slam.landmarks.hindsight import Found, FrozenScans, Hindsight
 from graph_slam_ros.slam.landmarks.known_map import with_map
 from graph_slam_ros.slam.landmarks.landmark_map import Landmarks
-from graph_slam_ros.slam.landmarks.renumbered import first_of_later, with_vertices
+from graph_slam_ros.slam.landmarks.renumbered import first_of_later
+from graph_slam_ros.slam.landmarks.scan_history import ScanHistory
 from graph_slam_ros.slam.landmarks.scans import (
-    NEARBY_NS,
     SCAN_NS,
     DeadReckoning,
     Motion,
-    MotionNoise,
     Scan,
     ScanBuilder,
     Seen,
-    motion_between,
-    rescaled_nearby,
 )
 from graph_slam_ros.slam.landmarks.sighted_point import sighted_point, with_extent
 from graph_slam_ros.solver import Solver
@@ -78,9 +75,9 @@ class AnonymousLandmarks:
         self._config, self._space = c, space
         self._landmarks, self._solver, self._counters = landmarks, solver, counters
         self._hand_over = hand_over
-        self._noise, self._motion_noise = OdometryNoise(config.odometry, space), MotionNoise.of(config.odometry)
-        self._jump = np.diag(np.square(space.sigmas(config.odometry.jump_sigma_m, config.odometry.jump_sigma_rad)))
+        self._noise = OdometryNoise(config.odometry, space)
         self._reckoning = DeadReckoning(space, config.ordering.late_s + 2.0)
+        self._history = ScanHistory(space, config.odometry, self._reckoning)
         extent = max(c.added_sigma_m**2 + c.unnamed_sigma_m**2, LEAST_M2) * np.eye(space.dimensions)
         self._builder = ScanBuilder(space, extent, c.close_m, c.size_sigma_m)
         self._settings = BeamSettings(
@@ -96,13 +93,8 @@ class AnonymousLandmarks:
         self._beam: Beam | None = None
         self._sorts, self._sizes = dict[int, str](), dict[int, float]()  # of landmarks, whatever beam began them
         self._leader: Decision | None = None
-        self._scans: list[Scan] = []
-        self._motions: list[Motion] = []
-        self._nearby: list[Array] = []  # of the scans after which odometry went on for long enough
         self._same: dict[int, int] = {}  # landmarks of the beam that are others in the graph
-        self._firsts: list[int] = []  # the first cluster of each scan
         self._clocks: dict[str, float] = {}  # of each input the correction that its stamps have
-        self._doubt: Callable[[float], Array] | None = None
         self._compared = 0  # scans
         self._displaced: int | None = None  # the scan from which on all are explained anew
         self.elsewhere = UnnamedDisplacement(space, landmarks)
@@ -117,16 +109,9 @@ class AnonymousLandmarks:
         """Add a step of odometry. Returns the sightings of a scan that ended long before it."""
         stands = step.broken or self._noise.stands(step.T_last_base, self._reckoning.since_s(step.stamp_ns))
         self._reckoning.step(step, stands=stands)
-        self._note_motion(step.stamp_ns)
+        self._history.note_motion(step.stamp_ns)
         began_ns = self._builder.began_ns
         return self.end_scan() if began_ns is not None and began_ns < step.stamp_ns - 2 * SCAN_NS else []
-
-    def _note_motion(self, now_ns: int) -> None:
-        """Keep how the robot moved around the scans, as far as odometry shows it by now."""
-        for scan in self._scans[len(self._nearby) :]:
-            if now_ns < scan.at.stamp_ns + NEARBY_NS:
-                break
-            self._nearby.append(self._reckoning.nearby(scan.at.stamp_ns))
 
     def forget_belief(self) -> None:
         """Restart the beam from the solver's estimate, because the map has moved."""
@@ -139,13 +124,9 @@ class AnonymousLandmarks:
         """
         for topic, seconds in clocks.items():
             self._clocks[topic] = self._clocks.get(topic, 0.0) + seconds
-        self._motions = [motion.rescaled(factors) for motion in self._motions]
-        self._nearby = [rescaled_nearby(self._space, one, factors) for one in self._nearby]
         self._reckoning.rescale(factors)
-        at = self._reckoning.at
-        self._builder.reckon_anew(at)
-        known = [self._reckoning.remembers(scan.at.stamp_ns) for scan in self._scans]
-        self._scans = [replace(s, at=at(s.at.stamp_ns)) if k else s for s, k in zip(self._scans, known, strict=True)]
+        self._history.rescale(factors)
+        self._builder.reckon_anew(self._reckoning.at)
         self.hindsight.rescale(factors)
         self.forget_belief()
 
@@ -179,14 +160,10 @@ class AnonymousLandmarks:
         scan = self._builder.close()
         if scan is None:
             return []
-        if self._scans:
-            motion = motion_between(self._space, self._motion_noise, self._scans[-1].at, scan.at, self._jump)
-            self._motions.append(self._doubted(motion))
-        self._scans.append(scan)
         first = self.clusters.append(scan.clusters)
-        self._firsts.append(first)
+        motion = self._history.append(scan, first)
         try:
-            now = self._explained(scan, first, self._motions[-1] if self._motions else None)
+            now = self._explained(scan, first, motion)
         except (GraphSlamError, np.linalg.LinAlgError):  # no covariance now: the solve that failed is counted
             self._beam = self._leader = now = None
         changed = {c: self._same.get(k, k) for c, k in changes(self._leader, now).items()}
@@ -229,55 +206,53 @@ class AnonymousLandmarks:
         ----------
         added : variances (dof,) that so many seconds of motion add; None from now on
         """
-        self._doubt = added
-        since = [k for k, scan in enumerate(self._scans) if k and scan.at.stamp_ns > since_ns]
-        if added is None or not since:
-            return
-        for k in since:
-            self._motions[k - 1] = self._doubted(self._motions[k - 1])
-        self.explain_since(since[0])
-
-    def _doubted(self, motion: Motion) -> Motion:
-        if self._doubt is None:
-            return motion
-        return replace(motion, covariance=motion.covariance + np.diag(self._doubt(motion.moving_s)))
+        since = self._history.doubt(since_ns, added)
+        if since is not None:
+            self.explain_since(since)
 
     def _propose(self) -> None:
         """Assign the newest scans, where they contradict the pose, to the landmarks that they fit elsewhere."""
-        if len(self._scans) not in (0, self._compared):
-            self._compared = len(self._scans)
+        scans = self._history.scans
+        if len(scans) not in (0, self._compared):
+            self._compared = len(scans)
             given = np.array(self.clusters.given, dtype=np.int64)
-            seen = AllSeen(self._scans, self._firsts, given, self.clusters.names, self.clusters.before)
+            seen = AllSeen(scans, self._history.firsts, given, self.clusters.names, self.clusters.before)
             self.clusters.give(self.elsewhere.propose(seen))
 
     def displaced(self, first: int) -> None:
         """Begin anew at a keyframe, by its vertex: the robot was moved there."""
         self._beam = None
         self.hindsight.restart()
-        k = next((k for k, scan in enumerate(self._scans) if scan.where.vertex >= first), len(self._scans))
-        if 0 < k < len(self._scans):
-            m = self._motions[k - 1]
-            self._motions[k - 1] = replace(m, covariance=m.covariance + self._jump, is_broken=True)
-        if (since := self.elsewhere.since) is not None:  # what was begun at the wrong place
+        k = self._history.split(first)
+        if k is not None and (since := self.elsewhere.since) is not None:  # what was begun at the wrong place
             lost = [c for c in range(since, len(self.clusters.given)) if c not in self.elsewhere.proposed]
             self.clusters.give(dict.fromkeys((c for c in lost if self.clusters.given[c] >= since), NOTHING))
             self._displaced = k
         self.elsewhere.end()
 
+    def rejoined(self, first: int) -> None:
+        """Believe odometry again at a keyframe, by its vertex, at which the robot was thought to be moved."""
+        self._beam = None
+        self.hindsight.restart()
+        self.elsewhere.end()
+        self._history.rejoin(first)
+
     def explain_since(self, first: int) -> None:
         """Explain the scans anew from one on: what they were thought to be is forgotten."""
-        self.clusters.give(dict.fromkeys(range(self._firsts[first], len(self.clusters.given)), NOTHING))
+        self.clusters.give(dict.fromkeys(range(self._history.firsts[first], len(self.clusters.given)), NOTHING))
         self._solver.update()
         self._explain_from(first)
 
     def _explain_from(self, first: int) -> None:
         """Explain the scans anew from one on, by the map and the path as they are."""
-        clusters = range(self._firsts[first], len(self.clusters.given))
+        history = self._history
+        clusters = range(history.firsts[first], len(self.clusters.given))
         self.hindsight.restart()
         self._beam = self._leader = now = None
         try:
-            for k in range(first, len(self._scans)):
-                now = self._explained(self._scans[k], self._firsts[k], self._motions[k - 1] if k else None)
+            for k in range(first, len(history.scans)):
+                motion = history.motions[k - 1] if k else None
+                now = self._explained(history.scans[k], history.firsts[k], motion)
                 self._leader = now
         except (GraphSlamError, np.linalg.LinAlgError):  # as when they were new
             self._beam = self._leader = None
@@ -293,9 +268,10 @@ class AnonymousLandmarks:
         oldest = self._builder.oldest_keyframe
         if self.elsewhere.since is not None or self._displaced is not None or (oldest or keyframe) < keyframe:
             return False
-        if not self.hindsight.is_on or not self._scans:
+        scans = self._history.scans
+        if not self.hindsight.is_on or not scans:
             return True
-        return self.hindsight.covers(first_of_later(self._scans, keyframe)) and not self.hindsight.is_doubtful
+        return self.hindsight.covers(first_of_later(scans, keyframe)) and not self.hindsight.is_doubtful
 
     def forget_before(self, keyframe: int, vertices: Index) -> None:
         """Forget the scans from keyframes before a number, which have left the graph: their landmarks are final.
@@ -304,13 +280,13 @@ class AnonymousLandmarks:
         ----------
         vertices : new ids by old ones
         """
-        k = first_of_later(self._scans, keyframe)
+        history = self._history
+        k = first_of_later(history.scans, keyframe)
         self.hindsight.forget(k)
-        clusters = self._firsts[k] if k < len(self._scans) else len(self.clusters.given)
-        self._scans = [with_vertices(scan, vertices) for scan in self._scans[k:]]
-        self._motions, self._nearby = self._motions[k:], self._nearby[k:]
-        self._firsts, self._compared = [one - clusters for one in self._firsts[k:]], self._compared - k
-        new = self.clusters.forget(clusters, (c for scan in self._scans for c in scan.clusters))
+        clusters = history.firsts[k] if k < len(history.scans) else len(self.clusters.given)
+        history.forget(k, clusters, vertices)
+        self._compared -= k
+        new = self.clusters.forget(clusters, (c for scan in history.scans for c in scan.clusters))
         beam = self._beam
         self._leader, *last = new.histories([self._leader, *(beam.history if beam else ())])
         self._same = {new.landmark(one): new.landmark(other) for one, other in self._same.items()}
@@ -337,14 +313,14 @@ class AnonymousLandmarks:
             self._displaced = None
         self._propose()
         self._adopt(self._guarded(lambda: self.hindsight.outcome(count)), keyframes)
-        if self.hindsight.is_due(len(self._scans)):
+        if self.hindsight.is_due(len(self._history.scans)):
             self._guarded(lambda: self.hindsight.start(self._frozen(), count))
         if count % self._config.review_every_keyframes == 0:
             self.clusters.judge(keyframes[-1].stamp_ns)
 
     def explain_all(self, keyframes: StampedPoses[Keyframe]) -> None:
         """Explain all scans at once, now."""
-        if self._landmarks.begins_new and self._scans:
+        if self._landmarks.begins_new and self._history.scans:
             self._adopt(self._guarded(lambda: self.hindsight.found(self._frozen)), keyframes)
             self.clusters.judge(keyframes[-1].stamp_ns)
 
@@ -358,7 +334,7 @@ class AnonymousLandmarks:
 
     def _frozen(self) -> FrozenScans:
         self._hand_over()
-        group, scans = self._space.group, self._scans
+        group, scans = self._space.group, self._history.scans
         moved = np.array([scan.where.T_keyframe_base for scan in scans])
         at = self._solver.estimate([scan.where.vertex for scan in scans])
         poses = np.stack(group.compose(tuple(at.T), tuple(moved.T)), axis=-1)
@@ -367,9 +343,8 @@ class AnonymousLandmarks:
         leader = given.copy()
         for cluster, landmark in changes(None, self._leader).items():
             leader[cluster] = landmark
-        nearby = self._nearby + [self._reckoning.nearby(scan.at.stamp_ns) for scan in scans[len(self._nearby) :]]
-        motions, clocks = tuple(self._motions), dict(self._clocks)
-        frozen = FrozenScans(tuple(scans), motions, np.array(nearby), poses, scales.copy(), given, leader, clocks)
+        motions, clocks = tuple(self._history.motions), dict(self._clocks)
+        frozen = FrozenScans(tuple(scans), motions, self._history.nearby(), poses, scales.copy(), given, leader, clocks)
         return with_map(frozen, self._belief, self.clusters.final)
 
     def _adopt(self, found: Found | None, keyframes: StampedPoses[Keyframe]) -> None:

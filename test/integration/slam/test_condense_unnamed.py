@@ -145,7 +145,7 @@ def test_what_is_seen_too_rarely_is_in_no_place_and_its_sightings_are_counted(wo
 def test_the_map_is_known_relative_to_a_scan_as_the_solver_knows_it(small):
     slam, _ = small
     anonymous, space = slam._landmarks.anonymous, slam.space
-    scan, names = anonymous._scans[-1], [mark.name for mark in anonymous.clusters.final.values()][:4]
+    scan, names = anonymous._history.scans[-1], [mark.name for mark in anonymous.clusters.final.values()][:4]
     points, covariances = SolverBelief(space, slam.solver, slam._landmarks.map).seen_from(scan, names)
     vertices = [scan.where.vertex, *(slam.landmarks[name].vertex for name in names)]
     values = [slam.solver.estimate([vertex])[0] for vertex in vertices]

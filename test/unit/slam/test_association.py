@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from graph_slam_ros.chi_square import quantile
+from graph_slam_ros.config.frontend import OdometryConfig
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
 from graph_slam_ros.measurements.types import Sighting
 from graph_slam_ros.runs.outcome import shortcomings
@@ -20,6 +21,7 @@ from graph_slam_ros.slam.landmarks.explanation import Costs, Drive, Estimate
 from graph_slam_ros.slam.landmarks.moves import refined
 from graph_slam_ros.slam.landmarks.presence_check import presence
 from graph_slam_ros.slam.landmarks.rotations import rotation, rotation_vector
+from graph_slam_ros.slam.landmarks.scan_history import ScanHistory
 from graph_slam_ros.slam.landmarks.scans import (
     NEARBY_S,
     Cluster,
@@ -327,6 +329,25 @@ def test_dead_reckoning_and_motions_are_rescaled_alike(n):
     after = motion_between(space, NOISE, plain.at(begin), plain.at(begin + S // 10), np.zeros((space.dof,) * 2))
     assert before.rescaled(factors).way == pytest.approx(after.way, rel=1e-4), "as the explanation has its scales"
     assert before.rescaled(factors).turn == pytest.approx(after.turn, abs=1e-9)
+
+
+def test_odometry_between_two_scans_is_as_before_where_the_robot_was_not_moved():
+    reckoning = DeadReckoning(PLANAR, 10.0)
+    history, new_ids = ScanHistory(PLANAR, OdometryConfig(), reckoning), np.arange(-1, 5)
+    for k in range(6):
+        one = scan(0.5 * k, (0.3 * k, 0.0, 0.0, 0.3 * k), [(2.0, 1.0)])
+        history.append(replace(one, where=replace(WHERE, vertex=k)), k)
+    before = list(history.motions)
+    assert history.split(0) is None and history.split(9) is None, "no scan before, or none since"
+    assert history.split(3) == 3
+    assert history.motions[2].is_broken and history.motions[2].covariance[0, 0] > 1e3 * before[2].covariance[0, 0]
+    history.forget(1, 1, new_ids)
+    history.rejoin(2)
+    assert not history.motions[1].is_broken
+    for now, then in zip(history.motions, before[1:], strict=True):
+        assert now.covariance == pytest.approx(then.covariance, abs=1e-12)
+    history.rejoin(2)
+    assert history.motions[1].covariance == pytest.approx(before[2].covariance, abs=1e-12), "once"
 
 
 def test_a_robot_that_does_not_turn_knows_nothing_of_a_clock():
