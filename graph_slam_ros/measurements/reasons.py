@@ -40,6 +40,7 @@ _REFUSED, _REPAIRED, _NOTED = Effect.REFUSED, Effect.REPAIRED, Effect.NOTED
 _COVARIANCE = "correct the driver's covariance, or INPUT.noise=sigmas; of odometry odometry.noise=density"
 _SIGMAS = "INPUT.sigma_m, INPUT.sigma_rad: its standard deviations; of closures with INPUT.noise=sigmas"
 _FRAMES = "publish the transform on /tf_static, or INPUT.mount, or frames.base as the messages name it"
+_GAPS = "publish the moving transform at 10 Hz or more, all the time; inputs.tf_wait_s where it comes late"
 _SPACE = "world.dimensions=3"
 
 REASONS: dict[str, Reason] = {
@@ -90,11 +91,7 @@ REASONS: dict[str, Reason] = {
     "frame_empty": Reason(_REFUSED, "the message names no frame", "INPUT.frame, or INPUT.mount"),
     "frame_in_itself": Reason(_REFUSED, "a frame is its own parent", "correct the driver's frame names"),
     "frame_unknown": Reason(_REFUSED, "no transform links the message's frame to the robot", _FRAMES),
-    "transform_gaps": Reason(
-        _REFUSED,
-        "/tf links the message's frame to the robot, but not at its stamp",
-        "publish the moving transform at 10 Hz or more, all the time; inputs.tf_wait_s where it comes late",
-    ),
+    "transform_gaps": Reason(_REFUSED, "/tf links the message's frame to the robot, but not at its stamp", _GAPS),
     "odom_frame_unknown": Reason(
         _REFUSED,
         "no transform links the odometry's frame to frames.odom",
@@ -374,8 +371,7 @@ REASONS: dict[str, Reason] = {
     "worker_restarted": Reason(_NOTED, "a job would have ended the solver's thread, which went on", "report it"),
     "fault": Reason(
         _NOTED,
-        "an exception, counted by its type: of a solve (the last good estimate stands), of a second look, or of a"
-        " callback",
+        "an exception, by its type: of a solve (the last good estimate stands), of a second look, or of a callback",
         "report it with the log",
     ),
 }

@@ -66,7 +66,8 @@ WITHIN = {
     "messages": {"colours", "lie", "graph", "formats", "measurements", "config", "slam", "messages/inputs"},
     "recordings": {"lie", "formats", "messages", "messages/inputs"},
     "check": {
-        *("lie", "formats", "measurements", "config", "slam", "slam/calibration", "messages", "messages/inputs"),
+        *("lie", "formats", "measurements", "config", "slam", "slam/calibration", "slam/landmarks"),
+        *("messages", "messages/inputs"),
     },
     "runs": {
         *("edge_tags", "lie", "graph", "solver", "warmup", "formats", "measurements", "config"),
