@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from scipy.special import bdtrc
 
@@ -22,6 +21,7 @@ from graph_slam_ros.slam.landmarks.beam import NOTHING
 from graph_slam_ros.slam.landmarks.landmark_map import Landmarks
 from graph_slam_ros.slam.landmarks.rigid_alignment import aligned
 from graph_slam_ros.slam.landmarks.scans import Scan
+from graph_slam_ros.slam.landmarks.view import FIT_M, is_missing
 from graph_slam_ros.typing import Array, Index
 
 _SCANS, _CLUSTERS = 6, 8  # the newest, and at least so many in them
@@ -34,8 +34,7 @@ _VIEW = 12  # scans before them, which show the field of view
 _GOES_ON = 0.25  # part of them that is of landmarks seen before
 _MISSED_BY_CHANCE = 1e-5  # probability
 _SLIP = 0.5  # part of the way by which odometry may err: that is a slip
-_SAME_DIRECTION_RAD = 0.3  # what is nearer than something seen in about this direction should be seen
-_FIT_M, _MOST = 0.5, 0.9  # and the part that fits since the robot was moved
+_MOST = 0.9  # part that fits since the robot was moved
 _MOST_GROUPS, _MOST_MOTIONS = 12, 4000
 _LEAST, _LEAST_APART_M = 4, 2.0  # points of a constellation, and how far two of them are apart
 _SAME_M, _SAME_RAD = 1.0, 0.3  # poses farther from each other are two
@@ -148,7 +147,7 @@ class UnnamedDisplacement:
         for scan in seen.scans[-_AFTER:]:
             moved = group.between(scan.at.pose, last.at.pose)
             in_base = last.points[is_followed] @ space.turn(moved).T + np.array(moved[: space.dimensions])
-            fit_m = _FIT_M + _SLIP * float(np.linalg.norm(moved[: space.dimensions]))
+            fit_m = FIT_M + _SLIP * float(np.linalg.norm(moved[: space.dimensions]))
             missing += is_missing(in_base, view, scan.points, fit_m)
         return _are_gone(seen, missing)
 
@@ -178,10 +177,10 @@ class UnnamedDisplacement:
         begins = np.array(seen.firsts[k:]) - self.since
         is_known = self.fits_from is not None and self.fits_from == self.keeps_from
         for one, begin in zip([] if is_known else seen.scans[k:], begins.tolist(), strict=False):
-            if begin < len(away) and np.mean(away[begin:] < _FIT_M) >= _MOST:
+            if begin < len(away) and np.mean(away[begin:] < FIT_M) >= _MOST:
                 self.fits_from = one.where.vertex
                 break
-        fits = np.flatnonzero((away < _FIT_M) & ~np.isin(which, numbers))
+        fits = np.flatnonzero((away < FIT_M) & ~np.isin(which, numbers))
         return {self.since + c: int(numbers[of[c]]) for c in fits.tolist()}
 
 
@@ -207,22 +206,6 @@ def _missed_part(seen: Seen) -> float:
     return (missed + 1) / (count + 2)
 
 
-def is_missing(in_base: Array, view: Array, points: Array, fit_m: float = _FIT_M) -> NDArray[np.bool_]:
-    """Return which of the landmarks should be seen and are not.
-
-    Parameters
-    ----------
-    in_base : (L, n) where they should be seen, in the base frame [m]
-    view : (V, n) what shows the field of view: what is nearer than a point in about the same direction is in view
-    points : (P, n) what is seen
-    fit_m : what is nearer to a landmark than this is the landmark
-    """
-    near, far = (np.linalg.norm(one, axis=1) + 1e-9 for one in (in_base, view))
-    is_in_view = (in_base / near[:, None]) @ (view / far[:, None]).T > np.cos(_SAME_DIRECTION_RAD)
-    is_seen = np.linalg.norm(in_base[:, None] - points[None], axis=2).min(axis=1) < fit_m
-    return np.asarray((is_in_view & (near[:, None] < far)).any(axis=1) & ~is_seen)
-
-
 def only_motion(points: Array, places: Array, here: tuple[float, ...]) -> tuple[Array, Array] | None:
     """Return the rotation and translation that lay points (G, 2) on places (L, 2) as no other does, nor chance.
 
@@ -237,8 +220,8 @@ def only_motion(points: Array, places: Array, here: tuple[float, ...]) -> tuple[
     c, s = np.cos(turns)[:, None], np.sin(turns)[:, None]
     x, y = points.T
     laid = np.stack([c * x - s * y + shifts[:, :1], s * x + c * y + shifts[:, 1:]], axis=-1)
-    away, _ = tree.query(laid, distance_upper_bound=_FIT_M)
-    counts = np.count_nonzero(away < _FIT_M, axis=1)
+    away, _ = tree.query(laid, distance_upper_bound=FIT_M)
+    counts = np.count_nonzero(away < FIT_M, axis=1)
     best = int(counts.argmax())
     position = (
         np.stack([c[:, 0] * here[0] - s[:, 0] * here[1], s[:, 0] * here[0] + c[:, 0] * here[1]], axis=-1) + shifts
@@ -247,11 +230,11 @@ def only_motion(points: Array, places: Array, here: tuple[float, ...]) -> tuple[
     is_apart |= np.abs(se2.wrap(turns - turns[best])) > _SAME_RAD
     if 2 * int(counts[is_apart].max(initial=0)) > counts[best]:
         return None
-    chance = len(places) * np.pi * _FIT_M**2 / max(float(np.prod(np.ptp(places, axis=0))), 1.0)
+    chance = len(places) * np.pi * FIT_M**2 / max(float(np.prod(np.ptp(places, axis=0))), 1.0)
     if len(turns) * bdtrc(int(counts[best]) - 3, len(points) - 2, min(chance, 1.0)) > _BY_CHANCE:
         return None
     away, of = tree.query(laid[best])
-    fits = away < _FIT_M
+    fits = away < FIT_M
     return aligned(points[fits], places[of[fits]], np.ones(np.count_nonzero(fits)))
 
 
@@ -263,7 +246,7 @@ def _motions(points: Array, places: Array) -> tuple[Array, Array]:
     distances = np.linalg.norm(places[:, None] - places[None], axis=2)
     turns, shifts = [], []
     for a, b, far in zip(i.tolist(), j.tolist(), apart.tolist(), strict=True):
-        k, m = np.nonzero(np.abs(distances - far) < _FIT_M)
+        k, m = np.nonzero(np.abs(distances - far) < FIT_M)
         d, e = points[b] - points[a], places[m] - places[k]
         turn = np.arctan2(e[:, 1], e[:, 0]) - np.arctan2(d[1], d[0])
         middle, c, s = 0.5 * (points[a] + points[b]), np.cos(turn), np.sin(turn)

@@ -19,6 +19,7 @@ from graph_slam_ros.slam.landmarks.beam import NOTHING, BeamSettings, Ids
 from graph_slam_ros.slam.landmarks.constellation import laid_on_the_map
 from graph_slam_ros.slam.landmarks.explanation import SCALES, UNUSED, Costs, Drive, Estimate
 from graph_slam_ros.slam.landmarks.moves import refined, without_few
+from graph_slam_ros.slam.landmarks.other_beams import MOST_SCANS, other_associations
 from graph_slam_ros.slam.landmarks.presence_check import NOTHING_SEEN, Presence, presence
 from graph_slam_ros.slam.landmarks.rotations import matrices_of, poses_of
 from graph_slam_ros.slam.landmarks.scans import Motion, Scan
@@ -252,35 +253,52 @@ class Hindsight:
 
 
 def explained(space: Geometry, frozen: FrozenScans, settings: BeamSettings, costs: Costs) -> Found | None:
-    """Explain all scans, from the graph's assignment and from the beam's; None if too little was seen."""
+    """Explain all scans, from the graph's assignment and from the beam's; None if too little was seen.
+
+    Where the map is probably wrong, other beams associate the whole drive again. The explanation with the largest
+    evidence is kept.
+    """
     drive = Drive(frozen.scans, frozen.motions, frozen.nearby, settings, costs, frozen.clocks, frozen.times)
     here = matrices_of(space, frozen.poses)
     paths = here, drive.along_odometry(here[0][0], here[1][0], frozen.scales)
-    found: list[Found] = []
-    for given in (frozen.given, frozen.leader):
-        numbers, which = _indices(given)
-        if not len(numbers) or (found and np.array_equal(frozen.given, frozen.leader)):
-            continue
-        no_landmarks, clocks = np.empty((0, drive.n)), np.zeros(len(drive.topics))
-        starts = [Estimate(*path, no_landmarks, frozen.scales, clocks, which) for path in paths]
-        staged = min((drive.staged(start) for start in starts), key=lambda e: e.cost)
-        drive.begin_moves()
-        found.append(Found(frozen, refined(drive, staged), is_whole=drive.may_move))
+    given = [frozen.given] if np.array_equal(frozen.given, frozen.leader) else [frozen.given, frozen.leader]
+    found = [one for some in given for one in _from(drive, paths, frozen, some)]
     if not found:
         return None
-    best = min(found, key=lambda one: drive.total(one.estimate))
+    best = _laid(drive, min(found, key=lambda one: drive.total(one.estimate)))
+    if not best.presence.is_doubtful or frozen.of_map or frozen.count > MOST_SCANS:
+        return best
+    for other in other_associations(space, frozen.scans, frozen.motions, frozen.poses[0], settings):
+        tried = (_laid(drive, one) for one in _from(drive, paths, frozen, other))
+        best = min([best, *tried], key=lambda one: drive.total(one.estimate))
+    return best
+
+
+def _from(drive: Drive, paths: Sequence[tuple[Array, Array]], frozen: FrozenScans, given: Ids) -> list[Found]:
+    """Explain all scans from an association; nothing if it has no landmark that was seen often enough."""
+    numbers, which = _indices(given)
+    if not len(numbers):
+        return []
+    no_landmarks, clocks = np.empty((0, drive.n)), np.zeros(len(drive.topics))
+    starts = [Estimate(*path, no_landmarks, frozen.scales, clocks, which) for path in paths]
+    staged = min((drive.staged(start) for start in starts), key=lambda e: e.cost)
     drive.begin_moves()
-    estimate, undecided = laid_on_the_map(drive, best.estimate)
-    is_whole = best.is_whole and drive.may_move
+    return [Found(frozen, refined(drive, staged), is_whole=drive.may_move)]
+
+
+def _laid(drive: Drive, found: Found) -> Found:
+    """Lay stretches of an explanation on other landmarks, and say what is known of it."""
+    drive.begin_moves()
+    estimate, undecided = laid_on_the_map(drive, found.estimate)
     unknowns = drive.named(estimate)
     return replace(
-        best,
+        found,
         estimate=estimate,
         undecided=undecided,
-        is_whole=is_whole,
+        is_whole=found.is_whole and drive.may_move,
         scales={name: one for name, one in unknowns.items() if name in SCALES},
         clocks={name: one for name, one in unknowns.items() if name not in SCALES},
-        presence=presence(drive, estimate, frozen.of_map),
+        presence=presence(drive, estimate, found.frozen.of_map),
     )
 
 

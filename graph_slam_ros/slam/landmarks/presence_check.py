@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from graph_slam_ros.slam.landmarks.elsewhere import is_missing
 from graph_slam_ros.slam.landmarks.explanation import UNUSED, Drive, Estimate
+from graph_slam_ros.slam.landmarks.view import is_missing
 
 _MUCH_MORE = 4.0  # times what the sensor misses; maps that are right reach 2.3
 _LEAST_PART, _LEAST = 0.02, 10
