@@ -5,6 +5,7 @@ Intact and damaged files are read the same way. Everything intact is read; what 
 
 import heapq
 import re
+import shlex
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -17,6 +18,7 @@ from mcap.writer import CompressionType, Writer
 from rosbags.typesys.store import Typestore
 
 from graph_slam_ros.errors import FormatError, GraphSlamError, similar_file
+from graph_slam_ros.formats.bag_folder import as_listed
 from graph_slam_ros.formats.durable import AppendedFile
 from graph_slam_ros.formats.files import opened
 from graph_slam_ros.messages.interfaces import typestore
@@ -127,12 +129,14 @@ def open_bag(path: Path | str) -> Bag:
     """
     path = Path(path)
     try:
-        files = _files(path)
+        files, missing, others = as_listed(path, _files(path))
         bag = Bag([_part(file) for file in files])
     except OSError as error:
         raise BagError(f"{path}: {error.strerror}") from None
     except FormatError as error:
         raise BagError(str(error)) from None
+    bag.losses += missing
+    bag.warnings += others
     names = {re.sub(r"[_-]?\d+$", "", file.stem) for file in files}
     if len(names) > 1 and not (path / "metadata.yaml").is_file():
         bag.warnings.append(
@@ -171,7 +175,8 @@ def _part(file: Path) -> "_Part":
             return kind(file)
     for magic, codec in _PACKED.items():
         if begins.startswith(magic):
-            mend = f"unpack it first: {codec} -dc < {file.name} > UNPACKED"
+            whole = file.with_suffix("") if file.suffix in (".zstd", ".gz", ".bz2", ".lz4") else Path("UNPACKED")
+            mend = f"unpack it first: {codec} -dc < {shlex.quote(str(file))} > {shlex.quote(str(whole))}"
             raise BagError(f"{file}: the whole file is compressed with {codec}: {mend}")
     raise BagError(f"{file}: not a readable recording: it begins as neither mcap, sqlite3 nor a ROS 1 bag")
 

@@ -5,6 +5,7 @@ from importlib.metadata import version
 
 import numpy as np
 import pytest
+import yaml
 from mcap.records import Chunk
 from mcap.stream_reader import StreamReader
 from recordings import DETECTIONS, ODOMETRY, TOPICS, read, short_drive, write_mcap
@@ -38,6 +39,23 @@ def test_a_recording_may_be_a_folder_of_parts_in_natural_order(tmp_path, message
         write_mcap(tmp_path / f"drive_{k}.mcap", messages[k * size : (k + 1) * size if k < 11 else None])
     (tmp_path / "metadata.yaml").write_text("not read")
     assert read(tmp_path) == (messages, [])
+
+
+def test_of_a_folder_the_files_are_read_that_its_metadata_name(tmp_path, messages):
+    half, names = len(messages) // 2, ["bag_0.mcap", "bag_1.mcap.zstd", "bag_2.mcap"]
+    write_mcap(tmp_path / "bag_0.mcap", messages[:half])
+    write_mcap(tmp_path / "bag_1.mcap", messages[half:])  # it was unpacked
+    write_mcap(tmp_path / "bag_0_copy.mcap", messages[:half])
+    metadata = {"rosbag2_bagfile_information": {"relative_file_paths": names}}
+    (tmp_path / "metadata.yaml").write_text(yaml.safe_dump(metadata))
+    bag = open_bag(tmp_path)
+    assert list(bag.messages(TOPICS)) == messages
+    assert bag.losses == [f"{tmp_path / 'bag_2.mcap'}: not there, though metadata.yaml names it"]
+    assert len(bag.warnings) == 1
+    assert bag.warnings[0].startswith(f"{tmp_path / 'bag_0_copy.mcap'}: not read, as metadata.yaml does not name it")
+    for content in ("rosbag2_bagfile_information: {relative_file_paths: [other.mcap]}", "[", "a: *b", "{}"):
+        (tmp_path / "metadata.yaml").write_text(content)
+        assert sum(topic.count for topic in open_bag(tmp_path).topics.values()) == len(messages) + half
 
 
 def test_our_own_files_carry_checksums_in_every_chunk(recorded, tmp_path, messages):
