@@ -1,6 +1,7 @@
 """All checks of a recording, in order: a finding of an early check can make the later ones meaningless."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -53,7 +54,13 @@ def check_columns(c: Columns, checks: tuple[Check, ...] = CHECKS) -> list[Findin
                 break
         else:
             found += _nothing_corrects(c)
-    return in_order(found)
+    return in_order(with_inputs(c, found))
+
+
+def with_inputs(c: Columns, found: Iterable[Finding]) -> list[Finding]:
+    """Findings with the name of the input that their topic is of."""
+    inputs = {name: topic.inputs[0] for name, topic in c.topics.items() if topic.inputs}
+    return [replace(one, source=inputs.get(one.topic, "")) for one in found]
 
 
 def worst_of_replay(c: Columns) -> Finding | None:

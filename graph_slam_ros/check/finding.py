@@ -39,6 +39,7 @@ _MOUNT = "publish the transform on /tf_static, or set INPUT.mount"
 _ONE_CLOCK = "synchronise the clocks (chrony, PTP); set use_sim_time for all nodes or for none"
 _PUBLISHER = "let one node only publish each frame"
 _ID = "give each landmark an id of its own"
+_ASSUMED, _MEND_FIRST = "frame_unlinked", "mend what is above first, then check again"
 _WHEELS = "choose the topic of the wheels with --odom"
 
 KINDS: dict[str, Kind] = {
@@ -70,7 +71,16 @@ KINDS: dict[str, Kind] = {
         "cut the recording in two; time.on_jump sets what a run does at the step",
     ),
     "constant_stamps": Kind(
-        "all messages of odometry have one stamp", "stamp each message when it is measured (header.stamp)", True
+        "all messages of an input have one stamp", "stamp each message when it is measured (header.stamp)", True
+    ),
+    "coarse_stamps": Kind(
+        "the stamps of odometry are rounded so much that most messages have the stamp of the one before",
+        "stamp each message when it is measured, to the millisecond",
+        True,
+    ),
+    "rounded_stamps": Kind(
+        "the stamps of odometry are rounded, and the first message of each stamp is used",
+        "stamp each message when it is measured, to the millisecond",
     ),
     "duplicates": Kind(
         "messages have the stamp of the message before",
@@ -227,6 +237,7 @@ class Finding:
     text : what was measured, in one sentence
     topic, first_ns, count : where: the topic, the first stamp (0: unknown), and how many messages or sightings
     settings : ``KEY=VALUE``, which together mend it; empty where no parameter does
+    source : the input of the topic; empty where it is of none
     """
 
     code: str
@@ -239,6 +250,12 @@ class Finding:
     first_ns: int = 0
     count: int = 0
     settings: tuple[str, ...] = ()
+    source: str = ""
+
+    @property
+    def mend(self) -> str:
+        """Return what mends it beyond the settings, with the name of the input; empty where nothing is to be done."""
+        return KINDS[self.code].mend.replace("INPUT", self.source or "the input") if self.code in KINDS else ""
 
     @property
     def ends(self) -> bool:
@@ -268,16 +285,21 @@ def in_order(findings: list[Finding]) -> list[Finding]:
 
 
 def with_one_value(findings: list[Finding]) -> list[Finding]:
-    """Findings that give each parameter one value: a later one that has another value for it prints no settings."""
-    values, out = dict[str, Any](), list[Finding]()
-    for one in findings:
+    """Findings that give each parameter one value: a later one that has another value for it prints no settings.
+
+    A place that is only assumed, as nothing links its frame, gives way to one that was measured.
+    """
+    values, out = dict[str, tuple[Any, str]](), dict[int, Finding]()
+    for k, one in sorted(enumerate(findings), key=lambda pair: pair[1].code == _ASSUMED):
         own = dict(parse_setting(text) for text in one.settings)
-        if any(values.get(key, value) != value for key, value in own.items()):
-            out.append(replace(one, settings=(), text=f"{one.text} (mend what is above first, then check again)"))
+        others = [values[key][1] for key, value in own.items() if key in values and values[key][0] != value]
+        if others:
+            first = f"{others[0]} has the setting" if one.code == _ASSUMED else _MEND_FIRST
+            out[k] = replace(one, settings=(), text=f"{one.text} ({first})")
         else:
-            values |= own
-            out.append(one)
-    return out
+            values |= {key: (value, one.code) for key, value in own.items()}
+            out[k] = one
+    return [out[k] for k in range(len(findings))]
 
 
 def worst(findings: list[Finding]) -> Finding | None:

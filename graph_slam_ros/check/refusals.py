@@ -6,6 +6,7 @@ import numpy as np
 
 from graph_slam_ros.check.columns import Columns
 from graph_slam_ros.check.finding import Finding, Severity, Where
+from graph_slam_ros.check.times import rounded_s
 from graph_slam_ros.measurements.reasons import Effect, explain, remedy
 
 _MOST = 0.5
@@ -29,6 +30,7 @@ ELSEWHERE = {  # those that a check of its own explains better
     *("frame_unknown", "child_frame_unknown", "odom_frame_unknown", "map_frame_unknown", "no_id", "id_merged"),
 }
 _OF_TWIST = ("covariance_not_positive_definite", "nonfinite_covariance")
+_OF_ROUNDED = ("other_publisher", "duplicate_stamp")  # of odometry whose stamps are rounded
 _OF_COVARIANCE = {*_OF_TWIST, "covariance_asymmetric"}
 
 
@@ -40,7 +42,8 @@ def check_refusals(c: Columns) -> Iterator[Finding]:
         for reason, times in counts.items():
             row = explain(reason)
             is_of_twist = source == c.odometry.input and reason in _OF_TWIST
-            if row.effect is not Effect.REFUSED or reason in ELSEWHERE or is_of_twist:
+            is_rounded = source == c.odometry.input and reason in _OF_ROUNDED and rounded_s(c.odometry) > 0.0
+            if row.effect is not Effect.REFUSED or reason in ELSEWHERE or is_of_twist or is_rounded:
                 continue
             received = max(c.counters.received[source], items.get(source, 0) + times, times)
             share = times / received

@@ -1,6 +1,7 @@
 """Checks of the times of a recording: clocks, order, gaps."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -17,6 +18,7 @@ _WINDOWS, _APART, _LEAST_S, _LEAST_MESSAGES = 20, 5, 30.0, 200
 _DRIFT, _DRIFTED_S, _SCATTERS = 1e-4, 0.02, 4.0
 _JUMP_S, _PER_WINDOW, _SIDE = 0.05, 5, 3
 _DUPLICATES, _OUT_OF_ORDER = 0.01, 0.001
+_LEAST_ROUNDED_NS, _AS_OTHERS, _COARSE_S = 1_000_000, 0.1, 0.15
 _LONG_S, _VERY_LONG_S, _PERIODS, _MOVED_M, _TURNED = 1.0, 2.0, 10.0, 0.05, 0.05
 _SLOW_HZ, _BETWEEN_S = 5.0, 0.02
 _JITTER, _FAST_HZ = 1.5, 200.0
@@ -25,6 +27,9 @@ _OUTSIDE, _MARGIN_NS = 0.2, 500_000_000
 
 def check_times(c: Columns) -> Iterator[Finding]:
     """Clocks of inputs against the recorder's and each other, and the order of the stamps of each."""
+    if constant := [one for topic in c.topics.values() for one in _constant(topic)]:
+        yield from constant
+        return
     for key, value in c.assumed.items():
         if key.endswith(".offset_s"):
             name = key.removesuffix(".offset_s")
@@ -35,9 +40,6 @@ def check_times(c: Columns) -> Iterator[Finding]:
             where: Where = {"topic": "" if topic is None else topic.name, "settings": (assignment(key, value),)}
             yield Finding("clock_domains", "error", -value, _CLOCKS_DIFFER_S, "s", text, **where)
     stamped = {name: topic for name, topic in c.topics.items() if np.count_nonzero(topic.stamp_ns) >= _FEW}
-    if constant := next(_constant(c.odometry), None):
-        yield constant
-        return
     yield from _clocks(c, stamped)
     for topic in stamped.values():
         yield from _order(c, topic)
@@ -45,14 +47,34 @@ def check_times(c: Columns) -> Iterator[Finding]:
     yield from _overlap(c)
 
 
-def _constant(o: OdometryColumns) -> Iterator[Finding]:
-    """Odometry whose messages all have one stamp."""
-    stamp_ns = o.stamp_ns[o.stamp_ns != 0]
-    if len(stamp_ns) >= _MANY and not np.ptp(stamp_ns):
-        text = f"{o.topic}: all of its {len(stamp_ns)} messages have the stamp {stamp_ns[0] * 1e-9:.3f} s"
-        yield Finding(
-            "constant_stamps", "error", len(stamp_ns), _MANY, "messages", text, o.topic, int(stamp_ns[0]), len(stamp_ns)
-        )
+def _constant(topic: TopicColumns) -> Iterator[Finding]:
+    """An input whose messages all have one stamp, though they were not recorded at one time."""
+    stamp_ns = topic.stamp_ns[topic.stamp_ns != 0]
+    is_input, count = topic.use in ("odometry", "landmarks"), len(stamp_ns)
+    if is_input and count >= _MANY and not np.ptp(stamp_ns) and np.ptp(topic.log_ns):
+        text = f"{topic.name}: all of its {count} messages have the stamp {stamp_ns[0] * 1e-9:.3f} s"
+        at: Where = {"topic": topic.name, "first_ns": int(stamp_ns[0]), "count": count}
+        yield Finding("constant_stamps", "error", count, _MANY, "messages", text, **at)
+
+
+def rounded_s(o: OdometryColumns) -> float:
+    """Return to how much the stamps of odometry are rounded, where several messages have one; 0 where they are not.
+
+    Messages of one stamp then go on along the path as others do. A message that is there twice does not move, and that
+    of another publisher is elsewhere.
+    """
+    stamp_ns, at = o.stamp_ns[o.stamp_ns != 0], o.poses[o.stamp_ns != 0, :3]
+    own_ns = np.diff(np.unique(stamp_ns))
+    if len(own_ns) < _FEW or own_ns.min() < _LEAST_ROUNDED_NS:
+        return 0.0
+    steps = own_ns / own_ns.min()
+    moved = np.diff(at, axis=0)
+    way_m, is_repeated = np.linalg.norm(moved, axis=1), np.diff(stamp_ns) == 0
+    straight_m = np.linalg.norm(moved[1:] + moved[:-1], axis=1).sum()
+    goes_on = straight_m > 0.5 * (way_m[1:] + way_m[:-1]).sum()
+    as_others = way_m[is_repeated].mean() > _AS_OTHERS * way_m[~is_repeated].mean() if is_repeated.any() else False
+    is_rounded = np.abs(steps - np.round(steps)).max() < _AS_OTHERS and goes_on and as_others
+    return float(own_ns.min()) * 1e-9 if is_rounded else 0.0
 
 
 def _lags(topic: TopicColumns) -> tuple[Array, Index, Index]:
@@ -157,7 +179,12 @@ def _order(c: Columns, topic: TopicColumns) -> Iterator[Finding]:
     repeated, back = step_s == 0.0, step_s < 0.0
     where: Where = {"topic": topic.name}
     share = float(repeated.mean())
-    if topic.use == "odometry" and share > _DUPLICATES:
+    if topic.name == c.odometry.topic and share > _DUPLICATES and (each_s := rounded_s(c.odometry)):
+        is_coarse = each_s > _COARSE_S
+        text = f"{topic.name}: stamps are rounded to {each_s:.3g} s: {share:.1%} are that of the message before"
+        found = Finding("coarse_stamps", "error", each_s, _COARSE_S, "s", text, **where)
+        yield found if is_coarse else replace(found, code="rounded_stamps", severity="note")
+    elif topic.use == "odometry" and share > _DUPLICATES:
         text = (
             f"{topic.name}: {share:.1%} of the messages have the stamp of the one before: published or recorded twice"
         )

@@ -4,7 +4,7 @@ import argparse
 import json
 import shlex
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from graph_slam_ros.check.finding import Finding
@@ -40,12 +40,10 @@ def check(args: argparse.Namespace) -> int:
         mend = [text for one in done.findings if one.severity != "note" for text in one.settings]
         last = {parse_setting(text)[0]: text for text in [*args.set, *mend]}  # of several, the last one counts
         own = [f"--config {shlex.quote(str(args.config))}"] if args.config else []
-        given = shlex.split(done.command)
-        more = [f"--set {shlex.quote(text)}" for text in last.values() if text not in given]
         if any(one.forbids_replay for one in done.findings):
             console.then(f"correct what is an error, then check again: {console.command('check', args.bag)}")
         elif done.command:
-            console.then(" ".join([done.command, *own, *more]))
+            console.then(" ".join([_with(done.command, last), *own]))
         else:
             console.then(console.command("info", args.bag))
     console.report_losses(done.losses, done.warnings)
@@ -76,12 +74,21 @@ def lines(one: Finding) -> Iterator[str]:
         yield f"    {evidence}{since}"
     if one.settings:
         yield "    remedy: " + " ".join(f"--set {shlex.quote(text)}" for text in one.settings)
-    else:
-        from graph_slam_ros.check.finding import KINDS
+    elif one.mend:
+        yield f"    remedy: {one.mend}"
 
-        if one.code in KINDS and KINDS[one.code].mend:
-            yield f"    remedy: {KINDS[one.code].mend.replace('INPUT', 'the input')}"
+
+def _with(command: str, settings: Mapping[str, str]) -> str:
+    """A command with the settings of some parameters, by dotted name, in place of those that it has of these."""
+    words = shlex.split(command)
+    given = {k: text for k, text in enumerate(words) if k and words[k - 1] == "--set"}
+    old = [k for k, text in given.items() if settings.get(parse_setting(text)[0], text) != text]
+    kept = [word for k, word in enumerate(words) if k not in old and k + 1 not in old]
+    more = [word for text in settings.values() if text not in given.values() for word in ("--set", text)]
+    return shlex.join([*kept, *more])
 
 
 def _amount(value: float, unit: str) -> str:
-    return f"{100.0 * value:.3g} %" if unit == "part" else f"{value:.4g} {unit}"
+    if unit == "part":
+        return f"{100.0 * value:.3g} %"
+    return f"{value:.4g} {unit[:-1] if value == 1 and unit[1:].endswith('s') else unit}"  # 1 topic, but 1 s

@@ -78,7 +78,7 @@ REASONS: dict[str, Reason] = {
     "duplicate_stamp": Reason(
         _REFUSED,
         "odometry says two different things for one stamp",
-        "one publisher for each odometry topic: ros2 topic info -v TOPIC",
+        "one publisher for each odometry topic: ros2 topic info -v TOPIC; stamps to the millisecond",
     ),
     "sent_again": Reason(_NOTED, "the transform was sent before with the same stamp"),
     "lost_in_transport": Reason(

@@ -6,6 +6,7 @@ import numpy as np
 
 from graph_slam_ros.typing import Array, Index
 
+_SAME_S = 1e-3  # stamps that differ by less are one, by the rounding of lags
 _SLOWEST, _FASTEST = 0.1, 10.0  # receive time that passes in a second of stamps; a file that was converted has others
 
 
@@ -18,7 +19,8 @@ def clock_offset_s(
     """Return what must be added to the stamps of a topic to have the clock of another [s]; 0 where that is not known.
 
     Lags are compared that were received at the same time. So a recording that was played fast or slow shows no offset.
-    Where receive times do not run with the stamps at all, as in a converted file, they say nothing.
+    Where receive times do not run with the stamps at all, as in a converted file, or stamps that are all the same, they
+    say nothing.
 
     Parameters
     ----------
@@ -31,5 +33,7 @@ def clock_offset_s(
     received_s, other_s = ((np.asarray(ns) - origin_ns) * 1e-9 for ns in (received_ns, other_received_ns))
     passed_s, stamped_s = float(other_s[-1]), float(other_s[-1] - other_lag_s[-1] + other_lag_s[0])
     if len(other_s) > 1 and not _SLOWEST * stamped_s < passed_s < _FASTEST * stamped_s:
+        return 0.0
+    if np.ptp(received_s) > _SAME_S > np.ptp(received_s - lag_s):
         return 0.0
     return float(np.median(np.asarray(lag_s) - np.interp(received_s, other_s, np.asarray(other_lag_s))))

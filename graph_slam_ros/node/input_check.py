@@ -9,7 +9,7 @@ from functools import partial
 
 from graph_slam_ros.check.checks import worst_while_driving
 from graph_slam_ros.check.columns import Collector, Columns
-from graph_slam_ros.check.finding import KINDS, Finding
+from graph_slam_ros.check.finding import Finding
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.types import Measured, Odometry
 from graph_slam_ros.messages.from_msg import TF, TF_STATIC, TRANSFORMS, Decoder, decoder
@@ -123,4 +123,4 @@ class InputCheck:
 
 
 def _text(found: Finding) -> str:
-    return f"{found.code}: {found.text}: {' '.join(found.settings) or KINDS[found.code].mend}"
+    return f"{found.code}: {found.text}: {' '.join(found.settings) or found.mend}"

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from graph_slam_ros.check.checks import check_columns
+from graph_slam_ros.check.checks import check_columns, with_inputs
 from graph_slam_ros.check.columns import Collector, Columns
 from graph_slam_ros.check.finding import Finding, Severity, in_order, with_one_value
 from graph_slam_ros.check.gyro import of_gyro_or_wheels
@@ -98,7 +98,8 @@ def check(
     found += _damage(bag)
     found += check_columns(columns)
     if not quick and not any(one.ends for one in found):
-        found += _trial(columns, _for_trial(columns, [some for number, some in measured if number == 0]))
+        some = _for_trial(columns, [some for number, some in measured if number == 0])
+        found += with_inputs(columns, _trial(columns, some))
     others = suggestion.settings.keys() - suggested.assumed.keys()
     command = "" if suggestion.trouble else suggestion.command(without=others)
     found = of_pose_or_twist(of_gyro_or_wheels(found, config.gyro_input))

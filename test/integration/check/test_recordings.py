@@ -354,3 +354,50 @@ def test_a_clean_drive_of_ranges_alone_needs_the_search_for_other_hypotheses(tmp
     assert main(["simulate", "manhattan", "--out", str(bag), *city]) == 0
     capsys.readouterr()
     assert check(bag)[0] == 0
+
+
+def rounded(to_ns, topics=("/odom",)):
+    """Stamps of these topics rounded down."""
+
+    def change(topic, m):
+        if topic in topics:
+            stamp_ns = (m.header.stamp.sec * 10**9 + m.header.stamp.nanosec) // to_ns * to_ns
+            m.header.stamp.sec, m.header.stamp.nanosec = divmod(stamp_ns, 10**9)
+        return m
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("to_ns", "exit_code", "name"), [(120_000_000, 0, "rounded_stamps"), (10**9, 4, "coarse_stamps")]
+)
+def test_rounded_stamps_are_not_taken_for_two_publishers(drive, check, tmp_path, to_ns, exit_code, name):
+    code, found, _ = check(copy(drive, tmp_path / "a.mcap", rounded(to_ns)), "--quick")
+    assert (code, found[name]["value"]) == (exit_code, pytest.approx(to_ns * 1e-9))
+    assert not {"duplicates", "other_publisher", "duplicate_stamp"} & found.keys()
+
+
+def test_landmarks_of_one_stamp_have_no_clock_of_their_own(drive, check, tmp_path):
+    code, found, _ = check(copy(drive, tmp_path / "a.mcap", rounded(10**18, ["/landmarks"])))
+    assert (code, list(found)) == (4, ["constant_stamps"])
+    assert found["constant_stamps"]["text"].startswith("/landmarks: all of its")
+
+
+def test_a_place_that_is_assumed_gives_way_to_one_that_is_measured(drive, check, tmp_path, capsys):
+    def change(topic, m):
+        for one in m.detections if topic == "/landmarks" else ():
+            p = one.results[0].pose.pose.position
+            p.x, p.y = p.y, -p.x
+            in_frame(m, "camera_link")
+        return m
+
+    bag = copy(drive, tmp_path / "a.mcap", change)
+    code, found, _ = check(bag, "--quick")
+    assert (code, found["frame_unlinked"]["settings"]) == (4, [])
+    assert found["frame_unlinked"]["text"].endswith("(axes has the setting)")
+    code, found, _ = check(bag, "--quick", *(w for text in found["axes"]["settings"] for w in ("--set", text)))
+    assert (code, found) == (0, {})
+    assert main(["check", str(bag), "--quick"]) == 4
+    out = capsys.readouterr().out
+    assert "remedy: publish the transform on /tf_static, or set detections.mount\n" in out
+    assert out.splitlines()[-1].count("detections.mount=") == 1

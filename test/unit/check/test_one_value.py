@@ -17,6 +17,14 @@ def test_a_second_value_of_a_parameter_is_not_printed():
     assert "mend what is above first" in out[1].text
 
 
+def test_a_place_that_is_assumed_gives_way_whatever_the_order():
+    assumed = finding("frame_unlinked", 1.0, "a.mount=0 0 0 0 0 0")
+    measured = finding("axes", 12.0, "a.frame=b", "a.mount=0 0 0 0 0 1.5708")
+    out = with_one_value([assumed, measured])
+    assert [one.settings for one in out] == [(), measured.settings]
+    assert out[0].text.endswith("(axes has the setting)")
+
+
 def test_a_gyro_that_does_not_explain_a_wrong_heading_keeps_its_finding_alone():
     gyro = finding("gyro_scale", 1.2, "odometry.turn_factor=1.2")
     right, both = finding("turn_scale", -1.0 / 6.0), finding("turn_scale", 0.2)
