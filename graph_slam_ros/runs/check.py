@@ -1,7 +1,7 @@
 """The check of a recording: choose its inputs, read it once, collect all findings."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -100,6 +100,7 @@ def check(
     if not quick and not any(one.ends for one in found):
         some = _for_trial(columns, [some for number, some in measured if number == 0])
         found += with_inputs(columns, _trial(columns, some))
+    found = [_with_candidates(one, suggestion) for one in found]
     others = suggestion.settings.keys() - suggested.assumed.keys()
     command = "" if suggestion.trouble else suggestion.command(without=others)
     found = of_pose_or_twist(of_gyro_or_wheels(found, config.gyro_input))
@@ -141,6 +142,15 @@ def _unused(recording: Recording, suggestion: Suggestion, *, has_landmarks: bool
             text = f"{name} is not used: {why}"
             severity = "note" if has_landmarks and is_landmark else "error"
             yield Finding(code, severity, 1, 0, "topics", text, name, count=one.topic.count)
+
+
+def _with_candidates(one: Finding, suggestion: Suggestion) -> Finding:
+    """The finding that nothing corrects odometry, with the topics that may have landmarks."""
+    if one.code != "no_landmarks":
+        return one
+    return replace(
+        one, text="; ".join([one.text, *(f"{name}: {suggestion.unused[name]}" for name in suggestion.perhaps)])
+    )
 
 
 def _damage(bag: Bag) -> Iterator[Finding]:

@@ -21,12 +21,14 @@ from graph_slam_ros.runs.namespaces import is_truth
 from graph_slam_ros.runs.suggested_odometry import DETECTIONS, ESTIMATE, POSES, OdometryChoice, readable
 from graph_slam_ros.slam import Config
 
+MARKERS = "visualization_msgs/msg/MarkerArray"
 CLOUD, GNSS, IMU = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/Imu"
 POSE, POSE_WITH_COVARIANCE = POSES
 
 _TAG = re.compile(r"((?:.*[/_])?(?:tag|aruco|marker|fiducial).*?)[:_]?\d+", re.IGNORECASE)
 _TAG_TOPIC = re.compile(r"(?:tag|aruco|marker|fiducial)[_/:]?(\d+)(?:/pose)?$", re.IGNORECASE)
 _CORNERS = re.compile(r"^(?!.*map).*(tag|aruco|fiducial)", re.IGNORECASE)
+_WITHOUT_ID = re.compile(r"/(PoseArray|Detection2DArray)$")
 _OF_ROS = ("/clock", "/rosout", "/parameter_events", "/diagnostics", "/events/write_split", "/robot_description")
 _MOST_LISTED = 6
 _CLOCKS_DIFFER_S = 2.0
@@ -41,6 +43,7 @@ class Suggestion:
     topics, names : of odom and detections; of all inputs
     notes : sentences: what was chosen and why, and what is assumed
     unused : why a topic that could be an input is not offered, by its name
+    perhaps : topics of these that may have landmarks: nobody but the user knows
     trouble : why there is no command; empty where there is one
     """
 
@@ -49,6 +52,7 @@ class Suggestion:
         self.settings: dict[str, Any] = {}
         self.notes: list[str] = []
         self.unused: dict[str, str] = {}
+        self.perhaps: list[str] = []
         self.topics: dict[str, str] = {}  # of odom and detections
         self.names: list[str] = []
         self.trouble = self._of_a_result()
@@ -127,11 +131,9 @@ class Suggestion:
                 self._add("plugin", one)
             except GraphSlamError as error:
                 self.unused[one.topic.name] = str(error)
-        for name, one in self._recording.topics.items():
+        for one in self._recording.topics.values():
             if _CORNERS.search(one.topic.type) and one.topic.type not in known:
                 self._corners(one)
-            elif one.topic.type == "visualization_msgs/msg/MarkerArray" and not is_truth(name):
-                self.unused[name] = "markers are mostly pictures; an input of this type and topic takes them"
 
     def _tag_number(self, one: TopicContents) -> str:
         """The number of the tag whose pose in the camera's frame a topic has; empty for any other topic."""
@@ -280,6 +282,9 @@ class Suggestion:
             is_usual = usual in (TF_TOPIC, TF_STATIC_TOPIC) and usual in self._recording.topics
             if one.topic.type == TRANSFORMS and is_usual and name != usual:
                 self.unused[name] = f"{usual} is there, and it alone is read"
+            elif why := self._perhaps_landmarks(one):
+                self.unused[name] = why
+                self.perhaps.append(name)
         known = known_types()
         found = [
             f"{name} ({one.topic.type or 'no type'})"
@@ -291,3 +296,15 @@ class Suggestion:
             note = f"no input reads {', '.join(found[:_MOST_LISTED])}{more}: their types are none of docs/inputs.md"
             own = "; landmarks in a type of your own: a plugin (docs/inputs.md), or publish them as Detection3DArray"
             self.notes.append(note + own * (self.names == ["odom"]))
+
+    def _perhaps_landmarks(self, one: TopicContents) -> str:
+        """Return how a topic is used that may have landmarks, by its type; empty for any other."""
+        name, of = one.topic.name, one.topic.type
+        if is_truth(name) or not one.topic.count:
+            return ""
+        if of == MARKERS:
+            chosen = f"--set 'inputs.names={' '.join([*self.names, 'markers'])}' --set markers.type={of}"
+            return f"markers are mostly pictures; where they are landmarks: {chosen} --set markers.topic={name}"
+        if _WITHOUT_ID.search(of):
+            return f"no input reads {of}, which has no ids; where these are landmarks, publish them as {DETECTIONS}"
+        return ""

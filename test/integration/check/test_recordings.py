@@ -10,7 +10,7 @@ from reliability import times
 
 from graph_slam_ros.cli import main
 from graph_slam_ros.messages.from_msg import decoder
-from graph_slam_ros.messages.to_msg import encode, transform
+from graph_slam_ros.messages.to_msg import encode, header, make, transform
 from graph_slam_ros.recordings.bag import BagWriter, open_bag
 from graph_slam_ros.runs import check as runs_check
 from graph_slam_ros.simulation import Fault, simulate, write_faulty_bag
@@ -401,3 +401,19 @@ def test_a_place_that_is_assumed_gives_way_to_one_that_is_measured(drive, check,
     out = capsys.readouterr().out
     assert "remedy: publish the transform on /tf_static, or set detections.mount\n" in out
     assert out.splitlines()[-1].count("detections.mount=") == 1
+
+
+def test_without_landmarks_topics_are_named_that_may_have_them(drive, check, tmp_path):
+    things, poses = "visualization_msgs/msg/MarkerArray", "geometry_msgs/msg/PoseArray"
+    messages = [m for m in read(drive)[0] if m.topic == "/odom"]
+    end_ns = messages[-1].log_ns
+    with BagWriter(tmp_path / "a.mcap") as out:
+        for m in messages:
+            out.write(m.topic, "nav_msgs/msg/Odometry", m.log_ns, m.cdr)
+        out.write("/things", things, end_ns, encode(make(things, markers=[])))
+        out.write("/places", poses, end_ns, encode(make(poses, header=header(end_ns, "base_link"), poses=[])))
+    _, found, _ = check(tmp_path / "a.mcap", "--quick")
+    text = found["no_landmarks"]["text"]
+    settings = f"--set 'inputs.names=odom markers' --set markers.type={things} --set markers.topic=/things"
+    assert f"/things: markers are mostly pictures; where they are landmarks: {settings}" in text
+    assert f"/places: no input reads {poses}, which has no ids" in text
