@@ -4,6 +4,7 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
+from graph_slam_ros.check.bearings import check_bearings
 from graph_slam_ros.check.columns import Columns
 from graph_slam_ros.check.finding import Finding, Where
 from graph_slam_ros.check.noise import TYPICAL_M, check_noise, check_noise_alone, noisier
@@ -46,7 +47,10 @@ def check_contradictions(c: Columns) -> Iterator[Finding]:
     for s in c.sightings:
         if not len(s.stamp_ns):
             continue
-        found = [*check_ranges(s, path_ns, path), *check_noise_alone(c, s), *_contradictions(c, s, path_ns, path)]
+        found = list(check_ranges(s, path_ns, path))
+        if c.config.world.dimensions == 2:
+            found += check_bearings(s, path_ns, path)
+        found += [*check_noise_alone(c, s), *_contradictions(c, s, path_ns, path)]
         yield from found
         yield from _identities(c, s)
         if not any(one.ends for one in found):

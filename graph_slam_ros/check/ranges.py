@@ -10,6 +10,7 @@ from graph_slam_ros.check.sightings import SightingColumns
 from graph_slam_ros.typing import Array, Index
 
 _LATER_S, _DRIVEN_M, _LEAST, _FASTEST = 30.0, 1.0, 20, 10.0
+_MOST, _FEWEST = 1.3, 0.1  # m/m, which nearly none exceeds: feet, where beacons are ahead or behind
 
 
 def check_ranges(s: SightingColumns, path_ns: Index, path: Array) -> Iterator[Finding]:
@@ -20,11 +21,11 @@ def check_ranges(s: SightingColumns, path_ns: Index, path: Array) -> Iterator[Fi
     places = poses_at(s.stamp_ns[use], path_ns, path)[:, :3]
     changes = [_changes(s, use[s.name[use] == k], places[s.name[use] == k]) for k in np.unique(s.name[use])]
     each = np.concatenate(changes) if changes else np.empty(0)
-    factor = float(np.median(each)) if len(each) >= _LEAST else 0.0
-    if factor > _FASTEST:
-        text = f"{s.topic}: ranges change by {factor:.0f} for each metre that the robot drives: are these metres?"
+    factor, least = np.quantile(each, [0.5, _FEWEST]).tolist() if len(each) >= _LEAST else (0.0, 0.0)
+    if factor > _FASTEST or least > _MOST:
+        text = f"{s.topic}: ranges change by {factor:.3g} for each metre of odometry: are both metres?"
         where: Where = {"topic": s.topic, "first_ns": int(s.stamp_ns[0]), "count": len(use)}
-        yield Finding("units", "error", factor, _FASTEST, "m/m", text, **where)
+        yield Finding("units", "error", factor, _MOST, "m/m", text, **where)
 
 
 def _changes(s: SightingColumns, chosen: Index, places: Array) -> Array:

@@ -25,6 +25,7 @@ class SightingColumns:
     names, name : identities, and (k,) the number of each sighting's; the empty one is of those without
     points : (k, 3) in the base frame; NaN of a range or bearing alone
     ranges : (k,) of a range alone [m]; NaN of others
+    bearings : (k,) of a bearing alone, in the plane or horizontal [rad]; NaN of others
     sigmas : (k,) of the position or range [m], or of a bearing alone [rad]
     frame, T_base_frame : the frame of the first message, and where it is on the robot
     """
@@ -37,6 +38,7 @@ class SightingColumns:
     name: Index
     points: Array
     ranges: Array
+    bearings: Array
     sigmas: Array
     frame: str
     T_base_frame: se3.Pose
@@ -58,7 +60,7 @@ class SightingCollector:
     def begin_anew(self) -> None:
         """Drop all sightings."""
         self.stamp_ns, self.message, self.name = array("q"), array("q"), array("q")
-        self.points, self.ranges, self.sigmas = array("d"), array("d"), array("d")
+        self.points, self.ranges, self.bearings, self.sigmas = array("d"), array("d"), array("d"), array("d")
         self.names: dict[str, int] = {}
         self._messages = 0
 
@@ -81,6 +83,7 @@ class SightingCollector:
             self.name.append(self.names.setdefault(one.id, len(self.names)))
             self.points.extend(point)
             self.ranges.append(one.measured[0] if one.kind == "range" else np.nan)
+            self.bearings.append(one.measured[0] if one.kind == "bearing" else np.nan)
             self.sigmas.append(sigma)
 
     def columns(self) -> SightingColumns:
@@ -93,6 +96,7 @@ class SightingCollector:
             *numbers,
             points,
             np.array(self.ranges),
+            np.array(self.bearings),
             np.array(self.sigmas),
             self.frame,
             self.T_base_frame,

@@ -50,6 +50,7 @@ _LIMITS = {
     "distance": ("part", 0.03, 0.05),
     "turn": ("part", 0.03, 0.05),
     "range_factor": ("part", 0.03, 0.05),
+    "range_offset": ("m", 0.1, np.inf),
 }
 _OVER_CONFIDENT, _ODOMETRY_OVER_CONFIDENT, _LEAST_DOF = 2.0, 6.0**0.5, 100.0
 _OF_A_BREAK = (
@@ -143,9 +144,12 @@ def check_trial(c: Columns, slam: GraphSlam) -> Iterator[Finding]:
     yield from (found_one for one in fitted for found_one in _fitted(c, slam, one, off))
     yield from _clock_jumps(c, fit)
     slips = [] if off else list(check_slips(c, slam))  # a clock or mount that is wrong bends the path in turns
-    is_displaced = any(one.severity == "warning" for one in slips)
     yield from slips
-    yield from (one for one in found if not (is_displaced and one.code in _OF_A_BREAK))
+    if any(one.severity == "warning" for one in slips):
+        found = [one for one in found if one.code not in _OF_A_BREAK]
+    elif any(one.code == "map_breaks" for one in found):
+        found = [one for one in found if one.code != "ids_unsure"]
+    yield from found
     if no_scales:
         yield Finding("fit_unsure", "note", 1, 0, "fits", f"noise cannot be checked: {no_scales}")
     for noise in scales:

@@ -55,6 +55,12 @@ def places_of(problem: TrialProblem) -> list[Parameter]:
     return [Parameter(source, axis) for source, some in kinds.items() if not only_ranges(some) for axis in ("x", "y")]
 
 
+def offsets_of(problem: TrialProblem) -> list[Parameter]:
+    """The offset of the ranges of each sensor that measures bearings, too."""
+    both = (edges.source for edges in problem.model().sightings if edges.kind == "range and bearing")
+    return [Parameter(source, "range_offset") for source in dict.fromkeys(both)]
+
+
 def only_ranges(kinds: Collection[str]) -> bool:
     """Return whether kinds of edges measure distances alone."""
     return all(kind.startswith("range") and kind != "range and bearing" for kind in kinds)

@@ -3,6 +3,8 @@
 A sensor that is further to the side, or further ahead, than its mount says passes for another scale of odometry, or for
 a sensor that is turned. So all are fitted once more together with the places. That fit is taken where a place is off
 beyond doubt. Elsewhere the places would only make the other parameters less certain.
+Ranges that are too long by an offset pass for another scale of odometry, too. So where something is off, the offset of
+a sensor of ranges and bearings is fitted as well, without its place: for one that looks ahead the two are one.
 
 Where noise of odometry is as large as its motion, a factor is too small by that alone. So a factor that is off must be
 off, too, in a fit in which noise grows with it. If it is not, nothing is known of it.
@@ -14,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 
 from graph_slam_ros.errors import SingularError
-from graph_slam_ros.slam.calibration.choice import places_of
+from graph_slam_ros.slam.calibration.choice import offsets_of, places_of
 from graph_slam_ros.slam.calibration.decision import SIGMAS, is_certain
 from graph_slam_ros.slam.calibration.fit import TrialFit, fit, likelier_fit
 from graph_slam_ros.slam.calibration.parameters import FACTORS, Parameter
@@ -28,7 +30,7 @@ _AGREEING, _PART = 2.0, 1.0 / 3.0  # a factor is off by so many sigmas, and so m
 def fit_with_places(
     problem: TrialProblem, priors: Mapping[Parameter, float], log_odds: float, *, is_thorough: bool = True
 ) -> tuple[TrialFit, TrialFit]:
-    """Fit parameters as ``likelier_fit`` does, with the places of sensors where one is off by ``LEAST_M`` or more.
+    """Fit parameters as ``likelier_fit`` does, with places or range offsets where one is off by ``LEAST_M`` or more.
 
     Parameters
     ----------
@@ -43,19 +45,22 @@ def fit_with_places(
     SingularError
         The edges do not determine the estimate.
     """
-    again, places = replace(problem, graph=problem.graph.copy()), places_of(problem)
-    found = likelier_fit(problem, priors, log_odds)  # which overwrites the graph of its problem
-    every, is_off = found, bool((np.abs(found.values) > SIGMAS * found.sigmas).any())
-    if places and (is_off or is_thorough):
-        wider = {**priors, **dict.fromkeys(places, _SIGMA_M)}
+    again, places, offsets = replace(problem, graph=problem.graph.copy()), places_of(problem), offsets_of(problem)
+    first = found = likelier_fit(problem, priors, log_odds)  # which overwrites the graph of its problem
+    every, used, is_off = found, priors, bool((np.abs(found.values) > SIGMAS * found.sigmas).any())
+    for lengths, is_asked in ((places, is_off or is_thorough), (offsets, is_off)):
+        if not lengths or not is_asked:
+            continue
+        wider = {**priors, **dict.fromkeys(lengths, _SIGMA_M)}
         try:
-            every = likelier_fit(replace(again, graph=again.graph.copy()), wider, log_odds, found)
+            other = likelier_fit(replace(again, graph=again.graph.copy()), wider, log_odds, first)
         except SingularError:
-            every = found
-        else:
-            if any(abs(every.value(one)) >= LEAST_M and is_certain(every, one) for one in places):
-                found, priors = every, wider
-    return _without_noise(again, found, priors), every
+            continue
+        every = other if lengths is places else every
+        is_better = found is first or other.evidence > found.evidence
+        if is_better and any(abs(other.value(one)) >= LEAST_M and is_certain(other, one) for one in lengths):
+            found, used = other, wider
+    return _without_noise(again, found, used), every
 
 
 def _without_noise(problem: TrialProblem, found: TrialFit, priors: Mapping[Parameter, float]) -> TrialFit:

@@ -116,6 +116,8 @@ def test_a_planted_fault_is_found_and_its_settings_mend_it(drive, tmp_path, name
     [
         ("range", "wrong_units", "units"),
         ("range", "wrong_units:factor=100.0", "units"),
+        ("range", "wrong_units:factor=3.28084", "units"),
+        ("bearing", "wrong_axes:how=mirrored", "mirrored"),
         ("bearing", "wrong_units:of=bearings,factor=57.29578", "bearing_out_of_range"),
     ],
 )

@@ -348,6 +348,18 @@ def test_ranges_alone_that_are_too_long_are_mended_by_their_own_factor(tmp_path,
     assert float(value) == pytest.approx(1.0, abs=0.02)  # three of its sigmas
 
 
+def test_ranges_alone_that_are_too_long_by_an_offset_are_mended_by_it(tmp_path, check, capsys):
+    """The end of a replay said so, and a check did not."""
+    bag = tmp_path / "ranges.mcap"
+    hall = ("--set", "sensor=range", "--seed", "7")
+    assert main(["simulate", "warehouse", "--out", str(bag), *hall]) == 0
+    capsys.readouterr()
+    code, found, _ = check(bag, "--set", "ranges.range_offset_m=0.3")
+    key, value = found["range_scale"]["settings"][0].split("=")
+    assert (code, key) == (4, "ranges.range_offset_m")
+    assert float(value) == pytest.approx(0.0, abs=0.1)
+
+
 def test_a_clean_drive_of_ranges_alone_needs_the_search_for_other_hypotheses(tmp_path, check, capsys):
     bag = tmp_path / "ranges.mcap"
     city = ("--poses", "300", "--set", "blocks=10", "--set", "sensor=range", "--seed", "501")

@@ -70,6 +70,7 @@ def columns(seed):
         rng.integers(0, len(names), k),
         numbers(rng, k, 3),
         np.abs(numbers(rng, k)) if rng.random() < 0.3 else np.full(k, np.nan),
+        numbers(rng, k) if rng.random() < 0.3 else np.full(k, np.nan),
         np.abs(numbers(rng, k)),
         pick(),
         tuple(rng.choice([0.0, 1.0], 3)) + tuple(se3.IDENTITY[3:]),

@@ -37,6 +37,7 @@ def seen(random, *, wrong=0.0, far=0.0, burst=1):
         given,
         np.column_stack((points, np.zeros(len(name)))),
         np.full(len(name), np.nan),
+        np.full(len(name), np.nan),
         np.full(len(name), SIGMA_M),
         "base_link",
         se3.IDENTITY,

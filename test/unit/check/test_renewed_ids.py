@@ -20,7 +20,8 @@ def sightings(drive):
     points[:, :2] += RNG.normal(0.0, 0.03, (len(seen), 2))
     stamp_ns, count = np.array([round(t * NS) for t, *_ in seen]), len(seen)
     nowhere, T = np.full(count, np.nan), (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
-    columns = ("detections", "/tags", stamp_ns, np.arange(count), names, number, points, nowhere, np.full(count, 0.03))
+    seen_by = stamp_ns, np.arange(count), names, number, points, nowhere, nowhere, np.full(count, 0.03)
+    columns = ("detections", "/tags", *seen_by)
     return SightingColumns(*columns, "base_link", T), points
 
 
