@@ -26,6 +26,7 @@ from graph_slam_ros.slam.calibration.parameters import OF_ODOMETRY, QUANTITIES, 
 from graph_slam_ros.slam.calibration.uncorrected import CODES
 from graph_slam_ros.warmup import warmup
 
+_HIDES = "nothing is calibrated, for what is found hides this"
 _ROUNDS = 4  # replays; a large clock needs two or three
 _MOST_REPEATED = 0.8  # of the keyframes: of more, all are
 _STILL_ACCEPTED = 0.9  # of the part that was accepted before: with less, what was found does harm
@@ -214,15 +215,23 @@ def _wrong(fault: Finding | None) -> str:
 
 
 def _misplaced(slam: GraphSlam, config: Config) -> str:
-    """Return why nothing is used where a sensor is elsewhere on the robot: that passes for scale and yaw."""
-    off = next((one for one in slam.uncorrected() if one.code == CODES["x"]), None)
-    if off is None or not off.setting:
-        return ""
-    source = next(one for one in config.sources if one.name == off.source)
-    key, value = off.setting
-    turn = source.numbers("mount_correction", 6)[3:] or (0.0, 0.0, 0.0)
-    mount = " ".join((*str(value).split()[:3], *(f"{angle:.5g}" for angle in turn)))
-    return f"nothing is calibrated, for what is found hides this: {off}. Measure it, or --set {key}='{mount}'"
+    """Return why nothing is used where a sensor is elsewhere on the robot, or its ranges have an offset.
+
+    That passes for scale and yaw. The offset of ranges alone is fitted with the scale, and hides nothing.
+    """
+    fitted = {one["source"] for one in slam.calibration_report["parameters"] if one["name"] == "range_offset"}
+    for off in slam.uncorrected():
+        if not off.setting:
+            continue
+        key, value = off.setting
+        if key == f"{off.source}.range_offset_m" and off.source not in fitted:
+            return f"{_HIDES}: {off}. Set it, and calibrate again: --set {key}={value}"
+        if off.code == CODES["x"]:
+            source = next(one for one in config.sources if one.name == off.source)
+            turn = source.numbers("mount_correction", 6)[3:] or (0.0, 0.0, 0.0)
+            mount = " ".join((*str(value).split()[:3], *(f"{angle:.5g}" for angle in turn)))
+            return f"{_HIDES}: {off}. Measure it, or --set {key}='{mount}'"
+    return ""
 
 
 def _accepted(slam: GraphSlam) -> tuple[int, int]:

@@ -3,8 +3,8 @@
 A sensor that is further to the side, or further ahead, than its mount says passes for another scale of odometry, or for
 a sensor that is turned. So all are fitted once more together with the places. That fit is taken where a place is off
 beyond doubt. Elsewhere the places would only make the other parameters less certain.
-Ranges that are too long by an offset pass for another scale of odometry, too. So where something is off, the offset of
-a sensor of ranges and bearings is fitted as well, without its place: for one that looks ahead the two are one.
+Ranges that are too long by an offset pass for another scale of odometry, too. So the offset of a sensor of ranges and
+bearings is fitted as well, without its place: for one that looks ahead the two are one.
 
 Where noise of odometry is as large as its motion, a factor is too small by that alone. So a factor that is off must be
 off, too, in a fit in which noise grows with it. If it is not, nothing is known of it.
@@ -34,7 +34,7 @@ def fit_with_places(
 
     Parameters
     ----------
-    is_thorough : fit the places also where no other parameter is off
+    is_thorough : fit these also where no other parameter is off
 
     Returns
     -------
@@ -48,8 +48,8 @@ def fit_with_places(
     again, places, offsets = replace(problem, graph=problem.graph.copy()), places_of(problem), offsets_of(problem)
     first = found = likelier_fit(problem, priors, log_odds)  # which overwrites the graph of its problem
     every, used, is_off = found, priors, bool((np.abs(found.values) > SIGMAS * found.sigmas).any())
-    for lengths, is_asked in ((places, is_off or is_thorough), (offsets, is_off)):
-        if not lengths or not is_asked:
+    for lengths in (places, offsets) if is_off or is_thorough else ():
+        if not lengths:
             continue
         wider = {**priors, **dict.fromkeys(lengths, _SIGMA_M)}
         try:

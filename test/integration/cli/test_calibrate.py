@@ -96,6 +96,21 @@ def test_a_sensor_that_is_elsewhere_is_said_instead_of_what_would_hide_it(laps, 
     assert float(found["settings"]["detections.mount_correction"].split()[5]) == pytest.approx(0.0, abs=0.02)
 
 
+def test_an_offset_of_ranges_is_said_instead_of_the_scale_that_would_hide_it(tmp_path, capsys):
+    """The scale that passes for it makes the map, and the errors, larger."""
+    bag, given = str(tmp_path / "drive.mcap"), ("--set", "ranges.range_offset_m=0.3")
+    write_bag(simulate("warehouse", 3, aisles=3, laps=2, sensor="range_bearing"), bag)
+    assert main(["calibrate", bag, *given]) == 3
+    out, err = capsys.readouterr()
+    assert "distance_factor" not in out
+    found = re.search(r"ranges are 0\.\d+ m too long .*--set ranges.range_offset_m=(\S+)$", err, re.MULTILINE)
+    assert float(found[1]) == pytest.approx(0.0, abs=0.04)
+    assert main(["check", bag, *given]) == 4
+    out = capsys.readouterr().out
+    assert "[warning] range_scale" in out
+    assert "odometry_scale" not in out
+
+
 @pytest.mark.parametrize(("how", "code"), [("mirrored", "mirrored"), ("backwards", "axes")])
 def test_a_recording_that_is_wrong_in_itself_is_not_calibrated_and_says_what_is_wrong(tmp_path, capsys, how, code):
     bag, faulty = str(tmp_path / "drive.mcap"), str(tmp_path / "faulty.mcap")
