@@ -99,6 +99,7 @@ class KidnapDetector:
         self._slips = SlipDetector(space, config.odometry, backend, counters, self._history, anonymous.doubt)
         self._next = graph.edge_count
         self._splits: list[_Split] = []  # of the present frame of odometry
+        self._was_doubtful = False  # the association, when the present alarm began: it is no evidence then
         self._refuted: list[Numbers] = []  # where that frame does not lie: it was decided and taken back
 
     @property
@@ -206,9 +207,10 @@ class KidnapDetector:
             last = self._splits[-1] if self._splits else None
             if last and self._is_refuted(last, found, int(vertices[-1])):
                 self._revoke(last, found, len(keyframes) - 1, stamp_ns)
-            else:
+                found = None
+            elif not self._was_doubtful:
                 self._decide(found, keyframes, stamp_ns)
-            found = None
+                found = None
         self._note(found, stamp_ns)
         self._protect()
 
@@ -272,6 +274,8 @@ class KidnapDetector:
             counts = (sum_of.held_back, sum_of.count) if sum_of else (0, 0)
             determines_pose = found is not None or is_elsewhere or self._search.held_back_count > 0
             self.alarms.append(Alarm(stamp_ns, evidence, None, None, 0.0, 0.0, *counts, determines_pose))
+            hindsight = self._anonymous.hindsight
+            self._was_doubtful, hindsight.is_suspicious = hindsight.is_doubtful, True
         elif now is not None and evidence > now.evidence:
             self.alarms[-1] = replace(now, evidence=evidence)
         elif now is not None and not found and not is_contradicted and self._is_calm(now, stamp_ns):

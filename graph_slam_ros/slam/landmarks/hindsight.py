@@ -1,7 +1,9 @@
 """Explains all scans at once, in the background on a copy. The result is used at a fixed later keyframe.
 
 The scans are solved in stages, once from odometry and once from the present path, and the cheaper solution is kept.
-Then moves correct the association. The result does not depend on when the work is done.
+Then moves correct the association. Other beams associate the drive again where the map is probably wrong twice in a row
+or at the end, and at the end of a drive in which landmarks said that the robot is elsewhere. The result does not depend
+on when the work is done.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -145,6 +147,7 @@ class Hindsight:
     Attributes
     ----------
     is_on : whether it does
+    is_suspicious : whether landmarks have said that the robot is elsewhere: associations may be wrong, too
     scales : (2,) of odometry, as last found, and their standard deviation
     found_scales : the same by name, as the last explanation has them, with its standard deviations
     newest : the explanation that was found last
@@ -160,7 +163,7 @@ class Hindsight:
         self._explained = 0  # scans of the last explanation that was begun
         self._job: tuple[int, Callable[[], Found | None]] | None = None
         self._last: Ids | None = None
-        self.is_on = True
+        self.is_on, self.is_suspicious = True, False
         self.scales: tuple[Array, float] = np.zeros(2), settings.scale_sigma
         self.found_scales: dict[str, tuple[float, float]] = {}
         self.newest: Found | None = None
@@ -172,7 +175,8 @@ class Hindsight:
     def start(self, frozen: FrozenScans, keyframes: int) -> None:
         """Start with the present scans."""
         self._next, self._explained = round(_MORE * frozen.count), frozen.count
-        work = self._executor(lambda: explained(self._space, frozen, self._settings, self._costs))
+        doubts = _is_doubtful if self.is_doubtful else _never
+        work = self._executor(lambda: explained(self._space, frozen, self._settings, self._costs, doubts))
         self._job = keyframes + self._after, work
 
     def restart(self) -> None:
@@ -221,7 +225,8 @@ class Hindsight:
         if self._last is not None and np.array_equal(self._last, frozen.given[frozen.clusters_of_map :]):
             return None
         self._explained = frozen.count
-        return self._noted(explained(self._space, frozen, self._settings, self._costs))
+        doubts = _always if self.is_suspicious else _is_doubtful
+        return self._noted(explained(self._space, frozen, self._settings, self._costs, doubts))
 
     def note(self, given: Sequence[int]) -> None:
         """Note that everything was explained, and the landmark of each cluster."""
@@ -252,11 +257,27 @@ class Hindsight:
         return found
 
 
-def explained(space: Geometry, frozen: FrozenScans, settings: BeamSettings, costs: Costs) -> Found | None:
+def _is_doubtful(found: Found) -> bool:
+    return found.presence.is_doubtful
+
+
+def _never(_: Found) -> bool:
+    return False
+
+
+def _always(_: Found) -> bool:
+    return True
+
+
+def explained(
+    space: Geometry, frozen: FrozenScans, settings: BeamSettings, costs: Costs, doubts: Callable[[Found], bool] = _never
+) -> Found | None:
     """Explain all scans, from the graph's assignment and from the beam's; None if too little was seen.
 
-    Where the map is probably wrong, other beams associate the whole drive again. The explanation with the largest
-    evidence is kept.
+    Parameters
+    ----------
+    doubts : whether to associate the whole drive again by other beams, and keep the explanation with the largest
+        evidence
     """
     drive = Drive(frozen.scans, frozen.motions, frozen.nearby, settings, costs, frozen.clocks, frozen.times)
     here = matrices_of(space, frozen.poses)
@@ -266,7 +287,7 @@ def explained(space: Geometry, frozen: FrozenScans, settings: BeamSettings, cost
     if not found:
         return None
     best = _laid(drive, min(found, key=lambda one: drive.total(one.estimate)))
-    if not best.presence.is_doubtful or frozen.of_map or frozen.count > MOST_SCANS:
+    if not doubts(best) or frozen.of_map or frozen.count > MOST_SCANS:
         return best
     for other in other_associations(space, frozen.scans, frozen.motions, frozen.poses[0], settings):
         tried = (_laid(drive, one) for one in _from(drive, paths, frozen, other))

@@ -11,7 +11,7 @@ from graph_slam_ros.graph import R2
 from graph_slam_ros.lie import se2
 from graph_slam_ros.runs.journal import RecordWriter
 from graph_slam_ros.runs.map_journal import MapGrowth, read_map, state_of
-from graph_slam_ros.simulation import Fault, faulty_recording, measurements
+from graph_slam_ros.simulation import Fault, faulty_recording, measurements, simulate
 from graph_slam_ros.simulation.motion import VelocityNoise
 from graph_slam_ros.simulation.recording import drive
 from graph_slam_ros.simulation.sensing import RangeBearing
@@ -57,6 +57,10 @@ def park(seed, laps=2, clutter=None):
 def pipeline(association, **settings):
     named = {f"landmarks.{key}": value for key, value in settings.items()}
     return GraphSlam(Config.from_mapping({"landmarks.association": association} | named))
+
+
+def rotated(yaw):
+    return np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
 
 
 def without_ids(m):
@@ -111,6 +115,19 @@ def test_without_ids_the_path_is_as_near_to_the_truth_and_each_tree_is_there_onc
     which, apart = nearest_true(slam, recording)
     assert apart.max() < 1.0
     assert len(set(which.tolist())) == len(which) >= 0.8 * len(recording.landmarks)
+
+
+@pytest.mark.parametrize(("seed", "aisle_m"), times([(2, 8.0)], [(1, 8.0), (3, 10.0), (7, 12.0), (9, 12.0)]))
+def test_among_racks_that_look_alike_other_beams_find_the_way(seed, aisle_m):
+    """The first beam confuses the tags of the two faces of a rack, and of aisles: 0.16 to 1.7 m."""
+    recording = simulate("warehouse", seed, aisles=3, aisle_m=aisle_m)
+    slam = driven(recording)
+    at = np.searchsorted(recording.stamps_ns, slam.keyframes.stamps_ns)
+    true = recording.T_world_base[at, :2]
+    away = slam.trajectory()[:, :2] @ rotated(recording.T_world_base[at[0], 2]).T + true[0] - true
+    assert np.sqrt(np.mean(np.sum(away**2, axis=1))) < 0.25
+    assert not slam.association_report["is_doubtful"]
+    assert len(slam.landmarks) <= len(recording.landmarks)
 
 
 def test_covariances_are_those_of_the_joint_one_where_landmarks_came_and_went():
