@@ -163,7 +163,7 @@ KINDS: dict[str, Kind] = {
         "let the detector give each landmark its own id; without ids set landmarks.association=joint",
     ),
     "no_closure": Kind(
-        "no landmark is seen again later in the drive, or none over more than a tenth of it",
+        "no landmark is seen again later in the drive, or hardly one over more than a tenth of it",
         "record a drive with a loop; where there was one, ids change: let the detector give each landmark its own",
     ),
     "no_parallax": Kind(
@@ -206,7 +206,7 @@ KINDS: dict[str, Kind] = {
     ),
     "ids_exchanged": Kind("two landmarks exchange their ids", _ID),
     "ids_renewed": Kind(
-        "the ids of all landmarks are new from some time on",
+        "the ids of all landmarks are new from some time on, once or again and again",
         "let the detector keep its ids when it begins anew; without ids set landmarks.association=joint",
     ),
     "landmark_moved": Kind("a landmark was moved during the drive", "use landmarks that nobody moves"),

@@ -1,7 +1,7 @@
-"""Find that the detector has numbered all landmarks anew on the way, as after a restart.
+"""Find that the detector has numbered all landmarks anew on the way, as after a restart, once or several times.
 
-Then no id of before is seen any more, and most new landmarks lie where others were. The two halves of the map have no
-landmark in common, so nothing corrects the one by the other.
+Then there is a time from which on no id of before is seen any more, and most new landmarks lie where others were. The
+two parts of the map have no landmark in common, so nothing corrects the one by the other.
 """
 
 from dataclasses import dataclass
@@ -14,8 +14,10 @@ from graph_slam_ros.typing import Array, Index
 LEAST = 4
 """Sightings of an id that counts, and ids on either side."""
 
-_SPANNING = 0.05  # part of the ids that may be seen on both sides: wrong ones
-_SAME, _NEAR, _NEAR_M = 0.5, 0.4, 1.0  # part of the new ids that lie where others were; how near, in spacings, at most
+_SPANNING = 0.1  # part of the ids of either side that may be seen on both: wrong ones
+_SAME, _NEAR, _NEAR_M = 0.5, 0.5, 1.0  # part of the new ids that lie where others were; how near, in spacings, at most
+_BY_CHANCE, _SIGMAS = 0.16, 4.0  # part of them that is so near to another by chance, in landmarks that lie at random
+_NEXT = 5  # ids that are new after one, of which the nearest is how far apart landmarks are
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,34 +37,42 @@ class RenewedIds:
     def __str__(self) -> str:
         return (
             f"from {self.since_ns * 1e-9:.3f} s on all ids are new, and {self.same} of {self.new} landmarks lie where "
-            "others were: did the detector begin anew?"
+            "others were: did the detector begin anew, once or again and again?"
         )
 
 
 def renewed_ids(at: Array, first_ns: Index, last_ns: Index) -> RenewedIds | None:
     """Return which ids are new from some time on; None if none are.
 
+    Of several such times it is that from which on the most landmarks lie where others were.
+
     Parameters
     ----------
     at : (n, d) where the landmark of each id is [m]
     first_ns, last_ns : (n,) stamps at which each id was seen first and last
     """
-    since_ns = _cut(first_ns, last_ns)
-    if since_ns is None:
+    ends_ns = _ended_there(at, first_ns, last_ns)
+    since_ns = np.unique(first_ns)
+    before = np.searchsorted(np.sort(last_ns), since_ns)
+    new = len(first_ns) - np.searchsorted(np.sort(first_ns), since_ns)
+    spanning = len(first_ns) - before - new
+    again = ends_ns < first_ns
+    same = np.searchsorted(np.sort(ends_ns[again]), since_ns) - np.searchsorted(np.sort(first_ns[again]), since_ns)
+    least = np.maximum(_SAME * new, _BY_CHANCE * new + _SIGMAS * np.sqrt(_BY_CHANCE * (1.0 - _BY_CHANCE) * new))
+    is_renewed = (same >= np.maximum(least, LEAST)) & (spanning <= _SPANNING * np.minimum(before, new))
+    if not is_renewed.any():
         return None
-    old, new = last_ns < since_ns, first_ns >= since_ns
-    tree = KDTree(at[old])
-    near_m = min(_NEAR * float(np.median(tree.query(at[old], k=2)[0][:, 1])), _NEAR_M)
-    same = int((tree.query(at[new])[0] < near_m).sum())
-    return RenewedIds(since_ns, int(new.sum()), same) if same >= max(LEAST, _SAME * new.sum()) else None
+    best = int(np.where(is_renewed, same, 0).argmax())
+    return RenewedIds(int(since_ns[best]), int(new[best]), int(same[best]))
 
 
-def _cut(first_ns: Index, last_ns: Index) -> int | None:
-    """Return the stamp that parts most ids into old and new ones; None if none does."""
-    cuts = np.unique(first_ns)
-    before = np.searchsorted(np.sort(last_ns), cuts)
-    since = len(first_ns) - np.searchsorted(np.sort(first_ns), cuts)
-    spanning = len(first_ns) - before - since
-    fewer = np.where(spanning <= _SPANNING * len(first_ns), np.minimum(before, since), 0)
-    best = int(fewer.argmax()) if len(fewer) else 0
-    return int(cuts[best]) if len(fewer) and fewer[best] >= LEAST else None
+def _ended_there(at: Array, first_ns: Index, last_ns: Index) -> Index:
+    """(n,) When the first of the ids near each was seen last, itself among them."""
+    in_order, n = at[np.argsort(first_ns, kind="stable")], len(at) - _NEXT
+    apart = [np.linalg.norm(in_order[k : k + n] - in_order[:n], axis=1) for k in range(1, _NEXT + 1)]
+    near_m = min(_NEAR * float(np.median(np.min(apart, axis=0))), _NEAR_M)
+    a, b = KDTree(at).query_pairs(near_m, output_type="ndarray").T
+    ends_ns = last_ns.copy()
+    np.minimum.at(ends_ns, a, last_ns[b])
+    np.minimum.at(ends_ns, b, last_ns[a])
+    return ends_ns

@@ -42,6 +42,34 @@ def test_a_detector_that_begins_anew_is_found_though_some_ids_are_wrong(wrong):
     assert found.value >= 28
 
 
+def renewed(drive):
+    s, points = sightings(drive)
+    return list(check_renewed(s, points, np.array([900 * NS, 2000 * NS]), 2))
+
+
+ROWS = np.array([(2.0 * k, 3.0 * row) for row in range(6) for k in range(15)])
+HALF = lap(1000.0, "a{}", ROWS[:45]) + lap(1140.0, "b{}", ROWS[45:])
+
+
+@pytest.mark.parametrize("drift_m", [0.0, 0.7])
+@pytest.mark.parametrize("every_s", [25.0, 100.0, 200.0])
+def test_a_detector_that_begins_anew_again_and_again_is_found(every_s, drift_m):
+    """On new ground in the first half, and there again in the second."""
+    later = ROWS + np.array([drift_m, 0.0])
+    laps = HALF + lap(1280.0, "a{}", later[:45]) + lap(1420.0, "b{}", later[45:])
+    (found,) = renewed([(t, f"{name}, {t // every_s}", at) for t, name, at in laps])
+    assert (found.code, found.severity) == ("ids_renewed", "warning")
+    assert 1180 * NS <= found.first_ns <= 1290 * NS
+    assert 80 <= found.value <= found.count <= 160
+
+
+def test_a_way_out_and_back_past_its_landmarks_has_the_same_ids_but_for_a_few():
+    back = lap(1280.0, "b{}", ROWS[45:][::-1]) + lap(1420.0, "a{}", ROWS[:45][::-1])
+    back = [(t, name if k % 20 else f"{name} wrong", at) for k, (t, name, at) in enumerate(back)]
+    for end_s in (1280.0, 1285.0, 1300.0, 1420.0, 1600.0):
+        assert renewed([one for one in HALF + back if one[0] < end_s]) == []
+
+
 @pytest.mark.parametrize(
     "drive",
     [
