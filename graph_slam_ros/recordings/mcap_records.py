@@ -111,8 +111,8 @@ def records(
     """Schemas, channels and messages in order of the file.
 
     A damaged part is skipped up to the next chunk; a truncated end stops the reading. Each adds a line to ``losses``. A
-    line in ``warnings`` names damage in a file without checksums, which may have more. ``follow``: the file may be a
-    symbolic link.
+    line in ``warnings`` names damage in a file without checksums, which may have more, or a file that is cut off behind
+    its messages. ``follow``: the file may be a symbolic link.
     """
     known = len(losses)
     read, unchecked, is_unindexed = 0, False, False
@@ -142,8 +142,8 @@ def records(
                 if is_unindexed and record.data_section_crc not in (0, _checksum(stream, at)):
                     losses.append(f"{path.name}: damaged: its data do not agree with their checksum")
                 unchecked |= is_unindexed and not record.data_section_crc
-                if not _ends_whole(stream):
-                    losses.append(f"{path.name}: cut off after {read} messages, in the summary behind them")
+                if len(losses) == known and warnings is not None and not _ends_whole(stream):
+                    warnings.append(f"{path.name}: cut off in the summary at its end; all {read} messages were read")
                 break
             elif record is not None:
                 is_unindexed |= isinstance(record, Message)
