@@ -44,13 +44,18 @@ class CommandParser(argparse.ArgumentParser):
             raise argparse.ArgumentError(action, f"{error.message}{near}") from None
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
-        """Refuse options that the command does not have, with the option that is close."""
+        """Refuse options that the command does not have, with the option that is close, and a second recording."""
         known, rest = super().parse_known_args(args, namespace)
         options = [word.partition("=")[0] for word in rest if word.startswith("--")]
         if options:
             self.error(
                 f"unrecognized arguments: {' '.join(rest)}{did_you_mean(options[0], self._option_string_actions)}"
             )
+        if rest and hasattr(known, "bag"):
+            parts = (
+                f"{rest[0]} is one recording too many: parts of one drive go into one folder, and BAG is that folder"
+            )
+            self.error(parts)
         return known, rest
 
     def error(self, message: str) -> NoReturn:

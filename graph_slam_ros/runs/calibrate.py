@@ -42,7 +42,7 @@ class Calibrated:
     ----------
     settings : parameters to be set, by dotted name
     parameters : of the last replay, as ``calibration`` in ``run.json``
-    command : the replay with them
+    command : the replay with them; the next calibration, where one setting is to be made before
     rounds : replays, that of a part included
     is_complete : whether the last replay found nothing more
     refused : why what was found is not among the settings; empty if it is
@@ -93,7 +93,8 @@ def calibrate(
         raise GraphSlamError(f"{path}: no odometry of it could be used: graph_slam info {path}")
     found, refused = rounds.found, rounds.refused
     parameters = rounds.parameters or ([] if refused else list(_undriven(config, rounds.keyframes)))
-    command = suggested.suggestion.command(found | dict(settings or {}) | found)
+    name = "calibrate" if rounds.named else "replay"
+    command = suggested.suggestion.command(found | dict(settings or {}) | found | rounds.named, name=name)
     outcome = parameters, command, rounds.count, rounds.is_complete, refused, rounds.fault
     return Calibrated(found, *outcome, _once(bag.losses), _once(bag.warnings))
 
@@ -104,6 +105,7 @@ class _Rounds:
     Attributes
     ----------
     found, parameters, refused, fault, is_complete : as of ``Calibrated``
+    named : the setting that is to be made first, if ``refused`` names one
     count : replays so far
     keyframes : of the last replay of the whole recording
     """
@@ -112,6 +114,7 @@ class _Rounds:
         self.found: dict[str, float | str] = {}
         self.parameters: list[dict[str, Any]] = []
         self.refused, self.is_complete = "", False
+        self.named: dict[str, float | str] = {}
         self.fault: Finding | None = None
         self.count = self.keyframes = 0
         self._bag, self._inputs, self._config, self._progress = bag, inputs, config, progress
@@ -128,7 +131,9 @@ class _Rounds:
             if _is_less(accepted, before):
                 self.refused, self.found = _harm(self.found, kept, before, accepted), kept
                 return
-            self.refused = _wrong(self.fault) or _misplaced(slam, slam.config)
+            self.refused = _wrong(self.fault)
+            if not self.refused:
+                self.refused, self.named = _misplaced(slam, slam.config)
             if self.refused:
                 self.found, self.parameters = {}, []
                 return
@@ -214,8 +219,8 @@ def _wrong(fault: Finding | None) -> str:
     return f"nothing is calibrated: mend {fault.code} first"
 
 
-def _misplaced(slam: GraphSlam, config: Config) -> str:
-    """Return why nothing is used where a sensor is elsewhere on the robot, or its ranges have an offset.
+def _misplaced(slam: GraphSlam, config: Config) -> tuple[str, dict[str, float | str]]:
+    """Return why nothing is used where a sensor is elsewhere on the robot, or its ranges have an offset; the setting.
 
     That passes for scale and yaw. The offset of ranges alone is fitted with the scale, and hides nothing.
     """
@@ -225,13 +230,14 @@ def _misplaced(slam: GraphSlam, config: Config) -> str:
             continue
         key, value = off.setting
         if key == f"{off.source}.range_offset_m" and off.source not in fitted:
-            return f"{_HIDES}: {off}. Set it, and calibrate again: --set {key}={value}"
+            return f"{_HIDES}: {off}. Set it, and calibrate again: --set {key}={value}", {key: value}
         if off.code == CODES["x"]:
             source = next(one for one in config.sources if one.name == off.source)
             turn = source.numbers("mount_correction", 6)[3:] or (0.0, 0.0, 0.0)
             mount = " ".join((*str(value).split()[:3], *(f"{angle:.5g}" for angle in turn)))
-            return f"{_HIDES}: {off}. Measure it, or --set {key}='{mount}'"
-    return ""
+            text = f"{_HIDES}: {off}. Measure it, or calibrate again with --set {key}='{mount}'"
+            return text, {key: mount}
+    return "", {}
 
 
 def _accepted(slam: GraphSlam) -> tuple[int, int]:

@@ -72,16 +72,18 @@ class Suggestion:
             self._finish()
             self.trouble = self._refused(bag)
 
-    def command(self, more: Mapping[str, Any] | None = None, without: Collection[str] = ()) -> str:
+    def command(
+        self, more: Mapping[str, Any] | None = None, without: Collection[str] = (), name: str = "replay"
+    ) -> str:
         """The command to paste into a shell, with additional settings, and without some of its own."""
         path = str(self._path)
-        words = ["graph_slam", "replay", f"./{path}" if path.startswith("-") else path]
-        for option, name in (("--odom", "odom"), ("--landmarks", "detections")):
-            words += [option, self.topics[name]] if name in self.topics else []
+        words = ["graph_slam", name, f"./{path}" if path.startswith("-") else path]
+        for option, source in (("--odom", "odom"), ("--landmarks", "detections")):
+            words += [option, self.topics[source]] if source in self.topics else []
         own = {key: value for key, value in self.settings.items() if key not in without}
         for key, value in (own | dict(more or {})).items():
             words += ["--set", assignment(key, value)]
-        return shlex.join([*words, "--out", str(suggested_out(self._path))])
+        return shlex.join([*words, *(("--out", str(suggested_out(self._path))) if name == "replay" else ())])
 
     def _refused(self, bag: Bag) -> str:
         """Return why the command would be refused; empty if it would not be."""

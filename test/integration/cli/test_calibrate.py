@@ -2,6 +2,7 @@
 
 import json
 import re
+import shlex
 
 import pytest
 from places import ROOT
@@ -105,6 +106,10 @@ def test_an_offset_of_ranges_is_said_instead_of_the_scale_that_would_hide_it(tmp
     assert "distance_factor" not in out
     found = re.search(r"ranges are 0\.\d+ m too long .*--set ranges.range_offset_m=(\S+)$", err, re.MULTILINE)
     assert float(found[1]) == pytest.approx(0.0, abs=0.04)
+    command = out.splitlines()[-1].removeprefix("next: ")
+    assert command.startswith("graph_slam calibrate ") and f"ranges.range_offset_m={found[1]}" in command
+    assert main(shlex.split(command)[1:]) in (0, 4)
+    assert " replay " in capsys.readouterr().out.splitlines()[-1]
     assert main(["check", bag, *given]) == 4
     out = capsys.readouterr().out
     assert "[warning] range_scale" in out

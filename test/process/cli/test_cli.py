@@ -272,6 +272,10 @@ REFUSED = {
         "did you mean 'wrong_mount'?",
     ),
     "unknown option": (["info", "{bag}", "--fast"], "unrecognized arguments: --fast"),
+    "two bags": (
+        ["check", "{bag}", "{cut}"],
+        "cut.mcap is one recording too many: parts of one drive go into one folder",
+    ),
     "no bag": (["replay"], "graph_slam replay: the following arguments are required: BAG"),
     "no out": (["replay", "{bag}"], "replay needs --out DIR"),
     "missing bag": (["replay", "none.mcap", "--out", "{out}"], "none.mcap: no such file or folder"),
