@@ -51,7 +51,7 @@ def imperfect_drive_and_truth(
 
     Parameters
     ----------
-    kind : of sightings: range_bearing, position or range
+    kind : of sightings: range_bearing, position, range or bearing
     turns : amplitude of the turn rate [rad/s]
     """
     random = np.random.default_rng(seed)
@@ -92,6 +92,8 @@ def _sighting(
     bearing = bearing - faults.yaw + 0.01 * random.standard_normal()
     if kind == "range":
         return Sighting(name, "range", (float(far),), (0.03**2,))
+    if kind == "bearing":
+        return Sighting(name, kind, (float(bearing),), (0.01**2,))
     if kind == "range_bearing":
         return Sighting(name, kind, (float(far), float(bearing)), (0.03**2, 0.0, 0.0, 0.01**2))
     turn = np.array([[np.cos(bearing), -np.sin(bearing)], [np.sin(bearing), np.cos(bearing)]])

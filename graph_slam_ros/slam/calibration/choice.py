@@ -14,7 +14,7 @@ def parameters_of(problem: TrialProblem, groups: Collection[str], *, chooses: bo
     Parameters
     ----------
     chooses : where all inputs of landmarks have ranges alone, these have an offset and a factor, as radios do, and
-        odometry keeps its scale: one of the two must
+        odometry keeps its scale: one of the two must; so does it where bearings alone tell no scale
     """
     if len(problem.keyframes) < _LEAST_KEYFRAMES:
         return []
@@ -25,6 +25,8 @@ def parameters_of(problem: TrialProblem, groups: Collection[str], *, chooses: bo
         kinds.setdefault(edges.source, set()).add(edges.kind)
     if chooses and kinds and all(only_ranges(some) for some in kinds.values()):
         groups = {*groups, "range_factor", "range_offset"}
+        excluded.add("distance")
+    if chooses and kinds and all(only_bearings(some) for some in kinds.values()) and not _has_scale(problem):
         excluded.add("distance")
     if any("offset" in kind for some in kinds.values() for kind in some):
         excluded.add("range_offset")  # it is an unknown of the graph
@@ -64,3 +66,13 @@ def offsets_of(problem: TrialProblem) -> list[Parameter]:
 def only_ranges(kinds: Collection[str]) -> bool:
     """Return whether kinds of edges measure distances alone."""
     return all(kind.startswith("range") and kind != "range and bearing" for kind in kinds)
+
+
+def only_bearings(kinds: Collection[str]) -> bool:
+    """Return whether kinds of edges measure directions alone."""
+    return all(kind.startswith("bearing") for kind in kinds)
+
+
+def _has_scale(problem: TrialProblem) -> bool:
+    """Return whether something besides odometry and landmarks that are new has a scale: a fix, a closure, a map."""
+    return bool(set(problem.graph.labels) - {"anchor", "odometry", "landmarks"}) or len(problem.held) > 1

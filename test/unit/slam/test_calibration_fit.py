@@ -93,6 +93,16 @@ def test_where_nothing_is_wrong_nothing_is_found():
     assert {one.parameter.name: one.verdict for one in findings} == dict.fromkeys(TRUTH, "nothing_to_correct")
 
 
+def test_bearings_alone_tell_no_scale_and_a_mount_is_found_where_odometry_keeps_its_own():
+    slam = driven(imperfect_drive(Faults(yaw=0.08), kind="bearing", seconds=60.0))
+    assert "distance" in {one.name for one in parameters_of(trial_problem(slam), ["factors"])}, "if it is asked for"
+    _, findings = slam.trial_fit(chooses=True)
+    by_name = {one.parameter.name: one for one in findings}
+    assert by_name.keys() == {"turn", "clock", "yaw"}
+    assert by_name["yaw"].verdict == "admitted"
+    assert by_name["yaw"].value == pytest.approx(0.08, abs=0.015)
+
+
 def test_the_fit_changes_nothing(wrong):
     before, measured = wrong.solver.values, [t.measured.values.copy() for t in wrong.graph.tables.values()]
     wrong.trial_fit(GROUPS)
