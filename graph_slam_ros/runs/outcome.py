@@ -12,6 +12,7 @@ from typing import Any
 from graph_slam_ros.check.finding import KINDS
 from graph_slam_ros.measurements.reasons import Effect, Reason, explain, remedy
 from graph_slam_ros.runs.tables import INPUT_COLUMNS
+from graph_slam_ros.runs.undetermined import wrong_sides
 from graph_slam_ros.slam.frontend.gyro import GyroState
 
 Summary = Mapping[str, Any]
@@ -292,6 +293,7 @@ def doubts(summary: Summary) -> Iterator[str]:
     """
     for text in ambiguities(summary.get("rivals", ())):
         yield f"{text} (graph_slam explain RUN)"
+    yield from filter(None, [wrong_sides(summary.get("landmarks", 0), summary.get("waiting", {}))])
     yield from _uncorrected(summary)
     if renewed := summary.get("renewed_ids"):
         yield renewed_text(renewed)

@@ -86,3 +86,15 @@ def test_an_odometry_without_any_message_is_one_and_a_spare_one_is_none():
     silent = {"use": "odometry", "received": 0, "used": 0, "believed": None}
     assert [*shortcomings(summary({}, vo=silent))] == ["vo: no message came"]
     assert not [*shortcomings(summary({}, vo=silent | {"received": 90}))]
+
+
+@pytest.mark.parametrize(("known", "two_places", "is_said"), [(23, 27, True), (66, 8, False), (3, 3, False)])
+def test_ranges_alone_that_leave_many_landmarks_without_a_side_are_said(known, two_places, is_said):
+    waiting = {str(k): "2 places fit: (1.56, -2.35) and (-2.20, -1.20)" for k in range(two_places)}
+    waiting["seen once"] = "1 sighting by range: too few"
+    run = summary({}) | {"landmarks": known, "waiting": waiting}
+    said = list(doubts(run))
+    assert len(said) == is_said
+    if is_said:
+        assert said[0].startswith("ranges alone: of 27 of 51 landmarks two places fit, one on either side")
+        assert "landmarks.surveyed" in said[0]
