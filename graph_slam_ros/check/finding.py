@@ -94,7 +94,10 @@ KINDS: dict[str, Kind] = {
         "odometry is so slow that the pose at a sighting is interpolated over a long time",
         "publish odometry at 10 Hz or more",
     ),
-    "jitter": Kind("the times between stamps vary a lot", "stamp messages when they are measured, not on arrival"),
+    "jitter": Kind(
+        "the times between stamps vary a lot",
+        "stamp messages when they are measured, not on arrival; no setting mends stamps that scatter",
+    ),
     # -- frames
     "frame_unlinked": Kind("no transform links a sensor's frame to the robot", _MOUNT),
     "two_parents": Kind("a frame has two parents, so transforms through it are arbitrary", _PUBLISHER),

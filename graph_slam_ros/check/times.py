@@ -22,6 +22,7 @@ _LEAST_ROUNDED_NS, _AS_OTHERS, _COARSE_S = 1_000_000, 0.1, 0.15
 _LONG_S, _VERY_LONG_S, _PERIODS, _MOVED_M, _TURNED = 1.0, 2.0, 10.0, 0.05, 0.05
 _SLOW_HZ, _BETWEEN_S = 5.0, 0.02
 _JITTER, _FAST_HZ = 1.5, 200.0
+_SCATTERED_S, _REGULAR, _LEAST_STEPS = 0.05, 0.2, 50
 _OUTSIDE, _MARGIN_NS = 0.2, 500_000_000
 
 
@@ -43,6 +44,7 @@ def check_times(c: Columns) -> Iterator[Finding]:
     yield from _clocks(c, stamped)
     for topic in stamped.values():
         yield from _order(c, topic)
+        yield from _scattered(topic)
     yield from _rate(c)
     yield from _overlap(c)
 
@@ -237,6 +239,27 @@ def _rate(c: Columns) -> Iterator[Finding]:
     if spread > _JITTER and 1.0 / median_s < _FAST_HZ:
         text = f"{o.topic}: the times between stamps vary by {spread:.1f} times their median: stamped on arrival?"
         yield Finding("jitter", "note", spread, _JITTER, "times", text, **where)
+
+
+def _scattered(topic: TopicColumns) -> Iterator[Finding]:
+    """Sightings that are recorded at regular times and stamped at others: each stamp is wrong by an error of its own.
+
+    Messages that are late on their way are not: those are recorded at irregular times.
+    """
+    stamped = topic.stamp_ns != 0
+    if topic.use != "landmarks" or np.count_nonzero(stamped) <= _LEAST_STEPS:
+        return
+    recorded_s, step_s = (np.diff(of[stamped]) * 1e-9 for of in (topic.log_ns, topic.stamp_ns))
+    every_s, median_s = float(np.median(recorded_s)), float(np.median(step_s))
+    vary_s, regular_s = (float(np.subtract(*np.percentile(of, [90.0, 10.0]))) for of in (step_s, recorded_s))
+    is_regular = abs(median_s - every_s) < _REGULAR * every_s and regular_s < _REGULAR * vary_s
+    if vary_s > _SCATTERED_S and is_regular:
+        text = (
+            f"{topic.name}: a message is recorded each {every_s:.2f} s, and the times between stamps vary by "
+            f"{vary_s:.2f} s: each stamp is wrong by an error of its own"
+        )
+        at: Where = {"topic": topic.name, "first_ns": int(topic.stamp_ns[stamped][0]), "count": len(step_s) + 1}
+        yield Finding("jitter", "warning", vary_s, _SCATTERED_S, "s", text, **at)
 
 
 def _often(times: int) -> str:

@@ -1,6 +1,8 @@
 """``graph_slam check`` on whole recordings: what a person sees, and the mistakes that people make."""
 
 import json
+import random
+from dataclasses import replace
 from itertools import count
 
 import numpy as np
@@ -13,7 +15,7 @@ from graph_slam_ros.messages.from_msg import decoder
 from graph_slam_ros.messages.to_msg import encode, header, make, transform
 from graph_slam_ros.recordings.bag import BagWriter, open_bag
 from graph_slam_ros.runs import check as runs_check
-from graph_slam_ros.simulation import Fault, simulate, write_faulty_bag
+from graph_slam_ros.simulation import Fault, simulate, write_bag, write_faulty_bag
 
 
 @pytest.fixture(scope="module")
@@ -387,6 +389,25 @@ def test_rounded_stamps_are_not_taken_for_two_publishers(drive, check, tmp_path,
     code, found, _ = check(copy(drive, tmp_path / "a.mcap", rounded(to_ns)), "--quick")
     assert (code, found[name]["value"]) == (exit_code, pytest.approx(to_ns * 1e-9))
     assert not {"duplicates", "other_publisher", "duplicate_stamp"} & found.keys()
+
+
+@pytest.mark.parametrize("is_late", [False, True])
+def test_stamps_of_landmarks_that_scatter_are_found_and_late_messages_are_not(check, tmp_path, is_late):
+    rng, bag = random.Random(1), tmp_path / "drive.mcap"
+    write_bag(simulate("warehouse", 3, aisles=2, aisle_m=6.0, laps=1), bag)
+    if is_late:
+        late = [(m.log_ns + rng.randrange(200_000_000) * (m.topic == "/landmarks"), m) for m in read(bag)[0]]
+        late = [replace(m, log_ns=log_ns) for log_ns, m in sorted(late, key=lambda one: one[0])]
+        write_mcap(bag, late)
+
+    def change(topic, m):
+        if topic == "/landmarks" and not is_late:
+            stamp_ns = m.header.stamp.sec * 10**9 + m.header.stamp.nanosec - rng.randrange(200_000_000)
+            m.header.stamp.sec, m.header.stamp.nanosec = divmod(stamp_ns, 10**9)
+        return m
+
+    _, found, _ = check(copy(bag, tmp_path / "a.mcap", change), "--quick")
+    assert {one["severity"] for code, one in found.items() if code == "jitter"} == (set() if is_late else {"warning"})
 
 
 def test_landmarks_of_one_stamp_have_no_clock_of_their_own(drive, check, tmp_path):
