@@ -267,11 +267,9 @@ class Finding:
 
     @property
     def forbids_replay(self) -> bool:
-        """Return whether a replay is of no use until the cause is corrected: no setting mends it.
-
-        Of a damaged recording, what can be read is of use.
-        """
-        return self.severity == "error" and not self.settings and self.code != "damaged"
+        """Return whether a replay is of no use until the cause is corrected: no setting mends it."""
+        is_refusal = self.code not in KINDS or self.code == "seen_in_fixed_frame"
+        return self.severity == "error" and not self.settings and (self.ends or is_refusal)
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values; a number that JSON has not is null."""

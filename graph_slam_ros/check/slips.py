@@ -60,7 +60,8 @@ def _errors(slam: GraphSlam) -> tuple[Array, Array, Index]:
         return np.empty((0, 2)), np.empty((0, 2)), stamps_ns
     stated, found = (se3.between(tuple(poses[:-1].T), tuple(poses[1:].T)) for poses in (own, estimate))
     error = np.stack(se3.local(found, stated), axis=1)
-    begins = np.isin(order, slam.segments)
+    decided = {index for alarm in slam.alarms if (index := getattr(alarm, "segment", None)) is not None}
+    begins = np.isin(order, [index for index in slam.segments if index not in decided])
     error[begins[1:]] = 0.0  # odometry was restarted or jumps there, which is another finding
     moved = np.stack(se3.local(stated, se3.IDENTITY), axis=1)
     sizes = np.stack([np.linalg.norm(moved[:, :3], axis=1), np.linalg.norm(moved[:, 3:], axis=1)], axis=1)
