@@ -31,7 +31,7 @@ def guided(name):
 DRIVES = (
     *("advise", "calibration_consistency", "calibration_random", "consistency", "displacement", "extreme_fixes"),
     *("bad_drives", "gyro_drives", "determination", "initialization", "mirrored_ranges", "several_odometries"),
-    *("nees", "planted", "simulation", "slip", "uncorrected", "unnamed"),
+    *("nees", "planted", "simulation", "slip", "recordings", "uncorrected", "unnamed"),
 )
 PROGRAMMES = {
     "lifelong": [

@@ -4,6 +4,8 @@ from pathlib import Path
 
 import yaml
 
+from graph_slam_ros.formats.files import read_text
+
 
 def as_listed(path: Path, found: list[Path]) -> tuple[list[Path], list[str], list[str]]:
     """The files that metadata.yaml names, where any of them is there; and what it says beyond them.
@@ -28,7 +30,7 @@ def _names_in(metadata: Path) -> list[str]:
     if not metadata.is_file():
         return []
     try:
-        content = yaml.safe_load(metadata.read_text())
+        content = yaml.safe_load(read_text(metadata, follow=True))
         return [str(name) for name in content["rosbag2_bagfile_information"]["relative_file_paths"]]
     except (OSError, UnicodeError, yaml.YAMLError, TypeError, KeyError, RecursionError):
         return []

@@ -112,7 +112,7 @@ def records(
 
     A damaged part is skipped up to the next chunk; a truncated end stops the reading. Each adds a line to ``losses``. A
     line in ``warnings`` names damage in a file without checksums, which may have more, or a file that is cut off behind
-    its messages. ``follow``: the file may be a symbolic link.
+    its messages; without ``warnings`` the latter is a loss. ``follow``: the file may be a symbolic link.
     """
     known = len(losses)
     read, unchecked, is_unindexed = 0, False, False
@@ -142,8 +142,9 @@ def records(
                 if is_unindexed and record.data_section_crc not in (0, _checksum(stream, at)):
                     losses.append(f"{path.name}: damaged: its data do not agree with their checksum")
                 unchecked |= is_unindexed and not record.data_section_crc
-                if len(losses) == known and warnings is not None and not _ends_whole(stream):
-                    warnings.append(f"{path.name}: cut off in the summary at its end; all {read} messages were read")
+                if len(losses) == known and not _ends_whole(stream):  # of a journal it may be more than the summary
+                    where = losses if warnings is None else warnings
+                    where.append(f"{path.name}: cut off in the summary at its end; all {read} messages were read")
                 break
             elif record is not None:
                 is_unindexed |= isinstance(record, Message)

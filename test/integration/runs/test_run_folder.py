@@ -395,6 +395,7 @@ def test_a_reader_of_a_run_folder_follows_no_link():
         "node/parameters.py: Path(file)",  # of the command line
         "recordings/ros1_records.py: path",
         "recordings/bag.py: file",
+        "formats/bag_folder.py: metadata",
         "analysis/trajectories.py: path",
         "report/places.py: file",
         "report/places.py: file.parent / os.fspath(content['image'])",  # of a floor plan that the user names
