@@ -32,5 +32,5 @@ def _names_in(metadata: Path) -> list[str]:
     try:
         content = yaml.safe_load(read_text(metadata, follow=True))
         return [str(name) for name in content["rosbag2_bagfile_information"]["relative_file_paths"]]
-    except (OSError, UnicodeError, yaml.YAMLError, TypeError, KeyError, RecursionError):
+    except (OSError, ValueError, yaml.YAMLError, TypeError, KeyError, RecursionError):
         return []

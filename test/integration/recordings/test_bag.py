@@ -53,7 +53,13 @@ def test_of_a_folder_the_files_are_read_that_its_metadata_name(tmp_path, message
     assert bag.losses == [f"{tmp_path / 'bag_2.mcap'}: not there, though metadata.yaml names it"]
     assert len(bag.warnings) == 1
     assert bag.warnings[0].startswith(f"{tmp_path / 'bag_0_copy.mcap'}: not read, as metadata.yaml does not name it")
-    for content in ("rosbag2_bagfile_information: {relative_file_paths: [other.mcap]}", "[", "a: *b", "{}"):
+    for content in (
+        "rosbag2_bagfile_information: {relative_file_paths: [other.mcap]}",
+        "[",
+        "a: *b",
+        "{}",
+        "a: 2026-99-99",
+    ):
         (tmp_path / "metadata.yaml").write_text(content)
         assert sum(topic.count for topic in open_bag(tmp_path).topics.values()) == len(messages) + half
 
