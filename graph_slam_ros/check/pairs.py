@@ -1,7 +1,9 @@
 """Pairs of sightings of the same landmark, seen twice within a few seconds: drift is negligible in so short a time."""
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -88,3 +90,37 @@ def pairs_of(s: SightingColumns, path_ns: Index, path: Array, dimensions: int) -
     if len(chosen) > _MOST_PAIRS:
         chosen = chosen[np.linspace(0, len(chosen) - 1, _MOST_PAIRS).astype(np.int64)]
     return Pairs(a[chosen], b[chosen], motion[chosen], dimensions)
+
+
+def changes_by_motion(
+    s: SightingColumns,
+    measured: Array,
+    at: Array,
+    chosen: Index,
+    later_s: float,
+    least: float,
+    differ: tuple[Callable[[Any, Any], float], Callable[[float, float], float]],
+) -> Array:
+    """Return the change of what is measured of each landmark, per metre or radian that the robot has moved.
+
+    Parameters
+    ----------
+    measured : (k,) of all sightings
+    at : (m, ...) the pose of the robot at each chosen sighting, or a part of it
+    chosen : (m,) the sightings that count
+    later_s, least : how long after one sighting another may be, and how far the robot has moved in between
+    differ : the motion between two of ``at``, and the change between two measured values
+    """
+    moved_between, changed_between = differ
+    found = []
+    for name in np.unique(s.name[chosen]):
+        own = np.flatnonzero(s.name[chosen] == name)
+        rows = own[np.argsort(s.stamp_ns[chosen[own]], kind="stable")].tolist()
+        first = rows[0]
+        for k in rows[1:]:
+            if (s.stamp_ns[chosen[k]] - s.stamp_ns[chosen[first]]) * 1e-9 > later_s:
+                first = k
+            elif abs(moved := moved_between(at[first], at[k])) > least:
+                found.append(changed_between(float(measured[chosen[first]]), float(measured[chosen[k]])) / moved)
+                first = k
+    return np.array(found)

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from graph_slam_ros.check.finding import Finding, Where
-from graph_slam_ros.check.pairs import poses_at
+from graph_slam_ros.check.pairs import changes_by_motion, poses_at
 from graph_slam_ros.check.sightings import SightingColumns
 from graph_slam_ros.typing import Array, Index
 
@@ -19,8 +19,7 @@ def check_ranges(s: SightingColumns, path_ns: Index, path: Array) -> Iterator[Fi
     is_named = np.array([bool(name) for name in s.names], dtype=bool)[s.name]
     use = np.flatnonzero(np.isfinite(s.ranges) & inside & is_named)
     places = poses_at(s.stamp_ns[use], path_ns, path)[:, :3]
-    changes = [_changes(s, use[s.name[use] == k], places[s.name[use] == k]) for k in np.unique(s.name[use])]
-    each = np.concatenate(changes) if changes else np.empty(0)
+    each = changes_by_motion(s, s.ranges, places, use, _LATER_S, _DRIVEN_M, (_driven, _changed))
     factor, least = np.quantile(each, [0.5, _FEWEST]).tolist() if len(each) >= _LEAST else (0.0, 0.0)
     if factor > _FASTEST or least > _MOST:
         text = f"{s.topic}: ranges change by {factor:.3g} for each metre of odometry: are both metres?"
@@ -28,15 +27,9 @@ def check_ranges(s: SightingColumns, path_ns: Index, path: Array) -> Iterator[Fi
         yield Finding("units", "error", factor, _MOST, "m/m", text, **where)
 
 
-def _changes(s: SightingColumns, chosen: Index, places: Array) -> Array:
-    """The change of the ranges of one landmark per metre driven, between sightings a metre or more apart."""
-    order = np.argsort(s.stamp_ns[chosen], kind="stable")
-    stamp_ns, ranges, places = s.stamp_ns[chosen][order], s.ranges[chosen][order], places[order]
-    found, first = [], 0
-    for k in range(1, len(order)):
-        if (stamp_ns[k] - stamp_ns[first]) * 1e-9 > _LATER_S:
-            first = k
-        elif (driven_m := float(np.linalg.norm(places[k] - places[first]))) > _DRIVEN_M:
-            found.append(abs(ranges[k] - ranges[first]) / driven_m)
-            first = k
-    return np.array(found)
+def _driven(a: Array, b: Array) -> float:
+    return float(np.linalg.norm(b - a))
+
+
+def _changed(a: float, b: float) -> float:
+    return abs(b - a)

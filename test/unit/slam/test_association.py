@@ -162,10 +162,11 @@ def test_where_missing_landmarks_count_nothing_new_is_behind_one_that_should_be_
         assert beam._missing(np.array(points))[0] == missing + (third == 4 and missing > 0), points
 
 
-def test_other_beams_associate_a_drive_again_from_its_beginning():
-    trees = np.array([(3.0, 2.0), (5.0, -2.0), (7.0, 2.5), (9.0, -1.5)])
-    scans = tuple(scan(k, (0.5 * k, 0.0, 0.0, 0.5 * k), trees - [0.5 * k, 0.0]) for k in range(8))
-    found = list(other_associations(PLANAR, scans, tuple(motions(scans)), np.zeros(3), SETTINGS))
+@pytest.mark.parametrize("n", [2, 3])
+def test_other_beams_associate_a_drive_again_from_its_beginning(n):
+    trees = np.array([(3.0, 2.0, 0.5), (5.0, -2.0, 0.0), (7.0, 2.5, 1.0), (9.0, -1.5, 0.2)])[:, :n]
+    scans = tuple(scan(k, (0.5 * k, 0.0, 0.0, 0.5 * k), trees - 0.5 * k * np.eye(n)[0]) for k in range(8))
+    found = list(other_associations(SPACES[n], scans, tuple(motions(scans, n)), np.array(pose(n)), SETTINGS))
     assert len(found) == 3
     for which in found:
         assert which.tolist() == [0, 1, 2, 3] * len(scans)
