@@ -202,7 +202,7 @@ def _coverage(s: SightingColumns, path_ns: Index, path: Array) -> Iterator[Findi
         yield Finding("seen_once", "warning", seldom, _ONCE, "part", text, **where)
     driven = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path[:, :3], axis=0), axis=1))])
     seconds = (path_ns - path_ns[0]) * 1e-9
-    reach_m, few, comes_back = _reach(s, chosen, path_ns[0], seconds, driven)
+    reach_m, few, comes_back = seen_over(s, chosen, path_ns[0], seconds, driven)
     least_m = float((_LOOP if comes_back else _SPAN) * driven[-1])
     if reach_m < least_m and driven[-1] > _AGAIN_M:
         again = "nothing joins its parts that are farther apart" if comes_back else "no landmark is seen again later"
@@ -211,7 +211,9 @@ def _coverage(s: SightingColumns, path_ns: Index, path: Array) -> Iterator[Findi
         yield Finding("no_closure", "warning", reach_m, least_m, "m", text, **where)
 
 
-def _reach(s: SightingColumns, chosen: Index, first_ns: int, seconds: Array, driven: Array) -> tuple[float, int, bool]:
+def seen_over(
+    s: SightingColumns, chosen: Index, first_ns: int, seconds: Array, driven: Array
+) -> tuple[float, int, bool]:
     """Return the longest way over which a landmark is seen, without how many, and whether one is seen again later.
 
     One or two of a hundred do not join a drive: where all ids change now and then, a few come back before that.

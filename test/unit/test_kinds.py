@@ -1,6 +1,7 @@
 """Kinds of tests: each has one by its folder, and a unit test can start no process."""
 
 import os
+from collections import Counter
 
 import pytest
 import soak
@@ -19,6 +20,12 @@ def test_a_unit_test_that_starts_a_process_fails_and_says_what_is_missing(start)
 def test_each_test_is_of_one_kind(request):
     assert all(sum(map(item.keywords.__contains__, KINDS)) == 1 for item in request.session.items)
     assert request.node.get_closest_marker("unit")
+
+
+def test_no_two_files_of_tests_have_one_name():
+    """The folders are no packages: pytest imports a file by its name alone, and refuses the second of two."""
+    times = Counter(file.name for file in (ROOT / "test").rglob("*.py"))
+    assert [name for name, n in times.items() if n > 1] == []
 
 
 def test_each_file_of_which_more_is_tried_in_make_soak_is_in_a_programme_of_it():

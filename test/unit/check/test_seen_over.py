@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from graph_slam_ros.check.contradictions import _reach
+from graph_slam_ros.check.contradictions import seen_over
 from graph_slam_ros.check.sightings import SightingColumns
 
 NS = 1_000_000_000
@@ -22,5 +22,5 @@ def test_a_few_ids_that_come_back_are_left_out_of_many(ids, back, few, reach_m):
     places = np.zeros((len(name), 3)), nowhere, nowhere, nowhere
     s = SightingColumns("tags", "/tags", *columns, *places, "base_link", (0.0,) * 6 + (1.0,))
     seconds = np.linspace(0.0, 400.0, 401)
-    found = _reach(s, np.arange(len(name)), 0, seconds, seconds)  # at 1 m/s
+    found = seen_over(s, np.arange(len(name)), 0, seconds, seconds)  # at 1 m/s
     assert found == (pytest.approx(reach_m), few, back > 0)
