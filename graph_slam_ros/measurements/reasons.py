@@ -355,7 +355,7 @@ REASONS: dict[str, Reason] = {
     ),
     "displacement_taken_back": Reason(
         _NOTED,
-        "a displacement was decided, and later sightings contradict it: landmarks repeat, or ids are used twice",
+        "a displacement was decided, and all or later sightings contradict it: landmarks repeat, or ids are used twice",
         "graph_slam explain RUN; give each landmark an id of its own; check the sensor's place (INPUT.mount or TF)",
     ),
     "new_while_elsewhere": Reason(

@@ -341,16 +341,14 @@ class Backend:
         self._go_on(found, keyframe)
         return edge
 
-    def rejoin(self, link: int, replacement: int, values: Array, found: DisplacementHypothesis, keyframe: int) -> None:
-        """Undo ``split``: odometry's edge is accepted again, its replacement is rejected, all others are judged anew.
-
-        Parameters
-        ----------
-        values : stored numbers of all vertices to go on from
-        """
+    def rejoin(self, link: int, replacement: int, keyframe: int, evidence: float = 0.0) -> None:
+        """Undo ``split``: odometry's edge is accepted again, and its replacement is rejected."""
         self.decisions.withdraw([replacement], keyframe, Reason.REVOKED)
-        self.decisions.reinstate(link, keyframe, found.evidence)
+        self.decisions.reinstate(link, keyframe, evidence)
         self.odometries.return_to(self.graph.edge(link).vertices, keyframe)
+
+    def judge_anew(self, values: Array, found: DisplacementHypothesis, keyframe: int) -> None:
+        """Judge all edges from other stored numbers of all vertices, and accept what shows where the robot is."""
         self.solver.start_at(values)
         self.decisions.reclassify(keyframe)
         self.decisions.exchange(found.fitting, found.contradicting, keyframe)

@@ -5,7 +5,7 @@ moves. When the evidence is strong, odometry's link to where the robot was moved
 begins there, at the pose that the landmarks show, and the path before it stays as it is.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,11 +15,12 @@ from graph_slam_ros.graph import Gaussian
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.slam.alarm import Alarm
 from graph_slam_ros.slam.backend import Backend
+from graph_slam_ros.slam.displacements import Displacement, Displacements
 from graph_slam_ros.slam.frontend.keyframes import Keyframe
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.slam.landmarks.anonymous import AnonymousLandmarks
 from graph_slam_ros.slam.robust.connections import moved_values
-from graph_slam_ros.slam.robust.displacement import SAME_M, SAME_RAD, DisplacementSearch
+from graph_slam_ros.slam.robust.displacement import DisplacementSearch
 from graph_slam_ros.slam.robust.displacement_hypothesis import DisplacementHypothesis
 from graph_slam_ros.slam.robust.innovation_monitor import InnovationMonitor
 from graph_slam_ros.slam.robust.landmark_history import LandmarkHistory
@@ -28,7 +29,7 @@ from graph_slam_ros.slam.slip_detector import SlipDetector
 from graph_slam_ros.slam.slip_review import Slip
 from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.solver import Report, Settings
-from graph_slam_ros.typing import Array, Index, Numbers
+from graph_slam_ros.typing import Index, Numbers
 
 _ALARM = 4  # sightings more for another pose than for odometry's
 _ALARM_LANDMARKS, _ALARM_KEYFRAMES = 2, 2
@@ -36,33 +37,7 @@ _DECIDED = 10
 _DECIDED_LANDMARKS, _DECIDED_KEYFRAMES = 3, 4  # two landmarks with headings tell as much as three without
 _TRIED = 5  # sightings that are compared with odometry's noise
 _MOST = 0.8  # part of the sightings since then that fit the other pose
-_DRIFT = 3.0  # sigmas
 _CALM_S = 5.0  # after the decision the alarm goes on for so long at least
-
-
-@dataclass(frozen=True, slots=True)
-class _Split:
-    """A displacement that was decided.
-
-    Attributes
-    ----------
-    first : vertex of the keyframe at which the segment begins
-    index : of that keyframe; None where a segment began there before
-    link, replacement : odometry's edge to it, which is out, and the edge with very large noise that replaces it
-    T_map_chain_before, T_map_chain : where the frame of odometry lay before, and lies since
-    chain, drift : where that frame had the keyframe, and the variances [m^2, rad^2] of odometry up to it
-    alarm : its index
-    """
-
-    first: int
-    index: int | None
-    link: int
-    replacement: int
-    T_map_chain_before: Numbers
-    T_map_chain: Numbers
-    chain: Numbers
-    drift: Array
-    alarm: int
 
 
 class KidnapDetector:
@@ -98,9 +73,8 @@ class KidnapDetector:
         self._monitor = InnovationMonitor(solver, backend.decisions, self._history)
         self._slips = SlipDetector(space, config.odometry, backend, counters, self._history, anonymous.doubt)
         self._next = graph.edge_count
-        self._splits: list[_Split] = []  # of the present frame of odometry
+        self._decided = Displacements(space, backend, self._search, counters, segments, self.alarms, anonymous.rejoined)
         self._was_doubtful = False  # the association, when the present alarm began: it is no evidence then
-        self._refuted: list[Numbers] = []  # where that frame does not lie: it was decided and taken back
 
     @property
     def is_quiet(self) -> bool:
@@ -121,12 +95,7 @@ class KidnapDetector:
         self._search.renumber(vertices, edges, first)
         self._monitor.renumber(vertices, edges)
         self._slips.renumber(vertices, edges)
-        of, edge = vertices.tolist(), edges.tolist()
-        splits = [
-            replace(one, first=of[one.first], link=edge[one.link], replacement=edge[one.replacement])
-            for one in self._splits
-        ]
-        self._splits = [one for one in splits if one.first > first and min(one.link, one.replacement) >= 0]
+        self._decided.renumber(vertices, edges, first)
         noted, self._next = edges[: self._next], graph.edge_count
         for number in range(int(np.count_nonzero(noted >= 0)), graph.edge_count):
             if (one := graph.edge(number)).label == "closures":
@@ -152,8 +121,8 @@ class KidnapDetector:
         self._search.begin(vertex)
         self._monitor.begin(vertex)
         self._slips.begin(stamp_ns)
-        self._splits.clear()
-        self._refuted.clear()
+        self._decided.clear()
+        self._anonymous.keep_displacements()
         if (now := self.now) is not None:
             outcome = "then a segment began" if now.segment is None else now.outcome
             self.alarms[-1] = replace(now, ended_ns=max(stamp_ns, now.began_ns), outcome=outcome)
@@ -197,6 +166,8 @@ class KidnapDetector:
         vertices = keyframes.ids
         if not self._backend.decides:
             return
+        if self._rejoin(keyframes, stamp_ns):
+            self._backend.decisions.reclassify(len(keyframes) - 1)
         found = self._significant(int(vertices[-1]))
         found = found and self._search.begun_at(found, self._anonymous.elsewhere.fits_from)
         is_decided = found is not None and self._is_decided(found)
@@ -204,9 +175,8 @@ class KidnapDetector:
             is_decided = False
             found = found if self.slips_now is None else None  # too few landmarks say so yet: an alarm
         if found is not None and is_decided:
-            last = self._splits[-1] if self._splits else None
-            if last and self._is_refuted(last, found, int(vertices[-1])):
-                self._revoke(last, found, len(keyframes) - 1, stamp_ns)
+            if (wrong := self._decided.refuted_by(found, int(vertices[-1]))) is not None:
+                self._revoke(wrong, found, len(keyframes) - 1, stamp_ns)
                 found = None
             elif not self._was_doubtful:
                 self._decide(found, keyframes, stamp_ns)
@@ -216,6 +186,7 @@ class KidnapDetector:
 
     def optimize(self, keyframes: StampedPoses[Keyframe], settings: Settings) -> Report:
         """Solve everything, and take back the slips that this contradicts."""
+        self._rejoin(keyframes, keyframes[-1].stamp_ns)
         report = self._backend.optimize(len(keyframes) - 1, settings)
         if self._slips.slips and self._slips.review(keyframes):
             report = self._backend.optimize(len(keyframes) - 1, settings)
@@ -242,13 +213,6 @@ class KidnapDetector:
             found.first, lambda vertex: self._space.group.compose(T_map_chain, self._search.chain.pose(vertex))
         )
 
-    def _is_refuted(self, split: _Split, found: DisplacementHypothesis, newest: int) -> bool:
-        """Return whether the robot is where it would be without a segment, but for odometry's drift since it began."""
-        before_m, before_rad = self._search.difference(split.T_map_chain_before, found.T_map_chain, newest)
-        after_m, _ = self._search.difference(split.T_map_chain, found.T_map_chain, newest)
-        drift_m, drift_rad = self._search.chain.drift_since(split.drift, split.chain, newest)
-        return before_m < min(after_m, SAME_M + _DRIFT * drift_m) and before_rad < SAME_RAD + _DRIFT * drift_rad
-
     def _protect(self) -> None:
         """Keep the map as it is while it is not decided; ranges or bearings fit a wrong pose by chance, too."""
         undecided = self.now if self.now and self.now.segment is None else None
@@ -260,7 +224,7 @@ class KidnapDetector:
         if self._search.held_back_count < _ALARM:
             return None
         found = self._search.hypothesis()
-        if found and not all(self._search.are_apart(one, found.T_map_chain, newest) for one in self._refuted):
+        if found and self._decided.was_refuted(found, newest):
             return None
         return found if found and self._is_doubtful(found) and self._is_beyond_noise(found) else None
 
@@ -326,9 +290,7 @@ class KidnapDetector:
         is_new = index not in self._segments  # where a pose was given, one begins already
         if is_new:
             self._segments.append(index)
-        self._search.begin(found.first)
-        self._monitor.begin(found.first)
-        self._slips.begin(stamp_ns, found.first)
+        self._begin_anew(found.first, stamp_ns)
         self._anonymous.displaced(found.first)
         now, alarm = self.now, Alarm(stamp_ns, found.evidence, None, index, distance_m, angle_rad)
         if now is not None and now.segment is None:
@@ -337,8 +299,8 @@ class KidnapDetector:
             if now is not None:
                 self.alarms[-1] = replace(now, ended_ns=stamp_ns)
             self.alarms.append(alarm)
-        self._splits.append(
-            _Split(
+        self._decided.append(
+            Displacement(
                 found.first,
                 index if is_new else None,
                 link,
@@ -351,26 +313,26 @@ class KidnapDetector:
             )
         )
 
-    def _revoke(self, split: _Split, found: DisplacementHypothesis, keyframe: int, stamp_ns: int) -> None:
+    def _revoke(self, wrong: Displacement, found: DisplacementHypothesis, keyframe: int, stamp_ns: int) -> None:
         """Believe odometry again where the last segment begins: the landmarks show that it was right."""
-        group = self._space.group
-        back = group.compose(split.T_map_chain_before, group.inverse(split.T_map_chain))
-        values = moved_values(self._space, self._backend.solver, {split.first: back})
-        self._backend.rejoin(split.link, split.replacement, values, found, keyframe)
-        self._counters.count("odometry", "displacement_taken_back")
-        if split.index is not None:
-            self._segments.remove(split.index)
-        self._search.begin(found.first)
-        self._monitor.begin(found.first)
-        self._slips.begin(stamp_ns, found.first)
-        self._anonymous.rejoined(split.first)
-        wrong = self.alarms[split.alarm]
-        if self.now is not None and self.now != wrong:
+        self._decided.revoke(wrong, found, keyframe, stamp_ns)
+        self._begin_anew(found.first, stamp_ns)
+        if self.now is not None:
             self.alarms[-1] = replace(self.now, ended_ns=stamp_ns, outcome="the displacement before is taken back")
-        outcome = "taken back: later sightings contradict it"
-        self.alarms[split.alarm] = replace(wrong, ended_ns=wrong.ended_ns or stamp_ns, outcome=outcome)
-        self._splits.pop()
-        self._refuted.append(split.T_map_chain)
+
+    def _rejoin(self, keyframes: StampedPoses[Keyframe], stamp_ns: int) -> bool:
+        """Believe odometry again where the explanation of all scans has no displacement. Returns whether it has one."""
+        firsts = self._anonymous.pop_rejoined()
+        if not firsts or not self._decided.rejoin(firsts, len(keyframes) - 1, stamp_ns):
+            return False
+        self._begin_anew(keyframes[-1].vertex, stamp_ns)
+        return True
+
+    def _begin_anew(self, vertex: int, stamp_ns: int) -> None:
+        """Compare no sighting from before a keyframe, by its vertex, with where the robot is."""
+        self._search.begin(vertex)
+        self._monitor.begin(vertex)
+        self._slips.begin(stamp_ns, vertex)
 
     def _estimate(self, vertex: int) -> Numbers:
         return tuple(self._backend.solver.estimate([vertex])[0].tolist())

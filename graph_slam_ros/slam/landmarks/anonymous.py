@@ -96,6 +96,7 @@ class AnonymousLandmarks:
         self._same: dict[int, int] = {}  # landmarks of the beam that are others in the graph
         self._clocks: dict[str, float] = {}  # of each input the correction that its stamps have
         self._compared = 0  # scans
+        self._rejoined = frozenset[int]()  # keyframes at which an explanation has no displacement, by their vertices
         self._displaced: int | None = None  # the scan from which on all are explained anew
         self.elsewhere = UnnamedDisplacement(space, landmarks)
 
@@ -237,6 +238,16 @@ class AnonymousLandmarks:
         self.elsewhere.end()
         self._history.rejoin(first)
 
+    def keep_displacements(self) -> None:
+        """Note that another frame of odometry begins: displacements in the last one are taken back no more."""
+        self._history.keep_displacements()
+        self._rejoined = frozenset()
+
+    def pop_rejoined(self) -> frozenset[int]:
+        """Return the keyframes at which the last explanation believes odometry again, by their vertices, once."""
+        out, self._rejoined = self._rejoined, frozenset()
+        return out
+
     def explain_since(self, first: int) -> None:
         """Explain the scans anew from one on: what they were thought to be is forgotten."""
         self.clusters.give(dict.fromkeys(range(self._history.firsts[first], len(self.clusters.given)), NOTHING))
@@ -343,8 +354,11 @@ class AnonymousLandmarks:
         leader = given.copy()
         for cluster, landmark in changes(None, self._leader).items():
             leader[cluster] = landmark
-        motions, clocks = tuple(self._history.motions), dict(self._clocks)
-        frozen = FrozenScans(tuple(scans), motions, self._history.nearby(), poses, scales.copy(), given, leader, clocks)
+        history, clocks = self._history, dict(self._clocks)
+        motions = tuple(history.motions)
+        frozen = FrozenScans(tuple(scans), motions, history.nearby(), poses, scales.copy(), given, leader, clocks)
+        if history.displacements:
+            frozen = replace(frozen, displaced=history.displacements, undisplaced=history.undisplaced())
         return with_map(frozen, self._belief, self.clusters.final)
 
     def _adopt(self, found: Found | None, keyframes: StampedPoses[Keyframe]) -> None:
@@ -355,6 +369,7 @@ class AnonymousLandmarks:
             self._counters.count("landmarks", "undecided", found.undecided)
         if not found.is_whole:
             self._counters.count("landmarks", "moves_left")
+        self._rejoined |= found.rejoined
         numbers = found.numbers(self.clusters.given, self.clusters.fresh)
         values = found.carried_to(self._space, self._solver, keyframes)
         changed, gone = found.changes(self.clusters.given, numbers)

@@ -32,6 +32,7 @@ _FIRST, _MORE = 100, 2.0  # scans at the first time; then times as many
 _LEAST_LANDMARK = 1.0
 _SURE = 0.015  # standard deviation of a scale of odometry below which a part of a drive corrects it
 _SCALE_SIGMA = 0.02  # of odometry's scales, once they were found
+_DISPLACED = 2.0 * float(np.log(1e4))  # minus twice the log of how probable it is that a robot is moved in a drive
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +48,8 @@ class FrozenScans:
     clocks : of each input the correction that its stamps have by now [s]
     of_map : the first so many scans stand for the map (``known_map.py``); clusters_of_map : theirs
     times : (M,) how often the robot has seen what a cluster stands for; empty: once each
+    displaced : keyframes at which the robot is thought to have been moved, by their vertices
+    undisplaced : the motions as if it had not been; empty: it was nowhere
     """
 
     scans: tuple[Scan, ...]
@@ -60,6 +63,8 @@ class FrozenScans:
     of_map: int = 0
     clusters_of_map: int = 0
     times: Array = field(default_factory=lambda: np.empty(0))
+    displaced: frozenset[int] = frozenset()
+    undisplaced: tuple[Motion, ...] = ()
 
     @property
     def count(self) -> int:
@@ -77,6 +82,7 @@ class Found:
     scales : of odometry, by name, with standard deviations
     clocks : of each input the correction of its stamps [s], and its standard deviation
     presence : which landmarks in view were seen
+    rejoined : keyframes at which the robot was not moved after all, by their vertices
     """
 
     frozen: FrozenScans
@@ -86,6 +92,7 @@ class Found:
     scales: dict[str, tuple[float, float]] = field(default_factory=dict)
     clocks: dict[str, tuple[float, float]] = field(default_factory=dict)
     presence: Presence = NOTHING_SEEN
+    rejoined: frozenset[int] = frozenset()
 
     def numbers(self, given: Sequence[int], fresh: Callable[[], int]) -> Ids:
         """The number of each landmark: that of the map or of most of its clusters, each used once, or a fresh one."""
@@ -276,30 +283,57 @@ def explained(
 
     Parameters
     ----------
-    doubts : whether to associate the whole drive again by other beams, and keep the explanation with the largest
-        evidence
+    doubts : whether to associate the whole drive again by other beams, and as if the robot had not been moved, and
+        keep the explanation with the largest evidence
     """
-    drive = Drive(frozen.scans, frozen.motions, frozen.nearby, settings, costs, frozen.clocks, frozen.times)
-    here = matrices_of(space, frozen.poses)
-    paths = here, drive.along_odometry(here[0][0], here[1][0], frozen.scales)
-    given = [frozen.given] if np.array_equal(frozen.given, frozen.leader) else [frozen.given, frozen.leader]
-    found = [one for some in given for one in _from(drive, paths, frozen, some)]
-    if not found:
-        return None
-    best = _laid(drive, min(found, key=lambda one: drive.total(one.estimate)))
-    if not doubts(best) or frozen.of_map or frozen.count > MOST_SCANS:
+    drive = _drive(frozen, settings, costs)
+    found = _given(space, drive, frozen)
+    if found is None or not doubts(found) or frozen.of_map or frozen.count > MOST_SCANS:
+        return found
+    best = _among_others(space, drive, found)
+    if not frozen.undisplaced:
         return best
-    for other in other_associations(space, frozen.scans, frozen.motions, frozen.poses[0], settings):
-        tried = (_laid(drive, one) for one in _from(drive, paths, frozen, other))
-        best = min([best, *tried], key=lambda one: drive.total(one.estimate))
-    return best
+    whole = replace(frozen, motions=frozen.undisplaced)
+    drive_whole = _drive(whole, settings, costs)
+    if (found := _given(space, drive_whole, whole)) is None:
+        return best
+    found = _among_others(space, drive_whole, found)
+    worth = _log_volume(frozen.motions) - _log_volume(whole.motions) + _DISPLACED * len(frozen.displaced)
+    is_better = drive_whole.total(found.estimate) < drive.total(best.estimate) + worth
+    return replace(found, rejoined=frozen.displaced) if is_better else best
 
 
-def _from(drive: Drive, paths: Sequence[tuple[Array, Array]], frozen: FrozenScans, given: Ids) -> list[Found]:
+def _drive(frozen: FrozenScans, settings: BeamSettings, costs: Costs) -> Drive:
+    return Drive(frozen.scans, frozen.motions, frozen.nearby, settings, costs, frozen.clocks, frozen.times)
+
+
+def _log_volume(motions: Sequence[Motion]) -> float:
+    return float(np.linalg.slogdet(np.array([motion.covariance for motion in motions]))[1].sum())
+
+
+def _given(space: Geometry, drive: Drive, frozen: FrozenScans) -> Found | None:
+    """Explain all scans, from the graph's assignment and from the beam's; None if too little was seen."""
+    given = [frozen.given] if np.array_equal(frozen.given, frozen.leader) else [frozen.given, frozen.leader]
+    found = [one for some in given for one in _from(space, drive, frozen, some)]
+    return _laid(drive, min(found, key=lambda one: drive.total(one.estimate))) if found else None
+
+
+def _among_others(space: Geometry, drive: Drive, found: Found) -> Found:
+    """The explanation with the largest evidence, of one and of those from other beams."""
+    frozen = found.frozen
+    for other in other_associations(space, frozen.scans, frozen.motions, frozen.poses[0], drive.settings):
+        tried = (_laid(drive, one) for one in _from(space, drive, frozen, other))
+        found = min([found, *tried], key=lambda one: drive.total(one.estimate))
+    return found
+
+
+def _from(space: Geometry, drive: Drive, frozen: FrozenScans, given: Ids) -> list[Found]:
     """Explain all scans from an association; nothing if it has no landmark that was seen often enough."""
     numbers, which = _indices(given)
     if not len(numbers):
         return []
+    here = matrices_of(space, frozen.poses)
+    paths = here, drive.along_odometry(here[0][0], here[1][0], frozen.scales)
     no_landmarks, clocks = np.empty((0, drive.n)), np.zeros(len(drive.topics))
     starts = [Estimate(*path, no_landmarks, frozen.scales, clocks, which) for path in paths]
     staged = min((drive.staged(start) for start in starts), key=lambda e: e.cost)

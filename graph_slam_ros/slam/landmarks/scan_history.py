@@ -109,9 +109,27 @@ class ScanHistory:
         """Use odometry again at a keyframe at which the robot was thought to be moved."""
         k = self._first_from(vertex)
         if k is not None and vertex in self._split:
-            m = self.motions[k - 1]
-            self.motions[k - 1] = replace(m, covariance=m.covariance - self._jump, is_broken=False)
+            self.motions[k - 1] = self._unbroken(self.motions[k - 1])
         self._split.discard(vertex)
+
+    @property
+    def displacements(self) -> frozenset[int]:
+        """The keyframes at which the robot was moved, by their vertices, since the last other jump of odometry."""
+        return frozenset(self._split)
+
+    def keep_displacements(self) -> None:
+        """Note that another frame of odometry begins: what was decided in the last one stays."""
+        self._split.clear()
+
+    def undisplaced(self) -> tuple[Motion, ...]:
+        """Return the motions by odometry alone, as if the robot had not been moved."""
+        out = list(self.motions)
+        for k in filter(None, map(self._first_from, self._split)):
+            out[k - 1] = self._unbroken(out[k - 1])
+        return tuple(out)
+
+    def _unbroken(self, m: Motion) -> Motion:
+        return replace(m, covariance=m.covariance - self._jump, is_broken=False)
 
     def _first_from(self, vertex: int) -> int | None:
         """Return the first scan of a keyframe or a later one, if others are before it."""

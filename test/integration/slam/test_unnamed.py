@@ -117,9 +117,12 @@ def test_without_ids_the_path_is_as_near_to_the_truth_and_each_tree_is_there_onc
     assert len(set(which.tolist())) == len(which) >= 0.8 * len(recording.landmarks)
 
 
-@pytest.mark.parametrize(("seed", "aisle_m"), times([(2, 8.0)], [(1, 8.0), (3, 10.0), (7, 12.0), (9, 12.0)]))
+@pytest.mark.parametrize(("seed", "aisle_m"), times([(3, 8.0)], [(1, 8.0), (2, 8.0), (1, 10.0), (3, 10.0), (3, 12.0)]))
 def test_among_racks_that_look_alike_other_beams_find_the_way(seed, aisle_m):
-    """The first beam confuses the tags of the two faces of a rack, and of aisles: 0.16 to 1.7 m."""
+    """The first beam confuses the tags of the two faces of a rack, and of aisles: 0.16 to 1.9 m.
+
+    Where that made the robot seem to be moved, the displacement is taken back.
+    """
     recording = simulate("warehouse", seed, aisles=3, aisle_m=aisle_m)
     slam = driven(recording)
     at = np.searchsorted(recording.stamps_ns, slam.keyframes.stamps_ns)
@@ -127,6 +130,7 @@ def test_among_racks_that_look_alike_other_beams_find_the_way(seed, aisle_m):
     away = slam.trajectory()[:, :2] @ rotated(recording.T_world_base[at[0], 2]).T + true[0] - true
     assert np.sqrt(np.mean(np.sum(away**2, axis=1))) < 0.25
     assert not slam.association_report["is_doubtful"]
+    assert slam.segments == [0]
     assert len(slam.landmarks) <= len(recording.landmarks)
 
 
@@ -419,6 +423,8 @@ def test_a_robot_that_was_carried_to_new_ground_is_found_when_it_knows_the_groun
     slam = pipeline("joint")
     for m in [*before, *again]:
         slam.process(without_ids(m))
+    slam.process(Control("end"))
+    slam.process(Control("optimize"))  # all scans are explained without the displacement, too
     (alarm,) = slam.alarms
     assert alarm.began_ns < begin_ns + 23 * S
     stamps_ns = slam.keyframes.stamps_ns
