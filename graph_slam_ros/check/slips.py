@@ -1,7 +1,5 @@
 """Stretches in which odometry and the map do not agree on the motion: wheels that slip, a robot that is carried."""
 
-from collections.abc import Iterator
-
 import numpy as np
 
 from graph_slam_ros.check.columns import Columns
@@ -18,22 +16,26 @@ _LEAST_M, _LEAST_RAD = 0.15, 0.3
 _LARGE_SIGMAS, _LARGE_M, _LARGE_RAD = 12.0, 0.5, 0.8
 
 
-def check_slips(c: Columns, slam: GraphSlam) -> Iterator[Finding]:
+def check_slips(c: Columns, slam: GraphSlam) -> tuple[Finding, int] | None:
     """Find the stretch in which odometry is worst, if it is far worse there than in the rest of the drive.
 
     The errors of odometry's motion are summed over a few steps between keyframes. Their scale is that of the middle
     half of them, so a wrong factor, which all of them have, is none.
+
+    Returns
+    -------
+    The finding, from the stamp on at which the stretch begins, and the stamp at which it ends.
     """
     errors, size, stamps_ns = _errors(slam)
     if len(errors) < _LEAST_WINDOWS:
-        return
+        return None
     errors = errors - np.median(errors, axis=0)
     scale = _SIGMA * np.median(np.abs(errors), axis=0)
     least, large = np.array([_LEAST_M, _LEAST_RAD]), np.array([_LARGE_M, _LARGE_RAD])
     excess = np.abs(errors) / np.maximum(np.maximum(_SIGMAS * scale, least), _PART * size)
     k, part = np.unravel_index(int(np.argmax(excess)), excess.shape)
     if excess[k, part] <= 1.0:
-        return
+        return None
     error, unit = float(errors[k, part]), ("m", "rad")[part]
     is_large = abs(error) > max(large[part], _LARGE_SIGMAS * scale[part])
     severity: Severity = "warning" if is_large else "note"
@@ -48,7 +50,7 @@ def check_slips(c: Columns, slam: GraphSlam) -> Iterator[Finding]:
     )
     where: Where = {"topic": c.odometry.topic, "first_ns": int(stamps_ns[k]), "count": int(many)}
     limit = float(np.abs(error) / excess[k, part])
-    yield Finding("odometry_slips", severity, abs(error), limit, unit, text, **where)
+    return Finding("odometry_slips", severity, abs(error), limit, unit, text, **where), int(stamps_ns[k + _TOGETHER])
 
 
 def _errors(slam: GraphSlam) -> tuple[Array, Array, Index]:

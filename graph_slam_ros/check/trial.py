@@ -131,10 +131,12 @@ def check_trial(c: Columns, slam: GraphSlam) -> Iterator[Finding]:
     clocks = [one for one in fitted if one.parameter.name == "clock" and one.verdict == "admitted"]
     is_void = fit.lost > MOST_LOST or absurd_range(fit) is not None
     late_s = {} if is_void else {one.parameter.source: one.value for one in clocks}
-    found = [] if _goes_back(c) else _places(c, slam, path_ns, path, late_s)
     step_s = float(np.median(np.diff(path_ns))) * 1e-9
     known = [one for one in fitted if one.parameter.name in _LIMITS]
     off = {one.parameter: one.value for one in known if _is_far_off(fit, one, step_s)}
+    slip = None if off else check_slips(c, slam)  # a clock or mount that is wrong bends the path in turns
+    is_broken = slip is not None and slip[0].severity == "warning"
+    found = [] if _goes_back(c) else _places(c, slam, path_ns, path, late_s, slip if is_broken else None)
     if found and any(one.name in _OF_MOUNT for one in off):
         found = list(_places_of_fit(c, slam, fit, off, path_ns, path))
     if is_void:
@@ -143,9 +145,8 @@ def check_trial(c: Columns, slam: GraphSlam) -> Iterator[Finding]:
         return
     yield from (found_one for one in fitted for found_one in _fitted(c, slam, one, off))
     yield from _clock_jumps(c, fit)
-    slips = [] if off else list(check_slips(c, slam))  # a clock or mount that is wrong bends the path in turns
-    yield from slips
-    if any(one.severity == "warning" for one in slips):
+    yield from [slip[0]] if slip else []
+    if is_broken:
         found = [one for one in found if one.code not in _OF_A_BREAK]
     elif any(one.code == "map_breaks" for one in found):
         found = [one for one in found if one.code != "ids_unsure"]
@@ -279,21 +280,32 @@ def _places_of_fit(
         yield from check_outliers(s, straight, stamp_ns == s.stamp_ns, c.config, {one.name for one in two})
 
 
-def _places(c: Columns, slam: GraphSlam, path_ns: Index, path: Array, late_s: Mapping[str, float]) -> list[Finding]:
+def _places(
+    c: Columns,
+    slam: GraphSlam,
+    path_ns: Index,
+    path: Array,
+    late_s: Mapping[str, float],
+    slip: tuple[Finding, int] | None,
+) -> list[Finding]:
     """Identities by where the estimate puts them, and sightings that are far from their landmark.
 
     Parameters
     ----------
     late_s : by input: what its stamps are corrected by, since a wrong clock puts landmarks elsewhere in turns
+    slip : a stretch in which odometry does not say where the robot is: nothing is told from what was seen there
     """
     found: list[Finding] = []
     for s in c.sightings:
         late = round(late_s.get(s.input, 0.0) * 1e9)
         inside = (s.stamp_ns + late >= path_ns[0]) & (s.stamp_ns + late <= path_ns[-1])
+        if slip is not None:
+            inside &= (s.stamp_ns < slip[0].first_ns) | (s.stamp_ns > slip[1])
         if not inside.any():
             continue
         stamps = (np.clip(stamp_ns, path_ns[0], path_ns[-1]) for stamp_ns in (s.stamp_ns, s.stamp_ns + late))
         before, points = (points_in_map(s, poses_in_map(slam, one, path_ns, path)) for one in stamps)
+        points[~inside] = np.nan
         two = at_two_places(s, points, path_ns, c.config.world.dimensions)
         shift = np.linalg.norm(points - before, axis=1)
         shift = shift[np.isfinite(shift)]  # ranges and bearings alone have no point

@@ -383,6 +383,14 @@ def test_a_few_wrong_ids_are_a_note_where_what_contradicts_is_left_out(laps, tmp
     assert (one.severity, one.settings) == ("note", ())
 
 
+@pytest.mark.parametrize(("world", "dimensions"), [("warehouse", 2), ("flight", 3)])
+def test_what_a_robot_sees_while_it_is_carried_is_no_second_landmark(tmp_path, world, dimensions):
+    file = str(tmp_path / "carried.mcap")
+    write_faulty_bag(simulate(world, 11), file, [Fault.named("carried", at=0.5, distance_m=8.0)], 11)
+    found = check(file, {"world.dimensions": dimensions}).findings
+    assert [one.code for one in found if one.severity != "note"] == ["odometry_slips"]
+
+
 def test_a_replay_ends_with_the_worst_finding_and_only_its_summary_differs(drive, tmp_path, capsys):
     bag = planted(drive, tmp_path / "faulty.mcap", "turn rate mirrored")
     assert main(["replay", str(bag), "--out", str(tmp_path / "run")]) == 3
