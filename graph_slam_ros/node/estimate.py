@@ -17,6 +17,7 @@ from graph_slam_ros.runs.outcome import (
     visit_faults,
 )
 from graph_slam_ros.runs.tables import accepted_lately, condensed_part
+from graph_slam_ros.runs.undetermined import wrong_sides
 from graph_slam_ros.slam import GraphSlam
 from graph_slam_ros.slam.calibration.uncorrected import Uncorrected
 from graph_slam_ros.slam.solution import Correction
@@ -204,11 +205,16 @@ class Estimate:
             visits="; ".join(visit_faults({name: slam.counters["map", name] for name in VISITS})),
             uncorrected="; ".join(": ".join([str(one), *_settings(one)]) for one in slam.uncorrected_so_far),
             motion="; ".join(filter(None, (slam.gyro.fault if slam.gyro else "", slam.backend.odometries.doubted))),
-            ambiguity="; ".join(ambiguities([asdict(one) for one in slam.backend.rivals])),
+            ambiguity=_ambiguity(slam),
             gyro=str(slam.gyro or ""),
             is_resumed=is_resumed,
             calibration=_calibration(slam.calibration_report, slam.contradicted),
         )
+
+
+def _ambiguity(slam: GraphSlam) -> str:
+    rivals = ambiguities([asdict(one) for one in slam.backend.rivals])
+    return "; ".join(filter(None, (*rivals, wrong_sides(len(slam.landmarks), slam.waiting))))
 
 
 def doubted_lately(slam: GraphSlam) -> str:

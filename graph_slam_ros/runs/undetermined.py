@@ -2,11 +2,11 @@
 
 from collections.abc import Mapping
 
-_TWO, _MANY, _FEWEST = " places fit: ", 0.25, 4  # of the reasons; part and number of landmarks that are said
+_TWO, _MANY, _FEWEST = " places fit: ", 0.25, 4  # of the reasons; part and number of landmarks
 
 
 def wrong_sides(landmarks: int, waiting: Mapping[str, str]) -> str:
-    """Return that landmarks may be on the wrong side of the path; empty where few are undecided.
+    """Return that landmarks may be on the wrong side of the path; empty where few are undecided, or in the map.
 
     Parameters
     ----------
@@ -14,7 +14,7 @@ def wrong_sides(landmarks: int, waiting: Mapping[str, str]) -> str:
     waiting : landmarks that are not, with the reason
     """
     undecided = sum(_TWO in reason for reason in waiting.values())
-    if undecided < max(_FEWEST, _MANY * (landmarks + len(waiting))):
+    if landmarks < _FEWEST or undecided < max(_FEWEST, _MANY * (landmarks + len(waiting))):
         return ""
     return (
         f"ranges alone: of {undecided} of {landmarks + len(waiting)} landmarks two places fit, one on either side of "

@@ -674,3 +674,20 @@ def test_while_an_association_is_not_to_be_believed_the_node_is_degraded(monkeyp
     assert verdict.state == "DEGRADED"
     assert verdict.reasons[0].startswith("sightings without identity: 11 % of the landmarks that should be seen")
     assert "landmarks.density_per_m" in verdict.reasons[0]
+
+
+@pytest.mark.parametrize("passing", [0, 4])
+def test_ranges_alone_that_leave_many_landmarks_without_a_side_are_said(passing):
+    """Of four landmarks the side is known by a whole curve; others are seen from three places in a row."""
+    robot, around = round_a_curve(2, 0.4), [(4.0 * k, 3.0 + k % 2) for k in range(4)]
+    for k in range(20, 60):
+        robot.ingest([drive(2, k)])
+        to = around + [(31.0 + j, 50.0) for j in range(passing * (50 <= k < 53))]
+        at = drive(2, k).T_odom_base[:2]
+        some = tuple(Sighting(f"r{j}", "range", (math.dist(at, one),), (0.01,)) for j, one in enumerate(to))
+        robot.ingest([Sightings(drive(2, k).stamp_ns, "ranges", some)])
+    robot.evaluate()
+    reasons = judge(Facts("active", (), robot.estimate), Config()).reasons
+    assert [one[:38] for one in reasons if one.startswith("ranges alone: ")] == [
+        "ranges alone: of 4 of 8 landmarks two "
+    ] * (passing > 0)

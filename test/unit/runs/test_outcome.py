@@ -88,7 +88,9 @@ def test_an_odometry_without_any_message_is_one_and_a_spare_one_is_none():
     assert not [*shortcomings(summary({}, vo=silent | {"received": 90}))]
 
 
-@pytest.mark.parametrize(("known", "two_places", "is_said"), [(23, 27, True), (66, 8, False), (3, 3, False)])
+@pytest.mark.parametrize(
+    ("known", "two_places", "is_said"), [(23, 27, True), (66, 8, False), (3, 3, False), (0, 27, False)]
+)
 def test_ranges_alone_that_leave_many_landmarks_without_a_side_are_said(known, two_places, is_said):
     waiting = {str(k): "2 places fit: (1.56, -2.35) and (-2.20, -1.20)" for k in range(two_places)}
     waiting["seen once"] = "1 sighting by range: too few"
