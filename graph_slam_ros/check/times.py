@@ -16,6 +16,7 @@ _FEW, _MANY, _BACK_NS = 3, 10, 1_000_000_000
 _CLOCKS_DIFFER_S, _EARLY_S, _DAY_S = 10.0, 0.15, 86400.0
 _WINDOWS, _APART, _LEAST_S, _LEAST_MESSAGES = 20, 5, 30.0, 200
 _DRIFT, _DRIFTED_S, _SCATTERS = 1e-4, 0.02, 4.0
+_SAME_WAY = 0.85  # part of the slopes between windows that have one sign
 _JUMP_S, _PER_WINDOW, _SIDE = 0.05, 5, 3
 _DUPLICATES, _OUT_OF_ORDER = 0.01, 0.001
 _LEAST_ROUNDED_NS, _AS_OTHERS, _COARSE_S = 1_000_000, 0.1, 0.15
@@ -166,6 +167,8 @@ def _drift(topic: TopicColumns, lag_s: Array, log_ns: Index, stamp_ns: Index) ->
     slope = float(np.median(slopes))
     scatter_s = float(np.median(np.abs(least_s - np.median(least_s) - slope * (at_s - np.median(at_s)))))
     drifted_s = abs(slope) * span_s
+    if float((slopes * slope > 0.0).mean()) < _SAME_WAY:  # stamps that scatter
+        return
     if abs(slope) > _DRIFT and drifted_s > max(_DRIFTED_S, _SCATTERS * scatter_s) and drifted_s < _CLOCKS_DIFFER_S:
         text = (
             f"{topic.name}: its clock runs {-slope * 1e6:+.0f} ppm against the recorder's "

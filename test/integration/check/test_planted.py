@@ -391,6 +391,14 @@ def test_what_a_robot_sees_while_it_is_carried_is_no_second_landmark(tmp_path, w
     assert [one.code for one in found if one.severity != "note"] == ["odometry_slips"]
 
 
+def test_stamps_that_scatter_are_no_clock_that_drifts(tmp_path):
+    file = tmp_path / "scattered.mcap"
+    write_faulty_bag(simulate("flight", 11), file, [Fault.named("jitter", seconds=0.1)], 11)
+    found = {one.code for one in check(file, {"world.dimensions": 3}, quick=True).findings}
+    assert "jitter" in found
+    assert "clock_drift" not in found
+
+
 def test_a_replay_ends_with_the_worst_finding_and_only_its_summary_differs(drive, tmp_path, capsys):
     bag = planted(drive, tmp_path / "faulty.mcap", "turn rate mirrored")
     assert main(["replay", str(bag), "--out", str(tmp_path / "run")]) == 3
