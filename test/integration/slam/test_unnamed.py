@@ -134,6 +134,24 @@ def test_among_racks_that_look_alike_other_beams_find_the_way(seed, aisle_m):
     assert len(slam.landmarks) <= len(recording.landmarks)
 
 
+@pytest.mark.skipif(not times(0, 1), reason="only in make soak")
+def test_a_displacement_that_an_explanation_contradicts_is_taken_back_on_the_way():
+    recording = simulate("warehouse", 3, aisles=3, aisle_m=8.0)
+    slam, drive = pipeline("joint"), [without_ids(m) for m in measurements(recording)]
+    part = int(0.9 * len(drive))
+    for m in drive[:part]:
+        slam.process(m)
+    assert len(slam.segments) == 2
+    slam._landmarks.anonymous.explain_all(slam.keyframes)  # as at the end, where landmarks had said so
+    for m in drive[part:]:
+        slam.process(m)
+    assert slam.segments == [0]
+    assert slam.counters["odometry", "displacement_taken_back"] == 1
+    assert [one.outcome for one in slam.alarms if one.segment is not None] == [
+        "taken back: without it all sightings are explained better"
+    ]
+
+
 def test_covariances_are_those_of_the_joint_one_where_landmarks_came_and_went():
     """Where a region was ordered anew, what hangs below it in the tree may have a later key."""
     slam = unnamed(1, "joint")
