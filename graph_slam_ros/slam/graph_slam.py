@@ -222,7 +222,7 @@ class GraphSlam(MapView):
         now_ns, report = self._frontend.now_ns, None
         self._kidnaps.add(self.backend.handed_over[1], now_ns, self.keyframes)
         fits = self._solution.fits()
-        self._landmarks.review(self.keyframes, everything=everything is not None)
+        self._landmarks.review(self.keyframes, everything=everything is not None, alarmed=bool(self._kidnaps.alarms))
         if everything is None:
             self.backend.update(keyframe)
             self._kidnaps.check(self.keyframes, now_ns)

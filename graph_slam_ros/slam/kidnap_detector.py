@@ -238,8 +238,7 @@ class KidnapDetector:
             counts = (sum_of.held_back, sum_of.count) if sum_of else (0, 0)
             determines_pose = found is not None or is_elsewhere or self._search.held_back_count > 0
             self.alarms.append(Alarm(stamp_ns, evidence, None, None, 0.0, 0.0, *counts, determines_pose))
-            hindsight = self._anonymous.hindsight
-            self._was_doubtful, hindsight.is_suspicious = hindsight.is_doubtful, True
+            self._was_doubtful = self._anonymous.hindsight.is_doubtful
         elif now is not None and evidence > now.evidence:
             self.alarms[-1] = replace(now, evidence=evidence)
         elif now is not None and not found and not is_contradicted and self._is_calm(now, stamp_ns):

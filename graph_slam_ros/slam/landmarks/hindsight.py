@@ -154,7 +154,6 @@ class Hindsight:
     Attributes
     ----------
     is_on : whether it does
-    is_suspicious : whether landmarks have said that the robot is elsewhere: associations may be wrong, too
     scales : (2,) of odometry, as last found, and their standard deviation
     found_scales : the same by name, as the last explanation has them, with its standard deviations
     newest : the explanation that was found last
@@ -170,7 +169,7 @@ class Hindsight:
         self._explained = 0  # scans of the last explanation that was begun
         self._job: tuple[int, Callable[[], Found | None]] | None = None
         self._last: Ids | None = None
-        self.is_on, self.is_suspicious = True, False
+        self.is_on = True
         self.scales: tuple[Array, float] = np.zeros(2), settings.scale_sigma
         self.found_scales: dict[str, tuple[float, float]] = {}
         self.newest: Found | None = None
@@ -223,8 +222,13 @@ class Hindsight:
         (_, work), self._job = self._job, None
         return self._noted(work())
 
-    def found(self, freeze: Callable[[], FrozenScans]) -> Found | None:
-        """Explain the present scans at once; None if that was done before, or finds nothing."""
+    def found(self, freeze: Callable[[], FrozenScans], *, alarmed: bool) -> Found | None:
+        """Explain the present scans at once; None if that was done before, or finds nothing.
+
+        Parameters
+        ----------
+        alarmed : whether landmarks have said that the robot is elsewhere: other beams are tried
+        """
         self._job = None
         if not self.is_on:
             return None
@@ -232,7 +236,7 @@ class Hindsight:
         if self._last is not None and np.array_equal(self._last, frozen.given[frozen.clusters_of_map :]):
             return None
         self._explained = frozen.count
-        doubts = _always if self.is_suspicious else _is_doubtful
+        doubts = _always if alarmed else _is_doubtful
         return self._noted(explained(self._space, frozen, self._settings, self._costs, doubts))
 
     def note(self, given: Sequence[int]) -> None:

@@ -168,10 +168,15 @@ class LandmarkFrontend:
             out += passed.named if passed else ()
         return out
 
-    def review(self, keyframes: StampedPoses[Keyframe], *, everything: bool) -> None:
-        """Review the landmarks: which are gone, and those without id. The next solve includes the changes."""
+    def review(self, keyframes: StampedPoses[Keyframe], *, everything: bool, alarmed: bool) -> None:
+        """Review the landmarks: which are gone, and those without id. The next solve includes the changes.
+
+        Parameters
+        ----------
+        alarmed : whether landmarks have said that the robot is elsewhere
+        """
         self.lifetimes.review(keyframes)
         if self.is_anonymous and everything:
-            self.anonymous.explain_all(keyframes)
+            self.anonymous.explain_all(keyframes, alarmed=alarmed)
         elif self.is_anonymous:
             self.anonymous.review(keyframes)

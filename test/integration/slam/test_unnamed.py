@@ -142,7 +142,7 @@ def test_a_displacement_that_an_explanation_contradicts_is_taken_back_on_the_way
     for m in drive[:part]:
         slam.process(m)
     assert len(slam.segments) == 2
-    slam._landmarks.anonymous.explain_all(slam.keyframes)  # as at the end, where landmarks had said so
+    slam._landmarks.anonymous.explain_all(slam.keyframes, alarmed=True)  # as at the end, where landmarks had said so
     for m in drive[part:]:
         slam.process(m)
     assert slam.segments == [0]
