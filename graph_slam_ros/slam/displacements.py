@@ -17,7 +17,7 @@ _CONTRADICTED = "taken back: later sightings contradict it"
 _EXPLAINED = "taken back: without it all sightings are explained better"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Displacement:
     """A displacement that was decided.
 
