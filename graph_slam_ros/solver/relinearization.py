@@ -1,10 +1,15 @@
-"""The schedule of relinearisation: when vertices are searched for large steps."""
+"""The schedule of relinearisation: when vertices are searched for large steps, and what is large for a position."""
 
+import numpy as np
+
+from graph_slam_ros.graph import INVERSE_RELATIVE_POSE, RELATIVE_POSE, RELATIVE_POSE_3D, Graph
 from graph_slam_ros.solver.pending import NONE
 from graph_slam_ros.typing import Index
 
 NOT_YET, MAYBE, SURELY = range(3)
 BY_FAR = 10.0  # times the threshold: steps that are linearised anew at once
+_MOTIONS = {RELATIVE_POSE: 2, INVERSE_RELATIVE_POSE: 2, RELATIVE_POSE_3D: 3}  # components of their positions
+_CLASSES, _PER_OCTAVE = 41, 2  # of lengths, from a metre on
 
 
 class RelinearizationSchedule:
@@ -13,6 +18,7 @@ class RelinearizationSchedule:
     def __init__(self) -> None:
         self._unseen = NONE
         self._updates = 0
+        self._motions = MotionLength()
 
     def note(self, solved: Index) -> None:
         """Note vertices that were solved after an update's last search; the next update searches them."""
@@ -29,11 +35,40 @@ class RelinearizationSchedule:
             return SURELY
         return MAYBE if 3 * self._updates >= 2 * every else NOT_YET
 
-    def begin(self) -> None:
-        """Count from the present search."""
+    def begin(self, graph: Graph) -> int:
+        """Count from the present search. Returns the typical length of a motion [mm]."""
         self._updates = 0
+        return self._motions.typical_mm(graph)
 
     def unseen(self) -> Index:
         """Return the vertices that the last update solved after its last search; once."""
         unseen, self._unseen = self._unseen, NONE
         return unseen
+
+
+class MotionLength:
+    """The typical length of the measured motions between two poses: their median, to a factor of the root of two.
+
+    A false closure may be of any length, so it is no mean.
+    """
+
+    def __init__(self) -> None:
+        self._rows = dict.fromkeys(_MOTIONS, 0)
+        self._times = np.zeros(_CLASSES, dtype=np.int64)
+
+    def typical_mm(self, graph: Graph) -> int:
+        """Return the length in mm, a metre at least."""
+        for edge_type, n in _MOTIONS.items():
+            table, known = graph.tables.get(edge_type), self._rows[edge_type]
+            count = len(table) if table else 0
+            if count < known:  # edges were removed
+                self._times[:], self._rows = 0, dict.fromkeys(_MOTIONS, 0)
+                return self.typical_mm(graph)
+            if table and count > known:
+                square = np.square(table.measured.values[known:, :n]).sum(axis=1)
+                classes = np.floor(0.5 * _PER_OCTAVE * np.log2(np.maximum(square, 1.0)))
+                self._times += np.bincount(np.minimum(classes, _CLASSES - 1).astype(np.int64), minlength=_CLASSES)
+                self._rows[edge_type] = count
+        many = np.cumsum(self._times)
+        median = int(np.searchsorted(many, 0.5 * many[-1])) if many[-1] else 0
+        return round(1000.0 * 2.0 ** (median / _PER_OCTAVE))

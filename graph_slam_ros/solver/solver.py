@@ -13,7 +13,7 @@ from graph_slam_ros.solver.batch import BatchProblem, Settings, minimise
 from graph_slam_ros.solver.clique_tree import incremental
 from graph_slam_ros.solver.clique_tree.advance import DISSECT, DONE, advance, more_room, restructure
 from graph_slam_ros.solver.clique_tree.ordering import dissect
-from graph_slam_ros.solver.clique_tree.storage import AFFECTED, CLIQUE, DOF, NOTHING, SUBSTITUTED
+from graph_slam_ros.solver.clique_tree.storage import AFFECTED, CLIQUE, DOF, MOTION_MM, NOTHING, SUBSTITUTED
 from graph_slam_ros.solver.clique_tree.substitution import forget, read, show
 from graph_slam_ros.solver.covariance import among, joint, marginals
 from graph_slam_ros.solver.cross_covariance import CrossCovariances
@@ -340,7 +340,7 @@ class Solver(Problem):
             due = SURELY
         if due != SURELY:
             return NONE
-        self._schedule.begin()
+        self._tree.state[MOTION_MM] = self._schedule.begin(self.graph)
         if pending.broken:
             return NONE
         tolerances, limits = self._limits()[:2], (settings.relinearize_above, settings.relinearize_error)

@@ -12,7 +12,6 @@ from graph_slam_ros.solver.clique_tree.storage import (
     CLIQUE,
     CLIQUES,
     DEFERRED_COUNT,
-    DOF,
     FLOPS,
     FREE,
     FREE_CLIQUE,
@@ -39,7 +38,6 @@ from graph_slam_ros.solver.clique_tree.storage import (
     R_MADE,
     REGION,
     REGIONS,
-    STEP,
     TAIL_END,
     TAIL_FIRST,
     ZERO,
@@ -162,16 +160,16 @@ def relinearize(t: Tree, searched: Index, threshold: float, error: float) -> Ind
 
     A step is too large above the threshold, or where the neglected term of the linearisation is (``is_large``).
     """
-    vertex, edge, link, step, diagonal = t.vertex, t.edge, t.link, t.step, t.diagonal
+    vertex, edge, link = t.vertex, t.edge, t.link
     large = False
     for v in searched:
-        large = large or is_large(step, diagonal, vertex[v, STEP], vertex[v, DOF], threshold, error)
+        large = large or is_large(t, v, False, threshold, error)
     if not large:  # as nearly always
         return np.empty(0, np.int64)
     edges, moving = np.empty(64, np.int64), np.empty(len(searched), np.int64)
     count, many = ZERO, 0
     for v in searched:
-        if not is_large(step, diagonal, vertex[v, STEP], vertex[v, DOF], threshold, error):
+        if not is_large(t, v, False, threshold, error):
             continue
         moving[many] = v
         many += 1

@@ -71,7 +71,7 @@ SHIFTED, STALE, DEFERRED, LIST_COLUMNS = range(4)
 # the first vertex of its own
 R_PARENT, R_DEPTH, R_LEFT, R_RIGHT, R_COUNT, R_MADE, R_FIRST, REGION_COLUMNS = range(8)
 
-# tops of the pools, what decides how long the tail is kept, and what updates count
+# tops of the pools, what decides how long the tail is kept, what updates count, and the typical length of a motion
 (
     LINKS,
     CLIQUES,
@@ -101,8 +101,9 @@ R_PARENT, R_DEPTH, R_LEFT, R_RIGHT, R_COUNT, R_MADE, R_FIRST, REGION_COLUMNS = r
     SHIFTED_COUNT,
     STALE_COUNT,
     DEFERRED_COUNT,
+    MOTION_MM,
     STATE_COLUMNS,
-) = range(29)
+) = range(30)
 
 VECTOR, SE2_KIND, SE3_KIND = range(3)
 
@@ -180,6 +181,7 @@ def empty_tree() -> Tree:
     region[0] = [NOTHING, 0, NOTHING, NOTHING, 0, 0, NOTHING]
     state = np.zeros(STATE_COLUMNS, dtype=np.int64)
     state[REGIONS], state[FREE_REGION], state[TAIL_KEPT], state[FREE_CLIQUE] = 1, NOTHING, TAIL_LEAST, NOTHING
+    state[MOTION_MM] = 1000
     return Tree(
         vertex=np.zeros((0, VERTEX_COLUMNS), dtype=np.int64),
         edge=np.zeros((0, EDGE_COLUMNS), dtype=np.int64),

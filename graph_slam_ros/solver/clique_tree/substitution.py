@@ -31,9 +31,11 @@ from graph_slam_ros.solver.clique_tree.storage import (
     KIND,
     MARK,
     MEMBERS,
+    MOTION_MM,
     NOTED,
     NOTHING,
     PARENT,
+    SE2_KIND,
     SE3_KIND,
     SEEN,
     SHIFTED,
@@ -69,7 +71,7 @@ def substitute(t: Tree, cliques: Index, tolerance: float, sigmas: float, far: fl
     far, error : a step is far that is larger, or whose square exceeds so many standard deviations of the strongest
         measurement (``relinearize``)
     """
-    vertex, clique, members, step, diagonal = t.vertex, t.clique, t.members, t.step, t.diagonal
+    vertex, clique, members = t.vertex, t.clique, t.members
     solved, count = np.empty(64, np.int64), ZERO
     stack, top = np.empty(64, np.int64), ZERO
     x = np.empty(64)
@@ -95,7 +97,7 @@ def substitute(t: Tree, cliques: Index, tolerance: float, sigmas: float, far: fl
             v = members[m]
             solved[count] = v
             count += 1
-            if is_large(step, diagonal, vertex[v, STEP], vertex[v, DOF], far, error):
+            if is_large(t, v, False, far, error):
                 vertex[v, NOTED] |= IS_FAR
             else:
                 vertex[v, NOTED] &= ~IS_FAR
@@ -113,14 +115,25 @@ def substitute(t: Tree, cliques: Index, tolerance: float, sigmas: float, far: fl
 
 
 @kernel
-def is_large(step: Array, diagonal: Array, first: int, dof: int, threshold: float, error: float) -> bool:
-    """Return whether a step is above the threshold, or its square above ``error`` standard deviations.
+def is_large(t: Tree, v: int, changed: bool, threshold: float, error: float) -> bool:
+    """Return whether a vertex's step is above the threshold, or its square above ``error`` standard deviations.
 
-    These are those of the strongest measurement; the square of the step is what the linearisation neglects.
+    These are those of the strongest measurement; the square of the step is what the linearisation neglects. The
+    position of a pose counts in units of the typical motion: of a motion, the linearisation neglects products of a
+    turn with what is moved, relative to it.
+
+    Parameters
+    ----------
+    changed : whether the change since the last search is compared, instead of the whole step
     """
+    vertex, step, diagonal, unit = t.vertex, t.step, t.diagonal, 1e-3 * t.state[MOTION_MM]
+    first, kind = vertex[v, STEP], vertex[v, KIND]
+    positions = first + (2 if kind == SE2_KIND else 3 if kind == SE3_KIND else 0)
     largest = information = 0.0
-    for i in range(first, first + dof):
-        largest, information = max(largest, abs(step[i])), max(information, diagonal[i])
+    for i in range(first, first + vertex[v, DOF]):
+        scale, since = unit if i < positions else 1.0, t.reference[i] if changed else 0.0
+        largest = max(largest, abs(step[i] - since) / scale)
+        information = max(information, diagonal[i] * scale * scale)
     return largest > threshold or largest * largest * np.sqrt(information) > error
 
 
@@ -312,7 +325,7 @@ def find_changed(t: Tree, tolerance: float, sigmas: float, threshold: float, err
     vertex, clique, members, listed, state = t.vertex, t.clique, t.members, t.listed, t.state
     step, reference = t.step, t.reference
     for k in range(state[SHIFTED_COUNT]):
-        _note_if_much(vertex, step, reference, t.diagonal, listed[k, SHIFTED], threshold, error)
+        _note_if_much(t, listed[k, SHIFTED], threshold, error)
     stack, top, x = np.empty(64, np.int64), ZERO, np.empty(64)
     for k in range(state[DEFERRED_COUNT]):
         stack[0], top = listed[k, DEFERRED], ZERO + 1
@@ -328,7 +341,7 @@ def find_changed(t: Tree, tolerance: float, sigmas: float, threshold: float, err
                 x = np.empty(2 * clique[c, FULL_DOF])
             visit(t, c, x, tolerance, sigmas)
             for m in range(clique[c, MEMBERS], clique[c, MEMBERS] + clique[c, FRONTALS]):
-                _note_if_much(vertex, step, reference, t.diagonal, members[m], threshold, error)
+                _note_if_much(t, members[m], threshold, error)
             stack, top = with_children(clique, c, stack, top)
     count = kept = 0
     for k in range(state[DEFERRED_COUNT]):
@@ -356,15 +369,10 @@ def find_changed(t: Tree, tolerance: float, sigmas: float, threshold: float, err
 
 
 @inner
-def _note_if_much(
-    vertex: Index, step: Array, reference: Array, diagonal: Array, v: int, threshold: float, error: float
-) -> None:
+def _note_if_much(t: Tree, v: int, threshold: float, error: float) -> None:
     """Note a vertex whose step has changed much since a search last found it."""
-    largest = information = 0.0
-    for i in range(vertex[v, STEP], vertex[v, STEP] + vertex[v, DOF]):
-        largest, information = max(largest, abs(step[i] - reference[i])), max(information, diagonal[i])
-    if largest > threshold or largest * largest * np.sqrt(information) > error:
-        vertex[v, NOTED] |= IS_MUCH
+    if is_large(t, v, True, threshold, error):
+        t.vertex[v, NOTED] |= IS_MUCH
 
 
 @kernel
