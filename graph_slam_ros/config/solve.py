@@ -17,7 +17,8 @@ class SolveConfig:
     )
     relinearize_above: float = setting(
         _SOLVER.relinearize_above,
-        "a pose or landmark is linearised again when it has moved by more than this since",
+        "a pose or landmark is linearised again when it has moved by more than this since (poses whose motions are "
+        "longer than a metre: in units of these)",
         "m, rad",
         low=0.0,
         live=True,

@@ -57,7 +57,8 @@ class Settings:
     losses : by label, or by (label, source) for the edges of one source: the stages of the loss. Each is minimised, the
         last until converged; a loss with fewer stages keeps its last. Online an edge has the first at its first update
         and the last from then on
-    relinearize_above : online, a vertex is linearised anew when a component of its step is larger [m, rad]
+    relinearize_above : online, a vertex is linearised anew when a component of its step is larger [m, rad]; the
+        position of a pose in units of the typical motion between two, if that is longer than a metre
     relinearize_error : or when its step squared is more than so many standard deviations of its strongest measurement
     relinearize_every : that is looked for at every so many updates, or after two thirds of these at one that closes a
         loop; steps ten times as large are at any
