@@ -106,6 +106,14 @@ class Recording:
         links = self.fixed | {child: parent for child, parent in self.moving.items() if child != base}
         return _root(links, frame) == _root(links, base)
 
+    def moves_in(self, base: str, frame: str) -> bool:
+        """Return whether TF has the moving pose of the robot in a frame."""
+        links, seen = self.fixed | self.moving, set[str]()
+        while base in links and base not in seen and base != frame:
+            seen.add(base)
+            base = links[base]
+        return bool(seen) and base == frame
+
 
 def _root(links: dict[str, str], frame: str) -> str:
     seen = {frame}

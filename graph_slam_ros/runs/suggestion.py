@@ -258,7 +258,16 @@ class Suggestion:
         """Return the pose of a sensor that TF does not have."""
         if frame and self._recording.is_linked(frame, self._base):
             return {}
+        if frame == self._odom and self._recording.moves_in(self._base, frame):
+            self.notes.append(f"{topic} is given in {frame}: /tf says where the robot is in it")
+            return {}
         mount = assumed_mount(frame)
+        if frame in (self._odom, *MAP_FRAMES):
+            self.notes.append(
+                f"{topic} is given in {frame}, a frame that does not move with the robot: publish it in the sensor's "
+                "frame, no setting mends that"
+            )
+            return {"mount": mount}
         where = "at the base, looking ahead" if mount == OPTICAL else "at the base"
         self.notes.append(
             f"{topic}: no transform has the pose of {frame or 'its sensor'} on the robot: {where} is assumed"
