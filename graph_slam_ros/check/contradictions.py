@@ -4,10 +4,11 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
+from graph_slam_ros.check.along import check_along, motions_of
 from graph_slam_ros.check.bearings import check_bearings
 from graph_slam_ros.check.columns import Columns
 from graph_slam_ros.check.finding import Finding, Where
-from graph_slam_ros.check.noise import TYPICAL_M, check_noise, check_noise_alone, noisier
+from graph_slam_ros.check.noise import check_noise, check_noise_alone, noise_of, noisier
 from graph_slam_ros.check.pairs import LATER_S, Pairs, pairs_of, path_of, usable
 from graph_slam_ros.check.ranges import check_ranges
 from graph_slam_ros.check.sightings import SightingColumns
@@ -75,7 +76,11 @@ def _contradictions(c: Columns, s: SightingColumns, path_ns: Index, path: Array)
         yield Finding("no_parallax", "note", len(pairs.a), _LEAST_PAIRS, "pairs", text, **where)
         return
     where["count"] = len(pairs.a)
-    noise_m = 1.5 * (float(np.median(s.sigmas[pairs.a])) * 2.0**0.5 + TYPICAL_M)
+    noise_m = noise_of(s, pairs)
+    along = list(check_along(s, motions_of(s, pairs, path_ns, path, noise_m), where))
+    yield from along
+    if any(one.ends for one in along):
+        return
     found = _mirrored(c, s, pairs, noise_m, where) or _axes(s, pairs, noise_m, use, where)
     if found is not None:
         yield found

@@ -103,7 +103,7 @@ KINDS: dict[str, Kind] = {
     "two_parents": Kind("a frame has two parents, so transforms through it are arbitrary", _PUBLISHER),
     "static_changes": Kind("a static transform is published twice, with different values", _PUBLISHER),
     "seen_in_fixed_frame": Kind(
-        "sightings are given in a frame that does not move with the robot", "publish them in the sensor's frame"
+        "sightings are given in a frame that does not move with the robot", "publish them in the sensor's frame", True
     ),
     "tf_differs": Kind(
         "odometry's topic and /tf do not describe the same motion", "choose one with --odom, or stop the other"
@@ -212,6 +212,10 @@ KINDS: dict[str, Kind] = {
         "the ids of all landmarks are new from some time on, once or again and again",
         "let the detector keep its ids when it begins anew; without ids set landmarks.association=joint",
     ),
+    "landmark_moves": Kind(
+        "a landmark moves: a person, a vehicle, or a tag that the robot carries",
+        "let the detector leave out this id; a run believes none of its sightings that contradict the others",
+    ),
     "landmark_moved": Kind("a landmark was moved during the drive", "use landmarks that nobody moves"),
     "map_breaks": Kind(
         "many landmarks are elsewhere after some time, so the robot's path has a break there",
@@ -263,13 +267,12 @@ class Finding:
     @property
     def ends(self) -> bool:
         """Return whether other findings mean nothing while it is there."""
-        return self.code in KINDS and KINDS[self.code].ends
+        return self.code in KINDS and KINDS[self.code].ends and self.severity != "note"
 
     @property
     def forbids_replay(self) -> bool:
         """Return whether a replay is of no use until the cause is corrected: no setting mends it."""
-        is_refusal = self.code not in KINDS or self.code == "seen_in_fixed_frame"
-        return self.severity == "error" and not self.settings and (self.ends or is_refusal)
+        return self.severity == "error" and not self.settings and (self.ends or self.code not in KINDS)
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values; a number that JSON has not is null."""

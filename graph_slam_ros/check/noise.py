@@ -17,6 +17,11 @@ _QUARTILE, _OF_RAYLEIGH, _WORSE = 0.25, 0.7585, 3.0
 _RAISED, _TINY, _TOO_SMALL = 0.5, 1e-3, 10.0
 
 
+def noise_of(s: SightingColumns, pairs: Pairs) -> float:
+    """Return by how much two sightings of a landmark differ within a few seconds [m], where nothing is wrong."""
+    return 1.5 * (float(np.median(s.sigmas[pairs.a])) * 2.0**0.5 + TYPICAL_M)
+
+
 def noisier(s: SightingColumns, pairs: Pairs) -> Iterator[Finding]:
     """Sightings that are far worse than their noise says, by the smaller residuals of pairs, which no outlier has."""
     if not len(pairs.a):  # ranges or bearings alone

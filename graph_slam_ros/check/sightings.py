@@ -2,14 +2,14 @@
 
 from array import array
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from graph_slam_ros.check.located import located, moved
 from graph_slam_ros.lie import se3
 from graph_slam_ros.measurements.types import Sightings
-from graph_slam_ros.typing import Array, Index, Numbers
+from graph_slam_ros.typing import Array, Index, Mask, Numbers
 
 MOST = 200_000
 """Messages of each topic that are collected; a replay looks into no more."""
@@ -42,6 +42,11 @@ class SightingColumns:
     sigmas: Array
     frame: str
     T_base_frame: se3.Pose
+
+    def some(self, which: Mask) -> "SightingColumns":
+        """Return the columns of some of the sightings."""
+        rows = ("stamp_ns", "message", "name", "points", "ranges", "bearings", "sigmas")
+        return replace(self, **{row: getattr(self, row)[which] for row in rows})
 
 
 class SightingCollector:

@@ -1,12 +1,13 @@
 """The check of a recording: choose its inputs, read it once, collect all findings."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from graph_slam_ros.check.along import moving_names, without
 from graph_slam_ros.check.checks import check_columns, with_inputs
 from graph_slam_ros.check.columns import Collector, Columns
 from graph_slam_ros.check.finding import Finding, Severity, in_order, with_one_value
@@ -14,7 +15,7 @@ from graph_slam_ros.check.gyro import of_gyro_or_wheels
 from graph_slam_ros.check.odometry import of_pose_or_twist
 from graph_slam_ros.check.trial import check_trial, replayed
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.measurements.types import Measured
+from graph_slam_ros.measurements.types import Measured, Sightings
 from graph_slam_ros.messages.inputs import known_types
 from graph_slam_ros.messages.inputs.transforms import MAP_FRAMES
 from graph_slam_ros.recordings.bag import Bag, open_bag
@@ -98,8 +99,10 @@ def check(
     found += _damage(bag)
     found += check_columns(columns)
     if not quick and not any(one.ends for one in found):
+        moving = moving_names(columns)
         some = _for_trial(columns, [some for number, some in measured if number == 0])
-        found += with_inputs(columns, _trial(columns, some))
+        some = [_without(one, moving) for one in some] if moving else some
+        found += with_inputs(columns, _trial(without(columns, moving), some))
     found = [_with_candidates(one, suggestion) for one in found]
     others = suggestion.settings.keys() - suggested.assumed.keys()
     command = "" if suggestion.trouble else suggestion.command(without=others)
@@ -115,6 +118,16 @@ def _for_trial(columns: Columns, measured: list[Measurements]) -> list[Measureme
         return measured
     end_ns = min(int(s.stamp_ns.min()) for s in seen) + _UNNAMED_NS
     return [some for some in measured if all(getattr(m, "stamp_ns", 0) <= end_ns for m in some)]
+
+
+def _without(measured: Measurements, moving: Mapping[str, Collection[str]]) -> Measurements:
+    """Return measurements without sightings of what moves."""
+    return [
+        replace(m, sightings=tuple(one for one in m.sightings if one.id not in moving.get(m.topic, ())))
+        if isinstance(m, Sightings)
+        else m
+        for m in measured
+    ]
 
 
 def _trial(columns: Columns, measured: list[Measurements]) -> list[Finding]:

@@ -1,0 +1,151 @@
+"""Sightings that stay where they are while the robot moves, or that move by themselves."""
+
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from graph_slam_ros.check.columns import Columns
+from graph_slam_ros.check.finding import Finding, Where
+from graph_slam_ros.check.noise import noise_of
+from graph_slam_ros.check.pairs import Pairs, pairs_of, path_of, poses_at
+from graph_slam_ros.check.sightings import SightingColumns
+from graph_slam_ros.lie import se3
+from graph_slam_ros.typing import Array, Index, Mask
+
+_LEAST_PAIRS, _LEAST_NAMES = 10, 3
+_NOISES, _HALF = 4.0, 0.5
+_MOST, _SOME = 0.8, 0.3  # part of the pairs of one landmark that moves; part of the landmarks that may
+_TIMES, _NEARLY_ALL = 3.0, 0.9
+_MOST_NAMED, _SAMPLED, _ABOUT_NS = 5, 60, 10_000_000_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Motions:
+    """The motion of each landmark within some seconds, by the medians of its pairs.
+
+    Attributes
+    ----------
+    names : (n,) numbers of the identities that are seen often enough
+    on_robot, on_ground : (n,) on the robot, and on the ground if odometry is right [m]
+    staying : (n,) part of its sightings within some seconds that are at the same place on the ground
+    moving : (n,) part of its pairs that are farther apart on the ground than noise explains
+    at : (n, 3) where it is on the robot
+    """
+
+    names: Index
+    on_robot: Array
+    on_ground: Array
+    staying: Array
+    moving: Array
+    at: Array
+    noise_m: float
+
+    @property
+    def rides(self) -> Mask:
+        """(n,) Landmarks that stay at one place on the robot while that moves."""
+        far = (self.on_ground > _NOISES * self.noise_m) & (self.moving > _MOST)
+        return np.asarray(far & (self.on_robot < _HALF * self.on_ground))
+
+    @property
+    def wanders(self) -> Mask:
+        """(n,) Landmarks that stay nowhere; those with wrong ids now and then stay most of the time."""
+        far = (self.on_ground > _NOISES * self.noise_m) & (self.moving > _MOST)
+        return np.asarray(far & ~self.rides & (self.staying < _SOME))
+
+
+def motions_of(s: SightingColumns, pairs: Pairs, path_ns: Index, path: Array, noise_m: float) -> Motions:
+    """Return how each landmark moves, by odometry as ``path_of`` has it.
+
+    Parameters
+    ----------
+    noise_m : what two sightings of a landmark differ by, where nothing is wrong
+    """
+    on_ground = pairs.residuals(s.points)
+    on_robot = np.linalg.norm((s.points[pairs.b] - s.points[pairs.a])[:, : pairs.dimensions], axis=1)
+    of = s.name[pairs.a]
+    names = np.flatnonzero(np.bincount(of, minlength=len(s.names)) >= _LEAST_PAIRS)
+    chosen = [np.flatnonzero(of == name) for name in names]
+
+    def median(values: Array) -> Array:
+        return np.array([float(np.median(values[k])) for k in chosen])
+
+    poses = poses_at(np.clip(s.stamp_ns, path_ns[0], path_ns[-1]), path_ns, path)
+    ground = np.stack(se3.act(tuple(poses.T), tuple(s.points.T)), axis=1)[:, : pairs.dimensions]
+    moving = np.array([float((on_ground[k] > 2.0 * noise_m).mean()) for k in chosen])
+    at = np.array([np.median(s.points[pairs.a[k]], axis=0) for k in chosen]).reshape(-1, 3)
+    staying = np.array([_staying(s.stamp_ns[own], ground[own], 2.0 * noise_m) for own in _own(s, names)])
+    return Motions(names, median(on_robot), median(on_ground), staying, moving, at, noise_m)
+
+
+def _own(s: SightingColumns, names: Index) -> Iterator[Index]:
+    """The sightings of each identity."""
+    for name in names:
+        yield np.flatnonzero(s.name == name)
+
+
+def _staying(stamp_ns: Index, ground: Array, near_m: float) -> float:
+    """The median part of the sightings about the time of one that are at its place."""
+    parts = []
+    for k in np.linspace(0, len(stamp_ns) - 1, min(_SAMPLED, len(stamp_ns))).astype(np.int64):
+        about = np.abs(stamp_ns - stamp_ns[k]) < _ABOUT_NS
+        parts.append(float((np.linalg.norm(ground[about] - ground[k], axis=1) < near_m).mean()))
+    return float(np.median(parts))
+
+
+def check_along(s: SightingColumns, by: Motions, where: Where) -> Iterator[Finding]:
+    """Sightings of a fixed frame, whatever frame they name, and landmarks that move."""
+    if np.count_nonzero(by.rides) >= max(_LEAST_NAMES, _MOST * len(by.names)):
+        robot_m, ground_m = float(np.median(by.on_robot)), float(np.median(by.on_ground))
+        text = (
+            f"{s.topic}: while the robot drives, landmarks stay where they are on it to {robot_m:.2f} m, and "
+            f"would move by {ground_m:.2f} m on the ground: they are given in a frame that does not move with the robot"
+        )
+        value = ground_m / max(robot_m, 1e-9)
+        yield Finding("seen_in_fixed_frame", "error", value, 1.0 / _HALF, "times", text, **where)
+        return
+    for k in moving_alone(by)[:_MOST_NAMED]:
+        name, count = s.names[by.names[k]], int((s.name == by.names[k]).sum())
+        text = f"{s.topic}: landmark {name} moves: it is {by.on_ground[k]:.2f} m from its place a few seconds later"
+        if by.rides[k]:
+            x, y = by.at[k, :2]
+            text = (
+                f"{s.topic}: landmark {name} moves along with the robot, at x {x:.2f} and y {y:.2f} m on it: it is a "
+                "part of the robot, or follows it"
+            )
+        at: Where = {"topic": s.topic, "first_ns": int(s.stamp_ns[s.name == by.names[k]].min()), "count": count}
+        yield Finding("landmark_moves", "warning", by.on_ground[k], _NOISES * by.noise_m, "m", text, **at)
+
+
+def moving_alone(by: Motions) -> list[int]:
+    """The landmarks that move where the others do not, by their place in the columns; the farthest first."""
+    moves = by.rides | by.wanders
+    rest = by.on_ground[~moves]
+    if not moves.any() or moves.sum() > max(1.0, _SOME * len(moves)):
+        return []
+    if len(rest) and float(np.median(rest)) > 2.0 * by.noise_m:
+        return []
+    least_m = _TIMES * float(np.quantile(rest, _NEARLY_ALL)) if len(rest) else 0.0  # odometry that is wrong moves all
+    found = np.flatnonzero(moves & (by.on_ground > least_m))
+    return [int(k) for k in found[np.argsort(-by.on_ground[found], kind="stable")]]
+
+
+def moving_names(c: Columns) -> dict[str, set[str]]:
+    """Identities that move, by their input."""
+    path_ns, path = path_of(c)
+    found: dict[str, set[str]] = {}
+    for s in c.sightings if len(path_ns) > 1 else ():
+        pairs = pairs_of(s, path_ns, path, c.config.world.dimensions) if len(s.stamp_ns) else None
+        if pairs is not None and len(pairs.a) >= _LEAST_PAIRS:
+            by = motions_of(s, pairs, path_ns, path, noise_of(s, pairs))
+            found |= {s.input: {s.names[by.names[k]] for k in moving_alone(by)}}
+    return {name: names for name, names in found.items() if names}
+
+
+def without(c: Columns, moving: Mapping[str, Collection[str]]) -> Columns:
+    """The same recording without sightings of some identities, by their input."""
+    kept = []
+    for s in c.sightings:
+        out = [k for k, name in enumerate(s.names) if name in moving.get(s.input, ())]
+        kept.append(s.some(~np.isin(s.name, out)) if out else s)
+    return replace(c, sightings=tuple(kept))
