@@ -66,6 +66,10 @@ KINDS: dict[str, Kind] = {
     "no_overlap": Kind(
         "sightings are stamped before odometry begins or after it ends", f"{_ONE_CLOCK}; or set INPUT.offset_s", True
     ),
+    "odometry_short": Kind(
+        "sightings were recorded before odometry began or after it ended, and these are not used",
+        "record odometry from the beginning to the end; find out whether its driver stopped",
+    ),
     "time_jump": Kind(
         "stamps step back by more than time.jump_back_s: the clock was set, or two recordings were joined",
         "cut the recording in two; time.on_jump sets what a run does at the step",

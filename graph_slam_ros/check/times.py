@@ -24,7 +24,7 @@ _LONG_S, _VERY_LONG_S, _PERIODS, _MOVED_M, _TURNED = 1.0, 2.0, 10.0, 0.05, 0.05
 _SLOW_HZ, _BETWEEN_S = 5.0, 0.02
 _JITTER, _FAST_HZ = 1.5, 200.0
 _SCATTERED_S, _REGULAR, _LEAST_STEPS = 0.05, 0.2, 50
-_OUTSIDE, _MARGIN_NS = 0.2, 500_000_000
+_OUTSIDE, _NEARLY_ALL, _MARGIN_NS = 0.2, 0.95, 500_000_000
 
 
 def check_times(c: Columns) -> Iterator[Finding]:
@@ -284,14 +284,30 @@ def _overlap(c: Columns) -> Iterator[Finding]:
         return
     first_ns, last_ns = int(c.path_ns.min()), int(c.path_ns.max())
     for s in c.sightings:
-        if len(s.stamp_ns):
-            outside = (s.stamp_ns < first_ns - _MARGIN_NS) | (s.stamp_ns > last_ns + _MARGIN_NS)
-            share = float(outside.mean())
-            if share > _OUTSIDE:
-                ends = [(int(t) - first_ns) * 1e-9 for t in (s.stamp_ns.min(), s.stamp_ns.max())]
-                text = (
-                    f"{s.topic}: {share:.0%} of the sightings are stamped outside the time of odometry ({ends[0]:.1f} "
-                    f"to {ends[1]:.1f} s, odometry 0 to {(last_ns - first_ns) * 1e-9:.1f} s)"
-                )
-                at: Where = {"topic": s.topic, "first_ns": int(s.stamp_ns[outside][0]), "count": int(outside.sum())}
-                yield Finding("no_overlap", "error", share, _OUTSIDE, "part", text, **at)
+        outside = (s.stamp_ns < first_ns - _MARGIN_NS) | (s.stamp_ns > last_ns + _MARGIN_NS)
+        share = float(outside.mean()) if len(outside) else 0.0
+        if share <= _OUTSIDE:
+            continue
+        at: Where = {"topic": s.topic, "first_ns": int(s.stamp_ns[outside][0]), "count": int(outside.sum())}
+        ends = [(int(t) - first_ns) * 1e-9 for t in (s.stamp_ns.min(), s.stamp_ns.max())]
+        if share < _NEARLY_ALL and _recorded_alone(c, s.topic) > _OUTSIDE:
+            after_s = ends[1] - (last_ns - first_ns) * 1e-9
+            when = [f"begins {-ends[0]:.1f} s after the first of them"] * (-ends[0] > _MARGIN_NS * 1e-9)
+            when += [f"ends {after_s:.1f} s before the last of them"] * (after_s > _MARGIN_NS * 1e-9)
+            text = f"{s.topic}: {share:.0%} of the sightings were recorded without odometry, which {' and '.join(when)}"
+            yield Finding("odometry_short", "warning", share, _OUTSIDE, "part", text, **at)
+            continue
+        text = (
+            f"{s.topic}: {share:.0%} of the sightings are stamped outside the time of odometry ({ends[0]:.1f} "
+            f"to {ends[1]:.1f} s, odometry 0 to {(last_ns - first_ns) * 1e-9:.1f} s)"
+        )
+        yield Finding("no_overlap", "error", share, _OUTSIDE, "part", text, **at)
+
+
+def _recorded_alone(c: Columns, name: str) -> float:
+    """Return which part of the messages of a topic was recorded before odometry or after it, whatever their stamps."""
+    topic, of_odometry = c.topics.get(name), c.topics.get(c.odometry.topic)
+    if topic is None or of_odometry is None or not len(topic.log_ns) or not len(of_odometry.log_ns):
+        return 0.0
+    first_ns, last_ns = of_odometry.log_ns.min() - _MARGIN_NS, of_odometry.log_ns.max() + _MARGIN_NS
+    return float(((topic.log_ns < first_ns) | (topic.log_ns > last_ns)).mean())
