@@ -242,9 +242,10 @@ def _twist(o: OdometryColumns, steps: Steps, jumps: Mask, where: Where) -> Itera
     ):
         if total < 1.0 or not np.isfinite(factor):
             continue
-        if abs(factor - 1.0) > _SCALE and left < _EXPLAINED:
-            unit = next((why for k, why in _UNITS.items() if abs(factor / k - 1.0) < _SCALE), "another scale")
-            text = f"{o.topic}: the pose moves {factor:.3g} times as far as the {what} of the twist says ({unit})"
+        unit = next((why for k, why in _UNITS.items() if abs(factor / k - 1.0) < _SCALE), "")
+        if abs(factor - 1.0) > _SCALE and left < _EXPLAINED and (unit or width >= _LEAST_WIDTH):
+            text = f"{o.topic}: the pose moves {factor:.3g} times as far as the {what} of the twist says"
+            text += f" ({unit or 'another scale'})"
             yield Finding("twist_scale", "warning", factor, _SCALE, "times", text, settings=_DENSITY, **where)
         elif left > _UNEXPLAINED and total > 5.0 and width >= _LEAST_WIDTH:
             text = f"{o.topic}: the {what} of the twist does not explain {left:.0%} of the motion of the pose"
