@@ -1,10 +1,13 @@
 """The files of a rosbag2 folder, as its metadata.yaml names them."""
 
+import shlex
 from pathlib import Path
 
 import yaml
 
 from graph_slam_ros.formats.files import read_text
+
+_PACKED = ".zstd"
 
 
 def as_listed(path: Path, found: list[Path]) -> tuple[list[Path], list[str], list[str]]:
@@ -19,10 +22,27 @@ def as_listed(path: Path, found: list[Path]) -> tuple[list[Path], list[str], lis
     files = [there[name] for name in dict.fromkeys(named) if name in there]
     if not files:
         return found, [], []
-    missing = [f"{path / name}: not there, though metadata.yaml names it" for name in named if name not in there]
+    lost = [name for name in named if name not in there and not (path / f"{name}{_PACKED}").is_file()]
+    missing = [f"{path / name}: not there, though metadata.yaml names it" for name in lost]
     others = [file.name for file in found if file not in files]
     mend = "metadata.yaml does not name it: if it is a part of the recording, ros2 bag reindex"
     return files, missing, [f"{path / name}: not read, as {mend}" for name in others]
+
+
+def still_packed(path: Path, files: list[Path]) -> list[str]:
+    """The losses of files that are compressed as a whole, next to others that are not."""
+    there = {file.name for file in files}
+    if not path.is_dir() or any(name.endswith(_PACKED) for name in there):
+        return []
+    packed = sorted(file for file in path.glob(f"*{_PACKED}") if file.name.removesuffix(_PACKED) not in there)
+    return [f"{file.name}: not read: {unpacking(file)}" for file in packed if file.stem.endswith((".db3", ".mcap"))]
+
+
+def unpacking(file: Path, codec: str = "zstd") -> str:
+    """Say how a file is unpacked that is compressed as a whole."""
+    whole = file.with_suffix("") if file.suffix in (".zstd", ".gz", ".bz2", ".lz4") else Path("UNPACKED")
+    mend = f"unpack it first: {codec} -dc < {shlex.quote(str(file))} > {shlex.quote(str(whole))}"
+    return f"the whole file is compressed with {codec}: {mend}"
 
 
 def _names_in(metadata: Path) -> list[str]:

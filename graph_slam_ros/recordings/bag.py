@@ -5,7 +5,6 @@ Intact and damaged files are read the same way. Everything intact is read; what 
 
 import heapq
 import re
-import shlex
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -18,7 +17,7 @@ from mcap.writer import CompressionType, Writer
 from rosbags.typesys.store import Typestore
 
 from graph_slam_ros.errors import FormatError, GraphSlamError, similar_file
-from graph_slam_ros.formats.bag_folder import as_listed
+from graph_slam_ros.formats.bag_folder import as_listed, still_packed, unpacking
 from graph_slam_ros.formats.durable import AppendedFile
 from graph_slam_ros.formats.files import opened
 from graph_slam_ros.messages.interfaces import typestore
@@ -135,7 +134,7 @@ def open_bag(path: Path | str) -> Bag:
         raise BagError(f"{path}: {error.strerror}") from None
     except FormatError as error:
         raise BagError(str(error)) from None
-    bag.losses += missing
+    bag.losses += [*missing, *still_packed(path, files)]
     bag.warnings += others
     names = {re.sub(r"[_-]?\d+$", "", file.stem) for file in files}
     if len(names) > 1 and not (path / "metadata.yaml").is_file():
@@ -175,9 +174,7 @@ def _part(file: Path) -> "_Part":
             return kind(file)
     for magic, codec in _PACKED.items():
         if begins.startswith(magic):
-            whole = file.with_suffix("") if file.suffix in (".zstd", ".gz", ".bz2", ".lz4") else Path("UNPACKED")
-            mend = f"unpack it first: {codec} -dc < {shlex.quote(str(file))} > {shlex.quote(str(whole))}"
-            raise BagError(f"{file}: the whole file is compressed with {codec}: {mend}")
+            raise BagError(f"{file}: {unpacking(file, codec)}")
     raise BagError(f"{file}: not a readable recording: it begins as neither mcap, sqlite3 nor a ROS 1 bag")
 
 
