@@ -12,7 +12,8 @@ from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.formats.files import opened
 
 _MAX_BYTES, _MAX_DEPTH, _MAX_NODES = 2**20, 50, 20_000
-_NODE = "graph_slam"
+_NODE, _WRAPPER = "graph_slam", "ros__parameters"
+_OF_ANY_NODE = ("use_sim_time", "qos_overrides", "start_type_description_service")  # which rclpy itself reads
 
 
 class _StrictLoader(yaml.SafeLoader):
@@ -85,7 +86,8 @@ _StrictLoader.add_implicit_resolver(
 def read_parameters(path: Path | str, *, follow: bool = True) -> dict[str, Any]:
     """Nested values of a parameter file; a ROS wrapper (``/**: ros__parameters: ...``) is taken off.
 
-    Of a file for several nodes, the section of ``graph_slam``. ``follow``: the file may be a symbolic link.
+    What any node has (``use_sim_time``) is left out. Of a file for several nodes, the section of ``graph_slam``.
+    ``follow``: the file may be a symbolic link.
 
     Raises
     ------
@@ -113,7 +115,9 @@ def read_parameters(path: Path | str, *, follow: bool = True) -> dict[str, Any]:
 
 
 def _unwrapped(path: Path, values: dict[Any, Any]) -> dict[str, Any]:
-    wrapped = {k: v for k, v in values.items() if isinstance(v, dict) and "ros__parameters" in v}
+    wrapped = {k: v for k, v in values.items() if isinstance(v, dict) and _WRAPPER in v}
+    if any(isinstance(v, dict) and "ros_parameters" in v for v in values.values()):
+        raise ConfigError(f"{path}: ros_parameters: did you mean {_WRAPPER}? It has two underscores")
     if wrapped and len(values) > 1:
         ours = [name for name in wrapped if str(name).rpartition("/")[2] == _NODE]
         if len(ours) != 1 or any("*" in str(name) for name in values):
@@ -121,13 +125,13 @@ def _unwrapped(path: Path, values: dict[Any, Any]) -> dict[str, Any]:
                 f"{path}: parameters of several nodes ({', '.join(map(str, values))}); give a file of one"
             )
         wrapped = {ours[0]: wrapped[ours[0]]}
-    inner = next(iter(wrapped.values()))["ros__parameters"] if wrapped else values
+    inner = next(iter(wrapped.values()))[_WRAPPER] if wrapped else values
     if not isinstance(inner, dict):
-        raise ConfigError(f"{path}: ros__parameters is not a mapping")
+        raise ConfigError(f"{path}: {_WRAPPER} is not a mapping")
     for key in inner:
         if not isinstance(key, str):
             raise ConfigError(f"{path}: {key!r} is not a name")
-    return inner
+    return {k: v for k, v in inner.items() if not wrapped or k.partition(".")[0] not in _OF_ANY_NODE}
 
 
 def assignment(key: str, value: Any) -> str:
