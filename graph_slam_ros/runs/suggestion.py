@@ -209,13 +209,17 @@ class Suggestion:
             elif one.frame == self._odom:
                 self.unused[name] = "in the frame of the odometry: it says the same"
             elif one.topic.type == POSE or has_landmarks or len(self.names) > 1:
-                self.unused[name] = (
-                    "a pose may be an estimate or the truth; as a fix: type, topic, frame=map in a section"
-                )
+                self.unused[name] = f"a pose may be an estimate or the truth; as a fix: {self._as_fix(one)}"
             else:
                 chosen: dict[str, Any] = {} if one.frame == "map" else {"frame": "map"}
                 self._add("pose", one, chosen | ({} if one.has_noise else {"sigma_m": 0.1}), linked=True)
                 self.notes.append(f"{name} is taken for a fix: if it is an estimate or the truth, leave it out")
+
+    def _as_fix(self, one: TopicContents) -> str:
+        """The settings that make a topic of poses a fix, besides the inputs that are chosen."""
+        names, noise = " ".join([*self.names, "pose"]), "" if one.has_noise else " --set pose.sigma_m=0.1"
+        chosen = f"--set pose.type={one.topic.type} --set pose.topic={one.topic.name} --set pose.frame=map{noise}"
+        return f"--set 'inputs.names={names}' {chosen}"
 
     def _choose_imu(self, found: Iterator[TopicContents], is_needed: bool) -> None:
         for one in sorted(found, key=lambda one: -one.usable):
