@@ -9,7 +9,8 @@ from graph_slam_ros.typing import Index
 NOT_YET, MAYBE, SURELY = range(3)
 BY_FAR = 10.0  # times the threshold: steps that are linearised anew at once
 _MOTIONS = {RELATIVE_POSE: 2, INVERSE_RELATIVE_POSE: 2, RELATIVE_POSE_3D: 3}  # components of their positions
-_CLASSES, _PER_OCTAVE = 41, 2  # of lengths, from a metre on
+_SIGHTINGS = "landmarks"  # label of edges to landmarks, which may be poses, too
+_CLASSES, _PER_OCTAVE, _FARTHEST_M = 41, 2, 1e9  # of lengths, from a metre on
 
 
 class RelinearizationSchedule:
@@ -65,7 +66,9 @@ class MotionLength:
                 self._times[:], self._rows = 0, dict.fromkeys(_MOTIONS, 0)
                 return self.typical_mm(graph)
             if table and count > known:
-                square = np.square(table.measured.values[known:, :n]).sum(axis=1)
+                of_label = graph.labels.index(_SIGHTINGS) if _SIGHTINGS in graph.labels else -1
+                moved = table.measured.values[known:, :n][table.label.values[known:] != of_label]
+                square = np.square(np.clip(moved, -_FARTHEST_M, _FARTHEST_M)).sum(axis=1)
                 classes = np.floor(0.5 * _PER_OCTAVE * np.log2(np.maximum(square, 1.0)))
                 self._times += np.bincount(np.minimum(classes, _CLASSES - 1).astype(np.int64), minlength=_CLASSES)
                 self._rows[edge_type] = count

@@ -34,6 +34,15 @@ def test_false_closures_of_any_length_do_not_change_it_and_what_comes_later_coun
     assert motions.typical_mm(graph) == MotionLength().typical_mm(graph) == 1000
 
 
+def test_sightings_of_tags_are_no_motions():
+    graph, motions = chain([0.5] * 4, dimensions=3), MotionLength()
+    for k in range(20):
+        tag = graph.add_vertex(SE3, (5.0, float(k), 0.0, 0.0, 0.0, 0.0, 1.0))
+        seen = (5.0, float(k), 0.0, 0.0, 0.0, 0.0, 1.0)
+        graph.add_edge(RELATIVE_POSE_3D, (0, tag), seen, Gaussian(np.eye(6)), "landmarks")
+    assert motions.typical_mm(graph) == 1000
+
+
 def test_without_motions_it_is_a_metre():
     assert MotionLength().typical_mm(Graph()) == 1000
 
