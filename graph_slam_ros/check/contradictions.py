@@ -4,10 +4,10 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from graph_slam_ros.check.along import check_along, motions_of
 from graph_slam_ros.check.bearings import check_bearings
 from graph_slam_ros.check.columns import Columns
 from graph_slam_ros.check.finding import Finding, Where
+from graph_slam_ros.check.moving_landmarks import check_moving, motions_of
 from graph_slam_ros.check.noise import check_noise, check_noise_alone, noise_of, noisier
 from graph_slam_ros.check.pairs import LATER_S, Pairs, pairs_of, path_of, usable
 from graph_slam_ros.check.ranges import check_ranges
@@ -77,7 +77,7 @@ def _contradictions(c: Columns, s: SightingColumns, path_ns: Index, path: Array)
         return
     where["count"] = len(pairs.a)
     noise_m = noise_of(s, pairs)
-    along = list(check_along(s, motions_of(s, pairs, path_ns, path, noise_m), where))
+    along = list(check_moving(s, motions_of(s, pairs, path_ns, path, noise_m), where))
     yield from along
     if any(one.ends for one in along):
         return

@@ -293,7 +293,7 @@ def _places(
     Parameters
     ----------
     late_s : by input: what its stamps are corrected by, since a wrong clock puts landmarks elsewhere in turns
-    slip : a stretch in which odometry does not say where the robot is: nothing is told from what was seen there
+    slip : the stretch in which odometry does not say where the robot is: sightings in it are left out
     """
     found: list[Finding] = []
     for s in c.sightings:

@@ -22,6 +22,7 @@ from graph_slam_ros.runs.replay import RecordedRuns
 from graph_slam_ros.runs.suggested_inputs import SuggestedInputs
 from graph_slam_ros.runs.tables import account
 from graph_slam_ros.slam import Config, Counters, GraphSlam
+from graph_slam_ros.slam.calibration.decision import amount
 from graph_slam_ros.slam.calibration.parameters import OF_ODOMETRY, QUANTITIES, Parameter
 from graph_slam_ros.slam.calibration.uncorrected import CODES
 from graph_slam_ros.warmup import warmup
@@ -118,7 +119,7 @@ class _Rounds:
         self.fault: Finding | None = None
         self.count = self.keyframes = 0
         self._bag, self._inputs, self._config, self._progress = bag, inputs, config, progress
-        self._corrected = set[str]()
+        self._corrected = set[Parameter]()
         self._total = sum(bag.topics[topic].count for topic in inputs.by_topic())
 
     def run(self) -> None:
@@ -139,16 +140,18 @@ class _Rounds:
                 self.found, self.parameters = {}, []
                 return
             report, kept, before = slam.calibration_report, dict(self.found), accepted
-            self._corrected |= {str(one.parameter) for one in slam.corrected}
+            self._corrected |= {one.parameter for one in slam.corrected}
             self.parameters = [self._left(one) for one in report["parameters"]]
             self.found |= report["settings"]
             self.is_complete = not report["settings"] or self._finds_nothing_in(slam.calibrated_since + 1, accepted)
 
     def _left(self, one: dict[str, Any]) -> dict[str, Any]:
         """Say of a parameter that was corrected that its value is what is left of it."""
-        name, colon, rest = one["text"].partition(": nothing to correct (")
-        is_left = colon and name in self._corrected
-        return one | {"text": f"{name}: corrected, {rest[:-1]} is left"} if is_left else one
+        parameter = Parameter(one["source"], one["name"])
+        if one["verdict"] != "nothing_to_correct" or parameter not in self._corrected:
+            return one
+        left = f"{amount(parameter, one['value'], 3)}, sigma {amount(parameter, one['sigma'])}"
+        return one | {"text": f"{parameter}: corrected, {left} is left"}
 
     def _replayed(self) -> GraphSlam:
         """Replay the whole recording. The first replay collects what ``check`` needs."""

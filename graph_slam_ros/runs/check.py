@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from graph_slam_ros.check.along import moving_names, without
 from graph_slam_ros.check.checks import check_columns, with_inputs
 from graph_slam_ros.check.columns import Collector, Columns
 from graph_slam_ros.check.finding import Finding, Severity, in_order, with_one_value
 from graph_slam_ros.check.gyro import of_gyro_or_wheels
+from graph_slam_ros.check.moving_landmarks import moving_names, without
 from graph_slam_ros.check.odometry import of_pose_or_twist
 from graph_slam_ros.check.trial import check_trial, replayed
 from graph_slam_ros.errors import GraphSlamError

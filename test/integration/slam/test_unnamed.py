@@ -117,7 +117,9 @@ def test_without_ids_the_path_is_as_near_to_the_truth_and_each_tree_is_there_onc
     assert len(set(which.tolist())) == len(which) >= 0.8 * len(recording.landmarks)
 
 
-@pytest.mark.parametrize(("seed", "aisle_m"), times([(3, 8.0)], [(1, 8.0), (2, 8.0), (1, 10.0), (3, 10.0), (3, 12.0)]))
+@pytest.mark.parametrize(
+    ("seed", "aisle_m"), times([(3, 8.0)], [(1, 8.0), (2, 8.0), (1, 10.0), (3, 10.0), (3, 12.0), (7, 12.0), (9, 12.0)])
+)
 def test_among_racks_that_look_alike_other_beams_find_the_way(seed, aisle_m):
     """The first beam confuses the tags of the two faces of a rack, and of aisles: 0.16 to 1.9 m.
 

@@ -1,4 +1,4 @@
-"""Sightings that stay where they are while the robot moves, or that move by themselves."""
+"""Landmarks that move: with the robot, by themselves, or all at once because their frame does not move with it."""
 
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -21,7 +21,7 @@ _MOST_NAMED, _SAMPLED, _ABOUT_NS = 5, 60, 10_000_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Motions:
+class LandmarkMotions:
     """The motion of each landmark within some seconds, by the medians of its pairs.
 
     Attributes
@@ -31,6 +31,7 @@ class Motions:
     staying : (n,) part of its sightings within some seconds that are at the same place on the ground
     moving : (n,) part of its pairs that are farther apart on the ground than noise explains
     at : (n, 3) where it is on the robot
+    noise_m : what two sightings of a landmark differ by, where nothing is wrong
     """
 
     names: Index
@@ -42,19 +43,21 @@ class Motions:
     noise_m: float
 
     @property
-    def rides(self) -> Mask:
-        """(n,) Landmarks that stay at one place on the robot while that moves."""
-        far = (self.on_ground > _NOISES * self.noise_m) & (self.moving > _MOST)
-        return np.asarray(far & (self.on_robot < _HALF * self.on_ground))
+    def _moves(self) -> Mask:
+        return np.asarray((self.on_ground > _NOISES * self.noise_m) & (self.moving > _MOST))
 
     @property
-    def wanders(self) -> Mask:
+    def moves_with_robot(self) -> Mask:
+        """(n,) Landmarks that stay at one place on the robot while that moves."""
+        return np.asarray(self._moves & (self.on_robot < _HALF * self.on_ground))
+
+    @property
+    def moves_by_itself(self) -> Mask:
         """(n,) Landmarks that stay nowhere; those with wrong ids now and then stay most of the time."""
-        far = (self.on_ground > _NOISES * self.noise_m) & (self.moving > _MOST)
-        return np.asarray(far & ~self.rides & (self.staying < _SOME))
+        return np.asarray(self._moves & ~self.moves_with_robot & (self.staying < _SOME))
 
 
-def motions_of(s: SightingColumns, pairs: Pairs, path_ns: Index, path: Array, noise_m: float) -> Motions:
+def motions_of(s: SightingColumns, pairs: Pairs, path_ns: Index, path: Array, noise_m: float) -> LandmarkMotions:
     """Return how each landmark moves, by odometry as ``path_of`` has it.
 
     Parameters
@@ -75,7 +78,7 @@ def motions_of(s: SightingColumns, pairs: Pairs, path_ns: Index, path: Array, no
     moving = np.array([float((on_ground[k] > 2.0 * noise_m).mean()) for k in chosen])
     at = np.array([np.median(s.points[pairs.a[k]], axis=0) for k in chosen]).reshape(-1, 3)
     staying = np.array([_staying(s.stamp_ns[own], ground[own], 2.0 * noise_m) for own in _own(s, names)])
-    return Motions(names, median(on_robot), median(on_ground), staying, moving, at, noise_m)
+    return LandmarkMotions(names, median(on_robot), median(on_ground), staying, moving, at, noise_m)
 
 
 def _own(s: SightingColumns, names: Index) -> Iterator[Index]:
@@ -93,9 +96,9 @@ def _staying(stamp_ns: Index, ground: Array, near_m: float) -> float:
     return float(np.median(parts))
 
 
-def check_along(s: SightingColumns, by: Motions, where: Where) -> Iterator[Finding]:
+def check_moving(s: SightingColumns, by: LandmarkMotions, where: Where) -> Iterator[Finding]:
     """Sightings of a fixed frame, whatever frame they name, and landmarks that move."""
-    if np.count_nonzero(by.rides) >= max(_LEAST_NAMES, _MOST * len(by.names)):
+    if np.count_nonzero(by.moves_with_robot) >= max(_LEAST_NAMES, _MOST * len(by.names)):
         robot_m, ground_m = float(np.median(by.on_robot)), float(np.median(by.on_ground))
         text = (
             f"{s.topic}: while the robot drives, landmarks stay where they are on it to {robot_m:.2f} m, and "
@@ -107,7 +110,7 @@ def check_along(s: SightingColumns, by: Motions, where: Where) -> Iterator[Findi
     for k in moving_alone(by)[:_MOST_NAMED]:
         name, count = s.names[by.names[k]], int((s.name == by.names[k]).sum())
         text = f"{s.topic}: landmark {name} moves: it is {by.on_ground[k]:.2f} m from its place a few seconds later"
-        if by.rides[k]:
+        if by.moves_with_robot[k]:
             x, y = by.at[k, :2]
             text = (
                 f"{s.topic}: landmark {name} moves along with the robot, at x {x:.2f} and y {y:.2f} m on it: it is a "
@@ -117,9 +120,9 @@ def check_along(s: SightingColumns, by: Motions, where: Where) -> Iterator[Findi
         yield Finding("landmark_moves", "warning", by.on_ground[k], _NOISES * by.noise_m, "m", text, **at)
 
 
-def moving_alone(by: Motions) -> list[int]:
+def moving_alone(by: LandmarkMotions) -> list[int]:
     """The landmarks that move where the others do not, by their place in the columns; the farthest first."""
-    moves = by.rides | by.wanders
+    moves = by.moves_with_robot | by.moves_by_itself
     rest = by.on_ground[~moves]
     if not moves.any() or moves.sum() > max(1.0, _SOME * len(moves)):
         return []
