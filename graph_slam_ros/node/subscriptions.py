@@ -1,16 +1,19 @@
 """The node's subscriptions while it is active: raw messages in, measurements out, and counts of each topic."""
 
 import math
+import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
+from functools import partial, wraps
 from typing import Any
 
 try:
     from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventTypeError
 except ImportError:  # Humble
     from rclpy.qos_event import SubscriptionEventCallbacks, UnsupportedEventTypeError
+from rclpy.utilities import get_rmw_implementation_identifier
 
 from graph_slam_ros.measurements.types import Measured
 from graph_slam_ros.messages.from_msg import TF, TF_STATIC, TRANSFORMS, MessageConverter, is_correction
@@ -19,6 +22,7 @@ from graph_slam_ros.messages.message_class import message_class
 from graph_slam_ros.node.alternatives import alternatives
 from graph_slam_ros.node.diagnostics import InputFacts
 from graph_slam_ros.node.handle import NodeHandle
+from graph_slam_ros.node.losses import Losses
 from graph_slam_ros.node.qos import InputQos, InputTopic
 from graph_slam_ros.node.recent import Recent
 from graph_slam_ros.slam import Config, Counters
@@ -29,6 +33,16 @@ Guard = Callable[[Callback], Callback]
 Collect = Callable[[str, Sequence[str], int, Sequence[Measured]], None]
 Receive = Callable[[Sequence[Measured], bytes], None]
 _STATIC = InputQos(100, "/tf_static", "/tf_static")
+
+
+def event_is_safe() -> bool:
+    """Return whether the middleware's event of lost messages can be used.
+
+    Fast DDS can lock up when it is asked for this event while a message is lost (rmw_fastrtps, pull request 890): its
+    two threads wait for each other, and the node never hears or says anything again. It also reports a fragment of an
+    older message as two thousand million lost ones.
+    """
+    return not get_rmw_implementation_identifier().startswith("rmw_fastrtps")
 
 
 def full_name(endpoint: Any) -> str:
@@ -101,8 +115,19 @@ class Subscriptions:
         """Convert every message of a topic for each of its inputs, one input after another."""
         converter, map_frame, names, is_tf = self._converter, self._config.frames.map, topic.inputs, TF in topic.inputs
         counted = self._topics[topic.name] = _Received()
+        losses = None if event_is_safe() else Losses(lambda: self._publisher_ids(topic.name))
 
-        def on_message(cdr: bytes) -> None:
+        def count_lost(times: int) -> None:
+            if times:
+                for name in names:
+                    self._counters.count(name, "lost_in_transport", times)
+
+        def on_lost(event: Any) -> None:
+            count_lost(event.total_count_change)  # 0 at some: rclpy reports them twice
+
+        def on_message(cdr: bytes, info: Mapping[str, Any]) -> None:
+            if losses is not None:
+                count_lost(losses.before(info, time.monotonic_ns()))
             if is_tf and is_correction(cdr, map_frame):
                 self._on_correction(cdr)
                 return
@@ -116,12 +141,7 @@ class Subscriptions:
             self._receive(measured, cdr)
             self._collect(topic.name, names, self._node.now_ns, measured)
 
-        def on_lost(event: Any) -> None:
-            if event.total_count_change:  # rclpy reports some events twice
-                for name in names:
-                    self._counters.count(name, "lost_in_transport", event.total_count_change)
-
-        self._subscriptions.append(self._created(topic, self._guarded(on_message), self._guarded(on_lost)))
+        self._subscriptions.append(self._created(topic, _with_info(on_message, self._guarded), self._guarded(on_lost)))
 
     def _note_late(self, name: str, given: Sequence[Measured]) -> None:
         """Note how late the newest measurement of a message is, by the node's clock."""
@@ -131,12 +151,16 @@ class Subscriptions:
             self._late_ns[name] = min(late_ns, self._late_ns.get(name, late_ns))
 
     def _created(self, topic: InputTopic, on_message: Callback, on_lost: Callback) -> Any:
-        """A subscription, with the event of lost messages if the middleware supports it."""
+        """A subscription, with the event of lost messages if the middleware has one that can be used."""
         create = partial(self._node.create_subscription, message_class(topic.type_name), topic.name, on_message)
-        try:
-            return create(topic.qos.profile, raw=True, event_callbacks=SubscriptionEventCallbacks(message_lost=on_lost))
-        except UnsupportedEventTypeError:
-            return create(topic.qos.profile, raw=True)
+        if event_is_safe():
+            with suppress(UnsupportedEventTypeError):
+                events = SubscriptionEventCallbacks(message_lost=on_lost)
+                return create(topic.qos.profile, raw=True, event_callbacks=events)
+        return create(topic.qos.profile, raw=True)
+
+    def _publisher_ids(self, topic: str) -> frozenset[bytes]:
+        return frozenset(bytes(one.endpoint_gid) for one in self._node.get_publishers_info_by_topic(topic))
 
     # -- facts -------------------------------------------------------------------------------------------------------
 
@@ -203,6 +227,20 @@ class Subscriptions:
         """The reasons why publishers of a topic do not connect to its subscription; empty if all connect."""
         publishers = self._node.get_publishers_info_by_topic(topic.name)
         return "; ".join(filter(None, (_mismatch(publisher, topic) for publisher in publishers)))
+
+
+def _with_info(on_message: Callable[[bytes, Mapping[str, Any]], None], guarded: Guard) -> Callback:
+    """Return a callback that receives what rclpy says of a message, too.
+
+    rclpy reads from its signature that it wants both, and its events executor (7.1) gives them as one tuple.
+    """
+    call = guarded(on_message)
+
+    @wraps(on_message)
+    def received(*given: Any) -> None:
+        call(*(given if len(given) == 2 else given[0]))
+
+    return received
 
 
 def _mismatch(publisher: Any, topic: InputTopic) -> str:

@@ -273,11 +273,13 @@ def test_A38_what_the_middleware_loses_before_the_node_is_counted_and_degrades()
         r.wait_for_node()
         drive = Drive()
         r.until_it_says("OK", spin=drive.pace(r))
-        large = seen(drive, ids=False, frame="x" * 120_000)
+        large, sent = seen(drive, ids=False, frame="x" * 120_000), 0
 
         def too_much(seconds):
+            nonlocal sent
             for _ in range(20):
                 r.send("/landmarks", large)
+            sent += 20
             drive.pace(r)(seconds)
 
         def lost():
@@ -286,4 +288,5 @@ def test_A38_what_the_middleware_loses_before_the_node_is_counted_and_degrades()
 
         until(lambda: lost() > 100, too_much, "losses")
         r.until_it_says("DEGRADED", "/landmarks: ", "refused in 10 s", spin=too_much)
+        assert lost() < sent, "what was never sent is not lost"
         assert n.stop()[0] == 0
