@@ -140,13 +140,13 @@ def _check_memory(tree, in_use, vacant):
     held = np.array(sorted([*in_use, *vacant]), dtype=np.int64)
     members = t.CAPACITIES[clique[held, t.CLASS]]
     assert (clique[held, t.FULL_DOF] <= members).all()
-    for column, sizes, top in ((t.MEMBERS, members, t.MEMBERS_TOP), (t.FRONT, members * (members + 1), t.FRONTS_TOP)):
+    for column, sizes, top in ((t.MEMBERS, members, t.MEMBERS_TOP), (t.FRONT, t.packed_size(members), t.FRONTS_TOP)):
         order = np.argsort(clique[held, column])
         begin, end = clique[held, column][order], clique[held, column][order] + sizes[order]
         assert (end[:-1] <= begin[1:]).all()
         assert end.max(initial=0) <= state[top]
     live = t.CAPACITIES[clique[sorted(in_use), t.CLASS]] if in_use else np.empty(0, dtype=np.int64)
-    assert state[t.LIVE] == (live * (live + 1)).sum()
+    assert state[t.LIVE] == t.packed_size(live).sum()
 
 
 def _check_regions(solver, free, *, separate):

@@ -166,22 +166,22 @@ def store_first(t: Tree, rows: Index, ids: Index, residual: Array, jacobian: Arr
         for p in range(width):
             if m == 2:  # the usual sizes by themselves: short loops take most of the time
                 x, y = jacobian[k, 0, p], jacobian[k, 1, p]
-                for c in range(width):
+                for c in range(p, width):
                     blocks[at + c] = x * jacobian[k, 0, c] + y * jacobian[k, 1, c]
                 blocks[at + width] = x * residual[k, 0] + y * residual[k, 1]
             elif m == 3:
                 x, y, z = jacobian[k, 0, p], jacobian[k, 1, p], jacobian[k, 2, p]
-                for c in range(width):
+                for c in range(p, width):
                     blocks[at + c] = x * jacobian[k, 0, c] + y * jacobian[k, 1, c] + z * jacobian[k, 2, c]
                 blocks[at + width] = x * residual[k, 0] + y * residual[k, 1] + z * residual[k, 2]
             else:
-                blocks[at : at + width + 1] = 0.0
+                blocks[at + p : at + width + 1] = 0.0
                 for a in range(m):
                     x = jacobian[k, a, p]
-                    for c in range(width):
+                    for c in range(p, width):
                         blocks[at + c] += x * jacobian[k, a, c]
                     blocks[at + width] += x * residual[k, a]
-            at += width + 1
+            at += width - p  # where the next row would begin if nothing were left out
         add_to_diagonal(vertex, edge, link, e, blocks, diagonal)
 
 

@@ -23,6 +23,7 @@ from graph_slam_ros.solver.clique_tree.storage import (
     SIZE,
     Tree,
     front_of,
+    row_of,
 )
 from graph_slam_ros.solver.clique_tree.symbolic import mark
 from graph_slam_ros.typing import Array, Index
@@ -155,10 +156,11 @@ def _complete(front: Array, frontal: int, covariance: Array) -> None:
     for j in range(full - 1, -1, -1):
         row = covariance[j]  # symmetric: also its column
         for a in range(min(frontal - 1, j), -1, -1):
-            s = front[a, a] if a == j else 0.0
+            at = row_of(a, full)
+            s = front[at + a] if a == j else 0.0
             for i in range(a + 1, full):
-                s -= front[a, i] * row[i]
-            row[a] = covariance[a, j] = s * front[a, a]
+                s -= front[at + i] * row[i]
+            row[a] = covariance[a, j] = s * front[at + a]
 
 
 @kernel
@@ -194,11 +196,11 @@ def joint(t: Tree, vertices: Index) -> Array:
                 place[at] = vertex[members[m], LOCAL] + i
                 at += 1
         for a in range(clique[c, FRONT_DOF]):
-            p = place[a]
+            p, packed = place[a], row_of(a, at)
             for k in range(first[p], end[p]):
-                y[p, k] *= front[a, a]
+                y[p, k] *= front[packed + a]
             for i in range(a + 1, at if first[p] < end[p] else 0):
-                q, share = place[i], front[a, i]
+                q, share = place[i], front[packed + i]
                 for k in range(first[p], end[p]):
                     y[q, k] -= share * y[p, k]
                 first[q], end[q] = min(first[q], first[p]), max(end[q], end[p])

@@ -18,6 +18,7 @@ from graph_slam_ros.solver.clique_tree.storage import (
     PARENT,
     SIZE,
     Tree,
+    row_of,
 )
 from graph_slam_ros.typing import Array, Index
 
@@ -57,7 +58,10 @@ class CrossCovariances:
         """The rows of a clique, the inverse of its triangle, and the gain by which it follows its separator."""
         t = self._tree
         n, wide, base = (int(number) for number in t.clique[c, [FRONT_DOF, FULL_DOF, FRONT]])
-        front = t.fronts[base : base + wide * (wide + 1)].reshape(wide, wide + 1)[:n, :wide]
+        front = np.zeros((n, wide))
+        for row in range(n):
+            at = base + row_of(row, wide)
+            front[row, row:] = t.fronts[at + row : at + wide]
         upper = np.triu(front[:, :n], 1)
         upper[np.diag_indices(n)] = 1.0 / np.diagonal(front)
         inverse: Any = np.linalg.inv(upper)

@@ -35,6 +35,7 @@ from graph_slam_ros.solver.clique_tree.storage import (
     VALUE,
     WIDTH,
     Tree,
+    packed_size,
 )
 from graph_slam_ros.typing import Index, Mask
 
@@ -85,7 +86,7 @@ def record(
     for e in edges:
         table = table_at(graph, table_of[e])
         links += table[records.ENDS]
-        blocks += table[records.WIDTH] * (table[records.WIDTH] + 1)
+        blocks += packed_size(table[records.WIDTH])
     if links > len(t.link) or blocks > len(t.blocks):
         return NO_ROOM, links, blocks
     for code in range(len(graph) - records.TABLES):
@@ -174,7 +175,7 @@ def _append_edge(t: Tree, table: Index, e: int, row: int) -> None:
         t_link[link, LINK_EDGE], t_link[link, LINK_END], t_link[link, LINK_NEXT] = e, v, vertex[v, LINK]
         vertex[v, LINK] = link
     edge[e, BLOCK] = state[BLOCKS_TOP]
-    state[BLOCKS_TOP] += width * (width + 1)
+    state[BLOCKS_TOP] += packed_size(width)
     edge[e, WIDTH], edge[e, ACTIVE], edge[e, OWNER], edge[e, MARKED] = width, 0, NOTHING, 0
     for i in range(edge[e, BLOCK], state[BLOCKS_TOP]):
         blocks[i] = 0.0

@@ -12,7 +12,7 @@ from scipy.linalg.lapack import dpotrf, dpotrs, dtrtrs
 from graph_slam_ros.errors import SingularError
 from graph_slam_ros.graph import Graph
 from graph_slam_ros.graph.tables import EdgeTable
-from graph_slam_ros.solver.clique_tree.storage import ACTIVE, BLOCK, DOF, FREE, NOTHING, STEP, Tree
+from graph_slam_ros.solver.clique_tree.storage import ACTIVE, BLOCK, DOF, FREE, NOTHING, STEP, Tree, row_of
 from graph_slam_ros.solver.linearization import rows_of
 from graph_slam_ros.typing import Array, Index
 
@@ -75,8 +75,9 @@ def _sums(tree: Tree, rows: Mapping[EdgeTable, Index], every: Index, begin: Inde
     information, gradient = np.zeros((size + 1, size + 1)), np.zeros(size + 1)  # the last is for held vertices
     for table, chosen in rows.items():
         width, dofs = table.width, np.array(table.type.dofs)
-        numbers = tree.edge[table.id.values[chosen], BLOCK][:, None] + np.arange(width * (width + 1))
-        blocks = tree.blocks[numbers].reshape(-1, width, width + 1)
+        row, column = np.indices((width, width + 1))
+        packed = row_of(np.minimum(row, column), width) + np.maximum(row, column)
+        blocks = tree.blocks[tree.edge[table.id.values[chosen], BLOCK][:, None, None] + packed]
         begins = np.repeat(begin[np.searchsorted(every, table.vertices.values[chosen])], dofs, axis=1)
         at = np.where(begins < 0, size, begins + _ranges(np.zeros_like(dofs), dofs))
         np.add.at(information, (at[:, :, None], at[:, None, :]), blocks[:, :, :width])

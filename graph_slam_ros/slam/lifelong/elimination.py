@@ -3,8 +3,8 @@
 import numpy as np
 
 from graph_slam_ros.errors import SingularError
-from graph_slam_ros.solver.clique_tree.dense import partial_cholesky, solve_upper
-from graph_slam_ros.solver.clique_tree.storage import NOTHING
+from graph_slam_ros.solver.clique_tree.dense import pack, partial_cholesky, solve_upper
+from graph_slam_ros.solver.clique_tree.storage import NOTHING, packed_size
 from graph_slam_ros.typing import Array, Index
 
 
@@ -60,8 +60,9 @@ def solution(information: Array, right_side: Array) -> Array:
     """Return ``W^-1 b``. Raises SingularError where W is not positive definite."""
     n = len(information)
     front = _eliminated(information, n, right_side)
-    x = np.zeros(n)
-    solve_upper(front, n, x)
+    packed, x = np.empty(packed_size(n)), np.zeros(n)
+    pack(front, packed)
+    solve_upper(packed, n, n, x)
     return x
 
 

@@ -12,6 +12,7 @@ from graph_slam_ros.solver.clique_tree.storage import (
     AFFECTED,
     CLIQUES,
     CLIQUES_WANTED,
+    FORMS_WANTED,
     FRONTS_TOP,
     FRONTS_WANTED,
     LIVE,
@@ -60,6 +61,7 @@ def _regroup(t: Tree, touched: Index, new: Index, tolerance: float, sigmas: floa
         state[CLIQUES_WANTED] > len(clique)
         or state[MEMBERS_WANTED] > len(t.members)
         or state[FRONTS_WANTED] > len(t.fronts)
+        or (state[FORMS_WANTED] == 1 and len(t.forms) < len(t.fronts))
     ):
         return False, new
     release(t, marked)
@@ -141,10 +143,11 @@ def more_room(tree: Tree) -> Tree:
     if state[FRONTS_TOP] > max(SPARSE * state[LIVE], state[LIVE] + SPARE):
         compact(tree)
         return tree
-    return with_room(
+    tree = with_room(
         tree,
         clique=state[CLIQUES_WANTED],
         listed=state[CLIQUES_WANTED],
         members=state[MEMBERS_WANTED],
         fronts=state[FRONTS_WANTED] + (STRETCH if state[FRONTS_WANTED] > len(tree.fronts) else 0),
     )
+    return with_room(tree, forms=len(tree.fronts)) if state[FORMS_WANTED] else tree

@@ -10,7 +10,7 @@ from numba.extending import overload
 from numba.np.linalg import _BLAS, ensure_blas
 
 from graph_slam_ros.lie.jit import kernel
-from graph_slam_ros.solver.clique_tree.storage import NOTHING
+from graph_slam_ros.solver.clique_tree.storage import NOTHING, row_of
 from graph_slam_ros.typing import Array
 
 LEAST_PIVOT = 1e-14  # of its diagonal entry: what elimination left of it is rounding
@@ -110,12 +110,24 @@ def _subtract_four(front: Array, low: int, high: int, pivot: int) -> None:
             row[j] -= a * one[j] + b * two[j] + c * three[j] + d * four[j]
 
 
+@kernel
+def pack(front: Array, packed: Array) -> None:
+    """Pack the upper triangle of a front (n, n + 1) with its right side, row after row."""
+    rows = front.shape[0]
+    for i in range(rows):
+        at = row_of(i, rows)
+        source, target = front[i, i:], packed[at + i : at + rows + 1]
+        for j in range(len(source)):
+            target[j] = source[j]
+
+
 @dense
-def solve_upper(front: Array, frontal: int, x: Array) -> None:
+def solve_upper(packed: Array, rows: int, frontal: int, x: Array) -> None:
     """``x_F = U11^-1 (y - U12 x_S)``: x holds x_S behind the first ``frontal`` numbers, and gets x_F there."""
-    n = front.shape[0]
     for a in range(frontal - 1, -1, -1):
-        s = front[a, n]
-        for i in range(a + 1, n):
-            s -= front[a, i] * x[i]
-        x[a] = s * front[a, a]
+        at, count = row_of(a, rows), rows - a
+        row, behind = packed[at + a : at + rows + 1], x[a:rows]
+        s = row[count]
+        for i in range(1, count):
+            s -= row[i] * behind[i]
+        x[a] = s * row[0]

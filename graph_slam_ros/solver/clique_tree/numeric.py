@@ -7,7 +7,7 @@ import numpy as np
 
 from graph_slam_ros.lie import se2, se3
 from graph_slam_ros.lie.jit import inner, kernel
-from graph_slam_ros.solver.clique_tree.dense import partial_cholesky
+from graph_slam_ros.solver.clique_tree.dense import pack, partial_cholesky
 from graph_slam_ros.solver.clique_tree.rounding import JUST_MADE, UNKNOWN, is_rounding, suspect_row
 from graph_slam_ros.solver.clique_tree.storage import (
     BLOCK,
@@ -17,6 +17,7 @@ from graph_slam_ros.solver.clique_tree.storage import (
     FREE,
     FRONT_DOF,
     FRONTALS,
+    FULL_DOF,
     KIND,
     LINK,
     LINK_EDGE,
@@ -37,6 +38,8 @@ from graph_slam_ros.solver.clique_tree.storage import (
     WIDTH,
     Tree,
     front_of,
+    packed_size,
+    row_of,
 )
 from graph_slam_ros.typing import Array, Index
 
@@ -50,13 +53,15 @@ def eliminate(t: Tree, cliques: Index, damping: float) -> int:
     ``damping`` enlarges the diagonal of H by the factor 1 + damping (Marquardt).
     """
     vertex, clique, members, fronts, diagonal = t.vertex, t.clique, t.members, t.fronts, t.diagonal
-    scale = np.empty(0)
+    widest = 0
+    for c in cliques:
+        widest = max(widest, clique[c, FULL_DOF])
+    square, scale = np.empty(widest * (widest + 1)), np.empty(widest)  # of one clique after another: in the cache
     failed = NOTHING
     for c in cliques:
-        front, frontal = front_of(clique, fronts, c), clique[c, FRONT_DOF]
+        full, frontal = clique[c, FULL_DOF], clique[c, FRONT_DOF]
+        front = square[: full * (full + 1)].reshape(full, full + 1)
         clique[c, MAGNITUDES] = JUST_MADE
-        if len(scale) < frontal:
-            scale = np.empty(2 * frontal)
         front[:] = 0.0
         at = 0
         for m in range(clique[c, MEMBERS], clique[c, MEMBERS] + clique[c, SIZE]):
@@ -74,6 +79,7 @@ def eliminate(t: Tree, cliques: Index, damping: float) -> int:
             _add_contribution(vertex, clique, members, fronts, child, front)
             child = clique[child, SIBLING]
         failed = partial_cholesky(front, frontal, scale)
+        pack(front, front_of(clique, fronts, c))
         if failed == NOTHING and damping == 0.0:
             failed = suspect_row(front, frontal, scale)
             if failed != NOTHING and not is_rounding(t, c, failed):
@@ -106,50 +112,60 @@ def _add_edges(vertex: Index, edge: Index, link: Index, blocks: Array, v: int, f
         a = link[a, LINK_NEXT]
         if edge[e, OWNER] != v:
             continue
-        width = edge[e, WIDTH]
-        row = edge[e, BLOCK]  # of the block, where the rows of one end begin
+        block, width, row = blocks[edge[e, BLOCK] :], edge[e, WIDTH], 0
         for s in range(edge[e, COUNT]):
             u = link[edge[e, LINKED] + s, LINK_END]
             dof, at = vertex[u, DOF], vertex[u, LOCAL]
             if vertex[u, FREE] == 1:
-                column = row
-                for z in range(edge[e, COUNT]):
-                    w = link[edge[e, LINKED] + z, LINK_END]
-                    to = vertex[w, LOCAL]
-                    if to >= at and vertex[w, FREE] == 1:
-                        for i in range(dof):
-                            for j in range(vertex[w, DOF]):
-                                front[at + i, to + j] += blocks[column + i * (width + 1) + j]
-                    column += vertex[w, DOF]
                 for i in range(dof):
-                    front[at + i, right] -= blocks[column + i * (width + 1)]
-            row += dof * (width + 1)
+                    packed = row_of(row + i, width)
+                    front[at + i, right] -= block[packed + width]
+                    for j in range(i, dof):
+                        front[at + i, at + j] += block[packed + row + j]
+                column = row + dof
+                for z in range(s + 1, edge[e, COUNT]):
+                    w = link[edge[e, LINKED] + z, LINK_END]
+                    if vertex[w, FREE] == 1:
+                        _add_product(block, width, row, column, front, at, vertex[w, LOCAL], dof, vertex[w, DOF])
+                    column += vertex[w, DOF]
+            row += dof
+
+
+@inner
+def _add_product(
+    packed: Array, rows: int, row: int, column: int, front: Array, at: int, to: int, dof: int, width: int
+) -> None:
+    """Add the rectangle of a packed front that two vertices share to where they are in another front."""
+    if at < to:
+        for i in range(dof):
+            begin = row_of(row + i, rows) + column
+            for j in range(width):
+                front[at + i, to + j] += packed[begin + j]
+    else:
+        for i in range(dof):
+            begin = row_of(row + i, rows) + column
+            for j in range(width):
+                front[to + j, at + i] += packed[begin + j]
 
 
 @inner
 def _add_contribution(vertex: Index, clique: Index, members: Index, fronts: Array, child: int, front: Array) -> None:
     """Add a child's contribution to its separator."""
     of_child = front_of(clique, fronts, child)
-    right, of_right = front.shape[0], of_child.shape[0]
+    right, of_right = front.shape[0], clique[child, FULL_DOF]
     low, high = clique[child, MEMBERS] + clique[child, FRONTALS], clique[child, MEMBERS] + clique[child, SIZE]
     row = clique[child, FRONT_DOF]
     for m in range(low, high):
         at, dof = vertex[members[m], LOCAL], vertex[members[m], DOF]
         for i in range(dof):
-            front[at + i, right] += of_child[row + i, of_right]
+            packed = row_of(row + i, of_right)
+            front[at + i, right] += of_child[packed + of_right]
             for j in range(i, dof):
-                front[at + i, at + j] += of_child[row + i, row + j]
+                front[at + i, at + j] += of_child[packed + row + j]
         column = row + dof
         for k in range(m + 1, high):
             to, width = vertex[members[k], LOCAL], vertex[members[k], DOF]
-            if at < to:
-                for i in range(dof):
-                    for j in range(width):
-                        front[at + i, to + j] += of_child[row + i, column + j]
-            else:
-                for i in range(dof):
-                    for j in range(width):
-                        front[to + j, at + i] += of_child[row + i, column + j]
+            _add_product(of_child, of_right, row, column, front, at, to, dof, width)
             column += width
         row += dof
 
@@ -181,12 +197,13 @@ def retract(vertex: Index, value: Array, step: Array, estimate: Array, v: int) -
 @inner
 def add_to_diagonal(vertex: Index, edge: Index, link: Index, e: int, blocks: Array, diagonal: Array) -> None:
     """Add the diagonal of an edge's block to that of the information matrix."""
-    at, across = edge[e, BLOCK], edge[e, WIDTH] + 2  # from one number of a diagonal to the next
+    at, across = edge[e, BLOCK], edge[e, WIDTH] + 1  # from one number of a diagonal to the next
     for s in range(edge[e, COUNT]):
         v = link[edge[e, LINKED] + s, LINK_END]
         for i in range(vertex[v, DOF]):
             diagonal[vertex[v, STEP] + i] += blocks[at]
             at += across
+            across -= 1
 
 
 @kernel
@@ -196,14 +213,15 @@ def clear_block(vertex: Index, edge: Index, link: Index, e: int, blocks: Array, 
     If that was nearly all of the diagonal, the difference would be rounding. Then the diagonal is summed again.
     """
     begin, width = edge[e, BLOCK], edge[e, WIDTH]
-    at, cancelled = begin, False
+    at, across, cancelled = begin, width + 1, False
     for s in range(edge[e, COUNT]):
         v = link[edge[e, LINKED] + s, LINK_END]
         for i in range(vertex[v, DOF]):
             diagonal[vertex[v, STEP] + i] -= blocks[at]
             cancelled = cancelled or diagonal[vertex[v, STEP] + i] < CANCELLED * blocks[at]
-            at += width + 2  # from one number of the block's diagonal to the next
-    for i in range(begin, begin + width * (width + 1)):
+            at += across  # from one number of the block's diagonal to the next
+            across -= 1
+    for i in range(begin, begin + packed_size(width)):
         blocks[i] = 0.0
     if cancelled:
         for s in range(edge[e, COUNT]):
@@ -218,13 +236,13 @@ def _add_up_diagonal(vertex: Index, edge: Index, link: Index, v: int, blocks: Ar
     while a != NOTHING:
         e = link[a, LINK_EDGE]
         a = link[a, LINK_NEXT]
-        at, across = edge[e, BLOCK], edge[e, WIDTH] + 2  # from one number of a diagonal to the next
+        row = 0
         for s in range(edge[e, COUNT]):
             u = link[edge[e, LINKED] + s, LINK_END]
             if u == v:
-                for i in range(vertex[v, DOF]):
-                    own[i] += blocks[at + i * across]
-            at += vertex[u, DOF] * across
+                for i in range(row, row + vertex[v, DOF]):
+                    own[i - row] += blocks[edge[e, BLOCK] + row_of(i, edge[e, WIDTH]) + i]
+            row += vertex[u, DOF]
 
 
 @kernel
@@ -256,13 +274,14 @@ def gradient(t: Tree, edges: Index) -> Array:
     out = np.zeros(len(t.step))
     for e in edges:
         width = edge[e, WIDTH]
-        at = edge[e, BLOCK] + width
+        at, across = edge[e, BLOCK] + width, width  # from one number of the last column to the next
         for s in range(edge[e, COUNT]):
             v = link[edge[e, LINKED] + s, LINK_END]
             for i in range(vertex[v, DOF]):
                 if vertex[v, FREE] == 1:
                     out[vertex[v, STEP] + i] += blocks[at]
-                at += width + 1
+                at += across
+                across -= 1
     return out
 
 
@@ -282,7 +301,10 @@ def curvature(t: Tree, edges: Index, d: Array) -> float:
             for i in range(vertex[v, DOF]):
                 mine[k] = d[vertex[v, STEP] + i] if vertex[v, FREE] == 1 else 0.0
                 k += 1
+        at = edge[e, BLOCK]
         for i in range(width):
-            for j in range(width):
-                out += mine[i] * blocks[edge[e, BLOCK] + i * (width + 1) + j] * mine[j]
+            out += mine[i] * blocks[at] * mine[i]
+            for j in range(i + 1, width):
+                out += 2.0 * mine[i] * blocks[at + j - i] * mine[j]
+            at += width + 1 - i
     return out

@@ -62,4 +62,5 @@ def tree_of(p: Index) -> Tree:
         reals(p[30], p[31]),
         reals(p[32], p[33]),
         reals(p[34], p[35]),
+        reals(p[36], p[37]),
     )

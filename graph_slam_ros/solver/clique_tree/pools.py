@@ -24,6 +24,7 @@ from graph_slam_ros.solver.clique_tree.storage import (
     SIBLING,
     SIZE,
     Tree,
+    packed_size,
 )
 from graph_slam_ros.typing import Index
 
@@ -44,7 +45,7 @@ def capacity_class(size: int) -> int:
 @inner
 def numbers_of(size_class: int) -> int:
     """The numbers of a front."""
-    return CAPACITIES[size_class] * (CAPACITIES[size_class] + 1)
+    return packed_size(CAPACITIES[size_class])
 
 
 @inner
@@ -115,7 +116,7 @@ def allocate(t: Tree, size: int) -> int:
 @kernel
 def compact(t: Tree) -> None:
     """Move all cliques together in memory; vacant ones keep none."""
-    clique, vacant, members, fronts, state = t.clique, t.vacant, t.members, t.fronts, t.state
+    clique, vacant, members, fronts, forms, state = t.clique, t.vacant, t.members, t.fronts, t.forms, t.state
     live = np.ones(state[CLIQUES], np.bool_)
     c = state[FREE_CLIQUE]
     while c != NOTHING:
@@ -139,6 +140,9 @@ def compact(t: Tree) -> None:
                 members[member + i] = members[clique[c, MEMBERS] + i]
             for i in range(numbers_of(k)):
                 fronts[front + i] = fronts[clique[c, FRONT] + i]
+            if clique[c, FRONT] + numbers_of(k) <= len(forms):
+                for i in range(numbers_of(k)):
+                    forms[front + i] = forms[clique[c, FRONT] + i]
             clique[c, MEMBERS], clique[c, FRONT] = member, front
             member += CAPACITIES[k]
             front += numbers_of(k)

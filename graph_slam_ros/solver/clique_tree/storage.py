@@ -6,6 +6,8 @@ together, given a *separator* of later ones, which the parent clique contains. E
     [ U11  U12 | y ]   U11: the factor of the frontal variables, its diagonal inverted; U12: on the separator
     [  .    C  | d ]   C, d: what the whole subtree says of the separator, the contribution to the parent
 
+What is below the diagonal is not stored: a front is packed, row after row, each from its diagonal on.
+
 Because contributions are kept, an update touches only the cliques of changed edges and their ancestors (Kaess et al.,
 "iSAM2: incremental smoothing and mapping using the Bayes tree", IJRR 2012).
 
@@ -19,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from graph_slam_ros.lie.jit import inner
+from graph_slam_ros.lie.jit import inner, jitable
 from graph_slam_ros.solver.clique_tree.indices import lengthened
 from graph_slam_ros.typing import Array, Index
 
@@ -95,6 +97,7 @@ R_PARENT, R_DEPTH, R_LEFT, R_RIGHT, R_COUNT, R_MADE, R_FIRST, REGION_COLUMNS = r
     CLIQUES_WANTED,
     MEMBERS_WANTED,
     FRONTS_WANTED,
+    FORMS_WANTED,
     CHECKED,
     SOLUTIONS,
     SUBSTITUTED,
@@ -103,7 +106,7 @@ R_PARENT, R_DEPTH, R_LEFT, R_RIGHT, R_COUNT, R_MADE, R_FIRST, REGION_COLUMNS = r
     DEFERRED_COUNT,
     MOTION_MM,
     STATE_COLUMNS,
-) = range(30)
+) = range(31)
 
 VECTOR, SE2_KIND, SE3_KIND = range(3)
 
@@ -125,7 +128,8 @@ class Tree(NamedTuple):
     Attributes
     ----------
     members : vertices of the cliques, frontal ones first in order of elimination; fronts : their fronts
-    blocks : of each edge (D, D + 1): its share of the information matrix, J'J, and of the gradient, J'r
+    forms : of a front of the same place, the form of its separator (``rounding``); as long as fronts, or not needed yet
+    blocks : of each edge, packed as a front: its share of the information matrix, J'J, and of the gradient, J'r
     diagonal : of the information matrix, all edges together
     step : of each unknown, from its linearisation point ``value``; ``estimate`` is ``value [+] step``
     reference : the step when a search for large ones last found the vertex
@@ -147,6 +151,7 @@ class Tree(NamedTuple):
     state: Index
     listed: Index
     fronts: Array
+    forms: Array
     blocks: Array
     diagonal: Array
     step: Array
@@ -157,9 +162,20 @@ class Tree(NamedTuple):
 
 @inner
 def front_of(clique: Index, fronts: Array, c: int) -> Array:
-    """The front (full, full + 1): an upper triangle, and the right side as its last column."""
-    full, base = clique[c, FULL_DOF], clique[c, FRONT]
-    return fronts[base : base + full * (full + 1)].reshape(full, full + 1)
+    """The packed front of a clique: an upper triangle, and the right side as its last column."""
+    return fronts[clique[c, FRONT] : clique[c, FRONT] + packed_size(clique[c, FULL_DOF])]
+
+
+@jitable
+def packed_size(rows: int) -> int:
+    """Return the count of numbers in a packed front of so many rows."""
+    return rows * (rows + 3) // 2
+
+
+@jitable
+def row_of(row: int, rows: int) -> int:
+    """Return the index in a packed front to which a column, not before the row, is added for its entry in that row."""
+    return row * (2 * rows + 1 - row) // 2
 
 
 @inner
@@ -195,6 +211,7 @@ def empty_tree() -> Tree:
         state=state,
         listed=np.zeros((0, LIST_COLUMNS), dtype=np.int64),
         fronts=np.zeros(0),
+        forms=np.zeros(0),
         blocks=np.zeros(0),
         diagonal=np.zeros(0),
         step=np.zeros(0),

@@ -152,7 +152,7 @@ def visit(t: Tree, c: int, x: Array, tolerance: float, sigmas: float) -> None:
         for i in range(vertex[members[m], DOF]):
             x[at + i] = step[first + i]
         at += vertex[members[m], DOF]
-    solve_upper(front_of(clique, t.fronts, c), frontal, x)
+    solve_upper(front_of(clique, t.fronts, c), clique[c, FULL_DOF], frontal, x)
     at = 0
     for m in range(low, low + clique[c, FRONTALS]):
         v = members[m]

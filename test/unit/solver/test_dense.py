@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_triangular
 
-from graph_slam_ros.solver.clique_tree.dense import WIDE, partial_cholesky, solve_upper
-from graph_slam_ros.solver.clique_tree.storage import NOTHING
+from graph_slam_ros.solver.clique_tree.dense import WIDE, pack, partial_cholesky, solve_upper
+from graph_slam_ros.solver.clique_tree.storage import NOTHING, packed_size
 
 SIZES = [(1, 1), (3, 3), (6, 2), (7, 7), (12, 5), (26, 2), (26, 3), (27, 3), (40, 33), (90, 47)]
 SIZES += [(3 * WIDE - 1, WIDE), (3 * WIDE, WIDE - 1), (3 * WIDE, WIDE), (3 * WIDE + 1, WIDE + 3)]
@@ -49,7 +49,9 @@ def test_back_substitution_solves_the_system(n, frontal):
     x = np.full(n, np.nan)
     x[frontal:] = np.random.default_rng(n).standard_normal(n - frontal)
     given = x[frontal:].copy()
-    solve_upper(front, frontal, x)
+    packed = np.empty(packed_size(n))
+    pack(front, packed)
+    solve_upper(packed, n, frontal, x)
     assert np.array_equal(x[frontal:], given)
     # U11 x_F + U12 x_S = y is A_FF x_F + A_FS x_S = b_F
     expected = np.linalg.solve(a[:frontal, :frontal], b[:frontal, 0] - a[:frontal, frontal:] @ given)

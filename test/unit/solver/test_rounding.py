@@ -6,16 +6,19 @@ import pytest
 from graph_slam_ros.graph import LANDMARK_POSITION, POSE_PRIOR, R2, RELATIVE_POSE, SE2, Gaussian, Graph
 from graph_slam_ros.lie import se2
 from graph_slam_ros.solver import Solver
+from graph_slam_ros.solver.clique_tree.pools import compact
 from graph_slam_ros.solver.clique_tree.rounding import KEPT, magnitude_of
 from graph_slam_ros.solver.clique_tree.storage import (
     AFFECTED,
     CHECKED,
     CLIQUES,
     DOF,
+    FRONT,
     FRONTALS,
     MAGNITUDES,
     MEMBERS,
     STEP,
+    with_room,
 )
 from graph_slam_ros.solver.clique_tree.symbolic import mark
 
@@ -58,6 +61,7 @@ def test_a_magnitude_is_that_of_dense_algebra_walked_or_kept():
             drive.solver.add([point] if k == 0 else [], [edge])
     drive.solver.update()
     t, h = drive.solver._tree, drive.solver.information_matrix()
+    t = with_room(t, forms=len(t.fronts))
     cliques = mark(t, np.arange(drive.graph.vertex_count))
     frontals = [t.members[low : low + n] for low, n in t.clique[cliques][:, [MEMBERS, FRONTALS]].tolist()]
     of = [np.arange(t.vertex[v, STEP], t.vertex[v, STEP] + t.vertex[v, DOF]) for v in np.concatenate(frontals)]
@@ -73,6 +77,10 @@ def test_a_magnitude_is_that_of_dense_algebra_walked_or_kept():
     assert place == len(order)
     assert len(cliques) > 15
     assert (t.clique[cliques, MAGNITUDES] == KEPT).all()
+    before = t.clique[cliques, FRONT].copy()
+    compact(t)
+    assert (t.clique[cliques, FRONT] != before).any()
+    assert magnitude_of(t, c, row) == pytest.approx(expected[-1], rel=1e-9), "what is kept moves with its clique"
 
 
 def test_an_update_of_a_long_open_drive_looks_at_what_changed_not_at_the_whole_tree():
