@@ -12,6 +12,7 @@ from benchmarks.live.robot import HERE
 from benchmarks.live.started import listener, node, sender
 from benchmarks.live.streams import LANDMARKS, ODOMETRY
 from benchmarks.table import Row
+from graph_slam_ros.runs.tables import INPUT_COLUMNS
 
 _OUTPUTS = ("path", "pose", "odometry", "tf")
 _WARM_S = 5.0
@@ -140,7 +141,7 @@ def overload(short: bool) -> list[Row]:
                 rows[-1]["normal after s"] = _normal_after(told["when"], heard["odometry"], start_ns, usual_s)
         received = robot.ask()
         time.sleep(_DIAGNOSED_S)
-        used = _told(ears.ask()["diagnostics"][-1:], "used")
+        used = _told(ears.ask()["diagnostics"][-1:], INPUT_COLUMNS["used"])
     rows.append({"load": "in all", "sent": sent, "received": received, "used": int(sum(used))})
     return rows
 
