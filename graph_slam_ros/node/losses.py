@@ -31,7 +31,7 @@ class Losses:
         Parameters
         ----------
         info : what rclpy says of a message beside its content
-        now_ns : the time, to ask for the publishers of a topic that has several once a second only
+        now_ns : the time; while a topic has several publishers, they are asked for once a second
         """
         number = info.get(_NUMBER)
         if number is None or number >= _UNSUPPORTED:

@@ -181,7 +181,7 @@ def store_first(t: Tree, rows: Index, ids: Index, residual: Array, jacobian: Arr
                     for c in range(p, width):
                         blocks[at + c] += x * jacobian[k, a, c]
                     blocks[at + width] += x * residual[k, a]
-            at += width - p  # where the next row would begin if nothing were left out
+            at += width - p  # column c of the next row is at + c
         add_to_diagonal(vertex, edge, link, e, blocks, diagonal)
 
 

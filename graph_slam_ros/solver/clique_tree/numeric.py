@@ -56,7 +56,7 @@ def eliminate(t: Tree, cliques: Index, damping: float) -> int:
     widest = 0
     for c in cliques:
         widest = max(widest, clique[c, FULL_DOF])
-    square, scale = np.empty(widest * (widest + 1)), np.empty(widest)  # of one clique after another: in the cache
+    square, scale = np.empty(widest * (widest + 1)), np.empty(widest)  # all cliques share them
     failed = NOTHING
     for c in cliques:
         full, frontal = clique[c, FULL_DOF], clique[c, FRONT_DOF]
@@ -126,16 +126,16 @@ def _add_edges(vertex: Index, edge: Index, link: Index, blocks: Array, v: int, f
                 for z in range(s + 1, edge[e, COUNT]):
                     w = link[edge[e, LINKED] + z, LINK_END]
                     if vertex[w, FREE] == 1:
-                        _add_product(block, width, row, column, front, at, vertex[w, LOCAL], dof, vertex[w, DOF])
+                        _add_block(block, width, row, column, front, at, vertex[w, LOCAL], dof, vertex[w, DOF])
                     column += vertex[w, DOF]
             row += dof
 
 
 @inner
-def _add_product(
+def _add_block(
     packed: Array, rows: int, row: int, column: int, front: Array, at: int, to: int, dof: int, width: int
 ) -> None:
-    """Add the rectangle of a packed front that two vertices share to where they are in another front."""
+    """Add the block (row, column) of two vertices in a packed front to their places (at, to) in another front."""
     if at < to:
         for i in range(dof):
             begin = row_of(row + i, rows) + column
@@ -165,7 +165,7 @@ def _add_contribution(vertex: Index, clique: Index, members: Index, fronts: Arra
         column = row + dof
         for k in range(m + 1, high):
             to, width = vertex[members[k], LOCAL], vertex[members[k], DOF]
-            _add_product(of_child, of_right, row, column, front, at, to, dof, width)
+            _add_block(of_child, of_right, row, column, front, at, to, dof, width)
             column += width
         row += dof
 

@@ -128,7 +128,7 @@ class Tree(NamedTuple):
     Attributes
     ----------
     members : vertices of the cliques, frontal ones first in order of elimination; fronts : their fronts
-    forms : of a front of the same place, the form of its separator (``rounding``); as long as fronts, or not needed yet
+    forms : quadratic forms of separators (``rounding``), each at the place of its front; empty until one is needed
     blocks : of each edge, packed as a front: its share of the information matrix, J'J, and of the gradient, J'r
     diagonal : of the information matrix, all edges together
     step : of each unknown, from its linearisation point ``value``; ``estimate`` is ``value [+] step``
@@ -174,7 +174,7 @@ def packed_size(rows: int) -> int:
 
 @jitable
 def row_of(row: int, rows: int) -> int:
-    """Return the index in a packed front to which a column, not before the row, is added for its entry in that row."""
+    """Return the offset of a row in a packed front: entry (row, column), column >= row, is at this offset + column."""
     return row * (2 * rows + 1 - row) // 2
 
 
