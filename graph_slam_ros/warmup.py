@@ -262,11 +262,12 @@ def _shared_kernels() -> list[_Kernel]:
 def _structure_kernels() -> list[_Kernel]:
     """List kernels that order vertices and group them into cliques."""
     tree, index, number, real = _types()
+    limits = types.UniTuple(real, 3)  # type: ignore[no-untyped-call]
     return [
         (ordering.move_tail, (tree, index, index)),
         (ordering.dissect, (tree, number)),
         (advance._regroup, (tree, index, index, real, real)),
-        (incremental.relinearize, (tree, index, real, real)),
+        (incremental.relinearize, (tree, index, limits)),
         (pools.compact, (tree,)),
     ]
 
@@ -274,11 +275,12 @@ def _structure_kernels() -> list[_Kernel]:
 def _number_kernels() -> list[_Kernel]:
     """List kernels that eliminate, substitute and find covariances."""
     tree, index, _, real = _types()
+    limits = types.UniTuple(real, 3)  # type: ignore[no-untyped-call]
     return [
         (numeric.eliminate, (tree, index, real)),
-        (substitution.substitute, (tree, index, real, real, real, real)),
-        (incremental.solve, (tree, index, real, real, real, real)),
-        (advance.advance, (index, index, index, index, types.boolean, index, index, *[real] * 4)),
+        (substitution.substitute, (tree, index, real, real, limits)),
+        (incremental.solve, (tree, index, real, real, limits)),
+        (advance.advance, (index, index, index, index, types.boolean, index, index, real, real, limits)),
         (covariance.marginals, (tree, index)),
         (covariance.joint, (tree, index)),
         (covariance.among, (tree, types.int64[:, ::1])),

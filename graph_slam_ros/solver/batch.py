@@ -61,8 +61,9 @@ class Settings:
         position of a pose in units of the typical motion between two, if that is longer than a metre
     relinearize_error : or when its step squared is more than so many standard deviations of its strongest measurement
     relinearize_every : that is looked for at every so many updates, or after two thirds of these at one that closes a
-        loop; steps ten times as large are at any
-    relinearize_passes : how often at most within one update; after the first time for steps as large as that
+        loop. Steps ten times as large are looked for at any update, and in a small graph also smaller turns, whose
+        square is more than 5e-5 of the expected chi2
+    relinearize_passes : how often at most within one update; after the first time for such steps
     tolerance : online, changes of a step up to this are not followed [m, rad]
     tolerance_sigmas : nor are those up to so many standard deviations of the vertex given its neighbours
     at_once : an update computes the estimates of all vertices that it moves. Else those that nobody reads wait; then

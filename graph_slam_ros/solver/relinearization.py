@@ -1,13 +1,19 @@
 """The schedule of relinearisation: when vertices are searched for large steps, and what is large for a position."""
 
+import math
+
 import numpy as np
 
 from graph_slam_ros.graph import INVERSE_RELATIVE_POSE, RELATIVE_POSE, RELATIVE_POSE_3D, Graph
+from graph_slam_ros.solver.batch import Settings
+from graph_slam_ros.solver.clique_tree.storage import Limits
 from graph_slam_ros.solver.pending import NONE
 from graph_slam_ros.typing import Index
 
 NOT_YET, MAYBE, SURELY = range(3)
-BY_FAR = 10.0  # times the threshold: steps that are linearised anew at once
+_BY_FAR = 10.0  # times the threshold: steps that are linearised anew at once
+_NEGLECTED = 5e-5  # of the expected chi2: a turn whose square is more is linearised anew at once, too
+NO_LIMITS: Limits = (math.inf, math.inf, math.inf)
 _MOTIONS = {RELATIVE_POSE: 2, INVERSE_RELATIVE_POSE: 2, RELATIVE_POSE_3D: 3}  # components of their positions
 _SIGHTINGS = "landmarks"  # label of edges to landmarks, which may be poses, too
 _CLASSES, _PER_OCTAVE, _FARTHEST_M = 41, 2, 1e9  # of lengths, from a metre on
@@ -20,6 +26,8 @@ class RelinearizationSchedule:
         self._unseen = NONE
         self._updates = 0
         self._motions = MotionLength()
+        self._limits: tuple[float, float, Limits] = 0.0, 0.0, NO_LIMITS
+        self._limits_of: Settings | None = None
 
     def note(self, solved: Index) -> None:
         """Note vertices that were solved after an update's last search; the next update searches them."""
@@ -38,13 +46,37 @@ class RelinearizationSchedule:
 
     def begin(self, graph: Graph) -> int:
         """Count from the present search. Returns the typical length of a motion [mm]."""
-        self._updates = 0
+        self._updates, self._limits_of = 0, None
         return self._motions.typical_mm(graph)
+
+    def limits(self, graph: Graph, settings: Settings) -> tuple[float, float, Limits]:
+        """Return the tolerances of steps, and the limits above which a step is linearised anew at once.
+
+        The limits are those of the graph at the last search.
+        """
+        if settings is not self._limits_of:
+            far = far_limits(graph, settings) if settings.relinearize_passes else NO_LIMITS
+            self._limits_of, self._limits = settings, (settings.tolerance, settings.tolerance_sigmas, far)
+        return self._limits
 
     def unseen(self) -> Index:
         """Return the vertices that the last update solved after its last search; once."""
         unseen, self._unseen = self._unseen, NONE
         return unseen
+
+
+def far_limits(graph: Graph, settings: Settings) -> Limits:
+    """Return the limits above which a step, or the square of one, is linearised anew at once (``is_large``).
+
+    To stay linearised a turn away from the estimate costs about the square of that turn in chi2, for each degree of
+    freedom of the pose. In a small graph a single turn may be a visible part of chi2, whose expected value is the
+    number of measured components less the number of estimated ones.
+    """
+    measured = sum(table.type.residual_size * len(table) for table in graph.tables.values())
+    costly = math.sqrt(_NEGLECTED * max(0, measured - graph.initial.count))
+    above = settings.relinearize_above
+    far = _BY_FAR * above
+    return far, min(far, max(above, costly)), _BY_FAR**2 * settings.relinearize_error
 
 
 class MotionLength:

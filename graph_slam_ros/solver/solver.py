@@ -13,7 +13,7 @@ from graph_slam_ros.solver.batch import BatchProblem, Settings, minimise
 from graph_slam_ros.solver.clique_tree import incremental
 from graph_slam_ros.solver.clique_tree.advance import DISSECT, DONE, advance, more_room, restructure
 from graph_slam_ros.solver.clique_tree.ordering import dissect
-from graph_slam_ros.solver.clique_tree.storage import AFFECTED, CLIQUE, DOF, MOTION_MM, NOTHING, SUBSTITUTED
+from graph_slam_ros.solver.clique_tree.storage import AFFECTED, CLIQUE, DOF, MOTION_MM, NOTHING, SUBSTITUTED, Limits
 from graph_slam_ros.solver.clique_tree.substitution import forget, read, show
 from graph_slam_ros.solver.covariance import among, joint, marginals
 from graph_slam_ros.solver.cross_covariance import CrossCovariances
@@ -30,7 +30,7 @@ from graph_slam_ros.solver.linearization import (
 from graph_slam_ros.solver.loss_stages import LossStages
 from graph_slam_ros.solver.pending import NONE
 from graph_slam_ros.solver.problem import Problem, existing
-from graph_slam_ros.solver.relinearization import BY_FAR, MAYBE, SURELY, RelinearizationSchedule
+from graph_slam_ros.solver.relinearization import MAYBE, NO_LIMITS, SURELY, RelinearizationSchedule
 from graph_slam_ros.solver.report import Change, Report
 from graph_slam_ros.typing import Array, Index
 
@@ -50,8 +50,6 @@ class Solver(Problem):
         self._unfinished = False  # a batch stopped before the optimum
         self._schedule = RelinearizationSchedule()
         self._solved_with: Settings | None = None
-        self._limits_of: Settings | None = None
-        self._limited = 0.0, 0.0, 0.0, 0.0
 
     def release(self, vertices: ArrayLike) -> None:
         """Estimate held vertices again. The whole structure is rebuilt."""
@@ -343,17 +341,12 @@ class Solver(Problem):
         self._tree.state[MOTION_MM] = self._schedule.begin(self.graph)
         if pending.broken:
             return NONE
-        tolerances, limits = self._limits()[:2], (settings.relinearize_above, settings.relinearize_error)
-        return incremental.relinearize_changed(self._pointers, *tolerances, *limits)
+        above, error = settings.relinearize_above, settings.relinearize_error
+        return incremental.relinearize_changed(self._pointers, *self._limits()[:2], (above, above, error))
 
-    def _limits(self) -> tuple[float, float, float, float]:
+    def _limits(self) -> tuple[float, float, Limits]:
         """The tolerances of steps, and the limits above which a step is far (``substitute``)."""
-        s = self.settings
-        if s is not self._limits_of:
-            far = BY_FAR * s.relinearize_above, BY_FAR**2 * s.relinearize_error
-            limits = far if s.relinearize_passes else (np.inf, np.inf)
-            self._limits_of, self._limited = s, (s.tolerance, s.tolerance_sigmas, *limits)
-        return self._limited
+        return self._schedule.limits(self.graph, self.settings)
 
     def _relinearized(self, far: Index) -> Iterator[tuple[int, Index]]:
         """Linearise edges that are far, pass after pass; yields how many were, and the vertices that were solved."""
@@ -389,7 +382,7 @@ class Solver(Problem):
     def _renumber_after_batch(self) -> None:
         """Compute the numbers of the tree at the result of a batch. The result stays."""
         self._linearize(self._active())
-        failed, _ = incremental.renumber(self._tree, self._active(), np.inf, 0.0, np.inf, np.inf)
+        failed, _ = incremental.renumber(self._tree, self._active(), np.inf, 0.0, NO_LIMITS)
         if failed != NOTHING:
             self._pending.broken = True
         self._numbers_current = True

@@ -20,6 +20,7 @@ from graph_slam_ros.solver.clique_tree.storage import (
     MEMBERS_TOP,
     MEMBERS_WANTED,
     NOTHING,
+    Limits,
     Tree,
     with_room,
 )
@@ -98,8 +99,7 @@ def advance(
     unseen: Index,
     tolerance: float,
     sigmas: float,
-    far: float,
-    error: float,
+    far: Limits,
 ) -> tuple[int, Index, int, Index, Index]:
     """Apply changes of the structure to the tree, solve, and relinearise what is far (``substitute``).
 
@@ -128,10 +128,10 @@ def advance(
         return ROOM, touched, NOTHING, none, none
     if len(again):
         cliques = with_those_of(t, cliques, again)
-    failed, solved = solve(t, cliques, tolerance, sigmas, far, error)
+    failed, solved = solve(t, cliques, tolerance, sigmas, far)
     if failed != NOTHING:
         return DONE, touched, failed, none, none
-    found = relinearize(t, joined(solved, unseen), far, error)
+    found = relinearize(t, joined(solved, unseen), far)
     if not len(found):
         show(t, kept_of(pointers), solved)
     return DONE, touched, NOTHING, solved, found

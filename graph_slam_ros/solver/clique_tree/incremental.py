@@ -41,6 +41,7 @@ from graph_slam_ros.solver.clique_tree.storage import (
     TAIL_END,
     TAIL_FIRST,
     ZERO,
+    Limits,
     Tree,
 )
 from graph_slam_ros.solver.clique_tree.substitution import find_changed, is_large, substitute
@@ -122,7 +123,7 @@ def edges_of(vertex: Index, link: Index, v: int) -> Index:
 
 
 @kernel
-def solve(t: Tree, cliques: Index, tolerance: float, sigmas: float, far: float, error: float) -> tuple[int, Index]:
+def solve(t: Tree, cliques: Index, tolerance: float, sigmas: float, far: Limits) -> tuple[int, Index]:
     """Compute the numbers of cliques, children before parents, and the steps that matter (``substitute``).
 
     Returns a vertex that has no pivot, or NOTHING, and the vertices that were solved.
@@ -133,7 +134,7 @@ def solve(t: Tree, cliques: Index, tolerance: float, sigmas: float, far: float, 
     failed = eliminate(t, cliques, 0.0)
     if failed != NOTHING:
         return failed, cliques[:0].copy()
-    return failed, substitute(t, cliques, tolerance, sigmas, far, error)
+    return failed, substitute(t, cliques, tolerance, sigmas, far)
 
 
 @inner
@@ -149,27 +150,27 @@ def with_those_of(t: Tree, cliques: Index, edges: Index) -> Index:
 
 
 @kernel
-def renumber(t: Tree, edges: Index, tolerance: float, sigmas: float, far: float, error: float) -> tuple[int, Index]:
+def renumber(t: Tree, edges: Index, tolerance: float, sigmas: float, far: Limits) -> tuple[int, Index]:
     """Solve after a change of the edges' numbers alone."""
-    return solve(t, mark(t, ends_of(t, edges)), tolerance, sigmas, far, error)
+    return solve(t, mark(t, ends_of(t, edges)), tolerance, sigmas, far)
 
 
 @kernel
-def relinearize(t: Tree, searched: Index, threshold: float, error: float) -> Index:
+def relinearize(t: Tree, searched: Index, above: Limits) -> Index:
     """Move the linearisation points of those vertices whose step is too large; return all edges on them.
 
-    A step is too large above the threshold, or where the neglected term of the linearisation is (``is_large``).
+    A step is too large above one of the limits (``is_large``).
     """
     vertex, edge, link = t.vertex, t.edge, t.link
     large = False
     for v in searched:
-        large = large or is_large(t, v, False, threshold, error)
+        large = large or is_large(t, v, False, above)
     if not large:  # as nearly always
         return np.empty(0, np.int64)
     edges, moving = np.empty(64, np.int64), np.empty(len(searched), np.int64)
     count, many = ZERO, 0
     for v in searched:
-        if not is_large(t, v, False, threshold, error):
+        if not is_large(t, v, False, above):
             continue
         moving[many] = v
         many += 1
@@ -190,11 +191,12 @@ def relinearize(t: Tree, searched: Index, threshold: float, error: float) -> Ind
 
 
 @kernel
-def relinearize_changed(pointers: Index, tolerance: float, sigmas: float, threshold: float, error: float) -> Index:
+def relinearize_changed(pointers: Index, tolerance: float, sigmas: float, above: Limits) -> Index:
     """Search all vertices that have moved much since the last time, and relinearise: return the edges."""
     t = tree_of(pointers)
-    much = find_changed(t, tolerance, sigmas, MUCH * threshold, MUCH * MUCH * error)
-    return relinearize(t, much, threshold, error)
+    position, turn, error = above
+    much = find_changed(t, tolerance, sigmas, (MUCH * position, MUCH * turn, MUCH * MUCH * error))
+    return relinearize(t, much, above)
 
 
 @kernel

@@ -110,6 +110,12 @@ R_PARENT, R_DEPTH, R_LEFT, R_RIGHT, R_COUNT, R_MADE, R_FIRST, REGION_COLUMNS = r
 
 VECTOR, SE2_KIND, SE3_KIND = range(3)
 
+Limits = tuple[float, float, float]
+"""What a step is compared with: a component of it, the turn of a pose, and the square of its largest component [sigma].
+
+The standard deviation is that of the strongest measurement.
+"""
+
 TAIL_LEAST = 8  # newest vertices that stay in the tail in any case
 RECENT = 32  # closures that are looked at
 FAR = 1 << 40  # vertices: further than any closure reaches

@@ -49,6 +49,7 @@ from graph_slam_ros.solver.clique_tree.storage import (
     SUBSTITUTED,
     VALUE,
     ZERO,
+    Limits,
     Tree,
     front_of,
     with_children,
@@ -59,7 +60,7 @@ FEW = 8  # vertices that are read one by one; for more all that waits is solved
 
 
 @kernel
-def substitute(t: Tree, cliques: Index, tolerance: float, sigmas: float, far: float, error: float) -> Index:
+def substitute(t: Tree, cliques: Index, tolerance: float, sigmas: float, far: Limits) -> Index:
     """Solve cliques (children before parents) from the root down, and those below whose separator moved far.
 
     Others whose separator moved wait. Returns the frontal vertices of all that were solved.
@@ -68,8 +69,7 @@ def substitute(t: Tree, cliques: Index, tolerance: float, sigmas: float, far: fl
     ----------
     tolerance, sigmas : a step is kept if it changes by no more than so many m or rad, or standard deviations of the
         vertex given its neighbours. Then all that depends on it alone is kept, so errors do not add up
-    far, error : a step is far that is larger, or whose square exceeds so many standard deviations of the strongest
-        measurement (``relinearize``)
+    far : a step above these is far (``is_large``)
     """
     vertex, clique, members = t.vertex, t.clique, t.members
     solved, count = np.empty(64, np.int64), ZERO
@@ -97,7 +97,7 @@ def substitute(t: Tree, cliques: Index, tolerance: float, sigmas: float, far: fl
             v = members[m]
             solved[count] = v
             count += 1
-            if is_large(t, v, False, far, error):
+            if is_large(t, v, False, far):
                 vertex[v, NOTED] |= IS_FAR
             else:
                 vertex[v, NOTED] &= ~IS_FAR
@@ -115,12 +115,11 @@ def substitute(t: Tree, cliques: Index, tolerance: float, sigmas: float, far: fl
 
 
 @kernel
-def is_large(t: Tree, v: int, changed: bool, threshold: float, error: float) -> bool:
-    """Return whether a vertex's step is above the threshold, or its square above ``error`` standard deviations.
+def is_large(t: Tree, v: int, changed: bool, above: Limits) -> bool:
+    """Return whether a vertex's step is above one of the limits.
 
-    These are those of the strongest measurement; the square of the step is what the linearisation neglects. The
-    position of a pose counts in units of the typical motion: of a motion, the linearisation neglects products of a
-    turn with what is moved, relative to it.
+    The square of the step is what the linearisation neglects. The position of a pose counts in units of the typical
+    motion: of a motion, the linearisation neglects products of a turn with what is moved, relative to it.
 
     Parameters
     ----------
@@ -128,13 +127,15 @@ def is_large(t: Tree, v: int, changed: bool, threshold: float, error: float) -> 
     """
     vertex, step, diagonal, unit = t.vertex, t.step, t.diagonal, 1e-3 * t.state[MOTION_MM]
     first, kind = vertex[v, STEP], vertex[v, KIND]
-    positions = first + (2 if kind == SE2_KIND else 3 if kind == SE3_KIND else 0)
-    largest = information = 0.0
+    turns = first + (2 if kind == SE2_KIND else 3 if kind == SE3_KIND else vertex[v, DOF])
+    is_pose = kind in (SE2_KIND, SE3_KIND)
+    largest = turned = information = 0.0
     for i in range(first, first + vertex[v, DOF]):
-        scale, since = unit if i < positions else 1.0, t.reference[i] if changed else 0.0
-        largest = max(largest, abs(step[i] - since) / scale)
+        scale, since = unit if is_pose and i < turns else 1.0, t.reference[i] if changed else 0.0
+        one = abs(step[i] - since) / scale
+        largest, turned = max(largest, one), max(turned, one if i >= turns else 0.0)
         information = max(information, diagonal[i] * scale * scale)
-    return largest > threshold or largest * largest * np.sqrt(information) > error
+    return largest > above[0] or turned > above[1] or largest * largest * np.sqrt(information) > above[2]
 
 
 @kernel
@@ -313,19 +314,19 @@ def read(pointers: Index, kind: Index, ids: Index, size: int, tolerance: float, 
 
 
 @inner
-def find_changed(t: Tree, tolerance: float, sigmas: float, threshold: float, error: float) -> Index:
+def find_changed(t: Tree, tolerance: float, sigmas: float, much: Limits) -> Index:
     """Return the vertices, in order, whose steps have changed much since they were last returned.
 
     What waits is solved where a step of its separator has changed much; below that, changes are no larger.
 
     Parameters
     ----------
-    threshold, error : a change is much that is larger (``is_large``)
+    much : a change above these is much (``is_large``)
     """
     vertex, clique, members, listed, state = t.vertex, t.clique, t.members, t.listed, t.state
     step, reference = t.step, t.reference
     for k in range(state[SHIFTED_COUNT]):
-        _note_if_much(t, listed[k, SHIFTED], threshold, error)
+        _note_if_much(t, listed[k, SHIFTED], much)
     stack, top, x = np.empty(64, np.int64), ZERO, np.empty(64)
     for k in range(state[DEFERRED_COUNT]):
         stack[0], top = listed[k, DEFERRED], ZERO + 1
@@ -341,7 +342,7 @@ def find_changed(t: Tree, tolerance: float, sigmas: float, threshold: float, err
                 x = np.empty(2 * clique[c, FULL_DOF])
             visit(t, c, x, tolerance, sigmas)
             for m in range(clique[c, MEMBERS], clique[c, MEMBERS] + clique[c, FRONTALS]):
-                _note_if_much(t, members[m], threshold, error)
+                _note_if_much(t, members[m], much)
             stack, top = with_children(clique, c, stack, top)
     count = kept = 0
     for k in range(state[DEFERRED_COUNT]):
@@ -369,9 +370,9 @@ def find_changed(t: Tree, tolerance: float, sigmas: float, threshold: float, err
 
 
 @inner
-def _note_if_much(t: Tree, v: int, threshold: float, error: float) -> None:
+def _note_if_much(t: Tree, v: int, much: Limits) -> None:
     """Note a vertex whose step has changed much since a search last found it."""
-    if is_large(t, v, True, threshold, error):
+    if is_large(t, v, True, much):
         t.vertex[v, NOTED] |= IS_MUCH
 
 

@@ -1,4 +1,4 @@
-"""The typical length of a motion, by which positions count where steps are linearised anew."""
+"""Where steps are linearised anew: the typical length of a motion, and turns that show in chi2."""
 
 from itertools import pairwise
 
@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from graph_slam_ros.graph import RELATIVE_POSE, RELATIVE_POSE_3D, SE2, SE3, Gaussian, Graph
+from graph_slam_ros.lie import se2
 from graph_slam_ros.solver import Settings, Solver
-from graph_slam_ros.solver.relinearization import MotionLength
+from graph_slam_ros.solver.relinearization import NO_LIMITS, MotionLength, RelinearizationSchedule, far_limits
 
 
 def chain(lengths, dimensions=2):
@@ -59,3 +60,48 @@ def test_a_step_of_a_tenth_of_a_metre_is_linearised_anew_among_short_motions_onl
         change = solver.update()
     assert change.linearized == (3 if again else 1), "both edges of the pose that has moved by 0.15 m, and the new one"
     assert solver.estimate([4])[0] == pytest.approx((4.0 * length + 0.15, 0.0, 0.0))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_small_graph_is_at_its_optimum_after_each_closure(seed):
+    """Compass headings of 0.3 rad; a search for large steps is due at every tenth update only."""
+    random, graph, worst = np.random.default_rng(seed), Graph(), 1.0
+    noise, truth = Gaussian(np.diag([20.0, 20.0, 1.0 / 0.3])), np.zeros(3)
+    solver, poses = Solver(graph), [truth]
+    solver.add([graph.add_vertex(SE2, truth)], [])
+    solver.hold(0)
+    for k in range(1, 30):
+        poses.append(np.array(se2.compose(tuple(poses[-1]), (1.0, 0.0, np.pi / 2 if k % 3 == 0 else 0.0))))
+        measured = [noisy(random, poses, k - 1, k)]
+        at = se2.compose(tuple(solver.estimate([k - 1])[0]), measured[0])
+        solver.add([graph.add_vertex(SE2, at)], [graph.add_edge(RELATIVE_POSE, (k - 1, k), measured[0], noise, "o")])
+        if k >= 12:
+            closed = noisy(random, poses, k - 12, k)
+            solver.add([], [graph.add_edge(RELATIVE_POSE, (k - 12, k), closed, noise, "closures")])
+        solver.update()
+        if k > 15:
+            best = Solver(graph)
+            best.start_at(solver.values)
+            best.add(range(k + 1), range(graph.edge_count))
+            best.hold(0)
+            best.optimize()
+            worst = max(worst, solver.evaluate().chi2_final / best.evaluate().chi2_final)
+    assert worst < 1.1, "1.4 to 3.9 where all steps wait for the search"
+
+
+def noisy(random, poses, a, b):
+    """A motion between two of the poses, as it is measured."""
+    motion = np.array(se2.between(tuple(poses[a]), tuple(poses[b])))
+    return tuple((motion + random.normal(0.0, [0.05, 0.05, 0.3])).tolist())
+
+
+def test_the_limit_of_a_turn_grows_with_the_graph_to_ten_times_the_threshold():
+    graph, limits = chain([1.0]), []
+    for _ in range(2000):
+        graph.add_edge(RELATIVE_POSE, (0, 1), (1.0, 0.0, 0.0), Gaussian(np.eye(3)), "closures")
+        limits.append(far_limits(graph, Settings())[1])
+    assert limits[0] == 0.05
+    assert limits[999] == pytest.approx(np.sqrt(5e-5 * 2997))
+    assert limits[-1] == 0.5
+    assert {far_limits(graph, Settings())[k] for k in (0, 2)} == {0.5, 10.0}
+    assert RelinearizationSchedule().limits(graph, Settings(relinearize_passes=0))[2] == NO_LIMITS
