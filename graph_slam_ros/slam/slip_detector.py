@@ -1,11 +1,11 @@
 """Detection of slip: stretches of odometry whose errors are larger than its noise.
 
-A view is everything that was measured from one keyframe. If the last 1 to 16 views contradict odometry, some of their
-keyframes are tested as the start of a slip, of translation or of rotation, beside the hypothesis that the robot was
-moved. The best must be a slip, exceed the odds against it, and be likelier than none also without any one landmark.
-Then edges with more noise replace the odometry edges of the stretch, and new odometry gets more noise, too. The slip
-ends when odometry with its own noise is likelier again for some views. If that is true of the whole stretch, the slip
-is taken back, and everything is as before.
+A view is everything that was measured from one keyframe. If the last 1 to 16 views contradict odometry more than is
+usual in this drive, some of their keyframes are tested as the start of a slip, of translation or of rotation, beside
+the hypothesis that the robot was moved. The best must be a slip, exceed the odds against it, and be likelier than none
+also without any one landmark. Then edges with more noise replace the odometry edges of the stretch, and new odometry
+gets more noise, too. The slip ends when odometry with its own noise is likelier again for some views. If that is true
+of the whole stretch, the slip is taken back, and everything is as before.
 """
 
 from collections import deque
@@ -39,6 +39,7 @@ _VIEWS = 16
 _SUMS = (1, 2, 4, 8, 16)  # views whose innovations are summed
 _SURE = 1.0 - 1e-6  # probability with which clean measurements cause no comparison
 _CAP = 0.9999  # no innovation counts for more than this quantile: one alone does not decide
+_USUAL, _FEWEST = 200, 30  # newest sightings whose median says how large residuals are, and how many that needs
 _SINCE = (1, 2, 4, 6, 8, 12, 16)  # views before which a slip may have begun
 _EARLIER = (1, 2, 3, 4, 6, 8)  # edges by which a slip may have begun before it was found
 _SURELY = 1.0  # logarithm of the likelihood ratio that this needs
@@ -79,6 +80,7 @@ class SlipDetector:
         self._links: deque[Link] = deque(maxlen=_MOST_EDGES)
         self._views: deque[View] = deque(maxlen=_VIEWS + 1)
         self._new: list[int] = []  # edges that came since the last check, whose innovation is not known yet
+        self._ratios: deque[float] = deque(maxlen=_USUAL)  # of the newest squared residuals to the stated median
         self._replacing: set[int] = set()  # edges that replace others
         self._checked, self._allowed = -1, _BURST
         self.noise, self._added = MeasuredNoise(space, backend), SlipNoise(space, odometry)
@@ -178,14 +180,22 @@ class SlipDetector:
 
     def _store_innovations(self) -> None:
         """Store the innovations of the new edges."""
-        new, ledger = set(self._new), self._backend.ledger
+        new, ledger, usual = set(self._new), self._backend.ledger, self._usual()
         for view in reversed(self._views):
             for edge, what in zip(view.edges, view.seen, strict=True):
                 if edge in new and edge < len(ledger) and self._is_known(what, view.vertex):
-                    numbers = int(ledger.numbers.values[edge])
-                    view.statistic += min(float(ledger.statistic.values[edge]), quantile(_CAP, numbers))
+                    numbers, statistic = int(ledger.numbers.values[edge]), float(ledger.statistic.values[edge])
+                    self._ratios.append(statistic / quantile(0.5, numbers))
+                    view.statistic += min(statistic / usual, quantile(_CAP, numbers))
                     view.numbers += numbers
         self._new.clear()
+
+    def _usual(self) -> float:
+        """Return how large squared residuals are in this drive, as a multiple of those that the stated noise makes.
+
+        It is 1 at least. A residual is that of the predicted pose, whose noise is no part of the stated noise.
+        """
+        return max(1.0, float(np.median(self._ratios))) if len(self._ratios) >= _FEWEST else 1.0
 
     def _is_known(self, what: int | str, vertex: int) -> bool:
         return isinstance(what, str) or self._history.known_from(what, self._views[0].edges[0]) < vertex

@@ -169,21 +169,21 @@ def test_clean_drives_of_ten_minutes_have_no_slip(seed):
     assert slam.counters[SLIP] == 0
 
 
-def test_a_slip_that_one_landmark_shows_first_is_no_displacement():
-    """What fits a slip best and is not sure yet waits for another landmark, with an alarm."""
-    recording, begin_ns = slipping(world(5001, aisle_m=40.0, aisles=3), seconds=20.0)
-    slam, told_ns = GraphSlam(Config()), None
+@pytest.mark.parametrize(("loss", "within_s"), [(0.3, 2.0), (0.2, 4.0)])
+@pytest.mark.parametrize("seed", [5001, 5004])
+def test_a_slip_is_found_soon_and_is_no_displacement(seed, loss, within_s):
+    """Before it there are 1.5 times as large residuals as the noise of the sightings alone makes: no reason to ask."""
+    recording, begin_ns = slipping(world(seed, aisle_m=40.0, aisles=3), seconds=20.0, loss=loss)
+    slam = GraphSlam(Config())
     for m in measurements(recording):
-        if m.stamp_ns > begin_ns + 4 * 10**9:
+        if m.stamp_ns > begin_ns + within_s * 10**9:
             break
         slam.process(m)
-        told_ns = told_ns or (m.stamp_ns if slam.displaced else None)
     assert slam.counters[SLIP] == 1
     assert slam.segments == [0]
     slip = slam.alarms[0]
     assert isinstance(slip, Slip)
     assert abs(slip.began_ns - begin_ns) < 10**9
-    assert begin_ns < told_ns < slip.decided_ns
 
 
 def test_turns_that_are_as_wrong_as_odometry_says_are_no_slip():
