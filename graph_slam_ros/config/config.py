@@ -244,11 +244,12 @@ def _sections() -> Iterator[tuple[str, Any]]:
 def _input_names(text: Any) -> list[str]:
     """Names that are separated by spaces. Raises ConfigError for what cannot be the name of a section of its own."""
     if not isinstance(text, str):
-        raise ConfigError(f"inputs.names: {text!r} is not a text of names")
+        example = " ".join(map(str, text)) if isinstance(text, list | tuple) and text else "odom landmarks"
+        raise ConfigError(f"inputs.names: {text!r} is not one text; write the names with spaces: names: {example}")
     names, used = text.split(), {name for name, _ in _sections()} | {"tf_static"}
     for name in names:
         if not re.fullmatch(r"[a-zA-Z]\w*", name, re.ASCII):
-            raise ConfigError(f"inputs.names: {name!r} is not a name (letters, digits, _)")
+            raise ConfigError(f"inputs.names: {name!r} is not a name (letters, digits, _); separate names by spaces")
         if name in used:
             raise ConfigError(f"inputs.names: {name!r} is reserved or given twice")
         used.add(name)

@@ -1,4 +1,4 @@
-"""The schedule of relinearisation: when vertices are searched for large steps, and what is large for a position."""
+"""The schedule of relinearisation: when large steps are searched for, and which do not wait for that."""
 
 import math
 

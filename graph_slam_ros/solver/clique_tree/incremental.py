@@ -194,8 +194,8 @@ def relinearize(t: Tree, searched: Index, above: Limits) -> Index:
 def relinearize_changed(pointers: Index, tolerance: float, sigmas: float, above: Limits) -> Index:
     """Search all vertices that have moved much since the last time, and relinearise: return the edges."""
     t = tree_of(pointers)
-    position, turn, error = above
-    much = find_changed(t, tolerance, sigmas, (MUCH * position, MUCH * turn, MUCH * MUCH * error))
+    component, turn, square = above
+    much = find_changed(t, tolerance, sigmas, (MUCH * component, MUCH * turn, MUCH * MUCH * square))
     return relinearize(t, much, above)
 
 

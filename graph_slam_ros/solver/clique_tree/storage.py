@@ -111,9 +111,9 @@ R_PARENT, R_DEPTH, R_LEFT, R_RIGHT, R_COUNT, R_MADE, R_FIRST, REGION_COLUMNS = r
 VECTOR, SE2_KIND, SE3_KIND = range(3)
 
 Limits = tuple[float, float, float]
-"""What a step is compared with: a component of it, the turn of a pose, and the square of its largest component [sigma].
+"""Limits of a step: of any component [m, rad], of the turn of a pose [rad], and of the square of the largest component.
 
-The standard deviation is that of the strongest measurement.
+The last is in standard deviations of the strongest measurement.
 """
 
 TAIL_LEAST = 8  # newest vertices that stay in the tail in any case

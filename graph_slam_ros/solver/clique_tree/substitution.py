@@ -135,7 +135,8 @@ def is_large(t: Tree, v: int, changed: bool, above: Limits) -> bool:
         one = abs(step[i] - since) / scale
         largest, turned = max(largest, one), max(turned, one if i >= turns else 0.0)
         information = max(information, diagonal[i] * scale * scale)
-    return largest > above[0] or turned > above[1] or largest * largest * np.sqrt(information) > above[2]
+    component, turn, square = above
+    return largest > component or turned > turn or largest * largest * np.sqrt(information) > square
 
 
 @kernel
@@ -317,11 +318,8 @@ def read(pointers: Index, kind: Index, ids: Index, size: int, tolerance: float, 
 def find_changed(t: Tree, tolerance: float, sigmas: float, much: Limits) -> Index:
     """Return the vertices, in order, whose steps have changed much since they were last returned.
 
-    What waits is solved where a step of its separator has changed much; below that, changes are no larger.
-
-    Parameters
-    ----------
-    much : a change above these is much (``is_large``)
+    A change above the limits ``much`` is much (``is_large``). What waits is solved where a step of its separator has
+    changed much; below that, changes are no larger.
     """
     vertex, clique, members, listed, state = t.vertex, t.clique, t.members, t.listed, t.state
     step, reference = t.step, t.reference

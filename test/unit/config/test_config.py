@@ -204,3 +204,16 @@ def test_the_command_line_names_the_file_or_the_key_that_is_wrong(tmp_path, caps
         assert culprit in err
         assert err.count("\n") == 1
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("names", "remedy"),
+    [
+        (["odom", "tags"], r"\['odom', 'tags'\] is not one text; write the names with spaces: names: odom tags"),
+        ([], r"\[\] is not one text; write the names with spaces: names: odom landmarks"),
+        ("odom, tags", "'odom,' is not a name .*; separate names by spaces"),
+    ],
+)
+def test_names_of_inputs_that_are_a_list_are_answered_with_the_line_to_write(names, remedy):
+    with pytest.raises(ConfigError, match=remedy):
+        Config.from_mapping({"inputs.names": names})
