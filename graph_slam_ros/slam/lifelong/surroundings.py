@@ -106,12 +106,11 @@ def seen_from(space: Geometry, solver: Solver, keyframes: Index) -> list[set[int
     frozen map, or of a map that the robot is located in.
     """
     graph = solver.graph
-    out: list[set[int] | None] = [None if solver.is_held(vertex) else set() for vertex in keyframes.tolist()]
+    held = np.isin(keyframes, solver.held).tolist()
+    out: list[set[int] | None] = [None if is_held else set() for is_held in held]
     row_of = np.full(graph.vertex_count, -1)
     row_of[keyframes] = np.arange(len(keyframes))
-    edges = np.unique(np.concatenate([solver.edges_on(vertex) for vertex in keyframes.tolist()]))
-    for table, rows in _tables_of(graph, edges):
-        rows = rows[table.weight.values[rows] != 0.0]
+    for table, rows in _tables_of(graph, solver.edges):
         ends, numbers = table.vertices.values[rows], table.id.values[rows]
         is_fit = graph.has_label(numbers, (CLOSURES, FIXES))
         if table.type is space.relative_pose:

@@ -76,10 +76,11 @@ class OdometryChain:
         ----------
         first : the first keyframe that stays, by its new vertex: motions from it on are kept
         """
+        now = vertices[self.vertices].tolist()
         self._links = {
-            int(vertices[keyframe]): replace(link, edge=int(edges[link.edge]))
-            for keyframe, link in self._links.items()
-            if vertices[keyframe] > first
+            vertex: _Link(int(edges[link.edge]), link.stamp_ns, link.pose, link.drift)
+            for vertex, link in zip(now, self._links.values(), strict=True)
+            if vertex > first
         }
 
     def pose(self, keyframe: int) -> Numbers:
