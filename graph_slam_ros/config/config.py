@@ -7,6 +7,7 @@ types and values out of range are refused with the name of the culprit.
 import dataclasses
 import inspect
 import itertools
+import math
 import re
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -228,6 +229,7 @@ class Config:
             relinearize_above=s.relinearize_above,
             relinearize_error=s.relinearize_error,
             relinearize_every=s.relinearize_every,
+            relinearize_neglected=math.inf,  # measurements that contradict each other would drive it away (docs/solver.md)
             tolerance=s.tolerance,
             tolerance_sigmas=s.tolerance_sigmas,
             at_once=True,  # a replay need not read what the node reads, and when

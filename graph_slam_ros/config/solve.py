@@ -33,8 +33,7 @@ class SolveConfig:
     )
     relinearize_every: int = setting(
         _SOLVER.relinearize_every,
-        "relinearisation is checked at every so many updates (at each update for ten times the threshold, or less in a "
-        "small graph)",
+        "relinearisation is checked at every so many updates (at each update for ten times the threshold)",
         "updates",
         low=1,
         high=1_000_000,

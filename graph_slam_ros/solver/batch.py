@@ -38,6 +38,7 @@ _LEAST = {  # of the settings that are numbers
     "relinearize_above": 0.0,
     "relinearize_error": 0.0,
     "relinearize_every": 1,
+    "relinearize_neglected": 0.0,
     "relinearize_passes": 0,
     "tolerance": 0.0,
     "tolerance_sigmas": 0.0,
@@ -61,8 +62,9 @@ class Settings:
         position of a pose in units of the typical motion between two, if that is longer than a metre
     relinearize_error : or when its step squared is more than so many standard deviations of its strongest measurement
     relinearize_every : that is looked for at every so many updates, or after two thirds of these at one that closes a
-        loop. Steps ten times as large are looked for at any update, and in a small graph also smaller turns, whose
-        square is more than 5e-5 of the expected chi2
+        loop. Steps ten times as large are looked for at any update
+    relinearize_neglected : and so are turns whose square is more than this part of the expected chi2, as in a small
+        graph; inf: they wait
     relinearize_passes : how often at most within one update; after the first time for such steps
     tolerance : online, changes of a step up to this are not followed [m, rad]
     tolerance_sigmas : nor are those up to so many standard deviations of the vertex given its neighbours
@@ -78,6 +80,7 @@ class Settings:
     relinearize_above: float = 0.05
     relinearize_error: float = 0.1
     relinearize_every: int = 10
+    relinearize_neglected: float = 5e-5
     relinearize_passes: int = 5
     tolerance: float = 1e-5
     tolerance_sigmas: float = 1e-3

@@ -12,7 +12,6 @@ from graph_slam_ros.typing import Index
 
 NOT_YET, MAYBE, SURELY = range(3)
 _BY_FAR = 10.0  # times the threshold: steps that are linearised anew at once
-_NEGLECTED = 5e-5  # of the expected chi2: a turn whose square is more is linearised anew at once, too
 NO_LIMITS: Limits = (math.inf, math.inf, math.inf)
 _MOTIONS = {RELATIVE_POSE: 2, INVERSE_RELATIVE_POSE: 2, RELATIVE_POSE_3D: 3}  # components of their positions
 _SIGHTINGS = "landmarks"  # label of edges to landmarks, which may be poses, too
@@ -73,7 +72,7 @@ def far_limits(graph: Graph, settings: Settings) -> Limits:
     number of measured components less the number of estimated ones.
     """
     measured = sum(table.type.residual_size * len(table) for table in graph.tables.values())
-    costly = math.sqrt(_NEGLECTED * max(0, measured - graph.initial.count))
+    costly = math.sqrt(settings.relinearize_neglected * max(1, measured - graph.initial.count))
     above = settings.relinearize_above
     far = _BY_FAR * above
     return far, min(far, max(above, costly)), _BY_FAR**2 * settings.relinearize_error

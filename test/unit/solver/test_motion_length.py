@@ -104,4 +104,5 @@ def test_the_limit_of_a_turn_grows_with_the_graph_to_ten_times_the_threshold():
     assert limits[999] == pytest.approx(np.sqrt(5e-5 * 2997))
     assert limits[-1] == 0.5
     assert {far_limits(graph, Settings())[k] for k in (0, 2)} == {0.5, 10.0}
+    assert far_limits(graph, Settings(relinearize_neglected=np.inf))[1] == 0.5
     assert RelinearizationSchedule().limits(graph, Settings(relinearize_passes=0))[2] == NO_LIMITS
