@@ -229,7 +229,7 @@ class Config:
             relinearize_above=s.relinearize_above,
             relinearize_error=s.relinearize_error,
             relinearize_every=s.relinearize_every,
-            relinearize_neglected=math.inf,  # measurements that contradict each other would drive it away (docs/solver.md)
+            relinearize_neglected=math.inf,  # contradictions would drive it away (docs/solver.md)
             tolerance=s.tolerance,
             tolerance_sigmas=s.tolerance_sigmas,
             at_once=True,  # a replay need not read what the node reads, and when

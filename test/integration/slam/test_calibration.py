@@ -212,4 +212,4 @@ def test_a_factor_that_changes_on_the_way_is_followed_where_that_is_asked_for():
     report = drifting.calibration_report
     assert report["settings"] == {"odometry.distance_factor": pytest.approx(0.9, abs=0.01)}
     assert report["windows"] == [{"first_keyframe": 0, "settings": {}}]
-    assert error_m(drifting, truth) < 0.7 * error_m(constant, truth), "9 of 14 mm; when the slip is noticed is half a millimetre"
+    assert error_m(drifting, truth) < 0.7 * error_m(constant, truth), "9 of 14 mm"
