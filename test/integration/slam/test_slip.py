@@ -172,7 +172,7 @@ def test_clean_drives_of_ten_minutes_have_no_slip(seed):
 @pytest.mark.parametrize(("loss", "within_s"), [(0.3, 2.0), (0.2, 4.0)])
 @pytest.mark.parametrize("seed", [5001, 5004])
 def test_a_slip_is_found_soon_and_is_no_displacement(seed, loss, within_s):
-    """Before it there are 1.5 times as large residuals as the noise of the sightings alone makes: no reason to ask."""
+    """The residuals of the clean drive before it raise no alarm, so they use up no comparison."""
     recording, begin_ns = slipping(world(seed, aisle_m=40.0, aisles=3), seconds=20.0, loss=loss)
     slam = GraphSlam(Config())
     for m in measurements(recording):
