@@ -28,7 +28,7 @@ from graph_slam_ros.solver import Report, Settings, Solver
 from graph_slam_ros.typing import Array, Executor, Index, Numbers
 
 _MAX_PENDING = 200  # edges that are compared with all that is known at once, at most; reviews look at the others
-_NOISE_ROUNDS, _NOISE_ROUNDS_ONLINE = 8, 2  # of estimating the scale of the noise and solving with it
+_NOISE_ROUNDS = 8  # at most, of estimating the scale of the noise and solving with it
 
 
 class Backend:
@@ -198,15 +198,16 @@ class Backend:
     def scale_noise(self, keyframes: StampedPoses[Keyframe], everything: Settings | None) -> Report | None:
         """Estimate the scale of the noise if that is due, and solve with it. Returns the last report of a solve.
 
-        It is due at 50 keyframes, 100, 200 and so on, and when everything is solved. A map that was edited by hand
-        keeps its noise until a keyframe is added: residuals that an edit makes are not the noise of a sensor.
+        It is due at 50 keyframes, 100, 200 and so on, at the solve after each of these, and when everything is solved.
+        A map that was edited by hand keeps its noise until a keyframe is added: residuals that an edit makes are not
+        the noise of a sensor.
         """
         is_driven = not self.edits or len(keyframes) > self.edits[-1].keyframe + 1
         is_due = is_driven if everything is not None else self.noise.is_due(len(keyframes))
         if self._config.noise_scale != "estimated" or self.holds_back or not is_due:
             return None
         first_edge, report = self.first_free_edge, None
-        for _ in range(_NOISE_ROUNDS if everything else _NOISE_ROUNDS_ONLINE):
+        for _ in range(_NOISE_ROUNDS if everything else 1):
             before = dict(self.noise.factors)
             try:
                 found = factors_of(self.noise_scale(keyframes))

@@ -165,15 +165,19 @@ class NoiseScales:
         self.graph = graph
         self.factors: dict[Key, float] = dict(factors or {})
         self.history: list[Rescaling] = []
-        self._due = FIRST_DUE
+        self._due, self._once_more = FIRST_DUE, False
         self._narrower: dict[tuple[EdgeType, str, str], Array] = {}  # where it does not depend on what is measured
 
     def is_due(self, keyframes: int) -> bool:
-        """Return whether the number of keyframes has doubled since the last estimate."""
-        is_due = keyframes >= self._due
+        """Return whether the number of keyframes has doubled since the last estimate, or had at the call before.
+
+        An estimate at other noise is another one. To repeat it at once would double the time of that update.
+        """
+        has_doubled, once_more = keyframes >= self._due, self._once_more
         while keyframes >= self._due:
             self._due *= 2
-        return is_due
+        self._once_more = has_doubled
+        return has_doubled or once_more
 
     def add_edge(
         self, edge: EdgeType, vertices: Sequence[int], measured: Sequence[float] | Array, noise: Gaussian, *names: str
