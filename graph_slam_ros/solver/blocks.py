@@ -53,6 +53,8 @@ def whiten(
                 j[a, c] = 0.0
             for b in range(m):
                 root = sqrt_information[row, a, b]
+                if root == 0.0:  # half of a triangle, and more where components are independent
+                    continue
                 r[a] += root * residual[e, b]
                 for c in range(width):
                     j[a, c] += root * jacobian[e, b, c]
@@ -174,6 +176,15 @@ def store_first(t: Tree, rows: Index, ids: Index, residual: Array, jacobian: Arr
                 for c in range(p, width):
                     blocks[at + c] = x * jacobian[k, 0, c] + y * jacobian[k, 1, c] + z * jacobian[k, 2, c]
                 blocks[at + width] = x * residual[k, 0] + y * residual[k, 1] + z * residual[k, 2]
+            elif m == 6:
+                u, v, w = jacobian[k, 0, p], jacobian[k, 1, p], jacobian[k, 2, p]
+                x, y, z = jacobian[k, 3, p], jacobian[k, 4, p], jacobian[k, 5, p]
+                for c in range(p, width):
+                    first = u * jacobian[k, 0, c] + v * jacobian[k, 1, c] + w * jacobian[k, 2, c]
+                    last = x * jacobian[k, 3, c] + y * jacobian[k, 4, c] + z * jacobian[k, 5, c]
+                    blocks[at + c] = first + last
+                first = u * residual[k, 0] + v * residual[k, 1] + w * residual[k, 2]
+                blocks[at + width] = first + x * residual[k, 3] + y * residual[k, 4] + z * residual[k, 5]
             else:
                 blocks[at + p : at + width + 1] = 0.0
                 for a in range(m):

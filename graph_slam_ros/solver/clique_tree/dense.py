@@ -84,10 +84,13 @@ def _eliminate_panel(front: Array, low: int, high: int, below: int, diagonal: Ar
                 front[p, j] *= inverse
         if last - a == 4:
             _subtract_four(front, last, below, a)
+        elif last - a == 3:
+            _subtract_three(front, last, below, a)
+        elif last - a == 2:
+            _subtract_two(front, last, below, a)
         else:
             for i in range(last, below):
-                for q in range(a, last):
-                    _subtract(front, i, i, q)
+                _subtract(front, i, i, a)
     return NOTHING
 
 
@@ -108,6 +111,28 @@ def _subtract_four(front: Array, low: int, high: int, pivot: int) -> None:
         a, b, c, d = one[i], two[i], three[i], four[i]
         for j in range(i, front.shape[1]):
             row[j] -= a * one[j] + b * two[j] + c * three[j] + d * four[j]
+
+
+@dense
+def _subtract_three(front: Array, low: int, high: int, pivot: int) -> None:
+    """The same of three pivot rows, which is what a pose in the plane has."""
+    one, two, three = front[pivot], front[pivot + 1], front[pivot + 2]
+    for i in range(low, high):
+        row = front[i]
+        a, b, c = one[i], two[i], three[i]
+        for j in range(i, front.shape[1]):
+            row[j] -= a * one[j] + b * two[j] + c * three[j]
+
+
+@dense
+def _subtract_two(front: Array, low: int, high: int, pivot: int) -> None:
+    """The same of two pivot rows: what is left of a pose in space."""
+    one, two = front[pivot], front[pivot + 1]
+    for i in range(low, high):
+        row = front[i]
+        a, b = one[i], two[i]
+        for j in range(i, front.shape[1]):
+            row[j] -= a * one[j] + b * two[j]
 
 
 @kernel

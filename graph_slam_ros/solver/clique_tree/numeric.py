@@ -139,8 +139,15 @@ def _add_block(
     if at < to:
         for i in range(dof):
             begin = row_of(row + i, rows) + column
-            for j in range(width):
-                front[at + i, to + j] += packed[begin + j]
+            if width == 3:  # the usual widths by themselves: a loop of known length is unrolled
+                for j in range(3):
+                    front[at + i, to + j] += packed[begin + j]
+            elif width == 6:
+                for j in range(6):
+                    front[at + i, to + j] += packed[begin + j]
+            else:
+                for j in range(width):
+                    front[at + i, to + j] += packed[begin + j]
     else:
         for i in range(dof):
             begin = row_of(row + i, rows) + column
