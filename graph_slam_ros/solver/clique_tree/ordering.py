@@ -57,7 +57,8 @@ from graph_slam_ros.solver.clique_tree.storage import (
 from graph_slam_ros.typing import Index
 
 LEAF = 6  # vertices a region need not be dissected for
-GROWTH = 2.0  # a subtree is dissected anew when it has grown by this factor
+GROWTH = 2.0  # a subtree is dissected anew when it has grown by this factor,
+FEWEST = 64  # and by so many vertices: to dissect a small one costs more than its order is worth
 DEEPEST = 200
 ROOT: Any = np.int64(0)  # region; not a literal, for which kernels would be compiled once more
 TAIL_MOST = 128  # vertices that are kept in the tail at most
@@ -114,7 +115,7 @@ def move_tail(t: Tree, edges: Index, touched: Index) -> tuple[Index, int]:
         _enter(t, v, _deepest_place(t, v))
         r = vertex[v, REGION]
         while r != NOTHING:
-            if region[r, R_COUNT] > GROWTH * region[r, R_MADE] + LEAF and (
+            if region[r, R_COUNT] > GROWTH * region[r, R_MADE] + FEWEST and (
                 overgrown == NOTHING or region[r, R_DEPTH] < region[overgrown, R_DEPTH]
             ):
                 overgrown = r
