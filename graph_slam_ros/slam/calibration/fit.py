@@ -261,7 +261,10 @@ class _Fit:
 def _factor(rows: Rows) -> tuple[SuperLU, Array]:
     """H in factors, and ``H^-1 B``."""
     h = (rows.jacobian.T @ rows.jacobian).tocsc()
-    h += sparse.diags((h.diagonal() == 0.0).astype(float), format="csc")  # an unknown that has lost all its edges stays
+    lost = h.diagonal() == 0.0
+    if lost.any():  # an unknown that has lost all its edges stays
+        h += sparse.diags(lost.astype(float), format="csc")
+    h.eliminate_zeros()
     try:
         factor = splu(h, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
     except RuntimeError as error:

@@ -5,6 +5,7 @@ robot that stands and goes is nowhere near half-way when half of the time is ove
 """
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 from typing import Any
 
@@ -60,6 +61,12 @@ class EstimatedPath:
         gaps = [(self._sample_s[k], self._sample_s[k + 1]) for k in np.flatnonzero(is_open).tolist()]
         joints = [k - first for k in segments if first < k < len(stamps_ns)]
         self._gaps = [*gaps, *((self._own_s[k - 1], self._own_s[k]) for k in joints)]
+
+    def moved(self, poses: Array, track: OdometryTrack) -> "EstimatedPath":
+        """The same keyframes at other poses (n, size), with the same odometry corrected by other factors."""
+        out = copy(self)
+        out._poses, out._track = poses[self._first :], track
+        return out
 
     def _with_samples(self, track: OdometryTrack) -> tuple[Array, Array]:
         """Seconds and poses of odometry at the keyframes and between them."""

@@ -4,8 +4,10 @@ Each sighting is seen from a pose of its own, which is no unknown: it lies on th
 correction, between two keyframes whose steps move it. So a clock may be off by more than the time between keyframes.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -70,12 +72,20 @@ class TrialProblem:
         of = self.space, self.graph, self.origins, stamp_of, edges
         return MeasurementModel(*of, is_noise_measured=self.is_noise_measured)
 
-    def path(self, x: Array, values: Values) -> EstimatedPath:
-        """The path at stored values x and with other parameters."""
+    def path(self, x: Array, values: Values, like: EstimatedPath | None = None) -> EstimatedPath:
+        """The path at stored values x and with other parameters.
+
+        Parameters
+        ----------
+        like : another path of this problem, whose stamps are taken over
+        """
         named, track = {p.name: value for p, value in values.items() if p.name in OF_ODOMETRY}, self.track
         distance, turn = (1.0 + named.get(name, 0.0) for name in ("distance", "turn"))
         track = replace(track, distance=track.distance * distance, turn=track.turn * turn)
-        return EstimatedPath(self.space, self.stamps_ns, self.poses(x, self.keyframes), self.segments, track)
+        poses = self.poses(x, self.keyframes)
+        if like is not None:
+            return like.moved(poses, track)
+        return EstimatedPath(self.space, self.stamps_ns, poses, self.segments, track)
 
     def poses(self, x: Array, vertices: Index) -> Array:
         """The poses (n, size) of some vertices at stored values x."""
@@ -187,6 +197,7 @@ class Linearization:
             self._stamp_of[eyes.ids] = edges.stamps_ns
         self._known = known
         tables = graph.tables.values()  # how likely what odometry measured is does not change with its factors
+        self._path = problem.path(problem.values, {})
         self._log_roots = {one.code: np.linalg.slogdet(one.sqrt_information.values)[1] for one in tables}
 
     def rows(self, x: Array, theta: Array, losses: Mapping[LossKey, Loss]) -> Rows:
@@ -194,12 +205,12 @@ class Linearization:
         graph = self._p.graph
         values = dict(zip(self._parameters, theta.tolist(), strict=True))
         all_x = np.concatenate((x, graph.initial.values[len(x) :]))
-        path = self._p.path(x, values)
+        path = self._p.path(x, values, self._path)
         for eyes in self._eyes:
             eyes.place(all_x, values, self._model, path, self._parameters)
         derivative = self._correct(all_x, values)
         blocks = linearize(graph, all_x, rows_of(graph, self._edges), Losses(graph, losses))
-        parts = [self._of_block(block, derivative, all_x) for block in blocks]
+        parts = [self._of_block(block, derivative, all_x) for block in _by_table(blocks)]
         return Rows(
             sparse.vstack([part.jacobian for part in parts], format="csr"),
             *(np.concatenate([getattr(part, name) for part in parts]) for name in _COLUMNS),
@@ -313,9 +324,16 @@ def _adjoints(space: Geometry, poses: Any) -> Array:
     group, back = space.group, space.group.inverse(poses)
     columns = []
     for probe in np.eye(space.dof):
-        step = group.exp(tuple(1e-6 * one * np.ones_like(poses[0]) for one in probe))
+        step = group.exp(tuple(1e-6 * probe))
         columns.append(np.stack(group.log(group.compose(group.compose(poses, step), back)), axis=-1) * 1e6)
     return np.stack(columns, axis=-1)
+
+
+def _by_table(blocks: Iterable[Block]) -> Iterator[Block]:
+    """Join the blocks of each table, which follow one another."""
+    for table, some in groupby(blocks, key=attrgetter("table")):
+        columns = zip(*((one.rows, one.residual, one.jacobian, one.chi2, one.cost) for one in some), strict=True)
+        yield Block(table, *map(np.concatenate, columns))
 
 
 def _weighted_edges(problem: TrialProblem) -> Index:
