@@ -56,6 +56,8 @@ class EstimatedPath:
         self._origin_ns = int(stamps_ns[first])
         self._own_s = (stamps_ns[first:] - self._origin_ns) * 1e-9
         self._sample_s, self._samples = self._with_samples(track)
+        before, after = tuple(self._samples[:-1].T), tuple(self._samples[1:].T)
+        self._steps = np.stack(space.group.local(after, before), axis=-1)  # from each sample to the next
         stands = (np.diff(self._samples, axis=0) == 0.0).all(axis=1)
         is_open = (np.diff(self._sample_s) > _REST_S) & ~stands
         gaps = [(self._sample_s[k], self._sample_s[k + 1]) for k in np.flatnonzero(is_open).tolist()]
@@ -89,19 +91,14 @@ class EstimatedPath:
         since_s, group = (stamps_ns - self._origin_ns) * 1e-9 + after_s, self._space.group
         k, fraction = _interval(self._own_s, since_s)
         s, part = _interval(self._sample_s, since_s)
-        odom = group.compose(*self._step(self._samples, s, part))
+        step = group.exp(tuple(part * one for one in self._steps[s].T))
+        odom = group.compose(tuple(self._samples[s].T), step)
         start, end = (tuple(self._track.keyframes[self._first + at].T) for at in (k, k + 1))
         moved, whole = (self._corrected(group.between(start, one)) for one in (odom, end))
         a, b = tuple(self._poses[k].T), tuple(self._poses[k + 1].T)
         rest = tuple(fraction * one for one in group.local(b, group.compose(a, whole)))
         poses = group.compose(group.compose(a, moved), group.exp(rest))
         return Between(k + self._first, fraction, np.stack(poses, axis=-1))
-
-    def _step(self, poses: Array, k: Index, part: Array) -> tuple[Numbers, Numbers]:
-        """The poses before, and the motions from there as far as a part of that to the next."""
-        a, b = tuple(poses[k].T), tuple(poses[k + 1].T)
-        step: Numbers = self._space.group.exp(tuple(part * one for one in self._space.group.local(b, a)))
-        return a, step
 
     def _corrected(self, motion: Numbers) -> Numbers:
         n, factors = self._space.dimensions, (self._track.distance, self._track.turn)

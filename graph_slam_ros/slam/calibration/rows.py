@@ -22,7 +22,7 @@ from graph_slam_ros.slam.frontend.odometry_track import OdometryTrack
 from graph_slam_ros.slam.frontend.sighting_edges import SightingEdges
 from graph_slam_ros.solver import LossKey, Settings
 from graph_slam_ros.solver.linearization import Block, Losses, linearize, rows_of
-from graph_slam_ros.typing import Array, Index
+from graph_slam_ros.typing import Array, Index, Mask, Numbers
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,33 +139,43 @@ class _Eyes:
         self, x: Array, values: Values, model: MeasurementModel, path: EstimatedPath, parameters: tuple[Parameter, ...]
     ) -> None:
         """Move them to the path at the corrected stamps. It changes x."""
-        space, offset = self._p.space, self._p.graph.offset.values
-        size, group = np.arange(space.pose.size), space.group
-        own = tuple(x[offset[self._own][:, None] + size].T)
-        poses = np.stack(group.compose(own, model.scaled(tuple(self._edges.T_keyframe_base.T), values)), axis=-1)
+        edges, offset = self._edges, self._p.graph.offset.values
+        at = offset[self.ids][:, None] + np.arange(self._p.space.pose.size)
         self.first, self.second, self.fraction = self._own.copy(), self._own.copy(), np.zeros(len(self._own))
         self.steps[:] = 0.0
-        for k, parameter in enumerate(parameters):
-            if parameter.name in FACTORS:
-                self.steps[:, :, k] = self._scaled_steps(parameter, values, model)
-            elif parameter.name == "clock" and parameter.source == self._edges.source:
-                clock = clock_of(values, self._edges.source)
-                known = path.knows(self._edges.stamps_ns, abs(clock))
-                there = path.at(self._edges.stamps_ns, clock)
-                poses = np.where(known[:, None], there.poses, poses)
-                keyframes = self._p.keyframes
-                self.first = np.where(known, keyframes[there.first], self._own)
-                self.second = np.where(known, keyframes[np.minimum(there.first + 1, len(keyframes) - 1)], self._own)
-                self.fraction = np.where(known, there.fraction, 0.0)
-                velocity = path.velocity(self._edges.stamps_ns, clock)
-                self.steps[:, :, k] = np.where(known[:, None], velocity, 0.0)
-                self.steps[known, :, :k] = 0.0  # the path is as it is, whatever odometry says of it
-                # Where the path is not known, a sighting that is not brought to its time would contradict the others.
-                self._edges.table.weight.values[self._edges.rows] = np.where(known | (clock == 0.0), self._weight, 0.0)
-        x[offset[self.ids][:, None] + size] = poses
+        known = np.zeros(len(self._own), dtype=bool)
+        if (clock := Parameter(edges.source, "clock")) in parameters:
+            after_s = clock_of(values, edges.source)
+            known = path.knows(edges.stamps_ns, abs(after_s))
+            x[at[known]] = self._place_on_path(known, after_s, path, parameters.index(clock))
+            # Where the path is not known, a sighting that is not brought to its time would contradict the others.
+            edges.table.weight.values[edges.rows] = np.where(known | (after_s == 0.0), self._weight, 0.0)
+        if not known.all():
+            x[at[~known]] = self._place_by_odometry(~known, x, values, model, parameters)
 
-    def _scaled_steps(self, parameter: Parameter, values: Values, model: MeasurementModel) -> Array:
-        probe, moved = parameter.quantity.probe, tuple(self._edges.T_keyframe_base.T)
+    def _place_on_path(self, rows: Mask, after_s: float, path: EstimatedPath, clock: int) -> Array:
+        """The poses of some on the path. It is as it is, whatever odometry says of it."""
+        stamps_ns, keyframes = self._edges.stamps_ns[rows], self._p.keyframes
+        there = path.at(stamps_ns, after_s)
+        self.first[rows] = keyframes[there.first]
+        self.second[rows] = keyframes[np.minimum(there.first + 1, len(keyframes) - 1)]
+        self.fraction[rows] = there.fraction
+        self.steps[rows, :, clock] = path.velocity(stamps_ns, after_s)
+        return there.poses
+
+    def _place_by_odometry(
+        self, rows: Mask, x: Array, values: Values, model: MeasurementModel, parameters: tuple[Parameter, ...]
+    ) -> Array:
+        """The poses of some by odometry since their keyframes."""
+        group, moved = self._p.space.group, tuple(self._edges.T_keyframe_base[rows].T)
+        for k, one in enumerate(parameters):
+            if one.name in FACTORS:
+                self.steps[rows, :, k] = self._scaled_steps(one, moved, values, model)
+        own = tuple(self._p.poses(x, self._own[rows]).T)
+        return np.stack(group.compose(own, model.scaled(moved, values)), axis=-1)
+
+    def _scaled_steps(self, parameter: Parameter, moved: Numbers, values: Values, model: MeasurementModel) -> Array:
+        probe = parameter.quantity.probe
         sides = [
             model.scaled(moved, {**values, parameter: values.get(parameter, 0.0) + side}) for side in (probe, -probe)
         ]
