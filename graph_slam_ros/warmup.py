@@ -45,6 +45,8 @@ from graph_slam_ros.lie import se2, se3
 from graph_slam_ros.lie.jit import CACHE_DIR
 from graph_slam_ros.progress import report
 from graph_slam_ros.solver import METHODS, Settings, Solver, covariance
+from graph_slam_ros.solver import least_cost as innovations
+from graph_slam_ros.solver import stretch_filter as stretches
 from graph_slam_ros.solver.clique_tree import (
     advance,
     incremental,
@@ -284,6 +286,20 @@ def _number_kernels() -> list[_Kernel]:
         (covariance.marginals, (tree, index)),
         (covariance.joint, (tree, index)),
         (covariance.among, (tree, types.int64[:, ::1])),
+        *_evidence_kernels(),
+    ]
+
+
+def _evidence_kernels() -> list[_Kernel]:
+    """List kernels that tell what measurements say together: of an innovation, and of a stretch of odometry."""
+    _, index, number, real = _types()
+    indices, reals = types.int64[:, ::1], types.float64[:, ::1]
+    array, stack = types.float64[::1], types.float64[:, :, ::1]
+    of_stretch = (index, indices, index, array, index, reals, indices, reals, stack, reals, reals)
+    hypothesis = (number, array, number, number, real, real)
+    return [
+        (innovations.least_cost, (number, array, indices, reals, reals, reals, index, index, number)),
+        (stretches.filter_stretch, (*of_stretch, *hypothesis, array, reals, array, reals, stack, reals)),
     ]
 
 

@@ -1,13 +1,13 @@
 """Calls of an edge type's compiled linearisation by its address, from compiled code that does not know which it is."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
 from numba import types
 from numba.core import cgutils
-from numba.extending import intrinsic
+from numba.extending import intrinsic, overload
 
-from graph_slam_ros.lie.jit import jitable
 from graph_slam_ros.typing import Array, Index
 
 _ARRAYS = types.float64[::1], types.int64[:, ::1], types.float64[:, ::1]
@@ -23,10 +23,24 @@ def native_address(linearize: Callable[..., Any]) -> int:
     return 0
 
 
-@jitable
-def call_native(address: int, x: Array, at: Index, measured: Array) -> tuple[Array, Array]:
-    """Call the linearisation at an address; compiled code alone can."""
-    return _call(address, x, at, measured)  # type: ignore[call-arg]
+def call_native(linearize: Any, x: Array, at: Index, measured: Array) -> tuple[Array, Array]:
+    """Call a linearisation: compiled code by its address, plain Python the function itself."""
+    residual, jacobian = linearize(x, at, measured)
+    return np.array(residual, dtype=np.float64), np.array(jacobian, dtype=np.float64)
+
+
+@overload(call_native, jit_options={"error_model": "numpy"})
+def _compiled_call(linearize: Any, x: Any, at: Any, measured: Any) -> Callable[..., Any]:
+    def compiled(linearize: Any, x: Any, at: Any, measured: Any) -> Any:
+        return _call(linearize, x, at, measured)  # type: ignore[call-arg]
+
+    return compiled
+
+
+def native_or_plain(kernel: Callable[..., Any], linearize: Sequence[Callable[..., Any]]) -> tuple[Any, list[Any]]:
+    """Return a kernel and what it calls these linearisations by: addresses, or if one has none, all as plain Python."""
+    addresses = [native_address(one) for one in linearize]
+    return (kernel, addresses) if all(addresses) else (getattr(kernel, "py_func", kernel), list(linearize))
 
 
 @intrinsic

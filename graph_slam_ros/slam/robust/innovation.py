@@ -1,25 +1,20 @@
 """The innovation: the difference between a measurement and its prediction, normalised by both covariances."""
 
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 
 import numpy as np
-from scipy.optimize import leastsq
 
 from graph_slam_ros.graph import POINT_SEEN_FROM, SE2, SE3, Edge, Graph
+from graph_slam_ros.graph.native import native_or_plain
+from graph_slam_ros.graph.retraction import code_of
 from graph_slam_ros.solver import Solver
+from graph_slam_ros.solver.least_cost import least_cost
 from graph_slam_ros.solver.linearization import linearized
 from graph_slam_ros.typing import Array, Index
 
 _ANGLES = {SE2: 1, SE3: 3}  # of a pose, its last coordinates
 _MOST_STEPS = 60  # of a search: with extreme numbers it would creep for seconds; the least it has found is taken
-_DIFFERENCE = float(np.finfo(float).eps ** 0.5)  # of numerical derivatives
-_CONVERGED = 1e-6  # of costs and steps: where they change less, a search has ended
 _LINEAR_RAD2 = 0.1  # of a direction: beyond, a linear prediction is none
-
-
-class _Enough(Exception):
-    """Raised when a search has used all its evaluations."""
 
 
 def innovation(graph: Graph, solver: Solver, edge: int) -> float:
@@ -111,45 +106,21 @@ def _least_cost(graph: Graph, x: Array, edge: Edge, joint: Array) -> float:
     sigmas = axes * np.sqrt(np.maximum(variances, 0.0))
     ends = [graph.vertex(v) for v in edge.vertices]
     kinds = [end.kind for end in ends]
-    at = np.cumsum([0] + [kind.size for kind in kinds])
-    first = np.cumsum([0] + [kind.dof for kind in kinds])
-    rows = len(sigmas) + 1
-    before = [np.repeat(x[end.stored][None], rows, axis=0) for end in ends]
-    measured, root = np.repeat(edge.measured[None], rows, axis=0), edge.sqrt_information.T
-    ends_at = np.arange(rows)[:, None] * at[-1] + at[:-1]
-    found, evaluated = list[float](), 0
-
-    def counted(units: Array) -> Array:
-        nonlocal evaluated
-        if evaluated >= _MOST_STEPS * rows:
-            raise _Enough
-        evaluated += 1
-        out: Array = costs(units[None])[0]
-        found.append(float(out @ out))
-        return out
-
-    def derivative(units: Array) -> Array:
-        nonlocal evaluated
-        evaluated += len(units)
-        step = _DIFFERENCE * np.where(units < 0.0, -1.0, 1.0) * np.maximum(1.0, np.abs(units))
-        out = costs(np.vstack((units, units + np.diag(step))))
-        return np.asarray((out[1:] - out[0]).T / step)
-
-    def costs(units: Array) -> Array:
-        """The whitened step and the whitened residual, for rows of units at once."""
-        steps, count = units @ sigmas.T, len(units)
-        moved = [
-            kind.retract(value[:count], steps[:, k : k + kind.dof])
-            for kind, value, k in zip(kinds, before, first.tolist(), strict=False)
-        ]
-        residual, _ = edge.type.linearize(np.hstack(moved).ravel(), ends_at[:count], measured[:count])
-        return np.hstack((units, residual @ root))
-
-    # not least_squares, whose checks take half of the time
-    enough, most = dict.fromkeys(("ftol", "xtol", "gtol"), _CONVERGED), _MOST_STEPS * rows
-    with suppress(_Enough):
-        leastsq(counted, np.zeros(len(sigmas)), Dfun=derivative, full_output=True, maxfev=most, **enough)
-    return min(found)
+    at = np.cumsum([0] + [kind.size for kind in kinds[:-1]])
+    search, (linearize,) = native_or_plain(least_cost, [edge.type.linearize])
+    return float(
+        search(
+            linearize,
+            np.concatenate([x[end.stored] for end in ends]),
+            at[None],
+            edge.measured[None],
+            edge.sqrt_information,
+            sigmas,
+            np.array([code_of(kind) for kind in kinds]),
+            np.array([kind.dof for kind in kinds]),
+            _MOST_STEPS * (len(sigmas) + 1),
+        )
+    )
 
 
 def _spread(graph: Graph, x: Array, vertices: Sequence[int], joint: Array, predicted: Array) -> float:

@@ -6,21 +6,20 @@ changes nothing. So observations that the pipeline holds back are evidence, too,
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from math import log
+from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg.lapack import dpotrf, dtrtrs
 
 from graph_slam_ros.chi_square import quantile
-from graph_slam_ros.graph import Edge, EdgeType, Graph
+from graph_slam_ros.graph import Edge, Graph
 from graph_slam_ros.graph.geometry import Geometry
+from graph_slam_ros.graph.native import native_or_plain
+from graph_slam_ros.graph.retraction import code_of
+from graph_slam_ros.solver import stretch_filter
 from graph_slam_ros.typing import Array, Index, Numbers
 
 _ROUNDING = 1e-6  # of a cost
 _CAP = 0.9999  # an observation beyond this quantile does not fit
-_LINEAR_RAD = 0.1  # by which an observation turns the pose: beyond, it is linearised again
-_MOST_LINEARIZATIONS = 5
 
 Prior = Callable[[Sequence[int]], tuple[Array, Array]]
 
@@ -63,57 +62,33 @@ class Stretch:
     noise_factor: float
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class _State:
     """The newest pose, the shared error and all that was seen: stored values, and the joint covariance of errors.
 
-    ``x`` begins with the pose. The cost is minus twice the logarithm of the likelihood so far; ``spread`` is the part
-    of it that would be left if all were seen where it was expected. Observations that do not fit are counted.
+    ``x`` begins with the pose. The sums are the shared error, the cost, which is minus twice the logarithm of the
+    likelihood so far, its spread, and a count: the spread is the part of the cost that would be left if all were seen
+    where it was expected, and observations that do not fit are counted.
     """
 
     x: Array
-    shared: float
     covariance: Array
-    cost: float = 0.0
-    spread: float = 0.0
-    unfit: int = 0
+    sums: Array
 
+    @property
+    def cost(self) -> float:
+        """The cost so far."""
+        return float(self.sums[stretch_filter.COST])
 
-@dataclass(frozen=True, slots=True)
-class _Step:
-    """An edge of odometry: its measurement, the covariance of its noise with the factors, and what it does to errors.
+    @property
+    def spread(self) -> float:
+        """Its part that does not depend on what was seen."""
+        return float(self.sums[stretch_filter.SPREAD])
 
-    Attributes
-    ----------
-    moves : (dof, dof + 1) from errors of the pose before and the shared error to those of the pose after
-    """
-
-    measured: Numbers
-    covariance: Array
-    moves: Array
-
-
-@dataclass(frozen=True, slots=True)
-class _Seen:
-    """An observation from the newest pose, which is the same under each hypothesis.
-
-    Attributes
-    ----------
-    what : it is of
-    at : (1, k) where its vertices begin in ``_State.x``
-    columns : of its vertices in the covariance
-    noise : (m, m) covariance
-    log_root : logarithm of the determinant of the square root of the information
-    """
-
-    what: int | str
-    type: EdgeType
-    at: Index
-    measured: Array
-    columns: Index
-    noise: Array
-    log_root: float
-    cap: float
+    @property
+    def unfit(self) -> int:
+        """The number of observations that do not fit."""
+        return int(self.sums[stretch_filter.UNFIT])
 
 
 class OdometryFilter:
@@ -132,66 +107,73 @@ class OdometryFilter:
 
     def __init__(self, space: Geometry, graph: Graph, prior: Prior, stretch: Stretch) -> None:
         self._space, self._stretch = space, stretch
-        self._turns = slice(space.dimensions, space.dof)  # of errors of the newest pose
         links = [graph.edge(link) for link in stretch.links]
-        chain = {vertex for link in links for vertex in link.vertices}
-        first = links[0].vertices[0]
-        edges = [edge for seen in stretch.seen.values() for edge, _ in seen]
-        others = sorted({vertex for edge in edges for vertex in graph.edge(edge).vertices} - chain)
-        x, joint = prior([first, *others])
-        dof, kinds = space.dof, [graph.kind_of(vertex) for vertex in others]
-        begins = dof + 1 + np.concatenate(([0], np.cumsum([kind.dof for kind in kinds], dtype=np.int64)))
-        stored = space.pose.size + np.concatenate(([0], np.cumsum([kind.size for kind in kinds], dtype=np.int64)))
-        self._columns = {v: np.arange(begins[k], begins[k + 1]) for k, v in enumerate(others)}
-        self._stored = {v: np.arange(stored[k], stored[k + 1]) for k, v in enumerate(others)}
-        self._kinds = [
-            (
-                kind,
-                np.stack([self._stored[v] for v, one in zip(others, kinds, strict=True) if one is kind]),
-                np.stack([self._columns[v] for v, one in zip(others, kinds, strict=True) if one is kind]),
-            )
-            for kind in dict.fromkeys(kinds)
-        ]
-        covariance = np.zeros((begins[-1], begins[-1]))
-        kept = np.r_[0:dof, dof + 1 : begins[-1]]
-        covariance[np.ix_(kept, kept)] = joint
-        covariance[dof, dof] = 1.0 / stretch.noise_factor**2
-        self._start = _State(x, 0.0, covariance)
-        scale = np.outer(stretch.factors, stretch.factors)
-        noises = _noises(links)
-        self._steps = [
-            self._step(link, covariance * scale) for link, (covariance, _) in zip(links, noises, strict=True)
-        ]
         self._ends = [link.vertices[1] for link in links]
-        self._seen = self._observations(graph)
-        self._tight = list[_State]()  # before each edge and at the end, with odometry's own noise
+        chain, first = {vertex for link in links for vertex in link.vertices}, links[0].vertices[0]
+        every = [
+            (k, what, graph.edge(edge)) for k, v in enumerate(self._ends) for edge, what in stretch.seen.get(v, ())
+        ]
+        others = dict.fromkeys(  # in the order of their last observation, the last first
+            v for _, _, one in reversed(every) for v in one.vertices if v not in chain
+        )
+        self._start = self._prior(prior, first, list(others))
+        self._vertices = self._layout(graph, first, list(others))
+        # what is between two keyframes of the stretch is left out
+        self._observe([(k, what, one) for k, what, one in every if {*one.vertices} <= {self._ends[k], *others}], others)
+        noises = np.stack([covariance for covariance, _ in _noises(links)])
+        self._motions = np.stack([link.measured for link in links])
+        self._noises = noises * np.outer(stretch.factors, stretch.factors)
+        self._tight: _State | None = None  # before each edge and at the end, with odometry's own noise
 
-    def _step(self, link: Edge, covariance: Array) -> _Step:
-        measured = tuple(link.measured.tolist())
-        return _Step(measured, covariance, self._moves(measured, np.zeros(self._space.dof)))
+    def _prior(self, prior: Prior, first: int, others: Sequence[int]) -> _State:
+        """Return the state before the stretch, with a shared error that is not known yet."""
+        (x, joint), dof = prior([first, *others]), self._space.dof
+        covariance, kept = np.zeros((len(joint) + 1, len(joint) + 1)), np.delete(np.arange(len(joint) + 1), dof)
+        covariance[np.ix_(kept, kept)] = joint
+        covariance[dof, dof] = 1.0 / self._stretch.noise_factor**2
+        return _State(np.array(x, dtype=float), covariance, np.zeros(4))
 
-    def _moves(self, motion: Numbers, shared: Array) -> Array:
-        group = self._space.group
-        return np.column_stack((group.adjoint(group.inverse(motion)), shared))
+    def _layout(self, graph: Graph, first: int, others: Sequence[int]) -> Index:
+        """Return where the stored numbers of the pose and of what is seen begin, their kinds and dofs."""
+        kinds = [graph.kind_of(vertex) for vertex in (first, *others)]
+        stored = np.cumsum([0, *(kind.size for kind in kinds[:-1])])
+        return np.column_stack((stored, [code_of(kind) for kind in kinds], [kind.dof for kind in kinds]))
 
-    def _observations(self, graph: Graph) -> list[list[_Seen]]:
-        """Return what was seen from each keyframe, without what is between two keyframes of the stretch."""
-        dof, seen = self._space.dof, self._stretch.seen
-        every = [(k, what, graph.edge(edge)) for k, v in enumerate(self._ends) for edge, what in seen.get(v, ())]
-        every = [(k, what, one) for k, what, one in every if {*one.vertices} <= {self._ends[k], *self._columns}]
-        out: list[list[_Seen]] = [[] for _ in self._ends]
+    def _observe(self, every: Sequence[tuple[int, int | str, Edge]], others: Mapping[int, object]) -> None:
+        """Lay out what was seen for the kernel: from which keyframe, by its place, of what, and the edge."""
+        dof = self._space.dof
+        begins = np.cumsum([0, dof + 1, *self._vertices[1:, stretch_filter.DOF]])
+        place = {vertex: k for k, vertex in enumerate(others, start=1)}
+        names = self._names = {what: k for k, what in enumerate(dict.fromkeys(what for _, what, _ in every))}
+        integers, numbers, rows, limits = list[int](), list[float](), list[list[int]](), list[tuple[float, float]]()
         for (k, what, one), (noise, log_root) in zip(every, _noises([one for *_, one in every]), strict=True):
-            pose = self._ends[k]
-            at = np.array([[0 if v == pose else self._stored[v][0] for v in one.vertices]])
-            columns = np.concatenate([np.arange(dof) if v == pose else self._columns[v] for v in one.vertices])
-            cap = quantile(_CAP, len(noise))
-            out[k].append(_Seen(what, one.type, at, one.measured[None], columns, noise, log_root, cap))
-        return out
+            places = [0 if v == self._ends[k] else place[v] for v in one.vertices]
+            at = self._vertices[places, stretch_filter.STORED].tolist()
+            columns = [c for v in places for c in range(begins[v], begins[v] + self._vertices[v, stretch_filter.DOF])]
+            begin, seen = [len(integers), len(numbers)], one.measured.tolist()
+            integers += [*at, *columns]
+            numbers += [*seen, *noise.ravel().tolist()]
+            sizes = len(at), begin[1], len(seen), len(noise), begin[0] + len(at), len(columns), begin[1] + len(seen)
+            rows.append([begin[0], *sizes, names[what], max(places), 0])
+            limits.append((quantile(_CAP, len(noise)), log_root))
+        observations = np.array(rows, dtype=np.int64).reshape(-1, stretch_filter.FIELDS)
+        kept = np.maximum.accumulate(observations[::-1, stretch_filter.KEPT])[::-1] + 1
+        observations[:, stretch_filter.KEPT], observations[:, stretch_filter.KEPT_COLUMNS] = kept, begins[kept]
+        self._run, linearize = native_or_plain(stretch_filter.filter_stretch, [one.type.linearize for *_, one in every])
+        is_native = self._run is stretch_filter.filter_stretch
+        self._seen = (
+            np.array(linearize, dtype=np.int64) if is_native else linearize,
+            observations,
+            np.searchsorted([k for k, *_ in every], np.arange(self.size + 1)),
+            np.array(numbers, dtype=float),
+            np.array(integers, dtype=np.int64),
+            np.array(limits, dtype=float).reshape(-1, 2),
+        )
 
     @property
     def size(self) -> int:
         """The number of edges."""
-        return len(self._steps)
+        return len(self._ends)
 
     def seen_since(self, first: int) -> list[int | str]:
         """Landmarks, by vertex, and other classes that were seen after an edge, by its place."""
@@ -208,116 +190,79 @@ class OdometryFilter:
         without : what is left out
         above : a value up to this is of no interest; it may be returned as minus infinity
         """
-        state, begin = self._start, 0
-        if without is None and len(self._tight) > first:
-            state, begin = self._tight[first], first
+        if without is not None or self._tight is None:
+            begin = 0
+        else:
+            begin = first
             if self._least_cost(first) > -2.0 * above + _ROUNDING:
                 return -np.inf
-        return -0.5 * self._filtered(state, begin, errors, first, without, -2.0 * above).cost
+        is_tight = without is None and first == self.size
+        return -0.5 * self._filtered(begin, errors, without, -2.0 * above, is_kept=is_tight).cost
 
     def _least_cost(self, first: int) -> float:
         """A bound of the cost if odometry has more errors from an edge on, where all that was seen since then fits.
 
         At best all was seen where it was expected. The spread of what is expected is not smaller then.
         """
-        before, end = self._tight[first], self._tight[-1]
+        before, end = self._before(first), self._before(self.size)
         return before.cost + end.spread - before.spread if end.unfit == before.unfit else -np.inf
 
     def fitting(self, errors: Errors, first: int) -> float:
         """Return the part of what was seen after an edge that fits."""
-        begin = self._tight[first]
-        end = self._filtered(begin, first, errors, first)
+        end = self._filtered(first, errors)
         count = sum(len(self._stretch.seen.get(vertex, ())) for vertex in self._ends[first:])
-        return 1.0 - (end.unfit - begin.unfit) / max(1, count)
+        return 1.0 - (end.unfit - self._before(first).unfit) / max(1, count)
+
+    def _before(self, edge: int) -> _State:
+        """The state before an edge, or at the end, with odometry's own noise."""
+        if edge == 0 or self._tight is None:
+            return self._start
+        return _State(self._tight.x[edge], self._tight.covariance[edge], self._tight.sums[edge])
 
     def _filtered(
         self,
-        state: _State,
         begin: int,
         errors: Errors,
-        first: int,
         without: int | str | None = None,
         most: float = np.inf,
+        *,
+        is_kept: bool = False,
     ) -> _State:
-        """Filter what was seen from an edge on. The cost never falls, so one above ``most`` is not followed further."""
-        for k in range(begin, len(self._steps)):
-            if state.cost > most + _ROUNDING:
-                return replace(state, cost=np.inf)
-            if without is None and first == len(self._steps):
-                self._tight.append(state)
-            state = replace(state, x=state.x.copy(), covariance=state.covariance.copy())
-            self._move(state, k, errors)
-            for one in self._seen[k]:
-                if one.what != without:
-                    self._observe(state, one)
-        if without is None and first == len(self._steps):
-            self._tight.append(state)
-        return state
+        """Filter what was seen from an edge on. The cost never falls, so one above ``most`` is not followed further.
 
-    def _move(self, state: _State, k: int, errors: Errors) -> None:
-        """Move the pose along one edge of odometry."""
-        space, step, dof, scale = self._space, self._steps[k], self._space.dof, self._stretch.noise_factor**2
-        shared, motion, moves = errors.shared[k], step.measured, step.moves
-        if shared.any():
-            motion = space.group.retract(motion, tuple((shared * state.shared).tolist()))
-            moves = self._moves(motion, shared)
-        pose = space.group.compose(tuple(state.x[: space.pose.size].tolist()), motion)
-        variances = errors.variances[k]
-        if errors.jump == k and errors.jump_variances is not None:
-            pose, variances = errors.there, variances + errors.jump_variances
-        covariance = state.covariance
-        covariance[:dof] = moves @ covariance[: dof + 1]
-        covariance[:, :dof] = covariance[:, : dof + 1] @ moves.T
-        covariance[:dof, :dof] += step.covariance
-        covariance.ravel()[: dof * (len(covariance) + 1) : len(covariance) + 1] += variances / scale  # the diagonal
-        state.x[: space.pose.size] = pose
-
-    def _observe(self, state: _State, one: _Seen) -> None:
-        """Add an observation. The state follows it if it fits.
-
-        Where it turns the pose far, it is linearised again at the state to which it leads (an iterated filter).
+        Parameters
+        ----------
+        is_kept : whether the states on the way are those of odometry's own noise
         """
-        x, step, tangent, turns = state.x, np.zeros(len(state.covariance)), None, self._turns
-        for _ in range(_MOST_LINEARIZATIONS):
-            residuals, jacobians = one.type.linearize(x, one.at, one.measured)
-            residual, jacobian = residuals[0], jacobians[0]
-            if tangent is not None:
-                pose, jacobian = one.columns < len(tangent), jacobian.copy()
-                jacobian[:, pose] = jacobian[:, pose] @ tangent
-                residual = residual - jacobian @ step[one.columns]
-            gain = jacobian @ state.covariance[one.columns]
-            factor, failed = dpotrf(gain[:, one.columns] @ jacobian.T + one.noise, lower=True)
-            if failed:
-                raise np.linalg.LinAlgError("the covariance of an innovation is not positive definite")
-            white = dtrtrs(factor, residual, lower=True)[0]
-            gain, before = dtrtrs(factor, gain, lower=True)[0], step
-            step = -white @ gain
-            if np.abs(step[turns] - before[turns]).max() <= _LINEAR_RAD:
-                break
-            x = self._stepped(state.x, step)
-            tangent = self._space.group.right_jacobian(tuple(step[: self._space.dof].tolist()))
-        statistic = float(white @ white) / self._stretch.noise_factor**2
-        if statistic > one.cap:
-            state.cost += one.cap
-            state.unfit += 1
-            return
-        state.x, state.shared = self._stepped(state.x, step), state.shared + float(step[self._space.dof])
-        state.covariance -= gain.T @ gain
-        if tangent is not None:  # of the pose that it leads to
-            dof, covariance = len(tangent), state.covariance
-            covariance[:dof] = tangent @ covariance[:dof]
-            covariance[:, :dof] = covariance[:, :dof] @ tangent.T
-        spread = 2.0 * (log(factor.diagonal().prod()) + one.log_root)
-        state.cost += statistic + spread
-        state.spread += spread
-
-    def _stepped(self, x: Array, step: Array) -> Array:
-        """The values after a step (D,) of errors."""
-        out, pose = x.copy(), self._space.pose
-        out[: pose.size] = pose.retract(x[None, : pose.size], step[None, : self._space.dof])[0]
-        for kind, stored, columns in self._kinds:
-            out[stored] = kind.retract(x[stored], step[columns])
-        return out
+        start = self._before(begin)
+        state, count = _State(start.x.copy(), start.covariance.copy(), start.sums.copy()), self.size + 1
+        every = (state.x, state.covariance, state.sums)
+        kept = _State(*(np.empty((count if is_kept else 0, *one.shape)) for one in every))
+        jump, there = -1 if errors.jump is None else errors.jump, np.array(errors.there, dtype=float)
+        variances = errors.variances
+        if errors.jump is not None and errors.jump_variances is not None:
+            variances = variances.copy()
+            variances[jump] += errors.jump_variances
+        hypothesis = variances, errors.shared, jump, there, begin, self._names.get(without, -1), most  # type: ignore[arg-type]
+        failed = self._run(
+            *self._seen,
+            self._vertices,
+            self._motions,
+            self._noises,
+            *hypothesis,
+            self._stretch.noise_factor**2,
+            *every,
+            kept.x,
+            kept.covariance,
+            kept.sums,
+        )
+        if failed == stretch_filter.FAILED:
+            raise np.linalg.LinAlgError("the covariance of an innovation is not positive definite")
+        if failed == stretch_filter.TOO_MUCH:
+            state.sums[stretch_filter.COST] = np.inf
+        elif is_kept:
+            self._tight = kept
+        return state
 
 
 def _noises(edges: Sequence[Edge]) -> list[tuple[Array, float]]:
