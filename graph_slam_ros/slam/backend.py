@@ -1,6 +1,6 @@
 """The back-end: the graph, its solver, and what is believed of its edges, in step with one another."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.plugin_edges import failed_edges
 from graph_slam_ros.slam.calibration.rows import TrialProblem
 from graph_slam_ros.slam.frontend.keyframes import Keyframe, KeyframeList
-from graph_slam_ros.slam.frontend.noise_factors import Key, NoiseScales
+from graph_slam_ros.slam.frontend.noise_factors import CLASSES, Key, NoiseScales
 from graph_slam_ros.slam.frontend.sighting_edges import SightingEdges
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.slam.lifelong.state import BoundedState
@@ -225,12 +225,12 @@ class Backend:
             self.cancel_search()
         return report if everything else None
 
-    def noise_scale(self, keyframes: StampedPoses[Keyframe]) -> list[NoiseScale]:
-        """Estimate the scale of the noise without changing anything."""
+    def noise_scale(self, keyframes: StampedPoses[Keyframe], labels: Container[str] = CLASSES) -> list[NoiseScale]:
+        """Estimate the scale of the noise of some classes without changing anything."""
         stamps = np.zeros(self.graph.vertex_count, dtype=np.int64)
         stamps[keyframes.ids] = keyframes.stamps_ns
         edges = range(self.first_free_edge, self.handed_over[1])
-        return estimate_noise(self.graph, self.solver, self.noise.factors, stamps, edges)
+        return estimate_noise(self.graph, self.solver, self.noise.factors, stamps, edges, labels)
 
     def use_noise(self, factors: Mapping[Key, float]) -> None:
         """Scale the configured noise of edges by other factors than now; groups without one have none."""

@@ -34,7 +34,7 @@ class MeasuredNoise:
         self._measured_at, n = len(keyframes), self._space.dimensions
         parts = {"position": slice(n), "rotation": slice(n, None)}
         of_odometry, others = np.ones(self._space.dof), list[float]()
-        for one in self._backend.noise_scale(keyframes):
+        for one in self._backend.noise_scale(keyframes, ("odometry", "landmarks")):
             if one.label == "odometry" and one.dof > 0.0:
                 variance = (one.per_dof * one.dof + _PRIOR_DOF) / (one.dof + _PRIOR_DOF)
                 factor = float(np.sqrt(np.clip(variance, 1.0, _LARGEST**2)))

@@ -15,7 +15,7 @@ sums. Sums of positions are not used: what the ranges of a pass have in common i
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -25,7 +25,16 @@ from graph_slam_ros.graph import Graph
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
 from graph_slam_ros.graph.losses import weight_and_cost
 from graph_slam_ros.graph.tables import EdgeTable
-from graph_slam_ros.slam.frontend.noise_factors import PER_M, PER_RAD, Key, groups, grows, motion_parts, parts_of
+from graph_slam_ros.slam.frontend.noise_factors import (
+    CLASSES,
+    PER_M,
+    PER_RAD,
+    Key,
+    groups,
+    grows,
+    motion_parts,
+    parts_of,
+)
 from graph_slam_ros.slam.motion_noise import Growth, Motions, fit_growth, growth_of
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.solver.linearization import Losses
@@ -142,7 +151,12 @@ class _Sums:
 
 
 def estimate_noise(
-    graph: Graph, solver: Solver, factors: Mapping[Key, float], stamp_of: Index, edges: range
+    graph: Graph,
+    solver: Solver,
+    factors: Mapping[Key, float],
+    stamp_of: Index,
+    edges: range,
+    labels: Container[str] = CLASSES,
 ) -> list[NoiseScale]:
     """Estimate the noise of each group of residuals at the solver's estimate.
 
@@ -151,6 +165,7 @@ def estimate_noise(
     factors : of the configured sigmas, that the graph's edges have now
     stamp_of : (vertices,) nanoseconds of each pose, 0 elsewhere
     edges : that are looked at, by their ids; the solver has them
+    labels : the classes that are looked at
 
     Raises
     ------
@@ -163,7 +178,7 @@ def estimate_noise(
     values, losses = solver.values, Losses(graph, solver.settings.stages()[-1])
     for table, every, label, source in groups(graph, edges):
         rows = every[table.weight.values[every] > 0.0]
-        if len(rows):
+        if len(rows) and label in labels:
             block = _Block(table, rows, label, solver, values, losses)
             passes = _passes(block.ends, stamp_of) if label == "landmarks" else []
             does_grow = grows(table.type, label)
