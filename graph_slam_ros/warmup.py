@@ -40,6 +40,7 @@ from graph_slam_ros.graph import (
     Gaussian,
     Graph,
     Loss,
+    retraction,
 )
 from graph_slam_ros.lie import se2, se3
 from graph_slam_ros.lie.jit import CACHE_DIR
@@ -59,7 +60,7 @@ from graph_slam_ros.solver.clique_tree import (
 )
 from graph_slam_ros.solver.clique_tree.storage import empty_tree
 
-_KERNELS = 175  # about so many there are; a test compares it with the cache
+_KERNELS = 205  # about so many there are; a test compares it with the cache
 _SHARED = "shared"  # file that is there when the kernels that two parts call are in the cache
 
 
@@ -286,6 +287,7 @@ def _number_kernels() -> list[_Kernel]:
         (covariance.marginals, (tree, index)),
         (covariance.joint, (tree, index)),
         (covariance.among, (tree, types.int64[:, ::1])),
+        (covariance.joint_of_each, (tree, types.int64[:, ::1])),
         *_evidence_kernels(),
     ]
 
@@ -298,6 +300,7 @@ def _evidence_kernels() -> list[_Kernel]:
     of_stretch = (index, indices, index, array, index, reals, indices, reals, stack, reals, reals)
     hypothesis = (number, array, number, number, real, real)
     return [
+        (retraction.adjoints_of_inverses, (number, reals)),
         (innovations.least_cost, (number, array, indices, reals, reals, reals, index, index, number)),
         (stretches.filter_stretch, (*of_stretch, *hypothesis, array, reals, array, reals, stack, reals)),
     ]

@@ -68,3 +68,16 @@ def adjoint_of_inverse(code: int, motion: Array) -> Array:
             for k in range(3):
                 out[i, 3 + j] += shift[i, k] * turn[k, j]
     return out
+
+
+@kernel
+def adjoints_of_inverses(code: int, motions: Array) -> Array:
+    """Return those (n, dof, dof) of motions (n, size)."""
+    dof = 3 if code == PLANAR else 6
+    out = np.empty((len(motions), dof, dof))
+    for k in range(len(motions)):
+        one = adjoint_of_inverse(code, motions[k])
+        for i in range(dof):
+            for j in range(dof):
+                out[k, i, j] = one[i, j]
+    return out

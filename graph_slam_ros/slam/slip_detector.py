@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache, partial
+from statistics import median
 
 import numpy as np
 
@@ -191,11 +192,8 @@ class SlipDetector:
         self._new.clear()
 
     def _usual(self) -> float:
-        """Return how large squared residuals are in this drive, as a multiple of those that the stated noise makes.
-
-        It is 1 at least. A residual is that of the predicted pose, whose noise is no part of the stated noise.
-        """
-        return max(1.0, float(np.median(self._ratios))) if len(self._ratios) >= _FEWEST else 1.0
+        """Return how large squared residuals at predicted poses are, in units of the stated noise's; at least 1."""
+        return max(1.0, median(self._ratios)) if len(self._ratios) >= _FEWEST else 1.0
 
     def _is_known(self, what: int | str, vertex: int) -> bool:
         return isinstance(what, str) or self._history.known_from(what, self._views[0].edges[0]) < vertex

@@ -211,6 +211,37 @@ def joint(t: Tree, vertices: Index) -> Array:
     return _in_order_asked_for(vertex, vertices, ordered)
 
 
+@kernel
+def joint_of_each(t: Tree, ends: Index) -> Array:
+    """Return the joint covariance (n, D, D) of the vertices (n, k) in each row, of the same kinds; zero for held ones.
+
+    No edge need be between them.
+    """
+    vertex = t.vertex
+    n, count = ends.shape
+    width = 0
+    for s in range(count):
+        width += vertex[ends[0, s], DOF]
+    out, free, place = np.zeros((n, width, width)), np.empty(count, np.int64), np.empty(width, np.int64)
+    for k in range(n):
+        many = size = at = 0
+        for v in ends[k]:
+            if vertex[v, FREE]:
+                free[many] = v
+                many += 1
+                for i in range(vertex[v, DOF]):
+                    place[size] = at + i
+                    size += 1
+            at += vertex[v, DOF]
+        if many == 0:
+            continue
+        of_free = joint(t, free[:many])
+        for i in range(size):
+            for j in range(size):
+                out[k, place[i], place[j]] = of_free[i, j]
+    return out
+
+
 @inner
 def _by_key(vertex: Index, vertices: Index) -> Index:
     """Return the indices that sort vertices by their order of elimination."""

@@ -15,7 +15,7 @@ from graph_slam_ros.solver.clique_tree.advance import DISSECT, DONE, advance, mo
 from graph_slam_ros.solver.clique_tree.ordering import dissect
 from graph_slam_ros.solver.clique_tree.storage import AFFECTED, CLIQUE, DOF, MOTION_MM, NOTHING, SUBSTITUTED, Limits
 from graph_slam_ros.solver.clique_tree.substitution import forget, read, show
-from graph_slam_ros.solver.covariance import among, joint, marginals
+from graph_slam_ros.solver.covariance import among, joint, joint_of_each, marginals
 from graph_slam_ros.solver.cross_covariance import CrossCovariances
 from graph_slam_ros.solver.gauge import undetermined
 from graph_slam_ros.solver.left_out import without_edges
@@ -204,11 +204,15 @@ class Solver(Problem):
         self._estimates()
         return without_edges(self.graph, self._tree, self.joint_marginal, wanted, left_out)
 
-    def edge_marginals(self, ends: Index) -> Array:
-        """Covariances (n, D, D) as ``joint_marginal`` has them, of the vertices (n, k) of edges of one type."""
+    def edge_marginals(self, ends: Index, *, are_inside: bool = True) -> Array:
+        """Covariances (n, D, D) as ``joint_marginal`` has them, of the vertices (n, k) of edges of one type.
+
+        It takes longer if the edges are not in the problem.
+        """
         self._with_covariance(ends)
         with self._tree_remade_after_error():
-            return among(self._tree, np.ascontiguousarray(ends)) if len(ends) else np.zeros((0, 0, 0))
+            of_each = among if are_inside else joint_of_each
+            return of_each(self._tree, np.ascontiguousarray(ends)) if len(ends) else np.zeros((0, 0, 0))
 
     def cross_covariances(self) -> CrossCovariances:
         """Covariances of all vertices with one of them, as ``joint_marginal`` has them."""

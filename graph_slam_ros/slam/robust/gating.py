@@ -14,7 +14,7 @@ from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.config.robust import RobustConfig
 from graph_slam_ros.graph import Graph, Loss
 from graph_slam_ros.graph.losses import weight_and_cost
-from graph_slam_ros.slam.robust.innovation import innovation, likely_together
+from graph_slam_ros.slam.robust.innovation import innovations, likely_together
 from graph_slam_ros.slam.robust.landmark_support import LandmarkSupport, landmark_of
 from graph_slam_ros.slam.robust.ledger import FINAL, Ledger, Reason, Verdict
 from graph_slam_ros.slam.robust.tightness import TIGHTEST, TYPICAL, Tightness, chi2_per_dof
@@ -23,6 +23,7 @@ from graph_slam_ros.typing import Array, Index
 
 CANDIDATES = ("landmarks", "fixes", "closures", "initialpose", "custom")
 _READMISSIONS = 50  # edges that are out and are tried again after everything was solved
+_AT_ONCE = 10  # of them, until the first that is likely
 _AGREEING = 3  # edges that are out, at least, come in together between full solves: two agree by chance
 _REVIEWED_AT_ONCE = 1000  # accepted edges that one review looks at, besides as many of the newest
 
@@ -85,7 +86,7 @@ class OutlierGate:
         """Compare held-back edges with the estimate, the likeliest first; returns those that are accepted."""
         out, admitted = list(pending), list[int]()
         while out:
-            innovation = {edge: self._innovation(edge) for edge in out}
+            innovation = dict(zip(out, self.innovations(out), strict=True))
             likely = [edge for edge in out if self._is_likely(edge, innovation[edge])]
             if not likely:
                 break
@@ -133,8 +134,8 @@ class OutlierGate:
         others = outside[~fits & (self.ledger.verdict.values[outside] == Verdict.PENDING)].tolist()
         turn = [others[(self._next_out + k) % len(others)] for k in range(min(self._config.retests, len(others)))]
         self._next_out += len(turn)
-        likely = [(edge, fit) for edge in turn if self._is_likely(edge, fit := self._innovation(edge))]
-        for edge, fit in likely:
+        judged = list(zip(turn, self.innovations(turn), strict=True))
+        for edge, fit in [(edge, fit) for edge, fit in judged if self._is_likely(edge, fit)]:
             self._readmit(edge, keyframe, fit, self._innovation_gate(edge))
 
     def reclassify(self, keyframe: int) -> bool:
@@ -162,11 +163,14 @@ class OutlierGate:
         ----------
         costs : gets the innovations that were computed, by edge
         """
-        for edge in self._nearest():
-            costs[edge] = self._innovation(edge)
-            if costs[edge] <= self.ledger.threshold.values[edge] and self._is_likely(edge, costs[edge]):
-                self._readmit(edge, keyframe, costs[edge])
-                return True
+        nearest = self._nearest()
+        for begin in range(0, len(nearest), _AT_ONCE):
+            some = nearest[begin : begin + _AT_ONCE]
+            costs |= zip(some, self.innovations(some), strict=True)
+            for edge in some:
+                if costs[edge] <= self.ledger.threshold.values[edge] and self._is_likely(edge, costs[edge]):
+                    self._readmit(edge, keyframe, costs[edge])
+                    return True
         return False
 
     def readmit_group(self, keyframe: int, costs: Mapping[int, float]) -> list[int]:
@@ -189,7 +193,8 @@ class OutlierGate:
 
         Their costs follow from their joint covariance, so nothing is solved for edges that stay out.
         """
-        costs = {edge: self._innovation(edge) for edge in self._nearest(self._config.retests)}
+        nearest = self._nearest(self._config.retests)
+        costs = dict(zip(nearest, self.innovations(nearest), strict=True))
         group = likely_together(self._graph, self._solver, self._affordable(costs), self.most_cost, _AGREEING)
         for edge in group:
             self._readmit(edge, keyframe, costs[edge])
@@ -254,12 +259,13 @@ class OutlierGate:
     def are_beyond_noise(self, edges: Sequence[int]) -> bool:
         """Return whether most of some rejected edges are farther off than odometry's noise as stated explains."""
         factor, numbers = self.stated_scale, self.ledger.numbers.values
-        far = [self._innovation(edge) > factor * quantile(self._config.gate, int(numbers[edge])) for edge in edges]
+        limits = [factor * quantile(self._config.gate, int(numbers[edge])) for edge in edges]
+        far = [cost > limit for cost, limit in zip(self.innovations(edges), limits, strict=True)]
         return 2 * sum(far) > len(far)
 
     def innovations(self, edges: Sequence[int]) -> list[float]:
-        """Return the cost of accepting each of some rejected edges, given all accepted ones."""
-        return [self._innovation(edge) for edge in edges]
+        """Return the cost of accepting each of some rejected edges; infinite if it cannot be computed."""
+        return innovations(self._graph, self._solver, edges)
 
     def supersede(self, link: int, keyframe: int, evidence: float) -> None:
         """Reject an odometry edge that another one with more noise replaces."""
@@ -322,13 +328,6 @@ class OutlierGate:
             elif weight < 1.0 and ledger.verdict.values[edge] == Verdict.ACCEPTED:
                 ledger.note(edge, keyframe, Verdict.DOWN_WEIGHTED, Reason.NONE, fit)
 
-    def _innovation(self, edge: int) -> float:
-        """Return the cost of accepting an edge; infinite if it cannot be computed."""
-        try:
-            return innovation(self._graph, self._solver, edge)
-        except (np.linalg.LinAlgError, ValueError):
-            return np.inf
-
     def _is_likely(self, edge: int, innovation: float) -> bool:
         return innovation <= self._innovation_gate(edge)
 
@@ -361,7 +360,7 @@ class OutlierGate:
 
     def _limits(self, edges: Index, numbers: Index) -> Array:
         """Return the thresholds of chi2: the gate, or less if residuals of a class are far below their noise."""
-        limit = {int(n): quantile(self._config.gate, int(n)) for n in np.unique(numbers)}
+        limit = {n: quantile(self._config.gate, n) for n in set(numbers.tolist())}
         out = np.array([limit[n] for n in numbers.tolist()], dtype=float)
         for label, tightness in self._tightness.of_class.items():
             out[self._graph.has_label(edges, (label,))] *= tightness

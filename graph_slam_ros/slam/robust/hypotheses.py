@@ -29,6 +29,7 @@ _SAME = 1e-4  # of a cost, that one explanation may differ by from itself: solve
 MIRRORED = "mirrored"  # a start
 _LIKELIER = 9.0  # of the cost: by so much a mirror image must be likelier, and by so much less the other is ruled out
 _OTHER = 0.1  # m: another image differs by more, somewhere
+_NEAR = 1e-3  # m or rad: what two solves of one optimum differ by at most
 _STORY = 5  # closures that agree with one another and not with the map
 
 
@@ -110,6 +111,21 @@ class Outcome:
         return out
 
 
+@dataclass(frozen=True, slots=True)
+class _Way:
+    """Where a start has come after its first solve: accepted edges, stored numbers of all vertices, truncated cost."""
+
+    inside: Index
+    values: Array
+    cost: float
+
+    def joins(self, other: "_Way") -> bool:
+        """Return whether another start has come to the same place, up to what solves end off the optimum."""
+        if not (np.array_equal(self.inside, other.inside) and abs(self.cost - other.cost) <= _SAME * other.cost):
+            return False
+        return bool(np.abs(self.values - other.values).max() <= _NEAR)
+
+
 @dataclass(slots=True)
 class CancelToken:
     """A token that cancels a search whose outcome is not needed any more."""
@@ -119,15 +135,16 @@ class CancelToken:
 
 def search_alternatives(config: RobustConfig, frozen: FrozenGraph, wanted: CancelToken | None = None) -> Outcome | None:
     """Explain a graph anew from each start; the lowest cost wins. None if nothing can be solved, or if cancelled."""
-    found: list[Outcome] = []
+    found, ways = list[Outcome](), list[_Way]()
     for name, start, inliers in _starts(frozen):
         if wanted is not None and not wanted.still:
             return None
         if inliers is not None and any(one.start == "online" and not len(one.ledger.outside) for one in found):
             break
         with suppress(GraphSlamError, np.linalg.LinAlgError):  # what is believed there does not hold together
-            hopeless = _HOPELESS * min((outcome.cost for outcome in found), default=np.inf)
-            found.append(_explained(name, config, frozen, start, inliers, hopeless, found))
+            hopeless = _HOPELESS * min((one.cost for one in found), default=np.inf)
+            outcome = _explained(name, config, frozen, start, inliers, hopeless, found, ways)
+            found += [] if outcome is None else [outcome]
     found = [outcome for outcome in found if np.isfinite(outcome.cost)]
     if not found:
         return None
@@ -184,8 +201,11 @@ def _explained(
     inliers: Index | None,
     hopeless: float,
     found: Sequence[Outcome],
-) -> Outcome:
+    ways: list[_Way],
+) -> Outcome | None:
     """Solve and judge in turn, starting with the verdicts of the ledger, or with these candidates.
+
+    None if it comes to where another start has come: what follows is the same.
 
     It ends when no verdict changes, when the verdicts are again those of an earlier round (a candidate that was
     accepted on trial does not fit after all), when the cost is too high, or where one that was found before has ended.
@@ -201,6 +221,10 @@ def _explained(
         decisions.force_inliers(inliers, frozen.keyframe)
         solver.optimize(replace(frozen.settings, losses=decisions.cautious_losses(), max_iterations=_ITERATIONS))
         decisions.reclassify(frozen.keyframe)
+        here = _Way(mine.inside, solver.values, _cost(solver, mine))
+        if any(here.joins(one) for one in ways):
+            return None
+        ways.append(here)
     rounds = config.rounds if _cost(solver, mine) <= 2.0 * hopeless else 0
     solved = dict[bytes, Array]()  # values by verdicts
     for k in range(rounds):

@@ -7,39 +7,73 @@ import numpy as np
 from graph_slam_ros.graph import POINT_SEEN_FROM, SE2, SE3, Edge, Graph
 from graph_slam_ros.graph.native import native_or_plain
 from graph_slam_ros.graph.retraction import code_of
+from graph_slam_ros.graph.tables import EdgeTable
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.solver.least_cost import least_cost
-from graph_slam_ros.solver.linearization import linearized
+from graph_slam_ros.solver.linearization import linearized, rows_of
 from graph_slam_ros.typing import Array, Index
 
 _ANGLES = {SE2: 1, SE3: 3}  # of a pose, its last coordinates
 _MOST_STEPS = 60  # of a search: with extreme numbers it would creep for seconds; the least it has found is taken
+_REGULAR = 1e10  # times its own noise: an innovation's variance that leaves a solve enough digits
 _LINEAR_RAD2 = 0.1  # of a direction: beyond, a linear prediction is none
 
 
-def innovation(graph: Graph, solver: Solver, edge: int) -> float:
-    """The least that believing an edge would cost: its own residual and what must give way for it, squared, in sigmas.
+def innovations(graph: Graph, solver: Solver, edges: Sequence[int]) -> list[float]:
+    """The least that believing each edge would cost: its residual and what must give way for it, squared, in sigmas.
 
     With Sigma the joint covariance of its vertices, the least over a step d of ``d' Sigma^-1 d`` and the edge's chi2 at
     the estimate moved by d: ``r' (Omega^-1 + J Sigma J')^-1 r`` where the residual is linear. Where so little is known
-    of a direction that it is not, the least is searched for. The edge must not be part of the problem at present.
+    of a direction that it is not, the least is searched for. Infinite where it cannot be computed. The edges must not
+    be part of the problem at present.
 
     Raises
     ------
     GaugeError, SingularError
         As for ``Solver.marginal``.
     """
-    one = graph.edge(edge)
-    joint, root = solver.joint_marginal(one.vertices), one.sqrt_information
+    out = dict[int, float]()
+    for table, rows in rows_of(graph, np.array(edges, dtype=np.int64)).items():
+        kinds = graph.kind.values[table.vertices.values[rows]]
+        for some in [rows] if (kinds == kinds[0]).all() else np.split(rows, len(rows)):
+            out |= _innovations(graph, solver, table, some)
+    return [out[edge] for edge in edges]
+
+
+def _innovations(graph: Graph, solver: Solver, table: EdgeTable, rows: Index) -> dict[int, float]:
+    """The same of rows of a table whose vertices are of the same kinds, by edge."""
+    ids = table.id.values[rows].tolist()
+    try:
+        return dict(zip(ids, _least_costs(graph, solver, table, rows), strict=True))
+    except (np.linalg.LinAlgError, ValueError):  # of one of them
+        if len(rows) == 1:
+            return {ids[0]: np.inf}
+    out = dict[int, float]()
+    for row in np.split(rows, len(rows)):
+        out |= _innovations(graph, solver, table, row)
+    return out
+
+
+def _least_costs(graph: Graph, solver: Solver, table: EdgeTable, rows: Index) -> list[float]:
+    """The least costs of rows of a table."""
+    ends, root = table.vertices.values[rows], table.sqrt_information.values[rows]
+    joint = solver.edge_marginals(ends, are_inside=False)
     x = solver.values  # after the covariance, which integrates pending changes
-    residual, jacobian = linearized(graph, x, one.type, one.vertices, one.measured)
-    predicted = jacobian @ joint @ jacobian.T
-    white = root @ residual
-    if _spread(graph, x, one.vertices, joint, predicted) <= _LINEAR_RAD2:
-        spread = root @ predicted @ root.T + np.eye(len(white))
-        least = float(white @ np.linalg.lstsq(spread, white, rcond=None)[0])
-        return least if np.isfinite(least) else np.inf
-    return _least_cost(graph, x, one, joint)
+    residual, jacobian = table.type.linearize(x, graph.offset.values[ends], table.measured.values[rows])
+    predicted = jacobian @ joint @ jacobian.swapaxes(1, 2)
+    white = (root @ residual[:, :, None])[:, :, 0]
+    spread = root @ predicted @ root.swapaxes(1, 2) + np.eye(white.shape[1])
+    is_linear = _spread(graph, x, ends, joint, predicted) <= _LINEAR_RAD2
+    # lstsq where solve may lose all digits
+    is_regular = is_linear & (np.trace(spread, axis1=1, axis2=2) < _REGULAR)
+    out = np.full(len(rows), np.inf)
+    of = white[is_regular]
+    out[is_regular] = np.sum(of * np.linalg.solve(spread[is_regular], of[:, :, None])[:, :, 0], axis=1)
+    for k in np.flatnonzero(is_linear & ~is_regular).tolist():
+        out[k] = white[k] @ np.linalg.lstsq(spread[k], white[k], rcond=None)[0]
+    for k in np.flatnonzero(~is_linear).tolist():
+        out[k] = _least_cost(graph, x, graph.edge(int(table.id.values[rows[k]])), joint[k])
+    return np.where(np.isfinite(out), out, np.inf).tolist()
 
 
 def joint_innovations(graph: Graph, solver: Solver, edges: Sequence[int]) -> tuple[Array, Array, Index]:
@@ -47,7 +81,7 @@ def joint_innovations(graph: Graph, solver: Solver, edges: Sequence[int]) -> tup
 
     Returns whitened residuals (n,), their covariance (n, n) with the edges' own noise, and the edge of each.
     With the rows of a subset, ``r' S^-1 r`` is its cost where residuals are linear. None of them may be part of the
-    problem at present. Raises as ``innovation``.
+    problem at present. Raises as ``innovations``.
     """
     ones = [graph.edge(edge) for edge in edges]
     vertices = list(dict.fromkeys(vertex for one in ones for vertex in one.vertices))
@@ -123,17 +157,18 @@ def _least_cost(graph: Graph, x: Array, edge: Edge, joint: Array) -> float:
     )
 
 
-def _spread(graph: Graph, x: Array, vertices: Sequence[int], joint: Array, predicted: Array) -> float:
-    """Variance [rad^2] of the directions in which the vertices of an edge see one another."""
-    kinds = [graph.kind_of(v) for v in vertices]
+def _spread(graph: Graph, x: Array, ends: Index, joint: Array, predicted: Array) -> Array:
+    """Variance (n,) [rad^2] of the directions in which the vertices (n, k) of edges see one another."""
+    kinds, none = [graph.kind_of(v) for v in ends[0].tolist()], np.zeros(len(ends))
     pose = kinds[0]
     if pose not in _ANGLES:
-        return 0.0
+        return none
     sighting = POINT_SEEN_FROM[pose]
     if len(kinds) > 1 and kinds[1] in sighting.accepts[1]:
-        dof = pose.dof + kinds[1].dof
-        at, jacobian = linearized(graph, x, sighting, vertices[:2], np.zeros(kinds[1].dof))
-        across = jacobian @ joint[:dof, :dof] @ jacobian.T
-        return float(np.trace(across) / max(float(at @ at), 1e-12))
-    of_poses = len(predicted) == pose.dof
-    return float(np.diag(predicted)[-_ANGLES[pose] :].max()) if of_poses else 0.0
+        dof, size = pose.dof + kinds[1].dof, kinds[1].dof
+        at, jacobian = sighting.linearize(x, graph.offset.values[ends[:, :2]], np.zeros((len(ends), size)))
+        across = jacobian @ joint[:, :dof, :dof] @ jacobian.swapaxes(1, 2)
+        return np.asarray(np.trace(across, axis1=1, axis2=2) / np.maximum(np.sum(at * at, axis=1), 1e-12))
+    of_poses = predicted.shape[1] == pose.dof
+    angles = np.diagonal(predicted, axis1=1, axis2=2)[:, -_ANGLES[pose] :]
+    return np.asarray(angles.max(axis=1)) if of_poses else none

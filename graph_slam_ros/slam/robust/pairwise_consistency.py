@@ -14,6 +14,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from graph_slam_ros.graph import GROUPS, RELATIVE_POSE, RELATIVE_POSE_3D, SE2, SE3, Graph
+from graph_slam_ros.graph.retraction import adjoints_of_inverses, code_of
 from graph_slam_ros.graph.tables import EdgeTable
 from graph_slam_ros.typing import Array, Index
 
@@ -55,8 +56,8 @@ def consistent_groups(graph: Graph, values: Array, closures: Index, limits: Arra
     noise = np.linalg.inv(table.at(rows).sqrt_information)
     noise = noise @ noise.transpose(0, 2, 1)
     steps = np.abs(walked[order[ends[a]]] - walked[order[ends[b]]])
-    covariance = noise[b] + _propagated(group, after, noise[a])
-    covariance += _propagated(group, onwards, _walked(group, before, steps[:, 0]))
+    covariance = noise[b] + _propagated(after, noise[a])
+    covariance += _propagated(onwards, _walked(group, before, steps[:, 0]))
     covariance += _walked(group, after, steps[:, 1])
     distance = np.einsum("ki,ki->k", error, np.linalg.solve(covariance, error[:, :, None])[:, :, 0])
     agree = distance <= np.minimum(limits[a], limits[b])
@@ -94,12 +95,12 @@ def _along_odometry(graph: Graph, table: EdgeTable) -> tuple[Index, Array]:
 def _walked(group: Any, motion: Array, noise: Array) -> Array:
     """Covariance of the steps of a motion, as if all errors were made half way, with the average effect of turns."""
     half = _columns(group.exp, 0.5 * _columns(group.log, motion))
-    return _propagated(group, half, noise)
+    return _propagated(half, noise)
 
 
-def _propagated(group: Any, motion: Array, covariance: Array) -> Array:
+def _propagated(motion: Array, covariance: Array) -> Array:
     """The covariance, in right tangent coordinates, after a further motion."""
-    adjoint = np.array([group.adjoint(tuple(one)) for one in _columns(group.inverse, motion).tolist()])
+    adjoint = adjoints_of_inverses(code_of(SE2 if motion.shape[1] == SE2.size else SE3), motion)
     return adjoint @ covariance @ adjoint.transpose(0, 2, 1)
 
 

@@ -12,8 +12,9 @@ import numpy as np
 from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import Graph
+from graph_slam_ros.graph.tables import EdgeTable
 from graph_slam_ros.solver import Solver
-from graph_slam_ros.solver.linearization import linearized
+from graph_slam_ros.solver.linearization import rows_of
 from graph_slam_ros.typing import Array, Index
 
 TYPICAL = 30  # residuals tell what all are like
@@ -37,30 +38,30 @@ class Tightness:
             return
         ratio = _SLACK * float(np.median(chi2 / np.array([_median(n) for n in numbers.tolist()])))
         if ratio < 1.0:
-            redundancy = self._redundancy_of(label, edges, numbers)
+            redundancy = self._redundancy_of(label, edges)
             ratio = ratio / redundancy if redundancy >= _REDUNDANT else 1.0
         self.of_class[label] = min(1.0, max(TIGHTEST, ratio))
 
-    def _redundancy_of(self, label: str, edges: Index, numbers: Index) -> float:
+    def _redundancy_of(self, label: str, edges: Index) -> float:
         """Return the median redundancy of a class, by some of its edges, from 0 to 1; of old ones while it grows."""
         count, known = self._redundancy.get(label, (0, 0.0))
         if len(edges) >= _GROWN * count:
             some = np.linspace(0, len(edges) - 1, TYPICAL).astype(int)
             try:
-                found = [self._left_of(int(edges[k])) / int(numbers[k]) for k in some.tolist()]
+                found = [self._left_of(*of_table) for of_table in rows_of(self._graph, edges[some]).items()]
             except (GraphSlamError, np.linalg.LinAlgError):
                 return known
-            known = float(np.median(found))
+            known = float(np.median(np.concatenate(found)))
             self._redundancy[label] = len(edges), known
         return known
 
-    def _left_of(self, edge: int) -> float:
-        """Return the expected chi2 of an accepted edge's residual, at most how many numbers it measures."""
-        one = self._graph.edge(edge)
-        joint = self._solver.joint_marginal(one.vertices)
-        _, jacobian = linearized(self._graph, self._solver.values, one.type, one.vertices, one.measured)
-        white = one.sqrt_information @ jacobian
-        return len(white) - float(np.einsum("ij,jk,ik->", white, joint, white))
+    def _left_of(self, table: EdgeTable, rows: Index) -> Array:
+        """Return the expected chi2 (n,) of the residuals of accepted edges, for each number that they measure."""
+        ends, roots = table.vertices.values[rows], table.sqrt_information.values[rows]
+        joint = self._solver.edge_marginals(ends)
+        at, measured = self._graph.offset.values[ends], table.measured.values[rows]
+        white = roots @ table.type.linearize(self._solver.values, at, measured)[1]
+        return 1.0 - np.einsum("nij,njk,nik->n", white, joint, white) / white.shape[1]
 
 
 @cache

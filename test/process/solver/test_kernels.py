@@ -130,7 +130,7 @@ import sys
 import numpy as np
 from graph_slam_ros.formats.g2o import read_g2o
 from graph_slam_ros.graph import BEARING, LANDMARK_POSITION, R2, RELATIVE_POSE, SE2, Gaussian
-from graph_slam_ros.slam.robust.innovation import innovation
+from graph_slam_ros.slam.robust.innovation import innovations
 from graph_slam_ros.solver import Settings, Solver
 from graph_slam_ros.warmup import warmup
 
@@ -163,7 +163,8 @@ for path in sys.argv[1:]:
     vague, sharp = Gaussian.from_sigmas(30.0, 30.0), Gaussian.from_sigmas(0.1)
     seen = file.graph.add_edge(LANDMARK_POSITION, [0, far[0]], [3.0, 4.0], vague, "seen")
     solver.add(far, [seen])
-    assert 0.0 <= innovation(file.graph, solver, file.graph.add_edge(BEARING, [1, far[0]], [0.5], sharp, "seen"))
+    seen = file.graph.add_edge(BEARING, [1, far[0]], [0.5], sharp, "seen")
+    assert 0.0 <= innovations(file.graph, solver, [seen])[0]
 print([name for name, count in signatures().items() if count != before.get(name, 0)])
 """
 
