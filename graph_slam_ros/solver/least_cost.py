@@ -66,14 +66,9 @@ def least_cost(
             least = min(least, new)
             actual = 1.0 - new / cost if new < 100.0 * cost else -1.0
             damped = damping * length * length / cost
-            expected, sloping = bent + 2.0 * damped, -(bent + damped)
+            expected = bent + 2.0 * damped
             ratio = actual / expected if expected > 0.0 else 0.0
-            if ratio <= 0.25:
-                part = 0.5 if actual >= 0.0 else 0.5 * sloping / (sloping + 0.5 * actual)
-                part = 0.1 if new >= 100.0 * cost or part < 0.1 else part
-                radius, damping = part * min(radius, 10.0 * length), damping / part
-            elif damping == 0.0 or ratio >= 0.75:
-                radius, damping = 2.0 * length, 0.5 * damping
+            radius, damping = _trusted(ratio, actual, -(bent + damped), radius, damping, length)
             if abs(actual) <= _CONVERGED and expected <= _CONVERGED and ratio <= 2.0:
                 return least
             if ratio >= 1e-4:
@@ -163,6 +158,26 @@ def _set_normal(units: Array, white: Array, slope: Array, normal: Array, gradien
             normal[i, j] = 1.0 if i == j else 0.0
             for a in range(m):
                 normal[i, j] += slope[a, i] * slope[a, j]
+
+
+@kernel
+def _trusted(
+    ratio: float, actual: float, sloping: float, radius: float, damping: float, length: float
+) -> tuple[float, float]:
+    """Return the next radius and damping, by the part of the expected change of the cost that a step has made.
+
+    Parameters
+    ----------
+    actual : change of the cost, as a part of it, -1 where it rose a hundredfold; sloping : what its slope says
+    length : of the step
+    """
+    if ratio <= 0.25:
+        part = 0.5 if actual >= 0.0 else 0.5 * sloping / (sloping + 0.5 * actual)
+        part = 0.1 if part < 0.1 or actual == -1.0 else part
+        return part * min(radius, 10.0 * length), damping / part
+    if damping == 0.0 or ratio >= 0.75:
+        return 2.0 * length, 0.5 * damping
+    return radius, damping
 
 
 @kernel

@@ -204,7 +204,7 @@ def _observe(
     for i in range(len(x)):
         x[i] = point[i]
     sums[SHARED] += step[dof]
-    _take(covariance, gain)
+    _subtract(covariance, gain)
     if times > 1 or turned > _LINEAR_RAD:
         _turn_pose(covariance, size, tangent)  # of the pose that it leads to
     spread = 2.0 * (_log_diagonal(root) + limits[1])
@@ -304,7 +304,7 @@ def _stepped(x: Array, step: Array, vertices: Index, kept: int) -> Array:
 
 
 @kernel
-def _take(covariance: Array, gain: Array) -> None:
+def _subtract(covariance: Array, gain: Array) -> None:
     """Subtract what an observation tells from the covariance."""
     m, size = gain.shape
     for i in range(size):

@@ -233,7 +233,7 @@ BULK = {  # the stored numbers of many vertices, or the noise of many edges, at 
     *("slam/backend.py", "slam/robust/pairwise_consistency.py", "slam/robust/landmark_support.py"),
     *("runs/map_growth.py", "runs/ledger_file.py", "analysis/what_if.py", "simulation/pose_graph.py"),
     *("fleet/held_out.py", "check/trial.py", "slam/condensed_edges.py", "slam/lifelong/surroundings.py"),
-    "slam/robust/mirrored.py",
+    *("slam/robust/mirrored.py", "slam/robust/innovation.py", "slam/robust/tightness.py"),
 }
 
 

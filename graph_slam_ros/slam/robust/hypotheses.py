@@ -113,7 +113,7 @@ class Outcome:
 
 @dataclass(frozen=True, slots=True)
 class _Way:
-    """Where a start has come after its first solve: accepted edges, stored numbers of all vertices, truncated cost."""
+    """The result of the first solve of a start: accepted edges, stored numbers of all vertices, truncated cost."""
 
     inside: Index
     values: Array

@@ -34,7 +34,7 @@ def innovations(graph: Graph, solver: Solver, edges: Sequence[int]) -> list[floa
     """
     out = dict[int, float]()
     for table, rows in rows_of(graph, np.array(edges, dtype=np.int64)).items():
-        kinds = graph.kind.values[table.vertices.values[rows]]
+        kinds = graph.kind.values[table.at(rows).vertices]
         for some in [rows] if (kinds == kinds[0]).all() else np.split(rows, len(rows)):
             out |= _innovations(graph, solver, table, some)
     return [out[edge] for edge in edges]
@@ -42,7 +42,7 @@ def innovations(graph: Graph, solver: Solver, edges: Sequence[int]) -> list[floa
 
 def _innovations(graph: Graph, solver: Solver, table: EdgeTable, rows: Index) -> dict[int, float]:
     """The same of rows of a table whose vertices are of the same kinds, by edge."""
-    ids = table.id.values[rows].tolist()
+    ids = table.at(rows).ids.tolist()
     try:
         return dict(zip(ids, _least_costs(graph, solver, table, rows), strict=True))
     except (np.linalg.LinAlgError, ValueError):  # of one of them
@@ -56,10 +56,11 @@ def _innovations(graph: Graph, solver: Solver, table: EdgeTable, rows: Index) ->
 
 def _least_costs(graph: Graph, solver: Solver, table: EdgeTable, rows: Index) -> list[float]:
     """The least costs of rows of a table."""
-    ends, root = table.vertices.values[rows], table.sqrt_information.values[rows]
+    some = table.at(rows)
+    ends, root = some.vertices, some.sqrt_information
     joint = solver.edge_marginals(ends, are_inside=False)
     x = solver.values  # after the covariance, which integrates pending changes
-    residual, jacobian = table.type.linearize(x, graph.offset.values[ends], table.measured.values[rows])
+    residual, jacobian = table.type.linearize(x, graph.offset.values[ends], some.measured)
     predicted = jacobian @ joint @ jacobian.swapaxes(1, 2)
     white = (root @ residual[:, :, None])[:, :, 0]
     spread = root @ predicted @ root.swapaxes(1, 2) + np.eye(white.shape[1])
@@ -72,7 +73,7 @@ def _least_costs(graph: Graph, solver: Solver, table: EdgeTable, rows: Index) ->
     for k in np.flatnonzero(is_linear & ~is_regular).tolist():
         out[k] = white[k] @ np.linalg.lstsq(spread[k], white[k], rcond=None)[0]
     for k in np.flatnonzero(~is_linear).tolist():
-        out[k] = _least_cost(graph, x, graph.edge(int(table.id.values[rows[k]])), joint[k])
+        out[k] = _least_cost(graph, x, graph.edge(int(some.ids[k])), joint[k])
     return np.where(np.isfinite(out), out, np.inf).tolist()
 
 

@@ -57,10 +57,11 @@ class Tightness:
 
     def _left_of(self, table: EdgeTable, rows: Index) -> Array:
         """Return the expected chi2 (n,) of the residuals of accepted edges, for each number that they measure."""
-        ends, roots = table.vertices.values[rows], table.sqrt_information.values[rows]
+        some = table.at(rows)
+        ends = some.vertices
         joint = self._solver.edge_marginals(ends)
-        at, measured = self._graph.offset.values[ends], table.measured.values[rows]
-        white = roots @ table.type.linearize(self._solver.values, at, measured)[1]
+        _, jacobian = table.type.linearize(self._solver.values, self._graph.offset.values[ends], some.measured)
+        white = some.sqrt_information @ jacobian
         return 1.0 - np.einsum("nij,njk,nik->n", white, joint, white) / white.shape[1]
 
 
