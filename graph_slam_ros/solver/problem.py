@@ -6,9 +6,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.graph import SE2, SE3, Graph
+from graph_slam_ros.graph import Graph
 from graph_slam_ros.graph.graph import whole_numbers
 from graph_slam_ros.graph.records import weights_of
+from graph_slam_ros.graph.retraction import code_of
 from graph_slam_ros.graph.tables import EdgeTable
 from graph_slam_ros.solver.batch import Settings
 from graph_slam_ros.solver.clique_tree import incremental
@@ -20,13 +21,10 @@ from graph_slam_ros.solver.clique_tree.storage import (
     ACTIVE,
     DEFERRED_COUNT,
     FREE,
-    SE2_KIND,
-    SE3_KIND,
     STALE_COUNT,
     SUBSTITUTED,
     TAIL_END,
     TAIL_FIRST,
-    VECTOR,
     empty_tree,
     longer,
     with_room,
@@ -47,8 +45,6 @@ from graph_slam_ros.solver.linearization import chi2_of, evaluated, rows_of
 from graph_slam_ros.solver.pending import NONE, PendingChanges
 from graph_slam_ros.solver.transaction import Transaction
 from graph_slam_ros.typing import Array, Index
-
-_KINDS = {SE2: SE2_KIND, SE3: SE3_KIND}
 
 
 class Problem:
@@ -279,7 +275,7 @@ class Problem:
             self._edge_inside = longer(self._edge_inside, edges)
             self._kept = longer(self._kept, len(self._tree.estimate))
             if len(self._shapes) != len(self.graph.kinds):
-                self._shapes = np.array([(k.dof, k.size, _KINDS.get(k, VECTOR)) for k in self.graph.kinds])
+                self._shapes = np.array([(k.dof, k.size, code_of(k)) for k in self.graph.kinds])
         finally:  # some may have grown in place
             self._locate()
         self._room = self._room_now()

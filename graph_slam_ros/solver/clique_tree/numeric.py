@@ -5,7 +5,7 @@ Kernels take the arrays out of the tree once: each access through the tuple woul
 
 import numpy as np
 
-from graph_slam_ros.lie import se2, se3
+from graph_slam_ros.graph.retraction import SPATIAL, retract_at
 from graph_slam_ros.lie.jit import inner, kernel
 from graph_slam_ros.solver.clique_tree.dense import pack, partial_cholesky
 from graph_slam_ros.solver.clique_tree.rounding import JUST_MADE, UNKNOWN, is_rounding, suspect_row
@@ -29,8 +29,6 @@ from graph_slam_ros.solver.clique_tree.storage import (
     MEMBERS,
     NOTHING,
     OWNER,
-    SE2_KIND,
-    SE3_KIND,
     SIBLING,
     SIZE,
     STEP,
@@ -182,23 +180,12 @@ def retract(vertex: Index, value: Array, step: Array, estimate: Array, v: int) -
     """The estimate of a vertex: its linearisation point [+] its step."""
     kind, x, d, dof = vertex[v, KIND], vertex[v, VALUE], vertex[v, STEP], vertex[v, DOF]
     moved = False
+    for i in range(7 if kind == SPATIAL else dof):
+        estimate[x + i] = value[x + i]
     for i in range(d, d + dof):
         moved = moved or step[i] != 0.0
-    if not moved:
-        for i in range(7 if kind == SE3_KIND else dof):
-            estimate[x + i] = value[x + i]
-    elif kind == SE2_KIND:
-        pose = se2.retract((value[x], value[x + 1], value[x + 2]), (step[d], step[d + 1], step[d + 2]))
-        for i in range(3):
-            estimate[x + i] = pose[i]
-    elif kind == SE3_KIND:
-        p = (value[x], value[x + 1], value[x + 2], value[x + 3], value[x + 4], value[x + 5], value[x + 6])
-        q = se3.retract(p, (step[d], step[d + 1], step[d + 2], step[d + 3], step[d + 4], step[d + 5]))
-        for i in range(7):
-            estimate[x + i] = q[i]
-    else:
-        for i in range(vertex[v, DOF]):
-            estimate[x + i] = value[x + i] + step[d + i]
+    if moved:
+        retract_at(estimate, x, kind, dof, step, d)
 
 
 @inner
@@ -261,7 +248,7 @@ def accept_steps(t: Tree, vertices: Index) -> None:
         x, d, dof = vertex[v, VALUE], vertex[v, STEP], vertex[v, DOF]
         for i in range(dof):
             step[d + i] = reference[d + i] = 0.0
-        for i in range(7 if vertex[v, KIND] == SE3_KIND else dof):
+        for i in range(7 if vertex[v, KIND] == SPATIAL else dof):
             value[x + i] = estimate[x + i]
 
 

@@ -108,8 +108,6 @@ R_PARENT, R_DEPTH, R_LEFT, R_RIGHT, R_COUNT, R_MADE, R_FIRST, REGION_COLUMNS = r
     STATE_COLUMNS,
 ) = range(31)
 
-VECTOR, SE2_KIND, SE3_KIND = range(3)
-
 Limits = tuple[float, float, float]
 """Limits of a step: of any component [m, rad], of the turn of a pose [rad], and of the square of the largest component.
 

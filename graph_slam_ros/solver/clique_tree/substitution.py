@@ -8,6 +8,7 @@ A clique waits if a step of its separator changed after its own solution.
 
 import numpy as np
 
+from graph_slam_ros.graph.retraction import PLANAR, SPATIAL
 from graph_slam_ros.lie.jit import inner, kernel
 from graph_slam_ros.solver.clique_tree.dense import solve_upper
 from graph_slam_ros.solver.clique_tree.indices import in_order, lengthened
@@ -35,8 +36,6 @@ from graph_slam_ros.solver.clique_tree.storage import (
     NOTED,
     NOTHING,
     PARENT,
-    SE2_KIND,
-    SE3_KIND,
     SEEN,
     SHIFTED,
     SHIFTED_COUNT,
@@ -127,8 +126,8 @@ def is_large(t: Tree, v: int, changed: bool, above: Limits) -> bool:
     """
     vertex, step, diagonal, unit = t.vertex, t.step, t.diagonal, 1e-3 * t.state[MOTION_MM]
     first, kind = vertex[v, STEP], vertex[v, KIND]
-    turns = first + (2 if kind == SE2_KIND else 3 if kind == SE3_KIND else vertex[v, DOF])
-    is_pose = kind in (SE2_KIND, SE3_KIND)
+    turns = first + (2 if kind == PLANAR else 3 if kind == SPATIAL else vertex[v, DOF])
+    is_pose = kind in (PLANAR, SPATIAL)
     largest = turned = information = 0.0
     for i in range(first, first + vertex[v, DOF]):
         scale, since = unit if is_pose and i < turns else 1.0, t.reference[i] if changed else 0.0
@@ -273,7 +272,7 @@ def show(t: Tree, kept: Array, vertices: Index) -> None:
     for v in vertices:
         retract(vertex, value, step, estimate, v)
         x = vertex[v, VALUE]
-        for i in range(7 if vertex[v, KIND] == SE3_KIND else vertex[v, DOF]):
+        for i in range(7 if vertex[v, KIND] == SPATIAL else vertex[v, DOF]):
             kept[x + i] = estimate[x + i]
 
 
