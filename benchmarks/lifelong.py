@@ -39,6 +39,7 @@ from graph_slam_ros.runs.whole_path import removed_path
 from graph_slam_ros.slam import Control, GraphSlam, Measurement, Sightings
 from graph_slam_ros.slam.lifelong.removed import Left
 from graph_slam_ros.typing import Array, Numbers
+from graph_slam_ros.warmup import warmup
 
 Figures = dict[str, float]
 _WRONG_M = 1.0  # farther than that from its place a landmark without id is wrong
@@ -270,7 +271,8 @@ def drive(
     seed: int, keyframes: int, window: int, dimensions: int = 2, world: str = "points", blocks: int = 0
 ) -> Figures:
     """Return the figures of one drive: in a hall with a kind of landmarks, or in a city of so many blocks."""
-    Drive(Course(seed, 60), 0).run()  # what is loaded or compiled at first use is not counted
+    warmup(dimensions=dimensions)  # as the node does
+    Drive(Course(seed, 60), 0).run()  # what is loaded at first use is not counted
     space = PLANAR if dimensions == 2 else SPATIAL
     if blocks:
         one: Drive = CityDrive(City(seed, keyframes, space, blocks), window)
