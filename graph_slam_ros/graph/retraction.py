@@ -3,7 +3,7 @@
 import numpy as np
 
 from graph_slam_ros.graph.vertices import SE2, SE3, VertexKind
-from graph_slam_ros.lie import se2, se3, so3
+from graph_slam_ros.lie import se2, se3
 from graph_slam_ros.lie.jit import kernel
 from graph_slam_ros.typing import Array
 
@@ -12,7 +12,7 @@ _POSES = {SE2: PLANAR, SE3: SPATIAL}
 
 
 def code_of(kind: VertexKind) -> int:
-    """Return how compiled code moves a vertex of a kind: a pose in the plane or in space, or the sum of two vectors."""
+    """Return how a vertex of a kind is moved: PLANAR and SPATIAL are poses, and to a VECTOR the step is added."""
     return _POSES.get(kind, VECTOR)
 
 
@@ -57,17 +57,9 @@ def append_motion(x: Array, code: int, motion: Array) -> None:
 def adjoint_of_inverse(code: int, motion: Array) -> Array:
     """Return the adjoint (dof, dof) of the inverse of a motion: ``Exp(d) T = T Exp(Ad d)``."""
     if code == PLANAR:
-        back = se2.inverse((motion[0], motion[1], motion[2]))
-        c, s = np.cos(back[2]), np.sin(back[2])
-        return np.array([[c, -s, back[1]], [s, c, -back[0]], [0.0, 0.0, 1.0]])
-    inverse = se3.inverse((motion[0], motion[1], motion[2], motion[3], motion[4], motion[5], motion[6]))
-    turn, shift, out = so3.matrix(se3.rotation(inverse)), so3.hat(se3.position(inverse)), np.zeros((6, 6))
-    for i in range(3):
-        for j in range(3):
-            out[i, j] = out[3 + i, 3 + j] = turn[i, j]
-            for k in range(3):
-                out[i, 3 + j] += shift[i, k] * turn[k, j]
-    return out
+        return se2.adjoint(se2.inverse((motion[0], motion[1], motion[2])))
+    m = (motion[0], motion[1], motion[2], motion[3], motion[4], motion[5], motion[6])
+    return se3.adjoint(se3.inverse(m))
 
 
 @kernel

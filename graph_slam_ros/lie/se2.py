@@ -134,6 +134,7 @@ def interpolate(a: Pose, b: Pose, fraction: float) -> Pose:
     return retract(a, (fraction * x, fraction * y, fraction * omega))
 
 
+@jitable
 def adjoint(a: Pose) -> NDArray[np.float64]:
     """Adjoint matrix (3, 3) of one pose, eq. (159): ``a Exp(d) = Exp(Ad d) a``."""
     c, s = np.cos(a[2]), np.sin(a[2])

@@ -195,6 +195,7 @@ def interpolate(a: Pose, b: Pose, fraction: Any) -> Pose:
     )
 
 
+@jitable
 def adjoint(a: Pose) -> Array:
     """Adjoint matrix (6, 6) of one pose, eq. (175): ``a Exp(d) = Exp(Ad d) a``."""
     turn = so3.matrix(rotation(a))
