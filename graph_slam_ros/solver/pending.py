@@ -16,18 +16,20 @@ class PendingChanges:
     new, back : edges that were added; that came back, or have another weight or a newly held vertex
     touched : vertices that lost an edge or a neighbour
     may_float : whether something that held parts together may be gone
+    moved : whether all linearisation points were moved, so that nothing is linearised there yet
     broken : whether the tree must be made anew
     """
 
-    __slots__ = ("back", "broken", "may_float", "new", "touched", "vertices")
+    __slots__ = ("back", "broken", "may_float", "moved", "new", "touched", "vertices")
 
     def __init__(self) -> None:
         self.vertices = self.new = self.touched = NONE
         self.back: list[Index] = []
-        self.may_float = self.broken = False
+        self.may_float = self.moved = self.broken = False
 
     def __bool__(self) -> bool:
-        return bool(len(self.vertices) or len(self.new) or self.back or len(self.touched) or self.broken)
+        is_changed = len(self.vertices) or len(self.new) or self.back or len(self.touched)
+        return bool(is_changed or self.moved or self.broken)
 
     def add(self, vertices: Index, edges: Index) -> None:
         """Append new vertices and edges."""

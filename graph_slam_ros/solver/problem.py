@@ -19,6 +19,7 @@ from graph_slam_ros.solver.clique_tree.pointers import pointers_of
 from graph_slam_ros.solver.clique_tree.pools import compact
 from graph_slam_ros.solver.clique_tree.storage import (
     ACTIVE,
+    CLIQUES,
     DEFERRED_COUNT,
     FREE,
     STALE_COUNT,
@@ -81,7 +82,7 @@ class Problem:
         if values.shape != (size,) or not np.isfinite(values).all():
             raise GraphSlamError(f"start: expected {size} finite numbers, got an array {values.shape}")
         self._set_estimate(values)
-        self._pending.broken = True
+        self._pending.moved |= bool(self._tree.state[CLIQUES])
 
     def place(self, vertex: int, value: ArrayLike) -> None:
         """Start a vertex that is not in the problem yet from another value than the graph's initial one."""

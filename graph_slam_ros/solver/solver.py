@@ -281,7 +281,7 @@ class Solver(Problem):
         there), and how many edges were linearised.
         """
         pending = self._pending
-        if not self._numbers_current and not pending.broken:
+        if not (self._numbers_current or pending.broken or pending.moved):
             self._renumber_after_batch()
         settings, young = self.settings, self._stages.young
         again = self._relinearized_first(edges)
@@ -292,6 +292,9 @@ class Solver(Problem):
         if pending.broken:
             self._forget_numbers()
             fresh, again = self._active(), NONE
+        elif pending.moved:
+            self._forget_numbers()
+            again = np.setdiff1d(self._active(), fresh)
         both = np.union1d(fresh, again) if len(again) else fresh
         self._linearize(both)
         if pending.broken:

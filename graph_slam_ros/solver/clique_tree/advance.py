@@ -5,9 +5,9 @@ import numpy as np
 from graph_slam_ros.lie.jit import kernel
 from graph_slam_ros.solver.clique_tree.incremental import relinearize, solve, with_those_of
 from graph_slam_ros.solver.clique_tree.indices import joined
-from graph_slam_ros.solver.clique_tree.ordering import dissect, move_tail
+from graph_slam_ros.solver.clique_tree.ordering import ROOT, dissect, move_tail
 from graph_slam_ros.solver.clique_tree.pointers import kept_of, tree_of
-from graph_slam_ros.solver.clique_tree.pools import compact, release, room_for
+from graph_slam_ros.solver.clique_tree.pools import compact, has_outgrown, release, room_for
 from graph_slam_ros.solver.clique_tree.storage import (
     AFFECTED,
     CLIQUES,
@@ -83,9 +83,12 @@ def restructure(tree: Tree, edges: Index, touched: Index, new: Index, tolerance:
         if overgrown != NOTHING:
             touched = np.concatenate((touched, dissect(tree, overgrown)))
         done, _ = _regroup(tree, touched, new, tolerance, sigmas)
-        if done:
+        if not done:
+            tree = more_room(tree)
+        elif has_outgrown(tree):
+            touched, new = dissect(tree, ROOT), new[:0]
+        else:
             return tree
-        tree = more_room(tree)
 
 
 @kernel

@@ -14,6 +14,7 @@ import numpy as np
 
 from graph_slam_ros.lie.jit import inner, kernel
 from graph_slam_ros.solver.clique_tree.indices import in_order, joined
+from graph_slam_ros.solver.clique_tree.pools import GROWTH, has_outgrown
 from graph_slam_ros.solver.clique_tree.separator import separate
 from graph_slam_ros.solver.clique_tree.storage import (
     ACTIVE,
@@ -30,7 +31,6 @@ from graph_slam_ros.solver.clique_tree.storage import (
     LINK_END,
     LINK_NEXT,
     LINKED,
-    LIVE,
     LIVE_MADE,
     LOCAL,
     NEXT,
@@ -57,8 +57,7 @@ from graph_slam_ros.solver.clique_tree.storage import (
 from graph_slam_ros.typing import Index
 
 LEAF = 6  # vertices a region need not be dissected for
-GROWTH = 2.0  # a subtree is dissected anew when it has grown by this factor,
-FEWEST = 64  # and by so many vertices: to dissect a small one costs more than its order is worth
+FEWEST = 64  # vertices by which a subtree must have grown as well: to dissect a small one costs more than it is worth
 DEEPEST = 200
 ROOT: Any = np.int64(0)  # region; not a literal, for which kernels would be compiled once more
 TAIL_MOST = 128  # vertices that are kept in the tail at most
@@ -120,7 +119,7 @@ def move_tail(t: Tree, edges: Index, touched: Index) -> tuple[Index, int]:
             ):
                 overgrown = r
             r = region[r, R_PARENT]
-    if state[LIVE] > GROWTH * state[LIVE_MADE] > 0:
+    if has_outgrown(t):
         overgrown = ROOT
     return joined(touched, neighbourhood(t, moving)), overgrown
 

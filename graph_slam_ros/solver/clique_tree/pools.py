@@ -5,7 +5,7 @@ The place of a clique that leaves is reused by the next one of its class. It is 
 
 import numpy as np
 
-from graph_slam_ros.lie.jit import inner, kernel
+from graph_slam_ros.lie.jit import inner, jitable, kernel
 from graph_slam_ros.solver.clique_tree.indices import ascending
 from graph_slam_ros.solver.clique_tree.storage import (
     CAPACITIES,
@@ -17,6 +17,7 @@ from graph_slam_ros.solver.clique_tree.storage import (
     FRONTALS,
     FRONTS_TOP,
     LIVE,
+    LIVE_MADE,
     MARK,
     MEMBERS,
     MEMBERS_TOP,
@@ -27,6 +28,8 @@ from graph_slam_ros.solver.clique_tree.storage import (
     packed_size,
 )
 from graph_slam_ros.typing import Index
+
+GROWTH = 2.0  # the factor by which a part of the tree grows until it is dissected anew
 
 
 @inner
@@ -111,6 +114,12 @@ def allocate(t: Tree, size: int) -> int:
     state[MEMBERS_TOP] += CAPACITIES[k]
     state[FRONTS_TOP] += numbers_of(k)
     return c
+
+
+@jitable
+def has_outgrown(t: Tree) -> bool:
+    """Return whether all fronts together have grown so much that the whole tree is to be dissected anew."""
+    return bool(t.state[LIVE] > GROWTH * t.state[LIVE_MADE] > 0)
 
 
 @kernel

@@ -33,7 +33,7 @@ from graph_slam_ros.graph import (
 )
 from graph_slam_ros.lie import se2, se3
 from graph_slam_ros.solver import Change, Settings, Solver
-from graph_slam_ros.solver.clique_tree.storage import TAIL_END
+from graph_slam_ros.solver.clique_tree.storage import KEY, TAIL_END
 
 KINDS = (R1, R2, R3, SE2, SE3)
 PRIOR = POINT_PRIOR | {SE2: POSE_PRIOR, SE3: POSE_PRIOR_3D}
@@ -211,6 +211,16 @@ class Changes(RuleBasedStateMachine):
         self.new_vertices.append(v)
         self.edge(PRIOR[self.graph.kind_of(v)], (v,), np.random.default_rng(seed))
         self.hand_over()
+
+    @precondition(lambda self: self.inside)
+    @rule(seed=seeds, far=st.sampled_from([NOISE, 0.2]))
+    def start_elsewhere(self, seed, far):
+        rng, values = np.random.default_rng(seed), self.solver.values
+        for v in set(self.inside) - self.held:
+            kind, at = self.graph.kind_of(v), int(self.graph.offset.values[v])
+            values[at : at + kind.size] = kind.retract(self.truth[v][None], far * rng.standard_normal((1, kind.dof)))[0]
+        self.solver.start_at(values)
+        self.waits = True
 
     # -- what is asked
 
@@ -502,6 +512,30 @@ def test_what_was_asked_after_a_batch_changes_nothing_that_comes_later():
             append(solver, k, *([k - 20] if k % 7 == 0 else []))
             solver.update()
     assert np.array_equal(asked.values, silent.values)
+
+
+@pytest.mark.parametrize("grows", [False, True])
+@pytest.mark.parametrize("before", ["update", "optimize"])
+@pytest.mark.parametrize("way", ["update", "marginal", "optimize"])
+def test_from_another_start_everything_is_linearised_there_in_the_same_order(way, before, grows):
+    solver = chain(30, **EXACT)
+    ways = {
+        "update": solver.update,
+        "marginal": lambda: solver.marginal([3]),
+        "optimize": lambda: solver.optimize(Settings(**BATCH)),
+    }
+    solver.add([], [solver.graph.add_edge(RELATIVE_POSE, [0, 29], [28.0, 3.0, 0.4], PLANAR, "closures")])
+    ways[before]()
+    best, order = solver.values, solver._tree.vertex[:30, KEY].copy()
+    solver.start_at(best + 0.2 * np.sin(np.arange(len(best))))
+    if grows:
+        append(solver, 30, 5)
+    ways[way]()
+    assert off_by(solver) < 1e-6
+    if not grows:
+        assert np.abs(solver.values - best).max() < 1e-6
+        assert np.array_equal(solver._tree.vertex[:30, KEY], order)
+    check_tree(solver)
 
 
 @pytest.mark.parametrize("way", ["update", "marginal"])
