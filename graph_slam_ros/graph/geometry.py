@@ -82,6 +82,22 @@ class Geometry:
         return self.in_parent_axes(self.group.inverse(pose), covariance)
 
 
+def rigid_motions(points: Array) -> Array:
+    """Return how points (m, d) move with the whole, (m d, 3) in the plane and (m d, 6) in space, about the origin."""
+    m, size = points.shape
+    out = np.zeros((m, size, 3 if size == 2 else 6))
+    for axis in range(size):
+        out[:, axis, axis] = 1.0
+    if size == 2:
+        out[:, 0, 2], out[:, 1, 2] = -points[:, 1], points[:, 0]
+    else:
+        x, y, z = points.T
+        out[:, 1, 3], out[:, 2, 3] = -z, y
+        out[:, 0, 4], out[:, 2, 4] = z, -x
+        out[:, 0, 5], out[:, 1, 5] = -y, x
+    return out.reshape(m * size, -1)
+
+
 def _turn_2d(pose: Numbers) -> Array:
     c, s = np.cos(pose[2]), np.sin(pose[2])
     return np.array([[c, -s], [s, c]])

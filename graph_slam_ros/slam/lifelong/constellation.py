@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from graph_slam_ros.graph.geometry import Geometry
+from graph_slam_ros.graph.geometry import Geometry, rigid_motions
 from graph_slam_ros.typing import Array, Index, Numbers
 
 
@@ -96,22 +96,6 @@ class Constellation:
         for k, turn in enumerate(self.turns.tolist()):
             turns[k, :, d:] = space.turn((*space.identity[:d], *turn)).T if d > 2 else 1.0
         return np.concatenate((rigid_motions(self.points), turns.reshape(-1, space.dof)))
-
-
-def rigid_motions(points: Array) -> Array:
-    """Return how points (m, d) move with the whole, (m d, 3) in the plane and (m d, 6) in space, about the origin."""
-    m, size = points.shape
-    out = np.zeros((m, size, 3 if size == 2 else 6))
-    for axis in range(size):
-        out[:, axis, axis] = 1.0
-    if size == 2:
-        out[:, 0, 2], out[:, 1, 2] = -points[:, 1], points[:, 0]
-    else:
-        x, y, z = points.T
-        out[:, 1, 3], out[:, 2, 3] = -z, y
-        out[:, 0, 4], out[:, 2, 4] = z, -x
-        out[:, 0, 5], out[:, 1, 5] = -y, x
-    return out.reshape(m * size, -1)
 
 
 def turned(information: Array, turn: Array, points: int) -> Array:

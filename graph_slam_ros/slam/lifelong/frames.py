@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 
-from graph_slam_ros.graph.geometry import Geometry
-from graph_slam_ros.slam.lifelong.constellation import rigid_motions
+from graph_slam_ros.graph.geometry import Geometry, rigid_motions
 from graph_slam_ros.typing import Array, Index, Numbers
 
 LONGEST = 20  # keyframes of a frame

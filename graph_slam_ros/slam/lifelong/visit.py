@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike
 
 from graph_slam_ros.errors import SingularError
 from graph_slam_ros.graph import Edge, EdgeType, Gaussian, Graph
-from graph_slam_ros.graph.geometry import Geometry
-from graph_slam_ros.slam.lifelong.constellation import Constellation, rigid_motions
+from graph_slam_ros.graph.geometry import Geometry, rigid_motions
+from graph_slam_ros.slam.lifelong.constellation import Constellation
 from graph_slam_ros.slam.lifelong.elimination import marginal_information, product
 from graph_slam_ros.solver import Settings, Solver
 from graph_slam_ros.typing import Array

@@ -16,10 +16,11 @@ import numpy as np
 from graph_slam_ros.config.robust import RobustConfig
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import GROUPS, SE2, Graph, Loss
+from graph_slam_ros.graph.records import weights_of
 from graph_slam_ros.slam.robust.gating import OutlierGate
 from graph_slam_ros.slam.robust.ledger import FINAL, Ledger
 from graph_slam_ros.slam.robust.mirrored import is_of_ranges, mirror_images
-from graph_slam_ros.slam.robust.pairwise_consistency import consistent_groups, odometry_in_use
+from graph_slam_ros.slam.robust.pairwise_consistency import consistent_groups, contradicting_sightings, odometry_in_use
 from graph_slam_ros.solver import Settings, Solver
 from graph_slam_ros.typing import Array, Index
 
@@ -135,17 +136,15 @@ class CancelToken:
 
 def search_alternatives(config: RobustConfig, frozen: FrozenGraph, wanted: CancelToken | None = None) -> Outcome | None:
     """Explain a graph anew from each start; the lowest cost wins. None if nothing can be solved, or if cancelled."""
-    found, ways = list[Outcome](), list[_Way]()
-    for name, start, inliers in _starts(frozen):
+    search = _Search(config, frozen)
+    for name, start, inliers in _starts(config, frozen):
         if wanted is not None and not wanted.still:
             return None
-        if inliers is not None and any(one.start == "online" and not len(one.ledger.outside) for one in found):
+        if inliers is not None and search.explains_everything:
             break
         with suppress(GraphSlamError, np.linalg.LinAlgError):  # what is believed there does not hold together
-            hopeless = _HOPELESS * min((one.cost for one in found), default=np.inf)
-            outcome = _explained(name, config, frozen, start, inliers, hopeless, found, ways)
-            found += [] if outcome is None else [outcome]
-    found = [outcome for outcome in found if np.isfinite(outcome.cost)]
+            search.begin_at(name, start, inliers)
+    found = search.found
     if not found:
         return None
     best = min(found, key=lambda outcome: outcome.cost + _LIKELIER * (outcome.start == MIRRORED))
@@ -166,8 +165,8 @@ def _rival(one: Outcome, best: Outcome) -> Alternative | None:
     return Alternative(one.cost, best.cost, tuple(only_here.tolist()), tuple(only_there.tolist()))
 
 
-def _starts(frozen: FrozenGraph) -> Iterator[tuple[str, Array, Index | None]]:
-    """The online verdicts; closures that agree with a neighbour, at the online estimate and along odometry alone.
+def _starts(config: RobustConfig, frozen: FrozenGraph) -> Iterator[tuple[str, Array, Index | None]]:
+    """The online verdicts; candidates that agree with a neighbour, at the online estimate and along odometry alone.
 
     The last start accepts the largest rejected group alone.
     """
@@ -179,10 +178,12 @@ def _starts(frozen: FrozenGraph) -> Iterator[tuple[str, Array, Index | None]]:
     candidates = np.sort(np.concatenate((ledger.inside, ledger.outside)))
     is_closure = graph.has_label(candidates, ("closures",))
     closures, others = candidates[is_closure], candidates[~is_closure]
-    if not len(closures):
-        yield "all", frozen.values, candidates
-        return
     odometry = _along_odometry(graph, frozen.values, set(frozen.held.tolist()))
+    limits = config.noise_factor**2 * ledger.threshold.values[others]
+    others = np.setdiff1d(others, contradicting_sightings(graph, odometry, others, limits))
+    if not len(closures):
+        yield "neighbours", frozen.values, others
+        return
     groups = consistent_groups(graph, odometry, closures, ledger.threshold.values[closures])
     inliers = np.concatenate((others, *groups))
     yield "neighbours", frozen.values, inliers
@@ -193,58 +194,86 @@ def _starts(frozen: FrozenGraph) -> Iterator[tuple[str, Array, Index | None]]:
         yield "rejected", odometry, np.concatenate((others, largest))
 
 
-def _explained(
-    name: str,
-    config: RobustConfig,
-    frozen: FrozenGraph,
-    start: Array,
-    inliers: Index | None,
-    hopeless: float,
-    found: Sequence[Outcome],
-    ways: list[_Way],
-) -> Outcome | None:
-    """Solve and judge in turn, starting with the verdicts of the ledger, or with these candidates.
+class _Search:
+    """The starts of one search. They share one solver: from one to the next, what differs is ordered and grouped anew.
 
-    None if it comes to where another start has come: what follows is the same.
-
-    It ends when no verdict changes, when the verdicts are again those of an earlier round (a candidate that was
-    accepted on trial does not fit after all), when the cost is too high, or where one that was found before has ended.
+    Attributes
+    ----------
+    found : the explanations so far
     """
-    graph, mine = frozen.graph.copy(), frozen.ledger.copy()
-    solver = Solver(graph, frozen.settings)
-    solver.add(frozen.vertices, range(len(mine)))
-    solver.start_at(start)
-    for vertex in frozen.held.tolist():
-        solver.hold(vertex)
-    decisions = OutlierGate(config, graph, solver, mine)
-    if inliers is not None:
-        decisions.force_inliers(inliers, frozen.keyframe)
-        solver.optimize(replace(frozen.settings, losses=decisions.cautious_losses(), max_iterations=_ITERATIONS))
-        decisions.reclassify(frozen.keyframe)
-        here = _Way(mine.inside, solver.values, _cost(solver, mine))
-        if any(here.joins(one) for one in ways):
-            return None
-        ways.append(here)
-    rounds = config.rounds if _cost(solver, mine) <= 2.0 * hopeless else 0
-    solved = dict[bytes, Array]()  # values by verdicts
-    for k in range(rounds):
-        solver.optimize()
-        if k + 1 == rounds or _cost(solver, mine) > hopeless:
-            break
-        solved[mine.inside.tobytes()] = solver.values
-        if decisions.reclassify(frozen.keyframe):
-            if (values := solved.get(mine.inside.tobytes())) is None:
-                continue
-            solver.start_at(values)
-            break
-        if _is_known(_cost(solver, mine), mine, found):
-            break
-        costs = dict[int, float]()
-        if not decisions.readmit_next(frozen.keyframe, costs) and not _together(decisions, solver, frozen, costs):
-            break
-    judged = np.concatenate((mine.inside, mine.outside))
-    mine.statistic.values[judged], _ = solver.chi2_of(judged)
-    return Outcome(name, mine, solver.values, _cost(solver, mine), frozen)
+
+    def __init__(self, config: RobustConfig, frozen: FrozenGraph) -> None:
+        self._config, self._frozen, self._graph = config, frozen, frozen.graph.copy()
+        self._candidates = np.sort(np.concatenate((frozen.ledger.inside, frozen.ledger.outside)))
+        self._weights = weights_of(self._graph.pointers, self._candidates)
+        self._solver = Solver(self._graph, frozen.settings)
+        self._solver.add(frozen.vertices, range(len(frozen.ledger)))
+        for vertex in frozen.held.tolist():
+            self._solver.hold(vertex)
+        self.found = list[Outcome]()
+        self._ways = list[_Way]()
+
+    @property
+    def explains_everything(self) -> bool:
+        """Return whether the online verdicts reject nothing."""
+        return any(one.start == "online" and not len(one.ledger.outside) for one in self.found)
+
+    def begin_at(self, name: str, start: Array, inliers: Index | None) -> None:
+        """Solve and judge in turn, starting with the verdicts of the ledger, or with these candidates.
+
+        Nothing is found if it comes to where another start has come: what follows is the same.
+        """
+        frozen, mine = self._frozen, self._frozen.ledger.copy()
+        decisions = self._gate(start, mine)
+        hopeless = _HOPELESS * min((one.cost for one in self.found), default=np.inf)
+        solver = self._solver
+        if inliers is not None:
+            decisions.force_inliers(inliers, frozen.keyframe)
+            solver.optimize(replace(frozen.settings, losses=decisions.cautious_losses(), max_iterations=_ITERATIONS))
+            decisions.reclassify(frozen.keyframe)
+            here = _Way(mine.inside, solver.values, _cost(solver, mine))
+            if any(here.joins(one) for one in self._ways):
+                return
+            self._ways.append(here)
+        if inliers is None or _cost(solver, mine) <= 2.0 * hopeless:
+            self._alternate(decisions, hopeless)
+        judged = np.concatenate((mine.inside, mine.outside))
+        mine.statistic.values[judged], _ = solver.chi2_of(judged)
+        cost = _cost(solver, mine)
+        if np.isfinite(cost):
+            self.found.append(Outcome(name, mine, solver.values, cost, frozen))
+
+    def _gate(self, start: Array, ledger: Ledger) -> OutlierGate:
+        """Return to the weights of the frozen graph, at other values."""
+        now = weights_of(self._graph.pointers, self._candidates)
+        for k in np.flatnonzero(now != self._weights).tolist():
+            self._solver.set_weight(int(self._candidates[k]), float(self._weights[k]))
+        self._solver.start_at(start)
+        return OutlierGate(self._config, self._graph, self._solver, ledger)
+
+    def _alternate(self, decisions: OutlierGate, hopeless: float) -> None:
+        """Solve and judge until no verdict changes.
+
+        It ends, too, when the verdicts are again those of an earlier round (a candidate that was accepted on trial does
+        not fit after all), when the cost is too high, or where another start has ended.
+        """
+        solver, mine, keyframe = self._solver, decisions.ledger, self._frozen.keyframe
+        solved = dict[bytes, Array]()  # values by verdicts
+        for k in range(self._config.rounds):
+            solver.optimize()
+            if k + 1 == self._config.rounds or _cost(solver, mine) > hopeless:
+                return
+            solved[mine.inside.tobytes()] = solver.values
+            if decisions.reclassify(keyframe):
+                if (values := solved.get(mine.inside.tobytes())) is None:
+                    continue
+                solver.start_at(values)
+                return
+            if _is_known(_cost(solver, mine), mine, self.found):
+                return
+            costs = dict[int, float]()
+            if not (decisions.readmit_next(keyframe, costs) or _together(decisions, solver, self._frozen, costs)):
+                return
 
 
 def _together(decisions: OutlierGate, solver: Solver, frozen: FrozenGraph, costs: Mapping[int, float]) -> bool:

@@ -1,8 +1,9 @@
-"""Pairwise consistency of loop closures that join the same two stretches of the path.
+"""Pairwise consistency of loop closures that join the same two stretches of the path, and of sightings of a landmark.
 
 Odometry between near poses is good. So two such closures and the two short ways between their ends form a loop that
 must close: pairwise consistency (Mangelson et al., "Pairwise consistent measurement set maximization", ICRA 2018,
-eq. 3). Only neighbours are compared, where odometry is precise enough.
+eq. 3). So do two sightings of a landmark and the way between them. Only neighbours are compared, where odometry is
+precise enough.
 """
 
 from collections.abc import Callable
@@ -13,7 +14,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from graph_slam_ros.graph import GROUPS, RELATIVE_POSE, RELATIVE_POSE_3D, SE2, SE3, Graph
+from graph_slam_ros.graph import GROUPS, POINT_SEEN_FROM, RELATIVE_POSE, RELATIVE_POSE_3D, SE2, SE3, Graph
+from graph_slam_ros.graph.geometry import rigid_motions
 from graph_slam_ros.graph.retraction import adjoints_of_inverses, code_of
 from graph_slam_ros.graph.tables import EdgeTable
 from graph_slam_ros.typing import Array, Index
@@ -65,6 +67,49 @@ def consistent_groups(graph: Graph, values: Array, closures: Index, limits: Arra
     _, group_of = connected_components(joined, directed=False)
     some = np.unique(pairs[agree])
     return [closures[some[group_of[some] == one]] for one in np.unique(group_of[some])]
+
+
+def contradicting_sightings(graph: Graph, values: Array, sightings: Index, limits: Array) -> Index:
+    """Return sightings of points that agree neither with the one before nor with the one after of the same landmark.
+
+    Sightings of a landmark that is seen only once, and what is no position of a point, contradict nothing.
+
+    Parameters
+    ----------
+    values : stored numbers of all vertices, the poses by odometry alone
+    limits : of each sighting, what chi2 it may have
+    """
+    kind, edge_type = (SE2, RELATIVE_POSE) if SE2 in graph.kinds else (SE3, RELATIVE_POSE_3D)
+    odometry, table = graph.tables.get(edge_type), graph.tables.get(POINT_SEEN_FROM[kind])
+    if odometry is None or table is None:
+        return sightings[:0]
+    order, walked = _along_odometry(graph, odometry)
+    is_of_table = graph.table_of_edge.values[sightings] == table.code
+    sightings, limits = sightings[is_of_table], limits[is_of_table]
+    some = table.at(graph.row_of_edge.values[sightings])
+    poses, landmarks = some.vertices.T
+    in_time = np.lexsort((order[poses], landmarks))
+    in_time = in_time[order[poses[in_time]] >= 0]
+    follows = landmarks[in_time[1:]] == landmarks[in_time[:-1]]
+    a, b = in_time[:-1][follows], in_time[1:][follows]
+    if not len(a):
+        return sightings[:0]
+    group, path = GROUPS[kind], values[graph.offset.values[poses][:, None] + np.arange(kind.size)]
+    motion = _between(group, path[a], path[b])
+    back, size = group.inverse(tuple(motion.T)), some.measured.shape[1]
+    seen_before = np.stack(group.act(back, tuple(some.measured[a].T)), axis=-1)
+    axes = adjoints_of_inverses(code_of(kind), motion)[:, :size, :size]
+
+    noise = np.linalg.inv(some.sqrt_information)
+    noise = noise @ noise.transpose(0, 2, 1)
+    moves = rigid_motions(seen_before).reshape(len(a), size, -1)
+    steps = walked[order[poses[b]]] - walked[order[poses[a]]]
+    covariance = noise[b] + axes @ noise[a] @ axes.transpose(0, 2, 1)
+    covariance += moves @ _walked(group, motion, steps) @ moves.transpose(0, 2, 1)
+    error = some.measured[b] - seen_before
+    distance = np.einsum("ki,ki->k", error, np.linalg.solve(covariance, error[:, :, None])[:, :, 0])
+    agree = distance <= np.minimum(limits[a], limits[b])
+    return sightings[np.setdiff1d(np.union1d(a, b), np.union1d(a[agree], b[agree]))]
 
 
 def odometry_in_use(graph: Graph) -> Index:

@@ -348,7 +348,7 @@ def test_closures_that_support_one_another_come_in_together(monkeypatch, offsets
     assert min(costs) > decisions.most_cost(drive.false[:1])
     assert max(costs) < decisions.most_cost(drive.false) or verdict == "PENDING"
     monkeypatch.setattr(
-        hypotheses, "_starts", lambda frozen: [("online", frozen.values, None)]
+        hypotheses, "_starts", lambda _, frozen: [("online", frozen.values, None)]
     )  # others may find it, too
     if is_solved:
         drive.solve()
