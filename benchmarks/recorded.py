@@ -94,7 +94,7 @@ def _mrclam(name: str, converter: Path, set_7: Path, robot: int) -> tuple[Drawn,
         path = Path(folder) / "bag"
         words = [sys.executable, converter, set_7, str(robot), path, "--map"]
         subprocess.run(words, check=True, stdout=subprocess.DEVNULL)
-        bag, config = open_bag(path), Config()
+        bag, config = open_bag(path), Config.from_mapping({"map.condense": False})  # every sighting is wanted
         slam = GraphSlam(config)
         for several in measurements(bag, choose_inputs(bag, config), config, Counters()):
             for m in several:

@@ -46,6 +46,7 @@ _BEARING_RAD, _RANGE_M, _TRUNK_PART = 0.01, 0.1, 0.25
 
 # Trees of a park stand some 15 m apart. What the car drives between two scans is a keyframe; less is none.
 SETTINGS: Mapping[str, Any] = {
+    "map.condense": False,  # all of it is compared
     "landmarks.association": "joint",
     "landmarks.density_per_m": 0.07,
     "odometry.twist_correlation_s": _ERROR_LASTS_S,

@@ -27,6 +27,7 @@ _AS_THE_GRAPH: Mapping[str, Any] = {
     "odometry.still_rad": 0.0,
     "odometry.max_speed_m_s": 1e6,
     "landmarks.added_sigma_m": 0.0,
+    "map.condense": False,  # all of it is compared
     "robust.noise_scale": "configured",  # the noise of the file is what its optimum, and chi2, are by
 }
 _LOSSES: Mapping[str, Mapping[str, Any]] = {
