@@ -143,7 +143,7 @@ def search_alternatives(config: RobustConfig, frozen: FrozenGraph, wanted: Cance
         if inliers is not None and search.explains_everything:
             break
         with suppress(GraphSlamError, np.linalg.LinAlgError):  # what is believed there does not hold together
-            search.begin_at(name, start, inliers)
+            search.explain_from(name, start, inliers)
     found = search.found
     if not found:
         return None
@@ -218,7 +218,7 @@ class _Search:
         """Return whether the online verdicts reject nothing."""
         return any(one.start == "online" and not len(one.ledger.outside) for one in self.found)
 
-    def begin_at(self, name: str, start: Array, inliers: Index | None) -> None:
+    def explain_from(self, name: str, start: Array, inliers: Index | None) -> None:
         """Solve and judge in turn, starting with the verdicts of the ledger, or with these candidates.
 
         Nothing is found if it comes to where another start has come: what follows is the same.
@@ -244,7 +244,7 @@ class _Search:
             self.found.append(Outcome(name, mine, solver.values, cost, frozen))
 
     def _gate(self, start: Array, ledger: Ledger) -> OutlierGate:
-        """Return to the weights of the frozen graph, at other values."""
+        """Return the gate of a start, at whose values the weights of the frozen graph hold again."""
         now = weights_of(self._graph.pointers, self._candidates)
         for k in np.flatnonzero(now != self._weights).tolist():
             self._solver.set_weight(int(self._candidates[k]), float(self._weights[k]))
