@@ -295,7 +295,7 @@ class OutlierGate:
 
     def force_inliers(self, edges: Index, keyframe: int) -> None:
         """Accept these candidates and no others, as a trial."""
-        candidates = np.sort(np.concatenate((self.ledger.inside, self.ledger.outside)))
+        candidates = self.ledger.candidates
         self._set_verdicts(candidates, np.isin(candidates, edges), keyframe, self.ledger)
 
     def _set_verdicts(self, edges: Index, wanted: NDArray[np.bool_], keyframe: int, judge: Ledger) -> bool:
@@ -388,7 +388,7 @@ class OutlierGate:
             is_stated = self._config.noise_scale == "configured"
             noise_ratio = chi2_per_dof(self._solver, freedom) if is_stated else 1.0
             self._gate_scale = min(factor, max(TIGHTEST, factor * noise_ratio))
-        edges = np.concatenate((inside, ledger.outside))
+        edges = ledger.candidates
         ledger.threshold.values[edges] = self._limits(edges, ledger.numbers.values[edges])
 
 

@@ -175,7 +175,7 @@ def _starts(config: RobustConfig, frozen: FrozenGraph) -> Iterator[tuple[str, Ar
     if not len(frozen.held) and is_of_ranges(graph):
         for values in mirror_images(graph, frozen.values):
             yield MIRRORED, values, None
-    candidates = np.sort(np.concatenate((ledger.inside, ledger.outside)))
+    candidates = ledger.candidates
     is_closure = graph.has_label(candidates, ("closures",))
     closures, others = candidates[is_closure], candidates[~is_closure]
     odometry = _along_odometry(graph, frozen.values, set(frozen.held.tolist()))
@@ -204,7 +204,7 @@ class _Search:
 
     def __init__(self, config: RobustConfig, frozen: FrozenGraph) -> None:
         self._config, self._frozen, self._graph = config, frozen, frozen.graph.copy()
-        self._candidates = np.sort(np.concatenate((frozen.ledger.inside, frozen.ledger.outside)))
+        self._candidates = frozen.ledger.candidates
         self._weights = weights_of(self._graph.pointers, self._candidates)
         self._solver = Solver(self._graph, frozen.settings)
         self._solver.add(frozen.vertices, range(len(frozen.ledger)))
@@ -237,7 +237,7 @@ class _Search:
             self._ways.append(here)
         if inliers is None or _cost(solver, mine) <= 2.0 * hopeless:
             self._alternate(decisions, hopeless)
-        judged = np.concatenate((mine.inside, mine.outside))
+        judged = mine.candidates
         mine.statistic.values[judged], _ = solver.chi2_of(judged)
         cost = _cost(solver, mine)
         if np.isfinite(cost):

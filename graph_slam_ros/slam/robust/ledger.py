@@ -225,6 +225,11 @@ class Ledger:
         return np.array(sorted(self._out), dtype=np.int64)
 
     @property
+    def candidates(self) -> Index:
+        """Judged edges that may be judged again, with a weight or rejected, in order."""
+        return np.sort(np.concatenate((self.inside, self.outside)))
+
+    @property
     def outside_count(self) -> int:
         """The number of rejected edges that may come back."""
         return len(self._out)

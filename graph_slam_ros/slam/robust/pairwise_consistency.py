@@ -55,14 +55,12 @@ def consistent_groups(graph: Graph, values: Array, closures: Index, limits: Arra
     onwards = _compose(group, measured[a], after)
     error = _columns(group.log, _between(group, measured[b], _compose(group, before, onwards)))
 
-    noise = np.linalg.inv(table.at(rows).sqrt_information)
-    noise = noise @ noise.transpose(0, 2, 1)
+    noise = _covariances(table.at(rows).sqrt_information)
     steps = np.abs(walked[order[ends[a]]] - walked[order[ends[b]]])
     covariance = noise[b] + _propagated(after, noise[a])
     covariance += _propagated(onwards, _walked(group, before, steps[:, 0]))
     covariance += _walked(group, after, steps[:, 1])
-    distance = np.einsum("ki,ki->k", error, np.linalg.solve(covariance, error[:, :, None])[:, :, 0])
-    agree = distance <= np.minimum(limits[a], limits[b])
+    agree = _squared_sigmas(error, covariance) <= np.minimum(limits[a], limits[b])
     joined = coo_array((np.ones(np.count_nonzero(agree)), (a[agree], b[agree])), shape=(len(ends), len(ends)))
     _, group_of = connected_components(joined, directed=False)
     some = np.unique(pairs[agree])
@@ -100,15 +98,13 @@ def contradicting_sightings(graph: Graph, values: Array, sightings: Index, limit
     seen_before = np.stack(group.act(back, tuple(some.measured[a].T)), axis=-1)
     axes = adjoints_of_inverses(code_of(kind), motion)[:, :size, :size]
 
-    noise = np.linalg.inv(some.sqrt_information)
-    noise = noise @ noise.transpose(0, 2, 1)
+    noise = _covariances(some.sqrt_information)
     moves = rigid_motions(seen_before).reshape(len(a), size, -1)
     steps = walked[order[poses[b]]] - walked[order[poses[a]]]
     covariance = noise[b] + axes @ noise[a] @ axes.transpose(0, 2, 1)
     covariance += moves @ _walked(group, motion, steps) @ moves.transpose(0, 2, 1)
     error = some.measured[b] - seen_before
-    distance = np.einsum("ki,ki->k", error, np.linalg.solve(covariance, error[:, :, None])[:, :, 0])
-    agree = distance <= np.minimum(limits[a], limits[b])
+    agree = _squared_sigmas(error, covariance) <= np.minimum(limits[a], limits[b])
     return sightings[np.setdiff1d(np.union1d(a, b), np.union1d(a[agree], b[agree]))]
 
 
@@ -132,8 +128,7 @@ def _along_odometry(graph: Graph, table: EdgeTable) -> tuple[Index, Array]:
     vertices = table.at(rows).vertices
     order[vertices[:, 0]] = np.arange(len(rows))
     order[vertices[:, 1]] = np.arange(1, len(rows) + 1)
-    inverse = np.linalg.inv(table.at(rows).sqrt_information)
-    steps = inverse @ inverse.transpose(0, 2, 1)
+    steps = _covariances(table.at(rows).sqrt_information)
     return order, np.concatenate((np.zeros((1, *steps.shape[1:])), np.cumsum(steps, axis=0)))
 
 
@@ -147,6 +142,17 @@ def _propagated(motion: Array, covariance: Array) -> Array:
     """The covariance, in right tangent coordinates, after a further motion."""
     adjoint = adjoints_of_inverses(code_of(SE2 if motion.shape[1] == SE2.size else SE3), motion)
     return adjoint @ covariance @ adjoint.transpose(0, 2, 1)
+
+
+def _covariances(sqrt_information: Array) -> Array:
+    """The covariances (n, d, d) of measurements with these square roots of information."""
+    inverse = np.linalg.inv(sqrt_information)
+    return np.asarray(inverse @ inverse.transpose(0, 2, 1))
+
+
+def _squared_sigmas(error: Array, covariance: Array) -> Array:
+    """Errors (n, d) in sigmas, squared: chi2 of each."""
+    return np.asarray(np.einsum("ki,ki->k", error, np.linalg.solve(covariance, error[:, :, None])[:, :, 0]))
 
 
 def _compose(group: Any, a: Array, b: Array) -> Array:
