@@ -45,7 +45,7 @@ from graph_slam_ros.graph import (
 from graph_slam_ros.lie import se2, se3
 from graph_slam_ros.lie.jit import CACHE_DIR
 from graph_slam_ros.progress import report
-from graph_slam_ros.solver import METHODS, Settings, Solver, covariance
+from graph_slam_ros.solver import METHODS, Settings, Solver, compiled_update, covariance
 from graph_slam_ros.solver import least_cost as innovations
 from graph_slam_ros.solver import stretch_filter as stretches
 from graph_slam_ros.solver.clique_tree import (
@@ -270,22 +270,22 @@ def _structure_kernels() -> list[_Kernel]:
     return [
         (ordering.move_tail, (tree, index, index)),
         (ordering.dissect, (tree, number)),
-        (advance._regroup, (tree, index, index, real, real)),
+        (advance.regroup, (tree, index, index, real, real)),
         (incremental.relinearize, (tree, index, limits)),
-        (incremental.reach_back, (index, index)),
+        (incremental.reach_back, (tree, index)),
         (pools.compact, (tree,)),
     ]
 
 
 def _number_kernels() -> list[_Kernel]:
     """List kernels that eliminate, substitute and find covariances."""
-    tree, index, _, real = _types()
+    tree, index, number, real = _types()
     limits = types.UniTuple(real, 3)  # type: ignore[no-untyped-call]
     return [
         (numeric.eliminate, (tree, index, real)),
         (substitution.substitute, (tree, index, real, real, limits)),
         (incremental.solve, (tree, index, real, real, limits)),
-        (advance.advance, (index, index, index, index, types.boolean, index, index, real, real, limits)),
+        (compiled_update.update, (index, index, number, number, *[index] * 8, real, real, limits)),
         (covariance.marginals, (tree, index)),
         (covariance.joint, (tree, index)),
         (covariance.among, (tree, types.int64[:, ::1])),

@@ -33,6 +33,11 @@ def reals(address: int, count: int) -> Array:
     return np.ctypeslib.as_array(cast(int(address), POINTER(c_double)), (int(count),))
 
 
+def table(address: int, rows: int, columns: int) -> Index:
+    """Return the table of integers at an address."""
+    return integers(address, int(rows) * int(columns)).reshape(int(rows), int(columns))
+
+
 def flags(address: int, count: int) -> Mask:
     """Return the truth values at an address."""
     return np.ctypeslib.as_array(cast(int(address), POINTER(c_bool)), (int(count),)).view(np.bool_)
@@ -50,6 +55,14 @@ def _pointer(_: Any, address: Any) -> tuple[Any, Callable[..., Any]]:
 def _compiled_integers(address: Any, count: Any) -> Callable[..., Any]:
     def compiled(address: Any, count: Any) -> Any:
         return carray(_pointer(address), count, np.int64)  # type: ignore[call-arg]
+
+    return compiled
+
+
+@overload(table, jit_options={"error_model": "numpy"})
+def _compiled_table(address: Any, rows: Any, columns: Any) -> Callable[..., Any]:
+    def compiled(address: Any, rows: Any, columns: Any) -> Any:
+        return carray(_pointer(address), (rows, columns), np.int64)  # type: ignore[call-arg]
 
     return compiled
 

@@ -197,9 +197,7 @@ def store_first(t: Tree, rows: Index, ids: Index, residual: Array, jacobian: Arr
 
 
 @kernel
-def whiten_and_store(
-    pointers: Index, table: Index, rows: Index, residual: Array, jacobian: Array, losses: Index
-) -> int:
+def whiten_and_store(t: Tree, table: Index, rows: Index, residual: Array, jacobian: Array, losses: Index) -> int:
     """Whiten edges and add them to the tree; or add none, and return the row of one whose cost is not finite."""
     m, room = table[records.RESIDUAL_SIZE], table[records.ROOM]
     root = reals(table[records.SQRT_INFORMATION], room * m * m).reshape(room, m, m)
@@ -218,7 +216,7 @@ def whiten_and_store(
             worst = k
     if not np.isfinite(total):
         return rows[worst]
-    store(tree_of(pointers), rows, integers(table[records.ID], room), residual, jacobian)
+    store(t, rows, integers(table[records.ID], room), residual, jacobian)
     return NOTHING
 
 
@@ -231,7 +229,13 @@ def store_linearized(
     Returns NOTHING; the table of an edge that is not compiled, and then none is put into the tree; or the table and the
     row of one whose cost is not finite.
     """
-    t, room = tree_of(pointers), graph[records.EDGE_ROOM]
+    return linearize_edges(tree_of(pointers), graph, edges, losses, young, first)
+
+
+@inner
+def linearize_edges(t: Tree, graph: Index, edges: Index, losses: Index, young: Index, first: Index) -> tuple[int, int]:
+    """Do as ``store_linearized``, with the tree itself."""
+    room = graph[records.EDGE_ROOM]
     table_of, row_of = integers(graph[records.TABLE_OF_EDGE], room), integers(graph[records.ROW_OF_EDGE], room)
     for e in edges:
         if table_at(graph, table_of[e])[records.LINEARIZE] == 0:
@@ -248,7 +252,7 @@ def store_linearized(
                 if table_of[e] == code and t.edge[e, MARKED] != is_old:
                     rows[count] = row_of[e]
                     count += 1
-            bad = _linearize_rows(graph, pointers, table_at(graph, code), rows[:count], losses if is_old else first)
+            bad = _linearize_rows(t, graph, table_at(graph, code), rows[:count], losses if is_old else first)
             if bad != NOTHING:
                 of_bad = code
                 break
@@ -258,9 +262,9 @@ def store_linearized(
 
 
 @inner
-def _linearize_rows(graph: Index, pointers: Index, table: Index, rows: Index, losses: Index) -> int:
+def _linearize_rows(t: Tree, graph: Index, table: Index, rows: Index, losses: Index) -> int:
     """Linearise rows of a table and put them into the tree; or return the row of one whose cost is not finite."""
-    t, room, slots, size = tree_of(pointers), table[records.ROOM], table[records.ENDS], table[records.MEASURED_SIZE]
+    room, slots, size = table[records.ROOM], table[records.ENDS], table[records.MEASURED_SIZE]
     vertices = integers(table[records.VERTICES], room * slots).reshape(room, slots)
     measured = reals(table[records.MEASURED], room * size).reshape(room, size)
     offset = integers(graph[records.OFFSET], len(t.vertex))
@@ -268,7 +272,7 @@ def _linearize_rows(graph: Index, pointers: Index, table: Index, rows: Index, lo
         some = rows[begin : begin + CHUNK]
         at, z = gather(some, vertices, offset, measured)
         residual, jacobian = call_native(table[records.LINEARIZE], t.value, at, z)
-        bad = whiten_and_store(pointers, table, some, residual, jacobian, losses)
+        bad = whiten_and_store(t, table, some, residual, jacobian, losses)
         if bad != NOTHING:
             return bad
     return ZERO + NOTHING

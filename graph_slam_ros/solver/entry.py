@@ -188,7 +188,13 @@ def anchorage(graph: Index, pointers: Index, vertices: Index, edges: Index) -> i
     LEFT_OUT is returned if one of the vertices is no unknown, or one of the edges has no weight: without these it is to
     be asked again.
     """
-    t, inside, held = tree_of(pointers), flags_at(pointers, INSIDE), flags_at(pointers, HELD)
+    return how_anchored(tree_of(pointers), graph, pointers, vertices, edges)
+
+
+@inner
+def how_anchored(t: Tree, graph: Index, pointers: Index, vertices: Index, edges: Index) -> int:
+    """Do as ``anchorage``, with the tree itself."""
+    inside, held = flags_at(pointers, INSIDE), flags_at(pointers, HELD)
     for v in vertices:
         if held[v] or not inside[v]:
             return LEFT_OUT

@@ -21,7 +21,7 @@ from graph_slam_ros.solver.blocks import (
     whiten,
     whiten_and_store,
 )
-from graph_slam_ros.solver.clique_tree.storage import NOTHING
+from graph_slam_ros.solver.clique_tree.storage import NOTHING, Tree
 from graph_slam_ros.solver.report import ClassCost
 from graph_slam_ros.typing import Array, Index
 
@@ -95,9 +95,9 @@ def _weights(table: EdgeTable, rows: Index, losses: Losses) -> tuple[Array, Arra
 
 
 def linearize_into(
-    pointers: Index, graph: Graph, x: Array, edges: Index, losses: Losses, young: Index, first: Losses
+    pointers: Index, graph: Graph, tree: Tree, edges: Index, losses: Losses, young: Index, first: Losses
 ) -> None:
-    """Linearise edges at the stored values x, and put them into the tree (``pointers_of``).
+    """Linearise edges at the linearisation points of the tree, and put them into it; the pointers are the tree's.
 
     Parameters
     ----------
@@ -119,8 +119,8 @@ def linearize_into(
         for table, chosen in rows_of(graph, some).items():
             for begin in range(0, len(chosen), CHUNK):
                 rows = chosen[begin : begin + CHUNK]
-                given = _evaluate(graph, x, table, rows)
-                bad = whiten_and_store(pointers, table.pointers, rows, *given, of_some.pointers)
+                given = _evaluate(graph, tree.value, table, rows)
+                bad = whiten_and_store(tree, table.pointers, rows, *given, of_some.pointers)
                 if bad != NOTHING:
                     _refuse_row(table, bad)
             table.pointers[records.LINEARIZE] = native_address(table.type.linearize)

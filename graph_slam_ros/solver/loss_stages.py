@@ -49,6 +49,7 @@ class LossStages:
         self.young = NONE
         self._graph = graph
         self._losses: list[Losses] = []
+        self._pointers = NONE
         self._made_for: tuple[int, int, Settings | None] = 0, 0, None  # so many labels and sources, and their settings
 
     def losses(self, settings: Settings) -> list[Losses]:
@@ -58,11 +59,17 @@ class LossStages:
         if len(graph.labels) != labels or len(graph.sources) != sources or made_for is not settings:
             self._made_for = len(graph.labels), len(graph.sources), settings
             self._losses = [Losses(self._graph, given) for given in settings.stages()]
+            self._pointers = np.concatenate((self._losses[0].pointers, self._losses[-1].pointers))
         return self._losses
 
-    def begin(self, edges: Index, settings: Settings) -> None:
-        """Begin the first stage of new edges; earlier young edges are no longer young."""
-        self.young = edges if len(self.losses(settings)) > 1 else NONE
+    def pointers(self, settings: Settings) -> Index:
+        """Pointers of the losses of the first stage, then of the last."""
+        self.losses(settings)
+        return self._pointers
+
+    def of_new(self, edges: Index) -> Index:
+        """Return those of new edges that are held to the first stage: all of them, or none where there is but one."""
+        return edges if len(self._losses) > 1 else NONE
 
     def mature(self, values: Array, settings: Settings) -> None:
         """Keep as young only edges whose weight differs between the first and the last stage of their loss."""

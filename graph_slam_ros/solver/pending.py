@@ -31,6 +31,11 @@ class PendingChanges:
         is_changed = len(self.vertices) or len(self.new) or self.back or len(self.touched)
         return bool(is_changed or self.moved or self.broken)
 
+    def is_plain(self) -> bool:
+        """Return whether vertices and edges were added, and nothing else was changed."""
+        is_special = self.back or self.may_float or self.moved or self.broken
+        return not is_special and len(self.vertices) + len(self.new) > 0
+
     def add(self, vertices: Index, edges: Index) -> None:
         """Append new vertices and edges."""
         all_vertices = np.concatenate((self.vertices, vertices)) if len(self.vertices) else vertices

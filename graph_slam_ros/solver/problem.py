@@ -44,7 +44,6 @@ from graph_slam_ros.solver.entry import (
 from graph_slam_ros.solver.gauge import check_gauge, degrees_of_freedom, fix_the_whole
 from graph_slam_ros.solver.linearization import chi2_of, evaluated, rows_of
 from graph_slam_ros.solver.pending import NONE, PendingChanges
-from graph_slam_ros.solver.transaction import Transaction
 from graph_slam_ros.typing import Array, Index
 
 
@@ -333,14 +332,7 @@ class Problem:
             self._refuse_floating()
         return vertices, edges
 
-    def _transaction(self, vertices: Index, edges: Index) -> Transaction:
-        """Solve with vertices and edges that enter; an error undoes it: they are pending again, and the estimate stays.
-
-        After an error the tree is rebuilt at the next update, because its numbers are half old and half new.
-        """
-        return Transaction(self, vertices, edges)
-
-    def _undo(self, substituted: int, vertices: Index, edges: Index) -> None:
+    def _undo(self, substituted: int) -> None:
         """Undo what a transaction did since there were so many substitutions."""
         self._pending.broken = True
         state = self._tree.state
@@ -350,7 +342,7 @@ class Problem:
         state[TAIL_FIRST] = state[TAIL_END] = 0  # it is filled anew with the tree
         self._set_estimate(self._kept)
         self._after_error()
-        incremental.leave(self._tree, vertices, edges)  # the last: it needs memory
+        incremental.leave(self._tree, self._pending.vertices, self._pending.edges())  # the last: it needs memory
 
     def _after_error(self) -> None:
         """Undo what a solution keeps besides."""

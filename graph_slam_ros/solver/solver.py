@@ -11,12 +11,11 @@ from graph_slam_ros.graph import Graph
 from graph_slam_ros.graph.graph import whole_numbers
 from graph_slam_ros.solver.batch import BatchProblem, Settings, minimise
 from graph_slam_ros.solver.clique_tree import incremental
-from graph_slam_ros.solver.clique_tree.advance import DISSECT, DONE, advance, more_room, restructure
-from graph_slam_ros.solver.clique_tree.ordering import dissect
-from graph_slam_ros.solver.clique_tree.storage import AFFECTED, CLIQUE, DOF, MOTION_MM, NOTHING, SUBSTITUTED, Limits
+from graph_slam_ros.solver.clique_tree.storage import AFFECTED, CLIQUE, DOF, NOTHING, SUBSTITUTED
 from graph_slam_ros.solver.clique_tree.substitution import forget, read, show
 from graph_slam_ros.solver.covariance import among, joint, joint_of_each, marginals
 from graph_slam_ros.solver.cross_covariance import CrossCovariances
+from graph_slam_ros.solver.entry import enter_newest
 from graph_slam_ros.solver.gauge import undetermined
 from graph_slam_ros.solver.left_out import without_edges
 from graph_slam_ros.solver.linearization import (
@@ -24,18 +23,17 @@ from graph_slam_ros.solver.linearization import (
     costs,
     information,
     linearize,
-    linearize_into,
     rows_of,
 )
-from graph_slam_ros.solver.loss_stages import LossStages
+from graph_slam_ros.solver.online_problem import OnlineProblem
 from graph_slam_ros.solver.pending import NONE
-from graph_slam_ros.solver.problem import Problem, existing
-from graph_slam_ros.solver.relinearization import MAYBE, NO_LIMITS, SURELY, RelinearizationSchedule
+from graph_slam_ros.solver.problem import existing
 from graph_slam_ros.solver.report import Change, Report
+from graph_slam_ros.solver.transaction import Transaction
 from graph_slam_ros.typing import Array, Index
 
 
-class Solver(Problem):
+class Solver(OnlineProblem):
     """Maximum-likelihood estimate of the vertices it was given, online and in batch; it owns their estimates.
 
     Vertices and edges are records of a ``Graph``; the solver minimises over those that were added to it. ``update``
@@ -45,11 +43,7 @@ class Solver(Problem):
 
     def __init__(self, graph: Graph, settings: Settings | None = None) -> None:
         super().__init__(graph, settings)
-        self._stages = LossStages(graph)
-        self._numbers_current = True  # the tree's numbers are those at its linearisation points
         self._unfinished = False  # a batch stopped before the optimum
-        self._schedule = RelinearizationSchedule()
-        self._solved_with: Settings | None = None
 
     def release(self, vertices: ArrayLike) -> None:
         """Estimate held vertices again. The whole structure is rebuilt."""
@@ -73,24 +67,26 @@ class Solver(Problem):
             The estimate stays; what was added since the last update is not in it, and stays pending. So it is with
             any other exception, e.g. of a residual of one's own.
         """
+        self._grow()
         state = self._tree.state
         eliminated = int(state[AFFECTED])
-        vertices, edges = self._arriving()
-        with self._transaction(vertices, edges):
-            solved, far, linearized = self._integrate(vertices, edges)
+        found: list[Index] = []
+        with Transaction(self):
+            linearized, moved, solved, far = self._integrate()
             if self._unfinished:
                 solved, far = self._continue_batch()
-            found = [solved]
+                moved = len(solved)
             if len(far):
+                found.append(solved)
                 for again, these in self._relinearized(far):
-                    linearized += again
+                    linearized, moved = linearized + again, moved + len(these)
                     found.append(these)
         if self.settings.at_once:
             self._estimates()
-        elif len(found) > 1:
+        else:
             for these in found:
                 show(self._tree, self._kept, these)
-        return Change(int(state[AFFECTED]) - eliminated, linearized, sum(map(len, found)))
+        return Change(int(state[AFFECTED]) - eliminated, linearized, moved)
 
     def optimize(self, settings: Settings | None = None) -> Report:
         """Minimise the cost over everything, from the present estimate, until converged.
@@ -106,7 +102,8 @@ class Solver(Problem):
             return self.evaluate(settings)
         arriving = self._arriving(surely=bool(self._pending))
         self._estimates()
-        with self._transaction(*arriving):
+        with Transaction(self):
+            enter_newest(self._pointers, *arriving)
             self._tree.state[SUBSTITUTED] += 1  # from here on, steps are those of the batch
             self._forget_numbers()
             self._restructure(*arriving)
@@ -255,15 +252,12 @@ class Solver(Problem):
             if self._pending:
                 self.update()
             elif not self._numbers_current:
-                with self._transaction(*self._arriving()):
+                with Transaction(self):
+                    enter_newest(self._pointers, NONE, NONE)
                     self._renumber_after_batch()
             if (self._tree.vertex[wanted[~self._held[wanted]], CLIQUE] == NOTHING).any():
                 raise GraphSlamError("a covariance was asked for within an update")
         return wanted
-
-    def _after_error(self) -> None:
-        """Forget what an update that failed knew of stages and numbers."""
-        self._stages.young, self._numbers_current = NONE, True
 
     @contextmanager
     def _tree_remade_after_error(self) -> Iterator[None]:
@@ -274,60 +268,6 @@ class Solver(Problem):
             self._pending.broken = True
             raise
 
-    def _integrate(self, vertices: Index, edges: Index) -> tuple[Index, Index, int]:
-        """Solve with all that enters.
-
-        Returns the vertices that were solved, the edges on those that are far from their linearisation point (now moved
-        there), and how many edges were linearised.
-        """
-        pending = self._pending
-        if not (self._numbers_current or pending.broken or pending.moved):
-            self._renumber_after_batch()
-        settings, young = self.settings, self._stages.young
-        again = self._relinearized_first(edges)
-        if not pending and not len(young) and not len(again):
-            return NONE, NONE, 0
-        fresh = np.union1d(edges, young) if len(young) else edges
-        self._stages.begin(edges, settings)
-        if pending.broken:
-            self._forget_numbers()
-            fresh, again = self._active(), NONE
-        elif pending.moved:
-            self._forget_numbers()
-            again = np.setdiff1d(self._active(), fresh)
-        both = np.union1d(fresh, again) if len(again) else fresh
-        self._linearize(both)
-        if pending.broken:
-            vertices = self._unknowns()
-            self._estimates()
-            incremental.reset(self._tree, vertices)
-        failed, solved, far = self._advanced(vertices, fresh, again)
-        if failed != NOTHING:
-            self._refuse_floating()
-            raise undetermined(failed)
-        self._stages.mature(self._tree.value, settings)
-        self._solved_with, self._numbers_current = None, True
-        return solved, far, len(both)
-
-    def _advanced(self, vertices: Index, edges: Index, again: Index) -> tuple[int, Index, Index]:
-        """Advance the tree (``advance``), with as much room as it needs; returns the last three of its results."""
-        touched, limits, unseen = self._pending.touched, self._limits(), self._schedule.unseen()
-        tail = True
-        while True:
-            how, touched, failed, solved, far = advance(
-                self._pointers, edges, touched, vertices, tail, again, unseen, *limits
-            )
-            if how == DONE:
-                return failed, solved, far
-            tail = False
-            if how == DISSECT:
-                touched = np.concatenate((touched, dissect(self._tree, failed)))
-            else:
-                try:
-                    self._tree = more_room(self._tree)
-                finally:  # some arrays may have grown in place
-                    self._locate()
-
     def _continue_batch(self) -> tuple[Index, Index]:
         """Step on from where a batch stopped before the optimum; returns what was solved, and edges that are far."""
         self._unfinished = False
@@ -336,65 +276,3 @@ class Solver(Problem):
             raise undetermined(failed)
         self._schedule.hasten(self.settings.relinearize_every)
         return solved, incremental.relinearize(self._tree, solved, *self._limits()[2:])
-
-    def _relinearized_first(self, edges: Index) -> Index:
-        """Search all vertices for large steps, if it is time before these edges enter; return edges to linearise."""
-        settings, pending = self.settings, self._pending
-        due = self._schedule.is_due(settings.relinearize_every)
-        if due == MAYBE and len(edges) and not pending.broken and incremental.reach_back(self._pointers, edges):
-            due = SURELY
-        if due != SURELY:
-            return NONE
-        self._tree.state[MOTION_MM] = self._schedule.begin(self.graph)
-        if pending.broken:
-            return NONE
-        above, error = settings.relinearize_above, settings.relinearize_error
-        return incremental.relinearize_changed(self._pointers, *self._limits()[:2], (above, above, error))
-
-    def _limits(self) -> tuple[float, float, Limits]:
-        """The tolerances of steps, and the limits above which a step is far (``substitute``)."""
-        return self._schedule.limits(self.graph, self.settings)
-
-    def _relinearized(self, far: Index) -> Iterator[tuple[int, Index]]:
-        """Linearise edges that are far, pass after pass; yields how many were, and the vertices that were solved."""
-        limits, passes = self._limits(), self.settings.relinearize_passes
-        for k in range(passes):
-            self._linearize(far)
-            failed, solved = incremental.renumber(self._tree, far, *limits)
-            if failed != NOTHING:
-                raise undetermined(failed)
-            yield len(far), solved
-            if k == passes - 1:
-                self._schedule.note(solved)
-                return
-            far = incremental.relinearize(self._tree, solved, *limits[2:])
-            if not len(far):
-                return
-
-    def _forget_numbers(self) -> None:
-        """Set the sums to zero, because all edges are about to be linearised."""
-        self._tree.blocks[:] = 0.0
-        self._tree.diagonal[:] = 0.0
-
-    def _restructure(self, vertices: Index, edges: Index) -> None:
-        """Order and group what new vertices and edges touch, without numbers."""
-        if self._pending.broken:
-            vertices = self._unknowns()
-            incremental.reset(self._tree, vertices)
-        try:
-            self._tree = restructure(self._tree, edges, self._pending.touched, vertices, *self._limits()[:2])
-        finally:
-            self._locate()
-
-    def _renumber_after_batch(self) -> None:
-        """Compute the numbers of the tree at the result of a batch. The result stays."""
-        self._linearize(self._active())
-        failed, _ = incremental.renumber(self._tree, self._active(), np.inf, 0.0, NO_LIMITS)
-        if failed != NOTHING:
-            self._pending.broken = True
-        self._numbers_current = True
-
-    def _linearize(self, edges: Index) -> None:
-        """Put the blocks of edges at the linearisation points into the tree."""
-        first, *_, last = 2 * self._stages.losses(self.settings)
-        linearize_into(self._pointers, self.graph, self._tree.value, edges, last, self._stages.young, first)

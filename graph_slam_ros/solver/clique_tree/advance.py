@@ -1,12 +1,11 @@
-"""An update of the clique tree in one call: its structure, its numbers, and what is to be linearised anew."""
+"""An update of the clique tree: its structure, its numbers, and what is to be linearised anew."""
 
 import numpy as np
 
-from graph_slam_ros.lie.jit import kernel
+from graph_slam_ros.lie.jit import inner, kernel
 from graph_slam_ros.solver.clique_tree.incremental import relinearize, solve, with_those_of
 from graph_slam_ros.solver.clique_tree.indices import joined
 from graph_slam_ros.solver.clique_tree.ordering import ROOT, dissect, move_tail
-from graph_slam_ros.solver.clique_tree.pointers import kept_of, tree_of
 from graph_slam_ros.solver.clique_tree.pools import compact, has_outgrown, release, room_for
 from graph_slam_ros.solver.clique_tree.storage import (
     AFFECTED,
@@ -20,13 +19,14 @@ from graph_slam_ros.solver.clique_tree.storage import (
     MEMBERS_TOP,
     MEMBERS_WANTED,
     NOTHING,
+    ZERO,
     Limits,
     Tree,
     with_room,
 )
 from graph_slam_ros.solver.clique_tree.substitution import show, solve_marked
 from graph_slam_ros.solver.clique_tree.symbolic import build, cliques_of, collect, mark, structure
-from graph_slam_ros.typing import Index
+from graph_slam_ros.typing import Array, Index
 
 SPARSE = 1.2  # of the memory of fronts, as a multiple of those in use: then it is compacted, not lengthened
 SPARE = 1 << 16  # numbers of fronts for which that does not pay
@@ -35,7 +35,7 @@ DONE, ROOM, DISSECT = range(3)  # how ``advance`` ends
 
 
 @kernel
-def _regroup(t: Tree, touched: Index, new: Index, tolerance: float, sigmas: float) -> tuple[bool, Index]:
+def regroup(t: Tree, touched: Index, new: Index, tolerance: float, sigmas: float) -> tuple[bool, Index]:
     """Apply changes of the structure to the tree: eliminate what they touch again, and group it into cliques.
 
     Parameters
@@ -82,7 +82,7 @@ def restructure(tree: Tree, edges: Index, touched: Index, new: Index, tolerance:
             tail = False
         if overgrown != NOTHING:
             touched = np.concatenate((touched, dissect(tree, overgrown)))
-        done, _ = _regroup(tree, touched, new, tolerance, sigmas)
+        done, _ = regroup(tree, touched, new, tolerance, sigmas)
         if not done:
             tree = more_room(tree)
         elif has_outgrown(tree):
@@ -91,9 +91,10 @@ def restructure(tree: Tree, edges: Index, touched: Index, new: Index, tolerance:
             return tree
 
 
-@kernel
+@inner
 def advance(
-    pointers: Index,
+    t: Tree,
+    kept: Array,
     edges: Index,
     touched: Index,
     new: Index,
@@ -103,10 +104,10 @@ def advance(
     tolerance: float,
     sigmas: float,
     far: Limits,
-) -> tuple[int, Index, int, Index, Index]:
+) -> tuple[int, int, int, Index]:
     """Apply changes of the structure to the tree, solve, and relinearise what is far (``substitute``).
 
-    If nothing is far, the estimates of what was solved are kept.
+    If nothing is far, the estimates of what was solved are computed and kept.
 
     Parameters
     ----------
@@ -117,27 +118,28 @@ def advance(
 
     Returns
     -------
-    DONE; or ROOM or DISSECT, where the pools are too small, or a region is to be dissected, before it is called again
-    with the touched vertices, which come next. Then a vertex that has no pivot, or the region, or NOTHING; the vertices
-    that were solved; the edges to linearise at once.
+    * DONE; a vertex that has no pivot, or NOTHING; how many vertices were solved; if there are edges to linearise at
+      once: these vertices, then those edges.
+    * ROOM or DISSECT, where the pools are too small, or a region is to be dissected, before it is called again; the
+      region; 0; the touched vertices.
     """
-    t, none = tree_of(pointers), edges[:0].copy()
     if tail:
         touched, overgrown = move_tail(t, edges, touched)
         if overgrown != NOTHING:
-            return DISSECT, touched, overgrown, none, none
-    done, cliques = _regroup(t, touched, new, tolerance, sigmas)
+            return DISSECT, overgrown, ZERO, touched
+    done, cliques = regroup(t, touched, new, tolerance, sigmas)
     if not done:
-        return ROOM, touched, NOTHING, none, none
+        return ROOM, ZERO + NOTHING, ZERO, touched
     if len(again):
         cliques = with_those_of(t, cliques, again)
     failed, solved = solve(t, cliques, tolerance, sigmas, far)
     if failed != NOTHING:
-        return DONE, touched, failed, none, none
-    found = relinearize(t, joined(solved, unseen), far)
-    if not len(found):
-        show(t, kept_of(pointers), solved)
-    return DONE, touched, NOTHING, solved, found
+        return DONE, failed, ZERO, solved
+    found = relinearize(t, joined(solved, unseen) if len(unseen) else solved, far)
+    if len(found):
+        return DONE, failed, len(solved), joined(solved, found)
+    show(t, kept, solved)
+    return DONE, failed, len(solved), found
 
 
 def more_room(tree: Tree) -> Tree:

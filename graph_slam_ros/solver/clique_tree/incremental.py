@@ -12,6 +12,7 @@ from graph_slam_ros.solver.clique_tree.storage import (
     CLIQUE,
     CLIQUES,
     DEFERRED_COUNT,
+    ENTERED,
     FLOPS,
     FREE,
     FREE_CLIQUE,
@@ -55,6 +56,7 @@ MUCH = 0.2  # of the threshold above which a vertex is linearised anew: changes 
 def enter(t: Tree, vertices: Index, edges: Index) -> None:
     """Make vertices the newest unknowns, and put edges into the structure; their blocks are not computed yet."""
     vertex, tail, state = t.vertex, t.tail, t.state
+    state[ENTERED] += 1
     for v in vertices:
         vertex[v, FREE] = 1
         vertex[v, REGION] = vertex[v, NEXT] = vertex[v, CLIQUE] = NOTHING
@@ -200,9 +202,9 @@ def relinearize_changed(pointers: Index, tolerance: float, sigmas: float, above:
 
 
 @kernel
-def reach_back(pointers: Index, edges: Index) -> bool:
+def reach_back(t: Tree, edges: Index) -> bool:
     """Return whether one of the edges reaches a vertex that has left the tail: it closes a loop."""
-    t, back = tree_of(pointers), False
+    back = False
     for v in ends_of(t, edges):
         back = back or t.vertex[v, REGION] != NOTHING
     return back

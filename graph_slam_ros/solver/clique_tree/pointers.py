@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from graph_slam_ros.lie.addresses import address_of, integers, reals
+from graph_slam_ros.lie.addresses import address_of, integers, reals, table
 from graph_slam_ros.lie.jit import inner, kernel
 from graph_slam_ros.solver.clique_tree.storage import (
     CLIQUE_COLUMNS,
@@ -36,25 +36,20 @@ def kept_of(p: Index) -> Array:
 
 
 @kernel
-def _table(p: Index, k: int, columns: int) -> Index:
-    return integers(p[2 * k], p[2 * k + 1] * columns).reshape(p[2 * k + 1], columns)
-
-
-@kernel
 def tree_of(p: Index) -> Tree:
     """Return the tree whose ``pointers_of`` these are."""
     return Tree(
-        _table(p, 0, VERTEX_COLUMNS),
-        _table(p, 1, EDGE_COLUMNS),
-        _table(p, 2, LINK_COLUMNS),
-        _table(p, 3, CLIQUE_COLUMNS),
-        _table(p, 4, REGION_COLUMNS),
+        table(p[0], p[1], VERTEX_COLUMNS),
+        table(p[2], p[3], EDGE_COLUMNS),
+        table(p[4], p[5], LINK_COLUMNS),
+        table(p[6], p[7], CLIQUE_COLUMNS),
+        table(p[8], p[9], REGION_COLUMNS),
         integers(p[10], p[11]),
         integers(p[12], p[13]),
         integers(p[14], p[15]),
         integers(p[16], p[17]),
         integers(p[18], p[19]),
-        _table(p, 10, LIST_COLUMNS),
+        table(p[20], p[21], LIST_COLUMNS),
         reals(p[22], p[23]),
         reals(p[24], p[25]),
         reals(p[26], p[27]),

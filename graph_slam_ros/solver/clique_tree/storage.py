@@ -105,8 +105,9 @@ R_PARENT, R_DEPTH, R_LEFT, R_RIGHT, R_COUNT, R_MADE, R_FIRST, REGION_COLUMNS = r
     STALE_COUNT,
     DEFERRED_COUNT,
     MOTION_MM,
+    ENTERED,
     STATE_COLUMNS,
-) = range(31)
+) = range(32)
 
 Limits = tuple[float, float, float]
 """Limits of a step: of any component [m, rad], of the turn of a pose [rad], and of the square of the largest component.
