@@ -6,7 +6,7 @@ the arrays alive.
 """
 
 from collections.abc import Callable
-from ctypes import POINTER, c_bool, c_double, c_int64, cast
+from ctypes import POINTER, addressof, c_bool, c_char, c_double, c_int64, cast
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,8 @@ from graph_slam_ros.typing import Array, Index, Mask
 
 def address_of(array: NDArray[Any]) -> int:
     """Return where an array begins. An array that is replaced or grows is elsewhere."""
+    if array.nbytes:  # NumPy's own way takes three times as long
+        return addressof(c_char.from_buffer(array))
     begin: int = array.__array_interface__["data"][0]
     return begin
 

@@ -9,7 +9,17 @@ from graph_slam_ros.graph.records import table_at
 from graph_slam_ros.lie.addresses import flags, integers, reals
 from graph_slam_ros.lie.jit import inner, kernel
 from graph_slam_ros.solver.clique_tree.incremental import enter
-from graph_slam_ros.solver.clique_tree.pointers import EDGE_INSIDE, HELD, INSIDE, SHAPES, kept_of, tree_of
+from graph_slam_ros.solver.clique_tree.pointers import (
+    EDGE_INSIDE,
+    HELD,
+    INSIDE,
+    SHAPE_DOF,
+    SHAPE_KIND,
+    SHAPE_SIZE,
+    kept_of,
+    shapes_of,
+    tree_of,
+)
 from graph_slam_ros.solver.clique_tree.storage import (
     ACTIVE,
     BLOCK,
@@ -93,7 +103,10 @@ def record(
         for e in edges:
             if table_of[e] == code:
                 _append_edge(t, table_at(graph, code), e, row_of[e])
+    for e in edges:
+        edge_inside[e] = True
     for v in new:
+        inside[v] = True
         there = max(there, t.vertex[v, KEY] != NOTHING)
     return RECORDED, there, 0
 
@@ -104,8 +117,7 @@ def _append_vertices(t: Tree, graph: Index, pointers: Index, first: int, end: in
     if first == end:
         return
     vertex, t_step, value, estimate = t.vertex, t.step, t.value, t.estimate
-    kept = kept_of(pointers)
-    shapes = integers(pointers[SHAPES], 3 * pointers[SHAPES + 1])
+    kept, shapes = kept_of(pointers), shapes_of(pointers)
     kinds, offset = integers(graph[records.KIND], end), integers(graph[records.OFFSET], end)
     initial = reals(graph[records.INITIAL], numbers)
     step = 0 if first == 0 else vertex[first - 1, STEP] + vertex[first - 1, DOF]
@@ -113,13 +125,13 @@ def _append_vertices(t: Tree, graph: Index, pointers: Index, first: int, end: in
         for k in range(vertex.shape[1]):
             vertex[v, k] = NOTHING
         vertex[v, FREE] = vertex[v, CHANGED] = vertex[v, NOTED] = 0
-        at, of = offset[v], 3 * kinds[v]
-        dof = shapes[of]
-        vertex[v, DOF], vertex[v, KIND] = dof, shapes[of + 2]
+        at, of = offset[v], kinds[v]
+        dof = shapes[of, SHAPE_DOF]
+        vertex[v, DOF], vertex[v, KIND] = dof, shapes[of, SHAPE_KIND]
         vertex[v, STEP], vertex[v, VALUE] = step, at
         for i in range(step, step + dof):
             t_step[i] = 0.0
-        for i in range(at, at + shapes[of + 1]):
+        for i in range(at, at + shapes[of, SHAPE_SIZE]):
             value[i] = estimate[i] = kept[i] = initial[i]
         step += dof
 

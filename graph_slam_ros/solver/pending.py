@@ -36,11 +36,10 @@ class PendingChanges:
         is_special = self.back or self.may_float or self.moved or self.broken
         return not is_special and len(self.vertices) + len(self.new) > 0
 
-    def add(self, vertices: Index, edges: Index) -> None:
-        """Append new vertices and edges."""
+    def with_more(self, vertices: Index, edges: Index) -> tuple[Index, Index]:
+        """Return all added vertices and edges, with more of them."""
         all_vertices = np.concatenate((self.vertices, vertices)) if len(self.vertices) else vertices
-        all_new = np.concatenate((self.new, edges)) if len(self.new) else edges
-        self.vertices, self.new = all_vertices, all_new  # both, or where memory lacks neither
+        return all_vertices, np.concatenate((self.new, edges)) if len(self.new) else edges
 
     def again(self, edges: Index) -> None:
         """Append edges to be linearised again, even if they are pending already."""

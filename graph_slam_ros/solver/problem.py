@@ -15,7 +15,7 @@ from graph_slam_ros.solver.batch import Settings
 from graph_slam_ros.solver.clique_tree import incremental
 from graph_slam_ros.solver.clique_tree.numeric import accept_steps
 from graph_slam_ros.solver.clique_tree.ordering import ends_of
-from graph_slam_ros.solver.clique_tree.pointers import pointers_of
+from graph_slam_ros.solver.clique_tree.pointers import SHAPE_COLUMNS, pointers_of
 from graph_slam_ros.solver.clique_tree.pools import compact
 from graph_slam_ros.solver.clique_tree.storage import (
     ACTIVE,
@@ -57,7 +57,7 @@ class Problem:
         self.graph = graph
         self.settings = settings or Settings()
         self._tree = empty_tree()
-        self._shapes = np.zeros((0, 3), dtype=np.int64)  # of the graph's kinds
+        self._shapes = np.zeros((0, SHAPE_COLUMNS), dtype=np.int64)  # of the graph's kinds
         self._room = 0, 0, 0  # for vertices, their numbers, and edges
         self._vertices = 0  # of the graph, that have a record in the tree
         self._inside = np.zeros(0, dtype=bool)  # vertices of the problem
@@ -70,9 +70,10 @@ class Problem:
     def add(self, vertices: ArrayLike, edges: ArrayLike) -> None:
         """Add vertices (at their initial values) and edges of the graph to the problem, by id, each once."""
         new, new_edges = whole_numbers(vertices, "vertex").ravel(), whole_numbers(edges, "edge").ravel()
-        self._pending.broken |= self._record(new, new_edges)  # removed before: they are in the order still
-        self._pending.add(new, new_edges)
-        self._inside[new], self._edge_inside[new_edges] = True, True
+        pending = self._pending
+        of_all = pending.with_more(new, new_edges)  # before anything changes: it needs memory
+        pending.broken |= self._record(new, new_edges)  # removed before: they are in the order still
+        pending.vertices, pending.new = of_all
 
     def start_at(self, values: Array) -> None:
         """Start from other values than the graph's initial ones: the stored numbers of all vertices in one array."""

@@ -4,7 +4,9 @@ import math
 
 import numpy as np
 
-from graph_slam_ros.graph import INVERSE_RELATIVE_POSE, RELATIVE_POSE, RELATIVE_POSE_3D, Graph
+from graph_slam_ros.graph import INVERSE_RELATIVE_POSE, RELATIVE_POSE, RELATIVE_POSE_3D, Graph, records
+from graph_slam_ros.lie.addresses import integers, reals
+from graph_slam_ros.lie.jit import kernel
 from graph_slam_ros.solver.batch import Settings
 from graph_slam_ros.solver.clique_tree.storage import Limits
 from graph_slam_ros.solver.pending import NONE
@@ -87,22 +89,39 @@ class MotionLength:
     def __init__(self) -> None:
         self._rows = dict.fromkeys(_MOTIONS, 0)
         self._times = np.zeros(_CLASSES, dtype=np.int64)
+        self._median = 0  # class of lengths
 
     def typical_mm(self, graph: Graph) -> int:
         """Return the length in mm, a metre at least."""
-        for edge_type, n in _MOTIONS.items():
+        for edge_type, components in _MOTIONS.items():
             table, known = graph.tables.get(edge_type), self._rows[edge_type]
             count = len(table) if table else 0
             if count < known:  # edges were removed
-                self._times[:], self._rows = 0, dict.fromkeys(_MOTIONS, 0)
+                self._times[:], self._rows, self._median = 0, dict.fromkeys(_MOTIONS, 0), 0
                 return self.typical_mm(graph)
             if table and count > known:
                 of_label = graph.labels.index(_SIGHTINGS) if _SIGHTINGS in graph.labels else -1
-                moved = table.measured.values[known:, :n][table.label.values[known:] != of_label]
-                square = np.square(np.clip(moved, -_FARTHEST_M, _FARTHEST_M)).sum(axis=1)
-                classes = np.floor(0.5 * _PER_OCTAVE * np.log2(np.maximum(square, 1.0)))
-                self._times += np.bincount(np.minimum(classes, _CLASSES - 1).astype(np.int64), minlength=_CLASSES)
+                self._median = _median_class(table.pointers, known, count, components, of_label, self._times)
                 self._rows[edge_type] = count
-        many = np.cumsum(self._times)
-        median = int(np.searchsorted(many, 0.5 * many[-1])) if many[-1] else 0
-        return round(1000.0 * 2.0 ** (median / _PER_OCTAVE))
+        return round(1000.0 * 2.0 ** (self._median / _PER_OCTAVE))
+
+
+@kernel
+def _median_class(table: Index, first: int, end: int, components: int, left_out: int, times: Index) -> int:
+    """Count some rows of a table by their lengths, but for those of one label; return the class of the median."""
+    size = table[records.MEASURED_SIZE]
+    measured, label = reals(table[records.MEASURED], end * size), integers(table[records.LABEL], end)
+    for row in range(first, end):
+        square = 0.0
+        for k in range(row * size, row * size + components):
+            square += min(max(measured[k], -_FARTHEST_M), _FARTHEST_M) ** 2
+        if label[row] != left_out:
+            times[min(int(np.floor(0.5 * _PER_OCTAVE * np.log2(max(square, 1.0)))), len(times) - 1)] += 1
+    total, counted = 0, 0
+    for count in times:
+        total += count
+    for k in range(len(times)):
+        counted += times[k]
+        if 2 * counted >= total:
+            return k
+    return 0

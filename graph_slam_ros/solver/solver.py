@@ -136,12 +136,9 @@ class Solver(OnlineProblem):
         at = whole_numbers(ids, "vertex").ravel()
         if not len(at):
             return np.empty((0, 0))
-        graph, first = self.graph, int(at[0])
-        if not 0 <= first < self._vertices:
-            existing(at, self._vertices, "vertex")
-        kinds, settings = graph.kind.values, self.settings
-        size, tolerances = graph.kinds[kinds[first]].size, (settings.tolerance, settings.tolerance_sigmas)
-        unfit, out = read(self._pointers, kinds, at, size, *tolerances)
+        settings = self.settings
+        tolerances = settings.tolerance, settings.tolerance_sigmas
+        unfit, out = read(self.graph.pointers, self._pointers, self._vertices, at, *tolerances)
         if unfit != NOTHING:
             existing(at, self._vertices, "vertex")
             raise GraphSlamError("estimate: the vertices are not of one kind")

@@ -21,6 +21,7 @@ from graph_slam_ros.typing import Array, Index
 # behind those of the tree, the arrays of the problem: the estimate that the last call left; which vertices are in it,
 # which are held, which edges are in it; the shapes of the graph's kinds (degrees of freedom, stored numbers, kind)
 KEPT, INSIDE, HELD, EDGE_INSIDE, SHAPES = range(2 * len(Tree._fields), 2 * len(Tree._fields) + 10, 2)
+SHAPE_DOF, SHAPE_SIZE, SHAPE_KIND, SHAPE_COLUMNS = range(4)
 
 
 def pointers_of(tree: Tree, *more: NDArray[Any]) -> Index:
@@ -33,6 +34,12 @@ def pointers_of(tree: Tree, *more: NDArray[Any]) -> Index:
 def kept_of(p: Index) -> Array:
     """Return the estimate that the last call left."""
     return reals(p[KEPT], p[KEPT + 1])
+
+
+@inner
+def shapes_of(p: Index) -> Index:
+    """Return the shapes of the graph's kinds."""
+    return table(p[SHAPES], p[SHAPES + 1], SHAPE_COLUMNS)
 
 
 @kernel

@@ -228,13 +228,8 @@ def empty_tree() -> Tree:
 
 def with_room(tree: Tree, **lengths: int) -> Tree:
     """Return the tree with arrays of at least so many rows."""
-    for name, count in lengths.items():
-        if len(getattr(tree, name)) < count:
-            break
-    else:
-        return tree
-    short = {name: count for name, count in lengths.items() if len(getattr(tree, name)) < count}
-    return tree._replace(**{name: longer(getattr(tree, name), n) for name, n in short.items()})
+    short = [name for name, count in lengths.items() if len(getattr(tree, name)) < count]
+    return tree._replace(**{name: longer(getattr(tree, name), lengths[name]) for name in short}) if short else tree
 
 
 def longer(array: NDArray[Any], count: int) -> NDArray[Any]:

@@ -8,12 +8,14 @@ A clique waits if a step of its separator changed after its own solution.
 
 import numpy as np
 
+from graph_slam_ros.graph import records
 from graph_slam_ros.graph.retraction import PLANAR, SPATIAL
+from graph_slam_ros.lie.addresses import integers
 from graph_slam_ros.lie.jit import inner, kernel
 from graph_slam_ros.solver.clique_tree.dense import solve_upper
 from graph_slam_ros.solver.clique_tree.indices import in_order, lengthened
 from graph_slam_ros.solver.clique_tree.numeric import retract
-from graph_slam_ros.solver.clique_tree.pointers import kept_of, tree_of
+from graph_slam_ros.solver.clique_tree.pointers import SHAPE_SIZE, kept_of, shapes_of, tree_of
 from graph_slam_ros.solver.clique_tree.storage import (
     CHANGED,
     CHILD,
@@ -290,14 +292,22 @@ def show_all(t: Tree, kept: Array, tolerance: float, sigmas: float) -> None:
 
 
 @kernel
-def read(pointers: Index, kind: Index, ids: Index, size: int, tolerance: float, sigmas: float) -> tuple[int, Array]:
-    """Return stored numbers (n, size) of vertices of the first one's kind, and the index of an unfit id or NOTHING."""
+def read(
+    graph: Index, pointers: Index, vertices: int, ids: Index, tolerance: float, sigmas: float
+) -> tuple[int, Array]:
+    """Return an unfit id's index or NOTHING, and the stored numbers (n, size) of vertices of the first one's kind.
+
+    Parameters
+    ----------
+    graph : pointers of the graph; vertices : how many it has; ids : one at least
+    """
     t, kept = tree_of(pointers), kept_of(pointers)
-    vertex, estimate = t.vertex, t.estimate
-    out = np.empty((len(ids), size))
+    vertex, estimate, kind = t.vertex, t.estimate, integers(graph[records.KIND], vertices)
     for k in range(len(ids)):
-        if ids[k] < 0 or ids[k] >= len(kind) or kind[ids[k]] != kind[ids[0]]:
-            return k, out
+        if ids[k] < 0 or ids[k] >= vertices or kind[ids[k]] != kind[ids[0]]:
+            return k, np.empty((0, 0))
+    size = shapes_of(pointers)[kind[ids[0]], SHAPE_SIZE]
+    out = np.empty((len(ids), size))
     if len(ids) > FEW:
         show_all(t, kept, tolerance, sigmas)
     elif t.state[STALE_COUNT] or t.state[DEFERRED_COUNT]:
