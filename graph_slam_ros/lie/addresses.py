@@ -20,7 +20,7 @@ from graph_slam_ros.typing import Array, Index, Mask
 def address_of(array: NDArray[Any]) -> int:
     """Return where an array begins. An array that is replaced or grows is elsewhere."""
     if array.nbytes:  # NumPy's own way takes three times as long
-        return addressof(c_char.from_buffer(array))
+        return addressof(c_char.from_buffer(array))  # type: ignore[arg-type]
     begin: int = array.__array_interface__["data"][0]
     return begin
 

@@ -42,8 +42,8 @@ def whiten(
 ) -> tuple[Array, Array]:
     """Multiply residuals and Jacobians by sqrt(weight * rho') R in place; returns chi2 and cost of each edge."""
     n, m, width = jacobian.shape
-    chi2, cost = np.zeros(n), np.zeros(n)
-    r, j = np.zeros(m), np.zeros((m, width))
+    both, white = np.empty((2, n)), np.empty((width + 1) * m)  # few arrays: to make one takes as long as much of this
+    chi2, cost, r, j = both[0], both[1], white[:m], white[m:].reshape(m, width)
     for e in range(n):
         row = rows[e]
         s = 0.0
@@ -244,10 +244,10 @@ def linearize_edges(t: Tree, graph: Index, edges: Index, losses: Index, young: I
         t.edge[e, MARKED] = 0  # an error may have left it
     for e in young:
         t.edge[e, MARKED] = 1
-    bad, of_bad = ZERO + NOTHING, ZERO + NOTHING
+    bad, of_bad, rows = ZERO + NOTHING, ZERO + NOTHING, np.empty(len(edges), np.int64)
     for is_old in range(0 if len(young) else 1, 2):
         for code in range(len(graph) - records.TABLES if bad == NOTHING else 0):
-            count, rows = ZERO, np.empty(len(edges), np.int64)
+            count = ZERO
             for e in edges:
                 if table_of[e] == code and t.edge[e, MARKED] != is_old:
                     rows[count] = row_of[e]

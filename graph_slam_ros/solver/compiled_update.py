@@ -5,8 +5,7 @@ Where Python is needed the call ends early, and is made again from the next stag
 
 from graph_slam_ros.lie.jit import kernel
 from graph_slam_ros.solver.blocks import linearize_edges
-from graph_slam_ros.solver.clique_tree import advance as tree_update
-from graph_slam_ros.solver.clique_tree.advance import advance
+from graph_slam_ros.solver.clique_tree.advance import ENDS, advance_tree
 from graph_slam_ros.solver.clique_tree.incremental import enter, reach_back
 from graph_slam_ros.solver.clique_tree.pointers import kept_of, tree_of
 from graph_slam_ros.solver.clique_tree.storage import NOTHING, ZERO, Limits
@@ -15,8 +14,7 @@ from graph_slam_ros.solver.relinearization import MAYBE, SURELY
 from graph_slam_ros.typing import Index
 
 CHECK, LINEARIZE, ORDER, GROUP = range(4)  # stages: where the call begins
-DONE, ROOM, DISSECT = tree_update.DONE, tree_update.ROOM, tree_update.DISSECT  # how it ends
-UNSURE, SEARCH, PLAIN = range(3, 6)
+UNSURE, SEARCH, PLAIN = range(ENDS, ENDS + 3)  # how it ends where the tree was not advanced
 
 
 @kernel
@@ -46,18 +44,18 @@ def update(
     due : whether all vertices that moved are to be searched for large steps (``RelinearizationSchedule.is_due``)
     vertices, edges : that enter or have changed
     linear : edges to linearise: these, and those ``again`` that are far from where they were linearised
-    touched, unseen, tolerance, sigmas, far : see ``advance``
+    touched, unseen, tolerance, sigmas, far : see ``advance_tree``
     young, losses : edges held to the first stage of their loss; pointers of the losses of first and last stage
 
     Returns
     -------
-    What ``advance`` returns; or, and the rest says nothing:
+    What ``advance_tree`` returns; or, and the rest says nothing:
 
     * UNSURE: it may be that nothing fixes a vertex, or one is held, or an edge has no weight. Nothing was changed
     * SEARCH: they have entered, and it is time to search
     * PLAIN: an edge is not compiled, or its cost is not finite
     """
-    t, nothing = tree_of(pointers), vertices[:0].copy()
+    t, nothing = tree_of(pointers), vertices[:0]
     if stage <= CHECK:
         if how_anchored(t, graph, pointers, vertices, edges) != ANCHORED:
             return UNSURE, ZERO, ZERO, nothing
@@ -69,4 +67,4 @@ def update(
         if table != NOTHING:
             return PLAIN, ZERO, ZERO, nothing
     tail = stage <= ORDER
-    return advance(t, kept_of(pointers), edges, touched, vertices, tail, again, unseen, tolerance, sigmas, far)
+    return advance_tree(t, kept_of(pointers), edges, touched, vertices, tail, again, unseen, tolerance, sigmas, far)

@@ -103,10 +103,7 @@ def record(
         for e in edges:
             if table_of[e] == code:
                 _append_edge(t, table_at(graph, code), e, row_of[e])
-    for e in edges:
-        edge_inside[e] = True
     for v in new:
-        inside[v] = True
         there = max(there, t.vertex[v, KEY] != NOTHING)
     return RECORDED, there, 0
 

@@ -7,21 +7,10 @@ import numpy as np
 from graph_slam_ros.graph import Graph
 from graph_slam_ros.solver.batch import Settings
 from graph_slam_ros.solver.clique_tree import incremental
-from graph_slam_ros.solver.clique_tree.advance import more_room, restructure
+from graph_slam_ros.solver.clique_tree.advance import DISSECT, DONE, more_room, restructure
 from graph_slam_ros.solver.clique_tree.ordering import dissect
 from graph_slam_ros.solver.clique_tree.storage import MOTION_MM, NOTHING, Limits
-from graph_slam_ros.solver.compiled_update import (
-    CHECK,
-    DISSECT,
-    DONE,
-    GROUP,
-    LINEARIZE,
-    ORDER,
-    PLAIN,
-    SEARCH,
-    UNSURE,
-    update,
-)
+from graph_slam_ros.solver.compiled_update import CHECK, GROUP, LINEARIZE, ORDER, PLAIN, SEARCH, UNSURE, update
 from graph_slam_ros.solver.entry import enter_newest
 from graph_slam_ros.solver.gauge import undetermined
 from graph_slam_ros.solver.linearization import linearize_into
@@ -88,8 +77,9 @@ class OnlineProblem(Problem):
             raise undetermined(what)
         stages.mature(self._tree.value, settings)
         self._solved_with, self._numbers_current = None, True
-        far = found[count:]
-        return len(linear), count, found[:count] if len(far) else NONE, far
+        if not len(found):
+            return len(linear), count, NONE, NONE
+        return len(linear), count, found[:count], found[count:]
 
     def _entered(self, due: int) -> tuple[int, Index, Index, Index, Index]:
         """Let all that is pending enter, of whatever kind it is.

@@ -36,10 +36,11 @@ class PendingChanges:
         is_special = self.back or self.may_float or self.moved or self.broken
         return not is_special and len(self.vertices) + len(self.new) > 0
 
-    def with_more(self, vertices: Index, edges: Index) -> tuple[Index, Index]:
-        """Return all added vertices and edges, with more of them."""
+    def add(self, vertices: Index, edges: Index) -> None:
+        """Append new vertices and edges."""
         all_vertices = np.concatenate((self.vertices, vertices)) if len(self.vertices) else vertices
-        return all_vertices, np.concatenate((self.new, edges)) if len(self.new) else edges
+        all_new = np.concatenate((self.new, edges)) if len(self.new) else edges
+        self.vertices, self.new = all_vertices, all_new  # both, or where memory lacks neither
 
     def again(self, edges: Index) -> None:
         """Append edges to be linearised again, even if they are pending already."""

@@ -70,10 +70,9 @@ class Problem:
     def add(self, vertices: ArrayLike, edges: ArrayLike) -> None:
         """Add vertices (at their initial values) and edges of the graph to the problem, by id, each once."""
         new, new_edges = whole_numbers(vertices, "vertex").ravel(), whole_numbers(edges, "edge").ravel()
-        pending = self._pending
-        of_all = pending.with_more(new, new_edges)  # before anything changes: it needs memory
-        pending.broken |= self._record(new, new_edges)  # removed before: they are in the order still
-        pending.vertices, pending.new = of_all
+        self._pending.broken |= self._record(new, new_edges)  # removed before: they are in the order still
+        self._pending.add(new, new_edges)
+        self._inside[new], self._edge_inside[new_edges] = True, True
 
     def start_at(self, values: Array) -> None:
         """Start from other values than the graph's initial ones: the stored numbers of all vertices in one array."""

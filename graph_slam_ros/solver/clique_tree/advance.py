@@ -31,7 +31,7 @@ from graph_slam_ros.typing import Array, Index
 SPARSE = 1.2  # of the memory of fronts, as a multiple of those in use: then it is compacted, not lengthened
 SPARE = 1 << 16  # numbers of fronts for which that does not pay
 STRETCH = 1 << 13  # numbers of fronts by which it is lengthened at least
-DONE, ROOM, DISSECT = range(3)  # how ``advance`` ends
+DONE, ROOM, DISSECT, ENDS = range(4)  # how ``advance_tree`` ends
 
 
 @kernel
@@ -73,7 +73,10 @@ def regroup(t: Tree, touched: Index, new: Index, tolerance: float, sigmas: float
 
 
 def restructure(tree: Tree, edges: Index, touched: Index, new: Index, tolerance: float, sigmas: float) -> Tree:
-    """Return the tree after changes of the structure; its new cliques have no numbers yet. Arguments as ``advance``."""
+    """Return the tree after changes of the structure; its new cliques have no numbers.
+
+    Arguments are those of ``advance_tree``.
+    """
     tail = True
     while True:
         overgrown = NOTHING
@@ -92,7 +95,7 @@ def restructure(tree: Tree, edges: Index, touched: Index, new: Index, tolerance:
 
 
 @inner
-def advance(
+def advance_tree(
     t: Tree,
     kept: Array,
     edges: Index,
@@ -143,7 +146,7 @@ def advance(
 
 
 def more_room(tree: Tree) -> Tree:
-    """Return the tree with room for what ``advance`` could not place: compacted, or with longer pools."""
+    """Return the tree with room for what ``advance_tree`` could not place: compacted, or with longer pools."""
     state = tree.state
     if state[FRONTS_TOP] > max(SPARSE * state[LIVE], state[LIVE] + SPARE):
         compact(tree)

@@ -16,7 +16,8 @@ RUN = 16  # numbers that are sorted by insertion
 def ascending(numbers: Index) -> Index:
     """Return the indices that sort some numbers; equal ones keep their order. Short runs are merged."""
     n, width = len(numbers), RUN
-    order, merged = np.empty(n, np.int64), np.empty(n, np.int64)
+    order = np.empty(n, np.int64)
+    merged = np.empty(n, np.int64) if n > width else order
     for low in range(0, n, width):
         for k in range(low, min(low + width, n)):
             i = k

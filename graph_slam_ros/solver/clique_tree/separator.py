@@ -27,6 +27,8 @@ SEPARATOR: Any = np.int64(2)  # side; not a literal, for which kernels would be 
 @kernel
 def separate(start: Index, neighbour: Index, strength: Index, weight: Index) -> Index:
     """The side of each vertex, 0 or 1, or 2 where it separates them."""
+    if len(weight) <= COARSE:
+        return _first(start, neighbour, weight)
     starts, neighbours, strengths, weights = [start], [neighbour], [strength], [weight]
     coarser = [start[:0]]
     while len(weights[-1]) > COARSE:

@@ -295,12 +295,7 @@ def show_all(t: Tree, kept: Array, tolerance: float, sigmas: float) -> None:
 def read(
     graph: Index, pointers: Index, vertices: int, ids: Index, tolerance: float, sigmas: float
 ) -> tuple[int, Array]:
-    """Return an unfit id's index or NOTHING, and the stored numbers (n, size) of vertices of the first one's kind.
-
-    Parameters
-    ----------
-    graph : pointers of the graph; vertices : how many it has; ids : one at least
-    """
+    """Return an unfit id's index or NOTHING, and stored numbers (n, size) of vertices, one at least, of one kind."""
     t, kept = tree_of(pointers), kept_of(pointers)
     vertex, estimate, kind = t.vertex, t.estimate, integers(graph[records.KIND], vertices)
     for k in range(len(ids)):

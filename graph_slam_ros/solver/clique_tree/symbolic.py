@@ -125,10 +125,11 @@ def structure(t: Tree, order: Index, orphans: Index) -> tuple[Index, Index]:
     n = len(order)
     for k in range(n):
         vertex[order[k], LOCAL] = k
-    orphan_of, orphan_next = _by_first(t, orphans, n)
-    child_of, child_next = np.full(n, NOTHING, np.int64), np.full(n, NOTHING, np.int64)
-    seen = np.full(n, NOTHING, np.int64)
-    start = np.zeros(n + 1, np.int64)
+    scratch = np.full(4 * n + len(orphans), NOTHING, np.int64)  # one array: each takes as long as ten vertices
+    child_of, child_next, seen = scratch[:n], scratch[n : 2 * n], scratch[2 * n : 3 * n]
+    orphan_of, orphan_next = scratch[3 * n : 4 * n], scratch[4 * n :]
+    _link_by_first(t, orphans, n, orphan_of, orphan_next)
+    start = np.empty(n + 1, np.int64)
     later = np.empty(8 * n + 64, np.int64)
     top = ZERO
     for k in range(n):
@@ -154,17 +155,16 @@ def structure(t: Tree, order: Index, orphans: Index) -> tuple[Index, Index]:
             parent = later[start[k]]
             child_next[k] = child_of[parent]
             child_of[parent] = k
-        start[k + 1] = top
+    start[n] = top
     for v in order:
         vertex[v, LOCAL] = NOTHING
     return start, later
 
 
 @inner
-def _by_first(t: Tree, orphans: Index, n: int) -> tuple[Index, Index]:
-    """Linked lists of the orphans by the vertex of their separator that is eliminated first."""
+def _link_by_first(t: Tree, orphans: Index, n: int, orphan_of: Index, orphan_next: Index) -> None:
+    """Link the orphans to lists by the vertex of their separator that is eliminated first."""
     vertex, clique, members = t.vertex, t.clique, t.members
-    orphan_of, orphan_next = np.full(n, NOTHING, np.int64), np.empty(len(orphans), np.int64)
     for i in range(len(orphans)):
         c = orphans[i]
         first = n
@@ -172,7 +172,6 @@ def _by_first(t: Tree, orphans: Index, n: int) -> tuple[Index, Index]:
             first = min(first, vertex[members[m], LOCAL])
         orphan_next[i] = orphan_of[first]
         orphan_of[first] = i
-    return orphan_of, orphan_next
 
 
 @kernel
@@ -224,8 +223,8 @@ def cliques_of(t: Tree, order: Index, start: Index, later: Index) -> tuple[Index
     """
     vertex = t.vertex
     n = len(order)
-    clique = np.empty(n, np.int64)
-    last, head, size = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.int64)
+    made = np.empty(4 * n, np.int64)
+    clique, last, head, size = made[:n], made[n : 2 * n], made[2 * n : 3 * n], made[3 * n :]
     count = 0
     for k in range(n - 1, -1, -1):
         dof = vertex[order[k], DOF]
@@ -253,9 +252,8 @@ def build(
     """Write the new cliques into the tree; returns them, children before parents."""
     vertex, clique, members = t.vertex, t.clique, t.members
     n, count = len(order), len(last)
-    new = np.empty(count, np.int64)
-    fill = np.empty(count, np.int64)
-    frontals = np.zeros(count, np.int64)
+    made = np.zeros(4 * count, np.int64)
+    new, fill, frontals, upwards = made[:count], made[count : 2 * count], made[2 * count : 3 * count], made[3 * count :]
     for k in range(n):
         frontals[group[k]] += 1
     for j in range(count):
@@ -290,7 +288,6 @@ def build(
                 key = vertex[members[m], KEY]
                 parent = vertex[members[m], CLIQUE]
         _hang(t, c, parent)
-    upwards = np.empty(count, np.int64)
     for j in range(count):
         upwards[j] = new[count - 1 - j]
     return upwards

@@ -32,7 +32,8 @@ from graph_slam_ros.graph import (
     numeric_jacobian,
 )
 from graph_slam_ros.lie import se2, se3
-from graph_slam_ros.solver import Change, Settings, Solver
+from graph_slam_ros.solver import Change, Settings, Solver, online_problem, problem
+from graph_slam_ros.solver.clique_tree.advance import DISSECT, DONE, ROOM
 from graph_slam_ros.solver.clique_tree.storage import KEY, TAIL_END
 
 KINDS = (R1, R2, R3, SE2, SE3)
@@ -590,3 +591,37 @@ def test_what_is_left_when_the_passes_run_out_is_seen_to_by_later_updates():
         append(solver, k)
         solver.update()
     assert off_by(solver) < 1e-6
+
+
+def test_an_update_with_what_was_added_is_one_compiled_call(monkeypatch):
+    graph, noise = Graph(), Gaussian.from_sigmas(0.1, 0.1, 0.02)
+    solver, calls = Solver(graph, Settings(relinearize_every=1000)), []
+
+    def step(k):
+        v = graph.add_vertex(SE2, [float(k), 0.0, 0.0])
+        prior = POSE_PRIOR, [v], [0.0, 0.0, 0.0]
+        edge = graph.add_edge(*(prior if k == 0 else (RELATIVE_POSE, [v - 1, v], [1.0, 0.0, 0.0])), noise, "all")
+        solver.add([v], [edge])
+        return solver.update()
+
+    def counted(*arguments):
+        calls.append(how_it_ends(*arguments))
+        return calls[-1]
+
+    def forbidden(*_):
+        raise AssertionError("another compiled call")
+
+    for k in range(40):
+        step(k)
+    how_it_ends = online_problem.update
+    monkeypatch.setattr(online_problem, "update", counted)
+    for module, name in (
+        (problem, "anchorage"), (online_problem, "enter_newest"), (online_problem, "linearize_into"),
+        (online_problem.incremental, "renumber"), (online_problem.incremental, "relinearize"),
+    ):  # fmt: skip
+        monkeypatch.setattr(module, name, forbidden)
+    assert [step(k).linearized for k in range(40, 60)] == [1] * 20
+    ends = [how for how, *_ in calls]
+    assert ends.count(DONE) == 20
+    assert set(ends) <= {DONE, DISSECT, ROOM}  # where pools are too short, or the order has grown
+    assert len(ends) < 24
