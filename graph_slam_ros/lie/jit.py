@@ -181,6 +181,11 @@ def inner(function: Callable[..., Any]) -> Callable[..., Any]:
     return kernel(function, no_cpython_wrapper=True)
 
 
+def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile a small kernel into the kernels that call it: a call that passes a tree copies a hundred numbers."""
+    return kernel(function, no_cpython_wrapper=True, forceinline=True)
+
+
 def jitable(function: Callable[..., Any]) -> Callable[..., Any]:
     """Leave a formula plain Python (floats or whole arrays) and let kernels compile it inline."""
     plain: Callable[..., Any] = register_jitable(function)

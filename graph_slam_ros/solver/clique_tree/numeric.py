@@ -6,7 +6,7 @@ Kernels take the arrays out of the tree once: each access through the tuple woul
 import numpy as np
 
 from graph_slam_ros.graph.retraction import SPATIAL, retract_at
-from graph_slam_ros.lie.jit import inner, kernel
+from graph_slam_ros.lie.jit import inlined, inner, kernel
 from graph_slam_ros.solver.clique_tree.dense import pack, partial_cholesky
 from graph_slam_ros.solver.clique_tree.rounding import JUST_MADE, UNKNOWN, is_rounding, suspect_row
 from graph_slam_ros.solver.clique_tree.storage import (
@@ -100,7 +100,7 @@ def _member_at(vertex: Index, clique: Index, members: Index, c: int, row: int) -
     return NOTHING
 
 
-@kernel
+@inlined
 def _add_edges(vertex: Index, edge: Index, link: Index, blocks: Array, v: int, front: Array) -> None:
     """Add the blocks of the edges of which v is eliminated first."""
     right = front.shape[0]
@@ -129,7 +129,7 @@ def _add_edges(vertex: Index, edge: Index, link: Index, blocks: Array, v: int, f
             row += dof
 
 
-@inner
+@inlined
 def _add_block(
     packed: Array, rows: int, row: int, column: int, front: Array, at: int, to: int, dof: int, width: int
 ) -> None:
@@ -153,7 +153,7 @@ def _add_block(
                 front[to + j, at + i] += packed[begin + j]
 
 
-@inner
+@inlined
 def _add_contribution(vertex: Index, clique: Index, members: Index, fronts: Array, child: int, front: Array) -> None:
     """Add a child's contribution to its separator."""
     of_child = front_of(clique, fronts, child)
@@ -175,7 +175,7 @@ def _add_contribution(vertex: Index, clique: Index, members: Index, fronts: Arra
         row += dof
 
 
-@kernel
+@inlined
 def retract(vertex: Index, value: Array, step: Array, estimate: Array, v: int) -> None:
     """The estimate of a vertex: its linearisation point [+] its step."""
     kind, x, d, dof = vertex[v, KIND], vertex[v, VALUE], vertex[v, STEP], vertex[v, DOF]

@@ -5,7 +5,7 @@ The place of a clique that leaves is reused by the next one of its class. It is 
 
 import numpy as np
 
-from graph_slam_ros.lie.jit import inner, jitable, kernel
+from graph_slam_ros.lie.jit import inlined, inner, jitable, kernel
 from graph_slam_ros.solver.clique_tree.indices import ascending
 from graph_slam_ros.solver.clique_tree.storage import (
     CAPACITIES,
@@ -32,7 +32,7 @@ from graph_slam_ros.typing import Index
 GROWTH = 2.0  # the factor by which a part of the tree grows until it is dissected anew
 
 
-@inner
+@inlined
 def capacity_class(size: int) -> int:
     """The least size class that has room for so many degrees of freedom."""
     low, high = 0, len(CAPACITIES)
@@ -45,7 +45,7 @@ def capacity_class(size: int) -> int:
     return low
 
 
-@inner
+@inlined
 def numbers_of(size_class: int) -> int:
     """The numbers of a front."""
     return packed_size(CAPACITIES[size_class])
@@ -91,7 +91,7 @@ def release(t: Tree, cliques: Index) -> None:
         clique[c, SIZE] = clique[c, FRONTALS] = 0  # it may be in the list of those that wait still
 
 
-@inner
+@inlined
 def allocate(t: Tree, size: int) -> int:
     """Allocate the place of a clique of that many degrees of freedom."""
     clique, vacant, state = t.clique, t.vacant, t.state

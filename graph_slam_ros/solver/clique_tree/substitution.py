@@ -11,7 +11,7 @@ import numpy as np
 from graph_slam_ros.graph import records
 from graph_slam_ros.graph.retraction import PLANAR, SPATIAL
 from graph_slam_ros.lie.addresses import integers
-from graph_slam_ros.lie.jit import inner, kernel
+from graph_slam_ros.lie.jit import inlined, inner, kernel
 from graph_slam_ros.solver.clique_tree.dense import solve_upper
 from graph_slam_ros.solver.clique_tree.indices import in_order, lengthened
 from graph_slam_ros.solver.clique_tree.numeric import retract
@@ -115,7 +115,7 @@ def substitute(t: Tree, cliques: Index, tolerance: float, sigmas: float, far: Li
     return solved[:count]
 
 
-@kernel
+@inlined
 def is_large(t: Tree, v: int, changed: bool, above: Limits) -> bool:
     """Return whether a vertex's step is above one of the limits.
 
@@ -140,7 +140,7 @@ def is_large(t: Tree, v: int, changed: bool, above: Limits) -> bool:
     return largest > component or turned > turn or largest * largest * np.sqrt(information) > square
 
 
-@kernel
+@inlined
 def visit(t: Tree, c: int, x: Array, tolerance: float, sigmas: float) -> None:
     """Solve one clique; ``x`` is scratch, as long as its degrees of freedom."""
     vertex, clique, members, step, state = t.vertex, t.clique, t.members, t.step, t.state
@@ -178,7 +178,7 @@ def visit(t: Tree, c: int, x: Array, tolerance: float, sigmas: float) -> None:
         at += dof
 
 
-@kernel
+@inlined
 def needs(vertex: Index, clique: Index, members: Index, c: int) -> bool:
     """Return whether a step of a clique's separator changed after the clique was solved."""
     seen = clique[c, SEEN]
@@ -188,7 +188,7 @@ def needs(vertex: Index, clique: Index, members: Index, c: int) -> bool:
     return False
 
 
-@inner
+@inlined
 def _is_noted(vertex: Index, clique: Index, members: Index, c: int, bit: int) -> bool:
     """Return whether a vertex of a clique's separator has a bit of ``NOTED``."""
     for m in range(clique[c, MEMBERS] + clique[c, FRONTALS], clique[c, MEMBERS] + clique[c, SIZE]):
@@ -197,7 +197,7 @@ def _is_noted(vertex: Index, clique: Index, members: Index, c: int, bit: int) ->
     return False
 
 
-@inner
+@inlined
 def _defer(t: Tree, c: int) -> None:
     """Let a clique wait."""
     if t.clique[c, IN_DEFERRED] == 0:
@@ -371,7 +371,7 @@ def find_changed(t: Tree, tolerance: float, sigmas: float, much: Limits) -> Inde
     return in_order(out[:count])
 
 
-@inner
+@inlined
 def _note_if_much(t: Tree, v: int, much: Limits) -> None:
     """Note a vertex whose step has changed much since a search last found it."""
     if is_large(t, v, True, much):

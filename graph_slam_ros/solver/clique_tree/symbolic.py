@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from graph_slam_ros.lie.jit import inner, kernel
+from graph_slam_ros.lie.jit import inlined, inner, kernel
 from graph_slam_ros.solver.clique_tree.indices import ascending, chosen, lengthened
 from graph_slam_ros.solver.clique_tree.pools import allocate
 from graph_slam_ros.solver.clique_tree.storage import (
@@ -174,7 +174,7 @@ def _link_by_first(t: Tree, orphans: Index, n: int, orphan_of: Index, orphan_nex
         orphan_of[first] = i
 
 
-@kernel
+@inlined
 def _note(u: int, k: int, seen: Index, later: Index, top: int) -> int:
     """Note u as connected to k, once, if it is later; return how many are noted."""
     if u > k and seen[u] != k:
@@ -184,7 +184,7 @@ def _note(u: int, k: int, seen: Index, later: Index, top: int) -> int:
     return top
 
 
-@inner
+@inlined
 def _joined_by_edges(t: Tree, v: int, k: int, seen: Index, later: Index, top: int) -> int:
     """Note the vertices that edges connect to v; v owns those edges of which it is eliminated first."""
     vertex, edge, link = t.vertex, t.edge, t.link
@@ -205,7 +205,7 @@ def _joined_by_edges(t: Tree, v: int, k: int, seen: Index, later: Index, top: in
     return top
 
 
-@inner
+@inlined
 def _joined_by_orphan(t: Tree, c: int, k: int, seen: Index, later: Index, top: int) -> int:
     """Note the vertices that an orphan's separator connects."""
     vertex, clique, members = t.vertex, t.clique, t.members
@@ -293,7 +293,7 @@ def build(
     return upwards
 
 
-@inner
+@inlined
 def _hang(t: Tree, c: int, parent: int) -> None:
     clique = t.clique
     clique[c, PARENT] = parent
