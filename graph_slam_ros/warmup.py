@@ -258,7 +258,6 @@ def _shared_kernels() -> list[_Kernel]:
         (indices.joined, (index, index)),
         (indices.lengthened, (index, number)),
         (symbolic.mark, (tree, index)),
-        (numeric.clear_block, (*[types.int64[:, ::1]] * 3, number, *[types.float64[::1]] * 2)),
         (numeric.accept_steps, (tree, index)),
     ]
 

@@ -5,7 +5,7 @@ After Kaess and Dellaert, "Covariance recovery from a square root information ma
 
 import numpy as np
 
-from graph_slam_ros.lie.jit import inner, kernel
+from graph_slam_ros.lie.jit import inlined, inner, kernel
 from graph_slam_ros.solver.clique_tree.indices import ascending, chosen
 from graph_slam_ros.solver.clique_tree.storage import (
     CLIQUE,
@@ -115,7 +115,7 @@ def _of_cliques(t: Tree, cliques: Index) -> tuple[Index, Array]:
     return start, pool
 
 
-@inner
+@inlined
 def _place_in(vertex: Index, clique: Index, members: Index, c: int, v: int) -> int:
     """The row where a member begins in a clique's front."""
     at = 0
@@ -126,7 +126,7 @@ def _place_in(vertex: Index, clique: Index, members: Index, c: int, v: int) -> i
     return at
 
 
-@inner
+@inlined
 def _inherit(t: Tree, c: int, above: Array, covariance: Array) -> None:
     """Copy the covariance of a separator out of the parent's."""
     vertex, clique, members = t.vertex, t.clique, t.members
@@ -149,7 +149,7 @@ def _inherit(t: Tree, c: int, above: Array, covariance: Array) -> None:
             covariance[frontal + i, frontal + j] = above[place[i], place[j]]
 
 
-@inner
+@inlined
 def _complete(front: Array, frontal: int, covariance: Array) -> None:
     """Complete the covariance from the separator's block: ``U11 X = [1 / U11', 0] - U12 Sigma``, column by column."""
     full = len(covariance)

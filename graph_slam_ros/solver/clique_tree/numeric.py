@@ -188,7 +188,7 @@ def retract(vertex: Index, value: Array, step: Array, estimate: Array, v: int) -
         retract_at(estimate, x, kind, dof, step, d)
 
 
-@inner
+@inlined
 def add_to_diagonal(vertex: Index, edge: Index, link: Index, e: int, blocks: Array, diagonal: Array) -> None:
     """Add the diagonal of an edge's block to that of the information matrix."""
     at, across = edge[e, BLOCK], edge[e, WIDTH] + 1  # from one number of a diagonal to the next
@@ -200,7 +200,7 @@ def add_to_diagonal(vertex: Index, edge: Index, link: Index, e: int, blocks: Arr
             across -= 1
 
 
-@kernel
+@inlined
 def clear_block(vertex: Index, edge: Index, link: Index, e: int, blocks: Array, diagonal: Array) -> None:
     """Clear an edge's block, and its part of the diagonal of H.
 

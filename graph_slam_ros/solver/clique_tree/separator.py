@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from graph_slam_ros.lie.jit import inner, kernel
+from graph_slam_ros.lie.jit import inlined, inner, kernel
 from graph_slam_ros.solver.clique_tree.indices import ascending, chosen
 from graph_slam_ros.solver.clique_tree.storage import NOTHING, ZERO
 from graph_slam_ros.typing import Array, Index
@@ -232,7 +232,7 @@ def _refine(side: Index, start: Index, neighbour: Index, weight: Index) -> float
     return score
 
 
-@inner
+@inlined
 def _best_move(
     members: Index,
     count: int,
@@ -269,14 +269,14 @@ def _best_move(
     return pick, to, live
 
 
-@inner
+@inlined
 def _shift(u: int, to: int, side: Index, total: Array, weight: Index) -> None:
     total[side[u]] -= weight[u]
     side[u] = to
     total[to] += weight[u]
 
 
-@inner
+@inlined
 def _score(total: Array) -> float:
     return total[2] * (1.0 + abs(total[0] - total[1]) / (total[0] + total[1] + total[2])) + 1e-3 * abs(
         total[0] - total[1]
