@@ -67,7 +67,7 @@ class RelinearizationSchedule:
 
 
 def far_limits(graph: Graph, settings: Settings) -> Limits:
-    """Return the limits above which a step, or the square of one, is linearised anew at once (``is_large``).
+    """Return the limits above which a step, or the square of one, is linearised anew at once (``is_large_step``).
 
     To stay linearised a turn away from the estimate costs about the square of that turn in chi2, for each degree of
     freedom of the pose. In a small graph a single turn may be a visible part of chi2, whose expected value is the

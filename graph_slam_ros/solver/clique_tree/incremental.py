@@ -45,7 +45,7 @@ from graph_slam_ros.solver.clique_tree.storage import (
     Limits,
     Tree,
 )
-from graph_slam_ros.solver.clique_tree.substitution import find_changed, is_large, substitute
+from graph_slam_ros.solver.clique_tree.substitution import find_changed, is_large_step, substitute
 from graph_slam_ros.solver.clique_tree.symbolic import mark
 from graph_slam_ros.typing import Index
 
@@ -161,18 +161,18 @@ def renumber(t: Tree, edges: Index, tolerance: float, sigmas: float, far: Limits
 def relinearize(t: Tree, searched: Index, above: Limits) -> Index:
     """Move the linearisation points of those vertices whose step is too large; return all edges on them.
 
-    A step is too large above one of the limits (``is_large``).
+    A step is too large above one of the limits (``is_large_step``).
     """
     vertex, edge, link = t.vertex, t.edge, t.link
     large = False
     for v in searched:
-        large = large or is_large(t, v, False, above)
+        large = large or is_large_step(t, v, False, above)
     if not large:  # as nearly always
         return np.empty(0, np.int64)
     edges, moving = np.empty(64, np.int64), np.empty(len(searched), np.int64)
     count, many = ZERO, 0
     for v in searched:
-        if not is_large(t, v, False, above):
+        if not is_large_step(t, v, False, above):
             continue
         moving[many] = v
         many += 1

@@ -71,7 +71,7 @@ def eliminate(t: Tree, cliques: Index, damping: float) -> int:
                     front[at + i, at + i] = damping * scale[at + i]
             at += vertex[v, DOF]
         for m in range(clique[c, MEMBERS], clique[c, MEMBERS] + clique[c, FRONTALS]):
-            _add_edges(vertex, t.edge, t.link, t.blocks, members[m], front)
+            _add_own_edges(vertex, t.edge, t.link, t.blocks, members[m], front)
         child = clique[c, CHILD]
         while child != NOTHING:
             _add_contribution(vertex, clique, members, fronts, child, front)
@@ -101,7 +101,7 @@ def _member_at(vertex: Index, clique: Index, members: Index, c: int, row: int) -
 
 
 @inlined
-def _add_edges(vertex: Index, edge: Index, link: Index, blocks: Array, v: int, front: Array) -> None:
+def _add_own_edges(vertex: Index, edge: Index, link: Index, blocks: Array, v: int, front: Array) -> None:
     """Add the blocks of the edges of which v is eliminated first."""
     right = front.shape[0]
     a = vertex[v, LINK]
@@ -176,7 +176,7 @@ def _add_contribution(vertex: Index, clique: Index, members: Index, fronts: Arra
 
 
 @inlined
-def retract(vertex: Index, value: Array, step: Array, estimate: Array, v: int) -> None:
+def retract_vertex(vertex: Index, value: Array, step: Array, estimate: Array, v: int) -> None:
     """The estimate of a vertex: its linearisation point [+] its step."""
     kind, x, d, dof = vertex[v, KIND], vertex[v, VALUE], vertex[v, STEP], vertex[v, DOF]
     moved = False
@@ -244,7 +244,7 @@ def accept_steps(t: Tree, vertices: Index) -> None:
     """Make the estimates of vertices their linearisation points."""
     vertex, step, reference, value, estimate = t.vertex, t.step, t.reference, t.value, t.estimate
     for v in vertices:
-        retract(vertex, value, step, estimate, v)
+        retract_vertex(vertex, value, step, estimate, v)
         x, d, dof = vertex[v, VALUE], vertex[v, STEP], vertex[v, DOF]
         for i in range(dof):
             step[d + i] = reference[d + i] = 0.0
@@ -258,7 +258,7 @@ def step_by(t: Tree, vertices: Index, step: Array) -> None:
     for v in vertices:
         for i in range(t.vertex[v, STEP], t.vertex[v, STEP] + t.vertex[v, DOF]):
             t.step[i] = step[i]
-        retract(t.vertex, t.value, t.step, t.estimate, v)
+        retract_vertex(t.vertex, t.value, t.step, t.estimate, v)
 
 
 @kernel

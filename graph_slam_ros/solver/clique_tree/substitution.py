@@ -14,7 +14,7 @@ from graph_slam_ros.lie.addresses import integers
 from graph_slam_ros.lie.jit import inlined, inner, kernel
 from graph_slam_ros.solver.clique_tree.dense import solve_upper
 from graph_slam_ros.solver.clique_tree.indices import in_order, lengthened
-from graph_slam_ros.solver.clique_tree.numeric import retract
+from graph_slam_ros.solver.clique_tree.numeric import retract_vertex
 from graph_slam_ros.solver.clique_tree.pointers import SHAPE_SIZE, kept_of, shapes_of, tree_of
 from graph_slam_ros.solver.clique_tree.storage import (
     CHANGED,
@@ -70,7 +70,7 @@ def substitute(t: Tree, cliques: Index, tolerance: float, sigmas: float, far: Li
     ----------
     tolerance, sigmas : a step is kept if it changes by no more than so many m or rad, or standard deviations of the
         vertex given its neighbours. Then all that depends on it alone is kept, so errors do not add up
-    far : a step above these is far (``is_large``)
+    far : a step above these is far (``is_large_step``)
     """
     vertex, clique, members = t.vertex, t.clique, t.members
     solved, count = np.empty(64, np.int64), ZERO
@@ -90,7 +90,7 @@ def substitute(t: Tree, cliques: Index, tolerance: float, sigmas: float, far: Li
         clique[c, MARK] = 0
         if len(x) < clique[c, FULL_DOF]:
             x = np.empty(2 * clique[c, FULL_DOF])
-        visit(t, c, x, tolerance, sigmas)
+        solve_clique(t, c, x, tolerance, sigmas)
         low, frontals = clique[c, MEMBERS], clique[c, FRONTALS]
         if count + frontals > len(solved):
             solved = lengthened(solved, count + frontals)
@@ -98,7 +98,7 @@ def substitute(t: Tree, cliques: Index, tolerance: float, sigmas: float, far: Li
             v = members[m]
             solved[count] = v
             count += 1
-            if is_large(t, v, False, far):
+            if is_large_step(t, v, False, far):
                 vertex[v, NOTED] |= IS_FAR
             else:
                 vertex[v, NOTED] &= ~IS_FAR
@@ -109,14 +109,14 @@ def substitute(t: Tree, cliques: Index, tolerance: float, sigmas: float, far: Li
                     stack = lengthened(stack, top)
                 stack[top] = k
                 top += 1
-            elif needs(vertex, clique, members, k):
+            elif must_be_solved(vertex, clique, members, k):
                 _defer(t, k)
             k = clique[k, SIBLING]
     return solved[:count]
 
 
 @inlined
-def is_large(t: Tree, v: int, changed: bool, above: Limits) -> bool:
+def is_large_step(t: Tree, v: int, changed: bool, above: Limits) -> bool:
     """Return whether a vertex's step is above one of the limits.
 
     The square of the step is what the linearisation neglects. The position of a pose counts in units of the typical
@@ -141,7 +141,7 @@ def is_large(t: Tree, v: int, changed: bool, above: Limits) -> bool:
 
 
 @inlined
-def visit(t: Tree, c: int, x: Array, tolerance: float, sigmas: float) -> None:
+def solve_clique(t: Tree, c: int, x: Array, tolerance: float, sigmas: float) -> None:
     """Solve one clique; ``x`` is scratch, as long as its degrees of freedom."""
     vertex, clique, members, step, state = t.vertex, t.clique, t.members, t.step, t.state
     diagonal, listed = t.diagonal, t.listed
@@ -179,7 +179,7 @@ def visit(t: Tree, c: int, x: Array, tolerance: float, sigmas: float) -> None:
 
 
 @inlined
-def needs(vertex: Index, clique: Index, members: Index, c: int) -> bool:
+def must_be_solved(vertex: Index, clique: Index, members: Index, c: int) -> bool:
     """Return whether a step of a clique's separator changed after the clique was solved."""
     seen = clique[c, SEEN]
     for m in range(clique[c, MEMBERS] + clique[c, FRONTALS], clique[c, MEMBERS] + clique[c, SIZE]):
@@ -218,11 +218,11 @@ def solve_deferred(t: Tree, tolerance: float, sigmas: float) -> None:
         while top:
             top -= 1
             c = stack[top]
-            if not needs(vertex, clique, members, c):
+            if not must_be_solved(vertex, clique, members, c):
                 continue
             if len(x) < clique[c, FULL_DOF]:
                 x = np.empty(2 * clique[c, FULL_DOF])
-            visit(t, c, x, tolerance, sigmas)
+            solve_clique(t, c, x, tolerance, sigmas)
             stack, top = with_children(clique, c, stack, top)
     state[DEFERRED_COUNT] = 0
 
@@ -236,7 +236,7 @@ def solve_way(t: Tree, c: int, way: Index, tolerance: float, sigmas: float) -> I
         if count == len(way):
             way = lengthened(way, count)
         way[count] = c
-        if needs(vertex, clique, members, c):
+        if must_be_solved(vertex, clique, members, c):
             first = count
         count += 1
         c = clique[c, PARENT]
@@ -245,14 +245,14 @@ def solve_way(t: Tree, c: int, way: Index, tolerance: float, sigmas: float) -> I
     x = np.empty(64)
     for i in range(first, -1, -1):
         c = way[i]
-        if not needs(vertex, clique, members, c):
+        if not must_be_solved(vertex, clique, members, c):
             continue
         if len(x) < clique[c, FULL_DOF]:
             x = np.empty(2 * clique[c, FULL_DOF])
-        visit(t, c, x, tolerance, sigmas)
+        solve_clique(t, c, x, tolerance, sigmas)
         k = clique[c, CHILD]
         while k != NOTHING:
-            if needs(vertex, clique, members, k):
+            if must_be_solved(vertex, clique, members, k):
                 _defer(t, k)
             k = clique[k, SIBLING]
     return way
@@ -263,7 +263,7 @@ def solve_marked(t: Tree, marked: Index, tolerance: float, sigmas: float) -> Non
     """Solve those of marked cliques (children before parents) that wait, before they are eliminated again."""
     way = np.empty(64, np.int64)
     for k in range(len(marked) - 1, -1, -1):
-        if needs(t.vertex, t.clique, t.members, marked[k]):
+        if must_be_solved(t.vertex, t.clique, t.members, marked[k]):
             way = solve_way(t, marked[k], way, tolerance, sigmas)
 
 
@@ -272,7 +272,7 @@ def show(t: Tree, kept: Array, vertices: Index) -> None:
     """Compute the estimates of vertices from their steps, and copy them to ``kept``."""
     vertex, value, step, estimate = t.vertex, t.value, t.step, t.estimate
     for v in vertices:
-        retract(vertex, value, step, estimate, v)
+        retract_vertex(vertex, value, step, estimate, v)
         x = vertex[v, VALUE]
         for i in range(7 if vertex[v, KIND] == SPATIAL else vertex[v, DOF]):
             kept[x + i] = estimate[x + i]
@@ -322,8 +322,8 @@ def read(
 def find_changed(t: Tree, tolerance: float, sigmas: float, much: Limits) -> Index:
     """Return the vertices, in order, whose steps have changed much since they were last returned.
 
-    A change above the limits ``much`` is much (``is_large``). What waits is solved where a step of its separator has
-    changed much; below that, changes are no larger.
+    A change above the limits ``much`` is much (``is_large_step``). What waits is solved where a step of its separator
+    has changed much; below that, changes are no larger.
     """
     vertex, clique, members, listed, state = t.vertex, t.clique, t.members, t.listed, t.state
     step, reference = t.step, t.reference
@@ -335,21 +335,21 @@ def find_changed(t: Tree, tolerance: float, sigmas: float, much: Limits) -> Inde
         while top:
             top -= 1
             c = stack[top]
-            if not needs(vertex, clique, members, c):
+            if not must_be_solved(vertex, clique, members, c):
                 continue
             if not _is_noted(vertex, clique, members, c, IS_MUCH):
                 _defer(t, c)
                 continue
             if len(x) < clique[c, FULL_DOF]:
                 x = np.empty(2 * clique[c, FULL_DOF])
-            visit(t, c, x, tolerance, sigmas)
+            solve_clique(t, c, x, tolerance, sigmas)
             for m in range(clique[c, MEMBERS], clique[c, MEMBERS] + clique[c, FRONTALS]):
                 _note_if_much(t, members[m], much)
             stack, top = with_children(clique, c, stack, top)
     count = kept = 0
     for k in range(state[DEFERRED_COUNT]):
         c = listed[k, DEFERRED]
-        if needs(vertex, clique, members, c):
+        if must_be_solved(vertex, clique, members, c):
             listed[kept, DEFERRED] = c
             kept += 1
         else:
@@ -374,7 +374,7 @@ def find_changed(t: Tree, tolerance: float, sigmas: float, much: Limits) -> Inde
 @inlined
 def _note_if_much(t: Tree, v: int, much: Limits) -> None:
     """Note a vertex whose step has changed much since a search last found it."""
-    if is_large(t, v, True, much):
+    if is_large_step(t, v, True, much):
         t.vertex[v, NOTED] |= IS_MUCH
 
 
@@ -385,7 +385,7 @@ def step_all(t: Tree, cliques: Index) -> None:
     for c in cliques[::-1]:
         if len(x) < t.clique[c, FULL_DOF]:
             x = np.empty(2 * t.clique[c, FULL_DOF])
-        visit(t, c, x, -1.0, -1.0)
+        solve_clique(t, c, x, -1.0, -1.0)
 
 
 @kernel

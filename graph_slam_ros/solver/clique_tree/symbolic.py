@@ -144,7 +144,7 @@ def structure(t: Tree, order: Index, orphans: Index) -> tuple[Index, Index]:
         i = child_of[k]
         while i != NOTHING:
             for m in range(start[i], start[i + 1]):
-                top = _note(later[m], k, seen, later, top)
+                top = _note_later(later[m], k, seen, later, top)
             i = child_next[i]
         if top > start[k]:
             nearest = start[k]
@@ -175,7 +175,7 @@ def _link_by_first(t: Tree, orphans: Index, n: int, orphan_of: Index, orphan_nex
 
 
 @inlined
-def _note(u: int, k: int, seen: Index, later: Index, top: int) -> int:
+def _note_later(u: int, k: int, seen: Index, later: Index, top: int) -> int:
     """Note u as connected to k, once, if it is later; return how many are noted."""
     if u > k and seen[u] != k:
         seen[u] = k
@@ -199,7 +199,7 @@ def _joined_by_edges(t: Tree, v: int, k: int, seen: Index, later: Index, top: in
             w = link[edge[e, LINKED] + s, LINK_END]
             u = vertex[w, LOCAL]
             first = first and not (u < k and vertex[w, FREE] == 1)
-            top = _note(u, k, seen, later, top)
+            top = _note_later(u, k, seen, later, top)
         if first:
             edge[e, OWNER] = v
     return top
@@ -210,7 +210,7 @@ def _joined_by_orphan(t: Tree, c: int, k: int, seen: Index, later: Index, top: i
     """Note the vertices that an orphan's separator connects."""
     vertex, clique, members = t.vertex, t.clique, t.members
     for m in range(clique[c, MEMBERS] + clique[c, FRONTALS], clique[c, MEMBERS] + clique[c, SIZE]):
-        top = _note(vertex[members[m], LOCAL], k, seen, later, top)
+        top = _note_later(vertex[members[m], LOCAL], k, seen, later, top)
     return top
 
 
