@@ -23,7 +23,6 @@ import numpy as np
 
 from graph_slam_ros.graph import Graph
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
-from graph_slam_ros.graph.losses import weight_and_cost
 from graph_slam_ros.graph.tables import EdgeTable
 from graph_slam_ros.slam.frontend.noise_factors import (
     CLASSES,
@@ -37,6 +36,7 @@ from graph_slam_ros.slam.frontend.noise_factors import (
 )
 from graph_slam_ros.slam.motion_noise import Growth, Motions, fit_growth, growth_of
 from graph_slam_ros.solver import Solver
+from graph_slam_ros.solver.blocks import loss_weights
 from graph_slam_ros.solver.linearization import Losses
 from graph_slam_ros.typing import Array, Index
 
@@ -220,7 +220,7 @@ class _Block:
         self.roots = roots = table.sqrt_information.values[rows]
         chi2 = np.sum(np.einsum("nij,nj->ni", roots, self.residual) ** 2, axis=1)
         self._solver, self._dof = solver, table.type.dofs[0]
-        self.weight = np.array([weight_and_cost(losses.kind[code], losses.scale[code], one)[0] for one in chi2])
+        self.weight = loss_weights(int(losses.kind[code]), float(losses.scale[code]), chi2)
         self.covariance = np.linalg.inv(np.swapaxes(roots, 1, 2) @ roots)
         self.sampled = np.arange(0, len(rows), max(1, -(-len(rows) // _MOST_SAMPLED)))
         of = self._jacobian[self.sampled]

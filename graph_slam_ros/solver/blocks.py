@@ -71,6 +71,15 @@ def whiten(
 
 
 @kernel
+def loss_weights(kind: int, scale: float, chi2: Array) -> Array:
+    """Return the weights rho'(s) (n,) that one loss gives to squared residuals."""
+    out = np.empty(len(chi2))
+    for k in range(len(chi2)):
+        out[k], _ = weight_and_cost(kind, scale, chi2[k])
+    return out
+
+
+@kernel
 def squares(root: Array, rows: Index, residual: Array) -> Array:
     """Return the squared whitened residual of each edge, without its weight.
 

@@ -13,7 +13,7 @@ from graph_slam_ros.solver.entry import ANCHORED, how_anchored
 from graph_slam_ros.solver.relinearization import MAYBE, SURELY
 from graph_slam_ros.typing import Index
 
-CHECK, LINEARIZE, ORDER, GROUP = range(4)  # stages: where the call begins
+CHECK, LINEARIZE, ORDER, GROUP, END = range(5)  # stages: where the call begins; after the last there is nothing to do
 UNSURE, SEARCH, PLAIN = range(ENDS, ENDS + 3)  # how it ends where the tree was not advanced
 
 

@@ -10,7 +10,7 @@ from graph_slam_ros.solver.clique_tree import incremental
 from graph_slam_ros.solver.clique_tree.advance import DISSECT, DONE, more_room, restructure
 from graph_slam_ros.solver.clique_tree.ordering import dissect
 from graph_slam_ros.solver.clique_tree.storage import MOTION_MM, NOTHING, Limits
-from graph_slam_ros.solver.compiled_update import CHECK, GROUP, LINEARIZE, ORDER, PLAIN, SEARCH, UNSURE, update
+from graph_slam_ros.solver.compiled_update import CHECK, END, GROUP, LINEARIZE, ORDER, PLAIN, SEARCH, UNSURE, update
 from graph_slam_ros.solver.entry import enter_newest
 from graph_slam_ros.solver.gauge import undetermined
 from graph_slam_ros.solver.linearization import linearize_into
@@ -46,7 +46,7 @@ class OnlineProblem(Problem):
         stage, vertices, edges, again, young = CHECK, pending.vertices, pending.new, NONE, stages.of_new(pending.new)
         if not (self._numbers_current and pending.is_plain()) or len(stages.young):
             stage, vertices, edges, again, young = self._entered(due)
-            if stage == DONE:
+            if stage == END:
                 return 0, 0, NONE, NONE
         touched, unseen = pending.touched, self._schedule.unseen()
         while True:
@@ -84,7 +84,7 @@ class OnlineProblem(Problem):
     def _entered(self, due: int) -> tuple[int, Index, Index, Index, Index]:
         """Let all that is pending enter, of whatever kind it is.
 
-        Returns the stage of the compiled update that comes next (DONE if there is nothing to do), and what it is called
+        Returns the stage of the compiled update that comes next (END if there is nothing to do), and what it is called
         with: vertices and edges that entered, edges that are to be linearised again, and young ones.
         """
         pending, stages = self._pending, self._stages
@@ -96,7 +96,7 @@ class OnlineProblem(Problem):
             due = SURELY
         again = self._far_from_linearization() if due == SURELY else NONE
         if not pending and not len(stages.young) and not len(again):
-            return DONE, NONE, NONE, NONE, NONE
+            return END, NONE, NONE, NONE, NONE
         fresh = np.union1d(edges, stages.young) if len(stages.young) else edges
         stages.young = young = stages.of_new(edges)
         if pending.broken:

@@ -76,10 +76,12 @@ class OdometryChain:
         ----------
         first : the first keyframe that stays, by its new vertex: motions from it on are kept
         """
-        now = vertices[self.vertices].tolist()
+        links = list(self._links.values())
+        vertices_now = vertices[self.vertices].tolist()
+        edges_now = edges[[link.edge for link in links]].tolist() if links else []
         self._links = {
-            vertex: _Link(int(edges[link.edge]), link.stamp_ns, link.pose, link.drift)
-            for vertex, link in zip(now, self._links.values(), strict=True)
+            vertex: _Link(edge, link.stamp_ns, link.pose, link.drift)
+            for vertex, edge, link in zip(vertices_now, edges_now, links, strict=True)
             if vertex > first
         }
 
