@@ -15,6 +15,7 @@ from graph_slam_ros.solver.entry import enter_newest
 from graph_slam_ros.solver.gauge import undetermined
 from graph_slam_ros.solver.linearization import linearize_into
 from graph_slam_ros.solver.loss_stages import LossStages
+from graph_slam_ros.solver.neglected import neglected
 from graph_slam_ros.solver.pending import NONE
 from graph_slam_ros.solver.problem import Problem
 from graph_slam_ros.solver.relinearization import MAYBE, NO_LIMITS, SURELY, RelinearizationSchedule
@@ -117,7 +118,12 @@ class OnlineProblem(Problem):
         self._tree.state[MOTION_MM] = self._schedule.begin(self.graph)
         if self._pending.broken:
             return NONE
-        above, error = settings.relinearize_above, settings.relinearize_error
+        if self._schedule.is_check_due(self.graph.edge_count, settings):
+            edges = self._active()
+            self._estimates()
+            self._schedule.learn(*neglected(self.graph, self._tree, edges), len(edges))
+        tightness = self._schedule.tightness
+        above, error = tightness * settings.relinearize_above, tightness**2 * settings.relinearize_error
         return incremental.relinearize_changed(self._pointers, *self._limits()[:2], (above, above, error))
 
     def _make_pools_longer(self) -> None:

@@ -17,6 +17,10 @@ _BY_FAR = 10.0  # times the threshold: steps that are linearised anew at once
 NO_LIMITS: Limits = (math.inf, math.inf, math.inf)
 _MOTIONS = {RELATIVE_POSE: 2, INVERSE_RELATIVE_POSE: 2, RELATIVE_POSE_3D: 3}  # components of their positions
 _SIGHTINGS = "landmarks"  # label of edges to landmarks, which may be poses, too
+_TOO_MUCH, _ENOUGH = 1e-3, 2e-4  # of chi2, that linearisation neglects
+_TIGHTEST = 0.2  # factor of the thresholds
+_LEAST_OF_EDGE = 1e-7  # of chi2 that is neglected, for each edge: less is no reason to linearise
+_FIRST_CHECK = 128  # edges
 _CLASSES, _PER_OCTAVE, _FARTHEST_M = 41, 2, 1e9  # of lengths, from a metre on
 
 
@@ -29,6 +33,9 @@ class RelinearizationSchedule:
         self._motions = MotionLength()
         self._limits: tuple[float, float, Limits] = 0.0, 0.0, NO_LIMITS
         self._limits_of: Settings | None = None
+        self._checked_at = _FIRST_CHECK  # edges
+        self._neglected = 0.0  # of chi2, at the last check
+        self.tightness = 1.0
 
     def note(self, solved: Index) -> None:
         """Note vertices that were solved after an update's last search; the next update searches them."""
@@ -56,9 +63,32 @@ class RelinearizationSchedule:
         The limits are those of the graph at the last search.
         """
         if settings is not self._limits_of:
-            far = far_limits(graph, settings) if settings.relinearize_passes else NO_LIMITS
+            far = NO_LIMITS
+            if settings.relinearize_passes:
+                component, turn, square = far_limits(graph, settings)
+                far = self.tightness * component, self.tightness * turn, self.tightness**2 * square
             self._limits_of, self._limits = settings, (settings.tolerance, settings.tolerance_sigmas, far)
         return self._limits
+
+    def is_check_due(self, edges: int, settings: Settings) -> bool:
+        """Return whether the number of edges has doubled since what linearisation neglects was last checked."""
+        is_due = edges >= 2 * self._checked_at and math.isfinite(settings.relinearize_neglected)
+        if is_due:
+            self._checked_at = edges
+        return is_due
+
+    def learn(self, neglected: float, chi2: float, edges: int) -> None:
+        """Tighten or loosen the thresholds by what linearisation neglects; it falls with their fourth power.
+
+        Where measurements fit much better than their noise says, the thresholds, which are in units of that, are too
+        loose. What is neglected just after a closure passes, so they are tightened only at the second check in a row.
+        """
+        share = neglected / chi2 if neglected > _LEAST_OF_EDGE * edges else 0.0
+        lasting, self._neglected = min(share, self._neglected), share
+        if lasting > _TOO_MUCH:
+            self.tightness = max(_TIGHTEST, self.tightness * (_ENOUGH / lasting) ** 0.25)
+        elif self.tightness < 1.0 and share < _ENOUGH:
+            self.tightness = min(1.0, 2.0 * self.tightness)
 
     def unseen(self) -> Index:
         """Return the vertices that the last update solved after its last search; once."""

@@ -1,0 +1,81 @@
+"""Thresholds of relinearisation follow what linearisation neglects, where noise is much smaller than stated."""
+
+import numpy as np
+import pytest
+
+from graph_slam_ros.graph import POSE_PRIOR_3D, RELATIVE_POSE_3D, SE3, Gaussian, Graph
+from graph_slam_ros.lie import se3, so3
+from graph_slam_ros.solver import Solver
+from graph_slam_ros.solver.neglected import neglected
+from graph_slam_ros.solver.relinearization import RelinearizationSchedule
+
+STEP_M, RING, POSES = 8.0, 30, 600
+
+
+def truth():
+    """Poses of a robot that circles a sphere from south to north."""
+    radius = STEP_M * RING / (2.0 * np.pi)
+    for k in range(POSES):
+        around, up = 2.0 * np.pi * k / RING, 0.8 * np.pi * (k / POSES - 0.5)
+        at = radius * np.array([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)])
+        turn = so3.compose(so3.exp((0.0, 0.0, around)), so3.exp((0.0, up, 0.0)))
+        yield (*map(float, at), *map(float, turn))
+
+
+def driven(*, tightens):
+    """A solver after the drive; stated sigmas are 30 times the true ones."""
+    rng, noise, poses = np.random.default_rng(0), Gaussian.from_sigmas(*[1.0] * 6), list(truth())
+    graph = Graph()
+    solver = Solver(graph)
+
+    def seen(i, j):
+        error = se3.exp(tuple(rng.normal(0.0, 0.03, 6)))
+        return se3.compose(se3.between(poses[i], poses[j]), error)
+
+    for k in range(POSES):
+        if k:
+            z = seen(k - 1, k)
+            start = se3.compose(tuple(solver.estimate([k - 1])[0]), z)
+            graph.add_vertex(SE3, (*start[:3], *so3.normalize(start[3:])))
+            edges = [graph.add_edge(RELATIVE_POSE_3D, [k - 1, k], z, noise, "odometry")]
+        else:
+            graph.add_vertex(SE3, poses[0])
+            edges = [graph.add_edge(POSE_PRIOR_3D, [0], poses[0], noise, "anchor")]
+        if k >= RING:
+            edges.append(graph.add_edge(RELATIVE_POSE_3D, [k - RING, k], seen(k - RING, k), noise, "closures"))
+        solver.add([k], edges)
+        if not tightens:
+            solver._schedule.tightness = 1.0
+        solver.update()
+    return solver
+
+
+@pytest.mark.parametrize("tightens", [True, False])
+def test_the_estimate_is_at_the_optimum_although_noise_is_much_smaller_than_stated(tightens):
+    solver = driven(tightens=tightens)
+    found = solver.values
+    left_out, chi2 = neglected(solver.graph, solver._tree, solver.edges)
+    now = solver.evaluate().chi2_final
+    assert chi2 == pytest.approx(now)
+    above = now - solver.optimize().chi2_final
+    assert (above < 5e-4 * now) == tightens
+    assert 0.2 * above < left_out < 5.0 * above
+    assert not np.array_equal(found, solver.values)
+
+
+def test_thresholds_are_tightened_at_the_second_check_and_loosened_again():
+    schedule = RelinearizationSchedule()
+    schedule.learn(neglected=1.0, chi2=100.0, edges=1000)
+    assert schedule.tightness == 1.0  # a closure may have come
+    schedule.learn(neglected=1.0, chi2=100.0, edges=2000)
+    assert schedule.tightness == pytest.approx((2e-4 / 0.01) ** 0.25)
+    for _ in range(3):
+        schedule.learn(neglected=0.01, chi2=100.0, edges=4000)
+    assert schedule.tightness == 1.0
+
+
+def test_what_is_neglected_of_nothing_is_no_reason():
+    schedule = RelinearizationSchedule()
+    for edges in (1000, 2000, 4000):
+        schedule.learn(neglected=1e-9, chi2=0.0, edges=edges)
+    assert schedule.tightness == 1.0
