@@ -64,7 +64,7 @@ class Settings:
     relinearize_every : that is looked for at every so many updates, or after two thirds of these at one that closes a
         loop. Steps ten times as large are looked for at any update
     relinearize_neglected : and so are turns whose square is more than this part of the expected chi2, as in a small
-        graph; inf: they wait
+        graph; inf: they wait, and the thresholds do not follow what linearisation neglects
     relinearize_passes : how often at most within one update; after the first time for such steps
     tolerance : online, changes of a step up to this are not followed [m, rad]
     tolerance_sigmas : nor are those up to so many standard deviations of the vertex given its neighbours

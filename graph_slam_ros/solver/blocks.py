@@ -42,7 +42,7 @@ def whiten(
 ) -> tuple[Array, Array]:
     """Multiply residuals and Jacobians by sqrt(weight * rho') R in place; returns chi2 and cost of each edge."""
     n, m, width = jacobian.shape
-    both, white = np.empty((2, n)), np.empty((width + 1) * m)  # few arrays: to make one takes as long as much of this
+    both, white = np.empty((2, n)), np.empty((width + 1) * m)  # to allocate one takes as long as an edge
     chi2, cost, r, j = both[0], both[1], white[:m], white[m:].reshape(m, width)
     for e in range(n):
         row = rows[e]

@@ -5,7 +5,7 @@ Where Python is needed the call ends early, and is made again from the next stag
 
 from graph_slam_ros.lie.jit import kernel
 from graph_slam_ros.solver.blocks import linearize_edges
-from graph_slam_ros.solver.clique_tree.advance import ENDS, advance_tree
+from graph_slam_ros.solver.clique_tree.advance import DISSECT, advance_tree
 from graph_slam_ros.solver.clique_tree.incremental import enter, reach_back
 from graph_slam_ros.solver.clique_tree.pointers import kept_of, tree_of
 from graph_slam_ros.solver.clique_tree.storage import NOTHING, ZERO, Limits
@@ -14,7 +14,7 @@ from graph_slam_ros.solver.relinearization import MAYBE, SURELY
 from graph_slam_ros.typing import Index
 
 CHECK, LINEARIZE, ORDER, GROUP, END = range(5)  # stages: where the call begins; after the last there is nothing to do
-UNSURE, SEARCH, PLAIN = range(ENDS, ENDS + 3)  # how it ends where the tree was not advanced
+UNSURE, SEARCH, IN_PYTHON = range(DISSECT + 1, DISSECT + 4)  # how it ends where the tree was not advanced
 
 
 @kernel
@@ -53,7 +53,7 @@ def update(
 
     * UNSURE: it may be that nothing fixes a vertex, or one is held, or an edge has no weight. Nothing was changed
     * SEARCH: they have entered, and it is time to search
-    * PLAIN: an edge is not compiled, or its cost is not finite
+    * IN_PYTHON: an edge is not compiled, or its cost is not finite; all are to be linearised in Python
     """
     t, nothing = tree_of(pointers), vertices[:0]
     if stage <= CHECK:
@@ -65,6 +65,6 @@ def update(
     if stage <= LINEARIZE:
         table, _ = linearize_edges(t, graph, linear, losses[4:], young, losses[:4])
         if table != NOTHING:
-            return PLAIN, ZERO, ZERO, nothing
+            return IN_PYTHON, ZERO, ZERO, nothing
     tail = stage <= ORDER
     return advance_tree(t, kept_of(pointers), edges, touched, vertices, tail, again, unseen, tolerance, sigmas, far)

@@ -67,9 +67,9 @@ class LossStages:
         self.losses(settings)
         return self._pointers
 
-    def of_new(self, edges: Index) -> Index:
+    def of_new(self, edges: Index, settings: Settings) -> Index:
         """Return those of new edges that are held to the first stage: all of them, or none where there is but one."""
-        return edges if len(self._losses) > 1 else NONE
+        return edges if len(self.losses(settings)) > 1 else NONE
 
     def mature(self, values: Array, settings: Settings) -> None:
         """Keep as young only edges whose weight differs between the first and the last stage of their loss."""

@@ -8,9 +8,7 @@ from graph_slam_ros.solver.clique_tree.storage import STEP, Tree
 from graph_slam_ros.solver.linearization import rows_of
 from graph_slam_ros.typing import Array, Index
 
-_SMALL = (
-    1.0  # of a residual [m, rad]: an edge of which more is neglected has only just arrived, or its angle is wrapped
-)
+_LARGEST = 1.0  # part of a residual [m, rad] that counts: where it is larger, an edge is new or its angle was wrapped
 
 
 def neglected(graph: Graph, tree: Tree, edges: Index) -> tuple[float, float]:
@@ -28,7 +26,7 @@ def neglected(graph: Graph, tree: Tree, edges: Index) -> tuple[float, float]:
             here, _ = table.type.linearize(tree.estimate, at, measured)
             there, jacobian = table.type.linearize(tree.value, at, measured)
             rest = here - there - np.einsum("nij,nj->ni", jacobian, _steps(tree, ends, table.type.dofs))
-            rest[np.abs(rest).max(axis=1) > _SMALL] = 0.0
+            rest[np.abs(rest).max(axis=1) > _LARGEST] = 0.0
             weight = table.weight.values[rows]
             rest_squared += float(weight @ squares(root, rows, np.ascontiguousarray(rest)))
             chi2 += float(weight @ squares(root, rows, np.ascontiguousarray(here)))

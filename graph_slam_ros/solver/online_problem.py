@@ -10,7 +10,7 @@ from graph_slam_ros.solver.clique_tree import incremental
 from graph_slam_ros.solver.clique_tree.advance import DISSECT, DONE, more_room, restructure
 from graph_slam_ros.solver.clique_tree.ordering import dissect
 from graph_slam_ros.solver.clique_tree.storage import MOTION_MM, NOTHING, Limits
-from graph_slam_ros.solver.compiled_update import CHECK, END, GROUP, LINEARIZE, ORDER, PLAIN, SEARCH, UNSURE, update
+from graph_slam_ros.solver.compiled_update import CHECK, END, GROUP, IN_PYTHON, LINEARIZE, ORDER, SEARCH, UNSURE, update
 from graph_slam_ros.solver.entry import enter_newest
 from graph_slam_ros.solver.gauge import undetermined
 from graph_slam_ros.solver.linearization import linearize_into
@@ -44,7 +44,8 @@ class OnlineProblem(Problem):
         """
         pending, stages, settings = self._pending, self._stages, self.settings
         due, losses = self._schedule.is_due(settings.relinearize_every), stages.pointers(settings)
-        stage, vertices, edges, again, young = CHECK, pending.vertices, pending.new, NONE, stages.of_new(pending.new)
+        stage, vertices, edges, again = CHECK, pending.vertices, pending.new, NONE
+        young = stages.of_new(edges, settings)
         if not (self._numbers_current and pending.is_plain()) or len(stages.young):
             stage, vertices, edges, again, young = self._entered(due)
             if stage == END:
@@ -65,7 +66,7 @@ class OnlineProblem(Problem):
             stage = GROUP
             if how == SEARCH:
                 stage, again = LINEARIZE, self._far_from_linearization()
-            elif how == PLAIN:
+            elif how == IN_PYTHON:
                 stage = ORDER
                 self._linearize(linear)
             elif how == DISSECT:
@@ -99,7 +100,7 @@ class OnlineProblem(Problem):
         if not pending and not len(stages.young) and not len(again):
             return END, NONE, NONE, NONE, NONE
         fresh = np.union1d(edges, stages.young) if len(stages.young) else edges
-        stages.young = young = stages.of_new(edges)
+        stages.young = young = stages.of_new(edges, self.settings)
         if pending.broken:
             self._forget_numbers()
             fresh, vertices = self._active(), self._unknowns()

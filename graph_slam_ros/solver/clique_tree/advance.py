@@ -31,7 +31,7 @@ from graph_slam_ros.typing import Array, Index
 SPARSE = 1.2  # of the memory of fronts, as a multiple of those in use: then it is compacted, not lengthened
 SPARE = 1 << 16  # numbers of fronts for which that does not pay
 STRETCH = 1 << 13  # numbers of fronts by which it is lengthened at least
-DONE, ROOM, DISSECT, ENDS = range(4)  # how ``advance_tree`` ends
+DONE, ROOM, DISSECT = range(3)  # how ``advance_tree`` ends
 
 
 @kernel
