@@ -85,7 +85,7 @@ def worst_while_driving(c: Columns) -> list[Finding]:
     It is the worst error that makes the result meaningless; without one, it is what is wrong with odometry's twist
     or rate, and ids that are those of tracks.
     """
-    found = check_columns(c, OF_A_REPLAY)
+    found = check_columns(of_one_publisher(c, is_live=True), OF_A_REPLAY)
     errors = [one for one in found if one.severity == "error" and one.code in _WHILE_DRIVING]
     errors = [one for one in errors if one.code != "clock_domains" or not _may_be_late(c, one)]
     if errors:

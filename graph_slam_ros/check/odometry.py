@@ -17,6 +17,7 @@ LEAST = 10
 _FASTEST_M_S = 40.0
 _FASTEST_RAD_S, _LEAST_S = 12.0, 0.02  # of steps that are shorter, noise would pass for a turn
 _STEP_M, _STEP_RAD, _TIMES = 0.1, 0.1, 5.0
+_FEW, _FEW_JUMPS, _MANY = 0.01, 5.0, 0.1  # steps that may be jumps: a share, so many, and the most of few messages
 _CORRECTED = 3
 _LIMIT, _LEAST_LIMIT_M_S = 2.5, 0.5  # of the speed above which odometry jumps: times the fastest, and at least
 _IRREGULAR = 2.5  # spread of the times between messages, in medians; 3.2 where they come at random
@@ -51,7 +52,7 @@ class Steps:
     dt : (n,) seconds, positive
     moved, turned : (n, 3) in the frame of the earlier pose, metres and radians
     is_short : (n,) whether no gap is between them
-    fastest_m_s, fastest_rad_s : the 99 % quantiles of the speeds of those
+    fastest_m_s, fastest_rad_s : the fastest of those, without a few that may be jumps
     """
 
     index: Index
@@ -64,9 +65,9 @@ class Steps:
 
     @property
     def fastest_turn_rad_s(self) -> float:
-        """The 99 % quantile of the turn rates, without what noise makes of the shortest steps."""
+        """The fastest turn rate, without what noise makes of the shortest steps."""
         turned = np.linalg.norm(self.turned[self.is_short], axis=1)
-        return float(np.percentile(turned / np.maximum(self.dt[self.is_short], _LEAST_S), 99.0))
+        return _without_jumps(turned / np.maximum(self.dt[self.is_short], _LEAST_S))
 
     @property
     def jumps(self) -> Mask:
@@ -74,6 +75,11 @@ class Steps:
         dt = np.maximum(self.dt, float(np.median(self.dt)))
         far = np.linalg.norm(self.moved, axis=1) > _STEP_M + _TIMES * self.fastest_m_s * dt
         return far | (np.linalg.norm(self.turned, axis=1) > _STEP_RAD + _TIMES * self.fastest_rad_s * dt)
+
+
+def _without_jumps(speeds: Array) -> float:
+    """Return the speed that all of these (n,) but a few keep: 1 % of many, and up to five of few."""
+    return float(np.quantile(speeds, 1.0 - max(_FEW, min(_FEW_JUMPS / max(len(speeds), 1), _MANY))))
 
 
 def _usable(o: OdometryColumns) -> Index:
@@ -99,27 +105,31 @@ def steps_of(o: OdometryColumns) -> Steps | None:
     is_short = dt < max(1.0, 5.0 * float(np.median(dt)))
     rate = np.maximum(dt, float(np.median(dt)))
     speeds = np.stack([np.linalg.norm(moved, axis=1) / rate, np.linalg.norm(turned, axis=1) / rate])
-    fastest = np.percentile(speeds[:, is_short], 99.0, axis=1)
-    return Steps(index, dt, moved, turned, is_short, float(fastest[0]), float(fastest[1]))
+    return Steps(index, dt, moved, turned, is_short, *map(_without_jumps, speeds[:, is_short]))
 
 
-def of_one_publisher(c: Columns) -> Columns:
+def of_one_publisher(c: Columns, *, is_live: bool = False) -> Columns:
     """Return these columns without the odometry that other publishers on its topic have sent.
 
     It was refused because it does not continue the odometry in use, and is by itself the motion of a robot that is
     measured again and again. What is not is an outlier, or of the wrong unit, and stays.
+
+    Parameters
+    ----------
+    is_live : what a node has collected: messages come late and in bursts, and not all that is refused is counted yet,
+        so neither times nor counts decide
     """
     o = c.odometry
-    if c.counters[o.input, "other_publisher"] < LEAST:
+    if not is_live and c.counters[o.input, "other_publisher"] < LEAST:
         return c
     is_used = np.isin(o.stamp_ns, c.path_ns)
-    others = steps_of(o.some(~is_used))
-    if others is None or others.fastest_m_s > _FASTEST_M_S or others.fastest_turn_rad_s > _FASTEST_RAD_S:
+    others, of_used = steps_of(o.some(~is_used)), replace(c, odometry=o.some(is_used))
+    if others is None:
+        return of_used if is_live and is_used.sum() >= LEAST else c
+    if others.fastest_m_s > _FASTEST_M_S or others.fastest_turn_rad_s > _FASTEST_RAD_S:
         return c
     early_s, usual_s, late_s = np.percentile(others.dt, [10.0, 50.0, 90.0])
-    if late_s - early_s > _IRREGULAR * usual_s:
-        return c
-    return replace(c, odometry=o.some(is_used))
+    return of_used if is_live or late_s - early_s <= _IRREGULAR * usual_s else c
 
 
 def check_odometry(c: Columns) -> Iterator[Finding]:

@@ -162,7 +162,10 @@ class OnePublisher:
             self._tracks.append(_Track(m.source))
         used = self._tracks[0]
         if self._is_older(m):
-            return [m]
+            if not self._is_of_another(m):
+                return [m]
+            self._refuse()
+            return []
         track = self._continued(m)
         track.add(m)
         if track is used:
@@ -178,6 +181,11 @@ class OnePublisher:
         """Return whether its place is decided by the order of stamps."""
         used = self._tracks[0]
         return bool(used.past) and m.stamp_ns < used.newest_ns - _BACK_NS
+
+    def _is_of_another(self, late: Odometry) -> bool:
+        """Return whether a late message continues another publisher's track, and not the one in use."""
+        others = (track for track in self._tracks if track.is_established)
+        return self._tracks[0].misfit(late) > 1.0 and any(track.misfit(late) <= 1.0 for track in others)
 
     def finish(self) -> list[Odometry]:
         """No more messages come: odometry has jumped to those that are kept."""

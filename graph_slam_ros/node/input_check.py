@@ -58,7 +58,8 @@ class InputCheck:
 
     def add(self, topic: str, names: Sequence[str], now_ns: int, measured: Sequence[Measured]) -> None:
         """Collect what a message of these inputs has measured; of odometry, a part is enough."""
-        some = [m for m in measured if not isinstance(m, Odometry) or self._is_next(m)]
+        is_held = len(measured) > 1  # until now: its messages are collected already
+        some = [m for m in measured if not isinstance(m, Odometry) or self._is_next(m) or is_held]
         if topic in self._odometry:
             if (some or not measured) and self._is_due(topic):  # what was used is collected as it was used, too
                 self._kept += 1
@@ -98,7 +99,8 @@ class InputCheck:
         return True
 
     def _is_next(self, m: Odometry) -> bool:
-        if abs(m.stamp_ns - self._last_ns.get(m.source, 0)) < _APART_NS:
+        """Return whether odometry is collected. What comes late is not: nor is it used."""
+        if m.stamp_ns - self._last_ns.get(m.source, 0) < _APART_NS:
             return False
         self._last_ns[m.source] = m.stamp_ns
         return True

@@ -90,10 +90,10 @@ def test_of_odometry_at_a_high_rate_a_part_is_collected():
     assert len(check._collector.columns(Counters()).path_ns) == 40, "in two seconds"
 
 
-def odometry(k, stamp_ns=None, unit=1.0, yaw=None, twist=None, covariance=TWIST):
+def odometry(k, stamp_ns=None, unit=1.0, x=0.0, yaw=None, twist=None, covariance=TWIST):
     """A message of a robot that drives in a circle at 2 m/s."""
     turned = 0.05 * k
-    x, y = 2.0 * math.sin(turned), 2.0 - 2.0 * math.cos(turned)
+    x, y = x + 2.0 * math.sin(turned), 2.0 - 2.0 * math.cos(turned)
     speed = make("geometry_msgs/msg/Twist", linear=vector(0, 0), angular=vector(0, 0))
     speed.linear.x, speed.linear.y, speed.angular.z = map(float, twist(turned) if twist else (2.0, 0.0, 1.0))
     where = pose(unit * x, unit * y, 0.0, quaternion(yaw=turned if yaw is None else yaw(turned)))
@@ -115,7 +115,7 @@ def odometry(k, stamp_ns=None, unit=1.0, yaw=None, twist=None, covariance=TWIST)
         ({"unit": 1000.0}, "units: /odom: the robot drives at 2000 m/s: is its position in metres?"),
         ({"yaw": math.degrees}, "units: /odom: the orientation turns at "),
         ({"yaw": lambda _: 0.0}, "no_orientation_of_odometry: /odom: its orientation never changes in "),
-        ({"stamp_ns": 10**15}, "constant_stamps: /odom: all of its 393 messages have the stamp 1000000.000 s"),
+        ({"stamp_ns": 10**15}, "constant_stamps: /odom: all of its 396 messages have the stamp 1000000.000 s"),
         ({"twist": lambda a: (2 * math.cos(a), 2 * math.sin(a), 1.0)}, "twist_frame: /odom: the twist is given along"),
         ({"twist": lambda _: (2.0, 0.0, 57.3)}, "twist_scale: /odom: the pose moves 0.0175 times as far as the turn"),
         ({"twist": lambda _: (0.0, 0.0, 0.0)}, None),
@@ -132,6 +132,33 @@ def test_odometry_is_checked_by_itself_with_its_twist(wrong, text, monkeypatch):
     assert len(check.findings) == (text is not None), check.findings
     for one in check.findings:
         assert one.startswith(text)
+
+
+@pytest.mark.parametrize("lost, seed", [(0.0, 0), *((0.02, seed) for seed in range(8)), *((0.1, seed) for seed in range(4))])
+def test_two_publishers_on_a_busy_machine_have_no_wrong_units(lost, seed, monkeypatch):
+    """A lost message is sent again up to 0.6 s later; until then none of its publisher comes."""
+    rng, at_s = np.random.default_rng(seed), 100.0
+    arrivals, again_s = [], [0.0, 0.0]
+    for k in range(1000):
+        at_s += 0.022 + (rng.exponential(0.2) if rng.random() < 0.1 else 0.0)
+        for which in (0, 1) if 200 < k < 800 else (0,):
+            if rng.random() < lost:
+                again_s[which] = max(again_s[which], at_s + rng.uniform(0.05, 0.6))
+            arrivals.append((max(at_s, again_s[which]), which, k))
+    now_s = [0.0]
+    monkeypatch.setattr(input_check.time, "monotonic", lambda: now_s[0])
+    check, counters = InputCheck(Config(), {"odom": "/odom", "detections": "/tags"}, Counters()), Counters()
+    config = Config.from_mapping({"inputs.tf": False, "odometry.timeout_s": 10.0})
+    converter = MessageConverter(config, counters, check.decoders({}))
+    for at_s, which, k in sorted(arrivals):
+        now_s[0] = at_s
+        stamp_ns = 10**15 + k * 30_000_000 + which * 10_000_000
+        cdr = odometry(0.6 * k, stamp_ns=stamp_ns, x=80.0 * which)
+        check.add("/odom", ["odom"], stamp_ns, converter.convert("odom", cdr))
+        if (job := check.job()) is not None:
+            job()
+        assert check.findings == ()
+    assert counters["odom", "other_publisher"] > 300
 
 
 @pytest.mark.parametrize("burst, is_named", [(1, True), (10, False)])
