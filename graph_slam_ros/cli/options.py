@@ -169,7 +169,9 @@ def simulate(sub: CommandParser) -> None:
 
     sub.more = options_of_worlds
     sub.add_argument(
-        "scenario", metavar="SCENARIO", help="name of a world, city (a graph), or the file of a graph or recording"
+        "scenario",
+        metavar="SCENARIO",
+        help="name of a world (city, sphere: a graph), or the file of a graph or recording",
     )
     sub.add_argument(
         "--out",

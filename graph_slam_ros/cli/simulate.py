@@ -13,26 +13,25 @@ if TYPE_CHECKING:
     from graph_slam_ros.formats.graph_file import G2oFile
     from graph_slam_ros.simulation import Fault, Recording
 
-CITY = "city"  # a world that is a graph from the first
-
 
 def simulate(args: argparse.Namespace) -> int:
     """Record a synthetic world, or write it as a graph; put faults into it."""
     from graph_slam_ros.formats.strict import ending
-    from graph_slam_ros.simulation import WORLDS, Fault
+    from graph_slam_ros.simulation import GRAPH_WORLDS, WORLDS, Fault
 
+    is_world = args.scenario in (*WORLDS, *GRAPH_WORLDS)
     faults = [Fault.parsed(text) for text in args.fault]
     as_graph = ending(args.out) == ".g2o"
     if as_graph and (wrong := [fault.kind for fault in faults if fault.is_of_messages]):
         raise GraphSlamError(f"{wrong[0]}: a graph has no messages: --out FILE.mcap")
-    if args.scenario not in (*WORLDS, CITY) and _is_recording(Path(args.scenario)) and not as_graph:
+    if not is_world and _is_recording(Path(args.scenario)) and not as_graph:
         return _spoil_recording(args, faults)
-    if args.scenario not in (*WORLDS, CITY) and not Path(args.scenario).exists():
-        there = [*WORLDS, CITY]
+    if not is_world and not Path(args.scenario).exists():
+        there = [*WORLDS, *GRAPH_WORLDS]
         near = did_you_mean(args.scenario, there) or similar_file(Path(args.scenario))
         raise GraphSlamError(f"no world {args.scenario!r}; there are {', '.join(there)}, and no such file{near}")
-    of_file = args.scenario not in (*WORLDS, CITY) and Path(args.scenario).is_file()
-    if (of_file or args.scenario == CITY) and not as_graph:
+    of_file = not is_world and Path(args.scenario).is_file()
+    if (of_file or args.scenario in GRAPH_WORLDS) and not as_graph:
         raise GraphSlamError(f"{args.out}: {args.scenario} is a graph: --out FILE.g2o")
     companions = [".faults.csv"] * bool(faults) + [".truth.tum"] * (as_graph and not of_file)
     written, source = [_companion(args.out, ending) for ending in companions], Path(args.scenario) if of_file else None
@@ -86,13 +85,13 @@ def _spoil_recording(args: argparse.Namespace, faults: "list[Fault]") -> int:
 def _write_graph(args: argparse.Namespace, faults: "list[Fault]") -> None:
     from graph_slam_ros.formats.convert import write_graph
     from graph_slam_ros.formats.graph_file import G2oFile
-    from graph_slam_ros.simulation import city_graph, landmark_graph
+    from graph_slam_ros.simulation import GRAPH_WORLDS, landmark_graph
     from graph_slam_ros.simulation.pose_graph import truth_of, values_of
 
-    if args.scenario == CITY:
+    if world := GRAPH_WORLDS.get(args.scenario):
         if args.closures is not None:
-            raise GraphSlamError("city: no use for --closures: it has them")
-        graph, poses = city_graph(args.seed, **_options(args))
+            raise GraphSlamError(f"{args.scenario}: no use for --closures: it has them")
+        graph, poses = world.measure(args.seed, **_options(args))
         truth = poses.ravel()
     else:
         recording = _recorded(args)
@@ -166,7 +165,7 @@ def _companion(out: Path, ending: str) -> Path:
 
 def options_of_worlds() -> str:
     """Every option of the worlds and every kind of fault, with defaults."""
-    from graph_slam_ros.simulation import WORLDS, Instruments
+    from graph_slam_ros.simulation import GRAPH_WORLDS, WORLDS, Instruments
     from graph_slam_ros.simulation.faults import KINDS
     from graph_slam_ros.simulation.message_faults import MESSAGE_KINDS
     from graph_slam_ros.simulation.options import options_of
@@ -183,6 +182,8 @@ def options_of_worlds() -> str:
     for name, world in WORLDS.items():
         lines += [f"  {name}: {world.about}", *option_lines(world.options)]
     lines += ["  every world: with a satellite receiver and an IMU", *option_lines(Instruments)]
+    for name, graph_world in GRAPH_WORLDS.items():
+        lines += [f"  {name}, a graph: {graph_world.about}", *option_lines(graph_world.options)]
     lines += ["", "faults for --fault with their options; OUT.faults.csv lists what is wrong:"]
     for name, kind in KINDS.items():
         lines += [f"  {name}: {kind.about}", *option_lines(kind.options)]

@@ -18,7 +18,7 @@ from graph_slam_ros.simulation.faults import KINDS, Fault, spoil_messages
 from graph_slam_ros.simulation.faulty import faulty_graph, faulty_recording
 from graph_slam_ros.simulation.instruments import Instruments, with_instruments
 from graph_slam_ros.simulation.options import Option, fill, options_of
-from graph_slam_ros.simulation.pose_graph import CityGraph, city_graph, landmark_graph, write_graph
+from graph_slam_ros.simulation.pose_graph import GRAPH_WORLDS, city_graph, landmark_graph, sphere_graph, write_graph
 from graph_slam_ros.simulation.recording import Recording, measurements, with_closures
 
 
@@ -84,9 +84,9 @@ def spoil_bag(source: Path, out: Path, faults: Sequence[Fault], seed: int) -> No
 
 
 __all__ = [
+    "GRAPH_WORLDS",
     "KINDS",
     "WORLDS",
-    "CityGraph",
     "Drive",
     "Fault",
     "Instruments",
@@ -103,6 +103,7 @@ __all__ = [
     "measurements",
     "options_of",
     "simulate",
+    "sphere_graph",
     "spoil_bag",
     "spoil_messages",
     "with_closures",

@@ -1,7 +1,7 @@
-"""The same worlds as graphs: cities with closures between poses, and drives among landmarks."""
+"""Worlds as graphs: a city and a sphere with closures between poses, and drives among landmarks."""
 
 from bisect import bisect_right
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,11 +11,11 @@ from numpy.random import PCG64, Generator
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.g2o_writer import write_g2o
 from graph_slam_ros.formats.graph_file import G2oFile, Values
-from graph_slam_ros.graph import RELATIVE_POSE, SE2, Gaussian, Graph
-from graph_slam_ros.graph.geometry import Geometry
-from graph_slam_ros.lie import se2
+from graph_slam_ros.graph import Gaussian, Graph
+from graph_slam_ros.graph.geometry import PLANAR, SPATIAL, Geometry
+from graph_slam_ros.lie import se2, se3
 from graph_slam_ros.simulation.manhattan import STEP_M, stroll
-from graph_slam_ros.simulation.motion import space_of, step_covariance
+from graph_slam_ros.simulation.motion import integrate, space_of, step_covariance
 from graph_slam_ros.simulation.options import fill, option
 from graph_slam_ros.simulation.recording import Recording
 from graph_slam_ros.slam import Sighting
@@ -51,23 +51,73 @@ def city_graph(seed: int, **values: float) -> tuple[Graph, Array]:
     graph : edges labelled ``odometry`` and ``closures``, each in order of its later pose
     truth : (poses, 3) true poses
     """
-    options = fill("city_graph", CityGraph, values)
+    options = fill("city", CityGraph, values)
     rng = Generator(PCG64(seed))
     cells, ways = stroll(rng, options.poses - 1, options.blocks)
     headings = 0.5 * np.pi * np.concatenate([ways[:1], ways])
     truth = np.column_stack([STEP_M * cells, se2.wrap(headings)])
     closures = closure_pairs(rng, cells)
-    sigmas = np.array([options.sigma_m, options.sigma_m, options.sigma_rad])
-    coarse = options.odometry_noise_factor * sigmas
-    steps = np.column_stack([np.arange(options.poses - 1), np.arange(1, options.poses)])
-    odometry = _measured(rng, truth, steps, coarse)
-    graph = Graph()
-    graph.add_vertices(SE2, _composed(truth[0], odometry))
-    graph.add_edges(RELATIVE_POSE, steps, odometry, Gaussian.from_sigmas(*coarse.tolist()), "odometry")
-    if len(closures):
-        seen = _measured(rng, truth, closures, sigmas)
-        graph.add_edges(RELATIVE_POSE, closures, seen, Gaussian.from_sigmas(*sigmas.tolist()), "closures")
-    return graph, truth
+    sigmas = PLANAR.sigmas(options.sigma_m, options.sigma_rad)
+    return _pose_graph(PLANAR, rng, truth, closures, sigmas, options.odometry_noise_factor), truth
+
+
+@dataclass(frozen=True, slots=True)
+class SphereGraph:
+    """Options of ``sphere_graph``."""
+
+    poses: int = option(2500, "poses, from the lower to the upper pole", "", 2, 1e6)
+    poses_per_lap: int = option(50, "poses until the robot is above an earlier one", "", 2, 1e6)
+    closures: int = option(1, "closures of a pose, to the nearest poses of the lap before", "", 1, 9)
+    radius_m: float = option(100.0, "radius of the sphere", "m", 1e-3, 1e6)
+    sigma_m: float = option(0.1, "noise of relative positions, in x, y and z", "m", 1e-9, 10)
+    sigma_rad: float = option(0.01, "noise of relative rotations, about x, y and z", "rad", 1e-9, 1)
+    odometry_noise_factor: float = option(1.0, "odometry is noisier than closures by this factor", "", 1e-6, 1e3)
+
+
+def sphere_graph(seed: int, **values: float) -> tuple[Graph, Array]:
+    """Fly up around a sphere, lap above lap; each pose is measured from the odometry's last and from the lap before.
+
+    The x axis of a pose points away from the centre, its y axis ahead. Vertices start as in ``city_graph``, and edges
+    have its labels and order.
+
+    Parameters
+    ----------
+    values : options of ``SphereGraph``
+
+    Returns
+    -------
+    graph
+    truth : (poses, 7) true poses
+    """
+    options = fill("sphere", SphereGraph, values)
+    rng, count = Generator(PCG64(seed)), np.arange(options.poses)
+    yaw, pitch = 2.0 * np.pi * count / options.poses_per_lap, np.pi * (0.5 - (count + 0.5) / options.poses)
+    out = [se3.from_xyz_rpy((0.0, 0.0, 0.0, 0.0, *turn)) for turn in np.column_stack([pitch, yaw]).tolist()]
+    truth = np.array([se3.compose(pose, (options.radius_m, *se3.IDENTITY[1:])) for pose in out])
+    reach = (np.arange(1, options.closures + 1) // 2) * (-1) ** np.arange(options.closures)  # 0, -1, 1, -2, ...
+    pairs = np.stack(np.broadcast_arrays(count[:, None] - options.poses_per_lap + reach, count[:, None]), axis=-1)
+    closures = pairs[(pairs[:, :, 0] >= 0) & (pairs[:, :, 0] < pairs[:, :, 1] - 1)]
+    sigmas = SPATIAL.sigmas(options.sigma_m, options.sigma_rad)
+    return _pose_graph(SPATIAL, rng, truth, closures, sigmas, options.odometry_noise_factor), truth
+
+
+@dataclass(frozen=True, slots=True)
+class GraphWorld:
+    """A world that is a graph from the first: the dataclass of its options, and the function that measures it.
+
+    That returns the graph, and the true poses of its vertices.
+    """
+
+    options: type
+    measure: Callable[..., tuple[Graph, Array]]
+
+    @property
+    def about(self) -> str:
+        """Describe it in one sentence."""
+        return (self.measure.__doc__ or "").strip().splitlines()[0]
+
+
+GRAPH_WORLDS = {"city": GraphWorld(CityGraph, city_graph), "sphere": GraphWorld(SphereGraph, sphere_graph)}
 
 
 def closure_pairs(rng: Generator, cells: Index) -> Index:
@@ -93,15 +143,34 @@ def closure_pairs(rng: Generator, cells: Index) -> Index:
     return np.array(pairs, dtype=np.int64).reshape(-1, 2)
 
 
-def _measured(rng: Generator, truth: Array, pairs: Index, sigmas: Array) -> Array:
-    """Relative poses (n, 3) of the pairs, ``T_i_j Exp(noise)``."""
-    exact = se2.between(tuple(truth[pairs[:, 0]].T), tuple(truth[pairs[:, 1]].T))
-    noise = rng.standard_normal((len(pairs), 3)) * sigmas
-    return np.stack(se2.retract(exact, tuple(noise.T)), axis=1)
+def _pose_graph(
+    space: Geometry, rng: Generator, truth: Array, closures: Index, sigmas: Sequence[float], odometry_factor: float
+) -> Graph:
+    """A graph of odometry from pose to pose, and of these closures (n, 2); poses start where odometry leads."""
+    near = np.array(sigmas)
+    coarse = odometry_factor * near
+    steps = np.column_stack([np.arange(len(truth) - 1), np.arange(1, len(truth))])
+    odometry = _measured(space, rng, truth, steps, coarse)
+    graph = Graph()
+    graph.add_vertices(space.pose, _composed(space, truth[0], odometry))
+    graph.add_edges(space.relative_pose, steps, odometry, Gaussian.from_sigmas(*coarse.tolist()), "odometry")
+    if len(closures):
+        seen = _measured(space, rng, truth, closures, near)
+        graph.add_edges(space.relative_pose, closures, seen, Gaussian.from_sigmas(*near.tolist()), "closures")
+    return graph
 
 
-def _composed(start: Array, steps: Array) -> Array:
-    """Poses (n + 1, 3) from relative poses (n, 3)."""
+def _measured(space: Geometry, rng: Generator, truth: Array, pairs: Index, sigmas: Array) -> Array:
+    """Relative poses (n, k) of the pairs, ``T_i_j Exp(noise)``."""
+    exact = space.group.between(tuple(truth[pairs[:, 0]].T), tuple(truth[pairs[:, 1]].T))
+    noise = rng.standard_normal((len(pairs), len(sigmas))) * sigmas
+    return np.stack(space.group.retract(exact, tuple(noise.T)), axis=1)
+
+
+def _composed(space: Geometry, start: Array, steps: Array) -> Array:
+    """Poses (n + 1, k) from relative poses (n, k)."""
+    if space is SPATIAL:
+        return integrate(tuple(start.tolist()), np.stack(se3.log(tuple(steps.T)), axis=1))
     theta = start[2] + np.concatenate([[0.0], np.cumsum(steps[:, 2])])
     moved = se2.act((0.0, 0.0, theta[:-1]), (steps[:, 0], steps[:, 1]))
     x, y = (first + np.concatenate([[0.0], np.cumsum(d)]) for first, d in zip(start[:2], moved, strict=True))

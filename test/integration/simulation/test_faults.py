@@ -415,6 +415,9 @@ def test_a_recording_with_faults_has_their_table_beside_it(tmp_path, capsys):
     [
         (["city", "--out", "{out}.mcap"], "city is a graph: --out FILE.g2o"),
         (["city", "--closures", "5", "--out", "{out}.g2o"], "city: no use for --closures"),
+        (["sphere", "--out", "{out}.mcap"], "sphere is a graph: --out FILE.g2o"),
+        (["sphere", "--set", "laps=5", "--out", "{out}.g2o"], "sphere: no option 'laps'; it has poses, poses_per_lap"),
+        (["spere", "--out", "{out}.g2o"], "did you mean 'sphere'"),
         (["{graph}", "--set", "blocks=4", "--out", "{out}.g2o"], "no use for --set: it is no world"),
         (["{graph}", "--out", "{graph}"], "cannot be read from and written to at once"),
         (["{graph}", "--fault", "swapped_ids", "--out", "{out}.g2o"], "swapped_ids: needs 2 landmarks"),

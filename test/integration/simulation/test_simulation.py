@@ -7,7 +7,7 @@ from reliability import times
 from graph_slam_ros.analysis.path_error import path_error
 from graph_slam_ros.analysis.trajectories import read_truth
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.graph import RELATIVE_POSE
+from graph_slam_ros.graph import RELATIVE_POSE, RELATIVE_POSE_3D
 from graph_slam_ros.lie import se2, se3, so3
 from graph_slam_ros.messages.from_msg import MessageConverter
 from graph_slam_ros.messages.interfaces import typestore
@@ -21,6 +21,7 @@ from graph_slam_ros.simulation import (
     measurements,
     options_of,
     simulate,
+    sphere_graph,
     warehouse,
     write_bag,
 )
@@ -407,9 +408,9 @@ def test_a_wrong_world_or_option_is_refused_by_name(world, options, named):
     assert "\n" not in str(refused.value)
 
 
-def chi2_at(graph, values, label):
-    table = graph.tables[RELATIVE_POSE]
-    residual, _ = RELATIVE_POSE.linearize(values.ravel(), 3 * table.vertices.values, table.measured.values)
+def chi2_at(graph, values, label, edge_type=RELATIVE_POSE, size=3):
+    table = graph.tables[edge_type]
+    residual, _ = edge_type.linearize(values.ravel(), size * table.vertices.values, table.measured.values)
     mine = table.label.values == graph.labels.index(label)
     whitened = np.einsum("nij,nj->ni", table.sqrt_information.values[mine], residual[mine])
     return float((whitened**2).sum()), int(mine.sum())
@@ -438,6 +439,24 @@ def test_a_city_graph_has_one_closure_per_three_poses_and_each_leads_to_an_old_p
     assert np.abs(truth[earlier, :2] - truth[later, :2]).max() <= 2.0
     assert len(np.unique(later)) == len(later)
     assert [truth[:, :2].min(), truth[:, :2].max()] == [0.0, 40.0]
+
+
+@pytest.mark.parametrize("sigma_rad, closures", [(0.01, 1), (0.1, 1), (0.1, 4)])
+def test_the_truth_explains_a_sphere_within_its_noise_and_closures_lead_to_the_lap_before(sigma_rad, closures):
+    graph, truth = sphere_graph(2, poses=1000, sigma_rad=sigma_rad, closures=closures, odometry_noise_factor=2.0)
+    for label in ("odometry", "closures"):
+        chi2, edges = chi2_at(graph, truth, label, RELATIVE_POSE_3D, 7)
+        assert chi2 / (6 * edges) == pytest.approx(1.0, abs=5.0 * np.sqrt(2.0 / (6 * edges)))
+    chi2, _ = chi2_at(graph, graph.initial.values.reshape(-1, 7), "odometry", RELATIVE_POSE_3D, 7)
+    assert chi2 < 1e-12  # it starts at the odometry
+    table = graph.tables[RELATIVE_POSE_3D]
+    earlier, later = table.vertices.values[table.label.values == graph.labels.index("closures")].T
+    assert set((later - earlier).tolist()) == {1: {50}, 4: {49, 50, 51, 52}}[closures]
+    assert len(later) == pytest.approx(closures * 950, abs=3 * closures)
+    radius = np.linalg.norm(truth[:, :3], axis=1)
+    assert np.ptp(radius) < 1e-9 and radius[0] == pytest.approx(100.0)
+    lap_m = np.linalg.norm(truth[50:, :3] - truth[:-50, :3], axis=1)
+    assert lap_m == pytest.approx(2.0 * 100.0 * np.sin(np.pi / 40.0)), "a lap is a twentieth of the way up"
 
 
 def test_the_noise_of_a_landmark_graphs_odometry_explains_the_true_motion():

@@ -134,31 +134,32 @@ def test_odometry_is_checked_by_itself_with_its_twist(wrong, text, monkeypatch):
         assert one.startswith(text)
 
 
-@pytest.mark.parametrize("lost, seed", [(0.0, 0), *((0.02, seed) for seed in range(8)), *((0.1, seed) for seed in range(4))])
-def test_two_publishers_on_a_busy_machine_have_no_wrong_units(lost, seed, monkeypatch):
+@pytest.mark.parametrize("lost, seeds", [(0.0, 1), (0.02, 8), (0.1, 4)])
+def test_two_publishers_on_a_busy_machine_have_no_wrong_units(lost, seeds, monkeypatch):
     """A lost message is sent again up to 0.6 s later; until then none of its publisher comes."""
-    rng, at_s = np.random.default_rng(seed), 100.0
-    arrivals, again_s = [], [0.0, 0.0]
-    for k in range(1000):
-        at_s += 0.022 + (rng.exponential(0.2) if rng.random() < 0.1 else 0.0)
-        for which in (0, 1) if 200 < k < 800 else (0,):
-            if rng.random() < lost:
-                again_s[which] = max(again_s[which], at_s + rng.uniform(0.05, 0.6))
-            arrivals.append((max(at_s, again_s[which]), which, k))
     now_s = [0.0]
     monkeypatch.setattr(input_check.time, "monotonic", lambda: now_s[0])
-    check, counters = InputCheck(Config(), {"odom": "/odom", "detections": "/tags"}, Counters()), Counters()
-    config = Config.from_mapping({"inputs.tf": False, "odometry.timeout_s": 10.0})
-    converter = MessageConverter(config, counters, check.decoders({}))
-    for at_s, which, k in sorted(arrivals):
-        now_s[0] = at_s
-        stamp_ns = 10**15 + k * 30_000_000 + which * 10_000_000
-        cdr = odometry(0.6 * k, stamp_ns=stamp_ns, x=80.0 * which)
-        check.add("/odom", ["odom"], stamp_ns, converter.convert("odom", cdr))
-        if (job := check.job()) is not None:
-            job()
-        assert check.findings == ()
-    assert counters["odom", "other_publisher"] > 300
+    for seed in range(seeds):
+        rng, at_s = np.random.default_rng(seed), 100.0
+        arrivals, again_s = [], [0.0, 0.0]
+        for k in range(1000):
+            at_s += 0.022 + (rng.exponential(0.2) if rng.random() < 0.1 else 0.0)
+            for which in (0, 1) if 200 < k < 800 else (0,):
+                if rng.random() < lost:
+                    again_s[which] = max(again_s[which], at_s + rng.uniform(0.05, 0.6))
+                arrivals.append((max(at_s, again_s[which]), which, k))
+        check, counters = InputCheck(Config(), {"odom": "/odom", "detections": "/tags"}, Counters()), Counters()
+        config = Config.from_mapping({"inputs.tf": False, "odometry.timeout_s": 10.0})
+        converter = MessageConverter(config, counters, check.decoders({}))
+        for at_s, which, k in sorted(arrivals):
+            now_s[0] = at_s
+            stamp_ns = 10**15 + k * 30_000_000 + which * 10_000_000
+            cdr = odometry(0.6 * k, stamp_ns=stamp_ns, x=80.0 * which)
+            check.add("/odom", ["odom"], stamp_ns, converter.convert("odom", cdr))
+            if (job := check.job()) is not None:
+                job()
+            assert check.findings == ()
+        assert counters["odom", "other_publisher"] > 300
 
 
 @pytest.mark.parametrize("burst, is_named", [(1, True), (10, False)])
