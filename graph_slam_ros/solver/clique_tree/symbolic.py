@@ -38,7 +38,7 @@ from graph_slam_ros.solver.clique_tree.storage import (
 from graph_slam_ros.typing import Index
 
 RELAXED = 36  # zeros that a vertex may bring along when it joins a clique: fewer, larger fronts
-SHARE = 0.12  # or this share of a large one
+SHARE = 0.36  # or so many in each row of a large one: elimination pays for them, and assembly of a front is saved
 
 
 @kernel
@@ -235,8 +235,8 @@ def cliques_of(t: Tree, order: Index, start: Index, later: Index) -> tuple[Index
             parent = later[start[k]]
             c = clique[parent]
             same = (vertex[order[k], REGION] == NOTHING) == (vertex[order[parent], REGION] == NOTHING)
-            zeros = size[c] - width
-            if head[c] == parent and (zeros * dof <= RELAXED or (same and zeros <= SHARE * size[c])):
+            zeros = dof * (size[c] - width)
+            if head[c] == parent and (zeros <= RELAXED or (same and zeros <= SHARE * size[c])):
                 clique[k], head[c] = c, k
                 size[c] += dof
                 continue
