@@ -36,6 +36,7 @@ from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Index, Numbers
 
 BATCH = 200  # keyframes that leave the window together
+_VISITS, _BACKLOG = 4, 300  # most visits of an update, or it takes long; unless so many keyframes are to leave
 _ENOUGH = 3  # landmarks of a visit: with fewer it goes on in the next cell
 LONGEST = BATCH  # keyframes of a visit: so all that leave a cell together are one, and as little is cut as can be
 _PATIENCE = 200  # keyframes that are out of the window while a visit waits
@@ -175,8 +176,8 @@ class BoundedMap:
         at, rows, frames = solver.estimate(ids), list[_Row](), list[tuple[Frames, range]]()
         begins = [*(begin - first for begin in sorted(path.segments) if begin > first), len(ids)]
         cells = list(map(tuple, np.floor(at[:, : self._space.dimensions] / width).astype(np.int64).tolist()))
-        marks, k = seen_from(self._space, solver, ids), 0
-        while k < limit:
+        marks, k, room = seen_from(self._space, solver, ids), 0, _VISITS if limit < _BACKLOG else limit
+        while k < limit and room:
             longest = min(k + LONGEST, begins[bisect_right(begins, k)])  # a visit is of one segment
             end = k + _length(marks[k:longest], cells[k:longest])
             if max(end, k + 1) > limit:
@@ -194,7 +195,7 @@ class BoundedMap:
                 break
             self._note_end(done, end - k)
             rows += self._rows(visit, k, done, frames)
-            k = end
+            k, room = end, room - 1
         self.condenser.rescale()
         self._solution.guard.checked(solver.update)
         return rows, chained(self._space, frames, at), first + k
@@ -279,8 +280,7 @@ class BoundedMap:
     def _attach(self, left: Records, rows: Sequence[_Row]) -> Records:
         """Note how the keyframes that leave are joined to the graph, for closures that come to them."""
         out = np.zeros(len(rows), dtype=attached_type(self._space))
-        for k, row in enumerate(rows):
-            out[k] = row.joined, row.T_joined, row.covariance
+        out[:] = [(row.joined, row.T_joined, row.covariance) for row in rows]
         self.state.attached.add(self._space, self._frontend.path.keyframes.first, left, out)
         return out
 

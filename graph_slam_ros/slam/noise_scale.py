@@ -240,9 +240,12 @@ class _Block:
         total.chi2 += float(np.sum(white**2))
         total.outliers += int(np.count_nonzero(self.weight < LEAST_WEIGHT))
         total.passes += len(passes)
-        for those in passes:
-            total.of_means += len(those) * float(np.sum(white[those].mean(axis=0) ** 2))
-            total.of_singles += float(np.mean(np.sum(white[those] ** 2, axis=1)))
+        if passes:
+            sizes, ordered = np.array(list(map(len, passes))), white[np.concatenate(passes)]
+            sums = np.add.reduceat(ordered, np.cumsum(sizes) - sizes)
+            squares = np.add.reduceat(np.sum(ordered**2, axis=1), np.cumsum(sizes) - sizes)
+            total.of_means += float(np.sum(np.sum(sums**2, axis=1) / sizes))
+            total.of_singles += float(np.sum(squares / sizes))
 
     def _seconds(self, stamp_of: Index) -> float:
         """The time between the vertices of its edges, in all."""
