@@ -15,8 +15,9 @@ from graph_slam_ros.typing import Array
 
 LEAST_PIVOT = 1e-14  # of its diagonal entry: what elimination left of it is rounding
 WIDE = 12  # pivots that are applied to the rows below by matrix products
+PANEL = 48  # pivots that are applied to the rows below all of them at once: each pass over a large front takes time
 FEWEST, SHORTEST = 3, 24  # pivots, and rows below them, for which that pays
-STRIP = 64  # rows of one product: half of what it makes on the diagonal is not needed
+STRIP = 24  # rows of one product: half of what it makes on the diagonal is not needed
 
 dense = partial(kernel, fastmath={"reassoc", "contract", "nsz"})
 
@@ -56,16 +57,28 @@ def partial_cholesky(front: Array, frontal: int, diagonal: Array) -> int:
     rounding, which is judged by the ``diagonal`` of the whole problem. What is below the diagonal is not used.
     """
     n = front.shape[0]
-    for done in range(0, frontal, WIDE):
-        end = min(done + WIDE, frontal)
-        wide = end - done >= FEWEST and n - end >= SHORTEST
-        failed = _eliminate_panel(front, done, end, end if wide else n, diagonal)
-        if failed != NOTHING:
-            return failed
-        if wide:
-            for first in range(end, n, STRIP):
-                _subtract_product(front, done, end, first, min(first + STRIP, n))
+    for low in range(0, frontal, PANEL):
+        high = min(low + PANEL, frontal)
+        tall = high - low >= FEWEST and n - high >= SHORTEST
+        below = high if tall else n  # rows that get each few pivots at once
+        for done in range(low, high, WIDE):
+            end = min(done + WIDE, high)
+            wide = end - done >= FEWEST and below - end >= SHORTEST
+            failed = _eliminate_panel(front, done, end, end if wide else below, diagonal)
+            if failed != NOTHING:
+                return failed
+            if wide:
+                _subtract_strips(front, done, end, end, below)
+        if tall:
+            _subtract_strips(front, low, high, high, n)
     return NOTHING
+
+
+@dense
+def _subtract_strips(front: Array, low: int, high: int, first: int, last: int) -> None:
+    """Subtract the product of the pivot rows [low, high) from the rows [first, last), strip by strip."""
+    for row in range(first, last, STRIP):
+        _subtract_product(front, low, high, row, min(row + STRIP, last))
 
 
 @dense

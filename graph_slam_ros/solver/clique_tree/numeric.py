@@ -34,6 +34,7 @@ from graph_slam_ros.solver.clique_tree.storage import (
     STEP,
     VALUE,
     WIDTH,
+    ZERO,
     Tree,
     front_of,
     packed_size,
@@ -54,7 +55,7 @@ def eliminate(t: Tree, cliques: Index, damping: float) -> int:
     widest = 0
     for c in cliques:
         widest = max(widest, clique[c, FULL_DOF])
-    square, scale = np.empty(widest * (widest + 1)), np.empty(widest)  # all cliques share them
+    square, scale, runs = np.empty(widest * (widest + 1)), np.empty(widest), np.empty((widest, 3), np.int64)  # shared
     failed = NOTHING
     for c in cliques:
         full, frontal = clique[c, FULL_DOF], clique[c, FRONT_DOF]
@@ -74,7 +75,7 @@ def eliminate(t: Tree, cliques: Index, damping: float) -> int:
             _add_own_edges(vertex, t.edge, t.link, t.blocks, members[m], front)
         child = clique[c, CHILD]
         while child != NOTHING:
-            _add_contribution(vertex, clique, members, fronts, child, front)
+            _add_contribution(vertex, clique, members, fronts, child, front, runs)
             child = clique[child, SIBLING]
         failed = partial_cholesky(front, frontal, scale)
         pack(front, front_of(clique, fronts, c))
@@ -136,16 +137,7 @@ def _add_block(
     """Add the block (row, column) of two vertices in a packed front to their places (at, to) in another front."""
     if at < to:
         for i in range(dof):
-            begin = row_of(row + i, rows) + column
-            if width == 3:  # the usual widths by themselves: a loop of known length is unrolled
-                for j in range(3):
-                    front[at + i, to + j] += packed[begin + j]
-            elif width == 6:
-                for j in range(6):
-                    front[at + i, to + j] += packed[begin + j]
-            else:
-                for j in range(width):
-                    front[at + i, to + j] += packed[begin + j]
+            _add_run(front[at + i, to:], packed[row_of(row + i, rows) + column :], width)
     else:
         for i in range(dof):
             begin = row_of(row + i, rows) + column
@@ -154,25 +146,51 @@ def _add_block(
 
 
 @inlined
-def _add_contribution(vertex: Index, clique: Index, members: Index, fronts: Array, child: int, front: Array) -> None:
-    """Add a child's contribution to its separator."""
+def _add_contribution(
+    vertex: Index, clique: Index, members: Index, fronts: Array, child: int, front: Array, runs: Index
+) -> None:
+    """Add a child's contribution to its separator.
+
+    Columns that follow one another in both fronts are added together. ``runs`` (widest, 3) is scratch: place in the
+    front, place in the child's, and length of each such run.
+    """
     of_child = front_of(clique, fronts, child)
     right, of_right = front.shape[0], clique[child, FULL_DOF]
-    low, high = clique[child, MEMBERS] + clique[child, FRONTALS], clique[child, MEMBERS] + clique[child, SIZE]
-    row = clique[child, FRONT_DOF]
-    for m in range(low, high):
+    column, count = clique[child, FRONT_DOF], ZERO
+    for m in range(clique[child, MEMBERS] + clique[child, FRONTALS], clique[child, MEMBERS] + clique[child, SIZE]):
         at, dof = vertex[members[m], LOCAL], vertex[members[m], DOF]
-        for i in range(dof):
+        if count > 0 and runs[count - 1, 0] + runs[count - 1, 2] == at:
+            runs[count - 1, 2] += dof
+        else:
+            runs[count, 0], runs[count, 1], runs[count, 2] = at, column, dof
+            count += 1
+        column += dof
+    for r in range(count):
+        at, row, length = runs[r, 0], runs[r, 1], runs[r, 2]
+        for i in range(length):
             packed = row_of(row + i, of_right)
             front[at + i, right] += of_child[packed + of_right]
-            for j in range(i, dof):
-                front[at + i, at + j] += of_child[packed + row + j]
-        column = row + dof
-        for k in range(m + 1, high):
-            to, width = vertex[members[k], LOCAL], vertex[members[k], DOF]
-            _add_block(of_child, of_right, row, column, front, at, to, dof, width)
-            column += width
-        row += dof
+            _add_run(front[at + i, at + i :], of_child[packed + row + i :], length - i)
+            for z in range(r + 1, count):
+                to, begin, width = runs[z, 0], packed + runs[z, 1], runs[z, 2]
+                if at < to:
+                    _add_run(front[at + i, to:], of_child[begin:], width)
+                else:
+                    for j in range(width):
+                        front[to + j, at + i] += of_child[begin + j]
+
+
+@inlined
+def _add_run(target: Array, source: Array, width: int) -> None:
+    if width == 3:  # the usual widths by themselves: a loop of known length is unrolled
+        for j in range(3):
+            target[j] += source[j]
+    elif width == 6:
+        for j in range(6):
+            target[j] += source[j]
+    else:
+        for j in range(width):
+            target[j] += source[j]
 
 
 @inlined
