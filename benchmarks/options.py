@@ -8,12 +8,13 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from benchmarks.fresh import ROOT
-from benchmarks.problem import Problem, read_problem
+from benchmarks.problem import Problem, read_problem, sphere_problem
 from graph_slam_ros.cli import values
 from graph_slam_ros.errors import GraphSlamError
 
 PATIENCE_S = 600.0
 SLOW_S = 60.0  # who takes longer is not asked again
+_SPHERE = Path("sphere")  # no file: simulated
 _OF_GTSAM = ("w10000.graph", "sphere_smallnoise.graph")
 
 
@@ -41,7 +42,8 @@ def _names(text: str, known: Sequence[str]) -> list[str]:
 
 def add_files(options: argparse.ArgumentParser) -> None:
     """Graphs to race on, and how often."""
-    options.add_argument("files", nargs="*", type=Path, metavar="FILE", help="graphs (default: all that are at hand)")
+    about = "graphs, or sphere: simulated, with 0.1 rad of noise (default: all that are at hand)"
+    options.add_argument("files", nargs="*", type=Path, metavar="FILE", help=about)
     options.add_argument(
         "--reps", type=values.count, default=3, metavar="N", help="repetitions; their medians are told"
     )
@@ -57,9 +59,9 @@ def add_patience(options: argparse.ArgumentParser) -> None:
 
 def problems(args: argparse.Namespace) -> Iterator[Problem]:
     """The graphs asked for, one after the other; what cannot be raced is said and skipped."""
-    for path in args.files or usual_files():
+    for path in args.files or [*usual_files(), _SPHERE]:
         try:
-            problem = read_problem(path)
+            problem = sphere_problem() if path == _SPHERE else read_problem(path)
         except GraphSlamError as error:
             say(f"skipped: {error}")
             continue

@@ -167,6 +167,15 @@ def city_problem(poses: int, seed: int = 1, dimensions: int = 2) -> Problem:
     return problem if dimensions == 2 else _in_space(problem, seed)
 
 
+def sphere_problem(poses: int = 2500, seed: int = 0) -> Problem:
+    """Our simulator's sphere, with 0.1 rad of noise in each rotation."""
+    from graph_slam_ros.formats.graph_file import G2oFile
+    from graph_slam_ros.simulation import sphere_graph
+
+    graph, _ = sphere_graph(seed, poses=poses, sigma_rad=0.1)
+    return _in_time_order("noisy sphere", G2oFile(graph, list(range(graph.vertex_count))))
+
+
 def _in_space(problem: Problem, seed: int) -> Problem:
     """A drive in the plane as one in space, whose measurements are as noisy along and about all axes."""
     from graph_slam_ros.lie import se3
