@@ -85,12 +85,13 @@ def _spoil_recording(args: argparse.Namespace, faults: "list[Fault]") -> int:
 def _write_graph(args: argparse.Namespace, faults: "list[Fault]") -> None:
     from graph_slam_ros.formats.convert import write_graph
     from graph_slam_ros.formats.graph_file import G2oFile
-    from graph_slam_ros.simulation import GRAPH_WORLDS, landmark_graph
+    from graph_slam_ros.simulation import GRAPH_WORLDS, landmark_graph, options_of
     from graph_slam_ros.simulation.pose_graph import truth_of, values_of
 
     if world := GRAPH_WORLDS.get(args.scenario):
         if args.closures is not None:
-            raise GraphSlamError(f"{args.scenario}: no use for --closures: it has them")
+            more = ": --set closures=N" if any(o.name == "closures" for o in options_of(world.options)) else ""
+            raise GraphSlamError(f"{args.scenario}: no use for --closures: it has them{more}")
         graph, poses = world.measure(args.seed, **_options(args))
         truth = poses.ravel()
     else:

@@ -67,7 +67,7 @@ class SphereGraph:
 
     poses: int = option(2500, "poses, from the lower to the upper pole", "", 2, 1e6)
     poses_per_lap: int = option(50, "poses until the robot is above an earlier one", "", 2, 1e6)
-    closures: int = option(1, "closures of a pose, to the nearest poses of the lap before", "", 1, 9)
+    closures: int = option(1, "closures of a pose, to the nearest poses of the lap below", "", 1, 9)
     radius_m: float = option(100.0, "radius of the sphere", "m", 1e-3, 1e6)
     sigma_m: float = option(0.1, "noise of relative positions, in x, y and z", "m", 1e-9, 10)
     sigma_rad: float = option(0.01, "noise of relative rotations, about x, y and z", "rad", 1e-9, 1)
@@ -75,7 +75,7 @@ class SphereGraph:
 
 
 def sphere_graph(seed: int, **values: float) -> tuple[Graph, Array]:
-    """Fly up around a sphere, lap above lap; each pose is measured from the odometry's last and from the lap before.
+    """Fly up around a sphere, lap above lap. Each pose is measured from the one before and from the lap below.
 
     The x axis of a pose points away from the centre, its y axis ahead. Vertices start as in ``city_graph``, and edges
     have its labels and order.

@@ -415,6 +415,7 @@ def test_a_recording_with_faults_has_their_table_beside_it(tmp_path, capsys):
     [
         (["city", "--out", "{out}.mcap"], "city is a graph: --out FILE.g2o"),
         (["city", "--closures", "5", "--out", "{out}.g2o"], "city: no use for --closures"),
+        (["sphere", "--closures", "5", "--out", "{out}.g2o"], "it has them: --set closures=N"),
         (["sphere", "--out", "{out}.mcap"], "sphere is a graph: --out FILE.g2o"),
         (["sphere", "--set", "laps=5", "--out", "{out}.g2o"], "sphere: no option 'laps'; it has poses, poses_per_lap"),
         (["spere", "--out", "{out}.g2o"], "did you mean 'sphere'"),
