@@ -94,6 +94,8 @@ def _write_graph(args: argparse.Namespace, faults: "list[Fault]") -> None:
             raise GraphSlamError(f"{args.scenario}: no use for --closures: it has them{more}")
         graph, poses = world.measure(args.seed, **_options(args))
         truth = poses.ravel()
+        if "closures" not in graph.labels:
+            console.show(f"{args.scenario}: with {len(poses)} poses nothing is closed: a larger --poses")
     else:
         recording = _recorded(args)
         if recording.gnss or recording.imu:

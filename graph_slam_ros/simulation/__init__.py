@@ -17,7 +17,7 @@ from graph_slam_ros.simulation.drive import Drive
 from graph_slam_ros.simulation.faults import KINDS, Fault, spoil_messages
 from graph_slam_ros.simulation.faulty import faulty_graph, faulty_recording
 from graph_slam_ros.simulation.instruments import Instruments, with_instruments
-from graph_slam_ros.simulation.options import Option, fill, options_of
+from graph_slam_ros.simulation.options import Option, check_seed, fill, options_of
 from graph_slam_ros.simulation.pose_graph import GRAPH_WORLDS, city_graph, landmark_graph, sphere_graph, write_graph
 from graph_slam_ros.simulation.recording import Recording, measurements, with_closures
 
@@ -59,8 +59,7 @@ def check_options(world: str, seed: int, options: Mapping[str, Any]) -> tuple[An
     """Return the options of a world and of its instruments; as ``simulate``, which drives through it."""
     if world not in WORLDS:
         raise GraphSlamError(f"no world {world!r}; there are {', '.join(WORLDS)}{did_you_mean(world, WORLDS)}")
-    if seed < 0:
-        raise GraphSlamError(f"seed {seed} is negative")
+    check_seed(seed)
     of_instruments = {o.name for o in options_of(Instruments)}
     chosen = {name: value for name, value in options.items() if name in of_instruments}
     rest = {name: value for name, value in options.items() if name not in of_instruments}

@@ -66,6 +66,12 @@ def option(
     return field(default=default, metadata={"about": (meaning, unit, low, high, choices)})
 
 
+def check_seed(seed: int) -> None:
+    """Raise GraphSlamError for a seed that no random generator takes."""
+    if seed < 0:
+        raise GraphSlamError(f"seed {seed} is negative")
+
+
 def options_of(cls: type) -> Iterator[Option]:
     """Every option of a world's dataclass, in order."""
     for f in dataclasses.fields(cls):

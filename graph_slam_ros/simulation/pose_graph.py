@@ -16,7 +16,7 @@ from graph_slam_ros.graph.geometry import PLANAR, SPATIAL, Geometry
 from graph_slam_ros.lie import se2, se3
 from graph_slam_ros.simulation.manhattan import STEP_M, stroll
 from graph_slam_ros.simulation.motion import integrate, space_of, step_covariance
-from graph_slam_ros.simulation.options import fill, option
+from graph_slam_ros.simulation.options import check_seed, fill, option
 from graph_slam_ros.simulation.recording import Recording
 from graph_slam_ros.slam import Sighting
 from graph_slam_ros.typing import Array, Index, Numbers
@@ -52,6 +52,7 @@ def city_graph(seed: int, **values: float) -> tuple[Graph, Array]:
     truth : (poses, 3) true poses
     """
     options = fill("city", CityGraph, values)
+    check_seed(seed)
     rng = Generator(PCG64(seed))
     cells, ways = stroll(rng, options.poses - 1, options.blocks)
     headings = 0.5 * np.pi * np.concatenate([ways[:1], ways])
@@ -90,6 +91,7 @@ def sphere_graph(seed: int, **values: float) -> tuple[Graph, Array]:
     truth : (poses, 7) true poses
     """
     options = fill("sphere", SphereGraph, values)
+    check_seed(seed)
     rng, count = Generator(PCG64(seed)), np.arange(options.poses)
     yaw, pitch = 2.0 * np.pi * count / options.poses_per_lap, np.pi * (0.5 - (count + 0.5) / options.poses)
     out = [se3.from_xyz_rpy((0.0, 0.0, 0.0, 0.0, *turn)) for turn in np.column_stack([pitch, yaw]).tolist()]

@@ -416,6 +416,8 @@ def test_a_recording_with_faults_has_their_table_beside_it(tmp_path, capsys):
         (["city", "--out", "{out}.mcap"], "city is a graph: --out FILE.g2o"),
         (["city", "--closures", "5", "--out", "{out}.g2o"], "city: no use for --closures"),
         (["sphere", "--closures", "5", "--out", "{out}.g2o"], "it has them: --set closures=N"),
+        (["sphere", "--seed", "-1", "--out", "{out}.g2o"], "seed -1 is negative"),
+        (["city", "--seed", "-1", "--out", "{out}.g2o"], "seed -1 is negative"),
         (["sphere", "--out", "{out}.mcap"], "sphere is a graph: --out FILE.g2o"),
         (["sphere", "--set", "laps=5", "--out", "{out}.g2o"], "sphere: no option 'laps'; it has poses, poses_per_lap"),
         (["spere", "--out", "{out}.g2o"], "did you mean 'sphere'"),
@@ -444,3 +446,9 @@ def test_the_help_tells_every_fault_and_all_that_can_be_set(capsys):
             unit = f" [{option.unit}]" if option.unit else ""
             default = str(option.default).lower() if isinstance(option.default, bool) else option.default
             assert f"    {option.name}={default}{unit}  {option.meaning}" in out
+
+
+def test_a_sphere_of_less_than_a_lap_has_no_closures_and_says_so(capsys, tmp_path):
+    code, said, _ = run(capsys, "simulate", "sphere", "--poses", 40, "--out", tmp_path / "s.g2o")
+    assert code == 0 and "sphere: with 40 poses nothing is closed: a larger --poses" in said
+    assert "nothing is closed" not in run(capsys, "simulate", "sphere", "--poses", 60, "--out", tmp_path / "t.g2o")[1]
