@@ -7,7 +7,7 @@
 # soak          the tests that take too long for every run: up to three hours, resumed where it was; ONLY=name,name
 # colcon        build and test as ROS does, in a scratch folder; colcon goes into .venv-colcon; TESTS=, too
 # test-oldest   the tests without ROS, in .venv-oldest with the lowest versions that setup.py allows
-# lint, format  check style and types; correct the style
+# lint, format  check style, layers, budgets and types; correct the style
 # lock          write requirements.txt and constraints-oldest.txt from setup.py; LOCK=--upgrade takes newer versions
 # bench         measure ours against GTSAM, g2o and python-graphslam into docs/benchmarks.md and accuracy.md; hours
 # robust        measure ours and GTSAM with false closures and wrong ids, into docs/robustness.md; two hours, resumed where it was
@@ -55,6 +55,8 @@ comma := ,
 lint: $(VENV)/package.stamp
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
+	$(BIN)/lint-imports --no-cache
+	$(BIN)/python tools/budget.py
 	$(BIN)/mypy
 
 format: $(VENV)/package.stamp

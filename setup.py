@@ -50,7 +50,7 @@ setup(
     author_email="maintainers@graph-slam-ros.example",
     python_requires=">=3.10",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
-    package_data={NAME: ["py.typed", "report/page.*", "view/edits*.*"]},
+    package_data={NAME: ["py.typed", "tools/report/page.*", "tools/view/edits*.*"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
@@ -88,6 +88,7 @@ setup(
         "test": [
             "axe-playwright-python>=0.1.4",  # accessibility of the pages
             "hypothesis>=6.82",
+            "import-linter>=2.5",  # which folder may import which: pyproject.toml
             "mypy>=1.8",
             "playwright>=1.65.2",  # with an installed Chromium, for the report
             "pytest>=7.4",

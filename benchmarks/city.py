@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL, Geometry
-from graph_slam_ros.simulation.manhattan import STEP_M, stroll
-from graph_slam_ros.simulation.pose_graph import closure_pairs
 from graph_slam_ros.slam import Closure, Config, Measurement, Odometry
+from graph_slam_ros.tools.simulation.manhattan import STEP_M, stroll
+from graph_slam_ros.tools.simulation.pose_graph import closure_pairs
 from graph_slam_ros.typing import Numbers
 
 SIGMA_M, SIGMA_RAD = 0.05, 0.01

@@ -20,8 +20,8 @@ from benchmarks import options, table
 from graph_slam_ros.analysis.consistency import Nees, landmark_errors, pose_errors
 from graph_slam_ros.lie import se3
 from graph_slam_ros.messages.results import landmark_estimates
-from graph_slam_ros.simulation import Recording, measurements, simulate
 from graph_slam_ros.slam import Config, Control, GraphSlam
+from graph_slam_ros.tools.simulation import Recording, measurements, simulate
 
 Array = NDArray[np.float64]
 

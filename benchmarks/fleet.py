@@ -20,14 +20,14 @@ import numpy as np
 
 from benchmarks.consistency import run_band
 from graph_slam_ros import cli
-from graph_slam_ros.fleet.engine import Workers, connected, run_jobs
-from graph_slam_ros.fleet.isolation import run_isolated
-from graph_slam_ros.fleet.job import Job
-from graph_slam_ros.fleet.replay import Fleet, replay_all
-from graph_slam_ros.fleet.table import read_table
-from graph_slam_ros.fleet.tune import Tuning
-from graph_slam_ros.fleet.tune import tune as tuned
-from graph_slam_ros.fleet.tuned import in_words, proof_in_words
+from graph_slam_ros.tools.fleet.engine import Workers, connected, run_jobs
+from graph_slam_ros.tools.fleet.isolation import run_isolated
+from graph_slam_ros.tools.fleet.job import Job
+from graph_slam_ros.tools.fleet.replay import Fleet, replay_all
+from graph_slam_ros.tools.fleet.table import read_table
+from graph_slam_ros.tools.fleet.tune import Tuning
+from graph_slam_ros.tools.fleet.tune import tune as tuned
+from graph_slam_ros.tools.fleet.tuned import in_words, proof_in_words
 
 RECORDINGS, NOTHING, DAMAGED = 200, 5000, 5
 HASHED = ("graph.g2o", "ledger.csv", "path.tum", "landmarks.csv", "map.mcap")

@@ -160,7 +160,7 @@ def city_problem(poses: int, seed: int = 1, dimensions: int = 2) -> Problem:
     In space (``dimensions`` 3) the same streets, driven with noise in height, roll and pitch as well.
     """
     from graph_slam_ros.formats.graph_file import G2oFile
-    from graph_slam_ros.simulation.pose_graph import city_graph
+    from graph_slam_ros.tools.simulation.pose_graph import city_graph
 
     graph, _ = city_graph(seed, poses=poses)
     problem = _in_time_order(f"city{poses}", G2oFile(graph, list(range(graph.vertex_count))))
@@ -170,7 +170,7 @@ def city_problem(poses: int, seed: int = 1, dimensions: int = 2) -> Problem:
 def sphere_problem(poses: int = 2500, seed: int = 0) -> Problem:
     """Our simulator's sphere, with 0.1 rad of noise in each rotation."""
     from graph_slam_ros.formats.graph_file import G2oFile
-    from graph_slam_ros.simulation import sphere_graph
+    from graph_slam_ros.tools.simulation import sphere_graph
 
     graph, _ = sphere_graph(seed, poses=poses, sigma_rad=0.1)
     return _in_time_order("noisy sphere", G2oFile(graph, list(range(graph.vertex_count))))

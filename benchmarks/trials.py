@@ -10,11 +10,11 @@ from benchmarks.problem import Array, Edges, Problem, joined
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph.geometry import PLANAR
 from graph_slam_ros.lie import se2, se3
-from graph_slam_ros.simulation import Fault
-from graph_slam_ros.simulation import false_closures as generator
-from graph_slam_ros.simulation.draft import Draft
-from graph_slam_ros.simulation.faults import put_faults
 from graph_slam_ros.slam import Sighting
+from graph_slam_ros.tools.simulation import Fault
+from graph_slam_ros.tools.simulation import false_closures as generator
+from graph_slam_ros.tools.simulation.draft import Draft
+from graph_slam_ros.tools.simulation.faults import put_faults
 
 ID_POLICIES = ("wrong_ids", "swapped_ids")
 POLICIES = (*generator.POLICIES, *ID_POLICIES)

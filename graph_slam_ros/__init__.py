@@ -8,7 +8,6 @@ __version__ = "0.1.0"
 
 TYPE_CHECKING = False  # type checkers take it for true; typing itself is slow to import
 if TYPE_CHECKING:
-    from graph_slam_ros.certificate import Certificate, certify
     from graph_slam_ros.config import Config
     from graph_slam_ros.formats.g2o import read_g2o
     from graph_slam_ros.formats.g2o_writer import write_g2o
@@ -20,6 +19,7 @@ if TYPE_CHECKING:
     from graph_slam_ros.runs.saved_run import SavedRun, load_run
     from graph_slam_ros.slam import GraphSlam
     from graph_slam_ros.solver import Settings, Solver
+    from graph_slam_ros.tools.certificate import Certificate, certify
 
 __all__ = [
     "Certificate",
@@ -48,7 +48,7 @@ __all__ = [
 
 _HOMES = {
     "optimization": ("Solution", "optimize"),
-    "certificate": ("Certificate", "certify"),
+    "tools.certificate": ("Certificate", "certify"),
     "config": ("Config",),
     "formats.g2o": ("read_g2o",),
     "formats.g2o_writer": ("write_g2o",),

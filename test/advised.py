@@ -3,15 +3,15 @@
 import numpy as np
 from driven import drive
 
-from graph_slam_ros.analysis.additions import NEW, expected, stored_values
-from graph_slam_ros.analysis.advice import KINDS, Advisor
-from graph_slam_ros.analysis.weakness import HEADING, Weakness
 from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.lie import se3, so3
-from graph_slam_ros.simulation import measurements, simulate
 from graph_slam_ros.slam import Config
 from graph_slam_ros.slam.weak_direction import position_covariance
 from graph_slam_ros.solver import Solver
+from graph_slam_ros.tools.advise.additions import NEW, expected, stored_values
+from graph_slam_ros.tools.advise.advice import KINDS, Advisor
+from graph_slam_ros.tools.advise.weakness import HEADING, Weakness
+from graph_slam_ros.tools.simulation import measurements, simulate
 
 HELPS = 0.97  # of the sigma is left, or less
 TRIED = 100  # additions of a kind

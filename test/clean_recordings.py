@@ -15,7 +15,7 @@ from pathlib import Path
 import public_recordings
 
 from graph_slam_ros.runs.check import check
-from graph_slam_ros.simulation import simulate, write_bag
+from graph_slam_ros.tools.simulation import simulate, write_bag
 
 WORLDS = {
     "warehouse, tags": ("warehouse", {"aisles": 2}),

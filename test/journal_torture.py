@@ -31,8 +31,8 @@ from graph_slam_ros.node.session import Session
 from graph_slam_ros.runs.folder import BEGUN, RunError, check_room, earlier_runs, is_run, run_config
 from graph_slam_ros.runs.journal import read_ingest
 from graph_slam_ros.runs.recorder import RunRecorder
-from graph_slam_ros.simulation import measurements, simulate
 from graph_slam_ros.slam import Config, Counters, GraphSlam
+from graph_slam_ros.tools.simulation import measurements, simulate
 from graph_slam_ros.warmup import warmup
 
 RESULTS = ("graph.g2o", "graph_vertices.csv", "ledger.csv", "path.tum", "covariances.csv", "landmarks.csv", "run.json")

@@ -17,9 +17,9 @@ from graph_slam_ros.formats.parameters import parse_setting
 from graph_slam_ros.lie import se3
 from graph_slam_ros.messages.from_msg import decoder
 from graph_slam_ros.runs.check import check
-from graph_slam_ros.simulation import Drive, Fault, simulate, spoil_messages, write_bag
-from graph_slam_ros.simulation.drive import Sightings
-from graph_slam_ros.simulation.odometry_faults import _moved
+from graph_slam_ros.tools.simulation import Drive, Fault, simulate, spoil_messages, write_bag
+from graph_slam_ros.tools.simulation.drive import Sightings
+from graph_slam_ros.tools.simulation.odometry_faults import _moved
 
 TRUTH = "/ground_truth"
 MOST_MISSED = 0.05

@@ -10,7 +10,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from graph_slam_ros.messages.interfaces import INTERFACES, typestore
 from graph_slam_ros.recordings.bag import open_bag
-from graph_slam_ros.simulation import simulate, write_bag
+from graph_slam_ros.tools.simulation import simulate, write_bag
 
 ODOMETRY, DETECTIONS = "nav_msgs/msg/Odometry", "vision_msgs/msg/Detection3DArray"
 TOPICS = {"/odom": ODOMETRY, "/landmarks": DETECTIONS}

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 from gyroscopes import TICK_S, TRUE_NOISE, with_wrong_wheels
 
-from graph_slam_ros.simulation import simulate
-from graph_slam_ros.simulation.motion import VelocityNoise, integrate
-from graph_slam_ros.simulation.recording import measurements
-from graph_slam_ros.simulation.warehouse import Warehouse
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sightings
+from graph_slam_ros.tools.simulation import simulate
+from graph_slam_ros.tools.simulation.motion import VelocityNoise, integrate
+from graph_slam_ros.tools.simulation.recording import measurements
+from graph_slam_ros.tools.simulation.warehouse import Warehouse
 
 BOTH = {"inputs.names": "odom second detections", "second.type": "nav_msgs/msg/Odometry"}
 PARALLEL = {**BOTH, "odometry.fusion": "parallel"}

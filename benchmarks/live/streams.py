@@ -12,9 +12,9 @@ from benchmarks.problem import Array, city_problem
 from graph_slam_ros.lie import se2, se3
 from graph_slam_ros.messages import to_msg
 from graph_slam_ros.recordings.bag import BagMessage, open_bag
-from graph_slam_ros.simulation import simulate, write_bag
-from graph_slam_ros.simulation import warehouse as slower
-from graph_slam_ros.simulation.recording import START_NS
+from graph_slam_ros.tools.simulation import simulate, write_bag
+from graph_slam_ros.tools.simulation import warehouse as slower
+from graph_slam_ros.tools.simulation.recording import START_NS
 
 ODOMETRY, LANDMARKS, CLOSURES = "/odom", "/landmarks", "/closures"
 TYPES = {

@@ -36,7 +36,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         from graph_slam_ros.cli.parser import parser  # Ctrl-C while modules are imported is no traceback
 
-        args = parser().parse_args(arguments)
+        given = sys.argv[1:] if arguments is None else arguments
+        args = parser(next((word for word in given if word[:1] != "-"), "")).parse_args(given)
         progress.listeners[:] = [console.Throttled()]
         if args.run.__name__ in _COMPUTES:
             from graph_slam_ros.warmup import compile_all

@@ -4,28 +4,26 @@ import argparse
 import json
 import shlex
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from graph_slam_ros.cli import console
+from graph_slam_ros.cli.usage import later
 from graph_slam_ros.errors import GraphSlamError
 
 if TYPE_CHECKING:
-    from graph_slam_ros.certificate import Certificate
     from graph_slam_ros.formats.graph_file import G2oFile
     from graph_slam_ros.graph import Graph, Loss
     from graph_slam_ros.optimization import Solution
-    from graph_slam_ros.solver import Report, Settings, Solver
+    from graph_slam_ros.solver import Report, Solver
 
-_START = {
+STARTS = {
     "file": "the file",
     "tree": "the spanning tree",
     "chordal": "the chordal relaxation",
     "online": "the drive, pose after pose",
 }
 _NO_VALUES = "the file has no vertex lines"
-_SAME = 1e-6  # of chi2: what one optimum may differ by from another run to it
 
 
 def optimize(args: argparse.Namespace) -> int:
@@ -46,12 +44,12 @@ def optimize(args: argparse.Namespace) -> int:
     )
     solution = solve(file, settings, init=args.init)
     solver, report, start = solution.solver, solution.report, solution.start
-    proof = _certify(solution, settings) if args.certify else None
+    proof = later("tools.certificate.command", "certified")(solution, settings) if args.certify else None
     if args.json:
         answer = _answer(report, start, args) | _starts(solution)
         console.show(json.dumps(answer if proof is None else answer | {"certificate": proof.as_dict()}))
     else:
-        start_text = _START[start] + ("" if file.has_values else f": {_NO_VALUES}")
+        start_text = STARTS[start] + ("" if file.has_values else f": {_NO_VALUES}")
         console.show(*_optimize_text(report, start_text, args.loss), *_starts_text(solution))
         console.show(*(proof.text(report.chi2_final) if proof else ()))
     if args.out:
@@ -81,7 +79,7 @@ def _options(args: argparse.Namespace) -> Iterable[str]:
     """Yield the options of the solution as they were typed."""
     from graph_slam_ros.cli.parser import parser
 
-    usual = parser().parse_args(["optimize", "GRAPH"])
+    usual = parser("optimize").parse_args(["optimize", "GRAPH"])
     for option in ("method", "loss", "init", "from", "max-iterations", "tolerance", "error-map", "information"):
         name = {"from": "source"}.get(option, option.replace("-", "_"))
         value = getattr(args, name)
@@ -106,7 +104,7 @@ def convert(args: argparse.Namespace) -> int:
         solver, start = started(file, "file")
         written = write_graph(args.out, file, solver.estimate, target)
         if not file.has_values:
-            console.show(f"{_NO_VALUES}: those of {_START[start]} are written")
+            console.show(f"{_NO_VALUES}: those of {STARTS[start]} are written")
     else:
         written = write_graph(args.out, file, None, target)
     vertices = f"{written.vertices} of {file.graph.vertex_count} vertices"
@@ -134,52 +132,6 @@ def _warn_unknown(file: "G2oFile") -> None:
         console.warn(f"{len(file.unknown)} lines with unknown tags kept as they are: {', '.join(tags)}")
 
 
-@dataclass(frozen=True, slots=True)
-class _Proof:
-    """The certificate of a solution, and the outcome of a second start if the first was not certified."""
-
-    first: "Certificate"
-    start: str = ""
-    second: "Certificate | None" = None
-    failure: str = ""
-
-    @property
-    def code(self) -> int:
-        from graph_slam_ros.certificate import CERTIFIED, NOT_CERTIFIED
-
-        codes = {CERTIFIED: console.DONE, NOT_CERTIFIED: console.NOT_CERTIFIED}
-        return codes.get(self.first.verdict, console.NOT_APPLICABLE)
-
-    def as_dict(self) -> dict[str, Any]:
-        again = {"start": self.start, "failure": self.failure} | (self.second.as_dict() if self.second else {})
-        return self.first.as_dict() | {"second_start": again if self.start else None}
-
-    def text(self, chi2: float) -> Iterable[str]:
-        yield from str(self.first).splitlines()
-        if self.failure:
-            yield f"a second start, {_START[self.start]}, fails: {self.failure}"
-        elif self.second:
-            lower = self.second.chi2 < chi2 * (1.0 - _SAME)
-            much = f"which is lower: --init {self.start} takes it" if lower else "which is no lower"
-            yield f"a second start, {_START[self.start]}, comes to chi2 {self.second.chi2:.6f}, {much}"
-            yield from ("  " + line for line in str(self.second).splitlines())
-
-
-def _certify(solution: "Solution", settings: "Settings") -> _Proof:
-    """Compute the certificate. If it fails and could succeed from another start, try that one."""
-    from graph_slam_ros.certificate import CERTIFIED, certify, other_start
-    from graph_slam_ros.optimization import optimize
-
-    first = certify(solution)
-    if first.verdict == CERTIFIED or not first.computed:
-        return _Proof(first)
-    start = other_start(solution.start)
-    try:
-        return _Proof(first, start, certify(optimize(solution.file, settings, init=start)))
-    except GraphSlamError as error:
-        return _Proof(first, start, failure=str(error))
-
-
 def _starts(solution: "Solution") -> dict[str, Any]:
     """The starts for JSON: which were tried, and the reason if there was more than one."""
     tried = [
@@ -194,12 +146,12 @@ def _starts_text(solution: "Solution") -> Iterable[str]:
     if not solution.suspicion:
         return
     first, *others = solution.attempts
-    yield f"suspicious from {_START[first.start]}: {solution.suspicion}"
+    yield f"suspicious from {STARTS[first.start]}: {solution.suspicion}"
     for one in others:
         found = f"fails: {one.failure[:120]}" if one.failure else f"comes to chi2 {one.chi2:.6f}"
-        yield f"  another start, {_START[one.start]}, {found}"
+        yield f"  another start, {STARTS[one.start]}, {found}"
     if solution.start != first.start:
-        yield f"  the answer is from {_START[solution.start]}: chi2 {first.chi2:.6f} was a local minimum"
+        yield f"  the answer is from {STARTS[solution.start]}: chi2 {first.chi2:.6f} was a local minimum"
     elif others and not all(one.failure for one in others):
         yield "  no start is better: wrong closures or too little noise are likelier than a local minimum"
     elif others:

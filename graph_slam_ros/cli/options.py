@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from graph_slam_ros.cli import values
-from graph_slam_ros.cli.usage import CODES, CommandParser
+from graph_slam_ros.cli.usage import CODES, CommandParser, later
 
 
 def replay(sub: CommandParser) -> None:
@@ -165,9 +165,7 @@ def convert(sub: CommandParser) -> None:
 
 def simulate(sub: CommandParser) -> None:
     """Add the options of ``simulate``."""
-    from graph_slam_ros.cli.simulate import options_of_worlds
-
-    sub.more = options_of_worlds
+    sub.more = later("tools.simulation.command", "options_of_worlds")
     sub.add_argument(
         "scenario",
         metavar="SCENARIO",

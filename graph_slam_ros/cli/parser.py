@@ -2,11 +2,10 @@
 
 import argparse
 from collections.abc import Callable
-from importlib import import_module
 
 from graph_slam_ros import __version__
-from graph_slam_ros.cli import audit, edit, fleet, graphs, maps, options, recordings, simulate, view
-from graph_slam_ros.cli.usage import CommandParser
+from graph_slam_ros.cli import audit, edit, graphs, maps, options, recordings
+from graph_slam_ros.cli.usage import CommandParser, later
 
 
 class Command:
@@ -25,15 +24,6 @@ class Command:
         self.examples = examples
 
 
-def _later(name: str) -> Callable[[argparse.Namespace], int]:
-    """The function of a command in the module of its name, which is imported when it is run."""
-
-    def run(args: argparse.Namespace) -> int:
-        return int(getattr(import_module(f"graph_slam_ros.cli.{name}"), name)(args))
-
-    return run
-
-
 COMMANDS = {
     "info": Command(
         recordings.info,
@@ -42,14 +32,14 @@ COMMANDS = {
         "drive.mcap",
     ),
     "check": Command(
-        _later("check"),
+        later("cli.check", "check"),
         options.check,
         "find what is wrong with a recording, by how much, and the setting that mends it",
         "drive.mcap",
         "drive.mcap --set detections.offset_s=-0.096",
     ),
     "calibrate": Command(
-        _later("calibrate"),
+        later("cli.calibrate", "calibrate"),
         options.calibrate,
         "estimate odometry's scale, clocks and mounts from a recording, and print the settings",
         "drive.mcap",
@@ -116,15 +106,15 @@ COMMANDS = {
         "drive_run --animate drive.gif",
     ),
     "report": Command(
-        _later("report"),
+        later("tools.report.command", "report"),
         options.report,
         "write one HTML file on a run: map, edges with their reasons, charts and tables",
         "drive_run",
         "drive_run --truth drive.mcap:/ground_truth --out drive.html",
     ),
     "view": Command(
-        view.view,
-        view.add_options,
+        later("tools.view.command", "view"),
+        later("tools.view.command", "add_options"),
         "show the report in a browser, solve what-ifs at once, edit the map and save it as another run",
         "drive_run",
         "drive_run --port 8080 --no-browser",
@@ -149,7 +139,7 @@ COMMANDS = {
         "drive_run --count 5",
     ),
     "advise": Command(
-        _later("advise"),
+        later("tools.advise.command", "advise"),
         options.advise,
         "find the weakest directions of a run's map, and what to measure to make them better known",
         "drive_run",
@@ -168,20 +158,20 @@ COMMANDS = {
         "graph.g2o graph.toro",
     ),
     "simulate": Command(
-        simulate.simulate,
+        later("tools.simulation.command", "simulate"),
         options.simulate,
         "simulate a recording with truth and, if asked, faults: pythonrobotics, manhattan, warehouse, flight",
         "warehouse --out world.mcap --seed 7",
     ),
     "fleet": Command(
-        fleet.fleet,
-        fleet.add_options,
+        later("tools.fleet.command", "fleet"),
+        later("tools.fleet.command", "add_options"),
         "replay, compare and tune on many recordings at once, on all cores or many machines",
         "replay drives/ --out fleet",
         "compare last_week fleet --fail 'rmse>1.02x'",
     ),
     "params": Command(
-        _later("params"),
+        later("cli.params", "params"),
         options.params,
         "list the parameters with default, unit, bounds and meaning",
         "keyframes",
@@ -194,13 +184,13 @@ COMMANDS = {
         "",
     ),
     "demo": Command(
-        recordings.demo,
+        later("tools.demo", "demo"),
         options.demo,
         "replay the recording that comes with the source through a live ROS graph",
         "--force",
     ),
     "completion": Command(
-        _later("completion"),
+        later("cli.completion", "completion"),
         options.completion,
         "print a script for shell completion: eval it in ~/.bashrc or ~/.zshrc",
         "bash",
@@ -208,8 +198,13 @@ COMMANDS = {
 }
 
 
-def parser() -> argparse.ArgumentParser:
-    """The whole command line; the arguments' ``run`` is the command's function."""
+def parser(command: str | None = None) -> argparse.ArgumentParser:
+    """The whole command line; the arguments' ``run`` is the command's function.
+
+    Parameters
+    ----------
+    command : the only command whose options are needed; None: all have theirs, which takes more imports
+    """
     whole = CommandParser(
         prog="graph_slam",
         description="Online pose-graph SLAM: replay recordings, optimise and convert graphs, simulate, evaluate.",
@@ -217,13 +212,14 @@ def parser() -> argparse.ArgumentParser:
     )
     whole.add_argument("--version", action="version", version=f"graph_slam_ros {__version__}")
     commands = whole.add_subparsers(required=True, metavar="COMMAND", parser_class=CommandParser)
-    for name, command in COMMANDS.items():
+    for name, row in COMMANDS.items():
         sub: CommandParser = commands.add_parser(
             name,
-            help=command.about,
-            description=f"{command.about[0].upper()}{command.about[1:]}.",
-            examples=[f"graph_slam {name} {one}".rstrip() for one in command.examples],
+            help=row.about,
+            description=f"{row.about[0].upper()}{row.about[1:]}.",
+            examples=[f"graph_slam {name} {one}".rstrip() for one in row.examples],
         )
-        sub.set_defaults(run=command.run)
-        command.add_options(sub)
+        sub.set_defaults(run=row.run)
+        if command in (None, name):
+            row.add_options(sub)
     return whole

@@ -1,4 +1,4 @@
-"""The commands on recordings and runs: ``replay``, ``info``, ``evaluate``, ``warmup``, ``demo``."""
+"""The commands on recordings and runs: ``replay``, ``info``, ``evaluate``, ``warmup``."""
 
 import argparse
 import importlib.util
@@ -207,15 +207,6 @@ def warmup(args: argparse.Namespace) -> int:
     console.warn(f"kernels ready after {compiled():.1f} s")
     console.then(console.command("info", "RECORDING"))
     return console.DONE
-
-
-def demo(args: argparse.Namespace) -> int:
-    """Run the demonstration."""
-    from graph_slam_ros.cli.demo import demo as shown
-
-    code = shown(args.out, live=console.has_ros(), force=args.force, progress=console.progress, show=console.show)
-    console.then(f"a recording of your own: {console.command('info', 'RECORDING')}")
-    return code
 
 
 def _refuse_idle_options(args: argparse.Namespace, of_run: bool) -> None:

@@ -12,8 +12,8 @@ from graph_slam_ros.config.world import FramesConfig
 from graph_slam_ros.messages.topics import PUBLICATIONS, SUBSCRIPTIONS
 from graph_slam_ros.recordings.bag import open_bag
 from graph_slam_ros.runs.replay import replay
-from graph_slam_ros.simulation import simulate, write_bag
 from graph_slam_ros.slam.solution import Correction
+from graph_slam_ros.tools.simulation import simulate, write_bag
 
 CONFIG = ROOT / "config"
 RVIZ = yaml.safe_load((CONFIG / "graph_slam.rviz").read_text())["Visualization Manager"]

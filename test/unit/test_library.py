@@ -17,10 +17,10 @@ from graph_slam_ros.config.config import parameters
 from graph_slam_ros.edge_tags import EDGE_TAGS
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import EdgeType
-from graph_slam_ros.report.places import keyframe_paths
 from graph_slam_ros.runs.restore import map_of, record_run
-from graph_slam_ros.simulation import measurements, simulate, write_bag
 from graph_slam_ros.slam import Update
+from graph_slam_ros.tools.report.places import keyframe_paths
+from graph_slam_ros.tools.simulation import measurements, simulate, write_bag
 
 
 @pytest.fixture(scope="module")

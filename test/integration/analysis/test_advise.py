@@ -8,13 +8,13 @@ from advised import SimulatedRun
 from reliability import tell, times
 
 from graph_slam_ros import cli
-from graph_slam_ros.analysis.additions import CLOSURE, NEW, stored_values
-from graph_slam_ros.analysis.advice import KINDS, Advisor
-from graph_slam_ros.analysis.weakness import Weakness
 from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.runs.recorder import RunRecorder
 from graph_slam_ros.runs.restore import freeze, map_of
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
+from graph_slam_ros.tools.advise.additions import CLOSURE, NEW, stored_values
+from graph_slam_ros.tools.advise.advice import KINDS, Advisor
+from graph_slam_ros.tools.advise.weakness import Weakness
 
 S = 1_000_000_000
 NOISY = {"sigma_speed_m_s": 0.2, "sigma_turn_rad_s": 0.2}

@@ -19,8 +19,8 @@ from graph_slam_ros.lie import se2, se3
 from graph_slam_ros.runs.recorder import RunRecorder
 from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.runs.trajectory import Trajectory, read_covariances
-from graph_slam_ros.simulation import measurements, simulate, write_bag
 from graph_slam_ros.slam import Config, Control, GraphSlam
+from graph_slam_ros.tools.simulation import measurements, simulate, write_bag
 
 
 def spread(rng, dof):

@@ -27,8 +27,8 @@ from graph_slam_ros.recordings.bag import BagWriter
 from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.runs.restore import map_of, record_run
 from graph_slam_ros.runs.trajectory import Trajectory, read_tum
-from graph_slam_ros.simulation import measurements, simulate, write_bag
 from graph_slam_ros.slam import Config, Control
+from graph_slam_ros.tools.simulation import measurements, simulate, write_bag
 
 START_S = 1_700_000_000
 

@@ -10,8 +10,8 @@ from scipy.stats import chi2
 from graph_slam_ros.analysis.consistency import landmark_nees, pose_nees
 from graph_slam_ros.lie import se3
 from graph_slam_ros.messages.results import landmark_estimates
-from graph_slam_ros.simulation import measurements, simulate
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry
+from graph_slam_ros.tools.simulation import measurements, simulate
 
 SEEDS = range(times(3, 5))
 # What the simulator draws and nothing else: white errors of velocity, of sightings what they say, no outliers.

@@ -11,11 +11,11 @@ from graph_slam_ros.analysis import what_if
 from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import Loss
-from graph_slam_ros.report.contents import read_contents
 from graph_slam_ros.runs.ledger_file import read_ledger
 from graph_slam_ros.runs.recorder import RunRecorder
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
-from graph_slam_ros.view.workbench import Workbench
+from graph_slam_ros.tools.report.contents import read_contents
+from graph_slam_ros.tools.view.workbench import Workbench
 
 
 @pytest.fixture(scope="module")

@@ -9,10 +9,6 @@ from places import DATASETS
 from scipy.sparse import csc_array
 
 from graph_slam_ros import certify, optimize, read_g2o
-from graph_slam_ros.certificate import CERTIFIED, DOES_NOT_APPLY, NOT_CERTIFIED, other_start
-from graph_slam_ros.certificate.polish import polish
-from graph_slam_ros.certificate.spectrum import factorize, least_eigenvalue
-from graph_slam_ros.certificate.synchronization import Edges, Poses, Synchronization
 from graph_slam_ros.cli import main
 from graph_slam_ros.formats.graph_file import G2oFile
 from graph_slam_ros.graph import (
@@ -31,8 +27,12 @@ from graph_slam_ros.graph import (
     Loss,
 )
 from graph_slam_ros.lie import se2, se3
-from graph_slam_ros.simulation import city_graph, write_graph
 from graph_slam_ros.solver import Settings
+from graph_slam_ros.tools.certificate import CERTIFIED, DOES_NOT_APPLY, NOT_CERTIFIED, other_start
+from graph_slam_ros.tools.certificate.polish import polish
+from graph_slam_ros.tools.certificate.spectrum import factorize, least_eigenvalue
+from graph_slam_ros.tools.certificate.synchronization import Edges, Poses, Synchronization
+from graph_slam_ros.tools.simulation import city_graph, write_graph
 
 GRAPHS = DATASETS
 GRAPHS = GRAPHS / "pose_graphs"
@@ -450,11 +450,11 @@ def test_the_command_tries_a_second_start_where_it_is_not_certified_and_ends_wit
 
 
 def test_a_second_start_that_is_no_better_is_told_so_and_one_that_fails_why(run, monkeypatch):
-    monkeypatch.setattr("graph_slam_ros.certificate.other_start", lambda start: "file")
+    monkeypatch.setattr("graph_slam_ros.tools.certificate.other_start", lambda start: "file")
     code, out = run(ring(PLANE, 2), "--init", "file")
     assert code == 4
     assert "which is no lower\n  not certified\n" in out
-    monkeypatch.setattr("graph_slam_ros.certificate.other_start", lambda start: "nowhere")
+    monkeypatch.setattr("graph_slam_ros.tools.certificate.other_start", lambda start: "nowhere")
     monkeypatch.setattr("graph_slam_ros.cli.graphs._START", {"file": "the file", "nowhere": "nowhere"})
     code, out = run(ring(PLANE, 2), "--init", "file")
     assert code == 4

@@ -10,8 +10,8 @@ from graph_slam_ros.recordings.bag import open_bag
 from graph_slam_ros.recordings.contents import recording_of
 from graph_slam_ros.runs.check import check
 from graph_slam_ros.runs.suggestion import Suggestion
-from graph_slam_ros.simulation import Drive, Fault, spoil_messages
-from graph_slam_ros.simulation.drive import Sightings
+from graph_slam_ros.tools.simulation import Drive, Fault, spoil_messages
+from graph_slam_ros.tools.simulation.drive import Sightings
 
 
 def in_odom(drive, frame):

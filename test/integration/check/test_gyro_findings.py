@@ -4,8 +4,8 @@ import pytest
 
 from graph_slam_ros.formats.parameters import parse_setting
 from graph_slam_ros.runs.check import check
-from graph_slam_ros.simulation import Drive, Fault, simulate, spoil_messages, write_bag
-from graph_slam_ros.simulation.instruments import Instruments, with_instruments
+from graph_slam_ros.tools.simulation import Drive, Fault, simulate, spoil_messages, write_bag
+from graph_slam_ros.tools.simulation.instruments import Instruments, with_instruments
 
 SETTINGS = {
     "inputs.names": "odom detections imu",

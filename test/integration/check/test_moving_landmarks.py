@@ -10,8 +10,8 @@ from recordings import short_drive
 from graph_slam_ros.cli import main
 from graph_slam_ros.lie import se3
 from graph_slam_ros.runs.check import check
-from graph_slam_ros.simulation import Drive
-from graph_slam_ros.simulation.drive import Sightings
+from graph_slam_ros.tools.simulation import Drive
+from graph_slam_ros.tools.simulation.drive import Sightings
 
 
 def posed(drive):

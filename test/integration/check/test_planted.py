@@ -15,10 +15,10 @@ from graph_slam_ros.formats.parameters import parse_setting
 from graph_slam_ros.recordings.bag import open_bag
 from graph_slam_ros.runs.check import check
 from graph_slam_ros.runs.replay import replay
-from graph_slam_ros.simulation import Drive, Fault, simulate, spoil_messages, write_bag, write_faulty_bag
-from graph_slam_ros.simulation.drive import Sightings
-from graph_slam_ros.simulation.message_faults import MESSAGE_KINDS
 from graph_slam_ros.slam import Config
+from graph_slam_ros.tools.simulation import Drive, Fault, simulate, spoil_messages, write_bag, write_faulty_bag
+from graph_slam_ros.tools.simulation.drive import Sightings
+from graph_slam_ros.tools.simulation.message_faults import MESSAGE_KINDS
 
 SELECTED = (
     "landmark clock +400 ms",

@@ -15,7 +15,7 @@ from graph_slam_ros.messages.from_msg import decoder
 from graph_slam_ros.messages.to_msg import encode, header, make, transform
 from graph_slam_ros.recordings.bag import BagWriter, open_bag
 from graph_slam_ros.runs import check as runs_check
-from graph_slam_ros.simulation import Fault, simulate, write_bag, write_faulty_bag
+from graph_slam_ros.tools.simulation import Fault, simulate, write_bag, write_faulty_bag
 
 
 @pytest.fixture(scope="module")

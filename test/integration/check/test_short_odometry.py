@@ -5,7 +5,7 @@ import pytest
 from recordings import short_drive
 
 from graph_slam_ros.runs.check import check
-from graph_slam_ros.simulation import Drive
+from graph_slam_ros.tools.simulation import Drive
 
 
 def cut(drive, part, *, begins):

@@ -1,7 +1,7 @@
 """The twist of odometry that comes once a second says nothing of the motion in between."""
 
 from graph_slam_ros.runs.check import check
-from graph_slam_ros.simulation import Drive, simulate, write_bag
+from graph_slam_ros.tools.simulation import Drive, simulate, write_bag
 
 
 def test_the_twist_of_slow_odometry_has_no_scale_of_its_own(tmp_path):

@@ -7,9 +7,9 @@ from planted_faults import reused
 from graph_slam_ros.formats.parameters import parse_setting
 from graph_slam_ros.lie import se2
 from graph_slam_ros.runs.check import check
-from graph_slam_ros.simulation import Drive, write_bag
-from graph_slam_ros.simulation.recording import LANDMARKS_TOPIC, START_NS, Recording
 from graph_slam_ros.slam import Sighting, Sightings
+from graph_slam_ros.tools.simulation import Drive, write_bag
+from graph_slam_ros.tools.simulation.recording import LANDMARKS_TOPIC, START_NS, Recording
 
 
 def loops(seed, yaw_deg, hz=12, ahead_m=0.2):

@@ -10,9 +10,9 @@ from places import ROOT
 from graph_slam_ros.cli import main
 from graph_slam_ros.formats.parameters import read_parameters
 from graph_slam_ros.runs.calibrate import calibrate
-from graph_slam_ros.simulation import simulate, write_bag
 from graph_slam_ros.slam import GraphSlam
 from graph_slam_ros.slam.calibration.parameters import QUANTITIES
+from graph_slam_ros.tools.simulation import simulate, write_bag
 
 DEMO = str(ROOT / "data" / "demo.mcap")
 WRONG = ("--set", "detections.mount_correction=0 0 0 0 0 0.1", "--set", "odometry.distance_factor=1.08")

@@ -5,7 +5,7 @@ import shlex
 from recordings import short_drive
 
 from graph_slam_ros.cli import main
-from graph_slam_ros.simulation import Drive
+from graph_slam_ros.tools.simulation import Drive
 
 
 def test_poses_are_fixes_with_the_settings_that_info_prints(tmp_path, capsys):

@@ -10,8 +10,8 @@ from places import ROOT
 from graph_slam_ros.formats.parameters import read_parameters
 from graph_slam_ros.lie import se2
 from graph_slam_ros.runs.replay import replay
-from graph_slam_ros.simulation import simulate, write_bag
 from graph_slam_ros.slam import Config
+from graph_slam_ros.tools.simulation import simulate, write_bag
 
 TEXT = (ROOT / "docs" / "nav2.md").read_text()
 SECTIONS = {

@@ -20,7 +20,6 @@ from graph_slam_ros.lie import se3
 from graph_slam_ros.maps.edit import Plan, edit_run, plan_text, source_hash, undo_edit
 from graph_slam_ros.maps.merge import merge
 from graph_slam_ros.measurements.edits import edit_of
-from graph_slam_ros.report.contents import read_contents
 from graph_slam_ros.runs import outcome
 from graph_slam_ros.runs.condensed_map import condensed_record, read_condensed
 from graph_slam_ros.runs.folder import run_config, summary_of
@@ -30,7 +29,8 @@ from graph_slam_ros.runs.restore import freeze, map_of, record_run, recover
 from graph_slam_ros.runs.trajectory import Trajectory, read_tum
 from graph_slam_ros.slam import GraphSlam
 from graph_slam_ros.slam.calibrator import Calibrator
-from graph_slam_ros.view.workbench import Workbench
+from graph_slam_ros.tools.report.contents import read_contents
+from graph_slam_ros.tools.view.workbench import Workbench
 
 BASE = {"who": "a test", "when": "2026-01-01T00:00:00Z", "why": "to try it"}
 KEYFRAMES = 500

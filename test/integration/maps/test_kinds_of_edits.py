@@ -18,13 +18,13 @@ from graph_slam_ros.maps.edit import Plan, edit, plan_text, source_hash, undo_ed
 from graph_slam_ros.measurements.edit_actions import ACTIONS
 from graph_slam_ros.measurements.edits import edit_of
 from graph_slam_ros.recordings.mcap_records import records
-from graph_slam_ros.report.contents import read_contents
 from graph_slam_ros.runs.map_journal import read_map, state_of
 from graph_slam_ros.runs.restore import map_of, record_run, restored
 from graph_slam_ros.runs.saved_run import load_run
 from graph_slam_ros.slam import Control, Fix, GraphSlam
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict
 from graph_slam_ros.solver import Solver
+from graph_slam_ros.tools.report.contents import read_contents
 
 WHO = {"who": "Anna", "when": "2026-05-04T10:30:00Z", "why": "seen on the spot"}
 EXACT = {"sigma_m": 0.0, "sigma_rad": 0.0}

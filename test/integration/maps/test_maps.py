@@ -19,8 +19,8 @@ from graph_slam_ros.runs.folder import run_config
 from graph_slam_ros.runs.map_journal import read_map
 from graph_slam_ros.runs.recorder import RunRecorder
 from graph_slam_ros.runs.restore import map_of, restored
-from graph_slam_ros.simulation import simulate, with_closures
 from graph_slam_ros.slam import Config, Control, GraphSlam, Sightings
+from graph_slam_ros.tools.simulation import simulate, with_closures
 
 
 def measurements(recording):

@@ -5,8 +5,8 @@ import pytest
 
 from graph_slam_ros import edit_run
 from graph_slam_ros.maps.edit import undo_edit
-from graph_slam_ros.report.contents import read_contents
 from graph_slam_ros.runs.restore import restored
+from graph_slam_ros.tools.report.contents import read_contents
 
 WHO = {"who": "Anna", "when": "2026-05-04T10:30:00Z", "why": "the aisles look alike"}
 

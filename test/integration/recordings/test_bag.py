@@ -15,8 +15,8 @@ from graph_slam_ros.recordings import bag
 from graph_slam_ros.recordings.bag import BagError, BagWriter, open_bag
 from graph_slam_ros.runs.chosen_inputs import choose_inputs
 from graph_slam_ros.runs.replay import replay
-from graph_slam_ros.simulation import simulate, write_bag
 from graph_slam_ros.slam import Config
+from graph_slam_ros.tools.simulation import simulate, write_bag
 
 SINGLE_FILES = pytest.mark.skipif(
     version("rosbags").split(".")[:2] < ["0", "11"], reason="this rosbags reads folders only"

@@ -18,12 +18,12 @@ from graph_slam_ros.analysis.evaluation import evaluate
 from graph_slam_ros.analysis.explain import STATES, Numbers, remedy, statements, title
 from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.report import page, places, verdict
-from graph_slam_ros.report.contents import _once, read_contents
-from graph_slam_ros.report.packing import UNKNOWN, Packing, json_for_script, shown
-from graph_slam_ros.report.sentences import effects, sentences
 from graph_slam_ros.runs.folder import BEGUN
 from graph_slam_ros.slam import Config
+from graph_slam_ros.tools.report import page, places, verdict
+from graph_slam_ros.tools.report.contents import _once, read_contents
+from graph_slam_ros.tools.report.packing import UNKNOWN, Packing, json_for_script, shown
+from graph_slam_ros.tools.report.sentences import effects, sentences
 
 
 @pytest.fixture(scope="module")

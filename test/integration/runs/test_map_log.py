@@ -16,8 +16,8 @@ from graph_slam_ros.runs.map_journal import MAP, MapGrowth, read_map, state_of
 from graph_slam_ros.runs.recorder import RunRecorder
 from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.runs.restore import map_of
-from graph_slam_ros.simulation import measurements, simulate
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry
+from graph_slam_ros.tools.simulation import measurements, simulate
 
 GOLDEN = ROOT / "test" / "golden"
 WORLDS = {

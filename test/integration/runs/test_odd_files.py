@@ -15,8 +15,8 @@ from plain_rights import plain_rights
 from graph_slam_ros import cli
 from graph_slam_ros.cli.console import shortened
 from graph_slam_ros.runs.replay import replay
-from graph_slam_ros.simulation import simulate, write_bag
 from graph_slam_ros.slam import Config
+from graph_slam_ros.tools.simulation import simulate, write_bag
 
 MOST = 200  # characters of a line on standard error
 

@@ -1,6 +1,5 @@
 """What of a folder is a run's, what is never removed, and how its files are opened."""
 
-import ast
 import contextlib
 import itertools
 import json
@@ -21,8 +20,8 @@ from graph_slam_ros.recordings.bag import BagWriter
 from graph_slam_ros.runs.folder import MARK, RunError, check_room, is_run, keep_earlier, remove, suggested_out
 from graph_slam_ros.runs.recorder import RunRecorder
 from graph_slam_ros.runs.replay import replay
-from graph_slam_ros.simulation import simulate, write_bag
 from graph_slam_ros.slam import Config, Odometry
+from graph_slam_ros.tools.simulation import simulate, write_bag
 
 PACKAGE = Path(graph_slam_ros.__file__).parent
 GOLDEN = ROOT / "test" / "golden"
@@ -340,67 +339,6 @@ def test_a_file_is_written_whole_or_not_at_all_whatever_interrupts(tmp_path):
             new.write_text("half")
             raise error
         assert state(tmp_path) == {"a": b"old"}
-
-
-# Calls that open, write, rename or remove files, and the only places that have them.
-OPENING = {"open", "read_text", "read_bytes", "write_text", "write_bytes", "unlink", "remove", "rename", "replace"}
-OPENING |= {"rmtree", "rmdir", "FileIO", "fdopen", "savefig", "touch", "move", "copy", "copyfile", "copytree"}
-OF_FILES = {
-    "formats/files.py": {"os.open"},
-    "formats/durable.py": {"os.open", "os.replace", "new.unlink", "other.unlink"},
-    "runs/folder.py": {"folder.rename", "file.unlink", "(folder / SUMMARY).unlink", "folder.rmdir"},
-    # not of runs, nor of the user's
-    "node/player.py": {"parameters.write_text", "subprocess.Popen"},
-    "lie/jit.py": None,
-    "warmup.py": {"(CACHE_DIR / _SHARED).touch", "(CACHE_DIR / f'complete-{sys.argv[1]}').touch", "subprocess.Popen"},
-    "runs/resource_log.py": {"_STATM.read_text"},
-    "analysis/plots.py": {"figure.savefig"},  # into memory
-    "solver/problem.py": {"self._pending.touch"},
-    "report/page.py": {f"(_HERE / 'page.{kind}').read_text" for kind in ("css", "html", "js")} | {"file.read_text"},
-    "fleet/store.py": {"os.open", "mark.unlink", "shutil.rmtree", "made.rename"},  # its own jobs and marks
-    "fleet/job.py": {"open", "shutil.rmtree", "Path('/proc/self/clear_refs').write_text"},
-    "fleet/isolation.py": {"os.fdopen"},
-    "view/page.py": {"(_HERE / f'edits.{kind}').read_text", "(_HERE / name).read_text"},
-    "report/places.py": {"Image.open"},  # from memory
-}
-
-
-def test_every_file_is_opened_through_the_one_module_for_it():
-    for path in sorted(PACKAGE.rglob("*.py")):
-        name = path.relative_to(PACKAGE).as_posix()
-        allowed = OF_FILES.get(name, set())
-        for node in ast.walk(ast.parse(path.read_text())):
-            if not isinstance(node, ast.Call) or allowed is None:
-                continue
-            called = ast.unparse(node.func)
-            last = called.rpartition(".")[2]
-            if last not in OPENING or called in allowed:
-                continue
-            is_of_a_module = called.startswith(("os.", "shutil.", "io.")) or called == "open"
-            is_of_text = last in ("replace", "remove", "copy", "move", "open") and not is_of_a_module
-            is_function = "." not in called and called != "open"  # of ours
-            assert is_of_text or is_function, f"{name}:{node.lineno}: {called}"
-
-
-def test_a_reader_of_a_run_folder_follows_no_link():
-    """Who reads with ``follow`` reads what the user has named: these, and no others."""
-    found = set()
-    for path in PACKAGE.rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.Call) and any(k.arg == "follow" for k in node.keywords):
-                (value,) = (ast.unparse(k.value) for k in node.keywords if k.arg == "follow")
-                if value == "True":
-                    found.add(f"{path.relative_to(PACKAGE).as_posix()}: {ast.unparse(node.args[0])}")
-    assert found == {
-        "node/parameters.py: Path(file)",  # of the command line
-        "recordings/ros1_records.py: path",
-        "recordings/bag.py: file",
-        "formats/bag_folder.py: metadata",
-        "analysis/trajectories.py: path",
-        "report/places.py: file",
-        "report/places.py: file.parent / os.fspath(content['image'])",  # of a floor plan that the user names
-        "cli/check.py: args.config",
-    }
 
 
 def test_the_recordings_of_a_run_are_told_from_those_of_a_simulation(tmp_path, bag):

@@ -24,9 +24,9 @@ from graph_slam_ros.runs.recorder import RunRecorder
 from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.runs.restore import complete, recover
 from graph_slam_ros.runs.tables import fitted_summary, summarize
-from graph_slam_ros.simulation import measurements, simulate, write_bag
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam
 from graph_slam_ros.slam.backend import Backend
+from graph_slam_ros.tools.simulation import measurements, simulate, write_bag
 
 WORLD = tuple(measurements(simulate("warehouse", 5, aisles=2, laps=1, aisle_m=4.0)))
 MUNICH, OSLO = (48.0, 11.0, 500.0), (60.0, 11.0, 100.0)

@@ -6,8 +6,8 @@ from scipy.stats import chi2
 
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.lie import se2, se3
-from graph_slam_ros.simulation import city_graph, simulate
-from graph_slam_ros.simulation.false_closures import count_for, disagreement, false_closures
+from graph_slam_ros.tools.simulation import city_graph, simulate
+from graph_slam_ros.tools.simulation.false_closures import count_for, disagreement, false_closures
 
 ROOTS = {3: np.diag([20.0, 20.0, 100.0]), 7: np.diag([20.0, 20.0, 20.0, 100.0, 100.0, 100.0])}
 

@@ -12,7 +12,8 @@ from graph_slam_ros.formats.g2o import read_g2o
 from graph_slam_ros.messages.from_msg import MessageConverter
 from graph_slam_ros.messages.interfaces import typestore
 from graph_slam_ros.recordings.bag import open_bag
-from graph_slam_ros.simulation import (
+from graph_slam_ros.slam import Closure, Config, Counters
+from graph_slam_ros.tools.simulation import (
     KINDS,
     Fault,
     faulty_recording,
@@ -22,10 +23,9 @@ from graph_slam_ros.simulation import (
     with_closures,
     write_bag,
 )
-from graph_slam_ros.simulation.draft import Draft
-from graph_slam_ros.simulation.false_closures import Closures
-from graph_slam_ros.simulation.motion import space_of
-from graph_slam_ros.slam import Closure, Config, Counters
+from graph_slam_ros.tools.simulation.draft import Draft
+from graph_slam_ros.tools.simulation.false_closures import Closures
+from graph_slam_ros.tools.simulation.motion import space_of
 
 WORLDS = {"warehouse": {"aisles": 2, "laps": 2, "aisle_m": 8.0}, "flight": {"laps": 2}}
 

@@ -10,13 +10,13 @@ from graph_slam_ros.messages.to_msg import transform
 from graph_slam_ros.recordings.bag import open_bag
 from graph_slam_ros.runs.chosen_inputs import choose_inputs
 from graph_slam_ros.runs.replay import measurements as measured
-from graph_slam_ros.simulation import measurements, simulate, with_closures, write_bag
-from graph_slam_ros.simulation.bag import TRUE_LANDMARKS_TOPIC, TRUTH_TOPIC
-from graph_slam_ros.simulation.drive import TRANSFORMS, Drive, Message
-from graph_slam_ros.simulation.instruments import ANTENNA_M, DATUM, geodetic
-from graph_slam_ros.simulation.message_faults import MESSAGE_KINDS
-from graph_slam_ros.simulation.motion import space_of
 from graph_slam_ros.slam import Closure, Config, Counters, Fix
+from graph_slam_ros.tools.simulation import measurements, simulate, with_closures, write_bag
+from graph_slam_ros.tools.simulation.bag import TRUE_LANDMARKS_TOPIC, TRUTH_TOPIC
+from graph_slam_ros.tools.simulation.drive import TRANSFORMS, Drive, Message
+from graph_slam_ros.tools.simulation.instruments import ANTENNA_M, DATUM, geodetic
+from graph_slam_ros.tools.simulation.message_faults import MESSAGE_KINDS
+from graph_slam_ros.tools.simulation.motion import space_of
 
 SMALL = {"warehouse": {"aisles": 2, "aisle_m": 8.0, "laps": 1}, "flight": {"laps": 1}}
 INPUTS = {

@@ -13,7 +13,8 @@ from graph_slam_ros.messages.from_msg import MessageConverter
 from graph_slam_ros.messages.interfaces import typestore
 from graph_slam_ros.recordings.bag import open_bag
 from graph_slam_ros.runs.trajectory import Trajectory
-from graph_slam_ros.simulation import (
+from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Odometry
+from graph_slam_ros.tools.simulation import (
     WORLDS,
     city_graph,
     flight,
@@ -25,8 +26,7 @@ from graph_slam_ros.simulation import (
     warehouse,
     write_bag,
 )
-from graph_slam_ros.simulation.motion import VelocityNoise, accumulated, integrate, space_of
-from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Odometry
+from graph_slam_ros.tools.simulation.motion import VelocityNoise, accumulated, integrate, space_of
 
 SMALL = {
     "pythonrobotics": {},

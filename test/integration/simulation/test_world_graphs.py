@@ -7,9 +7,9 @@ from graph_slam_ros import cli
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.g2o import read_g2o
 from graph_slam_ros.lie import se3
-from graph_slam_ros.simulation import simulate, with_closures
-from graph_slam_ros.simulation.motion import space_of
-from graph_slam_ros.simulation.recording import places
+from graph_slam_ros.tools.simulation import simulate, with_closures
+from graph_slam_ros.tools.simulation.motion import space_of
+from graph_slam_ros.tools.simulation.recording import places
 
 WORLDS = {"warehouse": {"aisles": 2, "laps": 2, "aisle_m": 8.0}, "flight": {"laps": 2}}
 

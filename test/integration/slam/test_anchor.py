@@ -6,9 +6,9 @@ import pytest
 from graph_slam_ros.lie import se2, so3
 from graph_slam_ros.measurements.types import from_record, to_record
 from graph_slam_ros.runs.map_journal import state_of
-from graph_slam_ros.simulation import measurements, simulate
-from graph_slam_ros.simulation.motion import space_of
 from graph_slam_ros.slam import Config, Control, Fix, GraphSlam
+from graph_slam_ros.tools.simulation import measurements, simulate
+from graph_slam_ros.tools.simulation.motion import space_of
 
 END = (Control("end"), Control("optimize"))
 SMALL = {"warehouse": {"aisles": 2, "laps": 1, "aisle_m": 6.0}, "flight": {"laps": 1}}

@@ -7,9 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks.hall import config, fitted, hall, measurements, rms
-from graph_slam_ros.analysis.advice import Advisor
 from graph_slam_ros.analysis.explain import explain_edge, explain_run
-from graph_slam_ros.analysis.weakness import Weakness
 from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.errors import GraphSlamError, SingularError
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
@@ -31,6 +29,8 @@ from graph_slam_ros.slam.lifelong.removed import Left
 from graph_slam_ros.slam.lifelong.surroundings import CHAIN
 from graph_slam_ros.slam.robust.ledger import Verdict
 from graph_slam_ros.solver import Solver
+from graph_slam_ros.tools.advise.advice import Advisor
+from graph_slam_ros.tools.advise.weakness import Weakness
 
 KEYFRAMES, WINDOW = 700, 60
 SPACES = {"plane": PLANAR, "space": SPATIAL}

@@ -9,11 +9,11 @@ from graph_slam_ros.graph.geometry import PLANAR
 from graph_slam_ros.lie import se2
 from graph_slam_ros.measurements.edge_noise import LEAST_RAD2
 from graph_slam_ros.measurements.types import Sighting
-from graph_slam_ros.simulation import measurements, simulate
 from graph_slam_ros.slam import Config, Control, GraphSlam
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
 from graph_slam_ros.slam.landmarks.determination import least_chi2
 from graph_slam_ros.solver import Solver
+from graph_slam_ros.tools.simulation import measurements, simulate
 
 SIGMA_M, ORIGIN = 0.02, (0.0, 0.0, 0.0)
 LEFT, RIGHT = np.array([3.0, 1.5]), np.array([3.0, -1.5])

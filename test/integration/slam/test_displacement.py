@@ -11,11 +11,11 @@ from reliability import times
 from graph_slam_ros.lie import se2
 from graph_slam_ros.measurements.types import InitialPose
 from graph_slam_ros.runs.restore import complete, map_of, record_run, recover
-from graph_slam_ros.simulation import Fault, faulty_recording, measurements, simulate
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry
 from graph_slam_ros.slam.alarm import Alarm
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict
 from graph_slam_ros.slam.snapshot import MapSnapshot
+from graph_slam_ros.tools.simulation import Fault, faulty_recording, measurements, simulate
 
 DISPLACED, SLIP = ("odometry", "displaced"), ("odometry", "slip")
 

@@ -15,8 +15,8 @@ from graph_slam_ros.lie import se2
 from graph_slam_ros.measurements.types import from_record, to_record
 from graph_slam_ros.runs.outcome import shortcomings
 from graph_slam_ros.runs.tables import summarize
-from graph_slam_ros.simulation import measurements, simulate
 from graph_slam_ros.slam import Config, Control, Fix, GraphSlam, Odometry, Sighting, Sightings
+from graph_slam_ros.tools.simulation import measurements, simulate
 
 S = 1_000_000_000
 T0 = 1_700_000_000 * S

@@ -9,10 +9,10 @@ from reliability import tell, times
 
 from graph_slam_ros.cli import main
 from graph_slam_ros.config.config import Config
-from graph_slam_ros.simulation import simulate
-from graph_slam_ros.simulation.bag import write_bag
-from graph_slam_ros.simulation.instruments import Instruments, with_instruments
 from graph_slam_ros.slam import AngularVelocity
+from graph_slam_ros.tools.simulation import simulate
+from graph_slam_ros.tools.simulation.bag import write_bag
+from graph_slam_ros.tools.simulation.instruments import Instruments, with_instruments
 
 SEEDS = times(1, 20)
 BAND = (1.0, 5.0)

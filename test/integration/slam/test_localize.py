@@ -5,9 +5,9 @@ import pytest
 from driven import without_names
 
 from graph_slam_ros.runs.map_journal import state_of
-from graph_slam_ros.simulation import measurements, simulate
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
 from graph_slam_ros.slam.robust.ledger import Verdict
+from graph_slam_ros.tools.simulation import measurements, simulate
 
 
 @pytest.fixture(scope="module")

@@ -8,10 +8,10 @@ import pytest
 from reliability import times
 
 from graph_slam_ros.runs.outcome import ambiguities
-from graph_slam_ros.simulation import measurements, simulate
 from graph_slam_ros.slam import Config, Control, GraphSlam
 from graph_slam_ros.slam.robust import background
 from graph_slam_ros.slam.robust.mirrored import is_of_ranges, mirror_images
+from graph_slam_ros.tools.simulation import measurements, simulate
 
 KINDS = [  # the sensor of the second is ahead of the base, so its ranges are only nearly the same
     ("pythonrobotics", {}, {}, 1e-6),

@@ -8,9 +8,9 @@ import pytest
 from graph_slam_ros.measurements.types import InitialPose
 from graph_slam_ros.runs.recorder import RunRecorder
 from graph_slam_ros.runs.tables import summarize
-from graph_slam_ros.simulation import measurements, simulate
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry
 from graph_slam_ros.slam.motion_only import MotionOnly
+from graph_slam_ros.tools.simulation import measurements, simulate
 
 END = Control("end"), Control("optimize")
 MS = 1_000_000

@@ -12,10 +12,10 @@ from graph_slam_ros.errors import SingularError
 from graph_slam_ros.runs.map_journal import read_map
 from graph_slam_ros.runs.outcome import noise
 from graph_slam_ros.runs.replay import replay
-from graph_slam_ros.simulation import measurements, simulate, write_bag
 from graph_slam_ros.slam import Control, GraphSlam
 from graph_slam_ros.slam.frontend.noise_factors import FIRST_DUE
 from graph_slam_ros.slam.noise_scale import NoiseScale
+from graph_slam_ros.tools.simulation import measurements, simulate, write_bag
 
 CONFIGURED = Config.from_mapping({"robust.noise_scale": "configured"})
 ESTIMATED = Config.from_mapping({"robust.noise_scale": "estimated"})

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from graph_slam_ros.lie import se2
-from graph_slam_ros.simulation import simulate, write_bag
 from graph_slam_ros.slam import Config, Control, Fix, GraphSlam, Odometry, Sighting, Sightings
+from graph_slam_ros.tools.simulation import simulate, write_bag
 
 S = 10**9
 T0 = 1_700_000_000 * S

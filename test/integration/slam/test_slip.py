@@ -9,13 +9,13 @@ from reliability import tell, times
 from graph_slam_ros.lie import se2, se3
 from graph_slam_ros.measurements.types import Odometry
 from graph_slam_ros.runs.restore import map_of, record_run
-from graph_slam_ros.simulation import Fault, faulty_recording, measurements, simulate
 from graph_slam_ros.slam import Config, Control, GraphSlam
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict
 from graph_slam_ros.slam.robust.odometry_filter import OdometryFilter
 from graph_slam_ros.slam.robust.odometry_hypotheses import HypothesisTest
 from graph_slam_ros.slam.slip_review import Slip
 from graph_slam_ros.solver import left_out
+from graph_slam_ros.tools.simulation import Fault, faulty_recording, measurements, simulate
 
 LONG = times(False, True)
 SLIP = ("odometry", "slip")

@@ -11,9 +11,9 @@ from reliability import tell, times
 from graph_slam_ros.analysis.path_error import alignment
 from graph_slam_ros.lie import se3
 from graph_slam_ros.node.session import Session
-from graph_slam_ros.simulation import simulate
-from graph_slam_ros.simulation.recording import START_NS
 from graph_slam_ros.slam import Config, Counters, Odometry
+from graph_slam_ros.tools.simulation import simulate
+from graph_slam_ros.tools.simulation.recording import START_NS
 
 S = 1_000_000_000
 HOUR_NS, DRIVE_NS = 3600 * S, times(200, 600) * S

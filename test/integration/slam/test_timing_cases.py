@@ -26,9 +26,9 @@ from reliability import tell, times
 from graph_slam_ros.graph import RELATIVE_POSE
 from graph_slam_ros.runs.recorder import RunRecorder
 from graph_slam_ros.runs.tables import summarize
-from graph_slam_ros.simulation import measurements, simulate
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
 from graph_slam_ros.slam.frontend.ingest_gate import TimeJumpDetector
+from graph_slam_ros.tools.simulation import measurements, simulate
 
 S = 1_000_000_000
 T0 = 1_700_000_000 * S

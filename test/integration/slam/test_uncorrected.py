@@ -15,8 +15,8 @@ from graph_slam_ros.messages.to_msg import WARN
 from graph_slam_ros.node.diagnostics import Facts, judge, statuses
 from graph_slam_ros.node.estimate import Estimate, UnseenWay
 from graph_slam_ros.runs.outcome import doubts
-from graph_slam_ros.simulation import simulate, write_bag
 from graph_slam_ros.slam import Config, Control, GraphSlam, Sightings
+from graph_slam_ros.tools.simulation import simulate, write_bag
 
 SURE = {"odometry.translation_density": 1e-3, "odometry.lateral_density": 1e-3}
 WRONG = [

@@ -12,13 +12,13 @@ from graph_slam_ros.graph import R2
 from graph_slam_ros.lie import se2, se3
 from graph_slam_ros.runs.journal import RecordWriter
 from graph_slam_ros.runs.map_journal import MapGrowth, read_map, state_of
-from graph_slam_ros.simulation import Fault, faulty_recording, measurements, simulate
-from graph_slam_ros.simulation.motion import VelocityNoise
-from graph_slam_ros.simulation.recording import drive
-from graph_slam_ros.simulation.sensing import RangeBearing
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
 from graph_slam_ros.slam.landmarks import hindsight
 from graph_slam_ros.slam.slip_review import Slip
+from graph_slam_ros.tools.simulation import Fault, faulty_recording, measurements, simulate
+from graph_slam_ros.tools.simulation.motion import VelocityNoise
+from graph_slam_ros.tools.simulation.recording import drive
+from graph_slam_ros.tools.simulation.sensing import RangeBearing
 
 S = 1_000_000_000
 TICK_NS = S // 10

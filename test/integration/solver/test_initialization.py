@@ -12,8 +12,8 @@ from graph_slam_ros.formats.g2o import read_g2o
 from graph_slam_ros.graph import LANDMARK_POSITION, R2, RELATIVE_POSE, RELATIVE_POSE_3D, SE2, SE3, Gaussian, Graph
 from graph_slam_ros.lie import se2, se3
 from graph_slam_ros.optimization import optimize
-from graph_slam_ros.simulation import city_graph
 from graph_slam_ros.solver import Settings, Solver, initial_values
+from graph_slam_ros.tools.simulation import city_graph
 
 GRAPHS = DATASETS
 GRAPHS = GRAPHS / "pose_graphs"

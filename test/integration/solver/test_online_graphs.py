@@ -8,9 +8,9 @@ from places import DATASETS
 
 from graph_slam_ros.formats.g2o import read_g2o
 from graph_slam_ros.graph import R2
-from graph_slam_ros.simulation import city_graph, simulate
-from graph_slam_ros.simulation.pose_graph import landmark_graph
 from graph_slam_ros.solver import Settings, Solver
+from graph_slam_ros.tools.simulation import city_graph, simulate
+from graph_slam_ros.tools.simulation.pose_graph import landmark_graph
 
 GRAPHS = DATASETS
 GRAPHS = GRAPHS / "pose_graphs"

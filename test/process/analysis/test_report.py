@@ -19,8 +19,8 @@ from graph_slam_ros.formats.tum import tum_text
 from graph_slam_ros.lie import se3
 from graph_slam_ros.runs.restore import record_run
 from graph_slam_ros.runs.trajectory import Trajectory, read_tum
-from graph_slam_ros.simulation import simulate, write_bag
 from graph_slam_ros.slam import Config, Control
+from graph_slam_ros.tools.simulation import simulate, write_bag
 
 COLUMNS = "id,kind,x,y,theta,sightings,cov_xx,cov_xy,cov_yy"
 

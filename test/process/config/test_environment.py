@@ -16,7 +16,7 @@ from plain_rights import plain_rights
 from graph_slam_ros import cli, warmup
 from graph_slam_ros.lie import jit
 from graph_slam_ros.runs.replay import replay
-from graph_slam_ros.simulation import simulate, write_bag
+from graph_slam_ros.tools.simulation import simulate, write_bag
 
 MOST = 200
 _NEW_MOUNTS, _PRIVATE = 0x20000, 1 << 18 | 1 << 14

@@ -17,12 +17,12 @@ from fleet_nodes import scheduler, wait_for
 
 from graph_slam_ros import cli
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.fleet import engine
-from graph_slam_ros.fleet.engine import Workers, connected, run_jobs
-from graph_slam_ros.fleet.job import Job
-from graph_slam_ros.fleet.replay import Fleet, replay_all
 from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.slam import Config
+from graph_slam_ros.tools.fleet import engine
+from graph_slam_ros.tools.fleet.engine import Workers, connected, run_jobs
+from graph_slam_ros.tools.fleet.job import Job
+from graph_slam_ros.tools.fleet.replay import Fleet, replay_all
 
 HASHED = ("graph.g2o", "ledger.csv", "path.tum", "landmarks.csv", "map.mcap")
 

@@ -18,10 +18,10 @@ from reliability import tell, times
 
 from graph_slam_ros import cli
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.fleet.engine import Workers
-from graph_slam_ros.fleet.replay import Fleet, replay_all
 from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.slam import Config
+from graph_slam_ros.tools.fleet.engine import Workers
+from graph_slam_ros.tools.fleet.replay import Fleet, replay_all
 
 HASHED = ("graph.g2o", "ledger.csv", "path.tum", "landmarks.csv", "map.mcap")
 COUNT = times(2, 12)

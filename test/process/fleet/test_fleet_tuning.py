@@ -10,8 +10,8 @@ pytest.importorskip("distributed", reason="the extra fleet is not installed")
 
 from graph_slam_ros import cli
 from graph_slam_ros.config.config import flatten
-from graph_slam_ros.fleet.table import read_table
 from graph_slam_ros.formats.parameters import read_parameters
+from graph_slam_ros.tools.fleet.table import read_table
 
 ADDED = "landmarks.added_sigma_m"
 

@@ -17,8 +17,8 @@ from rclpy.qos import ReliabilityPolicy
 from graph_slam_ros.cli import main
 from graph_slam_ros.recordings.bag import BagWriter, open_bag
 from graph_slam_ros.runs.replay import replay
-from graph_slam_ros.simulation import simulate, write_bag
 from graph_slam_ros.slam import Config
+from graph_slam_ros.tools.simulation import simulate, write_bag
 from graph_slam_ros.warmup import warmup
 
 INSTALLED = [executable("graph_slam_node")]

@@ -26,8 +26,8 @@ from graph_slam_ros.messages.topics import PUBLICATIONS, SERVICES, SUBSCRIPTIONS
 from graph_slam_ros.node.session import Session
 from graph_slam_ros.runs.folder import changed_since
 from graph_slam_ros.runs.replay import replay
-from graph_slam_ros.simulation import simulate, write_bag
 from graph_slam_ros.slam import Config, Counters, Odometry
+from graph_slam_ros.tools.simulation import simulate, write_bag
 
 PACKAGE = Path(graph_slam_ros.__file__).parent
 FILES = {path.relative_to(PACKAGE).as_posix(): path for path in sorted(PACKAGE.rglob("*.py"))}

@@ -16,9 +16,9 @@ from graph_slam_ros.maps.edit import edit_run
 from graph_slam_ros.measurements.edit_actions import ACTIONS
 from graph_slam_ros.runs.map_journal import read_map
 from graph_slam_ros.runs.restore import restored
-from graph_slam_ros.simulation import simulate
-from graph_slam_ros.simulation.bag import write_bag
 from graph_slam_ros.slam.robust.ledger import Reason
+from graph_slam_ros.tools.simulation import simulate
+from graph_slam_ros.tools.simulation.bag import write_bag
 
 
 @pytest.fixture(autouse=True)

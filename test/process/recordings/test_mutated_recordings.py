@@ -14,8 +14,8 @@ from graph_slam_ros.analysis.trajectories import TRUE_LANDMARKS_TOPIC, TRUTH_TOP
 from graph_slam_ros.lie import se3
 from graph_slam_ros.recordings.bag import BagWriter, open_bag
 from graph_slam_ros.runs.replay import replay
-from graph_slam_ros.simulation import simulate, write_bag
 from graph_slam_ros.slam import Config
+from graph_slam_ros.tools.simulation import simulate, write_bag
 
 MOST, MOST_WITH_LOSS = 1.2, 2.0  # times the error of the recording as it was
 LONG_S = 300.0  # of a public recording

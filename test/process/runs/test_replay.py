@@ -24,8 +24,8 @@ from graph_slam_ros.runs.journal import RecordWriter, parts_of, read_ingest
 from graph_slam_ros.runs.recorder import RunRecorder
 from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.runs.trajectory import read_tum
-from graph_slam_ros.simulation import measurements, simulate, write_bag
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry
+from graph_slam_ros.tools.simulation import measurements, simulate, write_bag
 
 RESULTS = (
     "graph.g2o",

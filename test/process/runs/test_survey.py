@@ -15,8 +15,8 @@ from graph_slam_ros.runs import outcome
 from graph_slam_ros.runs.folder import run_config
 from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.runs.tables import summarize
-from graph_slam_ros.simulation import measurements, simulate, write_bag
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
+from graph_slam_ros.tools.simulation import measurements, simulate, write_bag
 
 END = (Control("end"), Control("optimize"))
 T_PLAN_WORLD = (12.0, -5.0, 2.0)

@@ -10,9 +10,9 @@ from graph_slam_ros.cli import main
 from graph_slam_ros.measurements.types import Odometry
 from graph_slam_ros.recordings.bag import BagMessage, open_bag
 from graph_slam_ros.runs.replay import replay
-from graph_slam_ros.simulation import simulate, write_bag
 from graph_slam_ros.slam import Config, Control, Counters
 from graph_slam_ros.slam.frontend.ingest_gate import IngestGate
+from graph_slam_ros.tools.simulation import simulate, write_bag
 
 S = 10**9
 

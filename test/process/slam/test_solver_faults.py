@@ -18,10 +18,10 @@ from reliability import tell, times
 from graph_slam_ros.errors import GaugeError, GraphSlamError, SingularError
 from graph_slam_ros.lie import se2
 from graph_slam_ros.measurements.types import Closure
-from graph_slam_ros.simulation import measurements, simulate
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict
 from graph_slam_ros.solver.clique_tree.storage import LOCAL, MARKED, NOTHING
+from graph_slam_ros.tools.simulation import measurements, simulate
 
 S = 1_000_000_000
 T0 = 1_700_000_000 * S

@@ -22,19 +22,19 @@ from graph_slam_ros import cli
 from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.graph import Loss
 from graph_slam_ros.maps.edit import edit, read_plan
-from graph_slam_ros.report.contents import read_contents
 from graph_slam_ros.runs.recorder import RunRecorder
 from graph_slam_ros.runs.restore import restored
 from graph_slam_ros.runs.trajectory import read_tum
 from graph_slam_ros.slam import Config
+from graph_slam_ros.tools.report.contents import read_contents
 
 pytest.importorskip("starlette", reason="view is tested with its extra: pip install 'graph_slam_ros[view]'")
 pytest.importorskip("uvicorn", reason="view is tested with its extra: pip install 'graph_slam_ros[view]'")
 
-from graph_slam_ros.view import guard, server
-from graph_slam_ros.view.guard import Access
-from graph_slam_ros.view.page import page_of
-from graph_slam_ros.view.workbench import Workbench
+from graph_slam_ros.tools.view import guard, server
+from graph_slam_ros.tools.view.guard import Access
+from graph_slam_ros.tools.view.page import page_of
+from graph_slam_ros.tools.view.workbench import Workbench
 
 PATIENCE_S = 0.5
 

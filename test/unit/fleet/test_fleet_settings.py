@@ -11,12 +11,12 @@ pytest.importorskip("distributed", reason="the extra fleet is not installed")
 from graph_slam_ros import cli
 from graph_slam_ros.cli.parser import parser
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.fleet.compare import compare, markdown, parse_limit
-from graph_slam_ros.fleet.page import write_page
-from graph_slam_ros.fleet.recordings import find_sources, fingerprint, local_copy
-from graph_slam_ros.fleet.replay import settings_of, truth_of
-from graph_slam_ros.fleet.store import Store, begin_attempt, job_key, keep
-from graph_slam_ros.fleet.table import read_table, write_table
+from graph_slam_ros.tools.fleet.compare import compare, markdown, parse_limit
+from graph_slam_ros.tools.fleet.page import write_page
+from graph_slam_ros.tools.fleet.recordings import find_sources, fingerprint, local_copy
+from graph_slam_ros.tools.fleet.replay import settings_of, truth_of
+from graph_slam_ros.tools.fleet.store import Store, begin_attempt, job_key, keep
+from graph_slam_ros.tools.fleet.table import read_table, write_table
 
 
 def test_settings_are_the_product_of_files_and_values(tmp_path):

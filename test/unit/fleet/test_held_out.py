@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from graph_slam_ros.fleet.held_out import STRETCH_NS, predict
 from graph_slam_ros.graph import R2, Gaussian, Graph
 from graph_slam_ros.graph.edges import DIFFERENCE, POINT_PRIOR
 from graph_slam_ros.solver import Solver
+from graph_slam_ros.tools.fleet.held_out import STRETCH_NS, predict
 
 STEP, SEEN = 0.1, 0.05  # true noise of a step and of a sighting
 LANDMARKS = np.array([[0.0, 2.0], [4.0, -1.0], [8.0, 2.0]])
@@ -69,7 +69,7 @@ class Walk:
 
 
 def test_it_is_the_density_of_what_is_left_out_given_the_rest():
-    from graph_slam_ros.fleet.held_out import _half
+    from graph_slam_ros.tools.fleet.held_out import _half
 
     walk = Walk(40, seed=1)
     found = walk.nats()

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from graph_slam_ros.fleet.surface import LONGEST, Surface, design, held_out_of, interval
+from graph_slam_ros.tools.fleet.surface import LONGEST, Surface, design, held_out_of, interval
 
 H = np.array([[60.0, 20.0], [20.0, 40.0]])
 LEAST = np.array([0.2, -0.3])

@@ -10,12 +10,12 @@ pytest.importorskip("optuna", reason="the extra fleet is not installed")
 from graph_slam_ros.config import Config
 from graph_slam_ros.config.config import flatten
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.fleet.compare import change_of
-from graph_slam_ros.fleet.fit import fit_about
-from graph_slam_ros.fleet.search import Range, Search, ranges_of, score
-from graph_slam_ros.fleet.tune import Tuned, TunedParameter, _found, _proof
-from graph_slam_ros.fleet.tuned import as_yaml
 from graph_slam_ros.formats.parameters import read_parameters
+from graph_slam_ros.tools.fleet.compare import change_of
+from graph_slam_ros.tools.fleet.fit import fit_about
+from graph_slam_ros.tools.fleet.search import Range, Search, ranges_of, score
+from graph_slam_ros.tools.fleet.tune import Tuned, TunedParameter, _found, _proof
+from graph_slam_ros.tools.fleet.tuned import as_yaml
 
 TRUE = {"a.density": 0.05, "b.sigma": 0.3}
 RANGES = [Range("a.density", 0.15, 0.0, math.inf), Range("b.sigma", 0.06, 0.0, 1e9), Range("c.flat", 1.0, 0.0, 9.0)]

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from graph_slam_ros.simulation import measurements, simulate
 from graph_slam_ros.slam import Control, GraphSlam
+from graph_slam_ros.tools.simulation import measurements, simulate
 
 
 def test_odometry_is_corrected_evenly_from_one_keyframe_to_the_next():

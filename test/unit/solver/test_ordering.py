@@ -5,7 +5,6 @@ import pytest
 from online import check_tree
 
 from graph_slam_ros.graph import POSE_PRIOR, RELATIVE_POSE, SE2, Gaussian, Graph
-from graph_slam_ros.simulation import city_graph
 from graph_slam_ros.solver import Settings, Solver
 from graph_slam_ros.solver.clique_tree.separator import HEAVIEST, separate
 from graph_slam_ros.solver.clique_tree.storage import (
@@ -18,6 +17,7 @@ from graph_slam_ros.solver.clique_tree.storage import (
     PARENT,
     R_MADE,
 )
+from graph_slam_ros.tools.simulation import city_graph
 
 
 def arrays(n, pairs, weight=None):

@@ -28,8 +28,8 @@ from graph_slam_ros.graph import (
     Loss,
 )
 from graph_slam_ros.lie import se2
-from graph_slam_ros.simulation import city_graph
 from graph_slam_ros.solver import Settings, Solver
+from graph_slam_ros.tools.simulation import city_graph
 
 POSES, POINTS = 12, 3
 TIGHT = {"step_tolerance": 1e-11, "cost_tolerance": 1e-15, "max_iterations": 100}

@@ -1,0 +1,1 @@
+"""Tools beside the SLAM: worlds, reports, fleets, advice, certificates. The core never imports them."""

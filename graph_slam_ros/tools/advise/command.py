@@ -1,0 +1,162 @@
+"""The command ``advise``: the weak parts of a run, and what would make them better known."""
+
+import argparse
+import json
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from graph_slam_ros.cli import console
+
+if TYPE_CHECKING:
+    from graph_slam_ros.tools.advise.advice import Advice, Advisor
+    from graph_slam_ros.tools.advise.weakness import Stretch, Weakest, Weakness
+
+
+def advise(args: argparse.Namespace) -> int:
+    """Print what is weak in a run, and which single addition would help most."""
+    from graph_slam_ros.analysis.what_if import SavedGraph
+    from graph_slam_ros.tools.advise.advice import Advisor
+    from graph_slam_ros.tools.advise.weakness import Weakness
+
+    losses: list[str] = []
+    run = SavedGraph(args.run_folder, losses)
+    weakness = Weakness(run)
+    advisor = Advisor(weakness, args.survey_sigma)
+    everything = advisor.advise()
+    found = [_best(some, args.count) for some in everything]
+    of_path = min((one for some in everything for one in some), key=lambda one: one.path_m, default=None)
+    if args.json:
+        console.show(json.dumps(_as_dict(weakness, advisor, found, of_path)))
+    else:
+        console.show(*_weak_text(weakness, advisor), *_advice_text(advisor, found, of_path))
+        console.then(_next(args, found))
+    return console.report_losses(losses)
+
+
+def _best(some: "list[Advice]", count: int) -> "list[Advice]":
+    """The best of each kind, the best first."""
+    kinds: dict[str, int] = {}
+    out = []
+    for one in some:
+        kinds[one.addition.kind] = kinds.get(one.addition.kind, 0) + 1
+        if kinds[one.addition.kind] <= count:
+            out.append(one)
+    return out
+
+
+# -- text --------------------------------------------------------------------------------------------------------------
+
+
+def _weak_text(weakness: "Weakness", advisor: "Advisor") -> Iterator[str]:
+    run = weakness.run
+    yield (
+        f"{len(run.slam.keyframes)} keyframes, {len(run.landmarks)} landmarks; all sigmas are relative to what holds"
+        f" the map: {weakness.held_by()}"
+    )
+    yield "weakest"
+    for one in advisor.weakest:
+        where = _where(weakness, one)
+        sigma, usual = (_sigma(one.what, x) for x in (one.direction.sigma, one.usual))
+        words = "" if one.direction.words == one.what else f" {one.direction.words}"
+        yield f"  {one.what:9s} {one.about}{where}: {sigma}{words} (median {usual})"
+    stretches = [*weakness.stretches()]
+    unseen = weakness.longest_unseen()
+    yield "weak stretches" if stretches or unseen else "weak stretches: none"
+    for stretch in stretches:
+        numbers = f"sigma up to {_sigma(stretch.what, stretch.sigma)}, median {_sigma(stretch.what, stretch.usual)}"
+        yield f"  {stretch.what} weak for {_span(stretch)}: {stretch.reason}; {numbers}"
+    if unseen:
+        yield f"  {unseen.reason} for {_span(unseen)}: the longest part of the path without one"
+
+
+def _where(weakness: "Weakness", one: "Weakest") -> str:
+    if not one.about.startswith("keyframe"):
+        return ""
+    stamp_s, driven_m = weakness.run.stamps_ns[one.keyframe] * 1e-9, weakness.travelled_m[one.keyframe]
+    return f" ({stamp_s:.3f} s, {driven_m:.1f} m driven)"
+
+
+def _span(one: "Stretch") -> str:
+    stamps = f"{one.begins_ns * 1e-9:.3f} to {one.ends_ns * 1e-9:.3f} s"
+    return (
+        f"{one.length_m:.1f} m (keyframes {one.first} to {one.last}, {stamps},"
+        f" {one.begins_m:.1f} to {one.begins_m + one.length_m:.1f} m driven)"
+    )
+
+
+def _sigma(what: str, sigma: float) -> str:
+    return f"{np.degrees(sigma):.2f} deg" if what == "heading" else f"{sigma:.3f} m"
+
+
+def _advice_text(advisor: "Advisor", found: "list[list[Advice]]", of_path: "Advice | None") -> Iterator[str]:
+    yield "what would help most, each alone: the sigma that it leaves, and the position error on the path (rms)"
+    for one, some in zip(advisor.weakest, found, strict=True):
+        what = "heading" if one.what == "heading" else f"position, {one.direction.words},"
+        yield f"  {what} of {one.about}: {_sigma(one.what, one.direction.sigma)} now"
+        for advice in some:
+            yield f"    {_sigma(one.what, advice.predicted):>10s}   {_path(advice)}   {advice.addition.about}"
+        if not some:
+            yield f"    nothing that was tried helps by 2 % or more: {advisor.why_nothing()}"
+    if of_path:
+        yield f"  of these, most for the whole path: {of_path.addition.about}, {_path(of_path)}"
+
+
+def _path(one: "Advice") -> str:
+    return f"path {one.path_now_m:.3f} -> {one.path_m:.3f} m"
+
+
+def _next(args: argparse.Namespace, found: "list[list[Advice]]") -> str:
+    if any(found):
+        return "measure the first of these, and replay with it; a survey goes into landmarks.surveyed_file"
+    return f"{console.command('explain', args.run_folder)} (what was believed, and what not)"
+
+
+# -- JSON --------------------------------------------------------------------------------------------------------------
+
+
+def _as_dict(
+    weakness: "Weakness", advisor: "Advisor", found: "list[list[Advice]]", of_path: "Advice | None"
+) -> dict[str, Any]:
+    stretches, unseen = [*weakness.stretches()], weakness.longest_unseen()
+    return {
+        "keyframes": len(weakness.run.slam.keyframes),
+        "landmarks": len(weakness.run.landmarks),
+        "sampled_keyframes": len(advisor.keyframes),
+        "sampled_landmarks": len(advisor.landmarks),
+        "held_by": weakness.held_by(),
+        "weakest": [
+            {
+                "what": one.what,
+                "about": one.about,
+                "keyframe": weakness.run.numbers[one.keyframe],
+                "direction": one.direction.words,
+                "axis": one.direction.axis.tolist(),
+                "sigma": one.direction.sigma,
+                "usual": one.usual,
+                "advice": [_advice_as_dict(advice) | {"predicted": advice.predicted} for advice in some],
+            }
+            for one, some in zip(advisor.weakest, found, strict=True)
+        ],
+        "best_for_path": _advice_as_dict(of_path) if of_path else None,
+        "stretches": [_stretch_as_dict(one) for one in (*stretches, *([unseen] if unseen else []))],
+    }
+
+
+def _advice_as_dict(one: "Advice") -> dict[str, Any]:
+    kind, about = one.addition.kind, one.addition.about
+    return {"kind": kind, "about": about, "path_now_m": one.path_now_m, "path_m": one.path_m}
+
+
+def _stretch_as_dict(one: "Stretch") -> dict[str, Any]:
+    return {
+        "what": one.what or "sightings",
+        "keyframes": [one.first, one.last],
+        "stamps_ns": [one.begins_ns, one.ends_ns],
+        "begins_m": one.begins_m,
+        "length_m": one.length_m,
+        "sigma": one.sigma if one.what else None,
+        "usual": one.usual if one.what else None,
+        "reason": one.reason,
+    }

@@ -1,0 +1,23 @@
+"""The command ``report``: one HTML file on a run."""
+
+import argparse
+import gc
+
+from graph_slam_ros.cli import console
+from graph_slam_ros.errors import GraphSlamError
+
+
+def report(args: argparse.Namespace) -> int:
+    """Write the report on a run."""
+    from graph_slam_ros.tools.report import write_report
+
+    if not args.truth and (args.topic or args.no_align):
+        raise GraphSlamError("report: no use for --topic or --no-align without --truth")
+    out = args.out or args.run_folder.with_name(f"{args.run_folder.resolve().name}.html")
+    console.check_file(out, force=args.force)
+    gc.disable()  # a map is a million small objects that all stay: to look through them is a sixth of the time
+    made = write_report(args.run_folder, out, args.truth, args.compare, args.plan, args.topic, align=not args.no_align)
+    gc.freeze()  # nor at the end of the process
+    console.show(*made.data["sentences"] or (), f"report in {out}")
+    console.then(f"open {out} in a browser: it needs no network")
+    return console.report_losses(made.losses, made.beware)

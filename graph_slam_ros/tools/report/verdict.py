@@ -1,0 +1,258 @@
+"""The verdict on a run in three sentences, and its tables."""
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from graph_slam_ros import __version__
+from graph_slam_ros.analysis.consistency import should_be
+from graph_slam_ros.analysis.explain import explain_run
+from graph_slam_ros.analysis.what_if import SavedGraph
+from graph_slam_ros.config.config import Config, flatten, parameters
+from graph_slam_ros.measurements.reasons import Effect, explain, remedy
+from graph_slam_ros.runs import outcome
+from graph_slam_ros.runs.tables import INPUT_COLUMNS
+from graph_slam_ros.slam.noise_scale import NoiseScale
+from graph_slam_ros.tools.report.packing import shown
+
+Row = list[Any]
+_FINE = 0.5, 2.0  # chi2 per degree of freedom
+_MOST_NEES = 2.0  # times what is expected
+_TOO_SMALL = "its covariances are too small"
+_MOST_REASONS = 3  # that the sentence on rejected measurements names
+
+
+def verdict(
+    run: Path, summary: Mapping[str, Any], saved: SavedGraph | None, scores: Any, losses: Sequence[str]
+) -> list[str]:
+    """Three sentences: whether the map can be used, what was not believed, and what to do next.
+
+    Parameters
+    ----------
+    saved : the graph; None if it cannot be read
+    scores : of the evaluation, None without truth
+    """
+    short = [*outcome.shortcomings(summary)] if _is_complete(summary) else []
+    doubts = [*outcome.doubts(summary)] if _is_complete(summary) else []
+    gates = [line for line in explain_run(saved) if line.startswith("warning: ")] if saved else []
+    first = _state(summary, saved, scores, short, [*doubts, *gates], losses)
+    untrue = list(scores.warnings) if scores is not None else []
+    covariances = _covariances(saved, scores) if not untrue else []
+    last = _next(run, (untrue, short, doubts, gates, covariances), losses, summary, has_truth=scores is not None)
+    return [first, _judged(saved), last]
+
+
+def _is_complete(summary: Mapping[str, Any]) -> bool:
+    return {"counters", "inputs", "keyframes", "landmarks", "sightings", "waiting"} <= set(summary)
+
+
+def _state(
+    summary: Mapping[str, Any],
+    saved: SavedGraph | None,
+    scores: Any,
+    short: Sequence[str],
+    doubts: Sequence[str],
+    losses: Sequence[str],
+) -> str:
+    if saved is None:
+        return f"There is no map to show: {losses[0] if losses else 'the run holds no keyframe'}."
+    size = f"{len(saved.slam.keyframes)} keyframes and {summary.get('landmarks', len(saved.landmarks))} landmarks"
+    fit = _fit(saved)
+    error = ""
+    if scores is not None:
+        error = f", {scores.estimate.position_m['rmse']:.3f} m from the truth (RMSE)"
+        if scores.odometry is not None:
+            error += f", dead reckoning {scores.odometry.position_m['rmse']:.3f} m"
+        error += f"; {_TOO_SMALL}" if not scores.warnings and _covariances(saved, scores) else ""
+        error += "; whether that is a truth of this drive is not sure" if scores.warnings else ""
+    if short:
+        return f"Do not rely on this map yet: {size}{error}."
+    if not summary.get("converged", True):
+        return f"Do not rely on this map yet: {size}{error}; the last solve did not converge."
+    if doubts or losses:
+        return f"Use this map with care: {size}{error}{fit}."
+    return f"The run shows nothing wrong with this map: {size}{error}{fit}."
+
+
+def _covariances(saved: SavedGraph | None, scores: Any) -> list[str]:
+    """A sentence where errors against the truth are far larger than the covariances say; else none."""
+    poses = scores.consistency.poses if scores is not None and scores.consistency else None
+    if saved is None or poses is None or poses.mean < _MOST_NEES * poses.dof:
+        return []
+    advised = [line for line in scores.consistency.advice.splitlines() if "--set" in line]
+    estimated = f"; {'; '.join(advised)}" if advised else ""
+    return [f"{_TOO_SMALL}: NEES of poses {poses.mean:.1f}, where {poses.dof} is expected{estimated}"]
+
+
+def _fit(saved: SavedGraph) -> str:
+    ratio = chi2_per_dof(saved)
+    if ratio is None:
+        return ""
+    if _FINE[0] <= ratio <= _FINE[1]:
+        return f"; residuals are as large as the stated noise (chi2 per degree of freedom {ratio:.2f})"
+    which = "larger" if ratio > 1.0 else "smaller"
+    return f"; residuals are {which} than the stated noise (chi2 per degree of freedom {ratio:.2f})"
+
+
+def chi2_per_dof(saved: SavedGraph) -> float | None:
+    """Chi2 by the residuals that are not used up by unknowns; None without any."""
+    dof = saved.restored.degrees_of_freedom
+    return saved.restored.evaluate().chi2_final / dof if dof > 0 else None
+
+
+def _judged(saved: SavedGraph | None) -> str:
+    if saved is None:
+        return "What was measured cannot be shown without the map."
+    judged = [e for e in saved.entries if e.verdict]
+    if not judged:
+        return "The map is odometry alone: no landmark, fix or closure is in it."
+    out = [e for e in judged if not e.is_in]
+    weak = sum(e.verdict.name == "DOWN_WEIGHTED" for e in judged)
+    low = f"; {weak} more have little weight" if weak else ""
+    condensed = sum(sum(of.values()) for of in saved.slam.bounded.accepted.values()) if saved.slam.bounded else 0
+    low += f"; {condensed} more were believed, and are condensed" if condensed else ""
+    if not out:
+        return f"All {len(judged)} measurements are in the map{low}."
+    counted = Counter((e.source or e.label, e.reason.name.lower().replace("_", " ")) for e in out)
+    several = [f"{times} of {shown(name)} ({why})" for (name, why), times in counted.most_common(_MOST_REASONS)]
+    rest = "; the most are " if len(counted) > _MOST_REASONS else ": "
+    return f"{len(out)} of {len(judged)} measurements are not in the map{rest}{', '.join(several)}{low}."
+
+
+def _next(
+    run: Path,
+    several: Iterable[Sequence[str]],
+    losses: Sequence[str],
+    summary: Mapping[str, Any],
+    *,
+    has_truth: bool,
+) -> str:
+    """The first of several kinds of sentences that has any."""
+    if summary.get("ended") is False:
+        again = f"If it was cut off, graph_slam recover {run.name} --out DIR writes its results"
+        return f"This run is still being written, or it was cut off: this is its map so far. {again}."
+    if losses:
+        again = f"graph_slam recover {run.name} --out DIR writes its results anew"
+        return f"First get the run whole: {losses[0]} ({again})."
+    first = next((some[0] for some in several if some), "")
+    if first:
+        return f"Why, and what to do: {first.removeprefix('warning: ')}{'' if first.endswith('.') else '.'}"
+    if has_truth:
+        return "Nothing needs to be changed."
+    truth = f"graph_slam report {run.name} --truth TRUTH"
+    return f"Next: compare it with a ground truth, if there is one: {truth}."
+
+
+# -- tables ------------------------------------------------------------------------------------------------------------
+
+
+def inputs(summary: Mapping[str, Any]) -> list[Row]:
+    """A row for each input: received, used, believed, refused; and one for each reason, with its remedy."""
+    rows: list[Row] = []
+    of_inputs = summary.get("inputs", {})
+    counters = summary.get("counters", {})
+    for name in dict.fromkeys([*of_inputs, *counters]):
+        of = of_inputs.get(name, {})
+        counts = counters.get(name, {})
+        refused = sum(times for reason, times in counts.items() if explain(reason).effect is Effect.REFUSED)
+        numbers = [(of | {"refused": refused}).get(column) for column in INPUT_COLUMNS]
+        rows.append([shown(name), of.get("use", ""), *numbers, "", ""])
+        for reason, times in sorted(counts.items(), key=lambda one: -one[1]):
+            row = explain(reason)
+            why = f"{reason}: {row.meaning}"
+            rows.append(["", row.effect.value, None, None, None, times, why, remedy(name, reason)])
+    return rows
+
+
+def configuration(config: Config) -> list[Row]:
+    """The parameters that differ from their defaults: name, value, default, meaning."""
+    names = config.inputs.names.split()
+    known = {p.name: p for p in parameters(names)}
+    rows = []
+    for name, value in flatten(config.as_mapping()):
+        p = known.get(name)
+        if p is None or value != p.default:
+            default, meaning = (shown(str(p.default)), p.meaning) if p else ("", "")
+            rows.append([shown(name), shown(str(value)), default, meaning])
+    return rows
+
+
+def versions(run: Path, summary: Mapping[str, Any]) -> list[Row]:
+    """Versions, and what tells the files of the run from others."""
+    recording = str(summary.get("recording") or "a live run, or not known")
+    rows = [
+        ["report made by", f"graph_slam_ros {__version__}"],
+        ["run written by", f"graph_slam_ros {summary.get('version', '?')}"],
+        ["run folder", shown(run.resolve().name)],
+        ["recording", shown(recording)],
+    ]
+    for kind in ("recorded", "files"):
+        of = summary.get(kind)
+        if isinstance(of, dict):
+            rows += [[shown(str(name)), shown(str(mark))] for name, mark in sorted(of.items())]
+    return rows
+
+
+def timing(summary: Mapping[str, Any]) -> list[Row]:
+    """Time, memory and backlog of the run, as its summary has them."""
+    rows: list[Row] = []
+    if "time_s" in summary:
+        rows.append(["time", f"{summary['time_s']:.1f} s"])
+    if "cpu_s" in summary:
+        rows.append(["CPU time", f"{summary['cpu_s']:.1f} s"])
+    span_s, solves = summary.get("span_s"), summary.get("solves")
+    if span_s:
+        rows.append(["span of the drive", f"{span_s:.1f} s"])
+        if "cpu_s" in summary:
+            rows.append(["CPU time per second of the drive", f"{summary['cpu_s'] / span_s:.3f} s"])
+    if solves:
+        rows.append(["solves", str(solves)])
+        if "cpu_s" in summary:
+            rows.append(["CPU time per solve, with all else", f"{1e3 * summary['cpu_s'] / solves:.2f} ms"])
+    if summary.get("unprocessed"):
+        rows.append(["backlog at the end", f"{summary['unprocessed']} measurements accepted and not processed"])
+    elif "unprocessed" in summary:
+        rows.append(["backlog at the end", "none"])
+    load = dict(summary.get("load") or {})
+    if load:
+        rows.append(["largest backlog", f"{max(load['backlog'])} measurements"])
+        rows.append(["memory, at most", f"{max(load['memory_mib']):.0f} MiB, with Python and its libraries"])
+    else:
+        rows.append(["memory", "not in this run folder: it was not ended, or is of an earlier version"])
+    return rows
+
+
+def load(summary: Mapping[str, Any]) -> dict[str, list[float]] | None:
+    """CPU time for each keyframe [ms], memory [MiB] and backlog over the keyframes; None if the summary has no two."""
+    rows = dict(summary.get("load") or {})
+    at = [float(k) for k in rows.get("keyframes", ())]
+    if len(at) < 2:
+        return None
+    cpu = [float(s) for s in rows["cpu_s"]]
+    each = [1e3 * (b - a) / max(1.0, n - m) for a, b, m, n in zip(cpu, cpu[1:], at, at[1:], strict=False)]
+    return {"keyframes": at[1:], "cpu_ms": each, "memory_mib": rows["memory_mib"][1:], "backlog": rows["backlog"][1:]}
+
+
+def noise(summary: Mapping[str, Any], scores: Any = None) -> list[Row]:
+    """Chi2 per degree of freedom and the factor that sigmas should have, by class, input and part.
+
+    Parameters
+    ----------
+    scores : of the evaluation, None without truth
+    """
+    rows, over_confident = [], scores.consistency.over_confidence if scores is not None and scores.consistency else ""
+    for one in summary.get("noise", ()):
+        name = " ".join(filter(None, (one["label"], one["source"], one["part"])))
+        scale = NoiseScale.from_dict(one)
+        per_dof = scale.per_dof if math.isfinite(scale.per_dof) else None
+        rows.append([shown(name), one["dof"], per_dof, one["design_effect"], should_be(scale, over_confident)])
+    return rows
+
+
+def classes(summary: Mapping[str, Any]) -> Iterator[Row]:
+    """Edges, numbers and chi2 of each class."""
+    for name, of in summary.get("classes", {}).items():
+        residuals = of.get("residuals", 0)
+        yield [shown(name), of["edges"], residuals, of["chi2"], of["chi2"] / residuals if residuals else None]

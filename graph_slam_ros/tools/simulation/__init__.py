@@ -1,0 +1,119 @@
+"""Synthetic worlds with truth: the same seed gives the same recording.
+
+recording = simulate("warehouse", seed=7, aisles=5)
+write_bag(recording, "warehouse.mcap")
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from graph_slam_ros.errors import GraphSlamError, did_you_mean
+from graph_slam_ros.tools.simulation import flight, manhattan, pythonrobotics, warehouse
+from graph_slam_ros.tools.simulation.bag import write_bag
+from graph_slam_ros.tools.simulation.draft import WrongLine, WrongMessage, write_table
+from graph_slam_ros.tools.simulation.drive import Drive
+from graph_slam_ros.tools.simulation.faults import KINDS, Fault, spoil_messages
+from graph_slam_ros.tools.simulation.faulty import faulty_graph, faulty_recording
+from graph_slam_ros.tools.simulation.instruments import Instruments, with_instruments
+from graph_slam_ros.tools.simulation.options import Option, check_seed, fill, options_of
+from graph_slam_ros.tools.simulation.pose_graph import (
+    GRAPH_WORLDS,
+    city_graph,
+    landmark_graph,
+    sphere_graph,
+    write_graph,
+)
+from graph_slam_ros.tools.simulation.recording import Recording, measurements, with_closures
+
+
+@dataclass(frozen=True, slots=True)
+class World:
+    """A world: the dataclass of its options, and the function that drives through it."""
+
+    options: type
+    drive: Callable[[int, Any], Recording]
+
+    @property
+    def about(self) -> str:
+        """Describe it in one sentence."""
+        return (self.drive.__doc__ or "").strip().splitlines()[0]
+
+
+WORLDS: dict[str, World] = {
+    "pythonrobotics": World(pythonrobotics.PythonRobotics, pythonrobotics.simulate),
+    "manhattan": World(manhattan.Manhattan, manhattan.simulate),
+    "warehouse": World(warehouse.Warehouse, warehouse.simulate),
+    "flight": World(flight.Flight, flight.simulate),
+}
+
+
+def simulate(world: str, /, seed: int, **options: Any) -> Recording:
+    """Drive through a world.
+
+    Raises
+    ------
+    GraphSlamError
+        Unknown world or option (those that exist are named), wrong type, or a value out of bounds.
+    """
+    of_world, of_instruments = check_options(world, seed, options)
+    return with_instruments(WORLDS[world].drive(seed, of_world), seed, of_instruments)
+
+
+def check_options(world: str, seed: int, options: Mapping[str, Any]) -> tuple[Any, Instruments]:
+    """Return the options of a world and of its instruments; as ``simulate``, which drives through it."""
+    if world not in WORLDS:
+        raise GraphSlamError(f"no world {world!r}; there are {', '.join(WORLDS)}{did_you_mean(world, WORLDS)}")
+    check_seed(seed)
+    of_instruments = {o.name for o in options_of(Instruments)}
+    chosen = {name: value for name, value in options.items() if name in of_instruments}
+    rest = {name: value for name, value in options.items() if name not in of_instruments}
+    return fill(world, WORLDS[world].options, rest, [*of_instruments]), fill(world, Instruments, chosen)
+
+
+def write_faulty_bag(recording: Recording, path: Path, faults: Sequence[Fault], seed: int) -> list[WrongMessage]:
+    """Write a bag of a recording with faults. Returns the measurements that are wrong."""
+    faulty, wrong = faulty_recording(recording, faults, seed)
+    write_bag(faulty, path)
+    if any(fault.is_of_messages for fault in faults):
+        spoil_bag(path, path, faults, seed)
+    return wrong
+
+
+def spoil_bag(source: Path, out: Path, faults: Sequence[Fault], seed: int) -> None:
+    """Write a copy of a recording, with faults in its messages."""
+    drive = Drive(source)
+    spoil_messages(drive, faults, seed)
+    drive.write(out)
+
+
+__all__ = [
+    "GRAPH_WORLDS",
+    "KINDS",
+    "WORLDS",
+    "Drive",
+    "Fault",
+    "Instruments",
+    "Option",
+    "Recording",
+    "World",
+    "WrongLine",
+    "WrongMessage",
+    "check_options",
+    "city_graph",
+    "faulty_graph",
+    "faulty_recording",
+    "landmark_graph",
+    "measurements",
+    "options_of",
+    "simulate",
+    "sphere_graph",
+    "spoil_bag",
+    "spoil_messages",
+    "with_closures",
+    "write_bag",
+    "write_faulty_bag",
+    "write_graph",
+    "write_table",
+]

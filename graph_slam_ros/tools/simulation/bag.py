@@ -1,0 +1,247 @@
+"""A recording as one mcap bag: the topics of the robot, and the truth as further topics."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from heapq import merge
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.formats.durable import replaced
+from graph_slam_ros.graph.geometry import Geometry
+from graph_slam_ros.messages.to_msg import (
+    covariance6,
+    encode,
+    header,
+    make,
+    pose_stamped,
+    pose_with_covariance,
+    quaternion,
+    transform,
+    vector,
+)
+from graph_slam_ros.recordings.bag import BagWriter
+from graph_slam_ros.slam import Closure, Sighting, Sightings
+from graph_slam_ros.tools.simulation.motion import space_of
+from graph_slam_ros.tools.simulation.recording import CLOSURES_TOPIC, LANDMARKS_TOPIC, Gnss, Imu, Recording
+from graph_slam_ros.typing import Array, Numbers
+
+Message: TypeAlias = tuple[str, str, int, bytes]
+"""Topic, type, stamp [ns] and CDR bytes."""
+
+GNSS_TOPIC, IMU_TOPIC = "/gps/fix", "/imu/data"
+GNSS_FRAME, IMU_FRAME = "gps", "imu_link"
+_FIX, _NO_FIX, _GPS, _DIAGONAL_KNOWN = 0, -1, 1, 2
+
+
+def gnss_messages(gnss: Gnss | None) -> Iterator[Message]:
+    """sensor_msgs/NavSatFix in order of stamp. Without a fix, latitude, longitude and height are NaN."""
+    if gnss is None:
+        return
+    if gnss.antenna is not None:
+        yield _mounted(int(gnss.stamps_ns[0]), GNSS_FRAME, (*gnss.antenna, 0.0, 0.0, 0.0, 1.0))
+    name = "sensor_msgs/msg/NavSatFix"
+    for stamp_ns, where, has_fix in zip(gnss.stamps_ns.tolist(), gnss.geodetic.tolist(), gnss.has_fix, strict=True):
+        latitude, longitude, altitude = where if has_fix else (np.nan,) * 3
+        message = make(
+            name,
+            header=header(stamp_ns, GNSS_FRAME),
+            status=make("sensor_msgs/msg/NavSatStatus", status=_FIX if has_fix else _NO_FIX, service=_GPS),
+            latitude=latitude,
+            longitude=longitude,
+            altitude=altitude,
+            position_covariance=gnss.covariance.ravel() if has_fix else np.zeros(9),
+            position_covariance_type=_DIAGONAL_KNOWN if has_fix else 0,
+        )
+        yield GNSS_TOPIC, name, stamp_ns, encode(message)
+
+
+def imu_messages(imu: Imu | None) -> Iterator[Message]:
+    """sensor_msgs/Imu in order of stamp. The covariances of rates and accelerations are unknown."""
+    if imu is None:
+        return
+    yield _mounted(int(imu.stamps_ns[0]), IMU_FRAME, imu.T_base_imu)
+    name = "sensor_msgs/msg/Imu"
+    for k, stamp_ns in enumerate(imu.stamps_ns.tolist()):
+        message = make(
+            name,
+            header=header(stamp_ns, IMU_FRAME),
+            orientation=quaternion(*imu.orientation[k].tolist()),
+            orientation_covariance=imu.covariance.ravel(),
+            angular_velocity=vector(*imu.rate[k].tolist()),
+            angular_velocity_covariance=np.zeros(9),
+            linear_acceleration=vector(*imu.acceleration[k].tolist()),
+            linear_acceleration_covariance=np.zeros(9),
+        )
+        yield IMU_TOPIC, name, stamp_ns, encode(message)
+
+
+def _mounted(stamp_ns: int, frame: str, T_base_frame: Numbers) -> Message:
+    return "/tf_static", "tf2_msgs/msg/TFMessage", stamp_ns, transform(stamp_ns, "base_link", frame, T_base_frame)
+
+
+ODOMETRY_TOPIC = "/odom"
+TRUTH_TOPIC = "/ground_truth"
+TRUE_LANDMARKS_TOPIC = "/landmarks_ground_truth"
+_DETECTIONS = "vision_msgs/msg/Detection3DArray"
+_POINTS = "sensor_msgs/msg/PointCloud2"
+_SENSOR = "sensor"
+_UNUSED = 1e6  # variance of what is not measured: z, roll, pitch of a planar robot, the rotation of a point
+_SURVEYED_M = 1e-3  # truth has no error; a covariance of zero would mean unknown
+
+
+def write_bag(recording: Recording, path: Path | str) -> None:
+    """Write a bag in order of stamp, whole or not at all.
+
+    ``/odom`` nav_msgs/Odometry (odom, base_link), ``/landmarks`` vision_msgs/Detection3DArray (base_link),
+    ``/ground_truth`` geometry_msgs/PoseStamped and, once, ``/landmarks_ground_truth`` Detection3DArray (world); where
+    there are closures, ``/closures`` Detection3DArray (base_link), as an input of ``use: closure`` takes them.
+
+    Ranges and bearings are sensor_msgs/PointCloud2 instead, with the fields ``id``, ``range``, ``bearing``,
+    ``elevation``, ``sigma`` and ``sigma_bearing``, as far as they are measured, in the frame ``sensor`` of
+    ``/tf_static``. A field holds no name: landmarks then go by their numbers, in the truth, too.
+
+    A satellite receiver is on ``/gps/fix`` (NavSatFix, frame ``gps``), an IMU on ``/imu/data`` (Imu, ``imu_link``).
+
+    Raises
+    ------
+    GraphSlamError
+        What is seen is of kinds that no one message has.
+    """
+    space, seen = space_of(recording.T_world_base[0]), {s.stamp_ns: s for s in recording.seen}
+    kinds, polar, names = _kinds(recording), _is_polar(recording), recorded_names(recording)
+    if polar and len(kinds) > 1:
+        raise GraphSlamError(f"no message holds {' and '.join(sorted(kinds))} together")
+    closed = recording.closures_at()
+    twist_covariance = covariance6(recording.twist_covariance, _UNUSED)
+    instruments = merge(gnss_messages(recording.gnss), imu_messages(recording.imu), key=_stamp_of)
+    instrument = next(instruments, None)
+    with replaced(Path(path)) as new, BagWriter(new) as bag:
+        first_ns = int(recording.stamps_ns[0])
+        for k, stamp_ns in enumerate(recording.stamps_ns.tolist()):
+            if polar and stamp_ns == first_ns:
+                T_base_sensor = next(s.T_base_sensor for one in recording.seen for s in one.sightings) or space.identity
+                mounted = transform(stamp_ns, "base_link", _SENSOR, T_base_sensor)
+                bag.write("/tf_static", "tf2_msgs/msg/TFMessage", stamp_ns, mounted)
+            while instrument is not None and _stamp_of(instrument) <= stamp_ns:
+                bag.write(*instrument)
+                instrument = next(instruments, None)
+            bag.write(ODOMETRY_TOPIC, "nav_msgs/msg/Odometry", stamp_ns, _odometry(recording, k, twist_covariance))
+            if stamp_ns in seen and polar:
+                bag.write(LANDMARKS_TOPIC, _POINTS, stamp_ns, _point_cloud(seen[stamp_ns], names))
+            elif stamp_ns in seen:
+                bag.write(LANDMARKS_TOPIC, _DETECTIONS, stamp_ns, _detections(seen[stamp_ns], "base_link", space))
+            if stamp_ns in closed:
+                bag.write(CLOSURES_TOPIC, _DETECTIONS, stamp_ns, _closures(closed[stamp_ns], space))
+            truth = pose_stamped(stamp_ns, "world", tuple(recording.T_world_base[k].tolist()))
+            bag.write(TRUTH_TOPIC, "geometry_msgs/msg/PoseStamped", stamp_ns, truth)
+            if stamp_ns == first_ns:
+                true = _true_landmarks(recording, space)
+                true = replace(true, sightings=tuple(replace(s, id=names[s.id]) for s in true.sightings))
+                bag.write(TRUE_LANDMARKS_TOPIC, _DETECTIONS, stamp_ns, _detections(true, "world", space))
+
+
+def _stamp_of(message: Message) -> int:
+    return message[2]
+
+
+def recorded_names(recording: Recording) -> dict[str, str]:
+    """Return the name of each landmark in a bag: its id, or a number if the messages have no names."""
+    polar = _is_polar(recording)
+    return {name: str(k) if polar else name for k, name in enumerate(recording.landmarks)}
+
+
+def _kinds(recording: Recording) -> set[str]:
+    return {s.kind for one in recording.seen for s in one.sightings}
+
+
+def _is_polar(recording: Recording) -> bool:
+    return bool(_kinds(recording) - {"position", "pose"})
+
+
+def _odometry(recording: Recording, k: int, twist_covariance: Array) -> bytes:
+    at, velocity = tuple(recording.T_odom_base[k].tolist()), recording.twist[k].tolist()
+    if len(velocity) == 3:
+        velocity = [velocity[0], velocity[1], 0.0, 0.0, 0.0, velocity[2]]
+    twist = make("geometry_msgs/msg/Twist", linear=vector(*velocity[:3]), angular=vector(*velocity[3:]))
+    message = make(
+        "nav_msgs/msg/Odometry",
+        header=header(int(recording.stamps_ns[k]), "odom"),
+        child_frame_id="base_link",
+        pose=pose_with_covariance(at, recording.odom_covariance[k], _UNUSED),
+        twist=make("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=twist_covariance),
+    )
+    return encode(message)
+
+
+def _true_landmarks(recording: Recording, space: Geometry) -> Sightings:
+    """The true map, as sightings from the origin of the world."""
+    known = []
+    for name, at in recording.landmarks.items():
+        kind, dof = ("pose", space.dof) if len(at) == space.pose.size else ("position", space.dimensions)
+        known.append(Sighting(name, kind, at, tuple((_SURVEYED_M**2 * np.eye(dof)).ravel().tolist())))
+    return Sightings(int(recording.stamps_ns[0]), TRUE_LANDMARKS_TOPIC, tuple(known))
+
+
+def _detections(seen: Sightings, frame: str, space: Geometry) -> bytes:
+    head = header(seen.stamp_ns, frame)
+    return encode(make(_DETECTIONS, header=head, detections=[_detection(head, s, space) for s in seen.sightings]))
+
+
+def _closures(several: list[Closure], space: Geometry) -> bytes:
+    """Earlier poses of the base relative to the later ones: a motion ``d`` of a pose is ``-Ad d`` of its inverse."""
+    head, detections = header(several[0].stamp_ns, "base_link"), []
+    for one in several:
+        back = space.group.adjoint(one.T_from_base)
+        covariance = back @ np.reshape(one.covariance, (space.dof, space.dof)) @ back.T
+        measured = tuple(float(number) for number in space.group.inverse(one.T_from_base))
+        seen = Sighting(str(one.from_stamp_ns), "pose", measured, tuple(covariance.ravel().tolist()))
+        detections.append(_detection(head, seen, space))
+    return encode(make(_DETECTIONS, header=head, detections=detections))
+
+
+def _point_cloud(seen: Sightings, names: Mapping[str, str]) -> bytes:
+    """A PointCloud2 of doubles, a point for each sighting; its sigmas are the roots of the variances."""
+    kind = seen.sightings[0].kind
+    angles = ("bearing", "elevation")[: len(seen.sightings[0].measured) - ("range" in kind)]
+    measured = ("range", *angles) if "range" in kind else angles
+    sigmas = ("sigma", "sigma_bearing") if kind == "range_bearing" else ("sigma",)
+    rows = []
+    for s in seen.sightings:
+        variances = np.reshape(s.covariance, (len(measured), -1)).diagonal()
+        rows.append([int(names[s.id]), *s.measured, *np.sqrt(variances[: len(sigmas)])])
+    points = np.array(rows, dtype="<f8")
+    fields = [
+        make("sensor_msgs/msg/PointField", name=name, offset=8 * k, datatype=8, count=1)
+        for k, name in enumerate(("id", *measured, *sigmas))
+    ]
+    message = make(
+        _POINTS,
+        header=header(seen.stamp_ns, _SENSOR),
+        height=1,
+        width=len(points),
+        fields=fields,
+        is_bigendian=False,
+        point_step=8 * len(fields),
+        row_step=points.nbytes,
+        data=points.ravel().view(np.uint8),
+        is_dense=True,
+    )
+    return encode(message)
+
+
+def _detection(head: Any, s: Sighting, space: Geometry) -> Any:
+    known = space.dof if s.kind == "pose" else space.dimensions
+    covariance = _UNUSED * np.eye(space.dof)
+    covariance[:known, :known] = np.reshape(s.covariance, (known, known))
+    posed = pose_with_covariance((*s.measured, *space.identity[len(s.measured) :]), covariance, _UNUSED)
+    hypothesis = make("vision_msgs/msg/ObjectHypothesis", class_id=s.id, score=1.0)
+    return make(
+        "vision_msgs/msg/Detection3D",
+        header=head,
+        results=[make("vision_msgs/msg/ObjectHypothesisWithPose", hypothesis=hypothesis, pose=posed)],
+        bbox=make("vision_msgs/msg/BoundingBox3D", center=posed.pose, size=vector(0.0, 0.0)),
+        id=s.id,
+    )

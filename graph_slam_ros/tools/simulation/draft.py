@@ -1,0 +1,179 @@
+"""A draft of measurements, into which faults are put before it becomes a recording or a graph.
+
+Recordings and graphs are converted into the same draft, and back. A fault only changes the draft.
+"""
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import astuple, dataclass, field, fields, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from graph_slam_ros.formats.g2o_writer import write_text
+from graph_slam_ros.graph.geometry import Geometry
+from graph_slam_ros.lie import se2
+from graph_slam_ros.slam import Sighting
+from graph_slam_ros.tools.simulation.false_closures import Closures
+from graph_slam_ros.typing import Array, Index, Numbers
+
+Measured = Literal["odometry", "sighting", "closure"]
+
+
+@dataclass(frozen=True, slots=True)
+class Wrong:
+    """A fault of a measurement.
+
+    Attributes
+    ----------
+    fault : its kind; where several hit one measurement, their kinds with ``+`` between
+    true_id : of a sighting, the landmark that was seen; empty of others
+    """
+
+    fault: str
+    true_id: str = ""
+
+
+@dataclass(slots=True)
+class Draft:
+    """Odometry, sightings and closures of n poses, in order of time.
+
+    Attributes
+    ----------
+    truth : (n, 3) or (n, 7) true poses
+    odometry : the same by dead reckoning
+    twist : (n, d) velocity since the pose before; None where nobody measured it
+    sightings, seen_at : what was seen, and (m,) from which pose
+    landmarks : true places by id
+    closures : of true places; false ones are added
+    places : the poses that closures join
+    hidden : sightings that a fault leaves out, by number, with the fault
+    wrong : what faults have made wrong, by what was measured and its number; of odometry the later pose's
+    """
+
+    space: Geometry
+    truth: Array
+    odometry: Array
+    twist: Array | None
+    sightings: list[Sighting]
+    seen_at: Index
+    landmarks: Mapping[str, Numbers]
+    closures: Closures
+    places: Index
+    wrong: dict[tuple[Measured, int], Wrong] = field(default_factory=dict)
+    hidden: dict[int, str] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.odometry)
+
+    def pose_at(self, fraction: float) -> int:
+        """The pose at a fraction of the drive: 0 is the first, 1 the last."""
+        return round(fraction * (len(self) - 1))
+
+    def true_id(self, number: int) -> str:
+        """The landmark that was really seen, whatever id the sighting has now."""
+        wrong = self.wrong.get(("sighting", number))
+        return wrong.true_id if wrong else self.sightings[number].id
+
+    def spoil(self, number: int, fault: str, sighting: Sighting) -> None:
+        """Replace a sighting by a wrong one."""
+        before = self.wrong.get(("sighting", number))
+        self.wrong["sighting", number] = Wrong(_both(before, fault), self.true_id(number))
+        self.sightings[number] = sighting
+
+    def hide(self, number: int, fault: str) -> None:
+        """Leave a sighting out."""
+        self.hidden[number] = fault
+
+    def spoil_odometry(self, later: Sequence[int], fault: str) -> None:
+        """Mark the motion up to some poses as wrong."""
+        for pose in later:
+            self.wrong["odometry", pose] = Wrong(_both(self.wrong.get(("odometry", pose)), fault))
+
+    def add_closures(self, false: Closures, fault: str) -> None:
+        """Append false closures."""
+        old = self.closures
+        for k in range(len(old), len(old) + len(false)):
+            self.wrong["closure", k] = Wrong(fault)
+        self.closures = Closures(
+            np.concatenate([old.ends, false.ends]),
+            np.concatenate([old.measured, false.measured]),
+            np.concatenate([old.root, false.root]),
+        )
+
+    def seen_from(self, number: int, displaced: Array) -> Sighting:
+        """A sighting as it would have been, with its noise, if the landmark had been elsewhere.
+
+        Parameters
+        ----------
+        displaced : (2,) or (3,) by how much, in world
+        """
+        old, T_world_base = self.sightings[number], self.truth[self.seen_at[number]]
+        n = self.space.dimensions
+        if old.kind in ("position", "pose"):
+            moved = np.array(old.measured)
+            moved[:n] += self.space.turn(tuple(T_world_base)).T @ displaced
+            return replace(old, measured=tuple(moved.tolist()))
+        edge, at = self.space.sightings[old.kind], np.array([[0, len(T_world_base)]])
+        whole = edge.whole(np.array([*old.measured, *(old.T_base_sensor or ())])[None])
+        true = np.array(self.landmarks[self.true_id(number)][:n])
+        before, after = (
+            edge.linearize(np.concatenate([T_world_base, place]), at, whole)[0][0] for place in (true, true + displaced)
+        )
+        moved = old.measured + after - before
+        angles = slice("range" in old.kind, None)
+        moved[angles] = se2.wrap(moved[angles])
+        return replace(old, measured=tuple(moved.tolist()))
+
+
+def _both(before: Wrong | None, fault: str) -> str:
+    return fault if before is None or fault in before.fault.split("+") else f"{before.fault}+{fault}"
+
+
+@dataclass(frozen=True, slots=True)
+class WrongMessage:
+    """A row of a recording's table: a wrong message, or one of its detections.
+
+    Attributes
+    ----------
+    index : of the detection or point in its message; empty of odometry
+    id : that it carries; of a closure, the earlier stamp
+    true_id : the landmark that was seen
+    """
+
+    topic: str
+    stamp_ns: int
+    index: int | str
+    id: str
+    fault: str
+    true_id: str
+
+
+@dataclass(frozen=True, slots=True)
+class WrongLine:
+    """A row of a graph's table: a wrong edge.
+
+    Attributes
+    ----------
+    line : of the file, from 1
+    first, second : ids of its vertices, as in the file
+    true_second : the landmark that was seen
+    """
+
+    line: int
+    tag: str
+    first: int
+    second: int
+    fault: str
+    true_second: int | str
+
+
+def write_table(path: Path | str, of: type, rows: Sequence[WrongMessage] | Sequence[WrongLine]) -> None:
+    """Write a table as CSV, below the names of the fields. Raises FormatError."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(field.name for field in fields(of))
+    writer.writerows(astuple(row) for row in rows)
+    write_text(path, text.getvalue())

@@ -1,0 +1,125 @@
+"""A satellite receiver and an IMU on the robot of any world.
+
+The world's x points east, y north and z up; its origin is at ``DATUM``.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.random import PCG64, Generator, SeedSequence
+
+from graph_slam_ros.lie import se3, so3
+from graph_slam_ros.messages.inputs.fixes import east_north_up
+from graph_slam_ros.tools.simulation.motion import VelocityNoise
+from graph_slam_ros.tools.simulation.options import option
+from graph_slam_ros.tools.simulation.recording import Gnss, Imu, Recording, Stamps
+from graph_slam_ros.typing import Array, Numbers
+
+DATUM = (47.4, 8.55, 440.0)  # latitude [deg], longitude [deg], height above the ellipsoid [m] of the world's origin
+ANTENNA_M = (0.3, 0.1, 0.8)  # in base_link
+T_BASE_IMU = (0.1, 0.0, 0.2, 0.0, 0.0, float(np.sqrt(0.5)), float(np.sqrt(0.5)))  # turned to the left
+UP = 2.0  # a fix is so many times worse upwards
+SIGMA_ACCELERATION_M_S2 = 0.02
+GRAVITY_M_S2 = 9.81
+EARTH_M = 6.37e6  # its radius, nearly
+_STEPS = 6
+_STREAM = 1  # of the seed: the drive is the same with and without instruments
+
+
+@dataclass(frozen=True, slots=True)
+class Instruments:
+    """Options of every world in addition to its own: a satellite receiver and an IMU."""
+
+    landmarks: bool = option(True, "whether the robot sees landmarks at all")
+    gnss: float = option(0.0, "fixes of a satellite receiver, on /gps/fix; 0: there is none", "Hz", 0, 100)
+    gnss_sigma_m: float = option(0.3, "error of a fix east and north; twice that upwards", "m", 1e-3, 100)
+    gnss_correlation_s: float = option(2.0, "how long such an error lasts (1/e)", "s", 0, 1e4)
+    gnss_outage_s: float = option(0.0, "time without a fix, in the middle of the drive", "s", 0)
+    gnss_tf: bool = option(True, "whether /tf_static says where the antenna is: 0.3 m ahead, 0.1 left, 0.8 up")
+    imu: float = option(0.0, "messages of an IMU with orientation, on /imu/data; 0: there is none", "Hz", 0, 1000)
+    imu_sigma_rad: float = option(0.02, "error of its roll, pitch and heading", "rad", 1e-6, 1)
+    imu_correlation_s: float = option(5.0, "how long such an error lasts (1/e)", "s", 0, 1e4)
+    imu_drift_rad_s: float = option(0.0, "its heading drifts besides: there is no compass", "rad/s", -1, 1)
+    imu_sigma_rate_rad_s: float = option(0.002, "error of each of its turn rates", "rad/s", 0, 10)
+    imu_bias_rad_s: float = option(0.0, "bias of its turn rates, about each axis", "rad/s", -10, 10)
+    imu_bias_walk: float = option(0.0, "random walk of that", "rad/s/sqrt(s)", 0, 1)
+
+
+def with_instruments(recording: Recording, seed: int, options: Instruments) -> Recording:
+    """A recording with the measurements of the chosen instruments added, or without landmarks."""
+    streams = [Generator(PCG64(SeedSequence(seed, spawn_key=(_STREAM, k)))) for k in range(3)]
+    gnss = _gnss(streams[0], recording, options) if options.gnss > 0.0 else None
+    imu = _imu(streams[1], recording, options) if options.imu > 0.0 else None
+    imu = _biased(streams[2], imu, options) if imu else None
+    return replace(recording, gnss=gnss, imu=imu, seen=recording.seen if options.landmarks else ())
+
+
+def _gnss(rng: Generator, recording: Recording, options: Instruments) -> Gnss:
+    stamps_ns, poses = _true_poses(recording, options.gnss)
+    sigmas = options.gnss_sigma_m * np.array([1.0, 1.0, UP])
+    noise = VelocityNoise(tuple(sigmas.tolist()), options.gnss_correlation_s)
+    antenna = np.stack(se3.act(tuple(poses.T), ANTENNA_M), axis=1)
+    measured = antenna + noise.draw(rng, len(poses), 1.0 / options.gnss)
+    from_middle_s = np.abs(stamps_ns - (stamps_ns[0] + stamps_ns[-1]) // 2) * 1e-9
+    has_fix = from_middle_s >= 0.5 * options.gnss_outage_s
+    return Gnss(stamps_ns, geodetic(measured, DATUM), noise.covariance, has_fix, ANTENNA_M if options.gnss_tf else None)
+
+
+def _imu(rng: Generator, recording: Recording, options: Instruments) -> Imu:
+    stamps_ns, poses = _true_poses(recording, options.imu)
+    dt_s = 1.0 / options.imu
+    noise = VelocityNoise((options.imu_sigma_rad,) * 3, options.imu_correlation_s)
+    error = noise.draw(rng, len(poses), dt_s)
+    error[:, 2] += options.imu_drift_rad_s * dt_s * np.arange(len(poses))
+    true = se3.compose(tuple(poses.T), T_BASE_IMU)
+    turned = se3.rotation(true)
+    orientation = so3.normalize(so3.compose(so3.exp(tuple(error.T)), turned))
+    next_, last = (tuple(column[part] for column in true) for part in (slice(1, None), slice(None, -1)))
+    rate = np.zeros((len(poses), 3))
+    rate[1:] = np.stack(se3.local(next_, last)[3:], axis=1) / dt_s
+    felt = _second_derivative(np.stack(se3.position(true), axis=1), dt_s) + np.array([0.0, 0.0, GRAVITY_M_S2])
+    acceleration = np.stack(so3.act(so3.inverse(turned), tuple(felt.T)), axis=1)
+    rate += options.imu_sigma_rate_rad_s * rng.standard_normal(rate.shape)
+    acceleration += SIGMA_ACCELERATION_M_S2 * rng.standard_normal(acceleration.shape)
+    return Imu(stamps_ns, np.stack(orientation, axis=1), noise.covariance, rate, acceleration, T_BASE_IMU)
+
+
+def _biased(rng: Generator, imu: Imu, options: Instruments) -> Imu:
+    """An IMU whose gyro has a bias that walks."""
+    steps = options.imu_bias_walk * np.sqrt(1.0 / options.imu) * rng.standard_normal(imu.rate.shape)
+    return replace(imu, rate=imu.rate + options.imu_bias_rad_s + np.cumsum(steps, axis=0))
+
+
+def _second_derivative(positions: Array, dt_s: float) -> Array:
+    """The second derivative of positions (n, 3) over time. The ends get the values of their neighbours."""
+    out = np.zeros_like(positions)
+    if len(positions) > 2:
+        out[1:-1] = np.diff(positions, 2, axis=0) / dt_s**2
+        out[0], out[-1] = out[1], out[-2]
+    return out
+
+
+def _true_poses(recording: Recording, rate_hz: float) -> tuple[Stamps, Array]:
+    """Stamps from the first odometry on, and the true poses (n, 7) then, interpolated between stamps of odometry."""
+    ticks_ns = recording.stamps_ns
+    count = int((ticks_ns[-1] - ticks_ns[0]) * 1e-9 * rate_hz) + 1
+    stamps_ns = ticks_ns[0] + np.round(np.arange(count) * (1e9 / rate_hz)).astype(np.int64)
+    before = np.clip(np.searchsorted(ticks_ns, stamps_ns, side="right") - 1, 0, len(ticks_ns) - 2)
+    fraction = (stamps_ns - ticks_ns[before]) / (ticks_ns[before + 1] - ticks_ns[before])
+    poses = se3.in_space(recording.T_world_base)
+    between = se3.interpolate(tuple(poses[before].T), tuple(poses[before + 1].T), fraction)
+    return stamps_ns, np.stack(between, axis=1)
+
+
+def geodetic(points: Array, datum: Numbers) -> Array:
+    """Latitude [deg], longitude [deg] and height [m] of points (n, 3) east, north and up of a datum.
+
+    Newton's method on ``east_north_up``, whose derivative is nearly that of a sphere.
+    """
+    degree_m = np.array([np.deg2rad(EARTH_M), np.deg2rad(EARTH_M) * np.cos(np.deg2rad(datum[0])), 1.0])
+    out = np.tile(np.array(datum), (len(points), 1))
+    for row, point in zip(out, points, strict=True):
+        for _ in range(_STEPS):
+            missing = point - east_north_up((float(row[0]), float(row[1]), float(row[2])), datum)
+            row += missing[[1, 0, 2]] / degree_m
+    return out

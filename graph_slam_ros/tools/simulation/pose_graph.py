@@ -1,0 +1,267 @@
+"""Worlds as graphs: a city and a sphere with closures between poses, and drives among landmarks."""
+
+from bisect import bisect_right
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.random import PCG64, Generator
+
+from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.formats.g2o_writer import write_g2o
+from graph_slam_ros.formats.graph_file import G2oFile, Values
+from graph_slam_ros.graph import Gaussian, Graph
+from graph_slam_ros.graph.geometry import PLANAR, SPATIAL, Geometry
+from graph_slam_ros.lie import se2, se3
+from graph_slam_ros.slam import Sighting
+from graph_slam_ros.tools.simulation.manhattan import STEP_M, stroll
+from graph_slam_ros.tools.simulation.motion import integrate, space_of, step_covariance
+from graph_slam_ros.tools.simulation.options import check_seed, fill, option
+from graph_slam_ros.tools.simulation.recording import Recording
+from graph_slam_ros.typing import Array, Index, Numbers
+
+POSES_PER_CLOSURE = 3
+CLOSURE_RANGE_STEPS = 2  # to an earlier pose at most this far away in x and in y
+CLOSURE_GAP_POSES = 20  # and at least this many poses earlier
+
+
+@dataclass(frozen=True, slots=True)
+class CityGraph:
+    """Options of ``city_graph``."""
+
+    poses: int = option(3500, "poses, 1 m apart", "", 2, 1e6)
+    blocks: int = option(60, "the city is this many blocks of 4 m wide and deep", "", 1, 1000)
+    sigma_m: float = option(0.05, "noise of relative positions, in x and in y", "m", 1e-9, 10)
+    sigma_rad: float = option(0.01, "noise of relative headings", "rad", 1e-9, 1)
+    odometry_noise_factor: float = option(1.0, "odometry is noisier than closures by this factor", "", 1e-6, 1e3)
+
+
+def city_graph(seed: int, **values: float) -> tuple[Graph, Array]:
+    """Manhattan as a pose graph: odometry (vertex k to k + 1), a closure per three poses once streets are revisited.
+
+    Vertices start at the composed odometry, the first one at its true pose. No vertex is fixed.
+
+    Parameters
+    ----------
+    values : options of ``CityGraph``
+
+    Returns
+    -------
+    graph : edges labelled ``odometry`` and ``closures``, each in order of its later pose
+    truth : (poses, 3) true poses
+    """
+    options = fill("city", CityGraph, values)
+    check_seed(seed)
+    rng = Generator(PCG64(seed))
+    cells, ways = stroll(rng, options.poses - 1, options.blocks)
+    headings = 0.5 * np.pi * np.concatenate([ways[:1], ways])
+    truth = np.column_stack([STEP_M * cells, se2.wrap(headings)])
+    closures = closure_pairs(rng, cells)
+    sigmas = PLANAR.sigmas(options.sigma_m, options.sigma_rad)
+    return _pose_graph(PLANAR, rng, truth, closures, sigmas, options.odometry_noise_factor), truth
+
+
+@dataclass(frozen=True, slots=True)
+class SphereGraph:
+    """Options of ``sphere_graph``."""
+
+    poses: int = option(2500, "poses, from the lower to the upper pole", "", 2, 1e6)
+    poses_per_lap: int = option(50, "poses until the robot is above an earlier one", "", 2, 1e6)
+    closures: int = option(1, "closures of a pose, to the nearest poses of the lap below", "", 1, 9)
+    radius_m: float = option(100.0, "radius of the sphere", "m", 1e-3, 1e6)
+    sigma_m: float = option(0.1, "noise of relative positions, in x, y and z", "m", 1e-9, 10)
+    sigma_rad: float = option(0.01, "noise of relative rotations, about x, y and z", "rad", 1e-9, 1)
+    odometry_noise_factor: float = option(1.0, "odometry is noisier than closures by this factor", "", 1e-6, 1e3)
+
+
+def sphere_graph(seed: int, **values: float) -> tuple[Graph, Array]:
+    """Fly up around a sphere, lap above lap. Each pose is measured from the one before and from the lap below.
+
+    The x axis of a pose points away from the centre, its y axis ahead. Vertices start as in ``city_graph``, and edges
+    have its labels and order.
+
+    Parameters
+    ----------
+    values : options of ``SphereGraph``
+
+    Returns
+    -------
+    graph
+    truth : (poses, 7) true poses
+    """
+    options = fill("sphere", SphereGraph, values)
+    check_seed(seed)
+    rng, count = Generator(PCG64(seed)), np.arange(options.poses)
+    yaw, pitch = 2.0 * np.pi * count / options.poses_per_lap, np.pi * (0.5 - (count + 0.5) / options.poses)
+    out = [se3.from_xyz_rpy((0.0, 0.0, 0.0, 0.0, *turn)) for turn in np.column_stack([pitch, yaw]).tolist()]
+    truth = np.array([se3.compose(pose, (options.radius_m, *se3.IDENTITY[1:])) for pose in out])
+    reach = (np.arange(1, options.closures + 1) // 2) * (-1) ** np.arange(options.closures)  # 0, -1, 1, -2, ...
+    pairs = np.stack(np.broadcast_arrays(count[:, None] - options.poses_per_lap + reach, count[:, None]), axis=-1)
+    closures = pairs[(pairs[:, :, 0] >= 0) & (pairs[:, :, 0] < pairs[:, :, 1] - 1)]
+    sigmas = SPATIAL.sigmas(options.sigma_m, options.sigma_rad)
+    return _pose_graph(SPATIAL, rng, truth, closures, sigmas, options.odometry_noise_factor), truth
+
+
+@dataclass(frozen=True, slots=True)
+class GraphWorld:
+    """A world that is a graph from the first: the dataclass of its options, and the function that measures it.
+
+    That returns the graph, and the true poses of its vertices.
+    """
+
+    options: type
+    measure: Callable[..., tuple[Graph, Array]]
+
+    @property
+    def about(self) -> str:
+        """Describe it in one sentence."""
+        return (self.measure.__doc__ or "").strip().splitlines()[0]
+
+
+GRAPH_WORLDS = {"city": GraphWorld(CityGraph, city_graph), "sphere": GraphWorld(SphereGraph, sphere_graph)}
+
+
+def closure_pairs(rng: Generator, cells: Index) -> Index:
+    """Pairs (earlier, later), at most one per later pose, chosen evenly among the earlier ones around it.
+
+    While streets are new there is nothing to close. The missing closures are added when streets are revisited.
+    """
+    visits: dict[tuple[int, int], list[int]] = {}
+    reach = range(-CLOSURE_RANGE_STEPS, CLOSURE_RANGE_STEPS + 1)
+    draws = rng.random(len(cells)).tolist()
+    pairs: list[tuple[int, int]] = []
+    for k, (x, y) in enumerate(cells.tolist()):
+        if len(pairs) < (k + 1) // POSES_PER_CLOSURE:
+            lists = [found for dx in reach for dy in reach if (found := visits.get((x + dx, y + dy)))]
+            counts = [bisect_right(found, k - CLOSURE_GAP_POSES) for found in lists]
+            pick = int(draws[k] * sum(counts))
+            for found, count in zip(lists, counts, strict=True):
+                if pick < count:
+                    pairs.append((found[pick], k))
+                    break
+                pick -= count
+        visits.setdefault((x, y), []).append(k)
+    return np.array(pairs, dtype=np.int64).reshape(-1, 2)
+
+
+def _pose_graph(
+    space: Geometry, rng: Generator, truth: Array, closures: Index, sigmas: Sequence[float], odometry_factor: float
+) -> Graph:
+    """A graph of odometry from pose to pose, and of these closures (n, 2); poses start where odometry leads."""
+    near = np.array(sigmas)
+    coarse = odometry_factor * near
+    steps = np.column_stack([np.arange(len(truth) - 1), np.arange(1, len(truth))])
+    odometry = _measured(space, rng, truth, steps, coarse)
+    graph = Graph()
+    graph.add_vertices(space.pose, _composed(space, truth[0], odometry))
+    graph.add_edges(space.relative_pose, steps, odometry, Gaussian.from_sigmas(*coarse.tolist()), "odometry")
+    if len(closures):
+        seen = _measured(space, rng, truth, closures, near)
+        graph.add_edges(space.relative_pose, closures, seen, Gaussian.from_sigmas(*near.tolist()), "closures")
+    return graph
+
+
+def _measured(space: Geometry, rng: Generator, truth: Array, pairs: Index, sigmas: Array) -> Array:
+    """Relative poses (n, k) of the pairs, ``T_i_j Exp(noise)``."""
+    exact = space.group.between(tuple(truth[pairs[:, 0]].T), tuple(truth[pairs[:, 1]].T))
+    noise = rng.standard_normal((len(pairs), len(sigmas))) * sigmas
+    return np.stack(space.group.retract(exact, tuple(noise.T)), axis=1)
+
+
+def _composed(space: Geometry, start: Array, steps: Array) -> Array:
+    """Poses (n + 1, k) from relative poses (n, k)."""
+    if space is SPATIAL:
+        return integrate(tuple(start.tolist()), np.stack(se3.log(tuple(steps.T)), axis=1))
+    theta = start[2] + np.concatenate([[0.0], np.cumsum(steps[:, 2])])
+    moved = se2.act((0.0, 0.0, theta[:-1]), (steps[:, 0], steps[:, 1]))
+    x, y = (first + np.concatenate([[0.0], np.cumsum(d)]) for first, d in zip(start[:2], moved, strict=True))
+    return np.stack([x, y, se2.wrap(theta)], axis=1)
+
+
+def landmark_graph(recording: Recording) -> Graph:
+    """A recording as a graph: a pose at each stamp of odometry, a vertex for each landmark that was seen.
+
+    Poses start at the dead reckoning, landmarks where they were first seen from there. The noise of an odometry edge is
+    the twist covariance over the tick, as where each tick's error is its own. No vertex is fixed.
+
+    Raises
+    ------
+    GraphSlamError
+        A landmark is seen by bearing or by range alone: one sighting does not tell where it is.
+    """
+    graph, space = Graph(), space_of(recording.T_odom_base[0])
+    poses = graph.add_vertices(space.pose, recording.T_odom_base)
+    dt_s = np.diff(recording.stamps_ns) * 1e-9
+    noise = [
+        step_covariance(twist * dt, recording.twist_covariance * dt**2)
+        for twist, dt in zip(recording.twist[1:], dt_s.tolist(), strict=True)
+    ]
+    odometry = space.group.between(tuple(recording.T_odom_base[:-1].T), tuple(recording.T_odom_base[1:].T))
+    graph.add_edges(
+        space.relative_pose,
+        np.column_stack([poses[:-1], poses[1:]]),
+        np.stack(odometry, axis=1),
+        Gaussian.from_covariance(np.array(noise)),
+        "odometry",
+    )
+    vertex_of: dict[str, int] = {}
+    pose_at = dict(zip(recording.stamps_ns.tolist(), poses.tolist(), strict=True))
+    for seen in recording.seen:
+        pose = pose_at[seen.stamp_ns]
+        for s in seen.sightings:
+            if s.id not in vertex_of:
+                vertex_of[s.id] = _first_seen(graph, space, tuple(recording.T_odom_base[pose].tolist()), s)
+        for kind in dict.fromkeys(s.kind for s in seen.sightings):
+            same, edge = [s for s in seen.sightings if s.kind == kind], space.sightings[kind]
+            covariances = np.reshape([s.covariance for s in same], (-1, edge.residual_size, edge.residual_size))
+            graph.add_edges(
+                edge,
+                [(pose, vertex_of[s.id]) for s in same],
+                [edge.whole([*s.measured, *(s.T_base_sensor or ())]) for s in same],
+                Gaussian.from_covariance(covariances),
+                "landmarks",
+            )
+    for c in recording.closures:
+        noise_of = Gaussian.from_covariance(np.reshape(c.covariance, (space.dof, space.dof)))
+        ends = pose_at[c.from_stamp_ns], pose_at[c.stamp_ns]
+        graph.add_edge(space.relative_pose, ends, c.T_from_base, noise_of, "closures")
+    return graph
+
+
+def _first_seen(graph: Graph, space: Geometry, T_odom_base: Numbers, s: Sighting) -> int:
+    """A vertex for a landmark, at its first sighting."""
+    group, seen = space.group, s.measured
+    if s.kind == "pose":
+        return graph.add_vertex(space.pose, group.compose(T_odom_base, seen))
+    if s.kind == "range_bearing":
+        distance, azimuth, elevation = (*seen, 0.0)[:3]
+        flat = distance * np.cos(elevation)
+        in_sensor = (flat * np.cos(azimuth), flat * np.sin(azimuth), distance * np.sin(elevation))
+        seen = group.act(s.T_base_sensor or space.identity, in_sensor[: space.dimensions])
+    elif s.kind != "position":
+        raise GraphSlamError(f"a {s.kind} alone does not determine a landmark, and a graph needs initial values")
+    return graph.add_vertex(space.point, group.act(T_odom_base, seen))
+
+
+def write_graph(graph: Graph, path: Path | str) -> None:
+    """Write a graph as g2o at its initial values. A FIX line holds the first vertex."""
+    write_g2o(path, G2oFile(graph, list(range(graph.vertex_count)), [0]), values_of(graph, graph.initial.values))
+
+
+def values_of(graph: Graph, numbers: Array) -> Values:
+    """The values of vertices by id, of the stored numbers of all of them end to end."""
+
+    def values(ids: Sequence[int]) -> Array:
+        size = graph.kind_of(ids[0]).size
+        return np.asarray(numbers[graph.offset.values[ids][:, None] + np.arange(size)])
+
+    return values
+
+
+def truth_of(recording: Recording, graph: Graph) -> Array:
+    """The true stored numbers of all vertices of a recording's graph, end to end."""
+    names = list(dict.fromkeys(s.id for seen in recording.seen for s in seen.sightings))
+    true = [recording.landmarks[name] for name in names]
+    size = [graph.kind_of(len(recording.stamps_ns) + k).size for k in range(len(names))]
+    return np.concatenate([recording.T_world_base.ravel(), *(place[:n] for place, n in zip(true, size, strict=True))])

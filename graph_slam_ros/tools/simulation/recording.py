@@ -1,0 +1,205 @@
+"""A simulated recording with its truth: drive, measurements, and true loop closures."""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.random import PCG64, Generator, SeedSequence
+from numpy.typing import NDArray
+
+from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.slam import Closure, Odometry, Sighting, Sightings
+from graph_slam_ros.tools.simulation.motion import VelocityNoise, accumulated, integrate, space_of
+from graph_slam_ros.typing import Array, Index, Numbers
+
+Stamps = NDArray[np.int64]
+
+START_NS = 1_700_000_000 * 10**9  # a plausible date: stamps near zero would hide faults of precision
+LANDMARKS_TOPIC = "/landmarks"
+CLOSURES_TOPIC = "/closures"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Gnss:
+    """The measurements of a satellite receiver.
+
+    Attributes
+    ----------
+    stamps_ns : (n,)
+    geodetic : (n, 3) latitude [deg], longitude [deg] and height above the ellipsoid [m] of the antenna
+    covariance : (3, 3) of each: the truth about the noise that was added, east, north and up [m^2]
+    has_fix : (n,) where it does not, it says so
+    antenna : in base_link [m]; None where no transform tells
+    """
+
+    stamps_ns: Stamps
+    geodetic: Array
+    covariance: Array
+    has_fix: NDArray[np.bool_]
+    antenna: Numbers | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Imu:
+    """The measurements of an inertial measurement unit.
+
+    Attributes
+    ----------
+    stamps_ns : (n,)
+    orientation : (n, 4) quaternions (x, y, z, w) of R_world_imu
+    covariance : (3, 3) of each about the axes of world, without its drift [rad^2]
+    rate, acceleration : (n, 3) in its own axes [rad/s, m/s^2]
+    T_base_imu : where it is
+    """
+
+    stamps_ns: Stamps
+    orientation: Array
+    covariance: Array
+    rate: Array
+    acceleration: Array
+    T_base_imu: Numbers
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recording:
+    """A drive or flight: odometry and sightings as measured, poses and landmarks as they are.
+
+    Poses have 3 numbers in the plane and 7 in space, velocities 3 and 6 (d), in tangent order.
+
+    Attributes
+    ----------
+    stamps_ns : (n,) stamps of odometry and of the true poses
+    T_odom_base : (n, 3) or (n, 7) dead-reckoned poses, from the origin [m, rad]
+    twist : (n, d) measured velocity in base_link since the stamp before; the first is zero [m/s, rad/s]
+    twist_covariance : (d, d) of each twist: the truth about the noise that was added
+    odom_covariance : (n, d, d) of ``T_odom_base`` in its tangent space
+    seen : in order of stamp, each at a stamp of odometry
+    T_world_base : (n, 3) or (n, 7) true poses
+    landmarks : true poses in world by id; of points the position alone
+    closures : in order of their later stamp; both are stamps of odometry
+    gnss, imu : None where the robot has none
+    """
+
+    stamps_ns: Stamps
+    T_odom_base: Array
+    twist: Array
+    twist_covariance: Array
+    odom_covariance: Array
+    seen: tuple[Sightings, ...]
+    T_world_base: Array
+    landmarks: dict[str, Numbers]
+    closures: tuple[Closure, ...] = ()
+    gnss: Gnss | None = None
+    imu: Imu | None = None
+
+    def closures_at(self) -> dict[int, list[Closure]]:
+        """The closures of each later stamp."""
+        out: dict[int, list[Closure]] = {}
+        for closure in self.closures:
+            out.setdefault(closure.stamp_ns, []).append(closure)
+        return out
+
+
+def measurements(recording: Recording) -> Iterator[Odometry | Sightings | Closure]:
+    """Yield the input of ``GraphSlam.process`` in order of stamp; at one stamp odometry comes first.
+
+    Measurements of a satellite receiver or an IMU are not among it: converters make fixes of them, from a bag.
+    """
+    twist_covariance = tuple(recording.twist_covariance.ravel().tolist())
+    seen = {s.stamp_ns: s for s in recording.seen}
+    closed = recording.closures_at()
+    for stamp_ns, pose in zip(recording.stamps_ns.tolist(), recording.T_odom_base.tolist(), strict=True):
+        yield Odometry(stamp_ns, tuple(pose), twist_covariance)
+        if stamp_ns in seen:
+            yield seen[stamp_ns]
+        yield from closed.get(stamp_ns, ())
+
+
+Observe = Callable[[Numbers], list[Sighting]]
+"""From the true pose, what is seen."""
+
+
+def drive(
+    rng: Generator,
+    start: Numbers,
+    twists: Array,
+    dt_ns: int,
+    noise: VelocityNoise,
+    observe: Observe,
+    observe_every: int,
+    landmarks: Mapping[str, Numbers],
+) -> Recording:
+    """Drive and record.
+
+    Parameters
+    ----------
+    start : true pose at the first stamp; odometry begins at the origin
+    twists : (n, 3) or (n, 6) true velocities in base_link, each for one tick [m/s, rad/s]
+    observe_every : ticks from one look to the next, the first after the first tick
+    landmarks : true poses or points by id
+    """
+    dt_s = dt_ns * 1e-9
+    measured = twists + noise.draw(rng, len(twists), dt_s)
+    truth = integrate(start, twists * dt_s)
+    stamps_ns = START_NS + dt_ns * np.arange(len(truth), dtype=np.int64)
+    seen = []
+    for k in range(observe_every, len(truth), observe_every):
+        sightings = observe(tuple(truth[k].tolist()))
+        if sightings:
+            seen.append(Sightings(int(stamps_ns[k]), LANDMARKS_TOPIC, tuple(sightings)))
+    return Recording(
+        stamps_ns=stamps_ns,
+        T_odom_base=integrate(space_of(start).identity, measured * dt_s),
+        twist=np.concatenate([np.zeros((1, twists.shape[1])), measured]),
+        twist_covariance=noise.covariance,
+        odom_covariance=accumulated(measured * dt_s, noise.per_tick(dt_s)),
+        seen=tuple(seen),
+        T_world_base=truth,
+        landmarks=dict(landmarks),
+    )
+
+
+PLACE_M = 0.5  # between the places that closures join, along the way
+REACH_M = 2.0  # from one end of a closure to the other at most
+GAP_NS = 10 * 10**9  # and at least so much later
+SIGMA_M, SIGMA_RAD = 0.05, 0.01
+_STREAM = 0
+
+
+def places(poses: Array) -> Index:
+    """Numbers of the first pose, and of each pose (n, 3) or (n, 7) after a given distance from the one before."""
+    steps = np.linalg.norm(np.diff(poses[:, : space_of(poses[0]).dimensions], axis=0), axis=1)
+    count = np.floor(np.concatenate([[0.0], np.cumsum(steps)]) / PLACE_M)
+    return np.flatnonzero(np.diff(count, prepend=-1.0) > 0.0)
+
+
+def with_closures(recording: Recording, count: int, seed: int) -> Recording:
+    """Add a number of true closures to a recording, evenly among the revisited places.
+
+    Raises
+    ------
+    GraphSlamError
+        It did not come back so often.
+    """
+    rng = Generator(PCG64(SeedSequence(seed, spawn_key=(_STREAM,))))
+    space, at = space_of(recording.T_world_base[0]), places(recording.T_world_base)
+    n, truth, stamps_ns = space.dimensions, recording.T_world_base[at], recording.stamps_ns[at]
+    back: list[tuple[int, Index]] = []
+    for later, stamp_ns in enumerate(stamps_ns.tolist()):
+        before = int(np.searchsorted(stamps_ns, stamp_ns - GAP_NS, side="right"))
+        away = np.linalg.norm(truth[:before, :n] - truth[later, :n], axis=1)
+        if (near := np.flatnonzero(away <= REACH_M)).size:
+            back.append((later, near))
+    if len(back) < count:
+        raise GraphSlamError(f"{count} closures: the robot came back to {len(back)} places only")
+    sigmas = np.concatenate([np.full(n, SIGMA_M), np.full(space.dof - n, SIGMA_RAD)])
+    covariance = tuple(np.diag(np.square(sigmas)).ravel().tolist())
+    found = []
+    for pick in np.sort(rng.permutation(len(back))[:count]).tolist():
+        later, near = back[pick]
+        earlier = int(near[rng.integers(len(near))])
+        true = space.group.between(tuple(truth[earlier].tolist()), tuple(truth[later].tolist()))
+        noise = tuple((sigmas * rng.standard_normal(space.dof)).tolist())
+        measured = tuple(float(number) for number in space.group.retract(true, noise))
+        found.append(Closure(int(stamps_ns[later]), int(stamps_ns[earlier]), CLOSURES_TOPIC, measured, covariance))
+    return replace(recording, closures=tuple(found))

@@ -1,0 +1,69 @@
+"""The command ``view``: the page of a run on the loopback, with what-if and edits."""
+
+import argparse
+import contextlib
+import importlib.util
+import os
+import sys
+
+from graph_slam_ros.cli import console, values
+from graph_slam_ros.cli.options import add_run, add_shown
+from graph_slam_ros.cli.usage import CommandParser
+from graph_slam_ros.errors import GraphSlamError
+
+_NEEDS = "starlette", "uvicorn"
+
+
+def add_options(sub: CommandParser) -> None:
+    """Add the options of ``view``."""
+    add_run(sub)
+    add_shown(sub)
+    sub.add_argument("--port", type=values.port, default=0, help="port to listen on (default: a free one)")
+    sub.add_argument(
+        "--host", default="127.0.0.1", metavar="ADDRESS", help="address to listen on (default: this machine alone)"
+    )
+    sub.add_argument("--no-browser", action="store_true", help="print the address, and open no browser")
+
+
+def view(args: argparse.Namespace) -> int:
+    """Serve the page of a run until Ctrl-C."""
+    if not all(map(importlib.util.find_spec, _NEEDS)):
+        raise GraphSlamError("view serves its page with Starlette and uvicorn: pip install 'graph_slam_ros[view]'")
+    from graph_slam_ros.tools.report.contents import read_contents
+    from graph_slam_ros.tools.view.guard import Access
+    from graph_slam_ros.tools.view.page import page_of
+    from graph_slam_ros.tools.view.server import application, listening, server
+    from graph_slam_ros.tools.view.workbench import Workbench
+    from graph_slam_ros.warmup import compile_all
+
+    if not args.truth and (args.topic or args.no_align):
+        raise GraphSlamError("view: no use for --topic or --no-align without --truth")
+    compile_all()
+    made = read_contents(args.run_folder, args.truth, args.compare, args.plan, args.topic, align=not args.no_align)
+    work = Workbench(made, values.LOSS_SCALE)
+    page = page_of(made, work)
+    bound = listening(args.host, args.port)
+    access = Access(args.host, bound.getsockname()[1])
+    address = access.address
+    code = console.report_losses(made.losses, made.beware)
+    if not access.is_local:
+        console.warn(f"beware: other machines can reach {args.host}; a person with the address can edit the run")
+
+    def ready() -> None:
+        console.show(address)
+        console.then("open it in a browser, once; Ctrl-C ends it")
+        sys.stdout.flush()
+        if not args.no_browser and _has_screen():
+            import webbrowser
+
+            webbrowser.open(address)
+
+    with contextlib.suppress(KeyboardInterrupt):
+        server(application(work, page, access), ready).run([bound])
+    console.show("ended")
+    return code
+
+
+def _has_screen() -> bool:
+    """Return whether a browser would have a window: others would run in this terminal."""
+    return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
