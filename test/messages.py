@@ -3,7 +3,9 @@
 import math
 
 import numpy as np
+from foreign import DEFINITIONS
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.base import Nodetype
 
 from graph_slam_ros.lie import se2
 from graph_slam_ros.messages.from_msg import MessageConverter
@@ -106,10 +108,53 @@ def recorded(type_name, definition):
     return recorded_decoder(Topic("/t", type_name, 1, definition)), message, encoded
 
 
+def everything():
+    """Our types and those of packages that need not be there."""
+    store, theirs = get_typestore(Stores.EMPTY), {}
+    for name, definition in DEFINITIONS.items():
+        theirs |= get_types_from_msg(definition, name)
+    store.register(typestore().fielddefs | theirs)
+    return store
+
+
+STORE = everything()
+DECODERS = {name: (lambda cdr, name=name: STORE.deserialize_cdr(cdr, name)) for name in DEFINITIONS}
+
+
+def part(name, **given):
+    """A message of any of these types, zero but for what is given."""
+    fields = STORE.fielddefs[name][1]
+    return STORE.types[name](**{field: given.get(field, _zero(*described)) for field, described in fields})
+
+
+def sent(name, **given):
+    """The bytes of such a message."""
+    return bytes(STORE.serialize_cdr(part(name, **given), name))
+
+
+def _zero(node, of):
+    if node == Nodetype.NAME:
+        return quaternion() if of == "geometry_msgs/msg/Quaternion" else part(of)
+    if node == Nodetype.BASE:
+        return {"string": "", "bool": False}.get(of[0], 0.0 if of[0].startswith("float") else 0)
+    (inner, what), size = of
+    count = size if node == Nodetype.ARRAY else 0
+    is_number = inner == Nodetype.BASE and what[0] != "string"
+    return np.zeros(count, what[0]) if is_number else [_zero(inner, what) for _ in range(count)]
+
+
+class Border(MessageConverter):
+    """A border whose counters are at hand."""
+
+    def __init__(self, config, decoders):
+        self.counts = Counters()
+        super().__init__(config, self.counts, decoders)
+
+
 def border(*links, decoders=None, **sections):
     """A border of this configuration that has been told of these fixed links, and waits for no others but if told."""
     sections["inputs"] = {"tf": False, **sections.get("inputs", {})}
-    out = MessageConverter(Config.from_mapping(sections), Counters(), decoders)
+    out = Border(Config.from_mapping(sections), decoders)
     if links:
         out.convert("tf_static", transforms(*links))
     return out
@@ -146,7 +191,7 @@ def heard(b, name, cdr):
 
 
 def counted(b):
-    return b._counters.as_dict()
+    return b.counts.as_dict()
 
 
 def only(sightings):

@@ -34,9 +34,10 @@ from graph_slam_ros.slam import Closure, Config, Control, GraphSlam, Odometry, S
 
 S = 1_000_000_000
 POSE = "PoseWithCovarianceStamped"
-TAG = np.diag([0.01] * 6)
+TAG, ONES, ZERO = np.diag([0.01] * 6), np.ones((3, 3)), np.zeros((3, 3))
 POLAR = [("id", "i4"), ("range", "f8"), ("bearing", "f8")]
 IN_SPACE = [*POLAR, ("elevation", "f8")]
+NAN, INF = math.nan, math.inf
 
 
 def skew(value):
@@ -49,27 +50,8 @@ def posing(**settings):
     return listening("pose", f"geometry_msgs/msg/{POSE}", settings=settings)
 
 
-def refused(reason, *odometries):
-    """Each of these is, by a border of its own, for this reason and no other."""
-    for cdr in odometries:
-        b = border()
-        assert heard(b, "odom", cdr) is None
-        assert counted(b) == {"odom": {reason: 1}}
-
-
-def left_out(reason, *found):
-    """Each of these detections is, and the other of its message is not."""
-    for bad in found:
-        b = border()
-        m = heard(b, "detections", detections(bad, detection(name="good")))
-        assert [s.id for s in m.sightings] == ["good"]
-        assert counted(b) == {"detections": {reason: 1}}
-
-
-def none_of(b, name, cdr, reason):
-    """Nothing comes of the message, and it is counted for this reason alone."""
-    assert heard(b, name, cdr) is None
-    assert counted(b) == {name: {reason: 1}}
+def ranging(dimensions=2):
+    return scanner(dimensions, sigma_m=0.1, sigma_rad=0.1)
 
 
 def diagonal(flat):
@@ -77,39 +59,119 @@ def diagonal(flat):
     return np.diag(np.reshape(flat, (math.isqrt(len(flat)), -1)))
 
 
-# -- positions and rotations -------------------------------------------------------------------------------------------
+def turned(norm):
+    return pose(q=quaternion(norm=norm))
 
 
-def test_A1_a_position_that_is_no_number_or_beyond_any_map_is_refused_on_every_topic():
-    refused("nonfinite", odometry(pose(math.nan, 0.0)), odometry(pose(0.0, -math.inf)))
-    refused("nonfinite", odometry(pose(0.0, 0.0, math.nan)), odometry(pose(q=quaternion(norm=math.nan))))
-    refused("too_far", odometry(pose(1e200, 0.0)))
-    left_out("nonfinite", detection(pose(math.nan, 0.0)))
-    left_out("too_far", detection(pose(-1e10, 0.0)))
-    none_of(posing(), "pose", posed(POSE, pose(math.inf, 0.0), covariance=TAG), "nonfinite")
-    none_of(receiver(), "gps", gnss(math.nan), "nonfinite")
-    none_of(compass(3), "imu", imu(quaternion(norm=math.nan), np.eye(3)), "nonfinite")
-    none_of(scanner(sigma_m=1.0, sigma_rad=1.0), "scan", cloud(POLAR, (1, math.nan, 0.0)), "nonfinite")
-    none_of(scanner(sigma_m=1.0, sigma_rad=1.0), "scan", cloud(POLAR, (1, 2.0, math.inf)), "nonfinite")
-    earlier = detection(pose(math.nan, 0.0), TAG, name="7")
-    none_of(closing(2), "loops", detections(earlier), "nonfinite")
-    none_of(border(), "tf_static", transforms(("base_link", "a", (math.nan, 0.0, 0.0), quaternion())), "nonfinite")
+def fixed(parent, child, x=0.0, norm=1.0):
+    return transforms((parent, child, (x, 0.0, 0.0), quaternion(norm=norm)))
+
+
+ODOMETRY = [  # of odometry, each is refused for this reason and no other
+    ("A1", "nonfinite", {"at": pose(NAN, 0.0)}),
+    ("A1", "nonfinite", {"at": pose(0.0, -INF)}),
+    ("A1", "nonfinite", {"at": pose(0.0, 0.0, NAN)}),
+    ("A1", "nonfinite", {"at": turned(NAN)}),
+    ("A1", "too_far", {"at": pose(1e200, 0.0)}),
+    ("A2", "nonfinite_covariance", {"twist": np.diag([0.04, NAN, 0.02])}),
+    ("A4", "zero_quaternion", {"at": turned(0.0)}),
+    *(("A6", "denormal_quaternion", {"at": turned(norm)}) for norm in (0.89, 1.11, 1e-150)),
+    ("A6", "nonfinite", {"at": turned(1e200)}),  # its square is not finite
+    ("A8", "covariance_asymmetric", {"twist": TWIST + skew(1e-3)}),
+    ("A9", "covariance_not_positive_definite", {"twist": np.diag([0.04, -0.01, 0.02])}),
+    ("A9", "covariance_not_positive_definite", {"twist": ONES - 1e-6 * np.eye(3)}),
+    ("A14", "frame_empty", {"frame": ""}),
+    ("A14", "frame_empty", {"child": ""}),
+    ("A15", "odom_frame_unknown", {"frame": "world"}),
+    ("A17", "child_frame_unknown", {"child": "wheel"}),
+    ("A19", "frame_in_itself", {"frame": "base_link"}),
+    ("A19", "frame_in_itself", {"child": "odom"}),
+]
+DETECTIONS = [  # of a message with another, which is used
+    ("A1", "nonfinite", {"at": pose(NAN, 0.0)}),
+    ("A1", "too_far", {"at": pose(-1e10, 0.0)}),
+    ("A2", "nonfinite_covariance", {"covariance": np.diag([0.01, INF])}),
+    ("A4", "zero_quaternion", {"at": turned(0.0), "covariance": TAG}),
+    ("A6", "denormal_quaternion", {"at": turned(2.0), "covariance": TAG}),
+    ("A8", "covariance_asymmetric", {"covariance": [[0.01, 0.005], [0.0, 0.01]]}),
+    ("A9", "covariance_not_positive_definite", {"covariance": [[0.01, 0.02], [0.02, 0.01]]}),
+    ("A15", "frame_unknown", {"frame": "camera"}),
+    ("A20", "id_too_long", {"name": "ä" * 65}),
+]
+SPACE, NO_TURN = lambda: compass(3), np.diag([-1.0, 0.0, 0.0])
+STILL = imu(quaternion(), ZERO, rate_covariance=NO_TURN)
+OTHERS = [
+    ("A1", "nonfinite", posing, "pose", posed(POSE, pose(INF, 0.0), covariance=TAG)),
+    ("A1", "nonfinite", receiver, "gps", gnss(NAN)),
+    ("A1", "nonfinite", SPACE, "imu", imu(quaternion(norm=NAN), np.eye(3))),
+    ("A1", "nonfinite", ranging, "scan", cloud(POLAR, (1, NAN, 0.0))),
+    ("A1", "nonfinite", ranging, "scan", cloud(POLAR, (1, 2.0, INF))),
+    ("A1", "nonfinite", lambda: closing(2), "loops", detections(detection(pose(NAN, 0.0), TAG, name="7"))),
+    ("A1", "nonfinite", border, "tf_static", fixed("base_link", "a", NAN)),
+    ("A4", "zero_quaternion", SPACE, "imu", imu(quaternion(norm=0.0), np.eye(3))),
+    ("A4", "zero_quaternion", border, "tf_static", fixed("base_link", "a", norm=0.0)),
+    ("A7", "noise_unknown", posing, "pose", posed(POSE, pose(1.0, 2.0), covariance=np.zeros((6, 6)))),
+    ("A7", "noise_unknown", SPACE, "imu", imu(quaternion(), ZERO)),
+    ("A13", "no_orientation", SPACE, "imu", imu(quaternion(), NO_TURN)),
+    ("A13", "no_orientation", lambda: compass(2, sigma_rad=0.1), "imu", imu(quaternion(), NO_TURN)),
+    *(("A13", "no_angular_velocity", lambda n=n: compass(n, use="gyro"), "imu", STILL) for n in (2, 3)),
+    ("A14", "frame_empty", border, "detections", detections(detection(), frame="")),
+    ("A22", "range_not_positive", ranging, "scan", cloud(POLAR, (1, 0.0, 0.2))),
+    ("A22", "range_not_positive", ranging, "scan", cloud(POLAR, (1, -2.0, 0.2))),
+    *(("A23", "bearing_out_of_range", ranging, "scan", cloud(POLAR, (1, 5.0, far))) for far in (12.6, -12.6, 1e300)),
+    ("A23", "bearing_out_of_range", lambda: ranging(3), "scan", cloud(IN_SPACE, (1, 5.0, 12.6, 0.1))),
+    ("A23", "bearing_out_of_range", lambda: ranging(3), "scan", cloud(IN_SPACE, (1, 5.0, 0.3, 1.6))),
+    ("A31", "no_fix", receiver, "gps", gnss(status=-1)),
+    ("A31", "noise_unknown", receiver, "gps", gnss(kind=0)),
+    ("A31", "covariance_not_positive_definite", receiver, "gps", gnss(covariance=np.diag([1.0, -1.0, 1.0]))),
+    *(
+        ("A32", "id_not_a_stamp", lambda: closing(2), "loops", detections(detection(covariance=TAG, name=name)))
+        for name in ("dock", "", "9" * 20)
+    ),
+]
+
+
+def ids(rows):
+    return [f"{case}-{k}" for k, (case, *_) in enumerate(rows)]
+
+
+@pytest.mark.parametrize("case, reason, given", ODOMETRY, ids=ids(ODOMETRY))
+def test_odometry_that_cannot_be_used_is_refused_and_counted(case, reason, given):
+    b = border()
+    assert heard(b, "odom", odometry(**given)) is None
+    assert counted(b) == {"odom": {reason: 1}}
+
+
+@pytest.mark.parametrize("case, reason, given", DETECTIONS, ids=ids(DETECTIONS))
+def test_a_detection_that_cannot_be_used_is_refused_and_counted_and_others_are_used(case, reason, given):
+    b = border()
+    m = heard(b, "detections", detections(detection(**given), detection(name="good")))
+    assert [s.id for s in m.sightings] == ["good"]
+    assert counted(b) == {"detections": {reason: 1}}
+
+
+@pytest.mark.parametrize("case, reason, made, name, cdr", OTHERS, ids=ids(OTHERS))
+def test_what_cannot_be_used_of_other_inputs_is_refused_and_counted(case, reason, made, name, cdr):
+    b = made()
+    assert heard(b, name, cdr) is None
+    assert counted(b) == {name: {reason: 1}}
+
+
+# -- positions, rotations and covariances ------------------------------------------------------------------------------
 
 
 def test_A2_a_covariance_that_is_no_number_is_refused_but_where_another_is_configured():
-    nan, inf = np.diag([0.04, math.nan, 0.02]), np.diag([0.01, math.inf])
-    refused("nonfinite_covariance", odometry(twist=nan))
-    left_out("nonfinite_covariance", detection(covariance=inf))
-    inputs = {
-        "gps": (receiver, gnss(covariance=nan)),
-        "imu": (lambda **s: compass(3, **s), imu(quaternion(), nan)),
-        "pose": (posing, posed(POSE, pose(1.0, 2.0), covariance=np.diag([math.nan] * 6))),
-    }
-    for name, (made, cdr) in inputs.items():
-        none_of(made(), name, cdr, "nonfinite_covariance")
+    nan = np.diag([0.04, NAN, 0.02])
+    for name, made, cdr, sigmas in (
+        ("gps", receiver, gnss(covariance=nan), [0.3] * 3),
+        ("imu", lambda **s: compass(3, **s), imu(quaternion(), nan), [0.1] * 3),
+        ("pose", posing, posed(POSE, pose(1.0, 2.0), covariance=np.diag([NAN] * 6)), [0.3, 0.3, 0.1]),
+    ):
+        b = made()
+        assert heard(b, name, cdr) is None
+        assert counted(b) == {name: {"nonfinite_covariance": 1}}
         b = made(noise="sigmas", sigma_m=0.3, sigma_rad=0.1)
-        told = np.sqrt(diagonal(heard(b, name, cdr).covariance))
-        assert told == pytest.approx({"gps": [0.3] * 3, "imu": [0.1] * 3, "pose": [0.3, 0.3, 0.1]}[name])
+        assert np.sqrt(diagonal(heard(b, name, cdr).covariance)) == pytest.approx(sigmas)
         assert counted(b) == {}
     b = border(odometry={"noise": "density"})
     assert heard(b, "odom", odometry(twist=nan)).twist_covariance is None
@@ -117,25 +179,18 @@ def test_A2_a_covariance_that_is_no_number_is_refused_but_where_another_is_confi
 
 
 def test_A3_without_an_altitude_the_height_of_a_fix_is_not_known_and_that_is_counted():
-    sent = gnss(altitude=math.nan, covariance=np.diag([1.0, 2.0, 3.0]))
-    b = receiver(3)
-    m = heard(b, "gps", sent)
-    assert m.measured == (0.0, 0.0, 0.0)
-    assert diagonal(m.covariance).tolist() == [1.0, 2.0, 1e6]
+    cdr, b = gnss(altitude=NAN, covariance=np.diag([1.0, 2.0, 3.0])), receiver(3)
+    m = heard(b, "gps", cdr)
+    assert (m.measured, diagonal(m.covariance).tolist()) == ((0.0, 0.0, 0.0), [1.0, 2.0, 1e6])
     assert counted(b) == {"gps": {"no_altitude": 1}}
     b = receiver(2)
-    assert heard(b, "gps", sent).measured == (0.0, 0.0)
-    assert counted(b) == {}, "nothing is lost in the plane"
+    assert (heard(b, "gps", cdr).measured, counted(b)) == ((0.0, 0.0), {}), "nothing is lost in the plane"
 
 
-def test_A4_zero_quaternion():
-    refused("zero_quaternion", odometry(pose(q=quaternion(norm=0.0))))
-    left_out("zero_quaternion", detection(pose(q=quaternion(norm=0.0)), TAG))
-    none_of(compass(3), "imu", imu(quaternion(norm=0.0), np.eye(3)), "zero_quaternion")
-    none_of(border(), "tf_static", transforms(("base_link", "a", (0, 0, 0), quaternion(norm=0.0))), "zero_quaternion")
+def test_A4_of_a_point_the_orientation_says_nothing():
     b = border()
     assert only(heard(b, "detections", detections(detection(pose(2.0, 1.0, 0.0, quaternion(norm=0.0))))))
-    assert counted(b) == {}, "of a point the orientation says nothing"
+    assert counted(b) == {}
 
 
 @pytest.mark.parametrize("norm", [0.9001, 0.95, 1.0 + 1e-5, 1.0999])
@@ -147,115 +202,75 @@ def test_A5_a_nearly_unit_quaternion_is_normalised_and_counted(norm):
     assert counted(b) == {"odom": {"quaternion_normalized": 1}}
 
 
-def test_A6_a_quaternion_far_from_unit_length_is_refused():
-    refused("denormal_quaternion", *(odometry(pose(q=quaternion(norm=norm))) for norm in (0.89, 1.11, 1e-150)))
-    refused("nonfinite", odometry(pose(q=quaternion(norm=1e200))))  # its square is not finite
-    left_out("denormal_quaternion", detection(pose(q=quaternion(norm=2.0)), TAG))
-
-
-# -- covariances -------------------------------------------------------------------------------------------------------
-
-
 def test_A7_zero_covariance_means_unknown():
     b = border(landmarks={"sigma_m": 0.3})
     m = heard(b, "detections", detections(detection(covariance=np.zeros((2, 2)))))
     assert only(m).covariance == pytest.approx((0.09, 0.0, 0.0, 0.09))
     for _ in range(2):
-        assert heard(b, "odom", odometry(twist=np.zeros((3, 3)))).twist_covariance is None, "the densities are used"
+        assert heard(b, "odom", odometry(twist=ZERO)).twist_covariance is None, "the densities are used"
     assert counted(b) == {"detections": {"covariance_unknown": 1}, "odom": {"covariance_unknown": 2}}
-    none_of(posing(), "pose", posed(POSE, pose(1.0, 2.0), covariance=np.zeros((6, 6))), "noise_unknown")
-    none_of(compass(3), "imu", imu(quaternion(), np.zeros((3, 3))), "noise_unknown")
-    assert heard(compass(2, sigma_rad=0.1), "imu", imu(quaternion(), np.zeros((3, 3)))).covariance == pytest.approx(
-        (0.01,)
-    )
+    told = heard(compass(2, sigma_rad=0.1), "imu", imu(quaternion(), ZERO))
+    assert told.covariance == pytest.approx((0.01,))
+    assert heard(receiver(sigma_m=3.0), "gps", gnss(kind=0)).covariance == pytest.approx(tuple(9 * np.eye(3).ravel()))
 
 
-def test_A8_a_covariance_that_is_not_symmetric():
+def twist_of(given, dimensions=3):
+    """Of a twist covariance: what is made of it, and what is counted."""
     b = border()
-    got = heard(b, "odom", odometry(twist=TWIST + skew(2e-4)))
-    assert np.reshape(got.twist_covariance, (3, 3)) == pytest.approx(TWIST + skew(1e-4) + skew(1e-4).T)
-    assert counted(b) == {"odom": {"covariance_symmetrized": 1}}
-    refused("covariance_asymmetric", odometry(twist=TWIST + skew(1e-3)))
-    left_out("covariance_asymmetric", detection(covariance=[[0.01, 0.005], [0.0, 0.01]]))
+    out = heard(b, "odom", odometry(twist=given)).twist_covariance
+    return out and np.reshape(out, (3, 3)), counted(b).get("odom", {})
+
+
+def test_A8_a_covariance_that_is_nearly_symmetric_is_made_so():
+    got, counts = twist_of(TWIST + skew(2e-4))
+    assert got == pytest.approx(TWIST + skew(1e-4) + skew(1e-4).T)
+    assert counts == {"covariance_symmetrized": 1}
 
 
 def test_A9_a_covariance_that_is_not_positive_definite():
+    got, counts = twist_of(ONES)  # of rank 1
+    assert np.linalg.eigvalsh(got) == pytest.approx([3e-9, 3e-9, 3.0], rel=1e-4)
+    assert counts == {"covariance_floored": 1}
     b = border()
-    ones = np.ones((3, 3))  # of rank 1
-    got = heard(b, "odom", odometry(twist=ones))
-    assert np.linalg.eigvalsh(np.reshape(got.twist_covariance, (3, 3))) == pytest.approx([3e-9, 3e-9, 3.0], rel=1e-4)
-    assert counted(b) == {"odom": {"covariance_floored": 1}}
-    refused("covariance_not_positive_definite", odometry(twist=np.diag([0.04, -0.01, 0.02])))
-    refused("covariance_not_positive_definite", odometry(twist=ones - 1e-6 * np.eye(3)))
-    left_out("covariance_not_positive_definite", detection(covariance=[[0.01, 0.02], [0.02, 0.01]]))
+    assert heard(b, "odom", odometry(twist=np.diag([0.04, -0.01, 0.02]))) is None
+    assert counted(b) == {"odom": {"covariance_not_positive_definite": 1}}
 
 
 def test_A10_negative_off_diagonals_are_legal():
-    b = border()
-    twist = TWIST.copy()
-    twist[0, 1] = twist[1, 0] = -0.015
-    got = heard(b, "odom", odometry(twist=twist)).twist_covariance
-    assert np.reshape(got, (3, 3)) == pytest.approx(twist, rel=1e-15)
-    assert counted(b) == {}
+    twist = TWIST + skew(-0.015) + skew(-0.015).T
+    got, counts = twist_of(twist)
+    assert (got, counts) == (pytest.approx(twist, rel=1e-15), {})
 
 
-def test_A11_a_variance_beyond_any_meaning_is_clamped_with_its_correlations():
+def test_A11_a_variance_beyond_any_meaning_is_clamped_with_its_correlations_and_of_a_twist_it_is_unknown():
     b = border()
     m = heard(b, "detections", detections(detection(covariance=np.array([[4e6, 1e3], [1e3, 1.0]]))))
     assert np.reshape(only(m).covariance, (2, 2)) == pytest.approx(np.array([[1e6, 500.0], [500.0, 1.0]]))
     assert counted(b) == {"detections": {"covariance_clamped": 1}}
+    assert twist_of(np.diag([1.7e308, 4e6, 1.0]))[0] is None
 
 
-def test_A11_a_twist_of_which_a_variance_is_beyond_any_meaning_is_unknown():
-    b = border()
-    assert heard(b, "odom", odometry(twist=np.diag([1.7e308, 4e6, 1.0]))).twist_covariance is None
-
-
-def test_A12_a_covariance_smaller_than_anything_measured_gets_a_floor_of_a_tenth_of_a_millimetre():
+def test_A12_a_covariance_smaller_than_anything_measured_gets_a_floor_and_an_unknown_axis_takes_nothing_from_others():
     b = border()
     m = heard(b, "detections", detections(detection(covariance=np.diag([5e-324, 1e-310]))))
     assert only(m).covariance == (1e-8, 0.0, 0.0, 1e-8)
-    got = heard(b, "odom", odometry(twist=np.diag([0.04, 0.0, 1e-300]))).twist_covariance
-    assert diagonal(got) == pytest.approx([0.04, 1e-8, 1e-10], rel=1e-12)
-    assert counted(b) == {"detections": {"covariance_floored": 1}, "odom": {"covariance_floored": 1}}
-
-
-def test_A12_one_axis_of_which_nothing_is_known_takes_nothing_from_the_others():
+    assert counted(b) == {"detections": {"covariance_floored": 1}}
+    got, counts = twist_of(np.diag([0.04, 0.0, 1e-300]))
+    assert (np.diag(got), counts) == (pytest.approx([0.04, 1e-8, 1e-10], rel=1e-12), {"covariance_floored": 1})
     b = receiver(3)
     got = heard(b, "gps", gnss(covariance=np.diag([4e-6, 4e-6, 1e6]))).covariance
     assert diagonal(got).tolist() == [4e-6, 4e-6, 1e6], "of condition 2.5e11: a fix to 2 mm without a height"
     assert counted(b) == {}
 
 
-def test_A13_an_imu_that_flags_its_orientation_as_absent():
-    none_of(compass(3), "imu", imu(quaternion(), np.diag([-1.0, 0.0, 0.0])), "no_orientation")
-    none_of(compass(2, sigma_rad=0.1), "imu", imu(quaternion(), np.diag([-1.0, 0.0, 0.0])), "no_orientation")
-
-
-def test_A13_an_imu_that_flags_its_angular_velocity_as_absent():
-    absent = imu(quaternion(), np.zeros((3, 3)), rate_covariance=np.diag([-1.0, 0.0, 0.0]))
-    for dimensions in (2, 3):
-        none_of(compass(dimensions, use="gyro"), "imu", absent, "no_angular_velocity")
-
-
 # -- frames ------------------------------------------------------------------------------------------------------------
 
 
-def test_A14_empty_frames():
-    refused("frame_empty", odometry(frame=""), odometry(child=""))
-    b = border()
-    assert heard(b, "odom", odometry(frame="/")) is None
-    assert counted(b) == {"odom": {"frame_empty": 1, "frame_slash_stripped": 1}}
-    none_of(border(), "detections", detections(detection(), frame=""), "frame_empty")
-
-
-def test_A15_a_frame_that_is_not_the_odometrys_is_transformed_where_it_is_linked_and_refused_elsewhere():
+def test_A15_a_frame_that_is_not_the_odometrys_is_transformed_where_it_is_linked():
     b = border(("odom", "start", (10.0, 5.0, 0.0), quaternion(yaw=math.pi / 2)))
     m = heard(b, "odom", odometry(pose(2.0, 1.0, 0.0, quaternion(yaw=0.3)), frame="start"))
     assert m.T_odom_base == pytest.approx((9.0, 7.0, math.pi / 2 + 0.3))
     assert counted(b) == {}
-    refused("odom_frame_unknown", odometry(frame="world"))
-    left_out("frame_unknown", detection(frame="camera"))
 
 
 def test_A16_one_leading_slash_is_stripped_and_counted():
@@ -264,12 +279,14 @@ def test_A16_one_leading_slash_is_stripped_and_counted():
     assert counted(b) == {"odom": {"frame_slash_stripped": 2}}
     assert heard(b, "odom", odometry(frame="//odom")) is None
     assert counted(b)["odom"]["odom_frame_unknown"] == 1
+    assert heard(b, "odom", odometry(frame="/")) is None
+    assert counted(b)["odom"]["frame_empty"] == 1
     b = border(("/base_link", "/wheel", (0.5, 0.0, 0.0), quaternion()))
     assert heard(b, "odom", odometry(child="wheel")).T_odom_base == pytest.approx((-0.5, 0.0, 0.0))
     assert counted(b) == {"tf_static": {"frame_slash_stripped": 2}}
 
 
-def test_A17_the_lever_arm_of_a_linked_child_frame_is_applied_and_one_that_is_not_linked_is_refused():
+def test_A17_A18_the_lever_arm_of_a_linked_child_frame_is_applied_also_where_the_child_changes():
     # the wheel is 0.5 m ahead and 0.2 m left of the base, turned by 90 degrees
     b = border(("base_link", "wheel", (0.5, 0.2, 0.1), quaternion(yaw=math.pi / 2)))
     m = heard(b, "odom", odometry(pose(3.0, 4.0, 0.0, quaternion(yaw=math.pi)), child="wheel"))
@@ -277,25 +294,18 @@ def test_A17_the_lever_arm_of_a_linked_child_frame_is_applied_and_one_that_is_no
     assert m.T_odom_base == pytest.approx((3.2, 3.5, math.pi / 2))
     assert m.twist_covariance is None, "that of another point of the robot"
     assert counted(b) == {}
-    refused("child_frame_unknown", odometry(child="wheel"))
-
-
-def test_A18_a_child_frame_that_changes_is_taken_for_what_it_is_or_refused_and_named():
     b = border(("base_link", "wheel", (0.5, 0.0, 0.0), quaternion()))
-    children = {"base_link": 0.0, "wheel": 0.5}
-    sent = [
-        odometry(pose(k + children[c], 0.0), child=c, stamp_ns=STAMP_NS + k * 10**9) for k, c in enumerate(children)
-    ]
-    assert [heard(b, "odom", cdr).T_odom_base[0] for cdr in sent] == pytest.approx([0.0, 1.0]), "no jump of 0.5 m"
+    for k, (child, x) in enumerate((("base_link", 0.0), ("wheel", 1.5))):
+        m = heard(b, "odom", odometry(pose(x, 0.0), child=child, stamp_ns=STAMP_NS + k * S))
+        assert m.T_odom_base[0] == pytest.approx(k), "no jump of 0.5 m"
     assert heard(b, "odom", odometry(child="arm")) is None
     assert counted(b) == {"odom": {"child_frame_unknown": 1}}
     assert b.unlinked("odom") == (("arm", "base_link"),)
 
 
-def test_A19_a_frame_in_itself():
-    refused("frame_in_itself", odometry(frame="base_link"), odometry(child="odom"))
+def test_A19_a_frame_in_itself_leaves_the_good_link():
     b = border(("base_link", "mast", (1.0, 0.0, 0.0), quaternion()))
-    b.convert("tf_static", transforms(("mast", "mast", (9.0, 0.0, 0.0), quaternion())))
+    b.convert("tf_static", fixed("mast", "mast", 9.0))
     assert counted(b) == {"tf_static": {"frame_in_itself": 1}}
     assert only(heard(b, "detections", detections(detection(pose(2.0, 1.0)), frame="mast"))).measured == (3.0, 1.0)
 
@@ -303,59 +313,38 @@ def test_A19_a_frame_in_itself():
 # -- landmarks ---------------------------------------------------------------------------------------------------------
 
 
-def test_A20_an_identity_is_any_number_or_text_of_at_most_128_bytes_and_never_cut():
+def test_A20_A21_an_identity_is_any_number_or_text_never_cut_with_the_prefix_of_its_input():
     names = ["-5", str(2**31 + 1), str(2**63 - 1), "ä" * 64, "line\nfeed"]
     b = border()
     m = heard(b, "detections", detections(*(detection(name=name) for name in names)))
     assert [s.id for s in m.sightings] == names
     assert counted(b) == {}
-    left_out("id_too_long", detection(name="ä" * 65))
-    layout = [("x", "f4"), ("y", "f4"), ("id", "f8")]
-    numbers = [-5.0, float(2**53), 1.5]
-    m = heard(scanner(sigma_m=0.1), "scan", cloud(layout, *((1.0, k, n) for k, n in enumerate(numbers))))
+    points = [(1.0, k, n) for k, n in enumerate((-5.0, float(2**53), 1.5))]
+    m = heard(scanner(sigma_m=0.1), "scan", cloud([("x", "f4"), ("y", "f4"), ("id", "f8")], *points))
     assert [s.id for s in m.sightings] == ["-5", str(2**53), "1.5"]
-
-
-def test_A21_identities_of_two_inputs_are_kept_apart_by_a_prefix():
-    b = border(detections={"id_prefix": "front/"})
-    m = heard(b, "detections", detections(detection(name="5"), detection(name="")))
+    m = heard(
+        border(detections={"id_prefix": "front/"}), "detections", detections(detection(name="5"), detection(name=""))
+    )
     assert [s.id for s in m.sightings] == ["front/5", ""]
 
 
-def test_A22_a_range_of_zero_or_less_is_refused_and_a_long_one_is_not():
-    for reach in (0.0, -2.0, -math.inf):
-        none_of(
-            scanner(sigma_m=0.1, sigma_rad=0.1),
-            "scan",
-            cloud(POLAR, (1, reach, 0.2)),
-            "range_not_positive" if math.isfinite(reach) else "nonfinite",
-        )
-    b = scanner(sigma_m=0.1, sigma_rad=0.1)
+def test_A22_a_long_range_is_not_refused():
+    b = ranging()
     assert only(heard(b, "scan", cloud(POLAR, (1, 500.0, 0.2)))).measured == (500.0, 0.2)
     assert counted(b) == {}
 
 
 @pytest.mark.parametrize("layout, tail", [(POLAR, ()), (IN_SPACE, (0.1,))], ids=["plane", "space"])
-def test_A23_a_bearing_beyond_half_a_turn_is_wrapped_and_one_beyond_two_turns_refused(layout, tail):
-    def told(bearing):
-        b = scanner(2 + len(tail), sigma_m=0.1, sigma_rad=0.1)
-        return heard(b, "scan", cloud(layout, (1, 5.0, bearing, *tail))), counted(b)
+def test_A23_a_bearing_or_an_elevation_beyond_half_a_turn_is_wrapped(layout, tail):
+    def told(bearing, *tail):
+        b = ranging(2 + len(tail))
+        return only(heard(b, "scan", cloud(layout, (1, 5.0, bearing, *tail)))).measured, counted(b)
 
-    within, _ = told(0.3)
-    for turns in (1, -1):
-        m, counts = told(0.3 + turns * 2.0 * math.pi)
-        assert only(m).measured == pytest.approx(only(within).measured)
-        assert counts == {"scan": {"bearing_wrapped": 1}}
-    assert told(math.pi)[1] == {}
-    for bearing in (12.6, -12.6, 1e300):
-        assert told(bearing) == (None, {"scan": {"bearing_out_of_range": 1}})
-
-
-def test_A23_an_elevation_beyond_the_zenith_is_none():
-    b = scanner(3, sigma_m=0.1, sigma_rad=0.1)
-    assert heard(b, "scan", cloud(IN_SPACE, (1, 5.0, 0.3, 1.6))) is None
-    assert only(heard(b, "scan", cloud(IN_SPACE, (1, 5.0, 0.3, 0.2 - 2.0 * math.pi)))).measured[2] == pytest.approx(0.2)
-    assert counted(b) == {"scan": {"bearing_out_of_range": 1, "bearing_wrapped": 1}}
+    turn = 2.0 * math.pi
+    wrapped = [(0.3 + turn, *tail), (0.3 - turn, *tail), *((0.3, one - turn) for one in tail)]
+    for given in wrapped:
+        assert told(*given) == (pytest.approx(told(0.3, *tail)[0]), {"scan": {"bearing_wrapped": 1}})
+    assert told(math.pi, *tail)[1] == {}
 
 
 def pipeline(**values):
@@ -506,29 +495,6 @@ def test_A28_of_a_robot_that_leaves_the_plane_the_projection_is_used_and_it_is_c
 # -- fixes and closures ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "fields, reason",
-    [
-        ({"status": -1}, "no_fix"),
-        ({"kind": 0}, "noise_unknown"),
-        ({"latitude": 91.0}, "not_on_earth"),
-        ({"longitude": 361.0}, "not_on_earth"),
-        ({"latitude": 0.0, "longitude": 0.0}, "no_position"),
-        ({"latitude": 50.0}, "far_from_datum"),
-        ({"covariance": np.diag([1.0, -1.0, 1.0])}, "covariance_not_positive_definite"),
-    ],
-)
-def test_A31_a_fix_that_cannot_be_used_is_refused_and_counted_under_its_reason(fields, reason):
-    none_of(receiver(datum="48 11 500"), "gps", gnss(**fields), reason)
-
-
-def test_A31_what_is_refused_is_not_the_datum():
-    b = receiver()
-    assert heard(b, "gps", gnss(0.0, 0.0)) is None
-    assert heard(b, "gps", gnss()).measured == (0.0, 0.0, 0.0)
-    assert heard(receiver(sigma_m=3.0), "gps", gnss(kind=0)).covariance == pytest.approx(tuple(9 * np.eye(3).ravel()))
-
-
 def test_A32_a_closure_from_where_there_was_no_odometry_is_refused():
     def closure(t_s, from_s):
         stamp_ns, from_ns = (STAMP_NS + round(s * S) for s in (t_s, from_s))
@@ -540,8 +506,6 @@ def test_A32_a_closure_from_where_there_was_no_odometry_is_refused():
     assert slam.counters["/loops", "from_where_there_was_no_odometry"] == 2, "waits for the odometry of 12 s"
     run(slam, Control("end"))
     assert slam.counters["/loops", "after_odometry"] == 1
-    for name, reason in (("dock", "id_not_a_stamp"), ("", "id_not_a_stamp"), ("9" * 20, "id_not_a_stamp")):
-        none_of(closing(2), "loops", detections(detection(covariance=TAG, name=name)), reason)
 
 
 @pytest.mark.parametrize(
