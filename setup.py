@@ -80,7 +80,6 @@ setup(
             "distributed>=2026.8",
             "duckdb>=1.4",
             "fsspec>=2025.9",
-            "optuna>=4.5",
             "pyarrow>=21.0",
         ],
         "view": ["plotly>=7.1.0", "starlette>=1.0", "uvicorn>=0.40"],

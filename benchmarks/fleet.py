@@ -1,6 +1,6 @@
 """What a fleet costs beside its replays, how it scales, and what faults change.
 
-``python -m benchmarks.fleet [speedup|overhead|faults|resumed|tune]...`` with the extra ``fleet``; nothing else may run.
+``python -m benchmarks.fleet [speedup|overhead|faults|resumed]...`` with the extra ``fleet``; nothing else may run.
 """
 
 import contextlib
@@ -16,18 +16,11 @@ import time
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-
-from benchmarks.consistency import run_band
 from graph_slam_ros import cli
 from graph_slam_ros.tools.fleet.engine import Workers, connected, run_jobs
 from graph_slam_ros.tools.fleet.isolation import run_isolated
 from graph_slam_ros.tools.fleet.job import Job
 from graph_slam_ros.tools.fleet.replay import Fleet, replay_all
-from graph_slam_ros.tools.fleet.table import read_table
-from graph_slam_ros.tools.fleet.tune import Tuning
-from graph_slam_ros.tools.fleet.tune import tune as tuned
-from graph_slam_ros.tools.fleet.tuned import in_words, proof_in_words
 
 RECORDINGS, NOTHING, DAMAGED = 200, 5000, 5
 HASHED = ("graph.g2o", "ledger.csv", "path.tum", "landmarks.csv", "map.mcap")
@@ -146,58 +139,7 @@ def resumed(scratch: Path, *, count: int = 40, stops: int = 10) -> None:
     print(f"stopped {stops} times: the same table: {hashes == {row['recording']: row['map_hash'] for row in rows}}")
 
 
-# Errors of velocity that are drawn anew for each tick of 20 ms; their densities are the root of a tick times these.
-DRIVEN = {
-    "sigma_speed_m_s": 0.3536,
-    "sigma_sideways_m_s": 0.0707,
-    "sigma_turn_rad_s": 0.3536,
-    "correlation_time_s": 0.0,
-}
-HALL = {"sensor": "position", "aisles": 2, "laps": 1, "aisle_m": 6.0, **DRIVEN}
-TRUE = {
-    "odometry.translation_density": 0.05,
-    "odometry.lateral_density": 0.01,
-    "odometry.rotation_density": 0.05,
-    "landmarks.added_sigma_m": 0.1,  # by the fault `noisy`, of 0.05 m or a little more
-}
-OFF = dict.fromkeys(TRUE, 1.0 / 3.0) | {"odometry.translation_density": 3.0, "odometry.lateral_density": 1.0}
-
-
-def tune(scratch: Path, *, count: int = 9, trials: int = 12) -> None:
-    """Noises that are a factor of three off are found from drives of 45 s, without their truth."""
-    bags = scratch / "tune"
-    bags.mkdir()
-    for seed in range(count):
-        options = [f"--set={name}={value}" for name, value in HALL.items()]
-        words = ["simulate", "warehouse", "--out", str(bags / f"{seed}.mcap"), "--seed", str(seed), *options]
-        with contextlib.redirect_stdout(None):
-            cli.main([*words, "--fault", "noisy:factor=2"])
-    settings = [f"{name}={value * OFF[name]}" for name, value in TRUE.items()]
-    settings.append("odometry.noise=density")
-    cpu = _cpu_s()
-    work = Tuning(
-        [str(bags)],
-        scratch / "tuned",
-        [name for name in TRUE if OFF[name] != 1.0],
-        settings=settings,
-        trials=trials,
-        truth="{path}",
-    )
-    done = tuned(work, Workers(count=2))
-    for one in done.parameters:
-        found = f"{one.found / TRUE[one.name]:.3f} of the truth (asked 0.8 to 1.2)" if one.found > 0.0 else ""
-        print(f"{one.name}: {one.state}, {in_words(one)}; {found}")
-    print(*proof_in_words(done), sep="\n")
-    held = [row for row in read_table(scratch / "tuned") if row["recording"] in done.held_out]
-    label = " ".join(f"{name}={value}" for name, value in done.settings.items())
-    for setting in ("configured", label):
-        nees = np.array([row["nees"] for row in held if row["setting"] == setting])
-        low, high = run_band(nees, 3.0)
-        print(f"NEES of {len(nees)} held-out drives, {setting}: {nees.mean():.2f}, band {low:.2f} to {high:.2f}")
-    print(f"{done.counts}, {_cpu_s() - cpu:.0f} s of CPU")
-
-
-PARTS = {"speedup": speedup, "overhead": overhead, "faults": faults, "resumed": resumed, "tune": tune}
+PARTS = {"speedup": speedup, "overhead": overhead, "faults": faults, "resumed": resumed}
 
 if __name__ == "__main__":
     for name in sys.argv[1:] or PARTS:

@@ -166,7 +166,7 @@ COMMANDS = {
     "fleet": Command(
         later("tools.fleet.command", "fleet"),
         later("tools.fleet.command", "add_options"),
-        "replay, compare and tune on many recordings at once, on all cores or many machines",
+        "replay many recordings at once, and compare two such fleets, on all cores or many machines",
         "replay drives/ --out fleet",
         "compare last_week fleet --fail 'rmse>1.02x'",
     ),

@@ -21,7 +21,6 @@ from graph_slam_ros.slam.calibrator import Calibrator
 from graph_slam_ros.slam.frontend.gyro import GyroState, SavedBias
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
 from graph_slam_ros.slam.frontend.noise_factors import Key, Rescaling
-from graph_slam_ros.slam.frontend.sighting_edges import SightingEdges
 from graph_slam_ros.slam.kidnap_detector import KidnapDetector
 from graph_slam_ros.slam.landmarks.landmark import Landmark
 from graph_slam_ros.slam.landmarks.landmark_frontend import LandmarkFrontend
@@ -65,11 +64,6 @@ class MapView(PathView):
         return f"{type(self).__name__}({counts}, {self.solves} solves)"
 
     # -- odometry and sightings ------------------------------------------------------------------------------------
-
-    @property
-    def sighting_origins(self) -> SightingEdges:
-        """The stamp and the place of each sighting that is an edge."""
-        return self._landmarks.map.origins
 
     @property
     def T_map_odom(self) -> Numbers:

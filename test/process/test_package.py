@@ -20,8 +20,7 @@ FILES = {path.relative_to(PACKAGE).as_posix(): path for path in sorted(PACKAGE.r
 
 SERVES = {"view/guard.py", "view/server.py"}  # with the extra `view`, which may not be there
 DISTRIBUTES = {  # with the extra `fleet`
-    *(f"fleet/{name}.py" for name in ("recordings", "job", "table", "engine", "replay", "compare", "simulate")),
-    *(f"fleet/{name}.py" for name in ("search", "fit", "tune", "tuned")),
+    f"fleet/{name}.py" for name in ("recordings", "job", "table", "engine", "replay", "compare")
 }
 SPEAK_RCLPY = {
     f"node/{name}.py"
@@ -49,7 +48,7 @@ def test_everything_but_the_node_imports_without_ros():
         for name in FILES
         if name not in SPEAK_MESSAGES
         and (name not in SERVES or find_spec("uvicorn"))
-        and (name not in DISTRIBUTES or all(map(find_spec, ("distributed", "duckdb", "fsspec", "optuna"))))
+        and (name not in DISTRIBUTES or all(map(find_spec, ("distributed", "duckdb", "fsspec"))))
     ]
     script = f"""
 import importlib, sys

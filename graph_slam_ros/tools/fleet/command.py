@@ -9,10 +9,8 @@ from typing import Any
 from graph_slam_ros.cli import console, values
 from graph_slam_ros.cli.usage import CODES, CommandParser
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.tools.fleet.simulate_command import simulate
-from graph_slam_ros.tools.fleet.tune_command import tune
 
-_NEEDED = ("dask", "distributed", "fsspec", "pyarrow", "duckdb", "optuna")
+_NEEDED = ("dask", "distributed", "fsspec", "pyarrow", "duckdb")
 _MIB = 2**20
 _MOST_NAMED = 20
 
@@ -35,8 +33,6 @@ def add_options(sub: CommandParser) -> None:
     _add_replay(commands)
     _add_table(commands)
     _add_compare(commands)
-    _add_tune(commands)
-    _add_simulate(commands)
 
 
 def _command(commands: Any, name: str, run: Any, about: str, *examples: str) -> CommandParser:
@@ -79,9 +75,23 @@ def _add_replay(commands: Any) -> None:
         metavar="KEY=V1,V2",
         help="replay with each of these values of a parameter",
     )
-    _add_truth(sub)
+    sub.add_argument(
+        "--truth",
+        default="",
+        metavar="PATTERN",
+        help="truth of each recording: {path}, {folder} and {stem} are replaced",
+    )
     sub.add_argument("--report", action="store_true", help="write a report on each run")
-    _add_machine(sub)
+    sub.add_argument(
+        "--workers", type=values.count, default=0, metavar="N", help="processes (default: one for each core)"
+    )
+    sub.add_argument("--scheduler", default="", metavar="ADDRESS", help="Dask scheduler to use, as tcp://host:8786")
+    sub.add_argument(
+        "--limit", type=values.positive, default=3600.0, metavar="S", help="seconds for one run (default: 3600)"
+    )
+    sub.add_argument(
+        "--memory", type=values.positive, default=0.0, metavar="MIB", help="memory for one run (default: any)"
+    )
 
 
 def _add_table(commands: Any) -> None:
@@ -121,97 +131,6 @@ def _add_compare(commands: Any) -> None:
     sub.add_argument("--markdown", type=Path, metavar="FILE", help="write the comparison as Markdown")
 
 
-def _add_tune(commands: Any) -> None:
-    sub = _command(
-        commands,
-        "tune",
-        tune,
-        "tune parameters on recordings, and prove them on others that they were not tuned on",
-        "drives/ --parameters 'odometry.*_density,landmarks.added_sigma_m' --out tuning",
-        "drives/ --parameters landmarks.added_sigma_m --objective nees --truth '{path}:/ground_truth' --out tuning",
-    )
-    sub.add_argument("recordings", nargs="+", metavar="BAG", help="as of fleet replay; a third is held out")
-    sub.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the study and tuned.yaml")
-    sub.add_argument(
-        "--parameters", required=True, metavar="A,B", help="names or patterns of parameters that are numbers above 0"
-    )
-    sub.add_argument(
-        "--objective",
-        default="likelihood",
-        choices=("likelihood", "nees", "chi2", "rmse"),
-        help="what is made best: likelihood (default): of sightings left out, without truth; nees, rmse: with --truth",
-    )
-    sub.add_argument("--trials", type=values.count, default=24, metavar="N", help="of the search (default: 24)")
-    sub.add_argument("--seed", type=int, default=0, metavar="N", help="of the search (default: 0)")
-    sub.add_argument("--config", type=Path, nargs=1, default=[], metavar="YAML", help="what is configured")
-    sub.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="set a parameter")
-    _add_truth(sub)
-    _add_machine(sub)
-
-
-def _add_simulate(commands: Any) -> None:
-    sub = _command(
-        commands,
-        "simulate",
-        simulate,
-        "simulate worlds with many seeds and faults, replay them, and compare them with their truth",
-        "warehouse --seeds 100 --out sweep",
-        "warehouse --fault wrong_ids noisy:factor=4 --set aisles=2,4 --set robust.decide=true,false --out sweep",
-    )
-    sub.add_argument("worlds", nargs="+", metavar="WORLD", help="as of graph_slam simulate")
-    sub.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the results")
-    sub.add_argument("--seeds", type=values.count, default=10, metavar="N", help="drives of each (default: 10)")
-    sub.add_argument("--seed", type=int, default=0, metavar="N", help="the first seed (default: 0)")
-    sub.add_argument(
-        "--fault",
-        nargs="+",
-        action="extend",
-        default=[],
-        metavar="KIND",
-        help="KIND or KIND:KEY=VALUE,...; also without any",
-    )
-    sub.add_argument(
-        "--config",
-        type=Path,
-        nargs="+",
-        action="extend",
-        default=[],
-        metavar="YAML",
-        help="replay with each of these files",
-    )
-    sub.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="KEY=V1,V2",
-        help="with each of these values: of a parameter if KEY has a dot, else of an option of the worlds",
-    )
-    _add_machine(sub)
-
-
-def _add_truth(sub: CommandParser) -> None:
-    sub.add_argument(
-        "--truth",
-        default="",
-        metavar="PATTERN",
-        help="truth of each recording: {path}, {folder} and {stem} are replaced",
-    )
-
-
-def _add_machine(sub: CommandParser) -> None:
-    """Options of runs: workers, limits."""
-    sub.add_argument(
-        "--workers", type=values.count, default=0, metavar="N", help="processes (default: one for each core)"
-    )
-    sub.add_argument("--scheduler", default="", metavar="ADDRESS", help="Dask scheduler to use, as tcp://host:8786")
-    sub.add_argument(
-        "--limit", type=values.positive, default=3600.0, metavar="S", help="seconds for one run (default: 3600)"
-    )
-    sub.add_argument(
-        "--memory", type=values.positive, default=0.0, metavar="MIB", help="memory for one run (default: any)"
-    )
-
-
 def _replay(args: argparse.Namespace) -> int:
     from graph_slam_ros.tools.fleet.engine import Workers
     from graph_slam_ros.tools.fleet.page import write_page
@@ -230,7 +149,7 @@ def _replay(args: argparse.Namespace) -> int:
         args.report,
     )
     try:
-        done = replay_all(work, Workers(args.scheduler, args.workers), _progress, _name_dashboard)
+        done = replay_all(work, Workers(args.scheduler, args.workers), _progress)
     except KeyboardInterrupt:
         console.warn(f"stopped: what is done is in {args.out}, and the same command goes on from there")
         return console.INTERRUPTED
@@ -269,11 +188,6 @@ def _progress(label: str) -> Any:
             yield item
 
     return bar
-
-
-def _name_dashboard(link: str) -> None:
-    if importlib.util.find_spec("bokeh"):
-        console.warn(f"dashboard: {link}")
 
 
 def _table(args: argparse.Namespace) -> int:

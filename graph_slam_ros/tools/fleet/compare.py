@@ -108,7 +108,7 @@ def compare(old: Path, new: Path, limits: Sequence[Limit] = ()) -> Comparison:
     gained = [_name(k) for k in common if not _ok(before[k]) and _ok(after[k])]
     both = [k for k in common if _ok(before[k]) and _ok(after[k])]
     metrics = dict.fromkeys((*METRICS, *(one.metric for one in limits)))
-    changes = [change for metric in metrics if (change := change_of(metric, both, before, after))]
+    changes = [change for metric in metrics if (change := _change_of(metric, both, before, after))]
     return Comparison(
         changes,
         lost,
@@ -138,7 +138,7 @@ def _name(key: Key) -> str:
     return " ".join(part for part in key if part)
 
 
-def change_of(metric: str, keys: Sequence[Key], before: Mapping[Key, Any], after: Mapping[Key, Any]) -> Change | None:
+def _change_of(metric: str, keys: Sequence[Key], before: Mapping[Key, Any], after: Mapping[Key, Any]) -> Change | None:
     """The change of a metric over recordings and settings; None if none has it in both, above 0."""
     pairs = [(k, before[k].get(metric), after[k].get(metric)) for k in keys]
     pairs = [(k, float(a), float(b)) for k, a, b in pairs if a is not None and b is not None and a > 0.0 and b > 0.0]

@@ -37,11 +37,9 @@ from graph_slam_ros.tools.fleet.store import (
     keep,
     traces,
 )
-from graph_slam_ros.tools.fleet.worlds import world_of
 
 if TYPE_CHECKING:
     from graph_slam_ros.config import Config
-    from graph_slam_ros.slam import GraphSlam
 
 _HASHED = ("graph.g2o", "ledger.csv", "path.tum", "landmarks.csv")
 _OF_THE_MACHINE = {errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS, errno.ESTALE, errno.EMFILE, errno.ENFILE}
@@ -64,8 +62,6 @@ class Job:
     limit_s : seconds after which it is ended
     memory : bytes that it may use in addition to what the worker has; 0 without limit
     with_report : write a page on the run
-    held_out : score how well left-out sightings are predicted
-    keeps_run : keep the run folder; else the row alone
     """
 
     key: str
@@ -78,8 +74,6 @@ class Job:
     limit_s: float
     memory: int
     with_report: bool
-    held_out: bool = False
-    keeps_run: bool = True
 
 
 def run_job(job: Job) -> Row:
@@ -103,8 +97,6 @@ def run_job(job: Job) -> Row:
             except (GraphSlamError, MemoryError) as error:
                 _check_machine(out, error)
                 row |= {"state": "failed", "reason": _reason(job, error)}
-        if not job.keeps_run:
-            shutil.rmtree(made / RUN, ignore_errors=True)
         keep(out, job.key, made, row)
     finally:
         shutil.rmtree(made, ignore_errors=True)
@@ -128,8 +120,7 @@ def report_on(job: Job) -> Row:
 
 def head(job: Job) -> Row:
     """Return the columns that say which job it is."""
-    about = {"key": job.key, "recording": job.recording, "setting": job.setting, "url": job.url, "truth": job.truth}
-    return about | world_of(job.url)
+    return {"key": job.key, "recording": job.recording, "setting": job.setting, "url": job.url, "truth": job.truth}
 
 
 def _check_machine(out: Path, error: BaseException) -> None:
@@ -202,14 +193,9 @@ def _results(job: Job, made: Path) -> Row:
         row, lost = columns(done.summary), [*shortcomings(done.summary), *done.losses]
         if job.truth:
             try:
-                row |= _scores(made / RUN, str(source) if world_of(job.url) else job.truth)
+                row |= _scores(made / RUN, job.truth)
             except GraphSlamError as error:
                 lost.append(f"not compared with the truth: {error}")
-        if job.held_out:
-            try:
-                row |= _held_out(done.slam)
-            except GraphSlamError as error:
-                lost.insert(0, f"no held-out likelihood: {error}")
     if not done.summary["keyframes"]:
         raise GraphSlamError("no odometry of it could be used: graph_slam info says what is in it")
     if job.with_report:
@@ -239,14 +225,6 @@ def _inputs(job: Job, recording: Path) -> tuple["Config", tuple[str | None, str 
         found.topics.get("odom"),
         found.topics.get("detections"),
     )
-
-
-def _held_out(slam: "GraphSlam") -> Row:
-    """The held-out likelihood of a run."""
-    from graph_slam_ros.tools.fleet.held_out import held_out
-
-    found = held_out(slam)
-    return {"held_out_nats": found.nats, "held_out_sightings": found.sightings}
 
 
 def columns(summary: Mapping[str, Any]) -> Row:

@@ -10,7 +10,6 @@ from typing import Any
 from fsspec.core import url_to_fs
 
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.tools.fleet.worlds import record, world_of
 
 _SUFFIXES = (".mcap", ".bag", ".db3", ".mcap.zstd", ".db3.zstd", ".bag.active")
 _METADATA = "metadata.yaml"
@@ -121,15 +120,13 @@ def fingerprint(url: str) -> str:
 
 
 def local_copy(url: str, folder: Path) -> Path:
-    """Return where a recording can be read on this machine: itself, or in ``folder`` a copy or a simulated one.
+    """Return where a recording can be read on this machine: itself, or a copy in ``folder``.
 
     Raises
     ------
     GraphSlamError
         It is not there, seen from this machine.
     """
-    if world_of(url):
-        return record(url, folder)
     fs, root = url_to_fs(url)
     if not fs.exists(root):
         raise GraphSlamError(f"{url}: no such file or folder on this worker: put recordings where all workers see them")

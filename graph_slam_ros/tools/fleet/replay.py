@@ -146,14 +146,12 @@ def replay_all(
     fleet: Fleet,
     workers: Workers,
     progress: Callable[[str], Progress] = lambda _: lambda items, _total: items,
-    on_start: Callable[[str], None] = lambda _: None,
 ) -> Done:
     """Run all jobs that are not in the folder yet, and write the table.
 
     Parameters
     ----------
     progress : of a label, wraps a sequence
-    on_start : is called with the address of Dask's dashboard
 
     Raises
     ------
@@ -168,14 +166,13 @@ def replay_all(
     with store.locked():
         store.forget_attempts()
         with connected(workers) as client:
-            on_start(client.dashboard_link)
             known = fingerprints(client, store, sources, progress("hash"))
             every = jobs_of(fleet, sources, known)
             first = {job.key: job for job in reversed(every)}
             jobs = [job for job in every if first[job.key] is job]
             copies = {job.recording: first[job.key].recording for job in every if first[job.key] is not job}
             try:
-                by_key, reused = run_missing(client, store, jobs, progress("replay"))
+                by_key, reused = _run_missing(client, store, jobs, progress("replay"))
                 bare = [job for job in jobs if _lacks_report(store, job, by_key[job.key])]
                 reported = list(run_jobs(client, bare, progress("report"), partial(run_isolated, task="report")))
             finally:
@@ -185,7 +182,7 @@ def replay_all(
     return Done(list(by_key.values()), reused, unreadable, copies, unreported)
 
 
-def run_missing(client: Client, store: Store, jobs: Sequence[Job], progress: Progress) -> tuple[dict[str, Row], int]:
+def _run_missing(client: Client, store: Store, jobs: Sequence[Job], progress: Progress) -> tuple[dict[str, Row], int]:
     """Run the jobs that have no result yet. Return the rows of all by key, and how many were there."""
     by_key = {job.key: job for job in jobs}
     rows = {key: row for key in by_key if (row := store.result(key)) and not row.get("retry")}

@@ -14,10 +14,7 @@ from graph_slam_ros.formats.durable import write_whole
 from graph_slam_ros.tools.fleet.store import ERRORS, TABLE, Row
 
 FIRST = ("recording", "setting", "state", "rmse_m", "rpe_m_per_m", "nees", "keyframes", "cpu_s", "memory_mib", "reason")
-_TEXTS = {
-    *("key", "recording", "setting", "url", "truth", "state"),
-    *("reason", "worker", "map_hash", "world", "fault", "inputs"),
-}
+_TEXTS = {"key", "recording", "setting", "url", "truth", "state", "reason", "worker", "map_hash", "inputs"}
 _NO_COLUMNS = {"retry", ERRORS}
 _TOGETHER = 10_000
 

@@ -4,7 +4,7 @@ recording = simulate("warehouse", seed=7, aisles=5)
 write_bag(recording, "warehouse.mcap")
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -57,19 +57,14 @@ def simulate(world: str, /, seed: int, **options: Any) -> Recording:
     GraphSlamError
         Unknown world or option (those that exist are named), wrong type, or a value out of bounds.
     """
-    of_world, of_instruments = check_options(world, seed, options)
-    return with_instruments(WORLDS[world].drive(seed, of_world), seed, of_instruments)
-
-
-def check_options(world: str, seed: int, options: Mapping[str, Any]) -> tuple[Any, Instruments]:
-    """Return the options of a world and of its instruments; as ``simulate``, which drives through it."""
     if world not in WORLDS:
         raise GraphSlamError(f"no world {world!r}; there are {', '.join(WORLDS)}{did_you_mean(world, WORLDS)}")
     check_seed(seed)
-    of_instruments = {o.name for o in options_of(Instruments)}
-    chosen = {name: value for name, value in options.items() if name in of_instruments}
-    rest = {name: value for name, value in options.items() if name not in of_instruments}
-    return fill(world, WORLDS[world].options, rest, [*of_instruments]), fill(world, Instruments, chosen)
+    names = {o.name for o in options_of(Instruments)}
+    chosen = {name: value for name, value in options.items() if name in names}
+    rest = {name: value for name, value in options.items() if name not in names}
+    of_world: Any = fill(world, WORLDS[world].options, rest, [*names])
+    return with_instruments(WORLDS[world].drive(seed, of_world), seed, fill(world, Instruments, chosen))
 
 
 def write_faulty_bag(recording: Recording, path: Path, faults: Sequence[Fault], seed: int) -> list[WrongMessage]:
@@ -100,7 +95,6 @@ __all__ = [
     "World",
     "WrongLine",
     "WrongMessage",
-    "check_options",
     "city_graph",
     "faulty_graph",
     "faulty_recording",

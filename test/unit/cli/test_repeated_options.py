@@ -18,7 +18,7 @@ def refused(monkeypatch, capsys, *words):
 
 @pytest.mark.parametrize("words", (("warehouse", "--fault", "nonsense", "--fault", "wrong_ids"),))
 def test_the_first_of_two_faults_is_not_forgotten(monkeypatch, capsys, tmp_path, words):
-    code, said = refused(monkeypatch, capsys, "fleet", "simulate", *words, "--out", tmp_path / "out")
+    code, said = refused(monkeypatch, capsys, "simulate", *words, "--out", tmp_path / "out")
     assert code == 2
     assert "nonsense" in said
 
