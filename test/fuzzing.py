@@ -25,10 +25,8 @@ from mcap.writer import CompressionType
 from recordings import TOPICS, short_drive, to_ros1, to_sqlite, write_mcap
 
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.formats.convert import write_graph
 from graph_slam_ros.formats.g2o import read_g2o
 from graph_slam_ros.formats.parameters import read_parameters
-from graph_slam_ros.optimization import started
 from graph_slam_ros.recordings.bag import open_bag
 from graph_slam_ros.runs.chosen_inputs import choose_inputs
 from graph_slam_ros.runs.replay import measurements
@@ -158,16 +156,10 @@ def ros1(folder):
 
 
 def graphs(folder):
-    from graph_texts import PLANE, SPACE
+    from graph_texts import PLANE, SPACE, in_dialect
 
-    texts = []
-    for name, text, endings in (("plane", PLANE, ("g2o", "toro", "gtsam")), ("space", SPACE, ("g2o", "toro"))):
-        (folder / f"{name}.g2o").write_text(text)
-        for ending in endings:
-            file = read_g2o(folder / f"{name}.g2o")
-            write_graph(folder / f"again.{ending}", file, started(file, "file")[0].estimate, ending)
-            texts.append((folder / f"again.{ending}").read_bytes())
-    return texts
+    twins = ((PLANE, "toro"), (PLANE, "gtsam"), (SPACE, "toro"))
+    return [text.encode() for text in (PLANE, SPACE, *(in_dialect(*twin)[1] for twin in twins))]
 
 
 def parameter_files(folder):

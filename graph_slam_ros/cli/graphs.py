@@ -1,4 +1,4 @@
-"""The commands on graphs: ``optimize`` and ``convert``."""
+"""The command ``optimize``: solves the graph of a file."""
 
 import argparse
 import json
@@ -29,6 +29,8 @@ _NO_VALUES = "the file has no vertex lines"
 def optimize(args: argparse.Namespace) -> int:
     """Solve a graph, print the outcome, write it and draw it."""
     from graph_slam_ros.formats.g2o_writer import write_g2o
+    from graph_slam_ros.formats.strict import ending
+    from graph_slam_ros.formats.tum import write_trajectory
     from graph_slam_ros.optimization import optimize as solve
     from graph_slam_ros.optimization import started
     from graph_slam_ros.solver import Settings
@@ -53,7 +55,7 @@ def optimize(args: argparse.Namespace) -> int:
         console.show(*_optimize_text(report, start_text, args.loss), *_starts_text(solution))
         console.show(*(proof.text(report.chi2_final) if proof else ()))
     if args.out:
-        write_g2o(args.out, file, solver.estimate)
+        (write_trajectory if ending(args.out) == ".tum" else write_g2o)(args.out, file, solver.estimate)
     if args.plot:
         _plot_graph(args.plot, graph, _positions(graph, started(file, start)[0]), _positions(graph, solver))
     _warn_unknown(file)
@@ -65,6 +67,8 @@ def optimize(args: argparse.Namespace) -> int:
 
 
 def _after(args: argparse.Namespace, converged: bool) -> str:
+    from graph_slam_ros.formats.strict import ending
+
     if not converged:
         start = "online" if args.init == "chordal" else "chordal"
         words = _options(argparse.Namespace(**vars(args) | {"init": start}))
@@ -72,7 +76,9 @@ def _after(args: argparse.Namespace, converged: bool) -> str:
     if args.out is None:
         words = _options(args)
         return f"{console.command('optimize', args.graph, *words, '--out', 'SOLVED.g2o')} (the same, and write it)"
-    return f"{console.command('convert', args.out, 'POSES.tum')} (the poses as a trajectory)"
+    if ending(args.out) == ".tum":
+        return f"evo_traj tum {shlex.quote(str(args.out))} --plot, or any reader of TUM trajectories"
+    return f"{console.command('optimize', args.out, '--out', 'POSES.tum')} (the poses as a trajectory)"
 
 
 def _options(args: argparse.Namespace) -> Iterable[str]:
@@ -87,33 +93,6 @@ def _options(args: argparse.Namespace) -> Iterable[str]:
             yield from (f"--{option}", _loss_text(value) if name == "loss" else str(value))
     if args.lenient:
         yield "--lenient"
-
-
-def convert(args: argparse.Namespace) -> int:
-    """Write a graph in another format."""
-    from graph_slam_ros.formats.convert import NAMES, format_of, write_graph
-    from graph_slam_ros.formats.strict import ending
-    from graph_slam_ros.optimization import started
-
-    target = args.to or format_of(args.out)
-    if ending(args.graph) == ".tum" and not args.source:
-        raise GraphSlamError(f"{args.graph}: a trajectory has no edges, and so is no graph: TUM is only written")
-    console.check_file(args.out, force=args.force, source=args.graph)
-    file = _read_graph(args)
-    if file.has_values or target != "gtsam":  # which alone needs no vertex lines
-        solver, start = started(file, "file")
-        written = write_graph(args.out, file, solver.estimate, target)
-        if not file.has_values:
-            console.show(f"{_NO_VALUES}: those of {STARTS[start]} are written")
-    else:
-        written = write_graph(args.out, file, None, target)
-    vertices = f"{written.vertices} of {file.graph.vertex_count} vertices"
-    console.show(f"wrote {args.out} as {NAMES[target]}: {vertices}, {written.edges} of {file.graph.edge_count} edges")
-    reader = "evo_traj tum" if target == "tum" else "graph_slam optimize"
-    console.then(shlex.join([*reader.split(), str(args.out)]))
-    if target == "g2o":
-        _warn_unknown(file)
-    return console.report_losses(file.skipped + written.lost)
 
 
 def _read_graph(args: argparse.Namespace, **options: Any) -> "G2oFile":

@@ -141,26 +141,9 @@ def optimize(sub: CommandParser) -> None:
     )
     _add_reading(sub)
     _add_json(sub, "the answer")
-    sub.add_argument("--out", type=Path, metavar="FILE.g2o", help="write the solved graph")
+    sub.add_argument("--out", type=Path, metavar="FILE.g2o|FILE.tum", help="write the solved graph, or its poses")
     sub.add_argument("--plot", type=Path, metavar="FILE.png", help="draw the initial estimate and the result")
     _add_force(sub)
-
-
-def convert(sub: CommandParser) -> None:
-    """Add the options of ``convert``."""
-    sub.codes = f"What the format of B cannot express is left out and reported; the exit code is 3. {CODES}"
-    sub.add_argument("graph", type=Path, metavar="A", help="g2o, TORO, iSAM or GTSAM text")
-    sub.add_argument(
-        "out",
-        type=Path,
-        metavar="B",
-        help="output file; format by its ending: .g2o; .toro, .graph; .gtsam; .tum (poses, id as stamp)",
-    )
-    sub.add_argument(
-        "--to", choices=("g2o", "toro", "gtsam", "tum"), help="format of B, instead of the one of its ending"
-    )
-    _add_force(sub)
-    _add_reading(sub)
 
 
 def simulate(sub: CommandParser) -> None:

@@ -151,12 +151,6 @@ COMMANDS = {
         "solve a graph: g2o, TORO, iSAM or GTSAM text",
         "graph.g2o --out solved.g2o --plot graph.png",
     ),
-    "convert": Command(
-        graphs.convert,
-        options.convert,
-        "write a graph in another format: g2o, TORO, GTSAM text; its poses as TUM",
-        "graph.g2o graph.toro",
-    ),
     "simulate": Command(
         later("tools.simulation.command", "simulate"),
         options.simulate,
@@ -207,7 +201,7 @@ def parser(command: str | None = None) -> argparse.ArgumentParser:
     """
     whole = CommandParser(
         prog="graph_slam",
-        description="Online pose-graph SLAM: replay recordings, optimise and convert graphs, simulate, evaluate.",
+        description="Online pose-graph SLAM: replay recordings, optimise graphs, simulate, evaluate.",
         examples=("graph_slam info drive.mcap", "graph_slam replay drive.mcap --out drive_run"),
     )
     whole.add_argument("--version", action="version", version=f"graph_slam_ros {__version__}")

@@ -1,7 +1,6 @@
-"""Other texts for graphs, said in g2o's words and back: TORO, iSAM (VERTEX2, EDGE2), GTSAM (ODOMETRY, LANDMARK).
+"""Other texts for graphs, read as g2o's lines: TORO, iSAM (VERTEX2, EDGE2), GTSAM (ODOMETRY, LANDMARK).
 
-Each line is turned into the g2o line of the same meaning, so there is one reader, one set of checks and one graph; and
-a g2o line into the line of the same meaning, so there is one writer.
+Each line is turned into the g2o line of the same meaning, so there is one reader, one set of checks and one graph.
 
 * TORO: the information of EDGE2 as I11 I12 I22 I33 I13 I23, that of EDGE3 in rows of the upper triangle; angles in
   radians, roll, pitch and yaw about fixed axes. It has poses and what is between them, nothing else.
@@ -18,14 +17,13 @@ import numpy as np
 
 from graph_slam_ros.errors import FormatError
 from graph_slam_ros.formats.strict import expect, integer, numbers
-from graph_slam_ros.lie import se2, so3
+from graph_slam_ros.lie import so3
 
 Words: TypeAlias = list[str]
 
 LANDMARK_IDS_FROM = 1_000_000_000  # GTSAM's text numbers landmarks apart from poses
 
 _TORO = [0, 1, 4, 2, 5, 3]  # where g2o's rows of the upper triangle stand in TORO's order
-_TO_TORO = [0, 1, 3, 5, 2, 4]
 _HALVED = np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.5])
 _UPPER_3D = np.triu_indices(6)
 
@@ -72,15 +70,6 @@ def may_be_roots(words: Words, text: Text) -> bool:
     return not np.array_equal(numbers(words[9:]), np.eye(6)[_UPPER_3D])  # which is its own root
 
 
-def from_g2o_words(words: Words, text: Text) -> Words | None:
-    """The g2o line in the text's dialect; None if the dialect has no such line."""
-    translate = _WRITTEN[text.dialect or "g2o"].get(words[0])
-    return None if translate is None else translate(words, text)
-
-
-# -- reading ---------------------------------------------------------------------------------------------------------
-
-
 def _vertex2(words: Words, _: Text) -> Words:
     expect(words, 4)
     return ["VERTEX_SE2", *words[1:]]
@@ -122,7 +111,7 @@ def _odometry(words: Words, text: Text) -> Words:
     expect(words, 11)
     if text.dialect == "isam":
         return ["EDGE_SE2", *words[1:6], *_written(_squared(numbers(words[6:])))]
-    return ["EDGE_SE2", *words[1:6], *_written(_inverse(numbers(words[6:]), "covariance"))]
+    return ["EDGE_SE2", *words[1:6], *_written(_inverse(numbers(words[6:])))]
 
 
 def _landmark(words: Words, text: Text) -> Words:
@@ -130,7 +119,7 @@ def _landmark(words: Words, text: Text) -> Words:
     landmark = str(LANDMARK_IDS_FROM + integer(words[2]))
     if text.dialect == "isam":
         return ["EDGE_SE2_XY", words[1], landmark, *words[3:5], *_written(_squared(numbers(words[5:])))]
-    return ["EDGE_SE2_XY", words[1], landmark, *words[3:5], *_written(_inverse(numbers(words[5:]), "covariance"))]
+    return ["EDGE_SE2_XY", words[1], landmark, *words[3:5], *_written(_inverse(numbers(words[5:])))]
 
 
 def _point(words: Words, text: Text) -> Words:
@@ -152,65 +141,11 @@ _READ: dict[str, Translation] = {
 }
 
 
-# -- writing ---------------------------------------------------------------------------------------------------------
-
-
-def _as_it_is(words: Words, _: Text) -> Words:
-    return words
-
-
-def _to_vertex2(words: Words, _: Text) -> Words:
-    return ["VERTEX2", *words[1:]]
-
-
-def _to_edge2(words: Words, _: Text) -> Words:
-    return ["EDGE2", *words[1:6], *(words[6 + k] for k in _TO_TORO)]
-
-
-def _to_vertex3(words: Words, _: Text) -> Words:
-    return ["VERTEX3", words[1], *_written(_xyz_rpy(numbers(words[2:])))]
-
-
-def _to_edge3(words: Words, text: Text) -> Words:
-    information = np.array(numbers(words[10:]))
-    if not text.raw:
-        information = information * np.outer(_HALVED, _HALVED)[_UPPER_3D]
-    return ["EDGE3", *words[1:3], *_written(_xyz_rpy(numbers(words[3:10]))), *_written(information.tolist())]
-
-
-def _to_odometry(words: Words, _: Text) -> Words:
-    return ["ODOMETRY", *words[1:6], *_written(_inverse(numbers(words[6:]), "information"))]
-
-
-def _to_landmark(words: Words, text: Text) -> Words:
-    landmark = str(integer(words[2]) - text.landmarks_from)
-    return ["LANDMARK", words[1], landmark, *words[3:5], *_written(_inverse(numbers(words[5:]), "information"))]
-
-
-def _to_point(words: Words, text: Text) -> Words:
-    return ["VERTEX_XY", str(integer(words[1]) - text.landmarks_from), *words[2:]]
-
-
 _G2O = ("VERTEX_SE2", "VERTEX_XY", "EDGE_SE2", "EDGE_SE2_XY", "EDGE_PRIOR_SE2", "EDGE_SE2_POSITION")
 _G2O_3D = ("VERTEX_SE3:QUAT", "VERTEX_TRACKXYZ", "EDGE_SE3:QUAT")
 
-_WRITTEN: dict[str, dict[str, Translation]] = {
-    "g2o": dict.fromkeys([*_G2O, *_G2O_3D, "FIX"], _as_it_is),
-    "toro": {
-        "VERTEX_SE2": _to_vertex2,
-        "EDGE_SE2": _to_edge2,
-        "VERTEX_SE3:QUAT": _to_vertex3,
-        "EDGE_SE3:QUAT": _to_edge3,
-    },
-    "gtsam": {
-        "VERTEX_SE2": _as_it_is,
-        "VERTEX_XY": _to_point,
-        "EDGE_SE2": _to_odometry,
-        "EDGE_SE2_XY": _to_landmark,
-    },
-}
 _TAGS = {
-    "g2o": frozenset(_WRITTEN["g2o"]),
+    "g2o": frozenset({*_G2O, *_G2O_3D, "FIX"}),
     "toro": frozenset({"VERTEX2", "EDGE2", "VERTEX3", "EDGE3"}),
     "gtsam": frozenset({"VERTEX_SE2", "VERTEX2", "VERTEX_XY", "ODOMETRY", "LANDMARK"}),
     "isam": frozenset({"VERTEX2", "EDGE2", "ODOMETRY", "LANDMARK", "VERTEX3", "EDGE3"}),
@@ -227,19 +162,6 @@ def _pose(xyz_rpy: list[float]) -> list[float]:
     roll, pitch, yaw = xyz_rpy[3:6]
     about_z, about_y, about_x = so3.exp((0.0, 0.0, yaw)), so3.exp((0.0, pitch, 0.0)), so3.exp((roll, 0.0, 0.0))
     return [*xyz_rpy[:3], *(float(q) for q in so3.compose(so3.compose(about_z, about_y), about_x))]
-
-
-def _xyz_rpy(pose: list[float]) -> list[float]:
-    """Back from ``_pose``; exact to rounding also where the pitch is 90 degrees, since no arcsine is taken.
-
-    With half the sum and half the difference of roll and yaw, ``x + z`` and ``w - y`` are the sine and cosine of the
-    one times ``sqrt(2) sin(pi/4 - pitch/2)``, ``x - z`` and ``w + y`` those of the other times the cosine.
-    """
-    x, y, z, w = pose[3:7]
-    half_sum, half_difference = np.arctan2(x + z, w - y), np.arctan2(x - z, w + y)
-    pitch = 0.5 * np.pi - 2.0 * np.arctan2(np.hypot(x + z, w - y), np.hypot(x - z, w + y))
-    roll, yaw = se2.wrap(half_sum + half_difference), se2.wrap(half_sum - half_difference)
-    return [*pose[:3], float(roll), float(pitch), float(yaw)]
 
 
 def _is_definite(upper: list[float]) -> bool:
@@ -260,23 +182,23 @@ def _squared(rows: list[float]) -> list[float]:
     return out
 
 
-def _inverse(upper: list[float], what: str) -> list[float]:
-    """The inverse of a symmetric matrix from its upper triangle, computed by correlations as units may differ much."""
+def _inverse(upper: list[float]) -> list[float]:
+    """The inverse of a covariance from its upper triangle, computed by correlations as units may differ much."""
     size = 3 if len(upper) == 6 else 2
     matrix = np.zeros((size, size))
     at = np.triu_indices(size)
     matrix[at] = upper
     matrix.T[at] = upper
     if not (np.diagonal(matrix) > 0.0).all():
-        raise FormatError(f"the {what} is not positive definite")
+        raise FormatError("the covariance is not positive definite")
     scale = 1.0 / np.sqrt(np.diagonal(matrix))
     correlation = matrix * scale[:, None] * scale
     if not np.linalg.det(correlation) > 0.0:
-        raise FormatError(f"the {what} is not positive definite")
+        raise FormatError("the covariance is not positive definite")
     with np.errstate(over="ignore"):
         inverse = (np.linalg.inv(correlation) * scale[:, None] * scale)[at]
     if not np.isfinite(inverse).all():
-        raise FormatError(f"the {what} is too small to have an inverse")
+        raise FormatError("the covariance is too small to have an inverse")
     out: list[float] = inverse.tolist()
     return out
 

@@ -4,8 +4,8 @@ Information matrices are taken as they are, but for one thing: g2o measures a ro
 its quaternion, which is half the rotation vector, so a rotation's information counts a quarter in our residual.
 A sighting in space is measured in a sensor's frame, and names the parameter that says where that is on the robot; in
 the graph it is in the robot's. Tags of ours stand for what g2o has no word for. Unknown tags are kept, word for word,
-and written back. TORO's, iSAM's and GTSAM's texts are read as well (``dialects``, and ``convert`` to write them), and
-files without vertex lines.
+and written back. TORO's, iSAM's and GTSAM's texts are read as well (``dialects``), and files
+without vertex lines.
 """
 
 import itertools

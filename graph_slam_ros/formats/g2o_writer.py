@@ -18,28 +18,22 @@ from graph_slam_ros.formats.graph_file import (
     moved,
 )
 from graph_slam_ros.formats.strict import is_gzipped
-from graph_slam_ros.graph import LANDMARK_POSITION_3D, POSE_PRIOR_3D, EdgeType, Graph
+from graph_slam_ros.graph import LANDMARK_POSITION_3D, POSE_PRIOR_3D, EdgeType
 from graph_slam_ros.lie import se3
 
 
-def write_g2o(path: Path | str, file: G2oFile, values: Values) -> int:
+def write_g2o(path: Path | str, file: G2oFile, values: Values) -> None:
     """Write a graph; ``values(ids)`` gives the numbers of vertices of one kind, e.g. ``Solver.estimate``.
 
     17 significant digits: what is read back is what was written. The information of an edge is multiplied by its
-    weight; one of weight 0 is out of the problem, and left out. Returns how many were.
+    weight; one of weight 0 is out of the problem, and left out.
     """
     write_text(path, g2o_text(file, values))
-    return weightless(file.graph)
 
 
 def g2o_text(file: G2oFile, values: Values) -> str:
     """Return what ``write_g2o`` writes."""
     return "\n".join(graph_lines(file, values)) + "\n"
-
-
-def weightless(graph: Graph) -> int:
-    """Return the number of edges with weight 0."""
-    return sum(int((table.weight.values == 0.0).sum()) for table in graph.tables.values())
 
 
 def write_text(path: Path | str, text: str) -> None:
@@ -51,9 +45,9 @@ def write_text(path: Path | str, text: str) -> None:
         raise FormatError(f"{path}: {error.strerror}") from None
 
 
-def graph_lines(file: G2oFile, values: Values | None) -> list[str]:
-    """The lines of a g2o file; without values, those of the edges alone."""
-    out = [] if values is None else _vertex_lines(file, values)
+def graph_lines(file: G2oFile, values: Values) -> list[str]:
+    """The lines of a g2o file."""
+    out = _vertex_lines(file, values)
     edges = sorted(_edge_lines(file), key=lambda edge: edge[:2])
     # A label's code and the number of its edges come first since GTSAM looks for two integers behind every tag in the
     # plane: where a line has none (a FIX line as well), it reads no edge after it.

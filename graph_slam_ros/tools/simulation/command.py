@@ -83,8 +83,8 @@ def _spoil_recording(args: argparse.Namespace, faults: "list[Fault]") -> int:
 
 
 def _write_graph(args: argparse.Namespace, faults: "list[Fault]") -> None:
-    from graph_slam_ros.formats.convert import write_graph
     from graph_slam_ros.formats.graph_file import G2oFile
+    from graph_slam_ros.formats.tum import write_trajectory
     from graph_slam_ros.tools.simulation import GRAPH_WORLDS, landmark_graph, options_of
     from graph_slam_ros.tools.simulation.pose_graph import truth_of, values_of
 
@@ -105,7 +105,7 @@ def _write_graph(args: argparse.Namespace, faults: "list[Fault]") -> None:
     file = G2oFile(graph, list(range(graph.vertex_count)), [0])
     _write_faulty(args, file, truth, faults)
     path = _companion(args.out, ".truth.tum")
-    write_graph(path, file, values_of(graph, truth), "tum")
+    write_trajectory(path, file, values_of(graph, truth))
     console.show(f"wrote {path}: the true poses")
 
 

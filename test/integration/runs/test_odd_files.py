@@ -315,7 +315,7 @@ TAKING = [  # what takes it, whatever it is for
     ("replay", "BAG", "--out", "OUT", "--config", "X"),
     ("merge", "RUN", "X", "--out", "OUT"),
     ("simulate", "warehouse", "--out", "OUT", "--fault", "X"),
-    ("convert", "X", "OUT"),
+    ("optimize", "X", "--out", "OUT"),
 ]
 
 

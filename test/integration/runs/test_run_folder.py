@@ -191,7 +191,10 @@ def test_a_run_or_a_file_that_is_there_is_replaced_with_force_alone(bag, run, tm
         assert "--force" in line
         assert state(tmp_path) == before
         assert code_of(*words, "--force") == 0, words
-    for words, out in ((["convert", graph], tmp_path / "a.toro"), (["optimize", graph, "--plot"], tmp_path / "a.png")):
+    for words, out in (
+        (["optimize", graph, "--out"], tmp_path / "a.g2o"),
+        (["optimize", graph, "--plot"], tmp_path / "a.png"),
+    ):
         assert code_of(*words, out) in (0, 3)
         assert code_of(*words, out) == 2
         assert code_of(*words, out, "--force") in (0, 3)

@@ -237,7 +237,7 @@ def test_each_command_ends_with_a_line_of_what_to_do_next(bag, run, tmp_path, ca
         ("freeze", run, "--out", tmp_path / "frozen"),
         ("export", run, "--to", "g2o", "--out", tmp_path / "a.g2o"),
         ("optimize", tmp_path / "a.g2o"),
-        ("convert", tmp_path / "a.g2o", tmp_path / "a.tum"),
+        ("optimize", tmp_path / "a.g2o", "--out", tmp_path / "a.tum"),
         ("simulate", "manhattan", "--poses", "20", "--out", tmp_path / "b.mcap"),
         ("diff", run, tmp_path / "a_run"),
         ("explain", run),
@@ -332,8 +332,7 @@ REFUSED = {
     "simulate nowhere": (["simulate", "manhattan", "--out", "/nowhere/a.mcap"], "/nowhere/a.mcap: No such file"),
     "missing graph": (["optimize", "none.g2o"], "none.g2o: no such file"),
     "unknown loss": (["optimize", "{text}", "--loss", "hubr"], "loss 'hubr': choose none, huber, cauchy"),
-    "unknown format": (["convert", "{text}", "{out}"], "its ending is none of .g2o, .toro, .graph, .gtsam, .tum"),
-    "no graph": (["convert", "{text}", "{out}", "--to", "g2o"], "no vertex in it; is it a graph?"),
+    "no graph": (["optimize", "{text}"], "no vertex in it; is it a graph?"),
     "truth is a run": (["evaluate", "{run}", "--truth", "{run}"], "a run, not the truth: graph_slam evaluate RUN"),
     "report of a recording": (
         ["report", "{bag}"],

@@ -98,6 +98,17 @@ def test_gzipped_graphs_are_solved_and_written(run, tmp_path, graph):
     assert answer_of(run, out)["chi2_initial"] == pytest.approx(answer["chi2_final"], rel=1e-9)
 
 
+def test_a_trajectory_has_the_poses_in_order_of_id_with_the_id_as_stamp(run, tmp_path, graph):
+    out = tmp_path / "poses.tum"
+    graph.write_text("VERTEX_SE2 30 5 6 -1\n" + SMALL + "EDGE_SE2 5 30 0 0 0 1 0 0 1 0 1\nFIX 3\n")
+    code, text, err = run(graph, "--out", out)
+    assert (code, err) == (0, "")
+    assert text.splitlines()[-1].startswith(f"next: evo_traj tum {out}")
+    rows = [[float(v) for v in line.split()] for line in out.read_text().splitlines()]
+    assert [row[0] for row in rows] == [3, 4, 5, 30]
+    assert rows[0][1:] == [0.5, 0, 0, 0, 0, 0, 1]
+
+
 def test_the_first_pose_is_held_where_nothing_else_fixes_the_graph(run, tmp_path, graph):
     out = tmp_path / "out.g2o"
     run(graph, "--out", out, "--force")

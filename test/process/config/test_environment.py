@@ -69,7 +69,7 @@ FULL = {  # what is written, and how it is called
     "mcap": ("export", "RUN", "--to", "mcap", "--out", "DISK/a.mcap"),
     "plot": ("plot", "RUN", "--out", "DISK/a.png"),
     "optimize": ("optimize", "GRAPH", "--out", "DISK/a.g2o"),
-    "convert": ("convert", "GRAPH", "DISK/a.toro"),
+    "poses": ("optimize", "GRAPH", "--out", "DISK/a.tum"),
 }
 
 
