@@ -17,9 +17,9 @@ _WINDOW_NS, _LEAST_WINDOWS, _LEAST_SAMPLES = 1_000_000_000, 20, 3
 _TURNING_RAD, _LEAST_TURNING = 0.1, 10
 _SCALE, _GROSS, _UNEXPLAINED, _BIAS_SIGMAS = 0.1, 0.4, 0.5, 3.0
 _OF_NOTHING = 0.2  # of odometry's turns: a gyro that measures none of them, but others
-_ROUNDS = 15
-_EXPLAINED = 0.5  # of a wrong heading: more than that is left where the gyro alone does not explain it
+_ROUNDS, _EXPLAINED = 15, 0.5  # of a wrong heading: more than that is left where the gyro alone does not explain it
 _EITHER = ": the track width is wrong, or the scale of the gyro"
+_OF_A_HEADING = ("id_reused", "ids_unsure", "landmark_moved", "map_breaks", "outliers")  # where that is wrong
 _MOST_BIAS = 1.0  # [rad/s] that gyro.bias_sigma may be
 
 
@@ -129,7 +129,7 @@ def of_gyro_or_wheels(findings: list[Finding], gyro_input: str) -> list[Finding]
         return rest  # both are wrong: the gyro's finding says by how much they differ
     text = f"{gyro.text.removesuffix(_EITHER)}: landmarks agree with odometry, so the scale of the gyro is wrong"
     mended = replace(gyro, text=text, settings=(assignment(f"{gyro_input}.use", "none"),))
-    return [mended if one is gyro else one for one in rest]
+    return [mended if one is gyro else one for one in rest if one.code not in _OF_A_HEADING]
 
 
 def _turned_over(c: Columns, T_base_gyro: se3.Pose) -> tuple[str, ...]:

@@ -43,7 +43,10 @@ from graph_slam_ros.lie import se3
 from graph_slam_ros.solver import LossKey, Settings
 from graph_slam_ros.typing import Numbers
 
-REMOVED = {"landmarks.follow_s": "observations without identity are compared with all landmarks around"}
+REMOVED = {
+    "landmarks.follow_s": "observations without identity are compared with all landmarks around",
+    "gyro.gate": "the gyro's turn replaces that of odometry",
+}
 """Parameters of earlier versions, which had no effect any more. Saved runs have them."""
 
 

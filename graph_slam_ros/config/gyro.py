@@ -24,7 +24,7 @@ class GyroConfig:
         high=1.0,
     )
     bias_sigma: float = setting(
-        0.02, "standard deviation of the gyro's bias before the robot has stood or driven", "rad/s", low=0.0, high=1.0
+        0.02, "standard deviation of the gyro's bias before the robot has stood", "rad/s", low=0.0, high=1.0
     )
     bias_walk: float = setting(1e-4, "random walk of the gyro's bias", "rad/s/sqrt(s)", low=0.0, high=0.1)
     bias_correlation_s: float = setting(
@@ -34,13 +34,6 @@ class GyroConfig:
         "s",
         low=1e-3,
         high=1e4,
-    )
-    gate: float = setting(
-        0.9999,
-        "odometry's turn over a second that differs from the gyro's by more than this part of their errors is not used",
-        "probability",
-        low=0.5,
-        high=1.0 - 1e-9,
     )
     timeout_s: float = setting(
         0.1,

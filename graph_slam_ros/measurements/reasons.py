@@ -160,10 +160,10 @@ REASONS: dict[str, Reason] = {
         "than their noise, so one is made of the other, and its errors would count twice",
         "leave the worse of both out; INPUT.sigma_factor below 1 for both if they are independent and that good",
     ),
-    "turn_slips": Reason(
+    "gyro_waiting": Reason(
         _NOTED,
-        "a turn of this odometry contradicts the gyro beyond gyro.gate: wheels slip, and the gyro's turn is used alone",
-        "odometry.turn_factor, if that is always so",
+        "a step of odometry turned without the gyro: its bias is not known before the robot has stood",
+        "stand for a second before the drive; gyro.bias_sigma where the bias is larger",
     ),
     "gyro_silent": Reason(
         _NOTED,
@@ -172,7 +172,7 @@ REASONS: dict[str, Reason] = {
     ),
     "gyro_doubted": Reason(
         _NOTED,
-        "a step of odometry turned without the gyro: most of the time it contradicts odometry",
+        "a step of odometry turned without the gyro: in most turns it contradicts odometry",
         "rad/s, counter-clockwise positive; its frame and TF or INPUT.mount; odometry.turn_factor",
     ),
     "no_angular_velocity": Reason(

@@ -28,7 +28,7 @@ _FEWEST_LOST = 2  # visits that are lost, which are said
 VISITS = ("visit_condensed", "visit_lost", "visit_wider")  # in the counters of "map"
 _MENDED = (  # of what is noted, signs of a wrong setting
     *("displaced", "displacement_taken_back", "jump"),
-    *("not_in_use", "turn_slips", "gyro_silent", "gyro_doubted", "odometry_contradicted", "odometry_alike"),
+    *("not_in_use", "gyro_waiting", "gyro_silent", "gyro_doubted", "odometry_contradicted", "odometry_alike"),
 )
 _CONTRADICT = (
     "graph_slam explain RUN says why. Check of this sensor and of odometry: metres and radians, y and bearings to the "
@@ -100,11 +100,11 @@ def _gyro_faults(summary: Summary) -> Iterator[str]:
         return
     name, counted = gyro["name"], summary["counters"].get(gyro["name"], {})
     steps = max((counts["used"] for counts in inputs.values() if counts["use"] == "odometry"), default=0)
-    silent = counted.get("gyro_silent", 0)
+    without, reason = max((counted.get(one, 0), one) for one in ("gyro_silent", "gyro_waiting"))
     if gyro["state"] == "doubted":
         yield GyroState(**gyro).fault
-    elif silent > _MOSTLY * steps and inputs.get(name, {}).get("used"):
-        yield f"{name}: in {silent} of {steps} steps odometry turned without the gyro: {remedy(name, 'gyro_silent')}"
+    elif without > _MOSTLY * steps and inputs.get(name, {}).get("used"):
+        yield f"{name}: in {without} of {steps} steps odometry turned without the gyro: {remedy(name, reason)}"
 
 
 def noise(summary: Summary) -> Iterator[str]:

@@ -189,7 +189,7 @@ class KeyframeFrontend:
             if self.gyro is None:
                 yield self.corrections.step(step, seconds)
                 continue
-            fused = self.gyro.fuse(self.corrections.without_bias(step), seconds, m.source)
+            fused = self.gyro.fuse(self.corrections.without_bias(step), seconds)
             yield self.corrections.with_bias(fused, seconds)
 
     @property

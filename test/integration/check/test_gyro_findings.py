@@ -1,6 +1,7 @@
 """A gyro that is wrong is found against odometry, and the setting that is printed mends it."""
 
 import pytest
+from gyroscopes import stood
 
 from graph_slam_ros.formats.parameters import parse_setting
 from graph_slam_ros.runs.check import check
@@ -59,9 +60,9 @@ def test_a_gyro_that_is_wrong_is_found_and_its_setting_mends_it(bag, tmp_path, f
 
 @pytest.fixture(scope="module")
 def laps(tmp_path_factory):
-    """Long enough for landmarks to decide whether the gyro or odometry is wrong."""
+    """Long enough for landmarks to decide whether the gyro or odometry is wrong; first the robot stands."""
     file = tmp_path_factory.mktemp("gyro") / "laps.mcap"
-    recording = simulate("warehouse", 3, aisles=2, aisle_m=6.0, laps=2)
+    recording = stood(simulate("warehouse", 3, aisles=2, aisle_m=6.0, laps=2), 2.0)
     write_bag(with_instruments(recording, 3, Instruments(imu=50.0)), file)
     return file
 

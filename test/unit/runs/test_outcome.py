@@ -31,6 +31,12 @@ def test_a_gyro_that_is_wrong_is_one_with_its_likely_cause():
     assert "degrees" in said
 
 
+def test_a_gyro_whose_robot_never_stood_is_one_with_the_parameter():
+    (said,) = shortcomings(summary({"imu": {"gyro_waiting": 51}}, GYRO | {"state": "waiting"}, imu=used(200)))
+    assert said.startswith("imu: in 51 of 100 steps odometry turned without the gyro: ")
+    assert "gyro.bias_sigma" in said
+
+
 def test_a_gyro_without_messages_most_of_the_time_is_one_with_the_parameter():
     (said,) = shortcomings(summary({"imu": {"gyro_silent": 51}}, GYRO, imu=used(20)))
     assert said.startswith("imu: in 51 of 100 steps odometry turned without the gyro: ")
