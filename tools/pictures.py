@@ -59,14 +59,14 @@ def demonstration(scratch: Path, browser: Any) -> None:
     """Draw the drive, its animation, and its report."""
     run = scratch / "demo"
     graph_slam("replay", BAG, "--out", run)
-    graph_slam("plot", run, "--truth", BAG, "--out", DOCS / "demo.png", "--force")
+    graph_slam("map", "export", run, "--truth", BAG, "--out", DOCS / "demo.png", "--force")
     with Image.open(DOCS / "demo.png") as picture:
         small = picture.convert("RGB").resize(
             (800, round(800 * picture.height / picture.width)), Image.Resampling.LANCZOS
         )
         few = small.quantize(_COLOURS, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
     few.save(DOCS / "demo.png", optimize=True)
-    graph_slam("plot", run, "--truth", BAG, "--animate", DOCS / "demo.gif", "--force")
+    graph_slam("map", "export", run, "--truth", BAG, "--out", DOCS / "demo.gif", "--force")
     graph_slam("report", run, "--truth", BAG, "--out", scratch / "demo.html")
     page = browser.new_page(viewport={"width": _WIDTH, "height": 900})
     page.goto((scratch / "demo.html").as_uri() + "#edge=900")

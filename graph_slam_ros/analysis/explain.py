@@ -179,7 +179,7 @@ def _rival(folder: Path, rival: Mapping[str, Any]) -> str:
     if rival.get("is_mirror_image"):
         return f"warning: ambiguous: {costs}: its mirror image"
     here, there = (" ".join(f"{edge:d}" for edge in rival[which]) for which in ("only_here", "only_there"))
-    tried = f"graph_slam solve {folder} --with {here}" + (f" --without {there}" if there else "")
+    tried = f"graph_slam explain {folder} --with {here}" + (f" --without {there}" if there else "")
     return f"warning: ambiguous: {costs}: {tried}"
 
 

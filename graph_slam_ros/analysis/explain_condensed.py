@@ -64,7 +64,7 @@ def statements_of_one_that_left(run: SavedGraph, row: Row) -> Iterator[tuple[str
         yield "now", "what it measured is in a place, or in a longer motion, and its verdict is final"
     else:
         yield "now", "it was not believed when its visit was condensed, and can no longer come back"
-    yield "what if", f"it were otherwise needs all keyframes: {of_all(run.folder)}; then graph_slam solve WHOLE"
+    yield "what if", f"it were otherwise needs all keyframes: {of_all(run.folder)}; then explain --without"
 
 
 def statements_of_place(run: SavedGraph, e: Entry) -> Iterator[tuple[str, str]]:

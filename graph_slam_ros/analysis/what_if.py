@@ -173,7 +173,7 @@ class SavedGraph:
         return solver
 
     def problem(self, without: Iterable[int] = (), let_in: Sequence[int] = (), loss: Loss | None = None) -> Solver:
-        """The problem that ``solve`` solves, at the saved estimate.
+        """The problem that a what-if solves, at the saved estimate.
 
         A landmark without edges is left out. A keyframe without edges is an error.
 

@@ -1,8 +1,8 @@
 """The commands ``graph_slam`` and ``graph_slam_node``.
 
 Exit codes: 0 done, 1 internal error, 2 refused (one line names the culprit), 3 done but something was lost, 130
-interrupted (Ctrl-C); of ``optimize --certify`` also 4 not certified, 5 the certificate does not apply; of ``diff`` 4
-they differ; of ``check`` 4 something above a note was found.
+interrupted (Ctrl-C); of ``optimize --certify`` also 4 not certified, 5 the certificate does not apply; of ``map diff``
+4 they differ; of ``check`` 4 something above a note was found.
 """
 
 import os
@@ -24,7 +24,6 @@ from graph_slam_ros.cli import console
 from graph_slam_ros.errors import GraphSlamError
 
 _OBJECTS = 50_000  # that are new before cycles are searched for: there are hardly any, and a run makes many objects
-_COMPUTES = {"optimize", "solve", "influence"}  # with kernels, and without a warm-up of their own
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -37,12 +36,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         from graph_slam_ros.cli.parser import parser  # Ctrl-C while modules are imported is no traceback
 
         given = sys.argv[1:] if arguments is None else arguments
-        args = parser(next((word for word in given if word[:1] != "-"), "")).parse_args(given)
+        args = parser(given).parse_args(given)
         progress.listeners[:] = [console.Throttled()]
-        if args.run.__name__ in _COMPUTES:
-            from graph_slam_ros.warmup import compile_all
-
-            compile_all()
         return int(args.run(args))
     except GraphSlamError as error:
         console.warn(str(error))

@@ -6,7 +6,8 @@ import textwrap
 from pathlib import Path
 
 from graph_slam_ros.cli import console
-from graph_slam_ros.cli.check import lines, settings_of
+from graph_slam_ros.cli.check import check_options, lines, settings_of
+from graph_slam_ros.cli.usage import CODES, CommandParser
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.durable import write_whole
 from graph_slam_ros.formats.parameters import parameters_text
@@ -14,6 +15,14 @@ from graph_slam_ros.runs.calibrate import Calibrated
 from graph_slam_ros.runs.calibrate import calibrate as calibrated
 
 _WIDTH = 100
+
+
+def calibrate_options(sub: CommandParser) -> None:
+    """Add the options of ``calibrate``."""
+    check_options(sub, of_check=False)
+    sub.codes = f"{CODES} 4: something is to be corrected."
+    sub.add_argument("--out", type=Path, metavar="FILE", help="write the settings as a parameter file, too")
+    sub.add_argument("--force", action="store_true", help="replace an existing file")
 
 
 def calibrate(args: argparse.Namespace) -> int:

@@ -5,15 +5,32 @@ import json
 import shlex
 import textwrap
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 from graph_slam_ros.check.finding import Finding
-from graph_slam_ros.cli import console
+from graph_slam_ros.cli import arguments, console
+from graph_slam_ros.cli.usage import CODES, CommandParser
 from graph_slam_ros.config.config import flatten
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.parameters import parse_setting, read_parameters
 
 _WIDTH = 100
+
+
+def check_options(sub: CommandParser, *, of_check: bool = True) -> None:
+    """Add the options of ``check``; without ``of_check``, those that ``calibrate`` has, too."""
+    sub.codes = f"{CODES} 4: something above a note was found."
+    sub.add_argument("bag", type=Path, metavar="BAG", help="file or folder of a recording")
+    sub.add_argument("--odom", metavar="TOPIC", help="odometry topic (default: as info chooses)")
+    sub.add_argument("--landmarks", metavar="TOPIC", help="landmark topic (default: as info chooses)")
+    sub.add_argument("--config", type=Path, metavar="FILE", help="parameter file; its values come before info's")
+    sub.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", help="set one parameter, before the file's"
+    )
+    if of_check:
+        sub.add_argument("--quick", action="store_true", help="leave out what needs a replay and a fit")
+    arguments.add_json(sub)
 
 
 def check(args: argparse.Namespace) -> int:

@@ -9,17 +9,21 @@ from collections.abc import Iterator
 
 from graph_slam_ros.cli import console
 from graph_slam_ros.cli.parser import parser
+from graph_slam_ros.cli.usage import CommandParser
 
 _SCRIPT = """\
 _graph_slam() {
-  local cur=${COMP_WORDS[COMP_CWORD]} prev=${COMP_WORDS[COMP_CWORD-1]} list=
+  local cur=${COMP_WORDS[COMP_CWORD]} prev=${COMP_WORDS[COMP_CWORD-1]} command=${COMP_WORDS[1]} list=
   if [ "$COMP_CWORD" -eq 1 ]; then
     list=%(commands)s
   else
-    case "${COMP_WORDS[1]} $prev" in
+    if [ "$COMP_CWORD" -gt 2 ]; then
+      case "$command" in %(groups)s) command="$command ${COMP_WORDS[2]}" ;; esac
+    fi
+    case "$command $prev" in
 %(choices)s
     *)
-      case "${COMP_WORDS[1]}" in
+      case "$command" in
 %(options)s
       esac
       case "$cur" in -*) ;; *) list=${list##*@} ;; esac ;;
@@ -32,6 +36,11 @@ complete -o bashdefault -o default -F _graph_slam graph_slam
 _ZSH = "autoload -U +X compinit && compinit -u\nautoload -U +X bashcompinit && bashcompinit\n"
 
 
+def completion_options(sub: CommandParser) -> None:
+    """Add the options of ``completion``."""
+    sub.add_argument("shell", choices=("bash", "zsh"), help='shell; use: eval "$(graph_slam completion bash)"')
+
+
 def completion(args: argparse.Namespace) -> int:
     """Print the script."""
     console.show(*((_ZSH if args.shell == "zsh" else "") + script(parser())).splitlines())
@@ -40,16 +49,27 @@ def completion(args: argparse.Namespace) -> int:
 
 def script(whole: argparse.ArgumentParser) -> str:
     """The script for bash, which zsh can run, too."""
-    (commands,) = (a for a in whole._actions if isinstance(a, argparse._SubParsersAction))
-    names = [*commands.choices, *(option for a in whole._actions for option in a.option_strings)]
+    names = [*_commands(whole), *(option for a in whole._actions for option in a.option_strings)]
+    groups = [name for name, sub in _commands(whole).items() if _commands(sub)]
     choices, options = [], []
-    for name, sub in commands.choices.items():
+    for name, sub in _all(whole):
         choices += [f"    {name}\\ {option}) list={_quoted(values)} ;;" for option, values in _choices(sub)]
         of_command = [option for action in sub._actions for option in action.option_strings]
         places = [str(c) for a in sub._actions if not a.option_strings for c in a.choices or ()]
         options.append(f"      {name}) list={_quoted(of_command)}@{_quoted(places)} ;;")
-    lines = {"commands": _quoted(names), "choices": "\n".join(choices), "options": "\n".join(options)}
-    return _SCRIPT % lines
+    lines = {"choices": "\n".join(choices), "options": "\n".join(options)}
+    return _SCRIPT % {**lines, "commands": _quoted(names), "groups": "|".join(groups)}
+
+
+def _commands(of: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
+    return {k: sub for a in of._actions if isinstance(a, argparse._SubParsersAction) for k, sub in a.choices.items()}
+
+
+def _all(whole: argparse.ArgumentParser, before: str = "") -> Iterator[tuple[str, argparse.ArgumentParser]]:
+    """Yield each command, as the shell quotes it, and those of groups."""
+    for name, sub in _commands(whole).items():
+        yield f"{before}{name}", sub
+        yield from _all(sub, f"{before}{name}\\ ")
 
 
 def _choices(sub: argparse.ArgumentParser) -> Iterator[tuple[str, list[str]]]:

@@ -21,7 +21,7 @@ _LEAST_WORD = 40  # characters that a word keeps when it is shortened: the name 
 _GAP = "..."
 DONE, FAULT, REFUSED, LOSSES, INTERRUPTED = 0, 1, 2, 3, 130
 NOT_CERTIFIED, NOT_APPLICABLE = 4, 5  # of optimize --certify
-DIFFERENT = 4  # of diff
+DIFFERENT = 4  # of map diff
 FOUND = 4  # of check
 
 

@@ -1,17 +1,16 @@
-"""The command ``edit``: applies a plan of edits by hand to a run, and writes the result as a new run."""
+"""The command ``map edit``: applies a plan of edits by hand to a run, and writes the result as a new run."""
 
 import argparse
 from pathlib import Path
 
-from graph_slam_ros.cli import console
-from graph_slam_ros.cli.options import add_run
+from graph_slam_ros.cli import arguments, console
 from graph_slam_ros.cli.usage import CODES, CommandParser
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.measurements.edit_actions import ACTIONS
 
 
-def add_options(sub: CommandParser) -> None:
-    """Add the options of ``edit``."""
+def edit_options(sub: CommandParser) -> None:
+    """Add the options of ``map edit``."""
     sub.codes = f"explain RUN prints the ids of edges and the names of landmarks; so does ledger.csv. {CODES}"
     sub.more = lambda: "\n".join(
         [
@@ -19,7 +18,7 @@ def add_options(sub: CommandParser) -> None:
             *(f"  {do:16s} {action.keys_text}" for do, action in ACTIONS.items()),
         ]
     )
-    add_run(sub)
+    arguments.add_run(sub)
     sub.add_argument("--plan", type=Path, metavar="FILE", help="JSON file with the edits")
     sub.add_argument("--out", type=Path, metavar="DIR", help="new run folder for the result: nothing is replaced")
     sub.add_argument("--dry-run", action="store_true", help="print what the plan would change, and write nothing")
@@ -45,7 +44,7 @@ def edit(args: argparse.Namespace) -> int:
         return console.report_losses(summary["losses"])
     if args.undo is not None or args.plan is None or (args.out is None) is not args.dry_run:
         raise GraphSlamError(
-            "edit needs --plan FILE with --out DIR or --dry-run, or --undo NAME with --out DIR, or --new-plan FILE"
+            "map edit needs --plan FILE with --out DIR or --dry-run, or --undo NAME with --out DIR, or --new-plan FILE"
         )
     done = edited(args.run_folder, read_plan(args.plan), args.out)
     console.show(*(one.text for one in done.edits))
@@ -57,8 +56,8 @@ def edit(args: argparse.Namespace) -> int:
     console.show(*(fit.text for fit in done.by_hand))
     if args.dry_run:
         console.show("nothing was written")
-        console.then(console.command("edit", args.run_folder, "--plan", args.plan, "--out", "NEW"))
+        console.then(console.command("map", "edit", args.run_folder, "--plan", args.plan, "--out", "NEW"))
     else:
         console.show(f"results in {args.out}; {args.run_folder} is as it was")
-        console.then(f"{console.command('diff', args.run_folder, args.out)} (what the edits have changed)")
+        console.then(f"{console.command('map', 'diff', args.run_folder, args.out)} (what the edits have changed)")
     return console.report_losses(done.losses, done.warnings)

@@ -1,13 +1,34 @@
-"""The contents of a recording, and the replay command that fits."""
+"""The command ``info``: the contents of a recording, and the replay command that fits."""
 
+import argparse
 import textwrap
 from pathlib import Path
 
+from graph_slam_ros.cli import console
+from graph_slam_ros.cli.usage import CommandParser
 from graph_slam_ros.messages.inputs import CONVERTERS
 from graph_slam_ros.messages.inputs.plugins import described
-from graph_slam_ros.recordings.bag import Bag
+from graph_slam_ros.recordings.bag import Bag, open_bag
 from graph_slam_ros.recordings.contents import TopicContents, recording_of
+from graph_slam_ros.runs.folder import is_run, suggested_out
 from graph_slam_ros.runs.suggestion import Suggestion
+
+
+def info_options(sub: CommandParser) -> None:
+    """Add the options of ``info``."""
+    sub.add_argument("bag", type=Path, metavar="BAG", help="file or folder of a recording")
+
+
+def info(args: argparse.Namespace) -> int:
+    """Print the contents of a recording."""
+    if is_run(args.bag):
+        console.show(f"an earlier run: {console.command('replay', args.bag, '--out', suggested_out(args.bag))}")
+        return console.DONE
+    bag = open_bag(args.bag)
+    lines, fits = describe(bag, args.bag)
+    checked = f"what is wrong with it, and what mends it: {console.command('check', args.bag)}"
+    console.show(*lines[:-1], checked, lines[-1])  # the command to paste is the last line
+    return console.report_losses(bag.losses, bag.warnings) or (console.DONE if fits else console.LOSSES)
 
 
 def describe(bag: Bag, path: Path) -> tuple[list[str], bool]:

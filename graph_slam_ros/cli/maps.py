@@ -1,31 +1,19 @@
-"""The commands on the maps of runs: ``export``, ``diff``, ``merge``, ``freeze``."""
+"""The commands on the maps of runs: ``map diff``, ``map merge``, ``map freeze``."""
 
 import argparse
 import json
+from pathlib import Path
 
-from graph_slam_ros.cli import console
-
-
-def export(args: argparse.Namespace) -> int:
-    """Write a run in another format."""
-    from graph_slam_ros.maps.export import export as exported
-    from graph_slam_ros.maps.export import files_of
-
-    console.check_file(*files_of(args.out, args.to), force=args.force)
-    losses: list[str] = []
-    files = exported(args.run_folder, args.out, args.to, losses, last_drive=args.last_drive)
-    console.show(*(f"wrote {file}" for file in files))
-    _then_use(args)
-    return console.report_losses(losses)
+from graph_slam_ros.cli import arguments, console
+from graph_slam_ros.cli.usage import CODES, CommandParser
 
 
-def _then_use(args: argparse.Namespace) -> None:
-    use = {
-        "tum": f"evo_traj tum {args.out} --plot, or any reader of TUM trajectories",
-        "g2o": console.command("optimize", args.out),
-        "mcap": f"open {args.out} in Foxglove, or ros2 bag play {args.out}",
-    }
-    console.then(use[args.to])
+def diff_options(sub: CommandParser) -> None:
+    """Add the options of ``map diff``."""
+    sub.codes = f"{CODES} 4: they differ."
+    sub.add_argument("a", type=Path, metavar="A", help="run folder")
+    sub.add_argument("b", type=Path, metavar="B", help="run folder")
+    arguments.add_json(sub)
 
 
 def diff(args: argparse.Namespace) -> int:
@@ -36,10 +24,17 @@ def diff(args: argparse.Namespace) -> int:
     found = compared(args.a, args.b, losses)
     console.show(*([json.dumps(found.as_dict())] if args.json else found.lines()))
     if not args.json:
-        merged = f"{console.command('merge', args.a, args.b, '--out', 'MERGED')} (one map of both)"
+        merged = f"{console.command('map', 'merge', args.a, args.b, '--out', 'MERGED')} (one map of both)"
         cannot = f"nothing: they cannot be merged: {found.merge_trouble}" if found.merge_trouble else ""
         console.then("nothing: they are the same" if found.is_same else cannot or merged)
     return console.report_losses(losses) or (console.DONE if found.is_same else console.DIFFERENT)
+
+
+def merge_options(sub: CommandParser) -> None:
+    """Add the options of ``map merge``."""
+    sub.add_argument("a", type=Path, metavar="A", help="run folder; the result has its map frame and configuration")
+    sub.add_argument("b", type=Path, metavar="B", help="run folder")
+    arguments.add_out(sub)
 
 
 def merge(args: argparse.Namespace) -> int:
@@ -53,12 +48,18 @@ def merge(args: argparse.Namespace) -> int:
     if done.is_repeated:
         console.show("the drive of B was repeated from its journal, because its visits are condensed")
     console.show(f"results in {args.out}")
-    console.then(f"{console.command('freeze', args.out, '--out', 'SITE')} (a map that stays as it is)")
+    console.then(f"{console.command('map', 'freeze', args.out, '--out', 'SITE')} (a map that stays as it is)")
     moved = [
         f"landmark {name} is {metres:.2f} m ({sigmas:.0f} sigmas) elsewhere in B: what B saw of it is left out"
         for name, (metres, sigmas) in done.left_out.items()
     ]
     return console.report_losses(done.losses, [*moved, *done.calibrations])
+
+
+def freeze_options(sub: CommandParser) -> None:
+    """Add the options of ``map freeze``."""
+    arguments.add_run(sub)
+    arguments.add_out(sub)
 
 
 def freeze(args: argparse.Namespace) -> int:

@@ -5,9 +5,21 @@ import fnmatch
 from collections.abc import Iterator
 
 from graph_slam_ros.cli import console
+from graph_slam_ros.cli.usage import CommandParser
 from graph_slam_ros.config.config import parameters
 from graph_slam_ros.config.parameter import Parameter
 from graph_slam_ros.errors import GraphSlamError
+
+
+def params_options(sub: CommandParser) -> None:
+    """Add the options of ``params``."""
+    sub.add_argument(
+        "pattern",
+        nargs="?",
+        default="",
+        metavar="PATTERN",
+        help="part of a name or of its help, or a name with * (default: all)",
+    )
 
 
 def params(args: argparse.Namespace) -> int:

@@ -1,219 +1,237 @@
 """The command line of ``graph_slam``: a table of the commands, and the parser that it makes."""
 
-import argparse
-from collections.abc import Callable
+from collections.abc import Mapping, Sequence
+from importlib import import_module
 
 from graph_slam_ros import __version__
-from graph_slam_ros.cli import audit, edit, graphs, maps, options, recordings
 from graph_slam_ros.cli.usage import CommandParser, later
 
 
 class Command:
-    """A command: its function, its options, its purpose, and examples of its arguments."""
+    """A command: where its code is, its purpose, and examples of its arguments.
 
-    def __init__(
-        self,
-        run: Callable[[argparse.Namespace], int],
-        add_options: Callable[[CommandParser], None],
-        about: str,
-        *examples: str,
-    ) -> None:
-        self.run = run
-        self.add_options = add_options
+    Parameters
+    ----------
+    code : ``module:name``: the module of the package, which is imported when the command is called, has the function
+        ``name`` and, for its options, ``name_options``
+    options : the module of ``name_options``, if that is another one
+    """
+
+    def __init__(self, code: str, about: str, *examples: str, options: str = "") -> None:
+        self._module, _, self._name = code.partition(":")
+        self._options = options or self._module
         self.about = about
         self.examples = examples
 
+    def add_to(self, sub: CommandParser) -> None:
+        """Add the options, and the function as ``run``."""
+        getattr(import_module(f"graph_slam_ros.{self._options}"), f"{self._name}_options")(sub)
+        sub.set_defaults(run=later(self._module, self._name))
 
-COMMANDS = {
+
+class Group:
+    """Commands on one thing."""
+
+    def __init__(self, about: str, commands: Mapping[str, Command]) -> None:
+        self.about = about
+        self.commands = commands
+        self.examples = tuple(f"{name} {one.examples[0]}" for name, one in commands.items())
+
+
+COMMANDS: dict[str, Command | Group] = {
     "info": Command(
-        recordings.info,
-        options.info,
+        "cli.info:info",
         "show topics, types, rates, frames and span of a recording, and how to replay it",
         "drive.mcap",
     ),
     "check": Command(
-        later("cli.check", "check"),
-        options.check,
+        "cli.check:check",
         "find what is wrong with a recording, by how much, and the setting that mends it",
         "drive.mcap",
         "drive.mcap --set detections.offset_s=-0.096",
     ),
     "calibrate": Command(
-        later("cli.calibrate", "calibrate"),
-        options.calibrate,
+        "cli.calibrate:calibrate",
         "estimate odometry's scale, clocks and mounts from a recording, and print the settings",
         "drive.mcap",
         "drive.mcap --set calibrate.groups='factors clock'",
     ),
     "replay": Command(
-        recordings.replay,
-        options.replay,
+        "cli.replay:replay",
         "run a recording (mcap, db3, ROS 1) or an earlier run through the pipeline",
         "drive.mcap --out drive_run",
         "drive.mcap --out drive_run --force --set keyframes.min_distance_m=0.3",
     ),
-    "evaluate": Command(
-        recordings.evaluate,
-        options.evaluate,
-        "compute the errors of a run against the truth, test its covariances, draw a picture",
-        "drive_run --truth drive.mcap:/ground_truth",
-    ),
     "recover": Command(
-        recordings.recover,
-        options.recover,
+        "cli.replay:recover",
         "write the results of a run that was cut off, without repeating the drive",
         "runs/latest --out recovered",
     ),
-    "export": Command(
-        maps.export,
-        options.export,
-        "write a run's path as TUM, its graph as g2o, or both as an mcap of ROS messages",
-        "drive_run --to tum --out path.tum",
+    "evaluate": Command(
+        "cli.evaluate:evaluate",
+        "compute the errors of a run against the truth, test its covariances, draw a picture",
+        "drive_run --truth drive.mcap:/ground_truth",
     ),
-    "diff": Command(
-        maps.diff,
-        options.diff,
-        "compare the maps of two runs: keyframes, landmarks, verdicts, chi2",
-        "monday_run tuesday_run",
-    ),
-    "merge": Command(
-        maps.merge,
-        options.merge,
-        "merge the maps of two runs, aligned by the landmarks that both have",
-        "monday_run tuesday_run --out site",
-    ),
-    "freeze": Command(
-        maps.freeze,
-        options.freeze,
-        "write a run's map as a frozen one: it stays fixed when it is loaded for localization",
-        "drive_run --out site",
-    ),
-    "edit": Command(
-        edit.edit,
-        edit.add_options,
-        "edit a run's map by hand with a plan: edges, closures, landmarks, where the map lies, parts of the drive",
-        "drive_run --new-plan edits.json",
-        "drive_run --plan edits.json --dry-run",
-        "drive_run --plan edits.json --out drive_edited",
-        "drive_edited --undo wrong-aisle --out drive_mended",
-    ),
-    "plot": Command(
-        recordings.plot,
-        options.plot,
-        "draw a run: path, landmarks, and the truth if there is one",
+    "explain": Command(
+        "cli.explain:explain",
+        "show which measurements a run accepted or rejected and why, which matter, and what would be without some",
         "drive_run",
-        "drive_run --truth drive.mcap:/ground_truth --out drive.png",
-        "drive_run --animate drive.gif",
+        "drive_run 142",
+        "drive_run --influence 5",
+        "drive_run --without 142 143",
     ),
     "report": Command(
-        later("tools.report.command", "report"),
-        options.report,
+        "tools.report.command:report",
         "write one HTML file on a run: map, edges with their reasons, charts and tables",
         "drive_run",
         "drive_run --truth drive.mcap:/ground_truth --out drive.html",
+        options="cli.of_tools",
     ),
     "view": Command(
-        later("tools.view.command", "view"),
-        later("tools.view.command", "add_options"),
+        "tools.view.command:view",
         "show the report in a browser, solve what-ifs at once, edit the map and save it as another run",
         "drive_run",
         "drive_run --port 8080 --no-browser",
     ),
-    "explain": Command(
-        audit.explain,
-        options.explain,
-        "show which measurements a run accepted or rejected and why, or all about one edge",
-        "drive_run",
-        "drive_run 142",
-    ),
-    "solve": Command(
-        audit.solve,
-        options.solve,
-        "solve a run's graph again without some edges, with others, or with another loss",
-        "drive_run --without 142 143",
-    ),
-    "influence": Command(
-        audit.influence,
-        options.influence,
-        "list the edges of a run that its last pose depends on most",
-        "drive_run --count 5",
-    ),
     "advise": Command(
-        later("tools.advise.command", "advise"),
-        options.advise,
+        "tools.advise.command:advise",
         "find the weakest directions of a run's map, and what to measure to make them better known",
         "drive_run",
         "drive_run --json",
+        options="cli.of_tools",
+    ),
+    "map": Group(
+        "compare, merge, edit, freeze or export the maps of runs",
+        {
+            "diff": Command(
+                "cli.maps:diff",
+                "compare the maps of two runs: keyframes, landmarks, verdicts, chi2",
+                "monday_run tuesday_run",
+            ),
+            "merge": Command(
+                "cli.maps:merge",
+                "merge the maps of two runs, aligned by the landmarks that both have",
+                "monday_run tuesday_run --out site",
+            ),
+            "edit": Command(
+                "cli.edit:edit",
+                "edit a run's map by hand with a plan: edges, closures, landmarks, where it lies, parts of the drive",
+                "drive_run --new-plan edits.json",
+                "drive_run --plan edits.json --dry-run",
+                "drive_run --plan edits.json --out drive_edited",
+                "drive_edited --undo wrong-aisle --out drive_mended",
+            ),
+            "freeze": Command(
+                "cli.maps:freeze",
+                "write a run's map as a frozen one: it stays fixed when it is loaded for localization",
+                "drive_run --out site",
+            ),
+            "export": Command(
+                "cli.export:export",
+                "write a run's path as TUM, its graph as g2o, both as an mcap of ROS messages, or a picture of it",
+                "drive_run --out path.tum",
+                "drive_run --out drive.png --truth drive.mcap:/ground_truth",
+                "drive_run --out drive.gif",
+            ),
+        },
     ),
     "optimize": Command(
-        graphs.optimize,
-        options.optimize,
+        "cli.optimize:optimize",
         "solve a graph: g2o, TORO, iSAM or GTSAM text",
         "graph.g2o --out solved.g2o --plot graph.png",
     ),
     "simulate": Command(
-        later("tools.simulation.command", "simulate"),
-        options.simulate,
+        "tools.simulation.command:simulate",
         "simulate a recording with truth and, if asked, faults: pythonrobotics, manhattan, warehouse, flight",
         "warehouse --out world.mcap --seed 7",
+        options="cli.of_tools",
     ),
-    "fleet": Command(
-        later("tools.fleet.command", "fleet"),
-        later("tools.fleet.command", "add_options"),
+    "fleet": Group(
         "replay many recordings at once, and compare two such fleets, on all cores or many machines",
-        "replay drives/ --out fleet",
-        "compare last_week fleet --fail 'rmse>1.02x'",
+        {
+            "replay": Command(
+                "tools.fleet.command:replay",
+                "replay many recordings with one or more configurations; what is done is not done again",
+                "drives/ --out fleet",
+                "drives/ --out fleet --truth '{path}:/ground_truth' --set robust.noise_scale=configured,estimated",
+            ),
+            "table": Command(
+                "tools.fleet.command:table",
+                "print the table of a fleet, or a part of it",
+                "fleet",
+                "fleet --where 'rmse_m > 0.1' --order 'rmse_m DESC'",
+            ),
+            "compare": Command(
+                "tools.fleet.command:compare",
+                "compare two fleets recording by recording, and fail where the new one is worse",
+                "last_week fleet",
+                "last_week fleet --fail 'rmse>1.02x' --fail 'cpu>1.2x' --markdown summary.md",
+            ),
+        },
     ),
     "params": Command(
-        later("cli.params", "params"),
-        options.params,
+        "cli.params:params",
         "list the parameters with default, unit, bounds and meaning",
         "keyframes",
         "'odometry.*'",
     ),
     "warmup": Command(
-        recordings.warmup,
-        options.nothing,
+        "cli.warmup:warmup",
         "compile the kernels, once per installation",
         "",
     ),
     "demo": Command(
-        later("tools.demo", "demo"),
-        options.demo,
+        "tools.demo:demo",
         "replay the recording that comes with the source through a live ROS graph",
         "--force",
     ),
     "completion": Command(
-        later("cli.completion", "completion"),
-        options.completion,
+        "cli.completion:completion",
         "print a script for shell completion: eval it in ~/.bashrc or ~/.zshrc",
         "bash",
     ),
 }
 
+_ELSEWHERE = {
+    **{name: f"map {name}" for name in ("diff", "merge", "edit", "freeze", "export")},
+    "plot": "map export RUN --out FILE.png",
+    "solve": "explain RUN --without EDGE",
+    "influence": "explain RUN --influence",
+    "convert": "optimize GRAPH --out FILE.g2o",
+}
+"""Words that are no commands, and what does the same."""
 
-def parser(command: str | None = None) -> argparse.ArgumentParser:
+
+def parser(words: Sequence[str] | None = None) -> CommandParser:
     """The whole command line; the arguments' ``run`` is the command's function.
 
     Parameters
     ----------
-    command : the only command whose options are needed; None: all have theirs, which takes more imports
+    words : the command line: only the command that it calls is imported and gets its options; None: all are
     """
     whole = CommandParser(
         prog="graph_slam",
         description="Online pose-graph SLAM: replay recordings, optimise graphs, simulate, evaluate.",
         examples=("graph_slam info drive.mcap", "graph_slam replay drive.mcap --out drive_run"),
     )
+    whole.elsewhere = _ELSEWHERE
     whole.add_argument("--version", action="version", version=f"graph_slam_ros {__version__}")
-    commands = whole.add_subparsers(required=True, metavar="COMMAND", parser_class=CommandParser)
-    for name, row in COMMANDS.items():
+    _add(whole, COMMANDS, None if words is None else [word for word in words if word[:1] != "-"])
+    return whole
+
+
+def _add(parent: CommandParser, rows: Mapping[str, Command | Group], called: Sequence[str] | None) -> None:
+    commands = parent.add_subparsers(required=True, metavar="COMMAND", parser_class=CommandParser)
+    for name, row in rows.items():
         sub: CommandParser = commands.add_parser(
             name,
             help=row.about,
             description=f"{row.about[0].upper()}{row.about[1:]}.",
-            examples=[f"graph_slam {name} {one}".rstrip() for one in row.examples],
+            examples=[f"{parent.prog} {name} {one}".rstrip() for one in row.examples],
         )
-        sub.set_defaults(run=row.run)
-        if command in (None, name):
-            row.add_options(sub)
-    return whole
+        if called is not None and called[:1] != [name]:
+            continue
+        if isinstance(row, Group):
+            _add(sub, row.commands, None if called is None else called[1:])
+        else:
+            row.add_to(sub)

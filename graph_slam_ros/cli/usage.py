@@ -1,8 +1,9 @@
 """Usage errors and help of the command line, and modules that are imported when they are needed."""
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
+from types import MappingProxyType
 from typing import Any, NoReturn
 
 from graph_slam_ros.cli import console
@@ -35,6 +36,7 @@ class CommandParser(argparse.ArgumentParser):
     """Reports usage errors in one line. Its help ends with examples and the exit codes."""
 
     more: Callable[[], str] | None = None  # what the help tells besides, where it takes imports to know it
+    elsewhere: Mapping[str, str] = MappingProxyType({})  # words that are no commands, and what does the same
     codes = CODES
 
     def __init__(self, *args: Any, examples: Sequence[str] = (), **options: Any) -> None:
@@ -53,7 +55,8 @@ class CommandParser(argparse.ArgumentParser):
         try:
             super()._check_value(action, value)
         except argparse.ArgumentError as error:
-            near = did_you_mean(str(value), map(str, action.choices or ()))
+            other = self.elsewhere.get(str(value))
+            near = f"; {self.prog} {other}" if other else did_you_mean(str(value), map(str, action.choices or ()))
             raise argparse.ArgumentError(action, f"{error.message}{near}") from None
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:

@@ -262,7 +262,7 @@ def edit(folder: Path, plan: Plan, out: Path | None) -> Edited:
 
 
 def edit_run(run: Path | str, edits: Sequence[Mapping[str, Any]], out: Path | str | None = None) -> Edited:
-    """Edit the map of a run by hand, as ``graph_slam edit`` does.
+    """Edit the map of a run by hand, as ``graph_slam map edit`` does.
 
     Parameters
     ----------

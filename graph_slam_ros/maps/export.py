@@ -41,7 +41,7 @@ def export(folder: Path, out: Path, target: str, losses: list[str], *, last_driv
     left = read_left(folder, slam.space, slam.bounded)
     if last_drive:
         if target != "tum":
-            raise RunError(f"--last-drive: {target} holds a whole map; with --to tum it is the path of the last drive")
+            raise RunError(f"--last-drive: {target} holds a whole map; as TUM it is the path of the last drive")
         return _tum(slam, left, out, slam.drives[-1])
     return TARGETS[target](slam, left, out)
 

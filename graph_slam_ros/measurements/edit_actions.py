@@ -1,6 +1,6 @@
 """The kinds of edits by hand: what each one does, and the keys that it has.
 
-This table is the only one. Plans, ``graph_slam edit --help``, docs/edits.md and the page are made from it.
+This table is the only one. Plans, ``graph_slam map edit --help``, docs/edits.md and the page are made from it.
 """
 
 import math

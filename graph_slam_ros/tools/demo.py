@@ -10,7 +10,8 @@ from typing import Any
 
 from graph_slam_ros.analysis.evaluation import evaluate
 from graph_slam_ros.analysis.plots import draw_run
-from graph_slam_ros.cli import console
+from graph_slam_ros.cli import arguments, console
+from graph_slam_ros.cli.usage import CommandParser
 from graph_slam_ros.formats.files import read_text
 from graph_slam_ros.recordings.bag import open_bag
 from graph_slam_ros.runs.chosen_inputs import choose_inputs
@@ -21,6 +22,14 @@ from graph_slam_ros.tools.simulation import simulate, write_bag
 from graph_slam_ros.warmup import compile_all
 
 _BAG = Path(__file__).resolve().parents[2] / "data" / "demo.mcap"
+
+
+def demo_options(sub: CommandParser) -> None:
+    """Add the options of ``demo``."""
+    sub.add_argument(
+        "--out", type=Path, default=Path("runs/demo"), metavar="DIR", help="folder for the results (default: runs/demo)"
+    )
+    arguments.add_force(sub)
 
 
 def demo(args: argparse.Namespace) -> int:

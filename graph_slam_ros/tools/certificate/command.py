@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from graph_slam_ros.cli import console
-from graph_slam_ros.cli.graphs import STARTS
+from graph_slam_ros.cli.optimize import STARTS
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.optimization import optimize
 from graph_slam_ros.tools.certificate import CERTIFIED, NOT_CERTIFIED, Certificate, certify, other_start

@@ -1,4 +1,4 @@
-"""The command ``fleet``: many recordings at once. Replays them, shows their table, compares two fleets."""
+"""The commands ``fleet replay``, ``fleet table`` and ``fleet compare``: many recordings at once."""
 
 import argparse
 import importlib.util
@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-from graph_slam_ros.cli import console, values
+from graph_slam_ros.cli import arguments, console
 from graph_slam_ros.cli.usage import CODES, CommandParser
 from graph_slam_ros.errors import GraphSlamError
 
@@ -15,46 +15,14 @@ _MIB = 2**20
 _MOST_NAMED = 20
 
 
-def fleet(args: argparse.Namespace) -> int:
-    """Run the command of ``fleet`` that was given."""
+def _check_installed() -> None:
     missing = [name for name in _NEEDED if importlib.util.find_spec(name) is None]
     if missing:
         raise GraphSlamError(f"fleet needs {', '.join(missing)}: pip install 'graph_slam_ros[fleet]'")
-    done: int = args.of_fleet(args)
-    return done
 
 
-def add_options(sub: CommandParser) -> None:
-    """Add the commands of ``fleet`` and their options."""
-    sub.codes = f"{CODES} 4: worse than --fail allows."
-    commands = sub.add_subparsers(
-        required=True, metavar="COMMAND", parser_class=CommandParser, help="fleet COMMAND --help has its options"
-    )
-    _add_replay(commands)
-    _add_table(commands)
-    _add_compare(commands)
-
-
-def _command(commands: Any, name: str, run: Any, about: str, *examples: str) -> CommandParser:
-    sub: CommandParser = commands.add_parser(
-        name,
-        help=about,
-        description=f"{about[0].upper()}{about[1:]}.",
-        examples=[f"graph_slam fleet {name} {one}" for one in examples],
-    )
-    sub.set_defaults(of_fleet=run)
-    return sub
-
-
-def _add_replay(commands: Any) -> None:
-    sub = _command(
-        commands,
-        "replay",
-        _replay,
-        "replay many recordings with one or more configurations, on all cores; what is done is not done again",
-        "drives/ --out fleet",
-        "drives/ --out fleet --truth '{path}:/ground_truth' --set robust.noise_scale=configured,estimated",
-    )
+def replay_options(sub: CommandParser) -> None:
+    """Add the options of ``fleet replay``."""
     sub.add_argument(
         "recordings", nargs="+", metavar="BAG", help="recordings, folders of them, s3:// or gs:// addresses"
     )
@@ -83,42 +51,29 @@ def _add_replay(commands: Any) -> None:
     )
     sub.add_argument("--report", action="store_true", help="write a report on each run")
     sub.add_argument(
-        "--workers", type=values.count, default=0, metavar="N", help="processes (default: one for each core)"
+        "--workers", type=arguments.count, default=0, metavar="N", help="processes (default: one for each core)"
     )
     sub.add_argument("--scheduler", default="", metavar="ADDRESS", help="Dask scheduler to use, as tcp://host:8786")
     sub.add_argument(
-        "--limit", type=values.positive, default=3600.0, metavar="S", help="seconds for one run (default: 3600)"
+        "--limit", type=arguments.positive, default=3600.0, metavar="S", help="seconds for one run (default: 3600)"
     )
     sub.add_argument(
-        "--memory", type=values.positive, default=0.0, metavar="MIB", help="memory for one run (default: any)"
+        "--memory", type=arguments.positive, default=0.0, metavar="MIB", help="memory for one run (default: any)"
     )
 
 
-def _add_table(commands: Any) -> None:
-    sub = _command(
-        commands,
-        "table",
-        _table,
-        "print the table of a fleet, or a part of it",
-        "fleet",
-        "fleet --where 'rmse_m > 0.1' --order 'rmse_m DESC'",
-    )
+def table_options(sub: CommandParser) -> None:
+    """Add the options of ``fleet table``."""
     sub.add_argument("folder", type=Path, metavar="DIR", help="folder of the fleet")
     sub.add_argument("--where", default="", metavar="SQL", help="condition on the columns")
     sub.add_argument("--order", default="", metavar="SQL", help="columns to sort by")
-    sub.add_argument("--most", type=values.count, default=1000, metavar="N", help="rows to print (default: 1000)")
+    sub.add_argument("--most", type=arguments.count, default=1000, metavar="N", help="rows to print (default: 1000)")
     sub.add_argument("--columns", default="", metavar="A,B", help="columns to print; all prints all")
 
 
-def _add_compare(commands: Any) -> None:
-    sub = _command(
-        commands,
-        "compare",
-        _compare,
-        "compare two fleets recording by recording, and fail where the new one is worse",
-        "last_week fleet",
-        "last_week fleet --fail 'rmse>1.02x' --fail 'cpu>1.2x' --markdown summary.md",
-    )
+def compare_options(sub: CommandParser) -> None:
+    """Add the options of ``fleet compare``."""
+    sub.codes = f"{CODES} 4: worse than --fail allows."
     sub.add_argument("old", type=Path, metavar="OLD", help="folder of the earlier fleet")
     sub.add_argument("new", type=Path, metavar="NEW", help="folder of the later fleet")
     sub.add_argument(
@@ -131,7 +86,9 @@ def _add_compare(commands: Any) -> None:
     sub.add_argument("--markdown", type=Path, metavar="FILE", help="write the comparison as Markdown")
 
 
-def _replay(args: argparse.Namespace) -> int:
+def replay(args: argparse.Namespace) -> int:
+    """Replay many recordings."""
+    _check_installed()
     from graph_slam_ros.tools.fleet.engine import Workers
     from graph_slam_ros.tools.fleet.page import write_page
     from graph_slam_ros.tools.fleet.replay import Fleet, replay_all
@@ -190,7 +147,9 @@ def _progress(label: str) -> Any:
     return bar
 
 
-def _table(args: argparse.Namespace) -> int:
+def table(args: argparse.Namespace) -> int:
+    """Print the table of a fleet."""
+    _check_installed()
     from graph_slam_ros.tools.fleet.store import Store
     from graph_slam_ros.tools.fleet.table import FIRST, read_table
 
@@ -214,12 +173,15 @@ def _cell(value: Any) -> str:
     return "-" if value is None else f"{value:.4g}" if isinstance(value, float) else console.escaped(str(value))
 
 
-def _compare(args: argparse.Namespace) -> int:
+def compare(args: argparse.Namespace) -> int:
+    """Compare two fleets."""
+    _check_installed()
     from graph_slam_ros.formats.durable import write_whole
-    from graph_slam_ros.tools.fleet.compare import compare, markdown, parse_limit
+    from graph_slam_ros.tools.fleet.compare import compare as compared
+    from graph_slam_ros.tools.fleet.compare import markdown, parse_limit
 
     console.check_file(args.markdown, force=False)
-    done = compare(args.old, args.new, [parse_limit(text) for text in args.fail])
+    done = compared(args.old, args.new, [parse_limit(text) for text in args.fail])
     text = markdown(done)
     if args.markdown is not None:
         write_whole(args.markdown, text.encode())

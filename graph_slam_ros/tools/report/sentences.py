@@ -191,7 +191,7 @@ def _group(
 def _what_if(run: SavedGraph, e: Entry, ends: Sequence[str], is_known: bool, is_alone: bool, end: int) -> str:
     name = shown(run.folder.name)
     which, option = ("out", "--without") if e.is_in else ("in with its full weight", "--with")
-    exactly = f"graph_slam solve {name} {option} {{edge}} solves it"
+    exactly = f"graph_slam explain {name} {option} {{edge}} solves it"
     if is_alone:
         return f"it were {which}: nothing else determines one of its vertices, and nothing could be solved"
     if not is_known:

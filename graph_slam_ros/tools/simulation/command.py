@@ -153,8 +153,6 @@ def _options(args: argparse.Namespace) -> dict[str, Any]:
     options = dict(parse_setting(text) for text in args.set)
     if "seed" in options:
         raise GraphSlamError("--set seed: no option of a world; --seed N")
-    if args.as_original:
-        options["as_original"] = True
     if args.poses is not None:
         options["poses"] = args.poses
     return options

@@ -6,19 +6,18 @@ import importlib.util
 import os
 import sys
 
-from graph_slam_ros.cli import console, values
-from graph_slam_ros.cli.options import add_run, add_shown
+from graph_slam_ros.cli import arguments, console
 from graph_slam_ros.cli.usage import CommandParser
 from graph_slam_ros.errors import GraphSlamError
 
 _NEEDS = "starlette", "uvicorn"
 
 
-def add_options(sub: CommandParser) -> None:
+def view_options(sub: CommandParser) -> None:
     """Add the options of ``view``."""
-    add_run(sub)
-    add_shown(sub)
-    sub.add_argument("--port", type=values.port, default=0, help="port to listen on (default: a free one)")
+    arguments.add_run(sub)
+    arguments.add_shown(sub)
+    sub.add_argument("--port", type=arguments.port, default=0, help="port to listen on (default: a free one)")
     sub.add_argument(
         "--host", default="127.0.0.1", metavar="ADDRESS", help="address to listen on (default: this machine alone)"
     )
@@ -40,7 +39,7 @@ def view(args: argparse.Namespace) -> int:
         raise GraphSlamError("view: no use for --topic or --no-align without --truth")
     compile_all()
     made = read_contents(args.run_folder, args.truth, args.compare, args.plan, args.topic, align=not args.no_align)
-    work = Workbench(made, values.LOSS_SCALE)
+    work = Workbench(made, arguments.LOSS_SCALE)
     page = page_of(made, work)
     bound = listening(args.host, args.port)
     access = Access(args.host, bound.getsockname()[1])

@@ -97,7 +97,7 @@ class Workbench:
         return values
 
     def solve(self, body: bytes) -> dict[str, Any]:
-        """Solve the run without some edges, with others, or with another loss, as ``graph_slam solve``.
+        """Solve the run without some edges, with others, or with another loss, as ``graph_slam explain RUN --without``.
 
         Parameters
         ----------
@@ -142,7 +142,7 @@ class Workbench:
             }
 
     def save(self, body: bytes) -> dict[str, Any]:
-        """Write the run that a plan makes of this one, next to it: as ``graph_slam edit``. Nothing is replaced.
+        """Write the run that a plan makes of this one, next to it: as ``graph_slam map edit``. Nothing is replaced.
 
         Raises
         ------
@@ -154,7 +154,7 @@ class Workbench:
         with self._lock:
             out = _free(self._run)
             edited = edit(self._run, plan, out)
-        words = ["graph_slam", "edit", str(self._run), "--plan", "edits.json", "--out", str(out)]
+        words = ["graph_slam", "map", "edit", str(self._run), "--plan", "edits.json", "--out", str(out)]
         return {
             "folder": shown(str(out), _MOST_PATH),
             "command": shown(shlex.join(words), _MOST_PATH),

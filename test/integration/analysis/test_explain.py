@@ -102,14 +102,14 @@ def test_each_verdict_is_explained_in_its_words(run):
         assert words in " ".join(" ".join(explain_edge(saved, str(entry.edge))).split())
 
 
-@pytest.mark.parametrize("words", [("explain",), ("explain", 3), ("solve", "--without", 3), ("influence",)])
+@pytest.mark.parametrize("words", [(), (3,), ("--without", 3), ("--influence",)])
 def test_a_run_that_was_never_saved_is_explained_from_its_map(run, tmp_path, words, capsys):
     copy = copied(run, tmp_path)
     for name in (LEDGER, CHANGES, GRAPH):
         (copy / name).unlink()
     answers = []
     for folder in (run, copy):
-        assert cli.main([words[0], str(folder), *map(str, words[1:])]) == 0
+        assert cli.main(["explain", str(folder), *map(str, words)]) == 0
         lines = capsys.readouterr().out.replace(str(folder), "RUN").splitlines()
         answers.append([line for line in lines if not line.startswith("solved in")])
     assert answers[0] == answers[1] != []
@@ -130,7 +130,7 @@ def test_another_explanation_is_warned_of_with_how_to_try_it(run, tmp_path, caps
     rival = {"cost": 120.0, "best_cost": 100.0, "only_here": [5, 6], "only_there": [7]}
     (copy / "run.json").write_text(json.dumps({"rivals": [rival]}))
     _, text, _ = told(capsys, copy)
-    assert f"this explanation costs 100, another 120: graph_slam solve {copy} --with 5 6 --without 7" in text
+    assert f"this explanation costs 100, another 120: graph_slam explain {copy} --with 5 6 --without 7" in text
 
 
 @pytest.mark.parametrize("tag", EDGE_TAGS)

@@ -1,4 +1,4 @@
-"""``solve`` and ``influence``: the graph of a saved run solved otherwise is what a graph made otherwise is."""
+"""What-if and influence: the graph of a saved run solved otherwise is what a graph made otherwise is."""
 
 import json
 
@@ -106,7 +106,7 @@ def test_a_landmark_without_its_sightings_is_left_out_and_what_determines_nothin
 def test_what_leaves_a_keyframe_without_edges_is_refused(replayed, saved, capsys):
     last = saved.keyframes[-1]
     for without in ([e.edge for e in saved.entries], [e.edge for e in saved.entries if last in e.vertices]):
-        code, out, err = told(capsys, "solve", replayed[1], "--without", *without)
+        code, out, err = told(capsys, "explain", replayed[1], "--without", *without)
         assert (code, out, "nothing fixes the gauge of vertex" in err, err.count("\n")) == (2, "", True, 1)
 
 
@@ -126,7 +126,7 @@ def test_influence_tells_which_edges_cannot_be_done_without(tmp_path, capsys):
     landmarks = {e.edge for e in read_ledger(run) if e.label == "landmarks"}
     assert {one.edge for one in SavedGraph(run, []).influences(5) if one.exact_m == np.inf} == landmarks
     assert len(landmarks) == 2
-    code, out, err = told(capsys, "influence", run)
+    code, out, err = told(capsys, "explain", run, "--influence")
     assert (code, out.count("undetermined"), err) == (0, 2, "")
 
 
@@ -134,10 +134,10 @@ def test_what_does_not_converge_is_no_solution_and_is_said(replayed, saved, caps
     """Closures that all else contradicts, and few steps."""
     run, out = replayed[1], [e.edge for e in saved.entries if not e.is_in and e.label == "closures"]
     asked = json.dumps({"without": [], "let_in": out, "loss": "", "first": False}).encode()
-    assert told(capsys, "solve", run, "--with", *out)[0] == 0
+    assert told(capsys, "explain", run, "--with", *out)[0] == 0
     assert Workbench(read_contents(run), 3.0).solve(asked)["is_solved"]
     monkeypatch.setattr(what_if, "MOST_STEPS", 1)  # then the run's own limit counts
-    code, said, err = told(capsys, "solve", run, "--with", *out)
+    code, said, err = told(capsys, "explain", run, "--with", *out)
     assert (code, "NOT converged (max_iterations) after" in said, "not a solution" in err) == (3, True, True)
     assert not Workbench(read_contents(run), 3.0).solve(asked)["is_solved"]
 
@@ -145,16 +145,16 @@ def test_what_does_not_converge_is_no_solution_and_is_said(replayed, saved, caps
 def test_the_commands_say_what_moves(replayed, saved, capsys):
     run = replayed[1]
     false = next(e for e in read_ledger(run) if not e.is_in and e.label == "closures")
-    code, out, _ = told(capsys, "solve", run, "--with", false.edge)
+    code, out, _ = told(capsys, "explain", run, "--with", false.edge)
     moved = saved.moved(saved.solve(let_in=[false.edge]))
     assert code == 0
     assert f"{moved.before.chi2_final:.4f}  ->  " in out
     assert f"last pose  moves by {moved.final[0]:.4f} m" in out
     assert f"edge {moved.worse[0][0]} (" in out
-    code, out, _ = told(capsys, "influence", run, "--count", "3")
+    code, out, _ = told(capsys, "explain", run, "--influence", "3")
     assert code == 0
     *table, after = out.splitlines()
     assert [int(line.split()[0]) for line in table[2:]] == [one.edge for one in saved.influences(3)]
     assert after.startswith("next: graph_slam explain ")
-    code, _, err = told(capsys, "solve", run)
-    assert (code, "solve needs --without EDGE, --with EDGE or --loss NAME" in err) == (2, True)
+    code, _, err = told(capsys, "explain", run, "3", "--loss", "none")
+    assert (code, "one of EDGE, --influence, and --without, --with and --loss together" in err) == (2, True)

@@ -455,7 +455,7 @@ def test_a_second_start_that_is_no_better_is_told_so_and_one_that_fails_why(run,
     assert code == 4
     assert "which is no lower\n  not certified\n" in out
     monkeypatch.setattr("graph_slam_ros.tools.certificate.other_start", lambda start: "nowhere")
-    monkeypatch.setattr("graph_slam_ros.cli.graphs._START", {"file": "the file", "nowhere": "nowhere"})
+    monkeypatch.setattr("graph_slam_ros.cli.optimize._START", {"file": "the file", "nowhere": "nowhere"})
     code, out = run(ring(PLANE, 2), "--init", "file")
     assert code == 4
     assert "a second start, nowhere, fails: init 'nowhere'" in out

@@ -1,4 +1,4 @@
-"""``graph_slam edit``: each edit does what the pipeline's own does, and stays in all that is made of the map."""
+"""``graph_slam map edit``: each edit does what the pipeline's own does, and stays in all that is made of the map."""
 
 import functools
 import hashlib
@@ -66,7 +66,7 @@ def planned(run, folder, *edits):
 
 
 def edit(run, plan, *words):
-    return cli.main(["edit", *map(str, [run, *(["--plan", plan] if plan else []), *words])])
+    return cli.main(["map", "edit", *map(str, [run, *(["--plan", plan] if plan else []), *words])])
 
 
 def contents(folder):
@@ -179,12 +179,12 @@ def test_explain_ledger_diff_solve_and_freeze_know_the_edits(run, edits, edited,
     assert f"by hand {text}" in told("explain", edited, gone)[1]
     assert f"edge {let_in} let in, as edge {added.edge}, by Anna" in told("explain", edited, added.edge)[1]
     assert f"by hand: {text}" in told("explain", edited)[1]
-    code, difference = told("diff", run, edited)
+    code, difference = told("map", "diff", run, edited)
     assert code == 4
     assert f"by hand only in B: {text}" in difference
-    assert told("diff", edited, edited)[1].endswith("nothing: they are the same")
-    assert told("solve", edited, "--without", added.edge)[0] == 0
-    assert told("freeze", edited, "--out", tmp_path / "site")[0] == 0
+    assert told("map", "diff", edited, edited)[1].endswith("nothing: they are the same")
+    assert told("explain", edited, "--without", added.edge)[0] == 0
+    assert told("map", "freeze", edited, "--out", tmp_path / "site")[0] == 0
     assert f"by hand: {text}" in told("explain", tmp_path / "site")[1]
     state = map_of(tmp_path / "site", [])
     assert [one.edit.name for one in state.edits] == list(edits)

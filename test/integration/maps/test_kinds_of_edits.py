@@ -156,28 +156,28 @@ def test_commands_on_maps_know_an_edit(do, run, edited, second, said, capsys, tm
     assert text in said(capsys, "explain", new)[1]
     for edge in (*slam.edits[0].edges[:1], *slam.edits[0].added[:1]):
         assert f"by hand {slam.edits[0].text}" in said(capsys, "explain", new, edge)[1]
-    code, difference = said(capsys, "diff", run, new)
+    code, difference = said(capsys, "map", "diff", run, new)
     assert code == 4 and f"by hand only in B: {slam.edits[0].text}" in difference
     saved = SavedGraph(new, [])
     assert saved.solver.estimate(saved.keyframes) == pytest.approx(slam.trajectory(), abs=1e-4)
-    assert said(capsys, "export", new, "--to", "tum", "--out", tmp_path / "path.tum")[0] == 0
+    assert said(capsys, "map", "export", new, "--out", tmp_path / "path.tum")[0] == 0
     assert len(np.loadtxt(tmp_path / "path.tum")) == len(slam.keyframes)
-    assert said(capsys, "export", new, "--to", "g2o", "--out", tmp_path / "graph.g2o")[0] == 0
+    assert said(capsys, "map", "export", new, "--out", tmp_path / "graph.g2o")[0] == 0
     file = read_g2o(tmp_path / "graph.g2o")
     assert file.graph.edge_count == sum(e.is_in for e in saved.entries)
     assert said(capsys, "optimize", tmp_path / "graph.g2o")[0] == 0
     poses = [file.graph.vertex(v).initial for v in range(file.graph.vertex_count) if file.graph.kind_of(v).size == 3]
     assert np.array(poses)[:, :2] == pytest.approx(slam.trajectory()[:, :2], abs=1e-4)
-    assert said(capsys, "export", new, "--to", "mcap", "--out", tmp_path / "map.mcap")[0] == 0
+    assert said(capsys, "map", "export", new, "--out", tmp_path / "map.mcap")[0] == 0
     assert len([m for m in records(tmp_path / "map.mcap", []) if isinstance(m, Message)]) == len(slam.keyframes) + 3
     last = max(e.edge for e in saved.entries if e.is_in and e.verdict)
     chi2 = [solver.evaluate().chi2_final for solver in (saved.solver, saved.solve([last]))]
-    assert "chi2 {:.4f} -> {:.4f}".format(*chi2) in said(capsys, "solve", new, "--without", last)[1]
+    assert "chi2 {:.4f} -> {:.4f}".format(*chi2) in said(capsys, "explain", new, "--without", last)[1]
     page = read_contents(new)
     assert page.losses == []
     assert page.data["tables"]["edits"] == [[do, slam.edits[0].edit.text, *WHO.values()]]
     assert page.data["edges"]["by_hand"].keys() == {str(e) for e in (*slam.edits[0].edges, *slam.edits[0].added)}
-    for command in (["freeze", new], ["merge", new, second], ["merge", second, new]):
+    for command in (["map", "freeze", new], ["map", "merge", new, second], ["map", "merge", second, new]):
         out = tmp_path / f"{command[0]}_{len(list(tmp_path.iterdir()))}"
         assert said(capsys, *command, "--out", out)[0] == 0
         state = map_of(out, [])
@@ -405,7 +405,7 @@ def test_what_a_later_edit_depends_on_is_not_undone(run, tmp_path):
 
 
 def test_a_frozen_map_and_one_that_measurements_locate_are_not_moved(run, tmp_path):
-    assert cli.main(["freeze", str(run), "--out", str(tmp_path / "site")]) == 0
+    assert cli.main(["map", "freeze", str(run), "--out", str(tmp_path / "site")]) == 0
     for do in ("move_anchor", "move_map", "cut", "split_landmark", "add_closure"):
         one = values(do, tmp_path / "site", name=do)
         with pytest.raises(GraphSlamError, match="it is part of a frozen map, which never changes"):
@@ -423,7 +423,7 @@ def test_a_closure_that_all_else_contradicts_is_warned_of(run, capsys, tmp_path)
     (fit,) = done.by_hand
     assert fit.innovation > 10 * fit.limit
     (tmp_path / "plan.json").write_text(plan_text(plan(run, wrong)))
-    assert cli.main(["edit", str(run), "--plan", str(tmp_path / "plan.json"), "--dry-run"]) == 0
+    assert cli.main(["map", "edit", str(run), "--plan", str(tmp_path / "plan.json"), "--dry-run"]) == 0
     said = capsys.readouterr()
     against = f"edge {fit.edge}: chi2 {fit.innovation:.4g} against all else, chi2 {fit.chi2:.4g} after the solve"
     assert against in said.out

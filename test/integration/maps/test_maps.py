@@ -55,8 +55,8 @@ def run(*words):
 
 
 def test_export_writes_what_the_run_folder_has(whole, tmp_path, capsys):
-    assert run("export", whole, "--to", "tum", "--out", tmp_path / "path.tum") == 0
-    assert run("export", whole, "--to", "g2o", "--out", tmp_path / "graph.g2o") == 0
+    assert run("map", "export", whole, "--out", tmp_path / "path.tum") == 0
+    assert run("map", "export", whole, "--out", tmp_path / "graph.g2o") == 0
     assert "graph_vertices.csv" in capsys.readouterr().out
     assert (tmp_path / "graph_vertices.csv").read_bytes() == (whole / "graph_vertices.csv").read_bytes()
     a, b = (np.loadtxt(folder / "path.tum") for folder in (whole, tmp_path))
@@ -67,14 +67,14 @@ def test_export_writes_what_the_run_folder_has(whole, tmp_path, capsys):
 
 
 def test_export_of_a_graph_may_be_gzipped(whole, tmp_path):
-    assert run("export", whole, "--to", "g2o", "--out", tmp_path / "map.g2o.gz") == 0
+    assert run("map", "export", whole, "--out", tmp_path / "map.g2o.gz") == 0
     assert (tmp_path / "map_vertices.csv").read_bytes() == (whole / "graph_vertices.csv").read_bytes()
     assert read_g2o(tmp_path / "map.g2o.gz").graph.vertex_count == read_g2o(whole / "graph.g2o").graph.vertex_count
 
 
 def test_export_as_messages_has_every_pose_at_its_stamp(cut_off, tmp_path):
     folder, slam = cut_off
-    assert run("export", folder, "--to", "mcap", "--out", tmp_path / "map.mcap") == 3, "its end is missing"
+    assert run("map", "export", folder, "--out", tmp_path / "map.mcap") == 3, "its end is missing"
     bag = open_bag(tmp_path / "map.mcap")
     counts = {name: topic.count for name, topic in bag.topics.items()}
     assert counts == {"/pose": len(slam.keyframes), "/path": 1, "/landmarks": 1, "/landmarks_estimate": 1}
@@ -95,7 +95,7 @@ def test_export_of_a_map_that_is_cut_is_of_what_is_left_and_tells(cut_off, tmp_p
     def exported_after_a_cut_of(name):
         whole = (folder / name).read_bytes()
         (tmp_path / "run" / name).write_bytes(whole[: len(whole) // 2])
-        assert run("export", tmp_path / "run", "--to", "tum", "--out", tmp_path / "path.tum", "--force") == 3
+        assert run("map", "export", tmp_path / "run", "--out", tmp_path / "path.tum", "--force") == 3
         assert f"{name}: cut off" in capsys.readouterr().err
         return [int(line.split()[0].replace(".", "")) for line in (tmp_path / "path.tum").read_text().splitlines()]
 
@@ -110,13 +110,13 @@ def test_export_refuses_in_one_line(whole, tmp_path, capsys):
     shutil.copytree(whole, another)
     before = (whole / "path.tum").read_bytes()
     for words in (
-        (whole, "--to", "tum", "--out", whole / "path.tum"),
-        (tmp_path, "--to", "tum", "--out", tmp_path / "path.tum"),
-        (whole, "--to", "mcap", "--out", tmp_path / "none" / "map.mcap"),
-        (whole, "--to", "mcap", "--out", tmp_path / "map.bag"),
-        (whole, "--to", "g2o", "--out", another / "graph.g2o"),
+        (whole, "--out", whole / "path.tum"),
+        (tmp_path, "--out", tmp_path / "path.tum"),
+        (whole, "--out", tmp_path / "none" / "map.mcap"),
+        (whole, "--out", tmp_path / "map.bag"),
+        (whole, "--out", another / "graph.g2o"),
     ):
-        assert run("export", *words) == 2
+        assert run("map", "export", *words) == 2
         assert len(capsys.readouterr().err.splitlines()) == 1
     assert (whole / "path.tum").read_bytes() == before
 
@@ -168,12 +168,12 @@ def second(tmp_path_factory):
 
 def test_diff_of_a_run_and_what_it_repeats_to_is_nothing(first, tmp_path, capsys):
     assert run("replay", first, "--out", tmp_path / "again") == 0
-    code, found = told(capsys, "diff", first, tmp_path / "again", "--json")
+    code, found = told(capsys, "map", "diff", first, tmp_path / "again", "--json")
     assert code == 0
     assert found["same"]
     assert found["keyframes"]["a"] == found["keyframes"]["both"] > 50
     assert found["edges"]["a"] == found["edges"]["both"] > 100
-    assert run("diff", first, tmp_path / "again") == 0
+    assert run("map", "diff", first, tmp_path / "again") == 0
     assert capsys.readouterr().out.splitlines()[-2] == "no difference"
 
 
@@ -185,7 +185,7 @@ def test_diff_finds_the_landmark_that_was_moved_and_what_is_only_in_one(first, w
         replace(m, sightings=tuple(one for one in m.sightings if one.id != gone)) if isinstance(m, Sightings) else m
         for m in moved(world, other, 0.4)
     ]
-    code, found = told(capsys, "diff", first, ended(tmp_path / "other", without), "--json")
+    code, found = told(capsys, "map", "diff", first, ended(tmp_path / "other", without), "--json")
     assert code == 4
     assert found["only_in_a"] == [gone]
     assert found["only_in_b"] == []
@@ -193,7 +193,7 @@ def test_diff_finds_the_landmark_that_was_moved_and_what_is_only_in_one(first, w
     assert farthest["landmark"] == other
     assert farthest["sigmas"] > 2.0 * max(one["sigmas"] for one in others)
     assert 0.1 < farthest["distance_m"] < 0.8
-    assert run("diff", first, tmp_path / "other") == 4
+    assert run("map", "diff", first, tmp_path / "other") == 4
     out = capsys.readouterr().out
     assert f"only in A  landmark {gone}" in out
     assert f"moved      landmark {other}" in out
@@ -201,7 +201,7 @@ def test_diff_finds_the_landmark_that_was_moved_and_what_is_only_in_one(first, w
 
 
 def test_diff_tells_sigmas_that_are_as_large_as_they_should_be(first, second, capsys):
-    code, found = told(capsys, "diff", first, second, "--json")
+    code, found = told(capsys, "map", "diff", first, second, "--json")
     assert code == 4
     assert found["aligned_by"].endswith("landmarks")
     sigmas = np.array([one["sigmas"] for one in found["moved"]])
@@ -214,7 +214,7 @@ def test_diff_tells_verdicts_on_the_same_measurement(first, world, tmp_path, cap
     a = ended(tmp_path / "a", with_a_wrong_sighting(world))
     config = Config.from_mapping({"robust.decide": False})
     b = ended(tmp_path / "b", with_a_wrong_sighting(world), config)
-    code, found = told(capsys, "diff", a, b, "--json")
+    code, found = told(capsys, "map", "diff", a, b, "--json")
     assert code == 4
     (wrong,) = (one for one in found["verdicts"] if one["verdict_a"] in ("pending", "rejected"))
     assert wrong["about"].startswith("landmarks ")
@@ -223,14 +223,14 @@ def test_diff_tells_verdicts_on_the_same_measurement(first, world, tmp_path, cap
 
 def test_diff_without_common_landmarks_is_by_stamps(world, first, tmp_path, capsys):
     blind = [m for m in world if not isinstance(m, Sightings)]
-    code, found = told(capsys, "diff", first, ended(tmp_path / "blind", blind), "--json")
+    code, found = told(capsys, "map", "diff", first, ended(tmp_path / "blind", blind), "--json")
     assert code == 4
     assert found["aligned_by"] == f"{found['keyframes']['both']} stamps"
     assert found["landmarks"] == {"a": found["landmarks"]["a"], "b": 0, "both": 0}
     assert found["only_in_a"]
     assert found["keyframes_m"][1] > 0.05
     assert " keyframes are of the same drive in " in found["merge_trouble"]
-    assert run("diff", first, tmp_path / "blind") == 4
+    assert run("map", "diff", first, tmp_path / "blind") == 4
     out, _ = capsys.readouterr()
     assert f"next: nothing: they cannot be merged: {found['merge_trouble']}" in " ".join(out.split())
 
@@ -238,9 +238,9 @@ def test_diff_without_common_landmarks_is_by_stamps(world, first, tmp_path, caps
 def test_diff_of_the_plane_and_space_is_refused(first, tmp_path, capsys):
     flight = list(measurements(simulate("flight", 0, laps=1)))[:120]
     other = ended(tmp_path / "flight", flight, Config.from_mapping({"world.dimensions": 3}))
-    assert run("diff", first, other) == 2
+    assert run("map", "diff", first, other) == 2
     assert "world.dimensions" in capsys.readouterr().err
-    assert told(capsys, "diff", other, other, "--json")[0] == 0
+    assert told(capsys, "map", "diff", other, other, "--json")[0] == 0
 
 
 # -- merge -------------------------------------------------------------------------------------------------------------
@@ -269,7 +269,7 @@ def elsewhere(tmp_path_factory):
 @pytest.fixture(scope="module")
 def merged(first, elsewhere, tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs") / "merged"
-    assert run("merge", first, elsewhere, "--out", folder) == 0
+    assert run("map", "merge", first, elsewhere, "--out", folder) == 0
     return folder
 
 
@@ -293,7 +293,7 @@ def test_a_merged_run_repeats_recovers_and_is_gone_on_in(merged, world, tmp_path
     for name in RECORDED:
         assert (merged / name).read_bytes() == (tmp_path / "again" / name).read_bytes(), name
     assert run("recover", merged, "--out", tmp_path / "recovered") == 0
-    assert run("diff", merged, tmp_path / "recovered") == 0
+    assert run("map", "diff", merged, tmp_path / "recovered") == 0
     assert run("explain", merged) == 0
     start = map_of(merged, [])
     known = set(start.landmarks)
@@ -307,12 +307,12 @@ def test_merge_leaves_out_what_has_moved_and_tells(first, tmp_path, capsys):
     seen = restored(first, []).landmarks
     name = max(seen, key=lambda name: seen[name].sightings)
     other = moved(measurements(simulate("warehouse", 5, aisles=2, laps=1, aisle_m=6.0)), name, 1.5)
-    assert run("merge", first, ended(tmp_path / "other", other, ELSEWHERE), "--out", tmp_path / "out") == 0
+    assert run("map", "merge", first, ended(tmp_path / "other", other, ELSEWHERE), "--out", tmp_path / "out") == 0
     warning = capsys.readouterr().err
     assert f"landmark {name} is 1." in warning
     assert len(warning.splitlines()) == 1
     one, both = restored(first, []), restored(tmp_path / "out", [])
-    _, found = told(capsys, "diff", first, tmp_path / "out", "--json")
+    _, found = told(capsys, "map", "diff", first, tmp_path / "out", "--json")
     (same,) = (one for one in found["moved"] if one["landmark"] == name)
     assert same["distance_m"] < 0.1, "it is where the first session saw it"
     out = [edge for edge in both.ledger.outside.tolist() if edge >= one.graph.edge_count]
@@ -337,7 +337,7 @@ def test_merge_of_unnamed_landmarks_keeps_them_apart(first, elsewhere, tmp_path)
         return sum(map(ord, name))
 
     a, b = ended(tmp_path / "a", half_named(0), config), ended(tmp_path / "b", half_named(5), config)
-    assert run("merge", a, b, "--out", tmp_path / "out") == 0
+    assert run("map", "merge", a, b, "--out", tmp_path / "out") == 0
     start = read_map(tmp_path / "out", [], start_only=True)
     one, two = (restored(folder, []) for folder in (a, b))
     unnamed = [sum(mark.is_unnamed for mark in slam.touched_landmarks(0).values()) for slam in (one, two)]
@@ -360,7 +360,7 @@ def test_merge_in_space_and_of_what_shares_an_offset(kind, tmp_path):
     recordings = [simulate(name, seed, **options) for seed in (0, 3)]
     given = simulation.measurements if kind == "ranges" else measurements
     runs = [ended(tmp_path / str(k), given(r), Config.from_mapping(settings)) for k, r in enumerate(recordings)]
-    assert run("merge", *runs, "--out", tmp_path / "out") == 0
+    assert run("map", "merge", *runs, "--out", tmp_path / "out") == 0
     one, two, both = (restored(folder, []) for folder in (*runs, tmp_path / "out"))
     assert list(both.range_offsets) == list(one.range_offsets)
     assert both.graph.vertex_count < one.graph.vertex_count + two.graph.vertex_count
@@ -397,11 +397,11 @@ def test_merge_refuses_in_one_line(first, elsewhere, world, tmp_path, capsys):
         (first, "of the same drive"),
         (ended(tmp_path / "alike", alike), "of the same drive"),  # however few landmarks agree
     ):
-        assert run("merge", first, other, "--out", tmp_path / "out") == 2
+        assert run("map", "merge", first, other, "--out", tmp_path / "out") == 2
         told = capsys.readouterr().err
         assert complaint in told
         assert len(told.splitlines()) == 1
-    assert run("merge", first, elsewhere, "--out", first) == 2
+    assert run("map", "merge", first, elsewhere, "--out", first) == 2
     assert not (tmp_path / "out").exists()
 
 
@@ -411,7 +411,7 @@ def test_merge_refuses_in_one_line(first, elsewhere, world, tmp_path, capsys):
 @pytest.fixture(scope="module")
 def frozen(first, tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs") / "frozen"
-    assert run("freeze", first, "--out", folder) == 0
+    assert run("map", "freeze", first, "--out", folder) == 0
     return folder
 
 
@@ -444,7 +444,7 @@ def another_drive():
 
 
 def test_freeze_changes_nothing_and_is_a_run_like_any_other(first, frozen, tmp_path):
-    assert run("diff", first, frozen) == 0
+    assert run("map", "diff", first, frozen) == 0
     assert run("explain", frozen) == 0
     of_first, of_frozen = (restored(folder, []).solver.degrees_of_freedom for folder in (first, frozen))
     assert of_first == of_frozen > 0, "what is held was estimated before"
@@ -478,7 +478,7 @@ def test_what_is_asked_of_a_run_in_a_frozen_map_leaves_that_where_it_is(frozen, 
     moved = np.abs(after.estimate(saved.keyframes) - saved.solve().estimate(saved.keyframes)).max(axis=1)
     assert moved[:first_new].max() == 0.0 < moved[first_new:].max()
     assert saved.solve().estimate(saved.keyframes) == pytest.approx(slam.trajectory(), abs=1e-4)
-    assert run("influence", tmp_path / "run") == run("explain", tmp_path / "run", edges[0].edge) == 0
+    assert run("explain", tmp_path / "run", "--influence") == run("explain", tmp_path / "run", edges[0].edge) == 0
 
 
 def test_new_landmarks_are_added_to_a_frozen_map(world, tmp_path):
@@ -488,7 +488,7 @@ def test_new_landmarks_are_added_to_a_frozen_map(world, tmp_path):
         replace(m, sightings=tuple(s for s in m.sightings if s.id in known)) if isinstance(m, Sightings) else m
         for m in world
     ]
-    assert run("freeze", ended(tmp_path / "half", half), "--out", tmp_path / "frozen") == 0
+    assert run("map", "freeze", ended(tmp_path / "half", half), "--out", tmp_path / "frozen") == 0
     slam = gone_on(tmp_path / "run", tmp_path / "frozen", measurements(another_drive()))
     assert_untouched(slam, tmp_path / "frozen")
     assert set(slam.landmarks) == set(names)
@@ -523,7 +523,7 @@ def test_a_run_in_a_frozen_map_that_was_cut_off_is_taken_up_with_it_frozen(froze
     slam = gone_on(tmp_path / "more", tmp_path / "run", world[len(world) // 2 :])
     assert_untouched(slam, frozen)
     other = ended(tmp_path / "other", world)
-    assert run("merge", frozen, other, "--out", tmp_path / "merged") == 0
+    assert run("map", "merge", frozen, other, "--out", tmp_path / "merged") == 0
     assert_untouched(restored(tmp_path / "merged", []), frozen)
 
 
@@ -531,7 +531,7 @@ def test_without_names_and_with_closures_a_frozen_map_stays(tmp_path):
     config = Config.from_mapping({"landmarks.association": "joint"})
     recording = with_closures(simulate("warehouse", 0, aisles=2, laps=2, aisle_m=6.0, sensor="position"), 60, 0)
     source = ended(tmp_path / "run", without_names(measurements(recording)), config)
-    assert run("freeze", source, "--out", tmp_path / "frozen") == 0
+    assert run("map", "freeze", source, "--out", tmp_path / "frozen") == 0
     again = with_closures(simulate("warehouse", 5, aisles=2, laps=2, aisle_m=6.0, sensor="position"), 60, 1)
     world = [*without_names(measurements(again)), Control("clear_closures")]
     slam = gone_on(tmp_path / "more", tmp_path / "frozen", world)
@@ -559,7 +559,7 @@ def test_class_and_size_are_the_same_bytes_after_freezing_and_a_restart(tmp_path
     config = Config.from_mapping({"landmarks.association": "joint", "landmarks.size_sigma_m": 0.03})
     first, second = (simulate("warehouse", seed, aisles=2, laps=1, aisle_m=6.0, sensor="position") for seed in (0, 5))
     source = ended(tmp_path / "run", with_features(measurements(first)), config)
-    assert run("freeze", source, "--out", tmp_path / "frozen") == 0
+    assert run("map", "freeze", source, "--out", tmp_path / "frozen") == 0
 
     def features(folder):
         return {name: (m.sort, m.size, m.sized) for name, m in read_map(folder, []).landmarks.items()}
@@ -587,7 +587,7 @@ def test_merge_keeps_the_edits_of_both_with_the_ids_of_their_edges(first, second
         plan = Plan(source_hash(folder), (edit_of(values | {"edge": edge}),))
         edited.append(tmp_path / f"edited_{number}")
         edit(folder, plan, edited[-1])
-    assert run("merge", *edited, "--out", tmp_path / "both") == 0
+    assert run("map", "merge", *edited, "--out", tmp_path / "both") == 0
     merged = SavedGraph(tmp_path / "both", [])
     assert [one.edit.name for one in merged.edits] == ["a", "a-2"]
     for one in merged.edits:

@@ -70,10 +70,14 @@ def test_a_line_of_an_error_keeps_its_beginning_and_its_end(tmp_path):
     told = shortened(f"graph_slam: {long}/run/path.tum: cannot be read: do this", MOST)
     assert told.endswith("/run/path.tum: cannot be read: do this")
     folder = tmp_path / ("b" * 90) / ("c" * 90) / ("d" * 200)
-    for words in (("plot", folder), ("info", folder), ("optimize", folder / "a.g2o"), ("info", "e" * 5000)):
+    for words in (("explain", folder), ("info", folder), ("optimize", folder / "a.g2o"), ("info", "e" * 5000)):
         code, err = answer(*words)
         check(code, err, (2,), "graph_slam", words)
-    for words in (("plot", "a", "b\x1b[2J\n" * 99), ("influence", "a", "--count", "\x1b" * 999), ("\n" * 300,)):
+    for words in (
+        ("map", "freeze", "a", "b\x1b[2J\n" * 99),
+        ("explain", "a", "--influence", "\x1b" * 999),
+        ("\n" * 300,),
+    ):
         code, err = answer(*words)
         check(code, err, (2,), "--help shows what there is", words)
         assert not set("".join(err)) & set("\x1b\n"), words
@@ -86,19 +90,19 @@ OF_MAP = ("run.json", "config.yaml", "map.mcap")
 NEEDS = {  # what each command reads of a run
     ("explain", "RUN"): OF_MAP,
     ("explain", "RUN", "3"): OF_MAP,
-    ("solve", "RUN", "--without", "3"): OF_MAP,
-    ("influence", "RUN", "--count", "1"): OF_MAP,
+    ("explain", "RUN", "--without", "3"): OF_MAP,
+    ("explain", "RUN", "--influence", "1"): OF_MAP,
     ("advise", "RUN"): OF_MAP,
     ("evaluate", "RUN", "--truth", "BAG"): SCORED,
-    ("plot", "RUN"): SCORED,
+    ("map", "export", "RUN", "--out", "OUT.png"): SCORED,
     ("replay", "RUN", "--out", "OUT"): ("run.json", "config.yaml", "ingest.mcap"),
     ("replay", "BAG", "--map", "RUN", "--out", "OUT"): OF_MAP,
     ("recover", "RUN", "--out", "OUT"): OF_MAP,
     ("recover", "RUN"): OF_MAP,
-    ("freeze", "RUN", "--out", "OUT"): OF_MAP,
-    ("export", "RUN", "--to", "tum", "--out", "OUT"): OF_MAP,
-    ("diff", "RUN", "OTHER"): OF_MAP,
-    ("merge", "OTHER", "RUN", "--out", "OUT"): OF_MAP,
+    ("map", "freeze", "RUN", "--out", "OUT"): OF_MAP,
+    ("map", "export", "RUN", "--out", "OUT.tum"): OF_MAP,
+    ("map", "diff", "RUN", "OTHER"): OF_MAP,
+    ("map", "merge", "OTHER", "RUN", "--out", "OUT"): OF_MAP,
 }
 CASES = [(words, name) for words, names in NEEDS.items() for name in names]
 
@@ -124,7 +128,8 @@ def of_another_run(path, other):
 
 def asked(words, made, folder):
     """The answer of a command about the run of a folder, to somebody who is no superuser."""
-    names = {"RUN": folder / "run", "BAG": made / "drive.mcap", "OUT": folder / "out", "OTHER": made / "other_run"}
+    names = {"RUN": folder / "run", "BAG": made / "drive.mcap", "OTHER": made / "other_run"}
+    names |= {f"OUT{ending}": folder / f"out{ending}" for ending in ("", ".png", ".tum")}
     with plain_rights():
         return answer(*(names.get(word, word) for word in words))
 
@@ -144,7 +149,7 @@ def wrong_with(odd, words, name, made, folder):
         )
         assert code != 0 or "beware" in "".join(err)
         assert completed or changed <= {"run/path.png"}, changed
-        assert code in (0, 3, 4) or not (folder / "out").exists() or "no odometry of it could be used" in err[0]
+        assert code in (0, 3, 4) or not [*folder.glob("out*")] or "no odometry of it could be used" in err[0]
     except AssertionError as error:
         return f"{odd.__name__} {words} {name}: {code} {err}: {error}"
     finally:
@@ -170,18 +175,18 @@ def test_a_run_that_may_be_read_and_not_written_is_read_and_stays(made, tmp_path
     run = tmp_path / "run"
     shutil.copytree(made / "drive_run", run)
     os.chmod(run, 0o555)
-    refused = {("plot", "RUN"), ("recover", "RUN")}
+    refused = {("recover", "RUN")}
     before = state(tmp_path)
-    for words in (*NEEDS, ("replay", "BAG", "--out", "RUN", "--force"), ("diff", "RUN", "RUN")):
+    for words in (*NEEDS, ("replay", "BAG", "--out", "RUN", "--force"), ("map", "diff", "RUN", "RUN")):
         code, err = asked(words, made, tmp_path)
         assert not any("internal error" in line for line in err), (words, err)
         if words in refused or words[-1] == "--force":
             check(code, err, (2,), f"{run}.*: Permission denied", words)
         else:
-            assert code == (4 if words == ("diff", "RUN", "OTHER") else 0), (words, err)
+            assert code == (4 if words == ("map", "diff", "RUN", "OTHER") else 0), (words, err)
             assert not err or "no picture" in err[0], (words, err)
-        out = tmp_path / "out"
-        shutil.rmtree(out) if out.is_dir() else out.unlink(missing_ok=True)
+        for out in tmp_path.glob("out*"):
+            shutil.rmtree(out) if out.is_dir() else out.unlink()
         assert state(tmp_path) == before, words
         reliability.tell("folders_of_others", tried=1, failed=0)
     os.chmod(run, 0o700)
@@ -197,7 +202,7 @@ def test_a_private_folder_of_somebody_else_is_refused_by_name(made, tmp_path):
     for words in (*NEEDS, *extra):
         code, err = asked(words, made, tmp_path)
         check(code, err, (2,), str(run), words)
-        assert not (tmp_path / "out").exists(), words
+        assert not [*tmp_path.glob("out*")], words
         reliability.tell("folders_of_others", tried=1, failed=0)
     os.chmod(run, 0o700)
 
@@ -311,9 +316,9 @@ TAKING = [  # what takes it, whatever it is for
     ("evaluate", "RUN", "--truth", "X"),
     ("evaluate", "RUN", "--truth", "BAG", "--estimate", "X"),
     ("explain", "RUN", "X"),
-    ("solve", "RUN", "--loss", "X"),
+    ("explain", "RUN", "--loss", "X"),
     ("replay", "BAG", "--out", "OUT", "--config", "X"),
-    ("merge", "RUN", "X", "--out", "OUT"),
+    ("map", "merge", "RUN", "X", "--out", "OUT"),
     ("simulate", "warehouse", "--out", "OUT", "--fault", "X"),
     ("optimize", "X", "--out", "OUT"),
 ]

@@ -171,10 +171,10 @@ def test_a_run_or_a_file_that_is_there_is_replaced_with_force_alone(bag, run, tm
     commands = [
         (["replay", bag], other),
         (["recover", run], other),
-        (["freeze", run], other),
-        (["export", run, "--to", "tum"], tmp_path / "path.tum"),
-        (["export", run, "--to", "g2o"], tmp_path / "path.g2o"),
-        (["export", run, "--to", "mcap"], tmp_path / "path.mcap"),
+        (["map", "freeze", run], other),
+        (["map", "export", run], tmp_path / "path.tum"),
+        (["map", "export", run], tmp_path / "path.g2o"),
+        (["map", "export", run], tmp_path / "path.mcap"),
         (["optimize", graph], tmp_path / "solved.g2o"),
         (["simulate", "manhattan", "--poses", "20", "--set", "blocks=2"], tmp_path / "world.mcap"),
         (city, tmp_path / "world_2.g2o"),
@@ -202,7 +202,7 @@ def test_a_run_or_a_file_that_is_there_is_replaced_with_force_alone(bag, run, tm
 
 def test_what_lies_beside_a_file_that_is_written_is_not_replaced_either(tmp_path, run, capsys):
     (tmp_path / "a_vertices.csv").write_text("mine")
-    assert code_of("export", run, "--to", "g2o", "--out", tmp_path / "a.g2o") == 2
+    assert code_of("map", "export", run, "--out", tmp_path / "a.g2o") == 2
     (tmp_path / "w.truth.tum").write_text("mine")
     assert code_of("simulate", "city", "--poses", "12", "--out", tmp_path / "w.g2o") == 2
     (tmp_path / "v.faults.csv").write_text("mine")
@@ -245,15 +245,15 @@ TABLES = ("run.json", "config.yaml", "graph.g2o", "ledger.csv", "ledger_changes.
 SCORED = ("sightings.tum", "odometry.tum", "landmarks.csv")
 READERS = {  # and the files of the run that they need
     ("explain", "RUN"): ("run.json", "config.yaml", "map.mcap"),
-    ("solve", "RUN", "--without", "3"): ("config.yaml", "map.mcap"),
-    ("influence", "RUN", "--count", "1"): ("map.mcap",),
+    ("explain", "RUN", "--without", "3"): ("config.yaml", "map.mcap"),
+    ("explain", "RUN", "--influence", "1"): ("map.mcap",),
     ("advise", "RUN"): ("map.mcap",),
     ("evaluate", "RUN", "--truth", "BAG"): ("run.json", "config.yaml", "path.tum", "covariances.csv", *SCORED),
-    ("plot", "RUN"): ("run.json", "config.yaml", "path.tum", "covariances.csv", *SCORED),
+    ("map", "export", "RUN", "--out", "OUT.png"): ("run.json", "config.yaml", "path.tum", "covariances.csv", *SCORED),
     ("replay", "RUN", "--out", "OUT"): ("config.yaml", "ingest.mcap"),
     ("recover", "RUN", "--out", "OUT"): ("config.yaml", "map.mcap"),
-    ("export", "RUN", "--to", "tum", "--out", "OUT"): ("map.mcap",),
-    ("diff", "RUN", "RUN"): ("map.mcap",),
+    ("map", "export", "RUN", "--out", "OUT.tum"): ("map.mcap",),
+    ("map", "diff", "RUN", "RUN"): ("map.mcap",),
     ("replay", "BAG", "--out", "RUN", "--force"): (*TABLES[1:], *SCORED, "path.png", "ingest.mcap", "run.mcap"),
 }
 
@@ -292,7 +292,7 @@ def test_no_command_waits_for_a_fifo_in_a_run_folder_or_follows_a_link(
     before = victim.read_bytes()
     (run / name).unlink(missing_ok=True)
     kind(run / name, victim)
-    names = {"RUN": run, "BAG": bag, "OUT": tmp_path / "out"}
+    names = {"RUN": run, "BAG": bag} | {f"OUT{ending}": tmp_path / f"out{ending}" for ending in ("", ".png", ".tum")}
     assert code_of(*(names.get(word, word) for word in words)) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert "not a regular file" in line or "a symbolic link" in line or "never removed" in line, line

@@ -81,7 +81,7 @@ def test_every_command_reads_the_run_and_a_repetition_has_the_same_bytes(install
     capsys.readouterr()
     assert main(["recover", run, "--out", str(tmp_path / "recovered")]) == 0
     assert "of the map as it was read, solved once" in capsys.readouterr().out
-    assert main(["diff", run, str(tmp_path / "recovered")]) == 0
+    assert main(["map", "diff", run, str(tmp_path / "recovered")]) == 0
     assert "no difference" in capsys.readouterr().out
     entries = load_run(run).edges
     (wrong, *_) = [e for e in entries if e.label == "custom" and not e.is_in]
@@ -91,12 +91,12 @@ def test_every_command_reads_the_run_and_a_repetition_has_the_same_bytes(install
     assert "what if it were in with its full weight" in text
     assert main(["explain", run, "east"]) == 0
     assert f"landmark east: {1 + MEDIUM // 2} edges" in capsys.readouterr().out
-    assert main(["solve", run, "--without", str(wrong.edge - 1)]) == 0
+    assert main(["explain", run, "--without", str(wrong.edge - 1)]) == 0
     assert main(["optimize", f"{run}/graph.g2o", "--out", str(tmp_path / "solved.g2o")]) == 0
     assert "unknown" not in capsys.readouterr().err
     lines = (tmp_path / "run" / "graph.g2o").read_text().splitlines()
     assert sum(line.startswith(TAG) for line in lines) == sum(e.is_in for e in entries if e.label == "custom")
-    assert main(["export", run, "--to", "g2o", "--out", str(tmp_path / "exported.g2o")]) == 0
+    assert main(["map", "export", run, "--out", str(tmp_path / "exported.g2o")]) == 0
 
 
 def test_a_map_of_such_edges_is_gone_on_in_and_solves_to_the_same(install, tmp_path):
@@ -109,7 +109,9 @@ def test_a_map_of_such_edges_is_gone_on_in_and_solves_to_the_same(install, tmp_p
     assert np.abs(poses - first.trajectory())[:, :2].max() < 0.1
 
 
-@pytest.mark.parametrize("command", ["explain RUN", "recover RUN --out OUT", "replay RUN --out OUT", "diff RUN RUN"])
+@pytest.mark.parametrize(
+    "command", ["explain RUN", "recover RUN --out OUT", "replay RUN --out OUT", "map diff RUN RUN"]
+)
 def test_without_the_plugin_a_map_or_journal_is_refused_in_one_line_that_names_it(
     command, install, tmp_path, monkeypatch, capsys
 ):

@@ -1,4 +1,4 @@
-"""The work behind the page: what-if is that of ``solve``, what is saved is that of ``edit``, and the run stays."""
+"""The work behind the page: a what-if is that of ``explain``, a save that of ``map edit``, and the run stays."""
 
 import json
 from types import SimpleNamespace
@@ -55,7 +55,7 @@ def test_a_what_if_is_that_of_solve(faulty, loss, capsys):
     assert np.abs(expected - faulty.saved.solver.estimate(faulty.saved.keyframes)).max() > 0.01, "something moves"
     for name, place in found["landmarks"].items():
         assert place == pytest.approx(solver.estimate([faulty.saved.slam.landmarks[name].vertex])[0], abs=1e-5)
-    words = ["solve", str(faulty.run), "--without", *map(str, out), "--with", *map(str, back)]
+    words = ["explain", str(faulty.run), "--without", *map(str, out), "--with", *map(str, back)]
     assert cli.main([*words, *(["--loss", loss] if loss else [])]) == 0
     before, after = found["chi2"]
     assert f"chi2       {before:14.4f}  ->  {after:14.4f}" in capsys.readouterr().out
@@ -93,7 +93,7 @@ def test_what_is_tried_is_what_is_saved_and_what_edit_writes(faulty):
         assert place == pytest.approx(marks[name].position[: len(place)], abs=1e-5)
     file, other = faulty.folder / "edits.json", faulty.folder / "other"
     file.write_bytes(body)
-    assert cli.main(["edit", str(faulty.run), "--plan", str(file), "--out", str(other)]) == 0
+    assert cli.main(["map", "edit", str(faulty.run), "--plan", str(file), "--out", str(other)]) == 0
     for one in folder.iterdir():
         if one.name not in ("run.json", "path.png"):
             assert one.read_bytes() == (other / one.name).read_bytes(), one.name

@@ -227,26 +227,22 @@ def test_a_planted_link_is_replaced_and_not_written_through(run, tmp_path):
     assert not (run / "run.png").is_symlink()
 
 
-def test_plot_draws_with_and_without_truth_and_replay_always(tmp_path, recording, figures, capsys, monkeypatch):
+def test_plot_draws_with_and_without_truth_and_replay_always(tmp_path, recording, figures, capsys):
     write_bag(recording, tmp_path / "yard.mcap")
     bag, out = str(tmp_path / "yard.mcap"), str(tmp_path / "run")
     assert main(["replay", bag, "--out", out]) == 0
     assert f"picture in {out}/path.png" in capsys.readouterr().out
     assert (tmp_path / "run/path.png").stat().st_size > 10_000
     assert figures[0].get_suptitle().startswith("yard.mcap  ·  51 keyframes")
-    assert main(["plot", out, "--out", str(tmp_path / "a.png")]) == 0
-    assert main(["plot", out, "--truth", bag, "--topic", "/ground_truth", "--out", str(tmp_path / "b.png")]) == 0
+    assert main(["map", "export", out, "--out", str(tmp_path / "a.png")]) == 0
+    assert (
+        main(["map", "export", out, "--truth", bag, "--topic", "/ground_truth", "--out", str(tmp_path / "b.png")]) == 0
+    )
     assert [len(figure.axes) for figure in figures] == [1, 1, 2]
-    assert main(["plot", out, "--topic", "/odom"]) == 2
-    assert main(["plot", str(tmp_path / "none")]) == 2
-    capsys.readouterr()
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
-    assert main(["replay", bag, "--out", str(tmp_path / "bare")]) == 0
-    assert "no picture: matplotlib is not installed: pip install matplotlib" in capsys.readouterr().err
-    assert not (tmp_path / "bare/path.png").exists()
-    assert main(["evaluate", str(tmp_path / "bare"), "--truth", bag]) == 0
-    assert main(["plot", out]) == 2
-    assert "pip install matplotlib" in capsys.readouterr().err
+    assert main(["map", "export", out, "--topic", "/odom", "--out", str(tmp_path / "c.png")]) == 2
+    assert main(["map", "export", str(tmp_path / "none"), "--out", str(tmp_path / "c.png")]) == 2
+    assert main(["map", "export", out, "--out", str(tmp_path / "c.bmp")]) == 2
+    assert "its ending is none of .tum, .g2o, .mcap, .png" in capsys.readouterr().err
 
 
 def test_the_animation_repeats_the_drive_and_ends_with_the_solved_path(tmp_path, monkeypatch, capsys):
@@ -256,7 +252,7 @@ def test_the_animation_repeats_the_drive_and_ends_with_the_solved_path(tmp_path,
     seen = []
     drawn = animation._drawn
     monkeypatch.setattr(animation, "_drawn", lambda moments, *rest: drawn(seen.append(moments) or moments, *rest))
-    assert main(["plot", str(run), "--animate", str(gif), "--truth", str(tmp_path / "world.mcap")]) == 0
+    assert main(["map", "export", str(run), "--out", str(gif), "--truth", str(tmp_path / "world.mcap")]) == 0
     (moments,) = seen
     lengths = [len(moment.path) for moment in moments]
     assert lengths == sorted(lengths) and lengths[0] < 0.1 * lengths[-1]
@@ -267,15 +263,14 @@ def test_the_animation_repeats_the_drive_and_ends_with_the_solved_path(tmp_path,
         image.seek(image.n_frames - 1)
         assert b"\x1f\x6f\xd6" in image.convert("RGB").tobytes(), "truth is blue"
     capsys.readouterr()
-    assert main(["plot", str(run), "--animate", str(gif)]) == 2, "it is there"
-    assert main(["plot", str(run), "--animate", str(tmp_path / "drive.png")]) == 2
+    assert main(["map", "export", str(run), "--out", str(gif)]) == 2, "it is there"
     monkeypatch.setattr(animation, "_drawn", lambda moments, *rest: drawn(moments[-1:], *rest))  # each takes a while
     journal = (run / "ingest.mcap").read_bytes()
     (run / "ingest.mcap").write_bytes(journal[: len(journal) * 9 // 10])
-    assert main(["plot", str(run), "--animate", str(gif), "--force"]) == 3, "a part of the drive is lost"
+    assert main(["map", "export", str(run), "--out", str(gif), "--force"]) == 3, "a part of the drive is lost"
     assert "ingest.mcap" in capsys.readouterr().err
     (run / "ingest.mcap").unlink()
-    assert main(["plot", str(run), "--animate", str(gif), "--force"]) == 2
+    assert main(["map", "export", str(run), "--out", str(gif), "--force"]) == 2
     assert "ingest.mcap" in capsys.readouterr().err
 
 

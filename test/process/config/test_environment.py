@@ -27,7 +27,7 @@ def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("made")
     write_bag(simulate("warehouse", 5, aisles=2, laps=1, aisle_m=4.0), folder / "drive.mcap")
     replay(folder / "drive.mcap", folder / "run")
-    assert cli.main(["export", str(folder / "run"), "--to", "g2o", "--out", str(folder / "graph.g2o")]) == 0
+    assert cli.main(["map", "export", str(folder / "run"), "--out", str(folder / "graph.g2o")]) == 0
     return folder
 
 
@@ -63,11 +63,11 @@ FULL = {  # what is written, and how it is called
     "a graph": ("simulate", "city", "--poses", "300", "--out", "DISK/a.g2o"),
     "replay": ("replay", "BAG", "--out", "DISK/out"),
     "recover": ("recover", "RUN", "--out", "DISK/out"),
-    "freeze": ("freeze", "RUN", "--out", "DISK/out"),
-    "tum": ("export", "RUN", "--to", "tum", "--out", "DISK/a.tum"),
-    "g2o": ("export", "RUN", "--to", "g2o", "--out", "DISK/a.g2o"),
-    "mcap": ("export", "RUN", "--to", "mcap", "--out", "DISK/a.mcap"),
-    "plot": ("plot", "RUN", "--out", "DISK/a.png"),
+    "freeze": ("map", "freeze", "RUN", "--out", "DISK/out"),
+    "tum": ("map", "export", "RUN", "--out", "DISK/a.tum"),
+    "g2o": ("map", "export", "RUN", "--out", "DISK/a.g2o"),
+    "mcap": ("map", "export", "RUN", "--out", "DISK/a.mcap"),
+    "plot": ("map", "export", "RUN", "--out", "DISK/a.png"),
     "optimize": ("optimize", "GRAPH", "--out", "DISK/a.g2o"),
     "poses": ("optimize", "GRAPH", "--out", "DISK/a.tum"),
 }
@@ -195,7 +195,7 @@ TOLD = """
 import sys
 from graph_slam_ros import cli
 run, out = sys.argv[1:]
-for words in (["plot", run, "--out", out], ["explain", run, "\\u00e4\\u202e"], ["params", "min_distance"]):
+for words in (["map", "export", run, "--out", out], ["explain", run, "\\u00e4\\u202e"], ["params", "min_distance"]):
     print("code", cli.main(words), file=sys.stderr)
 """
 

@@ -218,7 +218,7 @@ def test_a_recording_is_located_in_a_map_that_stays(tmp_path, capsys):
     bag = tmp_path / "world.mcap"
     write_bag(simulate("warehouse", 0, aisles=2, laps=1), bag)
     assert main(["replay", str(bag), "--out", str(tmp_path / "first")]) == 0
-    assert main(["freeze", str(tmp_path / "first"), "--out", str(tmp_path / "site")]) == 0
+    assert main(["map", "freeze", str(tmp_path / "first"), "--out", str(tmp_path / "site")]) == 0
     capsys.readouterr()
     assert main(["replay", str(bag), "--map", str(tmp_path / "site"), "--out", str(tmp_path / "second")]) == 0
     site, second = ((tmp_path / name / "landmarks.csv").read_text() for name in ("site", "second"))
@@ -227,9 +227,7 @@ def test_a_recording_is_located_in_a_map_that_stays(tmp_path, capsys):
     first, path = (np.loadtxt(tmp_path / name / "path.tum") for name in ("first", "second"))
     assert len(path) > len(first)
     assert np.linalg.norm(path[-1, 1:3] - first[-1, 1:3]) < 0.1
-    assert (
-        main(["export", str(tmp_path / "second"), "--to", "tum", "--last-drive", "--out", str(tmp_path / "a.tum")]) == 0
-    )
+    assert main(["map", "export", str(tmp_path / "second"), "--last-drive", "--out", str(tmp_path / "a.tum")]) == 0
     assert len(np.loadtxt(tmp_path / "a.tum")) == len(path) - new["keyframe"]
 
 

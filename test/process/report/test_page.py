@@ -66,7 +66,7 @@ def test_a_page_says_why_as_explain_does(page, faulty):
     told = " ".join(" ".join(explain_edge(faulty.saved, str(false.edge))).split())
     before = told[: told.index(" what if ")]
     assert why(page).startswith(before)
-    assert f"graph_slam solve run --with {false.edge}" in why(page)
+    assert f"graph_slam explain run --with {false.edge}" in why(page)
     page.fill("#filter", f"{false.edge + 1}")
     before = ranges(page)
     page.click(f".row[data-edge='{false.edge + 1}']")
@@ -207,8 +207,8 @@ def test_a_run_in_space_a_merged_and_frozen_one_and_an_empty_one_open(opened, tm
     assert why(page).startswith("landmark b: 20 edges")
     one, two = (drive(tmp_path / name, ["a", "b", "c", name], at) for name, at in (("one", 0), ("two", 100)))
     both, site = tmp_path / "both", tmp_path / "site"
-    assert cli.main(["merge", str(one), str(two), "--out", str(both)]) == 0
-    assert cli.main(["freeze", str(both), "--out", str(site)]) == 0
+    assert cli.main(["map", "merge", str(one), str(two), "--out", str(both)]) == 0
+    assert cli.main(["map", "freeze", str(both), "--out", str(site)]) == 0
     code, html = reported(site, tmp_path / "site.html", "--compare", one)
     page = opened(html, "#keyframe=30")
     assert code == 0

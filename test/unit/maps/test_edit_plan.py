@@ -59,7 +59,7 @@ def test_the_page_has_every_kind_and_every_key():
 
 def test_the_help_of_the_command_has_every_kind(capsys):
     with pytest.raises(SystemExit):
-        parser().parse_args(["edit", "--help"])
+        parser().parse_args(["map", "edit", "--help"])
     text = capsys.readouterr().out
     for do, action in ACTIONS.items():
         assert f"  {do:16s} {action.keys_text}" in text

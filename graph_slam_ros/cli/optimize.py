@@ -7,8 +7,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from graph_slam_ros.cli import console
-from graph_slam_ros.cli.usage import later
+from graph_slam_ros.cli import arguments, console
+from graph_slam_ros.cli.usage import CODES, CommandParser, later
 from graph_slam_ros.errors import GraphSlamError
 
 if TYPE_CHECKING:
@@ -26,6 +26,42 @@ STARTS = {
 _NO_VALUES = "the file has no vertex lines"
 
 
+def optimize_options(sub: CommandParser) -> None:
+    """Add the options of ``optimize``."""
+    sub.codes = f"{CODES} With --certify: 4 not certified, 5 the certificate does not apply."
+    sub.add_argument("graph", type=Path, metavar="GRAPH", help="file of a graph")
+    about = "method of optimisation; gn (default) is damped only if it does not converge"
+    sub.add_argument("--method", type=arguments.method, default="gn", metavar="gn|lm|dogleg", help=about)
+    about = "most iterations (default: 100)"
+    sub.add_argument("--max-iterations", type=arguments.count, default=100, metavar="N", help=about)
+    about = "converged when the cost decreases by a smaller fraction (default: 1e-6)"
+    sub.add_argument("--tolerance", type=arguments.positive, default=1e-6, metavar="X", help=about)
+    about = f"robust loss of all edges but odometry; SCALE in sigmas (default: {arguments.LOSS_SCALE:g})"
+    sub.add_argument("--loss", type=arguments.loss, default="none", metavar="none|huber|cauchy[:SCALE]", help=about)
+    about = (
+        "initial estimate; auto: the values of the file (without vertices: tree); if the result is suspicious,"
+        " chordal and then online (pose by pose) are tried, and the best result is used"
+    )
+    sub.add_argument("--init", choices=("auto", "file", "tree", "chordal", "online"), default="auto", help=about)
+    about = "error of relative poses; seed: of the inverse"
+    sub.add_argument("--error-map", choices=("relative", "seed"), default="relative", help=about)
+    about = "prove that the result is the global optimum; for graphs of poses only"
+    sub.add_argument("--certify", action="store_true", help=about)
+    about = (
+        "format of the lines; others are refused (default: each by its tag); isam: square roots of the"
+        " information; rows: information of EDGE2 in rows of its upper triangle"
+    )
+    sub.add_argument("--from", dest="source", choices=("g2o", "toro", "gtsam", "isam", "rows"), help=about)
+    about = "scale of the information of 3D rotations; raw: unscaled"
+    sub.add_argument("--information", choices=("g2o", "raw"), default="g2o", help=about)
+    sub.add_argument("--lenient", action="store_true", help="leave out bad lines, list them, exit with 3")
+    arguments.add_json(sub, "the answer")
+    about = "write the solved graph, or its poses"
+    sub.add_argument("--out", type=Path, metavar="FILE.g2o|FILE.tum", help=about)
+    sub.add_argument("--plot", type=Path, metavar="FILE.png", help="draw the initial estimate and the result")
+    arguments.add_force(sub)
+
+
 def optimize(args: argparse.Namespace) -> int:
     """Solve a graph, print the outcome, write it and draw it."""
     from graph_slam_ros.formats.g2o_writer import write_g2o
@@ -34,7 +70,9 @@ def optimize(args: argparse.Namespace) -> int:
     from graph_slam_ros.optimization import optimize as solve
     from graph_slam_ros.optimization import started
     from graph_slam_ros.solver import Settings
+    from graph_slam_ros.warmup import compile_all
 
+    compile_all()
     console.check_file(args.out, args.plot, force=args.force, source=args.graph)
     file = _read_graph(args, error_map=args.error_map)
     graph = file.graph
@@ -85,7 +123,7 @@ def _options(args: argparse.Namespace) -> Iterable[str]:
     """Yield the options of the solution as they were typed."""
     from graph_slam_ros.cli.parser import parser
 
-    usual = parser("optimize").parse_args(["optimize", "GRAPH"])
+    usual = parser(["optimize"]).parse_args(["optimize", "GRAPH"])
     for option in ("method", "loss", "init", "from", "max-iterations", "tolerance", "error-map", "information"):
         name = {"from": "source"}.get(option, option.replace("-", "_"))
         value = getattr(args, name)

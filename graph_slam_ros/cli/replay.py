@@ -1,19 +1,38 @@
-"""The commands on recordings and runs: ``replay``, ``info``, ``evaluate``, ``warmup``."""
+"""The commands ``replay`` and ``recover``: recordings through the pipeline, and runs that were cut off."""
 
 import argparse
-import importlib.util
 import json
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from graph_slam_ros.cli import console
+from graph_slam_ros.cli import arguments, console
+from graph_slam_ros.cli.results import draw, suggest_next
+from graph_slam_ros.cli.usage import CommandParser
 from graph_slam_ros.errors import GraphSlamError
 
 if TYPE_CHECKING:
     from graph_slam_ros.slam import Config
 
-_NO_MATPLOTLIB = "matplotlib is not installed: pip install matplotlib"
+
+def replay_options(sub: CommandParser) -> None:
+    """Add the options of ``replay``."""
+    sub.add_argument("bag", type=Path, metavar="BAG", help="file or folder of a recording, or a run folder")
+    arguments.add_out(sub, required=False)  # not with --ros and --node
+    sub.add_argument("--odom", metavar="TOPIC", help="odometry topic (default: the only one, or /odom)")
+    sub.add_argument("--landmarks", metavar="TOPIC", help="landmark topic (default: the only one, or /landmarks)")
+    arguments.add_config(sub)
+    sub.add_argument(
+        "--map", type=Path, metavar="RUN", help="continue in the map of a run, frozen or not, with its parameters"
+    )
+    sub.add_argument("--ros", action="store_true", help="publish into a live ROS graph: a node of its own with --out")
+    sub.add_argument(
+        "--rate",
+        type=arguments.positive,
+        metavar="X",
+        help="with --ros: multiple of real time (default: as fast as possible)",
+    )
+    sub.add_argument("--node", metavar="NAME", help="with --ros and without --out: name of the running node")
 
 
 def replay(args: argparse.Namespace) -> int:
@@ -37,9 +56,9 @@ def replay(args: argparse.Namespace) -> int:
     if done.topics and config.inputs.names == Config().inputs.names:
         _print_unused(args.bag, done.topics)
     console.show(f"results in {args.out}")
-    _draw(args.out)
+    draw(args.out)
     code = console.report_losses(done.losses, done.warnings) or code
-    _suggest_next(args.out, None if is_run(args.bag) or not (code or done.warnings) else args.bag)
+    suggest_next(args.out, None if is_run(args.bag) or not (code or done.warnings) else args.bag)
     return code
 
 
@@ -84,12 +103,18 @@ def _replay_live(args: argparse.Namespace, config: "Config") -> int:
         summary = json.loads(read_text(args.out / SUMMARY))
         asked = {name: counts for name, counts in summary["inputs"].items() if name in inputs.topics}
         code = _print_summary(args.bag, summary | {"inputs": asked})
-        _draw(args.out)
+        draw(args.out)
     console.show(f"{played.sent} messages sent, {played.lost} lost; results in {played.saved}")
     losses = bag.losses + ([f"{played.lost} messages did not arrive"] if played.lost else [])
     code = console.report_losses(losses, bag.warnings) or code
-    _suggest_next(Path(played.saved), args.bag if code else None)
+    suggest_next(Path(played.saved), args.bag if code else None)
     return code
+
+
+def recover_options(sub: CommandParser) -> None:
+    """Add the options of ``recover``."""
+    sub.add_argument("run_folder", type=Path, metavar="RUN", help="run folder")
+    arguments.add_out(sub, required=False, default="RUN itself")
 
 
 def recover(args: argparse.Namespace) -> int:
@@ -101,112 +126,8 @@ def recover(args: argparse.Namespace) -> int:
     code = _print_summary(args.run_folder, summary)
     console.show(f"results in {args.out or args.run_folder}")
     code = console.report_losses(summary["losses"]) or code
-    _suggest_next(args.out or args.run_folder)
+    suggest_next(args.out or args.run_folder)
     return code
-
-
-def info(args: argparse.Namespace) -> int:
-    """Print the contents of a recording."""
-    from graph_slam_ros.cli.info import describe
-    from graph_slam_ros.recordings.bag import open_bag
-    from graph_slam_ros.runs.folder import is_run, suggested_out
-
-    if is_run(args.bag):
-        console.show(f"an earlier run: {console.command('replay', args.bag, '--out', suggested_out(args.bag))}")
-        return console.DONE
-    bag = open_bag(args.bag)
-    lines, fits = describe(bag, args.bag)
-    checked = f"what is wrong with it, and what mends it: {console.command('check', args.bag)}"
-    console.show(*lines[:-1], checked, lines[-1])  # the command to paste is the last line
-    return console.report_losses(bag.losses, bag.warnings) or (console.DONE if fits else console.LOSSES)
-
-
-def evaluate(args: argparse.Namespace) -> int:
-    """Compare a run with the truth."""
-    from graph_slam_ros.analysis.evaluation import evaluate as compared
-    from graph_slam_ros.analysis.evaluation import input_topics
-    from graph_slam_ros.analysis.trajectories import read_truth
-    from graph_slam_ros.runs.folder import changed_since
-
-    console.check_file(args.plot, force=args.force)
-    truth = read_truth(args.truth, args.topic, input_topics(args.run_folder))
-    scores = compared(args.run_folder, truth, args.estimate, align=not args.no_align)
-    console.show(*([json.dumps(scores.as_dict())] if args.json else str(scores).split("\n")))
-    _draw(args.run_folder, truth, args.plot, align=not args.no_align, quiet=args.json)
-    code = console.report_losses(scores.losses, [*scores.warnings, *changed_since(args.run_folder)])
-    if not args.json:
-        same = [*(("--topic", args.topic) if args.topic else ()), *(("--no-align",) if args.no_align else ())]
-        with_truth = console.command("report", args.run_folder, "--truth", args.truth, *same)
-        console.then(f"{with_truth} (one page: the map, its errors, and why each edge is in or out)")
-    return code
-
-
-def plot(args: argparse.Namespace) -> int:
-    """Draw a run."""
-    from graph_slam_ros.analysis.plots import draw_run
-    from graph_slam_ros.runs.folder import PICTURE, changed_since
-
-    if not args.truth and (args.topic or args.no_align):
-        raise GraphSlamError("plot: no use for --topic or --no-align without --truth")
-    if not _has_matplotlib():
-        raise GraphSlamError(_NO_MATPLOTLIB)
-    if args.animate:
-        return _animate(args)
-    console.check_file(args.out, force=args.force)
-    picture = args.out or args.run_folder / PICTURE
-    draw_run(args.run_folder, args.truth, picture, args.topic, align=not args.no_align)
-    console.show(f"picture in {picture}")
-    _suggest_next(args.run_folder)
-    return console.report_losses([], changed_since(args.run_folder))
-
-
-def _animate(args: argparse.Namespace) -> int:
-    """Draw the drive as an animation."""
-    from graph_slam_ros.analysis.animation import animate_run
-    from graph_slam_ros.runs.folder import changed_since
-    from graph_slam_ros.warmup import compile_all
-
-    if args.out:
-        raise GraphSlamError("plot: --animate has no use for --out")
-    console.check_file(args.animate, force=args.force)
-    compile_all()
-    options = {"truth": args.truth, "topic": args.topic, "align": not args.no_align}
-    losses = animate_run(args.run_folder, args.animate, **options)
-    console.show(f"animation in {args.animate}")
-    _suggest_next(args.run_folder)
-    return console.report_losses(losses, changed_since(args.run_folder))
-
-
-def _draw(run: Path, truth: Any = None, out: Path | None = None, *, align: bool = True, quiet: bool = False) -> None:
-    """Draw a run in addition to other output. A failure to draw does not fail the command."""
-    from graph_slam_ros.runs.folder import PICTURE
-
-    if not _has_matplotlib():
-        return console.warn(f"no picture: {_NO_MATPLOTLIB}")
-    from graph_slam_ros.analysis.plots import draw_run
-
-    picture = out or run / PICTURE
-    try:
-        draw_run(run, truth, picture, align=align)
-    except GraphSlamError as error:
-        if out is not None:  # it was asked for
-            raise
-        return console.warn(f"no picture: {error}")
-    if not quiet:
-        console.show(f"picture in {picture}")
-
-
-def _has_matplotlib() -> bool:
-    return importlib.util.find_spec("matplotlib") is not None
-
-
-def warmup(args: argparse.Namespace) -> int:
-    """Compile the kernels."""
-    from graph_slam_ros.warmup import warmup as compiled
-
-    console.warn(f"kernels ready after {compiled():.1f} s")
-    console.then(console.command("info", "RECORDING"))
-    return console.DONE
 
 
 def _refuse_idle_options(args: argparse.Namespace, of_run: bool) -> None:
@@ -281,7 +202,7 @@ def _print_earlier(folder: Path, summary: dict[str, Any]) -> int:
     code = _print_shortcomings(summary)
     console.show(*outcome.text(summary))
     console.show(f"odometry went back in time, and time.on_jump is reset: the run until then is in {folder}")
-    _draw(folder)
+    draw(folder)
     return code
 
 
@@ -292,14 +213,3 @@ def _print_shortcomings(summary: dict[str, Any]) -> int:
     for sentence in shortcomings:
         console.warn(sentence, most=console.SENTENCE)
     return console.LOSSES if shortcomings else console.DONE
-
-
-def _suggest_next(run: Path, doubtful: Path | None = None) -> None:
-    """Name the next command; ``doubtful`` is a recording whose result is incomplete, or comes with a warning."""
-    if doubtful is not None:
-        return console.then(f"{console.command('check', doubtful)} (what is wrong with the recording, and the remedy)")
-    if importlib.util.find_spec("plotly") is None:
-        what = f"{console.command('explain', run)} (which measurements are believed, and why)"
-    else:
-        what = f"{console.command('report', run)} (one page: the map, and why each edge is in or out)"
-    console.then(f"{what}; with a ground truth: {console.command('evaluate', run, '--truth', 'TRUTH')}")

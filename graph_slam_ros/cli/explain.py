@@ -1,12 +1,13 @@
-"""The commands on what a run has decided: ``explain``, ``solve`` and ``influence``."""
+"""The command ``explain``: what a run has decided, which edges matter, and what would be without some of them."""
 
 import argparse
 import math
 import time
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from graph_slam_ros.cli import console
+from graph_slam_ros.cli import arguments, console
+from graph_slam_ros.cli.usage import CODES, CommandParser
 from graph_slam_ros.errors import GraphSlamError
 
 if TYPE_CHECKING:
@@ -16,8 +17,33 @@ _SHOWN = 10  # edges that fit worse
 _NO_SOLUTION = "not a solution: the solver did not converge. What was let in contradicts all else"
 
 
+def explain_options(sub: CommandParser) -> None:
+    """Add the options of ``explain``."""
+    sub.codes = f"Edges have the ids of the run's ledger. {CODES}"
+    arguments.add_run(sub)
+    about = "id of an edge or name of a landmark (landmark:7 if the name is a number); default: the whole run"
+    sub.add_argument("edge", nargs="?", metavar="EDGE", help=about)
+    about = "list the N edges (default: 10) that the last pose depends on most, each left out in turn"
+    sub.add_argument("--influence", type=arguments.count, nargs="?", const=10, metavar="N", help=about)
+    edges: dict[str, Any] = {"nargs": "+", "action": "extend", "type": arguments.edge, "default": []}
+    sub.add_argument("--without", **edges, metavar="EDGE", help="ids of edges to remove")
+    about = "ids of edges to include with full weight, without a robust loss"
+    sub.add_argument("--with", dest="let_in", **edges, metavar="EDGE", help=about)
+    names, scale = "none|huber|cauchy|geman_mcclure|dcs[:SCALE]", f"SCALE in sigmas ({arguments.LOSS_SCALE:g})"
+    about = f"robust loss of all candidates, instead of the run's; {scale}"
+    sub.add_argument("--loss", type=arguments.loss, metavar=names, help=about)
+
+
 def explain(args: argparse.Namespace) -> int:
-    """Print why measurements are in or out."""
+    """Print why measurements are in or out, which matter most, or what moves without some of them."""
+    what_if = bool(args.without or args.let_in or args.loss)
+    if bool(args.edge) + (args.influence is not None) + what_if > 1:
+        raise GraphSlamError("explain: one of EDGE, --influence, and --without, --with and --loss together")
+    if what_if or args.influence is not None:
+        from graph_slam_ros.warmup import compile_all
+
+        compile_all()
+        return _solve(args) if what_if else _influence(args)
     from graph_slam_ros.analysis.explain import explain_calibration, explain_edge, explain_run
     from graph_slam_ros.analysis.what_if import SavedGraph
 
@@ -28,18 +54,16 @@ def explain(args: argparse.Namespace) -> int:
     run = SavedGraph(args.run_folder, losses)
     console.show(*(explain_edge(run, args.edge) if args.edge else explain_run(run)))
     if args.edge:
-        console.then(f"{console.command('solve', args.run_folder, '--without', 'EDGE')} (the drive without an edge)")
+        console.then(f"{console.command('explain', args.run_folder, '--without', 'EDGE')} (the drive without an edge)")
     else:
         console.then(f"{console.command('explain', args.run_folder, 'EDGE')} (all about one edge or landmark)")
     return console.report_losses(losses)
 
 
-def solve(args: argparse.Namespace) -> int:
+def _solve(args: argparse.Namespace) -> int:
     """Solve a run's graph again with other edges or another loss, and print what moves."""
     from graph_slam_ros.analysis.what_if import SavedGraph
 
-    if not (args.without or args.let_in or args.loss):
-        raise GraphSlamError("solve needs --without EDGE, --with EDGE or --loss NAME: what would be otherwise")
     losses: list[str] = []
     run = SavedGraph(args.run_folder, losses)
     start = time.process_time()
@@ -53,17 +77,17 @@ def solve(args: argparse.Namespace) -> int:
     return code if report.converged else console.LOSSES
 
 
-def influence(args: argparse.Namespace) -> int:
+def _influence(args: argparse.Namespace) -> int:
     """Print the edges with the largest influence on the last pose."""
     from graph_slam_ros.analysis.what_if import SavedGraph
 
     losses: list[str] = []
     run = SavedGraph(args.run_folder, losses)
     console.show(
-        f"the last pose without each edge, the {args.count} of most influence to first order",
+        f"the last pose without each edge, the {args.influence} of most influence to first order",
         f"  {'edge':<8s} {'':24s} {'first order':>12s} {'solved again':>12s}",
     )
-    for one in run.influences(args.count):
+    for one in run.influences(args.influence):
         exact = f"{one.exact_m:10.4f} m" if math.isfinite(one.exact_m) else _without_number(one.exact_m)
         text = f"{one.first_order_m:10.4f} m {exact}"
         console.show(f"  {one.edge:<8d} {run.edge(one.edge).about:24s} {text}")

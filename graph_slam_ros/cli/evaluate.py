@@ -1,0 +1,41 @@
+"""The command ``evaluate``: a run against the truth."""
+
+import argparse
+import json
+from pathlib import Path
+
+from graph_slam_ros.cli import arguments, console
+from graph_slam_ros.cli.results import draw
+from graph_slam_ros.cli.usage import CommandParser
+
+
+def evaluate_options(sub: CommandParser) -> None:
+    """Add the options of ``evaluate``."""
+    arguments.add_run(sub)
+    arguments.add_truth(sub, required=True)
+    about = "trajectory to evaluate (default: sightings.tum; path.tum without observations)"
+    sub.add_argument("--estimate", default="", metavar="FILE", help=about)
+    arguments.add_json(sub, "the numbers")
+    about = "file of the picture (default: path.png in the run folder)"
+    sub.add_argument("--plot", type=Path, metavar="FILE.png", help=about)
+    arguments.add_force(sub)
+
+
+def evaluate(args: argparse.Namespace) -> int:
+    """Compare a run with the truth."""
+    from graph_slam_ros.analysis.evaluation import evaluate as compared
+    from graph_slam_ros.analysis.evaluation import input_topics
+    from graph_slam_ros.analysis.trajectories import read_truth
+    from graph_slam_ros.runs.folder import changed_since
+
+    console.check_file(args.plot, force=args.force)
+    truth = read_truth(args.truth, args.topic, input_topics(args.run_folder))
+    scores = compared(args.run_folder, truth, args.estimate, align=not args.no_align)
+    console.show(*([json.dumps(scores.as_dict())] if args.json else str(scores).split("\n")))
+    draw(args.run_folder, truth, args.plot, align=not args.no_align, quiet=args.json)
+    code = console.report_losses(scores.losses, [*scores.warnings, *changed_since(args.run_folder)])
+    if not args.json:
+        same = [*(("--topic", args.topic) if args.topic else ()), *(("--no-align",) if args.no_align else ())]
+        with_truth = console.command("report", args.run_folder, "--truth", args.truth, *same)
+        console.then(f"{with_truth} (one page: the map, its errors, and why each edge is in or out)")
+    return code
