@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from graph_slam_ros.formats.g2o import read_g2o
     from graph_slam_ros.formats.g2o_writer import write_g2o
     from graph_slam_ros.graph import Gaussian, Graph
-    from graph_slam_ros.maps.edit import edit_run, undo_edit
+    from graph_slam_ros.maps.edit import edit_run
     from graph_slam_ros.measurements import Control, CustomEdge, Odometry, Sighting, Sightings
     from graph_slam_ros.optimization import Solution, optimize
     from graph_slam_ros.runs.replay import replay
@@ -42,7 +42,6 @@ __all__ = [
     "optimize",
     "read_g2o",
     "replay",
-    "undo_edit",
     "write_g2o",
 ]
 
@@ -53,7 +52,7 @@ _HOMES = {
     "formats.g2o": ("read_g2o",),
     "formats.g2o_writer": ("write_g2o",),
     "graph": ("Gaussian", "Graph"),
-    "maps.edit": ("edit_run", "undo_edit"),
+    "maps.edit": ("edit_run",),
     "measurements": ("Control", "CustomEdge", "Odometry", "Sighting", "Sightings"),
     "runs.replay": ("replay",),
     "runs.saved_run": ("SavedRun", "load_run"),

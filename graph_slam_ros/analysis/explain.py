@@ -24,7 +24,7 @@ from graph_slam_ros.graph.place import LABEL as PLACES
 from graph_slam_ros.runs.folder import SUMMARY, summary_of
 from graph_slam_ros.runs.ledger_file import Entry
 from graph_slam_ros.slam import Config
-from graph_slam_ros.slam.edit_tools import HAND_MADE
+from graph_slam_ros.slam.edits import HAND_MADE
 from graph_slam_ros.slam.robust.ledger import FINAL, Reason, Verdict, VerdictChange
 
 STATES = {

@@ -22,7 +22,6 @@ def edit_options(sub: CommandParser) -> None:
     sub.add_argument("--plan", type=Path, metavar="FILE", help="JSON file with the edits")
     sub.add_argument("--out", type=Path, metavar="DIR", help="new run folder for the result: nothing is replaced")
     sub.add_argument("--dry-run", action="store_true", help="print what the plan would change, and write nothing")
-    sub.add_argument("--undo", metavar="NAME", help="write the run to --out as it is without this edit")
     sub.add_argument("--new-plan", type=Path, metavar="FILE", help="write a plan for this run, without edits, and end")
 
 
@@ -30,22 +29,14 @@ def edit(args: argparse.Namespace) -> int:
     """Apply a plan of edits to a run, or begin one."""
     from graph_slam_ros.maps.edit import edit as edited
     from graph_slam_ros.maps.edit import read_plan, write_empty_plan
-    from graph_slam_ros.maps.edit import undo_edit as undone
 
     if args.new_plan is not None:
         write_empty_plan(args.run_folder, args.new_plan)
         console.show(f"wrote {args.new_plan}: a plan for {args.run_folder}, with no edits: docs/edits.md has the keys")
         console.then(f"{console.command('explain', args.run_folder)} (the ids of edges), then edit {args.new_plan}")
         return console.DONE
-    if args.undo is not None and args.out is not None and args.plan is None and not args.dry_run:
-        summary = undone(args.run_folder, args.undo, args.out)
-        console.show(f"chi2       {summary['chi2']:14.4f}", f"results in {args.out}; {args.run_folder} is as it was")
-        console.then(f"{console.command('explain', args.out)} (the edits that are left)")
-        return console.report_losses(summary["losses"])
-    if args.undo is not None or args.plan is None or (args.out is None) is not args.dry_run:
-        raise GraphSlamError(
-            "map edit needs --plan FILE with --out DIR or --dry-run, or --undo NAME with --out DIR, or --new-plan FILE"
-        )
+    if args.plan is None or (args.out is None) is not args.dry_run:
+        raise GraphSlamError("map edit needs --plan FILE with --out DIR or --dry-run, or --new-plan FILE")
     done = edited(args.run_folder, read_plan(args.plan), args.out)
     console.show(*(one.text for one in done.edits))
     console.show(

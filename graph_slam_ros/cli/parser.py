@@ -115,11 +115,10 @@ COMMANDS: dict[str, Command | Group] = {
             ),
             "edit": Command(
                 "cli.edit:edit",
-                "edit a run's map by hand with a plan: edges, closures, landmarks, where it lies, parts of the drive",
+                "edit a run's map by hand with a plan: edges, closures, landmarks, where it lies",
                 "drive_run --new-plan edits.json",
                 "drive_run --plan edits.json --dry-run",
                 "drive_run --plan edits.json --out drive_edited",
-                "drive_edited --undo wrong-aisle --out drive_mended",
             ),
             "freeze": Command(
                 "cli.maps:freeze",

@@ -6,7 +6,7 @@ import json
 import math
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from reprlib import repr as shortened
 from typing import Any
@@ -14,17 +14,21 @@ from typing import Any
 import numpy as np
 
 from graph_slam_ros.chi_square import quantile
-from graph_slam_ros.errors import FormatError, GraphSlamError
+from graph_slam_ros.errors import FormatError, GaugeError, GraphSlamError, SingularError
 from graph_slam_ros.formats.durable import write_whole
 from graph_slam_ros.formats.files import opened, read_text
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.edits import AppliedEdit, Edit, edit_of
-from graph_slam_ros.runs.folder import CONFIG, RunError, check_room, discard, recording_of, run_config
-from graph_slam_ros.runs.journal import INGEST, MAP, parts_of, read_measurements
-from graph_slam_ros.runs.map_journal import read_map, state_of
+from graph_slam_ros.runs.folder import CONFIG, RunError, check_room, discard, recording_of
+from graph_slam_ros.runs.journal import INGEST, MAP, parts_of
+from graph_slam_ros.runs.map_journal import state_of
 from graph_slam_ros.runs.restore import config_to_go_on, record_run, restored, stopwatch
 from graph_slam_ros.runs.run_check import check_run
-from graph_slam_ros.slam import Control, GraphSlam
+from graph_slam_ros.slam import Config, Control, GraphSlam
+from graph_slam_ros.slam.map_editor import MapEditor
+from graph_slam_ros.slam.robust.innovation import innovations
+from graph_slam_ros.slam.snapshot import MapSnapshot
+from graph_slam_ros.solver import Solver
 
 FORMAT, VERSION = "graph_slam_ros edits", 1
 _KEYS = ("format", "version", "source", "edits")
@@ -60,8 +64,8 @@ class Fit:
     edge: int
     innovation: float
     limit: float
-    chi2: float = 0.0
-    residual: tuple[float, ...] = ()
+    chi2: float
+    residual: tuple[float, ...]
 
     @property
     def text(self) -> str:
@@ -138,8 +142,11 @@ def source_hash(folder: Path) -> str:
 
 def plan_text(plan: Plan) -> str:
     """A plan as JSON."""
-    content = {"format": FORMAT, "version": VERSION, "source": plan.source, "edits": [e.values for e in plan.edits]}
-    return json.dumps(content, indent=2, ensure_ascii=False) + "\n"
+    return json.dumps(_content(plan), indent=2, ensure_ascii=False) + "\n"
+
+
+def _content(plan: Plan) -> dict[str, Any]:
+    return {"format": FORMAT, "version": VERSION, "source": plan.source, "edits": [e.values for e in plan.edits]}
 
 
 def write_empty_plan(folder: Path, file: Path) -> None:
@@ -208,15 +215,19 @@ def _plan(content: Any) -> Plan:
         raise FormatError(f"source: {shortened(source)} is not the hash of a run")
     if not isinstance(edits, list) or len(edits) > _MOST_EDITS:
         raise FormatError(f"edits: {shortened(edits)} is not a list of at most {_MOST_EDITS} edits")
+    return Plan(source, _edits(edits))
+
+
+def _edits(several: Sequence[Any]) -> tuple[Edit, ...]:
     read = list[Edit]()
-    for number, values in enumerate(edits, start=1):
+    for number, values in enumerate(several, start=1):
         try:
             read.append(edit_of(values))
         except FormatError as error:
             raise FormatError(f"edit {number}: {error}") from None
         if read[-1].name in {one.name for one in read[:-1]}:
             raise FormatError(f"edit {number}: name: {shortened(read[-1].name)} is the name of another edit, too")
-    return Plan(source, tuple(read))
+    return tuple(read)
 
 
 # -- what a plan makes of a run ----------------------------------------------------------------------------------------
@@ -244,17 +255,17 @@ def edit(folder: Path, plan: Plan, out: Path | None) -> Edited:
         raise GraphSlamError(f"the plan is for another run: its source is {plan.source[:80]}, and {folder} is {found}")
     if not plan.edits:
         raise GraphSlamError("the plan has no edits")
-    losses: list[str] = []
-    counters = Counters()
+    losses, counters = list[str](), Counters()
     slam = restored(folder, losses, counters)
     rehearsal = Rehearsal(slam, folder)
     edited = rehearsal.attempt(plan.edits, losses)[1]
     if out is None:
         return edited
     options: dict[str, Any] = {"earlier": counters, "took": took, "recording": recording_of(folder)}
+    options["more"] = lambda: {"plan": _content(plan)}
     try:
-        config, measurements = config_to_go_on(slam, folder), _controls(plan.edits)
-        edited.summary.update(record_run(out, config, measurements, losses, rehearsal.state, **options)[1])
+        config, state = config_to_go_on(slam, folder), rehearsal.edited(plan.edits)
+        edited.summary.update(record_run(out, config, [Control("optimize")], losses, state, **options)[1])
     except Exception:
         discard(out)
         raise
@@ -274,49 +285,8 @@ def edit_run(run: Path | str, edits: Sequence[Mapping[str, Any]], out: Path | st
     GraphSlamError
         A key of an edit is wrong, or it cannot be applied; the text names it. Nothing was written.
     """
-    folder, read = Path(run), list[Edit]()
-    for number, values in enumerate(edits, start=1):
-        try:
-            read.append(edit_of(values))
-        except FormatError as error:
-            raise FormatError(f"edit {number}: {error}") from None
-    return edit(folder, Plan(source_hash(folder), tuple(read)), None if out is None else Path(out))
-
-
-def undo_edit(run: Path | str, name: str, out: Path | str) -> dict[str, Any]:
-    """Write the run that a run would be without one of its edits, by its name; returns the summary.
-
-    Raises
-    ------
-    GraphSlamError
-        The run has no such edit, a later one depends on it, or the map cannot be solved. Nothing was written.
-    """
-    folder, out, took, losses = Path(run), Path(out), stopwatch(), list[str]()
-    if os.path.lexists(out):
-        raise RunError(f"{out}: exists already: an edited map is written to a new folder")
-    start, config = read_map(folder, losses, start_only=True), run_config(folder)
-    events = list(read_measurements(folder, losses)) if start is not None else []
-    made = [edit_of(dict(m.values)) for m in events if isinstance(m, Control) and m.event == "edit"]
-    if start is None or name not in [one.name for one in made]:
-        before = start is not None and name in [one.edit.name for one in start.edits]
-        there = f"it has {', '.join(one.name for one in made)}" if made else "it has none of its own"
-        why = "is of the map that it began in: undo it in the run that has it" if before else f"is not in it: {there}"
-        raise GraphSlamError(f"{folder}: edit {shortened(name)} {why}")
-    gone = [one.name for one in made].index(name)
-    for one in made[gone + 1 :]:
-        if any(edge >= start.graph.edge_ids.of(start.graph.edge_count) for edge in one.named_edges):
-            raise GraphSlamError(f"edit {one.name} is of an edge that an edit has added: undo {one.name} first")
-    rest = [m for m in events if not (isinstance(m, Control) and ("name", name) in m.values)]
-    slam = GraphSlam(config, start=start)
-    for m in rest:
-        try:
-            slam.process(m)
-        except GraphSlamError as error:
-            raise GraphSlamError(f"edit {name} cannot be undone alone: without it {error}") from None
-    if not slam.is_solved:
-        raise GraphSlamError(f"the map cannot be solved without this edit: {slam.failing}")
-    start = read_map(folder, [], start_only=True)
-    return record_run(out, config, rest, losses, start, took=took, recording=recording_of(folder))[1]
+    folder = Path(run)
+    return edit(folder, Plan(source_hash(folder), _edits(edits)), None if out is None else Path(out))
 
 
 class Rehearsal:
@@ -326,74 +296,75 @@ class Rehearsal:
     ----------
     slam : the restored run, which stays as it is
     folder : of the run
-
-    Attributes
-    ----------
-    state : the map of the run
     """
 
     def __init__(self, slam: GraphSlam, folder: Path) -> None:
-        self.state = state_of(slam, folder)
-        self._config = slam.config
+        self._config, self._before = slam.config, slam
+        self._state = state_of(slam, folder)
+        if len(slam.ledger) < slam.graph.edge_count:  # it never ended
+            whole = GraphSlam(slam.config, start=self._state)
+            whole.process(Control("optimize"))
+            self._state = state_of(whole, folder)
+
+    def edited(self, edits: Sequence[Edit]) -> MapSnapshot:
+        """A copy of the map to which edits were applied; nothing is solved. Raises GraphSlamError where one fails."""
+        state = copy.deepcopy(self._state, {id(self._state.graph): self._state.graph.copy()})  # kinds are shared
+        editor = MapEditor(state, self._config)
+        for one in edits:
+            editor.apply(one)
+        return state
 
     def attempt(self, edits: Sequence[Edit], losses: Sequence[str] = ()) -> tuple[GraphSlam, Edited]:
-        """Apply edits to a copy of the map; returns it, and what changed. Raises GraphSlamError where one fails."""
-        state = copy.deepcopy(self.state, {id(self.state.graph): self.state.graph.copy()})  # kinds are shared
-        slam = GraphSlam(self._config, start=state)
-        return slam, _applied(slam, _controls(edits), [*losses])
+        """The map with edits, solved, and what changed. Raises GraphSlamError where one fails."""
+        before, state = self._before, self.edited(edits)
+        known, ids = len(before.edits), state.graph.edge_ids
+        done = tuple(state.edits[known:])
+        added = [edge for one in done if one.edit.do in ("add_closure", "let_in_edge") for edge in one.added]
+        found = [row for row in map(ids.find, added) if row is not None]
+        rows = [row for row in found if not state.ledger.is_withdrawn(row)]
+        costs = _innovations(state, self._config, rows)
+        try:
+            slam = GraphSlam(self._config, start=state)
+            slam.process(Control("optimize"))
+        except (GaugeError, SingularError) as error:
+            raise GraphSlamError(f"the map cannot be solved with these edits: {error}") from None
+        if not slam.is_solved:
+            raise GraphSlamError(f"the map cannot be solved with these edits: {slam.failing}")
+        n, by_hand = slam.space.dimensions, {edge for one in done for edge in one.edges}
+        distances = np.linalg.norm(slam.trajectory()[:, :n] - before.trajectory()[:, :n], axis=1)
+        farthest, inside = int(distances.argmax()), before.ledger.inside.tolist()
+        return slam, Edited(
+            done,
+            (before.solver.evaluate().chi2_final, slam.solver.evaluate().chi2_final),
+            (slam.first_keyframe + farthest, float(distances[farthest])),
+            float(distances[-1]),
+            tuple(_fit(slam, row, cost) for row, cost in zip(rows, costs, strict=True)),
+            tuple(edge for row in inside if (edge := ids.of(row)) not in by_hand and not slam.ledger.is_inside(row)),
+            {},
+            [*losses],
+        )
 
 
-def _controls(edits: Sequence[Edit]) -> list[Control]:
-    """The control events of a plan, with the solve after them."""
-    return [*(Control("edit", tuple(one.values.items())) for one in edits), Control("optimize")]
+def _innovations(state: MapSnapshot, config: Config, rows: Sequence[int]) -> list[float]:
+    """chi2 of edges against a solution of all else; infinite where nothing else determines what they are between."""
+    if not rows:
+        return []
+    graph = state.graph.copy()
+    graph.set_weights(np.array(rows), 0.0)
+    solver = Solver(graph, config.solver_settings())
+    solver.add(state.vertices, range(graph.edge_count))
+    solver.start_at(state.values)
+    for vertex in state.vertices:
+        if vertex < state.frozen:
+            solver.hold(vertex)
+    try:
+        solver.optimize()
+        return innovations(graph, solver, rows)
+    except (GaugeError, SingularError):
+        return [math.inf] if len(rows) == 1 else [cost for row in rows for cost in _innovations(state, config, [row])]
 
 
-def _applied(slam: GraphSlam, measurements: Sequence[Control], losses: list[str]) -> Edited:
-    """Apply edits to a map in memory, and compare it with what it was."""
-    known, vertices, before = len(slam.edits), slam.keyframes.ids.copy(), slam.trajectory()
-    chi2, inside = slam.solver.evaluate().chi2_final, slam.ledger.inside
-    fits, ids = list[Fit](), slam.graph.edge_ids
-    for one in measurements:
-        slam.process(one)
-        if one.event == "edit" and slam.edits[-1].edit.do in ("add_closure", "let_in_edge"):
-            fits += [_fit(slam, one) for one in slam.edits[-1].added]
-    if not slam.is_solved:
-        raise GraphSlamError(f"the map cannot be solved with these edits: {slam.failing}")
-    n, done = slam.space.dimensions, tuple(slam.edits[known:])
-    before = before[np.isin(vertices, slam.keyframes.ids)]  # without those that were cut out
-    distances = np.linalg.norm(slam.trajectory()[:, :n] - before[:, :n], axis=1)
-    farthest = int(distances.argmax())
-    by_hand = {edge for one in done for edge in one.edges}
-    return Edited(
-        done,
-        (chi2, slam.solver.evaluate().chi2_final),
-        (slam.first_keyframe + farthest, float(distances[farthest])),
-        float(distances[-1]),
-        tuple(_solved(slam, fit) for fit in fits if not slam.ledger.is_withdrawn(_row(slam, fit.edge))),
-        tuple(ids.of(row) for row in inside.tolist() if not slam.ledger.is_inside(row) and ids.of(row) not in by_hand),
-        {},
-        losses,
-    )
-
-
-def _fit(slam: GraphSlam, edge: int) -> Fit:
-    """Compare an edge that is in by hand with all else."""
-    row = _row(slam, edge)
-    decisions, numbers = slam.backend.decisions, slam.graph.edge(row).type.residual_size
-    slam.solver.set_weight(row, 0.0)
-    (innovation,) = decisions.innovations([row])
-    slam.solver.set_weight(row, 1.0)
-    return Fit(edge, innovation, decisions.gate_scale * quantile(slam.config.robust.gate, numbers))
-
-
-def _solved(slam: GraphSlam, fit: Fit) -> Fit:
-    row = _row(slam, fit.edge)
-    chi2, _ = slam.solver.chi2_of([row])
-    return replace(fit, chi2=float(chi2[0]), residual=tuple(slam.solver.residuals_of([row]).tolist()))
-
-
-def _row(slam: GraphSlam, edge: int) -> int:
-    """The row of an edge that the map has, by its id."""
-    row = slam.graph.edge_ids.find(edge)
-    assert row is not None, f"edge {edge} was just added"
-    return row
+def _fit(slam: GraphSlam, row: int, innovation: float) -> Fit:
+    (chi2,), residual = slam.solver.chi2_of([row])[0].tolist(), tuple(slam.solver.residuals_of([row]).tolist())
+    limit = slam.backend.decisions.gate_scale * quantile(slam.config.robust.gate, len(residual))
+    return Fit(slam.graph.edge_ids.of(row), innovation, limit, chi2, residual)

@@ -17,8 +17,8 @@ from graph_slam_ros.edge_tags import tag_of
 from graph_slam_ros.graph import Gaussian
 from graph_slam_ros.maps.alignment import Alignment
 from graph_slam_ros.maps.compatibility import aligned_for_merge, refuse_other_space
-from graph_slam_ros.measurements.edit_actions import ALL_FIELDS
-from graph_slam_ros.measurements.edits import AppliedEdit, Value
+from graph_slam_ros.measurements.edit_actions import ALL_FIELDS, Argument
+from graph_slam_ros.measurements.edits import AppliedEdit
 from graph_slam_ros.runs.condensed_map import CONDENSED
 from graph_slam_ros.runs.folder import check_room
 from graph_slam_ros.runs.journal import parts_of
@@ -27,7 +27,7 @@ from graph_slam_ros.runs.restore import config_to_go_on, record_run, restored_an
 from graph_slam_ros.slam import Control, GraphSlam
 from graph_slam_ros.slam.alarm import Alarm
 from graph_slam_ros.slam.calibration.parameters import QUANTITIES, Parameter
-from graph_slam_ros.slam.edit_tools import HAND_MADE
+from graph_slam_ros.slam.edits import HAND_MADE
 from graph_slam_ros.slam.landmarks.assignments import NAME, last_number
 from graph_slam_ros.slam.landmarks.lifetimes import OLD, name_of_old
 from graph_slam_ros.slam.robust.landmark_support import landmark_of
@@ -182,7 +182,7 @@ class _Second:
         alarm = Alarm(**fields | {"segment": self._keyframes + one["segment"]})
         return asdict(alarm) | {"text": str(alarm)}
 
-    def _argument(self, key: str, value: Value, number: Mapping[int, int]) -> Value:
+    def _argument(self, key: str, value: Argument, number: Mapping[int, int]) -> Argument:
         """A value of an edit, with the ids and keyframes of the merged map."""
         match ALL_FIELDS[key].kind, value:
             case "edge", int():

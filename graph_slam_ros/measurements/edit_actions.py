@@ -185,14 +185,10 @@ ACTIONS: dict[str, Action] = {
         "The map is moved rigidly: `pose` is where its origin was, in the axes that it gets. It stays anchored at the "
         "same keyframe.",
     ),
-    "cut": Action(
-        _RANGE,
-        "keyframes from {from} until {until} cut out",
-        "A part of the drive is cut out: its keyframes, their edges, and landmarks that were seen from nowhere else. "
-        "Odometry over that part becomes one edge.",
-    ),
 }
 """What can be done by hand, by the value of ``do``."""
+STOPPED = {"cut": "no part of a drive is cut out of a map: replay the recording without it, as mcap filter writes it"}
+"""What could be done in an earlier version, and what to do instead."""
 ALL_FIELDS = {key: field for action in ACTIONS.values() for key, field in action.known.items()}
 """What each key holds."""
 

@@ -4,12 +4,11 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from reprlib import repr as shortened
-from typing import Any, TypeAlias
+from typing import Any
 
 from graph_slam_ros.errors import FormatError, did_you_mean
-from graph_slam_ros.measurements.edit_actions import ACTIONS, Argument, read_arguments
+from graph_slam_ros.measurements.edit_actions import ACTIONS, STOPPED, Argument, read_arguments
 
-Value: TypeAlias = Argument
 COMMON = ("name", "who", "when", "why", "do")
 _MOST = {"name": 80, "who": 200, "when": 100, "why": 2000}  # characters
 _DAY, _CLOCK = r"\d{4}-(0[1-9]|1[0-2])-(0[1-9]|[12]\d|3[01])", r"([01]\d|2[0-3]):[0-5]\d(:[0-5]\d(\.\d{1,9})?)?"
@@ -22,7 +21,7 @@ class Edit:
 
     Attributes
     ----------
-    name : by which it is undone; unique in a map
+    name : unique in a map
     who, when, why : the person, an ISO 8601 time with its zone, and the reason
     do : one of ``ACTIONS``
     arguments : of the action
@@ -33,19 +32,12 @@ class Edit:
     when: str
     why: str
     do: str
-    arguments: Mapping[str, Value]
+    arguments: Mapping[str, Argument]
 
     @property
-    def values(self) -> dict[str, Value]:
-        """All of it, flat, as in a plan and in a control event."""
+    def values(self) -> dict[str, Argument]:
+        """All of it, flat, as in a plan."""
         return {name: getattr(self, name) for name in COMMON} | dict(self.arguments)
-
-    @property
-    def named_edges(self) -> tuple[int, ...]:
-        """The edges that the edit names."""
-        edge, edges = self.arguments.get("edge"), self.arguments.get("edges", ())
-        assert isinstance(edges, tuple)
-        return (*map(int, edges), *([edge] if isinstance(edge, int) else []))
 
     @property
     def text(self) -> str:
@@ -69,6 +61,8 @@ def edit_of(values: Any) -> Edit:
     if not isinstance(values, Mapping):
         raise FormatError(f"{shortened(values)} is not an object with the keys of an edit")
     do = values.get("do")
+    if isinstance(do, str) and do in STOPPED:
+        raise FormatError(f"do: {do}: {STOPPED[do]}")
     if not isinstance(do, str) or do not in ACTIONS:
         near = did_you_mean(do, ACTIONS) if isinstance(do, str) else ""
         raise FormatError(

@@ -312,13 +312,6 @@ REASONS: dict[str, Reason] = {
         _NOTED, "a landmark that the map does not have, while map.localize is true", "map.localize=false to add it"
     ),
     "removed": Reason(_NOTED, "an edge or a landmark that was removed by hand (~/remove)"),
-    "let_in": Reason(_NOTED, "an edge that a plan of edits let in"),
-    "merged_by_hand": Reason(_NOTED, "a landmark that a plan of edits merged into another"),
-    "renamed": Reason(_NOTED, "a landmark that a plan of edits renamed"),
-    "closed_by_hand": Reason(_NOTED, "a loop closure that a plan of edits added"),
-    "split": Reason(_NOTED, "a landmark of which a plan of edits made two"),
-    "moved_by_hand": Reason(_NOTED, "a plan of edits moved the map rigidly, and anchored it"),
-    "cut_out": Reason(_NOTED, "a part of the drive that a plan of edits cut out"),
     "unknown_edge": Reason(_NOTED, "~/remove named an edge that is not there", "graph_slam explain RUN lists ids"),
     "unknown_landmark": Reason(
         _NOTED, "~/remove named a landmark that is not in the map", "ros2 topic echo ~/landmarks_estimate lists names"

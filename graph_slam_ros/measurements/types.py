@@ -9,13 +9,13 @@ from dataclasses import asdict, dataclass
 from typing import Any, Literal, TypeAlias, get_args
 
 from graph_slam_ros.errors import FormatError
-from graph_slam_ros.measurements.edits import Value, edit_of
 from graph_slam_ros.typing import Numbers
 
 SIGHTING_KINDS = ("position", "pose", "range_bearing", "bearing", "range")
 FIX_KINDS = ("pose", "position", "heading", "attitude")
+Value: TypeAlias = bool | int | float | str | tuple[int, ...] | tuple[float, ...]
 Event: TypeAlias = Literal[
-    "flush", "end", "optimize", "clear_closures", "time_jump", "set", "remove", "edit", "memory", "restart"
+    "flush", "end", "optimize", "clear_closures", "time_jump", "set", "remove", "memory", "restart"
 ]
 EVENTS: tuple[Event, ...] = get_args(Event)
 _VALUES: dict[Event, dict[str, type]] = {"memory": {"is_short": bool}, "remove": {"edge": int, "landmark": str}}
@@ -215,10 +215,10 @@ class Control:
     event : ``flush`` processes the measurements that are held for sorting by stamp; ``end`` also drops those that no
         odometry reached; ``optimize`` solves everything; ``clear_closures`` removes all loop closures; ``time_jump``
         begins a segment whose stamps may be older; ``set`` changes parameters; ``remove`` removes an edge or landmark;
-        ``edit`` changes the map by hand; ``memory`` begins or ends a shortage of memory; ``restart`` goes back to the
+        ``memory`` begins or ends a shortage of memory; ``restart`` goes back to the
         last good estimate after an outside fault
     values : names and values. ``set``: parameters. ``remove``: ``edge`` and its id, or ``landmark`` and its name.
-        ``edit``: those of an ``Edit``. ``memory``: ``is_short``. Others: none
+        ``memory``: ``is_short``. Others: none
 
     Raises
     ------
@@ -231,9 +231,7 @@ class Control:
 
     def __post_init__(self) -> None:
         _check_choice(Control, self.event, EVENTS)
-        if self.event == "edit":
-            edit_of(dict(self.values))
-        if self.event in ("set", "edit"):
+        if self.event == "set":
             return
         known = _VALUES.get(self.event, {})
         if [known.get(name) for name, _ in self.values] != [type(value) for _, value in self.values] or (

@@ -29,10 +29,10 @@ JSON records in mcap, as in the journal. The first is ``map`` with the version o
   same while ``map.localize`` is true, zeros when it ends; ``edits``: ``AppliedEdit.record`` of each edit by hand.
 
 Now and then an ``estimate`` tells all values, end to end. A run that goes on in another's map has that first, as one
-``growth`` and one ``estimate``, up to a record ``start``. After a part of the drive was cut out, ``anew`` ends all
-before it, and a ``growth`` of the whole map follows. Programs of version 1 do not know ``anew``: a second ``map`` with
-version 2 stands before it, which they refuse. So it is after visits were condensed, with version 3, in a part of its
-own that takes the place of all parts before. Where a run was killed before it did, it is read instead of these.
+``growth`` and one ``estimate``, up to a record ``start``. After visits were condensed, ``anew`` ends all before it, in
+a part of its own that takes the place of all parts before: a ``growth`` of the whole map follows. Programs of version 1
+do not know ``anew``: a second ``map`` with version 3 stands before it, which they refuse. Where a run was killed before
+it did, it is read instead of these.
 """
 
 import math
@@ -61,7 +61,7 @@ from graph_slam_ros.slam.snapshot import MapSnapshot
 
 GROWTH = "graph_slam_ros.Map"
 VERSION = 3
-_FIRST, _CUT = 1, 2  # what every program reads: a map from which nothing was cut out; and one from which something was
+_FIRST = 1  # of a map from which nothing was condensed, which every program reads
 _MORE = 1.1  # an estimate is written when there are so many times the keyframes: in total it stays linear
 _JUMP_M = 0.5  # or when a solve moved the newest that far, and there are a hundredth more
 
@@ -106,10 +106,9 @@ class MapGrowth:
         ----------
         is_anew : whether a part of the map has left it, so that all ids are others
         """
-        if is_anew or any(one.edit.do == "cut" for one in slam.edits[self._edits :]):
+        if is_anew:
             self._begin()
-            version = _CUT if slam.bounded is None else VERSION
-            yield from ({"type": "map", "version": version}, {"type": ANEW})
+            yield from ({"type": "map", "version": VERSION}, {"type": ANEW})
         changed: Record = {"settings": dict(slam.settings)} if slam.settings != self._settings else {}
         self._settings = dict(slam.settings)
         if (alarms := slam.displacements) != self._displacements:

@@ -256,8 +256,8 @@ def numbered(slam: GraphSlam) -> tuple[list[int], str]:
     """The number of each vertex, and the table of all vertices.
 
     Poses are numbered from 0 in order of time, landmarks after them, because other tools read odometry from that order.
-    A vertex that is not part of the map any more is ``unused``: a cut keyframe, a deleted landmark. Any other one is an
-    offset that the ranges of a sensor share.
+    A vertex that is not part of the map any more is ``unused``: a deleted landmark. Any other one is an offset that
+    the ranges of a sensor share.
     """
     names: list[tuple[int, int, str, int | str, str]] = []
     for one in slam.bounded.old if slam.bounded else ():

@@ -5,7 +5,7 @@ from collections.abc import Container, Mapping, Sequence
 import numpy as np
 
 from graph_slam_ros.config.robust import RobustConfig
-from graph_slam_ros.graph import Gaussian
+from graph_slam_ros.graph import Gaussian, Graph
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.plugin_edges import failed_edges
@@ -296,15 +296,7 @@ class Backend:
 
     def move(self, T_new_old: Numbers, space: Geometry) -> None:
         """Move everything rigidly. A running search is cancelled."""
-        values, graph = self.solver.values, self.graph
-        for kind in (space.pose, space.point):
-            if kind not in graph.kinds:
-                continue
-            of_kind = graph.kind.values == graph.kinds.index(kind)
-            at = graph.offset.values[of_kind][:, None] + np.arange(kind.size)
-            move = space.group.compose if kind is space.pose else space.group.act
-            values[at] = np.stack(move(T_new_old, tuple(values[at].T)), axis=-1)
-        self.solver.start_at(values)
+        self.solver.start_at(moved_values(self.graph, self.solver.values, T_new_old, space))
         self.cancel_search()
 
     def withdraw(self, edges: Sequence[int], keyframe: int, reason: Reason = Reason.WITHDRAWN) -> None:
@@ -393,3 +385,15 @@ class Backend:
     def _frozen_graph(self, keyframe: int, settings: Settings) -> FrozenGraph:
         problem = self.graph.copy(), self.solver.vertices, self.solver.held, self.solver.values
         return FrozenGraph(keyframe, *problem, settings, self.ledger.copy())
+
+
+def moved_values(graph: Graph, values: Array, T_new_old: Numbers, space: Geometry) -> Array:
+    """Stored numbers of all vertices of a map that is moved rigidly."""
+    out = values.copy()
+    for kind in (space.pose, space.point):
+        if kind in graph.kinds:
+            of_kind = graph.kind.values == graph.kinds.index(kind)
+            at = graph.offset.values[of_kind][:, None] + np.arange(kind.size)
+            move = space.group.compose if kind is space.pose else space.group.act
+            out[at] = np.stack(move(T_new_old, tuple(values[at].T)), axis=-1)
+    return out

@@ -12,7 +12,7 @@ import numpy as np
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.errors import DivergedError, GraphSlamError
 from graph_slam_ros.measurements.counters import Counters
-from graph_slam_ros.measurements.edits import Value
+from graph_slam_ros.measurements.edits import aliases
 from graph_slam_ros.measurements.types import (
     Closure,
     Control,
@@ -24,6 +24,7 @@ from graph_slam_ros.measurements.types import (
     Observation,
     Odometry,
     Sightings,
+    Value,
 )
 from graph_slam_ros.plugin_edges import failed_edges
 from graph_slam_ros.slam.anchor import Anchor
@@ -90,7 +91,8 @@ class GraphSlam(MapView):
         super().__init__(config, backend, frontend, landmarks, kidnaps, solution)
         self.settings, self._anchor = dict[str, Value](), Anchor(config, backend)
         self._sink, self._faults = sink or (lambda measurement: None), Faults(counters)
-        self._edits = Edits(config.space, backend, frontend, landmarks, self._anchor, solution.guard, counters)
+        self._edits = Edits(backend, frontend, landmarks.map, counters)
+        landmarks.map.aliases = aliases(backend.edits)
         self._custom = CustomEdges(config, backend, frontend, landmarks.map, self._anchor, counters)
         self._calibrator = Calibrator(config, backend, frontend, landmarks, kidnaps, counters, executor, start)
         if start is not None and start.keyframes:
@@ -250,8 +252,8 @@ class GraphSlam(MapView):
             case "clear_closures":
                 if self._edits.clear_closures(len(self.keyframes) - 1):
                     self._solve()
-            case "remove" | "edit":
-                if self._edits.change(event, values, len(self.keyframes) - 1):
+            case "remove":
+                if self._edits.remove(values, len(self.keyframes) - 1):
                     self._solve(self.config.solver_settings())
             case "set":
                 self._set(values)

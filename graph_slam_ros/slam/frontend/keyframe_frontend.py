@@ -142,14 +142,6 @@ class KeyframeFrontend:
         for pose in sighting_poses:
             self.sighting_poses.append(pose.keyframe, pose.stamp_ns, pose.T_keyframe_base)
 
-    def cut(self, first: int, last: int) -> None:
-        """Cut out the keyframes between two indices, both included, and what was observed from them."""
-        self.path.cut(first, last)
-        of = self.sighting_poses.ids
-        self.sighting_poses = self.sighting_poses.without(np.flatnonzero((of >= first) & (of <= last)))
-        of = self.sighting_poses.ids
-        of[of > last] -= last - first + 1
-
     def forget_before(self, first: int, vertices: Index) -> None:
         """Forget the keyframes before a number. All others have other vertices now, given in order."""
         self.path.forget_before(first, vertices)

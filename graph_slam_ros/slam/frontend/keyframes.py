@@ -127,15 +127,6 @@ class KeyframeList:
             IntegratedOdometry(self._noise, self._space, last, self.keyframes[last].stamp_ns, self._rest)
         )
 
-    def cut(self, first: int, last: int) -> None:
-        """Cut out the keyframes between two indices, both included. No motion may be remembered then."""
-        count, left = last - first + 1, len(self.keyframes) - (last - first + 1)
-        self.keyframes = self.keyframes.without(np.arange(first, last + 1))
-        for begins in (self.segments, self.drives):
-            moved = [k if k < first else max(k - count, first) for k in begins]
-            begins[:] = [k for k in dict.fromkeys(moved) if k < left]
-        self._epoch = min(self._epoch, left)
-
     def forget_before(self, first: int, vertices: Index) -> None:
         """Forget the keyframes before a number. The others have other vertices now, given in order."""
         self.keyframes = self.keyframes.since(first, vertices)

@@ -17,7 +17,7 @@ from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.graph.place import LABEL as PLACES
 from graph_slam_ros.runs.ledger_file import Entry
-from graph_slam_ros.slam.edit_tools import HAND_MADE
+from graph_slam_ros.slam.edits import HAND_MADE
 from graph_slam_ros.slam.robust.ledger import FINAL
 from graph_slam_ros.tools.report.packing import shown
 from graph_slam_ros.typing import Array

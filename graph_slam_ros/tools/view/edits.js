@@ -123,7 +123,7 @@ async function solve() {
 }
 
 function asMoved(found) {
-  return {path: found.places.map((axis) => Float64Array.from(axis, (value) => (value === null ? NaN : value))), landmarks: new Map(Object.entries(found.landmarks))};
+  return {path: found.places.map((axis) => Float64Array.from(axis)), landmarks: new Map(Object.entries(found.landmarks))};
 }
 
 function changesText(changes) {
@@ -315,7 +315,7 @@ const panel = {
       byId("applied").append(element("h3", "Edits that the run has"));
       const list = element("ul");
       for (const [name, text, who, when, why] of known.edits) list.append(element("li", `${name}: ${text}, by ${who}, ${when}: ${why}`));
-      byId("applied").append(list, element("p", `graph_slam map edit ${known.run} --undo NAME --out NEW takes one of them back`, {class: "note"}));
+      byId("applied").append(list);
     }
   },
   show(kind, which, body) {

@@ -5,7 +5,6 @@ import json
 import os
 import shlex
 import threading
-from collections.abc import Set
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
@@ -26,7 +25,6 @@ from graph_slam_ros.solver import Solver
 from graph_slam_ros.tools.report.contents import Contents
 from graph_slam_ros.tools.report.packing import shown
 from graph_slam_ros.tools.report.verdict import verdict
-from graph_slam_ros.typing import Array
 
 _KEYS = {"without": list, "let_in": list, "loss": str, "first": bool}
 _FIRST_STEPS = 3  # of an answer that is not to wait for the solution
@@ -118,7 +116,7 @@ class Workbench:
             moved = run.moved(solver)
             return {
                 "is_solved": report.converged,
-                "places": self._places(solver, set(run.keyframes)),
+                "places": self._places(solver),
                 "landmarks": _landmarks(run.slam, solver),
                 "chi2": [moved.before.chi2_final, moved.after.chi2_final],
                 "cost": [moved.before.cost_final, moved.after.cost_final],
@@ -135,7 +133,7 @@ class Workbench:
                 self._rehearsal = Rehearsal(self._saved.slam, self._run)
             slam, edited = self._rehearsal.attempt(plan.edits)
             return {
-                "places": self._places(slam.solver, set(slam.keyframes.ids.tolist())),
+                "places": self._places(slam.solver),
                 "landmarks": _landmarks(slam, slam.solver),
                 "changes": self._changes(slam, edited),
                 **_effect(edited),
@@ -168,20 +166,13 @@ class Workbench:
         if source != self._source:
             raise GraphSlamError("the plan is for another run than the one on this page")
 
-    def _places(self, solver: Solver, there: Set[int]) -> list[list[Any]]:
-        """Positions of the keyframes of the run, by axis; null for one that is not there any more.
-
-        Parameters
-        ----------
-        there : vertices that are keyframes in the solution
-        """
-        run, n = self._saved, self._saved.space.dimensions
-        path = run.whole_path.poses(solver)
-        places = np.zeros((len(path), 3))
-        places[:, :n] = path[:, :n]
-        gone = [vertex not in there for vertex in run.slam.keyframes.ids.tolist()]
-        places[run.slam.first_keyframe :][gone] = np.nan
-        return _columns(places)
+    def _places(self, solver: Solver) -> list[list[float]]:
+        """Positions of the keyframes of the run, by axis."""
+        n, path = self._saved.space.dimensions, self._saved.whole_path.poses(solver)
+        places = np.zeros((3, len(path)))
+        places[:n] = path[:, :n].T
+        columns: list[list[float]] = np.round(places, _DECIMALS).tolist()
+        return columns
 
     def _changes(self, slam: MapView, edited: Edited) -> list[list[Any]]:
         """Edges whose verdict is another afterwards, and which were not named by an edit: id, before and after."""
@@ -224,18 +215,6 @@ def _landmarks(slam: MapView, solver: Solver) -> dict[str, list[Any]]:
         for name, vertex in marks.items()
         for place in (solver.estimate([vertex])[0],)
     }
-
-
-def _columns(places: Array) -> list[list[Any]]:
-    """Columns of numbers for JSON, null where one is not known."""
-    rounded = np.round(places, _DECIMALS)
-    known = np.isfinite(rounded)
-    if known.all():
-        return [column.tolist() for column in rounded.T]
-    return [
-        [x if ok else None for x, ok in zip(c.tolist(), k, strict=True)]
-        for c, k in zip(rounded.T, known.T, strict=True)
-    ]
 
 
 def _asked(body: bytes) -> dict[str, Any]:

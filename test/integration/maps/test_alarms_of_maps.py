@@ -5,7 +5,7 @@ from dataclasses import asdict
 import pytest
 import small_drive
 
-from graph_slam_ros.maps.edit import edit_run, undo_edit
+from graph_slam_ros.maps.edit import edit_run
 from graph_slam_ros.maps.merge import merge
 from graph_slam_ros.runs.folder import summary_of
 from graph_slam_ros.runs.replay import replay
@@ -40,7 +40,6 @@ def test_an_edited_map_has_the_alarms_of_the_map(run, tmp_path):
     edited = tmp_path / "edited"
     assert edit_run(run, [EDIT | {"to": "other"}], edited).summary["displacements"] == [TOLD]
     assert map_of(edited, []).displacements == [TOLD]
-    assert undo_edit(edited, "a", tmp_path / "undone")["displacements"] == [TOLD]
 
 
 def test_a_merged_map_has_the_alarms_of_both_with_their_keyframes(run, tmp_path):

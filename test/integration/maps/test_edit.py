@@ -1,259 +1,390 @@
-"""``graph_slam map edit``: each edit does what the pipeline's own does, and stays in all that is made of the map."""
+"""Edits by hand: what each kind does to a map, that what is made of the map keeps it, and what is refused."""
 
-import functools
 import hashlib
 import json
 
 import numpy as np
 import pytest
+import small_drive
 from faulty import faulty_run
 
-from graph_slam_ros import cli
+from graph_slam_ros import cli, replay
 from graph_slam_ros.analysis.what_if import SavedGraph
-from graph_slam_ros.maps.edit import source_hash
+from graph_slam_ros.errors import FormatError, GraphSlamError
+from graph_slam_ros.formats.g2o import read_g2o
+from graph_slam_ros.maps.edit import Plan, edit_run, plan_text, source_hash
+from graph_slam_ros.measurements.edit_actions import ACTIONS
+from graph_slam_ros.measurements.edits import edit_of
 from graph_slam_ros.runs.ledger_file import read_ledger
-from graph_slam_ros.runs.map_journal import read_map, state_of
-from graph_slam_ros.runs.restore import map_of, restored
+from graph_slam_ros.runs.restore import map_of, record_run, restored
 from graph_slam_ros.runs.saved_run import load_run
-from graph_slam_ros.slam import Control, GraphSlam, Odometry, Sighting, Sightings
+from graph_slam_ros.slam import Fix, Sighting, Sightings
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict
+from graph_slam_ros.tools.report.contents import read_contents
 
 WHO = {"who": "Anna", "when": "2026-05-04T10:30:00Z", "why": "seen on the spot"}
+EXACT = {"sigma_m": 0.0, "sigma_rad": 0.0}
+CLOSURE = {"from_keyframe": 2, "to_keyframe": "1021", "sigma_m": 0.05, "sigma_rad": 0.02}
+
+
+def one(do, **arguments):
+    return {"name": do, **WHO, "do": do, **arguments}
+
+
+def split(**arguments):
+    return one("split_landmark", landmark="0", to="dock <2>", **arguments)
+
+
+def contents(folder):
+    return {f.name: hashlib.sha256(f.read_bytes()).hexdigest() for f in folder.iterdir() if f.name != "run.json"}
+
+
+@pytest.fixture(scope="module", params=[2, 3])
+def either(request, tmp_path_factory):
+    """A run in the plane, and one in space."""
+    return small_drive.run(tmp_path_factory.mktemp("small") / f"run_{request.param}", request.param)
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    return faulty_run(tmp_path_factory.mktemp("faulty"))[1]
+    return small_drive.run(tmp_path_factory.mktemp("small") / "run")
+
+
+def applied(run, folder, *edits):
+    """A map before and after a plan."""
+    edit_run(run, edits, folder / "new")
+    return restored(run, []), restored(folder / "new", [])
+
+
+# -- what each one does ------------------------------------------------------------------------------------------------
+
+
+def test_a_closure_by_hand_is_in_and_pulls_as_its_sigmas_say(either, tmp_path):
+    before = restored(either, [])
+    space = before.space
+    true = space.group.between(*map(tuple, before.trajectory()[[2, 21]]))
+    pose = list(map(float, space.normalized((true[0] + 0.05, *true[1:]))))
+    ends = {"from_keyframe": 2, "to_keyframe": "1021", "sigma_m": 1e-3, "sigma_rad": 1e-3}
+    before, slam = applied(either, tmp_path, one("add_closure", **ends, pose=pose))
+    now = space.group.between(*map(tuple, slam.trajectory()[[2, 21]]))
+    assert abs(now[0] - pose[0]) < 0.01
+    (edge,) = slam.edits[0].added
+    made = slam.graph.edge(edge)
+    assert (made.label, made.source, made.weight) == ("by_hand", "by hand", 1.0)
+    assert np.linalg.inv(made.sqrt_information.T @ made.sqrt_information) == pytest.approx(1e-6 * np.eye(space.dof))
+    assert (slam.ledger.verdict_of(edge), slam.ledger.reason.values[edge]) == (Verdict.NOT_EVALUATED, Reason.BY_HAND)
+
+
+def test_a_map_is_moved_rigidly_and_stays_there(either, tmp_path):
+    is_flat = restored(either, []).space.dimensions == 2
+    pose = [10.0, 20.0, 1.0] if is_flat else [10.0, 20.0, 3.0, 0.0, 0.6, 0.0, 0.8]
+    before, slam = applied(either, tmp_path, one("move_anchor", keyframe=5, pose=pose, **EXACT))
+    group = slam.space.group
+    assert np.allclose(group.local(tuple(slam.trajectory()[5]), tuple(pose)), 0.0, atol=1e-6)
+    for a, b in ((0, 5), (5, 20)):
+        then, now = (group.between(*map(tuple, of.trajectory()[[a, b]])) for of in (before, slam))
+        assert np.allclose(group.local(now, then), 0.0, atol=1e-5)
+    covariances = slam.keyframe_covariances()
+    assert np.trace(covariances[5]) < 1e-5 < np.trace(covariances[0])
+    assert slam.solver.evaluate().chi2_final == pytest.approx(before.solver.evaluate().chi2_final, rel=1e-6)
+    (tmp_path / "map").mkdir()
+    _, moved = applied(either, tmp_path / "map", one("move_map", pose=pose, sigma_m=0.3, sigma_rad=0.1))
+    assert np.allclose(group.local(tuple(moved.trajectory()[0]), tuple(pose)), 0.0, atol=1e-5)
+    assert np.diag(moved.keyframe_covariances()[0])[:2] == pytest.approx(0.09, rel=1e-6)
+    (anchor,) = moved.edits[0].added
+    assert [edge for edge in moved.solver.edges.tolist() if len(moved.graph.edge(edge).vertices) == 1] == [anchor]
+
+
+def test_a_landmark_is_split_by_edges_or_by_keyframes_and_merged_again(either, tmp_path):
+    before = restored(either, [])
+    vertex, sightings = before.landmarks["0"].vertex, before.graph.edges_of("landmarks").tolist()
+    edges = [e for e in sightings if before.graph.edge(e).vertices[1] == vertex]
+    late = [e for e in edges if before.graph.edge(e).vertices[0] >= before.keyframes.ids[12]]
+    assert 0 < len(late) < len(edges)
+    _, slam = applied(either, tmp_path, split(**{"from": 12, "until": "1023"}))
+    assert restored(either, []).trajectory().tolist() == before.trajectory().tolist()
+    assert edit_run(either, [split(edges=late)]).edits[0].edges == slam.edits[0].edges == tuple(late)
+    a, b = slam.landmarks["0"], slam.landmarks["dock <2>"]
+    assert (a.sightings, b.sightings) == (len(edges) - len(late), len(late))
+    assert a.last_seen_ns < b.first_seen_ns <= b.last_seen_ns == before.landmarks["0"].last_seen_ns
+    for new, old in zip(slam.edits[0].added, late, strict=True):
+        assert slam.graph.edge(new).measured.tolist() == before.graph.edge(old).measured.tolist()
+        assert slam.graph.edge(new).vertices == (before.graph.edge(old).vertices[0], b.vertex)
+        assert slam.ledger.is_inside(new)
+    edit_run(tmp_path / "new", [one("merge_landmarks", landmark="dock <2>", into="0")], tmp_path / "merged")
+    merged = restored(tmp_path / "merged", [])
+    assert merged.trajectory() == pytest.approx(before.trajectory(), abs=1e-4)
+    assert merged.landmarks.keys() == before.landmarks.keys()
+    assert merged.landmarks["0"].sightings == len(edges)
 
 
 @pytest.fixture(scope="module")
-def entries(run):
-    return read_ledger(run)
-
-
-@pytest.fixture(scope="module")
-def edits(entries):
-    """One of each kind: a closure that is in goes out, one that is out comes in; three landmarks are changed."""
-    inside = next(e.edge for e in entries if e.label == "closures" and e.is_in)
-    outside = next(e.edge for e in entries if e.label == "closures" and not e.is_in)
+def faulty(tmp_path_factory):
+    """A run with false closures and wrong identities, and edits of closures that are in and out, and of landmarks."""
+    run = faulty_run(tmp_path_factory.mktemp("faulty"))[1]
+    entries = read_ledger(run)
+    inside, outside = (next(e.edge for e in entries if e.label == "closures" and e.is_in is w) for w in (True, False))
     names = sorted({e.landmark for e in entries if e.landmark})
-    values = [
-        {"do": "remove_edge", "edge": inside},
-        {"do": "let_in_edge", "edge": outside},
-        {"do": "remove_landmark", "landmark": names[0]},
-        {"do": "rename_landmark", "landmark": names[1], "to": "dock <1>"},
-        {"do": "merge_landmarks", "landmark": names[2], "into": names[3]},
+    return run, [
+        one("remove_edge", edge=inside),
+        one("let_in_edge", edge=outside),
+        one("remove_landmark", landmark=names[0]),
+        one("rename_landmark", landmark=names[1], to="dock <1>"),
+        one("merge_landmarks", landmark=names[2], into=names[3]),
     ]
-    return {one["do"]: {"name": one["do"], **WHO} | one for one in values}
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_an_edge_that_is_out_or_in_by_hand_is_as_in_a_graph_that_was_solved_so(number, faulty, tmp_path):
+    run, edits = faulty
+    saved, edge = SavedGraph(run, []), edits[number]["edge"]
+    _, slam = applied(run, tmp_path, edits[number])
+    changed = [e for e in saved.entries if e.is_in != slam.ledger.is_inside(e.edge) and e.verdict and e.edge != edge]
+    out, back = ([e.edge for e in changed if e.is_in is was] for was in (True, False))  # by the second look
+    solver = saved.solve(without=[edge, *out], let_in=back) if number == 0 else saved.solve(out, [edge, *back])
+    assert np.abs(solver.estimate(saved.keyframes) - slam.trajectory()).max() < 0.02
+
+
+def test_a_landmark_that_was_merged_has_the_edges_of_both(faulty, tmp_path):
+    run, (*_, plan) = faulty
+    before, slam = applied(run, tmp_path, plan)
+    gone, into = plan["landmark"], plan["into"]
+    assert gone not in slam.landmarks
+    assert slam.landmarks[into].sightings == sum(before.landmarks[name].sightings for name in (gone, into))
+    assert before.landmarks[gone].vertex not in slam.solver.vertices
+    (record,) = slam.edits
+    for old, new in zip(record.edges, record.added, strict=True):
+        (a, b) = (slam.graph.edge(edge) for edge in (old, new))
+        assert slam.ledger.reason.values[old] == Reason.BY_HAND
+        assert a.measured.tolist() == b.measured.tolist()
+        assert b.vertices == (a.vertices[0], slam.landmarks[into].vertex)
+
+
+# -- what is made of an edited map -------------------------------------------------------------------------------------
+
+
+def all_edits(run):
+    """One of each kind, in one plan."""
+    slam = restored(run, [])
+    edges = slam.graph.edges_of("landmarks").tolist()
+    pose = list(map(float, slam.space.group.between(*map(tuple, slam.trajectory()[[2, 21]]))))
+    return [
+        one("remove_edge", edge=edges[7]),
+        one("let_in_edge", edge=edges[9]),
+        one("add_closure", **CLOSURE, pose=pose),
+        split(**{"from": 12, "until": 23}),
+        one("remove_landmark", landmark="3"),
+        one("merge_landmarks", landmark="4", into="5"),
+        one("rename_landmark", landmark="6", to="gate"),
+        one("move_anchor", keyframe=5, pose=[10.0, 20.0, 1.0], **EXACT),
+        one("move_map", pose=[-3.0, 1.0, 0.5], sigma_m=0.1, sigma_rad=0.05),
+    ]
 
 
 @pytest.fixture(scope="module")
-def edited(run, edits, tmp_path_factory):
-    """All of them, in one plan."""
-    folder = tmp_path_factory.mktemp("edited")
-    assert edit(run, planned(run, folder, *edits.values()), "--out", folder / "new") == 0
-    return folder / "new"
+def edited(run, tmp_path_factory):
+    """The run with one edit of each kind."""
+    out = tmp_path_factory.mktemp("edited") / "new"
+    edit_run(run, all_edits(run), out)
+    return out
+
+
+def test_an_edited_run_has_one_edit_of_each_kind_and_is_repeated_to_the_same_bytes(run, edited, tmp_path):
+    before, slam = restored(run, []), restored(edited, [])
+    assert {done.edit.do for done in slam.edits} == ACTIONS.keys()
+    assert slam.landmarks.keys() == {*before.landmarks, "gate", "dock <2>"} - {"3", "4", "6"}
+    assert load_run(edited).trajectory().poses[:, :2] == pytest.approx(slam.trajectory()[:, :2], abs=1e-6)
+    assert set(load_run(edited).landmarks.names) == slam.landmarks.keys()
+    replay(edited, tmp_path / "again")
+    assert contents(edited) == contents(tmp_path / "again")
+
+
+def test_an_edit_is_undone_with_the_plan_that_an_edited_run_keeps(run, edited, tmp_path):
+    plan = json.loads((edited / "run.json").read_text())["plan"]
+    plan["edits"] = [values for values in plan["edits"] if values["do"] == "remove_landmark"]
+    (tmp_path / "edits.json").write_text(json.dumps(plan))
+    assert command(run, "--plan", tmp_path / "edits.json", "--out", tmp_path / "new") == 0
+    assert restored(tmp_path / "new", []).landmarks.keys() == restored(run, []).landmarks.keys() - {"3"}
+
+
+def test_commands_on_maps_know_the_edits(run, edited, capsys, tmp_path):
+    def said(*arguments):
+        capsys.readouterr()
+        code = cli.main(list(map(str, arguments)))
+        return code, " ".join(capsys.readouterr().out.split())
+
+    slam, saved = restored(edited, []), SavedGraph(edited, [])
+    code, difference = said("map", "diff", run, edited)
+    explained = said("explain", edited)[1]
+    assert code == 4
+    for done in slam.edits:
+        assert f"by hand: {done.text}" in explained
+        assert f"by hand only in B: {done.text}" in difference
+        for edge in (*done.edges[:1], *done.added[:1]):
+            assert f"by hand {done.text}" in said("explain", edited, edge)[1]
+    assert said("map", "diff", edited, edited)[1].endswith("nothing: they are the same")
+    assert said("map", "export", edited, "--out", tmp_path / "graph.g2o")[0] == 0
+    file = read_g2o(tmp_path / "graph.g2o").graph
+    assert file.edge_count == sum(e.is_in for e in saved.entries)
+    poses = [file.vertex(v).initial for v in range(file.vertex_count) if file.kind_of(v).size == 3]
+    assert np.array(poses)[:, :2] == pytest.approx(slam.trajectory()[:, :2], abs=1e-4)
+    last = max(e.edge for e in saved.entries if e.is_in and e.verdict)
+    chi2 = [solver.evaluate().chi2_final for solver in (saved.solver, saved.solve([last]))]
+    assert "chi2 {:.4f} -> {:.4f}".format(*chi2) in said("explain", edited, "--without", last)[1]
+    page = read_contents(edited)
+    assert page.losses == []
+    assert page.data["tables"]["edits"] == [[e.edit.name, e.edit.text, *WHO.values()] for e in slam.edits]
+    assert page.data["edges"]["by_hand"].keys() == {str(k) for e in slam.edits for k in (*e.edges, *e.added)}
+    other = small_drive.run(tmp_path / "other", start_s=5000, seed=1, first=6)
+    for command in (["map", "freeze", edited], ["map", "merge", edited, other], ["map", "merge", other, edited]):
+        out = tmp_path / f"{command[1]}_{len(list(tmp_path.iterdir()))}"
+        assert said(*command, "--out", out)[0] == 0
+        state = map_of(out, [])
+        assert [done.edit.name for done in state.edits] == [done.edit.name for done in slam.edits]
+        reasons = {state.ledger.reason.values[edge] for done in state.edits for edge in done.edges}
+        assert reasons <= {Reason.BY_HAND, Reason.WITHDRAWN}
+
+
+def test_a_robot_that_goes_on_in_the_map_keeps_every_edit(edited, tmp_path):
+    start = map_of(edited, [])
+    decided = [edge for edge, reason in enumerate(start.ledger.reason.values) if reason == Reason.BY_HAND]
+    verdicts, edits, seen = (
+        start.ledger.verdict.values[decided].tolist(),
+        list(start.edits),
+        start.landmarks["5"].sightings,
+    )
+    assert {Verdict(verdict) for verdict in verdicts} == {Verdict.REJECTED, Verdict.NOT_EVALUATED}
+    drive = small_drive.drive(start_s=9000, seed=2, first=3)
+    slam, _ = record_run(tmp_path / "on", small_drive.config(), drive, [], start)
+    assert slam.edits == edits
+    assert slam.ledger.verdict.values[decided].tolist() == verdicts
+    assert {slam.ledger.reason.values[edge] for edge in decided} == {Reason.BY_HAND}
+    assert len(slam.drives) == 2
+    assert "4" not in slam.landmarks and slam.landmarks["5"].sightings > seen, "its identity is that of another"
+    assert {"3", "6", "gate"} <= slam.landmarks.keys(), "what was removed or renamed begins anew"
+    last = tuple(slam.trajectory()[-1])
+    replay(tmp_path / "on", tmp_path / "again")
+    assert contents(tmp_path / "on") == contents(tmp_path / "again")
+    assert tuple(restored(tmp_path / "on", []).trajectory()[-1]) == pytest.approx(last, abs=1e-6)
+
+
+# -- what cannot be done -----------------------------------------------------------------------------------------------
+
+MOVE = {"pose": [0.0] * 6 + [1.0], **EXACT}
+REFUSED = [
+    (one("remove_edge", edge=999999), "edit remove_edge (edge 999999): it is not in the graph"),
+    (one("remove_edge", edge=0), "it is odometry or a prior"),
+    (one("let_in_edge", edge=999999), "it is not in the graph"),
+    (one("let_in_edge", edge=0), "it is odometry or a prior"),
+    (one("remove_landmark", landmark="none"), "edit remove_landmark (landmark none): it is not in the map"),
+    (one("rename_landmark", landmark="none", to="x"), "it is not in the map"),
+    (one("rename_landmark", landmark="3", to="4"), "another landmark is named 4"),
+    (one("merge_landmarks", landmark="3", into="none"), "landmark none is not in the map"),
+    (one("add_closure", **CLOSURE | {"from_keyframe": 99}, pose=[0, 0, 0]), "no keyframe 99: the map has 0 to 23"),
+    (one("add_closure", **CLOSURE | {"to_keyframe": "2000.5"}, pose=[0, 0, 0]), "no keyframe at 2000.5 s"),
+    (one("add_closure", **CLOSURE | {"to_keyframe": 2}, pose=[0, 0, 0]), "both are one keyframe"),
+    (one("add_closure", **CLOSURE, pose=[0.0] * 6 + [1.0]), "pose: 7 numbers; in 2 dimensions it has 3"),
+    (split(edges=[0]) | {"landmark": "none"}, "it is not in the map"),
+    (split(edges=[0]), "edge 0 is no sighting of landmark 0"),
+    (split(edges=[0]) | {"to": "4"}, "another landmark is named 4"),
+    (split(**{"from": 5, "until": 6}), "it was not seen there"),
+    (split(**{"from": 7, "until": 2}), "no keyframe from 7 until 2"),
+    (split(**{"from": 0, "until": 23}), "what is left of 0 does not determine where it is: 0 sightings"),
+    (one("move_anchor", keyframe=24, **MOVE), "no keyframe 24"),
+    (one("move_anchor", keyframe=5, **MOVE), "pose: 7 numbers"),
+    (one("move_map", **MOVE), "pose: 7 numbers"),
+]
+
+
+@pytest.mark.parametrize(("values", "named"), REFUSED)
+def test_what_cannot_be_done_is_named_and_nothing_is_written(values, named, run, tmp_path):
+    before = contents(run)
+    with pytest.raises(GraphSlamError) as raised:
+        edit_run(run, [values], tmp_path / "new")
+    assert str(raised.value).startswith(f"edit {values['name']}")
+    assert named in str(raised.value)
+    assert "\n" not in str(raised.value)
+    assert not (tmp_path / "new").exists()
+    assert contents(run) == before
+
+
+def test_a_frozen_map_and_one_that_measurements_locate_are_not_moved(run, tmp_path):
+    assert cli.main(["map", "freeze", str(run), "--out", str(tmp_path / "site")]) == 0
+    turn = one("move_map", pose=[-3.0, 1.0, 0.5], **EXACT)
+    anchored = one("move_anchor", keyframe=5, pose=[-3.0, 1.0, 0.5], **EXACT)
+    closed = one("add_closure", **CLOSURE, pose=[1.0, 0.0, 0.0])
+    for values in (anchored, turn, split(**{"from": 12, "until": 23}), closed):
+        with pytest.raises(GraphSlamError, match="it is part of a frozen map, which never changes"):
+            edit_run(tmp_path / "site", [values])
+    fix = Fix(1005 * 10**9, "gnss", "position", (50.0, 60.0), (0.01, 0.0, 0.0, 0.01))
+    measured = list(small_drive.drive())
+    record_run(tmp_path / "fixed", small_drive.config(), [*measured[:12], fix, *measured[12:]], [])
+    with pytest.raises(GraphSlamError, match=r"1 measurements say where the map lies, the first is edge \d+ \(fixes\)"):
+        edit_run(tmp_path / "fixed", [turn])
+
+
+def test_a_part_of_the_drive_is_not_cut_out_and_the_line_says_what_to_do_instead(run):
+    with pytest.raises(FormatError, match=r"edit 1: do: cut: .*replay the recording without it"):
+        edit_run(run, [one("cut", **{"from": 2, "until": 4})])
+
+
+def test_an_edge_in_by_hand_that_all_else_contradicts_is_warned_of(run, tmp_path):
+    """Also one without which a landmark would be undetermined."""
+    (fit,) = (done := edit_run(run, [one("add_closure", **CLOSURE, pose=[3.0, 3.0, 0.0])])).by_hand
+    assert fit.innovation > 10 * fit.limit
+    assert f"edge {fit.edge} is in by hand, and all else contradicts it" in done.warnings[0]
+    slam = restored(run, [])
+    true = list(map(float, slam.space.group.between(*map(tuple, slam.trajectory()[[2, 21]]))))
+    good = edit_run(run, [one("add_closure", **CLOSURE, pose=true)])
+    assert good.warnings == []
+    assert good.by_hand[0].innovation < 1.0
+    drive = list(small_drive.drive())
+    seen_once = Sightings(1003 * 10**9, "detections", (Sighting("lamp", "position", (1.0, 1.0), (0.01, 0, 0, 0.01)),))
+    record_run(tmp_path / "lamp", small_drive.config(), [*drive[:8], seen_once, *drive[8:]], [])
+    lamp = next(e.edge for e in read_ledger(tmp_path / "lamp") if e.landmark == "lamp")
+    (alone,) = edit_run(tmp_path / "lamp", [one("let_in_edge", edge=lamp)]).by_hand
+    assert "nothing else determines what it is between" in alone.text
+
+
+# -- the command -------------------------------------------------------------------------------------------------------
 
 
 def planned(run, folder, *edits):
     file = folder / "edits.json"
-    file.unlink(missing_ok=True)
-    assert edit(run, None, "--new-plan", file) == 0
-    plan = json.loads(file.read_text())
-    plan["edits"] += edits
-    file.write_text(json.dumps(plan))
+    file.write_text(plan_text(Plan(source_hash(run), tuple(map(edit_of, edits)))))
     return file
 
 
-def edit(run, plan, *words):
-    return cli.main(["map", "edit", *map(str, [run, *(["--plan", plan] if plan else []), *words])])
+def command(run, *words):
+    return cli.main(["map", "edit", str(run), *map(str, words)])
 
 
-def contents(folder):
-    return {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in folder.iterdir()}
-
-
-@pytest.fixture(scope="module")
-def applied(run, edits):
-    """The same by the pipeline, in memory."""
-    before = restored(run, [])
-
-    @functools.cache
-    def done(do):
-        slam = GraphSlam(before.config, start=state_of(before))
-        slam.process(Control("edit", tuple(edits[do].items())))
-        slam.process(Control("optimize"))
-        return slam
-
-    return done
-
-
-@pytest.mark.parametrize("do", ["remove_edge", "let_in_edge", "remove_landmark", "rename_landmark", "merge_landmarks"])
-def test_the_command_does_what_the_pipeline_does(do, run, edits, applied, tmp_path):
-    before = contents(run)
-    assert edit(run, planned(run, tmp_path, edits[do]), "--out", tmp_path / "new") == 0
-    assert contents(run) == before
-    slam, new = applied(do), load_run(tmp_path / "new")
-    assert new.trajectory().poses[:, :2] == pytest.approx(slam.trajectory()[:, :2], abs=1e-9)
-    assert set(new.landmarks.names) == set(slam.landmarks)
-    assert [e.verdict for e in new.edges] == slam.ledger.verdict.values.tolist()
-    assert [e.reason for e in new.edges] == slam.ledger.reason.values.tolist()
-    state = read_map(tmp_path / "new", [])
-    assert state.edits == slam.edits
-    assert state.landmarks.keys() == slam.touched_landmarks(0).keys() & slam.landmarks.keys()
-
-
-def test_an_edge_that_is_out_or_in_by_hand_is_as_in_a_graph_that_was_solved_so(run, edits, applied):
-    saved = SavedGraph(run, [])
-    for do, options in (("remove_edge", "without"), ("let_in_edge", "let_in")):
-        slam, edge = applied(do), edits[do]["edge"]
-        kept = [e.edge for e in saved.entries if e.is_in != slam.ledger.is_inside(e.edge) and e.verdict]
-        others = [one for one in kept if one != edge]  # the second look may have changed these, too
-        out = [one for one in others if saved.entries[one].is_in]
-        solver = saved.solve(**{options: [edge], "without": [edge, *out] if do == "remove_edge" else out})
-        assert np.abs(solver.estimate(saved.keyframes) - slam.trajectory()).max() < 0.02
-
-
-def test_a_landmark_that_was_merged_has_the_edges_of_both(run, edits, applied):
-    one = edits["merge_landmarks"]
-    before, slam = restored(run, []), applied("merge_landmarks")
-    sightings = [before.landmarks[one[key]].sightings for key in ("landmark", "into")]
-    assert one["landmark"] not in slam.landmarks
-    assert slam.landmarks[one["into"]].sightings == sum(sightings)
-    merged = before.landmarks[one["landmark"]].vertex
-    assert merged not in slam.solver.vertices
-    (record,) = slam.edits
-    assert [slam.ledger.reason.values[edge] for edge in record.edges] == [Reason.BY_HAND] * len(record.edges)
-    for old, new in zip(record.edges, record.added, strict=True):
-        (a, b) = (slam.graph.edge(edge) for edge in (old, new))
-        assert a.measured.tolist() == b.measured.tolist()
-        assert b.vertices == (a.vertices[0], slam.landmarks[one["into"]].vertex)
-
-
-def test_a_robot_that_goes_on_in_the_map_keeps_every_edit(run, edits, edited):
-    state = map_of(edited, [])
-    slam = GraphSlam(restored(run, []).config, start=state)
-    merged, into = edits["merge_landmarks"]["landmark"], edits["merge_landmarks"]["into"]
-    at, n = slam.keyframes.stamps_ns[-1], slam.landmarks[into].sightings
-    kind = slam.graph.edge(int(slam.graph.edges_of("landmarks")[0]))
-    measured = tuple(kind.measured[:2].tolist())
-    decided = {edge: slam.ledger.reason.values[edge] for edge in range(slam.graph.edge_count)}
-    decided = [edge for edge, reason in decided.items() if reason == Reason.BY_HAND]
-    verdicts = slam.ledger.verdict.values[decided].tolist()
-    for k in range(60):
-        stamp_ns = int(at + (k + 1) * 5 * 10**8)
-        slam.process(Odometry(stamp_ns, (0.5 * k, 0.0, 0.0)))
-        sighting = Sighting(merged, "position", measured, (0.01, 0.0, 0.0, 0.01))
-        slam.process(Sightings(stamp_ns, "detections", (sighting,)))
-    slam.process(Control("end"))
-    slam.process(Control("optimize"))
-    assert len(decided) > 10
-    assert slam.ledger.verdict.values[decided].tolist() == verdicts
-    assert {slam.ledger.reason.values[edge] for edge in decided} == {Reason.BY_HAND}
-    assert {Verdict(verdict) for verdict in verdicts} == {Verdict.REJECTED, Verdict.NOT_EVALUATED}
-    assert merged not in slam.landmarks
-    assert slam.landmarks[into].sightings > n
-    assert "dock <1>" in slam.landmarks
-    assert [one.edit.name for one in slam.edits] == list(edits)
-
-
-def test_an_edited_run_is_repeated_to_the_same_bytes(edited, tmp_path):
-    assert cli.main(["replay", str(edited), "--out", str(tmp_path / "again")]) == 0
-    one, two = contents(edited), contents(tmp_path / "again")
-    assert {name for name in one if one[name] != two[name]} == {"run.json"}
-
-
-def test_explain_ledger_diff_solve_and_freeze_know_the_edits(run, edits, edited, tmp_path, capsys):
-    entries = read_ledger(edited)
-    gone, let_in = edits["remove_edge"]["edge"], edits["let_in_edge"]["edge"]
-    assert (entries[gone].verdict, entries[gone].reason) == (Verdict.REJECTED, Reason.BY_HAND)
-    (added,) = (e for e in entries if e.label == "by_hand")
-    assert (added.measured, added.reason, added.weight) == (entries[let_in].measured, Reason.BY_HAND, 1.0)
-
-    def told(*words):
-        capsys.readouterr()
-        code = cli.main([*map(str, words)])
-        return code, " ".join(capsys.readouterr().out.split())
-
-    text = f"edge {gone} taken out, by Anna, 2026-05-04T10:30:00Z: seen on the spot (edit remove_edge)"
-    assert f"by hand {text}" in told("explain", edited, gone)[1]
-    assert f"edge {let_in} let in, as edge {added.edge}, by Anna" in told("explain", edited, added.edge)[1]
-    assert f"by hand: {text}" in told("explain", edited)[1]
-    code, difference = told("map", "diff", run, edited)
-    assert code == 4
-    assert f"by hand only in B: {text}" in difference
-    assert told("map", "diff", edited, edited)[1].endswith("nothing: they are the same")
-    assert told("explain", edited, "--without", added.edge)[0] == 0
-    assert told("map", "freeze", edited, "--out", tmp_path / "site")[0] == 0
-    assert f"by hand: {text}" in told("explain", tmp_path / "site")[1]
-    state = map_of(tmp_path / "site", [])
-    assert [one.edit.name for one in state.edits] == list(edits)
-    assert state.ledger.reason.values[gone] == Reason.BY_HAND
-
-
-def test_what_cannot_be_applied_is_refused_in_one_line_and_nothing_is_written(run, edits, entries, tmp_path, capsys):
-    odometry = next(e.edge for e in entries if e.label == "odometry")
-    cases = [
-        ({"do": "remove_edge", "edge": 999999}, "(remove_edge, edge 999999): it is not in the graph"),
-        ({"do": "let_in_edge", "edge": 999999}, "(let_in_edge, edge 999999): it is not in the graph"),
-        ({"do": "remove_edge", "edge": odometry}, "it is odometry or a prior"),
-        ({"do": "let_in_edge", "edge": odometry}, "it is odometry or a prior"),
-        ({"do": "remove_landmark", "landmark": "none"}, "(remove_landmark, landmark none): it is not in the map"),
-        ({"do": "rename_landmark", "landmark": "none", "to": "x"}, "it is not in the map"),
-        ({"do": "merge_landmarks", "landmark": entries[-1].landmark or "1", "into": "none"}, "none is not in the map"),
-        (edits["rename_landmark"] | {"to": edits["remove_landmark"]["landmark"]}, "another landmark is named"),
-    ]
-    for number, (values, named) in enumerate(cases):
-        plan = planned(run, tmp_path, {"name": f"case-{number}", **WHO} | values | {"name": f"case-{number}"})
-        capsys.readouterr()
-        assert edit(run, plan, "--out", tmp_path / "new") == 2
-        (line,) = capsys.readouterr().err.splitlines()
-        assert f"edit case-{number} (" in line
-        assert named in line
-        assert not (tmp_path / "new").exists()
-
-
-def test_a_plan_for_another_run_and_a_folder_that_is_there_are_refused(run, edits, edited, tmp_path, capsys):
-    plan = planned(edited, tmp_path, edits["remove_edge"])
-    assert source_hash(run) != source_hash(edited)
-    assert edit(run, plan, "--dry-run") == 2
-    assert "the plan is for another run" in capsys.readouterr().err
-    assert edit(edited, plan, "--dry-run") == 2
-    assert "the map has an edit of that name already" in capsys.readouterr().err
-    plan = planned(run, tmp_path, edits["remove_edge"])
-    for there in (run, edited):
-        before = contents(there)
-        assert edit(run, plan, "--out", there) == 2
-        assert contents(there) == before
-    (tmp_path / "empty").mkdir()
-    assert edit(run, plan, "--out", tmp_path / "empty") == 2
-    assert edit(run, planned(run, tmp_path), "--dry-run") == 2
+def test_a_new_plan_is_for_its_run_alone_and_a_folder_that_is_there_stays(run, edited, tmp_path, capsys):
+    file = tmp_path / "new.json"
+    assert command(run, "--new-plan", file) == 0
+    assert command(run, "--plan", file, "--dry-run") == 2
     assert "the plan has no edits" in capsys.readouterr().err
+    values = one("rename_landmark", landmark="0", to="x")
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"edits": [values]}))
+    assert command(edited, "--plan", file, "--dry-run") == 2
+    assert "the plan is for another run" in capsys.readouterr().err
+    assert command(edited, "--plan", planned(edited, tmp_path, values), "--dry-run") == 2
+    assert "the map has an edit of that name already" in capsys.readouterr().err
+    (tmp_path / "empty").mkdir()
+    for there in (run, edited, tmp_path / "empty"):
+        before = contents(there)
+        assert command(run, "--plan", file, "--out", there) == 2
+        assert contents(there) == before
 
 
-def test_a_dry_run_prints_the_effect_and_writes_nothing(run, edits, edited, tmp_path, capsys):
-    plan = planned(run, tmp_path, *edits.values())
+def test_a_dry_run_prints_the_effect_and_writes_nothing(run, edited, tmp_path, capsys):
+    plan = planned(run, tmp_path, *all_edits(run), one("add_closure", **CLOSURE, pose=[3, 3, 0]) | {"name": "wrong"})
     before = contents(tmp_path) | contents(run)
-    capsys.readouterr()
-    assert edit(run, plan, "--dry-run") == 0
-    out = capsys.readouterr().out
-    assert "nothing was written" in out
+    assert command(run, "--plan", plan, "--dry-run") == 0
+    said = capsys.readouterr()
+    assert "nothing was written" in said.out
+    assert "beware: edge" in said.err
     assert contents(tmp_path) | contents(run) == before
-    chi2 = float(next(line for line in out.splitlines() if line.startswith("chi2")).split()[-1])
-    assert chi2 == pytest.approx(json.loads((edited / "run.json").read_text())["chi2"], rel=1e-6)
-
-
-def test_undo_writes_the_run_as_without_that_edit_to_the_same_bytes(run, edits, edited, tmp_path, capsys):
-    for name in ("let_in_edge", "rename_landmark"):
-        before, rest = contents(edited), [one for do, one in edits.items() if do != name]
-        without, undone = tmp_path / f"without_{name}", tmp_path / f"undone_{name}"
-        assert edit(run, planned(run, tmp_path, *rest), "--out", without) == 0
-        assert edit(edited, None, "--undo", name, "--out", undone) == 0
-        assert contents(edited) == before
-        one, two = contents(without), contents(undone)
-        assert {file for file in one if one[file] != two[file]} == {"run.json"}
-    for folder, name, named in ((run, "x", "edit 'x' is not in it"), (edited, "x", "it has remove_edge, let_in_edge")):
-        capsys.readouterr()
-        assert edit(folder, None, "--undo", name, "--out", tmp_path / "none") == 2
-        assert named in capsys.readouterr().err
-        assert not (tmp_path / "none").exists()
+    assert command(run, "--plan", planned(run, tmp_path, *all_edits(run)), "--dry-run") == 0
+    chi2 = float(next(line for line in capsys.readouterr().out.splitlines() if line.startswith("chi2")).split()[-1])
+    assert chi2 == pytest.approx(json.loads((edited / "run.json").read_text())["chi2"], abs=1e-4)

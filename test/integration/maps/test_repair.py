@@ -4,7 +4,6 @@ import planted_closures
 import pytest
 
 from graph_slam_ros import edit_run
-from graph_slam_ros.maps.edit import undo_edit
 from graph_slam_ros.runs.restore import restored
 from graph_slam_ros.tools.report.contents import read_contents
 
@@ -34,5 +33,3 @@ def test_the_page_leads_to_every_wrong_closure_and_the_edited_map_is_as_good_as_
     assert effect.warnings == []
     edit_run(run, edits, tmp_path / "mended")
     assert planted_closures.error_m(tmp_path / "mended") <= 1.05 * clean
-    undo_edit(tmp_path / "mended", f"aisle-{believed[0]}", tmp_path / "three")
-    assert len(restored(tmp_path / "three", []).edits) == 11

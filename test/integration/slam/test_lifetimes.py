@@ -10,6 +10,7 @@ from graph_slam_ros.analysis.explain import explain_edge
 from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.lie import se2
+from graph_slam_ros.maps.edit import edit_run
 from graph_slam_ros.maps.merge import merge
 from graph_slam_ros.runs.restore import record_run, restored
 from graph_slam_ros.slam import Control, GraphSlam, Odometry, Sighting, Sightings
@@ -162,12 +163,12 @@ def test_merge_keeps_what_is_retired_and_never_takes_two_old_places_for_one(tmp_
     assert "retired_ns" in (tmp_path / "both" / "landmarks.csv").read_text()
 
 
-def test_a_map_that_is_moved_forgets_from_where_landmarks_were_seen():
-    slam = driven(measurements(4))
-    assert slam.landmark_passes(0)
+def test_a_map_that_is_moved_forgets_from_where_landmarks_were_seen(tmp_path):
+    record_run(tmp_path / "run", config(), measurements(4), [])
+    assert restored(tmp_path / "run", []).landmark_passes(0)
     by = {"name": "turn", "who": "a", "when": "2026-11-23T10:00:00Z", "why": "test", "do": "move_map"}
-    turn = by | {"pose": (1.0, 2.0, 1.5), "sigma_m": 0.1, "sigma_rad": 0.1}
-    slam.process(Control("edit", tuple(turn.items())))
+    edit_run(tmp_path / "run", [by | {"pose": [1.0, 2.0, 1.5], "sigma_m": 0.1, "sigma_rad": 0.1}], tmp_path / "turned")
+    slam = restored(tmp_path / "turned", [])
     assert slam.landmark_passes(0) == []
     driven(measurements(2, start=4 * LAP), slam)
     assert not slam.landmark_events

@@ -115,14 +115,11 @@ def test_edits_of_the_path_are_tried_as_they_are_saved(faulty):
         },
         {"do": "split_landmark", "landmark": faulty.saved.entries[seen[0]].landmark, "to": "twin", "edges": seen[:2]},
         {"do": "move_map", "pose": [3.0, 4.0, 0.5], "sigma_m": 0, "sigma_rad": 0},
-        {"do": "cut", "from": 40, "until": 44},
     ]
     attempted = faulty.work.attempt(plan(faulty, *edits))
     folder = faulty.run.with_name(faulty.work.save(plan(faulty, *edits))["folder"].rpartition("/")[2])
     path, found = read_tum(folder / "path.tum").poses[:, :3], places(attempted)
-    is_there = np.isfinite(found).all(axis=1)
-    assert 0 < (~is_there).sum() < 8 and not is_there[41:44].any()
-    assert found[is_there] == pytest.approx(path, abs=1e-5)
+    assert found == pytest.approx(path, abs=1e-5)
     assert found[0] == pytest.approx([3.0, 4.0, 0.0], abs=0.01)
     assert any("against all else" in one for one in attempted["notes"])
     assert "twin" in attempted["landmarks"]

@@ -11,12 +11,7 @@ from live_nodes import ENVIRONMENT, finish, node, own_domain, replayed, results,
 from std_msgs.msg import String
 
 from graph_slam_ros.cli import main
-from graph_slam_ros.lie import se2
-from graph_slam_ros.maps.edit import edit_run
-from graph_slam_ros.measurements.edit_actions import ACTIONS
 from graph_slam_ros.runs.map_journal import read_map
-from graph_slam_ros.runs.restore import restored
-from graph_slam_ros.slam.robust.ledger import Reason
 from graph_slam_ros.tools.simulation import simulate
 from graph_slam_ros.tools.simulation.bag import write_bag
 
@@ -154,59 +149,6 @@ def test_a_map_is_loaded_at_the_start_with_the_pose_of_the_robot(tmp_path, use):
         assert n.stop()[0] == 0
     assert "going on in its map; output.load_pose is not used: it has driven since" in n.said
     assert len(np.loadtxt(tmp_path / "run" / "path.tum")) >= len(read_map(tmp_path / "run-1", []).keyframes)
-
-
-def all_edits(run):
-    """An edit of each kind, all of which can stand in one plan."""
-    before = restored(run, [])
-    sightings = before.graph.edges_of("landmarks").tolist()
-    a, b = before.trajectory()[[10, 30]]
-    relative, exact = list(map(float, se2.between(tuple(a), tuple(b)))), {"sigma_m": 0.0, "sigma_rad": 0.0}
-    several = [
-        {"do": "remove_edge", "edge": sightings[0]},
-        {"do": "let_in_edge", "edge": sightings[5]},
-        {"do": "split_landmark", "landmark": "east", "to": "east-2", "from": 0, "until": 25},
-        {"do": "merge_landmarks", "landmark": "east-2", "into": "east"},
-        {"do": "rename_landmark", "landmark": "west", "to": "gate"},
-        {"do": "remove_landmark", "landmark": "south"},
-        {
-            "do": "add_closure",
-            "from_keyframe": 10,
-            "to_keyframe": 30,
-            "pose": relative,
-            "sigma_m": 0.1,
-            "sigma_rad": 0.1,
-        },
-        {"do": "cut", "from": 2, "until": 4},
-        {"do": "move_anchor", "keyframe": 10, "pose": [1.0, 2.0, 0.3], **exact},
-        {"do": "move_map", "pose": [3.0, 0.0, 0.1], **exact},
-    ]
-    assert {one["do"] for one in several} == ACTIONS.keys()
-    return [{"name": one["do"], "who": "Anna", "when": "2026-05-04T10:30:00Z", "why": "seen"} | one for one in several]
-
-
-def test_a_node_that_goes_on_in_a_map_keeps_every_edit(tmp_path):
-    earlier_run(tmp_path / "base", 100)
-    edit_run(tmp_path / "base", all_edits(tmp_path / "base"), tmp_path / "site")
-    start = read_map(tmp_path / "site", [])
-    decided = [k for k, reason in enumerate(start.ledger.reason.values) if reason == Reason.BY_HAND]
-    at = f"output.folder:={tmp_path / 'run'}", "output.load:=site", "output.load_at_start:=true"
-    with node(*at, "inputs.reliable:=true") as n, robot(hears=("landmarks_estimate", "pose", "/diagnostics")) as r:
-        r.wait_for_node()
-        drive = Drive(truth=(2.0, 1.0, 0.5))
-        until(lambda: r.heard["landmarks_estimate"] and r.heard["pose"], drive.pace(r), "landmarks")
-        drive.go(r, 60, every=3)
-        r.settle()
-        assert {"gate", "north", "east", "south", "west"} == places(r.heard["landmarks_estimate"][-1]).keys()
-        finish(n, r)
-    after = read_map(tmp_path / "run", [])
-    assert after.edits == start.edits
-    assert len(after.edits) == 10 and len(after.drives) == 2
-    assert len(decided) > 5
-    for column in ("verdict", "reason"):
-        was, now = (getattr(one.ledger, column).values[decided].tolist() for one in (start, after))
-        assert now == was
-    assert replayed(tmp_path / "run", tmp_path) == results(tmp_path / "run")
 
 
 def landmarks(folder):
