@@ -46,7 +46,6 @@ REASONS = {
     Reason.REVOKED: "revoked",
     Reason.FAILED: "plugin failed",
     Reason.BY_HAND: "by hand",
-    Reason.CONTRADICTED: "contradicted",
     Reason.SLIP: "slip",
     Reason.MOVED: "landmark moved",
 }
@@ -55,7 +54,6 @@ _KIND = {
     "landmarks": "a sighting",
     "fixes": "a fix",
     "odometry": "odometry",
-    "parallel": "another odometry",
     "custom": "an edge of a plugin",
     "by_hand": "an edge that was let in or added",
 }

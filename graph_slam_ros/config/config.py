@@ -43,11 +43,14 @@ from graph_slam_ros.lie import se3
 from graph_slam_ros.solver import LossKey, Settings
 from graph_slam_ros.typing import Numbers
 
+_ONE_ODOMETRY = "the first of inputs.names that publishes is used; a filter, e.g. robot_localization, fuses several"
 REMOVED = {
     "landmarks.follow_s": "observations without identity are compared with all landmarks around",
     "gyro.gate": "the gyro's turn replaces that of odometry",
+    "odometry.fusion": _ONE_ODOMETRY,
+    "robust.odometry_gate": _ONE_ODOMETRY,
 }
-"""Parameters of earlier versions, which had no effect any more. Saved runs have them."""
+"""Parameters of earlier versions. Saved runs have them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,8 +120,6 @@ class Config:
     @property
     def not_condensed(self) -> str:
         """Return the parameter with which nothing is condensed yet; empty if there is none."""
-        if self.odometry.fusion == "parallel":
-            return "odometry.fusion=parallel"
         for one in self.sources:  # its edges may begin at any keyframe
             if one.use == "edges":
                 return f"{one.name}.use={one.use}"

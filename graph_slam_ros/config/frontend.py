@@ -17,13 +17,6 @@ class OdometryConfig:
         "driven (turn_per_rad, turn_per_m, turn_per_s, way_per_m, way_per_s)",
         choices=("twist", "density", "motion"),
     )
-    fusion: str = setting(
-        "first",
-        "several odometries: first: the first of inputs.names that publishes is used; parallel: that one makes the "
-        "keyframes, and the motion of each other between these is used as well. Only for odometries whose errors are "
-        "independent: not for a filter of the other",
-        choices=("first", "parallel"),
-    )
     translation_density: float = setting(
         0.02, "random walk of the odometry position along x of the base", "m/sqrt(s)", low=1e-6, high=10.0
     )

@@ -20,14 +20,6 @@ class RobustConfig:
         low=0.5,
         high=1.0 - 1e-12,
     )
-    odometry_gate: float = setting(
-        0.99999,
-        "odometry.fusion: parallel: odometries whose motions differ by more than this part of their errors contradict "
-        "each other",
-        "probability",
-        low=0.5,
-        high=1.0 - 1e-12,
-    )
     noise_factor: float = setting(
         2.0,
         "the gate allows for noise this many times larger than stated, or than residuals show where these are smaller",

@@ -143,22 +143,11 @@ REASONS: dict[str, Reason] = {
     "not_in_use": Reason(
         _NOTED,
         "another odometry is used, the first of inputs.names that is alive",
-        "odometry.fusion=parallel uses all of them at once",
+        "a filter, e.g. robot_localization, makes one odometry of several",
     ),
     "switched_to": Reason(_NOTED, "this odometry took over from one that fell silent, or is of higher priority"),
     "switched_to_unlinked": Reason(
         _NOTED, "this odometry took over, but had not come before: the motion between is unknown"
-    ),
-    "odometry_contradicted": Reason(
-        _NOTED,
-        "a motion of this odometry is not used: another odometry contradicts it, and the landmarks or a majority do",
-        "wheels that slip, its scale; INPUT.sigma_factor where its noise is larger",
-    ),
-    "odometry_alike": Reason(
-        _NOTED,
-        "a motion of this odometry is not used: in position or rotation it differs from the one in use by far less "
-        "than their noise, so one is made of the other, and its errors would count twice",
-        "leave the worse of both out; INPUT.sigma_factor below 1 for both if they are independent and that good",
     ),
     "gyro_waiting": Reason(
         _NOTED,

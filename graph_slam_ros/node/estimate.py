@@ -204,7 +204,7 @@ class Estimate:
             condensed=condensed_text(condensed_part(slam)),
             visits="; ".join(visit_faults({name: slam.counters["map", name] for name in VISITS})),
             uncorrected="; ".join(": ".join([str(one), *_settings(one)]) for one in slam.uncorrected_so_far),
-            motion="; ".join(filter(None, (slam.gyro.fault if slam.gyro else "", slam.backend.odometries.doubted))),
+            motion=slam.gyro.fault if slam.gyro else "",
             ambiguity=_ambiguity(slam),
             gyro=str(slam.gyro or ""),
             is_resumed=is_resumed,

@@ -28,7 +28,7 @@ _FEWEST_LOST = 2  # visits that are lost, which are said
 VISITS = ("visit_condensed", "visit_lost", "visit_wider")  # in the counters of "map"
 _MENDED = (  # of what is noted, signs of a wrong setting
     *("displaced", "displacement_taken_back", "jump"),
-    *("not_in_use", "gyro_waiting", "gyro_silent", "gyro_doubted", "odometry_contradicted", "odometry_alike"),
+    *("not_in_use", "gyro_waiting", "gyro_silent", "gyro_doubted"),
 )
 _CONTRADICT = (
     "graph_slam explain RUN says why. Check of this sensor and of odometry: metres and radians, y and bearings to the "
@@ -305,9 +305,6 @@ def doubts(summary: Summary) -> Iterator[str]:
                 "topic and an input of its own (inputs.names); one that jumps: is it in metres and radians?"
             )
     for name, counts in summary.get("inputs", {}).items():
-        counted = summary["counters"].get(name, {})
-        if alike := counted.get("odometry_alike", 0):
-            yield f"{name}: {_because(name, {'odometry_alike': alike})}"
         if counts["use"] in MOTION or not counts["used"]:
             continue
         accepted = (counts["believed"] or 0) / counts["used"]

@@ -22,7 +22,6 @@ from graph_slam_ros.slam.robust.displacement_hypothesis import DisplacementHypot
 from graph_slam_ros.slam.robust.gating import OutlierGate
 from graph_slam_ros.slam.robust.hypotheses import MIRRORED, Alternative, FrozenGraph, Outcome, search_alternatives
 from graph_slam_ros.slam.robust.ledger import Ledger, Reason
-from graph_slam_ros.slam.robust.odometry_judge import OdometryJudge
 from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.solver import Report, Settings, Solver
 from graph_slam_ros.typing import Array, Executor, Index, Numbers
@@ -42,7 +41,6 @@ class Backend:
     Attributes
     ----------
     graph, solver : the problem; decisions : the outlier gate, which judges edges
-    odometries : judges odometries that contradict each other
     noise : adds edges to the graph, with noise in scale
     handed_over : vertices and edges of the graph that the solver has
     frozen, frozen_edges : the first so many vertices, and verdicts on the first so many edges, stay for good
@@ -72,7 +70,6 @@ class Backend:
         self.handed_over, self.held = (0, 0), (0, 0)
         self.frozen, self.frozen_edges = start.frozen, start.ledger.final
         self.edits, self.bounded = list(start.edits), start.bounded or BoundedState()
-        self.odometries = OdometryJudge(config.odometry_gate, self.graph, self.solver, self.ledger, self._counters)
         self._background = Background(config, executor)
         self._rivals: tuple[Alternative, ...] = ()
         self.spares_memory = self.holds_back = False
@@ -129,7 +126,6 @@ class Backend:
         for vertex in inside[inside < vertices].tolist():
             self.solver.hold(vertex)
         self.ledger.finish(edges)
-        self.odometries.finish()
 
     def release_map(self) -> None:
         """Undo ``hold_map``. A frozen map stays fixed."""
@@ -151,8 +147,6 @@ class Backend:
         self.hand_over()
         new = self.decisions.gate_new(self.handed_over[1], keyframe, trusts_sightings=self.trusts_sightings)
         self._pending = [*self._pending, *new][-_MAX_PENDING:]
-        if self._config.decide:
-            self.odometries.examine(self.handed_over[1], keyframe)
 
     def update(self, keyframe: int) -> None:
         """Solve with the new accepted edges, then judge the held-back ones."""
@@ -172,8 +166,6 @@ class Backend:
         self._admit(keyframe)
         if is_due and (group := self.decisions.readmit_likely_group(keyframe)):
             self._admission.make_fit(group, keyframe)
-        if self.odometries.decide(keyframe):
-            self.solver.update()
         out = self.ledger.outside_count
         if self._config.decide and not self.spares_memory and self._background.is_due(out, keyframe, self.graph):
             self._background.start(self._frozen_graph(keyframe, self.solver.settings), out)
@@ -185,8 +177,6 @@ class Backend:
         if not self._config.decide or self.holds_back:
             return report
         self._admit(keyframe)
-        if self.odometries.decide(keyframe, everything=True):
-            report = self.solver.optimize(settings)
         outcome = self._guarded(lambda: search_alternatives(self._config, self._frozen_graph(keyframe, settings)))
         if outcome is not None:
             self._adopt(outcome, keyframe)
@@ -285,7 +275,6 @@ class Backend:
         self.decisions.renumber(new)
         self.frozen_edges = self.ledger.final
         self.held = self.held[0], int(np.count_nonzero(new[: self.held[1]] >= 0))
-        self.odometries.forget()
         self.handed_over = self.graph.vertex_count, self.graph.edge_count
         self._rivals = ()
         self.cancel_search()
@@ -327,7 +316,6 @@ class Backend:
         edge = self.graph.add_edge(old.type, old.vertices, motion, noise, "odometry", old.source)
         self.hand_over()
         self.decisions.gate_new(self.handed_over[1], keyframe)
-        self.odometries.displace(old.vertices, keyframe)
         self.decisions.supersede(link, keyframe, found.evidence)
         self.decisions.exchange(found.fitting, (*found.contradicting, *initial_poses), keyframe)
         self.solver.start_at(values)
@@ -338,7 +326,6 @@ class Backend:
         """Undo ``split``: odometry's edge is accepted again, and its replacement is rejected."""
         self.decisions.withdraw([replacement], keyframe, Reason.REVOKED)
         self.decisions.reinstate(link, keyframe, evidence)
-        self.odometries.return_to(self.graph.edge(link).vertices, keyframe)
 
     def judge_anew(self, values: Array, found: DisplacementHypothesis, keyframe: int) -> None:
         """Judge all edges from other stored numbers of all vertices, and accept what shows where the robot is."""

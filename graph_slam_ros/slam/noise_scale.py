@@ -113,7 +113,7 @@ def factors_of(scales: Sequence[NoiseScale]) -> dict[Key, float]:
     for one in scales:
         if not one.reason:
             out[one.key] = one.factor
-            if one.label in ("odometry", "parallel"):
+            if one.label == "odometry":
                 out[one.label, one.source, one.part + PER_RAD] = one.per_rad
                 out[one.label, one.source, one.part + PER_M] = one.per_m
     return out

@@ -30,7 +30,6 @@ from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
 from graph_slam_ros.slam.frontend.noise_factors import NoiseScales
 from graph_slam_ros.slam.frontend.odometry_integration import IntegratedOdometry, OdometryNoise
 from graph_slam_ros.slam.frontend.odometry_selector import OdometrySelector, Step
-from graph_slam_ros.slam.frontend.parallel_odometry import ParallelOdometry
 from graph_slam_ros.slam.frontend.pose_edges import PoseEdges
 from graph_slam_ros.slam.frontend.stamp_order import PendingObservations, StampOrder
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
@@ -81,7 +80,6 @@ class KeyframeFrontend:
         self.config, self._space, self._pose_of = config, config.space, pose_of
         self._edges, self._graph, self._counters = edges, edges.graph, counters
         self._noise = OdometryNoise(config.odometry, self._space)
-        self._parallel = ParallelOdometry(config, self._noise) if config.odometry.fusion == "parallel" else None
         self.odometry = OdometrySelector(config.odometry, config.inputs.names.split(), self._space, counters)
         self.path = KeyframeList(self._noise, self._space)
         self.sighting_poses = StampedPoses(SightingPose, self._space.pose.size)
@@ -155,26 +153,17 @@ class KeyframeFrontend:
         self._thinning.forget_time()
         if self.gyro:
             self.gyro.forget()
-        if self._parallel:
-            self._parallel.forget()
 
     def accepts(self, m: Measured) -> TypeGuard[Odometry | Observation]:
         """Return whether a measurement may be queued. If not, it is counted, or it was a gyro's and is used up."""
         if isinstance(m, AngularVelocity):
             self._add_to_gyro(m)
             return False
-        if self._parallel and isinstance(m, Odometry):
-            self._parallel.add(m, self.path.keyframes)
-            if m.source != self.source and self.order.is_late(m):  # another than that in use may come late
-                self._counters.used[m.source] += 1
-                self.odometry.sources.add(m.source)
-                return False
         return self.order.accepts(m) and (isinstance(m, Odometry) or self._arrivals.admit(m) is not None)
 
     def steps(self, m: Odometry) -> Iterator[Step]:
         """Yield the corrected steps that an odometry message completes."""
         before_ns = self.odometry.newest_ns
-        self._add_parallel()
         for step in self.odometry.steps(m):
             seconds = 0.0 if before_ns is None else (step.stamp_ns - before_ns) * 1e-9
             before_ns, self.T_odom_base = step.stamp_ns, step.T_odom_base
@@ -187,15 +176,7 @@ class KeyframeFrontend:
     @property
     def uses_odometry_alone(self) -> bool:
         """Return whether steps are those of the odometry in use, as it reports them: no gyro, nothing corrected."""
-        return self.gyro is None and self._parallel is None and self.corrections.leave_odometry
-
-    def _add_parallel(self) -> None:
-        """Add the complete motions of the other odometries as edges between keyframes."""
-        if self._parallel is None:
-            return
-        for one in self._parallel.motions(self.path, self.source):
-            noise = edge_noise(self._counters, one.source, one.covariance, self._space.dimensions)
-            self._edges.add_edge(self._space.relative_pose, one.vertices, one.motion, noise, "parallel", one.source)
+        return self.gyro is None and self.corrections.leave_odometry
 
     def _add_to_gyro(self, m: AngularVelocity) -> None:
         if self.gyro is None or m.topic != self.gyro.name:
@@ -259,8 +240,6 @@ class KeyframeFrontend:
         """Add a keyframe at a step that was integrated before."""
         now = self._motion.now
         covariance, held = now.covariance, self.held_covariance
-        if held is not None and self._parallel:
-            self._parallel.disconnect(len(self.path.keyframes))
         if held is not None:  # the first that is free in a held map is as uncertain as the pose was then
             covariance, self.held_covariance = self._space.group.propagate(held, now.T_keyframe_base, covariance), None
         self._append(step, now.T_keyframe_base, covariance)
@@ -275,8 +254,6 @@ class KeyframeFrontend:
         else:  # of a loaded map, too: its odometry was that of another drive
             T_last_now = self._space.group.between(keyframes[-1].T_odom_base, step.T_odom_base)
             covariance = np.zeros_like(self.covariance)
-        if self._parallel:
-            self._parallel.disconnect(len(keyframes))
         if not is_prior:
             self.path.segments.append(len(keyframes))
         added_sigmas = self._added_sigmas(given, T_last_now, is_prior=is_prior)

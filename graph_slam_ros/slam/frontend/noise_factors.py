@@ -14,7 +14,7 @@ from graph_slam_ros.graph import EdgeType, Gaussian, Graph
 from graph_slam_ros.graph.tables import EdgeTable
 from graph_slam_ros.typing import Array, Index
 
-CLASSES = ("odometry", "parallel", "landmarks", "fixes", "closures", "custom")
+CLASSES = ("odometry", "landmarks", "fixes", "closures", "custom")
 FIRST_DUE = 50  # keyframes
 LEAST_CHANGE = 0.02  # of a sigma: less changes nothing
 _LEAST_OWN = 1e-9  # part of a variance that is not of the motion: less is rounding
@@ -27,7 +27,7 @@ Key = tuple[str, str, str]
 
 def grows(edge: EdgeType, label: str) -> bool:
     """Return whether the noise of these edges grows with the measured motion."""
-    return label in ("odometry", "parallel") and edge.name.removesuffix(" 3D") == "relative pose"
+    return label == "odometry" and edge.name.removesuffix(" 3D") == "relative pose"
 
 
 def motion_sizes(measured: Array) -> tuple[Array, Array]:

@@ -98,7 +98,7 @@ class OdometrySelector:
             return [self._follow(used, m)]
         if self._has_failed_over(m, used):
             return self._switched(past, used)
-        self._leave_out(m)
+        self._counters.count(m.source, "not_in_use")
         return []
 
     def motions(self, following: Sequence[Odometry]) -> list[Numbers] | None:
@@ -122,13 +122,6 @@ class OdometrySelector:
         self._past[m.source].append(m)
         return self._use(m, motion, broken="")
 
-    def _leave_out(self, m: Odometry) -> None:
-        if self._config.fusion == "parallel":
-            self._counters.used[m.source] += 1
-            self.sources.add(m.source)
-        else:
-            self._counters.count(m.source, "not_in_use")
-
     def _has_failed_over(self, m: Odometry, used: Odometry) -> bool:
         if self._order.index(m.source) < self._order.index(used.source):
             return m.stamp_ns >= used.stamp_ns
@@ -142,7 +135,7 @@ class OdometrySelector:
         source = past[-1].source
         if not older:
             if newer[-1].stamp_ns - used.stamp_ns <= self._silent_ns:
-                self._leave_out(newer[-1])
+                self._counters.count(source, "not_in_use")
                 return []
             self._counters.count(source, "switched_to_unlinked")
             return [self._use(newer[-1], self._space.identity, broken="jump")]

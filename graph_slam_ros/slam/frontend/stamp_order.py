@@ -53,7 +53,7 @@ class StampOrder:
             if reason:
                 self._counters.count(m.topic, reason, size_of(m))
             return not reason
-        if self.is_late(m):
+        if self._released_ns is not None and m.stamp_ns < self._released_ns:  # it is older than what was released
             self._counters.count(m.source, "late")
             return False
         is_newest = self._newest_odometry_ns is None or m.stamp_ns > self._newest_odometry_ns
@@ -61,10 +61,6 @@ class StampOrder:
             self._counters.count(m.source, "overflow")
             return False
         return True
-
-    def is_late(self, m: Odometry) -> bool:
-        """Return whether an odometry message is older than what was released."""
-        return self._released_ns is not None and m.stamp_ns < self._released_ns
 
     def _has_room(self, stamp_ns: int) -> bool:
         """Return whether the queue has room, or the measurement with the latest stamp of all can make room."""

@@ -17,7 +17,7 @@ from graph_slam_ros.graph.losses import weight_and_cost
 from graph_slam_ros.slam.robust.innovation import innovations, likely_together
 from graph_slam_ros.slam.robust.landmark_support import LandmarkSupport, landmark_of
 from graph_slam_ros.slam.robust.ledger import FINAL, Ledger, Reason, Verdict
-from graph_slam_ros.slam.robust.tightness import TIGHTEST, TYPICAL, Tightness, chi2_per_dof
+from graph_slam_ros.slam.robust.tightness import TIGHTEST, TYPICAL, Tightness
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Index
 
@@ -386,7 +386,7 @@ class OutlierGate:
         if self.is_calibrated:
             # estimated noise allows for errors that are alike, so residuals are smaller: that says nothing of odometry
             is_stated = self._config.noise_scale == "configured"
-            noise_ratio = chi2_per_dof(self._solver, freedom) if is_stated else 1.0
+            noise_ratio = self._solver.evaluate().chi2_final / freedom if is_stated else 1.0
             self._gate_scale = min(factor, max(TIGHTEST, factor * noise_ratio))
         edges = ledger.candidates
         ledger.threshold.values[edges] = self._limits(edges, ledger.numbers.values[edges])

@@ -36,14 +36,13 @@ class Reason(IntEnum):
     REVOKED = 7  # what replaced a displaced or slipped edge of odometry, which is used again
     FAILED = 8  # the plugin of its edge type failed at it
     BY_HAND = 9  # somebody decided so: taken out for good, or in and never judged
-    CONTRADICTED = 10  # odometry, where another odometry contradicts it; its judge lets it in again
     SLIP = 11  # odometry, where its errors were larger than it says: an edge with more noise stands in its place
     MOVED = 12  # a sighting of a landmark at a place to which it had moved: that is another landmark since then
 
 
 FINAL = (  # it is out for good
     *(Reason.WITHDRAWN, Reason.QUARANTINED, Reason.DISPLACED, Reason.REVOKED, Reason.FAILED, Reason.BY_HAND),
-    *(Reason.CONTRADICTED, Reason.SLIP, Reason.MOVED),
+    *(Reason.SLIP, Reason.MOVED),
 )
 INSIDE = (Verdict.ACCEPTED, Verdict.DOWN_WEIGHTED)
 _ACCEPTED, _DOWN_WEIGHTED = _INSIDE = tuple(map(int, INSIDE))  # comparing with members of an enumeration is slow

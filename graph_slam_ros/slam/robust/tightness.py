@@ -68,12 +68,3 @@ class Tightness:
 @cache
 def _median(numbers: int) -> float:
     return quantile(0.5, numbers)
-
-
-def chi2_per_dof(solver: Solver, freedom: int) -> float:
-    """Chi2 per degree of freedom, without parallel odometries: where these are alike it says nothing of noise."""
-    report = solver.evaluate()
-    parallel = report.classes.get("parallel")
-    if parallel is None or freedom - parallel.residuals < TYPICAL:
-        return report.chi2_final / freedom
-    return (report.chi2_final - parallel.chi2) / (freedom - parallel.residuals)

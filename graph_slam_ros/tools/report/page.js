@@ -474,7 +474,7 @@ const HINTS = {  // of verdicts and reasons
   "not judged": "odometry and priors are not judged", accepted: "it is in the map", "down-weighted": "it is in the map, with little weight",
   "held back": "it is not in the map, and is judged again whenever the map changes", rejected: "it is not in the map",
   unlikely: "all else would have to move too far for it", "does not fit": "it was tried, and its error stayed too large",
-  outvoted: "more or better measurements say something else", contradicted: "measurements that came later say something else",
+  outvoted: "more or better measurements say something else",
   "by hand": "a person decided it",
 };
 const values = (name) => (k) => ofEdge(data.edges.columns[name], k);

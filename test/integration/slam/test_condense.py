@@ -295,7 +295,7 @@ def test_a_map_that_is_taken_up_again_goes_on_condensing(recorded, tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("odometry.fusion", "parallel"), ("calibrate.groups", "auto")],
+    [("calibrate.groups", "auto")],
 )
 def test_what_cannot_be_condensed_yet_is_kept_and_the_end_says_why(name, value):
     assert Config().condenses

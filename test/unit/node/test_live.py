@@ -236,7 +236,7 @@ def test_the_weakest_direction_of_the_newest_pose_and_the_way_without_a_landmark
 
 @pytest.mark.parametrize(
     ("settings", "said"),
-    [({}, "keyframes 0 to "), ({"odometry.fusion": "parallel"}, "nothing: not with odometry.fusion=parallel yet")],
+    [({}, "keyframes 0 to "), ({"calibrate.groups": "auto"}, "nothing: not with calibrate.groups=auto yet")],
 )
 def test_the_graph_says_what_was_condensed_or_why_nothing_was(settings, said):
     """A robot drives east for 300 keyframes without landmarks; the window is 40."""

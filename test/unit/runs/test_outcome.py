@@ -47,17 +47,11 @@ def test_a_gyro_without_messages_most_of_the_time_is_one_with_the_parameter():
     assert said == "imu: nothing of 200 messages was used: gyro_silent 100 (" + said.partition("(")[2]
 
 
-def test_an_odometry_that_has_no_part_is_doubted_with_the_parameter():
-    (said,) = doubts(summary({"vo": {"odometry_alike": 60}}, vo=used(200, "odometry")))
-    assert said.startswith("vo: odometry_alike 60 (")
-    assert "vo.sigma_factor" in said
-
-
 def test_what_is_counted_is_said_with_the_input_in_its_remedy():
-    lines = " ".join(" ".join(text(summary({"vo": {"odometry_alike": 60}}, vo=used(200, "odometry")))).split())
-    assert "vo.sigma_factor below 1" in lines
+    lines = " ".join(" ".join(text(summary({"imu": {"gyro_silent": 60}}, GYRO, imu=used(140)))).split())
+    assert "imu.offset_s for its clock" in lines
     lines = " ".join(" ".join(text(summary({"vo": {"not_in_use": 200}}, vo=used(0, "odometry")))).split())
-    assert "-> odometry.fusion=parallel uses all of them at once" in lines
+    assert "-> a filter, e.g. robot_localization, makes one odometry of several" in lines
 
 
 def test_a_solve_that_did_not_converge_is_a_shortcoming_with_the_parameter():

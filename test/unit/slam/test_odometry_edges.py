@@ -5,11 +5,7 @@ import pytest
 
 from graph_slam_ros.graph import Gaussian, Graph
 from graph_slam_ros.graph.geometry import PLANAR
-from graph_slam_ros.slam import Config
-from graph_slam_ros.slam.backend import Backend
-from graph_slam_ros.slam.odometry_edges import replace_odometry
 from graph_slam_ros.slam.robust.hypotheses import _along_odometry
-from graph_slam_ros.slam.robust.ledger import Reason, Verdict
 from graph_slam_ros.slam.robust.pairwise_consistency import odometry_in_use
 
 STEP, EXACT = (1.0, 0.0, 0.0), Gaussian.from_sigmas(0.01, 0.01, 0.01)
@@ -27,24 +23,3 @@ def test_the_path_by_odometry_alone_goes_along_what_replaced_an_edge():
     assert odometry_in_use(graph).tolist() == [0, 4, 2, 3]
     found = _along_odometry(graph, graph.initial.values, set())
     assert found.reshape(-1, 3) == pytest.approx(np.array(path))
-
-
-def test_an_odometry_edge_that_a_slip_replaced_stays_out_while_another_odometry_contradicts_it():
-    config = Config()
-    backend = Backend(config.robust, config.solver_settings())
-    graph = backend.graph
-    vertices = [graph.add_vertex(PLANAR.pose, (0.0, 0.0, 0.0))]
-    graph.add_edge(PLANAR.pose_prior, vertices, (0.0, 0.0, 0.0), EXACT, "anchor")
-    used = []
-    for k in range(5):
-        vertices.append(graph.add_vertex(PLANAR.pose, (k + 1.0, 0.0, 0.0)))
-        used.append(graph.add_edge(PLANAR.relative_pose, vertices[-2:], STEP, EXACT, "odometry", "odom"))
-        graph.add_edge(PLANAR.relative_pose, vertices[-2:], (0.7, 0.0, 0.0), EXACT, "parallel", "second")
-        backend.update(k + 1)
-    assert backend.odometries.contradictions
-    slipped = used[2:]
-    new = replace_odometry(backend, slipped, [Gaussian.from_sigmas(0.5, 0.5, 0.5)] * 3, 5, 40.0, 10.0)
-    backend.odometries.decide(8)
-    assert [graph.edge(edge).weight for edge in (*slipped, *new)] == [0.0] * 3 + [1.0] * 3
-    assert all(backend.ledger.verdict_of(edge) is Verdict.REJECTED for edge in slipped)
-    assert (backend.ledger.reason.values[slipped] == Reason.SLIP).all()
