@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from graph_slam_ros.formats.g2o_writer import write_g2o
     from graph_slam_ros.graph import Gaussian, Graph
     from graph_slam_ros.maps.edit import edit_run
-    from graph_slam_ros.measurements import Control, CustomEdge, Odometry, Sighting, Sightings
+    from graph_slam_ros.measurements import Control, Odometry, Sighting, Sightings
     from graph_slam_ros.optimization import Solution, optimize
     from graph_slam_ros.runs.replay import replay
     from graph_slam_ros.runs.saved_run import SavedRun, load_run
@@ -25,7 +25,6 @@ __all__ = [
     "Certificate",
     "Config",
     "Control",
-    "CustomEdge",
     "Gaussian",
     "Graph",
     "GraphSlam",
@@ -53,7 +52,7 @@ _HOMES = {
     "formats.g2o_writer": ("write_g2o",),
     "graph": ("Gaussian", "Graph"),
     "maps.edit": ("edit_run",),
-    "measurements": ("Control", "CustomEdge", "Odometry", "Sighting", "Sightings"),
+    "measurements": ("Control", "Odometry", "Sighting", "Sightings"),
     "runs.replay": ("replay",),
     "runs.saved_run": ("SavedRun", "load_run"),
     "slam": ("GraphSlam",),

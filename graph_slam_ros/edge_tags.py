@@ -43,7 +43,7 @@ from graph_slam_ros.graph import (
     place_edge,
 )
 from graph_slam_ros.graph.place import MOST_MEMBERS, members_of
-from graph_slam_ros.plugin_edges import fault_of, isolated, measured_at_stamps, named
+from graph_slam_ros.plugin_edges import fault_of, named
 from graph_slam_ros.plugins import EDGES, load, names
 
 VERTEX_TAGS: dict[str, VertexKind] = {
@@ -90,7 +90,7 @@ PLACE_TAGS = {
 }  # ours; ":3" follows, or ":3:1" with a pose
 _BUILT_IN = {edge: tag for tag, edge in EDGE_TAGS.items()} | {INVERSE_RELATIVE_POSE: "EDGE_SE2"}
 _RESERVED = frozenset({*EDGE_TAGS, *VERTEX_TAGS, OFFSET, "FIX"})
-_loaded: dict[str, tuple[EdgeType, EdgeType, EdgeType]] = {}  # of plugins: as given, for files, and for maps
+_loaded: dict[str, EdgeType] = {}  # of plugins
 _tags: dict[EdgeType, str] = {}
 
 
@@ -116,20 +116,7 @@ def edge_of(tag: str) -> EdgeType:
     ConfigError
         The plugin cannot be used, or there is none.
     """
-    return built_in(tag) or _plugin(tag)[1]
-
-
-def map_edge_of(tag: str) -> EdgeType:
-    """Return the edge type of a tag as maps have it: an edge at which a plugin fails counts for nothing.
-
-    Those edges are in ``plugin_edges.failed_edges``. Raises ConfigError as ``edge_of``.
-    """
-    return built_in(tag) or _plugin(tag)[2]
-
-
-def plugin_edge(tag: str) -> EdgeType:
-    """Return the edge type that a plugin has under a tag, as its author wrote it. Raises ConfigError as ``edge_of``."""
-    return _plugin(tag)[0]
+    return built_in(tag) or _plugin(tag)
 
 
 def tag_of(edge: EdgeType) -> str:
@@ -160,8 +147,7 @@ def tag_of(edge: EdgeType) -> str:
 def measured_sizes(tag: str) -> tuple[int, ...]:
     """Return how many numbers a measurement may have in a file: all, or without those that have defaults."""
     edge = edge_of(tag)
-    of_plugin = () if built_in(tag) else (_plugin(tag)[0].measured_size,)  # without the motion from a keyframe
-    return edge.measured_size, edge.measured_size - len(edge.tail), *of_plugin
+    return edge.measured_size, edge.measured_size - len(edge.tail)
 
 
 def described() -> list[str]:
@@ -177,7 +163,7 @@ def described() -> list[str]:
     return lines
 
 
-def _plugin(tag: str) -> tuple[EdgeType, EdgeType, EdgeType]:
+def _plugin(tag: str) -> EdgeType:
     if tag not in _loaded:
         found = None if tag in _RESERVED else load(EDGES, tag, _wrong)
         if found is None:
@@ -185,9 +171,8 @@ def _plugin(tag: str) -> tuple[EdgeType, EdgeType, EdgeType]:
             raise ConfigError(f"{tag}: no plugin has an edge of this tag: {remedy}")
         if not re.fullmatch(r"[A-Za-z_][\w:.+-]*", tag, re.ASCII):
             raise ConfigError(f"{tag!r}: {found[1]}: a tag is one word of letters, digits and _:.+-")
-        edge = measured_at_stamps(found[0])
-        _loaded[tag] = found[0], named(edge, found[1]), isolated(edge, tag, found[1])
-        _tags.update(dict.fromkeys(_loaded[tag], tag))
+        _loaded[tag] = named(*found)
+        _tags.update(dict.fromkeys((found[0], _loaded[tag]), tag))
     return _loaded[tag]
 
 

@@ -44,7 +44,6 @@ REASONS = {
     Reason.QUARANTINED: "quarantined",
     Reason.DISPLACED: "displaced",
     Reason.REVOKED: "revoked",
-    Reason.FAILED: "plugin failed",
     Reason.BY_HAND: "by hand",
     Reason.SLIP: "slip",
     Reason.MOVED: "landmark moved",
@@ -54,7 +53,6 @@ _KIND = {
     "landmarks": "a sighting",
     "fixes": "a fix",
     "odometry": "odometry",
-    "custom": "an edge of a plugin",
     "by_hand": "an edge that was let in or added",
 }
 _SHOWN = 5
@@ -255,7 +253,7 @@ def by_hand(run: SavedGraph, edge: int) -> list[str]:
 
 
 class Numbers(NamedTuple):
-    """The numbers of a measurement that are explained; ``expected`` is the residual of an edge type of a plugin."""
+    """The numbers of a measurement that are explained."""
 
     measured: Sequence[float]
     sigmas: Sequence[float]
@@ -264,15 +262,13 @@ class Numbers(NamedTuple):
     @classmethod
     def of(cls, e: Entry) -> "Numbers":
         """The numbers of one edge."""
-        expected = e.residual if measurement_text.is_custom(e) else measurement_text.expected(e)
-        return cls(measurement_text.measured(e), measurement_text.sigmas(e), expected)
+        return cls(measurement_text.measured(e), measurement_text.sigmas(e), measurement_text.expected(e))
 
 
 def title(e: Entry, of: str) -> str:
     """An edge's title: its kind, the landmarks that it is ``of``, and the verdict on it."""
-    kind = _KIND.get(e.label, e.label) + (f" ({e.tag})" if measurement_text.is_custom(e) else "")
     by = e.source and (f" {e.source}" if e.source == HAND_MADE else f" by {e.source}")
-    return f"edge {e.edge}: {kind}{of and f' of {of}'}{by}: {_state(e.verdict, e.reason)}"
+    return f"edge {e.edge}: {_KIND.get(e.label, e.label)}{of and f' of {of}'}{by}: {_state(e.verdict, e.reason)}"
 
 
 def statements(
@@ -284,8 +280,7 @@ def statements(
     yield "between", " and ".join(ends)
     yield "measured", measurement_text.with_units(e, numbers.measured)
     yield "sigmas", measurement_text.with_units(e, numbers.sigmas)
-    last = "residual" if measurement_text.is_custom(e) else "expected"
-    yield last, f"{measurement_text.with_units(e, numbers.expected)}, when it was judged first"
+    yield "expected", f"{measurement_text.with_units(e, numbers.expected)}, when it was judged first"
     yield "decided", _decided(e, history, config)
     if e.verdict:
         yield "now", f"chi2 {e.chi2:.4g} by its own noise; {e.percent:.3g} % of its weight counts"
@@ -319,8 +314,6 @@ def _decided(e: Entry, history: Sequence[VerdictChange], config: Config) -> str:
             return "not by its chi2: a user cleared or removed it, or association gave it to another landmark"
         case Reason.QUARANTINED:
             return "not by its chi2: several solves in a row failed with it, and succeeded without it"
-        case Reason.FAILED:
-            return "not by its chi2: the plugin of its edge type failed at it; the log of the run has the error"
         case Reason.BY_HAND:
             return "not by its chi2: a user decided it by hand"
         case Reason.MOVED:

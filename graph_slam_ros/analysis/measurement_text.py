@@ -6,7 +6,6 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from graph_slam_ros.edge_tags import built_in
 from graph_slam_ros.lie import se2, se3, so3
 from graph_slam_ros.runs.ledger_file import Entry
 
@@ -47,27 +46,15 @@ def _named(tag: str, count: int) -> Sequence[str]:
 
 def with_units(entry: Entry, numbers: Sequence[float]) -> str:
     """One number for each that the edge measures, with their names; angles in degrees."""
-    if is_custom(entry):
-        return ", ".join(f"{number:.4g}" for number in numbers)
     words = []
     for (what, unit), number in zip(units(entry.tag, len(numbers)), numbers, strict=True):
         words.append(f"{what} {number * _DEGREES:.2f} deg" if unit == "rad" else f"{what} {number:.3f} {unit}")
     return ", ".join(words)
 
 
-def is_custom(entry: Entry) -> bool:
-    """Return whether its edge type is a plugin's: nobody knows what its numbers are."""
-    return not built_in(entry.tag)
-
-
 def measured(entry: Entry) -> tuple[float, ...]:
-    """Return what was measured, as many numbers as the residual has; rotations in space as vectors.
-
-    All numbers of an edge type of a plugin.
-    """
+    """Return what was measured, as many numbers as the residual has; rotations in space as vectors."""
     z = entry.measured
-    if is_custom(entry):
-        return z
     if entry.tag == "EDGE_ATTITUDE_SE3":
         return tuple(so3.log(z))
     if entry.dof == 6:

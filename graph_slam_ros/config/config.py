@@ -51,6 +51,11 @@ REMOVED = {
     "robust.odometry_gate": _ONE_ODOMETRY,
 }
 """Parameters of earlier versions. Saved runs have them."""
+REMOVED_VALUES = {
+    ("INPUT.use", "edges"): "the pipeline has no edges of plugins; one's own edge type stays in the library and in g2o "
+    "files, and a converter of one's own yields landmarks, fixes, closures or odometry",
+}
+"""Values of parameters of earlier versions."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,9 +125,6 @@ class Config:
     @property
     def not_condensed(self) -> str:
         """Return the parameter with which nothing is condensed yet; empty if there is none."""
-        for one in self.sources:  # its edges may begin at any keyframe
-            if one.use == "edges":
-                return f"{one.name}.use={one.use}"
         return f"calibrate.groups={self.calibrate.groups}" if self.calibrate.is_on else ""
 
     @classmethod
@@ -145,6 +147,9 @@ class Config:
                 near = nearest(name, known)
                 raise ConfigError(f"unknown parameter {name!r}; did you mean {near!r}?{_unlisted(name, names)}")
             section, key = name.split(".")
+            of = "INPUT" if section in names else section
+            if why := REMOVED_VALUES.get((f"{of}.{key}", str(value))):
+                raise ConfigError(f"{name}={value} was removed: {why}")
             sections.setdefault(section, {})[key] = known[name].check(value)
         trees = {name: type(default)(**sections.get(name, {})) for name, default in _sections()}
         inputs = (dataclasses.replace(default_input(name), **sections.get(name, {})) for name in names)
@@ -210,7 +215,7 @@ class Config:
         landmarks, robust = self.landmarks, self.robust
         others = narrow_then_wide(robust.loss, robust.loss_scale)
         out: dict[LossKey, Sequence[Loss]] = {"landmarks": landmark_stages(landmarks.loss, landmarks.loss_scale)}
-        out |= dict.fromkeys(("fixes", "closures", "initialpose", "custom"), others)
+        out |= dict.fromkeys(("fixes", "closures", "initialpose"), others)
         for one in self.sources:
             if one.loss == "auto" and not one.loss_scale:
                 continue
@@ -218,7 +223,7 @@ class Config:
             out["landmarks", one.name] = landmark_stages(name, one.loss_scale or landmarks.loss_scale)
             name = robust.loss if one.loss == "auto" else one.loss
             stages = narrow_then_wide(name, one.loss_scale or robust.loss_scale)
-            out |= {(label, one.name): stages for label in ("fixes", "closures", "custom")}
+            out |= {(label, one.name): stages for label in ("fixes", "closures")}
         return out
 
     def solver_settings(self) -> Settings:

@@ -28,7 +28,7 @@ class InputConfig:
     use: str = setting(
         "auto",
         "use of the input; auto: the first use that its type allows; none: the input is ignored",
-        choices=("auto", "odometry", "gyro", "landmarks", "fix", "closure", "edges", "none"),
+        choices=("auto", "odometry", "gyro", "landmarks", "fix", "closure", "none"),
     )
     frame: str = setting("", "frame of the measurements, instead of the one in the messages; empty: as in the messages")
     mount: str = setting(
@@ -114,14 +114,14 @@ class InputConfig:
     )
     loss: str = setting(
         "auto",
-        "robust loss of the input's measurements; auto: landmarks.loss for landmarks, robust.loss for fixes, "
-        "closures and edges of plugins; odometry has none",
+        "robust loss of the input's measurements; auto: landmarks.loss for landmarks, robust.loss for fixes "
+        "and closures; odometry has none",
         choices=("auto", *LOSSES),
     )
     loss_scale: float = setting(
         0.0,
         "residuals of the input well below this many standard deviations keep their full weight; 0: "
-        "landmarks.loss_scale for landmarks, robust.loss_scale for fixes, closures and edges of plugins",
+        "landmarks.loss_scale for landmarks, robust.loss_scale for fixes and closures",
         "sigma",
         low=0.0,
     )

@@ -85,19 +85,8 @@ def _shared(one: GraphSlam, two: GraphSlam, a: Path, b: Path) -> list[str]:
 
 
 def absolute_classes(slam: GraphSlam) -> list[str]:
-    """The classes of edges that are absolute in the map; of custom edges those whose chi2 changes if all is moved."""
-    space, values, here = slam.space, slam.solver.values, slam.solver.evaluate().classes.get("custom")
-    found = [label for label in _ABSOLUTE if len(slam.graph.edges_of(label))]
-    if here is None:
-        return found
-    T_new_old = space.group.exp(tuple(1.0 + 0.3 * k for k in range(space.dof)))
-    for vertex in range(slam.graph.vertex_count):
-        one = slam.graph.vertex(vertex)
-        move = {space.pose: space.group.compose, space.point: space.group.act}.get(one.kind)
-        if move is not None:
-            values[one.stored] = move(T_new_old, tuple(values[one.stored].tolist()))
-    there = slam.solver.evaluate(at=values).classes["custom"]
-    return [*found, *["custom"] * (abs(there.chi2 - here.chi2) > _SAME * max(1.0, here.chi2))]
+    """The classes of edges that are absolute in the map."""
+    return [label for label in _ABSOLUTE if len(slam.graph.edges_of(label))]
 
 
 def _aligned(one: GraphSlam, two: GraphSlam, shared: list[str]) -> Alignment:

@@ -12,14 +12,12 @@ class Counters:
     ----------
     on_first : called with source and reason when they are counted for the first time
     received : number of messages of each input, zero included
-    used : number of measurements of each input that were used: odometry messages, sightings, fixes, closures, edges
-    faults : by input, the first error of a plugin, in one line
+    used : number of measurements of each input that were used: odometry messages, sightings, fixes, closures
     """
 
     def __init__(self) -> None:
         self.received: Counter[str] = Counter()
         self.used: Counter[str] = Counter()
-        self.faults: dict[str, str] = {}
         self._counts: Counter[tuple[str, str]] = Counter()
         self.on_first: Callable[[str, str], None] = lambda source, reason: None
 

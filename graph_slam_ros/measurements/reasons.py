@@ -107,7 +107,7 @@ REASONS: dict[str, Reason] = {
     "undecodable": Reason(_REFUSED, "the bytes are not a message of this type", "INPUT.type, or record it again"),
     "plugin_failed": Reason(
         _REFUSED,
-        "the plugin of this type failed at a message, gave what is no measurement, or failed at an edge of its own",
+        "the plugin of this type failed at a message, or gave what is no measurement",
         "correct or uninstall the package; the log of the node, or the end of replay, names it with its first error",
     ),
     "nonfinite": Reason(_REFUSED, "a number is NaN or infinite", "correct the driver"),
@@ -247,15 +247,6 @@ REASONS: dict[str, Reason] = {
         "a landmark that is surveyed or held is seen elsewhere, and not where it stands in the map: it stays there",
         "correct its line in landmarks.surveyed, or remove it from a frozen map by the edit remove_landmark",
     ),
-    # -- edges of plugins
-    "landmark_unknown": Reason(
-        _REFUSED,
-        "a custom edge names a landmark that is not in the map, or was surveyed while nothing says where the map lies",
-        "an input of landmarks that sees it; or landmarks.surveyed with anchor.pose",
-    ),
-    "landmark_of_other_kind": Reason(
-        _REFUSED, "a custom edge is of a point and its landmark is a pose, or the other way round", "correct the plugin"
-    ),
     # -- fixes
     "no_fix": Reason(_REFUSED, "the receiver has no fix", "wait for one: a clear view of the sky"),
     "no_position": Reason(_REFUSED, "latitude and longitude are zero", "wait for a fix"),
@@ -291,7 +282,7 @@ REASONS: dict[str, Reason] = {
     "id_not_a_stamp": Reason(_REFUSED, "a closure's id is not the earlier stamp in nanoseconds", "see docs/node.md"),
     "closure_with_itself": Reason(_REFUSED, "a closure's two stamps are the same", "correct the publisher"),
     "no_result": Reason(_REFUSED, "a closure has no result with a pose", "correct the publisher"),
-    "within_one_keyframe": Reason(_REFUSED, "a closure or edge links two moments of one keyframe: it says nothing new"),
+    "within_one_keyframe": Reason(_REFUSED, "a closure links two moments of one keyframe: it says nothing new"),
     "from_where_there_was_no_odometry": Reason(
         _REFUSED, "the earlier stamp of a closure or edge is outside the odometry", "stamps by the robot's clock"
     ),

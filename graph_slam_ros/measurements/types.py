@@ -152,48 +152,6 @@ class Closure:
 
 
 @dataclass(frozen=True, slots=True)
-class CustomEdge:
-    """A measurement for a plugin's edge type: it becomes one edge between poses of the robot and landmarks.
-
-    Attributes
-    ----------
-    tag : of the edge type: the name of its entry point of the group ``graph_slam_ros.edges``
-    ends : for each vertex of the edge type, in order: a stamp [ns], for the pose of the robot then, or the name of a
-        landmark. No stamp is later than ``stamp_ns``
-    measured : the numbers of the edge type; its defaults may be left out
-    covariance : (m, m) of the residual, row-major, without the noise of odometry
-
-    Raises
-    ------
-    FormatError
-        ``ends`` are none, or one is later than ``stamp_ns``.
-    """
-
-    stamp_ns: int
-    topic: str
-    tag: str
-    ends: tuple[int | str, ...]
-    measured: Numbers
-    covariance: Numbers
-
-    def __post_init__(self) -> None:
-        if not self.ends or not all(isinstance(end, str) or (type(end) is int and end > 0) for end in self.ends):
-            raise FormatError(f"CustomEdge: {self.ends!r} are not stamps [ns] and names of landmarks")
-        if max(self.stamps_ns, default=0) > self.stamp_ns:
-            raise FormatError(f"CustomEdge: the stamp {max(self.stamps_ns)} of a pose is later than {self.stamp_ns}")
-
-    @property
-    def stamps_ns(self) -> tuple[int, ...]:
-        """The stamps of its poses of the robot."""
-        return tuple(end for end in self.ends if isinstance(end, int))
-
-    @property
-    def landmarks(self) -> tuple[str, ...]:
-        """The names of its landmarks."""
-        return tuple(end for end in self.ends if isinstance(end, str))
-
-
-@dataclass(frozen=True, slots=True)
 class InitialPose:
     """A pose given by a user or another system; it is used from the next odometry on.
 
@@ -245,7 +203,7 @@ END = Control("end"), Control("optimize")
 """The end of a run: what is held is processed, nothing more comes, and everything is solved."""
 
 
-Observation: TypeAlias = Sightings | Fix | Closure | CustomEdge
+Observation: TypeAlias = Sightings | Fix | Closure
 Measured: TypeAlias = Odometry | AngularVelocity | Observation
 Measurement: TypeAlias = Measured | InitialPose | Control
 
@@ -255,7 +213,6 @@ _TYPES = {
     "sightings": Sightings,
     "fix": Fix,
     "closure": Closure,
-    "custom_edge": CustomEdge,
     "initial_pose": InitialPose,
     "control": Control,
 }

@@ -77,7 +77,7 @@ class Session:
                 self.recording_fails = True
                 raise
         self.slam, self._recorder, self.recording_fails = slam, recorder, False
-        self.slam.counters.on_first = self._warn_first
+        self.slam.counters.on_first = self._warn
         self._refused_before = Counters()
         self._refused_before.update(self._border)
         self.estimate = None
@@ -89,11 +89,6 @@ class Session:
         self._slowest_s = 0.0
         self._fit, self._fitted_at, self._fit_due_s = float("nan"), 0, 0.0
         self._doubted = ""
-
-    def _warn_first(self, source: str, reason: str) -> None:
-        """Log a reason when it is first counted, with the error of a plugin if that is the reason."""
-        fault = self.slam.counters.faults.get(source) if reason == "plugin_failed" else None
-        self._warn(source, f"{reason}: {fault}" if fault else reason)
 
     @property
     def incomplete(self) -> list[Path]:

@@ -15,10 +15,9 @@ from typing import Any
 from mcap.records import Channel, Message
 from mcap.writer import CompressionType, Writer
 
-from graph_slam_ros.edge_tags import map_edge_of
 from graph_slam_ros.errors import FormatError
 from graph_slam_ros.formats.durable import AppendedFile
-from graph_slam_ros.measurements.types import EVENTS, CustomEdge, Measurement, Odometry, from_record, to_record
+from graph_slam_ros.measurements.types import EVENTS, Measurement, Odometry, from_record, to_record
 from graph_slam_ros.recordings.mcap_records import LIBRARY, records
 
 _ENCODE = json.JSONEncoder(separators=(",", ":"), check_circular=False, allow_nan=False).encode
@@ -216,23 +215,14 @@ def read_ingest(folder: Path, losses: list[str]) -> Iterator[dict[str, Any]]:
 
 
 def read_measurements(folder: Path, losses: list[str]) -> Iterator[Measurement]:
-    """The measurements and events of ``read_ingest``; events of another version are left out and add to ``losses``.
-
-    Raises
-    ------
-    ConfigError
-        A plugin that has the edge type of a custom edge is not installed, or cannot be used.
-    """
+    """The measurements and events of ``read_ingest``; events of another version are left out and add to ``losses``."""
     return _measurements(read_ingest(folder, losses), losses)
 
 
 def _measurements(records: Iterable[dict[str, Any]], losses: list[str]) -> Iterator[Measurement]:
     for record in records:
         if record.get("type") != "control" or record.get("event") in EVENTS:
-            m = from_record(record)
-            if isinstance(m, CustomEdge):
-                map_edge_of(m.tag)
-            yield m
+            yield from_record(record)
         elif (loss := f"{INGEST}: event {record.get('event')!r} is not known to this version; left out") not in losses:
             losses.append(loss)
 

@@ -17,7 +17,7 @@ from typing import Any, NewType, TypeVar, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
-from graph_slam_ros.edge_tags import map_edge_of, tag_of
+from graph_slam_ros.edge_tags import edge_of, tag_of
 from graph_slam_ros.errors import ConfigError, FormatError
 from graph_slam_ros.formats.strict import integer, lines, numbers, stamp
 from graph_slam_ros.graph.losses import weight_and_cost
@@ -138,7 +138,7 @@ def read_ledger(folder: Path) -> list[Entry]:
 def _fault(entry: Entry) -> str:
     """Return which fields of an edge contradict one another."""
     try:
-        edge = map_edge_of(entry.tag)
+        edge = edge_of(entry.tag)
     except ConfigError as error:
         return f"tag {shortened(entry.tag)} is none of a graph: {error}"
     m = edge.residual_size

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from graph_slam_ros.edge_tags import map_edge_of
+from graph_slam_ros.edge_tags import edge_of
 from graph_slam_ros.graph import Gaussian, Graph
 from graph_slam_ros.graph.vertices import R1, R2, R3, SE2, SE3
 from graph_slam_ros.measurements.edits import applied_edit
@@ -141,7 +141,7 @@ def _add_edges(graph: Graph, edges: Sequence[Any]) -> None:
         codes[:, k] = _code(graph.labels, label), _code(graph.sources, source)
     added = []
     for tag, places in by_tag.items():
-        edge, at = map_edge_of(tag), np.array(places)
+        edge, at = edge_of(tag), np.array(places)
         _, vertices, measured, roots, label, source = zip(*(edges[k] for k in places), strict=True)
         noise = Gaussian(np.array(roots, dtype=float).reshape(-1, edge.residual_size, edge.residual_size))
         graph.add_edges(edge, vertices, measured, noise, label[0], source[0])

@@ -289,9 +289,7 @@ def _checked(columns: Collector, counters: Counters) -> dict[str, Any]:
 
 
 def _warnings(slam: GraphSlam, summary: dict[str, Any]) -> list[str]:
-    faults = [f"{source}: {fault}" for source, fault in slam.counters.faults.items()]
     return [
-        *faults,
         *doubts(summary),
         *map(str, slam.alarms),
         *unscaled(summary),

@@ -137,7 +137,6 @@ def _started(folder: Path, state: MapSnapshot, losses: list[str]) -> GraphSlam:
     # what is asked of a map is asked of all of it
     config = config_of(folder, state).changed({"map.localize": False} | _NOTHING_LEAVES)
     slam = GraphSlam(config, start=state)
-    losses += [f"{folder}: {source}: {fault}" for source, fault in slam.counters.faults.items()]
     return slam
 
 

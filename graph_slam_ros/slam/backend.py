@@ -8,7 +8,6 @@ from graph_slam_ros.config.robust import RobustConfig
 from graph_slam_ros.graph import Gaussian, Graph
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.measurements.counters import Counters
-from graph_slam_ros.plugin_edges import failed_edges
 from graph_slam_ros.slam.calibration.rows import TrialProblem
 from graph_slam_ros.slam.frontend.keyframes import Keyframe, KeyframeList
 from graph_slam_ros.slam.frontend.noise_factors import CLASSES, Key, NoiseScales
@@ -356,8 +355,7 @@ class Backend:
     def _guarded(self, search: Work) -> Outcome | None:
         """The outcome of a search; None if it failed, which changes nothing."""
         try:
-            with failed_edges():  # of another estimate: nothing is withdrawn for it
-                return search()
+            return search()
         except Exception as error:
             self._counters.count("second_look", type(error).__name__)
             return None

@@ -109,7 +109,7 @@ def standing_edges(graph: Graph, ledger: Ledger, vertex: int) -> list[int]:
 
 def determining(graph: Graph, ledger: Ledger, vertex: int) -> list[int]:
     """The edges of a landmark without those that are out or do not determine where it is."""
-    edges = [edge for edge in standing_edges(graph, ledger, vertex) if graph.label_of(edge) != "custom"]
+    edges = standing_edges(graph, ledger, vertex)
     return [edge for edge in edges if ledger.verdict_of(edge) not in OUT]
 
 

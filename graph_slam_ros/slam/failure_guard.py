@@ -204,20 +204,13 @@ class FailureGuard:
                 found[True, vertex] = _Suspect(tuple(on.tolist()), vertex)
         new = np.setdiff1d(edges[edges >= self._good_edges], [edge for one in found.values() for edge in one.edges])
         for edge in new[self._graph.has_label(new, CANDIDATES)].tolist():
-            landmark = landmark_of(self._graph, edge) or self._new_landmark_of(edge)
+            landmark = landmark_of(self._graph, edge)
             if landmark is None or landmark < self._good_vertices:
                 found[False, edge] = _Suspect((edge,))
             else:
                 before = found.get((True, landmark), _Suspect(()))
                 found[True, landmark] = _Suspect((*before.edges, edge), landmark)
         return list(found.values())
-
-    def _new_landmark_of(self, edge: int) -> int | None:
-        """A landmark of a custom edge that the last good estimate lacks."""
-        one = self._graph.edge(edge)
-        new = [vertex for vertex in one.vertices if vertex >= self._good_vertices]
-        landmarks = [vertex for vertex in new if self._graph.kind_of(vertex) not in GROUPS]
-        return landmarks[0] if one.label == "custom" and landmarks else None
 
     def _to_blame(self, suspects: list[_Suspect]) -> list[_Suspect]:
         """The suspects that must stay rejected, found by halving. The others are accepted again."""

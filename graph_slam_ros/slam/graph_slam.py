@@ -16,7 +16,6 @@ from graph_slam_ros.measurements.edits import aliases
 from graph_slam_ros.measurements.types import (
     Closure,
     Control,
-    CustomEdge,
     Event,
     Fix,
     InitialPose,
@@ -26,12 +25,10 @@ from graph_slam_ros.measurements.types import (
     Sightings,
     Value,
 )
-from graph_slam_ros.plugin_edges import failed_edges
 from graph_slam_ros.slam.anchor import Anchor
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.bounded_map import BoundedMap
 from graph_slam_ros.slam.calibrator import Calibrator
-from graph_slam_ros.slam.custom_edges import CustomEdges
 from graph_slam_ros.slam.edits import Edits
 from graph_slam_ros.slam.failure_guard import FailureGuard
 from graph_slam_ros.slam.faults import Faults
@@ -93,13 +90,9 @@ class GraphSlam(MapView):
         self._sink, self._faults = sink or (lambda measurement: None), Faults(counters)
         self._edits = Edits(backend, frontend, landmarks.map, counters)
         landmarks.map.aliases = aliases(backend.edits)
-        self._custom = CustomEdges(config, backend, frontend, landmarks.map, self._anchor, counters)
         self._calibrator = Calibrator(config, backend, frontend, landmarks, kidnaps, counters, executor, start)
         if start is not None and start.keyframes:
-            with failed_edges() as failed:
-                self._restore(start)
-            if self._custom.withdraw(failed.values(), len(self.keyframes) - 1):
-                self._solve(self.config.solver_settings())
+            self._restore(start)
         bounded = BoundedMap(backend, frontend, landmarks, self._anchor, kidnaps, solution, counters)
         self._updates = UpdateLog(self, bounded, MotionOnly(frontend, landmarks, bounded))
 
@@ -175,9 +168,6 @@ class GraphSlam(MapView):
                 self._add_fix(admitted, self._frontend.where(admitted))
             case Closure():
                 self._frontend.add_closure(admitted, self._frontend.where(admitted))
-            case CustomEdge():
-                self._solution.resting += self._frontend.path.rests
-                self._custom.add(admitted)
         self._solve_if_due()
 
     def _add_sightings(self, m: Sightings, where: PoseAtStamp) -> None:
@@ -213,11 +203,8 @@ class GraphSlam(MapView):
         """Solve the new part, or everything. After a failure, which is counted, the last estimate stays."""
         if self.keyframes:
             count = len(self.keyframes)
-            with failed_edges() as failed:
-                solved = self._solution.solve(lambda: self._solved(count - 1, everything), self.keyframes[-1], count)
+            solved = self._solution.solve(lambda: self._solved(count - 1, everything), self.keyframes[-1], count)
             self._frontend.covariance = solved.covariance if solved else self._frontend.covariance
-            if self._custom.withdraw(failed.values(), count - 1):
-                self._solve(everything)
 
     def _solved(self, keyframe: int, everything: Settings | None) -> Solved:
         self.backend.hand_over()

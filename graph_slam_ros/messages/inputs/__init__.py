@@ -12,7 +12,7 @@ from typing import Any
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.config.inputs import InputConfig
 from graph_slam_ros.errors import ConfigError
-from graph_slam_ros.measurements.types import CustomEdge, Measured
+from graph_slam_ros.measurements.types import Measured
 from graph_slam_ros.messages.inputs import detections, fixes, odometry, plugins, ranges
 from graph_slam_ros.messages.inputs.checks import MessageError
 from graph_slam_ros.messages.inputs.landmark_types import LANDMARK_TYPES
@@ -22,7 +22,6 @@ from graph_slam_ros.messages.inputs.source import InputContext, NotYet
 
 __all__ = [
     "CONVERTERS",
-    "CustomEdge",
     "InputContext",
     "InputType",
     "MessageError",

@@ -9,9 +9,8 @@ from typing import Any
 
 from graph_slam_ros import edge_tags
 from graph_slam_ros.errors import ConfigError
-from graph_slam_ros.measurements.custom_edges import edge_type_of, refuse_unusable
 from graph_slam_ros.measurements.reasons import REASONS
-from graph_slam_ros.measurements.types import AngularVelocity, Closure, CustomEdge, Fix, Measured, Odometry, to_record
+from graph_slam_ros.measurements.types import AngularVelocity, Closure, Fix, Measured, Odometry, to_record
 from graph_slam_ros.messages.inputs.checks import MessageError
 from graph_slam_ros.messages.inputs.landmarks import ObservedLandmark, sightings
 from graph_slam_ros.messages.inputs.source import InputContext, NotYet
@@ -23,7 +22,6 @@ _YIELDS: Mapping[str, type] = {
     "closure": Closure,
     "odometry": Odometry,
     "gyro": AngularVelocity,
-    "edges": CustomEdge,
 }
 
 
@@ -33,18 +31,15 @@ class InputType:
 
     Attributes
     ----------
-    converters : by use (``landmarks``, ``fix``, ``closure``, ``odometry``, ``gyro``, ``edges``; the first is that of
-        ``auto``), a function of ``InputContext`` and a message that yields ``ObservedLandmark``, ``Fix``, ``Closure``,
-        ``Odometry``, ``AngularVelocity`` or ``CustomEdge``. It raises ``MessageError(reason)`` for a message that is
-        to be refused
+    converters : by use (``landmarks``, ``fix``, ``closure``, ``odometry``, ``gyro``; the first is that of ``auto``),
+        a function of ``InputContext`` and a message that yields ``ObservedLandmark``, ``Fix``, ``Closure``,
+        ``Odometry`` or ``AngularVelocity``. It raises ``MessageError(reason)`` for a message that is to be refused
     definition : the text of its .msg file, for recordings that hold no definitions; types of other packages that ROS
         does not have follow it, each after a line of ``=`` and one of ``MSG: package/Name``
-    edges : the tags of the edge types that its custom edges have; each is loaded, compiled and tried at the start
     """
 
     converters: Mapping[str, Callable[[InputContext, Any], Iterable[Any]]]
     definition: str = ""
-    edges: tuple[str, ...] = ()
 
 
 class PluginFault(MessageError):
@@ -76,7 +71,7 @@ def converters(type_name: str) -> Mapping[str, Callable[[InputContext, Any], Ite
     if found is None:
         return None
     plugin = _loaded[type_name][1]
-    return {use: partial(_converted, (plugin, found.edges), use, read) for use, read in found.converters.items()}
+    return {use: partial(_converted, plugin, use, read) for use, read in found.converters.items()}
 
 
 def types() -> set[str]:
@@ -114,31 +109,17 @@ def _wrong(there: Any) -> str:
             inspect.signature(read).bind(None, None)
         except TypeError as error:
             return f"its converter of {use} is not a function of an InputContext and a message: {error}"
-    return _wrong_edges(there)
-
-
-def _wrong_edges(there: InputType) -> str:
-    if not isinstance(there.edges, tuple) or not all(isinstance(tag, str) for tag in there.edges):
-        return "its edges are not a tuple of tags"
-    if bool(there.edges) is not ("edges" in there.converters):
-        return "it has a converter of edges without the tags of these, or tags without a converter: InputType(edges=)"
-    for tag in there.edges:
-        try:
-            refuse_unusable(tag)
-        except ConfigError as error:
-            return str(error)
     return ""
 
 
 def _converted(
-    of: tuple[str, tuple[str, ...]],
+    plugin: str,
     use: str,
     read: Callable[[InputContext, Any], Iterable[Any]],
     source: InputContext,
     message: Any,
 ) -> list[Measured]:
-    """The measurements of a message, all or none; ``of`` is the plugin and the tags of its edges."""
-    plugin, tags = of
+    """The measurements of a message, all or none."""
     try:
         found = list(read(source, message))
         for one in found:
@@ -146,10 +127,6 @@ def _converted(
                 raise PluginFault(f"{plugin}: as {use} it gives a {type(one).__name__}, not {_YIELDS[use].__name__}")
         out: list[Measured] = list(sightings(source, found)) if use == "landmarks" else found
         for measured in out:
-            if isinstance(measured, CustomEdge):
-                edge_type_of(measured)
-                if measured.tag not in tags:
-                    raise PluginFault(f"{plugin}: {measured.tag} is not among the edges of its InputType")
             if getattr(measured, "topic", getattr(measured, "source", None)) != source.name:
                 raise PluginFault(f"{plugin}: the topic or source of what it gives is not {source.name!r}")
             json.dumps(to_record(measured))  # as the journal keeps it

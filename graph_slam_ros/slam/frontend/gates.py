@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from typing import Generic, Protocol, TypeVar
 
 from graph_slam_ros.measurements.counters import Counters
-from graph_slam_ros.measurements.types import Closure, CustomEdge, Fix, Observation
+from graph_slam_ros.measurements.types import Closure, Fix, Observation
 from graph_slam_ros.slam.frontend.keyframes import KeyframeList
 from graph_slam_ros.slam.frontend.odometry_selector import OdometrySelector
 
@@ -79,18 +79,18 @@ class DatumGate:
 
 
 class ClosureStart:
-    """Refuses a loop closure or a custom edge if one of its stamps is outside the time that odometry covers."""
+    """Refuses a loop closure from a stamp outside the time that odometry covers."""
 
     def __init__(self, path: KeyframeList, odometry: OdometrySelector) -> None:
         self._path, self._odometry = path, odometry
         self.reason = ""
 
     def admit(self, m: Observation) -> Observation | None:
-        """Return the observation, or None for such a closure or edge."""
-        stamps_ns = (m.from_stamp_ns,) if isinstance(m, Closure) else m.stamps_ns if isinstance(m, CustomEdge) else ()
-        newest_ns, path, oldest_ns = self._odometry.newest_ns or 0, self._path, self._path.oldest_ns
-        is_left = path.keyframes.first > 0 and min(stamps_ns, default=oldest_ns) < oldest_ns
+        """Return the observation, or None for such a closure."""
+        if not isinstance(m, Closure):
+            return m
+        newest_ns, path, from_ns = self._odometry.newest_ns or 0, self._path, m.from_stamp_ns
+        is_left = path.keyframes.first > 0 and from_ns < path.oldest_ns
         reason = "from_condensed_keyframe" if is_left else "from_where_there_was_no_odometry"
         self.reason = reason
-        is_known = path.reaches if isinstance(m, Closure) else lambda stamp_ns: stamp_ns >= oldest_ns
-        return m if all(stamp_ns <= newest_ns and is_known(stamp_ns) for stamp_ns in stamps_ns) else None
+        return m if from_ns <= newest_ns and path.reaches(from_ns) else None

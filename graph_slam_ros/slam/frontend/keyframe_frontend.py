@@ -12,7 +12,6 @@ from graph_slam_ros.measurements.edge_noise import edge_noise
 from graph_slam_ros.measurements.types import (
     AngularVelocity,
     Closure,
-    CustomEdge,
     InitialPose,
     Measured,
     Observation,
@@ -66,7 +65,6 @@ class KeyframeFrontend:
     covariance : (dof, dof) of the newest keyframe's pose, by the last solve and the odometry since
     initial_pose : the pose that is given for the next odometry
     held_covariance : (dof, dof) of the newest pose when the map was held, for the next odometry
-    custom_noise_dominates : whether the motion to a pose adds more than a part of the variance of a custom edge
     """
 
     def __init__(
@@ -101,7 +99,6 @@ class KeyframeFrontend:
         self.T_odom_base: Numbers = self._space.identity
         self.initial_pose: InitialPose | None = None
         self.held_covariance: Array | None = None
-        self.custom_noise_dominates: Callable[[CustomEdge, PoseAtStamp, float], bool] = lambda m, where, most: False
         self._observed_from, self._observed = -1, set[str]()  # a keyframe, and what was observed since
 
     @property
@@ -320,8 +317,6 @@ class KeyframeFrontend:
         c, added_sigma_m = self.config.keyframes, self.config.landmarks.added_sigma_m
         since_s = (where.stamp_ns - newest.start_ns) * 1e-9
         most = max(c.shared_noise, _SHARED_WHEN_SOON) if since_s < c.min_interval_s else c.shared_noise
-        if isinstance(m, CustomEdge):
-            return self.custom_noise_dominates(m, where, most)
         if not motion_compensation.motion_noise_dominates(self._space, m, where, most, added_sigma_m):
             return False
         if since_s >= _SLOW * c.min_interval_s or not self._is_repeated(m, where):

@@ -14,7 +14,7 @@ from graph_slam_ros.graph import EdgeType, Gaussian, Graph
 from graph_slam_ros.graph.tables import EdgeTable
 from graph_slam_ros.typing import Array, Index
 
-CLASSES = ("odometry", "landmarks", "fixes", "closures", "custom")
+CLASSES = ("odometry", "landmarks", "fixes", "closures")
 FIRST_DUE = 50  # keyframes
 LEAST_CHANGE = 0.02  # of a sigma: less changes nothing
 _LEAST_OWN = 1e-9  # part of a variance that is not of the motion: less is rounding
@@ -52,7 +52,7 @@ def configured_variance(now: Array, part: str, of_group: Mapping[str, float], me
 
 def depends_on_place(edge: EdgeType, label: str) -> bool:
     """Return whether the parts of the residual are along the line of sight, and across it."""
-    return label != "custom" and edge.name.removesuffix(" 3D") in ("landmark position", "tag position")
+    return edge.name.removesuffix(" 3D") in ("landmark position", "tag position")
 
 
 def parts_of(edge: EdgeType, label: str, measured: Array) -> dict[str, Array]:
@@ -65,8 +65,6 @@ def parts_of(edge: EdgeType, label: str, measured: Array) -> dict[str, Array]:
     n, m = len(measured), edge.residual_size
     axes = np.broadcast_to(np.eye(m), (n, m, m))
     name = edge.name.removesuffix(" 3D")
-    if label == "custom":  # nobody knows what its numbers are
-        return {"all": axes}
     if depends_on_place(edge, label):
         return _sight_parts(measured[:, :m])
     if name == "range and bearing":

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from graph_slam_ros.config.config import Config
-from graph_slam_ros.measurements.types import CustomEdge, Fix, Observation, Sightings
+from graph_slam_ros.measurements.types import Fix, Observation, Sightings
 from graph_slam_ros.slam.frontend.keyframes import KeyframeList
 
 
@@ -38,20 +38,15 @@ class ObservationThinning:
         match m:
             case Sightings():
                 return None if self._is_repeated(m) else m
-            case CustomEdge():
-                return None if self._is_repeated(m) else m
             case Fix():
                 return self._thinned(m)
             case _:
                 return m
 
-    def _is_repeated(self, m: Sightings | CustomEdge) -> bool:
-        """Return whether the robot rests and has just observed: another observation would have the same errors.
-
-        A message may have several custom edges of one stamp.
-        """
-        before_ns, least_ns = self._observed_ns.get(m.topic), int(isinstance(m, CustomEdge))
-        if self._path.rests and before_ns is not None and least_ns <= m.stamp_ns - before_ns < self._most_ns:
+    def _is_repeated(self, m: Sightings) -> bool:
+        """Return whether the robot rests and has just observed: another observation would have the same errors."""
+        before_ns = self._observed_ns.get(m.topic)
+        if self._path.rests and before_ns is not None and 0 <= m.stamp_ns - before_ns < self._most_ns:
             return True
         self._observed_ns[m.topic] = m.stamp_ns
         return False

@@ -147,14 +147,6 @@ class Landmarks:
             self._hold(topic, landmark, self._survey[name])
         self._add_edge(topic, landmark, s, where)
 
-    def begin_surveyed(self, topic: str, name: str, stamp_ns: int) -> None:
-        """Add a landmark at its surveyed place, without a sighting of it."""
-        known = self._survey[name]
-        vertex = self._graph.add_vertex(self._space.point, known.position)
-        landmark = self.known[name] = Landmark(name, vertex, first_seen_ns=stamp_ns, last_seen_ns=stamp_ns)
-        self._hold(topic, landmark, known)
-        self.touched.append(name)
-
     def _hold(self, topic: str, landmark: Landmark, known: Surveyed) -> None:
         """Add a prior for the survey. It has no loss, because sightings that contradict it are wrong."""
         space, vertices = self._space, [landmark.vertex]

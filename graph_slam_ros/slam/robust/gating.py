@@ -21,7 +21,7 @@ from graph_slam_ros.slam.robust.tightness import TIGHTEST, TYPICAL, Tightness
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Index
 
-CANDIDATES = ("landmarks", "fixes", "closures", "initialpose", "custom")
+CANDIDATES = ("landmarks", "fixes", "closures", "initialpose")
 _READMISSIONS = 50  # edges that are out and are tried again after everything was solved
 _AT_ONCE = 10  # of them, until the first that is likely
 _AGREEING = 3  # edges that are out, at least, come in together between full solves: two agree by chance
@@ -79,8 +79,7 @@ class OutlierGate:
     def _is_of_known(self, edge: int) -> bool:
         """Return whether its landmark was part of the last solve: without the edge it is determined as before."""
         landmark = landmark_of(self._graph, edge)
-        is_custom = self._graph.label_of(edge) == "custom"  # nothing needs it
-        return is_custom or (landmark is not None and landmark < self._vertices)
+        return landmark is not None and landmark < self._vertices
 
     def admit_compatible(self, pending: Sequence[int], keyframe: int) -> list[int]:
         """Compare held-back edges with the estimate, the likeliest first; returns those that are accepted."""

@@ -34,14 +34,13 @@ class Reason(IntEnum):
     QUARANTINED = 5  # nothing could be solved with it
     DISPLACED = 6  # odometry, where the landmarks showed that the robot was moved without its noticing
     REVOKED = 7  # what replaced a displaced or slipped edge of odometry, which is used again
-    FAILED = 8  # the plugin of its edge type failed at it
     BY_HAND = 9  # somebody decided so: taken out for good, or in and never judged
     SLIP = 11  # odometry, where its errors were larger than it says: an edge with more noise stands in its place
     MOVED = 12  # a sighting of a landmark at a place to which it had moved: that is another landmark since then
 
 
 FINAL = (  # it is out for good
-    *(Reason.WITHDRAWN, Reason.QUARANTINED, Reason.DISPLACED, Reason.REVOKED, Reason.FAILED, Reason.BY_HAND),
+    *(Reason.WITHDRAWN, Reason.QUARANTINED, Reason.DISPLACED, Reason.REVOKED, Reason.BY_HAND),
     *(Reason.SLIP, Reason.MOVED),
 )
 INSIDE = (Verdict.ACCEPTED, Verdict.DOWN_WEIGHTED)

@@ -217,11 +217,11 @@ def _numbers(entries: Sequence[Entry]) -> dict[str, Array]:
         information[:, upper[0], upper[1]] = information[:, upper[1], upper[0]] = values
         of = {name: tuple(np.array([getattr(e, name) for e in several]).T) for name in ("measured", "residual")}
         whole: Any = SimpleNamespace(tag=tag, dof=m, **of)
-        expected = whole.residual if measurement_text.is_custom(whole) else measurement_text.expected(whole)
+        expected = measurement_text.expected(whole)
         sigmas = tuple(measurement_text.sigmas_of(information).T)
         for name, columns in zip(Numbers._fields, (measurement_text.measured(whole), sigmas, expected), strict=True):
             is_angle = [unit == "rad" for _, unit in measurement_text.units(tag, len(columns))]
             for k, column in enumerate(columns):
-                unit = _DEGREES if not measurement_text.is_custom(whole) and is_angle[k] else 1.0
+                unit = _DEGREES if is_angle[k] else 1.0
                 out.setdefault(f"{name}{k}", np.full(len(entries), np.nan))[at] = column * unit
     return out

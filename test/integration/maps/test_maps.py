@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from driven import drive, seldom, with_a_wrong_sighting, without_names
 
-from graph_slam_ros import cli, read_g2o, simulation
+from graph_slam_ros import cli, read_g2o
 from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.maps.alignment import laid_on
 from graph_slam_ros.maps.edit import Plan, edit, source_hash
@@ -20,6 +20,7 @@ from graph_slam_ros.runs.map_journal import read_map
 from graph_slam_ros.runs.recorder import RunRecorder
 from graph_slam_ros.runs.restore import map_of, restored
 from graph_slam_ros.slam import Config, Control, GraphSlam, Sightings
+from graph_slam_ros.tools import simulation
 from graph_slam_ros.tools.simulation import simulate, with_closures
 
 

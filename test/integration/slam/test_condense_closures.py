@@ -14,9 +14,8 @@ from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
 from graph_slam_ros.runs.condensed_map import LEFT, read_left
 from graph_slam_ros.runs.journal import RecordWriter, read_measurements, read_records
 from graph_slam_ros.runs.map_journal import read_map
-from graph_slam_ros.runs.outcome import condensed_text, text
 from graph_slam_ros.runs.restore import record_run
-from graph_slam_ros.runs.tables import account, condensed_part, summarize
+from graph_slam_ros.runs.tables import account
 from graph_slam_ros.runs.whole_path import removed_path
 from graph_slam_ros.slam import Closure, Control, GraphSlam
 from graph_slam_ros.slam.lifelong.removed import Left
@@ -181,13 +180,3 @@ def test_rows_that_cannot_be_read_are_said_in_a_line(recorded, tmp_path, damage)
     writer.close()
     with pytest.raises(FormatError, match=r"condensed\.mcap has 0 keyframes"):
         read_map(copy, [])
-
-
-def test_edges_of_plugins_keep_all_keyframes_and_the_end_says_so():
-    asked = {"inputs.names": "odom mine", "mine.use": "edges", "mine.topic": "/mine"}
-    assert Config.from_mapping(asked).not_condensed == "mine.use=edges"
-    settings = bounded(inputs_names="odom loops mine", mine_use="edges", mine_topic="/mine")
-    slam, left, *_ = driven(City(3, 440, PLANAR, BLOCKS), settings)
-    assert not left
-    assert "condensed  nothing: not with mine.use=edges yet" in "\n".join(text(summarize(slam)))
-    assert condensed_text(condensed_part(slam)).startswith("nothing: not with mine.use=edges yet")

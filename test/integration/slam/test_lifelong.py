@@ -183,7 +183,7 @@ def test_what_cannot_be_condensed_stays_and_says_why():
         [visit[3], robot.vertices[100]],
         world.steps[0],
         Gaussian.from_sigmas(1, 1, 1),
-        "custom",
+        "by_hand",
     )
     robot.solver.add([], [closure])
     done = robot.condenser.condense(visit, robot.vertices[20], "here", ())

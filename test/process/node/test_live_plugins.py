@@ -6,7 +6,6 @@ import subprocess
 
 import beacons
 import built_packages
-import differences
 import pytest
 from executables import executable
 from installed import installer
@@ -15,10 +14,6 @@ from places import ROOT
 
 (EXAMPLE,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs/inputs.md").read_text(), re.DOTALL)
 LANDMARKS = ("inputs.names=odom radio", f"radio.type={beacons.TYPE}", "radio.topic=/radio", "radio.sigma_m=0.05")
-EDGES = (
-    *("inputs.names=odom tdoa", f"tdoa.type={differences.TYPE}", "tdoa.topic=/tdoa", "tdoa.sigma_m=0.03"),
-    *("anchor.pose=0 0 0", "anchor.sigma_m=0.1", "anchor.sigma_rad=0.05"),
-)
 
 
 @pytest.fixture(autouse=True)
@@ -31,7 +26,7 @@ def domain(monkeypatch):
 @pytest.fixture
 def replays(request, tmp_path, tmp_path_factory, monkeypatch):
     """A function that replays a recording in a node and without, where a package of plugins is installed."""
-    messages = {"Beacons": beacons.DEFINITION, "RangeDifference": differences.DEFINITION}
+    messages = {"Beacons": beacons.DEFINITION}
     built_packages.use("my_msgs", messages, request, tmp_path_factory, monkeypatch)
 
     def replayed(bag, site, *settings):
@@ -55,11 +50,3 @@ def test_the_example_of_the_page_reads_in_the_node_what_it_reads_in_a_replay(rep
         site = install(EXAMPLE, group="graph_slam_ros.inputs", name=name, module="my_beacons", at="BEACONS")
         run = replays(beacons.recording(tmp_path / "a.mcap"), site, *LANDMARKS)
     assert all(name in (run / "landmarks.csv").read_text() for name in beacons.BEACONS)
-
-
-def test_edges_of_a_plugin_are_in_the_map_of_the_node_as_in_that_of_a_replay(replays, tmp_path, monkeypatch):
-    (tmp_path / "survey.csv").write_text(differences.SURVEY)
-    with differences.example_installer(tmp_path, monkeypatch) as install:
-        bag = differences.recording(tmp_path / "a.mcap", steps=60)
-        run = replays(bag, install(), *EDGES, f"landmarks.surveyed_file={tmp_path / 'survey.csv'}")
-    assert (run / "graph.g2o").read_text().count(differences.TAG) > 50

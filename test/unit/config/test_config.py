@@ -98,6 +98,8 @@ def test_an_empty_file_is_the_defaults_and_whole_numbers_do_for_floats(tmp_path)
 def test_a_parameter_that_was_removed_is_refused_by_name_and_read_in_runs_that_have_it():
     with pytest.raises(ConfigError, match=r"parameter 'landmarks.follow_s' was removed: .*; leave it out"):
         Config.from_mapping({"landmarks.follow_s": 10.0})
+    with pytest.raises(ConfigError, match=r"radio.use=edges was removed: the pipeline has no edges of plugins; "):
+        Config.from_mapping({"inputs.names": "odom radio", "radio.use": "edges"})
     (golden,) = (CONFIG.parent / "test" / "golden").iterdir()
     assert "follow_s" in (golden / "config.yaml").read_text()
     assert run_config(golden).landmarks.give_up_s == Config().landmarks.give_up_s
