@@ -43,12 +43,28 @@ from graph_slam_ros.lie import se3
 from graph_slam_ros.solver import LossKey, Settings
 from graph_slam_ros.typing import Numbers
 
+_STEP_TOLERANCE = 1e-5  # [m, rad]: the solve at the end has converged, far below what any sensor resolves
+_COST_TOLERANCE = 1e-9  # and so it has when the cost changes by a smaller part than this
 _ONE_ODOMETRY = "the first of inputs.names that publishes is used; a filter, e.g. robot_localization, fuses several"
 REMOVED = {
     "landmarks.follow_s": "observations without identity are compared with all landmarks around",
     "gyro.gate": "the gyro's turn replaces that of odometry",
     "odometry.fusion": _ONE_ODOMETRY,
     "robust.odometry_gate": _ONE_ODOMETRY,
+    **dict.fromkeys(
+        (
+            *("odometry.doubt_m_s", "odometry.doubt_rad_s", "odometry.jump_sigma_m", "odometry.jump_sigma_rad"),
+            *("landmarks.close_m", "landmarks.ambiguity_chi2", "landmarks.orientation_known_below_rad"),
+            *("landmarks.max_per_message", "landmarks.determined_below", "landmarks.mirror_chi2"),
+            *("landmarks.confirm_sightings", "landmarks.confirm_s"),
+            *("landmarks.review_every_keyframes", "robust.out_below", "robust.retests"),
+            *("solve.relinearize_above", "solve.relinearize_error", "solve.relinearize_every", "solve.tolerance"),
+            *("solve.tolerance_sigmas", "solve.step_tolerance", "solve.cost_tolerance"),
+            *("inputs.tf_buffer_s", "output.path_moved_m", "output.path_moved_rad", "output.graph_period_s"),
+            *("output.landmarks_every_keyframes", "output.graph_max_edges"),
+        ),
+        "its default is used always",
+    ),
 }
 """Parameters of earlier versions. Saved runs have them."""
 REMOVED_VALUES = {
@@ -232,15 +248,10 @@ class Config:
         return Settings(
             s.method,
             s.max_iterations,
-            s.step_tolerance,
-            s.cost_tolerance,
+            _STEP_TOLERANCE,
+            _COST_TOLERANCE,
             self._losses(),
-            relinearize_above=s.relinearize_above,
-            relinearize_error=s.relinearize_error,
-            relinearize_every=s.relinearize_every,
             relinearize_neglected=math.inf,  # contradictions would drive it away (docs/solver.md)
-            tolerance=s.tolerance,
-            tolerance_sigmas=s.tolerance_sigmas,
             at_once=True,  # a replay need not read what the node reads, and when
         )
 

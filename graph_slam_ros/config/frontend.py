@@ -111,31 +111,11 @@ class OdometryConfig:
     max_speed_m_s: float = setting(
         50.0, "odometry that moves faster than this has jumped: a new segment of the path begins", "m/s", low=1e-3
     )
-    jump_sigma_m: float = setting(
-        10.0, "standard deviation of the position change across a jump of odometry", "m", low=1e-3
-    )
-    jump_sigma_rad: float = setting(
-        3.0, "standard deviation of the rotation across a jump of odometry", "rad", low=1e-3
-    )
     doubt: bool = setting(
         True, "true: where several landmarks contradict odometry over some seconds, it counts for less while it slips"
     )
     doubt_odds: float = setting(
         1e-6, "odds that a stretch of odometry slips, before anything is seen", "odds", low=1e-12, high=1.0
-    )
-    doubt_m_s: float = setting(
-        0.35,
-        "standard deviation of the speed that odometry does not notice while it slips",
-        "m/s",
-        low=1e-3,
-        high=100.0,
-    )
-    doubt_rad_s: float = setting(
-        0.35,
-        "standard deviation of the turn rate that odometry does not notice while it slips",
-        "rad/s",
-        low=1e-3,
-        high=100.0,
     )
 
     @property

@@ -20,12 +20,6 @@ class LandmarksConfig:
         "m",
         low=0.0,
     )
-    max_per_message: int = setting(
-        1000, "most landmarks used of one message; the nearest are used, the others counted", "landmarks", low=1
-    )
-    orientation_known_below_rad: float = setting(
-        0.5, "a landmark is a full pose if the standard deviation of its heading is below this", "rad", low=0.0
-    )
     association: str = setting(
         "id",
         "data association: none: landmarks are not used; id: by identity; joint: observations without identity by "
@@ -45,12 +39,6 @@ class LandmarksConfig:
         "probability",
         low=0.5,
         high=1.0,
-    )
-    close_m: float = setting(
-        0.5,
-        "objects closer together than this, seen in one message, may be one landmark",
-        "m",
-        low=0.0,
     )
     unnamed_sigma_m: float = setting(
         0.14,
@@ -73,44 +61,13 @@ class LandmarksConfig:
         "1/m",
         low=1e-4,
     )
-    ambiguity_chi2: float = setting(
-        6.0,
-        "a stretch of the drive is laid on other landmarks only if every alternative fits worse by this much",
-        "chi2",
-        low=0.0,
-    )
-    confirm_sightings: int = setting(5, "observations that confirm a new landmark without identity", "sightings", low=1)
-    confirm_s: float = setting(
-        2.0, "time over which a new landmark without identity must be observed before it is confirmed", "s", low=0.0
-    )
     give_up_s: float = setting(
         60.0, "a landmark that is not confirmed is removed when it was not observed for this long", "s", low=0.0
-    )
-    review_every_keyframes: int = setting(
-        10,
-        "landmarks without identity are confirmed and removed after every so many keyframes",
-        "keyframes",
-        low=1,
     )
     retire: bool = setting(
         False,
         "a landmark that is not seen any more from where it was seen before is retired; one that is seen elsewhere has "
         "moved: its new place is a new landmark",
-    )
-    determined_below: float = setting(
-        0.2,
-        "a landmark from ranges or bearings enters the map when its standard deviation is below this "
-        "part of its distance",
-        "m/m",
-        low=1e-3,
-        high=10.0,
-    )
-    mirror_chi2: float = setting(
-        12.0,
-        "a landmark from ranges or bearings enters the map when every other position, e.g. the mirror"
-        " image, fits worse by this much",
-        "chi2",
-        low=0.0,
     )
     surveyed: str = setting(
         "",

@@ -97,7 +97,6 @@ class InputsConfig:
     tf: bool = setting(
         True, "whether the node subscribes to /tf, for sensors on moving joints; it always does to /tf_static"
     )
-    tf_buffer_s: float = setting(10.0, "time for which transforms of /tf are kept", "s", low=0.1)
     tf_wait_s: float = setting(
         0.2,
         "an observation without a transform of /tf is refused when odometry is this much newer",
@@ -169,22 +168,6 @@ class OutputConfig:
     path_period_s: float = setting(0.2, "shortest period of ~/path and ~/path_updates", "s", low=0.0, live=True)
     path_max_poses: int = setting(
         10_000, "most poses of ~/path; a longer path is thinned out", "poses", low=2, high=10_000_000, live=True
-    )
-    path_moved_m: float = setting(0.02, "~/path_updates lists keyframes that moved by more than this", "m", low=0.0)
-    path_moved_rad: float = setting(
-        0.02, "~/path_updates lists keyframes that turned by more than this", "rad", low=0.0
-    )
-    landmarks_every_keyframes: int = setting(
-        20,
-        "~/landmarks is published after this many keyframes and after each solve of everything, if it has subscribers",
-        "keyframes",
-        low=1,
-        high=1_000_000,
-        live=True,
-    )
-    graph_period_s: float = setting(2.0, "shortest period of ~/graph", "s", low=0.0, live=True)
-    graph_max_edges: int = setting(
-        5_000, "most edges of ~/graph; the worst fitting come first", "edges", low=1, high=1_000_000, live=True
     )
     pose_covariance_max: float = setting(
         0.25,

@@ -41,22 +41,12 @@ class RobustConfig:
         "sigma",
         low=LEAST_LOSS_SCALE,
     )
-    out_below: float = setting(
-        0.01,
-        "a measurement whose robust weight falls below this is removed as an outlier",
-        "part of weight",
-        low=0.0,
-        high=1.0,
-    )
     review_every_keyframes: int = setting(
         20,
         "verdicts are reviewed after this many keyframes: the newest, and some of the others in turn",
         "keyframes",
         low=1,
         high=1_000_000,
-    )
-    retests: int = setting(
-        10, "measurements that are held back and tested again at each review, in turn", "edges", low=0, high=1_000_000
     )
     rounds: int = setting(
         10,

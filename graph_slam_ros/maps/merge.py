@@ -28,6 +28,7 @@ from graph_slam_ros.slam import Control, GraphSlam
 from graph_slam_ros.slam.alarm import Alarm
 from graph_slam_ros.slam.calibration.parameters import QUANTITIES, Parameter
 from graph_slam_ros.slam.edits import HAND_MADE
+from graph_slam_ros.slam.frontend.odometry_jumps import JUMP_SIGMA_M, JUMP_SIGMA_RAD
 from graph_slam_ros.slam.landmarks.assignments import NAME, last_number
 from graph_slam_ros.slam.landmarks.lifetimes import OLD, name_of_old
 from graph_slam_ros.slam.robust.landmark_support import landmark_of
@@ -195,12 +196,12 @@ class _Second:
 
     def _bridge(self) -> list[Any]:
         """A weak edge from the last keyframe of the first map to the first keyframe of the second."""
-        space, config = self._one.space, self._one.config.odometry
+        space = self._one.space
         ends = [int(self._one.keyframes.ids[-1]), self._vertex[int(self._two.keyframes.ids[0])]]
         last = tuple(self._one.trajectory()[-1].tolist())
         begun = space.group.compose(self._T, tuple(self._two.trajectory()[0].tolist()))
         measured = [float(x) for x in space.group.between(last, begun)]
-        root = Gaussian.from_sigmas(*space.sigmas(config.jump_sigma_m, config.jump_sigma_rad)).sqrt_information
+        root = Gaussian.from_sigmas(*space.sigmas(JUMP_SIGMA_M, JUMP_SIGMA_RAD)).sqrt_information
         return [tag_of(space.relative_pose), ends, measured, np.ravel(root).tolist(), "odometry", ""]
 
     def _landmarks(self, landmarks: Mapping[str, Any]) -> dict[str, Any]:

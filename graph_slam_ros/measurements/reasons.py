@@ -63,7 +63,7 @@ REASONS: dict[str, Reason] = {
     ),
     "far_in_time": Reason(
         _REFUSED,
-        "the transform is dated more than inputs.tf_buffer_s before or after all others of its frame",
+        "the transform is dated more than 10 s before or after all others of its frame",
         "one clock for all that publishes /tf",
     ),
     "before_jump": Reason(_REFUSED, "it was sent before the clock jumped back and arrived after"),
@@ -197,7 +197,7 @@ REASONS: dict[str, Reason] = {
     "surveyed_orientation_unused": Reason(
         _NOTED,
         "a landmark whose orientation was surveyed was first seen without one: its surveyed position alone is used",
-        "landmarks.orientation_known_below_rad; a detector that measures orientations",
+        "a detector that measures orientations, to 0.5 rad",
     ),
     "not_for_a_pose": Reason(
         _REFUSED, "a range or bearing to a landmark that is known as a pose", "INPUT.id_prefix: two identities"
@@ -206,8 +206,8 @@ REASONS: dict[str, Reason] = {
     "poor_tag": Reason(_NOTED, "the tag is beyond INPUT.hamming_max or below INPUT.decision_margin_min"),
     "too_many": Reason(
         _REFUSED,
-        "the message has more landmarks than landmarks.max_per_message: the nearest are used",
-        "landmarks.max_per_message",
+        "the message has more than 1000 landmarks: the nearest are used",
+        "a scan is no list of landmarks",
     ),
     "unknown_action": Reason(_REFUSED, "the marker's action is none of add, modify, delete", "correct the driver"),
     "lengths_differ": Reason(_REFUSED, "the message has not as many ids as poses", "correct the driver"),

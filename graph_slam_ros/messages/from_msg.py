@@ -30,6 +30,7 @@ Decoder = Callable[[bytes], Any]
 
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 TF_STATIC, TF, INITIAL_POSE = "tf_static", "tf", "initialpose"
+_TF_BUFFER_NS = 10 * 10**9  # transforms of /tf are kept for so long, as tf2 does
 _POSE_NUMBERS = 7 + 36  # of a geometry_msgs/PoseWithCovariance
 
 
@@ -108,7 +109,7 @@ class MessageConverter:
         self._config = config
         self._counters = counters
         self.on_fault: Callable[[str], object] = lambda line: None
-        self._transforms = Transforms(round(config.inputs.tf_buffer_s * 1e9), self._is_far_in_time)
+        self._transforms = Transforms(_TF_BUFFER_NS, self._is_far_in_time)
         self._links, self._awaits_stamp = 0, False  # of the last try of what waits
         self._sources: dict[str, InputContext] = {}
         self._convert: dict[str, Callable[[Any], Any]] = {}

@@ -20,6 +20,12 @@ from graph_slam_ros.slam import Config, GraphSlam, Update
 
 _LANDMARKS = ("landmarks", "landmarks_estimate")
 _LATER = ("path", "path_updates", "graph", *_LANDMARKS)
+_MOVED_M, _MOVED_RAD = 0.02, 0.02  # a keyframe that moved by less looks the same in RViz
+_LANDMARKS_EVERY = 20  # keyframes, some seconds of driving
+_GRAPH_S, _MOST_EDGES = (
+    2.0,
+    5000,
+)  # period and edges of ~/graph at most: a message of a MB that RViz draws at once
 _SPARE = 50.0  # of the worker's time, one part for each topic
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
@@ -61,8 +67,7 @@ class Publishers:
     def begin(self, config: Config, *, has_map: bool = False) -> None:
         """Begin a new run, perhaps in a loaded map: earlier messages belong to another run."""
         self._has_something |= has_map
-        output = config.output
-        self._updates = PathUpdates(output.path_moved_m, output.path_moved_rad)
+        self._updates = PathUpdates(_MOVED_M, _MOVED_RAD)
         self._landmarks_at = 0
         for topic in self._topics.values():
             topic.is_stale = topic.begins_anew = True
@@ -92,7 +97,7 @@ class Publishers:
         for name in ("path", "path_updates", "graph"):
             self._topics[name].is_stale = True
         if self._landmarks_due(slam, update):
-            self._landmarks_at = len(slam.keyframes) + slam.config.output.landmarks_every_keyframes
+            self._landmarks_at = len(slam.keyframes) + _LANDMARKS_EVERY
             for name in _LANDMARKS:
                 self._topics[name].is_stale = True
         if self._events.get_subscription_count():
@@ -143,7 +148,7 @@ class Publishers:
             topic.begins_anew = True  # who came late has what was latched, and of what is not latched nothing
             topic.is_stale = topic.is_stale or name == "path_updates"
         topic.subscribers = subscribers
-        period_s = output.graph_period_s if name == "graph" else output.path_period_s
+        period_s = _GRAPH_S if name == "graph" else output.path_period_s
         period_s = max(period_s, _SPARE * topic.encode_s)  # what takes long comes seldom
         return self._has_something and topic.is_stale and bool(subscribers) and now_s - topic.sent_s >= period_s
 
@@ -152,7 +157,7 @@ class Publishers:
         now_s, output = time.monotonic(), slam.config.output
         make: dict[str, Callable[[], bytes]] = {
             "path": lambda: results.path(slam, output.path_max_poses),
-            "graph": lambda: results.graph(slam, output.graph_max_edges),
+            "graph": lambda: results.graph(slam, _MOST_EDGES),
             "landmarks": lambda: results.landmarks(slam),
             "landmarks_estimate": lambda: results.landmarks_estimate(slam),
         }

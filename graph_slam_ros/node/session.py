@@ -32,6 +32,7 @@ from graph_slam_ros.runs.recorder import RunRecorder
 from graph_slam_ros.runs.restore import map_of, save_copy
 from graph_slam_ros.runs.tables import account, summarize
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Measurement, Update
+from graph_slam_ros.slam.frontend.odometry_jumps import JUMP_SIGMA_M
 from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.typing import Numbers
 
@@ -196,7 +197,7 @@ class Session:
     def _is_sure(self) -> bool:
         """Return whether the newest keyframe is better known in the map than across a jump of odometry."""
         covariance = self.slam.pose_covariance
-        return float(covariance[0, 0] + covariance[1, 1]) ** 0.5 < _CONFIRMED * self.slam.config.odometry.jump_sigma_m
+        return float(covariance[0, 0] + covariance[1, 1]) ** 0.5 < _CONFIRMED * JUMP_SIGMA_M
 
     def evaluate(self) -> None:
         """Compute how well all measurements fit, and which are not believed, when idle, in a fiftieth of the time."""

@@ -17,6 +17,7 @@ from graph_slam_ros.slam.alarm import Alarm
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.displacements import Displacement, Displacements
 from graph_slam_ros.slam.frontend.keyframes import Keyframe
+from graph_slam_ros.slam.frontend.odometry_jumps import JUMP_SIGMA_M, JUMP_SIGMA_RAD
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.slam.landmarks.anonymous import AnonymousLandmarks
 from graph_slam_ros.slam.robust.connections import moved_values
@@ -63,7 +64,7 @@ class KidnapDetector:
         anonymous: AnonymousLandmarks,
         start: MapSnapshot | None = None,
     ) -> None:
-        self._space, self._odometry, self._backend, self._counters = config.space, config.odometry, backend, counters
+        self._space, self._backend, self._counters = config.space, backend, counters
         self._segments, self._anonymous = segments, anonymous
         self.alarms: list[Alarm] = []
         self.earlier: list[dict[str, Any]] = start.displacements if start else []
@@ -338,10 +339,10 @@ class KidnapDetector:
 
     def _replacement(self, first: int, there: Numbers) -> tuple[int, Numbers, Gaussian]:
         """Odometry's edge to a keyframe, the motion that the landmarks show instead, and next to no trust in it."""
-        link, c = self._slips.active(self._search.chain.edge(first)), self._odometry
+        link = self._slips.active(self._search.chain.edge(first))
         before = self._estimate(self._backend.graph.edge(link).vertices[0])
         motion = tuple(map(float, self._space.group.between(before, there)))
-        return link, motion, Gaussian.from_sigmas(*self._space.sigmas(c.jump_sigma_m, c.jump_sigma_rad))
+        return link, motion, Gaussian.from_sigmas(*self._space.sigmas(JUMP_SIGMA_M, JUMP_SIGMA_RAD))
 
     def _motions(self, found: DisplacementHypothesis) -> dict[int, Numbers]:
         """Return how each keyframe from the first displaced one on is moved in map, by its vertex.

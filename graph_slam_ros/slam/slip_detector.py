@@ -24,6 +24,7 @@ from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.frontend.keyframes import Keyframe
+from graph_slam_ros.slam.frontend.odometry_jumps import JUMP_SIGMA_M, JUMP_SIGMA_RAD
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.slam.measured_noise import MeasuredNoise
 from graph_slam_ros.slam.odometry_edges import replace_odometry, restore_odometry
@@ -84,7 +85,7 @@ class SlipDetector:
         self._ratios: deque[float] = deque(maxlen=_USUAL)  # of the newest squared residuals to the stated median
         self._replacing: set[int] = set()  # edges that replace others
         self._checked, self._allowed = -1, _BURST
-        self.noise, self._added = MeasuredNoise(space, backend), SlipNoise(space, odometry)
+        self.noise, self._added = MeasuredNoise(space, backend), SlipNoise(space)
         self.slips: list[Slip] = []
 
     @property
@@ -241,7 +242,7 @@ class SlipDetector:
         if moved is not None:
             k = next((k for k, link in enumerate(links) if link.vertices[1] >= moved.first), len(links) - 1)
             there = moved.pose_of(links[k].vertices[1])
-            compared.add_moved(k, there, self._config.jump_sigma_m, self._config.jump_sigma_rad)
+            compared.add_moved(k, there, JUMP_SIGMA_M, JUMP_SIGMA_RAD)
         return compared.choice()
 
     def _known_seen(self, view: View, is_determined: Callable[[int | str], bool]) -> list[tuple[int, int | str]]:

@@ -22,6 +22,7 @@ from graph_slam_ros.typing import Numbers
 _AGREE_SIGMA = 3.0
 _LONGEST_ID = 128  # bytes
 _UPRIGHT = 1e-6
+_MOST = 1000  # landmarks that are used of one message: what has more is a scan
 _LARGEST_M = 1e3  # no landmark is larger
 _POLAR = {"range": (1,), "bearing": (1, 2), "range_bearing": (2, 3)}  # numbers of each kind, by SIGHTING_KINDS
 
@@ -100,10 +101,10 @@ def _size(source: InputContext, size: float) -> float:
 
 def _nearest(source: InputContext, found: list[ObservedLandmark]) -> list[ObservedLandmark]:
     """The nearest landmarks of a message, up to the limit."""
-    if len(found) <= (most := source.config.landmarks.max_per_message):
+    if len(found) <= _MOST:
         return found
-    source.count("too_many", len(found) - most)
-    nearest = np.argsort([_reach(one) for one in found], kind="stable")[:most]  # no number sorts last
+    source.count("too_many", len(found) - _MOST)
+    nearest = np.argsort([_reach(one) for one in found], kind="stable")[:_MOST]  # no number sorts last
     return [found[k] for k in sorted(nearest.tolist())]
 
 

@@ -18,6 +18,7 @@ from graph_slam_ros.typing import Array, Mask, Numbers
 
 _PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
 _BEYOND_MEANING = 1e12  # [m^2, rad^2]: larger numbers could not be turned into other axes
+_ORIENTATION_KNOWN_RAD2 = 0.5**2  # a heading of a larger variance is none: beyond, a residual is not linear
 _FLAT = 0.5  # the horizontal part of an x axis that is too short to have a heading
 _LITTLE = 0.1  # of a quaternion's x and y: a robot that leans less is upright
 _LEVEL_M, _UPRIGHT = 0.5, math.cos(math.radians(20.0))  # of a robot that moves in a plane
@@ -257,8 +258,7 @@ class InputContext:
     def orientation_known(self, covariance: Array) -> bool:
         """Return whether a pose's covariance (6, 6) has an orientation: the heading in the plane, all axes in space."""
         variances = np.diag(covariance)[5 if self.space.dimensions == 2 else 3 :]
-        most = self.config.landmarks.orientation_known_below_rad**2
-        return bool(((variances > 0.0) & (variances < most)).all())
+        return bool(((variances > 0.0) & (variances < _ORIENTATION_KNOWN_RAD2)).all())
 
     def pose_covariance(self, flat: Any, distance_m: float) -> Array:
         """Covariance (6, 6) in the axes of the frame, from the message, or from the settings if it has none."""

@@ -28,6 +28,7 @@ from graph_slam_ros.slam.frontend.max_distance import MaxDistance
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
 from graph_slam_ros.slam.frontend.noise_factors import NoiseScales
 from graph_slam_ros.slam.frontend.odometry_integration import IntegratedOdometry, OdometryNoise
+from graph_slam_ros.slam.frontend.odometry_jumps import JUMP_SIGMA_M, JUMP_SIGMA_RAD
 from graph_slam_ros.slam.frontend.odometry_selector import OdometrySelector, Step
 from graph_slam_ros.slam.frontend.pose_edges import PoseEdges
 from graph_slam_ros.slam.frontend.stamp_order import PendingObservations, StampOrder
@@ -298,15 +299,15 @@ class KeyframeFrontend:
 
         A given pose that is far away must not pull on the path before it: it may be wrong.
         """
-        jump_m, jump_rad = self.config.odometry.jump_sigma_m, self.config.odometry.jump_sigma_rad
         if given is None:
-            return jump_m, jump_rad
+            return JUMP_SIGMA_M, JUMP_SIGMA_RAD
         if is_prior:
             return self.config.initialpose.loosen_m, self.config.initialpose.loosen_rad
         group, last = self._space.group, self._pose_of(self.path.keyframes[-1].vertex)
         away = group.between(group.compose(last, T_last_now), given.T_map_base)
         far_m = math.hypot(*away[: self._space.dimensions])
-        return max(jump_m, min(_UNCERTAIN * far_m, _MAX_UNCERTAIN_M)), max(jump_rad, _UNCERTAIN * math.pi)
+        uncertain_m = min(_UNCERTAIN * far_m, _MAX_UNCERTAIN_M)
+        return max(JUMP_SIGMA_M, uncertain_m), max(JUMP_SIGMA_RAD, _UNCERTAIN * math.pi)
 
     def _deserves_keyframe(self, m: Observation, where: PoseAtStamp, newest: IntegratedOdometry) -> bool:
         """Return whether the noise of the motion since the keyframe is too large beside that of the measurement."""

@@ -6,6 +6,7 @@ from graph_slam_ros.config.frontend import OdometryConfig
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.typing import Numbers
 
+JUMP_SIGMA_M, JUMP_SIGMA_RAD = 10.0, 3.0  # of the motion across a jump: any heading, and anywhere within a hall
 _AT_ZERO = 1e-9  # [m, rad]
 _RESET_M, _RESET_RAD, _UNUSUAL = 0.1, 0.1, 3.0
 _LEAST_S = 0.02  # stamps of some drivers crowd together: a pair of them says nothing of speed

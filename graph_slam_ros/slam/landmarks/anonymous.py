@@ -44,6 +44,8 @@ from graph_slam_ros.slam.landmarks.sighted_point import sighted_point, with_exte
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Executor, Index
 
+_CLOSE_M = 0.5  # objects of one message this close may be one: two poles of a group, or one of them seen twice
+_REVIEWED_EVERY = 10  # keyframes, some seconds: landmarks are confirmed and given up
 _POSITIONED = ("position", "pose", "range_bearing")
 
 
@@ -79,7 +81,7 @@ class AnonymousLandmarks:
         self._reckoning = DeadReckoning(space, config.ordering.late_s + 2.0)
         self._history = ScanHistory(space, config.odometry, self._reckoning)
         extent = max(c.added_sigma_m**2 + c.unnamed_sigma_m**2, LEAST_M2) * np.eye(space.dimensions)
-        self._builder = ScanBuilder(space, extent, c.close_m, c.size_sigma_m)
+        self._builder = ScanBuilder(space, extent, _CLOSE_M, c.size_sigma_m)
         self._settings = BeamSettings(
             quantile(c.gate_same, space.dimensions),
             space.dimensions * float(np.log(c.density_per_m)),
@@ -326,7 +328,7 @@ class AnonymousLandmarks:
         self._adopt(self._guarded(lambda: self.hindsight.outcome(count)), keyframes)
         if self.hindsight.is_due(len(self._history.scans)):
             self._guarded(lambda: self.hindsight.start(self._frozen(), count))
-        if count % self._config.review_every_keyframes == 0:
+        if count % _REVIEWED_EVERY == 0:
             self.clusters.judge(keyframes[-1].stamp_ns)
 
     def explain_all(self, keyframes: StampedPoses[Keyframe], *, alarmed: bool) -> None:

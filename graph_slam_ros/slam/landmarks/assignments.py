@@ -22,6 +22,7 @@ from graph_slam_ros.slam.landmarks.scans import Cluster, Seen
 NOT_IN_MAP = ""  # in place of a name, where the map is held and nothing in it fits
 NAME = "unnamed"
 """What landmarks are called that have no name; a number follows."""
+_CONFIRMED, _CONFIRMED_NS = 5, 2 * 10**9  # sightings, and their time: clutter is seen for less, from one place
 _OF_MEDIAN = 0.1  # part of the scans of the median landmark that one is seen in to be believed
 _FROM_MAP = -100  # numbers of landmarks that no cluster of this drive began, downwards
 
@@ -60,7 +61,8 @@ class Assignments:
     def __init__(
         self, config: LandmarksConfig, landmarks: Landmarks, counters: Counters, hand_over: Callable[[], None]
     ) -> None:
-        self._config, self._landmarks, self._counters, self._hand_over = config, landmarks, counters, hand_over
+        self._landmarks, self._counters, self._hand_over = landmarks, counters, hand_over
+        self._give_up_ns = round(config.give_up_s * 1e9)
         self.given: list[int] = []
         self.names: dict[int, str] = {}
         self.seen: list[tuple[Seen, ...]] = []
@@ -176,20 +178,20 @@ class Assignments:
 
     def judge(self, now_ns: int) -> None:
         """Accept landmarks that were seen often enough, and remove those that were not seen again."""
-        c, known = self._config, self._landmarks.known
+        known = self._landmarks.known
         counts = [n for k, n in self._scans.items() if n >= LEAST_SCANS and k != NOTHING]
         least = _OF_MEDIAN * float(np.median(counts)) if counts else 0.0
         for number, name in self.names.items():
             mark = known.get(name)
             if mark is None or self._landmarks.is_held(name):
                 continue
-            for_long = mark.last_seen_ns - mark.first_seen_ns >= round(c.confirm_s * 1e9)
+            for_long = mark.last_seen_ns - mark.first_seen_ns >= _CONFIRMED_NS
             often = number < _FROM_MAP or self._scans[number] >= least
-            is_sure = mark.sightings >= c.confirm_sightings and for_long and often
+            is_sure = mark.sightings >= _CONFIRMED and for_long and often
             is_sure |= len(mark.seen) < mark.sightings and not mark.is_tentative  # some cannot be taken back any more
             if is_sure == mark.is_tentative:
                 self._landmarks.confirm(name, is_sure=is_sure)
-            if not is_sure and now_ns - mark.last_seen_ns > round(c.give_up_s * 1e9):
+            if not is_sure and now_ns - mark.last_seen_ns > self._give_up_ns:
                 self._landmarks.prune(name)
                 self._given_up[number] = [cluster for cluster, k in enumerate(self.given) if k == number]
                 self._counters.count("landmarks", "given_up")

@@ -28,6 +28,8 @@ from graph_slam_ros.slam.landmarks.triangulation import PartialObservation
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Numbers
 
+_DETERMINED_BELOW = 0.2  # of its distance is the sigma of a place: with more, linearising there is wrong
+_MIRROR_CHI2 = 12.0  # by which every other place, e.g. the mirror image, fits worse: likelier by e^6, 400 times
 _Seen = Sequence[tuple[PoseAtStamp, Sighting]]
 
 
@@ -51,15 +53,15 @@ def why_undetermined(
     if not candidate.places:
         return f"no place fits {count} sightings by {kind}"
     best, *others = candidate.places
-    fitting = [one.position for one in others if one.chi2 < best.chi2 + config.mirror_chi2]
+    fitting = [one.position for one in others if one.chi2 < best.chi2 + _MIRROR_CHI2]
     if fitting:
         return _several([best.position, *fitting])
     n = space.dimensions
     distance = min(float(np.linalg.norm(best.position - np.array(g.T_map_sensor[:n]))) for g in glances)
     is_finite = np.isfinite(best.covariance).all()
     sigma = float(np.sqrt(np.linalg.eigvalsh(best.covariance)[-1])) if is_finite else np.inf
-    if sigma > config.determined_below * distance:
-        return f"sigma {sigma:.2f} m at {distance:.2f} m: more than {config.determined_below:g} of the distance"
+    if sigma > _DETERMINED_BELOW * distance:
+        return f"sigma {sigma:.2f} m at {distance:.2f} m: more than {_DETERMINED_BELOW:g} of the distance"
     return _why_unsure(config, space, solver, candidate) if others else ""
 
 
@@ -73,7 +75,7 @@ def _why_unsure(config: LandmarksConfig, space: Geometry, solver: Solver, candid
         first, *chi2 = least_chi2(space, solver, seen, places, config.range_offset_sigma_m)
     except (GraphSlamError, np.linalg.LinAlgError) as error:
         return f"how well the path is known cannot be computed: {error}"
-    fitting = [place for place, one in zip(places[1:], chi2, strict=True) if not one >= first + config.mirror_chi2]
+    fitting = [place for place, one in zip(places[1:], chi2, strict=True) if not one >= first + _MIRROR_CHI2]
     return f"{_several([places[0], *fitting])}, as far as the path is known" if fitting else ""
 
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from graph_slam_ros.config.frontend import OdometryConfig
 from graph_slam_ros.graph.geometry import Geometry
+from graph_slam_ros.slam.frontend.odometry_jumps import JUMP_SIGMA_M, JUMP_SIGMA_RAD
 from graph_slam_ros.slam.landmarks.renumbered import with_vertices
 from graph_slam_ros.slam.landmarks.scans import (
     NEARBY_NS,
@@ -39,7 +40,7 @@ class ScanHistory:
 
     def __init__(self, space: Geometry, odometry: OdometryConfig, reckoning: DeadReckoning) -> None:
         self._space, self._reckoning, self._noise = space, reckoning, MotionNoise.of(odometry)
-        self._jump = np.diag(np.square(space.sigmas(odometry.jump_sigma_m, odometry.jump_sigma_rad)))
+        self._jump = np.diag(np.square(space.sigmas(JUMP_SIGMA_M, JUMP_SIGMA_RAD)))
         self.scans: list[Scan] = []
         self.firsts: list[int] = []
         self.motions: list[Motion] = []

@@ -25,6 +25,8 @@ CANDIDATES = ("landmarks", "fixes", "closures", "initialpose")
 _READMISSIONS = 50  # edges that are out and are tried again after everything was solved
 _AT_ONCE = 10  # of them, until the first that is likely
 _AGREEING = 3  # edges that are out, at least, come in together between full solves: two agree by chance
+_RETESTS = 10  # edges that are out and are tried again at each review: ten innovations cost less than an update
+_OUT_BELOW = 0.01  # of its weight: what counts for less moves nothing, and is removed
 _REVIEWED_AT_ONCE = 1000  # accepted edges that one review looks at, besides as many of the newest
 
 
@@ -131,7 +133,7 @@ class OutlierGate:
         for edge, fit in zip(outside[fits].tolist(), chi2[fits].tolist(), strict=True):
             self._readmit(edge, keyframe, fit)
         others = outside[~fits & (self.ledger.verdict.values[outside] == Verdict.PENDING)].tolist()
-        turn = [others[(self._next_out + k) % len(others)] for k in range(min(self._config.retests, len(others)))]
+        turn = [others[(self._next_out + k) % len(others)] for k in range(min(_RETESTS, len(others)))]
         self._next_out += len(turn)
         judged = list(zip(turn, self.innovations(turn), strict=True))
         for edge, fit in [(edge, fit) for edge, fit in judged if self._is_likely(edge, fit)]:
@@ -192,7 +194,7 @@ class OutlierGate:
 
         Their costs follow from their joint covariance, so nothing is solved for edges that stay out.
         """
-        nearest = self._nearest(self._config.retests)
+        nearest = self._nearest(_RETESTS)
         costs = dict(zip(nearest, self.innovations(nearest), strict=True))
         group = likely_together(self._graph, self._solver, self._affordable(costs), self.most_cost, _AGREEING)
         for edge in group:
@@ -322,7 +324,7 @@ class OutlierGate:
         for edge, fit in zip(edges[unfit].tolist(), chi2[unfit].tolist(), strict=True):
             loss = self._solver.settings.last_loss(self._graph.label_of(edge), self._graph.source_of(edge))
             weight, _ = weight_and_cost(loss.kind, loss.scale, fit)
-            if weight < self._config.out_below and not self._support.is_needed(edge):
+            if weight < _OUT_BELOW and not self._support.is_needed(edge):
                 self._reject(edge, keyframe, Reason.DOES_NOT_FIT, fit)
             elif weight < 1.0 and ledger.verdict.values[edge] == Verdict.ACCEPTED:
                 ledger.note(edge, keyframe, Verdict.DOWN_WEIGHTED, Reason.NONE, fit)

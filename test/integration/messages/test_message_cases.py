@@ -428,11 +428,6 @@ def test_A25_two_poses_either_side_of_half_a_turn_are_merged_between_them():
 
 
 def test_A30_of_100_000_landmarks_in_one_message_the_nearest_are_taken_and_the_others_counted():
-    b = border(landmarks={"max_per_message": 3})
-    xs = (5.0, -1.0, math.nan, 40.0, 2.0, -3.0)
-    m = heard(b, "detections", detections(*(detection(pose(x, 0.0), name=str(k)) for k, x in enumerate(xs))))
-    assert [s.id for s in m.sightings] == ["1", "4", "5"]
-    assert counted(b) == {"detections": {"too_many": 3}}
     b = scanner(sigma_m=0.1)
     points = np.stack([np.linspace(1e3, 1.0, 100_000), np.zeros(100_000), np.arange(100_000.0)], axis=1)
     sent = cloud([("x", "f8"), ("y", "f8"), ("id", "f8")], *map(tuple, points.tolist()))

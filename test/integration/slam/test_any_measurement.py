@@ -33,10 +33,6 @@ class Stranger:
         values = {
             "world.dimensions": dimensions,
             "landmarks.association": association,
-            "landmarks.review_every_keyframes": 2,
-            "landmarks.confirm_s": 0.1,
-            "landmarks.confirm_sightings": 2,
-            "landmarks.give_up_s": 2.0,
             "landmarks.added_sigma_m": self.pick(0.0, 0.05),
             "landmarks.unnamed_sigma_m": self.pick(0.0, 0.1),
             "landmarks.range_offset_sigma_m": self.pick(0.0, 1.0),

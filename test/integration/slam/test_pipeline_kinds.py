@@ -154,7 +154,7 @@ def test_G3_a_landmark_seen_by_bearing_from_one_place_waits_and_says_why():
 
 
 def test_G5_both_mirror_places_of_a_landmark_are_kept_until_the_robot_turns():
-    pipeline, at = slam(PLANAR, landmarks__mirror_chi2=20.0), PLANAR.identity
+    pipeline, at = slam(PLANAR), PLANAR.identity
     for k in range(160):
         pipeline.process(Odometry(stamp(k), at))
         if k == 60:  # straight ahead all the way: the beacon is on the left or on the right
