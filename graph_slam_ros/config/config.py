@@ -51,6 +51,7 @@ REMOVED = {
     "gyro.gate": "the gyro's turn replaces that of odometry",
     "odometry.fusion": _ONE_ODOMETRY,
     "robust.odometry_gate": _ONE_ODOMETRY,
+    "tf.second_authority": "another broadcaster of map -> odom is reported; tf.publish_tf=false stops this one",
     **dict.fromkeys(
         (
             *("odometry.doubt_m_s", "odometry.doubt_rad_s", "odometry.jump_sigma_m", "odometry.jump_sigma_rad"),

@@ -68,12 +68,6 @@ class TfConfig:
         low=0.0,
         live=True,
     )
-    second_authority: str = setting(
-        "report",
-        "reaction to another broadcaster of map -> odom: report: report it; yield: also stop broadcasting",
-        choices=("report", "yield"),
-        live=True,
-    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -83,8 +83,6 @@ class TfBroadcaster:
         config, estimate, newest = self._now()
         if self._is_closed or estimate is None or newest is None or not config.tf.publish_tf or not estimate.is_located:
             return
-        if config.tf.second_authority == "yield" and (self.has_rival or self.static.transform):
-            return
         now_ns = self._node.get_clock().now().nanoseconds
         due = self._policy.next(config.tf, now_ns, newest.stamp_ns, newest.T_odom_base, estimate.T_map_odom)
         if due is None:

