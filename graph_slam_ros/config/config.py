@@ -51,6 +51,9 @@ REMOVED = {
     "gyro.gate": "the gyro's turn replaces that of odometry",
     "odometry.fusion": _ONE_ODOMETRY,
     "robust.odometry_gate": _ONE_ODOMETRY,
+    **dict.fromkeys(
+        ("initialpose.use", "initialpose.loosen_m", "initialpose.loosen_rad"), "a given pose begins a new segment"
+    ),
     "tf.second_authority": "another broadcaster of map -> odom is reported; tf.publish_tf=false stops this one",
     **dict.fromkeys(
         (

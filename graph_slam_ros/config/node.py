@@ -103,23 +103,11 @@ class InputsConfig:
 class InitialPoseConfig:
     """A pose that a person gives on ``initialpose``."""
 
-    use: str = setting(
-        "segment",
-        "use of a pose from initialpose: segment: a new segment of the path begins there; prior: it "
-        "is a measurement, and the last odometry edge gets more noise",
-        choices=("segment", "prior"),
-    )
     sigma_m: float = setting(
         0.5, "position noise of a pose from initialpose whose covariance is unknown", "m", low=1e-6
     )
     sigma_rad: float = setting(
         0.26, "heading noise of a pose from initialpose whose covariance is unknown", "rad", low=1e-6
-    )
-    loosen_m: float = setting(
-        1.0, "position noise added to the last odometry edge if initialpose.use is prior", "m", low=0.0
-    )
-    loosen_rad: float = setting(
-        0.5, "rotation noise added to the last odometry edge if initialpose.use is prior", "rad", low=0.0
     )
 
 

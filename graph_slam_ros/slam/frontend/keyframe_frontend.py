@@ -246,16 +246,13 @@ class KeyframeFrontend:
         """Add a keyframe after a jump of odometry or time, or at a given pose; return whether one was added."""
         given, self.initial_pose, self.held_covariance = self.initial_pose, None, None
         motion, keyframes = self.path.motion, self.path.keyframes
-        is_prior = given is not None and motion is not None and self.config.initialpose.use == "prior"
         if motion is not None:
             T_last_now, covariance = motion.now.T_keyframe_base, motion.now.covariance
         else:  # of a loaded map, too: its odometry was that of another drive
             T_last_now = self._space.group.between(keyframes[-1].T_odom_base, step.T_odom_base)
             covariance = np.zeros_like(self.covariance)
-        if not is_prior:
-            self.path.segments.append(len(keyframes))
-        added_sigmas = self._added_sigmas(given, T_last_now, is_prior=is_prior)
-        covariance = covariance + np.diag(np.square(self._space.sigmas(*added_sigmas)))
+        self.path.segments.append(len(keyframes))
+        covariance = covariance + np.diag(np.square(self._space.sigmas(*self._added_sigmas(given, T_last_now))))
         self._append(step, T_last_now, covariance, given.T_map_base if given else None)
         if given:
             self.edges.initial_pose(keyframes[-1].vertex, given)
@@ -294,15 +291,13 @@ class KeyframeFrontend:
         self.covariance = group.propagate(self.covariance, T_last_now, covariance)
         self.path.append(vertex, step, self.config.ordering.late_s)
 
-    def _added_sigmas(self, given: InitialPose | None, T_last_now: Numbers, *, is_prior: bool) -> tuple[float, float]:
+    def _added_sigmas(self, given: InitialPose | None, T_last_now: Numbers) -> tuple[float, float]:
         """Return the sigmas in metres and radians that are added to the motion into a new segment.
 
         A given pose that is far away must not pull on the path before it: it may be wrong.
         """
         if given is None:
             return JUMP_SIGMA_M, JUMP_SIGMA_RAD
-        if is_prior:
-            return self.config.initialpose.loosen_m, self.config.initialpose.loosen_rad
         group, last = self._space.group, self._pose_of(self.path.keyframes[-1].vertex)
         away = group.between(group.compose(last, T_last_now), given.T_map_base)
         far_m = math.hypot(*away[: self._space.dimensions])

@@ -39,7 +39,6 @@ class Stranger:
             "landmarks.loss": self.pick("none", "huber", "cauchy", "huber_then_cauchy"),
             "keyframes.shared_noise": self.pick(0.0, 0.05, 1e9),
             "odometry.noise": self.pick("twist", "density"),
-            "initialpose.use": self.pick("segment", "prior"),
             "ordering.window_s": self.pick(0.0, 0.05),
             "ordering.late_s": self.pick(0.5, 10.0),
             "ordering.max_waiting": self.pick(2, 1000, 1000),

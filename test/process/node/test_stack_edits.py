@@ -130,12 +130,11 @@ def located(r, drive):
     assert distance((said.x, said.y), at) < 0.01
 
 
-@pytest.mark.parametrize("use", ["segment", "prior"])
-def test_a_map_is_loaded_at_the_start_with_the_pose_of_the_robot(tmp_path, use):
+def test_a_map_is_loaded_at_the_start_with_the_pose_of_the_robot(tmp_path):
     earlier_run(tmp_path / "site", 100)
     at = f"output.folder:={tmp_path / 'run'}", "output.load:=site", "output.load_at_start:=true"
     drive = Drive(truth=(2.0, 1.0, 0.5))
-    given = f"output.load_pose:='{text(drive.truth)}'", f"initialpose.use:={use}", "inputs.reliable:=true"
+    given = f"output.load_pose:='{text(drive.truth)}'", "inputs.reliable:=true"
     with node(*at, *given) as n, robot(hears=("pose", "/tf", "/diagnostics")) as r:
         r.wait_for_node()
         drive.sees = False
