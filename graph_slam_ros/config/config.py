@@ -72,10 +72,14 @@ REMOVED = {
 }
 """Parameters of earlier versions. Saved runs have them."""
 REMOVED_VALUES = {
-    ("INPUT.use", "edges"): "the pipeline has no edges of plugins; one's own edge type stays in the library and in g2o "
-    "files, and a converter of one's own yields landmarks, fixes, closures or odometry",
+    ("INPUT.use", "edges"): (
+        "none",
+        "the pipeline has no edges of plugins; one's own edge type stays in the library and in g2o files, and a "
+        "converter of one's own yields landmarks, fixes, closures or odometry",
+    ),
+    ("landmarks.association", "nearest"): ("joint", "joint keeps several hypotheses, and is better and as fast"),
 }
-"""Values of parameters of earlier versions."""
+"""Values of earlier versions: what saved runs have instead, and what a person is told."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,13 +171,22 @@ class Config:
                 near = nearest(name, known)
                 raise ConfigError(f"unknown parameter {name!r}; did you mean {near!r}?{_unlisted(name, names)}")
             section, key = name.split(".")
-            of = "INPUT" if section in names else section
-            if why := REMOVED_VALUES.get((f"{of}.{key}", str(value))):
-                raise ConfigError(f"{name}={value} was removed: {why}")
+            if removed := _removed_value(name, value, names):
+                raise ConfigError(f"{name}={value} was removed: {removed[1]}")
             sections.setdefault(section, {})[key] = known[name].check(value)
         trees = {name: type(default)(**sections.get(name, {})) for name, default in _sections()}
         inputs = (dataclasses.replace(default_input(name), **sections.get(name, {})) for name in names)
         return cls(**trees, sources=tuple(inputs))
+
+    @classmethod
+    def of_saved_run(cls, values: Mapping[str, Any]) -> "Config":
+        """As ``from_mapping``, without what earlier versions had. Raises as that."""
+        given = {name: value for name, value in flatten(values) if name not in REMOVED}
+        names = _input_names(given.get("inputs.names", InputsConfig().names))
+        for name, value in given.items():
+            if removed := _removed_value(name, value, names):
+                given[name] = removed[0]
+        return cls.from_mapping(given)
 
     def changed(self, values: Mapping[str, Any]) -> "Config":
         """The configuration with other values of some parameters, by dotted name; all of them or none.
@@ -280,6 +293,11 @@ def _input_names(text: Any) -> list[str]:
             raise ConfigError(f"inputs.names: {name!r} is reserved or given twice")
         used.add(name)
     return names
+
+
+def _removed_value(name: str, value: Any, inputs: Iterable[str]) -> tuple[str, str] | None:
+    section, _, key = name.partition(".")
+    return REMOVED_VALUES.get((f"{'INPUT' if section in inputs else section}.{key}", str(value)))
 
 
 def _unlisted(name: str, names: list[str]) -> str:

@@ -23,8 +23,8 @@ class LandmarksConfig:
     association: str = setting(
         "id",
         "data association: none: landmarks are not used; id: by identity; joint: observations without identity by "
-        "several hypotheses, which later ones decide; nearest: the same with one hypothesis",
-        choices=("none", "id", "nearest", "joint"),
+        "several hypotheses, which later ones decide",
+        choices=("none", "id", "joint"),
     )
     gate_same: float = setting(
         0.9999,

@@ -192,7 +192,7 @@ REASONS: dict[str, Reason] = {
     "unclear_which": Reason(
         _REFUSED,
         "a detection without identity is of no landmark: it fits none, and nothing else was seen there",
-        "landmarks.association=joint where it is nearest; else noise that is as large as the sensor's",
+        "noise that is as large as the sensor's",
     ),
     "surveyed_orientation_unused": Reason(
         _NOTED,

@@ -19,7 +19,6 @@ from typing import Any
 from mcap.records import Channel, Schema
 
 from graph_slam_ros import __version__
-from graph_slam_ros.config.config import REMOVED, flatten
 from graph_slam_ros.errors import ConfigError, FormatError, GraphSlamError, similar_file
 from graph_slam_ros.formats.durable import NEW, claimed, sync_folder, write_whole
 from graph_slam_ros.formats.files import is_regular, opened, read_bytes, read_text
@@ -165,7 +164,7 @@ def run_config(folder: Path) -> Config:
         raise ConfigError(f"{folder}: not a run: no {CONFIG} in it{made or similar_file(folder)}")
     values = read_parameters(folder / CONFIG, follow=False)
     try:
-        return Config.from_mapping({name: value for name, value in flatten(values) if name not in REMOVED})
+        return Config.of_saved_run(values)
     except GraphSlamError as error:
         raise ConfigError(f"{folder / CONFIG}: {error}") from None
 

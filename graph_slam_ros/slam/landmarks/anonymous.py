@@ -85,7 +85,7 @@ class AnonymousLandmarks:
         self._settings = BeamSettings(
             quantile(c.gate_same, space.dimensions),
             space.dimensions * float(np.log(c.density_per_m)),
-            hypotheses=1 if c.association == "nearest" else 40,
+            hypotheses=40,
             size_sigma_m=c.size_sigma_m,
             clock_sigma_s=config.calibrate.clock_sigma_s,
         )

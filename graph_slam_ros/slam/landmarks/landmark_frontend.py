@@ -158,7 +158,7 @@ class LandmarkFrontend:
     @property
     def is_anonymous(self) -> bool:
         """Return whether landmarks are told apart without identities, so that they need each step of odometry."""
-        return self._config.association in ("nearest", "joint")
+        return self._config.association == "joint"
 
     def _passed(self, named: Sequence[Assigned]) -> list[Assigned]:
         """The sightings that pass the gates, by input."""

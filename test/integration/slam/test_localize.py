@@ -97,7 +97,7 @@ def test_a_map_that_is_released_grows_and_is_corrected_again(world):
 
 def test_unnamed_sightings_are_matched_to_the_held_map_and_begin_nothing(world):
     before, after = split(list(without_names(world)), 0.2)
-    config = Config.from_mapping({"landmarks.association": "nearest"})
+    config = Config.from_mapping({"landmarks.association": "joint"})
     held = driven(GraphSlam(config), [*before, HOLD])
     there, known = places(held), held._landmarks.map.known
     names, sightings = set(known), sum(mark.sightings for mark in known.values())

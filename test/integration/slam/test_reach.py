@@ -76,7 +76,7 @@ def test_a_detection_at_1e8_m_is_refused_and_changes_nothing(dimensions, associa
     assert replayed.counters.as_dict()[SOURCE]["beyond_max_distance"] == 4 * RATE
 
 
-@pytest.mark.parametrize("dimensions, association", list(itertools.product((2, 3), ("id", "nearest"))))
+@pytest.mark.parametrize("dimensions, association", list(itertools.product((2, 3), ("id", "joint"))))
 @pytest.mark.parametrize("axis", [0, -1])
 def test_where_it_is_allowed_to_see_so_far_every_solve_still_succeeds(dimensions, association, axis):
     config = settings(dimensions, association, **{f"{SOURCE}.max_distance_m": 1e9})

@@ -103,6 +103,7 @@ def test_a_parameter_that_was_removed_is_refused_by_name_and_read_in_runs_that_h
         Config.from_mapping({"landmarks.follow_s": 10.0})
     with pytest.raises(ConfigError, match=r"radio.use=edges was removed: the pipeline has no edges of plugins; "):
         Config.from_mapping({"inputs.names": "odom radio", "radio.use": "edges"})
+    assert Config.of_saved_run({"landmarks.association": "nearest"}).landmarks.association == "joint"
     (golden,) = (CONFIG.parent / "test" / "golden").iterdir()
     assert "follow_s" in (golden / "config.yaml").read_text()
     assert run_config(golden).landmarks.sigma_m == Config().landmarks.sigma_m

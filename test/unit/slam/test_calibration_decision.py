@@ -115,7 +115,7 @@ def test_windows_of_a_loaded_map_begin_with_the_drive():
 def test_the_factors_of_an_association_are_used_by_default_where_there_is_one():
     assert not Config().uses_found_factors
     assert Config.from_mapping({"landmarks.association": "joint"}).uses_found_factors
-    for other in ({"landmarks.association": "nearest"}, {"calibrate.groups": "none"}, {"calibrate.groups": "auto"}):
+    for other in ({"landmarks.association": "id"}, {"calibrate.groups": "none"}, {"calibrate.groups": "auto"}):
         assert not Config.from_mapping({"landmarks.association": "joint"} | other).uses_found_factors
     with pytest.raises(ConfigError, match="is association and some"):
         Config.from_mapping({"calibrate.groups": "association clock"})
