@@ -54,6 +54,7 @@ REMOVED = {
     **dict.fromkeys(
         ("initialpose.use", "initialpose.loosen_m", "initialpose.loosen_rad"), "a given pose begins a new segment"
     ),
+    "INPUT.depth": "inputs.depth is that of all inputs",
     "tf.second_authority": "another broadcaster of map -> odom is reported; tf.publish_tf=false stops this one",
     **dict.fromkeys(
         (
@@ -165,13 +166,13 @@ class Config:
         known = {p.name: p for p in parameters(names)}
         sections: dict[str, dict[str, Any]] = {}
         for name, value in given.items():
-            if name in REMOVED:
-                raise ConfigError(f"parameter {name!r} was removed: {REMOVED[name]}; leave it out")
+            if why := REMOVED.get(_general(name, names)):
+                raise ConfigError(f"parameter {name!r} was removed: {why}; leave it out")
             if name not in known:
                 near = nearest(name, known)
                 raise ConfigError(f"unknown parameter {name!r}; did you mean {near!r}?{_unlisted(name, names)}")
             section, key = name.split(".")
-            if removed := _removed_value(name, value, names):
+            if removed := REMOVED_VALUES.get((_general(name, names), str(value))):
                 raise ConfigError(f"{name}={value} was removed: {removed[1]}")
             sections.setdefault(section, {})[key] = known[name].check(value)
         trees = {name: type(default)(**sections.get(name, {})) for name, default in _sections()}
@@ -181,12 +182,12 @@ class Config:
     @classmethod
     def of_saved_run(cls, values: Mapping[str, Any]) -> "Config":
         """As ``from_mapping``, without what earlier versions had. Raises as that."""
-        given = {name: value for name, value in flatten(values) if name not in REMOVED}
+        given = dict(flatten(values))
         names = _input_names(given.get("inputs.names", InputsConfig().names))
-        for name, value in given.items():
-            if removed := _removed_value(name, value, names):
-                given[name] = removed[0]
-        return cls.from_mapping(given)
+        general = {name: _general(name, names) for name in given}
+        kept = {name: value for name, value in given.items() if general[name] not in REMOVED}
+        instead = {name: REMOVED_VALUES.get((general[name], str(value)), (value,)) for name, value in kept.items()}
+        return cls.from_mapping({name: value[0] for name, value in instead.items()})
 
     def changed(self, values: Mapping[str, Any]) -> "Config":
         """The configuration with other values of some parameters, by dotted name; all of them or none.
@@ -295,9 +296,10 @@ def _input_names(text: Any) -> list[str]:
     return names
 
 
-def _removed_value(name: str, value: Any, inputs: Iterable[str]) -> tuple[str, str] | None:
+def _general(name: str, inputs: Iterable[str]) -> str:
+    """The name of a parameter in the tables of what was removed: ``INPUT`` stands for the section of any input."""
     section, _, key = name.partition(".")
-    return REMOVED_VALUES.get((f"{'INPUT' if section in inputs else section}.{key}", str(value)))
+    return f"INPUT.{key}" if section in inputs else name
 
 
 def _unlisted(name: str, names: list[str]) -> str:

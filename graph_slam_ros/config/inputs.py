@@ -137,13 +137,6 @@ class InputConfig:
         "latched publisher, a volatile publisher then does not connect",
         choices=("volatile", "transient_local"),
     )
-    depth: int = setting(
-        0,
-        "messages that the middleware holds for the input's subscription; 0: inputs.depth",
-        "messages",
-        low=0,
-        high=100_000,
-    )
 
     def __post_init__(self) -> None:
         self.numbers("mount", 6)

@@ -83,5 +83,4 @@ def input_qos(config: Config, topic: str, names: Sequence[str]) -> InputQos:
         asked |= given
     if config.inputs.reliable and "best_effort" not in asked:
         asked.setdefault("reliable", "inputs.reliable")
-    depth = max((one.depth or config.inputs.depth for one in inputs), default=config.inputs.depth)
-    return InputQos(depth, asked.get("reliable", ""), asked.get("transient_local", ""))
+    return InputQos(config.inputs.depth, asked.get("reliable", ""), asked.get("transient_local", ""))

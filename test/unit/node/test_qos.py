@@ -21,7 +21,7 @@ def qos(**values):
 def test_an_input_asks_for_what_its_parameters_say_else_for_what_those_of_all_inputs_say():
     least = qos().profile
     assert (least.reliability, least.durability) == (ReliabilityPolicy.BEST_EFFORT, DurabilityPolicy.VOLATILE)
-    assert (least.depth, qos(inputs__depth=7).depth, qos(a__depth=3, b__depth=20).depth) == (1000, 7, 20)
+    assert (least.depth, qos(inputs__depth=7).depth) == (1000, 7)
     assert qos(inputs__reliable=True).reliability == "inputs.reliable"
     assert qos(a__reliability="reliable").reliability == "a.reliability"
     assert not qos(inputs__reliable=True, a__reliability="best_effort").reliability
