@@ -85,8 +85,8 @@ class Drive:
                 robot.spin(0.005)
 
     def pace(self, robot):
-        """For ``until``: a step, and a moment to hear."""
-        return lambda seconds: (self.step(robot), robot.spin(seconds))
+        """For ``until``: a step where the node keeps up, and a moment to hear."""
+        return lambda seconds: (robot.is_ahead or self.step(robot), robot.spin(seconds))
 
 
 def distance(a, b):

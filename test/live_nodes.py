@@ -115,11 +115,11 @@ def graph_slam(*words, timeout=60.0):
     return server().run(["graph_slam", *map(str, words)], ENVIRONMENT, lenient(timeout))
 
 
-def until(condition, spin, what, patience_s=PATIENCE_S):
-    """Poll for what must come to be."""
+def until(condition, spin, what, patience_s=PATIENCE_S, but=lambda: ""):
+    """Poll for what must come to be; ``but`` tells what there is instead."""
     deadline = time.monotonic() + lenient(patience_s)
     while not condition():
-        assert time.monotonic() < deadline, f"no {what} in {patience_s} s"
+        assert time.monotonic() < deadline, f"no {what} in {patience_s} s {but()}"
         spin(0.02)
 
 
@@ -155,7 +155,7 @@ class Robot:
         kinds = {"/odom": Odometry, "/landmarks": Detection3DArray}
         self.publishers = {topic: self.node.create_publisher(kinds[topic], topic.lstrip("/"), qos) for topic in sends}
         self.heard = {}
-        for topic in hears:
+        for topic in dict.fromkeys((*hears, "/diagnostics")):
             self.hear(topic, raw=topic in raw)
         self._save = self.client("save")
         self._hears.start()
@@ -182,6 +182,13 @@ class Robot:
         return [(s.level[0], {one.key: one.value for one in s.values}) for s in found]
 
     @property
+    def is_ahead(self):
+        """Whether many messages wait in the SLAM node, by the last of /diagnostics: a busy machine needs its time."""
+        name = f"{self._of.lstrip('/')}: health"
+        said = [s for m in self.heard["diagnostics"][-3:] for s in m.status if s.name == name]
+        return bool(said) and int(next((v.value for v in said[-1].values if v.key == "messages waiting"), 0)) > 100
+
+    @property
     def verdict(self):
         """The last; None before the first."""
         if not (said := self.said()):
@@ -197,10 +204,7 @@ class Robot:
             v = self.verdict
             return v is not None and v.state == state and all(word in str(v) for word in words)
 
-        try:
-            until(is_said, spin or self.spin, f"{state} {words}", patience_s)
-        except AssertionError as error:
-            raise AssertionError(f"{error}, but {self.verdict}") from None
+        until(is_said, spin or self.spin, f"{state} {words}", patience_s, lambda: f"but {self.verdict}")
 
     def graph(self):
         """Numbers of the graph by the last of /diagnostics."""
@@ -214,10 +218,7 @@ class Robot:
             numbers = self.graph()
             return all(numbers.get(key) == value for key, value in values.items())
 
-        try:
-            until(is_so, spin or self.spin, f"graph with {values}", patience_s)
-        except AssertionError as error:
-            raise AssertionError(f"{error}, but {self.graph()}") from None
+        until(is_so, spin or self.spin, f"graph with {values}", patience_s, lambda: f"but {self.graph()}")
 
     def set(self, values, together=True):
         """Set parameters: whether it was done and why not, of all of them or each."""
@@ -337,7 +338,7 @@ class Robot:
             self.settle()
             return was_saved_whole(run)
 
-        until(is_whole, self.spin, "save of everything")
+        until(is_whole, self.spin, "save of everything", 60.0)
 
     def close(self):
         self._is_closed = True

@@ -165,41 +165,22 @@ def test_arguments_reach_the_node_and_rviz_looks_at_the_same_robot(prefix):
 
 
 @needs_launch
-def test_the_node_comes_up_and_ctrl_c_ends_it_cleanly(prefix):
-    install(prefix, NODE, RUN_NODE)
-    own = prefix / "own.yaml"
-    own.write_text(f'/**:\n  ros__parameters:\n    output.folder: "{prefix / "run"}"\n')
-    with launched(prefix, "namespace:=robot1", f"params_file:={own}") as (process, said):
-        deadline = time.monotonic() + 120.0  # kernels may have to be compiled
-        while "kernels ready" not in said():
-            assert time.monotonic() < deadline and process.poll() is None, said()
-            time.sleep(0.1)
-        os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to launch and to the node
-        assert process.wait(timeout=20.0) == 0
-    assert "process has finished cleanly" in said()
-    assert "Traceback" not in said()
-
-
-@needs_launch
-def test_the_lines_of_the_readme_for_two_robots_start_both(prefix, monkeypatch):
+def test_the_lines_of_the_readme_for_two_robots_start_both_and_ctrl_c_ends_them_cleanly(prefix, monkeypatch):
     install(prefix, NODE, RUN_NODE)
     monkeypatch.chdir(prefix)
     line = re.search(r"namespace:=robot1 frame_prefix:=robot1/", (ROOT / "docs/ros.md").read_text())[0]
     with contextlib.ExitStack() as stack:
-        both = [
-            stack.enter_context(launched(prefix, *line.replace("robot1", name).split())) for name in ("robot1", "two")
-        ]
-        until_ready(both)
-        for process, _ in both:
-            os.killpg(process.pid, signal.SIGINT)
-        assert [process.wait(timeout=20.0) for process, _ in both] == [0, 0]
+        several = [line.replace("robot1", name).split() for name in ("robot1", "two")]
+        both = [stack.enter_context(launched(prefix, *words)) for words in several]
+        for process, said in both:
+            deadline = time.monotonic() + 120.0  # kernels may have to be compiled
+            while "kernels ready" not in said():
+                assert time.monotonic() < deadline and process.poll() is None, said()
+                time.sleep(0.1)
+        for process, said in both:
+            os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to launch and to the node
+            assert process.wait(timeout=60.0) == 0
+            assert "process has finished cleanly" in said()
+            assert "Traceback" not in said()
     assert (prefix / "robot1_graph_slam_run").is_dir()
     assert (prefix / "two_graph_slam_run").is_dir()
-
-
-def until_ready(several):
-    for process, said in several:
-        deadline = time.monotonic() + 120.0
-        while "kernels ready" not in said():
-            assert time.monotonic() < deadline and process.poll() is None, said()
-            time.sleep(0.1)

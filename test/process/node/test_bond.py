@@ -9,7 +9,7 @@ import time
 
 import built_packages
 import pytest
-from live_nodes import ENVIRONMENT, PATIENCE_S, lenient, node, own_domain, robot, until
+from live_nodes import ENVIRONMENT, PATIENCE_S, lenient, node, robot, until
 from places import ROOT
 
 from graph_slam_ros.node.bond import MISSING, is_installed
@@ -26,13 +26,6 @@ STATUS = (
 def with_bond(request, tmp_path_factory, monkeypatch):
     """The environment of processes that have the messages."""
     built_packages.use("bond", {"Status": STATUS}, request, tmp_path_factory, monkeypatch)
-
-
-@pytest.fixture(autouse=True)
-def domain(monkeypatch):
-    with own_domain() as number:
-        monkeypatch.setitem(ENVIRONMENT, "ROS_DOMAIN_ID", number)
-        yield
 
 
 @contextlib.contextmanager

@@ -5,11 +5,10 @@ from types import SimpleNamespace
 
 import built_packages
 import numpy as np
-import pytest
 from executables import executable
 from foreign import DEFINITIONS, parts
-from live_nodes import ENVIRONMENT, own_domain
-from messages import STAMP_NS, odometry, pose, quaternion, recorded
+from live_nodes import ENVIRONMENT
+from messages import STAMP_NS, odometry, part, pose, quaternion, sent
 from recordings import definition, write_mcap
 
 from graph_slam_ros.messages.to_msg import header, make, vector
@@ -18,38 +17,25 @@ FIDUCIALS = "fiducial_msgs/msg/FiducialTransformArray"
 SETTINGS = ("inputs.names=odom tags", f"tags.type={FIDUCIALS}", "tags.topic=/fiducial_transforms", "tags.sigma_m=0.1")
 
 
-@pytest.fixture(autouse=True)
-def domain(monkeypatch):
-    with own_domain() as number:
-        monkeypatch.setitem(ENVIRONMENT, "ROS_DOMAIN_ID", number)
-        yield
+def seen_at(x, y):
+    return make("geometry_msgs/msg/Transform", translation=vector(x, y, 0.0), rotation=quaternion())
 
 
 def record(file):
     """A robot on a line that sees two fiducials."""
-    _, message, encoded = recorded(FIDUCIALS, DEFINITIONS[FIDUCIALS])
-    sent = []
+    kept = []
     for k in range(30):
         stamp_ns, x = STAMP_NS + k * 10**8, 0.1 * k
         found = [
-            message(
-                "fiducial_msgs/msg/FiducialTransform",
-                fiducial_id=number,
-                transform=make(
-                    "geometry_msgs/msg/Transform", translation=vector(5.0 - x, y, 0.0), rotation=quaternion()
-                ),
-                image_error=0.5,
-                object_error=0.01,
-                fiducial_area=900.0,
-            )
+            part("fiducial_msgs/msg/FiducialTransform", fiducial_id=number, transform=seen_at(5.0 - x, y))
             for number, y in ((7, 1.0), (8, -1.0))
         ]
-        sent.append(("/odom", stamp_ns, odometry(pose(x), stamp_ns=stamp_ns)))
-        cdr = encoded(header=header(stamp_ns, "base_link"), image_seq=k, transforms=found)
-        sent.append(("/fiducial_transforms", stamp_ns, cdr))
+        kept.append(("/odom", stamp_ns, odometry(pose(x), stamp_ns=stamp_ns)))
+        cdr = sent(FIDUCIALS, header=header(stamp_ns, "base_link"), image_seq=k, transforms=found)
+        kept.append(("/fiducial_transforms", stamp_ns, cdr))
     return write_mcap(
         file,
-        [SimpleNamespace(topic=topic, log_ns=stamp_ns, cdr=cdr) for topic, stamp_ns, cdr in sent],
+        [SimpleNamespace(topic=topic, log_ns=stamp_ns, cdr=cdr) for topic, stamp_ns, cdr in kept],
         types={"/odom": "nav_msgs/msg/Odometry", "/fiducial_transforms": FIDUCIALS},
         text=lambda name: DEFINITIONS.get(name) or definition(name),
     )

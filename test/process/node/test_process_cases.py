@@ -6,35 +6,34 @@ The node is in this process, with a thread of its own for its callbacks, so that
 import contextlib
 import gc
 import itertools
+import json
 import subprocess
 import sys
 import threading
 
+import numpy as np
 import pytest
 from live_drive import Drive
-from live_nodes import ENVIRONMENT, own_domain, replayed, results, robot, until
+from live_nodes import ENVIRONMENT, replayed, results, robot, until
+from messages import detection, detections, pose
+from rclpy.clock import ClockType, JumpThreshold
 from rclpy.context import Context
+from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
+from rclpy.time import Time
+from vision_msgs.msg import Detection3DArray
 
-from graph_slam_ros.measurements.types import Closure
 from graph_slam_ros.node.memory import resident_mib
 from graph_slam_ros.node.node import GraphSlamNode
+from graph_slam_ros.node.pose_extrapolator import PoseExtrapolator
 from graph_slam_ros.node.session import Session
 from graph_slam_ros.node.worker import Worker
 from graph_slam_ros.slam import GraphSlam
+from graph_slam_ros.solver import Solver
 
 HEARS = "/diagnostics", "/tf", "pose"
 NUMBERS = itertools.count()  # of nodes: who was there before in this process may be heard for a while
-
-
-@pytest.fixture(autouse=True)
-def domain(monkeypatch):
-    """Of each test its own: what is left of others says nothing here."""
-    with own_domain() as number:
-        monkeypatch.setitem(ENVIRONMENT, "ROS_DOMAIN_ID", number)
-        monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-        yield
 
 
 @contextlib.contextmanager
@@ -80,21 +79,26 @@ def at_work(**values):
 
 
 @contextlib.contextmanager
-def held(slam):
+def held(monkeypatch):
     """Until the end no solve ends."""
-    gate, solver = threading.Event(), slam._run._session.slam.solver
-    update = solver.update
+    gate, update = threading.Event(), Solver.update
+    with monkeypatch.context() as patched:
+        patched.setattr(Solver, "update", lambda self: gate.wait(60.0) and update(self))
+        try:
+            yield
+        finally:
+            gate.set()
 
-    def hold():
-        gate.wait(60.0)
-        return update()
 
-    solver.update = hold
-    try:
-        yield
-    finally:
-        gate.set()
-        del solver.update
+def counted(r, name, reason):
+    """Of an input, by the last of /diagnostics."""
+    said = r.said(f"input {name}")
+    return int(said[-1][1].get(f"counted: {reason}", 0)) if said else 0
+
+
+def faults(run):
+    """What callbacks raised, by what was saved."""
+    return json.loads((run / "run.json").read_text())["counters"].get("node", {})
 
 
 def test_a_node_that_is_destroyed_is_seen_by_nobody_from_then_on():
@@ -111,45 +115,24 @@ def test_a_node_that_is_destroyed_is_seen_by_nobody_from_then_on():
             until(lambda: not is_seen(), r.spin, "end of the node")
             r.settle(1.0)
             assert not is_seen()
-        with robot(of="/gone/graph_slam", hears=(), name="later") as r:
-            r.settle(2.0)
-            assert ("graph_slam", "/gone") not in r.node.get_node_names_and_namespaces()
     finally:
         gc.enable()
 
 
-def test_P9_where_a_solve_does_not_end_it_says_so_and_transforms_go_on():
-    with at_work(health__stuck_s=0.5) as (slam, r, drive):
-        with held(slam):
+def test_P9_P10_P17_where_a_solve_does_not_end_it_says_so_refuses_what_is_too_much_and_goes_on(tmp_path, monkeypatch):
+    run = tmp_path / "run"
+    with at_work(health__stuck_s=0.5, inputs__queue=20, output__folder=str(run)) as (_, r, drive):
+        with held(monkeypatch):
             r.until_it_says("DEGRADED", "solver stuck", spin=drive.pace(r))
             r.heard["tf"].clear()
             until(lambda: len(r.heard["tf"]) > 20, drive.pace(r), "transforms")
-        r.until_it_says("OK", spin=drive.pace(r))
-
-
-def test_P10_what_does_not_fit_into_the_queue_is_refused_before_it_is_accepted_and_soon_all_is_well(tmp_path):
-    with at_work(inputs__queue=20, output__folder=str(tmp_path / "run")) as (slam, r, drive):
-        run = slam._run
-        with held(slam):
-            drive.go(r, 200)
-            until(lambda: run.counters["odom", "overflow"] > 50, r.spin, "refusals")
             r.until_it_says("DEGRADED", "messages refused: the queue is full", spin=drive.pace(r))
-            assert run._worker.waiting <= 21
-        r.until_it_says("OK", spin=drive.pace(r))
-        r.save_all(tmp_path / "run")
-        assert results(tmp_path / "run") == replayed(tmp_path / "run", tmp_path)
-
-
-def test_P17_a_parameter_that_is_set_during_a_solve_takes_effect_after_it(tmp_path):
-    with at_work(output__folder=str(tmp_path / "run")) as (slam, r, drive):
-        session = slam._run._session
-        with held(slam):
-            until(lambda: slam._run._worker.waiting > 3, drive.pace(r), "measurements that wait")
+            assert int(r.said()[-1][1]["messages waiting"]) <= 21
             assert r.set({"keyframes.min_distance_m": 2.5}) == (True, "")
-            assert session.slam.config.keyframes.min_distance_m < 2.5
-        until(lambda: session.slam.config.keyframes.min_distance_m == 2.5, drive.pace(r), "the new value")
-        r.save_all(tmp_path / "run")
-        assert results(tmp_path / "run") == replayed(tmp_path / "run", tmp_path)
+        r.until_it_says("OK", spin=drive.pace(r))
+        until(lambda: counted(r, "odom", "overflow") > 50, drive.pace(r), "their count")
+        r.save_all(run)
+    assert results(run) == replayed(run, tmp_path), "the parameter has its place among what waited"
 
 
 def test_P11_a_robot_that_has_gone_and_comes_back_is_heard_again():
@@ -163,62 +146,62 @@ def test_P11_a_robot_that_has_gone_and_comes_back_is_heard_again():
             again.until_graph(drive.pace(again), segments=1)
 
 
-def test_G7_while_solves_fail_it_says_so_and_why_and_transforms_go_on_by_the_last_good_estimate():
-    with at_work() as (slam, r, drive):
-        session = slam._run._session
-        solver = session.slam.solver
+def test_G7_while_solves_fail_it_says_so_and_why_and_transforms_go_on_by_the_last_good_estimate(monkeypatch):
+    with at_work() as (_, r, drive):
+        with monkeypatch.context() as patched:
 
-        def fail(*arguments):
-            raise MemoryError("no room")
+            def fail(*arguments, **words):
+                raise MemoryError("no room")
 
-        solver.update = solver.optimize = fail
-        r.until_it_says(
-            "DEGRADED", "solves fail, the last good estimate stands", "MemoryError: no room", spin=drive.pace(r)
-        )
-        r.heard["tf"].clear()
-        until(lambda: len(r.heard["tf"]) > 20, drive.pace(r), "transforms")
-        del solver.update, solver.optimize
+            for name in ("update", "optimize"):
+                patched.setattr(Solver, name, fail)
+            why = "solves fail, the last good estimate stands", "MemoryError: no room"
+            r.until_it_says("DEGRADED", *why, spin=drive.pace(r))
+            r.heard["tf"].clear()
+            until(lambda: len(r.heard["tf"]) > 20, drive.pace(r), "transforms")
         r.until_it_says("OK", spin=drive.pace(r))
-        assert session.slam.counters["solver", "MemoryError"] > 0
 
 
 def test_P7_above_its_limit_of_memory_closures_are_refused_and_counted_and_below_taken_again(tmp_path):
-    with at_work(output__folder=str(tmp_path / "run")) as (slam, r, drive):
-        run, backend = slam._run, slam._run._session.slam.backend
+    run, loops = tmp_path / "run", {"type": "vision_msgs/msg/Detection3DArray", "use": "closure", "topic": "/loops"}
+    given = {"inputs__names": "odom detections loops", **{f"loops__{name}": value for name, value in loops.items()}}
+    with at_work(output__folder=str(run), **given) as (_, r, drive):
+        found = r.publisher("/loops", Detection3DArray)
+        until(found.get_subscription_count, drive.pace(r), "subscriber of closures")
+
+        def close():
+            here = detection(pose(0.0), np.eye(6), str(drive.stamp_ns - 10**9))
+            found.publish(detections(here, stamp_ns=drive.stamp_ns))
+
         assert r.set({"health.memory_mib": 0.5 * resident_mib()}) == (True, "")
         r.until_it_says("DEGRADED", "health.memory_mib", spin=drive.pace(r))
-        closure = Closure(
-            drive.stamp_ns, drive.stamp_ns - 10**9, "/closures", (0.0, 0.0, 0.0), (1.0, 0, 0, 0, 1.0, 0, 0, 0, 1.0)
-        )
-        run._ingest.receive([closure], b"")
-        assert run.counters["/closures", "memory"] == 1
-        until(lambda: backend.spares_memory, drive.pace(r), "no second looks")
+        close()
+        until(lambda: counted(r, "loops", "memory") == 1, drive.pace(r), "refusal")
         assert r.set({"health.memory_mib": 10.0 * resident_mib()}) == (True, "")
         r.until_it_says("OK", spin=drive.pace(r))
-        until(lambda: not backend.spares_memory, drive.pace(r), "second looks")
-        run._ingest.receive([closure], b"")
-        assert run.counters["/closures", "memory"] == 1
-        r.save_all(tmp_path / "run")
-        assert results(tmp_path / "run") == replayed(tmp_path / "run", tmp_path)
+        close()
+        until(lambda: int(r.said("input loops")[-1][1]["measurements used"]) > 0, drive.pace(r), "closure")
+        assert counted(r, "loops", "memory") == 1
+        r.save_all(run)
+    assert results(run) == replayed(run, tmp_path)
 
 
-def test_P23_what_would_end_the_solvers_thread_does_not_and_it_goes_on_with_the_graph_that_there_is(monkeypatch):
-    with at_work() as (slam, r, drive):
-        run = slam._run
-        slam_before, before = run._session.slam, len(run._session.slam.keyframes)
-        process = GraphSlam.process
+def test_P23_what_would_end_the_solvers_thread_does_not_and_it_goes_on_with_the_graph_that_there_is(
+    tmp_path, monkeypatch
+):
+    with at_work(output__folder=str(tmp_path / "run")) as (_, r, drive):
+        before, process = r.graph()["keyframes"], GraphSlam.process
 
         def dies(self, measurement):
             monkeypatch.setattr(GraphSlam, "process", process)
             raise SystemExit
 
         monkeypatch.setattr(GraphSlam, "process", dies)
-        until(lambda: run.counters["node", "worker_restarted"] == 1, drive.pace(r), "the counter")
+        until(lambda: GraphSlam.process is process, drive.pace(r), "the fault")
+        until(lambda: r.graph()["keyframes"] > before + 5, drive.pace(r), "keyframes")
         r.until_it_says("OK", spin=drive.pace(r))
-        until(lambda: len(run._session.slam.keyframes) > before + 5, drive.pace(r), "keyframes")
-        assert run._session.slam is slam_before
-        assert run._worker.is_alive
-        assert not slam_before.failing
+        assert r.save().success
+    assert faults(tmp_path / "run")["worker_restarted"] == 1
 
 
 def test_P23_who_waits_for_a_job_that_would_have_ended_its_thread_is_told():
@@ -239,18 +222,34 @@ def test_P23_who_waits_for_a_job_that_would_have_ended_its_thread_is_told():
 
 
 def test_P21_exceptions_of_callbacks_are_counted_told_once_and_an_error_from_a_hundred_on(monkeypatch, capfd):
-    with at_work() as (slam, r, drive):
-        process = Session.process
-        monkeypatch.setattr(Session, "process", lambda *_: 1 // 0)
-        for _ in range(5):
-            drive.step(r)
-        until(lambda: slam._run.counters["node", "ZeroDivisionError"] > 4, r.spin, "faults")
-        assert r.verdict.state != "ERROR"
-        r.until_it_says("ERROR", "faults in callbacks in 10 s", spin=drive.pace(r), patience_s=20.0)
-        monkeypatch.setattr(Session, "process", process)
+    with at_work() as (_, r, drive):
+        with monkeypatch.context() as patched:
+            patched.setattr(Session, "process", lambda *_: 1 // 0)
+            drive.go(r, 5)
+            r.settle()
+            assert r.verdict.state != "ERROR"
+            r.until_it_says("ERROR", "faults in callbacks in 10 s", spin=drive.pace(r), patience_s=20.0)
         r.heard["pose"].clear()
         until(lambda: r.heard["pose"], drive.pace(r), "poses")
     assert capfd.readouterr().err.count("Traceback") == 1
+
+
+def test_B15_what_is_raised_after_a_jump_reaches_nobody_and_is_counted(tmp_path, monkeypatch):
+    monkeypatch.setattr(PoseExtrapolator, "forget", lambda self: 1 // 0)
+    called, run = [], tmp_path / "run"
+    with inside("/jumps", use_sim_time=True, output__folder=str(run)) as slam:
+        back = JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False)
+        after = slam.get_clock().create_jump_callback(back, post_callback=called.append)
+        with robot(of="/jumps/graph_slam", hears=("pose",)) as r:
+            r.wait_for_node()
+            for seconds in (5_100, 5_040):
+                slam.get_clock().set_ros_time_override(Time(seconds=seconds, clock_type=ClockType.ROS_TIME))
+                r.heard["pose"].clear()
+                until(lambda: r.heard["pose"], Drive(5_000 * 10**9).pace(r), "pose")
+            assert r.save().success
+        after.unregister()
+    assert len(called) == 1, "those who come after it are called"
+    assert faults(run)["ZeroDivisionError"] == 1
 
 
 def test_P24_numpy_has_one_thread_in_the_node():

@@ -1,9 +1,7 @@
 """The node among others: who joins late, what does not fit, several of them, transforms, odometry, long paths."""
 
 import contextlib
-import csv
 import itertools
-import json
 import math
 import re
 import time
@@ -12,7 +10,7 @@ import numpy as np
 import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from live_drive import TAGS, Drive, distance, earlier_run
-from live_nodes import ENVIRONMENT, finish, lenient, node, own_domain, replayed, results, robot, until
+from live_nodes import node, robot, until
 from nav_msgs.msg import Path
 from places import ROOT
 from rclpy.qos import ReliabilityPolicy
@@ -24,14 +22,6 @@ from graph_slam_ros.runs.folder import is_run
 
 NS = 10**9
 STATES = ("path", "pose", "landmarks", "landmarks_estimate", "graph", "path_updates")
-
-
-@pytest.fixture(autouse=True)
-def domain(monkeypatch):
-    """Of each test its own: what is left of others says nothing here."""
-    with own_domain() as number:
-        monkeypatch.setitem(ENVIRONMENT, "ROS_DOMAIN_ID", number)
-        yield
 
 
 def stamp_ns(header):
@@ -57,10 +47,13 @@ def by_stamp(path):
 
 def test_who_joins_after_the_drive_gets_path_pose_landmarks_and_graph_and_the_whole_path_as_updates(tmp_path):
     parameters = f"output.folder:={tmp_path / 'run'}", "inputs.reliable:=true", "output.path_period_s:=0.02"
-    with node(*parameters) as n, robot(hears=("path", "path_updates")) as r:
+    with node(*parameters) as n, robot(hears=("path", "path_updates", "pose", "landmarks", "/tf")) as r:
         r.wait_for_node()
+        r.settle()
+        assert not r.heard["pose"] and not r.heard["tf"], "nothing before the first odometry"
         Drive().go(r, 250, every=2)
         until(lambda: len(r.heard["path_updates"]) > 1, r.spin, "updates of the path, told as it went")
+        until(lambda: len(r.heard["landmarks"]) > 1, r.spin, "landmarks on the way")
         assert r.save().success
         r.settle()
         followed = rebuilt(r.heard["path_updates"])
@@ -88,6 +81,11 @@ def test_who_joins_after_the_drive_gets_path_pose_landmarks_and_graph_and_the_wh
     assert stamp_ns(newest.header) == list(path)[-1]
     last = list(path.values())[-1].position
     assert (newest.pose.pose.position.x, newest.pose.pose.position.y) == pytest.approx((last.x, last.y), abs=1e-9)
+    poses = [stamp_ns(m.header) for m in r.heard["pose"]]
+    assert poses == sorted(poses) and len(set(poses)) > 10, "a solve between two keyframes sends the newest again"
+    for m in r.heard["pose"]:
+        assert np.linalg.eigvalsh(np.reshape(m.pose.covariance, (6, 6)))[0] > 0.0
+    assert {(t.header.frame_id, t.child_frame_id) for m in r.heard["tf"] for t in m.transforms} == {("map", "odom")}
     assert {m.text for m in heard["landmarks"][-1].markers if m.text} == set(TAGS)
     assert {d.id for d in heard["landmarks_estimate"][-1].detections} == set(TAGS)
     drawn = {m.ns: len(m.points) for m in heard["graph"][-1].markers}
@@ -97,56 +95,40 @@ def test_who_joins_after_the_drive_gets_path_pose_landmarks_and_graph_and_the_wh
 # -- what does not fit -------------------------------------------------------------------------------------------------
 
 
-def test_B23_a_qos_that_does_not_match_and_all_else_that_keeps_odometry_from_coming_is_named(tmp_path):
-    parameters = "output.folder:=''", "inputs.reliable:=true"
-    with node(*parameters) as n, robot(hears=("/diagnostics",), sends=()) as other:
-        other.until_it_says("WAITING", "nobody publishes /odom")
-        with robot(name="shy", reliability=ReliabilityPolicy.BEST_EFFORT, hears=()):
-            other.until_it_says(
-                "WAITING", "/odom: shy offers best effort, inputs.reliable asks for reliable", patience_s=3.0
-            )
-        with robot(name="liar", hears=(), sends=()) as liar:
-            liar.publisher("/odom", Path)
-            other.until_it_says(
-                "WAITING", "/odom: liar publishes nav_msgs/msg/Path, not nav_msgs/msg/Odometry", patience_s=3.0
-            )
-        with robot(name="driver", hears=()) as driver:
-            other.until_it_says("WAITING", "/odom: /driver publishes it, but nothing has come yet", patience_s=3.0)
-            driver.wait_for_node()
-            lost = Drive(frames="wheels/")
-            other.until_it_says(
-                "WAITING",
-                "no transform links wheels/odom to odom",
-                spin=lambda s: (lost.step(driver), other.spin(s)),
-                patience_s=3.0,
-            )
-        assert n.stop()[0] == 0
-    assert "Traceback" not in n.said
-
-
-def test_the_qos_of_one_input_is_its_own_and_a_publisher_that_does_not_connect_is_named_with_the_parameter():
+def test_B23_a_qos_that_does_not_match_and_all_else_that_keeps_odometry_from_coming_is_named():
     asked = "odom.reliability:=reliable", "detections.durability:=transient_local"
     with node("output.folder:=''", *asked) as n, robot(hears=("/diagnostics",), sends=()) as other:
+        other.until_it_says("WAITING", "nobody publishes /odom")
         with robot(name="shy", reliability=ReliabilityPolicy.BEST_EFFORT, hears=()):
-            reliability = "offers best effort, odom.reliability asks for reliable delivery (QoS)"
-            other.until_it_says("WAITING", f"/odom: shy {reliability}")
-            until(lambda: f"/odom: shy {reliability}" in n.said, other.spin, "that in the log")
+            reliability = "/odom: shy offers best effort, odom.reliability asks for reliable delivery (QoS)"
+            other.until_it_says("WAITING", reliability)
+            until(lambda: reliability in n.said, other.spin, "that in the log")
             latched = "shy offers volatile, detections.durability asks for transient_local (QoS)"
             until(
                 lambda: latched in [s.message for m in other.heard["diagnostics"] for s in m.status],
                 other.spin,
                 latched,
             )
+        with robot(name="liar", hears=(), sends=()) as liar:
+            liar.publisher("/odom", Path)
+            other.until_it_says("WAITING", "/odom: liar publishes nav_msgs/msg/Path, not nav_msgs/msg/Odometry")
+        with robot(name="driver", hears=(), sends=("/odom",)) as driver:
+            other.until_it_says("WAITING", "/odom: /driver publishes it, but nothing has come yet")
+            driver.wait_for_node()
+            lost = Drive(frames="wheels/")
+            lost.sees = False
+            unlinked = "no transform links wheels/odom to odom"
+            other.until_it_says("WAITING", unlinked, spin=lambda s: (lost.step(driver), other.spin(s)))
         assert n.stop()[0] == 0
-    with node("output.folder:=''", "odom.reliability:=sometimes") as n:
-        code, said = n.ended()
-    assert code != 0
-    assert "odom.reliability: 'sometimes' is not one of auto, reliable, best_effort" in said
+    assert "Traceback" not in n.said
 
 
-def test_frames_that_nothing_links_to_the_robot_are_named_and_the_rest_goes_on(tmp_path):
+def test_A18_it_waits_is_well_is_degraded_while_odometry_is_silent_or_nothing_links_a_frame_and_well_again():
     with node("output.folder:=''") as n, robot(hears=("/diagnostics", "path")) as r:
         r.wait_for_node()
+        r.until_it_says("WAITING", "publishes it, but nothing has come yet")
+        until(lambda: re.search(r"\[WARN\].*WAITING", n.said), r.spin, "a warning that it waits still")
+        assert re.search(r"\[(\w+)\].*WAITING", n.said)[1] == "INFO", "at first that is no reason to warn"
         drive = Drive()
 
         def with_a_camera_of_its_own(seconds):
@@ -155,28 +137,14 @@ def test_frames_that_nothing_links_to_the_robot_are_named_and_the_rest_goes_on(t
             drive.move()
             r.spin(seconds)
 
-        r.until_it_says(
-            "DEGRADED",
-            "/landmarks: all refused in 10 s",
-            "no transform links camera_of_its_own to base_link",
-            spin=with_a_camera_of_its_own,
-        )
+        unlinked = "/landmarks: all refused in 10 s", "no transform links camera_of_its_own to base_link"
+        r.until_it_says("DEGRADED", *unlinked, spin=with_a_camera_of_its_own)
         until(lambda: r.heard["path"], with_a_camera_of_its_own, "path of odometry alone")
-        assert n.stop()[0] == 0
-
-
-def test_it_waits_is_well_is_degraded_while_odometry_is_silent_and_well_again():
-    with node("output.folder:=''") as n, robot(hears=("/diagnostics",)) as r:
-        r.wait_for_node()
-        r.until_it_says("WAITING", "publishes it, but nothing has come yet")
-        until(lambda: re.search(r"\[WARN\].*WAITING", n.said), r.spin, "a warning that it waits still")
-        assert re.search(r"\[(\w+)\].*WAITING", n.said)[1] == "INFO", "at first that is no reason to warn"
-        drive = Drive()
-        r.until_it_says("OK", spin=drive.pace(r))
+        r.until_it_says("OK", spin=drive.pace(r), patience_s=30.0)
         r.until_it_says("DEGRADED", "/odom: silent for")
         r.until_it_says("OK", spin=drive.pace(r))
         assert n.stop()[0] == 0
-    assert [s for s in ("WAITING", "OK", "DEGRADED") if s in n.said] == ["WAITING", "OK", "DEGRADED"], "the log, too"
+    assert [s for s in ("WAITING", "DEGRADED", "OK") if s in n.said] == ["WAITING", "DEGRADED", "OK"], "the log, too"
 
 
 def test_B13_a_clock_that_does_not_come_is_named_where_simulated_time_is_used():
@@ -188,68 +156,40 @@ def test_B13_a_clock_that_does_not_come_is_named_where_simulated_time_is_used():
         assert n.stop()[0] == 0
 
 
-def test_after_eight_seconds_of_detections_at_1e8_m_every_solve_succeeds_as_before(tmp_path):
-    run = tmp_path / "run"
-    parameters = f"output.folder:={run}", "inputs.reliable:=true", "world.dimensions:=3"
-    with node(*parameters) as n, robot(hears=("/diagnostics", "pose")) as r:
-        r.wait_for_node()
-        drive = Drive()
-        drive.go(r, 60)
-        drive.claims = {"far": (0.0, 0.0, 1e8)}
-        drive.go(r, 80)
-        drive.claims = {}
-        drive.go(r, 60)
-        r.until_it_says("OK", spin=drive.pace(r))
-        assert r.save().success
-        finish(n, r)
-    record = json.loads((run / "run.json").read_text())
-    assert record["counters"]["detections"]["beyond_max_distance"] == 27
-    assert "solver" not in record["counters"]
-    found = {row["id"]: row for row in csv.DictReader((run / "landmarks.csv").read_text().splitlines())}
-    assert found.keys() == TAGS.keys()
-    for name, at in TAGS.items():
-        assert distance(at, (float(found[name]["x"]), float(found[name]["y"]))) < 0.1
-    assert replayed(run, tmp_path) == results(run)
-
-
 # -- several nodes -----------------------------------------------------------------------------------------------------
 
 
-def test_two_robots_in_namespaces_do_not_see_each_other(tmp_path):
-    frames = {"map": "map", "odom": "odom", "base": "base_link"}
-
-    def started(name):
-        named = (f"frames.{key}:={name}/{frame}" for key, frame in frames.items())
-        return node("output.folder:=''", "inputs.reliable:=true", *named, remap=[f"__ns:=/{name}"])
-
-    hears = "/diagnostics", "/tf", "pose", "path"
-    with (
-        started("a") as one,
-        started("b") as other,
-        robot(of="/a/graph_slam", hears=hears) as r,
-        robot(of="/b/graph_slam", hears=hears) as q,
-    ):
-        drives = {r: Drive(frames="a/"), q: Drive(frames="b/", turn=-0.02)}
-        for each in drives:
-            each.wait_for_node()
+def test_two_robots_with_the_shipped_parameters_do_not_see_each_other_and_record_each_into_its_own_folder(tmp_path):
+    names, hears = ("a", "fleet/b"), ("/diagnostics", "/tf", "pose")
+    with contextlib.ExitStack() as stack:
+        robots, drives = {}, {}
+        for name, turn in zip(names, (0.02, -0.02), strict=True):
+            frames = (f"frames.{key}:={name}/{key.replace('base', 'base_link')}" for key in ("map", "odom", "base"))
+            shipped = "--params-file", str(ROOT / "config" / "planar.yaml"), "-r", f"__ns:=/{name}"
+            stack.enter_context(node("inputs.reliable:=true", *frames, cwd=tmp_path, words=shipped))
+            robots[name] = stack.enter_context(robot(of=f"/{name}/graph_slam", hears=hears))
+            drives[name] = Drive(frames=f"{name}/", turn=turn)
 
         def both(seconds):
-            for each, drive in drives.items():
-                drive.step(each)
-                each.spin(seconds / 2)
+            for name, r in robots.items():
+                drives[name].step(r)
+                r.spin(seconds / 2)
 
-        for each in drives:
-            each.until_it_says("OK", spin=both)
-        until(lambda: all(len(each.heard["pose"]) > 20 for each in drives), both, "poses of both")
-        for each, name in ((r, "a"), (q, "b")):
-            assert {m.header.frame_id for m in each.heard["pose"]} == {f"{name}/map"}
-            assert each.heard["pose"][-1].pose.pose.position.y * (1.0 if name == "a" else -1.0) > 0.0
-        told = {(t.header.frame_id, t.child_frame_id) for m in r.heard["tf"] for t in m.transforms}
-        assert told == {("a/map", "a/odom"), ("b/map", "b/odom")}
-        assert {s.hardware_id for m in r.heard["diagnostics"] for s in m.status} == {"a/graph_slam", "b/graph_slam"}
-        for n in (one, other):
-            assert n.stop()[0] == 0
-            assert "WARN" not in n.said.replace("WAITING", "").replace("[WARN]", "", n.said.count("WAITING")), n.said
+        for name, r in robots.items():
+            r.wait_for_node()
+            folder = f"{name.replace('/', '_')}_graph_slam_run"
+            assert r.get(["output.folder"]) == {"output.folder": folder}
+            assert is_run(tmp_path / folder)
+        for r in robots.values():
+            r.until_it_says("OK", spin=both)
+        until(lambda: all(len(r.heard["pose"]) > 20 for r in robots.values()), both, "poses of both")
+        for name, r in robots.items():
+            assert {m.header.frame_id for m in r.heard["pose"]} == {f"{name}/map"}
+            assert r.heard["pose"][-1].pose.pose.position.y * drives[name].turn > 0.0
+        told = {(t.header.frame_id, t.child_frame_id) for m in robots["a"].heard["tf"] for t in m.transforms}
+        assert told == {(f"{name}/map", f"{name}/odom") for name in names}
+        ids = {s.hardware_id for m in robots["a"].heard["diagnostics"] for s in m.status}
+        assert ids == {f"{name}/graph_slam" for name in names}
 
 
 def test_P19_two_nodes_of_one_name_say_so_until_one_has_gone():
@@ -359,9 +299,8 @@ def test_P20_transforms_dated_by_the_clock_are_ahead_of_it_by_the_tolerance():
     assert -0.3 - 1e-3 <= min(late_s) < -0.1, late_s
 
 
-@pytest.mark.parametrize("most", [0.0, 1.0])
-def test_a_correction_moves_the_robot_no_faster_than_allowed(most):
-    with node("output.folder:=''", f"tf.max_speed_m_s:={most}") as n, robot(hears=("/tf",)) as r:
+def test_a_correction_moves_the_robot_no_faster_than_allowed():
+    with node("output.folder:=''", "tf.max_speed_m_s:=1.0") as n, robot(hears=("/tf",)) as r:
         r.wait_for_node()
         there = r.publisher("initialpose", PoseWithCovarianceStamped)
         drive = Drive(step_s=0.05)
@@ -374,11 +313,7 @@ def test_a_correction_moves_the_robot_no_faster_than_allowed(most):
         until(lambda: told(r)[-1][1] == pytest.approx(3.0, abs=1e-3), standing(r, drive), "correction")
         assert n.stop()[0] == 0
     steps = [((b[0] - a[0]) * 1e-9, distance(a[1:], b[1:])) for a, b in itertools.pairwise(told(r))]
-    fastest = max(moved / dt for dt, moved in steps)
-    if most:
-        assert 0.9 * most < fastest <= most * (1.0 + 1e-6)
-    else:
-        assert max(moved for _, moved in steps) == pytest.approx(3.0, abs=1e-3)
+    assert 0.9 < max(moved / dt for dt, moved in steps) <= 1.0 + 1e-6
 
 
 def standing(r, drive):
@@ -477,39 +412,15 @@ def test_P9_while_everything_is_solved_and_saved_transforms_odometry_and_diagnos
     r.settle()
     for topic in r.heard.values():
         topic.clear()
-    futures, since, heard = [r.ask("optimize"), r.ask("save")], time.monotonic(), []
+    futures, meanwhile = [], {}
 
     def step(seconds):
+        if sum(not future.done() for future in futures) < 3:
+            futures.extend((r.ask("optimize"), r.ask("save")))
         drive.pace(r)(seconds)
-        heard.append((time.monotonic() - since, len(r.heard["odometry"]), len(r.heard["tf"])))
+        if not all(future.done() for future in futures):
+            meanwhile.update((topic, len(r.heard[topic])) for topic in ("odometry", "tf", "diagnostics"))
 
-    until(lambda: all(future.done() for future in futures), step, "solution", 60.0)
-    took_s, counts = time.monotonic() - since, {topic: len(some) for topic, some in r.heard.items()}
+    until(lambda: meanwhile and min(meanwhile.values()) > 3, step, "transforms, odometry and diagnostics", 30.0)
+    until(lambda: all(future.done() for future in futures), r.spin, "answers", 60.0)
     assert all(future.result().success for future in futures)
-    assert took_s > 0.2, "or nothing is shown"
-    assert counts["odometry"] >= 0.9 * len(heard) - 5, (counts, len(heard))
-    assert counts["tf"] >= 0.5 * min(len(heard), took_s / 0.05) - 5, (counts, len(heard), took_s)
-    assert counts["diagnostics"] >= 0.5 * took_s - 1, (counts, took_s)
-    assert longest_gap(heard, 1) < lenient(0.5), "odometry comes evenly"
-    assert longest_gap(heard, 2) < lenient(0.5), "and so do transforms"
-
-
-def longest_gap(heard, column):
-    """How long a count did not grow."""
-    at = [b[0] for a, b in itertools.pairwise(heard) if b[column] > a[column]]
-    return max(b - a for a, b in itertools.pairwise(at))
-
-
-def test_two_robots_with_the_shipped_parameters_record_each_into_a_folder_of_its_own(tmp_path):
-    shipped = ROOT / "config" / "planar.yaml"
-    with contextlib.ExitStack() as stack:
-        for name in ("robot1", "fleet/robot2"):
-            words = ("--params-file", str(shipped), "-r", f"__ns:=/{name}")
-            stack.enter_context(node(cwd=tmp_path, words=words))
-        robots = [stack.enter_context(robot(of=f"/{name}/graph_slam")) for name in ("robot1", "fleet/robot2")]
-        for r in robots:
-            r.wait_for_node()
-        names = [r.get(["output.folder"])["output.folder"] for r in robots]
-        assert names == ["robot1_graph_slam_run", "fleet_robot2_graph_slam_run"]
-        for name in names:
-            assert is_run(tmp_path / name)

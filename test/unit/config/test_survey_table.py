@@ -83,85 +83,38 @@ def test_the_example_of_the_manual_is_a_tag_on_a_wall():
     assert abs(surveyed(text, 2)["tag36h11:7"].orientation[0]) == pytest.approx(np.pi)
 
 
-PLACE_2 = "sigma or sigma_x,sigma_y or cov_xx,cov_xy,cov_yy or sigma_x,sigma_y,sigma_z"
-TURN_2 = "yaw or roll,pitch,yaw or qx,qy,qz,qw"
+WRONG = """
+2 | a,1,2,0.1 |  | line 1: column 'a' is not known: expected a header with some of id,x,y,z,sigma,
+2 | id,x,y,sigma,X |  | line 1: column 'X' is not known
+2 | id,x,y,x,sigma |  | line 1: column 'x' is given twice
+2 | id,x,sigma |  | line 1: columns of a position: id,x, expected id,x,y or id,x,y,z
+3 | id,x,y,sigma |  | line 1: columns of a position: id,x,y, expected id,x,y,z
+2 | id,x,y |  | line 1: columns of the noise of the position: none, expected sigma or sigma_x,sigma_y or cov_xx,
+2 | id,x,y,sigma,sigma_x |  | line 1: columns of the noise of the position: sigma,sigma_x, expected sigma or
+2 | id,x,y,sigma,yaw |  | line 1: columns of the noise of the orientation: none, expected sigma_yaw or sigma_rad
+2 | id,x,y,sigma,sigma_rad |  | line 1: columns of an orientation: none, expected yaw or roll,pitch,yaw or qx,qy,qz,qw
+2 | id,x,y,sigma,yaw,qx,qy,qz,qw,sigma_rad |  | line 1: columns of an orientation: yaw,qx,qy,qz,qw, expected yaw or
+3 | id,x,y,z,sigma,yaw,sigma_rad |  | line 1: columns of an orientation: yaw, expected roll,pitch,yaw or qx,qy,qz,qw
+2 | id,x,y,sigma,yaw,sigma_rad | a,1,2,0.1,0.5 | line 2: 5 values, not id,x,y,sigma,yaw,sigma_rad
+2 | id,x,y,sigma,yaw,sigma_rad | a,1,2,0.1,,0.5 | line 2: yaw '' is not a finite number
+2 | id,x,y,sigma,yaw,sigma_rad | a,1,2,0.1,inf,0.5 | line 2: yaw 'inf' is not a finite number
+2 | id,x,y,sigma,yaw,sigma_rad | a,1,2,0.1,0.5,0 | line 2: sigma_rad 0 is not above 0: nothing is certain
+2 | id,x,y,sigma,yaw,sigma_rad | a,1,2,0.1,90,1 | line 2: yaw 90 is more than a turn: expected radians
+2 | id,x,y,sigma,yaw,sigma_rad | a,1,2,0.1,1,10 | line 2: sigma_rad 10 is more than a turn: expected radians
+2 | id,x,y,sigma_x,sigma_y | a,1,2,0.1,-1 | line 2: sigma_y -1 is not above 0: nothing is certain
+2 | id,x,y,cov_xx,cov_xy,cov_yy | a,1,2,1,2,1 | line 2: cov_xx,cov_xy,cov_yy: [1 2; 2 1] is no positive
+2 | id,x,y,sigma | a,1,2,1e200 | line 2: sigma: [inf 0; 0 inf] is no positive definite covariance
+2 | id,x,y,sigma,qx,qy,qz,qw,sigma_rad | a,1,2,1,0,0,0,0,1 | line 2: qx,qy,qz,qw: a quaternion of length 0, expected 1
+2 | id,x,y,sigma,roll,pitch,yaw,sigma_rad | a,1,2,1,0,1.57,0,1 | line 2: roll,pitch,yaw: the x axis of the landmark is
+2 | id,x,y,sigma,yaw,sigma_rad | a,1,2,1,0,1\\na,1,2,1,0,1 | line 3: 'a' is given twice
+"""
 
 
-@pytest.mark.parametrize(
-    "header, line, dimensions, said",
-    [
-        ("a,1,2,0.1", "", 2, "line 1: column 'a' is not known: expected a header with some of id,x,y,z,sigma,"),
-        ("id,x,y,sigma,X", "", 2, "line 1: column 'X' is not known"),
-        ("id,x,y,x,sigma", "", 2, "line 1: column 'x' is given twice"),
-        ("id,x,sigma", "", 2, "line 1: columns of a position: id,x, expected id,x,y or id,x,y,z"),
-        ("id,x,y,sigma", "", 3, "line 1: columns of a position: id,x,y, expected id,x,y,z"),
-        ("id,x,y", "", 2, f"line 1: columns of the noise of the position: none, expected {PLACE_2}"),
-        (
-            "id,x,y,sigma,sigma_x",
-            "",
-            2,
-            "line 1: columns of the noise of the position: sigma,sigma_x, expected sigma or",
-        ),
-        (
-            "id,x,y,sigma,yaw",
-            "",
-            2,
-            "line 1: columns of the noise of the orientation: none, expected sigma_yaw or sigma_rad",
-        ),
-        ("id,x,y,sigma,sigma_rad", "", 2, f"line 1: columns of an orientation: none, expected {TURN_2}"),
-        (
-            "id,x,y,sigma,yaw,qx,qy,qz,qw,sigma_rad",
-            "",
-            2,
-            f"line 1: columns of an orientation: yaw,qx,qy,qz,qw, expected {TURN_2}",
-        ),
-        (
-            "id,x,y,z,sigma,yaw,sigma_rad",
-            "",
-            3,
-            "line 1: columns of an orientation: yaw, expected roll,pitch,yaw or qx,qy,qz,qw",
-        ),
-        ("id,x,y,sigma,yaw,sigma_rad", "a,1,2,0.1,0.5", 2, "line 2: 5 values, not id,x,y,sigma,yaw,sigma_rad"),
-        ("id,x,y,sigma,yaw,sigma_rad", "a,1,2,0.1,,0.5", 2, "line 2: yaw '' is not a finite number"),
-        ("id,x,y,sigma,yaw,sigma_rad", "a,1,2,0.1,inf,0.5", 2, "line 2: yaw 'inf' is not a finite number"),
-        ("id,x,y,sigma,yaw,sigma_rad", "a,1,2,0.1,0.5,0", 2, "line 2: sigma_rad 0 is not above 0: nothing is certain"),
-        ("id,x,y,sigma,yaw,sigma_rad", "a,1,2,0.1,90,1", 2, "line 2: yaw 90 is more than a turn: expected radians"),
-        (
-            "id,x,y,sigma,yaw,sigma_rad",
-            "a,1,2,0.1,1,10",
-            2,
-            "line 2: sigma_rad 10 is more than a turn: expected radians",
-        ),
-        ("id,x,y,sigma_x,sigma_y", "a,1,2,0.1,-1", 2, "line 2: sigma_y -1 is not above 0: nothing is certain"),
-        (
-            "id,x,y,cov_xx,cov_xy,cov_yy",
-            "a,1,2,1,2,1",
-            2,
-            "line 2: cov_xx,cov_xy,cov_yy: [1 2; 2 1] is no positive",
-        ),
-        (
-            "id,x,y,sigma",
-            "a,1,2,1e200",
-            2,
-            "line 2: sigma: [inf 0; 0 inf] is no positive definite covariance",
-        ),
-        (
-            "id,x,y,sigma,qx,qy,qz,qw,sigma_rad",
-            "a,1,2,1,0,0,0,0,1",
-            2,
-            "line 2: qx,qy,qz,qw: a quaternion of length 0, expected 1",
-        ),
-        (
-            "id,x,y,sigma,roll,pitch,yaw,sigma_rad",
-            "a,1,2,1,0,1.57,0,1",
-            2,
-            "line 2: roll,pitch,yaw: the x axis of the landmark is upright",
-        ),
-        ("id,x,y,sigma,yaw,sigma_rad", "a,1,2,1,0,1\na,1,2,1,0,1", 2, "line 3: 'a' is given twice"),
-    ],
-)
-def test_what_is_wrong_is_said_with_line_column_and_what_is_expected(header, line, dimensions, said):
+@pytest.mark.parametrize("row", WRONG.strip().splitlines())
+def test_what_is_wrong_is_said_with_line_column_and_what_is_expected(row):
+    dimensions, header, line, said = (one.strip() for one in row.split(" | "))
+    text = line.replace("\\n", "\n")
     with pytest.raises(ConfigError) as caught:
-        surveyed(f"{header}\n{line}\n", dimensions)
+        surveyed(f"{header}\n{text}\n", int(dimensions))
     assert str(caught.value).startswith(said)
     assert "\n" not in str(caught.value)

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from messages import STAMP_NS, TWIST, border, odometry, pose, quaternion
+from messages import STAMP_NS, TWIST, border, counted, odometry, pose, quaternion
 
 from graph_slam_ros.messages.from_msg import decoder
 from graph_slam_ros.messages.inputs.odometry import TYPE
@@ -65,7 +65,7 @@ def converted(messages, monkeypatch, *, decoded=False, in_runs=False, **sections
         own.note = lambda message: calls.append(hasattr(message, "header"))
         out = border(decoders={TYPE: own}, **sections)
         measured = together(out, messages) if in_runs else [out.convert("odom", cdr) for cdr in messages]
-        return [*measured, out.finish()], out._counters.as_dict(), sum(calls)
+        return [*measured, out.finish()], counted(out), sum(calls)
 
 
 def compare(messages, monkeypatch, **sections):
@@ -83,7 +83,7 @@ def test_a_message_is_read_as_it_is_decoded(what, dimensions, monkeypatch):
 
 
 @pytest.mark.parametrize("dimensions", [2, 3])
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(4))
 def test_any_messages_are_read_as_they_are_decoded(seed, dimensions, monkeypatch):
     """Odd ones among plain ones, in any order, with stamps that stand still, leap and go back."""
     rng = np.random.default_rng(seed)

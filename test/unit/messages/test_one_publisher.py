@@ -36,6 +36,9 @@ class Publisher:
             self.used += self._one.accept(m)
         return self
 
+    def forget_time(self):
+        self._one.forget_time()
+
     def end(self):
         self.used += self._one.finish()
         return self
@@ -57,21 +60,17 @@ def mixed(*publishers):
     return sorted(itertools.chain(*publishers), key=lambda m: m.stamp_ns)
 
 
-@pytest.mark.parametrize("offset", [(0.3, 0.0, 0.0), (8.0, -3.0, 1.0), (0.0, 0.0, 0.4), (400.0, 0.0, 3.0)], ids=str)
-@pytest.mark.parametrize(("mine", "others"), [(50, 30), (10, 100), (20, 20), (100, 10)])
+@pytest.mark.parametrize("offset", [(0.3, 0.0, 0.0), (0.0, 0.0, 0.4), (400.0, 0.0, 3.0)], ids=str)
+@pytest.mark.parametrize(("mine", "others"), [(50, 30), (10, 100), (100, 10)])
 @pytest.mark.parametrize("begin", [0.0, 4.0], ids=["from the start", "later"])
 def test_A34_of_two_publishers_the_first_is_used_and_every_message_of_the_other_is_counted(mine, others, begin, offset):
     used, other = driven(mine), driven(others, 9.0, begin, offset, late_s=0.003)
     p = Publisher().hear(mixed(used, other)).end()
     assert p.used == used
     assert p.refused == len(other)
-
-
-def test_A34_three_publishers_are_told_apart():
-    used, others = driven(50), [driven(30, 9.0, 1.0, (k, -k, 0.5 * k), late_s=0.004 * k) for k in (1.0, 2.0)]
-    p = Publisher().hear(mixed(used, *others)).end()
-    assert p.used == used
-    assert p.refused == sum(map(len, others))
+    third = driven(30, 9.0, 1.0, se2.compose(offset, (1.0, -1.0, 0.5)), late_s=0.004)
+    p = Publisher().hear(mixed(used, other, third)).end()
+    assert (p.used, p.refused) == (used, len(other) + len(third))
 
 
 def test_A34_in_space_they_are_told_apart_by_where_they_are_and_how_they_are_turned():
@@ -149,7 +148,7 @@ def test_when_the_one_in_use_dies_another_takes_over_under_a_name_of_its_own():
 def test_where_stamps_begin_anew_tracks_do():
     used = driven(20)
     p = Publisher().hear(used)
-    p._one.forget_time()
+    p.forget_time()
     assert p.hear(used).used == [*used, *used]
 
 

@@ -31,12 +31,6 @@ def test_as_a_path_grows_the_same_poses_are_kept_until_half_of_them_go():
     assert halved == 5
 
 
-def test_of_few_edges_all_are_shown():
-    ids = np.array([3, 5, 8])
-    assert worst_and_some(ids, np.array([1.0, 2.0, 3.0]), 3).tolist() == [3, 5, 8]
-    assert worst_and_some(ids[:0], np.empty(0), 3).tolist() == []
-
-
 @pytest.mark.parametrize("most", [1, 2, 7, 64, 999])
 def test_of_many_edges_the_worst_are_shown_and_some_of_all(most):
     rng = np.random.default_rng(most)
@@ -50,6 +44,9 @@ def test_of_many_edges_the_worst_are_shown_and_some_of_all(most):
     others, rest = np.setdiff1d(shown, worst), np.setdiff1d(ids, worst)
     stride = next(2**k for k in range(12) if len(rest[rest % 2**k == 0]) <= most - most // 2)
     assert others.tolist() == rest[rest % stride == 0].tolist()
+    few = ids[:most]
+    assert worst_and_some(few, misfit[:most], most).tolist() == few.tolist()
+    assert worst_and_some(ids[:0], np.empty(0), most).tolist() == []
 
 
 def test_the_edges_shown_are_the_same_ones_as_more_come():
