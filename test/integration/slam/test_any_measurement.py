@@ -220,5 +220,5 @@ def test_of_extreme_numbers_no_search_takes_more_steps_than_the_bound(monkeypatc
         return cost
 
     monkeypatch.setattr("graph_slam_ros.slam.robust.innovation.native_or_plain", lambda _, plain: (counted, plain))
-    drive(2, 3, "joint")
+    drive(12, 3, "id")
     assert max(evaluations) >= 60, "it is a drive on which a search would go on"
