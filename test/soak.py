@@ -30,7 +30,7 @@ def guided(name):
 
 DRIVES = (
     *("advise", "calibration_consistency", "calibration_random", "consistency", "displacement", "extreme_fixes"),
-    *("bad_drives", "gyro_drives", "determination", "initialization", "mirrored_ranges"),
+    *("bad_drives", "gyro_drives", "determination", "initialization"),
     *("nees", "planted", "simulation", "slip", "recordings", "uncorrected", "unnamed"),
 )
 PROGRAMMES = {

@@ -172,8 +172,6 @@ def _rivals(folder: Path) -> Iterator[str]:
 
 def _rival(folder: Path, rival: Mapping[str, Any]) -> str:
     costs = f"this explanation costs {rival['best_cost']:.4g}, another {rival['cost']:.4g}"
-    if rival.get("is_mirror_image"):
-        return f"warning: ambiguous: {costs}: its mirror image"
     here, there = (" ".join(f"{edge:d}" for edge in rival[which]) for which in ("only_here", "only_there"))
     tried = f"graph_slam explain {folder} --with {here}" + (f" --without {there}" if there else "")
     return f"warning: ambiguous: {costs}: {tried}"

@@ -48,6 +48,8 @@ _COST_TOLERANCE = 1e-9  # and so it has when the cost changes by a smaller part 
 _ONE_ODOMETRY = "the first of inputs.names that publishes is used; a filter, e.g. robot_localization, fuses several"
 REMOVED = {
     "landmarks.follow_s": "observations without identity are compared with all landmarks around",
+    "landmarks.size_sigma_m": "sizes are not compared; give things of other sizes another class",
+    "landmarks.range_offset_sigma_m": "graph_slam calibrate finds INPUT.range_offset_m",
     "gyro.gate": "the gyro's turn replaces that of odometry",
     "odometry.fusion": _ONE_ODOMETRY,
     "robust.odometry_gate": _ONE_ODOMETRY,

@@ -46,14 +46,6 @@ class LandmarksConfig:
         "m",
         low=0.0,
     )
-    size_sigma_m: float = setting(
-        0.0,
-        "standard deviation of the size that a message states of a landmark without identity (the box of a "
-        "Detection3D; the field size, diameter or radius of a point): a landmark of another size is another one; 0: "
-        "sizes are not compared",
-        "m",
-        low=0.0,
-    )
     density_per_m: float = setting(
         0.03,
         "prior density of landmarks per metre along each axis: an observation must fit a known "
@@ -76,12 +68,6 @@ class LandmarksConfig:
         "m, rad",
     )
     surveyed_file: str = setting("", "file with the lines of landmarks.surveyed, read at the start where that is empty")
-    range_offset_sigma_m: float = setting(
-        0.0,
-        "standard deviation of an offset that all ranges of a topic share and that is estimated; 0: no offset",
-        "m",
-        low=0.0,
-    )
     loss: str = setting(
         "huber_then_cauchy",
         "robust loss of landmark observations; huber_then_cauchy converges with Huber first, then with Cauchy",

@@ -35,7 +35,7 @@ from graph_slam_ros.slam.robust.landmark_support import landmark_of
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict
 from graph_slam_ros.slam.snapshot import MapSnapshot
 
-_ONCE = ("surveyed", "range_offset")  # what both sessions were told is told once
+_ONCE = ("surveyed",)  # what both sessions were told is told once
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +112,6 @@ class _Second:
         self._one, self._two, self._T = one, two, aligned.T_a_b
         self._keyframes = len(one.keyframes)
         same = {two.landmarks[name].vertex: one.landmarks[name].vertex for name in shared}
-        same |= {v: one.range_offsets[name] for name, v in two.range_offsets.items() if name in one.range_offsets}
         self._vertex: dict[int, int] = same
         self._new = [vertex for vertex in range(two.graph.vertex_count) if vertex not in same]
         self._vertex |= {vertex: one.graph.vertex_count + k for k, vertex in enumerate(self._new)}
@@ -144,7 +143,6 @@ class _Second:
             "edits": [self._edit_record(one, ids) for one in self._two.edits],
             "displacements": [*self._one.displacements, *map(self._displacement, self._two.displacements)],
             "datum": growth.get("datum", self._one.datum),
-            "offsets": {name: self._vertex[vertex] for name, vertex in growth.get("offsets", {}).items()},
         }
 
     def _value(self, vertex: int, kind: str) -> list[Any]:

@@ -307,7 +307,6 @@ REASONS: dict[str, Reason] = {
     "visit_lost": Reason(_NOTED, "a visit that contradicts itself or its place: its odometry alone is kept"),
     "not_condensed": Reason(_NOTED, "a keyframe that stays, for its edges or as too little is seen around it"),
     "held_keyframe": Reason(_NOTED, "a keyframe that stays: its map is frozen, or held by map.localize"),
-    "turned_over": Reason(_NOTED, "a map of ranges was its mirror image: odometry's turns are likelier the other way"),
     "cleared": Reason(_NOTED, "loop closures that ~/clear_closures took out"),
     "displaced": Reason(
         _NOTED,

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from graph_slam_ros.graph.vertices import GROUPS, R1
+from graph_slam_ros.graph.vertices import GROUPS
 from graph_slam_ros.slam.landmarks.lifetimes import ALL_VOID
 from graph_slam_ros.slam.landmarks.presence import Presence
 from graph_slam_ros.slam.snapshot import MapSnapshot
@@ -42,9 +42,6 @@ def fault_of(state: MapSnapshot) -> str:
     for k, record in enumerate(state.passes):
         if record != [ALL_VOID] and not (is_index(record[0], len(kinds)) and Presence.is_record(record[1:])):
             return f"record {k} of the passes of landmarks is not valid"
-    for name, vertex in state.range_offsets.items():
-        if not (is_index(vertex, len(kinds)) and kinds[vertex] is R1):
-            return f"the offset of {name} is not valid"
     if not all(is_index(one, state.keyframe_count) for one in (*state.segments, *state.drives)):
         return "a segment or a drive begins where no keyframe is"
     if not (state.used_ns is None or is_index(state.used_ns, 2**63)) or not isinstance(state.source, str):

@@ -13,7 +13,6 @@ JSON records in mcap, as in the journal. The first is ``map`` with the version o
   stamp, and where it is retired since when, where it has a class or size these two and how many sightings have a
   size, or null where it was given up; ``seen``: of those without identity, each
   sighting and its edge; ``passes``: by vertex, what is known of when a landmark is seen (``Presence.record``);
-  ``offsets``: by input, the vertex of what its ranges have in common;
 * ``datum``: latitude, longitude and height that fixes are from; ``settings``: parameters that were changed on the way;
   ``displacements``: all alarms by then, of all drives, as in ``run.json``;
 * ``processed``: records of the ingest sequence that all of it came of; ``used``: stamp and input of the last odometry
@@ -87,7 +86,7 @@ class MapGrowth:
 
     def _begin(self) -> None:
         self._vertices = self._edges = self._judged = self._changes = 0
-        self._keyframes = self._segments = self._sightings = self._landmarks = self._offsets = 0
+        self._keyframes = self._segments = self._sightings = self._landmarks = 0
         self._edits = self._frozen = self._drives = self._rescaled = self._passes = 0
         self._noise: dict[Key, float] = {}
         self._calibration: Totals = {}
@@ -140,8 +139,6 @@ class MapGrowth:
         landmarks = a.touched_landmarks(self._landmarks)
         out["landmarks"] = {name: mark and _landmark(mark) for name, mark in landmarks.items()}
         out["seen"] = [_seen(one) for mark in landmarks.values() if mark for one in _newer(mark.seen, first_edge)]
-        if len(a.range_offsets) > self._offsets:
-            out["offsets"] = a.range_offsets
         if a.frozen > self._frozen:
             out["frozen"] = [a.frozen, a.frozen_edges]
         if a.held != self._held:
@@ -167,7 +164,7 @@ class MapGrowth:
             out["stamp_ns"] = keyframes[-1].stamp_ns
         self._vertices, self._edges, self._judged = graph.vertex_count, graph.edge_count, len(a.ledger)
         self._changes, self._keyframes, self._segments = len(a.ledger.history), a.keyframe_count, len(a.segments)
-        self._sightings, self._offsets, self._frozen = len(a.sighting_poses), len(a.range_offsets), a.frozen
+        self._sightings, self._frozen = len(a.sighting_poses), a.frozen
         self._drives, self._edits, self._landmarks = len(a.drives), len(a.edits), a.landmark_changes
         return {name: part for name, part in out.items() if part}
 

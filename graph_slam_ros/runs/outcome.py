@@ -44,10 +44,6 @@ _NOT_CONVERGED = (
     "the estimate is not at its optimum: --set solve.max_iterations=1000. If that does not help, measurements that are "
     "believed contradict each other: graph_slam explain RUN lists those that fit worst"
 )
-_MIRRORED = (
-    "ambiguous: the mirror image of this map explains its ranges as well: odometry's turns do not decide between the "
-    "two. Drive more turns, or add bearings, fixes or surveyed landmarks (landmarks.surveyed)"
-)
 _EXTREME = "distances or noise that no robot means do that: --set INPUT.max_distance_m=... or INPUT.noise=sigmas"
 
 
@@ -278,8 +274,6 @@ def ambiguities(rivals: Collection[Mapping[str, Any]]) -> Iterator[str]:
     ----------
     rivals : ``Backend.rivals`` as dictionaries
     """
-    if any(rival.get("is_mirror_image") for rival in rivals):
-        yield _MIRRORED
     if count := sum(len(rival["only_here"]) for rival in rivals):
         yield f"ambiguous: {count} loop closures that are not believed agree with one another as well"
 

@@ -256,8 +256,7 @@ def numbered(slam: GraphSlam) -> tuple[list[int], str]:
     """The number of each vertex, and the table of all vertices.
 
     Poses are numbered from 0 in order of time, landmarks after them, because other tools read odometry from that order.
-    A vertex that is not part of the map any more is ``unused``: a deleted landmark. Any other one is an offset that
-    the ranges of a sensor share.
+    A vertex that is not part of the map any more is ``unused``: a deleted landmark.
     """
     names: list[tuple[int, int, str, int | str, str]] = []
     for one in slam.bounded.old if slam.bounded else ():
@@ -267,9 +266,9 @@ def numbered(slam: GraphSlam) -> tuple[list[int], str]:
     for k, (name, landmark) in enumerate(slam.landmarks.items(), start=len(slam.keyframes)):
         names.append((k, landmark.vertex, "landmark", "", name))
     named = {vertex for _, vertex, *_ in names}
-    offsets, rest = set(slam.range_offsets.values()), sorted(set(range(slam.graph.vertex_count)) - named)
+    rest = sorted(set(range(slam.graph.vertex_count)) - named)
     more = enumerate(rest, start=len(slam.keyframes) + len(slam.landmarks))
-    names += [(k, vertex, "offset" if vertex in offsets else "unused", "", "") for k, vertex in more]
+    names += [(k, vertex, "unused", "", "") for k, vertex in more]
     ids = [0] * slam.graph.vertex_count
     rows = ["id,vertex,stamp_ns,name"]
     for file_id, vertex, what, stamp, name in names:
@@ -282,7 +281,7 @@ def graph_file(slam: GraphSlam, ids: list[int]) -> G2oFile:
     """The graph, with the vertices of a frozen map fixed, and without those that are not part of the map any more."""
     named = {*slam.keyframes.ids.tolist(), *(mark.vertex for mark in slam.landmarks.values())}
     named |= {one.vertex for one in slam.bounded.old} if slam.bounded else set()
-    absent = frozenset(range(slam.graph.vertex_count)) - named - set(slam.range_offsets.values())
+    absent = frozenset(range(slam.graph.vertex_count)) - named
     return G2oFile(slam.graph, ids, slam.solver.held.tolist(), absent=absent)
 
 

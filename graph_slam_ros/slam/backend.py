@@ -19,7 +19,7 @@ from graph_slam_ros.slam.robust.admission import Admission
 from graph_slam_ros.slam.robust.background import Background, Work, run_when_asked
 from graph_slam_ros.slam.robust.displacement_hypothesis import DisplacementHypothesis
 from graph_slam_ros.slam.robust.gating import OutlierGate
-from graph_slam_ros.slam.robust.hypotheses import MIRRORED, Alternative, FrozenGraph, Outcome, search_alternatives
+from graph_slam_ros.slam.robust.hypotheses import Alternative, FrozenGraph, Outcome, search_alternatives
 from graph_slam_ros.slam.robust.ledger import Ledger, Reason
 from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.solver import Report, Settings, Solver
@@ -89,7 +89,7 @@ class Backend:
     @property
     def rivals(self) -> tuple[Alternative, ...]:
         """Other explanations of the same measurements that the last second look could not rule out."""
-        return tuple(one for one in self._rivals if one.stands(self.graph, self.ledger))
+        return tuple(one for one in self._rivals if one.stands(self.ledger))
 
     def restore(self, vertices: Sequence[int], values: Array, held: tuple[int, int] = (0, 0)) -> Report:
         """Solve all accepted edges of a loaded graph: some of its vertices, from given values.
@@ -166,7 +166,7 @@ class Backend:
         if is_due and (group := self.decisions.readmit_likely_group(keyframe)):
             self._admission.make_fit(group, keyframe)
         out = self.ledger.outside_count
-        if self._config.decide and not self.spares_memory and self._background.is_due(out, keyframe, self.graph):
+        if self._config.decide and not self.spares_memory and self._background.is_due(out):
             self._background.start(self._frozen_graph(keyframe, self.solver.settings), out)
 
     def optimize(self, keyframe: int, settings: Settings) -> Report:
@@ -363,9 +363,7 @@ class Backend:
     def _adopt(self, outcome: Outcome, keyframe: int) -> bool:
         """Use the verdicts of a search. Returns whether it explains the measurements in another way than now."""
         self._rivals = outcome.rivals
-        if is_turned := outcome.start == MIRRORED:
-            self._counters.count("map", "turned_over")
-        return self.decisions.adopt_verdicts(outcome.ledger, keyframe) or is_turned
+        return self.decisions.adopt_verdicts(outcome.ledger, keyframe)
 
     def _frozen_graph(self, keyframe: int, settings: Settings) -> FrozenGraph:
         problem = self.graph.copy(), self.solver.vertices, self.solver.held, self.solver.values

@@ -279,7 +279,7 @@ class GraphSlam(MapView):
             raise GraphSlamError(f"the map is not in {self.space.dimensions} dimensions")
         self._frontend.restore(*start.path, start.continues_with, start.gyro_bias, start.first_keyframe)
         self._anchor.restore()
-        self._landmarks.restore(start.landmarks, start.range_offsets, start.passes)
+        self._landmarks.restore(start.landmarks, start.passes)
         report = self.backend.restore(start.vertices, start.values, start.held if self.config.map.localize else (0, 0))
         self._solution.restore(report, self.keyframes[-1], len(self.keyframes))
         (self._frontend.covariance,) = self.solver.marginal([self.keyframes[-1].vertex])

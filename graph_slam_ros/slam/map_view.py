@@ -221,11 +221,6 @@ class MapView(PathView):
         """The corrections of measurements that were in the graph, in order."""
         return self._calibrator.history
 
-    @property
-    def range_offsets(self) -> dict[str, int]:
-        """The vertex of the offset that all ranges of an input share, by input."""
-        return self._landmarks.map.offsets
-
     def touched_landmarks(self, first: int) -> dict[str, Landmark | None]:
         """The landmarks that changed after the ``first`` changes, tentative ones included; None: removed."""
         landmarks = self._landmarks.map

@@ -51,7 +51,6 @@ class MapSnapshot:
     drives: list[int] = field(default_factory=list)
     sighting_poses: list[SightingPose] = field(default_factory=list)
     landmarks: dict[str, Landmark] = field(default_factory=dict)
-    range_offsets: dict[str, int] = field(default_factory=dict)
     passes: list[list[Any]] = field(default_factory=list)
     frozen: int = 0
     held: tuple[int, int] = (0, 0)
@@ -105,7 +104,7 @@ class MapSnapshot:
         poses = {one.vertex for one in self.keyframes}
         poses |= {one.vertex for one in self.bounded.old} if self.bounded else set()
         points = {mark.vertex for mark in self.landmarks.values()}
-        return sorted(poses | points | {*self.range_offsets.values()})
+        return sorted(poses | points)
 
     def freeze(self) -> None:
         """Fix everything. Landmarks that are too new are removed first.

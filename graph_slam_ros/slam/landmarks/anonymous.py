@@ -81,19 +81,18 @@ class AnonymousLandmarks:
         self._reckoning = DeadReckoning(space, config.ordering.late_s + 2.0)
         self._history = ScanHistory(space, config.odometry, self._reckoning)
         extent = max(c.added_sigma_m**2 + c.unnamed_sigma_m**2, LEAST_M2) * np.eye(space.dimensions)
-        self._builder = ScanBuilder(space, extent, _CLOSE_M, c.size_sigma_m)
+        self._builder = ScanBuilder(space, extent, _CLOSE_M)
         self._settings = BeamSettings(
             quantile(c.gate_same, space.dimensions),
             space.dimensions * float(np.log(c.density_per_m)),
             hypotheses=40,
-            size_sigma_m=c.size_sigma_m,
             clock_sigma_s=config.calibrate.clock_sigma_s,
         )
         self._belief = SolverBelief(space, solver, landmarks)
         self.hindsight = Hindsight(config, self._settings, executor)
         self.clusters = Assignments(c, landmarks, counters, hand_over)
         self._beam: Beam | None = None
-        self._sorts, self._sizes = dict[int, str](), dict[int, float]()  # of landmarks, whatever beam began them
+        self._sorts = dict[int, str]()  # of landmarks, whatever beam began them
         self._leader: Decision | None = None
         self._same: dict[int, int] = {}  # landmarks of the beam that are others in the graph
         self._clocks: dict[str, float] = {}  # of each input the correction that its stamps have
@@ -182,7 +181,7 @@ class AnonymousLandmarks:
             scales, sigma = self.hindsight.scales
             seed = self._belief.seed(scan, names, scales if beam is None else beam.scales[0], sigma)
             beam, self._leader = Beam(self._settings, seed), None
-            beam.sorts, beam.sizes = self._features()
+            beam.sorts = self._classes()
         else:
             beam.advance(motion)
             self._belief.recall(beam, scan, names)
@@ -192,15 +191,13 @@ class AnonymousLandmarks:
         self._beam = beam
         return decision
 
-    def _features(self) -> tuple[dict[int, str], dict[int, float]]:
-        """Classes and sizes of landmarks, also of those that no beam began: of a map, or of an explanation of all."""
+    def _classes(self) -> dict[int, str]:
+        """Classes of landmarks, also of those that no beam began: of a map, or of an explanation of all."""
         for number, name in self.clusters.names.items():
             mark = self._landmarks.known.get(name)
             if mark is not None and mark.sort:
                 self._sorts[number] = mark.sort
-            if mark is not None and mark.sized:
-                self._sizes[number] = mark.size
-        return self._sorts, self._sizes
+        return self._sorts
 
     def doubt(self, since_ns: int, added: Callable[[float], Array] | None) -> None:
         """Use odometry with more noise, or as stated again. In the first case the scans since then are explained anew.
@@ -308,9 +305,9 @@ class AnonymousLandmarks:
             beam.history = last
             beam.renumber(new.landmark, new.landmarks(beam.ids))
             kept |= set(beam.ids.ravel().tolist())
-        self._sorts, self._sizes = new.kept(self._sorts, kept), new.kept(self._sizes, kept)
+        self._sorts = new.kept(self._sorts, kept)
         if beam is not None:
-            beam.sorts, beam.sizes = self._sorts, self._sizes
+            beam.sorts = self._sorts
         self._builder.renumber(vertices)
 
     # -- afterwards --------------------------------------------------------------------------------------------------

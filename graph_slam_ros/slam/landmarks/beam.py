@@ -23,10 +23,6 @@ _FREE, _SLIPPED = -1, -9
 _UNLIKELY = 2.0  # log of how much less likely nothing is than something new
 _SLIP_LONGEST = 6.0
 _MORE_SLOTS = 8
-SIZE_CHI2 = 25.0
-"""No size counts for more against a landmark: of a thing that is half hidden it is wrong."""
-LOG_SIZES = float(np.log(10.0))
-"""Log of the number of different sizes: the size of something new is less likely by this."""
 
 Ids = NDArray[np.int64]
 
@@ -45,7 +41,6 @@ class BeamSettings:
     slots : landmarks that a hypothesis holds at once; the one not seen for longest leaves
     scale_sigma : of odometry's two scales
     clock_sigma_s : of the clock of each input, against odometry's
-    size_sigma_m : of the size of a cluster; zero: sizes are not compared
     log_missed : log probability that a landmark in view is not seen; zero: what is missing does not count
     slip_every_s, slip_log_prior, slip_sigma_m, slip_sigma_rad : how odometry slips
     """
@@ -58,7 +53,6 @@ class BeamSettings:
     slots: int = 40
     scale_sigma: float = 0.1
     clock_sigma_s: float = 0.5
-    size_sigma_m: float = 0.0
     log_missed: float = 0.0
     slip_every_s: float = 2.0
     slip_log_prior: float = -3.5
@@ -144,7 +138,6 @@ class Beam:
         self.log_weight = np.zeros(1)
         self.history: list[Decision | None] = [None]
         self.sorts: dict[int, str] = {}
-        self.sizes: dict[int, float] = {}
         self._signs: list[tuple[int, ...]] = [()]
         self._scans, self._since_slip = 0, 0.0
 
@@ -229,8 +222,7 @@ class Beam:
         what = self._expect(cluster)
         fits = what.log_likelihood
         fits[(self.ids[:, :, None] == used[:, None]).any(axis=2)] = -np.inf
-        log_new = c.log_new - LOG_SIZES * bool(cluster.size and c.size_sigma_m)
-        others = np.broadcast_to([log_new, log_new - _UNLIKELY], (len(fits), 2))
+        others = np.broadcast_to([c.log_new, c.log_new - _UNLIKELY], (len(fits), 2))
         weights = (np.concatenate([fits, others], axis=1) + self.log_weight[:, None]).ravel()
         likely = np.flatnonzero(weights > weights.max() - c.within)
         kept = list[tuple[int, int, int]]()
@@ -281,16 +273,8 @@ class Beam:
             sorts = [[self.sorts.get(one, cluster.sort) == cluster.sort for one in row] for row in self.ids.tolist()]
             is_possible &= np.array(sorts, dtype=bool).reshape(is_possible.shape)
         volume = np.log(np.where(is_possible, determinant, 1.0)) + n * np.log(2.0 * np.pi)
-        if cluster.size and self.settings.size_sigma_m:
-            chi2 = chi2 + self._size_chi2(cluster.size)
         log_likelihood = np.where(is_possible, -0.5 * (chi2 + volume), -np.inf)
         return _Expected(log_likelihood, residual, inverse, of_turn, back)
-
-    def _size_chi2(self, size: float) -> Array:
-        """chi2 (K, L) of the difference of a size to those of the landmarks; zero where theirs is not known."""
-        away = np.array([self.sizes.get(one, size) - size for one in self.ids.ravel().tolist()])
-        chi2 = np.square(away / self.settings.size_sigma_m) / 2.0  # both sizes were measured
-        return np.minimum(chi2, SIZE_CHI2).reshape(self.ids.shape)
 
     def _update(self, source: Ids, options: Ids, what: _Expected) -> None:
         """Kalman updates of the hypotheses that assign the cluster to a landmark of theirs."""
@@ -324,8 +308,6 @@ class Beam:
             return
         if cluster.sort:
             self.sorts[number] = cluster.sort
-        if cluster.size:
-            self.sizes[number] = cluster.size
         n, r = self._n, self._r
         slot = self._slots_for(which)
         turn, p = self.turn[which], self.covariance[which]

@@ -147,10 +147,9 @@ def _candidates(drive: Drive, e: Estimate, inside: Ids, strong: Ids, middle: int
     weakest = np.linalg.eigvalsh(whiten.transpose(0, 2, 1) @ whiten)[:, 0]
     reach = 1.001 * _NONE / np.maximum(weakest, 1e-12)  # squared [m2]: what is farther away counts as nothing
     is_other = are_others(drive.sort[inside][:, None], sorts_of(drive, e)[strong])
-    of_size = drive.size_chi2(e, inside)[:, strong]
     scored = []
     for turn, move, prior in zip(turns[likely], moves[likely], priors.tolist(), strict=True):
-        least, best = _nearest(at @ turn.T + move, there, turn, whiten, reach, of_size, is_other)
+        least, best = _nearest(at @ turn.T + move, there, turn, whiten, reach, is_other)
         score = float(np.minimum(least / 4.0, _MOST_COST).sum()) + prior
         scored.append((score, np.where(least < _NONE, strong[best], UNUSED), turn, move))
     as_it_lies = scored[int(np.flatnonzero(likely == 0)[0])][0]
@@ -158,16 +157,14 @@ def _candidates(drive: Drive, e: Estimate, inside: Ids, strong: Ids, middle: int
     return [one[1:] for one in scored if one[0] < as_it_lies + _MOST_PRIOR]
 
 
-def _nearest(
-    at: Array, there: Array, turn: Array, whiten: Array, reach: Array, of_size: Array, is_other: Mask
-) -> tuple[Array, Ids]:
+def _nearest(at: Array, there: Array, turn: Array, whiten: Array, reach: Array, is_other: Mask) -> tuple[Array, Ids]:
     """The least chi2 (C,) of moved clusters (C, n) with landmarks (J, n), and of which; infinite if none is in reach.
 
     Parameters
     ----------
     turn : by which the clusters were turned; whiten : (C, n, n) in the axes before
     reach : (C,) squared distance up to which landmarks are looked at [m2]
-    of_size, is_other : (C, J) chi2 of sizes, and whether the sorts differ
+    is_other : (C, J) whether the sorts differ
     """
     apart = np.zeros((len(at), len(there)))
     for axis in range(at.shape[1]):
@@ -175,7 +172,7 @@ def _nearest(
     i, j = np.nonzero((apart < reach[:, None]) & ~is_other)
     away = (there[j] - at[i]) @ turn  # in the axes before the turn
     chi2 = np.full(apart.shape, np.inf)
-    chi2[i, j] = np.square((whiten[i] @ away[..., None])[..., 0]).sum(axis=-1) + of_size[i, j]
+    chi2[i, j] = np.square((whiten[i] @ away[..., None])[..., 0]).sum(axis=-1)
     best: Ids = chi2.argmin(axis=1)
     return chi2[np.arange(len(at)), best], best
 

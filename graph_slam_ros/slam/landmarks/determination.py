@@ -72,7 +72,7 @@ def _why_unsure(config: LandmarksConfig, space: Geometry, solver: Solver, candid
     if 2 * len(seen) < len(candidate.seen):
         return ""  # nothing is solved yet, so nobody knows how well the path is known
     try:
-        first, *chi2 = least_chi2(space, solver, seen, places, config.range_offset_sigma_m)
+        first, *chi2 = least_chi2(space, solver, seen, places)
     except (GraphSlamError, np.linalg.LinAlgError) as error:
         return f"how well the path is known cannot be computed: {error}"
     fitting = [place for place, one in zip(places[1:], chi2, strict=True) if not one >= first + _MIRROR_CHI2]
@@ -84,9 +84,7 @@ def _several(places: Sequence[Array]) -> str:
     return f"{len(places)} places fit: {some}"
 
 
-def least_chi2(
-    space: Geometry, solver: Solver, seen: _Seen, places: Sequence[Array], offset_sigma_m: float = 0.0
-) -> list[float]:
+def least_chi2(space: Geometry, solver: Solver, seen: _Seen, places: Sequence[Array]) -> list[float]:
     """Return the least chi2 near each place, over its position and over the path as the other edges leave it uncertain.
 
     It is ``min_x (r + A x)' S^-1 (r + A x)`` with ``S = R + J P J'``, residuals r, and their derivative A by the place.
@@ -95,7 +93,6 @@ def least_chi2(
     Parameters
     ----------
     places : (n,) in map
-    offset_sigma_m : standard deviation of an offset that all ranges have in common
 
     Raises
     ------
@@ -105,7 +102,7 @@ def least_chi2(
     vertices = list(dict.fromkeys(where.vertex for where, _ in seen))
     joint, poses = solver.joint_marginal(vertices), solver.estimate(vertices)
     row_of = {vertex: k for k, vertex in enumerate(vertices)}
-    return [_least_chi2(space, joint, poses, row_of, seen, place, offset_sigma_m) for place in places]
+    return [_least_chi2(space, joint, poses, row_of, seen, place) for place in places]
 
 
 def _least_chi2(
@@ -115,9 +112,8 @@ def _least_chi2(
     row_of: dict[int, int],
     seen: _Seen,
     place: Array,
-    offset_sigma_m: float,
 ) -> float:
-    residuals, by_place, by_path, common = list[Array](), list[Array](), list[Array](), list[Array]()
+    residuals, by_place, by_path = list[Array](), list[Array](), list[Array]()
     noise, dof = list[Array](), space.dof
     for where, s in seen:
         k = row_of[where.vertex]
@@ -139,9 +135,7 @@ def _least_chi2(
         by_place.append(by_keyframe @ space.turn(pose).T)
         by_path.append(on_path)
         noise.append(own)
-        common.append(np.full(len(r), offset_sigma_m * (s.kind == "range")))
     spread = block_diag(*noise) + np.vstack(by_path) @ joint @ np.vstack(by_path).T
-    spread += np.outer(np.concatenate(common), np.concatenate(common))
     root = np.linalg.cholesky(spread)
     white = np.linalg.solve(root, np.column_stack([np.concatenate(residuals), np.vstack(by_place)]))
     step = np.linalg.lstsq(white[:, 1:], white[:, 0])[0]

@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from graph_slam_ros.slam.landmarks.beam import LOG_SIZES, SIZE_CHI2, BeamSettings
+from graph_slam_ros.slam.landmarks.beam import BeamSettings
 from graph_slam_ros.slam.landmarks.bordered import BorderedEquations, Pattern, Rows
 from graph_slam_ros.slam.landmarks.rotations import applied, lever, product, rotation, rotation_vector
 from graph_slam_ros.slam.landmarks.scans import Motion, Scan, interpolated_nearby
@@ -105,9 +105,7 @@ class Drive:
         self.n = self.points.shape[1]
         self.times = np.ones(len(self.points)) if times is None or not len(times) else times
         self.sort = np.array([c.sort for one in scans for c in one.clusters])
-        self._size = np.array([c.size for one in scans for c in one.clusters])
-        self._has_sizes = settings.size_sigma_m > 0.0 and bool(self._size.any())
-        self.costs = replace(costs, landmark=costs.landmark + 2.0 * LOG_SIZES) if self._has_sizes else costs
+        self.costs = costs
         self.whiten = _whitening(np.array([c.covariance for one in scans for c in one.clusters]))
         self._set_motions(motions)
         self._set_clocks(scans, nearby, clocks or {})
@@ -184,18 +182,7 @@ class Drive:
         whiten = product(self.whiten[clusters], e.turn[k].transpose(0, 2, 1))
         away = self.seen_at(e, clusters)[:, None] - e.landmarks[None]
         chi2 = np.square(away @ whiten.transpose(0, 2, 1)).sum(axis=-1)
-        return np.asarray(chi2 + self.size_chi2(e, clusters))
-
-    def size_chi2(self, e: Estimate, clusters: Ids | slice = slice(None)) -> Array:
-        """chi2 (m, J) of the sizes of clusters with the mean size of every landmark; zero where one is not known."""
-        size, count = self._size[clusters], len(e.landmarks)
-        if not self._has_sizes:
-            return np.zeros((len(size), count))
-        known = (e.which >= 0) & (self._size > 0.0)
-        times = np.bincount(e.which[known], minlength=count)
-        mean = np.bincount(e.which[known], self._size[known], minlength=count) / np.maximum(times, 1)
-        away = np.where((size[:, None] > 0.0) & (times > 0), size[:, None] - mean, 0.0)
-        return np.minimum(np.square(away / self.settings.size_sigma_m), SIZE_CHI2)
+        return np.asarray(chi2)
 
     def cost_of(self, e: Estimate, *, loss_scale: float = 0.0, slips: bool = True) -> float:
         """The cost of an estimate."""
@@ -206,8 +193,6 @@ class Drive:
         square = (loss_scale or self.costs.loss_scale) ** 2
         scales = float(np.square(e.scales).sum()) / self.settings.scale_sigma**2
         scales += float(np.square(e.clocks).sum()) / self.settings.clock_sigma_s**2
-        if self._has_sizes:
-            scales += float(self.size_chi2(e)[np.flatnonzero(used), e.which[used]].sum())
         clusters = square * np.log1p(chi2 / square).sum() + self.costs.unused * np.count_nonzero(~used)
         return float(np.minimum(tight, slipped).sum() + clusters) + scales
 

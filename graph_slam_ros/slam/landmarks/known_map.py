@@ -39,7 +39,7 @@ def with_map(frozen: FrozenScans, belief: SolverBelief, known: Mapping[int, Land
     points, covariances = belief.seen_from(first, [mark.name for mark in marks])
     n = points.shape[1]
     clusters = tuple(
-        Cluster(point, _COUNT * (covariance + _LEAST_M2 * np.eye(n)), (), mark.sort, mark.size)
+        Cluster(point, _COUNT * (covariance + _LEAST_M2 * np.eye(n)), (), mark.sort)
         for mark, point, covariance in zip(marks, points, covariances, strict=True)
     )
     still = Motion(np.zeros(n), np.zeros(dof - n), _STILL * np.eye(dof), 1e-3, is_broken=False)

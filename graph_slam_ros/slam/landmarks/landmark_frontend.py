@@ -114,11 +114,9 @@ class LandmarkFrontend:
             (HeldMapGate(self.map), AlarmGate(self.map, trusts_sightings)), lambda m: len(m.named), counters
         )
 
-    def restore(
-        self, landmarks: dict[str, Landmark], range_offsets: dict[str, int], passes: Sequence[list[Any]]
-    ) -> None:
+    def restore(self, landmarks: dict[str, Landmark], passes: Sequence[list[Any]]) -> None:
         """Continue with the landmarks of a map."""
-        self.map.restore(landmarks, range_offsets)
+        self.map.restore(landmarks)
         self.lifetimes.restore(passes)
         self.anonymous.restore()
 

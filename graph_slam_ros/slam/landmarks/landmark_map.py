@@ -8,7 +8,7 @@ import numpy as np
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.config.survey import Surveyed
 from graph_slam_ros.errors import ConfigError, NoiseError
-from graph_slam_ros.graph import POINT_PRIOR, R1, Gaussian, VertexKind
+from graph_slam_ros.graph import POINT_PRIOR, Gaussian, VertexKind
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.edge_noise import LEAST_RAD2, edge_noise
 from graph_slam_ros.measurements.types import Sighting
@@ -35,7 +35,6 @@ class Landmarks:
     ----------
     known : those in the graph, by identity
     undetermined : those that are not determined yet
-    offsets : by input, the vertex of what all its ranges have in common
     touched : the name of a landmark of the graph for each change of it, in order
     touched_before : changes that are not in ``touched`` any more
     aliases : the landmark that an identity is of, where somebody has merged two
@@ -62,7 +61,6 @@ class Landmarks:
         for name, known in config.survey.items():
             if known.orientation:
                 self._noise_of_pose(name, known)
-        self.offsets: dict[str, int] = {}
         self.touched: list[str] = []
         self.touched_before = 0
         self.aliases: dict[str, str] = {}
@@ -109,10 +107,9 @@ class Landmarks:
             measured = (*measured, *[0.0] * (self._space.dimensions - 1))
         return self._survey[name], self._from_sensor(s, where, motion_compensation.point_of(self._space, measured))
 
-    def restore(self, known: dict[str, Landmark], offsets: dict[str, int]) -> None:
+    def restore(self, known: dict[str, Landmark]) -> None:
         """Continue with these landmarks, whose vertices and edges are in the graph."""
         self.known.update(known)
-        self.offsets.update(offsets)
         self.touched += known
 
     def renumber(self, vertices: Index, edges: Index) -> None:
@@ -124,7 +121,6 @@ class Landmarks:
             landmark.vertex = int(vertices[landmark.vertex])
             landmark.seen = [one.renumbered(vertices, edges) for one in landmark.seen if edges[one.edge] >= 0]
             landmark.stamps = {one.where.stamp_ns for one in landmark.seen}
-        self.offsets = {name: int(vertices[vertex]) for name, vertex in self.offsets.items()}
         self.touched_before += len(self.touched) - len(self.known)
         self.touched[:] = self.known
         self.origins.renumber(edges)
@@ -183,9 +179,6 @@ class Landmarks:
         else:
             edge_type, metres = space.sightings[s.kind], 0 if s.kind == "bearing" else 1
             compensated = self._from_sensors(s, where, landmark)
-            if s.kind == "range" and self._config.landmarks.range_offset_sigma_m > 0.0:
-                edge_type = space.range_with_offset
-                vertices.append(self._offset(topic))
         distance_m = float(np.linalg.norm(compensated.measured[:metres]))
         noise = edge_noise(self._counters, topic, self._blurred(s, compensated), metres, distance_m)
         edge = self._edges.add_edge(edge_type, vertices, compensated.measured, noise, LABEL, topic)
@@ -215,15 +208,6 @@ class Landmarks:
         elif s.kind != "bearing":
             covariance[0, 0] += added
         return covariance
-
-    def _offset(self, topic: str) -> int:
-        """The vertex of the offset that all ranges of a topic share."""
-        if topic not in self.offsets:
-            vertex = self._graph.add_vertex(R1, [0.0])
-            noise = Gaussian.from_sigmas(self._config.landmarks.range_offset_sigma_m)
-            self._graph.add_edge(POINT_PRIOR[R1], [vertex], [0.0], noise, "range_offset")
-            self.offsets[topic] = vertex
-        return self.offsets[topic]
 
     # -- taken back ----------------------------------------------------------------------------------------------
 
@@ -340,7 +324,7 @@ class Landmarks:
         for where, s in candidate.seen:
             covariance = motion_compensation.as_matrix(s.covariance) + LEAST_RAD2 * np.eye(len(s.measured))
             glances.append(PartialObservation(self._sensor_pose(s, where), s.kind, s.measured, covariance))
-        candidate.places = triangulation.places(self._space, glances, self._config.landmarks.range_offset_sigma_m)
+        candidate.places = triangulation.places(self._space, glances)
         candidate.reason = why_undetermined(self._config.landmarks, self._space, self._solver, candidate, glances)
         if not candidate.reason:
             del self.undetermined[name]

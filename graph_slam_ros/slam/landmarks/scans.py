@@ -24,7 +24,6 @@ SCAN_NS, _SCAN_RAD = 500_000_000, 0.15
 NEARBY_S = np.linspace(-0.5, 0.5, 21)
 NEARBY_NS = 500_000_000
 """Times relative to a scan's stamp, at which its motion by odometry is kept, for clocks that differ."""
-_OTHER_SIZE = 6.0  # sigmas by which sizes of two sightings of one thing do not differ
 _SAME = 0.9973  # probability with which two sightings of one thing fall into one cluster
 
 
@@ -226,15 +225,13 @@ class Seen:
 class Cluster:
     """Sightings of one landmark: its position relative to the scan, with covariance (n, n).
 
-    ``sort`` is the class of the landmark, empty where none of them has one; ``size`` is the mean of its sizes [m], zero
-    where none of them has one.
+    ``sort`` is the class of the landmark, empty where none of them has one.
     """
 
     point: Array
     covariance: Array
     seen: tuple[Seen, ...]
     sort: str = ""
-    size: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -267,11 +264,10 @@ class ScanBuilder:
     ----------
     extent : (n, n) covariance of where on a thing it is seen
     close_m : things this close to one another are one
-    size_sigma_m : of a size; zero: sizes are not compared
     """
 
-    def __init__(self, space: Geometry, extent: Array, close_m: float, size_sigma_m: float = 0.0) -> None:
-        self._space, self._extent, self._close_m, self._size_sigma_m = space, extent, close_m, size_sigma_m
+    def __init__(self, space: Geometry, extent: Array, close_m: float) -> None:
+        self._space, self._extent, self._close_m = space, extent, close_m
         self._glimpses: list[_Glimpse] = []
 
     @property
@@ -313,21 +309,15 @@ class ScanBuilder:
             return None
         middle = glimpses[(len(glimpses) - 1) // 2]
         carried = [self._carried(one, middle.at) for one in glimpses]
-        groups = _clustered(
-            [point for point, _ in carried],
-            [c + self._extent for _, c in carried],
-            glimpses,
-            self._close_m,
-            self._size_sigma_m,
-        )
+        points, covariances = [point for point, _ in carried], [c + self._extent for _, c in carried]
+        groups = _clustered(points, covariances, glimpses, self._close_m)
         clusters = []
         for members in groups:
             point = np.mean([carried[k][0] for k in members], axis=0)
             covariance = np.mean([carried[k][1] for k in members], axis=0) + self._extent
             seen = tuple(glimpses[k].seen.shared_by(len(members)) for k in members)
             sort = next((glimpses[k].sort for k in members if glimpses[k].sort), "")
-            sizes = [one.sighting.size for one in seen if one.sighting.size]
-            clusters.append(Cluster(point, covariance, seen, sort, float(np.mean(sizes)) if sizes else 0.0))
+            clusters.append(Cluster(point, covariance, seen, sort))
         return Scan(middle.at, middle.seen.where, tuple(clusters))
 
     def _carried(self, one: _Glimpse, at: Reckoned) -> tuple[Array, Array]:
@@ -337,11 +327,7 @@ class ScanBuilder:
 
 
 def _clustered(
-    points: Sequence[Array],
-    covariances: Sequence[Array],
-    glimpses: Sequence[_Glimpse],
-    close_m: float,
-    size_sigma_m: float,
+    points: Sequence[Array], covariances: Sequence[Array], glimpses: Sequence[_Glimpse], close_m: float
 ) -> list[list[int]]:
     """Indices of the sightings of each landmark. Those of one message are of one landmark only if they are close."""
     groups: list[list[int]] = []
@@ -354,7 +340,6 @@ def _clustered(
             away = point - mean
             is_far = float(np.linalg.norm(away)) > close_m
             is_other = bool(glimpses[k].sort) and any(glimpses[i].sort not in ("", glimpses[k].sort) for i in group)
-            is_other |= any(_differ_in_size(glimpses[i], glimpses[k], size_sigma_m) for i in group)
             if is_other or (is_far and _same_message(glimpses, group, k)):
                 continue
             chi2 = float(away @ np.linalg.solve(covariances[k] + covariances[first], away))
@@ -367,11 +352,6 @@ def _clustered(
             groups[best].append(k)
             means[best] = np.mean([points[i] for i in groups[best]], axis=0)
     return groups
-
-
-def _differ_in_size(a: _Glimpse, b: _Glimpse, sigma_m: float) -> bool:
-    one, other = a.seen.sighting.size, b.seen.sighting.size
-    return sigma_m > 0.0 and one > 0.0 and other > 0.0 and abs(one - other) > _OTHER_SIZE * sigma_m
 
 
 def _same_message(glimpses: Sequence[_Glimpse], group: Sequence[int], k: int) -> bool:

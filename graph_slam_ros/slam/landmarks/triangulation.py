@@ -20,7 +20,6 @@ _ITERATIONS = 30
 _ARRIVED_M = 1e-5
 _ONE_PLACE_M = 1e-2
 _LEAST_CURVATURE = 1e-12
-_NO_OFFSET_M = 1e-6
 
 
 Field = tuple[str, Array, Array, Array, Array]
@@ -52,20 +51,10 @@ class PositionHypothesis:
     chi2: float
 
 
-def places(
-    space: Geometry, glances: Sequence[PartialObservation], offset_sigma_m: float = 0.0
-) -> list[PositionHypothesis]:
-    """All local minima of the misfit to the sightings, the best first.
-
-    Parameters
-    ----------
-    offset_sigma_m : standard deviation of an unknown offset that all ranges have in common
-    """
-    fields = _fields(space, glances)
-    known = 1.0 / max(offset_sigma_m, _NO_OFFSET_M) ** 2
-    starts = np.array([[*start, 0.0] for start in _starts(space, glances[0])])
+def places(space: Geometry, glances: Sequence[PartialObservation]) -> list[PositionHypothesis]:
+    """All local minima of the misfit to the sightings, the best first."""
     found: list[PositionHypothesis] = []
-    for place in _descend(space, fields, starts, known):
+    for place in _descend(space, _fields(space, glances), np.array(_starts(space, glances[0]))):
         if all(np.linalg.norm(place.position - other.position) > _ONE_PLACE_M for other in found):
             found.append(place)
     return sorted(found, key=lambda place: place.chi2)
@@ -105,23 +94,22 @@ def _directions(n: int) -> Array:
     return np.stack([flat * np.cos(angle), flat * np.sin(angle), z], axis=1)
 
 
-def _descend(space: Geometry, fields: list[Field], starts: Array, known: float) -> list[PositionHypothesis]:
+def _descend(space: Geometry, fields: list[Field], starts: Array) -> list[PositionHypothesis]:
     """Levenberg-Marquardt from all starts at once, each to the nearest minimum. Returns those that converge, in order.
 
     Parameters
     ----------
-    starts : (s, n + 1) points and the ranges' offset
-    known : information on the offset
+    starts : (s, n)
     """
     n, at, damping = space.dimensions, starts.copy(), np.full(len(starts), 1e-3)
-    chi2, b, h = _normal(space, fields, at, known)
+    chi2, b, h = _normal(space, fields, at)
     under_way, has_arrived = np.arange(len(starts)), np.zeros(len(starts), dtype=bool)
     for _ in range(_ITERATIONS):
         k = under_way
         lift = damping[k, None] * np.einsum("kii->ki", h[k]) + _LEAST_CURVATURE
-        step = -np.linalg.solve(h[k] + lift[..., None] * np.eye(n + 1), b[k, :, None])[..., 0]
+        step = -np.linalg.solve(h[k] + lift[..., None] * np.eye(n), b[k, :, None])[..., 0]
         tried = at[k] + step
-        chi2_there, b_there, h_there = _normal(space, fields, tried, known)
+        chi2_there, b_there, h_there = _normal(space, fields, tried)
         goes = ~(chi2_there > chi2[k])
         gone = k[goes]
         at[gone], chi2[gone], b[gone], h[gone] = tried[goes], chi2_there[goes], b_there[goes], h_there[goes]
@@ -131,11 +119,8 @@ def _descend(space: Geometry, fields: list[Field], starts: Array, known: float) 
         under_way = k[~has_arrived[k]]
         if not len(under_way):
             break
-    points = h[:, :n, :n] - h[:, :n, n:] * h[:, n:, :n] / h[:, n:, n:]  # the offset is eliminated
-    return [
-        PositionHypothesis(at[k, :n], _covariance(points[k]), float(chi2[k]))
-        for k in np.flatnonzero(has_arrived).tolist()
-    ]
+    arrived = np.flatnonzero(has_arrived).tolist()
+    return [PositionHypothesis(at[k], _covariance(h[k]), float(chi2[k])) for k in arrived]
 
 
 def _covariance(information: Array) -> Array:
@@ -146,22 +131,17 @@ def _covariance(information: Array) -> Array:
     return inverse
 
 
-def _normal(space: Geometry, fields: list[Field], at: Array, known: float) -> tuple[Array, Array, Array]:
-    """chi2 (s,), gradients (s, n + 1) and Gauss-Newton matrices (s, n + 1, n + 1) at points and offsets (s, n + 1)."""
+def _normal(space: Geometry, fields: list[Field], at: Array) -> tuple[Array, Array, Array]:
+    """chi2 (s,), gradients (s, n) and Gauss-Newton matrices (s, n, n) at points (s, n)."""
     n = space.dimensions
-    b, h = np.zeros(at.shape), np.zeros((*at.shape, n + 1))
-    chi2, b[:, n], h[:, n, n] = known * at[:, n] ** 2, known * at[:, n], known
+    chi2, b, h = np.zeros(len(at)), np.zeros(at.shape), np.zeros((*at.shape, n))
     for kind, turns, sensors, measured, whiten in fields:
-        p = np.einsum("kij,ski->skj", turns, at[:, None, :n] - sensors)
+        p = np.einsum("kij,ski->skj", turns, at[:, None] - sensors)
         r = predict(space, kind, p) - measured
         first_angle = 0 if kind == "bearing" else 1
         r[..., first_angle:] = se2.wrap(r[..., first_angle:])
-        j = np.zeros((*r.shape, n + 1))
-        j[..., :n] = gradient(space, kind, p) @ np.swapaxes(turns, 1, 2)
-        if kind == "range":
-            r[..., 0] += at[:, None, n]
-            j[..., 0, n] = 1.0
-        j = (whiten @ j).reshape(len(at), -1, n + 1)
+        j = gradient(space, kind, p) @ np.swapaxes(turns, 1, 2)
+        j = (whiten @ j).reshape(len(at), -1, n)
         r = (whiten @ r[..., None]).reshape(len(at), -1, 1)
         transposed = np.swapaxes(j, 1, 2)
         chi2 += np.sum(r * r, axis=(1, 2))

@@ -9,13 +9,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from graph_slam_ros.config.robust import RobustConfig
-from graph_slam_ros.graph import Graph
 from graph_slam_ros.slam.robust.hypotheses import CancelToken, FrozenGraph, Outcome, search_alternatives
-from graph_slam_ros.slam.robust.mirrored import is_of_ranges
 from graph_slam_ros.typing import Executor as Executor
 from graph_slam_ros.typing import Result
 
-_FIRST_MIRRORED = 20  # keyframes until a map of ranges is compared with its mirror image; then twice as many each time
 _MORE = 1.5  # times as many out as at the last look: looks become rarer as their cost grows
 
 Work = Callable[[], Outcome | None]
@@ -39,7 +36,6 @@ class Background:
     def __init__(self, config: RobustConfig, executor: Executor) -> None:
         self._config, self._executor = config, executor
         self._out = 0  # candidates that were out at the last look
-        self._mirrored_at = _FIRST_MIRRORED  # the keyframe
         self._job: _Job | None = None
 
     @property
@@ -47,15 +43,11 @@ class Background:
         """Return whether a search goes on."""
         return self._job is not None
 
-    def is_due(self, out: int, keyframe: int, graph: Graph) -> bool:
-        """Return whether a search is due: by this number of rejected candidates, or because ranges may be mirrored."""
+    def is_due(self, out: int) -> bool:
+        """Return whether a search is due by this number of rejected candidates."""
         after, self._out = self._config.second_look_after, min(self._out, out)
         if self._job is not None or after <= 0:
             return False
-        if keyframe >= self._mirrored_at:
-            self._mirrored_at = 2 * keyframe
-            if is_of_ranges(graph):
-                return True
         return out >= max(self._out + after, _MORE * self._out)
 
     def start(self, frozen: FrozenGraph, out: int) -> None:

@@ -1,10 +1,10 @@
 """Search for the best explanation: solve, judge, solve again, from several starts; the lowest cost wins.
 
 The first verdicts of an online run may rest on a false closure that came before the true ones. So there are several
-starts: the online estimate with its verdicts; of a map of ranges, also its mirror image; the candidates that agree with
-a neighbour, at the online estimate and at odometry alone; and the largest group of rejected candidates. From each
-start, everything is solved and every candidate is judged by its residual, until no verdict changes. A rejected
-candidate costs the limit of its gate (truncated least squares).
+starts: the online estimate with its verdicts; the candidates that agree with a neighbour, at the online estimate and at
+odometry alone; and the largest group of rejected candidates. From each start, everything is solved and every candidate
+is judged by its residual, until no verdict changes. A rejected candidate costs the limit of its gate (truncated least
+squares).
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,7 +19,6 @@ from graph_slam_ros.graph import GROUPS, SE2, Graph, Loss
 from graph_slam_ros.graph.records import weights_of
 from graph_slam_ros.slam.robust.gating import OutlierGate
 from graph_slam_ros.slam.robust.ledger import FINAL, Ledger
-from graph_slam_ros.slam.robust.mirrored import is_of_ranges, mirror_images
 from graph_slam_ros.slam.robust.pairwise_consistency import consistent_groups, contradicting_sightings, odometry_in_use
 from graph_slam_ros.solver import Settings, Solver
 from graph_slam_ros.typing import Array, Index
@@ -27,9 +26,6 @@ from graph_slam_ros.typing import Array, Index
 _ITERATIONS = 20  # of each stage of the losses, from another start
 _HOPELESS = 2.0  # times the least cost that was found: another explanation is none
 _SAME = 1e-4  # of a cost, that one explanation may differ by from itself: solves end a little off the optimum
-MIRRORED = "mirrored"  # a start
-_LIKELIER = 9.0  # of the cost: by so much a mirror image must be likelier, and by so much less the other is ruled out
-_OTHER = 0.1  # m: another image differs by more, somewhere
 _NEAR = 1e-3  # m or rad: what two solves of one optimum differ by at most
 _STORY = 5  # closures that agree with one another and not with the map
 
@@ -63,19 +59,15 @@ class Alternative:
     ----------
     cost, best_cost : truncated cost of this one, and of the one that is believed
     only_here, only_there : closures that this one believes and the other does not, and the other way round
-    is_mirror_image : whether it is the mirror image of a map of ranges
     """
 
     cost: float
     best_cost: float
     only_here: tuple[int, ...] = ()
     only_there: tuple[int, ...] = ()
-    is_mirror_image: bool = False
 
-    def stands(self, graph: Graph, ledger: Ledger) -> bool:
-        """Return whether it is still possible: none of its edges was withdrawn, or only ranges tell the sides."""
-        if self.is_mirror_image:
-            return is_of_ranges(graph)
+    def stands(self, ledger: Ledger) -> bool:
+        """Return whether it is still possible: none of its edges was withdrawn."""
         return not np.isin(ledger.reason.values[list(self.only_here)], FINAL).any()
 
 
@@ -147,16 +139,14 @@ def search_alternatives(config: RobustConfig, frozen: FrozenGraph, wanted: Cance
     found = search.found
     if not found:
         return None
-    best = min(found, key=lambda outcome: outcome.cost + _LIKELIER * (outcome.start == MIRRORED))
+    best = min(found, key=lambda outcome: outcome.cost)
     rivals = {rival.only_here: rival for rival in (_rival(one, best) for one in found) if rival is not None}
     return replace(best, rivals=tuple(rivals.values()))
 
 
 def _rival(one: Outcome, best: Outcome) -> Alternative | None:
-    """Another explanation as an alternative to the best, if a whole group of closures differs, or all is mirrored."""
+    """Another explanation as an alternative to the best, if a whole group of closures differs."""
     graph = best.frozen.graph
-    if MIRRORED in (one.start, best.start) and np.abs(one.values - best.values).max() > _OTHER:
-        return Alternative(one.cost, best.cost, is_mirror_image=True) if one.cost < best.cost + _LIKELIER else None
     here, there = (outcome.ledger.inside for outcome in (one, best))
     only_here, only_there = np.setdiff1d(here, there), np.setdiff1d(there, here)
     is_story = np.count_nonzero(graph.has_label(only_here, ("closures",))) >= _STORY
@@ -172,9 +162,6 @@ def _starts(config: RobustConfig, frozen: FrozenGraph) -> Iterator[tuple[str, Ar
     """
     yield "online", frozen.values, None
     ledger, graph = frozen.ledger, frozen.graph
-    if not len(frozen.held) and is_of_ranges(graph):
-        for values in mirror_images(graph, frozen.values):
-            yield MIRRORED, values, None
     candidates = ledger.candidates
     is_closure = graph.has_label(candidates, ("closures",))
     closures, others = candidates[is_closure], candidates[~is_closure]

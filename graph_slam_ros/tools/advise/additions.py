@@ -152,7 +152,7 @@ class Additions:
     def _learn(self) -> None:
         of_key: dict[_Key, list[Entry]] = {}
         space = self._space
-        types = {*space.sightings.values(), space.tag_position, space.range_with_offset}
+        types = {*space.sightings.values(), space.tag_position}
         for entry in self._run.entries:
             is_known = entry.is_in and entry.landmark in self._run.landmarks
             key = entry.source, self._run.type_of(entry)

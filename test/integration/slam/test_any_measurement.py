@@ -35,7 +35,6 @@ class Stranger:
             "landmarks.association": association,
             "landmarks.added_sigma_m": self.pick(0.0, 0.05),
             "landmarks.unnamed_sigma_m": self.pick(0.0, 0.1),
-            "landmarks.range_offset_sigma_m": self.pick(0.0, 1.0),
             "landmarks.loss": self.pick("none", "huber", "cauchy", "huber_then_cauchy"),
             "keyframes.shared_noise": self.pick(0.0, 0.05, 1e9),
             "odometry.noise": self.pick("twist", "density"),

@@ -126,22 +126,6 @@ def test_what_is_seen_between_keyframes_by_a_sensor_anywhere_costs_nothing_where
     assert pipeline.report.chi2_final < 1e-6
 
 
-@BOTH
-def test_ranges_that_share_an_offset_say_how_large_it_is(space):
-    true, odom = drive(space, 20.0)
-    world = landmarks(space)
-    pipeline = slam(space, landmarks__range_offset_sigma_m=1.0)
-    for k, at in enumerate(odom):
-        pipeline.process(Odometry(stamp(k), at))
-        if k % 4 == 1:
-            seen = [sighting(space, "range", name, true[k], p, 0.01) for name, p in world.items()]
-            longer = [Sighting(s.id, s.kind, (s.measured[0] + 0.4,), s.covariance, s.T_base_sensor) for s in seen]
-            pipeline.process(Sightings(stamp(k), "seen", tuple(longer)))
-    [pipeline.process(event) for event in END]
-    (offset,) = [v for v in range(pipeline.graph.vertex_count) if pipeline.graph.kind_of(v).dof == 1]
-    assert pipeline.solver.estimate([offset])[0] == pytest.approx([0.4], abs=0.02)
-
-
 def test_G3_a_landmark_seen_by_bearing_from_one_place_waits_and_says_why():
     pipeline = slam(PLANAR)
     for k in range(40):

@@ -309,57 +309,37 @@ def pairs():
     return drive(rng, (0.0, 0.0, 0.0), twists, TICK_NS, NOISE, observe, 5, true)
 
 
-def with_features(by):
-    """The measurements of ``pairs`` without ids; sightings have a class or a size."""
-    rng = np.random.default_rng(4)
+def seen_by(slam, *, has_class):
+    """The pipeline after ``pairs`` without ids; sightings have a size, and perhaps a class."""
 
     def known(s):
-        if by == "class":
-            return replace(s, id="", sort=s.id.split()[0])
-        size = 0.5 if s.id.startswith("tree") else 0.15
-        return replace(s, id="", size=size + 0.03 * float(rng.standard_normal()) if by == "size" else 0.0)
+        sort = s.id.split()[0]
+        return replace(s, id="", sort=sort * has_class, size={"tree": 0.5, "pole": 0.15}[sort])
 
-    for m in measurements(pairs()):
-        yield replace(m, sightings=tuple(known(s) for s in m.sightings)) if isinstance(m, Sightings) else m
-
-
-def kind_of(one):
-    """Of a sighting or a landmark, by its class or size."""
-    return one.sort or ("tree" if one.size > 0.325 else "pole")
-
-
-def seen_by(slam, by):
-    for m in [*with_features(by), Control("end"), Control("optimize")]:
-        slam.process(m)
+    for m in [*measurements(pairs()), Control("end"), Control("optimize")]:
+        slam.process(replace(m, sightings=tuple(map(known, m.sightings))) if isinstance(m, Sightings) else m)
     return slam
 
 
-@functools.cache
-def taken_for_one():
-    """How many landmarks there are where neither is seen."""
-    return len(seen_by(pipeline("joint", size_sigma_m=0.03), "nothing").landmarks)
-
-
-@pytest.mark.parametrize("by", ["class", "size"])
-def test_landmarks_near_one_another_are_told_apart_by_their_class_or_size_and_a_map_has_them(by, tmp_path):
-    slam = seen_by(pipeline("joint", size_sigma_m=0.03), by)
+def test_landmarks_near_one_another_are_told_apart_by_their_class_and_a_map_has_it_and_their_size(tmp_path):
+    slam = seen_by(pipeline("joint"), has_class=True)
     at = places(slam)
     apart = np.linalg.norm(at[:, None] - at, axis=2) + 100.0 * np.eye(len(at))
     assert len(at) == 16
     assert apart.min(axis=1).max() < 0.6
-    assert taken_for_one() < 16
+    assert len(seen_by(pipeline("joint"), has_class=False).landmarks) < 16
 
     marks = slam.landmarks.values()
-    assert sorted(map(kind_of, marks)) == ["pole"] * 8 + ["tree"] * 8
-    assert all(bool(mark.sort) == (by == "class") and bool(mark.sized) == (by == "size") for mark in marks)
+    assert sorted(mark.sort for mark in marks) == ["pole"] * 8 + ["tree"] * 8
+    assert all(mark.size == pytest.approx({"tree": 0.5, "pole": 0.15}[mark.sort]) for mark in marks)
     writer = RecordWriter(tmp_path / "map.mcap")
     writer.write([{"type": "map", "version": 1}, MapGrowth().since(state_of(slam))])
     writer.close()
     start = read_map(tmp_path, [])
     assert [(m.sort, m.size, m.sized) for m in start.landmarks.values()] == [(m.sort, m.size, m.sized) for m in marks]
-    again = seen_by(GraphSlam(slam.config, start=start), by)
-    seen = {name: [kind_of(one.sighting) for one in mark.seen] for name, mark in again.landmarks.items()}
-    wrong = sum(kind != kind_of(start.landmarks[name]) for name in start.landmarks for kind in seen[name])
+    again = seen_by(GraphSlam(slam.config, start=start), has_class=True)
+    seen = {name: [one.sighting.sort for one in mark.seen] for name, mark in again.landmarks.items()}
+    wrong = sum(kind != start.landmarks[name].sort for name in start.landmarks for kind in seen[name])
     assert sum(map(len, seen.values())) > 1.5 * sum(len(mark.seen) for mark in marks), "they are seen again"
     assert wrong < 0.01 * sum(map(len, seen.values()))
 

@@ -486,20 +486,6 @@ def test_a_run_in_space_leaves_positions_rotations_and_all_covariances(tmp_path)
     assert again.slam.config.world.dimensions == 3
 
 
-def test_an_offset_that_ranges_share_is_a_vertex_of_its_own_in_the_saved_graph(tmp_path):
-    config = Config.from_mapping({"landmarks.range_offset_sigma_m": 0.5})
-    recorder = RunRecorder(tmp_path, config)
-    slam = GraphSlam(config, recorder.sink)
-    for m in [*measurements(simulate("warehouse", 0, aisles=2, laps=1, sensor="range")), Control("optimize")]:
-        slam.process(m)
-    recorder.save(slam)
-    file = read_g2o(tmp_path / "graph.g2o")
-    assert file.graph.vertex_count == slam.graph.vertex_count == len(set(file.ids))
-    vertices = [line.split(",") for line in (tmp_path / "graph_vertices.csv").read_text().splitlines()[1:]]
-    assert [row[1] for row in vertices].count("offset") == 1
-    assert len(vertices) == slam.graph.vertex_count
-
-
 def a_run(folder):
     recorder = RunRecorder(folder, Config(), force=True)
     slam = GraphSlam(sink=recorder.sink)

@@ -516,26 +516,6 @@ def test_which_of_two_halls_alike_it_is_stays_open(halls):
     assert (undecided > 0) == (halls == 2)
 
 
-# -- sizes ---------------------------------------------------------------------------------------------------------
-
-
-def sized(second, points, sizes):
-    one = scan(second, (0, 0, 0, 0), points)
-    return replace(one, clusters=tuple(replace(c, size=s) for c, s in zip(one.clusters, sizes, strict=True)))
-
-
-def test_what_has_another_size_is_another_landmark_and_of_two_the_one_of_its_size():
-    settings = replace(SETTINGS, size_sigma_m=0.05)
-    first = sized(0.0, [(4.0, 0.0)], [0.2])
-    assert explained([first, sized(0.5, [(4.0, 0.0)], [0.6])], settings)[1] == [0, 1]
-    assert explained([first, sized(0.5, [(4.0, 0.0)], [0.22])], settings)[1] == [0, 0]
-    assert explained([first, sized(0.5, [(4.0, 0.0)], [0.0])], settings)[1] == [0, 0], "not known"
-    assert explained([first, sized(0.5, [(4.0, 0.0)], [0.6])])[1] == [0, 0], "sizes are not compared by default"
-    both = sized(0.0, [(4.0, 0.1), (4.0, -0.1)], [0.2, 0.6])
-    names = explained([both, sized(0.5, [(4.0, 0.0)], [0.6])], settings)[1]
-    assert names[2] == names[1], "the second is as near"
-
-
 @pytest.mark.parametrize("landmarks", [3, 40])
 def test_the_equations_of_a_chain_with_a_border_are_solved_as_the_dense_ones(landmarks):
     """A short border is dense; the landmarks of a long one are factorised as a sparse matrix."""
@@ -582,11 +562,11 @@ def test_landmarks_out_of_reach_of_a_cluster_are_none_that_fit_it(n):
     rng = np.random.default_rng(n)
     at, there = rng.uniform(-10.0, 10.0, (40, n)), rng.uniform(-10.0, 10.0, (25, n))
     whiten, turn = 0.5 * rng.standard_normal((40, n, n)) + 1.5 * np.eye(n), rotation(rng.standard_normal(2 * n - 3))
-    of_size, is_other = rng.uniform(0.0, 9.0, (40, 25)), rng.random((40, 25)) < 0.3
+    is_other = rng.random((40, 25)) < 0.3
     weakest = np.array([np.linalg.svd(one)[1][-1] ** 2 for one in whiten])
-    least, best = constellation._nearest(at, there, turn, whiten, 60.0 / weakest, of_size, is_other)
+    least, best = constellation._nearest(at, there, turn, whiten, 60.0 / weakest, is_other)
     chi2 = np.array([[np.sum((w @ turn.T @ (y - x)) ** 2) for y in there] for w, x in zip(whiten, at, strict=True)])
-    chi2 = np.where(is_other, np.inf, chi2 + of_size)
+    chi2 = np.where(is_other, np.inf, chi2)
     near = chi2.min(axis=1) < 60.0
     assert 5 < np.count_nonzero(near) < 40
     assert least[near] == pytest.approx(chi2.min(axis=1)[near], rel=1e-12)
