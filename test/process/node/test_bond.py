@@ -79,18 +79,15 @@ def test_P14_a_bond_forms_when_active_and_breaks_with_whoever_goes(tmp_path, wit
             until(lambda: said[1:] == ["broken: dead\n"], r.spin, "end by the process that was told to stop")
     assert MISSING not in n.said
     assert "Traceback" not in n.said
-
-
-def test_P14_the_manager_notices_a_node_that_has_crashed(tmp_path, with_bond):
     with manager(lenient(1.0)) as (_, said):
-        with managed(tmp_path / "run") as n, robot(hears=()) as r:
+        with managed(tmp_path / "another") as n, robot(hears=()) as r:
             assert r.change("configure", lenient(30.0))
             r.settle()
             assert not said, "there is no bond before it is active"
             assert r.change("activate")
             until(lambda: said == ["formed\n"], r.spin, "bond")
         assert n.process.returncode == -signal.SIGKILL
-        until(lambda: said[1:] == ["broken: silent\n"], time.sleep, "silence")
+        until(lambda: said[1:] == ["broken: silent\n"], time.sleep, "silence of one that has crashed")
 
 
 @pytest.mark.skipif(is_installed(), reason="bond is installed")

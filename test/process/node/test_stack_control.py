@@ -306,11 +306,14 @@ def killed_in_mid_drive(folder, drive):
     return stamps, before
 
 
-def test_P2_P12_killed_it_goes_on_in_its_map_and_where_it_was_if_odometry_goes_on(tmp_path):
-    drive = Drive()
-    known, before = killed_in_mid_drive(tmp_path / "run", drive)
-    parameters = f"output.folder:={tmp_path / 'run'}", "inputs.reliable:=true"
-    with node(*parameters) as n, robot(hears=("pose", "/tf", "path", "/diagnostics", "landmarks")) as r:
+def test_P2_P12_killed_it_goes_on_where_it_was_if_odometry_goes_on_else_once_a_landmark_is_recognised(tmp_path):
+    run, drive = tmp_path / "run", Drive()
+    known, before = killed_in_mid_drive(run, drive)
+    parameters, hears = (
+        (f"output.folder:={run}", "inputs.reliable:=true"),
+        ("pose", "/tf", "path", "odometry", "landmarks"),
+    )
+    with node(*parameters) as n, robot(hears=hears) as r:
         r.wait_for_node()
         drive.sees = False
         drive.stamp_ns += 10**9
@@ -326,17 +329,9 @@ def test_P2_P12_killed_it_goes_on_in_its_map_and_where_it_was_if_odometry_goes_o
         drive.sees = True
         r.until_it_says("OK", spin=drive.pace(r))
         until(lambda: drive.off_by(r) < 0.5, drive.pace(r), "the pose of now")
-        finish(n, r)
     assert "the last run was never ended: going on in its map" in n.said
-    assert is_repeated(tmp_path / "run", tmp_path)
-    assert not is_cut_off(tmp_path / "run")
-
-
-def test_P2_P12_killed_with_its_odometry_it_claims_no_pose_until_a_landmark_is_recognised(tmp_path):
-    drive = Drive()
-    killed_in_mid_drive(tmp_path / "run", drive)
-    parameters = f"output.folder:={tmp_path / 'run'}", "inputs.reliable:=true"
-    with node(*parameters) as n, robot(hears=("pose", "/tf", "odometry", "/diagnostics")) as r:
+    assert n.process.returncode == -signal.SIGKILL
+    with node(*parameters) as n, robot(hears=hears) as r:
         r.wait_for_node()
         drive.sees = False
         drive.stamp_ns += 10**9
@@ -350,7 +345,8 @@ def test_P2_P12_killed_with_its_odometry_it_claims_no_pose_until_a_landmark_is_r
         until(lambda: r.heard["pose"] and r.heard["tf"], drive.pace(r), "place in the map")
         until(lambda: drive.off_by(r) < 0.5, drive.pace(r), "the pose of now")
         finish(n, r)
-    assert is_repeated(tmp_path / "run", tmp_path)
+    assert is_repeated(run, tmp_path)
+    assert not is_cut_off(run)
 
 
 # -- parameters --------------------------------------------------------------------------------------------------------
