@@ -1,4 +1,4 @@
-"""A Dask scheduler and workers of it, as processes that talk over TCP on the loopback."""
+"""A Dask scheduler and workers of it, as processes that talk over TCP on the loopback; drives and their results."""
 
 import contextlib
 import json
@@ -8,6 +8,11 @@ import sys
 import time
 from pathlib import Path
 
+from graph_slam_ros import cli
+from graph_slam_ros.runs.replay import replay
+from graph_slam_ros.slam import Config
+
+HASHED = ("graph.g2o", "ledger.csv", "path.tum", "landmarks.csv", "map.mcap")
 PATIENCE_S = 60.0
 
 
@@ -59,3 +64,21 @@ def children(pid: int) -> list[int]:
     with contextlib.suppress(FileNotFoundError):
         return [int(one) for file in Path(f"/proc/{pid}/task").glob("*/children") for one in file.read_text().split()]
     return []
+
+
+def drives(folder: Path, count: int, *damaged: bytes):
+    """Recordings with truth and damaged ones in a folder, and the bytes of the results of a serial run, by name."""
+    serial = {}
+    for name in (f"{seed}.mcap" for seed in range(1, count + 1)):
+        words = ["simulate", "pythonrobotics", "--out", str(folder / name), "--seed", name.partition(".")[0]]
+        assert cli.main(words) == 0
+        replay(folder / name, folder.with_name("serial") / name, Config())
+        serial[name] = contents(folder.with_name("serial") / name)
+    for k, content in enumerate(damaged):
+        (folder / f"damaged{k}.mcap").write_bytes(content)
+    return serial
+
+
+def contents(run: Path):
+    """Return what is the same wherever a recording was replayed."""
+    return {name: (run / name).read_bytes() for name in HASHED}

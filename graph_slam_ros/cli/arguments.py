@@ -86,9 +86,8 @@ def add_out(sub: CommandParser, *, required: bool = True, default: str = "") -> 
 
 def add_force(sub: CommandParser) -> None:
     """Add ``--force``."""
-    sub.add_argument(
-        "--force", action="store_true", help="replace an existing run or file; nothing else is overwritten"
-    )
+    about = "replace an existing run or file; nothing else is overwritten"
+    sub.add_argument("--force", action="store_true", help=about)
 
 
 def add_json(sub: CommandParser, what: str = "all of it") -> None:
@@ -112,9 +111,8 @@ def add_truth(sub: CommandParser, *, required: bool) -> None:
         help="topic of the truth: poses, odometry, NavSatFix or PointStamped; of transforms /tf:PARENT:CHILD"
         " (default: /ground_truth, or the only one that may be it)",
     )
-    sub.add_argument(
-        "--no-align", action="store_true", help="do not align: the map is in the frame of the truth already"
-    )
+    about = "do not align: the map is in the frame of the truth already"
+    sub.add_argument("--no-align", action="store_true", help=about)
 
 
 def add_shown(sub: CommandParser) -> None:

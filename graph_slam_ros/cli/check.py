@@ -25,9 +25,8 @@ def check_options(sub: CommandParser, *, of_check: bool = True) -> None:
     sub.add_argument("--odom", metavar="TOPIC", help="odometry topic (default: as info chooses)")
     sub.add_argument("--landmarks", metavar="TOPIC", help="landmark topic (default: as info chooses)")
     sub.add_argument("--config", type=Path, metavar="FILE", help="parameter file; its values come before info's")
-    sub.add_argument(
-        "--set", action="append", default=[], metavar="KEY=VALUE", help="set one parameter, before the file's"
-    )
+    about = "set one parameter, before the file's"
+    sub.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help=about)
     if of_check:
         sub.add_argument("--quick", action="store_true", help="leave out what needs a replay and a fit")
     arguments.add_json(sub)

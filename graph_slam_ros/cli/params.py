@@ -13,13 +13,8 @@ from graph_slam_ros.errors import GraphSlamError
 
 def params_options(sub: CommandParser) -> None:
     """Add the options of ``params``."""
-    sub.add_argument(
-        "pattern",
-        nargs="?",
-        default="",
-        metavar="PATTERN",
-        help="part of a name or of its help, or a name with * (default: all)",
-    )
+    about = "part of a name or of its help, or a name with * (default: all)"
+    sub.add_argument("pattern", nargs="?", default="", metavar="PATTERN", help=about)
 
 
 def params(args: argparse.Namespace) -> int:

@@ -22,16 +22,11 @@ def replay_options(sub: CommandParser) -> None:
     sub.add_argument("--odom", metavar="TOPIC", help="odometry topic (default: the only one, or /odom)")
     sub.add_argument("--landmarks", metavar="TOPIC", help="landmark topic (default: the only one, or /landmarks)")
     arguments.add_config(sub)
-    sub.add_argument(
-        "--map", type=Path, metavar="RUN", help="continue in the map of a run, frozen or not, with its parameters"
-    )
+    about = "continue in the map of a run, frozen or not, with its parameters"
+    sub.add_argument("--map", type=Path, metavar="RUN", help=about)
     sub.add_argument("--ros", action="store_true", help="publish into a live ROS graph: a node of its own with --out")
-    sub.add_argument(
-        "--rate",
-        type=arguments.positive,
-        metavar="X",
-        help="with --ros: multiple of real time (default: as fast as possible)",
-    )
+    about = "with --ros: multiple of real time (default: as fast as possible)"
+    sub.add_argument("--rate", type=arguments.positive, metavar="X", help=about)
     sub.add_argument("--node", metavar="NAME", help="with --ros and without --out: name of the running node")
 
 

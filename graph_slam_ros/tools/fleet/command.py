@@ -23,43 +23,23 @@ def _check_installed() -> None:
 
 def replay_options(sub: CommandParser) -> None:
     """Add the options of ``fleet replay``."""
-    sub.add_argument(
-        "recordings", nargs="+", metavar="BAG", help="recordings, folders of them, s3:// or gs:// addresses"
-    )
+    about = "recordings, folders of them, s3:// or gs:// addresses"
+    sub.add_argument("recordings", nargs="+", metavar="BAG", help=about)
     sub.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the results of the fleet")
-    sub.add_argument(
-        "--config",
-        type=Path,
-        nargs="+",
-        action="extend",
-        default=[],
-        metavar="YAML",
-        help="replay with each of these files",
-    )
-    sub.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="KEY=V1,V2",
-        help="replay with each of these values of a parameter",
-    )
-    sub.add_argument(
-        "--truth",
-        default="",
-        metavar="PATTERN",
-        help="truth of each recording: {path}, {folder} and {stem} are replaced",
-    )
+    about = "replay with each of these files"
+    sub.add_argument("--config", type=Path, nargs="+", action="extend", default=[], metavar="YAML", help=about)
+    about = "replay with each of these values of a parameter"
+    sub.add_argument("--set", action="append", default=[], metavar="KEY=V1,V2", help=about)
+    about = "truth of each recording: {path}, {folder} and {stem} are replaced"
+    sub.add_argument("--truth", default="", metavar="PATTERN", help=about)
     sub.add_argument("--report", action="store_true", help="write a report on each run")
-    sub.add_argument(
-        "--workers", type=arguments.count, default=0, metavar="N", help="processes (default: one for each core)"
-    )
+    about = "processes (default: one for each core)"
+    sub.add_argument("--workers", type=arguments.count, default=0, metavar="N", help=about)
     sub.add_argument("--scheduler", default="", metavar="ADDRESS", help="Dask scheduler to use, as tcp://host:8786")
-    sub.add_argument(
-        "--limit", type=arguments.positive, default=3600.0, metavar="S", help="seconds for one run (default: 3600)"
-    )
-    sub.add_argument(
-        "--memory", type=arguments.positive, default=0.0, metavar="MIB", help="memory for one run (default: any)"
-    )
+    about = "seconds for one run (default: 3600)"
+    sub.add_argument("--limit", type=arguments.positive, default=3600.0, metavar="S", help=about)
+    about = "memory for one run (default: any)"
+    sub.add_argument("--memory", type=arguments.positive, default=0.0, metavar="MIB", help=about)
 
 
 def table_options(sub: CommandParser) -> None:
@@ -76,13 +56,8 @@ def compare_options(sub: CommandParser) -> None:
     sub.codes = f"{CODES} 4: worse than --fail allows."
     sub.add_argument("old", type=Path, metavar="OLD", help="folder of the earlier fleet")
     sub.add_argument("new", type=Path, metavar="NEW", help="folder of the later fleet")
-    sub.add_argument(
-        "--fail",
-        action="append",
-        default=[],
-        metavar="LIMIT",
-        help="exit with 4 beyond it: METRIC>NUMBERx or METRIC>NUMBER",
-    )
+    about = "exit with 4 beyond it: METRIC>NUMBERx or METRIC>NUMBER"
+    sub.add_argument("--fail", action="append", default=[], metavar="LIMIT", help=about)
     sub.add_argument("--markdown", type=Path, metavar="FILE", help="write the comparison as Markdown")
 
 

@@ -18,9 +18,8 @@ def view_options(sub: CommandParser) -> None:
     arguments.add_run(sub)
     arguments.add_shown(sub)
     sub.add_argument("--port", type=arguments.port, default=0, help="port to listen on (default: a free one)")
-    sub.add_argument(
-        "--host", default="127.0.0.1", metavar="ADDRESS", help="address to listen on (default: this machine alone)"
-    )
+    about = "address to listen on (default: this machine alone)"
+    sub.add_argument("--host", default="127.0.0.1", metavar="ADDRESS", help=about)
     sub.add_argument("--no-browser", action="store_true", help="print the address, and open no browser")
 
 

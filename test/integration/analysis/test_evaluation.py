@@ -75,12 +75,6 @@ def test_known_errors_come_out_with_their_statistics_and_units():
     assert error.n == 8
 
 
-def test_a_rigid_motion_is_no_error():
-    error = path_error(eight().moved(motion(5.0, -3.0, 2.1)), eight())
-    assert error.position_m["max"] < 1e-9
-    assert error.angle_rad["max"] < 1e-7
-
-
 def test_in_space_the_alignment_has_six_degrees_of_freedom_and_the_error_all_three_axes():
     rng = np.random.default_rng(3)
     truth = Trajectory(START_S + np.arange(50.0), np.array([se3.exp(tuple(d)) for d in rng.normal(size=(50, 6))]))
@@ -98,11 +92,6 @@ def test_in_space_the_alignment_has_six_degrees_of_freedom_and_the_error_all_thr
 def test_positions_on_a_line_leave_a_turn_open_in_space():
     with pytest.raises(GraphSlamError, match="on a line"):
         alignment(np.outer(np.arange(5.0), (1.0, 2.0, 3.0)), np.outer(np.arange(5.0), (1.0, 0.0, 0.0)))
-
-
-def test_a_wrong_scale_is_an_error():
-    error = path_error(ring([1.1]), ring([1.0]))
-    assert error.position_m["rmse"] == pytest.approx(0.1)
 
 
 def test_the_alignment_stays_in_the_plane_and_never_mirrors():

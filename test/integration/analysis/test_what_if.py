@@ -82,17 +82,6 @@ def test_another_loss_is_that_of_all_that_may_be_wrong(saved):
     assert plain.after.chi2_final <= plain.before.chi2_final
 
 
-def test_influence_to_first_order_is_that_of_solving_again(saved):
-    """For edges that fit: the largest, within a fifth; the whole step, not its length alone, for the first of them."""
-    found = saved.influences(8)
-    assert [one.exact_m for one in found] == sorted((one.exact_m for one in found), reverse=True)
-    assert all(one.exact_m == pytest.approx(one.first_order_m, rel=0.2) for one in found)
-    last, edge = saved.keyframes[-1:], found[0].edge
-    before, after = saved.solve().estimate(last)[0], saved.solve([edge]).estimate(last)[0]
-    step = saved.space.group.local(tuple(after), tuple(before))
-    assert step == pytest.approx(saved.first_order(edge), abs=0.2 * float(np.linalg.norm(step)))
-
-
 def test_a_landmark_without_its_sightings_is_left_out_and_what_determines_nothing_is_refused(saved):
     landmark = next(e.landmark for e in saved.entries if e.landmark)
     seen = [e.edge for e in saved.entries if e.landmark == landmark and e.is_in]

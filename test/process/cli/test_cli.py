@@ -107,24 +107,6 @@ def test_the_command_that_info_prints_works_as_it_is(bag, run, tmp_path, capsys,
     assert results(tmp_path / words[-1]) == results(run)
 
 
-def test_replay_takes_the_inputs_that_info_suggests_where_no_topic_is_usual(tmp_path, capsys, monkeypatch):
-    """Landmarks in a cloud, and a truth that looks like landmarks: without that it would be odometry alone."""
-    monkeypatch.chdir(tmp_path)
-    assert told(capsys, *SIMULATE, "--set", "sensor=range_bearing", "--out", "drive.mcap")[0] == 0
-    code, out, (said,) = told(capsys, "replay", "drive.mcap", "--out", "run")
-    assert code == 0
-    assert "not used" not in out
-    begin = "graph_slam: there are no landmarks of the usual type, so this is: "
-    assert said.startswith(begin)
-    program, *words = shlex.split(said.removeprefix(begin))
-    assert program == "graph_slam"
-    assert told(capsys, *words)[::2] == (0, [])
-    assert results(tmp_path / "drive_run") == results(tmp_path / "run")
-    code, _, err = told(capsys, "replay", "drive.mcap", "--out", "alone", "--set", "inputs.names=odom")
-    assert code == 3
-    assert "this is odometry alone" in err[0]
-
-
 def test_replay_names_what_could_be_an_input_and_is_none(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert told(capsys, *SIMULATE, "--set", "gnss=1", "--set", "imu=10", "--out", "drive.mcap")[0] == 0
@@ -266,9 +248,13 @@ REFUSED = {
         "did you mean 'odometry'?",
     ),
     "run with a typo": (["explain", "{bag}s"], "did you mean 'drive it.mcap'?"),
-    "fault with a typo": (
-        ["simulate", "warehouse", "--out", "{out}.mcap", "--fault", "wrong_mout"],
+    "first fault with a typo": (
+        ["simulate", "warehouse", "--out", "{out}.mcap", "--fault", "wrong_mout", "--fault", "wrong_ids"],
         "did you mean 'wrong_mount'?",
+    ),
+    "first of two files of a fleet": (
+        ["fleet", "replay", "{bag}", "--config", "no.yaml", "--config", "{text}", "--out", "{out}"],
+        "no.yaml",
     ),
     "unknown option": (["info", "{bag}", "--fast"], "unrecognized arguments: --fast"),
     "two bags": (
@@ -280,6 +266,7 @@ REFUSED = {
     "missing bag": (["replay", "none.mcap", "--out", "{out}"], "none.mcap: no such file or folder"),
     "empty bag": (["replay", "{empty}", "--out", "{out}"], "empty.mcap: the file is empty"),
     "bag cut off too early": (["info", "{cut}"], "cut.mcap: no topic in it that is whole; cut.mcap: cut off after 0"),
+    "fifo": (["info", "{fifo}"], "neither a file nor a folder"),
     "no recording": (["info", "{text}"], "text.mcap: not a readable recording"),
     "unknown topic": (
         ["replay", "{bag}", "--out", "{out}", "--odom", "/wheel"],
@@ -358,7 +345,8 @@ def test_what_is_refused_is_told_in_one_line_with_code_2_and_nothing_is_touched(
         names[name].parent.mkdir(exist_ok=True)
         names[name].write_text(content)
     names["there"] = shutil.copytree(run, tmp_path / "there")
-    names["foreign"], names["cut"] = tmp_path / "f", tmp_path / "cut.mcap"
+    names |= {"foreign": tmp_path / "f", "cut": tmp_path / "cut.mcap", "fifo": tmp_path / "fifo.mcap"}
+    os.mkfifo(names["fifo"])
     names["cut"].write_bytes(bag.read_bytes()[:5000])
     before = results(run)
     code, _, err = told(capsys, *(word.format(**names) for word in words))
@@ -431,14 +419,6 @@ def test_the_installed_command_passes_its_exit_code_on(tmp_path):
     out, err = p.communicate(timeout=60)
     assert (p.returncode, out) == (2, "")
     assert err == f"graph_slam: {tmp_path}/none.mcap: no such file or folder\n"
-
-
-def test_a_fifo_is_refused_and_not_waited_for(tmp_path):
-    os.mkfifo(tmp_path / "a.mcap")
-    p = process("info", tmp_path / "a.mcap")
-    _, err = p.communicate(timeout=30)
-    assert p.returncode == 2
-    assert "neither a file nor a folder" in err
 
 
 def test_ctrl_c_during_a_replay_is_one_line_and_code_130_and_leaves_nothing_behind(bag, long_bag, tmp_path, capsys):

@@ -2,11 +2,8 @@
 
 import gzip
 import json
-import os
 import shlex
 import struct
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -137,16 +134,9 @@ def test_the_text_shows_every_step_and_the_classes(run, graph):
         assert any(name in line and f"{part['chi2']:.6f}" in line for line in out.splitlines())
 
 
-def test_few_iterations_are_told_as_not_converged(run):
-    code, out, _ = run(CITY, "--max-iterations", 1)
-    assert code == 0
-    assert "NOT converged (max_iterations)" in out
-
-
 def test_the_number_of_iterations_may_be_bounded(run):
-    answer = answer_of(run, CITY, "--init", "file", "--max-iterations", 2)
-    assert (answer["stop"], answer["converged"]) == ("max_iterations", False)
-    assert answer["iterations"] == 2
+    code, out, _ = run(CITY, "--init", "file", "--max-iterations", 2)
+    assert (code, "NOT converged (max_iterations)" in out, out.count("largest step")) == (0, True, 2)
 
 
 @pytest.fixture
@@ -349,20 +339,6 @@ def test_options_that_cannot_be_are_refused_in_one_line(graph, words, capsys):
     assert err.count("\n") == 1
     assert words[0] in err
     assert " _" not in err  # no name of a function
-
-
-def test_the_installed_command_never_shows_a_traceback(tmp_path):
-    noise = tmp_path / "noise.g2o"
-    noise.write_bytes(bytes(range(256)) * 40)
-    done = subprocess.run(
-        [sys.executable, "-m", "graph_slam_ros.cli", "optimize", str(noise)],
-        capture_output=True,
-        text=True,
-        env=os.environ | {"GRAPH_SLAM_TRACEBACK": ""},
-        timeout=60,
-    )
-    assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == "graph_slam: noise.g2o: not a text file\n"
 
 
 def test_a_suspicious_result_is_told_with_what_other_starts_came_to_and_which_won(run, tmp_path):

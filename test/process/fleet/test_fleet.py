@@ -12,50 +12,35 @@ import pytest
 
 pytest.importorskip("distributed", reason="the extra fleet is not installed")
 
+import fleet_nodes
 from distributed import Client
-from fleet_nodes import scheduler, wait_for
+from fleet_nodes import contents, scheduler, wait_for
 
 from graph_slam_ros import cli
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.runs.replay import replay
-from graph_slam_ros.slam import Config
 from graph_slam_ros.tools.fleet import engine
 from graph_slam_ros.tools.fleet.engine import Workers, connected, run_jobs
 from graph_slam_ros.tools.fleet.job import Job
 from graph_slam_ros.tools.fleet.replay import Fleet, replay_all
 
-HASHED = ("graph.g2o", "ledger.csv", "path.tum", "landmarks.csv", "map.mcap")
+
+@pytest.fixture(scope="module")
+def serial(tmp_path_factory):
+    """Bytes of the results of each of three recordings, replayed one by one; a fourth one is damaged."""
+    folder = tmp_path_factory.mktemp("fleet") / "drives"
+    folder.mkdir()
+    return folder, fleet_nodes.drives(folder, 3, b"\x89MCAP0\r\n" + bytes(100))
 
 
 @pytest.fixture(scope="module")
-def drives(tmp_path_factory):
-    """Three recordings with truth, and one that is damaged."""
-    folder = tmp_path_factory.mktemp("drives")
-    for seed in (1, 2, 3):
-        assert (
-            cli.main(["simulate", "pythonrobotics", "--out", str(folder / f"d{seed}.mcap"), "--seed", str(seed)]) == 0
-        )
-    (folder / "damaged.mcap").write_bytes(b"\x89MCAP0\r\n" + bytes(100))
-    return folder
-
-
-@pytest.fixture(scope="module")
-def serial(drives, tmp_path_factory):
-    """Bytes of the results of each recording, replayed one by one in this process."""
-    out = tmp_path_factory.mktemp("serial")
-    for seed in (1, 2, 3):
-        replay(drives / f"d{seed}.mcap", out / f"d{seed}", Config())
-    return {f"d{seed}.mcap": contents(out / f"d{seed}") for seed in (1, 2, 3)}
-
-
-def contents(run):
-    return {name: (run / name).read_bytes() for name in HASHED}
+def drives(serial):
+    return serial[0]
 
 
 def equal_to_serial(out, rows, serial):
     for row in rows:
         if row["state"] == "done":
-            assert contents(out / "jobs" / row["key"] / "run") == serial[row["recording"]], row
+            assert contents(out / "jobs" / row["key"] / "run") == serial[1][row["recording"]], row
     return sum(row["state"] == "done" for row in rows)
 
 
@@ -76,7 +61,7 @@ def test_one_command_replays_all_and_the_second_time_nothing(drives, serial, tmp
     options = ("--out", out, "--truth", "{path}", "--workers", 2)
     done = fleet("replay", drives, *options)
     assert done.returncode == 3, done
-    assert "failed: damaged.mcap (defaults):" in done.stderr
+    assert "failed: damaged0.mcap (defaults):" in done.stderr
     assert "Traceback" not in done.stderr
     rows = [json.loads(file.read_text()) for file in out.glob("jobs/*/row.json")]
     assert equal_to_serial(out, rows, serial) == 3
@@ -128,12 +113,12 @@ def test_over_tcp_a_worker_that_is_killed_changes_nothing(drives, serial, tmp_pa
         done = replay_all(Fleet([str(drives)], out), Workers(address))
         killer.join()
     assert equal_to_serial(out, done.rows, serial) == 3
-    assert [row["recording"] for row in done.rows if row["state"] == "failed"] == ["damaged.mcap"]
+    assert [row["recording"] for row in done.rows if row["state"] == "failed"] == ["damaged0.mcap"]
     assert all(row["attempts"] <= 3 for row in done.rows)
 
 
 def test_a_job_beyond_its_limits_is_a_row_and_the_others_are_done(drives, tmp_path):
-    one = str(drives / "d1.mcap")
+    one = str(drives / "1.mcap")
     slow = replay_all(Fleet([one], tmp_path / "slow", limit_s=0.05), Workers(count=1))
     assert [row["state"] for row in slow.rows] == ["failed"]
     assert "limit of time" in slow.rows[0]["reason"]
@@ -145,11 +130,11 @@ def test_a_job_beyond_its_limits_is_a_row_and_the_others_are_done(drives, tmp_pa
 
 def test_without_its_truth_a_run_is_kept_and_says_so(drives, tmp_path):
     truth = "{folder}/{stem}.tum"
-    done = replay_all(Fleet([str(drives / "d1.mcap")], tmp_path / "out", truth=truth), Workers(count=1))
+    done = replay_all(Fleet([str(drives / "1.mcap")], tmp_path / "out", truth=truth), Workers(count=1))
     (row,) = done.rows
     assert row["state"] == "incomplete"
     assert "not compared with the truth" in row["reason"]
-    assert "d1.tum" in row["reason"]
+    assert "1.tum" in row["reason"]
     assert (tmp_path / "out/jobs" / row["key"] / "run/path.tum").is_file()
 
 
@@ -190,22 +175,22 @@ def test_a_full_disk_is_named_and_with_room_the_same_command_goes_on(drives, ser
     if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=300k", "none", tmp_path], check=False).returncode:
         pytest.skip("needs the right to mount a small file system")
     try:
-        full = fleet("replay", drives / "d1.mcap", "--out", tmp_path / "out", "--workers", 1)
+        full = fleet("replay", drives / "1.mcap", "--out", tmp_path / "out", "--workers", 1)
         assert full.returncode in (2, 3), full
         assert "No space left on device" in full.stderr
         assert "Traceback" not in full.stderr
         subprocess.run(["mount", "-o", "remount,size=20m", tmp_path], check=True)
-        done = replay_all(Fleet([str(drives / "d1.mcap")], tmp_path / "out"), Workers(count=1))
+        done = replay_all(Fleet([str(drives / "1.mcap")], tmp_path / "out"), Workers(count=1))
         assert equal_to_serial(tmp_path / "out", done.rows, serial) == 1
     finally:
         subprocess.run(["umount", "--lazy", tmp_path], check=False)
 
 
 def test_a_copy_of_a_recording_is_named(drives, tmp_path):
-    (tmp_path / "same.mcap").write_bytes((drives / "damaged.mcap").read_bytes())
-    both = (drives / "damaged.mcap", tmp_path / "same.mcap")
+    (tmp_path / "same.mcap").write_bytes((drives / "damaged0.mcap").read_bytes())
+    both = (drives / "damaged0.mcap", tmp_path / "same.mcap")
     done = fleet("replay", *both, "--out", tmp_path / "out", "--workers", 1)
-    assert "not replayed: same.mcap: a copy of damaged.mcap, which has the row" in done.stderr
+    assert "not replayed: same.mcap: a copy of damaged0.mcap, which has the row" in done.stderr
     assert "runs              1 " in done.stdout
 
 

@@ -12,51 +12,37 @@ import pytest
 
 pytest.importorskip("distributed", reason="the extra fleet is not installed")
 
+import fleet_nodes
 from distributed import Client
-from fleet_nodes import children, scheduler
+from fleet_nodes import children, contents, scheduler
 from reliability import tell, times
 
-from graph_slam_ros import cli
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.runs.replay import replay
-from graph_slam_ros.slam import Config
 from graph_slam_ros.tools.fleet.engine import Workers
 from graph_slam_ros.tools.fleet.replay import Fleet, replay_all
 
-HASHED = ("graph.g2o", "ledger.csv", "path.tum", "landmarks.csv", "map.mcap")
 COUNT = times(2, 12)
 DAMAGE = (b"", b"nothing", b"\x89MCAP0\r\n" + bytes(100))
 SOAK = pytest.mark.skipif(not times(0, 1), reason="takes minutes: make soak")
 
 
 @pytest.fixture(scope="module")
-def drives(tmp_path_factory):
-    """Recordings, and three that are damaged, one of them cut off."""
-    folder = tmp_path_factory.mktemp("drives")
-    for seed in range(COUNT):
-        assert cli.main(["simulate", "pythonrobotics", "--out", str(folder / f"{seed}.mcap"), "--seed", str(seed)]) == 0
-    for k, content in enumerate(DAMAGE):
-        (folder / f"damaged{k}.mcap").write_bytes(content)
-    return folder
+def serial(tmp_path_factory):
+    """Bytes of the results of recordings, replayed one by one; three more are damaged, one of them cut off."""
+    folder = tmp_path_factory.mktemp("fleet") / "drives"
+    folder.mkdir()
+    return folder, fleet_nodes.drives(folder, COUNT, *DAMAGE)
 
 
 @pytest.fixture(scope="module")
-def serial(drives, tmp_path_factory):
-    """Bytes of the results, replayed one by one in this process."""
-    out = tmp_path_factory.mktemp("serial")
-    for seed in range(COUNT):
-        replay(drives / f"{seed}.mcap", out / f"{seed}", Config())
-    return {f"{seed}.mcap": contents(out / f"{seed}") for seed in range(COUNT)}
-
-
-def contents(run):
-    return {name: (run / name).read_bytes() for name in HASHED}
+def drives(serial):
+    return serial[0]
 
 
 def check(out, rows, serial):
     """No result is wrong; return the recordings that have one."""
     done = {row["recording"]: contents(out / "jobs" / row["key"] / "run") for row in rows if row["state"] == "done"}
-    assert done == {name: serial[name] for name in done}
+    assert done == {name: serial[1][name] for name in done}
     assert all(row["attempts"] <= 3 for row in rows)
     assert all(row["reason"] for row in rows if row["state"] != "done")
     return set(done)
@@ -65,7 +51,7 @@ def check(out, rows, serial):
 def whole(drives, out, serial, workers=2):
     """The same command again has all results, and leaves nothing half-written."""
     rows = replay_all(Fleet([str(drives)], out), Workers(count=workers)).rows
-    assert check(out, rows, serial) == set(serial)
+    assert check(out, rows, serial) == set(serial[1])
     assert sum(row["state"] == "failed" for row in rows) == len(DAMAGE)
     assert not list(out.glob("jobs/.*"))
 
@@ -85,16 +71,6 @@ def test_a_fleet_that_is_killed_at_any_moment_goes_on(drives, serial, tmp_path):
         process.communicate()
     whole(drives, tmp_path / "out", serial)
     tell("fleets killed, and begun again", killed=stops)
-
-
-@SOAK
-def test_of_two_fleets_that_begin_together_one_is_refused(drives, serial, tmp_path):
-    for k in range(times(0, 5)):
-        both = [begun(drives, tmp_path / f"{k}", "--workers", "1") for _ in range(2)]
-        ends = [(*process.communicate(timeout=300), process.returncode) for process in both]
-        (refused,) = [said for _, said, code in ends if code == 2]
-        assert "another fleet writes into it" in refused
-        whole(drives, tmp_path / f"{k}", serial)
 
 
 @SOAK
