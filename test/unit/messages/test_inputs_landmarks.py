@@ -143,6 +143,7 @@ POINT = (1.0, 2.0, 3.0, 4, 0.1)
         (cloud(doubles("id", "range"), (1, -2.0)), "range_not_positive"),
         (cloud(doubles("id", "bearing"), (1, 0.2)), "noise_unknown"),
     ],
+    ids=lambda one: one if isinstance(one, str) else "",
 )
 def test_A29_a_cloud_that_cannot_be_used_is_counted_under_its_reason(cdr, reason):
     b = scanner(2)
@@ -367,9 +368,6 @@ def test_mrpts_beacons_are_ranges():
     m = heard(of(kind), "seen", cdr)
     assert told(m) == [("2", "range", (5.0,), [0.01])]
     assert only(m).T_base_sensor == pytest.approx((0.5, 0.0, 0.0))
-
-
-# -- types that cannot be -------------------------------------------------------------------------------------------
 
 
 def test_a_recorded_definition_that_lacks_what_is_read_is_refused_by_field():
