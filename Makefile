@@ -11,6 +11,7 @@
 # lock          write requirements.txt and constraints-oldest.txt from setup.py; LOCK=--upgrade takes newer versions
 # bench         measure ours against GTSAM, g2o and python-graphslam into docs/benchmarks.md and accuracy.md; hours
 # robust        measure ours and GTSAM with false closures and wrong ids, into docs/robustness.md; two hours, resumed where it was
+# figures       measure the table that must not get worse, docs/figures/figures.csv, and compare; half an hour; WRITE=1 replaces it
 # pictures      draw the pictures of README.md and docs/ again, in Chromium
 # clean         remove what these made
 
@@ -30,7 +31,7 @@ ifeq ($(SYSTEM_ROS),)
 unexport LD_LIBRARY_PATH
 endif
 
-.PHONY: install demo check test soak colcon test-oldest lint format lock bench robust pictures clean
+.PHONY: install demo check test soak colcon test-oldest lint format lock bench robust figures pictures clean
 .DELETE_ON_ERROR:
 
 install: $(VENV)/interfaces.stamp $(VENV)/kernels.stamp
@@ -149,6 +150,9 @@ bench: $(VENV)-bench/stamp $(VENV)-bench-g2o/stamp
 robust: $(VENV)-bench/stamp
 	$(VENV)-bench/bin/python -m benchmarks.robust --jobs 2 --keep benchmarks/results/robust --json benchmarks/results/robust.json
 	$(VENV)-bench/bin/python -m benchmarks.table benchmarks/results/robust.json
+
+figures: $(VENV)-bench/stamp
+	$(VENV)-bench/bin/python -m benchmarks.figures $(if $(WRITE),--write) $(if $(ONLY),--only '$(ONLY)')
 
 pictures: install
 	PYTHONPATH=test $(BIN)/python tools/pictures.py

@@ -79,13 +79,18 @@ def courses(kept: Kept) -> Iterator[Course]:
             options.say(f"skipped: no {path}: set GRAPH_SLAM_DATASETS")
     if converter.exists() and set_7.exists():
         for robot in _ROBOTS:
-            name = f"MR.CLAM 7, robot {robot}"
-            drawn, truth = kept.ask(digest(name, code_of(OURS)), partial(_mrclam, name, converter, set_7, robot))
-            yield drawn.course(partial(_against_truth, truth))
+            yield of_robot(kept, robot, converter, set_7)
     if park.exists():
         drive = victoria_park.read_drive(park)
         drawn = kept.ask(digest(park.name, code_of(OURS), victoria_park.SETTINGS), partial(_victoria_park, drive))
         yield drawn.course(partial(_against_gps, drive, drawn.stamps_s))
+
+
+def of_robot(kept: Kept, robot: int, converter: Path, set_7: Path) -> Course:
+    """That of a robot of MR.CLAM set 7."""
+    name = f"MR.CLAM 7, robot {robot}"
+    drawn, truth = kept.ask(digest(name, code_of(OURS)), partial(_mrclam, name, converter, set_7, robot))
+    return drawn.course(partial(_against_truth, truth))
 
 
 def _mrclam(name: str, converter: Path, set_7: Path, robot: int) -> tuple[Drawn, Array]:

@@ -59,8 +59,8 @@ def commanded(words: list[str]) -> float:
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
-def compare(bag: Path, command: str, options: list[str], reps: int) -> str:
-    """Let reading and the command take turns; return a line with their medians and the ratio."""
+def times(bag: Path, command: str, options: list[str], reps: int) -> tuple[int, list[float], list[float]]:
+    """Let the command and reading take turns; return the number of messages, and the CPU times of both [s]."""
     reading_s, command_s, count = list[float](), list[float](), 0
     with tempfile.TemporaryDirectory(prefix="replay-") as folder:
         out = ["--out", f"{folder}/run", "--force"] if command == "replay" else []
@@ -69,6 +69,12 @@ def compare(bag: Path, command: str, options: list[str], reps: int) -> str:
             count, cpu_s = read(bag)
             reading_s.append(cpu_s)
             command_s.append(commanded([command, str(bag.resolve()), *out, *options]))
+    return count, command_s, reading_s
+
+
+def compare(bag: Path, command: str, options: list[str], reps: int) -> str:
+    """Return a line with the medians of both, and the ratio."""
+    count, command_s, reading_s = times(bag, command, options, reps)
     reading, whole = statistics.median(reading_s), statistics.median(command_s)
     spread = ", ".join(f"{a:.1f}/{b:.2f}" for a, b in zip(command_s, reading_s, strict=True))
     return (

@@ -20,7 +20,7 @@ from numba.core import event
 
 from benchmarks.fresh import ROOT
 
-_COMPILE = "from graph_slam_ros.warmup import compile_all; compile_all(dimensions={dimensions})"
+COMPILE = "from graph_slam_ros.warmup import compile_all; compile_all(dimensions={dimensions})"
 _DEMO = "import sys; from graph_slam_ros.cli import main; sys.exit(main(['demo', '--out', {out!r}]))"
 
 
@@ -47,16 +47,20 @@ class _Costs(event.Listener):
         self._inner[-1] += took
 
 
-def _run(what: str, code: str, cache: Path) -> None:
-    """Print CPU and wall time of a process with its children, and its exit code where that is not 0."""
+def run(code: str, cache: Path) -> tuple[float, float, int]:
+    """Return CPU and wall time [s] of a process with its children, whose kernels are in a folder, and its exit code."""
     before, since = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     environment = os.environ | {"GRAPH_SLAM_CACHE": str(cache)}
     command = [sys.executable, "-c", code]
     done = subprocess.run(command, cwd=ROOT, env=environment, check=False, stdout=subprocess.DEVNULL)
     wall, after = time.perf_counter() - since, resource.getrusage(resource.RUSAGE_CHILDREN)
-    cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    code_said = f", exit code {done.returncode}" if done.returncode else ""
-    print(f"{what}: {cpu:.1f} s of CPU, {wall:.1f} s{code_said}", flush=True)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, wall, done.returncode
+
+
+def _say(what: str, code: str, cache: Path) -> None:
+    """Print what ``run`` returns."""
+    cpu, wall, status = run(code, cache)
+    print(f"{what}: {cpu:.1f} s of CPU, {wall:.1f} s{f', exit code {status}' if status else ''}", flush=True)
 
 
 def _table() -> None:
@@ -83,9 +87,9 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="start-") as folder:
         place = Path(folder)
         for what, dimensions in (("the plane", 2), ("all kernels", 3)):
-            _run(f"compile {what}", _COMPILE.format(dimensions=dimensions), place / f"{dimensions}")
+            _say(f"compile {what}", COMPILE.format(dimensions=dimensions), place / f"{dimensions}")
         for what in ("demo, nothing compiled", "demo once more"):
-            _run(what, _DEMO.format(out=str(place / what)), place / "demo")
+            _say(what, _DEMO.format(out=str(place / what)), place / "demo")
         if parser.parse_args().kernels:
             environment = os.environ | {"GRAPH_SLAM_CACHE": str(place / "kernels")}
             command = [sys.executable, "-m", "benchmarks.start", "--table"]
