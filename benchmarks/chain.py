@@ -15,7 +15,7 @@ from benchmarks import fresh, options, table
 from benchmarks.contenders import ONLINE_PEERS, OURS
 from benchmarks.drive import drive
 from benchmarks.problem import Edges, Problem
-from graph_slam_ros.cli import values
+from graph_slam_ros.cli import arguments as values
 from graph_slam_ros.lie import se2
 
 _SIGMAS = 0.1, 0.1, 0.02  # [m, m, rad]

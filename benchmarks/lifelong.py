@@ -33,7 +33,7 @@ from benchmarks import fresh, lifelong, table
 from benchmarks.city import City
 from benchmarks.city import config as in_city
 from benchmarks.hall import STEP_S, Course, config, fitted, measured, rms, without_ids
-from graph_slam_ros.cli import values
+from graph_slam_ros.cli import arguments as values
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
 from graph_slam_ros.runs.whole_path import removed_path
 from graph_slam_ros.slam import Control, GraphSlam, Measurement, Sightings

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from benchmarks.fresh import ROOT
 from benchmarks.problem import Problem, read_problem, sphere_problem
-from graph_slam_ros.cli import values
+from graph_slam_ros.cli import arguments as values
 from graph_slam_ros.errors import GraphSlamError
 
 PATIENCE_S = 600.0

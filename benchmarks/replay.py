@@ -19,7 +19,7 @@ from pathlib import Path
 
 from benchmarks.fresh import ROOT
 from benchmarks.options import say
-from graph_slam_ros.cli import values
+from graph_slam_ros.cli import arguments as values
 
 _READ = """
 import sys, time

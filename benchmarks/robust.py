@@ -26,7 +26,7 @@ from benchmarks.kept import Kept, code_of, digest
 from benchmarks.robust_cells import Rates
 from benchmarks.scores import Row, Score, Stage, row, score, stages
 from benchmarks.trials import POLICIES, Trial
-from graph_slam_ros.cli import values
+from graph_slam_ros.cli import arguments as values
 from graph_slam_ros.errors import GraphSlamError
 
 SEEDS = 10
