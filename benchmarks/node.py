@@ -11,11 +11,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from benchmarks import options, table
-from benchmarks.live import cities, drives, executors, lifecycle, paths
+from benchmarks.live import cities, drives, lifecycle, paths
 from graph_slam_ros.warmup import warmup
 
 FIGURES: dict[str, Callable[[bool], Sequence[table.Row]]] = {
-    "executors": executors.measure,
     **drives.FIGURES,
     "path": paths.measure,
     **cities.FIGURES,

@@ -124,26 +124,6 @@ def _batch(rows: Sequence[Row]) -> str:
     return _table(names, lines)
 
 
-def _growth(rows: Sequence[Row]) -> str:
-    names = ("poses", "who", "odometry alone, µs", "with a closure, µs")
-    lines = [
-        [f"{row['from']} to {row['to']}", row["who"], _microseconds(row["odometry_s"]), _microseconds(row["closure_s"])]
-        for row in sorted(rows, key=lambda row: (row["from"], row["who"] != OURS, row["who"]))
-    ]
-    return "![time per update over the size of the graph](growth.png)\n\n" + _table(names, lines)
-
-
-def _memory(rows: Sequence[Row]) -> str:
-    names = ("world", "poses, edges", "who", "peak MB", "bytes per pose")
-    lines = []
-    for row in rows:
-        peak = _with_ratio(row, _of_ours(row, rows), "peak_bytes", 1e-6, 1)
-        who = row["who"] + (f" ({row['fault']})" if row["fault"] else "")
-        sizes = [row["graph"], f"{row['poses']}, {row['edges']}"]
-        lines.append([*sizes, who, peak, f"{row['peak_bytes'] / row['poses']:.0f}"])
-    return _table(names, lines)
-
-
 def _consistency(rows: Sequence[Row]) -> str:
     names = ("world", "settings", "seeds", "NEES of", "mean", "expected", "99.9 % band", "", "within 3 sigma")
     lines = []
@@ -204,8 +184,6 @@ _TABLES: dict[str, Callable[[Sequence[Row]], str]] = {
     "online": _online,
     "update": _online,
     "batch": _batch,
-    "growth": _growth,
-    "memory": _memory,
     "consistency": _consistency,
     "marginals": _marginals,
     "robust": _robust,
@@ -254,10 +232,6 @@ def _cost(row: Row, rows: Sequence[Row], error_map: str) -> str:
 def _repeated(rows: Sequence[Row]) -> str:
     times = max((row.get("reps", 1) for row in rows), default=1)
     return f"medians of {times} repetitions" if times > 1 else ""
-
-
-def _microseconds(seconds: float | None) -> str:
-    return "" if seconds is None else f"{1e6 * seconds:.0f}"
 
 
 def _table(names: Sequence[str], lines: Sequence[Sequence[str]]) -> str:

@@ -1,7 +1,6 @@
 """Draw all pictures of the README and of docs/ again: ``make pictures``.
 
 The drive of the demonstration, a page of its report, and the repair of a map step by step (docs/repair.md) in Chromium.
-Times of the growth picture are those of the table in docs/benchmarks.md.
 """
 
 import re
@@ -119,7 +118,6 @@ def main() -> None:
         demonstration(Path(scratch), browser)
         repair(Path(scratch), browser)
         browser.close()
-    subprocess.run([sys.executable, "-m", "benchmarks.growth", "--redraw"], check=True, cwd=ROOT)
 
 
 if __name__ == "__main__":

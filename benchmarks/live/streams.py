@@ -43,7 +43,7 @@ def warehouse(seconds: float, odometry_hz: int, landmarks_hz: int) -> Iterator[B
 
 
 def city(poses: int, dimensions: int = 2) -> Iterator[BagMessage]:
-    """Manhattan of 60 by 60 blocks with a closure per three poses, as ``benchmarks.growth`` drives through it.
+    """Manhattan of 60 by 60 blocks with a closure per three poses.
 
     A pose per second: its odometry, the closure that ends there, and odometry that releases both.
     """
