@@ -450,12 +450,12 @@ def test_the_command_tries_a_second_start_where_it_is_not_certified_and_ends_wit
 
 
 def test_a_second_start_that_is_no_better_is_told_so_and_one_that_fails_why(run, monkeypatch):
-    monkeypatch.setattr("graph_slam_ros.tools.certificate.other_start", lambda start: "file")
+    monkeypatch.setattr("graph_slam_ros.tools.certificate.command.other_start", lambda start: "file")
     code, out = run(ring(PLANE, 2), "--init", "file")
     assert code == 4
     assert "which is no lower\n  not certified\n" in out
-    monkeypatch.setattr("graph_slam_ros.tools.certificate.other_start", lambda start: "nowhere")
-    monkeypatch.setattr("graph_slam_ros.cli.optimize._START", {"file": "the file", "nowhere": "nowhere"})
+    monkeypatch.setattr("graph_slam_ros.tools.certificate.command.other_start", lambda start: "nowhere")
+    monkeypatch.setattr("graph_slam_ros.tools.certificate.command.STARTS", {"file": "the file", "nowhere": "nowhere"})
     code, out = run(ring(PLANE, 2), "--init", "file")
     assert code == 4
     assert "a second start, nowhere, fails: init 'nowhere'" in out
