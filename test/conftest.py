@@ -6,6 +6,7 @@ import os
 import re
 import sys
 import tempfile
+from importlib.util import find_spec
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the commands do, before NumPy comes in
@@ -85,6 +86,20 @@ def pytest_sessionstart(session) -> None:  # type: ignore[no-untyped-def]
     """Not by the first test that needs one, whose digits would be its own; what hands tests to others needs none."""
     is_alone = hasattr(session.config, "workerinput") or not getattr(session.config.option, "numprocesses", None)
     (warmup if is_alone else compile_all)()
+
+
+@pytest.fixture(autouse=True)
+def domain(request, monkeypatch):  # type: ignore[no-untyped-def]
+    """Nodes of a test are alone in a DDS domain: what is left of others says nothing there."""
+    if not request.path.match("process/node/*.py") or find_spec("rclpy") is None:
+        yield
+        return
+    import live_nodes
+
+    with live_nodes.own_domain() as number:
+        monkeypatch.setitem(live_nodes.ENVIRONMENT, "ROS_DOMAIN_ID", number)
+        monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        yield
 
 
 @pytest.fixture
