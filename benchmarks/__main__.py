@@ -18,8 +18,7 @@ def main() -> None:
     """One programme after the other; what is done is in the document even if the next is stopped."""
     races = (["batch"], ["online"], ["online", "--no-path"])
     lifelong = ["lifelong", "--keyframes", "50000", "--seeds", "1", "--windows", "60"]
-    city = ["lifelong", "--keyframes", "20000", "--seeds", "1", "--windows", "60", "--blocks", "20"]
-    for programme in (*races, ["consistency"], ["marginals"], lifelong, city):
+    for programme in (*races, ["consistency"], ["marginals"], lifelong):
         asked = sys.argv[1:] if programme in races else []
         path = _RESULTS / f"{''.join(programme)}.json"
         subprocess.run(

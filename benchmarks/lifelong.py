@@ -2,8 +2,7 @@
 
 ``python -m benchmarks.lifelong``. A hall of 60 by 40 m, aisles driven at random, a keyframe each 0.5 m, 40 landmarks
 that are seen within 8 m, every second one. ``GraphSlam`` gets the measurements as from a robot; each drive has a
-process of its own. With ``--blocks`` it is a city that is known by closures alone, a keyframe each metre. What is
-printed of a drive:
+process of its own. What is printed of a drive:
 
 * sizes of the graph at the end, and resident memory after a tenth of the drive and at the end;
 * errors: of the newest pose (in the frame of the landmarks), of the whole path (keyframes that left the map included)
@@ -30,14 +29,12 @@ if not __package__:  # run as a script: what it imports is in the repository, no
     sys.path[0] = str(Path(__file__).resolve().parents[1])
 
 from benchmarks import fresh, lifelong, table
-from benchmarks.city import City
-from benchmarks.city import config as in_city
 from benchmarks.hall import STEP_S, Course, config, fitted, measured, rms, without_ids
 from graph_slam_ros.cli import arguments as values
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
 from graph_slam_ros.runs.whole_path import removed_path
 from graph_slam_ros.slam import Control, GraphSlam, Measurement, Sightings
-from graph_slam_ros.slam.lifelong.removed import Left
+from graph_slam_ros.slam.lifelong.state import Left
 from graph_slam_ros.typing import Array, Numbers
 from graph_slam_ros.warmup import warmup
 
@@ -221,42 +218,6 @@ class UnnamedDrive(Drive):
         return np.asarray(KDTree(places).query(there @ turn.T + shift)[1])
 
 
-class CityDrive(Drive):
-    """The same in a city that is known by closures alone, in the frame of the first pose."""
-
-    def __init__(self, city: City, window: int) -> None:
-        self.city, self.slam = city, GraphSlam(in_city(city.space, **_settings(window)))
-        self._begin(len(city.where))
-
-    def measurements(self) -> Iterator[list[Measurement]]:
-        """Return what the robot measures at each keyframe; once."""
-        return self.city.measurements()
-
-    def figures(self) -> dict[str, float]:
-        """What was measured."""
-        error, nees = np.array(self.looks).T
-        return {
-            **self._sizes(),
-            "newest m": float(np.sqrt((error**2).mean())),
-            "path m": rms(self.path, self._true()[: len(self.path)]),
-            "NEES newest": float(nees.mean()),
-            **self._times(),
-        }
-
-    def _true(self) -> Array:
-        out = np.zeros((len(self.city.where), self.slam.space.dimensions))
-        out[:, :2] = self.city.where
-        return out
-
-    def _newest(self) -> tuple[float, ...]:
-        slam, group = self.slam, self.slam.space.group
-        newest = slam.keyframes[-1].vertex
-        (pose,), (covariance,) = slam.solver.estimate([newest]), slam.solver.marginal([newest])
-        off = np.array(group.log(group.between(tuple(pose), self.city.in_map(len(slam.keyframes) - 1))))
-        error = float(np.linalg.norm(off[: slam.space.dimensions]))
-        return error, float(off @ np.linalg.solve(covariance, off)) / len(off)
-
-
 def _settings(window: int) -> dict[str, Any]:
     return {"map_condense": True, "map_window_keyframes": window} if window else {"map_condense": False}
 
@@ -267,18 +228,13 @@ def _resident_mib() -> float:
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
-def drive(
-    seed: int, keyframes: int, window: int, dimensions: int = 2, world: str = "points", blocks: int = 0
-) -> Figures:
-    """Return the figures of one drive: in a hall with a kind of landmarks, or in a city of so many blocks."""
+def drive(seed: int, keyframes: int, window: int, dimensions: int = 2, world: str = "points") -> Figures:
+    """Return the figures of one drive in a hall with a kind of landmarks."""
     warmup(dimensions=dimensions)  # as the node does
     Drive(Course(seed, 60), 0).run()  # what is loaded at first use is not counted
     space = PLANAR if dimensions == 2 else SPATIAL
-    if blocks:
-        one: Drive = CityDrive(City(seed, keyframes, space, blocks), window)
-    else:
-        kind = UnnamedDrive if world == "unnamed" else Drive
-        one = kind(Course(seed, keyframes, space, tags=world == "tags"), window)
+    kind = UnnamedDrive if world == "unnamed" else Drive
+    one = kind(Course(seed, keyframes, space, tags=world == "tags"), window)
     one.run()
     return one.figures()
 
@@ -287,13 +243,13 @@ _AGAINST = ("newest m", "path m", "landmarks m")
 
 
 def measure(
-    keyframes: int, seeds: Sequence[int], windows: Sequence[int], dimensions: int, *, world: str, blocks: int
+    keyframes: int, seeds: Sequence[int], windows: Sequence[int], dimensions: int, *, world: str
 ) -> Iterator[table.Row]:
     """Yield a row for each drive, and one for each window: the means, and errors over those of all keyframes."""
     found: dict[int, list[Figures]] = {window: [] for window in windows}
     for seed in seeds:
         for window in windows:
-            row = fresh.call(lifelong.drive, seed, keyframes, window, dimensions, world, blocks)
+            row = fresh.call(lifelong.drive, seed, keyframes, window, dimensions, world)
             found[window].append(row)
             yield {"seed": seed, "window": window or "all", **row}
     for window, rows in found.items():
@@ -318,14 +274,11 @@ def main() -> None:
         default="points",
         help="points with ids, tags whose orientation is seen, too, or points without ids",
     )
-    options.add_argument("--blocks", type=values.count, default=0, metavar="N", help="a city of N by N blocks")
     options.add_argument("--flat", action="store_true", help="fail where memory grows after a tenth of the drive")
     options.add_argument("--json", type=Path, metavar="OUT", help="write the results there as well")
     args = options.parse_args()
     rows = []
-    for row in measure(
-        args.keyframes, range(args.seeds), args.windows, args.dimensions, world=args.landmarks, blocks=args.blocks
-    ):
+    for row in measure(args.keyframes, range(args.seeds), args.windows, args.dimensions, world=args.landmarks):
         print(
             "benchmarks:",
             *(f"{k}={v:.4g}" if isinstance(v, float) else f"{k}={v}" for k, v in row.items()),
@@ -334,9 +287,7 @@ def main() -> None:
         )
         rows.append(row)
     table.finish(
-        table.results(
-            "city" if args.blocks else "lifelong", rows, f"{args.keyframes} keyframes, {args.dimensions} dimensions"
-        ),
+        table.results("lifelong", rows, f"{args.keyframes} keyframes, {args.dimensions} dimensions"),
         args.json,
     )
     if args.flat and any(row["late MiB"] > _FLAT * row["early MiB"] for row in rows if "late MiB" in row):

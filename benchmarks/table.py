@@ -23,7 +23,7 @@ Row = dict[str, Any]
 DOCUMENT = ROOT / "docs/benchmarks.md"
 _ACCURACY = ROOT / "docs/accuracy.md"
 _OTHER_HOMES = {"consistency": _ACCURACY, "marginals": _ACCURACY, "robust": ROOT / "docs/robustness.md"}
-_OTHER_HOMES |= dict.fromkeys(("lifelong", "city"), ROOT / "docs/lifelong.md")
+_OTHER_HOMES["lifelong"] = ROOT / "docs/lifelong.md"
 _LIBRARIES = ("numpy", "scipy", "numba", "gtsam", "graphslam", "ros-jazzy-rclpy")
 
 # The lowest cost that anybody has found, in our error map with the information matrices of the file.

@@ -1,25 +1,35 @@
 """Runs whose old visits are condensed: a drive through the hall of the benchmark, a window of 60 keyframes."""
 
+import functools
+import tempfile
+from pathlib import Path
+
 from benchmarks.hall import STEP_S, config, hall, measurements
 from graph_slam_ros.graph.geometry import PLANAR
 from graph_slam_ros.runs.restore import record_run
 from graph_slam_ros.slam import Control
 
-SEED = 3
+SEED, KEYFRAMES, WINDOW = 3, 500, 60
+_folder = tempfile.TemporaryDirectory()
 
 
-def condensed_run(folder, keyframes=500, *, condense=True, part=slice(None), longest=1000):
-    """Drive and save; returns the folder, the pipeline and the summary.
+def bounded(space=PLANAR, **values):
+    """Parameters of a pipeline that condenses."""
+    return config(space, map_condense=True, map_window_keyframes=WINDOW, **values)
+
+
+@functools.cache
+def condensed_run(last=KEYFRAMES, *, condense=True, first=0, of=None):
+    """Drive and save, once; returns the folder, which nobody may change, the pipeline and the summary.
 
     Parameters
     ----------
-    part : of the keyframes of a drive of ``longest``; default: the first ``keyframes`` of a shorter one
+    last, first : of the keyframes of a drive of so many (``of``, by default ``last``) these are driven
     """
-    settings = {"map_condense": True, "map_window_keyframes": 60} if condense else {}
-    whole = part == slice(None)
-    drive = list(measurements(hall(SEED, keyframes if whole else longest)))
-    if not whole:
-        first, last = (drive[0].stamp_ns + round(k * STEP_S * 1e9) for k in (part.start or 0, part.stop or longest))
-        drive = [m for m in drive if first <= m.stamp_ns < last]
-    slam, summary = record_run(folder, config(PLANAR, **settings), [*drive, Control("end"), Control("optimize")], [])
+    drive = list(measurements(hall(SEED, of or last)))
+    begin_ns, end_ns = (drive[0].stamp_ns + round(k * STEP_S * 1e9) for k in (first, last))
+    drive = [m for m in drive if begin_ns <= m.stamp_ns and (m.stamp_ns < end_ns or last == (of or last))]
+    folder = Path(_folder.name) / f"run_{first}_{last}_of_{of or last}{'_condensed' * condense}"
+    settings = bounded() if condense else config(PLANAR)
+    slam, summary = record_run(folder, settings, [*drive, Control("end"), Control("optimize")], [])
     return folder, slam, summary

@@ -145,13 +145,11 @@ class Config:
         return self.map.condense and not self.not_condensed
 
     @property
-    def has_closures(self) -> bool:
-        """Return whether an input is one of closures."""
-        return any(one.use == "closure" for one in self.sources)
-
-    @property
     def not_condensed(self) -> str:
         """Return the parameter with which nothing is condensed yet; empty if there is none."""
+        for one in self.sources:  # they may begin at any keyframe
+            if one.use == "closure":
+                return f"{one.name}.use=closure"
         return f"calibrate.groups={self.calibrate.groups}" if self.calibrate.is_on else ""
 
     @classmethod

@@ -82,7 +82,7 @@ class MapConfig:
         True,
         "true: what was driven long ago is condensed to one measurement of each place, so that memory and time follow "
         "the area and not the distance driven; false: every keyframe is kept, as it always is with "
-        "calibration",
+        "closures or calibration",
     )
     window_keyframes: int = setting(
         2000,

@@ -19,7 +19,7 @@ from graph_slam_ros.runs.restore import restored
 from graph_slam_ros.runs.tables import graph_file, numbered
 from graph_slam_ros.runs.whole_path import WholePath
 from graph_slam_ros.slam import GraphSlam
-from graph_slam_ros.slam.lifelong.removed import Left
+from graph_slam_ros.slam.lifelong.state import Left
 
 
 def export(folder: Path, out: Path, target: str, losses: list[str], *, last_drive: bool = False) -> list[Path]:

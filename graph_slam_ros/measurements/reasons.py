@@ -286,7 +286,7 @@ REASONS: dict[str, Reason] = {
     "from_where_there_was_no_odometry": Reason(
         _REFUSED, "the earlier stamp of a closure or edge is outside the odometry", "stamps by the robot's clock"
     ),
-    "from_condensed_keyframe": Reason(_REFUSED, "its start left the map", "INPUT.use=closure or map.condense=false"),
+    "from_condensed_keyframe": Reason(_REFUSED, "its start left the map", "map.condense=false"),
     # -- the map
     "not_in_map": Reason(
         _NOTED, "a landmark that the map does not have, while map.localize is true", "map.localize=false to add it"

@@ -6,17 +6,12 @@ The record ``condensed`` of a ``growth`` (``map_journal``) has
 * ``vertices``, ``edges``: the lasting ids of the first rows, and that of the row after these;
 * ``old``: number, vertex, stamp and ``T_odom_base`` of each keyframe before the first that is in the graph;
 * ``places``: cell, edge, visits, the strikes against its landmarks, by vertex, and ``linearized_at``, of each place;
-* ``skeleton``: position, axis and sign of each keyframe of a visit that is in no place which has stayed;
-* ``attached``: the number of the first keyframe that has left and at which closures can begin; null if there is none;
-* ``left``: how many keyframes, poses at which something was seen, and frames have left the map;
+* ``left``: how many keyframes, and poses at which something was seen, have left the map;
 * ``accepted``: of each drive, by its first keyframe, how many accepted measurements of each input have left the map;
-* ``begins``: of each drive whose first keyframe has left, that and the number of poses of sightings before it;
-* ``made``: the lasting ids of the closures that condensing has made of others.
+* ``begins``: of each drive whose first keyframe has left, that and the number of poses of sightings before it.
 
 What has left is in ``condensed.mcap``, a record ``left`` each time: the number of its first keyframe, how many poses
-had left before, and the rows of ``slam.lifelong.removed.record_type`` and of ``slam.lifelong.frames`` in base64; there
-are no frames in a map that an older version made. Where closures can begin at these keyframes it has rows of
-``slam.frontend.attached.attached_type`` as well. ``left_edges`` has the table of the
+had left before, and the rows of ``slam.lifelong.state.record_type`` in base64. ``left_edges`` has the table of the
 edges. A map may know of fewer than are there, if its run was killed: the others do not count.
 """
 
@@ -38,12 +33,9 @@ from graph_slam_ros.graph.lasting_ids import LastingIds
 from graph_slam_ros.runs.journal import read_records
 from graph_slam_ros.slam.bounded_map import Condensation
 from graph_slam_ros.slam.condensed_edges import CondensedEdge
-from graph_slam_ros.slam.frontend.attached import AttachedKeyframes, attached_type
 from graph_slam_ros.slam.lifelong.fit import VisitScale
-from graph_slam_ros.slam.lifelong.frames import Frames, frame_type, member_type
-from graph_slam_ros.slam.lifelong.place_edge import place_of
-from graph_slam_ros.slam.lifelong.removed import Left, OldKeyframe, Records, record_type
-from graph_slam_ros.slam.lifelong.state import BoundedState
+from graph_slam_ros.slam.lifelong.place import place_of
+from graph_slam_ros.slam.lifelong.state import BoundedState, Left, OldKeyframe, Records, record_type
 
 CONDENSED = "condensed"
 """Name of the recording of what has left the map."""
@@ -69,19 +61,15 @@ def condensed_record(graph: Graph, first: int, state: BoundedState) -> Record:
         for one in several
     ]
     old = [[one.number, one.vertex, one.stamp_ns, one.T_odom_base] for one in state.old]
-    left = [state.keyframes, state.sightings, state.frames]
     return {
         "first": first,
         **dict(zip(("vertices", "edges"), ids, strict=True)),
         "old": old,
         "places": places,
-        "left": left,
+        "left": [state.keyframes, state.sightings],
         "scale": astuple(state.scale),
         "accepted": [[first, dict(of)] for first, of in state.accepted.items()],
         "begins": list(state.begins.items()),
-        "made": sorted(state.made),
-        "skeleton": list(state.skeleton.rows()),
-        "attached": state.attached.first if state.attached.first < state.attached.end == state.keyframes else None,
     }
 
 
@@ -99,24 +87,17 @@ def read_condensed(graph: Graph, record: Mapping[str, Any]) -> tuple[int, Bounde
         if not len(ids) or (np.diff(ids) <= 0).any() or ids[0] < 0 or len(ids) - 1 > count:
             raise ValueError(f"condensed: the ids of its {name} do not ascend, or are more than there are")
         setattr(graph, _IDS[name], LastingIds(ids[:-1], int(ids[-1])))
-    keyframes, sightings, *frames = record["left"]
-    state = BoundedState(keyframes=keyframes, sightings=sightings, frames=frames[0] if frames else 0)
-    state.accepted |= {first: Counter(of) for first, of in record.get("accepted", ())}  # an older map has none
-    state.begins |= dict(record.get("begins", ()))  # nor these
-    state.made = set(record.get("made", ()))
-    rows = record.get("skeleton", ())
-    state.skeleton.restore(rows, len(rows[0]) - 2 if rows else 0)
-    first = record.get("attached")
-    state.attached = AttachedKeyframes(keyframes if first is None else int(first))
-    state.scale = VisitScale(*record.get("scale", ()))  # nor this
+    keyframes, sightings = record["left"]
+    state = BoundedState(keyframes=keyframes, sightings=sightings, scale=VisitScale(*record["scale"]))
+    state.accepted |= {first: Counter(of) for first, of in record["accepted"]}
+    state.begins |= dict(record["begins"])
     if not 1.0 <= state.scale.factor < np.inf:
         raise ValueError(f"condensed: the variances of visits count {state.scale.factor} times")
-    for cell, number, visits, strikes, *at in record["places"]:
-        edge = graph.edge(number)
-        where = np.array(at[0], dtype=np.float64).ravel() if at else None  # older maps have rows, or nothing
-        if where is not None and len(where) != edge.type.measured_size:
+    for cell, number, visits, strikes, at in record["places"]:
+        edge, where = graph.edge(number), np.array(at, dtype=np.float64)
+        if len(where) != edge.type.measured_size:
             raise ValueError(f"condensed: place {number} is linearised at {len(where)} numbers")
-        if where is not None and not np.isfinite(where).all():
+        if not np.isfinite(where).all():
             raise ValueError(f"condensed: place {number} has a landmark that is nowhere")
         state.places.setdefault(tuple(cell), []).append(place_of(edge, where, visits, dict(strikes)))
     state.old += [OldKeyframe(number, vertex, stamp, tuple(pose)) for number, vertex, stamp, pose in record["old"]]
@@ -130,9 +111,6 @@ def left_records(done: Condensation) -> Iterator[Record]:
     """Yield the records of what has left a map."""
     left = done.left
     rows = {"keyframes": _text(left.keyframes), "sightings": _text(left.sightings)}
-    if left.attached is not None:
-        rows["attached"] = _text(left.attached)
-    rows |= {"linked_frames": _text(left.frames.rows), "ends": _text(left.frames.members)}
     yield {"type": "left", "first": done.first, "sightings_before": done.sightings_before, **rows}
     if done.edges:
         out = io.StringIO()
@@ -150,40 +128,15 @@ def read_left(folder: Path, space: Geometry, state: BoundedState | None) -> Left
         Some of those that the map knows of are missing.
     """
     found: list[Left] = []
-    if state is not None:
-        for record in read_records(folder, CONDENSED, [], "left"):
-            if record["first"] >= state.keyframes:
-                break
-            keyframes, sightings = (_rows(record[name], record_type(space)) for name in ("keyframes", "sightings"))
-            found.append(Left(keyframes, sightings, _frames(record, space)))
+    for record in read_records(folder, CONDENSED, [], "left") if state is not None else ():
+        if state is None or record["first"] >= state.keyframes:
+            break
+        found.append(Left(*(_rows(record[name], record_type(space)) for name in ("keyframes", "sightings"))))
     out = Left.joined(space, found)
-    count = len(out.keyframes), len(out.sightings), len(out.frames)
-    if state is not None and count != (state.keyframes, state.sightings, state.frames):
+    count = len(out.keyframes), len(out.sightings)
+    if state is not None and count != (state.keyframes, state.sightings):
         raise _incomplete(folder, count[0], state)
     return out
-
-
-def attach(folder: Path, space: Geometry, state: BoundedState) -> None:
-    """Read how the keyframes that have left a map are joined to it, for closures that begin at them.
-
-    Raises
-    ------
-    FormatError
-        Some are missing.
-    """
-    first = state.attached.first
-    for record in read_records(folder, CONDENSED, [], "left") if first < state.keyframes else ():
-        if first <= record["first"] < state.keyframes:
-            try:
-                keyframes = _rows(record["keyframes"], record_type(space))
-                rows = _rows(record.get("attached", ""), attached_type(space))
-            except (LookupError, TypeError, ValueError):
-                raise _incomplete(folder, state.attached.end, state) from None
-            if len(rows) != len(keyframes):
-                raise _incomplete(folder, state.attached.end, state)
-            state.attached.add(space, record["first"], keyframes, rows)
-    if state.attached.end != state.keyframes:
-        raise _incomplete(folder, state.attached.end, state)
 
 
 def _incomplete(folder: Path, count: int, state: BoundedState) -> FormatError:
@@ -214,25 +167,6 @@ def read_left_edges(folder: Path) -> Iterator[dict[str, str]]:
     """Yield the rows of the edges that have left the map of a run, by column."""
     for record in read_records(folder, CONDENSED, [], "left_edges"):
         yield from csv.DictReader(io.StringIO(record["table"]), COLUMNS)
-
-
-def _frames(record: Record, space: Geometry) -> Frames:
-    """Return frames; in older maps they have no links, and their landmarks no axes."""
-    links, axes = ("base", "T_base", "count"), ("landmark", "point", "weight")
-    rows = _now_or_older(record, ("linked_frames", "frames"), frame_type(space), links)
-    rows["T_before"][~rows["information"].any(axis=1)] = space.identity
-    return Frames(rows, _now_or_older(record, ("ends", "members"), member_type(space), axes))
-
-
-def _now_or_older(record: Record, names: tuple[str, str], kind: np.dtype[np.void], older: tuple[str, ...]) -> Records:
-    """Return rows that a record has under the first name, or those of fewer columns under the second; others are 0."""
-    if names[0] in record:
-        return _rows(record[names[0]], kind).copy()
-    rows = _rows(record.get(names[1], ""), np.dtype([(name, kind[name]) for name in older]))
-    out = np.zeros(len(rows), kind)
-    for name in older:
-        out[name] = rows[name]
-    return out
 
 
 def _text(rows: Records) -> str:

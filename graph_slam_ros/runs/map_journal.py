@@ -44,9 +44,8 @@ from typing import Any
 from graph_slam_ros.edge_tags import tag_of
 from graph_slam_ros.errors import FormatError, GraphSlamError
 from graph_slam_ros.graph import Graph
-from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
 from graph_slam_ros.measurements.types import sighting_record
-from graph_slam_ros.runs.condensed_map import attach, condensed_record
+from graph_slam_ros.runs.condensed_map import condensed_record
 from graph_slam_ros.runs.journal import ANEW, MAP, parts_of, read_records
 from graph_slam_ros.runs.map_faults import fault_of
 from graph_slam_ros.runs.map_growth import AT_ONCE, Growing, apply_verdicts, grow
@@ -225,8 +224,6 @@ def _read(folder: Path, losses: list[str], at_once: int, *, start_only: bool) ->
         raise FormatError(f"{file}: {fault}")
     apply_verdicts(state)
     state.folder = folder
-    if state.bounded is not None:
-        attach(folder, PLANAR if PLANAR.pose in state.graph.kinds else SPATIAL, state.bounded)
     return state
 
 
@@ -240,8 +237,6 @@ def state_of(slam: GraphSlam, folder: Path | None = None) -> MapSnapshot:
     state = MapSnapshot(folder=folder)
     extend(state, MapGrowth().since(slam))
     state.values, state.settings, state.displacements = slam.solver.values, dict(slam.settings), slam.displacements
-    if slam.bounded is not None and state.bounded is not None:
-        state.bounded.attached = slam.bounded.attached
     state.used_ns, state.source = slam.newest_odometry_ns, slam.odometry_source
     return state
 

@@ -22,8 +22,7 @@ from graph_slam_ros.runs.whole_path import WholePath
 from graph_slam_ros.slam import Counters, GraphSlam
 from graph_slam_ros.slam.calibration.decision import SIGMAS
 from graph_slam_ros.slam.calibration.parameters import QUANTITIES
-from graph_slam_ros.slam.lifelong.removed import Left, seen_from
-from graph_slam_ros.slam.lifelong.state import BoundedState
+from graph_slam_ros.slam.lifelong.state import BoundedState, Left, seen_from
 from graph_slam_ros.slam.robust.gating import CANDIDATES
 from graph_slam_ros.slam.robust.ledger import INSIDE, Verdict
 from graph_slam_ros.typing import Mask
@@ -229,10 +228,8 @@ def _by_input(slam: GraphSlam, chosen: Callable[[EdgeTable], Mask]) -> tuple[Cou
     inside = [Verdict.NOT_EVALUATED, *INSIDE]
     verdicts, sources = slam.ledger.verdict.values, slam.graph.sources
     is_candidate = np.array([label in CANDIDATES for label in slam.graph.labels], dtype=bool)
-    made = list(slam.bounded.made) if slam.bounded else []  # by condensing, of closures that are counted
     for table in slam.graph.tables.values():
-        is_measured = ~np.isin(slam.graph.edge_ids.of_all(table.id.values), made)
-        rows = np.flatnonzero(is_candidate[table.label.values] & is_measured & chosen(table))
+        rows = np.flatnonzero(is_candidate[table.label.values] & chosen(table))
         ids = table.at(rows).ids
         is_in = ids >= len(verdicts)
         is_in[~is_in] = np.isin(verdicts[ids[~is_in]], inside)
@@ -243,10 +240,7 @@ def _by_input(slam: GraphSlam, chosen: Callable[[EdgeTable], Mask]) -> tuple[Cou
 
 
 def _drives(slam: GraphSlam) -> list[dict[str, int]]:
-    """Return the first row of each drive in ``path.tum`` and in ``sightings.tum``, from 0.
-
-    That in ``sightings.tum`` is 0 for a later drive whose first keyframes an older version has condensed.
-    """
+    """Return the first row of each drive in ``path.tum`` and in ``sightings.tum``, from 0."""
     of, state = slam.sighting_poses.ids, slam.bounded or BoundedState()
     rows = {first: state.sightings + int(np.sum(of < first)) for first in slam.drives if first >= slam.first_keyframe}
     return [{"keyframe": first, "sighting": rows.get(first, state.begins.get(first, 0))} for first in slam.drives]

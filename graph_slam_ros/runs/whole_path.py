@@ -6,8 +6,7 @@ import numpy as np
 
 from graph_slam_ros.runs.condensed_map import read_left
 from graph_slam_ros.slam import GraphSlam
-from graph_slam_ros.slam.lifelong.frames import PresentLandmarks
-from graph_slam_ros.slam.lifelong.removed import Left
+from graph_slam_ros.slam.lifelong.state import Left
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Index
 
@@ -49,17 +48,5 @@ def removed_path(slam: GraphSlam, left: Left, solver: Solver | None = None) -> A
         return np.empty((0, slam.space.pose.size))
     solver = solver or slam.solver
     vertices = np.array([*(one.vertex for one in slam.bounded.old), *slam.keyframes.ids.tolist()], dtype=np.int64)
-    order, lasting = np.argsort(vertices), slam.graph.vertex_ids
-    ids, poses = lasting.of_all(vertices[order]), solver.estimate(vertices[order])
-    return left.path(slam.space, ids, poses, _present_landmarks(slam, solver))
-
-
-def _present_landmarks(slam: GraphSlam, solver: Solver) -> PresentLandmarks:
-    marks = np.sort(np.array([mark.vertex for mark in slam.landmarks.values()], dtype=np.int64))
-    d, graph = slam.space.dimensions, slam.graph
-    is_pose = np.array([graph.kind_of(mark) is slam.space.pose for mark in marks.tolist()], dtype=bool)
-    points, axes = np.zeros((len(marks), d)), np.zeros((len(marks), d, d))
-    points[~is_pose] = solver.estimate(marks[~is_pose]).reshape(-1, d)
-    poses = solver.estimate(marks[is_pose]).reshape(-1, slam.space.pose.size)
-    points[is_pose], axes[is_pose] = poses[:, :d], np.moveaxis(slam.space.turn(tuple(poses.T)), -1, 0)
-    return PresentLandmarks(graph.vertex_ids.of_all(marks), points, axes)
+    vertices = np.sort(vertices)
+    return left.path(slam.space, slam.graph.vertex_ids.of_all(vertices), solver.estimate(vertices))

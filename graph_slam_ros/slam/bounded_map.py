@@ -7,7 +7,7 @@ does.
 
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -18,22 +18,17 @@ from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.slam.anchor import Anchor
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.condensed_edges import CONDENSED, CondensedEdge, archived
-from graph_slam_ros.slam.frontend.attached import NOWHERE, attached_type
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
 from graph_slam_ros.slam.kidnap_detector import KidnapDetector
 from graph_slam_ros.slam.landmarks.landmark_frontend import LandmarkFrontend
-from graph_slam_ros.slam.lifelong.compaction import compact
-from graph_slam_ros.slam.lifelong.condenser import Cell, Condenser
-from graph_slam_ros.slam.lifelong.frames import LONGEST as FRAME
-from graph_slam_ros.slam.lifelong.frames import Frames, chained, frame_of, weight_at
-from graph_slam_ros.slam.lifelong.outcome import Condensed
-from graph_slam_ros.slam.lifelong.place_edge import PlaceEdge
-from graph_slam_ros.slam.lifelong.removed import Left, OldKeyframe, Records, record_type
-from graph_slam_ros.slam.lifelong.surroundings import CHAIN, CLOSURES, seen_from
+from graph_slam_ros.slam.lifelong.condenser import Condensed, Condenser, RemovedPose, compact
+from graph_slam_ros.slam.lifelong.place import Cell, PlaceEdge
+from graph_slam_ros.slam.lifelong.state import Left, OldKeyframe, Records, record_type
+from graph_slam_ros.slam.lifelong.surroundings import CHAIN, seen_from
 from graph_slam_ros.slam.robust.gating import CANDIDATES
 from graph_slam_ros.slam.solution import Solution
 from graph_slam_ros.solver import Solver
-from graph_slam_ros.typing import Array, Index, Numbers
+from graph_slam_ros.typing import Array, Index
 
 BATCH = 200  # keyframes that leave the window together
 _VISITS, _BACKLOG = 4, 300  # most visits of an update, or it takes long; unless so many keyframes are to leave
@@ -43,24 +38,6 @@ _PATIENCE = 200  # keyframes that are out of the window while a visit waits
 _AGAIN = 20  # keyframes until it is tried again, where sightings without ids are not explained yet
 _SOURCE = "map"  # of what is counted
 _SUMMED = (PLACES, CHAIN)  # edges that a later one contains, when it takes their place
-_THIN = 0.1  # of the width of a cell: so far apart keyframes stay that are in no place
-
-
-@dataclass(frozen=True, slots=True)
-class _Row:
-    """A keyframe that leaves: its vertex, lasting id of its base or -1 - n of frame n, and pose relative to that.
-
-    Attributes
-    ----------
-    joined, T_joined, covariance : lasting id of the vertex that closures to it lead to, and the motion from there
-    """
-
-    vertex: int
-    base: int
-    T_base: Numbers
-    joined: int
-    T_joined: Numbers
-    covariance: Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,15 +78,10 @@ class BoundedMap:
         self._space, self._backend, self._frontend = frontend.config.space, backend, frontend
         self._landmarks, self._anchor, self._kidnaps = landmarks, anchor, kidnaps
         self._solution, self._counters = solution, counters
-        config, self.state = frontend.config, backend.bounded
+        self.state = backend.bounded
         self.condenser = Condenser(self._space, backend.solver)
         self.condenser.places, self.condenser.scale = self.state.places, self.state.scale
-        self.state.skeleton.spread(_THIN * config.map.cell_m)
-        self.condenser.skeleton = self.state.skeleton
-        frontend.path.attached = self.state.attached
-        frontend.path.vertex_of = lambda lasting: backend.graph.vertex_ids.find(lasting)
         self._tried = 0  # keyframes at the last try
-        self._nothing = np.zeros((self._space.dof, self._space.dof))
 
     @property
     def is_due(self) -> bool:
@@ -143,14 +115,11 @@ class BoundedMap:
             return None
         self._landmarks.map.withdraw_tentative(self._limit)
         graph, values, places = backend.graph.copy(), backend.solver.values, _copies(self.state.places)
-        vertices, scale, skeleton = backend.solver.vertices, replace(self.state.scale), self.state.skeleton.copy()
+        vertices, scale = backend.solver.vertices, replace(self.state.scale)
         self._tried = len(keyframes)
-        self.condenser.serves_closures = self._frontend.config.has_closures or CLOSURES in backend.graph.labels
         try:
-            rows, frames, end = self._condensed_visits()
+            rows, end = self._condensed_visits()
             backend.note_condensed(len(keyframes) - 1)
-            left = self._left(rows)
-            attached = self._attach(left, rows) if self.condenser.serves_closures else None
         except Exception as error:
             self._counters.count(_SOURCE, type(error).__name__)
             self._tried += BATCH - 1  # the same would most likely fail at the next keyframe again
@@ -158,22 +127,18 @@ class BoundedMap:
             self.state.places.clear()
             self.state.places.update(places)
             self.state.scale = self.condenser.scale = scale
-            self.state.skeleton = self.condenser.skeleton = skeleton
             _restart(backend.solver, vertices, values)
             return None
-        added = np.arange(graph.edge_count, backend.graph.edge_count)
-        closures = added[backend.graph.has_label(added, (CLOSURES,))]
-        self.state.made.update(backend.graph.edge_ids.of_all(closures).tolist())
-        return self._compacted(rows, Left(left, self._sightings(end), frames, attached), end) if rows else None
+        return self._compacted(rows, Left(self._left(rows), self._sightings(end)), end) if rows else None
 
     # -- visits ------------------------------------------------------------------------------------------------------
 
-    def _condensed_visits(self) -> tuple[list[_Row], Frames, int]:
-        """Condense; returns what left, in order of time, its frames, and the first number that stays."""
+    def _condensed_visits(self) -> tuple[list[RemovedPose], int]:
+        """Condense; returns what left, in order of time, and the first number that stays."""
         path, solver = self._frontend.path, self._backend.solver
         ids, first, width = path.keyframes.ids, path.keyframes.first, self._frontend.config.map.cell_m
         limit = self._limit - first
-        at, rows, frames = solver.estimate(ids), list[_Row](), list[tuple[Frames, range]]()
+        at, rows = solver.estimate(ids), list[RemovedPose]()
         begins = [*(begin - first for begin in sorted(path.segments) if begin > first), len(ids)]
         cells = list(map(tuple, np.floor(at[:, : self._space.dimensions] / width).astype(np.int64).tolist()))
         marks, k, room = seen_from(self._space, solver, ids), 0, _VISITS if limit < _BACKLOG else limit
@@ -183,7 +148,7 @@ class BoundedMap:
             if max(end, k + 1) > limit:
                 break
             if end == k:  # it has an edge that cannot be condensed
-                rows.append(self._own(int(ids[k])))
+                rows.append(self._staying_keyframe(int(ids[k])))
                 self._counters.count(_SOURCE, "held_keyframe" if solver.is_held(int(ids[k])) else "not_condensed")
                 k += 1
                 continue
@@ -194,11 +159,12 @@ class BoundedMap:
             if done.how == "waits":
                 break
             self._note_end(done, end - k)
-            rows += self._rows(visit, k, done, frames)
+            removed = {one.vertex: one for one in done.removed}
+            rows += [removed.get(vertex) or self._staying_keyframe(vertex) for vertex in visit]
             k, room = end, room - 1
         self.condenser.rescale()
         self._solution.guard.checked(solver.update)
-        return rows, chained(self._space, frames, at), first + k
+        return rows, first + k
 
     def _note_end(self, done: Condensed, keyframes: int) -> None:
         """Count how a visit of so many keyframes ended."""
@@ -222,76 +188,26 @@ class BoundedMap:
                 out.update(ends[is_one & (ends[:, 0] >= first) & (ends[:, 0] <= last), 1].tolist())
         return out
 
-    def _own(self, vertex: int) -> _Row:
-        own = self._backend.graph.vertex_ids.of(vertex)
-        return _Row(vertex, own, self._space.identity, own, self._space.identity, self._nothing)
+    def _staying_keyframe(self, vertex: int) -> RemovedPose:
+        """Return a keyframe that is its own base."""
+        return RemovedPose(vertex, vertex, self._space.identity)
 
-    def _rows(
-        self, visit: Sequence[int], first: int, done: Condensed, frames: list[tuple[Frames, range]]
-    ) -> list[_Row]:
-        """Return what left of a visit; frames that it moves with are added, each with its stretch of keyframes.
-
-        Parameters
-        ----------
-        first : row of the first keyframe of the visit
-        """
-        lasting, out = self._backend.graph.vertex_ids, {vertex: self._own(vertex) for vertex in visit}
-        for one in done.removed:
-            base = lasting.of(one.base)
-            joined = NOWHERE if one.covariance is None else base
-            covariance = self._nothing if one.covariance is None else one.covariance
-            out[one.vertex] = _Row(one.vertex, base, one.T_base_vertex, joined, one.T_base_vertex, covariance)
-        poses = dict(zip(visit, self._backend.solver.estimate(list(visit)), strict=True))
-        for k in range(0, len(visit), FRAME if done.seen else len(visit)):
-            stretch = visit[k : k + FRAME]
-            gone = [vertex for vertex in stretch if done.seen and out[vertex].base != lasting.of(vertex)]
-            if gone:
-                at = tuple(poses[stretch[len(stretch) // 2]].tolist())
-                of_stretch = {vertex: poses[vertex] for vertex in stretch}
-                frames.append((self._frame(done, of_stretch, at), range(first + k, first + k + len(stretch))))
-                number = -self.state.frames - len(frames)
-                for vertex in gone:
-                    pose = self._space.group.between(at, tuple(poses[vertex].tolist()))
-                    out[vertex] = replace(out[vertex], base=number, T_base=tuple(map(float, pose)))
-        return [out[vertex] for vertex in visit]
-
-    def _frame(self, done: Condensed, poses: Mapping[int, Array], at: Numbers) -> Frames:
-        """Return the frame of a stretch of a visit, whose keyframes have these poses."""
-        solver, lasting, n = self._backend.solver, self._backend.graph.vertex_ids, self._space.dimensions
-        pairs = [both for both in done.seen if both[0] in poses]
-        there = {mark: solver.estimate([mark])[0] for mark in dict.fromkeys(mark for _, mark in pairs)}
-        weights = dict[int, float]()
-        for vertex, mark in pairs:
-            distance_m = float(np.linalg.norm(there[mark][:n] - poses[vertex][:n]))
-            weights[mark] = max(weights.get(mark, 0.0), weight_at(distance_m))  # their errors are alike
-        landmarks = {lasting.of(mark): (tuple(there[mark].tolist()), weights[mark]) for mark in weights}
-        base = done.removed[0].base
-        return frame_of(self._space, (lasting.of(base), self._solution.pose(base)), at, landmarks)
-
-    def _left(self, rows: Sequence[_Row]) -> Records:
+    def _left(self, rows: Sequence[RemovedPose]) -> Records:
         """Return the records of the keyframes that leave."""
         keyframes, lasting = self._frontend.path.keyframes, self._backend.graph.vertex_ids.of
         left = np.zeros(len(rows), dtype=record_type(self._space))
         for k, row in enumerate(rows):
             one = keyframes[keyframes.first + k]
-            left[k] = one.stamp_ns, lasting(row.vertex), row.base, row.T_base, one.T_odom_base
+            left[k] = one.stamp_ns, lasting(row.vertex), lasting(row.base), row.T_base_vertex, one.T_odom_base
         return left
-
-    def _attach(self, left: Records, rows: Sequence[_Row]) -> Records:
-        """Note how the keyframes that leave are joined to the graph, for closures that come to them."""
-        out = np.zeros(len(rows), dtype=attached_type(self._space))
-        out[:] = [(row.joined, row.T_joined, row.covariance) for row in rows]
-        self.state.attached.add(self._space, self._frontend.path.keyframes.first, left, out)
-        return out
 
     # -- compaction --------------------------------------------------------------------------------------------------
 
-    def _compacted(self, rows: Sequence[_Row], left: Left, end: int) -> Condensation:
+    def _compacted(self, rows: Sequence[RemovedPose], left: Left, end: int) -> Condensation:
         """Remove what has left from the graph, and give all parts the new ids."""
         keyframes, graph = self._frontend.path.keyframes, self._backend.graph
-        lasting = graph.vertex_ids.of
         for k, row in enumerate(rows):
-            if row.base == lasting(row.vertex):
+            if row.base == row.vertex:
                 one = keyframes[keyframes.first + k]
                 self.state.old.append(OldKeyframe(keyframes.first + k, row.vertex, one.stamp_ns, one.T_odom_base))
         before = self.state.sightings
@@ -315,7 +231,6 @@ class BoundedMap:
             if out.first <= drive < end:
                 self.state.begins[drive] = before + int(np.sum(left.sightings["of"] < drive))
         self.state.keyframes, self.state.sightings = end, before + len(left.sightings)
-        self.state.frames += len(left.frames)
         self._note_accepted(out.edges)
         self._landmarks.forget_before(end, new.vertices, new.edges)
         self._anchor.restore()
@@ -324,13 +239,12 @@ class BoundedMap:
         return out
 
     def _note_accepted(self, edges: Sequence[CondensedEdge]) -> None:
-        """Count the accepted measurements among edges that leave; a closure that was made of others is none."""
-        drives, made = self._frontend.path.drives, self.state.made
+        """Count the accepted measurements among edges that leave."""
+        drives = self._frontend.path.drives
         for one in edges:
-            if one.became == CONDENSED and one.label in CANDIDATES and one.edge not in made:
+            if one.became == CONDENSED and one.label in CANDIDATES:
                 drive = drives[max(bisect_right(drives, one.keyframe) - 1, 0)]
                 self.state.accepted.setdefault(drive, Counter())[one.source] += 1
-        made.difference_update(one.edge for one in edges)
 
     def _staying(self, window: int) -> tuple[Index, Index]:
         """The vertices and edges that stay; ``window`` is the first keyframe of the window, by its vertex.

@@ -89,8 +89,8 @@ class ClosureStart:
         """Return the observation, or None for such a closure."""
         if not isinstance(m, Closure):
             return m
-        newest_ns, path, from_ns = self._odometry.newest_ns or 0, self._path, m.from_stamp_ns
-        is_left = path.keyframes.first > 0 and from_ns < path.oldest_ns
+        oldest_ns = self._path.oldest_ns
+        is_left = self._path.keyframes.first > 0 and m.from_stamp_ns < oldest_ns
         reason = "from_condensed_keyframe" if is_left else "from_where_there_was_no_odometry"
         self.reason = reason
-        return m if from_ns <= newest_ns and path.reaches(from_ns) else None
+        return m if oldest_ns <= m.from_stamp_ns <= (self._odometry.newest_ns or 0) else None

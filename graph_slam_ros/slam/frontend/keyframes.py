@@ -1,13 +1,12 @@
 """The path: its keyframes, and the odometry between them as far back as late measurements may reach."""
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from graph_slam_ros.graph.geometry import Geometry
-from graph_slam_ros.slam.frontend.attached import NOWHERE, AttachedKeyframes
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
 from graph_slam_ros.slam.frontend.odometry_integration import IntegratedOdometry, OdometryNoise, StationaryDetector
 from graph_slam_ros.slam.frontend.odometry_selector import Step
@@ -42,8 +41,6 @@ class KeyframeList:
     segments : the keyframes at which odometry began or began again
     drives : the first keyframe of each drive; there is more than one after a map was loaded
     samples : odometry between the keyframes
-    attached : the keyframes that were condensed, where closures may begin at them
-    vertex_of : the vertex of a lasting id; None where it was removed
     """
 
     def __init__(self, noise: OdometryNoise, space: Geometry) -> None:
@@ -56,8 +53,6 @@ class KeyframeList:
         self._rest = StationaryDetector(noise, space)
         self._epoch = 0  # the first keyframe since stamps began anew
         self.samples = OdometrySamples(space)
-        self.attached = AttachedKeyframes()
-        self.vertex_of: Callable[[int], int | None] = lambda lasting: None
 
     @property
     def motion(self) -> IntegratedOdometry | None:
@@ -73,10 +68,6 @@ class KeyframeList:
     def oldest_ns(self) -> int:
         """Stamp of the first keyframe since stamps last jumped back."""
         return int(self.keyframes.stamps_ns[max(self._epoch - self.keyframes.first, 0)])
-
-    def reaches(self, stamp_ns: int) -> bool:
-        """Return whether a closure may begin at a stamp: at or after a keyframe that is there, or is attached."""
-        return stamp_ns >= self.oldest_ns or self._attached_at(stamp_ns) is not None
 
     @property
     def remembered_ns(self) -> int:
@@ -150,34 +141,11 @@ class KeyframeList:
 
     def _where_long_ago(self, stamp_ns: int) -> PoseAtStamp:
         """Interpolate between two keyframes whose odometry is no longer remembered."""
-        first, attached = max(self._epoch, self.keyframes.first), None
-        present = self.keyframes.stamps_ns[first - self.keyframes.first :]
-        k = first + int(np.searchsorted(present, stamp_ns, side="right")) - 1
-        if k < first and (attached := self._attached_at(stamp_ns)) is not None:
-            k = attached.keyframe
-        group, (a, b) = self._space.group, (self._keyframe(k), self._keyframe(k + 1))
+        present = self.keyframes.stamps_ns[max(self._epoch - self.keyframes.first, 0) :]
+        k = len(self.keyframes) - len(present) + int(np.searchsorted(present, stamp_ns, side="right")) - 1
+        group, (a, b) = self._space.group, (self.keyframes[k], self.keyframes[k + 1])
         T_a_b = self._space.identity if k + 1 in self.segments else group.between(a.T_odom_base, b.T_odom_base)
         fraction = (stamp_ns - a.stamp_ns) / (b.stamp_ns - a.stamp_ns)
         moved = group.interpolate(self._space.identity, T_a_b, fraction)
         covariance = group.noise_during(moved, self._noise.of(moved, (stamp_ns - a.stamp_ns) * 1e-9, None))
-        if attached is None:
-            return PoseAtStamp(k, a.vertex, stamp_ns, moved, covariance)
-        whole = tuple(map(float, group.compose(attached.T_keyframe_base, moved)))
-        return PoseAtStamp(k, attached.vertex, stamp_ns, whole, group.propagate(attached.covariance, moved, covariance))
-
-    def _keyframe(self, number: int) -> Keyframe:
-        """Return a keyframe, also one that was condensed and is attached."""
-        if number >= self.keyframes.first:
-            return self.keyframes[number]
-        row = self.attached.read(number)
-        return Keyframe(NOWHERE, int(row["stamp_ns"]), tuple(row["T_odom"].tolist()))
-
-    def _attached_at(self, stamp_ns: int) -> PoseAtStamp | None:
-        """Return the condensed keyframe before a stamp, joined to the graph; None if nothing can begin there."""
-        if self._epoch >= self.keyframes.first or self.attached.end != self.keyframes.first:
-            return None
-        k = self.attached.before(stamp_ns, self._epoch)
-        row = None if k is None else self.attached.read(k)
-        if k is None or row is None or (vertex := self.vertex_of(int(row["base"]))) is None:
-            return None
-        return PoseAtStamp(k, vertex, stamp_ns, tuple(row["T_base"].tolist()), row["covariance"])
+        return PoseAtStamp(k, a.vertex, stamp_ns, moved, covariance)

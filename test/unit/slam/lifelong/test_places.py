@@ -1,7 +1,6 @@
-"""Visits to a place condensed to one Gaussian, compared with everything solved at once."""
+"""Visits to a place condensed to one Gaussian, compared with everything solved at once; and how a visit fits."""
 
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -10,13 +9,16 @@ from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.errors import SingularError
 from graph_slam_ros.graph import Gaussian, Graph
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
+from graph_slam_ros.slam.lifelong.condenser import ITSELF, Condenser
 from graph_slam_ros.slam.lifelong.constellation import Constellation
 from graph_slam_ros.slam.lifelong.elimination import marginal_information, square_root, without
+from graph_slam_ros.slam.lifelong.fit import VisitScale, fit_of
 from graph_slam_ros.slam.lifelong.place import Place, fused, visit_without
-from graph_slam_ros.slam.lifelong.visit import best_known, visit_of
+from graph_slam_ros.slam.lifelong.visit import Visit, best_known, visit_of
 from graph_slam_ros.solver import Settings, Solver
 
 POSES, SIGMA_ODOMETRY, SIGMA_SIGHTING = 5, 0.02, 0.05
+GATE, SIGMA_M = 0.9999, 0.1
 STILL = Settings(step_tolerance=1e-11, cost_tolerance=0.0)
 
 
@@ -163,19 +165,6 @@ def test_two_visits_are_what_all_their_edges_say_at_once(space, tags):
     assert exact.place(0, 1)[0].information == pytest.approx(information, abs=1e-9 * np.abs(information).max())
 
 
-def test_with_the_noise_of_sensors_it_is_nearly_so(space, tags):
-    world = World(space, noise=1.0, seed=3, tags=tags)
-    for sees in (range(5), range(1, 6), range(6)):
-        world.visit(sees)
-    place, _ = world.place(0, 1, 2)
-    seen, information = world.batch(0, 1, 2)
-    sigmas = np.sqrt(np.diag(np.linalg.inv(information)))
-    assert (np.abs(place.seen.minus(space, seen)) < 0.2 * sigmas).all()
-    root = np.linalg.inv(np.linalg.cholesky(information))
-    ratios = np.linalg.eigvalsh(root @ place.information @ root.T)
-    assert ratios[0] > 0.9 and ratios[-1] < 1.1
-
-
 def test_a_later_visit_says_nothing_of_where_it_is_seen_from(space, tags):
     world = World(space, noise=1.0, tags=tags)
     visit = world.condensed(world.visit(range(6)))
@@ -258,36 +247,6 @@ def test_the_pose_that_landmarks_determine_best_sees_them(space):
         best_known(space, world.graph, world.estimate, world.poses[number], nothing)
 
 
-def test_a_pose_that_knows_its_position_but_not_its_heading_is_no_base():
-    space, graph = PLANAR, Graph()
-    close, wide = [(1.4, -0.1), (1.4, 0.1)], [(8.0, -5.0), (8.0, 5.0)]
-    poses = [graph.add_vertex(space.pose, [0.5 * k, 0.0, 0.0]) for k in range(5)]
-    factors, at = {}, {}
-    for k, seen in ((0, close), (4, wide)):
-        for point in seen:
-            mark = at.setdefault(point, graph.add_vertex(space.point, point))
-            sighting = [point[0] - 0.5 * k, point[1]]
-            noise = Gaussian.from_sigmas(*[0.02 * np.hypot(*sighting)] * 2)
-            factors[graph.add_edge(space.sightings["position"], [poses[k], mark], sighting, noise, "landmarks")] = 1.0
-    for pair in pairwise(poses):
-        noise = Gaussian.from_sigmas(0.05, 0.05, 0.2)
-        factors[graph.add_edge(space.relative_pose, pair, [0.5, 0.0, 0.0], noise, "odometry")] = 1.0
-
-    def estimate(ids):
-        return np.array([graph.vertex(int(v)).initial for v in ids])
-
-    assert best_known(space, graph, estimate, poses, factors) == 4
-
-
-def test_half_of_each_measurement_and_the_other_half_are_the_whole(space, tags):
-    world = World(space, noise=0.0, tags=tags)
-    world.visit(range(6))
-    whole = world.condensed(0)
-    edges = dict.fromkeys(world.edges[0], 0.5)
-    half = visit_of(space, world.graph, world.estimate, world.poses[0], world.base(0), edges)
-    assert 2.0 * half.information == pytest.approx(whole.information, rel=1e-9, abs=1e-6)
-
-
 def test_landmarks_that_a_visit_cannot_place_are_left_out():
     world = World(PLANAR, noise=1.0)
     first = world.visit(range(3))
@@ -365,3 +324,132 @@ def test_a_landmark_that_a_visit_alone_puts_at_infinity_is_left_out():
         edge = world.graph.add_edge(PLANAR.sightings["bearing"], [vertex, far], measured, noise, "landmarks")
         world.edges[first].append(edge)
     assert world.condensed(first).members == tuple(world.marks[:3])
+
+
+class Joined:
+    """Four visits to one place, joined by odometry, in a solver that begins at a pose that is known."""
+
+    def __init__(self, space):
+        self.space, self.world = space, World(space, noise=1.0)
+        for _ in range(4):
+            self.world.visit(range(6))
+        self.graph, self.noise = self.world.graph, Gaussian.from_sigmas(*space.sigmas(0.02, 0.02))
+        begin = self.graph.add_vertex(space.pose, space.identity)
+        self.graph.add_edge(space.pose_prior, [begin], space.identity, self.noise, "priors")
+        ends = [begin, *(poses[k] for poses in self.world.poses for k in (0, -1))]
+        for pair in zip(ends[::2], ends[1::2], strict=False):
+            self.join(pair, "odometry")
+        self.solver = Solver(self.graph)
+        self.solver.add(range(self.graph.vertex_count), range(self.graph.edge_count))
+        self.solver.update()
+        self.condenser = Condenser(space, self.solver)
+
+    def join(self, ends, label):
+        motion = self.space.group.between(*(tuple(self.graph.vertex(v).initial) for v in ends))
+        return self.graph.add_edge(self.space.relative_pose, ends, motion, self.noise, label)
+
+    def condense(self, number):
+        after = self.world.poses[number + 1][0]
+        done = self.condenser.condense(self.world.poses[number], after, (0,), self.world.marks)
+        self.solver.update()
+        return done
+
+
+def test_a_visit_begins_a_place_the_next_is_added_and_one_that_contradicts_itself_leaves_its_odometry_alone(space):
+    one = Joined(space)
+    first = one.condense(0)
+    (place,) = one.condenser.places[0,]
+    assert first.how == "first"
+    assert place.place.visits == 1
+    again = one.condense(1)
+    assert (again.how, place.place.visits) == ("again", 2)
+    assert {removed.base for removed in (*first.removed, *again.removed)} == {place.base}
+    assert [removed.vertex for removed in again.removed] == one.world.poses[1]
+    sighting = next(e for e in one.world.edges[2] if one.graph.edge(e).vertices[1] in one.world.marks)
+    table, row = one.graph.row(sighting)
+    table.measured.values[row, 0] += 1.0
+    landmarks = one.solver.estimate(one.world.marks)
+    lost = one.condense(2)
+    assert (lost.how, lost.why, lost.is_contradiction, place.place.visits) == ("composed", ITSELF, True, 2)
+    assert one.solver.estimate(one.world.marks) == pytest.approx(landmarks, abs=0.1)
+
+
+def test_a_visit_with_an_edge_that_leads_elsewhere_or_of_another_kind_stays_and_says_why(space):
+    for label in ("closures", "by_hand"):
+        one = Joined(space)
+        edge = one.join([one.world.poses[1][2], one.world.poses[3][0]], label)
+        one.solver.add([], [edge])
+        one.condense(0)
+        kept, before = one.condense(1), one.solver.values
+        assert kept.how == "kept"
+        assert kept.why == f"edge {edge} leads from the visit to vertex {one.world.poses[3][0]}"
+        assert one.condense(1).how == "kept"
+        assert one.solver.values.tobytes() == before.tobytes()
+
+
+class Visits:
+    """Visits that see all of eight landmarks, from the same pose."""
+
+    def __init__(self, space, seed=0):
+        self.space, self.rng = space, np.random.default_rng(seed)
+        self.points = 5.0 * self.rng.standard_normal((8, space.dimensions))
+        self.no_turns = np.empty((0, space.pose.size - space.dimensions))
+
+    def visit(self, noise):
+        """One with so many times the errors that it states."""
+        errors = noise * SIGMA_M * self.rng.standard_normal(self.points.shape)
+        information = np.eye(self.points.size) / SIGMA_M**2
+        seen, at = (Constellation(one, self.no_turns) for one in (self.points + errors, self.points))
+        return Visit(tuple(range(len(self.points))), seen, at, information, 0.0, 0)
+
+    def fit(self, place, visit, strikes=None):
+        return fit_of(self.space, place, visit, self.space.identity, GATE, strikes or {})
+
+
+@pytest.mark.parametrize("noise", [1.0, 2.0])
+def test_the_factor_is_that_of_the_errors(space, noise):
+    visits, scale = Visits(space), VisitScale()
+    place = Place.begun_by(visits.visit(noise))
+    for _ in range(60):
+        one = visits.visit(noise)
+        fit = visits.fit(place, replace(one, information=one.information / scale.factor))
+        scale.add(fit.as_is, GATE)
+        place = fit.result.place
+        place = replace(place, information=place.information / scale.change())
+    assert scale.factor == pytest.approx(noise**2, rel=0.25)
+    off = (place.seen.points - place.seen.points.mean(axis=0)) - (visits.points - visits.points.mean(axis=0))
+    stated = np.sqrt(np.diag(np.linalg.pinv(place.information))).mean()
+    assert np.sqrt((off**2).mean()) < 1.5 * stated
+
+
+def test_one_visit_alone_does_not_make_all_others_unsure(space):
+    visits, scale = Visits(space), VisitScale()
+    place = Place.begun_by(visits.visit(1.0))
+    for noise in (20.0, *[1.0] * 30):
+        scale.add(visits.fit(place, visits.visit(noise)).as_is, GATE)
+    scale.change()
+    assert scale.factor < 1.3
+
+
+def test_a_visit_that_contradicts_its_place_has_larger_variances_or_no_say(space):
+    visits = Visits(space)
+    place = Place.begun_by(visits.visit(1.0))
+    assert visits.fit(place, visits.visit(1.0)).wider == 1.0
+    fit = visits.fit(place, visits.visit(3.0))
+    assert fit.wider > 1.0
+    assert fit.without is fit.anew is None
+    assert fit.visit.information == pytest.approx(visits.visit(1.0).information / fit.wider)
+    assert fit.result.statistic < fit.as_is.statistic
+    assert visits.fit(place, visits.visit(30.0)).result is None
+
+
+def test_a_landmark_that_contradicts_a_place_is_left_out_once_and_then_known_anew(space):
+    visits = Visits(space)
+    place = Place.begun_by(visits.visit(1.0))
+    visits.points[2] += 1.5
+    fit = visits.fit(place, visits.visit(1.0))
+    assert (fit.without, fit.anew, fit.wider) == (2, None, 1.0)
+    assert fit.as_is.statistic > quantile(GATE, fit.as_is.degrees) > fit.result.statistic
+    again = visits.fit(fit.result.place, visits.visit(1.0), {2: 1})
+    assert (again.without, again.anew) == (None, 2)
+    assert again.result.statistic < quantile(GATE, again.result.degrees)
