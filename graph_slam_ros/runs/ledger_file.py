@@ -33,7 +33,7 @@ Ids = tuple[int, ...]
 Stamp = NewType("Stamp", int)
 Row = TypeVar("Row")
 _ROUNDING = 1e-6  # of a statistic, which is then below 0
-_VERDICTS, _REASONS = tuple(Verdict), tuple(Reason)
+_VERDICTS, _REASONS = tuple(Verdict), {int(one): one for one in Reason}
 
 
 @dataclass(frozen=True, slots=True)
