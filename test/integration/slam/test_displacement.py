@@ -14,7 +14,6 @@ from graph_slam_ros.runs.restore import complete, map_of, record_run, recover
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry
 from graph_slam_ros.slam.alarm import Alarm
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict
-from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.tools.simulation import Fault, faulty_recording, measurements, simulate
 
 DISPLACED, SLIP = ("odometry", "displaced"), ("odometry", "slip")
@@ -69,12 +68,12 @@ class Driven:
             if given is not None and m.stamp_ns > event_ns:
                 self.slam.process(given)
                 given = None
-            self.slam.process(m)
+            is_new = bool(self.slam.process(m))
             alarm = self.slam.displaced
             if alarm is not None:
                 self.alarmed_s = self.alarmed_s or (alarm.began_ns - event_ns) * 1e-9
             is_decided = (alarm and alarm.segment) or self.slam.counters[DISPLACED] or self.slam.counters[SLIP]
-            if m.stamp_ns > event_ns > 0 and not is_decided:
+            if is_new and m.stamp_ns > event_ns > 0 and not is_decided:
                 before = self.slam.trajectory()[self.slam.keyframes.stamps_ns <= event_ns, :2]
                 reference = before if reference is None else reference
                 self.moved_m = max(self.moved_m, float(np.linalg.norm(before - reference, axis=1).max()))
@@ -104,7 +103,8 @@ def test_G23_a_robot_that_was_carried_is_found_and_the_path_before_stays(recordi
     assert slam.ledger.verdict_of(out[0]) is Verdict.REJECTED
 
 
-@pytest.mark.parametrize("seed", times([3], [3, 5]))
+@pytest.mark.skipif(not times(0, 1), reason="only in make soak")
+@pytest.mark.parametrize("seed", [3, 5])
 def test_G23_a_robot_that_was_carried_to_new_ground_is_found_where_it_was_carried(seed):
     """Landmarks were begun at wrong places before it sees known ground again: they move with it."""
     recording = simulate("manhattan", seed=seed)
@@ -191,7 +191,7 @@ def test_G23_wrong_identities_are_no_displacement(recording, rate):
     assert rate > 0.1 or not driven.slam.alarms
 
 
-@pytest.mark.parametrize("away_m, sigma_m", [(3.0, 0.05), *times([], [(48.0, 0.5)]), (1e6, 0.5)])
+@pytest.mark.parametrize("away_m, sigma_m", times([(3.0, 0.05)], [(3.0, 0.05), (48.0, 0.5), (1e6, 0.5)]))
 def test_G24_a_wrong_pose_that_somebody_gives_is_found_out_by_the_landmarks(recording, away_m, sigma_m):
     event_ns = int(recording.stamps_ns[int(0.7 * len(recording.stamps_ns))])
     covariance = tuple(np.diag([sigma_m**2, sigma_m**2, 0.0025]).ravel().tolist())
@@ -205,41 +205,30 @@ def test_G24_a_wrong_pose_that_somebody_gives_is_found_out_by_the_landmarks(reco
 
 def test_G24_a_true_pose_that_somebody_gives_is_believed(recording):
     event_ns = int(recording.stamps_ns[int(0.7 * len(recording.stamps_ns))])
-    pose = GraphSlam()
-    for m in measurements(recording):
-        if m.stamp_ns > event_ns:
-            break
-        pose.process(m)
-    said = InitialPose(tuple(pose.trajectory()[-1].tolist()), tuple((0.01 * np.eye(3)).ravel().tolist()))
+    true = (tuple(recording.T_world_base[k]) for k in (0, np.searchsorted(recording.stamps_ns, event_ns)))
+    said = InitialPose(se2.between(*true), tuple((0.01 * np.eye(3)).ravel().tolist()))
     slam = Driven(recording, event_ns, said).slam
     assert slam.ledger.verdict_of(int(slam.graph.edges_of("initialpose")[0])) is Verdict.ACCEPTED
     assert not slam.alarms
     assert errors(slam, recording).max() < 0.5
 
 
-def test_an_alarm_is_in_the_summary_and_a_map_with_a_segment_in_the_past_is_taken_up(recording, tmp_path):
+def test_a_map_that_is_taken_up_has_the_segment_and_a_recovered_run_its_alarms(recording, tmp_path):
+    """Also one that was cut off, and has no summary; one of an older version has them in its summary alone."""
     faulty, _ = carried(recording)
     slam, summary = record_run(tmp_path / "run", Config(), [*measurements(faulty), Control("end")], [])
     (told,) = summary["displacements"]
     assert told["segment"] == slam.alarms[0].segment
     state = map_of(tmp_path / "run", [])
-    assert isinstance(state, MapSnapshot)
     assert state.segments == slam.segments
     again = GraphSlam(Config(), start=state)
     assert np.abs((again.trajectory() - slam.trajectory())[:, :2]).max() < 0.05  # solved anew, all of it
-
-
-def test_a_recovered_run_has_its_alarms(recording, tmp_path):
-    """Also one that was cut off, and has no summary; one of an older version has them in its summary alone."""
-    faulty, _ = carried(recording)
-    _, summary = record_run(tmp_path / "run", Config(), [*measurements(faulty), Control("end")], [])
-    assert len(summary["displacements"]) == 1
     shutil.copytree(tmp_path / "run", tmp_path / "cut")
     (tmp_path / "cut" / "run.json").unlink()
     for name in ("run", "cut"):
-        assert recover(tmp_path / name, tmp_path / f"{name} again")["displacements"] == summary["displacements"]
-        assert complete(tmp_path / name)["displacements"] == summary["displacements"]
-    assert recover(tmp_path / "run again", tmp_path / "third")["displacements"] == summary["displacements"]
+        assert recover(tmp_path / name, tmp_path / f"{name} again")["displacements"] == [told]
+        assert complete(tmp_path / name)["displacements"] == [told]
+    assert recover(tmp_path / "run again", tmp_path / "third")["displacements"] == [told]
 
 
 def test_a_displacement_that_later_sightings_contradict_is_taken_back(recording):
