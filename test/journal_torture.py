@@ -40,8 +40,8 @@ STATES = ("empty folder", "earlier run there", "after one save", "after a disk-f
 STEPS, SAVES = 34, (20,)  # measurements, and after which of them is saved; once more at the end
 UPDATED, SAVED, WRONG = b"u", b"s", b"!"
 IS_LONG = times(False, True)
-EVERY = times(6, 1)
-"""Of the calls that reach the disk, which."""
+EVERY, FAILS_EVERY = times((6, 23), (1, 1))
+"""Of the calls that reach the disk, at which it crashes, and which fail."""
 
 
 def row(name, tried, faults, failed):
@@ -393,7 +393,7 @@ def errors(state, root, kinds_of):
     folder, wrong, tried, recovered = root / "run", [], 0, 0
     if state == "earlier run there":
         drive(folder, lambda what: None)
-    for k, n in enumerate(itertools.count(1, EVERY)):
+    for k, n in enumerate(itertools.count(1, FAILS_EVERY)):
         fired = 0
         for kind, lasts in kinds_of(k):
             if state != "earlier run there":

@@ -31,7 +31,7 @@ def guided(name):
 DRIVES = (
     *("advise", "calibration_consistency", "calibration_random", "consistency", "displacement", "extreme_fixes"),
     *("bad_drives", "gyro_drives", "determination", "initialization"),
-    *("nees", "planted", "simulation", "slip", "recordings", "uncorrected", "unnamed"),
+    *("nees", "planted", "rates", "simulation", "slip", "recordings", "uncorrected", "unnamed"),
 )
 PROGRAMMES = {
     "lifelong": [
@@ -52,7 +52,7 @@ PROGRAMMES = {
     "kernels": tests("test_kernels.py"),
     "drives": tests(*(f"test_{name}.py" for name in DRIVES)),
     "fleet": tests("test_fleet_faults.py"),
-    "odd_files": tests("test_odd_files.py"),
+    "odd_files": tests("test_odd_files.py", "test_run_folder.py"),
     **{f"guided_{name}": guided(name) for name in ("g2o", "yaml", "cdr", "journal")},
     "planted_faults": [sys.executable, "test/planted_faults.py"],
     "clean_recordings": [sys.executable, "test/clean_recordings.py", "--seeds", "7", "--public"],

@@ -196,11 +196,12 @@ def written(slam):
 
 @pytest.mark.parametrize("dimensions, association", list(itertools.product((2, 3), ASSOCIATIONS)))
 def test_whatever_is_measured_nothing_is_raised_and_nothing_infinite_comes_out(dimensions, association):
-    once = drive(0, dimensions, association)
+    count = times(30, 60)
+    once = drive(0, dimensions, association, count)
     assert len(once.keyframes) > 1
-    assert written(drive(0, dimensions, association)) == written(once)
-    for seed in range(1, times(2, 20)):
-        drive(seed, dimensions, association)
+    assert written(drive(0, dimensions, association, count)) == written(once)
+    for seed in range(1, times(1, 20)):
+        drive(seed, dimensions, association, count)
 
 
 def test_of_extreme_numbers_no_search_takes_more_steps_than_the_bound(monkeypatch):
@@ -219,5 +220,5 @@ def test_of_extreme_numbers_no_search_takes_more_steps_than_the_bound(monkeypatc
         return cost
 
     monkeypatch.setattr("graph_slam_ros.slam.robust.innovation.native_or_plain", lambda _, plain: (counted, plain))
-    drive(12, 3, "id")
+    drive(55, 3, "id")
     assert max(evaluations) >= 60, "it is a drive on which a search would go on"

@@ -281,7 +281,7 @@ def test_G16_what_an_update_costs_does_not_grow_with_the_graph_while_no_loop_is_
     graph = Graph()
     solver = Solver(graph)
     eliminated = []
-    for k in range(3000):
+    for k in range(1500):
         graph.add_vertex(SE2, (0.1 * k, 0.0, 0.0))
         if k:
             graph.add_edge(RELATIVE_POSE, [k - 1, k], (0.1, 0.0, 0.0), POSE, "odometry")
@@ -289,8 +289,8 @@ def test_G16_what_an_update_costs_does_not_grow_with_the_graph_while_no_loop_is_
             graph.add_edge(POSE_PRIOR, [0], (0.0, 0.0, 0.0), POSE, "anchor")
         solver.add([k], [k])
         eliminated.append(solver.update().eliminated)
-    assert np.median(eliminated[-500:]) <= np.median(eliminated[500:1000])
-    assert np.mean(eliminated[-500:]) < 3.0 * np.mean(eliminated[500:1000])
+    assert np.median(eliminated[-300:]) <= np.median(eliminated[300:600])
+    assert np.mean(eliminated[-300:]) < 3.0 * np.mean(eliminated[300:600])
 
 
 # -- thirty graphs, and what is to come of each ------------------------------------------------------------------------

@@ -111,20 +111,6 @@ def test_saving_on_the_way_costs_no_measurement():
     assert p.counters.as_dict() == {}
 
 
-def test_a_sighting_that_comes_late_is_carried_to_the_keyframe_before_it():
-    in_time = run(slam(), *straight(1), seen(0.75, point()), *END)
-    late = run(slam(), *straight(1), Control("flush"), seen(0.75, point()), *END)
-    assert list(late.sighting_poses) == list(in_time.sighting_poses) != []
-    assert late.counters.as_dict() == {}
-
-
-def test_B17_sightings_older_than_what_is_kept_are_dropped_and_counted_each():
-    p = slam(ordering={"late_s": 0.2})
-    run(p, *straight(1), seen(0.05, point("a"), point("b")), seen(1.0, point("c")))
-    assert p.counters.as_dict() == {"/landmarks": {"late": 2}}
-    assert set(p.landmarks) == {"c"}
-
-
 def test_B2_late_sightings_go_where_they_belong():
     late = run(slam(), *straight(9), seen(3.7, point("a")), seen(8.2, point("b")), *END)
     in_time = slam()
@@ -140,12 +126,6 @@ def test_B2_late_sightings_go_where_they_belong():
         assert there == pytest.approx(here, abs=1e-9)
         at = [table(p, LANDMARK_POSITION).measured.values for p in (late, in_time)]
     assert np.sort(at[0], axis=0) == pytest.approx(np.sort(at[1], axis=0), abs=1e-12)
-
-
-def test_B16_sightings_from_before_the_first_odometry_are_counted_whenever_they_come():
-    p = run(slam(), seen(-1, point("a")), *straight(1), seen(-0.5, point("a")), *END)
-    assert p.counters.as_dict() == {"/landmarks": {"before_odometry": 2}}
-    assert not p.landmarks
 
 
 def test_sightings_from_after_the_last_odometry_are_counted_at_the_end():
@@ -205,11 +185,11 @@ def test_G20_a_standing_robot_makes_no_keyframes_and_gathers_no_noise():
     assert covariance_of(p, LANDMARK_POSITION) == pytest.approx(np.reshape(POINT, (2, 2)), rel=1e-5)
 
 
-@pytest.mark.parametrize(("jitter_m", "hz"), [(2e-5, 50), (2e-4, 10), (1e-4, 100)])
+@pytest.mark.parametrize(("jitter_m", "hz"), [(2e-5, 50), (2e-4, 10)])
 def test_odometry_that_jitters_while_the_robot_stands_is_no_motion(jitter_m, hz):
     rng = np.random.default_rng(1)
     p = slam(keyframes={"min_distance_m": 0.5, "max_interval_s": 1.0})
-    count = 900 * hz
+    count = 100 * hz
     for k, (x, y, theta) in enumerate((jitter_m * rng.standard_normal((count, 3))).tolist()):
         p.process(odometry(k / hz, (x, y, theta)))
     assert len(p.keyframes) == 1

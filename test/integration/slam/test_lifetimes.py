@@ -1,7 +1,6 @@
 """Landmarks that vanish, move or come back, in the pipeline: laps around a small hall, with ids and without."""
 
 import json
-from functools import cache
 
 import numpy as np
 import pytest
@@ -72,29 +71,34 @@ def what(slam, kind):
     return {one.name for one in slam.landmark_events if one.what == kind}
 
 
-@cache
-def changed_hall():
-    return driven(measurements(34, changed=14))
+@pytest.fixture(scope="module")
+def changed(tmp_path_factory):
+    """The run of a hall that changes, and its pipeline."""
+    folder = tmp_path_factory.mktemp("changed") / "run"
+    return folder, record_run(folder, config(), measurements(34, changed=14), [])[0]
 
 
-def test_what_is_gone_is_retired_and_what_moved_is_at_its_new_place():
-    slam = changed_hall()
+def test_what_is_gone_is_retired_what_moved_is_at_its_new_place_and_a_second_run_and_its_map_know_the_same(changed):
+    folder, slam = changed
     assert what(slam, "retired") == {"m1", "m6"}
     assert what(slam, "moved") == {"m3", "m10"}
     assert {name for name, mark in slam.landmarks.items() if mark.retired_ns} == {"m1", "m6", "m3#1", "m10#1"}
     for name, at in (LATER | LATE | {"m3#1": MARKS["m3"], "m10#1": MARKS["m10"], "m5": MARKS["m5"]}).items():
         if at is not None:
             assert slam.solver.estimate([slam.landmarks[name].vertex])[0] == pytest.approx(at, abs=0.2)
-
-
-def test_what_showed_it_elsewhere_is_set_aside_with_its_reason():
-    slam = changed_hall()
-    moved = [change for change in slam.ledger.history if change.reason.name == "MOVED"]
-    assert moved
-    assert {slam.graph.edge(one.edge).vertices[1] for one in moved} <= {
-        slam.landmarks["m3#1"].vertex,
-        slam.landmarks["m10#1"].vertex,
-    }
+    set_aside = [change for change in slam.ledger.history if change.reason.name == "MOVED"]
+    ends = {slam.graph.edge(one.edge).vertices[1] for one in set_aside}
+    assert set() < ends <= {slam.landmarks["m3#1"].vertex, slam.landmarks["m10#1"].vertex}
+    again = restored(folder, [])
+    assert "m3#1" in (folder / "landmarks.csv").read_text()
+    assert again.landmark_passes(0) == slam.landmark_passes(0)
+    retired = [{name: mark.retired_ns for name, mark in one.landmarks.items()} for one in (slam, again)]
+    assert retired[0] == retired[1]
+    events = json.loads((folder / "run.json").read_text())["landmark_events"]
+    assert events == list(map(str, slam.landmark_events))
+    text = "\n".join(explain_edge(SavedGraph(folder, []), "landmark:m3#1"))
+    assert "landmark m3 moved from" in text
+    assert "landmark moved" in text
 
 
 def test_without_the_parameter_nothing_is_retired():
@@ -140,24 +144,9 @@ def test_a_surveyed_landmark_is_reported_and_stays():
     assert not slam.landmarks["m3"].retired_ns
 
 
-def test_a_second_run_and_its_map_know_the_same(tmp_path):
-    record_run(tmp_path / "run", config(), measurements(34, changed=14), [])
-    live, again = changed_hall(), restored(tmp_path / "run", [])
-    assert "m3#1" in (tmp_path / "run" / "landmarks.csv").read_text()
-    assert again.landmark_passes(0) == live.landmark_passes(0)
-    retired = [{name: mark.retired_ns for name, mark in slam.landmarks.items()} for slam in (live, again)]
-    assert retired[0] == retired[1]
-    events = json.loads((tmp_path / "run" / "run.json").read_text())["landmark_events"]
-    assert events == list(map(str, live.landmark_events))
-    text = "\n".join(explain_edge(SavedGraph(tmp_path / "run", []), "landmark:m3#1"))
-    assert "landmark m3 moved from" in text
-    assert "landmark moved" in text
-
-
-def test_merge_keeps_what_is_retired_and_never_takes_two_old_places_for_one(tmp_path):
-    for name, seed in (("a", 0), ("b", 1)):
-        record_run(tmp_path / name, config(), measurements(34, changed=14, seed=seed), [])
-    merge(tmp_path / "a", tmp_path / "b", tmp_path / "both")
+def test_merge_keeps_what_is_retired_and_never_takes_two_old_places_for_one(changed, tmp_path):
+    record_run(tmp_path / "b", config(), measurements(34, changed=14, seed=1), [])
+    merge(changed[0], tmp_path / "b", tmp_path / "both")
     marks = restored(tmp_path / "both", []).landmarks
     assert {name for name, mark in marks.items() if mark.retired_ns} == {"m1", "m6", "m3#1", "m10#1", "m3#2", "m10#2"}
     assert "retired_ns" in (tmp_path / "both" / "landmarks.csv").read_text()

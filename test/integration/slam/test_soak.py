@@ -16,7 +16,7 @@ from graph_slam_ros.tools.simulation import simulate
 from graph_slam_ros.tools.simulation.recording import START_NS
 
 S = 1_000_000_000
-HOUR_NS, DRIVE_NS = 3600 * S, times(200, 600) * S
+HOUR_NS, DRIVE_NS = 3600 * S, times(60, 600) * S
 REBOOT_HOURS = 6.0
 JITTER_M = 2e-5
 """Of odometry while the robot is parked."""

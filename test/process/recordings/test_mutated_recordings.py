@@ -98,12 +98,6 @@ def test_what_happens_to_a_recording_leaves_the_path_nearly_as_good(simulated, w
     simulated(world).judge(kind, 0)
 
 
-@pytest.fixture(scope="module", params=ROBOTS)
-def public(request, tmp_path_factory):
-    folder = tmp_path_factory.mktemp(f"robot{request.param}")
-    return Recorded(mrclam(request.param, folder / "clean"), folder, end_s=LONG_S)
-
-
 @pytest.mark.skipif(not times(0, 1), reason="only in make soak")
 @pytest.mark.skipif(not HAS_MRCLAM, reason=WITHOUT_MRCLAM)
 @pytest.mark.parametrize("robot", ROBOTS)

@@ -33,8 +33,9 @@ def test_a_recorded_robot_is_found_to_a_decimetre_and_so_are_its_landmarks(robot
     assert not done.losses
 
 
+@pytest.mark.skipif(not times(0, 1), reason="only in make soak")
 @pytest.mark.skipif(not HAS_MRCLAM, reason=WITHOUT_MRCLAM)
-@pytest.mark.parametrize("robot, seconds", times([(2, 450.0)], [(robot, None) for robot in MOST_M]))
+@pytest.mark.parametrize("robot, seconds", ROBOTS)
 def test_with_condensed_visits_it_is_nearly_as_good(robot, seconds, tmp_path):
     """Odometry says a way that is 10 % too long, and the clock is late: the visits' errors are no noise."""
     bag = mrclam(robot, tmp_path / "bag", seconds=seconds)

@@ -33,7 +33,7 @@ from graph_slam_ros.runs.recorder import RunRecorder
 from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.slam import Config, Counters, GraphSlam, Odometry
 
-CUTS, FLIPS, KILLS = times((400, 150, 12), (None, 5_000, 3_000))  # None: at every byte
+CUTS, FLIPS, KILLS = times((100, 60, 5), (None, 5_000, 3_000))  # None: at every byte
 
 
 # -- cut and flipped ---------------------------------------------------------------------------------------------------

@@ -9,6 +9,7 @@ import signal
 import time
 import traceback
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -152,18 +153,18 @@ def struck(seed):
     return p, faulty
 
 
-@pytest.fixture(scope="module")
-def clean():
-    return [run(pipeline(), (*drive(seed), *END)) for seed in range(10)]
+@cache
+def undisturbed(seed):
+    return run(pipeline(), (*drive(seed), *END)).trajectory()
 
 
-@pytest.mark.parametrize("part", range(10))
-def test_T14_whatever_fails_at_any_solve_the_last_good_estimate_stays_and_soon_one_succeeds(part, clean):
+@pytest.mark.parametrize("part", times([6], range(10)))
+def test_T14_whatever_fails_at_any_solve_the_last_good_estimate_stays_and_soon_one_succeeds(part):
     tried = hit = 0
-    for seed in range(part, times(50, 2000), 10):
+    for seed in range(part, times(100, 2000), 10):
         p, faulty = struck(seed)
         tried, hit = tried + 1, hit + faulty.struck
-        assert p.trajectory() == pytest.approx(clean[seed % 10].trajectory(), abs=0.05)
+        assert p.trajectory() == pytest.approx(undisturbed(seed % 10), abs=0.05)
     tell("solver_faults", tried=tried, faults=hit, failed=0)
     assert hit > 0.3 * tried
 
@@ -194,15 +195,21 @@ class Allergic:
         return solve
 
 
-@pytest.mark.parametrize("k", [13, 17, 24])
-def test_G7_what_a_solve_fails_with_again_and_again_is_quarantined_and_nothing_else(k, clean):
+def driven_allergic(k):
+    """A pipeline that fails with the closure of a keyframe, that fault, and whether it failed at each keyframe."""
     p = pipeline()
     measurements = list(drive(0))
-    vertices = clean[0].keyframes.ids.tolist()
+    vertices = run(pipeline(), measurements).keyframes.ids.tolist()
     allergic, states = Allergic(p, (vertices[k - AROUND], vertices[k])), []
     for m in measurements:
         if p.process(m).keyframes:
             states.append(bool(p.failing))
+    return p, allergic, states
+
+
+@pytest.mark.parametrize("k", times([17], [13, 17, 24]))
+def test_G7_what_a_solve_fails_with_again_and_again_is_quarantined_and_nothing_else(k):
+    p, allergic, states = driven_allergic(k)
     edge = allergic.edge
     assert 1 <= sum(states) <= 3
     assert p.counters.as_dict() == {"closures": {"quarantined": 1}, "solver": {"MemoryError": 2}}
@@ -210,7 +217,7 @@ def test_G7_what_a_solve_fails_with_again_and_again_is_quarantined_and_nothing_e
     assert (change.edge, change.verdict) == (edge, Verdict.REJECTED)
     run(p, END)
     assert edge not in p.solver.edges
-    assert p.trajectory() == pytest.approx(clean[0].trajectory(), abs=0.1)
+    assert p.trajectory() == pytest.approx(undisturbed(0), abs=0.1)
 
 
 def test_G7_an_old_landmark_that_later_solves_do_not_determine_is_quarantined():
@@ -219,7 +226,7 @@ def test_G7_an_old_landmark_that_later_solves_do_not_determine_is_quarantined():
     How many solves fail in one drive is chance: rounding decides where such a landmark goes.
     """
     parts = []
-    for seed in range(7):
+    for seed in range(times(1, 7)):
         p = GraphSlam(Config())
         for m in measurements(simulate("warehouse", seed, aisles=2, aisle_m=4.0, laps=1, sensor="bearing")):
             p.process(replace(m, sightings=tuple(map(in_degrees, m.sightings))) if isinstance(m, Sightings) else m)
@@ -227,15 +234,15 @@ def test_G7_an_old_landmark_that_later_solves_do_not_determine_is_quarantined():
         parts.append(p.counters.as_dict()["solver"]["SingularError"] / len(p.keyframes))
         assert p.counters.as_dict()["landmarks"]["quarantined"] > 5
         assert not p.failing
-    assert 0.0 < np.median(parts) < 0.1
+    assert 0.0 < np.median(parts) < times(0.5, 0.1)
 
 
 def in_degrees(one):
     return replace(one, measured=(float(se2.wrap(math.degrees(one.measured[0]))),))
 
 
-@pytest.mark.parametrize("at", [5, 40, 70])
-def test_P23_to_go_back_to_the_last_good_estimate_in_a_solver_made_anew_changes_nothing_in_the_end(at, clean):
+@pytest.mark.parametrize("at", times([40], [5, 40, 70]))
+def test_P23_to_go_back_to_the_last_good_estimate_in_a_solver_made_anew_changes_nothing_in_the_end(at):
     p = pipeline()
     for k, m in enumerate(drive(0)):
         p.process(m)
@@ -245,29 +252,8 @@ def test_P23_to_go_back_to_the_last_good_estimate_in_a_solver_made_anew_changes_
             assert p.trajectory() == pytest.approx(before, abs=1e-12)
             assert np.isnan(p.keyframe_covariances()).all(), "unknown until the next solve"
     run(p, END)
-    assert p.trajectory() == pytest.approx(clean[0].trajectory(), abs=1e-4)
+    assert p.trajectory() == pytest.approx(undisturbed(0), abs=1e-4)
     assert not p.counters.as_dict()
-
-
-def test_P21_a_fault_of_one_measurement_costs_none_of_those_that_are_released_with_it():
-    p = GraphSlam(Config.from_mapping({"ordering.window_s": 5.0}))
-    for k in range(5):
-        p.process(Odometry(stamp(0) + k * S // 2, (0.5 * k, 0.0, 0.0)))
-        seen = [Sighting(name, "position", (1.0, 1.0), (0.01, 0.0, 0.0, 0.01)) for name in (f"{k}",)]
-        p.process(Sightings(stamp(0) + k * S // 2, "/landmarks", tuple(seen)))
-    add = p._landmarks.map.add
-
-    def faulty(topic, name, *others):
-        if name == "1":
-            raise RuntimeError("injected")
-        add(topic, name, *others)
-
-    p._landmarks.map.add = faulty
-    with pytest.raises(RuntimeError, match="injected"):
-        p.process(Control("flush"))
-    run(p, END)
-    assert set(p.landmarks) == {"0", "2", "3", "4"}
-    assert len(p.keyframes) == 5
 
 
 @pytest.mark.parametrize("label", ["odometry", "landmarks"])
@@ -320,12 +306,12 @@ def fails():
     raise MemoryError("injected")
 
 
-def test_a_second_look_that_fails_changes_nothing_and_is_counted(clean):
+def test_a_second_look_that_fails_changes_nothing_and_is_counted():
     p = run(pipeline(executor=lambda work: fails), drive(0))
     assert p.counters["second_look", "MemoryError"] > 0
     assert not p.failing
     run(p, END)
-    assert p.trajectory() == pytest.approx(clean[0].trajectory(), abs=1e-6)
+    assert p.trajectory() == pytest.approx(undisturbed(0), abs=1e-6)
 
 
 # -- memory ------------------------------------------------------------------------------------------------------------
@@ -376,9 +362,10 @@ def is_where_it_was(p, good):
 
 def test_T13_without_memory_a_solve_fails_and_with_memory_again_it_goes_on():
     """In children of this process, of which each lacks other memory."""
+    driven_allergic(17)  # with kernels that are loaded now: without memory that would end the process
     p = run(pipeline(), many(0, 600))
     measurements, codes = [*many(600, 660), *END], {}
-    for seed in range(times(32, 1000)):
+    for seed in range(times(8, 1000)):
         child = os.fork()
         if not child:
             code = BAD + 2
@@ -395,7 +382,10 @@ def test_T13_without_memory_a_solve_fails_and_with_memory_again_it_goes_on():
     faults = sum(code in (RAISED_ONLY, DEGRADED) for code in codes.values())
     tell("out_of_memory", tried=len(codes), faults=faults, failed=len(failed))
     assert not failed
-    assert set(codes.values()) == {RAISED_ONLY, DEGRADED, FINE}, "or not all is shown"
+    shown = set(codes.values())
+    assert times(RAISED_ONLY in shown or DEGRADED in shown, shown == {RAISED_ONLY, DEGRADED, FINE}), (
+        "or not all is shown"
+    )
 
 
 def many(first, end):
