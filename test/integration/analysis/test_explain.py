@@ -95,7 +95,6 @@ def test_each_verdict_is_explained_in_its_words(run):
         (Verdict.REJECTED, Reason.DOES_NOT_FIT, "after a solve with it, it had chi2"),
         (Verdict.REJECTED, Reason.OUTVOTED, "in the solution of least cost of the whole graph it has chi2"),
         (Verdict.REJECTED, Reason.WITHDRAWN, "withdrawn is final"),
-        (Verdict.REJECTED, Reason.FAILED, "the plugin of its edge type failed at it"),
         (Verdict.DOWN_WEIGHTED, Reason.NONE, "it is accepted, but its loss leaves it little weight"),
     ):
         saved.entries[entry.edge] = dataclasses.replace(entry, verdict=verdict, reason=reason)

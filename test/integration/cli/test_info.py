@@ -448,7 +448,9 @@ def test_an_imu_is_offered_where_nothing_else_is(info, capsys, covariance):
     assert not any("imu" in word for word in words)
     assert any(line.startswith("not used: /imu/data: its heading may drift") for line in lines)
     offered = shlex.split(" ".join(lines).split("part of odometry: ")[1].split(" what is wrong")[0])
-    assert run([*words[:-2], *offered, "--out", "b_imu"], capsys)[0]["inputs"]["imu"]["used"] > 0
+    told, _, err = run([*words[:-2], *offered, "--out", "b_imu"], capsys, code=3)
+    assert told["inputs"]["imu"]["used"] > 0
+    assert "stand for a second before the drive" in err  # the bias of the gyro is learnt at rest
     _, lines, _ = info(ODOMETRY, ("/imu/raw", IMU, compass(-1.0)), name="c.mcap")
     assert any(line.startswith("not used: /imu/raw: it has no orientation") for line in lines)
     assert "--set imu.topic=/imu/raw --set 'imu.mount=0 0 0 0 0 0' --set imu.use=gyro" in " ".join(

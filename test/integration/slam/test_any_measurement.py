@@ -9,7 +9,6 @@ from reliability import times
 from graph_slam_ros.lie import so3
 from graph_slam_ros.measurements.types import InitialPose
 from graph_slam_ros.slam import Closure, Config, Control, Fix, GraphSlam, Odometry, Sighting, Sightings
-from graph_slam_ros.solver.least_cost import least_cost
 
 S = 1_000_000_000
 LAST_NS = (2**31 - 100) * S
@@ -202,23 +201,3 @@ def test_whatever_is_measured_nothing_is_raised_and_nothing_infinite_comes_out(d
     assert written(drive(0, dimensions, association, count)) == written(once)
     for seed in range(1, times(1, 20)):
         drive(seed, dimensions, association, count)
-
-
-def test_of_extreme_numbers_no_search_takes_more_steps_than_the_bound(monkeypatch):
-    """Where it had none, one mixture took a minute, in 15 searches of up to a thousand steps."""
-    evaluations = []
-
-    def counted(linearize, *given):
-        evaluations.append(0)
-
-        def count(*values):
-            evaluations[-1] += 1
-            return linearize(*values)
-
-        cost = getattr(least_cost, "py_func", least_cost)(count, *given)
-        assert evaluations[-1] <= given[-1]
-        return cost
-
-    monkeypatch.setattr("graph_slam_ros.slam.robust.innovation.native_or_plain", lambda _, plain: (counted, plain))
-    drive(55, 3, "id")
-    assert max(evaluations) >= 60, "it is a drive on which a search would go on"
