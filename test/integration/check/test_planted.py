@@ -302,9 +302,9 @@ def test_each_finding_is_said_once(laps, tmp_path):
     assert len(found) == len(set(found)) > 0
 
 
-@pytest.mark.parametrize("read_ahead", [20_000, 1_500], ids=["all is read", "a part is read"])
-def test_a_replay_says_before_the_work_what_makes_its_result_meaningless(drive, tmp_path, monkeypatch, read_ahead):
-    monkeypatch.setattr("graph_slam_ros.runs.replay._READ_AHEAD", read_ahead)
+def test_a_replay_says_before_the_work_what_makes_its_result_meaningless(drive, tmp_path, monkeypatch):
+    """Of a part that is read ahead; of all of it, see the test of its exit code."""
+    monkeypatch.setattr("graph_slam_ros.runs.replay._READ_AHEAD", 1_500)
     bag, run, said = planted(drive, tmp_path / "mirrored.mcap", "bearings mirrored"), tmp_path / "run", []
 
     def warn(text):
@@ -384,7 +384,7 @@ def test_a_few_wrong_ids_are_a_note_where_what_contradicts_is_left_out(laps, tmp
     assert (one.severity, one.settings) == ("note", ())
 
 
-@pytest.mark.parametrize(("world", "dimensions"), [("warehouse", 2), ("flight", 3)])
+@pytest.mark.parametrize(("world", "dimensions"), times([("warehouse", 2)], [("warehouse", 2), ("flight", 3)]))
 def test_what_a_robot_sees_while_it_is_carried_is_no_second_landmark(tmp_path, world, dimensions):
     file = str(tmp_path / "carried.mcap")
     write_faulty_bag(simulate(world, 11), file, [Fault.named("carried", at=0.5, distance_m=8.0)], 11)
@@ -407,7 +407,8 @@ def test_a_replay_ends_with_the_worst_finding_and_only_its_summary_differs(drive
     assert '"code": "mirrored"' in (tmp_path / "run" / "run.json").read_text()
 
 
-@pytest.mark.parametrize(("blocks", "poses", "seed"), times([(6, 200, 2)], [(10, 300, 301), (6, 200, 2)]))
+@pytest.mark.skipif(not times(0, 1), reason="only in make soak")
+@pytest.mark.parametrize(("blocks", "poses", "seed"), [(10, 300, 301), (6, 200, 2)])
 def test_ids_that_are_new_after_a_while_are_found_where_landmarks_come_back_before(tmp_path, blocks, poses, seed):
     """At a crossing of streets the robot turns round: it sees a landmark again, with its id, and never later."""
     clean = simulate("manhattan", seed, poses=poses, blocks=blocks)

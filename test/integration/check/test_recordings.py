@@ -362,6 +362,7 @@ def test_ranges_alone_that_are_too_long_by_an_offset_are_mended_by_it(tmp_path, 
     assert float(value) == pytest.approx(0.0, abs=0.1)
 
 
+@pytest.mark.skipif(not times(0, 1), reason="only in make soak")
 def test_a_clean_drive_of_ranges_alone_needs_the_search_for_other_hypotheses(tmp_path, check, capsys):
     bag = tmp_path / "ranges.mcap"
     city = ("--poses", "300", "--set", "blocks=10", "--set", "sensor=range", "--seed", "501")

@@ -83,11 +83,6 @@ def test_velocity_errors_add_up_over_time_as_stated(correlation_time_s):
     assert (whitened**2).mean() == pytest.approx(1.0, abs=0.16)  # 1200 samples: 4 sigma
 
 
-def test_an_error_that_lasts_half_a_second_is_a_density_of_its_variance_times_one_second():
-    noise = VelocityNoise((0.05, 0.01, 0.02), 0.5)
-    assert np.diag(noise.per_tick(0.02)) / 0.02 == pytest.approx(np.square(noise.sigmas) * 1.0, rel=1e-3)
-
-
 @pytest.mark.parametrize("turn", [0.0, 1e-7, 1e-4, 0.99e-3, 1.01e-3, 0.3, -2.5])
 def test_the_right_jacobian_of_a_step_is_its_numeric_derivative(turn):
     step, h = np.array([1.7, -0.4, turn]), 1e-6
@@ -132,7 +127,7 @@ def error_of(sighting, T_world_base, landmark):
 @pytest.mark.parametrize("world, sensor", SENSORS)
 def test_sightings_are_off_the_truth_by_what_their_covariance_says(world, sensor):
     whitened = []
-    for seed in range(5):
+    for seed in range(times(3, 5)):
         recording = simulate(world, seed, **SMALL[world], sensor=sensor)
         at = {stamp_ns: tuple(p) for stamp_ns, p in zip(recording.stamps_ns, recording.T_world_base, strict=True)}
         for seen in recording.seen:
@@ -142,7 +137,7 @@ def test_sightings_are_off_the_truth_by_what_their_covariance_says(world, sensor
                 whitened.append((s.kind, *np.linalg.solve(root, error)))
     assert {kind for kind, *_ in whitened} == {sensor} | ({"position"} if world == "flight" else set())
     ours = np.array([row[1:] for row in whitened if row[0] == sensor])
-    assert len(ours) > 250
+    assert len(ours) > 150
     # of each component and each two: 5 sigma; a covariance taken at the measured bearing or attitude adds a little
     assert ours.T @ ours / len(ours) == pytest.approx(np.eye(ours.shape[1]), abs=5.0 * np.sqrt(2.0 / len(ours)))
 

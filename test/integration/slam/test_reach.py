@@ -58,7 +58,7 @@ def written(slam):
     return slam.trajectory().tobytes(), slam.keyframe_covariances().tobytes(), list(slam.landmarks)
 
 
-@pytest.mark.parametrize("dimensions, association", list(itertools.product((2, 3), ("id", "joint"))))
+@pytest.mark.parametrize("dimensions, association", [(2, "joint"), (3, "id")])
 def test_a_detection_at_1e8_m_is_refused_and_changes_nothing(dimensions, association):
     config = settings(dimensions, association)
     far = np.zeros(dimensions)
@@ -76,8 +76,9 @@ def test_a_detection_at_1e8_m_is_refused_and_changes_nothing(dimensions, associa
     assert replayed.counters.as_dict()[SOURCE]["beyond_max_distance"] == 4 * RATE
 
 
-@pytest.mark.parametrize("dimensions, association", list(itertools.product((2, 3), ("id", "joint"))))
-@pytest.mark.parametrize("axis", [0, -1])
+@pytest.mark.parametrize(
+    "dimensions, association, axis", [(2, "id", 0), (2, "joint", -1), (3, "id", -1), (3, "joint", 0)]
+)
 def test_where_it_is_allowed_to_see_so_far_every_solve_still_succeeds(dimensions, association, axis):
     config = settings(dimensions, association, **{f"{SOURCE}.max_distance_m": 1e9})
     far = np.zeros(dimensions)
