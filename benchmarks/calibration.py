@@ -2,9 +2,9 @@
 
 ``python -m benchmarks.calibration [ROBOT ...]`` drives MR.CLAM set 7 (of GRAPH_SLAM_DATASETS), known ids, as it is and
 *wrong*: odometry 5 % too long and 5 % too much turned, sightings 100 ms late, the mount turned by 5 degrees. Each
-without calibration and with ``calibrate.groups=auto``. Printed are the error of positions at the stamps of the
-sightings against motion capture, after alignment, and how much of what was put in did not come back: the difference of
-the corrected settings of the two runs with calibration, where both correct that parameter.
+without calibration and with the settings that ``graph_slam calibrate`` prints. Printed are the error of positions at
+the stamps of the sightings against motion capture, after alignment, and how much of what was put in did not come back:
+the difference of the settings, where both print them.
 """
 
 import argparse
@@ -13,9 +13,7 @@ import os
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -25,10 +23,12 @@ from benchmarks.fresh import ROOT
 from graph_slam_ros.analysis.path_error import interpolated
 from graph_slam_ros.analysis.trajectories import read_truth
 from graph_slam_ros.lie import se3
+from graph_slam_ros.measurements.types import END
 from graph_slam_ros.recordings.bag import open_bag
+from graph_slam_ros.runs.calibrate import calibrate
 from graph_slam_ros.runs.chosen_inputs import choose_inputs
 from graph_slam_ros.runs.replay import measurements
-from graph_slam_ros.slam import Config, Control, Counters, GraphSlam
+from graph_slam_ros.slam import Config, Counters, GraphSlam
 
 WRONG = {
     "odometry.distance_factor": 1.05,
@@ -36,47 +36,36 @@ WRONG = {
     "detections.offset_s": 0.1,
     "detections.mount_correction": f"0 0 0 0 0 {math.radians(5.0):.6f}",
 }
-AUTO = {"calibrate.groups": "auto"}
-_UNITS = {"distance": (1.0, ""), "turn": (1.0, ""), "clock": (1e3, " ms"), "yaw": (math.degrees(1.0), " deg")}
+_UNITS = {
+    "odometry.distance_factor": (1.0, ""),
+    "odometry.turn_factor": (1.0, ""),
+    "detections.offset_s": (1e3, " ms"),
+    "detections.mount_correction": (math.degrees(1.0), " deg"),
+}
 
 
-@dataclass(frozen=True, slots=True)
-class Driven:
-    """One drive of a robot.
-
-    Attributes
-    ----------
-    error_m : of positions
-    cpu_s : of the pipeline, reading left out
-    found : corrected settings by parameter, of those that were corrected
-    """
-
-    error_m: float
-    cpu_s: float
-    found: Mapping[str, float]
-
-
-def drive(path: Path, settings: Mapping[str, object]) -> Driven:
-    """Replay a recording in memory."""
+def drive(path: Path, settings: Mapping[str, object]) -> float:
+    """The error of positions [m] of a replay in memory."""
     bag, config = open_bag(path), Config.from_mapping(settings)
-    ingested = [m for several in measurements(bag, choose_inputs(bag, config), config, Counters()) for m in several]
-    begin_s, slam = time.process_time(), GraphSlam(config)
-    for m in (*ingested, Control("end"), Control("optimize")):
-        slam.process(m)
-    cpu_s, seen = time.process_time() - begin_s, slam.sighting_poses
+    slam = GraphSlam(config)
+    for several in measurements(bag, choose_inputs(bag, config), config, Counters()):
+        for m in several:
+            slam.process(m)
+    for event in END:
+        slam.process(event)
+    seen = slam.sighting_poses
     truth = np.asarray(se3.in_plane(interpolated(read_truth(path).trajectory, seen.stamps_ns * 1e-9)))
     known = np.isfinite(truth).all(axis=1)
-    error_m = judge.position_error(slam.sighting_trajectory()[known], truth[known])
-    found = {name: value for (_, name), value in slam.calibration.items()}
-    return Driven(error_m, cpu_s, found)
+    return judge.position_error(slam.sighting_trajectory()[known], truth[known])
 
 
-def not_back(clean: Mapping[str, float], wrong: Mapping[str, float]) -> str:
+def not_back(clean: Mapping[str, float | str], wrong: Mapping[str, float | str]) -> str:
     """How much of what was put in did not come back."""
     words = []
     for name, (shown, unit) in _UNITS.items():
         if name in clean and name in wrong:
-            words.append(f"{name} {shown * (wrong[name] - clean[name]):.2g}{unit}")
+            a, b = (float(str(one[name]).split()[-1]) for one in (clean, wrong))
+            words.append(f"{name} {shown * (b - a):.2g}{unit}")
     return ", ".join(words)
 
 
@@ -90,17 +79,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if not needed.exists():
             print(f"benchmarks: no {needed}: set GRAPH_SLAM_DATASETS", file=sys.stderr)
             return 2
-    print("| robot | as it is | with auto | wrong | wrong, with auto | over as it is | CPU of auto | not come back |")
-    print("|---|---|---|---|---|---|---|---|")
+    print("| robot | as it is | calibrated | wrong | wrong, calibrated | over as it is | not come back |")
+    print("|---|---|---|---|---|---|---|")
     for robot in options.parse_args(arguments).robots:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "bag"
             words = [sys.executable, converter, set_7, str(robot), path]
             subprocess.run(words, check=True, stdout=subprocess.DEVNULL)
-            clean, auto, wrong, mended = (drive(path, one) for one in ({}, AUTO, WRONG, WRONG | AUTO))
-        errors = " | ".join(f"{one.error_m:.3f}" for one in (clean, auto, wrong, mended))
-        ratios = f"{mended.error_m / clean.error_m:.2f} | {auto.cpu_s / clean.cpu_s:.2f}"
-        print(f"| {robot} | {errors} | {ratios} | {not_back(auto.found, mended.found)} |", flush=True)
+            found = [calibrate(path, one).settings for one in ({}, WRONG)]
+            errors = [drive(path, one) for one in ({}, found[0], WRONG, WRONG | found[1])]
+        numbers = " | ".join(f"{one:.3f}" for one in errors)
+        print(f"| {robot} | {numbers} | {errors[3] / errors[0]:.2f} | {not_back(*found)} |", flush=True)
     return 0
 
 

@@ -18,12 +18,11 @@ CLASSES = {
     "no turns": {},
     "standing": {},
     "a clock that jumps": {},
-    "a prior that contradicts": {},
 }
 
 
 def random_drive(name, seed):
-    """Measurements, settings, truth and faults of one drive of a class."""
+    """Measurements, truth and faults of one drive of a class."""
     random = np.random.default_rng([seed, list(CLASSES).index(name)])
     part = 0.0 if name == "nothing wrong" else 1.0
     faults = Faults(
@@ -42,7 +41,6 @@ def random_drive(name, seed):
         turns=turns,
     )
     middle_ns = (drive[0].stamp_ns + drive[-1].stamp_ns) // 2
-    settings: dict[str, object] = {}
     match name:
         case "one landmark":
             drive = [_only(m, {"3"}) for m in drive]
@@ -56,13 +54,7 @@ def random_drive(name, seed):
         case "standing":
             drive = [_stopped(m, random) for m in drive]
             truth = replace(truth, poses=np.repeat(truth.poses[:1], len(truth.poses), axis=0))
-        case "a prior that contradicts":
-            settings |= {
-                "calibrate.yaw_sigma_rad": 0.01,
-                "calibrate.factor_sigma": 0.01,
-                "calibrate.clock_sigma_s": 0.02,
-            }
-    return sorted((m for m in drive if m is not None), key=lambda m: m.stamp_ns), settings, truth, faults
+    return sorted((m for m in drive if m is not None), key=lambda m: m.stamp_ns), truth, faults
 
 
 def _of_sightings(m, change):

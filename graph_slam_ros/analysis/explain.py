@@ -89,27 +89,6 @@ def explain_run(run: SavedGraph) -> Iterator[str]:
     yield from (one["text"] for one in summary_of(run.folder).get("displacements", ()) if "text" in one)
 
 
-def explain_calibration(folder: Path) -> Iterator[str]:
-    """Say what calibration has found of each parameter, and how to determine what it has not.
-
-    Raises
-    ------
-    GraphSlamError
-        The run did not calibrate.
-    """
-    report = summary_of(folder).get("calibration")
-    if not report:
-        raise GraphSlamError(f"{folder}: it did not calibrate; graph_slam replay with --set calibrate.groups=auto does")
-    yield f"{report['trials']} trial fits; what is left after the corrections:"
-    for one in report["parameters"]:
-        yield from textwrap.wrap(one["text"], _WIDTH, initial_indent="  ", subsequent_indent="    ")
-    for window in report.get("windows", ()):
-        lines = ", ".join(f"{name}={value}" for name, value in window["settings"].items())
-        yield f"corrected from keyframe {window['first_keyframe']} on: {lines or 'nothing'}"
-    for name, value in report["settings"].items():
-        yield f"corrected: {name}={value}"
-
-
 def _table(entries: Sequence[Entry]) -> Iterator[str]:
     counts = Counter((e.label, _state(e.verdict, e.reason)) for e in entries)
     labels, states = dict.fromkeys(e.label for e in entries), sorted({state for _, state in counts})

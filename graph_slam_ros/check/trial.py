@@ -32,7 +32,7 @@ from graph_slam_ros.typing import Array, Index
 _THIN_NS = 80_000_000
 _APART_S = 1.0
 _COARSE = {
-    **{"solve.every_keyframes": 20, "robust.rounds": 3, "odometry.doubt": False, "calibrate.groups": "none"},
+    **{"solve.every_keyframes": 20, "robust.rounds": 3, "odometry.doubt": False},
     "map.condense": False,  # the fit is of all keyframes
 }
 _SIGMAS = 4.0
@@ -119,7 +119,7 @@ def check_trial(c: Columns, slam: GraphSlam) -> Iterator[Finding]:
     if len(slam.keyframes) < 3 or len(path_ns) < 2 or not slam.landmarks:
         return
     try:
-        fit, fitted = slam.trial_fit(chooses=True, places=True)
+        fit, fitted = slam.trial_fit(places=True)
     except GraphSlamError as error:
         yield Finding("fit_unsure", "note", 1, 0, "fits", f"the trial fit failed: {error}")
         return

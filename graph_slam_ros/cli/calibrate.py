@@ -13,6 +13,7 @@ from graph_slam_ros.formats.durable import write_whole
 from graph_slam_ros.formats.parameters import parameters_text
 from graph_slam_ros.runs.calibrate import Calibrated
 from graph_slam_ros.runs.calibrate import calibrate as calibrated
+from graph_slam_ros.slam.calibration.parameters import AUTO, GROUPS
 
 _WIDTH = 100
 
@@ -21,6 +22,9 @@ def calibrate_options(sub: CommandParser) -> None:
     """Add the options of ``calibrate``."""
     check_options(sub, of_check=False)
     sub.codes = f"{CODES} 4: something is to be corrected."
+    about = "auto (default: odometry's factors, clocks, yaws; of ranges alone their factor and offset), or some of "
+    about += f"{', '.join(GROUPS)}: what is estimated"
+    sub.add_argument("--groups", default=AUTO, help=about)
     sub.add_argument("--out", type=Path, metavar="FILE", help="write the settings as a parameter file, too")
     sub.add_argument("--force", action="store_true", help="replace an existing file")
 
@@ -34,7 +38,7 @@ def calibrate(args: argparse.Namespace) -> int:
     if args.out:
         console.check_file(args.out, force=args.force)
     settings = settings_of(args)
-    topics = {"odometry": args.odom, "landmarks": args.landmarks}
+    topics = {"groups": args.groups, "odometry": args.odom, "landmarks": args.landmarks}
     done = calibrated(args.bag, settings, **topics, progress=console.progress("calibrate"))
     if args.out:
         write_whole(args.out, _as_yaml(done).encode())

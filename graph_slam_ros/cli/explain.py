@@ -44,13 +44,10 @@ def explain(args: argparse.Namespace) -> int:
 
         compile_all()
         return _solve(args) if what_if else _influence(args)
-    from graph_slam_ros.analysis.explain import explain_calibration, explain_edge, explain_run
+    from graph_slam_ros.analysis.explain import explain_edge, explain_run
     from graph_slam_ros.analysis.what_if import SavedGraph
 
     losses: list[str] = []
-    if args.edge == "calibration":
-        console.show(*explain_calibration(args.run_folder))
-        return console.DONE
     run = SavedGraph(args.run_folder, losses)
     console.show(*(explain_edge(run, args.edge) if args.edge else explain_run(run)))
     if args.edge:

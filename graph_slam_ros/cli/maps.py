@@ -53,7 +53,7 @@ def merge(args: argparse.Namespace) -> int:
         f"landmark {name} is {metres:.2f} m ({sigmas:.0f} sigmas) elsewhere in B: what B saw of it is left out"
         for name, (metres, sigmas) in done.left_out.items()
     ]
-    return console.report_losses(done.losses, [*moved, *done.calibrations])
+    return console.report_losses(done.losses, moved)
 
 
 def freeze_options(sub: CommandParser) -> None:

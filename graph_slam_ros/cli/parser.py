@@ -54,7 +54,7 @@ COMMANDS: dict[str, Command | Group] = {
         "cli.calibrate:calibrate",
         "estimate odometry's scale, clocks and mounts from a recording, and print the settings",
         "drive.mcap",
-        "drive.mcap --set calibrate.groups='factors clock'",
+        "drive.mcap --groups 'factors clock'",
     ),
     "replay": Command(
         "cli.replay:replay",

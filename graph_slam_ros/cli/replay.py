@@ -157,15 +157,9 @@ def config_of(args: argparse.Namespace, suggested: Mapping[str, Any] | None = No
     values = dict(flatten(read_parameters(file, follow=file == args.config))) if file else {}
     try:
         asked = dict(parse_setting(text) for text in args.set)
-        config = Config.from_mapping(dict(suggested or {}) | values | asked)
+        return Config.from_mapping(dict(suggested or {}) | values | asked)
     except GraphSlamError as error:
         raise GraphSlamError(f"{file}: {error}" if file and not args.set else str(error)) from None
-    if asked.get("calibrate.groups") == "association" and not config.uses_found_factors:
-        raise GraphSlamError(
-            "calibrate.groups=association has no effect without landmarks.association=joint: set that, too, "
-            "or calibrate.groups=auto"
-        )
-    return config
 
 
 def _print_summary(source: Path, summary: dict[str, Any]) -> int:

@@ -14,7 +14,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from graph_slam_ros.config.calibrate import CalibrateConfig
 from graph_slam_ros.config.frontend import KeyframesConfig, OdometryConfig, OrderingConfig
 from graph_slam_ros.config.gyro import GyroConfig
 from graph_slam_ros.config.inputs import DEFAULT_INPUTS, InputConfig, default_input
@@ -46,11 +45,16 @@ from graph_slam_ros.typing import Numbers
 _STEP_TOLERANCE = 1e-5  # [m, rad]: the solve at the end has converged, far below what any sensor resolves
 _COST_TOLERANCE = 1e-9  # and so it has when the cost changes by a smaller part than this
 _ONE_ODOMETRY = "the first of inputs.names that publishes is used; a filter, e.g. robot_localization, fuses several"
+_CALIBRATE = ("groups", "factor_sigma", "clock_sigma_s", "yaw_sigma_rad", "mount_sigma_m", "range_offset_sigma_m")
 REMOVED = {
     "landmarks.follow_s": "observations without identity are compared with all landmarks around",
     "landmarks.size_sigma_m": "sizes are not compared; give things of other sizes another class",
     "landmarks.range_offset_sigma_m": "graph_slam calibrate finds INPUT.range_offset_m",
     "gyro.gate": "the gyro's turn replaces that of odometry",
+    **{
+        f"calibrate.{name}": "graph_slam calibrate BAG prints the settings that correct clocks, mounts and scales"
+        for name in (*_CALIBRATE, "range_factor_sigma", "turn_bias_sigma", "drift")
+    },
     "odometry.fusion": _ONE_ODOMETRY,
     "robust.odometry_gate": _ONE_ODOMETRY,
     **dict.fromkeys(
@@ -102,7 +106,6 @@ class Config:
     anchor: AnchorConfig = AnchorConfig()
     map: MapConfig = MapConfig()
     ordering: OrderingConfig = OrderingConfig()
-    calibrate: CalibrateConfig = CalibrateConfig()
     solve: SolveConfig = SolveConfig()
     robust: RobustConfig = RobustConfig()
     initialpose: InitialPoseConfig = InitialPoseConfig()
@@ -121,23 +124,12 @@ class Config:
 
     def __post_init__(self) -> None:
         _ = self.start_pose, self.load_pose, self.survey, self.gyro_input  # a wrong one is refused here, not later
-        words = self.calibrate.groups.split()
-        if "range_factor" in words and {"factors", "auto"} & set(words) and not self.survey:
-            raise ConfigError(
-                "calibrate.groups: factors and range_factor are one scale: leave one out, or survey landmarks "
-                "(landmarks.surveyed)"
-            )
 
     @property
     def differing(self) -> dict[str, Any]:
         """The parameters that differ from their defaults, as ``from_mapping`` takes them."""
         usual = {p.name: p.default for p in parameters(one.name for one in self.sources)}
         return {name: value for name, value in flatten(self.as_mapping()) if value != usual[name]}
-
-    @property
-    def uses_found_factors(self) -> bool:
-        """Return whether the factors of odometry that the association finds correct the graph."""
-        return self.landmarks.association == "joint" and self.calibrate.groups == "association"
 
     @property
     def condenses(self) -> bool:
@@ -150,7 +142,7 @@ class Config:
         for one in self.sources:  # they may begin at any keyframe
             if one.use == "closure":
                 return f"{one.name}.use=closure"
-        return f"calibrate.groups={self.calibrate.groups}" if self.calibrate.is_on else ""
+        return ""
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any]) -> "Config":

@@ -81,8 +81,7 @@ class MapConfig:
     condense: bool = setting(
         True,
         "true: what was driven long ago is condensed to one measurement of each place, so that memory and time follow "
-        "the area and not the distance driven; false: every keyframe is kept, as it always is with "
-        "closures or calibration",
+        "the area and not the distance driven; false: every keyframe is kept, as it always is with closures",
     )
     window_keyframes: int = setting(
         2000,

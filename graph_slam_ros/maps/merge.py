@@ -5,7 +5,7 @@ Visits of the first map may be condensed. Where those of the second are, its dri
 then the merged map has all of its keyframes, and condenses them as its configuration says.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from itertools import chain, count
 from pathlib import Path
@@ -26,7 +26,6 @@ from graph_slam_ros.runs.map_journal import MapGrowth, Record, extend, state_of
 from graph_slam_ros.runs.restore import config_to_go_on, record_run, restored_and_solved, stopwatch
 from graph_slam_ros.slam import Control, GraphSlam
 from graph_slam_ros.slam.alarm import Alarm
-from graph_slam_ros.slam.calibration.parameters import QUANTITIES, Parameter
 from graph_slam_ros.slam.edits import HAND_MADE
 from graph_slam_ros.slam.frontend.odometry_jumps import JUMP_SIGMA_M, JUMP_SIGMA_RAD
 from graph_slam_ros.slam.landmarks.assignments import NAME, last_number
@@ -46,7 +45,6 @@ class Merged:
     ----------
     shared : landmarks that both know
     left_out : what B saw of those of them that have moved, by name in metres and standard deviations
-    calibrations : sentences on parameters that are not the same in both
     is_repeated : whether the drive of B was repeated from its journal, because its visits are condensed
     """
 
@@ -54,7 +52,6 @@ class Merged:
     losses: list[str]
     shared: int
     left_out: dict[str, tuple[float, float]]
-    calibrations: list[str]
     is_repeated: bool
 
 
@@ -82,17 +79,7 @@ def merge(a: Path, b: Path, out: Path, *, force: bool = False) -> Merged:
     _leave_out(state, first_edge, chi2, aligned.limit)
     config = config_to_go_on(one, a)
     _, summary = record_run(out, config, [Control("optimize")], losses, state, took=took, force=force)
-    differ, is_repeated = list(_calibrations(one, two)), bool(parts_of(b, CONDENSED))
-    return Merged(summary, summary["losses"], len(shared), left_out, differ, is_repeated)
-
-
-def _calibrations(one: GraphSlam, two: GraphSlam) -> Iterator[str]:
-    """Yield a sentence on each corrected parameter that differs by more than what is worth a correction."""
-    for source, name in dict.fromkeys((*one.calibration, *two.calibration)):
-        a, b = (slam.calibrated(source, name) for slam in (one, two))
-        if abs(a - b) >= QUANTITIES[name].least:
-            what = Parameter(source, name)
-            yield f"{what} is {a:.4g} in A and {b:.4g} in B: the merged map goes on with that of A"
+    return Merged(summary, summary["losses"], len(shared), left_out, bool(parts_of(b, CONDENSED)))
 
 
 def _leave_out(state: MapSnapshot, first_edge: int, chi2: Mapping[int, float], limit: float) -> None:

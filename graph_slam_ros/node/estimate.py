@@ -113,8 +113,7 @@ class Estimate:
     uncorrected : clocks, mounts and scales that are off and not corrected; empty where none is
     motion : why the gyro, or an odometry, has no part in the motion; empty where all have
     gyro : its state and its bias; empty where no input is one
-    calibration : settings that calibration has corrected, a sentence for each parameter that it has fitted, and what is
-        off without being corrected
+    calibration : settings of odometry's factors that the association found, and what is off without being corrected
     is_resumed : whether a drive that was cut off goes on by odometry alone: nothing was recognised since
     """
 
@@ -208,7 +207,7 @@ class Estimate:
             ambiguity=_ambiguity(slam),
             gyro=str(slam.gyro or ""),
             is_resumed=is_resumed,
-            calibration=_calibration(slam.calibration_report, slam.contradicted),
+            calibration=_calibration(slam.found_settings, slam.contradicted),
         )
 
 
@@ -228,7 +227,6 @@ def _settings(one: Uncorrected) -> list[str]:
     return [f"{key}={value}" for key, value in one.as_dict()["settings"].items()]
 
 
-def _calibration(report: Mapping[str, Any], contradicted: Sequence[str]) -> dict[str, str]:
-    settings = {f"corrected {name}": str(value) for name, value in report.get("settings", {}).items()}
-    off = {OFF: ", ".join(contradicted)} if contradicted else {}
-    return settings | off | {f"{one['name']} of {one['source']}": one["text"] for one in report.get("parameters", ())}
+def _calibration(found: Mapping[str, float], contradicted: Sequence[str]) -> dict[str, str]:
+    settings = {f"corrected {name}": str(value) for name, value in found.items()}
+    return settings | ({OFF: ", ".join(contradicted)} if contradicted else {})

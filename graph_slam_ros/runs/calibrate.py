@@ -1,10 +1,11 @@
-"""The calibration of a recording: replays in memory, each with what the last one found, until nothing changes.
+"""The calibration of a recording: replays in memory, each with what was found so far, until nothing more is.
 
-From the last correction by more than a sigma on, a replay is as one with these settings. So it is enough to replay what
-came before once more. Where that part finds more, or believes fewer of the measurements, all is replayed.
+Fits are made after 50, 100, 200 and so on keyframes, and at the end. What one finds is set, and the replay begins anew:
+a map that is driven to its end with a wrong scale has learnt noise that hides it.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from typing import Any
 from graph_slam_ros.check.checks import worst_of_replay
 from graph_slam_ros.check.columns import Collector
 from graph_slam_ros.check.finding import Finding
-from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.errors import GraphSlamError, SingularError
 from graph_slam_ros.measurements.types import END
 from graph_slam_ros.messages.inputs import recorded_uses
 from graph_slam_ros.messages.survey import with_survey
@@ -22,14 +23,15 @@ from graph_slam_ros.runs.replay import RecordedRuns
 from graph_slam_ros.runs.suggested_inputs import SuggestedInputs
 from graph_slam_ros.runs.tables import account
 from graph_slam_ros.slam import Config, Counters, GraphSlam
+from graph_slam_ros.slam.calibration.decision import Finding as Fitted
 from graph_slam_ros.slam.calibration.decision import amount
-from graph_slam_ros.slam.calibration.parameters import OF_ODOMETRY, QUANTITIES, Parameter
-from graph_slam_ros.slam.calibration.uncorrected import CODES
+from graph_slam_ros.slam.calibration.parameters import AUTO, DEFAULT_GROUPS, GROUPS, OF_ODOMETRY, QUANTITIES, Parameter
+from graph_slam_ros.slam.calibration.uncorrected import CODES, setting_of
+from graph_slam_ros.slam.trial_fits import FIRST_DUE
 from graph_slam_ros.warmup import warmup
 
 _HIDES = "nothing is calibrated, for what is found hides this"
 _ROUNDS = 4  # replays; a large clock needs two or three
-_MOST_REPEATED = 0.8  # of the keyframes: of more, all are
 _STILL_ACCEPTED = 0.9  # of the part that was accepted before: with less, what was found does harm
 
 Progress = Callable[[Iterable[Any], int], Iterable[Any]]
@@ -42,9 +44,9 @@ class Calibrated:
     Attributes
     ----------
     settings : parameters to be set, by dotted name
-    parameters : of the last replay, as ``calibration`` in ``run.json``
+    parameters : of the last replay: ``source``, ``name``, ``value``, ``sigma``, ``verdict`` and ``text`` of each
     command : the replay with them; the next calibration, where one setting is to be made before
-    rounds : replays, that of a part included
+    rounds : replays
     is_complete : whether the last replay found nothing more
     refused : why what was found is not among the settings; empty if it is
     fault : the worst that ``check`` finds without a fit; with an error nothing is among the settings
@@ -66,6 +68,7 @@ def calibrate(
     path: Path | str,
     settings: Mapping[str, Any] | None = None,
     *,
+    groups: str = "auto",
     odometry: str | None = None,
     landmarks: str | None = None,
     progress: Progress = lambda items, total: items,
@@ -74,26 +77,27 @@ def calibrate(
 
     Parameters
     ----------
-    settings : parameters by dotted name, which come before those that ``graph_slam info`` chooses; of
-        ``calibrate.groups`` the default is ``auto``
+    settings : parameters by dotted name, which come before those that ``graph_slam info`` chooses
+    groups : what is estimated, words of ``GROUPS`` or ``auto``
     odometry, landmarks : topics, instead of those that ``info`` chooses
     progress : wraps the sequence of messages
 
     Raises
     ------
     GraphSlamError
-        The recording or an input cannot be used, or has no keyframe.
+        The recording or an input cannot be used, or has no keyframe; a group is unknown, or one scale with another.
     """
     path, bag = Path(path), open_bag(Path(path))
-    suggested = SuggestedInputs(bag, path, {"calibrate.groups": "auto"} | dict(settings or {}), odometry, landmarks)
-    config = _config(suggested.settings)
+    suggested = SuggestedInputs(bag, path, settings, odometry, landmarks)
+    config = with_survey(Config.from_mapping(suggested.settings))
+    words = _words(groups, config)
     warmup(dimensions=config.world.dimensions)
-    rounds = _Rounds(bag, suggested.inputs(config), config, progress)
+    rounds = _Rounds(bag, suggested.inputs(config), config, words, progress)
     rounds.run()
     if not rounds.keyframes:
         raise GraphSlamError(f"{path}: no odometry of it could be used: graph_slam info {path}")
     found, refused = rounds.found, rounds.refused
-    parameters = rounds.parameters or ([] if refused else list(_undriven(config, rounds.keyframes)))
+    parameters = rounds.parameters or ([] if refused else list(_undriven(config, words, rounds.keyframes)))
     name = "calibrate" if rounds.named else "replay"
     command = suggested.suggestion.command(found | dict(settings or {}) | found | rounds.named, name=name)
     outcome = parameters, command, rounds.count, rounds.is_complete, refused, rounds.fault
@@ -111,73 +115,116 @@ class _Rounds:
     keyframes : of the last replay of the whole recording
     """
 
-    def __init__(self, bag: Bag, inputs: Inputs, config: Config, progress: Progress) -> None:
+    def __init__(self, bag: Bag, inputs: Inputs, config: Config, words: Sequence[str], progress: Progress) -> None:
         self.found: dict[str, float | str] = {}
         self.parameters: list[dict[str, Any]] = []
         self.refused, self.is_complete = "", False
         self.named: dict[str, float | str] = {}
         self.fault: Finding | None = None
         self.count = self.keyframes = 0
-        self._bag, self._inputs, self._config, self._progress = bag, inputs, config, progress
+        self._config = config.changed({"map.condense": False})  # a fit is of all keyframes
+        self._bag, self._inputs, self._words, self._progress = bag, inputs, words, progress
         self._corrected = set[Parameter]()
+        self._kept, self._accepted = dict[str, float | str](), (0, 0)  # by the replay before
+        self._kept, self._accepted = dict[str, float | str](), (0, 0)  # by the replay before
         self._total = sum(bag.topics[topic].count for topic in inputs.by_topic())
 
     def run(self) -> None:
         """Replay until nothing more is found, or what was found does harm, or is refused."""
-        kept, before = dict[str, float | str](), (0, 0)
-        while not self.is_complete and self.count < _ROUNDS:
-            slam = self._replayed()
-            if not self.keyframes:
+        for k in range(_ROUNDS):
+            slam = self._replayed(math.inf if k else FIRST_DUE)
+            if not self.keyframes or self._does_harm(slam):
                 return
-            accepted = _accepted(slam)
-            if _is_less(accepted, before):
-                self.refused, self.found = _harm(self.found, kept, before, accepted), kept
-                return
-            self.refused = _wrong(self.fault)
-            if not self.refused:
-                self.refused, self.named = _misplaced(slam, slam.config)
+            findings = self._fitted(slam)
+            if self.fault is not None and self.fault.severity == "error":  # what is fitted to it means nothing
+                self.refused = f"nothing is calibrated: mend {self.fault.code} first"
+            else:
+                self.refused, self.named = _misplaced(slam, self._config, findings)
             if self.refused:
                 self.found, self.parameters = {}, []
                 return
-            report, kept, before = slam.calibration_report, dict(self.found), accepted
-            self._corrected |= {one.parameter for one in slam.corrected}
-            self.parameters = [self._left(one) for one in report["parameters"]]
-            self.found |= report["settings"]
-            self.is_complete = not report["settings"] or self._finds_nothing_in(slam.calibrated_since + 1, accepted)
+            self.parameters = [self._said(one) for one in findings]
+            self.is_complete = not self._set(slam, findings, are_followed=True)
+            if self.is_complete:
+                return
 
-    def _left(self, one: dict[str, Any]) -> dict[str, Any]:
-        """Say of a parameter that was corrected that its value is what is left of it."""
-        parameter = Parameter(one["source"], one["name"])
-        if one["verdict"] != "nothing_to_correct" or parameter not in self._corrected:
-            return one
-        left = f"{amount(parameter, one['value'], 3)}, sigma {amount(parameter, one['sigma'])}"
-        return one | {"text": f"{parameter}: corrected, {left} is left"}
+    def _replayed(self, due: float) -> GraphSlam:
+        """Replay the whole recording; from its beginning where a fit on the way finds something.
 
-    def _replayed(self) -> GraphSlam:
-        """Replay the whole recording. The first replay collects what ``check`` needs."""
-        self.count += 1
-        config, counters = self._config.changed(self.found), Counters()
-        columns = Collector(config, self._inputs.topics) if self.count == 1 else None
-        runs = RecordedRuns(self._bag, self._inputs, config, counters, columns=columns)
-        slam = _replayed(self._progress(runs, self._total), config)
+        Parameters
+        ----------
+        due : keyframes at which the first of these fits is due, and at twice as many each next one
+        """
+        is_over = False
+        while not is_over:
+            self.count += 1
+            config, counters = self._config.changed(self.found), Counters()
+            slam, columns = GraphSlam(config), Collector(config, self._inputs.topics)
+            runs = RecordedRuns(self._bag, self._inputs, config, counters, columns=columns)
+            for _, some in self._progress(runs, self._total):
+                for one in some:
+                    slam.process(one)
+                if len(slam.keyframes) >= due and slam.is_solved and not slam.backend.holds_back:
+                    due *= 2
+                    if self._set(slam, self._fitted(slam), are_followed=False):
+                        break
+            else:
+                is_over = True
+        for event in END:
+            slam.process(event)
         self.keyframes = len(slam.keyframes)
-        if columns is not None and self.keyframes:
-            self.fault = worst_of_replay(columns.columns(counters))
+        self.fault = worst_of_replay(columns.columns(counters)) if self.keyframes and due < math.inf else self.fault
         return slam
 
-    def _finds_nothing_in(self, keyframes: int, accepted: tuple[int, int]) -> bool:
-        """Return whether a replay of the beginning, which ends where the last correction was made, is enough.
-
-        It is where that part finds nothing more, and accepts at least as much as all did.
-        """
-        part = keyframes / self.keyframes
-        if self.count >= _ROUNDS or part >= _MOST_REPEATED:
+    def _does_harm(self, slam: GraphSlam) -> bool:
+        """Return whether clearly fewer measurements are accepted than in the replay before; then all is as it was."""
+        of_inputs = [one for one in account(slam, slam.counters)["inputs"].values() if one["use"] != "odometry"]
+        accepted, every = sum(one["believed"] or 0 for one in of_inputs), sum(one["used"] for one in of_inputs)
+        (before, of), kept = self._accepted, self._kept
+        if accepted * of >= _STILL_ACCEPTED * before * every:
+            self._accepted, self._kept = (accepted, every), dict(self.found)
             return False
-        self.count += 1
-        config = self._config.changed(self.found)
-        runs = RecordedRuns(self._bag, self._inputs, config, Counters())
-        slam = _replayed(self._progress(runs, round(part * self._total)), config, keyframes)
-        return not slam.calibration_report["settings"] and not _is_less(_accepted(slam), accepted)
+        lines = ", ".join(f"{name}={value}" for name, value in self.found.items() if kept.get(name) != value)
+        self.refused = (
+            f"not used: {lines}: with it {accepted} of {every} measurements are accepted, without it {before} of {of}"
+        )
+        self.found = kept
+        return True
+
+    def _set(self, slam: GraphSlam, findings: Iterable[Fitted], *, are_followed: bool) -> bool:
+        """Set what was found. Returns whether it was anything.
+
+        Parameters
+        ----------
+        are_followed : whether a parameter that was set is set again where it is off by its sigma, though not by four
+        """
+        values = {
+            one.parameter: one.value
+            for one in findings
+            if one.verdict == "admitted"
+            or (are_followed and one.is_determined and one.parameter in self._corrected and abs(one.value) > one.sigma)
+        }
+        more = slam.found_settings | dict(setting_of(one, values, slam.calibrated) for one in values)
+        self._corrected |= values.keys()
+        is_more = any(self.found.get(name) != value for name, value in more.items())
+        self.found |= more
+        return is_more
+
+    def _fitted(self, slam: GraphSlam) -> list[Fitted]:
+        """Fit the parameters of the groups; none where the edges do not determine the estimate."""
+        try:
+            return slam.trial_fit(self._words, is_to_correct=True)[1]
+        except SingularError:
+            return []
+
+    def _said(self, one: Fitted) -> dict[str, Any]:
+        """A finding as plain values. Of a parameter that was corrected its value is what is left of it."""
+        parameter, text = one.parameter, one.text
+        if one.verdict == "nothing_to_correct" and parameter in self._corrected:
+            left = f"{amount(parameter, one.value, 3)}, sigma {amount(parameter, one.sigma)}"
+            text = f"{parameter}: corrected, {left} is left"
+        numbers = {"value": one.value, "sigma": one.sigma, "verdict": one.verdict, "text": text}
+        return {"source": parameter.source, "name": parameter.name, **numbers}
 
 
 def _once(lines: Iterable[str]) -> list[str]:
@@ -185,13 +232,11 @@ def _once(lines: Iterable[str]) -> list[str]:
     return list(dict.fromkeys(lines))
 
 
-def _undriven(config: Config, keyframes: int) -> Iterator[dict[str, Any]]:
+def _undriven(config: Config, words: Sequence[str], keyframes: int) -> Iterator[dict[str, Any]]:
     """Yield each parameter with what to drive, where there was nothing to fit."""
-    uses = recorded_uses(config)
+    uses, groups = recorded_uses(config), {*words, *DEFAULT_GROUPS * (AUTO in words)}
     for name, quantity in QUANTITIES.items():
-        if quantity.group not in config.calibrate.asked or (
-            name in ("roll", "pitch", "z") and config.world.dimensions == 2
-        ):
+        if quantity.group not in groups or (name in ("roll", "pitch", "z") and config.world.dimensions == 2):
             continue
         use = "odometry" if name in OF_ODOMETRY else "landmarks"
         for source in (one for one, used in uses.items() if used == use):
@@ -200,42 +245,25 @@ def _undriven(config: Config, keyframes: int) -> Iterator[dict[str, Any]]:
             yield {"source": source, "name": name, "verdict": "not_determined", "text": text}
 
 
-def _config(given: Mapping[str, Any]) -> Config:
-    config = with_survey(Config.from_mapping(given))
-    if not config.calibrate.is_on:
-        groups = config.calibrate.groups
-        raise GraphSlamError(f"calibrate.groups: {groups} leaves nothing to fit here; without this setting it is auto")
-    if config.calibrate.drift:
-        raise GraphSlamError("calibrate.drift: settings are constant; graph_slam replay with it corrects what changes")
-    return config
+def _words(text: str, config: Config) -> list[str]:
+    """The groups that are asked for. Raises GraphSlamError for what is none, and for two that are one scale."""
+    words = text.split()
+    unknown = [word for word in words if word not in (*GROUPS, AUTO)]
+    if unknown or not words:
+        raise GraphSlamError(f"--groups: {' '.join(unknown)!r} is not auto or some of {', '.join(GROUPS)}")
+    if "range_factor" in words and {"factors", AUTO} & set(words) and not config.survey:
+        raise GraphSlamError(
+            "--groups: factors and range_factor are one scale: leave one out, or survey landmarks (landmarks.surveyed)"
+        )
+    return words
 
 
-def _replayed(runs: Iterable[Any], config: Config, most: int | None = None) -> GraphSlam:
-    """Replay in memory, all or until there are so many keyframes."""
-    slam = GraphSlam(config)
-    for _, some in runs:
-        if most is not None and len(slam.keyframes) >= most:
-            break
-        for one in some:
-            slam.process(one)
-    for event in END:
-        slam.process(event)
-    return slam
-
-
-def _wrong(fault: Finding | None) -> str:
-    """Return why nothing is used of a recording that has an error: what is fitted to it means nothing."""
-    if fault is None or fault.severity != "error":
-        return ""
-    return f"nothing is calibrated: mend {fault.code} first"
-
-
-def _misplaced(slam: GraphSlam, config: Config) -> tuple[str, dict[str, float | str]]:
+def _misplaced(slam: GraphSlam, config: Config, findings: Iterable[Fitted]) -> tuple[str, dict[str, float | str]]:
     """Return why nothing is used where a sensor is elsewhere on the robot, or its ranges have an offset; the setting.
 
     That passes for scale and yaw. The offset of ranges alone is fitted with the scale, and hides nothing.
     """
-    fitted = {one["source"] for one in slam.calibration_report["parameters"] if one["name"] == "range_offset"}
+    fitted = {one.parameter.source for one in findings if one.parameter.name == "range_offset"}
     for off in slam.uncorrected():
         if not off.setting:
             continue
@@ -249,28 +277,3 @@ def _misplaced(slam: GraphSlam, config: Config) -> tuple[str, dict[str, float | 
             text = f"{_HIDES}: {off}. Measure it, or calibrate again with --set {key}='{mount}'"
             return text, {key: mount}
     return "", {}
-
-
-def _accepted(slam: GraphSlam) -> tuple[int, int]:
-    """Count the measurements that the estimate uses, and all; odometry is in neither."""
-    of_inputs = [one for one in account(slam, slam.counters)["inputs"].values() if one["use"] != "odometry"]
-    return sum(one["believed"] or 0 for one in of_inputs), sum(one["used"] for one in of_inputs)
-
-
-def _is_less(accepted: tuple[int, int], before: tuple[int, int]) -> bool:
-    """Return whether clearly fewer of the measurements are accepted than before."""
-    return accepted[0] * before[1] < _STILL_ACCEPTED * before[0] * accepted[1]
-
-
-def _harm(
-    found: Mapping[str, float | str],
-    kept: Mapping[str, float | str],
-    before: tuple[int, int],
-    accepted: tuple[int, int],
-) -> str:
-    """Return why settings are not used with which fewer measurements are accepted than without."""
-    lines = ", ".join(f"{name}={value}" for name, value in found.items() if kept.get(name) != value)
-    return (
-        f"not used: {lines}: with it {accepted[0]} of {accepted[1]} measurements are accepted, "
-        f"without it {before[0]} of {before[1]}"
-    )

@@ -21,8 +21,8 @@ JSON records in mcap, as in the journal. The first is ``map`` with the version o
   ``rescaled``: changes of edges of earlier records, in order: first edge, the first that is not among them, and the
   factors of the groups that changed, before and after, as in ``noise``;
 * ``gyro``: its input, the bias about each axis and the variance of that, stamp of the newest odometry by then;
-* ``calibration``: corrections with those configured, ``[input, name, value]`` each; ``recalibrated``: edges of
-  earlier records as they are by these: edge type, rows of its table, numbers measured, square roots of the information;
+* ``calibration``: odometry's factors as found, ``[input, name, value]`` each; ``recalibrated``: edges of earlier
+  records as they are by these: edge type, rows of its table, numbers measured, square roots of the information;
 * ``condensed``: first in a map from which visits were condensed, see ``condensed_map.py``;
 * ``frozen``: so many vertices, the first, stay where they are, and verdicts on so many edges as they are; ``held``: the
   same while ``map.localize`` is true, zeros when it ends; ``edits``: ``AppliedEdit.record`` of each edit by hand.

@@ -78,7 +78,7 @@ def text(summary: Summary) -> list[str]:
         if source not in inputs or explain(reason).effect is not Effect.REFUSED
         for line in _counted_lines(source, reason, times)
     ]
-    found = [*_gyro(summary), *noise(summary), *calibration(summary), *_contradicted(summary), *_clocks(summary)]
+    found = [*_gyro(summary), *noise(summary), *_calibrated(summary), *_contradicted(summary), *_clocks(summary)]
     return [*lines, *undetermined, *others, *found, *table(summary)]
 
 
@@ -121,21 +121,15 @@ def noise(summary: Summary) -> Iterator[str]:
         yield from _wrapped(f"noise      as configured: {', '.join(unknown)}", 11)
 
 
-def calibration(summary: Summary) -> Iterator[str]:
-    """Yield the corrections of the calibration with their settings, and what it could not determine."""
-    report = summary.get("calibration")
-    if not report:
-        return
-    settings = report["settings"]
-    lines = " ".join(f"--set {shlex.quote(f'{name}={value}')}" for name, value in settings.items())
-    yield from _wrapped(f"calibrated {lines or 'nothing: no correction was needed and determined'}", 11)
-    for one in report["parameters"]:
-        if one["verdict"] not in ("admitted", "nothing_to_correct"):
-            yield from _wrapped(f"calibrated {one['text']}", 11)
+def _calibrated(summary: Summary) -> Iterator[str]:
+    """Yield the settings of the factors of odometry that the association found."""
+    if settings := summary.get("calibrated"):
+        lines = " ".join(f"--set {shlex.quote(f'{name}={value}')}" for name, value in settings.items())
+        yield from _wrapped(f"calibrated {lines}", 11)
 
 
 def _contradicted(summary: Summary) -> Iterator[str]:
-    """Yield what is off in a calibration that nothing corrects, where covariances contain it."""
+    """Yield what is off in the calibration, where covariances contain it."""
     if off := summary.get("contradicted"):
         text = f"not corrected, so the covariances contain it: {', '.join(off)} (graph_slam calibrate BAG)"
         yield from _wrapped(f"off        {text}", 11)

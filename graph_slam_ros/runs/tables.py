@@ -107,7 +107,7 @@ def summarize(slam: GraphSlam, earlier: Counters | None = None) -> dict[str, Any
         | condensed_part(slam)
         | ({"survey_unseen": unseen} if (unseen := sorted(slam.config.survey.keys() - slam.landmarks.keys())) else {})
         | ({"gyro": asdict(gyro)} if (gyro := slam.gyro) else {})
-        | ({"calibration": report} if (report := slam.calibration_report) else {})
+        | ({"calibrated": settings} if (settings := slam.found_settings) else {})
         | ({"association": found} if (found := _association(slam)) else {})
         | account(slam, counters)
     )

@@ -236,7 +236,6 @@ class Backend:
         space: Geometry,
         path: KeyframeList,
         origins: SightingEdges,
-        settings: Settings | None = None,
         factors: tuple[float, float] = (1.0, 1.0),
     ) -> TrialProblem:
         """A copy of the present problem for a trial fit. Rejected sightings are included, under their loss.
@@ -249,7 +248,7 @@ class Backend:
         graph.set_weights(out[graph.has_label(out, ("landmarks",))], 1.0)
         rows, begins = path.keyframes, [max(k - path.keyframes.first, 0) for k in path.segments]
         keyframes = rows.ids.copy(), rows.stamps_ns.copy(), tuple(dict.fromkeys(begins))
-        problem = solver.vertices, solver.held, solver.values, settings or solver.settings
+        problem = solver.vertices, solver.held, solver.values, solver.settings
         track = path.samples.track(path.keyframes.poses, factors)
         return TrialProblem(space, graph, *problem, origins.copy(), *keyframes, track, self.first_free_edge)
 

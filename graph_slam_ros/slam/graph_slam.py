@@ -28,10 +28,10 @@ from graph_slam_ros.measurements.types import (
 from graph_slam_ros.slam.anchor import Anchor
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.bounded_map import BoundedMap
-from graph_slam_ros.slam.calibrator import Calibrator
 from graph_slam_ros.slam.edits import Edits
 from graph_slam_ros.slam.failure_guard import FailureGuard
 from graph_slam_ros.slam.faults import Faults
+from graph_slam_ros.slam.found_factors import FoundFactors
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
 from graph_slam_ros.slam.frontend.odometry_selector import Step
@@ -44,6 +44,7 @@ from graph_slam_ros.slam.robust.background import Executor, run_when_asked
 from graph_slam_ros.slam.robust.ledger import Reason
 from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.slam.solution import Solution, Solved
+from graph_slam_ros.slam.trial_fits import TrialFits
 from graph_slam_ros.slam.update import Update, UpdateLog
 from graph_slam_ros.solver import Settings
 
@@ -90,7 +91,9 @@ class GraphSlam(MapView):
         self._sink, self._faults = sink or (lambda measurement: None), Faults(counters)
         self._edits = Edits(backend, frontend, landmarks.map, counters)
         landmarks.map.aliases = aliases(backend.edits)
-        self._calibrator = Calibrator(config, backend, frontend, landmarks, kidnaps, counters, executor, start)
+        self._found_factors = FoundFactors(config, backend, frontend, landmarks, counters, start)
+        first = start.keyframe_count if start is not None else 0
+        self._trials = TrialFits(config, backend, frontend, landmarks, kidnaps, counters, executor, first)
         if start is not None and start.keyframes:
             self._restore(start)
         bounded = BoundedMap(backend, frontend, landmarks, self._anchor, kidnaps, solution, counters)
@@ -218,7 +221,8 @@ class GraphSlam(MapView):
         else:
             report = self._kidnaps.optimize(self.keyframes, everything)
         report = self.backend.scale_noise(self.keyframes, everything) or report
-        report = self._calibrator.after_solve(keyframe, everything) or report
+        self._trials.after_solve(keyframe, is_of_everything=everything is not None)
+        report = self._found_factors.after_solve(keyframe, everything) or report
         (covariance,) = self.solver.marginal([self.keyframes[keyframe].vertex])
         if not np.isfinite(covariance).all():
             raise DivergedError("the covariance is not finite")

@@ -197,14 +197,6 @@ class KidnapDetector:
         """The edges of odometry of each slip, each with the one that replaces it."""
         return self._slips.slipped(keyframes)
 
-    def revoke_slips(self, keyframes: StampedPoses[Keyframe], settings: Settings | None) -> Report:
-        """Take back all slips, because wrong parameters, corrected by now, passed for them; and solve."""
-        self._slips.revoke_all(keyframes)
-        report = self._backend.solver.optimize(settings)
-        if self._backend.decisions.reclassify(len(keyframes) - 1):
-            report = self._backend.solver.optimize(settings)
-        return report
-
     def _moved_to(self, found: DisplacementHypothesis | None) -> Moved | None:
         """The place to which the robot was moved, if it was."""
         if found is None:

@@ -1,7 +1,7 @@
 """The read-only part of the pipeline: path, landmarks, covariances, statistics and health."""
 
-from collections.abc import Collection, Sequence, Set
-from dataclasses import asdict, replace
+from collections.abc import Sequence, Set
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -10,14 +10,12 @@ from graph_slam_ros.config.config import Config
 from graph_slam_ros.measurements.edits import AppliedEdit
 from graph_slam_ros.slam.alarm import Alarm
 from graph_slam_ros.slam.backend import Backend
-from graph_slam_ros.slam.calibration.choice import parameters_of
-from graph_slam_ros.slam.calibration.decision import Finding, decide
-from graph_slam_ros.slam.calibration.fit import TrialFit, likelier_fit
-from graph_slam_ros.slam.calibration.parameters import DEFAULT_GROUPS
-from graph_slam_ros.slam.calibration.places import fit_with_places
+from graph_slam_ros.slam.calibration.decision import Finding
+from graph_slam_ros.slam.calibration.fit import TrialFit
+from graph_slam_ros.slam.calibration.parameters import AUTO
 from graph_slam_ros.slam.calibration.recalibration import Recalibration
 from graph_slam_ros.slam.calibration.uncorrected import Uncorrected
-from graph_slam_ros.slam.calibrator import Calibrator
+from graph_slam_ros.slam.found_factors import FoundFactors
 from graph_slam_ros.slam.frontend.gyro import GyroState, SavedBias
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
 from graph_slam_ros.slam.frontend.noise_factors import Key, Rescaling
@@ -31,6 +29,7 @@ from graph_slam_ros.slam.path_view import PathView
 from graph_slam_ros.slam.robust.ledger import Ledger
 from graph_slam_ros.slam.slip_review import Slip
 from graph_slam_ros.slam.solution import Correction, Solution
+from graph_slam_ros.slam.trial_fits import TrialFits
 from graph_slam_ros.solver import Report
 from graph_slam_ros.typing import Array, Numbers
 
@@ -57,7 +56,8 @@ class MapView(PathView):
         self._frontend, self._landmarks = frontend, landmarks
         self._kidnaps, self._solution = kidnaps, solution
 
-    _calibrator: Calibrator
+    _trials: TrialFits
+    _found_factors: FoundFactors
 
     def __repr__(self) -> str:
         counts = f"{len(self.keyframes)} keyframes, {len(self.landmarks)} landmarks, {self.graph.edge_count} edges"
@@ -133,15 +133,16 @@ class MapView(PathView):
         return self.backend.noise_scale(self.keyframes)
 
     def trial_fit(
-        self, groups: Collection[str] = DEFAULT_GROUPS, *, chooses: bool = False, places: bool = False
+        self, groups: Sequence[str] = (AUTO,), *, places: bool = False, is_to_correct: bool = False
     ) -> tuple[TrialFit, list[Finding]]:
         """Fit the calibration of odometry and sensors with the map, on a copy: nothing is changed.
 
         Parameters
         ----------
-        groups : of ``slam.calibration.parameters.GROUPS``
-        chooses : where all landmarks are observed by ranges alone, fit these instead of odometry's distance
+        groups : of ``slam.calibration.parameters.GROUPS``, or ``auto``
         places : fit the places of sensors, too, where one is so far off that it passes for other parameters
+        is_to_correct : whether somebody sets what is found: what a gyro measures, and factors that landmarks without
+            identities merely confirm, are left out
 
         Returns
         -------
@@ -153,36 +154,24 @@ class MapView(PathView):
         SingularError
             The edges do not determine the estimate.
         """
-        frontend, origins = self._frontend, self._landmarks.map.origins
-        problem = self.backend.trial_problem(self.space, frontend.path, origins, factors=frontend.corrections.factors)
-        problem = replace(problem, slips=self._kidnaps.slipped(self.keyframes))
-        priors = {one: one.quantity.prior for one in parameters_of(problem, groups, chooses=chooses)}
-        log_odds = self.config.odometry.log_odds
-        found = fit_with_places(problem, priors, log_odds)[0] if places else likelier_fit(problem, priors, log_odds)
-        stated = problem.model().sigma_per_m()
-        return found, decide(found, len(self.landmarks), slides=self.config.odometry.slides, sigma_per_m=stated)
+        return self._trials.fit(groups, places=places, is_to_correct=is_to_correct)
 
     def uncorrected(self) -> list[Uncorrected]:
         """A clock, a mount or a scale that is off by so much that the poses are worse than their covariances say.
 
         A trial fit finds it, on a copy: nothing is changed.
         """
-        return self._calibrator.uncorrected() if self.is_solved else []
+        return self._trials.uncorrected() if self.is_solved else []
 
     @property
     def uncorrected_so_far(self) -> Sequence[Uncorrected]:
         """The same of the last trial fit in the background."""
-        return self._calibrator.watch.uncorrected_so_far()
+        return self._trials.uncorrected_so_far()
 
     @property
     def contradicted(self) -> list[str]:
-        """Return what is off in a calibration that nothing corrects, by parameter: covariances contain it."""
-        return self._calibrator.watch.sentences()
-
-    @property
-    def calibration_report(self) -> dict[str, Any]:
-        """The number of trial fits, what is known of each parameter, and settings that have it."""
-        return self._calibrator.summary()
+        """Return what is off in the calibration, by parameter: covariances contain it."""
+        return self._trials.contradicted()
 
     @property
     def association_report(self) -> dict[str, Any]:
@@ -199,7 +188,7 @@ class MapView(PathView):
 
     @property
     def calibration(self) -> dict[tuple[str, str], float]:
-        """The corrections that were found, with those that were configured, by input and name."""
+        """The factors of odometry that the association found, with those that were configured, by input and name."""
         return self._frontend.corrections.totals()
 
     def calibrated(self, source: str, name: str) -> float:
@@ -207,19 +196,19 @@ class MapView(PathView):
         return self._frontend.corrections.total((source, name))
 
     @property
-    def corrected(self) -> Sequence[Finding]:
-        """The findings that calibration has taken over, in order."""
-        return self._calibrator.corrected
+    def found_settings(self) -> dict[str, float]:
+        """The parameters of the configuration that have the factors of odometry that the association found."""
+        return self._frontend.corrections.lines()
 
     @property
-    def calibrated_since(self) -> int:
-        """The keyframe, by its number, at which calibration last corrected a parameter by more than its sigma."""
-        return self._calibrator.corrected_at
+    def corrected(self) -> Sequence[Finding]:
+        """The findings of these factors, in order."""
+        return self._found_factors.corrected
 
     @property
     def recalibrations(self) -> Sequence[Recalibration]:
         """The corrections of measurements that were in the graph, in order."""
-        return self._calibrator.history
+        return self._found_factors.history
 
     def touched_landmarks(self, first: int) -> dict[str, Landmark | None]:
         """The landmarks that changed after the ``first`` changes, tentative ones included; None: removed."""
@@ -255,7 +244,7 @@ class MapView(PathView):
         It is the marginal of the last solve, propagated with the odometry since then.
         """
         covariance = self._frontend.covariance.copy()
-        return self._calibrator.widened(covariance, int(self.keyframes.ids[-1])) if self.keyframes else covariance
+        return self._trials.widened(covariance, int(self.keyframes.ids[-1])) if self.keyframes else covariance
 
     def landmark_covariances(self, names: Sequence[str] | None = None) -> list[Array]:
         """Marginals of all or some landmarks: of points in map's axes, of poses in tangent space; NaN if unknown."""
@@ -273,7 +262,7 @@ class MapView(PathView):
         solved = self._solution.vertices if self.is_solved else 0
         known = [k for k, vertex in enumerate(vertices) if vertex < solved]
         for k, marginal in zip(known, self.solver.marginal([vertices[k] for k in known]), strict=True):
-            out[k] = self._calibrator.widened(marginal, vertices[k])
+            out[k] = self._trials.widened(marginal, vertices[k])
         return out
 
     # -- the graph and its solution --------------------------------------------------------------------------------

@@ -353,26 +353,15 @@ class SlipDetector:
             pairs = slipped_pairs(self._backend, keyframes, slip.began_ns, slip.ended_ns) if slip.ended_ns else []
             if revoke_slip(self._backend, pairs, len(keyframes) - 1, _FACTOR):
                 changed = True
-                self._note_revoked(k, pairs, "all measurements together agree with odometry")
+                self._note_revoked(k, pairs)
         return changed
 
-    def revoke_all(self, keyframes: StampedPoses[Keyframe]) -> None:
-        """Take back all slips, because wrong parameters, which are corrected now, passed for them."""
-        keyframe, stamp_ns = len(keyframes) - 1, int(keyframes.stamps_ns[-1])
-        for k, slip in enumerate(self.slips):
-            pairs = slipped_pairs(self._backend, keyframes, slip.began_ns, slip.ended_ns)
-            if pairs:
-                restore_odometry(self._backend, pairs, keyframe, 0.0)
-                self._note_revoked(k, pairs, "a wrong parameter, which is corrected now, passed for it")
-        if (now := self.now) is not None:
-            self.slips[-1] = replace(now, ended_ns=stamp_ns)
-            self._doubt(stamp_ns, None)
-
-    def _note_revoked(self, k: int, pairs: Sequence[Pair], why: str) -> None:
+    def _note_revoked(self, k: int, pairs: Sequence[Pair]) -> None:
         """Note that odometry counts again with its own noise where a slip was."""
         self._counters.count("odometry", "slip_taken_back")
         slip, restored = self.slips[k], {edge for _, edge in pairs}
-        self.slips[k] = replace(slip, edges=max(0, slip.edges - len(pairs)), outcome=f"taken back: {why}")
+        outcome = "taken back: all measurements together agree with odometry"
+        self.slips[k] = replace(slip, edges=max(0, slip.edges - len(pairs)), outcome=outcome)
         for link in self._links:
             link.edge = link.own if link.edge in restored else link.edge
 

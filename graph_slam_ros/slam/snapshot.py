@@ -34,7 +34,7 @@ class MapSnapshot:
     used_ns : stamp of the last odometry that was used by then; None before the first
     source : the input of that odometry
     noise_factors : of the configured sigmas, that the edges have, as ``NoiseScales.factors``
-    calibration : corrections that were found, with those that were configured, by input and name
+    calibration : factors of odometry that the association found, with those configured, by input and name
     edits : by hand, in order
     gyro_bias : of the gyro, as far as it was learnt; None without a gyro
     first_keyframe : the number of the first of ``keyframes``: those before were condensed

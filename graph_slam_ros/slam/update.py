@@ -29,7 +29,7 @@ class Update:
     report : of a solve of everything
     correction : of the last solve
     changes : of verdicts, since the last update that told any
-    calibrated : corrections by calibration
+    calibrated : factors of odometry that the association found
     landmarks : what happened to them: which were retired, moved or returned
     alarms : that began, were decided or ended since then: the landmarks contradict odometry
     condensed : what left the map before anything else, when all that stays got new ids

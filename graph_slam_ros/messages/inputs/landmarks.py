@@ -138,9 +138,9 @@ def _sighting(source: InputContext, stamp_ns: int, seen: ObservedLandmark) -> Si
 
 
 def _sensor(source: InputContext, T_base_frame: se3.Pose) -> Numbers | None:
-    """The pose of a sensor on the base if calibration may turn it about its origin; None at the base."""
+    """The pose of a sensor on the base, about whose origin a correction turns it; None at the base."""
     at, n = se3.position(T_base_frame), source.space.dimensions
-    if not (source.config.calibrate.is_on or source.settings.mount_correction) or not any(at[:n]):
+    if not any(at[:n]):
         return None
     return (*map(float, at[:n]), *source.space.identity[n:])
 

@@ -2,23 +2,22 @@
 
 from collections.abc import Collection
 
-from graph_slam_ros.slam.calibration.parameters import OF_ODOMETRY, QUANTITIES, Parameter
+from graph_slam_ros.slam.calibration.parameters import AUTO, DEFAULT_GROUPS, OF_ODOMETRY, QUANTITIES, Parameter
 from graph_slam_ros.slam.calibration.rows import TrialProblem
 
 _LEAST_KEYFRAMES = 3
 
 
-def parameters_of(problem: TrialProblem, groups: Collection[str], *, chooses: bool = False) -> list[Parameter]:
+def parameters_of(problem: TrialProblem, groups: Collection[str]) -> list[Parameter]:
     """The parameters of some groups that the edges of a graph depend on.
 
-    Parameters
-    ----------
-    chooses : where all inputs of landmarks have ranges alone, these have an offset and a factor, as radios do, and
-        odometry keeps its scale: one of the two must; so does it where bearings alone tell no scale
+    With ``auto``, where all inputs of landmarks have ranges alone, these have an offset and a factor, as radios do, and
+    odometry keeps its scale: one of the two must. So does it where bearings alone tell no scale.
     """
     if len(problem.keyframes) < _LEAST_KEYFRAMES:
         return []
-    model, excluded = problem.model(), set[str]()
+    model, excluded, chooses = problem.model(), set[str](), AUTO in groups
+    groups = {*groups, *DEFAULT_GROUPS} if chooses else groups
     odometries = sorted({edges.source for edges in model.odometry})
     kinds: dict[str, set[str]] = {}
     for edges in model.sightings:

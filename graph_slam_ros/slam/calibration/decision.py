@@ -19,9 +19,8 @@ parameters make a direction.
 """
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -69,10 +68,8 @@ class Finding:
 def decide(
     found: TrialFit,
     landmarks: int,
-    corrected: Collection[Parameter] = (),
     *,
     slides: tuple[float, float] = (0.0, 0.0),
-    drifts: bool = False,
     sigma_per_m: float = 1.0,
     by_association: Mapping[str, tuple[float, float]] | None = None,
 ) -> list[Finding]:
@@ -81,20 +78,14 @@ def decide(
     Parameters
     ----------
     landmarks : how many were seen
-    corrected : parameters that were let in before: what is left of them is followed
     slides : configured noise of odometry sideways and upwards, relative to that ahead
-    drifts : whether parameters may change on the way
     sigma_per_m : of odometry's position for each metre, as stated, in the middle of all steps; infinite if none moves
     by_association : odometry's factors less 1 with sigmas, as far as the association of landmarks without identities
         found them; None where landmarks have identities
     """
-    void, remedy = (
-        _void(found, landmarks, sigma_per_m),
-        "raise calibrate.drift, or " * drifts + "correct the configuration first",
-    )
-    moves, unnamed = math.isfinite(sigma_per_m), partial(_unnamed, found, by_association)
+    void, moves = _void(found, landmarks, sigma_per_m), math.isfinite(sigma_per_m)
     return [
-        _finding(found, k, void or _stands(one, moves), remedy, _slides(one, slides) or unnamed(k), one in corrected)
+        _finding(found, k, void or _stands(one, moves), _slides(one, slides) or _unnamed(found, by_association, k))
         for k, one in enumerate(found.parameters)
     ]
 
@@ -162,25 +153,24 @@ def absurd_text(found: TrialFit, k: int) -> str:
     return f"{one} would be off by {amount(one, value, 3)}, more than {amount(one, most)}"
 
 
-def _finding(found: TrialFit, k: int, void: str, remedy: str, slides: str, is_corrected: bool) -> Finding:
+def _finding(found: TrialFit, k: int, void: str, slides: str) -> Finding:
     parameter, value, sigma = found.parameters[k], float(found.values[k]), float(found.sigmas[k])
-    verdict, why = _verdict(found, k, void, remedy, slides, is_corrected)
+    verdict, why = _verdict(found, k, void, slides)
     return Finding(parameter, value, sigma, verdict, f"{parameter}: {why}")
 
 
-def _verdict(found: TrialFit, k: int, void: str, remedy: str, slides: str, is_corrected: bool) -> tuple[Verdict, str]:
+def _verdict(found: TrialFit, k: int, void: str, slides: str) -> tuple[Verdict, str]:
     parameter, value, sigma = found.parameters[k], float(found.values[k]), float(found.sigmas[k])
     quantity, (correlation, other) = parameter.quantity, found.worst_correlation(k)
     is_unseen = void.endswith(" are needed")
     shown = f"{amount(parameter, value, 3)}, sigma {amount(parameter, sigma)}"
     if void:
         return "refused", f"not determined: {void}{f': {quantity.manoeuvre}' if is_unseen else ''}"
-    if sigma >= quantity.determined_below and not is_corrected:
+    if sigma >= quantity.determined_below:
         needs = f"sigma {amount(parameter, sigma)}, needs {amount(parameter, quantity.determined_below)}"
         return "not_determined", f"not determined ({needs}): {quantity.manoeuvre}"
-    least = FOLLOWED * sigma if is_corrected else max(SIGMAS * sigma, quantity.least)
-    if abs(value) < least:
-        why = f": within {SIGMAS:.0f} sigmas of zero" if abs(value) >= quantity.least and not is_corrected else ""
+    if abs(value) < max(SIGMAS * sigma, quantity.least):
+        why = f": within {SIGMAS:.0f} sigmas of zero" if abs(value) >= quantity.least else ""
         return "nothing_to_correct", f"{'not corrected' if why else 'nothing to correct'} ({shown}){why}"
     if slides:
         return "refused", f"not used ({shown}): {slides}"
@@ -188,9 +178,9 @@ def _verdict(found: TrialFit, k: int, void: str, remedy: str, slides: str, is_co
         return "not_separable", f"not separable from {other} (correlation {correlation:.2f}): {quantity.manoeuvre}"
     if abs(value) > PRIOR_SIGMAS * found.priors[k]:
         most = amount(parameter, PRIOR_SIGMAS * float(found.priors[k]))
-        return "refused", f"not used ({shown}): larger than {most}: {remedy}"
+        return "refused", f"not used ({shown}): larger than {most}: correct the configuration first"
     halves = float(found.first[k]), float(found.second[k])
-    if not is_corrected and not _agree(*halves):
+    if not _agree(*halves):
         first, second = (amount(parameter, half, 3) for half in halves)
         return "not_reproducible", f"not used ({shown}): {first} in one half of the drive, {second} in the other"
     return "admitted", shown
@@ -221,7 +211,7 @@ def _unnamed(found: TrialFit, by_association: Mapping[str, tuple[float, float]] 
     parameter = found.parameters[k]
     if by_association is None or parameter.name not in OF_ODOMETRY:
         return ""
-    remedy = f"Use ids, or ask for it: calibrate.groups={parameter.quantity.group}"
+    remedy = f"Use ids, or ask for it: graph_slam calibrate --groups {parameter.quantity.group}"
     if parameter.name not in by_association:
         return f"landmarks without ids were identified by this odometry. {remedy}"
     value, sigma = by_association[parameter.name]

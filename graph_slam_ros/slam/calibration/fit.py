@@ -18,7 +18,6 @@ from scipy.sparse.linalg import SuperLU, splu
 
 from graph_slam_ros.errors import SingularError
 from graph_slam_ros.graph import Graph, VertexKind
-from graph_slam_ros.slam.calibration.model import Values
 from graph_slam_ros.slam.calibration.parameters import Parameter
 from graph_slam_ros.slam.calibration.rows import Linearization, Rows, TrialProblem
 from graph_slam_ros.typing import Array, Index
@@ -66,31 +65,19 @@ class TrialFit:
     evidence: float
     slips: bool = True
 
-    def adds(self, vertex: int, dof: int, left: Values) -> Array:
-        """The covariance (dof, dof) that parameters add to a vertex whose marginal takes them for known.
+    def adds(self, vertex: int, dof: int) -> Array:
+        """The covariance (dof, dof) that wrong parameters add to a vertex whose marginal takes them for known.
 
-        Parameters
-        ----------
-        left : those that the drive determines, and what of each is not corrected
+        The error is how far the fit moves the vertex.
         """
-        of = [self.parameters.index(one) for one in left]
-        steps = self._of(self.sensitivity, vertex, dof)[:, of]
-        return self._spread(steps, of) + np.outer(bias := steps @ np.array(list(left.values())), bias)
-
-    def adds_all(self, vertex: int, dof: int) -> Array:
-        """The same where no parameter is corrected: the error is how far the fit moves the vertex."""
         steps, bias = self._of(self.sensitivity, vertex, dof), self._of(self.shift, vertex, dof)
-        return self._spread(steps, list(range(len(self.parameters)))) + np.outer(bias, bias)
+        spread = steps @ (self.correlation * np.outer(self.sigmas, self.sigmas)) @ steps.T
+        return np.asarray(spread + np.outer(bias, bias))
 
     def _of(self, rows: Array, vertex: int, dof: int) -> Array:
         """The rows of a vertex; 0 for one that the fit did not have."""
         at = int(self.column[vertex]) if vertex < len(self.column) else -1
         return rows[at : at + dof] if at >= 0 else np.zeros((dof, *rows.shape[1:]))
-
-    def _spread(self, steps: Array, of: list[int]) -> Array:
-        """The covariance of steps (dof, p) with some of the parameters."""
-        sigmas = self.sigmas[of]
-        return np.asarray(steps @ (self.correlation[np.ix_(of, of)] * np.outer(sigmas, sigmas)) @ steps.T)
 
     @property
     def sigmas(self) -> Array:

@@ -22,7 +22,6 @@ from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.graph.tables import EdgeTable
 from graph_slam_ros.lie import so3
 from graph_slam_ros.slam.calibration.parameters import OF_ODOMETRY, Parameter
-from graph_slam_ros.slam.calibration.path import EstimatedPath
 from graph_slam_ros.slam.frontend.sighting_edges import SightingEdges
 from graph_slam_ros.typing import Array, Index, Numbers
 
@@ -83,7 +82,7 @@ class MeasurementModel:
     Parameters
     ----------
     origins : of the sightings
-    stamp_of : (vertices,) nanoseconds of each pose
+    keyframes, stamps_ns : vertices and stamps of the keyframes
     edges : whose measurements may be corrected
     is_noise_measured : whether the noise of odometry is that of what was measured, and not of the motion
     """
@@ -93,12 +92,15 @@ class MeasurementModel:
         space: Geometry,
         graph: Graph,
         origins: SightingEdges,
-        stamp_of: Index,
+        keyframes: Index,
+        stamps_ns: Index,
         edges: range,
         *,
         is_noise_measured: bool = False,
     ) -> None:
         self._space, self.is_noise_measured = space, is_noise_measured
+        stamp_of = np.zeros(graph.vertex_count, dtype=np.int64)
+        stamp_of[keyframes] = stamps_ns
         self.odometry: list[OdometryEdges] = []
         self.sightings: list[Sightings] = []
         for table in graph.tables.values():
@@ -170,22 +172,6 @@ class MeasurementModel:
         named, n = _of(values, None, OF_ODOMETRY), self._space.dimensions
         distance, turn = (1.0 + named.get(name, 0.0) for name in ("distance", "turn"))
         return np.array([distance] * n + [turn] * (self._space.dof - n))
-
-    def base(self, edges: Sightings, values: Values, path: EstimatedPath, own: Array) -> Array:
-        """Poses (n, size) of the base from the keyframes (n, size), at the corrected stamps."""
-        group, is_asked = self._space.group, any((p.source, p.name) == (edges.source, "clock") for p in values)
-        out = np.stack(self.scaled(tuple(edges.T_keyframe_base.T), values), axis=-1)
-        if not is_asked:
-            return out
-        clock = clock_of(values, edges.source)
-        there = group.between(tuple(own.T), tuple(path.at(edges.stamps_ns, clock).poses.T))
-        return np.where(path.knows(edges.stamps_ns, abs(clock))[:, None], np.stack(there, axis=-1), out)
-
-    def stamps(self, edges: Sightings, values: Values, path: EstimatedPath) -> Index:
-        """Corrected stamps (n,)."""
-        clock = clock_of(values, edges.source)
-        known = path.knows(edges.stamps_ns, abs(clock))
-        return edges.stamps_ns + np.where(known, round(clock * 1e9), 0)
 
     def seen(self, edges: Sightings, values: Values) -> Array:
         """Measurements (n, p) from the base at the stamp, by a sensor with a corrected position."""

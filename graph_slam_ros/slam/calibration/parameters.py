@@ -59,6 +59,8 @@ QUANTITIES = {
     "range_factor": Quantity("range_factor", *_SCALE, "pass landmarks near and far, within one drive"),
 }
 GROUPS = tuple(dict.fromkeys(quantity.group for quantity in QUANTITIES.values()))
+AUTO = "auto"
+"""The groups of ``DEFAULT_GROUPS``; where all landmarks have ranges alone, these instead of odometry's distance."""
 FACTORS = ("distance", "turn")
 OF_ODOMETRY = (*FACTORS, "turn_bias")
 

@@ -66,10 +66,8 @@ class TrialProblem:
 
     def model(self) -> MeasurementModel:
         """Its measurements as functions of parameters."""
-        stamp_of = np.zeros(self.graph.vertex_count, dtype=np.int64)
-        stamp_of[self.keyframes] = self.stamps_ns
         edges = range(self.first_edge, self.graph.edge_count)
-        of = self.space, self.graph, self.origins, stamp_of, edges
+        of = self.space, self.graph, self.origins, self.keyframes, self.stamps_ns, edges
         return MeasurementModel(*of, is_noise_measured=self.is_noise_measured)
 
     def path(self, x: Array, values: Values, like: EstimatedPath | None = None) -> EstimatedPath:

@@ -205,6 +205,8 @@ def setting_of(one: Parameter, values: Values, total: Total) -> tuple[str, Any]:
     if one.name == "range_offset":
         factor = 1.0 + values.get(Parameter(source, "range_factor"), 0.0)
         return f"{source}.range_offset_m", round(before * factor + value, 3)
+    if one.name == "turn_bias":
+        return "odometry.turn_bias_rad_s", round(before + value, 6)
     return f"odometry.{one.name}_factor", round(before * (1.0 + value), 4)
 
 

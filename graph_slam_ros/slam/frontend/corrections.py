@@ -1,6 +1,6 @@
-"""Corrections of odometry and sightings: those that are configured, and those that calibration has found on the way.
+"""Corrections of odometry and sightings: those that are configured, and the factors of odometry that are found.
 
-``inputs.offset_s`` is applied where messages are read; a clock's correction that is found is added to it here.
+``INPUT.offset_s`` is applied where messages are read.
 """
 
 import math
@@ -12,7 +12,7 @@ import numpy as np
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.config.inputs import InputConfig
 from graph_slam_ros.lie import so3
-from graph_slam_ros.measurements.types import Observation, Odometry, Sighting, Sightings
+from graph_slam_ros.measurements.types import Observation, Sighting, Sightings
 from graph_slam_ros.slam.frontend.odometry_selector import Step
 from graph_slam_ros.typing import Array, Numbers
 
@@ -21,27 +21,38 @@ _LONGEST_LAG_S = 1.0  # a clock that is corrected by more is another clock, not 
 Key = tuple[str, str]
 """Input, and the name of what is corrected."""
 AXES = ("x", "y", "z", "roll", "pitch", "yaw")
+_FACTORS = ("distance", "turn")
 _ODOMETRY = {"distance": "distance_factor", "turn": "turn_factor", "turn_bias": "turn_bias_rad_s"}
 
 
 class Corrections:
-    """The corrections that apply at present.
-
-    Attributes
-    ----------
-    found : what calibration estimated beyond the configuration: factors less 1, seconds, radians, metres
-    """
+    """The corrections that apply at present."""
 
     def __init__(self, config: Config) -> None:
         self._config, self._space = config, config.space
         self._inputs = {one.name: one for one in config.sources}
-        self.found: dict[Key, float] = {}
-        self._of: dict[Key, float] | None = None  # what was found when these two were computed
-        self._factors, self._lag_ns = (1.0, 1.0, 0.0), 0
-        self._of_sensor: dict[str, tuple[list[float], Numbers, float, float]] = {}  # by input, with what was found
+        lags = (-one.offset_s for one in config.sources)
+        self.lag_ns = round(1e9 * max((lag for lag in lags if 0.0 < lag <= _LONGEST_LAG_S), default=0.0))
+        self._of_sensor: dict[str, tuple[list[float], Numbers, float, float]] = {}  # by input
+        self.found = {}
+
+    @property
+    def found(self) -> dict[Key, float]:
+        """Factors of odometry that the association found, by which those that are configured are multiplied."""
+        return self._found
+
+    @found.setter
+    def found(self, found: dict[Key, float]) -> None:
+        self._found = found
+        distance, turn = (self._factor(name) for name in _FACTORS)
+        self._factors = distance, turn, self._config.odometry.turn_bias_rad_s
+
+    def _factor(self, name: str) -> float:
+        found = next((value for (_, other), value in self.found.items() if other == name), 1.0)
+        return float(getattr(self._config.odometry, _ODOMETRY[name])) * found
 
     def configured(self, key: Key) -> float:
-        """Return the configured value of a parameter that calibration corrects."""
+        """Return the configured value of a parameter."""
         source, name = key
         if name in _ODOMETRY:
             return float(getattr(self._config.odometry, _ODOMETRY[name]))
@@ -52,38 +63,21 @@ class Corrections:
             {"clock": settings.offset_s, "range_factor": settings.range_factor}.get(name, settings.range_offset_m)
         )
 
-    def total(self, key: Key, found: float | None = None) -> float:
-        """Return the configured value with the estimated correction added."""
-        found = self.found.get(key, 0.0) if found is None else found
-        is_factor = key[1] in ("distance", "turn", "range_factor")
-        if key[1] == "range_offset":  # ranges are scaled by what was found, too, after the configured offset
-            return self.configured(key) * (1.0 + self.found.get((key[0], "range_factor"), 0.0)) + found
-        return self.configured(key) * (1.0 + found) if is_factor else self.configured(key) + found
+    def total(self, key: Key) -> float:
+        """Return the configured value with the factor that was found."""
+        return self.configured(key) * self.found.get(key, 1.0)
 
     def restore(self, totals: Mapping[Key, float]) -> None:
         """Continue with the values of another run, whatever is configured now."""
-        for key, total in totals.items():
-            is_factor = key[1] in ("distance", "turn", "range_factor")
-            self.found[key] = total / self.configured(key) - 1.0 if is_factor else total - self.configured(key)
+        self.found = {key: total / self.configured(key) for key, total in totals.items() if key[1] in _FACTORS}
 
     def totals(self) -> dict[Key, float]:
-        """Return all corrected values, as ``restore`` expects them."""
+        """Return what was found with what is configured, as ``restore`` expects it."""
         return {key: self.total(key) for key in self.found}
 
-    def lines(self) -> dict[str, float | str]:
-        """Return the configuration parameters that state the corrected values."""
-        out: dict[str, float | str] = {}
-        for source, name in self.found:
-            total = self.total((source, name))
-            if name in _ODOMETRY:
-                out[f"odometry.{_ODOMETRY[name]}"] = float(f"{total:.6g}")
-            elif name in AXES:
-                numbers = (self.total((source, axis)) for axis in AXES)
-                out[f"{source}.mount_correction"] = " ".join(f"{number:.6g}" for number in numbers)
-            else:
-                key = {"clock": "offset_s", "range_offset": "range_offset_m"}.get(name, name)
-                out[f"{source}.{key}"] = float(f"{total:.6g}")
-        return out
+    def lines(self) -> dict[str, float]:
+        """Return the configuration parameters that state what was found."""
+        return {f"odometry.{_ODOMETRY[key[1]]}": float(f"{self.total(key):.6g}") for key in self.found}
 
     # -- odometry ----------------------------------------------------------------------------------------------------
 
@@ -94,17 +88,16 @@ class Corrections:
 
     def without_bias(self, step: Step) -> Step:
         """A step of odometry with its factors corrected, before the turn of a gyro is part of it."""
-        factors = self._of_odometry("distance"), self._of_odometry("turn"), 0.0
+        factors = (*self.factors, 0.0)
         return replace(step, T_last_base=self._corrected(step.T_last_base, 0.0, factors))
 
     def with_bias(self, step: Step, seconds: float) -> Step:
         """A step whose factors are corrected, with the turn rate that is added."""
-        factors = 1.0, 1.0, self._of_odometry("turn_bias")
+        factors = 1.0, 1.0, self._factors[2]
         return replace(step, T_last_base=self._corrected(step.T_last_base, seconds, factors))
 
     def motion(self, motion: Numbers, seconds: float = 0.0) -> Numbers:
         """A motion by odometry, corrected; its numbers may be arrays."""
-        self._refresh()
         return self._corrected(motion, seconds, self._factors)
 
     def _corrected(self, motion: Numbers, seconds: float, factors: tuple[float, float, float]) -> Numbers:
@@ -123,12 +116,11 @@ class Corrections:
     @property
     def factors(self) -> tuple[float, float]:
         """The factors of distance and turn."""
-        return self._of_odometry("distance"), self._of_odometry("turn")
+        return self._factors[:2]
 
     @property
     def leave_odometry(self) -> bool:
         """Return whether odometry is used as it comes."""
-        self._refresh()
         return self._factors == (1.0, 1.0, 0.0)
 
     @property
@@ -140,58 +132,27 @@ class Corrections:
     def uncorrected(self, motion: Numbers) -> Numbers:
         """Undo the correction of a motion, except for its bias."""
         group, n = self._space.group, self._space.dimensions
-        distance, turn = self._of_odometry("distance"), self._of_odometry("turn")
+        distance, turn = self.factors
         tangent = group.log(motion)
         out: Numbers = group.exp(tuple(x / (distance if k < n else turn) for k, x in enumerate(tangent)))
         return out
 
-    def _refresh(self) -> None:
-        """Compute anew what each message needs, where something else was found since."""
-        if self.found != self._of:
-            self._of = dict(self.found)
-            self._of_sensor.clear()
-            distance, turn, bias = (self._of_odometry(name) for name in _ODOMETRY)
-            self._factors, self._lag_ns = (distance, turn, bias), self._lag()
-
-    def _of_odometry(self, name: str) -> float:
-        found = next((value for (_, other), value in self.found.items() if other == name), 0.0)
-        value = float(getattr(self._config.odometry, _ODOMETRY[name]))
-        return value + found if name == "turn_bias" else value * (1.0 + found)
-
     # -- sightings ---------------------------------------------------------------------------------------------------
-
-    def stamp_ns(self, m: Odometry | Observation) -> int:
-        """Return the corrected stamp of a measurement."""
-        return m.stamp_ns + (round(self.found.get((m.topic, "clock"), 0.0) * 1e9) if isinstance(m, Sightings) else 0)
-
-    def lag_ns(self) -> int:
-        """Return how long after odometry of the same stamp the sightings with a corrected clock arrive."""
-        self._refresh()
-        return self._lag_ns
-
-    def _lag(self) -> int:
-        clocks = {(one.name, "clock") for one in self._inputs.values() if one.offset_s}
-        clocks |= {key for key in self.found if key[1] == "clock"}
-        lags = (-self.total(key) for key in clocks)
-        return round(1e9 * max((lag for lag in lags if 0.0 < lag <= _LONGEST_LAG_S), default=0.0))
 
     def observation(self, m: Observation) -> Observation:
         """Return an observation with its corrections."""
         if not isinstance(m, Sightings):
             return m
         mount, turned, scale, offset = self._sensor(m.topic)
-        stamp_ns = self.stamp_ns(m)
-        if stamp_ns == m.stamp_ns and not any(mount) and (scale, offset) == (1.0, 0.0):
+        if not any(mount) and (scale, offset) == (1.0, 0.0):
             return m
-        sightings = tuple(self._sighting(s, mount, turned, scale, offset) for s in m.sightings)
-        return replace(m, stamp_ns=stamp_ns, sightings=sightings)
+        return replace(m, sightings=tuple(self._sighting(s, mount, turned, scale, offset) for s in m.sightings))
 
     def _sensor(self, source: str) -> tuple[list[float], Numbers, float, float]:
         """Return the correction of a sensor's mount and its turn, and the factor and offset of its ranges."""
-        self._refresh()
         if source not in self._of_sensor:
-            mount = [self.total((source, axis)) for axis in AXES]
-            ranges = self.total((source, "range_factor")), self.total((source, "range_offset"))
+            mount = [self.configured((source, axis)) for axis in AXES]
+            ranges = self.configured((source, "range_factor")), self.configured((source, "range_offset"))
             self._of_sensor[source] = mount, self._turn(mount), *ranges
         return self._of_sensor[source]
 

@@ -83,7 +83,7 @@ class KeyframeFrontend:
         self.path = KeyframeList(self._noise, self._space)
         self.sighting_poses = StampedPoses(SightingPose, self._space.pose.size)
         self.corrections = Corrections(config)
-        self.order = StampOrder(config.ordering, counters, self.corrections)
+        self.order = StampOrder(config.ordering, counters, self.corrections.lag_ns)
         self.pending = PendingObservations(config.ordering, self.path, self.odometry, counters)
         self.datum = DatumGate(datum)
         self._arrivals = GateChain[Observation]((self.datum,), size_of, counters)

@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from graph_slam_ros.config.frontend import OrderingConfig
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.types import Observation, Odometry
-from graph_slam_ros.slam.frontend.corrections import Corrections
 from graph_slam_ros.slam.frontend.ingest_gate import size_of
 from graph_slam_ros.slam.frontend.keyframes import KeyframeList
 from graph_slam_ros.slam.frontend.odometry_selector import OdometrySelector
@@ -24,16 +23,15 @@ _REMEMBERED = 100  # messages of each topic, by which one that comes again is kn
 
 
 class StampOrder:
-    """A bounded queue that releases measurements by (corrected stamp, odometry first, topic, arrival).
+    """A bounded queue that releases measurements by (stamp, odometry first, topic, arrival).
 
     Parameters
     ----------
-    corrections : of the clocks of sensors
+    lag_ns : how long after odometry of the same stamp the sightings of a late sensor arrive
     """
 
-    def __init__(self, config: OrderingConfig, counters: Counters, corrections: Corrections) -> None:
-        self._corrections = corrections
-        self._window_ns = round(config.window_s * NS)
+    def __init__(self, config: OrderingConfig, counters: Counters, lag_ns: int = 0) -> None:
+        self._window_ns = round(config.window_s * NS) + lag_ns
         self._max_pending = config.max_waiting
         self._counters = counters
         self._queue: list[tuple[int, int, str, int, Odometry | Observation]] = []  # ascending
@@ -86,13 +84,13 @@ class StampOrder:
     def push(self, m: Odometry | Observation) -> list[Odometry | Observation]:
         """Queue one measurement; return those that are released."""
         rank, topic = (0, "") if isinstance(m, Odometry) else (1, m.topic)
-        insort(self._queue, (self._corrections.stamp_ns(m), rank, topic, self._arrivals, m))
+        insort(self._queue, (m.stamp_ns, rank, topic, self._arrivals, m))
         self._arrivals += 1
         if isinstance(m, Odometry):
             self._newest_odometry_ns = max(m.stamp_ns, self._newest_odometry_ns or m.stamp_ns)
         if self._newest_odometry_ns is None:
             return []
-        return self._release(self._newest_odometry_ns - self._window_ns - self._corrections.lag_ns())
+        return self._release(self._newest_odometry_ns - self._window_ns)
 
     def flush(self) -> list[Odometry | Observation]:
         """Release all that is queued."""
@@ -114,7 +112,7 @@ class StampOrder:
     def next_odometry(self, m: Odometry) -> list[Odometry] | None:
         """Return the odometry that newer odometry releases; None if it is not newer, or releases more than that."""
         newest_ns, out = self._newest_odometry_ns, list[Odometry]()
-        until_ns = m.stamp_ns - self._window_ns - self._corrections.lag_ns()
+        until_ns = m.stamp_ns - self._window_ns
         if newest_ns is None or m.stamp_ns <= newest_ns or m.stamp_ns <= until_ns:
             return None
         for stamp_ns, rank, _, _, queued in self._queue:

@@ -6,7 +6,7 @@ scans are explained at once, in the background on a copy (``explanation.py``, ``
 result is used a fixed number of keyframes later.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -86,7 +86,6 @@ class AnonymousLandmarks:
             quantile(c.gate_same, space.dimensions),
             space.dimensions * float(np.log(c.density_per_m)),
             hypotheses=40,
-            clock_sigma_s=config.calibrate.clock_sigma_s,
         )
         self._belief = SolverBelief(space, solver, landmarks)
         self.hindsight = Hindsight(config, self._settings, executor)
@@ -95,7 +94,6 @@ class AnonymousLandmarks:
         self._sorts = dict[int, str]()  # of landmarks, whatever beam began them
         self._leader: Decision | None = None
         self._same: dict[int, int] = {}  # landmarks of the beam that are others in the graph
-        self._clocks: dict[str, float] = {}  # of each input the correction that its stamps have
         self._compared = 0  # scans
         self._rejoined = frozenset[int]()  # keyframes at which an explanation has no displacement, by their vertices
         self._displaced: int | None = None  # the scan from which on all are explained anew
@@ -119,13 +117,8 @@ class AnonymousLandmarks:
         """Restart the beam from the solver's estimate, because the map has moved."""
         self._beam = None
 
-    def recalibrate(self, factors: tuple[float, float], clocks: Mapping[str, float]) -> None:
-        """Take over that odometry's distance and turn were multiplied, and seconds added to the clocks of inputs.
-
-        Stamps of scans stay: the explanation knows what they lack.
-        """
-        for topic, seconds in clocks.items():
-            self._clocks[topic] = self._clocks.get(topic, 0.0) + seconds
+    def rescale(self, factors: tuple[float, float]) -> None:
+        """Take over that odometry's distance and turn were multiplied."""
         self._reckoning.rescale(factors)
         self._history.rescale(factors)
         self._builder.reckon_anew(self._reckoning.at)
@@ -139,7 +132,7 @@ class AnonymousLandmarks:
         for s in m.sightings:
             point, covariance = sighted_point(self._space, s)
             whole = with_extent(self._space, s, self._config.unnamed_sigma_m)
-            seen = Seen(m.topic, whole, where, self._clocks.get(m.topic, 0.0))
+            seen = Seen(m.topic, whole, where)
             self._builder.add(at, point, covariance, seen, s.sort)
         return out
 
@@ -358,9 +351,9 @@ class AnonymousLandmarks:
         leader = given.copy()
         for cluster, landmark in changes(None, self._leader).items():
             leader[cluster] = landmark
-        history, clocks = self._history, dict(self._clocks)
+        history = self._history
         motions = tuple(history.motions)
-        frozen = FrozenScans(tuple(scans), motions, history.nearby(), poses, scales.copy(), given, leader, clocks)
+        frozen = FrozenScans(tuple(scans), motions, history.nearby(), poses, scales.copy(), given, leader)
         if history.displacements:
             frozen = replace(frozen, displaced=history.displacements, undisplaced=history.undisplaced())
         return with_map(frozen, self._belief, self.clusters.final)

@@ -4,7 +4,7 @@ The method is Gauss-Newton with Levenberg's damping. Odometry is tight or has sl
 have Cauchy's loss. The first stage has no slip and a wide loss, because a local minimum looks like a wrong association.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -82,7 +82,7 @@ class Drive:
     stamps_s : (N,)
     scan : (M,) the scan of each cluster
     points : (M, n) clusters, from their scans
-    topics : (T,) inputs; ``clocks`` are the corrections that stamps have by now
+    topics : (T,) inputs
     whiten : (M, n, n)
     times : (M,) how often the robot has seen what a cluster stands for
     work : rows of odometry and clusters that were linearised by now
@@ -95,7 +95,6 @@ class Drive:
         nearby: Array,
         settings: BeamSettings,
         costs: Costs,
-        clocks: Mapping[str, float] | None = None,
         times: Array | None = None,
     ) -> None:
         self.settings = settings
@@ -108,7 +107,7 @@ class Drive:
         self.costs = costs
         self.whiten = _whitening(np.array([c.covariance for one in scans for c in one.clusters]))
         self._set_motions(motions)
-        self._set_clocks(scans, nearby, clocks or {})
+        self._set_inputs(scans, nearby)
         self.work = self._free = 0
         self._pattern: tuple[Ids | None, Pattern] = None, Pattern()  # of the equations of an assignment
 
@@ -138,14 +137,12 @@ class Drive:
         volumes = np.linalg.slogdet(slipped)[1] - np.linalg.slogdet(tight)[1]
         self.slip_cost = volumes - 2.0 * c.slip_log_prior
 
-    def _set_clocks(self, scans: Sequence[Scan], nearby: Array, clocks: Mapping[str, float]) -> None:
-        """Note of which input each cluster is, what its stamps lack, and how the robot moved around each scan."""
+    def _set_inputs(self, scans: Sequence[Scan], nearby: Array) -> None:
+        """Note of which input each cluster is, and how the robot moved around each scan."""
         of = [[seen.topic for seen in c.seen] for one in scans for c in one.clusters]
         self.topics = tuple(sorted({topic for names in of for topic in names}))
         parts = [[names.count(topic) / max(len(names), 1) for topic in self.topics] for names in of]
         self._part = np.array(parts).reshape(len(of), len(self.topics))
-        lacks = [[clocks.get(s.topic, 0.0) - s.clock_s for s in c.seen] for one in scans for c in one.clusters]
-        self._late_s = np.array([np.mean(one) if one else 0.0 for one in lacks])
         self._nearby = nearby
 
     # -- what it costs -----------------------------------------------------------------------------------------------
@@ -170,7 +167,7 @@ class Drive:
         A clock says that they were seen from another point on the way, which odometry has.
         """
         points = self.points[clusters]
-        after_s = self._part[clusters] @ e.clocks + self._late_s[clusters]
+        after_s = self._part[clusters] @ e.clocks
         moved, rate = interpolated_nearby(self._nearby[self.scan[clusters]], after_s)
         turned = applied(rotation(moved[:, self.n :]), points)
         swung = applied(lever(turned), rate[:, self.n :])

@@ -6,7 +6,7 @@ or at the end, and at the end of a drive in which landmarks said that the robot 
 on when the work is done.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -46,7 +46,6 @@ class FrozenScans:
     given : (M,) the number of each cluster's landmark
     leader : (M,) the same, by the beam alone
     nearby : (N, S, dof) how the robot moved around each scan, by odometry
-    clocks : of each input the correction that its stamps have by now [s]
     of_map : the first so many scans stand for the map (``known_map.py``); clusters_of_map : theirs
     times : (M,) how often the robot has seen what a cluster stands for; empty: once each
     displaced : keyframes at which the robot is thought to have been moved, by their vertices
@@ -60,7 +59,6 @@ class FrozenScans:
     scales: Array
     given: Ids
     leader: Ids
-    clocks: Mapping[str, float] = field(default_factory=dict)
     of_map: int = 0
     clusters_of_map: int = 0
     times: Array = field(default_factory=lambda: np.empty(0))
@@ -309,7 +307,7 @@ def explained(
 
 
 def _drive(frozen: FrozenScans, settings: BeamSettings, costs: Costs) -> Drive:
-    return Drive(frozen.scans, frozen.motions, frozen.nearby, settings, costs, frozen.clocks, frozen.times)
+    return Drive(frozen.scans, frozen.motions, frozen.nearby, settings, costs, frozen.times)
 
 
 def _log_volume(motions: Sequence[Motion]) -> float:

@@ -208,12 +208,11 @@ def motion_between(space: Geometry, noise: MotionNoise, a: Reckoned, b: Reckoned
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """A sighting without id: its input, and the robot's pose; ``clock_s`` is the correction that its stamp has."""
+    """A sighting without id: its input, and the robot's pose."""
 
     topic: str
     sighting: Sighting
     where: PoseAtStamp
-    clock_s: float = 0.0
 
     def shared_by(self, count: int) -> "Seen":
         """The sighting as one of several with the same error: together they count as one."""

@@ -8,7 +8,7 @@ from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
 
 MOUNT = {"x": 0.07, "y": -0.06, "z": 0.08, "roll": 0.03, "pitch": -0.04, "yaw": 0.05}
-ON = {"world.dimensions": 3, "calibrate.groups": "yaw mount", "calibrate.mount_sigma_m": 0.1}
+GROUPS = ("yaw", "mount")
 STEP_S, SIGMA_M = 0.05, 0.03
 
 
@@ -44,13 +44,13 @@ def drive(mount, *, tilts, seed=0, seconds=34.0):
 
 
 def found(measurements, settings):
-    """The pipeline after a drive, and its findings by name."""
+    """The findings of a trial fit after a drive, by name."""
     densities = {"translation": 0.01, "lateral": 0.002, "vertical": 0.002, "rotation": 0.01, "tilt": 0.005}
     noise = {f"odometry.{name}_density": value for name, value in densities.items()}
-    slam = GraphSlam(Config.from_mapping({**noise, "landmarks.added_sigma_m": 0.0, **ON, **settings}))
+    slam = GraphSlam(Config.from_mapping({**noise, "landmarks.added_sigma_m": 0.0, "world.dimensions": 3, **settings}))
     for one in (*measurements, Control("end"), Control("optimize")):
         slam.process(one)
-    return slam, {one["name"]: one for one in slam.calibration_report["parameters"]}
+    return {one.parameter.name: one for one in slam.trial_fit(GROUPS, is_to_correct=True)[1]}
 
 
 @pytest.fixture(scope="module")
@@ -59,33 +59,30 @@ def wrong():
 
 
 def test_all_six_numbers_of_a_mount_are_found(wrong):
-    slam, findings = found(wrong, {})
-    line = slam.calibration_report["settings"]["detections.mount_correction"]
-    np.testing.assert_allclose(list(map(float, line.split())), list(MOUNT.values()), atol=0.012)
+    findings = found(wrong, {})
     for name, truth in MOUNT.items():
         one = findings[name]
-        assert abs(one["correction"] - truth) < 5.0 * one["sigma"] + 0.1 * abs(truth), one["text"]
-        assert one["verdict"] == "nothing_to_correct", one["text"]
+        assert one.verdict == "admitted", one.text
+        assert one.value == pytest.approx(truth, abs=0.012)
+        assert abs(one.value - truth) < 5.0 * one.sigma + 0.1 * abs(truth), one.text
 
 
 def test_a_level_drive_does_not_tell_the_height_of_a_sensor():
     """All landmarks would be as much higher."""
-    slam, findings = found(drive(MOUNT, tilts=0.0), {})
-    assert findings["z"]["verdict"] == "not_determined"
-    assert "drive up a ramp and down, so that the robot tilts" in findings["z"]["text"]
-    line = list(map(float, slam.calibration_report["settings"]["detections.mount_correction"].split()))
-    assert line[2] == 0.0
-    np.testing.assert_allclose(line[3:], list(MOUNT.values())[3:], atol=0.012)
+    findings = found(drive(MOUNT, tilts=0.0), {})
+    assert findings["z"].verdict == "not_determined"
+    assert "drive up a ramp and down, so that the robot tilts" in findings["z"].text
+    for name in ("roll", "pitch", "yaw"):
+        assert findings[name].value == pytest.approx(MOUNT[name], abs=0.012)
 
 
 def test_a_robot_that_may_drift_upwards_does_not_tell_the_pitch_of_its_sensor(wrong):
-    _, findings = found(wrong[: len(wrong) * 2 // 3], {"odometry.vertical_density": 0.006})
-    assert findings["pitch"]["verdict"] == "refused"
-    assert "odometry.vertical_density (upwards) is 0.6 of odometry.translation_density" in findings["pitch"]["text"]
-    assert findings["yaw"]["verdict"] != "refused"
+    findings = found(wrong[: len(wrong) * 2 // 3], {"odometry.vertical_density": 0.006})
+    assert findings["pitch"].verdict == "refused"
+    assert "odometry.vertical_density (upwards) is 0.6 of odometry.translation_density" in findings["pitch"].text
+    assert findings["yaw"].verdict != "refused"
 
 
 def test_where_nothing_is_wrong_nothing_is_corrected():
-    slam, findings = found(drive({}, tilts=0.3, seconds=24.0), {})
-    assert not slam.calibration_report["settings"]
-    assert {one["verdict"] for one in findings.values()} <= {"nothing_to_correct", "not_determined"}
+    findings = found(drive({}, tilts=0.3, seconds=24.0), {})
+    assert {one.verdict for one in findings.values()} <= {"nothing_to_correct", "not_determined"}

@@ -277,14 +277,9 @@ def test_a_map_that_is_taken_up_again_goes_on_condensing(recorded, tmp_path):
     assert losses == []
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [("calibrate.groups", "auto"), ("loops.use", "closure")],
-)
-def test_what_does_not_go_with_condensing_is_named(name, value):
-    loops = {"inputs.names": "odom loops", "loops.topic": "/loops"} if name == "loops.use" else {}
+def test_what_does_not_go_with_condensing_is_named():
     assert Config().condenses
-    assert Config.from_mapping({name: value, **loops}).not_condensed == f"{name}={value}"
+    assert bounded(**LOOPS).not_condensed == "loops.use=closure"
 
 
 def test_with_closures_all_is_kept_and_the_end_says_why():

@@ -1,6 +1,8 @@
 """A clock, a mount or a scale that is off and that nothing corrects is told, and its setting mends it."""
 
+import gc
 import json
+import weakref
 from dataclasses import replace
 
 import numpy as np
@@ -64,7 +66,6 @@ def test_covariances_contain_what_is_off(faults, settings, seed):
     slam = driven(drive, settings)
     off = {sentence.split(" of ")[0] for sentence in slam.contradicted}
     assert off == {"distance", "turn", "clock", "yaw", "x", "y"}
-    assert not slam.corrected
     of_said = nees(slam, truth, slam.keyframe_covariances())
     assert of_said < min(6.0, 0.2 * nees(slam, truth, of_noise(slam)))  # 3 is expected
     wider = np.linalg.eigvalsh(slam.keyframe_covariances() - of_noise(slam))
@@ -74,7 +75,7 @@ def test_covariances_contain_what_is_off(faults, settings, seed):
 
 def test_a_clock_that_is_off_beyond_doubt_is_told_though_its_sigma_is_too_large_to_correct_it():
     """Odometry with the default noise, five times as large as that of this drive, leaves the clock unsure."""
-    drive, _, _, faults = random_drive("wrong calibration", 7016)
+    drive, _, faults = random_drive("wrong calibration", 7016)
     slam = GraphSlam(Config())
     for measurement in (*drive, Control("end"), Control("optimize")):
         slam.process(measurement)
@@ -83,16 +84,6 @@ def test_a_clock_that_is_off_beyond_doubt_is_told_though_its_sigma_is_too_large_
     (one,) = [one for one in slam.uncorrected() if one.code == "clock_offset"]
     assert one.sigma > 0.03
     assert one.value == pytest.approx(faults.clock_s, abs=3.0 * one.sigma)
-
-
-def test_a_prior_that_contradicts_does_not_hide_what_is_off():
-    drive, _ = imperfect_drive_and_truth(Faults(yaw=np.deg2rad(10.0)), seconds=60.0)
-    for groups in ("association", "auto"):
-        slam = driven(drive, {"calibrate.groups": groups, "calibrate.yaw_sigma_rad": 0.01})
-        assert not slam.corrected
-        (one,) = slam.uncorrected()
-        assert one.code == "mount_yaw"
-        assert one.value == pytest.approx(np.deg2rad(10.0), abs=0.01)
 
 
 @pytest.mark.parametrize("kind", ["range_bearing", "position", "range"])
@@ -110,7 +101,6 @@ def test_the_node_is_degraded_by_the_same_words():
     assert np.trace(slam.pose_covariance) > 2.0 * np.trace(slam.solver.marginal(slam.keyframes.ids[-1:])[0])
     (one,) = slam.uncorrected_so_far
     assert one.code == "clock_offset"
-    assert not slam.corrected
     of = {"is_confirmed": True, "is_resumed": False, "solve_s": 0.0, "slowest_solve_s": 0.0, "fit": 1.0, "doubted": ""}
     estimate = Estimate.of(slam, slam.correction, unseen=UnseenWay(0, 0), **of)
     health = judge(Facts("active", estimate=estimate), Config())
@@ -189,7 +179,13 @@ def test_an_error_of_the_recording_makes_a_fit_meaningless():
 
 def test_trials_that_nobody_asks_for_are_not_kept():
     drive, _ = imperfect_drive_and_truth(Faults(clock_s=0.2), seconds=60.0)
-    slam, asked = GraphSlam(Config()), GraphSlam(Config())
+    begun = []
+
+    def noted(work):
+        begun.append(weakref.ref(work))
+        return work
+
+    slam, asked = GraphSlam(Config(), executor=noted), GraphSlam(Config())
     for k, measurement in enumerate(drive):
         for one in (slam, asked):
             one.process(measurement)
@@ -197,6 +193,8 @@ def test_trials_that_nobody_asks_for_are_not_kept():
                 one.process(Control("optimize"))
         if asked.keyframes:
             assert asked.pose_covariance is not None
-    assert len(slam._calibrator.watch._jobs) <= 2
+    gc.collect()
+    assert len(begun) > 3
+    assert sum(one() is not None for one in begun) <= 2
     np.testing.assert_array_equal(slam.pose_covariance, asked.pose_covariance)
     assert slam.contradicted == asked.contradicted != []

@@ -298,31 +298,6 @@ def test_landmarks_near_one_another_are_told_apart_by_their_class_and_a_map_has_
     assert wrong < 0.01 * sum(map(len, seen.values()))
 
 
-def test_the_factor_of_odometry_that_the_association_finds_corrects_the_graph():
-    """Odometry tells 10 % too long a way."""
-    recording, scale = park(1, laps=1), 1.1
-
-    def found(settings):
-        usual = {"landmarks.association": "joint", "robust.noise_scale": "configured"}
-        slam = GraphSlam(Config.from_mapping(usual | settings))
-        for m in [*measurements(recording), Control("end"), Control("optimize")]:
-            if isinstance(m, Odometry):
-                x, y, heading = m.T_odom_base
-                m = replace(m, T_odom_base=(scale * x, scale * y, heading))
-            slam.process(without_ids(m))
-        return slam
-
-    slam, without = found({}), found({"calibrate.groups": "none"})
-    assert slam.calibrated("odometry", "distance") == pytest.approx(1.0 / scale, abs=0.015)
-    assert slam.calibrated("odometry", "turn") == 1.0, "one circle does not determine it"
-    assert not without.calibration_report
-    assert path_rmse(slam, recording) < 0.3 * path_rmse(without, recording)
-    assert len(slam.landmarks) == 40
-    # odometry that is wrong has a larger noise
-    allowed = found({"calibrate.groups": "none", "robust.noise_scale": "estimated"})
-    assert path_rmse(allowed, recording) < 0.3 * path_rmse(without, recording)
-
-
 def test_where_odometry_slips_what_was_seen_since_is_explained_anew():
     recording = park(3, laps=1)
     lost, _ = faulty_recording(recording, [Fault.named("slip", at=0.4, lasting=0.08, factor=1.0 / 0.6)], seed=1)

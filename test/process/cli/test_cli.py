@@ -289,8 +289,8 @@ REFUSED = {
         "unknown parameter 'base_frame'; did you mean 'frames.base'?",
     ),
     "setting without effect": (
-        ["replay", "{bag}", "--out", "{out}", "--set", "calibrate.groups=association"],
-        "calibrate.groups=association has no effect without landmarks.association=joint",
+        ["replay", "{bag}", "--out", "{out}", "--set", "calibrate.groups=auto"],
+        "calibrate.groups' was removed: graph_slam calibrate BAG prints the settings",
     ),
     "no setting": (["replay", "{bag}", "--out", "{out}", "--set", "a.b"], "'a.b' is not key=value"),
     "missing config": (["replay", "{bag}", "--out", "{out}", "--config", "no.yaml"], "no.yaml: No such file"),

@@ -279,8 +279,8 @@ def around(scans):
     return np.zeros((len(scans), len(NEARBY_S), 3))
 
 
-def of_drive(scans, which, n=2, nearby=None, settings=SETTINGS, clocks=None):
-    drive = Drive(scans, motions(scans, n), around(scans) if nearby is None else nearby, settings, COSTS, clocks)
+def of_drive(scans, which, n=2, nearby=None, settings=SETTINGS):
+    drive = Drive(scans, motions(scans, n), around(scans) if nearby is None else nearby, settings, COSTS)
     position, turn = drive.along_odometry(np.zeros(n), np.eye(n), np.zeros(2))
     clocks = np.zeros(len(drive.topics))
     return drive, drive.staged(Estimate(position, turn, np.empty((0, n)), np.zeros(2), clocks, np.array(which)))
@@ -323,18 +323,6 @@ def test_solving_all_finds_the_clock_of_an_input(late_s):
     assert sigma < 0.03
     _, same = of_drive(scans, truth, nearby=nearby, settings=replace(SETTINGS, clock_sigma_s=1e-6))
     assert (same.cost > e.cost + 16.0) == bool(late_s), "four sigmas"
-
-
-def test_what_stamps_lack_of_a_clock_that_was_corrected_is_no_unknown():
-    scans, truth, nearby = weaving(0.22)
-    drive, e = of_drive(scans, truth, nearby=nearby, clocks={"seen": -0.22})
-    assert drive.named(e)["seen"][0] == pytest.approx(0.0, abs=0.02)
-    with_it = [
-        replace(one, clusters=tuple(replace(c, seen=(replace(SEEN, clock_s=-0.22),)) for c in one.clusters))
-        for one in scans
-    ]
-    drive, e = of_drive(with_it, truth, nearby=nearby, clocks={"seen": -0.22})
-    assert drive.named(e)["seen"][0] == pytest.approx(-0.22, abs=0.02), "these stamps have it already"
 
 
 @pytest.mark.parametrize("n", [2, 3])

@@ -96,7 +96,7 @@ def test_where_nothing_is_wrong_nothing_is_found():
 def test_bearings_alone_tell_no_scale_and_a_mount_is_found_where_odometry_keeps_its_own():
     slam = driven(imperfect_drive(Faults(yaw=0.08), kind="bearing", seconds=60.0))
     assert "distance" in {one.name for one in parameters_of(trial_problem(slam), ["factors"])}, "if it is asked for"
-    _, findings = slam.trial_fit(chooses=True)
+    _, findings = slam.trial_fit()
     by_name = {one.parameter.name: one for one in findings}
     assert by_name.keys() == {"turn", "clock", "yaw"}
     assert by_name["yaw"].verdict == "admitted"

@@ -9,7 +9,7 @@ from imperfect import Faults, driven, imperfect_drive
 from graph_slam_ros.lie import se2
 from graph_slam_ros.slam import Config, Sighting, Sightings
 from graph_slam_ros.slam.calibration.parameters import Parameter
-from graph_slam_ros.slam.frontend.corrections import Corrections
+from graph_slam_ros.slam.frontend.corrections import AXES, Corrections
 from graph_slam_ros.slam.frontend.odometry_selector import Step
 
 PLACE = (0.6, 0.1, 0.0)
@@ -51,12 +51,12 @@ def test_what_comes_is_corrected_as_what_is_in_the_graph(kind):
     values = {Parameter("detections", name): value for name, value in found.items()}
     (edges,) = problem.model().sightings
     after = problem.model().seen(edges, values)
-    corrections = Corrections(Config())
-    corrections.found = {("detections", name): value for name, value in found.items()}
+    axes = " ".join(str(found.get(axis, 0.0)) for axis in AXES)
+    configured = {"mount_correction": axes, "range_factor": 1.0 + found.get("range_factor", 0.0)}
     for k, row in enumerate(edges.seen[:40]):
         measured = tuple(row[:2])
         s = Sighting("a", kind, measured, (0.01, 0.0, 0.0, 0.01), PLACE)
-        out = corrections.observation(Sightings(1, "detections", (s,))).sightings[0]
+        out = corrected(s, configured)
         expected = out.measured if kind == "position" else (*out.measured, *out.T_base_sensor)
         np.testing.assert_allclose(after[k], expected, atol=1e-9)
 

@@ -24,15 +24,13 @@ def seen(ms, topic="/landmarks", name="a"):
 
 def order(window_s=0.05, max_waiting=1000):
     config = Config.from_mapping({"ordering": {"window_s": window_s, "max_waiting": max_waiting}})
-    return StampOrder(config.ordering, Counters(), Corrections(config))
+    return StampOrder(config.ordering, Counters())
 
 
-def with_clock(settings, found_s):
-    """A queue by a configuration, where a clock's correction was found."""
-    config = Config.from_mapping(settings)
-    corrections = Corrections(config)
-    corrections.found["detections", "clock"] = found_s
-    return StampOrder(config.ordering, Counters(), corrections)
+def with_clock(offset_s):
+    """A queue by a configured clock."""
+    config = Config.from_mapping({"detections.offset_s": offset_s})
+    return StampOrder(config.ordering, Counters(), Corrections(config).lag_ns)
 
 
 def through(queue, measurements):
@@ -135,22 +133,19 @@ def test_flush_releases_everything_and_is_harmless_when_nothing_waits(window_s):
     assert queue.flush() == []
 
 
-@pytest.mark.parametrize("offset_s", [0.0, -0.1])
-def test_odometry_waits_for_a_sensor_whose_clock_is_corrected(offset_s):
-    """A sighting is seen 100 ms before its stamp, and perhaps 100 ms of that are configured."""
-    queue = with_clock({"detections.offset_s": offset_s}, -0.1)
-    late_ms = round(-1000 * offset_s)
-    out = []
+def test_odometry_waits_for_a_sensor_that_is_late():
+    """A sighting is seen 100 ms before its message comes."""
+    queue, out = with_clock(-0.1), []
     for ms in range(0, 1000, 20):
         out += queue.push(odometry(ms))
-        out += queue.push(seen(ms + 5 - late_ms, "detections"))
+        out += queue.push(seen(ms + 5 - 100, "detections"))
     out += queue.flush()
-    corrected = [m.stamp_ns - 100 * MS * isinstance(m, Sightings) for m in out]
-    assert corrected == sorted(corrected)
+    stamps = [m.stamp_ns for m in out]
+    assert stamps == sorted(stamps)
     assert len(out) == 100
 
 
 def test_odometry_does_not_wait_for_another_clock():
-    queue = with_clock({"detections.offset_s": -3000.0}, 0.0)
+    queue = with_clock(-3000.0)
     out = [m for ms in range(0, 1000, 20) for m in queue.push(odometry(ms))]
     assert len(out) > 40

@@ -1,0 +1,142 @@
+"""Factors of odometry that the association of landmarks without identities finds: they correct all measurements.
+
+Landmarks without identities are recognised by odometry, so the association leaves its two scales open. What each
+explanation of all scans finds of them corrects what edges have measured, and what comes.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from graph_slam_ros.config.config import Config
+from graph_slam_ros.measurements.counters import Counters
+from graph_slam_ros.slam.backend import Backend
+from graph_slam_ros.slam.calibration.decision import Finding, of_association
+from graph_slam_ros.slam.calibration.model import MeasurementModel, Values
+from graph_slam_ros.slam.calibration.parameters import Parameter
+from graph_slam_ros.slam.calibration.recalibration import Recalibration
+from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
+from graph_slam_ros.slam.landmarks.explanation import SCALES
+from graph_slam_ros.slam.landmarks.landmark_frontend import LandmarkFrontend
+from graph_slam_ros.slam.snapshot import MapSnapshot
+from graph_slam_ros.solver import Report, Settings
+from graph_slam_ros.typing import Array, Index
+
+_DIGITS = 12  # of a corrected measurement: the last ones of a sine depend on the machine
+
+
+class FoundFactors:
+    """Applies these factors.
+
+    Parameters
+    ----------
+    start : the map to go on in: its odometry keeps the factors that were found
+
+    Attributes
+    ----------
+    corrected : findings that were used, in order
+    history : all corrections of measurements that were there, in order
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        backend: Backend,
+        frontend: KeyframeFrontend,
+        landmarks: LandmarkFrontend,
+        counters: Counters,
+        start: MapSnapshot | None = None,
+    ) -> None:
+        self._config, self._backend, self._frontend, self._counters = config, backend, frontend, counters
+        self._origins, self._anonymous = landmarks.map.origins, landmarks.anonymous
+        self.corrected: list[Finding] = []
+        self.history: list[Recalibration] = []
+        self._is_new = start is None or not start.keyframe_count
+        if start is not None:
+            frontend.corrections.restore(start.calibration)
+        self._used: Mapping[str, tuple[float, float]] = landmarks.anonymous.hindsight.found_scales
+
+    def after_solve(self, keyframe: int, everything: Settings | None) -> Report | None:
+        """Apply what the last explanation of all scans has found, if it is new. Returns the report of a solve."""
+        scales = self._anonymous.hindsight.found_scales
+        if scales is self._used or not self._is_new or self._backend.holds_back:
+            return None
+        self._used, model = scales, self._model()
+        sources = {edges.source for edges in model.odometry}
+        if len(sources) != 1:
+            return None
+        (source,) = sources
+        names = [name for name in scales if name != "turn" or not self._config.gyro_input]  # its turn is the gyro's
+        before = self._frontend.corrections.found
+        findings = [of_association(Parameter(source, name), *scales[name], (source, name) in before) for name in names]
+        used = [one for one in findings if one.verdict == "admitted"]
+        values = {one.parameter: _rounded(one.value) for one in used}
+        report = self._correct(model, values, keyframe, everything) if values else None
+        if report is not None:
+            self.corrected += used
+        return report
+
+    def _model(self) -> MeasurementModel:
+        graph, keyframes = self._backend.graph, self._frontend.path.keyframes
+        edges = range(self._backend.first_free_edge, graph.edge_count)
+        return MeasurementModel(self._config.space, graph, self._origins, keyframes.ids, keyframes.stamps_ns, edges)
+
+    def _correct(
+        self, model: MeasurementModel, values: Values, keyframe: int, everything: Settings | None
+    ) -> Report | None:
+        """Correct all measurements, present and future, and solve. A failure is undone."""
+        backend, corrections = self._backend, self._frontend.corrections
+        before, start = corrections.found, backend.solver.values
+        changes, origins = self._changes(model, values)
+        undo = [change.apply(backend.graph) for change in changes]
+        try:
+            corrections.found = before | {
+                (one.source, one.name): before.get((one.source, one.name), 1.0) * (1.0 + value)
+                for one, value in values.items()
+            }
+            backend.solver.rebuild()
+            report = backend.solver.optimize(everything)
+            if backend.decisions.reclassify(keyframe):
+                report = backend.solver.optimize(everything)
+        except Exception as error:
+            self._counters.count("calibration", type(error).__name__)
+            corrections.found = before
+            for change in undo:
+                change.apply(backend.graph)
+            backend.solver.start_at(start)
+            backend.solver.rebuild()
+            return None
+        for rows, poses in origins:
+            self._origins.move(rows, poses)
+        self.history += changes
+        factors = [1.0 + next((v for p, v in values.items() if p.name == name), 0.0) for name in SCALES]
+        self._anonymous.rescale((factors[0], factors[1]))
+        backend.cancel_search()
+        return report
+
+    def _changes(
+        self, model: MeasurementModel, values: Values
+    ) -> "tuple[list[Recalibration], list[tuple[Index, Array]]]":
+        """Return the corrected measurements of all edges, and the corrected origins of sightings."""
+        changes, origins = [], []
+        for odometry in model.odometry:
+            z = model.corrected_odometry(odometry, values)
+            changes.append(Recalibration(odometry.table.type.name, odometry.rows, _exact(z), odometry.roots))
+        for seen in model.sightings:
+            T_keyframe_base = model.scaled(tuple(seen.T_keyframe_base.T), values)
+            z = model.from_pose(seen, model.seen(seen, values), T_keyframe_base)
+            roots = model.roots(seen, values, T_keyframe_base)
+            changes.append(Recalibration(seen.table.type.name, seen.rows, _exact(z), _exact(roots)))
+            places = self._origins.places(seen.table.id.values[seen.rows])
+            known = places >= 0
+            origins.append((places[known], _exact(np.stack(T_keyframe_base, axis=-1)[known])))
+        return [one for change in changes if (one := change.only_changed(self._backend.graph)) is not None], origins
+
+
+def _rounded(value: float) -> float:
+    """A value with six digits, because the last ones of a sine depend on the memory alignment of an array."""
+    return float(f"{value:.6g}")
+
+
+def _exact(numbers: Array) -> Array:
+    return np.round(numbers, _DIGITS)

@@ -1,0 +1,236 @@
+"""Trial fits of clocks, mounts and scales at fixed keyframes: what is off is said, and covariances contain it.
+
+A trial starts at keyframes 50, 100, 200 and so on of this drive, and when everything is solved. It works on a copy, in
+the background if possible, and corrects nothing. Its outcome counts a fixed number of keyframes later, so that a replay
+says what the live run did.
+
+Covariances that take a wrong parameter for known are too small. A drive that contradicts one parameter of the
+configuration says that nobody has calibrated this robot. So all parameters count then: the error is how far the fit
+moves the estimate, and the sigmas of all parameters add to it (S. F. Schmidt, "Application of state-space methods to
+navigation problems", Advances in Control Systems 3, 1966: parameters that are considered, not estimated).
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import TypeVar
+
+import numpy as np
+
+from graph_slam_ros.config.config import Config
+from graph_slam_ros.measurements.counters import Counters
+from graph_slam_ros.slam.backend import Backend
+from graph_slam_ros.slam.calibration.choice import parameters_of
+from graph_slam_ros.slam.calibration.decision import Finding, amount, decide
+from graph_slam_ros.slam.calibration.fit import TrialFit, likelier_fit
+from graph_slam_ros.slam.calibration.model import MeasurementModel
+from graph_slam_ros.slam.calibration.parameters import AUTO, FACTORS, Parameter
+from graph_slam_ros.slam.calibration.places import fit_with_places
+from graph_slam_ros.slam.calibration.rows import TrialProblem
+from graph_slam_ros.slam.calibration.uncorrected import Uncorrected, is_off, sampled, uncorrected
+from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
+from graph_slam_ros.slam.kidnap_detector import KidnapDetector
+from graph_slam_ros.slam.landmarks.landmark_frontend import LandmarkFrontend
+from graph_slam_ros.typing import Array, Executor, Index
+
+FIRST_DUE = 50  # keyframes
+_DIGITS = 12  # of an added variance: the last ones of a sine depend on the machine
+_MOST_POSES = 100  # whose covariances say whether what is not corrected matters
+
+Fits = tuple[TrialFit, TrialFit]
+"""The fit whose findings are said, and the one that always has the places of all sensors."""
+
+Outcome = TypeVar("Outcome")
+Trial = Callable[[], "Fits | None"]
+
+
+class TrialFits:
+    """The newest outcome of trial fits. Each is computed when somebody asks.
+
+    Parameters
+    ----------
+    first_keyframe : the first that is driven now; those before are of another drive
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        backend: Backend,
+        frontend: KeyframeFrontend,
+        landmarks: LandmarkFrontend,
+        kidnaps: KidnapDetector,
+        counters: Counters,
+        executor: Executor,
+        first_keyframe: int = 0,
+    ) -> None:
+        self._config, self._backend, self._frontend = config, backend, frontend
+        self._landmarks, self._anonymous = landmarks.map, landmarks.anonymous
+        self._kidnaps, self._counters, self._executor = kidnaps, counters, executor
+        self._graph, self._solver = backend.graph, backend.solver
+        self._first_keyframe, self._first_edge = first_keyframe, backend.graph.edge_count
+        self._due = FIRST_DUE
+        self._jobs = list[tuple[int, Trial]]()  # each with the keyframe from which on its outcome counts
+        self._fits: Fits | None = None
+        self._contradicting: TrialFit | None = None
+        self._fits_so_far: Fits | None = None
+        self._so_far: list[Uncorrected] = []
+        self._of_edges = -1  # the map that the newest trial of everything was of
+
+    # -- trials ------------------------------------------------------------------------------------------------------
+
+    def after_solve(self, keyframe: int, *, is_of_everything: bool) -> None:
+        """Start a trial if it is due.
+
+        Parameters
+        ----------
+        is_of_everything : whether all that was measured was solved
+        """
+        driven, is_due = keyframe + 1 - self._first_keyframe, is_of_everything
+        if self._backend.holds_back or not (is_due or driven >= self._due):
+            return
+        while not is_due and driven >= self._due:
+            self._due *= 2
+        if not self._backend.spares_memory:
+            counts_from = keyframe + (0 if is_of_everything else self._config.robust.apply_after_keyframes)
+            trial = self._guarded(lambda: self._executor(self._trial(is_thorough=is_of_everything)))
+            if trial is not None:
+                if is_of_everything:
+                    self._jobs, self._of_edges = [], self._graph.edge_count
+                self._jobs = [*self._jobs[-1:], (counts_from, trial)]  # each holds a copy of the map
+
+    def _trial(self, *, is_thorough: bool = True) -> Trial:
+        problem, log_odds = self._problem(), self._config.odometry.log_odds
+
+        def run() -> Fits | None:
+            priors = self._parameters(problem)
+            return fit_with_places(problem, priors, log_odds, is_thorough=is_thorough) if priors else None
+
+        return lambda: self._guarded(run)
+
+    def _problem(self) -> TrialProblem:
+        """A copy of the map as it is now."""
+        path, origins, factors = self._frontend.path, self._landmarks.origins, self._frontend.corrections.factors
+        problem = self._backend.trial_problem(self._config.space, path, origins, factors)
+        slips = self._kidnaps.slipped(path.keyframes)
+        return replace(problem, first_edge=self._first_free_edge, slips=slips)
+
+    def fit(self, groups: Sequence[str], *, places: bool, is_to_correct: bool) -> tuple[TrialFit, list[Finding]]:
+        """Fit the map as it is now, as of ``GraphSlam.trial_fit``."""
+        problem, log_odds = self._problem(), self._config.odometry.log_odds
+        wanted = self._parameters(problem, groups, has_gyro=is_to_correct)
+        found = fit_with_places(problem, wanted, log_odds)[0] if places else likelier_fit(problem, wanted, log_odds)
+        return found, self._judged(found, is_confirmed=is_to_correct and "factors" not in groups)
+
+    def _parameters(
+        self, problem: TrialProblem, groups: Sequence[str] = (AUTO,), *, has_gyro: bool = True
+    ) -> dict[Parameter, float]:
+        """The parameters of groups, as of ``parameters_of``, with the sigmas of their priors."""
+        wanted = parameters_of(problem, groups)
+        if has_gyro and self._config.gyro_input:  # odometry's turn is mostly that of the gyro
+            wanted = [one for one in wanted if one.name != "turn"]
+        return {one: one.quantity.prior for one in wanted}
+
+    def _guarded(self, job: Callable[[], Outcome | None]) -> Outcome | None:
+        try:
+            return job()
+        except Exception as error:
+            self._counters.count("calibration", type(error).__name__)
+            return None
+
+    def _judged(self, found: TrialFit, *, is_confirmed: bool = True) -> list[Finding]:
+        """The finding of each parameter of a fit.
+
+        Parameters
+        ----------
+        is_confirmed : whether landmarks without identities, where most are, merely confirm factors of odometry
+        """
+        known = [mark.is_unnamed for mark in self._landmarks.known.values() if not mark.is_tentative]
+        is_confirmed = is_confirmed and not self._first_keyframe and 2 * sum(known) > len(known)
+        return decide(
+            found,
+            len(known),
+            slides=self._config.odometry.slides,
+            sigma_per_m=self._stated(),
+            by_association=self._anonymous.hindsight.found_scales if is_confirmed else None,
+        )
+
+    def _stated(self) -> float:
+        """The stated noise of odometry's way for each metre."""
+        keyframes, edges = self._frontend.path.keyframes, range(self._first_free_edge, self._graph.edge_count)
+        of = self._config.space, self._graph, self._landmarks.origins, keyframes.ids, keyframes.stamps_ns, edges
+        return MeasurementModel(*of).sigma_per_m()
+
+    @property
+    def _first_free_edge(self) -> int:
+        return max(self._backend.first_free_edge, self._first_edge)
+
+    # -- what they find ----------------------------------------------------------------------------------------------
+
+    def widened(self, marginal: Array, vertex: int) -> Array:
+        """The marginal of a vertex with what wrong parameters add to it, where any contradicts the configuration."""
+        self._compute()
+        found, dof = self._contradicting, len(marginal)
+        if found is None:
+            return marginal
+        return marginal + np.round(found.adds(self._known(vertex, dof, found.column), dof), _DIGITS)
+
+    def _known(self, vertex: int, dof: int, column: Index) -> int:
+        """A vertex that a trial had: a pose after it counts as the last keyframe before."""
+        keyframes = self._frontend.path.keyframes.ids
+        if vertex < len(column) or dof != self._graph.kind_of(int(keyframes[-1])).dof:
+            return vertex
+        earlier = keyframes[keyframes < len(column)]
+        return int(earlier[-1]) if len(earlier) else vertex
+
+    def contradicted(self) -> list[str]:
+        """Say what each parameter is off by, with its sigma; empty where nothing contradicts the configuration.
+
+        Covariances contain a factor of odometry that noise explains, too: its noise is no worse said by it. But that is
+        no error of the configuration.
+        """
+        self._compute()
+        found = self._contradicting
+        if found is None or self._fits is None:
+            return []
+        known = self._fits[0].parameters
+        values = zip(found.parameters, found.values.tolist(), found.sigmas.tolist(), strict=True)
+        return [
+            f"{one} {amount(one, value, 3)} (sigma {amount(one, sigma)})"
+            for one, value, sigma in values
+            if one in known or one.name not in FACTORS
+        ]
+
+    def uncorrected(self) -> list[Uncorrected]:
+        """Return what is wrong in the map as it is now."""
+        if self._of_edges != self._graph.edge_count:
+            return self._off(self._trial()())
+        self._compute()
+        return self._off(self._fits)
+
+    def uncorrected_so_far(self) -> Sequence[Uncorrected]:
+        """Return what was wrong in the map at the newest trial."""
+        if self._solver.is_current:
+            self._compute()
+            if self._fits is not self._fits_so_far:
+                self._fits_so_far, self._so_far = self._fits, self._off(self._fits)
+        return self._so_far
+
+    def _compute(self) -> None:
+        """Compute the newest trial whose outcome counts."""
+        keyframe = len(self._frontend.path.keyframes) - 1
+        ready = [job for begins, job in self._jobs if begins <= keyframe]
+        if not ready:
+            return
+        self._jobs = [one for one in self._jobs if one[0] > keyframe]
+        self._fits = ready[-1]()
+        self._contradicting = None
+        if self._fits is not None:
+            chosen, whole = self._fits
+            self._contradicting = whole if any(is_off(chosen, one) for one in self._judged(chosen)) else None
+
+    def _off(self, fits: Fits | None) -> list[Uncorrected]:
+        if fits is None or not self._solver.is_current:
+            return []
+        keyframes, total = self._frontend.path.keyframes.ids, self._frontend.corrections.total
+        vertices = sampled(keyframes[np.isin(keyframes, self._solver.vertices)], _MOST_POSES)
+        covariances: Mapping[int, Array] = dict(zip(vertices.tolist(), self._solver.marginal(vertices), strict=True))
+        return uncorrected(fits[0], self._judged(fits[0]), covariances, lambda *key: total(key), self._stated())
