@@ -71,7 +71,7 @@ KINDS: dict[str, Kind] = {
         "record odometry from the beginning to the end; find out whether its driver stopped",
     ),
     "time_jump": Kind(
-        "stamps step back by more than time.jump_back_s: the clock was set, or two recordings were joined",
+        "stamps step back by more than a second: the clock was set, or two recordings were joined",
         "cut the recording in two; time.on_jump sets what a run does at the step",
     ),
     "constant_stamps": Kind(

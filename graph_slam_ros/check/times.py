@@ -200,7 +200,7 @@ def _order(c: Columns, topic: TopicColumns) -> Iterator[Finding]:
     most_s, at, count = -float(step_s.min()), int(stamp_ns[1:][back][0]), int(back.sum())
     more: Where = {"first_ns": at, "count": count, **where}
     window_s = c.config.ordering.window_s if topic.use == "odometry" else c.config.ordering.late_s
-    if most_s > max(c.config.time.jump_back_s, 1.0) and most_s > window_s:
+    if most_s > 1.0 and most_s > window_s:
         text = f"{topic.name}: stamps step back by up to {most_s:.2f} s: the clock was set, or two drives were joined"
         is_expected = c.config.time.on_jump != TimeConfig().on_jump
         severity: Severity = "note" if is_expected else "error"

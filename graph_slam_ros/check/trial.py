@@ -32,7 +32,7 @@ from graph_slam_ros.typing import Array, Index
 _THIN_NS = 80_000_000
 _APART_S = 1.0
 _COARSE = {
-    **{"solve.every_keyframes": 20, "robust.rounds": 3, "odometry.doubt": False},
+    **{"solve.every_keyframes": 20, "odometry.doubt": False},
     "map.condense": False,  # the fit is of all keyframes
 }
 _SIGMAS = 4.0

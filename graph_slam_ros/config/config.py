@@ -61,6 +61,7 @@ REMOVED = {
         ("initialpose.use", "initialpose.loosen_m", "initialpose.loosen_rad"), "a given pose begins a new segment"
     ),
     "INPUT.depth": "inputs.depth is that of all inputs",
+    "INPUT.loss_scale": "landmarks.loss_scale and robust.loss_scale are those of all inputs",
     "tf.second_authority": "another broadcaster of map -> odom is reported; tf.publish_tf=false stops this one",
     **dict.fromkeys(
         (
@@ -72,7 +73,10 @@ REMOVED = {
             *("solve.relinearize_above", "solve.relinearize_error", "solve.relinearize_every", "solve.tolerance"),
             *("solve.tolerance_sigmas", "solve.step_tolerance", "solve.cost_tolerance"),
             *("inputs.tf_buffer_s", "output.path_moved_m", "output.path_moved_rad", "output.graph_period_s"),
-            *("output.landmarks_every_keyframes", "output.graph_max_edges"),
+            *("output.landmarks_every_keyframes", "output.graph_max_edges", "output.pose_covariance_max"),
+            *("odometry.doubt_odds", "gyro.bias_walk", "gyro.bias_correlation_s", "landmarks.give_up_s"),
+            *("landmarks.gate_same", "landmarks.gate_other", "robust.rounds", "robust.review_every_keyframes"),
+            *("tf.report_jump_rad", "time.jump_back_s", "journal.sync_s"),
         ),
         "its default is used always",
     ),
@@ -243,13 +247,10 @@ class Config:
         out: dict[LossKey, Sequence[Loss]] = {"landmarks": landmark_stages(landmarks.loss, landmarks.loss_scale)}
         out |= dict.fromkeys(("fixes", "closures", "initialpose"), others)
         for one in self.sources:
-            if one.loss == "auto" and not one.loss_scale:
-                continue
-            name = landmarks.loss if one.loss == "auto" else one.loss
-            out["landmarks", one.name] = landmark_stages(name, one.loss_scale or landmarks.loss_scale)
-            name = robust.loss if one.loss == "auto" else one.loss
-            stages = narrow_then_wide(name, one.loss_scale or robust.loss_scale)
-            out |= {(label, one.name): stages for label in ("fixes", "closures")}
+            if one.loss != "auto":
+                out["landmarks", one.name] = landmark_stages(one.loss, landmarks.loss_scale)
+                stages = narrow_then_wide(one.loss, robust.loss_scale)
+                out |= {(label, one.name): stages for label in ("fixes", "closures")}
         return out
 
     def solver_settings(self) -> Settings:

@@ -114,19 +114,11 @@ class OdometryConfig:
     doubt: bool = setting(
         True, "true: where several landmarks contradict odometry over some seconds, it counts for less while it slips"
     )
-    doubt_odds: float = setting(
-        1e-6, "odds that a stretch of odometry slips, before anything is seen", "odds", low=1e-12, high=1.0
-    )
 
     @property
     def slides(self) -> tuple[float, float]:
         """The noise sideways and upwards, relative to that ahead."""
         return self.lateral_density / self.translation_density, self.vertical_density / self.translation_density
-
-    @property
-    def log_odds(self) -> float:
-        """The logarithm of ``doubt_odds``."""
-        return math.log(self.doubt_odds)
 
     @property
     def has_densities(self) -> bool:

@@ -26,15 +26,6 @@ class GyroConfig:
     bias_sigma: float = setting(
         0.02, "standard deviation of the gyro's bias before the robot has stood", "rad/s", low=0.0, high=1.0
     )
-    bias_walk: float = setting(1e-4, "random walk of the gyro's bias", "rad/s/sqrt(s)", low=0.0, high=0.1)
-    bias_correlation_s: float = setting(
-        10.0,
-        "time for which an error of the bias counts as one: the heading's variance grows by the bias's variance times "
-        "this, each second",
-        "s",
-        low=1e-3,
-        high=1e4,
-    )
     timeout_s: float = setting(
         0.1,
         "longest gap between messages of the gyro that is bridged; in a longer one odometry is used alone",

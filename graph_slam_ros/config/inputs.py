@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 
-from graph_slam_ros.config.loss import LEAST_LOSS_SCALE, LOSSES
+from graph_slam_ros.config.loss import LOSSES
 from graph_slam_ros.config.parameter import numbers, setting
 from graph_slam_ros.errors import ConfigError
 
@@ -118,13 +118,6 @@ class InputConfig:
         "and closures; odometry has none",
         choices=("auto", *LOSSES),
     )
-    loss_scale: float = setting(
-        0.0,
-        "residuals of the input well below this many standard deviations keep their full weight; 0: "
-        "landmarks.loss_scale for landmarks, robust.loss_scale for fixes and closures",
-        "sigma",
-        low=0.0,
-    )
     reliability: str = setting(
         "auto",
         "QoS reliability that the input's subscription asks for; auto: as inputs.reliable says; reliable: a "
@@ -145,10 +138,6 @@ class InputConfig:
         for (name, most, unit), number in zip(limits, self.numbers("datum", 3), strict=False):
             if abs(number) > most:
                 raise ConfigError(f"{self.name}.datum: {name} {number:g} is not in [-{most:g}, {most:g}] {unit}")
-        if 0.0 < self.loss_scale < LEAST_LOSS_SCALE:
-            raise ConfigError(
-                f"{self.name}.loss_scale: {self.loss_scale:g} is not 0 or in [{LEAST_LOSS_SCALE:g}, 1e+09]"
-            )
 
     def numbers(self, key: str, count: int) -> tuple[float, ...]:
         """Numbers of a text; none if it is empty. Raises ConfigError unless there are ``count`` of them."""

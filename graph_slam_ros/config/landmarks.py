@@ -26,20 +26,6 @@ class LandmarksConfig:
         "several hypotheses, which later ones decide",
         choices=("none", "id", "joint"),
     )
-    gate_same: float = setting(
-        0.9999,
-        "an observation without identity may belong to a landmark within this probability of the chi2 test",
-        "probability",
-        low=0.5,
-        high=1.0,
-    )
-    gate_other: float = setting(
-        0.99999,
-        "an observation outside this probability of every landmark is not used",
-        "probability",
-        low=0.5,
-        high=1.0,
-    )
     unnamed_sigma_m: float = setting(
         0.14,
         "position noise added to observations without identity: where on an object, or on which of several, it is seen",
@@ -52,9 +38,6 @@ class LandmarksConfig:
         "landmark better than a new one",
         "1/m",
         low=1e-4,
-    )
-    give_up_s: float = setting(
-        60.0, "a landmark that is not confirmed is removed when it was not observed for this long", "s", low=0.0
     )
     retire: bool = setting(
         False,

@@ -56,15 +56,9 @@ class TfConfig:
     )
     report_jump_m: float = setting(
         0.5,
-        "a correction that moves map -> odom by more than this is reported with the edges that caused it",
+        "a correction that moves map -> odom by more than this, or turns it by 0.2 rad, is reported with the edges "
+        "that caused it",
         "m",
-        low=0.0,
-        live=True,
-    )
-    report_jump_rad: float = setting(
-        0.2,
-        "a correction that turns map -> odom by more than this is reported with the edges that caused it",
-        "rad",
         low=0.0,
         live=True,
     )
@@ -151,13 +145,6 @@ class OutputConfig:
     path_max_poses: int = setting(
         10_000, "most poses of ~/path; a longer path is thinned out", "poses", low=2, high=10_000_000, live=True
     )
-    pose_covariance_max: float = setting(
-        0.25,
-        "variance of z, roll and pitch published for a planar robot, whose values are published as 0;"
-        " 1e6: unknown (RViz draws a kilometre)",
-        "m^2, rad^2",
-        low=0.0,
-    )
 
     def __post_init__(self) -> None:
         check_run_name("output.load", self.load)
@@ -171,14 +158,6 @@ class JournalConfig:
     resume: bool = setting(
         True, "true: a node whose last run did not end resumes its map when configured, as ~/load would"
     )
-    sync_s: float = setting(
-        1.0,
-        "longest time until the journal is on the disk: what a power cut may lose; the end of the "
-        "process loses nothing that was published",
-        "s",
-        low=0.05,
-        high=3600.0,
-    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,9 +170,6 @@ class TimeConfig:
         "run is saved and begins anew; stop: measurements are refused until ~/reset",
         choices=("segment", "reset", "stop"),
         live=True,
-    )
-    jump_back_s: float = setting(
-        0.2, "time by which the clock must jump back to count as a jump; less is a message out of order", "s", low=1e-3
     )
     future_s: float = setting(
         1.0,

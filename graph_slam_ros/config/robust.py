@@ -41,20 +41,6 @@ class RobustConfig:
         "sigma",
         low=LEAST_LOSS_SCALE,
     )
-    review_every_keyframes: int = setting(
-        20,
-        "verdicts are reviewed after this many keyframes: the newest, and some of the others in turn",
-        "keyframes",
-        low=1,
-        high=1_000_000,
-    )
-    rounds: int = setting(
-        10,
-        "most rounds of a search for better hypotheses: solve everything, then review all verdicts",
-        "rounds",
-        low=1,
-        high=1000,
-    )
     second_look_after: int = setting(
         10,
         "a search for better hypotheses starts in the background when so many more measurements are "

@@ -75,7 +75,7 @@ def _mcap(slam: GraphSlam, left: Left, out: Path) -> list[Path]:
 
     The covariance of a keyframe that was condensed is not known: all variances are those of what a pose does not have.
     """
-    frame, unused = slam.config.frames.map, slam.config.output.pose_covariance_max
+    frame, unused = slam.config.frames.map, to_msg.UNUSED
     whole = WholePath(slam, left)
     path, stamps_ns = whole.poses(), whole.stamps_ns.tolist()
     unknown = np.broadcast_to(unused * np.eye(slam.space.dof), (len(left.keyframes), slam.space.dof, slam.space.dof))

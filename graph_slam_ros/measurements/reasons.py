@@ -232,7 +232,7 @@ REASONS: dict[str, Reason] = {
         _NOTED, "the search for landmarks that are in the map twice reached its limit of work: some may be left"
     ),
     "reassigned": Reason(_NOTED, "what was seen without identity turned out to be of another landmark"),
-    "given_up": Reason(_NOTED, "a new unnamed landmark was not seen again in landmarks.give_up_s"),
+    "given_up": Reason(_NOTED, "a new unnamed landmark was not seen again within a minute"),
     # -- landmarks.retire
     "retired": Reason(_NOTED, "a landmark was not seen any more from where it was seen before: it is retired"),
     "moved": Reason(_NOTED, "a landmark was seen elsewhere, and not where it stood: its new place is a new landmark"),
@@ -323,7 +323,6 @@ REASONS: dict[str, Reason] = {
     "slip_taken_back": Reason(
         _NOTED,
         "a slip was decided, and later sightings agree with odometry: it counts as before",
-        "odometry.doubt_odds",
     ),
     "displacement_taken_back": Reason(
         _NOTED,

@@ -43,7 +43,7 @@ def pose(slam: GraphSlam) -> bytes:
         slam.config.frames.map,
         newest_pose(slam),
         slam.pose_covariance,
-        slam.config.output.pose_covariance_max,
+        to_msg.UNUSED,
     )
 
 

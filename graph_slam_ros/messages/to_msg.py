@@ -20,6 +20,7 @@ from graph_slam_ros.messages.interfaces import typestore
 from graph_slam_ros.typing import Array, Numbers
 
 UNKNOWN = 1e6  # variance [m^2, rad^2] of what is not known at all
+UNUSED = 0.25  # variance of z, roll and pitch of a pose in the plane; RViz draws those of 1e6 a kilometre large
 _IN_PLANE = np.array([0, 1, 5, 6, 7, 11, 30, 31, 35])  # of the 36 numbers: x, y and yaw
 _OUT_OF_PLANE = np.array([14, 21, 28])  # the variances of z, roll and pitch
 

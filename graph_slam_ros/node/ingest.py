@@ -33,7 +33,7 @@ from graph_slam_ros.node.worker import Worker
 from graph_slam_ros.slam import Config, Control, Counters, Odometry
 from graph_slam_ros.slam.edits import SOURCE as EDITS
 from graph_slam_ros.slam.edits import removal
-from graph_slam_ros.slam.frontend.ingest_gate import IngestGate, Passage
+from graph_slam_ros.slam.frontend.ingest_gate import JUMP_BACK_S, IngestGate, Passage
 
 OnJump = Callable[[Passage, str, str], None]
 
@@ -80,7 +80,7 @@ class Ingest:
         self.check = InputCheck(config, topics, counters)
         self.converter = MessageConverter(config, counters, self.check.decoders(_installed(config)))
         self.converter.on_fault = node.get_logger().error
-        self.gate = IngestGate(config.time.jump_back_s, counters, lambda: node.now_ns)
+        self.gate = IngestGate(counters, lambda: node.now_ns)
         self.extrapolator = PoseExtrapolator(config)
         self.memory_is_short = False
         self.outcome: Outcome | None = None
@@ -97,7 +97,7 @@ class Ingest:
 
     def activate(self) -> None:
         """Watch the clock for jumps."""
-        back = Duration(nanoseconds=-round(self._node.config.time.jump_back_s * 1e9))
+        back = Duration(nanoseconds=-round(JUMP_BACK_S * 1e9))
         threshold = JumpThreshold(min_forward=None, min_backward=back, on_clock_change=True)
         clock, callback = self._node.get_clock(), self._node.guarded(self._on_clock_jump)
         self._clock_jumps = clock.create_jump_callback(threshold, post_callback=callback)
@@ -182,7 +182,7 @@ class Ingest:
         estimate, config = self._session.estimate, self._node.config
         if estimate is None or not estimate.is_located:
             return
-        frames, unused = config.frames, config.output.pose_covariance_max
+        frames, unused = config.frames, to_msg.UNUSED
         twist = twist_of(cdr, frames.base) if m.source.partition("#")[0] in self._with_twist else None
         pose, covariance = self.extrapolator.pose(estimate)
         self._publishers.odometry(to_msg.odometry(m.stamp_ns, frames.map, frames.base, pose, covariance, unused, twist))

@@ -16,6 +16,7 @@ from graph_slam_ros.slam.frontend.ingest_gate import input_of, size_of
 
 ACKNOWLEDGE = 32  # messages
 _MOST_UNPUBLISHED_S, _AGAIN_S = 4.0, 5.0
+_JUMP_RAD = 0.2  # of a correction that is reported
 
 
 class PublishingClock:
@@ -74,7 +75,7 @@ class PublishingClock:
         """Publish what an update changed, and log large moves of the robot."""
         self._publishers.update(slam, update, is_located=is_located)
         moved, tf = update.correction, slam.config.tf
-        if update.solved and (moved.distance_m > tf.report_jump_m or moved.angle_rad > tf.report_jump_rad):
+        if update.solved and (moved.distance_m > tf.report_jump_m or moved.angle_rad > _JUMP_RAD):
             slam.counters.count("tf", "jump")
             if (left_out := self._corrections.next()) is not None:
                 more = f" ({left_out} more since the last one)" if left_out else ""

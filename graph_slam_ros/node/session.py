@@ -73,7 +73,7 @@ class Session:
                 start.folder = moved
             self._recorder = None
             try:
-                recorder = RunRecorder(self._folder, self.config, self.config.journal.sync_s, start, force=True)
+                recorder = RunRecorder(self._folder, self.config, _SYNC_S, start, force=True)
             except Exception:
                 self.recording_fails = True
                 raise
@@ -390,4 +390,5 @@ class Session:
 
 
 _MOST_UNWRITTEN = 256 * 2**20  # bytes of the journal: hours of a robot's measurements
+_SYNC_S = 1.0  # until the journal is on the disk: what a power cut may lose
 _CONFIRMED = 0.2  # of the noise of the motion over a jump: less, and something was recognised

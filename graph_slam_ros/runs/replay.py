@@ -107,7 +107,7 @@ class RecordedRuns:
     ) -> None:
         self._bag, self._inputs, self._counters, self._columns = bag, inputs, counters, columns
         self._on_jump = config.time.on_jump
-        self._gate = IngestGate(config.time.jump_back_s, counters)
+        self._gate = IngestGate(counters)
         self.counted: list[Counters] = []
         used = [bag.topics[topic] for topic in inputs.topics.values()]
         decoders = {topic.type: recorded_decoder(topic) for topic in used}

@@ -27,6 +27,7 @@ from graph_slam_ros.typing import Array, Executor, Index, Numbers
 
 _MAX_PENDING = 200  # edges that are compared with all that is known at once, at most; reviews look at the others
 _NOISE_ROUNDS = 8  # at most, of estimating the scale of the noise and solving with it
+_REVIEW_EVERY = 20  # keyframes: the newest verdicts are reviewed, and some of the others in turn
 
 
 class Backend:
@@ -153,7 +154,7 @@ class Backend:
         if self.holds_back:
             self.solver.update()
             return
-        is_due = self._config.decide and keyframe - self._reviewed >= self._config.review_every_keyframes
+        is_due = self._config.decide and keyframe - self._reviewed >= _REVIEW_EVERY
         if is_due:
             self._reviewed = keyframe
             self.decisions.review(keyframe)

@@ -31,7 +31,7 @@ from graph_slam_ros.slam.odometry_edges import replace_odometry, restore_odometr
 from graph_slam_ros.slam.robust.landmark_history import LandmarkHistory
 from graph_slam_ros.slam.robust.odometry_errors import OdometryErrors, odometry_errors
 from graph_slam_ros.slam.robust.odometry_filter import OdometryFilter, Stretch
-from graph_slam_ros.slam.robust.odometry_hypotheses import CARRIED, SLIPS, Choice, HypothesisTest, Moved
+from graph_slam_ros.slam.robust.odometry_hypotheses import CARRIED, LOG_ODDS, SLIPS, Choice, HypothesisTest, Moved
 from graph_slam_ros.slam.slip_noise import SlipNoise
 from graph_slam_ros.slam.slip_review import Link, Pair, Slip, View, covariance_of, revoke_slip, slipped_pairs
 from graph_slam_ros.solver import Solver
@@ -234,7 +234,7 @@ class SlipDetector:
         stretch = Stretch([link.edge for link in links], seen, self.noise.of_odometry, self.noise.of_all)
         edges = [edge for of_view in seen.values() for edge, _ in of_view if self._backend.ledger.is_inside(edge)]
         filtered = OdometryFilter(self._space, self._backend.graph, partial(self._without, edges), stretch)
-        compared = HypothesisTest(filtered, self._space, self._config.doubt_odds)
+        compared = HypothesisTest(filtered, self._space)
         firsts = sorted({self._first_of(links, since) for since in _SINCE if since < len(self._views)})
         for kind, (variances, shared) in zip(SLIPS, self._added_noise(links, *SLIPS), strict=True):
             for k in firsts:
@@ -369,7 +369,7 @@ class SlipDetector:
 
     def _replace(self, links: Sequence[Link], slip: Slip, keyframe: int) -> None:
         """Replace odometry edges by edges with more noise."""
-        graph, threshold = self._backend.graph, -2.0 * self._config.log_odds
+        graph, threshold = self._backend.graph, -2.0 * LOG_ODDS
         own = [link.edge for link in links]
         noises = []
         for link in links:

@@ -30,6 +30,7 @@ from graph_slam_ros.slam.calibration.uncorrected import Uncorrected, is_off, sam
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
 from graph_slam_ros.slam.kidnap_detector import KidnapDetector
 from graph_slam_ros.slam.landmarks.landmark_frontend import LandmarkFrontend
+from graph_slam_ros.slam.robust.odometry_hypotheses import LOG_ODDS
 from graph_slam_ros.typing import Array, Executor, Index
 
 FIRST_DUE = 50  # keyframes
@@ -98,11 +99,11 @@ class TrialFits:
                 self._jobs = [*self._jobs[-1:], (counts_from, trial)]  # each holds a copy of the map
 
     def _trial(self, *, is_thorough: bool = True) -> Trial:
-        problem, log_odds = self._problem(), self._config.odometry.log_odds
+        problem = self._problem()
 
         def run() -> Fits | None:
             priors = self._parameters(problem)
-            return fit_with_places(problem, priors, log_odds, is_thorough=is_thorough) if priors else None
+            return fit_with_places(problem, priors, LOG_ODDS, is_thorough=is_thorough) if priors else None
 
         return lambda: self._guarded(run)
 
@@ -115,9 +116,9 @@ class TrialFits:
 
     def fit(self, groups: Sequence[str], *, places: bool, is_to_correct: bool) -> tuple[TrialFit, list[Finding]]:
         """Fit the map as it is now, as of ``GraphSlam.trial_fit``."""
-        problem, log_odds = self._problem(), self._config.odometry.log_odds
+        problem = self._problem()
         wanted = self._parameters(problem, groups, has_gyro=is_to_correct)
-        found = fit_with_places(problem, wanted, log_odds)[0] if places else likelier_fit(problem, wanted, log_odds)
+        found = fit_with_places(problem, wanted, LOG_ODDS)[0] if places else likelier_fit(problem, wanted, LOG_ODDS)
         return found, self._judged(found, is_confirmed=is_to_correct and "factors" not in groups)
 
     def _parameters(

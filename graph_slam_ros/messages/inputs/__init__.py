@@ -141,6 +141,6 @@ def _use(settings: InputConfig) -> str:
     use = next(iter(there)) if settings.use == "auto" else settings.use
     if use not in there:
         raise ConfigError(f"{settings.name}.use: {settings.type} can be {' or '.join(there)}, not {use}")
-    if use == "odometry" and (settings.loss != "auto" or settings.loss_scale):
+    if use == "odometry" and settings.loss != "auto":
         raise ConfigError(f"{settings.name}.loss: {settings.name} is used as odometry, which has no robust loss")
     return use

@@ -1,7 +1,7 @@
 """A gyro beside odometry: between keyframes its turn replaces that of odometry.
 
 Its bias is found while the robot stands. Until then odometry turns alone. The error of the bias is common to all steps,
-so it counts as if it lasted ``gyro.bias_correlation_s``.
+so it counts as if it lasted 10 s.
 
 A gyro that differs from odometry grossly in most of the turns is wrong: in other units, or with another mount. It is
 not used then.
@@ -21,6 +21,8 @@ from graph_slam_ros.slam.frontend.odometry_selector import Step
 from graph_slam_ros.typing import Numbers
 
 _WINDOW_S = 1.0
+_BIAS_WALK = 1e-4  # rad/s/sqrt(s): of a MEMS gyro after its warm-up
+_BIAS_CORRELATION_S = 10.0  # for which an error of the bias counts as one
 _GATE = 0.9999  # of a turn over a second that the gyro measures while wheels stand
 _MEMORY_S = 60.0
 _DOUBTED, _TRUSTED = 0.5, 0.25  # part of the time in turns in which they differ grossly
@@ -197,7 +199,7 @@ class GyroFusion:
     def _age(self, stamp_ns: int) -> None:
         """Let the bias walk until now. It is never known less than that of a gyro that was not used yet."""
         gone_s = (stamp_ns - (stamp_ns if self._newest_ns is None else self._newest_ns)) * 1e-9
-        walked = self._config.bias_walk**2 * gone_s if gone_s >= 0.0 else math.inf  # of another clock
+        walked = _BIAS_WALK**2 * gone_s if gone_s >= 0.0 else math.inf  # of another clock
         self._bias_variance = [min(v + walked, self._config.bias_sigma**2) for v in self._bias_variance]
         self._newest_ns = stamp_ns
 
@@ -228,8 +230,7 @@ class GyroFusion:
         if stands and not by_hand:
             return step
         motion = tuple(map(float, group.exp((*tangent[:n], *measured))))
-        of_bias = self._config.bias_correlation_s
-        density = tuple(v / seconds + b * of_bias for v, b in zip(own, self._bias_variance, strict=True))
+        density = tuple(v / seconds + b * _BIAS_CORRELATION_S for v, b in zip(own, self._bias_variance, strict=True))
         return replace(step, T_last_base=motion, turn_variance=density, slips=by_hand)
 
     def _wrapped(self, angle: float) -> float:

@@ -30,12 +30,14 @@ class Passage:
     measured: Sequence[Measured] = ()
 
 
+JUMP_BACK_S = 0.2  # the clock jumped back; what is older by less is out of order
+
+
 class IngestGate:
     """Decides which measurements pass to the pipeline, and counts the others.
 
     Parameters
     ----------
-    jump_back_s : ``time.jump_back_s``
     counters : where each refused measurement counts, by its input and the reason
     now_ns : the clock, for what was on its way when the clock jumped back; 0 where there is none
 
@@ -45,8 +47,8 @@ class IngestGate:
     is_stopped : whether everything is refused until another run begins: time jumped, and ``time.on_jump`` is stop
     """
 
-    def __init__(self, jump_back_s: float, counters: Counters, now_ns: Callable[[], int] = lambda: 0) -> None:
-        self._detector = TimeJumpDetector(jump_back_s)
+    def __init__(self, counters: Counters, now_ns: Callable[[], int] = lambda: 0) -> None:
+        self._detector = TimeJumpDetector(JUMP_BACK_S)
         self._counters, self._now_ns = counters, now_ns
         self._jumped_ns = 0  # halfway between the clock before its jump and after; 0: it did not jump lately
         self.is_paused = self.is_stopped = False

@@ -45,6 +45,7 @@ from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Executor, Index
 
 _CLOSE_M = 0.5  # objects of one message this close may be one: two poles of a group, or one of them seen twice
+_GATE_SAME = 0.9999  # probability of the chi2 test within which an observation may belong to a landmark
 _REVIEWED_EVERY = 10  # keyframes, some seconds: landmarks are confirmed and given up
 _POSITIONED = ("position", "pose", "range_bearing")
 
@@ -83,13 +84,13 @@ class AnonymousLandmarks:
         extent = max(c.added_sigma_m**2 + c.unnamed_sigma_m**2, LEAST_M2) * np.eye(space.dimensions)
         self._builder = ScanBuilder(space, extent, _CLOSE_M)
         self._settings = BeamSettings(
-            quantile(c.gate_same, space.dimensions),
+            quantile(_GATE_SAME, space.dimensions),
             space.dimensions * float(np.log(c.density_per_m)),
             hypotheses=40,
         )
         self._belief = SolverBelief(space, solver, landmarks)
         self.hindsight = Hindsight(config, self._settings, executor)
-        self.clusters = Assignments(c, landmarks, counters, hand_over)
+        self.clusters = Assignments(landmarks, counters, hand_over)
         self._beam: Beam | None = None
         self._sorts = dict[int, str]()  # of landmarks, whatever beam began them
         self._leader: Decision | None = None

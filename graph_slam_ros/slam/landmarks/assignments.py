@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from graph_slam_ros.config.landmarks import LandmarksConfig
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.types import Sighting
@@ -24,6 +23,7 @@ NAME = "unnamed"
 """What landmarks are called that have no name; a number follows."""
 _CONFIRMED, _CONFIRMED_NS = 5, 2 * 10**9  # sightings, and their time: clutter is seen for less, from one place
 _OF_MEDIAN = 0.1  # part of the scans of the median landmark that one is seen in to be believed
+_GIVE_UP_NS = 60 * 10**9  # a landmark that is not confirmed goes when it was not seen for this long
 _FROM_MAP = -100  # numbers of landmarks that no cluster of this drive began, downwards
 
 
@@ -58,11 +58,9 @@ class Assignments:
     before : of landmarks by number how many clusters there were that have left
     """
 
-    def __init__(
-        self, config: LandmarksConfig, landmarks: Landmarks, counters: Counters, hand_over: Callable[[], None]
-    ) -> None:
+    def __init__(self, landmarks: Landmarks, counters: Counters, hand_over: Callable[[], None]) -> None:
         self._landmarks, self._counters, self._hand_over = landmarks, counters, hand_over
-        self._give_up_ns = round(config.give_up_s * 1e9)
+        self._give_up_ns = _GIVE_UP_NS
         self.given: list[int] = []
         self.names: dict[int, str] = {}
         self.seen: list[tuple[Seen, ...]] = []

@@ -30,6 +30,7 @@ from graph_slam_ros.typing import Array, Executor
 
 _FIRST, _MORE = 100, 2.0  # scans at the first time; then times as many
 _AMBIGUITY_CHI2 = 6.0  # by which every alternative is worse where a stretch is laid on others: likelier by e^3
+_GATE_OTHER = 0.99999  # an observation outside this probability of every landmark is not used
 _LEAST_LANDMARK = 1.0
 _SURE = 0.015  # standard deviation of a scale of odometry below which a part of a drive corrects it
 _SCALE_SIGMA = 0.02  # of odometry's scales, once they were found
@@ -160,8 +161,7 @@ class Hindsight:
 
     def __init__(self, config: Config, settings: BeamSettings, executor: Executor) -> None:
         self._space, self._settings, self._executor = config.space, settings, executor
-        c = config.landmarks
-        unused = quantile(c.gate_other, config.space.dimensions)
+        unused = quantile(_GATE_OTHER, config.space.dimensions)
         self._costs = Costs(max(-2.0 * settings.log_new, _LEAST_LANDMARK), unused, _AMBIGUITY_CHI2)
         self._after = config.robust.apply_after_keyframes
         self._next = _FIRST

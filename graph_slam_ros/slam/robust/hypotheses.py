@@ -24,6 +24,7 @@ from graph_slam_ros.solver import Settings, Solver
 from graph_slam_ros.typing import Array, Index
 
 _ITERATIONS = 20  # of each stage of the losses, from another start
+_ROUNDS = 10  # of a search at most: solve everything, then review all verdicts
 _HOPELESS = 2.0  # times the least cost that was found: another explanation is none
 _SAME = 1e-4  # of a cost, that one explanation may differ by from itself: solves end a little off the optimum
 _NEAR = 1e-3  # m or rad: what two solves of one optimum differ by at most
@@ -246,9 +247,9 @@ class _Search:
         """
         solver, mine, keyframe = self._solver, decisions.ledger, self._frozen.keyframe
         solved = dict[bytes, Array]()  # values by verdicts
-        for k in range(self._config.rounds):
+        for k in range(_ROUNDS):
             solver.optimize()
-            if k + 1 == self._config.rounds or _cost(solver, mine) > hopeless:
+            if k + 1 == _ROUNDS or _cost(solver, mine) > hopeless:
                 return
             solved[mine.inside.tobytes()] = solver.values
             if decisions.reclassify(keyframe):

@@ -18,6 +18,7 @@ from graph_slam_ros.typing import Array, Numbers
 TIGHT, CARRIED = "tight", "carried"
 SLIPS = ("translation", "rotation")
 _LOG_ODDS_MOVED = float(np.log(1e-2))  # of a robot that was moved, relative to one that slipped
+LOG_ODDS = float(np.log(1e-6))  # of a slip within a stretch of odometry, before anything is seen
 _LEAST_FITTING = 0.6  # part of what was seen since then that a slip must explain
 
 
@@ -63,16 +64,10 @@ class Choice:
 
 
 class HypothesisTest:
-    """Compares hypotheses on a stretch of odometry with the one that its noise is as stated.
+    """Compares hypotheses on a stretch of odometry with the one that its noise is as stated."""
 
-    Parameters
-    ----------
-    odds : of a slip, before anything is seen
-    """
-
-    def __init__(self, filtered: OdometryFilter, space: Geometry, odds: float) -> None:
+    def __init__(self, filtered: OdometryFilter, space: Geometry) -> None:
         self._filter, self._space = filtered, space
-        self._log_odds = float(np.log(odds))
         self._none = np.zeros((filtered.size, space.dof))
         self._tight = Errors(self._none, self._none)
         self._best = (0.0, TIGHT, 0, self._tight)
@@ -81,13 +76,13 @@ class HypothesisTest:
     def add_slip(self, kind: str, first: int, variances: Array, shared: Array) -> None:
         """Consider a slip from an edge on, with variances (n, dof) and shared sigmas (n, dof) of all edges."""
         is_part = (np.arange(len(variances)) >= first)[:, None]
-        self._add(kind, first, Errors(variances * is_part, shared * is_part), self._log_odds)
+        self._add(kind, first, Errors(variances * is_part, shared * is_part), LOG_ODDS)
 
     def add_moved(self, first: int, there: Numbers, sigma_m: float, sigma_rad: float) -> None:
         """Consider that the robot was moved across an edge."""
         variances = np.square(self._space.sigmas(sigma_m, sigma_rad))
         errors = Errors(self._none, self._none, first, there, variances)
-        self._add(CARRIED, first, errors, self._log_odds + _LOG_ODDS_MOVED)
+        self._add(CARRIED, first, errors, LOG_ODDS + _LOG_ODDS_MOVED)
 
     def _add(self, kind: str, first: int, errors: Errors, log_odds: float) -> None:
         above = self._best[0] - log_odds + self._likelihood
@@ -99,7 +94,7 @@ class HypothesisTest:
         gain, kind, first, errors = self._best
         if kind not in SLIPS:
             return Choice(kind, first)
-        ratio, voters, is_sure = gain - self._log_odds, list[int | str](), True
+        ratio, voters, is_sure = gain - LOG_ODDS, list[int | str](), True
         for one in self._filter.seen_since(first):
             tight = self._filter.log_likelihood(self._tight, self._filter.size, one)
             without = self._filter.log_likelihood(errors, first, one) - tight

@@ -1,6 +1,5 @@
 """Condensing with landmarks without identities: what leaves is final, and the map is known to what comes after."""
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -124,22 +123,6 @@ def test_a_map_that_is_taken_up_again_goes_on_condensing(world, recorded, tmp_pa
     there, true, nearest = landmarks(more, world)
     assert np.linalg.norm(there - true[nearest], axis=1).max() < 0.5
     assert len(set(nearest.tolist())) == len(nearest)
-
-
-def test_what_is_seen_too_rarely_is_in_no_place_and_its_sightings_are_counted(world):
-    """One sighting in ten is of something that is there only then; it would be given up long after it left."""
-    rng, slam = np.random.default_rng(1), GraphSlam(bounded(landmarks_give_up_s=1e6))
-    for m in drive(world, 0, 600):
-        if isinstance(m, Sightings) and rng.random() < 0.1:
-            where = tuple(rng.uniform(-6.0, 6.0, 2).tolist())
-            m = replace(m, sightings=(*m.sightings, replace(m.sightings[0], measured=where)))
-        slam.process(m)
-    members = {one for several in slam.bounded.places.values() for place in several for one in place.place.members}
-    members = {one for one in members if slam.graph.kind_of(one) is slam.space.point}  # the others are keyframes
-    assert members <= {mark.vertex for mark in slam.landmarks.values() if not mark.is_tentative}
-    assert slam.counters["landmarks", "condensed"] > 5
-    there, true, nearest = landmarks(slam, world)
-    assert np.linalg.norm(there - true[nearest], axis=1).max() < 0.5
 
 
 def test_the_map_is_known_relative_to_a_scan_as_the_solver_knows_it(small):

@@ -199,7 +199,7 @@ def test_A36_a_map_that_cannot_be_loaded_at_the_start_is_an_error_until_another_
 
 
 def test_A37_path_landmarks_and_graph_come_while_messages_wait_and_jumps_are_told_now_and_then():
-    slow = "keyframes.min_distance_m:=0.01", "tf.report_jump_m:=0.0", "tf.report_jump_rad:=0.0"
+    slow = "keyframes.min_distance_m:=0.01", "tf.report_jump_m:=0.0"
     hears = "/diagnostics", "path", "landmarks", "graph", "pose"
     with node("output.folder:=''", "inputs.reliable:=true", *slow) as n, robot(hears=hears) as r:
         r.wait_for_node()

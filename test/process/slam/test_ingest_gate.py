@@ -127,7 +127,7 @@ def counters():
 
 @pytest.fixture
 def gate(counters):
-    return IngestGate(0.2, counters)
+    return IngestGate(counters)
 
 
 def jump_back(gate, on_jump):
@@ -171,7 +171,7 @@ def test_P10_what_is_paused_or_finds_no_room_is_refused_by_its_reason_and_input(
 
 def test_B7_what_was_on_its_way_when_the_clock_jumped_is_known_until_the_clock_is_there(counters):
     clock = itertools.chain([1010 * S], itertools.repeat(1020 * S, 2), itertools.repeat(1100 * S))
-    gate = IngestGate(0.2, counters, lambda: next(clock))
+    gate = IngestGate(counters, lambda: next(clock))
     assert not gate.is_from_before(odometry(60.0)), "it did not jump"
     gate.clock_jumped(-60 * S)
     assert gate.is_from_before(odometry(60.0))

@@ -29,7 +29,7 @@ T0 = 1_700_000_000 * S
 AROUND, KEYFRAMES = 12, 30
 SIGMAS = (0.05, 0.05, 0.02)
 PLACES = {"a": (1.0, 4.0), "b": (-3.0, 2.0), "c": (3.0, 7.0)}
-OFTEN = {"robust.second_look_after": 2, "robust.apply_after_keyframes": 2, "robust.review_every_keyframes": 5}
+OFTEN = {"robust.second_look_after": 2, "robust.apply_after_keyframes": 2}
 
 
 def covariance(*sigmas):

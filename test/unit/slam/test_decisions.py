@@ -128,7 +128,7 @@ def test_a_verdict_tells_why_and_against_what():
 
 def test_G14_what_was_held_back_comes_in_when_the_map_agrees_in_the_end():
     """A fix far away, which nobody believes until all others say the same."""
-    drive = Drive(review_every_keyframes=1).go(60)
+    drive = Drive().go(60)
     moved = se2.compose(drive.true[20], (0.0, 3.0, 0.0))
     graph = drive.backend.graph
     edge = graph.add_edge(POSE_PRIOR, [20], moved, Gaussian.from_sigmas(0.01, 0.01, 0.01), "fixes")
@@ -136,7 +136,7 @@ def test_G14_what_was_held_back_comes_in_when_the_map_agrees_in_the_end():
     assert drive.verdicts([edge]) == {Verdict.PENDING}
     drive.backend.solver.set_weight(0, 0.0)  # the anchor: the whole map is free to follow
     graph.add_edge(POSE_PRIOR, [20], moved, Gaussian.from_sigmas(0.01, 0.01, 0.01), "anchor")
-    drive.go(64)
+    drive.go(84)
     assert drive.verdicts([edge]) == {Verdict.ACCEPTED}
 
 
@@ -265,7 +265,7 @@ def test_a_second_look_decides_the_same_whether_it_is_taken_in_a_thread_or_when_
 
 
 def test_a_search_ends_where_a_candidate_on_trial_does_not_fit_after_all(monkeypatch):
-    drive = Drive(rounds=10).go(60, lambda d, k: d.close(k - 20, k, (0.0, 0.0, 1.5)) if k == 50 else None)
+    drive = Drive().go(60, lambda d, k: d.close(k - 20, k, (0.0, 0.0, 1.5)) if k == 50 else None)
     (wrong,) = drive.false
     solves = []
 
@@ -353,6 +353,6 @@ def test_closures_that_support_one_another_come_in_together(monkeypatch, offsets
     if is_solved:
         drive.solve()
     else:
-        drive.go(92 + Config().robust.review_every_keyframes)
+        drive.go(92 + 20)
     assert drive.verdicts(drive.false) == {Verdict[verdict]}
     assert drive.verdicts(drive.closures) == {Verdict.ACCEPTED}
