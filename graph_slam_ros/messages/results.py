@@ -39,11 +39,7 @@ def path(slam: GraphSlam, most: int = 0) -> bytes:
 def pose(slam: GraphSlam) -> bytes:
     """The newest keyframe's pose and covariance."""
     return to_msg.pose_with_covariance_stamped(
-        slam.keyframes[-1].stamp_ns,
-        slam.config.frames.map,
-        newest_pose(slam),
-        slam.pose_covariance,
-        to_msg.UNUSED,
+        slam.keyframes[-1].stamp_ns, slam.config.frames.map, newest_pose(slam), slam.pose_covariance, to_msg.UNUSED
     )
 
 

@@ -179,10 +179,9 @@ class Ingest:
         return not self._future_stamps.is_ahead([m]) and self.extrapolator.on_odometry(m, self._session.estimate)
 
     def _publish_odometry(self, m: Odometry, cdr: bytes) -> None:
-        estimate, config = self._session.estimate, self._node.config
+        estimate, frames, unused = self._session.estimate, self._node.config.frames, to_msg.UNUSED
         if estimate is None or not estimate.is_located:
             return
-        frames, unused = config.frames, to_msg.UNUSED
         twist = twist_of(cdr, frames.base) if m.source.partition("#")[0] in self._with_twist else None
         pose, covariance = self.extrapolator.pose(estimate)
         self._publishers.odometry(to_msg.odometry(m.stamp_ns, frames.map, frames.base, pose, covariance, unused, twist))

@@ -15,8 +15,7 @@ from graph_slam_ros.slam import GraphSlam, Update
 from graph_slam_ros.slam.frontend.ingest_gate import input_of, size_of
 
 ACKNOWLEDGE = 32  # messages
-_MOST_UNPUBLISHED_S, _AGAIN_S = 4.0, 5.0
-_JUMP_RAD = 0.2  # of a correction that is reported
+_MOST_UNPUBLISHED_S, _AGAIN_S, _JUMP_RAD = 4.0, 5.0, 0.2
 
 
 class PublishingClock:
