@@ -18,21 +18,21 @@ TEST = ROOT / "test"
 # Small, and between them they call every kernel.
 SMALL = [
     "test_lie.py",
-    "test_graph.py",
     "test_solver.py::test_a_report_adds_up",
-    "test_solver.py::test_a_held_vertex_stays_and_is_certain",
-    "test_solver.py::test_where_all_is_held_nothing_is_to_do",
-    "test_solver.py::test_marginals_are_the_blocks_of_the_dense_inverse",
-    "test_solver.py::test_a_joint_marginal_is_the_block_of_the_dense_inverse_in_the_order_asked_for",
-    "test_edges.py",
-    "test_solver.py::test_vectors_are_solved_in_one_step_to_the_weighted_mean",
-    "test_solver.py::test_G1_parts_without_a_link_are_solved_as_if_alone",
     "test_online.py::test_updates_that_fail_many_times_write_nothing_beyond_the_arrays",
-    "test_online.py::test_a_vertex_is_held_at_its_estimate_and_not_where_it_was_linearised",
-    "test_online.py::test_a_removed_vertex_may_be_added_again_and_is_there_once[60-40]",
-    "test_ordering.py::test_the_tree_holds_after_edges_between_old_vertices_and_without_some[0]",
-    "test_ordering.py::test_what_a_separator_separates_is_never_adjacent[drive-200]",
-    "test_dense.py::test_elimination_leaves_the_factor_and_the_schur_complement[37-15-1]",
+    *times(
+        [],
+        [
+            "test_graph.py",
+            "test_edges.py",
+            "test_solver.py::test_where_all_is_held_nothing_is_to_do",
+            "test_solver.py::test_marginals_are_the_blocks_of_the_dense_inverse",
+            "test_solver.py::test_a_joint_marginal_is_the_block_of_the_dense_inverse_in_the_order_asked_for",
+            "test_solver.py::test_G1_parts_without_a_link_are_solved_as_if_alone",
+            "test_online.py::test_a_vertex_is_held_at_its_estimate_and_not_where_it_was_linearised",
+            "test_ordering.py::test_the_tree_holds_after_edges_between_old_vertices_and_without_some",
+        ],
+    ),
 ]
 
 

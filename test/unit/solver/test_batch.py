@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from places import ROOT
+from rows import each
 
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.g2o import read_g2o
@@ -49,7 +50,7 @@ def chain(count=4):
     return graph
 
 
-@pytest.mark.parametrize("init", STARTS)
+@each("init", STARTS)
 def test_graphs_with_next_to_nothing_are_solved_from_any_start(init):
     nothing = optimize(Graph(), init=init)
     assert (nothing.report.stop, nothing.poses.shape, nothing.points.shape) == ("nothing_to_do", (0, 0), (0, 0))
@@ -68,7 +69,7 @@ def without_a_weight(graph):
     table.weight.values[row] = 0.0
 
 
-@pytest.mark.parametrize(
+@each(
     "prior",
     [
         lambda g: None,
@@ -78,9 +79,8 @@ def without_a_weight(graph):
         lambda g: g.add_edge(POSITION_PRIOR, [0], [5, 6], unit(2), "fixes"),
         lambda g: g.add_edge(POINT_PRIOR[R1], [g.add_vertex(R1, [0.0])], [0.0], unit(1), "offset"),
     ],
-    ids=["none", "an empty table", "one of no weight", "a heading", "one position", "an offset of a sensor"],
 )
-@pytest.mark.parametrize("init", STARTS)
+@each("init", STARTS)
 def test_G2_the_first_pose_is_held_where_priors_do_not_fix_position_and_heading(prior, init):
     graph = chain()
     prior(graph)
@@ -90,14 +90,13 @@ def test_G2_the_first_pose_is_held_where_priors_do_not_fix_position_and_heading(
     assert solved.report.converged
 
 
-@pytest.mark.parametrize(
+@each(
     "priors",
     [
         [(POSE_PRIOR, 1, [7, 8, 0.3])],
         [(POSITION_PRIOR, 1, [7, 8]), (HEADING_PRIOR, 3, [0.3])],
         [(POSITION_PRIOR, 0, [7, 8]), (POSITION_PRIOR, 2, [9, 8])],
     ],
-    ids=["a pose", "a position and a heading", "two positions"],
 )
 def test_nothing_is_held_where_priors_fix_the_whole_together(priors):
     graph = chain()
@@ -108,8 +107,8 @@ def test_nothing_is_held_where_priors_fix_the_whole_together(priors):
     assert solved.solver.marginal([0])[0].any()
 
 
-@pytest.mark.parametrize(
-    ("priors", "fixed"),
+@each(
+    "priors, fixed",
     [
         ([(POSITION_PRIOR_3D, k) for k in (0, 1)], False),  # it turns about the line through both
         ([(POSITION_PRIOR_3D, k) for k in (0, 1, 2)], True),
@@ -132,7 +131,7 @@ def test_in_space_too_priors_fix_the_whole_or_do_not(priors, fixed):
     assert solved.solver.marginal([0])[0].any() == fixed
 
 
-@pytest.mark.parametrize("init", STARTS[1:])
+@each("init", STARTS[1:])
 def test_edges_of_no_weight_do_not_say_where_to_start(init):
     graph = Graph()
     graph.add_vertices(SE2, np.zeros((3, 3)))
@@ -149,7 +148,7 @@ def test_edges_of_no_weight_do_not_say_where_to_start(init):
     assert initial_values(graph, init, 0) == pytest.approx(np.array(expected, dtype=float), abs=1e-12)
 
 
-@pytest.mark.parametrize(
+@each(
     "wrong",
     [
         {"max_iterations": -3},

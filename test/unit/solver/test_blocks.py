@@ -7,6 +7,7 @@ import numba
 import numpy as np
 import pytest
 from online import check_pointers, check_tree
+from rows import each
 
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import CAUCHY, HUBER, LANDMARK_POSITION, R2, RELATIVE_POSE, SE2, Gaussian, Graph, Loss
@@ -57,7 +58,7 @@ def test_edges_are_the_same_bytes_compiled_and_one_table_after_the_other():
     assert [bool(table.pointers[LINEARIZE]) for table in slow.graph.tables.values()] == [False, False]
 
 
-@pytest.mark.parametrize("types", [(RELATIVE_POSE, LANDMARK_POSITION), (in_python(RELATIVE_POSE), LANDMARK_POSITION)])
+@each("types", [(RELATIVE_POSE, LANDMARK_POSITION), (in_python(RELATIVE_POSE), LANDMARK_POSITION)])
 def test_an_edge_whose_cost_is_not_finite_is_named_and_the_estimate_stays(types):
     driving = drive(*types, more=1e200)
     with pytest.raises(GraphSlamError, match=r"edge \d+ \(landmark position\) .*not finite"):
@@ -70,7 +71,7 @@ def test_an_edge_whose_cost_is_not_finite_is_named_and_the_estimate_stays(types)
     check_tree(solver)
 
 
-@pytest.mark.parametrize("way", [Graph.copy, lambda graph: pickle.loads(pickle.dumps(graph)), lambda graph: kept_part(
+@each("way", [Graph.copy, lambda graph: pickle.loads(pickle.dumps(graph)), lambda graph: kept_part(
     graph, np.arange(graph.vertex_count), np.arange(graph.edge_count), graph.initial.values)])  # fmt: skip
 def test_a_copy_of_a_graph_is_where_its_own_columns_are(way):
     graph = Graph()

@@ -1,7 +1,7 @@
 """The dense kernels of the fronts against NumPy, at sizes on both sides of every path through them."""
 
 import numpy as np
-import pytest
+from rows import each
 from scipy.linalg import solve_triangular
 
 from graph_slam_ros.solver.clique_tree.dense import WIDE, pack, partial_cholesky, solve_upper
@@ -24,8 +24,8 @@ def off(found, expected):
     return np.abs(found - expected).max(initial=0.0) / np.abs(expected).max(initial=1e-300)
 
 
-@pytest.mark.parametrize("right", [1, 3])
-@pytest.mark.parametrize(("n", "frontal"), SIZES)
+@each("right", [1, 3])
+@each("n, frontal", SIZES)
 def test_elimination_leaves_the_factor_and_the_schur_complement(n, frontal, right):
     a, b, front = random_front(n, right, 7 * n + frontal)
     assert partial_cholesky(front, frontal, np.diag(a).copy()) == NOTHING
@@ -42,7 +42,7 @@ def test_elimination_leaves_the_factor_and_the_schur_complement(n, frontal, righ
     assert np.abs(front[frontal:, frontal:][upper] - rest[upper]).max(initial=0.0) <= bound * scale
 
 
-@pytest.mark.parametrize(("n", "frontal"), SIZES)
+@each("n, frontal", SIZES)
 def test_back_substitution_solves_the_system(n, frontal):
     a, b, front = random_front(n, 1, n + 11 * frontal)
     partial_cholesky(front, frontal, np.diag(a).copy())
@@ -58,8 +58,8 @@ def test_back_substitution_solves_the_system(n, frontal):
     assert off(x[:frontal], expected) <= 1e-13 * max(10.0, np.linalg.cond(a[:frontal, :frontal]))
 
 
-@pytest.mark.parametrize(("n", "frontal"), [(n, f) for n, f in SIZES if f > 1])
-@pytest.mark.parametrize("where", [0.3, 0.999])
+@each("n, frontal", [(n, f) for n, f in SIZES if f > 1])
+@each("where", [0.3, 0.999])
 def test_a_pivot_that_is_lost_is_found_where_it_is(n, frontal, where):
     lost = max(1, int(where * frontal))
     rng = np.random.default_rng(n)
@@ -72,7 +72,7 @@ def test_a_pivot_that_is_lost_is_found_where_it_is(n, frontal, where):
     assert partial_cholesky(front, frontal, scale) == lost
 
 
-@pytest.mark.parametrize("bad", [0.0, -1.0, np.nan])
+@each("bad", [0.0, -1.0, np.nan])
 def test_a_pivot_that_is_no_positive_number_is_refused(bad):
     front = np.hstack([np.diag([1.0, bad, 1.0]), np.zeros((3, 1))])
     assert partial_cholesky(front, 3, np.ones(3)) == 1

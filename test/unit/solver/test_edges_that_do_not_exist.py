@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from rows import each
 
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import R2, Gaussian, Graph
@@ -9,8 +10,8 @@ from graph_slam_ros.graph.edges import DIFFERENCE
 from graph_slam_ros.solver import Solver
 
 
-@pytest.mark.parametrize("edge", [-1, 1, 10**12])
-@pytest.mark.parametrize(
+@each("edge", [-1, 1, 10**12])
+@each(
     "ask",
     [
         lambda solver, ids: solver.chi2_of(ids),

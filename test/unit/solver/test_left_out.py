@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from rows import each
 
 from graph_slam_ros.errors import SingularError
 from graph_slam_ros.graph import (
@@ -80,8 +81,8 @@ def stored(solver, vertices):
     return np.concatenate([solver.values[solver.graph.vertex(vertex).stored] for vertex in vertices])
 
 
-@pytest.mark.parametrize("held", [(), (4,), (2, 7)])
-@pytest.mark.parametrize("seed", [0, 1])
+@each("held", [(), (4,), (2, 7)])
+@each("seed", [0, 1])
 def test_where_all_is_linear_it_is_the_solution_anew(seed, held):
     graph, loop = vectors(np.random.default_rng(seed))
     found, wanted = solved(graph, held=held), [7, 0, 23, 12]
@@ -97,8 +98,8 @@ def test_where_all_is_linear_it_is_the_solution_anew(seed, held):
     assert np.array_equal(covariance, covariance.T)
 
 
-@pytest.mark.parametrize("losses", [{}, {"landmarks": [Loss(HUBER, 1.0)]}])
-@pytest.mark.parametrize("online", [False, True])
+@each("losses", [{}, {"landmarks": [Loss(HUBER, 1.0)]}])
+@each("online", [False, True])
 def test_it_is_the_dense_inverse_without_what_the_edges_say(losses, online):
     graph, poses, marks, seen = drive(np.random.default_rng(3))
     solver = solved(graph, losses=losses)
@@ -134,15 +135,6 @@ def test_a_held_vertex_is_certain_and_stays():
     values, covariance = solver.joint_marginal_without(marks[:2], seen)
     assert np.array_equal(values, stored(solver, marks[:2]))
     assert not covariance.any()
-
-
-def test_without_any_edge_it_is_the_joint_marginal():
-    graph, poses, marks, _ = drive(np.random.default_rng(2))
-    solver = solved(graph)
-    wanted = [poses[3], marks[2], poses[20]]
-    values, covariance = solver.joint_marginal_without(wanted, [])
-    assert values == pytest.approx(stored(solver, wanted), abs=1e-12)
-    assert covariance == pytest.approx(solver.joint_marginal(wanted), rel=1e-9, abs=1e-15)
 
 
 def test_what_only_these_edges_determine_is_refused_and_nothing_has_changed():

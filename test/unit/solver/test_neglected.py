@@ -72,10 +72,3 @@ def test_thresholds_are_tightened_at_the_second_check_and_loosened_again():
     for _ in range(3):
         schedule.learn(neglected=0.01, chi2=100.0, edges=4000)
     assert schedule.tightness == 1.0
-
-
-def test_what_is_neglected_of_nothing_is_no_reason():
-    schedule = RelinearizationSchedule()
-    for edges in (1000, 2000, 4000):
-        schedule.learn(neglected=1e-9, chi2=0.0, edges=edges)
-    assert schedule.tightness == 1.0
