@@ -46,7 +46,6 @@ REASONS = {
     Reason.REVOKED: "revoked",
     Reason.BY_HAND: "by hand",
     Reason.SLIP: "slip",
-    Reason.MOVED: "landmark moved",
 }
 _KIND = {
     "closures": "a loop closure",
@@ -85,7 +84,6 @@ def explain_run(run: SavedGraph) -> Iterator[str]:
     yield from _gates(judged, run.changes, run.config)
     yield from (f"by hand: {one.text}" for one in run.edits)
     yield from _rivals(run.folder)
-    yield from summary_of(run.folder).get("landmark_events", ())
     yield from (one["text"] for one in summary_of(run.folder).get("displacements", ()) if "text" in one)
 
 
@@ -187,8 +185,6 @@ def _landmark(run: SavedGraph, name: str) -> Iterator[str]:
         yield from landmark_lines(run.folder, name, seen)
     if left:
         yield f"landmark {name}: {len(left)} edges are not in the map any more: {became(left)}"
-    events = summary_of(run.folder).get("landmark_events", ())
-    yield from (one for one in events if one.startswith(f"landmark {name} ") or f" old place is {name}" in f"{one} ")
 
 
 def landmark_lines(folder: Path, name: str, seen: Sequence[Entry]) -> Iterator[str]:
@@ -293,8 +289,6 @@ def _decided(e: Entry, history: Sequence[VerdictChange], config: Config) -> str:
             return "not by its chi2: several solves in a row failed with it, and succeeded without it"
         case Reason.BY_HAND:
             return "not by its chi2: a user decided it by hand"
-        case Reason.MOVED:
-            return f"its landmark had moved: passes showed it elsewhere, where a new landmark begins; {numbers}"
         case Reason.DISPLACED:
             return (
                 f"{e.statistic:.0f} sightings more agreed on another pose of the robot than on this motion: it was"

@@ -50,6 +50,7 @@ REMOVED = {
     "landmarks.follow_s": "observations without identity are compared with all landmarks around",
     "landmarks.size_sigma_m": "sizes are not compared; give things of other sizes another class",
     "landmarks.range_offset_sigma_m": "graph_slam calibrate finds INPUT.range_offset_m",
+    "landmarks.retire": "remove what is gone: ~/remove, or graph_slam map edit RUN with remove_landmark",
     "gyro.gate": "the gyro's turn replaces that of odometry",
     **{
         f"calibrate.{name}": "graph_slam calibrate BAG prints the settings that correct clocks, mounts and scales"

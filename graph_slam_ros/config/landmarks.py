@@ -39,11 +39,6 @@ class LandmarksConfig:
         "1/m",
         low=1e-4,
     )
-    retire: bool = setting(
-        False,
-        "a landmark that is not seen any more from where it was seen before is retired; one that is seen elsewhere has "
-        "moved: its new place is a new landmark",
-    )
     surveyed: str = setting(
         "",
         "landmarks with known positions in the map: a header id,x,y,sigma or id,x,y,z,sigma, then a line for each;"

@@ -6,7 +6,6 @@ from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.maps.alignment import Alignment, align, positions
 from graph_slam_ros.runs.whole_path import WholePath
 from graph_slam_ros.slam import GraphSlam
-from graph_slam_ros.slam.landmarks.lifetimes import has_identity
 
 _ABSOLUTE = ("fixes", "surveyed")  # in the axes of map
 _SAME = 1e-6  # of chi2
@@ -22,7 +21,7 @@ def refuse_other_space(one: GraphSlam, two: GraphSlam, a: Path, b: Path) -> None
 
 def shared_landmarks(one: GraphSlam, two: GraphSlam) -> list[str]:
     """The landmarks with the same id in both, but for old places of those that moved."""
-    named = [{name for name, mark in slam.landmarks.items() if has_identity(mark)} for slam in (one, two)]
+    named = [{name for name, mark in slam.landmarks.items() if not mark.is_unnamed} for slam in (one, two)]
     return [name for name in one.landmarks if name in named[0] & named[1]]
 
 

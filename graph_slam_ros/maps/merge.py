@@ -29,7 +29,6 @@ from graph_slam_ros.slam.alarm import Alarm
 from graph_slam_ros.slam.edits import HAND_MADE
 from graph_slam_ros.slam.frontend.odometry_jumps import JUMP_SIGMA_M, JUMP_SIGMA_RAD
 from graph_slam_ros.slam.landmarks.assignments import NAME, last_number
-from graph_slam_ros.slam.landmarks.lifetimes import OLD, name_of_old
 from graph_slam_ros.slam.robust.landmark_support import landmark_of
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict
 from graph_slam_ros.slam.snapshot import MapSnapshot
@@ -194,19 +193,13 @@ class _Second:
         known = self._one.touched_landmarks(0)
         number = last_number({*known, *landmarks})
         for name, fields in landmarks.items():
-            vertex, is_unnamed, is_tentative, sightings, first_ns, last_ns, *rest = fields
-            retired_ns, features = rest[0] if rest else 0, rest[1:]
+            vertex, is_unnamed, is_tentative, sightings, first_ns, last_ns, *features = fields
             if name in self._shared:
                 mark = self._one.landmarks[name]
                 sightings += mark.sightings
                 first_ns, last_ns = min(first_ns, mark.first_seen_ns), max(last_ns, mark.last_seen_ns)
-                retired_ns = max(retired_ns, mark.retired_ns)
-            elif name in known and retired_ns and not is_unnamed:
-                name = name_of_old(name.partition(OLD)[0], {*known, *landmarks, *out})
             elif name in known:
                 number += 1
                 name = f"{NAME}{number}"
-            retired_ns *= retired_ns >= last_ns  # it was seen since
-            of_it = [is_unnamed, is_tentative, sightings, first_ns, last_ns]
-            out[name] = [self._vertex[vertex], *of_it, *[retired_ns] * bool(retired_ns or features), *features]
+            out[name] = [self._vertex[vertex], is_unnamed, is_tentative, sightings, first_ns, last_ns, *features]
         return out

@@ -233,20 +233,6 @@ REASONS: dict[str, Reason] = {
     ),
     "reassigned": Reason(_NOTED, "what was seen without identity turned out to be of another landmark"),
     "given_up": Reason(_NOTED, "a new unnamed landmark was not seen again within a minute"),
-    # -- landmarks.retire
-    "retired": Reason(_NOTED, "a landmark was not seen any more from where it was seen before: it is retired"),
-    "moved": Reason(_NOTED, "a landmark was seen elsewhere, and not where it stood: its new place is a new landmark"),
-    "returned": Reason(_NOTED, "a retired landmark was seen again where it stood"),
-    "missing": Reason(
-        _NOTED,
-        "a landmark that is surveyed or held is not seen any more from where it was seen before: it stays",
-        "remove its line from landmarks.surveyed, or from a frozen map by the edit remove_landmark",
-    ),
-    "elsewhere": Reason(
-        _NOTED,
-        "a landmark that is surveyed or held is seen elsewhere, and not where it stands in the map: it stays there",
-        "correct its line in landmarks.surveyed, or remove it from a frozen map by the edit remove_landmark",
-    ),
     # -- fixes
     "no_fix": Reason(_REFUSED, "the receiver has no fix", "wait for one: a clear view of the sky"),
     "no_position": Reason(_REFUSED, "latitude and longitude are zero", "wait for a fix"),

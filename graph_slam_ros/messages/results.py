@@ -60,18 +60,17 @@ def landmarks(slam: GraphSlam, estimates: Sequence[Estimate] | None = None) -> b
     known = landmark_estimates(slam) if estimates is None else estimates
     positions = np.array([value[:n] for _, value, _ in known]).reshape(-1, n)
     spreads = [covariance[:n, :n] for _, _, covariance in known]
-    names = [f"{name} (retired)" if slam.landmarks[name].retired_ns else name for name, _, _ in known]
+    names = [name for name, _, _ in known]
     return markers.landmark_markers(_stamp_ns(slam), slam.config.frames.map, names, positions, spreads)
 
 
 def landmarks_estimate(slam: GraphSlam, estimates: Sequence[Estimate] | None = None) -> bytes:
-    """Landmarks with identity, pose and covariance in the map's axes, without retired ones; all, or some estimates.
+    """Landmarks with identity, pose and covariance in the map's axes; all, or some estimates.
 
     What a point does not have, in the plane also height, roll and pitch, is zero with the variance ``to_msg.UNKNOWN``;
     so is all of a covariance that is unknown.
     """
     known = landmark_estimates(slam) if estimates is None else estimates
-    known = [one for one in known if not slam.landmarks[one[0]].retired_ns]
     space, unused = slam.space, to_msg.UNKNOWN
     poses, covariances = np.empty((len(known), 7)), np.empty((len(known), 36))
     for k, (_, value, covariance) in enumerate(known):

@@ -47,9 +47,6 @@ def of_update(slam: GraphSlam, update: Update) -> Iterator[Status]:
     for found in update.calibrated:
         value, sigma, source = f"{found.value:.6g}", f"{found.sigma:.3g}", found.parameter.source
         yield happened("calibration", f"corrected {found.text}", value=value, sigma=sigma, source=source)
-    for event in update.landmarks:
-        level = OK if event.what == "returned" else WARN
-        yield happened("landmark", str(event), level, change=event.what, landmark=event.name, passes=event.passes)
     for alarm in update.alarms:
         yield _alarm(alarm)
     if update.solved and update.correction.distance_m + update.correction.angle_rad > 0.0:

@@ -6,8 +6,6 @@ from typing import Any
 import numpy as np
 
 from graph_slam_ros.graph.vertices import GROUPS
-from graph_slam_ros.slam.landmarks.lifetimes import ALL_VOID
-from graph_slam_ros.slam.landmarks.presence import Presence
 from graph_slam_ros.slam.snapshot import MapSnapshot
 
 
@@ -34,14 +32,11 @@ def fault_of(state: MapSnapshot) -> str:
     for name, mark in state.landmarks.items():
         if not all(map(is_index, (mark.vertex, mark.sightings), (len(kinds), 2**31))):
             return f"landmark {name} is not valid"
-        if not all(is_index(ns, 2**63) for ns in (mark.first_seen_ns, mark.last_seen_ns, mark.retired_ns)):
+        if not all(is_index(ns, 2**63) for ns in (mark.first_seen_ns, mark.last_seen_ns)):
             return f"a stamp of landmark {name} is not valid"
         is_sized = is_index(mark.sized, 2**31) and are_numbers((mark.size,)) and mark.size >= 0.0
         if not (isinstance(mark.sort, str) and is_sized):
             return f"the class or size of landmark {name} is not valid"
-    for k, record in enumerate(state.passes):
-        if record != [ALL_VOID] and not (is_index(record[0], len(kinds)) and Presence.is_record(record[1:])):
-            return f"record {k} of the passes of landmarks is not valid"
     if not all(is_index(one, state.keyframe_count) for one in (*state.segments, *state.drives)):
         return "a segment or a drive begins where no keyframe is"
     if not (state.used_ns is None or is_index(state.used_ns, 2**63)) or not isinstance(state.source, str):

@@ -92,7 +92,6 @@ def grow(state: MapSnapshot, records: Sequence[Growth]) -> None:
     state.segments += of_all("segments")
     state.drives += of_all("drives")
     state.sighting_poses += [SightingPose(k, stamp, tuple(pose)) for k, stamp, pose in of_all("sightings")]
-    state.passes += of_all("passes")
     state.edits += map(applied_edit, of_all("edits"))
     for record in records:
         _know(state, record)

@@ -10,9 +10,8 @@ JSON records in mcap, as in the journal. The first is ``map`` with the version o
 * ``keyframes``: vertex, stamp, ``T_odom_base``; ``segments``: keyframes at which odometry began; ``drives``:
   the first keyframe of each drive; ``sightings``: keyframe, stamp, ``T_keyframe_base``;
 * ``landmarks``: by name, vertex, whether without identity, whether tentative, number of sightings, first and last
-  stamp, and where it is retired since when, where it has a class or size these two and how many sightings have a
-  size, or null where it was given up; ``seen``: of those without identity, each
-  sighting and its edge; ``passes``: by vertex, what is known of when a landmark is seen (``Presence.record``);
+  stamp, and where it has a class or size these two and how many sightings have a size, or null where it was given up;
+  ``seen``: of those without identity, each sighting and its edge;
 * ``datum``: latitude, longitude and height that fixes are from; ``settings``: parameters that were changed on the way;
   ``displacements``: all alarms by then, of all drives, as in ``run.json``;
 * ``processed``: records of the ingest sequence that all of it came of; ``used``: stamp and input of the last odometry
@@ -86,7 +85,7 @@ class MapGrowth:
     def _begin(self) -> None:
         self._vertices = self._edges = self._judged = self._changes = 0
         self._keyframes = self._segments = self._sightings = self._landmarks = 0
-        self._edits = self._frozen = self._drives = self._rescaled = self._passes = 0
+        self._edits = self._frozen = self._drives = self._rescaled = 0
         self._noise: dict[Key, float] = {}
         self._calibration: Totals = {}
         self._recalibrated = 0
@@ -153,7 +152,6 @@ class MapGrowth:
         changed = a.recalibrations[self._recalibrated :] if first_edge else ()
         out["recalibrated"] = [one.present(graph).as_record() for one in changed]  # rescaled since, perhaps
         self._recalibrated = len(a.recalibrations)
-        out["passes"], self._passes = a.landmark_passes(self._passes), a.pass_changes
         out["edits"] = [one.record for one in a.edits[self._edits :]]
         if a.datum != self._datum:
             out["datum"] = self._datum = a.datum
@@ -296,9 +294,8 @@ def _as_json(number: float) -> float | str:
 def _landmark(mark: Landmark) -> list[Any]:
     stamps = mark.first_seen_ns, mark.last_seen_ns
     has_features = bool(mark.sort or mark.sized)
-    retired = [mark.retired_ns] * bool(mark.retired_ns or has_features)
     features = [mark.sort, mark.size, mark.sized] * has_features
-    return [mark.vertex, mark.is_unnamed, mark.is_tentative, mark.sightings, *stamps, *retired, *features]
+    return [mark.vertex, mark.is_unnamed, mark.is_tentative, mark.sightings, *stamps, *features]
 
 
 def _newer(seen: Sequence[LandmarkEdge], first_edge: int) -> Iterable[LandmarkEdge]:

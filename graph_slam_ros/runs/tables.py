@@ -87,7 +87,6 @@ def summarize(slam: GraphSlam, earlier: Counters | None = None) -> dict[str, Any
             "keyframes": len(slam.keyframes),
             "landmarks": len(slam.landmarks),
             "waiting": slam.waiting,
-            **({"landmark_events": events} if (events := list(map(str, slam.landmark_events))) else {}),
             "segments": len(slam.segments),
             "drives": _drives(slam),
             "sightings": sum(landmark.sightings for landmark in slam.landmarks.values()),
@@ -293,8 +292,6 @@ def _covariance_table(slam: GraphSlam, before_ns: Sequence[int]) -> str:
 def _landmark_table(slam: GraphSlam) -> str:
     space = slam.config.space
     rows = [f"id,kind,{_POSE[space.dof]},sightings,{','.join(f'cov_{a}{b}' for a, b in _upper(_TANGENT[space.dof]))}"]
-    has_retired = any(mark.retired_ns for mark in slam.landmarks.values())
-    rows[0] += ",retired_ns" * has_retired
     has_features = any(mark.sort or mark.sized for mark in slam.landmarks.values())
     rows[0] += ",class,size" * has_features
     for name, value, covariance in results.landmark_estimates(slam):
@@ -302,9 +299,8 @@ def _landmark_table(slam: GraphSlam) -> str:
         at = [*map(repr, value), *[""] * (space.pose.size - len(value))]
         spread = [f"{covariance[i, j]:.9e}" if j < len(covariance) else "" for i, j in _upper(range(space.dof))]
         mark = slam.landmarks[name]
-        retired = [str(mark.retired_ns or "")] * has_retired
         features = [_csv(mark.sort), repr(mark.size) if mark.sized else ""] if has_features else []
-        rows.append(",".join([_csv(name), kind, *at, str(mark.sightings), *spread, *retired, *features]))
+        rows.append(",".join([_csv(name), kind, *at, str(mark.sightings), *spread, *features]))
     return "\n".join(rows) + "\n"
 
 

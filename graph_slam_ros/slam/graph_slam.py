@@ -41,7 +41,6 @@ from graph_slam_ros.slam.landmarks.landmark_frontend import LandmarkFrontend
 from graph_slam_ros.slam.map_view import MapView
 from graph_slam_ros.slam.motion_only import MotionOnly
 from graph_slam_ros.slam.robust.background import Executor, run_when_asked
-from graph_slam_ros.slam.robust.ledger import Reason
 from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.slam.solution import Solution, Solved
 from graph_slam_ros.slam.trial_fits import TrialFits
@@ -76,9 +75,8 @@ class GraphSlam(MapView):
         config, self.counters = config or Config(), (counters := Counters())
         backend = Backend(config.robust, config.solver_settings(), executor, start, counters)
         landmarks = LandmarkFrontend(
-            *(config, backend.noise, backend.solver, counters, backend.ledger),
+            *(config, backend.noise, backend.solver, counters),
             withdraw=lambda edges: backend.withdraw(edges, len(self.keyframes) - 1),
-            set_aside=lambda edges: backend.withdraw(edges, len(self.keyframes) - 1, Reason.MOVED),
             hand_over=backend.hand_over,
             trusts_sightings=lambda: backend.trusts_sightings,
             executor=executor,
@@ -283,7 +281,7 @@ class GraphSlam(MapView):
             raise GraphSlamError(f"the map is not in {self.space.dimensions} dimensions")
         self._frontend.restore(*start.path, start.continues_with, start.gyro_bias, start.first_keyframe)
         self._anchor.restore()
-        self._landmarks.restore(start.landmarks, start.passes)
+        self._landmarks.restore(start.landmarks)
         report = self.backend.restore(start.vertices, start.values, start.held if self.config.map.localize else (0, 0))
         self._solution.restore(report, self.keyframes[-1], len(self.keyframes))
         (self._frontend.covariance,) = self.solver.marginal([self.keyframes[-1].vertex])

@@ -299,7 +299,7 @@ class MapEditor:
         fixed, compose = anchors(graph, ledger), self._space.group.compose
         values = moved_values(graph, state.values, T_new_old, self._space)
         self._refuse_located(values, {*fixed, *poses}, T_new_old)
-        state.values, state.passes = values, []  # from where landmarks are seen is known in the old axes
+        state.values = values
         self._withdraw(fixed)
         noise = Gaussian.from_sigmas(*self._space.sigmas(a["sigma_m"] or TIGHT, a["sigma_rad"] or TIGHT))
         self._add(self._space.pose_prior, [vertex], self._value(vertex), noise)

@@ -22,7 +22,6 @@ from graph_slam_ros.slam.frontend.noise_factors import Key, Rescaling
 from graph_slam_ros.slam.kidnap_detector import KidnapDetector
 from graph_slam_ros.slam.landmarks.landmark import Landmark
 from graph_slam_ros.slam.landmarks.landmark_frontend import LandmarkFrontend
-from graph_slam_ros.slam.landmarks.lifetimes import LandmarkEvent
 from graph_slam_ros.slam.landmarks.renewed_ids import LEAST, RenewedIds, renewed_ids
 from graph_slam_ros.slam.noise_scale import NoiseScale
 from graph_slam_ros.slam.path_view import PathView
@@ -220,20 +219,6 @@ class MapView(PathView):
     def landmark_changes(self) -> int:
         """The number of changes of landmarks."""
         return self._landmarks.map.touched_before + len(self._landmarks.map.touched)
-
-    @property
-    def landmark_events(self) -> Sequence[LandmarkEvent]:
-        """The events of landmarks, in order: which were retired, moved or returned."""
-        return self._landmarks.lifetimes.events
-
-    def landmark_passes(self, first: int) -> list[list[Any]]:
-        """The records of when landmarks are seen, after the first so many changes; after none of all landmarks."""
-        return self._landmarks.lifetimes.records(first)
-
-    @property
-    def pass_changes(self) -> int:
-        """The number of these changes."""
-        return self._landmarks.lifetimes.changes
 
     # -- covariances -----------------------------------------------------------------------------------------------
 

@@ -24,7 +24,6 @@ class MapSnapshot:
     Attributes
     ----------
     values : stored numbers of all vertices, as ``Graph.initial``: where solving begins
-    passes : by landmark's vertex, what is known of when it is seen, as ``Presence.record``
     frozen : the first so many vertices stay there, and verdicts on what is between them as they are
     held : so many vertices and edges were held when localization began (``map.localize``); zeros where the map grows
     datum : of fixes on earth, as in ``Fix``
@@ -51,7 +50,6 @@ class MapSnapshot:
     drives: list[int] = field(default_factory=list)
     sighting_poses: list[SightingPose] = field(default_factory=list)
     landmarks: dict[str, Landmark] = field(default_factory=dict)
-    passes: list[list[Any]] = field(default_factory=list)
     frozen: int = 0
     held: tuple[int, int] = (0, 0)
     datum: tuple[float, ...] = ()
@@ -126,15 +124,6 @@ class MapSnapshot:
     def touched_landmarks(self, first: int) -> dict[str, Landmark | None]:
         """All of them, but for the first so many."""
         return dict(list(self.landmarks.items())[first:])
-
-    def landmark_passes(self, first: int) -> list[list[Any]]:
-        """The records of when landmarks are seen, but for the first so many."""
-        return self.passes[first:]
-
-    @property
-    def pass_changes(self) -> int:
-        """The number of these records."""
-        return len(self.passes)
 
     @property
     def landmark_changes(self) -> int:

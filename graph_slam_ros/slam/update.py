@@ -6,7 +6,6 @@ from graph_slam_ros.measurements.types import Measurement, Odometry
 from graph_slam_ros.slam.alarm import Alarm
 from graph_slam_ros.slam.bounded_map import BoundedMap, Condensation
 from graph_slam_ros.slam.calibration.decision import Finding
-from graph_slam_ros.slam.landmarks.lifetimes import LandmarkEvent
 from graph_slam_ros.slam.map_view import MapView
 from graph_slam_ros.slam.motion_only import MotionOnly
 from graph_slam_ros.slam.robust.ledger import VerdictChange
@@ -30,7 +29,6 @@ class Update:
     correction : of the last solve
     changes : of verdicts, since the last update that told any
     calibrated : factors of odometry that the association found
-    landmarks : what happened to them: which were retired, moved or returned
     alarms : that began, were decided or ended since then: the landmarks contradict odometry
     condensed : what left the map before anything else, when all that stays got new ids
     """
@@ -43,7 +41,6 @@ class Update:
     changes: tuple[VerdictChange, ...] = ()
     alarms: tuple[Alarm | Slip, ...] = ()
     calibrated: tuple[Finding, ...] = ()
-    landmarks: tuple[LandmarkEvent, ...] = ()
     condensed: Condensation | None = None
 
     def __bool__(self) -> bool:
@@ -82,7 +79,6 @@ class UpdateLog:
         self._report: Report | None = None
         self._changes = len(view.ledger.history)  # of verdicts, that updates have reported
         self._alarms, self._corrections = view.alarms, len(view.corrected)
-        self._landmarks = len(view.landmark_events)
         self._condensed: Condensation | None = None
 
     def begin(self, m: Measurement) -> bool:
@@ -120,13 +116,8 @@ class UpdateLog:
             changes,
             tuple(one for one in self._alarms if _state(one) not in known),
             self._new_corrections(),
-            self._new_landmark_events(),
             self._condensed,
         )
-
-    def _new_landmark_events(self) -> tuple[LandmarkEvent, ...]:
-        first, self._landmarks = self._landmarks, len(self._view.landmark_events)
-        return tuple(self._view.landmark_events[first:])
 
     def _new_corrections(self) -> tuple[Finding, ...]:
         first, self._corrections = self._corrections, len(self._view.corrected)

@@ -31,7 +31,6 @@ class Landmark:
     ----------
     is_unnamed : whether no sighting of it tells which it is
     is_tentative : whether it is too new to be believed: it may be given up
-    retired_ns : stamp since which it is known to be gone; 0 where it is there
     sort : its class, by its sightings; empty where none has one
     size : the mean of the sizes of its sightings [m]; zero where none has one
     sized : sightings with a size
@@ -46,7 +45,6 @@ class Landmark:
     sightings: int = 0
     first_seen_ns: int = 0
     last_seen_ns: int = 0
-    retired_ns: int = 0
     sort: str = ""
     size: float = 0.0
     sized: int = 0

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.measurements.counters import Counters
@@ -18,7 +17,6 @@ from graph_slam_ros.slam.landmarks.anonymous import AnonymousLandmarks
 from graph_slam_ros.slam.landmarks.assignments import Assigned
 from graph_slam_ros.slam.landmarks.landmark import Landmark
 from graph_slam_ros.slam.landmarks.landmark_map import Landmarks
-from graph_slam_ros.slam.landmarks.lifetimes import Lifetimes, Verdicts
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Executor, Index
 
@@ -73,18 +71,15 @@ class LandmarkFrontend:
     Parameters
     ----------
     edges : adds edges to the graph
-    verdicts : on all edges
     withdraw : takes edges out for good
     hand_over : gives the solver what is new in the graph
     trusts_sightings : whether new landmarks may begin: not so while an alarm cannot be decided
-    set_aside : takes edges out for good, since their landmark has moved
     executor : begins work in the background
 
     Attributes
     ----------
     map : the landmarks
     anonymous : the association of those without identity
-    lifetimes : decides which landmarks are gone
     """
 
     def __init__(
@@ -93,37 +88,27 @@ class LandmarkFrontend:
         edges: NoiseScales,
         solver: Solver,
         counters: Counters,
-        verdicts: Verdicts,
         *,
         withdraw: Callable[[Sequence[int]], None],
         hand_over: Callable[[], None],
         trusts_sightings: Callable[[], bool],
-        set_aside: Callable[[Sequence[int]], None],
         executor: Executor,
     ) -> None:
         self._config, self._space, self._counters = config.landmarks, config.space, counters
         self.map = Landmarks(config, edges, solver, counters, withdraw)
         self.anonymous = AnonymousLandmarks(config, self.map, solver, counters, hand_over, executor)
-        self.lifetimes = Lifetimes(
-            *(config.space, self.map, solver, verdicts, counters),
-            survey=config.survey if config.landmarks.retire else None,
-            set_aside=set_aside,
-            on_retired=self.anonymous.forget_belief,
-        )
         self._gates = GateChain[NamedSightings](
             (HeldMapGate(self.map), AlarmGate(self.map, trusts_sightings)), lambda m: len(m.named), counters
         )
 
-    def restore(self, landmarks: dict[str, Landmark], passes: Sequence[list[Any]]) -> None:
+    def restore(self, landmarks: dict[str, Landmark]) -> None:
         """Continue with the landmarks of a map."""
         self.map.restore(landmarks)
-        self.lifetimes.restore(passes)
         self.anonymous.restore()
 
     def forget_before(self, keyframe: int, vertices: Index, edges: Index) -> None:
         """Take over new ids, by old ones, after the keyframes before a number have left; -1: it was removed."""
         self.map.renumber(vertices, edges)
-        self.lifetimes.renumber(vertices, edges)
         self.anonymous.forget_before(keyframe, vertices)
 
     def identified(self, m: Sightings, where: PoseAtStamp) -> list[Assigned]:
@@ -147,7 +132,6 @@ class LandmarkFrontend:
     def forget_where(self) -> None:
         """Forget what depends on the axes of the map, because it has moved."""
         self.anonymous.forget_belief()
-        self.lifetimes.forget()
 
     def end_scan(self) -> list[Assigned]:
         """End the scan. Returns its sightings that can be used."""
@@ -167,13 +151,12 @@ class LandmarkFrontend:
         return out
 
     def review(self, keyframes: StampedPoses[Keyframe], *, everything: bool, alarmed: bool) -> None:
-        """Review the landmarks: which are gone, and those without id. The next solve includes the changes.
+        """Review the landmarks without id. The next solve includes the changes.
 
         Parameters
         ----------
         alarmed : whether landmarks have said that the robot is elsewhere
         """
-        self.lifetimes.review(keyframes)
         if self.is_anonymous and everything:
             self.anonymous.explain_all(keyframes, alarmed=alarmed)
         elif self.is_anonymous:

@@ -265,8 +265,8 @@ class Landmarks:
         return {landmark.vertex: name for name, landmark in self.known.items()}
 
     def is_there(self, name: str) -> bool:
-        """Return whether a landmark is in the graph, and not retired."""
-        return name in self.known and not self.known[name].retired_ns
+        """Return whether a landmark is in the graph."""
+        return name in self.known
 
     def positions(self, vertices: Sequence[int]) -> Array:
         """Positions (k, n) of landmarks in map."""

@@ -36,12 +36,11 @@ class Reason(IntEnum):
     REVOKED = 7  # what replaced a displaced or slipped edge of odometry, which is used again
     BY_HAND = 9  # somebody decided so: taken out for good, or in and never judged
     SLIP = 11  # odometry, where its errors were larger than it says: an edge with more noise stands in its place
-    MOVED = 12  # a sighting of a landmark at a place to which it had moved: that is another landmark since then
 
 
 FINAL = (  # it is out for good
     *(Reason.WITHDRAWN, Reason.QUARANTINED, Reason.DISPLACED, Reason.REVOKED, Reason.BY_HAND),
-    *(Reason.SLIP, Reason.MOVED),
+    Reason.SLIP,
 )
 INSIDE = (Verdict.ACCEPTED, Verdict.DOWN_WEIGHTED)
 _ACCEPTED, _DOWN_WEIGHTED = _INSIDE = tuple(map(int, INSIDE))  # comparing with members of an enumeration is slow
