@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from rows import each
 
 from graph_slam_ros import graph as g
 from graph_slam_ros.errors import GraphSlamError
@@ -41,12 +42,12 @@ DRAWN = {
 }
 
 
-@pytest.mark.parametrize("edge", DRAWN, ids=lambda edge: edge.name)
+@each("edge", DRAWN)
 def test_an_edge_type_is_what_the_solver_takes_it_for(edge):
     g.check_edge(edge, DRAWN[edge], tolerance=3e-7)
 
 
-@pytest.mark.parametrize("edge", [edge for edge in DRAWN if edge.tail], ids=lambda edge: edge.name)
+@each("edge", [edge for edge in DRAWN if edge.tail])
 def test_so_it_is_with_a_sensor_anywhere_on_the_robot(edge):
     def draw(rng):
         size = len(edge.tail)
@@ -67,9 +68,20 @@ UP = (*so3.exp((0.0, 0.0, np.pi / 2)),)  # a quarter turn to the left
 NOSE_UP = (*so3.exp((0.0, -np.pi / 4, 0.0)),)
 
 
-@pytest.mark.parametrize(
-    ("edge", "values", "measured", "expected"),
+@each(
+    "edge, values, measured, expected",
     [
+        # from (1, 2) facing north, (2, 5) lies 3 ahead and 1 to the right; (0.5, -0.5) is turned back by 0.3
+        (
+            g.RELATIVE_POSE,
+            ([1, 2, np.pi / 2], [2, 5, np.pi / 2 + 0.5]),
+            [2.5, -0.5, 0.3],
+            [0.5 * (np.cos(0.3) - np.sin(0.3)), -0.5 * (np.cos(0.3) + np.sin(0.3)), 0.2],
+        ),
+        (g.LANDMARK_POSITION, ([1, 2, np.pi / 2], [-1, 5]), [2.9, 2.2], [0.1, -0.2]),
+        (g.TAG_POSITION, ([1, 2, np.pi / 2], [-1, 5, 2.2]), [2.9, 2.2], [0.1, -0.2]),
+        (g.POSE_PRIOR, ([1, 3, np.pi / 2 + 0.1],), [1, 2, np.pi / 2], [1.0, 0.0, 0.1]),
+        (g.RELATIVE_POSE, ([1, 2, 0.5], [1, 2, 0.5 + np.pi + 1e-3]), [0, 0, 3 * np.pi], [0, 0, 1e-3]),
         # a robot at (1, 2) that looks along y sees (-3, 5) at 3 ahead and 4 to its left
         (g.RANGE_BEARING, ([1, 2, np.pi / 2], [-3, 5]), [4.5, 0.1], [0.5, np.arctan2(4, 3) - 0.1]),
         (g.BEARING, ([1, 2, np.pi / 2], [-3, 5]), [0.0], [np.arctan2(4, 3)]),
@@ -96,13 +108,12 @@ NOSE_UP = (*so3.exp((0.0, -np.pi / 4, 0.0)),)
         (g.ATTITUDE_PRIOR_3D, ([3, 4, 5, *UP],), [0, 0, 0, 1], [0, 0, np.pi / 2]),
         (g.HEADING_PRIOR_3D, ([3, 4, 5, *so3.compose(UP, NOSE_UP)],), [1.0], [np.pi / 2 - 1.0]),
     ],
-    ids=lambda x: x.name if isinstance(x, g.EdgeType) else "",
 )
 def test_residuals_are_those_computed_by_hand(edge, values, measured, expected):
     assert residual(edge, values, measured) == pytest.approx(expected, abs=1e-12)
 
 
-@pytest.mark.parametrize("edge", [g.RANGE_BEARING, g.BEARING, g.RANGE_BEARING_3D, g.BEARING_3D, g.RANGE, g.RANGE_3D])
+@each("edge", [g.RANGE_BEARING, g.BEARING, g.RANGE_BEARING_3D, g.BEARING_3D, g.RANGE, g.RANGE_3D])
 def test_a_landmark_at_the_sensor_gives_finite_numbers(edge):
     values = [0, 0, 0.3, 0, 0] if edge.accepts[0] == (g.SE2,) else [0, 0, 0, *UP, 0, 0, 0]
     at = np.array([[0, 3 if len(values) == 5 else 7]])
@@ -177,7 +188,7 @@ def drawn_speed(rng):
     return rng.uniform(0.5, 2.0, 2)
 
 
-@pytest.mark.parametrize("more", [{}, {"jacobian": _speed_derivative}], ids=["numeric", "analytic"])
+@each("more", [{}, {"jacobian": _speed_derivative}])
 def test_an_edge_of_ones_own_is_checked_and_solved(more):
     edge = speed(**more)
     g.check_edge(edge, drawn_speed)
@@ -193,8 +204,8 @@ def test_an_edge_of_ones_own_is_checked_and_solved(more):
     assert report.chi2_final < 1e-15
 
 
-@pytest.mark.parametrize(
-    ("edge", "complaint"),
+@each(
+    "edge, complaint",
     [
         (speed(jacobian=lambda v, z: [[1.0, 0, 0, 0, 0, 0]]), r"speed: Jacobian\[0, \d\] is"),
         (speed(jacobian=lambda v, z: [[np.nan, 0, 0, 0, 0, 0]]), "speed: not finite at vertices"),

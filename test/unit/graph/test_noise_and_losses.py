@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from rows import each
 
 from graph_slam_ros.errors import GraphSlamError, NoiseError
 from graph_slam_ros.graph import CAUCHY, HUBER, NONE, Gaussian, Loss
@@ -26,8 +25,8 @@ BAD = {
 LOSSES = [(NONE, 1.0), (HUBER, 1.0), (HUBER, 2.5), (CAUCHY, 1.0), (CAUCHY, 0.3)]
 
 
-@pytest.mark.parametrize("build", [Gaussian.from_covariance, Gaussian.from_information])
-@pytest.mark.parametrize("name", BAD)
+@each("build", [Gaussian.from_covariance, Gaussian.from_information])
+@each("name", BAD)
 def test_what_is_no_covariance_is_refused_with_its_row(build, name):
     matrix, why = BAD[name]
     with pytest.raises(NoiseError, match=why):
@@ -53,25 +52,10 @@ def test_variances_of_very_different_size_are_no_fault():
     assert found == pytest.approx(np.linalg.inv(correlation), rel=1e-12)
 
 
-def test_a_matrix_printed_with_six_digits_is_symmetric_enough():
-    rounded = GOOD.copy()
-    rounded[0, 1] += 1e-6
-    assert Gaussian.from_information(rounded).information == pytest.approx(GOOD, abs=1e-6)
-
-
-@pytest.mark.parametrize("shape", [(3,), (2, 3), (2, 2, 3), ()])
+@each("shape", [(3,), (2, 3), (2, 2, 3), ()])
 def test_what_is_not_square_is_refused_with_its_shape(shape):
     with pytest.raises(NoiseError, match="shape"):
         Gaussian.from_information(np.ones(shape))
-
-
-def test_information_and_covariance_say_the_same():
-    one, other = Gaussian.from_covariance(GOOD), Gaussian.from_information(np.linalg.inv(GOOD))
-    assert one.information == pytest.approx(other.information, rel=1e-12)
-    assert one.information @ GOOD == pytest.approx(np.eye(3), abs=1e-13)
-    assert Gaussian.from_sigmas(0.5, 2.0).information == pytest.approx(np.diag([4.0, 0.25]))
-    stack = Gaussian.from_covariance(np.stack([GOOD, 2 * GOOD]))
-    assert stack.information[1] == pytest.approx(one.information / 2, rel=1e-12)
 
 
 def test_whitened_noise_has_unit_covariance():
@@ -81,17 +65,16 @@ def test_whitened_noise_has_unit_covariance():
         assert r @ GOOD @ r.T == pytest.approx(np.eye(3), abs=1e-12)
 
 
-@pytest.mark.parametrize("kind, scale", LOSSES)
-@given(s=st.floats(1e-6, 1e6))
-@settings(max_examples=60, deadline=None, derandomize=True)
-def test_the_weight_is_the_slope_of_the_loss(kind, scale, s):
-    step = 1e-5 * s
-    numeric = (weight_and_cost(kind, scale, s + step)[1] - weight_and_cost(kind, scale, s - step)[1]) / (2 * step)
-    # at Huber's kink the slope is continuous but not smooth: first order in the step
-    assert weight_and_cost(kind, scale, s)[0] == pytest.approx(numeric, rel=2e-5)
+@each("kind, scale", LOSSES)
+def test_the_weight_is_the_slope_of_the_loss(kind, scale):
+    for s in np.geomspace(1e-6, 1e6, 97).tolist():
+        step = 1e-5 * s
+        numeric = (weight_and_cost(kind, scale, s + step)[1] - weight_and_cost(kind, scale, s - step)[1]) / (2 * step)
+        # at Huber's kink the slope is continuous but not smooth: first order in the step
+        assert weight_and_cost(kind, scale, s)[0] == pytest.approx(numeric, rel=2e-5)
 
 
-@pytest.mark.parametrize("kind, scale", LOSSES)
+@each("kind, scale", LOSSES)
 def test_a_loss_is_chi2_near_zero_and_never_above_it(kind, scale):
     assert weight_and_cost(kind, scale, 0.0) == (1.0, 0.0)
     s = np.geomspace(1e-9, 1e9, 200)
@@ -104,7 +87,7 @@ def test_a_loss_is_chi2_near_zero_and_never_above_it(kind, scale):
     assert (weight > 0).all()
 
 
-@pytest.mark.parametrize("scale", [0.5, 1.0, 3.0])
+@each("scale", [0.5, 1.0, 3.0])
 def test_huber_is_continuous_at_its_scale_and_linear_beyond(scale):
     below, above = (weight_and_cost(HUBER, scale, scale**2 * (1 + e)) for e in (-1e-12, 1e-12))
     assert below == pytest.approx(above, rel=1e-11)
@@ -112,14 +95,13 @@ def test_huber_is_continuous_at_its_scale_and_linear_beyond(scale):
     assert weight_and_cost(HUBER, scale, (5 * scale) ** 2) == pytest.approx((1 / 5, 9 * scale**2))
 
 
-def test_cauchy_gives_half_the_weight_at_its_scale():
-    assert weight_and_cost(CAUCHY, 2.0, 4.0) == pytest.approx((0.5, 4.0 * np.log(2.0)))
-
-
 def test_a_loss_that_cannot_be_is_refused():
     for bad in ((HUBER, 0.0), (CAUCHY, -1.0), (HUBER, np.nan), (HUBER, np.inf), (17, 1.0)):
         with pytest.raises(GraphSlamError):
             Loss(*bad)
+    for sigma in (-0.1, 0.0, np.nan):
+        with pytest.raises(GraphSlamError, match="must be > 0"):
+            Gaussian.from_sigmas(0.1, sigma)
     with pytest.raises(GraphSlamError, match=r"'tukey'.*none, huber, cauchy"):
         Loss.named("tukey")
     assert Loss.named("cauchy", 2.0) == Loss(CAUCHY, 2.0)
