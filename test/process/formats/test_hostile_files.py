@@ -10,6 +10,7 @@ from contextlib import closing, suppress
 
 import pytest
 from confined import confined
+from rows import each
 
 from graph_slam_ros.cli import main
 from graph_slam_ros.errors import ConfigError, FormatError
@@ -41,7 +42,7 @@ WRITERS = {
 }
 
 
-@pytest.mark.parametrize("kind", WRITERS)
+@each("kind", WRITERS)
 def test_F33_what_a_careless_pattern_would_match_for_hours_is_read_or_refused(tmp_path, kind):
     name, text, read, refusal = WRITERS[kind]
     for shape in SHAPES.values():
@@ -76,7 +77,7 @@ def test_F34_a_table_that_computes_its_messages_is_refused_before_any_is(tmp_pat
         open_bag(path)
 
 
-@pytest.mark.parametrize("text", ["VERTEX_SE2 0 0 0 0\n", "1"], ids=["lines", "line"])
+@each("text", ["VERTEX_SE2 0 0 0 0\n", "1"])
 def test_F35_a_gzipped_graph_that_grows_without_end_is_not_unpacked(tmp_path, text):
     path = tmp_path / "bomb.g2o.gz"
     with gzip.open(path, "wb") as stream:
@@ -86,9 +87,7 @@ def test_F35_a_gzipped_graph_that_grows_without_end_is_not_unpacked(tmp_path, te
         confined(read_g2o, path)
 
 
-@pytest.mark.parametrize(
-    ("name", "begin"), [("a.g2o", b""), ("a.mcap", mcap_records.MAGIC + b"\xff" * 99), ("a.bag", b"#ROSBAG V2.0\n")]
-)
+@each("name, begin", [("a.g2o", b""), ("a.mcap", mcap_records.MAGIC + b"\xff" * 99), ("a.bag", b"#ROSBAG V2.0\n")])
 def test_F35_a_sparse_file_of_a_terabyte_is_refused_at_once(tmp_path, capsys, name, begin):
     path = tmp_path / name
     path.write_bytes(begin)
@@ -97,7 +96,7 @@ def test_F35_a_sparse_file_of_a_terabyte_is_refused_at_once(tmp_path, capsys, na
     assert len(capsys.readouterr().err.splitlines()) == 1
 
 
-@pytest.mark.parametrize("claims", [lambda left: left - 9, lambda left: 44], ids=["all the rest", "nothing"])
+@each("claims", [lambda left: left - 9, lambda left: 44])
 def test_F35_forged_heads_of_chunks_one_after_another_cost_little_each(tmp_path, claims):
     heads, body = 32_000, b""
     for k in range(heads):

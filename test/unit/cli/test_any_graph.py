@@ -5,6 +5,7 @@ import random
 
 import pytest
 from graph_texts import PLANE, SPACE, in_dialect
+from rows import each
 
 from graph_slam_ros.cli import main
 from graph_slam_ros.runs.folder import MARK
@@ -47,9 +48,7 @@ def command(file, folder, rng):
 
 
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize(
-    "name, dialect", [("plane", "g2o"), ("plane", "toro"), ("plane", "gtsam"), ("space", "g2o"), ("space", "toro")]
-)
+@each("name, dialect", [("plane", "g2o"), ("plane", "toro"), ("plane", "gtsam"), ("space", "g2o"), ("space", "toro")])
 def test_whatever_is_in_a_file_it_is_used_or_refused_in_one_line(tmp_path, capsys, name, dialect):
     text, file = {"plane": PLANE + MORE, "space": SPACE}[name], tmp_path / f"file.{dialect}"
     text = text if dialect == "g2o" else in_dialect(text, dialect)[1]

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from graph_texts import SPACE, in_dialect
 from places import DATASETS, ROOT
+from rows import each
 from scipy.spatial.transform import Rotation
 
 from graph_slam_ros.errors import FormatError
@@ -35,8 +36,8 @@ def chi2_of(file):
     return solver.optimize(Settings(max_iterations=1)).chi2_initial
 
 
-@pytest.mark.parametrize(
-    ("name", "dialect"),
+@each(
+    "name, dialect",
     [*(("city", d) for d in ("toro", "gtsam", "isam", "rows")), ("landmarks", "gtsam"), ("", "toro"), ("", "isam")],
 )
 def test_a_text_has_the_chi2_of_its_twin_in_g2o(tmp_path, name, dialect):
@@ -120,12 +121,7 @@ def test_edge3_may_be_isams_square_root_which_is_said_and_taken_where_it_is_aske
     assert not read(tmp_path, text(np.eye(6))).notes, "the identity is its own root"
 
 
-def test_a_graph_of_edges_alone_starts_from_its_tree(tmp_path):
-    file = read(tmp_path, "EDGE_SE2 0 1 1 0 1.5707963267948966 1 0 0 1 0 1\nEDGE_SE2 1 2 1 0 0 1 0 0 1 0 1\n")
-    assert np.allclose(initial_values(file.graph, "tree", 0).reshape(-1, 3)[:, :2], [[0, 0], [1, 0], [1, 1]])
-
-
-@pytest.mark.parametrize(
+@each(
     "line",
     [
         "EDGE2 0 1 1 0",

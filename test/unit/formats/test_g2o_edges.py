@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from rows import each
 
 from graph_slam_ros.edge_tags import EDGE_TAGS
 from graph_slam_ros.errors import FormatError
@@ -119,8 +120,8 @@ def test_the_robots_own_frame_may_be_left_out_and_is_written(tmp_path):
     assert (tmp_path / "b.g2o").read_text().startswith("PARAMS_SE3OFFSET 0 0.0 0.0 0.0 0.0 0.0 0.0 1.0\n")
 
 
-@pytest.mark.parametrize(
-    ("line", "why"),
+@each(
+    "line, why",
     [
         ("EDGE_SE3_TRACKXYZ 0 2 4 1 2 3 9 1 2 8 3 7", "parameter 4, which is not declared"),
         ("EDGE_SE3_TRACKXYZ 0 2 3 1 2 3 9 1 2 8 3", "needs 12 fields"),
