@@ -14,9 +14,7 @@ GRAPHS = GRAPHS / "pose_graphs"
 
 
 @pytest.mark.skipif(not GRAPHS.exists(), reason=f"no public graphs under {GRAPHS}")
-@pytest.mark.parametrize(
-    ("name", "optimum"), [("smallGrid3D", 1033.9), ("parking-garage", 1.26838)]
-)
+@pytest.mark.parametrize(("name", "optimum"), [("smallGrid3D", 1033.9), ("parking-garage", 1.26838)])
 def test_public_graphs_in_space_reach_their_optimum(name, optimum):
     file = read_g2o(GRAPHS / f"{name}.g2o", raw=True)
     assert solved(file).chi2_final == pytest.approx(optimum, rel=1e-4)
