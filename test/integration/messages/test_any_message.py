@@ -6,13 +6,13 @@ from dataclasses import fields, is_dataclass
 from types import SimpleNamespace
 
 import numpy as np
-import pytest
 from foreign import DEFINITIONS
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from messages import CLOUD, DECODERS, STAMP_NS, STORE, cloud, counted, listening, part, quaternion, transforms
 from reliability import tell, times
 from rosbags.typesys.base import Nodetype
+from rows import each
 
 from graph_slam_ros.measurements.types import to_record
 from graph_slam_ros.messages.inputs import CONVERTERS
@@ -171,7 +171,7 @@ FUZZ = functools.partial(
 CASES = [(name, use, n) for name, uses in CONVERTERS.items() for use in uses for n in (2, 3)]
 
 
-@pytest.mark.parametrize("type_name, use, dimensions", CASES)
+@each("type_name, use, dimensions", CASES)
 def test_whatever_comes_is_used_or_counted_and_nothing_is_raised(type_name, use, dimensions):
     count, found, borders = times(2_000, 500_000) // len(CASES) + 1, [], {}
 
@@ -219,7 +219,7 @@ def only_used(name, message, used):
     return SimpleNamespace(**out)
 
 
-@pytest.mark.parametrize("type_name", LANDMARK_TYPES)
+@each("type_name", LANDMARK_TYPES)
 def test_a_type_of_landmarks_is_read_by_no_other_fields_than_its_row_names(type_name):
     assert type_name in DEFINITIONS, "test/foreign.py has the recorded definition of each"
     sender, found = Sender(0, "landmarks"), 0

@@ -33,14 +33,16 @@ def install(tmp_path, monkeypatch):
         yield installed
 
 
-@pytest.mark.parametrize("defined", [True, False])
-def test_the_example_of_the_page_reads_a_recording_with_its_definition_or_without(defined, install, tmp_path):
+def test_the_example_of_the_page_reads_a_recording_with_its_definition_or_without(install, tmp_path):
     assert POINTS == ("graph_slam_ros.inputs", NAME, "my_beacons:BEACONS")
     install(EXAMPLE)
-    done = replay(recording(tmp_path / "a.mcap", defined=defined), tmp_path / "run", Config.from_mapping(SETTINGS))
-    assert set(done.slam.landmarks) == set(BEACONS)
-    for name, at in BEACONS.items():
-        assert done.slam.solver.estimate([done.slam.landmarks[name].vertex])[0] == pytest.approx(at, abs=0.1)
+    for defined in (True, False):
+        file = recording(tmp_path / f"{defined}.mcap", defined=defined)
+        done = replay(file, tmp_path / f"run_{defined}", Config.from_mapping(SETTINGS))
+        assert set(done.slam.landmarks) == set(BEACONS), defined
+        for name, at in BEACONS.items():
+            found = done.slam.solver.estimate([done.slam.landmarks[name].vertex])[0]
+            assert found == pytest.approx(at, abs=0.1), (defined, name)
 
 
 def test_info_names_plugins_and_suggests_an_input_of_their_type(install, tmp_path, capsys):
@@ -57,30 +59,29 @@ def test_info_names_plugins_and_suggests_an_input_of_their_type(install, tmp_pat
     assert "my_odometry" not in sys.modules, "a plugin for a built-in type is not even imported"
 
 
-LINE = rf"{NAME}: plugin my_beacons:BEACONS of my-beacons 1.0"
 INPUT = "from graph_slam_ros.messages.inputs import InputType\n"
-
-
-@pytest.mark.parametrize(
-    ("text", "line"),
-    [
-        ("import not_there", "cannot be loaded: ModuleNotFoundError: No module named 'not_there'"),
-        ("raise ValueError('two\\nlines')", "cannot be loaded: ValueError: two lines"),
-        ("import sys; sys.exit(7)", "cannot be loaded: SystemExit: 7"),
-        ("", "cannot be loaded: AttributeError: .*BEACONS"),
-        ("def BEACONS(source, message): return []", "it is a function, not an InputType"),
-        (f"{INPUT}BEACONS = InputType(dict())", "its converters are not a dictionary by landmarks, fix"),
-        (f"{INPUT}BEACONS = InputType(dict(tags=print))", "its converters are not a dictionary by landmarks, fix"),
-        (f"{INPUT}BEACONS = InputType(dict(fix=print), 3)", "its definition is not a text"),
-        (f"{INPUT}BEACONS = InputType(dict(fix=lambda m: []))", "its converter of fix is not a function of an Inp"),
-        (f"{INPUT}BEACONS = InputType(dict(fix=4))", "its converter of fix is not a function of an InputContext"),
-    ],
+UNUSABLE = (
+    ("import not_there", "cannot be loaded: ModuleNotFoundError: No module named 'not_there'"),
+    ("raise ValueError('two\\nlines')", "cannot be loaded: ValueError: two lines"),
+    ("import sys; sys.exit(7)", "cannot be loaded: SystemExit: 7"),
+    ("", "cannot be loaded: AttributeError: .*BEACONS"),
+    ("def BEACONS(source, message): return []", "it is a function, not an InputType"),
+    (f"{INPUT}BEACONS = InputType(dict())", "its converters are not a dictionary by landmarks, fix"),
+    (f"{INPUT}BEACONS = InputType(dict(tags=print))", "its converters are not a dictionary by landmarks, fix"),
+    (f"{INPUT}BEACONS = InputType(dict(fix=print), 3)", "its definition is not a text"),
+    (f"{INPUT}BEACONS = InputType(dict(fix=lambda m: []))", "its converter of fix is not a function of an Inp"),
+    (f"{INPUT}BEACONS = InputType(dict(fix=4))", "its converter of fix is not a function of an InputContext"),
 )
-def test_a_plugin_that_cannot_be_used_is_refused_in_one_line(text, line, install):
-    install(text)
-    with pytest.raises(ConfigError, match=rf"\A{LINE}:? {line}") as refused:
-        converters(TYPE)
-    assert "\n" not in str(refused.value)
+
+
+def test_a_plugin_that_cannot_be_used_is_refused_in_one_line(install):
+    for k, (text, line) in enumerate(UNUSABLE):
+        install(text, name=f"my_msgs.msg.Type{k}", module=f"my_module{k}")
+        with pytest.raises(ConfigError) as refused:
+            converters(f"my_msgs/msg/Type{k}")
+        begin = rf"\Amy_msgs.msg.Type{k}: plugin my_module{k}:BEACONS of my-module{k} 1.0:? {line}"
+        assert re.match(begin, str(refused.value)), (text, refused.value)
+        assert "\n" not in str(refused.value), text
 
 
 def test_of_two_plugins_for_a_type_neither_is_used_and_without_one_the_type_is_refused(install, tmp_path):
@@ -99,13 +100,8 @@ def test_of_two_plugins_for_a_type_neither_is_used_and_without_one_the_type_is_r
         ("return 1 / 0", "ZeroDivisionError: division by zero"),
         ("return None", "TypeError: 'NoneType' object is not iterable"),
         ("return [3]", "as landmarks it gives a int, not ObservedLandmark"),
-        ("return m.field_that_is_not_there", "AttributeError: .*field_that_is_not_there"),
-        ("return [ObservedLandmark(m.header.stamp, 'base_link', 'a', 'here')]", "AttributeError: .*'x'"),
-        ("return [ObservedLandmark(m.header.stamp, 'base_link', 7, polar=('range', (1.0,)))]", "TypeError: "),
         ("return [ObservedLandmark(m.header.stamp, 'base_link', 'a', polar=('smell', (1.0,)))]", "FormatError: "),
-        ("return [ObservedLandmark(m.header.stamp, 'base_link', 'a', polar=('range', (1.0, 2.0)))]", "FormatError: "),
         ("raise MessageError('too\\nfoggy')", r"refuses a message: too foggy"),
-        ("raise SystemError", "SystemError: "),
     ],
 )
 def test_what_a_plugin_fails_at_is_counted_and_named_once_and_other_inputs_go_on(body, line, install, tmp_path):

@@ -1,6 +1,5 @@
 """Recordings with inputs of every kind, through replay and the command line."""
 
-import json
 import re
 import shlex
 
@@ -64,29 +63,12 @@ def test_all_inputs_of_a_recording_are_used_together(drive, tmp_path):
         assert where(slam, name) == pytest.approx(there, abs=0.05)
 
 
-def test_without_tf_a_sensor_on_a_joint_is_nowhere(drive, tmp_path):
-    slam, _ = replayed(drive, tmp_path / "run", inputs={"tf": False})
-    assert slam.counters["detections", "frame_unknown"] == 900
-
-
 def test_odometry_may_come_from_tf_alone(drive, tmp_path):
     noise = {"odometry": {"noise": "density"}}
     slam, events = replayed(drive, tmp_path / "tf", odom={"type": TF, "topic": "/tf"}, **noise)
     other, _ = replayed(drive, tmp_path / "topic", **noise)
     assert sum(isinstance(m, Odometry) for m in events) == 300
     assert slam.trajectory() == pytest.approx(other.trajectory(), abs=1e-6)
-
-
-def test_two_odometries_have_their_inputs_names(tmp_path):
-    with BagWriter(tmp_path / "a.mcap") as bag:
-        for k in range(5):
-            for topic, frame in (("/odom", "odom"), ("/vo/odom", "vo")):
-                stamp_ns = STAMP_NS + k * 10**8
-                cdr = odometry(pose(0.1 * k), frame=frame, stamp_ns=stamp_ns)
-                bag.write(topic, "nav_msgs/msg/Odometry", stamp_ns, cdr)
-    settings = {"inputs.names": "odom vo", "vo": {"type": "nav_msgs/msg/Odometry", "topic": "vo/odom", "frame": "odom"}}
-    _, events = replayed(tmp_path / "a.mcap", tmp_path / "run", **settings)
-    assert [m.source for m in events if isinstance(m, Odometry)] == ["odom", "vo"] * 5
 
 
 def test_an_input_without_its_topic_takes_the_only_one_of_its_type_and_else_is_refused(drive):
@@ -115,19 +97,6 @@ def test_the_command_that_info_prints_uses_what_is_there(drive, tmp_path, capsys
     assert main(command[1:]) == 0
     topics = {m.topic for m in ingested(tmp_path / command[-1]) if isinstance(m, Sightings | Fix)}
     assert topics == {"detections", "gps", "tags"}
-
-
-def test_info_takes_odometry_from_tf_where_it_is_nowhere_else(tmp_path, capsys):
-    whole = record_drive(tmp_path / "drive.mcap", seconds=2)
-    bag = open_bag(whole)
-    with BagWriter(tmp_path / "tf.mcap") as writer:
-        for m in bag.messages({"/tf", "/tf_static", "/landmarks"}):
-            writer.write(m.topic, bag.topics[m.topic].type, m.log_ns, m.cdr)
-    assert main(["info", str(tmp_path / "tf.mcap")]) == 0
-    command = shlex.split(capsys.readouterr().out.splitlines()[-1])
-    assert main([*command[1:-1], str(tmp_path / "run")]) == 0
-    run = json.loads((tmp_path / "run" / "run.json").read_text())
-    assert run["keyframes"] > 3
 
 
 def test_a_type_that_only_the_recording_defines_is_read_by_its_definition(tmp_path):

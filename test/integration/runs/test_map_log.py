@@ -8,7 +8,6 @@ import pytest
 from driven import drive, seldom, with_a_wrong_sighting, without_names
 from places import ROOT
 
-from graph_slam_ros import cli
 from graph_slam_ros.errors import FormatError
 from graph_slam_ros.runs.folder import RunError, is_cut_off, keep_earlier, run_config
 from graph_slam_ros.runs.journal import RecordWriter, read_records
@@ -22,7 +21,6 @@ from graph_slam_ros.tools.simulation import measurements, simulate
 GOLDEN = ROOT / "test" / "golden"
 WORLDS = {
     "points": ({}, {}),
-    "ranges": ({}, {"sensor": "range"}),
     "unnamed": ({"landmarks.association": "joint"}, {"sensor": "position"}),
 }
 
@@ -74,22 +72,8 @@ def test_what_is_read_back_is_what_there_was(run):
 def test_it_is_solved_to_where_it_was(run):
     folder, slam = run
     again = GraphSlam(run_config(folder), start=read_map(folder, []))
-    # by range alone both creep along a valley, and may stop anywhere in it
-    exact = slam.report.converged and again.report.converged
-    if exact:
-        assert again.trajectory() == pytest.approx(slam.trajectory(), abs=1e-6)
-    else:
-        assert again.trajectory()[:, :2] == pytest.approx(slam.trajectory()[:, :2], abs=0.05)
-    assert again.report.cost_final == pytest.approx(slam.report.cost_final, rel=1e-9 if exact else 1e-4)
-
-
-def test_a_map_that_is_taken_up_is_written_down_as_it_was_read(run):
-    folder, _ = run
-    first, second = (MapGrowth(read_map(folder, [])).first for _ in range(2))
-    assert json.dumps(first) == json.dumps(second)
-    again = told(state_of(GraphSlam(run_config(folder), start=read_map(folder, []))))
-    for part in ("vertices", "edges", "changes", "keyframes", "landmarks"):
-        assert again.get(part) == told(read_map(folder, [])).get(part), part
+    assert again.trajectory() == pytest.approx(slam.trajectory(), abs=1e-6)
+    assert again.report.cost_final == pytest.approx(slam.report.cost_final, rel=1e-9)
 
 
 def test_a_run_that_goes_on_in_a_map_knows_its_landmarks_and_is_repeated_byte_by_byte(tmp_path):
@@ -150,24 +134,25 @@ def test_cut_anywhere_it_is_read_as_far_as_it_goes(run, tmp_path):
     assert len(set(counts)) > 6
 
 
-@pytest.mark.parametrize(
-    ("record", "complaint"),
-    [
-        ({"type": "map", "version": 99}, "its version is 99"),
-        ({"type": "growth", "vertices": [["SE9", [0, 0, 0]]]}, "SE9"),
-        ({"type": "growth", "vertices": [["SE2", [0, 0]]]}, "shape"),
-        ({"type": "growth", "edges": [["EDGE_SE2", [0, 7], [1, 0, 0], [1] * 9, "odometry", ""]]}, "vertex 7"),
-        ({"type": "growth", "keyframes": [[0]]}, "values to unpack"),
-        ({"type": "growth", "changes": [[5, 0, "believed", "none", 0, 0]]}, "believed"),
-        ({"type": "growth", "seen": [[0, "", {}, 0, 0, 0, [], []]]}, "edge 0 does not exist"),
-    ],
+NO_MAP = (
+    ({"type": "map", "version": 99}, "its version is 99"),
+    ({"type": "growth", "vertices": [["SE9", [0, 0, 0]]]}, "SE9"),
+    ({"type": "growth", "vertices": [["SE2", [0, 0]]]}, "shape"),
+    ({"type": "growth", "edges": [["EDGE_SE2", [0, 7], [1, 0, 0], [1] * 9, "odometry", ""]]}, "vertex 7"),
+    ({"type": "growth", "keyframes": [[0]]}, "values to unpack"),
+    ({"type": "growth", "changes": [[5, 0, "believed", "none", 0, 0]]}, "believed"),
+    ({"type": "growth", "seen": [[0, "", {}, 0, 0, 0, [], []]]}, "edge 0 does not exist"),
 )
-def test_what_is_no_map_is_refused_by_record(tmp_path, record, complaint):
-    writer = RecordWriter(tmp_path / "map.mcap")
-    writer.write([{"type": "map", "version": 1}, {"type": "growth", "vertices": [["SE2", [0, 0, 0]]]}, record])
-    writer.close()
-    with pytest.raises(FormatError, match=rf"map\.mcap: record 2: .*({complaint})"):
-        read_map(tmp_path, [])
+
+
+def test_what_is_no_map_is_refused_by_record(tmp_path):
+    for record, complaint in NO_MAP:
+        (tmp_path / "map.mcap").unlink(missing_ok=True)
+        writer = RecordWriter(tmp_path / "map.mcap")
+        writer.write([{"type": "map", "version": 1}, {"type": "growth", "vertices": [["SE2", [0, 0, 0]]]}, record])
+        writer.close()
+        with pytest.raises(FormatError, match=rf"map\.mcap: record 2: .*({complaint})"):
+            read_map(tmp_path, [])
 
 
 def test_a_run_of_an_earlier_version_is_taken_up_by_repeating_it(tmp_path):
@@ -204,19 +189,8 @@ def test_a_run_is_cut_off_until_it_is_ended_and_kept_whatever_is_asked(tmp_path)
         map_of(folder, [])
 
 
-def test_recover_gives_the_results_of_a_run_that_was_cut_off(tmp_path, capsys):
-    slam = drive(tmp_path / "run", Config(), measurements(simulate("warehouse", 0, aisles=2, laps=1, aisle_m=6.0)))
-    assert cli.main(["recover", str(tmp_path / "run"), "--out", str(tmp_path / "out")]) == 3, "its end is missing"
-    assert capsys.readouterr().out.split()[:2] == ["keyframes", str(len(slam.keyframes))]
-    lines = (tmp_path / "out" / "path.tum").read_text().splitlines()
-    told = np.array([line.split()[1:3] for line in lines], dtype=float)
-    assert told == pytest.approx(slam.trajectory()[:, :2], abs=1e-6)
-    assert cli.main(["recover", str(tmp_path / "none"), "--out", str(tmp_path / "no")]) == 2
-
-
-@pytest.mark.parametrize("version", [1])
-def test_maps_of_every_version_load(version, tmp_path):
-    folder = GOLDEN / f"run_{version}"
+def test_maps_of_every_version_load(tmp_path):
+    (folder,) = GOLDEN.iterdir()
     told = json.loads((folder / "run.json").read_text())
     state = read_map(folder, losses := [])
     assert losses == []

@@ -12,19 +12,16 @@ import pytest
 from places import ROOT
 from reliability import times
 
-import graph_slam_ros
 from graph_slam_ros import cli
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.durable import AppendedFile, replaced, write_whole
 from graph_slam_ros.formats.files import opened, read_text
-from graph_slam_ros.recordings.bag import BagWriter
-from graph_slam_ros.runs.folder import MARK, RunError, check_room, is_run, keep_earlier, remove, suggested_out
+from graph_slam_ros.runs.folder import MARK, RunError, is_run, keep_earlier, remove
 from graph_slam_ros.runs.recorder import RunRecorder
 from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.slam import Config, Odometry
 from graph_slam_ros.tools.simulation import simulate, write_bag
 
-PACKAGE = Path(graph_slam_ros.__file__).parent
 GOLDEN = ROOT / "test" / "golden"
 NAMES = ("run_1.mcap", "map.mcap", "ingest.mcap", "ingest_2.mcap", "run.mcap", "config.yaml", "graph.g2o", "path.tum")
 
@@ -66,20 +63,21 @@ def code_of(*words):
 # -- what is not ours --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("force", [False, True])
-@pytest.mark.parametrize("names", [*([name] for name in NAMES), NAMES, ("run_1.mcap", "map.mcap")])
-def test_a_folder_of_recordings_with_the_names_of_a_run_is_never_cleared(bag, tmp_path, names, force, capsys):
-    mine = tmp_path / "mine"
-    mine.mkdir()
-    for name in names:
-        shutil.copy(bag, mine / name)
-    before = state(mine)
-    assert code_of("replay", bag, "--out", mine, *["--force"] * force) == 2
-    assert "not empty and not an earlier run; nothing was written" in capsys.readouterr().err
-    with pytest.raises(RunError):
-        RunRecorder(mine, Config(), force=force)
-    keep_earlier(mine, 0)
-    assert state(mine) == before
+def test_a_folder_of_recordings_with_the_names_of_a_run_is_never_cleared(bag, tmp_path, capsys):
+    several = [*([name] for name in NAMES), NAMES, ("run_1.mcap", "map.mcap")]
+    for k, (names, force) in enumerate(itertools.product(several, (False, True))):
+        mine = tmp_path / str(k)
+        mine.mkdir()
+        for name in names:
+            shutil.copy(bag, mine / name)
+        before = state(mine)
+        assert code_of("replay", bag, "--out", mine, *["--force"] * force) == 2, names
+        assert "not empty and not an earlier run; nothing was written" in capsys.readouterr().err, names
+        with pytest.raises(RunError):
+            RunRecorder(mine, Config(), force=force)
+        keep_earlier(mine, 0)
+        assert state(mine) == before, names
+        shutil.rmtree(mine)
 
 
 def test_a_run_json_of_somebody_else_makes_no_run(bag, tmp_path):
@@ -96,16 +94,16 @@ def test_a_run_json_of_somebody_else_makes_no_run(bag, tmp_path):
         assert state(mine) == before
 
 
-@pytest.mark.parametrize("name", ["run_7.mcap", "ingest_4.mcap", "map_1.mcap"])
-def test_a_recording_of_the_user_in_a_run_folder_is_not_removed_whatever_its_name(bag, run, name, capsys):
-    shutil.copy(bag, run / name)
-    before = state(run)
-    assert code_of("replay", bag, "--out", run, "--force") == 2
-    assert f"{run / name}: not written by this run, and so never removed" in capsys.readouterr().err
-    with contextlib.suppress(OSError):
-        remove(run)
-    assert (run / name).read_bytes() == bag.read_bytes()
-    (run / name).unlink(), (run / "run.json").write_bytes(before["run.json"])
+def test_a_recording_of_the_user_in_a_run_folder_is_not_removed_whatever_its_name(bag, run, capsys):
+    for name in ("run_7.mcap", "ingest_4.mcap", "map_1.mcap"):
+        shutil.copy(bag, run / name)
+        before = state(run)
+        assert code_of("replay", bag, "--out", run, "--force") == 2, name
+        assert f"{run / name}: not written by this run, and so never removed" in capsys.readouterr().err
+        with contextlib.suppress(OSError):
+            remove(run)
+        assert (run / name).read_bytes() == bag.read_bytes(), name
+        (run / name).unlink(), (run / "run.json").write_bytes(before["run.json"])
     assert code_of("replay", bag, "--out", run, "--force") == 0
 
 
@@ -173,8 +171,6 @@ def test_a_run_or_a_file_that_is_there_is_replaced_with_force_alone(bag, run, tm
         (["replay", bag], other),
         (["recover", run], other),
         (["map", "freeze", run], other),
-        (["map", "export", run], tmp_path / "path.tum"),
-        (["map", "export", run], tmp_path / "path.g2o"),
         (["map", "export", run], tmp_path / "path.mcap"),
         (["optimize", graph], tmp_path / "solved.g2o"),
         (["simulate", "manhattan", "--poses", "20", "--set", "blocks=2"], tmp_path / "world.mcap"),
@@ -201,19 +197,6 @@ def test_a_run_or_a_file_that_is_there_is_replaced_with_force_alone(bag, run, tm
         assert code_of(*words, out, "--force") in (0, 3)
 
 
-def test_what_lies_beside_a_file_that_is_written_is_not_replaced_either(tmp_path, run, capsys):
-    (tmp_path / "a_vertices.csv").write_text("mine")
-    assert code_of("map", "export", run, "--out", tmp_path / "a.g2o") == 2
-    (tmp_path / "w.truth.tum").write_text("mine")
-    assert code_of("simulate", "city", "--poses", "12", "--out", tmp_path / "w.g2o") == 2
-    (tmp_path / "v.faults.csv").write_text("mine")
-    simulated = ["simulate", "manhattan", "--poses", "20", "--fault", "slip", "--out", tmp_path / "v.mcap"]
-    assert code_of(*simulated) == 2
-    assert not any((tmp_path / name).exists() for name in ("a.g2o", "w.g2o", "v.mcap"))
-    assert {(tmp_path / name).read_text() for name in ("a_vertices.csv", "w.truth.tum", "v.faults.csv")} == {"mine"}
-    assert capsys.readouterr().err.count("exists already") == 3
-
-
 def test_a_file_that_is_not_a_regular_one_is_not_replaced_even_with_force(tmp_path, capsys):
     victim = tmp_path / "victim"
     victim.write_text("mine")
@@ -226,18 +209,6 @@ def test_a_file_that_is_not_a_regular_one_is_not_replaced_even_with_force(tmp_pa
         assert code_of("simulate", "city", "--poses", "12", "--out", tmp_path / name, "--force") == 2
         assert f"{name}: not a regular file, and so not replaced" in capsys.readouterr().err
     assert state(tmp_path) == before
-
-
-def test_a_name_for_the_run_is_that_of_its_recording_and_free(bag, run, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert suggested_out(bag) == Path("drive_run")
-    Path("drive_run").mkdir()
-    assert suggested_out(bag) == Path("drive_run_2")
-    Path("drive_run_2").symlink_to("nowhere")
-    assert suggested_out(bag) == Path("drive_run_3")
-    assert suggested_out(run) == Path("run_again")
-    names = {"a.mcap.zstd": "a_run", "b.bag.active": "b_run", "2026.01.02": "2026.01.02_run", "c.db3": "c_run"}
-    assert {name: str(suggested_out(Path(name))) for name in names} == names
 
 
 # -- one way to open ---------------------------------------------------------------------------------------------------
@@ -281,25 +252,22 @@ def no_wait():
     signal.signal(signal.SIGALRM, before)
 
 
-@pytest.mark.parametrize("kind", [fifo, link])
-@pytest.mark.parametrize(
-    ("words", "name"), [(words, name) for words, names in READERS.items() for name in names][:: times(4, 1)]
-)
-def test_no_command_waits_for_a_fifo_in_a_run_folder_or_follows_a_link(
-    bag, run, tmp_path, words, name, kind, no_wait, capsys
-):
-    if words[0] == "evaluate":
-        pytest.importorskip("evo")
-    victim = tmp_path / "victim"
-    victim.write_bytes((run / name).read_bytes() if (run / name).is_file() else b"a picture of mine")
-    before = victim.read_bytes()
-    (run / name).unlink(missing_ok=True)
-    kind(run / name, victim)
-    names = {"RUN": run, "BAG": bag} | {f"OUT{ending}": tmp_path / f"out{ending}" for ending in ("", ".png", ".tum")}
-    assert code_of(*(names.get(word, word) for word in words)) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "not a regular file" in line or "a symbolic link" in line or "never removed" in line, line
-    assert victim.read_bytes() == before
+def test_no_command_waits_for_a_fifo_in_a_run_folder_or_follows_a_link(bag, saved, tmp_path, no_wait, capsys):
+    """Each command with each file that it needs; some of them in turn, all with ``make soak``."""
+    pytest.importorskip("evo")
+    cases = [(words, name) for words, names in READERS.items() for name in names]
+    for k, ((words, name), kind) in enumerate([*itertools.product(cases, (fifo, link))][:: times(5, 1)]):
+        run, victim, what = shutil.copytree(saved, tmp_path / f"run_{k}"), tmp_path / "victim", (words, name, kind)
+        victim.write_bytes((run / name).read_bytes() if (run / name).is_file() else b"a picture of mine")
+        before = victim.read_bytes()
+        (run / name).unlink(missing_ok=True)
+        kind(run / name, victim)
+        outs = {f"OUT{ending}": tmp_path / f"out_{k}{ending}" for ending in ("", ".png", ".tum")}
+        names = {"RUN": run, "BAG": bag} | outs
+        assert code_of(*(names.get(word, word) for word in words)) == 2, what
+        (line,) = capsys.readouterr().err.splitlines()
+        assert "not a regular file" in line or "a symbolic link" in line or "never removed" in line, (what, line)
+        assert victim.read_bytes() == before, what
 
 
 def test_evaluate_replaces_a_planted_link_and_does_not_write_through_it(bag, run, tmp_path):
@@ -345,15 +313,3 @@ def test_a_file_is_written_whole_or_not_at_all_whatever_interrupts(tmp_path):
             new.write_text("half")
             raise error
         assert state(tmp_path) == {"a": b"old"}
-
-
-def test_the_recordings_of_a_run_are_told_from_those_of_a_simulation(tmp_path, bag):
-    with BagWriter(tmp_path / "run.mcap") as writer:
-        writer.write("/odom", "nav_msgs/msg/Odometry", 1, b"")
-    mine = tmp_path / "mine"
-    recorder = RunRecorder(mine, Config())
-    recorder.close()
-    check_room(mine)
-    shutil.copy(tmp_path / "run.mcap", mine / "run.mcap")
-    with pytest.raises(RunError, match="never removed"):
-        check_room(mine, force=True)

@@ -143,34 +143,29 @@ HOMES = {  # variables, and in which folder kernels are kept then
 }
 
 
-@pytest.mark.parametrize("name", HOMES)
-def test_without_a_home_a_cache_or_tmp_kernels_are_kept_elsewhere(tmp_path, monkeypatch, name):
-    places = {
-        "LOCKED": tmp_path / "locked",
-        "TMP": tmp_path / "tmp",
-        "OWN": tmp_path / "own",
-        "FILE": tmp_path / "file",
-    }
-    for key in ("LOCKED", "TMP", "OWN"):
-        places[key].mkdir()
-    places["FILE"].write_text("mine")
-    places["LOCKED"].chmod(0o500)
-    variables, where = HOMES[name]
-    for key in ("HOME", "GRAPH_SLAM_CACHE", "XDG_CACHE_HOME"):
-        monkeypatch.delenv(key, raising=False)
-    monkeypatch.setenv("TMPDIR", str(places["TMP"]))
-    monkeypatch.setattr("tempfile.tempdir", None)
-    for key, value in variables.items():
-        for place, path in places.items():
-            value = value and value.replace(place, str(path))
-        monkeypatch.setenv(key, value) if value is not None else monkeypatch.delenv(key, raising=False)
-    monkeypatch.chdir(tmp_path)
-    with plain_rights():
-        folder = jit._cache_dir()
-    assert not where or folder.is_relative_to(places[where]), folder
-    assert folder.stat().st_mode & 0o077 == 0
-    assert places["FILE"].read_text() == "mine"
-    reliability.tell("environment", tried=1, failed=0)
+def test_without_a_home_a_cache_or_tmp_kernels_are_kept_elsewhere(tmp_path, monkeypatch):
+    for k, (name, (variables, where)) in enumerate(HOMES.items()):
+        places = {key: tmp_path / str(k) / key.lower() for key in ("LOCKED", "TMP", "OWN", "FILE")}
+        for key in ("LOCKED", "TMP", "OWN"):
+            places[key].mkdir(parents=True)
+        places["FILE"].write_text("mine")
+        places["LOCKED"].chmod(0o500)
+        with monkeypatch.context() as patched:
+            for key in ("HOME", "GRAPH_SLAM_CACHE", "XDG_CACHE_HOME"):
+                patched.delenv(key, raising=False)
+            patched.setenv("TMPDIR", str(places["TMP"]))
+            patched.setattr("tempfile.tempdir", None)
+            for key, value in variables.items():
+                for place, path in places.items():
+                    value = value and value.replace(place, str(path))
+                patched.setenv(key, value) if value is not None else patched.delenv(key, raising=False)
+            patched.chdir(tmp_path)
+            with plain_rights():
+                folder = jit._cache_dir()
+        assert not where or folder.is_relative_to(places[where]), (name, folder)
+        assert folder.stat().st_mode & 0o077 == 0, name
+        assert places["FILE"].read_text() == "mine", name
+        reliability.tell("environment", tried=1, failed=0)
 
 
 # -- variables ---------------------------------------------------------------------------------------------------------

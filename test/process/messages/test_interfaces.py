@@ -2,14 +2,11 @@
 
 import importlib
 import json
-import shutil
-import sys
-from importlib.machinery import ModuleSpec
 from pathlib import Path
 
-import generate_interfaces
 import numpy as np
 import pytest
+from rows import each
 
 from graph_slam_ros.messages.interfaces import INTERFACES, typestore
 
@@ -50,7 +47,7 @@ def test_the_type_hashes_are_those_of_the_complete_upstream_packages():
     assert hash_of(DETECTIONS) == "RIHS01_793f5eab9595ac1c0da07873cc859db42eae51f0ee76056db8562515d830e018"
 
 
-@pytest.mark.parametrize(("package", "message"), MESSAGES)
+@each("package, message", MESSAGES)
 def test_ros_and_rosbags_agree_on_the_type_hash(package, message):
     import_ros(package)
     prefix = Path(importlib.import_module(package).__file__).parents[4]
@@ -92,28 +89,3 @@ def test_what_rosbags_serialises_rclpy_decodes():
     transforms.transforms[0].transform.translation.y = -2.0
     rewritten = store.serialize_cdr(store.deserialize_cdr(serialize_message(transforms), TF), TF)
     assert deserialize_message(bytes(rewritten), type(transforms)) == transforms
-
-
-def test_nothing_is_generated_beside_an_installed_ros(monkeypatch, tmp_path):
-    installed = ModuleSpec("rclpy", None, origin=str(tmp_path / "rclpy" / "__init__.py"))
-    monkeypatch.setattr(generate_interfaces, "find_spec", lambda name: installed if name == "rclpy" else None)
-    monkeypatch.setenv("ROS_DISTRO", "humble")
-    assert "sudo apt install ros-humble-vision-msgs" in generate_interfaces.obstacle(["vision_msgs"])
-
-
-def test_a_machine_without_ros_or_compiler_is_told_in_one_line(monkeypatch, capsys):
-    monkeypatch.setattr(generate_interfaces, "find_spec", lambda name: None)
-    assert generate_interfaces.main() == 2
-    assert capsys.readouterr().err.splitlines() == [
-        "graph_slam_ros: no ROS 2 here (its wheels are for Linux on x86-64): what needs none works, live graphs do not"
-    ]
-    wheel = ModuleSpec("rclpy", None, origin=f"{sys.prefix}/rclpy/__init__.py")
-    monkeypatch.setattr(generate_interfaces, "find_spec", lambda name: wheel if name == "rclpy" else None)
-    monkeypatch.setattr(sys, "base_prefix", "/elsewhere")
-    monkeypatch.setattr(shutil, "which", lambda name: None)
-    monkeypatch.delenv("CXX", raising=False)
-    assert generate_interfaces.main() == 2
-    assert capsys.readouterr().err.splitlines() == [
-        "graph_slam_ros: no ROS 2 without a compiler and Python's headers for tf2_msgs and vision_msgs: "
-        "sudo apt install g++ python3-dev"
-    ]

@@ -155,7 +155,7 @@ def test_P25_whatever_is_asked_of_a_driving_node_in_whatever_order_it_answers_an
     parameters = f"output.folder:={tmp_path / 'data' / 'run'}", "inputs.reliable:=true", "journal.resume:=false"
     with node(*parameters) as n, robot(hears=("/diagnostics", "pose", "/tf"), name="asker") as r:
         r.wait_for_node()
-        burst, asked = Burst(r, 17), times(120, 2000)
+        burst, asked = Burst(r, 17), times(60, 2000)
         while burst.asked.total() < asked:
             burst.step()
         burst.wait()

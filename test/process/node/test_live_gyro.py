@@ -3,9 +3,8 @@
 import math
 import signal
 
-import pytest
 from live_drive import Drive
-from live_nodes import ENVIRONMENT, finish, node, own_domain, replayed, results, robot
+from live_nodes import finish, node, replayed, results, robot
 from messages import imu, quaternion
 from sensor_msgs.msg import Imu
 
@@ -18,14 +17,6 @@ GYRO = (
     "gyro.timeout_s:=0.25",
     "inputs.reliable:=true",
 )
-
-
-@pytest.fixture(autouse=True)
-def domain(monkeypatch):
-    """Of each test its own: what is left of others says nothing here."""
-    with own_domain() as number:
-        monkeypatch.setitem(ENVIRONMENT, "ROS_DOMAIN_ID", number)
-        yield
 
 
 def go(r, drive, gyro, steps, *, stands=False):

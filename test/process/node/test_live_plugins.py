@@ -9,18 +9,11 @@ import built_packages
 import pytest
 from executables import executable
 from installed import installer
-from live_nodes import ENVIRONMENT, own_domain
+from live_nodes import ENVIRONMENT
 from places import ROOT
 
 (EXAMPLE,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs/inputs.md").read_text(), re.DOTALL)
 LANDMARKS = ("inputs.names=odom radio", f"radio.type={beacons.TYPE}", "radio.topic=/radio", "radio.sigma_m=0.05")
-
-
-@pytest.fixture(autouse=True)
-def domain(monkeypatch):
-    with own_domain() as number:
-        monkeypatch.setitem(ENVIRONMENT, "ROS_DOMAIN_ID", number)
-        yield
 
 
 @pytest.fixture

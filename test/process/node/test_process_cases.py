@@ -146,8 +146,10 @@ def test_P11_a_robot_that_has_gone_and_comes_back_is_heard_again():
             again.until_graph(drive.pace(again), segments=1)
 
 
-def test_G7_while_solves_fail_it_says_so_and_why_and_transforms_go_on_by_the_last_good_estimate(monkeypatch):
-    with at_work() as (_, r, drive):
+def test_G7_P21_P23_solves_that_fail_faults_of_callbacks_and_the_end_of_its_thread_are_said_and_it_goes_on(
+    tmp_path, monkeypatch, capfd
+):
+    with at_work(output__folder=str(tmp_path / "run")) as (_, r, drive):
         with monkeypatch.context() as patched:
 
             def fail(*arguments, **words):
@@ -158,8 +160,32 @@ def test_G7_while_solves_fail_it_says_so_and_why_and_transforms_go_on_by_the_las
             why = "solves fail, the last good estimate stands", "MemoryError: no room"
             r.until_it_says("DEGRADED", *why, spin=drive.pace(r))
             r.heard["tf"].clear()
-            until(lambda: len(r.heard["tf"]) > 20, drive.pace(r), "transforms")
+            until(lambda: len(r.heard["tf"]) > 20, drive.pace(r), "transforms by the last good estimate")
         r.until_it_says("OK", spin=drive.pace(r))
+
+        before, process = r.graph()["keyframes"], GraphSlam.process
+
+        def dies(self, measurement):
+            monkeypatch.setattr(GraphSlam, "process", process)
+            raise SystemExit
+
+        monkeypatch.setattr(GraphSlam, "process", dies)
+        until(lambda: GraphSlam.process is process, drive.pace(r), "what would end the thread")
+        until(lambda: r.graph()["keyframes"] > before + 5, drive.pace(r), "keyframes of the graph that there is")
+        r.until_it_says("OK", spin=drive.pace(r))
+
+        capfd.readouterr()
+        with monkeypatch.context() as patched:
+            patched.setattr(Session, "process", lambda *_: 1 // 0)
+            drive.go(r, 5)
+            r.settle()
+            assert r.verdict.state != "ERROR"
+            r.until_it_says("ERROR", "faults in callbacks in 10 s", spin=drive.pace(r), patience_s=20.0)
+        assert capfd.readouterr().err.count("Traceback") == 1
+        r.heard["pose"].clear()
+        until(lambda: r.heard["pose"], drive.pace(r), "poses")
+        assert r.save().success
+    assert faults(tmp_path / "run")["worker_restarted"] == 1
 
 
 def test_P7_above_its_limit_of_memory_closures_are_refused_and_counted_and_below_taken_again(tmp_path):
@@ -186,24 +212,6 @@ def test_P7_above_its_limit_of_memory_closures_are_refused_and_counted_and_below
     assert results(run) == replayed(run, tmp_path)
 
 
-def test_P23_what_would_end_the_solvers_thread_does_not_and_it_goes_on_with_the_graph_that_there_is(
-    tmp_path, monkeypatch
-):
-    with at_work(output__folder=str(tmp_path / "run")) as (_, r, drive):
-        before, process = r.graph()["keyframes"], GraphSlam.process
-
-        def dies(self, measurement):
-            monkeypatch.setattr(GraphSlam, "process", process)
-            raise SystemExit
-
-        monkeypatch.setattr(GraphSlam, "process", dies)
-        until(lambda: GraphSlam.process is process, drive.pace(r), "the fault")
-        until(lambda: r.graph()["keyframes"] > before + 5, drive.pace(r), "keyframes")
-        r.until_it_says("OK", spin=drive.pace(r))
-        assert r.save().success
-    assert faults(tmp_path / "run")["worker_restarted"] == 1
-
-
 def test_P23_who_waits_for_a_job_that_would_have_ended_its_thread_is_told():
     done = []
     worker = Worker(10, print, lambda: done.append("first"))
@@ -219,19 +227,6 @@ def test_P23_who_waits_for_a_job_that_would_have_ended_its_thread_is_told():
         worker.call(lambda: 1 // 0).result(10.0)
     assert done == ["first", "after"]
     assert worker.stop(10.0)
-
-
-def test_P21_exceptions_of_callbacks_are_counted_told_once_and_an_error_from_a_hundred_on(monkeypatch, capfd):
-    with at_work() as (_, r, drive):
-        with monkeypatch.context() as patched:
-            patched.setattr(Session, "process", lambda *_: 1 // 0)
-            drive.go(r, 5)
-            r.settle()
-            assert r.verdict.state != "ERROR"
-            r.until_it_says("ERROR", "faults in callbacks in 10 s", spin=drive.pace(r), patience_s=20.0)
-        r.heard["pose"].clear()
-        until(lambda: r.heard["pose"], drive.pace(r), "poses")
-    assert capfd.readouterr().err.count("Traceback") == 1
 
 
 def test_B15_what_is_raised_after_a_jump_reaches_nobody_and_is_counted(tmp_path, monkeypatch):

@@ -7,6 +7,7 @@ import ast
 import contextlib
 import importlib.util
 import re
+import shutil
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -134,9 +135,8 @@ def folders(tmp_path_factory):
     """A data folder with a run, and a run outside of it that nobody may get at."""
     base = tmp_path_factory.mktemp("robot")
     write_bag(simulate("manhattan", 2, poses=12, blocks=4), base / "drive.mcap")
-    for run in (base / "secret", base / "data" / "earlier"):
-        run.parent.mkdir(exist_ok=True)
-        replay(base / "drive.mcap", run)
+    replay(base / "drive.mcap", base / "secret")
+    shutil.copytree(base / "secret", base / "data" / "earlier")
     (base / "data" / "linked").symlink_to(base / "secret")
     return base / "data"
 

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from geometry_msgs.msg import PoseWithCovarianceStamped
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from live_drive import TAGS, Drive, earlier_run
@@ -89,15 +88,45 @@ def weight(process):
     return int(status["VmRSS"].split()[0]) / 1024.0, len(list((of / "fd").iterdir())), int(status["Threads"])
 
 
-def test_P13_a_life_of_many_transitions_leaves_nothing_behind(tmp_path):
-    times, warm = often(6), 2
+def test_P13_P16_P22_of_a_managed_node_transitions_out_of_turn_are_refused_and_a_life_of_many_leaves_nothing(tmp_path):
+    lives, warm = often(4), 2
     with managed(tmp_path / "run") as n, robot(hears=("pose", "path", "/tf", "/diagnostics")) as r:
+        for name in SERVICES:
+            answer = r.call(name)
+            assert (answer.success, answer.message) == (False, "not configured: the node is unconfigured"), name
+        for kind in (0, 42, 255):
+            nothing = [Parameter(name="tf.publish_tf", value=ParameterValue(type=kind))]
+            request = SetParametersAtomically.Request(parameters=nothing)
+            assert not r.call("set_parameters_atomically", SetParametersAtomically, request).result.successful
+            answer = r.call("set_parameters", SetParameters, SetParameters.Request(parameters=nothing))
+            assert not any(one.successful for one in answer.results)
+        for name, value in (("output.folder", str(tmp_path / "elsewhere")), ("inputs.names", "odom")):
+            done, why = r.set({"frames.map": "world", name: value})
+            assert (done, name in why) == (False, True), why
+        given = {"frames.map": "world", "tf.max_speed_m_s": 2}
+        assert r.set(given) == (True, ""), "a whole number is a number"
+        unchanged = {"output.folder": str(tmp_path / "run"), "tf.publish_tf": True}
+        assert r.get([*given, *unchanged]) == {**given, **unchanged}
+
+        rng, state = random.Random(5), "unconfigured"
+        for _ in range(often(15)):
+            wanted = rng.choice(list(NUMBERS))
+            done = r.change(wanted if rng.random() < 0.5 else NUMBERS[wanted])
+            assert done == (wanted in TURNS[state]), (state, wanted)
+            state = TURNS[state].get(wanted, state)
+            assert r.state() == state
+            answer = r.call(rng.choice(("pause", "resume", "optimize", "clear_closures")))
+            assert answer.success == (state != "unconfigured"), (state, answer.message)
+        for wanted in {"active": ("deactivate", "cleanup"), "inactive": ("cleanup",)}.get(state, ()):
+            assert r.change(wanted)
+
         drive, weights = Drive(), []
-        for _ in range(warm + times):
+        for _ in range(warm + lives):
             assert r.change("configure")
             assert r.change("activate")
             r.heard["pose"].clear()
             until(lambda: len(r.heard["pose"]) > 3, drive.pace(r), "poses")
+            assert r.heard["pose"][0].header.frame_id == "world"
             assert r.change("deactivate")
             drive.go(r, 3)
             assert r.change("cleanup")
@@ -108,43 +137,26 @@ def test_P13_a_life_of_many_transitions_leaves_nothing_behind(tmp_path):
         assert n.stop()[0] == 0
     assert "Traceback" not in n.said
     memory, files, _ = zip(*weights[warm:], strict=True)
-    assert memory[-1] - memory[0] < 5.0 + 0.05 * times, memory
+    assert memory[-1] - memory[0] < 5.0 + 0.05 * lives, memory
     assert max(files) <= files[0], files
-    last = warm + times - 1
-    assert {run.name for run in tmp_path.iterdir()} == {"run", *(f"run-{last - k}" for k in range(5))}
+    names = {run.name.partition("-")[0] for run in tmp_path.iterdir()}
+    assert (names, len(list(tmp_path.iterdir()))) == ({"run"}, 1 + 5), "nothing elsewhere, five are kept"
 
 
-def test_P22_a_transition_out_of_turn_is_refused_by_name_and_by_number_and_the_node_is_as_it_was(tmp_path):
-    with managed(tmp_path / "run") as n, robot(hears=("/diagnostics",)) as r:
-        rng, state = random.Random(5), "unconfigured"
-        for _ in range(often(20)):
-            wanted = rng.choice(list(NUMBERS))
-            done = r.change(wanted if rng.random() < 0.5 else NUMBERS[wanted])
-            assert done == (wanted in TURNS[state]), (state, wanted)
-            state = TURNS[state].get(wanted, state)
-            assert r.state() == state
-            answer = r.call(rng.choice(("pause", "resume", "optimize", "clear_closures")))
-            assert answer.success == (state != "unconfigured"), (state, answer.message)
-        for wanted in {"active": ("deactivate", "cleanup"), "inactive": ("cleanup",)}.get(state, ()):
-            assert r.change(wanted)
-        for name in SERVICES:
-            answer = r.call(name)
-            assert (answer.success, answer.message) == (False, "not configured: the node is unconfigured"), name
-        assert r.change("configure")
-        assert r.change("activate")
-        r.until_it_says("OK", spin=Drive().pace(r))
-        assert n.stop()[0] == 0
-    assert "Traceback" not in n.said
-
-
-def test_what_cannot_be_configured_or_activated_leaves_nothing_and_can_be_once_it_is_mended(tmp_path):
+def test_what_cannot_be_configured_activated_or_saved_leaves_nothing_and_can_be_once_it_is_mended(tmp_path):
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "letter").write_text("mine")
-    with managed(tmp_path / "run") as n, robot(hears=("/diagnostics",)) as r:
+    with managed(tmp_path / "run") as n, robot(hears=("pose", "/diagnostics")) as r:
 
         def fails(transition):
             assert not r.change(transition)
             assert r.state() == "unconfigured"
+
+        def drives():
+            assert r.change("configure")
+            assert r.change("activate")
+            r.heard["pose"].clear()
+            until(lambda: r.heard["pose"], Drive().pace(r), "pose")
 
         fails("configure")
         (tmp_path / "run" / "letter").unlink()
@@ -152,42 +164,31 @@ def test_what_cannot_be_configured_or_activated_leaves_nothing_and_can_be_once_i
         fails("configure")
         assert r.set({"detections.type": "vision_msgs/msg/Detection3DArray", "odom.topic": "not a/topic"}) == (True, "")
         weights = []
-        for _ in range(10):
+        for _ in range(8):
             assert r.change("configure")
             fails("activate")
             weights.append(weight(n.process)[1:])
         assert weights[-1] <= max(weights[:6]), "open files and threads"
         assert r.set({"odom.topic": "odom"}) == (True, ""), "it is unconfigured"
-        assert r.change("configure")
-        assert r.change("activate")
-        r.until_it_says("OK", spin=Drive().pace(r))
-        assert n.stop()[0] == 0
-    for why in ("not empty and not an earlier run; nothing was written", "apriltag_msgs is not installed here"):
-        assert why in n.said
-    assert "Traceback" not in n.said
-
-
-def test_a_run_that_cannot_be_saved_ends_with_its_cleanup_and_another_may_begin(tmp_path):
-    with managed(tmp_path / "run") as n, robot(hears=("pose", "/diagnostics")) as r:
-        for is_last in (False, True):
-            assert r.change("configure")
-            assert r.change("activate")
-            r.heard["pose"].clear()
-            until(lambda: r.heard["pose"], Drive().pace(r), "pose")
-            if not is_last:
-                shutil.rmtree(tmp_path / "run")
-                (tmp_path / "run").write_text("in its place")
-                assert r.change("deactivate")
-                assert not r.change("cleanup")
-                assert r.state() == "unconfigured"
-                (tmp_path / "run").unlink()
+        drives()
+        shutil.rmtree(tmp_path / "run")
+        (tmp_path / "run").write_text("in its place")
+        assert r.change("deactivate")
+        fails("cleanup")
+        (tmp_path / "run").unlink()
+        drives()
         assert r.change("shutdown"), "from whatever state"
         assert numbers(tmp_path / "run")["keyframes"] > 0
         r.until_it_says("FINALIZED")
         assert not r.change("configure")
         assert not r.call("save").success
         assert n.stop()[0] == 0
-    assert f"{tmp_path / 'run'}: Not a directory" in n.said
+    for why in (
+        "not empty and not an earlier run; nothing was written",
+        "apriltag_msgs is not installed here",
+        f"{tmp_path / 'run'}: Not a directory",
+    ):
+        assert why in n.said
     assert "Traceback" not in n.said
 
 
@@ -197,7 +198,7 @@ SIGNALS = signal.SIGINT, signal.SIGTERM
 MEANWHILE = "", "save", "optimize", "reset", "clear_closures"
 
 
-@pytest.mark.parametrize("seed", range(often(2)))
+@pytest.mark.parametrize("seed", range(often(1)))
 def test_P6_told_to_stop_at_any_moment_of_a_drive_it_saves_what_it_has_and_ends_with_0(tmp_path, seed):
     rng, meanwhile = random.Random(seed), MEANWHILE[(seed + 2) % len(MEANWHILE)]
     with node(f"output.folder:={tmp_path / 'run'}", "inputs.reliable:=true") as n, robot(hears=("pose",)) as r:
@@ -223,7 +224,7 @@ def hears_signals(process):
     return bool(int(status["SigCgt"], 16) >> (signal.SIGTERM - 1) & 1)
 
 
-@pytest.mark.parametrize("seed", range(often(2)))
+@pytest.mark.parametrize("seed", range(often(1)))
 def test_P6_told_to_stop_at_any_moment_of_its_start_it_ends_with_0_and_may_begin_again(tmp_path, seed):
     rng = random.Random(seed)
     with node(f"output.folder:={tmp_path / 'run'}", by=MODULE) as n:
@@ -233,18 +234,6 @@ def test_P6_told_to_stop_at_any_moment_of_its_start_it_ends_with_0_and_may_begin
     assert code == 0, n.said
     assert "Traceback" not in n.said
     check_room(tmp_path / "run", force=True)
-
-
-def test_P5_a_second_node_that_would_record_into_the_folder_of_the_first_does_not_start_and_says_why(tmp_path):
-    folder = f"output.folder:={tmp_path / 'run'}"
-    with node(folder) as n, robot(hears=("/diagnostics",)) as r:
-        r.wait_for_node()
-        with node(folder, remap=("__node:=second",)) as second:
-            code, said = second.ended(30.0)
-        assert code == 2
-        assert f"{tmp_path / 'run'}: another process records there" in said
-        assert n.is_alive
-        assert n.stop()[0] == 0
 
 
 def test_P6_while_kernels_are_compiled_the_node_answers_says_how_far_it_is_and_ends_when_it_is_told(
@@ -267,13 +256,13 @@ def test_P6_while_kernels_are_compiled_the_node_answers_says_how_far_it_is_and_e
 
 
 def test_P6_told_to_stop_while_a_long_run_is_loaded_it_does_not_wait_for_it(tmp_path):
-    earlier_run(tmp_path / "life", 20_000)  # without its map: the drive is repeated, which takes long
+    earlier_run(tmp_path / "life", 8_000)  # without its map: the drive is repeated, which takes long
     parameters = f"output.folder:={tmp_path / 'run'}", "output.load:=life", "output.load_at_start:=true"
     with node(*parameters) as n, robot(hears=("/diagnostics",)) as r:
         until(lambda: "kernels ready" in n.said, r.spin, "configured node", 120.0)
         assert n.stop()[0] == 0, n.said
     assert "Traceback" not in n.said
-    assert len(accepted(tmp_path / "life")) == 20_000 + 1_000
+    assert len(accepted(tmp_path / "life")) == 8_000 + 400
     assert not accepted(tmp_path / "run")
 
 
@@ -396,7 +385,7 @@ def test_P15_of_parameters_that_are_set_together_all_or_none_change_and_the_run_
         r.wait_for_node()
         drive, now = Drive(), {name: p.default for name, p in LIVE.items()}
         until(lambda: r.heard["pose"], drive.pace(r), "pose")
-        for _ in range(often(20)):
+        for _ in range(often(12)):
             wanted = {p.name: valid(p, rng) for p in rng.sample(list(LIVE.values()), rng.randrange(1, 5))}
             culprit, value, why = hostile(rng) if rng.random() < 0.6 else ("", None, "")
             asked = list((wanted | {culprit: value} if culprit else wanted).items())
@@ -426,52 +415,21 @@ def test_P15_of_parameters_that_are_set_together_all_or_none_change_and_the_run_
     assert is_repeated(tmp_path / "run", tmp_path)
 
 
-def test_P16_a_node_that_is_not_configured_takes_what_is_valid_but_neither_folder_nor_inputs(tmp_path):
-    with managed(tmp_path / "run") as n, robot(hears=("pose",)) as r:
-        for kind in (0, 42, 255):
-            nothing = [Parameter(name="tf.publish_tf", value=ParameterValue(type=kind))]
-            request = SetParametersAtomically.Request(parameters=nothing)
-            assert not r.call("set_parameters_atomically", SetParametersAtomically, request).result.successful
-            answer = r.call("set_parameters", SetParameters, SetParameters.Request(parameters=nothing))
-            assert not any(one.successful for one in answer.results)
-        for name, value in (("output.folder", str(tmp_path / "elsewhere")), ("inputs.names", "odom")):
-            done, why = r.set({"frames.map": "world", name: value})
-            assert (done, name in why) == (False, True), why
-        assert r.set({"frames.map": "world", "tf.max_speed_m_s": 2}) == (True, ""), "a whole number is a number"
-        assert r.get(["frames.map", "tf.max_speed_m_s", "output.folder"]) == {
-            "frames.map": "world",
-            "tf.max_speed_m_s": 2.0,
-            "output.folder": str(tmp_path / "run"),
-        }
-        assert r.get(["tf.publish_tf"]) == {"tf.publish_tf": True}
-        assert r.change("configure")
-        assert r.change("activate")
-        until(lambda: r.heard["pose"], Drive().pace(r), "pose")
-        assert r.heard["pose"][0].header.frame_id == "world"
-        assert n.stop()[0] == 0
-    assert [run.name for run in tmp_path.iterdir()] == ["run"]
-
-
 # -- services ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("loaded", ["newest", "frozen"])
-def test_P12_of_a_loaded_map_nothing_is_claimed_until_a_landmark_is_recognised(tmp_path, loaded):
+def test_P12_of_a_loaded_map_nothing_is_claimed_until_a_landmark_is_recognised(tmp_path):
     hears = "pose", "/tf", "odometry", "/diagnostics", "landmarks"
-    parameters = f"output.folder:={tmp_path / 'run'}", "inputs.reliable:=true"
-    named = () if loaded == "newest" else (f"output.load:={loaded}",)
-    with node(*parameters, *named) as n, robot(hears=hears) as r:
+    parameters = f"output.folder:={tmp_path / 'run'}", "inputs.reliable:=true", "output.load:=frozen"
+    with node(*parameters) as n, robot(hears=hears) as r:
         r.wait_for_node()
         drive = Drive()
-        drive.go(r, 120, every=3)
-        r.settle()  # or the call may come before what was sent
-        assert r.call("reset").success
-        if loaded == "frozen":
-            drive.go(r, 60, every=3)
-            r.settle()
+        for _ in range(2):
+            drive.go(r, 90, every=3)
+            r.settle()  # or the call may come before what was sent
             assert r.call("reset").success
-            merge(tmp_path / "run-1", tmp_path / "run-2", tmp_path / "merged")
-            freeze(tmp_path / "merged", tmp_path / "frozen")
+        merge(tmp_path / "run-1", tmp_path / "run-2", tmp_path / "merged")
+        freeze(tmp_path / "merged", tmp_path / "frozen")
         assert r.call("load").success
         r.settle()
         assert {m.text for m in r.heard["landmarks"][-1].markers if m.text} == set(TAGS)
@@ -491,35 +449,22 @@ def test_P12_of_a_loaded_map_nothing_is_claimed_until_a_landmark_is_recognised(t
         r.until_graph(elsewhere.pace(r), landmarks=len(TAGS))
         finish(n, r)
     assert is_repeated(tmp_path / "run", tmp_path)
-    if loaded == "frozen":
-        frozen, since = (read_map(tmp_path / name, []) for name in ("frozen", "run"))
-        assert (since.values[: len(frozen.values)] == frozen.values).all()
+    frozen, since = (read_map(tmp_path / name, []) for name in ("frozen", "run"))
+    assert (since.values[: len(frozen.values)] == frozen.values).all()
 
 
-def test_X9_reset_saves_first_and_of_what_it_saved_the_last_five_are_kept(tmp_path):
-    with node(f"output.folder:={tmp_path / 'run'}", "inputs.reliable:=true") as n, robot(hears=("pose",)) as r:
+def test_X9_paused_it_takes_nothing_and_reset_saves_first_and_keeps_the_last_of_what_it_saved(tmp_path):
+    given = f"output.folder:={tmp_path / 'run'}", "inputs.reliable:=true", "output.keep_earlier:=2"
+    with node(*given) as n, robot(hears=("pose", "/tf", "/diagnostics")) as r:
         r.wait_for_node()
         drive = Drive()
-        for _ in range(7):
+        for _ in range(3):
             r.heard["pose"].clear()
             drive.go(r, 15, every=3)
             until(lambda: len(r.heard["pose"]) > 3, drive.pace(r), "poses")
             answer = r.call("reset")
             assert (answer.success, answer.message) == (True, str(tmp_path / "run"))
-        finish(n, r)
-    kept = {int(run.name.removeprefix("run-")): run for run in tmp_path.glob("run-*")}
-    assert sorted(kept) == [3, 4, 5, 6, 7]
-    assert all(numbers(run)["keyframes"] > 3 for run in kept.values())
-    assert is_repeated(kept[7], tmp_path)
-
-
-def test_while_it_is_paused_it_takes_nothing_and_its_transform_goes_on(tmp_path):
-    with (
-        node(f"output.folder:={tmp_path / 'run'}", "inputs.reliable:=true") as n,
-        robot(hears=("pose", "/tf", "/diagnostics")) as r,
-    ):
-        r.wait_for_node()
-        drive = Drive()
+        r.heard["pose"].clear()
         until(lambda: r.heard["pose"] and r.heard["tf"], drive.pace(r), "pose and transform")
         r.settle()
         assert r.call("pause").message == "paused"
@@ -527,7 +472,7 @@ def test_while_it_is_paused_it_takes_nothing_and_its_transform_goes_on(tmp_path)
         before = r.graph()["keyframes"]
         r.heard["tf"].clear()
         drive.go(r, 30, every=2)
-        until(lambda: len(r.heard["tf"]) > 5, drive.pace(r), "transforms")
+        until(lambda: len(r.heard["tf"]) > 5, drive.pace(r), "transforms: odometry goes on")
         r.until_it_says("DEGRADED", "paused", spin=drive.pace(r))
         assert r.graph()["keyframes"] == before
         assert r.call("optimize").success
@@ -540,6 +485,9 @@ def test_while_it_is_paused_it_takes_nothing_and_its_transform_goes_on(tmp_path)
     assert counted["odom"]["paused"] > 30
     assert counted["detections"]["paused"] > 10
     assert is_repeated(tmp_path / "run", tmp_path)
+    kept = {int(run.name.removeprefix("run-")): run for run in tmp_path.glob("run-*")}
+    assert sorted(kept) == [2, 3]
+    assert all(numbers(run)["keyframes"] > 3 for run in kept.values())
 
 
 def closure(stamp_ns, earlier_ns, x):
@@ -574,29 +522,5 @@ def test_closures_bend_the_path_until_they_are_cleared_and_optimize_says_how_muc
         solved = int(answer.message.removesuffix(" keyframes"))
         assert solved >= 20
         until(lambda: r.graph()["keyframes"] >= solved, drive.pace(r), "as many keyframes")
-        finish(n, r)
-    assert is_repeated(tmp_path / "run", tmp_path)
-
-
-def test_a_pose_that_somebody_gives_begins_a_segment(tmp_path):
-    with (
-        node(f"output.folder:={tmp_path / 'run'}", "inputs.reliable:=true") as n,
-        robot(hears=("pose", "/diagnostics")) as r,
-    ):
-        r.wait_for_node()
-        given = r.publisher("initialpose", PoseWithCovarianceStamped)
-        until(given.get_subscription_count, r.spin, "subscriber of initialpose")
-        drive = Drive()
-        drive.sees = False
-        until(lambda: r.heard["pose"], drive.pace(r), "pose")
-        said = PoseWithCovarianceStamped()
-        said.header.frame_id = "map"
-        said.pose.pose.position.x, said.pose.pose.position.y, said.pose.pose.orientation.w = 2.0, -1.0, 1.0
-        said.pose.covariance = (1e-4 * np.eye(6)).ravel()
-        drive.truth = 2.0, -1.0, 0.0
-        given.publish(said)
-        until(lambda: drive.off_by(r) < 0.4, drive.pace(r), "pose where it was told to be")
-        r.until_it_says("OK", spin=drive.pace(r))
-        r.until_graph(drive.pace(r), segments=2)
         finish(n, r)
     assert is_repeated(tmp_path / "run", tmp_path)

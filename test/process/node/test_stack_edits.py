@@ -4,23 +4,12 @@ import json
 import signal
 
 import numpy as np
-import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from live_drive import Drive, distance, earlier_run
-from live_nodes import ENVIRONMENT, finish, node, own_domain, replayed, results, robot, until
+from live_nodes import finish, node, replayed, results, robot, until
 from std_msgs.msg import String
 
-from graph_slam_ros.cli import main
 from graph_slam_ros.runs.map_journal import read_map
-from graph_slam_ros.tools.simulation import simulate
-from graph_slam_ros.tools.simulation.bag import write_bag
-
-
-@pytest.fixture(autouse=True)
-def domain(monkeypatch):
-    with own_domain() as number:
-        monkeypatch.setitem(ENVIRONMENT, "ROS_DOMAIN_ID", number)
-        yield
 
 
 def counters(folder):
@@ -155,34 +144,5 @@ def landmarks(folder):
     return [list(map(float, row[2:])) for row in rows]
 
 
-def test_a_recording_is_located_in_a_map_that_stays(tmp_path, capsys):
-    bag = tmp_path / "world.mcap"
-    write_bag(simulate("warehouse", 0, aisles=2, laps=1), bag)
-    assert main(["replay", str(bag), "--out", str(tmp_path / "first")]) == 0
-    assert main(["map", "freeze", str(tmp_path / "first"), "--out", str(tmp_path / "site")]) == 0
-    capsys.readouterr()
-    assert main(["replay", str(bag), "--map", str(tmp_path / "site"), "--out", str(tmp_path / "second")]) == 0
-    site, second = ((tmp_path / name / "landmarks.csv").read_text() for name in ("site", "second"))
-    assert _positions(second) == _positions(site)
-    (_, new) = json.loads((tmp_path / "second" / "run.json").read_text())["drives"]
-    first, path = (np.loadtxt(tmp_path / name / "path.tum") for name in ("first", "second"))
-    assert len(path) > len(first)
-    assert np.linalg.norm(path[-1, 1:3] - first[-1, 1:3]) < 0.1
-    assert main(["map", "export", str(tmp_path / "second"), "--last-drive", "--out", str(tmp_path / "a.tum")]) == 0
-    assert len(np.loadtxt(tmp_path / "a.tum")) == len(path) - new["keyframe"]
-
-
 def _positions(text):
     return [line.split(",")[:4] for line in text.splitlines()]
-
-
-def test_a_map_that_cannot_be_gone_on_in_is_refused_by_name(tmp_path, capsys):
-    bag = tmp_path / "world.mcap"
-    write_bag(simulate("warehouse", 0, aisles=2, laps=1), bag)
-    for words, culprit in (
-        (["replay", bag, "--map", tmp_path / "nothing", "--out", tmp_path / "a"], "nothing is not a run folder"),
-        (["replay", bag, "--map", tmp_path, "--out", tmp_path / "a"], "is not a run folder"),
-    ):
-        assert main([str(word) for word in words]) == 2
-        assert culprit in capsys.readouterr().err
-        assert not (tmp_path / "a").exists()

@@ -3,12 +3,9 @@
 import itertools
 import json
 
-import pytest
 from live_drive import TAGS, Drive
 from live_nodes import finish, node, often, replayed, results, robot, until
 from rosgraph_msgs.msg import Clock
-
-from graph_slam_ros.formats.cdr import LATEST_NS
 
 NS = 10**9
 HEARS = "/diagnostics", "/tf", "pose"
@@ -59,15 +56,16 @@ def simulated(folder, *parameters):
 # -- jumps -------------------------------------------------------------------------------------------------------------
 
 
-def test_B7_B8_B11_B12_B14_of_a_simulated_clock_jumps_alone_begin_segments_of_one_map(tmp_path):
-    loops = often(2)
+def test_B7_B8_B11_B12_B13_B14_of_a_simulated_clock_jumps_alone_begin_segments_of_one_map(tmp_path):
+    loops = often(1)
     with simulated(tmp_path / "run") as n, robot(hears=HEARS) as r:
         r.wait_for_node()
         played = Played(r)
+        r.until_it_says("WAITING", "use_sim_time is set and nothing comes on /clock")
         until(lambda: r.heard["pose"], lambda s: (played.drive.step(r), r.spin(s)), "pose before there is a clock")
         r.until_it_says("DEGRADED", "nothing comes on /clock")
         r.until_it_says("OK", spin=played.step)
-        for _ in range(10):
+        for _ in range(5):
             played.tell(played.drive.stamp_ns - NS // 8)  # back a little
             played.go(3)
         r.until_it_says("OK", spin=played.step)
@@ -101,7 +99,7 @@ def test_B7_B8_B11_B12_B14_of_a_simulated_clock_jumps_alone_begin_segments_of_on
             played.drive = Drive(4_000 * NS)
             played.tell()
             r.spin(0.1)
-            until(lambda: played.drive.steps >= 120, played.step, "end of the recording")
+            until(lambda: played.drive.steps >= 80, played.step, "end of the recording")
             r.until_it_says("OK")
         r.settle()
         r.until_graph(segments=2 + loops)
@@ -109,7 +107,7 @@ def test_B7_B8_B11_B12_B14_of_a_simulated_clock_jumps_alone_begin_segments_of_on
         finish(n, r)
     told = numbers(tmp_path / "run")
     assert (told["segments"], told["landmarks"]) == (2 + loops, len(TAGS))
-    assert told["keyframes"] > 30 * loops
+    assert told["keyframes"] > 20 * loops
     assert replayed(tmp_path / "run", tmp_path) == results(tmp_path / "run")
 
 
@@ -161,61 +159,29 @@ def test_B6_B7_B14_odometry_tells_of_a_jump_where_no_clock_does_and_the_future_i
     assert replayed(tmp_path / "run", tmp_path) == results(tmp_path / "run")
 
 
-@pytest.mark.parametrize("policy", ["reset", "stop"])
-def test_B7_where_that_is_asked_for_a_jump_back_begins_another_run_or_nothing_is_taken_until_reset(tmp_path, policy):
-    with simulated(tmp_path / "run", f"time.on_jump:={policy}") as n, robot(hears=HEARS) as r:
+def test_B7_where_that_is_asked_for_a_jump_back_begins_another_run_or_nothing_is_taken_until_reset(tmp_path):
+    with simulated(tmp_path / "run", "time.on_jump:=reset") as n, robot(hears=HEARS) as r:
         r.wait_for_node()
         played = Played(r)
         r.until_it_says("OK", spin=played.step)
         played.go(30)
-        before = r.graph()["keyframes"]
         played.drive.stamp_ns -= 60 * NS
-        if policy == "stop":
-            r.until_it_says("ERROR", "stopped when the clock jumped back", "~/reset begins anew", spin=played.step)
-            before = r.graph()["keyframes"]
-            played.go(30)
-            r.until_it_says("ERROR", spin=played.step)
-            assert r.graph()["keyframes"] == before
-            assert r.call("reset").success
         until((tmp_path / "run-1" / "path.tum").exists, played.step, "new run")
         r.until_it_says("OK", spin=played.step)
+        assert r.set({"time.on_jump": "stop"}) == (True, "")
+        played.go(30)
+        played.drive.stamp_ns -= 60 * NS
+        r.until_it_says("ERROR", "stopped when the clock jumped back", "~/reset begins anew", spin=played.step)
+        before = r.graph()["keyframes"]
+        played.go(30)
+        r.until_it_says("ERROR", spin=played.step)
+        assert r.graph()["keyframes"] == before
+        assert r.call("reset").success
+        until((tmp_path / "run-2" / "path.tum").exists, played.step, "new run")
+        r.until_it_says("OK", spin=played.step)
         finish(n, r)
-    earlier, later = numbers(tmp_path / "run-1"), numbers(tmp_path / "run")
-    assert earlier["keyframes"] >= before
-    assert policy == "reset" or earlier["keyframes"] <= before + 1, "what waited for its turn"
-    assert (earlier["segments"], later["segments"]) == (1, 1)
-    for run in ("run-1", "run"):
+    assert numbers(tmp_path / "run-2")["keyframes"] <= before + 1, "what waited for its turn"
+    for run in ("run-1", "run-2", "run"):
+        assert numbers(tmp_path / run)["segments"] == 1
         (tmp_path / f"of_{run}").mkdir()
         assert replayed(tmp_path / run, tmp_path / f"of_{run}") == results(tmp_path / run)
-
-
-def test_B25_stamps_at_both_ends_of_time_count_and_the_robot_goes_on_by_a_clock_that_stops_leaps_and_is_zero(tmp_path):
-    with simulated(tmp_path / "run") as n, robot(hears=HEARS) as r:
-        r.wait_for_node()
-        played = Played(r, start_s=2**31 - 400)
-        r.until_it_says("OK", spin=played.step)
-        drive, right_ns = played.drive, played.drive.stamp_ns
-        for wrong_ns in (1, NS, right_ns + 300 * NS, LATEST_NS):
-            played.go(3)
-            right_ns, drive.stamp_ns = drive.stamp_ns, wrong_ns
-            r.send("/odom", drive.odometry())
-            r.send("/landmarks", drive.seen())
-            drive.stamp_ns = right_ns
-        for clock_ns in (drive.stamp_ns + 60 * NS, drive.stamp_ns + 120 * NS):
-            played.tell(clock_ns)  # forth, and with the next step back: a segment each
-            r.spin(0.1)
-            played.go(20)
-            r.until_it_says("OK", spin=played.step)
-        played.tell(0)
-        r.spin(0.1)
-        played.go(40)
-        r.until_it_says("OK", spin=played.step)
-        assert r.save().success
-        assert drive.off_by(r) < 1.0
-        finish(n, r)
-        assert "Traceback" not in n.said
-    counters = numbers(tmp_path / "run")["counters"]
-    assert counters["odom"]["late"] == 2
-    assert counters["odom"]["future"] == 2
-    assert "node" not in counters
-    assert replayed(tmp_path / "run", tmp_path) == results(tmp_path / "run")

@@ -12,7 +12,6 @@ import subprocess
 import sys
 import threading
 from dataclasses import dataclass
-from pathlib import Path
 
 import journal_torture
 import pytest
@@ -22,8 +21,6 @@ from mcap.writer import CompressionType, Writer
 from reliability import times
 
 from graph_slam_ros.errors import FormatError
-from graph_slam_ros.formats import durable
-from graph_slam_ros.formats.durable import AppendedFile
 from graph_slam_ros.measurements.types import to_record
 from graph_slam_ros.node.session import Session
 from graph_slam_ros.recordings.mcap_records import MAGIC
@@ -162,24 +159,6 @@ def test_T9_F3_a_flipped_bit_gives_no_record_that_was_not_written_and_none_after
         untold += is_all and not losses
     assert untold < FLIPS / 2  # places that no record depends on: times, the index
     assert not row("journal_flipped", FLIPS, FLIPS, wrong)
-
-
-def test_F3_a_last_chunk_that_is_taken_for_something_else_is_missed_and_nothing_after_it_is_read(parts, tmp_path):
-    part, after = parts[0], parts[1]
-    (before, _), (_, count) = part.flushed[-2:]
-    heads = [before]  # of the records from there to the end of the data
-    while part.data[heads[-1]] != Opcode.DATA_END:
-        heads.append(heads[-1] + 9 + struct.unpack_from("<Q", part.data, heads[-1] + 1)[0])
-    written, missed = part.records + after.records, 0
-    for at, bit in itertools.product(heads, range(8)):
-        data = bytearray(part.data)
-        data[at] ^= 1 << bit
-        losses = []
-        read = list(read_ingest(laid_out(tmp_path, [data, after.data]), losses))
-        assert read == written[: len(read)], (at, bit)
-        assert read == written or losses, (at, bit)
-        missed += len(read) < count
-    assert missed >= 7
 
 
 def test_F19_a_length_of_2_to_the_60_in_a_journal_is_refused_before_memory_is_asked_for(parts, tmp_path):
@@ -350,95 +329,8 @@ def test_P3_a_run_ends_while_a_flush_in_the_background_waits_for_its_turn(tmp_pa
     assert len(list(read_ingest(tmp_path / "run", []))) == 1
 
 
-def test_P3_who_accepts_measurements_does_not_wait_for_a_disk_that_is_slow_at_a_save(tmp_path, monkeypatch):
-    fsync, asked, goes_on = os.fsync, threading.Event(), threading.Event()
-
-    def slow(fd):
-        if threading.current_thread().name.startswith("journal"):
-            asked.set()
-            goes_on.wait(60.0)
-        fsync(fd)
-
-    monkeypatch.setattr(os, "fsync", slow)
-    recorder, slam = RunRecorder(tmp_path / "run", Config(), 1e-9), GraphSlam(Config())
-    recorder.sink(recorded()[0])
-    assert asked.wait(10.0)
-    saves = threading.Thread(target=recorder.save, args=(slam,), daemon=True)
-    saves.start()
-    until_it_waits = threading.Event()
-    while recorder._writing.acquire(blocking=False):
-        recorder._writing.release()
-        until_it_waits.wait(0.01)
-    recorder.accept(recorded()[1])
-    assert in_time(recorder.flush_in_background)
-    assert saves.is_alive()
-    goes_on.set()
-    saves.join(10.0)
-    assert not saves.is_alive()
-    recorder.close()
-    assert len(list(read_ingest(tmp_path / "run", []))) == 2
-
-
-def test_P3_a_part_that_begins_while_the_disk_is_still_busy_with_another_is_not_asked_for_too_soon(
-    tmp_path, monkeypatch
-):
-    fsync, flush, begins, told = os.fsync, AppendedFile.flush, threading.Event(), []
-
-    def slow(fd):
-        if threading.current_thread() is not threading.main_thread():
-            assert begins.wait(10.0)
-        fsync(fd)
-
-    def late(file):
-        if file._path.name == "map_1.mcap" and not begins.is_set():
-            begins.set()
-            assert session._recorder._syncing.exception(10.0) is None
-        flush(file)
-
-    session = session_in(tmp_path / "run", told)
-    session.ingest(recorded()[:60])
-    session.save()
-    monkeypatch.setattr(os, "fsync", slow)
-    monkeypatch.setattr(AppendedFile, "flush", late)
-    session._recorder._due_s = 0.0
-    first, *others = recorded()[60:120]
-    session.accept([first])
-    session._recorder.flush()  # it asks the disk for the new part
-    session.process([first])
-    session.ingest(others)
-    assert begins.is_set()
-    session.finish()
-    assert not told
-
-
 def as_read(measurements):
     return [json.loads(json.dumps(to_record(m))) for m in measurements]
-
-
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full")
-def test_P4_what_a_full_device_does_not_take_waits(monkeypatch):
-    monkeypatch.setattr(durable, "created", lambda path: os.open(path, os.O_WRONLY))  # only new files otherwise
-    file = AppendedFile(Path("/dev/full"))
-    file.write(b"of use")
-    for _ in range(2):
-        with pytest.raises(OSError, match=os.strerror(errno.ENOSPC)):
-            file.flush()
-        assert (file.unwritten, file.tell()) == (6, 6)
-    file.abandon()
-
-
-def read_only(tmp_path):
-    if os.geteuid():
-        (tmp_path / "locked").mkdir(mode=0o555)
-        return tmp_path / "locked"
-    return Path("/proc")  # root writes anywhere else
-
-
-@pytest.mark.parametrize("where", [read_only, lambda tmp_path: Path("/dev/null")], ids=["read_only", "no_folder"])
-def test_P5_a_folder_that_cannot_be_written_is_refused_when_it_is_configured(where, tmp_path):
-    told = []
-    with pytest.raises(RunError, match="run: "):
-        session_in(where(tmp_path) / "run", told)
 
 
 def test_P3_a_power_cut_finds_names_and_contents_on_the_disk_before_anything_hangs_on_them(tmp_path, monkeypatch):

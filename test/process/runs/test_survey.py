@@ -4,9 +4,10 @@ import json
 
 import numpy as np
 import pytest
+from rows import each
 
 from graph_slam_ros.cli import main
-from graph_slam_ros.config.survey import Surveyed, surveyed
+from graph_slam_ros.config.survey import Surveyed
 from graph_slam_ros.errors import ConfigError, FormatError, GraphSlamError
 from graph_slam_ros.graph import POINT_PRIOR, POSITION_PRIOR, R2, R3, SE2
 from graph_slam_ros.lie import se2, se3, so3
@@ -57,7 +58,7 @@ def start_of(recording, error=(0.0, 0.0, 0.0)):
 # -- the map lies where it is said to ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("sensor", ["pose", "position", "range_bearing", "bearing", "range"])
+@pytest.mark.parametrize("sensor", ["position", "bearing", "range"])
 def test_a_warehouse_lies_on_its_floor_plan_whatever_is_seen_of_the_surveyed_tags(sensor):
     recording = simulate("warehouse", 4, **SMALL, sensor=sensor)
     rough = start_of(recording, (0.3, -0.2, 0.1))
@@ -71,23 +72,9 @@ def test_a_warehouse_lies_on_its_floor_plan_whatever_is_seen_of_the_surveyed_tag
     assert not slam.waiting
 
 
-def test_three_surveyed_tags_hold_the_whole_map_and_the_others_follow():
-    recording = simulate("warehouse", 4, **SMALL)
-    names = [one.id for seen in (recording.seen[0], recording.seen[150], recording.seen[-1]) for one in seen.sightings]
-    text = plan_of(recording, list(dict.fromkeys(names))[:3])
-    slam = driven(
-        recording, landmarks__surveyed=text, anchor__pose=start_of(recording, (0.3, 0.1, 0.1)), anchor__sigma_m=1.0,
-        anchor__sigma_rad=0.5,
-    )  # fmt: skip
-    assert errors(slam, recording)[0].max() < 0.3
-    assert slam.report.classes["surveyed"].edges == 3 < len(slam.landmarks)
-    (of_surveyed,) = slam.solver.marginal([slam.landmarks[names[0]].vertex])
-    assert np.sqrt(of_surveyed[0, 0]) < SIGMA_M * 1.01
-
-
 @pytest.mark.parametrize(
     ("sensor", "anchor"),
-    [("pose", {}), ("position", {"anchor__sigma_m": 1e3, "anchor__sigma_rad": 3.0}), ("range_bearing", {})],
+    [("position", {"anchor__sigma_m": 1e3, "anchor__sigma_rad": 3.0}), ("range_bearing", {})],
 )
 def test_without_a_start_pose_the_map_turns_into_the_plan_by_what_is_seen(sensor, anchor):
     recording = simulate("warehouse", 4, **SMALL, sensor=sensor)
@@ -184,39 +171,7 @@ def within(sigma, n):
     return tuple(map(tuple, (sigma * sigma * np.eye(n)).tolist()))
 
 
-def test_a_table_is_read_as_spreadsheets_write_it():
-    text = 'id, x, y, z, sigma\r\n\r\n"door, left", 1.5, -2e0, 0.7, 0.05\r\ntag36h11:5,3,4,1,0.1\r\n'
-    assert surveyed(text, 2) == {
-        "door, left": Surveyed((1.5, -2.0), within(0.05, 2)),
-        "tag36h11:5": Surveyed((3.0, 4.0), within(0.1, 2)),
-    }
-    assert surveyed(text, 3)["tag36h11:5"] == Surveyed((3.0, 4.0, 1.0), within(0.1, 3))
-    assert surveyed("", 2) == {}
-
-
-@pytest.mark.parametrize(
-    "text, dimensions, said",
-    [
-        (table([("a", 1, 2, 0.1)]), 3, "line 1: columns of a position: id,x,y, expected id,x,y,z"),
-        (table([("a", 1, 2)]), 2, "line 2: 3 values, not id,x,y,sigma"),
-        (table([("a", 1, 2, 0.1), ("b", 1, "2,5", 0.1)]), 2, "line 3: 5 values, not id,x,y,sigma"),
-        (table([("a", "east", 2, 0.1)]), 2, "line 2: x 'east' is not a finite number"),
-        (table([("a", 1, "nan", 0.1)]), 2, "line 2: y 'nan' is not a finite number"),
-        (table([("a", 1, "1_0", 0.1)]), 2, "line 2: y '1_0' is not a finite number"),
-        (table([("a", 1, 2, 0)]), 2, "line 2: sigma 0 is not above 0: nothing is certain"),
-        (table([("", 1, 2, 0.1)]), 2, "line 2: the id is empty"),
-        (table([("a", 1, 2, 0.1), ("b", 0, 0, 1), ("a", 1, 2, 0.1)]), 2, "line 4: 'a' is given twice"),
-        ('id,x,y,sigma\n"a,1,2,0.1\n', 2, "line 2: unexpected end of data"),
-        ("id,x,y,sigma\n", 2, "a header and no landmark"),
-    ],
-)
-def test_what_is_wrong_with_a_table_is_said_with_its_line(text, dimensions, said):
-    with pytest.raises(ConfigError, match=r"^landmarks\.surveyed: ") as told:
-        Config.from_mapping({"landmarks.surveyed": text, "world.dimensions": dimensions})
-    assert str(told.value).removeprefix("landmarks.surveyed: ") == said
-
-
-@pytest.mark.parametrize(
+@each(
     "text, dimensions, said",
     [
         ("1 2", 2, "'1 2' is not 3 numbers"),
@@ -271,30 +226,3 @@ def test_a_run_keeps_the_survey_it_was_made_with_and_repeats_without_the_file(tm
     with pytest.raises(GraphSlamError, match=f"{plan}: no such file"):
         replay(bag, tmp_path / "none", Config.from_mapping({"landmarks.surveyed_file": str(plan)}))
     assert not (tmp_path / "none" / "run.json").exists()
-
-
-# -- live -------------------------------------------------------------------------------------------------------------
-
-
-def test_the_node_reads_the_file_and_saves_what_replay_saves(tmp_path):
-    live = pytest.importorskip("live_nodes")
-    recording = simulate("warehouse", 4, **SMALL)
-    bag, plan = tmp_path / "drive.mcap", tmp_path / "plan.csv"
-    write_bag(recording, bag)
-    plan.write_text(plan_of(recording))
-    words = ("--set", f"landmarks.surveyed_file={plan}", "--set", f"anchor.pose={start_of(recording)}")
-    replay(bag, tmp_path / "offline", Config.from_mapping(dict(word.split("=", 1) for word in words[1::2])))
-    done = live.graph_slam("replay", bag, "--ros", "--out", tmp_path / "live", *words)
-    assert done.returncode == 0, done.stderr
-    for name in ("graph.g2o", "path.tum", "landmarks.csv"):
-        assert (tmp_path / "live" / name).read_bytes() == (tmp_path / "offline" / name).read_bytes()
-
-
-def test_a_node_whose_file_is_wrong_does_not_start_and_says_where(tmp_path):
-    live = pytest.importorskip("live_nodes")
-    plan = tmp_path / "plan.csv"
-    plan.write_text(table([("a", 1, 2, 0)]))
-    with live.node("output.folder:=''", f"landmarks.surveyed_file:={plan}") as n:
-        code, said = n.ended(60.0)
-    assert code == 2
-    assert f"{plan}: line 2: sigma 0 is not above 0" in said

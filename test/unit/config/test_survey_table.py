@@ -5,6 +5,7 @@ import re
 import numpy as np
 import pytest
 from places import ROOT
+from rows import each
 
 from graph_slam_ros.config.survey import surveyed
 from graph_slam_ros.errors import ConfigError
@@ -18,12 +19,7 @@ def only(header, line, dimensions):
     return known
 
 
-def test_columns_may_stand_in_any_order():
-    text = "sigma,y,id,x,yaw,sigma_rad"
-    assert only(text, "0.1,2,a,1,0.5,0.2", 2) == only("id,x,y,sigma,yaw,sigma_yaw", "a,1,2,0.1,0.5,0.2", 2)
-
-
-@pytest.mark.parametrize("header", ["id,x,y,z,sigma", "id,x,y,z,sigma_x,sigma_y,sigma_z"])
+@each("header", ["id,x,y,z,sigma", "id,x,y,z,sigma_x,sigma_y,sigma_z"])
 def test_a_sigma_for_all_axes_or_for_each(header):
     each = len(header.split(",")) > 5
     known = only(header, "a,1,2,3," + ("0.1,0.2,0.3" if each else "0.1"), 3)
@@ -32,7 +28,7 @@ def test_a_sigma_for_all_axes_or_for_each(header):
     assert np.diag(known.position_covariance) == pytest.approx([0.01, 0.04, 0.09] if each else [0.01] * 3)
 
 
-@pytest.mark.parametrize("dimensions", [2, 3])
+@each("dimensions", [2, 3])
 def test_a_full_covariance_of_the_position(dimensions):
     known = only("id,x,y,z,cov_xx,cov_xy,cov_xz,cov_yy,cov_yz,cov_zz", "a,1,2,3,4,1,0.5,5,0.25,6", dimensions)
     full = np.array([[4, 1, 0.5], [1, 5, 0.25], [0.5, 0.25, 6]])
@@ -40,7 +36,7 @@ def test_a_full_covariance_of_the_position(dimensions):
     assert only("id,x,y,cov_xx,cov_xy,cov_yy", "a,1,2,4,1,5", 2).position_covariance == ((4, 1), (1, 5))
 
 
-@pytest.mark.parametrize("dimensions", [2, 3])
+@each("dimensions", [2, 3])
 def test_angles_and_a_quaternion_say_the_same(dimensions):
     q = se3.rotation(se3.from_xyz_rpy((0, 0, 0, *RPY)))
     by_angles = only(
@@ -57,7 +53,7 @@ def test_angles_and_a_quaternion_say_the_same(dimensions):
         assert by_angles.orientation == pytest.approx([RPY[2]])
 
 
-@pytest.mark.parametrize("dimensions", [2, 3])
+@each("dimensions", [2, 3])
 def test_a_sigma_for_each_angle_is_about_the_axes_of_map(dimensions):
     header = "id,x,y,z,sigma_x,sigma_y,sigma_z,roll,pitch,yaw,sigma_roll,sigma_pitch,sigma_yaw"
     known = only(header, "a,1,2,3,0.1,0.2,0.3,0,0,1,0.4,0.5,0.6", dimensions)
@@ -110,7 +106,7 @@ WRONG = """
 """
 
 
-@pytest.mark.parametrize("row", WRONG.strip().splitlines())
+@each("row", WRONG.strip().splitlines())
 def test_what_is_wrong_is_said_with_line_column_and_what_is_expected(row):
     dimensions, header, line, said = (one.strip() for one in row.split(" | "))
     text = line.replace("\\n", "\n")

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from messages import counted, gnss, heard, receiver
 from reliability import tell, times
+from rows import each
 
 from graph_slam_ros.errors import ConfigError
 
@@ -38,7 +39,7 @@ PLACES = {
 }
 
 
-@pytest.mark.parametrize("place", PLACES)
+@each("place", PLACES)
 def test_A31_wherever_on_earth_the_map_has_fixes_where_they_are(place):
     rng, tried = np.random.default_rng(31), times(40, 4000)
     for _ in range(tried):
@@ -68,7 +69,7 @@ NOWHERE = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("dimensions", [2, 3])
+@each("dimensions", [2, 3])
 def test_A31_what_is_nowhere_is_refused_and_becomes_no_origin(dimensions):
     for reason, places in NOWHERE.items():
         for place in places:
@@ -85,7 +86,7 @@ def test_A31_what_is_nowhere_is_refused_and_becomes_no_origin(dimensions):
     assert heard(b, "gps", gnss()).datum == (48.0, 11.0, 500.0)
 
 
-@pytest.mark.parametrize("datum", ["95 0 0", "48 400 0", "48 11 1e9"])
+@each("datum", ["95 0 0", "48 400 0", "48 11 1e9"])
 def test_A31_an_origin_that_is_nowhere_is_refused_by_name(datum):
     with pytest.raises(ConfigError, match=r"^gps\.datum: (latitude|longitude|altitude) \S+ is not in"):
         receiver(datum=datum)

@@ -25,13 +25,12 @@ from messages import (
     receiver,
     transforms,
 )
+from rows import each
 
 from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.lie import se2, se3, so3
 from graph_slam_ros.measurements.reasons import warnings
 from graph_slam_ros.measurements.types import Closure, Fix, Odometry, from_record, to_record
-from graph_slam_ros.messages.inputs.fixes import east_north_up
-from graph_slam_ros.messages.interfaces import typestore
 from graph_slam_ros.messages.to_msg import covariance6, make
 
 IN_SPACE = {"world": {"dimensions": 3}}
@@ -104,13 +103,7 @@ def test_odometry_becomes_its_pose_and_the_covariance_of_its_twist():
     assert matrix(m.twist_covariance, 6) == pytest.approx(twist, rel=1e-12)
 
 
-def test_a_repeated_twist_covariance_is_judged_each_time():
-    b, bad = border(), odometry(twist=np.diag([0.04, -0.01, 0.02]))
-    assert [heard(b, "odom", cdr) is None for cdr in (bad, bad, odometry(), bad)] == [True, True, False, True]
-    assert counted(b) == {"odom": {"covariance_not_positive_definite": 3}}
-
-
-@pytest.mark.parametrize(
+@each(
     "dimensions, variances",
     [
         (3, (0.04, 0.01, 0.0, 0.1, 0.1, 0.02)),
@@ -130,14 +123,6 @@ def test_in_space_the_lever_arm_of_a_linked_child_frame_is_applied_with_its_tilt
     m = heard(b, "odom", odometry(pose(3.0, 4.0, 5.0, quaternion(-0.2, 0.4, 1.0)), child="imu"))
     back = se3.compose(m.T_odom_base, (*arm, *numbers(q)))
     assert back == pytest.approx((3.0, 4.0, 5.0, *numbers(quaternion(-0.2, 0.4, 1.0))))
-
-
-def test_frames_are_those_of_the_configuration():
-    b = border(frames={"odom": "start", "base": "body"})
-    assert heard(b, "odom", odometry(frame="start", child="body")) is not None
-    assert heard(b, "odom", odometry()) is None
-    vo = listening("vo", "nav_msgs/msg/Odometry", settings={"frame": "odom"})
-    assert heard(vo, "vo", odometry(frame="camera_init")).source == "vo"
 
 
 # -- landmarks ------------------------------------------------------------------------------------------------------
@@ -204,14 +189,6 @@ def test_links_are_followed_over_several_frames_and_in_both_directions_and_a_loo
     assert counted(b) == {"detections": {"frame_unknown": 1}}
 
 
-def test_a_bad_static_transform_is_counted_and_the_others_are_kept():
-    bad = link(child="a", x=math.nan), link(child="b", q=quaternion(norm=0.0)), link(child="")
-    b = border(*bad, link(child="good", x=1.0))
-    b.convert("tf_static", b"\x00\x01\x00\x00\xff\xff\xff")
-    assert counted(b) == {"tf_static": {"nonfinite": 1, "zero_quaternion": 1, "frame_empty": 1, "undecodable": 1}}
-    assert seen(b, detection(pose(2.0, 1.0)), frame="good")[0].measured == (3.0, 1.0)
-
-
 def test_the_tangent_covariance_of_a_tag_is_what_samples_of_its_message_say():
     covariance, q = spread(6, 3), quaternion(0.5, 0.2, -1.0)
     (s,) = seen(border(mast(), **IN_SPACE), detection(pose(2.0, 1.0, 0.7, q), covariance, frame="mast"))
@@ -229,16 +206,6 @@ def test_the_tangent_covariance_of_a_tag_is_what_samples_of_its_message_say():
     )
 
 
-def test_a_tag_in_an_optical_frame_has_the_heading_of_its_x_axis_in_the_base():
-    # seen by the camera, the tag's x axis points back at it: along the optical -z
-    tag = pose(0.5, 0.2, 4.0, quaternion(pitch=math.pi / 2))
-    (s,) = seen(border(camera()), detection(tag, np.diag([0.01, 0.04, 0.25, 0.03, 0.02, 0.05])), frame="camera_optical")
-    assert s.measured[:2] == pytest.approx((4.3, -0.4))
-    assert abs(s.measured[2]) == pytest.approx(math.pi)
-    # the base's z is the optical -y: heading variance 0.02; turned by 180 degrees x and y keep their variances
-    assert matrix(s.covariance, 3) == pytest.approx(np.diag([0.25, 0.01, 0.02]), abs=1e-12)
-
-
 def test_a_landmark_is_a_pose_only_where_its_orientation_is_known():
     for variance, size in ((0.2499, 3), (0.2501, 2), (0.0, 2), (1e6, 2)):
         (s,) = seen(border(), detection(covariance=np.diag([0.01, 0.04, 1.0, 1.0, 1.0, variance])))
@@ -253,7 +220,7 @@ def test_a_landmark_is_a_pose_only_where_its_orientation_is_known():
 # -- how an input is told -------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
+@each(
     "sections, complaint",
     [
         ({"odom.type": "nav_msgs/msg/Path"}, "odom.type: 'nav_msgs/msg/Path' is no type of an input: docs/inputs.md"),
@@ -301,7 +268,7 @@ def located(dimensions=2, *links, type_name=POSE, **settings):
     return listening("mocap", f"geometry_msgs/msg/{type_name}", *links, dimensions=dimensions, settings=given)
 
 
-@pytest.mark.parametrize("dimensions", [2, 3])
+@each("dimensions", [2, 3])
 def test_a_pose_of_a_sensor_in_a_linked_frame_is_a_fix_of_the_base_and_so_are_samples_of_it(dimensions):
     hall = link("map", "hall", 10.0, 5.0, 0.0, quaternion(yaw=1.2))
     b, covariance, q = located(dimensions, hall, mount="0.4 -0.2 0.3 0 0 0.7"), spread(6, 5), quaternion(yaw=2.0)
@@ -349,14 +316,6 @@ def test_a_pose_may_be_a_landmark_of_configured_identity_or_odometry():
 
 
 # -- satellites -----------------------------------------------------------------------------------------------------
-
-
-def test_east_north_up_of_a_published_pair_of_points_is_the_published_range_azimuth_and_elevation():
-    here = 42.002581974253744, -81.997751960067460, 1139.701799575106
-    azimuth, elevation = math.radians(33.0), math.radians(70.0)  # of 1000 m, from 42 N, 82 W, 200 m
-    level = 1000.0 * math.cos(elevation)
-    expected = level * math.sin(azimuth), level * math.cos(azimuth), 1000.0 * math.sin(elevation)
-    assert east_north_up(here, (42.0, -82.0, 200.0)) == pytest.approx(expected, abs=1e-6)
 
 
 def test_the_datum_is_configured_or_that_of_the_map_or_the_first_fix():
@@ -412,7 +371,7 @@ def test_an_imu_gives_the_attitude_of_the_base_in_space_and_its_heading_in_the_p
     assert (m.kind, m.measured, m.covariance) == ("heading", pytest.approx((1.3,)), pytest.approx((0.091,)))
 
 
-@pytest.mark.parametrize("dimensions", [2, 3])
+@each("dimensions", [2, 3])
 def test_an_imu_as_gyro_gives_the_rate_about_the_axes_of_the_base(dimensions):
     turn, covariance = so3.matrix(numbers(CHIP[3])), np.diag([1e-4, 2e-4, 9e-4]) + 1e-5
     rate, axes = np.array([0.1, -0.2, 0.7]), slice(2, 3) if dimensions == 2 else slice(0, 3)
@@ -433,7 +392,7 @@ def test_an_imu_as_gyro_gives_the_rate_about_the_axes_of_the_base(dimensions):
 # -- closures -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("dimensions", [2, 3])
+@each("dimensions", [2, 3])
 def test_a_detection_of_where_the_robot_was_is_a_closure_and_so_are_samples_of_it(dimensions):
     lidar = link("base_link", "lidar", 0.3, 0.1, 0.5, quaternion(yaw=0.6))
     covariance, q, earlier = spread(6, 6), quaternion(yaw=-1.1), STAMP_NS - 60_000_000_000
@@ -478,8 +437,8 @@ def test_the_transform_from_odom_to_the_base_is_odometry_and_no_other_is():
     assert (counted(b), b.not_found("odom")) == ({}, "")
 
 
-@pytest.mark.parametrize(
-    ("parent", "child", "settings", "said"),
+@each(
+    "parent, child, settings, said",
     [
         ("wheels", "base_link", {}, "odom -> base_link has come, but wheels -> base_link: correct frames.odom"),
         ("odom", "chassis", {}, "odom -> base_link has come, but odom -> chassis: correct frames.odom or frames.base"),
@@ -526,34 +485,6 @@ def test_a_sensor_on_a_joint_is_where_it_was_at_the_stamp_of_what_it_saw_which_w
         assert only(m).measured == pytest.approx((1.0 + 2.0 * math.cos(yaw), 2.0 * math.sin(yaw)))
 
 
-def test_what_no_transform_links_is_not_tried_again_with_each_message():
-    tried = []
-
-    class Watched:
-        """A message that notes when it is read."""
-
-        def __init__(self, message):
-            self._message = message
-
-        def __getattr__(self, name):
-            tried.append(name)
-            return getattr(self._message, name)
-
-    kind = "vision_msgs/msg/Detection3DArray"
-    b = border(
-        **MOVING,
-        frames={"base": "base_lnk"},
-        decoders={kind: lambda cdr: Watched(typestore().deserialize_cdr(cdr, kind))},
-    )
-    for k in range(20):
-        assert by_turret(b) is None
-        b.convert("odom", odometry(stamp_ns=STAMP_NS + k))
-        b.convert("tf", turret(0.1 * k, 0.0))
-    assert tried.count("detections") < 100, "not 20 * 20"
-    assert b.finish() == []
-    assert counted(b)["detections"] == {"frame_unknown": 20}
-
-
 def test_a_tag_on_tf_that_waits_for_its_sensors_joint_is_not_taken_for_one_that_is_sent_again():
     b = listening("tags", TF, settings={"use": "landmarks", "frame_prefix": "tag"}, **MOVING)
     b.convert("tf", turret(-0.1, 0.0))
@@ -593,11 +524,3 @@ def test_of_what_waits_for_tf_only_so_much_is_kept():
     assert counted(b) == {"detections": {"frame_unknown": 2}}
     late = b.convert("tf", turret(0.02, 0.0)) + b.convert("tf", turret(0.1, 0.0))
     assert [m.stamp_ns - STAMP_NS for m in late] == [20_000_000, 30_000_000, 40_000_000]
-
-
-def test_what_we_estimate_ourselves_is_no_transform_to_measure_by():
-    b = border(**MOVING)
-    b.convert("tf", transforms(link("map", "base_link", 5.0)))
-    assert seen(b, detection(), frame="map") == ()
-    assert b.finish() == []
-    assert counted(b) == {"detections": {"frame_unknown": 1}}

@@ -1,5 +1,6 @@
 """Landmarks from every type of message: point clouds, markers, ranges, and packages that need not be installed."""
 
+import itertools
 import math
 import struct
 from dataclasses import replace
@@ -23,6 +24,7 @@ from messages import (
     sent,
     transforms,
 )
+from rows import each
 
 from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.lie import so3
@@ -45,8 +47,7 @@ def doubles(*names):
 # -- point clouds ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("big", [False, True])
-@pytest.mark.parametrize("height", [1, 2])
+@each("big, height", [*itertools.product([False, True], [1, 2])])
 def test_a_cloud_is_read_by_name_datatype_offset_step_and_byte_order(big, height):
     points = (1.5, -2.0, 0.25, 7, 0.1), (3.0, 4.0, 0.5, 8, 0.2)
     m = heard(scanner(3), "scan", cloud(XYZ, *points, big=big, height=height, row_padding=5))
@@ -69,7 +70,7 @@ def test_points_in_the_plane_need_no_height_nor_sigma_nor_identity():
         assert counted(b) == {}
 
 
-@pytest.mark.parametrize(
+@each(
     "name, kind, value, told",
     [
         ("size", "f8", 0.3, ("", 0.3)),
@@ -129,7 +130,7 @@ def test_in_the_plane_a_tilted_sensors_direction_is_levelled():
 POINT = (1.0, 2.0, 3.0, 4, 0.1)
 
 
-@pytest.mark.parametrize(
+@each(
     "cdr, reason",
     [
         (cloud([("intensity", "f4")], (1.0,)), "fields_unknown"),
@@ -141,19 +142,11 @@ POINT = (1.0, 2.0, 3.0, 4, 0.1)
         (cloud(doubles("id", "range"), (1, -2.0)), "range_not_positive"),
         (cloud(doubles("id", "bearing"), (1, 0.2)), "noise_unknown"),
     ],
-    ids=lambda one: one if isinstance(one, str) else "",
 )
 def test_A29_a_cloud_that_cannot_be_used_is_counted_under_its_reason(cdr, reason):
     b = scanner(2)
     assert heard(b, "scan", cdr) is None
     assert counted(b) == {"scan": {reason: 1}}
-
-
-def test_repeated_bearings_are_merged_across_half_a_turn():
-    b, layout = scanner(2), doubles("id", "bearing", "sigma")
-    s = only(heard(b, "scan", cloud(layout, (1, math.pi - 0.01, 0.02), (1, 0.01 - math.pi, 0.02))))
-    assert (math.cos(s.measured[0]), s.covariance) == (pytest.approx(-1.0), pytest.approx((0.0002,)))
-    assert counted(b) == {"scan": {"id_merged": 1}}
 
 
 # -- markers --------------------------------------------------------------------------------------------------------
@@ -232,7 +225,7 @@ def test_apriltags_are_where_tf_says_at_their_stamp_and_poor_ones_are_left_out()
     assert at == pytest.approx((2.2, 1.0)), "the mount is the camera's: z ahead, x to the right"
 
 
-@pytest.mark.parametrize("later_s", [11, 300])
+@each("later_s", [11, 300])
 def test_a_tag_that_is_seen_again_after_a_while_counts_at_once(later_s):
     b = of(TAGS, AHEAD, inputs={"tf": True})
     for elapsed_s in range(later_s + 1):
@@ -263,14 +256,6 @@ def test_A29_arrays_of_marker_numbers_and_poses_must_be_of_one_length():
     assert told(m) == [("5", "pose", (2.0, 1.0, 0.3), SIGMAS)]
     assert heard(b, "seen", sent(kind, header=HEAD, marker_ids=np.array([5, 6], np.int64), poses=[AT])) is None
     assert counted(b) == {"seen": {"lengths_differ": 1}}
-
-
-def test_aruco_boards_are_landmarks_by_name():
-    kind, package = "aruco_opencv_msgs/msg/ArucoDetection", "aruco_opencv_msgs/msg/"
-    single = part(f"{package}MarkerPose", marker_id=4, pose=pose(1.0, 2.0))
-    board = part(f"{package}BoardPose", board_name="door", pose=pose(3.0, 4.0))
-    m = heard(of(kind), "seen", sent(kind, header=HEAD, markers=[single], boards=[board]))
-    assert [(s.id, s.measured) for s in m.sightings] == [("4", (1.0, 2.0)), ("door", (3.0, 4.0))]
 
 
 def test_poses_of_aruco_markers_have_a_header_each_that_goes_before_that_of_the_marker_and_of_the_array():
@@ -338,7 +323,7 @@ def test_cartographers_weights_are_inverse_standard_deviations():
     assert counted(b) == {"seen": {"covariance_unknown": 1, "nonfinite_covariance": 1}}
 
 
-@pytest.mark.parametrize("dimensions", [2, 3])
+@each("dimensions", [2, 3])
 def test_mrpts_ranges_and_bearings_pitch_down_and_minus_one_is_no_identity(dimensions):
     kind, single = "mrpt_msgs/msg/ObservationRangeBearing", "mrpt_msgs/msg/SingleRangeBearingObservation"
     b = of(kind, ("base_link", "mast", (1.0, 0, 0), quaternion()), dimensions=dimensions)
@@ -357,17 +342,6 @@ def test_mrpts_ranges_and_bearings_pitch_down_and_minus_one_is_no_identity(dimen
     assert counted(b) == {}
 
 
-def test_mrpts_beacons_are_ranges():
-    kind, parts = (
-        "mrpt_msgs/msg/ObservationRangeBeacon",
-        [part("mrpt_msgs/msg/SingleRangeBeaconObservation", range=5.0, id=2)],
-    )
-    cdr = sent(kind, header=HEAD, sensor_pose_on_robot=pose(0.5, 0.0), sensor_std_range=0.1, sensed_data=parts)
-    m = heard(of(kind), "seen", cdr)
-    assert told(m) == [("2", "range", (5.0,), [0.01])]
-    assert only(m).T_base_sensor == pytest.approx((0.5, 0.0, 0.0))
-
-
 def test_a_recorded_definition_that_lacks_what_is_read_is_refused_by_field():
     for type_name, text in (
         (TAGS, DEFINITIONS[TAGS].replace("int32 hamming\n", "")),
@@ -377,7 +351,7 @@ def test_a_recorded_definition_that_lacks_what_is_read_is_refused_by_field():
             recorded_decoder(Topic("/t", type_name, 1, text))
 
 
-@pytest.mark.parametrize(
+@each(
     "given, remedy",
     [
         ("fiducial_msgs/FiducialTransformArray", "is it fiducial_msgs/msg/FiducialTransformArray?"),

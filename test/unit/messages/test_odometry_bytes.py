@@ -1,10 +1,12 @@
 """Odometry read by the places of its bytes, alone or in runs, is what a decoder makes of it, with the same counters."""
 
+import itertools
 import math
 
 import numpy as np
 import pytest
 from messages import STAMP_NS, TWIST, border, counted, odometry, pose, quaternion
+from rows import each
 
 from graph_slam_ros.messages.from_msg import decoder
 from graph_slam_ros.messages.inputs.odometry import TYPE
@@ -75,15 +77,13 @@ def compare(messages, monkeypatch, **sections):
         assert converted(messages, monkeypatch, in_runs=in_runs, **sections)[:2] == expected
 
 
-@pytest.mark.parametrize("dimensions", [2, 3])
-@pytest.mark.parametrize("what", ODD)
+@each("dimensions, what", [*itertools.product([2, 3], ODD)])
 def test_a_message_is_read_as_it_is_decoded(what, dimensions, monkeypatch):
     messages = [*drive(5), *drive(1, **ODD[what]), *drive(8), *drive(8, **ODD[what]), *drive(3)]
     compare(messages, monkeypatch, world={"dimensions": dimensions})
 
 
-@pytest.mark.parametrize("dimensions", [2, 3])
-@pytest.mark.parametrize("seed", range(4))
+@each("dimensions, seed", [*itertools.product([2, 3], range(4))])
 def test_any_messages_are_read_as_they_are_decoded(seed, dimensions, monkeypatch):
     """Odd ones among plain ones, in any order, with stamps that stand still, leap and go back."""
     rng = np.random.default_rng(seed)
@@ -96,11 +96,7 @@ def test_any_messages_are_read_as_they_are_decoded(seed, dimensions, monkeypatch
     compare(messages, monkeypatch, world={"dimensions": dimensions})
 
 
-@pytest.mark.parametrize(
-    "sections",
-    [{"odometry": {"noise": "density"}}, {"odom": {"frame": "odom"}}, {"odom": {"offset_s": -0.25}}],
-    ids=str,
-)
+@each("sections", [{"odometry": {"noise": "density"}}, {"odom": {"frame": "odom"}}, {"odom": {"offset_s": -0.25}}])
 def test_settings_of_the_input_are_followed(sections, monkeypatch):
     compare([*drive(5), *drive(5, frame="elsewhere"), *drive(2, child="wheel")], monkeypatch, **sections)
 
@@ -117,7 +113,7 @@ def test_nearly_all_messages_are_not_decoded(monkeypatch):
     assert len(out.convert_run("odom", messages[1:], 0)) == 49
 
 
-@pytest.mark.parametrize(
+@each(
     "damaged",
     [
         lambda cdr: cdr[:-1],

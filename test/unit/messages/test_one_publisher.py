@@ -4,9 +4,9 @@ import itertools
 import math
 
 import numpy as np
-import pytest
 from live_drive import TAGS, Drive
 from messages import DETECTIONS, odometry, pose, quaternion
+from rows import each
 
 from graph_slam_ros.lie import se2, se3, so3
 from graph_slam_ros.messages.one_publisher import OnePublisher
@@ -60,9 +60,15 @@ def mixed(*publishers):
     return sorted(itertools.chain(*publishers), key=lambda m: m.stamp_ns)
 
 
-@pytest.mark.parametrize("offset", [(0.3, 0.0, 0.0), (0.0, 0.0, 0.4), (400.0, 0.0, 3.0)], ids=str)
-@pytest.mark.parametrize(("mine", "others"), [(50, 30), (10, 100), (100, 10)])
-@pytest.mark.parametrize("begin", [0.0, 4.0], ids=["from the start", "later"])
+@each(
+    "begin, mine, others, offset",
+    [
+        (0.0, 50, 30, (0.3, 0.0, 0.0)),
+        (4.0, 10, 100, (0.0, 0.0, 0.4)),
+        (0.0, 100, 10, (400.0, 0.0, 3.0)),
+        (4.0, 50, 30, (400.0, 0.0, 3.0)),
+    ],
+)
 def test_A34_of_two_publishers_the_first_is_used_and_every_message_of_the_other_is_counted(mine, others, begin, offset):
     used, other = driven(mine), driven(others, 9.0, begin, offset, late_s=0.003)
     p = Publisher().hear(mixed(used, other)).end()
@@ -152,7 +158,7 @@ def test_where_stamps_begin_anew_tracks_do():
     assert p.hear(used).used == [*used, *used]
 
 
-@pytest.mark.parametrize("ahead_s", [3, 55, 3600])
+@each("ahead_s", [3, 55, 3600])
 def test_what_is_far_ahead_is_refused_where_odometry_goes_on_without_it_and_used_where_it_goes_on_there(ahead_s):
     used, other = driven(20), driven(20, 10.0, 0.0, (5.0, 5.0, 1.0), late_s=0.01)
     later = [Odometry(m.stamp_ns + (10 + ahead_s) * NS, m.T_odom_base, None, "odom") for m in used]
@@ -203,10 +209,12 @@ def off_m(slam, truth):
     return math.dist(slam.trajectory()[-1][:2], truth[k][:2])
 
 
-@pytest.mark.parametrize("intruder", [range(300), range(100, 200)], ids=["from the start", "for a while"])
+@each("intruder", [range(300), range(100, 200)])
 def test_A34_a_recording_of_two_odometries_on_one_topic_gives_what_one_would(tmp_path, intruder):
-    truth = record(tmp_path / "two.mcap", intruder=intruder)
-    done = replay(tmp_path / "two.mcap", tmp_path / "run")
+    folder = tmp_path / str(len(intruder))
+    folder.mkdir()
+    truth = record(folder / "two.mcap", intruder=intruder)
+    done = replay(folder / "two.mcap", folder / "run")
     assert done.slam.segments == [0], "no segment begins"
     assert off_m(done.slam, truth) < 0.3
     assert done.summary["counters"]["odom"] == {"other_publisher": len(intruder)}

@@ -1,7 +1,10 @@
 """Clocks of two topics by the times at which their messages were received."""
 
+import itertools
+
 import numpy as np
 import pytest
+from rows import each
 
 from graph_slam_ros.messages.receive_times import clock_offset_s
 
@@ -12,8 +15,7 @@ def ns(seconds):
     return np.round(seconds * 1e9).astype(np.int64)
 
 
-@pytest.mark.parametrize("late_s", [0.0, 0.4, -20.0])
-@pytest.mark.parametrize("rate", [0.5, 1.0, 1.2, 5.0])
+@each("late_s, rate", [*itertools.product([0.0, 0.4, -20.0], [0.5, 1.0, 1.2, 5.0])])
 def test_a_recording_that_is_played_fast_or_slow_shows_the_offset_of_the_clock_and_no_other(rate, late_s):
     """The landmarks begin later than odometry, so their lags have grown by more."""
     received_s, other_s = 1.7e9 + LANDMARKS_S / rate, 1.7e9 + ODOMETRY_S / rate

@@ -1,9 +1,11 @@
 """Messages out: their bytes are those of rosbags' serialiser, their numbers those of ROS's conventions."""
 
+import itertools
 import math
 
 import numpy as np
 import pytest
+from rows import each
 
 from graph_slam_ros.graph import R2
 from graph_slam_ros.messages import markers, results, to_msg
@@ -80,7 +82,7 @@ WRITTEN = {
 }
 
 
-@pytest.mark.parametrize("name", WRITTEN)
+@each("name", WRITTEN)
 def test_what_is_written_has_the_bytes_of_the_serialiser_for_every_length_of_the_frames_name(name):
     for length in range(1, 17):
         frame = "abcdefghijklmnop"[:length]
@@ -90,15 +92,6 @@ def test_what_is_written_has_the_bytes_of_the_serialiser_for_every_length_of_the
             assert cdr == to_msg.encode(message)
             (first, *_) = getattr(message, "transforms", getattr(message, "markers", [message]))
             assert first.header.frame_id == frame
-
-
-def test_a_path_keeps_the_stamp_of_each_pose_and_carries_the_newest():
-    stamps = [STAMP_NS, STAMP_NS + 1, STAMP_NS + 20_000_000_000]
-    told = decode(to_msg.path("map", stamps, np.array([[1, 2, 0], [3, 4, math.pi / 2], [5, 6, -1.0]])), results.PATH)
-    assert [p.header.stamp.sec * 10**9 + p.header.stamp.nanosec for p in told.poses] == stamps
-    assert (told.header.stamp.sec, told.header.stamp.nanosec) == divmod(stamps[-1], 10**9)
-    assert {p.header.frame_id for p in told.poses} | {told.header.frame_id} == {"map"}
-    assert numbers(told.poses[1].pose) == pytest.approx((3, 4, 0, 0, 0, math.sqrt(0.5), math.sqrt(0.5)))
 
 
 def test_a_covariance_is_published_in_the_axes_of_the_parent_frame():
@@ -122,17 +115,7 @@ def test_a_covariance_is_published_in_the_axes_of_the_parent_frame():
     assert numbers(message.pose.pose) == pose
 
 
-def test_a_transform_names_its_frames_and_its_stamp():
-    for motion, expected in ((SPATIAL, SPATIAL), ((1.0, 2.0, math.pi), (1.0, 2.0, 0.0, 0.0, 0.0, 1.0, 0.0))):
-        (t,) = decode(to_msg.transform(STAMP_NS, "map", "odom", motion), results.TF).transforms
-        assert (t.header.frame_id, t.child_frame_id) == ("map", "odom")
-        assert (t.header.stamp.sec, t.header.stamp.nanosec) == divmod(STAMP_NS, 10**9)
-        p, q = t.transform.translation, t.transform.rotation
-        assert (p.x, p.y, p.z, q.x, q.y, q.z, q.w) == pytest.approx(expected)
-
-
-@pytest.mark.parametrize("little_endian", [True, False])
-@pytest.mark.parametrize("child", ["b", "ba", "bas", "base", "base_link"])
+@each("little_endian, child", [*itertools.product([True, False], ["b", "ba", "bas", "base", "base_link"])])
 def test_the_twist_of_an_odometry_message_is_passed_on_as_it_was_received(child, little_endian):
     for length in range(1, 9):
         twist = np.random.default_rng(length).standard_normal(42)
@@ -151,34 +134,20 @@ def test_the_twist_of_an_odometry_message_is_passed_on_as_it_was_received(child,
     assert twist_of(slashed, child) == slashed[-336:]
 
 
-@pytest.mark.parametrize("little_endian", [True, False])
-@pytest.mark.parametrize("frame, expected", [("map", True), ("/map", True), ("mapp", False), ("", False)])
+@each(
+    "little_endian, frame, expected",
+    [
+        sum(row, ())
+        for row in itertools.product(
+            [(one,) for one in [True, False]], [("map", True), ("/map", True), ("mapp", False), ("", False)]
+        )
+    ],
+)
 def test_a_transform_of_the_map_frame_is_known_without_being_decoded(frame, expected, little_endian):
     message = decode(to_msg.transform(STAMP_NS, frame, "odom", (1.0, 2.0, 3.0)), results.TF)
     cdr = bytes(typestore().serialize_cdr(message, results.TF, little_endian=little_endian))
     assert is_correction(cdr, "map") is expected
     assert not any(is_correction(cdr[:length], "map") for length in range(23)), "cut off: nothing is known"
-
-
-def test_diagnostics_tell_of_each_status_its_level_its_words_and_its_values():
-    statuses = [
-        to_msg.Status(to_msg.WARN, "graph_slam: odometry", "silent for 2 s", "robot 1", {"rate_hz": "0", "lost": "3"}),
-        to_msg.Status(to_msg.OK, "graph_slam: graph"),
-    ]
-    message = decode(to_msg.diagnostics(STAMP_NS, iter(statuses)), "diagnostic_msgs/msg/DiagnosticArray")
-    assert (message.header.stamp.sec, message.header.stamp.nanosec) == divmod(STAMP_NS, 10**9)
-    assert message.header.frame_id == ""
-    for told, status in zip(message.status, statuses, strict=True):
-        assert (told.level, told.name, told.message) == (status.level, status.name, status.message)
-        assert told.hardware_id == status.hardware_id
-        assert {v.key: v.value for v in told.values} == status.values
-    kind = message.status[0]
-    assert (kind.OK, kind.WARN, kind.ERROR, kind.STALE) == (to_msg.OK, to_msg.WARN, to_msg.ERROR, to_msg.STALE)
-
-
-def test_the_clock_is_the_stamp():
-    clock = decode(to_msg.clock(STAMP_NS), "rosgraph_msgs/msg/Clock").clock
-    assert (clock.sec, clock.nanosec) == divmod(STAMP_NS, 10**9)
 
 
 def driven():

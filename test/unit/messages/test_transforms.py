@@ -1,37 +1,13 @@
 """Transforms: fixed and moving links, at a stamp, kept for a while."""
 
-import math
-
 import pytest
 
-from graph_slam_ros.lie import se3, so3
+from graph_slam_ros.lie import so3
 from graph_slam_ros.messages.inputs.transforms import Transforms
 
 
 def at(x=0.0, y=0.0, z=0.0, yaw=0.0):
     return (x, y, z, *so3.exp((0.0, 0.0, yaw)))
-
-
-def test_a_moving_link_is_interpolated_between_its_stamps_and_never_extrapolated():
-    t = Transforms()
-    t.add_at(100, "base", "arm", at(1.0, 0.0, 0.0, 0.0))
-    t.add_at(300, "base", "arm", at(1.0, 0.0, 0.0, 1.0))
-    assert t.lookup("base", "arm", 200) == pytest.approx(at(1.0, 0.0, 0.0, 0.5))
-    assert t.lookup("base", "arm", 300) == at(1.0, 0.0, 0.0, 1.0)
-    assert t.lookup("base", "arm", 99) is None
-    assert t.lookup("base", "arm", 301) is None
-    assert t.lookup("base", "arm") is None, "what moves is nowhere at no time"
-
-
-def test_fixed_and_moving_links_make_one_chain_in_both_directions():
-    t = Transforms()
-    t.add("base", "torso", at(0.0, 0.0, 1.0))
-    t.add_at(5, "torso", "head", at(yaw=math.pi / 2))
-    t.add("head", "eye", at(0.1))
-    assert t.lookup("base", "eye", 5) == pytest.approx(at(0.0, 0.1, 1.0, math.pi / 2))
-    back = se3.compose(t.lookup("eye", "base", 5), t.lookup("base", "eye", 5))
-    assert back == pytest.approx(se3.IDENTITY)
-    assert t.lookup("base", "torso") == at(0.0, 0.0, 1.0)
 
 
 def test_messages_out_of_order_and_repeated_stamps_are_sorted_in_and_what_is_too_old_is_forgotten():

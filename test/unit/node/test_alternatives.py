@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-import pytest
+from rows import each
 
 from graph_slam_ros.node.alternatives import alternatives
 from graph_slam_ros.slam import Config
@@ -37,7 +37,7 @@ class Graph:
         return "/"
 
 
-@pytest.mark.parametrize(
+@each(
     "name, topics, texts",
     [
         ("odom", {"wheels": (ODOMETRY, "driver")}, ("/wheels has this type: odom.topic:=/wheels",)),

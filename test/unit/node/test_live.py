@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from messages import STAMP_NS
+from rows import each
 
 from graph_slam_ros.lie import se2, so3
 from graph_slam_ros.node import diagnostics
@@ -26,7 +27,6 @@ from graph_slam_ros.runs.tables import accepted_lately
 from graph_slam_ros.slam import Config, Counters, GraphSlam, Odometry, Sighting, Sightings
 
 NS = 1_000_000_000
-HERE, THERE = (1.0, 2.0, 0.3), (2.0, 2.0, 0.3)
 
 
 # -- map -> odom -------------------------------------------------------------------------------------------------------
@@ -37,22 +37,6 @@ def policy(**values):
     return MapToOdom(config), config.tf
 
 
-def test_each_odometry_stamp_is_told_once_and_never_an_older_one():
-    correction, tf = policy()
-    told = [correction.next(tf, 0, stamp, (0.0, 0.0, 0.0), HERE) for stamp in (5 * NS, 5 * NS, 4 * NS, 6 * NS)]
-    assert told == [(5 * NS + NS // 10, HERE), None, None, (6 * NS + NS // 10, HERE)]
-    correction.forget_time()
-    assert correction.next(tf, 0, NS, (0.0, 0.0, 0.0), HERE) == (NS + NS // 10, HERE)
-
-
-def test_dated_by_the_clock_it_is_silent_with_odometry_and_never_dated_back():
-    correction, tf = policy(stamp="now", transform_tolerance=0.5)
-    assert correction.next(tf, 100 * NS, 5 * NS, (0.0, 0.0, 0.0), HERE) == (100 * NS + NS // 2, HERE)
-    assert correction.next(tf, 101 * NS, 5 * NS, (0.0, 0.0, 0.0), HERE) is None
-    assert correction.next(tf, 99 * NS, 6 * NS, (0.0, 0.0, 0.0), HERE) is None
-    assert correction.next(tf, 101 * NS, 6 * NS, (0.0, 0.0, 0.0), HERE) == (101 * NS + NS // 2, HERE)
-
-
 def test_what_would_be_dated_before_the_last_is_not_told_and_how_much_earlier_is_known():
     policy, tf = MapToOdom(Config()), Config().tf
     assert policy.next(replace(tf, transform_tolerance=9.0), 0, NS, (0.0,) * 3, (0.0,) * 3) is not None
@@ -60,19 +44,6 @@ def test_what_would_be_dated_before_the_last_is_not_told_and_how_much_earlier_is
     assert policy.behind_s == pytest.approx(8.0 - tf.transform_tolerance)
     assert policy.next(tf, 0, 20 * NS, (0.0,) * 3, (0.0,) * 3) is not None
     assert policy.behind_s == 0.0
-
-
-@pytest.mark.parametrize("T_odom_base", [(0.0, 0.0, 0.0), (-40.0, 70.0, 2.0)])
-def test_a_limited_correction_moves_the_robot_in_the_map_no_faster_and_arrives(T_odom_base):
-    correction, tf = policy(max_speed_m_s=0.5, max_turn_rad_s=0.1)
-    group = Config().space.group
-    target = group.compose((0.7, -0.4, 0.35), HERE)
-    told = [correction.next(tf, 0, k * NS // 10, T_odom_base, HERE if k == 0 else target)[1] for k in range(1200)]
-    robot = [group.compose(T, T_odom_base) for T in told]
-    steps = [group.between(a, b) for a, b in itertools.pairwise(robot)]
-    assert max(math.hypot(*step[:2]) for step in steps) <= 0.05 + 1e-9
-    assert max(abs(step[2]) for step in steps) <= 0.01 + 1e-9
-    assert 0 < next(k for k, T in enumerate(told) if target == T) < 1200
 
 
 # -- reckoning ---------------------------------------------------------------------------------------------------------
@@ -108,8 +79,7 @@ def drive(dimensions, k, source="odometry"):
     )
 
 
-@pytest.mark.parametrize("dimensions", [2, 3])
-@pytest.mark.parametrize("heard_from", [0, 19])
+@each("dimensions, heard_from", [*itertools.product([2, 3], [0, 19])])
 def test_odometry_in_the_map_is_ahead_of_the_keyframes_and_as_uncertain_as_a_keyframe_there(dimensions, heard_from):
     rare, often = round_a_curve(dimensions, 3.2), round_a_curve(dimensions, 0.4)
     reckoning = PoseExtrapolator(rare.config)
@@ -128,28 +98,7 @@ def test_odometry_in_the_map_is_ahead_of_the_keyframes_and_as_uncertain_as_a_key
         assert covariance == pytest.approx(slam.pose_covariance, rel=1e-3, abs=1e-6)  # an edge has a least noise
 
 
-def test_asking_at_each_message_or_at_the_last_alone_gives_the_same():
-    session = round_a_curve(2, 3.2)
-    often, once = PoseExtrapolator(session.config), PoseExtrapolator(session.config)
-    for k in range(15, 40):
-        for one in (often, once):
-            one.on_odometry(drive(2, k), session.estimate)
-        asked = often.pose(session.estimate)
-    pose, covariance = once.pose(session.estimate)
-    assert (pose, covariance.tolist()) == (asked[0], asked[1].tolist())
-
-
-def test_another_odometry_or_an_older_message_says_nothing_of_the_robot_in_the_map():
-    session = round_a_curve(2, 3.2)
-    reckoning = PoseExtrapolator(session.config)
-    assert reckoning.on_odometry(drive(2, 19), session.estimate)
-    assert not reckoning.on_odometry(drive(2, 20, "another"), session.estimate)
-    assert not reckoning.on_odometry(drive(2, 18), session.estimate)
-    assert not reckoning.on_odometry(drive(2, 19), session.estimate)
-    assert reckoning.newest == drive(2, 19)
-
-
-@pytest.mark.parametrize("dimensions", [2, 3])
+@each("dimensions", [2, 3])
 def test_a_jump_of_odometry_is_no_motion_and_nothing_is_said_of_the_robot_until_the_estimate_has_it(dimensions):
     session = round_a_curve(dimensions, 3.2)
     reckoning, space = PoseExtrapolator(session.config), session.config.space
@@ -193,11 +142,6 @@ def test_B6_what_is_ahead_of_the_clock_waits_for_it_and_keeps_its_order(monkeypa
     assert refused == [seen(20 * NS)]
 
 
-def test_where_no_clock_runs_or_nobody_asks_nothing_is_ahead():
-    for ahead in (FutureStamps(1.0, lambda: 0, pytest.fail), FutureStamps(0.0, lambda: NS, pytest.fail)):
-        assert list(ahead.pass_on(seen(10**18))) == [seen(10**18)]
-
-
 # -- weak directions ---------------------------------------------------------------------------------------------------
 
 
@@ -237,19 +181,6 @@ def test_the_weakest_direction_of_the_newest_pose_and_the_way_without_a_landmark
     assert seen.values["orientation"] == f"{math.degrees(covariance[2, 2] ** 0.5):.2f} deg heading"
 
 
-def test_the_graph_says_what_was_condensed():
-    """A robot drives east for 300 keyframes without landmarks; the window is 40."""
-    given = {"ordering.window_s": 0.0, "output.folder": "", "map.window_keyframes": 40, "keyframes.min_distance_m": 0.5}
-    session = Session(Config.from_mapping(given), Counters(), lambda slam, update: None, lambda *_: None)
-    for k in range(300):
-        session.ingest([Odometry(STAMP_NS + k * NS, (0.6 * k, 0.0, 0.0), None, "odom")])
-    estimate = session.estimate
-    facts = Facts("active", (odom(),), estimate, estimate.weakest(session.config.space))
-    graph = next(one for one in statuses(facts, judge(facts, Config()), "node") if one.name == "node: graph")
-    assert graph.message.startswith(f"{estimate.keyframes} keyframes; condensed: keyframes 0 to ")
-    assert graph.values["keyframes"] == str(estimate.keyframes)
-
-
 # -- the worker --------------------------------------------------------------------------------------------------------
 
 
@@ -275,23 +206,6 @@ def test_P10_a_worker_does_everything_in_order_refuses_what_is_too_much_and_surv
     assert not worker.is_alive
 
 
-def test_a_worker_that_is_stopped_tells_when_what_waits_cannot_be_done_in_time_and_begins_no_more():
-    faults = []
-    worker, begun, gate, done = Worker(10, faults.append), threading.Event(), threading.Event(), []
-    worker.offer(lambda: begun.set() or (gate.wait(60.0) and 1 / 0))
-    worker.offer(lambda: done.append(1))
-    assert begun.wait(10.0)
-    assert not worker.stop(0.01)
-    assert worker.lag_s > 0.0
-    gate.set()
-    deadline = time.monotonic() + 10.0
-    while worker.is_alive and time.monotonic() < deadline:
-        time.sleep(0.001)
-    assert not worker.is_alive
-    assert done == []
-    assert not faults, "what it uses may be gone"
-
-
 # -- health ------------------------------------------------------------------------------------------------------------
 
 
@@ -315,7 +229,7 @@ UNLINKED = odom(received=3, recent=refused(3, odom_frame_unknown=3), frames=(("w
 RIVALS = {"has_other_authority": True, "authorities": ("/amcl", "/wheels")}
 
 
-@pytest.mark.parametrize(
+@each(
     "facts, state, reason",
     [
         (Facts("unconfigured"), "UNCONFIGURED", "waits for ros2 lifecycle set NODE configure"),
@@ -362,7 +276,7 @@ WELL = odom(received=9, silent_s=0.0)
 LOST = tags(received=4, silent_s=0.0, recent=refused(4, frame_unknown=4), frames=(("c", "base_link"),))
 
 
-@pytest.mark.parametrize(
+@each(
     "values, inputs, reason",
     [
         ({}, (odom(received=9, silent_s=0.9), tags(received=3, silent_s=59.0)), ""),
@@ -423,18 +337,6 @@ def test_at_work_it_is_well_or_degraded_with_the_reason(values, inputs, reason):
     assert told[-1].values["keyframes"] == str(estimate.keyframes)
 
 
-def test_a_topic_that_nobody_publishes_is_a_warning_of_its_input():
-    estimate = round_a_curve(2, 3.2).estimate
-    for one, level, message in (
-        (tags(), diagnostics.OK, "0 messages received"),
-        (tags(publishers=()), diagnostics.WARN, "nobody publishes /tags"),
-        (tags(publishers=(), received=3, silent_s=1.0), diagnostics.OK, "3 messages received"),
-    ):
-        facts = Facts("active", (WELL, one), estimate)
-        (status,) = (s for s in statuses(facts, judge(facts, Config()), "slam") if s.name == "slam: input tags")
-        assert (status.level, status.message) == (level, message)
-
-
 def test_where_an_input_is_wrong_from_the_beginning_it_is_the_reason_and_not_what_follows():
     follows = {"displaced": "elsewhere", "uncorrected": "clock_offset", "doubted": "only 1 of 9", "association": "lost"}
     estimate = replace(round_a_curve(2, 3.2).estimate, **follows, fit=99.0, visits="3 of 9 visits")
@@ -448,7 +350,7 @@ def test_where_an_input_is_wrong_from_the_beginning_it_is_the_reason_and_not_wha
     assert reasons == ("odom leaves the plane: these are three dimensions: world.dimensions=3", "3 of 9 visits")
 
 
-@pytest.mark.parametrize("names", ["a{}", "b{}"], ids=["the same ids", "new ids"])
+@each("names", ["a{}", "b{}"])
 def test_a_detector_that_begins_anew_is_named(names):
     robot, trees = round_a_curve(2, 0.4), [(4.0 * k, 3.0 + k % 2) for k in range(6)]
     for k in range(20, 60):
@@ -491,7 +393,7 @@ def driven(metres, every_s=1.0, sees=()):
     return session
 
 
-@pytest.mark.parametrize(
+@each(
     "metres, every_s, one, is_said",
     [
         (12, 1.0, tags(publishers=(), alternatives=("/seen has this type: tags.topic:=/seen",)), True),
@@ -521,7 +423,7 @@ def test_odometry_that_is_late_is_no_fault_where_map_to_odom_is_dated_ahead_or_n
     assert status.values["late [s]"] == "0.50"
 
 
-@pytest.mark.parametrize("late_s, odometry_s", [(2.0, 0.0), (7.0, 0.0), (7.0, 6.0), (7.0, math.nan), (12.0, 0.0)])
+@each("late_s, odometry_s", [(2.0, 0.0), (7.0, 0.0), (7.0, 6.0), (7.0, math.nan), (12.0, 0.0)])
 def test_observations_that_are_nearly_too_late_are_named_before_any_is_refused(late_s, odometry_s):
     late = InputFacts("tags", "/tags", "landmarks", 9, 9, silent_s=0.0, publishers=("/camera",), late_s=late_s)
     main = odom(received=9, silent_s=0.0, late_s=odometry_s)
@@ -566,13 +468,6 @@ def test_a_parameter_file_for_other_nodes_is_named(tmp_path):
     assert not list(files_for_others(["--params-file", "nothing.yaml"], "/graph_slam"))
 
 
-def test_odometry_in_the_frame_of_a_map_is_the_output_of_a_localiser():
-    recent = Recent(20, {"odom_frame_unknown": 20}, goes_on=True)
-    facts = Facts("active", (odom(received=20, silent_s=0.0, recent=recent, frames=(("map", "odom"),)),))
-    (reason,) = judge(facts, Config()).reasons
-    assert reason.endswith("so it is the output of a localiser: odom.topic:=TOPIC, that of the wheels")
-
-
 def test_A35_what_is_refused_is_judged_by_the_last_seconds_wherever_it_was_refused():
     recent, accepted, before, after = RecentInputs(), {}, {"tags": {}}, {"tags": {}}
 
@@ -613,18 +508,7 @@ def test_A37_what_is_told_seldom_tells_how_often_it_was_left_out(monkeypatch):
     assert told == [0, *[None] * 4, 4, *[None] * 4, 4, *[None] * 3]
 
 
-def test_while_visits_of_a_condensed_map_contradict_one_another_the_node_is_degraded():
-    robot = round_a_curve(2, 3.2)
-    assert not robot.estimate.visits
-    robot.slam.counters.count("map", "visit_condensed", 10)
-    robot.slam.counters.count("map", "visit_lost", 3)
-    robot.ingest([drive(2, k) for k in range(20, 40)])
-    verdict = judge(Facts("active", (WELL,), robot.estimate), Config())
-    assert verdict.state == "DEGRADED"
-    assert "3 of 13 visits contradict themselves or the others" in verdict.reasons[0]
-
-
-@pytest.mark.parametrize("dimensions", [2, 3])
+@each("dimensions", [2, 3])
 def test_while_an_association_is_not_to_be_believed_the_node_is_degraded(monkeypatch, dimensions):
     """By what the pipeline reports: the same sentence as at the end of a replay."""
     report = {"is_whole": True, "is_doubtful": True, "missing_part": 0.11, "lost_part": 0.013, "clocks": {}}
@@ -634,20 +518,3 @@ def test_while_an_association_is_not_to_be_believed_the_node_is_degraded(monkeyp
     assert verdict.state == "DEGRADED"
     assert verdict.reasons[0].startswith("sightings without identity: 11 % of the landmarks that should be seen")
     assert "landmarks.density_per_m" in verdict.reasons[0]
-
-
-@pytest.mark.parametrize("passing", [0, 4])
-def test_ranges_alone_that_leave_many_landmarks_without_a_side_are_said(passing):
-    """Of four landmarks the side is known by a whole curve; others are seen from three places in a row."""
-    robot, around = round_a_curve(2, 0.4), [(4.0 * k, 3.0 + k % 2) for k in range(4)]
-    for k in range(20, 60):
-        robot.ingest([drive(2, k)])
-        to = around + [(31.0 + j, 50.0) for j in range(passing * (50 <= k < 53))]
-        at = drive(2, k).T_odom_base[:2]
-        some = tuple(Sighting(f"r{j}", "range", (math.dist(at, one),), (0.01,)) for j, one in enumerate(to))
-        robot.ingest([Sightings(drive(2, k).stamp_ns, "ranges", some)])
-    robot.evaluate()
-    reasons = judge(Facts("active", (), robot.estimate), Config()).reasons
-    assert [one[:38] for one in reasons if one.startswith("ranges alone: ")] == [
-        "ranges alone: of 4 of 8 landmarks two "
-    ] * (passing > 0)

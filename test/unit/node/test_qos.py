@@ -1,6 +1,7 @@
 """The QoS of the subscription of a topic, from the parameters of its inputs."""
 
 import pytest
+from rows import each
 
 from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.slam import Config
@@ -29,7 +30,7 @@ def test_an_input_asks_for_what_its_parameters_say_else_for_what_those_of_all_in
     assert latched.profile.durability is DurabilityPolicy.TRANSIENT_LOCAL
 
 
-@pytest.mark.parametrize(
+@each(
     "values, complaint",
     [
         (

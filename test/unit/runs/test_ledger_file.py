@@ -1,6 +1,7 @@
 """The ledger of a saved run: what it says is what was decided, and what was put wrong is told."""
 
 import csv
+import random
 
 import numpy as np
 import pytest
@@ -86,3 +87,15 @@ def test_what_is_no_ledger_is_refused_by_name(replayed, tmp_path):
     (tmp_path / LEDGER).write_text("edge,label\n0,odometry\n")
     with pytest.raises(FormatError, match="not a ledger"):
         read_ledger(tmp_path)
+    rng, refused, content = random.Random(0), 0, (replayed[1] / LEDGER).read_text().splitlines()
+    for k in range(30):
+        rows = list(csv.reader(content))
+        rows[rng.randrange(len(rows))][rng.randrange(len(rows[0]))] = ("nan", "1e400", "x", "", "9" * 5000)[k % 5]
+        with (tmp_path / LEDGER).open("w", newline="") as stream:
+            csv.writer(stream).writerows(rows)
+        try:
+            assert len(read_ledger(tmp_path)) == len(rows) - 1
+        except FormatError as error:
+            assert LEDGER in str(error) and len(str(error)) < 1000
+            refused += 1
+    assert refused > 10

@@ -1,6 +1,6 @@
 """What the end of a run says of its odometries and its gyro."""
 
-import pytest
+from rows import each
 
 from graph_slam_ros.runs.outcome import doubts, shortcomings, text
 
@@ -61,9 +61,7 @@ def test_a_solve_that_did_not_converge_is_a_shortcoming_with_the_parameter():
     assert not [*shortcomings(summary({}) | {"converged": True, "stop": "cost"})]
 
 
-@pytest.mark.parametrize(
-    ("lost", "condensed", "is_said"), [(0, 40, False), (1, 5, False), (2, 60, False), (2, 28, True), (6, 30, True)]
-)
+@each("lost, condensed, is_said", [(0, 40, False), (1, 5, False), (2, 60, False), (2, 28, True), (6, 30, True)])
 def test_visits_that_contradict_the_others_are_said(lost, condensed, is_said):
     said = list(doubts(summary({"map": {"visit_lost": lost, "visit_condensed": condensed}})))
     assert len(said) == is_said
@@ -88,9 +86,7 @@ def test_an_odometry_without_any_message_is_one_and_a_spare_one_is_none():
     assert not [*shortcomings(summary({}, vo=silent | {"received": 90}))]
 
 
-@pytest.mark.parametrize(
-    ("known", "two_places", "is_said"), [(23, 27, True), (66, 8, False), (3, 3, False), (0, 27, False)]
-)
+@each("known, two_places, is_said", [(23, 27, True), (66, 8, False), (3, 3, False), (0, 27, False)])
 def test_ranges_alone_that_leave_many_landmarks_without_a_side_are_said(known, two_places, is_said):
     waiting = {str(k): "2 places fit: (1.56, -2.35) and (-2.20, -1.20)" for k in range(two_places)}
     waiting["seen once"] = "1 sighting by range: too few"
