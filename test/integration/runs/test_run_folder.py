@@ -13,9 +13,6 @@ from places import ROOT
 from reliability import times
 
 from graph_slam_ros import cli
-from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.formats.durable import AppendedFile, replaced, write_whole
-from graph_slam_ros.formats.files import opened, read_text
 from graph_slam_ros.runs.folder import MARK, RunError, is_run, keep_earlier, remove
 from graph_slam_ros.runs.recorder import RunRecorder
 from graph_slam_ros.runs.replay import replay
@@ -280,36 +277,3 @@ def test_evaluate_replaces_a_planted_link_and_does_not_write_through_it(bag, run
     assert victim.read_text() == "mine"
     assert not (run / "path.png").is_symlink()
     assert (run / "path.png").read_bytes().startswith(b"\x89PNG")
-
-
-def test_only_regular_files_are_opened_and_a_name_that_exists_is_never_written_to(tmp_path):
-    os.mkfifo(tmp_path / "fifo")
-    (tmp_path / "file").write_text("text")
-    (tmp_path / "link").symlink_to(tmp_path / "file")
-    (tmp_path / "to_fifo").symlink_to(tmp_path / "fifo")
-    for name, follow in itertools.product(("fifo", "to_fifo", "."), (False, True)):
-        with pytest.raises(OSError, match=r"not a regular file|symbolic link"):
-            opened(tmp_path / name, follow=follow)
-    with pytest.raises(OSError, match="a symbolic link, which is not followed here"):
-        opened(tmp_path / "link")
-    assert read_text(tmp_path / "link", follow=True) == read_text(tmp_path / "file") == "text"
-    for name in ("fifo", "file", "link"):
-        file = AppendedFile(tmp_path / name)
-        file.write(b"theirs")
-        with pytest.raises(FileExistsError):
-            file.flush()
-        file.abandon()
-    with pytest.raises(FileExistsError, match="not a regular file"):
-        write_whole(tmp_path / "fifo", b"theirs")
-    write_whole(tmp_path / "link", b"theirs")
-    assert (tmp_path / "file").read_text() == "text"
-    assert (tmp_path / "link").read_text() == "theirs"
-
-
-def test_a_file_is_written_whole_or_not_at_all_whatever_interrupts(tmp_path):
-    (tmp_path / "a").write_text("old")
-    for error in (KeyboardInterrupt, GraphSlamError("no")):
-        with pytest.raises((KeyboardInterrupt, GraphSlamError)), replaced(tmp_path / "a") as new:
-            new.write_text("half")
-            raise error
-        assert state(tmp_path) == {"a": b"old"}

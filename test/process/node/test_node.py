@@ -55,7 +55,13 @@ def surveyed(file):
 
 
 def flight(bag, file):
-    write_bag(simulate("flight", 3, laps=1), file)
+    whole = file.with_name("whole.mcap")
+    write_bag(simulate("flight", 3, laps=1), whole)
+    opened = open_bag(whole)
+    messages = list(opened.messages(opened.topics))
+    with BagWriter(file) as writer:
+        for m in messages[: len(messages) // 3]:
+            writer.write(m.topic, opened.topics[m.topic].type, m.log_ns, m.cdr)
 
 
 def joints(bag, file):
@@ -65,7 +71,7 @@ def joints(bag, file):
 def garbled(bag, file):
     """As a bad network and a bad driver would deliver them: late, out of order, twice, broken; landmarks at 28 Hz."""
     rng, messages = np.random.default_rng(2), list(open_bag(bag).messages({"/odom", "/landmarks"}))
-    messages = messages[: len(messages) // 2]
+    messages = messages[: len(messages) // 3]
     delay = np.where(rng.random(len(messages)) < 0.1, rng.uniform(0.0, 0.3e9, len(messages)), 0.0)
     with BagWriter(file) as writer:
         for k in sorted(range(len(messages)), key=lambda k: messages[k].log_ns + delay[k]):
