@@ -78,7 +78,6 @@ setup(
         "fleet": [
             "dask>=2026.8",
             "distributed>=2026.8",
-            "duckdb>=1.4",
             "fsspec>=2025.9",
             "pyarrow>=21.0",
         ],

@@ -119,7 +119,7 @@ def _with_wrong_ids(problem: Problem, fault: Fault, seed: int) -> Trial:
         PLANAR,
         nowhere,
         nowhere,
-        None,
+        nowhere,
         named,
         seen.ends[:, 0],
         {},

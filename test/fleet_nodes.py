@@ -9,8 +9,6 @@ import time
 from pathlib import Path
 
 from graph_slam_ros import cli
-from graph_slam_ros.runs.replay import replay
-from graph_slam_ros.slam import Config
 
 HASHED = ("graph.g2o", "ledger.csv", "path.tum", "landmarks.csv", "map.mcap")
 PATIENCE_S = 60.0
@@ -26,29 +24,26 @@ def wait_for(what, patience_s=PATIENCE_S):
 
 @contextlib.contextmanager
 def scheduler(folder: Path, workers: int):
-    """Start both, yield the scheduler's address, and end them."""
+    """Start both, yield the scheduler's address and what starts a worker more, and end them."""
     file = folder / "scheduler.json"
     common = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "start_new_session": True}
     environment = {**os.environ, "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "2"}
     begun = []
 
     def start(name, *options):
-        command = [
-            sys.executable,
-            "-m",
-            f"distributed.cli.dask_{name}",
-            "--scheduler-file",
-            str(file),
-            "--no-dashboard",
-        ]
-        begun.append(subprocess.Popen([*command, *options], env=environment, **common))
+        command = [sys.executable, "-m", f"distributed.cli.dask_{name}", "--scheduler-file", str(file)]
+        command += ["--no-dashboard", "--host", "127.0.0.1", *options]
+        begun.append(subprocess.Popen(command, env=environment, **common))
+
+    def start_worker():
+        start("worker", "--nthreads", "1", "--local-directory", str(folder))
 
     try:
-        start("scheduler", "--host", "127.0.0.1", "--port", "0")
+        start("scheduler", "--port", "0")
         wait_for(file.exists)
         for _ in range(workers):
-            start("worker", "--nthreads", "1", "--host", "127.0.0.1", "--local-directory", str(folder))
-        yield json.loads(file.read_text())["address"]
+            start_worker()
+        yield json.loads(file.read_text())["address"], start_worker
     finally:
         for process in reversed(begun):
             process.terminate()
@@ -69,11 +64,13 @@ def children(pid: int) -> list[int]:
 def drives(folder: Path, count: int, *damaged: bytes):
     """Recordings with truth and damaged ones in a folder, and the bytes of the results of a serial run, by name."""
     serial = {}
-    for name in (f"{seed}.mcap" for seed in range(1, count + 1)):
-        words = ["simulate", "pythonrobotics", "--out", str(folder / name), "--seed", name.partition(".")[0]]
-        assert cli.main(words) == 0
-        replay(folder / name, folder.with_name("serial") / name, Config())
-        serial[name] = contents(folder.with_name("serial") / name)
+    for seed in range(1, count + 1):
+        name, out = f"{seed}.mcap", folder.with_name("serial") / str(seed)
+        sensor = "range_bearing" if seed == 2 else "position"  # whose topic is that of no usual input
+        words = ["simulate", "pythonrobotics", "--seed", str(seed), "--set", f"sensor={sensor}"]
+        assert cli.main([*words, "--out", str(folder / name)]) == 0
+        assert cli.main(["replay", str(folder / name), "--out", str(out)]) == 0
+        serial[name] = contents(out)
     for k, content in enumerate(damaged):
         (folder / f"damaged{k}.mcap").write_bytes(content)
     return serial

@@ -31,7 +31,7 @@ def guided(name):
 DRIVES = (
     *("advise", "calibration_consistency", "calibration_random", "consistency", "displacement", "extreme_fixes"),
     *("bad_drives", "gyro_drives", "determination", "initialization"),
-    *("nees", "planted", "rates", "simulation", "slip", "recordings", "uncorrected", "unnamed"),
+    *("certificate", "nees", "planted", "rates", "simulation", "slip", "recordings", "uncorrected", "unnamed"),
 )
 PROGRAMMES = {
     "lifelong": [

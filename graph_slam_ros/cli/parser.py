@@ -14,18 +14,16 @@ class Command:
     ----------
     code : ``module:name``: the module of the package, which is imported when the command is called, has the function
         ``name`` and, for its options, ``name_options``
-    options : the module of ``name_options``, if that is another one
     """
 
-    def __init__(self, code: str, about: str, *examples: str, options: str = "") -> None:
+    def __init__(self, code: str, about: str, *examples: str) -> None:
         self._module, _, self._name = code.partition(":")
-        self._options = options or self._module
         self.about = about
         self.examples = examples
 
     def add_to(self, sub: CommandParser) -> None:
         """Add the options, and the function as ``run``."""
-        getattr(import_module(f"graph_slam_ros.{self._options}"), f"{self._name}_options")(sub)
+        getattr(import_module(f"graph_slam_ros.{self._module}"), f"{self._name}_options")(sub)
         sub.set_defaults(run=later(self._module, self._name))
 
 
@@ -85,7 +83,6 @@ COMMANDS: dict[str, Command | Group] = {
         "write one HTML file on a run: map, edges with their reasons, charts and tables",
         "drive_run",
         "drive_run --truth drive.mcap:/ground_truth --out drive.html",
-        options="cli.of_tools",
     ),
     "view": Command(
         "tools.view.command:view",
@@ -98,7 +95,6 @@ COMMANDS: dict[str, Command | Group] = {
         "find the weakest directions of a run's map, and what to measure to make them better known",
         "drive_run",
         "drive_run --json",
-        options="cli.of_tools",
     ),
     "map": Group(
         "compare, merge, edit, freeze or export the maps of runs",
@@ -143,7 +139,6 @@ COMMANDS: dict[str, Command | Group] = {
         "tools.simulation.command:simulate",
         "simulate a recording with truth and, if asked, faults: pythonrobotics, manhattan, warehouse, flight",
         "warehouse --out world.mcap --seed 7",
-        options="cli.of_tools",
     ),
     "fleet": Group(
         "replay many recordings at once, and compare two such fleets, on all cores or many machines",
@@ -153,12 +148,6 @@ COMMANDS: dict[str, Command | Group] = {
                 "replay many recordings with one or more configurations; what is done is not done again",
                 "drives/ --out fleet",
                 "drives/ --out fleet --truth '{path}:/ground_truth' --set robust.noise_scale=configured,estimated",
-            ),
-            "table": Command(
-                "tools.fleet.command:table",
-                "print the table of a fleet, or a part of it",
-                "fleet",
-                "fleet --where 'rmse_m > 0.1' --order 'rmse_m DESC'",
             ),
             "compare": Command(
                 "tools.fleet.command:compare",

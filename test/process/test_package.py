@@ -48,7 +48,7 @@ def test_everything_but_the_node_imports_without_ros():
         for name in FILES
         if name not in SPEAK_MESSAGES
         and (name not in SERVES or find_spec("uvicorn"))
-        and (name not in DISTRIBUTES or all(map(find_spec, ("distributed", "duckdb", "fsspec"))))
+        and (name not in DISTRIBUTES or all(map(find_spec, ("distributed", "fsspec", "pyarrow"))))
     ]
     script = f"""
 import importlib, sys

@@ -28,6 +28,7 @@ _NEAR, _NEAR_M = 0.15, 0.3  # of the distance, and at least: so far from a sight
 _SAME_SIDE = 0.7  # between the directions from which a tag with orientation is seen: 40 degrees
 _TEMPLATES = 5000  # sightings of an input and type that are learnt from
 _TAG_SIGHTINGS = 24  # of a new tag
+_CLOSURE_M, _CLOSURE_RAD = 0.05, 0.01  # sigmas of a closure where the run has none
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,7 +129,6 @@ class Additions:
     ----------
     keyframes : those that may be part of an addition, as indices
     survey_sigma : of each coordinate of a surveyed point [m]
-    closure_sigmas : of a closure where the run has none [m, rad]
     """
 
     def __init__(
@@ -137,10 +137,9 @@ class Additions:
         keyframes: Sequence[int],
         travelled_m: Array,
         survey_sigma: float,
-        closure_sigmas: tuple[float, float],
     ) -> None:
         self._run, self._keyframes, self._travelled_m = run, keyframes, travelled_m
-        self._survey_sigma, self._closure_sigmas = survey_sigma, closure_sigmas
+        self._survey_sigma = survey_sigma
         self._space, self._values = run.space, run.solver.values
         self._vertices = [run.keyframes[k] for k in keyframes]
         self._poses = _columns([self._stored(vertex) for vertex in self._vertices])
@@ -259,9 +258,8 @@ class Additions:
             like = sorted(found, key=lambda e: float(np.linalg.slogdet(e.information_matrix)[1]))[len(found) // 2]
             share = float(np.mean([min(e.weight, 1.0) for e in found]))
             return Gaussian.from_information(like.information_matrix), like.source, share, ""
-        sigma_m, sigma_rad = self._closure_sigmas
-        assumed = f", to {sigma_m:g} m and {np.degrees(sigma_rad):.2g} deg"
-        return Gaussian.from_sigmas(*self._space.sigmas(sigma_m, sigma_rad)), "", 1.0, assumed
+        assumed = f", to {_CLOSURE_M:g} m and {np.degrees(_CLOSURE_RAD):.2g} deg"
+        return Gaussian.from_sigmas(*self._space.sigmas(_CLOSURE_M, _CLOSURE_RAD)), "", 1.0, assumed
 
     # -- new tags --------------------------------------------------------------------------------------------------
 

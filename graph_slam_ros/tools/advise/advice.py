@@ -41,12 +41,11 @@ class Advice:
 
     Attributes
     ----------
-    now, predicted : sigma of the weakest direction, as it is and with the addition [m or rad]
+    predicted : sigma of the weakest direction with the addition [m or rad]
     path_now_m, path_m : root mean square of the position sigmas of the sampled keyframes, as it is and with it
     """
 
     addition: Addition
-    now: float
     predicted: float
     path_now_m: float
     path_m: float
@@ -57,7 +56,7 @@ class Advisor:
 
     Parameters
     ----------
-    survey_sigma, closure_sigmas : as of ``Additions``
+    survey_sigma : as of ``Additions``
 
     Attributes
     ----------
@@ -65,15 +64,13 @@ class Advisor:
     keyframes, landmarks : the sample: indices of keyframes, and names
     """
 
-    def __init__(
-        self, weakness: Weakness, survey_sigma: float = 0.02, closure_sigmas: tuple[float, float] = (0.05, 0.01)
-    ) -> None:
+    def __init__(self, weakness: Weakness, survey_sigma: float = 0.02) -> None:
         self._weakness, self._run = weakness, weakness.run
         self._space, self._graph = weakness.run.space, weakness.run.graph
         self.weakest = list(weakness.weakest())
         self.keyframes = self._sampled_keyframes()
         self.landmarks = self._sampled_landmarks()
-        self._options = survey_sigma, closure_sigmas
+        self._survey_sigma = survey_sigma
         self._join()
 
     # -- the sample ------------------------------------------------------------------------------------------------
@@ -180,12 +177,12 @@ class Advisor:
             sigmas, path = self.predict(addition)
             for k, now in enumerate(np.sqrt(self._now)):
                 if sigmas[k] < (1.0 - _LEAST_GAIN) * now:
-                    out[k].append(Advice(addition, float(now), float(sigmas[k]), path_now, path))
+                    out[k].append(Advice(addition, float(sigmas[k]), path_now, path))
         return [sorted(some, key=lambda one: one.predicted) for some in out]
 
     def additions(self, kinds: Sequence[str] = KINDS) -> Iterator[Addition]:
         """The additions that are possible, of each kind at most a bounded number."""
-        known = Additions(self._run, self.keyframes, self._weakness.travelled_m, *self._options)
+        known = Additions(self._run, self.keyframes, self._weakness.travelled_m, self._survey_sigma)
         makers = {
             SIGHTING: lambda: known.sightings(self.landmarks),
             SURVEY: lambda: known.surveys(self.landmarks),

@@ -7,11 +7,21 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from graph_slam_ros.cli import console
+from graph_slam_ros.cli import arguments, console
+from graph_slam_ros.cli.usage import CommandParser
 
 if TYPE_CHECKING:
     from graph_slam_ros.tools.advise.advice import Advice, Advisor
-    from graph_slam_ros.tools.advise.weakness import Stretch, Weakest, Weakness
+    from graph_slam_ros.tools.advise.weakness import Stretch, Weakness
+
+
+def advise_options(sub: CommandParser) -> None:
+    """Add the options of ``advise``."""
+    arguments.add_run(sub)
+    sub.add_argument("--count", type=arguments.count, default=1, metavar="N", help="additions of a kind (default: 1)")
+    about = "sigma of each coordinate of a surveyed landmark [m] (default: 0.02)"
+    sub.add_argument("--survey-sigma", type=arguments.positive, default=0.02, metavar="M", help=about)
+    arguments.add_json(sub)
 
 
 def advise(args: argparse.Namespace) -> int:
@@ -31,7 +41,9 @@ def advise(args: argparse.Namespace) -> int:
         console.show(json.dumps(_as_dict(weakness, advisor, found, of_path)))
     else:
         console.show(*_weak_text(weakness, advisor), *_advice_text(advisor, found, of_path))
-        console.then(_next(args, found))
+        first = "measure the first of these, and replay with it; a survey goes into landmarks.surveyed_file"
+        explain = f"{console.command('explain', args.run_folder)} (what was believed, and what not)"
+        console.then(first if any(found) else explain)
     return console.report_losses(losses)
 
 
@@ -57,7 +69,10 @@ def _weak_text(weakness: "Weakness", advisor: "Advisor") -> Iterator[str]:
     )
     yield "weakest"
     for one in advisor.weakest:
-        where = _where(weakness, one)
+        where = ""
+        if one.about.startswith("keyframe"):
+            stamp_s, driven_m = run.stamps_ns[one.keyframe] * 1e-9, weakness.travelled_m[one.keyframe]
+            where = f" ({stamp_s:.3f} s, {driven_m:.1f} m driven)"
         sigma, usual = (_sigma(one.what, x) for x in (one.direction.sigma, one.usual))
         words = "" if one.direction.words == one.what else f" {one.direction.words}"
         yield f"  {one.what:9s} {one.about}{where}: {sigma}{words} (median {usual})"
@@ -69,13 +84,6 @@ def _weak_text(weakness: "Weakness", advisor: "Advisor") -> Iterator[str]:
         yield f"  {stretch.what} weak for {_span(stretch)}: {stretch.reason}; {numbers}"
     if unseen:
         yield f"  {unseen.reason} for {_span(unseen)}: the longest part of the path without one"
-
-
-def _where(weakness: "Weakness", one: "Weakest") -> str:
-    if not one.about.startswith("keyframe"):
-        return ""
-    stamp_s, driven_m = weakness.run.stamps_ns[one.keyframe] * 1e-9, weakness.travelled_m[one.keyframe]
-    return f" ({stamp_s:.3f} s, {driven_m:.1f} m driven)"
 
 
 def _span(one: "Stretch") -> str:
@@ -107,12 +115,6 @@ def _path(one: "Advice") -> str:
     return f"path {one.path_now_m:.3f} -> {one.path_m:.3f} m"
 
 
-def _next(args: argparse.Namespace, found: "list[list[Advice]]") -> str:
-    if any(found):
-        return "measure the first of these, and replay with it; a survey goes into landmarks.surveyed_file"
-    return f"{console.command('explain', args.run_folder)} (what was believed, and what not)"
-
-
 # -- JSON --------------------------------------------------------------------------------------------------------------
 
 
@@ -123,8 +125,6 @@ def _as_dict(
     return {
         "keyframes": len(weakness.run.slam.keyframes),
         "landmarks": len(weakness.run.landmarks),
-        "sampled_keyframes": len(advisor.keyframes),
-        "sampled_landmarks": len(advisor.landmarks),
         "held_by": weakness.held_by(),
         "weakest": [
             {

@@ -1,4 +1,4 @@
-"""The commands ``fleet replay``, ``fleet table`` and ``fleet compare``: many recordings at once."""
+"""The commands ``fleet replay`` and ``fleet compare``: many recordings at once."""
 
 import argparse
 import importlib.util
@@ -10,7 +10,7 @@ from graph_slam_ros.cli import arguments, console
 from graph_slam_ros.cli.usage import CODES, CommandParser
 from graph_slam_ros.errors import GraphSlamError
 
-_NEEDED = ("dask", "distributed", "fsspec", "pyarrow", "duckdb")
+_NEEDED = ("dask", "distributed", "fsspec", "pyarrow")
 _MIB = 2**20
 _MOST_NAMED = 20
 
@@ -42,15 +42,6 @@ def replay_options(sub: CommandParser) -> None:
     sub.add_argument("--memory", type=arguments.positive, default=0.0, metavar="MIB", help=about)
 
 
-def table_options(sub: CommandParser) -> None:
-    """Add the options of ``fleet table``."""
-    sub.add_argument("folder", type=Path, metavar="DIR", help="folder of the fleet")
-    sub.add_argument("--where", default="", metavar="SQL", help="condition on the columns")
-    sub.add_argument("--order", default="", metavar="SQL", help="columns to sort by")
-    sub.add_argument("--most", type=arguments.count, default=1000, metavar="N", help="rows to print (default: 1000)")
-    sub.add_argument("--columns", default="", metavar="A,B", help="columns to print; all prints all")
-
-
 def compare_options(sub: CommandParser) -> None:
     """Add the options of ``fleet compare``."""
     sub.codes = f"{CODES} 4: worse than --fail allows."
@@ -64,88 +55,42 @@ def compare_options(sub: CommandParser) -> None:
 def replay(args: argparse.Namespace) -> int:
     """Replay many recordings."""
     _check_installed()
-    from graph_slam_ros.tools.fleet.engine import Workers
     from graph_slam_ros.tools.fleet.page import write_page
     from graph_slam_ros.tools.fleet.replay import Fleet, replay_all
 
     if args.scheduler and args.workers:
         raise GraphSlamError("fleet replay: no use for --workers with --scheduler: its workers are there already")
-    work = Fleet(
-        args.recordings,
-        args.out,
-        args.config,
-        args.set,
-        args.truth,
-        args.limit,
-        int(args.memory * _MIB),
-        args.report,
-    )
+    memory = int(args.memory * _MIB)
+    work = Fleet(args.recordings, args.out, args.config, args.set, args.truth, args.limit, memory, args.report)
     try:
-        done = replay_all(work, Workers(args.scheduler, args.workers), _progress)
+        rows, reused = replay_all(work, args.scheduler, args.workers, _progress)
     except KeyboardInterrupt:
         console.warn(f"stopped: what is done is in {args.out}, and the same command goes on from there")
         return console.INTERRUPTED
-    page = write_page(args.out, done.rows)
-    for name in done.unreadable:
-        console.warn(f"lost: {name}: cannot be read")
-    for line in done.unreported:
-        console.warn(f"no report: {line}", most=console.SENTENCE)
-    for name, first in done.copies.items():
-        console.warn(f"not replayed: {name}: a copy of {first}, which has the row")
-    failed = [row for row in done.rows if row["state"] == "failed"]
+    page = write_page(args.out, rows)
+    failed, incomplete = ([row for row in rows if row["state"] == state] for state in ("failed", "incomplete"))
     for row in failed[:_MOST_NAMED]:
         console.warn(f"failed: {row['recording']} ({row['setting']}): {row['reason']}", most=console.SENTENCE)
     if len(failed) > _MOST_NAMED:
-        console.warn(f"failed: {len(failed) - _MOST_NAMED} more: graph_slam fleet table --where \"state = 'failed'\"")
-    incomplete = [row for row in done.rows if row["state"] == "incomplete"]
+        console.warn(f"failed: {len(failed) - _MOST_NAMED} more: {page} has them")
     console.show(
-        f"runs       {len(done.rows):8d}   of them {done.reused} were there",
+        f"runs       {len(rows):8d}   of them {reused} were there",
         f"incomplete {len(incomplete):8d}   the table says why",
         f"failed     {len(failed):8d}",
         f"results in {args.out}: {page.name}, table.parquet",
     )
-    console.then(f"{console.command('fleet', 'table', args.out, '--order', 'rmse_m DESC')} (the worst first)")
-    return console.LOSSES if failed or incomplete or done.unreadable else console.DONE
+    console.then(f"open {page} in a browser: the worst run first")
+    return console.LOSSES if failed or incomplete else console.DONE
 
 
-def _progress(label: str) -> Any:
-    """Return what wraps hashes or rows in a progress bar, which counts failed ones."""
-
-    def bar(items: Iterable[Any], total: int) -> Iterator[Any]:
-        failed, shown = 0, console.progress(label, " recordings" if label == "hash" else " runs")(items, total)
-        for item in shown:
-            if isinstance(item, dict) and item["state"] == "failed":
-                failed += 1
-                shown.set_postfix_str(f"{failed} failed")
-            yield item
-
-    return bar
-
-
-def table(args: argparse.Namespace) -> int:
-    """Print the table of a fleet."""
-    _check_installed()
-    from graph_slam_ros.tools.fleet.store import Store
-    from graph_slam_ros.tools.fleet.table import FIRST, read_table
-
-    Store(args.folder)
-    names = () if args.columns == "all" else args.columns.split(",") if args.columns else FIRST
-    rows = read_table(args.folder, args.where, args.order, names, args.most + 1)
-    if len(rows) > args.most:
-        rows.pop()
-        console.warn(f"these are {args.most} rows, and there are more: --most N prints N")
-    if not rows:
-        console.show("no rows")
-        return console.DONE
-    cells = [list(rows[0]), *([_cell(value) for value in row.values()] for row in rows)]
-    widths = [max(len(line[k]) for line in cells) for k in range(len(cells[0]))]
-    for line in cells:
-        console.show("  ".join(f"{cell:{width}s}" for cell, width in zip(line, widths, strict=True)).rstrip())
-    return console.DONE
-
-
-def _cell(value: Any) -> str:
-    return "-" if value is None else f"{value:.4g}" if isinstance(value, float) else console.escaped(str(value))
+def _progress(rows: Iterable[Any], total: int) -> Iterator[Any]:
+    """Yield rows below a progress bar, which counts failed ones."""
+    failed, shown = 0, console.progress("replay", " runs")(rows, total)
+    for row in shown:
+        if row["state"] == "failed":
+            failed += 1
+            shown.set_postfix_str(f"{failed} failed")
+        yield row
 
 
 def compare(args: argparse.Namespace) -> int:

@@ -4,8 +4,6 @@ import contextlib
 import itertools
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import dask
@@ -13,10 +11,9 @@ from distributed import Client, LocalCluster, as_completed
 
 from graph_slam_ros import __version__
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.tools.fleet.isolation import run_isolated
-from graph_slam_ros.tools.fleet.job import Job, failed, why_it_died
-from graph_slam_ros.tools.fleet.recordings import Source, fingerprint
-from graph_slam_ros.tools.fleet.store import MOST_ATTEMPTS, Row, Store
+from graph_slam_ros.tools.fleet.isolation import MOST_ATTEMPTS, run_isolated
+from graph_slam_ros.tools.fleet.job import Job, failed
+from graph_slam_ros.tools.fleet.store import Row
 
 _SETTINGS = {
     "distributed.scheduler.allowed-failures": MOST_ATTEMPTS - 1,  # ends of a worker's process that a task survives
@@ -34,23 +31,9 @@ _SETTINGS = {
 Progress = Callable[[Iterable[Any], int], Iterable[Any]]
 
 
-@dataclass(frozen=True, slots=True)
-class Workers:
-    """The workers that run the jobs.
-
-    Attributes
-    ----------
-    scheduler : address of a Dask scheduler; empty: processes of this machine
-    count : how many of them; 0: one for each core
-    """
-
-    scheduler: str = ""
-    count: int = 0
-
-
 @contextlib.contextmanager
-def connected(workers: Workers) -> Iterator[Client]:
-    """Connect to the workers, and end those that were started.
+def connected(scheduler: str, count: int) -> Iterator[Client]:
+    """Connect to the workers of a scheduler; where its address is empty, start some here (0: one a core), and end them.
 
     Raises
     ------
@@ -58,16 +41,16 @@ def connected(workers: Workers) -> Iterator[Client]:
         The scheduler cannot be reached, has no worker, or its workers have another version of this package.
     """
     with dask.config.set(_SETTINGS), contextlib.ExitStack() as stack:
-        if workers.scheduler:
+        if scheduler:
             try:
-                client = stack.enter_context(Client(workers.scheduler, timeout="10s", set_as_default=False))
+                client = stack.enter_context(Client(scheduler, timeout="10s", set_as_default=False))
             except (OSError, ValueError, TimeoutError) as error:
-                raise GraphSlamError(f"{workers.scheduler}: no Dask scheduler answers: {error}") from None
-            _check_versions(client, workers.scheduler)
+                raise GraphSlamError(f"{scheduler}: no Dask scheduler answers: {error}") from None
+            _check_versions(client, scheduler)
         else:
             scratch = stack.enter_context(tempfile.TemporaryDirectory(prefix="graph_slam_dask_"))
             cluster = LocalCluster(
-                n_workers=workers.count or None,
+                n_workers=count or None,
                 threads_per_worker=1,
                 processes=True,
                 host="127.0.0.1",
@@ -98,29 +81,10 @@ def _version() -> str:
     return here
 
 
-def fingerprints(client: Client, store: Store, sources: Sequence[Source], progress: Progress) -> dict[str, str]:
-    """Return the fingerprint of each recording by its address. Those of unchanged files are not computed again.
-
-    A recording that cannot be read has none.
-    """
-    known = store.fingerprints()
-    unknown = [one for one in sources if one.identity not in known]
-    futures = client.map(fingerprint, [one.url for one in unknown], pure=False)
-    by_future = dict(zip(futures, unknown, strict=True))
-    for future in progress(as_completed(futures, loop=client.loop), len(unknown)):
-        if future.status == "finished":
-            known[by_future[future].identity] = future.result()
-    store.keep_fingerprints(known)
-    return {one.url: known[one.identity] for one in sources if one.identity in known}
-
-
 def run_jobs(
     client: Client, jobs: Sequence[Job], progress: Progress, function: Callable[[Job], Row] = run_isolated
 ) -> Iterator[Row]:
-    """Run jobs in their order, and yield the row of each when it is done.
-
-    A job whose process ends, or whose worker does, is begun again, three times in all. Then its row has the reason.
-    """
+    """Run jobs in their order, and yield the row of each when it is done."""
     yield from progress(_rows(client, jobs, function), len(jobs))
 
 
@@ -134,21 +98,14 @@ def _rows(client: Client, jobs: Sequence[Job], function: Callable[[Job], Row]) -
     def fill() -> None:
         room = max(sum(client.nthreads().values()), 1) - len(at_work)
         for job in itertools.islice(left, max(room, 0)):
-            future = client.submit(function, job, key=f"{job.recording} {job.key}", pure=False, retries=2)
+            future = client.submit(function, job, key=f"{job.recording} {job.key}", pure=False)
             at_work[future] = job
             done.add(future)
 
     fill()
     for future in done:
         job = at_work.pop(future)
-        row = future.result() if future.status == "finished" else _lost(job, future.exception())
+        error = None if future.status == "finished" else future.exception()
+        yield future.result() if error is None else failed(job, f"no worker could finish it: {error}")
         future.release()
         fill()
-        yield row
-
-
-def _lost(job: Job, error: BaseException) -> Row:
-    """The row of a job that no worker could finish."""
-    if type(error).__name__ in ("KilledWorker", "ProcessEndedError"):
-        return failed(job, why_it_died(Path(job.out), job.key))
-    return failed(job, str(error) if isinstance(error, OSError) else f"{type(error).__name__}: {error}")

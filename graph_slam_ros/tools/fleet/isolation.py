@@ -11,49 +11,45 @@ import select
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
 from dataclasses import asdict
-from typing import Any
 
-from graph_slam_ros.tools.fleet.job import Job, head, report_on, run_job
+from graph_slam_ros.tools.fleet.job import Job, failed, run_job
 from graph_slam_ros.tools.fleet.store import Row
 
-_TASKS: dict[str, Callable[[Job], Row]] = {"run": run_job, "report": report_on, "nothing": head}
-_GRACE_S = 60.0  # to start, to copy traces: after the limit of time a process that does not answer is killed
-
-
-class ProcessEndedError(OSError):
-    """The process of a job ended before the job did."""
+MOST_ATTEMPTS = 3
+_START_S = 300.0  # for the imports of the process
+_KILLED = f"its process ended {MOST_ATTEMPTS} times: killed, out of memory, or a crash"
+_HUNG = f"took longer than the limit of time, {MOST_ATTEMPTS} times"
 
 
 class _Process:
-    """A process that runs jobs: one line in, one line out."""
+    """A process that runs jobs: one line in, one line out, after an empty one when it is ready."""
 
     def __init__(self) -> None:
         self._popen = subprocess.Popen([sys.executable, "-m", __name__], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        self.wrong = "" if self._line(_START_S) else _KILLED
 
-    @property
-    def is_alive(self) -> bool:
-        return self._popen.poll() is None
-
-    def run(self, task: str, job: Job) -> Row:
+    def run(self, job: Job) -> Row | None:
+        """The row of a job; None, and what is ``wrong``, where there is none. The process is of no more use then."""
         assert self._popen.stdin is not None
-        assert self._popen.stdout is not None
         try:
-            self._popen.stdin.write(json.dumps([task, asdict(job)]).encode() + b"\n")
+            self._popen.stdin.write(json.dumps(asdict(job)).encode() + b"\n")
             self._popen.stdin.flush()
-            answers, _, _ = select.select([self._popen.stdout], [], [], job.limit_s + _GRACE_S)
-            line = self._popen.stdout.readline() if answers else b""
+            line = self._line(job.limit_s)
         except BrokenPipeError:
             line = b""
-        if not line.endswith(b"\n"):
-            self.end()
-            raise ProcessEndedError(f"{job.recording}: its process ended")
-        answer: dict[str, Any] = json.loads(line)
-        if "error" in answer:
-            raise OSError(answer["error"])
-        row: Row = answer["row"]
-        return row
+        if line is None or not line.endswith(b"\n"):
+            self.wrong = _HUNG if line is None else _KILLED
+            return None
+        row: Row = json.loads(line)
+        self.wrong = row["reason"] if row["state"] == "failed" else ""
+        return None if row.get("retry") else row
+
+    def _line(self, most_s: float) -> bytes | None:
+        """The next line; empty where the process has ended, None where there is none in time."""
+        assert self._popen.stdout is not None
+        answers, _, _ = select.select([self._popen.stdout], [], [], most_s)
+        return self._popen.stdout.readline() if answers else None
 
     def end(self) -> None:
         self._popen.kill()
@@ -63,27 +59,21 @@ class _Process:
 _of_this_thread = threading.local()
 
 
-def run_isolated(job: Job, task: str = "run") -> Row:
+def run_isolated(job: Job) -> Row:
     """Run a job in the process beside this one; returns its row.
 
-    Parameters
-    ----------
-    task : ``run`` it, write the ``report`` on its run, or ``nothing``: what remains is the cost of jobs
-
-    Raises
-    ------
-    ProcessEndedError
-        The process ended: begin the job again.
-    OSError
-        The disk or the store fails.
+    A job is begun again where its process ends, or its machine fails: three times in all.
     """
-    process = getattr(_of_this_thread, "process", None)
-    if process is None or not process.is_alive:
-        process = _of_this_thread.process = _Process()
-    row = process.run(task, job)
-    if row.get("state") == "failed":
-        process.end()  # nothing of what went wrong reaches the next job
-    return row
+    for _ in range(MOST_ATTEMPTS):
+        process = getattr(_of_this_thread, "process", None) or _Process()
+        _of_this_thread.process = process
+        row = process.run(job)
+        if process.wrong:  # nothing of it reaches the next job
+            process.end()
+            _of_this_thread.process = None
+        if row is not None:
+            return row
+    return failed(job, process.wrong)
 
 
 def _serve() -> None:
@@ -96,14 +86,11 @@ def _serve() -> None:
     os.dup2(2, 1)
     lines: queue.SimpleQueue[bytes] = queue.SimpleQueue()
     threading.Thread(target=_read, args=(lines,), daemon=True).start()
+    answer = "\n"
     while True:
-        task, job = json.loads(lines.get())
-        try:
-            answer: dict[str, Any] = {"row": _TASKS[task](Job(**job))}
-        except Exception as error:
-            answer = {"error": f"{type(error).__name__}: {error}"}
-        answers.write(json.dumps(answer) + "\n")
+        answers.write(answer)
         answers.flush()
+        answer = json.dumps(run_job(Job(**json.loads(lines.get())))) + "\n"
 
 
 def _read(lines: "queue.SimpleQueue[bytes]") -> None:

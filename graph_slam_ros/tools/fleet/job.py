@@ -1,12 +1,11 @@
 """One job of a fleet: a recording with a configuration, replayed and scored, to one row of the table.
 
-It runs in a worker's process, with a limit of time and of memory. What is wrong with the recording is a row with the
-reason. What is wrong with the machine is an exception, or the end of the process: then it is begun again elsewhere.
+It runs in a process of its own, with a limit of memory. A row says what is wrong with the recording, or with the
+machine: then the job is begun again.
 """
 
 import contextlib
 import errno
-import faulthandler
 import hashlib
 import os
 import platform
@@ -25,18 +24,7 @@ from graph_slam_ros.config.config import flatten
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.files import read_bytes
 from graph_slam_ros.tools.fleet.recordings import local_copy
-from graph_slam_ros.tools.fleet.store import (
-    ATTEMPTS,
-    ERRORS,
-    JOBS,
-    MOST_ATTEMPTS,
-    REPORT,
-    RUN,
-    Row,
-    begin_attempt,
-    keep,
-    traces,
-)
+from graph_slam_ros.tools.fleet.store import ERRORS, JOBS, REPORT, RUN, Row, keep
 
 if TYPE_CHECKING:
     from graph_slam_ros.config import Config
@@ -44,7 +32,6 @@ if TYPE_CHECKING:
 _HASHED = ("graph.g2o", "ledger.csv", "path.tum", "landmarks.csv")
 _OF_THE_MACHINE = {errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS, errno.ESTALE, errno.EMFILE, errno.ENFILE}
 _PARTS = 40
-_TIMEOUT = "Timeout ("  # how faulthandler begins
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,12 +42,11 @@ class Job:
     ----------
     key : its name, of the hashes of all that its result depends on
     url, recording : where the recording is, and its short name
-    setting : the configuration in words
-    values : parameters by name
+    setting, values : the configuration in words, and parameters by name
     truth : as ``evaluate --truth``; empty without
     out : the folder of the fleet
     limit_s : seconds after which it is ended
-    memory : bytes that it may use in addition to what the worker has; 0 without limit
+    memory : bytes that it may use in addition to what its process has; 0 without limit
     with_report : write a page on the run
     """
 
@@ -77,95 +63,67 @@ class Job:
 
 
 def run_job(job: Job) -> Row:
-    """Run a job; returns its row, which is in the store, too.
-
-    Raises
-    ------
-    OSError
-        The disk or the store fails: try it elsewhere.
-    """
-    out = Path(job.out)
-    attempt = begin_attempt(out, job.key)
-    if attempt > MOST_ATTEMPTS:
-        return failed(job, why_it_died(out, job.key))
-    made = Path(tempfile.mkdtemp(prefix=f".{job.key}.", dir=out / JOBS))
+    """Run a job; returns its row, which is in the store, too; with ``retry`` it is not, and the machine failed."""
     try:
-        row = head(job) | {"attempts": attempt, "worker": platform.node()}
-        with open(out / ATTEMPTS / f"{job.key}.{attempt}", "w") as trace, _limits(job, trace):
-            try:
-                row |= _results(job, made)
-            except (GraphSlamError, MemoryError) as error:
-                _check_machine(out, error)
-                row |= {"state": "failed", "reason": _reason(job, error)}
-        keep(out, job.key, made, row)
-    finally:
-        shutil.rmtree(made, ignore_errors=True)
+        made = _made(job)
+        try:
+            row = _head(job) | {"worker": platform.node()}
+            with _memory_limit(job.memory):
+                try:
+                    row |= _results(job, made)
+                except (GraphSlamError, MemoryError, OSError) as error:
+                    row |= {"state": "failed", "reason": _reason(job, error)}
+            keep(Path(job.out), job.key, made, row)
+        finally:
+            shutil.rmtree(made, ignore_errors=True)
+    except Exception as error:
+        what = str(error) if isinstance(error, OSError) else f"{type(error).__name__}: {error}"
+        return _head(job) | {"state": "failed", "reason": what, "retry": True}
     return row
 
 
-def report_on(job: Job) -> Row:
-    """Write the report on a run that is there; returns which one.
-
-    Raises
-    ------
-    OSError
-        The disk or the store fails.
-    """
-    from graph_slam_ros.tools.report import write_report
-
-    folder = Path(job.out) / JOBS / job.key
-    write_report(folder / RUN, folder / REPORT)
-    return head(job) | {"state": "done"}
+def _made(job: Job) -> Path:
+    """A new folder for the results, which is renamed when they are whole."""
+    return Path(tempfile.mkdtemp(prefix=f".{job.key}.", dir=Path(job.out) / JOBS))
 
 
-def head(job: Job) -> Row:
+def _head(job: Job) -> Row:
     """Return the columns that say which job it is."""
     return {"key": job.key, "recording": job.recording, "setting": job.setting, "url": job.url, "truth": job.truth}
 
 
-def _check_machine(out: Path, error: BaseException) -> None:
-    """Raise the error of the operating system behind ``error`` if it says nothing about the recording."""
-    cause: BaseException | None = error
-    while cause is not None:
-        if isinstance(cause, OSError) and cause.errno in _OF_THE_MACHINE:
-            raise OSError(cause.errno, os.strerror(cause.errno), str(out)) from None
-        cause = cause.__cause__ or cause.__context__
-
-
 def failed(job: Job, reason: str) -> Row:
     """Return the row of a job that did not end, and write it where there is room."""
-    row = head(job) | {"state": "failed", "reason": reason, "attempts": MOST_ATTEMPTS, "retry": True}
+    row = _head(job) | {"state": "failed", "reason": reason, "retry": True}
     with contextlib.suppress(OSError):  # without the row it is run again, too
-        made = Path(tempfile.mkdtemp(prefix=f".{job.key}.", dir=Path(job.out) / JOBS))
-        keep(Path(job.out), job.key, made, row)
+        keep(Path(job.out), job.key, _made(job), row)
     return row
 
 
-def why_it_died(out: Path, key: str) -> str:
-    """The reason why the process of a job ended, from what its attempts left."""
-    if any(_TIMEOUT in trace for trace in traces(out, key)):
-        return f"took longer than the limit of time, {MOST_ATTEMPTS} times"
-    return f"its process ended {MOST_ATTEMPTS} times: killed, out of memory, or a crash"
-
-
 def _reason(job: Job, error: BaseException) -> str:
-    if isinstance(error, MemoryError):
+    """The reason why a recording cannot be used; an error of the machine is raised instead, also one behind another."""
+    if isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM:
         return f"out of memory: more than {job.memory / 2**20:.0f} MiB (--memory)"
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, OSError) and cause.errno in _OF_THE_MACHINE:
+            raise OSError(cause.errno, os.strerror(cause.errno), job.out) from None
+        cause = cause.__cause__ or cause.__context__
+    if isinstance(error, OSError):
+        raise error
     return " ".join(str(error).split())
 
 
 @contextlib.contextmanager
-def _limits(job: Job, trace: Any) -> Iterator[None]:
-    """End the process after the limit of time; let allocations fail beyond the limit of memory."""
+def _memory_limit(memory: int) -> Iterator[None]:
+    """Let allocations fail beyond a limit; 0 is none."""
     before = resource.getrlimit(resource.RLIMIT_DATA)
-    faulthandler.dump_traceback_later(job.limit_s, exit=True, file=trace)  # a thread, which needs memory itself
-    if job.memory:
-        limit = _status_bytes("VmData") + job.memory
+    if memory:
+        limit = _status_bytes("VmData") + memory
         resource.setrlimit(resource.RLIMIT_DATA, (limit if before[1] < 0 else min(limit, before[1]), before[1]))
     try:
         yield
     finally:
-        faulthandler.cancel_dump_traceback_later()
         resource.setrlimit(resource.RLIMIT_DATA, before)
 
 

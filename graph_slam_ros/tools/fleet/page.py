@@ -59,7 +59,7 @@ def _more(folder: Path, rows: Sequence[Mapping[str, Any]]) -> str:
     """Say what the table of runs lacks, and how to get it."""
     lines = []
     if len(rows) > _MOST:
-        lines.append(f"These are {_MOST} of {len(rows)} runs. graph_slam fleet table {folder} prints the others.")
+        lines.append(f"These are {_MOST} of {len(rows)} runs. table.parquet has all of them.")
     if not any((folder / JOBS / row["key"] / REPORT).is_file() for row in rows):
         lines.append("The runs have no reports: fleet replay --report writes them.")
     if not any(row.get("rmse_m") is not None for row in rows):

@@ -1,4 +1,4 @@
-"""The recordings of a fleet: found in folders and in the stores of fsspec, hashed, and copied to a worker."""
+"""The recordings of a fleet: found in folders and in the stores of fsspec, and copied to a worker."""
 
 import hashlib
 import os
@@ -13,7 +13,6 @@ from graph_slam_ros.errors import GraphSlamError
 
 _SUFFIXES = (".mcap", ".bag", ".db3", ".mcap.zstd", ".db3.zstd", ".bag.active")
 _METADATA = "metadata.yaml"
-_BLOCK = 2**20
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +24,7 @@ class Source:
     url : path, or address that fsspec can read
     name : short name, unique in the fleet
     size : bytes of its files
-    identity : changes when a file does: names, sizes, and times or checksums of the store
+    identity : changes when a file does: a hash of names, sizes, and times or checksums of the store
     """
 
     url: str
@@ -104,19 +103,6 @@ def _short_names(urls: list[str]) -> dict[str, str]:
                 break
         out[url] = "/".join(tail)
     return out
-
-
-def fingerprint(url: str) -> str:
-    """Return the SHA-256 of a recording's files and their names, in hexadecimal."""
-    fs, root = url_to_fs(url)
-    files = sorted(fs.find(root)) if fs.isdir(root) else [root]
-    digest = hashlib.sha256()
-    for file in files:
-        digest.update(file[len(root) :].encode() + b"\0")
-        with fs.open(file, "rb") as opened:
-            while block := opened.read(_BLOCK):
-                digest.update(block)
-    return digest.hexdigest()
 
 
 def local_copy(url: str, folder: Path) -> Path:

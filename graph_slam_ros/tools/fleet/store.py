@@ -1,9 +1,7 @@
 """The folder of a fleet: one folder for each job, written under another name first, and a table of all.
 
 fleet.json         what this folder is
-recordings.txt     identity and fingerprint of each recording
 jobs/KEY/          row.json, and run/ as replay writes it; report.html
-attempts/KEY.N     a job was begun for the Nth time
 table.parquet      the rows of all jobs
 """
 
@@ -25,23 +23,21 @@ from graph_slam_ros.formats.durable import write_whole
 from graph_slam_ros.formats.files import read_text
 
 MARK, FORMAT = "fleet.json", "graph_slam_ros fleet"
-ROW, RUN, REPORT, TABLE, RECORDINGS = "row.json", "run", "report.html", "table.parquet", "recordings.txt"
-JOBS, ATTEMPTS = "jobs", "attempts"
+JOBS, ROW, RUN, REPORT, TABLE = "jobs", "row.json", "run", "report.html", "table.parquet"
 ERRORS = "errors_m"
 """Errors of parts of a drive, in its order. The page draws them."""
-MOST_ATTEMPTS = 3
 _ADDRESS = re.compile(r"[a-z][a-z0-9+.-]+:/")  # as Path leaves s3://
 
 Row = dict[str, Any]
 
 
-def job_key(fingerprint: str, settings: Mapping[str, Any], truth: str) -> str:
-    """Return the name of a job: of the recording's bytes, all parameters, the truth with its time, and the version."""
+def job_key(identity: str, settings: Mapping[str, Any], truth: str) -> str:
+    """Return the name of a job: of the recording's identity, all parameters, the truth with its time, the version."""
     changed = 0
     with contextlib.suppress(OSError):
         file = truth if os.path.exists(truth) else truth.rpartition(":")[0]  # BAG:TOPIC
         changed = os.stat(file).st_mtime_ns
-    whole = json.dumps([fingerprint, settings, truth, changed, __version__], sort_keys=True)
+    whole = json.dumps([identity, settings, truth, changed, __version__], sort_keys=True)
     return hashlib.sha256(whole.encode()).hexdigest()[:24]
 
 
@@ -75,8 +71,7 @@ class Store:
             if any(one.name != ".lock" for one in self.folder.iterdir()):
                 raise GraphSlamError(f"{self.folder}: is not empty and not the folder of a fleet: choose another --out")
             write_whole(self.folder / MARK, json.dumps({"format": FORMAT, "version": __version__}).encode())
-        for name in (JOBS, ATTEMPTS):
-            (self.folder / name).mkdir(exist_ok=True)
+        (self.folder / JOBS).mkdir(exist_ok=True)
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
@@ -112,52 +107,10 @@ class Store:
         keys = sorted(one.name for one in (self.folder / JOBS).iterdir() if not one.name.startswith("."))
         return (row for key in keys if (row := self.result(key)) is not None)
 
-    def forget_attempts(self) -> None:
-        """Remove the marks of jobs that were begun: those of a fleet that was stopped do not count."""
-        for mark in (self.folder / ATTEMPTS).iterdir():
-            mark.unlink(missing_ok=True)
-        for left in (self.folder / JOBS).glob(".*"):
+    def clear(self, keys: Iterable[str]) -> None:
+        """Remove what a fleet that was stopped left, and the folders of jobs that are run again."""
+        for left in (*(self.folder / JOBS).glob(".*"), *(self.folder / JOBS / key for key in keys)):
             shutil.rmtree(left, ignore_errors=True)
-
-    def discard(self, keys: Iterable[str]) -> None:
-        """Remove the folders of jobs that are run again: they have no row, or one of a machine that failed."""
-        for key in keys:
-            shutil.rmtree(self.folder / JOBS / key, ignore_errors=True)
-
-    def fingerprints(self) -> dict[str, str]:
-        """Fingerprints of recordings by identity, as far as they are known."""
-        try:
-            lines = read_text(self.folder / RECORDINGS).splitlines()
-        except OSError:
-            return {}
-        return {pair[0]: pair[1] for line in lines if len(pair := line.split()) == 2}
-
-    def keep_fingerprints(self, known: Mapping[str, str]) -> None:
-        """Save the fingerprints by identity."""
-        text = "".join(f"{identity} {value}\n" for identity, value in sorted(known.items()))
-        write_whole(self.folder / RECORDINGS, text.encode())
-
-
-def begin_attempt(folder: Path, key: str) -> int:
-    """Note that a job begins; returns how often it did, this time included.
-
-    Raises
-    ------
-    FileNotFoundError
-        The worker does not see the folder.
-    """
-    for n in range(1, MOST_ATTEMPTS + 1):
-        with contextlib.suppress(FileExistsError):
-            os.close(os.open(folder / ATTEMPTS / f"{key}.{n}", os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o644))
-            return n
-    return MOST_ATTEMPTS + 1
-
-
-def traces(folder: Path, key: str) -> Iterable[str]:
-    """Yield what the attempts of a job wrote before their process was ended."""
-    for n in range(1, MOST_ATTEMPTS + 1):
-        with contextlib.suppress(OSError):
-            yield read_text(folder / ATTEMPTS / f"{key}.{n}")
 
 
 def keep(folder: Path, key: str, made: Path, row: Row) -> None:

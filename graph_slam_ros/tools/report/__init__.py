@@ -7,8 +7,6 @@ from graph_slam_ros.formats.durable import write_whole
 from graph_slam_ros.tools.report.contents import Contents, read_contents
 from graph_slam_ros.tools.report.page import plotly, whole_page
 
-__all__ = ["write_report"]
-
 
 def write_report(
     run: Path,

@@ -2,9 +2,19 @@
 
 import argparse
 import gc
+from pathlib import Path
 
-from graph_slam_ros.cli import console
+from graph_slam_ros.cli import arguments, console
+from graph_slam_ros.cli.usage import CommandParser
 from graph_slam_ros.errors import GraphSlamError
+
+
+def report_options(sub: CommandParser) -> None:
+    """Add the options of ``report``."""
+    arguments.add_run(sub)
+    sub.add_argument("--out", type=Path, metavar="FILE.html", help="file of the report (default: RUN.html)")
+    arguments.add_shown(sub)
+    arguments.add_force(sub)
 
 
 def report(args: argparse.Namespace) -> int:

@@ -44,16 +44,11 @@ def whole_page(made: Contents, script: str, panel: Panel | None = None) -> str:
     """The whole HTML file; ``script`` is that of plotly."""
     own = (_HERE / "page.js").read_text(encoding="utf-8")
     scripts = [script, *([panel.script] if panel else []), own]
-    rules = "; ".join(
-        (
-            "default-src 'none'",
-            f"script-src 'unsafe-eval' {' '.join(map(_hash, scripts))}",  # plotly compiles its shaders' glue
-            "connect-src 'self'" if panel else "connect-src 'none'",
-            "style-src 'unsafe-inline'",
-            "img-src data: blob:",
-            "base-uri 'none'",
-            "form-action 'none'",
-        )
+    server = "'self'" if panel else "'none'"
+    rules = (  # plotly compiles its shaders' glue
+        f"default-src 'none'; script-src 'unsafe-eval' {' '.join(map(_hash, scripts))};"
+        f" connect-src {server}; style-src 'unsafe-inline'; img-src data: blob:;"
+        " base-uri 'none'; form-action 'none'"
     )
     title = html.escape(f"{shown(made.run.resolve().name)}: {'view' if panel else 'report'}")
     body = (_HERE / "page.html").read_text(encoding="utf-8")

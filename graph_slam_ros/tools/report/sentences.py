@@ -78,13 +78,8 @@ class Effects:
 def effects(run: SavedGraph) -> Effects:
     """Compute the effects of all judged edges, to first order."""
     count, n = len(run.entries), run.space.dimensions
-    out = Effects(
-        np.full(count, np.nan),
-        np.full(count, np.nan),
-        np.zeros(count, dtype=np.int64),
-        np.full(count, np.nan),
-        np.zeros(count, dtype=bool),
-    )
+    last_m, end_m, cost = np.full((3, count), np.nan)
+    out = Effects(last_m, end_m, np.zeros(count, dtype=np.int64), cost, np.zeros(count, dtype=bool))
 
     def enter(found: Influences) -> None:
         at = found.edges

@@ -17,11 +17,10 @@ from graph_slam_ros.tools.simulation.drive import Drive
 from graph_slam_ros.tools.simulation.faults import KINDS, Fault, spoil_messages
 from graph_slam_ros.tools.simulation.faulty import faulty_graph, faulty_recording
 from graph_slam_ros.tools.simulation.instruments import Instruments, with_instruments
-from graph_slam_ros.tools.simulation.options import Option, check_seed, fill, options_of
+from graph_slam_ros.tools.simulation.options import Option, check_seed, filled, options_of
 from graph_slam_ros.tools.simulation.pose_graph import (
     GRAPH_WORLDS,
     city_graph,
-    landmark_graph,
     sphere_graph,
     write_graph,
 )
@@ -34,11 +33,6 @@ class World:
 
     options: type
     drive: Callable[[int, Any], Recording]
-
-    @property
-    def about(self) -> str:
-        """Describe it in one sentence."""
-        return (self.drive.__doc__ or "").strip().splitlines()[0]
 
 
 WORLDS: dict[str, World] = {
@@ -63,8 +57,9 @@ def simulate(world: str, /, seed: int, **options: Any) -> Recording:
     names = {o.name for o in options_of(Instruments)}
     chosen = {name: value for name, value in options.items() if name in names}
     rest = {name: value for name, value in options.items() if name not in names}
-    of_world: Any = fill(world, WORLDS[world].options, rest, [*names])
-    return with_instruments(WORLDS[world].drive(seed, of_world), seed, fill(world, Instruments, chosen))
+    one = WORLDS[world]
+    recording = one.drive(seed, one.options(**filled(world, one.options, rest, [*names])))
+    return with_instruments(recording, seed, Instruments(**filled(world, Instruments, chosen)))
 
 
 def write_faulty_bag(recording: Recording, path: Path, faults: Sequence[Fault], seed: int) -> list[WrongMessage]:
@@ -98,7 +93,6 @@ __all__ = [
     "city_graph",
     "faulty_graph",
     "faulty_recording",
-    "landmark_graph",
     "measurements",
     "options_of",
     "simulate",

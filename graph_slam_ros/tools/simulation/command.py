@@ -1,17 +1,33 @@
-"""The command ``simulate``: worlds as recordings or graphs, and faults in them, or in the graph of a file."""
+"""The command ``simulate``: worlds as recordings or graphs, and faults in them, in a recording or in a graph."""
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from graph_slam_ros.cli import console
+from graph_slam_ros.cli import arguments, console
+from graph_slam_ros.cli.usage import CommandParser, later
 from graph_slam_ros.errors import GraphSlamError, did_you_mean, similar_file
 
-if TYPE_CHECKING:
-    from graph_slam_ros.formats.graph_file import G2oFile
-    from graph_slam_ros.tools.simulation import Fault, Recording
+
+def simulate_options(sub: CommandParser) -> None:
+    """Add the options of ``simulate``."""
+    sub.more = later("tools.simulation.command", "options_of_worlds")
+    about = "name of a world (city, sphere: a graph), or the file of a graph or recording"
+    sub.add_argument("scenario", metavar="SCENARIO", help=about)
+    about = "output file; by its ending a recording or a graph"
+    sub.add_argument("--out", type=Path, required=True, metavar="BAG.mcap|GRAPH.g2o", help=about)
+    arguments.add_force(sub)
+    sub.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the random numbers (default: 0)")
+    about = "number of poses of the drive, if the world has that option"
+    sub.add_argument("--poses", type=arguments.count, metavar="N", help=about)
+    about = "option of the world, listed below"
+    sub.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help=about)
+    about = "number of true loop closures to add, on /closures"
+    sub.add_argument("--closures", type=arguments.count, metavar="N", help=about)
+    about = "fault to add, listed below; several are added in order"
+    sub.add_argument("--fault", action="append", default=[], metavar="KIND[:KEY=VALUE,...]", help=about)
 
 
 def simulate(args: argparse.Namespace) -> int:
@@ -19,132 +35,101 @@ def simulate(args: argparse.Namespace) -> int:
     from graph_slam_ros.formats.strict import ending
     from graph_slam_ros.tools.simulation import GRAPH_WORLDS, WORLDS, Fault
 
-    is_world = args.scenario in (*WORLDS, *GRAPH_WORLDS)
+    source, is_world = Path(args.scenario), args.scenario in (*WORLDS, *GRAPH_WORLDS)
     faults = [Fault.parsed(text) for text in args.fault]
     as_graph = ending(args.out) == ".g2o"
-    if as_graph and (wrong := [fault.kind for fault in faults if fault.is_of_messages]):
-        raise GraphSlamError(f"{wrong[0]}: a graph has no messages: --out FILE.mcap")
-    if not is_world and _is_recording(Path(args.scenario)) and not as_graph:
-        return _spoil_recording(args, faults)
-    if not is_world and not Path(args.scenario).exists():
+    is_recording = not is_world and (source.is_dir() or source.suffix in (".mcap", ".db3", ".bag"))
+    if not is_world and not source.exists():
         there = [*WORLDS, *GRAPH_WORLDS]
-        near = did_you_mean(args.scenario, there) or similar_file(Path(args.scenario))
+        near = did_you_mean(args.scenario, there) or similar_file(source)
         raise GraphSlamError(f"no world {args.scenario!r}; there are {', '.join(there)}, and no such file{near}")
-    of_file = not is_world and Path(args.scenario).is_file()
-    if (of_file or args.scenario in GRAPH_WORLDS) and not as_graph:
-        raise GraphSlamError(f"{args.out}: {args.scenario} is a graph: --out FILE.g2o")
-    companions = [".faults.csv"] * bool(faults) + [".truth.tum"] * (as_graph and not of_file)
-    written, source = [_companion(args.out, ending) for ending in companions], Path(args.scenario) if of_file else None
-    console.check_file(args.out, *written, force=args.force, source=source)
-    if of_file:
-        return _spoil(args, faults)
+    for what in ("set", "closures", "poses"):
+        if not is_world and getattr(args, what):
+            raise GraphSlamError(f"{source}: no use for --{what}: it is no world")
+    is_graph = args.scenario in GRAPH_WORLDS or not (is_world or is_recording)
+    if is_graph != as_graph:
+        fitting = "a graph: --out FILE.g2o" if is_graph else "a recording: --out FILE.mcap"
+        raise GraphSlamError(f"{args.out}: {args.scenario} is {fitting}")
+    table, truth = _companion(args.out, ".faults.csv"), _companion(args.out, ".truth.tum")
+    companions = [table] * (bool(faults) and not is_recording) + [truth] * (is_graph and is_world)
+    console.check_file(args.out, *companions, force=args.force, source=None if is_world else source)
     try:
-        if as_graph:
-            _write_graph(args, faults)
+        if is_recording:
+            _spoil_recording(args, faults)
+        elif is_graph:
+            _write_graph(args, faults, truth)
         else:
             _write_bag(args, faults)
     except OSError as error:
         raise GraphSlamError(f"{args.out}: {error.strerror}") from None
-    console.then(console.command("optimize" if as_graph else "info", args.out))
+    console.then(console.command("optimize" if is_graph else "check" if is_recording else "info", args.out))
     return console.DONE
 
 
-def _write_bag(args: argparse.Namespace, faults: "list[Fault]") -> None:
-    from graph_slam_ros.tools.simulation import WrongMessage, write_faulty_bag, write_table
-
-    wrong = write_faulty_bag(_recorded(args), args.out, faults, args.seed)
-    console.show(f"wrote {args.out}")
-    if faults:
-        write_table(_companion(args.out, ".faults.csv"), WrongMessage, wrong)
-        console.show(f"wrote {_companion(args.out, '.faults.csv')}: {len(wrong)} measurements are wrong")
-
-
-def _is_recording(path: Path) -> bool:
-    return path.is_dir() or (path.is_file() and path.suffix in (".mcap", ".db3", ".bag"))
-
-
-def _spoil_recording(args: argparse.Namespace, faults: "list[Fault]") -> int:
+def _spoil_recording(args: argparse.Namespace, faults: list[Any]) -> None:
     """A recording of the user with faults in its messages."""
     from graph_slam_ros.tools.simulation import spoil_bag
 
-    for what, given in (("--set", args.set), ("--closures", args.closures), ("--poses", args.poses)):
-        if given:
-            raise GraphSlamError(f"{args.scenario}: no use for {what}: it is no world")
     for fault in faults:
         if not fault.is_of_messages:
             raise GraphSlamError(f"{fault.kind}: needs the truth of a world, which {args.scenario} is not")
     if not faults:
         raise GraphSlamError(f"{args.scenario}: no --fault, so nothing to do")
-    console.check_file(args.out, force=args.force, source=Path(args.scenario))
     spoil_bag(Path(args.scenario), args.out, faults, args.seed)
     console.show(f"wrote {args.out}")
-    console.then(console.command("check", args.out))
-    return console.DONE
 
 
-def _write_graph(args: argparse.Namespace, faults: "list[Fault]") -> None:
+def _write_bag(args: argparse.Namespace, faults: list[Any]) -> None:
+    from graph_slam_ros.tools.simulation import WrongMessage, with_closures, write_faulty_bag
+    from graph_slam_ros.tools.simulation import simulate as recorded
+
+    recording = recorded(args.scenario, args.seed, **_options(args))
+    if args.closures is not None:
+        recording = with_closures(recording, args.closures, args.seed)
+    wrong = write_faulty_bag(recording, args.out, faults, args.seed)
+    console.show(f"wrote {args.out}")
+    if faults:
+        _write_table(args.out, WrongMessage, wrong, "measurements")
+
+
+def _write_graph(args: argparse.Namespace, faults: list[Any], truth_file: Path) -> None:
+    """The graph of a world, or of a file, whose optimum is taken as the truth, with faults."""
+    from graph_slam_ros.formats.g2o import read_g2o
+    from graph_slam_ros.formats.g2o_writer import write_g2o
     from graph_slam_ros.formats.graph_file import G2oFile
     from graph_slam_ros.formats.tum import write_trajectory
-    from graph_slam_ros.tools.simulation import GRAPH_WORLDS, landmark_graph, options_of
-    from graph_slam_ros.tools.simulation.pose_graph import truth_of, values_of
+    from graph_slam_ros.optimization import optimize
+    from graph_slam_ros.tools.simulation import GRAPH_WORLDS, WrongLine, faulty_graph, options_of
+    from graph_slam_ros.tools.simulation.pose_graph import values_of
 
-    if world := GRAPH_WORLDS.get(args.scenario):
+    world = GRAPH_WORLDS.get(args.scenario)
+    if world:
         if args.closures is not None:
             more = ": --set closures=N" if any(o.name == "closures" for o in options_of(world.options)) else ""
             raise GraphSlamError(f"{args.scenario}: no use for --closures: it has them{more}")
         graph, poses = world.measure(args.seed, **_options(args))
-        truth = poses.ravel()
+        file, truth = G2oFile(graph, list(range(graph.vertex_count)), [0]), poses.ravel()
         if "closures" not in graph.labels:
             console.show(f"{args.scenario}: with {len(poses)} poses nothing is closed: a larger --poses")
     else:
-        recording = _recorded(args)
-        if recording.gnss or recording.imu:
-            raise GraphSlamError(f"{args.out}: a graph has no use for gnss or imu: --out FILE.mcap")
-        graph = landmark_graph(recording)
-        truth = truth_of(recording, graph)
-    file = G2oFile(graph, list(range(graph.vertex_count)), [0])
-    _write_faulty(args, file, truth, faults)
-    path = _companion(args.out, ".truth.tum")
-    write_trajectory(path, file, values_of(graph, truth))
-    console.show(f"wrote {path}: the true poses")
-
-
-def _spoil(args: argparse.Namespace, faults: "list[Fault]") -> int:
-    """The graph of a file with faults. Its optimum is taken as the truth."""
-    from graph_slam_ros.formats.g2o import read_g2o
-    from graph_slam_ros.optimization import optimize
-
-    source = Path(args.scenario)
-    for what, given in (("--set", args.set), ("--closures", args.closures), ("--poses", args.poses)):
-        if given:
-            raise GraphSlamError(f"{source}: no use for {what}: it is no world")
-    file = read_g2o(source)
-    solver = optimize(file).solver
-    truth = np.concatenate([solver.estimate([v])[0] for v in range(file.graph.vertex_count)])
-    _write_faulty(args, file, truth, faults)
-    console.then(console.command("optimize", args.out))
-    return console.DONE
-
-
-def _write_faulty(args: argparse.Namespace, file: "G2oFile", truth: Any, faults: "list[Fault]") -> None:
-    from graph_slam_ros.formats.g2o_writer import write_g2o
-    from graph_slam_ros.tools.simulation import WrongLine, faulty_graph, write_table
-    from graph_slam_ros.tools.simulation.pose_graph import values_of
-
-    out, wrong = faulty_graph(file, truth, faults, args.seed)
+        file = read_g2o(Path(args.scenario))
+        solver = optimize(file).solver
+        truth = np.concatenate([solver.estimate([v])[0] for v in range(file.graph.vertex_count)])
+    out, wrong = faulty_graph(file, truth, faults, args.seed) if faults else (file, [])
     write_g2o(args.out, out, values_of(out.graph, out.graph.initial.values))
     console.show(f"wrote {args.out}")
     if faults:
-        write_table(_companion(args.out, ".faults.csv"), WrongLine, wrong)
-        console.show(f"wrote {_companion(args.out, '.faults.csv')}: {len(wrong)} edges are wrong")
+        _write_table(args.out, WrongLine, wrong, "edges")
+    if world:
+        write_trajectory(truth_file, file, values_of(file.graph, truth))
+        console.show(f"wrote {truth_file}: the true poses")
 
 
-def _recorded(args: argparse.Namespace) -> "Recording":
-    from graph_slam_ros.tools.simulation import simulate as recorded
-    from graph_slam_ros.tools.simulation import with_closures
+def _write_table(out: Path, of: type, wrong: list[Any], what: str) -> None:
+    from graph_slam_ros.tools.simulation import write_table
 
-    recording = recorded(args.scenario, args.seed, **_options(args))
-    return recording if args.closures is None else with_closures(recording, args.closures, args.seed)
+    write_table(_companion(out, ".faults.csv"), of, wrong)
+    console.show(f"wrote {_companion(out, '.faults.csv')}: {len(wrong)} {what} are wrong")
 
 
 def _options(args: argparse.Namespace) -> dict[str, Any]:
@@ -166,14 +151,13 @@ def _companion(out: Path, ending: str) -> Path:
 
 def options_of_worlds() -> str:
     """Every option of the worlds and every kind of fault, with defaults."""
-    from graph_slam_ros.tools.simulation import GRAPH_WORLDS, WORLDS, Instruments
-    from graph_slam_ros.tools.simulation.faults import KINDS
+    from graph_slam_ros.tools.simulation import GRAPH_WORLDS, KINDS, WORLDS, Instruments, options_of
     from graph_slam_ros.tools.simulation.message_faults import MESSAGE_KINDS
-    from graph_slam_ros.tools.simulation.options import options_of
+    from graph_slam_ros.tools.simulation.options import about
 
-    def option_lines(cls: type) -> list[str]:
+    def option_lines(what: Any) -> list[str]:
         lines = []
-        for o in options_of(cls):
+        for o in options_of(what):
             choices = f": {', '.join(o.choices)}" if o.choices else ""
             default = str(o.default).lower() if isinstance(o.default, bool) else o.default
             lines.append(f"    {o.name}={default}{f' [{o.unit}]' if o.unit else ''}  {o.meaning}{choices}")
@@ -181,15 +165,15 @@ def options_of_worlds() -> str:
 
     lines = ["options of the worlds, for --set:"]
     for name, world in WORLDS.items():
-        lines += [f"  {name}: {world.about}", *option_lines(world.options)]
+        lines += [f"  {name}: {about(world.drive)}", *option_lines(world.options)]
     lines += ["  every world: with a satellite receiver and an IMU", *option_lines(Instruments)]
     for name, graph_world in GRAPH_WORLDS.items():
-        lines += [f"  {name}, a graph: {graph_world.about}", *option_lines(graph_world.options)]
-    lines += ["", "faults for --fault with their options; OUT.faults.csv lists what is wrong:"]
-    for name, kind in KINDS.items():
-        lines += [f"  {name}: {kind.about}", *option_lines(kind.options)]
-    lines += ["", "faults of drivers, clocks and frames, in a world or in a recording of yours:"]
-    for name, of_messages in MESSAGE_KINDS.items():
-        lines += [f"  {name}: {of_messages.about}", *option_lines(of_messages.options)]
+        lines += [f"  {name}, a graph: {about(graph_world.measure)}", *option_lines(graph_world.options)]
+    faults = "faults for --fault with their options; OUT.faults.csv lists what is wrong:"
+    others = "faults of drivers, clocks and frames, in a world or in a recording of yours:"
+    for title, kinds in ((faults, KINDS), (others, MESSAGE_KINDS)):
+        lines += ["", title]
+        for name, kind in kinds.items():
+            lines += [f"  {name}: {about(kind)}", *option_lines(kind)]
     lines += ["", "example: graph_slam simulate warehouse --out world.mcap --set gnss=5 --set imu=100"]
     return "\n".join(lines)

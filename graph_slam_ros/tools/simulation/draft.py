@@ -1,7 +1,4 @@
-"""A draft of measurements, into which faults are put before it becomes a recording or a graph.
-
-Recordings and graphs are converted into the same draft, and back. A fault only changes the draft.
-"""
+"""A draft of measurements, into which faults are put before it becomes a recording, and the tables of what is wrong."""
 
 import csv
 import io
@@ -44,26 +41,24 @@ class Draft:
     ----------
     truth : (n, 3) or (n, 7) true poses
     odometry : the same by dead reckoning
-    twist : (n, d) velocity since the pose before; None where nobody measured it
+    twist : (n, d) velocity since the pose before
     sightings, seen_at : what was seen, and (m,) from which pose
     landmarks : true places by id
     closures : of true places; false ones are added
     places : the poses that closures join
-    hidden : sightings that a fault leaves out, by number, with the fault
     wrong : what faults have made wrong, by what was measured and its number; of odometry the later pose's
     """
 
     space: Geometry
     truth: Array
     odometry: Array
-    twist: Array | None
+    twist: Array
     sightings: list[Sighting]
     seen_at: Index
     landmarks: Mapping[str, Numbers]
     closures: Closures
     places: Index
     wrong: dict[tuple[Measured, int], Wrong] = field(default_factory=dict)
-    hidden: dict[int, str] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.odometry)
@@ -82,10 +77,6 @@ class Draft:
         before = self.wrong.get(("sighting", number))
         self.wrong["sighting", number] = Wrong(_both(before, fault), self.true_id(number))
         self.sightings[number] = sighting
-
-    def hide(self, number: int, fault: str) -> None:
-        """Leave a sighting out."""
-        self.hidden[number] = fault
 
     def spoil_odometry(self, later: Sequence[int], fault: str) -> None:
         """Mark the motion up to some poses as wrong."""
@@ -159,7 +150,7 @@ class WrongLine:
     ----------
     line : of the file, from 1
     first, second : ids of its vertices, as in the file
-    true_second : the landmark that was seen
+    true_second : empty of a closure
     """
 
     line: int
@@ -167,7 +158,7 @@ class WrongLine:
     first: int
     second: int
     fault: str
-    true_second: int | str
+    true_second: str = ""
 
 
 def write_table(path: Path | str, of: type, rows: Sequence[WrongMessage] | Sequence[WrongLine]) -> None:

@@ -13,116 +13,46 @@ from numpy.random import PCG64, Generator, SeedSequence
 
 from graph_slam_ros.errors import GraphSlamError, did_you_mean
 from graph_slam_ros.formats.parameters import parse_setting
+from graph_slam_ros.tools.simulation import false_closures as generator
 from graph_slam_ros.tools.simulation.draft import Draft
 from graph_slam_ros.tools.simulation.drive import Drive
-from graph_slam_ros.tools.simulation.false_closures import GROUP, POLICIES, Closures, count_for, false_closures
 from graph_slam_ros.tools.simulation.message_faults import MESSAGE_KINDS
-from graph_slam_ros.tools.simulation.options import Kind, fill, option
+from graph_slam_ros.tools.simulation.options import Kinds, filled, option
 from graph_slam_ros.typing import Array
 
 _OFTEN = 3  # times that a landmark must be seen, and seen again later, to be worth a fault
 _STREAMS = 1  # the world itself is drawn from the seed alone, true closures from stream 0
 _HALFWAY = "when, as a part of the whole: 0 the first pose, 1 the last"
 
+KINDS = Kinds()
+"""Faults of worlds, whose truth is known."""
 
-@dataclass(frozen=True, slots=True)
-class FalseClosures:
+
+@KINDS.add
+def false_closures(
+    draft: Draft,
+    rng: Generator,
+    *,
+    policy: str = option("random", "which poses, see ``false_closures``", choices=generator.POLICIES),
+    rate: float = option(0.3, "false of all closures", "", 0, 0.99),
+    count: int = option(0, "so many, whatever the rate; 0: by the rate", "", 0, 1e6),
+    group: int = option(generator.GROUP, "pairs of poses in a group", "", 1, 1e4),
+) -> None:
     """Closures between different places; one that agrees with the truth is drawn again."""
-
-    policy: str = option("random", "which poses, see ``false_closures``", choices=POLICIES)
-    rate: float = option(0.3, "false of all closures", "", 0, 0.99)
-    count: int = option(0, "so many, whatever the rate; 0: by the rate", "", 0, 1e6)
-    group: int = option(GROUP, "pairs of poses in a group", "", 1, 1e4)
-
-
-@dataclass(frozen=True, slots=True)
-class WrongIds:
-    """Sightings with the id of another landmark, if possible one that is not in the same message."""
-
-    rate: float = option(0.05, "of all sightings", "", 0, 1)
-
-
-@dataclass(frozen=True, slots=True)
-class SwappedIds:
-    """Pairs of landmarks that exchange their ids, from some time on."""
-
-    pairs: int = option(1, "how many", "", 1, 1e4)
-    at: float = option(0.5, _HALFWAY, "", 0, 1)
-
-
-@dataclass(frozen=True, slots=True)
-class ReusedIds:
-    """Pairs of landmarks that both have the id of the first."""
-
-    pairs: int = option(1, "how many", "", 1, 1e4)
-
-
-@dataclass(frozen=True, slots=True)
-class MovedLandmarks:
-    """Landmarks that stand elsewhere from some time on."""
-
-    count: int = option(1, "how many", "", 1, 1e4)
-    at: float = option(0.5, _HALFWAY, "", 0, 1)
-    distance_m: float = option(2.0, "by how much each, in a direction of its own", "m", 0, 1000)
-
-
-@dataclass(frozen=True, slots=True)
-class RemovedLandmarks:
-    """Landmarks that are taken away, or first put up, at some time: no sighting of them after it, or before."""
-
-    count: int = option(1, "how many", "", 1, 1e4)
-    at: float = option(0.5, _HALFWAY, "", 0, 1)
-    put_up: bool = option(False, "they are there from then on, instead of until then")
-
-
-@dataclass(frozen=True, slots=True)
-class Outliers:
-    """Sightings whose range is too long, as by an echo."""
-
-    rate: float = option(0.05, "of all sightings", "", 0, 1)
-    most_m: float = option(5.0, "by how much at most; evenly from a fifth of it", "m", 1e-3, 1000)
-
-
-@dataclass(frozen=True, slots=True)
-class Slip:
-    """A stretch in which odometry tells a longer or shorter way than was driven."""
-
-    at: float = option(0.5, _HALFWAY, "", 0, 1)
-    lasting: float = option(0.02, "for how long, as a part of the whole", "", 0, 1)
-    factor: float = option(1.5, "distance in odometry for each metre driven", "", 0, 100)
-
-
-@dataclass(frozen=True, slots=True)
-class Carried:
-    """A robot that is carried along its way: odometry stands still, its sensors still measure."""
-
-    at: float = option(0.5, _HALFWAY, "", 0, 1)
-    distance_m: float = option(10.0, "how far from where it was lifted it is set down, at least", "m", 1e-3, 1e5)
-
-
-@dataclass(frozen=True, slots=True)
-class Jump:
-    """Odometry that jumps from one pose to the next, and does not know it."""
-
-    at: float = option(0.5, _HALFWAY, "", 0, 1)
-    ahead_m: float = option(1.0, "how far along its own x axis", "m", -1000, 1000)
-    left_m: float = option(0.0, "along its own y axis", "m", -1000, 1000)
-    turn_rad: float = option(0.2, "and by how much it turns", "rad", -3.15, 3.15)
-
-
-def _false_closures(draft: Draft, fault: FalseClosures, rng: Generator) -> None:
     if not len(draft.closures):
         raise GraphSlamError("false_closures: there is no true one to be like (simulate records some with --closures)")
-    count = fault.count or count_for(fault.rate, len(draft.closures))
-    found = false_closures(draft.truth[draft.places], draft.closures.root, count, fault.policy, rng, fault.group)
-    draft.add_closures(Closures(draft.places[found.ends], found.measured, found.root), "false_closures")
+    wanted = count or generator.count_for(rate, len(draft.closures))
+    found = generator.false_closures(draft.truth[draft.places], draft.closures.root, wanted, policy, rng, group)
+    draft.add_closures(generator.Closures(draft.places[found.ends], found.measured, found.root), "false_closures")
 
 
-def _wrong_ids(draft: Draft, fault: WrongIds, rng: Generator) -> None:
+@KINDS.add
+def wrong_ids(draft: Draft, rng: Generator, *, rate: float = option(0.05, "of all sightings", "", 0, 1)) -> None:
+    """Sightings with the id of another landmark, if possible one that is not in the same message."""
     names = list(_times(draft, 0, 0))
     if len(names) < 2:
         raise GraphSlamError(f"wrong_ids: {len(names)} landmarks are seen; another one's id needs two")
-    for k in _random_subset(rng, len(draft.sightings), fault.rate):
+    for k in _random_subset(rng, len(draft.sightings), rate):
         message = np.flatnonzero(draft.seen_at == draft.seen_at[k]).tolist()
         others_in_message = {name for j in message for name in (draft.sightings[j].id, draft.true_id(j))}
         others = [name for name in names if name not in others_in_message] or [
@@ -131,49 +61,57 @@ def _wrong_ids(draft: Draft, fault: WrongIds, rng: Generator) -> None:
         draft.spoil(k, "wrong_ids", replace(draft.sightings[k], id=others[rng.integers(len(others))]))
 
 
-def _swapped_ids(draft: Draft, fault: SwappedIds, rng: Generator) -> None:
-    begin = draft.pose_at(fault.at)
-    names = _some(rng, _seen_on_both_sides(draft, begin), 2 * fault.pairs, "swapped_ids")
+@KINDS.add
+def swapped_ids(
+    draft: Draft,
+    rng: Generator,
+    *,
+    pairs: int = option(1, "how many", "", 1, 1e4),
+    at: float = option(0.5, _HALFWAY, "", 0, 1),
+) -> None:
+    """Pairs of landmarks that exchange their ids, from some time on."""
+    begin = draft.pose_at(at)
+    names = _some(rng, _seen_on_both_sides(draft, begin), 2 * pairs, "swapped_ids")
     other = dict(zip(names[::2] + names[1::2], names[1::2] + names[::2], strict=True))
     for k, s in enumerate(draft.sightings):
         if draft.seen_at[k] >= begin and draft.true_id(k) in other:
             draft.spoil(k, "swapped_ids", replace(s, id=other[draft.true_id(k)]))
 
 
-def _reused_ids(draft: Draft, fault: ReusedIds, rng: Generator) -> None:
-    often = [name for name, times in _times(draft, 0, len(draft)).items() if times >= _OFTEN]
-    names = _some(rng, often, 2 * fault.pairs, "reused_ids")
-    first = dict(zip(names[1::2], names[::2], strict=True))
-    for k, s in enumerate(draft.sightings):
-        if draft.true_id(k) in first:
-            draft.spoil(k, "reused_ids", replace(s, id=first[draft.true_id(k)]))
-
-
-def _moved_landmarks(draft: Draft, fault: MovedLandmarks, rng: Generator) -> None:
-    begin = draft.pose_at(fault.at)
-    names = _some(rng, _seen_on_both_sides(draft, begin), fault.count, "moved_landmarks")
+@KINDS.add
+def moved_landmarks(
+    draft: Draft,
+    rng: Generator,
+    *,
+    count: int = option(1, "how many", "", 1, 1e4),
+    at: float = option(0.5, _HALFWAY, "", 0, 1),
+    distance_m: float = option(2.0, "by how much each, in a direction of its own", "m", 0, 1000),
+) -> None:
+    """Landmarks that stand elsewhere from some time on."""
+    begin = draft.pose_at(at)
+    names = _some(rng, _seen_on_both_sides(draft, begin), count, "moved_landmarks")
     angles = rng.uniform(-np.pi, np.pi, len(names))
-    ways = fault.distance_m * np.column_stack([np.cos(angles), np.sin(angles), np.zeros(len(names))])
+    ways = distance_m * np.column_stack([np.cos(angles), np.sin(angles), np.zeros(len(names))])
     displaced = dict(zip(names, ways[:, : draft.space.dimensions], strict=True))
     for k in range(len(draft.sightings)):
         if draft.seen_at[k] >= begin and draft.true_id(k) in displaced:
             draft.spoil(k, "moved_landmarks", draft.seen_from(k, displaced[draft.true_id(k)]))
 
 
-def _removed_landmarks(draft: Draft, fault: RemovedLandmarks, rng: Generator) -> None:
-    begin = draft.pose_at(fault.at)
-    names = set(_some(rng, _seen_on_both_sides(draft, begin), fault.count, "removed_landmarks"))
-    for k in range(len(draft.sightings)):
-        if draft.true_id(k) in names and (draft.seen_at[k] < begin) == fault.put_up:
-            draft.hide(k, "removed_landmarks")
-
-
-def _outliers(draft: Draft, fault: Outliers, rng: Generator) -> None:
+@KINDS.add
+def outliers(
+    draft: Draft,
+    rng: Generator,
+    *,
+    rate: float = option(0.05, "of all sightings", "", 0, 1),
+    most_m: float = option(5.0, "by how much at most; evenly from a fifth of it", "m", 1e-3, 1000),
+) -> None:
+    """Sightings whose range is too long, as by an echo."""
     n = draft.space.dimensions
     if not draft.sightings:
         raise GraphSlamError("outliers: no landmark is seen")
-    for k in _random_subset(rng, len(draft.sightings), fault.rate):
-        s, longer = draft.sightings[k], float(rng.uniform(0.2, 1.0)) * fault.most_m
+    for k in _random_subset(rng, len(draft.sightings), rate):
+        s, longer = draft.sightings[k], float(rng.uniform(0.2, 1.0)) * most_m
         if s.kind == "bearing":
             raise GraphSlamError("outliers: a bearing has no range")
         measured = np.array(s.measured)
@@ -185,49 +123,74 @@ def _outliers(draft: Draft, fault: Outliers, rng: Generator) -> None:
         draft.spoil(k, "outliers", replace(s, measured=tuple(measured.tolist())))
 
 
-def _slip(draft: Draft, fault: Slip, _rng: Generator) -> None:
-    first = draft.pose_at(fault.at)
-    last = min(len(draft) - 1, first + max(1, draft.pose_at(fault.lasting)))
+@KINDS.add
+def slip(
+    draft: Draft,
+    _rng: Generator,
+    *,
+    at: float = option(0.5, _HALFWAY, "", 0, 1),
+    lasting: float = option(0.02, "for how long, as a part of the whole", "", 0, 1),
+    factor: float = option(1.5, "distance in odometry for each metre driven", "", 0, 100),
+) -> None:
+    """A stretch in which odometry tells a longer or shorter way than was driven."""
+    first = draft.pose_at(at)
+    last = min(len(draft) - 1, first + max(1, draft.pose_at(lasting)))
     if first >= last:
-        raise GraphSlamError(f"slip: at {fault.at:g} of the whole nothing is driven any more")
+        raise GraphSlamError(f"slip: at {at:g} of the whole nothing is driven any more")
     group, n, poses = draft.space.group, draft.space.dimensions, draft.odometry
     steps = np.stack(group.between(tuple(poses[first:last].T), tuple(poses[first + 1 : last + 1].T)), axis=1)
-    steps[:, :n] *= fault.factor
+    steps[:, :n] *= factor
     slipped = [tuple(poses[first].tolist())]
     for step in steps.tolist():
         slipped.append(group.compose(slipped[-1], tuple(step)))
     draft.odometry = _moved_after(draft, last, slipped[-1])
     draft.odometry[first : last + 1] = slipped
-    if draft.twist is not None:
-        draft.twist = draft.twist.copy()
-        draft.twist[first + 1 : last + 1, :n] *= fault.factor
+    draft.twist = draft.twist.copy()
+    draft.twist[first + 1 : last + 1, :n] *= factor
     draft.spoil_odometry(range(first + 1, last + 1), "slip")
 
 
-def _carried(draft: Draft, fault: Carried, _rng: Generator) -> None:
-    first, n = draft.pose_at(fault.at), draft.space.dimensions
+@KINDS.add
+def carried(
+    draft: Draft,
+    _rng: Generator,
+    *,
+    at: float = option(0.5, _HALFWAY, "", 0, 1),
+    distance_m: float = option(10.0, "how far from where it was lifted it is set down, at least", "m", 1e-3, 1e5),
+) -> None:
+    """A robot that is carried along its way: odometry stands still, its sensors still measure."""
+    first, n = draft.pose_at(at), draft.space.dimensions
     away = np.linalg.norm(draft.truth[first:, :n] - draft.truth[first, :n], axis=1)
-    if not (away >= fault.distance_m).any():
-        raise GraphSlamError(f"carried: after {fault.at:g} of the whole it comes no farther than {away.max():.1f} m")
-    last = first + int(np.argmax(away >= fault.distance_m))
+    if not (away >= distance_m).any():
+        raise GraphSlamError(f"carried: after {at:g} of the whole it comes no farther than {away.max():.1f} m")
+    last = first + int(np.argmax(away >= distance_m))
     lifted = draft.odometry[first].copy()
     draft.odometry = _moved_after(draft, last, tuple(lifted.tolist()))
     draft.odometry[first:last] = lifted
-    if draft.twist is not None:
-        draft.twist = draft.twist.copy()
-        draft.twist[first + 1 : last + 1] = 0.0
+    draft.twist = draft.twist.copy()
+    draft.twist[first + 1 : last + 1] = 0.0
     draft.spoil_odometry(range(first + 1, last + 1), "carried")
 
 
-def _jump(draft: Draft, fault: Jump, _rng: Generator) -> None:
-    later = max(1, draft.pose_at(fault.at))
+@KINDS.add
+def jump(
+    draft: Draft,
+    _rng: Generator,
+    *,
+    at: float = option(0.5, _HALFWAY, "", 0, 1),
+    ahead_m: float = option(1.0, "how far along its own x axis", "m", -1000, 1000),
+    left_m: float = option(0.0, "along its own y axis", "m", -1000, 1000),
+    turn_rad: float = option(0.2, "and by how much it turns", "rad", -3.15, 3.15),
+) -> None:
+    """Odometry that jumps from one pose to the next, and does not know it."""
+    later = max(1, draft.pose_at(at))
     if later >= len(draft):
         raise GraphSlamError("jump: there is but one pose")
     space = draft.space
-    turned = [0.0] * (space.dof - space.dimensions - 1) + [fault.turn_rad]
-    ahead = [fault.ahead_m, fault.left_m, 0.0][: space.dimensions]
-    at = tuple(draft.odometry[later].tolist())
-    draft.odometry = _moved_after(draft, later, space.group.retract(at, (*ahead, *turned)))
+    turned = [0.0] * (space.dof - space.dimensions - 1) + [turn_rad]
+    ahead = [ahead_m, left_m, 0.0][: space.dimensions]
+    before = tuple(draft.odometry[later].tolist())
+    draft.odometry = _moved_after(draft, later, space.group.retract(before, (*ahead, *turned)))
     draft.spoil_odometry([later], "jump")
 
 
@@ -266,26 +229,12 @@ def _some(rng: Generator, names: Sequence[str], count: int, fault: str) -> list[
     return [names[k] for k in rng.permutation(len(names))[:count].tolist()]
 
 
-KINDS: dict[str, Kind] = {
-    "false_closures": Kind(FalseClosures, _false_closures),
-    "wrong_ids": Kind(WrongIds, _wrong_ids),
-    "swapped_ids": Kind(SwappedIds, _swapped_ids),
-    "reused_ids": Kind(ReusedIds, _reused_ids),
-    "moved_landmarks": Kind(MovedLandmarks, _moved_landmarks),
-    "removed_landmarks": Kind(RemovedLandmarks, _removed_landmarks),
-    "outliers": Kind(Outliers, _outliers),
-    "slip": Kind(Slip, _slip),
-    "carried": Kind(Carried, _carried),
-    "jump": Kind(Jump, _jump),
-}
-
-
 @dataclass(frozen=True, slots=True)
 class Fault:
     """A kind of fault and its options."""
 
     kind: str
-    options: Any
+    options: Mapping[str, Any]
 
     @classmethod
     def named(cls, kind: str, /, **options: Any) -> "Fault":
@@ -299,7 +248,7 @@ class Fault:
         known: dict[str, Any] = {**KINDS, **MESSAGE_KINDS}
         if kind not in known:
             raise GraphSlamError(f"no fault {kind!r}; there are {', '.join(known)}{did_you_mean(kind, known)}")
-        return cls(kind, fill(kind, known[kind].options, options))
+        return cls(kind, filled(kind, known[kind], options))
 
     @property
     def is_of_messages(self) -> bool:
@@ -323,15 +272,16 @@ def put_faults(draft: Draft, faults: Sequence[Fault], seed: int) -> None:
     """Put faults into a draft, one after the other; those of messages are left to ``spoil_messages``."""
     for k, fault in enumerate(faults):
         if not fault.is_of_messages:
-            KINDS[fault.kind].put(draft, fault.options, _stream(seed, k))
+            KINDS[fault.kind](draft, stream_of(seed, k), **fault.options)
 
 
 def spoil_messages(drive: Drive, faults: Sequence[Fault], seed: int) -> None:
     """Put the faults of messages into a drive, one after the other."""
     for k, fault in enumerate(faults):
         if fault.is_of_messages:
-            MESSAGE_KINDS[fault.kind].put(drive, fault.options, _stream(seed, k))
+            MESSAGE_KINDS[fault.kind](drive, stream_of(seed, k), **fault.options)
 
 
-def _stream(seed: int, number: int) -> Generator:
+def stream_of(seed: int, number: int) -> Generator:
+    """Return the random numbers of the fault of a number."""
     return Generator(PCG64(SeedSequence(seed, spawn_key=(_STREAMS, number))))

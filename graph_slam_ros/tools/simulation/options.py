@@ -1,16 +1,13 @@
-"""Options of a world: a frozen dataclass whose fields carry unit, meaning and bounds, filled from names and values."""
+"""Options of worlds and faults, with unit, meaning and bounds: fields of a dataclass, or parameters of a function."""
 
 import dataclasses
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
-
-from numpy.random import Generator
+from inspect import signature
+from typing import Any
 
 from graph_slam_ros.errors import GraphSlamError, did_you_mean
-
-Options = TypeVar("Options")
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,27 +40,28 @@ class Option:
         return value
 
 
-@dataclass(frozen=True, slots=True)
-class Kind:
-    """A kind of fault: its dataclass of options, and the function that puts it into a ``Draft`` or a ``Drive``."""
-
-    options: type
-    put: Callable[[Any, Any, Generator], None]
-
-    @property
-    def about(self) -> str:
-        """One sentence on it."""
-        return (self.options.__doc__ or "").strip().splitlines()[0]
-
-
 _ARTICLE = {bool: "true or false", int: "an integer", float: "a number", str: "a text"}
 
 
 def option(
     default: Any, meaning: str, unit: str = "", low: float = 0.0, high: float = 1e6, choices: tuple[str, ...] = ()
 ) -> Any:
-    """Dataclass field of an option."""
+    """An option, as a field of a dataclass or as the default of a parameter."""
     return field(default=default, metadata={"about": (meaning, unit, low, high, choices)})
+
+
+class Kinds(dict[str, Callable[..., None]]):
+    """Kinds of faults by name: functions that take a ``Draft`` or a ``Drive``, random numbers, and options."""
+
+    def add(self, put: Callable[..., None]) -> Callable[..., None]:
+        """Add a function under its name."""
+        self[put.__name__] = put
+        return put
+
+
+def about(what: Callable[..., Any]) -> str:
+    """Describe a world or a fault in one sentence."""
+    return (what.__doc__ or "").strip().splitlines()[0]
 
 
 def check_seed(seed: int) -> None:
@@ -72,27 +70,31 @@ def check_seed(seed: int) -> None:
         raise GraphSlamError(f"seed {seed} is negative")
 
 
-def options_of(cls: type) -> Iterator[Option]:
-    """Every option of a world's dataclass, in order."""
-    for f in dataclasses.fields(cls):
-        yield Option(f.name, f.default, *f.metadata["about"])
+def options_of(what: type | Callable[..., Any]) -> Iterator[Option]:
+    """Every option of a world's dataclass or of a fault, in order."""
+    parameters = signature(what).parameters
+    fields = {name: p.default for name, p in parameters.items() if isinstance(p.default, dataclasses.Field)}
+    for name, f in ({f.name: f for f in dataclasses.fields(what)} if isinstance(what, type) else fields).items():
+        yield Option(name, f.default, *f.metadata["about"])
 
 
-def fill(world: str, cls: type[Options], values: Mapping[str, Any], others: Sequence[str] = ()) -> Options:
-    """The dataclass with the named values; the rest keep their defaults.
+def filled(
+    name_of: str, what: type | Callable[..., Any], values: Mapping[str, Any], others: Sequence[str] = ()
+) -> dict[str, Any]:
+    """All options: the named values; the rest have their defaults.
 
     Parameters
     ----------
-    others : names of options that are elsewhere, to be named beside those of the dataclass
+    others : names of options that are elsewhere, to be named beside these
 
     Raises
     ------
     GraphSlamError
         Unknown name, wrong type, or a value out of bounds.
     """
-    known = {o.name: o for o in options_of(cls)}
+    known = {o.name: o for o in options_of(what)}
     for name in values:
         if name not in known:
             there = [*known, *others]
-            raise GraphSlamError(f"{world}: no option {name!r}; it has {', '.join(there)}{did_you_mean(name, there)}")
-    return cls(**{name: known[name].check(world, value) for name, value in values.items()})
+            raise GraphSlamError(f"{name_of}: no option {name!r}; it has {', '.join(there)}{did_you_mean(name, there)}")
+    return {name: o.check(name_of, values[name]) if name in values else o.default for name, o in known.items()}

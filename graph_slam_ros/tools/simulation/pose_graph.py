@@ -1,4 +1,4 @@
-"""Worlds as graphs: a city and a sphere with closures between poses, and drives among landmarks."""
+"""Worlds as graphs: a city and a sphere with closures between poses."""
 
 from bisect import bisect_right
 from collections.abc import Callable, Sequence
@@ -8,18 +8,15 @@ from pathlib import Path
 import numpy as np
 from numpy.random import PCG64, Generator
 
-from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.g2o_writer import write_g2o
 from graph_slam_ros.formats.graph_file import G2oFile, Values
 from graph_slam_ros.graph import Gaussian, Graph
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL, Geometry
 from graph_slam_ros.lie import se2, se3
-from graph_slam_ros.slam import Sighting
 from graph_slam_ros.tools.simulation.manhattan import STEP_M, stroll
-from graph_slam_ros.tools.simulation.motion import integrate, space_of, step_covariance
-from graph_slam_ros.tools.simulation.options import check_seed, fill, option
-from graph_slam_ros.tools.simulation.recording import Recording
-from graph_slam_ros.typing import Array, Index, Numbers
+from graph_slam_ros.tools.simulation.motion import integrate
+from graph_slam_ros.tools.simulation.options import check_seed, filled, option
+from graph_slam_ros.typing import Array, Index
 
 POSES_PER_CLOSURE = 3
 CLOSURE_RANGE_STEPS = 2  # to an earlier pose at most this far away in x and in y
@@ -51,7 +48,7 @@ def city_graph(seed: int, **values: float) -> tuple[Graph, Array]:
     graph : edges labelled ``odometry`` and ``closures``, each in order of its later pose
     truth : (poses, 3) true poses
     """
-    options = fill("city", CityGraph, values)
+    options = CityGraph(**filled("city", CityGraph, values))
     check_seed(seed)
     rng = Generator(PCG64(seed))
     cells, ways = stroll(rng, options.poses - 1, options.blocks)
@@ -90,7 +87,7 @@ def sphere_graph(seed: int, **values: float) -> tuple[Graph, Array]:
     graph
     truth : (poses, 7) true poses
     """
-    options = fill("sphere", SphereGraph, values)
+    options = SphereGraph(**filled("sphere", SphereGraph, values))
     check_seed(seed)
     rng, count = Generator(PCG64(seed)), np.arange(options.poses)
     yaw, pitch = 2.0 * np.pi * count / options.poses_per_lap, np.pi * (0.5 - (count + 0.5) / options.poses)
@@ -112,11 +109,6 @@ class GraphWorld:
 
     options: type
     measure: Callable[..., tuple[Graph, Array]]
-
-    @property
-    def about(self) -> str:
-        """Describe it in one sentence."""
-        return (self.measure.__doc__ or "").strip().splitlines()[0]
 
 
 GRAPH_WORLDS = {"city": GraphWorld(CityGraph, city_graph), "sphere": GraphWorld(SphereGraph, sphere_graph)}
@@ -179,71 +171,6 @@ def _composed(space: Geometry, start: Array, steps: Array) -> Array:
     return np.stack([x, y, se2.wrap(theta)], axis=1)
 
 
-def landmark_graph(recording: Recording) -> Graph:
-    """A recording as a graph: a pose at each stamp of odometry, a vertex for each landmark that was seen.
-
-    Poses start at the dead reckoning, landmarks where they were first seen from there. The noise of an odometry edge is
-    the twist covariance over the tick, as where each tick's error is its own. No vertex is fixed.
-
-    Raises
-    ------
-    GraphSlamError
-        A landmark is seen by bearing or by range alone: one sighting does not tell where it is.
-    """
-    graph, space = Graph(), space_of(recording.T_odom_base[0])
-    poses = graph.add_vertices(space.pose, recording.T_odom_base)
-    dt_s = np.diff(recording.stamps_ns) * 1e-9
-    noise = [
-        step_covariance(twist * dt, recording.twist_covariance * dt**2)
-        for twist, dt in zip(recording.twist[1:], dt_s.tolist(), strict=True)
-    ]
-    odometry = space.group.between(tuple(recording.T_odom_base[:-1].T), tuple(recording.T_odom_base[1:].T))
-    graph.add_edges(
-        space.relative_pose,
-        np.column_stack([poses[:-1], poses[1:]]),
-        np.stack(odometry, axis=1),
-        Gaussian.from_covariance(np.array(noise)),
-        "odometry",
-    )
-    vertex_of: dict[str, int] = {}
-    pose_at = dict(zip(recording.stamps_ns.tolist(), poses.tolist(), strict=True))
-    for seen in recording.seen:
-        pose = pose_at[seen.stamp_ns]
-        for s in seen.sightings:
-            if s.id not in vertex_of:
-                vertex_of[s.id] = _first_seen(graph, space, tuple(recording.T_odom_base[pose].tolist()), s)
-        for kind in dict.fromkeys(s.kind for s in seen.sightings):
-            same, edge = [s for s in seen.sightings if s.kind == kind], space.sightings[kind]
-            covariances = np.reshape([s.covariance for s in same], (-1, edge.residual_size, edge.residual_size))
-            graph.add_edges(
-                edge,
-                [(pose, vertex_of[s.id]) for s in same],
-                [edge.whole([*s.measured, *(s.T_base_sensor or ())]) for s in same],
-                Gaussian.from_covariance(covariances),
-                "landmarks",
-            )
-    for c in recording.closures:
-        noise_of = Gaussian.from_covariance(np.reshape(c.covariance, (space.dof, space.dof)))
-        ends = pose_at[c.from_stamp_ns], pose_at[c.stamp_ns]
-        graph.add_edge(space.relative_pose, ends, c.T_from_base, noise_of, "closures")
-    return graph
-
-
-def _first_seen(graph: Graph, space: Geometry, T_odom_base: Numbers, s: Sighting) -> int:
-    """A vertex for a landmark, at its first sighting."""
-    group, seen = space.group, s.measured
-    if s.kind == "pose":
-        return graph.add_vertex(space.pose, group.compose(T_odom_base, seen))
-    if s.kind == "range_bearing":
-        distance, azimuth, elevation = (*seen, 0.0)[:3]
-        flat = distance * np.cos(elevation)
-        in_sensor = (flat * np.cos(azimuth), flat * np.sin(azimuth), distance * np.sin(elevation))
-        seen = group.act(s.T_base_sensor or space.identity, in_sensor[: space.dimensions])
-    elif s.kind != "position":
-        raise GraphSlamError(f"a {s.kind} alone does not determine a landmark, and a graph needs initial values")
-    return graph.add_vertex(space.point, group.act(T_odom_base, seen))
-
-
 def write_graph(graph: Graph, path: Path | str) -> None:
     """Write a graph as g2o at its initial values. A FIX line holds the first vertex."""
     write_g2o(path, G2oFile(graph, list(range(graph.vertex_count)), [0]), values_of(graph, graph.initial.values))
@@ -257,11 +184,3 @@ def values_of(graph: Graph, numbers: Array) -> Values:
         return np.asarray(numbers[graph.offset.values[ids][:, None] + np.arange(size)])
 
     return values
-
-
-def truth_of(recording: Recording, graph: Graph) -> Array:
-    """The true stored numbers of all vertices of a recording's graph, end to end."""
-    names = list(dict.fromkeys(s.id for seen in recording.seen for s in seen.sightings))
-    true = [recording.landmarks[name] for name in names]
-    size = [graph.kind_of(len(recording.stamps_ns) + k).size for k in range(len(names))]
-    return np.concatenate([recording.T_world_base.ravel(), *(place[:n] for place, n in zip(true, size, strict=True))])

@@ -29,8 +29,7 @@ def view(args: argparse.Namespace) -> int:
         raise GraphSlamError("view serves its page with Starlette and uvicorn: pip install 'graph_slam_ros[view]'")
     from graph_slam_ros.tools.report.contents import read_contents
     from graph_slam_ros.tools.view.guard import Access
-    from graph_slam_ros.tools.view.page import page_of
-    from graph_slam_ros.tools.view.server import application, listening, server
+    from graph_slam_ros.tools.view.server import application, listening, page_of, server
     from graph_slam_ros.tools.view.workbench import Workbench
     from graph_slam_ros.warmup import compile_all
 
@@ -47,17 +46,15 @@ def view(args: argparse.Namespace) -> int:
     if not access.is_local:
         console.warn(f"beware: other machines can reach {args.host}; a person with the address can edit the run")
 
-    def ready() -> None:
-        console.show(address)
-        console.then("open it in a browser, once; Ctrl-C ends it")
-        sys.stdout.flush()
-        if not args.no_browser and _has_screen():
-            import webbrowser
+    console.show(address)
+    console.then("open it in a browser, once; Ctrl-C ends it")
+    sys.stdout.flush()
+    if not args.no_browser and _has_screen():
+        import webbrowser
 
-            webbrowser.open(address)
-
+        webbrowser.open(address)
     with contextlib.suppress(KeyboardInterrupt):
-        server(application(work, page, access), ready).run([bound])
+        server(application(work, page, access)).run([bound])
     console.show("ended")
     return code
 

@@ -3,19 +3,17 @@
 import numpy as np
 import pytest
 
-from graph_slam_ros.cli import main
-from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.lie import se3, so3
+from graph_slam_ros.messages.inputs.fixes import east_north_up
 from graph_slam_ros.messages.to_msg import transform
 from graph_slam_ros.recordings.bag import open_bag
 from graph_slam_ros.runs.chosen_inputs import choose_inputs
 from graph_slam_ros.runs.replay import measurements as measured
 from graph_slam_ros.slam import Closure, Config, Counters, Fix
-from graph_slam_ros.tools.simulation import measurements, simulate, with_closures, write_bag
+from graph_slam_ros.tools.simulation import Fault, measurements, simulate, spoil_messages, with_closures, write_bag
 from graph_slam_ros.tools.simulation.bag import TRUE_LANDMARKS_TOPIC, TRUTH_TOPIC
 from graph_slam_ros.tools.simulation.drive import TRANSFORMS, Drive, Message
 from graph_slam_ros.tools.simulation.instruments import ANTENNA_M, DATUM, geodetic
-from graph_slam_ros.tools.simulation.message_faults import MESSAGE_KINDS
 from graph_slam_ros.tools.simulation.motion import space_of
 
 SMALL = {"warehouse": {"aisles": 2, "aisle_m": 8.0, "laps": 1}, "flight": {"laps": 1}}
@@ -26,51 +24,38 @@ INPUTS = {
 
 
 def fixes_of(recording, path, name):
-    """What the border makes of an instrument, and what it counts."""
+    """What the border makes of an instrument, what it counts, and the true poses (n, 7) then."""
     write_bag(recording, path)
     dimensions = space_of(recording.T_world_base[0]).dimensions
     settings = {"inputs.names": f"odom {name}", name: INPUTS[name], "world.dimensions": dimensions}
     config, bag, counters = Config.from_mapping(settings), open_bag(path), Counters()
     several = [m for some in measured(bag, choose_inputs(bag, config), config, counters) for m in some]
-    return [m for m in several if isinstance(m, Fix)], counters
-
-
-def truth_at(recording, fixes):
-    """True poses (n, 7) at the stamps of fixes, which are those of odometry here."""
+    fixes = [m for m in several if isinstance(m, Fix)]
     at = np.searchsorted(recording.stamps_ns, [m.stamp_ns for m in fixes])
-    return se3.in_space(recording.T_world_base)[at]
+    return fixes, counters, se3.in_space(recording.T_world_base)[at]
 
 
 @pytest.mark.parametrize("world", SMALL)
 def test_fixes_are_where_the_antenna_truly_was_as_well_as_their_covariance_says(world, tmp_path):
-    recording = simulate(world, 3, **SMALL[world], gnss=5, gnss_correlation_s=0.0)
-    gps, counters = fixes_of(recording, tmp_path / "a.mcap", "gps")
+    recording = simulate(world, 3, **SMALL[world], gnss=5, gnss_correlation_s=0.0, gnss_outage_s=4.0)
+    gps, counters, truth = fixes_of(recording, tmp_path / "a.mcap", "gps")
     n = len(gps[0].measured)
-    error = (
-        np.array([m.measured for m in gps]) - np.stack(se3.act(tuple(truth_at(recording, gps).T), ANTENNA_M), 1)[:, :n]
-    )
+    error = np.array([m.measured for m in gps]) - np.stack(se3.act(tuple(truth.T), ANTENNA_M), 1)[:, :n]
     nees = [e @ np.linalg.solve(np.reshape(m.covariance, (n, n)), e) for e, m in zip(error, gps, strict=True)]
-    assert len(gps) >= 90
+    assert len(gps) >= 70
     assert np.mean(nees) == pytest.approx(n, rel=4.0 * np.sqrt(2.0 / (n * len(gps))))
     assert gps[0].point == pytest.approx(ANTENNA_M[:n])
-    assert not counters.as_dict()
+    assert 19 <= counters["gps", "no_fix"] <= 21, "an outage, which the receiver says"
+    assert len(gps) + counters["gps", "no_fix"] == len(recording.gnss.stamps_ns)
 
 
 def test_the_orientation_of_the_imu_is_off_by_its_noise_and_by_its_drift(tmp_path):
     recording = simulate("flight", 3, laps=1, imu=50, imu_drift_rad_s=0.01)
-    imu, _ = fixes_of(recording, tmp_path / "a.mcap", "imu")
-    true = tuple(truth_at(recording, imu)[:, 3:].T)
-    error = np.stack(so3.log(so3.compose(tuple(np.array([m.measured for m in imu]).T), so3.inverse(true))), axis=1)
-    seconds = 0.02 * np.arange(len(error))
+    imu, _, truth = fixes_of(recording, tmp_path / "a.mcap", "imu")
+    turned = tuple(np.array([m.measured for m in imu]).T)
+    error = np.stack(so3.log(so3.compose(turned, so3.inverse(tuple(truth[:, 3:].T)))), axis=1)
     assert error[:, :2].std() == pytest.approx(0.02, rel=0.4)
-    assert np.polyfit(seconds, error[:, 2], 1)[0] == pytest.approx(0.01, rel=0.2)
-
-
-def test_an_outage_is_told_by_the_receiver_and_counted(tmp_path):
-    recording = simulate("warehouse", 3, **SMALL["warehouse"], gnss=4, gnss_outage_s=10.0)
-    gps, counters = fixes_of(recording, tmp_path / "a.mcap", "gps")
-    assert 39 <= counters["gps", "no_fix"] <= 41
-    assert len(gps) + counters["gps", "no_fix"] == len(recording.gnss.stamps_ns)
+    assert np.polyfit(0.02 * np.arange(len(error)), error[:, 2], 1)[0] == pytest.approx(0.01, rel=0.2)
 
 
 def test_the_drive_is_the_same_with_and_without_instruments():
@@ -79,27 +64,9 @@ def test_the_drive_is_the_same_with_and_without_instruments():
     assert plain.gnss is None and plain.imu is None
     assert plain.seen and not fitted.seen
     assert len(fitted.imu.stamps_ns) == pytest.approx(100 * (plain.stamps_ns[-1] - plain.stamps_ns[0]) * 1e-9, abs=2)
-
-
-def test_latitude_and_longitude_lead_back_to_metres():
-    from graph_slam_ros.messages.inputs.fixes import east_north_up
-
     points = np.array([[0.0, 0.0, 0.0], [5000.0, -3000.0, 120.0]])
     for here, point in zip(geodetic(points, DATUM).tolist(), points, strict=True):
         assert east_north_up(tuple(here), DATUM) == pytest.approx(point, abs=1e-6)
-
-
-def test_what_does_not_fit_an_instrument_is_refused_by_name(tmp_path, capsys):
-    with pytest.raises(GraphSlamError, match=r"warehouse: gnss: 1000.0 is not in \[0, 100\]"):
-        simulate("warehouse", 1, gnss=1000)
-    with pytest.raises(GraphSlamError, match=r"no option 'gps'; it has aisles.*gnss\b"):
-        simulate("warehouse", 1, gps=1)
-    assert main(["simulate", "manhattan", "--out", str(tmp_path / "a.g2o"), "--set", "imu=50"]) == 2
-    assert "a graph has no use for gnss or imu: --out FILE.mcap" in capsys.readouterr().err
-    with pytest.raises(SystemExit):
-        main(["simulate", "--help"])
-    said = capsys.readouterr().out
-    assert "gnss_outage_s=0.0 [s]" in said and "aisle_m=12.0 [m]" in said
 
 
 def test_a_clock_that_is_set_back_is_that_of_everything_but_the_truth(tmp_path):
@@ -107,18 +74,14 @@ def test_a_clock_that_is_set_back_is_that_of_everything_but_the_truth(tmp_path):
     write_bag(recording, tmp_path / "a.mcap")
     drive, last = Drive(tmp_path / "a.mcap"), int(recording.stamps_ns[-1])
     drive.messages.append(Message("/tf", TRANSFORMS, last, transform(last, "odom", "base_link", se3.IDENTITY)))
-    fault = MESSAGE_KINDS["clock_set_back"]
-    fault.put(drive, fault.options(at=0.1), np.random.default_rng(0))
-    at_ns, back_ns = np.quantile(recording.stamps_ns, 0.1), 30_000_000_000
-    names = set()
+    spoil_messages(drive, [Fault.named("clock_set_back", at=0.1)], seed=0)
+    at_ns, back_ns, names = np.quantile(recording.stamps_ns, 0.1), 30_000_000_000, set()
     for m in drive.messages:
         if m.topic in (TRUTH_TOPIC, TRUE_LANDMARKS_TOPIC):
             assert isinstance(m.content, bytes)
-        elif m.log_ns > at_ns:
-            names.add(m.topic)
-            assert m.stamp_ns == m.log_ns - back_ns
         else:
-            assert m.stamp_ns == m.log_ns
+            names |= {m.topic} if m.log_ns > at_ns else set()
+            assert m.stamp_ns == m.log_ns - back_ns * (m.log_ns > at_ns)
     assert names == {"/odom", "/landmarks", "/gps/fix", "/imu/data", "/closures", "/tf"}
     earlier = {int(one.id) for m in drive.messages if m.topic == "/closures" for one in m.content.detections}
     closures = [m for m in measurements(recording) if isinstance(m, Closure)]

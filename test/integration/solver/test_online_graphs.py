@@ -8,12 +8,11 @@ from places import DATASETS
 
 from graph_slam_ros.formats.g2o import read_g2o
 from graph_slam_ros.graph import R2
+from graph_slam_ros.slam import GraphSlam
 from graph_slam_ros.solver import Settings, Solver
-from graph_slam_ros.tools.simulation import city_graph, simulate
-from graph_slam_ros.tools.simulation.pose_graph import landmark_graph
+from graph_slam_ros.tools.simulation import city_graph, measurements, simulate
 
-GRAPHS = DATASETS
-GRAPHS = GRAPHS / "pose_graphs"
+GRAPHS = DATASETS / "pose_graphs"
 
 
 def steps(graph):
@@ -68,8 +67,10 @@ def test_after_every_step_of_a_simulated_city_the_estimate_is_the_optimum():
 
 
 def test_after_every_step_among_landmarks_the_estimate_is_the_optimum():
-    graph = landmark_graph(simulate("pythonrobotics", 2))
-    replayed(graph, 3, **EXACT)
+    slam = GraphSlam()
+    for measurement in measurements(simulate("pythonrobotics", 2)):
+        slam.process(measurement)
+    replayed(slam.graph, 3, **EXACT)
 
 
 @pytest.mark.parametrize("seed", [3, 4])

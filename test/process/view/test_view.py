@@ -8,7 +8,6 @@ import socket
 import subprocess
 import sys
 import threading
-import time
 from contextlib import contextmanager, suppress
 from types import SimpleNamespace
 
@@ -33,10 +32,8 @@ pytest.importorskip("uvicorn", reason="view is tested with its extra: pip instal
 
 from graph_slam_ros.tools.view import guard, server
 from graph_slam_ros.tools.view.guard import Access
-from graph_slam_ros.tools.view.page import page_of
+from graph_slam_ros.tools.view.server import page_of
 from graph_slam_ros.tools.view.workbench import Workbench
-
-PATIENCE_S = 0.5
 
 
 @contextmanager
@@ -46,12 +43,10 @@ def served(run, page=None):
     work = Workbench(made, 3.0)
     bound = server.listening("127.0.0.1", 0)
     access = Access("127.0.0.1", bound.getsockname()[1])
-    is_ready = threading.Event()
-    one = server.server(server.application(work, page or page_of(made, work), access), is_ready.set)
+    one = server.server(server.application(work, page or page_of(made, work), access))
     thread = threading.Thread(target=one.run, args=([bound],))
     thread.start()
     try:
-        assert is_ready.wait(10.0)
         yield SimpleNamespace(access=access, port=access.port, work=work, run=run)
     finally:
         one.should_exit = True
@@ -65,16 +60,8 @@ def faulty(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def patient():
-    """Clients are dropped after less time, in the whole file."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(server, "PATIENCE_S", PATIENCE_S)
-        yield
-
-
-@pytest.fixture(scope="module")
-def attacked(faulty, patient):
-    with served(faulty, "<!DOCTYPE html>the page" + " " * 2**20) as one:
+def attacked(faulty):
+    with served(faulty, "<!DOCTYPE html>the page") as one:
         yield one
 
 
@@ -122,9 +109,11 @@ def test_X4_it_listens_on_the_loopback_address_alone(attacked):
         six.connect(("::1", attacked.port))
 
 
-@pytest.mark.parametrize(
-    "headers",
-    [
+def test_X5_a_page_that_is_not_its_own_gets_no_answer(attacked):
+    def filled(text):
+        return text and text.format(port=attacked.port, key=attacked.access.key).encode("latin-1")
+
+    for headers in (
         {"origin": "http://example.org"},
         {"origin": "null"},
         {"origin": None},
@@ -141,16 +130,11 @@ def test_X4_it_listens_on_the_loopback_address_alone(attacked):
         {"cookie": "graph_slam_view_{port}=x"},
         {"cookie": "graph_slam_view_{port}=\xff"},
         {"cookie": "graph_slam_view_1={key}"},
-    ],
-)
-def test_X5_a_page_that_is_not_its_own_gets_no_answer(attacked, headers):
-    def filled(text):
-        return text and text.format(port=attacked.port, key=attacked.access.key).encode("latin-1")
-
-    status, found, body = asked(attacked, "POST", "/solve", QUESTION, **{k: filled(v) for k, v in headers.items()})
-    assert status in (403, 415)
-    assert not [name for name in found if name.startswith("access-control")]
-    assert len(body) < 200 and b"chi2" not in body
+    ):
+        status, found, body = asked(attacked, "POST", "/solve", QUESTION, **{k: filled(v) for k, v in headers.items()})
+        assert status in (403, 415), headers
+        assert not [name for name in found if name.startswith("access-control")]
+        assert len(body) < 200 and b"chi2" not in body
 
 
 def test_X5_what_is_its_own_gets_one_that_no_other_page_may_read(attacked):
@@ -182,20 +166,17 @@ def test_X5_the_token_opens_the_page_once(faulty, attacked):
     assert b"graph_slam view" in body
 
 
-@pytest.mark.parametrize(
-    "host",
-    [
+def test_X6_a_name_that_was_made_to_point_here_is_refused(attacked):
+    for host in (
         *("example.org", "example.org:{port}", "127.0.0.1", "127.0.0.1:1", "localhost", "127.0.0.1.nip.io:{port}"),
         *("", "[::1", "127.0.0.1:{port}@example.org", "user@127.0.0.1:{port}", "127.0.0.1:{port}/x", "0.0.0.0:{port}"),
         *("192.168.1.7:{port}", "127.0.0.1:99999", "127.0.0.1:{port}x", None),
-    ],
-)
-def test_X6_a_name_that_was_made_to_point_here_is_refused(attacked, host):
-    host = host and host.format(port=attacked.port)
-    for method, path in (("GET", "/"), ("GET", f"/?token={attacked.access.token}"), ("POST", "/solve")):
-        # Without Host the server answers and closes before it reads a body, whose rest may reset the answer.
-        body = QUESTION if method == "POST" and host is not None else None
-        assert asked(attacked, method, path, body, host=host)[0] in (400, 403)
+    ):
+        name = host and host.format(port=attacked.port)
+        for method, path in (("GET", "/"), ("GET", f"/?token={attacked.access.token}"), ("POST", "/solve")):
+            # Without Host the server answers and closes before it reads a body, whose rest may reset the answer.
+            body = QUESTION if method == "POST" and name is not None else None
+            assert asked(attacked, method, path, body, host=name)[0] in (400, 403), (host, method)
     assert asked(attacked, host=f"localhost:{attacked.port}")[0] == 200
 
 
@@ -239,47 +220,6 @@ def test_X7_large_bodies_and_heads_are_refused(attacked):
     assert b" 400 " in raw(attacked, b"GET / HTTP/1.1\r\nx: " + 40_000 * b"x")
     assert asked(attacked, "POST", "/solve", b"x" * guard.MOST_BYTES)[0] == 422
     assert asked(attacked)[0] == 200
-
-
-def test_X7_whoever_is_slow_or_says_nothing_is_dropped(attacked):
-    started = time.monotonic()
-    assert raw(attacked) == b"", "says nothing"
-    assert raw(attacked, b"GET / HT") == b"", "half a head"
-    assert b" 200 " not in raw(attacked, head(attacked, "content-length: 100"), b"{")
-    with socket.socket() as client:  # asks for all of the page, again and again, and reads nothing of it
-        client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-        client.connect(("127.0.0.1", attacked.port))
-        client.sendall(20 * head(attacked).replace(b"POST /solve", b"GET /"))
-        deadline = time.monotonic() + 10.0
-        client.settimeout(0.2)
-        with pytest.raises(ConnectionError):
-            while time.monotonic() < deadline:
-                time.sleep(0.05)
-                client.send(b"\r\n")
-    assert time.monotonic() - started < 30.0
-    assert asked(attacked)[0] == 200
-
-
-def test_X7_clients_beyond_eight_are_refused_and_leave_room_when_they_are_dropped(attacked):
-    several = [socket.create_connection(("127.0.0.1", attacked.port), timeout=5) for _ in range(40)]
-    answers = []
-    for client in several[10:14]:
-        try:
-            client.sendall(b"GET / HTTP/1.1\r\nhost: x\r\n\r\n")
-            answers.append(client.recv(100))
-        except ConnectionError:
-            answers.append(b"")
-    assert all(one == b"" or b" 503 " in one for one in answers)
-    deadline = time.monotonic() + 10.0
-    while time.monotonic() < deadline:
-        try:
-            if asked(attacked)[0] == 200:
-                break
-        except (ConnectionError, http.client.HTTPException):
-            time.sleep(0.05)
-    assert asked(attacked)[0] == 200
-    for client in several:
-        client.close()
 
 
 # -- the page ----------------------------------------------------------------------------------------------------------
