@@ -40,8 +40,7 @@ def gnss_messages(gnss: Gnss | None) -> Iterator[Message]:
     """sensor_msgs/NavSatFix in order of stamp. Without a fix, latitude, longitude and height are NaN."""
     if gnss is None:
         return
-    if gnss.antenna is not None:
-        yield _mounted(int(gnss.stamps_ns[0]), GNSS_FRAME, (*gnss.antenna, 0.0, 0.0, 0.0, 1.0))
+    yield _mounted(int(gnss.stamps_ns[0]), GNSS_FRAME, (*gnss.antenna, 0.0, 0.0, 0.0, 1.0))
     name = "sensor_msgs/msg/NavSatFix"
     for stamp_ns, where, has_fix in zip(gnss.stamps_ns.tolist(), gnss.geodetic.tolist(), gnss.has_fix, strict=True):
         latitude, longitude, altitude = where if has_fix else (np.nan,) * 3

@@ -19,7 +19,8 @@ DATUM = (47.4, 8.55, 440.0)  # latitude [deg], longitude [deg], height above the
 ANTENNA_M = (0.3, 0.1, 0.8)  # in base_link
 T_BASE_IMU = (0.1, 0.0, 0.2, 0.0, 0.0, float(np.sqrt(0.5)), float(np.sqrt(0.5)))  # turned to the left
 UP = 2.0  # a fix is so many times worse upwards
-SIGMA_ACCELERATION_M_S2 = 0.02
+SIGMA_RAD, CORRELATION_S = 0.02, 5.0  # of the orientation of the IMU, and how long such an error lasts (1/e)
+SIGMA_RATE_RAD_S, SIGMA_ACCELERATION_M_S2 = 0.002, 0.02
 GRAVITY_M_S2 = 9.81
 EARTH_M = 6.37e6  # its radius, nearly
 _STEPS = 6
@@ -35,12 +36,8 @@ class Instruments:
     gnss_sigma_m: float = option(0.3, "error of a fix east and north; twice that upwards", "m", 1e-3, 100)
     gnss_correlation_s: float = option(2.0, "how long such an error lasts (1/e)", "s", 0, 1e4)
     gnss_outage_s: float = option(0.0, "time without a fix, in the middle of the drive", "s", 0)
-    gnss_tf: bool = option(True, "whether /tf_static says where the antenna is: 0.3 m ahead, 0.1 left, 0.8 up")
     imu: float = option(0.0, "messages of an IMU with orientation, on /imu/data; 0: there is none", "Hz", 0, 1000)
-    imu_sigma_rad: float = option(0.02, "error of its roll, pitch and heading", "rad", 1e-6, 1)
-    imu_correlation_s: float = option(5.0, "how long such an error lasts (1/e)", "s", 0, 1e4)
     imu_drift_rad_s: float = option(0.0, "its heading drifts besides: there is no compass", "rad/s", -1, 1)
-    imu_sigma_rate_rad_s: float = option(0.002, "error of each of its turn rates", "rad/s", 0, 10)
     imu_bias_rad_s: float = option(0.0, "bias of its turn rates, about each axis", "rad/s", -10, 10)
     imu_bias_walk: float = option(0.0, "random walk of that", "rad/s/sqrt(s)", 0, 1)
 
@@ -62,13 +59,13 @@ def _gnss(rng: Generator, recording: Recording, options: Instruments) -> Gnss:
     measured = antenna + noise.draw(rng, len(poses), 1.0 / options.gnss)
     from_middle_s = np.abs(stamps_ns - (stamps_ns[0] + stamps_ns[-1]) // 2) * 1e-9
     has_fix = from_middle_s >= 0.5 * options.gnss_outage_s
-    return Gnss(stamps_ns, geodetic(measured, DATUM), noise.covariance, has_fix, ANTENNA_M if options.gnss_tf else None)
+    return Gnss(stamps_ns, geodetic(measured, DATUM), noise.covariance, has_fix, ANTENNA_M)
 
 
 def _imu(rng: Generator, recording: Recording, options: Instruments) -> Imu:
     stamps_ns, poses = _true_poses(recording, options.imu)
     dt_s = 1.0 / options.imu
-    noise = VelocityNoise((options.imu_sigma_rad,) * 3, options.imu_correlation_s)
+    noise = VelocityNoise((SIGMA_RAD,) * 3, CORRELATION_S)
     error = noise.draw(rng, len(poses), dt_s)
     error[:, 2] += options.imu_drift_rad_s * dt_s * np.arange(len(poses))
     true = se3.compose(tuple(poses.T), T_BASE_IMU)
@@ -79,7 +76,7 @@ def _imu(rng: Generator, recording: Recording, options: Instruments) -> Imu:
     rate[1:] = np.stack(se3.local(next_, last)[3:], axis=1) / dt_s
     felt = _second_derivative(np.stack(se3.position(true), axis=1), dt_s) + np.array([0.0, 0.0, GRAVITY_M_S2])
     acceleration = np.stack(so3.act(so3.inverse(turned), tuple(felt.T)), axis=1)
-    rate += options.imu_sigma_rate_rad_s * rng.standard_normal(rate.shape)
+    rate += SIGMA_RATE_RAD_S * rng.standard_normal(rate.shape)
     acceleration += SIGMA_ACCELERATION_M_S2 * rng.standard_normal(acceleration.shape)
     return Imu(stamps_ns, np.stack(orientation, axis=1), noise.covariance, rate, acceleration, T_BASE_IMU)
 

@@ -74,23 +74,12 @@ def _integrate_planar(start: Numbers, steps: Array) -> Array:
     return np.stack([x, y, se2.wrap(theta)], axis=1)
 
 
-def step_covariance(step: Array, per_tick: Array) -> Array:
-    """Covariance (d, d) of ``Exp(step)`` in its tangent space, from that of the step's d components."""
-    group = se2 if len(step) == 3 else se3
-    return group.noise_during(_exp(step), per_tick)
-
-
 def accumulated(steps: Array, per_tick: Array) -> Array:
     """Covariance (n + 1, d, d) of the poses that n steps lead to, each in its tangent space; the first is zero."""
     n, d = steps.shape
     group = se2 if d == 3 else se3
     out = np.zeros((n + 1, d, d))
-    for k, step in enumerate(steps):
-        out[k + 1] = group.propagate(out[k], _exp(step), step_covariance(step, per_tick))
+    for k, step in enumerate(steps.tolist()):
+        moved = tuple(float(number) for number in group.exp(tuple(step)))  # plain floats, for the kernels
+        out[k + 1] = group.propagate(out[k], moved, group.noise_during(moved, per_tick))
     return out
-
-
-def _exp(step: Array) -> Numbers:
-    """The exponential in plain floats, for the kernels."""
-    group = se2 if len(step) == 3 else se3
-    return tuple(float(number) for number in group.exp(tuple(step.tolist())))

@@ -26,16 +26,12 @@ class PythonRobotics:
 
     poses: int = option(50, "ticks to drive, 2 s each", "", 1, 1e6)
     sensor: str = option("position", "what the sensor measures of a landmark", choices=KINDS)
-    as_original: bool = option(False, "squared noise as the original has it: 0.01 m/s, 0.03 rad/s, 0.04 m, 3e-4 rad")
 
 
 def simulate(seed: int, options: PythonRobotics) -> Recording:
     """Drive in a circle. The noise is drawn once for each tick."""
     rng = Generator(PCG64(seed))
-    speed, turn, distance, bearing = 0.1, np.deg2rad(10.0), 0.2, np.deg2rad(1.0)
-    if options.as_original:
-        speed, turn, distance, bearing = speed**2, turn**2, distance**2, bearing**2
-    sensor = RangeBearing(distance, bearing, MAX_RANGE_M)
+    sensor = RangeBearing(0.2, np.deg2rad(1.0), MAX_RANGE_M)
     points = np.array(LANDMARKS)
     landmarks = {str(k): at for k, at in enumerate(LANDMARKS)}
 
@@ -43,5 +39,5 @@ def simulate(seed: int, options: PythonRobotics) -> Recording:
         return sensor.observe(rng, T_world_base, list(landmarks), points, options.sensor)
 
     twists = np.tile([SPEED_M_S, 0.0, TURN_RAD_S], (options.poses, 1))
-    noise = VelocityNoise((speed, SIDEWAYS_M_S, turn))
+    noise = VelocityNoise((0.1, SIDEWAYS_M_S, np.deg2rad(10.0)))
     return drive(rng, se2.IDENTITY, twists, TICK_NS, noise, observe, 1, landmarks)

@@ -29,14 +29,14 @@ class Gnss:
     geodetic : (n, 3) latitude [deg], longitude [deg] and height above the ellipsoid [m] of the antenna
     covariance : (3, 3) of each: the truth about the noise that was added, east, north and up [m^2]
     has_fix : (n,) where it does not, it says so
-    antenna : in base_link [m]; None where no transform tells
+    antenna : in base_link [m]
     """
 
     stamps_ns: Stamps
     geodetic: Array
     covariance: Array
     has_fix: NDArray[np.bool_]
-    antenna: Numbers | None
+    antenna: Numbers
 
 
 @dataclass(frozen=True, slots=True, eq=False)
