@@ -105,14 +105,7 @@ def compare(args: argparse.Namespace) -> int:
     text = markdown(done)
     if args.markdown is not None:
         write_whole(args.markdown, text.encode())
-    console.show(f"{'metric':14s}{'runs':>6s}{'old':>10s}{'new':>10s}{'ratio':>8s}   95 %")
-    for one in done.changes:
-        low, high = one.interval
-        numbers = f"{one.count:6d}{one.old:10.4g}{one.new:10.4g}{one.ratio:8.3f}   {low:.3f} to {high:.3f}"
-        console.show(f"{one.metric:14s}{numbers}   {one.verdict}; most {one.worst[1]:.2f}x: {one.worst[0]}")
-    for what, names in (("only in the old table", done.only_old), ("only in the new table", done.only_new)):
-        if names:
-            console.warn(f"not compared: {len(names)} {what}, as {names[0]}")
+    console.show(*text.splitlines())
     for name in done.lost:
         console.warn(f"failed now, and not before: {name}", most=console.SENTENCE)
     for limit in done.exceeded:

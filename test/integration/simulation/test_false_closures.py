@@ -49,7 +49,7 @@ def test_what_agrees_with_the_truth_is_no_false_closure(paths, size):
 
         def off(margin, policy=policy, vague=vague):
             rng = np.random.default_rng(1)
-            found = false_closures(paths[size], vague[None], 700, policy, rng, margin=margin)
+            found = false_closures(paths[size], vague[None], 300, policy, rng, margin=margin)
             return disagreement(paths[size], found.ends, found.measured, vague)
 
         assert off(4.0).min() > limit
@@ -58,12 +58,12 @@ def test_what_agrees_with_the_truth_is_no_false_closure(paths, size):
 
 @SIZES
 def test_a_draw_is_off_the_identity_by_a_third_of_a_metre_and_ten_degrees(paths, size):
-    found = drawn(paths[size], 4000, "random")
+    found = drawn(paths[size], 2000, "random")
     group, n = (se2, 2) if size == 3 else (se3, 3)
     tangent = np.stack(group.log(tuple(found.measured.T)), axis=1)
     sigmas = [0.3] * n + [np.deg2rad(10.0)] * (tangent.shape[1] - n)
-    assert tangent.std(axis=0) == pytest.approx(sigmas, rel=0.05)
-    assert tangent.mean(axis=0) / sigmas == pytest.approx(np.zeros(len(sigmas)), abs=0.08)
+    assert tangent.std(axis=0) == pytest.approx(sigmas, rel=0.07)
+    assert tangent.mean(axis=0) / sigmas == pytest.approx(np.zeros(len(sigmas)), abs=0.11)
 
 
 def test_local_ones_join_poses_at_most_twenty_apart_and_a_group_is_consecutive_pairs_with_one_measurement(paths):

@@ -331,8 +331,9 @@ def test_in_a_graph_the_table_names_the_lines_that_are_more_and_no_others(tmp_pa
 
 def test_a_recording_with_faults_has_their_table_beside_it(tmp_path, capsys):
     bag, table = tmp_path / "a.world.mcap", tmp_path / "a.world.faults.csv"
-    words = ["simulate", "warehouse", "--out", bag, "--closures", 10, "--fault", "false_closures:rate=0.5,group=5"]
-    code, out, err = run(capsys, *words, "--fault", "swapped_ids:at=0.6")
+    hall = "simulate", "warehouse", "--set", "aisles=2", "--set", "aisle_m=6", "--out", bag
+    faults = "--fault", "false_closures:rate=0.5,group=5", "--fault", "swapped_ids:at=0.6"
+    code, out, err = run(capsys, *hall, "--closures", 10, *faults)
     assert (code, err) == (0, "")
     with table.open() as stream:
         rows = list(csv.DictReader(stream))
@@ -341,7 +342,7 @@ def test_a_recording_with_faults_has_their_table_beside_it(tmp_path, capsys):
     assert [row["fault"] for row in rows].count("false_closures") == 10
     assert open_bag(bag).topics["/closures"].count > 10
     table.unlink()
-    assert run(capsys, "simulate", "warehouse", "--out", bag, "--force")[0] == 0
+    assert run(capsys, *hall, "--force")[0] == 0
     assert not table.exists()
     assert "/closures" not in open_bag(bag).topics
 
