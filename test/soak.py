@@ -31,6 +31,7 @@ def guided(name):
 DRIVES = (
     *("advise", "calibration_consistency", "calibration_random", "consistency", "displacement", "extreme_fixes"),
     *("bad_drives", "gyro_drives", "determination", "initialization"),
+    *("calibrate", "condensed_maps", "gyro_findings", "maps", "online_graphs", "repair"),
     *("certificate", "nees", "planted", "rates", "simulation", "slip", "recordings", "uncorrected", "unnamed"),
 )
 PROGRAMMES = {
@@ -44,7 +45,7 @@ PROGRAMMES = {
     "large": tests("test_large.py"),
     "bursts": tests("test_bursts.py", "test_extreme_fixes.py"),
     "journal": tests("test_journal.py"),
-    "messages": tests("test_any_message.py", "test_any_measurement.py"),
+    "messages": tests("test_any_message.py", "test_any_measurement.py", "test_any_columns.py"),
     "permutations": tests("test_timing_cases.py", "-k", "B1"),
     "solver_faults": tests("test_solver_faults.py", "test_graph_cases.py"),
     "recorded": tests("test_recorded.py"),

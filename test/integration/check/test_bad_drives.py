@@ -47,7 +47,7 @@ def recorded(file, drive):
     return write(file, out)
 
 
-@pytest.mark.parametrize("name", CLASSES)
+@pytest.mark.parametrize("name", times(["some wrong ids", "two alike"], list(CLASSES)))
 def test_what_is_said_of_a_drive_that_is_wrong_in_several_ways_is_true(name, tmp_path, capsys):
     for seed in range(times(1, 20)):
         drive, _, faults = random_drive(name, seed)

@@ -4,8 +4,8 @@ import copy
 import math
 
 import numpy as np
-import pytest
 from recordings import short_drive
+from rows import each
 
 from graph_slam_ros.cli import main
 from graph_slam_ros.lie import se3
@@ -41,8 +41,8 @@ def walking(pose, t):
     return se3.act(se3.inverse(tuple(pose)), person)
 
 
-@pytest.mark.parametrize(
-    ("where", "said"),
+@each(
+    "where, said",
     [
         (on_robot, "landmark other moves along with the robot, at x 0.40 and y 0.10 m on it"),
         (walking, "landmark other moves: it is "),

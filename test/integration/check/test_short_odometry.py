@@ -1,8 +1,8 @@
 """Odometry that begins after the landmarks, or ends before them: the clocks are right."""
 
 import numpy as np
-import pytest
 from recordings import short_drive
+from rows import each
 
 from graph_slam_ros.runs.check import check
 from graph_slam_ros.tools.simulation import Drive
@@ -21,9 +21,7 @@ def found(drive, file):
     return [one for one in check(file, quick=True).findings if one.code in ("odometry_short", "no_overlap")]
 
 
-@pytest.mark.parametrize(
-    ("part", "begins", "said"), [(0.4, True, "s after the first of them"), (0.5, False, "s before the last of them")]
-)
+@each("part, begins, said", [(0.4, True, "s after the first of them"), (0.5, False, "s before the last of them")])
 def test_odometry_of_a_part_of_the_drive_is_no_clock_that_differs(part, begins, said, tmp_path):
     drive = cut(Drive(short_drive(tmp_path / "drive.mcap")), part, begins=begins)
     (one,) = found(drive, tmp_path / "cut.mcap")

@@ -1,7 +1,7 @@
 """The odometry of a second publisher is no part of the odometry that is checked; outliers are."""
 
 import numpy as np
-import pytest
+from rows import each
 
 from graph_slam_ros.check.columns import Columns, OdometryColumns
 from graph_slam_ros.check.odometry import of_one_publisher
@@ -33,7 +33,7 @@ def columns(other_s, other_m, count=None):
     return Columns(Config(), {}, odometry, own_ns, own, (), (), *empty, counters)
 
 
-@pytest.mark.parametrize("hz", [1.0, 20.0, 50.0])
+@each("hz", [1.0, 20.0, 50.0])
 def test_a_second_publisher_is_left_out_at_any_rate(hz):
     other_s = np.arange(round(95 * hz)) / hz + 1001.013
     whole = columns(other_s, 50.0 + 0.9 * (other_s - 1000.0))

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from rows import each
 
 from graph_slam_ros.check.outliers import check_outliers
 from graph_slam_ros.check.sightings import SightingColumns
@@ -50,7 +51,7 @@ def found(columns, others=()):
     return {one.code: one for one in check_outliers(columns, columns.points, inside, CONFIG, others)}
 
 
-@pytest.mark.parametrize("wrong", [0.01, 0.03, 0.1])
+@each("wrong", [0.01, 0.03, 0.1])
 def test_the_share_of_wrong_ids_is_reported_even_among_other_outliers(wrong):
     columns, share = seen(np.random.default_rng(1), wrong=wrong, far=0.03)
     one = found(columns)["ids_wrong"]
@@ -58,7 +59,7 @@ def test_the_share_of_wrong_ids_is_reported_even_among_other_outliers(wrong):
     assert one.severity == ("warning" if wrong > 0.05 else "note")
 
 
-@pytest.mark.parametrize("how", [{}, {"far": 0.05}, {"far": 0.1, "burst": 10}])
+@each("how", [{}, {"far": 0.05}, {"far": 0.1, "burst": 10}])
 def test_outliers_of_which_some_fit_another_landmark_by_chance_are_no_wrong_ids(how):
     for seed in range(50):
         assert "ids_wrong" not in found(seen(np.random.default_rng(seed), **how)[0])

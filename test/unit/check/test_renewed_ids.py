@@ -1,7 +1,7 @@
 """Ids that are new from some time on are found where the landmarks lie where others were."""
 
 import numpy as np
-import pytest
+from rows import each
 
 from graph_slam_ros.check.renewed_ids import check_renewed
 from graph_slam_ros.check.sightings import SightingColumns
@@ -32,7 +32,7 @@ def lap(begin_s, name, trees=TREES):
     ]
 
 
-@pytest.mark.parametrize("wrong", [0, 2])
+@each("wrong", [0, 2])
 def test_a_detector_that_begins_anew_is_found_though_some_ids_are_wrong(wrong):
     drive = lap(1000.0, "a{}") + lap(1100.0, "b{}") + [(1150.0, f"a{k}", TREES[k]) for k in range(wrong)]
     s, points = sightings(drive)
@@ -51,8 +51,8 @@ ROWS = np.array([(2.0 * k, 3.0 * row) for row in range(6) for k in range(15)])
 HALF = lap(1000.0, "a{}", ROWS[:45]) + lap(1140.0, "b{}", ROWS[45:])
 
 
-@pytest.mark.parametrize("drift_m", [0.0, 0.7])
-@pytest.mark.parametrize("every_s", [25.0, 100.0, 200.0])
+@each("drift_m", [0.0, 0.7])
+@each("every_s", [25.0, 100.0, 200.0])
 def test_a_detector_that_begins_anew_again_and_again_is_found(every_s, drift_m):
     """On new ground in the first half, and there again in the second."""
     later = ROWS + np.array([drift_m, 0.0])
@@ -70,7 +70,7 @@ def test_a_way_out_and_back_past_its_landmarks_has_the_same_ids_but_for_a_few():
         assert renewed([one for one in HALF + back if one[0] < end_s]) == []
 
 
-@pytest.mark.parametrize(
+@each(
     "drive",
     [
         lap(1000.0, "a{}"),
@@ -79,7 +79,6 @@ def test_a_way_out_and_back_past_its_landmarks_has_the_same_ids_but_for_a_few():
         lap(1000.0, "a{}") + lap(1100.0, "b{}", RNG.uniform(0.0, 40.0, (30, 2))),
         lap(1000.0, "a{}", TREES[:3]) + lap(1100.0, "b{}", TREES[:3]),
     ],
-    ids=["one lap", "two laps", "new ground", "others among them", "few"],
 )
 def test_ids_that_are_new_because_the_landmarks_are_not_found(drive):
     s, points = sightings(drive)

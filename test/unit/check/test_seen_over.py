@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from rows import each
 
 from graph_slam_ros.check.contradictions import seen_over
 from graph_slam_ros.check.sightings import SightingColumns
@@ -9,9 +10,7 @@ from graph_slam_ros.check.sightings import SightingColumns
 NS = 1_000_000_000
 
 
-@pytest.mark.parametrize(
-    ("ids", "back", "few", "reach_m"), [(120, 0, 2, 2.0), (120, 2, 2, 2.0), (120, 3, 2, 100.0), (20, 1, 0, 100.0)]
-)
+@each("ids, back, few, reach_m", [(120, 0, 2, 2.0), (120, 2, 2, 2.0), (120, 3, 2, 100.0), (20, 1, 0, 100.0)])
 def test_a_few_ids_that_come_back_are_left_out_of_many(ids, back, few, reach_m):
     """Each id is seen for two metres; some of the first are seen again after a hundred."""
     begins = np.linspace(0.0, 300.0, ids)
