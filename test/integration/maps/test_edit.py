@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 import small_drive
 from faulty import faulty_run
+from rows import each
 
 from graph_slam_ros import cli, replay
 from graph_slam_ros.analysis.what_if import SavedGraph
-from graph_slam_ros.errors import FormatError, GraphSlamError
+from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.g2o import read_g2o
 from graph_slam_ros.maps.edit import Plan, edit_run, plan_text, source_hash
 from graph_slam_ros.measurements.edit_actions import ACTIONS
@@ -120,17 +121,13 @@ def test_a_landmark_is_split_by_edges_or_by_keyframes_and_merged_again(either, t
 
 @pytest.fixture(scope="module")
 def faulty(tmp_path_factory):
-    """A run with false closures and wrong identities, and edits of closures that are in and out, and of landmarks."""
+    """A run with false closures and wrong identities; edits of closures that are in and out."""
     run = faulty_run(tmp_path_factory.mktemp("faulty"))[1]
     entries = read_ledger(run)
     inside, outside = (next(e.edge for e in entries if e.label == "closures" and e.is_in is w) for w in (True, False))
-    names = sorted({e.landmark for e in entries if e.landmark})
     return run, [
         one("remove_edge", edge=inside),
         one("let_in_edge", edge=outside),
-        one("remove_landmark", landmark=names[0]),
-        one("rename_landmark", landmark=names[1], to="dock <1>"),
-        one("merge_landmarks", landmark=names[2], into=names[3]),
     ]
 
 
@@ -143,21 +140,6 @@ def test_an_edge_that_is_out_or_in_by_hand_is_as_in_a_graph_that_was_solved_so(n
     out, back = ([e.edge for e in changed if e.is_in is was] for was in (True, False))  # by the second look
     solver = saved.solve(without=[edge, *out], let_in=back) if number == 0 else saved.solve(out, [edge, *back])
     assert np.abs(solver.estimate(saved.keyframes) - slam.trajectory()).max() < 0.02
-
-
-def test_a_landmark_that_was_merged_has_the_edges_of_both(faulty, tmp_path):
-    run, (*_, plan) = faulty
-    before, slam = applied(run, tmp_path, plan)
-    gone, into = plan["landmark"], plan["into"]
-    assert gone not in slam.landmarks
-    assert slam.landmarks[into].sightings == sum(before.landmarks[name].sightings for name in (gone, into))
-    assert before.landmarks[gone].vertex not in slam.solver.vertices
-    (record,) = slam.edits
-    for old, new in zip(record.edges, record.added, strict=True):
-        (a, b) = (slam.graph.edge(edge) for edge in (old, new))
-        assert slam.ledger.reason.values[old] == Reason.BY_HAND
-        assert a.measured.tolist() == b.measured.tolist()
-        assert b.vertices == (a.vertices[0], slam.landmarks[into].vertex)
 
 
 # -- what is made of an edited map -------------------------------------------------------------------------------------
@@ -296,7 +278,7 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize(("values", "named"), REFUSED)
+@each("values, named", REFUSED)
 def test_what_cannot_be_done_is_named_and_nothing_is_written(values, named, run, tmp_path):
     before = contents(run)
     with pytest.raises(GraphSlamError) as raised:
@@ -321,11 +303,6 @@ def test_a_frozen_map_and_one_that_measurements_locate_are_not_moved(run, tmp_pa
     record_run(tmp_path / "fixed", small_drive.config(), [*measured[:12], fix, *measured[12:]], [])
     with pytest.raises(GraphSlamError, match=r"1 measurements say where the map lies, the first is edge \d+ \(fixes\)"):
         edit_run(tmp_path / "fixed", [turn])
-
-
-def test_a_part_of_the_drive_is_not_cut_out_and_the_line_says_what_to_do_instead(run):
-    with pytest.raises(FormatError, match=r"edit 1: do: cut: .*replay the recording without it"):
-        edit_run(run, [one("cut", **{"from": 2, "until": 4})])
 
 
 def test_an_edge_in_by_hand_that_all_else_contradicts_is_warned_of(run, tmp_path):

@@ -2,6 +2,7 @@
 
 import planted_closures
 import pytest
+from reliability import times
 
 from graph_slam_ros import edit_run
 from graph_slam_ros.runs.restore import restored
@@ -10,7 +11,7 @@ from graph_slam_ros.tools.report.contents import read_contents
 WHO = {"who": "Anna", "when": "2026-05-04T10:30:00Z", "why": "the aisles look alike"}
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", times([0], [0, 1]))
 def test_the_page_leads_to_every_wrong_closure_and_the_edited_map_is_as_good_as_a_clean_one(seed, tmp_path):
     run = tmp_path / "run"
     wrong = planted_closures.run(run, seed)

@@ -8,6 +8,7 @@ import re
 
 import pytest
 from places import ROOT
+from rows import each
 
 from graph_slam_ros.cli.parser import parser
 from graph_slam_ros.errors import FormatError
@@ -65,7 +66,7 @@ def written(folder, *edits):
     return file
 
 
-@pytest.mark.parametrize("do", ACTIONS)
+@each("do", ACTIONS)
 def test_each_edit_is_read_as_it_was_written(do, tmp_path):
     for either in range(max(1, len(ACTIONS[do].either))):
         values = values_of(do, either)
@@ -89,8 +90,8 @@ def closure(**change):
     return values_of("add_closure", **change)
 
 
-@pytest.mark.parametrize(
-    ("values", "named"),
+@each(
+    "values, named",
     [
         (7, "7 is not an object"),
         *((out(edge=edge), f"edge: {edge!r} is not the id of an edge") for edge in (7.0, True, "7", -1, 2**63)),
@@ -136,8 +137,8 @@ def test_a_fault_of_an_edit_is_named(values, named, tmp_path):
     assert "\n" not in str(raised.value)
 
 
-@pytest.mark.parametrize(
-    ("text", "named"),
+@each(
+    "text, named",
     [
         ("", "not JSON"),
         ("[" * 100_000, "not JSON"),
