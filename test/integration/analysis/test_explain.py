@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from faulty import faulty_run
+from rows import each
 
 from graph_slam_ros import cli
 from graph_slam_ros.analysis import measurement_text
@@ -101,7 +102,7 @@ def test_each_verdict_is_explained_in_its_words(run):
         assert words in " ".join(" ".join(explain_edge(saved, str(entry.edge))).split())
 
 
-@pytest.mark.parametrize("words", [(), (3,), ("--without", 3), ("--influence",)])
+@each("words", [(), (3,), ("--without", 3), ("--influence",)])
 def test_a_run_that_was_never_saved_is_explained_from_its_map(run, tmp_path, words, capsys):
     copy = copied(run, tmp_path)
     for name in (LEDGER, CHANGES, GRAPH):
@@ -132,7 +133,7 @@ def test_another_explanation_is_warned_of_with_how_to_try_it(run, tmp_path, caps
     assert f"this explanation costs 100, another 120: graph_slam explain {copy} --with 5 6 --without 7" in text
 
 
-@pytest.mark.parametrize("tag", EDGE_TAGS)
+@each("tag", EDGE_TAGS)
 def test_every_type_of_edge_can_be_told(tag):
     edge = EDGE_TAGS[tag]
     m, sizes = edge.residual_size, edge.measured_size

