@@ -136,8 +136,3 @@ def all_values(solver):
         ids = np.flatnonzero(graph.kind.values == code)
         out[graph.offset.values[ids][:, None] + np.arange(kind.size)] = solver.estimate(ids)
     return out
-
-
-def reference_optimum(graph, vertices, edges, held, start):
-    """Where batch Gauss-Newton from the start converges to: the values of all vertices."""
-    return Reference(graph, vertices, edges, held).optimum(start)

@@ -7,6 +7,7 @@ import re
 import pytest
 import yaml
 from places import ROOT
+from rows import each
 
 from graph_slam_ros.config.world import FramesConfig
 from graph_slam_ros.messages.topics import PUBLICATIONS, SUBSCRIPTIONS
@@ -28,7 +29,7 @@ SHOWN_BY = {
 DISPLAYS = {d["Name"]: d for d in RVIZ["Displays"] if "Topic" in d}
 
 
-@pytest.mark.parametrize("name", DISPLAYS)
+@each("name", DISPLAYS)
 def test_a_display_of_rviz_connects_to_what_the_node_publishes(name):
     display, topic = DISPLAYS[name], DISPLAYS[name]["Topic"]
     assert not topic["Value"].startswith(("/", "~")), "relative: it follows RViz into a namespace"

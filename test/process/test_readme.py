@@ -6,6 +6,7 @@ import sys
 
 import pytest
 from places import ROOT
+from rows import each
 
 import graph_slam_ros
 
@@ -25,7 +26,7 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
-@pytest.mark.parametrize("block", BLOCKS, ids=lambda block: block.split("\n", 1)[0])
+@each("block", BLOCKS)
 def test_a_block_of_the_docs_prints_what_it_says(block, folder, capsys):
     said = re.findall(r"^print\(.*\)  # (.*)$", block, re.MULTILINE)
     assert len(said) == block.count("print(") > 0

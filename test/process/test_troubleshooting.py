@@ -10,6 +10,7 @@ from itertools import pairwise
 
 import pytest
 from places import ROOT
+from rows import each
 
 from graph_slam_ros.formats.parameters import read_parameters
 from graph_slam_ros.measurements.reasons import REASONS
@@ -55,7 +56,7 @@ def test_every_reason_of_a_state_is_on_the_page():
         assert piece.strip(" :;,") in page, piece
 
 
-@pytest.mark.parametrize("block", blocks("yaml"), ids=lambda block: re.search(r"type: (\S+),", block)[1])
+@each("block", blocks("yaml"))
 def test_a_recipe_is_a_parameter_file_and_its_input_can_be_used_so(block, tmp_path):
     file = tmp_path / "recipe.yaml"
     file.write_text(block)

@@ -4,8 +4,8 @@ import re
 from itertools import combinations
 
 import numpy as np
-import pytest
 from places import ROOT
+from rows import each
 
 from graph_slam_ros.colours import DARK, LIGHT
 
@@ -32,8 +32,8 @@ def lab(rgb):
     return np.array([116.0 * f[1] - 16.0, 500.0 * (f[0] - f[1]), 200.0 * (f[1] - f[2])])
 
 
-@pytest.mark.parametrize("seen", SEEN)
-@pytest.mark.parametrize("colours", [LIGHT, DARK], ids=["light", "dark"])
+@each("seen", SEEN)
+@each("colours", [LIGHT, DARK])
 def test_every_two_colours_stay_apart(colours, seen):
     found = {name: lab(np.array(SEEN[seen]) @ linear(colour)) for name, colour in colours.items()}
     apart = {(a, b): float(np.linalg.norm(found[a] - found[b])) for a, b in combinations(found, 2)}

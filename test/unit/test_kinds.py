@@ -7,11 +7,10 @@ import pytest
 import soak
 from conftest import KINDS, is_soaked
 from places import ROOT
+from rows import each
 
 
-@pytest.mark.parametrize(
-    "start", [lambda: os.system("true"), lambda: os.posix_spawn("/bin/true", ["true"], {})], ids=["system", "spawn"]
-)
+@each("start", [lambda: os.system("true"), lambda: os.posix_spawn("/bin/true", ["true"], {})])
 def test_a_unit_test_that_starts_a_process_fails_and_says_what_is_missing(start):
     with pytest.raises(RuntimeError, match=r"test_kinds\.py starts a process: it belongs into test/process"):
         start()

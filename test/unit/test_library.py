@@ -2,15 +2,15 @@
 
 import pydoc
 import re
-import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from places import ROOT
+from rows import each
 
 import graph_slam_ros
-from graph_slam_ros import Config, Control, Graph, GraphSlam, load_run, optimize
+from graph_slam_ros import Config, Control, load_run
 from graph_slam_ros import graph as edge_module
 from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.config.config import parameters
@@ -18,7 +18,6 @@ from graph_slam_ros.edge_tags import EDGE_TAGS
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import EdgeType
 from graph_slam_ros.runs.restore import map_of, record_run
-from graph_slam_ros.slam import Update
 from graph_slam_ros.tools.report.places import keyframe_paths
 from graph_slam_ros.tools.simulation import measurements, simulate, write_bag
 
@@ -83,12 +82,6 @@ def test_data_frames_have_a_row_for_each(done):
     assert set(edges["verdict"]) <= {"accepted", "down_weighted", "not_evaluated", "pending", "rejected"}
 
 
-def test_without_pandas_a_line_says_what_to_install(done, monkeypatch):
-    monkeypatch.setitem(sys.modules, "pandas", None)
-    with pytest.raises(GraphSlamError, match="pip install pandas"):
-        load_run(done[1]).landmark_frame()
-
-
 def test_what_is_no_run_or_has_no_results_is_refused(done, tmp_path):
     with pytest.raises(GraphSlamError, match="not a run's folder"):
         load_run(tmp_path)
@@ -99,29 +92,6 @@ def test_what_is_no_run_or_has_no_results_is_refused(done, tmp_path):
     (tmp_path / "run.json").write_text("[]")
     with pytest.raises(GraphSlamError, match=r"run\.json"):
         load_run(tmp_path)
-
-
-def test_objects_say_in_a_line_what_they_are(done):
-    slam, _ = done
-    counts = f"{len(slam.keyframes)} keyframes, {len(slam.landmarks)} landmarks, {slam.graph.edge_count} edges"
-    assert repr(slam) == f"GraphSlam({counts}, {slam.solves} solves)"
-    poses, odometry = len(slam.keyframes) + len(slam.landmarks), len(slam.graph.edges_of("odometry"))
-    assert repr(slam.graph).startswith(f"Graph({slam.graph.vertex_count} vertices: {poses} SE2; ")
-    assert f"{odometry} odometry" in repr(slam.graph)
-    assert repr(Graph()) == "Graph(0 vertices; 0 edges)"
-    solution = optimize(ROOT / "data/city.g2o")
-    assert re.fullmatch(r"Solution\(500 poses, 0 points, chi2 465\.97, \w+, start: file\)", repr(solution))
-    assert repr(Update()) == "Update(nothing)"
-    told = []
-    fresh = GraphSlam()
-    for m in [*measurements(simulate("pythonrobotics", 0, poses=12)), Control("optimize")]:
-        told.append(repr(fresh.process(m)))
-    assert re.fullmatch(r"Update\(\d+ edges?, solved everything, map -> odom moved \S+ m\)", told[-1])
-    assert any(one.startswith("Update(1 keyframe") for one in told)
-    assert repr(Config()) == "Config()"
-    text = repr(Config.from_mapping({"keyframes.min_distance_m": 0.5, "inputs.names": "odom gps", "gps.sigma_m": 2.0}))
-    assert text == "Config(keyframes.min_distance_m=0.5, inputs.names='odom gps', gps.sigma_m=2.0)"
-    assert all(len(repr(one)) < 300 for one in (slam, slam.graph, solution, Config()))
 
 
 def test_help_of_the_parameters_can_be_read_in_a_terminal():
@@ -171,7 +141,7 @@ def test_the_page_of_edge_types_is_the_table_of_edge_types():
         assert set(residual) <= units, name
 
 
-@pytest.mark.parametrize("name, edge", list(edge_types()), ids=lambda value: value if isinstance(value, str) else "")
+@each("name, edge", list(edge_types()))
 def test_the_units_of_a_residual_are_those_of_the_page(name, edge):
     """Metres scale with the map, radians do not."""
     rows = {n: rest for n, *rest in documented()}

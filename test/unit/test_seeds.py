@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from places import ROOT
+from rows import each
 
 from graph_slam_ros.errors import GaugeError
 from graph_slam_ros.formats.g2o import read_g2o
@@ -93,7 +94,7 @@ def test_on_a_line_the_landmark_as_a_vertex_uses_odometry_too_and_counts_each_si
 READINGS = [((1.0, 0.0, 0.1), (3.0, 1.0, 0.4), (2.0, 0.5, 0.3)), ((-7.0, 2.0, 3.0), (0.3, -4.0, -2.0), (9.0, 9.0, 1.0))]
 
 
-@pytest.mark.parametrize("second, first_sees, second_sees", READINGS)
+@each("second, first_sees, second_sees", READINGS)
 def test_in_the_plane_the_determinant_is_that_of_the_information_whatever_the_readings(second, first_sees, second_sees):
     # One edge between two poses, H = [Ji Jj]' Omega [Ji Jj]. With an anchor of information I on the first pose, a
     # determinant by blocks is det(I) det(Jj' Omega Jj) = det(Jj)^2 det(Omega). Jj is a rotation beside a 1, so what is
@@ -130,7 +131,7 @@ def solved(path, error_map="relative", **settings):
     return solver.optimize()
 
 
-@pytest.mark.parametrize(
+@each(
     "error_map, start, end, odometry, closures",
     [("seed", 7191686, "215.84", "142.189", "73.652"), ("relative", 5149721, "215.8302", "142.266", "73.564")],
 )
@@ -154,8 +155,8 @@ OPTIMA = [
 ]
 
 
-@pytest.mark.parametrize("method", ["gn", "lm"])
-@pytest.mark.parametrize("name, chi2, odometry, closures", OPTIMA, ids=lambda v: str(v) if isinstance(v, str) else "")
+@each("method", ["gn", "lm"])
+@each("name, chi2, odometry, closures", OPTIMA)
 def test_a_public_graph_comes_to_its_known_optimum(name, chi2, odometry, closures, method):
     report = solved(public(name), method=method)
     assert (report.method, report.converged) == (method, True)

@@ -3,8 +3,8 @@
 import re
 from xml.etree import ElementTree
 
-import pytest
 from places import ROOT
+from rows import each
 
 from graph_slam_ros.messages.topics import PUBLICATIONS, SERVICES, SUBSCRIPTIONS, Interface
 
@@ -17,7 +17,7 @@ def row(one):
     return f"| `{one.name}` | {re.sub('/(msg|srv)/', '/', one.type)} | {latched}{one.meaning} |"
 
 
-@pytest.mark.parametrize("head", TABLES)
+@each("head", TABLES)
 def test_the_readme_has_every_row_and_no_other(head):
     _, _, below = PAGE.partition(f"| {head} | type | |\n|---|---|---|\n")
     assert below.split("\n\n")[0].splitlines() == [row(one) for one in TABLES[head]]
@@ -26,7 +26,7 @@ def test_the_readme_has_every_row_and_no_other(head):
 DEPENDENCIES = {tag.text for tag in ElementTree.parse(ROOT / "package.xml").iter("exec_depend")}
 
 
-@pytest.mark.parametrize("table", [PUBLICATIONS, SUBSCRIPTIONS, SERVICES])
+@each("table", [PUBLICATIONS, SUBSCRIPTIONS, SERVICES])
 def test_each_name_is_there_once_and_each_package_is_a_dependency(table):
     assert len({one.name for one in table}) == len(table)
     assert {one.type.split("/")[0] for one in table} <= DEPENDENCIES

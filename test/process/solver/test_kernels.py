@@ -12,7 +12,6 @@ from places import ROOT, test_path
 from reliability import times
 
 from graph_slam_ros import warmup
-from graph_slam_ros.lie import jit
 
 TEST = ROOT / "test"
 # Small, and between them they call every kernel.
@@ -167,16 +166,6 @@ for path in sys.argv[1:]:
     assert 0.0 <= innovations(file.graph, solver, [seen])[0]
 print([name for name, count in signatures().items() if count != before.get(name, 0)])
 """
-
-
-def test_code_is_the_same_whatever_its_comments_and_docstrings():
-    code = jit._code_of(
-        b'"""Module."""\n\n\nclass A:\n    """Class."""\n    def f(x):\n        """Text."""\n        return "s"\n'
-    )
-    assert code == jit._code_of(
-        b'# comment\nclass A:\n    """B"""\n    def f(\n        x,\n    ):\n        return "s"  # s\n'
-    )
-    assert code != jit._code_of(b'class A:\n    """B"""\n    def f(x):\n        return "t"\n')
 
 
 def test_the_progress_of_the_compiler_counts_to_about_as_many_kernels_as_there_are():

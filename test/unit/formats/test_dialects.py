@@ -8,9 +8,8 @@ from rows import each
 from scipy.spatial.transform import Rotation
 
 from graph_slam_ros.errors import FormatError
-from graph_slam_ros.formats.dialects import LANDMARK_IDS_FROM
 from graph_slam_ros.formats.g2o import read_g2o
-from graph_slam_ros.graph import LANDMARK_POSITION, R2, RELATIVE_POSE, RELATIVE_POSE_3D, SE2
+from graph_slam_ros.graph import LANDMARK_POSITION, RELATIVE_POSE, RELATIVE_POSE_3D
 from graph_slam_ros.solver import Settings, Solver, initial_values
 
 GRAPHS = DATASETS
@@ -65,13 +64,6 @@ def test_an_order_is_not_guessed_from_units(tmp_path):
     file = read(tmp_path, "VERTEX2 0 0 0 0\nVERTEX2 1 1 0 0\nEDGE2 0 1 1 0 0 1e18 9e17 1e18 1e-2 9e7 9e7\n")
     expected = [[1e18, 9e17, 9e7], [9e17, 1e18, 9e7], [9e7, 9e7, 1e-2]]
     assert information(file, RELATIVE_POSE)[0] == pytest.approx(np.array(expected), rel=1e-9)
-
-
-def test_a_landmark_and_a_pose_of_one_number_are_two_vertices_in_gtsam_text(tmp_path):
-    text = "VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0\nVERTEX_XY 1 2 0\n"
-    file = read(tmp_path, text + "LANDMARK 0 1 2 0 1 0 1\nLANDMARK 1 1 1 0 1 0 1\nODOMETRY 0 1 1 0 0 1 0 0 1 0 1\n")
-    assert file.ids == [0, 1, LANDMARK_IDS_FROM + 1]
-    assert [file.graph.kind_of(v) for v in range(3)] == [SE2, SE2, R2]
 
 
 def test_edge2_with_rows_of_the_upper_triangle_may_be_square_roots_and_is_asked_for(tmp_path):

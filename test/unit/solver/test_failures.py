@@ -214,12 +214,3 @@ def test_an_edge_without_a_weight_may_come_without_its_vertex():
     solver.set_weight(seen[1], 1.0)
     solver.update()
     assert solver.estimate([lost])[0, 0] == pytest.approx(3.0, abs=1e-9)
-
-
-def test_the_diagonal_forgets_a_weight_that_was_huge():
-    solver = numbers(2, Sensor())
-    solver.set_weight(0, 1e32)
-    solver.update()
-    solver.set_weight(0, 1.0)
-    solver.update()
-    assert solver._tree.diagonal[:2].tolist() == [2.0, 1.0]

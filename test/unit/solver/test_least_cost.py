@@ -57,23 +57,3 @@ def test_the_least_cost_is_that_of_scipy(name):
         case = drawn(name, seed)
         least = least_squares(costs, np.zeros(len(case[-1])), method="lm", xtol=1e-12, args=case)
         assert searched(*case) == pytest.approx(2.0 * least.cost, rel=1e-4), (name, seed)
-
-
-def test_a_linearisation_in_plain_python_gives_the_same():
-    case = drawn("point", 3)
-    plain = searched(*case, linearize=lambda *given: LANDMARK_POSITION.linearize(*given))
-    assert plain == pytest.approx(searched(*case), rel=1e-12)
-
-
-def test_a_search_takes_no_more_evaluations_than_it_may():
-    case, count = drawn("space", 1), []
-
-    def counted(*given):
-        count.append(given)
-        return RELATIVE_POSE_3D.linearize(*given)
-
-    everything = searched(*case)
-    for most in (1, 20, 40, 60):
-        count.clear()
-        assert searched(*case, linearize=counted, most=most) >= everything
-        assert len(count) <= most

@@ -124,19 +124,6 @@ def test_it_is_the_dense_inverse_without_what_the_edges_say(losses, online):
     assert (np.abs(values - stored(anew, wanted)) / sigmas).max() < 0.05  # which is damped a little
 
 
-def test_a_held_vertex_is_certain_and_stays():
-    graph, poses, marks, seen = drive(np.random.default_rng(1))
-    solver = solved(graph, held=marks[:2])
-    wanted = [marks[0], poses[15], marks[3], marks[1]]
-    values, covariance = solver.joint_marginal_without(wanted, seen)
-    assert np.array_equal(values[[0, 1, -2, -1]], stored(solver, [marks[0], marks[1]]))
-    assert not covariance[[0, 1, -2, -1]].any()
-    assert np.linalg.eigvalsh(covariance[2:7, 2:7]).min() > 0.0
-    values, covariance = solver.joint_marginal_without(marks[:2], seen)
-    assert np.array_equal(values, stored(solver, marks[:2]))
-    assert not covariance.any()
-
-
 def test_what_only_these_edges_determine_is_refused_and_nothing_has_changed():
     graph, _, marks, _ = drive(np.random.default_rng(4))
     every = [edge for edge in graph.edges_of("landmarks").tolist() if marks[0] in graph.edge(edge).vertices]

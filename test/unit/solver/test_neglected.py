@@ -7,7 +7,6 @@ from graph_slam_ros.graph import POSE_PRIOR_3D, RELATIVE_POSE_3D, SE3, Gaussian,
 from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.solver.neglected import neglected
-from graph_slam_ros.solver.relinearization import RelinearizationSchedule
 
 STEP_M, RING, POSES = 8.0, 30, 600
 
@@ -61,14 +60,3 @@ def test_the_estimate_is_at_the_optimum_although_noise_is_much_smaller_than_stat
     assert (above < 5e-4 * now) == tightens
     assert 0.2 * above < left_out < 5.0 * above
     assert not np.array_equal(found, solver.values)
-
-
-def test_thresholds_are_tightened_at_the_second_check_and_loosened_again():
-    schedule = RelinearizationSchedule()
-    schedule.learn(neglected=1.0, chi2=100.0, edges=1000)
-    assert schedule.tightness == 1.0  # a closure may have come
-    schedule.learn(neglected=1.0, chi2=100.0, edges=2000)
-    assert schedule.tightness == pytest.approx((2e-4 / 0.01) ** 0.25)
-    for _ in range(3):
-        schedule.learn(neglected=0.01, chi2=100.0, edges=4000)
-    assert schedule.tightness == 1.0

@@ -33,8 +33,7 @@ from graph_slam_ros.graph import (
     numeric_jacobian,
 )
 from graph_slam_ros.lie import se2, se3
-from graph_slam_ros.solver import Change, Settings, Solver, online_problem, problem
-from graph_slam_ros.solver.clique_tree.advance import DISSECT, DONE, ROOM
+from graph_slam_ros.solver import Change, Settings, Solver
 from graph_slam_ros.solver.clique_tree.storage import TAIL_END
 
 KINDS = (R1, R2, R3, SE2, SE3)
@@ -450,48 +449,6 @@ def test_what_was_asked_after_a_batch_changes_nothing_that_comes_later():
     assert np.array_equal(asked.values, silent.values)
 
 
-@each("grows", [False, True])
-@each("before", ["update", "optimize"])
-@each("way", ["update", "marginal", "optimize"])
-def test_from_another_start_everything_is_linearised_there(way, before, grows):
-    solver = chain(30, **EXACT)
-    ways = {
-        "update": solver.update,
-        "marginal": lambda: solver.marginal([3]),
-        "optimize": lambda: solver.optimize(Settings(**BATCH)),
-    }
-    solver.add([], [solver.graph.add_edge(RELATIVE_POSE, [0, 29], [28.0, 3.0, 0.4], PLANAR, "closures")])
-    ways[before]()
-    best = solver.values
-    solver.start_at(best + 0.2 * np.sin(np.arange(len(best))))
-    if grows:
-        append(solver, 30, 5)
-    ways[way]()
-    assert off_by(solver) < 1e-6
-    if not grows:
-        assert np.abs(solver.values - best).max() < 1e-6
-    check_tree(solver)
-
-
-@each("way", ["update", "marginal"])
-def test_what_has_moved_far_is_linearised_anew_where_it_is_built_upon(way):
-    solver, sure = chain(12), Gaussian.from_sigmas(0.01, 0.01, 0.01)
-    graph = solver.graph
-    edges = [
-        graph.add_edge(RELATIVE_POSE, [0, 11], [11.0, 0.5, 0.1], Gaussian.from_sigmas(0.5, 0.5, 0.5), "closures"),
-        graph.add_edge(POSE_PRIOR, [9], [9.0, 0.2, 0.0], Gaussian.from_sigmas(0.2, 0.2, 9.0), "fix"),
-        graph.add_edge(RELATIVE_POSE, [5, 6], [-4.0, 1.0, 3.0], sure, "closures"),  # all is bent
-    ]
-    solver.add([], edges)
-    solver.optimize()
-    solver.set_weight(edges[-1], 0.0)
-    _ = solver.update() if way == "update" else solver.marginal([11])  # and straight again
-    added = append(solver, 12)
-    solver.update()
-    assert solver.chi2_of(added)[0].max() < 1.0
-    assert solver.evaluate().cost_final < 2.0
-
-
 def _square(x, at, measured):
     """``r = x^2 - z``: no measurement of minus one can be met, and at zero it tells nothing."""
     here = x[at[:, 0]]
@@ -514,37 +471,3 @@ def test_an_update_that_turns_singular_on_its_way_names_the_vertex_and_is_recove
     solver.add([], [graph.add_edge(POINT_PRIOR[R1], [0], [2.0], Gaussian.from_sigmas(0.1), "all")])
     solver.update()
     assert off_by(solver) < 1e-6
-
-
-def test_an_update_with_what_was_added_is_one_compiled_call(monkeypatch):
-    graph, noise = Graph(), Gaussian.from_sigmas(0.1, 0.1, 0.02)
-    solver, calls = Solver(graph, Settings(relinearize_every=1000)), []
-
-    def step(k):
-        v = graph.add_vertex(SE2, [float(k), 0.0, 0.0])
-        prior = POSE_PRIOR, [v], [0.0, 0.0, 0.0]
-        edge = graph.add_edge(*(prior if k == 0 else (RELATIVE_POSE, [v - 1, v], [1.0, 0.0, 0.0])), noise, "all")
-        solver.add([v], [edge])
-        return solver.update()
-
-    def counted(*arguments):
-        calls.append(how_it_ends(*arguments))
-        return calls[-1]
-
-    def forbidden(*_):
-        raise AssertionError("another compiled call")
-
-    for k in range(40):
-        step(k)
-    how_it_ends = online_problem.update
-    monkeypatch.setattr(online_problem, "update", counted)
-    for module, name in (
-        (problem, "anchorage"), (online_problem, "enter_newest"), (online_problem, "linearize_into"),
-        (online_problem.incremental, "renumber"), (online_problem.incremental, "relinearize"),
-    ):  # fmt: skip
-        monkeypatch.setattr(module, name, forbidden)
-    assert [step(k).linearized for k in range(40, 60)] == [1] * 20
-    ends = [how for how, *_ in calls]
-    assert ends.count(DONE) == 20
-    assert set(ends) <= {DONE, DISSECT, ROOM}  # where pools are too short, or the order has grown
-    assert len(ends) < 24

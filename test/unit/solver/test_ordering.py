@@ -12,10 +12,8 @@ from graph_slam_ros.solver.clique_tree.storage import (
     FRONTS_TOP,
     FULL_DOF,
     LIVE,
-    LIVE_MADE,
     NOTHING,
     PARENT,
-    R_MADE,
 )
 from graph_slam_ros.tools.simulation import city_graph
 
@@ -146,24 +144,6 @@ def test_a_batch_and_growth_leave_trees_that_are_alike_in_depth_and_width():
     (deep, wide), (grown_deep, grown_wide) = shape(whole), shape(grown)
     assert grown_deep <= 2 * deep
     assert grown_wide <= 2 * wide
-
-
-def test_where_the_fronts_have_doubled_since_all_was_ordered_all_is_ordered_anew():
-    graph, _ = city_graph(seed=2, poses=700, blocks=12)
-    newest = next(iter(graph.tables.values())).vertices.values.max(axis=1)
-    grown = Solver(graph)
-    state = grown._tree.state
-    for k in range(700):
-        grown.add([k], np.flatnonzero(newest == k))
-        if k == 0:
-            grown.hold(0)
-        grown.update()
-        if k == 600:
-            before = int(grown._tree.region[0, R_MADE])
-            state[LIVE_MADE] = state[LIVE] // 3
-    assert grown._tree.region[0, R_MADE] > before
-    assert state[LIVE] / 2 < state[LIVE_MADE] <= state[LIVE]
-    check_tree(grown, regions_separate=True)
 
 
 def shape(solver):
