@@ -4,8 +4,7 @@ recording = simulate("warehouse", seed=7, aisles=5)
 write_bag(recording, "warehouse.mcap")
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,25 +16,11 @@ from graph_slam_ros.tools.simulation.drive import Drive
 from graph_slam_ros.tools.simulation.faults import KINDS, Fault, spoil_messages
 from graph_slam_ros.tools.simulation.faulty import faulty_graph, faulty_recording
 from graph_slam_ros.tools.simulation.instruments import Instruments, with_instruments
-from graph_slam_ros.tools.simulation.options import Option, check_seed, filled, options_of
-from graph_slam_ros.tools.simulation.pose_graph import (
-    GRAPH_WORLDS,
-    city_graph,
-    sphere_graph,
-    write_graph,
-)
+from graph_slam_ros.tools.simulation.options import World, check_seed, filled, options_of
+from graph_slam_ros.tools.simulation.pose_graph import GRAPH_WORLDS, city_graph, sphere_graph, write_graph
 from graph_slam_ros.tools.simulation.recording import Recording, measurements, with_closures
 
-
-@dataclass(frozen=True, slots=True)
-class World:
-    """A world: the dataclass of its options, and the function that drives through it."""
-
-    options: type
-    drive: Callable[[int, Any], Recording]
-
-
-WORLDS: dict[str, World] = {
+WORLDS = {
     "pythonrobotics": World(pythonrobotics.PythonRobotics, pythonrobotics.simulate),
     "manhattan": World(manhattan.Manhattan, manhattan.simulate),
     "warehouse": World(warehouse.Warehouse, warehouse.simulate),
@@ -58,7 +43,7 @@ def simulate(world: str, /, seed: int, **options: Any) -> Recording:
     chosen = {name: value for name, value in options.items() if name in names}
     rest = {name: value for name, value in options.items() if name not in names}
     one = WORLDS[world]
-    recording = one.drive(seed, one.options(**filled(world, one.options, rest, [*names])))
+    recording = one.make(seed, one.options(**filled(world, one.options, rest, [*names])))
     return with_instruments(recording, seed, Instruments(**filled(world, Instruments, chosen)))
 
 
@@ -85,9 +70,7 @@ __all__ = [
     "Drive",
     "Fault",
     "Instruments",
-    "Option",
     "Recording",
-    "World",
     "WrongLine",
     "WrongMessage",
     "city_graph",

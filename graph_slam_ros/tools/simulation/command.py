@@ -107,7 +107,7 @@ def _write_graph(args: argparse.Namespace, faults: list[Any], truth_file: Path) 
         if args.closures is not None:
             more = ": --set closures=N" if any(o.name == "closures" for o in options_of(world.options)) else ""
             raise GraphSlamError(f"{args.scenario}: no use for --closures: it has them{more}")
-        graph, poses = world.measure(args.seed, **_options(args))
+        graph, poses = world.make(args.seed, **_options(args))
         file, truth = G2oFile(graph, list(range(graph.vertex_count)), [0]), poses.ravel()
         if "closures" not in graph.labels:
             console.show(f"{args.scenario}: with {len(poses)} poses nothing is closed: a larger --poses")
@@ -165,10 +165,10 @@ def options_of_worlds() -> str:
 
     lines = ["options of the worlds, for --set:"]
     for name, world in WORLDS.items():
-        lines += [f"  {name}: {about(world.drive)}", *option_lines(world.options)]
+        lines += [f"  {name}: {about(world.make)}", *option_lines(world.options)]
     lines += ["  every world: with a satellite receiver and an IMU", *option_lines(Instruments)]
     for name, graph_world in GRAPH_WORLDS.items():
-        lines += [f"  {name}, a graph: {about(graph_world.measure)}", *option_lines(graph_world.options)]
+        lines += [f"  {name}, a graph: {about(graph_world.make)}", *option_lines(graph_world.options)]
     faults = "faults for --fault with their options; OUT.faults.csv lists what is wrong:"
     others = "faults of drivers, clocks and frames, in a world or in a recording of yours:"
     for title, kinds in ((faults, KINDS), (others, MESSAGE_KINDS)):

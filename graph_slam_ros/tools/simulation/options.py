@@ -59,6 +59,14 @@ class Kinds(dict[str, Callable[..., None]]):
         return put
 
 
+@dataclass(frozen=True, slots=True)
+class World:
+    """A world: the dataclass of its options, and the function that drives through it, or that measures its graph."""
+
+    options: type
+    make: Callable[..., Any]
+
+
 def about(what: Callable[..., Any]) -> str:
     """Describe a world or a fault in one sentence."""
     return (what.__doc__ or "").strip().splitlines()[0]

@@ -1,7 +1,7 @@
 """Worlds as graphs: a city and a sphere with closures between poses."""
 
 from bisect import bisect_right
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from graph_slam_ros.graph.geometry import PLANAR, SPATIAL, Geometry
 from graph_slam_ros.lie import se2, se3
 from graph_slam_ros.tools.simulation.manhattan import STEP_M, stroll
 from graph_slam_ros.tools.simulation.motion import integrate
-from graph_slam_ros.tools.simulation.options import check_seed, filled, option
+from graph_slam_ros.tools.simulation.options import World, check_seed, filled, option
 from graph_slam_ros.typing import Array, Index
 
 POSES_PER_CLOSURE = 3
@@ -100,18 +100,7 @@ def sphere_graph(seed: int, **values: float) -> tuple[Graph, Array]:
     return _pose_graph(SPATIAL, rng, truth, closures, sigmas, options.odometry_noise_factor), truth
 
 
-@dataclass(frozen=True, slots=True)
-class GraphWorld:
-    """A world that is a graph from the first: the dataclass of its options, and the function that measures it.
-
-    That returns the graph, and the true poses of its vertices.
-    """
-
-    options: type
-    measure: Callable[..., tuple[Graph, Array]]
-
-
-GRAPH_WORLDS = {"city": GraphWorld(CityGraph, city_graph), "sphere": GraphWorld(SphereGraph, sphere_graph)}
+GRAPH_WORLDS = {"city": World(CityGraph, city_graph), "sphere": World(SphereGraph, sphere_graph)}
 
 
 def closure_pairs(rng: Generator, cells: Index) -> Index:

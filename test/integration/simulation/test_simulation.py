@@ -59,21 +59,11 @@ def test_the_same_seed_gives_the_same_recording_and_another_seed_another():
         assert not np.array_equal(one.T_odom_base, other.T_odom_base), world
 
 
-def test_velocity_errors_add_up_over_time_as_stated():
-    for correlation_time_s in (0.0, 0.5):
-        noise, dt_s, ticks = VelocityNoise((0.05, 0.01, 0.02), correlation_time_s), 0.02, 1000
-        errors = noise.draw(np.random.default_rng(1), 400 * ticks, dt_s)
-        assert errors.std(axis=0) == pytest.approx(noise.sigmas, rel=0.05)
-        moved = dt_s * errors.reshape(400, ticks, 3).sum(axis=1)
-        whitened = moved / np.sqrt(ticks * np.diag(noise.per_tick(dt_s)))
-        assert (whitened**2).mean() == pytest.approx(1.0, abs=0.16)  # 1200 samples: 4 sigma
-
-
 def test_dead_reckoning_is_off_by_what_its_covariance_says():
     plane = VelocityNoise((0.05, 0.03, 0.02)), [2.0, 0.1, 0.4]
     space = VelocityNoise((0.05, 0.03, 0.04, 0.01, 0.02, 0.03), 0.5), [2.0, 0.1, 0.3, 0.05, -0.1, 0.4]
     for (noise, twist), group in ((plane, se2), (space, se3)):
-        dt_s, ticks, runs = 0.1, 100, 300
+        dt_s, ticks, runs = 0.1, 100, 150
         steps = dt_s * np.tile(twist, (ticks, 1))
         truth = tuple(integrate(group.IDENTITY, steps)[-1])
         root = np.linalg.cholesky(accumulated(steps, noise.per_tick(dt_s))[-1])
@@ -243,7 +233,7 @@ def test_a_bag_holds_the_truth_in_world_and_everything_in_order_of_stamp(tmp_pat
 
 def test_ranges_and_bearings_are_points_with_named_fields_in_the_frame_of_the_sensor(tmp_path):
     for world, sensor in itertools.product(("warehouse", "flight"), ("range_bearing", "bearing", "range")):
-        recording = simulate(world, 1, laps=1, sensor=sensor)
+        recording = simulate(world, 1, **{"warehouse": {"aisles": 2}, "flight": {}}[world], laps=1, sensor=sensor)
         write_bag(recording, tmp_path / "bag.mcap")
         bag, first = open_bag(tmp_path / "bag.mcap"), {}
         for record in bag.messages(["/tf_static", "/landmarks", "/landmarks_ground_truth"]):
