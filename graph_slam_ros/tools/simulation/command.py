@@ -99,14 +99,13 @@ def _write_graph(args: argparse.Namespace, faults: list[Any], truth_file: Path) 
     from graph_slam_ros.formats.graph_file import G2oFile
     from graph_slam_ros.formats.tum import write_trajectory
     from graph_slam_ros.optimization import optimize
-    from graph_slam_ros.tools.simulation import GRAPH_WORLDS, WrongLine, faulty_graph, options_of
+    from graph_slam_ros.tools.simulation import GRAPH_WORLDS, WrongLine, faulty_graph
     from graph_slam_ros.tools.simulation.pose_graph import values_of
 
     world = GRAPH_WORLDS.get(args.scenario)
     if world:
         if args.closures is not None:
-            more = ": --set closures=N" if any(o.name == "closures" for o in options_of(world.options)) else ""
-            raise GraphSlamError(f"{args.scenario}: no use for --closures: it has them{more}")
+            raise GraphSlamError(f"{args.scenario}: no use for --closures: it has them")
         graph, poses = world.make(args.seed, **_options(args))
         file, truth = G2oFile(graph, list(range(graph.vertex_count)), [0]), poses.ravel()
         if "closures" not in graph.labels:

@@ -19,6 +19,7 @@ from graph_slam_ros.tools.simulation.options import World, check_seed, filled, o
 from graph_slam_ros.typing import Array, Index
 
 POSES_PER_CLOSURE = 3
+POSES_PER_LAP, RADIUS_M = 50, 100.0  # of the sphere
 CLOSURE_RANGE_STEPS = 2  # to an earlier pose at most this far away in x and in y
 CLOSURE_GAP_POSES = 20  # and at least this many poses earlier
 
@@ -64,9 +65,6 @@ class SphereGraph:
     """Options of ``sphere_graph``."""
 
     poses: int = option(2500, "poses, from the lower to the upper pole", "", 2, 1e6)
-    poses_per_lap: int = option(50, "poses until the robot is above an earlier one", "", 2, 1e6)
-    closures: int = option(1, "closures of a pose, to the nearest poses of the lap below", "", 1, 9)
-    radius_m: float = option(100.0, "radius of the sphere", "m", 1e-3, 1e6)
     sigma_m: float = option(0.1, "noise of relative positions, in x, y and z", "m", 1e-9, 10)
     sigma_rad: float = option(0.01, "noise of relative rotations, about x, y and z", "rad", 1e-9, 1)
     odometry_noise_factor: float = option(1.0, "odometry is noisier than closures by this factor", "", 1e-6, 1e3)
@@ -90,12 +88,10 @@ def sphere_graph(seed: int, **values: float) -> tuple[Graph, Array]:
     options = SphereGraph(**filled("sphere", SphereGraph, values))
     check_seed(seed)
     rng, count = Generator(PCG64(seed)), np.arange(options.poses)
-    yaw, pitch = 2.0 * np.pi * count / options.poses_per_lap, np.pi * (0.5 - (count + 0.5) / options.poses)
+    yaw, pitch = 2.0 * np.pi * count / POSES_PER_LAP, np.pi * (0.5 - (count + 0.5) / options.poses)
     out = [se3.from_xyz_rpy((0.0, 0.0, 0.0, 0.0, *turn)) for turn in np.column_stack([pitch, yaw]).tolist()]
-    truth = np.array([se3.compose(pose, (options.radius_m, *se3.IDENTITY[1:])) for pose in out])
-    reach = (np.arange(1, options.closures + 1) // 2) * (-1) ** np.arange(options.closures)  # 0, -1, 1, -2, ...
-    pairs = np.stack(np.broadcast_arrays(count[:, None] - options.poses_per_lap + reach, count[:, None]), axis=-1)
-    closures = pairs[(pairs[:, :, 0] >= 0) & (pairs[:, :, 0] < pairs[:, :, 1] - 1)]
+    truth = np.array([se3.compose(pose, (RADIUS_M, *se3.IDENTITY[1:])) for pose in out])
+    closures = np.column_stack([count - POSES_PER_LAP, count])[POSES_PER_LAP:]
     sigmas = SPATIAL.sigmas(options.sigma_m, options.sigma_rad)
     return _pose_graph(SPATIAL, rng, truth, closures, sigmas, options.odometry_noise_factor), truth
 

@@ -308,13 +308,13 @@ def test_the_truth_explains_the_graph_of_a_city_or_sphere_within_its_noise():
     assert len(ends) == pytest.approx(3000 / 3, rel=0.05)
     assert (later - earlier).min() >= 20 and len(np.unique(later)) == len(later)
     assert np.abs(truth[earlier, :2] - truth[later, :2]).max() <= 2.0
-    for sigma_rad, closures, reach in ((0.01, 1, {50}), (0.1, 4, {49, 50, 51, 52})):
-        sphere, truth = sphere_graph(2, poses=1000, sigma_rad=sigma_rad, closures=closures, odometry_noise_factor=2.0)
+    for sigma_rad in (0.01, 0.1):
+        sphere, truth = sphere_graph(2, poses=1000, sigma_rad=sigma_rad, odometry_noise_factor=2.0)
         for label in ("odometry", "closures"):
             mean, most, ends = chi2_at(sphere, truth, label, RELATIVE_POSE_3D)
             assert mean == pytest.approx(1.0, abs=most)
         earlier, later = ends.T
-        assert set((later - earlier).tolist()) == reach
+        assert set((later - earlier).tolist()) == {50}
         radius = np.linalg.norm(truth[:, :3], axis=1)
         assert np.ptp(radius) < 1e-9 and radius[0] == pytest.approx(100.0)
         lap_m = np.linalg.norm(truth[50:, :3] - truth[:-50, :3], axis=1)
