@@ -84,14 +84,16 @@ def optimize(args: argparse.Namespace) -> int:
     )
     solution = solve(file, settings, init=args.init)
     solver, report, start = solution.solver, solution.report, solution.start
-    proof = later("tools.certificate.command", "certified")(solution, settings) if args.certify else None
+    proof, code, told = None, console.DONE, ""
+    if args.certify:
+        proof, code, told = later("tools.certificate.command", "certified")(solution)
     if args.json:
         answer = _answer(report, start, args) | _starts(solution)
         console.show(json.dumps(answer if proof is None else answer | {"certificate": proof.as_dict()}))
     else:
         start_text = STARTS[start] + ("" if file.has_values else f": {_NO_VALUES}")
         console.show(*_optimize_text(report, start_text, args.loss), *_starts_text(solution))
-        console.show(*(proof.text(report.chi2_final) if proof else ()))
+        console.show(*told.splitlines())
     if args.out:
         (write_trajectory if ending(args.out) == ".tum" else write_g2o)(args.out, file, solver.estimate)
     if args.plot:
@@ -101,7 +103,7 @@ def optimize(args: argparse.Namespace) -> int:
         console.warn(note)
     if not args.json:
         console.then(_after(args, report.converged))
-    return console.report_losses(file.skipped) or (proof.code if proof else console.DONE)
+    return console.report_losses(file.skipped) or code
 
 
 def _after(args: argparse.Namespace, converged: bool) -> str:

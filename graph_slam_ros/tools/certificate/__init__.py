@@ -12,13 +12,6 @@ G. Calafiore, C. Tommolillo, F. Dellaert, "Planar pose graph optimization: duali
 verification", IEEE T-RO 32(3), 2016.
 """
 
-from graph_slam_ros.tools.certificate.certify import (
-    CERTIFIED,
-    DOES_NOT_APPLY,
-    NOT_CERTIFIED,
-    Certificate,
-    certify,
-    other_start,
-)
+from graph_slam_ros.tools.certificate.certify import CERTIFIED, DOES_NOT_APPLY, NOT_CERTIFIED, Certificate, certify
 
-__all__ = ["CERTIFIED", "DOES_NOT_APPLY", "NOT_CERTIFIED", "Certificate", "certify", "other_start"]
+__all__ = ["CERTIFIED", "DOES_NOT_APPLY", "NOT_CERTIFIED", "Certificate", "certify"]

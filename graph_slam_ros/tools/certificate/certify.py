@@ -138,11 +138,6 @@ def certify(solution: Solution) -> Certificate:
     )
 
 
-def other_start(start: str) -> str:
-    """The start to try next, if an estimate from that start is not certified: from a chordal start most are."""
-    return "tree" if start == "chordal" else "chordal"
-
-
 def _no_relative_poses(graph: Graph) -> str:
     """The reason why a graph is none of poses and relative poses, priors aside, or an empty string."""
     others = [kind.name for kind in graph.kinds if kind not in (SE2, SE3)]
