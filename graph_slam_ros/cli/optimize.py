@@ -84,16 +84,14 @@ def optimize(args: argparse.Namespace) -> int:
     )
     solution = solve(file, settings, init=args.init)
     solver, report, start = solution.solver, solution.report, solution.start
-    proof, code, told = None, console.DONE, ""
-    if args.certify:
-        proof, code, told = later("tools.certificate.command", "certified")(solution)
+    certified = later("tools.certificate.command", "certified")
+    proof, code, told = certified(solution) if args.certify else (None, console.DONE, "")
     if args.json:
-        answer = _answer(report, start, args) | _starts(solution)
-        console.show(json.dumps(answer if proof is None else answer | {"certificate": proof.as_dict()}))
+        proved = {"certificate": proof.as_dict()} if proof else {}
+        console.show(json.dumps(_answer(report, start, args) | _starts(solution) | proved))
     else:
         start_text = STARTS[start] + ("" if file.has_values else f": {_NO_VALUES}")
-        console.show(*_optimize_text(report, start_text, args.loss), *_starts_text(solution))
-        console.show(*told.splitlines())
+        console.show(*_optimize_text(report, start_text, args.loss), *_starts_text(solution), *told.splitlines())
     if args.out:
         (write_trajectory if ending(args.out) == ".tum" else write_g2o)(args.out, file, solver.estimate)
     if args.plot:
