@@ -49,7 +49,7 @@ def test_what_the_page_says_is_in_the_example_is(config):
 
 
 def test_a_drive_lies_on_the_plan_without_being_aligned(config, tmp_path):
-    recording = simulate("warehouse", 7, laps=1)
+    recording = simulate("warehouse", 7)
     write_bag(recording, tmp_path / "drive.mcap")
     done = replay(tmp_path / "drive.mcap", tmp_path / "run", config)
     at = np.searchsorted(recording.stamps_ns, done.slam.keyframes.stamps_ns)

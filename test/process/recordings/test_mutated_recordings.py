@@ -23,7 +23,7 @@ WORLDS = {
     "tags": ("warehouse", {"aisles": 2, "laps": times(1, 2), "aisle_m": 6.0}, {}),
     "ranges": (
         "warehouse",
-        {"aisles": 2, "laps": times(1, 2), "aisle_m": 6.0, "sensor": "range_bearing"},
+        {"aisles": 2, "laps": 2, "aisle_m": 6.0, "sensor": "range_bearing"},
         {"detections.type": "sensor_msgs/msg/PointCloud2"},
     ),
     "flight": ("flight", {"laps": 1}, {"world.dimensions": 3}),
