@@ -5,7 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
-from driven import drive, seldom, with_a_wrong_sighting, without_names
+from driven import drive, seldom, without_names
 from places import ROOT
 
 from graph_slam_ros.errors import FormatError
@@ -101,21 +101,6 @@ def test_a_run_that_goes_on_in_a_map_knows_its_landmarks_and_is_repeated_byte_by
         assert (tmp_path / "after" / name).read_bytes() == (tmp_path / "again" / name).read_bytes(), name
 
 
-def test_records_are_read_many_at_once_as_one_by_one(run, monkeypatch):
-    folder, _ = run
-    at_once = read_map(folder, [])
-    monkeypatch.setattr("graph_slam_ros.runs.map_journal.AT_ONCE", 1)
-    one_by_one = read_map(folder, [])
-    assert told(at_once) == told(one_by_one)
-    assert at_once.values.tolist() == one_by_one.values.tolist()
-    assert (at_once.processed, at_once.used_ns) == (one_by_one.processed, one_by_one.used_ns)
-    for a, b in zip(at_once.graph.tables.values(), one_by_one.graph.tables.values(), strict=True):
-        assert a.type is b.type
-        assert a.id.values.tolist() == b.id.values.tolist()
-    assert at_once.graph.labels == one_by_one.graph.labels
-    assert at_once.graph.sources == one_by_one.graph.sources
-
-
 def test_cut_anywhere_it_is_read_as_far_as_it_goes(run, tmp_path):
     folder, slam = run
     whole = (folder / "map.mcap").read_bytes()
@@ -153,19 +138,6 @@ def test_what_is_no_map_is_refused_by_record(tmp_path):
         writer.close()
         with pytest.raises(FormatError, match=rf"map\.mcap: record 2: .*({complaint})"):
             read_map(tmp_path, [])
-
-
-def test_a_run_of_an_earlier_version_is_taken_up_by_repeating_it(tmp_path):
-    world = measurements(simulate("warehouse", 0, aisles=2, laps=1, aisle_m=6.0))
-    slam = drive(tmp_path / "run", Config(), with_a_wrong_sighting(world))
-    (tmp_path / "run" / "map.mcap").unlink()
-    state = map_of(tmp_path / "run", [])
-    assert state.keyframes == list(slam.keyframes)
-    assert state.ledger.history == slam.ledger.history
-    out = slam.ledger.outside.tolist()
-    weights = [float(table.weight.values[row]) for table, row in map(state.graph.row, range(state.graph.edge_count))]
-    assert [edge for edge, weight in enumerate(weights) if not weight] == out
-    assert out, "or nothing is tried"
 
 
 def test_a_run_is_cut_off_until_it_is_ended_and_kept_whatever_is_asked(tmp_path):

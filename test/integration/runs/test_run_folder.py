@@ -6,7 +6,6 @@ import json
 import os
 import shutil
 import signal
-from pathlib import Path
 
 import pytest
 from places import ROOT
@@ -102,18 +101,6 @@ def test_a_recording_of_the_user_in_a_run_folder_is_not_removed_whatever_its_nam
         assert (run / name).read_bytes() == bag.read_bytes(), name
         (run / name).unlink(), (run / "run.json").write_bytes(before["run.json"])
     assert code_of("replay", bag, "--out", run, "--force") == 0
-
-
-def test_a_folder_or_a_fifo_with_the_name_of_a_result_is_not_removed(bag, run):
-    for make in (Path.mkdir, os.mkfifo, lambda path: path.symlink_to(bag)):
-        (run / "path.png").unlink(missing_ok=True)
-        make(run / "path.png")
-        before = state(run)
-        with pytest.raises(RunError, match=r"path\.png: not written by this run"):
-            replay(bag, run, force=True)
-        assert state(run) == before
-        with contextlib.suppress(OSError):
-            (run / "path.png").rmdir()
 
 
 def test_what_else_is_in_a_run_folder_stays_when_the_run_is_replaced(bag, run):

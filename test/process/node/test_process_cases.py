@@ -4,7 +4,6 @@ The node is in this process, with a thread of its own for its callbacks, so that
 """
 
 import contextlib
-import gc
 import itertools
 import json
 import subprocess
@@ -99,24 +98,6 @@ def counted(r, name, reason):
 def faults(run):
     """What callbacks raised, by what was saved."""
     return json.loads((run / "run.json").read_text())["counters"].get("node", {})
-
-
-def test_a_node_that_is_destroyed_is_seen_by_nobody_from_then_on():
-    gc.disable()  # which would end what still keeps it
-    try:
-        with robot(of="/gone/graph_slam", hears=()) as r:
-
-            def is_seen():
-                return ("graph_slam", "/gone") in r.node.get_node_names_and_namespaces()
-
-            with inside("/gone") as slam:
-                until(is_seen, r.spin, "node")
-                slam.destroy_node()  # and once more at the end
-            until(lambda: not is_seen(), r.spin, "end of the node")
-            r.settle(1.0)
-            assert not is_seen()
-    finally:
-        gc.enable()
 
 
 def test_P9_P10_P17_where_a_solve_does_not_end_it_says_so_refuses_what_is_too_much_and_goes_on(tmp_path, monkeypatch):

@@ -8,16 +8,14 @@ import time
 import numpy as np
 import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from live_drive import TAGS, Drive, distance, earlier_run
+from live_drive import TAGS, Drive, distance
 from live_nodes import LATCHED, node, robot, until
 from messages import quaternion, transforms
 from nav_msgs.msg import Path
 from places import ROOT
 from rclpy.qos import ReliabilityPolicy
-from reliability import times
 from tf2_msgs.msg import TFMessage
 
-from graph_slam_ros.messages.interfaces import typestore
 from graph_slam_ros.runs.folder import is_run
 
 NS = 10**9
@@ -45,7 +43,7 @@ def by_stamp(path):
 # -- who joins late ----------------------------------------------------------------------------------------------------
 
 
-def test_who_joins_after_the_drive_gets_path_pose_landmarks_and_graph_and_the_whole_path_as_updates(tmp_path):
+def test_P8_who_joins_after_the_drive_gets_path_pose_landmarks_and_graph_and_the_whole_path_as_updates(tmp_path):
     parameters = f"output.folder:={tmp_path / 'run'}", "inputs.reliable:=true", "output.path_period_s:=0.02"
     with node(*parameters) as n, robot(hears=("path", "path_updates", "pose", "landmarks", "/tf")) as r:
         r.wait_for_node()
@@ -329,70 +327,3 @@ def test_odometry_in_the_map_comes_at_each_message_and_grows_less_certain_until_
     spread = [m.pose.covariance[0] + m.pose.covariance[7] for m in heard]
     assert all(b > a for a, b in itertools.pairwise(spread))
     assert spread[-1] > 2.0 * spread[0]
-
-
-# -- a long life -------------------------------------------------------------------------------------------------------
-
-
-MOST = times(800, 10_000)
-PATH_AT_MOST = f"output.path_max_poses:={MOST}"
-
-
-@pytest.fixture(scope="module")
-def veteran(tmp_path_factory):
-    """A node with a life behind it: (its robot, a drive, the first and last stamp of that life)."""
-    folder, keyframes = tmp_path_factory.mktemp("veteran"), times(1_200, 100_000)
-    stamps = earlier_run(folder / "life", keyframes)
-    parameters = f"output.folder:={folder / 'run'}", "output.load:=life", "solve.every_keyframes:=200", PATH_AT_MOST
-    hears = "path", "odometry", "/tf", "/diagnostics"
-    with node(*parameters), robot(hears=hears, raw=("path",)) as r:
-        r.wait_for_node()
-        answer = r.call("load", patience_s=keyframes / 200)
-        assert answer.success, answer.message
-        r.settle(2.0)
-        assert r.heard["path"]
-        assert not r.heard["tf"], "where it is now is not known"
-        assert r.set({"solve.every_keyframes": 1}) == (True, "")
-        drive = Drive()
-        until(lambda: r.heard["tf"], drive.pace(r), "a place in the old map")
-        yield r, drive, (stamps[0], stamps[-1])
-
-
-def test_P8_of_a_path_that_is_too_long_some_poses_are_published_the_first_and_last_among_them(veteran):
-    r, drive, earlier = veteran
-    path = typestore().deserialize_cdr(r.heard["path"][0], "nav_msgs/msg/Path")
-    stamps = [stamp_ns(one.header) for one in path.poses]
-    assert MOST / 2 < len(stamps) <= MOST
-    assert (stamps[0], stamps[-1]) == earlier
-    assert stamps == sorted(stamps)
-    r.heard["path"].clear()
-    assert r.set({"output.path_max_poses": 100}) == (True, "")
-    until(lambda: r.heard["path"], drive.pace(r), "path")
-    until(lambda: len(r.heard["path"][-1]) < 20_000, drive.pace(r), "shorter path")
-
-    def newest():
-        return typestore().deserialize_cdr(r.heard["path"][-1], "nav_msgs/msg/Path").poses
-
-    until(lambda: stamp_ns(newest()[-1].header) > drive.stamp_ns - NS, r.spin, "path up to now")
-    assert 50 < len(newest()) <= 100
-    assert stamp_ns(newest()[0].header) == stamps[0]
-
-
-def test_P9_while_everything_is_solved_and_saved_transforms_odometry_and_diagnostics_go_on(veteran):
-    r, drive, _ = veteran
-    drive.go(r, 20)
-    r.settle()
-    for topic in r.heard.values():
-        topic.clear()
-    futures, meanwhile = [], {}
-
-    def step(seconds):
-        if sum(not future.done() for future in futures) < 3:
-            futures.extend((r.ask("optimize"), r.ask("save")))
-        drive.pace(r)(seconds)
-        if not all(future.done() for future in futures):
-            meanwhile.update((topic, len(r.heard[topic])) for topic in ("odometry", "tf", "diagnostics"))
-
-    until(lambda: meanwhile and min(meanwhile.values()) > 3, step, "transforms, odometry and diagnostics", 30.0)
-    until(lambda: all(future.done() for future in futures), r.spin, "answers", 60.0)
-    assert all(future.result().success for future in futures)

@@ -18,7 +18,7 @@ def slowly(r, drive):
 def test_a_robot_that_was_carried_or_is_told_to_be_elsewhere_is_degraded_until_it_is_found(tmp_path):
     with (
         node(f"output.folder:={tmp_path / 'run'}", "inputs.reliable:=true") as n,
-        robot(hears=("pose", "/diagnostics", "events")) as r,
+        robot(hears=("pose", "path", "/diagnostics", "events")) as r,
     ):
         r.wait_for_node()
         given = r.publisher("initialpose", PoseWithCovarianceStamped)
@@ -31,7 +31,9 @@ def test_a_robot_that_was_carried_or_is_told_to_be_elsewhere_is_degraded_until_i
             until(lambda: drive.off_by(r) < 0.5, drive.pace(r), "the pose that the landmarks show")
             r.until_graph(drive.pace(r), segments=segments)
 
-        until(lambda: drive.steps > 150 and r.heard["pose"], drive.pace(r), "a map")
+        until(lambda: drive.steps > 150 and r.heard["path"], drive.pace(r), "a map")
+        assert r.set({"output.path_max_poses": 20}) == (True, "")
+        until(lambda: 10 <= len(r.heard["path"][-1].poses) <= 20, drive.pace(r), "a path of fewer poses")
         r.until_it_says("OK", spin=drive.pace(r))
         drive.truth = drive.truth[0] + 30.0, drive.truth[1] - 2.0, drive.truth[2] + 1.0
         is_found(segments=2)

@@ -279,30 +279,6 @@ def test_P4_no_room_for_the_journal_is_told_and_all_is_written_when_there_is_roo
     assert again.slam.trajectory().tolist() == session.slam.trajectory().tolist()
 
 
-def test_P4_that_the_disk_did_not_take_it_in_time_is_told_and_does_not_keep_it_from_being_saved(tmp_path, monkeypatch):
-    fsync, failed, told = os.fsync, threading.Event(), []
-
-    def failing(fd):
-        if threading.current_thread() is not threading.main_thread() and not failed.is_set():
-            failed.set()
-            raise OSError(errno.EIO, os.strerror(errno.EIO))
-        fsync(fd)
-
-    monkeypatch.setattr(os, "fsync", failing)
-    session = session_in(tmp_path / "run", told)
-    session.ingest(recorded()[:1])
-    session.flush_in_background()
-    assert failed.wait(10.0)
-    assert not told
-    session.save()
-    assert told == [("output.folder", os.strerror(errno.EIO))]
-    assert not session.recording_fails
-    session.ingest(recorded()[1:60])
-    session.finish()
-    assert len(told) == 1
-    assert len(list(read_ingest(tmp_path / "run", []))) > 60
-
-
 def in_time(work):
     """Whether something ends in another thread."""
     thread = threading.Thread(target=work, daemon=True)

@@ -59,13 +59,6 @@ def test_an_edge_that_fits_is_green_and_one_of_three_sigmas_is_red_with_yellow_b
     assert given == [tuple(one) for one in markers.misfit_colours([1.0, 1.0, 9.0, 9.0]).tolist()], "at both ends"
 
 
-def test_an_edge_that_is_out_is_dashed_from_end_to_end():
-    lines = Lines(np.array([[1.0, 0.0, 0.0]]), np.array([[10.0, 0.0, 9.0]]), np.array([1.0]))
-    *_, rejected = decode(markers.graph_markers(STAMP_NS, "map", NONE.start, NONE.start, {}, lines)).markers
-    assert rejected.ns == "rejected"
-    assert [(p.x, p.y, p.z) for p in rejected.points] == [pytest.approx((1.0 + k, 0.0, k)) for k in range(10)]
-
-
 def test_markers_replace_the_former_ones_and_draw_each_landmark_as_its_two_sigma_ellipse():
     c, s = math.cos(0.3), math.sin(0.3)
     turn = np.array([[c, -s], [s, c]])
