@@ -8,10 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.hall import config, hall
-from benchmarks.hall import measurements as hall_measurements
 from graph_slam_ros.errors import FormatError
-from graph_slam_ros.graph.geometry import PLANAR
 from graph_slam_ros.maps.merge import merge
 from graph_slam_ros.measurements.types import Fix, Odometry
 from graph_slam_ros.node.session import Session
@@ -21,8 +18,7 @@ from graph_slam_ros.runs.map_journal import read_map
 from graph_slam_ros.runs.recorder import RunRecorder
 from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.runs.restore import complete, recover
-from graph_slam_ros.runs.tables import fitted_summary, summarize
-from graph_slam_ros.slam import Config, Control, Counters, GraphSlam
+from graph_slam_ros.slam import Config, Control, Counters
 from graph_slam_ros.tools.simulation import measurements, simulate, write_bag
 
 WORLD = tuple(measurements(simulate("warehouse", 5, aisles=2, laps=1, aisle_m=4.0)))
@@ -334,23 +330,3 @@ def test_P12_what_is_resumed_is_the_run_that_was_cut_off_also_where_another_is_n
         shutil.rmtree(run)
     last.resume()
     assert len(last.slam.keyframes) == len(site.slam.keyframes), "where there is nothing to resume"
-
-
-def test_a_run_completed_in_place_has_the_noise_of_all_of_it(tmp_path):
-    """What an earlier computation found of its beginning is not carried over."""
-    run, settings, drive = tmp_path / "run", config(PLANAR), list(hall_measurements(hall(3, 300)))
-    recorder = RunRecorder(run, settings)
-    slam, part = GraphSlam(settings, recorder.sink), len(drive) // 5
-    for m in drive[:part]:
-        recorder.record(slam, slam.process(m))
-    for m in drive[part:]:
-        recorder.sink(m)
-    recorder.save(
-        slam, summarize(slam) | fitted_summary(slam) | {"is_incomplete": True, "noise": [], "uncorrected": [{}]}
-    )
-    recorder.close()
-    done = complete(run)
-    saved = json.loads((run / "run.json").read_text())
-    assert saved["keyframes"] == 300
-    assert saved["noise"] == done["noise"] != []
-    assert "uncorrected" not in saved

@@ -21,23 +21,8 @@ from graph_slam_ros.config.config import flatten, parameters
 from graph_slam_ros.slam import Config
 
 NUMBERS = [0.0, -0.0, 1.0, -1.0, 1e-308, 5e-324, 1e9, 1e12, 1.7e308, -1.7e308, math.nan, math.inf, -math.inf]
-NAMES = [
-    "",
-    ".",
-    "..",
-    "../up",
-    "/etc",
-    "a/b",
-    "-rf",
-    "run",
-    "run-1",
-    "nobody",
-    "site",
-    "x" * 300,
-    "\n\x1b[31m",
-    "é",
-    "*",
-]
+NAMES = ["", ".", "..", "../up", "/etc", "a/b", "-rf", "run", "run-1", "nobody", "site", "x" * 300, "\n\x1b[31m"]
+NAMES += ["\u00e9", "*"]
 FRAMES = ["map", "map", "/map", "odom", "nowhere", "", "map " * 100]
 TRIGGERS = ["save", "load", "reset", "pause", "resume", "resume", "optimize", "clear_closures"]
 REMOVALS = ["", "edge", "edge -1", "edge 0", "edge 999999999999999999", "edge 1e9", "landmark nobody", "landmark west",
