@@ -27,8 +27,11 @@ def replays(request, tmp_path, tmp_path_factory, monkeypatch):
         monkeypatch.setitem(ENVIRONMENT, "PYTHONPATH", path)
         options = [word for one in settings for word in ("--set", one)]
         for name, ros in (("live", ["--ros"]), ("offline", [])):
-            words = [executable("graph_slam"), "replay", bag, *ros, *options, "--out", tmp_path / name]
-            done = subprocess.run(words, env=ENVIRONMENT, capture_output=True, text=True, timeout=120)
+            words = [executable("graph_slam"), "replay", bag, *ros, *options, "--force", "--out", tmp_path / name]
+            for _ in range(3):  # a machine that is very busy loses messages, and says so
+                done = subprocess.run(words, env=ENVIRONMENT, capture_output=True, text=True, timeout=120)
+                if "did not arrive" not in done.stderr:
+                    break
             assert done.returncode == 0, done.stderr
         for name in ("graph.g2o", "path.tum", "landmarks.csv"):
             assert (tmp_path / "live" / name).read_bytes() == (tmp_path / "offline" / name).read_bytes()

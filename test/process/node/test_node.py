@@ -101,12 +101,16 @@ def test_a_recording_through_a_live_graph_is_saved_byte_for_byte_as_offline(reco
     settings = settings or surveyed(tmp_path / "plan.csv")
     words = [word for key, value in settings.items() for word in ("--set", f"{key}={value}")]
     replay(tmp_path / "drive.mcap", tmp_path / "offline", Config.from_mapping(settings))
-    done = graph_slam("replay", tmp_path / "drive.mcap", "--ros", "--out", tmp_path / "123", *words)
+    for trial in range(3):  # a machine that is very busy loses messages, and says so
+        live = tmp_path / f"live_{trial}"
+        done = graph_slam("replay", tmp_path / "drive.mcap", "--ros", "--out", live, *words)
+        if "did not arrive" not in done.stderr:
+            break
     assert done.returncode in ((0, 3) if record is garbled else (0,)), done.stderr
     assert record is garbled or " 0 lost; results in" in done.stdout
-    assert results(tmp_path / "123") == results(tmp_path / "offline") == replayed(tmp_path / "123", tmp_path)
-    assert results(tmp_path / "123")["path.tum"].count(b"\n") > 10
-    counters = (tmp_path / "123" / "run.json").read_text()
+    assert results(live) == results(tmp_path / "offline") == replayed(live, tmp_path)
+    assert results(live)["path.tum"].count(b"\n") > 10
+    counters = (live / "run.json").read_text()
     assert '"node"' not in counters, "no message raised an error"
     if record is garbled:
         assert all(word in counters for word in ("late", "undecodable", "duplicate"))
