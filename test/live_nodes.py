@@ -186,7 +186,7 @@ class Robot:
         """Whether many messages wait in the SLAM node, by the last of /diagnostics: a busy machine needs its time."""
         name = f"{self._of.lstrip('/')}: health"
         said = [s for m in self.heard["diagnostics"][-3:] for s in m.status if s.name == name]
-        return bool(said) and int(next((v.value for v in said[-1].values if v.key == "messages waiting"), 0)) > 100
+        return bool(said) and int(next((v.value for v in said[-1].values if v.key == "messages waiting"), 0)) > 30
 
     @property
     def verdict(self):
