@@ -73,6 +73,14 @@ REASONS: dict[str, Reason] = {
     "after_odometry": Reason(
         _REFUSED, "it is newer than the last odometry", "end with odometry; INPUT.offset_s for a clock that differs"
     ),
+    "frozen": Reason(
+        _NOTED,
+        "the robot moved past landmarks while odometry stood still: there the landmarks alone say how",
+        "the odometry's driver repeats its pose, or the robot was towed, or carried",
+    ),
+    "odometry_gap": Reason(
+        _REFUSED, "odometry was silent then, and the robot moved", "find out why the driver paused, or lost messages"
+    ),
     "overflow": Reason(_REFUSED, "too many messages waited", "inputs.queue of a node, ordering.max_waiting"),
     "duplicate": Reason(_NOTED, "the same message has come before"),
     "duplicate_stamp": Reason(

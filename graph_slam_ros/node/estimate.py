@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from graph_slam_ros.graph.geometry import Geometry
+from graph_slam_ros.measurements.reasons import explain, remedy
 from graph_slam_ros.runs.outcome import (
     VISITS,
     ambiguities,
@@ -203,12 +204,17 @@ class Estimate:
             condensed=condensed_text(condensed_part(slam)),
             visits="; ".join(visit_faults({name: slam.counters["map", name] for name in VISITS})),
             uncorrected="; ".join(": ".join([str(one), *_settings(one)]) for one in slam.uncorrected_so_far),
-            motion=slam.gyro.fault if slam.gyro else "",
+            motion="; ".join(filter(None, (_frozen(slam), slam.gyro.fault if slam.gyro else ""))),
             ambiguity=_ambiguity(slam),
             gyro=str(slam.gyro or ""),
             is_resumed=is_resumed,
             calibration=_calibration(slam.found_settings, slam.contradicted),
         )
+
+
+def _frozen(slam: GraphSlam) -> str:
+    name = slam.odometry_source
+    return f"{name}: {explain('frozen').meaning}: {remedy(name, 'frozen')}" if slam.odometry_is_frozen else ""
 
 
 def _ambiguity(slam: GraphSlam) -> str:

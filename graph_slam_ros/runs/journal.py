@@ -242,7 +242,7 @@ def read_rest(folder: Path, processed: int, used_ns: int | None, losses: list[st
         if count >= processed:
             rest.append(_decoded(file, message))
         elif channel == "control":
-            if _decoded(file, message).get("event") == "time_jump":
+            if _decoded(file, message).get("event") in ("time_jump", "clock_step"):
                 waited.clear()
         elif channel != "initial_pose" and used_ns is not None and message.log_time > used_ns:
             waited.append(_decoded(file, message))

@@ -22,12 +22,13 @@ _MOST_REASONS, _MAX_UNDETERMINED = 5, 10  # that are listed
 _OUT_OF_PLANE = 0.05  # of all poses of an odometry: with more, the robot does not move in a plane
 _JUMPY, _MOST_JUMPS = 0.02, 5  # of all messages of an odometry; with more its motion is hardly used
 _MOSTLY = 0.5
+_FROZEN = 3  # keyframes that landmarks alone have placed; fewer are of somebody who pushed the robot
 MOTION = ("odometry", "gyro")  # uses whose measurements nobody doubts one by one
 _DOUBTED = 0.05  # of an input: as many that are not believed are said; so it is of visits to places
 _FEWEST_LOST = 2  # visits that are lost, which are said
 VISITS = ("visit_condensed", "visit_lost", "visit_wider")  # in the counters of "map"
 _MENDED = (  # of what is noted, signs of a wrong setting
-    *("displaced", "displacement_taken_back", "jump"),
+    *("displaced", "displacement_taken_back", "jump", "frozen"),
     *("not_in_use", "gyro_waiting", "gyro_silent", "gyro_doubted"),
 )
 _CONTRADICT = (
@@ -216,6 +217,8 @@ def shortcomings(summary: Summary) -> Iterator[str]:
                 f"{name}: {jumps} jumps, each begins a segment, and the motion across it is not used: odometry in "
                 "metres and radians? A robot as fast as that: --set odometry.max_speed_m_s=..."
             )
+        if (count := summary["counters"].get(name, {}).get("frozen", 0)) >= _FROZEN:
+            yield f"{name}: {explain('frozen').meaning} ({count} times): {remedy(name, 'frozen')}"
     yield from _gyro_faults(summary)
     yield from association_faults(summary.get("association", {}))
     if not sum(counts["believed"] or 0 for counts in inputs.values()):

@@ -159,7 +159,11 @@ class GraphSlam(MapView):
 
     def _on_observation(self, m: Observation) -> None:
         """Pass an observation through the gates, and add it to the keyframe before it."""
-        admitted = self._frontend.gates.admit(m) if self._frontend.pending.is_reached(m) else None
+        if not self._frontend.pending.is_reached(m):
+            return
+        if isinstance(m, Sightings):
+            self._frontend.follow_frozen(m)
+        admitted = self._frontend.gates.admit(m)
         if admitted is None:
             return
         match admitted:
@@ -228,13 +232,13 @@ class GraphSlam(MapView):
 
     def _on_event(self, event: Event, values: dict[str, Value]) -> None:
         match event:
-            case "flush" | "end" | "time_jump":
+            case "flush" | "end" | "time_jump" | "clock_step":
                 self._use(self._frontend.order.flush())
                 if event != "flush":
                     self._frontend.drop_pending()
                     self._add_assigned(self._landmarks.end_scan())
-                if event == "time_jump":
-                    self._frontend.forget_time()
+                if event in ("time_jump", "clock_step"):
+                    self._frontend.forget_time(goes_on=event == "clock_step")
             case "optimize":
                 self._add_assigned(self._landmarks.end_scan())
                 self._solve(self.config.solver_settings())

@@ -32,6 +32,8 @@ from graph_slam_ros.slam.trial_fits import TrialFits
 from graph_slam_ros.solver import Report
 from graph_slam_ros.typing import Array, Numbers
 
+_LATELY_NS = 10_000_000_000
+
 
 class MapView(PathView):
     """The map, the path and the health of a pipeline, read from its parts.
@@ -83,6 +85,12 @@ class MapView(PathView):
     def odometry_sources(self) -> Set[str]:
         """The names of the odometry inputs that have been used."""
         return self._frontend.odometry.sources
+
+    @property
+    def odometry_is_frozen(self) -> bool:
+        """Return whether landmarks have shown lately that the robot moves while odometry stands still."""
+        frozen_ns = self._frontend.frozen_ns
+        return frozen_ns is not None and 0 <= self._frontend.now_ns - frozen_ns < _LATELY_NS
 
     @property
     def gyro(self) -> GyroState | None:

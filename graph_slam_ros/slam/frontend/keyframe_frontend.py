@@ -20,6 +20,7 @@ from graph_slam_ros.measurements.types import (
 )
 from graph_slam_ros.slam.frontend import motion_compensation
 from graph_slam_ros.slam.frontend.corrections import Corrections
+from graph_slam_ros.slam.frontend.frozen_odometry import FrozenOdometry
 from graph_slam_ros.slam.frontend.gates import ClosureStart, DatumGate, GateChain
 from graph_slam_ros.slam.frontend.gyro import GyroFusion, SavedBias
 from graph_slam_ros.slam.frontend.ingest_gate import size_of
@@ -65,6 +66,7 @@ class KeyframeFrontend:
     T_odom_base : of the last step of odometry, as its messages have it
     covariance : (dof, dof) of the newest keyframe's pose, by the last solve and the odometry since
     initial_pose : the pose that is given for the next odometry
+    frozen_ns : when sightings last showed that the robot moves while odometry stands still
     held_covariance : (dof, dof) of the newest pose when the map was held, for the next odometry
     """
 
@@ -93,6 +95,8 @@ class KeyframeFrontend:
             size_of,
             counters,
         )
+        self._frozen = FrozenOdometry(self._noise, self._space)
+        self.frozen_ns: int | None = None
         self.edges = PoseEdges(self._space, edges, counters)
         self.covariance = np.zeros((self._space.dof, self._space.dof))
         self.gyro = GyroFusion(config, self._noise, counters) if config.gyro_input else None
@@ -101,6 +105,7 @@ class KeyframeFrontend:
         self.initial_pose: InitialPose | None = None
         self.held_covariance: Array | None = None
         self._observed_from, self._observed = -1, set[str]()  # a keyframe, and what was observed since
+        self._before_step: Array | None = None  # covariance of the motion until the clock was set
 
     @property
     def source(self) -> str:
@@ -143,8 +148,15 @@ class KeyframeFrontend:
         self.path.forget_before(first, vertices)
         self.sighting_poses = self.sighting_poses.without(np.flatnonzero(self.sighting_poses.ids < first))
 
-    def forget_time(self) -> None:
-        """Keep the map and start over with the stamps: the next odometry begins a segment."""
+    def forget_time(self, *, goes_on: bool = False) -> None:
+        """Keep the map and start over with the stamps: the next odometry begins a segment.
+
+        Parameters
+        ----------
+        goes_on : whether that is where odometry went on to, with another clock
+        """
+        motion = self.path.motion
+        self._before_step = motion.now.covariance if motion is not None and goes_on else None
         self.order.forget()
         self.odometry.forget()
         self.path.forget_time()
@@ -251,8 +263,12 @@ class KeyframeFrontend:
         else:  # of a loaded map, too: its odometry was that of another drive
             T_last_now = self._space.group.between(keyframes[-1].T_odom_base, step.T_odom_base)
             covariance = np.zeros_like(self.covariance)
+        goes_on, self._before_step = self._before_step, None
         self.path.segments.append(len(keyframes))
-        covariance = covariance + np.diag(np.square(self._space.sigmas(*self._added_sigmas(given, T_last_now))))
+        if goes_on is not None and given is None:
+            covariance = goes_on + self._noise.of(T_last_now, 1.0, step.twist_covariance)
+        else:
+            covariance = covariance + np.diag(np.square(self._space.sigmas(*self._added_sigmas(given, T_last_now))))
         self._append(step, T_last_now, covariance, given.T_map_base if given else None)
         if given:
             self.edges.initial_pose(keyframes[-1].vertex, given)
@@ -261,6 +277,18 @@ class KeyframeFrontend:
     def add_closure(self, m: Closure, where: PoseAtStamp) -> None:
         """Add a loop closure from an earlier pose to the pose at its stamp."""
         self.edges.closure(m, self.path.where(m.from_stamp_ns), where)
+
+    def follow_frozen(self, m: Sightings) -> None:
+        """Add a keyframe with a loose edge where sightings show that the robot moved and odometry stood still."""
+        where, motion = self.path.where(m.stamp_ns), self.path.motion
+        if motion is None or where.keyframe != motion.keyframe or not motion.before_last_ns < m.stamp_ns:
+            return
+        T_odom_base = self._space.group.compose(self.path.keyframes[where.keyframe].T_odom_base, where.T_keyframe_base)
+        if self._frozen.has_moved(m, T_odom_base):
+            self._counters.count(self.source, "frozen")
+            self.frozen_ns = m.stamp_ns
+            self._keyframe_at(where, motion, loose=True)
+            self._thinning.forget_time()
 
     def where(self, m: Observation) -> PoseAtStamp:
         """Return the pose at an observation; add a keyframe there if odometry's noise since the last one matters."""
@@ -329,7 +357,7 @@ class KeyframeFrontend:
         is_near = max(math.hypot(*moved[: self._space.dimensions]), self._space.angle(moved)) < _NEAR
         return is_near and "" not in names and names <= self._observed
 
-    def _keyframe_at(self, where: PoseAtStamp, motion: IntegratedOdometry) -> PoseAtStamp:
+    def _keyframe_at(self, where: PoseAtStamp, motion: IntegratedOdometry, *, loose: bool = False) -> PoseAtStamp:
         """Add a keyframe at a stamp within the last step of odometry; the step is cut in two."""
         group, size, keyframes = self._space.group, self._space.dof, self.path.keyframes
         stood = motion.now.stands
@@ -340,9 +368,10 @@ class KeyframeFrontend:
         ):  # odometry's own frame has no part in them
             left = self.corrections.uncorrected(rest.T_last_base) if rest is not None else self._space.identity
             T_odom_base = tuple(map(float, group.compose(self.T_odom_base, group.inverse(left))))
-        self._append(
-            Step(where.stamp_ns, self._space.identity, T_odom_base), motion.now.T_keyframe_base, where.covariance
-        )
+        covariance = where.covariance
+        if loose:
+            covariance = covariance + np.diag(np.square(self._space.sigmas(JUMP_SIGMA_M, JUMP_SIGMA_RAD)))
+        self._append(Step(where.stamp_ns, self._space.identity, T_odom_base), motion.now.T_keyframe_base, covariance)
         if rest is not None:
             self._motion.resume_after_cut(rest, stood)
         keyframe = len(keyframes) - 1

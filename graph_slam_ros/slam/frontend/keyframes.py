@@ -130,6 +130,11 @@ class KeyframeList:
         self._rest = StationaryDetector(self._noise, self._space)
         self._epoch = len(self.keyframes)
 
+    def reaches(self, stamp_ns: int) -> bool:
+        """Return whether odometry says where the robot was at a stamp: not while it was silent, and the robot moved."""
+        motion = next((m for m in reversed(self._motions) if m.start_ns <= stamp_ns), None)
+        return motion is None or motion.reaches(stamp_ns)
+
     def where(self, stamp_ns: int) -> PoseAtStamp:
         """Return the robot's pose at a stamp: the keyframe before it and the odometry in between."""
         motion = next((m for m in reversed(self._motions) if m.start_ns <= stamp_ns), None)

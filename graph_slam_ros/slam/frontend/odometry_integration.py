@@ -25,6 +25,7 @@ class OdometrySample:
     twist_covariance: Numbers | None = None
     stands: bool = False  # since the odometry before
     turn_variance: Numbers | None = None  # of the rotation about each axis, for each second, where a gyro is part of it
+    is_gap: bool = False  # nobody knows where the robot was since the odometry before
 
 
 class OdometryNoise:
@@ -225,6 +226,13 @@ class IntegratedOdometry:
         self._moved[-1] = at
         return Step(last.stamp_ns, rest, rest, last.twist_covariance, turn_variance=last.turn_variance)
 
+    def reaches(self, stamp_ns: int) -> bool:
+        """Return whether odometry says where the robot was at a stamp: not after its end, nor in a gap."""
+        k = bisect_right(self._moved, stamp_ns, key=_stamp)
+        if self._moved[k - 1].stamp_ns == stamp_ns:
+            return True
+        return k < len(self._moved) and not self._moved[k].is_gap
+
     def is_long(self, more: int = 0) -> bool:
         """Return whether, with some more, too many messages are remembered, so that a keyframe is needed."""
         return len(self._moved) + more >= _MOST
@@ -238,7 +246,8 @@ class IntegratedOdometry:
         moving_ns = (step.stamp_ns - a.stamp_ns) * (not stands)
         noise = self._noise.of(step.T_last_base, moving_ns * 1e-9, step.twist_covariance, step.turn_variance)
         covariance = self._space.group.propagate_during(a.covariance, step.T_last_base, noise)
-        return OdometrySample(step.stamp_ns, to, covariance, step.twist_covariance, stands, step.turn_variance)
+        is_gap = step.is_gap and not (stands or self._noise.is_jitter(step.T_last_base))
+        return OdometrySample(step.stamp_ns, to, covariance, step.twist_covariance, stands, step.turn_variance, is_gap)
 
 
 def _stamp(moved: OdometrySample) -> int:

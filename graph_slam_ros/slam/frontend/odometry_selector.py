@@ -1,5 +1,6 @@
 """Selects one odometry of several: the first in priority that sends. It returns steps, and marks jumps."""
 
+import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -11,6 +12,7 @@ from graph_slam_ros.measurements.types import Odometry
 from graph_slam_ros.slam.frontend.odometry_jumps import OdometryJumps
 from graph_slam_ros.typing import Numbers
 
+_GAP = 10.0  # times the usual period, and longer than odometry.timeout_s
 _REMEMBERED = 1000  # messages of a source that is not in use, to take over from where the one in use fell silent
 
 
@@ -22,6 +24,7 @@ class Step:
     ----------
     T_odom_base : the pose in the frame of the odometry in use
     broken : whether odometry jumped here, so that ``T_last_base`` is no motion of the robot
+    is_gap : whether so much time has passed since the step before that nobody knows where the robot was meanwhile
     turn_variance : of the rotation about each axis per second, if a gyro contributed to it [rad^2/s]
     slips : whether a gyro contradicts odometry, so that the robot may turn although odometry stands
     """
@@ -31,6 +34,7 @@ class Step:
     T_odom_base: Numbers
     twist_covariance: Numbers | None = None
     broken: bool = False
+    is_gap: bool = False
     turn_variance: Numbers | None = None
     slips: bool = False
 
@@ -56,6 +60,7 @@ class OdometrySelector:
         self._past: dict[str, deque[Odometry]] = {}
         self._used: Odometry | None = None
         self._last_step = space.identity
+        self._usual_ns, self._longest_ns = 0.0, math.inf  # between two messages; more is a gap
 
     @property
     def used(self) -> Odometry | None:
@@ -111,7 +116,8 @@ class OdometrySelector:
                 return None
             motion = self._space.group.between_one(at.T_odom_base, m.T_odom_base)
             last = out[-1] if out else self._last_step
-            if self._jumps.kind(motion, m.T_odom_base, (m.stamp_ns - at.stamp_ns) * 1e-9, last):
+            dt_ns = m.stamp_ns - at.stamp_ns
+            if dt_ns > self._longest_ns or self._jumps.kind(motion, m.T_odom_base, dt_ns * 1e-9, last):
                 return None
             at, last_ns = m, m.stamp_ns
             out.append(motion)
@@ -162,5 +168,10 @@ class OdometrySelector:
             self._counters.count(m.source, broken)
         self._counters.used[m.source] += 1
         self.sources.add(m.source)
+        dt_ns = m.stamp_ns - self._used.stamp_ns if self._used else 0
+        is_gap = dt_ns > self._longest_ns and not broken
+        usual_ns = self._usual_ns or dt_ns
+        self._usual_ns = usual_ns + 0.1 * (min(dt_ns, 2.0 * usual_ns) - usual_ns)
+        self._longest_ns = max(self._silent_ns, _GAP * self._usual_ns) if self._usual_ns else math.inf
         self._used, self._last_step = m, self._space.identity if broken else step
-        return Step(m.stamp_ns, step, m.T_odom_base, m.twist_covariance, bool(broken))
+        return Step(m.stamp_ns, step, m.T_odom_base, m.twist_covariance, bool(broken), is_gap)

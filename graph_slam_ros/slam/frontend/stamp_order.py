@@ -157,7 +157,9 @@ class PendingObservations:
         elif m.stamp_ns < self._path.remembered_ns:
             reason = "late"
         elif m.stamp_ns <= newest_ns:
-            return True
+            if self._path.reaches(m.stamp_ns):
+                return True
+            reason = "odometry_gap"
         elif len(self._pending) >= self._max_pending:
             reason = "overflow"
         if reason:

@@ -203,7 +203,7 @@ def begins_anew(*stamps_s, source="odom"):
     """Whether stamps of odometry begin anew, message by message."""
     jump = TimeJumpDetector(0.2)
     told = (s if isinstance(s, tuple) else (s, source) for s in stamps_s)
-    return [jump.is_jump([Odometry(T0 + round(s * S), (0.0, 0.0, 0.0), None, name)]) for s, name in told]
+    return [bool(jump.jump([Odometry(T0 + round(s * S), (0.0, 0.0, 0.0), None, name)])) for s, name in told]
 
 
 def test_B7_stamps_of_odometry_that_go_back_for_a_second_and_stay_there_begin_anew():
