@@ -63,6 +63,7 @@ REMOVED = {
     ),
     "INPUT.depth": "inputs.depth is that of all inputs",
     "INPUT.loss_scale": "landmarks.loss_scale and robust.loss_scale are those of all inputs",
+    "health.memory_mib": "map.condense bounds the map; a limit of the process is the system's (systemd: MemoryMax)",
     "tf.second_authority": "another broadcaster of map -> odom is reported; tf.publish_tf=false stops this one",
     **dict.fromkeys(
         (

@@ -189,14 +189,6 @@ class HealthConfig:
     )
     lag_s: float = setting(1.0, "degraded: the solver is behind by more than this", "s", low=0.0, live=True)
     stuck_s: float = setting(10.0, "degraded: one solve has taken longer than this", "s", low=0.0, live=True)
-    memory_mib: float = setting(
-        0.0,
-        "degraded: the process uses more memory than this; loop closures are refused and no search "
-        "for hypotheses starts; 0: never",
-        "MiB",
-        low=0.0,
-        live=True,
-    )
     chi2_per_dof: float = setting(
         10.0,
         "degraded: the measurements contradict each other by more than this chi2",

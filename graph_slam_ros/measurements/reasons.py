@@ -330,7 +330,6 @@ REASONS: dict[str, Reason] = {
     ),
     "quarantined": Reason(_REFUSED, "the solver works without these measurements only", "graph_slam explain RUN"),
     # -- the node and its solver
-    "memory": Reason(_REFUSED, "a closure, while memory is short", "health.memory_mib"),
     "paused": Reason(_NOTED, "it came while the node was paused", "~/resume"),
     "stopped": Reason(_REFUSED, "time jumped back and time.on_jump is stop", "~/reset, or --set time.on_jump=segment"),
     "worker_restarted": Reason(_NOTED, "a job would have ended the solver's thread, which went on", "report it"),

@@ -15,10 +15,10 @@ SIGHTING_KINDS = ("position", "pose", "range_bearing", "bearing", "range")
 FIX_KINDS = ("pose", "position", "heading", "attitude")
 Value: TypeAlias = bool | int | float | str | tuple[int, ...] | tuple[float, ...]
 Event: TypeAlias = Literal[
-    "flush", "end", "optimize", "clear_closures", "time_jump", "clock_step", "set", "remove", "memory", "restart"
+    "flush", "end", "optimize", "clear_closures", "time_jump", "clock_step", "set", "remove", "restart"
 ]
 EVENTS: tuple[Event, ...] = get_args(Event)
-_VALUES: dict[Event, dict[str, type]] = {"memory": {"is_short": bool}, "remove": {"edge": int, "landmark": str}}
+_VALUES: dict[Event, dict[str, type]] = {"remove": {"edge": int, "landmark": str}}
 
 
 def _check_choice(cls: type, value: str, choices: tuple[str, ...]) -> None:
@@ -173,10 +173,10 @@ class Control:
     event : ``flush`` processes the measurements that are held for sorting by stamp; ``end`` also drops those that no
         odometry reached; ``optimize`` solves everything; ``clear_closures`` removes all loop closures; ``time_jump``
         begins a segment whose stamps may be older; ``clock_step`` does so while the drive goes on; ``set`` changes
-        parameters; ``remove`` removes an edge or landmark; ``memory`` begins or ends a shortage of memory; ``restart``
-        goes back to the last good estimate after an outside fault
+        parameters; ``remove`` removes an edge or landmark; ``restart`` goes back to the last good estimate after an
+        outside fault
     values : names and values. ``set``: parameters. ``remove``: ``edge`` and its id, or ``landmark`` and its name.
-        ``memory``: ``is_short``. Others: none
+        Others: none
 
     Raises
     ------

@@ -88,7 +88,6 @@ class Facts:
     overflows, failures, restarts : messages refused for want of room, solves that failed, and threads of the solver
         that died, since the last look
     failing : why the last solve failed; empty where it did not
-    memory_is_short : the process has more than ``health.memory_mib``
     authorities : other nodes that publish /tf, one of which broadcasts map -> odom, if somebody does
     static_authority : the transform to odometry's frame that one of these publishes on /tf_static, if one does
     findings : what is wrong with the inputs by a check that needs no fit, each with what mends it
@@ -112,7 +111,6 @@ class Facts:
     worker_is_alive: bool = True
     restarts: int = 0
     failing: str = ""
-    memory_is_short: bool = False
     faults: int = 0
     overflows: int = 0
     failures: int = 0
@@ -263,8 +261,6 @@ def _faults(facts: Facts, config: Config) -> Iterator[str]:
         yield f"{facts.failures} solves failed: the last good estimate stands"
     if facts.restarts:
         yield "a job would have ended the solver's thread, which went on"
-    if facts.memory_is_short:
-        yield "the process has more memory than health.memory_mib: loop closures are refused"
     if facts.busy_s > health.stuck_s and not facts.loads:
         yield f"solver stuck: it has been at one thing for {facts.busy_s:.1f} s"
     if facts.overflows:

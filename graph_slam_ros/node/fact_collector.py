@@ -95,7 +95,6 @@ class FactCollector:
             worker_is_alive=worker.is_alive,
             restarts=restarts - before[2],
             failing=session.slam.failing,
-            memory_is_short=self._ingest.memory_is_short,
             overflows=overflows - before[0],
             failures=failures - before[1],
             recording_fails=session.recording_fails,

@@ -1,4 +1,4 @@
-"""The path of measurements from the callbacks to the worker: checks of future stamps, jumps of time and memory."""
+"""The path of measurements from the callbacks to the worker: checks of future stamps and jumps of time."""
 
 import time
 from collections import deque
@@ -13,7 +13,7 @@ from rclpy.serialization import deserialize_message
 
 from graph_slam_ros.errors import GraphSlamError, did_you_mean, message_of
 from graph_slam_ros.measurements.reasons import explain, remedy
-from graph_slam_ros.measurements.types import Closure, InitialPose, Measured
+from graph_slam_ros.measurements.types import InitialPose, Measured
 from graph_slam_ros.messages import results, to_msg
 from graph_slam_ros.messages.from_msg import INITIAL_POSE, Decoder, MessageConverter, twist_of
 from graph_slam_ros.messages.inputs import uses
@@ -24,7 +24,6 @@ from graph_slam_ros.node import events
 from graph_slam_ros.node.events import Outcome
 from graph_slam_ros.node.handle import NodeHandle
 from graph_slam_ros.node.input_check import InputCheck
-from graph_slam_ros.node.memory import is_short
 from graph_slam_ros.node.pose_extrapolator import PoseExtrapolator
 from graph_slam_ros.node.publishers import Publishers
 from graph_slam_ros.node.publishing_clock import PublishingClock
@@ -58,7 +57,6 @@ class Ingest:
     converter : makes measurements of messages
     gate : decides what a jump of time, a pause and a full queue mean
     extrapolator : the pose by the newest odometry
-    memory_is_short : whether the process has more memory than it should
     outcome : what became of the last ~/remove or initialpose that was not used; None before the first
     """
 
@@ -82,7 +80,6 @@ class Ingest:
         self.converter.on_fault = node.get_logger().error
         self.gate = IngestGate(counters, lambda: node.now_ns)
         self.extrapolator = PoseExtrapolator(config)
-        self.memory_is_short = False
         self.outcome: Outcome | None = None
         self._future_stamps = FutureStamps(config.time.future_s, self._stamp_clock_ns, partial(self.refuse, "future"))
         self._publishes_odometry = False
@@ -120,13 +117,6 @@ class Ingest:
             self.hand_over(measured)
         self._publishes_odometry = self._publishers.has_subscribers("odometry")
 
-    def watch_memory(self) -> None:
-        """Make the pipeline save memory while the process has more than ``health.memory_mib``."""
-        limit, before = self._node.config.health.memory_mib, self.memory_is_short
-        self.memory_is_short = is_short(limit, was_short=before)
-        if self.memory_is_short != before:
-            self.in_background(self.in_sequence([Control("memory", (("is_short", not before),))]))
-
     # -- measurements ------------------------------------------------------------------------------------------------
 
     def receive(self, measured: Sequence[Measured], cdr: bytes) -> None:
@@ -142,8 +132,6 @@ class Ingest:
         newest = [m for m in measured if isinstance(m, Odometry) and self._is_newest(m)]
         if newest and self._publishes_odometry:
             self._publish_odometry(newest[-1], cdr)
-        if self.memory_is_short:
-            measured = self._without_closures(measured)
         for some in self._future_stamps.pass_on(measured):
             self.hand_over(some)
 
@@ -165,12 +153,6 @@ class Ingest:
         """Count a message that is refused."""
         self.gate.refuse(reason, measured)
         self._clock.refused += 1
-
-    def _without_closures(self, measured: Sequence[Measured]) -> list[Measured]:
-        for m in measured:
-            if isinstance(m, Closure):
-                self._counters.count(m.topic, "memory")
-        return [m for m in measured if not isinstance(m, Closure)]
 
     # -- odometry in the map -----------------------------------------------------------------------------------------
 

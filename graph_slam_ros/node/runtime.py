@@ -153,7 +153,6 @@ class Runtime:
 
     def tick(self) -> None:
         """Do what is due ten times a second."""
-        self._ingest.watch_memory()
         self._session.flush_in_background()
         self._completion.tick()
         self._ingest.tick()

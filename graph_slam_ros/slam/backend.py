@@ -45,7 +45,6 @@ class Backend:
     handed_over : vertices and edges of the graph that the solver has
     frozen, frozen_edges : the first so many vertices, and verdicts on the first so many edges, stay for good
     held : the same while the robot is only located (``hold_map``): vertices and edges; zeros otherwise
-    spares_memory : whether no second look is begun
     holds_back : whether what does not fit stays out, and verdicts stay as they are, until somebody has decided
     trusts_sightings : whether a new sighting that fits is believed; else it waits until it is compared with all else
     edits : by hand, in order
@@ -72,7 +71,7 @@ class Backend:
         self.edits, self.bounded = list(start.edits), start.bounded or BoundedState()
         self._background = Background(config, executor)
         self._rivals: tuple[Alternative, ...] = ()
-        self.spares_memory = self.holds_back = False
+        self.holds_back = False
         self.trusts_sightings = True
         self._reviewed = 0  # the keyframe of the last review
         self._pending: list[int] = []  # edges that have come and do not fit by themselves
@@ -167,7 +166,7 @@ class Backend:
         if is_due and (group := self.decisions.readmit_likely_group(keyframe)):
             self._admission.make_fit(group, keyframe)
         out = self.ledger.outside_count
-        if self._config.decide and not self.spares_memory and self._background.is_due(out):
+        if self._config.decide and self._background.is_due(out):
             self._background.start(self._frozen_graph(keyframe, self.solver.settings), out)
 
     def optimize(self, keyframe: int, settings: Settings) -> Report:

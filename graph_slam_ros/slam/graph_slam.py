@@ -250,8 +250,6 @@ class GraphSlam(MapView):
                     self._solve(self.config.solver_settings())
             case "set":
                 self._set(values)
-            case "memory":
-                self.backend.spares_memory = bool(values["is_short"])
             case "restart":
                 self.restart()
 

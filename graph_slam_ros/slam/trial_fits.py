@@ -90,13 +90,12 @@ class TrialFits:
             return
         while not is_due and driven >= self._due:
             self._due *= 2
-        if not self._backend.spares_memory:
-            counts_from = keyframe + (0 if is_of_everything else self._config.robust.apply_after_keyframes)
-            trial = self._guarded(lambda: self._executor(self._trial(is_thorough=is_of_everything)))
-            if trial is not None:
-                if is_of_everything:
-                    self._jobs, self._of_edges = [], self._graph.edge_count
-                self._jobs = [*self._jobs[-1:], (counts_from, trial)]  # each holds a copy of the map
+        counts_from = keyframe + (0 if is_of_everything else self._config.robust.apply_after_keyframes)
+        trial = self._guarded(lambda: self._executor(self._trial(is_thorough=is_of_everything)))
+        if trial is not None:
+            if is_of_everything:
+                self._jobs, self._of_edges = [], self._graph.edge_count
+            self._jobs = [*self._jobs[-1:], (counts_from, trial)]  # each holds a copy of the map
 
     def _trial(self, *, is_thorough: bool = True) -> Trial:
         problem = self._problem()

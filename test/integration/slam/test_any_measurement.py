@@ -141,13 +141,12 @@ class Stranger:
         return Closure(self.stamp_ns - self.late_ns(), self.stamp_ns - back_ns, "loops", at, self.pose_covariance())
 
     def event(self):
-        event = self.pick("flush", "optimize", "end", "clear_closures", "time_jump", "set", "initial_pose", "memory")
+        event = self.pick("flush", "optimize", "end", "clear_closures", "time_jump", "set", "initial_pose")
         if event == "initial_pose":
             return InitialPose(self.any_pose() if self.is_wild() else self.pose(1.0), self.pose_covariance())
         if event == "time_jump" and self.happens(0.5):
             self.stamp_ns = 5 * S
-        values = {"set": (("solve.every_keyframes", self.pick(1, 3)),), "memory": (("is_short", self.happens(0.5)),)}
-        return Control(event, values.get(event, ()))
+        return Control(event, (("solve.every_keyframes", self.pick(1, 3)),) if event == "set" else ())
 
     def measurements(self, count):
         for _ in range(count):

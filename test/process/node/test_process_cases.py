@@ -10,20 +10,16 @@ import subprocess
 import sys
 import threading
 
-import numpy as np
 import pytest
 from live_drive import Drive
 from live_nodes import ENVIRONMENT, replayed, results, robot, until
-from messages import detection, detections, pose
 from rclpy.clock import ClockType, JumpThreshold
 from rclpy.context import Context
 from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.time import Time
-from vision_msgs.msg import Detection3DArray
 
-from graph_slam_ros.node.memory import resident_mib
 from graph_slam_ros.node.node import GraphSlamNode
 from graph_slam_ros.node.pose_extrapolator import PoseExtrapolator
 from graph_slam_ros.node.session import Session
@@ -167,30 +163,6 @@ def test_G7_P21_P23_solves_that_fail_faults_of_callbacks_and_the_end_of_its_thre
         until(lambda: r.heard["pose"], drive.pace(r), "poses")
         assert r.save().success
     assert faults(tmp_path / "run")["worker_restarted"] == 1
-
-
-def test_P7_above_its_limit_of_memory_closures_are_refused_and_counted_and_below_taken_again(tmp_path):
-    run, loops = tmp_path / "run", {"type": "vision_msgs/msg/Detection3DArray", "use": "closure", "topic": "/loops"}
-    given = {"inputs__names": "odom detections loops", **{f"loops__{name}": value for name, value in loops.items()}}
-    with at_work(output__folder=str(run), **given) as (_, r, drive):
-        found = r.publisher("/loops", Detection3DArray)
-        until(found.get_subscription_count, drive.pace(r), "subscriber of closures")
-
-        def close():
-            here = detection(pose(0.0), np.eye(6), str(drive.stamp_ns - 10**9))
-            found.publish(detections(here, stamp_ns=drive.stamp_ns))
-
-        assert r.set({"health.memory_mib": 0.5 * resident_mib()}) == (True, "")
-        r.until_it_says("DEGRADED", "health.memory_mib", spin=drive.pace(r))
-        close()
-        until(lambda: counted(r, "loops", "memory") == 1, drive.pace(r), "refusal")
-        assert r.set({"health.memory_mib": 10.0 * resident_mib()}) == (True, "")
-        r.until_it_says("OK", spin=drive.pace(r))
-        close()
-        until(lambda: int(r.said("input loops")[-1][1]["measurements used"]) > 0, drive.pace(r), "closure")
-        assert counted(r, "loops", "memory") == 1
-        r.save_all(run)
-    assert results(run) == replayed(run, tmp_path)
 
 
 def test_P23_who_waits_for_a_job_that_would_have_ended_its_thread_is_told():

@@ -145,8 +145,6 @@ def test_a_run_in_several_parts_is_replayed_as_one(tmp_path, world):
     [
         ("dance", (), "Control: 'dance' is not one of flush, end, optimize"),
         ("flush", (("edge", 1),), "Control: flush has {'edge': 1}; it needs no value"),
-        ("memory", (), "memory has {}; it needs is_short (bool)"),
-        ("memory", (("is_short", 1),), "it needs is_short (bool)"),
         ("remove", (("edge", 1), ("landmark", "a")), "it needs edge (int) or landmark (str)"),
         ("remove", (("vertex", 1),), "it needs edge (int) or landmark (str)"),
     ],

@@ -292,22 +292,6 @@ def test_a_search_ends_where_a_candidate_on_trial_does_not_fit_after_all(monkeyp
     assert without.optimize().iterations[0].step < 1e-3, "the values are not those of the verdicts"
 
 
-def test_P7_where_memory_is_short_no_second_look_is_begun():
-    begun = []
-
-    def beside(work):
-        begun.append(work)
-        return work
-
-    drive = Drive(1, beside, second_look_after=3, apply_after_keyframes=5)
-    drive.backend.spares_memory = True
-    drive.go(70, lies(every=1))
-    assert not begun
-    drive.backend.spares_memory = False
-    drive.go(72)
-    assert begun
-
-
 def test_a_second_look_starts_from_odometry_where_landmarks_are_poses_too():
     """Which no odometry leads to."""
     drive = Drive().go(60)
