@@ -26,6 +26,7 @@ _LONGEST = 80  # of a frame's name
 _LATE_S, _PLAYED_S = 0.3, 10.0  # later still, a recording is played without /clock
 _NEARLY = 0.5  # of the lateness from which on an observation is refused
 _NO_CLOCK = "use_sim_time is set and nothing comes on /clock"
+_CLOCK_STANDS = "/clock stands still while messages come"
 _TRANSITIONS = {
     "unconfigured": "waits for ros2 lifecycle set NODE configure, or a lifecycle manager, or node.autostart:=true",
     "inactive": "waits for ros2 lifecycle set NODE activate, or a lifecycle manager",
@@ -102,6 +103,7 @@ class Facts:
     estimate: Estimate | None = None
     weakest: Mapping[str, str] = field(default_factory=dict)
     waits_for_clock: bool = False
+    clock_stands: bool = False
     is_paused: bool = False
     loads: str = ""
     is_stopped: bool = False
@@ -163,10 +165,10 @@ def _errors(facts: Facts) -> Iterator[str]:
         yield "the solver's thread has ended"
     if facts.faults >= 100:
         yield f"{facts.faults} faults in callbacks in 10 s"
-    if facts.has_other_authority:
+    if facts.twins:  # which broadcasts map -> odom, too
+        yield "another node has this node's name and does the same: stop one, or rename it (-r __node:=NAME)"
+    elif facts.has_other_authority:
         yield _rivals(facts)
-    if facts.twins:
-        yield "another node has this node's name"
     if facts.is_stopped:
         yield "stopped when the clock jumped back (time.on_jump); ~/reset begins anew"
     if facts.recording_fails:
@@ -245,8 +247,10 @@ def _faults(facts: Facts, config: Config) -> Iterator[str]:
             yield from _lateness(one, max(_LATE_S, config.tf.transform_tolerance))
         elif one.use not in MOTION:
             yield from _later_than_odometry(one, facts, config.ordering.late_s)
+    if facts.clock_stands:
+        yield f"{_CLOCK_STANDS}: map -> odom is not sent until it goes on; use_sim_time:=false if this is no simulation"
     if facts.waits_for_clock:
-        yield f"{_NO_CLOCK}: no input counts as silent or late; use_sim_time:=false, or start what publishes /clock"
+        yield f"{_NO_CLOCK}: map -> odom waits for it, no input counts as silent; use_sim_time:=false, or publish it"
     yield from _uncorrected(facts)
     if facts.is_paused:
         yield "paused"
@@ -273,7 +277,7 @@ def _faults(facts: Facts, config: Config) -> Iterator[str]:
             " drive past known landmarks, or give initialpose"
         )
     elif estimate and not estimate.is_confirmed:
-        yield "where the robot is in the loaded map is not known yet"
+        yield "where the robot is in the loaded map is not known yet: drive past known landmarks, or give initialpose"
     if estimate:
         yield from map(_without_option, _of_measurements(facts, estimate, health.chi2_per_dof))
 

@@ -20,6 +20,8 @@ from graph_slam_ros.node.threads import run_in_thread
 from graph_slam_ros.node.worker import Worker
 from graph_slam_ros.slam import Counters
 
+_STANDS_S = 2.0
+
 
 class FactCollector:
     """Collects facts about once a second. Recent facts are those since the last collection.
@@ -43,6 +45,7 @@ class FactCollector:
         self._worker, self._ingest, self._publishers, self._clock = worker, ingest, publishers, clock
         self._recent = RecentInputs()
         self._not_loaded = ""
+        self._clock_ns, self._stands_since = 0, (0.0, 0)  # simulated time; since when it is that, and messages by then
         self._before = 0, 0, 0  # overflows, failures and restarts until the last time
 
     def note_load(self, loaded: "Future[str]") -> None:
@@ -86,6 +89,7 @@ class FactCollector:
             session.estimate,
             weakest=session.estimate.weakest(node.config.space) if session.estimate is not None else {},
             waits_for_clock=node.get_parameter("use_sim_time").value and not node.now_ns,
+            clock_stands=self._clock_stands(sum(processed.values())),
             is_paused=gate.is_paused,
             loads=session.loads,
             is_stopped=gate.is_stopped,
@@ -109,6 +113,14 @@ class FactCollector:
             preparing=preparation.status,
             cannot_prepare=preparation.fault or ("" if session.loaded_keyframes else self._not_loaded),
         )
+
+    def _clock_stands(self, processed: int) -> bool:
+        """Return whether simulated time stands still, and messages are processed all the same."""
+        now_ns, now_s = self._node.now_ns, time.monotonic()
+        if not now_ns or now_ns != self._clock_ns:
+            self._clock_ns, self._stands_since = now_ns, (now_s, processed)
+        since_s, before = self._stands_since
+        return now_s - since_s > _STANDS_S and processed > before
 
 
 def _rivals(broadcaster: TfBroadcaster) -> tuple[tuple[str, ...] | None, str]:

@@ -85,7 +85,8 @@ def changed(config: Config, given: Iterable[Any], *, is_configured: bool) -> tup
     wanted = config.changed(values)
     live = {p.name for p in parameters(one.name for one in config.sources) if p.live}
     if is_configured and (fixed := sorted(set(values) - live)):
-        raise ConfigError(f"{fixed[0]}: can be changed only before the node is configured (deactivate, clean up)")
+        when = "at the start of the node" if fixed[0] in _AT_START else "before the node is configured"
+        raise ConfigError(f"{fixed[0]}: can be changed only {when}")
     used = dict(flatten(wanted.as_mapping()))
     return wanted, {name: used[name] for name in values}
 

@@ -1,11 +1,14 @@
 """Checks by odometry whether an interrupted drive goes on after a restart."""
 
 import math
+from itertools import pairwise
 
 from graph_slam_ros.slam import GraphSlam
 from graph_slam_ros.typing import Numbers
 
 _LONGEST_NS = 60_000_000_000  # without odometry: after more, the robot may have been carried
+_SPEED_OF = 20  # keyframes before the end, which say how fast the robot was
+_LEAST, _MOST = 0.3, 1.2  # times the way at that speed: so far it has driven since
 _NEAR = 0.1  # m and rad: an odometry that begins anew so close to where it was does no harm
 
 
@@ -40,7 +43,18 @@ class Resumption:
         moved = slam.space.group.between(last.T_odom_base, first.T_odom_base)
         far_m = math.hypot(*moved[: slam.space.dimensions])
         most_m = slam.config.odometry.max_speed_m_s * (first.stamp_ns - last.stamp_ns) * 1e-9
-        return far_m <= most_m and not _begins_anew(slam, moved, first.T_odom_base)
+        if far_m > most_m:
+            return False
+        return self._is_as_fast(slam, far_m, first.T_odom_base) or not _begins_anew(slam, moved, first.T_odom_base)
+
+    def _is_as_fast(self, slam: GraphSlam, far_m: float, T_odom_base: Numbers) -> bool:
+        """Return whether the way since then fits the speed before, and odometry is not at its origin."""
+        several = [slam.keyframes[k] for k in range(max(self._first - _SPEED_OF, 0), self._first)]
+        seconds = (several[-1].stamp_ns - several[0].stamp_ns) * 1e-9
+        n, since_s = slam.space.dimensions, (slam.keyframes[self._first].stamp_ns - several[-1].stamp_ns) * 1e-9
+        way_m = sum(math.dist(a.T_odom_base[:n], b.T_odom_base[:n]) for a, b in pairwise(several))
+        usual_m = way_m / seconds * since_s if seconds > 0.0 else 0.0
+        return _LEAST * usual_m <= far_m <= _MOST * usual_m and _size(slam, T_odom_base) > _NEAR
 
 
 def _begins_anew(slam: GraphSlam, moved: Numbers, T_odom_base: Numbers) -> bool:

@@ -286,6 +286,10 @@ LATER = {  # what comes after a drive of 20 m that was cut off, and whether that
     "time before": (straight(39, 41), False),
     "anew at zero": (straight(0, 2, since_ns=30 * 10**9), False),
     "anew and driven since": (straight(0, 2, from_x=5.0, since_ns=30 * 10**9), False),
+    "on the way home": (
+        [replace(m, T_odom_base=(3.0 - 0.5 * k, 0.0, 0.0)) for k, m in enumerate(straight(81, 83))],
+        True,
+    ),
     "faster than robots": (straight(41, 43, from_x=60.0), False),
     "jumps later": ([*straight(41, 43), *straight(43, 45, from_x=60.0)], False),
 }
