@@ -93,8 +93,7 @@ class InputConfig:
     range_offset_m: float = setting(0.0, "length added to ranges of the input", "m", low=-1000.0, high=1000.0)
     max_distance_m: float = setting(
         0.0,
-        "landmarks and closures farther away than this are refused; 0: ten times the distance seen so"
-        " far, within 1 km and 100 km",
+        "landmarks and closures farther away than this are refused; 0: 100 km",
         "m",
         low=0.0,
     )

@@ -187,8 +187,6 @@ ACTIONS: dict[str, Action] = {
     ),
 }
 """What can be done by hand, by the value of ``do``."""
-STOPPED = {"cut": "no part of a drive is cut out of a map: replay the recording without it, as mcap filter writes it"}
-"""What could be done in an earlier version, and what to do instead."""
 ALL_FIELDS = {key: field for action in ACTIONS.values() for key, field in action.known.items()}
 """What each key holds."""
 

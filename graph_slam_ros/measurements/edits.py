@@ -7,7 +7,7 @@ from reprlib import repr as shortened
 from typing import Any
 
 from graph_slam_ros.errors import FormatError, did_you_mean
-from graph_slam_ros.measurements.edit_actions import ACTIONS, STOPPED, Argument, read_arguments
+from graph_slam_ros.measurements.edit_actions import ACTIONS, Argument, read_arguments
 
 COMMON = ("name", "who", "when", "why", "do")
 _MOST = {"name": 80, "who": 200, "when": 100, "why": 2000}  # characters
@@ -61,8 +61,6 @@ def edit_of(values: Any) -> Edit:
     if not isinstance(values, Mapping):
         raise FormatError(f"{shortened(values)} is not an object with the keys of an edit")
     do = values.get("do")
-    if isinstance(do, str) and do in STOPPED:
-        raise FormatError(f"do: {do}: {STOPPED[do]}")
     if not isinstance(do, str) or do not in ACTIONS:
         near = did_you_mean(do, ACTIONS) if isinstance(do, str) else ""
         raise FormatError(

@@ -46,53 +46,37 @@ _SPACE = "world.dimensions=3"
 REASONS: dict[str, Reason] = {
     # -- stamps and order
     "bad_stamp": Reason(
-        _REFUSED,
-        "the stamp is negative, has 1e9 nanoseconds or more, or is beyond 2^31 s with INPUT.offset_s",
-        "correct the driver's stamps",
+        _REFUSED, "the stamp is negative, beyond 2^31 s, or has 1e9 nanoseconds or more", "correct the driver's stamps"
     ),
     "zero_stamp": Reason(_REFUSED, "the stamp is zero", "have the driver fill in header.stamp"),
     "late": Reason(
         _REFUSED,
-        "it came after newer messages that had been used already",
-        "ordering.window_s for odometry, ordering.late_s for all else, INPUT.offset_s for a clock that differs",
+        "it came after newer messages were used",
+        "ordering.window_s, of others than odometry ordering.late_s; INPUT.offset_s",
     ),
     "future": Reason(
-        _REFUSED,
-        "the stamp is ahead of the node's clock by more than time.future_s, or of odometry that goes on without it",
-        "use_sim_time for a recording, INPUT.offset_s for a clock that differs",
+        _REFUSED, "the stamp is ahead of the clock, or of odometry", "use_sim_time for a recording; INPUT.offset_s"
     ),
     "far_in_time": Reason(
-        _REFUSED,
-        "the transform is dated more than 10 s before or after all others of its frame",
-        "one clock for all that publishes /tf",
+        _REFUSED, "the transform is dated 10 s away from the others of its frame", "one clock for all /tf"
     ),
     "before_jump": Reason(_REFUSED, "it was sent before the clock jumped back and arrived after"),
-    "before_odometry": Reason(
-        _REFUSED, "it is older than all odometry", "begin with odometry; INPUT.offset_s for a clock that differs"
-    ),
-    "after_odometry": Reason(
-        _REFUSED, "it is newer than the last odometry", "end with odometry; INPUT.offset_s for a clock that differs"
-    ),
+    "before_odometry": Reason(_REFUSED, "it is older than all odometry", "begin with odometry; INPUT.offset_s"),
+    "after_odometry": Reason(_REFUSED, "it is newer than the last odometry", "end with odometry; INPUT.offset_s"),
     "frozen": Reason(
         _NOTED,
-        "the robot moved past landmarks while odometry stood still: there the landmarks alone say how",
-        "the odometry's driver repeats its pose, or the robot was towed, or carried",
+        "the robot moved past landmarks while odometry stood still",
+        "its driver repeats a pose, or the robot was towed",
     ),
-    "odometry_gap": Reason(
-        _REFUSED, "odometry was silent then, and the robot moved", "find out why the driver paused, or lost messages"
-    ),
+    "odometry_gap": Reason(_REFUSED, "odometry was silent then, and the robot moved", "find out why its driver paused"),
     "overflow": Reason(_REFUSED, "too many messages waited", "inputs.queue of a node, ordering.max_waiting"),
     "duplicate": Reason(_NOTED, "the same message has come before"),
     "duplicate_stamp": Reason(
-        _REFUSED,
-        "odometry says two different things for one stamp",
-        "one publisher for each odometry topic: ros2 topic info -v TOPIC; stamps to the millisecond",
+        _REFUSED, "odometry says two different things for one stamp", "one publisher: ros2 topic info -v TOPIC"
     ),
     "sent_again": Reason(_NOTED, "the transform was sent before with the same stamp"),
     "lost_in_transport": Reason(
-        _REFUSED,
-        "the middleware lost it on its way to the node",
-        "INPUT.reliability: reliable, a larger net.core.rmem_max, or messages that are smaller or fewer",
+        _REFUSED, "the middleware lost it", "INPUT.reliability: reliable; a larger net.core.rmem_max; smaller messages"
     ),
     # -- frames
     "frame_slash_stripped": Reason(_REPAIRED, "the name of a frame began with a slash"),
@@ -101,46 +85,34 @@ REASONS: dict[str, Reason] = {
     "frame_unknown": Reason(_REFUSED, "no transform links the message's frame to the robot", _FRAMES),
     "transform_gaps": Reason(_REFUSED, "/tf links the message's frame to the robot, but not at its stamp", _GAPS),
     "odom_frame_unknown": Reason(
-        _REFUSED,
-        "no transform links the odometry's frame to frames.odom",
-        "frames.odom as its messages name it, or publish the transform on /tf_static",
+        _REFUSED, "no transform links the odometry's frame to frames.odom", "frames.odom as its messages name it"
     ),
     "map_frame_unknown": Reason(
-        _REFUSED,
-        "no transform links the pose's frame to frames.map",
-        "frames.map as its messages name it, or publish the transform on /tf_static",
+        _REFUSED, "no transform links the pose's frame to frames.map", "frames.map as its messages name it"
     ),
     "child_frame_unknown": Reason(_REFUSED, "no transform links the message's child frame to the robot", _FRAMES),
     # -- numbers
     "undecodable": Reason(_REFUSED, "the bytes are not a message of this type", "INPUT.type, or record it again"),
     "plugin_failed": Reason(
-        _REFUSED,
-        "the plugin of this type failed at a message, or gave what is no measurement",
-        "correct or uninstall the package; the log of the node, or the end of replay, names it with its first error",
+        _REFUSED, "the plugin of this type failed, or gave what is no measurement", "its first error is in the log"
     ),
     "nonfinite": Reason(_REFUSED, "a number is NaN or infinite", "correct the driver"),
     "too_far": Reason(_REFUSED, "a coordinate is beyond 1e9 m", "correct the driver"),
     "beyond_max_distance": Reason(
-        _REFUSED,
-        "the landmark or closure is farther away than the sensor can see",
-        "INPUT.max_distance_m where it does see so far, else correct the driver",
+        _REFUSED, "the landmark or closure is farther away than sensors see", "INPUT.max_distance_m"
     ),
     "quaternion_normalized": Reason(_REPAIRED, "the quaternion was not quite of length one"),
     "zero_quaternion": Reason(_REFUSED, "the quaternion is zero", "have the driver fill in the orientation"),
-    "denormal_quaternion": Reason(
-        _REFUSED, "the quaternion's length is off by more than 10 %", "correct the driver's orientation"
-    ),
+    "denormal_quaternion": Reason(_REFUSED, "the quaternion's length is off by more than 10 %", "correct the driver"),
     "no_heading": Reason(_REFUSED, "the x axis is nearly vertical, so there is no heading in the plane", _SPACE),
     "out_of_plane": Reason(
-        _NOTED, "the pose is more than 0.5 m above or below the first, or tilted by more than 20 degrees", _SPACE
+        _NOTED, "the pose is 0.5 m above or below the first, or tilted by 20 degrees", "world.dimensions=3"
     ),
     # -- noise
     "noise_unknown": Reason(_REFUSED, "neither the message nor the parameters have its noise", _SIGMAS),
     "covariance_unknown": Reason(_REPAIRED, "the covariance is zero: the configured noise is used"),
     "size_unknown": Reason(_NOTED, "the size of a landmark is negative, above 1 km or no number: it is unknown"),
-    "covariance_of_some_axes_unknown": Reason(
-        _REPAIRED, "the twist's covariance lacks some axes: the configured noise is used"
-    ),
+    "covariance_of_some_axes_unknown": Reason(_REPAIRED, "the twist's covariance lacks axes: configured noise is used"),
     "covariance_clamped": Reason(_REPAIRED, "a variance above 1e6 m^2 or 1e3 rad^2 was lowered to that"),
     "covariance_floored": Reason(_REPAIRED, "a variance that is nearly zero was raised"),
     "covariance_symmetrized": Reason(_REPAIRED, "the covariance was slightly asymmetric"),
@@ -149,73 +121,46 @@ REASONS: dict[str, Reason] = {
     "nonfinite_covariance": Reason(_REFUSED, "the covariance has NaN, infinite or negative numbers", _COVARIANCE),
     # -- odometry
     "not_in_use": Reason(
-        _NOTED,
-        "another odometry is used, the first of inputs.names that is alive",
-        "a filter, e.g. robot_localization, makes one odometry of several",
+        _NOTED, "another odometry is used: the first of inputs.names that is alive", "a filter makes one of several"
     ),
     "switched_to": Reason(_NOTED, "this odometry took over from one that fell silent, or is of higher priority"),
-    "switched_to_unlinked": Reason(
-        _NOTED, "this odometry took over, but had not come before: the motion between is unknown"
-    ),
+    "switched_to_unlinked": Reason(_NOTED, "this odometry took over; the motion between is unknown"),
     "gyro_waiting": Reason(
-        _NOTED,
-        "a step of odometry turned without the gyro: its bias is not known before the robot has stood",
-        "stand for a second before the drive; gyro.bias_sigma where the bias is larger",
+        _NOTED, "the gyro's bias is not known before the robot has stood", "stand for a second; gyro.bias_sigma"
     ),
     "gyro_silent": Reason(
-        _NOTED,
-        "a step of odometry turned without the gyro: it has no message for longer than gyro.timeout_s",
-        "a gyro has 10 messages a second or more; gyro.timeout_s for a slower one, INPUT.offset_s for its clock",
+        _NOTED, "the gyro had no message for longer than gyro.timeout_s", "gyro.timeout_s; INPUT.offset_s"
     ),
     "gyro_doubted": Reason(
-        _NOTED,
-        "a step of odometry turned without the gyro: in most turns it contradicts odometry",
-        "rad/s, counter-clockwise positive; its frame and TF or INPUT.mount; odometry.turn_factor",
+        _NOTED, "the gyro contradicts odometry in most turns", "rad/s, counter-clockwise; its TF or INPUT.mount"
     ),
-    "no_angular_velocity": Reason(
-        _REFUSED, "the IMU says that it has no angular velocity", "another input as gyro, or none (INPUT.use=fix)"
-    ),
+    "no_angular_velocity": Reason(_REFUSED, "the IMU says that it has no angular velocity", "INPUT.use=fix"),
     "jump": Reason(
-        _NOTED,
-        "odometry (or tf: the correction) jumped; after a jump of odometry a new segment begins",
-        "odometry.max_speed_m_s; for tf, tf.report_jump_m",
+        _NOTED, "odometry jumped: a segment begins; of tf: a correction", "odometry.max_speed_m_s; tf.report_jump_m"
     ),
     "other_publisher": Reason(
         _REFUSED,
-        "the pose does not continue the odometry in use: another node publishes on the same topic, or it is an outlier",
-        "one publisher for each odometry topic: ros2 topic info -v TOPIC; a second odometry is an input of its own; "
-        "where there is one only, metres and radians",
+        "the pose does not continue the odometry in use: another node's, or an outlier",
+        "one publisher: ros2 topic info -v TOPIC; metres and radians",
     ),
     "reset_to_zero": Reason(_NOTED, "odometry was set back to zero: a new segment begins"),
     # -- landmarks
     "no_id": Reason(_REFUSED, "the detection has no identity", "landmarks.association=joint"),
     "id_too_long": Reason(_REFUSED, "the identity has more than 128 bytes", "shorter ids, or landmarks.id_from"),
-    "id_conflict": Reason(
-        _REFUSED, "one message has an identity twice, at places that do not agree", "one id for each landmark"
-    ),
+    "id_conflict": Reason(_REFUSED, "one message has an identity at two places", "one id for each landmark"),
     "id_merged": Reason(_REPAIRED, "one message has an identity twice, at places that agree: their mean is used"),
-    "id_of_an_unnamed": Reason(
-        _REFUSED, "the identity is a name that is given to landmarks without one", "INPUT.id_prefix"
-    ),
+    "id_of_an_unnamed": Reason(_REFUSED, "the identity is a name of landmarks without one", "INPUT.id_prefix"),
     "unclear_which": Reason(
-        _REFUSED,
-        "a detection without identity is of no landmark: it fits none, and nothing else was seen there",
-        "noise that is as large as the sensor's",
+        _REFUSED, "a detection without identity fits no landmark", "noise that is as large as the sensor's"
     ),
     "surveyed_orientation_unused": Reason(
-        _NOTED,
-        "a landmark whose orientation was surveyed was first seen without one: its surveyed position alone is used",
-        "a detector that measures orientations, to 0.5 rad",
+        _NOTED, "a surveyed orientation is not used: it was first seen without one", "a detector of orientations"
     ),
-    "not_for_a_pose": Reason(
-        _REFUSED, "a range or bearing to a landmark that is known as a pose", "INPUT.id_prefix: two identities"
-    ),
+    "not_for_a_pose": Reason(_REFUSED, "a range or bearing to a landmark that is known as a pose", "INPUT.id_prefix"),
     "not_used": Reason(_NOTED, "landmarks.association is none", "landmarks.association=id"),
     "poor_tag": Reason(_NOTED, "the tag is beyond INPUT.hamming_max or below INPUT.decision_margin_min"),
     "too_many": Reason(
-        _REFUSED,
-        "the message has more than 1000 landmarks: the nearest are used",
-        "a scan is no list of landmarks",
+        _REFUSED, "the message has more than 1000 landmarks: the nearest are used", "a scan is no list of landmarks"
     ),
     "unknown_action": Reason(_REFUSED, "the marker's action is none of add, modify, delete", "correct the driver"),
     "lengths_differ": Reason(_REFUSED, "the message has not as many ids as poses", "correct the driver"),
@@ -223,36 +168,26 @@ REASONS: dict[str, Reason] = {
     "bearing_wrapped": Reason(_REPAIRED, "the bearing was beyond half a turn"),
     "bearing_out_of_range": Reason(_REFUSED, "an angle is far beyond a turn", "radians, not degrees"),
     "no_elevation": Reason(_REFUSED, "a bearing in space needs an elevation", "world.dimensions=2"),
-    "sensor_tilted": Reason(
-        _REFUSED, "an azimuth alone, of a sensor that is not level, is no direction in the plane", "send the elevation"
-    ),
+    "sensor_tilted": Reason(_REFUSED, "an azimuth alone, of a sensor that is not level", "send the elevation"),
     "overhead": Reason(_REFUSED, "the landmark is straight above or below: no direction in the plane", _SPACE),
     "fields_unknown": Reason(
-        _REFUSED,
-        "the cloud's fields are none of x y z, range, bearing, elevation, or not single numbers",
-        "name the fields so; a scan is no list of landmarks",
+        _REFUSED, "the cloud's fields are none of x y z, range, bearing, elevation", "a scan is no list of landmarks"
     ),
     "fields_beyond_point": Reason(_REFUSED, "a field of the cloud lies outside its point", "correct the driver"),
     "too_many_points": Reason(_REFUSED, "the cloud has more than 100,000 points", "a scan is no list of landmarks"),
     "cut_off": Reason(_REFUSED, "the cloud has fewer bytes than it says", "correct the driver"),
     "undecided": Reason(_NOTED, "a stretch of the drive may be of several places that look alike: it is left as it is"),
-    "moves_left": Reason(
-        _NOTED, "the search for landmarks that are in the map twice reached its limit of work: some may be left"
-    ),
+    "moves_left": Reason(_NOTED, "the search for landmarks that are in the map twice reached its limit"),
     "reassigned": Reason(_NOTED, "what was seen without identity turned out to be of another landmark"),
     "given_up": Reason(_NOTED, "a new unnamed landmark was not seen again within a minute"),
     # -- fixes
     "no_fix": Reason(_REFUSED, "the receiver has no fix", "wait for one: a clear view of the sky"),
     "no_position": Reason(_REFUSED, "latitude and longitude are zero", "wait for a fix"),
-    "not_on_earth": Reason(
-        _REFUSED, "latitude, longitude or altitude is out of range", "degrees and metres, not radians or 1e-7 degrees"
-    ),
+    "not_on_earth": Reason(_REFUSED, "latitude, longitude or altitude is out of range", "degrees and metres"),
     "far_from_datum": Reason(_REFUSED, "the fix is more than 100 km from the map's origin", "INPUT.datum"),
     "other_datum": Reason(_REFUSED, "the fix counts from another origin than the map", "the same INPUT.datum for all"),
     "thinned": Reason(
-        _NOTED,
-        "it came so soon after the last, of a fix or of what a resting robot sees, that both have the same error",
-        "INPUT.correlation_s of fixes; keyframes.max_interval_s",
+        _NOTED, "it came so soon that its error is that of the last", "INPUT.correlation_s; keyframes.max_interval_s"
     ),
     "mount_unknown": Reason(
         _REPAIRED,
@@ -262,16 +197,12 @@ REASONS: dict[str, Reason] = {
     "mount_at_base": Reason(_NOTED, "INPUT.mount puts the sensor at the base, as no transform has its place"),
     "map_moved": Reason(
         _NOTED,
-        "the first to measure where the map lies, a fix or a surveyed landmark: the map was laid onto it",
-        "anchor.sigma_m and anchor.sigma_rad hold the map where it begins",
+        "a fix or surveyed landmark was the first to locate the map",
+        "anchor.sigma_m and anchor.sigma_rad hold it",
     ),
     "no_altitude": Reason(_REPAIRED, "the fix has no altitude: it counts in the horizontal only"),
-    "no_orientation": Reason(
-        _REFUSED, "the IMU says that it has no orientation", "an IMU with a filter; its gyro alone: INPUT.use=gyro"
-    ),
-    "not_in_this_space": Reason(
-        _REFUSED, "such a fix or edge does not exist in so many dimensions", "world.dimensions"
-    ),
+    "no_orientation": Reason(_REFUSED, "the IMU says that it has no orientation", "its gyro alone: INPUT.use=gyro"),
+    "not_in_this_space": Reason(_REFUSED, "such a fix does not exist in so many dimensions", "world.dimensions"),
     # -- closures
     "id_not_a_stamp": Reason(_REFUSED, "a closure's id is not the earlier stamp in nanoseconds", "see docs/node.md"),
     "closure_with_itself": Reason(_REFUSED, "a closure's two stamps are the same", "correct the publisher"),
@@ -282,18 +213,14 @@ REASONS: dict[str, Reason] = {
     ),
     "from_condensed_keyframe": Reason(_REFUSED, "its start left the map", "map.condense=false"),
     # -- the map
-    "not_in_map": Reason(
-        _NOTED, "a landmark that the map does not have, while map.localize is true", "map.localize=false to add it"
-    ),
+    "not_in_map": Reason(_NOTED, "the map does not have it, and map.localize is true", "map.localize=false to add it"),
     "removed": Reason(_NOTED, "an edge or a landmark that was removed by hand (~/remove)"),
     "unknown_edge": Reason(_NOTED, "~/remove named an edge that is not there", "graph_slam explain RUN lists ids"),
     "unknown_landmark": Reason(
         _NOTED, "~/remove named a landmark that is not in the map", "ros2 topic echo ~/landmarks_estimate lists names"
     ),
     "needed_edge": Reason(_NOTED, "~/remove named odometry or a prior: without it poses are undetermined"),
-    "held_in_map": Reason(
-        _NOTED, "~/remove named a part of a map that is held", "map.localize=false; a frozen map never changes"
-    ),
+    "held_in_map": Reason(_NOTED, "~/remove named a part of a map that is held", "map.localize=false"),
     "condensed_in_map": Reason(_NOTED, "it is of a map with condensed visits", "edit a replay with map.condense=false"),
     "condensed": Reason(_REFUSED, "it left before its landmark was determined or confirmed", "map.window_keyframes"),
     "visit_condensed": Reason(_NOTED, "a visit was added to its place, begins one, or is one keyframe"),
@@ -304,29 +231,22 @@ REASONS: dict[str, Reason] = {
     "cleared": Reason(_NOTED, "loop closures that ~/clear_closures took out"),
     "displaced": Reason(
         _NOTED,
-        "the landmarks showed that the robot was elsewhere than odometry said: it slipped or was carried",
-        "graph_slam explain RUN; if it happens often, correct the odometry, the sensor's place (INPUT.mount or TF) or "
-        "its clock (INPUT.offset_s)",
+        "landmarks showed that the robot was elsewhere: it slipped or was carried",
+        "graph_slam explain RUN; graph_slam check",
     ),
     "slip": Reason(
         _NOTED,
-        "several landmarks contradicted odometry over some seconds: its wheels slipped, so it counts for less there",
-        "graph_slam explain RUN; if it happens often, its noise is larger than stated (odometry.noise), or its scale, "
-        "a clock or a mount is wrong (graph_slam check, graph_slam calibrate)",
+        "landmarks contradicted odometry over some seconds: it counts for less there",
+        "graph_slam check; odometry.noise",
     ),
-    "slip_taken_back": Reason(
-        _NOTED,
-        "a slip was decided, and later sightings agree with odometry: it counts as before",
-    ),
+    "slip_taken_back": Reason(_NOTED, "a slip was decided, and later sightings agree with odometry"),
     "displacement_taken_back": Reason(
         _NOTED,
-        "a displacement was decided, and all or later sightings contradict it: landmarks repeat, or ids are used twice",
-        "graph_slam explain RUN; give each landmark an id of its own; check the sensor's place (INPUT.mount or TF)",
+        "a displacement was decided, and later sightings contradict it",
+        "one id for each landmark; graph_slam check",
     ),
     "new_while_elsewhere": Reason(
-        _REFUSED,
-        "a landmark that is not known, while ranges or bearings contradict odometry: where the robot is, nobody knows",
-        "give initialpose",
+        _REFUSED, "a landmark that is not known, while nobody knows where the robot is", "give initialpose"
     ),
     "quarantined": Reason(_REFUSED, "the solver works without these measurements only", "graph_slam explain RUN"),
     # -- the node and its solver

@@ -5,14 +5,16 @@ and row-major, in the order of the tangent space: (x, y, theta), or (x, y, z, ro
 on the type of the message that they came from.
 """
 
+import math
+import operator
 from dataclasses import asdict, dataclass
 from typing import Any, Literal, TypeAlias, get_args
+
+import numpy as np
 
 from graph_slam_ros.errors import FormatError
 from graph_slam_ros.typing import Numbers
 
-SIGHTING_KINDS = ("position", "pose", "range_bearing", "bearing", "range")
-FIX_KINDS = ("pose", "position", "heading", "attitude")
 Value: TypeAlias = bool | int | float | str | tuple[int, ...] | tuple[float, ...]
 Event: TypeAlias = Literal[
     "flush", "end", "optimize", "clear_closures", "time_jump", "clock_step", "set", "remove", "restart"
@@ -21,9 +23,50 @@ EVENTS: tuple[Event, ...] = get_args(Event)
 _VALUES: dict[Event, dict[str, type]] = {"remove": {"edge": int, "landmark": str}}
 
 
+_POSE, _OF_POSE = (3, 7), (9, 36)  # numbers in the plane, in space; and of its covariance
+_KINDS: dict[str, tuple[tuple[int, ...], tuple[int, ...]]] = {  # numbers that are measured, and of their covariance
+    "position": ((2, 3), (4, 9)),
+    "pose": (_POSE, _OF_POSE),
+    "range_bearing": ((2, 3), (4, 9)),
+    "bearing": ((1, 2), (1, 4)),
+    "range": ((1,), (1,)),
+    "heading": ((1,), (1,)),
+    "attitude": ((4,), (9,)),
+}
+SIGHTING_KINDS = ("position", "pose", "range_bearing", "bearing", "range")
+FIX_KINDS = ("pose", "position", "heading", "attitude")
+
+
 def _check_choice(cls: type, value: str, choices: tuple[str, ...]) -> None:
     if value not in choices:
         raise FormatError(f"{cls.__name__}: {value!r} is not one of {', '.join(choices)}")
+
+
+def _check(one: Any, **sizes: tuple[int, ...]) -> None:
+    """Make plain tuples of arrays. Raises FormatError for wrong numbers, or so many as there may not be."""
+    name, value = "stamp_ns", getattr(one, "stamp_ns", 0)
+    try:
+        if type(value) is not int:
+            object.__setattr__(one, name, operator.index(value))
+        for name in sizes:
+            value = getattr(one, name)
+            if value is not None and not (type(value) is tuple and {float}.issuperset(map(type, value))):
+                value = tuple(map(float, np.ravel(value).tolist()))
+                object.__setattr__(one, name, value)
+            if value is not None and (len(value) not in sizes[name] or not all(map(math.isfinite, value))):
+                raise ValueError
+    except (TypeError, ValueError):
+        right = f"{' or '.join(map(str, sizes[name]))} finite numbers" if name in sizes else "whole nanoseconds"
+        raise FormatError(f"{type(one).__name__}: {name} {value!r}: it must be {right}") from None
+
+
+def _check_pair(one: Any, measured: str, allowed: tuple[tuple[int, ...], tuple[int, ...]], **more: Any) -> None:
+    """Check numbers that were measured, and that the covariance is of so many."""
+    _check(one, **{measured: allowed[0], "covariance": allowed[1]}, **more)
+    if allowed[0].index(len(getattr(one, measured))) != allowed[1].index(len(one.covariance)):
+        raise FormatError(
+            f"{type(one).__name__}: covariance of {len(one.covariance)} numbers is not that of {measured}"
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +84,9 @@ class Odometry:
     twist_covariance: Numbers | None = None
     source: str = "odometry"
 
+    def __post_init__(self) -> None:
+        _check(self, T_odom_base=_POSE, twist_covariance=_OF_POSE)
+
 
 @dataclass(frozen=True, slots=True)
 class AngularVelocity:
@@ -56,6 +102,9 @@ class AngularVelocity:
     topic: str
     rate: Numbers
     covariance: Numbers | None = None
+
+    def __post_init__(self) -> None:
+        _check(self, rate=(1, 3), covariance=(1, 9))
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,6 +140,7 @@ class Sighting:
 
     def __post_init__(self) -> None:
         _check_choice(Sighting, self.kind, SIGHTING_KINDS)
+        _check_pair(self, "measured", _KINDS[self.kind], T_base_sensor=_POSE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,6 +150,9 @@ class Sightings:
     stamp_ns: int
     topic: str
     sightings: tuple[Sighting, ...]
+
+    def __post_init__(self) -> None:
+        _check(self)
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,6 +184,7 @@ class Fix:
 
     def __post_init__(self) -> None:
         _check_choice(Fix, self.kind, FIX_KINDS)
+        _check_pair(self, "measured", _KINDS[self.kind], point=(0, 2, 3), datum=(0, 3))
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,6 +204,9 @@ class Closure:
     T_from_base: Numbers
     covariance: Numbers
 
+    def __post_init__(self) -> None:
+        _check_pair(self, "T_from_base", (_POSE, _OF_POSE))
+
 
 @dataclass(frozen=True, slots=True)
 class InitialPose:
@@ -162,6 +219,9 @@ class InitialPose:
 
     T_map_base: Numbers
     covariance: Numbers
+
+    def __post_init__(self) -> None:
+        _check_pair(self, "T_map_base", (_POSE, _OF_POSE))
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,6 +267,17 @@ Observation: TypeAlias = Sightings | Fix | Closure
 Measured: TypeAlias = Odometry | AngularVelocity | Observation
 Measurement: TypeAlias = Measured | InitialPose | Control
 
+
+def check_space(m: Measurement, dimensions: int) -> None:
+    """Raise FormatError for a measurement in the plane (2 dimensions) of a robot in space (3), or the reverse."""
+    pose = getattr(m, _POSES.get(type(m), ""), None)
+    several = m.sightings if isinstance(m, Sightings) else (m,) if isinstance(m, Fix) else ()
+    sizes = [(len(one.measured), _KINDS[one.kind][0]) for one in several] if pose is None else [(len(pose), _POSE)]
+    if any(size != of[min(dimensions - 2, len(of) - 1)] for size, of in sizes):
+        raise FormatError(f"{type(m).__name__}: its numbers are not of {dimensions} dimensions (world.dimensions)")
+
+
+_POSES = {Odometry: "T_odom_base", Closure: "T_from_base", InitialPose: "T_map_base"}
 _TYPES = {
     "odometry": Odometry,
     "angular_velocity": AngularVelocity,

@@ -26,7 +26,6 @@ _LONGEST = 80  # of a frame's name
 _LATE_S, _PLAYED_S = 0.3, 10.0  # later still, a recording is played without /clock
 _NEARLY = 0.5  # of the lateness from which on an observation is refused
 _NO_CLOCK = "use_sim_time is set and nothing comes on /clock"
-_CLOCK_STANDS = "/clock stands still while messages come"
 _TRANSITIONS = {
     "unconfigured": "waits for ros2 lifecycle set NODE configure, or a lifecycle manager, or node.autostart:=true",
     "inactive": "waits for ros2 lifecycle set NODE activate, or a lifecycle manager",
@@ -248,7 +247,7 @@ def _faults(facts: Facts, config: Config) -> Iterator[str]:
         elif one.use not in MOTION:
             yield from _later_than_odometry(one, facts, config.ordering.late_s)
     if facts.clock_stands:
-        yield f"{_CLOCK_STANDS}: map -> odom is not sent until it goes on; use_sim_time:=false if this is no simulation"
+        yield "/clock stands still while messages come, so map -> odom waits; use_sim_time:=false where it should not"
     if facts.waits_for_clock:
         yield f"{_NO_CLOCK}: map -> odom waits for it, no input counts as silent; use_sim_time:=false, or publish it"
     yield from _uncorrected(facts)

@@ -20,8 +20,6 @@ from graph_slam_ros.node.threads import run_in_thread
 from graph_slam_ros.node.worker import Worker
 from graph_slam_ros.slam import Counters
 
-_STANDS_S = 2.0
-
 
 class FactCollector:
     """Collects facts about once a second. Recent facts are those since the last collection.
@@ -120,7 +118,7 @@ class FactCollector:
         if not now_ns or now_ns != self._clock_ns:
             self._clock_ns, self._stands_since = now_ns, (now_s, processed)
         since_s, before = self._stands_since
-        return now_s - since_s > _STANDS_S and processed > before
+        return now_s - since_s > 2.0 and processed > before
 
 
 def _rivals(broadcaster: TfBroadcaster) -> tuple[tuple[str, ...] | None, str]:

@@ -22,7 +22,6 @@ _MOST_REASONS, _MAX_UNDETERMINED = 5, 10  # that are listed
 _OUT_OF_PLANE = 0.05  # of all poses of an odometry: with more, the robot does not move in a plane
 _JUMPY, _MOST_JUMPS = 0.02, 5  # of all messages of an odometry; with more its motion is hardly used
 _MOSTLY = 0.5
-_FROZEN = 3  # keyframes that landmarks alone have placed; fewer are of somebody who pushed the robot
 MOTION = ("odometry", "gyro")  # uses whose measurements nobody doubts one by one
 _DOUBTED = 0.05  # of an input: as many that are not believed are said; so it is of visits to places
 _FEWEST_LOST = 2  # visits that are lost, which are said
@@ -217,7 +216,7 @@ def shortcomings(summary: Summary) -> Iterator[str]:
                 f"{name}: {jumps} jumps, each begins a segment, and the motion across it is not used: odometry in "
                 "metres and radians? A robot as fast as that: --set odometry.max_speed_m_s=..."
             )
-        if (count := summary["counters"].get(name, {}).get("frozen", 0)) >= _FROZEN:
+        if (count := summary["counters"].get(name, {}).get("frozen", 0)) > 2:
             yield f"{name}: {explain('frozen').meaning} ({count} times): {remedy(name, 'frozen')}"
     yield from _gyro_faults(summary)
     yield from association_faults(summary.get("association", {}))
@@ -276,11 +275,9 @@ def ambiguities(rivals: Collection[Mapping[str, Any]]) -> Iterator[str]:
 
 
 def doubts(summary: Summary) -> Iterator[str]:
-    """Yield a sentence for each input of which many measurements are rejected, or all motions left out.
+    """Yield a sentence for each input of which many measurements are rejected, and for what makes a result doubtful.
 
-    Also one where many visits of a condensed map contradict the others: what is left in the map was not better. And one
-    for each clock, mount or scale that is off so far that the covariances are too small, and for each other explanation
-    of the measurements.
+    That are visits that contradict others, clocks, mounts or scales that are off, and other explanations.
     """
     for text in ambiguities(summary.get("rivals", ())):
         yield f"{text} (graph_slam explain RUN)"

@@ -24,6 +24,7 @@ from graph_slam_ros.measurements.types import (
     Odometry,
     Sightings,
     Value,
+    check_space,
 )
 from graph_slam_ros.slam.anchor import Anchor
 from graph_slam_ros.slam.backend import Backend
@@ -106,7 +107,13 @@ class GraphSlam(MapView):
         """Process one measurement or control event. Returns the changes.
 
         Of several exceptions the first is raised after everything else was processed; the others are counted.
+
+        Raises
+        ------
+        FormatError
+            It is a measurement in the plane of a robot in space, or the other way round: nothing has changed.
         """
+        check_space(measurement, self.space.dimensions)
         self._sink(measurement)
         if self._updates.begin(measurement):
             with self._faults:
@@ -216,7 +223,7 @@ class GraphSlam(MapView):
         now_ns, report = self._frontend.now_ns, None
         self._kidnaps.add(self.backend.handed_over[1], now_ns, self.keyframes)
         fits = self._solution.fits()
-        self._landmarks.review(self.keyframes, everything=everything is not None, alarmed=bool(self._kidnaps.alarms))
+        self._landmarks.review(self.keyframes, everything=everything is not None)
         if everything is None:
             self.backend.update(keyframe)
             self._kidnaps.check(self.keyframes, now_ns)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,26 +11,13 @@ from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.measurements.types import Closure, Observation, Sighting, Sightings
 from graph_slam_ros.slam.frontend import motion_compensation
 
-_LEARNED_AFTER = 30  # distances of an input
-_TIMES_FARTHEST = 10.0  # a sensor may see so many times farther than it has shown
-_ALWAYS_M = 1e3  # a learned limit is never less
-_MOST_M = 1e5  # nor more: farther than from any sensor to its horizon
-_FARTHEST = 3  # the third farthest counts: two wrong distances teach nothing
+_MOST_M = 1e5  # of an input without a limit: farther than from any sensor to its horizon
 _STEEP = 0.2  # cosine of an elevation: at 78.5 degrees and above the azimuth is turned away from the pole
 
 
-@dataclass(slots=True)
-class _Shown:
-    """The distances of one input so far: their number, and the largest of them in ascending order."""
-
-    count: int = 0
-    farthest: list[float] = field(default_factory=lambda: [0.0] * _FARTHEST)
-
-
 class MaxDistance:
-    """Gate for the largest distance [m] of each input: its ``max_distance_m``, or a learned limit.
+    """Gate for the largest distance [m] of each input.
 
-    The limit is learned only from accepted measurements in their order, so a replay refuses what the live run refused.
     A bearing has no distance. A fix has one only from the map's origin, which may be anywhere.
     """
 
@@ -38,17 +25,7 @@ class MaxDistance:
 
     def __init__(self, space: Geometry, inputs: Iterable[InputConfig]) -> None:
         self._space = space
-        self._configured = {one.name: one.max_distance_m for one in inputs if one.max_distance_m > 0.0}
-        self._shown: dict[str, _Shown] = {}
-
-    def limit_m(self, topic: str) -> float:
-        """Return the present limit of an input."""
-        if topic in self._configured:
-            return self._configured[topic]
-        shown = self._shown.get(topic)
-        if shown is None or shown.count < _LEARNED_AFTER:
-            return _MOST_M
-        return min(_MOST_M, max(_ALWAYS_M, _TIMES_FARTHEST * shown.farthest[0]))
+        self._limit_m = {one.name: one.max_distance_m for one in inputs if one.max_distance_m > 0.0}
 
     def admit(self, m: Observation) -> Observation | None:
         """Return the part of an observation within the limit, or None."""
@@ -70,15 +47,7 @@ class MaxDistance:
         return None if s.kind == "bearing" else abs(s.measured[0])
 
     def _is_within(self, topic: str, distance_m: float | None) -> bool:
-        if distance_m is None:
-            return True
-        if distance_m > self.limit_m(topic):
-            return False
-        shown = self._shown.setdefault(topic, _Shown())
-        shown.count += 1
-        if distance_m > shown.farthest[0]:
-            shown.farthest = sorted([*shown.farthest[1:], distance_m])
-        return True
+        return distance_m is None or distance_m <= self._limit_m.get(topic, _MOST_M)
 
 
 def off_the_pole(space: Geometry, s: Sighting) -> Sighting:

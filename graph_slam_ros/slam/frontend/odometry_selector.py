@@ -3,7 +3,7 @@
 import math
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from graph_slam_ros.config.frontend import OdometryConfig
 from graph_slam_ros.graph.geometry import Geometry
@@ -86,8 +86,6 @@ class OdometrySelector:
 
     def steps(self, m: Odometry) -> list[Step]:
         """Return the steps that a message completes: none if its odometry is not in use."""
-        if int in map(type, m.T_odom_base):  # the compiled functions need floats
-            m = replace(m, T_odom_base=tuple(map(float, m.T_odom_base)))
         if m.source not in self._order:
             self._order.append(m.source)
         if m.source not in self._past:
@@ -112,7 +110,7 @@ class OdometrySelector:
             return None
         at, last_ns, out = self._used, self._past[self._used.source][-1].stamp_ns, list[Numbers]()
         for m in following:
-            if m.source != at.source or m.stamp_ns == last_ns or int in map(type, m.T_odom_base):
+            if m.source != at.source or m.stamp_ns == last_ns:
                 return None
             motion = self._space.group.between_one(at.T_odom_base, m.T_odom_base)
             last = out[-1] if out else self._last_step

@@ -322,15 +322,10 @@ class AnonymousLandmarks:
         if count % _REVIEWED_EVERY == 0:
             self.clusters.judge(keyframes[-1].stamp_ns)
 
-    def explain_all(self, keyframes: StampedPoses[Keyframe], *, alarmed: bool) -> None:
-        """Explain all scans at once, now.
-
-        Parameters
-        ----------
-        alarmed : whether landmarks have said that the robot is elsewhere: associations may be wrong, too
-        """
+    def explain_all(self, keyframes: StampedPoses[Keyframe]) -> None:
+        """Explain all scans at once, now."""
         if self._landmarks.begins_new and self._history.scans:
-            self._adopt(self._guarded(lambda: self.hindsight.found(self._frozen, alarmed=alarmed)), keyframes)
+            self._adopt(self._guarded(lambda: self.hindsight.found(self._frozen)), keyframes)
             self.clusters.judge(keyframes[-1].stamp_ns)
 
     def _guarded(self, search: Callable[[], Found | None]) -> Found | None:

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from graph_slam_ros.slam.landmarks.rotations import lever, rotation
 from graph_slam_ros.slam.landmarks.scans import Cluster, Motion, Scan
-from graph_slam_ros.slam.landmarks.view import is_missing
 from graph_slam_ros.typing import Array
 
 NOTHING = -2
@@ -41,7 +40,6 @@ class BeamSettings:
     slots : landmarks that a hypothesis holds at once; the one not seen for longest leaves
     scale_sigma : of odometry's two scales
     clock_sigma_s : of the clock of each input, against odometry's
-    log_missed : log probability that a landmark in view is not seen; zero: what is missing does not count
     slip_every_s, slip_log_prior, slip_sigma_m, slip_sigma_rad : how odometry slips
     """
 
@@ -53,7 +51,6 @@ class BeamSettings:
     slots: int = 40
     scale_sigma: float = 0.1
     clock_sigma_s: float = 0.5
-    log_missed: float = 0.0
     slip_every_s: float = 2.0
     slip_log_prior: float = -3.5
     slip_sigma_m: float = 0.15
@@ -163,18 +160,10 @@ class Beam:
         order = sorted(range(len(scan.clusters)), key=lambda k: float(np.linalg.norm(scan.clusters[k].point)))
         for k in order:
             used = self._explain_cluster(scan.clusters[k], first + k, used)
-        if self.settings.log_missed and scan.clusters:
-            self.log_weight += self.settings.log_missed * self._missing(scan.points)
         self._keep(np.argsort(-self.log_weight, kind="stable")[: self.settings.hypotheses])
         self.log_weight -= self.log_weight[0]
         self.covariance = 0.5 * (self.covariance + self.covariance.transpose(0, 2, 1))
         return self.history[0]
-
-    def _missing(self, points: Array) -> Array:
-        """Return how many landmarks of each hypothesis (K,) are in view of a scan that has not seen them."""
-        away = self.landmarks - self.position[:, None]
-        is_absent = is_missing(away @ self.turn, points, points) & (self.ids != _FREE) & (self.last < self._scans)
-        return np.count_nonzero(is_absent, axis=1)
 
     def _keep(self, which: Ids) -> None:
         for name in ("position", "turn", "scales", "landmarks", "ids", "last", "covariance", "log_weight"):

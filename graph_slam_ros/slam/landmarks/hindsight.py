@@ -1,9 +1,7 @@
 """Explains all scans at once, in the background on a copy. The result is used at a fixed later keyframe.
 
 The scans are solved in stages, once from odometry and once from the present path, and the cheaper solution is kept.
-Then moves correct the association. Other beams associate the drive again where the map is probably wrong twice in a row
-or at the end, and at the end of a drive in which landmarks said that the robot is elsewhere. The result does not depend
-on when the work is done.
+Then moves correct the association. The result does not depend on when the work is done.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,7 +19,6 @@ from graph_slam_ros.slam.landmarks.beam import NOTHING, BeamSettings, Ids
 from graph_slam_ros.slam.landmarks.constellation import laid_on_the_map
 from graph_slam_ros.slam.landmarks.explanation import SCALES, UNUSED, Costs, Drive, Estimate
 from graph_slam_ros.slam.landmarks.moves import refined, without_few
-from graph_slam_ros.slam.landmarks.other_beams import MOST_SCANS, other_associations
 from graph_slam_ros.slam.landmarks.presence_check import NOTHING_SEEN, Presence, presence
 from graph_slam_ros.slam.landmarks.rotations import matrices_of, poses_of
 from graph_slam_ros.slam.landmarks.scans import Motion, Scan
@@ -34,6 +31,7 @@ _GATE_OTHER = 0.99999  # an observation outside this probability of every landma
 _LEAST_LANDMARK = 1.0
 _SURE = 0.015  # standard deviation of a scale of odometry below which a part of a drive corrects it
 _SCALE_SIGMA = 0.02  # of odometry's scales, once they were found
+_MOST_SCANS = 1000  # of a drive that is explained as if it had not been displaced, too
 _DISPLACED = 2.0 * float(np.log(1e4))  # minus twice the log of how probable it is that a robot is moved in a drive
 
 
@@ -180,8 +178,7 @@ class Hindsight:
     def start(self, frozen: FrozenScans, keyframes: int) -> None:
         """Start with the present scans."""
         self._next, self._explained = round(_MORE * frozen.count), frozen.count
-        doubts = _is_doubtful if self.is_doubtful else _never
-        work = self._executor(lambda: explained(self._space, frozen, self._settings, self._costs, doubts))
+        work = self._executor(lambda: explained(self._space, frozen, self._settings, self._costs))
         self._job = keyframes + self._after, work
 
     def restart(self) -> None:
@@ -221,13 +218,8 @@ class Hindsight:
         (_, work), self._job = self._job, None
         return self._noted(work())
 
-    def found(self, freeze: Callable[[], FrozenScans], *, alarmed: bool) -> Found | None:
-        """Explain the present scans at once; None if that was done before, or finds nothing.
-
-        Parameters
-        ----------
-        alarmed : whether landmarks have said that the robot is elsewhere: other beams are tried
-        """
+    def found(self, freeze: Callable[[], FrozenScans]) -> Found | None:
+        """Explain the present scans at once; None if that was done before, or finds nothing."""
         self._job = None
         if not self.is_on:
             return None
@@ -235,8 +227,7 @@ class Hindsight:
         if self._last is not None and np.array_equal(self._last, frozen.given[frozen.clusters_of_map :]):
             return None
         self._explained = frozen.count
-        doubts = _always if alarmed else _is_doubtful
-        return self._noted(explained(self._space, frozen, self._settings, self._costs, doubts))
+        return self._noted(explained(self._space, frozen, self._settings, self._costs))
 
     def note(self, given: Sequence[int]) -> None:
         """Note that everything was explained, and the landmark of each cluster."""
@@ -267,40 +258,19 @@ class Hindsight:
         return found
 
 
-def _is_doubtful(found: Found) -> bool:
-    return found.presence.is_doubtful
-
-
-def _never(_: Found) -> bool:
-    return False
-
-
-def _always(_: Found) -> bool:
-    return True
-
-
-def explained(
-    space: Geometry, frozen: FrozenScans, settings: BeamSettings, costs: Costs, doubts: Callable[[Found], bool] = _never
-) -> Found | None:
+def explained(space: Geometry, frozen: FrozenScans, settings: BeamSettings, costs: Costs) -> Found | None:
     """Explain all scans, from the graph's assignment and from the beam's; None if too little was seen.
 
-    Parameters
-    ----------
-    doubts : whether to associate the whole drive again by other beams, and as if the robot had not been moved, and
-        keep the explanation with the largest evidence
+    Where the robot was moved, it is done once more as if it had not been. The larger evidence decides.
     """
     drive = _drive(frozen, settings, costs)
-    found = _given(space, drive, frozen)
-    if found is None or not doubts(found) or frozen.of_map or frozen.count > MOST_SCANS:
-        return found
-    best = _among_others(space, drive, found)
-    if not frozen.undisplaced:
+    best = _given(space, drive, frozen)
+    if best is None or not frozen.undisplaced or frozen.of_map or frozen.count > _MOST_SCANS:
         return best
     whole = replace(frozen, motions=frozen.undisplaced)
     drive_whole = _drive(whole, settings, costs)
     if (found := _given(space, drive_whole, whole)) is None:
         return best
-    found = _among_others(space, drive_whole, found)
     worth = _log_volume(frozen.motions) - _log_volume(whole.motions) + _DISPLACED * len(frozen.displaced)
     is_better = drive_whole.total(found.estimate) < drive.total(best.estimate) + worth
     return replace(found, rejoined=frozen.displaced) if is_better else best
@@ -319,15 +289,6 @@ def _given(space: Geometry, drive: Drive, frozen: FrozenScans) -> Found | None:
     given = [frozen.given] if np.array_equal(frozen.given, frozen.leader) else [frozen.given, frozen.leader]
     found = [one for some in given for one in _from(space, drive, frozen, some)]
     return _laid(drive, min(found, key=lambda one: drive.total(one.estimate))) if found else None
-
-
-def _among_others(space: Geometry, drive: Drive, found: Found) -> Found:
-    """The explanation with the largest evidence, of one and of those from other beams."""
-    frozen = found.frozen
-    for other in other_associations(space, frozen.scans, frozen.motions, frozen.poses[0], drive.settings):
-        tried = (_laid(drive, one) for one in _from(space, drive, frozen, other))
-        found = min([found, *tried], key=lambda one: drive.total(one.estimate))
-    return found
 
 
 def _from(space: Geometry, drive: Drive, frozen: FrozenScans, given: Ids) -> list[Found]:

@@ -150,14 +150,9 @@ class LandmarkFrontend:
             out += passed.named if passed else ()
         return out
 
-    def review(self, keyframes: StampedPoses[Keyframe], *, everything: bool, alarmed: bool) -> None:
-        """Review the landmarks without id. The next solve includes the changes.
-
-        Parameters
-        ----------
-        alarmed : whether landmarks have said that the robot is elsewhere
-        """
+    def review(self, keyframes: StampedPoses[Keyframe], *, everything: bool) -> None:
+        """Review the landmarks without id. The next solve includes the changes."""
         if self.is_anonymous and everything:
-            self.anonymous.explain_all(keyframes, alarmed=alarmed)
+            self.anonymous.explain_all(keyframes)
         elif self.is_anonymous:
             self.anonymous.review(keyframes)

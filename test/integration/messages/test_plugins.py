@@ -118,7 +118,7 @@ def test_what_a_plugin_fails_at_is_counted_and_named_once_and_other_inputs_go_on
 def test_a_measurement_that_the_journal_cannot_keep_or_of_another_input_is_a_fault(install):
     imports = "import numpy as np\nfrom graph_slam_ros.measurements.types import Fix\n"
     for fix, line in (
-        ("Fix(9, source.name, 'position', np.zeros(2), (1.0, 0.0, 0.0, 1.0))", "TypeError: Object of type ndarray"),
+        ("Fix(9, source.name, 'position', np.zeros(3), np.eye(2))", "FormatError: Fix: covariance of 4 numbers"),
         ("Fix(9, 'gps', 'position', (0.0, 0.0), (1.0, 0.0, 0.0, 1.0))", "the topic or source of what it gives is not"),
     ):
         name = f"my_{len(fix)}"

@@ -125,7 +125,7 @@ class Stranger:
             "pose": at,
             "position": at[: self.n],
             "heading": (self.space.heading(at),),
-            "attitude": at[self.n :],
+            "attitude": at[self.n :] if self.n == 3 else (0.0, 0.0, 0.0, 1.0),
         }
         lengths = self.n if kind in ("pose", "position") else 0
         angles = {"pose": self.dof - self.n, "position": 0, "heading": 1, "attitude": 3}[kind]

@@ -560,7 +560,8 @@ def test_an_update_says_what_it_changed():
 
 
 @pytest.mark.parametrize(
-    "make", [lambda k: Sighting("a", k, (1.0, 0.0), (1.0, 0, 0, 1.0)), lambda k: Fix(1, "gps", k, (0.0,), (1.0,))]
+    "make",
+    [lambda k: Sighting("a", k, (1.0, 0.0), (1.0, 0, 0, 1.0)), lambda k: Fix(1, "gps", k, (0.0, 0.0), np.eye(2))],
 )
 def test_a_kind_that_is_none_is_refused_where_it_is_written(make):
     with pytest.raises(FormatError, match=r"'bering' is not one of .*, "):

@@ -124,28 +124,10 @@ def refused(reach, *distances, **options):
     return len(distances) - (len(within.sightings) if within else 0)
 
 
-def test_the_first_of_a_long_range_sensor_are_used_and_so_is_what_is_a_little_farther():
-    reach = MaxDistance(PLANAR, Config().sources)
-    assert refused(reach, 60e3) == 0
-    for far in np.geomspace(2e3, 90e3, 300):
-        assert refused(reach, float(far)) == 0
-    short = MaxDistance(PLANAR, Config().sources)
-    assert refused(short, *[0.5] * 1000) == 0
-    assert refused(short, 900.0, kind="position") == 0
-
-
-def test_a_limit_is_learned_from_the_third_farthest_so_that_two_wrong_distances_teach_nothing():
-    reach = MaxDistance(PLANAR, Config().sources)
-    assert refused(reach, 99e3, 99e3, *[200.0] * 30) == 0
-    assert reach.limit_m(SOURCE) == 2e3
-    assert refused(reach, 2.1e3, 1.9e3, 1e8) == 2
-    assert reach.limit_m("another") == 1e5
-    assert refused(MaxDistance(PLANAR, Config().sources), 1.1e5) == 1
-
-
 def test_a_given_limit_is_kept_to_the_letter_and_a_bearing_has_none():
     reach = MaxDistance(PLANAR, Config.from_mapping({f"{SOURCE}.max_distance_m": 5.0}).sources)
     assert refused(reach, 5.0, 5.1, 4.0, kind="position") == 1
+    assert refused(MaxDistance(PLANAR, Config().sources), 9.9e4, 1.1e5) == 1
     bearing = Sightings(S, SOURCE, (Sighting("a", "bearing", (1.0,), (0.01,)),))
     assert reach.admit(bearing) == bearing
     assert reach.admit(seen_at(6.0)) is None

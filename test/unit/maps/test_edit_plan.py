@@ -101,7 +101,6 @@ def closure(**change):
         (out(do="remove"), "do: 'remove' is none of remove_edge"),
         (out(do=["remove_edge"]), "do: ['remove_edge'] is none of"),
         (out(do="remove_landmark"), "'edge': unknown key; remove_landmark has"),
-        (out(do="cut"), "do: cut: no part of a drive is cut out of a map: replay the recording without it"),
         (out(who=""), "who: empty"),
         (out(why=" \n"), "why: empty"),
         (out(why="x" * 2001), "why: 2001 characters, at most 2000"),

@@ -259,7 +259,7 @@ RIVALS = {"has_other_authority": True, "authorities": ("/amcl", "/wheels")}
             "ERROR",
             "somebody else publishes map -> odom on /tf_static",
         ),
-        (active(has_other_authority=True, twins=1), "ERROR", "somebody else broadcasts map -> odom; another node has"),
+        (active(has_other_authority=True, twins=1), "ERROR", "another node has this node's name and does the same"),
         (active(odom(), twins=1), "ERROR", "another node has this node's name"),
         (active(odom(), is_stopped=True), "ERROR", "stopped when the clock jumped back"),
     ],
@@ -312,8 +312,13 @@ LOST = tags(received=4, silent_s=0.0, recent=refused(4, frame_unknown=4), frames
         (
             {"waits_for_clock": True},
             (),
-            "use_sim_time is set and nothing comes on /clock: no input counts as silent or late; use_sim_time:=false,"
-            " or start what publishes /clock",
+            "use_sim_time is set and nothing comes on /clock: map -> odom waits for it, no input counts as silent;"
+            " use_sim_time:=false, or publish it",
+        ),
+        (
+            {"clock_stands": True},
+            (),
+            "/clock stands still while messages come, so map -> odom waits; use_sim_time:=false where it should not",
         ),
         ({"is_paused": True}, (), "paused"),
         (

@@ -19,7 +19,6 @@ from graph_slam_ros.slam.landmarks.bordered import BorderedEquations, Rows
 from graph_slam_ros.slam.landmarks.constellation import laid_on_the_map
 from graph_slam_ros.slam.landmarks.explanation import Costs, Drive, Estimate
 from graph_slam_ros.slam.landmarks.moves import refined
-from graph_slam_ros.slam.landmarks.other_beams import other_associations
 from graph_slam_ros.slam.landmarks.presence_check import presence
 from graph_slam_ros.slam.landmarks.rotations import rotation, rotation_vector
 from graph_slam_ros.slam.landmarks.scan_history import ScanHistory
@@ -147,29 +146,6 @@ def test_dead_reckoning_adds_up_what_was_driven_and_not_what_jumped():
 
 
 # -- the beam ---------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("log_missed, third", [(0.0, 4), (-6.0, 0)])
-def test_where_missing_landmarks_count_nothing_new_is_behind_one_that_should_be_seen(log_missed, third):
-    settings = replace(SETTINGS, log_new=-1.2, log_missed=log_missed)
-    places = [(4.0, 0.0), (8.0, 0.0)], [(4.0, 0.0), (8.0, 0.0)], [(4.9, 0.0)]
-    scans = [scan(0.5 * k, (0.0, 0.0, 0.0, 0.0), points, sigma=0.4) for k, points in enumerate(places)]
-    beam, which = explained(scans, settings)
-    assert which == [0, 1, 0, 1, third]
-    beam.advance(motions([scans[-1], scan(2.0, (0.0, 0.0, 0.0, 0.0), [])])[0])
-    beam.explain(scan(2.0, (0.0, 0.0, 0.0, 0.0), []), 5)
-    for points, missing in (([(9.0, 0.0)], 2), ([(9.0, 0.0), (7.9, 0.1)], 1), ([(2.0, 0.0)], 0), ([(0.0, 9.0)], 0)):
-        assert beam._missing(np.array(points))[0] == missing + (third == 4 and missing > 0), points
-
-
-@pytest.mark.parametrize("n", [2, 3])
-def test_other_beams_associate_a_drive_again_from_its_beginning(n):
-    trees = np.array([(3.0, 2.0, 0.5), (5.0, -2.0, 0.0), (7.0, 2.5, 1.0), (9.0, -1.5, 0.2)])[:, :n]
-    scans = tuple(scan(k, (0.5 * k, 0.0, 0.0, 0.5 * k), trees - 0.5 * k * np.eye(n)[0]) for k in range(8))
-    found = list(other_associations(SPACES[n], scans, tuple(motions(scans, n)), np.array(pose(n)), SETTINGS))
-    assert len(found) == 3
-    for which in found:
-        assert which.tolist() == [0, 1, 2, 3] * len(scans)
 
 
 @pytest.mark.parametrize("n", [2, 3])
