@@ -18,8 +18,6 @@ def view_options(sub: CommandParser) -> None:
     arguments.add_run(sub)
     arguments.add_shown(sub)
     sub.add_argument("--port", type=arguments.port, default=0, help="port to listen on (default: a free one)")
-    about = "address to listen on (default: this machine alone)"
-    sub.add_argument("--host", default="127.0.0.1", metavar="ADDRESS", help=about)
     sub.add_argument("--no-browser", action="store_true", help="print the address, and open no browser")
 
 
@@ -39,20 +37,16 @@ def view(args: argparse.Namespace) -> int:
     made = read_contents(args.run_folder, args.truth, args.compare, args.plan, args.topic, align=not args.no_align)
     work = Workbench(made, arguments.LOSS_SCALE)
     page = page_of(made, work)
-    bound = listening(args.host, args.port)
-    access = Access(args.host, bound.getsockname()[1])
-    address = access.address
+    bound = listening(args.port)
+    access = Access(bound.getsockname()[1])
     code = console.report_losses(made.losses, made.beware)
-    if not access.is_local:
-        console.warn(f"beware: other machines can reach {args.host}; a person with the address can edit the run")
-
-    console.show(address)
+    console.show(access.address)
     console.then("open it in a browser, once; Ctrl-C ends it")
     sys.stdout.flush()
     if not args.no_browser and _has_screen():
         import webbrowser
 
-        webbrowser.open(address)
+        webbrowser.open(access.address)
     with contextlib.suppress(KeyboardInterrupt):
         server(application(work, page, access)).run([bound])
     console.show("ended")

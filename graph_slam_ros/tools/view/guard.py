@@ -6,10 +6,8 @@ makes point here is refused), and an Origin that is the page's own.
 """
 
 import hmac
-import ipaddress
 import secrets
 from dataclasses import dataclass, field
-from urllib.parse import urlsplit
 
 from starlette.requests import Request
 from starlette.responses import PlainTextResponse
@@ -26,7 +24,8 @@ _HEADERS = {
     "x-content-type-options": "nosniff",
     "x-frame-options": "DENY",
 }
-_LOCAL = ("127.0.0.1", "localhost", "::1")
+HOST = "127.0.0.1"
+"""The address that the server listens on; from another machine, ``ssh -L`` leads to it."""
 
 
 @dataclass
@@ -35,12 +34,11 @@ class Access:
 
     Attributes
     ----------
-    host, port : where it listens
+    port : where it listens, on the loopback
     token : in the address that is printed; it opens the page once
     key : in the cookie of the browser that opened it
     """
 
-    host: str
     port: int
     token: str = field(default_factory=lambda: secrets.token_urlsafe(24))
     key: str = field(default_factory=lambda: secrets.token_urlsafe(32))
@@ -53,24 +51,11 @@ class Access:
     @property
     def address(self) -> str:
         """The address that opens the page."""
-        host = f"[{self.host}]" if ":" in self.host else self.host
-        return f"http://{host}:{self.port}/?token={self.token}"
+        return f"http://{HOST}:{self.port}/?token={self.token}"
 
     def admits_host(self, name: str) -> bool:
-        """Return whether a Host or Origin (HOST:PORT) is this server: an address, or a name that was asked for."""
-        try:
-            parts = urlsplit(f"//{name}")
-            host, port = parts.hostname or "", parts.port or 80
-        except ValueError:
-            return False
-        if port != self.port or parts.path or parts.query or parts.fragment or "@" in name:
-            return False
-        return host == self.host or (host in _LOCAL if self.is_local else _is_address(host))
-
-    @property
-    def is_local(self) -> bool:
-        """Return whether it listens on the loopback alone."""
-        return self.host == "localhost" or (_is_address(self.host) and ipaddress.ip_address(self.host).is_loopback)
+        """Return whether a Host or Origin (HOST:PORT) is this server."""
+        return name in (f"{HOST}:{self.port}", f"localhost:{self.port}")
 
     def opens(self, token: str) -> bool:
         """Return whether a token opens the page; it does so once."""
@@ -82,14 +67,6 @@ class Access:
     def knows(self, key: str) -> bool:
         """Return whether a cookie is that of the browser that opened the page."""
         return hmac.compare_digest(key.encode(), self.key.encode())
-
-
-def _is_address(host: str) -> bool:
-    try:
-        ipaddress.ip_address(host)
-    except ValueError:
-        return False
-    return True
 
 
 class Guard:

@@ -17,7 +17,7 @@ from starlette.routing import Route
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.tools.report.contents import Contents
 from graph_slam_ros.tools.report.page import Panel, plotly, whole_page
-from graph_slam_ros.tools.view.guard import MOST_BYTES, Access, Guard, TooLargeError, body_of
+from graph_slam_ros.tools.view.guard import HOST, MOST_BYTES, Access, Guard, TooLargeError, body_of
 from graph_slam_ros.tools.view.workbench import Workbench, readable
 
 MOST_CLIENTS = 8
@@ -63,27 +63,23 @@ def _asked(answer: _Answer) -> Callable[[Request], Any]:
     return respond
 
 
-def listening(host: str, port: int) -> socket.socket:
+def listening(port: int) -> socket.socket:
     """A socket that clients can connect to, and that answers when a server is run with it; port 0 is a free one.
 
     Raises
     ------
     GraphSlamError
-        The address is not of this machine, or the port is somebody else's.
+        The port is somebody else's.
     """
-    try:
-        family, kind, protocol, _, where = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-        bound = socket.socket(family, kind, protocol)
-    except OSError as error:
-        raise GraphSlamError(f"--host {host}: {error.strerror}") from None
+    bound = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     try:
         bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        bound.bind(where)
+        bound.bind((HOST, port))
         bound.listen(MOST_CLIENTS)
     except OSError as error:
         bound.close()
         mend = "choose another --port, or none for a free one" if error.errno == errno.EADDRINUSE else error.strerror
-        raise GraphSlamError(f"{host}:{port}: cannot be listened on: {mend}") from None
+        raise GraphSlamError(f"{HOST}:{port}: cannot be listened on: {mend}") from None
     return bound
 
 

@@ -41,8 +41,8 @@ def served(run, page=None):
     """A server of a run in this process, as the command starts it."""
     made = read_contents(run)
     work = Workbench(made, 3.0)
-    bound = server.listening("127.0.0.1", 0)
-    access = Access("127.0.0.1", bound.getsockname()[1])
+    bound = server.listening(0)
+    access = Access(bound.getsockname()[1])
     one = server.server(server.application(work, page or page_of(made, work), access))
     thread = threading.Thread(target=one.run, args=([bound],))
     thread.start()
@@ -151,7 +151,7 @@ def test_X5_what_is_its_own_gets_one_that_no_other_page_may_read(attacked):
 
 
 def test_X5_the_token_opens_the_page_once(faulty, attacked):
-    one = SimpleNamespace(port=attacked.port, access=Access("127.0.0.1", attacked.port))
+    one = SimpleNamespace(port=attacked.port, access=Access(attacked.port))
     assert asked(one)[0] == 403, "the cookie of another start"
     for token in ("", "x", one.access.token, "\xe4"):
         path = f"/?token={token.encode('latin-1').hex() if token == chr(228) else token}"
