@@ -153,7 +153,7 @@ COMMANDS: dict[str, Command | Group] = {
                 "tools.fleet.command:compare",
                 "compare two fleets recording by recording, and fail where the new one is worse",
                 "last_week fleet",
-                "last_week fleet --fail 'rmse>1.02x' --fail 'cpu>1.2x' --markdown summary.md",
+                "last_week fleet --fail 'rmse>1.02x' --fail 'cpu>1.2x'",
             ),
         },
     ),

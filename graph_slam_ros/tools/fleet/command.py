@@ -49,7 +49,6 @@ def compare_options(sub: CommandParser) -> None:
     sub.add_argument("new", type=Path, metavar="NEW", help="folder of the later fleet")
     about = "exit with 4 beyond it: METRIC>NUMBERx or METRIC>NUMBER"
     sub.add_argument("--fail", action="append", default=[], metavar="LIMIT", help=about)
-    sub.add_argument("--markdown", type=Path, metavar="FILE", help="write the comparison as Markdown")
 
 
 def replay(args: argparse.Namespace) -> int:
@@ -96,16 +95,11 @@ def _progress(rows: Iterable[Any], total: int) -> Iterator[Any]:
 def compare(args: argparse.Namespace) -> int:
     """Compare two fleets."""
     _check_installed()
-    from graph_slam_ros.formats.durable import write_whole
     from graph_slam_ros.tools.fleet.compare import compare as compared
     from graph_slam_ros.tools.fleet.compare import markdown, parse_limit
 
-    console.check_file(args.markdown, force=False)
     done = compared(args.old, args.new, [parse_limit(text) for text in args.fail])
-    text = markdown(done)
-    if args.markdown is not None:
-        write_whole(args.markdown, text.encode())
-    console.show(*text.splitlines())
+    console.show(*markdown(done).splitlines())
     for name in done.lost:
         console.warn(f"failed now, and not before: {name}", most=console.SENTENCE)
     for limit in done.exceeded:

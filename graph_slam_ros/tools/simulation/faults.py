@@ -32,7 +32,6 @@ KINDS = Kinds()
 def false_closures(
     draft: Draft,
     rng: Generator,
-    *,
     policy: str = option("random", "which poses, see ``false_closures``", choices=generator.POLICIES),
     rate: float = option(0.3, "false of all closures", "", 0, 0.99),
     count: int = option(0, "so many, whatever the rate; 0: by the rate", "", 0, 1e6),
@@ -47,7 +46,7 @@ def false_closures(
 
 
 @KINDS.add
-def wrong_ids(draft: Draft, rng: Generator, *, rate: float = option(0.05, "of all sightings", "", 0, 1)) -> None:
+def wrong_ids(draft: Draft, rng: Generator, rate: float = option(0.05, "of all sightings", "", 0, 1)) -> None:
     """Sightings with the id of another landmark, if possible one that is not in the same message."""
     names = list(_times(draft, 0, 0))
     if len(names) < 2:
@@ -65,7 +64,6 @@ def wrong_ids(draft: Draft, rng: Generator, *, rate: float = option(0.05, "of al
 def swapped_ids(
     draft: Draft,
     rng: Generator,
-    *,
     pairs: int = option(1, "how many", "", 1, 1e4),
     at: float = option(0.5, _HALFWAY, "", 0, 1),
 ) -> None:
@@ -82,7 +80,6 @@ def swapped_ids(
 def moved_landmarks(
     draft: Draft,
     rng: Generator,
-    *,
     count: int = option(1, "how many", "", 1, 1e4),
     at: float = option(0.5, _HALFWAY, "", 0, 1),
     distance_m: float = option(2.0, "by how much each, in a direction of its own", "m", 0, 1000),
@@ -102,7 +99,6 @@ def moved_landmarks(
 def outliers(
     draft: Draft,
     rng: Generator,
-    *,
     rate: float = option(0.05, "of all sightings", "", 0, 1),
     most_m: float = option(5.0, "by how much at most; evenly from a fifth of it", "m", 1e-3, 1000),
 ) -> None:
@@ -127,7 +123,6 @@ def outliers(
 def slip(
     draft: Draft,
     _rng: Generator,
-    *,
     at: float = option(0.5, _HALFWAY, "", 0, 1),
     lasting: float = option(0.02, "for how long, as a part of the whole", "", 0, 1),
     factor: float = option(1.5, "distance in odometry for each metre driven", "", 0, 100),
@@ -154,7 +149,6 @@ def slip(
 def carried(
     draft: Draft,
     _rng: Generator,
-    *,
     at: float = option(0.5, _HALFWAY, "", 0, 1),
     distance_m: float = option(10.0, "how far from where it was lifted it is set down, at least", "m", 1e-3, 1e5),
 ) -> None:
@@ -176,7 +170,6 @@ def carried(
 def jump(
     draft: Draft,
     _rng: Generator,
-    *,
     at: float = option(0.5, _HALFWAY, "", 0, 1),
     ahead_m: float = option(1.0, "how far along its own x axis", "m", -1000, 1000),
     left_m: float = option(0.0, "along its own y axis", "m", -1000, 1000),

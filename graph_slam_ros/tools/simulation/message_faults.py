@@ -32,7 +32,7 @@ _OF_THE_ROBOT = (_IMU, "sensor_msgs/msg/NavSatFix", DETECTIONS, POINTS, TRANSFOR
 
 
 @MESSAGE_KINDS.add
-def brief(drive: Drive, _rng: Generator, *, part: float = option(0.1, "of its time", "", 0, 1)) -> None:
+def brief(drive: Drive, _rng: Generator, part: float = option(0.1, "of its time", "", 0, 1)) -> None:
     """A recording of the beginning of a drive."""
     first_ns, last_ns = drive.messages[0].log_ns, drive.messages[-1].log_ns
     end_ns = first_ns + part * (last_ns - first_ns)
@@ -41,7 +41,7 @@ def brief(drive: Drive, _rng: Generator, *, part: float = option(0.1, "of its ti
 
 @MESSAGE_KINDS.add
 def cut_off(
-    drive: Drive, _rng: Generator, *, part: float = option(0.7, "of its bytes that are left", "", 0.01, 1)
+    drive: Drive, _rng: Generator, part: float = option(0.7, "of its bytes that are left", "", 0.01, 1)
 ) -> None:
     """A file that ends too early, as where a disk was full or the power failed."""
     drive.part_of_file = part
@@ -49,14 +49,14 @@ def cut_off(
 
 @MESSAGE_KINDS.add
 def missing(
-    drive: Drive, _rng: Generator, *, what: str = option("landmarks", "which", choices=("landmarks", "odometry"))
+    drive: Drive, _rng: Generator, what: str = option("landmarks", "which", choices=("landmarks", "odometry"))
 ) -> None:
     """A recording without one of its topics."""
     drive.drop(drive.landmarks if what == "landmarks" else drive.odometry)
 
 
 @MESSAGE_KINDS.add
-def unreadable(drive: Drive, rng: Generator, *, rate: float = option(1.0, CHANGED, "", 0, 1)) -> None:
+def unreadable(drive: Drive, rng: Generator, rate: float = option(1.0, CHANGED, "", 0, 1)) -> None:
     """Landmarks whose bytes end too early, as those of another definition of the type."""
     for m in drive.landmarks:
         if rng.random() < rate:
@@ -68,7 +68,6 @@ def unreadable(drive: Drive, rng: Generator, *, rate: float = option(1.0, CHANGE
 def other_tf(
     drive: Drive,
     _rng: Generator,
-    *,
     distance: float = option(0.8, "metres on /tf for each metre in the topic", "", -1e3, 1e3),
 ) -> None:
     """A transform from odom to the robot on /tf that is of another odometry."""
@@ -89,7 +88,7 @@ def other_tf(
 
 @MESSAGE_KINDS.add
 def static_changes(
-    drive: Drive, _rng: Generator, *, x_m: float = option(0.1, "how far the second is from the first", "m", -100, 100)
+    drive: Drive, _rng: Generator, x_m: float = option(0.1, "how far the second is from the first", "m", -100, 100)
 ) -> None:
     """A static transform of the sensor that is published twice, with different values."""
     parent = str(drive.odometry[0].content.child_frame_id)
@@ -102,7 +101,7 @@ def static_changes(
 
 
 @MESSAGE_KINDS.add
-def same_ids(drive: Drive, rng: Generator, *, rate: float = option(0.2, CHANGED, "", 0, 1)) -> None:
+def same_ids(drive: Drive, rng: Generator, rate: float = option(0.2, CHANGED, "", 0, 1)) -> None:
     """Messages in which two landmarks have one id."""
     for m in drive.landmarks:
         seen = Sightings(m)
@@ -112,16 +111,14 @@ def same_ids(drive: Drive, rng: Generator, *, rate: float = option(0.2, CHANGED,
 
 
 @MESSAGE_KINDS.add
-def clock_offset(
-    drive: Drive, _rng: Generator, *, seconds: float = option(0.1, "by so much", "s", -1e10, 1e10)
-) -> None:
+def clock_offset(drive: Drive, _rng: Generator, seconds: float = option(0.1, "by so much", "s", -1e10, 1e10)) -> None:
     """Landmarks that are stamped too late, or too early where it is negative."""
     drive.restamp(drive.landmarks, lambda t: t + round(seconds * NS))
 
 
 @MESSAGE_KINDS.add
 def clock_drift(
-    drive: Drive, _rng: Generator, *, ppm: float = option(500.0, "by so many millionths", "ppm", -1e5, 1e5)
+    drive: Drive, _rng: Generator, ppm: float = option(500.0, "by so many millionths", "ppm", -1e5, 1e5)
 ) -> None:
     """Landmarks whose clock runs too fast."""
     drive.restamp(drive.landmarks, lambda t: t + ((t - t[0]) * ppm * 1e-6).astype(np.int64))
@@ -131,7 +128,6 @@ def clock_drift(
 def clock_jump(
     drive: Drive,
     _rng: Generator,
-    *,
     seconds: float = option(0.2, "by so much", "s", -1e5, 1e5),
     at: float = option(0.5, AT, "", 0, 1),
 ) -> None:
@@ -140,15 +136,13 @@ def clock_jump(
 
 
 @MESSAGE_KINDS.add
-def uptime(
-    drive: Drive, _rng: Generator, *, seconds: float = option(1000.0, "at the first message", "s", 0, 1e9)
-) -> None:
+def uptime(drive: Drive, _rng: Generator, seconds: float = option(1000.0, "at the first message", "s", 0, 1e9)) -> None:
     """Landmarks that are stamped by the time since their computer was started."""
     drive.restamp(drive.landmarks, lambda t: t - t[0] + round(seconds * NS))
 
 
 @MESSAGE_KINDS.add
-def zero_stamps(drive: Drive, rng: Generator, *, rate: float = option(0.3, CHANGED, "", 0, 1)) -> None:
+def zero_stamps(drive: Drive, rng: Generator, rate: float = option(0.3, CHANGED, "", 0, 1)) -> None:
     """Landmarks whose driver leaves stamps at zero."""
     drive.restamp(drive.landmarks, lambda t: np.where(rng.random(len(t)) < rate, 0, t))
 
@@ -157,7 +151,6 @@ def zero_stamps(drive: Drive, rng: Generator, *, rate: float = option(0.3, CHANG
 def clock_set_back(
     drive: Drive,
     _rng: Generator,
-    *,
     seconds: float = option(30.0, "by so much", "s", 0, 1e9),
     at: float = option(0.5, AT, "", 0, 1),
 ) -> None:
@@ -176,7 +169,6 @@ def clock_set_back(
 def wrong_frames(
     drive: Drive,
     _rng: Generator,
-    *,
     odometry: str = option("kept", "frame of odometry", choices=("kept", "map", "world")),
     landmarks: str = option("camera_link", "frame of landmarks", choices=("kept", "camera_link", "odom", "map")),
 ) -> None:
@@ -206,7 +198,6 @@ def _each(drive: Drive, change: Callable[[Sightings, Message], Array | None]) ->
 def wrong_mount(
     drive: Drive,
     _rng: Generator,
-    *,
     yaw_deg: float = option(5.0, "turned to the left", "degrees", -180, 180),
     x_m: float = option(0.0, "ahead of where it should be", "m", -10, 10),
     y_m: float = option(0.0, "to the left of it", "m", -10, 10),
@@ -236,7 +227,6 @@ _AXES = {
 def wrong_axes(
     drive: Drive,
     _rng: Generator,
-    *,
     how: str = option("mirrored", "which", choices=("mirrored", "exchanged", "optical", "backwards", "left", "right")),
 ) -> None:
     """Landmarks in other axes than x ahead and y to the left."""
@@ -253,7 +243,6 @@ def wrong_axes(
 def wrong_units(
     drive: Drive,
     _rng: Generator,
-    *,
     factor: float = option(1000.0, "so many for each metre or radian", "", 1e-6, 1e6),
     of: str = option("lengths", "which numbers", choices=("lengths", "bearings")),
 ) -> None:
@@ -269,7 +258,7 @@ def wrong_units(
 
 @MESSAGE_KINDS.add
 def tiny_covariance(
-    drive: Drive, _rng: Generator, *, sigma: float = option(1e-6, "its standard deviations", "m, rad", 0, 1e3)
+    drive: Drive, _rng: Generator, sigma: float = option(1e-6, "its standard deviations", "m, rad", 0, 1e3)
 ) -> None:
     """Landmarks whose covariance is smaller than any sensor's."""
     for m in drive.landmarks:
@@ -278,7 +267,7 @@ def tiny_covariance(
 
 @MESSAGE_KINDS.add
 def noisy(
-    drive: Drive, rng: Generator, *, factor: float = option(8.0, "so many times, at least of 5 cm", "", 0, 1e3)
+    drive: Drive, rng: Generator, factor: float = option(8.0, "so many times, at least of 5 cm", "", 0, 1e3)
 ) -> None:
     """Landmarks that are worse than their covariance."""
 
@@ -290,7 +279,7 @@ def noisy(
 
 
 @MESSAGE_KINDS.add
-def track_ids(drive: Drive, _rng: Generator, *, sightings: int = option(2, "of one id", "", 1, 1e6)) -> None:
+def track_ids(drive: Drive, _rng: Generator, sightings: int = option(2, "of one id", "", 1, 1e6)) -> None:
     """Landmarks with ids of tracks: after a few sightings a new one."""
     times: dict[str, int] = {}
     names: dict[tuple[str, int], str] = {}
@@ -304,7 +293,7 @@ def track_ids(drive: Drive, _rng: Generator, *, sightings: int = option(2, "of o
 
 
 @MESSAGE_KINDS.add
-def random_ids(drive: Drive, rng: Generator, *, rate: float = option(1.0, "of all sightings", "", 0, 1)) -> None:
+def random_ids(drive: Drive, rng: Generator, rate: float = option(1.0, "of all sightings", "", 0, 1)) -> None:
     """Landmarks with ids of other landmarks, at random."""
     names = sorted({name for m in drive.landmarks for name in Sightings(m).ids})
     if len(names) < 2:
@@ -317,7 +306,7 @@ def random_ids(drive: Drive, rng: Generator, *, rate: float = option(1.0, "of al
 
 
 @MESSAGE_KINDS.add
-def new_ids(drive: Drive, _rng: Generator, *, seconds: float = option(15.0, "how long", "s", 0.1, 1e6)) -> None:
+def new_ids(drive: Drive, _rng: Generator, seconds: float = option(15.0, "how long", "s", 0.1, 1e6)) -> None:
     """Landmarks that nobody recognises: after a time all have new ids."""
     first_ns = drive.landmarks[0].stamp_ns
     names: dict[tuple[str, int], str] = {}
@@ -333,7 +322,6 @@ def new_ids(drive: Drive, _rng: Generator, *, seconds: float = option(15.0, "how
 def wrong_gyro(
     drive: Drive,
     rng: Generator,
-    *,
     factor: float = option(1.2, "so many times as large", "", -1e3, 1e3),
     bias_rad_s: float = option(0.0, "larger by so much, about each axis", "rad/s", -10, 10),
     noise_rad_s: float = option(0.0, "wrong by so much at random, for a second at a time", "rad/s", 0, 100),
@@ -355,7 +343,7 @@ def wrong_gyro(
 
 
 @MESSAGE_KINDS.add
-def blind(drive: Drive, _rng: Generator, *, after: float = option(0.25, AT, "", 0, 1)) -> None:
+def blind(drive: Drive, _rng: Generator, after: float = option(0.25, AT, "", 0, 1)) -> None:
     """A sensor that sees nothing after a while."""
     at_ns = np.quantile(drive.odometry_ns, after)
     drive.drop([m for m in drive.landmarks if m.stamp_ns >= at_ns])

@@ -29,7 +29,6 @@ def recorded_twice(drive: Drive, _rng: Generator) -> None:
 def out_of_order(
     drive: Drive,
     rng: Generator,
-    *,
     seconds: float = option(0.2, "by so much", "s", 0, 100),
     rate: float = option(0.02, CHANGED, "", 0, 1),
 ) -> None:
@@ -42,7 +41,6 @@ def out_of_order(
 def gap(
     drive: Drive,
     _rng: Generator,
-    *,
     seconds: float = option(5.0, "how long", "s", 0, 1e6),
     at: float = option(0.33, AT, "", 0, 1),
 ) -> None:
@@ -52,9 +50,7 @@ def gap(
 
 
 @MESSAGE_KINDS.add
-def slow_odometry(
-    drive: Drive, _rng: Generator, *, hz: float = option(2.0, "so many a second", "Hz", 1e-3, 1e4)
-) -> None:
+def slow_odometry(drive: Drive, _rng: Generator, hz: float = option(2.0, "so many a second", "Hz", 1e-3, 1e4)) -> None:
     """Odometry of which few messages are left."""
     number, out = -1, []
     for m in drive.odometry:
@@ -65,7 +61,7 @@ def slow_odometry(
 
 
 @MESSAGE_KINDS.add
-def jitter(drive: Drive, rng: Generator, *, seconds: float = option(0.06, "mean delay", "s", 0, 100)) -> None:
+def jitter(drive: Drive, rng: Generator, seconds: float = option(0.06, "mean delay", "s", 0, 100)) -> None:
     """Odometry that is stamped when it arrives."""
     drive.restamp(drive.odometry, lambda t: np.sort(t + (rng.exponential(seconds, len(t)) * NS).astype(np.int64)))
 
@@ -98,7 +94,6 @@ def _twists(drive: Drive, change: Callable[[Array, Array, Array], tuple[Array, A
 def wrong_scale(
     drive: Drive,
     _rng: Generator,
-    *,
     distance: float = option(1.05, "distance in odometry for each metre driven", "", -1e6, 1e6),
     turn: float = option(1.0, "and turn for each radian turned", "", -1e3, 1e3),
     begin: float = option(0.0, AT, "", 0, 1),
@@ -125,7 +120,6 @@ def wrong_scale(
 def wrong_twist(
     drive: Drive,
     _rng: Generator,
-    *,
     linear: float = option(1.0, "factor of the speed", "", -1e6, 1e6),
     angular: float = option(1.0, "factor of the turn rate", "", -1e6, 1e6),
     axes: str = option("base", "along the axes of this frame", choices=("base", "odom")),
@@ -141,7 +135,7 @@ def wrong_twist(
 
 @MESSAGE_KINDS.add
 def twist_variance(
-    drive: Drive, _rng: Generator, *, variance: float = option(1e-12, "of each axis", "(m/s)^2", -1e12, 1e12)
+    drive: Drive, _rng: Generator, variance: float = option(1e-12, "of each axis", "(m/s)^2", -1e12, 1e12)
 ) -> None:
     """Odometry whose twist has another covariance."""
     for m in drive.odometry:
@@ -165,7 +159,7 @@ def _moved(poses: Array, at: int, T: se3.Pose) -> Array:
 
 
 @MESSAGE_KINDS.add
-def restarted(drive: Drive, _rng: Generator, *, at: float = option(0.5, AT, "", 0, 1)) -> None:
+def restarted(drive: Drive, _rng: Generator, at: float = option(0.5, AT, "", 0, 1)) -> None:
     """Odometry whose driver is restarted, and begins at zero again."""
     poses = drive.poses
     first = min(round(at * len(poses)), len(poses) - 1)
@@ -178,7 +172,6 @@ def restarted(drive: Drive, _rng: Generator, *, at: float = option(0.5, AT, "", 
 def corrected(
     drive: Drive,
     rng: Generator,
-    *,
     every_s: float = option(20.0, "how often", "s", 0.1, 1e6),
     sigma_m: float = option(0.3, "by how much", "m", 0, 1e3),
     sigma_rad: float = option(0.05, "and how much it is turned", "rad", 0, 3.0),
@@ -196,7 +189,6 @@ def corrected(
 def other_publisher(
     drive: Drive,
     _rng: Generator,
-    *,
     seconds: float = option(0.01, "how much later", "s", 1e-6, 100),
     x_m: float = option(8.0, "where the robot of the first is in the odometry of the second", "m", -1e6, 1e6),
     distance: float = option(0.98, "its distance for each metre of the first", "", 1e-3, 1e3),
@@ -217,7 +209,7 @@ def other_publisher(
 
 
 @MESSAGE_KINDS.add
-def not_a_number(drive: Drive, rng: Generator, *, rate: float = option(0.01, CHANGED, "", 0, 1)) -> None:
+def not_a_number(drive: Drive, rng: Generator, rate: float = option(0.01, CHANGED, "", 0, 1)) -> None:
     """Odometry with positions that are no numbers."""
     for m in drive.odometry:
         if rng.random() < rate:
