@@ -271,14 +271,14 @@ def _drive(out: Contents, saved: SavedGraph) -> dict[str, Any]:
     return {
         "frames": [
             {
-                "keyframes": one.keyframes,
-                "points": [out.packing.fixed(column, _MM, is_path=True) for column in one.points.T],
-                "landmarks": [out.packing.fixed(column, _MM) for column in one.landmarks.T],
+                "keyframes": count,
+                "points": [out.packing.fixed(column, _MM, is_path=True) for column in points.T],
+                "landmarks": [out.packing.fixed(column, _MM) for column in landmarks.T],
             }
-            for one in frames
+            for count, points, landmarks in frames
         ],
         "corrections": [out.packing.column(found[0], "i4"), out.packing.fixed(found[1], 1e-4)],
-        "jumps": [[one.keyframe, one.distance_m, one.angle_rad * 180.0 / np.pi, one.edges] for one in several],
+        "jumps": several,
     }
 
 

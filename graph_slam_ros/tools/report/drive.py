@@ -1,9 +1,9 @@
 """The history of the drive: the estimate at some moments, and the jumps of map -> odom."""
 
+import math
 import struct
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,20 +22,8 @@ MOST_FRAMES, MOST_POINTS, MOST_LANDMARKS, MOST_JUMPS = 80, 500, 300, 15
 _RUN = "run"
 
 
-@dataclass(frozen=True, slots=True)
-class Frame:
-    """The estimate at one moment.
-
-    Attributes
-    ----------
-    keyframes : how many there were
-    points : (m, 3) their positions in map as they were known then, or some of them
-    landmarks : (l, 3) positions of landmarks, as they were known then
-    """
-
-    keyframes: int
-    points: Array
-    landmarks: Array
+Frame = tuple[int, Array, Array]
+"""How many keyframes there were, positions (m, 3) of some of them, and of landmarks (l, 3), as they were known then."""
 
 
 def frames(run: Path, saved: SavedGraph, losses: list[str]) -> list[Frame]:
@@ -58,26 +46,9 @@ def frames(run: Path, saved: SavedGraph, losses: list[str]) -> list[Frame]:
         count = int(np.searchsorted(first + width, len(values), side="right"))
         if count:
             at = first[np.unique(np.linspace(0, count - 1, min(count, MOST_POINTS)).astype(int))]
-            found.append(
-                Frame(before + count, positions(values, at), positions(values, marks[marks + width <= len(values)]))
-            )
+            places = positions(values, at), positions(values, marks[marks + width <= len(values)])
+            found.append((before + count, *places))
     return found
-
-
-@dataclass(frozen=True, slots=True)
-class Jump:
-    """A moment at which ``map -> odom`` changed.
-
-    Attributes
-    ----------
-    distance_m, angle_rad : how far the robot was moved in map
-    edges : the measurements judged then that pulled most
-    """
-
-    keyframe: int
-    distance_m: float
-    angle_rad: float
-    edges: list[int]
 
 
 def corrections(run: Path, stamps_s: Array, odometry: Array, losses: list[str]) -> tuple[Array, Array, Array]:
@@ -108,8 +79,10 @@ def corrections(run: Path, stamps_s: Array, odometry: Array, losses: list[str]) 
     return keyframes, np.linalg.norm(moved[:, :3], axis=1), angles
 
 
-def jumps(found: tuple[Array, Array, Array], entries: Sequence[Entry], changed: dict[int, list[int]]) -> list[Jump]:
-    """The largest corrections, each with the measurements that came or were judged otherwise at that keyframe.
+def jumps(
+    found: tuple[Array, Array, Array], entries: Sequence[Entry], changed: dict[int, list[int]]
+) -> list[tuple[int, float, float, list[int]]]:
+    """The largest corrections: keyframe, distance [m], angle [degrees], and the edges judged then that pulled most.
 
     Parameters
     ----------
@@ -127,7 +100,7 @@ def jumps(found: tuple[Array, Array, Array], entries: Sequence[Entry], changed: 
         at = int(keyframes[k])
         pulled = sorted(came.get(at, ()), key=lambda e: -e.statistic)[:4]
         edges = list(dict.fromkeys([*changed.get(at, ())[:4], *(e.edge for e in pulled)]))
-        out.append(Jump(at, float(distances[k]), float(angles[k]), edges))
+        out.append((at, float(distances[k]), float(angles[k]) * 180.0 / math.pi, edges))
     return out
 
 
