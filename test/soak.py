@@ -31,7 +31,7 @@ def guided(name):
 DRIVES = (
     *("advise", "calibration_consistency", "calibration_random", "consistency", "displacement", "extreme_fixes"),
     *("bad_drives", "gyro_drives", "determination", "initialization"),
-    *("calibrate", "condensed_maps", "gyro_findings", "maps", "online_graphs", "repair"),
+    *("calibrate", "condensed_maps", "gyro_findings", "maps", "online_graphs", "repair", "turned_sensor"),
     *("certificate", "nees", "planted", "rates", "simulation", "slip", "recordings", "uncorrected", "unnamed"),
 )
 PROGRAMMES = {

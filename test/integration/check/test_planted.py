@@ -285,8 +285,6 @@ def test_a_replay_says_before_the_work_what_makes_its_result_meaningless(drive, 
     (one,) = said
     assert one.startswith("the result will mean nothing: mirrored: ")
     assert done.summary["check"]["code"] == "mirrored"
-    replay(drive, tmp_path / "clean", Config(), warn=said.append)
-    assert len(said) == 1
 
 
 @pytest.mark.parametrize(("read_ahead", "says"), [(20_000, True), (1_500, False)])

@@ -217,10 +217,8 @@ def test_a_restart_that_is_slower_than_any_jump_has_a_setting_that_makes_it_one(
     (setting,) = found["odometry_jumps"]["settings"]
     _, found, _ = check(bag, "--quick", "--set", setting)
     assert "odometry_jumps" not in found
-    for words, segments in (((), 0), (("--set", setting), 1)):
-        out = tmp_path / f"run{segments}"
-        main(["replay", str(bag), "--out", str(out), *words])
-        assert json.loads((out / "run.json").read_text())["counters"].get("odom", {}).get("jump", 0) == segments
+    main(["replay", str(bag), "--out", str(tmp_path / "run"), "--set", setting])
+    assert json.loads((tmp_path / "run/run.json").read_text())["counters"]["odom"]["jump"] == 1
 
 
 def test_covariances_of_minus_one_have_settings_that_replay_all(drive, check, tmp_path):
@@ -326,6 +324,7 @@ def test_a_damaged_recording_is_checked_as_far_as_it_goes(drive, check, tmp_path
     assert "lost: cut.mcap" in err[0]
 
 
+@SOAK
 def test_ranges_alone_that_are_too_long_are_mended_by_their_own_factor(tmp_path, check, capsys):
     """The distance of odometry would make the map as much too large."""
     bag = tmp_path / "ranges.mcap"

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from planted_faults import reused
+from reliability import times
 
 from graph_slam_ros.formats.parameters import parse_setting
 from graph_slam_ros.lie import se2
@@ -10,6 +11,8 @@ from graph_slam_ros.runs.check import check
 from graph_slam_ros.slam import Sighting, Sightings
 from graph_slam_ros.tools.simulation import Drive, write_bag
 from graph_slam_ros.tools.simulation.recording import LANDMARKS_TOPIC, START_NS, Recording
+
+SOAK = pytest.mark.skipif(not times(0, 1), reason="only in make soak")
 
 
 def loops(seed, yaw_deg, hz=12, ahead_m=0.2):
@@ -49,6 +52,7 @@ def codes(file):
     return {one.code for one in check(file).findings if one.severity != "note"}
 
 
+@SOAK
 def test_a_turned_sensor_is_no_reason_to_doubt_identities(tmp_path):
     write_bag(loops(0, -12.0, ahead_m=0.0), tmp_path / "turned.mcap")
     assert codes(tmp_path / "turned.mcap") == {"mount_yaw"}

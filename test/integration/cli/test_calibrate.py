@@ -121,9 +121,6 @@ def test_a_recording_that_is_wrong_in_itself_is_not_calibrated_and_says_what_is_
     assert "nothing to correct" not in out
     assert out.endswith(f"next: graph_slam check {faulty}\n")
     assert err == f"graph_slam: nothing is calibrated: mend {code} first\n"
-    assert main(["calibrate", faulty, "--json"]) == 3
-    said = json.loads(capsys.readouterr().out)
-    assert (said["settings"], said["parameters"], said["fault"]["code"]) == ({}, [], code)
 
 
 def test_a_robot_that_stood_says_for_each_parameter_what_to_drive(tmp_path, capsys):

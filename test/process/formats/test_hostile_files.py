@@ -46,7 +46,7 @@ WRITERS = {
 def test_F33_what_a_careless_pattern_would_match_for_hours_is_read_or_refused(tmp_path, kind):
     name, text, read, refusal = WRITERS[kind]
     for shape in SHAPES.values():
-        (tmp_path / name).write_text(text(shape(320_000)), encoding="latin-1")
+        (tmp_path / name).write_text(text(shape(100_000)), encoding="latin-1")
         with suppress(refusal):
             read(tmp_path / name)
 
@@ -81,7 +81,7 @@ def test_F34_a_table_that_computes_its_messages_is_refused_before_any_is(tmp_pat
 def test_F35_a_gzipped_graph_that_grows_without_end_is_not_unpacked(tmp_path, text):
     path = tmp_path / "bomb.g2o.gz"
     with gzip.open(path, "wb") as stream:
-        for _ in range(100):
+        for _ in range(30):
             stream.write(text.encode() * (2_000_000 // len(text)))
     with pytest.raises(FormatError, match=r"unpacks to more than 100 times its size|a line of more than"):
         confined(read_g2o, path)
@@ -98,7 +98,7 @@ def test_F35_a_sparse_file_of_a_terabyte_is_refused_at_once(tmp_path, capsys, na
 
 @each("claims", [lambda left: left - 9, lambda left: 44])
 def test_F35_forged_heads_of_chunks_one_after_another_cost_little_each(tmp_path, claims):
-    heads, body = 32_000, b""
+    heads, body = 8_000, b""
     for k in range(heads):
         length = claims(58 * (heads - k))
         head = struct.pack("<Q", length) + bytes(28) + b"\4\0\0\0zstd" + struct.pack("<Q", length - 44)
