@@ -9,7 +9,6 @@ from faulty import faulty_run
 from graph_slam_ros import cli
 from graph_slam_ros.analysis import what_if
 from graph_slam_ros.analysis.what_if import SavedGraph
-from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.runs.ledger_file import read_ledger
 from graph_slam_ros.runs.recorder import RunRecorder
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
@@ -73,16 +72,6 @@ def test_what_is_false_bends_the_map_when_it_is_let_in_and_not_under_a_loss_that
     assert all(after > before for _, before, after in believed.worse)
     gain = [after - before for _, before, after in believed.worse]
     assert gain == sorted(gain, reverse=True)
-
-
-def test_a_landmark_without_its_sightings_is_left_out_and_what_determines_nothing_is_refused(saved):
-    landmark = next(e.landmark for e in saved.entries if e.landmark)
-    seen = [e.edge for e in saved.entries if e.landmark == landmark and e.is_in]
-    assert saved.moved(saved.solve(without=seen)).most[1] < 1.0
-    with pytest.raises(GraphSlamError, match="no edge 99999"):
-        saved.solve(without=[99999])
-    with pytest.raises(GraphSlamError, match=r"gauge|position"):
-        saved.solve(without=[e.edge for e in saved.entries if e.label == "anchor"])
 
 
 def test_what_leaves_a_keyframe_without_edges_is_refused(replayed, saved, capsys):
