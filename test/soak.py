@@ -29,10 +29,11 @@ def guided(name):
 
 
 DRIVES = (
-    *("advise", "calibration_consistency", "calibration_random", "consistency", "displacement", "extreme_fixes"),
-    *("bad_drives", "gyro_drives", "determination", "initialization"),
-    *("calibrate", "condensed_maps", "gyro_findings", "maps", "online_graphs", "repair", "turned_sensor"),
-    *("certificate", "nees", "planted", "rates", "simulation", "slip", "recordings", "uncorrected", "unnamed"),
+    *("advise", *(f"calibration_{name}" for name in ("consistency", "doubt", "random", "space"))),
+    *("calibrate", "certificate", "condense", "condense_unnamed", "condensed_maps", "consistency"),
+    *("bad_drives", "displacement", "extreme_fixes", "found_factors", "gyro_drives", "gyro_findings"),
+    *("determination", "initialization", "maps", "nees", "online_graphs", "planted", "rates", "repair"),
+    *("simulation", "slip", "recordings", "turned_sensor", "uncorrected", "unnamed"),
 )
 PROGRAMMES = {
     "lifelong": [

@@ -5,7 +5,6 @@ import pytest
 
 from graph_slam_ros.lie import se2, so3
 from graph_slam_ros.measurements.types import from_record, to_record
-from graph_slam_ros.runs.map_journal import state_of
 from graph_slam_ros.slam import Config, Control, Fix, GraphSlam
 from graph_slam_ros.tools.simulation import measurements, simulate
 from graph_slam_ros.tools.simulation.motion import space_of
@@ -14,7 +13,6 @@ END = (Control("end"), Control("optimize"))
 SMALL = {"warehouse": {"aisles": 2, "laps": 1, "aisle_m": 6.0}, "flight": {"laps": 1}}
 T_EARTH_WORLD = {2: (300.0, -40.0, 2.5), 3: (300.0, -40.0, 15.0, *so3.exp((0.0, 0.0, 2.5)))}
 HELD = {"anchor.sigma_m": 1e-3, "anchor.sigma_rad": 1e-3}
-WORLDS = pytest.mark.parametrize("world", SMALL)
 
 
 def fix(recording, k, kind, rng, sigma=0.05):
@@ -64,9 +62,9 @@ def errors(slam, recording, T_earth_world):
     return np.linalg.norm(off[:, :n], axis=1), np.linalg.norm(off[:, n:], axis=1)
 
 
-@WORLDS
-@pytest.mark.parametrize("kind", ["position", "pose"])
-@pytest.mark.parametrize("begin", [0.0, 0.6])
+@pytest.mark.parametrize(
+    ("world", "kind", "begin"), [("warehouse", "position", 0.6), ("flight", "pose", 0.0), ("flight", "position", 0.6)]
+)
 def test_the_map_lies_in_the_frame_of_the_fixes_from_whenever_they_come(world, kind, begin):
     recording = simulate(world, 4, **SMALL[world])
     slam, _ = drive_with_fixes(recording, kind, begin=begin)
@@ -75,14 +73,6 @@ def test_the_map_lies_in_the_frame_of_the_fixes_from_whenever_they_come(world, k
     assert radians.max() < 0.1
     assert slam.counters.as_dict() == {kind: {"map_moved": 1}}
     assert slam.ledger.outside_count <= 2
-
-
-@WORLDS
-def test_without_landmarks_fixes_alone_do_so(world):
-    recording = simulate(world, 4, landmarks=False, **SMALL[world])
-    slam, _ = drive_with_fixes(recording, "position")
-    metres, _ = errors(slam, recording, T_EARTH_WORLD[slam.space.dimensions])
-    assert metres.max() < 0.3
 
 
 def test_a_heading_turns_the_map_about_where_it_begins_and_a_position_then_shifts_it():
@@ -124,31 +114,11 @@ def test_of_a_start_that_is_given_the_map_does_not_move_and_the_fixes_correct_it
     assert slam.counters.as_dict() == {}
 
 
-@WORLDS
-def test_the_same_events_give_the_same_bytes(world):
-    recording = simulate(world, 4, **SMALL[world])
+def test_the_same_events_give_the_same_bytes():
+    recording = simulate("warehouse", 4, **SMALL["warehouse"])
     slam, events = drive_with_fixes(recording, "position", begin=0.3)
     again = GraphSlam(slam.config)
     for event in events:
         again.process(from_record(to_record(event)))
     assert again.trajectory().tobytes() == slam.trajectory().tobytes()
     assert again.keyframe_covariances().tobytes() == slam.keyframe_covariances().tobytes()
-
-
-def test_a_map_that_was_taken_up_gives_way_too():
-    recording = simulate("warehouse", 4, **SMALL["warehouse"])
-    first, _ = drive_with_fixes(recording, every=10**9, begin=0.99)
-    again = GraphSlam(Config(), start=state_of(first))
-    rng, shift_ns = np.random.default_rng(1), 10**12
-    for k, m in enumerate(measurements(recording)):
-        fields = to_record(m) | {"stamp_ns": m.stamp_ns + shift_ns}
-        again.process(from_record(fields))
-        if k % 40 == 39:
-            there = fix(recording, int(np.searchsorted(recording.stamps_ns, m.stamp_ns)), "position", rng)
-            again.process(from_record(to_record(there) | {"stamp_ns": m.stamp_ns + shift_ns}))
-    for event in END:
-        again.process(event)
-    old = len(first.keyframes)
-    at = np.searchsorted(recording.stamps_ns, again.keyframes.stamps_ns[:old])
-    true = np.stack(se2.compose(T_EARTH_WORLD[2], tuple(recording.T_world_base[at].T)), axis=1)
-    assert np.abs(again.trajectory()[:old, :2] - true[:, :2]).max() < 0.2

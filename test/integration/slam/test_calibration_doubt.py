@@ -2,6 +2,7 @@
 
 import pytest
 from imperfect import Faults, driven, imperfect_drive
+from reliability import times
 
 from graph_slam_ros.slam import Odometry, Sightings
 
@@ -26,7 +27,7 @@ def only(measurements, names):
 
 
 def test_with_one_landmark_nothing_is_corrected():
-    slam = driven(list(only(imperfect_drive(Faults(yaw=0.1), seconds=40.0), {"3"})))
+    slam = driven(list(only(imperfect_drive(Faults(yaw=0.1), seconds=20.0), {"3"})))
     assert not admitted(slam)
     assert all("1 landmark was seen, 3 are needed" in one.text for one in findings(slam).values())
 
@@ -47,25 +48,10 @@ def test_a_standing_robot_corrects_nothing():
     assert not admitted(driven(same))
 
 
-def test_a_clock_that_jumps_half_way_is_not_reproducible():
-    half = 35 * 10**9
-    first = imperfect_drive(Faults(), seconds=70.0)
-    middle_ns = first[0].stamp_ns + half
-    jumped = [
-        Sightings(m.stamp_ns - 200_000_000, m.topic, m.sightings)
-        if isinstance(m, Sightings) and m.stamp_ns > middle_ns
-        else m
-        for m in first
-    ]
-    slam = driven(sorted(jumped, key=lambda m: m.stamp_ns))
-    one = findings(slam)["clock"]
-    assert one.verdict in ("not_reproducible", "refused", "not_determined"), one.text
-
-
-@pytest.mark.parametrize("wrong", [0.05, 0.2])
+@pytest.mark.parametrize("wrong", times([0.2], [0.05, 0.2]))
 def test_wrong_identities_do_not_make_calibration_worse_than_none(wrong):
     faults = Faults(distance=0.95, clock_s=0.1, yaw=0.08, wrong_ids=wrong)
-    measurements = imperfect_drive(faults, seconds=50.0)
+    measurements = imperfect_drive(faults, seconds=40.0)
     truth = {"distance": -0.05, "turn": 0.0, "clock": 0.1, "yaw": 0.08}
     for name, value in admitted(driven(measurements)).items():
         assert abs(value - truth[name]) < 0.5 * abs(truth[name]) + 0.01, (name, value)
@@ -79,10 +65,8 @@ def test_factors_apart_find_what_is_configured_wrong():
 
 def test_a_robot_that_may_slide_does_not_tell_the_yaw_of_its_sensor():
     """Its direction of motion, against which a yaw is measured, may be that in which it slides."""
-    measurements = imperfect_drive(Faults(yaw=0.08), seconds=30.0)
-    slam = driven(measurements, {"odometry.lateral_density": 0.006})
+    slam = driven(imperfect_drive(Faults(yaw=0.08), seconds=30.0), {"odometry.lateral_density": 0.006})
     one = findings(slam)["yaw"]
     assert one.verdict == "refused"
     assert "odometry.lateral_density (sideways) is 0.6 of odometry.translation_density" in one.text
     assert "drive 10 m straight past" in one.text
-    assert findings(driven(measurements))["yaw"].verdict != "refused"

@@ -22,10 +22,11 @@ def mended(drive, slam):
     return driven(sorted(moved, key=lambda m: m.stamp_ns), settings) if values else None
 
 
-@pytest.mark.parametrize("name", CLASSES if times(0, 1) else ["many wrong ids"])
+@pytest.mark.skipif(not times(0, 1), reason="only in make soak")
+@pytest.mark.parametrize("name", list(CLASSES)[: times(1, None)])
 def test_nothing_is_used_that_makes_the_error_worse(name):
     worse, used, sides = [], 0, []
-    for seed in range(times(1, 100)):
+    for seed in range(100):
         drive, truth, _ = random_drive(name, seed)
         off = driven(drive)
         on = mended(drive, off)

@@ -52,7 +52,7 @@ def by_a_solve(place, *drive):
     return solved(graph, [*vertices, mark]).evaluate().chi2_final
 
 
-@pytest.mark.parametrize("drive", [(0.02, 0.02), (0.01, 0.005), (0.0, 0.02)])
+@pytest.mark.parametrize("drive", [(0.02, 0.02), (0.01, 0.005)])
 def test_the_cost_of_a_place_is_that_of_a_solve_with_the_landmark_there(drive):
     graph, vertices, seen = driven(*drive)
     found = least_chi2(PLANAR, solved(graph, vertices), seen, [LEFT, RIGHT])

@@ -2,12 +2,11 @@
 
 import itertools
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from graph_slam_ros.errors import FormatError, SingularError
+from graph_slam_ros.errors import SingularError
 from graph_slam_ros.formats.g2o_writer import write_g2o
 from graph_slam_ros.formats.graph_file import G2oFile
 from graph_slam_ros.graph import LANDMARK_POSITION, RELATIVE_POSE, SE2, TAG_POSITION
@@ -15,7 +14,7 @@ from graph_slam_ros.lie import se2
 from graph_slam_ros.measurements.types import from_record, to_record
 from graph_slam_ros.runs.outcome import shortcomings
 from graph_slam_ros.runs.tables import summarize
-from graph_slam_ros.slam import Config, Control, Fix, GraphSlam, Odometry, Sighting, Sightings
+from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
 from graph_slam_ros.tools.simulation import measurements, simulate
 
 S = 1_000_000_000
@@ -102,15 +101,6 @@ def test_the_graph_is_a_function_of_the_ingest_sequence(recorded, in_order, tmp_
     assert g2o(in_order, tmp_path) != g2o(messy, tmp_path)
 
 
-def test_saving_on_the_way_costs_no_measurement():
-    seen_ahead = [
-        m for k in range(40) for m in (odometry(k, (0.3 * k, 0, 0)), seen(k + 0.02, point()), Control("flush"))
-    ]
-    p = run(slam(), *seen_ahead, odometry(40, (12.0, 0, 0)), *END)
-    assert p.landmarks["a"].sightings == 40
-    assert p.counters.as_dict() == {}
-
-
 def test_B2_late_sightings_go_where_they_belong():
     late = run(slam(), *straight(9), seen(3.7, point("a")), seen(8.2, point("b")), *END)
     in_time = slam()
@@ -128,26 +118,6 @@ def test_B2_late_sightings_go_where_they_belong():
     assert np.sort(at[0], axis=0) == pytest.approx(np.sort(at[1], axis=0), abs=1e-12)
 
 
-def test_sightings_from_after_the_last_odometry_are_counted_at_the_end():
-    p = run(slam(), *straight(1), seen(1.5, point("a"), point("b")))
-    assert p.counters.as_dict() == {}
-    run(p, *END)
-    assert p.counters.as_dict() == {"/landmarks": {"after_odometry": 2}}
-
-
-def test_sightings_that_wait_for_odometry_are_bounded():
-    p = slam(ordering={"max_waiting": 3})
-    run(p, odometry(0, (0, 0, 0)), odometry(100, (0.1, 0, 0)))
-    run(p, *(seen(100 + k, point("a")) for k in range(1, 6)))
-    assert p.counters["/landmarks", "overflow"] == 2
-    p = slam(ordering={"max_waiting": 3, "window_s": 10.0})
-    run(p, odometry(0, (0, 0, 0)), odometry(20, (0, 0, 0)), odometry(100, (0.1, 0, 0)))
-    run(p, *(seen(50 + k, point("a")) for k in range(5)))  # released at once, and waiting for odometry at 100 s
-    assert p.counters["/landmarks", "overflow"] == 2
-    run(p, odometry(200, (0.2, 0, 0)))
-    assert p.landmarks["a"].sightings == 3
-
-
 # -- keyframes and motion -------------------------------------------------------------------------------------------
 
 
@@ -161,44 +131,12 @@ def test_keyframes_come_by_distance_by_angle_and_by_time_in_motion():
         assert [k.stamp_ns for k in slow.keyframes] == [T0 + k * S for k in range(4)], hz
 
 
-def test_keyframes_and_sightings_are_the_same_one_by_one_and_as_columns():
-    p = run(slam(), *itertools.chain(*zip(straight(9), (seen(k / 10, point()) for k in range(91)), strict=True)))
-    for track, pose in ((p.keyframes, "T_odom_base"), (p.sighting_poses, "T_keyframe_base")):
-        assert len(list(track)) == len(track) == len(track.ids) > 25
-        assert list(track) == [track[k] for k in range(len(track))]
-        assert track[-1] == list(track)[-1]
-        assert track.stamps_ns.tolist() == [instant.stamp_ns for instant in track]
-        assert track.poses.tolist() == [list(getattr(instant, pose)) for instant in track]
-        with pytest.raises(IndexError):
-            track[len(track)]
-    assert p.keyframes.ids.tolist() == [k.vertex for k in p.keyframes]
-    assert p.sighting_poses.ids.tolist() == [s.keyframe for s in p.sighting_poses]
-    assert {type(value) for value in (p.keyframes[0].vertex, p.keyframes[0].stamp_ns)} == {int}
-    assert p.keyframes[-1].stamp_ns == T0 + 9 * S
-
-
 def test_G20_a_standing_robot_makes_no_keyframes_and_gathers_no_noise():
-    wiggle = [odometry(k / 10, (1e-6 * (k % 2), 0.0, 0.0)) for k in range(1, 6001)]
-    p = run(slam(), odometry(0, (0, 0, 0)), *wiggle, seen(600.0, point()))
+    wiggle = [odometry(k / 10, (1e-6 * (k % 2), 0.0, 0.0)) for k in range(1, 1001)]
+    p = run(slam(), odometry(0, (0, 0, 0)), *wiggle, seen(100.0, point()))
     assert len(p.keyframes) == 1
     assert p.graph.edge_count == 2
     assert covariance_of(p, LANDMARK_POSITION) == pytest.approx(np.reshape(POINT, (2, 2)), rel=1e-5)
-
-
-@pytest.mark.parametrize(("jitter_m", "hz"), [(2e-5, 50), (2e-4, 10)])
-def test_odometry_that_jitters_while_the_robot_stands_is_no_motion(jitter_m, hz):
-    rng = np.random.default_rng(1)
-    p = slam(keyframes={"min_distance_m": 0.5, "max_interval_s": 1.0})
-    count = 100 * hz
-    for k, (x, y, theta) in enumerate((jitter_m * rng.standard_normal((count, 3))).tolist()):
-        p.process(odometry(k / hz, (x, y, theta)))
-    assert len(p.keyframes) == 1
-    for k in range(count, count + 10 * hz):
-        p.process(odometry(k / hz, ((k - count) * 0.1 / hz, 0.0, 0.0)))
-    assert len(p.keyframes) in (10, 11)  # 0.1 m/s for ten seconds, a second each
-    sigma = math.sqrt(float(p.pose_covariance[0, 0]))
-    fresh = run(slam(keyframes={"min_distance_m": 0.5, "max_interval_s": 1.0}), *straight(10, 0.1, hz))
-    assert sigma < 1.5 * math.sqrt(float(fresh.pose_covariance[0, 0]))
 
 
 def test_odometry_edges_are_the_relative_motion_and_not_the_absolute_pose():
@@ -206,18 +144,6 @@ def test_odometry_edges_are_the_relative_motion_and_not_the_absolute_pose():
     assert table(p, RELATIVE_POSE).measured.values[0] == pytest.approx([1, 0, 0.2])
     assert p.trajectory() == pytest.approx(np.array([k.T_odom_base for k in p.keyframes])), "map begins where odom does"
     assert p.T_map_odom == pytest.approx((0, 0, 0), abs=1e-12)
-
-
-def test_a_keyframe_between_two_odometry_messages_cuts_the_motion_and_adds_none():
-    p, rng = slam(keyframes={"shared_noise": 0.05, "min_distance_m": 0.21}), np.random.default_rng(1)
-    for k in range(300):
-        p.process(odometry(0.1 * k, se2.exp((0.08 * k, 0.0, 0.002 * k))))
-        if rng.random() < 0.3:
-            p.process(seen(0.1 * k + float(rng.integers(1, 100)) / 1e3, point(covariance=(1e-6, 0.0, 0.0, 1e-6))))
-    seconds = (p.keyframes.stamps_ns - T0) / S
-    assert 30 < np.count_nonzero(np.abs(seconds * 10 - np.rint(seconds * 10)) > 1e-3) < len(seconds) - 30
-    expected = [se2.exp((0.8 * dt, 0.0, 0.02 * dt)) for dt in np.diff(seconds)]
-    assert table(p, RELATIVE_POSE).measured.values == pytest.approx(np.array(expected), abs=1e-9)
 
 
 def monte_carlo(steps, covariance_of_step, samples=20_000, seed=3):
@@ -266,27 +192,6 @@ def test_noise_by_motion_grows_with_all_that_was_turned_and_driven_not_with_wher
     assert (got / scale) == pytest.approx(expected / scale, abs=0.04)  # 20,000 samples: 1 % each, 4 sigma
 
 
-@pytest.mark.parametrize(
-    "odometry, is_same",
-    [
-        ({"noise": "twist"}, {"noise": "motion"}),
-        ({"noise": "twist", "rotation_density": 0.1}, {"noise": "density", "rotation_density": 0.1}),
-    ],
-)
-def test_a_twist_covariance_that_a_message_lacks_is_that_of_motion_unless_a_density_is_set(odometry, is_same):
-    with_twist, other = slam(odometry=odometry), slam(odometry=is_same)
-    for p in (with_twist, other):
-        run(p, *straight(1))
-    assert covariance_of(with_twist, RELATIVE_POSE) == pytest.approx(covariance_of(other, RELATIVE_POSE), rel=1e-12)
-
-
-def test_density_is_used_where_it_is_asked_for_whatever_the_messages_say():
-    plain, told = slam(), slam()
-    run(plain, *straight(1))
-    run(told, *(replace(m, twist_covariance=tuple(np.eye(3).ravel())) for m in straight(1)))
-    assert covariance_of(plain, RELATIVE_POSE) == pytest.approx(covariance_of(told, RELATIVE_POSE))
-
-
 # -- sightings ------------------------------------------------------------------------------------------------------
 
 
@@ -333,37 +238,6 @@ def test_a_tag_is_carried_to_the_last_keyframe_by_the_odometry_since():
     assert covariance_of(p, RELATIVE_POSE, row) == pytest.approx(expected, abs=0.03 * np.trace(expected))
 
 
-def test_a_sighting_splits_no_odometry_edge_and_makes_no_pose():
-    quiet, looking = slam(), slam()
-    run(quiet, *straight(3))
-    run(looking, *(m for o in straight(3) for m in (o, seen((o.stamp_ns - T0) / S + 0.04, point()))))
-    assert [k.stamp_ns for k in quiet.keyframes] == [k.stamp_ns for k in looking.keyframes]
-    one, other = table(quiet, RELATIVE_POSE), table(looking, RELATIVE_POSE)
-    assert one.measured.values.tobytes() == other.measured.values.tobytes()
-    assert one.sqrt_information.values.tobytes() == other.sqrt_information.values.tobytes()
-    assert looking.graph.vertex_count == len(looking.keyframes) + 1
-    assert looking.landmarks["a"].sightings == 30
-
-
-def test_a_sighting_at_a_keyframes_stamp_belongs_to_that_keyframe():
-    p = run(slam(), odometry(0, (0, 0, 0)), odometry(1, (1, 0, 0)), seen(1, point()))
-    assert table(p, LANDMARK_POSITION).vertices.values[0, 0] == p.keyframes[1].vertex
-    assert covariance_of(p, LANDMARK_POSITION) == pytest.approx(np.reshape(POINT, (2, 2)), rel=1e-4)
-
-
-def test_configured_noise_is_added_to_every_sighting():
-    p = slam(landmarks={"added_sigma_m": 0.3})
-    run(p, odometry(0, (0, 0, 0)), seen(0, point("a"), tag("b")))
-    assert covariance_of(p, LANDMARK_POSITION) == pytest.approx(np.reshape(POINT, (2, 2)) + 0.09 * np.eye(2))
-    assert covariance_of(p, RELATIVE_POSE) == pytest.approx(np.reshape(POSE, (3, 3)) + 0.09 * np.diag([1, 1, 0]))
-
-
-def test_where_the_robot_was_at_each_sighting_is_kept():
-    p, _, at_see = between_keyframes(point(), point("b"))
-    assert p.sighting_odometry() == pytest.approx(np.array([at_see]))
-    assert p.sighting_trajectory() == pytest.approx(np.array([at_see]))
-
-
 def test_a_landmark_seen_as_a_pose_first_takes_points_later():
     p = run(slam(), odometry(0, (0, 0, 0)), seen(0, tag()), odometry(1, (1, 0, 0)), seen(1, point(at=(1.0, 1.0))), *END)
     assert p.graph.kind_of(p.landmarks["a"].vertex) is SE2
@@ -403,42 +277,6 @@ def test_a_solve_comes_every_so_many_keyframes(every):
     assert p.report is None  # none of everything was asked for
 
 
-def test_by_default_every_keyframe_is_solved_for():
-    p = slam()
-    updates = [p.process(m) for m in straight(5)]
-    assert [u.solved for u in updates] == [bool(u.keyframes) and u.keyframes != (0,) for u in updates]
-
-
-def test_a_return_is_in_the_estimate_at_the_next_keyframe():
-    p = loop(slam())
-    before = p.trajectory()
-    newest = p.keyframes[-1]
-    p.process(Odometry(newest.stamp_ns + S, se2.compose(newest.T_odom_base, (0.5, 0.0, 0.0)), None))
-    assert np.abs(p.trajectory()[-2] - before[-1]).max() > 0.01
-    online = p.trajectory()
-    run(p, *END)
-    # linearised anew beyond 0.05: second order in that
-    assert p.trajectory() == pytest.approx(online, abs=5e-3)
-
-
-def test_looking_at_covariances_changes_nothing_that_comes_later(recorded, tmp_path):
-    blind, looking = GraphSlam(), GraphSlam()
-    for k, m in enumerate(recorded[:2500]):
-        assert blind.process(m) == looking.process(m)
-        if k % 7 == 0:
-            assert len(looking.landmark_covariances()) == len(looking.landmarks)
-    assert g2o(blind, tmp_path) == g2o(looking, tmp_path)
-    assert blind.counters.as_dict() == looking.counters.as_dict() == {}
-
-
-def test_the_covariance_of_a_landmark_is_unknown_until_it_is_solved_for():
-    p = run(slam(), odometry(0, (0, 0, 0)), odometry(1, (1, 0, 0)), seen(1, point(), tag("b")))
-    assert [c.shape for c in p.landmark_covariances()] == [(2, 2), (3, 3)]
-    assert np.isnan(np.concatenate([c.ravel() for c in p.landmark_covariances()])).all()
-    p.process(odometry(2, (2, 0, 0)))
-    assert all((np.linalg.eigvalsh(c) > 0.0).all() for c in p.landmark_covariances())
-
-
 def loop(p):
     """A square drive with a drift, whose first landmark returns at its end."""
     x, heading, t = (0.0, 0.0), 0.0, 0
@@ -468,13 +306,6 @@ def test_after_a_solve_the_pose_covariance_is_the_marginal_and_then_grows_with_t
     ad = se2.adjoint(se2.inverse(step))
     grown = ad @ dense @ ad.T + covariance_of(p, RELATIVE_POSE)
     assert p.pose_covariance == pytest.approx(grown, rel=1e-6, abs=1e-7)
-
-
-def test_the_first_pose_is_as_uncertain_as_its_anchor():
-    p = run(slam(anchor={"sigma_m": 0.1, "sigma_rad": 0.2}), odometry(0, (1, 2, 3)))
-    assert p.pose_covariance == pytest.approx(np.diag([0.01, 0.01, 0.04]))
-    run(p, *END)
-    assert p.pose_covariance == pytest.approx(np.diag([0.01, 0.01, 0.04]))
 
 
 def test_a_closed_loop_moves_the_map_under_the_odometry_and_halves_its_error():
@@ -525,9 +356,8 @@ def test_G7_a_solve_that_fails_is_counted_and_the_last_estimate_stays(monkeypatc
     assert p.counters["solver", "SingularError"] == 3
 
 
-@pytest.mark.parametrize("far", [1e8, 1e9])
-def test_numbers_at_the_borders_limits_leave_no_vertex_without_its_edge(far):
-    p = slam(landmarks={"loss": "none"})
+def test_numbers_at_the_borders_limits_leave_no_vertex_without_its_edge():
+    p, far = slam(landmarks={"loss": "none"}), 1e9
     huge, tiny = tuple(np.diag([1e6, 1e6, 1e3]).ravel()), tuple(1e-30 * np.eye(3).ravel())
     run(p, odometry(0, (0, 0, 0), huge), seen(0, tag(at=(far, -far, 1.0)), point("b", (far, far), (1e6, 0, 0, 1e6))))
     run(p, odometry(1e9, (far, far, 2.0), huge), seen(1e9, tag(), tag("c", covariance=tiny)))
@@ -535,38 +365,6 @@ def test_numbers_at_the_borders_limits_leave_no_vertex_without_its_edge(far):
     inside = set(np.concatenate([t.vertices.values.ravel() for t in p.graph.tables.values()]).tolist())
     assert inside == set(range(p.graph.vertex_count))
     assert np.isfinite(p.trajectory()).all()
-
-
-def test_nothing_comes_of_nothing():
-    p = run(slam(), *END)
-    assert p.trajectory().shape == p.sighting_trajectory().shape == (0, 3)
-    assert p.T_map_odom == (0.0, 0.0, 0.0)
-    assert p.newest_odometry_ns is None
-    assert summarize(p)["stop"] == "nothing_to_do"
-
-
-def test_an_update_says_what_it_changed():
-    p = slam(solve={"every_keyframes": 2})
-    assert p.process(odometry(0, (0, 0, 0))).keyframes == (0,)
-    assert not p.process(odometry(0.1, (0.01, 0, 0)))
-    assert p.process(odometry(1, (1, 0, 0))).keyframes == (1,)
-    last = p.process(odometry(2, (2, 0, 0)))
-    assert (last.keyframes, last.solved, last.report) == ((2,), True, None)
-    everything = p.process(Control("optimize"))
-    assert (everything.keyframes, everything.solved) == ((), True)
-    assert everything.report is p.report
-    assert everything.report.converged
-    assert p.solves == 2
-
-
-@pytest.mark.parametrize(
-    "make",
-    [lambda k: Sighting("a", k, (1.0, 0.0), (1.0, 0, 0, 1.0)), lambda k: Fix(1, "gps", k, (0.0, 0.0), np.eye(2))],
-)
-def test_a_kind_that_is_none_is_refused_where_it_is_written(make):
-    with pytest.raises(FormatError, match=r"'bering' is not one of .*, "):
-        make("bering")
-    assert make("position").kind == "position"
 
 
 def test_P21_of_several_faults_at_once_the_first_is_raised_and_all_count(monkeypatch):

@@ -68,16 +68,13 @@ def test_the_minimum_is_that_of_the_sum_of_both_losses(first):
     assert cost(2.0) > best.fun
 
 
-@pytest.mark.parametrize(
-    "values, complaint",
-    [
+def test_a_wrong_value_of_an_input_is_named():
+    for values, complaint in (
         ({"good.loss": "tukey"}, "good.loss: 'tukey' is not one of auto, none, huber, cauchy"),
         ({"good.loss_scale": 1.5}, "'good.loss_scale' was removed"),
         ({"good.reliability": "yes"}, "good.reliability: 'yes' is not one of auto, reliable, best_effort"),
         ({"good.durability": "latched"}, "good.durability: 'latched' is not one of volatile, transient_local"),
         ({"odom.loss": "huber"}, "odom.loss: odom is used as odometry, which has no robust loss"),
-    ],
-)
-def test_a_wrong_value_of_an_input_is_named(values, complaint):
-    with pytest.raises(ConfigError, match=complaint):
-        uses(Config.from_mapping(INPUTS | values))
+    ):
+        with pytest.raises(ConfigError, match=complaint):
+            uses(Config.from_mapping(INPUTS | values))

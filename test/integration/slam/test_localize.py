@@ -5,7 +5,7 @@ import pytest
 from driven import without_names
 
 from graph_slam_ros.runs.map_journal import state_of
-from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
+from graph_slam_ros.slam import Config, Control, GraphSlam
 from graph_slam_ros.slam.robust.ledger import Verdict
 from graph_slam_ros.tools.simulation import measurements, simulate
 
@@ -19,7 +19,7 @@ def settings(**values):
     return Control("set", tuple((name.replace("__", "."), value) for name, value in values.items()))
 
 
-HOLD, RELEASE = settings(map__localize=True), settings(map__localize=False)
+HOLD = settings(map__localize=True)
 
 
 def driven(slam, some):
@@ -55,22 +55,6 @@ def test_while_the_map_is_held_it_stays_to_the_bit_and_the_robot_is_located_in_i
     assert held.landmark_covariances()[0].max() == 0.0
 
 
-def test_a_surveyed_landmark_that_the_held_map_does_not_have_does_not_move_the_map():
-    def observed(k, *names):
-        measured = [Sighting(name, "position", (1.0, 1.0), (0.01, 0.0, 0.0, 0.01)) for name in names]
-        return [Odometry(k * 10**9, (0.5 * k, 0.0, 0.0)), Sightings(k * 10**9, "tags", tuple(measured))]
-
-    held = GraphSlam(
-        Config.from_mapping({"landmarks.surveyed": "id,x,y,sigma\ndock,9,9,0.1", "ordering.window_s": 0.0})
-    )
-    driven(held, [*observed(0, "a"), *observed(1, "a"), HOLD])
-    there, path = places(held), held.trajectory()
-    driven(held, [*observed(2, "a"), *observed(3, "a", "dock")])
-    assert places(held) == there
-    assert held.trajectory()[:2].tobytes() == path.tobytes()
-    assert held.counters.as_dict() == {"tags": {"not_in_map": 1}}
-
-
 def test_what_the_held_map_does_not_have_is_counted_and_begins_no_landmark(world):
     before, after = split(world, 0.2)
     held = driven(GraphSlam(), [*before, HOLD])
@@ -80,19 +64,6 @@ def test_what_the_held_map_does_not_have_is_counted_and_begins_no_landmark(world
     driven(held, after)
     assert set(held.landmarks) == known
     assert held.counters.as_dict()["/landmarks"]["not_in_map"] > 0
-
-
-def test_a_map_that_is_released_grows_and_is_corrected_again(world):
-    first, rest = split(world, 0.3)
-    second, third = split(rest, 0.3)
-    slam = driven(GraphSlam(), [*first, HOLD, *second])
-    there = places(slam)
-    driven(slam, [RELEASE, *third, Control("optimize")])
-    whole = driven(GraphSlam(), [*world, Control("optimize")])
-    assert set(slam.landmarks) == set(whole.landmarks)
-    assert not any(places(slam)[name] == place for name, place in there.items())
-    assert slam.trajectory()[-1, :2] == pytest.approx(whole.trajectory()[-1, :2], abs=0.15)
-    assert not len(slam.solver.held)
 
 
 def test_unnamed_sightings_are_matched_to_the_held_map_and_begin_nothing(world):

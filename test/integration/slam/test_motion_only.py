@@ -54,9 +54,7 @@ def run(config, drive, folder, monkeypatch, *, is_short):
     ("world", "settings", "least"),
     [
         ("warehouse", {}, 0.5),
-        ("warehouse", {"odometry.noise": "motion", "landmarks.association": "joint"}, 0.0),
-        ("warehouse", {"odometry.turn_factor": 1.01, "odometry.noise": "density"}, 0.0),
-        ("warehouse", {"ordering.window_s": 0.4, "map.localize": False}, 0.3),
+        ("warehouse", {"ordering.window_s": 0.4, "odometry.turn_factor": 1.01, "odometry.noise": "density"}, 0.0),
         ("flight", {"world.dimensions": 3}, 0.4),
     ],
 )

@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 from reliability import times
 
-from graph_slam_ros.lie import se2
 from graph_slam_ros.slam import Config, Control, Fix, GraphSlam, Odometry, Sighting, Sightings
-from graph_slam_ros.tools.simulation import simulate, write_bag
 
 S = 10**9
 T0 = 1_700_000_000 * S
@@ -43,27 +41,13 @@ def parked(seconds, jitter_rad, jitter_m, rng, hz=20):
             yield Sightings(T0 + k * S // hz, "camera", tuple(seen))
 
 
-@pytest.mark.parametrize("jitter_rad, jitter_m", [(2e-3, 0.0), (2e-3, 1e-3), (0.0, 2e-3)])
+@pytest.mark.parametrize("jitter_rad, jitter_m", times([(2e-3, 1e-3)], [(2e-3, 0.0), (2e-3, 1e-3), (0.0, 2e-3)]))
 def test_a_parked_robot_whose_odometry_jitters_gets_no_keyframes(jitter_rad, jitter_m):
     p = run(slam(), *parked(120, jitter_rad, jitter_m, np.random.default_rng(1)))
     assert len(p.keyframes) <= 2
     seen = len(p.sighting_poses)
     assert 115 <= seen <= 180, "one a second, once it rests"
     assert p.counters["camera", "thinned"] > 2 * 1000
-
-
-def test_slow_driving_is_no_jitter():
-    steps = [Odometry(T0 + k * S // 10, (2e-3 * k, 0.0, 0.0)) for k in range(600)]  # 2 cm/s
-    p = run(slam(), *steps)
-    assert len(p.keyframes) >= 1.2 / 0.25
-    reached = np.sqrt(p.pose_covariance[0, 0])
-    assert reached == pytest.approx(np.sqrt(1e-4 * 60.0 + 2e-3 * 1.2), rel=0.05), "its noise grows all the time"
-
-
-def test_a_robot_that_creeps_by_less_than_its_jitter_a_second_is_believed_to_move():
-    steps = [Odometry(T0 + k * S // 10, (3e-4 * k, 0.0, 0.0)) for k in range(1200)]  # 3 mm/s, 0.36 m
-    p = run(slam(), *steps)
-    assert np.sqrt(p.pose_covariance[0, 0]) > 0.5 * 0.02 * np.sqrt(120.0)
 
 
 def test_an_imu_at_50_hz_makes_no_keyframe_each():
@@ -95,27 +79,6 @@ def test_errors_that_last_do_not_average_out():
     assert sigmas[1000.0] == pytest.approx(0.02, rel=0.05)
 
 
-def test_the_noise_of_a_recorded_imu_is_honest_and_its_drive_better_than_odometry(tmp_path):
-    from graph_slam_ros.runs.replay import replay
-
-    settings = {"inputs.names": "odom imu", "imu.type": "sensor_msgs/msg/Imu", "imu.correlation_s": 5.0}
-    inside, off, odometry_off = [], [], []
-    for seed in times((2,), (1, 2)):
-        recording = simulate("warehouse", seed, laps=1, landmarks=False, imu=50)
-        write_bag(recording, tmp_path / f"{seed}.mcap")
-        done = replay(tmp_path / f"{seed}.mcap", tmp_path / f"run{seed}", Config.from_mapping(settings))
-        at = np.searchsorted(recording.stamps_ns, done.slam.keyframes.stamps_ns)
-        true = recording.T_world_base[at, 2]
-        wrong = se2.wrap(done.slam.trajectory()[:, 2] - true)
-        sigma = np.sqrt(done.slam.keyframe_covariances()[:, 2, 2])
-        inside.append(np.mean((wrong / sigma) ** 2))
-        off.append(np.abs(wrong).mean())
-        first = recording.T_world_base[0, 2]
-        odometry_off.append(np.abs(se2.wrap(done.slam.keyframes.poses[:, 2] + first - true)).mean())
-    assert np.mean(inside) < 2.0
-    assert np.mean(off) < 0.5 * np.mean(odometry_off)
-
-
 def past_tags(p, speed):
     """Straight on for 12 s, with a camera that sees tags at 12 Hz."""
     rng, hz = np.random.default_rng(2), 60
@@ -133,14 +96,10 @@ def past_tags(p, speed):
     return run(p)
 
 
-@pytest.mark.parametrize("speed, heading, most", [(0.4, 0.02, 7.0), (0.4, 0.05, 15.5), (1.5, 0.05, 4.5)])
+@pytest.mark.parametrize(
+    "speed, heading, most", times([(1.5, 0.05, 4.5)], [(0.4, 0.02, 7.0), (0.4, 0.05, 15.5), (1.5, 0.05, 4.5)])
+)
 def test_a_camera_that_sees_tags_at_12_hz_makes_no_keyframe_at_each_sighting(speed, heading, most):
     p = past_tags(slam(**{"odometry.rotation_density": heading}), speed)
     assert len(p.keyframes) / (speed * 12.0) < most
     assert np.abs(p.trajectory()[:, 1]).max() < 0.05
-
-
-def test_looks_in_quick_succession_get_keyframes_where_odometry_is_worse_than_the_camera():
-    """Carried to one keyframe they would share its noise, which no covariance tells: the result would seem too good."""
-    p = past_tags(slam(**{"odometry.translation_density": 0.3}), 0.4)
-    assert len(p.keyframes) > 0.95 * 12 * 12

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
-from graph_slam_ros.measurements import edge_noise
 from graph_slam_ros.slam import Closure, Config, Control, GraphSlam, Odometry, Sighting, Sightings
 from graph_slam_ros.slam.frontend.max_distance import MaxDistance, off_the_pole
 
@@ -76,9 +75,7 @@ def test_a_detection_at_1e8_m_is_refused_and_changes_nothing(dimensions, associa
     assert replayed.counters.as_dict()[SOURCE]["beyond_max_distance"] == 4 * RATE
 
 
-@pytest.mark.parametrize(
-    "dimensions, association, axis", [(2, "id", 0), (2, "joint", -1), (3, "id", -1), (3, "joint", 0)]
-)
+@pytest.mark.parametrize("dimensions, association, axis", [(2, "joint", -1), (3, "id", -1)])
 def test_where_it_is_allowed_to_see_so_far_every_solve_still_succeeds(dimensions, association, axis):
     config = settings(dimensions, association, **{f"{SOURCE}.max_distance_m": 1e9})
     far = np.zeros(dimensions)
@@ -87,27 +84,6 @@ def test_where_it_is_allowed_to_see_so_far_every_solve_still_succeeds(dimensions
     assert not slam.failing
     assert "solver" not in slam.counters.as_dict()
     assert np.linalg.norm(slam.trajectory()[-1][: len(at)] - at) < 0.1
-
-
-def test_an_edge_that_was_held_back_goes_with_its_landmark_when_that_is_quarantined(monkeypatch):
-    """Numbers that no solve resolves: with nothing added to the noise of what is far, the landmark is taken out."""
-    monkeypatch.setattr(edge_noise, "_FINEST", 0.0)
-    slam = GraphSlam(settings(3, **{f"{SOURCE}.max_distance_m": 1e9, "solve.every_keyframes": 8}))
-    marks, covariance = np.random.default_rng(0).uniform(-10.0, 10.0, (12, 3)), tuple((np.eye(3) * 0.0025).ravel())
-    for k in range(150):
-        at, turn, whole = pose(3, k / RATE)
-        slam.process(Odometry(S + k * S // RATE, whole))
-        seen = [(f"m{j}", turn.T @ (mark - at)) for j, mark in enumerate(marks)]
-        seen += [("far", np.array([9e8, 0.0, 0.0]))] * (50 <= k < 100)
-        items = (Sighting(name, "position", tuple(map(float, z)), covariance) for name, z in seen)
-        slam.process(Sightings(S + k * S // RATE, SOURCE, tuple(items)))
-    for event in ("end", "optimize"):
-        slam.process(Control(event))
-    counted = slam.counters.as_dict()
-    assert counted["landmarks"]["quarantined"] > 0
-    assert counted["solver"].keys() == {"SingularError"}
-    assert not slam.failing
-    assert np.linalg.norm(slam.trajectory()[-1][:3] - at) < 0.1
 
 
 # -- the limit ---------------------------------------------------------------------------------------------------------
@@ -149,8 +125,9 @@ def test_a_closure_farther_than_any_is_refused_and_counted():
 # -- straight up and down ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", ["bearing", "range_bearing"])
-@pytest.mark.parametrize("height, aside", list(itertools.product((5.0, -2.0), (0.0, 1e-7, 0.02))))
+@pytest.mark.parametrize(
+    "kind, height, aside", [("bearing", 5.0, 0.0), ("range_bearing", -2.0, 1e-7), ("bearing", -2.0, 0.02)]
+)
 def test_a_landmark_at_the_zenith_or_nadir_is_found_and_every_solve_succeeds(kind, height, aside):
     slam, mark, rng = GraphSlam(settings(3)), np.array([1.5, aside, height]), np.random.default_rng(1)
     for k in range(60):

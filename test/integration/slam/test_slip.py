@@ -6,15 +6,12 @@ import numpy as np
 import pytest
 from reliability import tell, times
 
-from graph_slam_ros.lie import se2, se3
+from graph_slam_ros.lie import se2
 from graph_slam_ros.measurements.types import Odometry
 from graph_slam_ros.runs.restore import map_of, record_run
 from graph_slam_ros.slam import Config, Control, GraphSlam
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict
-from graph_slam_ros.slam.robust.odometry_filter import OdometryFilter
-from graph_slam_ros.slam.robust.odometry_hypotheses import HypothesisTest
 from graph_slam_ros.slam.slip_review import Slip
-from graph_slam_ros.solver import left_out
 from graph_slam_ros.tools.simulation import Fault, faulty_recording, measurements, simulate
 
 LONG = times(False, True)
@@ -43,16 +40,14 @@ def errors(slam, recording):
     return np.linalg.norm((slam.trajectory() - true)[:, :2], axis=1)
 
 
-def driven(recording):
-    slam = GraphSlam(Config())
+def driven(recording, until_ns=None, slam=None):
+    slam = slam or GraphSlam(Config())
     for m in measurements(recording):
+        if until_ns is not None and m.stamp_ns > until_ns:
+            return slam
         slam.process(m)
     slam.process(Control("end"))
     return slam
-
-
-def edges_of_odometry(slam):
-    return slam.graph.edges_of("odometry").tolist()[-20:]
 
 
 def rms(values):
@@ -109,26 +104,6 @@ def assert_replaced(slam, slips, tmp_path):
     assert again.ledger.reason.values.tolist() == ledger.reason.values.tolist()
 
 
-@pytest.mark.parametrize("seed", times([2], range(1, 21)))
-def test_in_space_a_slip_is_found_and_ends(seed):
-    clean = simulate("flight", seed=seed, laps=2)
-    recording, begin_ns = slipping(clean, at=0.6, seconds=8.0)
-    slam = GraphSlam(Config.from_mapping({"world.dimensions": 3}))
-    for m in [*measurements(recording), Control("end")]:
-        slam.process(m)
-    slips = [one for one in slam.alarms if isinstance(one, Slip)]
-    assert {one.kind for one in slips} == {"translation"}
-    assert (slips[0].decided_ns - begin_ns) * 1e-9 < 5.0
-    assert slam.displaced is None
-    assert (slips[-1].ended_ns - begin_ns) * 1e-9 < 8.0 + 5.0
-    first = se3.compose(tuple(clean.T_odom_base[0]), se3.inverse(tuple(clean.T_world_base[0])))
-    stamps_ns = slam.keyframes.stamps_ns
-    at = np.searchsorted(clean.stamps_ns, stamps_ns, side="right") - 1
-    true = np.array([se3.compose(first, tuple(pose)) for pose in clean.T_world_base[at]])
-    wrong = np.linalg.norm((slam.trajectory() - true)[:, :3], axis=1)
-    assert rms(wrong[stamps_ns > begin_ns]) < 1.2 * rms(wrong[stamps_ns <= begin_ns]) + 0.05
-
-
 def followed(recording, clean, begin_ns):
     """A drive, its errors before a stamp at each later stamp until odometry is doubted, and when it is [s]."""
     slam, before, told_s = GraphSlam(Config()), {}, None
@@ -142,61 +117,37 @@ def followed(recording, clean, begin_ns):
 
 
 @SOAKED
-@pytest.mark.parametrize("seed", range(1, 21))
-@pytest.mark.parametrize("kind", ["slip", "carried"])
-def test_slip_and_carried_are_told_apart_within_five_seconds(kind, seed):
+@pytest.mark.parametrize("seed", times([1], range(1, 21)))
+def test_slip_and_carried_are_told_apart_within_five_seconds(seed):
     """Closures move the path before by up to 0.6 m, in the clean drive, too: so the two are compared."""
     clean = world(seed, aisle_m=40.0, aisles=3)
-    recording, begin_ns = slipping(clean, seconds=20.0)
-    if kind == "carried":
-        recording, _ = faulty_recording(clean, [Fault.named("carried", at=0.7, distance_m=30.0)], seed=1)
-    slam, found, told_s = followed(recording, clean, begin_ns)
+    slid, begin_ns = slipping(clean, seconds=20.0)
+    lifted, _ = faulty_recording(clean, [Fault.named("carried", at=0.7, distance_m=30.0)], seed=1)
     without, good, _ = followed(clean, clean, begin_ns)
-    assert told_s < 5.0
-    both = [(found[stamp_ns], good[stamp_ns]) for stamp_ns in sorted(found.keys() & good.keys())]
-    bend_m = max(rms(one) - rms(other) for one, other in both)
-    bend_most_m = max(float(np.max(one - other)) for one, other in both)
-    after = [rms(errors(one, clean)[one.keyframes.stamps_ns > begin_ns + 25 * 10**9]) for one in (slam, without)]
-    worst = {"told_s": told_s, "bend_m": bend_m, "bend_most_m": bend_most_m, "after": after[0] / after[1]}
-    tell(f"{kind} of 20 s", drives=1, worst=worst)
-    assert (slam.counters[SLIP] > 0, slam.counters["odometry", "displaced"] > 0) == (kind == "slip", kind == "carried")
-    assert bend_m < 0.05
-    assert bend_most_m < 0.15
-    assert after[0] < (1.5 if kind == "slip" else 1.2) * after[1] + 0.05
+    for kind, recording in (("slip", slid), ("carried", lifted)):
+        slam, found, told_s = followed(recording, clean, begin_ns)
+        assert told_s < 5.0
+        both = [(found[stamp_ns], good[stamp_ns]) for stamp_ns in sorted(found.keys() & good.keys())]
+        bend_m = max(rms(one) - rms(other) for one, other in both)
+        bend_most_m = max(float(np.max(one - other)) for one, other in both)
+        after = [rms(errors(one, clean)[one.keyframes.stamps_ns > begin_ns + 25 * 10**9]) for one in (slam, without)]
+        worst = {"told_s": told_s, "bend_m": bend_m, "bend_most_m": bend_most_m, "after": after[0] / after[1]}
+        tell(f"{kind} of 20 s", drives=1, worst=worst)
+        counted = slam.counters[SLIP] > 0, slam.counters["odometry", "displaced"] > 0
+        assert counted == (kind == "slip", kind == "carried")
+        assert bend_m < 0.05
+        assert bend_most_m < 0.15
+        assert after[0] < (1.5 if kind == "slip" else 1.2) * after[1] + 0.05
 
 
 @SOAKED
-@pytest.mark.parametrize("seed", range(100))
+@pytest.mark.parametrize("seed", times([0], range(100)))
 def test_clean_drives_of_ten_minutes_have_no_slip(seed):
     kind = ("warehouse", "manhattan")[seed % 2]
     options = {"aisles": 3, "aisle_m": 40.0, "laps": 4} if kind == "warehouse" else {"poses": 500, "blocks": 8}
     slam = driven(simulate(kind, seed=seed, **options))
     tell("slips on clean drives", drives=1, alarms=slam.counters[SLIP])
     assert slam.counters[SLIP] == 0
-
-
-@SOAKED
-@pytest.mark.parametrize(("loss", "within_s"), [(0.3, 2.0), (0.2, 4.0)])
-@pytest.mark.parametrize("seed", [5001, 5004])
-def test_a_slip_is_found_soon_and_is_no_displacement(seed, loss, within_s):
-    """The residuals of the clean drive before it raise no alarm, so they use up no comparison."""
-    recording, begin_ns = slipping(world(seed, aisle_m=40.0, aisles=3), seconds=20.0, loss=loss)
-    slam = GraphSlam(Config())
-    for m in measurements(recording):
-        if m.stamp_ns > begin_ns + within_s * 10**9:
-            break
-        slam.process(m)
-    assert slam.counters[SLIP] == 1
-    assert slam.segments == [0]
-    slip = slam.alarms[0]
-    assert isinstance(slip, Slip)
-    assert abs(slip.began_ns - begin_ns) < 10**9
-
-
-def test_turns_that_are_as_wrong_as_odometry_says_are_no_slip():
-    """Steps of 2 s whose turn has a sigma of 20 degrees: what is seen at 15 m is not linear in such a turn."""
-    recording = simulate("pythonrobotics", seed=5023, poses=40)
-    assert driven(recording).counters[SLIP] == 0
 
 
 def test_a_burst_of_wrong_identities_and_a_moved_landmark_are_no_slip():
@@ -217,96 +168,45 @@ def test_a_burst_of_wrong_identities_and_a_moved_landmark_are_no_slip():
     assert slam.segments == [0]
 
 
-def test_a_copy_solved_without_the_sightings_decides_alike(monkeypatch):
-    """A hypothesis is left only where the best so far is likelier."""
-    recording, begin_ns = slipping(world(3))
-    whole, left, added = OdometryFilter.log_likelihood, [], HypothesisTest._add
-
-    def compared(filtered, errors, first, without=None, above=-np.inf):
-        found = whole(filtered, errors, first, without, above)
-        if above > -np.inf:
-            everything = whole(filtered, errors, first)
-            assert found == everything or (found == -np.inf and everything <= above + 1e-6)
-            left.append(found == -np.inf)
-        return found
-
-    def known(test, kind, first, errors, log_odds):
-        before = test._best
-        added(test, kind, first, errors, log_odds)
-        gain = whole(test._filter, errors, first) - test._likelihood + log_odds
-        assert test._best[0] == max(before[0], gain)
-
-    def slips():
-        slam = GraphSlam(Config())
-        for m in measurements(recording):
-            if m.stamp_ns > begin_ns + 12 * 10**9:
-                break
-            slam.process(m)
-        return [one for one in slam.alarms if isinstance(one, Slip)]
-
-    with monkeypatch.context() as patch:
-        patch.setattr(OdometryFilter, "log_likelihood", compared)
-        patch.setattr(HypothesisTest, "_add", known)
-        fast = slips()
-    assert fast
-    assert 0.2 < np.mean(left) < 1.0
-    monkeypatch.setattr(left_out, "_LEAST_PIVOT", 2.0)  # more than there can be
-    copied = slips()
-    assert [replace(one, evidence=0.0) for one in copied] == [replace(one, evidence=0.0) for one in fast]
-    assert [one.evidence for one in copied] == pytest.approx([one.evidence for one in fast], rel=0.05)
-    assert [one.evidence for one in copied] != [one.evidence for one in fast]
+def doubt(slam, links, now_ns, **ended):
+    """Put a slip into a pipeline where none was."""
+    slip = Slip("translation", links[0].stamps_ns[0], now_ns, 20.0, 2, **ended)
+    detector = slam._kidnaps._slips
+    detector.slips.append(slip)
+    detector._replace(links, slip, len(slam.keyframes) - 1)
 
 
 def test_a_slip_that_was_none_is_taken_back_and_leaves_no_trace():
-    recording = world(3)
+    """By what is seen next, or where it has ended when everything is solved."""
+    recording = world(3, laps=1)
     half = int(recording.stamps_ns[len(recording.stamps_ns) // 2])
-    plain, doubted = GraphSlam(Config()), GraphSlam(Config())
-    is_forced = False
+    plain, doubted, ended = (GraphSlam(Config()) for _ in range(3))
+    detector, links = doubted._kidnaps._slips, None
     for m in measurements(recording):
-        plain.process(m)
-        doubted.process(m)
-        if not is_forced and isinstance(m, Odometry) and m.stamp_ns > half:
-            is_forced = True
-            detector = doubted._kidnaps._slips
+        for slam in (plain, doubted, ended):
+            slam.process(m)
+        if links is None and isinstance(m, Odometry) and m.stamp_ns > half:
             links = list(detector._links)[-3:]
-            slip = Slip("translation", links[0].stamps_ns[0], m.stamp_ns, 20.0, 2)
-            detector.slips.append(slip)
-            detector._replace(links, slip, len(doubted.keyframes) - 1)
+            doubt(doubted, links, m.stamp_ns)
             assert "odometry in doubt since" in str(doubted.displaced)
             assert all(detector.active(link.own) == link.edge != link.own for link in links)
-        if is_forced and doubted.displaced is None:
+            doubt(ended, list(ended._kidnaps._slips._links)[-5:], m.stamp_ns, ended_ns=m.stamp_ns + 1)
+        if links is not None and doubted.displaced is None:
             break
-    assert doubted.counters[TAKEN_BACK] == 1
-    own = {edge for edge in edges_of_odometry(doubted) if doubted.ledger.reason.values[edge] != Reason.REVOKED}
-    assert {detector.active(edge) for edge in edges_of_odometry(doubted)} <= own
-    assert "taken back" in str(doubted.alarms[0])
-    for slam in (plain, doubted):
+    edges = doubted.graph.edges_of("odometry")
+    reasons = doubted.ledger.reason.values[edges]
+    own = set(edges[reasons != Reason.REVOKED].tolist())
+    assert {detector.active(edge) for edge in edges.tolist()[-20:]} <= own
+    assert ended.counters[TAKEN_BACK] == 0
+    for slam in (plain, doubted, ended):
+        slam.process(Control("optimize"))
         slam.solver.optimize(slam.solver.settings.until_still())
-    assert np.abs(plain.trajectory() - doubted.trajectory()).max() < 1e-6
-    reasons = doubted.ledger.reason.values[doubted.graph.edges_of("odometry")]
-    assert set(reasons.tolist()) == {Reason.NONE, Reason.REVOKED}
-
-
-def test_a_slip_that_has_ended_is_taken_back_when_everything_is_solved():
-    recording, slam = world(3), GraphSlam(Config())
-    half = int(recording.stamps_ns[len(recording.stamps_ns) // 2])
-    for m in measurements(recording):
-        if m.stamp_ns > half + 20 * 10**9:
-            break
-        slam.process(m)
-        detector = slam._kidnaps._slips
-        if not detector.slips and isinstance(m, Odometry) and m.stamp_ns > half:
-            links = list(detector._links)[-5:]
-            began_ns = links[0].stamps_ns[0]
-            detector.slips.append(Slip("translation", began_ns, m.stamp_ns, 20.0, 2, ended_ns=m.stamp_ns + 1))
-            detector._replace(links, detector.slips[-1], len(slam.keyframes) - 1)
-    assert slam.counters[TAKEN_BACK] == 0
-    slam.process(Control("optimize"))
-    assert slam.counters[TAKEN_BACK] == 1
-    (slip,) = slam.alarms
-    assert slip.edges == 0
-    assert "taken back: all measurements together agree with odometry" in str(slip)
-    edges = slam.graph.edges_of("odometry")
-    reasons = slam.ledger.reason.values[edges].tolist()
-    assert set(reasons) == {Reason.NONE, Reason.REVOKED}
-    assert reasons.count(Reason.REVOKED) == len(links)
+    assert "taken back: all measurements together agree with odometry" in str(ended.alarms[0])
+    for slam, count in ((doubted, 3), (ended, 5)):
+        assert slam.counters[TAKEN_BACK] == 1
+        (slip,) = slam.alarms
+        assert (slip.edges, "taken back" in str(slip)) == (0, True)
+        assert np.abs(plain.trajectory() - slam.trajectory()).max() < 1e-6
+        reasons = slam.ledger.reason.values[slam.graph.edges_of("odometry")].tolist()
+        assert set(reasons) == {Reason.NONE, Reason.REVOKED}
+        assert reasons.count(Reason.REVOKED) >= count

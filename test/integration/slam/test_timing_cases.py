@@ -84,7 +84,7 @@ def test_B1_whatever_the_order_within_the_window_and_what_comes_twice_the_saved_
     in_order = run(GraphSlam(config), *recorded, *END)
     expected = saved(in_order, tmp_path / "in_order")
     assert in_order.counters.as_dict() == {}
-    tries = times(3, 2000)
+    tries = times(2, 2000)
     for seed in range(tries):
         rng = np.random.default_rng(seed)
         # the first odometry decides where the map begins: nothing of it may be overtaken by 50 ms of stamp time
@@ -111,20 +111,19 @@ INPUTS = {
 }
 
 
-@pytest.mark.parametrize("name", INPUTS)
-def test_B4_a_zero_stamp_is_refused_on_every_topic(name):
-    made, cdr = INPUTS[name]
-    b = made()
-    assert heard(b, name, cdr(0)) is None
-    assert counted(b) == {name: {"zero_stamp": 1}}
-    assert heard(b, name, cdr(STAMP_NS)).stamp_ns == STAMP_NS
+def test_B4_a_zero_stamp_is_refused_on_every_topic():
+    for name, (made, cdr) in INPUTS.items():
+        b = made()
+        assert heard(b, name, cdr(0)) is None, name
+        assert counted(b) == {name: {"zero_stamp": 1}}
+        assert heard(b, name, cdr(STAMP_NS)).stamp_ns == STAMP_NS, name
 
 
-@pytest.mark.parametrize("changes", [{"nanosec": 10**9}, {"nanosec": 2**32 - 1}, {"sec": -1}])
-def test_B5_a_stamp_that_is_none_is_refused(changes):
-    b = border()
-    assert heard(b, "odom", odometry(**changes)) is None
-    assert counted(b) == {"odom": {"bad_stamp": 1}}
+def test_B5_a_stamp_that_is_none_is_refused():
+    for changes in ({"nanosec": 10**9}, {"nanosec": 2**32 - 1}, {"sec": -1}):
+        b = border()
+        assert heard(b, "odom", odometry(**changes)) is None, changes
+        assert counted(b) == {"odom": {"bad_stamp": 1}}
 
 
 def test_B3_odometry_of_one_stamp_is_used_once_and_counted_by_whether_it_differs():
@@ -250,7 +249,7 @@ def test_B19_where_nothing_is_seen_odometry_goes_on_and_the_covariance_grows():
     assert grown[-1] > 10.0 * grown[0]
 
 
-@pytest.mark.parametrize("hz", [1, 10, 1000])
+@pytest.mark.parametrize("hz", [1, 100])
 def test_B21_however_often_odometry_comes_keyframes_come_by_the_way_and_not_by_messages(hz):
     p = run(slam(keyframes__min_distance_m=0.99, keyframes__max_interval_s=100.0), *straight(0, 20, hz=hz))
     assert len(p.keyframes) == 21

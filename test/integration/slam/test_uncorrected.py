@@ -1,8 +1,6 @@
 """A clock, a mount or a scale that is off and that nothing corrects is told, and its setting mends it."""
 
-import gc
 import json
-import weakref
 from dataclasses import replace
 
 import numpy as np
@@ -20,6 +18,7 @@ from graph_slam_ros.runs.outcome import doubts
 from graph_slam_ros.slam import Config, Control, GraphSlam, Sightings
 from graph_slam_ros.tools.simulation import simulate, write_bag
 
+SOAKED = pytest.mark.skipif(not times(0, 1), reason="only in make soak")
 SURE = {"odometry.translation_density": 1e-3, "odometry.lateral_density": 1e-3}
 WRONG = [
     (Faults(clock_s=0.2), {}, "clock_offset", 0.2, "detections.offset_s"),
@@ -36,71 +35,47 @@ def nees(slam, truth, covariances):
     return float(np.mean(np.einsum("ni,nij,nj->n", every, np.linalg.pinv(covariances), every)))
 
 
-@pytest.mark.parametrize(("faults", "settings", "code", "value", "key"), WRONG)
-def test_what_is_off_is_told_with_its_sigma_and_the_setting_mends_it(faults, settings, code, value, key):
-    drive, truth = imperfect_drive_and_truth(faults, seconds=60.0)
-    slam = driven(drive, settings)
-    (one,) = slam.uncorrected()
-    assert (one.code, one.setting[0]) == (code, key)
-    assert one.value == pytest.approx(value, abs=max(0.015, 4.0 * one.sigma))
-    assert code in str(one)
-    if key == "detections.offset_s":  # which is applied where messages are read
-        drive, truth = imperfect_drive_and_truth(Faults(clock_s=faults.clock_s - one.value), seconds=60.0)
-        mended = driven(drive, settings)
-    else:
-        mended = driven(drive, settings | dict([one.setting]))
-    assert not mended.uncorrected()
-    assert not mended.contradicted
-    assert nees(mended, truth, of_noise(mended)) < 0.5 * nees(slam, truth, of_noise(slam))
-
-
 def of_noise(slam):
     """Covariances (n, 3, 3) of the keyframes that take all parameters for known."""
     return np.array(slam.solver.marginal(slam.keyframes.ids))
 
 
 @pytest.mark.parametrize("seed", range(times(1, 4)))
-@pytest.mark.parametrize(("faults", "settings"), [one[:2] for one in WRONG])
-def test_covariances_contain_what_is_off(faults, settings, seed):
+@pytest.mark.parametrize(("faults", "settings", "code", "value", "key"), WRONG)
+def test_what_is_off_is_told_with_its_sigma_covariances_contain_it_and_the_setting_mends_it(
+    faults, settings, code, value, key, seed
+):
     drive, truth = imperfect_drive_and_truth(faults, seed=seed, seconds=60.0)
     slam = driven(drive, settings)
-    off = {sentence.split(" of ")[0] for sentence in slam.contradicted}
-    assert off == {"distance", "turn", "clock", "yaw", "x", "y"}
-    of_said = nees(slam, truth, slam.keyframe_covariances())
-    assert of_said < min(6.0, 0.2 * nees(slam, truth, of_noise(slam)))  # 3 is expected
-    wider = np.linalg.eigvalsh(slam.keyframe_covariances() - of_noise(slam))
-    assert wider.min() > -1e-9
+    noise = of_noise(slam)
+    assert {sentence.split(" of ")[0] for sentence in slam.contradicted} == {
+        *("distance", "turn", "clock", "yaw", "x", "y")
+    }
+    by_noise = nees(slam, truth, noise)
+    assert nees(slam, truth, slam.keyframe_covariances()) < min(6.0, 0.2 * by_noise)  # 3 is expected
+    assert np.linalg.eigvalsh(slam.keyframe_covariances() - noise).min() > -1e-9
     assert slam.pose_covariance == pytest.approx(slam.keyframe_covariances()[-1])
+    if seed:
+        return  # covariances are a matter of many drives
+    (one,) = slam.uncorrected()
+    assert (one.code, one.setting[0]) == (code, key)
+    assert one.value == pytest.approx(value, abs=max(0.015, 4.0 * one.sigma))
+    assert code in str(one)
+    if key == "detections.offset_s":  # which is applied where messages are read
+        assert_the_node_says_so(slam)
+        drive, truth = imperfect_drive_and_truth(Faults(clock_s=faults.clock_s - one.value), seed=seed, seconds=60.0)
+        mended = driven(drive, settings)
+    else:
+        mended = driven(drive, settings | dict([one.setting]))
+    assert not mended.uncorrected()
+    assert not mended.contradicted
+    assert nees(mended, truth, of_noise(mended)) < 0.5 * by_noise
 
 
-def test_a_clock_that_is_off_beyond_doubt_is_told_though_its_sigma_is_too_large_to_correct_it():
-    """Odometry with the default noise, five times as large as that of this drive, leaves the clock unsure."""
-    drive, _, faults = random_drive("wrong calibration", 7016)
-    slam = GraphSlam(Config())
-    for measurement in (*drive, Control("end"), Control("optimize")):
-        slam.process(measurement)
-    _, findings = slam.trial_fit()
-    assert next(one for one in findings if one.parameter.name == "clock").verdict == "not_determined"
-    (one,) = [one for one in slam.uncorrected() if one.code == "clock_offset"]
-    assert one.sigma > 0.03
-    assert one.value == pytest.approx(faults.clock_s, abs=3.0 * one.sigma)
-
-
-@pytest.mark.parametrize("kind", ["range_bearing", "position", "range"])
-@pytest.mark.parametrize("seed", range(times(1, 4)))
-def test_nothing_is_told_of_a_drive_with_nothing_wrong(kind, seed):
-    slam = driven(imperfect_drive_and_truth(Faults(), seed=seed, seconds=40.0, kind=kind)[0])
-    assert not slam.uncorrected()
-    assert not slam.contradicted
-    np.testing.assert_array_equal(slam.keyframe_covariances(), of_noise(slam))
-
-
-def test_the_node_is_degraded_by_the_same_words():
+def assert_the_node_says_so(slam):
     """Trials begin at keyframes 50, 100, 200; what they find is told 20 keyframes later, and corrects nothing."""
-    slam = driven(imperfect_drive_and_truth(Faults(clock_s=0.2), seconds=60.0)[0])
     assert np.trace(slam.pose_covariance) > 2.0 * np.trace(slam.solver.marginal(slam.keyframes.ids[-1:])[0])
     (one,) = slam.uncorrected_so_far
-    assert one.code == "clock_offset"
     of = {"is_confirmed": True, "is_resumed": False, "solve_s": 0.0, "slowest_solve_s": 0.0, "fit": 1.0, "doubted": ""}
     estimate = Estimate.of(slam, slam.correction, unseen=UnseenWay(0, 0), **of)
     health = judge(Facts("active", estimate=estimate), Config())
@@ -114,14 +89,27 @@ def test_the_node_is_degraded_by_the_same_words():
     assert "clock of detections 0.2" in calibration.message
 
 
-def test_a_factor_that_noise_explains_is_no_error_of_the_configuration(tmp_path):
-    """Headings are wrong by 0.3 rad a step, so the fit with the places of sensors has half of each turn."""
-    bag, run = tmp_path / "drive.mcap", tmp_path / "run"
-    write_bag(simulate("pythonrobotics", 1, poses=100), bag)
-    bag = planted(bag, tmp_path / "turned.mcap", "mount turned -10 degrees")
-    assert main(["replay", str(bag), "--out", str(run)]) in (0, 3)
-    off = json.loads((run / "run.json").read_text())["contradicted"]
-    assert [one.split(" of ")[0] for one in off] == ["distance", "clock", "yaw", "x", "y"]
+@SOAKED
+def test_a_clock_that_is_off_beyond_doubt_is_told_though_its_sigma_is_too_large_to_correct_it():
+    """Odometry with the default noise, five times as large as that of this drive, leaves the clock unsure."""
+    drive, _, faults = random_drive("wrong calibration", 7016)
+    slam = GraphSlam(Config())
+    for measurement in (*drive, Control("end"), Control("optimize")):
+        slam.process(measurement)
+    _, findings = slam.trial_fit()
+    assert next(one for one in findings if one.parameter.name == "clock").verdict == "not_determined"
+    (one,) = [one for one in slam.uncorrected() if one.code == "clock_offset"]
+    assert one.sigma > 0.03
+    assert one.value == pytest.approx(faults.clock_s, abs=3.0 * one.sigma)
+
+
+@pytest.mark.parametrize("kind", times(["range_bearing"], ["range_bearing", "position", "range"]))
+@pytest.mark.parametrize("seed", range(times(1, 4)))
+def test_nothing_is_told_of_a_drive_with_nothing_wrong(kind, seed):
+    slam = driven(imperfect_drive_and_truth(Faults(), seed=seed, seconds=40.0, kind=kind)[0])
+    assert not slam.uncorrected()
+    assert not slam.contradicted
+    np.testing.assert_array_equal(slam.keyframe_covariances(), of_noise(slam))
 
 
 @pytest.fixture(scope="module")
@@ -135,9 +123,12 @@ def laps(tmp_path_factory):
     ("fault", "code", "words"),
     [
         ("mount turned -10 degrees", "mount_yaw", "its sensor is turned by -"),
+    ]
+    + [
         ("sensor 0.3 m to the left of its mount", "mount_place", "its sensor is 0.3"),
         ("sensor 0.4 m behind its mount", "mount_place", "m further back than its mount says"),
-    ],
+    ]
+    * times(0, 1),
 )
 def test_the_end_of_a_replay_names_a_wrong_mount(laps, tmp_path, capsys, fault, code, words):
     bag, run = planted(laps, tmp_path / "faulty.mcap", fault), tmp_path / "run"
@@ -156,7 +147,7 @@ def test_the_end_of_a_replay_names_a_wrong_mount(laps, tmp_path, capsys, fault, 
 
 
 def test_a_clock_that_was_set_on_the_way_is_told():
-    drive, _ = imperfect_drive_and_truth(Faults(), seconds=90.0)
+    drive, _ = imperfect_drive_and_truth(Faults(), seconds=60.0)
     middle_ns = drive[len(drive) // 2].stamp_ns
     late = [
         replace(m, stamp_ns=m.stamp_ns + 300_000_000) if isinstance(m, Sightings) and m.stamp_ns > middle_ns else m
@@ -175,26 +166,3 @@ def test_an_error_of_the_recording_makes_a_fit_meaningless():
     summary = {"counters": {}, "inputs": {}, "uncorrected": [off]}
     assert len(list(doubts(summary))) == 1
     assert not list(doubts(summary | {"check": {"severity": "error"}}))
-
-
-def test_trials_that_nobody_asks_for_are_not_kept():
-    drive, _ = imperfect_drive_and_truth(Faults(clock_s=0.2), seconds=60.0)
-    begun = []
-
-    def noted(work):
-        begun.append(weakref.ref(work))
-        return work
-
-    slam, asked = GraphSlam(Config(), executor=noted), GraphSlam(Config())
-    for k, measurement in enumerate(drive):
-        for one in (slam, asked):
-            one.process(measurement)
-            if k % 400 == 0:
-                one.process(Control("optimize"))
-        if asked.keyframes:
-            assert asked.pose_covariance is not None
-    gc.collect()
-    assert len(begun) > 3
-    assert sum(one() is not None for one in begun) <= 2
-    np.testing.assert_array_equal(slam.pose_covariance, asked.pose_covariance)
-    assert slam.contradicted == asked.contradicted != []

@@ -21,17 +21,20 @@ from graph_slam_ros.tools.simulation.sensing import RangeBearing
 
 S = 1_000_000_000
 TICK_NS = S // 10
-SENSOR = RangeBearing(0.1, np.deg2rad(0.5), 15.0, np.pi)
+SIZE, TREES = times((0.5, 20), (1.0, 40))
+"""Of the park; ``make soak`` has the whole."""
+SENSOR = RangeBearing(0.1, np.deg2rad(0.5), SIZE * 15.0, np.pi)
 NOISE = VelocityNoise((0.1, 0.01, 0.02), 0.5)
-LAP_TICKS = 700  # a circle of 22 m, at 2 m/s
+LAP_TICKS = round(SIZE * 700)  # a circle of 22 m, at 2 m/s
+SOAKED = pytest.mark.skipif(not times(0, 1), reason="only in make soak")
 
 
-def trees(seed, count=40, apart_m=3.0):
+def trees(seed, count=TREES, apart_m=3.0):
     """Places in a ring along the way, none close to another."""
     rng, out = np.random.default_rng(seed), []
     while len(out) < count:
-        distance, angle = rng.uniform(12.0, 34.0), rng.uniform(0.0, 2.0 * np.pi)
-        at = np.array([distance * np.cos(angle), 22.3 + distance * np.sin(angle)])
+        distance, angle = SIZE * rng.uniform(12.0, 34.0), rng.uniform(0.0, 2.0 * np.pi)
+        at = np.array([distance * np.cos(angle), SIZE * 22.3 + distance * np.sin(angle)])
         if all(np.linalg.norm(at - other) > apart_m for other in out):
             out.append(at)
     return np.array(out)
@@ -90,13 +93,10 @@ def nearest_true(slam, recording):
     return apart.argmin(axis=1), apart.min(axis=1)
 
 
-SOAKED = pytest.mark.skipif(not times(0, 1), reason="only in make soak")
-
-
-@pytest.mark.parametrize("seed", times([1], [1, 2]))
+@pytest.mark.parametrize("seed", times([4], [1, 2]))
 def test_without_ids_the_path_is_as_near_to_the_truth_and_each_tree_is_there_once(seed):
     """Where a region was ordered anew, what hangs below it in the tree may have a later key: covariances are right."""
-    recording = park(seed)
+    recording = park(seed, laps=times(1, 2))
     named, slam = driven(recording, "id"), driven(recording)
     assert not slam.alarms
     assert path_rmse(slam, recording) < 1.5 * path_rmse(named, recording)
@@ -109,8 +109,10 @@ def test_without_ids_the_path_is_as_near_to_the_truth_and_each_tree_is_there_onc
         assert one == pytest.approx(joint[2 * k : 2 * k + 2, 2 * k : 2 * k + 2], abs=1e-9)
 
 
+@SOAKED
 def test_what_moves_is_given_up():
-    recording = park(4, laps=1, clutter=lambda t_s: (20.0 * np.sin(0.1 * t_s), 22.3 + 20.0 * np.cos(0.13 * t_s)))
+    around = lambda t_s: SIZE * np.array([20.0 * np.sin(0.1 * t_s), 22.3 + 20.0 * np.cos(0.13 * t_s)])  # noqa: E731
+    recording = park(4, laps=1, clutter=around)
     slam = driven(recording)
     assert slam.counters["landmarks", "given_up"] > 0
     assert nearest_true(slam, recording)[1].max() < 1.0
@@ -149,7 +151,7 @@ def test_each_landmark_is_the_one_it_was_and_no_other(places_of, seconds, expect
 def slipped(slam):
     """Odometry loses half a radian where nothing is seen; only later sightings tell which landmark was which."""
     world = np.array([[4.0, 0.0], [4.0, 2.2], [4.0, -2.2], [-3.0, 3.0], [-4.0, -2.0]])
-    for k in range(1200):
+    for k in range(700):
         t_s = 0.1 * k
         stamp_ns, told = S + round(t_s * S), 0.3 * np.sin(0.2 * t_s)
         heading = told + (0.5 if t_s > 40.0 else 0.0)
@@ -198,19 +200,6 @@ def test_where_all_scans_cannot_be_explained_at_once_it_is_counted_and_the_rest_
     assert len(slam.landmarks) == 2
 
 
-def test_by_range_and_bearing_from_as_far_as_ever_nothing_known_is_taken_for_it():
-    """Across it is so vague that along it there is nothing but rounding: a singular matrix."""
-    allowed = {"inputs.names": "odom seen", "seen.max_distance_m": 1e9}  # else it is refused before
-    slam = GraphSlam(Config.from_mapping({"landmarks.association": "joint"} | allowed))
-    standing(slam, lambda t_s: [(8.0, 2.0), (9.0, -3.0)], 10.0)
-    noise = (1e-4, 0.0, 0.0, 1.0)
-    far = [Sighting("", "range_bearing", (6e8, bearing), noise) for bearing in np.linspace(0.0, 3.0, 50).tolist()]
-    slam.process(Sightings(10 * S, "seen", tuple(far)))
-    slam.process(Control("end"))
-    assert slam.counters.as_dict() == {}
-    assert len(slam.landmarks) == 2
-
-
 def test_G19_where_association_asks_of_what_cannot_be_solved_no_covariance_is_known():
     slam = pipeline("joint")
     standing(slam, lambda t_s: [(8.0, 2.0)], 10.0)
@@ -228,8 +217,8 @@ def test_G19_where_association_asks_of_what_cannot_be_solved_no_covariance_is_kn
 
 @functools.cache
 def pairs():
-    """Pairs of a tree and a pole 0.3 m apart, seen with an error of 0.1 m and half a degree from up to 15 m."""
-    places_of = trees(3, count=8, apart_m=9.0)
+    """Pairs of a tree and a pole 0.3 m apart, seen with an error of 0.1 m and half a degree."""
+    places_of = trees(3, count=8, apart_m=SIZE * 9.0)
     points = np.vstack([places_of, places_of + np.array([0.3, 0.0])])
     sorts = ["tree"] * 8 + ["pole"] * 8
     names, rng = [f"{sort} {k}" for k, sort in enumerate(sorts)], np.random.default_rng(3)
@@ -237,7 +226,7 @@ def pairs():
     def observe(T_world_base):
         return SENSOR.observe(rng, T_world_base, names, points, "range_bearing")
 
-    twists = np.tile([2.0, 0.0, 2.0 * np.pi / (LAP_TICKS * 0.1)], (LAP_TICKS, 1))
+    twists = np.tile([2.0, 0.0, 2.0 * np.pi / (LAP_TICKS * 0.1)], (LAP_TICKS + 100, 1))
     true = dict(zip(names, points.tolist(), strict=True))
     return drive(rng, (0.0, 0.0, 0.0), twists, TICK_NS, NOISE, observe, 5, true)
 
@@ -277,6 +266,7 @@ def test_landmarks_near_one_another_are_told_apart_by_their_class_and_a_map_has_
     assert wrong < 0.01 * sum(map(len, seen.values()))
 
 
+@SOAKED
 def test_where_odometry_slips_what_was_seen_since_is_explained_anew():
     recording = park(3, laps=1)
     lost, _ = faulty_recording(recording, [Fault.named("slip", at=0.4, lasting=0.08, factor=1.0 / 0.6)], seed=1)
@@ -300,24 +290,6 @@ def put_back(recording, from_ns, to_ns):
     return before, [
         replace(m, T_odom_base=se2.compose(back, m.T_odom_base)) if isinstance(m, Odometry) else m for m in again
     ]
-
-
-@pytest.mark.parametrize("seed", times([4], [1, 2, 4, 5]))
-def test_a_robot_that_was_carried_to_new_ground_is_noticed(seed):
-    recording = park(seed, laps=1)
-    begin_ns = int(recording.stamps_ns[0])
-    before, again = put_back(recording, begin_ns + 20 * S, begin_ns + 45 * S)
-    slam = pipeline("joint")
-    for m in before:
-        slam.process(without_ids(m))
-    assert not slam.alarms
-    for m in again:
-        slam.process(without_ids(m))
-        if m.stamp_ns > begin_ns + 25 * S:
-            break
-    (alarm,) = slam.alarms
-    assert alarm.began_ns < begin_ns + 23 * S
-    assert "what should be seen there is not" in str(alarm) or "contradict odometry" in str(alarm)
 
 
 @SOAKED
@@ -344,40 +316,25 @@ def test_a_robot_that_was_carried_to_new_ground_is_found_when_it_knows_the_groun
     assert len(slam.landmarks) == len(recording.landmarks)
 
 
-@SOAKED
-@pytest.mark.parametrize("seed", [40, 51])
-def test_a_sensor_that_misses_a_third_raises_no_alarm(seed):
-    rng = np.random.default_rng(seed)
-    recording = park(seed, laps=1, clutter=lambda t_s: (20.0 * np.cos(t_s / 3.0), 20.0 * np.sin(t_s / 3.0)))
-    slam = pipeline("joint")
-    for m in measurements(recording):
-        if isinstance(m, Sightings):
-            seen = tuple(s for s in without_ids(m).sightings if rng.random() < 0.7)
-            if not seen:
-                continue
-            m = replace(m, sightings=seen)
-        slam.process(m)
-    assert not slam.alarms
-
-
 def test_a_robot_that_was_carried_is_found_by_what_it_sees_as_a_whole():
-    recording = park(1, laps=1)
+    recording = park(times(3, 1), laps=1)
     begin_ns = int(recording.stamps_ns[0])
-    before, again = put_back(recording, begin_ns + 45 * S, begin_ns + 20 * S)
+    from_s, to_s = times((28, 12), (45, 20))
+    before, again = put_back(recording, begin_ns + from_s * S, begin_ns + to_s * S)
     slam = pipeline("joint")
     for m in before:
         slam.process(without_ids(m))
     assert not slam.alarms
     for m in again:
         slam.process(without_ids(m))
-        if m.stamp_ns > begin_ns + 53 * S:
+        if m.stamp_ns > begin_ns + (from_s + 8) * S:
             break
     (alarm,) = slam.alarms
-    assert alarm.began_ns < begin_ns + 50 * S
+    assert alarm.began_ns < begin_ns + (from_s + 5) * S
     assert len(slam.segments) == 2
     stamps_ns = slam.keyframes.stamps_ns
-    after = np.flatnonzero(stamps_ns > begin_ns + 46 * S)
-    same = np.searchsorted(stamps_ns, stamps_ns[after] - 25 * S)  # it was there before, and sees the same
+    after = np.flatnonzero(stamps_ns > begin_ns + (from_s + 1) * S)
+    same = np.searchsorted(stamps_ns, stamps_ns[after] - (from_s - to_s) * S)  # it was there before, and sees the same
     path = slam.trajectory()[:, :2]
     assert np.linalg.norm(path[after] - path[same], axis=1).max() < 0.6
     assert len(slam.landmarks) <= len(recording.landmarks)

@@ -153,13 +153,6 @@ def test_B7_after_a_jump_that_stops_nothing_passes_until_another_run_begins(gate
     assert gate.admit(odometry(3.0), "stop").measured
 
 
-def test_B7_after_a_jump_that_resets_what_comes_is_of_another_run_even_where_it_was_stopped(gate, counters):
-    jump_back(gate, "stop")
-    passage = gate.begin_anew("reset")
-    assert (passage.jump, passage.events) == ("reset", ())
-    assert gate.admit(odometry(3.0), "reset").measured
-
-
 def test_P10_what_is_paused_or_finds_no_room_is_refused_by_its_reason_and_input(gate, counters):
     assert not gate.admit(odometry(0.0, "odom#2"), "segment", has_room=False).measured
     gate.is_paused = True

@@ -21,7 +21,6 @@ from graph_slam_ros.lie import se2
 from graph_slam_ros.measurements.types import Closure
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict
-from graph_slam_ros.solver.clique_tree.storage import LOCAL, MARKED, NOTHING
 from graph_slam_ros.tools.simulation import measurements, simulate
 
 S = 1_000_000_000
@@ -123,6 +122,7 @@ RAISED = [
     )
 ]
 END = Control("end"), Control("optimize")
+SOAKED = pytest.mark.skipif(not times(0, 1), reason="only in make soak")
 METHODS = "update", "update", "optimize", "marginal", "joint_marginal", "chi2_of", "add", "residuals_of"
 
 
@@ -220,13 +220,14 @@ def test_G7_what_a_solve_fails_with_again_and_again_is_quarantined_and_nothing_e
     assert p.trajectory() == pytest.approx(undisturbed(0), abs=0.1)
 
 
+@SOAKED
 def test_G7_an_old_landmark_that_later_solves_do_not_determine_is_quarantined():
     """Bearings in degrees: a landmark that they put somewhere moves farther and farther away.
 
     How many solves fail in one drive is chance: rounding decides where such a landmark goes.
     """
     parts = []
-    for seed in range(times(1, 7)):
+    for seed in range(7):
         p = GraphSlam(Config())
         for m in measurements(simulate("warehouse", seed, aisles=2, aisle_m=4.0, laps=1, sensor="bearing")):
             p.process(replace(m, sightings=tuple(map(in_degrees, m.sightings))) if isinstance(m, Sightings) else m)
@@ -234,7 +235,7 @@ def test_G7_an_old_landmark_that_later_solves_do_not_determine_is_quarantined():
         parts.append(p.counters.as_dict()["solver"]["SingularError"] / len(p.keyframes))
         assert p.counters.as_dict()["landmarks"]["quarantined"] > 5
         assert not p.failing
-    assert 0.0 < np.median(parts) < times(0.5, 0.1)
+    assert 0.0 < np.median(parts) < 0.1
 
 
 def in_degrees(one):
@@ -254,52 +255,6 @@ def test_P23_to_go_back_to_the_last_good_estimate_in_a_solver_made_anew_changes_
     run(p, END)
     assert p.trajectory() == pytest.approx(undisturbed(0), abs=1e-4)
     assert not p.counters.as_dict()
-
-
-@pytest.mark.parametrize("label", ["odometry", "landmarks"])
-def test_T13_a_vertex_that_came_without_its_edge_costs_one_solve(label):
-    p, raised = pipeline(), 0
-    add_edge = p.graph.add_edge
-
-    def faulty(*arguments):
-        if label in arguments and p.graph.vertex_count > 5:
-            p.graph.add_edge = add_edge
-            raise MemoryError("injected")
-        return add_edge(*arguments)
-
-    p.graph.add_edge = faulty
-    for m in many(0, 30):
-        if isinstance(m, Sightings):  # of another landmark each time
-            m = replace(m, sightings=(replace(m.sightings[0], id=str(m.stamp_ns)),))
-        try:
-            p.process(m)
-        except MemoryError:
-            raised += 1
-    assert (raised, p.failing) == (1, "")
-    assert p.counters.as_dict() == {"solver": {"GaugeError": 1}}
-    run(p, END)
-    assert len(p.keyframes) == 30
-    assert len(p.landmarks) == (30 if label == "odometry" else 29)
-    true = {m.stamp_ns: m.T_odom_base for m in many(0, 30) if isinstance(m, Odometry)}
-    assert is_where_it_was(p, [true[stamp_ns] for stamp_ns in p.keyframes.stamps_ns.tolist()])
-
-
-@pytest.mark.parametrize("method", ["marginals", "joint"])
-def test_T13_what_a_covariance_that_fails_left_in_the_tree_does_no_harm(method, monkeypatch):
-    p = run(pipeline(), (*drive(0), *END))
-    solver, vertices = p.solver, p.keyframes.ids.tolist()
-    before = solver.joint_marginal(vertices)
-
-    def faulty(tree, ids):
-        tree.vertex[ids, LOCAL], tree.edge[:, MARKED] = 10**6, 1
-        raise MemoryError("injected")
-
-    with monkeypatch.context() as patch, pytest.raises(MemoryError, match="injected"):
-        patch.setattr(f"graph_slam_ros.solver.solver.{method}", faulty)
-        solver.marginal(vertices) if method == "marginals" else solver.joint_marginal(vertices)
-    assert solver.joint_marginal(vertices) == pytest.approx(before, rel=1e-6, abs=1e-12)
-    assert (solver._tree.vertex[: p.graph.vertex_count, LOCAL] == NOTHING).all()
-    assert not solver._tree.edge[: p.graph.edge_count, MARKED].any()
 
 
 def fails():

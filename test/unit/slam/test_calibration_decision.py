@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from graph_slam_ros.slam.calibration.decision import decide, is_certain
 from graph_slam_ros.slam.calibration.fit import TrialFit
@@ -34,20 +33,6 @@ def test_what_is_off_by_four_sigmas_is_certain_however_large_they_are():
     assert not is_certain(replace(fitted(0.3, 0.035), second=np.array([-0.1])), CLOCK), "not in either half"
 
 
-def test_a_change_beyond_the_prior_names_what_mends_it():
-    (one,) = decide(fitted(2.0, 0.01), 10)
-    assert one.verdict == "refused"
-    assert one.text.endswith("larger than 1.5 s: correct the configuration first")
-
-
-def test_nothing_is_let_in_where_odometry_states_less_noise_than_any_wheels_have():
-    """The drift of a heading would pass for a wrong track width."""
-    (one,) = decide(fitted(0.3, 0.025), 10, sigma_per_m=4e-4)
-    assert one.verdict == "refused"
-    assert one.text.endswith("no wheels are so good: set odometry.noise=motion")
-    assert decide(fitted(0.3, 0.025), 10, sigma_per_m=2e-3)[0].verdict == "admitted"
-
-
 def test_a_yaw_is_not_measured_by_a_robot_that_only_turns():
     """By what a wrong track width does to its place, it seemed to be off by 10 degrees, at four sigmas."""
     yaw = replace(fitted(-0.17, 0.038), parameters=(Parameter("detections", "yaw"),))
@@ -66,11 +51,5 @@ def test_factors_are_refused_where_odometry_told_the_landmarks_apart():
     assert one.verdict == "refused"
     assert one.text.endswith("Use ids, or ask for it: graph_slam calibrate --groups factors")
     assert decide(fitted(0.3, 0.025), 10, by_association={})[0].verdict == "admitted", "a clock shows in turns"
-
-
-@pytest.mark.parametrize(("found_there", "verdict"), [(-0.10, "admitted"), (-0.03, "refused"), (0.11, "refused")])
-def test_a_factor_that_the_association_found_as_well_is_let_in(found_there, verdict):
-    """The association leaves odometry's scales open, so it does not merely confirm them."""
-    found = replace(fitted(-0.11, 0.01), parameters=(Parameter("odom", "distance"),))
-    (one,) = decide(found, 10, by_association={"distance": (found_there, 0.01)})
-    assert one.verdict == verdict
+    for there, expected in ((-0.10, "admitted"), (-0.03, "refused"), (0.11, "refused")):  # it leaves scales open
+        assert decide(found, 10, by_association={"distance": (there, 0.01)})[0].verdict == expected

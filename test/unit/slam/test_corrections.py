@@ -21,20 +21,6 @@ def corrected(sighting, settings):
     return m.sightings[0]
 
 
-def test_a_position_is_turned_about_the_sensor_and_its_noise_with_it():
-    seen = Sighting("a", "position", (2.6, 0.1), (0.04, 0.0, 0.0, 0.01), PLACE)
-    out = corrected(seen, {"mount_correction": "0 0.5 0 0 0 1.5707963267948966"})
-    assert out.measured == pytest.approx((0.6, 0.1 + 2.0 + 0.5))
-    assert np.reshape(out.covariance, (2, 2)) == pytest.approx(np.diag([0.01, 0.04]))
-
-
-def test_a_range_is_scaled_then_shifted_and_its_sensor_turned():
-    seen = Sighting("a", "range_bearing", (2.0, 0.3), (0.01, 0.0, 0.0, 0.01), PLACE)
-    out = corrected(seen, {"mount_correction": "0 0 0 0 0 0.2", "range_factor": 1.1, "range_offset_m": -0.2})
-    assert out.measured == pytest.approx((2.0, 0.3))
-    assert out.T_base_sensor == pytest.approx((0.6, 0.1, 0.2))
-
-
 @pytest.mark.parametrize("kind", ["position", "range_bearing"])
 def test_what_comes_is_corrected_as_what_is_in_the_graph(kind):
     """A sighting through ``Corrections``, and its edge through the model, are the same afterwards."""

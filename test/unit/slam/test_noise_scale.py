@@ -30,11 +30,8 @@ SIGMAS = {"odometry": (0.02, 0.02, 0.01), "position": (0.1, 0.05)}  # along and 
 MANY = 1e9  # residuals: the configuration counts as nothing
 
 
-def drive(rng, factors, pass_bias=0.0, poses=1500, laps=4, lasting=0.0):
-    """A drive in a circle past 12 landmarks, with noise that is so many times as large as its edges say.
-
-    ``lasting`` is the correlation of odometry's error with the one before.
-    """
+def drive(rng, factors, pass_bias=0.0, poses=1500, laps=4):
+    """A drive in a circle past 12 landmarks, with noise that is so many times as large as its edges say."""
     graph = Graph()
     angles = np.arange(poses) * 2 * np.pi * laps / poses
     true = np.stack([10 * np.cos(angles), 10 * np.sin(angles), angles + np.pi / 2], axis=1)
@@ -44,11 +41,9 @@ def drive(rng, factors, pass_bias=0.0, poses=1500, laps=4, lasting=0.0):
     marks = graph.add_vertices(R2, points)
     graph.add_edge(POSE_PRIOR, [vertices[0]], true[0], Gaussian.from_sigmas(1e-3, 1e-3, 1e-3), "anchor")
     step = np.array(SIGMAS["odometry"])
-    last = np.zeros(3)
     for k in range(poses - 1):
-        last = lasting * last + np.sqrt(1.0 - lasting**2) * rng.normal(size=3)
         motion = np.array(se2.between(tuple(true[k]), tuple(true[k + 1])))
-        error = factors["odometry"] * step * last
+        error = factors["odometry"] * step * rng.normal(size=3)
         graph.add_edge(RELATIVE_POSE, vertices[k : k + 2], motion + error, Gaussian.from_sigmas(*step), *ODOMETRY[:2])
     bias = {}
     for k in range(poses):
@@ -85,14 +80,14 @@ def sigma_factor(one):
     return np.sqrt(one.factor**2 + (one.per_rad * turned + one.per_m * way) / SIGMAS["odometry"][2] ** 2)
 
 
-@pytest.mark.parametrize("factors", [(1.0, 1.0, 1.0), (2.0, 1.0, 0.5), (0.6, 2.0, 1.0)])
+@pytest.mark.parametrize("factors", [(2.0, 1.0, 0.5), (0.6, 2.0, 1.0)])
 def test_planted_factors_come_out(factors):
     graph, stamps = drive(np.random.default_rng(3), dict(zip(("odometry", "range", "bearing"), factors, strict=True)))
     found = converged(graph, stamps)
     for key, planted in zip((ODOMETRY, RANGE, BEARING), factors, strict=True):
         assert not found[key].reason
         # odometry stays nearer to what is configured, and where it does others take what is missing
-        rel = 0.12 if set(factors) == {1.0} or key == RANGE else 0.35
+        rel = 0.12 if key == RANGE else 0.35
         assert sigma_factor(found[key]) == pytest.approx(planted, rel=rel)
 
 
@@ -103,15 +98,6 @@ def test_errors_that_are_alike_within_a_pass_make_sigmas_larger_and_others_not()
     assert found[RANGE].factor > 3.0 / 1.2  # sqrt(1 + 2^2) alone would be 2.2
     assert found[BEARING].design_effect < 1.3
     assert found[BEARING].factor == pytest.approx(1.0, rel=0.12)
-
-
-def test_odometry_whose_errors_last_has_the_noise_of_their_sums():
-    precise = {"odometry": 2.0, "range": 0.3, "bearing": 0.3}
-    lasting = converged(*drive(np.random.default_rng(4), precise, lasting=0.6))
-    white = converged(*drive(np.random.default_rng(4), precise))
-    of_sums = np.sqrt(1.0 + 2.0 * (0.75 * 0.6 + 0.5 * 0.6**2 + 0.25 * 0.6**3))  # windows of four steps
-    ratio = sigma_factor(lasting[ODOMETRY]) / sigma_factor(white[ODOMETRY])
-    assert ratio == pytest.approx(of_sums, rel=0.15)
 
 
 def test_what_says_too_little_keeps_its_noise_and_says_why():
@@ -126,18 +112,7 @@ def test_what_says_too_little_keeps_its_noise_and_says_why():
     assert factors_of(found) == {}
 
 
-def test_smaller_sigmas_are_not_believed_without_passes():
-    factors = {"odometry": 1.0, "range": 0.5, "bearing": 1.0}
-    graph, stamps = drive(np.random.default_rng(2), factors)
-    solver = Solver(graph)
-    solver.add(np.arange(graph.vertex_count), np.arange(graph.edge_count))
-    solver.optimize()
-    far_apart = {one.key: one for one in estimate_noise(graph, solver, {}, stamps * 1000, range(graph.edge_count))}
-    assert "passes by landmarks" in far_apart[RANGE].reason
-    assert far_apart[RANGE].factor == 1.0
-
-
-@pytest.mark.parametrize(("label", "planted"), [("closures", 0.4), ("fixes", 0.4), ("closures", 2.0), ("fixes", 2.0)])
+@pytest.mark.parametrize(("label", "planted"), [("fixes", 0.4), ("closures", 2.0)])
 def test_sigmas_of_closures_and_fixes_may_be_larger_than_stated_and_not_smaller(label, planted):
     """A gate has left out those that fit worst, and what lasts in fixes leaves no residual."""
     rng, graph, poses = np.random.default_rng(6), Graph(), 400
@@ -166,15 +141,12 @@ def test_sigmas_of_closures_and_fixes_may_be_larger_than_stated_and_not_smaller(
 
 
 def test_a_factor_is_bounded():
-    for planted, bound in ((10.0, LARGEST), (0.05, SMALLEST)):
-        factors = {"odometry": 1.0, "range": planted, "bearing": 1.0}
-        found = converged(*drive(np.random.default_rng(7), factors))
-        assert found[RANGE].factor == pytest.approx(bound, rel=1e-9)
+    factors = {"odometry": 1.0, "range": 10.0, "bearing": 0.05}
+    found = converged(*drive(np.random.default_rng(7), factors))
+    assert (found[RANGE].factor, found[BEARING].factor) == pytest.approx((LARGEST, SMALLEST), rel=1e-9)
 
 
-@pytest.mark.parametrize(
-    "planted", [Growth(1.0, 0.0, 0.0), Growth(0.2, 0.02, 0.0), Growth(0.5, 0.01, 0.002), Growth(2.0, 0.0, 0.0)]
-)
+@pytest.mark.parametrize("planted", [Growth(1.0, 0.0, 0.0), Growth(0.5, 0.01, 0.002)])
 def test_noise_that_grows_with_what_was_turned_and_driven_comes_out(planted):
     """Errors that are half known: the rest of each is what measurements leave to it."""
     rng = np.random.default_rng(11)
@@ -193,67 +165,30 @@ def test_noise_that_grows_with_what_was_turned_and_driven_comes_out(planted):
         assert float(np.mean(motions.variance(found)[kind])) == pytest.approx(expected, rel=0.15)
 
 
-def test_the_noise_of_odometry_stays_in_its_bounds_whatever_its_errors_are():
-    motions, found = Motions(np.full(100, 1e-3), np.full(100, 0.1), np.full(100, 0.1)), Growth()
-    for _ in range(50):
-        found = fit_growth(motions, np.full(100, 1e6), np.zeros(100), found, MANY, is_rotation=True)
-    assert motions.variance(found).mean() < 20 * 1e-3
-    for _ in range(50):
-        found = fit_growth(motions, np.zeros(100), np.zeros(100), found, MANY, is_rotation=True)
-    assert motions.variance(found).mean() == pytest.approx(0.1**2 * 1e-3, rel=1e-3)
-    assert fit_growth(motions, np.full(100, 1.0), np.zeros(100), Growth(), MANY, is_rotation=False).per_rad == 0.0
-
-
-@pytest.mark.parametrize("count", [2.0, CONFIGURED_COUNT, 1e6])
-def test_what_few_observations_say_of_odometry_hardly_changes_its_noise(count):
+def test_what_few_observations_say_of_odometry_hardly_changes_its_noise():
     """The variance lies between what is configured and what is observed, as a mean of so many observations of each."""
     motions, observed = Motions(np.full(100, 1e-3), np.full(100, 0.1), np.full(100, 0.1)), 4e-3
-    found = Growth()
-    for _ in range(50):
-        found = fit_growth(motions, np.full(100, observed), np.zeros(100), found, count, is_rotation=True)
-    expected = (count * observed + CONFIGURED_COUNT * 1e-3) / (count + CONFIGURED_COUNT)
-    assert motions.variance(found) == pytest.approx(expected, rel=1e-6)
+    for count in (2.0, CONFIGURED_COUNT, 1e6):
+        found = Growth()
+        for _ in range(50):
+            found = fit_growth(motions, np.full(100, observed), np.zeros(100), found, count, is_rotation=True)
+        expected = (count * observed + CONFIGURED_COUNT * 1e-3) / (count + CONFIGURED_COUNT)
+        assert motions.variance(found) == pytest.approx(expected, rel=1e-6)
 
 
-def test_an_edge_of_odometry_gets_what_motion_adds_and_gives_it_back():
-    graph = Graph()
-    a, b = graph.add_vertex(SE2, [0, 0, 0]), graph.add_vertex(SE2, [3, 4, 0.5])
-    scales = NoiseScales(graph)
-    stated = np.diag([0.04, 0.01, 0.0025])
-    one = RELATIVE_POSE, [a, b], [3.0, 4.0, -0.5], Gaussian.from_covariance(stated), "odometry", "odom"
-    scales.add_edge(*one)
-    added = {"rotation": 0.5, "rotation per rad": 0.02, "rotation per m": 0.001, "position per m": 0.01}
-    motion = {("odometry", "odom", part): value for part, value in added.items()}
-    scales.change(motion, 0)
-    scales.add_edge(*one)
-    heading = 0.25 * 0.0025 + 0.02 * 0.5 + 0.001 * 5.0
-    expected = np.diag([0.04 * 2.0, 0.01 * 2.0, heading])  # to 0.05 m^2 of both axes 0.05 m^2 are added
-    roots = graph.tables[RELATIVE_POSE].sqrt_information.values
-    for root in roots:
-        np.testing.assert_allclose(np.linalg.inv(root.T @ root), expected, rtol=1e-9)
-    scales.change(scales.neutral(), 0)
-    for root in graph.tables[RELATIVE_POSE].sqrt_information.values:
-        np.testing.assert_allclose(np.linalg.inv(root.T @ root), stated, rtol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("edge", "label", "measured"),
-    [
+def test_parts_are_orthonormal_and_together_the_whole_residual():
+    for edge, label, measured in (
         (LANDMARK_POSITION, "landmarks", [3.0, -4.0]),
-        (LANDMARK_POSITION, "landmarks", [-3.0, 0.0]),
         (LANDMARK_POSITION, "landmarks", [0.0, 0.0]),
         (LANDMARK_POSITION_3D, "landmarks", [-1.0, 2.0, 0.5]),
         (RELATIVE_POSE, "closures", [1.0, 2.0, 0.3]),
         (RELATIVE_POSE, "odometry", [1.0, 2.0, 0.3]),
         (RELATIVE_POSE_3D, "landmarks", [1.0, 2.0, 0.3, 0.0, 0.0, 0.0, 1.0]),
         (RANGE_BEARING, "landmarks", [4.0, 0.2, 0.0, 0.0, 0.0]),
-    ],
-)
-def test_parts_are_orthonormal_and_together_the_whole_residual(edge, label, measured):
-    parts = parts_of(edge, label, np.array([measured]))
-    axes = np.concatenate(list(parts.values()), axis=2)[0]
-    assert axes.shape == (edge.residual_size, edge.residual_size)
-    np.testing.assert_allclose(axes.T @ axes, np.eye(len(axes)), atol=1e-12)
+    ):
+        axes = np.concatenate(list(parts_of(edge, label, np.array([measured])).values()), axis=2)[0]
+        assert axes.shape == (edge.residual_size, edge.residual_size), (edge, label)
+        np.testing.assert_allclose(axes.T @ axes, np.eye(len(axes)), atol=1e-12, err_msg=f"{edge} {label}")
 
 
 def test_a_rescaled_edge_has_its_sigma_along_the_line_of_sight_and_a_new_one_the_same():
@@ -275,7 +210,7 @@ def test_a_rescaled_edge_has_its_sigma_along_the_line_of_sight_and_a_new_one_the
         np.testing.assert_allclose(frame.T @ covariance_now @ frame, expected, atol=1e-12)
 
 
-@pytest.mark.parametrize("dof", [3, 6])
+@pytest.mark.parametrize("dof", [6])
 def test_noise_of_odometry_that_changes_keeps_what_a_wrong_heading_does_to_the_position(dof):
     """Most of the position's error is that of the heading, times the way: so it is with any noise."""
     rng = np.random.default_rng(5)

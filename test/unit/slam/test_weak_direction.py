@@ -14,9 +14,8 @@ def along(*axis, sigma=0.3, others=0.1):
     return others**2 * np.eye(len(u)) + (sigma**2 - others**2) * np.outer(u, u)
 
 
-@pytest.mark.parametrize(
-    ("covariance", "path", "words"),
-    [
+def test_the_weakest_direction_of_a_position_in_words():
+    for covariance, path, words in (
         (along(1.0, 0.1), None, "along x of map"),
         (along(-0.1, 1.0), None, "along y of map"),
         (along(1.0, -1.0), None, "135 deg from x of map"),
@@ -27,13 +26,11 @@ def along(*axis, sigma=0.3, others=0.1):
         (along(1.0, 0.0), (0.0, 0.0), "along x of map"),
         (along(0.1, 0.0, 1.0), (1.0, 0.0, 0.0), "along z of map"),
         (along(0.0, 1.0, 0.0), (1.0, 0.0, 0.0), "across the path"),
-    ],
-)
-def test_the_weakest_direction_of_a_position_in_words(covariance, path, words):
-    found = weakest_position(covariance, None if path is None else np.array(path))
-    assert found.words == words
-    assert found.sigma == pytest.approx(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
-    assert found.axis @ covariance @ found.axis == pytest.approx(found.sigma**2)
+    ):
+        found = weakest_position(covariance, None if path is None else np.array(path))
+        assert found.words == words
+        assert found.sigma == pytest.approx(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
+        assert found.axis @ covariance @ found.axis == pytest.approx(found.sigma**2)
 
 
 def test_a_covariance_is_turned_from_the_pose_into_the_map():
@@ -47,14 +44,15 @@ def test_a_covariance_is_turned_from_the_pose_into_the_map():
     assert weakest_turn(PLANAR, pose, tangent).sigma == pytest.approx(0.02)
 
 
-@pytest.mark.parametrize(
-    ("axis", "words"),
-    [((0.0, 0.0, 1.0), "heading"), ((0.0, 1.0, 0.1), "roll and pitch"), ((1.0, 0, 1.0), "heading with roll and pitch")],
-)
-def test_in_space_the_weakest_turn_is_about_an_axis_of_the_map(axis, words):
+def test_in_space_the_weakest_turn_is_about_an_axis_of_the_map():
     """Whatever the robot's own axes are."""
     pose = (1.0, 2.0, 3.0, *so3.exp((0.4, -0.3, 1.2)))
-    in_map = np.zeros((6, 6))
-    in_map[:3, :3], in_map[3:, 3:] = 0.1 * np.eye(3), along(*axis, sigma=0.2, others=0.01)
-    found = weakest_turn(SPATIAL, pose, SPATIAL.in_tangent(pose, in_map))
-    assert (found.words, found.sigma) == (words, pytest.approx(0.2))
+    for axis, words in (
+        ((0.0, 0.0, 1.0), "heading"),
+        ((0.0, 1.0, 0.1), "roll and pitch"),
+        ((1.0, 0, 1.0), "heading with roll and pitch"),
+    ):
+        in_map = np.zeros((6, 6))
+        in_map[:3, :3], in_map[3:, 3:] = 0.1 * np.eye(3), along(*axis, sigma=0.2, others=0.01)
+        found = weakest_turn(SPATIAL, pose, SPATIAL.in_tangent(pose, in_map))
+        assert (found.words, found.sigma) == (words, pytest.approx(0.2))

@@ -6,15 +6,12 @@ import numpy as np
 import pytest
 
 from graph_slam_ros.chi_square import quantile
-from graph_slam_ros.errors import SingularError
 from graph_slam_ros.graph import Gaussian, Graph
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
-from graph_slam_ros.slam.lifelong.condenser import ITSELF, Condenser
 from graph_slam_ros.slam.lifelong.constellation import Constellation
-from graph_slam_ros.slam.lifelong.elimination import marginal_information, square_root, without
 from graph_slam_ros.slam.lifelong.fit import VisitScale, fit_of
 from graph_slam_ros.slam.lifelong.place import Place, fused, visit_without
-from graph_slam_ros.slam.lifelong.visit import Visit, best_known, visit_of
+from graph_slam_ros.slam.lifelong.visit import Visit, visit_of
 from graph_slam_ros.solver import Settings, Solver
 
 POSES, SIGMA_ODOMETRY, SIGMA_SIGHTING = 5, 0.02, 0.05
@@ -27,7 +24,7 @@ def space(request):
     return request.param
 
 
-@pytest.fixture(params=[0, 2, 6], ids=["points", "both", "poses"])
+@pytest.fixture(params=[0, 2], ids=["points", "both"])
 def tags(request):
     """The number of the six landmarks, the last ones, that are poses."""
     return request.param
@@ -165,25 +162,6 @@ def test_two_visits_are_what_all_their_edges_say_at_once(space, tags):
     assert exact.place(0, 1)[0].information == pytest.approx(information, abs=1e-9 * np.abs(information).max())
 
 
-def test_a_later_visit_says_nothing_of_where_it_is_seen_from(space, tags):
-    world = World(space, noise=1.0, tags=tags)
-    visit = world.condensed(world.visit(range(6)))
-    columns = visit.seen.rigid_motions(space)
-    shape = without(visit.information, columns)
-    assert np.abs(shape @ columns).max() < 1e-9 * np.abs(visit.information).max()
-    assert np.linalg.eigvalsh(shape)[columns.shape[1]] > 0.0
-
-
-def test_the_order_of_later_visits_does_not_matter(space, tags):
-    world = World(space, noise=1e-5, tags=tags)
-    for sees in (range(5), range(1, 6), (0, 2, 3, 5), range(2, 6)):
-        world.visit(sees)
-    one, other = world.place(0, 1, 2, 3)[0], world.place(0, 3, 2, 1)[0]
-    assert one.members == other.members
-    assert one.seen.minus(space, other.seen) == pytest.approx(0.0, abs=1e-6)
-    assert one.information == pytest.approx(other.information, abs=1e-6 * np.abs(one.information).max())
-
-
 def test_right_visits_pass_the_gate_and_a_landmark_that_moved_does_not(space, tags):
     statistics = np.zeros(2)
     for seed in range(24):
@@ -200,53 +178,6 @@ def test_right_visits_pass_the_gate_and_a_landmark_that_moved_does_not(space, ta
     assert left[world.marks[2]] < quantile(0.9999, degrees - world.graph.kind_of(world.marks[2]).dof)
 
 
-def test_the_motion_is_found_from_a_poor_guess(space, tags):
-    world = World(space, noise=1.0, tags=tags)
-    world.visit(range(6))
-    world.visit(range(6))
-    place, visit = Place.begun_by(world.condensed(0)), world.condensed(1)
-    group = space.group
-    right = group.between(*(tuple(world.estimate([world.base(n)])[0]) for n in (0, 1)))
-    off = group.compose(right, group.exp((0.5, *[-0.2] * (space.dof - 2), 0.3)))
-    one, other = (fused(space, place, visit, guess).place for guess in (right, off))
-    assert one.seen.minus(space, other.seen) == pytest.approx(0.0, abs=1e-9)
-
-
-def test_visits_whose_odometry_is_weak_agree_in_either_order(space):
-    statistics, degrees = np.zeros(2), 0
-    for seed in range(24):
-        world = World(space, noise=1.0, seed=seed, landmarks=8, sigma_odometry=0.4)
-        several = []
-        for number in (world.visit(range(8)), world.visit(range(8))):
-            factors = {}
-            for edge in world.edges[number]:
-                first, last = world.graph.edge(edge).vertices
-                is_early = world.poses[number].index(first) < 3
-                if last not in world.marks or is_early == (last < world.marks[4]):
-                    factors[edge] = 1.0  # odometry alone says how half of the landmarks lie to the others
-            poses, base = world.poses[number], world.base(number)
-            several.append((visit_of(space, world.graph, world.estimate, poses, base, factors), base))
-        for k, ((first, base), (second, other)) in enumerate((several, several[::-1])):
-            guess = space.group.between(*map(tuple, world.estimate([base, other])))
-            done = fused(space, Place.begun_by(first), second, guess)
-            statistics[k] += done.statistic
-        degrees += done.degrees
-    assert statistics[0] == pytest.approx(statistics[1])
-    assert quantile(1e-4, degrees) < statistics[0] < quantile(1 - 1e-4, degrees)
-
-
-def test_the_pose_that_landmarks_determine_best_sees_them(space):
-    world = World(space, noise=1.0)
-    number = world.visit(range(6))
-    seeing = world.poses[number][3]
-    edges = {edge: world.graph.edge(edge).vertices for edge in world.edges[number]}
-    factors = {edge: 1.0 for edge, (first, last) in edges.items() if last not in world.marks or first == seeing}
-    assert best_known(space, world.graph, world.estimate, world.poses[number], factors) == 3
-    nothing = {edge: 1.0 for edge, (_, last) in edges.items() if last not in world.marks}
-    with pytest.raises(SingularError):
-        best_known(space, world.graph, world.estimate, world.poses[number], nothing)
-
-
 def test_landmarks_that_a_visit_cannot_place_are_left_out():
     world = World(PLANAR, noise=1.0)
     first = world.visit(range(3))
@@ -261,19 +192,6 @@ def test_landmarks_that_a_visit_cannot_place_are_left_out():
     assert world.condensed(bearings).members == tuple(world.marks[:4])  # from several poses they have a place
 
 
-def test_a_visit_that_shares_too_little_is_refused(space):
-    world = World(space, noise=1.0)
-    world.visit(range(3))
-    world.visit(range(2, 6))
-    with pytest.raises(SingularError, match="shares 1 landmarks"):
-        world.place(0, 1)
-    whole = world.condensed(0)
-    empty = whole.seen.part(())
-    nothing = replace(whole, members=(), seen=empty, linearized_at=empty, information=np.zeros((0, 0)))
-    with pytest.raises(SingularError, match="shares 0"):
-        fused(space, Place.begun_by(nothing), world.condensed(1), space.identity)
-
-
 def test_one_landmark_that_is_a_pose_lays_a_visit_on_a_place(space):
     world = World(space, noise=1e-6, tags=1)
     world.visit((0, 1, 5))
@@ -283,31 +201,6 @@ def test_one_landmark_that_is_a_pose_lays_a_visit_on_a_place(space):
     assert degrees == 0 and place.members == tuple(world.marks[m] for m in (0, 1, 2, 3, 5))
     assert place.seen.minus(space, seen) == pytest.approx(0.0, abs=1e-8)
     assert place.information == pytest.approx(information, rel=1e-4, abs=1e-5 * np.abs(information).max())
-
-
-def test_a_tag_of_which_only_positions_were_seen_is_left_out(space):
-    world = World(space, noise=1.0, tags=1)
-    first = world.visit(range(5))
-    poses, tag = world.poses[first], world.marks[5]
-    for pose in poses:
-        seen, noise = (
-            space.tag_position.whole(np.ones(space.dimensions)),
-            Gaussian.from_sigmas(*[0.1] * space.dimensions),
-        )
-        world.edges[first].append(world.graph.add_edge(space.tag_position, [pose, tag], seen, noise, "landmarks"))
-    assert world.condensed(first).members == tuple(world.marks[:5])
-
-
-def test_elimination_is_that_of_the_textbook():
-    rng = np.random.default_rng(0)
-    root = rng.standard_normal((40, 40))
-    information = root @ root.T + np.eye(40)
-    kept = np.array([3, 17, 2, 30])
-    covariance = np.linalg.inv(information)
-    assert np.linalg.inv(marginal_information(information, kept)) == pytest.approx(covariance[np.ix_(kept, kept)])
-    assert square_root(information).T @ square_root(information) == pytest.approx(information)
-    with pytest.raises(SingularError, match="is not determined"):
-        square_root(np.diag([1.0, 0.0]))
 
 
 def test_a_landmark_that_a_visit_alone_puts_at_infinity_is_left_out():
@@ -324,67 +217,6 @@ def test_a_landmark_that_a_visit_alone_puts_at_infinity_is_left_out():
         edge = world.graph.add_edge(PLANAR.sightings["bearing"], [vertex, far], measured, noise, "landmarks")
         world.edges[first].append(edge)
     assert world.condensed(first).members == tuple(world.marks[:3])
-
-
-class Joined:
-    """Four visits to one place, joined by odometry, in a solver that begins at a pose that is known."""
-
-    def __init__(self, space):
-        self.space, self.world = space, World(space, noise=1.0)
-        for _ in range(4):
-            self.world.visit(range(6))
-        self.graph, self.noise = self.world.graph, Gaussian.from_sigmas(*space.sigmas(0.02, 0.02))
-        begin = self.graph.add_vertex(space.pose, space.identity)
-        self.graph.add_edge(space.pose_prior, [begin], space.identity, self.noise, "priors")
-        ends = [begin, *(poses[k] for poses in self.world.poses for k in (0, -1))]
-        for pair in zip(ends[::2], ends[1::2], strict=False):
-            self.join(pair, "odometry")
-        self.solver = Solver(self.graph)
-        self.solver.add(range(self.graph.vertex_count), range(self.graph.edge_count))
-        self.solver.update()
-        self.condenser = Condenser(space, self.solver)
-
-    def join(self, ends, label):
-        motion = self.space.group.between(*(tuple(self.graph.vertex(v).initial) for v in ends))
-        return self.graph.add_edge(self.space.relative_pose, ends, motion, self.noise, label)
-
-    def condense(self, number):
-        after = self.world.poses[number + 1][0]
-        done = self.condenser.condense(self.world.poses[number], after, (0,), self.world.marks)
-        self.solver.update()
-        return done
-
-
-def test_a_visit_begins_a_place_the_next_is_added_and_one_that_contradicts_itself_leaves_its_odometry_alone(space):
-    one = Joined(space)
-    first = one.condense(0)
-    (place,) = one.condenser.places[0,]
-    assert first.how == "first"
-    assert place.place.visits == 1
-    again = one.condense(1)
-    assert (again.how, place.place.visits) == ("again", 2)
-    assert {removed.base for removed in (*first.removed, *again.removed)} == {place.base}
-    assert [removed.vertex for removed in again.removed] == one.world.poses[1]
-    sighting = next(e for e in one.world.edges[2] if one.graph.edge(e).vertices[1] in one.world.marks)
-    table, row = one.graph.row(sighting)
-    table.measured.values[row, 0] += 1.0
-    landmarks = one.solver.estimate(one.world.marks)
-    lost = one.condense(2)
-    assert (lost.how, lost.why, lost.is_contradiction, place.place.visits) == ("composed", ITSELF, True, 2)
-    assert one.solver.estimate(one.world.marks) == pytest.approx(landmarks, abs=0.1)
-
-
-def test_a_visit_with_an_edge_that_leads_elsewhere_or_of_another_kind_stays_and_says_why(space):
-    for label in ("closures", "by_hand"):
-        one = Joined(space)
-        edge = one.join([one.world.poses[1][2], one.world.poses[3][0]], label)
-        one.solver.add([], [edge])
-        one.condense(0)
-        kept, before = one.condense(1), one.solver.values
-        assert kept.how == "kept"
-        assert kept.why == f"edge {edge} leads from the visit to vertex {one.world.poses[3][0]}"
-        assert one.condense(1).how == "kept"
-        assert one.solver.values.tobytes() == before.tobytes()
 
 
 class Visits:
@@ -420,15 +252,6 @@ def test_the_factor_is_that_of_the_errors(space, noise):
     off = (place.seen.points - place.seen.points.mean(axis=0)) - (visits.points - visits.points.mean(axis=0))
     stated = np.sqrt(np.diag(np.linalg.pinv(place.information))).mean()
     assert np.sqrt((off**2).mean()) < 1.5 * stated
-
-
-def test_one_visit_alone_does_not_make_all_others_unsure(space):
-    visits, scale = Visits(space), VisitScale()
-    place = Place.begun_by(visits.visit(1.0))
-    for noise in (20.0, *[1.0] * 30):
-        scale.add(visits.fit(place, visits.visit(noise)).as_is, GATE)
-    scale.change()
-    assert scale.factor < 1.3
 
 
 def test_a_visit_that_contradicts_its_place_has_larger_variances_or_no_say(space):
