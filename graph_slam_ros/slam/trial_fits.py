@@ -74,6 +74,7 @@ class TrialFits:
         self._contradicting: TrialFit | None = None
         self._fits_so_far: Fits | None = None
         self._so_far: list[Uncorrected] = []
+        self._of_whole: list[Uncorrected] = []  # before anything was condensed
         self._of_edges = -1  # the map that the newest trial of everything was of
 
     # -- trials ------------------------------------------------------------------------------------------------------
@@ -86,6 +87,8 @@ class TrialFits:
         is_of_everything : whether all that was measured was solved
         """
         driven, is_due = keyframe + 1 - self._first_keyframe, is_of_everything
+        if driven == self._config.map.window_keyframes and self._config.condenses:  # what it says later is of a part
+            self._of_whole = self._off(self._trial()())
         if self._backend.holds_back or not (is_due or driven >= self._due):
             return
         while not is_due and driven >= self._due:
@@ -202,16 +205,22 @@ class TrialFits:
     def uncorrected(self) -> list[Uncorrected]:
         """Return what is wrong in the map as it is now."""
         if self._of_edges != self._graph.edge_count:
-            return self._off(self._trial()())
+            return self._with_whole(self._off(self._trial()()))
         self._compute()
-        return self._off(self._fits)
+        return self._with_whole(self._off(self._fits))
+
+    def _with_whole(self, now: list[Uncorrected]) -> list[Uncorrected]:
+        """Add what was found before anything was condensed, and the window that is left does not show."""
+        known = {(one.code, one.source) for one in now}
+        has_left = self._frontend.path.keyframes.first > 0
+        return now + [one for one in self._of_whole if has_left and (one.code, one.source) not in known]
 
     def uncorrected_so_far(self) -> Sequence[Uncorrected]:
         """Return what was wrong in the map at the newest trial."""
         if self._solver.is_current:
             self._compute()
             if self._fits is not self._fits_so_far:
-                self._fits_so_far, self._so_far = self._fits, self._off(self._fits)
+                self._fits_so_far, self._so_far = self._fits, self._with_whole(self._off(self._fits))
         return self._so_far
 
     def _compute(self) -> None:

@@ -12,7 +12,7 @@ from graph_slam_ros.measurements.types import Odometry
 from graph_slam_ros.slam.frontend.odometry_jumps import OdometryJumps
 from graph_slam_ros.typing import Numbers
 
-_GAP = 10.0  # times the usual period, and longer than odometry.timeout_s
+_GAP, _LEAST_GAP_NS = 10.0, 1_000_000_000  # times the usual period, and no less than a second
 _REMEMBERED = 1000  # messages of a source that is not in use, to take over from where the one in use fell silent
 
 
@@ -170,6 +170,6 @@ class OdometrySelector:
         is_gap = dt_ns > self._longest_ns and not broken
         usual_ns = self._usual_ns or dt_ns
         self._usual_ns = usual_ns + 0.1 * (min(dt_ns, 2.0 * usual_ns) - usual_ns)
-        self._longest_ns = max(self._silent_ns, _GAP * self._usual_ns) if self._usual_ns else math.inf
+        self._longest_ns = max(_LEAST_GAP_NS, _GAP * self._usual_ns) if self._usual_ns else math.inf
         self._used, self._last_step = m, self._space.identity if broken else step
         return Step(m.stamp_ns, step, m.T_odom_base, m.twist_covariance, bool(broken), is_gap)
