@@ -32,10 +32,8 @@ class Nees:
     Attributes
     ----------
     mean : ``dof`` is expected; if it is larger, the covariances are too small; if it is smaller, they are too large
-    band : contains the mean in 95 % of runs if the n errors are independent. Those of a path are correlated, so the
-        band is too narrow for a path; use ``inside`` there
-    inside : the part of the single values in their own 95 % band
-    n, skipped : how many were used, and had no covariance or no truth
+    band : contains the mean in 95 % of runs if the n errors are independent: it is too narrow for a path
+    inside, n, skipped : part of single values in their own band; how many were used, and had no covariance or truth
     """
 
     mean: float
@@ -57,6 +55,12 @@ class Nees:
         single = [quantile(edge, dof) for edge in _BAND]
         inside = float(((values >= single[0]) & (values <= single[1])).mean())
         return cls(float(values.mean()), dof, (low, high), inside, n, len(errors) - n)
+
+    @property
+    def verdict(self) -> str:
+        """Return whether the sigmas fit the errors."""
+        fits = self.band[0] <= self.mean <= self.band[1] or 0.9 <= self.inside < 1.0
+        return "right" if fits else "too small" if self.mean > self.dof else "large"
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,15 +97,13 @@ class Consistency:
         named = {"last pose": self.last_pose, "poses": self.poses, "landmarks": self.landmarks}
         lines += [f"{'NEES':30s}{self.frame}"] if self.frame else []
         if any(named.values()):
-            lines.append(
-                f"{'NEES':30s}{'mean':>10s}{'expected':>10s}{'95 % band':>16s}{'inside':>8s}{'n':>7s}{'skipped':>9s}"
-            )
+            head = f"{'mean':>10s}{'expected':>10s}{'95 % band':>16s}{'inside':>8s}{'n':>7s}{'skipped':>9s}   sigmas"
+            lines.append(f"{'NEES':30s}{head}")
         for name, nees in named.items():
             if nees is not None:
                 band = f"{nees.band[0]:.2f} to {nees.band[1]:.2f}"
-                lines.append(
-                    f"{name:30s}{nees.mean:10.2f}{nees.dof:10d}{band:>16s}{nees.inside:8.0%}{nees.n:7d}{nees.skipped:9d}"
-                )
+                counts = f"{nees.inside:8.0%}{nees.n:7d}{nees.skipped:9d}   {nees.verdict}"
+                lines.append(f"{name:30s}{nees.mean:10.2f}{nees.dof:10d}{band:>16s}{counts}")
         lines += [f"{f'NEES of {name}':30s}left out: {reason}" for name, reason in self.left_out.items()]
         if self.noise:
             head = f"{'dof':>8s}{'chi2/dof':>10s}{'repeated':>10s}"
@@ -116,10 +118,8 @@ class Consistency:
 
 
 def _growth(one: NoiseScale) -> str:
-    """Format the variance that turning and driving add to odometry."""
-    unit = "rad^2" if one.part == "rotation" else "m^2"
-    added = {"rad": one.per_rad, "m": one.per_m}
-    return "".join(f" + {value:.2g} {unit}/{per}" for per, value in added.items() if value > 0.0)
+    """Say that the noise is larger in motion, if it is."""
+    return ", more in motion" if one.per_rad > 0.0 or one.per_m > 0.0 else ""
 
 
 def pose_nees(estimate: Array, truth: Array, covariances: Array) -> tuple[Nees | None, Nees | None]:

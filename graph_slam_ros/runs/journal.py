@@ -17,7 +17,7 @@ from mcap.writer import CompressionType, Writer
 
 from graph_slam_ros.errors import FormatError
 from graph_slam_ros.formats.durable import AppendedFile
-from graph_slam_ros.measurements.types import EVENTS, Measurement, Odometry, from_record, to_record
+from graph_slam_ros.measurements.types import EVENTS, Measurement, Odometry, from_record
 from graph_slam_ros.recordings.mcap_records import LIBRARY, records
 
 _ENCODE = json.JSONEncoder(separators=(",", ":"), check_circular=False, allow_nan=False).encode
@@ -67,12 +67,7 @@ class RecordWriter:
 
     def _odometry_text(self, m: Odometry) -> str:
         """The JSON of odometry, of which there is most, as the encoder writes it in three times the time."""
-        try:
-            pose = ",".join(map(float.__repr__, m.T_odom_base))
-        except TypeError:  # whole numbers, in a journal that others wrote
-            return _ENCODE(to_record(m))
-        if "n" in pose:  # not finite: the encoder refuses it
-            return _ENCODE(to_record(m))
+        pose = ",".join(map(float.__repr__, m.T_odom_base))
         if m.twist_covariance is not self._twist:  # drivers repeat the same one
             self._twist_text = _ENCODE(m.twist_covariance)
             self._twist = m.twist_covariance

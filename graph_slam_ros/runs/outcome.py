@@ -53,7 +53,7 @@ def text(summary: Summary) -> list[str]:
         f"keyframes  {summary['keyframes']:8d}   over {summary['span_s']:.1f} s",
         f"landmarks  {summary['landmarks']:8d}   from {summary['sightings']} sightings",
         f"edges      {summary['edges']:8d}",
-        f"chi2       {summary['chi2']:12.3f}   {_solves(summary)}",
+        f"chi2       {summary['chi2']:12.3f}   {_dof(summary)}{_solves(summary)}",
     ]
     if what := condensed_text(summary):
         all_ = ": --set map.condense=false keeps all" if "condensed" in summary else ""
@@ -113,10 +113,10 @@ def noise(summary: Summary) -> Iterator[str]:
         if one["reason"]:
             unknown.append(f"{name} ({one['reason']})")
         else:
-            grows = " and more by motion" if one["per_rad"] > 0.0 or one["per_m"] > 0.0 else ""
-            known.append(f"{name} {one['factor']:.2f}{grows}")
+            grows = ", more in motion" if one["per_rad"] > 0.0 or one["per_m"] > 0.0 else ""
+            known.append(f"{name} {one['factor']:.2f} times{grows}")
     if known:
-        yield from _wrapped(f"noise      estimated; factors of the configured sigmas: {', '.join(known)}", 11)
+        yield from _wrapped(f"noise      by the residuals, sigmas to the configured ones: {'; '.join(known)}", 11)
     if unknown:
         yield from _wrapped(f"noise      as configured: {', '.join(unknown)}", 11)
 
@@ -141,6 +141,10 @@ def _clocks(summary: Summary) -> Iterator[str]:
         if one["setting"]:
             found = f"{one['value']:+.3f} s (sigma {one['sigma']:.3f} s), used to recognise landmarks"
             yield from _wrapped(f"clock      of {topic}: {found}; in the estimate, too: --set {one['setting']}", 11)
+
+
+def _dof(summary: Summary) -> str:
+    return f"of {summary['dof']} degrees of freedom, " if "dof" in summary else ""
 
 
 def _solves(summary: Summary) -> str:

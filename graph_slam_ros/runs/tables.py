@@ -93,6 +93,7 @@ def summarize(slam: GraphSlam, earlier: Counters | None = None) -> dict[str, Any
             "edges": slam.graph.edge_count,
             "solves": slam.solves,
             "chi2": last.chi2_final if last else 0.0,
+            "dof": slam.solver.degrees_of_freedom,
             "cost": last.cost_final if last else 0.0,
             "ended": True,
             "converged": last.converged if last else True,

@@ -106,12 +106,8 @@ class GraphSlam(MapView):
     def process(self, measurement: Measurement) -> Update:
         """Process one measurement or control event. Returns the changes.
 
-        Of several exceptions the first is raised after everything else was processed; the others are counted.
-
-        Raises
-        ------
-        FormatError
-            It is a measurement in the plane of a robot in space, or the other way round: nothing has changed.
+        Of several exceptions the first is raised after everything else was processed; the others are counted. Raises
+        FormatError for a measurement of other dimensions: then nothing has changed.
         """
         check_space(measurement, self.space.dimensions)
         self._sink(measurement)

@@ -87,7 +87,7 @@ class TrialFits:
         is_of_everything : whether all that was measured was solved
         """
         driven, is_due = keyframe + 1 - self._first_keyframe, is_of_everything
-        if driven == self._config.map.window_keyframes and self._config.condenses:  # what it says later is of a part
+        if driven == self._config.map.window_keyframes and self._config.condenses:  # later it is of a part
             self._of_whole = self._off(self._trial()())
         if self._backend.holds_back or not (is_due or driven >= self._due):
             return
@@ -204,16 +204,17 @@ class TrialFits:
 
     def uncorrected(self) -> list[Uncorrected]:
         """Return what is wrong in the map as it is now."""
-        if self._of_edges != self._graph.edge_count:
-            return self._with_whole(self._off(self._trial()()))
         self._compute()
-        return self._with_whole(self._off(self._fits))
+        is_newest = self._of_edges == self._graph.edge_count
+        return self._with_whole(self._off(self._fits if is_newest else self._trial()()))
 
     def _with_whole(self, now: list[Uncorrected]) -> list[Uncorrected]:
         """Add what was found before anything was condensed, and the window that is left does not show."""
-        known = {(one.code, one.source) for one in now}
-        has_left = self._frontend.path.keyframes.first > 0
-        return now + [one for one in self._of_whole if has_left and (one.code, one.source) not in known]
+        known, whole = (
+            {(one.code, one.source) for one in now},
+            self._of_whole * bool(self._frontend.path.keyframes.first),
+        )
+        return now + [one for one in whole if (one.code, one.source) not in known]
 
     def uncorrected_so_far(self) -> Sequence[Uncorrected]:
         """Return what was wrong in the map at the newest trial."""

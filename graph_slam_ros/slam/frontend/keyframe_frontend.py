@@ -149,12 +149,7 @@ class KeyframeFrontend:
         self.sighting_poses = self.sighting_poses.without(np.flatnonzero(self.sighting_poses.ids < first))
 
     def forget_time(self, *, goes_on: bool = False) -> None:
-        """Keep the map and start over with the stamps: the next odometry begins a segment.
-
-        Parameters
-        ----------
-        goes_on : whether that is where odometry went on to, with another clock
-        """
+        """Keep the map and start over with the stamps: the next odometry begins a segment, or goes on."""
         motion = self.path.motion
         self._before_step = motion.now.covariance if motion is not None and goes_on else None
         self.order.forget()
@@ -363,9 +358,7 @@ class KeyframeFrontend:
         stood = motion.now.stands
         rest = motion.cut(where.stamp_ns)
         T_odom_base = group.compose(keyframes[where.keyframe].T_odom_base, where.T_keyframe_base)
-        if (
-            self.gyro or self.corrections.found or self.corrections.are_configured
-        ):  # odometry's own frame has no part in them
+        if self.gyro or self.corrections.found or self.corrections.are_configured:  # not in odometry's own frame
             left = self.corrections.uncorrected(rest.T_last_base) if rest is not None else self._space.identity
             T_odom_base = tuple(map(float, group.compose(self.T_odom_base, group.inverse(left))))
         covariance = where.covariance
