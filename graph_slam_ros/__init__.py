@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from graph_slam_ros.runs.saved_run import SavedRun, load_run
     from graph_slam_ros.slam import GraphSlam
     from graph_slam_ros.solver import Settings, Solver
-    from graph_slam_ros.tools.certificate import Certificate, certify
+    from graph_slam_ros.tools.certificate.certify import Certificate, certify
 
 __all__ = [
     "Certificate",

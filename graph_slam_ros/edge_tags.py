@@ -6,89 +6,60 @@ This is the only table of them. A plugin's edge type is an entry point of the gr
 import re
 from typing import Any
 
+from graph_slam_ros import graph as graphs
 from graph_slam_ros.errors import ConfigError, FormatError
-from graph_slam_ros.graph import (
-    ATTITUDE_PRIOR_3D,
-    BEARING,
-    BEARING_3D,
-    COORDINATE_PRIOR,
-    COORDINATE_PRIOR_3D,
-    HEADING_PRIOR,
-    HEADING_PRIOR_3D,
-    INVERSE_RELATIVE_POSE,
-    LANDMARK_POSITION,
-    LANDMARK_POSITION_3D,
-    POINT_PRIOR,
-    POSE_PRIOR,
-    POSE_PRIOR_3D,
-    POSITION_PRIOR,
-    POSITION_PRIOR_3D,
-    R1,
-    R2,
-    R3,
-    RANGE,
-    RANGE_3D,
-    RANGE_BEARING,
-    RANGE_BEARING_3D,
-    RANGE_WITH_OFFSET,
-    RANGE_WITH_OFFSET_3D,
-    RELATIVE_POSE,
-    RELATIVE_POSE_3D,
-    SE2,
-    SE3,
-    TAG_POSITION,
-    TAG_POSITION_3D,
-    EdgeType,
-    VertexKind,
-    place_edge,
-)
+from graph_slam_ros.graph import SE2, SE3, EdgeType, VertexKind, place_edge
 from graph_slam_ros.graph.place import MOST_MEMBERS, members_of
 from graph_slam_ros.plugin_edges import fault_of, named
 from graph_slam_ros.plugins import EDGES, load, names
 
 VERTEX_TAGS: dict[str, VertexKind] = {
     "VERTEX_SE2": SE2,
-    "VERTEX_XY": R2,
+    "VERTEX_XY": graphs.R2,
     "VERTEX_SE3:QUAT": SE3,
-    "VERTEX_TRACKXYZ": R3,
-    "VERTEX_OFFSET": R1,  # ours
+    "VERTEX_TRACKXYZ": graphs.R3,
+    "VERTEX_OFFSET": graphs.R1,  # ours
 }
 EDGE_TAGS: dict[str, EdgeType] = {
-    "EDGE_SE2": RELATIVE_POSE,
-    "EDGE_SE2_XY": LANDMARK_POSITION,
-    "EDGE_PRIOR_SE2": POSE_PRIOR,
-    "EDGE_PRIOR_SE2_XY": POSITION_PRIOR,
-    "EDGE_PRIOR_XY": POINT_PRIOR[R2],
-    "EDGE_BEARING_SE2_XY": BEARING,
-    "EDGE_SE3:QUAT": RELATIVE_POSE_3D,
-    "EDGE_SE3_PRIOR": POSE_PRIOR_3D,
-    "EDGE_SE3_TRACKXYZ": LANDMARK_POSITION_3D,
-    "EDGE_POINTXYZ_PRIOR": POINT_PRIOR[R3],
+    "EDGE_SE2": graphs.RELATIVE_POSE,
+    "EDGE_SE2_XY": graphs.LANDMARK_POSITION,
+    "EDGE_PRIOR_SE2": graphs.POSE_PRIOR,
+    "EDGE_PRIOR_SE2_XY": graphs.POSITION_PRIOR,
+    "EDGE_PRIOR_XY": graphs.POINT_PRIOR[graphs.R2],
+    "EDGE_BEARING_SE2_XY": graphs.BEARING,
+    "EDGE_SE3:QUAT": graphs.RELATIVE_POSE_3D,
+    "EDGE_SE3_PRIOR": graphs.POSE_PRIOR_3D,
+    "EDGE_SE3_TRACKXYZ": graphs.LANDMARK_POSITION_3D,
+    "EDGE_POINTXYZ_PRIOR": graphs.POINT_PRIOR[graphs.R3],
     # ours; of a landmark that is a pose, only the POSITION was seen
-    "EDGE_SE2_POSITION": TAG_POSITION,
-    "EDGE_SE3_POSITION": TAG_POSITION_3D,
-    "EDGE_RANGE_SE2_XY": RANGE,
-    "EDGE_RANGE_BEARING_SE2_XY": RANGE_BEARING,
-    "EDGE_RANGE_OFFSET_SE2_XY": RANGE_WITH_OFFSET,
-    "EDGE_PRIOR_OFFSET": POINT_PRIOR[R1],
-    "EDGE_COORDINATE_SE2": COORDINATE_PRIOR,
-    "EDGE_HEADING_SE2": HEADING_PRIOR,
-    "EDGE_RANGE_SE3_XYZ": RANGE_3D,
-    "EDGE_BEARING_SE3_XYZ": BEARING_3D,
-    "EDGE_RANGE_BEARING_SE3_XYZ": RANGE_BEARING_3D,
-    "EDGE_RANGE_OFFSET_SE3_XYZ": RANGE_WITH_OFFSET_3D,
-    "EDGE_POSITION_SE3": POSITION_PRIOR_3D,
-    "EDGE_COORDINATE_SE3": COORDINATE_PRIOR_3D,
-    "EDGE_ATTITUDE_SE3": ATTITUDE_PRIOR_3D,
-    "EDGE_HEADING_SE3": HEADING_PRIOR_3D,
+    "EDGE_SE2_POSITION": graphs.TAG_POSITION,
+    "EDGE_SE3_POSITION": graphs.TAG_POSITION_3D,
+    "EDGE_RANGE_SE2_XY": graphs.RANGE,
+    "EDGE_RANGE_BEARING_SE2_XY": graphs.RANGE_BEARING,
+    "EDGE_RANGE_OFFSET_SE2_XY": graphs.RANGE_WITH_OFFSET,
+    "EDGE_PRIOR_OFFSET": graphs.POINT_PRIOR[graphs.R1],
+    "EDGE_COORDINATE_SE2": graphs.COORDINATE_PRIOR,
+    "EDGE_HEADING_SE2": graphs.HEADING_PRIOR,
+    "EDGE_RANGE_SE3_XYZ": graphs.RANGE_3D,
+    "EDGE_BEARING_SE3_XYZ": graphs.BEARING_3D,
+    "EDGE_RANGE_BEARING_SE3_XYZ": graphs.RANGE_BEARING_3D,
+    "EDGE_RANGE_OFFSET_SE3_XYZ": graphs.RANGE_WITH_OFFSET_3D,
+    "EDGE_POSITION_SE3": graphs.POSITION_PRIOR_3D,
+    "EDGE_COORDINATE_SE3": graphs.COORDINATE_PRIOR_3D,
+    "EDGE_ATTITUDE_SE3": graphs.ATTITUDE_PRIOR_3D,
+    "EDGE_HEADING_SE3": graphs.HEADING_PRIOR_3D,
 }
+SWITCHED = {  # closures that may be false: Vertigo's, and RTAB-Map's where it is robust; a switch follows the poses
+    "EDGE_SE2_SWITCHABLE": "EDGE_SE2",
+    "EDGE_SE2_MAXMIX": "EDGE_SE2",
+    "EDGE_SE3_SWITCHABLE": "EDGE_SE3:QUAT",
+    "EDGE_SE3:QUAT_SWITCHABLE": "EDGE_SE3:QUAT",
+}
+OF_POSES = {("EDGE_POINTXYZ_PRIOR", SE3): "EDGE_POSITION_SE3", ("EDGE_PRIOR_XY", SE2): "EDGE_PRIOR_SE2_XY"}
 _PLACE = re.compile(r"(0|[1-9][0-9]{0,2})(?::([1-9][0-9]{0,2}))?", re.ASCII)
 OFFSET = "PARAMS_SE3OFFSET"
-PLACE_TAGS = {
-    "EDGE_PLACE_SE2_XY": SE2,
-    "EDGE_PLACE_SE3_XYZ": SE3,
-}  # ours; ":3" follows, or ":3:1" with a pose
-_BUILT_IN = {edge: tag for tag, edge in EDGE_TAGS.items()} | {INVERSE_RELATIVE_POSE: "EDGE_SE2"}
+PLACE_TAGS = {"EDGE_PLACE_SE2_XY": SE2, "EDGE_PLACE_SE3_XYZ": SE3}  # ours; ":3" follows, or ":3:1" with a pose
+_BUILT_IN = {edge: tag for tag, edge in EDGE_TAGS.items()} | {graphs.INVERSE_RELATIVE_POSE: "EDGE_SE2"}
 _RESERVED = frozenset({*EDGE_TAGS, *VERTEX_TAGS, OFFSET, "FIX"})
 _loaded: dict[str, EdgeType] = {}  # of plugins
 _tags: dict[EdgeType, str] = {}

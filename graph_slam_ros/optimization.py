@@ -1,5 +1,7 @@
 """Solve a whole graph in one call: initial values, gauge, solution."""
 
+import re
+import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,13 +12,17 @@ from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.g2o import read_g2o
 from graph_slam_ros.formats.graph_file import G2oFile
 from graph_slam_ros.graph import Graph
+from graph_slam_ros.progress import report
 from graph_slam_ros.solver import Report, Settings, Solver, initial_values
+from graph_slam_ros.solver.incremental_initialization import OnPose
 from graph_slam_ros.typing import Array
 
 _FAR_ABOVE = 2.0  # times its degrees of freedom: chi2 of an optimum is about as large as these, or smaller
 _UNLIKELY = 1e-3  # that one edge of a graph has so large a residual by chance
 _UNEVEN, _SEVERAL = 10.0, 10  # mean over median of what so many closures or more have as chi2: in an optimum 1 to 4
 _NO_RESIDUAL = 1e-6  # chi2 for each number measured: less is rounding
+_MOST_TIMES, _MOST_S, _QUIET_S = 5.0, 10.0, 2.0  # of the first solution, and seconds, that others may take together
+_NUMBERS = re.compile(r"(?<=vertex )\d+|(?<=FIX )[\d ]*\d")  # of vertices in errors: to be the file's
 _SAME = 1e-6  # part of the cost by which one optimum differs from start to start
 
 
@@ -48,6 +54,7 @@ class Solution:
     report : iterations, chi2, and why the solve stopped
     start : origin of the initial values: ``file``, ``tree``, ``chordal`` or ``online``
     suspicion : why the first result may be a local minimum, so that other starts were tried; empty if it is good
+    doubt, let_go : why this solution is probably wrong, and of how many edges a robust loss has let go
     attempts : all starts that were tried, in order; this solution is the one with the lowest cost
     """
 
@@ -57,11 +64,22 @@ class Solution:
     start: str
     suspicion: str = ""
     attempts: tuple[Attempt, ...] = ()
+    doubt: str = ""
+    let_go: int = 0
 
     def __repr__(self) -> str:
         poses, points = len(self.poses), len(self.points)
         chi2, stop = self.report.chi2_final, "converged" if self.report.converged else self.report.stop
-        return f"Solution({poses} poses, {points} points, chi2 {chi2:.6g}, {stop}, start: {self.start})"
+        cost = f"chi2 {chi2:.6g} of {self.solver.degrees_of_freedom} degrees of freedom"
+        doubt = "".join(f"; {what}" for what in [self.doubt, *self.file.losses] if what)
+        return f"Solution({poses} poses, {points} points, {cost}, {stop}, start: {self.start}{doubt})"
+
+    def worst(self, count: int = 5) -> list[tuple[str, float]]:
+        """Edges that fit worst, for the numbers that each has measured: in words, with ids of the file, and chi2."""
+        edges = self.solver.edges
+        chi2, numbers = self.solver.chi2_of(edges)
+        order = np.argsort(-chi2 / numbers)[:count]
+        return [(edge_text(self.file, int(edges[k])), float(chi2[k])) for k in order]
 
     @property
     def poses(self) -> Array:
@@ -100,68 +118,100 @@ def optimize(source: Graph | G2oFile | Path | str, settings: Settings | None = N
         file = G2oFile(source, list(range(source.vertex_count)))
     else:
         file = source if isinstance(source, G2oFile) else read_g2o(source)
+    settings, began = settings or Settings(), time.perf_counter()
+    first = _solved(file, settings, "file" if init == "auto" else init)
     if init != "auto":
-        return _solved(file, settings, init)
-    return _best_of(_solved(file, settings, "file"), settings)
+        return _judged(first, settings)
+    return _best_of(first, settings, time.perf_counter() - began)
 
 
-def _solved(file: G2oFile, settings: Settings | None, init: str) -> Solution:
-    solver, start = started(file, init)
-    add_graph(solver, file)
-    report = solver.optimize(settings)
-    return Solution(file, solver, report, start, attempts=(Attempt(start, report.chi2_final, report.cost_final),))
+def _solved(file: G2oFile, settings: Settings, init: str, on_pose: OnPose = lambda *_: None) -> Solution:
+    try:
+        solver, start = started(file, init, on_pose)
+        add_graph(solver, file)
+        done = solver.optimize(settings)
+    except GraphSlamError as error:
+        error.args = (_NUMBERS.sub(lambda n: " ".join(str(file.ids[int(k)]) for k in n[0].split()), str(error)),)
+        raise
+    return Solution(file, solver, done, start, attempts=(Attempt(start, done.chi2_final, done.cost_final),))
 
 
-def _best_of(first: Solution, settings: Settings | None) -> Solution:
-    """The first where nothing is suspicious about it, else the best of it and of other starts."""
-    best, attempts, suspicion = first, list(first.attempts), suspicion_of(first)
+def _best_of(first: Solution, settings: Settings, first_s: float) -> Solution:
+    """The first where nothing is suspicious about it, else the best of it and of other starts, in a limited time."""
+    best, attempts, suspicion = first, list(first.attempts), suspicion_of(first, settings)
     root = _root(first.file)
-    if not suspicion or root is None or not _is_pose(first.file.graph, root):
-        return replace(first, suspicion=suspicion)
-    for start in ("chordal", "online"):
+    others = ("chordal", "online") if suspicion and root is not None and _is_pose(first.file.graph, root) else ()
+    most_s, began = max(_MOST_TIMES * first_s, _MOST_S), time.perf_counter()
+
+    def on_pose(pose: int, count: int) -> None:
+        elapsed_s = time.perf_counter() - began
+        if elapsed_s > most_s:
+            raise GraphSlamError(f"stopped after {most_s:.0f} s, at pose {pose} of {count}")
+        if elapsed_s > _QUIET_S:
+            report(f"another start, the drive, pose after pose: {pose} of {count}")
+
+    for start in others:
+        left_s = most_s - (time.perf_counter() - began)
+        most = int(0.5 * left_s * (1 + len(first.report.iterations)) / first_s)  # damped ones may follow
+        limited = replace(settings, max_iterations=max(1, min(most, settings.max_iterations)))
         try:
-            other = _solved(first.file, settings, start)
+            other = _solved(first.file, limited, start, on_pose)
         except (GraphSlamError, np.linalg.LinAlgError) as error:
             attempts.append(Attempt(start, failure=str(error)))
             continue
         attempts += other.attempts
         if other.report.cost_final < best.report.cost_final * (1.0 - _SAME):
             best = other
-        if not suspicion_of(best):  # a good one is found
+        if not suspicion_of(best, settings):  # a good one is found
             break
-    return replace(best, suspicion=suspicion, attempts=tuple(attempts))
+    return _judged(replace(best, suspicion=suspicion, attempts=tuple(attempts)), settings)
 
 
-def suspicion_of(solution: Solution) -> str:
+def suspicion_of(solution: Solution, settings: Settings) -> str:
     """Return why a result may be a local minimum, in some words; empty where nothing speaks for it."""
-    solver, report, graph = solution.solver, solution.report, solution.file.graph
-    if not report.converged:
-        return f"it did not converge ({report.stop})"
+    solver, graph, edges = solution.solver, solution.file.graph, solution.solver.edges
+    closures = edges[graph.has_label(edges, ("closures",))]
+    chi2, numbers = solver.chi2_of(closures)
+    each = chi2 / numbers
+    is_uneven = len(each) >= _SEVERAL and each.mean() > max(_UNEVEN * float(np.median(each)), _NO_RESIDUAL)
+    return _judged(solution, settings).doubt or ("a few closures have nearly all of the residuals" if is_uneven else "")
+
+
+def _judged(solution: Solution, settings: Settings) -> Solution:
+    """The solution with its doubt. What a loss lets go of does not count if it is the smaller part of what has one."""
+    solver, graph, doubt = solution.solver, solution.file.graph, ""
     freedom, edges = solver.degrees_of_freedom, solver.edges
-    if freedom > 0 and report.chi2_final > max(_FAR_ABOVE * freedom, chdtri(freedom, _UNLIKELY)):
-        return f"chi2 {report.chi2_final:.6g} is far above its {freedom} degrees of freedom"
     chi2, numbers = solver.chi2_of(edges)
-    unlikely = chi2 > chdtri(numbers, _UNLIKELY / max(len(edges), 1))
-    far = np.flatnonzero(unlikely & (freedom > 0))
-    if len(far):
-        worst = int(np.argmax(chi2 / numbers))
+    unlikely = (chi2 > chdtri(numbers, _UNLIKELY / max(len(edges), 1))) & (freedom > 0)
+    has_loss = graph.has_label(edges, [label for label in graph.labels if settings.last_loss(label, "").kind])
+    gone, far = int((unlikely & has_loss).sum()), np.flatnonzero(unlikely & ~has_loss)
+    freedom, kept = freedom - int(numbers[unlikely & has_loss].sum()), float(chi2[~(unlikely & has_loss)].sum())
+    if not solution.report.converged:
+        doubt = f"it did not converge ({solution.report.stop})"
+    elif 2 * gone > has_loss.sum():
+        doubt = f"the loss lets go of {gone} of {has_loss.sum()} edges"
+    elif freedom > 0 and kept > max(_FAR_ABOVE * freedom, chdtri(freedom, _UNLIKELY)):
+        doubt = f"chi2 {kept:.6g} is far above its {freedom} degrees of freedom"
+    elif len(far):
+        worst = far[np.argmax(chi2[far] / numbers[far])]
         what = f"{len(far)} residuals are far outside" if len(far) > 1 else "a residual is far outside"
-        return f"{what} of their noise, e.g. edge {int(edges[worst])} with chi2 {chi2[worst]:.4g}"
-    closures = graph.has_label(edges, ("closures",))
-    each = chi2[closures] / numbers[closures]
-    if len(each) >= _SEVERAL and each.mean() > max(_UNEVEN * float(np.median(each)), _NO_RESIDUAL):
-        return "a few closures have nearly all of the residuals"
-    return ""
+        doubt = f"{what} of their noise, e.g. {edge_text(solution.file, int(edges[worst]))} with chi2 {chi2[worst]:.4g}"
+    return replace(solution, doubt=doubt, let_go=gone)
 
 
-def started(file: G2oFile, init: str) -> tuple[Solver, str]:
+def edge_text(file: G2oFile, edge: int) -> str:
+    """An edge by its class and its vertices' ids in the file."""
+    return " ".join([file.graph.label_of(edge), *(str(file.ids[vertex]) for vertex in file.graph.edge(edge).vertices)])
+
+
+def started(file: G2oFile, init: str, on_pose: OnPose = lambda *_: None) -> tuple[Solver, str]:
     """A solver with initial values, and where they are from: edges alone leave nothing but their tree."""
     root, start = _root(file), init if file.has_values or init != "file" else "tree"
     if root is None or not _is_pose(file.graph, root):
         start = "file"
     solver = Solver(file.graph)
     in_time = sorted(range(file.graph.vertex_count), key=lambda vertex: file.ids[vertex])
-    solver.start_at(initial_values(file.graph, start, root or 0, in_time))
+    solver.start_at(initial_values(file.graph, start, root or 0, in_time, on_pose))
     return solver, start
 
 

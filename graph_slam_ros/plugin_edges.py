@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 
 from graph_slam_ros.errors import ConfigError
-from graph_slam_ros.graph import EdgeType, VertexKind
+from graph_slam_ros.graph import EdgeType
+from graph_slam_ros.graph.check_edge import random_value
 from graph_slam_ros.graph.edge_type import numeric_jacobian
-from graph_slam_ros.graph.vertices import GROUPS
 from graph_slam_ros.plugins import in_one_line
 from graph_slam_ros.typing import Array, Index
 
-_TRIALS, _SPREAD = 20, 3.0  # at random values [m, rad]
+_TRIALS = 20  # at random values
 _TOLERANCE = 1e-4  # of the largest number of a Jacobian
 
 
@@ -23,7 +23,7 @@ def fault_of(edge: EdgeType) -> str:
     """
     rng, tried, wrong = np.random.default_rng(0), 0, list[str]()
     for _ in range(_TRIALS):
-        values = tuple(_random(kinds[0], rng) for kinds in edge.accepts)
+        values = tuple(random_value(kinds[0], rng) for kinds in edge.accepts)
         measured = edge.whole(rng.standard_normal(edge.measured_size - len(edge.tail)))
         at = np.cumsum([0, *(value.size for value in values[:-1])])[None]
         try:
@@ -47,30 +47,19 @@ def named(edge: EdgeType, plugin: str) -> EdgeType:
     """The same edge type, whose faults are a ConfigError that names the plugin."""
 
     def linearize(x: Array, at: Index, measured: Array) -> tuple[Array, Array]:
-        out = _linearized(edge, x, at, measured)
-        if isinstance(out, str):
-            raise ConfigError(f"edge {edge.name!r}, {plugin}: {out}")
+        try:
+            out = edge.linearize(x, at, measured)
+            fault = _shape_fault(edge, *out, len(at))
+        except Exception as error:  # whatever another's function does
+            fault = in_one_line(error)
+        if fault:
+            raise ConfigError(f"edge {edge.name!r}, {plugin}: {fault}")
         return out
 
     return replace(edge, linearize=linearize)
-
-
-def _linearized(edge: EdgeType, x: Array, at: Index, measured: Array) -> tuple[Array, Array] | str:
-    """Residuals and Jacobians, or what is wrong with them."""
-    try:
-        residuals, jacobians = edge.linearize(x, at, measured)
-        fault = _shape_fault(edge, residuals, jacobians, len(at))
-    except Exception as error:  # whatever another's function does
-        return in_one_line(error)
-    return fault or (residuals, jacobians)
 
 
 def _shape_fault(edge: EdgeType, residual: Any, jacobian: Any, count: int) -> str:
     due = (count, edge.residual_size), (count, edge.residual_size, sum(edge.dofs))
     shapes = np.shape(residual), np.shape(jacobian)
     return "" if shapes == due else f"shapes {shapes[0]} and {shapes[1]}, not {due[0]} and {due[1]}"
-
-
-def _random(kind: VertexKind, rng: np.random.Generator) -> Array:
-    origin = np.array(GROUPS[kind].IDENTITY if kind in GROUPS else [0.0] * kind.size)
-    return kind.retract(origin[None], _SPREAD * rng.standard_normal((1, kind.dof)))[0]

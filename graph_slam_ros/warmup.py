@@ -28,20 +28,7 @@ from numba import types
 
 from graph_slam_ros import graph as graphs
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.graph import (
-    HUBER,
-    LANDMARK_POSITION,
-    POSE_PRIOR,
-    R2,
-    RELATIVE_POSE,
-    SE2,
-    SE3,
-    EdgeType,
-    Gaussian,
-    Graph,
-    Loss,
-    retraction,
-)
+from graph_slam_ros.graph import SE2, SE3, EdgeType, Gaussian, Graph, Loss, retraction
 from graph_slam_ros.lie import se2, se3
 from graph_slam_ros.lie.jit import CACHE_DIR
 from graph_slam_ros.progress import report
@@ -188,14 +175,14 @@ def _load_plane() -> None:
     _make(_shared_kernels() + _structure_kernels() + _number_kernels())
     graph = Graph()
     poses = graph.add_vertices(SE2, np.zeros((2, 3)))
-    point = graph.add_vertex(R2, np.zeros(2))
+    point = graph.add_vertex(graphs.R2, np.zeros(2))
     planar, flat = (Gaussian.from_sigmas(*[1.0] * dof) for dof in (3, 2))
-    graph.add_edge(POSE_PRIOR, [poses[0]], [0, 0, 0], planar, "anchor")
-    graph.add_edge(RELATIVE_POSE, poses, [1, 0, 0.1], planar, "odometry")
+    graph.add_edge(graphs.POSE_PRIOR, [poses[0]], [0, 0, 0], planar, "anchor")
+    graph.add_edge(graphs.RELATIVE_POSE, poses, [1, 0, 0.1], planar, "odometry")
     for _ in range(2):
-        graph.add_edge(LANDMARK_POSITION, [poses[0], point], [1, 1], flat, "landmarks")
+        graph.add_edge(graphs.LANDMARK_POSITION, [poses[0], point], [1, 1], flat, "landmarks")
     solver = Solver(
-        graph, Settings(losses={"landmarks": [Loss(HUBER), Loss()]}, relinearize_above=0.0, relinearize_every=1)
+        graph, Settings(losses={"landmarks": [Loss(graphs.HUBER), Loss()]}, relinearize_above=0.0, relinearize_every=1)
     )
     edges = range(graph.edge_count - 1)
     solver.add(range(graph.vertex_count), edges)

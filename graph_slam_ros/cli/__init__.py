@@ -8,9 +8,7 @@ interrupted (Ctrl-C); of ``optimize --certify`` also 4 not certified, 5 the cert
 import os
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # small dense blocks: threads only cost, and reorder sums
-os.environ["MPLBACKEND"] = (
-    "agg"  # pictures go into files: what a shell says of windows is not for them, and may be wrong
-)
+os.environ["MPLBACKEND"] = "agg"  # pictures go into files, whatever a shell says of windows
 
 import gc
 import io

@@ -42,16 +42,6 @@ def edge(text: str) -> int:
         raise argparse.ArgumentTypeError(f"{text} is not the id of an edge") from None
 
 
-def method(text: str) -> str:
-    """One of the methods of the solver. Raises ArgumentTypeError."""
-    from graph_slam_ros.solver import Settings
-
-    try:
-        return Settings(method=text).method
-    except GraphSlamError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
-
-
 def port(text: str) -> int:
     """A port, 0 to 65535. Raises ArgumentTypeError."""
     if not re.fullmatch(r"\d{1,5}", text, re.ASCII) or int(text) > 65535:

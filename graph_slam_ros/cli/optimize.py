@@ -3,7 +3,9 @@
 import argparse
 import json
 import shlex
+import time
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,10 +14,9 @@ from graph_slam_ros.cli.usage import CODES, CommandParser, later
 from graph_slam_ros.errors import GraphSlamError
 
 if TYPE_CHECKING:
-    from graph_slam_ros.formats.graph_file import G2oFile
     from graph_slam_ros.graph import Graph, Loss
     from graph_slam_ros.optimization import Solution
-    from graph_slam_ros.solver import Report, Solver
+    from graph_slam_ros.solver import Report, Settings, Solver
 
 STARTS = {
     "file": "the file",
@@ -23,6 +24,7 @@ STARTS = {
     "chordal": "the chordal relaxation",
     "online": "the drive, pose after pose",
 }
+_MOST_TRIAL_S = 10.0
 _NO_VALUES = "the file has no vertex lines"
 
 
@@ -31,7 +33,7 @@ def optimize_options(sub: CommandParser) -> None:
     sub.codes = f"{CODES} With --certify: 4 not certified, 5 the certificate does not apply."
     sub.add_argument("graph", type=Path, metavar="GRAPH", help="file of a graph")
     about = "method of optimisation; gn (default) is damped only if it does not converge"
-    sub.add_argument("--method", type=arguments.method, default="gn", metavar="gn|lm|dogleg", help=about)
+    sub.add_argument("--method", choices=("gn", "lm", "dogleg"), default="gn", help=about)
     about = "most iterations (default: 100)"
     sub.add_argument("--max-iterations", type=arguments.count, default=100, metavar="N", help=about)
     about = "converged when the cost decreases by a smaller fraction (default: 1e-6)"
@@ -64,59 +66,91 @@ def optimize_options(sub: CommandParser) -> None:
 
 def optimize(args: argparse.Namespace) -> int:
     """Solve a graph, print the outcome, write it and draw it."""
+    from graph_slam_ros.formats.g2o import read_g2o
     from graph_slam_ros.formats.g2o_writer import write_g2o
     from graph_slam_ros.formats.strict import ending
     from graph_slam_ros.formats.tum import write_trajectory
     from graph_slam_ros.optimization import optimize as solve
     from graph_slam_ros.optimization import started
-    from graph_slam_ros.solver import Settings
+    from graph_slam_ros.runs.folder import GRAPH, is_run
     from graph_slam_ros.warmup import compile_all
 
     compile_all()
     console.check_file(args.out, args.plot, force=args.force, source=args.graph)
-    file = _read_graph(args, error_map=args.error_map)
+    if is_run(args.graph):
+        raise GraphSlamError(f"{args.graph}: a run folder; its graph is {args.graph / GRAPH}")
+    how: dict[str, Any] = {"lenient": args.lenient, "raw": args.information == "raw", "dialect": args.source}
+    file = read_g2o(args.graph, error_map=args.error_map, **how)
     graph = file.graph
-    settings = Settings(
-        method=args.method,
-        max_iterations=args.max_iterations,
-        cost_tolerance=args.tolerance,
-        losses={label: [args.loss] for label in graph.labels if label != "odometry"},
-    )
+    settings = _settings(args, graph)
     solution = solve(file, settings, init=args.init)
     solver, report, start = solution.solver, solution.report, solution.start
     certified = later("tools.certificate.command", "certified")
     proof, code, told = certified(solution) if args.certify else (None, console.DONE, "")
     if args.json:
         proved = {"certificate": proof.as_dict()} if proof else {}
-        console.show(json.dumps(_answer(report, start, args) | _starts(solution) | proved))
+        told_of = {"losses": file.losses, "notes": file.notes}
+        console.show(json.dumps(_answer(report, start, args) | _starts(solution) | told_of | proved))
     else:
         start_text = STARTS[start] + ("" if file.has_values else f": {_NO_VALUES}")
-        console.show(*_optimize_text(report, start_text, args.loss), *_starts_text(solution), *told.splitlines())
+        console.show(*_optimize_text(solution, start_text, args.loss), *_starts_text(solution), *told.splitlines())
     if args.out:
         (write_trajectory if ending(args.out) == ".tum" else write_g2o)(args.out, file, solver.estimate)
     if args.plot:
         _plot_graph(args.plot, graph, _positions(graph, started(file, start)[0]), _positions(graph, solver))
-    _warn_unknown(file)
     for note in file.notes:
         console.warn(note)
     if not args.json:
-        console.then(_after(args, report.converged))
-    return console.report_losses(file.skipped) or code
+        console.then(_after(args, solution))
+    why = f"{solution.doubt}: wrong edges, which --loss cauchy lets go of, or too little noise in the information"
+    lost = console.report_losses(file.losses, [why] if solution.doubt else ())
+    return lost or (console.LOSSES if solution.doubt else code)
 
 
-def _after(args: argparse.Namespace, converged: bool) -> str:
+def _settings(args: argparse.Namespace, graph: "Graph") -> "Settings":
+    from graph_slam_ros.solver import Settings
+
+    losses = {label: [args.loss] for label in graph.labels if label != "odometry"}
+    return Settings(args.method, args.max_iterations, cost_tolerance=args.tolerance, losses=losses)
+
+
+def _after(args: argparse.Namespace, solution: "Solution") -> str:
     from graph_slam_ros.formats.strict import ending
 
-    if not converged:
+    if not solution.report.converged:
         start = "online" if args.init == "chordal" else "chordal"
         words = _options(argparse.Namespace(**vars(args) | {"init": start}))
         return f"{console.command('optimize', args.graph, *words)} (another start)"
+    if solution.doubt:
+        return _remedy(args, solution)
     if args.out is None:
         words = _options(args)
         return f"{console.command('optimize', args.graph, *words, '--out', 'SOLVED.g2o')} (the same, and write it)"
     if ending(args.out) == ".tum":
         return f"evo_traj tum {shlex.quote(str(args.out))} --plot, or any reader of TUM trajectories"
     return f"{console.command('optimize', args.out, '--out', 'POSES.tum')} (the poses as a trajectory)"
+
+
+def _told(solution: "Solution") -> str:
+    return f"the loss lets go of {solution.let_go} edges" if solution.let_go else "all edges fit"
+
+
+def _remedy(args: argparse.Namespace, solution: "Solution") -> str:
+    """The command whose answer is not in doubt, if one of some that are tried is; else what to look at."""
+    from graph_slam_ros.optimization import optimize as solve
+
+    robust, began = {"loss": arguments.loss("cauchy")}, time.perf_counter()
+    for change in ({"init": "auto"}, robust | {"init": "file"}, robust | {"init": "auto"}):
+        other = argparse.Namespace(**vars(args) | change)
+        if list(_options(other)) == list(_options(args)) or time.perf_counter() - began > _MOST_TRIAL_S:
+            continue
+        with suppress(GraphSlamError):
+            tried = solve(solution.file, _settings(other, solution.file.graph), init=other.init)
+            if not tried.doubt:
+                words = console.command("optimize", args.graph, *_options(other), "--out", "SOLVED.g2o")
+                return f"{words} (tried: {_told(tried)})"
+    ratio = (solution.report.chi2_final / max(1, solution.solver.degrees_of_freedom)) ** 0.5
+    return f"the worst edges; if all fit alike, noise is {ratio:.3g} times what the information says (no loss helps)"
 
 
 def _options(args: argparse.Namespace) -> Iterable[str]:
@@ -133,29 +167,13 @@ def _options(args: argparse.Namespace) -> Iterable[str]:
         yield "--lenient"
 
 
-def _read_graph(args: argparse.Namespace, **options: Any) -> "G2oFile":
-    from graph_slam_ros.formats.g2o import read_g2o
-    from graph_slam_ros.runs.folder import GRAPH, is_run
-
-    if is_run(args.graph):
-        raise GraphSlamError(f"{args.graph}: a run folder; its graph is {args.graph / GRAPH}")
-    raw = args.information == "raw"
-    return read_g2o(args.graph, lenient=args.lenient, raw=raw, dialect=args.source, **options)
-
-
-def _warn_unknown(file: "G2oFile") -> None:
-    tags = sorted({line.split()[0] for line in file.unknown})
-    if tags:
-        console.warn(f"{len(file.unknown)} lines with unknown tags kept as they are: {', '.join(tags)}")
-
-
 def _starts(solution: "Solution") -> dict[str, Any]:
     """The starts for JSON: which were tried, and the reason if there was more than one."""
-    tried = [
-        {"start": one.start, "chi2": None if one.failure else one.chi2, "failure": one.failure}
-        for one in solution.attempts
-    ]
-    return {"suspicion": solution.suspicion, "starts": tried}
+    tried = [(one.start, None if one.failure else one.chi2, one.failure) for one in solution.attempts]
+    starts = [dict(zip(("start", "chi2", "failure"), one, strict=True)) for one in tried]
+    worst = [{"edge": edge, "chi2": chi2} for edge, chi2 in solution.worst()] if solution.doubt else []
+    freedom = {"degrees_of_freedom": solution.solver.degrees_of_freedom, "let_go": solution.let_go}
+    return freedom | {"suspicion": solution.suspicion, "doubt": solution.doubt, "worst": worst, "starts": starts}
 
 
 def _starts_text(solution: "Solution") -> Iterable[str]:
@@ -176,25 +194,15 @@ def _starts_text(solution: "Solution") -> Iterable[str]:
 
 
 def _answer(report: "Report", start: str, args: argparse.Namespace) -> dict[str, Any]:
-    return {
-        "chi2_initial": report.chi2_initial,
-        "chi2_final": report.chi2_final,
-        "cost_initial": report.cost_initial,
-        "cost_final": report.cost_final,
-        "iterations": len(report.iterations),
-        "converged": report.converged,
-        "stop": report.stop,
-        "method": report.method,
-        "loss": _loss_text(args.loss),
-        "start": start,
-        "error_map": args.error_map,
-        "classes": {name: {"edges": c.edges, "chi2": c.chi2} for name, c in report.classes.items()},
-    }
+    names = "chi2_initial", "chi2_final", "cost_initial", "cost_final", "converged", "stop", "method"
+    classes = {name: {"edges": part.edges, "chi2": part.chi2} for name, part in report.classes.items()}
+    settings = {"loss": _loss_text(args.loss), "start": start, "error_map": args.error_map, "classes": classes}
+    return {name: getattr(report, name) for name in names} | {"iterations": len(report.iterations)} | settings
 
 
-def _optimize_text(report: "Report", start: str, loss: "Loss") -> Iterable[str]:
+def _optimize_text(solution: "Solution", start: str, loss: "Loss") -> Iterable[str]:
     """The result as text. The cost is given in addition to chi2 if a loss makes them differ."""
-    robust = _loss_text(loss)
+    robust, report = _loss_text(loss), solution.report
 
     def both(chi2: float, cost: float) -> str:
         return f"chi2 {chi2:16.6f}" + (f"   cost {cost:16.6f}" if robust != "none" else "")
@@ -204,9 +212,14 @@ def _optimize_text(report: "Report", start: str, loss: "Loss") -> Iterable[str]:
         damping = f"   damping {step.damping:.0e}" if step.damping else ""
         yield f"{k:5d}    {both(step.chi2, step.cost)}   largest step {step.step:.2e}{damping}"
     state = "converged" if report.converged else "NOT converged"
-    yield f"{state} ({report.stop}), method {report.method}" + (f", loss {robust}" if robust != "none" else "")
+    told = f"{state} ({report.stop}), method {report.method}" + (f", loss {robust}" if robust != "none" else "")
+    yield f"{told}, {solution.solver.degrees_of_freedom} degrees of freedom"
     for name, part in report.classes.items():
         yield f"  {name:12s}{part.edges:7d} edges   chi2 {part.chi2:14.6f}"
+    if solution.let_go:
+        yield f"  {_told(solution)}"
+    if solution.doubt or solution.let_go:
+        yield from (f"  worst: {edge}, chi2 {chi2:.4g}" for edge, chi2 in solution.worst())
 
 
 def _loss_text(loss: "Loss") -> str:
@@ -226,12 +239,7 @@ def _plot_graph(out: Path, graph: "Graph", initial: Any, final: Any) -> None:
 
     from graph_slam_ros.analysis.plots import draw_graph
 
-    edges: dict[str, list[Any]] = {}
-    for table in graph.tables.values():
-        if len(table.type.accepts) == 2:
-            for code, label in enumerate(graph.labels):
-                edges.setdefault(label, []).extend(
-                    table.at(np.flatnonzero(table.label.values == code)).vertices.tolist()
-                )
+    ends = {label: [graph.edge(int(edge)).vertices for edge in graph.edges_of(label)] for label in graph.labels}
+    pairs = {label: [two for two in of_label if len(two) == 2] for label, of_label in ends.items()}
     points: Any = np.flatnonzero([graph.kind_of(v).name[0] == "R" for v in range(graph.vertex_count)])
-    draw_graph(out, initial, final, {k: np.array(v) for k, v in edges.items() if v}, points if len(points) else None)
+    draw_graph(out, initial, final, {k: np.array(v) for k, v in pairs.items() if v}, points if len(points) else None)

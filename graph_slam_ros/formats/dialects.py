@@ -11,13 +11,16 @@ Each line is turned into the g2o line of the same meaning, so there is one reade
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
-from graph_slam_ros.errors import FormatError
+from graph_slam_ros.edge_tags import SWITCHED
+from graph_slam_ros.errors import FormatError, NoiseError
 from graph_slam_ros.formats.strict import expect, integer, numbers
+from graph_slam_ros.graph import Gaussian
 from graph_slam_ros.lie import so3
+from graph_slam_ros.typing import Array
 
 Words: TypeAlias = list[str]
 
@@ -56,11 +59,8 @@ def in_g2o_words(words: Words, text: Text) -> Words:
     tag = words[0]
     if text.dialect and tag not in _TAGS[text.dialect] and any(tag in tags for tags in _TAGS.values()):
         raise FormatError(f"{tag} is no line of a {text.dialect} file")
-    translate = _READ.get(tag)
-    if translate is None:
-        return words
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite then is refused with its line
-        return translate(words, text)
+        return _READ[tag](words, text) if tag in _READ else words
 
 
 def may_be_roots(words: Words, text: Text) -> bool:
@@ -70,11 +70,6 @@ def may_be_roots(words: Words, text: Text) -> bool:
     return not np.array_equal(numbers(words[9:]), np.eye(6)[_UPPER_3D])  # which is its own root
 
 
-def _vertex2(words: Words, _: Text) -> Words:
-    expect(words, 4)
-    return ["VERTEX_SE2", *words[1:]]
-
-
 def _edge2(words: Words, text: Text) -> Words:
     """The fields of a g2o line from an EDGE2, in the order of its dialect; an order that must be named is refused."""
     expect(words, 11)
@@ -82,10 +77,12 @@ def _edge2(words: Words, text: Text) -> Words:
     if text.dialect == "isam":
         return ["EDGE_SE2", *words[1:6], *_written(_squared(rows))]
     toro = [rows[k] for k in _TORO]
-    if text.dialect is None and not _is_definite(toro) and rows[0] > 0.0 and rows[3] > 0.0 and rows[5] > 0.0:
-        raise FormatError(
-            "EDGE2 is not in TORO's order: --from isam (square roots of the information) or --from rows (information)"
-        )
+    if text.dialect is None and min(rows[0], rows[3], rows[5]) > 0.0:
+        try:
+            Gaussian.from_information(symmetric(toro))
+        except NoiseError:
+            remedy = "--from isam (square roots of the information) or --from rows (information)"
+            raise FormatError(f"EDGE2 is not in TORO's order: {remedy}") from None
     return ["EDGE_SE2", *words[1:6], *_written(rows if text.dialect == "rows" else toro)]
 
 
@@ -95,31 +92,29 @@ def _vertex3(words: Words, _: Text) -> Words:
 
 
 def _edge3(words: Words, text: Text) -> Words:
-    """The fields of a g2o line. The information is the identity if there is none; rotations are rotation vectors."""
+    """The fields of a g2o line; rotations are rotation vectors."""
     if len(words) != 9:
         expect(words, 29)
     values = numbers(words[3:])
-    information = np.array(values[6:]) if len(values) > 6 else np.eye(6)[_UPPER_3D]
-    if text.dialect == "isam":
-        information = np.array(_squared(information.tolist()))
-    if not text.raw:
+    information = np.array(_squared(values[6:]) if text.dialect == "isam" and values[6:] else values[6:])
+    if not text.raw and len(information):
         information = information / np.outer(_HALVED, _HALVED)[_UPPER_3D]
     return ["EDGE_SE3:QUAT", *words[1:3], *_written(_pose(values[:6])), *_written(information.tolist())]
 
 
 def _odometry(words: Words, text: Text) -> Words:
     expect(words, 11)
-    if text.dialect == "isam":
-        return ["EDGE_SE2", *words[1:6], *_written(_squared(numbers(words[6:])))]
-    return ["EDGE_SE2", *words[1:6], *_written(_inverse(numbers(words[6:])))]
+    return ["EDGE_SE2", *words[1:6], *_information(words[6:], text)]
 
 
 def _landmark(words: Words, text: Text) -> Words:
     expect(words, 7)
     landmark = str(LANDMARK_IDS_FROM + integer(words[2]))
-    if text.dialect == "isam":
-        return ["EDGE_SE2_XY", words[1], landmark, *words[3:5], *_written(_squared(numbers(words[5:])))]
-    return ["EDGE_SE2_XY", words[1], landmark, *words[3:5], *_written(_inverse(numbers(words[5:])))]
+    return ["EDGE_SE2_XY", words[1], landmark, *words[3:5], *_information(words[5:], text)]
+
+
+def _information(words: Words, text: Text) -> Words:
+    return _written((_squared if text.dialect == "isam" else _inverse)(numbers(words)))
 
 
 def _point(words: Words, text: Text) -> Words:
@@ -128,16 +123,31 @@ def _point(words: Words, text: Text) -> Words:
     return ["VERTEX_XY", str(text.landmarks_from + integer(words[1])), *words[2:]]
 
 
+def _horizontal(words: Words, _: Text) -> Words:
+    expect(words, 6)
+    x, y, xx, xy, yy = words[2:]
+    return ["EDGE_POSITION_SE3", words[1], x, y, "0", xx, xy, "0", yy, "0", "0"]
+
+
+def _named(tag: str, dropped: int = 0) -> "Translation":
+    """Translate a line that is g2o's or ours but for its tag, and maybe a field that is dropped."""
+    return lambda words, _: [tag, *(word for k, word in enumerate(words[1:], start=1) if k != dropped)]
+
+
 Translation: TypeAlias = Callable[[Words, Text], Words]
 
 _READ: dict[str, Translation] = {
-    "VERTEX2": _vertex2,
+    "VERTEX2": _named("VERTEX_SE2"),
     "EDGE2": _edge2,
     "VERTEX3": _vertex3,
     "EDGE3": _edge3,
     "ODOMETRY": _odometry,
     "LANDMARK": _landmark,
     "VERTEX_XY": _point,
+    "EDGE_SE3_PRIORXYZ": _named("EDGE_POSITION_SE3"),  # hdl_graph_slam's, as the next
+    "EDGE_SE3_PRIORXY": _horizontal,
+    "EDGE_SE3_XYZ_PRIOR": _named("EDGE_POSITION_SE3", 2),  # g2o does not use its parameter
+    **{tag: _named(plain, 3) for tag, plain in SWITCHED.items()},
 }
 
 
@@ -164,43 +174,25 @@ def _pose(xyz_rpy: list[float]) -> list[float]:
     return [*xyz_rpy[:3], *(float(q) for q in so3.compose(so3.compose(about_z, about_y), about_x))]
 
 
-def _is_definite(upper: list[float]) -> bool:
-    """Return whether a matrix is positive definite, by its correlations: units do not matter."""
-    a, b, c, d, e, f = upper
-    if not (a > 0.0 and d > 0.0 and f > 0.0):
-        return False
-    b, c, e = b / (a * d) ** 0.5, c / (a * f) ** 0.5, e / (d * f) ** 0.5
-    return b * b < 1.0 and 1.0 + 2.0 * b * c * e > b * b + c * c + e * e
+def symmetric(upper: Any) -> Array:
+    """Matrices (m, m) or (n, m, m) of the rows of their upper triangles."""
+    given = np.asarray(upper, dtype=np.float64)
+    size = round(np.sqrt(2 * given.shape[-1] + 0.25) - 0.5)
+    full, (i, j) = np.zeros((*given.shape[:-1], size, size)), np.triu_indices(size)
+    full[..., i, j] = full[..., j, i] = given
+    return full
 
 
 def _squared(rows: list[float]) -> list[float]:
     """The upper triangle of ``R'R``, from the rows of the upper triangle of R."""
-    size = {3: 2, 6: 3, 21: 6}[len(rows)]
-    at, root = np.triu_indices(size), np.zeros((size, size))
-    root[at] = rows
-    out: list[float] = (root.T @ root)[at].tolist()
-    return out
+    root = np.triu(symmetric(rows))
+    return [*(root.T @ root)[np.triu_indices(len(root))]]
 
 
 def _inverse(upper: list[float]) -> list[float]:
-    """The inverse of a covariance from its upper triangle, computed by correlations as units may differ much."""
-    size = 3 if len(upper) == 6 else 2
-    matrix = np.zeros((size, size))
-    at = np.triu_indices(size)
-    matrix[at] = upper
-    matrix.T[at] = upper
-    if not (np.diagonal(matrix) > 0.0).all():
-        raise FormatError("the covariance is not positive definite")
-    scale = 1.0 / np.sqrt(np.diagonal(matrix))
-    correlation = matrix * scale[:, None] * scale
-    if not np.linalg.det(correlation) > 0.0:
-        raise FormatError("the covariance is not positive definite")
-    with np.errstate(over="ignore"):
-        inverse = (np.linalg.inv(correlation) * scale[:, None] * scale)[at]
-    if not np.isfinite(inverse).all():
-        raise FormatError("the covariance is too small to have an inverse")
-    out: list[float] = inverse.tolist()
-    return out
+    """The upper triangle of the inverse of a covariance, from its own."""
+    inverse = Gaussian.from_covariance(symmetric(upper)).information
+    return [*inverse[np.triu_indices(len(inverse))]]
 
 
 def _written(values: list[float]) -> Words:

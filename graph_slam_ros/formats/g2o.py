@@ -10,40 +10,28 @@ without vertex lines.
 
 import itertools
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
-from graph_slam_ros.edge_tags import EDGE_TAGS, OFFSET, VERTEX_TAGS, built_in, edge_of, measured_sizes, plugin_tags
+from graph_slam_ros import edge_tags
+from graph_slam_ros import graph as graphs
 from graph_slam_ros.errors import FormatError, NoiseError
-from graph_slam_ros.formats.dialects import DIALECTS, LANDMARK_IDS_FROM, Text, in_g2o_words, may_be_roots
-from graph_slam_ros.formats.graph_file import AT_OFFSET, HALVED, G2oFile, moved
-from graph_slam_ros.formats.strict import expect, integer, lines, numbers
-from graph_slam_ros.graph import (
-    ATTITUDE_PRIOR_3D,
-    INVERSE_RELATIVE_POSE,
-    LANDMARK_POSITION_3D,
-    POSE_PRIOR_3D,
-    RELATIVE_POSE,
-    RELATIVE_POSE_3D,
-    SE2,
-    SE3,
-    EdgeType,
-    Gaussian,
-    Graph,
-)
+from graph_slam_ros.formats.dialects import DIALECTS, LANDMARK_IDS_FROM, Text, in_g2o_words, may_be_roots, symmetric
+from graph_slam_ros.formats.graph_file import AT_OFFSET, HALVED, NO_EDGES, G2oFile, moved, tags_of
+from graph_slam_ros.formats.strict import expect, foreign, integer, lines, numbers
+from graph_slam_ros.graph import SE2, SE3, EdgeType, Gaussian, Graph, VertexKind
 from graph_slam_ros.lie import se3
 from graph_slam_ros.typing import Array
 
 _RELATIVE = ("EDGE_SE2", "EDGE_SE3:QUAT")
 _CLASS = re.compile(r"#\s+(?:\d+\s+\d+\s+)?class\s+(\S+)\s*", re.ASCII)  # our comment, the label of what follows it
-_PRINTED = 1e-3  # of correlations: what three printed digits leave of an eigenvalue that should not be negative
 _UNIT = 1e-12  # a squared quaternion norm this near to 1 is left as it was written
-ERROR_MAPS = {"relative": RELATIVE_POSE, "seed": INVERSE_RELATIVE_POSE}
+ERROR_MAPS = {"relative": graphs.RELATIVE_POSE, "seed": graphs.INVERSE_RELATIVE_POSE}
 
 
 @dataclass(slots=True)
@@ -62,15 +50,13 @@ class _Reader:
     def __init__(self, name: str, lenient: bool, text: Text) -> None:
         self.name, self.lenient, self.text = name, lenient, text
         self.vertices: dict[int, tuple[str, list[float]]] = {}
-        self.edges: dict[str, list[_Edge]] = {tag: [] for tag in EDGE_TAGS}
+        self.edges: dict[str, list[_Edge]] = {tag: [] for tag in edge_tags.EDGE_TAGS}
         self.fixed: list[tuple[int, int]] = []
         self.offsets: dict[int, se3.Pose] = {}
-        self.unknown: list[str] = []
-        self.skipped: list[str] = []
-        self.repaired: list[int] = []
+        self.unknown, self.skipped, self.switched = list[str](), list[str](), list[str]()
+        self.repaired, self.bare = list[int](), list[int]()  # lines whose information is not definite, or not there
         self.assumed = 0  # the first line whose information may have been meant otherwise
-        self.has_values = True
-        self.label = ""
+        self.has_values, self.label = True, ""
 
     def refuse(self, line: int, why: str) -> None:
         message = f"{self.name}:{line}: {why}"
@@ -81,7 +67,7 @@ class _Reader:
     @cached_property
     def plugin_tags(self) -> frozenset[str]:
         """Tags of plugins, looked up at the first tag that is not built in."""
-        return plugin_tags()
+        return edge_tags.plugin_tags()
 
     def read_line(self, line: int, text: str) -> None:
         words = text.split()
@@ -91,27 +77,26 @@ class _Reader:
             return
         try:
             self.assumed = self.assumed or line * may_be_roots(words, self.text)
+            self.switched += words[:1] if words[0] in edge_tags.SWITCHED else ()
             words = in_g2o_words(words, self.text)
             tag = words[0]
-            if tag in VERTEX_TAGS:
+            if tag in edge_tags.VERTEX_TAGS:
                 self._vertex(tag, words)
-            elif built_in(tag):
-                self.edges.setdefault(tag, []).append(self._edge(line, tag, words))
-            elif tag == OFFSET:
+            elif tag == edge_tags.OFFSET:
                 self._offset(words)
             elif tag == "FIX":
                 if len(words) < 2:
                     raise FormatError("FIX names no vertex")
                 self.fixed += [(line, integer(word)) for word in words[1:]]
-            elif tag in self.plugin_tags:
+            elif edge_tags.built_in(tag) or tag in self.plugin_tags:
                 self.edges.setdefault(tag, []).append(self._edge(line, tag, words))
             else:
                 self.unknown.append(text.strip())
-        except FormatError as error:
+        except (FormatError, NoiseError) as error:
             self.refuse(line, str(error))
 
     def _vertex(self, tag: str, words: list[str]) -> None:
-        kind = VERTEX_TAGS[tag]
+        kind = edge_tags.VERTEX_TAGS[tag]
         expect(words, 1 + kind.size)
         vertex, value = integer(words[1]), _with_unit_quaternion(numbers(words[2:]), 3 if kind is SE3 else None)
         if vertex in self.vertices and self.vertices[vertex] != (tag, value):
@@ -121,48 +106,65 @@ class _Reader:
     def _offset(self, words: list[str]) -> None:
         expect(words, 1 + SE3.size)
         x, y, z, *q = _with_unit_quaternion(numbers(words[2:]), 3)
-        self.offsets[integer(words[1])] = (x, y, z, q[0], q[1], q[2], q[3])
+        number, pose = integer(words[1]), (x, y, z, q[0], q[1], q[2], q[3])
+        if self.offsets.setdefault(number, pose) != pose:
+            raise FormatError(f"parameter {number} was declared before, with other values: give each its own number")
 
     def _edge(self, line: int, tag: str, words: list[str]) -> _Edge:
-        edge = edge_of(tag)
-        slots, m, from_offset = len(edge.accepts), edge.residual_size, tag in AT_OFFSET
-        others, size = slots + from_offset + m * (m + 1) // 2, edge.measured_size
-        if len(words) - 1 - others in measured_sizes(tag):
-            size = len(words) - 1 - others
-        expect(words, others + size)
-        vertices = tuple(integer(word) for word in words[1 : 1 + slots])
-        values = numbers(words[1 + slots + from_offset :])
+        edge = edge_tags.edge_of(tag)
+        m, from_offset, sizes = edge.residual_size, tag in AT_OFFSET, edge_tags.measured_sizes(tag)
+        head, upper = len(edge.accepts) + from_offset, np.triu_indices(m)
+        given, count = len(words) - 1 - head, len(upper[0])
+        is_bare = given in sizes and given - count not in sizes
+        size = given if is_bare else given - count if given - count in sizes else edge.measured_size
+        expect(words, head + size + count * (not is_bare))
+        self.bare += [line] * is_bare
+        vertices = tuple(integer(word) for word in words[1 : 1 + len(edge.accepts)])
+        values = numbers(words[1 + head :])
         measured = _with_unit_quaternion(values[:size], _quaternion_at(edge))
         measured += edge.tail[size - edge.measured_size + len(edge.tail) :]
-        offset = integer(words[1 + slots]) if from_offset else None
-        return _Edge(line, vertices, measured, values[size:], self.label, offset)
+        offset = integer(words[head]) if from_offset else None
+        sigmas = HALVED[edge] if is_bare and edge in HALVED and not self.text.raw else np.ones(m)
+        information = values[size:] or np.diag(sigmas**-2.0)[upper].tolist()
+        return _Edge(line, vertices, measured, information, self.label, offset)
 
     def declare_all(self) -> None:
         """Declare the vertices of a file of edges alone: those that edges name, in order of id, without values."""
         self.has_values = False
-        kinds: dict[int, str] = {}
-        tags = {kind: tag for tag, kind in VERTEX_TAGS.items()}
+        kinds: dict[int, VertexKind] = {}
         for tag, edges in self.edges.items():
             for edge in edges:
-                for vertex, accepted in zip(edge.vertices, edge_of(tag).accepts, strict=True):
-                    kinds.setdefault(vertex, tags[accepted[0]])
-        nowhere = {"VERTEX_SE3:QUAT": [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]}
-        for vertex in sorted(kinds):
-            tag = kinds[vertex]
-            self.vertices[vertex] = (tag, nowhere.get(tag, [0.0] * VERTEX_TAGS[tag].size))
+                for vertex, accepted in zip(edge.vertices, edge_tags.edge_of(tag).accepts, strict=True):
+                    kinds.setdefault(vertex, accepted[0])
+        tags = {kind: tag for tag, kind in edge_tags.VERTEX_TAGS.items()}
+        for vertex, kind in sorted(kinds.items(), key=lambda item: item[0]):
+            self.vertices[vertex] = (tags[kind], [0.0] * (kind.size - 1) + [float(kind is SE3)])
 
     def graph(self, relative_pose: EdgeType) -> G2oFile:
         graph = Graph()
         at: dict[int, int] = {}
         for tag, run in itertools.groupby(self.vertices.items(), key=lambda item: item[1][0]):
             values = {file_id: value for file_id, (_, value) in run}
-            at.update(zip(values, graph.add_vertices(VERTEX_TAGS[tag], list(values.values())).tolist(), strict=True))
-        poses = sorted(file_id for file_id, (tag, _) in self.vertices.items() if VERTEX_TAGS[tag] in (SE2, SE3))
-        follows = dict(itertools.pairwise(poses))
+            at.update(
+                zip(values, graph.add_vertices(edge_tags.VERTEX_TAGS[tag], list(values.values())).tolist(), strict=True)
+            )
+        poses = sorted(
+            file_id for file_id, (tag, _) in self.vertices.items() if edge_tags.VERTEX_TAGS[tag] in (SE2, SE3)
+        )
+        follows = {one: next_ for one, next_ in itertools.pairwise(poses) if one >> 56 == next_ >> 56}  # of one robot
+        for (tag, kind), other in edge_tags.OF_POSES.items():
+            of_poses = [e for e in self.edges[tag] if self._kind(e.vertices[0]) is kind]
+            self.edges[tag] = [e for e in self.edges[tag] if self._kind(e.vertices[0]) is not kind]
+            self.edges[other] += [
+                replace(e, measured=[*e.measured, *edge_tags.EDGE_TAGS[other].tail]) for e in of_poses
+            ]
         seen_from: dict[int, int] = {}
         for tag, edges in self.edges.items():
-            edge_type = relative_pose if tag == "EDGE_SE2" else edge_of(tag)
-            for label, members in _by_label(tag, self._known(tag, edges), follows).items():
+            edge_type = relative_pose if tag == "EDGE_SE2" else edge_tags.edge_of(tag)
+            groups: dict[str, list[_Edge]] = {}
+            for edge in self._known(tag, edges):
+                groups.setdefault(edge.label or _usual_label(tag, edge, follows), []).append(edge)
+            for label, members in groups.items():
                 seen_from |= self._add(graph, edge_type, label, members, at)
         fixed = []
         for line, file_id in self.fixed:
@@ -170,26 +172,28 @@ class _Reader:
                 fixed.append(at[file_id])
             else:
                 self.refuse(line, f"FIX names vertex {file_id}, which is not declared")
-        return G2oFile(
-            graph,
-            list(at),
-            fixed,
-            self.offsets,
-            seen_from,
-            self.unknown,
-            self.skipped,
-            self.text.raw,
-            self.has_values,
-            list(self._notes()),
-        )
+        own, notes = (graph, list(at), fixed, self.offsets, seen_from, self.unknown), list(self._notes())
+        return G2oFile(*own, self.skipped, self.text.raw, self.has_values, notes)
+
+    def _kind(self, file_id: int) -> VertexKind | None:
+        return edge_tags.VERTEX_TAGS[self.vertices[file_id][0]] if file_id in self.vertices else None
 
     def _notes(self) -> Iterator[str]:
         if self.repaired:
-            what = f"{len(self.repaired)} information matrices" if len(self.repaired) > 1 else "an information matrix"
+            every = sum(len(edges) for edges in self.edges.values())
             yield (
-                f"{self.name}:{self.repaired[0]}: {what} not positive definite by the rounding of print alone:"
-                " weights from the traces of position and rotation are used instead"
+                f"{self.name}:{self.repaired[0]}: {len(self.repaired)} of {every} information matrices are not positive"
+                " definite as printed: weights from the traces of position and rotation are used instead"
             )
+        if self.bare:
+            yield (
+                f"{self.name}:{self.bare[0]}: {len(self.bare)} edges have no information: the identity is used, so all"
+                " of them weigh the same, a metre as much as a radian"
+            )
+        for tag in tags_of(self.switched):
+            yield f"{tag} are read as if they had no switch: --loss cauchy lets go of false ones"
+        if kept := tags_of(line for line in self.unknown if line.startswith(NO_EDGES)):
+            yield f"kept as they are, and not used: {', '.join(kept)}"
         if self.assumed:
             yield (
                 f"{self.name}:{self.assumed}: EDGE3 is read as TORO's information (--from toro says that it is); iSAM"
@@ -197,38 +201,36 @@ class _Reader:
             )
 
     def _known(self, tag: str, edges: Sequence[_Edge]) -> Iterator[_Edge]:
-        """Edges whose vertices exist and are of the right kind, and whose information is positive definite."""
         for edge in edges:
-            for file_id, kinds in zip(edge.vertices, edge_of(tag).accepts, strict=True):
-                declared = self.vertices.get(file_id)
-                if declared is None:
-                    self.refuse(edge.line, f"edge to vertex {file_id}, which is not declared")
-                    break
-                if VERTEX_TAGS[declared[0]] not in kinds:
-                    self.refuse(edge.line, f"{tag} to vertex {file_id}, which is a {declared[0]}")
-                    break
+            if fault := self._fault(tag, edge):
+                self.refuse(edge.line, fault)
             else:
-                if len(set(edge.vertices)) < len(edge.vertices):
-                    self.refuse(edge.line, f"edge from vertex {edge.vertices[0]} to itself")
-                elif edge.offset is None or self._is_at(tag, edge):
-                    yield edge
+                yield edge
 
-    def _is_at(self, tag: str, edge: _Edge) -> bool:
-        """Return whether the pose of an edge's sensor is known, and allows its measurement to be used."""
-        offset = self.offsets.get(edge.offset or 0)
-        if offset is None and edge.offset:  # some files leave out parameter 0, which is then the robot's frame itself
-            self.refuse(edge.line, f"parameter {edge.offset}, which is not declared")
-            return False
-        if tag == "EDGE_SE3_PRIOR" and offset not in (None, se3.IDENTITY):
-            self.refuse(edge.line, f"{tag} of a sensor that is not at the robot's origin")
-            return False
-        return True
+    def _fault(self, tag: str, edge: _Edge) -> str:
+        """Return why an edge cannot be used, by its vertices and the place of its sensor; empty where it can."""
+        for file_id, kinds in zip(edge.vertices, edge_tags.edge_of(tag).accepts, strict=True):
+            if (kind := self._kind(file_id)) is None:
+                return f"edge to vertex {file_id}, which is not declared"
+            if kind not in kinds:
+                return f"{tag} to vertex {file_id}, which is a {self.vertices[file_id][0]}"
+        if len(set(edge.vertices)) < len(edge.vertices):
+            return f"edge from vertex {edge.vertices[0]} to itself"
+        number = edge.offset or 0  # some files leave out parameter 0, which is then the robot's frame itself
+        if number and number not in self.offsets:
+            others = {e.offset for at in AT_OFFSET for e in self.edges[at]} - {0, number, *self.offsets}
+            too = f" (nor are {', '.join(map(str, others))})" if others else ""
+            mend = f"a line {edge_tags.OFFSET} {number} 0 0 0 0 0 0 1 says that its sensor is at the robot's origin"
+            return f"parameter {number}, which is not declared{too}: {mend}"
+        if tag == "EDGE_SE3_PRIOR" and self.offsets.get(number, se3.IDENTITY) != se3.IDENTITY:
+            return f"{tag} of a sensor that is not at the robot's origin"
+        return ""
 
     def _add(
         self, graph: Graph, edge_type: EdgeType, label: str, edges: list[_Edge], at: dict[int, int]
     ) -> dict[int, int]:
         """Add edges to the graph; returns the parameters of those that have one."""
-        information = _symmetric(np.array([e.information for e in edges]), edge_type.residual_size)
+        information = symmetric([e.information for e in edges])
         if edge_type in HALVED and not self.text.raw:
             information *= np.outer(HALVED[edge_type], HALVED[edge_type])
         good, kinds = list(range(len(edges))), edge_type.accepts
@@ -243,7 +245,7 @@ class _Reader:
             noise = Gaussian(np.stack([root for root in roots if root is not None]))
         edges = [edges[k] for k in good]
         measured = np.array([edge.measured for edge in edges])
-        if edge_type is LANDMARK_POSITION_3D:
+        if edge_type is graphs.LANDMARK_POSITION_3D:
             offsets = [self.offsets.get(edge.offset or 0, se3.IDENTITY) for edge in edges]
             measured, noise = moved(measured, noise.sqrt_information, offsets)
         ids = graph.add_edges(edge_type, [[at[v] for v in edge.vertices] for edge in edges], measured, noise, label)
@@ -313,37 +315,31 @@ def read_g2o(
     if not reader.vertices:
         reader.declare_all()
     if not reader.vertices:
-        raise FormatError(f"{path.name}: no vertex in it; is it a graph?")
+        seen = ", ".join(tags_of(reader.unknown)[:8])
+        what = foreign(path) or ("; is it a graph?" if not seen else f" of a kind that is known: there are {seen}")
+        raise FormatError(f"{path.name}: no vertex in it{what}")
     return reader.graph(ERROR_MAPS[error_map])
 
 
 def by_traces(information: Array, lengths: int) -> Array | None:
-    """Weights in place of an information matrix (m, m) that is not positive definite by the rounding of print alone.
+    """Weights in place of an information matrix (m, m) that is not positive definite, as print may leave it.
 
     As SE-Sync does for all: one weight for its first ``lengths`` numbers and one for the rest, each the mean of that
-    part of the diagonal. None where more than one eigenvalue is in doubt, one is too far below zero for rounding, or a
-    weight is not positive.
+    part of the diagonal. None where a number of the diagonal is not positive.
     """
-    if len(information) < 2 or not np.isfinite(information).all():
+    diagonal = np.diag(information).copy()
+    if not np.isfinite(information).all() or not (diagonal > 0.0).all():
         return None
-    diagonal = np.diag(information)
-    if not (diagonal > 0.0).all():
-        return None
-    scale = np.sqrt(diagonal)
-    least, second, *_ = np.linalg.eigvalsh(information / np.outer(scale, scale))
-    if least < -_PRINTED or second < _PRINTED:
-        return None
-    weights = np.empty(len(diagonal))
-    for block in (slice(0, lengths), slice(lengths, None)):
-        weights[block] = diagonal[block].mean() if len(diagonal[block]) else 0.0
-    return np.diag(weights)
+    for block in filter(len, (diagonal[:lengths], diagonal[lengths:])):
+        block[:] = block.mean()
+    return np.diag(diagonal)
 
 
 def _quaternion_at(edge: EdgeType) -> int | None:
     """Return the index of a quaternion in the measurement of an edge, if there is one."""
-    if edge in (RELATIVE_POSE_3D, POSE_PRIOR_3D):
+    if edge in (graphs.RELATIVE_POSE_3D, graphs.POSE_PRIOR_3D):
         return 3
-    if edge is ATTITUDE_PRIOR_3D:
+    if edge is graphs.ATTITUDE_PRIOR_3D:
         return 0
     return edge.measured_size - 4 if edge.tail == se3.IDENTITY else None
 
@@ -360,22 +356,7 @@ def _with_unit_quaternion(numbers: list[float], at: int | None) -> list[float]:
     return numbers[:at] + [q / square**0.5 for q in numbers[at:]]
 
 
-def _by_label(tag: str, edges: Iterable[_Edge], follows: dict[int, int]) -> dict[str, list[_Edge]]:
-    groups: dict[str, list[_Edge]] = {}
-    for edge in edges:
-        groups.setdefault(edge.label or _usual_label(tag, edge, follows), []).append(edge)
-    return groups
-
-
 def _usual_label(tag: str, edge: _Edge, follows: dict[int, int]) -> str:
     if tag in _RELATIVE:
         return "odometry" if follows.get(min(edge.vertices)) == max(edge.vertices) else "closures"
-    return "priors" if len(edge_of(tag).accepts) == 1 else "landmarks"
-
-
-def _symmetric(upper: Array, size: int) -> Array:
-    full = np.zeros((len(upper), size, size))
-    i, j = np.triu_indices(size)
-    full[:, i, j] = upper
-    full[:, j, i] = upper
-    return full
+    return "priors" if len(edge_tags.edge_of(tag).accepts) == 1 else "landmarks"

@@ -10,30 +10,24 @@ import numpy as np
 from graph_slam_ros.edge_tags import OFFSET, VERTEX_TAGS, tag_of
 from graph_slam_ros.errors import FormatError
 from graph_slam_ros.formats.durable import write_whole
-from graph_slam_ros.formats.graph_file import (
-    AT_OFFSET,
-    HALVED,
-    G2oFile,
-    Values,
-    moved,
-)
+from graph_slam_ros.formats.graph_file import AT_OFFSET, HALVED, G2oFile, Values, moved
 from graph_slam_ros.formats.strict import is_gzipped
-from graph_slam_ros.graph import LANDMARK_POSITION_3D, POSE_PRIOR_3D, EdgeType
+from graph_slam_ros.graph import LANDMARK_POSITION_3D, POSE_PRIOR_3D, EdgeType, Graph
 from graph_slam_ros.lie import se3
 
 
-def write_g2o(path: Path | str, file: G2oFile, values: Values) -> None:
+def write_g2o(path: Path | str, file: G2oFile | Graph, values: Values | None = None) -> None:
     """Write a graph; ``values(ids)`` gives the numbers of vertices of one kind, e.g. ``Solver.estimate``.
 
+    Without, the initial values are written. The ids of a ``Graph`` of one's own are its vertices' numbers.
     17 significant digits: what is read back is what was written. The information of an edge is multiplied by its
     weight; one of weight 0 is out of the problem, and left out.
     """
-    write_text(path, g2o_text(file, values))
-
-
-def g2o_text(file: G2oFile, values: Values) -> str:
-    """Return what ``write_g2o`` writes."""
-    return "\n".join(graph_lines(file, values)) + "\n"
+    if not isinstance(path, str | Path) or not isinstance(file, G2oFile | Graph):
+        raise FormatError("write_g2o(PATH, GRAPH, VALUES): PATH first, then a Graph or G2oFile, e.g. solution.file")
+    whole = file if isinstance(file, G2oFile) else G2oFile(file, list(range(file.vertex_count)))
+    values = values or (lambda ids: np.array([whole.graph.vertex(vertex).initial for vertex in ids]))
+    write_text(path, "\n".join(graph_lines(whole, values)) + "\n")
 
 
 def write_text(path: Path | str, text: str) -> None:

@@ -1,6 +1,7 @@
 """A graph as text files represent it, and g2o's tags of its vertices and edges."""
 
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
@@ -12,6 +13,7 @@ from graph_slam_ros.typing import Array
 
 Values: TypeAlias = Callable[[Sequence[int]], Array]
 
+NO_EDGES = ("VERTEX", "PARAMS", "EDGE_SWITCH_PRIOR", "ROBOTLASER", "RAWLASER")  # begin unknown tags that lose nothing
 AT_OFFSET = ("EDGE_SE3_PRIOR", "EDGE_SE3_TRACKXYZ")  # a parameter's number follows the vertices
 # of our residual, in g2o's
 HALVED = dict.fromkeys((RELATIVE_POSE_3D, POSE_PRIOR_3D), np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.5]))
@@ -46,6 +48,17 @@ class G2oFile:
     has_values: bool = True
     notes: list[str] = field(default_factory=list)
     absent: frozenset[int] = frozenset()
+
+    @property
+    def losses(self) -> list[str]:
+        """What is not in the graph: bad lines, in lenient reading, and lines that may be edges of an unknown kind."""
+        edges = [line for line in self.unknown if not line.startswith(NO_EDGES)]
+        return [*self.skipped, *(f"{tag}: of an unknown kind, so they are not in the graph" for tag in tags_of(edges))]
+
+
+def tags_of(lines: Iterable[str]) -> list[str]:
+    """The tags of lines, each with how often it is there."""
+    return [f"{count} {tag}" for tag, count in Counter(line.split()[0] for line in lines).items()]
 
 
 def moved(points: Array, root: Array, offsets: Sequence[se3.Pose]) -> tuple[Array, Gaussian]:

@@ -26,8 +26,18 @@ MOST_LINE = 2**20
 MOST_TEXT_RATIO = 100
 """Text of graphs is compressed 4 to 30 times; what grows beyond this is made to exhaust its reader."""
 _FREE = 2**20  # characters that may be unpacked whatever the ratio
-_ID = re.compile(r"[+-]?\d{1,18}", re.ASCII)
+_ID = re.compile(r"[+-]?\d{1,20}", re.ASCII)  # GTSAM's keys have 64 bits
+_COMMA = re.compile(r"[+-]?\d+,\d+(?:[eE][+-]?\d+)?", re.ASCII)
 _STAMP = re.compile(r"\d{1,18}|[1-8]\d{18}", re.ASCII)
+
+_FOREIGN = {
+    b"SQLite format 3": "a database. RTAB-Map's exports its graph: rtabmap-databaseViewer, File, Export poses, g2o",
+    b"22 serialization::archive": "a Boost archive, as slam_toolbox's .posegraph: no text of vertices and edges",
+    b"PK\3\4": "a zip archive: unzip it first",
+    b"\x1f\x8b": "compressed: give it a name that ends in .gz (a .tar.gz: tar xf)",
+    b"\x89MCAP": "a recording: graph_slam info prints how to replay it",
+    b"#ROSBAG": "a recording: graph_slam info prints how to replay it",
+}
 
 
 def lines(path: Path, *, follow: bool = True) -> Iterator[tuple[int, str]]:
@@ -44,7 +54,7 @@ def lines(path: Path, *, follow: bool = True) -> Iterator[tuple[int, str]]:
     except (gzip.BadGzipFile, zlib.error, EOFError):
         raise FormatError(f"{path.name}: damaged, or not a gzip file") from None
     except UnicodeDecodeError:
-        raise FormatError(f"{path.name}: not a text file") from None
+        raise FormatError(f"{path.name}: not a text file{foreign(path)}") from None
     except FileNotFoundError:
         raise FormatError(f"{path}: no such file{similar_file(path)}") from None
     except OSError as error:
@@ -66,6 +76,13 @@ def _bounded(stream: Any, path: Path, most: int | None) -> Iterator[tuple[int, s
         yield number, line
 
 
+def foreign(path: Path) -> str:
+    """Return what else a file is, and what mends that; empty where its first bytes do not tell."""
+    with opened(path, follow=True) as raw:
+        begins = raw.read(64)
+    return next((f": {what}" for magic, what in _FOREIGN.items() if begins.startswith(magic)), "")
+
+
 def is_gzipped(path: Path) -> bool:
     """Return whether the ending says so."""
     return path.suffix.lower() == ".gz"
@@ -84,7 +101,7 @@ def expect(words: list[str], count: int) -> None:
 
 def integer(word: str) -> int:
     """An id. Raises FormatError."""
-    if not _ID.fullmatch(word):
+    if not _ID.fullmatch(word) or not -(2**63) <= int(word) < 2**64:
         raise FormatError(f"{shortened(word)} is not an id")
     return int(word)
 
@@ -100,5 +117,8 @@ def numbers(words: list[str]) -> list[float]:
     """Finite numbers. Raises FormatError naming the first that is none."""
     for word in words:
         if len(word) > MOST_DIGITS or not _NUMBER.fullmatch(word) or float(word) in (np.inf, -np.inf):
-            raise FormatError(f"{shortened(word)} is not a finite number")
+            comma = (
+                ": a decimal comma; sed 's/,/./g' FILE > POINTS makes points of them" if _COMMA.fullmatch(word) else ""
+            )
+            raise FormatError(f"{shortened(word)} is not a finite number{comma}")
     return [float(word) for word in words]

@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph.edge_type import EdgeType, numeric_jacobian
-from graph_slam_ros.graph.vertices import SE2, SE3, VertexKind
+from graph_slam_ros.graph.vertices import GROUPS, VertexKind
 from graph_slam_ros.typing import Array
 
 _SPREAD = 5.0  # of random positions and measurements
@@ -32,7 +32,9 @@ def check_edge(
     """
     rng = np.random.default_rng(0)
     kinds = [accepted[0] for accepted in edge.accepts]
-    trials = [(tuple(_random(kind, rng) for kind in kinds), _measured(edge, measured, rng)) for _ in range(_TRIALS)]
+    trials = [
+        (tuple(random_value(kind, rng) for kind in kinds), _measured(edge, measured, rng)) for _ in range(_TRIALS)
+    ]
     alone = [_linearized(edge, [trial]) for trial in trials]
     for (values, z), (residual, jacobian) in zip(trials, alone, strict=True):
         at = f"at vertices {[v.tolist() for v in values]} and measured {z.tolist()}"
@@ -52,13 +54,10 @@ def check_edge(
             raise GraphSlamError(f"{edge.name}: edges linearised in one call are not what each is alone")
 
 
-def _random(kind: VertexKind, rng: np.random.Generator) -> Array:
-    value = _SPREAD * rng.standard_normal(kind.size)
-    if kind is SE2:
-        value[2] = rng.uniform(-np.pi, np.pi)
-    elif kind is SE3:
-        value[3:] /= np.linalg.norm(value[3:])
-    return value
+def random_value(kind: VertexKind, rng: np.random.Generator) -> Array:
+    """Return a value some metres and radians from the origin."""
+    origin = np.array(GROUPS[kind].IDENTITY if kind in GROUPS else [0.0] * kind.size)
+    return kind.retract(origin[None], _SPREAD * rng.standard_normal((1, kind.dof)))[0]
 
 
 def _measured(

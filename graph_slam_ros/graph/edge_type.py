@@ -39,6 +39,8 @@ class EdgeType:
     tail: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
+        kinds_of_each = tuple(one if isinstance(one, tuple) else (one,) for one in self.accepts)
+        object.__setattr__(self, "accepts", kinds_of_each)  # one kind may stand without its tuple
         if not self.accepts:
             raise GraphSlamError(f"{self.name}: 0 vertices; an edge has at least one")
         for slot, kinds in enumerate(self.accepts):
@@ -81,19 +83,25 @@ def edge_from_residual(
     ----------
     residual : the stored numbers of the edge's vertices, and what was measured (p,), to what they disagree by (m,).
         An angle in it must be wrapped to (-pi, pi]
-    jacobian : the same to (m, D), over the right perturbations of the vertices side by side; without it, central
-        differences of the residual. ``check_edge`` compares the two
+    jacobian : the same to (m, D), over the right perturbations side by side; without it, central differences are used
     """
-    sizes = [kinds[0].size for kinds in accepts]
-    kinds = tuple(kinds[0] for kinds in accepts)
-    derivative = jacobian or (lambda values, measured: _differences(kinds, values, lambda v: residual(v, measured)))
+    kinds = tuple(one[0] if isinstance(one, tuple) else one for one in accepts)
+    sizes = [kind.size for kind in kinds]
+
+    def checked(values: tuple[Array, ...], measured: Array) -> Array:
+        found = np.atleast_1d(np.asarray(residual(values, measured), dtype=np.float64))
+        if found.shape != (residual_size,):
+            raise GraphSlamError(f"{name}: the residual has the shape {found.shape}, not ({residual_size},)")
+        return found
+
+    derivative = jacobian or (lambda values, measured: _differences(kinds, values, lambda v: checked(v, measured)))
 
     def linearize(x: Array, at: Index, measured: Array) -> tuple[Array, Array]:
         residuals = np.empty((len(at), residual_size))
         jacobians = np.empty((len(at), residual_size, sum(kind.dof for kind in kinds)))
         for e, begins in enumerate(at.tolist()):
             values = tuple(x[begin : begin + size] for begin, size in zip(begins, sizes, strict=True))
-            residuals[e], jacobians[e] = residual(values, measured[e]), derivative(values, measured[e])
+            residuals[e], jacobians[e] = checked(values, measured[e]), derivative(values, measured[e])
         return residuals, jacobians
 
     return EdgeType(name, accepts, measured_size, residual_size, linearize)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.errors import GraphSlamError, NoiseError
 from graph_slam_ros.graph.edge_type import EdgeType
 from graph_slam_ros.graph.lasting_ids import LastingIds
 from graph_slam_ros.graph.noise import Gaussian
@@ -121,13 +121,7 @@ class Graph:
         return int(self.add_vertices(kind, np.asarray(value, dtype=float)[None])[0])
 
     def add_edges(
-        self,
-        edge: EdgeType,
-        vertices: ArrayLike,
-        measured: ArrayLike,
-        noise: Gaussian,
-        label: str,
-        source: str = "",
+        self, edge: EdgeType, vertices: ArrayLike, measured: ArrayLike, noise: Gaussian, label: str, source: str = ""
     ) -> Index:
         """Add n edges of one type; returns their ids.
 
@@ -142,6 +136,11 @@ class Graph:
         at, z = whole_numbers(vertices, edge.name), edge.whole(measured)
         if z.ndim != 2 or z.shape[1] != edge.measured_size or at.shape != (len(z), len(edge.accepts)):
             self._refuse_shapes(edge, at, z)
+        if not isinstance(noise, Gaussian):
+            what = f"noise is a {type(noise).__name__}, not a Gaussian"
+            raise NoiseError(
+                f"{edge.name}: {what}: Gaussian.from_sigmas, from_covariance or from_information makes one"
+            )
         shape, count = noise.sqrt_information.shape, len(at)
         if shape[-1] != edge.residual_size or (len(shape) == 3 and shape[0] != count):
             raise GraphSlamError(f"{edge.name}: noise of shape {shape} does not fit")
@@ -167,13 +166,7 @@ class Graph:
         return np.arange(first, first + count)
 
     def add_edge(
-        self,
-        edge: EdgeType,
-        vertices: ArrayLike,
-        measured: ArrayLike,
-        noise: Gaussian,
-        label: str,
-        source: str = "",
+        self, edge: EdgeType, vertices: ArrayLike, measured: ArrayLike, noise: Gaussian, label: str, source: str = ""
     ) -> int:
         """Add one edge, of (k,) vertices and what was measured (p,); returns its id."""
         one = np.asarray(vertices)[None], np.asarray(measured, dtype=float)[None]

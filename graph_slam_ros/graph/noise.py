@@ -12,7 +12,6 @@ _ASYMMETRY = 1e-6  # of the largest entry; text files carry 6 digits
 _LEAST_EIGENVALUE = 16.0 * float(np.finfo(float).eps)  # of the correlations; that of a singular matrix is rounding
 _ZERO = 1e-12  # eigenvalues of the correlations of what may be singular that are rounding
 _SURELY_REGULAR = 1e-6  # root of the determinant of the correlations, which is at most e times their least eigenvalue
-
 _LONG = 120  # characters of a matrix in a message
 
 
@@ -49,11 +48,12 @@ class Gaussian:
         return cls(np.asarray(np.linalg.inv(_cholesky(covariance, "covariance")), dtype=np.float64))
 
     @classmethod
-    def from_sigmas(cls, *sigmas: float) -> "Gaussian":
-        """Make it from independent standard deviations. Raises NoiseError where one is not positive."""
-        if not all(sigma > 0.0 for sigma in sigmas):
-            raise NoiseError(f"standard deviations {list(sigmas)}: each must be > 0")
-        return cls.from_covariance(np.diag(np.square(sigmas)))
+    def from_sigmas(cls, *sigmas: ArrayLike) -> "Gaussian":
+        """Make it from independent standard deviations, or from a list of them. Raises NoiseError if not positive."""
+        each = np.concatenate([np.ravel(sigma) for sigma in sigmas] or [[]]).astype(np.float64)  # type: ignore[list-item]
+        if not (each > 0.0).all():
+            raise NoiseError(f"standard deviations {each.tolist()}: each must be > 0")
+        return cls.from_covariance(np.diag(np.square(each)))
 
     @property
     def information(self) -> Array:

@@ -10,7 +10,7 @@ import numpy as np
 
 from graph_slam_ros import __version__
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.formats.g2o_writer import g2o_text
+from graph_slam_ros.formats.g2o_writer import graph_lines
 from graph_slam_ros.formats.graph_file import G2oFile
 from graph_slam_ros.formats.tum import tum_text
 from graph_slam_ros.graph.tables import EdgeTable
@@ -45,7 +45,7 @@ def result_texts(slam: GraphSlam, left: Left) -> dict[str, str]:
     stamps = [*sightings["stamp_ns"].tolist(), *slam.sighting_poses.stamps_ns.tolist()]
     stamps_ns = whole.stamps_ns.tolist()
     return {
-        GRAPH: g2o_text(graph_file(slam, ids), slam.solver.estimate),
+        GRAPH: "\n".join([*graph_lines(graph_file(slam, ids), slam.solver.estimate), ""]),
         VERTICES: vertices,
         LEDGER: ledger_text(slam, ids),
         CHANGES: changes_text(slam),

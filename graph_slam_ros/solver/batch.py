@@ -10,13 +10,7 @@ from graph_slam_ros.errors import GraphSlamError, SingularError
 from graph_slam_ros.graph import Graph, Loss
 from graph_slam_ros.graph.tables import EdgeTable
 from graph_slam_ros.solver.blocks import store_first
-from graph_slam_ros.solver.clique_tree.numeric import (
-    accept_steps,
-    curvature,
-    eliminate,
-    gradient,
-    step_by,
-)
+from graph_slam_ros.solver.clique_tree.numeric import accept_steps, curvature, eliminate, gradient, step_by
 from graph_slam_ros.solver.clique_tree.storage import NOTHING, Tree
 from graph_slam_ros.solver.clique_tree.substitution import forget, step_all
 from graph_slam_ros.solver.clique_tree.symbolic import mark

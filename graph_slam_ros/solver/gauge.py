@@ -14,6 +14,7 @@ from graph_slam_ros.solver.linearization import Losses, linearize
 from graph_slam_ros.typing import Array, Index, Mask
 
 _AXES = {SE2: 2, R2: 2, SE3: 3, R3: 3}
+_NAMED = 20  # parts of a graph
 _LEAST_EIGENVALUE = 1e-9  # of correlations: less is no information
 
 
@@ -43,9 +44,10 @@ def check_gauge(graph: Graph, free: Index, held: Index, rows: Mapping[EdgeTable,
     floating = np.sort(free[~np.isin(part[free], part[fixed])])
     if len(floating):
         more = int((part[floating] == part[floating[0]]).sum()) - 1
+        each = np.sort(floating[np.unique(part[floating], return_index=True)[1]])
         raise GaugeError(
             f"nothing fixes the gauge of vertex {int(floating[0])} and {more} more joined to it: add a prior"
-            " (an anchor) or hold a vertex"
+            f" (an anchor) or hold a vertex (in a file: FIX {' '.join(map(str, [*held[:1], *each[:_NAMED]]))})"
         )
 
 

@@ -4,7 +4,8 @@ Pose after pose, each predicted from the estimate so far, the incremental solver
 closure arrives; so it often reaches the optimum where batch solvers, from any start, do not.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import TypeAlias
 
 import numpy as np
 
@@ -14,13 +15,11 @@ from graph_slam_ros.lie import se2, se3
 from graph_slam_ros.solver.solver import Solver
 from graph_slam_ros.typing import Array, Index
 
+OnPose: TypeAlias = Callable[[int, int], None]
+
 
 def replayed_values(
-    graph: Graph,
-    values: Array,
-    poses: Sequence[int],
-    relative: Sequence[EdgeType],
-    sighting: EdgeType,
+    graph: Graph, values: Array, poses: Sequence[int], relative: Sequence[EdgeType], sighting: EdgeType, on_pose: OnPose
 ) -> Array:
     """Return the stored numbers of all vertices after an incremental solution along some poses.
 
@@ -29,6 +28,7 @@ def replayed_values(
     values : stored numbers to begin with; the first pose keeps its own, and so does what is not reached
     poses : in order of time
     relative, sighting : types of the edges that are driven along; all others are left to what comes after
+    on_pose : called before each pose (``initial_values``)
 
     Raises
     ------
@@ -48,6 +48,7 @@ def replayed_values(
             for row, k in zip(rows.tolist(), newest.tolist(), strict=True):
                 arriving[k].append((int(table.id.values[row]), edge, row))
     for k, pose in enumerate(poses):
+        on_pose(k, len(poses))
         drive.to(pose, sorted(arriving[k], key=lambda item: item[0]), rank, sighting)
     return drive.finish()
 

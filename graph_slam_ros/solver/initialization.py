@@ -32,7 +32,7 @@ from graph_slam_ros.graph import (
 )
 from graph_slam_ros.graph.tables import EdgeTable
 from graph_slam_ros.lie import so3
-from graph_slam_ros.solver.incremental_initialization import replayed_values
+from graph_slam_ros.solver.incremental_initialization import OnPose, replayed_values
 from graph_slam_ros.typing import Array, Index
 
 INITS = ("file", "tree", "chordal", "online")
@@ -43,7 +43,9 @@ _RELATIVE: dict[VertexKind, tuple[EdgeType, ...]] = {
 }
 
 
-def initial_values(graph: Graph, method: str, root: int, in_time: Sequence[int] | None = None) -> Array:
+def initial_values(
+    graph: Graph, method: str, root: int, in_time: Sequence[int] | None = None, on_pose: OnPose = lambda *_: None
+) -> Array:
     """Return the stored numbers of all vertices, as ``Graph.initial``.
 
     Parameters
@@ -51,6 +53,7 @@ def initial_values(graph: Graph, method: str, root: int, in_time: Sequence[int] 
     method : ``file`` (as they are), ``tree``, ``chordal`` or ``online``
     root : the pose that keeps its value
     in_time : all vertices in order of time, for ``online``; without, in order of id
+    on_pose : called by ``online`` before each pose, with its number and how many there are; it may raise
 
     Raises
     ------
@@ -69,7 +72,7 @@ def initial_values(graph: Graph, method: str, root: int, in_time: Sequence[int] 
     if method == "online":
         of_kind = set(poses.tolist())
         others = [v for v in (range(graph.vertex_count) if in_time is None else in_time) if v in of_kind and v != root]
-        return replayed_values(graph, values, [root, *others], _RELATIVE[kind], POINT_SEEN_FROM[kind])
+        return replayed_values(graph, values, [root, *others], _RELATIVE[kind], POINT_SEEN_FROM[kind], on_pose)
     ends, measured = _relative_edges(graph, kind)
     _along_tree(graph, values, kind, root, poses, ends, measured)
     if method == "chordal" and len(poses) > 1:

@@ -18,13 +18,7 @@ from graph_slam_ros.solver.cross_covariance import CrossCovariances
 from graph_slam_ros.solver.entry import enter_newest
 from graph_slam_ros.solver.gauge import undetermined
 from graph_slam_ros.solver.left_out import without_edges
-from graph_slam_ros.solver.linearization import (
-    Losses,
-    costs,
-    information,
-    linearize,
-    rows_of,
-)
+from graph_slam_ros.solver.linearization import Losses, costs, information, linearize, rows_of
 from graph_slam_ros.solver.online_problem import OnlineProblem
 from graph_slam_ros.solver.pending import NONE
 from graph_slam_ros.solver.problem import existing
@@ -98,6 +92,8 @@ class Solver(OnlineProblem):
         """
         settings = settings or self.settings
         self._grow()
+        if self.graph.edge_count and not len(self.edges):
+            raise GraphSlamError("nothing to solve: give the solver vertices and edges (add), or call optimize(graph)")
         if self._solved_with == settings and not self._pending:
             return self.evaluate(settings)
         arriving = self._arriving(surely=bool(self._pending))

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from graph_slam_ros.errors import FormatError
 from graph_slam_ros.formats.g2o import read_g2o
-from graph_slam_ros.graph import LANDMARK_POSITION, RELATIVE_POSE, RELATIVE_POSE_3D
+from graph_slam_ros.graph import RELATIVE_POSE, RELATIVE_POSE_3D
 from graph_slam_ros.solver import Settings, Solver, initial_values
 
 GRAPHS = DATASETS
@@ -53,7 +53,6 @@ def test_lines_of_another_dialect_than_the_one_that_is_named_are_refused(tmp_pat
         ("EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n", "gtsam", ":1: EDGE_SE2 is no line of a gtsam file"),
         ("VERTEX2 0 0 0 0\n", "g2o", ":1: VERTEX2 is no line of a g2o file"),
         ("EDGE2 0 1 1 0 0.5 4 0 0 3 0 9\n", "toro", ":1: information is not positive definite"),
-        ("", "ros", "dialect 'ros': choose g2o, toro, gtsam"),
     ):
         with pytest.raises(FormatError, match=says):
             read(tmp_path, text, dialect=dialect)
@@ -73,21 +72,6 @@ def test_edge2_with_rows_of_the_upper_triangle_may_be_square_roots_and_is_asked_
     assert len(str(error.value)) <= 200
     rows = read(tmp_path, text, dialect="rows")
     assert np.allclose(information(rows, RELATIVE_POSE)[0], np.diag([4.0, 3.0, 9.0]))
-    isam = read(tmp_path, text + "LANDMARK 1 7 2 3 5 1 2\n", dialect="isam")
-    assert np.allclose(information(isam, RELATIVE_POSE)[0], np.diag([16.0, 9.0, 81.0]))
-    assert np.allclose(information(isam, LANDMARK_POSITION)[0], [[25.0, 5.0], [5.0, 5.0]])
-    root = np.array([[4.0, 1.0, 2.0], [0.0, 3.0, -1.0], [0.0, 0.0, 9.0]])
-    full = read(tmp_path, "ODOMETRY 0 1 1 0 0.5 4 1 2 3 -1 9\n", dialect="isam")
-    assert np.allclose(information(full, RELATIVE_POSE)[0], root.T @ root)
-
-
-def test_gtsam_text_gives_covariances_and_numbers_landmarks_apart(tmp_path):
-    text = "ODOMETRY 0 1 1 0 0.5 0.25 0 0 0.5 0 0.1\nLANDMARK 1 1 2 3 0.5 0.1 0.25\n"
-    file = read(tmp_path, text)
-    assert file.graph.vertex_count == 3
-    assert not file.has_values
-    assert np.allclose(information(file, RELATIVE_POSE)[0], np.diag([4.0, 2.0, 10.0]))
-    assert np.allclose(information(file, LANDMARK_POSITION)[0], np.linalg.inv([[0.5, 0.1], [0.1, 0.25]]))
 
 
 def test_edge3_turns_roll_pitch_and_yaw_into_a_quaternion_and_needs_no_information(tmp_path):
@@ -111,22 +95,6 @@ def test_edge3_may_be_isams_square_root_which_is_said_and_taken_where_it_is_aske
     for dialect in ("isam", "toro"):
         assert not read(tmp_path, text(root), dialect=dialect).notes
     assert not read(tmp_path, text(np.eye(6))).notes, "the identity is its own root"
-
-
-@each(
-    "line",
-    [
-        "EDGE2 0 1 1 0",
-        "ODOMETRY 0 1 1 0 0 0 0 0 0 0",
-        "ODOMETRY 0 1 1 0 0 -1 0 0 1 0 1",
-        "LANDMARK 0 1 1 0 1 2 1",
-        "VERTEX2 0 nan 0 0",
-        "EDGE3 0 1 1",
-    ],
-)
-def test_a_bad_line_is_named(tmp_path, line):
-    with pytest.raises(FormatError, match=r"graph\.txt:1: "):
-        read(tmp_path, line + "\n")
 
 
 @pytest.mark.skipif(not VICTORIA.exists(), reason=f"no public graphs under {GRAPHS}")

@@ -5,7 +5,6 @@ import pytest
 from places import DATASETS
 
 from graph_slam_ros.formats.g2o import read_g2o
-from graph_slam_ros.formats.g2o_writer import write_g2o
 from graph_slam_ros.graph import RELATIVE_POSE_3D
 from graph_slam_ros.solver import Solver
 
@@ -21,15 +20,8 @@ def test_public_graphs_in_space_reach_their_optimum(name, optimum):
 
 
 @pytest.mark.skipif(not GRAPHS.exists(), reason=f"no public graphs under {GRAPHS}")
-def test_the_information_of_rotations_is_scaled_when_read_and_back_when_written(tmp_path):
-    original = (GRAPHS / "tinyGrid3D.g2o").read_text().splitlines()
+def test_the_information_of_rotations_is_scaled_when_read():
     file = read_g2o(GRAPHS / "tinyGrid3D.g2o")
-    write_g2o(tmp_path / "again.g2o", file, lambda ids: initial(file.graph, ids))
-    again = (tmp_path / "again.g2o").read_text().splitlines()
-    of = [
-        [list(map(float, line.split()[3:])) for line in lines if line.startswith("EDGE")] for lines in (original, again)
-    ]
-    assert np.abs(np.sort(of[0], axis=0) - np.sort(of[1], axis=0)).max() < 1e-5  # quaternions come back normalised
     raw = read_g2o(GRAPHS / "tinyGrid3D.g2o", raw=True)
     information = [f.graph.tables[RELATIVE_POSE_3D].sqrt_information.values for f in (file, raw)]
     scaled, plain = (np.swapaxes(r, 1, 2) @ r for r in information)
@@ -42,8 +34,3 @@ def solved(file):
     solver.add(range(file.graph.vertex_count), range(file.graph.edge_count))
     solver.hold(0)
     return solver.optimize()
-
-
-def initial(graph, ids):
-    size = graph.kind_of(ids[0]).size
-    return graph.initial.values[graph.offset.values[np.asarray(ids)][:, None] + np.arange(size)]

@@ -6,7 +6,6 @@ from places import ROOT
 from rows import each
 
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.formats.g2o import read_g2o
 from graph_slam_ros.graph import (
     ATTITUDE_PRIOR_3D,
     CAUCHY,
@@ -168,42 +167,6 @@ def test_settings_that_cannot_be_are_refused_by_name(wrong):
 
 
 # -- other starts where the first result is suspicious ----------------------------------------------------------------
-
-
-def from_nowhere(spread=2.0):
-    """A city whose initial values are of no use."""
-    file = read_g2o(CITY)
-    values = file.graph.initial.values
-    values[:] += np.random.default_rng(0).normal(0.0, spread, len(values))
-    return file
-
-
-def test_a_good_start_is_solved_once():
-    solution = optimize(CITY)
-    assert (solution.start, solution.suspicion) == ("file", "")
-    assert [one.start for one in solution.attempts] == ["file"]
-
-
-def test_a_local_minimum_is_noticed_and_left_by_another_start():
-    stuck = optimize(from_nowhere(), init="file")
-    assert stuck.report.converged
-    assert stuck.report.chi2_final > 1e5
-    solution = optimize(from_nowhere())
-    assert solution.start == "chordal"
-    assert solution.report.chi2_final == pytest.approx(465.969818, abs=1e-3)
-    assert solution.suspicion == f"chi2 {stuck.report.chi2_final:.6g} is far above its 471 degrees of freedom"
-    assert [one.start for one in solution.attempts] == ["file", "chordal"]
-
-
-def test_a_wrong_closure_is_no_local_minimum_and_all_starts_agree():
-    file = read_g2o(CITY)
-    far = file.graph.vertex_count // 2
-    file.graph.add_edge(RELATIVE_POSE, [0, far], [0, 0, 0], unit(3, 0.1), "closures")
-    solution = optimize(file)
-    assert solution.suspicion
-    assert [one.start for one in solution.attempts] == ["file", "chordal", "online"]
-    least = min(one.cost for one in solution.attempts if not one.failure)
-    assert solution.report.cost_final == pytest.approx(least, rel=1e-6)
 
 
 def test_a_start_that_fails_is_told_and_the_first_result_stays():
