@@ -17,7 +17,7 @@ class Logger(Protocol):
     def info(self, message: str) -> object:
         """Log as INFO."""
 
-    def warn(self, message: str) -> object:
+    def warn(self, message: str, *, throttle_duration_sec: float = 0.0) -> object:
         """Log as WARN."""
 
     def error(self, message: str) -> object:

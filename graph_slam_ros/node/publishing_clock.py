@@ -9,7 +9,6 @@ from graph_slam_ros.node import events
 from graph_slam_ros.node.handle import NodeHandle
 from graph_slam_ros.node.publishers import Publishers
 from graph_slam_ros.node.session import Session
-from graph_slam_ros.node.throttle import Throttle
 from graph_slam_ros.node.worker import Worker
 from graph_slam_ros.slam import GraphSlam, Update
 from graph_slam_ros.slam.frontend.ingest_gate import input_of, size_of
@@ -38,7 +37,6 @@ class PublishingClock:
         self._acknowledged = -1
         self._has_player = False
         self._is_overdue, self._published_s = False, time.monotonic()  # results, where the worker always has messages
-        self._corrections = Throttle(_AGAIN_S)
 
     # -- in the main thread ------------------------------------------------------------------------------------------
 
@@ -76,9 +74,7 @@ class PublishingClock:
         moved, tf = update.correction, slam.config.tf
         if update.solved and (moved.distance_m > tf.report_jump_m or moved.angle_rad > _JUMP_RAD):
             slam.counters.count("tf", "jump")
-            if (left_out := self._corrections.next()) is not None:
-                more = f" ({left_out} more since the last one)" if left_out else ""
-                self._node.get_logger().warn(events.correction(slam, update).message + more)
+            self._node.get_logger().warn(events.correction(slam, update).message, throttle_duration_sec=_AGAIN_S)
 
     def publish_due(self, slam: GraphSlam) -> None:
         """Publish what is due now."""

@@ -19,6 +19,7 @@ from graph_slam_ros.node.estimate import Estimate, UnseenWay, WeakestLandmark, d
 from graph_slam_ros.node.resumption import Resumption
 from graph_slam_ros.node.threads import run_in_thread
 from graph_slam_ros.runs.folder import (
+    CONFIG,
     RunError,
     earlier_runs,
     incomplete_runs,
@@ -201,6 +202,7 @@ class Session:
 
     def evaluate(self) -> None:
         """Compute how well all measurements fit, and which are not believed, when idle, in a fiftieth of the time."""
+        self._keep_folder()
         if self.estimate is None or self._fitted_at == self.slam.solves or time.perf_counter() < self._fit_due_s:
             return
         start = time.perf_counter()
@@ -209,6 +211,16 @@ class Session:
         self._doubted, self._fitted_at = doubted_lately(self.slam), self.slam.solves
         self._fit_due_s = start + 50.0 * (time.perf_counter() - start)
         self.estimate = replace(self.estimate, fit=self._fit, doubted=self._doubted)
+
+    def _keep_folder(self) -> None:
+        """Begin the run folder anew with the whole map, where somebody has removed it."""
+        if self._recorder is None or (self._recorder.folder / CONFIG).exists() or not self.slam.keyframes:
+            return
+        self._warn("output.folder", "the run folder was removed: it is made again, with the map as it is")
+        with self._accepting:
+            self._recorder.abandon()
+            self._recorder = RunRecorder(self._recorder.folder, self.slam.config, _SYNC_S, self.slam, force=True)
+            self._is_saved = False
 
     # -- services ----------------------------------------------------------------------------------------------------
 

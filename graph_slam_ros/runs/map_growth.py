@@ -103,8 +103,6 @@ def _set(state: MapSnapshot, record: Growth) -> None:
     state.calibration |= read_totals(record.get("calibration", ()))
     if "noise" in record:
         state.noise_factors = read_factors(record["noise"])
-    if record.get("offsets"):
-        raise ValueError("ranges have an offset of their own (landmarks.range_offset_sigma_m): replay the recording")
     state.datum = tuple(record.get("datum", state.datum))
     if "gyro" in record:
         name, bias, variance, stamp_ns = record["gyro"]

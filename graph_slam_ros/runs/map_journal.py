@@ -28,9 +28,8 @@ JSON records in mcap, as in the journal. The first is ``map`` with the version o
 
 Now and then an ``estimate`` tells all values, end to end. A run that goes on in another's map has that first, as one
 ``growth`` and one ``estimate``, up to a record ``start``. After visits were condensed, ``anew`` ends all before it, in
-a part of its own that takes the place of all parts before: a ``growth`` of the whole map follows. Programs of version 1
-do not know ``anew``: a second ``map`` with version 3 stands before it, which they refuse. Where a run was killed before
-it did, it is read instead of these.
+a part of its own that takes the place of all parts before: a ``growth`` of the whole map follows. Where a run was
+killed before it did, it is read instead of these.
 """
 
 import math
@@ -73,14 +72,16 @@ class MapGrowth:
     start : the map that the run goes on in
     """
 
-    def __init__(self, start: MapSnapshot | None = None) -> None:
+    def __init__(self, start: MapSnapshot | GraphSlam | None = None) -> None:
         self._displacements: list[dict[str, Any]] = []
         self._begin()
         self.first: list[Record] = [{"type": "map", "version": _FIRST}]
         if start is not None:
             known = {"displacements": start.displacements} if start.displacements else {}
             self._displacements = start.displacements
-            self.first += [self.since(start) | known, _estimate(start.values), {"type": "start"}]
+            values = start.values if isinstance(start, MapSnapshot) else start.solver.values
+            self.first += [self.since(start) | known, _estimate(values), {"type": "start"}]
+        self._before = start.processed if isinstance(start, GraphSlam) else 0  # records of another journal
 
     def _begin(self) -> None:
         self._vertices = self._edges = self._judged = self._changes = 0
@@ -111,7 +112,7 @@ class MapGrowth:
         if (alarms := slam.displacements) != self._displacements:
             changed["displacements"] = self._displacements = alarms
         used = {"used": [slam.newest_odometry_ns, slam.odometry_source]} if slam.odometry_source else {}
-        yield self.since(slam) | changed | {"processed": slam.processed} | used
+        yield self.since(slam) | changed | {"processed": slam.processed - self._before} | used
         count = len(slam.keyframes)
         has_jumped = slam.correction.distance_m > _JUMP_M and count > 1.01 * self._estimated
         if has_jumped or count >= _MORE * self._estimated + 1:

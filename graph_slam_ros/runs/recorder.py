@@ -61,7 +61,7 @@ class RunRecorder:
         folder: Path | str,
         config: Config,
         sync_s: float = 0.0,
-        start: MapSnapshot | None = None,
+        start: MapSnapshot | GraphSlam | None = None,
         *,
         force: bool = False,
     ) -> None:
@@ -71,7 +71,7 @@ class RunRecorder:
         self._writing, self._starting = threading.RLock(), threading.Lock()
         self._is_ended = False
         self._flushing: Future[None] | None = None
-        self.accepted = 0  # measurements, written or not
+        self.accepted = start.processed if isinstance(start, GraphSlam) else 0  # measurements, written or not
         self._syncing: Future[None] | None = None
         self._journal = Parts(self.folder, INGEST, MEASUREMENT)
         self._map = Parts(self.folder, MAP, GROWTH)
@@ -99,9 +99,9 @@ class RunRecorder:
             self.abandon()
             raise RunError(f"{self.folder}: {error.strerror}") from None
 
-    def _carry(self, config: Config, start: MapSnapshot | None) -> None:
+    def _carry(self, config: Config, start: MapSnapshot | GraphSlam | None) -> None:
         """Take over what has left the map that the run goes on in."""
-        if start is not None and start.bounded is not None and start.folder is not None:
+        if isinstance(start, MapSnapshot) and start.bounded is not None and start.folder is not None:
             for record in carried(start.folder, config.space, start.bounded):
                 self._left.write([record])
                 self._left.flush()

@@ -59,7 +59,6 @@ def map_of(folder: Path, losses: list[str], counters: Counters | None = None) ->
     state = _repeated(folder, losses, counters) if state is None else _with_rest(folder, state, losses, counters)
     if not state.keyframes:
         raise RunError(f"{folder}: no keyframe, so there is no map")
-    state.displacements = state.displacements or before.get("displacements", [])  # the map of an older version has none
     if state.graph.kind_of(state.keyframes[0].vertex) is not space.pose:
         raise RunError(f"{folder}: its map is not in {space.dimensions} dimensions, as its configuration says")
     return state

@@ -335,3 +335,16 @@ def test_P12_what_is_resumed_is_the_run_that_was_cut_off_also_where_another_is_n
         shutil.rmtree(run)
     last.resume()
     assert len(last.slam.keyframes) == len(site.slam.keyframes), "where there is nothing to resume"
+
+
+def test_a_run_folder_that_is_removed_while_driving_is_made_again_and_nothing_of_the_map_is_lost(tmp_path):
+    one = session(tmp_path / "run", told=(told := []))
+    one.ingest(WORLD[:300])
+    shutil.rmtree(tmp_path / "run")
+    one.evaluate()
+    one.ingest(WORLD[300:500])
+    one.abandon()
+    (again := session(tmp_path / "run")).resume()
+    before = one.slam.trajectory()
+    assert [what for what, _ in told] == ["output.folder"]
+    assert again.slam.trajectory()[: len(before)] == pytest.approx(before, abs=0.05)

@@ -21,7 +21,6 @@ from graph_slam_ros.node.parameters import files_for_others
 from graph_slam_ros.node.pose_extrapolator import PoseExtrapolator
 from graph_slam_ros.node.recent import Recent, RecentInputs
 from graph_slam_ros.node.session import Session
-from graph_slam_ros.node.throttle import Throttle
 from graph_slam_ros.node.worker import Worker
 from graph_slam_ros.runs.tables import accepted_lately
 from graph_slam_ros.slam import Config, Counters, GraphSlam, Odometry, Sighting, Sightings
@@ -501,16 +500,6 @@ def test_A35_what_is_refused_is_judged_by_the_last_seconds_wherever_it_was_refus
     for k in range(20):
         now = second(54 + k, good=19, unnamed=1)
     assert not now.is_bad, "a twentieth"
-
-
-def test_A37_what_is_told_seldom_tells_how_often_it_was_left_out(monkeypatch):
-    throttle, at = Throttle(5.0), [100.0]
-    monkeypatch.setattr(time, "monotonic", lambda: at[0])
-    told = []
-    for _ in range(14):
-        told.append(throttle.next())
-        at[0] += 1.0
-    assert told == [0, *[None] * 4, 4, *[None] * 4, 4, *[None] * 3]
 
 
 @each("dimensions", [2, 3])
