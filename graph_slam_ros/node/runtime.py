@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.measurements.types import Event
 from graph_slam_ros.messages.survey import with_survey
 from graph_slam_ros.node.completion import Completion
@@ -142,10 +143,8 @@ class Runtime:
         folder, log = self._node.config.output.folder, self._node.get_logger()
         if folder and (waiting or self._session.slam.processed):
             what = f"while {waiting} measurements waited" if waiting else "before the last solve had ended"
-            log.warn(
-                f"stopped {what}: all are in the journal; the next start completes the results, or graph_slam recover"
-                f" {folder}"
-            )
+            ends = f"the next start completes the results, or graph_slam recover {folder}"
+            log.warn(f"stopped {what}: all are in the journal; {ends}")
         if lost:
             log.error(f"{lost} measurements are lost: they came while another run was to begin, and it had not yet")
 
@@ -194,6 +193,8 @@ class Runtime:
 
     def save(self, config: Config | None = None) -> "Future[str]":
         """Solve everything, and write the run folder and the map under its configured name."""
+        if status := self._preparation.status:
+            raise GraphSlamError(f"nothing to save yet: {status}; what has come is in the journal")
         self._ingest.hand_over(self._ingest.converter.finish(is_end=False))
         name = (config or self._node.config).output.save_as
         return self._worker.call(partial(self._session.save, self._session.accept_save(), name))
@@ -209,8 +210,8 @@ class Runtime:
 
     def load(self, config: Config | None = None) -> "Future[str]":
         """Continue from an earlier run, with the robot at the configured pose."""
-        config = config or self._node.config
-        return self._begin_run(partial(self._session.load, config.output.load, config.load_pose))
+        output, pose = (config or self._node.config).output, (config or self._node.config).load_pose
+        return self._begin_run(partial(self._session.load, output.load, pose))
 
     def load_at_start(self) -> None:
         """Load the configured map. If it cannot be loaded, that is a state until another is."""
@@ -252,8 +253,7 @@ class Runtime:
 
     def control(self, event: Event) -> "Future[str]":
         """Process an event at its place in the ingest sequence."""
-        asked = Control(event)
-        self._session.accept([asked])
+        self._session.accept([asked := Control(event)])
         return self._worker.call(partial(self._session.control, asked))
 
     def set(self, values: dict[str, Any]) -> None:
