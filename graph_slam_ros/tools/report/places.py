@@ -145,7 +145,7 @@ def floor_plan(file: Path) -> dict[str, Any]:
             packed = io.BytesIO()
             drawn.save(packed, format="PNG", optimize=True)
             size = drawn.size
-    except (OSError, ValueError, KeyError, TypeError, yaml.YAMLError) as error:
+    except (OSError, ValueError, KeyError, TypeError, yaml.YAMLError, Image.DecompressionBombError) as error:
         raise GraphSlamError(f"{file}: not a map.yaml of Nav2 with its image ({error})") from None
     url = f"data:image/png;base64,{base64.b64encode(packed.getvalue()).decode()}"
     width, height = (resolution * pixels for pixels in size)
