@@ -24,9 +24,9 @@ from graph_slam_ros.analysis.path_error import interpolated
 from graph_slam_ros.analysis.trajectories import read_truth
 from graph_slam_ros.lie import se3
 from graph_slam_ros.measurements.types import END
+from graph_slam_ros.overview.chosen_inputs import choose_inputs
 from graph_slam_ros.recordings.bag import open_bag
 from graph_slam_ros.runs.calibrate import calibrate
-from graph_slam_ros.runs.chosen_inputs import choose_inputs
 from graph_slam_ros.runs.replay import measurements
 from graph_slam_ros.slam import Config, Counters, GraphSlam
 

@@ -26,8 +26,8 @@ from benchmarks.trials import in_order_of_sighting
 from graph_slam_ros.analysis.path_error import interpolated
 from graph_slam_ros.analysis.trajectories import read_truth
 from graph_slam_ros.lie import se2, se3
+from graph_slam_ros.overview.chosen_inputs import choose_inputs
 from graph_slam_ros.recordings.bag import open_bag
-from graph_slam_ros.runs.chosen_inputs import choose_inputs
 from graph_slam_ros.runs.replay import measurements
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam
 

@@ -27,8 +27,8 @@ from recordings import TOPICS, short_drive, to_ros1, to_sqlite, write_mcap
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.g2o import read_g2o
 from graph_slam_ros.formats.parameters import read_parameters
+from graph_slam_ros.overview.chosen_inputs import choose_inputs
 from graph_slam_ros.recordings.bag import open_bag
-from graph_slam_ros.runs.chosen_inputs import choose_inputs
 from graph_slam_ros.runs.replay import measurements
 from graph_slam_ros.slam import Config, Counters
 

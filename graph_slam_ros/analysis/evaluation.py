@@ -5,7 +5,7 @@ the plane or in space, as the run is. Poses are compared if their stamps differ 
 computed in the frame of a pose.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -181,6 +181,10 @@ def evaluate(
             f"the error is {error.position_m['rmse']:.3g} m on a true path of radius {extent_m:.3g} m (RMS): check "
             "that the truth is of this robot and this drive"
         )
+    w_first = replace(known.trajectory, poses=known.trajectory.poses[:, [0, 1, 2, 4, 5, 6, 3]])
+    turned = path_error(drive.estimate, w_first, dimensions, align=align).angle_rad
+    if turned and error.angle_rad and error.angle_rad["rmse"] > max(_FAR_M, 2.0 * turned["rmse"]):
+        warnings.append("the quaternions of the truth are read as x y z w, and fit far better if w comes first")
     return Scores(
         error,
         None if odometry is None else path_error(odometry, known.trajectory, dimensions),

@@ -81,7 +81,7 @@ def read_truth(truth: str | Path, topic: str = "", not_these: Collection[str] = 
     """
     path, named = _file_and_topic(str(truth))
     topic = topic or named
-    if path.suffix in (".tum", ".txt"):
+    if path.suffix in (".tum", ".txt", ".csv"):
         if topic:
             raise GraphSlamError(f"{path}: a TUM file has no topics: leave out {topic}")
         known = read_tum(path, follow=True)
@@ -97,12 +97,10 @@ def read_truth(truth: str | Path, topic: str = "", not_these: Collection[str] = 
     finite = [row for row in rows if all(map(math.isfinite, row[1]))]
     if len(finite) < len(rows):
         bag.losses.append(f"{len(rows) - len(finite)} of {len(rows)} poses on {name} are not finite")
-    rows = finite
-    if not rows:
+    if not finite:
         raise GraphSlamError(f"{path}: nothing on {name} is a pose of the robot")
-    # One rounding, as of the decimal text in a TUM file: equal stamps stay equal.
-    stamps_s = np.array([stamp_ns / 10**9 for stamp_ns, _ in rows])
-    found = trajectory(stamps_s, np.array([pose for _, pose in rows], dtype=float), f"{path}, {name}")
+    stamps_s = np.array([stamp_ns / 10**9 for stamp_ns, _ in finite])  # one rounding, as in a TUM file
+    found = trajectory(stamps_s, np.array([pose for _, pose in finite], dtype=float), f"{path}, {name}")
     found = replace(found, has_orientation=kind not in (_FIX, _POINT) and not _is_empty_heading(found.poses))
     landmarks = _recorded_landmarks(bag)
     source = f"{topic or name} ({kind})"
@@ -173,7 +171,7 @@ def _stated_sigma(bag: Bag, topic: str) -> float:
 def _rows(bag: Bag, topic: str, kind: str) -> Iterator[Row]:
     datum: tuple[float, float, float] | None = None
     for message in _decoded(bag, topic):
-        stamp_ns = _nanoseconds(message.header.stamp)
+        stamp_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
         if kind == _FIX:
             here = (message.latitude, message.longitude, message.altitude)
             if message.status.status < 0 or not all(map(math.isfinite, here[:2])) or here[0] == here[1] == 0.0:
@@ -193,7 +191,8 @@ def _transforms(bag: Bag, path: Path, topic: str, frames: str) -> list[Row]:
     for message in _decoded(bag, topic):
         for one in message.transforms:
             pair = (one.header.frame_id.lstrip("/"), one.child_frame_id.lstrip("/"))
-            row = (_nanoseconds(one.header.stamp), _numbers(one.transform.translation, one.transform.rotation))
+            t = one.header.stamp
+            row = (t.sec * 10**9 + t.nanosec, _numbers(one.transform.translation, one.transform.rotation))
             found.setdefault(pair, []).append(row)
     names = ", ".join(f"{topic}:{parent}:{child}" for parent, child in sorted(found))
     if frames:
@@ -217,10 +216,6 @@ def _decoded(bag: Bag, topic: str) -> Iterator[Any]:
             bag.losses += [loss] if loss not in bag.losses else []
             continue
         yield message
-
-
-def _nanoseconds(stamp: Any) -> int:
-    return int(stamp.sec) * 10**9 + int(stamp.nanosec)
 
 
 def _position_and_orientation(message: Any) -> tuple[Any, Any]:

@@ -8,6 +8,7 @@ import numpy as np
 from graph_slam_ros.check.columns import Columns
 from graph_slam_ros.check.contradictions import check_contradictions
 from graph_slam_ros.check.finding import Finding, in_order, worst
+from graph_slam_ros.check.fixes import check_fixes
 from graph_slam_ros.check.frames import check_frames
 from graph_slam_ros.check.gyro import check_gyro
 from graph_slam_ros.check.odometry import check_odometry, of_one_publisher
@@ -18,16 +19,17 @@ Check = Callable[[Columns], Iterator[Finding]]
 
 CHECKS: tuple[Check, ...] = (
     check_refusals,
-    check_frames,
     check_times,
+    check_frames,
     check_odometry,
+    check_fixes,
     check_gyro,
     check_unnamed,
     check_contradictions,
 )
 """They need no fit: milliseconds for each minute of a recording."""
 
-OF_A_REPLAY: tuple[Check, ...] = (check_frames, check_times, check_odometry, check_contradictions)
+OF_A_REPLAY: tuple[Check, ...] = (check_times, check_frames, check_odometry, check_fixes, check_contradictions)
 """Those that a replay does by itself; its own table has the refusals."""
 
 _FROM_THE_BEGINNING = ("units", "mirrored", "axes", "unrelated")  # what is read later does not make it right
@@ -48,6 +50,8 @@ def check_columns(c: Columns, checks: tuple[Check, ...] = CHECKS) -> list[Findin
     found: list[Finding] = []
     with np.errstate(all="ignore"):
         c = of_one_publisher(c)
+        if any(one.forbids_replay and one.topic == c.odometry.topic for one in check_refusals(c)):
+            checks = tuple(check for check in checks if check is check_refusals)  # the rest follows from that
         for check in checks:
             found += check(c)
             if any(one.ends for one in found):

@@ -14,13 +14,15 @@ import numpy as np
 from graph_slam_ros.check.located import mount_corrections
 from graph_slam_ros.check.sightings import MOST, SightingCollector, SightingColumns, index
 from graph_slam_ros.config.config import Config
-from graph_slam_ros.lie import se3
+from graph_slam_ros.config.inputs import ASSUMED, InputConfig
+from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.measurements.counters import Counters
-from graph_slam_ros.measurements.types import AngularVelocity, Control, Measured, Odometry, Sightings
+from graph_slam_ros.measurements.types import AngularVelocity, Control, Fix, Measured, Odometry, Sightings
 from graph_slam_ros.messages.from_msg import TF, TF_STATIC, OwnDecoder
 from graph_slam_ros.messages.inputs import uses
+from graph_slam_ros.messages.inputs.detections import names_of
 from graph_slam_ros.messages.inputs.odometry_bytes import OdometryBytes, OdometryRun
-from graph_slam_ros.messages.inputs.transforms import Transforms, pose
+from graph_slam_ros.messages.inputs.transforms import Transforms, assumed_mount, pose
 from graph_slam_ros.typing import Array, Index, Mask
 
 _TWIST, _COLUMNS = (0, 7, 14, 21, 28, 35), 19  # places in a covariance; numbers of a message
@@ -73,19 +75,33 @@ class OdometryColumns:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Link:
-    """A transform from a parent to a child frame, from /tf_static (``fixed``) or /tf.
+class FixColumns:
+    """The fixes of one input, as a replay uses them.
 
     Attributes
     ----------
-    change : by how much a fixed one differs from the first, at most [m, rad]
+    points, headings : (k,) of the plane, as complex numbers [m], and [rad]; NaN where there is none
+    sigma_m : the median standard deviation of the points
+    frame, T_base_frame : of a heading: its frame, and where that is on the robot
     """
+
+    input: str
+    topic: str
+    stamp_ns: Index
+    points: Array
+    headings: Array
+    sigma_m: float
+    frame: str
+    T_base_frame: se3.Pose
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Link:
+    """A transform from a parent to a child frame, from /tf_static (``fixed``) or /tf."""
 
     parent: str
     child: str
     fixed: bool
-    count: int = 1
-    change: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,7 +112,6 @@ class Columns:
     ----------
     assumed : parameters that were chosen for the recording, and that nobody has set
     path_ns, path : (m,) and (m, 7) T_odom_base, as a replay uses odometry
-    tf_ns, tf_path : (m,) and (m, 7) the transform from odometry's frame to its child on /tf
     gyro_ns, gyro : (g,) stamps and turn rate about the robot's z [rad/s] of the gyro that is used
     gyro_frame, T_base_gyro : its frame, and where that is on the robot; None where it is not fixed or not known
     """
@@ -108,14 +123,13 @@ class Columns:
     path: Array
     sightings: tuple[SightingColumns, ...]
     links: tuple[Link, ...]
-    tf_ns: Index
-    tf_path: Array
     counters: Counters
     assumed: Mapping[str, Any] = field(default_factory=dict)
     gyro_ns: Index = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     gyro: Array = field(default_factory=lambda: np.empty(0))
     gyro_frame: str = ""
     T_base_gyro: se3.Pose | None = None
+    fixes: tuple[FixColumns, ...] = ()
 
     def topic_of(self, source: str) -> TopicColumns | None:
         """The topic of an input; None where nothing was collected of it."""
@@ -170,11 +184,12 @@ class Collector:
         seen, mounts = (name for name, use in used.items() if use == "landmarks"), mount_corrections(config)
         self._sightings = {name: SightingCollector(name, topics[name], mounts[name]) for name in seen}
         self._frame_of = {name: by_name[name].frame for name in used}
+        self._fixes: dict[str, list[Fix]] = {name: [] for name, use in used.items() if use == "fix"}
+        self._frames_of_fixes = dict[str, str]()
         self._odometry_topic = topics.get(self._main, "")
         self._frame, self._child, self._gyro_frame = "", "", ""
         self.begin_anew()
         self._links: dict[tuple[str, str, bool], Link] = {}
-        self._first: dict[tuple[str, str], se3.Pose] = {}
         self._transforms = Transforms()
         self._last: Any = None
 
@@ -185,8 +200,8 @@ class Collector:
         for seen in self._sightings.values():
             seen.begin_anew()
         self._odometry_ns, self._numbers = array("q"), array("d")
+        self._fixes = {name: list[Fix]() for name in self._fixes}
         self._path_ns, self._path = array("q"), array("d")
-        self._tf_ns, self._tf_path = array("q"), array("d")
         self._gyro_ns, self._gyro = array("q"), array("d")
 
     def decoder(self, decode: Decoder) -> Decoder:
@@ -223,6 +238,8 @@ class Collector:
             elif isinstance(m, AngularVelocity) and len(self._gyro_ns) < MOST:
                 self._gyro_ns.append(m.stamp_ns)
                 self._gyro.append(m.rate[-1])
+            elif isinstance(m, Fix) and len(self._fixes[m.topic]) < MOST:
+                self._fixes[m.topic].append(m)
             elif isinstance(m, Sightings) and m.topic in self._sightings:
                 if message is not None and self._config.world.dimensions == 2:
                     heights = heights or _heights(message, self._sightings[m.topic].T_base_frame)
@@ -248,6 +265,8 @@ class Collector:
                 self._add_transforms(message, fixed=name == TF_STATIC)
             elif name in self._sightings and not self._sightings[name].frame:
                 self._place(self._sightings[name], message)
+            elif name in self._fixes and name not in self._frames_of_fixes:
+                self._frames_of_fixes[name] = self._frame_of[name] or _frame(message)
             elif name == self._config.gyro_input and not self._gyro_frame:
                 self._gyro_frame = self._frame_of[name] or _frame(message)
 
@@ -279,19 +298,10 @@ class Collector:
     def _add_transforms(self, message: Any, *, fixed: bool) -> None:
         for t in message.transforms:
             parent, child = t.header.frame_id.lstrip("/"), t.child_frame_id.lstrip("/")
-            r = t.transform.rotation
-            at = pose(t.transform.translation, (r.x, r.y, r.z, r.w))
-            link, change = self._links.get((parent, child, fixed)), 0.0
             if fixed:
-                first = self._first.setdefault((parent, child), at)
-                change = max(abs(a - b) for a, b in zip(first, at, strict=True))
-                self._transforms.add(parent, child, at)
-            elif child == self._child and parent == self._frame and len(self._tf_ns) < MOST:
-                self._tf_ns.append(t.header.stamp.sec * 1_000_000_000 + t.header.stamp.nanosec)
-                self._tf_path.extend(at)
-            if link is None or change > link.change or not fixed:
-                count = 1 if link is None else link.count + 1
-                self._links[parent, child, fixed] = Link(parent, child, fixed, count, change)
+                r = t.transform.rotation
+                self._transforms.add(parent, child, pose(t.transform.translation, (r.x, r.y, r.z, r.w)))
+            self._links[parent, child, fixed] = Link(parent, child, fixed)
 
     def _place(self, found: SightingCollector, message: Any) -> None:
         """Find the place of an input's sensor on the robot, by its first message that names a frame."""
@@ -303,7 +313,8 @@ class Collector:
     def _T_base(self, name: str, frame: str) -> se3.Pose | None:
         """The fixed pose of an input's frame on the robot, by TF, else as configured; None where neither has it."""
         known = self._transforms.lookup(self._config.frames.base, frame)
-        mounted = next((one.numbers("mount", 6) for one in self._config.sources if one.name == name), ())
+        of = next((one for one in self._config.sources if one.name == name), InputConfig(name))
+        mounted = tuple(map(float, assumed_mount(frame).split())) if of.mount == ASSUMED else of.numbers("mount", 6)
         return se3.from_xyz_rpy(mounted) if known is None and mounted else known
 
     def columns(self, counters: Counters) -> Columns:
@@ -316,14 +327,32 @@ class Collector:
             self._poses(self._path),
             tuple(one.columns() for one in self._sightings.values()),
             tuple(self._links.values()),
-            index(self._tf_ns),
-            np.array(self._tf_path).reshape(-1, 7),
             counters,
             self._assumed,
             index(self._gyro_ns),
             np.array(self._gyro),
             self._gyro_frame,
             self._T_base(self._config.gyro_input, self._gyro_frame),
+            tuple(self._fixes_of(name, some) for name, some in self._fixes.items()),
+        )
+
+    def _fixes_of(self, name: str, some: Sequence[Fix]) -> FixColumns:
+        topic = next((topic.name for topic in self._topics.values() if name in topic.inputs), name)
+        n, frame = self._config.world.dimensions, self._frames_of_fixes.get(name, "")
+        has_point = [m.kind in ("position", "pose") for m in some]
+        points = [complex(*m.measured[:2]) if has else complex(np.nan) for m, has in zip(some, has_point, strict=True)]
+        sigmas = [m.covariance[0] ** 0.5 for m, has in zip(some, has_point, strict=True) if has]
+        kind = some[0].kind if some else ""
+        headings = [np.nan if kind == "position" else _yaw(m.measured, n) for m in some]
+        return FixColumns(
+            name,
+            topic,
+            np.array([m.stamp_ns for m in some], dtype=np.int64),
+            np.array(points),
+            np.array(headings),
+            float(np.median(sigmas)) if sigmas else 0.0,
+            frame if kind in ("heading", "attitude") else "",
+            self._T_base(name, frame) or se3.IDENTITY,
         )
 
     def _poses(self, numbers: "array[float]") -> Array:
@@ -344,12 +373,17 @@ class Collector:
 
 def _heights(message: Any, T_base_frame: se3.Pose) -> dict[str, float]:
     """The heights of detections above the base, by id, which the plane does not have."""
-    out = {}
+    out: dict[str, float] = {}
     for one in getattr(message, "detections", ()):
         if getattr(one, "results", ()) and hasattr(one.results[0], "pose"):
             p = one.results[0].pose.pose.position
-            out[one.id] = float(se3.act(T_base_frame, (p.x, p.y, p.z))[2])
+            out |= dict.fromkeys(names_of(one), float(se3.act(T_base_frame, (p.x, p.y, p.z))[2]))
     return out
+
+
+def _yaw(measured: Sequence[float], dimensions: int) -> float:
+    """The heading at the end of a pose, an attitude or a heading."""
+    return float(measured[-1] if dimensions == 2 else so3.log(tuple(measured[-4:]))[2])
 
 
 def _frame(message: Any) -> str:

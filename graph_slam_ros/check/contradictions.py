@@ -9,6 +9,7 @@ from graph_slam_ros.check.columns import Columns
 from graph_slam_ros.check.finding import Finding, Where
 from graph_slam_ros.check.moving_landmarks import check_moving, motions_of
 from graph_slam_ros.check.noise import check_noise, check_noise_alone, noise_of, noisier
+from graph_slam_ros.check.odometry import ratio
 from graph_slam_ros.check.pairs import LATER_S, Pairs, pairs_of, path_of, usable
 from graph_slam_ros.check.ranges import check_ranges
 from graph_slam_ros.check.sightings import SightingColumns
@@ -22,7 +23,7 @@ _FAR_M = 200.0
 _HALF, _NOISES, _NEARLY = 0.5, 2.0, 1.2
 _RELATED = 0.7
 _UNRELATED, _UNRELATED_NOISES, _UNRELATED_PAIRS = 0.6, 4.0, 100
-_TWICE, _FEW = 0.002, 30
+_TWICE = 0.002
 _ONCE, _SELDOM = 0.5, 3
 _AGAIN_S, _AGAIN_M, _SPAN = 10.0, 3.0, 0.25
 _CHANCE, _MOST_BY_CHANCE = 0.02, 2
@@ -30,6 +31,7 @@ _LOOP = 0.1  # of the way: landmarks that come back within less close no loop of
 _SILENT = 0.5
 _QUARTER = 0.5**0.5
 _CORRECTED = "_corrected"
+_OTHER_SCALE = 0.15  # less is found by a fit
 
 # Where a sensor would be turned on the robot, if its positions are in other axes: R_frame_true.
 TURNS: Mapping[str, so3.Quaternion] = {
@@ -81,7 +83,9 @@ def _contradictions(c: Columns, s: SightingColumns, path_ns: Index, path: Array)
     yield from along
     if any(one.ends for one in along):
         return
-    found = _mirrored(c, s, pairs, noise_m, where) or _axes(s, pairs, noise_m, use, where)
+    found = (
+        _mirrored(c, s, pairs, noise_m, where) or _axes(s, pairs, noise_m, use, where) or _scaled(c, s, pairs, where)
+    )
     if found is not None:
         yield found
         return
@@ -158,6 +162,31 @@ def _axes(s: SightingColumns, pairs: Pairs, noise_m: float, use: Mask, where: Wh
     return Finding("axes", "error", value, 1.0 / _HALF, "times", text, settings=settings, **where)
 
 
+def _scaled(c: Columns, s: SightingColumns, pairs: Pairs, where: Where) -> Finding | None:
+    """Ranges by which two sightings of a landmark agree with odometry only if all are multiplied by one factor."""
+    origin = np.array(s.T_base_frame[:3])
+    n, by = pairs.dimensions, tuple(pairs.motion.T)
+    arms = [s.points[k] - origin for k in (pairs.a, pairs.b)]
+    sensor = np.stack(se3.act(by, tuple(np.broadcast_to(origin, arms[0].shape).T)), axis=1) - origin
+    x = (arms[0] - np.stack(so3.act(by[3:], tuple(arms[1].T)), axis=1))[:, :n]
+    y = sensor[:, :n]
+    least, left = ratio(x, y)
+    inverse, _ = ratio(y, x)
+    if not (least > 0.0 and inverse > 0.0):
+        return None
+    factor = float(np.sqrt(least / inverse))
+    low, high = sorted((least, 1.0 / inverse))  # noise makes the one too small, and the other too large
+    if left > _HALF or not (high < 1.0 - _OTHER_SCALE or low > 1.0 + _OTHER_SCALE) or not 0.1 <= factor <= 10.0:
+        return None
+    now = next((one.range_factor for one in c.config.sources if one.name == s.input), 1.0)
+    text = (
+        f"{s.topic}: ranges are {1.0 / factor:.2f} times as long as odometry says: is the size of the tags right "
+        "(that of the black square), and is odometry in metres?"
+    )
+    settings = (assignment(f"{s.input}.range_factor", round(now * factor, 3)),)
+    return Finding("range_scale", "error", 1.0 / factor, 1.0 + _OTHER_SCALE, "times", text, settings=settings, **where)
+
+
 def turned_mount(name: str, frame: str, T_base_frame: se3.Pose, T_frame_true: se3.Pose) -> tuple[str, ...]:
     """Settings that place an input's sensor elsewhere than its frame is, by a frame of its own name."""
     T = se3.compose(tuple(T_base_frame), T_frame_true)
@@ -186,16 +215,12 @@ def _identities(c: Columns, s: SightingColumns) -> Iterator[Finding]:
 
 def _coverage(s: SightingColumns, path_ns: Index, path: Array) -> Iterator[Finding]:
     where: Where = {"topic": s.topic, "first_ns": int(s.stamp_ns[0]), "count": len(s.stamp_ns)}
-    span_s = float(path_ns[-1] - path_ns[0]) * 1e-9
     inside = (s.stamp_ns >= path_ns[0]) & (s.stamp_ns <= path_ns[-1])
-    if inside.sum() < _FEW:
-        text = f"{s.topic}: only {int(inside.sum())} sightings in {span_s:.0f} s"
-        yield Finding("few_sightings", "note", int(inside.sum()), _FEW, "sightings", text, **where)
-    ends = np.concatenate([[path_ns[0]], np.sort(s.stamp_ns[inside]), [path_ns[-1]]])
-    silent_s = float(np.diff(ends).max()) * 1e-9
-    if silent_s > _SILENT * span_s:
-        text = f"{s.topic}: nothing is seen for {silent_s:.0f} of {span_s:.0f} s"
-        yield Finding("silent", "warning", silent_s, _SILENT * span_s, "s", text, **where)
+    between = np.diff([0, *np.searchsorted(path_ns, np.sort(s.stamp_ns[inside])), len(path_ns)])
+    silent = float(between.max()) / len(path_ns)
+    if silent > _SILENT:
+        text = f"{s.topic}: nothing is seen for {silent:.0%} of the drive, for {int(between.max())} poses of odometry"
+        yield Finding("silent", "warning", silent, _SILENT, "part", text, **where)
     is_named = np.array([bool(name) for name in s.names], dtype=bool)[s.name]
     chosen = np.flatnonzero(is_named & inside)
     if not len(chosen):

@@ -50,15 +50,19 @@ KINDS: dict[str, Kind] = {
     "no_landmarks": Kind(
         "the recording has no landmark, fix or closure, so nothing corrects odometry", "record a topic of landmarks"
     ),
-    "input_unused": Kind("a topic of landmarks or odometry cannot be used", "do what the text of the finding says"),
+    "input_unused": Kind(
+        "a topic of landmarks or odometry cannot be used",
+        "record it as a type of docs/inputs.md, or name another topic with --odom or --landmarks",
+    ),
     "damaged": Kind("a part of the recording cannot be read", "try ros2 bag reindex, or record it again"),
     # -- times
+    "wrong_stamps": Kind(
+        "the stamps of an input do not advance as its messages were recorded",
+        "correct the driver: header.stamp has the seconds, and the nanoseconds of the second (0 to 999999999)",
+        True,
+    ),
     "clock_domains": Kind("two inputs are stamped by different clocks", f"{_ONE_CLOCK}; or set INPUT.offset_s"),
     "latency": Kind("messages were recorded before the time in their stamps", f"{_ONE_CLOCK}; or set INPUT.offset_s"),
-    "clock_drift": Kind(
-        "the clock of an input runs faster or slower than the recorder's",
-        f"{_ONE_CLOCK}; a constant offset does not help",
-    ),
     "clock_jump": Kind(
         "the stamps of an input step, and stay there: its clock was set, or its messages came later from then on",
         f"{_ONE_CLOCK}; cut the recording there",
@@ -98,22 +102,19 @@ KINDS: dict[str, Kind] = {
         "odometry is so slow that the pose at a sighting is interpolated over a long time",
         "publish odometry at 10 Hz or more",
     ),
-    "jitter": Kind(
-        "the times between stamps vary a lot",
-        "stamp messages when they are measured, not on arrival; no setting mends stamps that scatter",
-    ),
     # -- frames
     "frame_unlinked": Kind("no transform links a sensor's frame to the robot", _MOUNT),
     "two_parents": Kind("a frame has two parents, so transforms through it are arbitrary", _PUBLISHER),
-    "static_changes": Kind("a static transform is published twice, with different values", _PUBLISHER),
     "seen_in_fixed_frame": Kind(
         "sightings are given in a frame that does not move with the robot", "publish them in the sensor's frame", True
     ),
-    "tf_differs": Kind(
-        "odometry's topic and /tf do not describe the same motion", "choose one with --odom, or stop the other"
-    ),
     "odometry_in_map": Kind("odometry is given in the frame of a map, so it is the output of a localiser", _WHEELS),
     # -- odometry
+    "pose_stands": Kind(
+        "the pose of odometry stays where it is, though its twist says that the robot moves",
+        "have the driver fill in the pose",
+        True,
+    ),
     "static": Kind("the robot does not move", "choose another topic with --odom, or drive", True),
     "units": Kind("distances or speeds are larger than any robot's", _DRIVER, True),
     "no_orientation_of_odometry": Kind(
@@ -132,10 +133,19 @@ KINDS: dict[str, Kind] = {
     "twist_scale": Kind("the twist has other units than the pose, or the opposite sign", _DENSITY),
     "twist_frame": Kind("the twist is given along the axes of the odometry frame, not of the robot", _DENSITY),
     "twist_unrelated": Kind("the twist does not describe the motion of the pose", _DENSITY),
-    "covariance_zero": Kind("the twist has no covariance, so odometry's noise is that of the parameters", ""),
     "covariance_negative": Kind("a variance of the twist is negative or not a number", _DENSITY),
     "covariance_tiny": Kind("the covariance of the twist is smaller than any wheels can be", _DENSITY),
     "covariance_useless": Kind("the standard deviation of the twist is larger than the speed", _DENSITY),
+    # -- fixes and headings
+    "fix_mirrored": Kind(
+        "the axes of fixes are exchanged or mirrored", "correct its driver (REP 103: east, north, up)"
+    ),
+    "fix_frozen": Kind("a fix stands still while the robot drives", "have its driver send nothing while it has no fix"),
+    "fix_jumps": Kind("a fix jumps", "mend its covariance, or set INPUT.sigma_m; a run leaves out what contradicts"),
+    "heading_clockwise": Kind(
+        "a heading counts clockwise", "correct its driver (REP 103: counter-clockwise from east)"
+    ),
+    "heading_offset": Kind("a heading is off the course", "correct its driver (0 is east), or where it is mounted"),
     # -- a gyro that is used as part of odometry
     "gyro_scale": Kind(
         "the gyro turns more or less than odometry, or the other way",
@@ -146,10 +156,6 @@ KINDS: dict[str, Kind] = {
         "let the robot stand when its gyro starts; or set gyro.bias_sigma",
     ),
     "gyro_unrelated": Kind("the gyro's turns are not those of odometry", "check its topic, its frame and its clock"),
-    "gyro_unchecked": Kind(
-        "the gyro cannot be compared with odometry, or not its scale",
-        "publish odometry at 10 Hz or more; record a drive with turns",
-    ),
     # -- sightings and odometry
     "mirrored": Kind("sightings and odometry turn in opposite directions", _DRIVER, True),
     "axes": Kind(
@@ -164,7 +170,6 @@ KINDS: dict[str, Kind] = {
         "correct the driver; or set INPUT.noise=sigmas with INPUT.sigma_m",
         True,
     ),
-    "few_sightings": Kind("there are hardly any sightings", "record a drive past more landmarks"),
     "seen_once": Kind(
         "most ids are seen less than three times: are they numbers of tracks, not of landmarks?",
         "let the detector give each landmark its own id; without ids set landmarks.association=joint",
@@ -191,7 +196,9 @@ KINDS: dict[str, Kind] = {
         "the robot turns more or less than odometry says", "correct the track width, or set odometry.turn_factor"
     ),
     "range_scale": Kind(
-        "ranges are longer or shorter than odometry says", "correct the sensor's driver, or set INPUT.range_factor"
+        "ranges are longer or shorter than odometry says",
+        "correct the size of the tags, or the sensor's driver, or set INPUT.range_factor",
+        True,
     ),
     "not_observable": Kind("the drive does not determine a clock, a mount or a scale", "drive what the text names"),
     "over_confident": Kind(
@@ -224,10 +231,6 @@ KINDS: dict[str, Kind] = {
     "map_breaks": Kind(
         "many landmarks are elsewhere after some time, so the robot's path has a break there",
         "find out whether the robot was carried or slipped",
-    ),
-    "ids_wrong": Kind(
-        "some sightings have the id of another landmark",
-        "correct the detector; robust.decide leaves out those that contradict the map, a few fit by chance",
     ),
     "outliers": Kind("many sightings are far from their landmark", "correct the detector, or set landmarks.loss"),
     "fit_unsure": Kind("the fit of clock, mount and scale failed", "mend the other findings first"),

@@ -2,30 +2,21 @@
 
 from collections.abc import Collection, Iterator, Sequence
 
-import numpy as np
-
 from graph_slam_ros.check.columns import Columns, Link
 from graph_slam_ros.check.finding import Finding, Severity, Where
 from graph_slam_ros.check.sightings import SightingColumns
+from graph_slam_ros.config.inputs import ASSUMED
 from graph_slam_ros.formats.parameters import assignment
 from graph_slam_ros.messages.inputs.transforms import MAP_FRAMES, assumed_mount
 
 _OF_CAMERAS = "world"  # which visual odometry calls its frame, too
 _FIXED = (*MAP_FRAMES, _OF_CAMERAS)
 _UNKNOWN = ("frame_unknown", "child_frame_unknown", "odom_frame_unknown", "map_frame_unknown")
-_SAME = 1e-6
-_DIFFER_M, _FEW = 0.05, 10
 
 
 def check_frames(c: Columns) -> Iterator[Finding]:
     """The tree of transforms, and where odometry and each sensor are in it."""
     yield from _parents(c)
-    for link in c.links:
-        if link.fixed and link.change > _SAME:
-            text = f"the static transform {link.parent} -> {link.child} differs by {link.change:.3g} from the first"
-            yield Finding(
-                "static_changes", "warning", link.change, _SAME, "m, rad", text, "/tf_static", count=link.count
-            )
     if c.odometry.frame in _FIXED:
         is_common = c.odometry.frame == _OF_CAMERAS
         severity: Severity = "note" if is_common else "warning"
@@ -40,7 +31,6 @@ def check_frames(c: Columns) -> Iterator[Finding]:
         unlinked |= {one.topic for one in found}
         yield from found
     yield from _unlinked(c, unlinked)
-    yield from _tf(c)
 
 
 def _parents(c: Columns) -> Iterator[Finding]:
@@ -54,17 +44,15 @@ def _parents(c: Columns) -> Iterator[Finding]:
             used.add(above)
             frame = above
     for child, several in parents.items():
-        if len(several) > 1:
-            severity: Severity = "error" if child in used else "note"
+        if len(several) > 1 and child in used:
             text = f"frame {child} has {len(several)} parents ({', '.join(list(several)[:4])}): two nodes publish it"
-            yield Finding("two_parents", severity, len(several), 1, "parents", text, "/tf")
+            yield Finding("two_parents", "error", len(several), 1, "parents", text, "/tf")
 
 
 def _of_sensor(c: Columns, s: SightingColumns) -> Iterator[Finding]:
     topic = c.topics.get(s.topic)
     if topic is None:
         return
-    key = f"{s.input}.mount"
     first_ns = int(topic.stamp_ns[0]) if len(topic.stamp_ns) else 0
     where: Where = {"topic": s.topic, "first_ns": first_ns, "count": len(topic.stamp_ns)}
     fixed = [frame for frame in topic.frames if frame.lstrip("/") in (*_FIXED, c.odometry.frame) and frame]
@@ -73,14 +61,22 @@ def _of_sensor(c: Columns, s: SightingColumns) -> Iterator[Finding]:
         text = f"{s.topic} is given in {fixed[0]}, a frame that does not move with the robot"
         severity: Severity = "note" if is_linked else "error"
         yield Finding("seen_in_fixed_frame", severity, topic.frames[fixed[0]], 0, "messages", text, **where)
-    elif key in c.assumed:
-        named = next(filter(None, topic.frames), "") or "its sensor"
-        text = (
-            f"{s.topic}: no transform links {named} to {c.config.frames.base}: the pose {c.assumed[key]!r} is assumed"
-        )
+    elif f"{s.input}.frame" in c.assumed:
+        text = f"{s.topic}: no transform has {next(iter(topic.frames))}: did you mean {s.frame}?"
         yield Finding(
-            "frame_unlinked", "error", 1, 0, "frames", text, settings=(assignment(key, c.assumed[key]),), **where
+            "frame_unlinked",
+            "error",
+            1,
+            0,
+            "frames",
+            text,
+            settings=(assignment(f"{s.input}.frame", s.frame),),
+            **where,
         )
+    elif next((one.mount for one in c.config.sources if one.name == s.input), "") == ASSUMED:
+        named = next(filter(None, topic.frames), "") or "its sensor, whose messages name no frame,"
+        text = f"{s.topic}: no transform links {named} to {c.config.frames.base}: a place at the base is assumed"
+        yield Finding("frame_unlinked", "error", 1, 0, "frames", text, **where)
 
 
 def _unlinked(c: Columns, known: set[str]) -> Iterator[Finding]:
@@ -98,7 +94,10 @@ def _unlinked(c: Columns, known: set[str]) -> Iterator[Finding]:
         others = ", ".join(linked[:4])
         text = f"{topic.name}: {times} measurements are refused: no transform links frame {lost} to {base}"
         settings = _place(c, source, frames, lost, "odom_frame_unknown" in counts)
-        if linked and lost:  # at a mount, what another robot sees would be seen by this one
+        if frames == ("",):
+            text = f"{topic.name}: {times} measurements are refused: they name no frame (header.frame_id of the driver)"
+            settings = ()
+        elif linked and lost:  # at a mount, what another robot sees would be seen by this one
             text += f"; the others are of {others}: is it another robot's frame, or a sensor without a transform?"
             settings = ()
         elif linked:  # a mount is not used for them
@@ -131,24 +130,3 @@ def _root(frame: str, links: Collection[Link]) -> str:
         frame = above[frame]
         seen.add(frame)
     return frame
-
-
-def _tf(c: Columns) -> Iterator[Finding]:
-    """Odometry's topic against the same transform on /tf."""
-    o = c.odometry
-    usable = np.isfinite(o.poses[:, :3]).all(axis=1) & (o.stamp_ns != 0)
-    if len(c.tf_ns) < _FEW or usable.sum() < _FEW:
-        return
-    stamp_ns, order = np.unique(o.stamp_ns[usable], return_index=True)
-    at = o.poses[usable][order]
-    inside = (c.tf_ns >= stamp_ns[0]) & (c.tf_ns <= stamp_ns[-1])
-    if inside.sum() < _FEW:
-        return
-    seconds, t = (stamp_ns - stamp_ns[0]) * 1e-9, (c.tf_ns[inside] - stamp_ns[0]) * 1e-9
-    apart = np.stack([np.interp(t, seconds, at[:, k]) for k in range(3)], axis=1) - c.tf_path[inside, :3]
-    median_m = float(np.median(np.linalg.norm(apart, axis=1)))
-    if median_m > _DIFFER_M:
-        text = f"/tf {o.frame} -> {o.child} and {o.topic} differ by {median_m:.2f} m (median): these are two odometries"
-        yield Finding(
-            "tf_differs", "warning", median_m, _DIFFER_M, "m", text, "/tf", int(c.tf_ns[0]), int(inside.sum())
-        )

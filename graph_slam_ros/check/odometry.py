@@ -156,6 +156,11 @@ def check_odometry(c: Columns) -> Iterator[Finding]:
     total_rad = float(np.linalg.norm(steps.turned[smooth], axis=1).sum())
     if total_m < _STILL_M and total_rad < _STILL_RAD:
         span_s = float(steps.dt.sum())
+        speed_m_s = float(np.median(np.linalg.norm(o.twist[steps.index, :3], axis=1)))
+        if speed_m_s > _SLOWEST_M_S:
+            text = f"{o.topic}: its pose never changes, though its twist says {speed_m_s:.1f} m/s"
+            yield Finding("pose_stands", "error", speed_m_s, _SLOWEST_M_S, "m/s", text, **where)
+            return
         text = f"{o.topic}: the robot moves {total_m:.2f} m and {np.degrees(total_rad):.0f} degrees in {span_s:.0f} s"
         yield Finding("static", "warning", total_m, _STILL_M, "m", text, **where)
         return
@@ -262,24 +267,6 @@ def _twist(o: OdometryColumns, steps: Steps, jumps: Mask, where: Where) -> Itera
             yield Finding("twist_unrelated", "warning", left, _UNEXPLAINED, "part", text, settings=_DENSITY, **where)
 
 
-def of_pose_or_twist(findings: list[Finding]) -> list[Finding]:
-    """Findings of a pose of odometry that contradicts its twist, and by which landmarks seem far too noisy.
-
-    Then the pose is likely to be wrong. Larger noise of landmarks would only hide that, so it is not offered.
-    """
-    twists = [one for one in findings if one.code == "twist_scale"]
-    noisy = [one for one in findings if one.code == "over_confident" and one.severity == "warning"]
-    if not (twists and noisy):
-        return findings
-    why = (
-        f"by the pose two sightings of a landmark differ by {max(one.value for one in noisy):.0f} times their noise. "
-        "Is the pose wrong? Correct it, or odometry.distance_factor and odometry.turn_factor. If the twist alone is "
-        "wrong, so is the noise of the landmarks"
-    )
-    mended = {id(one): replace(one, severity="error", text=f"{one.text}; {why}", settings=()) for one in twists}
-    return [mended.get(id(one), one) for one in findings if one not in noisy]
-
-
 def _in_odom(o: OdometryColumns, steps: Steps, sums: Callable[[Array], Array], moved: Array, twist: Array) -> bool:
     """Return whether the linear twist fits the motion along the axes of the odometry frame far better."""
     turns = o.poses[steps.index[:-1], 3:]
@@ -322,10 +309,6 @@ def _covariance(o: OdometryColumns, steps: Steps, where: Where) -> Iterator[Find
         yield Finding("covariance_negative", severity, int(bad.sum()), 0, "messages", text, settings=_DENSITY, **where)
         return
     if not used.any() or (np.median(used, axis=0) >= _UNUSED_M_S**2).any():
-        text = (
-            f"{o.topic}: the twist has no covariance: the noise of odometry is that of the parameters (odometry.noise)"
-        )
-        yield Finding("covariance_zero", "note", 0.0, 0.0, "m/s", text, **where)
         return
     sigmas, speed = np.sqrt(np.median(used, axis=0)), max(steps.fastest_m_s, _SLOWEST_M_S)
     if sigmas[0] > _USELESS * speed:

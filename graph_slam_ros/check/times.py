@@ -1,6 +1,6 @@
 """Checks of the times of a recording: clocks, order, gaps."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -10,27 +10,25 @@ from graph_slam_ros.check.finding import Finding, Severity, Where
 from graph_slam_ros.config.node import TimeConfig
 from graph_slam_ros.formats.parameters import assignment
 from graph_slam_ros.messages.receive_times import clock_offset_s
-from graph_slam_ros.typing import Array, Index
+from graph_slam_ros.typing import Array, Index, Mask
 
 _FEW, _MANY, _BACK_NS = 3, 10, 1_000_000_000
 _CLOCKS_DIFFER_S, _EARLY_S, _DAY_S = 10.0, 0.15, 86400.0
-_WINDOWS, _APART, _LEAST_S, _LEAST_MESSAGES = 20, 5, 30.0, 200
-_DRIFT, _DRIFTED_S, _SCATTERS = 1e-4, 0.02, 4.0
-_SAME_WAY = 0.85  # part of the slopes between windows that have one sign
-_JUMP_S, _PER_WINDOW, _SIDE = 0.05, 5, 3
 _DUPLICATES, _OUT_OF_ORDER = 0.01, 0.001
 _LEAST_ROUNDED_NS, _AS_OTHERS, _COARSE_S = 1_000_000, 0.1, 0.15
 _LONG_S, _VERY_LONG_S, _PERIODS, _MOVED_M, _TURNED = 1.0, 2.0, 10.0, 0.05, 0.05
 _SLOW_HZ, _BETWEEN_S = 5.0, 0.02
-_JITTER, _FAST_HZ = 1.5, 200.0
-_SCATTERED_S, _REGULAR, _LEAST_STEPS = 0.05, 0.2, 50
+_CROWDED, _FASTER = 0.2, 1.5
+_OF_A_SECOND = {1_000: "milliseconds", 1_000_000: "microseconds"}
+_PACE, _GOES_ON, _STEPS = 0.05, 0.3, 5
 _OUTSIDE, _NEARLY_ALL, _MARGIN_NS = 0.2, 0.95, 500_000_000
 
 
 def check_times(c: Columns) -> Iterator[Finding]:
     """Clocks of inputs against the recorder's and each other, and the order of the stamps of each."""
-    if constant := [one for topic in c.topics.values() for one in _constant(topic)]:
-        yield from constant
+    right = {name: topic for name, topic in c.topics.items() if not c.counters[topic.inputs[0], "bad_stamp"]}
+    if wrong := [one for topic in right.values() for one in _constant(topic)] or list(_wrong(right)):
+        yield from wrong
         return
     for key, value in c.assumed.items():
         if key.endswith(".offset_s"):
@@ -41,11 +39,10 @@ def check_times(c: Columns) -> Iterator[Finding]:
             topic = c.topic_of(name)
             where: Where = {"topic": "" if topic is None else topic.name, "settings": (assignment(key, value),)}
             yield Finding("clock_domains", "error", -value, _CLOCKS_DIFFER_S, "s", text, **where)
-    stamped = {name: topic for name, topic in c.topics.items() if np.count_nonzero(topic.stamp_ns) >= _FEW}
+    stamped = {name: topic for name, topic in right.items() if np.count_nonzero(topic.stamp_ns) >= _FEW}
     yield from _clocks(c, stamped)
     for topic in stamped.values():
         yield from _order(c, topic)
-        yield from _scattered(topic)
     yield from _rate(c)
     yield from _overlap(c)
 
@@ -58,6 +55,37 @@ def _constant(topic: TopicColumns) -> Iterator[Finding]:
         text = f"{topic.name}: all of its {count} messages have the stamp {stamp_ns[0] * 1e-9:.3f} s"
         at: Where = {"topic": topic.name, "first_ns": int(stamp_ns[0]), "count": count}
         yield Finding("constant_stamps", "error", count, _MANY, "messages", text, **at)
+
+
+def _wrong(topics: Mapping[str, TopicColumns]) -> Iterator[Finding]:
+    """Inputs whose stamps crowd together in each second, or that advance much faster or slower than other inputs'."""
+    advance = dict[str, float]()
+    for name, topic in topics.items():
+        lag_s, log_ns, stamp_ns = _lags(topic)
+        if len(lag_s) < _MANY or not np.ptp(log_ns):
+            continue
+        step_ns, recorded_ns = np.diff(stamp_ns), np.diff(log_ns)
+        where: Where = {"topic": name, "first_ns": int(stamp_ns[0]), "count": len(stamp_ns)}
+        part = int(np.quantile(stamp_ns % 10**9, _NEARLY_ALL))
+        if 0 < part < _CROWDED * 1e9 and np.median(step_ns) < _CROWDED * np.median(recorded_ns):
+            unit = next((unit for most, unit in _OF_A_SECOND.items() if part < most), "ticks")
+            text = f"{name}: all that comes in a second is stamped within {part * 1e-6:.3g} ms: nanosec has {unit}"
+            yield Finding("wrong_stamps", "error", part * 1e-9, _CROWDED, "s", text, **where)
+            return
+        apart = max(1, len(lag_s) // 4)
+        span_ns = np.maximum(log_ns[apart:] - log_ns[:-apart], 1)
+        advance[name] = float(np.median((stamp_ns[apart:] - stamp_ns[:-apart]) / span_ns))
+    usual = float(np.median(list(advance.values()))) if len(advance) > 2 else 1.0  # simulated time may be slow
+    for name, rate in advance.items():
+        others = [other for other in advance.values() if other != rate]
+        if _differ(rate, usual) and any(_differ(rate, other) for other in others):
+            text = f"{name}: its stamps advance by {rate:.3g} s for each second in which its messages were recorded"
+            at: Where = {"topic": name, "first_ns": int(topics[name].stamp_ns[0]), "count": len(topics[name].stamp_ns)}
+            yield Finding("wrong_stamps", "error", rate, _FASTER, "s/s", text, **at)
+
+
+def _differ(a: float, b: float) -> bool:
+    return b > 0.0 and not b / _FASTER < a < b * _FASTER
 
 
 def rounded_s(o: OdometryColumns) -> float:
@@ -92,7 +120,6 @@ def _clocks(c: Columns, topics: dict[str, TopicColumns]) -> Iterator[Finding]:
     if of_odometry is None or any((np.diff(t.stamp_ns[t.stamp_ns != 0]) < -_BACK_NS).any() for t in topics.values()):
         return
     odometry_lag_s, odometry_log_ns, _ = _lags(of_odometry)
-    typical_s = float(np.median(odometry_lag_s))
     for topic in topics.values():
         lag_s, log_ns, stamp_ns = _lags(topic)
         apart_s = clock_offset_s(log_ns, lag_s, odometry_log_ns, odometry_lag_s)
@@ -106,9 +133,6 @@ def _clocks(c: Columns, topics: dict[str, TopicColumns]) -> Iterator[Finding]:
             )
             setting = _offset(c, topic, apart_s)
             yield Finding("latency", "warning", -apart_s, _EARLY_S, "s", text, settings=(setting,), **where)
-        if topic.use in ("odometry", "landmarks") and abs(typical_s) < _DAY_S:  # else simulated time, or played again
-            jump = list(_jump(topic, lag_s, stamp_ns))
-            yield from jump or _drift(topic, lag_s, log_ns, stamp_ns)
 
 
 def _other_clock(c: Columns, topic: TopicColumns, of_odometry: TopicColumns, apart_s: float, where: Where) -> Finding:
@@ -121,61 +145,10 @@ def _other_clock(c: Columns, topic: TopicColumns, of_odometry: TopicColumns, apa
     return Finding("clock_domains", "error", -by_s, _CLOCKS_DIFFER_S, "s", text, settings=settings, **where)
 
 
-def _jump(topic: TopicColumns, lag_s: Array, stamp_ns: Index) -> Iterator[Finding]:
-    """A step of the shortest lags of windows, that stays: of the clock, or of what delays the messages."""
-    count = min(_WINDOWS, len(lag_s) // _PER_WINDOW)
-    if count < 2 * _APART:
-        return
-    parts = np.array_split(np.arange(len(lag_s)), count)
-    least_s = np.array([lag_s[part].min() for part in parts])
-
-    def spread_s(cut: int) -> float:
-        sides = least_s[:cut], least_s[cut:]
-        return max(float(np.quantile(np.abs(side - np.median(side)), 0.8)) for side in sides)
-
-    cut = min(range(_SIDE, count - _SIDE + 1), key=spread_s)
-    step_s = float(np.median(least_s[:cut]) - np.median(least_s[cut:]))
-    if not max(_JUMP_S, _SCATTERS * spread_s(cut)) < abs(step_s) < _CLOCKS_DIFFER_S:
-        return
-    at = int(stamp_ns[parts[cut][0]])
-    about = f"about {(at - int(stamp_ns[0])) * 1e-9:.0f} s after the first"
-    text = (
-        f"{topic.name}: from {about} its stamps are {step_s * 1e3:+.0f} ms off against the times of recording: "
-        "its clock was set, or its messages came with another delay"
-    )
-    yield Finding("clock_jump", "note", step_s, _JUMP_S, "s", text, topic.name, at, len(stamp_ns))
-
-
 def _offset(c: Columns, topic: TopicColumns, offset_s: float) -> str:
     name = topic.inputs[0]
     before_s = next(one.offset_s for one in c.config.sources if one.name == name)
     return assignment(f"{name}.offset_s", round(before_s + offset_s, 3))
-
-
-def _drift(topic: TopicColumns, lag_s: Array, log_ns: Index, stamp_ns: Index) -> Iterator[Finding]:
-    """Theil-Sen slope of the shortest lags of windows: what delays a message only adds to its lag."""
-    span_s = float(log_ns[-1] - log_ns[0]) * 1e-9
-    if len(log_ns) < _LEAST_MESSAGES or span_s < _LEAST_S:
-        return
-    least_s = np.array([one.min() for one in np.array_split(lag_s, _WINDOWS)])
-    at_s = np.array([(one - log_ns[0]).mean() for one in np.array_split(log_ns, _WINDOWS)]) * 1e-9
-    later, earlier = np.tril_indices(_WINDOWS, -_APART)
-    between_s = at_s[later] - at_s[earlier]
-    if not (between_s > 0.0).any():
-        return
-    slopes = (least_s[later] - least_s[earlier])[between_s > 0.0] / between_s[between_s > 0.0]
-    slope = float(np.median(slopes))
-    scatter_s = float(np.median(np.abs(least_s - np.median(least_s) - slope * (at_s - np.median(at_s)))))
-    drifted_s = abs(slope) * span_s
-    if float((slopes * slope > 0.0).mean()) < _SAME_WAY:  # stamps that scatter
-        return
-    if abs(slope) > _DRIFT and drifted_s > max(_DRIFTED_S, _SCATTERS * scatter_s) and drifted_s < _CLOCKS_DIFFER_S:
-        text = (
-            f"{topic.name}: its clock runs {-slope * 1e6:+.0f} ppm against the recorder's "
-            f"({-slope * span_s * 1e3:+.0f} ms in {span_s:.0f} s)"
-        )
-        where: Where = {"topic": topic.name, "first_ns": int(stamp_ns[0]), "count": len(stamp_ns)}
-        yield Finding("clock_drift", "warning", -slope * 1e6, _DRIFT * 1e6, "ppm", text, **where)
 
 
 def _order(c: Columns, topic: TopicColumns) -> Iterator[Finding]:
@@ -225,6 +198,13 @@ def _rate(c: Columns) -> Iterator[Finding]:
     if len(long):
         moved = np.linalg.norm(np.diff(poses[:, :3], axis=0)[long], axis=1) > _MOVED_M
         turned = np.linalg.norm(np.diff(poses[:, 3:], axis=0)[long], axis=1) > _TURNED
+        was_set = _was_set(poses, step_s, long)
+        for k in long[was_set]:
+            text = f"{o.topic}: the clock was set forward by {_span(step_s[k])}: odometry goes on where it was"
+            at_k = int(stamp_ns[k + 1])
+            yield Finding("clock_jump", "warning", step_s[k], most_s, "s", text, o.topic, at_k, 1)
+        long, moved, turned = long[~was_set], moved[~was_set], turned[~was_set]
+    if len(long):
         worst_s = float(step_s[long].max())
         is_bad = bool((step_s[long][moved | turned] > max(_PERIODS * median_s, _VERY_LONG_S)).any())
         text = (
@@ -238,31 +218,22 @@ def _rate(c: Columns) -> Iterator[Finding]:
         text = f"{o.topic} comes at {1.0 / median_s:.1f} Hz: poses are interpolated over {median_s:.2f} s"
         severity: Severity = "warning" if between > 0.5 else "note"
         yield Finding("slow_odometry", severity, 1.0 / median_s, _SLOW_HZ, "Hz", text, **where)
-    spread = float(np.subtract(*np.percentile(step_s, [90.0, 10.0]))) / median_s
-    if spread > _JITTER and 1.0 / median_s < _FAST_HZ:
-        text = f"{o.topic}: the times between stamps vary by {spread:.1f} times their median: stamped on arrival?"
-        yield Finding("jitter", "note", spread, _JITTER, "times", text, **where)
 
 
-def _scattered(topic: TopicColumns) -> Iterator[Finding]:
-    """Sightings that are recorded at regular times and stamped at others: each stamp is wrong by an error of its own.
+def _was_set(poses: Array, step_s: Array, gaps: Index) -> Mask:
+    """Return in which gaps the clock was set: the robot drives before and after, and in between not for so long."""
+    pace = np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1)
+    out = np.zeros(len(gaps), dtype=bool)
+    for n, k in enumerate(gaps):
+        sides = slice(max(k - _STEPS, 0), k), slice(k + 1, k + 1 + _STEPS)
+        speeds = [float(pace[side].sum() / max(step_s[side].sum(), 1e-9)) for side in sides]
+        out[n] = min(speeds) > _PACE and pace[k] < _GOES_ON * min(speeds) * step_s[k]
+    return out
 
-    Messages that are late on their way are not: those are recorded at irregular times.
-    """
-    stamped = topic.stamp_ns != 0
-    if topic.use != "landmarks" or np.count_nonzero(stamped) <= _LEAST_STEPS:
-        return
-    recorded_s, step_s = (np.diff(of[stamped]) * 1e-9 for of in (topic.log_ns, topic.stamp_ns))
-    every_s, median_s = float(np.median(recorded_s)), float(np.median(step_s))
-    vary_s, regular_s = (float(np.subtract(*np.percentile(of, [90.0, 10.0]))) for of in (step_s, recorded_s))
-    is_regular = abs(median_s - every_s) < _REGULAR * every_s and regular_s < _REGULAR * vary_s
-    if vary_s > _SCATTERED_S and is_regular:
-        text = (
-            f"{topic.name}: a message is recorded each {every_s:.2f} s, and the times between stamps vary by "
-            f"{vary_s:.2f} s: each stamp is wrong by an error of its own"
-        )
-        at: Where = {"topic": topic.name, "first_ns": int(topic.stamp_ns[stamped][0]), "count": len(step_s) + 1}
-        yield Finding("jitter", "warning", vary_s, _SCATTERED_S, "s", text, **at)
+
+def _span(seconds: float) -> str:
+    """A time in days or in seconds."""
+    return f"{seconds / _DAY_S:.1f} days" if seconds > _DAY_S else f"{seconds:.1f} s"
 
 
 def _often(times: int) -> str:

@@ -1,19 +1,15 @@
 """A trial of a recording: a replay in memory, then a fit of clock, mount and scales that starts at its estimate."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from graph_slam_ros.check.columns import Columns, TopicColumns
-from graph_slam_ros.check.contradictions import turned_mount
 from graph_slam_ros.check.finding import Finding, Where
 from graph_slam_ros.check.identities import at_two_places, check_identities, points_in_map
-from graph_slam_ros.check.located import moved
 from graph_slam_ros.check.noise import noisier
 from graph_slam_ros.check.outliers import check_outliers
 from graph_slam_ros.check.pairs import pairs_of, path_of, poses_at
-from graph_slam_ros.check.renewed_ids import check_renewed
 from graph_slam_ros.check.slips import check_slips
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.parameters import assignment
@@ -37,9 +33,7 @@ _COARSE = {
 }
 _SIGMAS = 4.0
 _TURN_SIGMAS = 6.0  # a wheel's noise that lasts adds up in heading, which neither sigma of a fit knows
-_OF_MOUNT = ("x", "y", "yaw")
 _OF_STEP = 0.25  # of the time between two poses of odometry
-_ABSURD, _BACKWARDS, _SURE = 0.5, 0.35, 0.05
 _DEGREE = np.pi / 180.0
 # By parameter: unit, limit, and from which sigma on it is not observable.
 _LIMITS = {
@@ -124,10 +118,6 @@ def check_trial(c: Columns, slam: GraphSlam) -> Iterator[Finding]:
         yield Finding("fit_unsure", "note", 1, 0, "fits", f"the trial fit failed: {error}")
         return
     scales, no_scales = _noise_scales(slam)
-    scale = next((one for one in fitted if one.parameter.name == "distance"), None)
-    if scale is not None and _has_points(c) and scale.sigma < _SURE and abs(scale.value - 0.1) > _ABSURD:
-        yield _absurd(c, 1.0 + scale.value)
-        return
     clocks = [one for one in fitted if one.parameter.name == "clock" and one.verdict == "admitted"]
     is_void = fit.lost > MOST_LOST or absurd_range(fit) is not None
     late_s = {} if is_void else {one.parameter.source: one.value for one in clocks}
@@ -136,9 +126,7 @@ def check_trial(c: Columns, slam: GraphSlam) -> Iterator[Finding]:
     off = {one.parameter: one.value for one in known if _is_far_off(fit, one, step_s)}
     slip = None if off else check_slips(c, slam)  # a clock or mount that is wrong bends the path in turns
     is_broken = slip is not None and slip[0].severity == "warning"
-    found = [] if _goes_back(c) else _places(c, slam, path_ns, path, late_s, slip if is_broken else None)
-    if found and any(one.name in _OF_MOUNT for one in off):
-        found = list(_places_of_fit(c, slam, fit, off, path_ns, path))
+    found = [] if off or _goes_back(c) else _places(c, slam, path_ns, path, late_s, slip if is_broken else None)
     if is_void:
         found += [one for s in c.sightings for one in noisier(s, pairs_of(s, path_ns, path, c.config.world.dimensions))]
         yield from found or [_void(fit)]
@@ -151,12 +139,17 @@ def check_trial(c: Columns, slam: GraphSlam) -> Iterator[Finding]:
     elif any(one.code == "map_breaks" for one in found):
         found = [one for one in found if one.code != "ids_unsure"]
     yield from found
+    if new := slam.renewed_ids():
+        name = c.sightings[0].topic
+        text = f"{name}: {new}"
+        yield Finding("ids_renewed", "warning", new.same, 0, "landmarks", text, name, new.since_ns, new.new)
     if no_scales:
         yield Finding("fit_unsure", "note", 1, 0, "fits", f"noise cannot be checked: {no_scales}")
-    for noise in scales:
+    for noise in () if off else scales:
         limit = _ODOMETRY_OVER_CONFIDENT if noise.label == "odometry" else _OVER_CONFIDENT
         factor = float(np.sqrt(noise.per_dof))
-        if factor > limit and noise.dof > _LEAST_DOF and not noise.reason:
+        is_allowed_for = c.config.robust.noise_scale == "estimated" and noise.factor < LARGEST
+        if factor > limit and noise.dof > _LEAST_DOF and not noise.reason and not is_allowed_for:
             yield _over_confident(c, noise, factor, limit)
 
 
@@ -175,25 +168,8 @@ def _goes_back(c: Columns) -> bool:
     return any((np.diff(t.stamp_ns[t.stamp_ns != 0]) < -1_000_000_000).any() for t in c.topics.values())
 
 
-def _has_points(c: Columns) -> bool:
-    """Return whether most sightings have a range: bearings alone tell no scale."""
-    return bool(np.isfinite(np.concatenate([s.points[:, 0] for s in c.sightings])).mean() > 0.5)
-
-
-def _absurd(c: Columns, factor: float) -> Finding:
-    """Odometry that a map would need in other units, or the wrong way round."""
-    s = next(s for s in c.sightings if len(s.stamp_ns))
-    where: Where = {"topic": s.topic, "first_ns": int(s.stamp_ns[0]), "count": len(s.stamp_ns)}
-    text = f"the robot would have to drive {factor:.2f} m for each metre of {c.odometry.topic}"
-    if abs(factor + 1.0) < _BACKWARDS:
-        settings = turned_mount(s.input, s.frame, s.T_base_frame, (0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0))
-        text = f"{s.topic}: {text}: does the sensor look backwards?"
-        return Finding("axes", "error", factor, -1.0, "times", text, settings=settings, **where)
-    return Finding("unrelated", "error", factor, 1.0 + _ABSURD, "times", f"{s.topic}: {text}", **where)
-
-
 def _over_confident(c: Columns, noise: NoiseScale, factor: float, limit: float) -> Finding:
-    """Noise that is too small: a note where the run allows for it."""
+    """Noise that is too small, and more than the run allows for."""
     code = "odometry_over_confident" if noise.label == "odometry" else "over_confident"
     of = c.topic_of(noise.source)
     topic = noise.source if of is None else of.name
@@ -202,8 +178,6 @@ def _over_confident(c: Columns, noise: NoiseScale, factor: float, limit: float) 
     if c.config.robust.noise_scale != "estimated":
         mends = ("robust.noise_scale=estimated",)
         return Finding(code, "warning", factor, limit, "times", text, topic, settings=mends)
-    if noise.factor < LARGEST:
-        return Finding(code, "note", factor, limit, "times", f"{text}; a run allows for it", topic)
     text += f"; a run allows for {LARGEST:g} times"
     own = next((one for one in c.config.sources if one.name == noise.source and one.use == "odometry"), None)
     settings = (f"{own.name}.sigma_factor={own.sigma_factor * factor:.2g}",) if own else ()
@@ -259,27 +233,6 @@ def _where(topic: TopicColumns) -> Where:
     return {"topic": topic.name, "first_ns": int(topic.stamp_ns[:1].sum()), "count": len(topic.stamp_ns)}
 
 
-def _places_of_fit(
-    c: Columns, slam: GraphSlam, fit: TrialFit, off: Mapping[Parameter, float], path_ns: Index, path: Array
-) -> Iterator[Finding]:
-    """Findings of places by the estimate of the fit: a mount that is wrong bends the map that it began with.
-
-    Parameters
-    ----------
-    off : what is far off, and by how much
-    """
-    at = slam.graph.offset.values[slam.keyframes.ids][:, None] + np.arange(slam.space.pose.size)
-    for s in c.sightings:
-        x, y, yaw = (off.get(Parameter(s.input, name), 0.0) for name in _OF_MOUNT)
-        points = moved(s.points, s.T_base_frame, (x, y, 0.0, 0.0, 0.0, yaw))
-        stamp_ns = np.clip(s.stamp_ns, path_ns[0], path_ns[-1])
-        poses = poses_in_map(slam, stamp_ns, path_ns, path, fit.path[at])
-        straight = points_in_map(replace(s, points=points), poses)
-        two = at_two_places(s, straight, path_ns, c.config.world.dimensions)
-        yield from check_identities(s, two)
-        yield from check_outliers(s, straight, stamp_ns == s.stamp_ns, c.config, {one.name for one in two})
-
-
 def _places(
     c: Columns,
     slam: GraphSlam,
@@ -311,7 +264,5 @@ def _places(
         shift = shift[np.isfinite(shift)]  # ranges and bearings alone have no point
         shift_m = float(np.quantile(shift, _MOST)) if len(shift) else 0.0
         found += check_identities(s, [one for one in two if one.apart_m > _SHIFTS * shift_m])
-        found += check_renewed(s, points, path_ns, c.config.world.dimensions)
-        elsewhere = {one.name for one in two}
-        found += check_outliers(s, points, inside, c.config, elsewhere)
+        found += check_outliers(s, points, inside, c.config.world.dimensions)
     return found

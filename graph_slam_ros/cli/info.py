@@ -8,8 +8,8 @@ from graph_slam_ros.cli import console
 from graph_slam_ros.cli.usage import CommandParser
 from graph_slam_ros.messages.inputs import CONVERTERS
 from graph_slam_ros.messages.inputs.plugins import described
+from graph_slam_ros.overview.contents import TopicContents, recording_of
 from graph_slam_ros.recordings.bag import Bag, open_bag
-from graph_slam_ros.recordings.contents import TopicContents, recording_of
 from graph_slam_ros.runs.folder import is_run, suggested_out
 from graph_slam_ros.runs.suggestion import Suggestion
 

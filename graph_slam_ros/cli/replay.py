@@ -75,8 +75,8 @@ def _with_suggestion(args: argparse.Namespace, config: "Config") -> "Config":
 
 def _replay_live(args: argparse.Namespace, config: "Config") -> int:
     from graph_slam_ros.formats.files import read_text
+    from graph_slam_ros.overview.chosen_inputs import choose_inputs
     from graph_slam_ros.recordings.bag import open_bag
-    from graph_slam_ros.runs.chosen_inputs import choose_inputs
 
     if not console.has_ros():
         raise GraphSlamError("--ros needs ROS 2 (no rclpy here); without --ros the same replay runs without it")

@@ -7,18 +7,13 @@ from graph_slam_ros.config.loss import LOSSES
 from graph_slam_ros.config.parameter import numbers, setting
 from graph_slam_ros.errors import ConfigError
 
-HIGHEST_M = 1e5
-"""Above the ellipsoid or below it: beyond is no place for a robot."""
+HIGHEST_M = 1e5  # above the ellipsoid or below it: beyond is no place for a robot
+ASSUMED = "assumed"  # the mount of a sensor whose place nobody has given
 
 
 @dataclass(frozen=True, slots=True)
 class InputConfig:
-    """The section of an input.
-
-    Attributes
-    ----------
-    name : of the input and of its section
-    """
+    """The section of an input, which has its name."""
 
     name: str
     topic: str = setting(
@@ -33,8 +28,9 @@ class InputConfig:
     frame: str = setting("", "frame of the measurements, instead of the one in the messages; empty: as in the messages")
     mount: str = setting(
         "",
-        "pose of the sensor frame on the robot, used where TF has none: x y z roll pitch yaw; empty: "
-        "messages are refused then, except that an antenna is assumed at the base",
+        "pose of the sensor frame on the robot, used where TF has none: x y z roll pitch yaw; assumed: at the base, an "
+        "optical frame looking ahead, and the run ends as incomplete; empty: messages are refused then, except that an "
+        "antenna is assumed at the base",
         "m, rad",
     )
     noise: str = setting(
@@ -85,7 +81,7 @@ class InputConfig:
     )
     range_factor: float = setting(
         1.0,
-        "factor by which ranges of the input are multiplied, before range_offset_m is added",
+        "factor by which ranges and positions of the input are multiplied, before range_offset_m is added",
         "times",
         low=0.1,
         high=10.0,
@@ -140,6 +136,8 @@ class InputConfig:
 
     def numbers(self, key: str, count: int) -> tuple[float, ...]:
         """Numbers of a text; none if it is empty. Raises ConfigError unless there are ``count`` of them."""
+        if getattr(self, key) == ASSUMED:
+            return (0.0,) * count
         return numbers(f"{self.name}.{key}", getattr(self, key), count)
 
 

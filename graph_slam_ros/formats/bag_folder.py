@@ -11,12 +11,7 @@ _PACKED = ".zstd"
 
 
 def as_listed(path: Path, found: list[Path]) -> tuple[list[Path], list[str], list[str]]:
-    """The files that metadata.yaml names, where any of them is there; and what it says beyond them.
-
-    Returns
-    -------
-    The files to read, the losses (named, and not there), and the warnings (there, and not named).
-    """
+    """The files that metadata.yaml names, the losses (named, and not there), and warnings (there, and not named)."""
     there = {file.name.removesuffix(".zstd"): file for file in found}
     named = [Path(name).name.removesuffix(".zstd") for name in _names_in(path / "metadata.yaml")]
     files = [there[name] for name in dict.fromkeys(named) if name in there]
@@ -39,9 +34,12 @@ def still_packed(path: Path, files: list[Path]) -> list[str]:
 
 
 def unpacking(file: Path, codec: str = "zstd") -> str:
-    """Say how a file is unpacked that is compressed as a whole."""
+    """Say how a file is unpacked that is compressed as a whole, or is an archive."""
+    name = shlex.quote(str(file))
+    if codec in ("zip", "tar") or ".tar." in file.name or file.suffix in (".tgz", ".tbz", ".txz"):
+        return f"an archive: unpack it, and give the folder in it: {'unzip' if codec == 'zip' else 'tar xf'} {name}"
     whole = file.with_suffix("") if file.suffix in (".zstd", ".gz", ".bz2", ".lz4") else Path("UNPACKED")
-    mend = f"unpack it first: {codec} -dc < {shlex.quote(str(file))} > {shlex.quote(str(whole))}"
+    mend = f"unpack it first: {codec} -dc < {name} > {shlex.quote(str(whole))}"
     return f"the whole file is compressed with {codec}: {mend}"
 
 

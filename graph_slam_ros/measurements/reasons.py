@@ -80,7 +80,7 @@ REASONS: dict[str, Reason] = {
     ),
     # -- frames
     "frame_slash_stripped": Reason(_REPAIRED, "the name of a frame began with a slash"),
-    "frame_empty": Reason(_REFUSED, "the message names no frame", "INPUT.frame, or INPUT.mount"),
+    "frame_empty": Reason(_REFUSED, "the message names no frame", "header.frame_id of its driver; or INPUT.frame"),
     "frame_in_itself": Reason(_REFUSED, "a frame is its own parent", "correct the driver's frame names"),
     "frame_unknown": Reason(_REFUSED, "no transform links the message's frame to the robot", _FRAMES),
     "transform_gaps": Reason(_REFUSED, "/tf links the message's frame to the robot, but not at its stamp", _GAPS),
@@ -194,7 +194,7 @@ REASONS: dict[str, Reason] = {
         "no transform has the position of the antenna on the robot: the base is assumed",
         '--set INPUT.mount="X Y Z 0 0 0", its place from the base in metres; zeros say that it is there',
     ),
-    "mount_at_base": Reason(_NOTED, "INPUT.mount puts the sensor at the base, as no transform has its place"),
+    "mount_assumed": Reason(_NOTED, "no transform has the place of the sensor: the base is assumed", _FRAMES),
     "map_moved": Reason(
         _NOTED,
         "a fix or surveyed landmark was the first to locate the map",

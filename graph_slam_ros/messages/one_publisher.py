@@ -10,7 +10,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import combinations
+from itertools import combinations, pairwise
 from typing import Any
 
 from graph_slam_ros.measurements.types import Odometry
@@ -81,10 +81,15 @@ class _Track:
         room_rad = room * _ROOM_RAD + 0.5 * _ACCELERATION_RAD_S2 * within_s**2
         if span_s == 0.0:
             room_m, room_rad = room_m + _START_M_S * within_s, room_rad + _START_RAD_S * within_s
-        x = pose[0] - last[0] - ratio * (last[0] - first[0])
-        y = pose[1] - last[1] - ratio * (last[1] - first[1])
+        dx, dy = last[0] - first[0], last[1] - first[1]
+        turned = math.remainder(last[2] - first[2], math.tau) if len(pose) == 3 else 0.0
+        if len(pose) == 3:  # what turns so fast may turn back
+            swept = sum(abs(math.remainder(b[2] - a[2], math.tau)) for (_, a), (_, b) in pairwise(self.past))
+            room_rad += 2.0 * swept / max(span_s, _LEAST_S) * within_s
+        bend = 0.5 * (1.0 + ratio) * turned  # between the middles of both motions, of a robot that goes on in a bend
+        c, s = ratio * math.cos(bend), ratio * math.sin(bend)
+        x, y = pose[0] - last[0] - c * dx + s * dy, pose[1] - last[1] - s * dx - c * dy
         if len(pose) == 3:
-            turned = math.remainder(last[2] - first[2], math.tau)
             off_rad = abs(math.remainder(pose[2] - last[2] - ratio * turned, math.tau))
             return max(math.hypot(x, y) / room_m, off_rad / room_rad)
         z = pose[2] - last[2] - ratio * (last[2] - first[2])
@@ -146,12 +151,16 @@ class OnePublisher:
         used = self._tracks[0]
         if used.label != m.source or not used.past or not -_BACK_NS <= m.stamp_ns - used.newest_ns <= _GAP_NS:
             return False
+        if is_next := self._fits(used, m):
+            used.add(m)
+        return is_next
+
+    def _fits(self, used: _Track, m: Odometry) -> bool:
+        """Return whether a message continues the track in use, as noisy as that is."""
         misfit = used.misfit(m)
-        if misfit > min(max(1.0, _NOISY * self._usual), _NOISIEST):
-            return False
-        self._usual += 0.1 * (misfit - self._usual)
-        used.add(m)
-        return True
+        if fits := misfit <= min(max(1.0, _NOISY * self._usual), _NOISIEST):
+            self._usual += 0.1 * (misfit - self._usual)
+        return fits
 
     def _follow_publisher(self, m: Odometry) -> list[Odometry]:
         if self._labels > _MOST_LABELS:
@@ -161,11 +170,8 @@ class OnePublisher:
         if not self._tracks:
             self._tracks.append(_Track(m.source))
         used = self._tracks[0]
-        if self._is_older(m):
-            if not self._is_of_another(m):
-                return [m]
-            self._refuse()
-            return []
+        if used.past and m.stamp_ns < used.newest_ns - _BACK_NS:  # its place is decided by the order of stamps
+            return [m]
         track = self._continued(m)
         track.add(m)
         if track is used:
@@ -176,16 +182,6 @@ class OnePublisher:
             return self._switch_to(track)
         self._held.append((track, m))
         return self._jumped() if len(self._held) > _MOST_HELD or _has_jumped(track, used) else []
-
-    def _is_older(self, m: Odometry) -> bool:
-        """Return whether its place is decided by the order of stamps."""
-        used = self._tracks[0]
-        return bool(used.past) and m.stamp_ns < used.newest_ns - _BACK_NS
-
-    def _is_of_another(self, late: Odometry) -> bool:
-        """Return whether a late message continues another publisher's track, and not the one in use."""
-        others = (track for track in self._tracks if track.is_established)
-        return self._tracks[0].misfit(late) > 1.0 and any(track.misfit(late) <= 1.0 for track in others)
 
     def finish(self) -> list[Odometry]:
         """No more messages come: odometry has jumped to those that are kept."""
@@ -217,11 +213,8 @@ class OnePublisher:
             return used
         is_lone = len(self._tracks) == 1
         is_due = len(used.past) > 1 and m.stamp_ns - used.newest_ns <= _PERIODS * used.period_ns
-        if is_lone or is_due:
-            misfit = used.misfit(m)
-            if misfit <= min(max(1.0, _NOISY * self._usual), _NOISIEST):
-                self._usual += 0.1 * (misfit - self._usual)
-                return used
+        if (is_lone or is_due) and self._fits(used, m):
+            return used
         misfit, k = min((track.misfit(m), k) for k, track in enumerate(self._tracks))
         if misfit <= 1.0:
             return self._tracks[k]

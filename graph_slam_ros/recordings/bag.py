@@ -14,19 +14,27 @@ from typing import Any, Protocol
 
 from mcap.records import Channel, Message, Schema
 from mcap.writer import CompressionType, Writer
-from rosbags.typesys.store import Typestore
 
 from graph_slam_ros.errors import FormatError, GraphSlamError, similar_file
 from graph_slam_ros.formats.bag_folder import as_listed, still_packed, unpacking
 from graph_slam_ros.formats.durable import AppendedFile
 from graph_slam_ros.formats.files import opened
+from graph_slam_ros.messages.from_msg import TRANSFORMS
 from graph_slam_ros.messages.interfaces import typestore
 from graph_slam_ros.recordings import mcap_records, ros1_records, sqlite_records
 from graph_slam_ros.recordings.decompression import ZSTD_MAGIC, zstd_message
 from graph_slam_ros.recordings.recorded_types import ros1_store
 
 _SUFFIXES = (".mcap", ".db3", ".bag", ".bag.active", ".mcap.zstd", ".db3.zstd")
-_PACKED = {b"\x1f\x8b": "gzip", ZSTD_MAGIC: "zstd", b"BZh": "bzip2", b"\x04\x22\x4d\x18": "lz4"}
+_PACKED = {
+    b"\x1f\x8b": "gzip",
+    ZSTD_MAGIC: "zstd",
+    b"BZh": "bzip2",
+    b"\x04\x22\x4d\x18": "lz4",
+    b"\xfd7zXZ": "xz",
+    b"PK": "zip",
+}
+_HEAD_BYTES, _TAR_AT = 512, 257
 _WINDOW_BYTES, _OVERHEAD = 64 * 2**20, 256
 
 
@@ -41,7 +49,7 @@ class Topic:
     Attributes
     ----------
     definition : the message definition recorded with it (ROS .msg text), or empty
-    encoding : of its messages
+    encoding : of its messages; those of ROS 1 are converted to CDR where their type is known
     """
 
     name: str
@@ -108,12 +116,22 @@ class Bag:
                 _push(heads, number, rest)
 
     def _of(self, part: "_Part", topics: Collection[str]) -> Iterator[BagMessage]:
-        losses, warnings = list[str](), list[str]()
+        losses, warnings, damaged = list[str](), list[str](), 0
         for message in part.messages(topics, losses, warnings):
             try:
-                yield _plain(message)
+                plain = _plain(message)
             except FormatError as error:
                 losses.append(f"{part.file.name}: a message of {message.topic} was passed over ({error})")
+                continue
+            if of_ros1 := part.ros1.get(message.topic):
+                try:
+                    plain = replace(plain, cdr=of_ros1(plain.cdr))
+                except Exception:  # of damaged bytes rosbags raises struct, index, unicode and assertion errors
+                    damaged += 1
+                    continue
+            yield plain
+        if damaged:
+            losses.append(f"{part.file.name}: {damaged} of its messages are not what their types say")
         for known, new in ((self.losses, losses), (self.warnings, warnings)):
             known += [line for line in dict.fromkeys(new) if line not in known]  # a file may be read more than once
 
@@ -166,7 +184,7 @@ def _natural(path: Path) -> list[tuple[int, str]]:
 def _part(file: Path) -> "_Part":
     """Open a file by its first bytes, whatever its name."""
     with opened(file, follow=True) as stream:
-        begins = stream.read(16)
+        begins = stream.read(_HEAD_BYTES)
     if not begins:
         raise BagError(f"{file}: the file is empty")
     for magic, kind in _KINDS.items():
@@ -175,6 +193,8 @@ def _part(file: Path) -> "_Part":
     for magic, codec in _PACKED.items():
         if begins.startswith(magic):
             raise BagError(f"{file}: {unpacking(file, codec)}")
+    if begins[_TAR_AT:].startswith(b"ustar"):
+        raise BagError(f"{file}: {unpacking(file, 'tar')}")
     raise BagError(f"{file}: not a readable recording: it begins as neither mcap, sqlite3 nor a ROS 1 bag")
 
 
@@ -184,11 +204,13 @@ class _Part(Protocol):
     Attributes
     ----------
     first_ns : time of its first message, or 0 where that is not known
+    ros1 : by topic: from a message of ROS 1 to CDR
     """
 
     file: Path
     topics: list[Topic]
     first_ns: int
+    ros1: dict[str, Callable[[bytes], bytes]]
 
     def messages(self, topics: Collection[str], losses: list[str], warnings: list[str]) -> Iterator[BagMessage]:
         """Messages in order of the file."""
@@ -198,7 +220,7 @@ class _McapPart:
     def __init__(self, file: Path) -> None:
         self.file = file
         self._contents = found = mcap_records.contents(file)
-        self.first_ns = found.first_ns
+        self.first_ns, self.ros1 = found.first_ns, dict[str, Callable[[bytes], bytes]]()
         self.topics = [
             self._topic(channel, found.schemas.get(channel.schema_id), found.counts.get(channel.id, 0))
             for channel in found.channels.values()
@@ -224,8 +246,10 @@ class _McapPart:
         type_name = schema.name if schema else ""
         if type_name.count("/") == 1:
             type_name = type_name.replace("/", "/msg/")
-        definition = schema.data.decode(errors="replace") if schema and schema.encoding == "ros2msg" else ""
-        return Topic(channel.topic, type_name, count, definition, channel.message_encoding)
+        has_text = schema is not None and schema.encoding in ("ros2msg", "ros1msg")
+        definition = schema.data.decode(errors="replace") if schema and has_text else ""
+        topic = Topic(channel.topic, type_name, count, definition, channel.message_encoding)
+        return _of_ros1(topic, channel.metadata.get("md5sum", ""), self.ros1) if topic.encoding == "ros1" else topic
 
 
 class _SqlitePart:
@@ -233,7 +257,7 @@ class _SqlitePart:
         self.file = file
         self._contents = found = sqlite_records.contents(file)
         self._damage: str | None = None  # not looked for yet: it takes as long as reading
-        self.first_ns = found.first_ns
+        self.first_ns, self.ros1 = found.first_ns, dict[str, Callable[[bytes], bytes]]()
         self.topics = [
             Topic(name, type_name, found.counts.get(number, 0), found.definitions.get(type_name, ""), encoding)
             for number, (name, type_name, encoding) in found.topics.items()
@@ -250,45 +274,36 @@ class _SqlitePart:
 
 
 class _Ros1Part:
-    """A ROS 1 bag. Messages are converted to CDR if the fields of their type agree with ours."""
-
     def __init__(self, file: Path) -> None:
         self.file = file
         found = ros1_records.contents(file)
         if not found.connections:
             raise BagError(f"{file}: no topic in it{' that is whole; ' + found.lost if found.lost else ''}")
-        self.first_ns = found.first_ns
-        self._stores: dict[str, Typestore | None] = {}
+        self.first_ns, self.ros1 = found.first_ns, dict[str, Callable[[bytes], bytes]]()
         by_name: dict[str, Topic] = {}
-        for number, connection in found.connections.items():
-            count = found.counts.get(number, 0) + (
-                by_name[connection.topic].count if connection.topic in by_name else 0
-            )
-            type_name = connection.type.replace("/", "/msg/")
-            if type_name not in self._stores:
-                self._stores[type_name] = ros1_store(type_name, connection.definition)
-            store = self._stores[type_name]
-            text = store.generate_msgdef(type_name, ros_version=2)[0] if store and store is not typestore() else ""
-            by_name[connection.topic] = Topic(connection.topic, type_name, count, text, "cdr" if store else "ros1")
+        for number, of in found.connections.items():
+            known, count = by_name.get(of.topic), found.counts.get(number, 0)
+            topic = Topic(of.topic, of.type.replace("/", "/msg/"), count, of.definition, "ros1")
+            if known is None or known.encoding == "ros1":  # a publisher may have no definition, and the next has
+                known = _of_ros1(replace(topic, count=known.count if known else 0), of.md5, self.ros1)
+            by_name[of.topic] = replace(known, count=known.count + count)
         self.topics = list(by_name.values())
 
     def messages(self, topics: Collection[str], losses: list[str], warnings: list[str]) -> Iterator[BagMessage]:
-        types = {topic.name: topic.type for topic in self.topics if topic.name in topics}
-        damaged = 0
         for message in ros1_records.messages(self.file, losses):
-            type_name = types.get(message.topic)
-            if type_name is None:
-                continue
-            cdr = message.data
-            if store := self._stores[type_name]:
-                try:
-                    cdr = bytes(store.ros1_to_cdr(cdr, type_name))
-                except Exception:  # of damaged bytes rosbags raises struct, index, unicode and assertion errors
-                    damaged += 1
-                    continue
-            yield BagMessage(message.topic, message.log_ns, cdr)
-        if damaged:
-            losses.append(f"{self.file.name}: {damaged} of its messages are not what their types say")
+            if message.topic in topics:
+                yield BagMessage(message.topic, message.log_ns, message.data)
+
+
+def _of_ros1(topic: Topic, md5: str, converters: dict[str, Callable[[bytes], bytes]]) -> Topic:
+    """The topic of ROS 1 messages as it is in CDR, with its converter added; unchanged where its type is not known."""
+    type_name = TRANSFORMS if topic.type == "tf/msg/tfMessage" else topic.type
+    store = ros1_store(type_name, topic.definition, md5)
+    if store is None:
+        return topic
+    converters[topic.name] = lambda data: bytes(store.ros1_to_cdr(data, type_name))
+    text = store.generate_msgdef(type_name, ros_version=2)[0] if store is not typestore() else ""
+    return replace(topic, type=type_name, definition=text, encoding="cdr")
 
 
 # By how a file begins. rosbags reads whole files alone, and of a damaged one nothing.

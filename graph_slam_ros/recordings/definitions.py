@@ -1,6 +1,7 @@
 """Recorded message definitions: a bag is decoded by its own definitions if they have the fields that we need."""
 
 from dataclasses import replace
+from typing import Any
 
 from rosbags.typesys import get_types_from_msg
 
@@ -12,36 +13,21 @@ from graph_slam_ros.recordings.bag import BagError, Topic
 from graph_slam_ros.recordings.recorded_types import MOST_TEXT, MOST_VALUES, has_too_many_values, store_with
 
 _NEEDED = {
-    "nav_msgs/msg/Odometry": "header child_frame_id pose twist",
-    "vision_msgs/msg/Detection3DArray": "header detections",
-    "vision_msgs/msg/Detection3D": "header results bbox id",
-    "vision_msgs/msg/ObjectHypothesisWithPose": "hypothesis pose",
-    "vision_msgs/msg/ObjectHypothesis": "class_id",
-    "vision_msgs/msg/BoundingBox3D": "center",
-    "tf2_msgs/msg/TFMessage": "transforms",
-    "std_msgs/msg/Header": "stamp frame_id",
-    "builtin_interfaces/msg/Time": "sec nanosec",
-    "geometry_msgs/msg/PoseWithCovariance": "pose covariance",
-    "geometry_msgs/msg/TwistWithCovariance": "covariance",
-    "geometry_msgs/msg/Pose": "position orientation",
-    "geometry_msgs/msg/Point": "x y z",
-    "geometry_msgs/msg/Quaternion": "x y z w",
-    "geometry_msgs/msg/TransformStamped": "header child_frame_id transform",
-    "geometry_msgs/msg/Transform": "translation rotation",
-    "geometry_msgs/msg/Vector3": "x y z",
-    "geometry_msgs/msg/PoseStamped": "header pose",
-    "geometry_msgs/msg/PoseWithCovarianceStamped": "header pose",
-    "sensor_msgs/msg/NavSatFix": "header status latitude longitude"
-    " altitude position_covariance position_covariance_type",
-    "sensor_msgs/msg/NavSatStatus": "status",
-    "sensor_msgs/msg/Imu": "header orientation orientation_covariance",
-    "sensor_msgs/msg/PointCloud2": "header height width fields is_bigendian point_step row_step data",
-    "sensor_msgs/msg/PointField": "name offset datatype",
-    "visualization_msgs/msg/MarkerArray": "markers",
+    "vision_msgs/msg/Detection3D": "header results bbox",
+    "vision_msgs/msg/ObjectHypothesisWithPose": "pose",
+    "vision_msgs/msg/ObjectHypothesis": "",
+    "vision_msgs/msg/BoundingBox3D": "center size",
     "visualization_msgs/msg/Marker": "header ns id action pose",
     **fields_used(),
 }
-"""What the converters read of each type. Those of packages that we have no layout of are compared by name only."""
+"""What the converters read of each type; of others all that ours have, and of packages that we have not, by name."""
+_OLDER = {
+    "vision_msgs/msg/Detection3DArray": "std_msgs/Header header\nvision_msgs/Detection3D[] detections",
+    "vision_msgs/msg/Detection3D": "std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\n"
+    "vision_msgs/BoundingBox3D bbox\nsensor_msgs/PointCloud2 source_cloud\nbool is_tracking\nstring tracking_id",
+    "vision_msgs/msg/ObjectHypothesisWithPose": "string id\nfloat64 score\ngeometry_msgs/PoseWithCovariance pose",
+}
+"""Definitions of ROS 2 Foxy, whose recordings have none."""
 
 
 def recorded_decoder(topic: Topic) -> Decoder:
@@ -52,8 +38,17 @@ def recorded_decoder(topic: Topic) -> Decoder:
     BagError
         Another encoding than CDR, a definition that cannot be parsed, or one that lacks a field we read.
     """
+    if topic.encoding == "ros1":
+        is_empty = not topic.definition.strip()
+        raise BagError(
+            f"topic {topic.name}: its definition of {topic.type} in the recording is "
+            f"{'empty, and none of ours has its md5sum' if is_empty else 'unusable'}: write the bag again with the "
+            "rosbag API where that package is installed"
+        )
     if topic.encoding != "cdr":
-        raise BagError(f"topic {topic.name}: messages are encoded as {topic.encoding!r}, not cdr")
+        raise BagError(f"topic {topic.name}: messages are encoded as {topic.encoding!r}: record them in ROS")
+    if not topic.definition and topic.type in _OLDER:
+        return _of_any_version(topic.type)
     if not topic.definition and topic.type in typestore().types:
         return decoder(topic.type)
     if not topic.definition:
@@ -62,6 +57,22 @@ def recorded_decoder(topic: Topic) -> Decoder:
             raise BagError(f"topic {topic.name}: no definition of {topic.type} in the recording")
         return _by_definition(replace(topic, definition=plugin.definition), "the plugin's")
     return _by_definition(topic, "the recorded")
+
+
+def _of_any_version(type_name: str) -> Decoder:
+    """A decoder without a recorded definition: by ours, else by the older one."""
+    ours, recorded = decoder(type_name), dict[str, Any]()
+    for name, text in _OLDER.items():
+        recorded |= get_types_from_msg(text, name)
+    older = store_with(recorded)
+
+    def decoded(cdr: bytes) -> Any:
+        try:
+            return ours(cdr)
+        except Exception:  # of a message of the other version rosbags raises errors of many kinds
+            return older.deserialize_cdr(cdr, type_name)
+
+    return decoded
 
 
 def _by_definition(topic: Topic, whose: str) -> Decoder:
@@ -77,7 +88,7 @@ def _by_definition(topic: Topic, whose: str) -> Decoder:
     for name, (_, fields) in recorded.items():
         there = dict(fields)
         known = dict(ours[name][1]) if name in ours else there
-        for field in _NEEDED.get(name, "").split():
+        for field in _NEEDED[name].split() if name in _NEEDED else known if name in ours else ():
             if field not in there:
                 raise BagError(f"topic {topic.name}: {name} of this recording has no field {field!r}")
             if there[field] != known[field]:

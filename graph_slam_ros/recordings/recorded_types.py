@@ -1,12 +1,14 @@
 """Types from the definitions in recordings: the least length of their messages, and ROS 1 types as CDR."""
 
 import re
+from functools import cache
 from typing import Any
 
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
+from graph_slam_ros.messages.from_msg import TRANSFORMS
 from graph_slam_ros.messages.inputs import known_types
 from graph_slam_ros.messages.interfaces import typestore
 
@@ -14,6 +16,7 @@ MOST_TEXT = 2**16
 """Of a recorded definition; rosbags' parser takes a minute for two megabytes of blank lines."""
 MOST_VALUES = 10_000
 """Of a message of a recorded definition, each sequence with one value: rosbags' decoder is as long as that."""
+_HEADER = "std_msgs/msg/Header"
 _OF_ROS1 = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")  # words of its language
 
 
@@ -47,28 +50,44 @@ def store_with(recorded: Any) -> Typestore:
     return store
 
 
-def ros1_store(type_name: str, definition: str) -> Typestore | None:
+def ros1_store(type_name: str, definition: str, md5: str = "") -> Typestore | None:
     """Return the converter of messages of a recorded ROS 1 type to CDR.
 
-    None if a type of ours that it is or contains has other fields there (a header's ``seq`` aside), if the definition
-    is unusable, or if no input reads the type.
+    None if the definition is unusable, or if it has other fields than ours (a header's ``seq`` aside) and no input
+    reads the type. Without a definition, as rosserial and goroslib record it, that of Noetic is used.
+
+    Parameters
+    ----------
+    md5 : the checksum that was recorded with the type; empty or ``*`` where there is none
     """
-    if len(definition) > MOST_TEXT:
+    definition = definition.strip() or _of_noetic(type_name, md5)
+    if not definition or len(definition) > MOST_TEXT:
         return None
     try:
         recorded = get_types_from_msg(definition, type_name)
     except Exception:  # rosbags' parser raises errors of its own grammar library
         return None
-    ours = typestore().fielddefs
-    for name, (_, fields) in recorded.items():
-        theirs = [field for field in fields if field[0] != "seq"]
-        if name in ours and name not in _OF_ROS1 and theirs != list(ours[name][1]):
-            return None
     if not set(re.findall(r"\w+/msg/\w+", repr(recorded))) <= {*recorded, *_OF_ROS1}:
         return None
-    foreign = {name: fields for name, fields in recorded.items() if name not in ours}
+    ours, foreign = typestore().fielddefs, {}
+    for name, (constants, fields) in recorded.items():
+        theirs = [field for field in fields if name != _HEADER or field[0] != "seq"]
+        if name not in _OF_ROS1 and (name not in ours or theirs != list(ours[name][1])):
+            foreign[name] = constants, theirs
     if not foreign:
         return typestore()
-    if type_name not in known_types() or has_too_many_values(foreign, type_name):
+    if _HEADER in foreign or type_name not in known_types() or has_too_many_values(foreign, type_name):
         return None
     return store_with(foreign)
+
+
+@cache
+def _of_noetic(type_name: str, md5: str) -> str:
+    """The definition of a type in ROS Noetic, or nothing where that has another checksum."""
+    store = get_typestore(Stores.ROS1_NOETIC)
+    if TRANSFORMS not in store.fielddefs:
+        store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms\n", TRANSFORMS))
+    if type_name not in store.fielddefs:
+        return ""
+    text, known = store.generate_msgdef(type_name, ros_version=1)
+    return text if md5 in ("", "*", known) else ""

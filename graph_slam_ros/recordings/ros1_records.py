@@ -23,11 +23,12 @@ Fields = dict[str, bytes]
 
 @dataclass(frozen=True, slots=True)
 class Connection:
-    """A topic of one publisher; the definition is ROS .msg text."""
+    """A topic of one publisher; the definition is ROS .msg text, or empty."""
 
     topic: str
     type: str
     definition: str
+    md5: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,7 +173,8 @@ def _fields(header: bytes) -> Fields:
 
 def _connection(fields: Fields, data: bytes) -> Connection:
     more = _fields(data)
-    return Connection(_word(fields, "topic"), _word(more, "type"), more["message_definition"].decode(errors="replace"))
+    md5, text = (more.get(name, b"").decode(errors="replace") for name in ("md5sum", "message_definition"))
+    return Connection(_word(fields, "topic"), _word(more, "type"), text, md5)
 
 
 def _word(fields: Fields, name: str) -> str:

@@ -17,8 +17,8 @@ from graph_slam_ros.errors import GraphSlamError, SingularError
 from graph_slam_ros.measurements.types import END
 from graph_slam_ros.messages.inputs import recorded_uses
 from graph_slam_ros.messages.survey import with_survey
+from graph_slam_ros.overview.chosen_inputs import Inputs
 from graph_slam_ros.recordings.bag import Bag, open_bag
-from graph_slam_ros.runs.chosen_inputs import Inputs
 from graph_slam_ros.runs.replay import RecordedRuns
 from graph_slam_ros.runs.suggested_inputs import SuggestedInputs
 from graph_slam_ros.runs.tables import account

@@ -12,17 +12,16 @@ from graph_slam_ros.check.columns import Collector, Columns
 from graph_slam_ros.check.finding import Finding, Severity, in_order, with_one_value
 from graph_slam_ros.check.gyro import of_gyro_or_wheels
 from graph_slam_ros.check.moving_landmarks import moving_names, without
-from graph_slam_ros.check.odometry import of_pose_or_twist
 from graph_slam_ros.check.trial import check_trial, replayed
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.measurements.types import Measured, Sightings
 from graph_slam_ros.messages.inputs import known_types
 from graph_slam_ros.messages.inputs.transforms import MAP_FRAMES
+from graph_slam_ros.overview.contents import Recording
+from graph_slam_ros.overview.suggested_odometry import ODOMETRY
 from graph_slam_ros.recordings.bag import Bag, open_bag
-from graph_slam_ros.recordings.contents import Recording
 from graph_slam_ros.runs.replay import RecordedRuns
 from graph_slam_ros.runs.suggested_inputs import OF_LANDMARKS, SuggestedInputs
-from graph_slam_ros.runs.suggested_odometry import ODOMETRY
 from graph_slam_ros.runs.suggestion import Suggestion
 from graph_slam_ros.slam import Config, Control, Counters
 from graph_slam_ros.warmup import warmup
@@ -83,8 +82,9 @@ def check(
     suggestion = suggested.suggestion
     found = list(_unused(suggested.recording, suggestion, has_landmarks=landmarks is not None))
     if suggestion.trouble and odometry is None and not settings:
-        text = f"not ready for replay: {suggestion.trouble}"
-        found.append(Finding("no_odometry", "error", 0, 1, "topics", text))
+        if all(one.severity != "error" for one in found):  # which say why
+            text = f"not ready for replay: {suggestion.trouble}"
+            found.append(Finding("no_odometry", "error", 0, 1, "topics", text))
         return Checked(in_order(found), "", bag.losses, bag.warnings)
     config = Config.from_mapping(suggested.settings)
     inputs = suggested.inputs(config)
@@ -106,7 +106,7 @@ def check(
     found = [_with_candidates(one, suggestion) for one in found]
     others = suggestion.settings.keys() - suggested.assumed.keys()
     command = "" if suggestion.trouble else suggestion.command(without=others)
-    found = of_pose_or_twist(of_gyro_or_wheels(found, config.gyro_input))
+    found = of_gyro_or_wheels(found, config.gyro_input)
     return Checked(with_one_value(in_order(list(dict.fromkeys(found)))), command, bag.losses, bag.warnings)
 
 

@@ -194,7 +194,8 @@ def table(summary: Summary) -> list[str]:
 def shortcomings(summary: Summary) -> Iterator[str]:
     """Yield the reasons why the result is incomplete, one sentence each; empty if it is complete."""
     inputs: Mapping[str, Any] = summary.get("inputs", {})
-    yield from checked(summary, "error")
+    causes = list(checked(summary, "error"))
+    yield from causes
     if summary.get("failing"):
         yield f"the last solve failed ({summary['failing']}), and the estimate is the one before it: {_EXTREME}"
     elif not summary.get("converged", True):
@@ -209,7 +210,7 @@ def shortcomings(summary: Summary) -> Iterator[str]:
             yield _unused(summary, name, counts["received"])
         elif refused > _MOSTLY * (refused + counts["used"]):
             yield f"{name}: most of it was refused: {_because(name, counted)}"
-        elif not is_odometry and (why := contradicts(name, counts["believed"] or 0, counts["used"])):
+        elif not (is_odometry or causes) and (why := contradicts(name, counts["believed"] or 0, counts["used"])):
             yield why
         if is_odometry:
             counted = summary["counters"].get(name, {})
@@ -222,6 +223,8 @@ def shortcomings(summary: Summary) -> Iterator[str]:
             )
         if (count := summary["counters"].get(name, {}).get("frozen", 0)) > 2:
             yield f"{name}: {explain('frozen').meaning} ({count} times): {remedy(name, 'frozen')}"
+    for name in (name for name, counted in summary["counters"].items() if counted.get("mount_assumed")):
+        yield f"{name}: no transform has the place of its sensor, and one is assumed: {remedy(name, 'mount_assumed')}"
     yield from _gyro_faults(summary)
     yield from association_faults(summary.get("association", {}))
     if not sum(counts["believed"] or 0 for counts in inputs.values()):
@@ -283,6 +286,8 @@ def doubts(summary: Summary) -> Iterator[str]:
 
     That are visits that contradict others, clocks, mounts or scales that are off, and other explanations.
     """
+    if any(checked(summary, "error")):  # of which all that follows may be a consequence
+        return
     for text in ambiguities(summary.get("rivals", ())):
         yield f"{text} (graph_slam explain RUN)"
     yield from filter(None, [wrong_sides(summary.get("landmarks", 0), summary.get("waiting", {}))])
@@ -306,8 +311,6 @@ def doubts(summary: Summary) -> Iterator[str]:
 
 
 def _uncorrected(summary: Summary) -> Iterator[str]:
-    if (summary.get("check") or {}).get("severity") == "error":  # which makes a fit meaningless
-        return
     for one in summary.get("uncorrected", ()):
         mend = " ".join(f"--set {shlex.quote(f'{key}={value}')}" for key, value in one["settings"].items())
         yield f"{one['text']}{mend and ': '}{mend} (graph_slam check BAG compares the causes)"

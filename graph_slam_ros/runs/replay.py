@@ -14,9 +14,9 @@ from graph_slam_ros.measurements.reasons import warnings as mendable
 from graph_slam_ros.measurements.types import END, Measured, Odometry
 from graph_slam_ros.messages.from_msg import TF_STATIC, MessageConverter
 from graph_slam_ros.messages.survey import with_survey
+from graph_slam_ros.overview.chosen_inputs import Inputs, choose_inputs
 from graph_slam_ros.recordings.bag import Bag, BagMessage, open_bag
 from graph_slam_ros.recordings.definitions import recorded_decoder
-from graph_slam_ros.runs.chosen_inputs import Inputs, choose_inputs
 from graph_slam_ros.runs.folder import RunError, check_room, is_run, keep_earlier, missing, recording_of, run_config
 from graph_slam_ros.runs.journal import read_measurements
 from graph_slam_ros.runs.map_journal import read_map
@@ -291,7 +291,7 @@ def _checked(columns: Collector, counters: Counters) -> dict[str, Any]:
 def _warnings(slam: GraphSlam, summary: dict[str, Any]) -> list[str]:
     return [
         *doubts(summary),
-        *map(str, slam.alarms),
+        *(() if any(checked(summary, "error")) else map(str, slam.alarms)),  # which may be its consequence
         *unscaled(summary),
         *checked(summary, "warning"),
         *mendable(summary["counters"]),

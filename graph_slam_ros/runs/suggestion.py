@@ -7,18 +7,19 @@ from pathlib import Path
 from typing import Any
 
 from graph_slam_ros.check.noise import ASSUMED_BEARING_RAD, ASSUMED_RANGE_M
+from graph_slam_ros.config.inputs import ASSUMED
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.parameters import assignment
 from graph_slam_ros.messages.from_msg import TRANSFORMS
 from graph_slam_ros.messages.inputs import CONVERTERS, converters, known_types
 from graph_slam_ros.messages.inputs.landmark_types import APRILTAGS, LANDMARK_TYPES
-from graph_slam_ros.messages.inputs.transforms import MAP_FRAMES, OPTICAL, assumed_mount
+from graph_slam_ros.messages.inputs.transforms import MAP_FRAMES
+from graph_slam_ros.overview.chosen_inputs import TF_STATIC_TOPIC, TF_TOPIC, choose_inputs
+from graph_slam_ros.overview.contents import Recording, TopicContents
+from graph_slam_ros.overview.namespaces import is_truth
+from graph_slam_ros.overview.suggested_odometry import DETECTIONS, ESTIMATE, POSES, OdometryChoice, readable
 from graph_slam_ros.recordings.bag import Bag
-from graph_slam_ros.recordings.contents import Recording, TopicContents
-from graph_slam_ros.runs.chosen_inputs import TF_STATIC_TOPIC, TF_TOPIC, choose_inputs
 from graph_slam_ros.runs.folder import suggested_out
-from graph_slam_ros.runs.namespaces import is_truth
-from graph_slam_ros.runs.suggested_odometry import DETECTIONS, ESTIMATE, POSES, OdometryChoice, readable
 from graph_slam_ros.slam import Config
 
 MARKERS = "visualization_msgs/msg/MarkerArray"
@@ -55,9 +56,6 @@ class Suggestion:
         self.perhaps: list[str] = []
         self.topics: dict[str, str] = {}  # of odom and detections
         self.names: list[str] = []
-        self.trouble = self._of_a_result()
-        if self.trouble:
-            return
         chosen = OdometryChoice(recording, self.unused)
         self._odometry, self._base, self._odom = chosen.contents, chosen.base, chosen.odom
         self.settings |= chosen.settings
@@ -92,17 +90,6 @@ class Suggestion:
             choose_inputs(bag, config, self.topics.get("odom"), self.topics.get("detections"))
         except GraphSlamError as error:
             return str(error)
-        return ""
-
-    def _of_a_result(self) -> str:
-        types = {name: one.topic.type for name, one in self._recording.topics.items()}
-        if (
-            types.get("/path") == "nav_msgs/msg/Path"
-            and types.get("/landmarks") == "visualization_msgs/msg/MarkerArray"
-        ):
-            return (
-                "this is the result of a run (path, pose, landmarks), not what sensors said: give replay its run folder"
-            )
         return ""
 
     # -- landmarks -----------------------------------------------------------------------------------------------
@@ -143,9 +130,9 @@ class Suggestion:
         return found[1] if found and one.frame not in (*MAP_FRAMES, "world", self._odom) else ""
 
     def _corners(self, one: TopicContents) -> None:
-        self.unused[one.topic.name] = (
-            "these are corners without poses: run a pose estimator first, e.g. apriltag_ros on the images"
-        )
+        corners = "these are corners without poses: run a pose estimator first, e.g. apriltag_ros on the images"
+        poses = f"no input reads {one.topic.type}: publish its poses as {DETECTIONS}, or a plugin (docs/inputs.md)"
+        self.unused[one.topic.name] = poses if "geometry_msgs/Pose" in one.topic.definition else corners
 
     def _detections(self, one: TopicContents) -> None:
         if not one.items:
@@ -265,18 +252,24 @@ class Suggestion:
         if frame == self._odom and self._recording.moves_in(self._base, frame):
             self.notes.append(f"{topic} is given in {frame}: /tf says where the robot is in it")
             return {}
-        mount = assumed_mount(frame)
+        if alike := self._recording.alike(frame):
+            self.notes.append(f"{topic}: no transform has {frame}: did you mean {alike}? It is taken; mend the driver")
+            return {"frame": alike}
+        if not frame and self._recording.topics[topic].topic.type == APRILTAGS:
+            self.notes.append(f"{topic} names no frame: have the driver of the camera fill in header.frame_id")
+            return {}
         if frame in (self._odom, *MAP_FRAMES):
             self.notes.append(
                 f"{topic} is given in {frame}, a frame that does not move with the robot: publish it in the sensor's "
                 "frame, no setting mends that"
             )
-            return {"mount": mount}
-        where = "at the base, looking ahead" if mount == OPTICAL else "at the base"
+            return {"mount": ASSUMED}
+        where = "at the base, looking ahead" if "optical" in frame else "at the base"
         self.notes.append(
-            f"{topic}: no transform has the pose of {frame or 'its sensor'} on the robot: {where} is assumed"
+            f"{topic}: no transform has the pose of {frame or 'its sensor, which it does not name,'} on the robot: "
+            f"{where} is assumed: publish it on /tf_static, or measure it and set its mount"
         )
-        return {"mount": mount}
+        return {"mount": ASSUMED}
 
     def _free(self, name: str) -> str:
         number = 1 + sum(re.fullmatch(rf"{name}(_\d+)?", other) is not None for other in self.names)

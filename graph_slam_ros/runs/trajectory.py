@@ -2,6 +2,7 @@
 
 import csv
 import io
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,13 @@ from graph_slam_ros.formats.files import read_text
 from graph_slam_ros.lie import se3
 from graph_slam_ros.typing import Array
 
+_SEPARATED = re.compile(r"[\s,;]+")
+_NANOSECONDS = 1e14  # no seconds are so many
+_NAMES = (
+    r"t|time.*|stamp.*|sec.*",
+    *(rf"(?:[pt]|[pt].*[._])?{axis}" for axis in "xyz"),
+    *(rf"[qor](?:.*[._])?{axis}" for axis in "xyzw"),
+)
 Point = tuple[float, float, float]
 
 
@@ -76,6 +84,8 @@ def read_tum(path: Path, *, follow: bool = False) -> Trajectory:
 def read_rows(path: Path, *, follow: bool = False) -> Trajectory:
     """Poses of a TUM file in the order of its rows, which in a run's files are in the order of its keyframes.
 
+    Commas may separate the numbers, stamps may be nanoseconds, and a header may name other columns (EuRoC, TUM-VI).
+
     Raises
     ------
     GraphSlamError
@@ -88,20 +98,42 @@ def read_rows(path: Path, *, follow: bool = False) -> Trajectory:
     except OSError as error:
         raise GraphSlamError(f"{path}: {error.strerror}") from None
     except UnicodeDecodeError as error:
-        raise GraphSlamError(f"{path}: not a readable text file ({type(error).__name__})") from None
-    found = []
+        why = "UTF-16: iconv -f utf-16 -t utf-8" if error.object[:2] in (b"\xff\xfe", b"\xfe\xff") else "binary"
+        raise GraphSlamError(f"{path}: not a readable text file ({why})") from None
+    found, columns, is_first = list[list[float]](), list[int](), True
     for number, line in enumerate(lines, start=1):
-        if line.strip() and not line.lstrip().startswith("#"):
-            try:
-                found.append([float(word) for word in line.split()])
-            except ValueError as error:
-                raise GraphSlamError(f"{path}:{number}: {error}") from None
-            if len(found[-1]) != 8 or not np.isfinite(found[-1]).all():
-                raise GraphSlamError(f"{path}:{number}: a row of a TUM file is eight finite numbers")
+        words = _SEPARATED.split(line.strip(" \t#,;"))
+        is_header = is_first and not line.lstrip().startswith("#") and re.match("[a-z]", words[0], re.IGNORECASE)
+        if not line.strip() or line.lstrip().startswith("#") or is_header:
+            columns = _columns(line) or columns
+            is_first &= not is_header
+            continue
+        is_first = False
+        try:
+            row = [float(word) for word in words]
+        except ValueError as error:
+            raise GraphSlamError(f"{path}:{number}: {error}") from None
+        if columns and len(row) > max(columns):
+            row = [row[k] for k in columns]
+        if len(row) != 8 or not np.isfinite(row).all():
+            why = "; 12 are KITTI's, without stamps: evo_traj kitti --save_as_tum adds them" if len(row) == 12 else ""
+            why = "; are these decimal commas? sed 's/,/./g'" if len(line.split()) == 8 < len(row) else why
+            raise GraphSlamError(f"{path}:{number}: a row of a TUM file is eight finite numbers{why}")
+        found.append(row)
     if not found:
         raise GraphSlamError(f"{path}: no pose in it")
     rows = np.array(found)
+    if np.median(rows[:, 0]) > _NANOSECONDS:
+        rows[:, 0] *= 1e-9
     return _normalized(rows[:, 0], rows[:, 1:], str(path))
+
+
+def _columns(header: str) -> list[int]:
+    """The columns of stamp, position and quaternion (w last) that a header names; none where it does not name all."""
+    names = [re.sub(r"\[.*?\]", "", word).strip().lower() for word in re.split("[,;]", header.strip(" \t#"))]
+    names = names if len(names) > 1 else header.strip(" \t#").lower().split()
+    at = [next((k for k, name in enumerate(names) if re.fullmatch(kind, name)), -1) for kind in _NAMES]
+    return at if min(at) >= 0 else []
 
 
 def trajectory(stamps_s: Array, poses: Array, source: str) -> Trajectory:

@@ -13,8 +13,8 @@ from graph_slam_ros.analysis.plots import draw_run
 from graph_slam_ros.cli import arguments, console
 from graph_slam_ros.cli.usage import CommandParser
 from graph_slam_ros.formats.files import read_text
+from graph_slam_ros.overview.chosen_inputs import choose_inputs
 from graph_slam_ros.recordings.bag import open_bag
-from graph_slam_ros.runs.chosen_inputs import choose_inputs
 from graph_slam_ros.runs.folder import SUMMARY, check_room
 from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.slam import Config

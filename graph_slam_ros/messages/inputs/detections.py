@@ -20,14 +20,22 @@ def detections(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
     by_class = source.config.landmarks.id_from == "class_id"
     for one in m.detections:
         first = one.results[0] if len(one.results) else None
-        sort = first.hypothesis.class_id if first else ""
-        name = sort if by_class else one.id
+        own, sort = names_of(one)
+        name = sort if by_class else own
         at, covariance = (first.pose.pose, first.pose.covariance) if first else (one.bbox.center, _NOTHING)
         frame = one.header.frame_id or m.header.frame_id
         size = _size(one.bbox.size)
         yield ObservedLandmark(
             m.header.stamp, frame, name, at.position, at.orientation, covariance, sort=sort, size=size
         )
+
+
+def names_of(one: Any) -> tuple[str, str]:
+    """The id and the class of a vision_msgs/Detection3D, in ROS 1 and Foxy those of its track and its hypothesis."""
+    first = one.results[0] if len(one.results) else None
+    of = getattr(first, "hypothesis", first)
+    sort = getattr(of, "class_id", getattr(of, "id", ""))
+    return getattr(one, "id", getattr(one, "tracking_id", "")), str(sort)
 
 
 def _size(box: Any) -> float:
@@ -95,18 +103,17 @@ def apriltags(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
         yield ObservedLandmark(m.header.stamp, m.header.frame_id, name, position, orientation)
 
 
-def aruco_markers(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
-    """aruco_msgs and aruco_markers_msgs/MarkerArray: the header of the pose, else of the marker, else of the array.
-
-    The detector aruco_markers stamps the array with the time of sending, and poses and markers with the stamp of the
-    image.
-    """
-    for one in m.markers:
+def tags_with_poses(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
+    """Markers and AprilTags with poses: the header of the pose, else of the tag, else of the array (sent later)."""
+    for one in m.markers if hasattr(m, "markers") else m.detections:
         headers = [of.header for of in (one.pose, one, m) if hasattr(of, "header")]
-        stamp = next((h.stamp for h in headers if h.stamp.sec or h.stamp.nanosec), m.header.stamp)
+        stamp = next((h.stamp for h in headers if h.stamp.sec or h.stamp.nanosec), headers[0].stamp)
         frame = next((h.frame_id for h in headers if h.frame_id), "")
-        at, covariance = one.pose.pose, getattr(one.pose, "covariance", None)
-        yield ObservedLandmark(stamp, frame, str(one.id), at.position, at.orientation, covariance)
+        of = one.pose.pose if hasattr(one.pose.pose, "pose") else one.pose
+        number = "_".join(str(part) for part in np.ravel(one.id))
+        name = f"{one.family}:{number}" if getattr(one, "family", "") else number
+        covariance = getattr(of, "covariance", None)
+        yield ObservedLandmark(stamp, frame, name, of.pose.position, of.pose.orientation, covariance)
 
 
 def ros2_aruco(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:

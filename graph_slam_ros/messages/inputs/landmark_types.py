@@ -29,36 +29,40 @@ class LandmarkType:
     fields: Mapping[str, str]
 
 
+def _tags(read: Callable[[InputContext, Any], Iterable[ObservedLandmark]], **fields: str) -> LandmarkType:
+    return LandmarkType("tags", read, fields)
+
+
 APRILTAGS = "apriltag_msgs/msg/AprilTagDetectionArray"
 _MRPT = "header sensor_pose_on_robot sensor_std_range"
+_POSED = detections.tags_with_poses
+_APRILTAGS = _tags(_POSED, AprilTagDetectionArray="detections", AprilTagDetection="id pose")
+_MARKERS = _tags(_POSED, MarkerArray="header markers", Marker="header id pose")
 
 LANDMARK_TYPES: Mapping[str, LandmarkType] = {
-    APRILTAGS: LandmarkType(
-        "tags",
+    APRILTAGS: _tags(
         detections.apriltags,
-        {"AprilTagDetectionArray": "header detections", "AprilTagDetection": "family id hamming decision_margin"},
+        AprilTagDetectionArray="header detections",
+        AprilTagDetection="family id hamming decision_margin",
     ),
-    "aruco_msgs/msg/MarkerArray": LandmarkType(
-        "tags", detections.aruco_markers, {"MarkerArray": "header markers", "Marker": "header id pose"}
-    ),
-    "ros2_aruco_interfaces/msg/ArucoMarkers": LandmarkType(
-        "tags", detections.ros2_aruco, {"ArucoMarkers": "header marker_ids poses"}
-    ),
-    "aruco_opencv_msgs/msg/ArucoDetection": LandmarkType(
-        "tags",
+    "isaac_ros_apriltag_interfaces/msg/AprilTagDetectionArray": _APRILTAGS,
+    "apriltag_ros/msg/AprilTagDetectionArray": _APRILTAGS,
+    "apriltags_ros/msg/AprilTagDetectionArray": _APRILTAGS,
+    "ar_track_alvar_msgs/msg/AlvarMarkers": _tags(_POSED, AlvarMarkers="header markers", AlvarMarker="header id pose"),
+    "aruco_msgs/msg/MarkerArray": _MARKERS,
+    "aruco_markers_msgs/msg/MarkerArray": _MARKERS,
+    "ros2_aruco_interfaces/msg/ArucoMarkers": _tags(detections.ros2_aruco, ArucoMarkers="header marker_ids poses"),
+    "aruco_opencv_msgs/msg/ArucoDetection": _tags(
         detections.aruco_opencv,
-        {"ArucoDetection": "header markers boards", "MarkerPose": "marker_id pose", "BoardPose": "board_name pose"},
+        ArucoDetection="header markers boards",
+        MarkerPose="marker_id pose",
+        BoardPose="board_name pose",
     ),
-    "aruco_markers_msgs/msg/MarkerArray": LandmarkType(
-        "tags", detections.aruco_markers, {"MarkerArray": "header markers", "Marker": "header id pose"}
+    "fiducial_msgs/msg/FiducialTransformArray": _tags(
+        detections.fiducials, FiducialTransformArray="header transforms", FiducialTransform="fiducial_id transform"
     ),
-    "fiducial_msgs/msg/FiducialTransformArray": LandmarkType(
-        "tags",
-        detections.fiducials,
-        {"FiducialTransformArray": "header transforms", "FiducialTransform": "fiducial_id transform"},
-    ),
-    "rtabmap_msgs/msg/LandmarkDetections": LandmarkType(
-        "tags", detections.rtabmap, {"LandmarkDetections": "header landmarks", "LandmarkDetection": "header id pose"}
+    "rtabmap_msgs/msg/LandmarkDetections": _tags(
+        detections.rtabmap, LandmarkDetections="header landmarks", LandmarkDetection="header id pose"
     ),
     "cartographer_ros_msgs/msg/LandmarkList": LandmarkType(
         "reflectors",

@@ -122,7 +122,7 @@ def _sighting(source: InputContext, stamp_ns: int, seen: ObservedLandmark) -> Si
     if seen.polar is not None:
         kind, measured = seen.polar
         return _polar(source, name, kind, measured, seen.sigmas, se3.compose(T_base_frame, seen.T_frame_sensor))
-    p = checks.point(seen.position)
+    p = tuple(source.settings.range_factor * x for x in checks.point(seen.position))
     x, y, z = map(float, se3.act(T_base_frame, p))
     distance_m = math.hypot(x, y, z)
     covariance = SPATIAL.in_parent_axes(T_base_frame, source.pose_covariance(seen.covariance, distance_m))

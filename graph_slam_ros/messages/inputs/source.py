@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 
 from graph_slam_ros.config.config import Config
-from graph_slam_ros.config.inputs import InputConfig
+from graph_slam_ros.config.inputs import ASSUMED, InputConfig
 from graph_slam_ros.formats.cdr import LATEST_NS
 from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.messages.inputs import checks
 from graph_slam_ros.messages.inputs.checks import MessageError
-from graph_slam_ros.messages.inputs.transforms import Transforms
+from graph_slam_ros.messages.inputs.transforms import Transforms, assumed_mount
 from graph_slam_ros.typing import Array, Mask, Numbers
 
 _PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
@@ -76,7 +76,8 @@ class InputContext:
         self.unlinked: deque[tuple[str, str]] = deque(maxlen=4)
         self._offset_ns = round(settings.offset_s * 1e9)
         self._wait_ns = round(config.inputs.tf_wait_s * 1e9)
-        self._mount = _mount(settings)
+        mount = settings.numbers("mount", 6)
+        self._mount = se3.from_xyz_rpy(mount) if mount else None
 
     def count(self, reason: str, times: int = 1) -> None:
         """Count a refusal or a repair."""
@@ -125,19 +126,20 @@ class InputContext:
         if found is not None:
             return found
         if self._mount is not None and not self.transforms.knows(frame):
-            return self._mounted(self._mount)
+            return self._mounted(frame, self._mount)
         are_linked = self.transforms.are_linked(self.config.frames.base, frame)
         if self._may_come(stamp_ns):
             raise NotYet(are_linked)
         if self._mount is not None and not are_linked:
-            return self._mounted(self._mount)
+            return self._mounted(frame, self._mount)
         raise self._not_linked("transform_gaps" if are_linked else "frame_unknown", frame, self.config.frames.base)
 
-    def _mounted(self, mount: se3.Pose) -> se3.Pose:
-        """Return the configured mount. It is counted where it puts a sensor of landmarks at the base, as if assumed."""
-        if self.use == "landmarks" and not any(se3.position(mount)):
-            self.count("mount_at_base")
-        return mount
+    def _mounted(self, frame: str, mount: se3.Pose) -> se3.Pose:
+        """Return the configured mount, or the assumed one, which is counted."""
+        if self.settings.mount != ASSUMED:
+            return mount
+        self.count("mount_assumed")
+        return se3.from_xyz_rpy(tuple(map(float, assumed_mount(frame).split())))
 
     def T_sensor(self, sensor: str, seen: str, stamp_ns: int) -> se3.Pose:
         """Return the pose of a frame that a detector publishes on /tf, in the frame of its sensor.
@@ -301,10 +303,3 @@ class InputContext:
 def _first_false(mask: Mask) -> int:
     """The number of leading entries that are true."""
     return len(mask) if mask.all() else int(mask.argmin())
-
-
-def _mount(settings: InputConfig) -> se3.Pose | None:
-    mount = settings.numbers("mount", 6)
-    if not mount:
-        return None
-    return se3.from_xyz_rpy(mount)

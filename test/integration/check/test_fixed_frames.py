@@ -6,8 +6,8 @@ from recordings import short_drive
 
 from graph_slam_ros.cli import main
 from graph_slam_ros.lie import se3
+from graph_slam_ros.overview.contents import recording_of
 from graph_slam_ros.recordings.bag import open_bag
-from graph_slam_ros.recordings.contents import recording_of
 from graph_slam_ros.runs.check import check
 from graph_slam_ros.runs.suggestion import Suggestion
 from graph_slam_ros.tools.simulation import Drive, Fault, spoil_messages

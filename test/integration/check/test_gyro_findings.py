@@ -95,16 +95,6 @@ def test_landmarks_decide_which_of_gyro_and_odometry_is_wrong_and_one_value_is_p
     assert [one.code for one in mended if one.severity != "note"] == []
 
 
-def test_a_gyro_beside_slow_odometry_is_not_compared_and_that_is_said(bag, tmp_path):
-    drive = Drive(bag)
-    spoil_messages(drive, [Fault.named("slow_odometry"), Fault.named("wrong_gyro", factor=1.2)], seed=1)
-    drive.write(tmp_path / "slow.mcap")
-    found = of_the_gyro(tmp_path / "slow.mcap", {})
-    assert found.keys() == {"gyro_unchecked"}
-    assert found["gyro_unchecked"].severity == "note"
-    assert "is not compared with odometry" in found["gyro_unchecked"].text
-
-
 def test_a_gyro_that_is_tilted_and_upside_down_is_turned_over_about_the_robots_axes(bag, tmp_path):
     drive = Drive(bag)
     spoil_messages(drive, [Fault.named("wrong_gyro", factor=1.0, axes="exchanged")], seed=1)

@@ -1,8 +1,6 @@
 """``graph_slam check`` on whole recordings: what a person sees, and the mistakes that people make."""
 
 import json
-import random
-from dataclasses import replace
 from itertools import count
 
 import numpy as np
@@ -15,8 +13,7 @@ from graph_slam_ros.cli import main
 from graph_slam_ros.messages.from_msg import decoder
 from graph_slam_ros.messages.to_msg import encode, header, make, transform
 from graph_slam_ros.recordings.bag import BagWriter, open_bag
-from graph_slam_ros.runs import check as runs_check
-from graph_slam_ros.tools.simulation import Fault, simulate, write_bag, write_faulty_bag
+from graph_slam_ros.tools.simulation import Fault, simulate, write_faulty_bag
 
 SOAK = pytest.mark.skipif(not times(0, 1), reason="only in make soak")
 
@@ -71,21 +68,6 @@ def test_a_refused_message_is_a_finding_with_the_name_of_its_counter(drive, chec
     assert code == 4
     assert found["nonfinite"]["severity"] in ("warning", "error")
     assert found["nonfinite"]["evidence"]["topic"] == "/odom"
-
-
-def test_a_frame_that_nothing_links_is_an_error_until_its_mount_is_set(drive, check, tmp_path):
-    def change(topic, m):
-        if topic == "/landmarks":
-            m.header.frame_id = "camera_link"
-            for one in m.detections:
-                one.header.frame_id = "camera_link"
-        return m
-
-    bag = copy(drive, tmp_path / "a.mcap", change)
-    code, found, _ = check(bag)
-    assert (code, found["frame_unlinked"]["severity"]) == (4, "error")
-    code, found, _ = check(bag, *(w for text in found["frame_unlinked"]["settings"] for w in ("--set", text)))
-    assert (code, found) == (0, {})
 
 
 def in_frame(m, frame):
@@ -264,31 +246,6 @@ def test_odometry_in_the_frame_of_a_map_is_doubted_but_cameras_call_theirs_world
     assert (answered, found["odometry_in_map"]["severity"]) == (code, severity)
 
 
-def test_of_landmarks_without_identities_the_beginning_is_replayed(drive, check, tmp_path, monkeypatch):
-    """Their association may take minutes; a drive with identities is replayed to its end."""
-
-    def unnamed(topic, m):
-        for one in m.detections if topic == "/landmarks" else ():
-            one.id = ""
-            for result in one.results:
-                result.hypothesis.class_id = ""
-        return m
-
-    ends_ns = []
-
-    def replayed(config, measured):
-        measured = list(measured)
-        ends_ns.append(max(getattr(m, "stamp_ns", 0) for m in measured) - measured[0].stamp_ns)
-        return trial_replayed(config, measured)
-
-    trial_replayed = runs_check.replayed
-    monkeypatch.setattr(runs_check, "replayed", replayed)
-    monkeypatch.setattr(runs_check, "_UNNAMED_NS", 10**9)
-    assert check(copy(drive, tmp_path / "a.mcap", unnamed))[0] == 0
-    assert check(drive)[0] == 0
-    assert ends_ns[0] <= 2 * 10**9 < ends_ns[1]
-
-
 def test_the_mistakes_of_a_user_are_one_line_or_a_finding(drive, check, tmp_path, capsys):
     messages, _ = read(drive)
     code, _, err = check(drive, "--odom", "/wheel")
@@ -380,49 +337,10 @@ def test_rounded_stamps_are_not_taken_for_two_publishers(drive, check, tmp_path,
     assert not {"duplicates", "other_publisher", "duplicate_stamp"} & found.keys()
 
 
-@each("is_late", [False, True])
-def test_stamps_of_landmarks_that_scatter_are_found_and_late_messages_are_not(check, tmp_path, is_late):
-    rng, bag = random.Random(1), tmp_path / "drive.mcap"
-    write_bag(simulate("warehouse", 3, aisles=2, aisle_m=6.0, laps=1), bag)
-    if is_late:
-        late = [(m.log_ns + rng.randrange(200_000_000) * (m.topic == "/landmarks"), m) for m in read(bag)[0]]
-        late = [replace(m, log_ns=log_ns) for log_ns, m in sorted(late, key=lambda one: one[0])]
-        write_mcap(bag, late)
-
-    def change(topic, m):
-        if topic == "/landmarks" and not is_late:
-            stamp_ns = m.header.stamp.sec * 10**9 + m.header.stamp.nanosec - rng.randrange(200_000_000)
-            m.header.stamp.sec, m.header.stamp.nanosec = divmod(stamp_ns, 10**9)
-        return m
-
-    _, found, _ = check(copy(bag, tmp_path / "a.mcap", change), "--quick")
-    assert {one["severity"] for code, one in found.items() if code == "jitter"} == (set() if is_late else {"warning"})
-
-
 def test_landmarks_of_one_stamp_have_no_clock_of_their_own(drive, check, tmp_path):
     code, found, _ = check(copy(drive, tmp_path / "a.mcap", rounded(10**18, ["/landmarks"])))
     assert (code, list(found)) == (4, ["constant_stamps"])
     assert found["constant_stamps"]["text"].startswith("/landmarks: all of its")
-
-
-def test_a_place_that_is_assumed_gives_way_to_one_that_is_measured(drive, check, tmp_path, capsys):
-    def change(topic, m):
-        for one in m.detections if topic == "/landmarks" else ():
-            p = one.results[0].pose.pose.position
-            p.x, p.y = p.y, -p.x
-            in_frame(m, "camera_link")
-        return m
-
-    bag = copy(drive, tmp_path / "a.mcap", change)
-    code, found, _ = check(bag, "--quick")
-    assert (code, found["frame_unlinked"]["settings"]) == (4, [])
-    assert found["frame_unlinked"]["text"].endswith("(axes has the setting)")
-    code, found, _ = check(bag, "--quick", *(w for text in found["axes"]["settings"] for w in ("--set", text)))
-    assert (code, found) == (0, {})
-    assert main(["check", str(bag), "--quick"]) == 4
-    out = capsys.readouterr().out
-    assert "remedy: publish the transform on /tf_static, or set detections.mount\n" in out
-    assert out.splitlines()[-1].count("detections.mount=") == 1
 
 
 def test_without_landmarks_topics_are_named_that_may_have_them(drive, check, tmp_path):

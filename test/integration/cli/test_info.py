@@ -243,7 +243,12 @@ OFFERED = {
         for base in ("base_link", "robot1/base_footprint")
     },
     **{
-        f"clouds of {' and '.join(fields)}": ([ODOMETRY, ("/beacons", CLOUD, beacons(*fields))], [], [], 3)
+        f"clouds of {' and '.join(fields)}": (
+            [ODOMETRY, ("/beacons", CLOUD, beacons(*fields, frame="base_link"))],
+            [],
+            [],
+            3,
+        )
         for fields in (("range", "id"), ("range", "bearing", "id"), ("x", "y", "id"), ("bearing", "id"))
     },
     "two robots": (
@@ -262,7 +267,7 @@ OFFERED = {
         ["not used: /imu/data: its heading may drift"],
         3,
     ),
-    "an IMU alone": ([ODOMETRY, ("/imu/data", IMU, compass())], [], [], {"imu": None}),
+    "an IMU alone": ([ODOMETRY, ("/imu/data", IMU, compass(frame="base_link"))], [], [], {"imu": None}),
     "fixes": (
         [ODOMETRY, ("/gps/fix", FIX, satellite())],
         [],

@@ -4,8 +4,8 @@ import pytest
 import yaml
 from recordings import DETECTIONS, ODOMETRY, TOPICS, read, short_drive, write_mcap
 
+from graph_slam_ros.overview.chosen_inputs import choose_inputs
 from graph_slam_ros.recordings.bag import BagError, BagWriter, open_bag
-from graph_slam_ros.runs.chosen_inputs import choose_inputs
 from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.slam import Config
 from graph_slam_ros.tools.simulation import simulate, write_bag

@@ -3,22 +3,17 @@
 import re
 import shlex
 
-import numpy as np
 import pytest
-from foreign import DEFINITIONS
-from messages import DATUM, LANDMARKS, STAMP_NS, odometry, pose, quaternion, record_drive, recorded
+from messages import DATUM, LANDMARKS, STAMP_NS, odometry, pose, record_drive
 from places import ROOT
 
 from graph_slam_ros.cli import main
 from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.formats.parameters import read_parameters
-from graph_slam_ros.lie import se2
 from graph_slam_ros.measurements.types import from_record
 from graph_slam_ros.messages.inputs import CONVERTERS, uses
-from graph_slam_ros.messages.interfaces import typestore
-from graph_slam_ros.messages.to_msg import header, make, vector
+from graph_slam_ros.overview.chosen_inputs import choose_inputs
 from graph_slam_ros.recordings.bag import BagError, BagWriter, open_bag
-from graph_slam_ros.runs.chosen_inputs import choose_inputs
 from graph_slam_ros.runs.journal import read_ingest
 from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.runs.suggested_inputs import SuggestedInputs
@@ -97,65 +92,6 @@ def test_the_command_that_info_prints_uses_what_is_there(drive, tmp_path, capsys
     assert main(command[1:]) == 0
     topics = {m.topic for m in ingested(tmp_path / command[-1]) if isinstance(m, Sightings | Fix)}
     assert topics == {"detections", "gps", "tags"}
-
-
-def test_a_type_that_only_the_recording_defines_is_read_by_its_definition(tmp_path):
-    from recordings import definition, write_mcap
-
-    name = "ros2_aruco_interfaces/msg/ArucoMarkers"
-    _, _, encoded = recorded(name, DEFINITIONS[name])
-    sent = []
-    for k in range(30):
-        stamp_ns, x = STAMP_NS + k * 10**8, 0.1 * k
-        sent.append(("/odom", stamp_ns, odometry(pose(x), stamp_ns=stamp_ns)))
-        seen = pose(3.0 - x, 1.0, 0.0, quaternion(yaw=0.5))
-        cdr = encoded(header=header(stamp_ns, "base_link"), marker_ids=np.array([17], np.int64), poses=[seen])
-        sent.append(("/aruco", stamp_ns, cdr))
-    file = write_mcap(
-        tmp_path / "a.mcap",
-        [type("Sent", (), {"topic": t, "log_ns": s, "cdr": c}) for t, s, c in sent],
-        types={"/odom": "nav_msgs/msg/Odometry", "/aruco": name},
-        text=lambda type_name: DEFINITIONS[name] if type_name == name else definition(type_name),
-    )
-    settings = {"inputs.names": "odom aruco", "aruco": {"type": name, "sigma_m": 0.1, "sigma_rad": 0.1}}
-    slam, _ = replayed(file, tmp_path / "run", **settings)
-    (landmark,) = slam.landmarks
-    assert landmark == "17"
-    at = slam.solver.estimate([slam.landmarks["17"].vertex])[0]
-    assert at == pytest.approx((3.0, 1.0, 0.5), abs=1e-3)
-    assert se2.wrap(at[2]) == pytest.approx(0.5, abs=1e-3)
-
-
-def test_a_ros_1_bag_defines_its_types_too(tmp_path):
-    from recordings import with_seq
-    from rosbags.rosbag1 import Writer
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
-    name = "fiducial_msgs/msg/FiducialTransformArray"
-    decode, message, encoded = recorded(name, DEFINITIONS[name])
-    store = get_typestore(Stores.ROS1_NOETIC)
-    store.register(get_types_from_msg(DEFINITIONS[name], name))
-    with Writer(tmp_path / "a.bag") as bag:
-        types = {"/odom": "nav_msgs/msg/Odometry", "/fiducial_transforms": name}
-        connections = {topic: bag.add_connection(topic, of, typestore=store) for topic, of in types.items()}
-        for k in range(30):
-            stamp_ns, x = STAMP_NS + k * 10**8, 0.1 * k
-            at = make(
-                "geometry_msgs/msg/Transform", translation=vector(3.0 - x, 1.0, 0.0), rotation=quaternion(yaw=0.5)
-            )
-            errors = {"image_error": 0.5, "object_error": 0.01, "fiducial_area": 900.0}
-            one = message("fiducial_msgs/msg/FiducialTransform", fiducial_id=17, transform=at, **errors)
-            cdr = encoded(header=header(stamp_ns, "base_link"), image_seq=k, transforms=[one])
-            for topic, sent in (
-                ("/odom", typestore().deserialize_cdr(odometry(pose(x), stamp_ns=stamp_ns), types["/odom"])),
-                ("/fiducial_transforms", decode(cdr)),
-            ):
-                raw = store.serialize_ros1(with_seq(store, sent), types[topic])
-                bag.write(connections[topic], stamp_ns, raw)
-    settings = {"inputs.names": "odom tags", "tags": {"type": name, "sigma_m": 0.1, "sigma_rad": 0.1}}
-    slam, _ = replayed(tmp_path / "a.bag", tmp_path / "run", **settings)
-    at = slam.solver.estimate([slam.landmarks["17"].vertex])[0]
-    assert at == pytest.approx((3.0, 1.0, 0.5), abs=1e-3)
 
 
 def test_the_page_of_inputs_has_a_row_for_every_type_with_what_it_becomes_and_its_example_is_one(tmp_path):

@@ -6,8 +6,8 @@ import pytest
 from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.messages.inputs.fixes import east_north_up
 from graph_slam_ros.messages.to_msg import transform
+from graph_slam_ros.overview.chosen_inputs import choose_inputs
 from graph_slam_ros.recordings.bag import open_bag
-from graph_slam_ros.runs.chosen_inputs import choose_inputs
 from graph_slam_ros.runs.replay import measurements as measured
 from graph_slam_ros.slam import Closure, Config, Counters, Fix
 from graph_slam_ros.tools.simulation import Fault, measurements, simulate, spoil_messages, with_closures, write_bag

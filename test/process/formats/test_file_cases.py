@@ -45,10 +45,10 @@ from graph_slam_ros.formats.g2o import read_g2o
 from graph_slam_ros.formats.parameters import parse_setting, read_parameters
 from graph_slam_ros.messages.interfaces import typestore
 from graph_slam_ros.optimization import optimize
+from graph_slam_ros.overview.chosen_inputs import choose_inputs
 from graph_slam_ros.recordings import mcap_records
 from graph_slam_ros.recordings.bag import BagError, Topic, open_bag
 from graph_slam_ros.recordings.definitions import recorded_decoder
-from graph_slam_ros.runs.chosen_inputs import choose_inputs
 from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.slam import Config
 

@@ -88,13 +88,10 @@ def columns(seed):
     counters = Counters()
     for reason in rng.choice(list(REASONS), 3):
         counters.count(str(rng.choice(["odom", "detections", "tf"])), str(reason), int(rng.integers(1, 500)))
-    links = tuple(
-        Link(pick(), pick(), bool(rng.integers(2)), 1, float(rng.random())) for _ in range(rng.integers(0, 6))
-    )
-    t = int(rng.choice([0, 1, 50]))
+    links = tuple(Link(pick(), pick(), bool(rng.integers(2))) for _ in range(rng.integers(0, 6)))
     assumed = {"detections.offset_s": -2.5, "detections.mount": "0 0 0 0 0 0", "odom.mount": "0 0 0 0 0 0"}
     return Columns(
-        config, topics, o, odometry_ns, path, (seen,), links, stamps(rng, t), numbers(rng, t, 7), counters,
+        config, topics, o, odometry_ns, path, (seen,), links, counters,
         assumed if rng.random() < 0.3 else {},
     )  # fmt: skip
 
@@ -118,5 +115,5 @@ def test_no_columns_make_a_check_fail():
 def test_empty_columns_have_no_odometry():
     no_stamp, no_pose = np.empty(0, dtype=np.int64), np.empty((0, 7))
     odometry = OdometryColumns("", "", "", "", no_stamp, no_pose, *np.empty((2, 0, 6)))
-    nothing = Columns(Config(), {}, odometry, no_stamp, no_pose, (), (), no_stamp, no_pose, Counters())
+    nothing = Columns(Config(), {}, odometry, no_stamp, no_pose, (), (), Counters())
     assert [one.code for one in check_columns(nothing)] == ["no_odometry"]

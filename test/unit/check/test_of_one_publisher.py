@@ -29,8 +29,7 @@ def columns(other_s, other_m, count=None):
     for _ in range(len(other_s) if count is None else count):
         counters.count("odom", "other_publisher")
     odometry = OdometryColumns("odom", "/odom", "odom", "base_link", stamp_ns, poses, unknown, unknown)
-    empty = np.empty(0, dtype=np.int64), np.empty((0, 7))
-    return Columns(Config(), {}, odometry, own_ns, own, (), (), *empty, counters)
+    return Columns(Config(), {}, odometry, own_ns, own, (), (), counters)
 
 
 @each("hz", [1.0, 20.0, 50.0])

@@ -23,8 +23,8 @@ from rows import each
 from graph_slam_ros.formats.cdr import LATEST_NS
 from graph_slam_ros.messages import to_msg
 from graph_slam_ros.messages.inputs.transforms import Transforms
+from graph_slam_ros.overview.chosen_inputs import choose_inputs
 from graph_slam_ros.recordings.bag import open_bag
-from graph_slam_ros.runs.chosen_inputs import choose_inputs
 from graph_slam_ros.runs.replay import measurements
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam
 

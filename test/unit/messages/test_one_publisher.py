@@ -111,18 +111,6 @@ def test_an_outlier_is_left_out():
     assert p.refused == 1
 
 
-def test_a_late_message_of_another_publisher_is_not_used_and_one_of_the_own_is():
-    """Of each, those of half a second come after all others of the time until then."""
-    own, other = driven(20), driven(20, offset=(8.0, -3.0, 1.0), late_s=0.013, begin=1.0)
-    for late in (own, other):
-        held = [m for m in late if NS * 6 < m.stamp_ns < NS * 6.5]
-        on_time = [m for m in mixed(own, other) if m not in held]
-        k = next(k for k, m in enumerate(on_time) if m.stamp_ns > NS * 6.6)
-        p = Publisher(timeout_s=5.0).hear([*on_time[:k], *held, *on_time[k:]]).end()
-        assert sorted(m.stamp_ns for m in p.used) == [m.stamp_ns for m in own]
-        assert p.refused == len(other)
-
-
 def test_noise_of_two_centimetres_and_crowded_stamps_and_fast_robots_are_no_other_publisher():
     rng = np.random.default_rng(1)
     noisy = [

@@ -10,6 +10,7 @@ from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.lie import so3
 from graph_slam_ros.messages.from_msg import TRANSFORMS
 from graph_slam_ros.messages.inputs import known_types
+from graph_slam_ros.messages.inputs.detections import names_of
 from graph_slam_ros.messages.inputs.landmark_types import APRILTAGS
 from graph_slam_ros.messages.receive_times import clock_offset_s
 from graph_slam_ros.recordings.bag import Bag, BagError, Topic
@@ -17,6 +18,7 @@ from graph_slam_ros.recordings.definitions import recorded_decoder
 
 _SAMPLED, _EVERY = 2000, 8  # the first messages of each topic; of odometry then every so many
 _MOST_NAMES, _LAGS = 1000, 100  # lags: at least so many of a longer topic
+_ITEMS = ("landmarks", "markers", "sensed_data", "detections", "poses")
 _LEVEL_M, _UPRIGHT = 0.5, math.cos(math.radians(20.0))  # as for what is counted as out of the plane
 
 
@@ -106,6 +108,11 @@ class Recording:
         links = self.fixed | {child: parent for child, parent in self.moving.items() if child != base}
         return _root(links, frame) == _root(links, base)
 
+    def alike(self, frame: str) -> str:
+        """Return the frame of TF that differs from another one in slashes alone; empty if there is none."""
+        known = {*self.fixed, *self.fixed.values(), *self.moving} - {frame}
+        return next((one for one in sorted(known) if frame and one.replace("/", "") == frame.replace("/", "")), "")
+
     def moves_in(self, base: str, frame: str) -> bool:
         """Return whether TF has the moving pose of the robot in a frame."""
         links, seen = self.fixed | self.moving, set[str]()
@@ -161,11 +168,12 @@ def _add(recording: Recording, one: TopicContents, m: Any, log_ns: int) -> None:
         links.update((_plain(t.child_frame_id), _plain(t.header.frame_id)) for t in m.transforms)
         one.items += len(m.transforms)
         return
-    header = getattr(m, "header", None)
-    if header is not None:
-        one.frame = one.frame or _plain(header.frame_id)
+    items = next((getattr(m, name) for name in _ITEMS if hasattr(m, name)), ())
+    parts = [m, *items[:1], *(item.pose for item in items[:1] if hasattr(item, "pose"))]
+    if headers := [part.header for part in parts if hasattr(part, "header")]:
+        one.frame = one.frame or next(filter(None, (_plain(h.frame_id) for h in headers)), "")
         one.child = one.child or _plain(getattr(m, "child_frame_id", ""))
-        stamp_ns = header.stamp.sec * 10**9 + header.stamp.nanosec
+        stamp_ns = next(filter(None, (h.stamp.sec * 10**9 + h.stamp.nanosec for h in headers)), 0)
         one.is_stamped |= stamp_ns != 0
         one.add_lag(log_ns, stamp_ns)
     _OF_TYPE.get(one.topic.type, _any)(one, m)
@@ -180,10 +188,7 @@ def _plain(frame: str) -> str:
 
 def _any(one: TopicContents, m: Any) -> None:
     """The number of landmarks in a message of a package that may not be installed."""
-    for name in ("landmarks", "markers", "sensed_data", "detections", "poses"):
-        if hasattr(m, name):
-            one.items += len(getattr(m, name))
-            return
+    one.items += next((len(getattr(m, name)) for name in _ITEMS if hasattr(m, name)), 0)
 
 
 def _odometry(one: TopicContents, m: Any) -> None:
@@ -207,14 +212,14 @@ def _moved(one: TopicContents, pose: Any) -> None:
 
 
 def _detections(one: TopicContents, m: Any) -> None:
-    classes = [d.results[0].hypothesis.class_id for d in m.detections if len(d.results)]
+    classes = [names_of(d)[1] for d in m.detections if len(d.results)]
     one.is_repeated |= len(set(classes)) < len(classes)
     for d in m.detections:
         one.items += 1
-        one.without_id += not d.id
-        one.frame = one.frame or _plain(d.header.frame_id)
-        if d.id and len(one.ids) < _MOST_NAMES:
-            one.ids.add(d.id)
+        name = names_of(d)[0]
+        one.without_id += not name
+        if name and len(one.ids) < _MOST_NAMES:
+            one.ids.add(name)
     one.classes.update(filter(None, islice(classes, _MOST_NAMES - len(one.classes))))
 
 

@@ -1,0 +1,114 @@
+"""Checks of fixes and headings against the motion of odometry, and against one another."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from graph_slam_ros.check.columns import Columns, FixColumns
+from graph_slam_ros.check.contradictions import turned_mount
+from graph_slam_ros.check.finding import Finding, Where
+from graph_slam_ros.check.pairs import path_of, poses_at
+from graph_slam_ros.lie import se2, so3
+from graph_slam_ros.typing import Array, Index
+
+_LEAST, _STEP_M, _SIGMAS, _SCALE = 8, 2.0, 6.0, 1.5
+_TURNED_RAD, _HALF, _OFF_RAD, _NEARLY_RAD = 0.2, 0.5, 0.17, 0.1
+_SAME_M, _FROZEN_M, _JUMP_M, _SOON_S = 1e-6, 3.0, 3.0, 2.0
+
+
+def check_fixes(c: Columns) -> Iterator[Finding]:
+    """Fixes that are mirrored, of another scale, frozen or jump, and headings that count clockwise or are off."""
+    path_ns, path = path_of(c)
+    known: tuple[Index, Array] | None = None  # stamps, and by how much odometry's frame is turned in the map
+    for f in sorted(c.fixes, key=lambda f: bool(np.isnan(f.points).all())) if len(path_ns) > 1 else ():
+        use = (f.stamp_ns >= path_ns[0]) & (f.stamp_ns <= path_ns[-1])
+        order = np.flatnonzero(use)[np.argsort(f.stamp_ns[use], kind="stable")]
+        if len(order) < _LEAST:
+            continue
+        stamp_ns, points, headings = f.stamp_ns[order], f.points[order], f.headings[order]
+        poses = poses_at(stamp_ns, path_ns, path)
+        own, yaws = poses[:, 0] + 1j * poses[:, 1], np.stack(so3.log(tuple(poses[:, 3:].T)), axis=1)[:, 2]
+        where: Where = {"topic": f.topic, "first_ns": int(stamp_ns[0]), "count": len(order)}
+        if np.isfinite(points).all():
+            found = list(_positions(f, stamp_ns, points, own, where))
+            yield from found
+            ends = _apart(own, max(_STEP_M, _SIGMAS * f.sigma_m))
+            if len(ends) > _LEAST and not any(one.severity == "error" for one in found):
+                at_ns = (stamp_ns[ends[1:]] + stamp_ns[ends[:-1]]) // 2
+                known = at_ns, np.angle(np.diff(points[ends]) / np.diff(own[ends]))
+        if np.isfinite(headings).all():
+            yield from _headings(f, stamp_ns, headings, yaws, known, where)
+
+
+def _apart(own: Array, step_m: float) -> Index:
+    """Fixes between which the robot has driven so far."""
+    chosen = [0]
+    for k in range(1, len(own)):
+        if abs(own[k] - own[chosen[-1]]) > step_m:
+            chosen.append(k)
+    return np.array(chosen)
+
+
+def _mirrored(turns: Array, own: Array) -> tuple[float, float]:
+    """The median differences of turns and odometry's, as they are and mirrored, where odometry turns [rad]."""
+    at = np.abs(own) > _TURNED_RAD
+    if at.sum() < _LEAST:
+        return 0.0, 0.0
+    now, mirrored = (float(np.median(np.abs(se2.wrap(turns[at] - sign * own[at])))) for sign in (1.0, -1.0))
+    return now, mirrored
+
+
+def _positions(f: FixColumns, stamp_ns: Index, points: Array, own: Array, where: Where) -> Iterator[Finding]:
+    ends = _apart(own, max(_STEP_M, _SIGMAS * f.sigma_m))
+    if len(ends) > _LEAST:
+        moved, driven = np.diff(points[ends]), np.diff(own[ends])
+        now, mirrored = _mirrored(np.angle(moved[1:] / moved[:-1]), np.angle(driven[1:] / driven[:-1]))
+        if mirrored < _HALF * now and now > _TURNED_RAD:
+            text = (
+                f"{f.topic}: fixes turn to the right where odometry turns to the left: axes are exchanged or mirrored"
+            )
+            yield Finding("fix_mirrored", "error", now, mirrored, "rad", text, **where)
+            return
+        factor = float(np.median(np.abs(moved)) / np.median(np.abs(driven)))
+        if not 1.0 / _SCALE < factor < _SCALE:
+            text = f"{f.topic}: fixes move {factor:.2g} m for each metre of odometry: are both metres?"
+            yield Finding("unrelated", "error", factor, _SCALE, "times", text, **where)
+            return
+    step_m, way_m = np.abs(np.diff(points)), np.abs(np.diff(own))
+    begins = np.flatnonzero(np.concatenate([[True], step_m > _SAME_M]))
+    for k, end in zip(begins, [*(begins[1:] - 1), len(points) - 1], strict=True):
+        if (drove_m := float(way_m[k:end].sum())) > _FROZEN_M:
+            span_s = (stamp_ns[end] - stamp_ns[k]) * 1e-9
+            text = f"{f.topic}: the fix stands still for {span_s:.0f} s, while odometry drives {drove_m:.0f} m"
+            at: Where = {"topic": f.topic, "first_ns": int(stamp_ns[k]), "count": int(end - k)}
+            yield Finding("fix_frozen", "warning", drove_m, _FROZEN_M, "m", text, **at)
+            step_m[end : end + 1] = 0.0
+    far_m = max(_JUMP_M, 2.0 * _SIGMAS * f.sigma_m)
+    jumps = (step_m - way_m > far_m) & (np.diff(stamp_ns) < _SOON_S * 1e9)
+    if jumps.any():
+        text = f"{f.topic}: the fix jumps {int(jumps.sum())} times, by up to {step_m[jumps].max():.0f} m"
+        at = {"topic": f.topic, "first_ns": int(stamp_ns[1:][jumps][0]), "count": int(jumps.sum())}
+        yield Finding("fix_jumps", "warning", float(step_m[jumps].max()), far_m, "m", text, **at)
+
+
+def _headings(
+    f: FixColumns, stamp_ns: Index, headings: Array, yaws: Array, known: tuple[Index, Array] | None, where: Where
+) -> Iterator[Finding]:
+    ends = np.unique(np.searchsorted(stamp_ns, np.arange(stamp_ns[0], stamp_ns[-1], 10**9)))
+    now, mirrored = _mirrored(se2.wrap(np.diff(headings[ends])), se2.wrap(np.diff(yaws[ends])))
+    if mirrored < _HALF * now and now > _TURNED_RAD:
+        text = f"{f.topic}: its heading turns to the right where odometry turns to the left: it counts clockwise (NED)"
+        yield Finding(
+            "heading_clockwise", "error", now, mirrored, "rad", text, settings=(f"{f.input}.use=none",), **where
+        )
+    elif known is not None:
+        at = np.clip(np.searchsorted(stamp_ns, known[0]), 0, len(stamp_ns) - 1)
+        turned = np.exp(1j * (headings[at] - yaws[at] - known[1]))
+        off = float(np.angle(np.median(turned.real) + 1j * np.median(turned.imag)))
+        if abs(off) > _OFF_RAD and np.median(np.abs(np.angle(turned * np.exp(-1j * off)))) < _HALF * abs(off):
+            text = f"{f.topic}: its heading is {np.degrees(off):.0f} degrees off the course of the fixes (0 is east)"
+            quarter = round(off / (0.5 * np.pi)) * 0.5 * np.pi
+            off = quarter if abs(off - quarter) < _NEARLY_RAD else off
+            turn = (0.0, 0.0, 0.0, 0.0, 0.0, np.sin(0.5 * off), np.cos(0.5 * off))
+            settings = turned_mount(f.input, f.frame, f.T_base_frame, turn) if f.frame else ()
+            yield Finding("heading_offset", "error", off, _OFF_RAD, "rad", text, settings=settings, **where)

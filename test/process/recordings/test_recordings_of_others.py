@@ -1,0 +1,547 @@
+"""Recordings as other people's tools and robots make them, through the commands, as a user types them."""
+
+import json
+import math
+import shlex
+import shutil
+import sqlite3
+
+import numpy as np
+from mcap.writer import Writer as McapWriter
+from recordings import Ros1Writer, Ros2Writer, StoragePlugin
+from rosbags.interfaces import Nodetype
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from graph_slam_ros.cli import main
+from graph_slam_ros.lie import se3
+from graph_slam_ros.messages.interfaces import typestore
+from graph_slam_ros.runs.trajectory import read_tum
+
+BEGINS_S = 1_764_000_000
+ODOMETRY, DETECTIONS, TF = "nav_msgs/msg/Odometry", "vision_msgs/msg/Detection3DArray", "tf2_msgs/msg/TFMessage"
+CAMERA = (0.2, 0.0, 0.4, -0.5, 0.5, -0.5, 0.5)
+FRAME = "camera_optical_frame"
+
+
+class Robot:
+    """Messages of a robot that drives eights past tags, of one type store; a case changes what a report changed."""
+
+    def __init__(self, store=None, seconds=20.0, odometry_hz=20.0):
+        self.store = store or typestore()
+        rng = np.random.default_rng(1)
+        self.t = np.arange(0.0, seconds, 1.0 / odometry_hz)
+        self.v = np.where(self.t < 1.0, 0.0, 0.8)
+        self.w = np.where(self.t < 1.0, 0.0, 0.8 * np.cos(2.0 * np.pi * (self.t - 1.0) / 14.0) + 0.06)
+        self.true = self.path_of(self.v, self.w)
+        self.driven = self.path_of(
+            self.v * (1.01 + rng.normal(0, 0.03, len(self.t))),
+            self.w + (self.v > 0) * rng.normal(0.004, 0.05, len(self.t)),
+        )
+        low, high = self.true[:, :2].min(0) - 2.5, self.true[:, :2].max(0) + 2.5
+        x, y = (a.ravel() for a in np.meshgrid(*(np.arange(low[k], high[k], 2.0) for k in (0, 1))))
+        self.tags = np.stack([x, y, np.full(len(x), 0.7)], 1) + rng.uniform(-0.4, 0.4, (len(x), 3))
+        self.seen = [(t, self._sees(pose, rng)) for t, pose in zip(self.t[::3], self.true[::3], strict=True)]
+
+    def path_of(self, v, w):
+        dt = self.t[1]
+        yaw = np.concatenate([[0.0], np.cumsum(w[:-1] * dt)])
+        steps = [np.concatenate([[0.0], np.cumsum(v[:-1] * f(yaw[:-1]) * dt)]) for f in (np.cos, np.sin)]
+        return np.stack([*steps, yaw], 1)
+
+    def _sees(self, pose, rng):
+        camera = se3.compose(se3.from_xyz_rpy((*pose[:2], 0, 0, 0, pose[2])), CAMERA)
+        points = np.stack(se3.act(se3.inverse(camera), tuple(self.tags.T)), 1)
+        ahead = (points[:, 2] > 0.3) & (points[:, 2] < 4.5) & (np.abs(points[:, :2]).max(1) < 0.8 * points[:, 2])
+        return [(int(k), points[k] + rng.normal(0, 0.02, 3)) for k in np.flatnonzero(ahead)]
+
+    def make(self, name, **fields):
+        """A message; what is not given is zero or empty."""
+        return self.store.types[name](
+            **{
+                field: fields[field] if field in fields else self._zero(of)
+                for field, of in self.store.fielddefs[name][1]
+            }
+        )
+
+    def _zero(self, of):
+        kind, of = of
+        if kind == Nodetype.NAME:
+            return self.make(of)
+        if kind == Nodetype.BASE:
+            return "" if of[0] == "string" else 0.0 if "float" in of[0] else 0
+        (inner, name), count = of
+        if inner == Nodetype.BASE and name[0] != "string":
+            return np.zeros(count if kind == Nodetype.ARRAY else 0, name[0])
+        return [self._zero(of[0]) for _ in range(count if kind == Nodetype.ARRAY else 0)]
+
+    def stamp(self, t):
+        ns = round((BEGINS_S + t) * 1e9)
+        return self.make("builtin_interfaces/msg/Time", sec=ns // 10**9, nanosec=ns % 10**9)
+
+    def header(self, t, frame):
+        return self.make("std_msgs/msg/Header", stamp=t if hasattr(t, "sec") else self.stamp(t), frame_id=frame)
+
+    def xyzw(self, name, *numbers):
+        return self.make(f"geometry_msgs/msg/{name}", **dict(zip("xyzw", map(float, numbers), strict=False)))
+
+    def pose(self, x, y, z, yaw=0.0, covariance=None):
+        turn = self.xyzw("Quaternion", 0, 0, math.sin(yaw / 2), math.cos(yaw / 2))
+        at = self.make("geometry_msgs/msg/Pose", position=self.xyzw("Point", x, y, z), orientation=turn)
+        if covariance is None:
+            return at
+        return self.make("geometry_msgs/msg/PoseWithCovariance", pose=at, covariance=covariance)
+
+    def odometry(self, t, pose, v=0.0, w=0.0):
+        linear, angular = self.xyzw("Vector3", v), self.xyzw("Vector3", 0, 0, w)
+        twist = self.make("geometry_msgs/msg/Twist", linear=linear, angular=angular)
+        return self.make(
+            ODOMETRY,
+            header=self.header(t, "odom"),
+            child_frame_id="base_link",
+            pose=self.pose(*pose[:2], 0, pose[2], covariance=np.zeros(36)),
+            twist=self.make("geometry_msgs/msg/TwistWithCovariance", twist=twist),
+        )
+
+    def odometry_rows(self, stamp=lambda t: t, **more):
+        rows = zip(self.t.tolist(), self.driven, self.v, self.w, strict=True)
+        return [(t, "/odom", ODOMETRY, self.odometry(stamp(t), pose, v, w, **more)) for t, pose, v, w in rows]
+
+    def array(self, t, row, frame=FRAME, times=1.0, fields=lambda robot, i, at: {}):
+        found = [self._one(t, i, times * p, frame, fields) for i, p in row]
+        return self.make(DETECTIONS, header=self.header(t, frame), detections=found)
+
+    def _one(self, t, i, p, frame, fields):
+        at = self.pose(*p, covariance=np.diag([9e-4] * 3 + [0.0] * 3).ravel())
+        new = fields(self, i, at) or {
+            "id": str(i),
+            "results": [self.make("vision_msgs/msg/ObjectHypothesisWithPose", pose=at)],
+        }
+        return self.make("vision_msgs/msg/Detection3D", header=self.header(t, frame), **new)
+
+    def seen_rows(self, stamp=lambda t: t, **more):
+        return [(t + 0.04, "/landmarks", DETECTIONS, self.array(stamp(t), row, **more)) for t, row in self.seen if row]
+
+    def tags_rows(self, type_name, tag):
+        of = type_name.removesuffix("Array") if type_name.endswith("DetectionArray") else type_name.replace("Array", "")
+        field = "detections" if type_name.endswith("DetectionArray") else "markers"
+        for t, row in self.seen:
+            tags = [self.make(of, **tag(self, t, i, p)) for i, p in row]
+            header = {"header": self.header(t, FRAME)} if "header" in dict(self.store.fielddefs[type_name][1]) else {}
+            yield t + 0.04, "/tags", type_name, self.make(type_name, **header, **{field: tags})
+
+    def transform(self, parent, child):
+        translation, rotation = self.xyzw("Vector3", *CAMERA[:3]), self.xyzw("Quaternion", *CAMERA[3:])
+        moved = self.make("geometry_msgs/msg/Transform", translation=translation, rotation=rotation)
+        header = self.header(0.0, parent)
+        return self.make("geometry_msgs/msg/TransformStamped", header=header, child_frame_id=child, transform=moved)
+
+    def static_rows(self, *links, type_name=TF):
+        links = links or (("base_link", FRAME),)
+        return [
+            (0.0, "/tf_static", type_name, self.make(type_name, transforms=[self.transform(*one) for one in links]))
+        ]
+
+
+def written(path, robot, *rows, storage=StoragePlugin.MCAP):
+    """A rosbag2 folder of rows: when it was received [s], topic, type, message."""
+    with Ros2Writer(path, version=9, storage_plugin=storage) as writer:
+        known = {}
+        for t, topic, name, m in sorted((row for some in rows for row in some), key=lambda row: row[0]):
+            if topic not in known:
+                known[topic] = writer.add_connection(topic, name, typestore=robot.store)
+            writer.write(known[topic], round((BEGINS_S + t) * 1e9), robot.store.serialize_cdr(m, name))
+    return path
+
+
+def store_of(base, types=()):
+    """The types of a distribution, with those of a package: fields by package and name."""
+    store = get_typestore(base)
+    if TF not in store.fielddefs:
+        store.register({TF: typestore().fielddefs[TF]})
+    for name, fields in dict(types).items():
+        store.register(get_types_from_msg(fields.replace("; ", "\n") + "\n", name.replace("__", "/msg/")))
+    return store
+
+
+def written_ros1(path, robot, *rows, without=()):
+    """A ROS 1 bag; topics of ``without`` have an empty definition, as rosserial and goroslib write it."""
+    with Ros1Writer(path) as writer:
+        known = {}
+        for t, topic, name, m in sorted((row for some in rows for row in some), key=lambda row: row[0]):
+            if topic not in known:
+                text, md5 = robot.store.generate_msgdef(name, ros_version=1)
+                known[topic] = writer.add_connection(topic, name, msgdef="" if topic in without else text, md5sum=md5)
+            writer.write(known[topic], round((BEGINS_S + t) * 1e9), robot.store.serialize_ros1(m, name))
+    return path
+
+
+def converted(path, robot, *rows):
+    """What ``mcap convert`` makes of a ROS 1 bag."""
+    with path.open("wb") as stream:
+        writer = McapWriter(stream)
+        writer.start(profile="ros1", library="mcap go")
+        known = {}
+        for t, topic, name, m in sorted((row for some in rows for row in some), key=lambda row: row[0]):
+            if topic not in known:
+                text, md5 = robot.store.generate_msgdef(name, ros_version=1)
+                schema = writer.register_schema(name.replace("/msg/", "/"), "ros1msg", text.encode())
+                known[topic] = writer.register_channel(topic, "ros1", schema, {"md5sum": md5})
+            ns = round((BEGINS_S + t) * 1e9)
+            writer.add_message(known[topic], ns, bytes(robot.store.serialize_ros1(m, name)), ns)
+        writer.finish()
+    return path
+
+
+ARUCO = {
+    "aruco_msgs__Marker": "std_msgs/Header header; uint32 id; geometry_msgs/PoseWithCovariance pose",
+    "aruco_msgs__MarkerArray": "std_msgs/Header header; aruco_msgs/Marker[] markers",
+}
+APRILTAGS = {
+    "apriltag_ros__AprilTagDetection": "int32[] id; float64[] size; geometry_msgs/PoseWithCovarianceStamped pose",
+    "apriltag_ros__AprilTagDetectionArray": "std_msgs/Header header; apriltag_ros/AprilTagDetection[] detections",
+    "apriltags_ros__AprilTagDetection": "int32 id; float64 size; geometry_msgs/PoseStamped pose",
+    "apriltags_ros__AprilTagDetectionArray": "apriltags_ros/AprilTagDetection[] detections",
+    "tf__tfMessage": "geometry_msgs/TransformStamped[] transforms",
+}
+ISAAC = {
+    "isaac_ros_apriltag_interfaces__AprilTagDetection": "string family; int32 id; geometry_msgs/Point center; "
+    "geometry_msgs/Point[4] corners; geometry_msgs/PoseWithCovarianceStamped pose",
+    "isaac_ros_apriltag_interfaces__AprilTagDetectionArray": "std_msgs/Header header; "
+    "isaac_ros_apriltag_interfaces/AprilTagDetection[] detections",
+}
+OLDER = {
+    "vision_msgs__BoundingBox3D": "geometry_msgs/Pose center; geometry_msgs/Vector3 size",
+    "vision_msgs__Detection3DArray": "std_msgs/Header header; vision_msgs/Detection3D[] detections",
+}
+NOETIC = OLDER | {
+    "vision_msgs__ObjectHypothesisWithPose": "int64 id; float64 score; geometry_msgs/PoseWithCovariance pose",
+    "vision_msgs__Detection3D": "std_msgs/Header header; vision_msgs/ObjectHypothesisWithPose[] results; "
+    "vision_msgs/BoundingBox3D bbox; sensor_msgs/PointCloud2 source_cloud",
+}
+FOXY = OLDER | {
+    "vision_msgs__ObjectHypothesisWithPose": "string id; float64 score; geometry_msgs/PoseWithCovariance pose",
+    "vision_msgs__Detection3D": "std_msgs/Header header; vision_msgs/ObjectHypothesisWithPose[] results; "
+    "vision_msgs/BoundingBox3D bbox; sensor_msgs/PointCloud2 source_cloud; bool is_tracking; string tracking_id",
+}
+
+
+def aruco(robot, t, i, p):
+    return {
+        "header": robot.header(t, FRAME),
+        "id": i,
+        "pose": robot.pose(*p, covariance=np.zeros(36)),
+        "confidence": 1.0,
+    }
+
+
+def stamped(robot, t, p, frame=FRAME):
+    at = robot.pose(*p, covariance=np.zeros(36))
+    return robot.make("geometry_msgs/msg/PoseWithCovarianceStamped", header=robot.header(t, frame), pose=at)
+
+
+def of_ros1(robot, t, i, p):
+    return {"id": np.array([i], np.int32), "size": np.array([0.16]), "pose": stamped(robot, t, p)}
+
+
+def of_old_ros1(robot, t, i, p):
+    pose = robot.make("geometry_msgs/msg/PoseStamped", header=robot.header(t, FRAME), pose=robot.pose(*p))
+    return {"id": i, "size": 0.16, "pose": pose}
+
+
+def of_isaac(robot, t, i, p):
+    return {"family": "tag36h11", "id": i, "pose": stamped(robot, t, p)}
+
+
+def older(robot, i, at):
+    """Fields of a detection of Noetic and Foxy."""
+    of = "vision_msgs/msg/ObjectHypothesisWithPose"
+    is_number = dict(robot.store.fielddefs[of][1])["id"][1][0] == "int64"
+    fields = {"results": [robot.make(of, id=i if is_number else str(i), score=1.0, pose=at)]}
+    return fields if is_number else fields | {"is_tracking": True, "tracking_id": str(i)}
+
+
+def mcap_of_ros1(folder):
+    robot = Robot(store_of(Stores.ROS1_NOETIC, ARUCO))
+    tags = robot.tags_rows("aruco_msgs/msg/MarkerArray", aruco)
+    return converted(folder / "a.mcap", robot, robot.static_rows(), robot.odometry_rows(), tags)
+
+
+def ros1_without_definition(folder):
+    robot = Robot(store_of(Stores.ROS1_NOETIC, ARUCO))
+    rows = robot.static_rows(), robot.odometry_rows(), robot.tags_rows("aruco_msgs/msg/MarkerArray", aruco)
+    return written_ros1(folder / "a.bag", robot, *rows, without=("/odom", "/tf_static"))
+
+
+def ros1_apriltags(folder, package="apriltag_ros", tag=of_ros1):
+    robot = Robot(store_of(Stores.ROS1_NOETIC, APRILTAGS))
+    tags = robot.tags_rows(f"{package}/msg/AprilTagDetectionArray", tag)
+    static = robot.static_rows(type_name="tf/msg/tfMessage")
+    return written_ros1(folder / "a.bag", robot, static, robot.odometry_rows(), tags)
+
+
+def isaac(folder):
+    robot = Robot(store_of(Stores.ROS2_JAZZY, ISAAC))
+    tags = robot.tags_rows("isaac_ros_apriltag_interfaces/msg/AprilTagDetectionArray", of_isaac)
+    return written(folder / "a", robot, robot.static_rows(), robot.odometry_rows(), tags)
+
+
+def noetic(folder):
+    robot = Robot(store_of(Stores.ROS1_NOETIC, NOETIC))
+    rows = robot.static_rows(), robot.odometry_rows(), robot.seen_rows(fields=older)
+    return written_ros1(folder / "a.bag", robot, *rows)
+
+
+def foxy(folder):
+    robot = Robot(store_of(Stores.ROS2_FOXY, FOXY))
+    rows = robot.static_rows(), robot.odometry_rows(), robot.seen_rows(fields=older)
+    path = written(folder / "a", robot, *rows, storage=StoragePlugin.SQLITE3)
+    with sqlite3.connect(next(path.glob("*.db3"))) as db:  # as Foxy's, it has no definitions
+        for table in ("message_definitions", "metadata", "schema"):
+            db.execute(f"DROP TABLE IF EXISTS {table}")
+    return path
+
+
+def said(capsys, *words):
+    """The exit code and all that a command prints, in one line."""
+    code = main([str(word) for word in words])
+    out = capsys.readouterr()
+    return code, " ".join(f"{out.out} {out.err}".split())
+
+
+def pasted(capsys, bag, run, *more):
+    """What the command that ``info`` prints does."""
+    main(["info", str(bag)])
+    words = shlex.split(capsys.readouterr().out.strip().splitlines()[-1])
+    assert words[:2] == ["graph_slam", "replay"], " ".join(words)
+    return said(capsys, *words[1 : words.index("--out")], "--out", run, *more)
+
+
+def error_m(robot, run):
+    """The largest error of the path, after the rigid motion that fits best."""
+    path = read_tum(run / "path.tum")
+    true = np.stack([np.interp(path.stamps_s - BEGINS_S, robot.t, robot.true[:, k]) for k in (0, 1)], 1)
+    a, b = (of - of.mean(0) for of in (path.poses[:, :2], true))
+    u, _, v = np.linalg.svd(a.T @ b)
+    return float(np.linalg.norm(a @ u @ np.diag([1.0, np.linalg.det(u @ v)]) @ v - b, axis=1).max())
+
+
+READ = {
+    "mcap convert of a ROS 1 bag": mcap_of_ros1,
+    "ROS 1 without definitions": ros1_without_definition,
+    "ROS 1's apriltag_ros, tf/tfMessage": ros1_apriltags,
+    "ROS 1's apriltags_ros": lambda folder: ros1_apriltags(folder, "apriltags_ros", of_old_ros1),
+    "Isaac's AprilTags": isaac,
+    "vision_msgs of Noetic": noetic,
+    "vision_msgs of Foxy, in a db3 without definitions": foxy,
+}
+
+
+def test_a_recording_of_older_or_other_tools_is_read_by_the_command_that_info_prints(tmp_path, capsys):
+    for k, (name, make) in enumerate(READ.items()):
+        (folder := tmp_path / str(k)).mkdir()
+        code, text = pasted(capsys, make(folder), folder / "run")
+        assert code == 0, (name, text)
+        assert error_m(Robot(), folder / "run") < 0.05, (name, text)
+
+
+def driven(folder, odometry=None, seen=None, static=None, seconds=20.0):
+    """A recording of a robot, of which a part is as a report has it."""
+    robot = Robot(seconds=seconds)
+    static = robot.static_rows() if static is None else static(robot)
+    rows = odometry(robot) if odometry else robot.odometry_rows(), seen(robot) if seen else robot.seen_rows()
+    return written(folder / "bag", robot, static, *rows)
+
+
+def in_units(per_second):
+    """Stamps whose nanoseconds are of another unit."""
+
+    def stamp(robot, t):
+        ns = round((BEGINS_S + t) * 1e9)
+        sec, part = divmod(ns, 10**9)
+        return robot.make("builtin_interfaces/msg/Time", sec=sec, nanosec=part * per_second // 10**9)
+
+    return lambda robot: robot.odometry_rows(stamp=lambda t: stamp(robot, t))
+
+
+def fast(robot):
+    time = lambda t: robot.make("builtin_interfaces/msg/Time", sec=186_000_000 + int(t * 1000), nanosec=0)  # noqa: E731
+    return robot.odometry_rows(stamp=time)
+
+
+def leap(t):
+    return t + 8.0e6 * (t >= 8.0)
+
+
+def leapt(rows):
+    return [(leap(t), *rest) for t, *rest in rows]
+
+
+def without_pose(robot):
+    rows = zip(robot.t.tolist(), robot.v, robot.w, strict=True)
+    return [(t, "/odom", ODOMETRY, robot.odometry(t, (0.0, 0.0, 0.0), v, w)) for t, v, w in rows]
+
+
+def scaled(times):
+    return lambda folder: driven(folder, seen=lambda robot: robot.seen_rows(times=times))
+
+
+CAUSES = {
+    **{f"tags {k} times": (scaled(k), "range_scale", "times as long as odometry says") for k in (0.55, 1.2, 1.8, 2.5)},
+    "microseconds": (lambda f: driven(f, in_units(10**6)), "wrong_stamps", "nanosec has microseconds"),
+    "milliseconds": (lambda f: driven(f, in_units(10**3)), "wrong_stamps", "nanosec has milliseconds"),
+    "a fast clock": (lambda f: driven(f, fast), "wrong_stamps", "1e+03 s for each second"),
+    "NTP": (
+        lambda f: driven(f, lambda r: leapt(r.odometry_rows(leap)), lambda r: leapt(r.seen_rows(leap))),
+        "clock_jump",
+        "set forward by 92.6 days",
+    ),
+    "a twist alone": (lambda f: driven(f, without_pose), "pose_stands", "its twist says 0.8 m/s"),
+    "double slash": (
+        lambda f: driven(f, static=lambda r: r.static_rows(("base_link", "robot//cam")), seen=of_frame("robot/cam")),
+        "frame_unlinked",
+        "did you mean robot//cam?",
+    ),
+    "no transform": (lambda f: driven(f, static=lambda r: []), "frame_unlinked", "is assumed"),
+}
+
+
+def of_frame(frame):
+    return lambda robot: robot.seen_rows(frame=frame)
+
+
+def found(capsys, bag, *settings):
+    """What a quick check finds above a note, by code."""
+    main(["check", str(bag), "--quick", "--json", *(word for one in settings for word in ("--set", one))])
+    out = capsys.readouterr().out
+    return {one["code"]: one for one in json.loads(out)["findings"] if one["severity"] != "note"}
+
+
+def test_the_cause_alone_is_said_and_its_settings_mend_it(tmp_path, capsys):
+    for k, (name, (make, code, words)) in enumerate(CAUSES.items()):
+        (folder := tmp_path / str(k)).mkdir()
+        bag = make(folder)
+        one = found(capsys, bag)
+        assert one.keys() == {code}, (name, one)
+        assert words in one[code]["text"], (name, one)
+        if code == "range_scale":
+            assert abs(one[code]["value"] / float(name.split()[1]) - 1.0) < 0.04, (name, one)
+        if one[code]["settings"]:
+            assert code not in found(capsys, bag, *one[code]["settings"]), name
+
+
+def test_a_replay_names_a_wrong_scale_and_a_place_that_is_assumed_and_what_it_prints_mends(tmp_path, capsys):
+    bag = scaled(1.8)(tmp_path)
+    code, text = pasted(capsys, bag, tmp_path / "long")
+    assert code == 3 and "times as long as odometry says" in text and "odometry was in doubt" not in text, text
+    factor = found(capsys, bag)["range_scale"]["settings"][0]
+    assert factor in text
+    code, text = pasted(capsys, bag, tmp_path / "mended", "--set", factor)
+    assert code == 0 and error_m(Robot(), tmp_path / "mended") < 0.1, text
+    (other := tmp_path / "other").mkdir()
+    bag = driven(other, static=lambda robot: [])
+    code, text = pasted(capsys, bag, other / "assumed")
+    assert code == 3 and "one is assumed" in text, text
+    mount = "detections.mount=0.2 0 0.4 -1.5707963 0 -1.5707963"
+    code, text = pasted(capsys, bag, other / "given", "--set", mount)
+    assert code == 0 and error_m(Robot(), other / "given") < 0.05, text
+
+
+def fix(robot, t, east, north):
+    longitude = 7.0 + math.degrees(east / (6_390_700.0 * math.cos(math.radians(52.0))))
+    at = {"latitude": 52.0 + math.degrees(north / 6_364_900.0), "longitude": longitude, "position_covariance_type": 2}
+    covariance, header = np.diag([0.04, 0.04, 0.1]).ravel(), robot.header(t, "base_link")
+    return robot.make("sensor_msgs/msg/NavSatFix", header=header, position_covariance=covariance, **at)
+
+
+def imu(robot, t, yaw):
+    turn, covariance = robot.pose(0, 0, 0, yaw).orientation, np.diag([1e-3] * 3).ravel()
+    header = robot.header(t, "base_link")
+    return robot.make("sensor_msgs/msg/Imu", header=header, orientation=turn, orientation_covariance=covariance)
+
+
+FIXES = {
+    "right": (lambda t, x, y: (x, y), lambda yaw: yaw, None),
+    "north, east": (lambda t, x, y: (y, x), lambda yaw: yaw, "fix_mirrored"),
+    "frozen": (lambda t, x, y: (x, y) if not 20 < t < 30 else (1.0, 1.0), lambda yaw: yaw, "fix_frozen"),
+    "jumps": (lambda t, x, y: (x + 9.0 * (20 < t < 24), y), lambda yaw: yaw, "fix_jumps"),
+    "zero at north": (lambda t, x, y: (x, y), lambda yaw: yaw - math.pi / 2, "heading_offset"),
+    "clockwise": (lambda t, x, y: (x, y), lambda yaw: math.pi / 2 - yaw, "heading_clockwise"),
+}
+
+
+def test_fixes_and_headings_are_compared_with_odometry_and_with_one_another(tmp_path, capsys):
+    robot, turn = Robot(seconds=50.0), 0.7
+    inputs = "inputs.names=odom gps imu", "gps.type=sensor_msgs/msg/NavSatFix", "gps.topic=/gps"
+    inputs = *inputs, "imu.type=sensor_msgs/msg/Imu", "imu.topic=/imu"
+    for k, (name, (at, heading, code)) in enumerate(FIXES.items()):
+        rows, rng = [], np.random.default_rng(1)
+        for t, (x, y, yaw) in zip(robot.t[::4].tolist(), robot.true[::4], strict=True):
+            z = complex(x, y) * np.exp(1j * turn)
+            place = at(t, z.real + rng.normal(0, 0.1), z.imag + rng.normal(0, 0.1))
+            rows.append((t + 0.03, "/gps", "sensor_msgs/msg/NavSatFix", fix(robot, t, *place)))
+            rows.append((t + 0.01, "/imu", "sensor_msgs/msg/Imu", imu(robot, t, heading(yaw + turn))))
+        bag = written(tmp_path / str(k), robot, robot.static_rows(), robot.odometry_rows(), rows)
+        one = found(capsys, bag, *inputs)
+        assert one.keys() - {"fix_jumps"} == ({code} if code else set()) - {"fix_jumps"}, (name, one)
+        assert code is None or code in one, (name, one)
+        if code and one[code]["settings"]:
+            assert found(capsys, bag, *inputs, *one[code]["settings"]) == {}, name
+
+
+def test_a_robot_that_turns_fast_or_drives_a_tight_bend_is_one_publisher(tmp_path, capsys):
+    for name, hz, v, w in (("turns", 7.8, 0.2, 6.0), ("bend", 20.0, 4.0, 3.0)):
+        robot = Robot(seconds=20.0, odometry_hz=hz)
+        t = robot.t
+        robot.driven = robot.path_of(np.where(t < 2, 0.0, v), w * np.sign(np.sin(t)) * (t > 3))
+        bag = written(tmp_path / name, robot, robot.odometry_rows())
+        assert "other_publisher" not in found(capsys, bag, "inputs.names=odom"), name
+
+
+def test_what_cannot_be_read_is_named_for_what_it_is(tmp_path, capsys):
+    robot = Robot(store_of(Stores.ROS1_NOETIC, ARUCO), seconds=3.0)
+    rows = robot.static_rows(), robot.odometry_rows(), robot.tags_rows("aruco_msgs/msg/MarkerArray", aruco)
+    empty = written_ros1(tmp_path / "empty.bag", robot, *rows, without=("/tags",))
+    named = {"info": "its definition of aruco_msgs/msg/MarkerArray in the recording is empty", "check": "is not used"}
+    for command, words in named.items():
+        assert words in said(capsys, command, empty)[1]
+    folder = written(tmp_path / "bag", Robot(seconds=2.0), Robot(seconds=2.0).odometry_rows())
+    for kind, command in {"zip": "unzip", "gztar": "tar xf", "tar": "tar xf"}.items():
+        packed = shutil.make_archive(str(tmp_path / "packed"), kind, tmp_path, "bag")
+        code, text = said(capsys, "info", packed)
+        assert code == 2 and f"{command} {packed}" in text, text
+    assert folder.is_dir()
+
+
+def test_truth_of_other_tools_is_read_or_named(tmp_path, capsys):
+    robot = Robot()
+    bag = written(tmp_path / "a", robot, robot.static_rows(), robot.odometry_rows(), robot.seen_rows())
+    assert pasted(capsys, bag, tmp_path / "run")[0] == 0
+    rows = [
+        (t, *pose[:2], math.sin(pose[2] / 2), math.cos(pose[2] / 2))
+        for t, pose in zip(robot.t, robot.true, strict=True)
+    ]
+    euroc = "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []\n"
+    tum = [f"{BEGINS_S + t:.6f} {x} {y} 0 0 0 {s} {c}\n" for t, x, y, s, c in rows]
+    read = {
+        "euroc.csv": euroc
+        + "".join(f"{round((BEGINS_S + t) * 1e9)},{x},{y},0,{c},0,0,{s},0\n" for t, x, y, s, c in rows),
+        "numbered.txt": "num t x y z qx qy qz qw\n" + "".join(f"{k} {row}" for k, row in enumerate(tum)),
+        "commas.csv": "".join(tum).replace(" ", ","),
+    }
+    for name, text in read.items():
+        (tmp_path / name).write_text(text)
+        code, shown = said(capsys, "evaluate", tmp_path / "run", "--truth", tmp_path / name, "--json")
+        scores = json.loads(shown[: shown.rindex("}") + 1])
+        assert code == 0 and scores["position_m"]["rmse"] < 0.03 and scores["heading_rad"]["rmse"] < 0.03, (name, shown)
+    refused = {
+        "decimal.tum": ("".join(tum[:3]).replace(".", ","), "decimal commas"),
+        "kitti.txt": ("1 0 0 0 0 1 0 0 0 0 1 0\n", "without stamps"),
+        "utf16.tum": ("".join(tum), "iconv"),
+    }
+    for name, (text, words) in refused.items():
+        (tmp_path / name).write_text(text, encoding="utf-16" if name == "utf16.tum" else "utf-8")
+        code, shown = said(capsys, "evaluate", tmp_path / "run", "--truth", tmp_path / name)
+        assert code == 2 and words in shown, shown
+    swapped = "".join(f"{BEGINS_S + t:.6f} {x} {y} 0 {c} 0 0 {s}\n" for t, x, y, s, c in rows)
+    (tmp_path / "w_first.tum").write_text(swapped)
+    assert "w comes first" in said(capsys, "evaluate", tmp_path / "run", "--truth", tmp_path / "w_first.tum")[1]
