@@ -208,10 +208,6 @@ class MeasurementModel:
             out[:, :, 0] /= factor
         return out
 
-    def of_growing_noise(self, edges: Sightings, values: Values, residuals: Array) -> Array:
-        """The derivative (n,) of ranges with respect to their factor, by the noise that grows with it."""
-        return residuals[:, 0] / _range_factor(values, edges.source)
-
     def _turns(self, poses: Any) -> Array:
         """Rotation matrices (n, d, d) of poses that are arrays."""
         n = self._space.dimensions

@@ -251,26 +251,24 @@ class Linearization:
         return self._model.seen(edges, values)
 
     def _derivative(self, edges: OdometryEdges | Sightings, parameter: Parameter, values: Values, x: Array) -> Array:
-        """Central difference of the residuals (n, m) with respect to one parameter.
+        """Central difference of the residuals (n, m) with respect to one parameter, and what it makes of their noise.
 
-        Of a factor by which noise grows, also what it makes of them.
+        The noise of a position is turned with the sensor. Without that part, errors along and across the line of sight
+        that go together would pass for a turned sensor.
         """
         at = self._p.graph.offset.values[edges.table.vertices.values[edges.rows]]
-        probe, sides = parameter.quantity.probe, []
+        probe, sides, roots = parameter.quantity.probe, [], []
         for side in (probe, -probe):
             there = {**values, parameter: values.get(parameter, 0.0) + side}
             sides.append(edges.table.type.linearize(x, at, self._measured(edges, there))[0])
+            roots.append(self._roots(edges, there))
         difference = sides[0] - sides[1]
         wrapped = np.abs(difference) > np.pi
-        out = np.asarray((difference - wrapped * np.sign(difference) * 2.0 * np.pi) / (2.0 * probe))
-        is_factor = isinstance(edges, OdometryEdges) and parameter.name in FACTORS
-        if is_factor and self._model.is_noise_measured:
-            n, factor = self._p.space.dimensions, 1.0 + values.get(parameter, 0.0)
-            scaled = slice(0, n) if parameter.name == "distance" else slice(n, None)
-            out[:, scaled] -= 0.5 * (sides[0] + sides[1])[:, scaled] / factor
-        elif not isinstance(edges, OdometryEdges) and parameter.name == "range_factor":
-            out[:, 0] -= self._model.of_growing_noise(edges, values, 0.5 * (sides[0] + sides[1]))
-        return out
+        out = difference - wrapped * np.sign(difference) * 2.0 * np.pi
+        if not np.array_equal(roots[0], roots[1]):
+            of_noise = np.einsum("nij,nj->ni", roots[0] - roots[1], 0.5 * (sides[0] + sides[1]))
+            out += np.linalg.solve(self._roots(edges, values), of_noise[..., None])[..., 0]
+        return np.asarray(out / (2.0 * probe))
 
     # -- blocks to rows --------------------------------------------------------------------------------------------
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from imperfect import START_NS, Faults, driven, imperfect_drive
 
-from graph_slam_ros.graph import LANDMARK_POSITION
 from graph_slam_ros.lie import se2
 from graph_slam_ros.slam import Odometry
 from graph_slam_ros.slam.calibration.choice import parameters_of
@@ -34,10 +33,7 @@ def wrong(request):
 
 def test_columns_of_the_parameters_are_the_derivatives_of_the_residuals(wrong):
     problem = trial_problem(wrong)
-    groups = [one for one in GROUPS if one != "clock"]
-    if LANDMARK_POSITION in wrong.graph.tables:
-        groups.remove("yaw")  # it turns the noise of positions, too: weights, which have no derivative here
-    parameters = tuple(parameters_of(problem, groups))
+    parameters = tuple(parameters_of(problem, [one for one in GROUPS if one != "clock"]))
     linear = Linearization(problem, parameters, problem.vertices)
     theta = np.full(len(parameters), 0.02)
     rows = linear.rows(problem.values, theta, {})
