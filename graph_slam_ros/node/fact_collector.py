@@ -43,7 +43,7 @@ class FactCollector:
         self._worker, self._ingest, self._publishers, self._clock = worker, ingest, publishers, clock
         self._recent = RecentInputs()
         self._not_loaded = ""
-        self._clock_ns, self._stands_since = 0, (0.0, 0)  # simulated time; since when it is that, and messages by then
+        self._clock_ns, self._stands_since, self._processed = 0, 0.0, 0  # simulated time, since when it is that
         self._before = 0, 0, 0  # overflows, failures and restarts until the last time
 
     def note_load(self, loaded: "Future[str]") -> None:
@@ -115,10 +115,10 @@ class FactCollector:
     def _clock_stands(self, processed: int) -> bool:
         """Return whether simulated time stands still, and messages are processed all the same."""
         now_ns, now_s = self._node.now_ns, time.monotonic()
+        before, self._processed = self._processed, processed
         if not now_ns or now_ns != self._clock_ns:
-            self._clock_ns, self._stands_since = now_ns, (now_s, processed)
-        since_s, before = self._stands_since
-        return now_s - since_s > 2.0 and processed > before
+            self._clock_ns, self._stands_since = now_ns, now_s
+        return now_s - self._stands_since > 2.0 and processed > before
 
 
 def _rivals(broadcaster: TfBroadcaster) -> tuple[tuple[str, ...] | None, str]:

@@ -160,7 +160,7 @@ def is_recording(path: Path) -> bool:
 def run_config(folder: Path) -> Config:
     """The configuration a run was made with. Raises ConfigError naming the file."""
     if not os.path.lexists(folder / CONFIG):
-        made = f"; of a recording graph_slam replay {folder} --out RUN makes one" * is_recording(folder)
+        made = f"; graph_slam replay {folder.name} --out RUN makes one of a recording" * is_recording(folder)
         raise ConfigError(f"{folder}: not a run: no {CONFIG} in it{made or similar_file(folder)}")
     values = read_parameters(folder / CONFIG, follow=False)
     try:

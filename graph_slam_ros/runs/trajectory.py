@@ -167,7 +167,10 @@ def _landmark(row: dict[str, str]) -> Landmark:
     for i, a in enumerate(names):
         for j, b in enumerate(names[i:], start=i):
             covariance[i, j] = covariance[j, i] = float(row[f"cov_{a}{b}"])
-    return Landmark((float(row["x"]), float(row["y"]), float(row.get("z", 0.0))), covariance)
+    x, y, z = float(row["x"]), float(row["y"]), float(row.get("z", 0.0))
+    if not max(map(abs, (x, y, z))) < 1e9:
+        raise ValueError(f"{row['id']} is at {x:g}, {y:g}, {z:g}")
+    return Landmark((x, y, z), covariance)
 
 
 def read_covariances(path: Path) -> Array:

@@ -387,7 +387,7 @@ def test_the_gyro_of_an_imu_is_offered_as_a_part_of_odometry(info, capsys):
     offered = shlex.split(" ".join(lines).split("part of odometry: ")[1].split(" what is wrong")[0])
     told, _, err = run([*words[:-2], *offered, "--out", "b_imu"], capsys, code=3)
     assert told["inputs"]["imu"]["used"] > 0
-    assert "stand for a second before the drive" in err  # the bias of the gyro is learnt at rest
+    assert "stand for a second" in err  # the bias of the gyro is learnt at rest
 
 
 def test_corners_without_poses_are_named_with_what_makes_poses_of_them(tmp_path, capsys):

@@ -144,7 +144,7 @@ WORDS = ["", "x", "nan", "inf", "1e400", "1_0", "\u0663", "-1", "9" * 25, "9" * 
 
 def another_word(path, other):
     """One word of a line is another, or a line is there twice; of what is no text, three bytes are others."""
-    rng, content = random.Random(str(path)), path.read_bytes()
+    rng, content = random.Random(path.name), path.read_bytes()
     if path.suffix == ".mcap":
         at = rng.randrange(len(content))
         path.write_bytes(content[:at] + rng.randbytes(3) + content[at + 3 :])

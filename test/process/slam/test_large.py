@@ -71,7 +71,7 @@ def write(file, count, width, *, is_grid):
 
 @pytest.mark.parametrize("shape", ["chain", "grid"])
 def test_G25_a_graph_of_very_many_vertices_is_solved(tmp_path, shape):
-    count = times(10_000, 1_000_000)
+    count = times(20_000, 1_000_000)
     true = write(tmp_path / "large.g2o", count, times(100, 1_000), is_grid=shape == "grid")
     command = [executable("graph_slam"), "optimize", "large.g2o", "--out", "solved.g2o"]
     begun = resource.getrusage(resource.RUSAGE_CHILDREN)
