@@ -167,20 +167,14 @@ def _landmark(row: dict[str, str]) -> Landmark:
     for i, a in enumerate(names):
         for j, b in enumerate(names[i:], start=i):
             covariance[i, j] = covariance[j, i] = float(row[f"cov_{a}{b}"])
-    x, y, z = float(row["x"]), float(row["y"]), float(row.get("z", 0.0))
-    if not max(map(abs, (x, y, z))) < 1e9:
-        raise ValueError(f"{row['id']} is at {x:g}, {y:g}, {z:g}")
-    return Landmark((x, y, z), covariance)
+    at = float(row["x"]), float(row["y"]), float(row.get("z", 0.0))
+    if not max(map(abs, at)) < 1e9:
+        raise ValueError(f"{row['id']} is at {at}")
+    return Landmark(at, covariance)
 
 
 def read_covariances(path: Path) -> Array:
-    """Covariances of a run's ``covariances.csv``, (n, 3, 3) or (n, 6, 6), each in its pose's tangent space.
-
-    Raises
-    ------
-    GraphSlamError
-        It is no such table.
-    """
+    """Covariances of a run's table, (n, 3, 3) or (n, 6, 6), in each pose's tangent space. Raises GraphSlamError."""
     try:
         lines = read_text(path).splitlines()[1:]
         rows = np.array([[float(word) for word in line.split(",")[1:]] for line in lines])

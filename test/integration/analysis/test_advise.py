@@ -201,7 +201,7 @@ def test_what_cannot_be_advised_on_is_refused_in_one_line(straight, tmp_path, to
     (bag := tmp_path / "drive.mcap").touch()
     for words, why in (
         ([tmp_path], "not a run: no config.yaml in it"),
-        ([bag], "not a run: no config.yaml in it; of a recording graph_slam replay"),
+        ([bag], "not a run: no config.yaml in it; graph_slam replay"),
         ([straight, "--survey-sigma", "1e-200"], "is not positive definite"),
     ):
         code, out, err = told("advise", *words)

@@ -49,8 +49,7 @@ def test_P8_who_joins_after_the_drive_gets_path_pose_landmarks_and_graph_and_the
         r.wait_for_node()
         r.settle()
         assert not r.heard["pose"] and not r.heard["tf"], "nothing before the first odometry"
-        drive = Drive()
-        drive.go(r, 250, every=2)
+        (drive := Drive()).go(r, 250, every=2)
         until(lambda: len(r.heard["path_updates"]) > 1, drive.pace(r), "updates of the path, told as it went")
         until(lambda: len(r.heard["landmarks"]) > 1, drive.pace(r), "landmarks on the way")
         assert r.save().success
