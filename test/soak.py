@@ -31,9 +31,9 @@ def guided(name):
 DRIVES = (
     *("advise", *(f"calibration_{name}" for name in ("consistency", "doubt", "random", "space"))),
     *("calibrate", "certificate", "condense", "condense_unnamed", "condensed_maps", "consistency"),
-    *("bad_drives", "displacement", "extreme_fixes", "found_factors", "gyro_drives", "gyro_findings"),
+    *("displacement", "extreme_fixes", "found_factors", "gyro_drives", "gyro_findings"),
     *("determination", "initialization", "maps", "nees", "online_graphs", "planted", "rates", "repair"),
-    *("simulation", "slip", "recordings", "turned_sensor", "uncorrected", "unnamed"),
+    *("simulation", "slip", "recordings", "uncorrected", "unnamed"),
 )
 PROGRAMMES = {
     "lifelong": [

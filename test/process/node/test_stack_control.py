@@ -385,7 +385,7 @@ def test_P15_of_parameters_that_are_set_together_all_or_none_change_and_the_run_
         r.wait_for_node()
         drive, now = Drive(), {name: p.default for name, p in LIVE.items()}
         until(lambda: r.heard["pose"], drive.pace(r), "pose")
-        for _ in range(often(12)):
+        for _ in range(often(5)):
             wanted = {p.name: valid(p, rng) for p in rng.sample(list(LIVE.values()), rng.randrange(1, 5))}
             culprit, value, why = hostile(rng) if rng.random() < 0.6 else ("", None, "")
             asked = list((wanted | {culprit: value} if culprit else wanted).items())

@@ -16,7 +16,6 @@ from graph_slam_ros.slam import Config
 MOST_M = {1: 0.15, 2: 0.15, 3: 0.15, 4: 0.25, 5: 0.15}
 # A robot and so many seconds of it (None: all); make soak has the whole of each.
 ROBOTS = times([(3, 300.0)], [(robot, None) for robot in MOST_M])
-UNNAMED = times([(3, 200.0)], ROBOTS)
 LEAST_ODOMETRY_M, MOST_MAP_M = times((0.3, 0.2), (1.0, 0.12))
 
 
@@ -63,8 +62,9 @@ def poles_and_landmarks(robot, slam):
     return np.loadtxt(SET_7 / "Landmark_Groundtruth.dat")[:, 1:3], moved
 
 
+@pytest.mark.skipif(not times(0, 1), reason="only in make soak")
 @pytest.mark.skipif(not HAS_MRCLAM, reason=WITHOUT_MRCLAM)
-@pytest.mark.parametrize("robot, seconds", UNNAMED)
+@pytest.mark.parametrize("robot, seconds", ROBOTS)
 def test_without_identities_it_is_nearly_as_good_and_no_landmark_is_where_there_is_none(robot, seconds, tmp_path):
     bag = mrclam(robot, tmp_path / "bag", "--ids", "none", seconds=seconds)
     done = replay(bag, tmp_path / "run", Config.from_mapping({"landmarks.association": "joint"}))
