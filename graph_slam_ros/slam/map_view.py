@@ -191,7 +191,8 @@ class MapView(PathView):
         if len(named) < 2 * LEAST or not self.is_solved:
             return None
         at = self._landmarks.map.positions([one.vertex for one in named])
-        return renewed_ids(at, *np.array([(one.first_seen_ns, one.last_seen_ns) for one in named]).T)
+        names, *ends_ns = zip(*((one.name, one.first_seen_ns, one.last_seen_ns) for one in named), strict=True)
+        return renewed_ids(names, at, *map(np.array, ends_ns))
 
     @property
     def calibration(self) -> dict[tuple[str, str], float]:

@@ -80,7 +80,7 @@ class Assignments:
     @property
     def final(self) -> dict[int, Landmark]:
         """The landmarks that have sightings which cannot be taken back, by number."""
-        marks = {k: self._landmarks.known[name] for k, name in self.names.items() if self._landmarks.is_there(name)}
+        marks = {k: self._landmarks.known[name] for k, name in self.names.items() if name in self._landmarks.known}
         return {k: mark for k, mark in marks.items() if len(mark.seen) < mark.sightings}
 
     def fresh(self) -> int:

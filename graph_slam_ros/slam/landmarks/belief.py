@@ -34,7 +34,7 @@ class SolverBelief:
         """
         n, dof = self._space.dimensions, self._space.dof
         position, turn, _ = self._pose(scan)
-        numbers = np.array([k for k, name in names.items() if self._landmarks.is_there(name)], dtype=np.int64)
+        numbers = np.array([k for k, name in names.items() if name in self._landmarks.known], dtype=np.int64)
         points = self._points(numbers, names)
         apart = np.linalg.norm(points - position, axis=1)
         near = np.argsort(apart, kind="stable")[:_MOST_AT_FIRST]
@@ -52,7 +52,7 @@ class SolverBelief:
         """Bring back landmarks of the map that the beam lacks, if something is seen near them."""
         inside = set(beam.ids[0].tolist())
         out = np.array(
-            [k for k, name in names.items() if k not in inside and self._landmarks.is_there(name)], dtype=np.int64
+            [k for k, name in names.items() if k not in inside and name in self._landmarks.known], dtype=np.int64
         )
         if not len(out):
             return

@@ -264,10 +264,6 @@ class Landmarks:
         """Return the names of all landmarks, by their vertices."""
         return {landmark.vertex: name for name, landmark in self.known.items()}
 
-    def is_there(self, name: str) -> bool:
-        """Return whether a landmark is in the graph."""
-        return name in self.known
-
     def positions(self, vertices: Sequence[int]) -> Array:
         """Positions (k, n) of landmarks in map."""
         n = self._space.dimensions
