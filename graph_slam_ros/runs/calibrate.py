@@ -109,9 +109,8 @@ class _Rounds:
 
     Attributes
     ----------
-    found, parameters, refused, fault, is_complete : as of ``Calibrated``
+    found, parameters, refused, fault, is_complete, count (of replays) : as of ``Calibrated``
     named : the setting that is to be made first, if ``refused`` names one
-    count : replays so far
     keyframes : of the last replay of the whole recording
     """
 
@@ -125,7 +124,7 @@ class _Rounds:
         self._config = config.changed({"map.condense": False})  # a fit is of all keyframes
         self._bag, self._inputs, self._words, self._progress = bag, inputs, words, progress
         self._corrected = set[Parameter]()
-        self._kept, self._accepted = dict[str, float | str](), (0, 0)  # by the replay before
+        self._withdrawn = set[Parameter]()
         self._kept, self._accepted = dict[str, float | str](), (0, 0)  # by the replay before
         self._total = sum(bag.topics[topic].count for topic in inputs.by_topic())
 
@@ -149,12 +148,7 @@ class _Rounds:
                 return
 
     def _replayed(self, due: float) -> GraphSlam:
-        """Replay the whole recording; from its beginning where a fit on the way finds something.
-
-        Parameters
-        ----------
-        due : keyframes at which the first of these fits is due, and at twice as many each next one
-        """
+        """Replay the whole recording; anew where a fit after ``due``, 2, 4 times as many keyframes finds more."""
         is_over = False
         while not is_over:
             self.count += 1
@@ -192,23 +186,24 @@ class _Rounds:
         return True
 
     def _set(self, slam: GraphSlam, findings: Iterable[Fitted], *, are_followed: bool) -> bool:
-        """Set what was found. Returns whether it was anything.
+        """Set what was found, withdraw what the whole drive does not bear out. Returns whether it was anything.
 
-        Parameters
-        ----------
-        are_followed : whether a parameter that was set is set again where it is off by its sigma, though not by four
+        With ``are_followed`` a parameter that was set is set again where it is off by its sigma, though not by four.
         """
         values = {
             one.parameter: one.value
             for one in findings
-            if one.verdict == "admitted"
+            if (one.verdict == "admitted" and one.parameter not in self._withdrawn)
             or (are_followed and one.is_determined and one.parameter in self._corrected and abs(one.value) > one.sigma)
         }
         more = slam.found_settings | dict(setting_of(one, values, slam.calibrated) for one in values)
-        self._corrected |= values.keys()
-        is_more = any(self.found.get(name) != value for name, value in more.items())
-        self.found |= more
-        return is_more
+        doubted = {one.parameter for one in findings if are_followed and not one.is_determined} & self._corrected
+        for one in doubted:
+            self.found.pop(setting_of(one, {one: 0.0}, slam.calibrated)[0], None)
+        self._withdrawn |= doubted
+        self._corrected = (self._corrected | values.keys()) - doubted
+        before, self.found = self.found, self.found | more
+        return bool(doubted) or self.found != before
 
     def _fitted(self, slam: GraphSlam) -> list[Fitted]:
         """Fit the parameters of the groups; none where the edges do not determine the estimate."""

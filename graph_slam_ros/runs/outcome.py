@@ -313,7 +313,7 @@ def doubts(summary: Summary) -> Iterator[str]:
 def _uncorrected(summary: Summary) -> Iterator[str]:
     for one in summary.get("uncorrected", ()):
         mend = " ".join(f"--set {shlex.quote(f'{key}={value}')}" for key, value in one["settings"].items())
-        yield f"{one['text']}{mend and ': '}{mend} (graph_slam check BAG compares the causes)"
+        yield f"{one['text']}{mend and ': '}{mend} (graph_slam calibrate BAG compares the causes)"
 
 
 def renewed_text(found: str) -> str:

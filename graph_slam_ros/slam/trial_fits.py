@@ -21,9 +21,9 @@ from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.calibration.choice import parameters_of
 from graph_slam_ros.slam.calibration.decision import Finding, amount, decide
-from graph_slam_ros.slam.calibration.fit import TrialFit, likelier_fit
+from graph_slam_ros.slam.calibration.fit import TrialFit
 from graph_slam_ros.slam.calibration.model import MeasurementModel
-from graph_slam_ros.slam.calibration.parameters import AUTO, FACTORS, Parameter
+from graph_slam_ros.slam.calibration.parameters import AUTO, Parameter
 from graph_slam_ros.slam.calibration.places import fit_with_places
 from graph_slam_ros.slam.calibration.rows import TrialProblem
 from graph_slam_ros.slam.calibration.uncorrected import Uncorrected, is_off, sampled, uncorrected
@@ -80,12 +80,7 @@ class TrialFits:
     # -- trials ------------------------------------------------------------------------------------------------------
 
     def after_solve(self, keyframe: int, *, is_of_everything: bool) -> None:
-        """Start a trial if it is due.
-
-        Parameters
-        ----------
-        is_of_everything : whether all that was measured was solved
-        """
+        """Start a trial if it is due, as it is where all that was measured was solved."""
         driven, is_due = keyframe + 1 - self._first_keyframe, is_of_everything
         if driven == self._config.map.window_keyframes and self._config.condenses:  # later it is of a part
             self._of_whole = self._off(self._trial()())
@@ -120,7 +115,7 @@ class TrialFits:
         """Fit the map as it is now, as of ``GraphSlam.trial_fit``."""
         problem = self._problem()
         wanted = self._parameters(problem, groups, has_gyro=is_to_correct)
-        found = fit_with_places(problem, wanted, LOG_ODDS)[0] if places else likelier_fit(problem, wanted, LOG_ODDS)
+        found = fit_with_places(problem, wanted, LOG_ODDS, has_places=places)[0]
         return found, self._judged(found, is_confirmed=is_to_correct and "factors" not in groups)
 
     def _parameters(
@@ -140,12 +135,7 @@ class TrialFits:
             return None
 
     def _judged(self, found: TrialFit, *, is_confirmed: bool = True) -> list[Finding]:
-        """The finding of each parameter of a fit.
-
-        Parameters
-        ----------
-        is_confirmed : whether landmarks without identities, where most are, merely confirm factors of odometry
-        """
+        """The finding of each parameter; landmarks without identities, where most are, may confirm factors merely."""
         known = [mark.is_unnamed for mark in self._landmarks.known.values() if not mark.is_tentative]
         is_confirmed = is_confirmed and not self._first_keyframe and 2 * sum(known) > len(known)
         return decide(
@@ -187,19 +177,18 @@ class TrialFits:
     def contradicted(self) -> list[str]:
         """Say what each parameter is off by, with its sigma; empty where nothing contradicts the configuration.
 
-        Covariances contain a factor of odometry that noise explains, too: its noise is no worse said by it. But that is
-        no error of the configuration.
+        Covariances contain what is doubted, too, but that is no error of the configuration.
         """
         self._compute()
         found = self._contradicting
         if found is None or self._fits is None:
             return []
-        known = self._fits[0].parameters
+        doubted = self._fits[0].doubted
         values = zip(found.parameters, found.values.tolist(), found.sigmas.tolist(), strict=True)
         return [
             f"{one} {amount(one, value, 3)} (sigma {amount(one, sigma)})"
             for one, value, sigma in values
-            if one in known or one.name not in FACTORS
+            if one not in doubted
         ]
 
     def uncorrected(self) -> list[Uncorrected]:
@@ -235,7 +224,8 @@ class TrialFits:
         self._contradicting = None
         if self._fits is not None:
             chosen, whole = self._fits
-            self._contradicting = whole if any(is_off(chosen, one) for one in self._judged(chosen)) else None
+            is_wrong = chosen.doubted or any(is_off(chosen, one) for one in self._judged(chosen))
+            self._contradicting = whole if is_wrong else None
 
     def _off(self, fits: Fits | None) -> list[Uncorrected]:
         if fits is None or not self._solver.is_current:

@@ -10,7 +10,7 @@ covariance (White, "Maximum likelihood estimation of misspecified models", 1982)
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy import sparse
@@ -48,6 +48,7 @@ class TrialFit:
     column : (vertices,) first row of each vertex in ``sensitivity`` and ``shift``, or -1
     evidence : logarithm of the likelihood of all measurements, whatever unknowns and parameters are, but for a constant
     slips : whether odometry counts for less where slips were found
+    doubted : parameters that something else explains as well: value, sigma, and what
     """
 
     parameters: tuple[Parameter, ...]
@@ -64,6 +65,7 @@ class TrialFit:
     column: Index
     evidence: float
     slips: bool = True
+    doubted: Mapping[Parameter, tuple[float, float, str]] = field(default_factory=dict)
 
     def adds(self, vertex: int, dof: int) -> Array:
         """The covariance (dof, dof) that wrong parameters add to a vertex whose marginal takes them for known.
@@ -95,6 +97,10 @@ class TrialFit:
         """The correction of one parameter; 0 where it was not fitted."""
         return float(self.values[self.parameters.index(parameter)]) if parameter in self.parameters else 0.0
 
+    def sigma(self, parameter: Parameter) -> float:
+        """The sigma of one parameter of the fit."""
+        return float(self.sigmas[self.parameters.index(parameter)])
+
     def worst_correlation(self, k: int) -> tuple[float, Parameter | None]:
         """The largest correlation of a parameter with another one, and that one."""
         row = np.abs(self.correlation[k])
@@ -104,17 +110,9 @@ class TrialFit:
 
 
 def fit(problem: TrialProblem, priors: Mapping[Parameter, float], start: TrialFit | None = None) -> TrialFit:
-    """Fit parameters together with all unknowns of a graph, starting at its estimate.
+    """Fit parameters, with sigmas of their priors, and all unknowns, from the estimate or the outcome of another fit.
 
-    Parameters
-    ----------
-    priors : sigma of each parameter
-    start : the outcome of a fit of the same graph with other parameters: start there
-
-    Raises
-    ------
-    SingularError
-        The edges do not determine the estimate.
+    Raises SingularError if the edges do not determine the estimate.
     """
     return _Fit(problem, priors).run(start)
 
@@ -124,17 +122,7 @@ def likelier_fit(
 ) -> TrialFit:
     """Fit parameters with the slips that were found and, if there are any, without: what is wrong passes for slips.
 
-    Returns the fit of more evidence (MacKay, "Bayesian interpolation", 1992).
-
-    Parameters
-    ----------
-    log_odds : logarithm of the odds of a slip before anything is seen
-    start : as of ``fit``
-
-    Raises
-    ------
-    SingularError
-        The edges do not determine the estimate.
+    Returns the fit of more evidence (MacKay, "Bayesian interpolation", 1992); each slip has these odds beforehand.
     """
     if not problem.slips:
         return fit(problem, priors, start)

@@ -21,13 +21,14 @@ from graph_slam_ros.graph import Graph
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.graph.tables import EdgeTable
 from graph_slam_ros.lie import so3
-from graph_slam_ros.slam.calibration.parameters import OF_ODOMETRY, Parameter
+from graph_slam_ros.slam.calibration.parameters import BEND, OF_ODOMETRY, Parameter
 from graph_slam_ros.slam.frontend.sighting_edges import SightingEdges
 from graph_slam_ros.typing import Array, Index, Numbers
 
 Values = Mapping[Parameter, float]
 _POINTS = ("landmark position", "tag position")
 
+_BEND_RAD = 0.1
 _MOVED_M = 0.01  # of a step: with less, noise is not for its metres
 
 
@@ -162,9 +163,13 @@ class MeasurementModel:
         return edges.roots / self._factors(values) if self.is_noise_measured else edges.roots
 
     def scaled(self, pose: Numbers, values: Values) -> Numbers:
-        """A motion by odometry with other factors."""
-        group = self._space.group
-        out: Numbers = group.exp(tuple(f * x for f, x in zip(self._factors(values), group.log(pose), strict=True)))
+        """A motion by odometry with other factors; that for bends counts by half in a step of ``_BEND_RAD``."""
+        group, n = self._space.group, self._space.dimensions
+        tangent = [f * x for f, x in zip(self._factors(values), group.log(pose), strict=True)]
+        if bend := _of(values, None, (BEND,)).get(BEND, 0.0):
+            turned = abs(tangent[-1])
+            tangent[:n] = [x * (1.0 + bend * turned / (turned + _BEND_RAD)) for x in tangent[:n]]
+        out: Numbers = group.exp(tuple(tangent))
         return out
 
     def _factors(self, values: Values) -> Array:

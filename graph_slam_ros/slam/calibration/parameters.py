@@ -45,6 +45,7 @@ _SCALE = ("%", 100.0, 0.2, 0.03, 0.01, 1e-4)
 QUANTITIES = {
     "distance": Quantity("factors", *_SCALE, "drive 10 m and back in sight of the same landmarks"),
     "turn": Quantity("factors", *_SCALE, "drive a figure of eight, so that the same landmarks are seen after turns"),
+    "bend": Quantity("", "%", 100.0, 0.3, 0.03, 0.01, 1e-4, "drive straight and in bends"),
     "turn_bias": Quantity("turn_bias", "rad/s", 1.0, 0.05, 0.002, 0.001, 1e-4, "drive straight and turn both ways"),
     "clock": Quantity("clock", "s", 1.0, 0.5, 0.03, 0.01, 0.02, "turn on the spot, to and fro, in sight of landmarks"),
     "roll": Quantity("yaw", *_ANGLE, _AHEAD),
@@ -58,11 +59,13 @@ QUANTITIES = {
     ),
     "range_factor": Quantity("range_factor", *_SCALE, "pass landmarks near and far, within one drive"),
 }
-GROUPS = tuple(dict.fromkeys(quantity.group for quantity in QUANTITIES.values()))
+GROUPS = tuple(dict.fromkeys(quantity.group for quantity in QUANTITIES.values() if quantity.group))
 AUTO = "auto"
 """The groups of ``DEFAULT_GROUPS``; where all landmarks have ranges alone, these instead of odometry's distance."""
 FACTORS = ("distance", "turn")
-OF_ODOMETRY = (*FACTORS, "turn_bias")
+BEND = "bend"
+"""What odometry's distance is wrong by in bends alone. No setting corrects it, but other parameters absorb it."""
+OF_ODOMETRY = (*FACTORS, BEND, "turn_bias")
 
 
 @dataclass(frozen=True, slots=True)

@@ -37,14 +37,7 @@ class Between:
 
 
 class EstimatedPath:
-    """Estimated keyframes, and odometry between two of them.
-
-    Parameters
-    ----------
-    stamps_ns : (n,) of keyframes
-    poses : (n, size)
-    segments : keyframes to which odometry does not lead
-    """
+    """Keyframes with stamps (n,) and poses (n, size), and odometry between two of them in a segment."""
 
     def __init__(
         self, space: Geometry, stamps_ns: Index, poses: Array, segments: Sequence[int], track: OdometryTrack

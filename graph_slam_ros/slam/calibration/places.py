@@ -7,7 +7,8 @@ Ranges that are too long by an offset pass for another scale of odometry, too. S
 bearings is fitted as well, without its place: for one that looks ahead the two are one.
 
 Where noise of odometry is as large as its motion, a factor is too small by that alone. So a factor that is off must be
-off, too, in a fit in which noise grows with it. If it is not, nothing is known of it.
+off, too, in a fit in which noise grows with it. If it is not, nothing is known of it. Some robots drive less in bends
+than odometry says, and as much on straights, which other parameters absorb. So where any is off, that is fitted, too.
 """
 
 from collections.abc import Mapping
@@ -17,9 +18,9 @@ import numpy as np
 
 from graph_slam_ros.errors import SingularError
 from graph_slam_ros.slam.calibration.choice import offsets_of, places_of
-from graph_slam_ros.slam.calibration.decision import SIGMAS, is_certain
+from graph_slam_ros.slam.calibration.decision import SIGMAS, amount, is_certain
 from graph_slam_ros.slam.calibration.fit import TrialFit, fit, likelier_fit
-from graph_slam_ros.slam.calibration.parameters import FACTORS, Parameter
+from graph_slam_ros.slam.calibration.parameters import BEND, FACTORS, Parameter
 from graph_slam_ros.slam.calibration.rows import TrialProblem
 
 LEAST_M = 0.2  # errors that last, as a robot that follows its commands late, are up to 0.14 m in recorded drives
@@ -28,27 +29,22 @@ _AGREEING, _PART = 2.0, 1.0 / 3.0  # a factor is off by so many sigmas, and so m
 
 
 def fit_with_places(
-    problem: TrialProblem, priors: Mapping[Parameter, float], log_odds: float, *, is_thorough: bool = True
+    problem: TrialProblem,
+    priors: Mapping[Parameter, float],
+    log_odds: float,
+    *,
+    is_thorough: bool = True,
+    has_places: bool = True,
 ) -> tuple[TrialFit, TrialFit]:
     """Fit parameters as ``likelier_fit`` does, with places or range offsets where one is off by ``LEAST_M`` or more.
 
-    Parameters
-    ----------
-    is_thorough : fit these also where no other parameter is off
-
-    Returns
-    -------
-    That fit, and the one with the places; the same without any, or where that is singular or not asked for.
-
-    Raises
-    ------
-    SingularError
-        The edges do not determine the estimate.
+    These are fitted if ``has_places``, where another parameter is off or if ``is_thorough``. Returns the fit that is
+    said, and the one with the places; the same where there is none. Raises SingularError as ``fit`` does.
     """
     again, places, offsets = replace(problem, graph=problem.graph.copy()), places_of(problem), offsets_of(problem)
     first = found = likelier_fit(problem, priors, log_odds)  # which overwrites the graph of its problem
-    every, used, is_off = found, priors, bool((np.abs(found.values) > SIGMAS * found.sigmas).any())
-    for lengths in (places, offsets) if is_off or is_thorough else ():
+    every, used = found, priors
+    for lengths in (places, offsets) if has_places and (_off(found) or is_thorough) else ():
         if not lengths:
             continue
         wider = {**priors, **dict.fromkeys(lengths, _SIGMA_M)}
@@ -60,23 +56,50 @@ def fit_with_places(
         is_better = found is first or other.evidence > found.evidence
         if is_better and any(abs(other.value(one)) >= LEAST_M and is_certain(other, one) for one in lengths):
             found, used = other, wider
-    return _without_noise(again, found, used), every
+    if _off(found):
+        again = again if found.slips else again.without_slips()
+        found, used = _with_bends(again, found, used)
+        found = _with_noise(again, found, used)
+    return found, every
 
 
-def _without_noise(problem: TrialProblem, found: TrialFit, priors: Mapping[Parameter, float]) -> TrialFit:
-    """The same; or a fit without the factors of odometry that are not off where its noise is of what was measured."""
+def _off(found: TrialFit) -> list[Parameter]:
     far = np.abs(found.values) > SIGMAS * found.sigmas
-    factors = [one for one, is_far in zip(found.parameters, far, strict=True) if is_far and one.name in FACTORS]
+    return [one for one, is_far in zip(found.parameters, far, strict=True) if is_far]
+
+
+def _with_bends(
+    problem: TrialProblem, found: TrialFit, priors: Mapping[Parameter, float]
+) -> tuple[TrialFit, Mapping[Parameter, float]]:
+    """The same with another distance of odometry in bends, where that is off beyond doubt; then no factor mends it."""
+    distance = next((one for one in found.parameters if one.name == "distance"), None)
+    if distance is None:
+        return found, priors
+    bend = Parameter(distance.source, BEND)
+    wider = {**priors, bend: bend.quantity.prior}
+    try:
+        other = fit(replace(problem, graph=problem.graph.copy()), wider, found)
+    except SingularError:
+        return found, priors
+    if bend not in _off(other) or other.evidence <= found.evidence:
+        return found, priors
+    why = {distance: f"in bends it is another, by {amount(bend, other.value(bend))}", bend: "no setting corrects it"}
+    doubted = {one: (other.value(one), other.sigma(one), text) for one, text in why.items()}
+    return replace(other, slips=found.slips, doubted=doubted), wider
+
+
+def _with_noise(problem: TrialProblem, found: TrialFit, priors: Mapping[Parameter, float]) -> TrialFit:
+    """The same with doubt in the factors of odometry that are not off where its noise is of what was measured."""
+    factors = [one for one in _off(found) if one.name in FACTORS and one not in found.doubted]
     if not factors:
         return found
-    problem = problem if found.slips else problem.without_slips()
-    copy = replace(problem, graph=problem.graph.copy(), is_noise_measured=True)
     try:
-        other = fit(copy, priors, found)
-        sigmas = dict(zip(other.parameters, other.sigmas.tolist(), strict=True))
-        parts = {one: other.value(one) / found.value(one) for one in factors}
-        of_noise = {one for one in factors if parts[one] < max(_PART, _AGREEING * sigmas[one] / abs(found.value(one)))}
-        left = {one: prior for one, prior in priors.items() if one not in of_noise}
-        return replace(fit(problem, left, found), slips=found.slips) if of_noise and left else found
+        other = fit(replace(problem, graph=problem.graph.copy(), is_noise_measured=True), priors, found)
     except SingularError:
         return found
+    doubted = {
+        one: (found.value(one), found.sigma(one), "the noise of odometry explains it as well")
+        for one in factors
+        if other.value(one) / found.value(one) < max(_PART, _AGREEING * other.sigma(one) / abs(found.value(one)))
+    }
+    return replace(found, doubted={**found.doubted, **doubted})

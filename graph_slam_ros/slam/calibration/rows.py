@@ -16,7 +16,7 @@ from scipy import sparse
 from graph_slam_ros.graph import Graph, Loss
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.slam.calibration.model import MeasurementModel, OdometryEdges, Sightings, Values, clock_of
-from graph_slam_ros.slam.calibration.parameters import FACTORS, OF_ODOMETRY, Parameter
+from graph_slam_ros.slam.calibration.parameters import BEND, FACTORS, OF_ODOMETRY, Parameter
 from graph_slam_ros.slam.calibration.path import EstimatedPath
 from graph_slam_ros.slam.frontend.odometry_track import OdometryTrack
 from graph_slam_ros.slam.frontend.sighting_edges import SightingEdges
@@ -167,7 +167,7 @@ class _Eyes:
         """The poses of some by odometry since their keyframes."""
         group, moved = self._p.space.group, tuple(self._edges.T_keyframe_base[rows].T)
         for k, one in enumerate(parameters):
-            if one.name in FACTORS:
+            if one.name in (*FACTORS, BEND):
                 self.steps[rows, :, k] = self._scaled_steps(one, moved, values, model)
         own = tuple(self._p.poses(x, self._own[rows]).T)
         return np.stack(group.compose(own, model.scaled(moved, values)), axis=-1)

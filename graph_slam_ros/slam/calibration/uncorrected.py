@@ -85,11 +85,7 @@ def uncorrected(
 ) -> list[Uncorrected]:
     """Return what is off by more than the poses' sigmas allow, the worst first.
 
-    Parameters
-    ----------
-    findings : of each parameter of the fit
-    covariances : (dof, dof) of poses in their tangent space, by vertex
-    sigma_per_m : of odometry's position for each metre, as stated
+    Findings are of each parameter, covariances (dof, dof) of poses by vertex, ``sigma_per_m`` is that of odometry.
     """
     shifts = pose_shifts(found, covariances)
     if sigma_per_m < LEAST_SIGMA_PER_M:
@@ -118,12 +114,7 @@ def is_off(found: TrialFit, one: Finding) -> bool:
 
 
 def clock_jumps(found: TrialFit) -> Iterator[tuple[Parameter, float, float, float, float]]:
-    """Yield the clocks that are not the same in both halves of the drive, beyond a limit and the sigma of either half.
-
-    Yields
-    ------
-    The parameter, its value in either half, the sigma of one, and the limit of their difference [s].
-    """
+    """Yield the clocks that differ in both halves of the drive, with both values, their sigma, and the limit [s]."""
     sigmas = np.sqrt(np.diag(found.covariance))
     for k, one in enumerate(found.parameters):
         before, after, sigma = float(found.first[k]), float(found.second[k]), 2.0**0.5 * float(sigmas[k])

@@ -82,7 +82,7 @@ def _cause(ratio: float | None, name: str) -> str:
     if ratio is not None and -1.0 / _GROSS < ratio < -_GROSS:
         return f"It must be counter-clockwise positive. Correct {mount}: roll pi turns it over"
     if ratio is not None and abs(ratio) < 1.0 - _GROSS:
-        return f"Its axis is not that of the robot, or its driver sends zeros. Correct {mount}"
+        return f"Its axis is not that of the robot, or its driver sends zeros. Correct {mount} (graph_slam check BAG)"
     return f"It must be in rad/s, counter-clockwise positive. Check {mount}, and odometry.turn_factor"
 
 

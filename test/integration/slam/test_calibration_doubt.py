@@ -4,6 +4,7 @@ import pytest
 from imperfect import Faults, driven, imperfect_drive
 from reliability import times
 
+from graph_slam_ros.lie import se2
 from graph_slam_ros.slam import Odometry, Sightings
 
 
@@ -39,10 +40,8 @@ def test_a_drive_without_turns_does_not_determine_the_turn_factor():
 
 
 def test_a_standing_robot_corrects_nothing():
-    still = [
-        Odometry(m.stamp_ns, (0.0, 0.0, 0.0)) if isinstance(m, Odometry) else m
-        for m in imperfect_drive(Faults(), seconds=15.0)
-    ]
+    drive = imperfect_drive(Faults(), seconds=15.0)
+    still = [Odometry(m.stamp_ns, (0.0, 0.0, 0.0)) if isinstance(m, Odometry) else m for m in drive]
     at_once = next(m for m in still if isinstance(m, Sightings))
     same = [m if isinstance(m, Odometry) else Sightings(m.stamp_ns, m.topic, at_once.sightings) for m in still]
     assert not admitted(driven(same))
@@ -70,3 +69,16 @@ def test_a_robot_that_may_slide_does_not_tell_the_yaw_of_its_sensor():
     assert one.verdict == "refused"
     assert "odometry.lateral_density (sideways) is 0.6 of odometry.translation_density" in one.text
     assert "drive 10 m straight past" in one.text
+
+
+def test_another_distance_in_bends_is_named_and_not_taken_for_a_setting():
+    drive, before, at = [], se2.IDENTITY, se2.IDENTITY
+    for m in imperfect_drive(Faults(), seconds=60.0):
+        if isinstance(m, Odometry):
+            x, y, turn = se2.log(se2.between(before, m.T_odom_base))
+            before, far = m.T_odom_base, 1.6 if abs(turn) > 0.02 else 1.0
+            at = se2.compose(at, se2.exp((far * x, far * y, turn)))
+        drive.append(Odometry(m.stamp_ns, at) if isinstance(m, Odometry) else m)
+    slam = driven(drive)
+    assert not admitted(slam) and "not sure" in findings(slam)["distance"].text
+    assert not [one for one in slam.uncorrected() if one.code in ("odometry_scale", "mount_yaw", "mount_place")]
