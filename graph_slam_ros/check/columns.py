@@ -113,6 +113,7 @@ class Columns:
     assumed : parameters that were chosen for the recording, and that nobody has set
     path_ns, path : (m,) and (m, 7) T_odom_base, as a replay uses odometry
     gyro_ns, gyro : (g,) stamps and turn rate about the robot's z [rad/s] of the gyro that is used
+    felt : (g, 6) turn rates [rad/s] and accelerations [m/s^2] about and along the axes of its sensor
     gyro_frame, T_base_gyro : its frame, and where that is on the robot; None where it is not fixed or not known
     """
 
@@ -127,6 +128,7 @@ class Columns:
     assumed: Mapping[str, Any] = field(default_factory=dict)
     gyro_ns: Index = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     gyro: Array = field(default_factory=lambda: np.empty(0))
+    felt: Array = field(default_factory=lambda: np.empty((0, 6)))
     gyro_frame: str = ""
     T_base_gyro: se3.Pose | None = None
     fixes: tuple[FixColumns, ...] = ()
@@ -202,7 +204,7 @@ class Collector:
         self._odometry_ns, self._numbers = array("q"), array("d")
         self._fixes = {name: list[Fix]() for name in self._fixes}
         self._path_ns, self._path = array("q"), array("d")
-        self._gyro_ns, self._gyro = array("q"), array("d")
+        self._gyro_ns, self._gyro, self._felt = array("q"), array("d"), array("d")
 
     def decoder(self, decode: Decoder) -> Decoder:
         """The same decoder, of which the message is remembered until it is collected."""
@@ -238,6 +240,8 @@ class Collector:
             elif isinstance(m, AngularVelocity) and len(self._gyro_ns) < MOST:
                 self._gyro_ns.append(m.stamp_ns)
                 self._gyro.append(m.rate[-1])
+                w, a = message.angular_velocity, message.linear_acceleration
+                self._felt.extend((w.x, w.y, w.z, a.x, a.y, a.z))
             elif isinstance(m, Fix) and len(self._fixes[m.topic]) < MOST:
                 self._fixes[m.topic].append(m)
             elif isinstance(m, Sightings) and m.topic in self._sightings:
@@ -331,6 +335,7 @@ class Collector:
             self._assumed,
             index(self._gyro_ns),
             np.array(self._gyro),
+            np.array(self._felt).reshape(-1, 6),
             self._gyro_frame,
             self._T_base(self._config.gyro_input, self._gyro_frame),
             tuple(self._fixes_of(name, some) for name, some in self._fixes.items()),

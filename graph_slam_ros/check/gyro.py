@@ -1,5 +1,6 @@
 """Checks of a gyro that is used as part of odometry, against odometry's turns."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -11,7 +12,8 @@ from graph_slam_ros.check.finding import Finding, Severity, Where
 from graph_slam_ros.check.pairs import path_of, poses_at
 from graph_slam_ros.formats.parameters import assignment
 from graph_slam_ros.lie import se3, so3
-from graph_slam_ros.typing import Array
+from graph_slam_ros.slam.frontend.gyro import GyroState
+from graph_slam_ros.typing import Array, Numbers
 
 _WINDOW_NS, _LEAST_WINDOWS, _LEAST_SAMPLES = 1_000_000_000, 20, 3
 _TURNING_RAD, _LEAST_TURNING = 0.1, 10
@@ -20,6 +22,7 @@ _OF_NOTHING = 0.2  # of odometry's turns: a gyro that measures none of them, but
 _ROUNDS, _EXPLAINED = 15, 0.5  # of a wrong heading: more than that is left where the gyro alone does not explain it
 _EITHER = ": the track width is wrong, or the scale of the gyro"
 _OF_A_HEADING = ("id_reused", "ids_unsure", "landmark_moved", "map_breaks", "outliers")  # where that is wrong
+_GRAVITY_M_S2 = 9.81
 _MOST_BIAS = 1.0  # [rad/s] that gyro.bias_sigma may be
 
 
@@ -54,13 +57,21 @@ def check_gyro(c: Columns) -> Iterator[Finding]:
         yield Finding("gyro_bias", "warning", bias, limit, "rad/s", text, settings=settings, **where)
 
 
-def _turns(c: Columns) -> tuple[Array, Array]:
-    """The turns [rad] about the robot's z over each second, by odometry and by the gyro."""
+def check_doubted(c: Columns, gyro: GyroState | None) -> Iterator[Finding]:
+    """A gyro that a replay does not use any more, where nothing else is found of it."""
+    if gyro is not None and gyro.state == "doubted" and all(one.severity == "note" for one in check_gyro(c)):
+        topic = c.topic_of(gyro.name)
+        where: Where = {"topic": topic.name if topic else "", "count": len(c.gyro_ns)}
+        yield Finding("gyro_unrelated", "warning", gyro.ratio or 0.0, 1.0, "times", gyro.fault, **where)
+
+
+def _turns(c: Columns, rates: Array | None = None) -> tuple[Array, Array]:
+    """The turns [rad] about the robot's z over each second, by odometry and by the gyro, or by other rates of it."""
     path_ns, path = path_of(c)
     stamp_ns, first = np.unique(c.gyro_ns, return_index=True)
     if len(path_ns) < 2 or len(stamp_ns) < 2:
         return np.empty(0), np.empty(0)
-    rate, began_ns = c.gyro[first], max(path_ns[0], stamp_ns[0])
+    rate, began_ns = (c.gyro if rates is None else rates)[first], max(path_ns[0], stamp_ns[0])
     edges = np.arange(began_ns, min(path_ns[-1], stamp_ns[-1]), _WINDOW_NS)
     if len(edges) < 2:
         return np.empty(0), np.empty(0)
@@ -104,16 +115,32 @@ def _scale(c: Columns, factor: float, where: Where) -> Finding:
             settings = _turned_over(c, c.T_base_gyro)
     elif abs(factor) < _GROSS:
         text += ": another of its axes points upwards, or its driver sends zeros"
+        settings = _upright(c) if c.config.world.dimensions == 2 else ()
     elif abs(factor) > 1.0 / _GROSS:
         text += ": are these degrees?"
     return Finding("gyro_scale", severity, factor, 1.0 + _SCALE, "times", text, settings=settings, **where)
 
 
+def upright(felt: Numbers) -> tuple[float, float]:
+    """Roll and pitch [rad] of a sensor that feels this acceleration in the mean; zeros where that is no gravity."""
+    x, y, z = felt
+    is_gravity = 0.5 < math.hypot(x, y, z) / _GRAVITY_M_S2 < 1.5
+    return (math.atan2(y, z), math.atan2(-x, math.hypot(y, z))) if is_gravity else (0.0, 0.0)
+
+
+def _upright(c: Columns) -> tuple[str, ...]:
+    """The settings by which gravity is upright, if the robot then turns as odometry says. A gyro needs no yaw."""
+    turned = se3.from_xyz_rpy((0.0, 0.0, 0.0, *upright(tuple(c.felt[:, 3:].mean(axis=0))), 0.0))
+    odometry, gyro = _turns(c, c.felt[:, :3] @ so3.matrix(se3.rotation(turned))[2])
+    if c.T_base_gyro is None or abs(_line(odometry, gyro)[0] - 1.0) >= _GROSS:
+        return ()
+    return turned_mount(c.config.gyro_input, c.gyro_frame, (*se3.position(c.T_base_gyro), 0.0, 0.0, 0.0, 1.0), turned)
+
+
 def of_gyro_or_wheels(findings: list[Finding], gyro_input: str) -> list[Finding]:
     """Findings in which landmarks have decided whether a gyro or odometry turns by a wrong amount.
 
-    With a gyro, the heading is that of the gyro. Where the gyro turns k times as much as odometry, and the robot 1 / k
-    times as much as the heading says, odometry is right.
+    The heading is that of the gyro. If that turns k times as much, and the robot 1 / k times, odometry is right.
     """
     gyro = next((one for one in findings if one.code == "gyro_scale" and one.severity == "warning"), None)
     turn = next((one for one in findings if one.code == "turn_scale"), None)

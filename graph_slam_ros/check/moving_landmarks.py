@@ -58,12 +58,7 @@ class LandmarkMotions:
 
 
 def motions_of(s: SightingColumns, pairs: Pairs, path_ns: Index, path: Array, noise_m: float) -> LandmarkMotions:
-    """Return how each landmark moves, by odometry as ``path_of`` has it.
-
-    Parameters
-    ----------
-    noise_m : what two sightings of a landmark differ by, where nothing is wrong
-    """
+    """Return how each landmark moves, by odometry of ``path_of``; two sightings differ by ``noise_m`` in any case."""
     on_ground = pairs.residuals(s.points)
     on_robot = np.linalg.norm((s.points[pairs.b] - s.points[pairs.a])[:, : pairs.dimensions], axis=1)
     of = s.name[pairs.a]

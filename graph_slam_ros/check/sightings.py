@@ -70,12 +70,7 @@ class SightingCollector:
         self._messages = 0
 
     def add(self, m: Sightings, heights: Mapping[str, float]) -> None:
-        """Collect a message.
-
-        Parameters
-        ----------
-        heights : by id: the height of a landmark above the base [m], which sightings in the plane do not have
-        """
+        """Collect a message, with the heights of landmarks above the base [m], by id, which the plane does not have."""
         if len(self.stamp_ns) >= MOST:
             return
         self._messages += 1

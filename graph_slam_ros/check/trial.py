@@ -77,12 +77,7 @@ def replayed(config: Config, measured: Iterable[Measurement]) -> GraphSlam:
 def poses_in_map(
     slam: GraphSlam, stamp_ns: Index, path_ns: Index, path: Array, trajectory: Array | None = None
 ) -> Array:
-    """Estimated poses (k, 7) at stamps; the correction between two keyframes is spread over the time between them.
-
-    Parameters
-    ----------
-    trajectory : poses of the keyframes, instead of those of the estimate
-    """
+    """Poses (k, 7) at stamps by the estimate, or by other poses of keyframes; corrections are spread between two."""
     keyframes = slam.keyframes
     estimate = se3.in_space(slam.trajectory() if trajectory is None else trajectory).reshape(-1, 7)
     own, at_ns = se3.in_space(keyframes.poses).reshape(-1, 7), keyframes.stamps_ns
@@ -143,8 +138,8 @@ def check_trial(c: Columns, slam: GraphSlam) -> Iterator[Finding]:
         name = c.sightings[0].topic
         text = f"{name}: {new}"
         yield Finding("ids_renewed", "warning", new.same, 0, "landmarks", text, name, new.since_ns, new.new)
-    if no_scales:
-        yield Finding("fit_unsure", "note", 1, 0, "fits", f"noise cannot be checked: {no_scales}")
+    text = f"noise cannot be checked: {no_scales}"
+    yield from [Finding("fit_unsure", "note", 1, 0, "fits", text)] if no_scales else []
     for noise in () if off else scales:
         limit = _ODOMETRY_OVER_CONFIDENT if noise.label == "odometry" else _OVER_CONFIDENT
         factor = float(np.sqrt(noise.per_dof))
@@ -185,33 +180,18 @@ def _over_confident(c: Columns, noise: NoiseScale, factor: float, limit: float) 
 
 
 def _is_far_off(fit: TrialFit, one: Fitted, step_s: float) -> bool:
-    """Return whether a parameter is far off by its limit and several sigmas.
-
-    Parameters
-    ----------
-    step_s : between two poses of odometry; what is interpolated between them is no proof of a clock
-    """
-    limit = _LIMITS[one.parameter.name][1]
-    if one.parameter.name == "clock":
-        limit = max(limit, _OF_STEP * step_s)
+    """Return whether a parameter is far off by its limit and several sigmas. Between two poses a clock is no proof."""
+    limit = max(_LIMITS[one.parameter.name][1], _OF_STEP * step_s * (one.parameter.name == "clock"))
     sigmas = _TURN_SIGMAS if one.parameter.name == "turn" else _SIGMAS
     return is_off(fit, one) and abs(one.value) > max(limit, sigmas * one.sigma)
 
 
 def _fitted(c: Columns, slam: GraphSlam, one: Fitted, off: Mapping[Parameter, float]) -> Iterator[Finding]:
-    """A parameter that is far off by its limit and several sigmas, or that the drive does not tell.
-
-    Parameters
-    ----------
-    off : all that are far off
-    """
-    if one.parameter.name not in _LIMITS:
-        return
-    code, (unit, limit, unknown) = CODES[one.parameter.name], _LIMITS[one.parameter.name]
+    """A parameter that is among those that are far off, or that the drive does not tell."""
     topic = c.topic_of(one.parameter.source)
-    if topic is None:
+    if one.parameter.name not in _LIMITS or topic is None:
         return
-    where = _where(topic)
+    code, (unit, limit, unknown), where = CODES[one.parameter.name], _LIMITS[one.parameter.name], _where(topic)
     if one.parameter in off:
         text = f"{topic.name}: {sentence(one.parameter, one.value, one.sigma)}"
         settings = (assignment(*setting_of(one.parameter, off, slam.calibrated)),)
@@ -243,10 +223,7 @@ def _places(
 ) -> list[Finding]:
     """Identities by where the estimate puts them, and sightings that are far from their landmark.
 
-    Parameters
-    ----------
-    late_s : by input: what its stamps are corrected by, since a wrong clock puts landmarks elsewhere in turns
-    slip : the stretch in which odometry does not say where the robot is: sightings in it are left out
+    Stamps are corrected by what inputs are late, and sightings within a slip are left out.
     """
     found: list[Finding] = []
     for s in c.sightings:

@@ -15,6 +15,7 @@ from graph_slam_ros.messages.inputs.landmark_types import APRILTAGS
 from graph_slam_ros.messages.receive_times import clock_offset_s
 from graph_slam_ros.recordings.bag import Bag, BagError, Topic
 from graph_slam_ros.recordings.definitions import recorded_decoder
+from graph_slam_ros.typing import Numbers
 
 _SAMPLED, _EVERY = 2000, 8  # the first messages of each topic; of odometry then every so many
 _MOST_NAMES, _LAGS = 1000, 100  # lags: at least so many of a longer topic
@@ -39,6 +40,7 @@ class TopicContents:
     is_repeated : whether one message has a class id twice
     has_noise : whether the first message tells its covariance
     usable : messages that can be used at all: with a fix, with an orientation
+    felt : sum of the accelerations of an IMU along its axes [m/s^2]
     path_m, off_plane : of odometry and poses: length of the path, and messages above, below or tilted against the first
     """
 
@@ -63,6 +65,7 @@ class TopicContents:
     is_repeated: bool = False
     has_noise: bool = False
     usable: int = 0
+    felt: Numbers = (0.0, 0.0, 0.0)
     path_m: float = 0.0
     off_plane: int = 0
     last_at: tuple[float, float, float] | None = None
@@ -91,13 +94,7 @@ class TopicContents:
 
 @dataclass(slots=True)
 class Recording:
-    """The contents of a recording.
-
-    Attributes
-    ----------
-    topics : by name
-    moving, fixed : frames that move in their parent, and that do not: child to parent
-    """
+    """The contents of a recording: of topics by name; parents of frames that move in them and that do not, by child."""
 
     topics: dict[str, TopicContents]
     moving: dict[str, str] = field(default_factory=dict)
@@ -236,7 +233,8 @@ def _fix(one: TopicContents, m: Any) -> None:
 
 
 def _imu(one: TopicContents, m: Any) -> None:
-    q = m.orientation
+    q, a = m.orientation, m.linear_acceleration
+    one.felt = tuple(total + part for total, part in zip(one.felt, (a.x, a.y, a.z), strict=True))
     is_known = m.orientation_covariance[0] != -1.0 and math.hypot(q.x, q.y, q.z, q.w) > 0.5
     if is_known and not one.usable:
         one.has_noise = bool(m.orientation_covariance[8] > 0.0)

@@ -10,7 +10,7 @@ import numpy as np
 from graph_slam_ros.check.checks import check_columns, with_inputs
 from graph_slam_ros.check.columns import Collector, Columns
 from graph_slam_ros.check.finding import Finding, Severity, in_order, with_one_value
-from graph_slam_ros.check.gyro import of_gyro_or_wheels
+from graph_slam_ros.check.gyro import check_doubted, of_gyro_or_wheels
 from graph_slam_ros.check.moving_landmarks import moving_names, without
 from graph_slam_ros.check.trial import check_trial, replayed
 from graph_slam_ros.errors import GraphSlamError
@@ -135,7 +135,8 @@ def _trial(columns: Columns, measured: list[Measurements]) -> list[Finding]:
     warmup(dimensions=columns.config.world.dimensions)
     try:
         with np.errstate(all="ignore"):
-            return list(check_trial(columns, replayed(columns.config, (m for some in measured for m in some))))
+            slam = replayed(columns.config, (m for some in measured for m in some))
+            return [*check_doubted(columns, slam.gyro), *check_trial(columns, slam)]
     except GraphSlamError as error:
         return [Finding("fit_unsure", "warning", 1, 0, "replays", f"a replay fails: {error}")]
 

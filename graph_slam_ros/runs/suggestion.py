@@ -6,6 +6,7 @@ from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from graph_slam_ros.check.gyro import upright
 from graph_slam_ros.check.noise import ASSUMED_BEARING_RAD, ASSUMED_RANGE_M
 from graph_slam_ros.config.inputs import ASSUMED
 from graph_slam_ros.errors import GraphSlamError
@@ -32,6 +33,7 @@ _CORNERS = re.compile(r"^(?!.*map).*(tag|aruco|fiducial)", re.IGNORECASE)
 _WITHOUT_ID = re.compile(r"/(PoseArray|Detection2DArray)$")
 _OF_ROS = ("/clock", "/rosout", "/parameter_events", "/diagnostics", "/events/write_split", "/robot_description")
 _MOST_LISTED = 6
+_LEVEL_RAD = 0.1  # of a sensor on a robot that may brake or stand on a slope
 _CLOCKS_DIFFER_S = 2.0
 
 
@@ -211,7 +213,9 @@ class Suggestion:
     def _choose_imu(self, found: Iterator[TopicContents], is_needed: bool) -> None:
         for one in sorted(found, key=lambda one: -one.usable):
             names = " ".join([*self.names, "imu"])
-            mount = "" if self._recording.is_linked(one.frame, self._base) else " --set 'imu.mount=0 0 0 0 0 0'"
+            angles = upright(tuple(total / max(one.read, 1) for total in one.felt))
+            turn = " ".join(f"{0.0 if abs(angle) < _LEVEL_RAD else angle:.4g}" for angle in angles)
+            mount = "" if self._recording.is_linked(one.frame, self._base) else f" --set 'imu.mount=0 0 0 {turn} 0'"
             chosen = f"--set 'inputs.names={names}' --set imu.type={IMU} --set imu.topic={one.topic.name}{mount}"
             as_gyro = f"Its gyro as part of odometry: {chosen} --set imu.use=gyro"
             if one.usable < 0.5 * one.read:

@@ -328,17 +328,17 @@ def wrong_gyro(
     late_s: float = option(0.0, "stamped too late by so much", "s", -1e5, 1e5),
     axes: str = option("kept", "which", choices=("kept", "exchanged")),
 ) -> None:
-    """An IMU whose turn rates are wrong."""
-    found = drive.decoded((_IMU,))
-    if not found:
+    """An IMU whose turn rates are wrong, or that lies on its side (axes)."""
+    if not (found := drive.decoded((_IMU,))):
         raise GraphSlamError("wrong_gyro: needs an IMU")
     errors: dict[int, float] = {}
     for m in found:
         w = m.content.angular_velocity
-        rates = (w.x, w.y, w.z) if axes == "kept" else (w.z, w.x, w.y)
+        for v in (w, m.content.linear_acceleration) if axes == "exchanged" else ():
+            v.x, v.y, v.z = v.z, v.x, v.y
         second, error = m.log_ns // NS, noise_rad_s * rng.standard_normal() if noise_rad_s else 0.0
         wrong = bias_rad_s + errors.setdefault(second, error)
-        w.x, w.y, w.z = (factor * rate + wrong for rate in rates)
+        w.x, w.y, w.z = (factor * rate + wrong for rate in (w.x, w.y, w.z))
         m.stamp_ns += round(late_s * NS)
 
 
