@@ -59,6 +59,8 @@ def fit_with_places(
     if _off(found):
         again = again if found.slips else again.without_slips()
         found, used = _with_bends(again, found, used)
+        if found.doubted:
+            every = _with_bends(again, every, dict(zip(every.parameters, every.priors.tolist(), strict=True)))[0]
         found = _with_noise(again, found, used)
     return found, every
 
@@ -72,15 +74,14 @@ def _with_bends(
     problem: TrialProblem, found: TrialFit, priors: Mapping[Parameter, float]
 ) -> tuple[TrialFit, Mapping[Parameter, float]]:
     """The same with another distance of odometry in bends, where that is off beyond doubt; then no factor mends it."""
-    distance = next((one for one in found.parameters if one.name == "distance"), None)
-    if distance is None:
+    if (distance := next((one for one in found.parameters if one.name == "distance"), None)) is None:
         return found, priors
     bend = Parameter(distance.source, BEND)
     wider = {**priors, bend: bend.quantity.prior}
     try:
         other = fit(replace(problem, graph=problem.graph.copy()), wider, found)
     except SingularError:
-        return found, priors
+        other = found
     if bend not in _off(other) or other.evidence <= found.evidence:
         return found, priors
     why = {distance: f"in bends it is another, by {amount(bend, other.value(bend))}", bend: "no setting corrects it"}
@@ -91,10 +92,9 @@ def _with_bends(
 def _with_noise(problem: TrialProblem, found: TrialFit, priors: Mapping[Parameter, float]) -> TrialFit:
     """The same with doubt in the factors of odometry that are not off where its noise is of what was measured."""
     factors = [one for one in _off(found) if one.name in FACTORS and one not in found.doubted]
-    if not factors:
-        return found
+    copy = replace(problem, graph=problem.graph.copy(), is_noise_measured=True)
     try:
-        other = fit(replace(problem, graph=problem.graph.copy(), is_noise_measured=True), priors, found)
+        other = fit(copy, priors, found) if factors else found
     except SingularError:
         return found
     doubted = {
