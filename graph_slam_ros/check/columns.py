@@ -348,7 +348,7 @@ class Collector:
         points = [complex(*m.measured[:2]) if has else complex(np.nan) for m, has in zip(some, has_point, strict=True)]
         sigmas = [m.covariance[0] ** 0.5 for m, has in zip(some, has_point, strict=True) if has]
         kind = some[0].kind if some else ""
-        headings = [np.nan if kind == "position" else _yaw(m.measured, n) for m in some]
+        headings = [np.nan if m.kind == "position" else _yaw(m.measured, n) for m in some]
         return FixColumns(
             name,
             topic,

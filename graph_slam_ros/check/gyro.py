@@ -72,17 +72,18 @@ def _turns(c: Columns, rates: Array | None = None) -> tuple[Array, Array]:
     if len(path_ns) < 2 or len(stamp_ns) < 2:
         return np.empty(0), np.empty(0)
     rate, began_ns = (c.gyro if rates is None else rates)[first], max(path_ns[0], stamp_ns[0])
-    edges = np.arange(began_ns, min(path_ns[-1], stamp_ns[-1]), _WINDOW_NS)
-    if len(edges) < 2:
+    begins = began_ns + np.unique((stamp_ns - began_ns) // _WINDOW_NS) * _WINDOW_NS  # none in a gap of years
+    begins = begins[(begins >= began_ns) & (begins + _WINDOW_NS < min(path_ns[-1], stamp_ns[-1]))]
+    if not len(begins):
         return np.empty(0), np.empty(0)
-    poses = poses_at(edges, path_ns, path)
-    motion = se3.between(tuple(poses[:-1].T), tuple(poses[1:].T))
+    edges = np.stack([begins, begins + _WINDOW_NS])
+    motion = se3.between(*(tuple(poses_at(edge, path_ns, path).T) for edge in edges))
     odometry = so3.log(tuple(motion[3:]))[2] * c.config.odometry.turn_factor
     step_s = np.diff(stamp_ns) * 1e-9
     angle = np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * step_s)])
-    gyro = np.diff(np.interp((edges - began_ns) * 1e-9, (stamp_ns - began_ns) * 1e-9, angle))
-    is_there = np.diff(np.searchsorted(stamp_ns, edges)) >= _LEAST_SAMPLES
-    is_there &= np.diff(np.searchsorted(path_ns, edges)) >= _LEAST_SAMPLES
+    gyro = np.diff(np.interp((edges - began_ns) * 1e-9, (stamp_ns - began_ns) * 1e-9, angle), axis=0)[0]
+    is_there = np.diff(np.searchsorted(stamp_ns, edges), axis=0)[0] >= _LEAST_SAMPLES
+    is_there &= np.diff(np.searchsorted(path_ns, edges), axis=0)[0] >= _LEAST_SAMPLES
     return np.asarray(odometry)[is_there], gyro[is_there]
 
 

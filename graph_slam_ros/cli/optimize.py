@@ -102,9 +102,10 @@ def optimize(args: argparse.Namespace) -> int:
         console.warn(note)
     if not args.json:
         console.then(_after(args, solution))
-    why = f"{solution.doubt}: wrong edges, which --loss cauchy lets go of, or too little noise in the information"
-    lost = console.report_losses(file.losses, [why] if solution.doubt else ())
-    return lost or (console.LOSSES if solution.doubt else code)
+    why = ": wrong edges, which --loss cauchy lets go of, or too little noise in the information"
+    beware = solution.doubt and solution.doubt + why * (report.converged and _loss_text(args.loss) == "none")
+    lost = console.report_losses(file.losses, [beware] if beware else ())
+    return lost or (console.LOSSES if beware else code)
 
 
 def _settings(args: argparse.Namespace, graph: "Graph") -> "Settings":

@@ -136,7 +136,7 @@ class InputConfig:
 
     def numbers(self, key: str, count: int) -> tuple[float, ...]:
         """Numbers of a text; none if it is empty. Raises ConfigError unless there are ``count`` of them."""
-        if getattr(self, key) == ASSUMED:
+        if key == "mount" and self.mount == ASSUMED:
             return (0.0,) * count
         return numbers(f"{self.name}.{key}", getattr(self, key), count)
 

@@ -20,7 +20,7 @@ def refuse_other_space(one: GraphSlam, two: GraphSlam, a: Path, b: Path) -> None
 
 
 def shared_landmarks(one: GraphSlam, two: GraphSlam) -> list[str]:
-    """The landmarks with the same id in both, but for old places of those that moved."""
+    """The landmarks with the same id in both, without unnamed ones."""
     named = [{name for name, mark in slam.landmarks.items() if not mark.is_unnamed} for slam in (one, two)]
     return [name for name in one.landmarks if name in named[0] & named[1]]
 

@@ -55,7 +55,7 @@ def _check(one: Any, **sizes: tuple[int, ...]) -> None:
                 object.__setattr__(one, name, value)
             if value is not None and (len(value) not in sizes[name] or not all(map(math.isfinite, value))):
                 raise ValueError
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         right = f"{' or '.join(map(str, sizes[name]))} finite numbers" if name in sizes else "whole nanoseconds"
         raise FormatError(f"{type(one).__name__}: {name} {value!r}: it must be {right}") from None
 

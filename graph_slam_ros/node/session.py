@@ -218,8 +218,13 @@ class Session:
             return
         self._warn("output.folder", "the run folder was removed: it is made again, with the map as it is")
         with self._accepting:
-            self._recorder.abandon()
-            self._recorder = RunRecorder(self._recorder.folder, self.slam.config, _SYNC_S, self.slam, force=True)
+            folder, before, self._recorder = self._recorder.folder, self._recorder, None
+            before.abandon()
+            try:
+                self._recorder = RunRecorder(folder, self.slam.config, _SYNC_S, self.slam, force=True)
+            except GraphSlamError as error:
+                self.recording_fails = True
+                self._warn("output.folder", f"recording was stopped: {error}")
             self._is_saved = False
 
     # -- services ----------------------------------------------------------------------------------------------------

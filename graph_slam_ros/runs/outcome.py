@@ -114,9 +114,9 @@ def noise(summary: Summary) -> Iterator[str]:
             unknown.append(f"{name} ({one['reason']})")
         else:
             grows = ", more in motion" if one["per_rad"] > 0.0 or one["per_m"] > 0.0 else ""
-            known.append(f"{name} {one['factor']:.2f} times{grows}")
+            known.append(f"{name} {one['factor']:.2f}{grows}")
     if known:
-        yield from _wrapped(f"noise      by the residuals, sigmas to the configured ones: {'; '.join(known)}", 11)
+        yield from _wrapped(f"noise      by the residuals, times the configured sigmas: {'; '.join(known)}", 11)
     if unknown:
         yield from _wrapped(f"noise      as configured: {', '.join(unknown)}", 11)
 

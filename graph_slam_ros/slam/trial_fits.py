@@ -35,6 +35,7 @@ from graph_slam_ros.typing import Array, Executor, Index
 
 FIRST_DUE = 50  # keyframes
 _DIGITS = 12  # of an added variance: the last ones of a sine depend on the machine
+_DONE_IN = 20  # keyframes, in which a trial is done in the background: fewer than until anything is condensed
 _MOST_POSES = 100  # whose covariances say whether what is not corrected matters
 
 Fits = tuple[TrialFit, TrialFit]
@@ -74,7 +75,8 @@ class TrialFits:
         self._contradicting: TrialFit | None = None
         self._fits_so_far: Fits | None = None
         self._so_far: list[Uncorrected] = []
-        self._of_whole: list[Uncorrected] = []  # before anything was condensed
+        self._whole: Trial | None = None  # before anything is condensed
+        self._of_whole: list[Uncorrected] = []  # what it found
         self._of_edges = -1  # the map that the newest trial of everything was of
 
     # -- trials ------------------------------------------------------------------------------------------------------
@@ -82,8 +84,11 @@ class TrialFits:
     def after_solve(self, keyframe: int, *, is_of_everything: bool) -> None:
         """Start a trial if it is due, as it is where all that was measured was solved."""
         driven, is_due = keyframe + 1 - self._first_keyframe, is_of_everything
-        if driven == self._config.map.window_keyframes and self._config.condenses:  # later it is of a part
-            self._of_whole = self._off(self._trial()())
+        window = self._config.map.window_keyframes
+        if driven == window and self._config.condenses:  # later it is of a part
+            self._whole = self._guarded(lambda: self._executor(self._trial()))
+        if self._whole is not None and driven >= window + _DONE_IN:
+            self._of_whole, self._whole = self._off(self._whole()), None
         if self._backend.holds_back or not (is_due or driven >= self._due):
             return
         while not is_due and driven >= self._due:

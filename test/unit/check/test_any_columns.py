@@ -7,7 +7,7 @@ import pytest
 from reliability import times
 
 from graph_slam_ros.check.checks import check_columns
-from graph_slam_ros.check.columns import Columns, Link, OdometryColumns, TopicColumns
+from graph_slam_ros.check.columns import Columns, FixColumns, Link, OdometryColumns, TopicColumns
 from graph_slam_ros.check.finding import KINDS, SEVERITIES
 from graph_slam_ros.check.sightings import SightingColumns
 from graph_slam_ros.cli.check import lines
@@ -90,9 +90,11 @@ def columns(seed):
         counters.count(str(rng.choice(["odom", "detections", "tf"])), str(reason), int(rng.integers(1, 500)))
     links = tuple(Link(pick(), pick(), bool(rng.integers(2))) for _ in range(rng.integers(0, 6)))
     assumed = {"detections.offset_s": -2.5, "detections.mount": "0 0 0 0 0 0", "odom.mount": "0 0 0 0 0 0"}
+    fixes_ns, parts = stamps(rng, n), 10.0 * rng.normal(size=(3, n))  # some of them years from the others
+    fixes = FixColumns("gps", "/gps", fixes_ns, parts[0] + 1j * parts[1], parts[2], 0.1, pick(), se3.IDENTITY)
     return Columns(
         config, topics, o, odometry_ns, path, (seen,), links, counters,
-        assumed if rng.random() < 0.3 else {},
+        assumed if rng.random() < 0.3 else {}, fixes=(fixes,),
     )  # fmt: skip
 
 
