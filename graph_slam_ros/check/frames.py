@@ -63,16 +63,8 @@ def _of_sensor(c: Columns, s: SightingColumns) -> Iterator[Finding]:
         yield Finding("seen_in_fixed_frame", severity, topic.frames[fixed[0]], 0, "messages", text, **where)
     elif f"{s.input}.frame" in c.assumed:
         text = f"{s.topic}: no transform has {next(iter(topic.frames))}: did you mean {s.frame}?"
-        yield Finding(
-            "frame_unlinked",
-            "error",
-            1,
-            0,
-            "frames",
-            text,
-            settings=(assignment(f"{s.input}.frame", s.frame),),
-            **where,
-        )
+        where["settings"] = (assignment(f"{s.input}.frame", s.frame),)
+        yield Finding("frame_unlinked", "error", 1, 0, "frames", text, **where)
     elif next((one.mount for one in c.config.sources if one.name == s.input), "") == ASSUMED:
         named = next(filter(None, topic.frames), "") or "its sensor, whose messages name no frame,"
         text = f"{s.topic}: no transform links {named} to {c.config.frames.base}: a place at the base is assumed"

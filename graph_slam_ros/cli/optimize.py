@@ -81,8 +81,7 @@ def optimize(args: argparse.Namespace) -> int:
         raise GraphSlamError(f"{args.graph}: a run folder; its graph is {args.graph / GRAPH}")
     how: dict[str, Any] = {"lenient": args.lenient, "raw": args.information == "raw", "dialect": args.source}
     file = read_g2o(args.graph, error_map=args.error_map, **how)
-    graph = file.graph
-    settings = _settings(args, graph)
+    graph, settings = file.graph, _settings(args, file.graph)
     solution = solve(file, settings, init=args.init)
     solver, report, start = solution.solver, solution.report, solution.start
     certified = later("tools.certificate.command", "certified")

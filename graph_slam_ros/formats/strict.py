@@ -78,10 +78,8 @@ def _bounded(stream: Any, path: Path, most: int | None) -> Iterator[tuple[int, s
 
 def foreign(path: Path) -> str:
     """Return what else a file is, and what mends that; empty where its first bytes do not tell."""
-    if is_gzipped(path):
-        return ": an archive: tar xf" if ".tar." in path.name else ""
     with opened(path, follow=True) as raw:
-        begins = raw.read(64)
+        begins = b"" if is_gzipped(path) else raw.read(64)
     return next((f": {what}" for magic, what in _FOREIGN.items() if begins.startswith(magic)), "")
 
 

@@ -89,8 +89,7 @@ class Session:
         self._resumption: Resumption | None = None
         self._unseen, self._weakest = UnseenWay(self.loaded_keyframes, slam.landmark_changes), WeakestLandmark()
         self._slowest_s = 0.0
-        self._fit, self._fitted_at, self._fit_due_s = float("nan"), 0, 0.0
-        self._doubted = ""
+        self._fit, self._fitted_at, self._fit_due_s, self._doubted = float("nan"), 0, 0.0, ""
 
     @property
     def incomplete(self) -> list[Path]:
@@ -218,14 +217,10 @@ class Session:
             return
         self._warn("output.folder", "the run folder was removed: it is made again, with the map as it is")
         with self._accepting:
-            folder, before, self._recorder = self._recorder.folder, self._recorder, None
-            before.abandon()
-            try:
-                self._recorder = RunRecorder(folder, self.slam.config, _SYNC_S, self.slam, force=True)
-            except GraphSlamError as error:
-                self.recording_fails = True
-                self._warn("output.folder", f"recording was stopped: {error}")
-            self._is_saved = False
+            self._recorder.abandon()
+            folder, self._recorder, self._is_saved, self.recording_fails = self._recorder.folder, None, False, True
+            self._recorder = RunRecorder(folder, self.slam.config, _SYNC_S, self.slam, force=True)
+            self.recording_fails = False
 
     # -- services ----------------------------------------------------------------------------------------------------
 

@@ -84,10 +84,9 @@ class TrialFits:
     def after_solve(self, keyframe: int, *, is_of_everything: bool) -> None:
         """Start a trial if it is due, as it is where all that was measured was solved."""
         driven, is_due = keyframe + 1 - self._first_keyframe, is_of_everything
-        window = self._config.map.window_keyframes
-        if driven == window and self._config.condenses:  # later it is of a part
+        if driven == self._config.map.window_keyframes and self._config.condenses:  # later it is of a part
             self._whole = self._guarded(lambda: self._executor(self._trial()))
-        if self._whole is not None and driven >= window + _DONE_IN:
+        if self._whole is not None and driven >= self._config.map.window_keyframes + _DONE_IN:
             self._of_whole, self._whole = self._off(self._whole()), None
         if self._backend.holds_back or not (is_due or driven >= self._due):
             return
@@ -204,10 +203,8 @@ class TrialFits:
 
     def _with_whole(self, now: list[Uncorrected]) -> list[Uncorrected]:
         """Add what was found before anything was condensed, and the window that is left does not show."""
-        known, whole = (
-            {(one.code, one.source) for one in now},
-            self._of_whole * bool(self._frontend.path.keyframes.first),
-        )
+        known = {(one.code, one.source) for one in now}
+        whole = self._of_whole * bool(self._frontend.path.keyframes.first)
         return now + [one for one in whole if (one.code, one.source) not in known]
 
     def uncorrected_so_far(self) -> Sequence[Uncorrected]:

@@ -14,8 +14,6 @@ from graph_slam_ros.measurements.types import Control, Measured, Odometry, Sight
 
 _SURE_NS, _SURE = 1_000_000_000, 3  # of stamps, and messages: a burst that was held up is shorter
 _AGAIN_NS = 10_000_000_000  # of stamps: an older stamp that came within this time is a repetition, and no jump
-
-
 _UNUSUAL = 3.0  # times the motion before: odometry does not go on from there
 _GOES_ON, _APART_M = 0.5, 0.05  # of the way to where odometry was at that stamp; less is no motion to tell by
 Jump: TypeAlias = Literal["time_jump", "clock_step"]

@@ -60,7 +60,6 @@ class Assignments:
 
     def __init__(self, landmarks: Landmarks, counters: Counters, hand_over: Callable[[], None]) -> None:
         self._landmarks, self._counters, self._hand_over = landmarks, counters, hand_over
-        self._give_up_ns = _GIVE_UP_NS
         self.given: list[int] = []
         self.names: dict[int, str] = {}
         self.seen: list[tuple[Seen, ...]] = []
@@ -189,7 +188,7 @@ class Assignments:
             is_sure |= len(mark.seen) < mark.sightings and not mark.is_tentative  # some cannot be taken back any more
             if is_sure == mark.is_tentative:
                 self._landmarks.confirm(name, is_sure=is_sure)
-            if not is_sure and now_ns - mark.last_seen_ns > self._give_up_ns:
+            if not is_sure and now_ns - mark.last_seen_ns > _GIVE_UP_NS:
                 self._landmarks.prune(name)
                 self._given_up[number] = [cluster for cluster, k in enumerate(self.given) if k == number]
                 self._counters.count("landmarks", "given_up")

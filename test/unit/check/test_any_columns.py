@@ -90,12 +90,10 @@ def columns(seed):
         counters.count(str(rng.choice(["odom", "detections", "tf"])), str(reason), int(rng.integers(1, 500)))
     links = tuple(Link(pick(), pick(), bool(rng.integers(2))) for _ in range(rng.integers(0, 6)))
     assumed = {"detections.offset_s": -2.5, "detections.mount": "0 0 0 0 0 0", "odom.mount": "0 0 0 0 0 0"}
-    fixes_ns, parts = stamps(rng, n), 10.0 * rng.normal(size=(3, n))  # some of them years from the others
-    fixes = FixColumns("gps", "/gps", fixes_ns, parts[0] + 1j * parts[1], parts[2], 0.1, pick(), se3.IDENTITY)
-    return Columns(
-        config, topics, o, odometry_ns, path, (seen,), links, counters,
-        assumed if rng.random() < 0.3 else {}, fixes=(fixes,),
-    )  # fmt: skip
+    x, y, yaw = 10.0 * rng.normal(size=(3, n))  # at stamps of which some are years from the others
+    fixes = FixColumns("gps", "/gps", stamps(rng, n), x + 1j * y, yaw, 0.1, pick(), se3.IDENTITY)
+    chosen = assumed if rng.random() < 0.3 else {}
+    return Columns(config, topics, o, odometry_ns, path, (seen,), links, counters, chosen, fixes=(fixes,))
 
 
 @pytest.mark.filterwarnings("error")
