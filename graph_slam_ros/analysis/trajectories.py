@@ -19,7 +19,7 @@ from graph_slam_ros.messages.inputs.fixes import east_north_up
 from graph_slam_ros.recordings.bag import Bag, open_bag
 from graph_slam_ros.recordings.definitions import recorded_decoder
 from graph_slam_ros.runs.folder import is_run
-from graph_slam_ros.runs.trajectory import Point, Trajectory, read_tum, trajectory
+from graph_slam_ros.runs.trajectory import MOST, Point, Trajectory, read_tum, trajectory
 from graph_slam_ros.typing import Array
 
 TRUTH_TOPIC = "/ground_truth"
@@ -94,7 +94,7 @@ def read_truth(truth: str | Path, topic: str = "", not_these: Collection[str] = 
         raise GraphSlamError(f"{path}: no topic {name} of poses; {_listed(bag)}{did_you_mean(name, bag.topics)}")
     kind = bag.topics[name].type
     rows = _transforms(bag, path, name, frames) if kind == _TF else list(_rows(bag, name, kind))
-    finite = [row for row in rows if all(map(math.isfinite, row[1]))]
+    finite = [row for row in rows if np.abs(row[1]).max() < MOST]
     if len(finite) < len(rows):
         bag.losses.append(f"{len(rows) - len(finite)} of {len(rows)} poses on {name} are not finite")
     if not finite:

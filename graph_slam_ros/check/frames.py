@@ -87,8 +87,9 @@ def _unlinked(c: Columns, known: set[str]) -> Iterator[Finding]:
         text = f"{topic.name}: {times} measurements are refused: no transform links frame {lost} to {base}"
         settings = _place(c, source, frames, lost, "odom_frame_unknown" in counts)
         if frames == ("",):
-            text = f"{topic.name}: {times} measurements are refused: they name no frame (header.frame_id of the driver)"
-            settings = ()
+            text = f"{topic.name}: {times} measurements name no frame: have their driver fill in header.frame_id"
+            yield Finding("frame_empty", "error", times, 0, "measurements", text, topic.name, 0, times)
+            continue
         elif linked and lost:  # at a mount, what another robot sees would be seen by this one
             text += f"; the others are of {others}: is it another robot's frame, or a sensor without a transform?"
             settings = ()
@@ -102,7 +103,7 @@ def _unlinked(c: Columns, known: set[str]) -> Iterator[Finding]:
     if key in c.assumed:
         named = c.odometry.child or "its child frame, which is empty,"
         text = f"{c.odometry.topic}: no transform links {named} to {c.config.frames.base}: one place is assumed"
-        setting = assignment(key, c.assumed[key])
+        setting = assignment(key, assumed_mount(""))
         yield Finding("frame_unlinked", "warning", 1, 0, "frames", text, c.odometry.topic, settings=(setting,))
 
 

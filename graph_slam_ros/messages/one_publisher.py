@@ -142,10 +142,7 @@ class OnePublisher:
         return next((k for k, m in enumerate(run) if not self._goes_on(m)), len(run))
 
     def _goes_on(self, m: Odometry) -> bool:
-        """Return whether a message, now part of it, goes on with the only track, soon and where it leads.
-
-        This is what ``_follow_publisher`` does of nearly all messages, without the questions that have one answer then.
-        """
+        """Return whether a message, now part of it, goes on with the only track: the quick answer for nearly all."""
         if len(self._tracks) != 1 or self._held or self._leap.holds or self._labels > _MOST_LABELS:
             return False
         used = self._tracks[0]
@@ -171,7 +168,11 @@ class OnePublisher:
             self._tracks.append(_Track(m.source))
         used = self._tracks[0]
         if used.past and m.stamp_ns < used.newest_ns - _BACK_NS:  # its place is decided by the order of stamps
-            return [m]
+            others = (track for track in self._tracks if track.is_established)
+            if used.misfit(m) <= 1.0 or all(track.misfit(m) > 1.0 for track in others):
+                return [m]
+            self._refuse()
+            return []
         track = self._continued(m)
         track.add(m)
         if track is used:

@@ -4,6 +4,7 @@ import re
 from collections.abc import Iterator
 from typing import Any
 
+from graph_slam_ros.config.inputs import ASSUMED
 from graph_slam_ros.messages.from_msg import TRANSFORMS
 from graph_slam_ros.messages.inputs.landmark_types import LANDMARK_TYPES
 from graph_slam_ros.messages.inputs.transforms import MAP_FRAMES
@@ -140,14 +141,11 @@ class OdometryChoice:
         elif parent != self.odom:
             self.settings["frames.odom"] = self.odom = parent
         if not child:
-            self.settings["odom.mount"] = "0 0 0 0 0 0"
+            self.settings["odom.mount"] = ASSUMED
             self.notes.append("odometry names no child frame: that of the robot's base is assumed")
         elif base := self._unlinked_base(child):
-            self.settings["odom.mount"] = "0 0 0 0 0 0"
-            self.notes.append(
-                f"no transform links {child}, which odometry names, to {base}, which carries the sensors: "
-                "they are taken for one place (odom.mount)"
-            )
+            self.settings["odom.mount"] = ASSUMED
+            self.notes.append(f"no transform links {child}, which odometry names, to {base}: one place is assumed")
             if base != self.base:
                 self.settings["frames.base"] = self.base = base
         elif child != self.base:

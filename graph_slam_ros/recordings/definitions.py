@@ -39,12 +39,9 @@ def recorded_decoder(topic: Topic) -> Decoder:
         Another encoding than CDR, a definition that cannot be parsed, or one that lacks a field we read.
     """
     if topic.encoding == "ros1":
-        is_empty = not topic.definition.strip()
-        raise BagError(
-            f"topic {topic.name}: its definition of {topic.type} in the recording is "
-            f"{'empty, and none of ours has its md5sum' if is_empty else 'unusable'}: write the bag again with the "
-            "rosbag API where that package is installed"
-        )
+        why = "unusable" if topic.definition.strip() else "empty, and none of ours has its md5sum"
+        mend = "write the bag again with the rosbag API where that package is installed"
+        raise BagError(f"topic {topic.name}: its definition of {topic.type} in the recording is {why}: {mend}")
     if topic.encoding != "cdr":
         raise BagError(f"topic {topic.name}: messages are encoded as {topic.encoding!r}: record them in ROS")
     if not topic.definition and topic.type in _OLDER:

@@ -34,9 +34,11 @@ def contents(path: Path) -> Contents:
     """Read the topics. Raises FormatError if it is no rosbag2 file, or if its topics cannot be read."""
     try:
         with closing(_connection(path)) as database:
-            kinds = dict(database.execute("SELECT name, type FROM sqlite_master WHERE name IN ('topics', 'messages')"))
-            if kinds != {"topics": "table", "messages": "table"}:
-                raise FormatError(f"{path}: not a readable recording: no tables of rosbag2 in it")
+            kinds = dict(database.execute("SELECT name, type FROM sqlite_master WHERE type IN ('table', 'view')"))
+            if not kinds.get("topics") == kinds.get("messages") == "table":
+                rtabmap = "a map of RTAB-Map: rtabmap-databaseViewer exports its graph as g2o"
+                why = rtabmap if {"Node", "Link"} <= kinds.keys() else "no tables of rosbag2 in it"
+                raise FormatError(f"{path}: not a readable recording: {why}")
             for table in ("topics", "messages", "message_definitions"):
                 _refuse_computed(database, path, table)
             rows = database.execute("SELECT id, name, type, serialization_format FROM topics").fetchall()

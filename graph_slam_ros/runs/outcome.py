@@ -223,8 +223,9 @@ def shortcomings(summary: Summary) -> Iterator[str]:
             )
         if (count := summary["counters"].get(name, {}).get("frozen", 0)) > 2:
             yield f"{name}: {explain('frozen').meaning} ({count} times): {remedy(name, 'frozen')}"
-    for name in (name for name, counted in summary["counters"].items() if counted.get("mount_assumed")):
-        yield f"{name}: no transform has the place of its sensor, and one is assumed: {remedy(name, 'mount_assumed')}"
+    for name, counted in summary["counters"].items():
+        for why in {"mount_assumed", "mount_unknown"} & counted.keys():
+            yield f"{name}: no transform has the place of its sensor, and one is assumed: {remedy(name, why)}"
     yield from _gyro_faults(summary)
     yield from association_faults(summary.get("association", {}))
     if not sum(counts["believed"] or 0 for counts in inputs.values()):

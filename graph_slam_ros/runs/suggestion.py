@@ -263,10 +263,8 @@ class Suggestion:
             self.notes.append(f"{topic} names no frame: have the driver of the camera fill in header.frame_id")
             return {}
         if frame in (self._odom, *MAP_FRAMES):
-            self.notes.append(
-                f"{topic} is given in {frame}, a frame that does not move with the robot: publish it in the sensor's "
-                "frame, no setting mends that"
-            )
+            why = f"{topic} is given in {frame}, a frame that does not move with the robot"
+            self.notes.append(f"{why}: publish it in the sensor's frame, no setting mends that")
             return {"mount": ASSUMED}
         where = "at the base, looking ahead" if "optical" in frame else "at the base"
         self.notes.append(

@@ -16,6 +16,7 @@ from graph_slam_ros.typing import Array
 
 _SEPARATED = re.compile(r"[\s,;]+")
 _NANOSECONDS = 1e14  # no seconds are so many
+MOST = 1e20  # a number of a path is smaller: the squares of larger ones are not finite
 _NAMES = (
     r"t|time.*|stamp.*|sec.*",
     *(rf"(?:[pt]|[pt].*[._])?{axis}" for axis in "xyz"),
@@ -115,10 +116,10 @@ def read_rows(path: Path, *, follow: bool = False) -> Trajectory:
             raise GraphSlamError(f"{path}:{number}: {error}") from None
         if columns and len(row) > max(columns):
             row = [row[k] for k in columns]
-        if len(row) != 8 or not np.isfinite(row).all():
+        if len(row) != 8 or not np.abs(row).max() < MOST:
             why = "; 12 are KITTI's, without stamps: evo_traj kitti --save_as_tum adds them" if len(row) == 12 else ""
             why = "; are these decimal commas? sed 's/,/./g'" if len(line.split()) == 8 < len(row) else why
-            raise GraphSlamError(f"{path}:{number}: a row of a TUM file is eight finite numbers{why}")
+            raise GraphSlamError(f"{path}:{number}: a row of a TUM file is eight finite numbers below {MOST:.0e}{why}")
         found.append(row)
     if not found:
         raise GraphSlamError(f"{path}: no pose in it")

@@ -183,7 +183,7 @@ def _named(source: InputContext, child: str) -> str:
     if child.startswith("/"):
         source.count("frame_slash_stripped")
         child = child[1:]
-    if not child and not source.has_mount:
+    if not child and not source.settings.mount:
         raise MessageError("frame_empty")
     return child
 

@@ -109,11 +109,6 @@ class InputContext:
             raise MessageError("frame_empty")
         return name
 
-    @property
-    def has_mount(self) -> bool:
-        """Return whether the pose of its frame on the robot is configured."""
-        return self._mount is not None
-
     def T_base(self, frame: str, stamp_ns: int) -> se3.Pose:
         """Return the pose of a frame on the robot, by TF, else as configured.
 
@@ -180,6 +175,8 @@ class InputContext:
         found = self.transforms.lookup(self.config.frames.base, child) if child else None
         if found is None:
             found = self._mount if self._mount is not None or child else se3.IDENTITY
+            if self.settings.mount == ASSUMED:
+                self.count("mount_assumed")
         if found is None:
             raise self._not_linked("child_frame_unknown", child, self.config.frames.base)
         return found

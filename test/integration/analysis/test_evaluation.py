@@ -251,9 +251,9 @@ def test_an_unknown_topic_is_refused_with_those_that_exist(run, tmp_path):
     "text, reason",
     [
         ("", "no pose in it"),
-        ("# only a comment\n", "no pose in it"),
         ("1 2 3\n", "eight finite numbers"),
         ("1 2 3 0 0 0 nan 1\n", "eight finite numbers"),
+        ("1 1e155 3 0 0 0 0 1\n", "eight finite numbers below 1e.20"),
         ("1 two 3 0 0 0 0 1\n", "two"),
         ("1 2 3 0 0 0 0 0\n", "a quaternion of zeros"),
     ],

@@ -233,15 +233,12 @@ OFFERED = {
     ),
     "received at another time": ([("/odom", ODOM, odom(**EARLY)), tags(**EARLY)], [], [], 3),
     "single tags": ([ODOMETRY, *(tag(n, where) for n, where in enumerate(PLACES.values()))], [], [], 3),
-    **{
-        f"odometry of a frame that is not linked to {base}": (
-            [static(base), ("/odom", ODOM, odom(child="chassis")), tags(frame="camera")],
-            ["odom.mount=0 0 0 0 0 0"],
-            [f"note: no transform links chassis, which odometry names, to {base}"],
-            3,
-        )
-        for base in ("base_link", "robot1/base_footprint")
-    },
+    "odometry of a frame that is not linked": (
+        [static("robot1/base_footprint"), ("/odom", ODOM, odom(child="chassis")), tags(frame="camera")],
+        ["odom.mount=assumed"],
+        ["note: no transform links chassis, which odometry names, to robot1/base_footprint"],
+        3,
+    ),
     **{
         f"clouds of {' and '.join(fields)}": (
             [ODOMETRY, ("/beacons", CLOUD, beacons(*fields, frame="base_link"))],

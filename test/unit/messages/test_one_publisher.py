@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 from live_drive import TAGS, Drive
@@ -107,8 +108,18 @@ def test_an_outlier_is_left_out():
     used = driven(20)
     outlier = Odometry(used[50].stamp_ns + 10**7, (90.0, 0.0, 0.0), None, "odom")
     p = Publisher().hear([*used[:51], outlier, *used[51:]]).end()
-    assert p.used == used
-    assert p.refused == 1
+    assert (p.used, p.refused) == (used, 1)
+
+
+def test_a_late_message_of_another_publisher_is_not_used_and_one_of_the_own_is():
+    """Of each, those of half a second come after all others of the time until then."""
+    own, other = driven(20), driven(20, offset=(8.0, -3.0, 1.0), late_s=0.013, begin=1.0)
+    for late in (own, other):
+        held = {id(m) for m in late if NS * 6 < m.stamp_ns < NS * 6.5}
+        heard = sorted(mixed(own, other), key=lambda m: NS * 6.6 if id(m) in held else m.stamp_ns)
+        p = Publisher(timeout_s=5.0).hear(heard).end()
+        assert sorted(m.stamp_ns for m in p.used) == [m.stamp_ns for m in own]
+        assert p.refused == len(other)
 
 
 def test_noise_of_two_centimetres_and_crowded_stamps_and_fast_robots_are_no_other_publisher():
@@ -118,15 +129,11 @@ def test_noise_of_two_centimetres_and_crowded_stamps_and_fast_robots_are_no_othe
         for m in driven(20, 60.0)
     ]
     assert Publisher().hear(noisy).end().refused < 0.02 * len(noisy)
-    crowded = [Odometry(m.stamp_ns // 10**8 * 10**8 + k % 5, *_rest(m)) for k, m in enumerate(driven(50))]
+    crowded = [replace(m, stamp_ns=m.stamp_ns // 10**8 * 10**8 + k % 5) for k, m in enumerate(driven(50))]
     assert Publisher().hear(crowded).end().used == crowded
     for hertz, speed in ((1, 2.0), (10, 3.0), (10, 30.0), (50, 30.0)):
         fast = driven(hertz, 20.0, speed=speed, begin=0.0)
         assert Publisher().hear(fast).end().used == fast, (hertz, speed)
-
-
-def _rest(m):
-    return m.T_odom_base, m.twist_covariance, m.source
 
 
 def test_when_the_one_in_use_dies_another_takes_over_under_a_name_of_its_own():
