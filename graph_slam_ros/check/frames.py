@@ -85,17 +85,15 @@ def _unlinked(c: Columns, known: set[str]) -> Iterator[Finding]:
         lost = ", ".join([frame for frame in frames if frame not in linked][:4])
         others = ", ".join(linked[:4])
         text = f"{topic.name}: {times} measurements are refused: no transform links frame {lost} to {base}"
-        settings = _place(c, source, frames, lost, "odom_frame_unknown" in counts)
+        settings = () if linked else _place(c, source, frames, lost, "odom_frame_unknown" in counts)
         if frames == ("",):
             text = f"{topic.name}: {times} measurements name no frame: have their driver fill in header.frame_id"
             yield Finding("frame_empty", "error", times, 0, "measurements", text, topic.name, 0, times)
             continue
         elif linked and lost:  # at a mount, what another robot sees would be seen by this one
             text += f"; the others are of {others}: is it another robot's frame, or a sensor without a transform?"
-            settings = ()
         elif linked:  # a mount is not used for them
             text = f"{topic.name}: {times} measurements are refused: they come before /tf links {others} to {base}"
-            settings = ()
         severity: Severity = "error" if times > 0.5 * max(c.counters.received[source], 1) else "warning"
         first_ns = int(topic.stamp_ns[0]) if len(topic.stamp_ns) else 0
         yield Finding("frame_unlinked", severity, times, 0, "measurements", text, topic.name, first_ns, times, settings)
