@@ -170,7 +170,7 @@ def evaluate(
     drive = scored_drive(run, known.trajectory, estimate)
     landmarks = {name: landmark.position for name, landmark in read_landmarks(run / "landmarks.csv").items()}
     scored = {"truth": known.source, "estimate": _described(drive)}
-    scored["frame"] = "the run is aligned to the truth" if align else "the run is not aligned to the truth"
+    scored["frame"] = "aligned to the truth" if align else "not aligned to the truth"
     warnings = [known.doubt] if known.doubt else []
     if known.topic in inputs:
         warnings.append(f"{known.topic} was an input of the run: the error says how well it fits, not how true it is")

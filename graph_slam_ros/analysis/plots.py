@@ -2,7 +2,7 @@
 
 import io
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.durable import write_whole
 from graph_slam_ros.lie import se3
 from graph_slam_ros.runs.folder import COVARIANCES, recording_of
-from graph_slam_ros.runs.trajectory import Landmark, Trajectory, read_covariances, read_landmarks, read_rows
+from graph_slam_ros.runs.trajectory import Trajectory, read_covariances, read_landmarks, read_rows
 from graph_slam_ros.typing import Array, Index
 
 _TRUTH, _ODOMETRY, _ESTIMATE = (LIGHT[name] for name in ("truth", "odometry", "estimate"))
@@ -36,15 +36,15 @@ def draw_run(
 ) -> None:
     """Draw a run: dead reckoning black, estimate red, landmarks as stars; truth blue, true landmarks as circles.
 
-    Start and end are marked, 2-sigma ellipses are drawn about landmarks and some of the poses. With truth, everything
-    is in its frame, and the position's error over time is below. Without, everything is in the frame map, and dead
-    reckoning begins where the estimate does. In space it is drawn from above and from the side.
+    Start and end are marked, 2-sigma ellipses are drawn about landmarks and some of the poses. Everything is in the
+    frame map, as in the report: the truth is laid on the estimate, and dead reckoning begins where the estimate does.
+    With truth, the position's error over time is below. In space it is drawn from above and from the side.
 
     Parameters
     ----------
     run : folder of a run, of which ``path.tum`` is there at least
     truth, topic : as ``truth.read_truth`` takes them, or what it has read; None: there is none
-    align : lay the run on the truth first
+    align : lay the truth on the run; False: it is in the frame map already
 
     Raises
     ------
@@ -58,8 +58,8 @@ def draw_run(
     found = _placed(drive, whole.at(drive.keyframes), known, dimensions, align=align)
     landmarks = read_landmarks(run / "landmarks.csv")
     points = np.array([landmark.position for landmark in landmarks.values()]).reshape(-1, 3)
-    points = np.stack(se3.act(found.T_world_map, tuple(points.T)), axis=1)
-    ellipses = [*_pose_spread(run, drive, found), *_landmark_spread(landmarks, points, found)]
+    spreads = zip(points, (one.covariance for one in landmarks.values()), strict=True)
+    ellipses = [*_pose_spread(run, drive, found), *spreads]
     figure, panels, below = _run_figure(found, points, dimensions)
     views = ([0, 1], [0, 2])
     for axes, shown in zip(panels, views, strict=False):
@@ -70,6 +70,7 @@ def draw_run(
             _draw_stars(axes, points[:, shown])
         if known:
             true_points = np.array([at for name, at in known.landmarks.items() if name in landmarks]).reshape(-1, 3)
+            true_points = np.stack(se3.act(found.T_map_truth, tuple(true_points.T)), axis=1)
             if len(true_points):
                 circles = {"s": 90, "facecolors": "none", "edgecolors": _TRUTH, "linewidths": 1.0, "zorder": 5}
                 axes.scatter(*true_points[:, shown].T, label="true landmarks", **circles)
@@ -80,13 +81,14 @@ def draw_run(
     if below is not None:
         _draw_errors(below, found)
     _legend(panels[0], at=0.0, side="left")
-    figure.suptitle(_title(run, drive, found, len(points)), x=0.01, ha="left", fontsize=11, color="#333333")
+    title = _title(run, drive, found, len(points), "aligned" if align else "not aligned")
+    figure.suptitle(title, x=0.01, ha="left", fontsize=11, color="#333333")
     _save(figure, out_png)
 
 
 @dataclass(frozen=True, slots=True)
 class _Placed:
-    """A run where it is drawn: in the frame of the truth, or in map.
+    """A run where it is drawn: in map.
 
     Attributes
     ----------
@@ -96,36 +98,36 @@ class _Placed:
     path: Trajectory
     odometry: Trajectory | None
     truth: Trajectory | None
-    T_world_map: se3.Pose
+    T_map_truth: se3.Pose
     errors: tuple[Array, Array] | None = None
     odometry_errors: tuple[Array, Array] | None = None
 
 
 def _placed(drive: Drive, path: Trajectory, known: Truth | None, dimensions: int, *, align: bool) -> _Placed:
-    odometry = drive.odometry
+    odometry = moved = drive.odometry if drive.odometry is not None and len(drive.odometry.stamps_s) else None
+    if odometry is not None:
+        at = int(np.argmin(np.abs(path.stamps_s - odometry.stamps_s[0])))
+        first = se3.inverse(tuple(odometry.poses[0].tolist()))
+        moved = odometry.moved(se3.compose(tuple(path.poses[at].tolist()), first))
     if not known:
-        if odometry is not None and len(odometry.stamps_s):
-            at = int(np.argmin(np.abs(path.stamps_s - odometry.stamps_s[0])))
-            first = se3.inverse(tuple(odometry.poses[0].tolist()))
-            odometry = odometry.moved(se3.compose(tuple(path.poses[at].tolist()), first))
-        return _Placed(path, odometry, None, se3.IDENTITY)
+        return _Placed(path, moved, None, se3.IDENTITY)
     one = matched(drive.estimate, known.trajectory, dimensions, align=align)
     errors, odometry_errors = (one.path.stamps_s, one.position_errors_m), None
-    if odometry is not None and len(odometry.stamps_s):
+    if odometry is not None:
         other = matched(odometry, known.trajectory, dimensions)
-        odometry = odometry.moved(other.T_truth_path)
         odometry_errors = (other.path.stamps_s, other.position_errors_m)
-    true = _with_gaps(_within(known.trajectory, path))
-    return _Placed(path.moved(one.T_truth_path), odometry, true, one.T_truth_path, errors, odometry_errors)
+    T_map_truth = se3.inverse(one.T_truth_path)
+    true = _with_gaps(_within(known.trajectory, path).moved(T_map_truth))
+    return _Placed(path, moved, true, T_map_truth, errors, odometry_errors)
 
 
-def _title(run: Path, drive: Drive, found: _Placed, landmarks: int) -> str:
+def _title(run: Path, drive: Drive, found: _Placed, landmarks: int, frame: str) -> str:
     name = recording_of(run) or run.resolve().name
     parts = [name, f"{len(found.path.stamps_s)} keyframes", f"{landmarks} landmarks"]
     if drive.count > 1:
         parts.insert(1, f"drive {drive.number} of {drive.count}")
     if found.errors is not None:
-        score = f"position error {np.sqrt(np.mean(found.errors[1] ** 2)):.3f} m rmse"
+        score = f"position error {np.sqrt(np.mean(found.errors[1] ** 2)):.3f} m RMSE, {frame}"
         if found.odometry_errors is not None:
             score += f", dead reckoning {np.sqrt(np.mean(found.odometry_errors[1] ** 2)):.3f} m"
         parts.append(score)
@@ -134,7 +136,7 @@ def _title(run: Path, drive: Drive, found: _Placed, landmarks: int) -> str:
 
 def _draw_paths(axes: Any, found: _Placed, whole: Trajectory, drive: Drive, shown: list[int]) -> None:
     if drive.count > 1:
-        others = whole.moved(found.T_world_map).poses
+        others = whole.poses.copy()
         others[drive.keyframes] = np.nan
         axes.plot(*others[:, shown].T, color=QUIET, linewidth=0.8, zorder=1, label="drives before")
     paths = ((found.truth, _TRUTH_STYLE), (found.odometry, _ODOMETRY_STYLE), (found.path, _ESTIMATE_STYLE))
@@ -158,12 +160,6 @@ def _pose_spread(run: Path, drive: Drive, found: _Placed) -> list[tuple[Array, A
         spread[:n, :n] = covariance[:n, :n]
         out.append((pose[:3], turn @ spread @ turn.T))
     return out
-
-
-def _landmark_spread(landmarks: Mapping[str, Landmark], points: Array, found: _Placed) -> Iterator[tuple[Array, Array]]:
-    turn = Rotation.from_quat(found.T_world_map[3:]).as_matrix()
-    for point, landmark in zip(points, landmarks.values(), strict=True):
-        yield point, turn @ landmark.covariance @ turn.T
 
 
 def _draw_ellipses(axes: Any, spreads: list[tuple[Array, Array]], shown: list[int]) -> None:

@@ -7,6 +7,7 @@ lack this mark, or the file; they are recognised by their journal. They are read
 
 import contextlib
 import errno
+import hashlib
 import itertools
 import json
 import os
@@ -34,7 +35,7 @@ SUMMARY, CONFIG = "run.json", "config.yaml"
 GRAPH, VERTICES, COVARIANCES = "graph.g2o", "graph_vertices.csv", "covariances.csv"
 PATH, PATH_ODOMETRY = "path.tum", "path_odometry.tum"  # at keyframes: estimate, and what odometry alone says
 SIGHTINGS, ODOMETRY = "sightings.tum", "odometry.tum"  # the same at the stamps of sightings
-LANDMARKS, PICTURE = "landmarks.csv", "path.png"
+LANDMARKS, PICTURE, REPORT = "landmarks.csv", "path.png", "report.html"
 _PATHS = {PATH, PATH_ODOMETRY, SIGHTINGS, ODOMETRY, COVARIANCES}
 _RESULTS = {SUMMARY, GRAPH, VERTICES, LEDGER, CHANGES, LANDMARKS, PICTURE, *_PATHS}
 MARK = "graph_slam_ros run"
@@ -381,6 +382,18 @@ def _clear(folder: Path) -> None:
         file.unlink()
 
 
+def page_mark(page: bytes, out: Path, run: Path) -> bytes:
+    """The last line of a page on a run, which tells it from a page that was changed, and from one on another run."""
+    place = os.path.relpath(run.resolve(), out.parent.resolve())  # of a folder that was moved with its page, the same
+    return b"<!-- graph_slam report %s -->\n" % hashlib.sha256(page + os.fsencode(place)).hexdigest().encode()
+
+
+def is_own_page(file: Path, run: Path) -> bool:
+    """Return whether a file is a page on that run as ``report`` wrote it. Raises OSError."""
+    page, size = read_bytes(file) if is_regular(file) else b"", len(page_mark(b"", file, run))
+    return page[-size:] == page_mark(page[:-size], file, run)
+
+
 def _contents(folder: Path) -> tuple[list[Path], list[Path]]:
     """The files that a run has made, without its mark, and others that have such a name."""
     ours, foreign = list[Path](), list[Path]()
@@ -389,7 +402,7 @@ def _contents(folder: Path) -> tuple[list[Path], list[Path]]:
             (ours if _is_recorded(file) else foreign).append(file)
         elif file.name in _RESULTS or file.name == CONFIG:
             (ours if is_regular(file) else foreign).append(file)
-        elif _is_unfinished(file):
+        elif _is_unfinished(file) or (file.name == REPORT and is_own_page(file, folder)):
             ours.append(file)
     return [file for file in ours if file.name != SUMMARY], foreign
 

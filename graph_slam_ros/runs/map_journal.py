@@ -52,7 +52,7 @@ from graph_slam_ros.slam.calibration.recalibration import Totals, totals_record
 from graph_slam_ros.slam.frontend.gyro import SavedBias
 from graph_slam_ros.slam.frontend.noise_factors import Key, factors_record
 from graph_slam_ros.slam.landmarks.landmark import Landmark, LandmarkEdge
-from graph_slam_ros.slam.robust.ledger import Ledger, Reason, Verdict, VerdictChange
+from graph_slam_ros.slam.robust.ledger import Ledger, Reason, Verdict
 from graph_slam_ros.slam.snapshot import MapSnapshot
 
 GROWTH = "graph_slam_ros.Map"
@@ -126,7 +126,10 @@ class MapGrowth:
         out["vertices"] = [_vertex(graph, v) for v in range(self._vertices, graph.vertex_count)]
         out["edges"] = [_edge(graph, edge) for edge in range(first_edge, graph.edge_count)]
         out["judged"] = _judgements(a.ledger, self._judged)
-        out["changes"] = [_change(change) for change in a.ledger.history[self._changes :]]
+        out["changes"] = [
+            [c.edge, c.keyframe, *_named(c.verdict, c.reason), _as_json(c.statistic), _as_json(c.threshold)]
+            for c in a.ledger.history[self._changes :]
+        ]
         if not self._keyframes and a.bounded is not None:
             out["condensed"] = condensed_record(graph, a.first_keyframe, a.bounded)
         keyframes = a.newer_keyframes(self._keyframes)
@@ -277,10 +280,6 @@ def _judgements(ledger: Ledger, first: int) -> list[list[Any]]:
 @cache
 def _words(verdict: int, reason: int) -> tuple[str, str]:
     return _named(Verdict(verdict), Reason(reason))
-
-
-def _change(c: VerdictChange) -> list[Any]:
-    return [c.edge, c.keyframe, *_named(c.verdict, c.reason), _as_json(c.statistic), _as_json(c.threshold)]
 
 
 def _named(verdict: Verdict, reason: Reason) -> tuple[str, str]:

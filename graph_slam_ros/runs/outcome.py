@@ -10,7 +10,7 @@ from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
 from graph_slam_ros.check.finding import KINDS
-from graph_slam_ros.measurements.reasons import Effect, Reason, explain, remedy
+from graph_slam_ros.measurements.reasons import Effect, explain, remedy
 from graph_slam_ros.runs.tables import INPUT_COLUMNS
 from graph_slam_ros.runs.undetermined import wrong_sides
 from graph_slam_ros.slam.frontend.gyro import GyroState
@@ -49,11 +49,12 @@ _EXTREME = "distances or noise that no robot means do that: --set INPUT.max_dist
 
 def text(summary: Summary) -> list[str]:
     """The numbers of a run, the size of its queue, and the outcome of each input."""
+    dof = f"of {summary['dof']} degrees of freedom, " if "dof" in summary else ""
     lines = [
         f"keyframes  {summary['keyframes']:8d}   over {summary['span_s']:.1f} s",
         f"landmarks  {summary['landmarks']:8d}   from {summary['sightings']} sightings",
         f"edges      {summary['edges']:8d}",
-        f"chi2       {summary['chi2']:12.3f}   {_dof(summary)}{_solves(summary)}",
+        f"chi2       {summary['chi2']:12.3f}   {dof}{_solves(summary)}",
     ]
     if what := condensed_text(summary):
         all_ = ": --set map.condense=false keeps all" if "condensed" in summary else ""
@@ -78,7 +79,7 @@ def text(summary: Summary) -> list[str]:
         if source not in inputs or explain(reason).effect is not Effect.REFUSED
         for line in _counted_lines(source, reason, times)
     ]
-    found = [*_gyro(summary), *noise(summary), *_calibrated(summary), *_contradicted(summary), *_clocks(summary)]
+    found = [*_gyro(summary), *noise(summary), *_calibration(summary), *_clocks(summary)]
     return [*lines, *undetermined, *others, *found, *table(summary)]
 
 
@@ -121,15 +122,11 @@ def noise(summary: Summary) -> Iterator[str]:
         yield from _wrapped(f"noise      as configured: {', '.join(unknown)}", 11)
 
 
-def _calibrated(summary: Summary) -> Iterator[str]:
-    """Yield the settings of the factors of odometry that the association found."""
+def _calibration(summary: Summary) -> Iterator[str]:
+    """Yield the factors of odometry that the association found, as settings, and what is off and in covariances."""
     if settings := summary.get("calibrated"):
         lines = " ".join(f"--set {shlex.quote(f'{name}={value}')}" for name, value in settings.items())
         yield from _wrapped(f"calibrated {lines}", 11)
-
-
-def _contradicted(summary: Summary) -> Iterator[str]:
-    """Yield what is off in the calibration, where covariances contain it."""
     if off := summary.get("contradicted"):
         text = f"not corrected, so the covariances contain it: {', '.join(off)} (graph_slam calibrate BAG)"
         yield from _wrapped(f"off        {text}", 11)
@@ -141,10 +138,6 @@ def _clocks(summary: Summary) -> Iterator[str]:
         if one["setting"]:
             found = f"{one['value']:+.3f} s (sigma {one['sigma']:.3f} s), used to recognise landmarks"
             yield from _wrapped(f"clock      of {topic}: {found}; in the estimate, too: --set {one['setting']}", 11)
-
-
-def _dof(summary: Summary) -> str:
-    return f"of {summary['dof']} degrees of freedom, " if "dof" in summary else ""
 
 
 def _solves(summary: Summary) -> str:
@@ -337,17 +330,14 @@ def visit_faults(counted: Mapping[str, int]) -> Iterator[str]:
     ----------
     counted : how often visits ended how, by the names of ``VISITS``
     """
-    doubted, visits = counted.get("visit_lost", 0) + counted.get("visit_wider", 0), _visits(counted)
+    condensed, lost, wider = (counted.get(name, 0) for name in VISITS)
+    doubted, visits = lost + wider, condensed + lost
     if doubted >= _FEWEST_LOST and doubted > _DOUBTED * visits:
         yield (
             f"map.condense: {doubted} of {visits} visits contradict themselves or the others, so the noise or the "
             "calibration is wrong, and the map may be much worse than with all keyframes: compare with --set "
             "map.condense=false, run graph_slam check on the recording, or keep more by map.window_keyframes"
         )
-
-
-def _visits(counted: Mapping[str, int]) -> int:
-    return sum(counted.get(name, 0) for name in ("visit_condensed", "visit_lost"))
 
 
 def checked(summary: Summary, severity: str) -> Iterator[str]:
@@ -380,9 +370,8 @@ def _because(name: str, counted: Mapping[str, int]) -> str:
     if not counted:
         return "it holds nothing"
     reason = next(iter(counted))
-    row: Reason = explain(reason)
     mend = remedy(name, reason)
-    return f"{reason} {counted[reason]} ({row.meaning})" + (f"; {mend}" if mend else "")
+    return f"{reason} {counted[reason]} ({explain(reason).meaning})" + (f"; {mend}" if mend else "")
 
 
 def _counted(summary: Summary, name: str, effect: Effect) -> dict[str, int]:

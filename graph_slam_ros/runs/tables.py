@@ -218,8 +218,7 @@ def _accepted_by_input(slam: GraphSlam, first: int) -> Counter[str]:
         out[judged] = keyframes[ids[judged]] >= first
         return out
 
-    accepted, _ = _by_input(slam, is_since)
-    return accepted
+    return _by_input(slam, is_since)[0]
 
 
 def _by_input(slam: GraphSlam, chosen: Callable[[EdgeTable], Mask]) -> tuple[Counter[str], Counter[str]]:

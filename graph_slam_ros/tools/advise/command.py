@@ -99,7 +99,7 @@ def _sigma(what: str, sigma: float) -> str:
 
 
 def _advice_text(advisor: "Advisor", found: "list[list[Advice]]", of_path: "Advice | None") -> Iterator[str]:
-    yield "what would help most, each alone: the sigma that it leaves, and the position error on the path (rms)"
+    yield "what would help most, each alone: the sigma it leaves, and the path error (rms, not aligned as in evaluate)"
     for one, some in zip(advisor.weakest, found, strict=True):
         what = "heading" if one.what == "heading" else f"position, {one.direction.words},"
         yield f"  {what} of {one.about}: {_sigma(one.what, one.direction.sigma)} now"

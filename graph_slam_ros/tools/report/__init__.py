@@ -4,6 +4,7 @@ from pathlib import Path
 
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.durable import write_whole
+from graph_slam_ros.runs.folder import page_mark
 from graph_slam_ros.tools.report.contents import Contents, read_contents
 from graph_slam_ros.tools.report.page import plotly, whole_page
 
@@ -30,7 +31,8 @@ def write_report(
     script = plotly()
     made = read_contents(run, truth, other, plan, topic, align=align)
     try:
-        write_whole(out, whole_page(made, script).encode())
+        page = f"{whole_page(made, script)}\n".encode()
+        write_whole(out, page + page_mark(page, out, run))
     except OSError as error:
         raise GraphSlamError(f"{out}: {error.strerror or error}") from None
     return made

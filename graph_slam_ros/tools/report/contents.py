@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.colours import DARK, LIGHT
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph.place import LABEL as PLACES
-from graph_slam_ros.runs.folder import COVARIANCES, changed_since, run_config, summary_of
+from graph_slam_ros.runs.folder import COVARIANCES, changed_since, recording_of, run_config, summary_of
 from graph_slam_ros.runs.ledger_file import Entry
 from graph_slam_ros.runs.run_check import check_run
 from graph_slam_ros.runs.tables import INPUT_COLUMNS
@@ -30,7 +31,8 @@ from graph_slam_ros.tools.report.packing import Packing, shown
 from graph_slam_ros.tools.report.places import floor_plan, keyframe_paths, outside, paths
 from graph_slam_ros.tools.report.sentences import effects, sentences
 
-_BINS, _SHOWN = 60, 25
+_BINS, _SHOWN = 60, 15
+_CLOCK_NS = 10**18  # stamps before are no dates
 _MM, _NOTHING = 1e-3, 1e-9
 
 
@@ -90,6 +92,7 @@ def read_contents(
     out.beware += out.attempt(lambda: changed_since(run)) or []
     scores = evaluate(run, known, align=align) if known and saved else None
     out.data["run"] = shown(run.resolve().name)
+    out.data["title"] = _title(run, saved)
     out.data["colours"] = {"light": LIGHT, "dark": DARK}
     out.data["dimensions"] = saved.space.dimensions if saved else out.attempt(lambda: dimensions_of(run)) or 2
     out.data["map"] = out.attempt(lambda: paths(out.packing, run, saved, known, other, align=align)) if saved else None
@@ -104,9 +107,18 @@ def read_contents(
     out.data["compared"] = _compared(run, other, out) if other else None
     out.losses = _once(out.losses)
     out.beware = [one for one in _once(out.beware) if not any(loss.endswith(one) for loss in out.losses)]
-    out.data["sentences"] = out.attempt(lambda: verdict.verdict(run, summary, saved, scores, out.losses))
+    jumps = [one for one in (out.data.get("drive") or {"jumps": ()})["jumps"] if saved.config.tf.report_jump_m < one[1]]
+    out.data["sentences"] = out.attempt(lambda: verdict.verdict(run, summary, saved, scores, out.losses, *jumps[:1]))
     out.data["losses"], out.data["beware"] = [[shown(one) for one in some] for some in (out.losses, out.beware)]
     return out
+
+
+def _title(run: Path, saved: SavedGraph | None) -> str:
+    """The name of the recording, or of the run, and the date."""
+    name, start_ns = shown(recording_of(run) or run.resolve().name), int(saved.whole_path.stamps_ns[0]) if saved else 0
+    if start_ns < _CLOCK_NS:
+        return name
+    return f"{name}, {datetime.fromtimestamp(start_ns // 10**9, timezone.utc):%d %B %Y, %H:%M} UTC"
 
 
 def _once(lines: Sequence[str]) -> list[str]:
@@ -219,15 +231,13 @@ def _charts(out: Contents, saved: SavedGraph) -> dict[str, Any]:
             at = [e.keyframe for e in judged if e.verdict is one]
             over[STATES[one]] = np.histogram(at, edges)[0].tolist()
     later = [c.keyframe for c in saved.changes]
-    inside = sorted((e for e in judged if e.is_in), key=lambda e: -e.chi2 / e.dof)[:_SHOWN]
-    outside = sorted((e for e in judged if not e.is_in), key=lambda e: -e.statistic / e.threshold)[:_SHOWN]
+    worst = sorted(judged, key=lambda e: -e.chi2 / e.dof)[:_SHOWN]
     return {
         "bins": edges.tolist(),
         "verdicts": over,
         "changes": np.histogram(later, edges)[0].tolist(),
         "chi2": list(_chi2_histograms(saved)),
-        "worst": [e.edge for e in inside],
-        "farthest": [e.edge for e in outside],
+        "worst": [e.edge for e in worst],
     }
 
 

@@ -134,7 +134,7 @@ function linkTo(kind, which, text) {
 
 // -- colours ---------------------------------------------------------------------------------------------------------
 
-const dark = matchMedia("(prefers-color-scheme: dark)");
+const dark = matchMedia("(prefers-color-scheme: dark)"), narrow = matchMedia("(max-width: 60rem)");
 const PAPER = {map: {width: 680, height: 560}, chart: {width: 680, height: 270}};  // [pixels] of CSS: A4 and Letter
 let onPaper = false;
 function colours() {
@@ -151,7 +151,7 @@ function colours() {
 function layout(more) {
   const c = colours(), axis = {gridcolor: c.grid, zerolinecolor: c.grid, linecolor: c.grid};
   return {
-    paper_bgcolor: c.paper, plot_bgcolor: c.paper, font: {color: c.ink, size: 12}, margin: {l: 55, r: 10, t: 10, b: 40},
+    paper_bgcolor: c.paper, plot_bgcolor: c.paper, font: {color: c.ink, size: 12, family: "system-ui, sans-serif"}, margin: {l: 50, r: 10, t: 10, b: 40},
     legend: {orientation: "h", y: 1.02, yanchor: "bottom"}, modebar: {orientation: "v"}, xaxis: axis, yaxis: axis, ...(onPaper ? PAPER.chart : {}), ...more(axis),
   };
 }
@@ -162,6 +162,7 @@ const CONFIG = {responsive: true, displaylogo: false, modeBarButtonsToRemove: ["
 const CAMERA = {eye: {x: 1.2, y: -2.3, z: 1.8}};
 const ALONG = ["odometry", "composed"];  // classes of edges along the path
 const MOST_SHOWN = 5000, MOST_DRAWN = 20000;  // edges of one class and verdict
+const MOST_NAMES = 30;  // of landmarks: the others show theirs where the pointer is
 const map = {inSpace: false, points: null, moved: null};  // moved: {path, landmarks} of another solution
 
 const estimate = () => (map.moved ? map.moved.path : data.map.paths.estimate.map(column));
@@ -216,11 +217,10 @@ function edgeTraces() {
   }
   const out = [];
   for (const [key, edges] of groups) {
-    const name = key.split(", ")[1], isIn = name === "accepted" || name === "not judged", isChanged = name.endsWith(UNSAVED), isSighting = key.startsWith("landmarks") || key.startsWith("places");
+    const name = key.split(", ")[1], isIn = name === "accepted" || name === "not judged", isChanged = name.endsWith(UNSAVED), isSighting = key.startsWith("landmarks") || key.startsWith("places"), shown = plain(key.replace(/^landmarks/, "sightings"));
     const every = Math.max(1, Math.ceil(edges.length / MOST_DRAWN)), some = edges.filter((_, k) => k % every === 0);
     if (every > 1) map.notes.push(`one of ${every} edges of "${key}" is drawn (the ledger has all)`);
-    const visible = isIn && edges.length > MOST_SHOWN ? "legendonly" : true;
-    if (visible !== true) map.notes.push(`${edges.length} edges of "${key}" are hidden at first: click that name in the legend`);
+    const visible = isSighting || (isIn && edges.length > MOST_SHOWN) ? "legendonly" : true;
     const ends = some.flatMap((k) => others.map((to) => [from[rowOf(k)], to[rowOf(k)], k]).filter(([, to]) => to >= 0));
     const axes = all.map((axis) => Float64Array.from(ends.flatMap(([a, b]) => [axis[a], axis[b], NaN])));
     const middle = all.map((axis) => Float64Array.from(ends, ([a, b]) => (axis[a] + axis[b]) / 2));
@@ -228,8 +228,8 @@ function edgeTraces() {
     const colour = isIn && isSighting ? colours().landmarks : isIn ? colours().closures : colours()[name];
     const isFaint = isIn && isSighting, dash = isIn || name === "down-weighted" || name.startsWith("let in") ? "solid" : name === "held back" ? "dot" : "dash";
     const strength = map.moved && !isIn && !isChanged ? 0.3 : 0.9;  // while edits are tried, what is out stands back
-    if (isFaint) out.push(trace(plain(key), [[null], [null], [null]], colour, {visible, legendgroup: key}));  // what the legend shows
-    out.push(trace(plain(key), axes, colour, {visible, isMany: true, opacity: isFaint ? faint : strength, line: {color: colour, dash, width: isChanged ? 3 : isFaint ? 1.5 : 2}, legendgroup: key, showlegend: !isFaint}));
+    if (isFaint) out.push(trace(shown, [[null], [null], [null]], colour, {visible, legendgroup: key}));  // what the legend shows
+    out.push(trace(shown, axes, colour, {visible, isMany: true, opacity: isFaint ? faint : strength, line: {color: colour, dash, width: isChanged ? 3 : isFaint ? 1.5 : 2}, legendgroup: key, showlegend: !isFaint}));
     out.push(trace("", middle, colour, {
       visible, isMany: true, mode: "markers", marker: {color: colour, size: (isIn ? 4 : 7) / (map.inSpace ? 2 : 1), symbol: name.startsWith("taken out") ? "x" : "diamond", opacity: isIn ? (isSighting ? faint : 0.35) : strength}, showlegend: false,
       legendgroup: key, customdata: ends.map(([, , k]) => k), meta: "edge", hovertemplate: `edge %{customdata}: ${plain(key)}<extra></extra>`, hoverinfo: "all",
@@ -252,27 +252,41 @@ function traces() {
     } : {line: {color: c[name], width: name === "truth" ? 3 : 1.2}, opacity: map.moved && name === "odometry" ? 0.25 : 1}));
   }
   out.push(trace("", [[], [], []], c["let in (not saved)"], {line: {color: c["let in (not saved)"], width: 7}, opacity: 0.5, showlegend: false, meta: "stretches"}));
-  if (!map.inSpace) out.push(keyframeNumbers(c));
   const marks = data.map.landmarks, labels = column(marks.names);
   if (labels.length) {
     const axes = map.moved ? placedNow(labels) : marks.points.map(column), text = labels.map((name) => plain(short(name)));
-    if (!map.inSpace && !map.moved) out.push(trace("2 sigma", [...marks.ellipses.map(column), []], c.landmarks, {line: {color: c.landmarks, width: 1}}));
+    if (!map.inSpace && !map.moved) out.push(trace("", [...marks.ellipses.map(column), []], c.landmarks, {line: {color: c.landmarks, width: 1}, legendgroup: "landmarks", showlegend: false}));
     out.push(trace("landmarks", axes, c.landmarks, {
-      mode: labels.length > 400 ? "markers" : "markers+text", text, textposition: "top center", textfont: {size: 10, color: c.ink}, meta: "landmark",
+      legendgroup: "landmarks", mode: labels.length > MOST_NAMES ? "markers" : "markers+text", text, textposition: "top center", textfont: {size: 10, color: c.ink}, meta: "landmark",
       marker: {symbol: map.inSpace ? "diamond" : "star", size: map.inSpace ? 3 : 11, color: c.landmarks}, customdata: labels,
       hovertemplate: "landmark %{text}<extra></extra>", hoverinfo: "all",
     }));
   }
+  out.push(ends(c));
   out.push(trace("as known then", [[], [], []], c.then, {line: {color: c.then, width: 3}, visible: true, showlegend: false, meta: "then"}));
   out.push(trace("landmarks as known then", [[], [], []], c.then, {mode: "markers", marker: {symbol: map.inSpace ? "diamond" : "star", size: map.inSpace ? 4 : 11, color: c.then}, showlegend: false, meta: "marks then"}));
   out.push(trace("chosen", [[], [], []], c.mark, {mode: "lines+markers", line: {color: c.mark, width: 5}, marker: {color: c.mark, size: map.inSpace ? 7 : 11}, showlegend: false, meta: "chosen"}));
   return out;
 }
 
-function keyframeNumbers(c) {  // about a dozen
-  const n = data.map.keyframes, step = [1, 2, 5].flatMap((one) => [0, 1, 2, 3, 4, 5, 6].map((power) => one * 10 ** power)).sort((a, b) => a - b).find((one) => n / one <= 20);
-  const some = Array.from({length: Math.ceil(n / step)}, (_, k) => k * step), at = estimate();
-  return trace("", at.map((axis) => some.map((k) => axis[k])), c.ink, {mode: "text", text: some.map(String), textposition: "bottom right", textfont: {size: 10, color: c.quiet}, showlegend: false});
+function ends(c) {  // where the drive starts and ends
+  const at = estimate(), n = at[0].length;
+  return trace("", at.map((axis) => (n ? [axis[0], axis[n - 1]] : [])), c.ink, {mode: "markers+text", text: ["start", "end"], textposition: "bottom right", textfont: {size: 11, color: c.ink}, marker: {size: map.inSpace ? 4 : 9, color: c.paper, line: {color: c.estimate, width: 2}}, showlegend: false});
+}
+
+// What the map shows at first: the estimate, and of the rest what is not far from it.
+function box() {
+  const {paths, landmarks} = data.map, extent = (arrays, from = -Infinity, to = Infinity) => {
+    let low = Infinity, high = -Infinity;
+    for (const values of arrays) for (const v of values) if (v >= from && v <= to) { low = Math.min(low, v); high = Math.max(high, v); }
+    return [low, high];
+  };
+  return [0, 1].map((axis) => {
+    const own = [estimate()[axis]], [low, high] = extent(own), reach = Math.max(high - low, 1);
+    const [a, b] = extent([...own, column(landmarks.points[axis]), ...["odometry", "truth", "other"].filter((one) => paths[one]).map((one) => column(paths[one][axis]))], low - reach, high + reach);
+    const margin = Math.max(0.06 * (b - a), 0.2);
+    return [a - margin, b + margin];
+  });
 }
 
 function showStretches(ends) {  // the parts of the drive that a group of closures joins
@@ -289,8 +303,11 @@ async function drawMap(isSame = false) {  // isSame: as it is zoomed
   };
   const c = colours(), scene = {aspectmode: "data", bgcolor: c.paper, camera: CAMERA};
   for (const axis of ["xaxis", "yaxis", "zaxis"]) scene[axis] = {title: {text: `${axis[0]} [m]`}, gridcolor: c.grid, color: c.ink};
+  const [x, y] = box(), clip = ([clipmin, clipmax]) => ({autorangeoptions: {clipmin, clipmax}});
+  byId("map-section").style.setProperty("--aspect", Math.min(3, Math.max(0.8, (x[1] - x[0]) / (y[1] - y[0]))));
+  const beside = !onPaper && !narrow.matches ? {legend: {x: 1.01, y: 1}} : {};
   const flat = layout((axis) => ({
-    xaxis: {...axis, title: {text: "x [m]"}}, yaxis: {...axis, title: {text: "y [m]"}, scaleanchor: "x", scaleratio: 1},
+    ...beside, xaxis: {...axis, ...clip(x), title: {text: "x [m]"}}, yaxis: {...axis, ...clip(y), title: {text: "y [m]"}, scaleanchor: "x", scaleratio: 1},
     dragmode: "pan", hovermode: "closest", images: image ? [image] : [], uirevision: "map",
   }));
   const shape = {...(map.inSpace ? {...layout(() => ({})), scene, uirevision: "space"} : flat), ...(onPaper ? PAPER.map : {})};
@@ -438,7 +455,7 @@ function edgeList(edges, body) {
   const list = element("ul"), e = data.edges;
   for (const k of edges.slice(0, 200)) {
     const item = element("li"), about = named(e.landmark, k);
-    item.append(linkTo("edge", k, `edge ${k}`), ` ${[named(e.label, k), short(about)].filter(Boolean).join(" ")}: ${verdictOf(k)}`);
+    item.append(linkTo("edge", k, `edge ${k}`), ` ${[named(e.label, k), short(about)].filter(Boolean).join(" ")}: ${verdictOf(k)}, chi2 ${number(values("chi2")(k))} of ${values("dof")(k)}`);
     list.append(item);
   }
   body.append(list);
@@ -490,7 +507,7 @@ const FIELDS = [  // name, value, and what it is
   ["end moves m", values("last_m"), "how far the end of the drive moves without it (if it is out: with it) [m], to first order"],
   ["own moves m", values("end_m"), "how far its own keyframe or landmark moves without it (if it is out: with it) [m], to first order"],
 ];
-const ledger = {order: null, sort: 0, up: true, chosen: -1};
+const ledger = {order: null, sort: FIELDS.findIndex(([name]) => name === "chi2"), up: false, chosen: -1};  // the worst first
 
 function startLedger() {
   FIELDS.forEach(([name, , hint], at) => {
@@ -500,7 +517,7 @@ function startLedger() {
     byId("head").append(cell);
   });
   const classes = data.edges.label.names;
-  byId("filter").value = classes.find((one) => one === "closures") || classes.find((one) => ![...ALONG, "anchor", "prior", "priors"].includes(one)) || "";
+  byId("filter").value = classes.find((one) => one === "closures") || "";
   byId("filter").addEventListener("input", arrange);
   byId("rows").addEventListener("scroll", () => requestAnimationFrame(drawRows));
   byId("rows").addEventListener("keydown", (event) => {
@@ -666,8 +683,15 @@ function startCharts() {
 
 // -- the page --------------------------------------------------------------------------------------------------------
 
+function sentence(text, at) {  // the first begins with the verdict; keyframes are links
+  const [, verdict, rest] = at ? [null, "", text] : text.match(/^(.*?)[:.](.*)$/s), out = element("p");
+  if (verdict) out.append(element("strong", verdict));
+  rest.split(/(keyframe \d+)/).forEach((part, k) => out.append(k % 2 ? linkTo("keyframe", part.slice(9), part) : part));
+  return out;
+}
+
 function writeVerdict() {
-  const [first, ...rest] = (data.sentences || []).map((one) => element("p", one)), place = byId("verdict");
+  const [first, ...rest] = (data.sentences || []).map(sentence), place = byId("verdict");
   if (!(data.groups || []).length) return place.append(...(first ? [first, ...rest] : []));
   const steps = element("ol"), look = element("li"), more = element("details");
   look.append("Look at ", element("a", "the groups of closures that are in", {href: "#groups-section"}), ".");
@@ -679,7 +703,7 @@ function writeVerdict() {
 }
 
 function writeText() {
-  byId("title").textContent = document.title;
+  byId("title").textContent = data.title;
   writeVerdict();
   const notes = [...data.losses.map((one) => `lost: ${one}`), ...data.beware.map((one) => `beware: ${one}`)];
   notes.forEach((one) => byId("notes").append(element("li", one)));
@@ -716,17 +740,15 @@ function writeGroups() {
   });
 }
 
-function writeEdges() {
-  const rows = (edges, judged) => edges.map((k) => [linkTo("edge", k, String(k)), named(data.edges.label, k), named(data.edges.landmark, k), values("keyframe")(k),
-    values(judged ? "statistic" : "chi2")(k), judged ? values("threshold")(k) : values("dof")(k), verdictOf(k)]);
-  table("worst", ["edge", "class", "about", "keyframe", "chi2", "dof", "verdict"], rows(data.charts.worst, false));
-  table("farthest", ["edge", "class", "about", "keyframe", "chi2", "limit", "verdict"], rows(data.charts.farthest, true));
+function showWorst() {
+  byId("why-body").append(element("h3", "Worst edges, by chi2 per degree of freedom"));
+  edgeList(data.charts.worst, byId("why-body"));
 }
 
 async function start() {
   writeText();
   await readColumns();
-  if (data.edges) { writeGroups(); writeEdges(); startLedger(); }
+  if (data.edges) { writeGroups(); showWorst(); startLedger(); }
   if (data.map && data.edges) {
     map.inSpace = data.dimensions === 3;
     await drawMap();
@@ -749,7 +771,7 @@ async function start() {
   startCharts();
   if (extra) extra.start();
   addEventListener("hashchange", () => fromHash(true));
-  dark.addEventListener("change", drawAgain);
+  for (const one of [dark, narrow]) one.addEventListener("change", drawAgain);
   addEventListener("beforeprint", () => print(true));
   addEventListener("afterprint", () => print(false));
   fromHash(true);

@@ -10,7 +10,7 @@ from typing import Any
 
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.tools.report.contents import Contents
-from graph_slam_ros.tools.report.packing import json_for_script, shown
+from graph_slam_ros.tools.report.packing import json_for_script
 
 _HERE = Path(__file__).resolve().parent
 _BAR, _PANEL = "<!-- bar -->", "<!-- panel -->"
@@ -50,7 +50,6 @@ def whole_page(made: Contents, script: str, panel: Panel | None = None) -> str:
         f" connect-src {server}; style-src 'unsafe-inline'; img-src data: blob:;"
         " base-uri 'none'; form-action 'none'"
     )
-    title = html.escape(f"{shown(made.run.resolve().name)}: {'view' if panel else 'report'}")
     body = (_HERE / "page.html").read_text(encoding="utf-8")
     for place, part in ((_BAR, panel.bar), (_PANEL, panel.html)) if panel else ():
         body = body.replace(place, part)
@@ -60,14 +59,14 @@ def whole_page(made: Contents, script: str, panel: Panel | None = None) -> str:
             '<html lang="en"><head><meta charset="utf-8">',
             f'<meta http-equiv="Content-Security-Policy" content="{html.escape(rules)}">',
             '<meta name="viewport" content="width=device-width, initial-scale=1">',
-            f"<title>{title}</title>",
+            f"<title>{html.escape(made.data['title'])}</title>",
             f"<style>{style()}{panel.css if panel else ''}</style></head>",
             body.strip(),
             f'<script type="application/json" id="data">{json_for_script(made.data)}</script>',
             f'<script type="text/plain" id="columns">{made.packing.block()}</script>',
             f'<script type="application/json" id="panel-data">{json_for_script(panel.data)}</script>' if panel else "",
             *(f"<script>{one}</script>" for one in scripts),
-            "</html>\n",
+            "</html>",
         )
     )
 

@@ -1,8 +1,8 @@
-"""The verdict on a run in three sentences, and its tables."""
+"""The verdict on a run in a few sentences, and its tables."""
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,80 +20,73 @@ from graph_slam_ros.tools.report.packing import shown
 Row = list[Any]
 _FINE = 0.5, 2.0  # chi2 per degree of freedom
 _MOST_NEES = 2.0  # times what is expected
-_TOO_SMALL = "its covariances are too small"
-_MOST_REASONS = 3  # that the sentence on rejected measurements names
+_MOST_REASONS = 3  # that are named: of rejected measurements, and of what else is wrong
 
 
 def verdict(
-    run: Path, summary: Mapping[str, Any], saved: SavedGraph | None, scores: Any, losses: Sequence[str]
+    run: Path,
+    summary: Mapping[str, Any],
+    saved: SavedGraph | None,
+    scores: Any,
+    losses: Sequence[str],
+    jump: Sequence[Any] = (),
 ) -> list[str]:
-    """Three sentences: whether the map can be used, what was not believed, and what to do next.
+    """Sentences: the verdict with its reason, what else is wrong, the figures, and what was not believed.
 
     Parameters
     ----------
     saved : the graph; None if it cannot be read
     scores : of the evaluation, None without truth
+    jump : keyframe and distance [m] of the largest jump of ``map -> odom``, if it is large
     """
-    short = [*outcome.shortcomings(summary)] if _is_complete(summary) else []
-    doubts = [*outcome.doubts(summary)] if _is_complete(summary) else []
-    gates = [line for line in explain_run(saved) if line.startswith("warning: ")] if saved else []
-    first = _state(summary, saved, scores, short, [*doubts, *gates], losses)
-    untrue = list(scores.warnings) if scores is not None else []
-    covariances = _covariances(saved, scores) if not untrue else []
-    last = _next(run, (untrue, short, doubts, gates, covariances), losses, summary, has_truth=scores is not None)
-    return [first, _judged(saved), last]
-
-
-def _is_complete(summary: Mapping[str, Any]) -> bool:
-    return {"counters", "inputs", "keyframes", "landmarks", "sightings", "waiting"} <= set(summary)
-
-
-def _state(
-    summary: Mapping[str, Any],
-    saved: SavedGraph | None,
-    scores: Any,
-    short: Sequence[str],
-    doubts: Sequence[str],
-    losses: Sequence[str],
-) -> str:
     if saved is None:
-        return f"There is no map to show: {losses[0] if losses else 'the run holds no keyframe'}."
+        return [f"There is no map to show: {losses[0] if losses else 'the run holds no keyframe'}."]
+    again = f"(graph_slam recover {run.name} --out DIR writes its results anew)"
+    short, doubts = list[str](), [f"a part of the run is lost: {loss} {again}" for loss in losses[:1]]
+    if summary.get("ended") is False:
+        doubts = [f"it is still being written, or was cut off, and this is its map so far {again}"]
+    if {"counters", "inputs", "keyframes", "landmarks", "sightings", "waiting"} <= set(summary):
+        short, doubts = [*outcome.shortcomings(summary)], [*doubts, *outcome.doubts(summary)]
+    elif not summary.get("converged", True):
+        short = ["the last solve did not converge"]
+    doubts += list(scores.warnings) if scores is not None else []
+    doubts += [line.removeprefix("warning: ") for line in explain_run(saved) if line.startswith("warning: ")]
+    doubts += _covariances(saved, scores)
+    state = "Do not rely on this map yet" if short else "Use this map with care"
+    first, *others = [*(one if one.endswith(".") else f"{one}." for one in (*short, *doubts)), ""]
+    out = [f"{state}: {first}"] if first else [f"Nothing wrong is found in this map: {_fit(saved)}."]
+    out += [f"Also: {one}" for one in others[:_MOST_REASONS] if one]
+    out += [f"map -> odom jumped by up to {jump[1]:.2f} m, at keyframe {jump[0]}."] if jump else []
     size = f"{len(saved.slam.keyframes)} keyframes and {summary.get('landmarks', len(saved.landmarks))} landmarks"
-    fit = _fit(saved)
-    error = ""
     if scores is not None:
-        error = f", {scores.estimate.position_m['rmse']:.3f} m from the truth (RMSE)"
+        size += f", position error {scores.estimate.position_m['rmse']:.3f} m (RMSE, {scores.scored['frame']})"
         if scores.odometry is not None:
-            error += f", dead reckoning {scores.odometry.position_m['rmse']:.3f} m"
-        error += f"; {_TOO_SMALL}" if not scores.warnings and _covariances(saved, scores) else ""
-        error += "; whether that is a truth of this drive is not sure" if scores.warnings else ""
-    if short:
-        return f"Do not rely on this map yet: {size}{error}."
-    if not summary.get("converged", True):
-        return f"Do not rely on this map yet: {size}{error}; the last solve did not converge."
-    if doubts or losses:
-        return f"Use this map with care: {size}{error}{fit}."
-    return f"The run shows nothing wrong with this map: {size}{error}{fit}."
+            size += f", dead reckoning {scores.odometry.position_m['rmse']:.3f} m"
+    out += [f"{size}{f'; {_fit(saved)}' if first else ''}.", _judged(saved)]
+    if scores is None and not first:
+        out.append(
+            f"Next: compare it with a ground truth, if there is one: graph_slam report {run.name} --truth TRUTH."
+        )
+    return out
 
 
-def _covariances(saved: SavedGraph | None, scores: Any) -> list[str]:
+def _covariances(saved: SavedGraph, scores: Any) -> list[str]:
     """A sentence where errors against the truth are far larger than the covariances say; else none."""
     poses = scores.consistency.poses if scores is not None and scores.consistency else None
-    if saved is None or poses is None or poses.mean < _MOST_NEES * poses.dof:
+    if poses is None or scores.warnings or poses.mean < _MOST_NEES * poses.dof:
         return []
     advised = [line for line in scores.consistency.advice.splitlines() if "--set" in line]
     estimated = f"; {'; '.join(advised)}" if advised else ""
-    return [f"{_TOO_SMALL}: NEES of poses {poses.mean:.1f}, where {poses.dof} is expected{estimated}"]
+    return [f"its covariances are too small: NEES of poses {poses.mean:.1f}, where {poses.dof} is expected{estimated}"]
 
 
 def _fit(saved: SavedGraph) -> str:
     ratio = chi2_per_dof(saved)
     if ratio is None:
-        return ""
-    if _FINE[0] <= ratio <= _FINE[1]:
-        return f"; residuals are as large as the stated noise (chi2 per degree of freedom {ratio:.2f})"
-    which = "larger" if ratio > 1.0 else "smaller"
-    return f"; residuals are {which} than the stated noise (chi2 per degree of freedom {ratio:.2f})"
+        return "nothing in it can be compared with its noise"
+    which = "as large as" if _FINE[0] <= ratio <= _FINE[1] else "larger than" if ratio > 1.0 else "smaller than"
+    chi2, dof = saved.restored.evaluate().chi2_final, saved.restored.degrees_of_freedom
+    return f"residuals are {which} the stated noise (chi2 {chi2:.1f} of {dof} degrees of freedom)"
 
 
 def chi2_per_dof(saved: SavedGraph) -> float | None:
@@ -102,9 +95,7 @@ def chi2_per_dof(saved: SavedGraph) -> float | None:
     return saved.restored.evaluate().chi2_final / dof if dof > 0 else None
 
 
-def _judged(saved: SavedGraph | None) -> str:
-    if saved is None:
-        return "What was measured cannot be shown without the map."
+def _judged(saved: SavedGraph) -> str:
     judged = [e for e in saved.entries if e.verdict]
     if not judged:
         return "The map is odometry alone: no landmark, fix or closure is in it."
@@ -119,30 +110,6 @@ def _judged(saved: SavedGraph | None) -> str:
     several = [f"{times} of {shown(name)} ({why})" for (name, why), times in counted.most_common(_MOST_REASONS)]
     rest = "; the most are " if len(counted) > _MOST_REASONS else ": "
     return f"{len(out)} of {len(judged)} measurements are not in the map{rest}{', '.join(several)}{low}."
-
-
-def _next(
-    run: Path,
-    several: Iterable[Sequence[str]],
-    losses: Sequence[str],
-    summary: Mapping[str, Any],
-    *,
-    has_truth: bool,
-) -> str:
-    """The first of several kinds of sentences that has any."""
-    if summary.get("ended") is False:
-        again = f"If it was cut off, graph_slam recover {run.name} --out DIR writes its results"
-        return f"This run is still being written, or it was cut off: this is its map so far. {again}."
-    if losses:
-        again = f"graph_slam recover {run.name} --out DIR writes its results anew"
-        return f"First get the run whole: {losses[0]} ({again})."
-    first = next((some[0] for some in several if some), "")
-    if first:
-        return f"Why, and what to do: {first.removeprefix('warning: ')}{'' if first.endswith('.') else '.'}"
-    if has_truth:
-        return "Nothing needs to be changed."
-    truth = f"graph_slam report {run.name} --truth TRUTH"
-    return f"Next: compare it with a ground truth, if there is one: {truth}."
 
 
 # -- tables ------------------------------------------------------------------------------------------------------------

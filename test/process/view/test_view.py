@@ -381,7 +381,7 @@ def test_forms_make_edits_of_landmarks_and_hostile_names_are_text(browser, tmp_p
         page.fill("#reason", "<script>document.title='broken'</script>")
         page.click("#save")
         page.wait_for_function("() => byId('saved').innerText.startsWith('Saved in')")
-        assert page.title() == "<b>&'run: view"
+        assert page.title() == "<b>&'run"
         assert page.locator("#edit-panel b, #edit-panel img, #edit-panel script").count() == 0
     edits = SavedGraph(run.with_name("<b>&'run_edited"), []).edits
     assert [one.edit.do for one in edits] == ["rename_landmark", "merge_landmarks"]
