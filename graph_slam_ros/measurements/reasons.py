@@ -52,7 +52,7 @@ REASONS: dict[str, Reason] = {
     "late": Reason(
         _REFUSED,
         "it came after newer messages were used",
-        "ordering.window_s, of others than odometry ordering.late_s; INPUT.offset_s",
+        "ordering.window_s for odometry, ordering.late_s for others; INPUT.offset_s",
     ),
     "future": Reason(
         _REFUSED, "the stamp is ahead of the clock, or of odometry", "use_sim_time for a recording; INPUT.offset_s"
@@ -68,7 +68,7 @@ REASONS: dict[str, Reason] = {
         "the robot moved past landmarks while odometry stood still",
         "its driver repeats a pose, or the robot was towed",
     ),
-    "odometry_gap": Reason(_REFUSED, "odometry was silent then, and the robot moved", "find out why its driver paused"),
+    "odometry_gap": Reason(_REFUSED, "odometry was silent, or jumped, then", "find out why its driver paused"),
     "overflow": Reason(_REFUSED, "too many messages waited", "inputs.queue of a node, ordering.max_waiting"),
     "duplicate": Reason(_NOTED, "the same message has come before"),
     "duplicate_stamp": Reason(

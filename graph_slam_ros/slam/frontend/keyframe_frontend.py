@@ -280,7 +280,7 @@ class KeyframeFrontend:
             return
         T_odom_base = self._space.group.compose(self.path.keyframes[where.keyframe].T_odom_base, where.T_keyframe_base)
         if self._frozen.has_moved(m, T_odom_base):
-            self._counters.count(self.source, "frozen")
+            self._counters.count(self.source.partition("#")[0], "frozen")
             self.frozen_ns = m.stamp_ns
             self._keyframe_at(where, motion, loose=True)
             self._thinning.forget_time()
