@@ -96,6 +96,16 @@ SingleRangeBeaconObservation[] sensed_data
 float64 range
 int32 id
 """,
+    "ar_track_alvar_msgs/msg/AlvarMarkers": "std_msgs/Header header\nar_track_alvar_msgs/AlvarMarker[] markers\n"
+    f"{_RULE}MSG: ar_track_alvar_msgs/AlvarMarker\nstd_msgs/Header header\nuint32 id\ngeometry_msgs/PoseStamped pose\n",
+} | {
+    f"{package}/msg/AprilTagDetectionArray": f"std_msgs/Header header\n{package}/AprilTagDetection[] detections\n"
+    f"{_RULE}MSG: {package}/AprilTagDetection\n{fields}\n"
+    for package, fields in {
+        "isaac_ros_apriltag_interfaces": "string family\nint32 id\ngeometry_msgs/PoseWithCovarianceStamped pose",
+        "apriltag_ros": "int32[] id\nfloat64[] size\ngeometry_msgs/PoseWithCovarianceStamped pose",
+        "apriltags_ros": "int32 id\nfloat64 size\ngeometry_msgs/PoseStamped pose",
+    }.items()
 }
 
 

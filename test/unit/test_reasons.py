@@ -83,8 +83,7 @@ def test_a_remedy_names_the_input_and_an_exception_has_the_row_of_faults():
 
 
 def test_what_mends_a_transform_without_frames_is_no_parameter():
-    """There are none for the frames of transforms."""
     for source in ("tf", "tf_static"):
         assert "header.frame_id" in remedy(source, "frame_empty")
         assert f"{source}." not in remedy(source, "frame_empty")
-    assert "detections.mount" in remedy("detections", "frame_empty")
+    assert "detections.frame" in remedy("detections", "frame_empty")

@@ -158,7 +158,7 @@ def without_orientation(topic, m):
     return m
 
 
-@each("change, said", [(turned_in_degrees, "are its angles in radians?"), (without_orientation, "0 of 671")])
+@each("change, said", [(turned_in_degrees, "are its angles in radians?"), (without_orientation, "671 are refused")])
 def test_what_no_setting_mends_names_no_replay(drive, tmp_path, capsys, change, said):
     bag = copy(drive, tmp_path / "a.mcap", change)
     assert main(["check", str(bag), "--quick"]) == 4

@@ -319,7 +319,7 @@ REFUSED = {
     "simulate nowhere": (["simulate", "manhattan", "--out", "/nowhere/a.mcap"], "/nowhere/a.mcap: No such file"),
     "missing graph": (["optimize", "none.g2o"], "none.g2o: no such file"),
     "unknown loss": (["optimize", "{text}", "--loss", "hubr"], "loss 'hubr': choose none, huber, cauchy"),
-    "no graph": (["optimize", "{text}"], "no vertex in it; is it a graph?"),
+    "no graph": (["optimize", "{text}"], "no vertex in it of a kind that is known"),
     "truth is a run": (["evaluate", "{run}", "--truth", "{run}"], "a run, not the truth: graph_slam evaluate RUN"),
     "report of a recording": (
         ["report", "{bag}"],

@@ -117,7 +117,7 @@ def test_it_is_written_to_g2o_and_read_back(space, tmp_path):
 
 
 def test_a_line_with_too_few_points_names_itself(tmp_path):
-    lines = "VERTEX_SE2 0 0 0 0\nVERTEX_XY 1 1 1\nEDGE_PLACE_SE2_XY:2 0 1 1 1 1 0 1\n"
+    lines = "VERTEX_SE2 0 0 0 0\nVERTEX_XY 1 1 1\nEDGE_PLACE_SE2_XY:2 0 1 2\n"
     (tmp_path / "a.g2o").write_text(lines)
     with pytest.raises(FormatError, match=r"a\.g2o:3: EDGE_PLACE_SE2_XY:2"):
         read_g2o(tmp_path / "a.g2o")
