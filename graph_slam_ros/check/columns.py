@@ -240,8 +240,8 @@ class Collector:
             elif isinstance(m, AngularVelocity) and len(self._gyro_ns) < MOST:
                 self._gyro_ns.append(m.stamp_ns)
                 self._gyro.append(m.rate[-1])
-                w, a = message.angular_velocity, message.linear_acceleration
-                self._felt.extend((w.x, w.y, w.z, a.x, a.y, a.z))
+                parts = (getattr(message, of, None) for of in ("angular_velocity", "linear_acceleration"))
+                self._felt.extend(getattr(part, axis, np.nan) for part in parts for axis in "xyz")  # a node has none
             elif isinstance(m, Fix) and len(self._fixes[m.topic]) < MOST:
                 self._fixes[m.topic].append(m)
             elif isinstance(m, Sightings) and m.topic in self._sightings:
