@@ -114,8 +114,7 @@ class FactCollector:
 
     def _clock_stands(self, processed: int) -> bool:
         """Return whether simulated time stands still, and messages are processed all the same."""
-        now_ns, now_s = self._node.now_ns, time.monotonic()
-        before, self._processed = self._processed, processed
+        now_ns, now_s, before, self._processed = self._node.now_ns, time.monotonic(), self._processed, processed
         if not now_ns or now_ns != self._clock_ns:
             self._clock_ns, self._stands_since = now_ns, now_s
         return now_s - self._stands_since > 2.0 and processed > before

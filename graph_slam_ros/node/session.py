@@ -217,9 +217,10 @@ class Session:
             return
         self._warn("output.folder", "the run folder was removed: it is made again, with the map as it is")
         with self._accepting:
-            self._recorder.abandon()
-            folder, self._recorder, self._is_saved, self.recording_fails = self._recorder.folder, None, False, True
-            self._recorder = RunRecorder(folder, self.slam.config, _SYNC_S, self.slam, force=True)
+            gone, self._recorder, self._is_saved, self.recording_fails = self._recorder, None, False, True
+            gone.abandon()
+            given = gone.folder, self.slam.config, _SYNC_S, self.slam
+            self._recorder = RunRecorder(*given, force=True, accepted=gone.accepted)
             self.recording_fails = False
 
     # -- services ----------------------------------------------------------------------------------------------------

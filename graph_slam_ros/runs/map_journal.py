@@ -72,7 +72,7 @@ class MapGrowth:
     start : the map that the run goes on in
     """
 
-    def __init__(self, start: MapSnapshot | GraphSlam | None = None) -> None:
+    def __init__(self, start: MapSnapshot | GraphSlam | None = None, before: int = 0) -> None:
         self._displacements: list[dict[str, Any]] = []
         self._begin()
         self.first: list[Record] = [{"type": "map", "version": _FIRST}]
@@ -81,7 +81,7 @@ class MapGrowth:
             self._displacements = start.displacements
             values = start.values if isinstance(start, MapSnapshot) else start.solver.values
             self.first += [self.since(start) | known, _estimate(values), {"type": "start"}]
-        self._before = start.processed if isinstance(start, GraphSlam) else 0  # records of another journal
+        self._before = before  # records of another journal
 
     def _begin(self) -> None:
         self._vertices = self._edges = self._judged = self._changes = 0
@@ -112,7 +112,7 @@ class MapGrowth:
         if (alarms := slam.displacements) != self._displacements:
             changed["displacements"] = self._displacements = alarms
         used = {"used": [slam.newest_odometry_ns, slam.odometry_source]} if slam.odometry_source else {}
-        yield self.since(slam) | changed | {"processed": slam.processed - self._before} | used
+        yield self.since(slam) | changed | {"processed": max(0, slam.processed - self._before)} | used
         count = len(slam.keyframes)
         has_jumped = slam.correction.distance_m > _JUMP_M and count > 1.01 * self._estimated
         if has_jumped or count >= _MORE * self._estimated + 1:

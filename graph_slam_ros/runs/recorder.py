@@ -53,7 +53,7 @@ class RunRecorder:
     folder : made if it is not there; anything in it is refused but a run that holds nothing
     force : a run that holds something is replaced, too
     sync_s : so often at most the disk is asked to take the journal, in a thread of its own; 0: at the end
-    start : the map that the run goes on in
+    start, accepted : the map that the run goes on in, and the measurements that it has accepted before this journal
     """
 
     def __init__(
@@ -64,6 +64,7 @@ class RunRecorder:
         start: MapSnapshot | GraphSlam | None = None,
         *,
         force: bool = False,
+        accepted: int = 0,
     ) -> None:
         self.folder = Path(folder)
         self._sync_s, self._due_s = sync_s, 0.0
@@ -71,13 +72,13 @@ class RunRecorder:
         self._writing, self._starting = threading.RLock(), threading.Lock()
         self._is_ended = False
         self._flushing: Future[None] | None = None
-        self.accepted = start.processed if isinstance(start, GraphSlam) else 0  # measurements, written or not
+        self.accepted = accepted  # measurements, written or not
         self._syncing: Future[None] | None = None
         self._journal = Parts(self.folder, INGEST, MEASUREMENT)
         self._map = Parts(self.folder, MAP, GROWTH)
         self._left = Parts(self.folder, CONDENSED, LEFT)
         self._accepted: deque[Measurement] = deque()  # and not written yet
-        self._growth, self._begins_in_a_map = MapGrowth(start), start is not None
+        self._growth, self._begins_in_a_map = MapGrowth(start, accepted), start is not None
         self._grown = self._growth.first
         self._bag: BagWriter | None = None
         self._bags = 0
@@ -239,9 +240,8 @@ class RunRecorder:
                     self._record_map(slam)
                 self._end_parts()
                 parts = self._ended_parts()
-            unprocessed = max(0, self.accepted - slam.processed)
-            contents = (summary or {}) | parts | {"unprocessed": unprocessed, "load": self._load.as_dict()}
-            save_results(self.folder, slam, contents, self._refuse_if_ended)
+            parts |= {"unprocessed": max(0, self.accepted - slam.processed), "load": self._load.as_dict()}
+            save_results(self.folder, slam, (summary or {}) | parts, self._refuse_if_ended)
         except OSError as error:
             raise RunError(f"{self.folder}: {error.strerror}") from None
         return self.folder

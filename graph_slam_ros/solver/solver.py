@@ -92,7 +92,7 @@ class Solver(OnlineProblem):
         """
         settings = settings or self.settings
         self._grow()
-        if self.graph.edge_count and not len(self.edges):
+        if self.graph.vertex_count and not len(self.vertices):
             raise GraphSlamError("nothing to solve: give the solver vertices and edges (add), or call optimize(graph)")
         if self._solved_with == settings and not self._pending:
             return self.evaluate(settings)

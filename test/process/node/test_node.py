@@ -2,14 +2,12 @@
 
 import json
 import os
-import shutil
 import time
 
 import numpy as np
 import pytest
 from executables import executable
-from live_drive import Drive
-from live_nodes import ENVIRONMENT, graph_slam, node, replayed, results, robot, until
+from live_nodes import ENVIRONMENT, graph_slam, node, replayed, results, until
 from messages import record_drive
 
 from graph_slam_ros.cli import main
@@ -149,17 +147,6 @@ def test_without_a_node_or_where_its_own_does_not_start_the_player_says_so(bag, 
 
 
 # -- start and save -------------------------------------------------------------------------------------------------
-
-
-def test_a_run_folder_that_is_removed_is_made_again_and_the_node_goes_on(tmp_path):
-    with node(f"output.folder:={tmp_path / 'run'}", "inputs.reliable:=true") as n, robot() as r:
-        r.wait_for_node()
-        drive = Drive()
-        until(lambda: r.heard["path"], drive.pace(r), "path")
-        shutil.rmtree(tmp_path / "run")
-        until((tmp_path / "run/config.yaml").exists, drive.pace(r), "folder")
-        assert r.save().success
-        assert n.stop()[0] == 0
 
 
 def test_what_is_refused_at_the_start_ends_the_node_with_its_reason_and_code_2(tmp_path):
