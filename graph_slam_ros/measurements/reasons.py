@@ -52,11 +52,9 @@ REASONS: dict[str, Reason] = {
     "late": Reason(
         _REFUSED,
         "it came after newer messages were used",
-        "ordering.window_s for odometry, ordering.late_s for others; INPUT.offset_s",
+        "ordering.window_s of odometry, ordering.late_s of others; INPUT.offset_s",
     ),
-    "future": Reason(
-        _REFUSED, "the stamp is ahead of the clock, or of odometry", "use_sim_time for a recording; INPUT.offset_s"
-    ),
+    "future": Reason(_REFUSED, "the stamp is ahead of the clock, or of odometry", "use_sim_time; INPUT.offset_s"),
     "far_in_time": Reason(
         _REFUSED, "the transform is dated 10 s away from the others of its frame", "one clock for all /tf"
     ),
@@ -64,9 +62,7 @@ REASONS: dict[str, Reason] = {
     "before_odometry": Reason(_REFUSED, "it is older than all odometry", "begin with odometry; INPUT.offset_s"),
     "after_odometry": Reason(_REFUSED, "it is newer than the last odometry", "end with odometry; INPUT.offset_s"),
     "frozen": Reason(
-        _NOTED,
-        "the robot moved past landmarks while odometry stood still",
-        "its driver repeats a pose, or the robot was towed",
+        _NOTED, "the robot moved past landmarks while odometry stood still", "its driver hangs, or it was towed"
     ),
     "odometry_gap": Reason(_REFUSED, "odometry was silent, or jumped, then", "find out why its driver paused"),
     "overflow": Reason(_REFUSED, "too many messages waited", "inputs.queue of a node, ordering.max_waiting"),
@@ -75,9 +71,7 @@ REASONS: dict[str, Reason] = {
         _REFUSED, "odometry says two different things for one stamp", "one publisher: ros2 topic info -v TOPIC"
     ),
     "sent_again": Reason(_NOTED, "the transform was sent before with the same stamp"),
-    "lost_in_transport": Reason(
-        _REFUSED, "the middleware lost it", "INPUT.reliability: reliable; a larger net.core.rmem_max; smaller messages"
-    ),
+    "lost_in_transport": Reason(_REFUSED, "the middleware lost it", "INPUT.reliability: reliable; net.core.rmem_max"),
     # -- frames
     "frame_slash_stripped": Reason(_REPAIRED, "the name of a frame began with a slash"),
     "frame_empty": Reason(_REFUSED, "the message names no frame", "header.frame_id of its driver; or INPUT.frame"),
@@ -99,7 +93,7 @@ REASONS: dict[str, Reason] = {
     "nonfinite": Reason(_REFUSED, "a number is NaN or infinite", "correct the driver"),
     "too_far": Reason(_REFUSED, "a coordinate is beyond 1e9 m", "correct the driver"),
     "beyond_max_distance": Reason(
-        _REFUSED, "the landmark or closure is farther away than sensors see", "INPUT.max_distance_m"
+        _REFUSED, "it is farther away than INPUT.max_distance_m, or 100 km", "INPUT.max_distance_m"
     ),
     "quaternion_normalized": Reason(_REPAIRED, "the quaternion was not quite of length one"),
     "zero_quaternion": Reason(_REFUSED, "the quaternion is zero", "have the driver fill in the orientation"),
@@ -129,7 +123,7 @@ REASONS: dict[str, Reason] = {
         _NOTED, "the gyro's bias is not known before the robot has stood", "stand for a second; gyro.bias_sigma"
     ),
     "gyro_silent": Reason(
-        _NOTED, "the gyro had no message for longer than gyro.timeout_s", "gyro.timeout_s; INPUT.offset_s"
+        _NOTED, "the gyro was silent for longer than gyro.timeout_s", "gyro.timeout_s; INPUT.offset_s"
     ),
     "gyro_doubted": Reason(
         _NOTED, "the gyro contradicts odometry in most turns", "rad/s, counter-clockwise; its TF or INPUT.mount"
@@ -196,9 +190,7 @@ REASONS: dict[str, Reason] = {
     ),
     "mount_assumed": Reason(_NOTED, "no transform has the place of the sensor: the base is assumed", _FRAMES),
     "map_moved": Reason(
-        _NOTED,
-        "a fix or surveyed landmark was the first to locate the map",
-        "anchor.sigma_m and anchor.sigma_rad hold it",
+        _NOTED, "a fix or surveyed landmark was the first to locate the map", "anchor.sigma_m holds it"
     ),
     "no_altitude": Reason(_REPAIRED, "the fix has no altitude: it counts in the horizontal only"),
     "no_orientation": Reason(_REFUSED, "the IMU says that it has no orientation", "its gyro alone: INPUT.use=gyro"),

@@ -270,14 +270,21 @@ Measurement: TypeAlias = Measured | InitialPose | Control
 
 def check_space(m: Measurement, dimensions: int) -> None:
     """Raise FormatError for a measurement in the plane (2 dimensions) of a robot in space (3), or the reverse."""
-    pose = getattr(m, _POSES.get(type(m), ""), None)
     several = m.sightings if isinstance(m, Sightings) else (m,) if isinstance(m, Fix) else ()
-    sizes = [(len(one.measured), _KINDS[one.kind][0]) for one in several] if pose is None else [(len(pose), _POSE)]
+    sizes = [(len(one.measured), _KINDS[one.kind][0]) for one in several]
+    of_type = [(one, *size) for one in (m, *several) for size in _SIZES.get(type(one), ())]
+    sizes += [(len(numbers), of) for one, name, of in of_type if (numbers := getattr(one, name))]
     if any(size != of[min(dimensions - 2, len(of) - 1)] for size, of in sizes):
         raise FormatError(f"{type(m).__name__}: its numbers are not of {dimensions} dimensions (world.dimensions)")
 
 
-_POSES = {Odometry: "T_odom_base", Closure: "T_from_base", InitialPose: "T_map_base"}
+_SIZES: dict[type, tuple[tuple[str, tuple[int, ...]], ...]] = {
+    Odometry: (("T_odom_base", _POSE), ("twist_covariance", _OF_POSE)),
+    AngularVelocity: (("rate", (1, 3)),),
+    Sighting: (("T_base_sensor", _POSE),),
+    Closure: (("T_from_base", _POSE),),
+    InitialPose: (("T_map_base", _POSE),),
+}
 _TYPES = {
     "odometry": Odometry,
     "angular_velocity": AngularVelocity,
