@@ -114,7 +114,7 @@ def _with_wrong_ids(problem: Problem, fault: Fault, seed: int) -> Trial:
     """By the simulator's faults, which know identities as texts."""
     odometry, closures = split(problem)
     seen, nowhere = problem.sightings, np.zeros((len(problem.poses), 3))
-    named = [Sighting(str(landmark), "position", (0.0, 0.0), ()) for landmark in seen.ends[:, 1].tolist()]
+    named = [Sighting(str(landmark), "position", (0.0, 0.0), np.eye(2)) for landmark in seen.ends[:, 1].tolist()]
     draft = Draft(
         PLANAR,
         nowhere,

@@ -12,7 +12,7 @@ from graph_slam_ros.measurements.types import Odometry
 from graph_slam_ros.slam.frontend.odometry_jumps import OdometryJumps
 from graph_slam_ros.typing import Numbers
 
-_GAP, _LEAST_GAP_NS = 10.0, 1_000_000_000  # times the usual period, and no less than a second
+_GAP, _LEAST_GAP_NS = 10.0, 2_000_000_000  # times the usual period, at least; recorded robots pause for 1.4 s
 _REMEMBERED = 1000  # messages of a source that is not in use, to take over from where the one in use fell silent
 
 
