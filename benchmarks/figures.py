@@ -185,7 +185,7 @@ def against_isam2(name: str) -> Iterator[Row]:
 
 def hall(keyframes: int, window: int) -> Iterator[Row]:
     """A robot that drives in one hall, its map bounded."""
-    found = next(iter(lifelong.measure(keyframes, [0], [window], 2, world="points", blocks=0)))
+    found = next(iter(lifelong.measure(keyframes, [0], [window], 2, world="points")))
     yield Row("path", found["path m"], "m")
     yield Row("landmarks", found["landmarks m"], "m")
     yield Row("memory", found["late MiB"], "MiB", tolerance=1.05)
