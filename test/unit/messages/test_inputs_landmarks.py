@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from foreign import DEFINITIONS
 from messages import (
     DECODERS,
     STAMP_NS,
@@ -28,10 +27,7 @@ from rows import each
 
 from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.lie import so3
-from graph_slam_ros.messages.message_class import message_class
 from graph_slam_ros.messages.to_msg import header, make
-from graph_slam_ros.recordings.bag import BagError, Topic
-from graph_slam_ros.recordings.definitions import recorded_decoder
 
 MARKERS = "visualization_msgs/msg/MarkerArray"
 XYZ = [("x", "f4"), ("y", "f4"), ("z", "f4"), ("id", "u4"), ("sigma", "f8")]
@@ -100,14 +96,10 @@ def test_ranges_and_bearings_are_those_of_a_sensor_that_may_be_turned():
     assert only(heard(scanner(2, TURNED), "scan", at)).T_base_sensor == pytest.approx((1.0, 2.0, 0.0))
     s = only(heard(scanner(2), "scan", cloud([("id", "u4"), ("range", "f8"), ("sigma", "f4")], (9, 3.0, 0.5))))
     assert (s.kind, s.measured, s.covariance) == ("range", (3.0,), (0.25,))
-
-
-def test_in_space_a_bearing_needs_an_elevation_and_stays_in_the_frame_of_its_sensor():
-    q = quaternion(0.1, 0.2, 0.5)
-    b = scanner(3, ("base_link", "eye", (1.0, 2.0, 0.5), q), sigma_rad=0.02)
+    b = scanner(3, TURNED, sigma_rad=0.02)
     s = only(heard(b, "scan", cloud(doubles("bearing", "elevation", "id"), (0.2, 0.1, 3), frame="eye")))
     assert (s.kind, s.measured, s.covariance) == ("bearing", (0.2, 0.1), pytest.approx((0.0004, 0, 0, 0.0004)))
-    assert s.T_base_sensor == pytest.approx((1.0, 2.0, 0.5, q.x, q.y, q.z, q.w))
+    assert s.T_base_sensor == pytest.approx((1.0, 2.0, 0.5, 0.0, 0.0, math.sin(0.25), math.cos(0.25)))
     assert heard(b, "scan", cloud(doubles("bearing", "id"), (0.2, 3), frame="eye")) is None
     assert counted(b) == {"scan": {"no_elevation": 1}}
 
@@ -137,9 +129,7 @@ POINT = (1.0, 2.0, 3.0, 4, 0.1)
         (cloud(XYZ, POINT, point_step=10), "fields_beyond_point"),
         (cloud(XYZ, POINT, width=2), "cut_off"),
         (cloud(XYZ, POINT, width=2**31), "too_many_points"),
-        (cloud(XYZ, (math.nan, *POINT[1:])), "nonfinite"),
         (cloud(XYZ, (*POINT[:4], math.nan)), "nonfinite_covariance"),
-        (cloud(doubles("id", "range"), (1, -2.0)), "range_not_positive"),
         (cloud(doubles("id", "bearing"), (1, 0.2)), "noise_unknown"),
     ],
 )
@@ -180,15 +170,8 @@ def of(type_name, *links, dimensions=2, inputs=None, **settings):
 
 def told(m):
     """Of each landmark of a message: identity, kind, what is measured, and the variances of that."""
-    return [
-        (
-            s.id,
-            s.kind,
-            pytest.approx(s.measured),
-            pytest.approx(np.diag(np.reshape(s.covariance, (len(s.measured), -1)))),
-        )
-        for s in m.sightings
-    ]
+    found = [(s, np.diag(np.reshape(s.covariance, (len(s.measured), -1)))) for s in m.sightings]
+    return [(s.id, s.kind, pytest.approx(s.measured), pytest.approx(variances)) for s, variances in found]
 
 
 def with_covariance(at, *diagonal):
@@ -223,39 +206,36 @@ def test_apriltags_are_where_tf_says_at_their_stamp_and_poor_ones_are_left_out()
     heard(b, "tf", tag_on_tf(-1.0, 0.3, 2.0))
     at = only(heard(b, "seen", tags_seen((3, 0, 60.0)))).measured
     assert at == pytest.approx((2.2, 1.0)), "the mount is the camera's: z ahead, x to the right"
-
-
-@each("later_s", [11, 300])
-def test_a_tag_that_is_seen_again_after_a_while_counts_at_once(later_s):
     b = of(TAGS, AHEAD, inputs={"tf": True})
-    for elapsed_s in range(later_s + 1):
+    for elapsed_s in range(12):
         stamp_ns = STAMP_NS + elapsed_s * 10**9
         b.convert("odom", odometry(stamp_ns=stamp_ns))
-        if elapsed_s in (0, later_s):
+        if elapsed_s in (0, 11):
             assert heard(b, "tf", tag_on_tf(stamp_ns=stamp_ns)) is None
             m = heard(b, "seen", tags_seen((3, 0, 60.0), stamp_ns=stamp_ns))
-            assert (m.stamp_ns, only(m).measured) == (stamp_ns, pytest.approx((3.0, 1.0)))
-    assert "tf" not in counted(b)
+            assert (m.stamp_ns, only(m).measured) == (stamp_ns, pytest.approx((3.0, 1.0))), "again, after a while"
 
 
-def test_aruco_markers_have_headers_of_their_own():
-    b, at = of("aruco_msgs/msg/MarkerArray"), with_covariance(pose(2.0, 1.0), 0.01, 0.04, 1, 1, 1, 1)
-    heads = (12, header(0, "")), (13, header(STAMP_NS + 7, "base_link"))
-    parts = [part("aruco_msgs/msg/Marker", header=head, id=k, pose=at) for k, head in heads]
-    out = b.convert("seen", sent("aruco_msgs/msg/MarkerArray", header=HEAD, markers=parts))
-    assert [(m.stamp_ns, *told(m)) for m in out] == [
+def test_arrays_of_other_packages_are_landmarks_with_their_own_frames_stamps_and_identities():
+    kind, own = "aruco_msgs/msg/MarkerArray", header(STAMP_NS + 7, "base_link")
+    at, b = with_covariance(pose(2.0, 1.0), 0.01, 0.04, 1, 1, 1, 1), of(kind)
+    parts = [part("aruco_msgs/msg/Marker", header=h, id=k, pose=at) for k, h in ((12, header(0, "")), (13, own))]
+    assert [(m.stamp_ns, *told(m)) for m in b.convert("seen", sent(kind, header=HEAD, markers=parts))] == [
         (STAMP_NS, ("12", "position", (2.0, 1.0), [0.01, 0.04])),
         (STAMP_NS + 7, ("13", "position", (2.0, 1.0), [0.01, 0.04])),
     ]
-
-
-def test_A29_arrays_of_marker_numbers_and_poses_must_be_of_one_length():
     kind = "ros2_aruco_interfaces/msg/ArucoMarkers"
     b = of(kind, sigma_m=0.2, sigma_rad=0.1)
     m = heard(b, "seen", sent(kind, header=HEAD, marker_ids=np.array([5], np.int64), poses=[AT]))
     assert told(m) == [("5", "pose", (2.0, 1.0, 0.3), SIGMAS)]
     assert heard(b, "seen", sent(kind, header=HEAD, marker_ids=np.array([5, 6], np.int64), poses=[AT])) is None
-    assert counted(b) == {"seen": {"lengths_differ": 1}}
+    assert counted(b) == {"seen": {"lengths_differ": 1}}, "A29"
+    kind, at = "rtabmap_msgs/msg/LandmarkDetections", with_covariance(pose(2.0, 1.0), *[0.01] * 6)
+    ahead = {"header": header(STAMP_NS, "eye"), "size": 0.1, "pose": at}
+    parts = [part("rtabmap_msgs/msg/LandmarkDetection", id=k, **ahead) for k in (6, 0)]
+    assert told(heard(of(kind, AHEAD), "seen", sent(kind, header=HEAD, landmarks=parts))) == [
+        (name, "pose", (3.0, 1.0, 0.0), [0.01] * 3) for name in ("6", "")
+    ]
 
 
 def test_poses_of_aruco_markers_have_a_header_each_that_goes_before_that_of_the_marker_and_of_the_array():
@@ -290,16 +270,6 @@ def test_fiducial_transforms_are_landmarks_in_the_frame_of_the_camera_as_the_byt
     m = heard(b, "seen", cdr)
     assert told(m) == [("7", "pose", (3.0, 1.0, 0.3), SIGMAS), ("107", "pose", (4.0, 1.0, 0.3), SIGMAS)]
     assert (m.stamp_ns, counted(b)) == (STAMP_NS, {})
-
-
-def test_rtabmaps_landmarks_have_their_own_frame_and_positive_ids():
-    kind, one = "rtabmap_msgs/msg/LandmarkDetections", "rtabmap_msgs/msg/LandmarkDetection"
-    at, b = with_covariance(pose(2.0, 1.0), *[0.01] * 6), of(kind, AHEAD)
-    parts = [part(one, header=header(STAMP_NS, "eye"), id=k, size=0.1, pose=at) for k in (6, 0)]
-    assert told(heard(b, "seen", sent(kind, header=HEAD, landmarks=parts))) == [
-        (name, "pose", (3.0, 1.0, 0.0), [0.01] * 3) for name in ("6", "")
-    ]
-    assert counted(b) == {}
 
 
 def test_cartographers_weights_are_inverse_standard_deviations():
@@ -342,15 +312,6 @@ def test_mrpts_ranges_and_bearings_pitch_down_and_minus_one_is_no_identity(dimen
     assert counted(b) == {}
 
 
-def test_a_recorded_definition_that_lacks_what_is_read_is_refused_by_field():
-    for type_name, text in (
-        (TAGS, DEFINITIONS[TAGS].replace("int32 hamming\n", "")),
-        ("sensor_msgs/msg/NavSatFix", "std_msgs/Header header\nfloat64 latitude\n"),
-    ):
-        with pytest.raises(BagError, match=r"of this recording has no field '(hamming|status)'"):
-            recorded_decoder(Topic("/t", type_name, 1, text))
-
-
 @each(
     "given, remedy",
     [
@@ -364,8 +325,3 @@ def test_a_type_that_no_input_reads_is_refused_with_the_one_that_is_meant(given,
         listening("seen", given)
     assert str(refused.value).startswith(f"seen.type: '{given}' is no type of an input: {remedy}")
     assert len(str(refused.value)) < 180, "a line of the command has 200 characters"
-
-
-def test_a_package_that_is_not_installed_is_refused_by_name():
-    with pytest.raises(ConfigError, match=r"^nobodys_msgs/msg/Thing: nobodys_msgs is not installed here"):
-        message_class("nobodys_msgs/msg/Thing")

@@ -4,7 +4,6 @@ import itertools
 import math
 
 import numpy as np
-import pytest
 from messages import STAMP_NS, TWIST, border, counted, odometry, pose, quaternion
 from rows import each
 
@@ -96,11 +95,6 @@ def test_any_messages_are_read_as_they_are_decoded(seed, dimensions, monkeypatch
     compare(messages, monkeypatch, world={"dimensions": dimensions})
 
 
-@each("sections", [{"odometry": {"noise": "density"}}, {"odom": {"frame": "odom"}}, {"odom": {"offset_s": -0.25}}])
-def test_settings_of_the_input_are_followed(sections, monkeypatch):
-    compare([*drive(5), *drive(5, frame="elsewhere"), *drive(2, child="wheel")], monkeypatch, **sections)
-
-
 def test_nearly_all_messages_are_not_decoded(monkeypatch):
     messages = [*drive(50)]
     measured, _, decoded = converted(messages, monkeypatch)
@@ -111,32 +105,3 @@ def test_nearly_all_messages_are_not_decoded(monkeypatch):
     assert not out.convert_run("odom", messages, 0)  # the first
     assert len(out.convert("odom", messages[0])) == 1
     assert len(out.convert_run("odom", messages[1:], 0)) == 49
-
-
-@each(
-    "damaged",
-    [
-        lambda cdr: cdr[:-1],
-        lambda cdr: cdr[:40],
-        lambda cdr: cdr[:5],
-        lambda cdr: b"",
-        lambda cdr: cdr + b"\0\0\0",
-        lambda cdr: cdr + b"\0\0\0\0",
-        lambda cdr: b"\x00\x00" + cdr[2:],
-        lambda cdr: b"\x00\x07" + cdr[2:],
-        lambda cdr: cdr[:12] + b"\xff\xff\xff\xff" + cdr[16:],
-        lambda cdr: cdr[:12] + b"\x00\x00\x00\x00" + cdr[16:],
-        lambda cdr: cdr.replace(b"odom\0", b"odomm"),
-        lambda cdr: cdr.replace(b"odom\0", b"od\0m\0"),
-    ],
-)
-def test_damaged_bytes_are_left_to_the_decoder(damaged, monkeypatch):
-    whole = [*drive(4)]
-    compare([whole[0], damaged(whole[1]), whole[2], damaged(whole[3]), damaged(whole[3])], monkeypatch)
-
-
-def test_a_recording_whose_messages_have_another_layout_is_decoded(monkeypatch):
-    own = decoder(TYPE)
-    out = border(decoders={TYPE: lambda cdr: own(cdr[:-8])})  # as if a field came after ours
-    monkeypatch.setattr(OdometryReader, "read", lambda self, cdr: pytest.fail("its bytes have other places"))
-    assert [len(out.convert("odom", cdr + bytes(8))) for cdr in drive(3)] == [1, 1, 1]

@@ -10,7 +10,7 @@ from graph_slam_ros.lie import se2, se3
 from graph_slam_ros.messages import results
 from graph_slam_ros.messages.interfaces import typestore
 from graph_slam_ros.messages.path_updates import PathUpdates
-from graph_slam_ros.slam import Closure, Config, Control, GraphSlam, Odometry
+from graph_slam_ros.slam import Closure, Config, GraphSlam, Odometry
 
 STAMP_NS = 1_700_000_000_000_000_000
 
@@ -60,8 +60,7 @@ def test_of_a_path_whose_first_keyframes_have_left_only_what_is_new_or_has_moved
 
 @each("side", [-1.0, 1.0])
 def test_in_space_a_turn_about_any_axis_is_one_whatever_the_sign_of_the_quaternion(side):
-    rng = np.random.default_rng(2)
-    most = 0.3
+    rng, most = np.random.default_rng(2), 0.3
     for _ in range(50):
         pose, axis = se3.exp(tuple(rng.standard_normal(6))), rng.standard_normal(3)
         for angle, too_far in ((most - 1e-6, False), (most + 1e-6, True), (np.pi, True)):
@@ -69,10 +68,6 @@ def test_in_space_a_turn_about_any_axis_is_one_whatever_the_sign_of_the_quaterni
             updates = PathUpdates(0.1, most)
             sent(updates, SPATIAL, [pose])
             assert sent(updates, SPATIAL, [[*turned[:3], *(side * np.array(turned[3:]))]]) == ([0] if too_far else None)
-        raised = [*pose[:2], pose[2] + 0.11, *pose[3:]]
-        updates = PathUpdates(0.1, most)
-        sent(updates, SPATIAL, [pose])
-        assert sent(updates, SPATIAL, [raised]) == [0]
 
 
 def driven():
@@ -95,7 +90,6 @@ def test_updates_put_together_by_stamp_are_the_path_within_the_thresholds():
             assert newest == slam.keyframes[-1].stamp_ns
             received.update(poses)
             told.append(len(poses))
-    assert updates.version == len(told)
     _, path = decoded(results.path(slam))
     assert received.keys() == path.keys()
     sent, now = np.array([received[stamp] for stamp in path]), np.array(list(path.values()))
@@ -103,17 +97,7 @@ def test_updates_put_together_by_stamp_are_the_path_within_the_thresholds():
     worst = np.abs(sent - now).max()
     assert 0.0 < worst <= 0.05
     assert max(told[:40]) == 1 and max(told) > 20, "closures move many, odometry none"
-
-
-def test_after_a_restart_all_is_forgotten_and_all_is_sent():
-    slam, updates = GraphSlam(), PathUpdates(0.05, 0.01)
-    assert (updates.update(slam), updates.version) == (None, 0)
-    for m in driven():
-        slam.process(m)
-    slam.process(Control("flush"))
-    updates.update(slam)
+    assert updates.version == len(told)
     assert updates.update(slam) is None
-    assert decoded(updates.restart(slam)) == (0, {})
-    assert updates.version == 1
-    assert decoded(updates.update(slam)) == decoded(results.path(slam))
-    assert updates.version == 2
+    assert decoded(updates.restart(slam)) == (0, {}), "all is forgotten"
+    assert decoded(updates.update(slam)) == decoded(results.path(slam)), "and sent"

@@ -19,14 +19,3 @@ def test_messages_out_of_order_and_repeated_stamps_are_sorted_in_and_what_is_too
         t.add_at(stamp_ns, "base", "arm", at(float(stamp_ns)))
     assert t.lookup("base", "arm", 885) is None
     assert t.lookup("base", "arm", 895)[0] == pytest.approx(895.0)
-
-
-def test_a_frame_that_changes_its_parent_leaves_its_past_and_a_link_that_is_fixed_does_not_move():
-    t = Transforms()
-    t.add_at(1, "gripper", "cup", at(1.0))
-    t.add_at(2, "table", "cup", at(2.0))
-    assert t.lookup("gripper", "cup", 1) is None
-    assert t.lookup("table", "cup", 2) == at(2.0)
-    t.add("base", "eye", at(1.0))
-    t.add_at(5, "base", "eye", at(2.0))
-    assert t.lookup("base", "eye", 5) == t.lookup("base", "eye", 9) == at(1.0)

@@ -1,6 +1,6 @@
 """Topics that an input could use instead of one that nobody publishes: they are named with the parameter."""
 
-from dataclasses import dataclass
+from types import SimpleNamespace
 
 from rows import each
 
@@ -10,12 +10,6 @@ from graph_slam_ros.slam import Config
 ODOMETRY, DETECTIONS = "nav_msgs/msg/Odometry", "vision_msgs/msg/Detection3DArray"
 APRILTAGS, CLOUD = "apriltag_msgs/msg/AprilTagDetectionArray", "sensor_msgs/msg/PointCloud2"
 OWN = "graph_slam"
-
-
-@dataclass
-class Publisher:
-    node_name: str
-    node_namespace: str = "/"
 
 
 class Graph:
@@ -28,7 +22,7 @@ class Graph:
         return [(name, [kind]) for name, (kind, *_) in self.topics.items()]
 
     def get_publishers_info_by_topic(self, topic):
-        return [Publisher(name) for name in self.topics[topic][1:]]
+        return [SimpleNamespace(node_name=name, node_namespace="/") for name in self.topics[topic][1:]]
 
     def get_name(self):
         return OWN
@@ -63,9 +57,3 @@ def test_topics_of_others_that_fit_are_named_with_the_parameter(name, topics, te
     assert len(found) == len(texts)
     for text, begin in zip(found, texts, strict=True):
         assert text.startswith(begin)
-
-
-def test_for_odometry_on_tf_no_topic_is_named():
-    config = Config.from_mapping({"odom.type": "tf2_msgs/msg/TFMessage", "odom.topic": "/frames"})
-    one = next(one for one in config.sources if one.name == "odom")
-    assert alternatives(Graph(tf=("tf2_msgs/msg/TFMessage", "driver")), one, "odometry", ()) == ()

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from messages import TWIST, covariance6, detection, detections, encode, header, make, pose, quaternion, vector
+from messages import TWIST, covariance6, encode, header, make, pose, quaternion, vector
 from rows import each
 
 from graph_slam_ros.lie import se2
@@ -140,57 +140,21 @@ def test_odometry_is_checked_by_itself_with_its_twist(wrong, text, clock):
         assert one.startswith(text)
 
 
-@each("lost, seeds", [(0.02, 1)])
-def test_two_publishers_on_a_busy_machine_have_no_wrong_units(lost, seeds, clock):
+def test_two_publishers_on_a_busy_machine_have_no_wrong_units(clock):
     """A lost message is sent again up to 0.6 s later; until then none of its publisher comes."""
-    for seed in range(seeds):
-        rng, at_s = np.random.default_rng(seed), 100.0
-        arrivals, again_s = [], [0.0, 0.0]
-        for k in range(1000):
-            at_s += 0.022 + (rng.exponential(0.2) if rng.random() < 0.1 else 0.0)
-            for which in (0, 1) if 200 < k < 800 else (0,):
-                if rng.random() < lost:
-                    again_s[which] = max(again_s[which], at_s + rng.uniform(0.05, 0.6))
-                arrivals.append((max(at_s, again_s[which]), which, k))
-        check, converter, counters = new_check(**{"odometry.timeout_s": 10.0})
-        for at_s, which, k in sorted(arrivals):
-            clock[0] = at_s
-            stamp_ns = 10**15 + k * 30_000_000 + which * 10_000_000
-            cdr = odometry(0.6 * k, stamp_ns=stamp_ns, x=80.0 * which)
-            check.add("/odom", ["odom"], stamp_ns, converter.convert("odom", cdr))
-            if (job := check.job()) is not None:
-                job()
-            assert check.findings == ()
-        assert counters["odom", "other_publisher"] > 300
-
-
-@each("burst, is_named", [(1, True), (10, False)])
-def test_slow_odometry_is_named_and_not_what_comes_in_bursts(burst, is_named, clock):
-    """Two poses a second, or twenty of which each ten come at once; sightings between them."""
-    check, converter, _ = new_check()
-    for k in range(0, 1000, 10):
-        clock[0] += 0.5
-        for j in range(k, k + 10, 10 // burst):
-            check.add("/odom", ["odom"], 10**15 + j * NS // 20, converter.convert("odom", odometry(j)))
-        stamp_ns = 10**15 + (2 * k + 5) * NS // 40
-        cdr = detections(detection(pose(3.0, 1.0)), stamp_ns=stamp_ns)
-        check.add("/tags", ["detections"], stamp_ns, converter.convert("detections", cdr))
-    run_job(check, clock)
-    assert len(check.findings) == is_named, check.findings
-    assert all(one.startswith("slow_odometry: /odom comes at 2.0 Hz: ") for one in check.findings)
-
-
-@each("late_s, setting", [(0.1, None), (3600.0, "odom.offset_s=3600.")])
-def test_a_clock_of_odometry_that_is_not_that_of_all_others_is_named_with_its_offset(late_s, setting, clock):
-    check, converter, _ = new_check()
-    for k in range(100):
-        clock[0] += 1.0
-        now_ns = 10**15 + k * NS // 20
-        cdr = odometry(k, stamp_ns=now_ns - round(late_s * NS))
-        check.add("/odom", ["odom"], now_ns, converter.convert("odom", cdr))
-        if k % 5 == 0:
-            cdr = detections(detection(pose(3.0, 1.0)), stamp_ns=now_ns)
-            check.add("/tags", ["detections"], now_ns, converter.convert("detections", cdr))
-    run_job(check, clock)
-    assert len(check.findings) == (setting is not None), check.findings
-    assert all(setting in one and "/odom: its stamps are" in one for one in check.findings)
+    rng, at_s, arrivals, again_s = np.random.default_rng(0), 100.0, [], [0.0, 0.0]
+    for k in range(1000):
+        at_s += 0.022 + (rng.exponential(0.2) if rng.random() < 0.1 else 0.0)
+        for which in (0, 1) if 200 < k < 800 else (0,):
+            if rng.random() < 0.02:
+                again_s[which] = max(again_s[which], at_s + rng.uniform(0.05, 0.6))
+            arrivals.append((max(at_s, again_s[which]), which, k))
+    check, converter, counters = new_check(**{"odometry.timeout_s": 10.0})
+    for clock[0], which, k in sorted(arrivals):
+        stamp_ns = 10**15 + k * 30_000_000 + which * 10_000_000
+        cdr = odometry(0.6 * k, stamp_ns=stamp_ns, x=80.0 * which)
+        check.add("/odom", ["odom"], stamp_ns, converter.convert("odom", cdr))
+        if (job := check.job()) is not None:
+            job()
+        assert check.findings == ()
+    assert counters["odom", "other_publisher"] > 300

@@ -9,7 +9,7 @@ from imperfect import START_NS, Faults, driven, imperfect_drive
 from graph_slam_ros.lie import se2
 from graph_slam_ros.slam import Odometry
 from graph_slam_ros.slam.calibration.choice import parameters_of
-from graph_slam_ros.slam.calibration.fit import fit, likelier_fit
+from graph_slam_ros.slam.calibration.fit import fit
 from graph_slam_ros.slam.calibration.parameters import GROUPS, Parameter
 from graph_slam_ros.slam.calibration.rows import Linearization
 from graph_slam_ros.slam.robust.odometry_errors import odometry_errors
@@ -89,25 +89,6 @@ def test_a_fit_finds_what_was_wrong_and_changes_nothing(wrong):
     assert np.abs(found.correlation - np.eye(4)).max() < 0.95
 
 
-def test_bearings_alone_tell_no_scale_and_a_mount_is_found_where_odometry_keeps_its_own():
-    slam = driven(imperfect_drive(Faults(yaw=0.08), kind="bearing", seconds=60.0))
-    assert "distance" in {one.name for one in parameters_of(trial_problem(slam), ["factors"])}, "if it is asked for"
-    _, findings = slam.trial_fit()
-    by_name = {one.parameter.name: one for one in findings}
-    assert by_name.keys() == {"turn", "clock", "yaw"}
-    assert by_name["yaw"].verdict == "admitted"
-    assert by_name["yaw"].value == pytest.approx(0.08, abs=0.015)
-
-
-def test_range_factor_and_offset_are_found_where_distance_is_held():
-    slam = driven(imperfect_drive(Faults(range_factor=0.93, range_offset=0.2), seconds=60.0))
-    problem = trial_problem(slam)
-    wanted = parameters_of(problem, ["range_factor", "range_offset"])
-    found = fit(problem, {one: one.quantity.prior for one in wanted})
-    for parameter, truth in zip(wanted, (0.2, -0.07), strict=True):
-        assert abs(found.value(parameter) - truth) < 5.0 * found.sigmas[wanted.index(parameter)] + 0.005, parameter
-
-
 def slipped(factor, seconds=60.0):
     """A drive in which odometry tells a multiple of the way from 40 s on for 8 s, and its trial problem with slips."""
     told, out, odom, last = (40.0, 48.0), [], (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
@@ -132,16 +113,3 @@ def test_evidence_of_a_slip_is_that_of_the_errors_of_odometry():
     without, found = fit(problem.without_slips(), {}), fit(problem, {})  # a fit overwrites its graph
     assert ratio < -20.0
     assert without.evidence - found.evidence == pytest.approx(ratio, rel=0.03)
-    problem = replace(trial_problem(slam), slips=slam._kidnaps.slipped(slam.keyframes))
-    priors = {one: one.quantity.prior for one in parameters_of(problem, ("factors", "clock", "yaw"))}
-    assert likelier_fit(problem, priors, np.log(1e-6)).slips, "whatever the parameters are"
-
-
-def test_a_wrong_mount_that_passes_for_slips_is_found_without_them():
-    slam = driven(imperfect_drive(Faults(yaw=-0.15, distance=0.95), seconds=60.0))
-    problem = replace(trial_problem(slam), slips=slam._kidnaps.slipped(slam.keyframes))
-    assert problem.slips
-    priors = {one: one.quantity.prior for one in parameters_of(problem, ("factors", "clock", "yaw"))}
-    found = likelier_fit(problem, priors, np.log(1e-6))
-    assert not found.slips
-    assert found.value(Parameter("detections", "yaw")) == pytest.approx(-0.15, abs=0.01)

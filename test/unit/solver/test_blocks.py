@@ -48,23 +48,21 @@ def drive(relative, sighting, *, poses=60, more=0.0):
 
 @pytest.mark.skipif(numba.config.DISABLE_JIT, reason="nothing is compiled")
 def test_edges_are_the_same_bytes_compiled_and_one_table_after_the_other():
-    compiled = drive(RELATIVE_POSE, LANDMARK_POSITION)
-    for fast, slow in zip(compiled, drive(in_python(RELATIVE_POSE), in_python(LANDMARK_POSITION)), strict=True):
+    in_two_ways = drive(RELATIVE_POSE, LANDMARK_POSITION), drive(in_python(RELATIVE_POSE), in_python(LANDMARK_POSITION))
+    for fast, slow in zip(*in_two_ways, strict=True):
         check_tree(fast)
         assert fast.values.tobytes() == slow.values.tobytes()
-        assert fast._tree.blocks.tobytes() == slow._tree.blocks.tobytes()
-    assert [bool(table.pointers[LINEARIZE]) for table in fast.graph.tables.values()] == [True, True]
-    assert [bool(table.pointers[LINEARIZE]) for table in slow.graph.tables.values()] == [False, False]
+    compiled = [bool(table.pointers[LINEARIZE]) for one in (fast, slow) for table in one.graph.tables.values()]
+    assert compiled == [True, True, False, False]
 
 
 @each("way", [Graph.copy, lambda graph: pickle.loads(pickle.dumps(graph)), lambda graph: kept_part(
     graph, np.arange(graph.vertex_count), np.arange(graph.edge_count), graph.initial.values)])  # fmt: skip
-def test_a_copy_of_a_graph_is_where_its_own_columns_are(way):
+def test_a_copy_of_a_graph_is_one_of_its_own(way):
     graph = Graph()
     poses = graph.add_vertices(SE2, np.zeros((40, 3)))
     graph.add_edges(RELATIVE_POSE, np.column_stack([poses[:-1], poses[1:]]), np.ones((39, 3)), PLANAR, "odometry")
     same = way(graph)
-    check_pointers(same)
     same.add_edge(next(iter(same.tables)), [0, 39], [1.0, 2.0, 3.0], PLANAR, "closures")
     check_pointers(same)
     assert (graph.edge_count, same.edge_count) == (39, 40)

@@ -8,7 +8,7 @@ from normal_equations import Reference, all_values
 from online import BATCH, EXACT, check_tree
 from rows import each
 
-from graph_slam_ros.errors import GaugeError, GraphSlamError
+from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import (
     DIFFERENCE,
     POINT_PRIOR,
@@ -18,7 +18,7 @@ from graph_slam_ros.graph import (
     Graph,
     edge_from_residual,
 )
-from graph_slam_ros.solver import Change, Settings, Solver
+from graph_slam_ros.solver import Settings, Solver
 
 UNIT = Gaussian.from_sigmas(1.0)
 
@@ -52,12 +52,6 @@ def numbers(count, sensor, **chosen):
         solver.add([v], [graph.add_edge(*first, UNIT, "all")])
         solver.update()
     return solver
-
-
-def off_by(solver):
-    graph = solver.graph
-    reference, found = Reference(graph, range(graph.vertex_count), range(graph.edge_count)), all_values(solver)
-    return reference.apart(found, reference.optimum(found))
 
 
 ERRORS = [ValueError("no table"), GraphSlamError("no table"), KeyboardInterrupt()]
@@ -97,24 +91,9 @@ def test_an_exception_of_a_residual_leaves_the_estimate_and_is_recovered_from(wa
     for again in WAYS.values():
         again(solver)
         check_tree(solver)
-        assert off_by(solver) < 1e-9
-    reference = Reference(graph, range(graph.vertex_count), range(graph.edge_count))
+        reference = Reference(graph, range(graph.vertex_count), range(graph.edge_count))
+        assert reference.apart(all_values(solver), reference.optimum(all_values(solver))) < 1e-9
     assert solver.marginal([3])[0] == pytest.approx(reference.covariance(all_values(solver), 3), rel=1e-9)
-
-
-@each("error", ERRORS)
-def test_an_exception_while_linearising_anew_leaves_the_estimate_of_before_the_update(error):
-    sensor = Sensor()
-    solver = numbers(6, sensor)
-    solver.add([], [solver.graph.add_edge(POINT_PRIOR[R1], [5], [30.0], UNIT, "all")])
-    before = all_values(solver)
-    sensor.arm(error)  # the new edge has no such residual: it is met when vertices that moved far are linearised anew
-    with pytest.raises(type(error)):
-        solver.update()
-    assert np.array_equal(all_values(solver), before)
-    assert solver.update().moved >= 5
-    assert off_by(solver) < 1e-9
-    assert solver.update() == Change()
 
 
 def _cliff(x, at, measured):
@@ -140,19 +119,6 @@ def test_a_step_to_where_a_cost_is_not_finite_is_not_taken():
     solver.update()
     assert solver.estimate([0, 1]).ravel().tolist() == [1.0, 1.0]
     check_tree(solver)
-
-
-def test_a_part_that_floats_is_refused_without_making_the_tree_anew():
-    sensor = Sensor()
-    solver = numbers(40, sensor)
-    lost = solver.graph.add_vertex(R1, [0.0])
-    solver.add([lost], [])
-    with pytest.raises(GaugeError, match=f"vertex {lost}"):
-        solver.update()
-    check_tree(solver)
-    solver.add([], [solver.graph.add_edge(DIFFERENCE[R1], [39, lost], [1.0], UNIT, "all")])
-    assert solver.update().linearized == 2
-    assert off_by(solver) < 1e-9
 
 
 # -- what was removed, and what a batch left --------------------------------------------------------------------------

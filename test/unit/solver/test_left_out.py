@@ -133,4 +133,3 @@ def test_what_only_these_edges_determine_is_refused_and_nothing_has_changed():
         solver.joint_marginal_without([marks[0]], every)
     assert np.array_equal(solver.values, before)
     assert np.array_equal(solver.joint_marginal(marks), eliminated)
-    assert not solver.update().eliminated

@@ -8,7 +8,7 @@ import pytest
 from rows import each
 from scipy.optimize import least_squares
 
-from graph_slam_ros.errors import GaugeError, GraphSlamError, SingularError
+from graph_slam_ros.errors import GraphSlamError, SingularError
 from graph_slam_ros.graph import (
     CAUCHY,
     HUBER,
@@ -184,17 +184,6 @@ def test_why_it_stopped_is_told():
     assert (short.stop, short.converged) == ("max_iterations", False)
 
 
-def test_stages_end_where_the_last_loss_has_its_minimum():
-    staged = World(3, outliers=True).solver(losses={"landmarks": STAGES["cauchy"]}, **TIGHT)
-    report = staged.optimize()
-    alone = World(3, outliers=True).solver(losses={"landmarks": STAGES["huber"]}, **TIGHT)
-    first = alone.optimize(alone.settings.on_the_way())
-    assert report.iterations[: len(first.iterations)] == first.iterations
-    assert len(report.iterations) > len(first.iterations)
-    alone.settings = Settings(losses={"landmarks": [Loss(CAUCHY, 2.0)]}, **TIGHT)
-    assert alone.optimize().cost_final == pytest.approx(report.cost_final, rel=1e-12)
-
-
 def test_a_second_update_changes_nothing():
     world = World(0)
     solver = world.solver()
@@ -312,20 +301,16 @@ def solve(graph, held=(), **settings):
 
 
 def test_where_all_is_held_nothing_is_to_do():
+    nothing = Solver(Graph())
+    report = nothing.optimize()
+    assert (report.stop, report.chi2_final, report.classes) == ("nothing_to_do", 0.0, {})
+    assert (nothing.marginal([]), len(nothing.estimate([]))) == ([], 0)
     graph = small([0.0, 0.0, 0.0], [2.0, 0.0, 0.0])
     graph.add_edge(RELATIVE_POSE, [0, 1], [1.0, 0.0, 0.0], PLANAR, "odometry")
     solver, report = solve(graph, held=[0, 1])
     assert (report.stop, report.chi2_final) == ("nothing_to_do", pytest.approx(100.0))
     assert not np.array(solver.marginal([0, 1])).any()
     assert solver.information_matrix().shape == (0, 0)
-
-
-def test_nothing_at_all_is_solved():
-    solver = Solver(Graph())
-    report = solver.optimize()
-    assert (report.stop, report.chi2_final, report.classes) == ("nothing_to_do", 0.0, {})
-    assert solver.marginal([]) == []
-    assert len(solver.estimate([])) == 0
 
 
 def test_G1_parts_without_a_link_are_solved_as_if_alone():
@@ -346,94 +331,18 @@ def test_G1_parts_without_a_link_are_solved_as_if_alone():
     assert second == pytest.approx(alone[1].estimate(range(POSES)), abs=1e-9)
 
 
-def test_G1_a_part_that_nothing_fixes_is_named_and_the_estimate_stays():
-    graph = small([0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [5.0, 0.0, 0.0], [6.5, 0.0, 0.0], [8.0, 0.0, 0.0])
-    for i, j in ((0, 1), (2, 3), (3, 4)):
-        graph.add_edge(RELATIVE_POSE, [i, j], [1.0, 0.0, 0.0], PLANAR, "odometry")
-    solver = Solver(graph)
-    solver.add(range(5), range(3))
-    with pytest.raises(GaugeError, match="vertex 0 and 1 more"):
-        solver.optimize()
-    solver.hold(0)
-    with pytest.raises(GaugeError, match="vertex 2 and 2 more"):
-        solver.optimize()
-    with pytest.raises(GaugeError, match="vertex 2"):
-        solver.marginal([1])
-    assert np.array_equal(solver.estimate(range(5)).ravel(), graph.initial.values)
-    solver.hold(3)
-    assert solver.optimize().chi2_final == pytest.approx(0.0, abs=1e-12)
-
-
-@each("method", ["gn", "lm", "dogleg"])
-@each("seed", range(6))
-def test_G6_a_pose_that_may_turn_around_its_only_landmark_is_named(method, seed):
-    rng = np.random.default_rng(seed)
-    graph = small(*rng.standard_normal((2, 3)))
-    graph.add_vertex(R2, rng.standard_normal(2))
-    noise = Gaussian.from_covariance(covariance(rng, 2, 0.1))
-    graph.add_edge(POSE_PRIOR, [0], [0.0, 0.0, 0.0], Gaussian.from_covariance(covariance(rng, 3, 0.1)), "anchor")
-    for pose in (0, 1):
-        graph.add_edge(LANDMARK_POSITION, [pose, 2], rng.standard_normal(2), noise, "landmarks")
-    solver = Solver(graph, Settings(method=method))
-    solver.add(range(3), range(3))
-    with pytest.raises(SingularError, match=r"vertex 1$"):
-        solver.optimize()
-    assert np.array_equal(solver.estimate([0, 1]).ravel(), graph.initial.values[:6])
-    with pytest.raises(SingularError, match=r"vertex 1$"):
-        solver.marginal([0])
-
-
-def test_edges_of_very_different_strength_are_not_called_singular():
-    graph = small([0.0, 0.0, 0.0], [1.0, 0.0, 0.1], [2.0, 0.0, 0.0])
-    graph.add_edge(POSE_PRIOR, [0], [0.0, 0.0, 0.0], Gaussian.from_sigmas(100.0, 100.0, 1.0), "anchor")
-    for i in (0, 1):
-        graph.add_edge(RELATIVE_POSE, [i, i + 1], [1.0, 0.0, 0.0], Gaussian.from_sigmas(1e-3, 1e-3, 1e-4), "odometry")
-    solver, report = solve(graph)
-    assert report.converged
-    assert solver.estimate([2])[0] == pytest.approx([2.0, 0.0, 0.0], abs=1e-6)
-
-
-def contradictions(seed):
-    """Readings that contradict each other by far: undamped steps jump about."""
-    rng = np.random.default_rng(seed)
+@each("seed", [3, 8])
+def test_gauss_newton_that_fails_is_done_again_with_damping(seed):
+    rng = np.random.default_rng(seed)  # readings that contradict each other by far: undamped steps jump about
     graph = small(*np.column_stack([rng.uniform(-5, 5, (6, 2)), rng.uniform(-3, 3, 6)]))
     graph.add_edge(POSE_PRIOR, [0], [0.0, 0.0, 0.0], PLANAR, "anchor")
     for i, j in itertools.combinations(range(6), 2):
         noise = Gaussian.from_sigmas(0.01, 0.01, 3.0)
         graph.add_edge(RELATIVE_POSE, [i, j], rng.uniform(-3, 3, 3), noise, "closures")
-    return graph
-
-
-@each("seed", [3, 8])
-def test_gauss_newton_that_fails_is_done_again_with_damping(seed):
-    graph = contradictions(seed)
-    solver, report = solve(graph, max_iterations=60)
+    _, report = solve(graph, max_iterations=60)
     assert (report.method, report.converged) == ("lm", True)
-    damped = [report.cost_initial, *(i.cost for i in report.iterations)]
     assert all(i.damping > 0.0 for i in report.iterations)
-    assert (np.diff(damped) <= 0).all()
-    gradient = 1e-4 * np.eye(18)
-    poses = solver.estimate(range(6))
-    values = []
-    for step in (np.zeros(18), *gradient, *-gradient):
-        graph_at = small(*SE2.retract(poses, step.reshape(6, 3)))
-        for table in graph.tables.values():
-            information = Gaussian(table.sqrt_information.values)
-            graph_at.add_edges(table.type, table.vertices.values, table.measured.values, information, "all")
-        values.append(solve(graph_at, held=range(6))[1].chi2_final)
-    assert values[0] == pytest.approx(report.chi2_final, rel=1e-12)
-    assert min(values) > values[0] * (1.0 - 2e-6)  # a minimum along each axis, up to the tolerance of the cost
-
-
-def test_G8_a_step_that_ends_above_the_start_is_not_taken_for_an_answer():
-    # two turns of a hundred degrees make Gauss-Newton overshoot; a loose tolerance would let it end there
-    graph = small([0.0, 0.0, 0.0], [0.0, 1.0, 1.8], [1.0, 1.0, -1.8])
-    graph.add_edge(POSE_PRIOR, [0], [0.0, 0.0, 0.0], PLANAR, "anchor")
-    for i, j in ((0, 1), (1, 2), (2, 0), (1, 0)):
-        graph.add_edge(RELATIVE_POSE, [i, j], [10.0, 0.0, 0.0], Gaussian.from_sigmas(0.01, 0.01, 1.0), "odometry")
-    first = solve(graph, max_iterations=1, step_tolerance=1e3)[1]
-    assert (first.method, first.stop) == ("lm", "step")
-    assert first.cost_final < first.cost_initial
+    assert (np.diff([report.cost_initial, *(i.cost for i in report.iterations)]) <= 0).all()
 
 
 @each("method", ["gn", "lm", "dogleg"])
@@ -449,10 +358,7 @@ def test_a_start_that_leaves_something_open_is_recovered_from(method):
     assert solver.estimate([1])[0] == pytest.approx([1.0, 1.0, 0.0], abs=1e-6)
 
 
-CITIES = {f"odometry {factor} times as noisy": factor for factor in (1.0, 3.0, 6.0)}
-
-
-@each("factor", CITIES.values())
+@each("factor", [1.0, 3.0, 6.0])
 def test_dogleg_converges_from_dead_reckoning_where_levenberg_marquardt_does(factor):
     graph, _ = city_graph(seed=5, poses=500, blocks=6, odometry_noise_factor=factor)
     damped, dogleg = (solve(graph, held=[0], method=method, max_iterations=200)[1] for method in ("lm", "dogleg"))
@@ -475,34 +381,6 @@ def test_G17_far_from_the_origin_the_answer_is_the_same(origin):
     assert other.marginal([7])[0] == pytest.approx(one.marginal([7])[0], rel=1e-5, abs=1e-9)
 
 
-@each("method", ["gn", "lm", "dogleg"])
-def test_G7_numbers_that_overflow_are_refused_and_name_the_edge(method):
-    graph = small([0.0, 0.0, 0.0], [1e200, 0.0, 0.0])
-    graph.add_edge(POSE_PRIOR, [0], [0.0, 0.0, 0.0], PLANAR, "anchor")
-    graph.add_edge(RELATIVE_POSE, [0, 1], [1.0, 0.0, 0.0], PLANAR, "odometry")
-    with pytest.raises(GraphSlamError, match=r"edge 1 .*\[0, 1\].*not finite"):
-        solve(graph, method=method)
-
-
-@each("method", ["gn", "lm", "dogleg"])
-@each("far", [1e6, 1e9, 1e14, 1e140])
-def test_what_is_huge_but_finite_ends_finite_or_is_refused(method, far):
-    graph = small([0.0, 0.0, 0.0], [far, -far, 2.0])
-    graph.add_edge(POSE_PRIOR, [0], [0.0, 0.0, 0.0], PLANAR, "anchor")
-    graph.add_edge(RELATIVE_POSE, [0, 1], [1.0, 0.0, 0.0], PLANAR, "odometry")
-    solver = Solver(graph, Settings(method=method))
-    solver.add([0, 1], [0, 1])
-    try:
-        report = solver.optimize()
-    except SingularError:  # seen from that far, the direction of the first pose is all there is
-        assert far > 1e6
-        assert np.array_equal(solver.estimate([0, 1]).ravel(), graph.initial.values)
-    else:
-        assert np.isfinite(solver.estimate([0, 1])).all()
-        assert report.chi2_final < report.chi2_initial
-        assert far > 1e9 or report.chi2_final < 1e-9
-
-
 def test_a_refused_add_leaves_nothing_behind():
     world = World(0)
     solver = Solver(world.graph)
@@ -523,24 +401,21 @@ def test_a_refused_add_leaves_nothing_behind():
     assert {name: c.edges for name, c in solver.optimize().classes.items()} == {"anchor": 1, "odometry": 2}
 
 
-@each("wrong", [-1, 15, 1000])
+@each("wrong", [-1, 1000, 10**12])
 def test_ids_that_do_not_exist_are_refused_wherever_they_are_asked_for(wrong):
     solver = World(0).solver()
-    for ask in (solver.estimate, solver.marginal, solver.hold):
+    for ask in (solver.estimate, solver.marginal, lambda ids: solver.hold(ids[0])):
         with pytest.raises(GraphSlamError, match=f"vertex {wrong} does not exist"):
-            ask([wrong] if ask != solver.hold else wrong)
+            ask([wrong])
+    of_edges = solver.chi2_of, solver.residuals_of, solver.leave_out, lambda ids: solver.graph.has_label(ids, ("one",))
+    for ask in (*of_edges, lambda ids: solver.set_weight(ids[-1], 1.0)):
+        with pytest.raises(GraphSlamError, match=f"edge {wrong} does not exist"):
+            ask(np.array([0, wrong]))
     for weight in (-1.0, np.nan, np.inf):
         with pytest.raises(GraphSlamError, match="edge 3: weight"):
             solver.set_weight(3, weight)
-    with pytest.raises(GraphSlamError, match=f"edge {wrong * 10} does not exist"):
-        solver.set_weight(wrong * 10, 1.0)
     with pytest.raises(GraphSlamError, match="not of one kind"):
         solver.estimate([0, POSES])
-
-
-def test_an_unknown_method_is_refused_with_the_choices():
-    with pytest.raises(GraphSlamError, match=r"'newton'.*gn, lm or dogleg"):
-        Settings(method="newton")
 
 
 @each("count, seed", [(17, 0), (31, 1), (59, 2), (143, 0), (300, 1)])
