@@ -199,7 +199,7 @@ def test_wheels_that_slip_in_every_turn_are_no_fault_of_the_gyro(wheels):
     robot = Robot()
     robot.drive(5.0)
     for rate in (0.5, -0.5) * 6:
-        robot.drive(10.0, speed=0.5)
+        robot.drive(2.0, speed=0.5)
         robot.drive(2.0, speed=0.5, wheels=wheels * rate, gyro=rate)
     assert robot.gyro.state.state == "used"
     assert robot.gyro.state.ratio == pytest.approx(1.0 / wheels, abs=0.05)
