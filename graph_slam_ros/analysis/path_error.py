@@ -122,18 +122,18 @@ def associate(estimate: Trajectory, truth: Trajectory) -> tuple[Trajectory, Traj
         Fewer than two.
     """
     stamps_s, known_s = estimate.stamps_s, truth.stamps_s
-    after = np.clip(np.searchsorted(known_s, stamps_s), 1, max(1, len(known_s) - 1))
-    after = np.minimum(after, len(known_s) - 1)
+    after = np.minimum(np.clip(np.searchsorted(known_s, stamps_s), 1, None), len(known_s) - 1)
     before = np.maximum(after - 1, 0)
     nearest = np.where(stamps_s - known_s[before] <= known_s[after] - stamps_s, before, after)
     inside = (stamps_s >= known_s[0]) & (stamps_s <= known_s[-1])
     near = np.abs(known_s[nearest] - stamps_s) <= MAX_STAMP_DIFFERENCE_S + _ROUNDING
     mine = np.flatnonzero(inside & near)
     if len(mine) < 2:
-        raise GraphSlamError(
-            f"{len(mine)} of {len(stamps_s)} stamps are within {MAX_STAMP_DIFFERENCE_S} s of the truth's:"
-            f" the estimate spans {_span(estimate)}, the truth {_span(truth)}"
-        )
+        text = f"{len(mine)} of {len(stamps_s)} stamps are within {MAX_STAMP_DIFFERENCE_S} s of the truth's: "
+        text += f"the estimate spans {_span(estimate)}, the truth {_span(truth)}"
+        if len(np.unique(known_s)) < 0.5 * len(known_s):  # as numpy.savetxt rounds by default
+            text += ", most of whose stamps are the same: write all their digits (%.9f)"
+        raise GraphSlamError(text)
     return estimate.at(mine), truth.at(nearest[mine])
 
 

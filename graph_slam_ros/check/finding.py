@@ -285,7 +285,7 @@ class Finding:
         """Plain values; a number that JSON has not is null."""
         numbers = {"value": self.value, "limit": self.limit}
         finite = {name: float(x) if math.isfinite(x) else None for name, x in numbers.items()}
-        evidence = {"topic": self.topic, "first_ns": self.first_ns, "count": self.count}
+        evidence = {"topic": self.topic, "input": self.source, "first_ns": self.first_ns, "count": self.count}
         first = {"code": self.code, "severity": self.severity, **finite, "unit": self.unit}
         return first | {"evidence": evidence, "text": self.text, "settings": list(self.settings)}
 

@@ -98,7 +98,7 @@ def check(
     columns = collector.columns(counters)
     found += _damage(bag)
     found += check_columns(columns)
-    if not quick and not any(one.ends for one in found):
+    if not quick and not any(one.ends or one.forbids_replay for one in found):
         moving = moving_names(columns)
         some = _for_trial(columns, [some for number, some in measured if number == 0])
         some = [_without(one, moving) for one in some] if moving else some

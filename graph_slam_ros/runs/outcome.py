@@ -127,7 +127,7 @@ def _calibration(summary: Summary) -> Iterator[str]:
     if settings := summary.get("calibrated"):
         lines = " ".join(f"--set {shlex.quote(f'{name}={value}')}" for name, value in settings.items())
         yield from _wrapped(f"calibrated {lines}", 11)
-    if off := summary.get("contradicted"):
+    if (off := summary.get("contradicted")) and not is_explained(summary):
         text = f"not corrected, so the covariances contain it: {', '.join(off)} (graph_slam calibrate BAG)"
         yield from _wrapped(f"off        {text}", 11)
 
@@ -179,7 +179,7 @@ def table(summary: Summary) -> list[str]:
         lines.append(f"{name:{wide}s}" + "".join(f"{'-' if n is None else n:>{_COLUMN}}" for n in numbers))
         for reason, times in list(refused.items())[:_MOST_REASONS]:
             lines += textwrap.wrap(f"{reason} {times}: {explain(reason).meaning}", _WIDTH - 2, initial_indent="  ")
-            if mend := remedy(name, reason):
+            if mend := _remedy(summary, name, reason):
                 lines += textwrap.wrap(f"-> {mend}", _WIDTH, initial_indent="    ", subsequent_indent="       ")
     return lines
 
@@ -196,13 +196,11 @@ def shortcomings(summary: Summary) -> Iterator[str]:
     if stopped := sum(reasons.get("stopped", 0) for reasons in summary["counters"].values()):
         yield f"time jumped back, and time.on_jump is stop: {stopped} measurements after it were refused: {_ON_JUMP}"
     for name, counts in inputs.items():
-        counted = _counted(summary, name, Effect.REFUSED)
-        refused = sum(counted.values())
         is_odometry = counts["use"] in MOTION
         if not counts["used"] and (counts["use"] != "odometry" or counts["received"] == 0):
             yield _unused(summary, name, counts["received"])
-        elif refused > _MOSTLY * (refused + counts["used"]):
-            yield f"{name}: most of it was refused: {_because(name, counted)}"
+        elif _is_mostly_refused(summary, name):
+            yield f"{name}: most of it was refused: {_because(summary, name, _counted(summary, name, Effect.REFUSED))}"
         elif not (is_odometry or causes) and (why := contradicts(name, counts["believed"] or 0, counts["used"])):
             yield why
         if is_odometry:
@@ -280,8 +278,9 @@ def doubts(summary: Summary) -> Iterator[str]:
 
     That are visits that contradict others, clocks, mounts or scales that are off, and other explanations.
     """
-    if any(checked(summary, "error")):  # of which all that follows may be a consequence
+    if is_explained(summary):
         return
+    yield from checked(summary, "warning")
     for text in ambiguities(summary.get("rivals", ())):
         yield f"{text} (graph_slam explain RUN)"
     yield from filter(None, [wrong_sides(summary.get("landmarks", 0), summary.get("waiting", {}))])
@@ -296,12 +295,28 @@ def doubts(summary: Summary) -> Iterator[str]:
                 "topic and an input of its own (inputs.names); one that jumps: is it in metres and radians?"
             )
     for name, counts in summary.get("inputs", {}).items():
-        if counts["use"] in MOTION or not counts["used"]:
+        if counts["use"] in MOTION or not counts["used"] or name == _cause(summary):
             continue
         accepted = (counts["believed"] or 0) / counts["used"]
         if _MOSTLY <= accepted < 1.0 - _DOUBTED:
             part, hint = 100.0 * (1.0 - accepted), _CONTRADICT.format(name)
             yield f"{name}: {part:.0f} % of {counts['used']} are not believed: {hint}"
+
+
+def is_explained(summary: Summary) -> bool:
+    """Return whether all doubts may be consequences: of an error of the recording, or of an input mostly refused."""
+    inputs = [name for name in summary.get("inputs", ()) if "#" not in name]  # not a second odometry of a topic
+    return any(checked(summary, "error")) or any(_is_mostly_refused(summary, name) for name in inputs)
+
+
+def _is_mostly_refused(summary: Summary, name: str) -> bool:
+    refused = sum(_counted(summary, name, Effect.REFUSED).values())
+    return bool(refused > _MOSTLY * (refused + summary["inputs"][name]["used"]))
+
+
+def _cause(summary: Summary) -> str:
+    """Return the input that the finding of the recording is of."""
+    return str((summary.get("check") or {}).get("evidence", {}).get("input", ""))
 
 
 def _uncorrected(summary: Summary) -> Iterator[str]:
@@ -362,16 +377,22 @@ def _unused(summary: Summary, name: str, received: int | None) -> str:
     counted = _counted(summary, name, Effect.REFUSED) or _counted(summary, name, Effect.NOTED)
     if not counted and summary["waiting"]:
         return f"{name}: nothing{messages} was used: {len(summary['waiting'])} landmarks are not determined (waiting)"
-    return f"{name}: nothing{messages} was used: {_because(name, counted)}"
+    return f"{name}: nothing{messages} was used: {_because(summary, name, counted)}"
 
 
-def _because(name: str, counted: Mapping[str, int]) -> str:
+def _because(summary: Summary, name: str, counted: Mapping[str, int]) -> str:
     """The most frequent reason, and its remedy."""
     if not counted:
         return "it holds nothing"
     reason = next(iter(counted))
-    mend = remedy(name, reason)
+    mend = _remedy(summary, name, reason)
     return f"{reason} {counted[reason]} ({explain(reason).meaning})" + (f"; {mend}" if mend else "")
+
+
+def _remedy(summary: Summary, name: str, reason: str) -> str:
+    """Return what mends a reason; of a frame that is unknown since transforms name none, what mends the transforms."""
+    empty = [one for one in ("tf", "tf_static") if summary["counters"].get(one, {}).get("frame_empty")]
+    return remedy(empty[0], "frame_empty") if empty and reason == "frame_unknown" else remedy(name, reason)
 
 
 def _counted(summary: Summary, name: str, effect: Effect) -> dict[str, int]:

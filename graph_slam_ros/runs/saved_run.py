@@ -1,14 +1,13 @@
-"""Read a run folder in Python: paths with stamps, landmarks with names, edges, tables for pandas."""
+"""Read a run folder in Python: paths with stamps, landmarks with names, edges."""
 
 import json
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.files import read_text
 from graph_slam_ros.runs.folder import COVARIANCES, SUMMARY, RunError, changed_since, run_config
 from graph_slam_ros.runs.ledger_file import Entry, read_ledger
@@ -103,28 +102,6 @@ class SavedRun:
         """Warnings about files that are not from the same save."""
         return changed_since(self.folder)
 
-    def trajectory_frame(self) -> Any:
-        """A pandas DataFrame of the keyframes: stamp_s, x, y, z, qx, qy, qz, qw, and the same of odometry."""
-        path, odometry = self.trajectory(), self.odometry()
-        names = ("x", "y", "z", "qx", "qy", "qz", "qw")
-        columns = {"stamp_s": path.stamps_s} | dict(zip(names, path.poses.T, strict=True))
-        columns |= {f"odometry_{name}": column for name, column in zip(names, odometry.poses.T, strict=True)}
-        return _pandas().DataFrame(columns)
-
-    def landmark_frame(self) -> Any:
-        """A pandas DataFrame of the landmarks by id: x, y, z and the standard deviations of these."""
-        table = self.landmarks
-        sigmas = np.sqrt(np.diagonal(table.covariances, axis1=1, axis2=2))
-        columns = dict(zip(("x", "y", "z"), table.positions.T, strict=True))
-        columns |= dict(zip(("sigma_x", "sigma_y", "sigma_z"), sigmas.T, strict=True))
-        return _pandas().DataFrame(columns, index=_pandas().Index(table.names, name="id"))
-
-    def edge_frame(self) -> Any:
-        """A pandas DataFrame of the edges by id, a column for each attribute of the ledger's ``Entry``."""
-        names = [field.name for field in fields(Entry)]
-        rows = [[_plain(getattr(entry, name)) for name in names] for entry in self.edges]
-        return _pandas().DataFrame(rows, columns=names).set_index("edge")
-
 
 def load_run(folder: Path | str) -> SavedRun:
     """The results of a run: the folder that ``replay`` or the node has written.
@@ -145,16 +122,3 @@ def load_run(folder: Path | str) -> SavedRun:
     if not isinstance(summary, dict):
         raise RunError(f"{folder / SUMMARY}: not the summary of a run")
     return SavedRun(folder, summary)
-
-
-def _plain(value: Any) -> Any:
-    """Verdicts and reasons by name."""
-    return value.name.lower() if hasattr(value, "name") else value
-
-
-def _pandas() -> Any:
-    try:
-        import pandas
-    except ImportError:
-        raise GraphSlamError("data frames need pandas: pip install pandas") from None
-    return pandas

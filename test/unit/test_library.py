@@ -68,20 +68,6 @@ def test_an_older_drive_in_a_newer_map_is_read_by_keyframe(done, tmp_path):
         assert path.poses[:, :2] == pytest.approx(slam.keyframes.poses[:, :2])
 
 
-def test_data_frames_have_a_row_for_each(done):
-    pytest.importorskip("pandas")
-    slam, folder = done
-    run = load_run(folder)
-    path, landmarks, edges = run.trajectory_frame(), run.landmark_frame(), run.edge_frame()
-    assert path["x"].to_numpy() == pytest.approx(slam.trajectory()[:, 0])
-    assert path["odometry_x"].to_numpy() == pytest.approx(slam.keyframes.poses[:, 0])
-    name = next(iter(slam.landmarks))
-    assert landmarks.loc[name, "x"] == pytest.approx(run.landmarks[name][0])
-    assert landmarks.loc[name, "sigma_y"] == pytest.approx(np.sqrt(run.landmarks.covariances[0, 1, 1]))
-    assert len(edges) == slam.graph.edge_count
-    assert set(edges["verdict"]) <= {"accepted", "down_weighted", "not_evaluated", "pending", "rejected"}
-
-
 def test_what_is_no_run_or_has_no_results_is_refused(done, tmp_path):
     with pytest.raises(GraphSlamError, match="not a run's folder"):
         load_run(tmp_path)

@@ -20,24 +20,15 @@ def used(count, use="gyro"):
     return {"use": use, "received": 200, "used": count, "believed": None}
 
 
-def test_a_gyro_that_is_well_is_no_shortcoming():
+def test_a_gyro_that_is_wrong_or_not_used_is_a_shortcoming_with_its_likely_cause():
     assert not [*shortcomings(summary({}, GYRO, imu=used(200)))]
-
-
-def test_a_gyro_that_is_wrong_is_one_with_its_likely_cause():
     wrong = GYRO | {"state": "doubted", "ratio": 57.3}
     (said,) = shortcomings(summary({"imu": {"gyro_doubted": 80}}, wrong, imu=used(200)))
     assert said.startswith("imu: gyro and odometry contradict each other, it turns 57.3 times as much as odometry")
     assert "degrees" in said
-
-
-def test_a_gyro_whose_robot_never_stood_is_one_with_the_parameter():
     (said,) = shortcomings(summary({"imu": {"gyro_waiting": 51}}, GYRO | {"state": "waiting"}, imu=used(200)))
     assert said.startswith("imu: in 51 of 100 steps odometry turned without the gyro: ")
     assert "gyro.bias_sigma" in said
-
-
-def test_a_gyro_without_messages_most_of_the_time_is_one_with_the_parameter():
     (said,) = shortcomings(summary({"imu": {"gyro_silent": 51}}, GYRO, imu=used(20)))
     assert said.startswith("imu: in 51 of 100 steps odometry turned without the gyro: ")
     assert "gyro.timeout_s" in said
@@ -96,3 +87,25 @@ def test_ranges_alone_that_leave_many_landmarks_without_a_side_are_said(known, t
     if is_said:
         assert said[0].startswith("ranges alone: of 27 of 51 landmarks two places fit, one on either side")
         assert "landmarks.surveyed" in said[0]
+
+
+def test_what_follows_from_odometry_that_is_refused_is_not_said_beside_it():
+    late = {"text": "clock_offset: tags: late", "settings": {"tags.offset_s": -0.7}}
+    well, refused = ({"odom": ODOMETRY | {"used": used}} for used in (100, 20))
+    assert list(doubts(summary({"odom": {"bad_stamp": 80}}, **refused) | {"uncorrected": [late]})) == []
+    assert len(list(doubts(summary({"odom": {"bad_stamp": 80}}, **well) | {"uncorrected": [late]}))) == 1
+
+
+def test_an_input_whose_cause_is_known_has_no_general_advice():
+    fixes = {"use": "fix", "received": 90, "used": 90, "believed": 70}
+    found = {"code": "fix_frozen", "severity": "warning", "text": "/gps: stands", "settings": []}
+    evidence = {"topic": "/gps", "input": "gps", "first_ns": 0, "count": 20}
+    assert [one.partition(":")[0] for one in doubts(summary({}, gps=fixes))] == ["gps"]
+    (said,) = doubts(summary({}, gps=fixes) | {"check": found | {"evidence": evidence}})
+    assert said.startswith("fix_frozen: /gps: stands")
+
+
+def test_frames_that_are_unknown_since_transforms_name_none_send_to_their_publisher():
+    counters = {"tf": {"frame_empty": 90}, "tags": {"frame_unknown": 90}}
+    said = " ".join(shortcomings(summary(counters, tags=LANDMARKS | {"used": 0, "believed": 0})))
+    assert "frame_unknown 90" in said and "header.frame_id and child_frame_id" in said and "mount" not in said
