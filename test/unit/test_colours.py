@@ -1,10 +1,8 @@
 """The colours of pictures stay apart for those who see fewer of them, and have one home."""
 
-import re
 from itertools import combinations
 
 import numpy as np
-from places import ROOT
 from rows import each
 
 from graph_slam_ros.colours import DARK, LIGHT
@@ -38,11 +36,3 @@ def test_every_two_colours_stay_apart(colours, seen):
     found = {name: lab(np.array(SEEN[seen]) @ linear(colour)) for name, colour in colours.items()}
     apart = {(a, b): float(np.linalg.norm(found[a] - found[b])) for a, b in combinations(found, 2)}
     assert min(apart.values()) > APART, min(apart, key=apart.get)
-
-
-def test_a_colour_is_written_in_one_place():
-    own = {colour for colours in (LIGHT, DARK) for name, colour in colours.items() if name != "paper"} - {"#ffffff"}
-    package = ROOT / "graph_slam_ros"
-    files = [f for f in package.rglob("*") if f.suffix in (".py", ".js") and f.name != "colours.py"]
-    found = {f.name: own & set(re.findall(r"#[0-9a-f]{6}", f.read_text())) for f in files}
-    assert {name: colours for name, colours in found.items() if colours} == {}

@@ -9,7 +9,7 @@ from places import ROOT
 from graph_slam_ros import edge_tags
 from graph_slam_ros.cli import main
 from graph_slam_ros.formats.g2o import read_g2o
-from graph_slam_ros.graph import LANDMARK_POSITION
+from graph_slam_ros.graph import RELATIVE_POSE
 
 PAGE = (ROOT / "docs/library.md").read_text()
 (EXAMPLE,) = re.findall(r"```python\n(import numpy as np\n.*?)check_edge\(tdoa\)", PAGE, re.DOTALL)
@@ -47,6 +47,8 @@ def graph(tmp_path):
 
 
 def test_a_tag_of_a_plugin_is_read_solved_written_and_read_again(install, graph, tmp_path, capsys):
+    assert main(["optimize", str(graph)]) == 3
+    assert "lost: 3 EDGE_TDOA: of an unknown kind" in capsys.readouterr().err, "without the plugin"
     install(EXAMPLE)
     solved = tmp_path / "solved.g2o"
     assert main(["optimize", str(graph), "--out", str(solved)]) == 3, capsys.readouterr().err
@@ -58,24 +60,6 @@ def test_a_tag_of_a_plugin_is_read_solved_written_and_read_again(install, graph,
     file = read_g2o(solved)
     (edge,) = [one for one in file.graph.tables if one.name == "difference of ranges"]
     assert len(file.graph.tables[edge].id.values) == 3
-
-
-def test_an_edge_type_of_a_program_is_written_with_the_tag_of_its_plugin(install, monkeypatch):
-    install(EXAMPLE)
-    from my_tdoa import tdoa
-
-    assert edge_tags.tag_of(tdoa) == "EDGE_TDOA"
-
-
-def test_without_the_plugin_the_lines_are_named_and_no_part_of_the_graph(graph, capsys):
-    assert main(["optimize", str(graph)]) == 3
-    assert "lost: 3 EDGE_TDOA: of an unknown kind" in capsys.readouterr().err
-
-
-def test_a_built_in_tag_is_never_a_plugins(install):
-    install(EXAMPLE, name="EDGE_SE2_XY")
-    assert edge_tags.edge_of("EDGE_SE2_XY") is LANDMARK_POSITION
-    assert "EDGE_SE2_XY" not in edge_tags.plugin_tags()
 
 
 @pytest.mark.parametrize(
@@ -103,10 +87,11 @@ def test_a_plugin_that_cannot_be_used_or_raises_is_named_in_one_line(text, line,
     assert line in said
 
 
-def test_info_lists_the_edge_types_of_plugins_usable_or_not(install):
+def test_a_built_in_tag_is_never_a_plugins_and_info_lists_edge_types_of_plugins_usable_or_not(install):
     install(EXAMPLE)
     install("tdoa = 3", name="EDGE_WRONG", module="my_wrong")
     install(EXAMPLE, name="EDGE_SE2", module="my_other")
+    assert edge_tags.edge_of("EDGE_SE2") is RELATIVE_POSE
     assert edge_tags.described() == [
         "EDGE_SE2: the plugin of my-other 1.0 is not used: the tag is built in",
         "EDGE_TDOA: 'difference of ranges', an edge type of my-tdoa 1.0",

@@ -30,7 +30,7 @@ def done(tmp_path_factory):
     return replayed.slam, folder / "run"
 
 
-def test_replay_takes_texts_and_a_run_is_loaded_with_stamps_names_and_covariances(done):
+def test_replay_takes_texts_and_a_run_is_loaded_with_stamps_names_covariances_and_data_frames(done):
     slam, folder = done
     run = load_run(str(folder))
     path = run.trajectory()
@@ -42,14 +42,13 @@ def test_replay_takes_texts_and_a_run_is_loaded_with_stamps_names_and_covariance
     for name, landmark in slam.landmarks.items():
         at = slam.solver.estimate([landmark.vertex])[0]
         assert run.landmarks[name] == pytest.approx([*at[:2], 0.0])
-    assert run.landmarks.covariances.shape == (len(slam.landmarks), 3, 3)
-    assert len(run.edges) == slam.graph.edge_count
-    assert run.config == slam.config
-    assert run.summary["recording"] == "bag.mcap"
-    assert run.warnings == []
-    assert repr(run).endswith(f"run': {len(slam.keyframes)} keyframes, {len(slam.landmarks)} landmarks)")
-    with pytest.raises(KeyError):
-        run.landmarks["nowhere"]
+    assert (run.config, run.summary["recording"], run.warnings) == (slam.config, "bag.mcap", [])
+    pytest.importorskip("pandas")
+    path, landmarks, edges = run.trajectory_frame(), run.landmark_frame(), run.edge_frame()
+    assert path["odometry_x"].to_numpy() == pytest.approx(slam.keyframes.poses[:, 0])
+    assert landmarks.loc[name, "x"] == pytest.approx(run.landmarks[name][0])
+    assert landmarks["sigma_y"].to_numpy() == pytest.approx(np.sqrt(run.landmarks.covariances[:, 1, 1]))
+    assert len(edges) == len(run.edges) == slam.graph.edge_count
 
 
 def test_an_older_drive_in_a_newer_map_is_read_by_keyframe(done, tmp_path):
@@ -96,12 +95,8 @@ def documented():
     """Rows of docs/edges.md by the name of the edge type."""
     for line in (ROOT / "docs/edges.md").read_text().splitlines():
         if line.startswith("| `"):
-            cells = [cell.strip() for cell in line.strip("|").split("|")]
-            yield cells[0].strip("`"), cells[1].strip("`"), *(listed(cell) for cell in cells[2:6])
-
-
-def listed(cell):
-    return [word.strip() for word in cell.split(",")] if cell else []
+            name, tag, *cells = (cell.strip(" `") for cell in line.strip("|").split("|")[:6])
+            yield name, tag, *([word.strip(" `") for word in cell.split(",") if cell] for cell in cells)
 
 
 def edge_types():
@@ -116,15 +111,12 @@ def test_the_page_of_edge_types_is_the_table_of_edge_types():
     known, tags = dict(edge_types()), {id(edge): tag for tag, edge in EDGE_TAGS.items()}
     rows = {name: rest for name, *rest in documented()}
     assert set(rows) == set(known)
-    units = {"m", "rad"}
     for name, (tag, vertices, measured, residual, sensor) in rows.items():
         edge = known[name]
         assert tag == tags.get(id(edge), ""), name
         assert [vertex.split()[0] for vertex in vertices] == [kinds[0].name for kinds in edge.accepts], name
-        assert len(measured) + len(sensor) == edge.measured_size, name
-        assert len(sensor) == len(edge.tail), name
-        assert len(residual) == edge.residual_size, name
-        assert set(residual) <= units, name
+        assert (len(measured) + len(sensor), len(sensor)) == (edge.measured_size, len(edge.tail)), name
+        assert len(residual) == edge.residual_size and set(residual) <= {"m", "rad"}, name
 
 
 @each("name, edge", list(edge_types()))

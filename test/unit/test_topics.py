@@ -6,7 +6,7 @@ from xml.etree import ElementTree
 from places import ROOT
 from rows import each
 
-from graph_slam_ros.messages.topics import PUBLICATIONS, SERVICES, SUBSCRIPTIONS, Interface
+from graph_slam_ros.messages.topics import PUBLICATIONS, SERVICES, SUBSCRIPTIONS
 
 PAGE = (ROOT / "docs/ros.md").read_text()
 TABLES = {"out": PUBLICATIONS, "in, and [other inputs](inputs.md)": SUBSCRIPTIONS, "service": SERVICES}
@@ -36,10 +36,3 @@ def test_every_message_package_that_is_imported_is_a_dependency():
     sources = "".join(path.read_text() for path in (ROOT / "graph_slam_ros").rglob("*.py"))
     imported = set(re.findall(r"^ *(?:from|import) (\w+_(?:msgs|srvs|interfaces))\b", sources, re.MULTILINE))
     assert {"rcl_interfaces"} <= imported <= DEPENDENCIES
-
-
-def test_names_are_resolved_as_ros_resolves_them():
-    names = ("~/path", "odom", "/tf")
-    resolved = [Interface(name, "std_msgs/msg/Empty", "").resolved("/robot/graph_slam") for name in names]
-    assert resolved == ["/robot/graph_slam/path", "/robot/odom", "/tf"]
-    assert Interface("odom", "", "").resolved() == "/odom"

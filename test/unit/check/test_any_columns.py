@@ -76,14 +76,11 @@ def columns(seed):
         pick(),
         tuple(rng.choice([0.0, 1.0], 3)) + tuple(se3.IDENTITY[3:]),
     )
+    inputs = ("/odom", "odom", "odometry", odometry_ns), ("/landmarks", "detections", "landmarks", seen_ns)
+    lag_ns = {name: rng.integers(0, 10**9, len(stamp_ns)) for name, _, _, stamp_ns in inputs}
     topics = {
-        name: TopicColumns(
-            name, "", (own,), use, stamp_ns + rng.integers(0, 10**9, len(stamp_ns)), stamp_ns, {pick(): 1}
-        )
-        for name, own, use, stamp_ns in (
-            ("/odom", "odom", "odometry", odometry_ns),
-            ("/landmarks", "detections", "landmarks", seen_ns),
-        )
+        name: TopicColumns(name, "", (own,), use, stamp_ns + lag_ns[name], stamp_ns, {pick(): 1})
+        for name, own, use, stamp_ns in inputs
     }
     counters = Counters()
     for reason in rng.choice(list(REASONS), 3):

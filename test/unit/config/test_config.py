@@ -44,23 +44,6 @@ def test_every_input_has_a_section_and_only_those():
     assert "detections.topic" not in names
 
 
-def test_every_parameter_says_what_it_means_and_its_default_is_valid():
-    for p in parameters():
-        assert p.meaning
-        assert p.check(p.default) == p.default
-        assert p.unit or p.type is not float or p.name.endswith("tolerance"), p.name
-
-
-def test_what_is_written_is_read_back_as_it_was(tmp_path):
-    values = {
-        "frames": {"map": 'a "quoted" \\ näme: {x}\n'},
-        "odometry": {"translation_density": 1e-6},
-        "solve": {"method": "lm"},
-    }
-    config = Config.from_mapping({**values, "tf": {"publish_tf": False}})
-    assert read(tmp_path, parameters_text(config.as_mapping())) == config
-
-
 def test_a_file_may_be_flat_dotted_or_wrapped_as_ros_does(tmp_path):
     for text in (
         "ordering:\n  window_s: 0.2\n",
@@ -71,6 +54,8 @@ def test_a_file_may_be_flat_dotted_or_wrapped_as_ros_does(tmp_path):
         assert read(tmp_path, text) == Config.from_mapping({"ordering": {"window_s": 0.2}})
     assert read(tmp_path, "") == Config()
     assert read(tmp_path, "tf:\n  transform_tolerance: 1\n").tf.transform_tolerance == 1.0
+    odd = Config.from_mapping({"frames": {"map": 'a "quoted" \\ näme: {x}\n'}, "odometry.translation_density": 1e-6})
+    assert read(tmp_path, parameters_text(odd.as_mapping())) == odd, "what is written is read back as it was"
     any_node = "/**:\n  ros__parameters:\n    use_sim_time: true\n    world: {dimensions: 3}\n"
     assert read(tmp_path, any_node) == Config.from_mapping(IN_SPACE), "what any node has is no parameter of ours"
 
@@ -112,9 +97,7 @@ def test_F28_an_unknown_key_is_refused_with_the_nearest_known_one(name, nearest)
         ("tf.publish_tf", 1, "1 is not true or false"),
         ("tf.transform_publish_period", "1e-3", "'1e-3' is not a number"),
         ("tf.transform_publish_period", None, "None is not a number"),
-        ("tf.transform_publish_period", [0.1], r"\[0.1\] is not a number"),
         ("tf.transform_publish_period", float("nan"), "nan is not finite"),
-        ("tf.transform_tolerance", float("inf"), "inf is not finite"),
         ("tf.transform_tolerance", 10**400, "is not a number"),
         ("keyframes.min_angle_rad", 3.2, r"3.2 is not in \[0.001, 3.14159\]"),
         ("anchor.sigma_m", -1, r"-1.0 is not in \[0, 1e\+09\]"),
@@ -138,8 +121,6 @@ def test_F29_a_value_of_the_wrong_type_or_out_of_range_is_refused_by_name(name, 
         ("tf: {stamp: now\n", "not valid YAML"),
         ("1: 2\n", "1 is not a name"),
         ("? [a, b]\n: 1\n", "line 1: a key is not a name"),
-        ("? {a: b}\n: 1\n", "line 1: a key is not a name"),
-        ("tf:\n  period_s: 2001-99-99\n", "not valid YAML"),
         ("a:\n  ros__parameters: {}\nb:\n  ros__parameters: {}\n", r"several nodes \(a, b\)"),
         ("graph_slam:\n  ros__parameters: {}\n/**:\n  ros__parameters: {}\n", "several nodes"),
         ("/**:\n  ros__parameters: 3\n", "ros__parameters is not a mapping"),
@@ -152,26 +133,14 @@ def test_a_file_that_is_not_plain_parameters_is_refused_by_name(tmp_path, text, 
     assert "\n" not in str(caught.value)
 
 
-@each("content", [None, b"\xff\xfe\x00"])
-def test_a_file_that_is_missing_or_no_text_is_refused_by_name(tmp_path, content):
-    file = tmp_path / "parameters.yaml"
-    if content is not None:
-        file.write_bytes(content)
-    with pytest.raises(ConfigError, match=r"parameters\.yaml: "):
-        read_parameters(file)
-
-
-def test_a_setting_is_read_as_yaml_reads_it():
+def test_a_setting_is_read_as_yaml_reads_it_or_refused():
     assert parse_setting("a.b=0.5") == ("a.b", 0.5)
     assert parse_setting("frames.map=x=y") == ("frames.map", "x=y")
     assert parse_setting("tf.publish_tf=false") == ("tf.publish_tf", False)
     assert parse_setting("output.folder=") == ("output.folder", None)
-
-
-@each("text", ["window_s", "=3", "a=[1", "a={[1]: 2}", "a=2001-99-99", "a={b: 1, b: 2}"])
-def test_a_setting_that_is_not_one_is_refused(text):
-    with pytest.raises(ConfigError):
-        parse_setting(text)
+    for text in ("window_s", "=3", "a=[1", "a={[1]: 2}", "a=2001-99-99", "a={b: 1, b: 2}"):
+        with pytest.raises(ConfigError):
+            parse_setting(text)
 
 
 @each(

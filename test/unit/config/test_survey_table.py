@@ -19,21 +19,22 @@ def only(header, line, dimensions):
     return known
 
 
-@each("header", ["id,x,y,z,sigma", "id,x,y,z,sigma_x,sigma_y,sigma_z"])
-def test_a_sigma_for_all_axes_or_for_each(header):
-    each = len(header.split(",")) > 5
-    known = only(header, "a,1,2,3," + ("0.1,0.2,0.3" if each else "0.1"), 3)
-    assert known.position == (1.0, 2.0, 3.0)
-    assert known.orientation == ()
-    assert np.diag(known.position_covariance) == pytest.approx([0.01, 0.04, 0.09] if each else [0.01] * 3)
+FULL = np.array([[4, 1, 0.5], [1, 5, 0.25], [0.5, 0.25, 6]])
 
 
-@each("dimensions", [2, 3])
-def test_a_full_covariance_of_the_position(dimensions):
-    known = only("id,x,y,z,cov_xx,cov_xy,cov_xz,cov_yy,cov_yz,cov_zz", "a,1,2,3,4,1,0.5,5,0.25,6", dimensions)
-    full = np.array([[4, 1, 0.5], [1, 5, 0.25], [0.5, 0.25, 6]])
-    assert np.array(known.position_covariance).tolist() == full[:dimensions, :dimensions].tolist()
-    assert only("id,x,y,cov_xx,cov_xy,cov_yy", "a,1,2,4,1,5", 2).position_covariance == ((4, 1), (1, 5))
+@each(
+    "header, values, full",
+    [
+        ("sigma", "0.1", 0.01 * np.eye(3)),
+        ("sigma_x,sigma_y,sigma_z", "0.1,0.2,0.3", np.diag([0.01, 0.04, 0.09])),
+        ("cov_xx,cov_xy,cov_xz,cov_yy,cov_yz,cov_zz", "4,1,0.5,5,0.25,6", FULL),
+    ],
+)
+def test_a_sigma_for_all_axes_or_for_each_or_a_full_covariance(header, values, full):
+    for n in (2, 3):
+        known = only(f"id,x,y,z,{header}", f"a,1,2,3,{values}", n)
+        assert (known.position, known.orientation) == ((1.0, 2.0, 3.0)[:n], ())
+        assert np.array(known.position_covariance) == pytest.approx(full[:n, :n])
 
 
 @each("dimensions", [2, 3])
@@ -66,6 +67,7 @@ def test_some_landmarks_of_a_table_may_have_no_orientation():
     known = surveyed("id,x,y,sigma,yaw,sigma_rad\na,1,2,0.1,0.5,0.2\nb,3,4,0.1,,\n", 2)
     assert known["a"].orientation == (0.5,)
     assert known["b"] == only("id,x,y,sigma", "b,3,4,0.1", 2)
+    assert only("id,x,y,cov_xx,cov_xy,cov_yy", "a,1,2,4,1,5", 2).position_covariance == ((4, 1), (1, 5))
 
 
 def test_the_example_of_the_manual_is_a_tag_on_a_wall():

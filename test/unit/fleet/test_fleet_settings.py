@@ -14,8 +14,8 @@ from graph_slam_ros.tools.fleet.compare import compare, markdown, parse_limit
 from graph_slam_ros.tools.fleet.page import write_page
 from graph_slam_ros.tools.fleet.recordings import find_sources, local_copy
 from graph_slam_ros.tools.fleet.replay import settings_of, truth_of
-from graph_slam_ros.tools.fleet.store import Store, job_key, keep
-from graph_slam_ros.tools.fleet.table import read_table, write_table
+from graph_slam_ros.tools.fleet.store import job_key
+from graph_slam_ros.tools.fleet.table import write_table
 
 
 def test_settings_are_the_product_of_files_and_values(tmp_path):
@@ -24,27 +24,17 @@ def test_settings_are_the_product_of_files_and_values(tmp_path):
     choices = ["robust.noise_scale=configured,estimated"]
     found = settings_of([tmp_path / "a.yaml", tmp_path / "b.yaml"], choices)
     assert list(found) == [
-        "a robust.noise_scale=configured",
-        "a robust.noise_scale=estimated",
-        "b robust.noise_scale=configured",
-        "b robust.noise_scale=estimated",
+        f"{file} robust.noise_scale={scale}" for file in "ab" for scale in ("configured", "estimated")
     ]
     assert found["b robust.noise_scale=estimated"]["keyframes.min_distance_m"] == 0.4
     assert list(settings_of([], [])) == ["defaults"]
 
 
-def test_a_setting_that_cannot_be_used_is_named(tmp_path):
-    files = [tmp_path / name / "a.yaml" for name in ("one", "two")]
-    for file in files:
-        file.parent.mkdir()
-        file.write_text("{}")
-    for configs, settings, says in (
-        ([], ["keyframes.min_distance=0.3"], "keyframes.min_distance"),
-        ([], ["keyframes.min_distance_m"], "KEY=VALUE"),
-        (files, [], "two files are named a"),
-    ):
-        with pytest.raises(GraphSlamError, match=says):
-            settings_of(configs, settings)
+def test_the_name_of_a_job_depends_on_all_that_its_result_depends_on(tmp_path):
+    truth = tmp_path / "truth.tum"
+    truth.write_text("0 0 0 0 0 0 0 1\n")
+    told = ("f", 1, ""), ("g", 1, ""), ("f", 2, ""), ("f", 1, str(truth)), ("f", 1, f"{truth}:/topic")
+    assert len({job_key(name, {"a": value}, of) for name, value, of in told}) == 5
 
 
 def test_recordings_are_found_in_folders_and_stores_the_largest_first(tmp_path):
@@ -77,37 +67,6 @@ def test_what_has_no_recording_is_named_and_equal_names_are_told_apart_by_their_
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "drive.mcap").write_bytes(b"x")
     assert {one.name for one in find_sources([str(tmp_path)])} == {"mon/drive.mcap", "tue/drive.mcap"}
-
-
-def test_a_folder_of_something_else_is_not_written_into(tmp_path):
-    (tmp_path / "thesis.txt").write_text("mine")
-    with pytest.raises(GraphSlamError, match="not empty"):
-        Store(tmp_path, new=True)
-    with pytest.raises(GraphSlamError, match="not the folder of a fleet"):
-        Store(tmp_path)
-    assert [one.name for one in tmp_path.iterdir()] == ["thesis.txt"]
-
-
-def test_the_name_of_a_job_depends_on_all_that_its_result_depends_on(tmp_path):
-    truth = tmp_path / "truth.tum"
-    truth.write_text("0 0 0 0 0 0 0 1\n")
-    keys = {
-        job_key("f", {"a": 1}, ""),
-        job_key("g", {"a": 1}, ""),
-        job_key("f", {"a": 2}, ""),
-        job_key("f", {"a": 1}, str(truth)),
-        job_key("f", {"a": 1}, f"{truth}:/topic"),
-    }
-    assert len(keys) == 5
-
-
-def test_results_that_are_there_stay(tmp_path):
-    Store(tmp_path / "out", new=True)
-    for value in (1, 2):
-        made = tmp_path / "out/jobs/.key.x"
-        made.mkdir()
-        keep(tmp_path / "out", "key", made, {"value": value})
-    assert list(Store(tmp_path / "out").rows()) == [{"value": 1}]
 
 
 def rows(factor=1.0, failed=(), count=8):
@@ -162,17 +121,6 @@ def test_a_limit_that_is_none_or_on_what_nobody_measured_is_refused(tmp_path):
             parse_limit(text)
     with pytest.raises(GraphSlamError, match="no recording has nees"):
         compare(*tables(tmp_path, rows(), rows()), [parse_limit("nees>1.1x")])
-
-
-def test_the_table_has_all_columns_of_all_rows_in_order(tmp_path):
-    write_table(tmp_path, [*reversed(rows(failed=(3,))), rows(count=9)[8] | {"rare": 2.5, "errors_m": [1.0]}])
-    found = read_table(tmp_path)
-    assert [row["recording"] for row in found] == [f"r{k}" for k in range(9)]
-    assert [row["rare"] for row in found] == [None] * 8 + [2.5]
-    assert found[3]["rmse_m"] is None and found[3]["nees"] is None and "errors_m" not in found[3]
-    (tmp_path / "table.parquet").write_bytes(b"PAR1")
-    with pytest.raises(GraphSlamError, match=r"table\.parquet"):
-        read_table(tmp_path)
 
 
 def test_the_page_draws_the_error_over_the_drive_and_has_a_bounded_number_of_runs(tmp_path):

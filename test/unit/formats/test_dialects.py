@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from graph_slam_ros.errors import FormatError
 from graph_slam_ros.formats.g2o import read_g2o
 from graph_slam_ros.graph import RELATIVE_POSE, RELATIVE_POSE_3D
-from graph_slam_ros.solver import Settings, Solver, initial_values
+from graph_slam_ros.solver import Solver, initial_values
 
 GRAPHS = DATASETS
 VICTORIA = GRAPHS / "pose_graphs" / "victoria_park.txt"
@@ -31,8 +31,7 @@ def chi2_of(file):
     solver = Solver(file.graph)
     solver.add(range(file.graph.vertex_count), range(file.graph.edge_count))
     solver.start_at(initial_values(file.graph, "file" if file.has_values else "tree", 0))
-    solver.hold(0)
-    return solver.optimize(Settings(max_iterations=1)).chi2_initial
+    return float(solver.chi2_of(np.arange(file.graph.edge_count))[0].sum())
 
 
 @each(
@@ -56,13 +55,6 @@ def test_lines_of_another_dialect_than_the_one_that_is_named_are_refused(tmp_pat
     ):
         with pytest.raises(FormatError, match=says):
             read(tmp_path, text, dialect=dialect)
-
-
-def test_an_order_is_not_guessed_from_units(tmp_path):
-    """With 1e-9 m and a right angle, determinants of such matrices are rounding alone."""
-    file = read(tmp_path, "VERTEX2 0 0 0 0\nVERTEX2 1 1 0 0\nEDGE2 0 1 1 0 0 1e18 9e17 1e18 1e-2 9e7 9e7\n")
-    expected = [[1e18, 9e17, 9e7], [9e17, 1e18, 9e7], [9e7, 9e7, 1e-2]]
-    assert information(file, RELATIVE_POSE)[0] == pytest.approx(np.array(expected), rel=1e-9)
 
 
 def test_edge2_with_rows_of_the_upper_triangle_may_be_square_roots_and_is_asked_for(tmp_path):

@@ -104,8 +104,7 @@ def test_right_jacobians_are_the_numeric_ones():
         # central differences: step^2 times a third derivative (up to 10), and rounding / step
         found = numeric(lambda e, d=d: se2.local(se2.exp(d + e), se2.exp(d)), 3)
         assert se2.right_jacobian(tuple(d)) == pytest.approx(found, abs=2e-9)
-    below, above = (se2.right_jacobian((8.0, -5.0, w)) for w in (1e-3 * (1 - 1e-9), 1e-3 * (1 + 1e-9)))
-    assert below == pytest.approx(above, abs=1e-11), "where its series ends"
+
     for d in tangents(6):
         w = tuple(d[3:])
         if np.linalg.norm(w) < 3.0:  # beyond, the two sides fall on different sheets
@@ -121,11 +120,8 @@ def test_interpolation_runs_at_constant_velocity_from_one_pose_to_the_other():
         assert gap(se2.interpolate(a, b, 0.0), a) < 1e-12
         assert gap(se2.interpolate(a, b, 1.0), b) < 1e-12
         assert gap(se2.interpolate(a, b, 0.3), se2.compose(a, se2.exp(0.3 * d))) < 1e-12
-
-
-def test_interpolation_takes_the_short_way_across_half_a_turn():
     middle = se2.interpolate((0.0, 0.0, 3.0), (0.0, 0.0, -3.0), 0.5)
-    assert abs(se2.wrap(middle[2] - np.pi)) < 1e-12
+    assert abs(se2.wrap(middle[2] - np.pi)) < 1e-12, "the short way across half a turn"
 
 
 @each("group, dof", GROUPS)
@@ -161,16 +157,6 @@ def test_propagate_is_the_first_order_formula_with_numeric_derivatives():
         assert se2.propagate(before, tuple(step), added) == pytest.approx(expected, rel=1e-7, abs=1e-7)
 
 
-def test_noise_during_agrees_with_drawn_velocities():
-    rng, velocity = np.random.default_rng(2), np.array([1.5, 0.2, 1.1])
-    of_twist = a_covariance(0.003)
-    drawn = velocity + rng.multivariate_normal(np.zeros(3), of_twist, 20000)
-    errors = np.stack(se2.local(se2.exp(tuple(drawn.T)), se2.exp(tuple(velocity))), axis=1)
-    expected = se2.noise_during(se2.exp(tuple(velocity)), of_twist)
-    scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
-    assert np.abs((np.cov(errors.T) - expected) / scale).max() < 0.04  # as above
-
-
 def test_the_noise_of_a_step_is_that_of_its_parts_fully_correlated():
     whole, of_twist, count = (1.0, 0.3, 0.5), np.diag([0.04, 0.01, 0.02]), 400
     part, j = tuple(np.array(whole) / count), np.zeros((3, 3))
@@ -196,7 +182,7 @@ def test_matrices_of_poses_are_those_of_scipy_and_lead_back():
     assert se3.to_matrix(one) == pytest.approx(matrices[7], abs=1e-14)
 
     planar = samples("uniform")
-    assert se2.to_matrix(tuple(planar.T))[5] == pytest.approx(matrix(planar[5]), abs=1e-15)
+
     assert np.stack(se2.from_matrix(se2.to_matrix(tuple(planar.T))), axis=-1) == pytest.approx(planar, abs=1e-14)
 
 
@@ -218,10 +204,6 @@ def test_the_plane_lies_in_space_level_and_at_height_zero_and_its_motions_stay_i
     back = se3.in_plane(raised)
     assert back[:, :2] == pytest.approx(together[:, :2])
     assert back[:, 2] == pytest.approx(se2.wrap(together[:, 2]))
-    assert se3.in_space(raised) is raised
     assert se3.in_space((1.0, 2.0, np.pi)) == pytest.approx([1.0, 2.0, 0.0, 0.0, 0.0, 1.0, 0.0])
-
-
-def test_a_pose_in_space_leaves_the_heading_of_its_x_axis_in_the_plane():
     rolled = so3.compose(so3.exp((0.0, 0.0, 2.5)), so3.compose(so3.exp((0.0, -0.6, 0.0)), so3.exp((0.9, 0.0, 0.0))))
-    assert se3.in_plane((1.0, 2.0, 9.0, *rolled)) == pytest.approx([1.0, 2.0, 2.5])
+    assert se3.in_plane((1.0, 2.0, 9.0, *rolled)) == pytest.approx([1.0, 2.0, 2.5]), "the heading of its x axis"
