@@ -123,17 +123,6 @@ def test_a_limit_that_is_none_or_on_what_nobody_measured_is_refused(tmp_path):
         compare(*tables(tmp_path, rows(), rows()), [parse_limit("nees>1.1x")])
 
 
-def test_the_page_draws_the_error_over_the_drive_and_has_a_bounded_number_of_runs(tmp_path):
-    many = rows(count=1500)
-    many[1499] |= {"errors_m": [0.1, 0.4, 0.2]}
-    page = write_page(tmp_path, many).read_text()
-    assert page.index("r1498<") < page.index("r1499<") < page.index("r1497<"), "the worst first"
-    assert page.count("at most 0.400 m") == 2, "a label and a title"
-    assert "These are 1000 of 1500 runs" in page
-    assert "r100<" not in page
-    assert "no reports" in page
-
-
 def test_hostile_names_are_text_on_the_page_and_in_markdown(tmp_path):
     hostile = rows(count=2)
     hostile[0] |= {"recording": "<script>alert(1)</script>|`x`", "state": "failed", "reason": "<b>'\"</b>"}

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from graph_texts import SPACE, in_dialect
-from places import DATASETS, ROOT
+from places import ROOT
 from rows import each
 from scipy.spatial.transform import Rotation
 
@@ -11,9 +11,6 @@ from graph_slam_ros.errors import FormatError
 from graph_slam_ros.formats.g2o import read_g2o
 from graph_slam_ros.graph import RELATIVE_POSE, RELATIVE_POSE_3D
 from graph_slam_ros.solver import Solver, initial_values
-
-GRAPHS = DATASETS
-VICTORIA = GRAPHS / "pose_graphs" / "victoria_park.txt"
 
 
 def read(tmp_path, text, **options):
@@ -87,10 +84,3 @@ def test_edge3_may_be_isams_square_root_which_is_said_and_taken_where_it_is_aske
     for dialect in ("isam", "toro"):
         assert not read(tmp_path, text(root), dialect=dialect).notes
     assert not read(tmp_path, text(np.eye(6))).notes, "the identity is its own root"
-
-
-@pytest.mark.skipif(not VICTORIA.exists(), reason=f"no public graphs under {GRAPHS}")
-def test_victoria_park_starts_where_its_reference_says():
-    file = read_g2o(VICTORIA)
-    assert file.graph.vertex_count == 6969 + 151
-    assert chi2_of(file) == pytest.approx(1.33018e8, rel=1e-5)

@@ -83,9 +83,6 @@ def in_plane(T):
     return T[0], T[1], np.arctan2(y, x)
 
 
-# -- odometry -------------------------------------------------------------------------------------------------------
-
-
 def test_odometry_becomes_its_pose_and_the_covariance_of_its_twist():
     twist, b = np.array([[0.04, -0.002, 0.001], [-0.002, 0.01, -0.003], [0.001, -0.003, 0.02]]), border()
     m = heard(b, "odom", odometry(pose(1.5, -2.5, 0.3, quaternion(yaw=2.5)), twist=covariance6(twist, 77.0)))
@@ -116,9 +113,6 @@ def test_A41_a_twist_covariance_that_leaves_out_an_axis_is_not_used(dimensions, 
     b = border(world={"dimensions": dimensions})
     assert heard(b, "odom", odometry(twist=np.diag(variances))).twist_covariance is None
     assert counted(b) == {"odom": {"covariance_of_some_axes_unknown": 1}}
-
-
-# -- landmarks ------------------------------------------------------------------------------------------------------
 
 
 def test_a_detection_is_a_point_with_its_covariance_in_the_axes_of_the_base():
@@ -202,9 +196,6 @@ def test_a_landmark_is_a_pose_only_where_its_orientation_is_known():
         assert seen(border(**IN_SPACE), detection(covariance=np.diag(variances)))[0].kind == "position"
 
 
-# -- how an input is told -------------------------------------------------------------------------------------------
-
-
 @each(
     "sections, complaint",
     [
@@ -243,9 +234,6 @@ def test_place_frame_and_noise_may_be_configured():
     assert s.covariance == pytest.approx((0.01, 0, 0, 0.04))
     with pytest.raises(KeyError):
         seen(border(detections={"use": "none"}), found)
-
-
-# -- poses in the map -----------------------------------------------------------------------------------------------
 
 
 def located(dimensions=2, *links, type_name=POSE, **settings):
@@ -300,9 +288,6 @@ def test_a_pose_may_be_a_landmark_of_configured_identity_or_odometry():
     assert m.T_odom_base == pytest.approx((5.0, -1.0, math.pi / 2))
 
 
-# -- satellites -----------------------------------------------------------------------------------------------------
-
-
 def test_the_datum_is_configured_or_that_of_the_map_or_the_first_fix():
     b = receiver()
     first, second = heard(b, "gps", gnss()), heard(b, "gps", gnss(48.00001, 11.00001, 502.0))
@@ -328,8 +313,6 @@ def test_A40_an_antenna_of_which_nothing_is_told_is_at_the_base_and_counted(fram
     assert (fix.kind, fix.point) == ("position", ())
     assert counted(b) == ({"gps": {"mount_unknown": 1}} if counts else {})
 
-
-# -- attitude -------------------------------------------------------------------------------------------------------
 
 CHIP = link("base_link", "chip", 0.1, 0.0, 0.0, quaternion(2.0, 0.3, -0.6))
 
@@ -364,9 +347,6 @@ def test_an_imu_as_gyro_gives_the_rate_about_the_axes_of_the_base(dimensions):
     assert told(imu={"rate": (0.0, math.nan, 0.0)}) is None
 
 
-# -- closures -------------------------------------------------------------------------------------------------------
-
-
 @each("dimensions", [2, 3])
 def test_a_detection_of_where_the_robot_was_is_a_closure_and_so_are_samples_of_it(dimensions):
     lidar = link("base_link", "lidar", 0.3, 0.1, 0.5, quaternion(yaw=0.6))
@@ -383,9 +363,6 @@ def test_a_detection_of_where_the_robot_was_is_a_closure_and_so_are_samples_of_i
     group, drawn = se3 if dimensions == 3 else se2, robot(samples_of((2.0, -1.0, 0.2, *numbers(q)), covariance))
     tangent = np.cov(np.stack(group.local(drawn, m.T_from_base)))
     assert matrix(m.covariance, len(tangent)) == pytest.approx(tangent, abs=0.03 * tangent.max())
-
-
-# -- transforms -----------------------------------------------------------------------------------------------------
 
 
 def test_frames_of_a_prefix_are_landmarks_in_their_parent_each_at_its_stamp_once():
@@ -411,8 +388,6 @@ def test_the_transform_from_odom_to_the_base_is_odometry_and_no_other_is():
     assert heard(b, "odom", transforms(*others)) is None
     assert (counted(b), b.not_found("odom")) == ({}, "")
 
-
-# -- sensors that move ----------------------------------------------------------------------------------------------
 
 MOVING = {"inputs": {"tf": True}}
 

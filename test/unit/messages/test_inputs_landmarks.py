@@ -40,9 +40,6 @@ def doubles(*names):
     return [(name, "u4" if name == "id" else "f8") for name in names]
 
 
-# -- point clouds ---------------------------------------------------------------------------------------------------
-
-
 @each("big, height", [*itertools.product([False, True], [1, 2])])
 def test_a_cloud_is_read_by_name_datatype_offset_step_and_byte_order(big, height):
     points = (1.5, -2.0, 0.25, 7, 0.1), (3.0, 4.0, 0.5, 8, 0.2)
@@ -139,9 +136,6 @@ def test_A29_a_cloud_that_cannot_be_used_is_counted_under_its_reason(cdr, reason
     assert counted(b) == {"scan": {reason: 1}}
 
 
-# -- markers --------------------------------------------------------------------------------------------------------
-
-
 def marker(number, action=0, ns="cones", stamp_ns=STAMP_NS):
     head = header(stamp_ns, "base_link")
     return part("visualization_msgs/msg/Marker", header=head, ns=ns, id=number, action=action, pose=pose(2.0, 1.0))
@@ -156,9 +150,6 @@ def test_A21_markers_that_are_added_are_landmarks_by_namespace_and_number_at_the
         (STAMP_NS + 5, [("cones/5", "position", (2.0, 1.0))]),
     ]
     assert counted(b) == {"cones": {"unknown_action": 1, "zero_stamp": 1}}
-
-
-# -- packages that need not be there --------------------------------------------------------------------------------
 
 
 def of(type_name, *links, dimensions=2, inputs=None, **settings):

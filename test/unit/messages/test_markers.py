@@ -1,9 +1,8 @@
 """Markers: what they draw is what there is."""
 
-import math
-
 import numpy as np
 import pytest
+from rows import each
 
 from graph_slam_ros.lie import so3
 from graph_slam_ros.messages import markers
@@ -30,33 +29,22 @@ def test_an_edge_that_fits_is_green_and_one_of_three_sigmas_is_red_at_both_ends(
     assert red[0, 0] < red[1, 0] <= red[2, 0] == red[3, 0]
 
 
-def test_markers_replace_the_former_ones_and_draw_each_landmark_as_its_two_sigma_ellipse():
-    c, s = math.cos(0.3), math.sin(0.3)
-    turn = np.array([[c, -s], [s, c]])
-    covariances = [turn @ np.diag([0.01, 0.09]) @ turn.T, np.zeros((2, 2))]
-    cdr = markers.landmark_markers(STAMP_NS, "map", ["a", "b"], np.array([[1.0, 2.0], [3.0, 4.0]]), covariances)
-    clear, *drawn = decode(cdr).markers
+@each(
+    "n, kind, turn, variances",
+    [(2, 3, (0.0, 0.0, 0.3), (0.01, 0.09, 0.0)), (3, 2, (0.4, -1.1, 0.7), (0.01, 0.09, 0.25))],
+)
+def test_markers_replace_the_former_ones_and_draw_each_landmark_as_its_two_sigma_ellipsoid(n, kind, turn, variances):
+    axes = so3.matrix(so3.exp(turn))
+    covariance, at = (axes @ np.diag(variances) @ axes.T)[:n, :n], np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])[:, :n]
+    unknown = np.full((n, n), np.nan) if n == 3 else np.zeros((n, n))
+    clear, *drawn = decode(markers.landmark_markers(STAMP_NS, "map", ["a", "b"], at, [covariance, unknown])).markers
     assert clear.action == 3
     assert [(m.ns, m.id, m.action) for m in drawn] == [(ns, k, 0) for k in (0, 1) for ns in ("landmarks", "names")]
-    ellipse, name, exact, _ = drawn
-    assert (ellipse.type, name.type) == (3, 9)
-    assert sorted((ellipse.scale.x, ellipse.scale.y)) == pytest.approx([0.4, 1.2])
-    tilt = 2 * math.atan2(ellipse.pose.orientation.z, ellipse.pose.orientation.w)
-    long_axis = tilt if ellipse.scale.x > ellipse.scale.y else tilt + math.pi / 2
-    assert math.sin(long_axis - (0.3 + math.pi / 2)) == pytest.approx(0.0, abs=1e-9)
-    assert name.text == "a"
-    assert (exact.scale.x, exact.scale.y) == (0.05, 0.05), "never too small to see"
-    assert {m.header.frame_id for m in drawn} == {"map"}
-
-
-def test_in_space_a_landmark_is_drawn_as_its_two_sigma_ellipsoid_or_small_where_that_is_unknown():
-    turn = so3.matrix(so3.exp((0.4, -1.1, 0.7)))
-    covariances = [turn @ np.diag([0.01, 0.09, 0.25]) @ turn.T, np.full((3, 3), np.nan)]
-    positions = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
-    cdr = markers.landmark_markers(STAMP_NS, "map", ["a", "b"], positions, covariances)
-    _, ellipsoid, _, unknown, _ = decode(cdr).markers
+    ellipsoid, name, small, _ = drawn
     p, q, size = ellipsoid.pose.position, ellipsoid.pose.orientation, ellipsoid.scale
-    assert (ellipsoid.type, p.x, p.y, p.z) == (2, 1.0, 2.0, 3.0)
+    assert (ellipsoid.type, name.type, name.text, {m.header.frame_id for m in drawn}) == (kind, 9, "a", {"map"})
+    assert [p.x, p.y, p.z][:n] == at[0].tolist()
     axes = so3.matrix((q.x, q.y, q.z, q.w))
-    assert axes @ np.diag(np.square([size.x, size.y, size.z]) / 16) @ axes.T == pytest.approx(covariances[0])
-    assert (unknown.scale.x, unknown.scale.y, unknown.scale.z) == (0.05, 0.05, 0.05)
+    drawn = axes @ np.diag(np.square([size.x, size.y, size.z]) / 16) @ axes.T
+    assert drawn[:n, :n] == pytest.approx(covariance)
+    assert (small.scale.x, small.scale.y) == (0.05, 0.05), "never too small to see, nor where it is unknown"

@@ -76,12 +76,6 @@ def compare(messages, monkeypatch, **sections):
         assert converted(messages, monkeypatch, in_runs=in_runs, **sections)[:2] == expected
 
 
-@each("dimensions, what", [*itertools.product([2, 3], ODD)])
-def test_a_message_is_read_as_it_is_decoded(what, dimensions, monkeypatch):
-    messages = [*drive(5), *drive(1, **ODD[what]), *drive(8), *drive(8, **ODD[what]), *drive(3)]
-    compare(messages, monkeypatch, world={"dimensions": dimensions})
-
-
 @each("dimensions, seed", [*itertools.product([2, 3], range(4))])
 def test_any_messages_are_read_as_they_are_decoded(seed, dimensions, monkeypatch):
     """Odd ones among plain ones, in any order, with stamps that stand still, leap and go back."""
@@ -89,7 +83,7 @@ def test_any_messages_are_read_as_they_are_decoded(seed, dimensions, monkeypatch
     messages, stamp_ns = [], STAMP_NS
     for _ in range(60):
         stamp_ns += int(rng.choice([20_000_000] * 12 + [0, -20_000_000, 3_000_000_000, -400_000_000]))
-        odd = list(ODD.values())[rng.integers(len(ODD))] if rng.random() < 0.1 else {}
+        odd = list(ODD.values())[rng.integers(len(ODD))] if rng.random() < 0.25 else {}
         at = pose(0.1 * len(messages), *rng.normal(0.0, 0.02, 2), quaternion(yaw=rng.normal(), **TILTED))
         messages.append(odometry(**({"stamp_ns": stamp_ns, "at": at} | odd)))
     compare(messages, monkeypatch, world={"dimensions": dimensions})

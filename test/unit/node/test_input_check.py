@@ -85,18 +85,6 @@ def test_of_a_few_sightings_nothing_is_said_and_a_driver_that_was_corrected_is_b
     assert checked(clock, 3100, check=check).findings == ()
 
 
-@each("late_ms", (0, 10, 30, 50))
-def test_messages_are_looked_at_however_arrival_and_stamps_go(late_ms, clock):
-    """Of every 20 ms; the first is late, or the stamps go on before the first arrival."""
-    check, converter, _ = new_check()
-    for k in range(1000):
-        clock[0] += 0.02 + (0.001 * late_ms if k == 1 else 0.0)
-        cdr = odometry(0.4 * k, stamp_ns=10**15 + k * NS // 50, unit=1000.0)
-        check.add("/odom", ["odom"], 10**15 + k * NS // 50, converter.convert("odom", cdr))
-    run_job(check, clock)
-    assert len(check.findings) == 1
-
-
 def odometry(k, stamp_ns=None, unit=1.0, x=0.0, yaw=None, twist=None, covariance=TWIST):
     """A message of a robot that drives in a circle at 2 m/s."""
     turned = 0.05 * k

@@ -6,7 +6,6 @@ import pytest
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
-from graph_slam_ros.slam.landmarks.beam import Beam, BeamSettings
 from graph_slam_ros.slam.landmarks.belief import SolverBelief
 from graph_slam_ros.slam.landmarks.rotations import rotation_vector
 from graph_slam_ros.slam.landmarks.scans import Cluster, Reckoned, Scan
@@ -99,21 +98,3 @@ def test_a_beam_begins_with_the_joint_gaussian_of_the_whole_graph(drive):
     expected = dense(n, slam, scan, [names[k] for k in seed.numbers.tolist()])
     assert without_scales(seed.covariance, dof) == pytest.approx(expected, rel=1e-5, abs=1e-9)
     assert seed.covariance[dof : dof + 2] == pytest.approx(SCALE_SIGMA**2 * np.eye(len(seed.covariance))[dof : dof + 2])
-
-
-def test_a_landmark_that_comes_back_has_the_covariance_it_would_have_had(drive):
-    """Of all other landmarks and the pose nothing is left out, so the conditional is exact."""
-    n, slam = drive
-    scan, names = a_scan(n, slam), {k: str(k) for k in range(len(MARKS))}
-    belief, dof = belief_of(n, slam), SPACES[n].dof
-    some = {k: names[k] for k in (0, 1, 3)}
-    beam = Beam(BeamSettings(18.0, -7.0), belief.seed(scan, some, np.zeros(2), SCALE_SIGMA))
-    belief.recall(beam, scan, names)
-    slots = np.flatnonzero(beam.ids[0] >= 0)
-    numbers = beam.ids[0][slots].tolist()
-    assert sorted(numbers) == [0, 1, 2, 3]
-    rows = np.r_[:dof, (dof + 2 + n * slots[:, None] + np.arange(n)).ravel()]
-    expected = dense(n, slam, scan, [names[k] for k in numbers])
-    assert beam.covariance[0][np.ix_(rows, rows)] == pytest.approx(expected, rel=1e-5, abs=1e-9)
-    back = beam.landmarks[0][beam.ids[0] == 2][0]
-    assert back == pytest.approx(slam.solver.estimate([slam.landmarks["2"].vertex])[0][:n], abs=1e-9)

@@ -33,9 +33,6 @@ def turned(gyro, a_ms, b_ms):
     return None if found is None else found.angle
 
 
-# -- what messages add up to ---------------------------------------------------------------------------------------
-
-
 def test_a_rate_that_changes_evenly_is_integrated_exactly_whatever_the_stamps():
     stamps = [0, 7, 20, 33, 34, 60, 90]
     gyro = samples(*(sample(ms, 0.01 * ms) for ms in stamps))
@@ -58,9 +55,6 @@ def test_each_message_is_counted_once():
     expected = {"before_odometry": 2, "duplicate": 1, "duplicate_stamp": 1, "late": 1, "after_odometry": 4}
     assert (counters.used["imu"], counters.as_dict()) == (3, {"imu": expected})
     # 10 messages: 2 before, 3 used (20, 30, 40), 50 in use, 4 that odometry did not reach
-
-
-# -- whom to believe -----------------------------------------------------------------------------------------------
 
 
 class Robot:
@@ -126,23 +120,6 @@ def test_wheels_that_slip_in_a_turn_have_no_part_in_it(dimensions):
     assert step.turn_variance[-1] == pytest.approx(1e-6 + 5e-5 * 0.51 + of_bias, rel=1e-6)
 
 
-def test_odometry_turns_alone_until_the_robot_has_stood_and_nothing_is_learnt_while_it_drives():
-    robot = Robot(3)
-    robot.drive(20.0, speed=0.5, wheels=0.002, gyro=0.012)
-    assert robot.heading() == pytest.approx(0.04)
-    assert robot.gyro.state.bias[-1] == 0.0
-    assert robot.gyro.state.state == "waiting"
-    assert "gyro.bias_sigma" in robot.gyro.state.fault
-    assert robot.counters["imu", "gyro_waiting"] == 1000
-    robot.drive(1.0, gyro=0.01)
-    robot.drive(20.0, speed=0.5, wheels=0.002, gyro=0.012)
-    assert robot.gyro.state.fault == ""
-    assert robot.counters["imu", "gyro_waiting"] == 1000
-
-
-# -- a bias that a map keeps ---------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("dimensions", [2, 3])
 def test_the_bias_of_a_map_is_gone_on_with_and_less_certain_by_the_time_that_has_passed(dimensions):
     before = Robot(dimensions)
@@ -163,9 +140,6 @@ def test_the_bias_of_a_map_is_gone_on_with_and_less_certain_by_the_time_that_has
     assert resumed(-100.0).sigma[-1] == 0.02, "by another clock"
     assert resumed(100.0, name="other").bias[-1] == 0.0, "that of another gyro"
     assert resumed(100.0, bias=(0.1, 0.1)).bias[-1] == 0.0, "that of another number of axes"
-
-
-# -- a gyro that is wrong, where the robot turns now and then ------------------------------------------------------
 
 
 @pytest.mark.parametrize(

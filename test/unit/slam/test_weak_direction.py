@@ -34,25 +34,19 @@ def test_the_weakest_direction_of_a_position_in_words():
 
 
 def test_a_covariance_is_turned_from_the_pose_into_the_map():
-    """A robot that faces along y, and knows its way least: that is along y of the map, and along the path."""
+    """A robot that faces along y, and knows its way least; and in space, whatever the robot's own axes are."""
     pose = (3.0, 4.0, 0.5 * np.pi)
     tangent = np.diag([0.5**2, 0.1**2, 0.02**2])
-    in_map = position_covariance(PLANAR, pose, tangent)
-    assert weakest_position(in_map).words == "along y of map"
-    assert weakest_position(in_map, np.array([0.0, 1.0])).words == "along the path"
-    assert weakest_turn(PLANAR, pose, tangent).words == "heading"
-    assert weakest_turn(PLANAR, pose, tangent).sigma == pytest.approx(0.02)
-
-
-def test_in_space_the_weakest_turn_is_about_an_axis_of_the_map():
-    """Whatever the robot's own axes are."""
+    assert weakest_position(position_covariance(PLANAR, pose, tangent)).words == "along y of map"
+    turn = weakest_turn(PLANAR, pose, tangent)
+    assert (turn.words, turn.sigma) == ("heading", pytest.approx(0.02))
     pose = (1.0, 2.0, 3.0, *so3.exp((0.4, -0.3, 1.2)))
     for axis, words in (
-        ((0.0, 0.0, 1.0), "heading"),
-        ((0.0, 1.0, 0.1), "roll and pitch"),
-        ((1.0, 0, 1.0), "heading with roll and pitch"),
+        ((0, 0, 1), "heading"),
+        ((0, 1, 0.1), "roll and pitch"),
+        ((1, 0, 1), "heading with roll and pitch"),
     ):
         in_map = np.zeros((6, 6))
         in_map[:3, :3], in_map[3:, 3:] = 0.1 * np.eye(3), along(*axis, sigma=0.2, others=0.01)
-        found = weakest_turn(SPATIAL, pose, SPATIAL.in_tangent(pose, in_map))
-        assert (found.words, found.sigma) == (words, pytest.approx(0.2))
+        turn = weakest_turn(SPATIAL, pose, SPATIAL.in_tangent(pose, in_map))
+        assert (turn.words, turn.sigma) == (words, pytest.approx(0.2))

@@ -144,9 +144,6 @@ def test_settings_that_cannot_be_are_refused_by_name():
     assert Settings(losses={"odometry": [Loss(HUBER)]}).stages()
 
 
-# -- other starts where the first result is suspicious ----------------------------------------------------------------
-
-
 def test_a_start_that_fails_is_told_and_the_first_result_stays():
     graph = chain(3)
     graph.add_vertex(SE2, [5.0, 5.0, 0.0])

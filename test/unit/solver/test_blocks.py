@@ -1,16 +1,13 @@
 """Edges that compiled code linearises by the address of their function, and the same one table after the other."""
 
 import dataclasses
-import pickle
 
 import numba
 import numpy as np
 import pytest
-from online import check_pointers, check_tree
-from rows import each
+from online import check_tree
 
 from graph_slam_ros.graph import CAUCHY, HUBER, LANDMARK_POSITION, R2, RELATIVE_POSE, SE2, Gaussian, Graph, Loss
-from graph_slam_ros.graph.kept_part import kept_part
 from graph_slam_ros.graph.records import LINEARIZE
 from graph_slam_ros.solver import Settings, Solver
 
@@ -54,20 +51,3 @@ def test_edges_are_the_same_bytes_compiled_and_one_table_after_the_other():
         assert fast.values.tobytes() == slow.values.tobytes()
     compiled = [bool(table.pointers[LINEARIZE]) for one in (fast, slow) for table in one.graph.tables.values()]
     assert compiled == [True, True, False, False]
-
-
-@each("way", [Graph.copy, lambda graph: pickle.loads(pickle.dumps(graph)), lambda graph: kept_part(
-    graph, np.arange(graph.vertex_count), np.arange(graph.edge_count), graph.initial.values)])  # fmt: skip
-def test_a_copy_of_a_graph_is_one_of_its_own(way):
-    graph = Graph()
-    poses = graph.add_vertices(SE2, np.zeros((40, 3)))
-    graph.add_edges(RELATIVE_POSE, np.column_stack([poses[:-1], poses[1:]]), np.ones((39, 3)), PLANAR, "odometry")
-    same = way(graph)
-    same.add_edge(next(iter(same.tables)), [0, 39], [1.0, 2.0, 3.0], PLANAR, "closures")
-    check_pointers(same)
-    assert (graph.edge_count, same.edge_count) == (39, 40)
-    solver = Solver(same)
-    solver.add(range(40), range(40))
-    solver.hold(0)
-    solver.update()
-    check_tree(solver)

@@ -121,9 +121,6 @@ def test_a_step_to_where_a_cost_is_not_finite_is_not_taken():
     check_tree(solver)
 
 
-# -- what was removed, and what a batch left --------------------------------------------------------------------------
-
-
 @each("start", [0.0, 0.3])
 def test_a_removed_vertex_may_be_placed_anew(start):
     solver = numbers(2, Sensor())

@@ -341,8 +341,6 @@ def test_after_any_changes_an_update_finds_the_optimum_and_the_marginals():
     run_state_machine_as_test(Changes, settings=chosen)
 
 
-# -- what once went wrong ---------------------------------------------------------------------------------------------
-
 PLANAR = Gaussian.from_sigmas(0.1, 0.1, 0.05)
 
 

@@ -25,7 +25,6 @@ from graph_slam_ros.graph import (
 )
 from graph_slam_ros.lie import se2
 from graph_slam_ros.solver import Settings, Solver
-from graph_slam_ros.tools.simulation import city_graph
 
 POSES, POINTS = 12, 3
 TIGHT = {"step_tolerance": 1e-11, "cost_tolerance": 1e-15, "max_iterations": 100}
@@ -48,8 +47,8 @@ class World:
         for _ in range(POSES - 1):
             truth.append(se2.compose(truth[-1], (2.0, 0.1, turn)))
         points = np.array(origin) + rng.uniform(-4, 4, (POINTS, 2)) + [0.0, 3.0]
-        estimate = [truth[0]]
-        steps = []
+        self.true = np.concatenate([np.ravel(truth), points.ravel()])
+        estimate, steps = [truth[0]], []
         for i in range(POSES - 1):
             sigma = covariance(rng, 3, 0.05)
             step = se2.retract(se2.between(truth[i], truth[i + 1]), rng.multivariate_normal(np.zeros(3), sigma))
@@ -112,16 +111,13 @@ def whitened(world, x, losses):
 
 
 @functools.cache
-def oracle(seed, loss):
-    world = World(seed, outliers=loss != "none")
+def oracle(loss):
+    """From near the truth: a redescending loss from dead reckoning may end elsewhere."""
+    world = World(1, outliers=loss != "none")
     losses = {} if loss == "none" else {"landmarks": (loss, SCALES[loss])}
-    start = world.graph.initial.values.copy()
     ends = {"xtol": 1e-15, "ftol": 1e-15, "gtol": 1e-12}
-    stages = [dict.fromkeys(losses, ("huber", 1.0)), losses] if losses else [{}]
-    for stage in stages:  # a redescending loss from dead reckoning may end elsewhere, so Huber first
-        found = least_squares(lambda x, s=stage: whitened(world, x, s), start, jac="3-point", **ends)
-        start = found.x
-    start[2 : 3 * POSES : 3] = se2.wrap(start[2 : 3 * POSES : 3])
+    found = least_squares(lambda x: whitened(world, x, losses), world.true, jac="3-point", **ends)
+    found.x[2 : 3 * POSES : 3] = se2.wrap(found.x[2 : 3 * POSES : 3])
     return found.x, 2.0 * found.cost
 
 
@@ -132,7 +128,7 @@ SCALES = {"huber": 1.0, "cauchy": 2.0}
 @each("method", ["gn", "lm", "dogleg"])
 @each("loss", ["none", "huber", "cauchy"])
 def test_the_optimum_is_that_of_an_independent_optimiser(loss, method):
-    best, cost = oracle(1, loss)
+    best, cost = oracle(loss)
     solver = World(1, outliers=loss != "none").solver(method=method, losses={"landmarks": STAGES[loss]}, **TIGHT)
     report = solver.optimize()
     assert (report.converged, report.method) == (True, method)
@@ -313,24 +309,6 @@ def test_where_all_is_held_nothing_is_to_do():
     assert solver.information_matrix().shape == (0, 0)
 
 
-def test_G1_parts_without_a_link_are_solved_as_if_alone():
-    a, b, both = World(1), World(2), World(1)
-    shift = both.graph.vertex_count
-    other = World(2)
-    values = other.graph.initial.values
-    both.graph.add_vertices(SE2, values[: 3 * POSES].reshape(-1, 3))
-    both.graph.add_vertices(R2, values[3 * POSES :].reshape(-1, 2))
-    for kind, ends, z, root, label in other.edges:
-        both.graph.add_edge(kind, [v + shift for v in ends], z, Gaussian(root), label)
-    solver = both.solver(**TIGHT)
-    report = solver.optimize()
-    alone = [w.solver(**TIGHT) for w in (a, b)]
-    assert report.chi2_final == pytest.approx(sum(s.optimize().chi2_final for s in alone), rel=1e-12)
-    assert solver.estimate(range(POSES)) == pytest.approx(alone[0].estimate(range(POSES)), abs=1e-9)
-    second = solver.estimate(range(shift, shift + POSES))
-    assert second == pytest.approx(alone[1].estimate(range(POSES)), abs=1e-9)
-
-
 @each("seed", [3, 8])
 def test_gauss_newton_that_fails_is_done_again_with_damping(seed):
     rng = np.random.default_rng(seed)  # readings that contradict each other by far: undamped steps jump about
@@ -356,16 +334,6 @@ def test_a_start_that_leaves_something_open_is_recovered_from(method):
     solver, report = solve(graph, method=method)
     assert report.converged
     assert solver.estimate([1])[0] == pytest.approx([1.0, 1.0, 0.0], abs=1e-6)
-
-
-@each("factor", [1.0, 3.0, 6.0])
-def test_dogleg_converges_from_dead_reckoning_where_levenberg_marquardt_does(factor):
-    graph, _ = city_graph(seed=5, poses=500, blocks=6, odometry_noise_factor=factor)
-    damped, dogleg = (solve(graph, held=[0], method=method, max_iterations=200)[1] for method in ("lm", "dogleg"))
-    assert damped.converged
-    assert (dogleg.converged, dogleg.method) == (True, "dogleg")
-    assert (np.diff([dogleg.cost_initial, *(i.cost for i in dogleg.iterations)]) <= 0.0).all()
-    assert dogleg.cost_final <= damped.cost_final * (1.0 + 1e-4)
 
 
 @each("origin", [(5e5, 4e6), (-4e6, 5e5)])
