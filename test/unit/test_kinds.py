@@ -16,13 +16,9 @@ def test_a_unit_test_that_starts_a_process_fails_and_says_what_is_missing(start)
         start()
 
 
-def test_each_test_is_of_one_kind(request):
-    assert all(sum(map(item.keywords.__contains__, KINDS)) == 1 for item in request.session.items)
-    assert request.node.get_closest_marker("unit")
-
-
-def test_no_two_files_of_tests_have_one_name():
+def test_each_test_is_of_one_kind_and_no_two_files_have_one_name(request):
     """The folders are no packages: pytest imports a file by its name alone, and refuses the second of two."""
+    assert all(sum(map(item.keywords.__contains__, KINDS)) == 1 for item in request.session.items)
     times = Counter(file.name for file in (ROOT / "test").rglob("*.py"))
     assert [name for name, n in times.items() if n > 1] == []
 

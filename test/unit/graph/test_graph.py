@@ -54,17 +54,6 @@ def test_an_edge_that_is_refused_is_named_and_leaves_no_trace(edge, ends, measur
     assert graph.add_edge(RELATIVE_POSE, [1, 0], [1, 0, 0], UNIT, "closures") == 1
 
 
-def test_arrays_may_lie_in_memory_as_they_like():
-    graph = two_poses_and_a_point()
-    ends, measured = np.asfortranarray([[0, 1], [1, 0]]), np.arange(12.0).reshape(6, 2).T[:, ::2]
-    ends.flags.writeable = False
-    first, last = graph.add_edges(RELATIVE_POSE, ends, measured, UNIT, "closures").tolist()
-    assert (graph.edge(first).vertices, graph.edge(last).vertices) == ((0, 1), (1, 0))
-    assert (graph.edge(first).measured.tolist(), graph.edge(last).measured.tolist()) == ([0, 4, 8], [1, 5, 9])
-    with pytest.raises(GraphSlamError, match="vertex 8 does not exist"):
-        graph.add_edges(RELATIVE_POSE, ends + 8, measured, UNIT, "closures")
-
-
 @each(
     "add, complaint",
     [

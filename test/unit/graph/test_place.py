@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from graph_slam_ros import graph as g
-from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.g2o import read_g2o
 from graph_slam_ros.formats.g2o_writer import write_g2o
 from graph_slam_ros.formats.graph_file import G2oFile
@@ -31,13 +30,6 @@ def test_the_derivative_is_that_of_the_residual(space):
             return numbers
 
         g.check_edge(edge, measured, tolerance=1e-6)
-
-
-def test_there_is_one_type_for_so_many_points_of_a_pose_and_none_for_others():
-    assert place_edge(g.SE2, 4) is place_edge(g.SE2, 4, 0)
-    for kind, points, poses in ((g.SE2, 0, 0), (g.R2, 3, 0), (g.SE3, 900, 100), (g.SE2, -1, 2)):
-        with pytest.raises(GraphSlamError, match="a place edge of"):
-            place_edge(kind, points, poses)
 
 
 def test_one_edge_of_many_points_is_worth_as_much_as_an_edge_for_each(space):

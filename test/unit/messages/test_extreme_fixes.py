@@ -8,8 +8,6 @@ from messages import counted, gnss, heard, receiver
 from reliability import tell, times
 from rows import each
 
-from graph_slam_ros.errors import ConfigError
-
 A_M, B_M = 6378137.0, 6356752.314245  # semi-axes of WGS 84
 
 
@@ -84,9 +82,3 @@ def test_A31_what_is_nowhere_is_refused_and_becomes_no_origin(dimensions):
     b = receiver(dimensions)
     assert heard(b, "gps", gnss(1.0, 1.0, 1.0, covariance=[math.inf] * 9)) is None
     assert heard(b, "gps", gnss()).datum == (48.0, 11.0, 500.0)
-
-
-@each("datum", ["95 0 0", "48 400 0", "48 11 1e9"])
-def test_A31_an_origin_that_is_nowhere_is_refused_by_name(datum):
-    with pytest.raises(ConfigError, match=r"^gps\.datum: (latitude|longitude|altitude) \S+ is not in"):
-        receiver(datum=datum)

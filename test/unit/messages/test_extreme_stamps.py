@@ -22,14 +22,13 @@ from rows import each
 
 from graph_slam_ros.formats.cdr import LATEST_NS
 from graph_slam_ros.messages import to_msg
-from graph_slam_ros.messages.inputs.transforms import Transforms
 from graph_slam_ros.overview.chosen_inputs import choose_inputs
 from graph_slam_ros.recordings.bag import open_bag
 from graph_slam_ros.runs.replay import measurements
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam
 
 S = 1_000_000_000
-ODOMETRY, TF, FIX = "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage", "sensor_msgs/msg/NavSatFix"
+FIX = "sensor_msgs/msg/NavSatFix"
 CONFIG = Config.from_mapping(
     {"inputs.names": "odom detections gps", "gps.type": FIX, "gps.topic": "fix", "ordering.max_waiting": 100}
 )
@@ -141,12 +140,3 @@ def test_B25_an_offset_does_not_lead_beyond_the_end_of_time_and_results_are_not_
         assert counted(b) == ({"odom": {reason: 1}} if reason else {})
     late, latest = (to_msg.transform(ns, "map", "odom", (0.0,) * 3) for ns in (LATEST_NS + 1, LATEST_NS))
     assert late == latest
-
-
-def test_B25_a_joint_whose_first_stamp_is_wrong_is_known_from_the_second_right_one_on():
-    refused = []
-    t = Transforms(10 * S, lambda: refused.append(1))
-    for stamp_ns in (LATEST_NS, 100 * S, 101 * S, 102 * S):
-        t.add_at(stamp_ns, "base", "arm", (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0))
-    assert t.lookup("base", "arm", 100 * S + 1) is not None
-    assert not refused, "it was the first, and nobody could know"

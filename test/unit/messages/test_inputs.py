@@ -33,6 +33,7 @@ from graph_slam_ros.messages.to_msg import covariance6, make
 
 IN_SPACE = {"world": {"dimensions": 3}}
 POSE, POSE_STAMPED, TF = "PoseWithCovarianceStamped", "PoseStamped", "tf2_msgs/msg/TFMessage"
+FIX = "sensor_msgs/msg/NavSatFix"
 
 
 def numbers(q):
@@ -207,8 +208,8 @@ def test_a_landmark_is_a_pose_only_where_its_orientation_is_known():
         ),
         ({"odom.use": "landmarks"}, "odom.use: nav_msgs/msg/Odometry can be odometry or fix, not landmarks"),
         ({"odom.use": "none"}, "inputs.names: none of 'odom detections' is used as odometry"),
-        ({"odom.mount": "1 2 3"}, "odom.mount: '1 2 3' is not 6 numbers"),
         ({"odom.mount": "0 0 0 0 0 nan"}, "odom.mount: '0 0 0 0 0 nan' is not 6 numbers"),
+        ({"inputs.names": "odom g", "g.type": FIX, "g.datum": "95 0 0"}, r"^g\.datum: latitude \S+ is not in"),
         ({"inputs.names": "odom tf"}, "inputs.names: 'tf' is reserved or given twice"),
         ({"inputs.names": "odom odom"}, "inputs.names: 'odom' is reserved or given twice"),
         ({"inputs.names": "odom a-b"}, "inputs.names: 'a-b' is not a name"),

@@ -25,7 +25,6 @@ from messages import (
 )
 from rows import each
 
-from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.lie import so3
 from graph_slam_ros.messages.to_msg import header, make
 
@@ -301,18 +300,3 @@ def test_mrpts_ranges_and_bearings_pitch_down_and_minus_one_is_no_identity(dimen
     assert m.sightings[0].T_base_sensor[:3] == pytest.approx((1.0, 0.5, 0.2 if dimensions == 3 else 0.0))
     assert m.sightings[1] == replace(m.sightings[0], id="")
     assert counted(b) == {}
-
-
-@each(
-    "given, remedy",
-    [
-        ("fiducial_msgs/FiducialTransformArray", "is it fiducial_msgs/msg/FiducialTransformArray?"),
-        ("mrpt_msgs/msg/ObservationRange", "is it mrpt_msgs/msg/ObservationRangeBeacon or "),
-        ("my_msgs/msg/Tags", "docs/inputs.md has a row for each, and no plugin reads it"),
-    ],
-)
-def test_a_type_that_no_input_reads_is_refused_with_the_one_that_is_meant(given, remedy):
-    with pytest.raises(ConfigError) as refused:
-        listening("seen", given)
-    assert str(refused.value).startswith(f"seen.type: '{given}' is no type of an input: {remedy}")
-    assert len(str(refused.value)) < 180, "a line of the command has 200 characters"

@@ -76,15 +76,6 @@ def test_an_input_that_contradicts_odometry_is_named_with_what_mends_it(sensor, 
         assert "correct the driver (REP 103" in one
 
 
-def test_of_a_few_sightings_nothing_is_said_and_a_driver_that_was_corrected_is_believed_again(clock):
-    assert checked(clock, 20, unit=1000.0).findings == ()
-    check = checked(clock, 400, unit=1000.0)
-    check.forget()
-    assert checked(clock, 400, check=check).findings, "not of a part"
-    check.forget()
-    assert checked(clock, 3100, check=check).findings == ()
-
-
 def odometry(k, stamp_ns=None, unit=1.0, x=0.0, yaw=None, twist=None, covariance=TWIST):
     """A message of a robot that drives in a circle at 2 m/s."""
     turned = 0.05 * k

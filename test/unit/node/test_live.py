@@ -29,9 +29,6 @@ from graph_slam_ros.slam import Config, Counters, GraphSlam, Odometry, Sighting,
 NS = 1_000_000_000
 
 
-# -- map -> odom -------------------------------------------------------------------------------------------------------
-
-
 def test_what_would_be_dated_before_the_last_is_not_told_and_how_much_earlier_is_known():
     policy, tf = MapToOdom(Config()), Config().tf
     assert policy.next(replace(tf, transform_tolerance=9.0), 0, NS, (0.0,) * 3, (0.0,) * 3) is not None
@@ -39,9 +36,6 @@ def test_what_would_be_dated_before_the_last_is_not_told_and_how_much_earlier_is
     assert policy.behind_s == pytest.approx(8.0 - tf.transform_tolerance)
     assert policy.next(tf, 0, 20 * NS, (0.0,) * 3, (0.0,) * 3) is not None
     assert policy.behind_s == 0.0
-
-
-# -- reckoning ---------------------------------------------------------------------------------------------------------
 
 
 def at_work(**settings):
@@ -93,9 +87,6 @@ def test_odometry_in_the_map_is_ahead_of_the_keyframes_and_as_uncertain_as_a_key
         assert covariance == pytest.approx(slam.pose_covariance, rel=1e-3, abs=1e-6)  # an edge has a least noise
 
 
-# -- messages from the future ------------------------------------------------------------------------------------------
-
-
 def seen(stamp_ns):
     return [Sightings(stamp_ns, "landmarks", (Sighting("a", "position", (1.0, 0.0), (1.0, 0.0, 0.0, 1.0)),))]
 
@@ -115,9 +106,6 @@ def test_B6_what_is_ahead_of_the_clock_waits_for_it_and_keeps_its_order(monkeypa
     monkeypatch.setattr(time, "monotonic", lambda: since + 1.1)
     assert ahead.due() == []
     assert refused == [seen(20 * NS)]
-
-
-# -- weak directions ---------------------------------------------------------------------------------------------------
 
 
 def test_the_weakest_direction_of_the_newest_pose_and_the_way_without_a_landmark_are_among_the_diagnostics():
@@ -153,9 +141,6 @@ def test_the_weakest_direction_of_the_newest_pose_and_the_way_without_a_landmark
     assert seen.values["orientation"] == f"{math.degrees(covariance[2, 2] ** 0.5):.2f} deg heading"
 
 
-# -- the worker --------------------------------------------------------------------------------------------------------
-
-
 def test_P10_a_worker_does_everything_in_order_refuses_what_is_too_much_and_survives_what_fails():
     faults = []
     worker, gate, done = Worker(4, faults.append), threading.Event(), []
@@ -176,9 +161,6 @@ def test_P10_a_worker_does_everything_in_order_refuses_what_is_too_much_and_surv
     assert [type(fault) for fault in faults] == [TypeError], "of an offered job; who called has it in the future"
     assert worker.stop(10.0)
     assert not worker.is_alive
-
-
-# -- health ------------------------------------------------------------------------------------------------------------
 
 
 def odom(**values):

@@ -26,7 +26,7 @@ def off(found, expected):
 
 @each("right", [1, 3])
 @each("n, frontal", SIZES)
-def test_elimination_leaves_the_factor_and_the_schur_complement(n, frontal, right):
+def test_elimination_leaves_the_factor_and_the_schur_complement_and_solves_the_system(n, frontal, right):
     a, b, front = random_front(n, right, 7 * n + frontal)
     assert partial_cholesky(front, frontal, np.diag(a).copy()) == NOTHING
     u = np.linalg.cholesky(a[:frontal, :frontal]).T
@@ -41,12 +41,9 @@ def test_elimination_leaves_the_factor_and_the_schur_complement(n, frontal, righ
     scale = np.abs(a).max() + np.abs(b).max()
     assert np.abs(front[frontal:, frontal:][upper] - rest[upper]).max(initial=0.0) <= bound * scale
 
-
-@each("n, frontal", SIZES)
-def test_back_substitution_solves_the_system(n, frontal):
-    a, b, front = random_front(n, 1, n + 11 * frontal)
-    partial_cholesky(front, frontal, np.diag(a).copy())
-    x = np.full(n, np.nan)
+    if right > 1:
+        return
+    x = np.full(n, np.nan)  # and back-substitution solves the system
     x[frontal:] = np.random.default_rng(n).standard_normal(n - frontal)
     given = x[frontal:].copy()
     packed = np.empty(packed_size(n))
@@ -55,7 +52,7 @@ def test_back_substitution_solves_the_system(n, frontal):
     assert np.array_equal(x[frontal:], given)
     # U11 x_F + U12 x_S = y is A_FF x_F + A_FS x_S = b_F
     expected = np.linalg.solve(a[:frontal, :frontal], b[:frontal, 0] - a[:frontal, frontal:] @ given)
-    assert off(x[:frontal], expected) <= 1e-13 * max(10.0, np.linalg.cond(a[:frontal, :frontal]))
+    assert off(x[:frontal], expected) <= max(1e-12, rounding)
 
 
 @each("n, frontal", [(n, f) for n, f in SIZES if f > 1])

@@ -67,7 +67,6 @@ class Changes(RuleBasedStateMachine):
         self.solver = Solver(self.graph, Settings(**EXACT))
         self.inside, self.held, self.removed, self.lacking = [], set(), [], []
         self.where_held = {}
-        self.waits = False  # something since the last update
         self.spoiled = False  # an open direction was not found
         self.new_vertices, self.new_edges = [], []
 
@@ -102,7 +101,6 @@ class Changes(RuleBasedStateMachine):
         self.solver.add(self.new_vertices, self.new_edges)
         self.inside += self.new_vertices
         self.new_vertices, self.new_edges = [], []
-        self.waits = True
 
     @rule(kind=st.sampled_from(KINDS), seed=seeds, more=st.integers(0, 2))
     def add_a_vertex_with_what_determines_it(self, kind, seed, more):
@@ -176,7 +174,6 @@ class Changes(RuleBasedStateMachine):
         table, row = self.graph.row(edge)
         if all(v in self.inside for v in table.vertices.values[row].tolist()):
             self.solver.set_weight(edge, weight)
-            self.waits = True
 
     @precondition(lambda self: len(self.inside) > 3)
     @rule(pick=picks)
@@ -184,7 +181,6 @@ class Changes(RuleBasedStateMachine):
         v = self.inside[pick % len(self.inside)]
         self.solver.hold(v)
         self.held.add(v)
-        self.waits = True
 
     @precondition(lambda self: len(self.inside) > 3)
     @rule(pick=picks)
@@ -199,7 +195,6 @@ class Changes(RuleBasedStateMachine):
         self.removed.append(v)
         self.held.discard(v)  # it is free again where it comes back
         self.where_held.pop(v, None)
-        self.waits = True
 
     @precondition(lambda self: self.removed)
     @rule(pick=picks, seed=seeds)
@@ -217,7 +212,6 @@ class Changes(RuleBasedStateMachine):
             kind, at = self.graph.kind_of(v), int(self.graph.offset.values[v])
             values[at : at + kind.size] = kind.retract(self.truth[v][None], far * rng.standard_normal((1, kind.dof)))[0]
         self.solver.start_at(values)
-        self.waits = True
 
     # -- what is asked
 
@@ -286,7 +280,6 @@ class Changes(RuleBasedStateMachine):
         assert self.solver.update() == Change()
         assert np.array_equal(all_values(self.solver), found)
         self.compare_marginals(reference, found)
-        self.waits = False
         check_tree(self.solver)
 
     def compare_marginals(self, reference, found):
@@ -301,16 +294,6 @@ class Changes(RuleBasedStateMachine):
             own = slice(reference.first[v], reference.first[v] + len(covariance))
             assert np.abs(covariance - inverse[own, own]).max() <= 1e-6 * np.abs(inverse[own, own]).max()
 
-    @precondition(lambda self: self.inside)
-    @rule(pick=picks)
-    def marginal(self, pick):
-        if not self.waits:
-            return
-        v = self.inside[pick % len(self.inside)]
-        if v not in self.held:
-            self.ask(lambda: self.solver.marginal([v]))
-            self.waits = False
-
     @rule(method=st.sampled_from(["gn", "lm", "dogleg"]))
     def optimize(self, method):
         report = self.ask(lambda: self.solver.optimize(Settings(method, **BATCH)))
@@ -319,7 +302,6 @@ class Changes(RuleBasedStateMachine):
         reference, found = self.reference(), all_values(self.solver)
         assert reference.apart(found, reference.optimum(found)) <= 1e-6
         assert report.chi2_final == pytest.approx(reference.chi2(found), rel=1e-9, abs=1e-9)
-        self.waits = False
 
     @invariant()
     def held_vertices_stay(self):
