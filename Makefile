@@ -48,7 +48,7 @@ check: lint $(VENV)/kernels.stamp
 test: install lint
 	$(PYTEST) $(TESTS)
 
-soak: install $(VENV)-fuzz/stamp
+soak: install
 	$(BIN)/python test/soak.py $(subst $(comma), ,$(ONLY))
 
 comma := ,
@@ -72,7 +72,7 @@ $(VENV)/venv.stamp:
 	$(PYTHON) -m venv $(if $(SYSTEM_ROS),--system-site-packages) $(VENV)
 	@touch $@
 
-# The lines of requirements.txt that are for ROS alone are those for one kind of machine; so is the other DDS of the tests.
+# The lines of requirements.txt that are for ROS alone are those for one kind of machine.
 without = awk '/^[^ \#]/ {keep = !/$(1)/} keep' requirements.txt > $(VENV)/requirements.txt
 
 $(VENV)/requirements.stamp: requirements.txt $(VENV)/venv.stamp
@@ -138,12 +138,6 @@ $(VENV)-bench-g2o/stamp: benchmarks/requirements-g2o.txt
 	$(VENV)-bench-g2o/bin/pip install --quiet -r benchmarks/requirements-g2o.txt
 	@touch $@
 
-# What test/guided_fuzzing.py runs with: atheris has wheels for some versions of Python, and is a compiler's work for others.
-$(VENV)-fuzz/stamp: setup.py setup.cfg pyproject.toml
-	$(PYTHON) -m venv $(VENV)-fuzz
-	$(VENV)-fuzz/bin/pip install --quiet atheris==3.0.0 -e .
-	@touch $@
-
 bench: $(VENV)-bench/stamp $(VENV)-bench-g2o/stamp
 	$(VENV)-bench/bin/python -m benchmarks
 
@@ -167,4 +161,4 @@ COMPILE = $(VENV)-lock/bin/uv pip compile --quiet --universal --python-version 3
   --no-emit-index-url --no-annotate --custom-compile-command 'make lock' $(LOCK)
 
 clean:
-	rm -rf $(VENV) $(VENV)-oldest $(VENV)-lock $(VENV)-bench $(VENV)-bench-g2o $(VENV)-fuzz build install log *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	rm -rf $(VENV) $(VENV)-oldest $(VENV)-lock $(VENV)-bench $(VENV)-bench-g2o build install log *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache

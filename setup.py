@@ -95,7 +95,6 @@ setup(
             "ruff>=0.6",
             "types-PyYAML>=6.0",
             "types-tqdm>=4.60",
-            f"cyclonedds>=11.0.1 ; {WHERE_JAZZY_HAS_WHEELS} and python_version < '3.14'",  # a DDS of another vendor
         ],
     },
     entry_points={

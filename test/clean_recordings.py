@@ -7,9 +7,7 @@ seed, each public recording at hand, and each recording that is given. Of the pu
 import argparse
 import sys
 import tempfile
-import time
 from collections import Counter
-from itertools import chain
 from pathlib import Path
 
 import public_recordings
@@ -37,27 +35,14 @@ TRUE = {  # docs/check.md says why
 }
 
 
-def said(file):
-    """Errors and warnings of a recording, and the time it took."""
-    start_s = time.process_time()
-    found = [one for one in check(file).findings if one.severity != "note"]
-    return found, time.process_time() - start_s
-
-
-def show(name, found, took_s):
-    print(
-        f"{'; '.join(f'[{f.severity}] {f.code}: {f.text}' for f in found) or 'nothing':60s} {name} {took_s:.1f} s",
-        flush=True,
-    )
-
-
-def simulated(folder, seeds):
-    """Name and file of each world and seed."""
-    for seed in seeds:
+def recordings(folder, args):
+    """Name and file of each."""
+    for seed in range(args.first, args.first + args.seeds):
         for name, (world, options) in WORLDS.items():
-            file = Path(folder) / "world.mcap"
-            write_bag(simulate(world, seed, **options), file)
-            yield f"{name}, seed {seed}", file
+            write_bag(simulate(world, seed, **options), folder / "world.mcap")
+            yield f"{name}, seed {seed}", folder / "world.mcap"
+    for file in (*(public_recordings.recordings(folder) if args.public else ()), *args.bags):
+        yield file.stem, file
 
 
 def main():
@@ -66,16 +51,11 @@ def main():
     parser.add_argument("--seeds", type=int, default=0, metavar="N", help="of each world")
     parser.add_argument("--first", type=int, default=100, metavar="SEED", help="the first of them (default: 100)")
     parser.add_argument("--public", action="store_true", help="the public recordings of GRAPH_SLAM_DATASETS, too")
-    args = parser.parse_args()
-    total, alarms = 0, Counter()
+    args, total, alarms = parser.parse_args(), 0, Counter()
     with tempfile.TemporaryDirectory() as folder:
-        worlds = simulated(folder, range(args.first, args.first + args.seeds))
-        files = public_recordings.recordings(Path(folder)) if args.public else ()
-        public = ((file.stem, file) for file in files)
-        given = ((bag.stem, bag) for bag in args.bags)
-        for name, file in chain(worlds, public, given):
-            found, took_s = said(file)
-            show(name, found, took_s)
+        for name, file in recordings(Path(folder), args):
+            found = [one for one in check(file).findings if one.severity != "note"]
+            print(name, *(f"[{f.severity}] {f.code}: {f.text}" for f in found), flush=True)
             total, _ = total + 1, alarms.update(f.code for f in found if f.code not in TRUE.get(name, ()))
     print(f"RELIABILITY clean_recordings tried={total} untrue={sum(alarms.values())} {dict(alarms)}", flush=True)
     return 1 if alarms else 0

@@ -22,7 +22,7 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 KINDS = "unit", "integration", "process"
 """The folders of test/, each with the folders of the package in it."""
-LONGEST = {"test_stopping.py", "test_recorded.py", "test_journal.py", "test_live_inputs.py", "test_stack_time.py"}
+LONGEST = {f"test_{name}.py" for name in ("live_packages", "stack_control", "stack", "recordings_of_others", "view")}
 TRIES = re.compile(r"\b(often|times)\(")
 """What it has that tries more in ``make soak``."""
 _running = []

@@ -1,6 +1,6 @@
 """Mutated files through the readers: each gives data or one of our errors, in 5 s of CPU time and 512 MiB.
 
-``python test/fuzzing.py FORMAT COUNT SEED`` prints what came of it, and ends with 1 where a file did something else;
+``python test/fuzzing.py COUNT SEED FORMAT ...`` prints what came of it; it ends with 1 where a file did something else:
 that file is kept under ``GRAPH_SLAM_FAULTS``, if that is set. Half of the mutations of mcap files are made before the
 chunks are compressed and summed up, or checksums would keep them from ever being parsed.
 """
@@ -51,11 +51,11 @@ def mutated(data, others, rng):
         if not data:
             break
         at, size = rng.randrange(len(data)), min(rng.choice((1, 4, 16, 64, 1024, 8192)), len(data))
+        width = rng.choice((1, 2, 4, 8))
         match rng.randrange(9):
             case 0 | 1:
                 data[at] ^= 1 << rng.randrange(8)
             case 2:
-                width = rng.choice((1, 2, 4, 8))
                 number = rng.choice(NUMBERS) % 256**width
                 data[at : at + width] = number.to_bytes(width, rng.choice(("little", "big")))
             case 3:
@@ -227,8 +227,7 @@ def confine():
 
 
 def keep(data, name):
-    folder = os.environ.get("GRAPH_SLAM_FAULTS")
-    if folder:
+    if folder := os.environ.get("GRAPH_SLAM_FAULTS"):
         Path(folder).mkdir(parents=True, exist_ok=True)
         (Path(folder) / name).write_bytes(data)
 
@@ -239,14 +238,27 @@ def peak_mib():
     return int(line.split()[1]) / 1024
 
 
-def main(name, count, seed):
-    faults, failures = fuzz(name, int(count), int(seed))
+def one(name, count, seed):
+    """Of one format, in this process: prints what came of it; whether something failed."""
+    faults, failures = fuzz(name, count, seed)
     mib = peak_mib()
     if mib > LIMIT_MIB:
         failures.append(f"{mib:.0f} MiB")
-    print(f"RELIABILITY fuzz_{name} tried={count} faults={faults} failed={len(failures)}")
-    print(f"{mib:.0f} MiB, {sum(os.times()[:2]):.1f} s of CPU time", *failures[:10], sep="\n", file=sys.stderr)
+    print(f"RELIABILITY fuzz_{name} tried={count} faults={faults} failed={len(failures)}", flush=True)
+    print(
+        f"{mib:.0f} MiB, {sum(os.times()[:2]):.1f} s of CPU time", *failures[:10], sep="\n", file=sys.stderr, flush=True
+    )
     return bool(failures)
+
+
+def main(count, seed, *names):
+    """Each format in a child of its own, which has little memory."""
+    codes = []
+    for name in names:
+        if not (child := os.fork()):
+            os._exit(one(name, int(count), int(seed)))
+        codes.append(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+    return any(codes)
 
 
 if __name__ == "__main__":

@@ -49,10 +49,7 @@ def imperfect_drive_and_truth(
 ) -> tuple[list[Odometry | Sightings], Truth]:
     """Measurements of a robot that winds its way among twelve landmarks, and where it was.
 
-    Parameters
-    ----------
-    kind : of sightings: range_bearing, position, range or bearing
-    turns : amplitude of the turn rate [rad/s]
+    ``kind``: range_bearing, position, range or bearing; ``turns`` the amplitude of the turn rate [rad/s].
     """
     random = np.random.default_rng(seed)
     landmarks = 6.0 * random.uniform(-1.0, 1.0, (12, 2)) + (1.0, 2.0)

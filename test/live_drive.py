@@ -15,14 +15,10 @@ HOUR_NS = 3_600 * 10**9
 
 
 class Drive:
-    """Messages of a robot, step by step: odometry at each, what it sees at every third.
+    """Messages of a robot, step by step (0.1 m, ``step_s`` of stamp time): odometry, at every third what it sees.
 
-    Parameters
-    ----------
-    start_ns : stamp of the first step; default: an hour ago, so that nothing is in the future however fast it goes
-    step_s : stamp time of a step, in which it goes 0.1 m
-    frames : put before ``odom`` and ``base_link``
-    truth : where it starts in the world
+    It begins an hour ago by default, so that nothing is in the future however fast it goes; ``frames`` is put before
+    ``odom`` and ``base_link``, ``truth`` is where it starts in the world.
     """
 
     def __init__(self, start_ns=None, step_s=0.1, frames="", truth=se2.IDENTITY, turn=0.02):

@@ -12,7 +12,6 @@ import subprocess
 import sys
 import threading
 import time
-from dataclasses import dataclass
 
 import pytest
 
@@ -35,7 +34,6 @@ from vision_msgs.msg import Detection3DArray
 
 from graph_slam_ros.messages import topics
 from graph_slam_ros.messages.message_class import message_class
-from graph_slam_ros.runs.folder import is_incomplete, was_saved_whole
 from graph_slam_ros.runs.replay import replay
 
 RESULTS = ("graph.g2o", "path.tum", "sightings.tum", "landmarks.csv", "ledger.csv", "ledger_changes.csv")
@@ -72,18 +70,6 @@ def often(times):
     return times * int(os.environ.get("GRAPH_SLAM_SOAK", "1"))
 
 
-@dataclass(frozen=True)
-class Verdict:
-    """What /diagnostics says of the node's health."""
-
-    level: int
-    state: str
-    reasons: tuple[str, ...]
-
-    def __str__(self):
-        return "; ".join((self.state, *self.reasons))
-
-
 def results(folder):
     return {name: (folder / name).read_bytes() for name in RESULTS}
 
@@ -91,17 +77,6 @@ def results(folder):
 def replayed(run, tmp_path):
     replay(run, tmp_path / "replayed")
     return results(tmp_path / "replayed")
-
-
-def completed(run, said):
-    """A run that a stopped node left, with all of its results: on a busy machine, ``recover`` makes them."""
-    if not is_incomplete(run):
-        return run
-    assert "the next start completes the results" in said, said
-    whole = run.with_name(f"recovered_{run.name}")
-    done = graph_slam("recover", run, "--out", whole)
-    assert done.returncode == 0, done.stdout + done.stderr
-    return whole
 
 
 @functools.cache
@@ -124,15 +99,7 @@ def until(condition, spin, what, patience_s=PATIENCE_S, but=lambda: ""):
 
 
 class Robot:
-    """A ROS node of the test's own: publishes what a robot would, and hears what the SLAM node says.
-
-    Parameters
-    ----------
-    of : the SLAM node
-    hears : of what that publishes
-    raw : of these, those whose bytes are kept as they come
-    sends : what it publishes
-    """
+    """A ROS node of the test's own: publishes what a robot would, and hears what the SLAM node ``of`` says."""
 
     def __init__(
         self,
@@ -140,7 +107,6 @@ class Robot:
         name="robot",
         of="/graph_slam",
         hears=("path", "pose", "landmarks", "/tf"),
-        raw=(),
         sends=("/odom", "/landmarks"),
     ):
         self.context = Context()
@@ -156,7 +122,7 @@ class Robot:
         self.publishers = {topic: self.node.create_publisher(kinds[topic], topic.lstrip("/"), qos) for topic in sends}
         self.heard = {}
         for topic in dict.fromkeys((*hears, "/diagnostics")):
-            self.hear(topic, raw=topic in raw)
+            self.hear(topic)
         self._save = self.client("save")
         self._hears.start()
 
@@ -164,11 +130,11 @@ class Robot:
         while not self._is_closed:
             self._executor.spin_once(timeout_sec=0.1)
 
-    def hear(self, topic, raw=False):
+    def hear(self, topic):
         """Keep what the SLAM node publishes there; returns the list it is kept in."""
         one, kept = PUBLICATIONS[topic], self.heard.setdefault(topic.lstrip("/"), [])
         qos = LATCHED if one.latched else RELIABLE
-        self.node.create_subscription(message_class(one.type), one.resolved(self._of), kept.append, qos, raw=raw)
+        self.node.create_subscription(message_class(one.type), one.resolved(self._of), kept.append, qos)
         return kept
 
     def publisher(self, topic, kind, qos=RELIABLE):
@@ -184,25 +150,22 @@ class Robot:
     @property
     def is_ahead(self):
         """Whether many messages wait in the SLAM node, by the last of /diagnostics: a busy machine needs its time."""
-        name = f"{self._of.lstrip('/')}: health"
-        said = [s for m in self.heard["diagnostics"][-3:] for s in m.status if s.name == name]
-        return bool(said) and int(next((v.value for v in said[-1].values if v.key == "messages waiting"), 0)) > 30
+        said = self.said()
+        return bool(said) and int(said[-1][1].get("messages waiting", 0)) > 30
 
     @property
     def verdict(self):
-        """The last; None before the first."""
-        if not (said := self.said()):
-            return None
-        level, values = said[-1]
-        return Verdict(level, values["state"], tuple(v for k, v in values.items() if k.startswith("reason ")))
+        """The last state and its reasons; nothing before the first."""
+        values = said[-1][1] if (said := self.said()) else {"state": ""}
+        return "; ".join((values["state"], *(v for k, v in values.items() if k.startswith("reason "))))
 
     def until_it_says(self, state, *words, spin=None, patience_s=PATIENCE_S):
         """Wait for a state, with these words among its reasons."""
         self.heard["diagnostics"].clear()
 
         def is_said():
-            v = self.verdict
-            return v is not None and v.state == state and all(word in str(v) for word in words)
+            verdict = self.verdict
+            return verdict.split("; ")[0] == state and all(word in verdict for word in words)
 
         until(is_said, spin or self.spin, f"{state} {words}", patience_s, lambda: f"but {self.verdict}")
 
@@ -297,13 +260,6 @@ class Robot:
     def send(self, topic, cdr):
         self.publishers[topic].publish(cdr)
 
-    def drive(self, messages, every=20):
-        """Send recorded messages in step with the node: not more than a few unheard."""
-        for k, m in enumerate(messages):
-            self.send(m.topic, m.cdr)
-            if k % every == 0:
-                self.spin(0.005)
-
     def ask(self, name, kind=Trigger, request=None):
         """Call a service of the SLAM node: a future."""
         client = self.client(name, kind)
@@ -323,22 +279,11 @@ class Robot:
     def save_in_turn(self):
         """Save after all that came before; asked again where a busy machine has lost the answer."""
         asked = []
-        for patience_s in (10.0, 20.0, 40.0):
+        for patience_s in (10.0, 60.0):
             asked.append(self.ask("save"))
-            with contextlib.suppress(AssertionError):
+            with contextlib.suppress(AssertionError) if len(asked) == 1 else contextlib.nullcontext():
                 until(lambda: any(one.done() for one in asked), self.spin, "answer of ~/save", patience_s)
                 return
-        raise AssertionError("no answer of ~/save")
-
-    def save_all(self, run):
-        """Save until the results are of all that was sent: what comes after a save is in the journal alone."""
-
-        def is_whole():
-            assert self.save().success
-            self.settle()
-            return was_saved_whole(run)
-
-        until(is_whole, self.spin, "save of everything", 60.0)
 
     def close(self):
         self._is_closed = True
@@ -361,23 +306,14 @@ MODULE = [sys.executable, "-m", "graph_slam_ros.node.node"]
 
 
 class Started:
-    """A SLAM node in a process of its own.
+    """A SLAM node in a process of its own, with parameters ``name:=value``.
 
-    Parameters
-    ----------
-    parameters : ``name:=value``
-    by : the command that starts it, where its start is what is tested; default: it is forked where that can be
-    remap : further ROS arguments for ``-r``
-    words : further ROS arguments
+    ``by`` is the command that starts it, where its start is what is tested; by default it is forked where that can be.
     """
 
-    def __init__(self, *parameters, by=None, cwd=None, remap=(), words=()):
-        words = [
-            "--ros-args",
-            *words,
-            *(word for p in parameters for word in ("-p", p)),
-            *(word for r in remap for word in ("-r", r)),
-        ]
+    def __init__(self, *parameters, by=None, cwd=None, remap=()):
+        words = [word for flag, texts in (("-p", parameters), ("-r", remap)) for text in texts for word in (flag, text)]
+        words = ["--ros-args", *words]
         if by is None and server().can_fork(ENVIRONMENT):
             self.process = server().start(["node", *words], ENVIRONMENT, cwd)
         else:

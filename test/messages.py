@@ -67,9 +67,7 @@ def detection(at=None, covariance=None, name="a", frame="", class_id="kind", res
 
 
 def detections(*found, frame="base_link", stamp_ns=STAMP_NS):
-    return encode(
-        make("vision_msgs/msg/Detection3DArray", header=header(stamp_ns, frame), detections=list(found)),
-    )
+    return encode(make("vision_msgs/msg/Detection3DArray", header=header(stamp_ns, frame), detections=list(found)))
 
 
 def transforms(*links, stamp_ns=STAMP_NS):

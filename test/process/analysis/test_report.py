@@ -1,14 +1,9 @@
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
-from matplotlib.image import imread
 from PIL import Image
 
-from graph_slam_ros.analysis import animation
 from graph_slam_ros.analysis.path_error import path_error
 from graph_slam_ros.analysis.plots import draw_graph, draw_run
 from graph_slam_ros.cli import main
@@ -69,9 +64,10 @@ def run(tmp_path, recording):
     return tmp_path
 
 
-def test_with_truth_everything_is_drawn_in_the_frame_of_the_map(run, recording, figures):
+def test_with_truth_everything_is_drawn_in_the_frame_of_the_map_with_the_error_that_is_scored(run, recording, figures):
+    (run / "run.json").write_text('{"recording": "yard.mcap"}')
     draw_run(run, run / "bag.mcap", run / "run.png")
-    axes, _ = figures[0].axes
+    axes, below = figures[0].axes
     truth = np.add(recording.T_world_base[:, :2], (40.0, 0.0))
     drawn = lines(axes)
     assert drawn["truth"] == pytest.approx(truth, abs=1e-6)
@@ -82,52 +78,23 @@ def test_with_truth_everything_is_drawn_in_the_frame_of_the_map(run, recording, 
     known = np.array([np.add(recording.landmarks[name][:2], (40.0, 0.0)) for name in "0123"])
     assert marks(axes)["landmarks"] == pytest.approx(known, abs=1e-6)
     assert marks(axes)["true landmarks"] == pytest.approx(known, abs=1e-6)  # the one that was not seen is left out
-
-
-def test_paths_have_their_colors_and_axes_their_units_and_one_scale(run, figures):
-    draw_run(run, run / "bag.mcap", run / "run.png")
-    axes, below = figures[0].axes
-    colors = {line.get_label(): to_hex(line.get_color()) for line in axes.get_lines()}
-    assert (colors["truth"], colors["dead reckoning"], colors["estimate"]) == ("#1f6fd6", "#1a1a1a", "#d62728")
     assert (axes.get_xlabel(), axes.get_ylabel(), axes.get_aspect()) == ("x [m]", "y [m]", 1.0)
-    legend = axes.get_legend()
-    assert {text.get_text() for text in legend.get_texts()} == set(colors) | {"landmarks", "true landmarks", "2 sigma"}
-    assert (below.get_xlabel(), below.get_ylabel()) == ("time [s]", "position error [m]")
-    image = imread(run / "run.png")
-    assert min(image.shape[:2]) > 1000
-    assert image[:, :, :3].std() > 0.05
-
-
-def test_without_truth_or_landmarks_the_run_is_drawn_in_its_own_frame(run, recording, figures):
-    (run / "landmarks.csv").unlink()
-    (run / "odometry.tum").unlink()
+    error = path_error(
+        read_tum(run / "odometry.tum"), Trajectory(recording.stamps_ns / 1e9, se3.in_space(recording.T_world_base))
+    )
+    values = lines(below)["dead reckoning"][:, 1]
+    assert (np.sqrt(np.mean(values**2)), values.max()) == pytest.approx(
+        (rmse := error.position_m["rmse"], error.position_m["max"])
+    )
+    title = (
+        f"yard.mcap  ·  {len(recording.stamps_ns)} keyframes  ·  4 landmarks  ·  position error 0.000 m RMSE, aligned"
+    )
+    assert figures[0].get_suptitle() == f"{title}, dead reckoning {rmse:.3f} m"
+    for name in ("landmarks.csv", "odometry.tum", "sightings.tum"):
+        (run / name).unlink()
     draw_run(run, None, run / "run.png")
-    (axes,) = figures[0].axes
-    assert set(lines(axes)) == {"estimate", "start", "end"}
-    assert lines(axes)["estimate"] == pytest.approx(np.add(recording.T_world_base[:, :2], (40.0, 0.0)), abs=1e-6)
-
-
-@pytest.mark.parametrize("left", [None, ""])
-def test_a_run_that_saw_nothing_is_aligned_by_its_keyframes(run, recording, figures, left):
-    (run / "sightings.tum").unlink()
-    if left is not None:
-        (run / "sightings.tum").write_text(left)
-    draw_run(run, run / "bag.mcap", run / "run.png")
-    truth = np.add(recording.T_world_base[:, :2], (40.0, 0.0))
-    assert lines(figures[0].axes[0])["truth"] == pytest.approx(truth, abs=1e-6)
-
-
-def test_no_line_crosses_a_gap_in_the_truth_and_none_of_it_outside_the_run_is_drawn(run, recording, figures):
-    stamps_s = recording.stamps_ns / 1e9
-    keep = [k for k in range(51) if k <= 10 or k >= 25]
-    before = np.add(stamps_s[:5], -100.0)
-    poses = np.vstack([np.add(recording.T_world_base[:5], (500.0, 0.0, 0.0)), recording.T_world_base[keep]])
-    (run / "truth.tum").write_text(tum(np.concatenate([before, stamps_s[keep]]), poses))
-    draw_run(run, run / "truth.tum", run / "run.png")
-    drawn = lines(figures[0].axes[0])["truth"]
-    assert np.isnan(drawn).all(axis=1).nonzero()[0].tolist() == [11]
-    assert len(drawn) == len(keep) + 1
-    assert np.nanmax(np.abs(drawn)) < 90.0
+    assert set(lines(figures[1].axes[0])) == {"estimate", "start", "end"}
+    assert lines(figures[1].axes[0])["estimate"] == pytest.approx(truth, abs=1e-6)
 
 
 def test_a_run_in_space_is_drawn_from_above_and_from_the_side(tmp_path, figures):
@@ -144,29 +111,6 @@ def test_a_run_in_space_is_drawn_from_above_and_from_the_side(tmp_path, figures)
     assert (above.get_xlabel(), above.get_ylabel(), side.get_ylabel()) == ("x [m]", "y [m]", "z [m]")
     assert lines(above)["truth"] == pytest.approx(turned[:, [0, 1]], abs=1e-5)
     assert lines(side)["truth"] == pytest.approx(turned[:, [0, 2]], abs=1e-5)
-
-
-def test_the_title_names_the_recording_and_tells_the_errors_where_they_are_known(run, recording, figures):
-    (run / "run.json").write_text('{"recording": "yard.mcap"}')
-    draw_run(run, None, run / "run.png")
-    draw_run(run, run / "bag.mcap", run / "run.png")
-    plain, scored = (figure.get_suptitle() for figure in figures)
-    assert plain == f"yard.mcap  ·  {len(recording.stamps_ns)} keyframes  ·  4 landmarks"
-    truth = Trajectory(recording.stamps_ns / 1e9, se3.in_space(recording.T_world_base))
-    odometry = path_error(read_tum(run / "odometry.tum"), truth).position_m["rmse"]
-    assert scored == f"{plain}  ·  position error 0.000 m RMSE, aligned, dead reckoning {odometry:.3f} m"
-
-
-def test_the_error_over_time_is_that_which_is_scored(run, recording, figures):
-    draw_run(run, run / "bag.mcap", run / "run.png")
-    drawn = lines(figures[0].axes[1])
-    truth = Trajectory(recording.stamps_ns / 1e9, se3.in_space(recording.T_world_base))
-    error = path_error(read_tum(run / "odometry.tum"), truth)
-    times, values = drawn["dead reckoning"].T
-    assert times == pytest.approx((recording.stamps_ns - recording.stamps_ns[0]) / 1e9, abs=1e-6)
-    assert np.sqrt(np.mean(values**2)) == pytest.approx(error.position_m["rmse"])
-    assert values.max() == pytest.approx(error.position_m["max"])
-    assert drawn["estimate"][:, 1].max() < 1e-6
 
 
 def ellipses(axes):
@@ -191,17 +135,6 @@ def test_ellipses_are_two_sigma_and_turn_with_the_robot(run, recording, figures)
     assert (off + 90.0) % 180.0 - 90.0 == pytest.approx(np.zeros(3), abs=1e-4), "an ellipse has two ends"
 
 
-def test_scales_are_equal_however_long_and_narrow_the_path_is(tmp_path, figures):
-    poses = np.column_stack([np.linspace(0.0, 200.0, 50), np.sin(np.arange(50.0)), np.zeros(50)])
-    (tmp_path / "path.tum").write_text(tum(np.arange(50.0), poses))
-    draw_run(tmp_path, None, tmp_path / "run.png")
-    (axes,) = figures[0].axes
-    pixels = axes.transData.transform([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)])
-    assert pixels[1, 0] - pixels[0, 0] == pytest.approx(pixels[2, 1] - pixels[0, 1])
-    width, height = figures[0].get_size_inches()
-    assert height < 0.6 * width
-
-
 def test_plot_draws_with_and_without_truth_and_replay_always(tmp_path, recording, figures, capsys):
     write_bag(recording, tmp_path / "yard.mcap")
     bag, out = str(tmp_path / "yard.mcap"), str(tmp_path / "run")
@@ -224,71 +157,30 @@ def test_the_animation_repeats_the_drive_and_ends_with_the_solved_path(tmp_path,
     write_bag(simulate("pythonrobotics", 2, poses=25), tmp_path / "world.mcap")
     run, gif = tmp_path / "run", tmp_path / "drive.gif"
     assert main(["replay", str(tmp_path / "world.mcap"), "--out", str(run)]) == 0
-    seen = []
-    drawn = animation._drawn
-    monkeypatch.setattr(animation, "_drawn", lambda moments, *rest: drawn(seen.append(moments) or moments, *rest))
     assert main(["map", "export", str(run), "--out", str(gif), "--truth", str(tmp_path / "world.mcap")]) == 0
-    (moments,) = seen
-    lengths = [len(moment.path) for moment in moments]
-    assert lengths == sorted(lengths) and lengths[0] < 0.1 * lengths[-1]
-    assert moments[-1].path[:, :2] == pytest.approx(read_tum(run / "path.tum").poses[:, :2], abs=1e-6)
     with Image.open(gif) as image:
-        assert image.n_frames == len(moments)
+        assert image.n_frames > 5
         assert image.size == (480, 480)
         image.seek(image.n_frames - 1)
         assert b"\x1f\x6f\xd6" in image.convert("RGB").tobytes(), "truth is blue"
     capsys.readouterr()
     assert main(["map", "export", str(run), "--out", str(gif)]) == 2, "it is there"
-    monkeypatch.setattr(animation, "_drawn", lambda moments, *rest: drawn(moments[-1:], *rest))  # each takes a while
     journal = (run / "ingest.mcap").read_bytes()
     (run / "ingest.mcap").write_bytes(journal[: len(journal) * 9 // 10])
     assert main(["map", "export", str(run), "--out", str(gif), "--force"]) == 3, "a part of the drive is lost"
-    assert "ingest.mcap" in capsys.readouterr().err
     (run / "ingest.mcap").unlink()
     assert main(["map", "export", str(run), "--out", str(gif), "--force"]) == 2
-    assert "ingest.mcap" in capsys.readouterr().err
+    assert capsys.readouterr().err.count("ingest.mcap") > 1
 
 
 def test_a_graph_is_drawn_before_and_after_with_closures_unlike_odometry(tmp_path, figures):
-    final = np.array([[0.0, 0, 0], [10, 0, 0], [10, 10, 0], [0, 10, 0]])
+    final = np.array([[0.0, 0, 0], [10, 0, 0], [10, 10, 0], [0, 10, 0], [5, 7, 0]])
     initial = final * (1.0, 0.5, 1.0)
     edges = {"odometry": np.array([[0, 1], [1, 2], [2, 3]]), "closures": np.array([[0, 2]])}
-    draw_graph(tmp_path / "graph.png", initial, final, edges)
+    draw_graph(tmp_path / "graph.png", initial, final, edges, landmarks=np.array([4]))
     for axes, values in zip(figures[0].axes, (initial, final), strict=True):
         drawn = {c.get_label(): c for c in axes.collections}
-        assert np.array_equal(drawn["odometry"].get_segments(), values[edges["odometry"], :2])
-        assert np.array_equal(drawn["closures"].get_segments(), values[edges["closures"], :2])
+        for kind, ends in edges.items():
+            assert np.array_equal(drawn[kind].get_segments(), values[ends, :2])
         assert to_hex(drawn["odometry"].get_color()[0]) != to_hex(drawn["closures"].get_color()[0])
-        low, high = axes.get_xlim()
-        assert low < 0.0 < 10.0 < high
-    legend = figures[0].axes[1].get_legend()
-    assert [text.get_text() for text in legend.get_texts()] == ["odometry", "closures"]
-
-
-def test_landmarks_of_a_graph_are_marked_before_and_after(tmp_path, figures):
-    initial, final = np.array([[0.0, 0, 0], [10, 0, 0], [5, 7, 0]]), np.array([[0.0, 0, 0], [10, 0, 0], [5, 8, 0]])
-    edges = {"odometry": np.array([[0, 1]]), "landmarks": np.array([[0, 2], [1, 2]])}
-    draw_graph(tmp_path / "graph.png", initial, final, edges, landmarks=np.array([2]))
-    assert [marks(axes)["landmarks"].tolist() for axes in figures[0].axes] == [[[5.0, 7.0]], [[5.0, 8.0]]]
-
-
-def test_a_graph_without_edges_is_drawn_too(tmp_path, figures):
-    draw_graph(tmp_path / "graph.png", np.zeros((1, 3)), np.zeros((1, 3)), {})
-    assert (tmp_path / "graph.png").stat().st_size > 0
-    assert len(figures[0].axes) == 2
-
-
-def test_matplotlib_is_imported_when_something_is_drawn_and_pyplot_never(tmp_path):
-    script = f"""
-import sys
-import numpy as np
-from graph_slam_ros.formats.parameters import parameters_text
-from graph_slam_ros.formats.tum import tum_text
-from graph_slam_ros.lie import se3
-from graph_slam_ros.analysis.plots import draw_graph
-assert "matplotlib" not in sys.modules
-draw_graph({str(tmp_path / "graph.png")!r}, np.zeros((2, 3)), np.eye(2, 3), {{"odometry": np.array([[0, 1]])}})
-assert "matplotlib.pyplot" not in sys.modules
-"""
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr
+        assert marks(axes)["landmarks"].tolist() == [values[4, :2].tolist()]

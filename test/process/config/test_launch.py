@@ -30,7 +30,7 @@ service = LaunchService()
 service.include_launch_description(LaunchDescription([included]))
 sys.exit(service.run())
 """
-NODE, RVIZ = "graph_slam_ros/graph_slam_node", "rviz2/rviz2"
+NODE, RVIZ, FRAMES = "graph_slam_ros/graph_slam_node", "rviz2/rviz2", ("map", "odom", "base_link")
 RUN_NODE = "import sys\nfrom graph_slam_ros.cli import node_main\nsys.exit(node_main())"
 TELL = """
 import json, pathlib, sys
@@ -114,49 +114,32 @@ def launched(prefix, *words):
 
 def started(prefix, *words):
     """Of each executable that was started, its words and what its parameter files say."""
-    for name in (NODE, RVIZ):
-        install(prefix, name, TELL.format(told=str(prefix / Path(name).name)))
+    told = {name: prefix / Path(name).name for name in (NODE, RVIZ)}
+    for name, file in told.items():
+        if not (prefix / "lib" / name).exists():
+            install(prefix, name, TELL.format(told=str(file)))
     with launched(prefix, *words) as (process, said):
         assert process.wait(timeout=60.0) == 0, said()
-    told = {name: prefix / Path(name).name for name in (NODE, RVIZ)}
     return {name: json.loads(file.read_text()) for name, file in told.items() if file.exists()}
 
 
 @needs_launch
-def test_without_arguments_the_node_has_the_shipped_parameters_and_no_rviz_is_opened(prefix):
+def test_arguments_reach_the_node_and_rviz_and_without_any_the_node_has_the_shipped_parameters(prefix):
     ((name, (words, parameters)),) = started(prefix).items()
     assert name == NODE
     assert {"odom:=odom", "landmarks:=landmarks"} <= set(words)
-    assert 'map: "map"' in parameters
-    assert "frames.map" not in parameters, "the frames of params_file stay"
-    assert "output.folder:" not in parameters, "and its folder"
-    assert "node.autostart: true" in parameters
-    assert "use_sim_time: false" in parameters
-
-
-@needs_launch
-def test_arguments_reach_the_node_and_rviz_looks_at_the_same_robot(prefix):
-    given = (
-        "namespace:=robot1",
-        "odom:=/wheels",
-        "frame_prefix:=robot1/",
-        "autostart:=false",
-        "use_sim_time:=true",
-        "folder:=/runs/1",
-    )
-    out = started(prefix, *given, "log_level:=debug", "rviz:=true")
+    for text in ('map: "map"', "node.autostart: true", "use_sim_time: false"):
+        assert text in parameters
+    for text in ("frames.map", "output.folder:"):
+        assert text not in parameters, "those of params_file stay"
+    given = "namespace:=robot1 odom:=/wheels frame_prefix:=robot1/ autostart:=false use_sim_time:=true folder:=/runs/1"
+    out = started(prefix, *given.split(), "log_level:=debug", "rviz:=true")
     words, parameters = out[NODE]
     assert {"__ns:=/robot1", "odom:=/wheels", "landmarks:=landmarks"} <= set(words)
     assert words[words.index("--log-level") + 1] == "debug"
-    for said in (
-        "node.autostart: false",
-        "use_sim_time: true",
-        "frames.map: robot1/map",
-        "frames.odom: robot1/odom",
-        "output.folder: /runs/1",
-    ):
-        assert said in parameters
-    assert "frames.base: robot1/base_link" in parameters
+    frames = (f"frames.{name}: robot1/{frame}" for name, frame in zip(("map", "odom", "base"), FRAMES, strict=True))
+    for text in (*frames, "node.autostart: false", "use_sim_time: true", "output.folder: /runs/1"):
+        assert text in parameters
     words, parameters = out[RVIZ]
     assert words[words.index("-f") + 1] == "robot1/map"
     assert words[words.index("-d") + 1].endswith("config/graph_slam.rviz")

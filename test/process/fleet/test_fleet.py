@@ -1,19 +1,21 @@
 """A fleet on real workers: processes of this machine, and those of a scheduler over TCP, with faults."""
 
+import contextlib
 import json
 import os
+import random
 import signal
 import subprocess
 import sys
 import threading
+import time
 
 import pytest
 
 pytest.importorskip("distributed", reason="the extra fleet is not installed")
 
-import fleet_nodes
 from distributed import Client
-from fleet_nodes import contents, scheduler, wait_for
+from reliability import times
 
 from graph_slam_ros import cli
 from graph_slam_ros.errors import GraphSlamError
@@ -24,13 +26,24 @@ from graph_slam_ros.tools.fleet.job import Job, run_job
 from graph_slam_ros.tools.fleet.replay import Fleet, jobs_of, replay_all
 from graph_slam_ros.tools.fleet.store import Store
 
+COUNT, STOPS = times((2, 1), (12, 10))
+HASHED = ("graph.g2o", "ledger.csv", "path.tum", "landmarks.csv", "map.mcap")
+
 
 @pytest.fixture(scope="module")
 def serial(tmp_path_factory):
-    """Bytes of the results of each of two recordings, replayed one by one; a third one is damaged."""
-    folder = tmp_path_factory.mktemp("fleet") / "drives"
-    folder.mkdir()
-    return folder, fleet_nodes.drives(folder, 2, b"\x89MCAP0\r\n" + bytes(100))
+    """Recordings in a folder, of which one is damaged, and the bytes of the results of a serial run, by name."""
+    (folder := tmp_path_factory.mktemp("fleet") / "drives").mkdir()
+    found = {}
+    for seed in range(1, COUNT + 1):
+        name, out = f"{seed}.mcap", folder.with_name("serial") / str(seed)
+        sensor = "range_bearing" if seed == 2 else "position"  # whose topic is that of no usual input
+        words = ["simulate", "pythonrobotics", "--seed", str(seed), "--set", f"sensor={sensor}"]
+        assert cli.main([*words, "--out", str(folder / name)]) == 0
+        assert cli.main(["replay", str(folder / name), "--out", str(out)]) == 0
+        found[name] = contents(out)
+    (folder / "damaged.mcap").write_bytes(b"\x89MCAP0\r\n" + bytes(100))
+    return folder, found
 
 
 @pytest.fixture(scope="module")
@@ -38,11 +51,26 @@ def drives(serial):
     return serial[0]
 
 
-def equal_to_serial(out, rows, serial):
-    for row in rows:
-        if row["state"] == "done":
-            assert contents(out / "jobs" / row["key"] / "run") == serial[1][row["recording"]], row
-    return sum(row["state"] == "done" for row in rows)
+def contents(run):
+    """What is the same wherever a recording was replayed."""
+    return {name: (run / name).read_bytes() for name in HASHED}
+
+
+def wait_for(what):
+    until = time.monotonic() + 60.0
+    while not what():
+        assert time.monotonic() < until, what
+        time.sleep(0.05)
+
+
+def check(out, rows, serial, *, whole=True):
+    """No result is wrong, and who has none says why; ``whole``: each that is not damaged has one."""
+    done = {row["recording"]: contents(out / "jobs" / row["key"] / "run") for row in rows if row["state"] == "done"}
+    assert done == {name: serial[1][name] for name in done}
+    assert all(row["reason"] for row in rows if row["state"] != "done")
+    if whole:
+        assert set(done) == set(serial[1])
+        assert [row["recording"] for row in rows if row["state"] == "failed"] == ["damaged.mcap"]
 
 
 def here(capsys, *arguments):
@@ -52,42 +80,81 @@ def here(capsys, *arguments):
     return code, *capsys.readouterr()
 
 
-def job(drives, out, **options):
-    """The job of the first recording alone."""
-    Store(out, new=True)
-    (one,) = jobs_of(Fleet([str(drives / "1.mcap")], out, **options))
-    return one
-
-
-def test_one_command_replays_all_and_the_second_time_nothing(drives, serial, tmp_path, capsys):
+def test_stopped_by_a_signal_it_goes_on_where_it_was_and_a_second_time_there_is_nothing_to_do(
+    drives, serial, tmp_path, capsys
+):
     out = tmp_path / "out"
-    options = ("--out", out, "--truth", "{path}", "--workers", 2)
+    options = ("--out", out, "--truth", "{path}", "--workers", 2, "--report")
+    command = [sys.executable, "-m", "graph_slam_ros.cli", "fleet", "replay", drives, *options]
+    for stop in range(STOPS):
+        with subprocess.Popen(list(map(str, command)), stderr=subprocess.PIPE, text=True) as process:
+            if stop:
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    process.wait(random.Random(stop).uniform(2.0, 6.0))
+                process.kill()
+                continue
+            wait_for(lambda: list(out.glob("jobs/*/row.json")))
+            with pytest.raises(GraphSlamError, match="another fleet writes into it"):
+                replay_all(Fleet([str(drives)], out), workers=1)
+            process.send_signal(signal.SIGINT)
+            said = process.communicate(timeout=60)[1]
+            assert process.returncode in (130, 3), said
+    there = len(list(out.glob("jobs/*/row.json")))
     code, _, said = here(capsys, "replay", drives, *options)
     assert code == 3
-    assert "failed: damaged0.mcap (defaults):" in said
+    assert "failed: damaged.mcap (defaults):" in said
     assert "Traceback" not in said
-    rows = [json.loads(file.read_text()) for file in out.glob("jobs/*/row.json")]
-    assert equal_to_serial(out, rows, serial) == 2
+    stamps = {file: file.stat().st_mtime_ns for file in out.glob("jobs/*/row.json")}
+    rows = [json.loads(file.read_text()) for file in stamps]
+    check(out, rows, serial)
+    assert not list(out.glob("jobs/.*")), "nothing half-written is left"
+    assert there <= len(rows) == COUNT + 1
     for row in rows:
         if row["state"] == "done":
             assert 0.0 < row["rmse_m"] < 0.5
             assert row["nees"] > 0.0 and row["cpu_s"] > 0.0
             assert len(row["errors_m"]) == 40
+            assert f"{row['key']}/report.html" in (out / "index.html").read_text()
     inputs = {row["recording"]: row.get("inputs") for row in rows}
     assert inputs["2.mcap"] == "odom ranges", "as info suggests where no topic is usual"
-    stamps = {file: file.stat().st_mtime_ns for file in out.glob("jobs/*/row.json")}
-    assert "of them 3 were there" in here(capsys, "replay", drives, *options)[1]
+    assert f"of them {COUNT + 1} were there" in here(capsys, "replay", drives, *options)[1]
     assert {file: file.stat().st_mtime_ns for file in out.glob("jobs/*/row.json")} == stamps
-    _, shown, _ = here(capsys, "replay", drives / "1.mcap", *options, "--report")
-    assert "of them 0 were there" in shown, "it lacked its report"
-    (report,) = out.glob("jobs/*/report.html")
-    assert str(report.relative_to(out)) in (out / "index.html").read_text()
     assert here(capsys, "compare", out, out, "--fail", "rmse>1.02x")[0] == 0
+
+
+# -- over TCP ----------------------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def scheduler(folder):
+    """A Dask scheduler's address and what starts a worker of it, as processes on the loopback."""
+    file, begun = folder / "scheduler.json", []
+    environment = {**os.environ, "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "2"}
+
+    def start(name, *options):
+        command = [sys.executable, "-m", f"distributed.cli.dask_{name}", "--scheduler-file", str(file)]
+        command += ["--no-dashboard", "--host", "127.0.0.1", *options]
+        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "start_new_session": True}
+        begun.append(subprocess.Popen(command, env=environment, **quiet))
+
+    try:
+        start("scheduler", "--port", "0")
+        wait_for(file.exists)
+        worker = "worker", "--nthreads", "1", "--local-directory", str(folder)
+        yield json.loads(file.read_text())["address"], lambda: start(*worker)
+    finally:
+        for process in reversed(begun):
+            process.terminate()
+        for process in begun:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(10.0)
+            process.kill()
+            process.wait()
 
 
 def test_over_tcp_a_worker_that_is_killed_changes_nothing(drives, serial, tmp_path):
     out = tmp_path / "out"
-    with scheduler(tmp_path, 0) as (address, start_worker):
+    with scheduler(tmp_path) as (address, start_worker):
         with pytest.raises(GraphSlamError, match="has no worker"), connected(address, 0):
             pass
         for _ in range(2):
@@ -99,62 +166,39 @@ def test_over_tcp_a_worker_that_is_killed_changes_nothing(drives, serial, tmp_pa
             for _ in run_jobs(client, jobs, lambda items, _: items, lambda job: {"key": job.key}):
                 most = max(most, *map(len, client.processing().values()))
         assert most <= 1, "a worker has no job but the one that it runs"
-        victim = next(iter(pids.values()))
 
         def kill_at_work():
             wait_for(lambda: list(out.glob("jobs/.*")))
-            os.kill(victim, signal.SIGKILL)
+            os.kill(next(iter(pids.values())), signal.SIGKILL)
 
         killer = threading.Thread(target=kill_at_work)
         killer.start()
         rows, _ = replay_all(Fleet([str(drives)], out), address)
         killer.join()
-    assert equal_to_serial(out, rows, serial) == 2
-    assert [row["recording"] for row in rows if row["state"] == "failed"] == ["damaged0.mcap"]
+    check(out, rows, serial)
 
 
-def test_a_job_beyond_its_limits_is_a_row_and_the_process_of_the_next_is_new(drives, serial, tmp_path, monkeypatch):
+# -- one job -----------------------------------------------------------------------------------------------------------
+
+
+def job(drives, out, **options):
+    """The job of the first recording alone."""
+    Store(out, new=True)
+    (one,) = jobs_of(Fleet([str(drives / "1.mcap")], out, **options))
+    return one
+
+
+def test_a_job_beyond_its_limits_or_without_its_truth_is_a_row_that_says_so(drives, tmp_path, monkeypatch):
     monkeypatch.setattr(isolation, "MOST_ATTEMPTS", 1)
     slow = run_isolated(job(drives, tmp_path / "out", limit_s=0.05))
     assert slow["state"] == "failed" and "limit of time" in slow["reason"]
     assert slow["retry"], "the next command runs it again"
     large = run_isolated(job(drives, tmp_path / "large", memory=2**20))
     assert "out of memory: more than 1 MiB (--memory)" in large["reason"]
-    rows, reused = replay_all(Fleet([str(drives / "1.mcap")], tmp_path / "out"), workers=1)
-    assert ([row["state"] for row in rows], reused) == (["done"], 0)
-
-
-def test_without_its_truth_a_run_is_kept_and_says_so(drives, tmp_path):
-    row = run_job(job(drives, tmp_path / "out", truth="{folder}/{stem}.tum"))
+    row = run_job(job(drives, tmp_path / "true", truth="{folder}/{stem}.tum"))
     assert row["state"] == "incomplete"
     assert "not compared with the truth" in row["reason"] and "1.tum" in row["reason"]
-    assert (tmp_path / "out/jobs" / row["key"] / "run/path.tum").is_file()
-
-
-def test_stopped_by_a_signal_it_goes_on_where_it_was(drives, serial, tmp_path):
-    out = tmp_path / "out"
-    options = ["replay", str(drives), "--out", str(out), "--workers", "1"]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "graph_slam_ros.cli", "fleet", *options], stderr=subprocess.PIPE, text=True
-    )
-    wait_for(lambda: list(out.glob("jobs/*/row.json")))
-    with pytest.raises(GraphSlamError, match="another fleet writes into it"):
-        replay_all(Fleet([str(drives)], out), workers=1)
-    process.send_signal(signal.SIGINT)
-    said = process.communicate(timeout=60)[1]
-    there = len(list(out.glob("jobs/*/row.json")))
-    assert process.returncode in (130, 3), said
-    rows, reused = replay_all(Fleet([str(drives)], out), workers=1)
-    assert reused >= there - 1
-    assert equal_to_serial(out, rows, serial) == 2
-    assert not list(out.glob("jobs/.*")), "nothing half-written is left"
-
-
-def test_a_scheduler_that_does_not_answer_is_named(monkeypatch):
-    monkeypatch.setattr(engine, "Client", lambda at, **options: Client(at, **options | {"timeout": "1s"}))
-    for address in ("tcp://127.0.0.1:9", "nonsense"):
-        with pytest.raises(GraphSlamError, match="no Dask scheduler answers"), connected(address, 0):
-            pass
+    assert (tmp_path / "true/jobs" / row["key"] / "run/path.tum").is_file()
 
 
 def test_a_full_disk_is_named_and_with_room_the_same_job_is_done(drives, serial, tmp_path):
@@ -166,12 +210,15 @@ def test_a_full_disk_is_named_and_with_room_the_same_job_is_done(drives, serial,
         assert full["state"] == "failed" and full["retry"]
         assert "No space left on device" in full["reason"]
         subprocess.run(["mount", "-o", "remount,size=20m", tmp_path], check=True)
-        assert equal_to_serial(tmp_path / "out", [run_job(one)], serial) == 1
+        row = run_job(one)
+        assert row["state"] == "done"
+        check(tmp_path / "out", [row], serial, whole=False)
     finally:
         subprocess.run(["umount", "--lazy", tmp_path], check=False)
 
 
-def test_mistakes_are_refused_in_one_line(drives, tmp_path, capsys):
+def test_mistakes_are_refused_in_one_line(drives, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(engine, "Client", lambda at, **options: Client(at, **options | {"timeout": "1s"}))
     out = ("--out", tmp_path / "o")
     for arguments, says in (
         (("replay", tmp_path / "none", *out), "no such file"),
@@ -187,3 +234,5 @@ def test_mistakes_are_refused_in_one_line(drives, tmp_path, capsys):
         assert says in said
         assert len(said.splitlines()) == 1
     assert not (tmp_path / "o").exists(), "nothing was begun"
+    with pytest.raises(GraphSlamError, match="no Dask scheduler answers"), connected("tcp://127.0.0.1:9", 0):
+        pass

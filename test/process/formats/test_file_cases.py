@@ -22,12 +22,13 @@ from confined import confined
 from mcap.data_stream import RecordBuilder
 from mcap.records import Chunk, Footer, SummaryOffset
 from mcap.stream_reader import StreamReader
-from mcap.writer import CompressionType, Writer
+from mcap.writer import CompressionType, IndexType, Writer
 from recordings import (
     CONTAINERS,
     ODOMETRY,
     RESULTS,
     TOPICS,
+    Ros1Writer,
     chunks,
     definition,
     read,
@@ -70,41 +71,34 @@ def reference(recorded, tmp_path_factory):
     return {name: (out / name).read_bytes() for name in RESULTS}
 
 
-@each("compression", list(CompressionType))
-def test_F5_mcap_is_read_whatever_its_compression(tmp_path, messages, compression):
-    file = write_mcap(tmp_path / "a.mcap", messages, compression=compression, chunk_size=20_000)
-    assert len(chunks(file)) > 3
+BARE = {"index_types": IndexType.NONE, "repeat_channels": False, "repeat_schemas": False, "use_statistics": False}
+BARE["use_summary_offsets"] = False
+
+
+@each("options", [*({"compression": one} for one in CompressionType), BARE, BARE | {"use_chunking": False}])
+def test_F2_F5_mcap_is_read_whatever_its_compression_and_without_index_or_summary(tmp_path, messages, options):
+    file = write_mcap(tmp_path / "a.mcap", messages, chunk_size=20_000, **options)
+    assert len(chunks(file)) > 3 or not options.get("use_chunking", True)
     assert read(file) == (messages, [])
+    counts = {topic.name: topic.count for topic in open_bag(file).topics.values()}
+    assert counts == Counter(m.topic for m in messages)
 
 
-@each("chunking", [True, False])
-def test_F2_mcap_without_index_or_summary_is_read_whole(tmp_path, messages, chunking):
-    from mcap.writer import IndexType
-
-    file = write_mcap(
-        tmp_path / "a.mcap",
-        messages,
-        index_types=IndexType.NONE,
-        repeat_channels=False,
-        repeat_schemas=False,
-        use_statistics=False,
-        use_summary_offsets=False,
-        use_chunking=chunking,
-    )
-    bag = open_bag(file)
-    assert {t.name: t.count for t in bag.topics.values()} == {
-        name: sum(m.topic == name for m in messages) for name in TOPICS
-    }
-    assert read(file) == (messages, [])
+CODECS = {f"ROS 1, {codec.name}": codec for codec in Ros1Writer.CompressionFormat}
 
 
-@each("container", CONTAINERS)
-def test_F8_every_container_gives_the_same_messages_with_and_without_metadata(tmp_path, messages, container):
-    assert read(CONTAINERS[container](tmp_path, messages)) == (messages, [])
+@each("container", [*CONTAINERS, *CODECS, "messages compressed one by one"])
+def test_F5_F8_every_container_gives_the_same_messages_with_and_without_metadata(tmp_path, messages, container):
+    if container in CODECS:
+        bag = to_ros1(tmp_path / "a.bag", messages, CODECS[container])
+    elif container in CONTAINERS:
+        bag = CONTAINERS[container](tmp_path, messages)
+    else:  # as rosbag2 does
+        bag = to_sqlite(tmp_path / "bag", [replace(m, cdr=zstandard.compress(m.cdr)) for m in messages])
+    assert read(bag) == (messages, [])
 
 
-@each("fraction", [0.15, 0.4, 0.77, 0.95])
-@each("compression", list(CompressionType))
+@each("fraction, compression", zip((0.15, 0.4, 0.77, 0.95), itertools.cycle(CompressionType)))
 def test_F1_of_a_truncated_file_every_whole_chunk_is_read_and_the_loss_is_told(
     tmp_path, messages, compression, fraction
 ):
@@ -123,18 +117,6 @@ def test_F1_of_a_truncated_file_every_whole_chunk_is_read_and_the_loss_is_told(
         return
     (loss,) = losses
     assert loss.startswith(f"cut.mcap: cut off after {len(got)} messages")
-
-
-@each("fraction", [0.3, 0.8])
-def test_F1_of_a_truncated_file_without_chunks_every_whole_message_is_read(tmp_path, messages, fraction):
-    whole = write_mcap(tmp_path / "whole.mcap", messages, use_chunking=False)
-    data = whole.read_bytes()
-    cut = int(len(data) * fraction)
-    (tmp_path / "cut.mcap").write_bytes(data[:cut])
-    got, losses = read(tmp_path / "cut.mcap")
-    ends = [data.index(m.cdr) + len(m.cdr) for m in messages]
-    assert got == messages[: sum(end <= cut for end in ends)]
-    assert len(losses) == 1
 
 
 def test_F1_cut_at_every_one_of_many_places_nothing_but_a_loss_or_a_refusal_comes_of_it(tmp_path, messages):
@@ -171,162 +153,100 @@ def test_F3_a_flipped_bit_in_a_chunk_costs_that_chunk_alone_and_is_told(tmp_path
         ]
 
 
-def test_F3_whatever_byte_of_a_file_is_wrong_it_is_read_or_refused_in_one_line(tmp_path, messages):
-    whole = write_mcap(tmp_path / "a.mcap", messages[:60], compression=CompressionType.LZ4, chunk_size=8_000)
-    data, rng = whole.read_bytes(), np.random.default_rng(0)
-    intact = messages[:60]
-    for at in [*range(0, 100, 5), *rng.integers(0, len(data), 150), *range(len(data) - 300, len(data), 7)]:
-        damaged = bytearray(data)
-        damaged[at] ^= 1 << int(rng.integers(8))
-        whole.write_bytes(damaged)
-        try:
-            got, losses = read(whole)
-        except BagError as error:
-            assert "\n" not in str(error)
-            continue
-        wrong = [m for m in got if (m.topic, m.cdr) not in {(i.topic, i.cdr) for i in intact}]
-        assert not wrong or losses or at < 1000, "a header outside of a chunk has no checksum"
-        assert len(got) == len(intact) or losses
+def make(path, content):
+    """A file, or a FIFO where there is no content."""
+    os.mkfifo(path) if content is None else path.write_bytes(content)
 
 
-def make_fifo(path):
-    os.mkfifo(path)
-    return path
-
-
-def make_file(path, content):
-    path.write_bytes(content)
-    return path
-
-
-NO_RECORDINGS = {
-    "empty file": (lambda p: make_file(p / "a.mcap", b""), "a.mcap: the file is empty"),
-    "wrong magic": (lambda p: make_file(p / "a.mcap", b"hello, world, this is no recording"), "a.mcap: not a readable"),
-    "wrong magic, no suffix": (
-        lambda p: make_file(p / "a", b"hello, world, this is no recording"),
-        "a: not a readable",
-    ),
-    "wrong magic in db3": (lambda p: make_file(p / "a.db3", b"hello, world" * 100), "a.db3: not a readable"),
-    "wrong magic in bag": (lambda p: make_file(p / "a.bag", b"hello, world" * 100), "a.bag: not a readable"),
-    "magic alone": (lambda p: make_file(p / "a.mcap", b"\x89MCAP0\r\n"), "a.mcap: no topic in it"),
-    "folder without recording": (lambda p: p, "no recording"),
-    "missing": (lambda p: p / "a.mcap", "a.mcap: no such file or folder"),
-    "fifo": (lambda p: make_fifo(p / "a.mcap"), "a.mcap: neither a file nor a folder"),
-    "folder with a fifo": (lambda p: make_fifo(p / "a.mcap").parent, "no recording"),
-    "folder with an empty part": (lambda p: make_file(p / "a.mcap", b"").parent, "a.mcap: the file is empty"),
-    "device": (lambda p: type(p)("/dev/zero"), "neither a file nor a folder"),
+NO_RECORDINGS = {  # a file's name and content (None: a FIFO), what is opened, and what is said
+    "empty file": ("a.mcap", b"", "a.mcap", "a.mcap: the file is empty"),
+    "wrong magic": ("a.mcap", b"hello, this is no recording", "a.mcap", "a.mcap: not a readable"),
+    "wrong magic, no suffix": ("a", b"hello, this is no recording", "a", "a: not a readable"),
+    "wrong magic in db3": ("a.db3", b"hello, world" * 100, "a.db3", "a.db3: not a readable"),
+    "wrong magic in bag": ("a.bag", b"hello, world" * 100, "a.bag", "a.bag: not a readable"),
+    "magic alone": ("a.mcap", b"\x89MCAP0\r\n", "a.mcap", "a.mcap: no topic in it"),
+    "folder without recording": ("a", b"", "", "no recording"),
+    "missing": ("b", b"", "a.mcap", "a.mcap: no such file or folder"),
+    "fifo": ("a.mcap", None, "a.mcap", "a.mcap: neither a file nor a folder"),
+    "folder with a fifo": ("a.mcap", None, "", "no recording"),
+    "folder with an empty part": ("a.mcap", b"", "", "a.mcap: the file is empty"),
+    "device": ("a", b"", "/dev/zero", "neither a file nor a folder"),
 }
 
 
 @each("kind", NO_RECORDINGS)
 def test_F7_what_is_no_recording_is_refused_in_one_line(tmp_path, kind):
-    path, complaint = NO_RECORDINGS[kind]
+    name, content, opened, complaint = NO_RECORDINGS[kind]
+    make(tmp_path / name, content)
     with pytest.raises(BagError, match=complaint) as caught:
-        open_bag(path(tmp_path))
+        open_bag(tmp_path / opened)
     assert "\n" not in str(caught.value)
 
 
-def replay_with(tmp_path, messages, **options):
+def replay_with(tmp_path, messages, definition_of=None, **options):
+    """Replay an mcap file of these messages; of odometry with another definition."""
+    if definition_of is not None:
+        options["text"] = lambda name: definition_of if name == ODOMETRY else definition(name)
     file = write_mcap(tmp_path / "a.mcap", messages, **options)
     return replay(file, tmp_path / "run", odometry="/odom", landmarks="/landmarks")
 
 
-def edited(old, new):
-    def text(name):
-        whole = definition(name)
-        assert name != ODOMETRY or old in whole
-        return whole.replace(old, new)
-
-    return text
-
-
-def test_F11_without_a_schema_the_refusal_says_so(tmp_path, messages):
+def test_F11_F12_without_a_schema_or_in_another_encoding_the_refusal_says_so(tmp_path, messages):
+    with pytest.raises(BagError, match="topic /odom: messages are encoded as 'json': record them in ROS"):
+        replay_with(tmp_path, messages, encoding="json")
     with pytest.raises(BagError, match="/odom has no type: the recording lacks its schema"):
         replay_with(tmp_path, messages, schemas=False)
     with pytest.raises(BagError, match=r"no topic of type nav_msgs/msg/Odometry .* /odom \(no type\)"):
         choose_inputs(open_bag(tmp_path / "a.mcap"), Config())
 
 
-def test_F11_a_schema_without_text_is_decoded_by_our_own_definition(tmp_path, messages, reference):
-    replay_with(tmp_path, messages, text=lambda name: "")
-    assert (tmp_path / "run" / "graph.g2o").read_bytes() == reference["graph.g2o"]
+def type_of_types(count, *fields):
+    """Types that each have fields of the next one's type."""
+    texts = [f"MSG: my/A{k}\n" + "".join(f"my/A{k + 1} {field}\n" for field in fields) for k in range(count)]
+    return ("=" * 80 + "\n").join(["my/A0 first\n" + WHOLE, *texts, f"MSG: my/A{count}\nint8 last\n"])
 
 
-@each(
-    "old, new, complaint",
-    [
-        ("string child_frame_id\n", "", "nav_msgs/msg/Odometry of this recording has no field 'child_frame_id'"),
-        ("float64[36] covariance\n", "float64[36] spread\n", "has no field 'covariance'"),
-        ("float64 w\n", "", "geometry_msgs/msg/Quaternion of this recording has no field 'w'"),
-        ("uint32 nanosec", "uint64 nanosec", "field 'nanosec' of builtin_interfaces/msg/Time has another type"),
-        (
-            "string child_frame_id\n",
-            "int32 child_frame_id\n",
-            "field 'child_frame_id' of nav_msgs/msg/Odometry has another",
-        ),
-        (
-            "string child_frame_id\n",
-            "= ] [ =\n",
-            "the recorded definition of nav_msgs/msg/Odometry is not",
-        ),
-    ],
-)
-def test_F11_a_schema_that_lacks_what_we_need_is_refused_by_field_and_nothing_is_touched(
-    tmp_path, messages, old, new, complaint
+WHOLE, CHILD = definition(ODOMETRY), "string child_frame_id\n"
+SCHEMAS = [
+    (WHOLE.replace(CHILD, ""), "nav_msgs/msg/Odometry of this recording has no field 'child_frame_id'"),
+    (WHOLE.replace("float64[36] covariance\n", "float64[36] spread\n"), "has no field 'covariance'"),
+    (WHOLE.replace("float64 w\n", ""), "geometry_msgs/msg/Quaternion of this recording has no field 'w'"),
+    (WHOLE.replace("uint32 nanosec", "uint64 nanosec"), "'nanosec' of builtin_interfaces/msg/Time has another type"),
+    (WHOLE.replace(CHILD, "int32 child_frame_id\n"), "field 'child_frame_id' of nav_msgs/msg/Odometry has another"),
+    (WHOLE.replace(CHILD, "= ] [ =\n"), "the recorded definition of nav_msgs/msg/Odometry is not"),
+    ("\n" * 2_000_000 + WHOLE, "the recorded .* is longer than 65536 bytes"),
+    ("geometry_msgs/Pose[1000000000] poses\n" + WHOLE, "the recorded .* has more than 10000 values"),
+    (WHOLE.replace(CHILD, f"{CHILD}nav_msgs/Odometry again\n"), "the recorded .* has more than 10000 values"),
+    (type_of_types(40, "left", "right"), "the recorded .* has more than 10000 values"),
+]
+
+
+@each("text, complaint", SCHEMAS)
+def test_F11_a_schema_that_lacks_what_we_need_or_never_ends_is_refused_and_nothing_is_touched(
+    tmp_path, messages, text, complaint
 ):
     with pytest.raises(BagError, match=f"topic /odom: .*{complaint}"):
-        replay_with(tmp_path, messages, text=edited(old, new))
+        replay_with(tmp_path, messages, text)
     assert not (tmp_path / "run").exists()
 
 
-def test_F11_a_schema_with_more_fields_is_decoded_by_itself(tmp_path, messages, reference):
-    text = definition(ODOMETRY).replace("string child_frame_id\n", "string child_frame_id\nint8[] extra\nint64 more\n")
+def test_F11_a_schema_with_more_fields_is_decoded_by_itself_and_one_without_text_by_ours(tmp_path, messages, reference):
+    text = WHOLE.replace(CHILD, f"{CHILD}int8[] extra\nint64 more\n")
     theirs = get_typestore(Stores.EMPTY)
     theirs.register({**typestore().fielddefs, **get_types_from_msg(text, ODOMETRY)})
     longer = []
     for m in messages:
         if m.topic == "/odom":
             ours = typestore().deserialize_cdr(m.cdr, ODOMETRY)
-            message = theirs.types[ODOMETRY](
-                header=ours.header,
-                child_frame_id=ours.child_frame_id,
-                extra=np.array([1, 2, 3], dtype=np.int8),
-                more=7,
-                pose=ours.pose,
-                twist=ours.twist,
-            )
-            m = type(m)(m.topic, m.log_ns, bytes(theirs.serialize_cdr(message, ODOMETRY)))
+            fields = {name: getattr(ours, name) for name in ("header", "child_frame_id", "pose", "twist")}
+            message = theirs.types[ODOMETRY](extra=np.array([1, 2, 3], dtype=np.int8), more=7, **fields)
+            m = replace(m, cdr=bytes(theirs.serialize_cdr(message, ODOMETRY)))
         longer.append(m)
-    done = replay_with(tmp_path, longer, text=lambda name: text if name == ODOMETRY else definition(name))
-    assert done.summary["counters"] == {}
+    assert replay_with(tmp_path, longer, text).summary["counters"] == {}
     assert (tmp_path / "run" / "graph.g2o").read_bytes() == reference["graph.g2o"]
-
-
-def type_of_types(count, *fields):
-    """Types that each have fields of the next one's type."""
-    texts = [f"MSG: my/A{k}\n" + "".join(f"my/A{k + 1} {field}\n" for field in fields) for k in range(count)]
-    return ("=" * 80 + "\n").join(["my/A0 first\n" + definition(ODOMETRY), *texts, f"MSG: my/A{count}\nint8 last\n"])
-
-
-ITSELF = definition(ODOMETRY).replace("string child_frame_id\n", "string child_frame_id\nnav_msgs/Odometry again\n")
-ENDLESS = {
-    "too long": ("\n" * 2_000_000 + definition(ODOMETRY), "is longer than 65536 bytes"),
-    "array of types": ("geometry_msgs/Pose[1000000000] poses\n" + definition(ODOMETRY), "has more than 10000 values"),
-    "of itself": (ITSELF, "has more than 10000 values"),
-    "two of two of two": (type_of_types(40, "left", "right"), "has more than 10000 values"),
-}
-
-
-@each("kind", ENDLESS)
-def test_F11_a_schema_that_would_take_for_ever_is_refused_at_once(tmp_path, messages, kind):
-    text, complaint = ENDLESS[kind]
-    with pytest.raises(BagError, match=f"topic /odom: the recorded .*{complaint}"):
-        replay_with(tmp_path, messages, text=lambda name: text if name == ODOMETRY else definition(name))
-
-
-def test_F12_another_encoding_is_refused_by_name(tmp_path, messages):
-    with pytest.raises(BagError, match="topic /odom: messages are encoded as 'json': record them in ROS"):
-        replay_with(tmp_path, messages, encoding="json")
+    shutil.rmtree(tmp_path / "run")
+    replay_with(tmp_path, messages, text=lambda name: "")
+    assert (tmp_path / "run" / "graph.g2o").read_bytes() == reference["graph.g2o"]
 
 
 def test_F12_big_endian_messages_are_read(messages):
@@ -361,13 +281,9 @@ def test_F3_a_damaged_head_of_a_chunk_costs_that_chunk_alone(tmp_path, messages,
     file.write_bytes(data)
     got, losses = read(file)
     assert got == [m for m in messages if m in got]
-    assert 0 < len(messages) - len(got) < 3 * len(messages) / len(chunks_before(messages, 20_000))
+    assert 0 < len(messages) - len(got) < 3 * len(messages) / (sum(len(m.cdr) for m in messages) // 20_000)
     assert losses or (offset == 0 and not summary), "a record of an unknown kind is passed over, as the format says"
     assert all("bytes" in loss or "messages could not be read" in loss for loss in losses)
-
-
-def chunks_before(messages, size):
-    return range(sum(len(m.cdr) for m in messages) // size)
 
 
 def test_F3_of_a_damaged_recording_without_checksums_one_is_warned(tmp_path, messages, capsys):
@@ -380,7 +296,8 @@ def test_F3_of_a_damaged_recording_without_checksums_one_is_warned(tmp_path, mes
         assert len(list(bag.messages(TOPICS))) == len(messages)
         assert bag.warnings == [], "rosbag2 writes none: of a file that reads well there is nothing to say"
         whole = file / "bag.mcap" if file.is_dir() else file
-        data = bytearray(whole.read_bytes())
+        intact = whole.read_bytes()
+        data = bytearray(intact)
         if file in (loose, summed):
             data[data.index(messages[40].cdr) - 31] = 0x70  # a kind of record that nobody knows is passed over
         else:
@@ -390,47 +307,16 @@ def test_F3_of_a_damaged_recording_without_checksums_one_is_warned(tmp_path, mes
         assert len(list(bag.messages(TOPICS))) < len(messages)
         assert bag.losses
         assert [("carries no checksums" in warning) for warning in bag.warnings] == [True] * has_none
+    data = bytearray(intact)
+    data[data.index(messages[40].cdr) + 60] ^= 1
+    summed.write_bytes(data)
+    got, losses = read(summed)
+    assert (len(got), losses) == (len(messages), ["c.mcap: damaged: its data do not agree with their checksum"])
     assert main(["info", str(bare)]) == 3
     assert "graph_slam: beware: bag.mcap: carries no checksums" in capsys.readouterr().err
 
 
-def test_F3_a_flipped_bit_outside_of_chunks_is_found_by_the_sum_over_all(tmp_path, messages):
-    file = write_mcap(tmp_path / "a.mcap", messages, use_chunking=False, enable_data_crcs=True)
-    data = bytearray(file.read_bytes())
-    data[data.index(messages[40].cdr) + 60] ^= 1
-    file.write_bytes(data)
-    got, losses = read(file)
-    assert len(got) == len(messages)
-    assert losses == ["a.mcap: damaged: its data do not agree with their checksum"]
-
-
 # -- codecs and sizes -----------------------------------------------------------------------------------------------
-
-
-@each("codec", ["BZ2", "LZ4", None])
-def test_F5_ros_1_chunks_of_every_codec_are_read(tmp_path, messages, codec):
-    from rosbags.rosbag1 import Writer
-
-    file = to_ros1(tmp_path / "a.bag", messages, codec and Writer.CompressionFormat[codec])
-    assert read(file) == (messages, [])
-
-
-def rewritten(file, changes):
-    """With fields of each mcap chunk changed."""
-    with file.open("rb") as stream:
-        parts = list(StreamReader(stream, emit_chunks=True).records)
-    out = RecordBuilder()
-    out.write(mcap_records.MAGIC)
-    for record in parts:
-        if isinstance(record, Chunk):
-            for name, value in changes(record).items():
-                setattr(record, name, value)
-        if not isinstance(record, Footer | SummaryOffset):
-            record.write(out)
-    Footer(summary_start=0, summary_offset_start=0, summary_crc=0).write(out)
-    out.write(mcap_records.MAGIC)
-    file.write_bytes(out.end())
-    return file
 
 
 def read_of(file):
@@ -441,43 +327,21 @@ def read_of(file):
         return [], [str(error)]
 
 
-@each("name", ["a.mcap.gz", "a.bag", "a.db3.zstd", "a.mcap.bz2", "a.lz4"])
-def test_F5_a_file_that_is_compressed_as_a_whole_is_refused_and_the_codec_named(tmp_path, recorded, name):
-    pack = {"gz": gzip.compress, "bag": gzip.compress, "zstd": zstandard.compress, "bz2": bz2.compress}
-    codec = {"gz": "gzip", "bag": "gzip", "zstd": "zstd", "bz2": "bzip2", "lz4": "lz4"}[name.split(".")[-1]]
-    packed = pack.get(name.split(".")[-1], lz4.frame.compress)(recorded.read_bytes())
-    (tmp_path / name).write_bytes(packed)
-    with pytest.raises(
-        BagError, match=rf"{name}: the whole file is compressed with {codec}: unpack it first: {codec} -dc <"
-    ):
+PACKED = [("a.mcap.gz", "gzip", gzip), ("a.bag", "gzip", gzip), ("a.db3.zstd", "zstd", zstandard)]
+PACKED += [("a.mcap.bz2", "bzip2", bz2), ("a.lz4", "lz4", lz4.frame)]
+
+
+@each("name, codec, library", PACKED)
+def test_F5_a_file_that_is_compressed_as_a_whole_is_refused_and_the_codec_named(
+    tmp_path, recorded, name, codec, library
+):
+    (tmp_path / name).write_bytes(library.compress(recorded.read_bytes()))
+    said = f"{name}: the whole file is compressed with {codec}: unpack it first: {codec} -dc <"
+    with pytest.raises(BagError, match=said):
         open_bag(tmp_path / name)
 
 
-def test_F5_messages_that_rosbag2_compressed_one_by_one_are_read(tmp_path, messages):
-    packed = [replace(m, cdr=zstandard.compress(m.cdr)) for m in messages]
-    assert read(to_sqlite(tmp_path / "bag", packed)) == (messages, [])
-
-
 ZEROS = bytes(64 * 2**20)  # 64 MiB of nothing
-
-
-def chunk_of(codec, plain, said):
-    pack = {"zstd": zstandard.compress, "lz4": lz4.frame.compress, "": bytes}
-    return {"compression": codec, "data": pack[codec](plain), "uncompressed_size": said, "uncompressed_crc": 0}
-
-
-BOMBS = {
-    "too large": (lambda: chunk_of("zstd", ZEROS, 2**29), "536870912 bytes; 268435456 is the limit"),
-    "2^60": (lambda: chunk_of("lz4", b"x", 2**60), "is the limit"),
-    "ratio": (lambda: chunk_of("zstd", ZEROS, len(ZEROS)), "1000 to 1 is the limit"),
-    "more than it says, zstd": (lambda: chunk_of("zstd", ZEROS, 1000), "says to be 1000 bytes and is more"),
-    "more than it says, lz4": (lambda: chunk_of("lz4", ZEROS, 1000), "says to be 1000 bytes and is more"),
-    "less than it says": (lambda: chunk_of("zstd", b"x" * 500, 1000), "says to be 1000 bytes and is 500"),
-    "a size of its own in zstd": (
-        lambda: chunk_of("", b"", 1000) | {"compression": "zstd", "data": huge_frame()},
-        "says to be 1000 bytes|zstd: ",
-    ),
-}
 
 
 def huge_frame():
@@ -485,21 +349,37 @@ def huge_frame():
     return b"\x28\xb5\x2f\xfd\xe0" + struct.pack("<Q", 2**60) + zstandard.compress(b"x" * 50)[6:]
 
 
-@each("bomb", BOMBS)
-def test_F6_a_bomb_in_an_mcap_chunk_is_passed_over_and_nothing_is_allocated_for_it(tmp_path, messages, bomb):
-    changes, complaint = BOMBS[bomb]
-    file = write_mcap(tmp_path / "a.mcap", messages, chunk_size=20_000)
-    second = list(range(len(chunks(file))))[1]
-    seen = iter(range(1000))
-    wanted = changes()
-    rewritten(file, lambda chunk: wanted if next(seen) == second else {})
+def test_F6_a_bomb_in_an_mcap_chunk_is_passed_over_and_nothing_is_allocated_for_it(tmp_path, messages):
+    zstd, lz4s = zstandard.compress, lz4.frame.compress
+    bombs = [  # in the second chunk, the third, ...: codec, data, the size it says, and what is said of it
+        ("zstd", zstd(ZEROS), 2**29, "536870912 bytes; 268435456 is the limit"),
+        ("lz4", lz4s(b"x"), 2**60, f"{2**60} bytes; 268435456 is the limit"),
+        ("zstd", zstd(ZEROS), len(ZEROS), "1000 to 1 is the limit"),
+        ("zstd", zstd(ZEROS), 1000, "says to be 1000 bytes and is more"),
+        ("lz4", lz4s(ZEROS), 1001, "says to be 1001 bytes and is more"),
+        ("zstd", zstd(b"x" * 500), 1002, "says to be 1002 bytes and is 500"),
+        ("zstd", huge_frame(), 1003, "says to be 1003 bytes|zstd: "),
+    ]
+    file = write_mcap(tmp_path / "a.mcap", messages, chunk_size=8_000)
+    with file.open("rb") as stream:
+        records = [
+            r for r in StreamReader(stream, emit_chunks=True).records if not isinstance(r, Footer | SummaryOffset)
+        ]
+    whole = [record for record in records if isinstance(record, Chunk)]
+    for chunk, (codec, data, size, _) in zip(whole[1:], bombs, strict=False):
+        chunk.compression, chunk.data, chunk.uncompressed_size, chunk.uncompressed_crc = codec, data, size, 0
+    out = RecordBuilder()
+    out.write(mcap_records.MAGIC)
+    for record in [*records, Footer(summary_start=0, summary_offset_start=0, summary_crc=0)]:
+        record.write(out)
+    out.write(mcap_records.MAGIC)
+    file.write_bytes(out.end())
     got, losses = confined(read, file, mib=64)
     assert 0 < len(got) < len(messages)
-    assert re.search(complaint, "; ".join(losses))
+    assert [said for *_, said in bombs if not re.search(said, "; ".join(losses))] == []
 
 
-@each("codec", ["bz2", "lz4"])
-@each("said", [1000, 2**31, len(ZEROS)])
+@each("codec, said", [("bz2", 1000), ("lz4", 2**31), ("lz4", len(ZEROS))])
 def test_F6_a_bomb_in_a_ros_1_chunk_is_passed_over_and_nothing_is_allocated_for_it(tmp_path, messages, codec, said):
     file = to_ros1(tmp_path / "a.bag", messages)
     pack = {"bz2": bz2.compress, "lz4": lz4.frame.compress}[codec]
@@ -527,18 +407,12 @@ def ros1_record(data, **fields):
     return struct.pack("<I", len(header)) + header + struct.pack("<I", len(data)) + data
 
 
-@each("length", [2**31, 2**40, 2**60, 2**64 - 1])
+@each("length", [2**31, 2**64 - 1])
 def test_F19_a_length_that_cannot_be_is_refused_before_anything_is_allocated(tmp_path, messages, length):
+    """Of a record, the data of a chunk, the first record, the summary."""
     whole = write_mcap(tmp_path / "a.mcap", messages, chunk_size=20_000)
     data = whole.read_bytes()
-    at = head_of_chunk(whole, 1)
-    places = {
-        "record": at + 1,
-        "data of the chunk": chunks(whole)[1][0] - 8,
-        "first record": 9,
-        "summary": len(data) - 28,
-    }
-    for place in places.values():
+    for place in (head_of_chunk(whole, 1) + 1, chunks(whole)[1][0] - 8, 9, len(data) - 28):
         whole.write_bytes(data[:place] + struct.pack("<Q", length) + data[place + 8 :])
         got, losses = confined(read_of, whole, mib=64)
         assert losses or got == messages
@@ -573,13 +447,12 @@ def test_F9_a_damaged_page_is_told_and_what_is_before_it_is_read(tmp_path, messa
     (file,) = folder.glob("*.db3")
     data = bytearray(file.read_bytes())
     size = struct.unpack_from(">H", data, 16)[0]
-    for page in range(1, len(data) // size):
+    for page in range(1, len(data) // size, 3):
         spoiled = data.copy()
         spoiled[page * size : page * size + 100] = b"\xff" * 100
         file.write_bytes(spoiled)
         got, losses = read_of(folder)
-        if len(got) < len(messages):
-            assert losses
+        assert losses or len(got) == len(messages)
         assert [(m.topic, m.log_ns) for m in got] == [(m.topic, m.log_ns) for m in messages[: len(got)]]
 
 
@@ -613,18 +486,14 @@ def test_F10_a_ros_1_bag_without_index_is_read_up_to_where_it_is_cut(tmp_path, m
 
 
 def test_F10_a_damaged_chunk_of_a_ros_1_bag_is_passed_over(tmp_path, messages):
-    from rosbags.rosbag1 import Writer
-
-    file = to_ros1(tmp_path / "a.bag", messages, Writer.CompressionFormat.BZ2, chunk_bytes=8_000)
+    file = to_ros1(tmp_path / "a.bag", messages, Ros1Writer.CompressionFormat.BZ2, chunk_bytes=8_000)
     data = bytearray(file.read_bytes())
     places = [found.end() for found in re.finditer(b"BZh9", data)]
-    assert len(places) > 4
     data[places[2] + 40] ^= 1
     file.write_bytes(data)
     got, losses = read(file)
     assert 0 < len(messages) - len(got) < 2 * len(messages) / len(places)
-    assert len(losses) == 1
-    assert "a damaged chunk" in losses[0]
+    assert len(losses) == 1 and "a damaged chunk" in losses[0]
 
 
 # -- order and size -------------------------------------------------------------------------------------------------
@@ -681,38 +550,14 @@ def with_few_descriptors(path):
     return read(path)
 
 
-def test_F15_of_a_file_that_is_still_being_written_what_is_whole_is_read(tmp_path, messages):
-    file = tmp_path / "growing.mcap"
-    with file.open("wb") as stream:
-        writer = Writer(stream, chunk_size=5_000)
-        writer.start(profile="ros2")
-        channels = {
-            topic: writer.register_channel(
-                topic, "cdr", writer.register_schema(name, "ros2msg", definition(name).encode())
-            )
-            for topic, name in TOPICS.items()
-        }
-        seen = 0
-        for k, m in enumerate(messages):
-            writer.add_message(channels[m.topic], m.log_ns, m.cdr, m.log_ns, k)
-            if k % 30 == 29:
-                stream.flush()
-                got, losses = read(file)
-                assert got == messages[: len(got)]
-                assert seen < len(got) <= k + 1
-                assert len(losses) == 1
-                seen = len(got)
-        writer.finish()
-    assert read(file) == (messages, [])
-
-
 # -- parameters -----------------------------------------------------------------------------------------------------
 
 
-def parameters(folder, text):
-    file = folder / "parameters.yaml"
+def refused(tmp_path, text, complaint):
+    file = tmp_path / "parameters.yaml"
     file.write_text(text)
-    return read_parameters(file)
+    with pytest.raises(ConfigError, match=rf"parameters\.yaml: {complaint}"):
+        read_parameters(file)
 
 
 @each(
@@ -728,35 +573,26 @@ def parameters(folder, text):
     ],
 )
 def test_F29_what_yaml_reads_in_its_own_way_is_refused_with_a_hint(tmp_path, text, hint):
-    with pytest.raises(ConfigError, match=re.escape(f"parameters.yaml: line 2: {hint}")):
-        parameters(tmp_path, f"tf:\n  stamp: {text}\n")
+    refused(tmp_path, f"tf:\n  stamp: {text}\n", f"line 2: {re.escape(hint)}")
     with pytest.raises(ConfigError, match=re.escape(f"tf.stamp: {hint}")):
         parse_setting(f"tf.stamp={text}")
-    assert parameters(tmp_path, f"tf:\n  stamp: '{text}'\n") == {"tf": {"stamp": text}}
+    texts = {"1e5": 1e5, "-2.5E-3": -0.0025, ".5": 0.5, "-7": -7, "0x1f": 31, "false": False, f"'{text}'": text}
+    (tmp_path / "good.yaml").write_text("".join(f"k{k}: {one}\n" for k, one in enumerate(texts)))
+    assert [(v, type(v)) for v in read_parameters(tmp_path / "good.yaml").values()] == [
+        (v, type(v)) for v in texts.values()
+    ]
 
 
-def test_F29_numbers_and_truth_values_are_read_as_everybody_does(tmp_path):
-    texts = {"1e5": 1e5, "-2.5E-3": -0.0025, ".5": 0.5, "0": 0, "-7": -7, "0x1f": 31, "True": True, "false": False}
-    values = parameters(tmp_path, "".join(f"k{k}: {text}\n" for k, text in enumerate(texts)))
-    assert [(value, type(value)) for value in values.values()] == [(value, type(value)) for value in texts.values()]
-
-
-def test_F30_a_key_given_twice_is_refused_with_its_line(tmp_path):
-    with pytest.raises(ConfigError, match=r"parameters\.yaml: line 3: 'stamp' is given twice"):
-        parameters(tmp_path, "tf:\n  stamp: now\n  stamp: now\n")
-
-
-DEEP, SHORT = "[" * 5000, "- " * 3000
 BILLION_LAUGHS = "a: &a [x, x]\n" + "".join(f"{b}: &{b} [*{a}, *{a}]\n" for a, b in itertools.pairwise("abcdefghij"))
-MERGED = "a: &a {x: 1}\nb: {<<: *a}\n"
 HOSTILE = {
+    "a key twice": ("tf:\n  stamp: now\n  stamp: now\n", "line 3: 'stamp' is given twice"),
     "python/object": ("tf: !!python/object/apply:os.system [id]", "line 1: the tag .*python/object.* is not read"),
     "tag that cannot be": ("tf: !!int ''", "line 1: the tag tag:yaml.org,2002:int is not read"),
     "alias bomb": (BILLION_LAUGHS, "line 2: aliases are not read"),
     "alias of itself": ("a: &a [*a]", "line 1: aliases are not read"),
-    "merge": (MERGED, "line 2: aliases are not read"),
-    "nested lists": (DEEP, "line 1: more than 50 levels"),
-    "nested blocks": (SHORT, "line 1: more than 50 levels"),
+    "merge": ("a: &a {x: 1}\nb: {<<: *a}\n", "line 2: aliases are not read"),
+    "nested lists": ("[" * 5000, "line 1: more than 50 levels"),
+    "nested blocks": ("- " * 3000, "line 1: more than 50 levels"),
     "nested maps": ("{a: " * 3000, "line 1: more than 50 levels"),
     "many values": ("a: [" + "1," * 500_000 + "]", "line 1: more than 50 levels, or than 20000 values"),
     "large": ("#" * 2**20 + "#", "larger than 1048576 bytes"),
@@ -764,14 +600,12 @@ HOSTILE = {
 
 
 @each("name", HOSTILE)
-def test_F31_hostile_yaml_is_refused_at_once(tmp_path, name):
-    text, complaint = HOSTILE[name]
-    with pytest.raises(ConfigError, match=rf"parameters\.yaml: {complaint}"):
-        parameters(tmp_path, text)
+def test_F30_F31_hostile_yaml_is_refused_at_once(tmp_path, name):
+    refused(tmp_path, *HOSTILE[name])
 
 
 def test_F31_what_is_no_file_of_parameters_is_refused_and_not_waited_for(tmp_path):
-    make_fifo(tmp_path / "fifo.yaml")
+    make(tmp_path / "fifo.yaml", None)
     for path, why in (
         (tmp_path / "fifo.yaml", "a FIFO, socket or device, not a regular file"),
         (tmp_path, "a folder, not a regular file"),

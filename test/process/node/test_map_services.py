@@ -1,11 +1,9 @@
-"""Requests of slam_toolbox for a map by name: what they ask for, and where its types are installed, that it is done."""
+"""Requests of slam_toolbox for a map by name: what they ask for,."""
 
 import math
 from types import SimpleNamespace
 
 import pytest
-from live_drive import Drive, distance
-from live_nodes import node, robot, until
 
 from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.node.map_services import MatchTypeError, loaded_from, saved_as
@@ -44,32 +42,3 @@ def test_a_request_that_cannot_be_is_refused_with_the_reason():
     ):
         with pytest.raises(error, match=why):
             Config().changed(loaded_from(asked, 2))
-
-
-def test_the_node_serves_requests_of_slam_toolbox(tmp_path):
-    types = pytest.importorskip("slam_toolbox.srv", reason="slam_toolbox is not installed: its services are not served")
-    with node(f"output.folder:={tmp_path / 'run'}", "inputs.reliable:=true") as n, robot(hears=("pose",)) as r:
-        r.wait_for_node()
-        drive = Drive()
-        drive.go(r, 60, every=3)
-        r.settle()
-        save, load = types.SerializePoseGraph, types.DeserializePoseGraph
-        assert r.call("serialize_map", save, save.Request(filename="site")).result == 0
-        assert r.call("serialize_map", save, save.Request(filename="site")).result == 255
-        asked = load.Request(filename="site", match_type=load.Request.LOCALIZE_AT_POSE)
-        x, y, yaw = drive.truth
-        asked.initial_pose.position.x, asked.initial_pose.position.y = x, y
-        asked.initial_pose.orientation.z, asked.initial_pose.orientation.w = math.sin(yaw / 2), math.cos(yaw / 2)
-        assert r.call("deserialize_map", load, asked).result == 0
-        assert r.get(["map.localize"]) == {"map.localize": True}
-        r.settle()
-        r.heard["pose"].clear()
-        drive.stamp_ns += 10**9
-        until(lambda: r.heard["pose"], drive.pace(r), "place in the map")
-        at = r.heard["pose"][0].pose.pose.position
-        assert distance((at.x, at.y), (x, y)) < 0.3
-        for filename, match_type, result in (("nobody", 3, 3), ("../site", 3, 1), ("site", 1, 2)):
-            asked.filename, asked.match_type = filename, match_type
-            assert r.call("deserialize_map", load, asked).result == result
-        assert n.stop()[0] == 0
-    assert "match_type: 1 gives no pose" in n.said

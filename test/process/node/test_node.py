@@ -53,23 +53,22 @@ def surveyed(file):
 
 
 def flight(bag, file):
-    whole = file.with_name("whole.mcap")
-    write_bag(simulate("flight", 3, laps=1), whole)
+    write_bag(simulate("flight", 3, laps=1), whole := file.with_name("whole.mcap"))
     opened = open_bag(whole)
     messages = list(opened.messages(opened.topics))
     with BagWriter(file) as writer:
-        for m in messages[: len(messages) // 3]:
+        for m in messages[: len(messages) // 5]:
             writer.write(m.topic, opened.topics[m.topic].type, m.log_ns, m.cdr)
 
 
 def joints(bag, file):
-    record_drive(file, seconds=5)
+    record_drive(file, seconds=3)
 
 
 def garbled(bag, file):
     """As a bad network and a bad driver would deliver them: late, out of order, twice, broken; landmarks at 28 Hz."""
     rng, messages = np.random.default_rng(2), list(open_bag(bag).messages({"/odom", "/landmarks"}))
-    messages = messages[: len(messages) // 3]
+    messages = messages[: len(messages) // 4]
     delay = np.where(rng.random(len(messages)) < 0.1, rng.uniform(0.0, 0.3e9, len(messages)), 0.0)
     with BagWriter(file) as writer:
         for k in sorted(range(len(messages)), key=lambda k: messages[k].log_ns + delay[k]):
@@ -155,10 +154,8 @@ def test_what_is_refused_at_the_start_ends_the_node_with_its_reason_and_code_2(t
     mine.write_text("mine")
     for word, complaint in (
         ("keyframes.min_distnce_m:=1.0", "unknown parameter 'keyframes.min_distnce_m'; did you mean"),
-        ("keyframes.min_distance_m:=-1.0", "keyframes.min_distance_m: -1.0 is not in [0.001, 1e+09]"),
         ("frames.map:=3", "frames.map: 3 is not a text"),
         (f"output.folder:={mine.parent}", f"{mine.parent}: not empty and not an earlier run; nothing was written"),
-        (f"landmarks.surveyed_file:={mine}", f"{mine}: line 1: column 'mine' is not known"),
         ("nonsense", "nonsense"),
     ):
         with node(word, cwd=tmp_path) as n:

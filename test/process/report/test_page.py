@@ -5,14 +5,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from condensed_run import condensed_run
 from faulty import faulty_run
 from pages import HOSTILE, chromium, drive, pages, violations
 
 from graph_slam_ros import cli
 from graph_slam_ros.analysis.explain import Numbers, explain_edge, statements, title
 from graph_slam_ros.analysis.what_if import SavedGraph
-from graph_slam_ros.graph.place import LABEL as PLACES
 from graph_slam_ros.runs.ledger_file import read_ledger
 from graph_slam_ros.runs.recorder import RunRecorder
 from graph_slam_ros.slam import Config
@@ -64,8 +62,7 @@ def test_a_page_says_why_as_explain_does(page, faulty):
     """By its address, by a row of the ledger, and by a click on the map."""
     false = next(e for e in read_ledger(faulty.run) if e.label == "closures" and not e.is_in)
     told = " ".join(" ".join(explain_edge(faulty.saved, str(false.edge))).split())
-    before = told[: told.index(" what if ")]
-    assert why(page).startswith(before)
+    assert why(page).startswith(told[: told.index(" what if ")])
     assert f"graph_slam explain run --with {false.edge}" in why(page)
     page.fill("#filter", f"{false.edge + 1}")
     before = ranges(page)
@@ -78,11 +75,6 @@ def test_a_page_says_why_as_explain_does(page, faulty):
     page.wait_for_function("() => byId('map')._fullLayout.xaxis.range[0] < 900")
     page.click("#whole")
     assert ranges(page) == pytest.approx(before)
-    edge = next(e for e in read_ledger(faulty.run) if e.label == "landmarks")
-    page.evaluate("which => go('edge', which)", edge.edge)  # as the map's click does
-    ends = ["", ""]
-    texts = dict(statements(edge, ends, Numbers.of(edge), (), faulty.saved.config))
-    page.wait_for_function("text => byId('why-body').innerText.includes(text)", arg=texts["measured"])
     page.evaluate("() => byId('map').emit('plotly_click', {points: [{data: {meta: 'keyframe'}, customdata: 5}]})")
     page.wait_for_function("() => document.getElementById('why-body').innerText.startsWith('keyframe 5:')")
     assert page.evaluate("location.hash") == "#keyframe=5"
@@ -143,7 +135,9 @@ def test_the_ledger_filters_sorts_and_is_walked_with_arrow_keys(page, faulty):
     page.wait_for_function("edge => location.hash === `#edge=${edge}`", arg=rows[1])
 
 
-def test_the_first_screen_has_verdict_and_path_and_axe_finds_nothing_wrong_with_it(page, faulty):
+def test_the_first_screen_has_verdict_and_path_axe_finds_nothing_wrong_and_charts_space_and_paper_are_drawn(
+    page, faulty
+):
     assert re.fullmatch(r"drive\.mcap, \d\d \w+ \d{4}, \d\d:\d\d UTC", page.inner_text("#title"))
     assert page.inner_text("#verdict strong") in ("Do not rely on this map yet", "Use this map with care")
     visible = "() => byId('map').data.filter((one) => one.name.startsWith('sightings')).map((one) => one.visible)"
@@ -152,30 +146,22 @@ def test_the_first_screen_has_verdict_and_path_and_axe_finds_nothing_wrong_with_
     page.set_viewport_size({"width": 390, "height": 844})
     page.wait_for_function("() => document.documentElement.scrollWidth <= 390")
     page.set_viewport_size({"width": 1400, "height": 900})
-
-
-def test_space_charts_and_print_draw_without_a_fault(page, faulty):
     page.click("#view")
     page.wait_for_function("() => byId('map').data.some(one => one.type === 'scatter3d')")
     page.evaluate("() => dispatchEvent(new Event('beforeprint'))")
     page.wait_for_function("() => [...document.querySelectorAll('#charts .plot')].every(one => one.data)")
     assert page.evaluate("() => byId('chi2-plots').children.length") > 1
-    assert page.evaluate("() => byId('chart-load').data[1].name") == "memory [MiB]"
-    assert "MiB, with Python and its libraries" in page.inner_text("#timing")
     assert "RMSE" in page.inner_text("#verdict")
+    assert page.evaluate("() => byId('chart-load').data[1].name") == "memory [MiB]"
     assert page.evaluate("() => getComputedStyle(document.body).backgroundColor") == "rgb(22, 25, 29)"
-
-
-def test_paper_is_light_and_as_wide_as_paper(page, faulty):
-    """The page is dark, and wider than paper."""
-    sizes = "() => [...document.querySelectorAll('.plot')].map((one) => [one.clientWidth, one._fullLayout.width])"
-    colour = "() => ['map', 'chart-verdicts'].map((id) => document.getElementById(id)._fullLayout.paper_bgcolor)"
+    page.click("#view")
     page.evaluate("() => dispatchEvent(new Event('beforeprint'))")
-    assert page.evaluate(colour) == ["#ffffff"] * 2
-    assert {drawn for _, drawn in page.evaluate(sizes)} == {680}
+    sizes = "() => [...document.querySelectorAll('.plot')].map((one) => one._fullLayout.width)"
+    colour = "() => ['map', 'chart-verdicts'].map((id) => document.getElementById(id)._fullLayout.paper_bgcolor)"
+    assert page.evaluate(colour) == ["#ffffff"] * 2, "paper is light, and the page dark"
+    assert set(page.evaluate(sizes)) == {680}
     page.evaluate("() => dispatchEvent(new Event('afterprint'))")
     page.wait_for_function(f"() => !({colour})().includes('#ffffff')")
-    page.wait_for_function(f"() => ({sizes})().every(([there, drawn]) => Math.abs(there - drawn) <= 2)")
 
 
 def test_hostile_names_are_shown_as_text(opened, tmp_path, capsys):
@@ -218,34 +204,3 @@ def test_a_run_in_space_a_merged_and_frozen_one_and_an_empty_one_open(opened, tm
     assert code == 3
     assert page.inner_text("#verdict").startswith("There is no map to show")
     assert not page.is_visible("#map")
-
-
-def test_a_map_with_condensed_visits_opens_at_a_place_an_edge_and_a_condensed_keyframe(opened, tmp_path, capsys):
-    run, slam, _ = condensed_run()
-    saved = SavedGraph(run, [])
-    code, html = reported(run, tmp_path / "run.html")
-    place = next(e for e in saved.entries if e.label == PLACES)
-    page = opened(html, f"#edge={place.edge}")
-    assert code == 0
-    assert why(page).startswith(f"edge {place.edge} edge {place.edge} a place: ")
-    assert all(f"{name} (" in why(page) for name in saved.landmarks_of(place))
-    assert page.evaluate("() => map.notes.length") == 0
-    newest = saved.entries[-1].edge
-    assert newest > len(saved.entries)
-    page.evaluate("k => go('edge', k)", newest)
-    page.wait_for_function("k => byId('why-body').innerText.startsWith(`edge ${k}`)", arg=newest)
-    told = " ".join(" ".join(explain_edge(saved, str(newest))).split())
-    assert told[: told.index(" what if ")] in why(page)
-    for k in range(1, 5):  # among them may be a base, which stays
-        page.evaluate("k => go('keyframe', k)", k)
-        page.wait_for_function("k => byId('why-body').innerText.startsWith(`keyframe ${k}`)", arg=k)
-        if "It was condensed" in why(page):
-            break
-    assert "It was condensed" in why(page)
-    gone = next(k for k in range(slam.graph.edge_ids.of(0), newest) if slam.graph.edge_ids.find(k) is None)
-    page.evaluate("k => go('edge', k)", gone)
-    page.wait_for_function("() => byId('why-body').innerText.startsWith('there is no edge')")
-    assert "visits are condensed" in why(page)
-    page.fill("#filter", "landmarks")
-    count = sum(e.label == "landmarks" for e in saved.entries)
-    assert page.inner_text("#count") == f"{count} of {len(saved.entries)} edges"

@@ -1,36 +1,68 @@
 """The journal: what was told outlives whatever ends the process, and a disk that fails loses nothing."""
 
 import errno
+import functools
 import itertools
 import json
 import os
 import random
-import resource
-import signal
+import shutil
 import struct
-import subprocess
-import sys
 import threading
 from dataclasses import dataclass
+from pathlib import Path
 
-import journal_torture
+import numpy as np
 import pytest
-from journal_torture import IS_LONG, KINDS, STATES, config_of, errors, recorded, row
 from mcap.opcode import Opcode
 from mcap.writer import CompressionType, Writer
-from reliability import times
+from reliability import tell, times
+from rows import each
 
-from graph_slam_ros.errors import FormatError
-from graph_slam_ros.measurements.types import to_record
+from graph_slam_ros.errors import FormatError, GraphSlamError
+from graph_slam_ros.formats.durable import NEW
+from graph_slam_ros.measurements.types import from_record, to_record
 from graph_slam_ros.node.session import Session
 from graph_slam_ros.recordings.mcap_records import MAGIC
-from graph_slam_ros.runs.folder import BEGUN, RunError
+from graph_slam_ros.runs.folder import BEGUN, RunError, check_room, earlier_runs, is_run, run_config
 from graph_slam_ros.runs.journal import RecordWriter, part_name, read_ingest
 from graph_slam_ros.runs.recorder import RunRecorder
 from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.slam import Config, Counters, GraphSlam, Odometry
+from graph_slam_ros.tools.simulation import measurements, simulate
 
-CUTS, FLIPS, KILLS = times((100, 60, 5), (None, 5_000, 3_000))  # None: at every byte
+RESULTS = ("graph.g2o", "graph_vertices.csv", "ledger.csv", "path.tum", "covariances.csv", "landmarks.csv", "run.json")
+STATES = ("empty folder", "earlier run there")
+STEPS, SAVE = 34, 20  # measurements, and after which of them is saved; once more at the end
+UPDATED, SAVED, WRONG = b"u", b"s", b"!"
+IS_LONG = times(False, True)
+EVERY, FAILS_EVERY = times((6, 23), (1, 1))
+"""Of the calls that reach the disk, at which it crashes, and which fail."""
+
+
+@functools.cache
+def recorded():
+    """What a simulated robot measures, in order."""
+    return tuple(measurements(simulate("warehouse", 5, aisles=2, laps=1, aisle_m=4.0)))
+
+
+def config_of(folder, keep_earlier=0):
+    return Config.from_mapping({"output.folder": str(folder), "output.keep_earlier": keep_earlier})
+
+
+def drive(folder, tell, keep_earlier=0):
+    """A short run with three saves, as the node makes it: what it acknowledges is told as it does."""
+    session = Session(config_of(folder, keep_earlier), Counters(), lambda *_: tell(UPDATED), lambda *_: None)
+    for k, measurement in enumerate(recorded()[:STEPS]):
+        session.ingest([measurement])
+        if k + 1 == SAVE:
+            session.save()
+            tell(SAVED)
+    session.finish()
+    tell(SAVED)
+
+
+CUTS, FLIPS = times((50, 60), (None, 5_000))  # None: at every byte
 
 
 # -- cut and flipped ---------------------------------------------------------------------------------------------------
@@ -51,48 +83,17 @@ class Part:
 
 @pytest.fixture(scope="module")
 def parts(tmp_path_factory):
-    """A journal of 200 KB as the live session writes it, flushed at each update, in eight files."""
-    folder, accepted, flushes, written = tmp_path_factory.mktemp("journal") / "run", [], [], []
-    config = Config.from_mapping({"keyframes.min_distance_m": 0.02, "keyframes.min_angle_rad": 0.02})
-    recorder = RunRecorder(folder, config, 1.0)
-
-    def size():
-        file = file_of(folder, len(written))
-        return file.stat().st_size if file.exists() else 0
-
-    def note():
-        if size() > flushes[-1][-1][0] and len(accepted) > flushes[-1][-1][1]:  # else it is the index
-            flushes[-1].append((size(), len(accepted)))
-
-    def sink(measurement):
-        accepted.append(as_read([measurement])[0])
-        recorder.sink(measurement)  # it flushes, too, where the disk is to take it
-        note()
-
-    slam = GraphSlam(config, sink)
-    flushes.append([(size(), 0)])
-    for k, measurement in enumerate(recorded()[:1000]):
-        if slam.process(measurement):
-            recorder.flush()
-            note()
-        if k % 125 == 124:
-            recorder._end_parts()
-            note()
-            written.append(list(accepted))
-            accepted.clear()
-            flushes.append([(0, 0)])
-    out = []
-    for number, records in enumerate(written):
+    """A journal of four files, in chunks of three records."""
+    folder, records, out = tmp_path_factory.mktemp("journal"), as_read(recorded()[:600]), []
+    for number in range(4):
+        some = records[150 * number : 150 * (number + 1)]
+        writer = RecordWriter(file_of(folder, number))
+        for k in range(0, len(some), 3):
+            writer.write(some[k : k + 3])
+        writer.close()
         data = file_of(folder, number).read_bytes()
-        ends = chunk_ends(data)
-        assert all(
-            a < end <= b for end, ((a, _), (b, _)) in zip(ends, itertools.pairwise(flushes[number]), strict=True)
-        )
-        out.append(
-            Part(data, records, [(end, count) for end, (_, count) in zip(ends, flushes[number][1:], strict=True)])
-        )
-    assert 150_000 < sum(len(part.data) for part in out) < 400_000
-    assert sum(len(part.flushed) for part in out) > 300
+        flushed = list(zip(chunk_ends(data), range(3, len(some) + 1, 3), strict=True))
+        out.append(Part(data, some, flushed))
     return out
 
 
@@ -136,7 +137,8 @@ def test_T9_F16_cut_anywhere_the_longest_prefix_of_whole_flushes_is_read(parts, 
             wrong.append((number, length, len(read), len(expected), losses))
         for file in tmp_path.iterdir():
             file.unlink()
-    assert not row("journal_cut", len(places), len(places), wrong)
+    tell("journal_cut", tried=len(places), failed=len(wrong))
+    assert not wrong
 
 
 def test_T9_F3_a_flipped_bit_gives_no_record_that_was_not_written_and_none_after_a_gap(parts, tmp_path):
@@ -158,18 +160,8 @@ def test_T9_F3_a_flipped_bit_gives_no_record_that_was_not_written_and_none_after
             wrong.append((number, place, bit, len(read), losses))
         untold += is_all and not losses
     assert untold < FLIPS / 2  # places that no record depends on: times, the index
-    assert not row("journal_flipped", FLIPS, FLIPS, wrong)
-
-
-def test_F19_a_length_of_2_to_the_60_in_a_journal_is_refused_before_memory_is_asked_for(parts, tmp_path):
-    for end, count in parts[0].flushed[:-1]:
-        data = bytearray(parts[0].data)
-        struct.pack_into("<Q", data, end + 1, 2**60)
-        losses = []
-        read = list(read_ingest(laid_out(tmp_path, [data]), losses))
-        assert read == parts[0].records[: len(read)]
-        assert len(read) >= count
-        assert losses
+    tell("journal_flipped", tried=FLIPS, failed=len(wrong))
+    assert not wrong
 
 
 def test_F18_a_kind_of_record_that_is_not_known_is_refused_by_its_name(tmp_path):
@@ -199,95 +191,7 @@ def test_F18_a_channel_that_is_not_of_json_is_refused_and_other_records_of_mcap_
         journal("cbor")
 
 
-# -- killed ------------------------------------------------------------------------------------------------------------
-
-
-def tortured(*words):
-    """By a process of its own, which forks: this one may have threads."""
-    done = subprocess.run([sys.executable, journal_torture.__file__, *map(str, words)], capture_output=True, text=True)
-    print(done.stdout, done.stderr)
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
-
-
-def test_T10_P1_P2_killed_at_any_moment_it_loses_nothing_that_was_told(memory):
-    said = tortured("kills", KILLS, memory)
-    assert f"RELIABILITY kill_9 tried={KILLS} faults={KILLS} failed=0" in said
-
-
-def test_T11_a_crash_at_any_call_that_reaches_the_disk_loses_nothing_that_was_told(memory):
-    said = tortured("crashes", len(STATES) if IS_LONG else 1, memory)
-    assert "RELIABILITY crash_at_nth_call" in said
-
-
-# -- a disk that fails -------------------------------------------------------------------------------------------------
-
-
-def test_T12_P4_a_disk_that_fails_at_any_call_is_told_of_and_loses_nothing(memory):
-    def one_of(k):
-        return [(KINDS[k % len(KINDS)], k // len(KINDS) % 2 == 0)]
-
-    def each(k):
-        return itertools.product(KINDS, (False, True))
-
-    tried, wrong, recovered = 0, [], 0
-    for state in STATES if IS_LONG else STATES[1:2]:
-        (memory / state).mkdir()
-        trials, some, went_on = errors(state, memory / state, each if IS_LONG else one_of)
-        tried, wrong, recovered = tried + trials, wrong + some, recovered + went_on
-    assert recovered > tried / 20  # recording was seen to fail, and to go on
-    assert not row("io_error_at_nth_call", tried, tried, wrong)
-
-
-def session_in(folder, told):
-    return Session(config_of(folder), Counters(), lambda *_: None, lambda *some: told.append(some))
-
-
-@pytest.mark.skipif(not hasattr(resource, "RLIMIT_FSIZE"), reason="no limit of file sizes")
-def test_P4_no_room_for_the_journal_is_told_and_all_is_written_when_there_is_room_again(tmp_path):
-    before, handler = resource.getrlimit(resource.RLIMIT_FSIZE), signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    told, fails = [], []
-    session = session_in(tmp_path / "run", told)
-    journal = tmp_path / "run" / "ingest.mcap"
-    try:
-        for k, measurement in enumerate(recorded()[:120]):
-            if k == 30:
-                full = journal.stat().st_size + 100
-                resource.setrlimit(resource.RLIMIT_FSIZE, (full, before[1]))
-            if k == 60:
-                assert journal.stat().st_size == full  # as much as there was room for
-                with pytest.raises(RunError, match=os.strerror(errno.EFBIG)):
-                    session.save()
-                there = {file.name for file in (tmp_path / "run").iterdir()}
-                assert there == {"run.json", "config.yaml", "ingest.mcap", "map.mcap", "run.mcap"}
-                assert (tmp_path / "run" / "run.json").read_bytes() == BEGUN  # no result was saved
-            if k == 90:
-                resource.setrlimit(resource.RLIMIT_FSIZE, before)
-            session.ingest([measurement])
-            fails.append(session.recording_fails)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-        signal.signal(signal.SIGXFSZ, handler)
-    assert [is_so for is_so, _ in itertools.groupby(fails)] == [False, True, False]
-    assert ("output.folder", os.strerror(errno.EFBIG)) in told
-    session.finish()
-    losses = []
-    records = list(read_ingest(tmp_path / "run", losses))
-    assert not losses
-    assert [r for r in records if r["type"] != "control"] == as_read(recorded()[:120])
-    again = replay(tmp_path / "run", tmp_path / "again")
-    assert again.slam.trajectory().tolist() == session.slam.trajectory().tolist()
-
-
-def in_time(work):
-    """Whether something ends in another thread."""
-    thread = threading.Thread(target=work, daemon=True)
-    thread.start()
-    thread.join(10.0)
-    return not thread.is_alive()
-
-
-@pytest.mark.parametrize("end", ["save", "leave", "close"])
+@each("end", ["save", "leave", "close"])
 def test_P3_a_run_ends_while_a_flush_in_the_background_waits_for_its_turn(tmp_path, end):
     """The end waits for the disk, which has to be asked while the flush waits for the end."""
     recorder, slam = RunRecorder(tmp_path / "run", Config(), 1e-9), GraphSlam(Config())
@@ -301,7 +205,10 @@ def test_P3_a_run_ends_while_a_flush_in_the_background_waits_for_its_turn(tmp_pa
                 end, recorder.close
             )()
 
-    assert in_time(ends)
+    thread = threading.Thread(target=ends, daemon=True)
+    thread.start()
+    thread.join(10.0)
+    assert not thread.is_alive()
     assert len(list(read_ingest(tmp_path / "run", []))) == 1
 
 
@@ -329,7 +236,7 @@ def test_P3_a_power_cut_finds_names_and_contents_on_the_disk_before_anything_han
     noted("fsync", of)
     noted("pwrite", of)
     noted("replace", lambda old, new: (str(old), new.name))
-    session = session_in(tmp_path / "run", [])
+    session = Session(config_of(tmp_path / "run"), Counters(), lambda *_: None, lambda *_: None)
     for measurement in recorded()[:60]:
         session.ingest([measurement])
     session.finish()
@@ -348,3 +255,301 @@ def test_P3_a_power_cut_finds_names_and_contents_on_the_disk_before_anything_han
         assert last["pwrite", f"{folder}/{name}"] < last["fsync", f"{folder}/{name}"] < renamed[len(begun)]
         first = calls.index(("pwrite", f"{folder}/{name}"))
         assert ("fsync", folder) in calls[:first][-2:]
+
+
+# -- what is left ------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Reference:
+    """The same run, undisturbed."""
+
+    records: list
+    acknowledged: list  # by update: how many records were accepted before it, and how many keyframes there were
+    saved: list  # by save: the bytes of each file of results
+    trajectory: np.ndarray
+
+    @classmethod
+    def of(cls, folder):
+        saves = (folder.with_name(f"{folder.name}_save_{k}") for k in itertools.count())
+        in_a_child(lambda tell: drive(folder, lambda what: what == SAVED and shutil.copytree(folder, next(saves))))
+        there = sorted(folder.parent.glob(f"{folder.name}_save_*"))
+        saved = [{name: (save / name).read_bytes() for name in RESULTS} for save in there]
+        records = list(read_ingest(folder, losses := []))
+        assert not losses
+        assert len({state["run.json"] for state in saved}) == 2
+        acknowledged, slam = replayed(records, config_of(folder))
+        return cls(records, acknowledged, saved, slam.trajectory())
+
+    def faults(self, folder, told, deep):
+        """What is wrong with a folder that such a run has left, having told so much; ``deep``: by a replay, too."""
+        updates, saves = told.count(UPDATED), told.count(SAVED)
+        check_room(folder, force=True)  # or nobody can start there again
+        if not updates:
+            return
+        assert is_run(folder), "it is no run"
+        run_config(folder)
+        records = list(read_ingest(folder, []))
+        assert records == self.records[: len(records)], "records that were not written"
+        least, keyframes = self.acknowledged[updates - 1]
+        assert len(records) >= least, f"{len(records)} records of {least} that were acknowledged"
+        if deep:
+            _, slam = replayed(records, run_config(folder))
+            assert len(slam.keyframes) >= keyframes, f"{len(slam.keyframes)} keyframes of {keyframes}"
+        for name in RESULTS:
+            there = (folder / name).read_bytes() if (folder / name).is_file() else None
+            before = ([BEGUN] if name == "run.json" else [None]) if not saves else []
+            known = [state[name] for state in self.saved[max(saves - 1, 0) :]] + before
+            if name == "run.json":  # when the journal is flushed, and CPU and memory, depend on the time
+                there, *known = map(without_marks, (there or b"{}", *known))
+            assert there in known, f"{name} is neither the old nor the new one"
+        for earlier in earlier_runs(folder).values():
+            list(read_ingest(earlier, []))
+
+
+def without_marks(summary):
+    """A run.json but for the marks of the recordings, and what the process has cost."""
+    told = json.loads(summary)
+    for name in ("recorded", "load"):
+        told.pop(name, None)
+    return told
+
+
+def replayed(records, config):
+    """(records and keyframes at each update, the pipeline)."""
+    accepted, acknowledged = [], []
+    slam = GraphSlam(config, accepted.append)
+    for record in records:
+        if slam.process(from_record(record)):
+            acknowledged.append((len(accepted), len(slam.keyframes)))
+    return acknowledged, slam
+
+
+def judged(judge, *arguments):
+    """What is wrong, in words; empty: nothing."""
+    try:
+        judge(*arguments)
+    except (AssertionError, GraphSlamError, OSError, ValueError) as error:
+        return f"{type(error).__name__}: {error}"
+    return ""
+
+
+def in_a_child(work):
+    """Do it in a forked process; returns how that ended, and what it told, which outlives it."""
+    reading, writing = os.pipe()
+    tell = functools.partial(os.write, writing)  # before anything is made to fail
+    if not (pid := os.fork()):
+        code = 1
+        try:
+            work(tell)
+            code = 0
+        except BaseException as error:
+            tell(WRONG + f"{type(error).__name__}: {error}".encode())
+        finally:
+            os._exit(code)
+    os.close(writing)
+    with open(reading, "rb") as pipe:
+        told = pipe.read()
+    status = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+    assert WRONG not in told, told.partition(WRONG)[2].decode()
+    return status, told
+
+
+# -- a disk that fails -------------------------------------------------------------------------------------------------
+
+CALLS = ("open", "write", "pwrite", "fsync", "replace", "ftruncate")
+ALSO_CRASHES = ("unlink", "rename", "mkdir")
+KINDS = (errno.ENOSPC, errno.EIO, errno.EROFS, errno.EDQUOT, errno.EACCES, "short")
+
+
+class Faulty:
+    """Counts the calls that reach the disk below a folder, and acts at one of them (0: none), and all from there on."""
+
+    def __init__(self, root, at, act, names=CALLS):
+        self._root, self._act, self._names = str(root), act, names
+        self._lock = threading.Lock()
+        self._real = []
+        self.at, self.count, self.fired = at, 0, 0
+
+    def __enter__(self):
+        for owner, name in [*((os, name) for name in self._names), (Path, "write_bytes")]:
+            real = getattr(owner, name)
+            self._real.append((owner, name, real))
+            setattr(owner, name, self._counted(name, real))
+        return self
+
+    def __exit__(self, *_):
+        for owner, name, real in self._real:
+            setattr(owner, name, real)
+
+    def _counted(self, name, real):
+        def call(*arguments, **options):
+            if not self.at or not (isinstance(arguments[0], int) or str(arguments[0]).startswith(self._root)):
+                return real(*arguments, **options)
+            with self._lock:
+                self.count += 1
+                since = self.count - self.at
+            if since < 0:
+                return real(*arguments, **options)
+            self.fired += 1
+            return self._act(since, name, real, arguments, options)
+
+        return call
+
+
+def crashing(since, name, real, arguments, options):
+    """In the middle of what is written, or before what cannot be half done."""
+    if name in ("pwrite", "write_bytes"):
+        first, data, *rest = arguments
+        real(first, data[: len(data) // 2], *rest)
+    os._exit(9)
+
+
+def failing(kind, lasts):
+    """Calls that fail, one or from there on; of a short write the first writes half, and then there is no room."""
+
+    def act(since, name, real, arguments, options):
+        if kind == "short" and since == 0:
+            if name == "pwrite":
+                fd, data, at = arguments
+                return real(fd, data[: max(1, len(data) // 2)], at)
+            return real(*arguments, **options)
+        if since > (kind == "short") and not lasts:
+            return real(*arguments, **options)
+        number = errno.ENOSPC if kind == "short" else kind
+        if name == "write_bytes":
+            path, data = arguments
+            real(path, data[: len(data) // 2])
+        raise OSError(number, os.strerror(number))
+
+    return act
+
+
+def crashes(state, root):
+    """A crash at one call that reaches the disk, a later one, ... until there are no more: (tried, wrong)."""
+    reference = Reference.of(root / "reference")
+    folder, wrong = root / "run", []
+    if state == "earlier run there":
+        in_a_child(lambda tell: drive(folder, tell))
+    for tried, n in enumerate(itertools.count(1, EVERY)):
+        if state == "empty folder":  # else there is what the one before has left
+            empty(folder)
+
+        def work(tell, n=n):
+            with Faulty(root, n, crashing, CALLS + ALSO_CRASHES):
+                drive(folder, tell)
+
+        code, told = in_a_child(work)
+        if fault := judged(reference.faults, folder, told, tried % 8 == 0):
+            wrong.append(f"{state}, call {n}: {fault}")
+        if code == 0:
+            return tried, wrong
+
+
+def empty(folder):
+    for file in folder.glob("*"):
+        file.unlink()
+
+
+def errors(state, root, kinds_of):
+    """One call after the other fails, or all from there on for a while: (tried, wrong, how often recording went on).
+
+    ``kinds_of`` has for each trial the kinds of faults, and whether they last.
+    """
+    reference = Reference.of(root / "reference")
+    folder, wrong, tried, recovered = root / "run", [], 0, 0
+    if state == "earlier run there":
+        drive(folder, lambda what: None)
+    for k, n in enumerate(itertools.count(1, FAILS_EVERY)):
+        fired = 0
+        for kind, lasts in kinds_of(k):
+            if state == "empty folder":
+                empty(folder)
+            trial = Trial(reference, folder)
+            if fault := judged(trial.go, n, failing(kind, lasts), kind):
+                wrong.append(f"{state}, call {n}, {kind}{', lasting' if lasts else ''}: {fault}")
+            tried, fired, recovered = tried + 1, fired + trial.fired, recovered + trial.has_recovered
+        if not fired:
+            return tried, wrong, recovered
+
+
+class Trial:
+    """One run on a disk that fails for a while: all that it is asked for is tried again when the disk is well."""
+
+    def __init__(self, reference, folder):
+        self._reference, self._folder, self._told = reference, folder, []
+        self.has_recovered, self.fired = False, 0
+
+    def go(self, n, act, kind):
+        files, fails = set(os.listdir("/proc/self/fd")), []
+        with Faulty(self._folder, n, act) as self._faulty:
+            make = functools.partial(
+                Session, config_of(self._folder), Counters(), lambda *_: None, lambda *told: self._told.append(told)
+            )
+            session = self._again(make)
+            for k, measurement in enumerate(recorded()[:STEPS]):
+                fails.append(session.recording_fails)
+                session.ingest([measurement])
+                if self._faulty.fired and k % 8 == 7:
+                    self._faulty.at = 0  # all is well
+                if k + 1 == SAVE:
+                    self._again(session.save)
+            self._again(session.finish)
+        fails.append(session.recording_fails)
+        self.fired, self.has_recovered = self._faulty.fired, any(fails) and not fails[-1]
+        assert not fails[-1], "it still says that recording fails"
+        assert self._told or kind == "short" or not self.fired, "nobody was told"
+        self._compare(session)
+        assert set(os.listdir("/proc/self/fd")) <= files, "files were left open"
+
+    def _again(self, call):
+        """When it fails, once more on a disk that is well."""
+        try:
+            return call()
+        except RunError as error:
+            self._told.append(error)
+            assert not list(self._folder.glob(f"*{NEW}")), "a new file was left there"
+            assert self._faulty.fired, error
+            self._faulty.at = 0
+            return call()
+
+    def _compare(self, session):
+        losses, reference = [], self._reference
+        records = list(read_ingest(self._folder, losses))
+        assert not losses, losses
+        assert measured(records) == measured(reference.records), "the journal is not complete"
+        _, again = replayed(records, run_config(self._folder))
+        assert np.array_equal(again.trajectory(), session.slam.trajectory()), "the journal gives another path"
+        assert np.allclose(session.slam.trajectory(), reference.trajectory, rtol=0.0, atol=1e-6), "another path"
+        assert not list(self._folder.glob(f"*{NEW}")), "a new file was left there"
+        assert json.loads((self._folder / "run.json").read_text())["keyframes"] == len(session.slam.keyframes)
+
+
+def measured(records):
+    """Without what each further save asks the pipeline for."""
+    return [record for record in records if record["type"] != "control"]
+
+
+def test_T11_P1_P2_a_crash_at_any_call_that_reaches_the_disk_loses_nothing_that_was_told(memory):
+    """In children of this process. A kill between two calls leaves what a crash at the second does."""
+    drive(memory / "warm", lambda what: None)  # what is slow the first time
+    for state in STATES if IS_LONG else STATES[:1]:
+        (memory / state).mkdir()
+        tried, wrong = crashes(state, memory / state)
+        tell("crash_at_nth_call", tried=tried, faults=tried, failed=len(wrong))
+        assert not wrong
+
+
+def test_T12_P4_a_disk_that_fails_at_any_call_is_told_of_and_loses_nothing(memory):
+    some, every = (
+        [(kind, lasts) for lasts in (True, False) for kind in KINDS],
+        [*itertools.product(KINDS, (False, True))],
+    )
+    recovered = 0
+    for state in STATES if IS_LONG else STATES[1:]:
+        (memory / state).mkdir()
+        tried, wrong, went_on = errors(state, memory / state, lambda k: every if IS_LONG else [some[k % len(some)]])
+        tell("io_error_at_nth_call", tried=tried, faults=tried, failed=len(wrong))
+        assert not wrong
+        recovered += went_on
+    assert recovered > tried / 20  # recording was seen to fail, and to go on

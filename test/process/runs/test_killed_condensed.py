@@ -74,13 +74,11 @@ def test_a_run_killed_before_the_rename_gives_the_same_bytes(runs, tmp_path):
         assert (tmp_path / "before" / name).read_bytes() == (runs["after recovered"] / name).read_bytes(), name
 
 
-@pytest.mark.parametrize("part", [0.001, 0.9])
-def test_a_new_map_that_is_torn_does_not_cost_the_old_one(runs, tmp_path, part):
+def test_a_new_map_that_is_torn_does_not_cost_the_old_one(runs, tmp_path):
     """What came since the old map is driven again from the journal, and is not condensed then."""
     torn = tmp_path / "torn"
     shutil.copytree(runs["before"], torn)
-    new = torn / "map_1.mcap"
-    os.truncate(new, int(part * new.stat().st_size))
+    os.truncate(torn / "map_1.mcap", int(0.9 * (torn / "map_1.mcap").stat().st_size))
     recover(torn, tmp_path / "again")
     again, after = (read_tum(folder / "path.tum") for folder in (tmp_path / "again", runs["after recovered"]))
     assert again.stamps_s.tolist() == after.stamps_s.tolist()

