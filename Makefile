@@ -2,7 +2,7 @@
 #
 # install       .venv with everything of requirements.txt, real ROS 2 included where there is none (default)
 # demo          install, then the demonstration
-# check         style, types and the unit tests, in two minutes: after each change; no process, no ROS
+# check         style, types and the unit tests, in a minute: after each change; no process, no ROS
 # test          install, then style, types and all tests; some of them: TESTS='-m "not process"', -m integration, a file
 # soak          the tests that take too long for every run: up to three hours, resumed where it was; ONLY=name,name
 # colcon        build and test as ROS does, in a scratch folder; colcon goes into .venv-colcon; TESTS=, too

@@ -27,7 +27,6 @@ from graph_slam_ros.graph import (
     SE2,
     SE3,
     TAG_POSITION,
-    EdgeType,
     Gaussian,
     Graph,
 )
@@ -398,27 +397,3 @@ def test_what_was_asked_of_covariances_changes_no_byte_that_comes_later():
             append(solver, k, *([k - 20] if k % 7 == 0 else []))
             solver.update()
     assert asked.values.tobytes() == silent.values.tobytes()
-
-
-def _square(x, at, measured):
-    """``r = x^2 - z``: no measurement of minus one can be met, and at zero it tells nothing."""
-    here = x[at[:, 0]]
-    return here[:, None] ** 2 - measured, 2.0 * here[:, None, None]
-
-
-SQUARE = EdgeType("square", ((R1,),), 1, 1, _square)
-
-
-def test_an_update_that_turns_singular_on_its_way_names_the_vertex_and_is_recovered_from():
-    graph = Graph()
-    graph.add_vertex(R1, [1.0])
-    graph.add_edge(SQUARE, [0], [-1.0], Gaussian.from_sigmas(1.0), "all")  # Gauss-Newton goes to zero at once
-    solver = Solver(graph, Settings(**EXACT))
-    solver.add([0], [0])
-    for _ in range(3):
-        with pytest.raises(SingularError, match="vertex 0"):
-            solver.update()
-        assert np.isfinite(solver.estimate([0])).all()
-    solver.add([], [graph.add_edge(POINT_PRIOR[R1], [0], [2.0], Gaussian.from_sigmas(0.1), "all")])
-    solver.update()
-    assert off_by(solver) < 1e-6
