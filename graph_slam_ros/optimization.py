@@ -15,7 +15,7 @@ from graph_slam_ros.graph import Graph
 from graph_slam_ros.progress import report
 from graph_slam_ros.solver import Report, Settings, Solver, initial_values
 from graph_slam_ros.solver.incremental_initialization import OnPose
-from graph_slam_ros.typing import Array
+from graph_slam_ros.typing import Array, Index
 
 _FAR_ABOVE = 2.0  # times its degrees of freedom: chi2 of an optimum is about as large as these, or smaller
 _UNLIKELY = 1e-3  # that one edge of a graph has so large a residual by chance
@@ -23,6 +23,7 @@ _UNEVEN, _SEVERAL = 10.0, 10  # mean over median of what so many closures or mor
 _NO_RESIDUAL = 1e-6  # chi2 for each number measured: less is rounding
 _MOST_TIMES, _MOST_S, _QUIET_S = 5.0, 10.0, 2.0  # of the first solution, and seconds, that others may take together
 _NUMBERS = re.compile(r"(?<=vertex )\d+|(?<=FIX )[\d ]*\d")  # of vertices in errors: to be the file's
+_SAMPLED = 100  # edges
 _SAME = 1e-6  # part of the cost by which one optimum differs from start to start
 
 
@@ -191,12 +192,19 @@ def _judged(solution: Solution, settings: Settings) -> Solution:
     elif 2 * gone > has_loss.sum():
         doubt = f"the loss lets go of {gone} of {has_loss.sum()} edges"
     elif freedom > 0 and kept > max(_FAR_ABOVE * freedom, chdtri(freedom, _UNLIKELY)):
-        doubt = f"chi2 {kept:.6g} is far above its {freedom} degrees of freedom"
+        doubt = f"chi2 {kept:.6g} is far above its {freedom} degrees of freedom{_hint(solution.file, edges)}"
     elif len(far):
         worst = far[np.argmax(chi2[far] / numbers[far])]
         what = f"{len(far)} residuals are far outside" if len(far) > 1 else "a residual is far outside"
         doubt = f"{what} of their noise, e.g. {edge_text(solution.file, int(edges[worst]))} with chi2 {chi2[worst]:.4g}"
     return replace(solution, doubt=doubt, let_go=gone)
+
+
+def _hint(file: G2oFile, edges: Index) -> str:
+    """Return that quaternions seem to have w first: then most edges would turn by half a turn about x."""
+    some = [file.graph.edge(int(edge)).measured for edge in edges[:_SAMPLED]]
+    turned = [one for one in some if len(one) == 7 and abs(one[3]) > abs(one[6])]
+    return ": does w come first in its quaternions? g2o has qx qy qz qw" if 2 * len(turned) > len(some) else ""
 
 
 def edge_text(file: G2oFile, edge: int) -> str:
@@ -228,11 +236,9 @@ def add_graph(solver: Solver, file: G2oFile) -> None:
 
 def _root(file: G2oFile) -> int | None:
     """The first pose of a FIX line, or that of the least id; where there are no poses, a landmark."""
-    if not file.graph.vertex_count:
-        return None
-    of_no_pose = [not _is_pose(file.graph, v) for v in range(file.graph.vertex_count)]
-    fixed = [v for v in file.fixed if not of_no_pose[v]]
-    return fixed[0] if fixed else min(range(file.graph.vertex_count), key=lambda v: (of_no_pose[v], file.ids[v]))
+    held = [v for v in file.fixed if _is_pose(file.graph, v)]
+    order = sorted(range(file.graph.vertex_count), key=lambda v: (not _is_pose(file.graph, v), file.ids[v]))
+    return next(iter([*held, *order]), None)
 
 
 def _is_pose(graph: Graph, vertex: int) -> bool:

@@ -3,7 +3,6 @@
 A plugin is imported when its name is first used. A built-in name is never looked up.
 """
 
-import os
 import sys
 from collections.abc import Callable
 from functools import lru_cache
@@ -22,20 +21,12 @@ def names(group: str) -> dict[str, str]:
 
 
 def _installed(group: str) -> EntryPoints:
-    """The entry points of a group; the files of all packages are read again if a folder of ``sys.path`` has changed."""
-    return _read(group, tuple((folder, _changed_ns(folder)) for folder in sys.path))
+    return _read(group, tuple(sys.path))
 
 
-@lru_cache(2)
-def _read(group: str, folders: tuple[tuple[str, int], ...]) -> EntryPoints:
+@lru_cache(4)
+def _read(group: str, path: tuple[str, ...]) -> EntryPoints:
     return entry_points(group=group)
-
-
-def _changed_ns(folder: str) -> int:
-    try:
-        return os.stat(folder or ".").st_mtime_ns
-    except OSError:  # not there, or no folder
-        return 0
 
 
 def load(group: str, name: str, check: Callable[[Any], str]) -> tuple[Any, str] | None:

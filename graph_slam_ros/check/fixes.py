@@ -13,7 +13,7 @@ from graph_slam_ros.typing import Array, Index
 
 _LEAST, _STEP_M, _SIGMAS, _SCALE = 8, 2.0, 6.0, 1.5
 _TURNED_RAD, _HALF, _OFF_RAD, _NEARLY_RAD = 0.2, 0.5, 0.17, 0.1
-_SAME_M, _FROZEN_M, _JUMP_M, _SOON_S = 1e-6, 3.0, 3.0, 2.0
+_SAME_M, _FROZEN_M, _JUMP_M, _SOON_S, _OFF = 1e-6, 3.0, 3.0, 2.0, 0.1
 
 
 def check_fixes(c: Columns) -> Iterator[Finding]:
@@ -27,10 +27,11 @@ def check_fixes(c: Columns) -> Iterator[Finding]:
             continue
         stamp_ns, points, headings = f.stamp_ns[order], f.points[order], f.headings[order]
         poses = poses_at(stamp_ns, path_ns, path)
-        own, yaws = poses[:, 0] + 1j * poses[:, 1], np.stack(so3.log(tuple(poses[:, 3:].T)), axis=1)[:, 2]
+        total = c.config.odometry.distance_factor
+        own, yaws = total * (poses[:, 0] + 1j * poses[:, 1]), np.stack(so3.log(tuple(poses[:, 3:].T)), axis=1)[:, 2]
         where: Where = {"topic": f.topic, "first_ns": int(stamp_ns[0]), "count": len(order)}
         if np.isfinite(points).all():
-            found = list(_positions(f, stamp_ns, points, own, where))
+            found = list(_positions(f, stamp_ns, points, own, total, where))
             yield from found
             ends = _apart(own, max(_STEP_M, _SIGMAS * f.sigma_m))
             if len(ends) > _LEAST and not any(one.severity == "error" for one in found):
@@ -58,22 +59,27 @@ def _mirrored(turns: Array, own: Array) -> tuple[float, float]:
     return now, mirrored
 
 
-def _positions(f: FixColumns, stamp_ns: Index, points: Array, own: Array, where: Where) -> Iterator[Finding]:
+def _positions(
+    f: FixColumns, stamp_ns: Index, points: Array, own: Array, total: float, where: Where
+) -> Iterator[Finding]:
     ends = _apart(own, max(_STEP_M, _SIGMAS * f.sigma_m))
     if len(ends) > _LEAST:
         moved, driven = np.diff(points[ends]), np.diff(own[ends])
         now, mirrored = _mirrored(np.angle(moved[1:] / moved[:-1]), np.angle(driven[1:] / driven[:-1]))
         if mirrored < _HALF * now and now > _TURNED_RAD:
-            text = (
-                f"{f.topic}: fixes turn to the right where odometry turns to the left: axes are exchanged or mirrored"
-            )
+            text = f"{f.topic}: fixes turn right where odometry turns left: axes are exchanged or mirrored"
             yield Finding("fix_mirrored", "error", now, mirrored, "rad", text, **where)
             return
         factor = float(np.median(np.abs(moved)) / np.median(np.abs(driven)))
+        spread = float(np.median(np.abs(np.abs(moved) / np.abs(driven) - factor)) / len(moved) ** 0.5)
         if not 1.0 / _SCALE < factor < _SCALE:
             text = f"{f.topic}: fixes move {factor:.2g} m for each metre of odometry: are both metres?"
             yield Finding("unrelated", "error", factor, _SCALE, "times", text, **where)
             return
+        if abs(factor - 1.0) > max(_OFF, _SIGMAS * spread):
+            text = f"{f.topic}: fixes move {factor:.3g} m for each metre of odometry"
+            settings = (f"odometry.distance_factor={total * factor:.4g}",)
+            yield Finding("odometry_scale", "warning", factor, 1.0 + _OFF, "times", text, settings=settings, **where)
     step_m, way_m = np.abs(np.diff(points)), np.abs(np.diff(own))
     begins = np.flatnonzero(np.concatenate([[True], step_m > _SAME_M]))
     for k, end in zip(begins, [*(begins[1:] - 1), len(points) - 1], strict=True):

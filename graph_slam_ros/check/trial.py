@@ -27,10 +27,7 @@ from graph_slam_ros.typing import Array, Index
 
 _THIN_NS = 80_000_000
 _APART_S = 1.0
-_COARSE = {
-    **{"solve.every_keyframes": 20, "odometry.doubt": False},
-    "map.condense": False,  # the fit is of all keyframes
-}
+_COARSE = {"solve.every_keyframes": 20, "odometry.doubt": False, "map.condense": False}  # a fit needs all keyframes
 _SIGMAS = 4.0
 _TURN_SIGMAS = 6.0  # a wheel's noise that lasts adds up in heading, which neither sigma of a fit knows
 _OF_STEP = 0.25  # of the time between two poses of odometry
@@ -47,11 +44,7 @@ _LIMITS = {
     "range_offset": ("m", 0.1, np.inf),
 }
 _OVER_CONFIDENT, _ODOMETRY_OVER_CONFIDENT, _LEAST_DOF = 2.0, 6.0**0.5, 100.0
-_OF_A_BREAK = (
-    "ids_unsure",
-    "map_breaks",
-    "landmark_moved",
-)  # what a robot that was carried makes of identities that are right
+_OF_A_BREAK = ("ids_unsure", "map_breaks", "landmark_moved")  # a robot that was carried has them with right ids
 _MOST, _SHIFTS = 0.9, 2.0
 
 

@@ -22,9 +22,8 @@ POSES = [(2 * sin(2 * pi * k / COUNT), -2 * cos(2 * pi * k / COUNT), 2 * pi * k 
 
 def numbers(pose, dim):
     x, y, turn = pose
-    return (
-        f"{x:.9f} {y:.9f} {turn:.9f}" if dim == 2 else f"{x:.9f} {y:.9f} 0 0 0 {sin(turn / 2):.9f} {cos(turn / 2):.9f}"
-    )
+    turned = f"{turn:.9f}" if dim == 2 else f"0 0 0 {sin(turn / 2):.9f} {cos(turn / 2):.9f}"
+    return f"{x:.9f} {y:.9f} {turned}"
 
 
 def edge(i, j, dim=2, tag="", more="", info=None, ids=int):
@@ -66,6 +65,7 @@ FALSE = PLAIN + "".join(f"EDGE_SE2 {k} {k + 5} 3 {k} 1 {INFO[2]}\n" for k in (1,
 TIGHT = re.sub(r"(\d\.\d)\d+", r"\1", PLAIN).replace("100 0 0 100 0 400", "1e7 0 0 1e7 0 4e7")
 PRINTED = (PLAIN + edge(2, 9)).replace(INFO[2], "4 4.0004 0 4 0 9", 3)
 PARTS = PLAIN + "".join(f"VERTEX_SE2 {70 + k} 0 0 0\n" for k in range(2)) + "EDGE_SE2 70 71 1 0 0 1 0 0 1 0 1\n"
+W_FIRST = re.sub(r"( 0 0)( \S+)( \S+)( 100.*)", r"\3\1\2\4", drive(3)) + edge(0, HALF, 3)
 READ = {  # content, exit code, what is said, edges of each class
     "switches in space": (switched(3, "EDGE_SE3_SWITCHABLE"), 0, "8 EDGE_SE3_SWITCHABLE are read", BOTH),
     "switches in the plane": (switched(2, "EDGE_SE2_SWITCHABLE"), 0, "8 VERTEX_SWITCH, 8 EDGE_SW", BOTH),
@@ -86,6 +86,8 @@ READ = {  # content, exit code, what is said, edges of each class
     "print": (PRINTED, 0, "3 of 24 information matrices are not positive definite as printed", BOTH | {"closures": 9}),
     "nonsense": (PLAIN.replace(INFO[2], "4 0 0 4 0 -9", 1), 2, "information is not positive definite", None),
     "false closures": (FALSE, 3, "wrong edges, which --loss cauchy lets go of", BOTH | {"closures": 11}),
+    "w first": (W_FIRST, 3, "does w come first in its quaternions?", BOTH | {"closures": 1}),
+    "covariances": (TIGHT.replace("e7", "e-4"), 0, "is a covariance given as information?", BOTH),
     "Boost": ("22 serialization::archive 18 0 0 0 Described 0 1.5", 2, "a Boost archive, as slam_toolbox's", None),
     "a database": (b"SQLite format 3\0\xff\xfe", 2, "a database. RTAB-Map's exports its graph", None),
 }

@@ -409,6 +409,7 @@ FIXES = {
     "right": (lambda t, x, y: (x, y), lambda yaw: yaw, None),
     "north, east": (lambda t, x, y: (y, x), lambda yaw: yaw, "fix_mirrored"),
     "frozen": (lambda t, x, y: (x, y) if not 12 < t < 20 else (1.0, 1.0), lambda yaw: yaw, "fix_frozen"),
+    "short": (lambda t, x, y: (0.7 * x, 0.7 * y), lambda yaw: yaw, "odometry_scale"),
     "jumps": (lambda t, x, y: (x + 9.0 * (12 < t < 16), y), lambda yaw: yaw, "fix_jumps"),
     "zero at north": (lambda t, x, y: (x, y), lambda yaw: yaw - math.pi / 2, "heading_offset"),
     "clockwise": (lambda t, x, y: (x, y), lambda yaw: math.pi / 2 - yaw, "heading_clockwise"),
