@@ -1,7 +1,4 @@
-"""For tests of the running node: it in processes of its own, and a robot that talks to it, on this machine's loopback.
-
-Limits of time are those of an idle machine; where it is busy they are as much longer (``lenient``).
-"""
+"""The running node for tests, in processes of its own, and a robot that talks to it, on this machine's loopback."""
 
 import contextlib
 import functools
@@ -19,7 +16,6 @@ pytest.importorskip("rclpy")
 pytest.importorskip("vision_msgs")
 pytest.importorskip("tf2_msgs")
 
-from busy import lenient
 from forked_nodes import Server
 from lifecycle_msgs.srv import ChangeState, GetState
 from nav_msgs.msg import Odometry
@@ -29,6 +25,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from reliability import lenient
 from std_srvs.srv import Trigger
 from vision_msgs.msg import Detection3DArray
 
@@ -356,9 +353,8 @@ class Started:
 def node(*parameters, **options):
     """A node; what still runs at the end is killed. A test that wants it killed leaves it running, and kills none.
 
-    For each robot has to be closed before. Fast DDS 2.14 makes a port in shared memory anew up to three seconds after
-    a process that had it was killed, in a thread of its own; a participant that is closed meanwhile may read memory
-    that is gone, and end the whole process.
+    For each robot has to be closed before: Fast DDS 2.14 makes the shared memory of a killed process anew, and a
+    participant that is closed meanwhile may read memory that is gone.
     """
     started = Started(*parameters, **options)
     try:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from busy import lenient
+from reliability import lenient
 
 from graph_slam_ros.runs.recorder import RunRecorder
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings

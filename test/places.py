@@ -1,4 +1,4 @@
-"""Where things are: the repository, its tests, and public recordings outside it (GRAPH_SLAM_DATASETS)."""
+"""Where things are: the repository, its tests and commands, and public recordings outside it (GRAPH_SLAM_DATASETS)."""
 
 import gzip
 import os
@@ -37,6 +37,13 @@ def _beginning(robot, folder, seconds):
         kept = [line for line in lines if float(line.split()[0]) < end_s]
         (folder / f"Robot{robot}_{name}.dat").write_text("".join(kept))
     return folder
+
+
+def executable(name):
+    """Return an installed command: pip puts it beside Python, colcon where ``ros2 run`` looks for it."""
+    prefixes = filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep))
+    folders = [Path(sys.executable).parent, *(Path(prefix, "lib", "graph_slam_ros") for prefix in prefixes)]
+    return next((file for folder in folders if (file := folder / name).exists()), folders[0] / name)
 
 
 def test_path(name):

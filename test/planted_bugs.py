@@ -1,8 +1,6 @@
 """Ten ways in which such systems are known to fail, put into a copy of this one, one at a time: tests must see each.
 
-``python test/planted_bugs.py [NAME ...]`` copies the sources to a temporary folder, where the tests must pass as they
-are and fail with each bug. Its exit code is 0 where all were caught. A bug is planted by a symbol's name, so that other
-changes of the source leave it.
+``python test/planted_bugs.py [NAME ...]``: in the copy the tests pass as they are and fail with each bug.
 """
 
 import ast

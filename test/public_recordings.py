@@ -1,20 +1,17 @@
-"""Public recordings written as bags, as their owners would record them: what is at hand of GRAPH_SLAM_DATASETS.
-
-``python test/public_recordings.py FOLDER`` writes them. Of the truth nothing is in the bags, but for MR.CLAM's.
-"""
+"""Public recordings of GRAPH_SLAM_DATASETS written as bags, as their owners would record them, without the truth."""
 
 import gzip
 import shutil
 import sys
 from operator import itemgetter
-from pathlib import Path
 
+import messages
 import numpy as np
 from places import DATASETS, HAS_MRCLAM, ROOT, mrclam
 
 from graph_slam_ros.lie import se2
-from graph_slam_ros.messages.to_msg import encode, header, make, transform
 from graph_slam_ros.messages.to_msg import odometry as odometry_of
+from graph_slam_ros.messages.to_msg import transform
 from graph_slam_ros.recordings.bag import BagWriter
 
 RECORDED = DATASETS / "recorded"
@@ -28,24 +25,9 @@ def ns(stamp_s):
 
 def cloud(stamp_ns, frame, **columns):
     """A PointCloud2 of doubles."""
-    points = np.column_stack(list(columns.values())).astype("<f8")
-    fields = [
-        make("sensor_msgs/msg/PointField", name=name, offset=8 * k, datatype=8, count=1)
-        for k, name in enumerate(columns)
-    ]
-    message = make(
-        "sensor_msgs/msg/PointCloud2",
-        header=header(stamp_ns, frame),
-        height=1,
-        width=len(points),
-        fields=fields,
-        is_bigendian=False,
-        point_step=8 * len(fields),
-        row_step=points.nbytes,
-        data=points.ravel().view(np.uint8),
-        is_dense=True,
-    )
-    return "sensor_msgs/msg/PointCloud2", encode(message)
+    rows = zip(*(np.asarray(column, float).tolist() for column in columns.values()), strict=True)
+    layout = [(name, "f8") for name in columns]
+    return messages.CLOUD, messages.cloud(layout, *rows, padding=0, frame=frame, stamp_ns=stamp_ns)
 
 
 def odometry(stamp_s, pose):
@@ -54,13 +36,13 @@ def odometry(stamp_s, pose):
     return "/odom", "nav_msgs/msg/Odometry", ns(stamp_s), message
 
 
-def write(file, messages, *static):
+def write(file, rows, *static):
     """A recording of (topic, type, stamp, bytes), in that order; none is recorded earlier than the one before."""
     now_ns = 0
     with BagWriter(file) as bag:
         for child, at in static:
-            bag.write("/tf_static", "tf2_msgs/msg/TFMessage", messages[0][2], transform(0, "base_link", child, at))
-        for topic, type_name, stamp_ns, message in messages:
+            bag.write("/tf_static", "tf2_msgs/msg/TFMessage", rows[0][2], transform(0, "base_link", child, at))
+        for topic, type_name, stamp_ns, message in rows:
             now_ns = max(now_ns, stamp_ns)
             bag.write(topic, type_name, now_ns, message)
     return file
@@ -109,9 +91,3 @@ def recordings(folder):
             yield folder / bag.stem
     for robot in range(1, 6) if HAS_MRCLAM else ():
         yield mrclam(robot, folder / f"mrclam7_{robot}")
-
-
-if __name__ == "__main__":
-    Path(sys.argv[1]).mkdir(parents=True, exist_ok=True)
-    for file in recordings(Path(sys.argv[1])):
-        print(file, flush=True)

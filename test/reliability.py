@@ -1,7 +1,4 @@
-"""How often what may fail was tried, and how often it failed: told at the end of a session, a line for each test.
-
-``make soak`` tries more (``GRAPH_SLAM_SOAK``).
-"""
+"""How often what may fail was tried, and failed, told at the end of a session; ``make soak`` tries more."""
 
 import json
 import os
@@ -47,3 +44,8 @@ def lines():
     for name, numbers in _TOLD.items():
         worst = [f"worst_{key}={value:.3g}" for key, value in _WORST[name].items()]
         yield " ".join(["RELIABILITY", name, *(f"{key}={number}" for key, number in numbers.items()), *worst])
+
+
+def lenient(seconds):
+    """A limit of time on an idle machine, or as much more as this one has more to do than it can."""
+    return seconds * max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))

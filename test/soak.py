@@ -1,8 +1,4 @@
-"""What takes too long for every test run: ``make soak``, or ``python test/soak.py [NAME ...]``; up to three hours.
-
-Two programmes at a time, each with its output in ``soak/NAME.txt``; what is through with the present code is not run
-again.
-"""
+"""What takes too long for every test run: ``make soak``, two programmes at a time, each with its output in soak/."""
 
 import argparse
 import hashlib

@@ -8,7 +8,6 @@ from importlib.util import find_spec
 from pathlib import Path
 from xml.etree import ElementTree
 
-import yaml
 from places import ROOT, test_path
 from planted_bugs import BUGS
 from rows import each
@@ -35,11 +34,6 @@ SPEAK_MESSAGES = SPEAK_RCLPY | {
 def test_the_version_number_is_the_same_everywhere():
     assert ElementTree.parse(ROOT / "package.xml").findtext("version") == graph_slam_ros.__version__
     assert version("graph_slam_ros") == graph_slam_ros.__version__
-
-
-@each("path", sorted((ROOT / "config").glob("*.yaml")))
-def test_every_shipped_yaml_is_a_mapping(path):
-    assert isinstance(yaml.safe_load(path.read_text()), dict)
 
 
 def test_everything_but_the_node_imports_without_ros():

@@ -10,7 +10,7 @@ import subprocess
 import time
 
 import pytest
-from executables import executable
+from places import executable
 from rows import each
 
 from graph_slam_ros import __version__, cli
@@ -58,9 +58,6 @@ def told(capsys, *words):
 
 def results(folder):
     return {name: (folder / name).read_bytes() for name in RESULTS}
-
-
-# -- 0 --------------------------------------------------------------------------------------------------------------
 
 
 def test_replay_says_what_happened_and_repeats_and_a_setting_changes_it(bag, run, tmp_path, capsys):
@@ -198,8 +195,6 @@ def test_each_command_ends_with_a_line_of_what_to_do_next(bag, run, tmp_path, ca
         assert out.count("next: ") == 1
 
 
-# -- 2 --------------------------------------------------------------------------------------------------------------
-
 REFUSED = [
     ("", "graph_slam: the following arguments are required: COMMAND"),
     ("fly", "invalid choice: 'fly'"),
@@ -287,9 +282,6 @@ def test_what_is_refused_is_told_in_one_line_with_code_2_and_nothing_is_touched(
     assert [f.read_text() for f in files["foreign"].iterdir()] == ["mine"]
 
 
-# -- 3 and 1 --------------------------------------------------------------------------------------------------------
-
-
 def test_a_loss_is_told_and_ends_with_3_and_the_rest_is_done(long_bag, tmp_path, capsys):
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(long_bag.read_bytes()[: int(long_bag.stat().st_size * 0.7)])
@@ -311,9 +303,6 @@ def test_a_fault_of_ours_is_one_line_with_code_1(bag, tmp_path, capsys, monkeypa
     assert err == [
         "graph_slam: internal error, ZeroDivisionError: division by zero (GRAPH_SLAM_TRACEBACK=1 shows where)"
     ]
-
-
-# -- as a process ---------------------------------------------------------------------------------------------------
 
 
 def test_the_installed_command_passes_its_exit_code_on(tmp_path):

@@ -47,9 +47,6 @@ def answer(*words):
     return code, err.getvalue().splitlines()
 
 
-# -- no room -----------------------------------------------------------------------------------------------------------
-
-
 def small(folder, kilobytes):
     """A disk of so many kilobytes for this process alone; False where it may not have one."""
     libc = ctypes.CDLL(None, use_errno=True)
@@ -108,8 +105,6 @@ def test_on_a_full_disk_each_command_says_so_and_leaves_nothing_half_written(mad
         reliability.tell("full_disk", tried=1, failed=0)
 
 
-# -- folders that are not there ----------------------------------------------------------------------------------------
-
 HOMES = {  # variables, and in which folder kernels are kept then
     "no home": ({"HOME": None}, ""),
     "a home that is not there": ({"HOME": "LOCKED/gone"}, "TMP"),
@@ -149,8 +144,6 @@ def test_without_a_home_a_cache_or_tmp_kernels_are_kept_elsewhere(tmp_path, monk
         assert places["FILE"].read_text() == "mine", name
         reliability.tell("environment", tried=1, failed=0)
 
-
-# -- variables ---------------------------------------------------------------------------------------------------------
 
 ODD = {"LANG": "C", "LC_ALL": "nonsense", "PYTHONUTF8": "0", "PYTHONIOENCODING": "ascii", "PYTHONHASHSEED": "0"}
 ODD |= {"COLUMNS": "0", "LINES": "-1", "NO_COLOR": "", "TERM": "", "ROS_DOMAIN_ID": "abc", "MPLBACKEND": "nonsense"}

@@ -122,9 +122,6 @@ def test_stopped_by_a_signal_it_goes_on_where_it_was_and_a_second_time_there_is_
     assert here(capsys, "compare", out, out, "--fail", "rmse>1.02x")[0] == 0
 
 
-# -- over TCP ----------------------------------------------------------------------------------------------------------
-
-
 @contextlib.contextmanager
 def scheduler(folder):
     """A Dask scheduler's address and what starts a worker of it, as processes on the loopback."""
@@ -176,9 +173,6 @@ def test_over_tcp_a_worker_that_is_killed_changes_nothing(drives, serial, tmp_pa
         rows, _ = replay_all(Fleet([str(drives)], out), address)
         killer.join()
     check(out, rows, serial)
-
-
-# -- one job -----------------------------------------------------------------------------------------------------------
 
 
 def job(drives, out, **options):

@@ -258,9 +258,6 @@ def test_F12_big_endian_messages_are_read(messages):
     assert decode(big).pose.pose == ours.pose.pose
 
 
-# -- chunks ---------------------------------------------------------------------------------------------------------
-
-
 def head_of_chunk(file, number):
     """Where a chunk's record begins: its opcode; 9 bytes on its fields."""
     codec = {b"\0" * 4: 0, b"\4\0\0\0zstd": 4, b"\3\0\0\0lz4": 3}
@@ -314,9 +311,6 @@ def test_F3_of_a_damaged_recording_without_checksums_one_is_warned(tmp_path, mes
     assert (len(got), losses) == (len(messages), ["c.mcap: damaged: its data do not agree with their checksum"])
     assert main(["info", str(bare)]) == 3
     assert "graph_slam: beware: bag.mcap: carries no checksums" in capsys.readouterr().err
-
-
-# -- codecs and sizes -----------------------------------------------------------------------------------------------
 
 
 def read_of(file):
@@ -419,9 +413,6 @@ def test_F19_a_length_that_cannot_be_is_refused_before_anything_is_allocated(tmp
         assert len(got) >= len(messages) // 2 or place == 9
 
 
-# -- sqlite3 and ROS 1 ----------------------------------------------------------------------------------------------
-
-
 @each("fraction", [0.02, 0.3, 0.6, 0.95])
 def test_F9_a_sqlite3_file_that_is_cut_is_read_up_to_there(tmp_path, messages, fraction):
     folder = to_sqlite(tmp_path / "bag", messages)
@@ -496,9 +487,6 @@ def test_F10_a_damaged_chunk_of_a_ros_1_bag_is_passed_over(tmp_path, messages):
     assert len(losses) == 1 and "a damaged chunk" in losses[0]
 
 
-# -- order and size -------------------------------------------------------------------------------------------------
-
-
 def test_F13_messages_that_were_written_out_of_order_are_put_in_order_and_ties_stay_as_they_were(tmp_path, messages):
     """Of one time they stay as they came: numbers of channels are the recorder's, and many write no sequence."""
     rng = np.random.default_rng(3)
@@ -548,9 +536,6 @@ def with_few_descriptors(path):
     most = len(os.listdir("/proc/self/fd")) + 10
     resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
     return read(path)
-
-
-# -- parameters -----------------------------------------------------------------------------------------------------
 
 
 def refused(tmp_path, text, complaint):
@@ -622,8 +607,6 @@ def test_F32_pickles_and_arrays_of_objects_are_no_file_of_ours(tmp_path, content
         with pytest.raises(GraphSlamError, match=re.escape(name)):
             read_it(tmp_path / name)
 
-
-# -- graphs ---------------------------------------------------------------------------------------------------------
 
 GRAPH = """\
 # two poses and a landmark

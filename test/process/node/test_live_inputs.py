@@ -12,8 +12,6 @@ from vision_msgs.msg import Detection3DArray
 
 from graph_slam_ros.lie import se2
 
-# -- what is refused ---------------------------------------------------------------------------------------------------
-
 
 def seen(drive, ids=True, unit=1.0, **options):
     """What a robot sees now of the tags."""

@@ -14,10 +14,9 @@ from pathlib import Path
 import beacons
 import generate_interfaces
 import pytest
-from executables import executable
 from installed import installer
 from live_nodes import ENVIRONMENT, PATIENCE_S, lenient, node, robot, until
-from places import ROOT
+from places import ROOT, executable
 
 from graph_slam_ros import cli
 from graph_slam_ros.node.bond import MISSING

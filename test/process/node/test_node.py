@@ -6,9 +6,9 @@ import time
 
 import numpy as np
 import pytest
-from executables import executable
 from live_nodes import ENVIRONMENT, graph_slam, node, replayed, results, until
 from messages import record_drive
+from places import executable
 
 from graph_slam_ros.cli import main
 from graph_slam_ros.node import player
@@ -47,9 +47,6 @@ def surveyed(file):
     rows = [f"{name},{at[0] + 3.0},{at[1] - 2.0},0.5" for name, at in landmarks.items()]
     file.write_text("\n".join(["id,x,y,sigma", *rows]) + "\n")
     return {"landmarks.surveyed_file": str(file), "anchor.pose": "3 -2 0", "anchor.sigma_m": 1.0}
-
-
-# -- live equals replay ---------------------------------------------------------------------------------------------
 
 
 def flight(bag, file):
@@ -114,9 +111,6 @@ def test_a_recording_through_a_live_graph_is_saved_byte_for_byte_as_offline(reco
         assert json.loads(counters)["classes"]["surveyed"]["edges"] > 3
 
 
-# -- the player -----------------------------------------------------------------------------------------------------
-
-
 def test_a_running_node_is_played_what_it_listens_to_at_a_rate(tmp_path):
     drive = record_drive(tmp_path / "drive.mcap", seconds=5)
     words = "inputs.names:=odom gps", "gps.type:=sensor_msgs/msg/NavSatFix", "gps.topic:=/fix", "inputs.tf:=false"
@@ -143,9 +137,6 @@ def test_without_a_node_or_where_its_own_does_not_start_the_player_says_so(bag, 
     monkeypatch.setattr(os, "environ", dict(ENVIRONMENT))
     assert main(["replay", str(bag), "--ros", "--node", "/nobody"]) == 2
     assert capsys.readouterr().err == "graph_slam: no parameters of /nobody: is the node running?\n"
-
-
-# -- start and save -------------------------------------------------------------------------------------------------
 
 
 def test_what_is_refused_at_the_start_ends_the_node_with_its_reason_and_code_2(tmp_path):

@@ -1,7 +1,4 @@
-"""What may happen to the process of the node: faults of its threads, memory, load; what it then does, and says.
-
-The node is in this process, with a thread of its own for its callbacks, so that its solver can be made to fail.
-"""
+"""What may happen to the process of the node, which is in this one, so that its solver can be made to fail."""
 
 import contextlib
 import itertools

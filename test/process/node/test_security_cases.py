@@ -1,7 +1,4 @@
-"""Nothing is let in: no code in files, no way out of the data folder, nothing that listens; and the SROS2 policy.
-
-The package alone is held to the list of what is banned: benchmarks keep pickles of their own processes' results.
-"""
+"""Nothing is let in: no code in files, no way out of the data folder, nothing that listens; and the SROS2 policy."""
 
 import ast
 import contextlib
@@ -38,10 +35,6 @@ OWN_SERVICES = (
     " get_parameter_types get_parameters list_parameters set_parameters set_parameters_atomically get_type_description"
 )
 OWN_SERVICES = {f"/graph_slam/{name}" for name in OWN_SERVICES.split()}
-
-
-# -- what the package may not do ------------------------------------------------------------------------------------
-
 
 # Of ruff's rules: what runs code that a file, a message or a name brings along, or gives it to a shell.
 UNSAFE = "S102,S301,S302,S307,S506,S602,S604,S605,S606"
@@ -81,8 +74,6 @@ def test_X4_nothing_listens_but_the_middleware_and_the_view():
     listens = re.compile(rf"^ *(import|from) ({LISTENING})\b", re.MULTILINE)
     assert [name for name, path in FILES.items() if listens.search(path.read_text())] == ["tools/view/server.py"]
 
-
-# -- the data folder ------------------------------------------------------------------------------------------------
 
 OUTSIDE = ("secret", "../secret", "../../secret", "/etc", "/etc/passwd", "~", "~/secret", "run/../../secret", ".", "..")
 SLASHED = "./ ../ ../../ / // run/ run/../ \\ ..\\ file:// %2e%2e/ $(id) -"
@@ -176,9 +167,6 @@ def test_X10_what_the_node_tells_has_neither_paths_nor_positions():
         "message",
         "str(error)",
     ]
-
-
-# -- the SROS2 policy -----------------------------------------------------------------------------------------------
 
 
 def allowed(kind, how):

@@ -36,9 +36,6 @@ def by_stamp(path):
     return {stamp_ns(one.header): one.pose for one in path.poses}
 
 
-# -- who joins late ----------------------------------------------------------------------------------------------------
-
-
 def test_P8_who_joins_after_the_drive_gets_path_pose_landmarks_and_graph_and_the_whole_path_as_updates(tmp_path):
     parameters = f"output.folder:={tmp_path / 'run'}", "inputs.reliable:=true", "output.path_period_s:=0.02"
     with node(*parameters) as n, robot(hears=("path", "path_updates", "pose", "landmarks", "/tf")) as r:
@@ -86,9 +83,6 @@ def test_P8_who_joins_after_the_drive_gets_path_pose_landmarks_and_graph_and_the
     assert drawn["edges/odometry"] == 2 * (len(path) - 1), drawn
 
 
-# -- what does not fit -------------------------------------------------------------------------------------------------
-
-
 def test_B23_a_qos_that_does_not_match_and_all_else_that_keeps_odometry_from_coming_is_named():
     asked = "odom.reliability:=reliable", "detections.durability:=transient_local"
     with node("output.folder:=''", *asked) as n, robot(hears=("/diagnostics",), sends=()) as other:
@@ -115,9 +109,6 @@ def test_B23_a_qos_that_does_not_match_and_all_else_that_keeps_odometry_from_com
             other.until_it_says("WAITING", unlinked, spin=lambda s: (lost.step(driver), other.spin(s)))
         assert n.stop()[0] == 0
     assert "Traceback" not in n.said
-
-
-# -- several nodes -----------------------------------------------------------------------------------------------------
 
 
 def test_P5_P19_a_second_node_with_the_folder_of_the_first_does_not_start_and_two_of_one_name_say_so(tmp_path):
@@ -169,9 +160,6 @@ def test_P18_another_broadcaster_of_map_to_odom_is_named_also_where_it_is_static
             assert r.set({"tf.publish_tf": True}) == (True, "")
         r.until_it_says("OK", spin=drive.pace(r))
         assert n.stop()[0] == 0
-
-
-# -- transforms --------------------------------------------------------------------------------------------------------
 
 
 def told(r):

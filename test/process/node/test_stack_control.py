@@ -50,8 +50,6 @@ def is_repeated(run, tmp_path):
     return replayed(run, place) == results(run)
 
 
-# -- lifecycle ---------------------------------------------------------------------------------------------------------
-
 TURNS = {"unconfigured": ("configure",), "inactive": ("activate", "cleanup"), "active": ("deactivate",)}
 NUMBERS = {
     name: getattr(Transition, f"TRANSITION_{name.upper()}")
@@ -168,8 +166,6 @@ def test_what_cannot_be_configured_activated_or_saved_leaves_nothing_and_can_be_
     assert "Traceback" not in n.said
 
 
-# -- signals -----------------------------------------------------------------------------------------------------------
-
 SIGNALS = signal.SIGINT, signal.SIGTERM
 MEANWHILE = "", "save", "optimize", "reset", "clear_closures"
 
@@ -243,9 +239,6 @@ def test_P6_told_to_stop_while_a_long_run_is_loaded_it_does_not_wait_for_it(tmp_
     assert not accepted(tmp_path / "run")
 
 
-# -- what outlives it --------------------------------------------------------------------------------------------------
-
-
 RESUMED = "goes on by odometry alone since the restart, nothing recognised yet"
 
 
@@ -313,8 +306,6 @@ def test_P2_P12_killed_it_goes_on_where_it_was_if_odometry_goes_on_else_once_a_l
     assert is_repeated(run, tmp_path)
     assert not is_cut_off(run)
 
-
-# -- parameters --------------------------------------------------------------------------------------------------------
 
 LIVE = [p for p in parameters() if p.live]
 HOSTILE = (  # name, value, what the refusal says besides the name

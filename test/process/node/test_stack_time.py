@@ -49,9 +49,6 @@ def parameters(folder):
     return f"output.folder:={folder}", "inputs.reliable:=true"
 
 
-# -- jumps -------------------------------------------------------------------------------------------------------------
-
-
 def test_B7_B8_B11_B12_B13_B14_of_a_simulated_clock_jumps_alone_begin_segments_of_one_map(tmp_path):
     loops = often(1)
     with node(*parameters(tmp_path / "run"), "use_sim_time:=true") as n, robot(hears=HEARS) as r:

@@ -65,9 +65,6 @@ def drive(folder, tell, keep_earlier=0):
 CUTS, FLIPS = times((50, 60), (None, 5_000))  # None: at every byte
 
 
-# -- cut and flipped ---------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Part:
     """A file of a journal: its bytes, its records, and by chunk where it ends and how many records there are then."""
@@ -257,9 +254,6 @@ def test_P3_a_power_cut_finds_names_and_contents_on_the_disk_before_anything_han
         assert ("fsync", folder) in calls[:first][-2:]
 
 
-# -- what is left ------------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Reference:
     """The same run, undisturbed."""
@@ -354,8 +348,6 @@ def in_a_child(work):
     assert WRONG not in told, told.partition(WRONG)[2].decode()
     return status, told
 
-
-# -- a disk that fails -------------------------------------------------------------------------------------------------
 
 CALLS = ("open", "write", "pwrite", "fsync", "replace", "ftruncate")
 ALSO_CRASHES = ("unlink", "rename", "mkdir")

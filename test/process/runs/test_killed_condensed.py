@@ -75,7 +75,6 @@ def test_a_run_killed_before_the_rename_gives_the_same_bytes(runs, tmp_path):
 
 
 def test_a_new_map_that_is_torn_does_not_cost_the_old_one(runs, tmp_path):
-    """What came since the old map is driven again from the journal, and is not condensed then."""
     torn = tmp_path / "torn"
     shutil.copytree(runs["before"], torn)
     os.truncate(torn / "map_1.mcap", int(0.9 * (torn / "map_1.mcap").stat().st_size))

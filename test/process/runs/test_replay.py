@@ -168,9 +168,6 @@ def test_a_record_of_another_shape_is_refused_by_field(record, complaint):
         from_record(record)
 
 
-# -- files ----------------------------------------------------------------------------------------------------------
-
-
 def test_the_graph_file_reads_back_with_poses_first_and_stamps_beside_it(folder, run):
     file = read_g2o(folder / "graph.g2o")
     table = [line.split(",") for line in (folder / "graph_vertices.csv").read_text().splitlines()]
@@ -250,9 +247,6 @@ def test_the_recorded_transforms_lead_from_map_over_odom_to_the_recorded_pose(fo
     for stamp, at in poses.items():
         found = se2.compose(links[stamp, "map", "odom"], links[stamp, "odom", "base_link"])
         assert found[:2] == pytest.approx(at, abs=1e-9)
-
-
-# -- folders --------------------------------------------------------------------------------------------------------
 
 
 def test_a_folder_is_not_read_and_written_at_once(tmp_path, bag, folder):

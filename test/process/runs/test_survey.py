@@ -54,9 +54,6 @@ def start_of(recording, error=(0.0, 0.0, 0.0)):
     return " ".join(str(a + e) for a, e in zip(at, error, strict=True))
 
 
-# -- the map lies where it is said to ---------------------------------------------------------------------------------
-
-
 @each("sensor", ["position", "bearing", "range"])
 def test_a_warehouse_lies_on_its_floor_plan_whatever_is_seen_of_the_surveyed_tags(sensor):
     recording = simulate("warehouse", 4, **SMALL, sensor=sensor)
@@ -81,9 +78,6 @@ def test_without_a_start_pose_the_map_turns_into_the_plan_by_what_is_seen(sensor
     metres, radians = errors(slam, recording)
     assert metres.max() < 0.15
     assert radians.max() < 0.03
-
-
-# -- what becomes of it in the graph ----------------------------------------------------------------------------------
 
 
 def pipeline(**settings):
@@ -124,8 +118,6 @@ def test_in_space_start_pose_and_survey_have_all_their_axes():
     assert flat.trajectory()[0] == pytest.approx([1, 2, 0, *so3.exp((0, 0, 0.3))])
 
 
-# -- strict reading ---------------------------------------------------------------------------------------------------
-
 SPACE = "id,x,y,z,sigma"
 
 
@@ -145,9 +137,6 @@ def test_a_file_is_read_at_the_border_and_named_where_it_is_wrong(tmp_path):
         with pytest.raises(ConfigError) as told:
             with_survey(config)
         assert str(told.value).startswith(f"{file}: {said}")
-
-
-# -- runs -------------------------------------------------------------------------------------------------------------
 
 
 def test_a_run_keeps_the_survey_it_was_made_with_and_repeats_without_the_file(tmp_path, capsys):

@@ -94,9 +94,6 @@ def test_B7_of_one_recording_with_a_jump_a_replay_makes_what_the_node_makes_and_
         assert "--set time.on_jump=segment" in said.err
 
 
-# -- the gate alone ----------------------------------------------------------------------------------------------------
-
-
 def odometry(seconds, name="odom"):
     return [Odometry(1000 * S + round(seconds * S), (0.0, 0.0, 0.0), None, name)]
 

@@ -97,9 +97,6 @@ def asked(one, method="GET", path="/", body=None, **headers):
 QUESTION = b'{"without": [], "let_in": [], "loss": "none", "first": false}'
 
 
-# -- who may ask -------------------------------------------------------------------------------------------------------
-
-
 def test_X4_it_listens_on_the_loopback_address_alone(attacked):
     assert asked(attacked)[0] == 200
     with pytest.raises(ConnectionRefusedError):  # as from another machine: a socket on all addresses has this one, too
@@ -176,9 +173,6 @@ def test_no_path_leads_anywhere_else(attacked):
         assert asked(attacked, "POST", path, QUESTION)[0] in (404, 405)
 
 
-# -- how much ----------------------------------------------------------------------------------------------------------
-
-
 def raw(one, *parts):
     """What is answered to some bytes, until the connection is closed."""
     with socket.create_connection(("127.0.0.1", one.port), timeout=10) as client:
@@ -206,9 +200,6 @@ def test_X7_large_bodies_and_heads_are_refused(attacked):
     assert b" 400 " in raw(attacked, b"GET / HTTP/1.1\r\nx: " + 40_000 * b"x")
     assert asked(attacked, "POST", "/solve", b"x" * guard.MOST_BYTES)[0] == 422
     assert asked(attacked)[0] == 200
-
-
-# -- the page ----------------------------------------------------------------------------------------------------------
 
 
 def estimate(page):
@@ -352,9 +343,6 @@ def test_forms_make_edits_of_landmarks_and_hostile_names_are_text(browser, tmp_p
     assert [one.edit.arguments["landmark"] for one in edits] == HOSTILE[:2]
 
 
-# -- the command -------------------------------------------------------------------------------------------------------
-
-
 def test_the_command_prints_an_address_and_ends_with_ctrl_c(tmp_path):
     run = drive(tmp_path / "run", ["a", "b"], dimensions=3)
     command = [sys.executable, "-m", "graph_slam_ros.cli", "view", str(run), "--no-browser"]
@@ -396,14 +384,3 @@ def test_what_cannot_be_shown_is_one_line_and_opens_no_socket(tmp_path, capsys, 
         captured = capsys.readouterr()
         assert (code, captured.out) == (2, ""), words
         assert len(captured.err.splitlines()) == 1, captured.err
-
-
-def test_without_the_extra_one_line_names_it(tmp_path, capsys, monkeypatch):
-    import importlib.util
-
-    find = importlib.util.find_spec
-    monkeypatch.setattr(
-        importlib.util, "find_spec", lambda name, *more: None if name == "uvicorn" else find(name, *more)
-    )
-    assert cli.main(["view", str(tmp_path)]) == 2
-    assert capsys.readouterr().err.rstrip().endswith("pip install 'graph_slam_ros[view]'")
