@@ -88,10 +88,3 @@ def test_what_foxglove_plots_is_among_the_nodes_diagnostics():
     for path in plotted:
         name, key = re.findall(r'=="(.+?)"', path)
         assert key in told[name]
-
-
-def test_the_layout_of_foxglove_has_every_panel_once():
-    def leaves(node):
-        return [node] if isinstance(node, str) else leaves(node["first"]) + leaves(node["second"])
-
-    assert sorted(leaves(FOXGLOVE["layout"])) == sorted(FOXGLOVE["configById"])

@@ -58,9 +58,6 @@ def test_the_predicted_sigma_is_within_a_fifth_of_what_comes_out_in_95_of_100(tm
     assert (off < 0.2).mean() >= 0.95
 
 
-# -- a corridor --------------------------------------------------------------------------------------------------------
-
-
 def corridor(folder, landmarks=True, length_m=60.0, start=None):
     """A robot drives east; landmarks stand at the beginning and at the end, none for 40 m between."""
     config = Config.from_mapping({"map.localize": start is not None})
@@ -106,19 +103,6 @@ def test_a_way_without_landmarks_is_named_with_its_length_and_stamps(straight, t
     assert out.splitlines()[-1].startswith("next: ")
 
 
-def test_the_weakest_is_where_the_odometry_has_drifted_most_and_across_the_path(straight):
-    """Nothing is seen twice: it is the last keyframe, whose way across grows with the error of the heading."""
-    run = SavedGraph(straight, [])
-    position, heading, landmark = Weakness(run).weakest()
-    assert position.keyframe == len(run.keyframes) - 1
-    assert position.direction.words == "across the path"
-    assert heading.direction.sigma == pytest.approx(
-        float(np.sqrt(run.solver.marginal([heading.vertex])[0][2, 2])), rel=1e-9
-    )
-    assert landmark.about == "landmark end"
-    assert heading.usual < heading.direction.sigma
-
-
 def test_a_survey_of_what_is_weakest_helps_it_most_and_leaves_what_was_surveyed(straight, told):
     code, out, _ = told("advise", straight, "--json", "--survey-sigma", "0.05", "--count", "3")
     assert code == 0
@@ -162,9 +146,6 @@ def test_a_prediction_is_that_of_the_whole_inverse(straight):
             at = slice(first[one.vertex], first[one.vertex] + dofs[one.vertex])
             real = float(np.sqrt(one.functional @ covariance[at, at] @ one.functional))
             assert sigma == pytest.approx(real, rel=1e-6), kind
-
-
-# -- what may be wrong -------------------------------------------------------------------------------------------------
 
 
 def test_a_run_without_landmarks_or_of_one_keyframe_says_so(tmp_path, told):

@@ -1,5 +1,4 @@
 import json
-import re
 from dataclasses import replace as changed
 
 import numpy as np
@@ -7,7 +6,7 @@ import pytest
 from rows import each
 
 from graph_slam_ros.analysis.evaluation import evaluate
-from graph_slam_ros.analysis.path_error import alignment, associate, path_error
+from graph_slam_ros.analysis.path_error import associate, path_error
 from graph_slam_ros.analysis.trajectories import read_truth
 from graph_slam_ros.cli import main
 from graph_slam_ros.errors import GraphSlamError
@@ -30,6 +29,7 @@ from graph_slam_ros.runs.restore import map_of, record_run
 from graph_slam_ros.runs.trajectory import Trajectory, read_tum
 from graph_slam_ros.slam import Config, Control
 from graph_slam_ros.tools.simulation import measurements, simulate, write_bag
+from graph_slam_ros.tools.simulation.instruments import geodetic
 
 START_S = 1_700_000_000
 
@@ -58,34 +58,6 @@ def planar(stamps_s, poses):
 
 def motion(x, y, theta):
     return tuple(se3.in_space((x, y, theta)))
-
-
-def test_the_alignment_stays_in_the_plane_and_never_mirrors():
-    truth = eight().poses[:, :2]
-    mirrored = truth * (1.0, -1.0)
-    x, y = se2.act(tuple(se3.in_plane(alignment(mirrored, truth))), tuple(mirrored.T))
-    assert np.hypot(x - truth[:, 0], y - truth[:, 1]).max() > 1.0  # turned over in space it would fit exactly
-    line = np.column_stack([np.arange(5.0), np.zeros(5)])
-    assert alignment(line, line[:, ::-1]) == pytest.approx(motion(0.0, 0.0, np.pi / 2))
-
-
-def test_headings_are_compared_across_the_turn_from_plus_to_minus_pi():
-    truth, estimate = eight(), eight()
-    for path, theta in ((truth, np.pi - 0.01), (estimate, -np.pi + 0.02)):
-        path.poses[:, 3:] = motion(0.0, 0.0, theta)[3:]
-    assert path_error(estimate, truth).angle_rad["max"] == pytest.approx(0.03)
-
-
-def test_only_stamps_within_a_twentieth_of_a_second_of_the_truth_are_scored():
-    truth = eight()
-    kept = (truth.stamps_s < START_S + 5.0) | (truth.stamps_s > START_S + 12.0)
-    gappy = Trajectory(truth.stamps_s[kept], truth.poses[kept])
-    estimate = Trajectory(truth.stamps_s + 0.04, truth.poses)
-    mine, theirs = associate(estimate, gappy)
-    assert np.abs(mine.stamps_s - theirs.stamps_s).max() < 0.05
-    inside_gap = (mine.stamps_s > START_S + 5.0) & (mine.stamps_s < START_S + 12.0)
-    assert not inside_gap.any()
-    assert len(mine.stamps_s) == kept.sum() - 1  # the last one is past the truth's end
 
 
 def test_paths_without_common_stamps_are_refused_with_both_spans():
@@ -135,84 +107,23 @@ def test_the_map_is_aligned_by_itself_and_only_what_both_know_counts(run, tmp_pa
     assert evaluate(run, tmp_path / "map.mcap").map_rmse_m == pytest.approx(0.1)
 
 
-def test_the_scores_as_plain_values_are_exactly_these(run, tmp_path):
-    add_true_landmarks(tmp_path / "map.mcap", {"a": (7.0, 0.0), "b": (0.0, 7.0)})
-    scores = evaluate(run, str(tmp_path / "map.mcap")).as_dict()
-    three = {"rmse", "median", "max"}
-    own = {"position_m", "heading_rad", "drift", "n", "of"}
-    assert set(scores) == own | {"map_m", "odometry", "consistency", "scored"}
-    assert set(scores["position_m"]) == set(scores["heading_rad"]) == three
-    assert set(scores["map_m"]) == {"rmse"}
-    assert set(scores["odometry"]) == own
-    assert set(scores["drift"]["per_s"]) == {"position_m_per_s", "heading_rad_per_s", "n"}
-    assert set(scores["drift"]["per_m"]) == {"position_m_per_m", "heading_rad_per_m", "n"}
-    assert scores["n"] == scores["odometry"]["n"] == 200
-    assert scores["position_m"]["max"] < 1e-6 < scores["odometry"]["position_m"]["rmse"]
-
-
 def test_the_truth_of_another_drive_is_suspected(run, tmp_path):
     truth = eight()
     write_truth(tmp_path / "other.mcap", truth.stamps_s, truth.poses[::-1].copy())
     assert evaluate(run, tmp_path / "truth.mcap").warnings == ()
+    assert evaluate(run, tmp_path / "truth.mcap").estimate.position_m["max"] < 1e-6
+    assert evaluate(run, tmp_path / "truth.mcap", align=False).estimate.position_m["rmse"] > 1.0, "a shift is an error"
     (warning,) = evaluate(run, tmp_path / "other.mcap").warnings
     assert "check that the truth is of this robot and this drive" in warning
 
 
-def test_a_run_without_dead_reckoning_or_landmarks_is_scored_without(run, tmp_path):
-    (run / "odometry.tum").unlink()
-    (run / "landmarks.csv").unlink()
-    scores = evaluate(run, tmp_path / "truth.mcap", "path.tum")
-    assert (scores.odometry, scores.map_rmse_m, scores.estimate.n) == (None, None, 100)
-
-
-def test_the_table_tells_metres_and_degrees(run, tmp_path):
-    poses = np.add(se3.in_plane(eight().poses), (0.0, 0.0, np.deg2rad(3.0)))
-    write_tum(run / "sightings.tum", eight().stamps_s, poses)
-    lines = str(evaluate(run, tmp_path / "truth.mcap")).splitlines()
-    assert [line.split() for line in lines if re.match(r"estimate,.*(position|deg)", line)] == [
-        ["estimate,", "position", "[m]", "0.000", "0.000", "0.000"],
-        ["estimate,", "heading", "[deg]", "3.00", "3.00", "3.00"],
-        ["estimate,", "drift", "[deg/s]", "0.000", "0.000", "0.000"],  # the same offset throughout
-        ["estimate,", "drift", "[deg/m]", "0.000", "0.000", "0.000"],
-    ]
-    assert len({len(line) for line in lines[3:] if "landmarks" not in line}) == 1
-
-
-def test_truth_is_read_from_every_type_of_pose(tmp_path):
-    at, q = point(1.0, 2.0, 9.0), heading(2.5)
-    bare = make("geometry_msgs/msg/Pose", position=at, orientation=q)
-    spread = make("geometry_msgs/msg/PoseWithCovariance", pose=bare, covariance=np.zeros(36))
-    still = make("geometry_msgs/msg/Twist", linear=vector(0, 0), angular=vector(0, 0))
-    twist = make("geometry_msgs/msg/TwistWithCovariance", twist=still, covariance=np.zeros(36))
-    moved = make("geometry_msgs/msg/Transform", translation=vector(1.0, 2.0, 9.0), rotation=q)
-    kinds = {
-        "geometry_msgs/msg/PoseStamped": {"pose": bare},
-        "geometry_msgs/msg/PoseWithCovarianceStamped": {"pose": spread},
-        "nav_msgs/msg/Odometry": {"child_frame_id": "base_link", "pose": spread, "twist": twist},
-        "geometry_msgs/msg/TransformStamped": {"child_frame_id": "base_link", "transform": moved},
-    }
-    stamp_ns = START_S * 10**9 + 123_456_789
-    for number, (kind, fields) in enumerate(kinds.items()):
-        with BagWriter(tmp_path / f"{number}.mcap") as bag:
-            bag.write("/here", kind, 1, encode(make(kind, header=header(stamp_ns, "world"), **fields)))
-        trajectory = read_truth(f"{tmp_path / str(number)}.mcap:/here").trajectory
-        assert trajectory.stamps_s.tolist() == [float("1700000000.123456789")]
-        assert trajectory.poses == pytest.approx(np.array([[1.0, 2.0, 9.0, *motion(0.0, 0.0, 2.5)[3:]]]))
-
-
-def write_topics(path, **kinds):
+def write_topics(path, topics):
     """A bag with one message, at x = 1, 2, ..., on each of the topics."""
+    kinds = {"PoseStamped": "geometry_msgs/msg/PoseStamped", "Odometry": "nav_msgs/msg/Odometry"}
     with BagWriter(path) as bag:
-        for x, (name, kind) in enumerate(kinds.items(), start=1):
-            fields = {"header": header(1, "world"), "pose": pose((x, 0, 0))}
-            if kind == "nav_msgs/msg/Odometry":
-                still = make("geometry_msgs/msg/Twist", linear=vector(0, 0), angular=vector(0, 0))
-                fields["pose"] = make(
-                    "geometry_msgs/msg/PoseWithCovariance", pose=fields["pose"], covariance=np.zeros(36)
-                )
-                fields["twist"] = make("geometry_msgs/msg/TwistWithCovariance", twist=still, covariance=np.zeros(36))
-                fields["child_frame_id"] = "base_link"
-            bag.write(f"/{name}", kind, 1, encode(make(kind, **fields)))
+        for x, (name, kind) in enumerate(topics.items(), start=1):
+            bag.write(f"/{name}", kinds[kind], 1, message(kinds[kind], 1, pose((x, 0, 0))))
+    return path
 
 
 @each(
@@ -222,21 +133,20 @@ def write_topics(path, **kinds):
         ({"odom": "Odometry", "vicon": "PoseStamped"}, 2),
         ({"wheels": "Odometry", "vicon": "PoseStamped"}, 2),
         ({"odom": "Odometry", "vicon": "Odometry"}, 2),
+        ({"odom": "Odometry"}, None),
+        ({"wheels": "Odometry", "vicon": "Odometry"}, None),
     ],
 )
-def test_the_truth_is_its_usual_topic_or_the_only_one_of_poses_besides_the_odometry(tmp_path, topics, chosen):
-    kinds = {"PoseStamped": "geometry_msgs/msg/PoseStamped", "Odometry": "nav_msgs/msg/Odometry"}
-    write_topics(tmp_path / "bag.mcap", **{name: kinds[kind] for name, kind in topics.items()})
-    assert read_truth(tmp_path / "bag.mcap").trajectory.poses[:, 0].tolist() == [chosen]
-
-
-@each("names", [["odom"], ["wheels", "vicon"]])
-def test_where_the_truth_cannot_be_told_it_must_be_named(tmp_path, names):
-    write_topics(tmp_path / "bag.mcap", **dict.fromkeys(names, "nav_msgs/msg/Odometry"))
-    with pytest.raises(GraphSlamError, match="with --topic") as refused:
-        read_truth(tmp_path / "bag.mcap")
-    assert all(f"/{name}" in str(refused.value) for name in names)
-    assert read_truth(f"{tmp_path / 'bag.mcap'}:/{names[0]}").trajectory.poses[:, 0].tolist() == [1.0]
+def test_the_truth_is_its_usual_topic_or_the_only_one_of_poses_besides_the_odometry_else_it_must_be_named(
+    tmp_path, topics, chosen
+):
+    bag = write_topics(tmp_path / "bag.mcap", topics)
+    if chosen is None:
+        with pytest.raises(GraphSlamError, match="with --topic") as refused:
+            read_truth(bag)
+        assert all(f"/{name}" in str(refused.value) for name in topics)
+    one = read_truth(bag if chosen else f"{bag}:/{next(iter(topics))}")
+    assert one.trajectory.poses[:, 0].tolist() == [chosen or 1]
 
 
 def test_an_unknown_topic_is_refused_with_those_that_exist(run, tmp_path):
@@ -297,39 +207,17 @@ def test_absolute_and_relative_errors_are_those_of_evo():
                 assert metric.get_statistic(metrics.StatisticsType[name]) == pytest.approx(value, rel=1e-6)
 
 
-# -- what may be the truth --------------------------------------------------------------------------------------------
-
-
-def stamped(stamp_ns, kind, **fields):
-    return encode(make(kind, header=header(stamp_ns, fields.pop("frame", "world")), **fields))
-
-
 def write_fixes(path, stamps_s, poses, topic="/fix", datum=(48.0, 11.0, 500.0)):
     """NavSatFix at poses that lie east and north of the datum; the first message has no fix."""
-    radius_m = 6_378_137.0
-    status = {
-        name: make("sensor_msgs/msg/NavSatStatus", status=code, service=1) for name, code in (("no", -1), ("yes", 0))
-    }
+    kind = "sensor_msgs/msg/NavSatFix"
     with BagWriter(path) as bag:
-        for k, (stamp, p) in enumerate(zip(stamps_s, poses, strict=True)):
+        places = geodetic(np.column_stack([poses[:, :2], 0.0 * poses[:, 0]]), datum).tolist()
+        for k, (stamp, at) in enumerate(zip(stamps_s, places, strict=True)):
+            status = make("sensor_msgs/msg/NavSatStatus", status=0 if k else -1, service=1)
+            fields = dict(zip(("latitude", "longitude", "altitude"), at if k else [0.0] * 3, strict=True))
+            fields |= {"position_covariance": np.zeros(9), "position_covariance_type": 0, "status": status}
             stamp_ns = round(stamp * 1e9)
-            # of a sphere with the ellipsoid's radii at the datum: to a millimetre over some metres
-            flat = 0.00669437999014
-            square = 1.0 - flat * np.sin(np.deg2rad(datum[0])) ** 2
-            north_m, east_m = radius_m * (1.0 - flat) / square**1.5, radius_m / np.sqrt(square)
-            latitude = datum[0] + np.rad2deg(p[1] / (north_m + datum[2]))
-            longitude = datum[1] + np.rad2deg(p[0] / ((east_m + datum[2]) * np.cos(np.deg2rad(datum[0]))))
-            cdr = stamped(
-                stamp_ns,
-                "sensor_msgs/msg/NavSatFix",
-                status=status["yes" if k else "no"],
-                latitude=float(latitude) if k else 0.0,
-                longitude=float(longitude) if k else 0.0,
-                altitude=datum[2],
-                position_covariance=np.zeros(9),
-                position_covariance_type=0,
-            )
-            bag.write(topic, "sensor_msgs/msg/NavSatFix", stamp_ns, cdr)
+            bag.write(topic, kind, stamp_ns, encode(make(kind, header=header(stamp_ns, "world"), **fields)))
 
 
 def test_fixes_are_a_truth_without_orientation_east_and_north_of_the_first(run, tmp_path):
@@ -349,34 +237,20 @@ def test_fixes_are_a_truth_without_orientation_east_and_north_of_the_first(run, 
     assert first == pytest.approx(np.zeros(3), abs=1e-9)
 
 
-def test_points_are_a_truth_without_orientation(run, tmp_path):
-    with BagWriter(tmp_path / "points.mcap") as bag:
-        for stamp, p in zip(eight().stamps_s, eight().poses, strict=True):
-            cdr = stamped(round(stamp * 1e9), "geometry_msgs/msg/PointStamped", point=point(*p[:3]))
-            bag.write("/prism", "geometry_msgs/msg/PointStamped", round(stamp * 1e9), cdr)
-    scores = evaluate(run, tmp_path / "points.mcap")
-    assert scores.estimate.position_m["max"] < 1e-6
-    assert scores.estimate.angle_rad is None
-
-
 def write_transforms(path, *pairs):
     """On /tf at each stamp the poses of ``eight`` between the first two frames, and standing still between others."""
     with BagWriter(path) as bag:
         for stamp, p in zip(eight().stamps_s, eight().poses, strict=True):
-            stamp_ns = round(stamp * 1e9)
-            transforms = []
+            stamp_ns, transforms = round(stamp * 1e9), []
             for k, (parent, child) in enumerate(pairs):
+                at = pose((1.0, 2.0, 0.0)) if k else pose(tuple(p))
                 moved = make(
                     "geometry_msgs/msg/Transform",
-                    translation=vector(*(p[:2] if not k else (1.0, 2.0))),
-                    rotation=heading(0.0)
-                    if k
-                    else make("geometry_msgs/msg/Quaternion", x=p[3], y=p[4], z=p[5], w=p[6]),
+                    translation=vector(at.position.x, at.position.y),
+                    rotation=at.orientation,
                 )
-                one = header(stamp_ns, parent)
-                transforms.append(
-                    make("geometry_msgs/msg/TransformStamped", header=one, child_frame_id=child, transform=moved)
-                )
+                kind = "geometry_msgs/msg/TransformStamped"
+                transforms.append(make(kind, header=header(stamp_ns, parent), child_frame_id=child, transform=moved))
             cdr = encode(make("tf2_msgs/msg/TFMessage", transforms=transforms))
             bag.write("/tf", "tf2_msgs/msg/TFMessage", stamp_ns, cdr)
 
@@ -393,6 +267,9 @@ def test_a_transform_is_a_truth_by_the_names_of_its_frames(run, tmp_path):
         evaluate(run, bag, topic="/tf:vicon:base")
     with pytest.raises(GraphSlamError, match="/tf:PARENT:CHILD"):
         evaluate(run, bag)
+    write_transforms(tmp_path / "of map.mcap", ("vicon", "robot"), ("map", "base_link"))
+    assert read_truth(tmp_path / "of map.mcap", "/tf:vicon:robot").doubt == ""
+    assert "map and odom" in read_truth(tmp_path / "of map.mcap", "/tf:map:base_link").doubt, "a localiser's"
     write_transforms(tmp_path / "one.mcap", ("vicon", "robot"))
     assert evaluate(run, tmp_path / "one.mcap", topic="/tf").estimate.position_m["max"] < 1e-6
 
@@ -407,9 +284,6 @@ def test_a_pose_that_is_not_finite_is_left_out_and_told(tmp_path):
     assert known.losses == ("1 of 200 poses on /ground_truth are not finite",)
 
 
-# -- drift, frames, drives --------------------------------------------------------------------------------------------
-
-
 def test_drift_is_the_error_of_a_second_and_of_a_metre_whatever_their_steps():
     seconds = np.arange(0.0, 60.0, 0.25)
     truth = planar(START_S + seconds, np.column_stack([2.0 * seconds, 0.0 * seconds, 0.0 * seconds]))
@@ -420,11 +294,6 @@ def test_drift_is_the_error_of_a_second_and_of_a_metre_whatever_their_steps():
     straight = planar(truth.stamps_s, np.column_stack([2.2 * seconds, 0.0 * seconds, 0.0 * seconds]))
     assert path_error(straight, truth).per_s.position["rmse"] == pytest.approx(0.2)
     assert path_error(straight, truth).per_m.position["rmse"] == pytest.approx(0.1)
-
-
-def test_without_alignment_a_shift_is_an_error(run, tmp_path):
-    assert evaluate(run, tmp_path / "truth.mcap").estimate.position_m["max"] < 1e-6
-    assert evaluate(run, tmp_path / "truth.mcap", align=False).estimate.position_m["rmse"] > 1.0
 
 
 def test_a_run_that_saw_nothing_is_scored_at_its_keyframes(run, tmp_path):
@@ -438,14 +307,12 @@ def test_a_run_that_saw_nothing_is_scored_at_its_keyframes(run, tmp_path):
     assert scores.scored["estimate"] == "path.tum"
 
 
-@each("hours", [1, -1])
-def test_of_a_run_in_a_loaded_map_the_drive_of_the_truth_alone_is_scored(tmp_path, hours):
-    """Also where the drive is older than the map."""
-    world = simulate("pythonrobotics", 0, poses=40)
+def test_of_a_run_in_a_loaded_map_the_drive_of_the_truth_alone_is_scored_also_where_it_is_older_than_the_map(tmp_path):
+    world = simulate("pythonrobotics", 0, poses=30)
     write_bag(world, tmp_path / "bag.mcap")
     replay(tmp_path / "bag.mcap", tmp_path / "before")
     before = map_of(tmp_path / "before", [])
-    hour_ns = hours * 3_600_000_000_000
+    hour_ns = -3_600_000_000_000
     record_run(tmp_path / "after", Config(), [*later(measurements(world), hour_ns), Control("end")], [], before)
     truth = Trajectory((world.stamps_ns + hour_ns) / 1e9, se3.in_space(world.T_world_base))
     write_tum(tmp_path / "truth.tum", truth.stamps_s, truth.poses)
@@ -471,17 +338,6 @@ def test_of_a_run_in_a_loaded_map_the_drive_of_the_truth_alone_is_scored(tmp_pat
 def later(items, by_ns):
     for one in items:
         yield changed(one, stamp_ns=one.stamp_ns + by_ns)
-
-
-def test_why_there_is_no_nees_is_told(run, tmp_path):
-    write_bag(simulate("pythonrobotics", 0), tmp_path / "bag.mcap")
-    replay(tmp_path / "bag.mcap", tmp_path / "replayed")
-    truth = read_truth(tmp_path / "bag.mcap").trajectory
-    write_tum(tmp_path / "all.tum", truth.stamps_s, truth.poses)
-    scores = evaluate(tmp_path / "replayed", tmp_path / "all.tum")
-    assert scores.consistency.left_out == {"landmarks": "the truth has none (/landmarks_ground_truth)"}
-    write_fixes(tmp_path / "fixes.mcap", truth.stamps_s, truth.poses)
-    assert "of positions" in str(evaluate(tmp_path / "replayed", tmp_path / "fixes.mcap"))
 
 
 def write_estimate(file, name, sigma_m):
@@ -513,7 +369,36 @@ def test_a_truth_that_is_an_estimate_is_doubted(tmp_path, capsys, run, name, sig
     assert why in " ".join(err.split())
 
 
-def test_a_localiser_is_known_by_the_frames_of_its_transform(tmp_path):
-    write_transforms(tmp_path / "tf.mcap", ("vicon", "robot"), ("map", "base_link"))
-    assert read_truth(tmp_path / "tf.mcap", "/tf:vicon:robot").doubt == ""
-    assert "map and odom" in read_truth(tmp_path / "tf.mcap", "/tf:map:base_link").doubt
+def message(kind, stamp_ns, at):
+    """A pose as a message of any of the types that have one."""
+    still = make("geometry_msgs/msg/Twist", linear=vector(0, 0), angular=vector(0, 0))
+    spread = make("geometry_msgs/msg/PoseWithCovariance", pose=at, covariance=np.zeros(36))
+    p, child = at.position, {"child_frame_id": "base_link"}
+    moved = make("geometry_msgs/msg/Transform", translation=vector(p.x, p.y, p.z), rotation=at.orientation)
+    twist = make("geometry_msgs/msg/TwistWithCovariance", twist=still, covariance=np.zeros(36))
+    fields = {
+        "geometry_msgs/msg/PoseStamped": {"pose": at},
+        "geometry_msgs/msg/PoseWithCovarianceStamped": {"pose": spread},
+        "nav_msgs/msg/Odometry": {"pose": spread, "twist": twist, **child},
+        "geometry_msgs/msg/TransformStamped": {"transform": moved, **child},
+        "geometry_msgs/msg/PointStamped": {"point": p},
+    }[kind]
+    return encode(make(kind, header=header(stamp_ns, "world"), **fields))
+
+
+STAMPED = [f"geometry_msgs/msg/{name}Stamped" for name in ("Pose", "PoseWithCovariance", "Transform", "Point")]
+
+
+@each("kind", [*STAMPED, "nav_msgs/msg/Odometry"])
+def test_truth_is_read_from_every_type_of_pose_or_point(tmp_path, kind):
+    stamp_ns, at = (
+        START_S * 10**9 + 123_456_789,
+        make("geometry_msgs/msg/Pose", position=point(1.0, 2.0, 9.0), orientation=heading(2.5)),
+    )
+    with BagWriter(tmp_path / "a.mcap") as bag:
+        bag.write("/here", kind, 1, message(kind, stamp_ns, at))
+    trajectory = read_truth(f"{tmp_path / 'a.mcap'}:/here").trajectory
+    assert trajectory.stamps_s.tolist() == [float("1700000000.123456789")]
+    assert trajectory.has_orientation is (kind != STAMPED[-1])
+    expected = [1.0, 2.0, 9.0, *motion(0.0, 0.0, 2.5 * trajectory.has_orientation)[3:]]
+    assert trajectory.poses == pytest.approx(np.array([expected]))

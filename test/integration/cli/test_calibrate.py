@@ -18,8 +18,6 @@ from graph_slam_ros.slam.calibration.parameters import QUANTITIES
 from graph_slam_ros.tools.simulation import simulate, write_bag
 
 SOAK = pytest.mark.skipif(not times(0, 1), reason="only in make soak")
-
-
 DEMO = str(ROOT / "data" / "demo.mcap")
 WRONG = ("--set", "detections.mount_correction=0 0 0 0 0 0.1", "--set", "odometry.distance_factor=1.08")
 

@@ -9,8 +9,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from foreign import DEFINITIONS
-from messages import cloud, detection, detections, gnss, imu, odometry, pose, posed, quaternion, recorded, transforms
-from recordings import definition, write_mcap
+from messages import cloud, detection, detections, gnss, imu, odometry, part, pose, posed, quaternion, sent, transforms
+from recordings import definition, short_drive, write_mcap
 from rows import each
 
 from graph_slam_ros.cli import main
@@ -18,19 +18,16 @@ from graph_slam_ros.lie import se2
 from graph_slam_ros.messages.to_msg import header, make, vector
 from graph_slam_ros.recordings.bag import BagWriter
 from graph_slam_ros.runs.outcome import doubts, shortcomings
+from graph_slam_ros.tools.simulation import Drive
 
 NS = 10**9
 START_NS = 1_700_000_000 * NS
-ODOM, TF, FIX, IMU = (
-    "nav_msgs/msg/Odometry",
-    "tf2_msgs/msg/TFMessage",
-    "sensor_msgs/msg/NavSatFix",
-    "sensor_msgs/msg/Imu",
-)
+ODOM, TF, FIX = "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage", "sensor_msgs/msg/NavSatFix"
+IMU = "sensor_msgs/msg/Imu"
 DETECTIONS, CLOUD = "vision_msgs/msg/Detection3DArray", "sensor_msgs/msg/PointCloud2"
 POSE, WITH_COVARIANCE = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped"
 PLACES = {"north": (0.0, 5.0), "east": (5.0, 1.0), "south": (1.0, -4.0)}
-STEPS = 120
+STEPS, MORE = 70, 120
 
 
 def write(file, *topics, steps=STEPS):
@@ -47,31 +44,32 @@ def write(file, *topics, steps=STEPS):
     return file
 
 
-def odom(frame="odom", child="base_link", every=1, height=0.0, lag_ns=0):
+def odom(frame="odom", child="base_link", height=0.0, lag_ns=0):
+    return lambda k, ns, _, at: odometry(
+        pose(at[0], at[1], height * k, quaternion(yaw=at[2])), frame, child, ns - lag_ns
+    )
+
+
+def from_robot(truth, place):
+    return tuple(map(float, se2.act(se2.inverse(truth), place)))
+
+
+def seen(frame="base_link", lag_ns=0, unnamed=False, class_ids=False):
     def made(k, stamp_ns, truth, drifting):
-        x, y, yaw = drifting
-        at = pose(x, y, height * k, quaternion(yaw=yaw))
-        return odometry(at, frame, child, stamp_ns - lag_ns) if k % every == 0 else None
-
-    return made
-
-
-def seen(names=None, frame="base_link", lag_ns=0, class_ids=False, upside=False):
-    def made(k, stamp_ns, truth, drifting):
-        found = []
-        for name, at in PLACES.items():
-            x, y = map(float, se2.act(se2.inverse(truth), at))
-            told = name if names is None else names(name, k)
-            found.append(detection(pose(x, y), np.eye(2) * 0.01, told, class_id=name if class_ids else "kind"))
+        found = [
+            detection(pose(*from_robot(truth, at)), np.eye(2) * 0.01, "" if unnamed else name,
+                      class_id=name if class_ids else "kind")
+            for name, at in PLACES.items()
+        ]  # fmt: skip
         return detections(*found, frame=frame, stamp_ns=stamp_ns - lag_ns)
 
     return made
 
 
-def satellite(frame="gps", status=0, kind=2):
+def satellite(status=0, kind=2):
     def made(k, stamp_ns, truth, drifting):
         north, east = truth[1] / 111_200.0, truth[0] / (111_320.0 * math.cos(math.radians(48.0)))
-        fields = {"status": status, "kind": kind, "stamp_ns": stamp_ns, "frame": frame}
+        fields = {"status": status, "kind": kind, "stamp_ns": stamp_ns, "frame": "gps"}
         return gnss(48.0 + north, 11.0 + east, covariance=np.eye(3) * 0.01, **fields) if k % 5 == 0 else None
 
     return made
@@ -85,10 +83,9 @@ def compass(covariance=0.01, frame="imu_link"):
 
 def beacons(*names, frame="uwb"):
     def made(k, stamp_ns, truth, drifting):
-        layout = [(name, "u4" if name == "id" else "f8") for name in names]
-        points = []
+        layout, points = [(name, "u4" if name == "id" else "f8") for name in names], []
         for number, at in enumerate(PLACES.values()):
-            x, y = se2.act(se2.inverse(truth), at)
+            x, y = from_robot(truth, at)
             told = {"id": number, "range": math.hypot(x, y), "bearing": math.atan2(y, x), "x": x, "y": y}
             points.append(tuple(told[name] for name in names))
         return cloud(layout, *points, frame=frame, stamp_ns=stamp_ns)
@@ -110,6 +107,7 @@ SEEN = ("/tags", DETECTIONS, seen())
 def info(tmp_path, monkeypatch, capsys):
     """Of a recording of these topics: (exit code, lines, words of the command)."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("graph_slam_ros.cli.replay.draw", lambda *_: None)
 
     def said(*topics, name="drive.mcap", **options):
         (tmp_path / name).unlink(missing_ok=True)
@@ -132,27 +130,27 @@ def run(words, capsys, code=0):
 
 
 def on_tf(parent, child):
-    def made(k, stamp_ns, truth, drifting):
-        x, y, yaw = drifting
-        return transforms((parent, child, (x, y, 0.0), quaternion(yaw=yaw)), stamp_ns=stamp_ns)
-
-    return "/tf", TF, made
+    return (
+        "/tf",
+        TF,
+        lambda k, ns, _, at: transforms((parent, child, (*at[:2], 0.0), quaternion(yaw=at[2])), stamp_ns=ns),
+    )
 
 
 def posed_odometry(name, frame):
-    def made(k, stamp_ns, truth, drifting):
-        x, y, yaw = drifting
-        return posed("PoseStamped", pose(x, y, 0.02 * k, quaternion(yaw=yaw)), frame, None, stamp_ns)
+    return (
+        name,
+        POSE,
+        lambda k, ns, _, at: posed("PoseStamped", pose(*at[:2], 0.02 * k, quaternion(yaw=at[2])), frame, None, ns),
+    )
 
-    return name, POSE, made
 
-
-def tag(number, at):
-    def made(k, stamp_ns, truth, drifting):
-        x, y = map(float, se2.act(se2.inverse(truth), at))
-        return posed("PoseStamped", pose(x, y), "base_link", None, stamp_ns)
-
-    return f"/tag_{number}/pose", POSE, made
+def tag(number, place):
+    return (
+        f"/tag_{number}/pose",
+        POSE,
+        lambda k, ns, truth, _: posed("PoseStamped", pose(*from_robot(truth, place)), "base_link", None, ns),
+    )
 
 
 def static(parent):
@@ -165,8 +163,8 @@ def millimetres(k, stamp_ns, truth, drifting):
     return odometry(pose(1000 * drifting[0], 1000 * drifting[1]), "odom", "base_link", stamp_ns)
 
 
-def tags(*names, **how):
-    return "/tags", DETECTIONS, seen(*names, **how)
+def tags(**how):
+    return "/tags", DETECTIONS, seen(**how)
 
 
 EARLY = {"lag_ns": START_NS - 900 * NS}  # a simulator's clock
@@ -177,131 +175,101 @@ ESTIMATES = [
     ("/reference/pose", WITH_COVARIANCE, at("PoseWithCovarianceStamped", covariance=KNOWN)),
 ]
 SCAN = ("/scan", "sensor_msgs/msg/LaserScan", lambda k, *_: None if k else b"\0\1\0\0")
+
+
+def row(*topics, has=(), says=(), of=3):
+    """Topics, words of the command, what is said, and what a replay has: landmarks, or what is used of inputs."""
+    return topics, has, says, of
+
+
 OFFERED = {
-    "several odometries": (
-        [
-            ("/wheel/odom_raw", ODOM, odom()),
-            ("/odometry/filtered", ODOM, odom()),
-            ("/odometry/global", ODOM, odom(frame="map")),
-            ("/ground_truth/odom", ODOM, odom(frame="world")),
-            SEEN,
+    "several odometries": row(
+        *(("/wheel/odom_raw", ODOM, odom()), ("/odometry/filtered", ODOM, odom()), SEEN),
+        *(("/odometry/global", ODOM, odom(frame="map")), ("/ground_truth/odom", ODOM, odom(frame="world"))),
+        has=["/odometry/filtered"],
+        says=[
+            *("2 odometries: /odometry/filtered is chosen", "not used: /odometry/global: in frame map"),
+            *("not used: /wheel/odom_raw: another", "ground truth"),
         ],
-        ["/odometry/filtered"],
-        [
-            "2 odometries: /odometry/filtered is chosen",
-            *("not used: /odometry/global: in frame map", "not used: /wheel/odom_raw: another", "ground truth"),
-        ],
-        {"odom": STEPS},
+        of={"odom": MORE},
     ),
     **{
-        f"odometry of {frame} and {child}": (
-            [("/o", ODOM, odom(frame, child)), tags(frame=child or "base_link")],
-            [],
-            [],
-            3,
-        )
+        f"odometry of {frame} and {child}": row(("/o", ODOM, odom(frame, child)), tags(frame=child or "base_link"))
         for frame, child in (("robot1/odom", "robot1/base_footprint"), ("world", "imu"), ("", ""))
     },
-    "odometry on tf": (
-        [on_tf("odom_combined", "base_footprint"), tags(frame="base_footprint")],
-        [],
-        ["note: odometry is odom_combined -> base_footprint of /tf: there is no topic with it"],
-        3,
+    "odometry on tf": row(
+        *(on_tf("odom_combined", "base_footprint"), tags(frame="base_footprint")),
+        says=["note: odometry is odom_combined -> base_footprint of /tf: there is no topic with it"],
     ),
-    "odometry that leaves the plane": (
-        [("/odom", ODOM, odom(height=0.02)), SEEN],
-        ["world.dimensions=3"],
-        ["these are three dimensions"],
-        3,
+    "odometry that leaves the plane": row(
+        ("/odom", ODOM, odom(height=0.02)), SEEN, has=["world.dimensions=3"], says=["these are three dimensions"]
     ),
     **{
-        f"poses that are odometry by name, in {frame}": (
-            [posed_odometry(name, frame), SEEN],
-            ["odom.use=odometry", f"odom.type={POSE}", "world.dimensions=3"],
-            [f"note: odometry is {name}, poses without a child frame"],
-            3,
+        f"poses that are odometry by name, in {frame}": row(
+            *(posed_odometry(name, frame), SEEN),
+            has=["odom.use=odometry", f"odom.type={POSE}", "world.dimensions=3"],
+            says=[f"note: odometry is {name}, poses without a child frame"],
         )
         for frame, name in (("odom", "/camera/pose"), ("start", "/vio/pose"))
     },
-    "no ids": ([ODOMETRY, tags(lambda name, k: "")], ["landmarks.association=joint"], [], 3),
-    "class ids": ([ODOMETRY, tags(lambda name, k: "", class_ids=True)], ["landmarks.id_from=class_id"], [], 3),
-    "another clock": (
-        [ODOMETRY, tags(lag_ns=100 * NS)],
-        [],
-        ["another clock than odometry: 100.000 s are added"],
-        {"detections": 3 * STEPS},
+    "no ids": row(ODOMETRY, tags(unnamed=True), has=["landmarks.association=joint"]),
+    "class ids": row(ODOMETRY, tags(unnamed=True, class_ids=True), has=["landmarks.id_from=class_id"]),
+    "another clock": row(
+        *(ODOMETRY, tags(lag_ns=100 * NS)),
+        says=["another clock than odometry: 100.000 s are added"],
+        of={"detections": 3 * MORE},
     ),
-    "received at another time": ([("/odom", ODOM, odom(**EARLY)), tags(**EARLY)], [], [], 3),
-    "single tags": ([ODOMETRY, *(tag(n, where) for n, where in enumerate(PLACES.values()))], [], [], 3),
-    "odometry of a frame that is not linked": (
-        [static("robot1/base_footprint"), ("/odom", ODOM, odom(child="chassis")), tags(frame="camera")],
-        ["odom.mount=assumed"],
-        ["note: no transform links chassis, which odometry names, to robot1/base_footprint"],
-        3,
+    "received at another time": row(("/odom", ODOM, odom(**EARLY)), tags(**EARLY)),
+    "single tags": row(ODOMETRY, *(tag(n, where) for n, where in enumerate(PLACES.values()))),
+    "odometry of a frame that is not linked": row(
+        *(static("robot1/base_footprint"), ("/odom", ODOM, odom(child="chassis")), tags(frame="camera")),
+        has=["odom.mount=assumed"],
+        says=["note: no transform links chassis, which odometry names, to robot1/base_footprint"],
     ),
     **{
-        f"clouds of {' and '.join(fields)}": (
-            [ODOMETRY, ("/beacons", CLOUD, beacons(*fields, frame="base_link"))],
-            [],
-            [],
-            3,
-        )
-        for fields in (("range", "id"), ("range", "bearing", "id"), ("x", "y", "id"), ("bearing", "id"))
+        f"clouds of {fields}": row(ODOMETRY, ("/beacons", CLOUD, beacons(*fields.split(), frame="base_link")))
+        for fields in ("range id", "range bearing id", "x y id", "bearing id")
     },
-    "two robots": (
-        [
-            (f"/{robot}/{name}", kind, made)
-            for robot in ("a", "b")
-            for name, kind, made in (("odom", ODOM, odom()), ("tags", DETECTIONS, seen()))
-        ],
-        ["/a/odom", "/a/tags"],
-        ["not used: /b/tags: of the robot of /b/odom: --odom /b/odom --landmarks /b/tags"],
-        3,
+    "two robots": row(
+        *((f"/{robot}/{name}", *made) for robot in "ab" for name, made in (("odom", ODOMETRY[1:]), ("tags", SEEN[1:]))),
+        has=["/a/odom", "/a/tags"],
+        says=["not used: /b/tags: of the robot of /b/odom: --odom /b/odom --landmarks /b/tags"],
     ),
-    "an IMU that is no compass": (
-        [ODOMETRY, SEEN, ("/imu/data", IMU, compass())],
-        [],
-        ["not used: /imu/data: its heading may drift"],
-        3,
+    "an IMU that is no compass": row(
+        ODOMETRY, SEEN, ("/imu/data", IMU, compass()), says=["not used: /imu/data: its heading may drift"]
     ),
-    "an IMU alone": ([ODOMETRY, ("/imu/data", IMU, compass(frame="base_link"))], [], [], {"imu": None}),
-    "fixes": (
-        [ODOMETRY, ("/gps/fix", FIX, satellite())],
-        [],
-        ["no transform has the pose of gps", "at the base is assumed"],
-        {"gps": None},
+    "an IMU alone": row(ODOMETRY, ("/imu/data", IMU, compass(frame="base_link")), of={"imu": None}),
+    "fixes": row(
+        *(ODOMETRY, ("/gps/fix", FIX, satellite())),
+        says=["no transform has the pose of gps", "at the base is assumed"],
+        of={"gps": None},
     ),
-    "fixes of unknown noise": (
-        [ODOMETRY, ("/gps/fix", FIX, satellite(kind=0)), ("/gps2/fix", FIX, satellite(status=-1))],
-        ["gps.sigma_m=2.0"],
-        [],
-        {"gps": None},
+    "fixes of unknown noise": row(
+        *(ODOMETRY, ("/gps/fix", FIX, satellite(kind=0)), ("/gps2/fix", FIX, satellite(status=-1))),
+        has=["gps.sigma_m=2.0"],
+        of={"gps": None},
     ),
-    "poses of a station": (
-        [
-            *(ODOMETRY, *ESTIMATES),
-            ("/uwb/position", WITH_COVARIANCE, at("PoseWithCovarianceStamped", "world", KNOWN)),
-        ],
-        ["pose.topic=/uwb/position"],
-        [],
-        {"pose": None},
+    "poses of a station": row(
+        *(ODOMETRY, *ESTIMATES),
+        ("/uwb/position", WITH_COVARIANCE, at("PoseWithCovarianceStamped", "world", KNOWN)),
+        has=["pose.topic=/uwb/position"],
+        of={"pose": None},
     ),
 }
-"""Topics, words of the command, what is said, and what a replay has: landmarks, or what is used of inputs."""
+UNFIXED = ("/gps2/fix", FIX, satellite(status=-1))
 ALONE = {
-    "nothing that is read": (
-        [ODOMETRY, SCAN],
-        ["note: no input reads /scan (sensor_msgs/msg/LaserScan)", "publish them as Detection3DArray"],
+    "nothing that is read": row(
+        *(ODOMETRY, SCAN),
+        says=["note: no input reads /scan (sensor_msgs/msg/LaserScan)", "publish them as Detection3DArray"],
     ),
-    "points of a scan": ([ODOMETRY, ("/scan", CLOUD, beacons("x", "y"))], ["not used: /scan: points without ids"]),
-    "a receiver without a fix": (
-        [ODOMETRY, ("/gps2/fix", FIX, satellite(status=-1))],
-        ["not used: /gps2/fix: no message has a fix"],
+    "points of a scan": row(
+        ODOMETRY, ("/scan", CLOUD, beacons("x", "y")), says=["not used: /scan: points without ids"]
     ),
-    "estimates and the truth": ([ODOMETRY, *ESTIMATES], []),
-    "an IMU without orientation": (
-        [ODOMETRY, ("/imu/raw", IMU, compass(-1.0))],
-        [
+    "a receiver without a fix": row(ODOMETRY, UNFIXED, says=["not used: /gps2/fix: no message has a fix"]),
+    "estimates and the truth": row(ODOMETRY, *ESTIMATES),
+    "an IMU without orientation": row(
+        *(ODOMETRY, ("/imu/raw", IMU, compass(-1.0))),
+        says=[
             "not used: /imu/raw: it has no orientation",
             "--set imu.topic=/imu/raw --set 'imu.mount=0 0 0 0 0 0' --set imu.use=gyro",
         ],
@@ -332,7 +300,7 @@ def one_line(lines):
 @each("case", OFFERED)
 def test_what_is_offered_works_as_it_is_pasted(info, capsys, case):
     topics, has, says, expected = OFFERED[case]
-    code, lines, words = info(*topics)
+    code, lines, words = info(*topics, steps=STEPS if isinstance(expected, int) else MORE)
     assert code == 0
     assert set(has) <= set(words)
     assert all(text in one_line(lines) for text in says), lines
@@ -347,7 +315,7 @@ def test_what_is_offered_works_as_it_is_pasted(info, capsys, case):
 
 @each("case", ALONE)
 def test_what_is_not_offered_is_named_and_odometry_alone_is_no_result(info, capsys, case):
-    topics, says = ALONE[case]
+    topics, _, says, _ = ALONE[case]
     code, lines, words = info(*topics)
     assert code == 0
     assert not any(word.startswith(("pose.", "imu.", "gps.")) for word in words)
@@ -390,12 +358,13 @@ def test_the_gyro_of_an_imu_is_offered_as_a_part_of_odometry(info, capsys):
 
 def test_corners_without_poses_are_named_with_what_makes_poses_of_them(tmp_path, capsys):
     name = "apriltag_msgs/msg/AprilTagDetectionArray"
-    _, _, encoded = recorded(name, DEFINITIONS[name])
-    corners = encoded(header=header(START_NS, "camera"), detections=[])
-    sent = [("/odom", START_NS, odometry(stamp_ns=START_NS)), ("/tags", START_NS, corners)]
+    corners = sent(name, header=header(START_NS, "camera"))
     file = write_mcap(
         tmp_path / "a.mcap",
-        [SimpleNamespace(topic=topic, log_ns=stamp_ns, cdr=cdr) for topic, stamp_ns, cdr in sent],
+        [
+            SimpleNamespace(topic=topic, log_ns=START_NS, cdr=cdr)
+            for topic, cdr in (("/odom", odometry(stamp_ns=START_NS)), ("/tags", corners))
+        ],
         types={"/odom": ODOM, "/tags": name},
         text=lambda type_name: DEFINITIONS.get(type_name) or definition(type_name),
     )
@@ -408,43 +377,30 @@ def test_corners_without_poses_are_named_with_what_makes_poses_of_them(tmp_path,
 def test_tags_of_packages_that_need_not_be_there_are_offered_and_a_map_of_them_is_not(tmp_path, monkeypatch, capsys):
     markers, fiducials = "aruco_markers_msgs/msg/MarkerArray", "fiducial_msgs/msg/FiducialTransformArray"
     fiducial_map = "fiducial_msgs/msg/FiducialMapEntryArray"
-    (_, marker, markers_cdr), (_, fiducial, fiducials_cdr) = (recorded(t, DEFINITIONS[t]) for t in (markers, fiducials))
-    sent, truth = [], se2.IDENTITY
+    written, truth = [], se2.IDENTITY
     for k in range(STEPS):
         stamp_ns = START_NS + k * NS // 10
         head, late = header(stamp_ns, "base_link"), header(stamp_ns + NS // 20, "base_link")
-        seen = [pose(*se2.act(se2.inverse(truth), at)) for at in PLACES.values()]
-        poses = [make("geometry_msgs/msg/PoseStamped", header=head, pose=at) for at in seen]
-        moves = [
-            make("geometry_msgs/msg/Transform", translation=vector(at.position.x, at.position.y, 0.0),
-                 rotation=at.orientation)
-            for at in seen
-        ]  # fmt: skip
-        unused = {"image_error": 0.5, "object_error": 0.01, "fiducial_area": 900.0}
-        of_markers = [
-            marker("aruco_markers_msgs/msg/Marker", header=head, id=number, pose=at, pixel_x=0.0, pixel_y=0.0)
-            for number, at in enumerate(poses)
-        ]
-        of_fiducials = [
-            fiducial("fiducial_msgs/msg/FiducialTransform", fiducial_id=100 + number, transform=at, **unused)
-            for number, at in enumerate(moves)
-        ]
-        sent += [
-            ("/odom", stamp_ns, odom()(k, stamp_ns, truth, truth)),
-            ("/aruco/markers", stamp_ns, markers_cdr(header=late, markers=of_markers)),
-            ("/fiducial_transforms", stamp_ns, fiducials_cdr(header=head, image_seq=k, transforms=of_fiducials)),
-            ("/fiducial_map", stamp_ns, b"\0\1\0\0\0\0\0\0"),
-        ]
+        of_markers, of_fiducials = [], []
+        for number, place in enumerate(PLACES.values()):
+            at = pose(*se2.act(se2.inverse(truth), place))
+            stamped, p = make("geometry_msgs/msg/PoseStamped", header=head, pose=at), at.position
+            moved = make("geometry_msgs/msg/Transform", translation=vector(p.x, p.y, 0.0), rotation=at.orientation)
+            of_markers.append(part("aruco_markers_msgs/msg/Marker", header=head, id=number, pose=stamped))
+            fiducial = {"fiducial_id": 100 + number, "transform": moved, "object_error": 0.01, "fiducial_area": 900.0}
+            of_fiducials.append(part("fiducial_msgs/msg/FiducialTransform", **fiducial))
+        for topic, cdr in (
+            ("/odom", odom()(k, stamp_ns, truth, truth)),
+            ("/aruco/markers", sent(markers, header=late, markers=of_markers)),
+            ("/fiducial_transforms", sent(fiducials, header=head, image_seq=k, transforms=of_fiducials)),
+            ("/fiducial_map", b"\0\1\0\0\0\0\0\0"),
+        ):
+            written.append(SimpleNamespace(topic=topic, log_ns=stamp_ns, cdr=cdr))
         truth = se2.compose(truth, (0.2, 0.0, 0.05))
     write_mcap(
         tmp_path / "a.mcap",
-        [SimpleNamespace(topic=topic, log_ns=stamp_ns, cdr=cdr) for topic, stamp_ns, cdr in sent],
-        types={
-            "/odom": ODOM,
-            "/aruco/markers": markers,
-            "/fiducial_transforms": fiducials,
-            "/fiducial_map": fiducial_map,
-        },
+        written,
+        types=dict(zip((m.topic for m in written), (ODOM, markers, fiducials, fiducial_map), strict=False)),
         text=lambda name: "int32[] fiducials\n" if name == fiducial_map else DEFINITIONS.get(name) or definition(name),
     )
     monkeypatch.chdir(tmp_path)
@@ -456,9 +412,6 @@ def test_tags_of_packages_that_need_not_be_there_are_offered_and_a_map_of_them_i
     assert [told["inputs"][name]["believed"] for name in ("tags", "tags_2")] == [3 * STEPS, 3 * STEPS]
 
 
-# -- the command -------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", ["a b's $drive.mcap", "-x.mcap", "drive.mcap"])
 def test_the_command_can_be_pasted_whatever_the_recording_is_called_and_names_a_folder_after_it(info, name, capsys):
     Path("drive_run").mkdir()
@@ -467,9 +420,6 @@ def test_the_command_can_be_pasted_whatever_the_recording_is_called_and_names_a_
     words = shlex.split(capsys.readouterr().out.splitlines()[-1])
     assert words[-1] == {"drive.mcap": "drive_run_2", "-x.mcap": "x_run"}.get(name, "a_b_s_drive_run")
     run(words, capsys)
-
-
-# -- loud results ------------------------------------------------------------------------------------------------------
 
 
 def test_a_replay_ends_with_a_table_of_its_inputs_and_the_lines_that_mend_them(info, capsys):
@@ -511,7 +461,26 @@ def test_an_input_that_is_mostly_not_believed_is_said():
 
 
 def test_odometry_that_keeps_jumping_is_said(info, capsys):
-    _, _, words = info(("/odom", ODOM, millimetres), SEEN)
+    _, _, words = info(("/odom", ODOM, millimetres), SEEN, steps=MORE)
     told, _, err = run(words, capsys, code=3)
     assert f"odom: {told['counters']['odom']['jump']} jumps, each begins a segment" in err
     assert "metres and radians?" in err
+
+
+def test_poses_are_fixes_with_the_settings_that_info_prints(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("graph_slam_ros.cli.replay.draw", lambda *_: None)
+    drive, file = Drive(short_drive(tmp_path / "drive.mcap")), tmp_path / "poses.mcap"
+    for m in drive.messages:
+        m.topic = "/total_station" if m.topic == "/ground_truth" else m.topic
+    drive.write(file)
+    assert main(["info", str(file)]) == 0
+    out = capsys.readouterr().out
+    told = " ".join(out.split()).partition("a pose may be an estimate or the truth; as a fix: ")[2]
+    words = shlex.split(told)
+    settings = [word for word, before in zip(words[1:], words[:-1], strict=True) if before == "--set"][:5]
+    assert settings[0] == "inputs.names=odom detections pose"
+    command = shlex.split(next(line for line in out.splitlines() if line.startswith("graph_slam replay")))[1:]
+    chosen = [word for setting in settings for word in ("--set", setting)]
+    assert main([*command[:-1], str(tmp_path / "run"), *chosen]) == 0
+    (used,) = (line.split() for line in capsys.readouterr().out.splitlines() if line.startswith("pose "))
+    assert int(used[2]) > 50 and used[-1] == "0"

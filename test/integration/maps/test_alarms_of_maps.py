@@ -34,9 +34,6 @@ def test_a_run_that_begins_in_a_map_has_the_alarms_of_the_map_and_so_have_its_co
     assert recover(run, tmp_path / "recovered")["displacements"] == [TOLD]
     assert complete(tmp_path / "recovered")["displacements"] == [TOLD]
     assert freeze(run, tmp_path / "frozen")["displacements"] == [TOLD]
-
-
-def test_an_edited_map_has_the_alarms_of_the_map(run, tmp_path):
     edited = tmp_path / "edited"
     assert edit_run(run, [EDIT | {"to": "other"}], edited).summary["displacements"] == [TOLD]
     assert map_of(edited, []).displacements == [TOLD]

@@ -11,12 +11,9 @@ from condensed_run import KEYFRAMES, SEED, bounded, condensed_run
 from reliability import times
 
 from benchmarks.hall import hall, measurements, rms
-from graph_slam_ros.analysis.run_consistency import consistency_of
-from graph_slam_ros.analysis.trajectories import Truth
 from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.errors import FormatError, GraphSlamError
 from graph_slam_ros.graph.place import LABEL as PLACES
-from graph_slam_ros.lie import se3
 from graph_slam_ros.maps.edit import Plan, edit_run, plan_text, source_hash
 from graph_slam_ros.maps.merge import merge
 from graph_slam_ros.measurements.edits import edit_of
@@ -25,7 +22,7 @@ from graph_slam_ros.runs.folder import run_config, summary_of
 from graph_slam_ros.runs.journal import read_measurements
 from graph_slam_ros.runs.map_journal import read_map
 from graph_slam_ros.runs.restore import freeze, record_run, recover
-from graph_slam_ros.runs.trajectory import Trajectory, read_tum
+from graph_slam_ros.runs.trajectory import read_tum
 from graph_slam_ros.slam import Sightings
 from graph_slam_ros.tools.report.contents import read_contents
 from graph_slam_ros.tools.view.workbench import Workbench
@@ -60,8 +57,8 @@ def positions(folder):
 def test_what_was_condensed_counts_as_believed(run, tmp_path):
     folder, slam, summary = run
     assert slam.first_keyframe > 200
-    told, drive = summary["inputs"]["landmarks"], measurements(hall(SEED, KEYFRAMES))
-    seen = sum(len(m.sightings) for m in drive if isinstance(m, Sightings))
+    told = summary["inputs"]["landmarks"]
+    seen = sum(len(m.sightings) for m in measurements(hall(SEED, KEYFRAMES)) if isinstance(m, Sightings))
     assert (told["used"], told["believed"]) == (seen, seen - 1), "one is an outlier"
     assert list(outcome.shortcomings(summary)) == list(outcome.doubts(summary)) == []
     again = recover(folder, tmp_path / "again")
@@ -119,19 +116,11 @@ def test_where_what_was_condensed_is_lost_an_edit_names_the_run_and_writes_nothi
     assert not (tmp_path / "edited").exists()
 
 
-@pytest.mark.parametrize(
-    "edit",
-    [
-        {"do": "remove_edge", "edge": 5},
-        {"do": "add_closure", "from_keyframe": 5, "to_keyframe": KEYFRAMES - 1, "pose": [0.0, 0.0, 0.0]}
-        | {"sigma_m": 1.0, "sigma_rad": 1.0},
-        {"do": "remove_landmark", "landmark": "m0"},
-    ],
-    ids=lambda edit: edit["do"],
-)
-def test_what_is_condensed_is_refused_with_the_command_that_makes_the_whole_map(run, tmp_path, edit):
-    with pytest.raises(GraphSlamError, match=r"it is condensed.*map\.condense=false"):
-        edit_run(run[0], [{"name": "one", **edit, **BASE}], tmp_path / "edited")
+def test_what_is_condensed_is_refused_with_the_command_that_makes_the_whole_map(run, tmp_path):
+    ends = {"from_keyframe": 5, "to_keyframe": KEYFRAMES - 1, "pose": [0.0, 0.0, 0.0], "sigma_m": 1.0, "sigma_rad": 1.0}
+    for edit in ({"do": "remove_edge", "edge": 5}, {"do": "add_closure", **ends}):
+        with pytest.raises(GraphSlamError, match=r"it is condensed.*map\.condense=false"):
+            edit_run(run[0], [{"name": "one", **edit, **BASE}], tmp_path / "edited")
     assert not (tmp_path / "edited").exists()
 
 
@@ -148,73 +137,63 @@ def test_the_page_that_edits_has_the_whole_path_of_each_answer(run, saved, work)
     assert all(before != after for _, before, after in tried["changes"])
 
 
-FIRST, BOTH = times((400, 800), (600, 1000))
+DUE = 200
+FIRST, BOTH = times((300, 600), (600, 1000))
 
 
-@pytest.fixture(scope="module")
-def two():
-    """Two drives in one hall, by name: A and B, condensed (in lower case) and not."""
-    of = {"a": {"last": FIRST}, "b": {"first": FIRST, "last": BOTH}}
-    names = {name: name.islower() for name in "AaBb"}
-    return {name: condensed_run(of=BOTH, condense=is_, **of[name.lower()])[0] for name, is_ in names.items()}
+def drive(name):
+    """The run of one of two drives in one hall, by name: A and B, condensed (in lower case) and not."""
+    of = {"a": {"last": FIRST}, "b": {"first": FIRST, "last": BOTH}}[name.lower()]
+    return condensed_run(of=BOTH, condense=name.islower(), **of)[0]
 
 
 @pytest.mark.parametrize("names", times(["ab"], ["aB", "ab"]))
-def test_merged_they_are_as_good_as_two_maps_of_all_keyframes(two, tmp_path, names):
-    merge(two["A"], two["B"], tmp_path / "whole")
-    done = merge(two[names[0]], two[names[1]], tmp_path / "both")
+def test_merged_they_are_as_good_as_two_maps_of_all_keyframes(tmp_path, names):
+    done = merge(drive(names[0]), drive(names[1]), tmp_path / "both")
     assert done.is_repeated is names[1].islower()
     true = np.array([pose[:2] for pose in hall(SEED, BOTH).poses[:BOTH]])
-    errors = [rms(positions(tmp_path / name), true) for name in ("whole", "both")]
-    assert errors[1] < 2.0 * errors[0] < 0.1  # the path of what was condensed moves rigidly with its base
+    error = rms(positions(tmp_path / "both"), true)
+    assert error < 0.1  # the path of what was condensed moves rigidly with its base
+    if times(False, True):
+        merge(drive("A"), drive("B"), tmp_path / "whole")
+        assert error < 2.0 * rms(positions(tmp_path / "whole"), true) < 0.1
     assert (done.losses, done.left_out, done.summary["keyframes"]) == ([], {}, BOTH)
     assert done.summary["inputs"]["landmarks"]["believed"] == done.summary["inputs"]["landmarks"]["used"]
     saved = SavedGraph(tmp_path / "both", [])
     assert saved.slam.first_keyframe > BOTH - 200, "the merged map condenses as the first did"
     assert len(saved.slam.drives) == 2
     with pytest.raises(GraphSlamError, match="are of the same drive"):
-        merge(tmp_path / "both", two[names[0]], tmp_path / "again")
+        merge(tmp_path / "both", drive(names[0]), tmp_path / "again")
     frozen = freeze(tmp_path / "both", tmp_path / "frozen")
     assert frozen["keyframes"] == BOTH
     assert positions(tmp_path / "frozen") == pytest.approx(positions(tmp_path / "both"), abs=1e-3)
 
 
-def test_a_drive_that_began_in_a_condensed_map_cannot_be_the_second(two, tmp_path):
-    freeze(two["a"], tmp_path / "site")
+def test_a_drive_that_began_in_a_condensed_map_cannot_be_the_second(tmp_path):
+    freeze(drive("a"), tmp_path / "site")
     with pytest.raises(GraphSlamError, match=r"site: it began in a map with condensed visits"):
-        merge(two["B"], tmp_path / "site", tmp_path / "both")
+        merge(drive("b"), tmp_path / "site", tmp_path / "both")
     assert not (tmp_path / "both").exists()
 
 
-def test_what_is_due_to_be_condensed_is_not_lost_when_the_map_is_frozen(two, tmp_path):
+def test_what_is_due_to_be_condensed_is_not_lost_when_the_map_is_frozen(tmp_path):
     """A map of all keyframes, in a folder whose configuration says that visits are condensed."""
-    folder = shutil.copytree(two["A"], tmp_path / "due")
+    folder = shutil.copytree(condensed_run(DUE, condense=False)[0], tmp_path / "due")
     text = (folder / "config.yaml").read_text()
     assert "condense: true" in text
     (folder / "config.yaml").write_text(re.sub(r"window_keyframes: \d+", "window_keyframes: 60", text))
     freeze(folder, tmp_path / "frozen")
-    assert len(positions(tmp_path / "frozen")) == FIRST
-    assert len(SavedGraph(tmp_path / "frozen", []).whole_path.stamps_ns) == FIRST
+    assert len(positions(tmp_path / "frozen")) == DUE
+    assert len(SavedGraph(tmp_path / "frozen", []).whole_path.stamps_ns) == DUE
     assert run_config(tmp_path / "frozen").map.condense
 
 
-def test_errors_are_compared_with_the_sigmas_of_what_is_in_the_graph(run):
-    folder, slam, _ = run
-    path = read_tum(folder / "path.tum")
-    truth = Trajectory(path.stamps_s, se3.in_space(np.array(hall(SEED, KEYFRAMES).poses[:KEYFRAMES])))
-    found = consistency_of(folder, Truth(truth, {}), slice(None), is_first=True)
-    assert found.frame.endswith("the first in the graph with a true pose")
-    assert len(slam.keyframes.ids) < found.poses.n < 0.6 * KEYFRAMES
-    assert 0.3 * found.poses.dof < found.poses.mean < 3.0 * found.poses.dof
-
-
 @pytest.mark.parametrize(("name", "localize"), times([("a", False)], [("A", True), ("a", False)]))
-def test_a_drive_in_a_frozen_map_is_condensed_and_the_map_stays(two, tmp_path, name, localize):
-    freeze(two[name], tmp_path / "site")
+def test_a_drive_in_a_frozen_map_is_condensed_and_the_map_stays(tmp_path, name, localize):
+    freeze(drive(name), tmp_path / "site")
     before = SavedGraph(tmp_path / "site", [])
-    settings = bounded(map_localize=localize)
-    drive = [*read_measurements(two["B"], [])]
-    slam, _ = record_run(tmp_path / "on", settings, drive, [], read_map(tmp_path / "site", []))
+    settings, measured = bounded(map_localize=localize), read_measurements(drive("b"), [])
+    slam, _ = record_run(tmp_path / "on", settings, measured, [], read_map(tmp_path / "site", []))
     assert slam.first_keyframe > FIRST + 50
     true = np.array([pose[:2] for pose in hall(SEED, BOTH).poses[FIRST:BOTH]])
     assert rms(positions(tmp_path / "on")[FIRST:], true) < 0.1

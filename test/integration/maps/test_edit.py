@@ -6,7 +6,6 @@ import json
 import numpy as np
 import pytest
 import small_drive
-from faulty import faulty_run
 from rows import each
 
 from graph_slam_ros import cli, replay
@@ -55,9 +54,6 @@ def applied(run, folder, *edits):
     """A map before and after a plan."""
     edit_run(run, edits, folder / "new")
     return restored(run, []), restored(folder / "new", [])
-
-
-# -- what each one does ------------------------------------------------------------------------------------------------
 
 
 def test_a_closure_by_hand_is_in_and_pulls_as_its_sigmas_say(either, tmp_path):
@@ -117,32 +113,6 @@ def test_a_landmark_is_split_by_edges_or_by_keyframes_and_merged_again(either, t
     assert merged.trajectory() == pytest.approx(before.trajectory(), abs=1e-4)
     assert merged.landmarks.keys() == before.landmarks.keys()
     assert merged.landmarks["0"].sightings == len(edges)
-
-
-@pytest.fixture(scope="module")
-def faulty(tmp_path_factory):
-    """A run with false closures and wrong identities; edits of closures that are in and out."""
-    run = faulty_run(tmp_path_factory.mktemp("faulty"))[1]
-    entries = read_ledger(run)
-    inside, outside = (next(e.edge for e in entries if e.label == "closures" and e.is_in is w) for w in (True, False))
-    return run, [
-        one("remove_edge", edge=inside),
-        one("let_in_edge", edge=outside),
-    ]
-
-
-@pytest.mark.parametrize("number", [0, 1])
-def test_an_edge_that_is_out_or_in_by_hand_is_as_in_a_graph_that_was_solved_so(number, faulty, tmp_path):
-    run, edits = faulty
-    saved, edge = SavedGraph(run, []), edits[number]["edge"]
-    _, slam = applied(run, tmp_path, edits[number])
-    changed = [e for e in saved.entries if e.is_in != slam.ledger.is_inside(e.edge) and e.verdict and e.edge != edge]
-    out, back = ([e.edge for e in changed if e.is_in is was] for was in (True, False))  # by the second look
-    solver = saved.solve(without=[edge, *out], let_in=back) if number == 0 else saved.solve(out, [edge, *back])
-    assert np.abs(solver.estimate(saved.keyframes) - slam.trajectory()).max() < 0.02
-
-
-# -- what is made of an edited map -------------------------------------------------------------------------------------
 
 
 def all_edits(run):
@@ -250,8 +220,6 @@ def test_a_robot_that_goes_on_in_the_map_keeps_every_edit(edited, tmp_path):
     assert tuple(restored(tmp_path / "on", []).trajectory()[-1]) == pytest.approx(last, abs=1e-6)
 
 
-# -- what cannot be done -----------------------------------------------------------------------------------------------
-
 MOVE = {"pose": [0.0] * 6 + [1.0], **EXACT}
 REFUSED = [
     (one("remove_edge", edge=999999), "edit remove_edge (edge 999999): it is not in the graph"),
@@ -321,9 +289,6 @@ def test_an_edge_in_by_hand_that_all_else_contradicts_is_warned_of(run, tmp_path
     lamp = next(e.edge for e in read_ledger(tmp_path / "lamp") if e.landmark == "lamp")
     (alone,) = edit_run(tmp_path / "lamp", [one("let_in_edge", edge=lamp)]).by_hand
     assert "nothing else determines what it is between" in alone.text
-
-
-# -- the command -------------------------------------------------------------------------------------------------------
 
 
 def planned(run, folder, *edits):

@@ -7,7 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from driven import drive, seldom, with_a_wrong_sighting
+from driven import drive, seldom
 from reliability import times
 
 from graph_slam_ros import cli, read_g2o
@@ -20,15 +20,12 @@ from graph_slam_ros.runs.recorder import RunRecorder
 from graph_slam_ros.runs.restore import map_of, restored
 from graph_slam_ros.slam import Config, Control, GraphSlam, Sightings
 from graph_slam_ros.tools import simulation
-from graph_slam_ros.tools.simulation import simulate, with_closures
+from graph_slam_ros.tools.simulation import simulate
 
 SOAK = pytest.mark.skipif(not times(0, 1), reason="only in make soak")
-
-
 RECORDED = ("graph.g2o", "ledger.csv", "ledger_changes.csv", "path.tum", "landmarks.csv", "covariances.csv")
 ELSEWHERE = Config.from_mapping({"anchor.pose": "30 -20 2"})  # its map lies otherwise
 FLIGHT = Config.from_mapping({"world.dimensions": 3})
-ANONYMOUS = Config.from_mapping({"landmarks.association": "joint"})
 
 
 @cache
@@ -106,9 +103,6 @@ def assert_repeated(folder, again):
         assert (folder / name).read_bytes() == (again / name).read_bytes(), name
 
 
-# -- export ------------------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def cut_off(tmp_path_factory):
     """A run that nobody ended, and its pipeline."""
@@ -143,24 +137,6 @@ def test_export_as_messages_has_every_pose_at_its_stamp(cut_off, tmp_path):
     assert len(next(iter(bag.messages({"/landmarks_estimate"}))).cdr) > 100 * len(slam.landmarks)
 
 
-def test_export_of_a_map_that_is_cut_is_of_what_is_left_and_tells(cut_off, tmp_path, capsys):
-    folder, slam = cut_off
-    shutil.copytree(folder, tmp_path / "run")
-    expected = slam.keyframes.stamps_ns.tolist()
-
-    def exported_after_a_cut_of(name):
-        whole = (folder / name).read_bytes()
-        (tmp_path / "run" / name).write_bytes(whole[: len(whole) // 2])
-        assert run("map", "export", tmp_path / "run", "--out", tmp_path / "path.tum", "--force") == 3
-        assert f"{name}: cut off" in capsys.readouterr().err
-        return [int(line.split()[0].replace(".", "")) for line in (tmp_path / "path.tum").read_text().splitlines()]
-
-    assert exported_after_a_cut_of("map.mcap") == expected, "the rest is made from the journal"
-    left = exported_after_a_cut_of("ingest.mcap")
-    assert 10 < len(left) < len(expected)
-    assert left == expected[: len(left)]
-
-
 def test_export_refuses_in_one_line(made, tmp_path, capsys):
     whole, another = made("first"), tmp_path / "another"
     shutil.copytree(whole, another)
@@ -175,9 +151,6 @@ def test_export_refuses_in_one_line(made, tmp_path, capsys):
         assert run("map", "export", *words) == 2
         assert len(capsys.readouterr().err.splitlines()) == 1
     assert (whole / "path.tum").read_bytes() == before
-
-
-# -- diff --------------------------------------------------------------------------------------------------------------
 
 
 def farther(name, by_m):
@@ -215,20 +188,6 @@ def test_diff_finds_the_landmark_that_was_moved_and_what_is_only_in_one(made, tm
     assert f"only in A  landmark {gone}" in out
     assert f"moved      landmark {other}" in out
     assert out.splitlines()[-2] == "they differ"
-
-
-def test_diff_tells_verdicts_on_the_same_measurement(tmp_path, capsys):
-    for name, decides in (("a", True), ("b", False)):
-        config = Config.from_mapping({"robust.decide": decides})
-        ended(tmp_path / name, with_a_wrong_sighting(drive_past(0)), config)
-    code, found = told(capsys, "map", "diff", tmp_path / "a", tmp_path / "b", "--json")
-    assert code == 4
-    (wrong,) = (one for one in found["verdicts"] if one["verdict_a"] in ("pending", "rejected"))
-    assert wrong["about"].startswith("landmarks ")
-    assert wrong["verdict_b"] == "accepted"
-
-
-# -- merge -------------------------------------------------------------------------------------------------------------
 
 
 def rmse(slam, *recordings):
@@ -285,26 +244,6 @@ def test_merge_leaves_out_what_has_moved_and_tells(made, tmp_path, capsys):
 
 
 @SOAK
-def test_merge_of_unnamed_landmarks_keeps_them_apart(tmp_path):
-    runs = tmp_path / "a", tmp_path / "b"
-    for folder, seed in zip(runs, (0, 5), strict=True):
-        world = measurements(recording(seed, sensor="position"))
-        half = seeing(world, lambda several: [replace(s, id=s.id * (sum(map(ord, s.id)) % 2)) for s in several])
-        ended(folder, half, ANONYMOUS)
-    assert run("map", "merge", *runs, "--out", tmp_path / "out") == 0
-    start = read_map(tmp_path / "out", [], start_only=True)
-    maps = (restored(folder, []) for folder in runs)
-    unnamed = [sum(mark.is_unnamed for mark in slam.touched_landmarks(0).values()) for slam in maps]
-    assert min(unnamed) > 3
-    assert sum(mark.is_unnamed for mark in start.landmarks.values()) == sum(unnamed)
-    for mark in start.landmarks.values():
-        for one in mark.seen:
-            assert start.graph.edge(one.edge).vertices == (one.where.vertex, mark.vertex)
-            assert start.keyframes[one.where.keyframe].vertex == one.where.vertex
-    assert_repeated(tmp_path / "out", tmp_path / "again")
-
-
-@SOAK
 def test_merge_in_space(tmp_path):
     flights, runs = [simulate("flight", seed, laps=1) for seed in (0, 3)], (tmp_path / "0", tmp_path / "1")
     one, two = (ended(out, measurements(flight), FLIGHT) for out, flight in zip(runs, flights, strict=True))
@@ -345,9 +284,6 @@ def test_merge_and_diff_refuse_in_one_line(made, tmp_path, capsys):
     assert run("map", "diff", first, tmp_path / "flight") == 2
     assert "world.dimensions" in capsys.readouterr().err
     assert run("map", "diff", tmp_path / "flight", tmp_path / "flight") == 0
-
-
-# -- freeze ------------------------------------------------------------------------------------------------------------
 
 
 def assert_untouched(slam, source):
@@ -397,18 +333,6 @@ def test_new_landmarks_are_added_to_a_frozen_map(tmp_path):
     assert all(np.trace(slam.solver.marginal([slam.landmarks[name].vertex])[0]) > 0.0 for name in new)
 
 
-def test_what_is_wrong_moves_neither_a_frozen_map_nor_the_robot_in_it(made, tmp_path):
-    right, world = restored(made("in_frozen"), []), drive_past(5)
-    slam = ended(tmp_path / "wrong", with_a_wrong_sighting(world, len(world) // 2), source=made("frozen"))
-    assert_untouched(slam, made("frozen"))
-    assert slam.ledger.outside_count == right.ledger.outside_count + 1
-    stamps = (one.keyframes.stamps_ns[one.segments[1] :] for one in (slam, right))
-    _, k, m = np.intersect1d(*stamps, return_indices=True)
-    there, here = (one.trajectory()[one.segments[1] :][i] for one, i in ((slam, k), (right, m)))
-    assert len(k) > 100
-    assert there[:, :2] == pytest.approx(here[:, :2], abs=0.05)
-
-
 def test_a_run_in_a_frozen_map_that_was_cut_off_is_taken_up_with_it_frozen(made, tmp_path):
     frozen, world = made("frozen"), drive_past(5)
     drive(tmp_path / "run", run_config(frozen), world[: len(world) // 2], map_of(frozen, []))
@@ -418,29 +342,3 @@ def test_a_run_in_a_frozen_map_that_was_cut_off_is_taken_up_with_it_frozen(made,
     assert_untouched(slam, frozen)
     assert run("map", "merge", frozen, made("second"), "--out", tmp_path / "merged") == 0
     assert_untouched(restored(tmp_path / "merged", []), frozen)
-
-
-@SOAK
-def test_without_names_and_with_closures_a_frozen_map_stays_and_so_do_classes(tmp_path):
-    def classed(several):
-        return [replace(s, id="", sort=s.id.rstrip("0123456789ewns")) for s in several]
-
-    def sorts(folder):
-        return {name: mark.sort for name, mark in read_map(folder, []).landmarks.items()}
-
-    one, two = (with_closures(recording(seed, laps=2, sensor="position"), 60, seed // 5) for seed in (0, 5))
-    ended(tmp_path / "run", seeing(measurements(one), classed), ANONYMOUS)
-    assert run("map", "freeze", tmp_path / "run", "--out", tmp_path / "frozen") == 0
-    world = [*seeing(measurements(two), classed), Control("clear_closures")]
-    slam = ended(tmp_path / "more", world, source=tmp_path / "frozen")
-    assert_untouched(slam, tmp_path / "frozen")
-    closures = slam.graph.edges_of("closures")
-    is_ours = closures < slam.ledger.final
-    assert is_ours.any()
-    assert not is_ours.all()
-    assert not any(slam.ledger.is_withdrawn(edge) for edge in closures[is_ours].tolist())
-    assert all(slam.ledger.is_withdrawn(edge) for edge in closures[~is_ours].tolist())
-    assert not any(mark.is_tentative for mark in read_map(tmp_path / "frozen", []).landmarks.values())
-    saved = sorts(tmp_path / "frozen")
-    assert set(saved.values()) == {"rack", "wall"}
-    assert saved.items() <= sorts(tmp_path / "run").items() & sorts(tmp_path / "more").items()

@@ -3,10 +3,8 @@
 import functools
 import math
 from dataclasses import fields, is_dataclass
-from types import SimpleNamespace
 
 import numpy as np
-from foreign import DEFINITIONS
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from messages import CLOUD, DECODERS, STAMP_NS, STORE, cloud, counted, listening, part, quaternion, transforms
@@ -16,7 +14,6 @@ from rows import each
 
 from graph_slam_ros.measurements.types import to_record
 from graph_slam_ros.messages.inputs import CONVERTERS
-from graph_slam_ros.messages.inputs.landmark_types import LANDMARK_TYPES, fields_used
 
 S = 1_000_000_000
 FRAMES = {  # those that make sense where a message is used so, and those of what it tells of
@@ -26,20 +23,7 @@ FRAMES = {  # those that make sense where a message is used so, and those of wha
     "landmarks": (("base_link", "mast", "turret", "odom"), ("tag1", "tag2", "tag3", "hand")),
     "closure": (("base_link", "mast", "turret"), ("base_link",)),
 }
-WILD_TEXTS = (
-    "",
-    "nowhere",
-    "map",
-    "base_link",
-    "/base_link",
-    "/",
-    "tag2",
-    "ä" * 100,
-    "\n",
-    str(STAMP_NS),
-    "nan",
-    "9" * 30,
-)
+WILD_TEXTS = ("", "nowhere", "map", "base_link", "/base_link", "/", "tag2", "ä" * 100, "\n", "nan", "9" * 30)
 WILD_NUMBERS = math.nan, math.inf, -math.inf, 0.0, -1.0, 5e-324, 1e-300, 1e9, 1e154, 1.7e308, -1.7e308
 LINKS = (
     ("base_link", "mast", (0.2, 0.0, 1.0), quaternion(0.1, 0.2, 0.3)),
@@ -204,29 +188,3 @@ def test_whatever_comes_is_used_or_counted_and_nothing_is_raised(type_name, use,
     assert found.count("accepted")
     assert found.count("rejected")
     tell("messages", tried=len(found), rejected=found.count("rejected"), failed=0)
-
-
-def only_used(name, message, used):
-    """A message with no other fields than those that its row names."""
-    described, out = dict(STORE.fielddefs[name][1]), {}
-    for field in used.get(name, " ".join(described)).split():
-        (kind, of), value = described[field], getattr(message, field)
-        if kind == Nodetype.NAME:
-            value = only_used(of, value, used)
-        elif kind in (Nodetype.ARRAY, Nodetype.SEQUENCE) and of[0][0] == Nodetype.NAME:
-            value = [only_used(of[0][1], one, used) for one in value]
-        out[field] = value
-    return SimpleNamespace(**out)
-
-
-@each("type_name", LANDMARK_TYPES)
-def test_a_type_of_landmarks_is_read_by_no_other_fields_than_its_row_names(type_name):
-    assert type_name in DEFINITIONS, "test/foreign.py has the recorded definition of each"
-    sender, found = Sender(0, "landmarks"), 0
-    tags = [f"{family}:{number}" for family in sender.texts for number in range(4)]  # whose poses are on /tf alone
-    links = [("base_link", frame, (1.0, 0.0, 0.0), quaternion()) for frame in ("mast", "turret", *tags)]
-    for _ in range(10):
-        message = only_used(type_name, sender.message(type_name, 3), fields_used())
-        b = listening("any", type_name, *links, decoders={type_name: lambda cdr, m=message: m})
-        found += len(b.convert("any", b""))
-    assert found

@@ -2,7 +2,6 @@
 
 import re
 import sys
-from types import SimpleNamespace
 
 import pytest
 from beacons import BEACONS, TYPE, recording
@@ -113,23 +112,6 @@ def test_what_a_plugin_fails_at_is_counted_and_named_once_and_other_inputs_go_on
     (told,) = [text for text in done.warnings if "plugin my_beacons" in text]
     assert re.match(rf"radio: plugin my_beacons:BEACONS of my-beacons 1.0:? {line}", told)
     assert "\n" not in told
-
-
-def test_a_measurement_that_the_journal_cannot_keep_or_of_another_input_is_a_fault(install):
-    imports = "import numpy as np\nfrom graph_slam_ros.measurements.types import Fix\n"
-    for fix, line in (
-        ("Fix(9, source.name, 'position', np.zeros(3), np.eye(2))", "FormatError: Fix: covariance of 4 numbers"),
-        ("Fix(9, 'gps', 'position', (0.0, 0.0), (1.0, 0.0, 0.0, 1.0))", "the topic or source of what it gives is not"),
-    ):
-        name = f"my_{len(fix)}"
-        install(
-            f"{imports}from graph_slam_ros.messages.inputs import InputType\n"
-            f"BEACONS = InputType({{'fix': lambda source, m: [{fix}]}})\n",
-            name=f"my_msgs.msg.{name}",
-            module=name,
-        )
-        with pytest.raises(plugins.PluginFault, match=line):
-            converters(f"my_msgs/msg/{name}")["fix"](SimpleNamespace(name="radio"), None)
 
 
 def test_a_run_is_repeated_and_recovered_where_its_plugin_is_not_installed_any_more(install, tmp_path, monkeypatch):

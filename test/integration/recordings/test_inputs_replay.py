@@ -1,13 +1,11 @@
 """Recordings with inputs of every kind, through replay and the command line."""
 
 import re
-import shlex
 
 import pytest
 from messages import DATUM, LANDMARKS, STAMP_NS, odometry, pose, record_drive
 from places import ROOT
 
-from graph_slam_ros.cli import main
 from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.formats.parameters import read_parameters
 from graph_slam_ros.measurements.types import from_record
@@ -32,21 +30,9 @@ def drive(tmp_path_factory):
     return record_drive(tmp_path_factory.mktemp("drive") / "drive.mcap", seconds=15)
 
 
-def ingested(run):
-    return [from_record(record) for record in read_ingest(run, [])]
-
-
-def replayed(drive, folder, **settings):
-    done = replay(drive, folder, Config.from_mapping(settings))
-    return done.slam, ingested(folder)
-
-
-def where(slam, name):
-    return slam.solver.estimate([slam.landmarks[name].vertex])[0, :2]
-
-
 def test_all_inputs_of_a_recording_are_used_together(drive, tmp_path):
-    slam, events = replayed(drive, tmp_path / "run", **EVERYTHING)
+    slam = replay(drive, tmp_path / "run", Config.from_mapping(EVERYTHING)).slam
+    events = [from_record(record) for record in read_ingest(tmp_path / "run", [])]
     assert {m.source for m in events if isinstance(m, Odometry)} == {"odom"}
     counts = {}
     for m in events:
@@ -55,15 +41,7 @@ def test_all_inputs_of_a_recording_are_used_together(drive, tmp_path):
     assert counts == {"detections": 150, "gps": 15, "tags": 150}
     assert not slam.counters["detections", "frame_unknown"]
     for name, there in LANDMARKS.items():
-        assert where(slam, name) == pytest.approx(there, abs=0.05)
-
-
-def test_odometry_may_come_from_tf_alone(drive, tmp_path):
-    noise = {"odometry": {"noise": "density"}}
-    slam, events = replayed(drive, tmp_path / "tf", odom={"type": TF, "topic": "/tf"}, **noise)
-    other, _ = replayed(drive, tmp_path / "topic", **noise)
-    assert sum(isinstance(m, Odometry) for m in events) == 150
-    assert slam.trajectory() == pytest.approx(other.trajectory(), abs=1e-6)
+        assert slam.solver.estimate([slam.landmarks[name].vertex])[0, :2] == pytest.approx(there, abs=0.05)
 
 
 def test_an_input_without_its_topic_takes_the_only_one_of_its_type_and_else_is_refused(drive):
@@ -81,17 +59,6 @@ def test_an_input_without_its_topic_takes_the_only_one_of_its_type_and_else_is_r
         choose_inputs(bag, Config.from_mapping(vo))
     with pytest.raises(BagError, match="no input is used as landmarks: /landmarks cannot be one"):
         choose_inputs(bag, Config.from_mapping(gps), landmarks="/landmarks")
-
-
-def test_the_command_that_info_prints_uses_what_is_there(drive, tmp_path, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert main(["info", str(drive)]) == 0
-    command = shlex.split(capsys.readouterr().out.splitlines()[-1])
-    assert "inputs.names=odom detections tags gps" in command
-    assert "tags.frame_prefix=tag36h11" in command
-    assert main(command[1:]) == 0
-    topics = {m.topic for m in ingested(tmp_path / command[-1]) if isinstance(m, Sightings | Fix)}
-    assert topics == {"detections", "gps", "tags"}
 
 
 def test_the_page_of_inputs_has_a_row_for_every_type_with_what_it_becomes_and_its_example_is_one(tmp_path):

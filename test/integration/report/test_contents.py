@@ -2,10 +2,8 @@
 
 import base64
 import io
-import json
 import shutil
 import zlib
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,15 +13,12 @@ from PIL import Image
 
 from graph_slam_ros import cli
 from graph_slam_ros.analysis.evaluation import evaluate
-from graph_slam_ros.analysis.explain import STATES
 from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.runs.folder import BEGUN
-from graph_slam_ros.slam import Config
 from graph_slam_ros.tools.report import page, places, verdict
-from graph_slam_ros.tools.report.contents import _once, read_contents
-from graph_slam_ros.tools.report.packing import UNKNOWN, Packing, json_for_script, shown
-from graph_slam_ros.tools.report.sentences import effects, sentences
+from graph_slam_ros.tools.report.contents import read_contents
+from graph_slam_ros.tools.report.packing import UNKNOWN
 
 
 @pytest.fixture(scope="module")
@@ -53,48 +48,6 @@ def unpacked(packing, one):
         return values
     values = np.cumsum(values, dtype=float) if one.get("sum") else np.where(values == UNKNOWN, np.nan, values)
     return values * one["step"]
-
-
-def test_columns_come_back():
-    packing = Packing()
-    path = np.cumsum(np.random.default_rng(1).normal(size=100))
-    gaps = np.where(path > 0.0, path, np.nan)
-    columns = [packing.fixed(path, 1e-3, is_path=True), packing.fixed(gaps, 1e-3), packing.column([1, 2, 250], "u1")]
-    columns += [packing.column([], "f4"), packing.column([1.7e9 + 1e-6], "f8"), packing.texts(["a", "", "ä<"])]
-    first, second, *others, texts = (unpacked(packing, one) for one in columns)
-    assert first == pytest.approx(path, abs=5.1e-4)
-    assert second == pytest.approx(gaps, abs=5.1e-4, nan_ok=True)
-    assert [one.tolist() for one in others] == [[1, 2, 250], [], [1.7e9 + 1e-6]]
-    assert texts == ["a", "", "ä<"]
-
-
-def test_nothing_in_the_data_ends_its_script():
-    hostile = "</script><!--<script>&\u2028\u202e"
-    text = json_for_script({hostile: [hostile]})
-    assert not set(text) & set("<>&\u2028\u202e")
-    assert json.loads(text) == {hostile: [hostile]}
-    assert shown("a\u202eb\x00") == "a\\u202eb\\x00"
-    assert len(shown("x" * 10_000)) == 200
-
-
-def test_the_effect_of_an_edge_is_that_of_the_influence_model_and_texts_are_few(saved):
-    found = effects(saved)
-    assert len(sentences(saved, found).groups) < 60
-    inside = [e.edge for e in saved.entries if e.is_in and e.verdict][::9]
-    for edge in inside:
-        assert found.last_m[edge] == pytest.approx(np.linalg.norm(saved.first_order(edge)[:2]))
-    assert np.isnan([found.last_m[e.edge] for e in saved.entries if not e.verdict]).all()
-
-
-def test_the_columns_of_the_ledger_are_those_of_the_run(saved, made):
-    edges = made.data["edges"]
-    for name in ("chi2", "statistic", "threshold", "keyframe", "stamp_s", "percent"):
-        expected = [getattr(e, name) for e in saved.entries]
-        assert unpacked(made.packing, edges["columns"][name]) == pytest.approx(expected, rel=1e-6)
-    verdicts = [edges["verdicts"][k] for k in unpacked(made.packing, edges["verdict"])]
-    assert verdicts == [STATES[e.verdict] for e in saved.entries]
-    names = [edges["landmark"]["names"][k] for k in unpacked(made.packing, edges["landmark"]["of"])]
-    assert names == [e.landmark for e in saved.entries]
 
 
 def test_the_sentences_on_top_say_what_is_out_and_what_to_do(made, run, saved):
@@ -131,27 +84,6 @@ def test_a_run_of_odometry_alone_has_a_report(tmp_path, capsys):
     assert cli.main(["report", str(run), "--out", str(tmp_path / "other.html")]) == 2, "of a run at another place"
 
 
-def test_jumps_name_measurements_judged_there(made, saved):
-    drive = made.data["drive"]
-    assert drive["frames"]
-    distances = [jump[1] for jump in drive["jumps"]]
-    assert distances == sorted(distances, reverse=True)
-    assert distances[0] > 0.05
-    keyframe, _, _, edges = drive["jumps"][0]
-    assert edges
-    changed = {c.edge for c in saved.changes if c.keyframe == keyframe}
-    assert all(saved.edge(edge).keyframe == keyframe or edge in changed for edge in edges)
-
-
-def test_frames_are_the_estimate_as_it_was_known_then(made, run):
-    """The last is near the end's, the first has fewer keyframes; none has one that came later."""
-    frames = made.data["drive"]["frames"]
-    counts = [frame["keyframes"] for frame in frames]
-    assert counts == sorted(counts) and counts[0] < 0.2 * counts[-1]
-    last = np.stack([unpacked(made.packing, column) for column in frames[-1]["points"]], axis=1)
-    assert np.linalg.norm(last[0, :2] - np.loadtxt(run / "path.tum")[0, 1:3]) < 0.1
-
-
 def test_nees_is_that_of_evaluate(run):
     truth = run.parent / "drive.mcap"
     made = read_contents(run, str(truth))
@@ -169,10 +101,7 @@ def test_a_floor_plan_lies_where_its_file_says_and_is_drawn_upright(tmp_path):
     pixels = np.full((20, 40), 255, np.uint8)
     pixels[:, 0] = 0
     Image.fromarray(pixels).save(tmp_path / "hall.png")
-    for turn, expected, size in (
-        (0.0, [-3.0, 2.0, 20.0, 10.0], (40, 20)),
-        (np.pi / 2, [-13.0, 2.0, 10.0, 20.0], None),
-    ):
+    for turn, expected, size in ((0.0, [-3.0, 2.0, 20.0, 10.0], (40, 20)), (np.pi / 2, [-13.0, 2.0, 10.0, 20.0], None)):
         (tmp_path / "map.yaml").write_text(f"image: hall.png\nresolution: 0.5\norigin: [-3.0, 2.0, {turn}]\n")
         plan = places.floor_plan(tmp_path / "map.yaml")
         picture = Image.open(io.BytesIO(base64.b64decode(plan["url"].partition(",")[2])))
@@ -223,15 +152,6 @@ def test_a_run_that_is_still_written_shows_its_map_so_far(run, tmp_path):
     assert np.isfinite([unpacked(made.packing, column) for column in points]).all()
 
 
-def test_results_of_an_earlier_save_are_not_drawn_with_a_later_map(tmp_path):
-    live = drive(tmp_path / "live", ["a", "b"])
-    lines = (live / "path.tum").read_text().splitlines(keepends=True)
-    (live / "path.tum").write_text("".join(lines[:-5]))
-    made = read_contents(live)
-    assert made.data["map"]["keyframes"] == 20 == len(made.saved.keyframes)
-    assert _once(["/a/b: map.mcap: cut off", "map.mcap: cut off", "c", "c"]) == ["/a/b: map.mcap: cut off", "c"]
-
-
 def test_a_damaged_run_shows_what_can_be_read_and_says_what_cannot(run, tmp_path, capsys):
     broken = shutil.copytree(run, tmp_path / "broken")
     (broken / "landmarks.csv").write_text("nonsense\n1\n")
@@ -265,16 +185,3 @@ def test_without_plotly_the_command_that_installs_it_is_named(run, tmp_path, mon
     monkeypatch.setattr(page.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(GraphSlamError, match=r"pip install 'graph_slam_ros\[report\]'"):
         page.plotly()
-
-
-def test_covariances_that_the_truth_contradicts_are_named():
-    poses = SimpleNamespace(mean=11.0, dof=3)
-    advice = "replay with --set robust.noise_scale=estimated to use these factors"
-    scores = SimpleNamespace(consistency=SimpleNamespace(poses=poses, advice=advice), warnings=())
-    saved = SimpleNamespace(config=Config())
-    (said,) = verdict._covariances(saved, scores)
-    assert "NEES of poses 11.0, where 3 is expected; replay with --set robust.noise_scale=estimated" in said
-    scores.consistency.advice = "no smaller sigmas are advised (landmarks detections position)"
-    assert "--set" not in verdict._covariances(saved, scores)[0]
-    poses.mean = 5.9
-    assert verdict._covariances(saved, scores) == []

@@ -17,19 +17,8 @@ from graph_slam_ros.slam import Closure, Config, Control, Counters, Odometry, Si
 S = 1_000_000_000
 TAGS = {"a": (2.0, 1.0), "b": (-1.0, 3.0), "c": (0.0, -2.0)}
 STEPS = 100
-HAPPENS = {
-    "drive": 40,
-    "see": 25,
-    "close": 5,
-    "killed": 4,
-    "fix": 3,
-    "flush": 3,
-    "jump": 2,
-    "save": 2,
-    "load": 2,
-    "pose": 1,
-    "reset": 1,
-}
+HAPPENS = {"drive": 40, "see": 25, "close": 5, "killed": 4, "fix": 3, "flush": 3, "jump": 2, "save": 2, "load": 2}
+HAPPENS |= {"pose": 1, "reset": 1}
 """How often what happens."""
 RESULTS = ("graph.g2o", "ledger.csv", "ledger_changes.csv", "path.tum", "landmarks.csv")
 COVARIANCE = (1e-3, 0.0, 0.0, 0.0, 1e-3, 0.0, 0.0, 0.0, 1e-3)
@@ -153,7 +142,7 @@ class Life:
             assert (again / name).read_bytes() == (self.folder / name).read_bytes(), name
 
 
-@pytest.mark.parametrize("part", range(times(2, 10)))
+@pytest.mark.parametrize("part", range(times(1, 10)))
 def test_T3_whatever_happens_in_whatever_order_nothing_that_was_told_is_lost(memory, part):
     count, steps = times(1, 300), times(STEPS, 2 * STEPS)
     for seed in range(part * count, (part + 1) * count):
@@ -161,7 +150,7 @@ def test_T3_whatever_happens_in_whatever_order_nothing_that_was_told_is_lost(mem
     tell("lives", tried=count, steps=count * steps, failed=0)
 
 
-@pytest.mark.parametrize("seed", times([2440], [363, 377, 1151, 2440, 2950]))
+@pytest.mark.parametrize("seed", times([], [363, 377, 1151, 2440, 2950]))
 def test_T3_where_much_of_the_path_turns_no_solve_goes_astray(memory, seed):
     live(memory / str(seed), seed, 2 * STEPS)
 

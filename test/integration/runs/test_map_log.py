@@ -19,10 +19,7 @@ from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry
 from graph_slam_ros.tools.simulation import measurements, simulate
 
 GOLDEN = ROOT / "test" / "golden"
-WORLDS = {
-    "points": ({}, {}),
-    "unnamed": ({"landmarks.association": "joint"}, {"sensor": "position"}),
-}
+WORLDS = {"points": ({}, {}), "unnamed": ({"landmarks.association": "joint"}, {"sensor": "position"})}
 
 
 def told(state):
@@ -45,7 +42,7 @@ def run(request, tmp_path_factory):
     )
 
 
-def test_what_is_read_back_is_what_there_was(run):
+def test_what_is_read_back_is_what_there_was_and_solved_to_where_it_was(run):
     folder, slam = run
     state = read_map(folder, losses := [])
     assert len(losses) == 1, "it was not closed"
@@ -67,10 +64,6 @@ def test_what_is_read_back_is_what_there_was(run):
             assert (getattr(a, column).values[k] == getattr(b, column).values[m]).all()
         assert state.graph.label_of(edge) == slam.graph.label_of(edge)
         assert state.graph.source_of(edge) == slam.graph.source_of(edge)
-
-
-def test_it_is_solved_to_where_it_was(run):
-    folder, slam = run
     again = GraphSlam(run_config(folder), start=read_map(folder, []))
     assert again.trajectory() == pytest.approx(slam.trajectory(), abs=1e-6)
     assert again.report.cost_final == pytest.approx(slam.report.cost_final, rel=1e-9)
@@ -106,7 +99,7 @@ def test_cut_anywhere_it_is_read_as_far_as_it_goes(run, tmp_path):
     whole = (folder / "map.mcap").read_bytes()
     shutil.copy(folder / "config.yaml", tmp_path)
     counts = []
-    for size in np.linspace(len(whole) // 50, len(whole), 12, dtype=int).tolist():
+    for size in np.linspace(len(whole) // 50, len(whole), 7, dtype=int).tolist():
         (tmp_path / "map.mcap").write_bytes(whole[:size])
         state = read_map(tmp_path, [])
         counts.append(0 if state is None else len(state.keyframes))
@@ -116,7 +109,7 @@ def test_cut_anywhere_it_is_read_as_far_as_it_goes(run, tmp_path):
             assert np.isfinite(GraphSlam(run_config(tmp_path), start=state).trajectory()).all()
     assert counts == sorted(counts)
     assert counts[-1] == len(slam.keyframes)
-    assert len(set(counts)) > 6
+    assert len(set(counts)) > 4
 
 
 NO_MAP = (

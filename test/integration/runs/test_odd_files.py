@@ -1,4 +1,4 @@
-"""Odd files in the folder of a run and odd values of settings: one line, its exit code, and nothing is changed."""
+"""Odd files in the folder of a run, odd settings, and what is not ours: one line, its exit code, nothing is changed."""
 
 import contextlib
 import io
@@ -7,13 +7,17 @@ import os
 import random
 import re
 import shutil
+import signal
 
 import pytest
 import reliability
+from places import ROOT
 from plain_rights import plain_rights
 
 from graph_slam_ros import cli
 from graph_slam_ros.cli.console import shortened
+from graph_slam_ros.runs.folder import RunError, is_run, keep_earlier, remove
+from graph_slam_ros.runs.recorder import RunRecorder
 from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.slam import Config
 from graph_slam_ros.tools.simulation import simulate, write_bag
@@ -27,8 +31,7 @@ def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("made")
     for name, seed in (("drive", 5), ("other", 6)):
         write_bag(simulate("warehouse", seed, aisles=2, laps=1, aisle_m=4.0), folder / f"{name}.mcap")
-        config = Config.from_mapping({"keyframes.min_distance_m": 0.01 * seed})
-        replay(folder / f"{name}.mcap", folder / f"{name}_run", config)
+        replay(folder / f"{name}.mcap", folder / f"{name}_run")
     return folder
 
 
@@ -43,8 +46,8 @@ def answer(*words):
     return code, err.getvalue().splitlines()
 
 
-def state(folder):
-    """Names and contents of what is below a folder."""
+def sizes(folder):
+    """Names, kinds and sizes of what is below a folder."""
     return {str(path.relative_to(folder)): (path.lstat().st_mode, path.lstat().st_size) for path in folder.rglob("*")}
 
 
@@ -55,9 +58,6 @@ def check(code, err, codes, culprit, what):
     assert all(len(line) <= MOST for line in err if code != 3 or "lost: " in line), (what, err)
     assert code not in (1, 2) or len(err) == 1, (what, err)
     assert any(re.search(culprit, line) for line in err), (what, culprit, err)
-
-
-# -- a line ------------------------------------------------------------------------------------------------------------
 
 
 def test_a_line_of_an_error_keeps_its_beginning_and_its_end(tmp_path):
@@ -82,8 +82,6 @@ def test_a_line_of_an_error_keeps_its_beginning_and_its_end(tmp_path):
         assert not set("".join(err)) & set("\x1b\n"), words
 
 
-# -- files of a run ----------------------------------------------------------------------------------------------------
-
 SCORED = ("run.json", "config.yaml", "path.tum", "sightings.tum", "odometry.tum", "landmarks.csv", "covariances.csv")
 OF_MAP = ("run.json", "config.yaml", "map.mcap")
 NEEDS = {  # what each command reads of a run
@@ -103,16 +101,8 @@ NEEDS = {  # what each command reads of a run
     ("map", "diff", "RUN", "OTHER"): OF_MAP,
     ("map", "merge", "OTHER", "RUN", "--out", "OUT"): OF_MAP,
 }
-SOME = [*NEEDS][reliability.times(1, 0) :: reliability.times(3, 1)]
+SOME = [*NEEDS][reliability.times(4, 0) :: reliability.times(6, 1)]
 CASES = [(words, name) for words, names in NEEDS.items() for name in names]
-
-
-def unreadable(path, other):
-    path.chmod(0)
-
-
-def sparse(path, other):
-    os.truncate(path, 2**40)
 
 
 def of_another_kind(path, other):
@@ -122,21 +112,9 @@ def of_another_kind(path, other):
         path.write_bytes(b"\x89PNG\r\n\x1a\n" + 999 * b"\0")
 
 
-def of_another_run(path, other):
-    shutil.copy(other / path.name, path)
-
-
 def folder(path, other):
     path.unlink()
     path.mkdir()
-
-
-def cut(path, other):
-    os.truncate(path, path.stat().st_size // 2)
-
-
-def not_text(path, other):
-    path.write_bytes(b"\xff" + path.read_bytes()[50:])
 
 
 WORDS = ["", "x", "nan", "inf", "1e400", "1_0", "\u0663", "-1", "9" * 25, "9" * 5000, '"', "rejected", "EDGE_SE2_XY"]
@@ -157,7 +135,16 @@ def another_word(path, other):
     path.write_text("\n".join(lines))
 
 
-ODD_FILES = unreadable, sparse, of_another_kind, of_another_run, folder, cut, not_text, another_word
+ODD_FILES = {
+    "unreadable": lambda path, _: path.chmod(0),
+    "sparse": lambda path, _: os.truncate(path, 2**40),
+    "of another kind": of_another_kind,
+    "of another run": lambda path, other: shutil.copy(other / path.name, path),
+    "a folder": folder,
+    "cut": lambda path, _: os.truncate(path, path.stat().st_size // 2),
+    "not text": lambda path, _: path.write_bytes(b"\xff" + path.read_bytes()[50:]),
+    "another word": another_word,
+}
 
 
 def asked(words, made, folder):
@@ -171,21 +158,19 @@ def asked(words, made, folder):
 def wrong_with(odd, words, name, made, folder):
     """What a command does wrong where one file of a run is odd; empty: nothing."""
     shutil.copytree(made / "drive_run", folder / "run")
-    odd(folder / "run" / name, made / "other_run")
-    before = state(folder)
+    ODD_FILES[odd](folder / "run" / name, made / "other_run")
+    before = sizes(folder)
     code, err = asked(words, made, folder)
-    after = state(folder)
+    after = sizes(folder)
     changed = {file for file in before if after.get(file) != before[file]}
     completed = words == ("recover", "RUN") and code in (0, 3)
     try:
-        check(
-            code, err, (0, 2, 3, 4), re.escape(name) + r"|run\.json|of the same drive in", (odd.__name__, words, name)
-        )
-        assert code != 0 or "beware" in "".join(err) or odd is another_word, "nothing is said"
+        check(code, err, (0, 2, 3, 4), re.escape(name) + r"|run\.json|of the same drive in", (odd, words, name))
+        assert code != 0 or "beware" in "".join(err) or odd == "another word", "nothing is said"
         assert completed or changed <= {"run/path.png"}, changed
         assert code in (0, 3, 4) or not [*folder.glob("out*")] or "no odometry of it could be used" in err[0]
     except AssertionError as error:
-        return f"{odd.__name__} {words} {name}: {code} {err}: {error}"
+        return f"{odd} {words} {name}: {code} {err}: {error}"
     finally:
         (folder / "run" / name).chmod(0o700)
         shutil.rmtree(folder)
@@ -194,25 +179,10 @@ def wrong_with(odd, words, name, made, folder):
 
 def test_an_odd_file_in_the_folder_of_a_run_is_named_by_each_command_that_reads_it(made, tmp_path):
     """Each command with each file that it needs; some of them in turn, all with ``make soak``."""
-    cases = [*itertools.product(ODD_FILES, CASES)][:: reliability.times(17, 1)]
+    cases = [*itertools.product(ODD_FILES, CASES)][:: reliability.times(41, 1)]
     wrong = [wrong_with(odd, *case, made, tmp_path / str(k)) for k, (odd, case) in enumerate(cases)]
     reliability.tell("odd_files", tried=len(cases), failed=sum(map(bool, wrong)))
     assert not any(wrong), "\n".join(filter(None, wrong))
-
-
-def test_a_folder_that_is_no_run_is_refused_and_a_mere_journal_is_answered(made, tmp_path):
-    begun = tmp_path / "begun"
-    begun.mkdir()
-    for name in ("config.yaml", "ingest.mcap"):
-        shutil.copy(made / "drive_run" / name, begun)
-    assert answer("explain", begun)[0] == 0
-    for words in ([], ["5"], ["--influence"]):
-        for folder in (tmp_path / "none", tmp_path, made / "drive_run" / "graph.g2o"):
-            code, err = answer("explain", folder, *words)
-            check(code, err, (2,), re.escape(str(folder)), words)
-
-
-# -- folders of somebody else ------------------------------------------------------------------------------------------
 
 
 def test_a_run_that_may_be_read_and_not_written_is_read_and_stays(made, tmp_path):
@@ -221,7 +191,7 @@ def test_a_run_that_may_be_read_and_not_written_is_read_and_stays(made, tmp_path
     shutil.copytree(made / "drive_run", run)
     os.chmod(run, 0o555)
     refused = {("recover", "RUN")}
-    before = state(tmp_path)
+    before = sizes(tmp_path)
     for words in (*SOME, ("replay", "BAG", "--out", "RUN", "--force")):
         code, err = asked(words, made, tmp_path)
         assert not any("internal error" in line for line in err), (words, err)
@@ -232,7 +202,7 @@ def test_a_run_that_may_be_read_and_not_written_is_read_and_stays(made, tmp_path
             assert not err or "no picture" in err[0], (words, err)
         for out in tmp_path.glob("out*"):
             shutil.rmtree(out) if out.is_dir() else out.unlink()
-        assert state(tmp_path) == before, words
+        assert sizes(tmp_path) == before, words
         reliability.tell("folders_of_others", tried=1, failed=0)
     os.chmod(run, 0o700)
 
@@ -252,8 +222,6 @@ def test_a_private_folder_of_somebody_else_is_refused_by_name(made, tmp_path):
     os.chmod(run, 0o700)
 
 
-# -- settings ----------------------------------------------------------------------------------------------------------
-
 NUMBERS = ["", " ", "nan", "-nan", ".nan", "inf", "-.inf", "1e999", "-1", "1_0", "\u0663", "1,5", "null", "~", "[1]"]
 NUMBERS += ["true", "*a", "%TAG ! x", "2001-99-99", "@", "`", "'"]
 NUMBERS += ["9" * 400, "9" * 9999, "0x" + "f" * 99, "[" * 99, "{" * 9999, "{a: 1}", "{a: {b: {c: 1}}}", "{a: 1, a: 2}"]
@@ -271,7 +239,8 @@ SETTINGS = [f"keyframes.min_distance_m={v}" for v in NUMBERS] + [f"{key}=1" for 
 
 def test_a_setting_that_is_none_is_refused_by_name_before_anything_is_read_or_written(made, tmp_path):
     wrong = []
-    for text in SETTINGS:
+    tried = SETTINGS[:: reliability.times(3, 1)]
+    for text in tried:
         try:
             code, err = answer("replay", made / "drive.mcap", "--out", tmp_path / "out", "--set", text)
             key = re.escape(ascii(text.partition("=")[0])[1:9])
@@ -281,11 +250,9 @@ def test_a_setting_that_is_none_is_refused_by_name_before_anything_is_read_or_wr
         except AssertionError as error:
             wrong.append(str(error)[:300])
             shutil.rmtree(tmp_path / "out", ignore_errors=True)
-    reliability.tell("settings", tried=len(SETTINGS), failed=len(wrong))
+    reliability.tell("settings", tried=len(tried), failed=len(wrong))
     assert not wrong, "\n".join(wrong)
 
-
-# -- arguments ---------------------------------------------------------------------------------------------------------
 
 LONG = ["x" * 99999, ":" * 5000, "a:" * 5000, "../" * 2000, "*a" * 200, "[" * 5000, "(a+)+" * 50, "\x1b[2J" * 999]
 LONG += ["\u00e9" * 5000]
@@ -304,10 +271,220 @@ TAKING = [  # what takes it, whatever it is for
 
 
 def test_a_long_or_odd_argument_is_refused_in_a_line(made, tmp_path):
-    for words, odd in [*itertools.product(TAKING, LONG + ODD)][:: reliability.times(2, 1)]:
+    for words, odd in [*itertools.product(TAKING, LONG + ODD)][:: reliability.times(7, 1)]:
         names = {"RUN": made / "drive_run", "BAG": made / "drive.mcap", "OUT": tmp_path / "out", "X": odd}
         code, err = answer(*(names.get(word, word) for word in words))
         check(code, err, (2,), "graph_slam", (words, odd[:20]))
         assert not set("".join(err)) & set("\x1b\udcff"), (words, odd[:20])
         assert not any(tmp_path.iterdir()), (words, odd[:20])
         reliability.tell("arguments", tried=1, failed=0)
+
+
+GOLDEN = ROOT / "test" / "golden"
+NAMES = ("run_1.mcap", "map.mcap", "ingest.mcap", "ingest_2.mcap", "run.mcap", "config.yaml", "graph.g2o", "path.tum")
+
+
+@pytest.fixture
+def bag(made):
+    return made / "drive.mcap"
+
+
+@pytest.fixture
+def saved(made):
+    return made / "drive_run"
+
+
+@pytest.fixture
+def run(saved, tmp_path):
+    return shutil.copytree(saved, tmp_path / "run")
+
+
+def state(folder):
+    """Names, kinds and contents of what is below a folder."""
+    return {
+        str(path.relative_to(folder)): path.read_bytes() if path.is_file() else path.lstat().st_mode
+        for path in folder.rglob("*")
+    }
+
+
+def code_of(*words):
+    try:
+        return cli.main([str(word) for word in words])
+    except SystemExit as end:
+        return end.code
+
+
+def test_a_folder_of_recordings_with_the_names_of_a_run_is_never_cleared(bag, tmp_path, capsys):
+    several = [*([name] for name in NAMES), NAMES, ("run_1.mcap", "map.mcap")]
+    for k, (names, force) in enumerate(itertools.product(several, (False, True))):
+        mine = tmp_path / str(k)
+        mine.mkdir()
+        for name in names:
+            shutil.copy(bag, mine / name)
+        before = state(mine)
+        assert code_of("replay", bag, "--out", mine, *["--force"] * force) == 2, names
+        assert "not empty and not an earlier run; nothing was written" in capsys.readouterr().err, names
+        with pytest.raises(RunError):
+            RunRecorder(mine, Config(), force=force)
+        keep_earlier(mine, 0)
+        assert state(mine) == before, names
+        shutil.rmtree(mine)
+
+
+def test_a_run_json_of_somebody_else_makes_no_run(bag, tmp_path):
+    contents = ("{}", "[]", '{"format": "theirs"}', '{"keyframes": 9, "ended": true}', "[" * 10**5, "")
+    for k, content in enumerate(contents):
+        mine = tmp_path / str(k)
+        mine.mkdir()
+        shutil.copy(bag, mine / "run_1.mcap")
+        (mine / "run.json").write_text(content)
+        before = state(mine)
+        assert not is_run(mine)
+        with pytest.raises(RunError, match="not an earlier run"):
+            replay(bag, mine, force=True)
+        assert state(mine) == before
+
+
+def test_a_recording_of_the_user_in_a_run_folder_is_not_removed_whatever_its_name(bag, run, capsys):
+    for name in ("run_7.mcap", "ingest_4.mcap", "map_1.mcap"):
+        shutil.copy(bag, run / name)
+        before = state(run)
+        assert code_of("replay", bag, "--out", run, "--force") == 2, name
+        assert f"{run / name}: not written by this run, and so never removed" in capsys.readouterr().err
+        with contextlib.suppress(OSError):
+            remove(run)
+        assert (run / name).read_bytes() == bag.read_bytes(), name
+        (run / name).unlink(), (run / "run.json").write_bytes(before["run.json"])
+    assert code_of("replay", bag, "--out", run, "--force") == 0
+
+
+def test_what_else_is_in_a_run_folder_stays_when_the_run_is_replaced(bag, run):
+    for name in ("notes.txt", "run_of_last_year.mcap", "path.tum.new", ".hidden.new"):
+        (run / name).write_text("mine")
+    (run / ".0123abcd.new").write_text("left behind by a killed process")
+    before = set(state(run)) - {".0123abcd.new"}
+    replay(bag, run, force=True)
+    assert set(state(run)) == before
+    assert (run / "notes.txt").read_text() == "mine"
+
+
+def test_a_run_of_an_earlier_version_is_known_by_its_journal_read_and_never_replaced(bag, tmp_path):
+    (golden,) = GOLDEN.iterdir()
+    old = shutil.copytree(golden, tmp_path / "old")
+    assert is_run(old)
+    cut = shutil.copytree(golden, tmp_path / "cut")
+    (cut / "run.json").unlink()
+    assert is_run(cut), "cut off before it was saved"
+    for folder in (old, cut):
+        before = state(folder)
+        for force in (False, True):
+            with pytest.raises(RunError, match="a run of an earlier version, which is never replaced"):
+                replay(bag, folder, force=force)
+        assert state(folder) == before
+    keep_earlier(old, 0)
+    assert state(tmp_path / "old-1")["ingest.mcap"] == (golden / "ingest.mcap").read_bytes()
+    (cut / "ingest.mcap").write_bytes(bag.read_bytes())
+    assert not is_run(cut), "its journal is a recording"
+
+
+def test_a_run_or_a_file_that_is_there_is_replaced_with_force_alone(bag, run, tmp_path, capsys):
+    graph, city = tmp_path / "world.g2o", ["simulate", "city", "--poses", "12", "--set", "blocks=2"]
+    assert code_of(*city, "--out", graph) == 0
+    other = shutil.copytree(run, tmp_path / "other")
+    commands = [
+        (["replay", bag], other),
+        (["recover", run], other),
+        (["map", "freeze", run], other),
+        (["map", "export", run], tmp_path / "path.mcap"),
+        (["optimize", graph], tmp_path / "solved.g2o"),
+        (["simulate", "manhattan", "--poses", "20", "--set", "blocks=2"], tmp_path / "world.mcap"),
+        (city, tmp_path / "world_2.g2o"),
+    ]
+    for words, out in commands:
+        words = [*words, "--out", out]
+        if out != other:
+            assert code_of(*words) == 0, words
+        before = state(tmp_path)
+        capsys.readouterr()
+        assert code_of(*words) == 2, words
+        (line,) = capsys.readouterr().err.splitlines()
+        assert str(out) in line
+        assert "--force" in line
+        assert state(tmp_path) == before
+        assert code_of(*words, "--force") == 0, words
+    for words, out in (
+        (["optimize", graph, "--out"], tmp_path / "a.g2o"),
+        (["optimize", graph, "--plot"], tmp_path / "a.png"),
+    ):
+        assert code_of(*words, out) in (0, 3)
+        assert code_of(*words, out) == 2
+        assert code_of(*words, out, "--force") in (0, 3)
+
+
+TABLES = ("run.json", "config.yaml", "graph.g2o", "ledger.csv", "ledger_changes.csv", "path.tum", "covariances.csv")
+SCORED = ("sightings.tum", "odometry.tum", "landmarks.csv")
+READERS = {  # and the files of the run that they need
+    ("explain", "RUN"): ("run.json", "config.yaml", "map.mcap"),
+    ("explain", "RUN", "--without", "3"): ("config.yaml", "map.mcap"),
+    ("explain", "RUN", "--influence", "1"): ("map.mcap",),
+    ("advise", "RUN"): ("map.mcap",),
+    ("evaluate", "RUN", "--truth", "BAG"): ("run.json", "config.yaml", "path.tum", "covariances.csv", *SCORED),
+    ("map", "export", "RUN", "--out", "OUT.png"): ("run.json", "config.yaml", "path.tum", "covariances.csv", *SCORED),
+    ("replay", "RUN", "--out", "OUT"): ("config.yaml", "ingest.mcap"),
+    ("recover", "RUN", "--out", "OUT"): ("config.yaml", "map.mcap"),
+    ("map", "export", "RUN", "--out", "OUT.tum"): ("map.mcap",),
+    ("map", "diff", "RUN", "RUN"): ("map.mcap",),
+    ("replay", "BAG", "--out", "RUN", "--force"): (*TABLES[1:], *SCORED, "path.png", "ingest.mcap", "run.mcap"),
+}
+
+
+def fifo(path, victim):
+    os.mkfifo(path)
+
+
+def link(path, victim):
+    path.symlink_to(victim)
+
+
+@pytest.fixture
+def no_wait():
+    """What waits for a FIFO waits for ever: an alarm ends it."""
+
+    def end(*_):
+        raise TimeoutError("it waits")
+
+    before = signal.signal(signal.SIGALRM, end)
+    signal.alarm(60)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
+
+
+def test_no_command_waits_for_a_fifo_in_a_run_folder_or_follows_a_link(bag, saved, tmp_path, no_wait, capsys):
+    """Each command with each file that it needs; some of them in turn, all with ``make soak``."""
+    pytest.importorskip("evo")
+    cases = [(words, name) for words, names in READERS.items() for name in names]
+    for k, ((words, name), kind) in enumerate([*itertools.product(cases, (fifo, link))][:: reliability.times(9, 1)]):
+        run, victim, what = shutil.copytree(saved, tmp_path / f"run_{k}"), tmp_path / "victim", (words, name, kind)
+        victim.write_bytes((run / name).read_bytes() if (run / name).is_file() else b"a picture of mine")
+        before = victim.read_bytes()
+        (run / name).unlink(missing_ok=True)
+        kind(run / name, victim)
+        outs = {f"OUT{ending}": tmp_path / f"out_{k}{ending}" for ending in ("", ".png", ".tum")}
+        names = {"RUN": run, "BAG": bag} | outs
+        assert code_of(*(names.get(word, word) for word in words)) == 2, what
+        (line,) = capsys.readouterr().err.splitlines()
+        assert "not a regular file" in line or "a symbolic link" in line or "never removed" in line, (what, line)
+        assert victim.read_bytes() == before, what
+
+
+def test_evaluate_replaces_a_planted_link_and_does_not_write_through_it(bag, run, tmp_path):
+    pytest.importorskip("evo")
+    victim = tmp_path / "victim"
+    victim.write_text("mine")
+    (run / "path.png").unlink(missing_ok=True)
+    (run / "path.png").symlink_to(victim)
+    assert code_of("evaluate", run, "--truth", bag) == 0
+    assert victim.read_text() == "mine"
+    assert not (run / "path.png").is_symlink()
+    assert (run / "path.png").read_bytes().startswith(b"\x89PNG")

@@ -9,12 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from graph_slam_ros.errors import FormatError
 from graph_slam_ros.maps.merge import merge
 from graph_slam_ros.measurements.types import Fix, Odometry
 from graph_slam_ros.node.session import Session
 from graph_slam_ros.runs.folder import RunError, changed_since, is_cut_off, is_run, run_config
-from graph_slam_ros.runs.journal import RecordWriter
 from graph_slam_ros.runs.map_journal import read_map
 from graph_slam_ros.runs.recorder import RunRecorder
 from graph_slam_ros.runs.replay import replay
@@ -71,23 +69,6 @@ def test_what_was_set_on_the_way_is_in_effect_in_what_is_made_of_the_map(tmp_pat
     assert read_map(tmp_path / "run", []).settings == {"robust.gate": 0.5}
     recover(tmp_path / "run", tmp_path / "out")
     assert run_config(tmp_path / "out").robust.gate == 0.5
-
-
-def test_a_reset_that_cannot_begin_anew_says_that_nothing_is_recorded(tmp_path, monkeypatch):
-    told = []
-    one = session(tmp_path / "run", told=told)
-    one.ingest(WORLD[:60])
-    monkeypatch.setattr(RunRecorder, "__init__", lambda *_, **__: (_ for _ in ()).throw(RunError("run: no room")))
-    with pytest.raises(RunError, match="no room"):
-        one.reset()
-    monkeypatch.undo()
-    assert one.recording_fails
-    one.ingest(WORLD[60:90])
-    assert one.recording_fails
-    assert one.reset() == "recording was stopped"
-    assert not one.recording_fails
-    one.ingest(WORLD[90:120])
-    assert one.finish() == str(tmp_path / "run")
 
 
 def test_a_folder_that_is_being_recorded_into_is_left_alone_by_everybody_else(tmp_path):
@@ -237,19 +218,6 @@ def test_of_a_run_that_went_on_its_results_are_told_to_be_older(tmp_path):
     assert is_cut_off(tmp_path / "run")
 
 
-def test_a_map_is_frozen_no_farther_than_it_is(tmp_path):
-    one = session(tmp_path / "run")
-    one.ingest(WORLD[:60])
-    one.finish()
-    for frozen in (["x", 0], [3, "x"], [10**6, 0], [-5, 0], [3, 10**6]):
-        (tmp_path / "run" / "map_1.mcap").unlink(missing_ok=True)
-        writer = RecordWriter(tmp_path / "run" / "map_1.mcap")
-        writer.write([{"type": "growth", "frozen": frozen}])
-        writer.close()
-        with pytest.raises(FormatError, match=r"run/map\.mcap: record \d+: frozen"):
-            read_map(tmp_path / "run", [])
-
-
 def test_a_replay_in_other_dimensions_is_refused_before_anything_is_replaced(tmp_path):
     for name in ("run", "out"):
         one = session(tmp_path / name)
@@ -259,9 +227,6 @@ def test_a_replay_in_other_dimensions_is_refused_before_anything_is_replaced(tmp
     with pytest.raises(RunError, match=r"world\.dimensions is 2 there"):
         replay(tmp_path / "run", tmp_path / "out", Config.from_mapping({"world.dimensions": 3}), force=True)
     assert (tmp_path / "out" / "path.tum").read_bytes() == before
-
-
-# -- a drive that was cut off ------------------------------------------------------------------------------------------
 
 
 def straight(first, last, *, from_x=0.0, since_ns=0, source="odom"):

@@ -1,30 +1,25 @@
 """Faults: each makes wrong what it says and nothing else, and the table tells what."""
 
 import csv
-from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from graph_slam_ros import cli
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.g2o import read_g2o
-from graph_slam_ros.messages.from_msg import MessageConverter
-from graph_slam_ros.messages.interfaces import typestore
 from graph_slam_ros.recordings.bag import open_bag
-from graph_slam_ros.slam import Closure, Config, Counters
 from graph_slam_ros.tools.simulation import (
     KINDS,
     Fault,
+    city_graph,
     faulty_recording,
-    measurements,
     options_of,
     simulate,
     with_closures,
-    write_bag,
 )
-from graph_slam_ros.tools.simulation.draft import Draft
-from graph_slam_ros.tools.simulation.false_closures import Closures
+from graph_slam_ros.tools.simulation.false_closures import disagreement, false_closures
 from graph_slam_ros.tools.simulation.message_faults import MESSAGE_KINDS
 from graph_slam_ros.tools.simulation.motion import space_of
 from graph_slam_ros.tools.simulation.options import about
@@ -36,8 +31,6 @@ WORLDS = {"warehouse": {"aisles": 2, "laps": 2, "aisle_m": 8.0}, "flight": {"lap
 def recording(request):
     return with_closures(simulate(request.param, 7, **WORLDS[request.param]), 30, seed=7)
 
-
-# -- faults in recordings ----------------------------------------------------------------------------------------------
 
 PUT = {
     "false_closures": {"rate": 0.5, "policy": "group"},
@@ -95,147 +88,6 @@ def test_the_table_names_what_is_wrong_and_all_else_is_as_it_was(recording):
             assert faulty_recording(recording, [fault], seed=6)[1] != wrong
 
 
-def halves(recording, at=0.5):
-    return recording.stamps_ns[round(at * (len(recording.stamps_ns) - 1))]
-
-
-def test_two_landmarks_have_swapped_their_ids_from_then_on(recording):
-    _, wrong = faulty_recording(recording, [Fault.named("swapped_ids", at=0.4)], seed=2)
-    a, b = {row.true_id for row in wrong}
-    assert {(row.true_id, row.id) for row in wrong} == {(a, b), (b, a)}
-    table = rows_of(wrong, "/landmarks")
-    for key, s in sightings(recording).items():
-        assert (key in table) == (s.id in (a, b) and key[0] >= halves(recording, 0.4))
-
-
-def test_a_wrong_id_is_that_of_a_landmark_elsewhere(recording):
-    _, wrong = faulty_recording(recording, [Fault.named("wrong_ids", rate=0.2)], seed=2)
-    assert len(wrong) == round(0.2 * len(sightings(recording)))
-    known = {s.id for s in sightings(recording).values()}
-    beside = {seen.stamp_ns: {s.id for s in seen.sightings} for seen in recording.seen}
-    for row in wrong:
-        assert row.id in known - beside[row.stamp_ns]
-    everywhere = simulate("pythonrobotics", 1)  # all five are in every message
-    for row in faulty_recording(everywhere, [Fault.named("wrong_ids", rate=0.2)], seed=2)[1]:
-        assert row.id != row.true_id
-
-
-def test_an_outlier_is_too_far_away_by_one_to_five_metres_on_the_same_ray(recording):
-    faulty, wrong = faulty_recording(recording, [Fault.named("outliers", rate=0.3)], seed=2)
-    before, after = sightings(recording), sightings(faulty)
-    n, longer = space_of(recording.T_world_base[0]).dimensions, []
-    for key in rows_of(wrong, "/landmarks"):
-        a, b = (np.array(side[key].measured) for side in (before, after))
-        longer.append(np.linalg.norm(b[:n]) - np.linalg.norm(a[:n]))
-        assert b[:n] / np.linalg.norm(b[:n]) == pytest.approx(a[:n] / np.linalg.norm(a[:n]))
-        assert np.array_equal(a[n:], b[n:])
-    assert len(longer) == round(0.3 * len(before))
-    assert [min(longer), max(longer)] == pytest.approx([1.0, 5.0], abs=0.25)
-
-
-def test_of_an_outlier_with_a_range_the_range_alone_is_wrong():
-    for sensor in ("range", "range_bearing"):
-        recording = simulate("flight", 1, laps=1, sensor=sensor)
-        faulty, wrong = faulty_recording(recording, [Fault.named("outliers", most_m=1.0)], seed=2)
-        before, after = sightings(recording), sightings(faulty)
-        for key in rows_of(wrong, "/landmarks"):
-            more = np.subtract(after[key].measured, before[key].measured)
-            assert 0.2 <= more[0] <= 1.0
-            assert not more[1:].any()
-
-
-@pytest.mark.parametrize("world", WORLDS)
-def test_a_moved_landmark_is_seen_where_it_stands_now_with_the_noise_it_had(world):
-    for sensor in ("pose", "position", "range_bearing", "bearing", "range"):
-        recording = simulate(world, 2, **WORLDS[world] | {"laps": 1}, sensor=sensor)
-        space, truth = space_of(recording.T_world_base[0]), recording.T_world_base
-        at = {stamp_ns: k for k, stamp_ns in enumerate(recording.stamps_ns.tolist())}
-        seen = [(at[one.stamp_ns], s) for one in recording.seen for s in one.sightings][:100]
-        none = Closures(np.empty((0, 2), dtype=np.int64), np.empty((0, space.pose.size)), np.empty((0, space.dof, 2)))
-        places = np.array([k for k, _ in seen])
-        draft = Draft(space, truth, truth, truth, [s for _, s in seen], places, recording.landmarks, none, [])
-        displaced = np.array([0.7, -1.1, 0.4])[: space.dimensions]
-        edge = space.sightings[sensor]
-        for k, (pose, s) in enumerate(seen):
-            place = np.array(recording.landmarks[s.id])
-            before, now = place[: None if sensor == "pose" else space.dimensions], place.copy()
-            now[: space.dimensions] += displaced
-            moved = draft.seen_from(k, displaced)
-            errors = [
-                edge.linearize(
-                    np.concatenate([truth[pose], where]),
-                    np.array([[0, space.pose.size]]),
-                    edge.whole([*sighting.measured, *(sighting.T_base_sensor or ())])[None],
-                )[0]
-                for where, sighting in ((before, s), (now[: len(before)], moved))
-            ]
-            if sensor == "pose":  # the same noise, but seen along the axes of what is measured
-                assert np.linalg.norm(errors[0]) == pytest.approx(np.linalg.norm(errors[1]))
-            else:
-                assert errors[0] == pytest.approx(errors[1], abs=1e-9)
-            assert replace(moved, measured=s.measured) == s
-
-
-def test_landmarks_have_moved_by_the_given_distance_from_then_on(recording):
-    faulty, wrong = faulty_recording(recording, [Fault.named("moved_landmarks", count=2, distance_m=3.0)], seed=2)
-    names = {row.true_id for row in wrong}
-    assert len(names) == 2
-    table, before, after = rows_of(wrong, "/landmarks"), sightings(recording), sightings(faulty)
-    n = space_of(recording.T_world_base[0]).dimensions
-    for key, s in before.items():
-        assert (key in table) == (s.id in names and key[0] >= halves(recording))
-        if key in table:
-            assert np.linalg.norm(np.subtract(after[key].measured, s.measured)[:n]) == pytest.approx(3.0)
-
-
-def test_slipping_odometry_tells_a_longer_way_for_a_while_and_then_goes_on_as_it_would(recording):
-    fault = Fault.named("slip", at=0.25, lasting=0.1, factor=1.5)
-    faulty, wrong = faulty_recording(recording, [fault], seed=2)
-    first, n = round(0.25 * (len(recording.stamps_ns) - 1)), space_of(recording.T_world_base[0]).dimensions
-    last = first + round(0.1 * (len(recording.stamps_ns) - 1))
-    assert [row.stamp_ns for row in wrong] == recording.stamps_ns[first + 1 : last + 1].tolist()
-    told, driven = motions(faulty), motions(recording)
-    longer = driven.copy()
-    longer[first:last, :n] *= 1.5
-    assert told == pytest.approx(longer, abs=1e-9)
-    assert np.array_equal(faulty.T_odom_base[: first + 1], recording.T_odom_base[: first + 1])
-    twist = recording.twist.copy()
-    twist[first + 1 : last + 1, :n] *= 1.5
-    assert np.array_equal(faulty.twist, twist)
-
-
-def test_odometry_stands_still_while_the_robot_is_carried_and_then_goes_on_as_it_would(recording):
-    faulty, wrong = faulty_recording(recording, [Fault.named("carried", at=0.25, distance_m=2.0)], seed=2)
-    first, n = round(0.25 * (len(recording.stamps_ns) - 1)), space_of(recording.T_world_base[0]).dimensions
-    away = np.linalg.norm(recording.T_world_base[first:, :n] - recording.T_world_base[first, :n], axis=1)
-    last = first + int(np.argmax(away >= 2.0))
-    assert [row.stamp_ns for row in wrong] == recording.stamps_ns[first + 1 : last + 1].tolist()
-    assert motions(faulty)[first:last, :n] == pytest.approx(np.zeros((last - first, n)), abs=1e-12)
-    assert motions(faulty)[last:] == pytest.approx(motions(recording)[last:], abs=1e-9)
-    assert not faulty.twist[first + 1 : last + 1].any()
-    assert np.array_equal(faulty.twist[last + 1 :], recording.twist[last + 1 :])
-
-
-def test_a_jump_is_one_motion_and_the_measured_velocity_knows_nothing_of_it(recording):
-    fault = Fault.named("jump", at=0.5, ahead_m=1.0, left_m=-0.5, turn_rad=0.2)
-    faulty, (row,) = faulty_recording(recording, [fault], seed=2)
-    k, space = round(0.5 * (len(recording.stamps_ns) - 1)), space_of(recording.T_world_base[0])
-    assert (row.topic, row.stamp_ns) == ("/odom", recording.stamps_ns[k])
-    jump = space.group.local(tuple(motions(faulty)[k - 1]), tuple(motions(recording)[k - 1]))
-    assert jump == pytest.approx((1.0, -0.5, 0.2) if space.dof == 3 else (1.0, -0.5, 0.0, 0.0, 0.0, 0.2), abs=1e-9)
-    assert np.array_equal(faulty.twist, recording.twist)
-
-
-def test_a_measurement_that_two_faults_hit_stands_once_with_both_and_with_what_was_seen(recording):
-    faults = [Fault.named("swapped_ids"), Fault.named("wrong_ids", rate=1.0)]
-    _, wrong = faulty_recording(recording, faults, seed=2)
-    before = sightings(recording)
-    assert len(wrong) == len(before)
-    assert {row.fault for row in wrong} == {"wrong_ids", "swapped_ids+wrong_ids"}
-    for row in wrong:
-        assert row.true_id == before[row.stamp_ns, row.index].id
-
-
 def test_a_fault_that_does_not_fit_is_refused_by_name():
     recording = simulate("warehouse", 1, aisles=2, laps=1, sensor="bearing")
     for fault, told in (
@@ -253,55 +105,6 @@ def test_a_fault_that_does_not_fit_is_refused_by_name():
     ):
         with pytest.raises(GraphSlamError, match=told):
             faulty_recording(recording, [Fault.parsed(fault)], seed=1)
-
-
-# -- as files ----------------------------------------------------------------------------------------------------------
-
-
-def test_closures_of_a_bag_decode_to_those_it_was_made_of_and_the_table_finds_its_messages(recording, tmp_path):
-    faults = [Fault.named("false_closures", policy="local-group"), Fault.named("wrong_ids"), Fault.named("jump")]
-    faulty, wrong = faulty_recording(recording, faults, seed=4)
-    write_bag(faulty, tmp_path / "bag.mcap")
-    settings = {
-        "world.dimensions": space_of(recording.T_world_base[0]).dimensions,
-        "inputs.names": "odom detections loops",
-        "loops.type": "vision_msgs/msg/Detection3DArray",
-        "loops.use": "closure",
-        "loops.topic": "closures",
-    }
-    counters = Counters()
-    border = MessageConverter(Config.from_mapping(settings), counters)
-    bag, decoded, messages = open_bag(tmp_path / "bag.mcap"), [], {}
-    for record in bag.messages(["/odom", "/landmarks", "/closures"]):
-        messages[record.topic, record.log_ns] = typestore().deserialize_cdr(record.cdr, bag.topics[record.topic].type)
-        if record.topic == "/closures":
-            decoded += border.convert("loops", record.cdr)
-    assert counters.as_dict() == {}
-    expected = [m for m in measurements(faulty) if isinstance(m, Closure)]
-    assert len(decoded) == len(expected) == 30 + round(30 * 0.3 / 0.7)
-    for a, b in zip(decoded, expected, strict=True):
-        assert (a.stamp_ns, a.from_stamp_ns) == (b.stamp_ns, b.from_stamp_ns)
-        assert a.T_from_base == pytest.approx(b.T_from_base, abs=1e-9)
-        assert a.covariance == pytest.approx(b.covariance, abs=1e-9)
-    for row in wrong:
-        message = messages[row.topic, row.stamp_ns]
-        assert row.topic == "/odom" or message.detections[row.index].id == row.id
-
-
-def test_landmarks_that_go_by_numbers_in_a_bag_go_by_them_in_the_table(tmp_path):
-    recording = simulate("warehouse", 1, aisles=2, laps=1, sensor="range_bearing")
-    faulty, wrong = faulty_recording(recording, [Fault.named("wrong_ids")], seed=4)
-    write_bag(faulty, tmp_path / "bag.mcap")
-    bag = open_bag(tmp_path / "bag.mcap")
-    clouds = {
-        r.log_ns: typestore().deserialize_cdr(r.cdr, bag.topics[r.topic].type) for r in bag.messages(["/landmarks"])
-    }
-    names = list(recording.landmarks)
-    for row in wrong:
-        cloud = clouds[row.stamp_ns]
-        points = np.frombuffer(bytes(cloud.data), np.dtype([(f.name, "<f8") for f in cloud.fields]))
-        assert int(points["id"][row.index]) == int(row.id)
-        assert names[int(row.true_id)] == sightings(recording)[row.stamp_ns, row.index].id
 
 
 def run(capsys, *words):
@@ -379,3 +182,22 @@ def test_the_help_tells_every_fault_and_all_that_can_be_set(capsys):
         for option in options_of(kind):
             unit = f" [{option.unit}]" if option.unit else ""
             assert f"    {option.name}={option.default}{unit}  {option.meaning}" in out
+
+
+@pytest.mark.parametrize("world", ["city", "flight"])
+def test_what_agrees_with_the_truth_is_no_false_closure(world):
+    """In a small world: what is drawn anywhere is true now and then."""
+    if world == "city":
+        truth, root, dof = city_graph(seed=3, poses=1000, blocks=3)[1], np.diag([20.0, 20.0, 100.0]), 3
+    else:
+        flown = simulate("flight", 3, laps=3).T_world_base
+        truth, root, dof = flown[:: len(flown) // 1000], np.diag([20.0] * 3 + [100.0] * 3), 6
+    for policy in ("random", "local", "group", "aliased"):
+        vague = root / (4.0 if policy == "local" else 10.0)
+
+        def off(margin, policy=policy, vague=vague):
+            found = false_closures(truth, vague[None], 300, policy, np.random.default_rng(1), margin=margin)
+            return disagreement(truth, found.ends, found.measured, vague)
+
+        assert off(4.0).min() > 4.0 * chi2.ppf(0.9999, dof)
+        assert (off(0.0) < 4.0 * chi2.ppf(0.9999, dof)).any(), "or the test shows nothing"

@@ -56,12 +56,6 @@ def test_wrong_identities_do_not_make_calibration_worse_than_none(wrong):
         assert abs(value - truth[name]) < 0.5 * abs(truth[name]) + 0.01, (name, value)
 
 
-def test_factors_apart_find_what_is_configured_wrong():
-    """``odometry.distance_factor`` that is wrong is as odometry that is wrong."""
-    slam = driven(imperfect_drive(Faults(), seconds=50.0), {"odometry.distance_factor": 1.06})
-    assert 1.06 * (1.0 + admitted(slam)["distance"]) == pytest.approx(1.0, abs=0.01)
-
-
 def test_a_robot_that_may_slide_does_not_tell_the_yaw_of_its_sensor():
     """Its direction of motion, against which a yaw is measured, may be that in which it slides."""
     slam = driven(imperfect_drive(Faults(yaw=0.08), seconds=30.0), {"odometry.lateral_density": 0.006})

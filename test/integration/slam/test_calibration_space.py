@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from imperfect import SECOND_NS, START_NS
-from reliability import times
 
 from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
@@ -75,11 +74,3 @@ def test_a_level_drive_does_not_tell_the_height_of_a_sensor():
     assert "drive up a ramp and down, so that the robot tilts" in findings["z"].text
     for name in ("roll", "pitch", "yaw"):
         assert findings[name].value == pytest.approx(MOUNT[name], abs=0.012)
-
-
-@pytest.mark.skipif(not times(0, 1), reason="only in make soak")
-def test_a_robot_that_may_drift_upwards_does_not_tell_the_pitch_of_its_sensor(wrong):
-    findings = found(wrong[: len(wrong) * 2 // 3], {"odometry.vertical_density": 0.006})
-    assert findings["pitch"].verdict == "refused"
-    assert "odometry.vertical_density (upwards) is 0.6 of odometry.translation_density" in findings["pitch"].text
-    assert findings["yaw"].verdict != "refused"

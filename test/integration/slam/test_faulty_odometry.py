@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from graph_slam_ros.config.config import Config
-from graph_slam_ros.errors import FormatError
 from graph_slam_ros.lie import se2
 from graph_slam_ros.runs.outcome import shortcomings
 from graph_slam_ros.runs.tables import account, summarize
@@ -82,19 +81,3 @@ def test_odometry_that_begins_anew_after_a_silence_ties_nothing_of_it_to_the_las
     before = slam.keyframes.stamps_ns < 1e12 + 1e9 * BEGINS
     there = np.array([truth(one) for one in 1e-9 * (slam.keyframes.stamps_ns[before] - 1e12)])[:, :2]
     assert np.linalg.norm(slam.trajectory()[before, :2] - there, axis=1).max() < 0.3
-
-
-@pytest.mark.parametrize(
-    ("make", "complaint"),
-    [
-        (lambda: Odometry(1, (np.nan, 0.0, 0.0)), "Odometry: T_odom_base .*3 or 7 finite numbers"),
-        (lambda: Odometry(1, (1.0, 0.0)), "T_odom_base .*3 or 7 finite numbers"),
-        (lambda: Odometry(1.5, (1.0, 0.0, 0.0)), "stamp_ns 1.5: it must be whole nanoseconds"),
-        (lambda: Sighting("a", "position", (1.0, 0.0), 0.01), "covariance .*4 or 9 finite numbers"),
-        (lambda: Sighting("a", "position", (1.0, 0.0), np.eye(3)), "covariance of 9 numbers"),
-        (lambda: GraphSlam(Config()).process(Odometry(1, (0.0,) * 6 + (1.0,))), "not of 2 dimensions"),
-    ],
-)
-def test_a_measurement_of_wrong_numbers_is_refused_where_it_is_made(make, complaint):
-    with pytest.raises(FormatError, match=complaint):
-        make()

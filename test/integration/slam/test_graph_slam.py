@@ -6,14 +6,11 @@ import math
 import numpy as np
 import pytest
 
-from graph_slam_ros.errors import SingularError
 from graph_slam_ros.formats.g2o_writer import write_g2o
 from graph_slam_ros.formats.graph_file import G2oFile
-from graph_slam_ros.graph import LANDMARK_POSITION, RELATIVE_POSE, SE2, TAG_POSITION
+from graph_slam_ros.graph import LANDMARK_POSITION, RELATIVE_POSE
 from graph_slam_ros.lie import se2
 from graph_slam_ros.measurements.types import from_record, to_record
-from graph_slam_ros.runs.outcome import shortcomings
-from graph_slam_ros.runs.tables import summarize
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
 from graph_slam_ros.tools.simulation import measurements, simulate
 
@@ -80,15 +77,7 @@ def recorded():
     return list(measurements(simulate("warehouse", 5, aisles=2, laps=1, aisle_m=6.0)))
 
 
-# -- order ----------------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def in_order(recorded):
-    return run(GraphSlam(), *recorded, *END)
-
-
-def test_the_graph_is_a_function_of_the_ingest_sequence(recorded, in_order, tmp_path):
+def test_the_graph_is_a_function_of_the_ingest_sequence(recorded, tmp_path):
     accepted = []
     rng = np.random.default_rng(1)
     late = sorted(range(len(recorded)), key=lambda k: (recorded[k].stamp_ns + rng.uniform(0.0, 0.2 * S), k))
@@ -98,7 +87,7 @@ def test_the_graph_is_a_function_of_the_ingest_sequence(recorded, in_order, tmp_
     assert g2o(again, tmp_path) == g2o(messy, tmp_path)
     assert len(accepted) == messy.processed == len(recorded) + 1 + len(END), "refused measurements are recorded, too"
     assert again.counters.as_dict() == messy.counters.as_dict(), "a replay refuses the same"
-    assert g2o(in_order, tmp_path) != g2o(messy, tmp_path)
+    assert g2o(run(GraphSlam(), *recorded, *END), tmp_path) != g2o(messy, tmp_path)
 
 
 def test_B2_late_sightings_go_where_they_belong():
@@ -116,9 +105,6 @@ def test_B2_late_sightings_go_where_they_belong():
         assert there == pytest.approx(here, abs=1e-9)
         at = [table(p, LANDMARK_POSITION).measured.values for p in (late, in_time)]
     assert np.sort(at[0], axis=0) == pytest.approx(np.sort(at[1], axis=0), abs=1e-12)
-
-
-# -- keyframes and motion -------------------------------------------------------------------------------------------
 
 
 def test_keyframes_come_by_distance_by_angle_and_by_time_in_motion():
@@ -139,13 +125,6 @@ def test_G20_a_standing_robot_makes_no_keyframes_and_gathers_no_noise():
     assert covariance_of(p, LANDMARK_POSITION) == pytest.approx(np.reshape(POINT, (2, 2)), rel=1e-5)
 
 
-def test_odometry_edges_are_the_relative_motion_and_not_the_absolute_pose():
-    p = run(slam(), odometry(0, (5, 5, math.pi / 2)), odometry(1, (5, 6, math.pi / 2 + 0.2)), odometry(2, (5, 7, 1.0)))
-    assert table(p, RELATIVE_POSE).measured.values[0] == pytest.approx([1, 0, 0.2])
-    assert p.trajectory() == pytest.approx(np.array([k.T_odom_base for k in p.keyframes])), "map begins where odom does"
-    assert p.T_map_odom == pytest.approx((0, 0, 0), abs=1e-12)
-
-
 def monte_carlo(steps, covariance_of_step, samples=20_000, seed=3):
     """Covariance at the end of noisy steps, in the tangent space there."""
     rng = np.random.default_rng(seed)
@@ -156,22 +135,6 @@ def monte_carlo(steps, covariance_of_step, samples=20_000, seed=3):
         twist = np.array(se2.log(step))[:, None] + noise.T
         noisy = se2.compose(noisy, se2.exp(tuple(twist)))
     return np.cov(np.stack(se2.local(noisy, end)))
-
-
-CURVE = [(0.1 * k, 0.004 * k * k, 0.05 * k) for k in range(4)]
-
-
-@pytest.mark.parametrize("noise", ["density", "twist"])
-def test_the_noise_of_a_step_is_what_random_steps_have(noise):
-    twist = np.array([[2e-3, 1e-4, 0], [1e-4, 1e-3, 0], [0, 0, 4e-3]])
-    p = slam(odometry={"noise": noise, "lateral_density": 0.01}, keyframes={"min_distance_m": 0.29})
-    run(p, *(odometry(0.1 * k, pose, tuple(twist.ravel())) for k, pose in enumerate(CURVE)))
-    assert len(p.keyframes) == 2
-    of_step = np.diag([0.02**2, 0.01**2, 0.05**2]) * 0.1 if noise == "density" else twist * 0.1 * 0.25
-    steps = [se2.between(a, b) for a, b in itertools.pairwise(CURVE)]
-    expected, got = monte_carlo(steps, [of_step] * 3), covariance_of(p, RELATIVE_POSE)
-    scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
-    assert (got / scale) == pytest.approx(expected / scale, abs=0.04)  # 20,000 samples: 1 % each, 4 sigma
 
 
 def motion_noise(turned, way, seconds):
@@ -192,61 +155,6 @@ def test_noise_by_motion_grows_with_all_that_was_turned_and_driven_not_with_wher
     assert (got / scale) == pytest.approx(expected / scale, abs=0.04)  # 20,000 samples: 1 % each, 4 sigma
 
 
-# -- sightings ------------------------------------------------------------------------------------------------------
-
-
-def between_keyframes(*sightings):
-    """Odometry at 0, 1 and 2 s; a sighting at 1.4 s, with keyframes at 0 and 2 s only."""
-    p = slam(keyframes={"min_distance_m": 0.9, "min_angle_rad": 3.0, "max_interval_s": 100.0})
-    at_1, at_2 = (0.6, 0.1, 0.5), (1.2, 0.5, 0.8)
-    run(p, odometry(0, (0, 0, 0)), odometry(1, at_1), seen(1.4, *sightings), odometry(2, at_2))
-    return p, at_1, se2.interpolate(at_1, at_2, 0.4)
-
-
-def carried_noise(at_1, at_see):
-    """Of the motion from the keyframe to the sighting, by random steps."""
-    density = np.diag([0.02**2, 0.005**2, 0.05**2])
-    return [at_1, se2.between(at_1, at_see)], [density * 1.0, density * 0.4]
-
-
-def test_a_point_is_carried_to_the_last_keyframe_by_the_odometry_since():
-    p, at_1, at_see = between_keyframes(point())
-    assert len(p.keyframes) == 2
-    edges = table(p, LANDMARK_POSITION)
-    assert edges.vertices.values[0].tolist() == [p.keyframes[0].vertex, p.landmarks["a"].vertex]
-    assert edges.measured.values[0] == pytest.approx(se2.act(at_see, (2.0, 1.0)))
-    rng = np.random.default_rng(5)
-    steps, noise = carried_noise(at_1, at_see)
-    n = 40_000
-    moved = tuple(np.zeros((3, n)))
-    for step, covariance in zip(steps, noise, strict=True):
-        twist = np.array(se2.log(step))[:, None] + rng.multivariate_normal(np.zeros(3), covariance, n).T
-        moved = se2.compose(moved, se2.exp(tuple(twist)))
-    local = np.array([2.0, 1.0])[:, None] + rng.multivariate_normal([0, 0], np.reshape(POINT, (2, 2)), n).T
-    expected = np.cov(np.stack(se2.act(moved, tuple(local))))
-    assert covariance_of(p, LANDMARK_POSITION) == pytest.approx(expected, abs=0.03 * np.trace(expected))
-
-
-def test_a_tag_is_carried_to_the_last_keyframe_by_the_odometry_since():
-    p, at_1, at_see = between_keyframes(tag())
-    edges = table(p, RELATIVE_POSE)
-    row = int(np.flatnonzero(edges.vertices.values[:, 1] == p.landmarks["a"].vertex)[0])
-    assert edges.measured.values[row] == pytest.approx(se2.compose(at_see, (2.0, 1.0, 0.5)))
-    steps, noise = carried_noise(at_1, at_see)
-    expected = monte_carlo([*steps, (2.0, 1.0, 0.5)], [*noise, np.zeros((3, 3))], 40_000)
-    expected += np.reshape(POSE, (3, 3))
-    assert covariance_of(p, RELATIVE_POSE, row) == pytest.approx(expected, abs=0.03 * np.trace(expected))
-
-
-def test_a_landmark_seen_as_a_pose_first_takes_points_later():
-    p = run(slam(), odometry(0, (0, 0, 0)), seen(0, tag()), odometry(1, (1, 0, 0)), seen(1, point(at=(1.0, 1.0))), *END)
-    assert p.graph.kind_of(p.landmarks["a"].vertex) is SE2
-    assert len(table(p, TAG_POSITION)) == 1
-    assert LANDMARK_POSITION not in p.graph.tables
-    assert p.solver.estimate([p.landmarks["a"].vertex])[0] == pytest.approx([2.0, 1.0, 0.5], abs=1e-6)
-    assert p.counters.as_dict() == {}
-
-
 def test_a_landmark_seen_as_a_point_first_takes_the_positions_of_poses_later():
     p = run(slam(), odometry(0, (0, 0, 0)), seen(0, point()), odometry(1, (1, 0, 0)), seen(1, tag(at=(1.0, 1.0, 0.5))))
     edges = table(p, LANDMARK_POSITION)
@@ -261,110 +169,11 @@ def test_a_landmark_seen_as_a_point_first_takes_the_positions_of_poses_later():
     assert p.solver.estimate([p.landmarks["a"].vertex])[0] == pytest.approx([2.0, 1.0], abs=1e-6)
 
 
-# -- solving --------------------------------------------------------------------------------------------------------
-
-
-def solves(p, items):
-    """Stamps in seconds at which a solve happened."""
-    return [(m.stamp_ns - T0) / S for m in items if p.process(m).solved]
-
-
-@pytest.mark.parametrize("every", [1, 4])
-def test_a_solve_comes_every_so_many_keyframes(every):
-    p = slam(solve={"every_keyframes": every}, keyframes={"min_distance_m": 0.95})
-    assert solves(p, straight(13)) == pytest.approx(range(every, 14, every))
-    assert p.solves == 13 // every
-    assert p.report is None  # none of everything was asked for
-
-
-def loop(p):
-    """A square drive with a drift, whose first landmark returns at its end."""
-    x, heading, t = (0.0, 0.0), 0.0, 0
-    run(p, odometry(0, (0, 0, 0)), seen(0, point("home", (2.0, 0.0))))
-    for _ in range(4):
-        for _ in range(5):
-            t += 1
-            x = (x[0] + math.cos(heading), x[1] + math.sin(heading))
-            run(p, odometry(t, (*x, heading)), seen(t, point(f"at {t}", (1.0, 1.0))))
-        heading += math.pi / 2 + 0.02
-    t += 1
-    return run(p, odometry(t, (*x, heading)), seen(t, point("home", (2.0, 0.0))))
-
-
-def test_after_a_solve_the_pose_covariance_is_the_marginal_and_then_grows_with_the_odometry():
-    p = loop(slam())
-    run(p, *END)
-    h = p.solver.information_matrix()
-    newest = p.keyframes[-1].vertex
-    dofs = [p.graph.kind_of(v).dof for v in range(p.graph.vertex_count)]
-    first = sum(dofs[:newest])
-    dense = np.linalg.inv(h)[first : first + 3, first : first + 3]
-    assert p.pose_covariance == pytest.approx(dense, rel=1e-8, abs=1e-10 * np.trace(dense))
-    step = (0.5, 0.0, 0.3)
-    at = p.keyframes[-1]
-    p.process(Odometry(at.stamp_ns + S, se2.compose(at.T_odom_base, step), None))
-    ad = se2.adjoint(se2.inverse(step))
-    grown = ad @ dense @ ad.T + covariance_of(p, RELATIVE_POSE)
-    assert p.pose_covariance == pytest.approx(grown, rel=1e-6, abs=1e-7)
-
-
-def test_a_closed_loop_moves_the_map_under_the_odometry_and_halves_its_error():
-    p = loop(slam())
-    drift = np.hypot(*p.keyframes[-1].T_odom_base[:2])
-    run(p, *END)
-    newest = se2.compose(p.T_map_odom, p.keyframes[-1].T_odom_base)
-    assert se2.local(newest, tuple(p.trajectory()[-1])) == pytest.approx((0, 0, 0), abs=1e-9)
-    assert np.hypot(*newest[:2]) < 0.5 * drift
-
-
 def test_with_identities_a_sighting_without_one_is_counted_and_the_others_of_its_message_are_used():
     p = slam(landmarks={"association": "id"})
     run(p, *straight(1), seen(0.5, point(""), point("a"), tag("")), seen(0.7, point("")), *END)
     assert p.counters.as_dict() == {"/landmarks": {"no_id": 3}}
     assert list(p.landmarks) == ["a"]
-
-
-class Failing:
-    """A solver's update that fails while it is told to."""
-
-    def __init__(self, pipeline, monkeypatch):
-        self.works, update = False, pipeline.solver.update
-        monkeypatch.setattr(pipeline.solver, "update", lambda *a: update(*a) if self.works else self.fail())
-
-    def fail(self):
-        raise SingularError("the edges do not determine vertex 7")
-
-
-def test_G7_a_solve_that_fails_is_counted_and_the_last_estimate_stays(monkeypatch):
-    p = slam(solve={"every_keyframes": 2})
-    failing = Failing(p, monkeypatch)
-    items = [m for o in straight(2) for m in (o, seen((o.stamp_ns - T0) / S, point(at=(3.0 - o.T_odom_base[0], 0.1))))]
-    updates = [p.process(m) for m in items]
-    assert not any(u.solved for u in updates)
-    assert p.counters["solver", "SingularError"] == 3
-    assert all(np.isnan(c).all() for c in p.landmark_covariances())
-    assert p.counters["solver", "SingularError"] == 3  # nothing was tried again
-    assert p.trajectory() == pytest.approx(np.array([k.T_odom_base for k in p.keyframes]), abs=1e-12)
-    assert np.isfinite(p.pose_covariance).all()
-    told = summarize(p)
-    assert told["solves"] == 0
-    assert any("the last solve failed" in one and p.failing in one for one in shortcomings(told))
-    failing.works = True
-    assert p.process(Control("optimize")).report.converged
-    assert not any("the last solve failed" in one for one in shortcomings(summarize(p)))
-    assert all(np.isfinite(c).all() for c in p.landmark_covariances())
-    assert p.counters["solver", "SingularError"] == 3
-
-
-def test_numbers_at_the_borders_limits_leave_no_vertex_without_its_edge():
-    p, far = slam(landmarks={"loss": "none"}), 1e9
-    huge, tiny = tuple(np.diag([1e6, 1e6, 1e3]).ravel()), tuple(1e-30 * np.eye(3).ravel())
-    run(p, odometry(0, (0, 0, 0), huge), seen(0, tag(at=(far, -far, 1.0)), point("b", (far, far), (1e6, 0, 0, 1e6))))
-    run(p, odometry(1e9, (far, far, 2.0), huge), seen(1e9, tag(), tag("c", covariance=tiny)))
-    run(p, odometry(1e9 + 1, (0, 0, 0)), *END)
-    inside = set(np.concatenate([t.vertices.values.ravel() for t in p.graph.tables.values()]).tolist())
-    assert inside == set(range(p.graph.vertex_count))
-    assert np.isfinite(p.trajectory()).all()
 
 
 def test_P21_of_several_faults_at_once_the_first_is_raised_and_all_count(monkeypatch):

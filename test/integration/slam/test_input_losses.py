@@ -2,14 +2,11 @@
 
 import numpy as np
 import pytest
-from scipy.optimize import minimize_scalar
 
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.errors import ConfigError
-from graph_slam_ros.graph import POINT_PRIOR, R1, Gaussian, Graph, Loss
 from graph_slam_ros.messages.inputs import uses
 from graph_slam_ros.slam import Control, Fix, GraphSlam, Odometry
-from graph_slam_ros.solver import Settings, Solver
 
 S = 1_000_000_000
 INPUTS = {
@@ -39,33 +36,6 @@ def test_the_loss_of_an_input_keeps_its_outliers_from_the_estimate():
     assert np.abs(estimate()[:, 1]).max() > 0.5, "without a loss they pull"
     assert np.abs(estimate(bad__loss="dcs", robust__loss_scale=1.0)[:, 1]).max() < 0.1
     assert np.abs(estimate(good__loss="dcs", robust__loss_scale=1.0)[:, 1]).max() > 0.5, "of the other input"
-
-
-def test_inputs_that_all_have_one_loss_give_the_estimate_of_that_loss_for_their_class():
-    by_class = estimate(robust__loss="cauchy", robust__loss_scale=1.5)
-    by_input = estimate(good__loss="cauchy", bad__loss="cauchy", robust__loss_scale=1.5)
-    np.testing.assert_array_equal(by_input, by_class)
-
-
-@pytest.mark.parametrize("first", ["a", "b"])
-def test_the_minimum_is_that_of_the_sum_of_both_losses(first):
-    """The order in which sources came into the graph says nothing."""
-    graph, measured = Graph(), {"a": 0.0, "b": 2.0}
-    vertex = graph.add_vertex(R1, [0.3])
-    for source in sorted(measured, key=lambda one: one != first):
-        graph.add_edge(POINT_PRIOR[R1], [vertex], [measured[source]], Gaussian.from_sigmas(1.0), "fixes", source)
-    loss = Loss.named("cauchy", 0.5)
-    solver = Solver(graph, Settings(losses={"fixes": [Loss()], ("fixes", "b"): [loss]}, cost_tolerance=1e-14))
-    solver.add([vertex], np.arange(2))
-    report = solver.optimize()
-
-    def cost(x):
-        return x**2 + 0.25 * np.log1p((x - 2.0) ** 2 / 0.25)
-
-    best = minimize_scalar(cost, bracket=(0.0, 0.5), options={"xtol": 1e-12})
-    assert solver.values[0] == pytest.approx(best.x, abs=1e-5)
-    assert report.cost_final == pytest.approx(best.fun, rel=1e-9)
-    assert cost(2.0) > best.fun
 
 
 def test_a_wrong_value_of_an_input_is_named():

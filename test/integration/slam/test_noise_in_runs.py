@@ -121,7 +121,7 @@ LARGER = NoiseScale("landmarks", "detections", "rotation", 100, 900.0, 4.0, 1.0,
 
 
 @pytest.mark.parametrize("which", ["last_pose", "poses", "landmarks"])
-def test_smaller_sigmas_are_not_advised_where_errors_are_larger_than_the_covariances_say(which):
+def test_smaller_sigmas_are_not_advised_where_errors_are_larger_than_the_covariances_say_or_alike_in_a_pass(which):
     parts = dict.fromkeys(("last_pose", "poses", "landmarks"), Nees(6.0, 6, (5.7, 6.3), 0.95, 400, 0))
     fine = Consistency(*parts.values(), (SMALLER,), {}, "")
     assert (fine.over_confidence, "0.45 times as large" in str(fine)) == ("", True)
@@ -137,9 +137,6 @@ def test_smaller_sigmas_are_not_advised_where_errors_are_larger_than_the_covaria
         assert "--set" not in advice
     larger = noise_advice((LARGER,), is_applied=False, over_confident=wrong.over_confidence)
     assert "--set robust.noise_scale=estimated" in larger
-
-
-def test_smaller_sigmas_are_not_advised_where_errors_of_a_pass_are_alike():
     alike = NoiseScale("landmarks", "detections", "range", 100, 900.0, 0.1, 3.8, 0.6)
     said = noise_advice((alike,), is_applied=False)
     assert ("--set" in said, "no smaller sigmas" in said) == (False, True)

@@ -1,14 +1,13 @@
 """Distances that no sensor can mean, and what is left of a drive after them; directions straight up and down."""
 
-import itertools
 import math
 
 import numpy as np
 import pytest
 
-from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
+from graph_slam_ros.graph.geometry import PLANAR
 from graph_slam_ros.slam import Closure, Config, Control, GraphSlam, Odometry, Sighting, Sightings
-from graph_slam_ros.slam.frontend.max_distance import MaxDistance, off_the_pole
+from graph_slam_ros.slam.frontend.max_distance import MaxDistance
 
 S, RATE = 10**9, 10
 SOURCE = "detections"
@@ -31,7 +30,7 @@ def pose(dimensions, second):
     return at, turn, tuple(map(float, whole))
 
 
-def drive(config, far=None, seconds=12):
+def drive(config, far=None, seconds=6):
     """Past twelve landmarks; in the second third of the time with a detection far away in every message."""
     n = config.space.dimensions
     taken, rng = [], np.random.default_rng(0)
@@ -65,14 +64,14 @@ def test_a_detection_at_1e8_m_is_refused_and_changes_nothing(dimensions, associa
     slam, taken, _ = drive(config, far)
     assert not slam.failing
     counted = slam.counters.as_dict()
-    assert counted[SOURCE].pop("beyond_max_distance") == 4 * RATE
+    assert counted[SOURCE].pop("beyond_max_distance") == 2 * RATE
     undisturbed, _, _ = drive(config)
     assert written(slam) == written(undisturbed)
     replayed = GraphSlam(config)
     for m in taken:
         replayed.process(m)
     assert written(replayed) == written(slam)
-    assert replayed.counters.as_dict()[SOURCE]["beyond_max_distance"] == 4 * RATE
+    assert replayed.counters.as_dict()[SOURCE]["beyond_max_distance"] == 2 * RATE
 
 
 @pytest.mark.parametrize("dimensions, association, axis", [(2, "joint", -1), (3, "id", -1)])
@@ -84,9 +83,6 @@ def test_where_it_is_allowed_to_see_so_far_every_solve_still_succeeds(dimensions
     assert not slam.failing
     assert "solver" not in slam.counters.as_dict()
     assert np.linalg.norm(slam.trajectory()[-1][: len(at)] - at) < 0.1
-
-
-# -- the limit ---------------------------------------------------------------------------------------------------------
 
 
 def seen_at(*distances, kind="range"):
@@ -122,9 +118,6 @@ def test_a_closure_farther_than_any_is_refused_and_counted():
     assert len(slam.graph.edges_of("closures")) == 1
 
 
-# -- straight up and down ----------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     "kind, height, aside", [("bearing", 5.0, 0.0), ("range_bearing", -2.0, 1e-7), ("bearing", -2.0, 0.02)]
 )
@@ -145,20 +138,3 @@ def test_a_landmark_at_the_zenith_or_nadir_is_found_and_every_solve_succeeds(kin
     assert slam.report.converged
     assert slam.counters.as_dict() == {}
     assert np.linalg.norm(slam.solver.estimate([slam.landmarks["lamp"].vertex])[0] - mark) < 0.1
-
-
-def test_a_steep_direction_is_the_same_direction_in_other_axes():
-    for azimuth, elevation, sensor in itertools.product((-2.0, 0.0, 3.0), (1.4, -1.5, math.pi / 2), (None, True)):
-        T_base_sensor = SPATIAL.group.exp((0.1, 0.2, 0.3, 0.4, -0.5, 0.6)) if sensor else None
-        s = Sighting("a", "range_bearing", (2.0, azimuth, elevation), tuple(np.diag([1.0, 0.04, 0.01]).ravel()))
-        s = Sighting(s.id, s.kind, s.measured, s.covariance, T_base_sensor)
-        turned = off_the_pole(SPATIAL, s)
-        flat = 2.0 * math.cos(elevation)
-        point = (flat * math.cos(azimuth), flat * math.sin(azimuth), 2.0 * math.sin(elevation))
-        at = SPATIAL.group.act(T_base_sensor or SPATIAL.identity, point)
-        assert turned.measured == (2.0, 0.0, 0.0)
-        assert np.allclose(SPATIAL.group.act(turned.T_base_sensor, (2.0, 0.0, 0.0)), at)
-        expected = np.diag([1.0, max(0.04 * math.cos(elevation) ** 2, 0.01), 0.01])
-        assert np.allclose(np.reshape(turned.covariance, (3, 3)), expected)
-    level = Sighting("a", "bearing", (1.0, 1.3), (0.01, 0.0, 0.0, 0.01))
-    assert off_the_pole(SPATIAL, level) is level

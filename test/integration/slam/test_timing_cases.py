@@ -66,9 +66,6 @@ def sigma_of_edges(pipeline):
     return np.array([np.sqrt(np.diag(np.linalg.inv(root.T @ root))) for root in roots])
 
 
-# -- order -------------------------------------------------------------------------------------------------------------
-
-
 def saved(pipeline, folder):
     """The files of a run, but for what was counted."""
     recorder = RunRecorder(folder, pipeline.config, force=True)
@@ -79,12 +76,12 @@ def saved(pipeline, folder):
 
 
 def test_B1_whatever_the_order_within_the_window_and_what_comes_twice_the_saved_run_has_the_same_bytes(tmp_path):
-    recorded = list(measurements(simulate("warehouse", 5, aisles=2, laps=1, aisle_m=4.0)))[:700]
+    recorded = list(measurements(simulate("warehouse", 5, aisles=2, laps=1, aisle_m=4.0)))[:500]
     config = Config.from_mapping({"ordering": {"max_waiting": 1_000_000}})
     in_order = run(GraphSlam(config), *recorded, *END)
     expected = saved(in_order, tmp_path / "in_order")
     assert in_order.counters.as_dict() == {}
-    tries = times(2, 2000)
+    tries = times(1, 2000)
     for seed in range(tries):
         rng = np.random.default_rng(seed)
         # the first odometry decides where the map begins: nothing of it may be overtaken by 50 ms of stamp time
@@ -101,45 +98,12 @@ def test_B1_whatever_the_order_within_the_window_and_what_comes_twice_the_saved_
     tell("permutations", tried=tries, failed=0)
 
 
-# -- stamps ------------------------------------------------------------------------------------------------------------
-
 INPUTS = {
     "odom": (border, lambda ns: odometry(stamp_ns=ns)),
     "detections": (border, lambda ns: detections(detection(), stamp_ns=ns)),
     "gps": (receiver, lambda ns: gnss(stamp_ns=ns)),
     "loops": (lambda: closing(2), lambda ns: detections(detection(name="7", covariance=np.eye(6)), stamp_ns=ns)),
 }
-
-
-def test_B4_a_zero_stamp_is_refused_on_every_topic():
-    for name, (made, cdr) in INPUTS.items():
-        b = made()
-        assert heard(b, name, cdr(0)) is None, name
-        assert counted(b) == {name: {"zero_stamp": 1}}
-        assert heard(b, name, cdr(STAMP_NS)).stamp_ns == STAMP_NS, name
-
-
-def test_B5_a_stamp_that_is_none_is_refused():
-    for changes in ({"nanosec": 10**9}, {"nanosec": 2**32 - 1}, {"sec": -1}):
-        b = border()
-        assert heard(b, "odom", odometry(**changes)) is None, changes
-        assert counted(b) == {"odom": {"bad_stamp": 1}}
-
-
-def test_B3_odometry_of_one_stamp_is_used_once_and_counted_by_whether_it_differs():
-    p = run(slam(), at(0), at(1, 1.0), at(1, 1.0), at(1, 9.0), at(2, 2.0))
-    assert p.counters.as_dict() == {"odometry": {"duplicate": 1, "duplicate_stamp": 1}}
-    assert [k.T_odom_base[0] for k in p.keyframes] == [0, 1, 2]
-
-
-def test_B22_where_ten_messages_have_one_stamp_the_first_is_used_and_the_motion_is_not_lost():
-    told = []
-    p = slam(keyframes__min_distance_m=0.05)
-    p.counters.on_first = lambda *one: told.append(one)
-    run(p, *(at(0.1 * (k // 10), 0.01 * k) for k in range(100)))
-    assert p.counters.as_dict() == {"odometry": {"duplicate_stamp": 90}}
-    assert told == [("odometry", "duplicate_stamp")], "the topic is named once"
-    assert p.trajectory()[:, 0] == pytest.approx(0.1 * np.arange(10))
 
 
 def test_B20_the_clock_of_a_sensor_is_put_right_by_an_offset_that_is_told():
@@ -156,37 +120,6 @@ def test_B20_the_clock_of_a_sensor_is_put_right_by_an_offset_that_is_told():
         (lambda **s: scanner(sigma_m=0.1, **s), "scan", cloud([("x", "f4"), ("y", "f4")], (1.0, 2.0))),
     ):
         assert heard(made(offset_s=0.25), name, cdr).stamp_ns == STAMP_NS + offset_ns
-
-
-# -- gaps and jumps ----------------------------------------------------------------------------------------------------
-
-
-def test_B9_over_a_gap_odometry_that_went_on_is_one_edge_whose_noise_has_grown_with_time():
-    p = run(slam(), *straight(0, 3), *straight(63, 3))
-    assert p.counters.as_dict() == {}
-    assert p.segments == [0]
-    edges = p.graph.tables[RELATIVE_POSE].measured.values
-    (over,) = np.flatnonzero(edges[:, 0] > 50.0)
-    sigma = sigma_of_edges(p)
-    assert sigma[over, 0] == pytest.approx(0.02 * math.sqrt(60.0), rel=0.05)
-    assert sigma[over, 2] == pytest.approx(0.05 * math.sqrt(60.0), rel=0.05)
-    assert sigma[over, 1] > 10.0, "60 m ahead of a heading that is not known"
-
-
-def test_B9_over_a_gap_odometry_that_began_anew_is_no_motion():
-    p = run(slam(), *straight(0, 3), *(at(63 + 0.1 * k, 0.1 * k) for k in range(30)))
-    assert p.counters.as_dict() == {"odometry": {"reset_to_zero": 1}}
-    assert len(p.segments) == 2
-    assert np.diff(p.trajectory()[:, 0]).min() > -1e-9, "the path goes on from where it was"
-
-
-def test_B18_a_short_drop_out_of_odometry_is_a_longer_step_of_more_noise():
-    whole, lossy = run(slam(), *straight(0, 6)), run(slam(), *straight(0, 2), *straight(4, 2))
-    assert lossy.counters.as_dict() == {}
-    assert lossy.segments == [0]
-    longest = [sigma_of_edges(p)[:, 2].max() for p in (whole, lossy)]
-    assert longest == pytest.approx([0.05 * math.sqrt(0.3), 0.05 * math.sqrt(2.1)], rel=0.1)
-    assert lossy.trajectory()[-1] == pytest.approx(whole.trajectory()[-1], abs=0.3)
 
 
 def test_B7_after_a_jump_of_time_what_is_older_than_the_map_is_used_and_begins_a_segment():
@@ -257,15 +190,56 @@ def test_B21_however_often_odometry_comes_keyframes_come_by_the_way_and_not_by_m
     assert sigma_of_edges(p)[:, 0] == pytest.approx([0.02] * 20, rel=0.01), "of a second each"
 
 
-def test_B16_what_is_seen_before_the_first_odometry_waits_for_it_and_is_used_or_counted():
+def test_B4_B5_a_zero_stamp_is_refused_on_every_topic_and_so_is_one_that_is_none():
+    for name, (made, cdr) in INPUTS.items():
+        b = made()
+        assert heard(b, name, cdr(0)) is None, name
+        assert counted(b) == {name: {"zero_stamp": 1}}
+        assert heard(b, name, cdr(STAMP_NS)).stamp_ns == STAMP_NS, name
+    for changes in ({"nanosec": 10**9}, {"nanosec": 2**32 - 1}, {"sec": -1}):
+        b = border()
+        assert heard(b, "odom", odometry(**changes)) is None, changes
+        assert counted(b) == {"odom": {"bad_stamp": 1}}
+
+
+def test_B3_B22_of_odometry_of_one_stamp_the_first_is_used_and_the_motion_is_not_lost():
+    p = run(slam(), at(0), at(1, 1.0), at(1, 1.0), at(1, 9.0), at(2, 2.0))
+    assert p.counters.as_dict() == {"odometry": {"duplicate": 1, "duplicate_stamp": 1}}
+    assert [k.T_odom_base[0] for k in p.keyframes] == [0, 1, 2]
+    told = []
+    p = slam(keyframes__min_distance_m=0.05)
+    p.counters.on_first = lambda *one: told.append(one)
+    run(p, *(at(0.1 * (k // 10), 0.01 * k) for k in range(100)))
+    assert p.counters.as_dict() == {"odometry": {"duplicate_stamp": 90}}
+    assert told == [("odometry", "duplicate_stamp")], "the topic is named once"
+    assert p.trajectory()[:, 0] == pytest.approx(0.1 * np.arange(10))
+
+
+def test_B9_B18_over_a_gap_odometry_is_one_edge_whose_noise_has_grown_with_time_or_no_motion_where_it_began_anew():
+    p = run(slam(), *straight(0, 3), *straight(63, 3))
+    assert p.counters.as_dict() == {}
+    assert p.segments == [0]
+    (over,) = np.flatnonzero(p.graph.tables[RELATIVE_POSE].measured.values[:, 0] > 50.0)
+    sigma = sigma_of_edges(p)[over]
+    assert sigma[[0, 2]] == pytest.approx(np.sqrt(60.0) * np.array([0.02, 0.05]), rel=0.05)
+    assert sigma[1] > 10.0, "60 m ahead of a heading that is not known"
+    p = run(slam(), *straight(0, 3), *(at(63 + 0.1 * k, 0.1 * k) for k in range(30)))
+    assert p.counters.as_dict() == {"odometry": {"reset_to_zero": 1}}
+    assert len(p.segments) == 2
+    assert np.diff(p.trajectory()[:, 0]).min() > -1e-9, "the path goes on from where it was"
+    whole, lossy = run(slam(), *straight(0, 6)), run(slam(), *straight(0, 2), *straight(4, 2))
+    assert (lossy.counters.as_dict(), lossy.segments) == ({}, [0])
+    longest = [sigma_of_edges(p)[:, 2].max() for p in (whole, lossy)]
+    assert longest == pytest.approx([0.05 * math.sqrt(0.3), 0.05 * math.sqrt(2.1)], rel=0.1)
+    assert lossy.trajectory()[-1] == pytest.approx(whole.trajectory()[-1], abs=0.3)
+
+
+def test_B16_B17_what_is_seen_before_the_first_odometry_waits_and_long_ago_goes_to_its_old_keyframe_if_that_is_kept():
     p = run(slam(), seen(0.5), seen(-0.5))
     assert not p.landmarks
     run(p, *straight(0, 2))
     assert p.landmarks["a"].sightings == 1
     assert p.counters.as_dict() == {"/landmarks": {"before_odometry": 1}}
-
-
-def test_B17_what_was_seen_long_ago_goes_to_its_old_keyframe_as_long_as_that_is_kept():
     p = run(slam(ordering__late_s=5.0), *straight(0, 20), seen(16.1), seen(3.0))
     assert p.counters.as_dict() == {"/landmarks": {"late": 1}}
     assert p.keyframes[p.sighting_poses[0].keyframe].stamp_ns == pytest.approx(T0 + 16 * S, abs=0.3 * S)

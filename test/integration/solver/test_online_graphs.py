@@ -9,9 +9,8 @@ from reliability import times
 
 from graph_slam_ros.formats.g2o import read_g2o
 from graph_slam_ros.graph import R2
-from graph_slam_ros.slam import GraphSlam
 from graph_slam_ros.solver import Settings, Solver
-from graph_slam_ros.tools.simulation import city_graph, measurements, simulate
+from graph_slam_ros.tools.simulation import city_graph
 
 GRAPHS = DATASETS / "pose_graphs"
 
@@ -65,16 +64,3 @@ def test_after_every_step_of_a_public_graph_the_estimate_is_the_optimum(name, ev
 def test_after_every_step_of_a_simulated_city_the_estimate_is_the_optimum():
     graph, _ = city_graph(seed=3, poses=times(200, 600), blocks=10, odometry_noise_factor=2.0)
     replayed(graph, times(4, 1), **EXACT)
-
-
-def test_after_every_step_among_landmarks_the_estimate_is_the_optimum():
-    slam = GraphSlam()
-    for measurement in measurements(simulate("pythonrobotics", 2)):
-        slam.process(measurement)
-    replayed(slam.graph, 3, **EXACT)
-
-
-@pytest.mark.parametrize("seed", times([3], [3, 4]))
-def test_with_default_settings_each_step_is_as_near_as_they_state(seed):
-    graph, _ = city_graph(seed=seed, poses=600, blocks=10)
-    replayed(graph, 5, within=Settings().relinearize_above)

@@ -77,7 +77,6 @@ def test_what_is_tried_is_what_is_saved_and_what_edit_writes(faulty):
     before = {file.name: file.read_bytes() for file in faulty.run.iterdir()}
     body = plan(faulty, *edits)
     attempted = faulty.work.attempt(body)
-    assert faulty.work.attempt(body) == attempted, "on the same map as before"
     saved = faulty.work.save(body)
     folder = faulty.run.with_name("run_edited")
     assert saved["folder"] == str(folder)
@@ -93,22 +92,16 @@ def test_what_is_tried_is_what_is_saved_and_what_edit_writes(faulty):
     for one in folder.iterdir():
         if one.name not in ("run.json", "path.png"):
             assert one.read_bytes() == (other / one.name).read_bytes(), one.name
-    again = faulty.work.save(plan(faulty, edits[0]))
-    assert again["folder"] == f"{folder}_2", "nothing is replaced"
     assert {file.name: file.read_bytes() for file in faulty.run.iterdir()} == before
 
 
-def test_edits_of_the_path_are_tried_as_they_are_saved(faulty):
+def test_edits_of_the_path_are_tried_as_they_are_saved_and_decisions_that_change_with_them_are_named(faulty):
+    """A closure that contradicts the others is let in: some of them go out."""
     seen = [e.edge for e in faulty.saved.entries if e.landmark == faulty.saved.entries[faulty.inside[0]].landmark]
+    closed = {"from_keyframe": 5, "to_keyframe": 30, "pose": [1.0, 0.5, 0.1], "sigma_m": 1.0, "sigma_rad": 1.0}
     edits = [
-        {
-            "do": "add_closure",
-            "from_keyframe": 5,
-            "to_keyframe": 30,
-            "pose": [1.0, 0.5, 0.1],
-            "sigma_m": 1.0,
-            "sigma_rad": 1.0,
-        },
+        {"do": "let_in_edge", "edge": faulty.outside[0]},
+        {"do": "add_closure", **closed},
         {"do": "split_landmark", "landmark": faulty.saved.entries[seen[0]].landmark, "to": "twin", "edges": seen[:2]},
         {"do": "move_map", "pose": [3.0, 4.0, 0.5], "sigma_m": 0, "sigma_rad": 0},
     ]
@@ -119,17 +112,13 @@ def test_edits_of_the_path_are_tried_as_they_are_saved(faulty):
     assert found[0] == pytest.approx([3.0, 4.0, 0.0], abs=0.01)
     assert any("against all else" in one for one in attempted["notes"])
     assert "twin" in attempted["landmarks"]
-
-
-def test_decisions_that_change_with_an_edit_are_named(faulty):
-    """A closure that contradicts the others is let in: some of them go out."""
-    found = faulty.work.attempt(plan(faulty, {"do": "let_in_edge", "edge": faulty.outside[0]}))
-    after = faulty.work.save(plan(faulty, {"do": "let_in_edge", "edge": faulty.outside[0]}))["folder"]
-    entries = SavedGraph(faulty.run.with_name(after.rpartition("/")[2]), []).entries
-    verdicts = {e.edge: e.verdict.name.lower().replace("_", " ") for e in faulty.saved.entries}
-    now = {e.edge: e.verdict.name.lower().replace("_", " ") for e in entries if e.edge in verdicts}
-    expected = [[edge, verdicts[edge], now[edge]] for edge in verdicts if verdicts[edge] != now[edge]]
-    assert found["changes"] == [one for one in expected if one[0] != faulty.outside[0]]
+    saved = SavedGraph(folder, [])
+    before, after = (
+        {e.edge: e.verdict.name.lower().replace("_", " ") for e in one.entries} for one in (faulty.saved, saved)
+    )
+    changed = [[edge, was, after[edge]] for edge, was in before.items() if was != after[edge]]
+    own = {edge for done in saved.slam.edits for edge in done.edges}
+    assert attempted["changes"] == [one for one in changed if one[0] not in own] != []
 
 
 def test_the_page_has_all_kinds_of_edits(faulty):
@@ -140,15 +129,10 @@ def test_the_page_has_all_kinds_of_edits(faulty):
 def test_what_is_no_what_if_is_refused_in_one_line(faulty):
     for body in (
         *(b"", b"\xff{}", b"[" * 100_000, b'{"without": [], "let_in": []}'),
-        b'{"without": ["1"], "let_in": [], "loss": "", "first": false}',
-        b'{"without": [true], "let_in": [], "loss": "", "first": false}',
-        b'{"without": [-1], "let_in": [], "loss": "", "first": false}',
-        b'{"without": [99999999999999999999], "let_in": [], "loss": "", "first": false}',
-        b'{"without": [0], "let_in": [0], "loss": "", "first": false}',
-        b'{"without": [], "let_in": [], "loss": "huber:nan", "first": false}',
-        b'{"without": [], "let_in": [], "loss": "huber:x", "first": false}',
-        b'{"without": [], "let_in": [], "loss": "sharp:1", "first": false}',
-        b'{"without": [], "let_in": [], "loss": "", "first": false, "out": "/tmp/x"}',
+        *(what_if([edge]) for edge in ("1", True, -1, 99999999999999999999)),
+        *(what_if(loss=loss) for loss in ("huber:nan", "huber:x", "sharp:1")),
+        what_if([0], [0]),
+        what_if().replace(b"}", b', "out": "/tmp/x"}'),
     ):
         with pytest.raises(GraphSlamError) as error:
             faulty.work.solve(body)
