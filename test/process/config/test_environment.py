@@ -107,14 +107,11 @@ def test_on_a_full_disk_each_command_says_so_and_leaves_nothing_half_written(mad
 
 HOMES = {  # variables, and in which folder kernels are kept then
     "no home": ({"HOME": None}, ""),
-    "a home that is not there": ({"HOME": "LOCKED/gone"}, "TMP"),
     "a home that is write-protected": ({"HOME": "LOCKED"}, "TMP"),
     "a home that is a file": ({"HOME": "FILE"}, "TMP"),
-    "a home of nothing": ({"HOME": ""}, ""),
     "a cache that is a device": ({"GRAPH_SLAM_CACHE": "/dev/null"}, "TMP"),
     "a cache of too long a name": ({"GRAPH_SLAM_CACHE": "/" + "a" * 9999}, "TMP"),
     "a cache that is write-protected": ({"GRAPH_SLAM_CACHE": "LOCKED"}, "TMP"),
-    "another cache": ({"XDG_CACHE_HOME": "OWN"}, "OWN"),
     "a cache of nothing": ({"GRAPH_SLAM_CACHE": "", "XDG_CACHE_HOME": "OWN"}, "OWN"),
     "no folder for temporary files": ({"GRAPH_SLAM_CACHE": "OWN", "TMPDIR": "/nowhere"}, "OWN"),
 }
