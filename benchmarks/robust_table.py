@@ -10,38 +10,37 @@ from benchmarks.trials import ID_POLICIES
 
 Row = dict[str, Any]
 
-NAMES = (
-    "graph",
-    "odometry, m",
-    "false ones",
-    "who",
-    "error, m",
-    "chi2",
-    "believed",
-    "fully",
-    "true lost",
-    "CPU s",
-    "of plain",
-    "asked",
-)
+_OURS = ("ours, online", "ours, solved")
 
 
-def lines(rows: Sequence[Row]) -> Iterator[list[str]]:
-    """Medians over the seeds, and in brackets the worst; graph and cell are named in the first of their lines."""
-    before: Row = {}
+def table(rows: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
+    """Names of columns, and a line for each cell: errors of ours online and of peers, and the time of ours, solved.
+
+    Errors are medians over the seeds, and in brackets the worst.
+    """
+    peers = [who for who in dict.fromkeys(str(row["who"]) for row in rows) if who != OURS]
+    cells: dict[tuple[Any, ...], dict[str, Row]] = {}
     for row in rows:
-        same_graph = before.get("graph") == row["graph"]
-        same_cell = same_graph and all(before[key] == row[key] for key in ("policy", "rate"))
-        graph = ["", ""] if same_graph else [row["graph"], f"{row['odometry_m']:.2f}"]
-        cell = "" if same_cell else f"{row['policy']}, {row['false']} of {row['false'] + row['true']}"
-        counts = [_spread(row[key], "g") for key in ("believed", "full", "lost")]
-        times = [time for time, fault in zip(row["cpu_s"], row["fault"], strict=True) if not fault]
-        plain = f"{median(times) / row['plain_s']:.1f}" if times and row["plain_s"] else ""
-        time = f"{median(times):.2f}" if times else ""
-        error = " ".join(filter(None, (_spread(row["error_m"], ".4f"), _failed(row))))
-        verdict = "" if row["who"] != OURS else ", ".join(misses(row)) or "met" if _is_asked(row) else ""
-        yield [*graph, cell, name(row), error, _spread(row["chi2"], ".3f"), *counts, time, plain, verdict]
-        before = row
+        cells.setdefault((row["graph"], row["policy"], row["rate"]), {})[name(row)] = row
+    lines, graph = [], ""
+    for key, by in cells.items():
+        row = next(iter(by.values()))
+        start = [str(key[0]) * (key[0] != graph), f"{key[1]}, {row['false']} of {row['false'] + row['true']}"]
+        errors = [_error(by.get(who)) for who in (*_OURS, *peers)]
+        lines.append([*start, *errors[:2], _of_plain(by.get(_OURS[1])), *errors[2:]])
+        graph = key[0]
+    return ["graph", "false ones", *_OURS, "of plain", *peers], lines
+
+
+def _error(row: Row | None) -> str:
+    """The error in metres, and how many seeds have none and why."""
+    return "" if row is None else " ".join(filter(None, (_spread(row["error_m"], ".4f"), _failed(row))))
+
+
+def _of_plain(row: Row | None) -> str:
+    """CPU time over that without a loss and without false measurements."""
+    times = [time for time, fault in zip(row["cpu_s"], row["fault"], strict=True) if not fault] if row else []
+    return f"{median(times) / row['plain_s']:.1f}" if row and times and row["plain_s"] else ""
 
 
 def missed(rows: Sequence[Row]) -> str:
@@ -83,10 +82,6 @@ def _misses_without_false(row: Row) -> Iterator[str]:
         yield f"{lost} true ones lost"
     if time > CLEAN_TIME * row["plain_s"]:
         yield f"{time / row['plain_s']:.2f} of the plain time"
-
-
-def _is_asked(row: Row) -> bool:
-    return row["target"] is not None or not row["false"]
 
 
 def _seeds(seeds: Sequence[int]) -> str:

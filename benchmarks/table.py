@@ -75,95 +75,75 @@ def into_document(measured: Row) -> None:
     document = _OTHER_HOMES.get(measured["programme"], DOCUMENT)
     begin, end = (mark.format(measured["programme"]) for mark in ("<!-- {}: begin -->", "<!-- {}: end -->"))
     text = document.read_text(encoding="utf-8")
+    if begin not in text:
+        print(f"{document.name} has no place for {measured['programme']}", file=sys.stderr)
+        return
     head, rest = text.split(begin)
     _, tail = rest.split(end)
     document.write_text(f"{head}{begin}\n{markdown(measured)}\n{end}{tail}", encoding="utf-8")
 
 
 def _online(rows: Sequence[Row]) -> str:
-    names = (
-        "graph",
-        "poses, edges",
-        "who",
-        "CPU s",
-        "median ms",
-        "p99 ms",
-        "worst ms",
-        "chi2 (of best)",
-        "in its own map",
-    )
+    """A line for each graph: ours, a peer, and what part of its times ours takes; a table for each peer."""
+    return "\n\n".join(_online_against(peer, rows) for peer in _peers(rows) or [""])
+
+
+def _online_against(peer: str, rows: Sequence[Row]) -> str:
+    names = ["graph", "poses, edges", "ours, CPU s", f"{peer}, CPU s", "part", "p99, part", "worst, part"]
     lines = []
-    for row in rows:
-        ours = _of_ours(row, rows)
-        times = [
-            _with_ratio(row, ours, "total_s", 1.0, 2),
-            _with_ratio(row, ours, "median_s", 1e3, 3),
-            _with_ratio(row, ours, "p99_s", 1e3, 2),
-            _with_ratio(row, ours, "worst_s", 1e3, 1),
-        ]
-        lines.append([*_heading(row, rows), *times, *_costs(row, rows)])
-    return _table(names, lines)
+    for graph, by in _by_graph(rows):
+        ours, theirs = by[OURS], by.get(peer, by[OURS])
+        parts = [_part(ours, theirs, key) for key in ("total_s", "p99_s", "worst_s")]
+        size = f"{ours['poses']}, {ours['edges']}"
+        best = [_of_best(one, rows) for one in (ours, theirs)]
+        lines.append([graph, size, _seconds(ours, 2), _seconds(theirs, 2), *parts, *best])
+    return _table([*names, "of best, ours", peer], lines)
 
 
 def _batch(rows: Sequence[Row]) -> str:
-    names = (
-        "graph",
-        "poses, edges",
-        "who",
-        "CPU s",
-        "of it building",
-        "iterations",
-        "chi2 (of best)",
-        "in its own map",
-    )
+    """A line for each graph: seconds of each, and in brackets what part of a peer's ours takes."""
+    peers = _peers(rows)
     lines = []
-    for row in rows:
-        seconds = _with_ratio(row, _of_ours(row, rows), "total_s", 1.0, 3)
-        about = [seconds, f"{row['build_s']:.3f}", str(row["iterations"])]
-        lines.append([*_heading(row, rows), *about, *_costs(row, rows)])
-    return _table(names, lines)
+    for graph, by in _by_graph(rows):
+        ours, found = by[OURS], []
+        for peer in peers:
+            same = by.get(OURS_AS_G2O, ours) if peer.startswith("g2o") else ours
+            part = _part(same, by[peer], "total_s") if peer in by else ""
+            found.append((_seconds(by[peer], 3) if peer in by else "") + (f" ({part})" if part else ""))
+        lines.append([graph, _seconds(ours, 3), *found, _of_best(ours, rows)])
+    return _table(["graph", "ours", *peers, "of best, ours"], lines)
 
 
 def _consistency(rows: Sequence[Row]) -> str:
-    names = ("world", "settings", "seeds", "NEES of", "mean", "expected", "99.9 % band", "", "within 3 sigma")
-    lines = []
+    """A line for each world and kind of vertex, a column of means for each range of seeds; outside the band is said."""
+    seeds = list(dict.fromkeys((row["first"], row["first"] + row["seeds"] - 1) for row in rows))
+    found: dict[tuple[str, ...], dict[int, str]] = {}
     for row in rows:
-        seeds = f"{row['first']} to {row['first'] + row['seeds'] - 1}"
-        band, verdict = f"{row['band'][0]:.3f} to {row['band'][1]:.3f}", "inside" if row["inside"] else "outside"
-        within = f"{100.0 * row['within']:.2f} % of {row['coordinates']}"
-        about = [row["world"], row["settings"], seeds, row["what"]]
-        lines.append([*about, f"{row['mean']:.3f}", str(row["expected"]), band, verdict, within])
-    return _table(names, lines)
+        key = row["world"], row["what"], str(row["expected"])
+        found.setdefault(key, {})[row["first"]] = f"{row['mean']:.3f}" + ", outside its band" * (not row["inside"])
+    names = ["world", "NEES of", "expected", *(f"mean, seeds {first} to {last}" for first, last in seeds)]
+    return _table(names, [[*key, *(by.get(first, "") for first, _ in seeds)] for key, by in found.items()])
 
 
 def _marginals(rows: Sequence[Row]) -> str:
-    names = (
-        "graph",
-        "poses, edges",
-        "against",
-        "largest difference",
-        "bound",
-        "",
-        "CPU ms",
-        "theirs, ms",
-        "ours / theirs",
-    )
-    lines = []
+    """A line for each graph: largest differences from each reference, and times; what is not fulfilled is said."""
+    against = list(dict.fromkeys(row["against"] for row in rows if row["difference"] is not None))
+    found: dict[str, dict[str, str]] = {}
     for row in rows:
-        about = [row["graph"], f"{row['poses']}, {row['edges']}", row["against"]]
-        difference = "" if row["difference"] is None else f"{row['difference']:.1e}"
-        bound = f"{row['bound']:.1e}" if difference else f"{row['bound']:g}x"
-        verdict = "fulfilled" if row["fulfilled"] else "not fulfilled"
-        times = ["", "", ""]
-        if "ours_s" in row:
-            theirs = row.get("gtsam_s", row.get("iteration_s"))
-            times = [f"{1e3 * row['ours_s']:.2f}", f"{1e3 * theirs:.2f}", f"{row['ours_s'] / theirs:.3f}"]
-        lines.append([*about, difference, bound, verdict, *times])
-    return _table(names, lines)
+        line, bad = found.setdefault(row["graph"], {}), ", not fulfilled" * (not row["fulfilled"])
+        if row["difference"] is not None:
+            line[row["against"]] = f"{row['difference']:.1e}{bad}"
+        if "gtsam_s" in row:
+            line |= {"ours, CPU ms": f"{1e3 * row['ours_s']:.2f}", "gtsam, ms": f"{1e3 * row['gtsam_s']:.2f}"}
+        elif "ours_s" in row:
+            line["ours, CPU ms"] = f"{1e3 * row['ours_s']:.2f}"
+            line["iteration"] = f"{row['ours_s'] / row['iteration_s']:.3f}{bad}"
+    names = [*against, "ours, CPU ms", "gtsam, ms", "iteration"]
+    return _table(["graph", *names], [[graph, *(by.get(name, "") for name in names)] for graph, by in found.items()])
 
 
 def _robust(rows: Sequence[Row]) -> str:
-    lines = _table(robust_table.NAMES, list(robust_table.lines(rows)))
+    lines = _table(*robust_table.table(rows))
     return f"{lines}\n\nWhat of ours misses what is asked:\n\n{robust_table.missed(rows)}"
 
 
@@ -190,43 +170,38 @@ _TABLES: dict[str, Callable[[Sequence[Row]], str]] = {
 }
 
 
-def _heading(row: Row, rows: Sequence[Row]) -> list[str]:
-    """Graph, size and who; the graph is named in the first of its lines."""
-    first = next(other for other in rows if other["graph"] == row["graph"]) is row
-    size = f"{row['poses']}, {row['edges']}"
-    return [row["graph"] if first else "", size if first else "", row["who"]]
+def _by_graph(rows: Sequence[Row]) -> Iterator[tuple[str, dict[str, Row]]]:
+    """The rows of each graph by who."""
+    for graph in dict.fromkeys(row["graph"] for row in rows):
+        yield graph, {row["who"]: row for row in rows if row["graph"] == graph}
 
 
-def _of_ours(row: Row, rows: Sequence[Row]) -> Row | None:
-    """What a peer is compared with: ours on the same graph, in space against g2o with its weights."""
-    same = {other["who"]: other for other in rows if other.get("graph") == row.get("graph")}
-    ours = same.get(OURS_AS_G2O, same[OURS]) if row["who"].startswith("g2o") else same[OURS]
-    return None if ours["fault"] else ours
+def _peers(rows: Sequence[Row]) -> list[str]:
+    return [who for who in dict.fromkeys(row["who"] for row in rows) if not who.startswith(OURS)]
 
 
-def _with_ratio(row: Row, ours: Row | None, key: str, scale: float, digits: int) -> str:
-    """A number, and for a peer in brackets what part of it ours is."""
-    text = f"{scale * row[key]:.{digits}f}"
-    if ours is None or row["fault"] or row["who"].startswith(OURS) or not row[key]:
-        return text
-    return f"{text} ({ours[key] / row[key]:.2f}x)"
-
-
-def _costs(row: Row, rows: Sequence[Row]) -> list[str]:
-    """The cost in our error map and in the contender's own, or instead why there is none."""
+def _seconds(row: Row, digits: int) -> str:
+    """CPU time, or why there is none; what was reached and is no optimum is said."""
     if row["chi2"] is None:
-        return [row["fault"], ""]
-    ours, own = _cost(row, rows, "relative"), _cost(row, rows, row["error_map"])
-    return [f"{ours}, {row['fault']}" if row["fault"] else ours, own]
+        return str(row["fault"])
+    return f"{row['total_s']:.{digits}f}" + (f", {row['fault']}" if row["fault"] else "")
 
 
-def _cost(row: Row, rows: Sequence[Row], error_map: str) -> str:
-    """A cost, and in brackets how many times the lowest known it is."""
+def _part(ours: Row, theirs: Row, key: str) -> str:
+    """What part of a peer's number ours is; empty where either failed."""
+    is_void = ours is theirs or ours["fault"] or theirs["fault"] or not theirs[key]
+    return "" if is_void else f"{ours[key] / theirs[key]:.2f}"
+
+
+def _of_best(row: Row, rows: Sequence[Row]) -> str:
+    """The cost in our error map, as a multiple of the lowest that is known."""
+    if row["chi2"] is None:
+        return ""
     same = (other for other in rows if all(other[key] == row[key] for key in ("graph", "reached")))
-    found = [other["chi2"][error_map] for other in same if other["chi2"]]
-    if row["whole"] and error_map == "relative" and row["graph"] in _BEST_KNOWN:
+    found = [other["chi2"]["relative"] for other in same if other["chi2"]]
+    if row["whole"] and row["graph"] in _BEST_KNOWN:
         found.append(_BEST_KNOWN[row["graph"]])
-    return f"{row['chi2'][error_map]:.4f} ({row['chi2'][error_map] / min(found):.4f})"
+    return f"{row['chi2']['relative'] / min(found):.4f}"
 
 
 def _repeated(rows: Sequence[Row]) -> str:
