@@ -157,7 +157,7 @@ def test_a_summary_or_a_table_of_covariances_that_is_none_is_refused_by_name(tmp
 
 
 def test_a_run_by_odometry_alone_is_scored_though_nothing_is_known_of_its_noise(tmp_path):
-    write_bag(simulate("warehouse", 1, laps=1), tmp_path / "bag.mcap")
+    write_bag(simulate("warehouse", 1, laps=1, aisles=2, aisle_m=4.0), tmp_path / "bag.mcap")
     replay(tmp_path / "bag.mcap", tmp_path / "run", Config.from_mapping({"landmarks.association": "none"}))
     scores = evaluate(tmp_path / "run", str(tmp_path / "bag.mcap"))
     assert any(np.isnan(one.per_dof) for one in scores.consistency.noise)

@@ -361,7 +361,8 @@ def write_estimate(file, name, sigma_m):
         ("/vicon", 0.0, ""),
     ],
 )
-def test_a_truth_that_is_an_estimate_is_doubted(tmp_path, capsys, run, name, sigma_m, why):
+def test_a_truth_that_is_an_estimate_is_doubted(tmp_path, capsys, monkeypatch, run, name, sigma_m, why):
+    monkeypatch.setattr("graph_slam_ros.cli.evaluate.draw", lambda *_, **__: None)
     assert main(["evaluate", str(run), "--truth", f"{write_estimate(tmp_path / 'e.mcap', name, sigma_m)}:{name}"]) == 0
     out, err = capsys.readouterr()
     assert f"{name} (geometry_msgs/msg/PoseWithCovarianceStamped)" in out

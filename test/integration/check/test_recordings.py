@@ -24,9 +24,8 @@ def drive(tmp_path_factory):
 
 
 @pytest.fixture
-def check(capsys, monkeypatch):
-    """(exit code, findings by code, lines on standard error); what is replayed is not drawn."""
-    monkeypatch.setattr("graph_slam_ros.cli.replay.draw", lambda *_: None)
+def check(capsys):
+    """(exit code, findings by code, lines on standard error)."""
 
     def checked(*words):
         code = main(["check", *map(str, words), "--json"])

@@ -27,7 +27,7 @@ IMU = "sensor_msgs/msg/Imu"
 DETECTIONS, CLOUD = "vision_msgs/msg/Detection3DArray", "sensor_msgs/msg/PointCloud2"
 POSE, WITH_COVARIANCE = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped"
 PLACES = {"north": (0.0, 5.0), "east": (5.0, 1.0), "south": (1.0, -4.0)}
-STEPS, MORE = 70, 120
+STEPS, MORE = 55, 120
 
 
 def write(file, *topics, steps=STEPS):
@@ -107,7 +107,6 @@ SEEN = ("/tags", DETECTIONS, seen())
 def info(tmp_path, monkeypatch, capsys):
     """Of a recording of these topics: (exit code, lines, words of the command)."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("graph_slam_ros.cli.replay.draw", lambda *_: None)
 
     def said(*topics, name="drive.mcap", **options):
         (tmp_path / name).unlink(missing_ok=True)
@@ -467,8 +466,7 @@ def test_odometry_that_keeps_jumping_is_said(info, capsys):
     assert "metres and radians?" in err
 
 
-def test_poses_are_fixes_with_the_settings_that_info_prints(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("graph_slam_ros.cli.replay.draw", lambda *_: None)
+def test_poses_are_fixes_with_the_settings_that_info_prints(tmp_path, capsys):
     drive, file = Drive(short_drive(tmp_path / "drive.mcap")), tmp_path / "poses.mcap"
     for m in drive.messages:
         m.topic = "/total_station" if m.topic == "/ground_truth" else m.topic

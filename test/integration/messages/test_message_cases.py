@@ -42,12 +42,10 @@ NAN, INF = math.nan, math.inf
 
 
 def skew(value):
-    """An entry above the diagonal alone."""
     return np.array([[0.0, value, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
 
 
 def posing(**settings):
-    """A border that hears of the robot's pose in the map."""
     return listening("pose", f"geometry_msgs/msg/{POSE}", settings=settings)
 
 
@@ -56,7 +54,6 @@ def ranging(dimensions=2):
 
 
 def diagonal(flat):
-    """Of a covariance."""
     return np.diag(np.reshape(flat, (math.isqrt(len(flat)), -1)))
 
 

@@ -94,6 +94,7 @@ def test_a_run_that_goes_on_in_a_map_knows_its_landmarks_and_is_repeated_byte_by
         assert (tmp_path / "after" / name).read_bytes() == (tmp_path / "again" / name).read_bytes(), name
 
 
+@pytest.mark.parametrize("run", ["unnamed"], indirect=True)
 def test_cut_anywhere_it_is_read_as_far_as_it_goes(run, tmp_path):
     folder, slam = run
     whole = (folder / "map.mcap").read_bytes()
