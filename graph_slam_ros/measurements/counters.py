@@ -4,6 +4,10 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import numpy as np
+
+from graph_slam_ros.errors import GraphSlamError
+
 
 class Counters:
     """Counts by (source, reason); a source is the name of a topic or of an input.
@@ -26,6 +30,11 @@ class Counters:
         if (source, reason) not in self._counts:
             self.on_first(source, reason)
         self._counts[source, reason] += times
+
+    def count_failure(self, source: str, error: Exception) -> None:
+        """Count a computation that failed, and changed nothing; what is an error of ours, by its type."""
+        is_known = isinstance(error, (GraphSlamError, np.linalg.LinAlgError, MemoryError))
+        self.count(source, "unsolved" if is_known else type(error).__name__)
 
     def __getitem__(self, key: tuple[str, str]) -> int:
         return self._counts[key]

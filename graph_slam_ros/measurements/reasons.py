@@ -78,12 +78,8 @@ REASONS: dict[str, Reason] = {
     "frame_in_itself": Reason(_REFUSED, "a frame is its own parent", "correct the driver's frame names"),
     "frame_unknown": Reason(_REFUSED, "no transform links the message's frame to the robot", _FRAMES),
     "transform_gaps": Reason(_REFUSED, "/tf links the message's frame to the robot, but not at its stamp", _GAPS),
-    "odom_frame_unknown": Reason(
-        _REFUSED, "no transform links the odometry's frame to frames.odom", "frames.odom as its messages name it"
-    ),
-    "map_frame_unknown": Reason(
-        _REFUSED, "no transform links the pose's frame to frames.map", "frames.map as its messages name it"
-    ),
+    "odom_frame_unknown": Reason(_REFUSED, "no transform links odometry to frames.odom", "frames.odom as it is named"),
+    "map_frame_unknown": Reason(_REFUSED, "no transform links the pose to frames.map", "frames.map as it is named"),
     "child_frame_unknown": Reason(_REFUSED, "no transform links the message's child frame to the robot", _FRAMES),
     # -- numbers
     "undecodable": Reason(_REFUSED, "the bytes are not a message of this type", "INPUT.type, or record it again"),
@@ -92,16 +88,12 @@ REASONS: dict[str, Reason] = {
     ),
     "nonfinite": Reason(_REFUSED, "a number is NaN or infinite", "correct the driver"),
     "too_far": Reason(_REFUSED, "a coordinate is beyond 1e9 m", "correct the driver"),
-    "beyond_max_distance": Reason(
-        _REFUSED, "it is farther away than INPUT.max_distance_m, or 100 km", "INPUT.max_distance_m"
-    ),
+    "beyond_max_distance": Reason(_REFUSED, "INPUT.max_distance_m, or 100 km, is nearer", "INPUT.max_distance_m"),
     "quaternion_normalized": Reason(_REPAIRED, "the quaternion was not quite of length one"),
     "zero_quaternion": Reason(_REFUSED, "the quaternion is zero", "have the driver fill in the orientation"),
     "denormal_quaternion": Reason(_REFUSED, "the quaternion's length is off by more than 10 %", "correct the driver"),
     "no_heading": Reason(_REFUSED, "the x axis is nearly vertical, so there is no heading in the plane", _SPACE),
-    "out_of_plane": Reason(
-        _NOTED, "the pose is 0.5 m above or below the first, or tilted by 20 degrees", "world.dimensions=3"
-    ),
+    "out_of_plane": Reason(_NOTED, "the pose is 0.5 m above or below the first, or tilted by 20 degrees", _SPACE),
     # -- noise
     "noise_unknown": Reason(_REFUSED, "neither the message nor the parameters have its noise", _SIGMAS),
     "covariance_unknown": Reason(_REPAIRED, "the covariance is zero: the configured noise is used"),
@@ -119,12 +111,8 @@ REASONS: dict[str, Reason] = {
     ),
     "switched_to": Reason(_NOTED, "this odometry took over from one that fell silent, or is of higher priority"),
     "switched_to_unlinked": Reason(_NOTED, "this odometry took over; the motion between is unknown"),
-    "gyro_waiting": Reason(
-        _NOTED, "the gyro's bias is not known before the robot has stood", "stand for a second; gyro.bias_sigma"
-    ),
-    "gyro_silent": Reason(
-        _NOTED, "the gyro was silent for longer than gyro.timeout_s", "gyro.timeout_s; INPUT.offset_s"
-    ),
+    "gyro_waiting": Reason(_NOTED, "the gyro has no bias before it stood", "stand for a second; gyro.bias_sigma"),
+    "gyro_silent": Reason(_NOTED, "the gyro was silent for gyro.timeout_s", "gyro.timeout_s; INPUT.offset_s"),
     "gyro_doubted": Reason(
         _NOTED, "the gyro contradicts odometry in most turns", "rad/s, counter-clockwise; its TF or INPUT.mount"
     ),
@@ -196,7 +184,7 @@ REASONS: dict[str, Reason] = {
     "no_orientation": Reason(_REFUSED, "the IMU says that it has no orientation", "its gyro alone: INPUT.use=gyro"),
     "not_in_this_space": Reason(_REFUSED, "such a fix does not exist in so many dimensions", "world.dimensions"),
     # -- closures
-    "id_not_a_stamp": Reason(_REFUSED, "a closure's id is not the earlier stamp in nanoseconds", "see docs/node.md"),
+    "id_not_a_stamp": Reason(_REFUSED, "a closure's id is not the earlier stamp in nanoseconds", "see docs/inputs.md"),
     "closure_with_itself": Reason(_REFUSED, "a closure's two stamps are the same", "correct the publisher"),
     "no_result": Reason(_REFUSED, "a closure has no result with a pose", "correct the publisher"),
     "within_one_keyframe": Reason(_REFUSED, "a closure links two moments of one keyframe: it says nothing new"),
@@ -245,17 +233,20 @@ REASONS: dict[str, Reason] = {
     "paused": Reason(_NOTED, "it came while the node was paused", "~/resume"),
     "stopped": Reason(_REFUSED, "time jumped back and time.on_jump is stop", "~/reset, or --set time.on_jump=segment"),
     "worker_restarted": Reason(_NOTED, "a job would have ended the solver's thread, which went on", "report it"),
-    "fault": Reason(
+    "unsolved": Reason(
         _NOTED,
-        "an exception, by its type: of a solve (the last good estimate stands), of a second look, or of a callback",
-        "report it with the log",
+        "a solve, a search or a fit failed, and what was known before it stands",
+        "graph_slam check; graph_slam explain RUN",
+    ),
+    "fault": Reason(
+        _NOTED, "an error of this program, by its type: what was known before it stands", "report it with the log"
     ),
 }
-"""By the name it is counted under; ``fault`` is for those that are counted by the type of an exception."""
+"""By the name it is counted under; ``fault`` is for errors of the program, which are counted by their type."""
 
 
 def explain(reason: str) -> Reason:
-    """The row of a reason. Exceptions are counted by their type and share one row."""
+    """The row of a reason. Errors of the program are counted by their type and share one row."""
     return REASONS.get(reason, REASONS["fault"])
 
 

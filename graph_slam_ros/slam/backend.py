@@ -205,7 +205,7 @@ class Backend:
                 self.solver.rebuild()
                 report = self.solver.optimize(everything)
             except Exception as error:
-                self._counters.count("noise_scale", type(error).__name__)
+                self._counters.count_failure("noise_scale", error)
                 self.use_noise(before)
                 report = self.solver.optimize(everything)
                 break
@@ -356,7 +356,7 @@ class Backend:
         try:
             return search()
         except Exception as error:
-            self._counters.count("second_look", type(error).__name__)
+            self._counters.count_failure("second_look", error)
             return None
 
     def _adopt(self, outcome: Outcome, keyframe: int) -> bool:

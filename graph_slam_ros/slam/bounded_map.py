@@ -121,7 +121,7 @@ class BoundedMap:
             rows, end = self._condensed_visits()
             backend.note_condensed(len(keyframes) - 1)
         except Exception as error:
-            self._counters.count(_SOURCE, type(error).__name__)
+            self._counters.count_failure(_SOURCE, error)
             self._tried += BATCH - 1  # the same would most likely fail at the next keyframe again
             vars(backend.graph).update(vars(graph))
             self.state.places.clear()

@@ -113,7 +113,7 @@ class FailureGuard:
             self._solver.rebuild()
 
     def _fail(self, error: Exception) -> None:
-        self._counters.count("solver", type(error).__name__)
+        self._counters.count_failure("solver", error)
         self.failing = message_of(error)
         self._in_a_row += 1
         self._note_undetermined(error)

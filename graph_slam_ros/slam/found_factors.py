@@ -99,7 +99,7 @@ class FoundFactors:
             if backend.decisions.reclassify(keyframe):
                 report = backend.solver.optimize(everything)
         except Exception as error:
-            self._counters.count("calibration", type(error).__name__)
+            self._counters.count_failure("calibration", error)
             corrections.found = before
             for change in undo:
                 change.apply(backend.graph)

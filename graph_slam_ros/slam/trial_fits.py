@@ -135,7 +135,7 @@ class TrialFits:
         try:
             return job()
         except Exception as error:
-            self._counters.count("calibration", type(error).__name__)
+            self._counters.count_failure("calibration", error)
             return None
 
     def _judged(self, found: TrialFit, *, is_confirmed: bool = True) -> list[Finding]:

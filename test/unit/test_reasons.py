@@ -36,6 +36,6 @@ def test_what_is_refused_has_a_remedy_and_remedies_name_parameters_that_exist():
 
 def test_a_remedy_names_the_input_and_what_mends_a_transform_without_frames_is_no_parameter():
     assert remedy("imu", "noise_unknown").startswith("imu.sigma_m, imu.sigma_rad")
-    assert explain("SingularError") is REASONS["fault"]
+    assert explain("KeyError") is REASONS["fault"]
     assert "header.frame_id" in remedy("tf", "frame_empty") and "tf." not in remedy("tf", "frame_empty")
     assert "detections.frame" in remedy("detections", "frame_empty")

@@ -333,7 +333,7 @@ class AnonymousLandmarks:
         try:
             return search()
         except Exception as error:
-            self._counters.count("second_look", type(error).__name__)
+            self._counters.count_failure("second_look", error)
             return None
 
     def _frozen(self) -> FrozenScans:
