@@ -372,7 +372,7 @@ def _started(node: GraphSlamNode, stop: _StopRequest) -> bool:
 
 
 def _executor() -> Any:
-    """The fastest executor: rclpy's events executor takes a fifth of the time per message (docs/benchmarks.md)."""
+    """The fastest executor: rclpy's events executor takes a fifth of the time per message."""
     try:
         from rclpy.experimental import EventsExecutor
     except ImportError:  # Humble
