@@ -32,13 +32,3 @@ def without_names(world):
         if isinstance(m, Sightings):
             m = replace(m, sightings=tuple(replace(one, id="") for one in m.sightings))
         yield m
-
-
-def with_a_wrong_sighting(world, at=100, by_m=3.0):
-    """The first thing in one message is told to be elsewhere."""
-    for k, m in enumerate(world):
-        if isinstance(m, Sightings) and k >= at and m.sightings:
-            first, *others = m.sightings
-            x, *rest = first.measured
-            m, at = replace(m, sightings=(replace(first, measured=(x + by_m, *rest)), *others)), float("inf")
-        yield m
