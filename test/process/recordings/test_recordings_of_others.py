@@ -26,10 +26,10 @@ FRAME = "camera_optical_frame"
 class Robot:
     """Messages of a robot that drives eights past tags, of one type store; a case changes what a report changed."""
 
-    def __init__(self, store=None, seconds=20.0, odometry_hz=20.0):
+    def __init__(self, store=None, seconds=15.0):
         self.store = store or typestore()
         rng = np.random.default_rng(1)
-        self.t = np.arange(0.0, seconds, 1.0 / odometry_hz)
+        self.t = np.arange(0.0, seconds, 0.05)
         self.v = np.where(self.t < 1.0, 0.0, 0.8)
         self.w = np.where(self.t < 1.0, 0.0, 0.8 * np.cos(2.0 * np.pi * (self.t - 1.0) / 14.0) + 0.06)
         self.true = self.path_of(self.v, self.w)
