@@ -209,12 +209,3 @@ def test_a_drive_in_a_frozen_map_is_condensed_and_the_map_stays(tmp_path, name, 
     of_map = len(read_tum(tmp_path / "site" / "sightings.tum").stamps_s)
     for run in ("on", "recovered"):  # the begin of the drive is condensed
         assert summary_of(tmp_path / run)["drives"][1] == {"keyframe": FIRST, "sighting": of_map}
-    again, _ = record_run(
-        tmp_path / "again",
-        settings,
-        read_measurements(tmp_path / "on", []),
-        [],
-        read_map(tmp_path / "on", [], start_only=True),
-    )
-    assert again.first_keyframe == slam.first_keyframe
-    assert (tmp_path / "again" / "path.tum").read_bytes() == (tmp_path / "on" / "path.tum").read_bytes()

@@ -12,7 +12,7 @@ from graph_slam_ros.slam.frontend.ingest_gate import IngestGate
 
 TAGS = {f"{x} {y}": (float(x), float(y)) for x in range(-8, 30, 4) for y in (-3, 3, 7, 13)}
 RATE, SPEED, STRAIGHT, RADIUS = 20, 1.2, 20.0, 5.0
-BEGINS, SECONDS = 6.0, 24.0
+BEGINS, SECONDS = 6.0, 19.0
 
 
 def truth(second):
