@@ -40,6 +40,13 @@ def is_soaked(file):  # type: ignore[no-untyped-def]
     return bool(TRIES.search(file.read_text(encoding="utf-8")))
 
 
+@pytest.fixture(autouse=True)
+def undrawn(request, monkeypatch):  # type: ignore[no-untyped-def]
+    """What a picture shows is told in test/process."""
+    if kind(request.path) == "integration":
+        monkeypatch.setattr("graph_slam_ros.cli.replay.draw", lambda *_: None)
+
+
 def pytest_ignore_collect(collection_path, config):  # type: ignore[no-untyped-def]
     """For unit tests alone the others are not even imported: ROS, with which half of them begin, takes a second."""
     is_other = collection_path.match("test_*.py") and kind(collection_path) != "unit"

@@ -24,7 +24,7 @@ _LEAST_S, _MOST_S, _MOST_RATIO = 0.02, 1.0, 10.0  # stamps may crowd together; a
 _BACK_NS = 200_000_000  # what is older is left to the order of stamps
 _AHEAD_NS = 60_000_000_000  # where odometry goes on so much later, the tracks begin anew
 _GAP_NS, _GAP_PERIODS = 1_000_000_000, 10.0  # what is dated later than after so long a gap waits for the next to agree
-_SURE, _PERIODS = 3, 3.0  # messages of a new track, and periods of the track in use, before that is given up
+_SURE, _PERIODS, _PATIENT_NS = 3, 3.0, 500_000_000  # of a new track, before that in use, perhaps late, is given up
 _NOISY, _NOISIEST = 3.0, 2.5  # of the usual misfit, and at most
 _MOST_LABELS = 8
 _USUAL_NS = 200_000_000  # period of a track that has only one pose
@@ -282,7 +282,7 @@ class OnePublisher:
 
 def _has_jumped(track: _Track, used: _Track) -> bool:
     """Return whether a new track has gone on without the one in use for so long that the latter is given up."""
-    return track.count >= _SURE and track.newest_ns - track.first_ns >= _PERIODS * used.period_ns
+    return track.count >= _SURE and track.newest_ns - track.first_ns >= max(_PERIODS * used.period_ns, _PATIENT_NS)
 
 
 def _labelled(m: Odometry, track: _Track) -> Odometry:
