@@ -18,7 +18,7 @@ class OdometryJumps:
     def __init__(self, config: OdometryConfig, space: Geometry) -> None:
         self._config, self._space = config, space
 
-    def kind(self, motion: Numbers, T_odom_base: Numbers, dt: float, last: Numbers) -> str:
+    def kind(self, motion: Numbers, T_odom_base: Numbers, dt: float, last: Numbers, *, is_gap: bool = False) -> str:
         """Return ``reset_to_zero`` or ``jump``; empty if a robot can move like this.
 
         Parameters
@@ -26,23 +26,21 @@ class OdometryJumps:
         motion, dt : from the message before [s]
         T_odom_base : where odometry is now
         last : the motion before
+        is_gap : odometry was silent for so long that its driver may have restarted, and driven on since
         """
-        if self._is_reset(motion, T_odom_base, last):
-            reason = "reset_to_zero"
-        else:
-            is_jump = self._space.square(motion) > (self._config.max_speed_m_s * max(dt, _LEAST_S)) ** 2
-            reason = "jump" if is_jump else ""
-        return reason
+        if self._is_reset(motion, T_odom_base, last, is_gap=is_gap):
+            return "reset_to_zero"
+        is_jump = self._space.square(motion) > (self._config.max_speed_m_s * max(dt, _LEAST_S)) ** 2
+        return "jump" if is_jump else ""
 
-    def _is_reset(self, motion: Numbers, T_odom_base: Numbers, last: Numbers) -> bool:
-        """Return whether the driver restarted: odometry is at the origin, farther away than robots move in a step.
-
-        The pause may have any length, because nothing arrives while a driver starts.
-        """
-        if abs(T_odom_base[0]) > _AT_ZERO or max(self._size(T_odom_base)) > _AT_ZERO:
+    def _is_reset(self, motion: Numbers, T_odom_base: Numbers, last: Numbers, *, is_gap: bool) -> bool:
+        """Return whether the driver restarted: odometry is at the origin, farther away than robots move in a step."""
+        if abs(T_odom_base[0]) > _AT_ZERO and not is_gap:
             return False
-        (far_m, far_rad), (usual_m, usual_rad) = self._size(motion), self._size(last)
-        return far_m > max(_RESET_M, _UNUSUAL * usual_m) or far_rad > max(_RESET_RAD, _UNUSUAL * usual_rad)
+        (far_m, far_rad), (at_m, at_rad), (usual_m, usual_rad) = map(self._size, (motion, T_odom_base, last))
+        most_m, most_rad = max(_RESET_M, _UNUSUAL * usual_m), max(_RESET_RAD, _UNUSUAL * usual_rad)
+        is_at_zero = at_m <= most_m and at_rad <= most_rad if is_gap else max(at_m, at_rad) <= _AT_ZERO
+        return is_at_zero and (far_m > most_m or far_rad > most_rad)
 
     def _size(self, pose: Numbers) -> tuple[float, float]:
         """Return the size of a motion in metres and radians."""

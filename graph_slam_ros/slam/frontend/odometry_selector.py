@@ -158,8 +158,9 @@ class OdometrySelector:
 
     def _follow(self, a: Odometry, b: Odometry) -> Step:
         step = self._space.group.between_one(a.T_odom_base, b.T_odom_base)
-        dt = (b.stamp_ns - a.stamp_ns) * 1e-9
-        return self._use(b, step, broken=self._jumps.kind(step, b.T_odom_base, dt, self._last_step))
+        dt_ns = b.stamp_ns - a.stamp_ns
+        how = self._jumps.kind(step, b.T_odom_base, dt_ns * 1e-9, self._last_step, is_gap=dt_ns > self._longest_ns)
+        return self._use(b, step, broken=how)
 
     def _use(self, m: Odometry, step: Numbers, *, broken: str) -> Step:
         if broken:
