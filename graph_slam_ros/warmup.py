@@ -181,9 +181,8 @@ def _load_plane() -> None:
     graph.add_edge(graphs.RELATIVE_POSE, poses, [1, 0, 0.1], planar, "odometry")
     for _ in range(2):
         graph.add_edge(graphs.LANDMARK_POSITION, [poses[0], point], [1, 1], flat, "landmarks")
-    solver = Solver(
-        graph, Settings(losses={"landmarks": [Loss(graphs.HUBER), Loss()]}, relinearize_above=0.0, relinearize_every=1)
-    )
+    settings = Settings(losses={"landmarks": [Loss(graphs.HUBER), Loss()]}, relinearize_above=0.0, relinearize_every=1)
+    solver = Solver(graph, settings)
     edges = range(graph.edge_count - 1)
     solver.add(range(graph.vertex_count), edges)
     solver.update()
@@ -257,6 +256,7 @@ def _structure_kernels() -> list[_Kernel]:
         (ordering.move_tail, (tree, index, index)),
         (ordering.dissect, (tree, number)),
         (advance.regroup, (tree, index, index, real, real)),
+        (incremental.reset, (tree, index)),  # after a failure, perhaps without memory to load it
         (incremental.relinearize, (tree, index, limits)),
         (incremental.reach_back, (tree, index)),
         (pools.compact, (tree,)),
