@@ -23,7 +23,7 @@ _UNEVEN, _SEVERAL = 10.0, 10  # mean over median of what so many closures or mor
 _NO_RESIDUAL = 1e-6  # chi2 for each number measured: less is rounding
 _MOST_TIMES, _MOST_S, _QUIET_S = 5.0, 10.0, 2.0  # of the first solution, and seconds, that others may take together
 _NUMBERS = re.compile(r"(?<=vertex )\d+|(?<=FIX )[\d ]*\d")  # of vertices in errors: to be the file's
-_SAMPLED = 100  # edges
+W_FIRST = ": does w come first in its quaternions? g2o has qx qy qz qw"
 _SAME = 1e-6  # part of the cost by which one optimum differs from start to start
 
 
@@ -202,9 +202,9 @@ def _judged(solution: Solution, settings: Settings) -> Solution:
 
 def _hint(file: G2oFile, edges: Index) -> str:
     """Return that quaternions seem to have w first: then most edges would turn by half a turn about x."""
-    some = [file.graph.edge(int(edge)).measured for edge in edges[:_SAMPLED]]
+    some = [file.graph.edge(int(edge)).measured for edge in edges[:100]]
     turned = [one for one in some if len(one) == 7 and abs(one[3]) > abs(one[6])]
-    return ": does w come first in its quaternions? g2o has qx qy qz qw" if 2 * len(turned) > len(some) else ""
+    return W_FIRST if 2 * len(turned) > len(some) else ""
 
 
 def edge_text(file: G2oFile, edge: int) -> str:

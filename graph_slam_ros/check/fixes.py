@@ -13,7 +13,7 @@ from graph_slam_ros.typing import Array, Index
 
 _LEAST, _STEP_M, _SIGMAS, _SCALE = 8, 2.0, 6.0, 1.5
 _TURNED_RAD, _HALF, _OFF_RAD, _NEARLY_RAD = 0.2, 0.5, 0.17, 0.1
-_SAME_M, _FROZEN_M, _JUMP_M, _SOON_S, _OFF = 1e-6, 3.0, 3.0, 2.0, 0.1
+_SAME_M, _FROZEN_M, _JUMP_M, _SOON_S, _OFF = 1e-6, 3.0, 3.0, 2.0, 0.1  # _OFF: of odometry's distances
 
 
 def check_fixes(c: Columns) -> Iterator[Finding]:
@@ -27,11 +27,11 @@ def check_fixes(c: Columns) -> Iterator[Finding]:
             continue
         stamp_ns, points, headings = f.stamp_ns[order], f.points[order], f.headings[order]
         poses = poses_at(stamp_ns, path_ns, path)
-        total = c.config.odometry.distance_factor
-        own, yaws = total * (poses[:, 0] + 1j * poses[:, 1]), np.stack(so3.log(tuple(poses[:, 3:].T)), axis=1)[:, 2]
+        factor = c.config.odometry.distance_factor
+        own, yaws = factor * (poses[:, 0] + 1j * poses[:, 1]), np.stack(so3.log(tuple(poses[:, 3:].T)), axis=1)[:, 2]
         where: Where = {"topic": f.topic, "first_ns": int(stamp_ns[0]), "count": len(order)}
         if np.isfinite(points).all():
-            found = list(_positions(f, stamp_ns, points, own, total, where))
+            found = list(_positions(f, stamp_ns, points, own, factor, where))
             yield from found
             ends = _apart(own, max(_STEP_M, _SIGMAS * f.sigma_m))
             if len(ends) > _LEAST and not any(one.severity == "error" for one in found):
@@ -60,7 +60,7 @@ def _mirrored(turns: Array, own: Array) -> tuple[float, float]:
 
 
 def _positions(
-    f: FixColumns, stamp_ns: Index, points: Array, own: Array, total: float, where: Where
+    f: FixColumns, stamp_ns: Index, points: Array, own: Array, applied: float, where: Where
 ) -> Iterator[Finding]:
     ends = _apart(own, max(_STEP_M, _SIGMAS * f.sigma_m))
     if len(ends) > _LEAST:
@@ -78,7 +78,7 @@ def _positions(
             return
         if abs(factor - 1.0) > max(_OFF, _SIGMAS * spread):
             text = f"{f.topic}: fixes move {factor:.3g} m for each metre of odometry"
-            settings = (f"odometry.distance_factor={total * factor:.4g}",)
+            settings = (f"odometry.distance_factor={applied * factor:.4g}",)
             yield Finding("odometry_scale", "warning", factor, 1.0 + _OFF, "times", text, settings=settings, **where)
     step_m, way_m = np.abs(np.diff(points)), np.abs(np.diff(own))
     begins = np.flatnonzero(np.concatenate([[True], step_m > _SAME_M]))

@@ -65,8 +65,8 @@ def optimize(args: argparse.Namespace) -> int:
     from graph_slam_ros.formats.g2o_writer import write_g2o
     from graph_slam_ros.formats.strict import ending
     from graph_slam_ros.formats.tum import write_trajectory
+    from graph_slam_ros.optimization import W_FIRST, started
     from graph_slam_ros.optimization import optimize as solve
-    from graph_slam_ros.optimization import started
     from graph_slam_ros.runs.folder import GRAPH, is_run
     from graph_slam_ros.warmup import compile_all
 
@@ -99,7 +99,7 @@ def optimize(args: argparse.Namespace) -> int:
     if not args.json:
         console.then(_after(args, solution))
     why = ": wrong edges, which --loss cauchy lets go of, or too little noise in the information"
-    is_open = report.converged and _loss_text(args.loss) == "none" and "qw" not in solution.doubt
+    is_open = report.converged and _loss_text(args.loss) == "none" and not solution.doubt.endswith(W_FIRST)
     beware = solution.doubt and solution.doubt + why * is_open
     lost = console.report_losses(file.losses, [beware] if beware else ())
     return lost or (console.LOSSES if beware else code)

@@ -32,7 +32,7 @@ class Counters:
         self._counts[source, reason] += times
 
     def count_failure(self, source: str, error: Exception) -> None:
-        """Count a computation that failed, and changed nothing; what is an error of ours, by its type."""
+        """Count a computation that failed and changed nothing: ``unsolved``, or the type of a program's error."""
         is_known = isinstance(error, (GraphSlamError, np.linalg.LinAlgError, MemoryError))
         self.count(source, "unsolved" if is_known else type(error).__name__)
 

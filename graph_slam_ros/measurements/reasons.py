@@ -52,7 +52,7 @@ REASONS: dict[str, Reason] = {
     "late": Reason(
         _REFUSED,
         "it came after newer messages were used",
-        "ordering.window_s of odometry, ordering.late_s of others; INPUT.offset_s",
+        "ordering.window_s for odometry, ordering.late_s for others; INPUT.offset_s",
     ),
     "future": Reason(_REFUSED, "the stamp is ahead of the clock, or of odometry", "use_sim_time; INPUT.offset_s"),
     "far_in_time": Reason(
@@ -78,8 +78,8 @@ REASONS: dict[str, Reason] = {
     "frame_in_itself": Reason(_REFUSED, "a frame is its own parent", "correct the driver's frame names"),
     "frame_unknown": Reason(_REFUSED, "no transform links the message's frame to the robot", _FRAMES),
     "transform_gaps": Reason(_REFUSED, "/tf links the message's frame to the robot, but not at its stamp", _GAPS),
-    "odom_frame_unknown": Reason(_REFUSED, "no transform links odometry to frames.odom", "frames.odom as it is named"),
-    "map_frame_unknown": Reason(_REFUSED, "no transform links the pose to frames.map", "frames.map as it is named"),
+    "odom_frame_unknown": Reason(_REFUSED, "no transform links it to frames.odom", "set frames.odom to its frame"),
+    "map_frame_unknown": Reason(_REFUSED, "no transform links it to frames.map", "set frames.map to its frame"),
     "child_frame_unknown": Reason(_REFUSED, "no transform links the message's child frame to the robot", _FRAMES),
     # -- numbers
     "undecodable": Reason(_REFUSED, "the bytes are not a message of this type", "INPUT.type, or record it again"),
@@ -88,7 +88,7 @@ REASONS: dict[str, Reason] = {
     ),
     "nonfinite": Reason(_REFUSED, "a number is NaN or infinite", "correct the driver"),
     "too_far": Reason(_REFUSED, "a coordinate is beyond 1e9 m", "correct the driver"),
-    "beyond_max_distance": Reason(_REFUSED, "INPUT.max_distance_m, or 100 km, is nearer", "INPUT.max_distance_m"),
+    "beyond_max_distance": Reason(_REFUSED, "it is beyond INPUT.max_distance_m, or 100 km", "INPUT.max_distance_m"),
     "quaternion_normalized": Reason(_REPAIRED, "the quaternion was not quite of length one"),
     "zero_quaternion": Reason(_REFUSED, "the quaternion is zero", "have the driver fill in the orientation"),
     "denormal_quaternion": Reason(_REFUSED, "the quaternion's length is off by more than 10 %", "correct the driver"),
@@ -111,8 +111,8 @@ REASONS: dict[str, Reason] = {
     ),
     "switched_to": Reason(_NOTED, "this odometry took over from one that fell silent, or is of higher priority"),
     "switched_to_unlinked": Reason(_NOTED, "this odometry took over; the motion between is unknown"),
-    "gyro_waiting": Reason(_NOTED, "the gyro has no bias before it stood", "stand for a second; gyro.bias_sigma"),
-    "gyro_silent": Reason(_NOTED, "the gyro was silent for gyro.timeout_s", "gyro.timeout_s; INPUT.offset_s"),
+    "gyro_waiting": Reason(_NOTED, "the gyro's bias is unknown until it stands", "stand for a second; gyro.bias_sigma"),
+    "gyro_silent": Reason(_NOTED, "the gyro was silent longer than gyro.timeout_s", "gyro.timeout_s; INPUT.offset_s"),
     "gyro_doubted": Reason(
         _NOTED, "the gyro contradicts odometry in most turns", "rad/s, counter-clockwise; its TF or INPUT.mount"
     ),
@@ -178,7 +178,7 @@ REASONS: dict[str, Reason] = {
     ),
     "mount_assumed": Reason(_NOTED, "no transform has the place of the sensor: the base is assumed", _FRAMES),
     "map_moved": Reason(
-        _NOTED, "a fix or surveyed landmark was the first to locate the map", "anchor.sigma_m holds it"
+        _NOTED, "a fix or surveyed landmark was the first to locate the map", "anchor.sigma_m, anchor.sigma_rad"
     ),
     "no_altitude": Reason(_REPAIRED, "the fix has no altitude: it counts in the horizontal only"),
     "no_orientation": Reason(_REFUSED, "the IMU says that it has no orientation", "its gyro alone: INPUT.use=gyro"),

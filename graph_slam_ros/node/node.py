@@ -261,7 +261,7 @@ class GraphSlamNode(LifecycleNode):
         """Count an exception of a callback or a job, and log its traceback once."""
         self._faults.append(time.monotonic())
         if self._run is not None:
-            self._run.counters.count_failure("node", error)
+            self._run.counters.count("node", type(error).__name__)
         key = f"{type(error).__name__}: {error}"
         if key not in self._logged and len(self._logged) < 1000:
             self._logged.add(key)

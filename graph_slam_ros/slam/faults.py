@@ -27,5 +27,5 @@ class Faults:
         if self._faults:
             (first, *others), self._faults = self._faults, []
             for error in others:
-                self._counters.count_failure("node", error)
+                self._counters.count("node", type(error).__name__)
             raise first
