@@ -7,8 +7,10 @@ import json
 import os
 import random
 import shutil
+import signal
 import struct
 import threading
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -37,6 +39,7 @@ STEPS, SAVE = 34, 20  # measurements, and after which of them is saved; once mor
 UPDATED, SAVED, WRONG = b"u", b"s", b"!"
 IS_LONG = times(False, True)
 EVERY, FAILS_EVERY = times((6, 23), (1, 1))
+KILLS = times(10, 3_000)
 """Of the calls that reach the disk, at which it crashes, and which fail."""
 
 
@@ -328,8 +331,8 @@ def judged(judge, *arguments):
     return ""
 
 
-def in_a_child(work):
-    """Do it in a forked process; returns how that ended, and what it told, which outlives it."""
+def in_a_child(work, killed_after_s=None):
+    """Do it in a forked process, or so much of it; returns how that ended, and what it told, which outlives it."""
     reading, writing = os.pipe()
     tell = functools.partial(os.write, writing)  # before anything is made to fail
     if not (pid := os.fork()):
@@ -342,6 +345,9 @@ def in_a_child(work):
         finally:
             os._exit(code)
     os.close(writing)
+    if killed_after_s is not None:
+        time.sleep(killed_after_s)
+        os.kill(pid, signal.SIGKILL)
     with open(reading, "rb") as pipe:
         told = pipe.read()
     status = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
@@ -530,6 +536,19 @@ def test_T11_P1_P2_a_crash_at_any_call_that_reaches_the_disk_loses_nothing_that_
         tried, wrong = crashes(state, memory / state)
         tell("crash_at_nth_call", tried=tried, faults=tried, failed=len(wrong))
         assert not wrong
+
+
+def test_T10_P1_P2_killed_at_any_moment_it_loses_nothing_that_was_told(memory):
+    reference, folder, wrong, began_s = Reference.of(memory / "reference"), memory / "run", [], time.perf_counter()
+    in_a_child(lambda tell: drive(folder, tell))
+    moments = np.random.default_rng(0).uniform(0.0, time.perf_counter() - began_s, KILLS)
+    for k, killed_after_s in enumerate(moments):
+        empty(folder)
+        _, told = in_a_child(lambda tell: drive(folder, tell), killed_after_s)
+        if fault := judged(reference.faults, folder, told, k % 8 == 0):
+            wrong.append(f"{len(told)} told: {fault}")
+    tell("kill_9", tried=KILLS, faults=KILLS, failed=len(wrong))
+    assert not wrong
 
 
 def test_T12_P4_a_disk_that_fails_at_any_call_is_told_of_and_loses_nothing(memory):

@@ -123,14 +123,12 @@ def test_a_limit_that_is_none_or_on_what_nobody_measured_is_refused(tmp_path):
         compare(*tables(tmp_path, rows(), rows()), [parse_limit("nees>1.1x")])
 
 
-def test_hostile_names_are_text_on_the_page_and_in_markdown(tmp_path):
+def test_hostile_names_are_text_on_the_page(tmp_path):
     hostile = rows(count=2)
     hostile[0] |= {"recording": "<script>alert(1)</script>|`x`", "state": "failed", "reason": "<b>'\"</b>"}
     page = write_page(tmp_path, hostile).read_text()
     assert "<script>" not in page
     assert "<b>" not in page
-    (tmp_path / "c").mkdir()
-    assert "<script>" not in markdown(compare(*tables(tmp_path / "c", rows(count=2), rows(count=2))))
     assert page.index("&lt;script&gt;") < page.index("r1<"), "failed ones are first"
 
 
@@ -143,6 +141,3 @@ def test_the_example_of_a_workflow_has_commands_that_are_there():
     assert replayed.truth == "{path}:/ground_truth"
     assert compared.new == replayed.out
     assert [parse_limit(text).metric for text in compared.fail] == ["rmse_m", "cpu_s"]
-    (installed,) = [step["run"] for step in job["steps"] if "pip install" in step.get("run", "")]
-    assert "[fleet,report]" in installed
-    assert "summary.md" in " ".join(step.get("run", "") for step in job["steps"] if "SUMMARY" in str(step))
