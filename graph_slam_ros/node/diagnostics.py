@@ -302,14 +302,15 @@ def _later_than_odometry(one: InputFacts, facts: Facts, most_s: float) -> Iterat
 
 
 def _of_measurements(facts: Facts, e: Estimate, chi2_per_dof: float) -> Iterator[str]:
-    """Yield what is wrong with what is measured. Where an input is wrong from the beginning, other faults are its."""
+    """Yield what is wrong with what is measured. A wrong or mostly refused input explains what else is wrong."""
     counted = ((one.name, one.counts, one.received) for one in facts.inputs if one.use in MOTION)
     wrong = [*facts.findings, *filter(None, (leaves_plane(*of) for of in counted))]
     yield from wrong
-    if not wrong:
+    is_explained = wrong or any(2 * one.recent.times > one.recent.came for one in facts.inputs)
+    if not is_explained:
         yield from filter(None, (e.displaced, e.association, e.uncorrected, "" if e.displaced else e.doubted))
     yield from filter(None, (e.visits, e.motion, e.ambiguity))
-    if not wrong and chi2_per_dof and e.fit > chi2_per_dof:
+    if not is_explained and chi2_per_dof and e.fit > chi2_per_dof:
         yield f"the measurements contradict each other: chi2 per degree of freedom is {e.fit:.1f}"
 
 

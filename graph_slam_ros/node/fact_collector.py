@@ -16,8 +16,7 @@ from graph_slam_ros.node.recent import RecentInputs
 from graph_slam_ros.node.session import Session
 from graph_slam_ros.node.subscriptions import Subscriptions
 from graph_slam_ros.node.tf_broadcaster import TfBroadcaster
-from graph_slam_ros.node.threads import run_in_thread
-from graph_slam_ros.node.worker import Worker
+from graph_slam_ros.node.worker import Worker, run_in_thread
 from graph_slam_ros.slam import Counters
 
 

@@ -28,11 +28,10 @@ from graph_slam_ros.errors import ConfigError, GraphSlamError, message_of
 from graph_slam_ros.messages import to_msg
 from graph_slam_ros.messages.message_class import message_class
 from graph_slam_ros.node import bond, diagnostics
-from graph_slam_ros.node.map_services import serve_maps
 from graph_slam_ros.node.parameters import changed, declare_parameters, files_for_others
 from graph_slam_ros.node.publishers import LATCHED
 from graph_slam_ros.node.runtime import Runtime
-from graph_slam_ros.node.services import serve_later
+from graph_slam_ros.node.services import serve_later, serve_maps
 from graph_slam_ros.node.worker import URGENT_S
 
 _SUCCESS, _FAILURE, _ERROR = (getattr(TransitionCallbackReturn, name) for name in ("SUCCESS", "FAILURE", "ERROR"))

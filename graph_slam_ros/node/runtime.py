@@ -14,13 +14,12 @@ from typing import Any
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.measurements.types import Event
 from graph_slam_ros.messages.survey import with_survey
-from graph_slam_ros.node.completion import Completion
 from graph_slam_ros.node.diagnostics import Facts
 from graph_slam_ros.node.estimate import Estimate
 from graph_slam_ros.node.fact_collector import FactCollector
 from graph_slam_ros.node.handle import NodeHandle
 from graph_slam_ros.node.ingest import Ingest
-from graph_slam_ros.node.preparation import Preparation
+from graph_slam_ros.node.preparation import Completion, Preparation
 from graph_slam_ros.node.publishers import Publishers
 from graph_slam_ros.node.publishing_clock import PublishingClock
 from graph_slam_ros.node.qos import input_topics

@@ -1,13 +1,15 @@
 """Services with a slow answer: the worker answers when the work is done, and callbacks go on meanwhile."""
 
+import math
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Any
 
 from std_srvs.srv import Trigger
 
-from graph_slam_ros.errors import message_of
+from graph_slam_ros.errors import ConfigError, GraphSlamError, message_of
 from graph_slam_ros.node.handle import NodeHandle
 
 
@@ -61,3 +63,98 @@ def _send(send: Callable[[Any, Any], None], response: Any, header: Any) -> None:
         send(response, header)
     except Exception:  # the node, or who asked, has gone in the meantime
         return
+
+
+_GIVEN_POSE, _LOCALIZE = 2, 3  # match_type of slam_toolbox/srv/DeserializePoseGraph
+_BAD_NAME, _BAD_MATCH_TYPE, _UNREADABLE, _FAILED = 1, 2, 3, 255  # its result, and that of SerializePoseGraph
+
+Values = dict[str, Any]
+
+
+class MatchTypeError(GraphSlamError):
+    """A request that does not contain where the robot is."""
+
+
+def saved_as(request: Any) -> Values:
+    """Convert a SerializePoseGraph request into parameters. Raises ConfigError without a name."""
+    return {"output.save_as": _name(request)}
+
+
+def loaded_from(request: Any, dimensions: int) -> Values:
+    """Convert a DeserializePoseGraph request into parameters.
+
+    Raises
+    ------
+    ConfigError, MatchTypeError
+        No name; no start pose, or an orientation that is none.
+    """
+    if request.match_type not in (_GIVEN_POSE, _LOCALIZE):
+        raise MatchTypeError(
+            f"match_type: {request.match_type} gives no pose: ask for START_AT_GIVEN_POSE (2) or LOCALIZE_AT_POSE (3)"
+        )
+    pose = _pose_text(request.initial_pose, dimensions)
+    localizes = request.match_type == _LOCALIZE
+    return {"output.load": _name(request), "output.load_pose": pose, "map.localize": localizes}
+
+
+def serve_maps(node: NodeHandle, serve_later: Callable[..., None]) -> None:
+    """Serve ``~/serialize_map`` and ``~/deserialize_map`` if slam_toolbox is installed, by ``services.serve_later``."""
+    try:
+        types = import_module("slam_toolbox.srv")
+    except ImportError:
+        return
+
+    def save(request: Any) -> "Future[str]":
+        config = node.config.changed(saved_as(request))
+        run = node.configured()
+        return run.save(config)
+
+    def load(request: Any) -> "Future[str]":
+        config = node.config.changed(loaded_from(request, node.config.world.dimensions))
+        run = node.configured()
+        run.check_map(config.output.load)  # before anything changes
+        if config.map.localize != node.config.map.localize:
+            node.change({"map.localize": config.map.localize})
+        return run.load(config)
+
+    def answer(response: Any, message: str, error: BaseException | None) -> Any:
+        """Fill the response with its result code; the log gets the message, for which it has no field."""
+        if error is None:
+            node.get_logger().info(message)
+        else:
+            node.get_logger().error(message_of(error))
+        if hasattr(response, "result"):  # some versions answer with nothing
+            response.result = _code(response, error)
+        return response
+
+    serve_later(node, "~/serialize_map", save, types.SerializePoseGraph, answer)
+    serve_later(node, "~/deserialize_map", load, types.DeserializePoseGraph, answer)
+
+
+def _code(response: Any, error: BaseException | None) -> int:
+    if error is None:
+        return 0
+    if not hasattr(response, "RESULT_INVALID_FILENAME"):
+        return _FAILED
+    by_type: dict[type[BaseException], int] = {ConfigError: _BAD_NAME, MatchTypeError: _BAD_MATCH_TYPE}
+    return by_type.get(type(error), _UNREADABLE if isinstance(error, GraphSlamError) else _FAILED)
+
+
+def _name(request: Any) -> str:
+    if not request.filename:
+        raise ConfigError("filename: is empty: give the name of a run in the directory of output.folder")
+    return str(request.filename)
+
+
+def _pose_text(pose: Any, dimensions: int) -> str:
+    if hasattr(pose, "theta"):  # geometry_msgs/Pose2D
+        numbers = [pose.x, pose.y, pose.theta]
+    else:
+        p, q = pose.position, pose.orientation
+        if not math.isclose(math.hypot(q.x, q.y, q.z, q.w), 1.0, abs_tol=0.01):
+            raise MatchTypeError("initial_pose: its orientation is no unit quaternion")
+        yaw = math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
+        roll = math.atan2(2.0 * (q.w * q.x + q.y * q.z), 1.0 - 2.0 * (q.x * q.x + q.y * q.y))
+        pitch = math.asin(max(-1.0, min(1.0, 2.0 * (q.w * q.y - q.z * q.x))))
+        numbers = [p.x, p.y, yaw] if dimensions == 2 else [p.x, p.y, p.z, roll, pitch, yaw]
+    return " ".join(map(repr, map(float, numbers)))

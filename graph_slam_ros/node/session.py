@@ -15,9 +15,8 @@ import numpy as np
 
 from graph_slam_ros.errors import GraphSlamError, similar_file
 from graph_slam_ros.measurements.types import END, InitialPose
-from graph_slam_ros.node.estimate import Estimate, UnseenWay, WeakestLandmark, doubted_lately
-from graph_slam_ros.node.resumption import Resumption
-from graph_slam_ros.node.threads import run_in_thread
+from graph_slam_ros.node.estimate import Estimate, Resumption, UnseenWay, WeakestLandmark, doubted_lately, estimate_of
+from graph_slam_ros.node.worker import run_in_thread
 from graph_slam_ros.runs.folder import (
     CONFIG,
     RunError,
@@ -180,9 +179,9 @@ class Session:
         if update.solved and not self._is_confirmed and len(slam.keyframes) > self.loaded_keyframes:
             self._is_confirmed = self._is_sure
         self._unseen = self._unseen.goes_on(slam)
-        self.estimate = Estimate.of(
+        self.estimate = estimate_of(
             slam,
-            update.correction,
+            correction=update.correction,
             is_confirmed=self._is_confirmed,
             is_resumed=not self._is_confirmed and self._resumption is not None and self._resumption.goes_on(slam),
             solve_s=solve_s,

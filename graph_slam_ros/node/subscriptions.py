@@ -3,7 +3,7 @@
 import math
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial, wraps
@@ -15,18 +15,98 @@ except ImportError:  # Humble
     from rclpy.qos_event import SubscriptionEventCallbacks, UnsupportedEventTypeError
 from rclpy.utilities import get_rmw_implementation_identifier
 
+from graph_slam_ros.config.inputs import InputConfig
 from graph_slam_ros.measurements.types import Measured
 from graph_slam_ros.messages.from_msg import TF, TF_STATIC, TRANSFORMS, MessageConverter, is_correction
 from graph_slam_ros.messages.inputs import uses
+from graph_slam_ros.messages.inputs.landmark_types import LANDMARK_TYPES
 from graph_slam_ros.messages.message_class import message_class
-from graph_slam_ros.node.alternatives import alternatives
 from graph_slam_ros.node.diagnostics import InputFacts
 from graph_slam_ros.node.handle import NodeHandle
-from graph_slam_ros.node.losses import Losses
 from graph_slam_ros.node.qos import InputQos, InputTopic
 from graph_slam_ros.node.recent import Recent
 from graph_slam_ros.slam import Config, Counters
 from graph_slam_ros.slam.frontend.ingest_gate import input_of
+
+_NUMBER = "publication_sequence_number"
+_UNSUPPORTED = 2**63
+_ASK_AGAIN_NS = 1_000_000_000
+
+
+class Losses:
+    """Counts lost messages by the numbers that their publisher gives them, where a topic has one publisher.
+
+    Numbers of several publishers cannot be told apart: rclpy names no publisher with a message. So nothing is counted
+    while there are several, and nothing at the first gap after the publisher changed.
+
+    Parameters
+    ----------
+    publishers : returns the identifiers of the topic's publishers; it is asked at the first message and at gaps
+    """
+
+    def __init__(self, publishers: Callable[[], frozenset[bytes]]) -> None:
+        self._publishers = publishers
+        self._known: frozenset[bytes] = frozenset()
+        self._expected: int | None = None
+        self._ask_at_ns = 0
+
+    def before(self, info: Mapping[str, Any], now_ns: int) -> int:
+        """Return how many messages were lost between the last message and this one.
+
+        Parameters
+        ----------
+        info : what rclpy says of a message beside its content
+        now_ns : the time; while a topic has several publishers, they are asked for once a second
+        """
+        number = info.get(_NUMBER)
+        if number is None or number >= _UNSUPPORTED:
+            return 0
+        expected, self._expected = self._expected, number + 1
+        if (expected is not None and number <= expected) or now_ns < self._ask_at_ns:
+            return 0
+        before, self._known = self._known, self._publishers()
+        if len(self._known) != 1:
+            self._ask_at_ns = now_ns + _ASK_AGAIN_NS
+            return 0
+        return 0 if expected is None or self._known != before else number - expected
+
+
+_MOST = 3  # that are named
+_LANDMARKS = frozenset({"vision_msgs/msg/Detection3DArray", *LANDMARK_TYPES})
+
+
+def alternatives(node: NodeHandle, one: InputConfig, use: str, subscribed: Collection[str]) -> tuple[str, ...]:
+    """Return a text for each topic of another node that the input could use, with the parameters that choose it.
+
+    Parameters
+    ----------
+    use : of the input
+    subscribed : the topics of all inputs
+    """
+    if one.type == TRANSFORMS:
+        return ()
+    found = [
+        (kind != one.type, topic, kind)
+        for topic, kinds in node.get_topic_names_and_types()
+        for kind in kinds
+        if kind == one.type or (use == "landmarks" and {kind, one.type} <= _LANDMARKS)
+        if topic not in subscribed and any(_others(node, topic))
+    ]
+    return tuple(_text(one.name, topic, kind, is_other_type=differs) for differs, topic, kind in sorted(found)[:_MOST])
+
+
+def _text(name: str, topic: str, kind: str, *, is_other_type: bool) -> str:
+    if is_other_type:
+        return f"{topic} has landmarks, too: {name}.type:={kind} {name}.topic:={topic}"
+    return f"{topic} has this type: {name}.topic:={topic}"
+
+
+def _others(node: NodeHandle, topic: str) -> Iterator[bool]:
+    """Yield for each publisher of a topic whether it belongs to another node."""
+    own = node.get_name(), node.get_namespace()
+    for publisher in node.get_publishers_info_by_topic(topic):
+        yield (publisher.node_name, publisher.node_namespace) != own
+
 
 Callback = Callable[..., None]
 Guard = Callable[[Callback], Callback]

@@ -12,7 +12,7 @@ from reliability import times
 from graph_slam_ros.cli import main
 from graph_slam_ros.messages.to_msg import WARN
 from graph_slam_ros.node.diagnostics import Facts, judge, statuses
-from graph_slam_ros.node.estimate import Estimate, UnseenWay
+from graph_slam_ros.node.estimate import UnseenWay, estimate_of
 from graph_slam_ros.runs.outcome import doubts
 from graph_slam_ros.slam import Config, Sightings
 from graph_slam_ros.tools.simulation import simulate, write_bag
@@ -76,7 +76,7 @@ def assert_the_node_says_so(slam):
     assert np.trace(slam.pose_covariance) > 2.0 * np.trace(slam.solver.marginal(slam.keyframes.ids[-1:])[0])
     (one,) = slam.uncorrected_so_far
     of = {"is_confirmed": True, "is_resumed": False, "solve_s": 0.0, "slowest_solve_s": 0.0, "fit": 1.0, "doubted": ""}
-    estimate = Estimate.of(slam, slam.correction, unseen=UnseenWay(0, 0), **of)
+    estimate = estimate_of(slam, correction=slam.correction, unseen=UnseenWay(0, 0), **of)
     health = judge(Facts("active", estimate=estimate), Config())
     assert (health.state, health.level) == ("DEGRADED", WARN)
     assert str(one) in health.reasons[0]

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 
 from graph_slam_ros.errors import ConfigError
-from graph_slam_ros.node.map_services import MatchTypeError, loaded_from, saved_as
+from graph_slam_ros.node.services import MatchTypeError, loaded_from, saved_as
 from graph_slam_ros.slam import Config
 
 YAW = 0.7

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 from rows import each
 
-from graph_slam_ros.node.alternatives import alternatives
+from graph_slam_ros.node.subscriptions import alternatives
 from graph_slam_ros.slam import Config
 
 ODOMETRY, DETECTIONS = "nav_msgs/msg/Odometry", "vision_msgs/msg/Detection3DArray"

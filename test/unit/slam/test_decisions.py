@@ -7,7 +7,7 @@ import pytest
 
 from graph_slam_ros.graph import POSE_PRIOR, RELATIVE_POSE, SE2, Gaussian
 from graph_slam_ros.lie import se2
-from graph_slam_ros.node.threads import run_in_thread
+from graph_slam_ros.node.worker import run_in_thread
 from graph_slam_ros.slam import Config
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.robust.background import run_when_asked
