@@ -7,7 +7,7 @@ import numpy as np
 from graph_slam_ros.lie import so3
 from graph_slam_ros.slam import AngularVelocity, Config, Control, GraphSlam, Odometry, Sightings
 from graph_slam_ros.tools.simulation import simulate
-from graph_slam_ros.tools.simulation.instruments import Instruments, with_instruments
+from graph_slam_ros.tools.simulation.instruments import with_instruments
 from graph_slam_ros.tools.simulation.motion import integrate
 from graph_slam_ros.tools.simulation.recording import measurements
 
@@ -50,7 +50,7 @@ def drive(seed, *, rest_s=0.0, bias=0.0, every=20, factor=1.0, slips=False, walk
     """What a robot with a gyro measures, in order of stamp, and its recording; few tags are seen."""
     world = simulate("warehouse", seed, sensor="position", **options)
     recording = stood(with_wrong_wheels(world, factor, slips=slips), rest_s)
-    recording = with_instruments(recording, seed, Instruments(imu=100.0, imu_bias_rad_s=bias, imu_bias_walk=walk))
+    recording = with_instruments(recording, seed, imu=100.0, imu_bias_rad_s=bias, imu_bias_walk=walk)
     out = [
         replace(m, source="odom") if isinstance(m, Odometry) else m
         for k, m in enumerate(measurements(recording))

@@ -15,16 +15,17 @@ from graph_slam_ros.tools.simulation.draft import WrongLine, WrongMessage, write
 from graph_slam_ros.tools.simulation.drive import Drive
 from graph_slam_ros.tools.simulation.faults import KINDS, Fault, spoil_messages
 from graph_slam_ros.tools.simulation.faulty import faulty_graph, faulty_recording
-from graph_slam_ros.tools.simulation.instruments import Instruments, with_instruments
-from graph_slam_ros.tools.simulation.options import World, check_seed, filled, options_of
+from graph_slam_ros.tools.simulation.instruments import with_instruments
+from graph_slam_ros.tools.simulation.message_faults import MESSAGE_KINDS
+from graph_slam_ros.tools.simulation.options import filled, options_of
 from graph_slam_ros.tools.simulation.pose_graph import GRAPH_WORLDS, city_graph, sphere_graph, write_graph
 from graph_slam_ros.tools.simulation.recording import Recording, measurements, with_closures
 
 WORLDS = {
-    "pythonrobotics": World(pythonrobotics.PythonRobotics, pythonrobotics.simulate),
-    "manhattan": World(manhattan.Manhattan, manhattan.simulate),
-    "warehouse": World(warehouse.Warehouse, warehouse.simulate),
-    "flight": World(flight.Flight, flight.simulate),
+    "pythonrobotics": pythonrobotics.simulate,
+    "manhattan": manhattan.simulate,
+    "warehouse": warehouse.simulate,
+    "flight": flight.simulate,
 }
 
 
@@ -38,13 +39,10 @@ def simulate(world: str, /, seed: int, **options: Any) -> Recording:
     """
     if world not in WORLDS:
         raise GraphSlamError(f"no world {world!r}; there are {', '.join(WORLDS)}{did_you_mean(world, WORLDS)}")
-    check_seed(seed)
-    names = {o.name for o in options_of(Instruments)}
-    chosen = {name: value for name, value in options.items() if name in names}
-    rest = {name: value for name, value in options.items() if name not in names}
-    one = WORLDS[world]
-    recording = one.make(seed, one.options(**filled(world, one.options, rest, [*names])))
-    return with_instruments(recording, seed, Instruments(**filled(world, Instruments, chosen)))
+    of_world, of_every_world = options_of(WORLDS[world]), options_of(with_instruments)
+    values = filled(world, of_world | of_every_world, options)
+    recording = WORLDS[world](seed, **{name: values[name] for name in of_world})
+    return with_instruments(recording, seed, **{name: values[name] for name in of_every_world})
 
 
 def write_faulty_bag(recording: Recording, path: Path, faults: Sequence[Fault], seed: int) -> list[WrongMessage]:
@@ -66,10 +64,10 @@ def spoil_bag(source: Path, out: Path, faults: Sequence[Fault], seed: int) -> No
 __all__ = [
     "GRAPH_WORLDS",
     "KINDS",
+    "MESSAGE_KINDS",
     "WORLDS",
     "Drive",
     "Fault",
-    "Instruments",
     "Recording",
     "WrongLine",
     "WrongMessage",
@@ -83,6 +81,7 @@ __all__ = [
     "spoil_bag",
     "spoil_messages",
     "with_closures",
+    "with_instruments",
     "write_bag",
     "write_faulty_bag",
     "write_graph",

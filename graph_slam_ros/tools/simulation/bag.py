@@ -1,8 +1,8 @@
 """A recording as one mcap bag: the topics of the robot, and the truth as further topics."""
 
-from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
 from heapq import merge
+from itertools import groupby
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -23,10 +23,10 @@ from graph_slam_ros.messages.to_msg import (
     vector,
 )
 from graph_slam_ros.recordings.bag import BagWriter
-from graph_slam_ros.slam import Closure, Sighting, Sightings
+from graph_slam_ros.slam import Sighting, Sightings
 from graph_slam_ros.tools.simulation.motion import space_of
 from graph_slam_ros.tools.simulation.recording import CLOSURES_TOPIC, LANDMARKS_TOPIC, Gnss, Imu, Recording
-from graph_slam_ros.typing import Array, Numbers
+from graph_slam_ros.typing import Numbers
 
 Message: TypeAlias = tuple[str, str, int, bytes]
 """Topic, type, stamp [ns] and CDR bytes."""
@@ -109,41 +109,21 @@ def write_bag(recording: Recording, path: Path | str) -> None:
     GraphSlamError
         What is seen is of kinds that no one message has.
     """
-    space, seen = space_of(recording.T_world_base[0]), {s.stamp_ns: s for s in recording.seen}
-    kinds, polar, names = _kinds(recording), _is_polar(recording), recorded_names(recording)
-    if polar and len(kinds) > 1:
-        raise GraphSlamError(f"no message holds {' and '.join(sorted(kinds))} together")
-    closed = recording.closures_at()
-    twist_covariance = covariance6(recording.twist_covariance, _UNUSED)
-    instruments = merge(gnss_messages(recording.gnss), imu_messages(recording.imu), key=_stamp_of)
-    instrument = next(instruments, None)
+    if _is_polar(recording) and len(_kinds(recording)) > 1:
+        raise GraphSlamError(f"no message holds {' and '.join(sorted(_kinds(recording)))} together")
+    streams = [
+        _mounted_sensor(recording),
+        gnss_messages(recording.gnss),
+        imu_messages(recording.imu),
+        _odometry(recording),
+        _landmarks(recording),
+        _closures(recording),
+        _truth(recording),
+        _true_landmarks(recording),
+    ]
     with replaced(Path(path)) as new, BagWriter(new) as bag:
-        first_ns = int(recording.stamps_ns[0])
-        for k, stamp_ns in enumerate(recording.stamps_ns.tolist()):
-            if polar and stamp_ns == first_ns:
-                T_base_sensor = next(s.T_base_sensor for one in recording.seen for s in one.sightings) or space.identity
-                mounted = transform(stamp_ns, "base_link", _SENSOR, T_base_sensor)
-                bag.write("/tf_static", "tf2_msgs/msg/TFMessage", stamp_ns, mounted)
-            while instrument is not None and _stamp_of(instrument) <= stamp_ns:
-                bag.write(*instrument)
-                instrument = next(instruments, None)
-            bag.write(ODOMETRY_TOPIC, "nav_msgs/msg/Odometry", stamp_ns, _odometry(recording, k, twist_covariance))
-            if stamp_ns in seen and polar:
-                bag.write(LANDMARKS_TOPIC, _POINTS, stamp_ns, _point_cloud(seen[stamp_ns], names))
-            elif stamp_ns in seen:
-                bag.write(LANDMARKS_TOPIC, _DETECTIONS, stamp_ns, _detections(seen[stamp_ns], "base_link", space))
-            if stamp_ns in closed:
-                bag.write(CLOSURES_TOPIC, _DETECTIONS, stamp_ns, _closures(closed[stamp_ns], space))
-            truth = pose_stamped(stamp_ns, "world", tuple(recording.T_world_base[k].tolist()))
-            bag.write(TRUTH_TOPIC, "geometry_msgs/msg/PoseStamped", stamp_ns, truth)
-            if stamp_ns == first_ns:
-                true = _true_landmarks(recording, space)
-                true = replace(true, sightings=tuple(replace(s, id=names[s.id]) for s in true.sightings))
-                bag.write(TRUE_LANDMARKS_TOPIC, _DETECTIONS, stamp_ns, _detections(true, "world", space))
-
-
-def _stamp_of(message: Message) -> int:
-    return message[2]
+        for message in merge(*streams, key=lambda message: message[2]):
+            bag.write(*message)
 
 
 def recorded_names(recording: Recording) -> dict[str, str]:
@@ -160,45 +140,73 @@ def _is_polar(recording: Recording) -> bool:
     return bool(_kinds(recording) - {"position", "pose"})
 
 
-def _odometry(recording: Recording, k: int, twist_covariance: Array) -> bytes:
-    at, velocity = tuple(recording.T_odom_base[k].tolist()), recording.twist[k].tolist()
-    if len(velocity) == 3:
-        velocity = [velocity[0], velocity[1], 0.0, 0.0, 0.0, velocity[2]]
-    twist = make("geometry_msgs/msg/Twist", linear=vector(*velocity[:3]), angular=vector(*velocity[3:]))
-    message = make(
-        "nav_msgs/msg/Odometry",
-        header=header(int(recording.stamps_ns[k]), "odom"),
-        child_frame_id="base_link",
-        pose=pose_with_covariance(at, recording.odom_covariance[k], _UNUSED),
-        twist=make("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=twist_covariance),
-    )
-    return encode(message)
+def _mounted_sensor(recording: Recording) -> Iterator[Message]:
+    """Where the sensor of ranges and bearings is."""
+    if _is_polar(recording):
+        T_base_sensor = next(s.T_base_sensor for one in recording.seen for s in one.sightings)
+        at = T_base_sensor or space_of(recording.T_world_base[0]).identity
+        yield _mounted(int(recording.stamps_ns[0]), _SENSOR, at)
 
 
-def _true_landmarks(recording: Recording, space: Geometry) -> Sightings:
+def _odometry(recording: Recording) -> Iterator[Message]:
+    name, covariance = "nav_msgs/msg/Odometry", covariance6(recording.twist_covariance, _UNUSED)
+    for k, stamp_ns in enumerate(recording.stamps_ns.tolist()):
+        velocity = recording.twist[k].tolist()
+        if len(velocity) == 3:
+            velocity = [velocity[0], velocity[1], 0.0, 0.0, 0.0, velocity[2]]
+        twist = make("geometry_msgs/msg/Twist", linear=vector(*velocity[:3]), angular=vector(*velocity[3:]))
+        at = tuple(recording.T_odom_base[k].tolist())
+        message = make(
+            name,
+            header=header(stamp_ns, "odom"),
+            child_frame_id="base_link",
+            pose=pose_with_covariance(at, recording.odom_covariance[k], _UNUSED),
+            twist=make("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=covariance),
+        )
+        yield ODOMETRY_TOPIC, name, stamp_ns, encode(message)
+
+
+def _truth(recording: Recording) -> Iterator[Message]:
+    for stamp_ns, pose in zip(recording.stamps_ns.tolist(), recording.T_world_base.tolist(), strict=True):
+        truth = pose_stamped(stamp_ns, "world", tuple(pose))
+        yield TRUTH_TOPIC, "geometry_msgs/msg/PoseStamped", stamp_ns, truth
+
+
+def _true_landmarks(recording: Recording) -> Iterator[Message]:
     """The true map, as sightings from the origin of the world."""
-    known = []
+    space, names, known = space_of(recording.T_world_base[0]), recorded_names(recording), []
     for name, at in recording.landmarks.items():
         kind, dof = ("pose", space.dof) if len(at) == space.pose.size else ("position", space.dimensions)
-        known.append(Sighting(name, kind, at, tuple((_SURVEYED_M**2 * np.eye(dof)).ravel().tolist())))
-    return Sightings(int(recording.stamps_ns[0]), TRUE_LANDMARKS_TOPIC, tuple(known))
+        known.append(Sighting(names[name], kind, at, tuple((_SURVEYED_M**2 * np.eye(dof)).ravel().tolist())))
+    yield _detections(TRUE_LANDMARKS_TOPIC, int(recording.stamps_ns[0]), "world", known, space)
 
 
-def _detections(seen: Sightings, frame: str, space: Geometry) -> bytes:
-    head = header(seen.stamp_ns, frame)
-    return encode(make(_DETECTIONS, header=head, detections=[_detection(head, s, space) for s in seen.sightings]))
+def _landmarks(recording: Recording) -> Iterator[Message]:
+    space, names, is_polar = space_of(recording.T_world_base[0]), recorded_names(recording), _is_polar(recording)
+    for one in recording.seen:
+        if is_polar:
+            yield LANDMARKS_TOPIC, _POINTS, one.stamp_ns, _point_cloud(one, names)
+        else:
+            yield _detections(LANDMARKS_TOPIC, one.stamp_ns, "base_link", one.sightings, space)
 
 
-def _closures(several: list[Closure], space: Geometry) -> bytes:
+def _closures(recording: Recording) -> Iterator[Message]:
     """Earlier poses of the base relative to the later ones: a motion ``d`` of a pose is ``-Ad d`` of its inverse."""
-    head, detections = header(several[0].stamp_ns, "base_link"), []
-    for one in several:
-        back = space.group.adjoint(one.T_from_base)
-        covariance = back @ np.reshape(one.covariance, (space.dof, space.dof)) @ back.T
-        measured = tuple(float(number) for number in space.group.inverse(one.T_from_base))
-        seen = Sighting(str(one.from_stamp_ns), "pose", measured, tuple(covariance.ravel().tolist()))
-        detections.append(_detection(head, seen, space))
-    return encode(make(_DETECTIONS, header=head, detections=detections))
+    space = space_of(recording.T_world_base[0])
+    for stamp_ns, several in groupby(recording.closures, key=lambda closure: closure.stamp_ns):
+        seen = []
+        for one in several:
+            back = space.group.adjoint(one.T_from_base)
+            covariance = back @ np.reshape(one.covariance, (space.dof, space.dof)) @ back.T
+            measured = tuple(float(number) for number in space.group.inverse(one.T_from_base))
+            seen.append(Sighting(str(one.from_stamp_ns), "pose", measured, tuple(covariance.ravel().tolist())))
+        yield _detections(CLOSURES_TOPIC, stamp_ns, "base_link", seen, space)
+
+
+def _detections(topic: str, stamp_ns: int, frame: str, seen: Sequence[Sighting], space: Geometry) -> Message:
+    head = header(stamp_ns, frame)
+    several = make(_DETECTIONS, header=head, detections=[_detection(head, s, space) for s in seen])
+    return topic, _DETECTIONS, stamp_ns, encode(several)
 
 
 def _point_cloud(seen: Sightings, names: Mapping[str, str]) -> bytes:

@@ -1,6 +1,7 @@
 """The command ``simulate``: worlds as recordings or graphs, and faults in them, in a recording or in a graph."""
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -106,7 +107,7 @@ def _write_graph(args: argparse.Namespace, faults: list[Any], truth_file: Path) 
     if world:
         if args.closures is not None:
             raise GraphSlamError(f"{args.scenario}: no use for --closures: it has them")
-        graph, poses = world.make(args.seed, **_options(args))
+        graph, poses = world(args.seed, **_options(args))
         file, truth = G2oFile(graph, list(range(graph.vertex_count)), [0]), poses.ravel()
         if "closures" not in graph.labels:
             console.show(f"{args.scenario}: with {len(poses)} poses nothing is closed: a larger --poses")
@@ -150,29 +151,16 @@ def _companion(out: Path, ending: str) -> Path:
 
 def options_of_worlds() -> str:
     """Every option of the worlds and every kind of fault, with defaults."""
-    from graph_slam_ros.tools.simulation import GRAPH_WORLDS, KINDS, WORLDS, Instruments, options_of
-    from graph_slam_ros.tools.simulation.message_faults import MESSAGE_KINDS
-    from graph_slam_ros.tools.simulation.options import about
+    from graph_slam_ros.tools.simulation import GRAPH_WORLDS, KINDS, MESSAGE_KINDS, WORLDS, with_instruments
+    from graph_slam_ros.tools.simulation.options import lines_about
 
-    def option_lines(what: Any) -> list[str]:
-        lines = []
-        for o in options_of(what):
-            choices = f": {', '.join(o.choices)}" if o.choices else ""
-            default = str(o.default).lower() if isinstance(o.default, bool) else o.default
-            lines.append(f"    {o.name}={default}{f' [{o.unit}]' if o.unit else ''}  {o.meaning}{choices}")
-        return lines
-
-    lines = ["options of the worlds, for --set:"]
-    for name, world in WORLDS.items():
-        lines += [f"  {name}: {about(world.make)}", *option_lines(world.options)]
-    lines += ["  every world: with a satellite receiver and an IMU", *option_lines(Instruments)]
-    for name, graph_world in GRAPH_WORLDS.items():
-        lines += [f"  {name}, a graph: {about(graph_world.make)}", *option_lines(graph_world.options)]
-    faults = "faults for --fault with their options; OUT.faults.csv lists what is wrong:"
-    others = "faults of drivers, clocks and frames, in a world or in a recording of yours:"
-    for title, kinds in ((faults, KINDS), (others, MESSAGE_KINDS)):
-        lines += ["", title]
-        for name, kind in kinds.items():
-            lines += [f"  {name}: {about(kind)}", *option_lines(kind)]
-    lines += ["", "example: graph_slam simulate warehouse --out world.mcap --set gnss=5 --set imu=100"]
-    return "\n".join(lines)
+    parts: dict[str, dict[str, Callable[..., Any]]] = {
+        "options of the worlds, for --set:": {**WORLDS, "every world": with_instruments}
+        | {f"{name}, a graph": world for name, world in GRAPH_WORLDS.items()},
+        "faults for --fault with their options; OUT.faults.csv lists what is wrong:": KINDS,
+        "faults of drivers, clocks and frames, in a world or in a recording of yours:": MESSAGE_KINDS,
+    }
+    lines = []
+    for title, of in parts.items():
+        lines += [title, *(line for name, what in of.items() for line in lines_about(name, what)), ""]
+    return "\n".join([*lines, "example: graph_slam simulate warehouse --out world.mcap --set gnss=5 --set imu=100"])

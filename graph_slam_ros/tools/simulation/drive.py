@@ -18,16 +18,12 @@ from graph_slam_ros.messages.from_msg import decoder
 from graph_slam_ros.messages.to_msg import encode, time, transform
 from graph_slam_ros.recordings.bag import BagWriter, open_bag
 from graph_slam_ros.tools.simulation.bag import ODOMETRY_TOPIC, TRUE_LANDMARKS_TOPIC, TRUTH_TOPIC
-from graph_slam_ros.tools.simulation.options import Kinds
 from graph_slam_ros.tools.simulation.recording import LANDMARKS_TOPIC
 from graph_slam_ros.typing import Array, Index
 
 _ODOMETRY, TRANSFORMS = "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage"
 DETECTIONS, POINTS = "vision_msgs/msg/Detection3DArray", "sensor_msgs/msg/PointCloud2"
 _DOUBLE = 8  # of sensor_msgs/PointField
-
-MESSAGE_KINDS = Kinds()
-"""Faults that any recording can have; those of worlds (``faults.KINDS``) need its truth."""
 
 
 class Message:

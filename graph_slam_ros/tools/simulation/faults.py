@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.random import PCG64, Generator, SeedSequence
+from numpy.random import Generator
 
 from graph_slam_ros.errors import GraphSlamError, did_you_mean
 from graph_slam_ros.formats.parameters import parse_setting
@@ -17,18 +17,14 @@ from graph_slam_ros.tools.simulation import false_closures as generator
 from graph_slam_ros.tools.simulation.draft import Draft
 from graph_slam_ros.tools.simulation.drive import Drive
 from graph_slam_ros.tools.simulation.message_faults import MESSAGE_KINDS
-from graph_slam_ros.tools.simulation.options import Kinds, filled, option
+from graph_slam_ros.tools.simulation.options import filled, option, options_of, random
 from graph_slam_ros.typing import Array
 
 _OFTEN = 3  # times that a landmark must be seen, and seen again later, to be worth a fault
 _STREAMS = 1  # the world itself is drawn from the seed alone, true closures from stream 0
 _HALFWAY = "when, as a part of the whole: 0 the first pose, 1 the last"
 
-KINDS = Kinds()
-"""Faults of worlds, whose truth is known."""
 
-
-@KINDS.add
 def false_closures(
     draft: Draft,
     rng: Generator,
@@ -45,7 +41,6 @@ def false_closures(
     draft.add_closures(generator.Closures(draft.places[found.ends], found.measured, found.root), "false_closures")
 
 
-@KINDS.add
 def wrong_ids(draft: Draft, rng: Generator, rate: float = option(0.05, "of all sightings", "", 0, 1)) -> None:
     """Sightings with the id of another landmark, if possible one that is not in the same message."""
     names = list(_times(draft, 0, 0))
@@ -60,7 +55,6 @@ def wrong_ids(draft: Draft, rng: Generator, rate: float = option(0.05, "of all s
         draft.spoil(k, "wrong_ids", replace(draft.sightings[k], id=others[rng.integers(len(others))]))
 
 
-@KINDS.add
 def swapped_ids(
     draft: Draft,
     rng: Generator,
@@ -76,7 +70,6 @@ def swapped_ids(
             draft.spoil(k, "swapped_ids", replace(s, id=other[draft.true_id(k)]))
 
 
-@KINDS.add
 def moved_landmarks(
     draft: Draft,
     rng: Generator,
@@ -95,7 +88,6 @@ def moved_landmarks(
             draft.spoil(k, "moved_landmarks", draft.seen_from(k, displaced[draft.true_id(k)]))
 
 
-@KINDS.add
 def outliers(
     draft: Draft,
     rng: Generator,
@@ -119,7 +111,6 @@ def outliers(
         draft.spoil(k, "outliers", replace(s, measured=tuple(measured.tolist())))
 
 
-@KINDS.add
 def slip(
     draft: Draft,
     _rng: Generator,
@@ -145,7 +136,6 @@ def slip(
     draft.spoil_odometry(range(first + 1, last + 1), "slip")
 
 
-@KINDS.add
 def carried(
     draft: Draft,
     _rng: Generator,
@@ -166,7 +156,6 @@ def carried(
     draft.spoil_odometry(range(first + 1, last + 1), "carried")
 
 
-@KINDS.add
 def jump(
     draft: Draft,
     _rng: Generator,
@@ -185,6 +174,13 @@ def jump(
     before = tuple(draft.odometry[later].tolist())
     draft.odometry = _moved_after(draft, later, space.group.retract(before, (*ahead, *turned)))
     draft.spoil_odometry([later], "jump")
+
+
+KINDS = {
+    put.__name__: put
+    for put in (false_closures, wrong_ids, swapped_ids, moved_landmarks, outliers, slip, carried, jump)
+}
+"""Faults of worlds, whose truth is known."""
 
 
 def _moved_after(draft: Draft, pose: int, to: Sequence[float]) -> Array:
@@ -241,7 +237,7 @@ class Fault:
         known: dict[str, Any] = {**KINDS, **MESSAGE_KINDS}
         if kind not in known:
             raise GraphSlamError(f"no fault {kind!r}; there are {', '.join(known)}{did_you_mean(kind, known)}")
-        return cls(kind, filled(kind, known[kind], options))
+        return cls(kind, filled(kind, options_of(known[kind]), options))
 
     @property
     def is_of_messages(self) -> bool:
@@ -265,16 +261,11 @@ def put_faults(draft: Draft, faults: Sequence[Fault], seed: int) -> None:
     """Put faults into a draft, one after the other; those of messages are left to ``spoil_messages``."""
     for k, fault in enumerate(faults):
         if not fault.is_of_messages:
-            KINDS[fault.kind](draft, stream_of(seed, k), **fault.options)
+            KINDS[fault.kind](draft, random(seed, _STREAMS, k), **fault.options)
 
 
 def spoil_messages(drive: Drive, faults: Sequence[Fault], seed: int) -> None:
     """Put the faults of messages into a drive, one after the other."""
     for k, fault in enumerate(faults):
         if fault.is_of_messages:
-            MESSAGE_KINDS[fault.kind](drive, stream_of(seed, k), **fault.options)
-
-
-def stream_of(seed: int, number: int) -> Generator:
-    """Return the random numbers of the fault of a number."""
-    return Generator(PCG64(SeedSequence(seed, spawn_key=(_STREAMS, number))))
+            MESSAGE_KINDS[fault.kind](drive, random(seed, _STREAMS, k), **fault.options)

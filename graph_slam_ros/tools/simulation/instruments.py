@@ -3,15 +3,16 @@
 The world's x points east, y north and z up; its origin is at ``DATUM``.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
-from numpy.random import PCG64, Generator, SeedSequence
+from numpy.random import Generator
 
 from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.messages.inputs.fixes import east_north_up
 from graph_slam_ros.tools.simulation.motion import VelocityNoise
-from graph_slam_ros.tools.simulation.options import option
+from graph_slam_ros.tools.simulation.options import checked, option, random
 from graph_slam_ros.tools.simulation.recording import Gnss, Imu, Recording, Stamps
 from graph_slam_ros.typing import Array, Numbers
 
@@ -27,47 +28,48 @@ _STEPS = 6
 _STREAM = 1  # of the seed: the drive is the same with and without instruments
 
 
-@dataclass(frozen=True, slots=True)
-class Instruments:
-    """Options of every world in addition to its own: a satellite receiver and an IMU."""
+@checked("instruments")
+def with_instruments(
+    recording: Recording,
+    seed: int,
+    landmarks: bool = option(True, "whether the robot sees landmarks at all"),
+    gnss: float = option(0.0, "fixes of a satellite receiver, on /gps/fix; 0: there is none", "Hz", 0, 100),
+    gnss_sigma_m: float = option(0.3, "error of a fix east and north; twice that upwards", "m", 1e-3, 100),
+    gnss_correlation_s: float = option(2.0, "how long such an error lasts (1/e)", "s", 0, 1e4),
+    gnss_outage_s: float = option(0.0, "time without a fix, in the middle of the drive", "s", 0),
+    imu: float = option(0.0, "messages of an IMU with orientation, on /imu/data; 0: there is none", "Hz", 0, 1000),
+    imu_drift_rad_s: float = option(0.0, "its heading drifts besides: there is no compass", "rad/s", -1, 1),
+    imu_bias_rad_s: float = option(0.0, "bias of its turn rates, about each axis", "rad/s", -10, 10),
+    imu_bias_walk: float = option(0.0, "random walk of that", "rad/s/sqrt(s)", 0, 1),
+) -> Recording:
+    """A satellite receiver and an IMU are added; or landmarks are left out."""
+    added: dict[str, Any] = {} if landmarks else {"seen": ()}
+    if gnss > 0.0:
+        sigmas = gnss_sigma_m * np.array([1.0, 1.0, UP])
+        noise = VelocityNoise(tuple(sigmas.tolist()), gnss_correlation_s)
+        added["gnss"] = _gnss(random(seed, _STREAM, 0), recording, gnss, noise, gnss_outage_s)
+    if imu > 0.0:
+        measured = _imu(random(seed, _STREAM, 1), recording, imu, imu_drift_rad_s)
+        steps = imu_bias_walk * np.sqrt(1.0 / imu) * random(seed, _STREAM, 2).standard_normal(measured.rate.shape)
+        added["imu"] = replace(measured, rate=measured.rate + imu_bias_rad_s + np.cumsum(steps, axis=0))
+    return replace(recording, **added)
 
-    landmarks: bool = option(True, "whether the robot sees landmarks at all")
-    gnss: float = option(0.0, "fixes of a satellite receiver, on /gps/fix; 0: there is none", "Hz", 0, 100)
-    gnss_sigma_m: float = option(0.3, "error of a fix east and north; twice that upwards", "m", 1e-3, 100)
-    gnss_correlation_s: float = option(2.0, "how long such an error lasts (1/e)", "s", 0, 1e4)
-    gnss_outage_s: float = option(0.0, "time without a fix, in the middle of the drive", "s", 0)
-    imu: float = option(0.0, "messages of an IMU with orientation, on /imu/data; 0: there is none", "Hz", 0, 1000)
-    imu_drift_rad_s: float = option(0.0, "its heading drifts besides: there is no compass", "rad/s", -1, 1)
-    imu_bias_rad_s: float = option(0.0, "bias of its turn rates, about each axis", "rad/s", -10, 10)
-    imu_bias_walk: float = option(0.0, "random walk of that", "rad/s/sqrt(s)", 0, 1)
 
-
-def with_instruments(recording: Recording, seed: int, options: Instruments) -> Recording:
-    """A recording with the measurements of the chosen instruments added, or without landmarks."""
-    streams = [Generator(PCG64(SeedSequence(seed, spawn_key=(_STREAM, k)))) for k in range(3)]
-    gnss = _gnss(streams[0], recording, options) if options.gnss > 0.0 else None
-    imu = _imu(streams[1], recording, options) if options.imu > 0.0 else None
-    imu = _biased(streams[2], imu, options) if imu else None
-    return replace(recording, gnss=gnss, imu=imu, seen=recording.seen if options.landmarks else ())
-
-
-def _gnss(rng: Generator, recording: Recording, options: Instruments) -> Gnss:
-    stamps_ns, poses = _true_poses(recording, options.gnss)
-    sigmas = options.gnss_sigma_m * np.array([1.0, 1.0, UP])
-    noise = VelocityNoise(tuple(sigmas.tolist()), options.gnss_correlation_s)
+def _gnss(rng: Generator, recording: Recording, rate_hz: float, noise: VelocityNoise, outage_s: float) -> Gnss:
+    stamps_ns, poses = _true_poses(recording, rate_hz)
     antenna = np.stack(se3.act(tuple(poses.T), ANTENNA_M), axis=1)
-    measured = antenna + noise.draw(rng, len(poses), 1.0 / options.gnss)
+    measured = antenna + noise.draw(rng, len(poses), 1.0 / rate_hz)
     from_middle_s = np.abs(stamps_ns - (stamps_ns[0] + stamps_ns[-1]) // 2) * 1e-9
-    has_fix = from_middle_s >= 0.5 * options.gnss_outage_s
+    has_fix = from_middle_s >= 0.5 * outage_s
     return Gnss(stamps_ns, geodetic(measured, DATUM), noise.covariance, has_fix, ANTENNA_M)
 
 
-def _imu(rng: Generator, recording: Recording, options: Instruments) -> Imu:
-    stamps_ns, poses = _true_poses(recording, options.imu)
-    dt_s = 1.0 / options.imu
+def _imu(rng: Generator, recording: Recording, rate_hz: float, drift_rad_s: float) -> Imu:
+    stamps_ns, poses = _true_poses(recording, rate_hz)
+    dt_s = 1.0 / rate_hz
     noise = VelocityNoise((SIGMA_RAD,) * 3, CORRELATION_S)
     error = noise.draw(rng, len(poses), dt_s)
-    error[:, 2] += options.imu_drift_rad_s * dt_s * np.arange(len(poses))
+    error[:, 2] += drift_rad_s * dt_s * np.arange(len(poses))
     true = se3.compose(tuple(poses.T), T_BASE_IMU)
     turned = se3.rotation(true)
     orientation = so3.normalize(so3.compose(so3.exp(tuple(error.T)), turned))
@@ -79,12 +81,6 @@ def _imu(rng: Generator, recording: Recording, options: Instruments) -> Imu:
     rate += SIGMA_RATE_RAD_S * rng.standard_normal(rate.shape)
     acceleration += SIGMA_ACCELERATION_M_S2 * rng.standard_normal(acceleration.shape)
     return Imu(stamps_ns, np.stack(orientation, axis=1), noise.covariance, rate, acceleration, T_BASE_IMU)
-
-
-def _biased(rng: Generator, imu: Imu, options: Instruments) -> Imu:
-    """An IMU whose gyro has a bias that walks."""
-    steps = options.imu_bias_walk * np.sqrt(1.0 / options.imu) * rng.standard_normal(imu.rate.shape)
-    return replace(imu, rate=imu.rate + options.imu_bias_rad_s + np.cumsum(steps, axis=0))
 
 
 def _second_derivative(positions: Array, dt_s: float) -> Array:

@@ -1,13 +1,17 @@
 """A city of square blocks: a robot drives along its streets and sees a landmark at every corner."""
 
-from dataclasses import dataclass
-
 import numpy as np
-from numpy.random import PCG64, Generator
+from numpy.random import Generator
 
 from graph_slam_ros.slam import Sighting
-from graph_slam_ros.tools.simulation.motion import VelocityNoise
-from graph_slam_ros.tools.simulation.options import option
+from graph_slam_ros.tools.simulation.motion import (
+    CORRELATION_TIME,
+    SIGMA_SIDEWAYS,
+    SIGMA_SPEED,
+    SIGMA_TURN,
+    VelocityNoise,
+)
+from graph_slam_ros.tools.simulation.options import checked, option, random
 from graph_slam_ros.tools.simulation.recording import Recording, drive
 from graph_slam_ros.tools.simulation.sensing import KINDS, RangeBearing
 from graph_slam_ros.typing import Array, Index, Numbers
@@ -20,19 +24,6 @@ OBSERVE_EVERY = 10
 CURB_M = 1.0  # from the middle of the crossing to the landmark, in x and in y
 SENSOR = RangeBearing(0.1, np.deg2rad(1.0), 5.0)
 _DIRECTIONS = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
-
-
-@dataclass(frozen=True, slots=True)
-class Manhattan:
-    """Options: blocks of 4 m; the robot drives 1 m a step and chooses its way at every crossing."""
-
-    poses: int = option(500, "steps to drive, 1 m each", "", 1, 1e6)
-    sensor: str = option("position", "what the sensor measures of a landmark", choices=KINDS)
-    blocks: int = option(60, "the city is this many blocks wide and deep", "", 1, 1000)
-    sigma_speed_m_s: float = option(0.05, "error of the measured speed", "m/s", 1e-6, 1)
-    sigma_sideways_m_s: float = option(0.01, "speed of slipping sideways", "m/s", 1e-6, 1)
-    sigma_turn_rad_s: float = option(0.05, "error of the measured turning speed", "rad/s", 1e-6, 1)
-    correlation_time_s: float = option(0.5, "how long such an error lasts (1/e)", "s", 0, 100)
 
 
 def stroll(rng: Generator, steps: int, blocks: int) -> tuple[Index, Index]:
@@ -63,21 +54,32 @@ def stroll(rng: Generator, steps: int, blocks: int) -> tuple[Index, Index]:
     return cells, ways
 
 
-def simulate(seed: int, options: Manhattan) -> Recording:
-    """Drive through the city, turning on the spot at crossings."""
-    rng = Generator(PCG64(seed))
-    cells, ways = stroll(rng, options.poses, options.blocks)
-    side = options.blocks + 1
+@checked("manhattan")
+def simulate(
+    seed: int,
+    poses: int = option(500, "steps to drive, 1 m each", "", 1, 1e6),
+    sensor: str = option("position", "what the sensor measures of a landmark", choices=KINDS),
+    blocks: int = option(60, "the city is this many blocks wide and deep", "", 1, 1000),
+    sigma_speed_m_s: float = SIGMA_SPEED,
+    sigma_sideways_m_s: float = SIGMA_SIDEWAYS,
+    sigma_turn_rad_s: float = SIGMA_TURN,
+    correlation_time_s: float = CORRELATION_TIME,
+) -> Recording:
+    """Drive through the city, turning on the spot at crossings.
+
+    Its blocks are of 4 m; the robot drives 1 m a step and chooses its way at every crossing.
+    """
+    rng = random(seed)
+    cells, ways = stroll(rng, poses, blocks)
+    side = blocks + 1
     corners = np.stack(np.meshgrid(np.arange(side), np.arange(side), indexing="ij"), axis=-1).reshape(-1, 2)
     points = np.asarray(corners * (STEPS_PER_BLOCK * STEP_M) + CURB_M, dtype=np.float64)
     names = [f"{i}/{j}" for i, j in corners.tolist()]
 
     def observe(T_world_base: Numbers) -> list[Sighting]:
-        return SENSOR.observe(rng, T_world_base, names, points, options.sensor)
+        return SENSOR.observe(rng, T_world_base, names, points, sensor)
 
-    noise = VelocityNoise(
-        (options.sigma_speed_m_s, options.sigma_sideways_m_s, options.sigma_turn_rad_s), options.correlation_time_s
-    )
+    noise = VelocityNoise((sigma_speed_m_s, sigma_sideways_m_s, sigma_turn_rad_s), correlation_time_s)
     start = (*(STEP_M * cells[0]).tolist(), 0.5 * np.pi * float(ways[0]))
     landmarks = dict(zip(names, map(tuple, points.tolist()), strict=True))
     return drive(rng, start, _twists(ways), TICK_NS, noise, observe, OBSERVE_EVERY, landmarks)

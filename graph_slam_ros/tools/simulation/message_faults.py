@@ -9,21 +9,11 @@ from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.cdr import NS
 from graph_slam_ros.lie import se3
 from graph_slam_ros.messages.to_msg import encode, transform
-from graph_slam_ros.tools.simulation.drive import (
-    DETECTIONS,
-    MESSAGE_KINDS,
-    POINTS,
-    TRANSFORMS,
-    Drive,
-    Message,
-    Sightings,
-)
-from graph_slam_ros.tools.simulation.odometry_faults import AT, CHANGED
+from graph_slam_ros.tools.simulation.drive import DETECTIONS, POINTS, TRANSFORMS, Drive, Message, Sightings
+from graph_slam_ros.tools.simulation.odometry_faults import ODOMETRY_KINDS
 from graph_slam_ros.tools.simulation.options import option
 from graph_slam_ros.tools.simulation.recording import CLOSURES_TOPIC
 from graph_slam_ros.typing import Array
-
-__all__ = ["MESSAGE_KINDS"]
 
 _CAMERA = "camera_link"
 _IMU = "sensor_msgs/msg/Imu"
@@ -31,23 +21,18 @@ _POSES = ("nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped", "geometry_ms
 _OF_THE_ROBOT = (_IMU, "sensor_msgs/msg/NavSatFix", DETECTIONS, POINTS, TRANSFORMS, *_POSES)
 
 
-@MESSAGE_KINDS.add
-def brief(drive: Drive, _rng: Generator, part: float = option(0.1, "of its time", "", 0, 1)) -> None:
-    """A recording of the beginning of a drive."""
+def brief(drive: Drive, _rng: Generator) -> None:
+    """A recording of the first tenth of a drive."""
     first_ns, last_ns = drive.messages[0].log_ns, drive.messages[-1].log_ns
-    end_ns = first_ns + part * (last_ns - first_ns)
+    end_ns = first_ns + 0.1 * (last_ns - first_ns)
     drive.drop([m for m in drive.messages if m.log_ns > end_ns])
 
 
-@MESSAGE_KINDS.add
-def cut_off(
-    drive: Drive, _rng: Generator, part: float = option(0.7, "of its bytes that are left", "", 0.01, 1)
-) -> None:
+def cut_off(drive: Drive, _rng: Generator) -> None:
     """A file that ends too early, as where a disk was full or the power failed."""
-    drive.part_of_file = part
+    drive.part_of_file = 0.7
 
 
-@MESSAGE_KINDS.add
 def missing(
     drive: Drive, _rng: Generator, what: str = option("landmarks", "which", choices=("landmarks", "odometry"))
 ) -> None:
@@ -55,16 +40,13 @@ def missing(
     drive.drop(drive.landmarks if what == "landmarks" else drive.odometry)
 
 
-@MESSAGE_KINDS.add
-def unreadable(drive: Drive, rng: Generator, rate: float = option(1.0, CHANGED, "", 0, 1)) -> None:
+def unreadable(drive: Drive, _rng: Generator) -> None:
     """Landmarks whose bytes end too early, as those of another definition of the type."""
     for m in drive.landmarks:
-        if rng.random() < rate:
-            whole = encode(m.content)
-            m.content = whole[: len(whole) // 3]
+        whole = encode(m.content)
+        m.content = whole[: len(whole) // 3]
 
 
-@MESSAGE_KINDS.add
 def other_tf(
     drive: Drive,
     _rng: Generator,
@@ -86,76 +68,38 @@ def other_tf(
     drive.messages = messages
 
 
-@MESSAGE_KINDS.add
-def static_changes(
-    drive: Drive, _rng: Generator, x_m: float = option(0.1, "how far the second is from the first", "m", -100, 100)
-) -> None:
-    """A static transform of the sensor that is published twice, with different values."""
-    parent = str(drive.odometry[0].content.child_frame_id)
-    for m in drive.landmarks:
-        m.frame = _CAMERA
-    first_ns = drive.messages[0].log_ns
-    for k, ahead_m in enumerate((0.0, x_m)):
-        content = transform(first_ns, parent, _CAMERA, (ahead_m, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0))
-        drive.messages.insert(k, Message("/tf_static", TRANSFORMS, first_ns + k * NS // 1000, content))
-
-
-@MESSAGE_KINDS.add
-def same_ids(drive: Drive, rng: Generator, rate: float = option(0.2, CHANGED, "", 0, 1)) -> None:
-    """Messages in which two landmarks have one id."""
+def same_ids(drive: Drive, rng: Generator) -> None:
+    """A fifth of the messages in which two landmarks have one id."""
     for m in drive.landmarks:
         seen = Sightings(m)
-        if len(seen.ids) > 1 and rng.random() < rate:
+        if len(seen.ids) > 1 and rng.random() < 0.2:
             seen.ids[1] = seen.ids[0]
             seen.store()
 
 
-@MESSAGE_KINDS.add
 def clock_offset(drive: Drive, _rng: Generator, seconds: float = option(0.1, "by so much", "s", -1e10, 1e10)) -> None:
     """Landmarks that are stamped too late, or too early where it is negative."""
     drive.restamp(drive.landmarks, lambda t: t + round(seconds * NS))
 
 
-@MESSAGE_KINDS.add
-def clock_drift(
-    drive: Drive, _rng: Generator, ppm: float = option(500.0, "by so many millionths", "ppm", -1e5, 1e5)
-) -> None:
-    """Landmarks whose clock runs too fast."""
-    drive.restamp(drive.landmarks, lambda t: t + ((t - t[0]) * ppm * 1e-6).astype(np.int64))
+def clock_jump(drive: Drive, _rng: Generator, seconds: float = option(0.2, "by so much", "s", -1e5, 1e5)) -> None:
+    """Landmarks whose clock is set half-way."""
+    drive.restamp(drive.landmarks, lambda t: t + np.where(t > np.quantile(t, 0.5), round(seconds * NS), 0))
 
 
-@MESSAGE_KINDS.add
-def clock_jump(
-    drive: Drive,
-    _rng: Generator,
-    seconds: float = option(0.2, "by so much", "s", -1e5, 1e5),
-    at: float = option(0.5, AT, "", 0, 1),
-) -> None:
-    """Landmarks whose clock is set on the way."""
-    drive.restamp(drive.landmarks, lambda t: t + np.where(t > np.quantile(t, at), round(seconds * NS), 0))
-
-
-@MESSAGE_KINDS.add
-def uptime(drive: Drive, _rng: Generator, seconds: float = option(1000.0, "at the first message", "s", 0, 1e9)) -> None:
+def uptime(drive: Drive, _rng: Generator) -> None:
     """Landmarks that are stamped by the time since their computer was started."""
-    drive.restamp(drive.landmarks, lambda t: t - t[0] + round(seconds * NS))
+    drive.restamp(drive.landmarks, lambda t: t - t[0] + 1000 * NS)
 
 
-@MESSAGE_KINDS.add
-def zero_stamps(drive: Drive, rng: Generator, rate: float = option(0.3, CHANGED, "", 0, 1)) -> None:
-    """Landmarks whose driver leaves stamps at zero."""
-    drive.restamp(drive.landmarks, lambda t: np.where(rng.random(len(t)) < rate, 0, t))
+def zero_stamps(drive: Drive, rng: Generator) -> None:
+    """Landmarks whose driver leaves three stamps in ten at zero."""
+    drive.restamp(drive.landmarks, lambda t: np.where(rng.random(len(t)) < 0.3, 0, t))
 
 
-@MESSAGE_KINDS.add
-def clock_set_back(
-    drive: Drive,
-    _rng: Generator,
-    seconds: float = option(30.0, "by so much", "s", 0, 1e9),
-    at: float = option(0.5, AT, "", 0, 1),
-) -> None:
-    """A clock of the whole robot that is set back."""
-    at_ns, back_ns = np.quantile(drive.odometry_ns, at), round(seconds * NS)
+def clock_set_back(drive: Drive, _rng: Generator) -> None:
+    """A clock of the whole robot that is set back by 30 s half-way."""
+    at_ns, back_ns = np.quantile(drive.odometry_ns, 0.5), 30 * NS
     drive.restamp(drive.decoded(_OF_THE_ROBOT), lambda t: np.where(t > at_ns, t - back_ns, t))
     for m in drive.messages:
         for one in m.content.detections if m.topic == CLOSURES_TOPIC else ():
@@ -165,7 +109,6 @@ def clock_set_back(
                     result.hypothesis.class_id = one.id
 
 
-@MESSAGE_KINDS.add
 def wrong_frames(
     drive: Drive,
     _rng: Generator,
@@ -178,7 +121,6 @@ def wrong_frames(
             m.frame = frame
 
 
-@MESSAGE_KINDS.add
 def two_parents(drive: Drive, _rng: Generator) -> None:
     """A frame of the sensor that two nodes publish, below two frames."""
     for m in drive.landmarks:
@@ -194,7 +136,6 @@ def _each(drive: Drive, change: Callable[[Sightings, Message], Array | None]) ->
         seen.store(turn)
 
 
-@MESSAGE_KINDS.add
 def wrong_mount(
     drive: Drive,
     _rng: Generator,
@@ -223,7 +164,6 @@ _AXES = {
 }
 
 
-@MESSAGE_KINDS.add
 def wrong_axes(
     drive: Drive,
     _rng: Generator,
@@ -239,7 +179,6 @@ def wrong_axes(
     _each(drive, change)
 
 
-@MESSAGE_KINDS.add
 def wrong_units(
     drive: Drive,
     _rng: Generator,
@@ -256,29 +195,22 @@ def wrong_units(
             seen.store()
 
 
-@MESSAGE_KINDS.add
-def tiny_covariance(
-    drive: Drive, _rng: Generator, sigma: float = option(1e-6, "its standard deviations", "m, rad", 0, 1e3)
-) -> None:
+def tiny_covariance(drive: Drive, _rng: Generator) -> None:
     """Landmarks whose covariance is smaller than any sensor's."""
     for m in drive.landmarks:
-        Sightings(m).set_noise(sigma)
+        Sightings(m).set_noise(1e-6)
 
 
-@MESSAGE_KINDS.add
-def noisy(
-    drive: Drive, rng: Generator, factor: float = option(8.0, "so many times, at least of 5 cm", "", 0, 1e3)
-) -> None:
-    """Landmarks that are worse than their covariance."""
+def noisy(drive: Drive, rng: Generator) -> None:
+    """Landmarks that are eight times worse than their covariance."""
 
     def change(seen: Sightings, _: Message) -> None:
-        sigmas = np.maximum(seen.sigmas, 0.05)[:, None] * [factor, factor, 0.0]
+        sigmas = np.maximum(seen.sigmas, 0.05)[:, None] * [8.0, 8.0, 0.0]
         seen.points = seen.points + sigmas * rng.standard_normal(seen.points.shape)
 
     _each(drive, change)
 
 
-@MESSAGE_KINDS.add
 def track_ids(drive: Drive, _rng: Generator, sightings: int = option(2, "of one id", "", 1, 1e6)) -> None:
     """Landmarks with ids of tracks: after a few sightings a new one."""
     times: dict[str, int] = {}
@@ -292,7 +224,6 @@ def track_ids(drive: Drive, _rng: Generator, sightings: int = option(2, "of one 
     _each(drive, change)
 
 
-@MESSAGE_KINDS.add
 def random_ids(drive: Drive, rng: Generator, rate: float = option(1.0, "of all sightings", "", 0, 1)) -> None:
     """Landmarks with ids of other landmarks, at random."""
     names = sorted({name for m in drive.landmarks for name in Sightings(m).ids})
@@ -305,7 +236,6 @@ def random_ids(drive: Drive, rng: Generator, rate: float = option(1.0, "of all s
     _each(drive, change)
 
 
-@MESSAGE_KINDS.add
 def new_ids(drive: Drive, _rng: Generator, seconds: float = option(15.0, "how long", "s", 0.1, 1e6)) -> None:
     """Landmarks that nobody recognises: after a time all have new ids."""
     first_ns = drive.landmarks[0].stamp_ns
@@ -318,7 +248,6 @@ def new_ids(drive: Drive, _rng: Generator, seconds: float = option(15.0, "how lo
     _each(drive, change)
 
 
-@MESSAGE_KINDS.add
 def wrong_gyro(
     drive: Drive,
     rng: Generator,
@@ -342,8 +271,16 @@ def wrong_gyro(
         m.stamp_ns += round(late_s * NS)
 
 
-@MESSAGE_KINDS.add
-def blind(drive: Drive, _rng: Generator, after: float = option(0.25, AT, "", 0, 1)) -> None:
-    """A sensor that sees nothing after a while."""
-    at_ns = np.quantile(drive.odometry_ns, after)
+def blind(drive: Drive, _rng: Generator) -> None:
+    """A sensor that sees nothing after a quarter of the drive."""
+    at_ns = np.quantile(drive.odometry_ns, 0.25)
     drive.drop([m for m in drive.landmarks if m.stamp_ns >= at_ns])
+
+
+_KINDS = (
+    *(brief, cut_off, missing, unreadable, other_tf, same_ids),
+    *(clock_offset, clock_jump, uptime, zero_stamps, clock_set_back, wrong_frames, two_parents),
+    *(wrong_mount, wrong_axes, wrong_units, tiny_covariance, noisy, track_ids, random_ids, new_ids, wrong_gyro, blind),
+)
+MESSAGE_KINDS = {**ODOMETRY_KINDS, **{put.__name__: put for put in _KINDS}}
+"""Faults that any recording can have; those of worlds (``faults.KINDS``) need its truth."""

@@ -8,7 +8,13 @@ from numpy.random import Generator
 
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL, Geometry
 from graph_slam_ros.lie import se2, se3
+from graph_slam_ros.tools.simulation.options import option
 from graph_slam_ros.typing import Array, Numbers
+
+SIGMA_SPEED = option(0.05, "error of the measured speed", "m/s", 1e-6, 1)
+SIGMA_SIDEWAYS = option(0.01, "speed of slipping sideways", "m/s", 1e-6, 1)
+SIGMA_TURN = option(0.05, "error of the measured turning speed", "rad/s", 1e-6, 1)
+CORRELATION_TIME = option(0.5, "how long such an error lasts (1/e)", "s", 0, 100)
 
 
 @dataclass(frozen=True, slots=True)

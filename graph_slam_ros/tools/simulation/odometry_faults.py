@@ -8,15 +8,11 @@ from numpy.random import Generator
 
 from graph_slam_ros.formats.cdr import NS
 from graph_slam_ros.lie import se3, so3
-from graph_slam_ros.tools.simulation.drive import MESSAGE_KINDS, Drive, Message
+from graph_slam_ros.tools.simulation.drive import Drive, Message
 from graph_slam_ros.tools.simulation.options import option
 from graph_slam_ros.typing import Array
 
-AT = "when, as a part of the messages: 0 the first, 1 the last"
-CHANGED = "of the messages"
 
-
-@MESSAGE_KINDS.add
 def recorded_twice(drive: Drive, _rng: Generator) -> None:
     """Odometry of which each message is in the recording twice."""
     again = []
@@ -25,31 +21,18 @@ def recorded_twice(drive: Drive, _rng: Generator) -> None:
     drive.messages = again
 
 
-@MESSAGE_KINDS.add
-def out_of_order(
-    drive: Drive,
-    rng: Generator,
-    seconds: float = option(0.2, "by so much", "s", 0, 100),
-    rate: float = option(0.02, CHANGED, "", 0, 1),
-) -> None:
-    """Odometry of which some messages are stamped too early."""
+def out_of_order(drive: Drive, rng: Generator) -> None:
+    """Odometry of which one message in fifty is stamped 0.2 s too early."""
     for m in drive.odometry:
-        m.stamp_ns -= round(seconds * NS) if rng.random() < rate else 0
+        m.stamp_ns -= NS // 5 if rng.random() < 0.02 else 0
 
 
-@MESSAGE_KINDS.add
-def gap(
-    drive: Drive,
-    _rng: Generator,
-    seconds: float = option(5.0, "how long", "s", 0, 1e6),
-    at: float = option(0.33, AT, "", 0, 1),
-) -> None:
-    """Odometry of which a stretch is lost."""
-    at_ns = np.quantile(drive.odometry_ns, at)
-    drive.drop([m for m in drive.odometry if at_ns < m.stamp_ns <= at_ns + seconds * NS])
+def gap(drive: Drive, _rng: Generator) -> None:
+    """Odometry of which a stretch of 5 s is lost, after a third of the drive."""
+    at_ns = np.quantile(drive.odometry_ns, 0.33)
+    drive.drop([m for m in drive.odometry if at_ns < m.stamp_ns <= at_ns + 5 * NS])
 
 
-@MESSAGE_KINDS.add
 def slow_odometry(drive: Drive, _rng: Generator, hz: float = option(2.0, "so many a second", "Hz", 1e-3, 1e4)) -> None:
     """Odometry of which few messages are left."""
     number, out = -1, []
@@ -58,12 +41,6 @@ def slow_odometry(drive: Drive, _rng: Generator, hz: float = option(2.0, "so man
         out += [m] if now == number else []
         number = now
     drive.drop(out)
-
-
-@MESSAGE_KINDS.add
-def jitter(drive: Drive, rng: Generator, seconds: float = option(0.06, "mean delay", "s", 0, 100)) -> None:
-    """Odometry that is stamped when it arrives."""
-    drive.restamp(drive.odometry, lambda t: np.sort(t + (rng.exponential(seconds, len(t)) * NS).astype(np.int64)))
 
 
 def _chained(first: Array, moved: Array, turned: Array) -> Array:
@@ -90,13 +67,12 @@ def _twists(drive: Drive, change: Callable[[Array, Array, Array], tuple[Array, A
         w.x, w.y, w.z = map(float, angular)
 
 
-@MESSAGE_KINDS.add
 def wrong_scale(
     drive: Drive,
     _rng: Generator,
     distance: float = option(1.05, "distance in odometry for each metre driven", "", -1e6, 1e6),
     turn: float = option(1.0, "and turn for each radian turned", "", -1e3, 1e3),
-    begin: float = option(0.0, AT, "", 0, 1),
+    begin: float = option(0.0, "when, as a part of the messages: 0 the first, 1 the last", "", 0, 1),
     lasting: float = option(1.0, "for how long, as a part of the messages", "", 0, 1),
 ) -> None:
     """Odometry that drives and turns more than the robot: wheels, track width, units, sign."""
@@ -116,7 +92,6 @@ def wrong_scale(
     _twists(drive, changed)
 
 
-@MESSAGE_KINDS.add
 def wrong_twist(
     drive: Drive,
     _rng: Generator,
@@ -133,7 +108,6 @@ def wrong_twist(
     _twists(drive, changed)
 
 
-@MESSAGE_KINDS.add
 def twist_variance(
     drive: Drive, _rng: Generator, variance: float = option(1e-12, "of each axis", "(m/s)^2", -1e12, 1e12)
 ) -> None:
@@ -144,7 +118,6 @@ def twist_variance(
         m.content.twist.covariance = covariance
 
 
-@MESSAGE_KINDS.add
 def standing(drive: Drive, _rng: Generator) -> None:
     """Odometry that is not connected: it always says the same pose."""
     drive.poses = np.repeat(drive.poses[:1], len(drive.odometry), axis=0)
@@ -158,47 +131,31 @@ def _moved(poses: Array, at: int, T: se3.Pose) -> Array:
     return np.concatenate([poses[:at], later])
 
 
-@MESSAGE_KINDS.add
-def restarted(drive: Drive, _rng: Generator, at: float = option(0.5, AT, "", 0, 1)) -> None:
-    """Odometry whose driver is restarted, and begins at zero again."""
+def restarted(drive: Drive, _rng: Generator) -> None:
+    """Odometry whose driver is restarted half-way, and begins at zero again."""
     poses = drive.poses
-    first = min(round(at * len(poses)), len(poses) - 1)
+    first = min(round(0.5 * len(poses)), len(poses) - 1)
     moved = _moved(poses, first, se3.IDENTITY)
     moved[first] = se3.IDENTITY
     drive.poses = moved
 
 
-@MESSAGE_KINDS.add
-def corrected(
-    drive: Drive,
-    rng: Generator,
-    every_s: float = option(20.0, "how often", "s", 0.1, 1e6),
-    sigma_m: float = option(0.3, "by how much", "m", 0, 1e3),
-    sigma_rad: float = option(0.05, "and how much it is turned", "rad", 0, 3.0),
-) -> None:
-    """Odometry that a localiser corrects."""
+def corrected(drive: Drive, rng: Generator) -> None:
+    """Odometry that a localiser corrects every 20 s, by some 0.3 m and 0.05 rad."""
     poses, stamps_ns = drive.poses, drive.odometry_ns
-    for at_ns in np.arange(stamps_ns[0] + every_s * NS, stamps_ns[-1], every_s * NS):
+    for at_ns in np.arange(stamps_ns[0] + 20.0 * NS, stamps_ns[-1], 20.0 * NS):
         at = int(np.searchsorted(stamps_ns, at_ns))
-        by = (*(sigma_m * rng.standard_normal(2)), 0.0, *so3.exp((0.0, 0.0, sigma_rad * rng.normal())))
+        by = (*(0.3 * rng.standard_normal(2)), 0.0, *so3.exp((0.0, 0.0, 0.05 * rng.normal())))
         poses = _moved(poses, at, se3.compose(tuple(poses[at].tolist()), by))
     drive.poses = poses
 
 
-@MESSAGE_KINDS.add
-def other_publisher(
-    drive: Drive,
-    _rng: Generator,
-    seconds: float = option(0.01, "how much later", "s", 1e-6, 100),
-    x_m: float = option(8.0, "where the robot of the first is in the odometry of the second", "m", -1e6, 1e6),
-    distance: float = option(0.98, "its distance for each metre of the first", "", 1e-3, 1e3),
-) -> None:
+def other_publisher(drive: Drive, _rng: Generator) -> None:
     """Odometry that a second node publishes on the same topic, a little later, from an origin of its own."""
-    messages = []
+    messages, later_ns, x_m, distance = [], NS // 100, 8.0, 0.98
     for m in drive.messages:
         messages.append(m)
         if m.topic == drive.odometry_topic:
-            later_ns = round(seconds * NS)
             other = Message(m.topic, m.type, m.log_ns + later_ns, deepcopy(m.content))
             other.stamp_ns = m.stamp_ns + later_ns
             at, twist = other.content.pose.pose.position, other.content.twist.twist.linear
@@ -208,9 +165,15 @@ def other_publisher(
     drive.messages = sorted(messages, key=lambda m: m.log_ns)
 
 
-@MESSAGE_KINDS.add
-def not_a_number(drive: Drive, rng: Generator, rate: float = option(0.01, CHANGED, "", 0, 1)) -> None:
-    """Odometry with positions that are no numbers."""
+def not_a_number(drive: Drive, rng: Generator) -> None:
+    """Odometry with one position in a hundred that is no number."""
     for m in drive.odometry:
-        if rng.random() < rate:
+        if rng.random() < 0.01:
             m.content.pose.pose.position.x = float("nan")
+
+
+_KINDS = (
+    *(recorded_twice, out_of_order, gap, slow_odometry, wrong_scale, wrong_twist, twist_variance),
+    *(standing, restarted, corrected, other_publisher, not_a_number),
+)
+ODOMETRY_KINDS = {put.__name__: put for put in _KINDS}

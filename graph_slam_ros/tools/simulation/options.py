@@ -1,70 +1,97 @@
-"""Options of worlds and faults, with unit, meaning and bounds: fields of a dataclass, or parameters of a function."""
+"""Options of worlds and faults: parameters of a function, each with default, unit, meaning and bounds.
 
-import dataclasses
+A function with options is called with some of them; ``checked`` fills in the others.
+"""
+
+import functools
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from inspect import signature
 from typing import Any
 
+from numpy.random import PCG64, Generator, SeedSequence
+
 from graph_slam_ros.errors import GraphSlamError, did_you_mean
+
+_ARTICLE = {bool: "true or false", int: "an integer", float: "a number", str: "a text"}
 
 
 @dataclass(frozen=True, slots=True)
 class Option:
     """An option; ``low`` and ``high`` are inclusive, ``choices`` those of a text."""
 
-    name: str
     default: Any
     meaning: str
-    unit: str
-    low: float
-    high: float
-    choices: tuple[str, ...]
+    unit: str = ""
+    low: float = 0.0
+    high: float = 1e6
+    choices: tuple[str, ...] = ()
 
-    def check(self, world: str, value: Any) -> Any:
-        """The value in the option's type. Raises GraphSlamError naming world, option and what is allowed."""
+    def check(self, what: str, value: Any) -> Any:
+        """The value in the option's type. Raises GraphSlamError with ``what`` and what is allowed."""
         kind = type(self.default)
         if kind is float and type(value) is int and abs(value) < 2**1000:
             value = float(value)
         if type(value) is not kind:
-            raise GraphSlamError(f"{world}: {self.name}: {value!r} is not {_ARTICLE[kind]}")
+            raise GraphSlamError(f"{what}: {value!r} is not {_ARTICLE[kind]}")
         if kind is str:
             if value not in self.choices:
-                raise GraphSlamError(
-                    f"{world}: {self.name}: {value!r} is not one of {', '.join(self.choices)}"
-                    f"{did_you_mean(value, self.choices)}"
-                )
+                near = did_you_mean(value, self.choices)
+                raise GraphSlamError(f"{what}: {value!r} is not one of {', '.join(self.choices)}{near}")
         elif kind is not bool and not (self.low <= value <= self.high and value != math.inf):
-            raise GraphSlamError(f"{world}: {self.name}: {value!r} is not in [{self.low:g}, {self.high:g}]")
+            raise GraphSlamError(f"{what}: {value!r} is not in [{self.low:g}, {self.high:g}]")
         return value
 
 
-_ARTICLE = {bool: "true or false", int: "an integer", float: "a number", str: "a text"}
+def option(*of: Any, **more: Any) -> Any:
+    """An option, as the default of a parameter; what it is made of as of ``Option``."""
+    return Option(*of, **more)
 
 
-def option(
-    default: Any, meaning: str, unit: str = "", low: float = 0.0, high: float = 1e6, choices: tuple[str, ...] = ()
-) -> Any:
-    """An option, as a field of a dataclass or as the default of a parameter."""
-    return field(default=default, metadata={"about": (meaning, unit, low, high, choices)})
+def options_of(what: Callable[..., Any]) -> dict[str, Option]:
+    """Every option of a function by its name, in order."""
+    found = {name: parameter.default for name, parameter in signature(what).parameters.items()}
+    return {name: default for name, default in found.items() if isinstance(default, Option)}
 
 
-class Kinds(dict[str, Callable[..., None]]):
-    """Kinds of faults by name: functions that take a ``Draft`` or a ``Drive``, random numbers, and options."""
+def checked(name: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Let a function be called with some of its options, which are checked, under a name."""
 
-    def add(self, put: Callable[..., None]) -> Callable[..., None]:
-        """Add a function under its name."""
-        self[put.__name__] = put
-        return put
+    def with_name(function: Callable[..., Any]) -> Callable[..., Any]:
+        known = options_of(function)
+
+        @functools.wraps(function)
+        def call(*given: Any, **values: Any) -> Any:
+            return function(*given, **filled(name, known, values))
+
+        return call
+
+    return with_name
 
 
-@dataclass(frozen=True, slots=True)
-class World:
-    """A world: the dataclass of its options, and the function that drives through it, or that measures its graph."""
+def filled(name: str, known: Mapping[str, Option], values: Mapping[str, Any]) -> dict[str, Any]:
+    """All options of a world or fault: the named values; the rest have their defaults.
 
-    options: type
-    make: Callable[..., Any]
+    Raises
+    ------
+    GraphSlamError
+        Unknown option (those that exist are named), wrong type, or a value out of bounds.
+    """
+    for one in values:
+        if one not in known:
+            near = did_you_mean(one, known)
+            raise GraphSlamError(f"{name}: no option {one!r}; it has {', '.join(known)}{near}")
+    return {k: o.check(f"{name}: {k}", values[k]) if k in values else o.default for k, o in known.items()}
+
+
+def lines_about(name: str, what: Callable[..., Any]) -> Iterator[str]:
+    """Describe a world or a fault, and its options."""
+    yield f"  {name}: {about(what)}"
+    for key, o in options_of(what).items():
+        choices = f": {', '.join(o.choices)}" if o.choices else ""
+        default = str(o.default).lower() if isinstance(o.default, bool) else o.default
+        yield f"    {key}={default}{f' [{o.unit}]' if o.unit else ''}  {o.meaning}{choices}"
 
 
 def about(what: Callable[..., Any]) -> str:
@@ -72,37 +99,8 @@ def about(what: Callable[..., Any]) -> str:
     return (what.__doc__ or "").strip().splitlines()[0]
 
 
-def check_seed(seed: int) -> None:
-    """Raise GraphSlamError for a seed that no random generator takes."""
+def random(seed: int, *stream: int) -> Generator:
+    """The random numbers of a seed, or of a stream of it. Raises GraphSlamError for a seed that nothing takes."""
     if seed < 0:
         raise GraphSlamError(f"seed {seed} is negative")
-
-
-def options_of(what: type | Callable[..., Any]) -> Iterator[Option]:
-    """Every option of a world's dataclass or of a fault, in order."""
-    parameters = signature(what).parameters
-    fields = {name: p.default for name, p in parameters.items() if isinstance(p.default, dataclasses.Field)}
-    for name, f in ({f.name: f for f in dataclasses.fields(what)} if isinstance(what, type) else fields).items():
-        yield Option(name, f.default, *f.metadata["about"])
-
-
-def filled(
-    name_of: str, what: type | Callable[..., Any], values: Mapping[str, Any], others: Sequence[str] = ()
-) -> dict[str, Any]:
-    """All options: the named values; the rest have their defaults.
-
-    Parameters
-    ----------
-    others : names of options that are elsewhere, to be named beside these
-
-    Raises
-    ------
-    GraphSlamError
-        Unknown name, wrong type, or a value out of bounds.
-    """
-    known = {o.name: o for o in options_of(what)}
-    for name in values:
-        if name not in known:
-            there = [*known, *others]
-            raise GraphSlamError(f"{name_of}: no option {name!r}; it has {', '.join(there)}{did_you_mean(name, there)}")
-    return {name: o.check(name_of, values[name]) if name in values else o.default for name, o in known.items()}
+    return Generator(PCG64(SeedSequence(seed, spawn_key=stream)))

@@ -2,11 +2,10 @@
 
 from bisect import bisect_right
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.random import PCG64, Generator
+from numpy.random import Generator
 
 from graph_slam_ros.formats.g2o_writer import write_g2o
 from graph_slam_ros.formats.graph_file import G2oFile, Values
@@ -15,88 +14,71 @@ from graph_slam_ros.graph.geometry import PLANAR, SPATIAL, Geometry
 from graph_slam_ros.lie import se2, se3
 from graph_slam_ros.tools.simulation.manhattan import STEP_M, stroll
 from graph_slam_ros.tools.simulation.motion import integrate
-from graph_slam_ros.tools.simulation.options import World, check_seed, filled, option
+from graph_slam_ros.tools.simulation.options import checked, option, random
 from graph_slam_ros.typing import Array, Index
 
 POSES_PER_CLOSURE = 3
 POSES_PER_LAP, RADIUS_M = 50, 100.0  # of the sphere
 CLOSURE_RANGE_STEPS = 2  # to an earlier pose at most this far away in x and in y
 CLOSURE_GAP_POSES = 20  # and at least this many poses earlier
+_FACTOR = option(1.0, "odometry is noisier than closures by this factor", "", 1e-6, 1e3)
 
 
-@dataclass(frozen=True, slots=True)
-class CityGraph:
-    """Options of ``city_graph``."""
-
-    poses: int = option(3500, "poses, 1 m apart", "", 2, 1e6)
-    blocks: int = option(60, "the city is this many blocks of 4 m wide and deep", "", 1, 1000)
-    sigma_m: float = option(0.05, "noise of relative positions, in x and in y", "m", 1e-9, 10)
-    sigma_rad: float = option(0.01, "noise of relative headings", "rad", 1e-9, 1)
-    odometry_noise_factor: float = option(1.0, "odometry is noisier than closures by this factor", "", 1e-6, 1e3)
-
-
-def city_graph(seed: int, **values: float) -> tuple[Graph, Array]:
+@checked("city")
+def city_graph(
+    seed: int,
+    poses: int = option(3500, "poses, 1 m apart", "", 2, 1e6),
+    blocks: int = option(60, "the city is this many blocks of 4 m wide and deep", "", 1, 1000),
+    sigma_m: float = option(0.05, "noise of relative positions, in x and in y", "m", 1e-9, 10),
+    sigma_rad: float = option(0.01, "noise of relative headings", "rad", 1e-9, 1),
+    odometry_noise_factor: float = _FACTOR,
+) -> tuple[Graph, Array]:
     """Manhattan as a pose graph: odometry (vertex k to k + 1), a closure per three poses once streets are revisited.
 
     Vertices start at the composed odometry, the first one at its true pose. No vertex is fixed.
-
-    Parameters
-    ----------
-    values : options of ``CityGraph``
 
     Returns
     -------
     graph : edges labelled ``odometry`` and ``closures``, each in order of its later pose
     truth : (poses, 3) true poses
     """
-    options = CityGraph(**filled("city", CityGraph, values))
-    check_seed(seed)
-    rng = Generator(PCG64(seed))
-    cells, ways = stroll(rng, options.poses - 1, options.blocks)
+    rng = random(seed)
+    cells, ways = stroll(rng, poses - 1, blocks)
     headings = 0.5 * np.pi * np.concatenate([ways[:1], ways])
     truth = np.column_stack([STEP_M * cells, se2.wrap(headings)])
     closures = closure_pairs(rng, cells)
-    sigmas = PLANAR.sigmas(options.sigma_m, options.sigma_rad)
-    return _pose_graph(PLANAR, rng, truth, closures, sigmas, options.odometry_noise_factor), truth
+    sigmas = PLANAR.sigmas(sigma_m, sigma_rad)
+    return _pose_graph(PLANAR, rng, truth, closures, sigmas, odometry_noise_factor), truth
 
 
-@dataclass(frozen=True, slots=True)
-class SphereGraph:
-    """Options of ``sphere_graph``."""
-
-    poses: int = option(2500, "poses, from the lower to the upper pole", "", 2, 1e6)
-    sigma_m: float = option(0.1, "noise of relative positions, in x, y and z", "m", 1e-9, 10)
-    sigma_rad: float = option(0.01, "noise of relative rotations, about x, y and z", "rad", 1e-9, 1)
-    odometry_noise_factor: float = option(1.0, "odometry is noisier than closures by this factor", "", 1e-6, 1e3)
-
-
-def sphere_graph(seed: int, **values: float) -> tuple[Graph, Array]:
+@checked("sphere")
+def sphere_graph(
+    seed: int,
+    poses: int = option(2500, "poses, from the lower to the upper pole", "", 2, 1e6),
+    sigma_m: float = option(0.1, "noise of relative positions, in x, y and z", "m", 1e-9, 10),
+    sigma_rad: float = option(0.01, "noise of relative rotations, about x, y and z", "rad", 1e-9, 1),
+    odometry_noise_factor: float = _FACTOR,
+) -> tuple[Graph, Array]:
     """Fly up around a sphere, lap above lap. Each pose is measured from the one before and from the lap below.
 
     The x axis of a pose points away from the centre, its y axis ahead. Vertices start as in ``city_graph``, and edges
     have its labels and order.
-
-    Parameters
-    ----------
-    values : options of ``SphereGraph``
 
     Returns
     -------
     graph
     truth : (poses, 7) true poses
     """
-    options = SphereGraph(**filled("sphere", SphereGraph, values))
-    check_seed(seed)
-    rng, count = Generator(PCG64(seed)), np.arange(options.poses)
-    yaw, pitch = 2.0 * np.pi * count / POSES_PER_LAP, np.pi * (0.5 - (count + 0.5) / options.poses)
+    rng, count = random(seed), np.arange(poses)
+    yaw, pitch = 2.0 * np.pi * count / POSES_PER_LAP, np.pi * (0.5 - (count + 0.5) / poses)
     out = [se3.from_xyz_rpy((0.0, 0.0, 0.0, 0.0, *turn)) for turn in np.column_stack([pitch, yaw]).tolist()]
     truth = np.array([se3.compose(pose, (RADIUS_M, *se3.IDENTITY[1:])) for pose in out])
     closures = np.column_stack([count - POSES_PER_LAP, count])[POSES_PER_LAP:]
-    sigmas = SPATIAL.sigmas(options.sigma_m, options.sigma_rad)
-    return _pose_graph(SPATIAL, rng, truth, closures, sigmas, options.odometry_noise_factor), truth
+    sigmas = SPATIAL.sigmas(sigma_m, sigma_rad)
+    return _pose_graph(SPATIAL, rng, truth, closures, sigmas, odometry_noise_factor), truth
 
 
-GRAPH_WORLDS = {"city": World(CityGraph, city_graph), "sphere": World(SphereGraph, sphere_graph)}
+GRAPH_WORLDS = {"city": city_graph, "sphere": sphere_graph}
 
 
 def closure_pairs(rng: Generator, cells: Index) -> Index:

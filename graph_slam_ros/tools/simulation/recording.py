@@ -1,15 +1,17 @@
 """A simulated recording with its truth: drive, measurements, and true loop closures."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from heapq import merge
 
 import numpy as np
-from numpy.random import PCG64, Generator, SeedSequence
+from numpy.random import Generator
 from numpy.typing import NDArray
 
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.slam import Closure, Odometry, Sighting, Sightings
 from graph_slam_ros.tools.simulation.motion import VelocityNoise, accumulated, integrate, space_of
+from graph_slam_ros.tools.simulation.options import random
 from graph_slam_ros.typing import Array, Index, Numbers
 
 Stamps = NDArray[np.int64]
@@ -92,27 +94,17 @@ class Recording:
     gnss: Gnss | None = None
     imu: Imu | None = None
 
-    def closures_at(self) -> dict[int, list[Closure]]:
-        """The closures of each later stamp."""
-        out: dict[int, list[Closure]] = {}
-        for closure in self.closures:
-            out.setdefault(closure.stamp_ns, []).append(closure)
-        return out
-
 
 def measurements(recording: Recording) -> Iterator[Odometry | Sightings | Closure]:
     """Yield the input of ``GraphSlam.process`` in order of stamp; at one stamp odometry comes first.
 
     Measurements of a satellite receiver or an IMU are not among it: converters make fixes of them, from a bag.
     """
-    twist_covariance = tuple(recording.twist_covariance.ravel().tolist())
-    seen = {s.stamp_ns: s for s in recording.seen}
-    closed = recording.closures_at()
-    for stamp_ns, pose in zip(recording.stamps_ns.tolist(), recording.T_odom_base.tolist(), strict=True):
-        yield Odometry(stamp_ns, tuple(pose), twist_covariance)
-        if stamp_ns in seen:
-            yield seen[stamp_ns]
-        yield from closed.get(stamp_ns, ())
+    covariance = tuple(recording.twist_covariance.ravel().tolist())
+    poses = zip(recording.stamps_ns.tolist(), recording.T_odom_base.tolist(), strict=True)
+    odometry = (Odometry(stamp_ns, tuple(pose), covariance) for stamp_ns, pose in poses)
+    streams: tuple[Iterable[Odometry | Sightings | Closure], ...] = (odometry, recording.seen, recording.closures)
+    yield from merge(*streams, key=lambda one: one.stamp_ns)
 
 
 Observe = Callable[[Numbers], list[Sighting]]
@@ -181,7 +173,7 @@ def with_closures(recording: Recording, count: int, seed: int) -> Recording:
     GraphSlamError
         It did not come back so often.
     """
-    rng = Generator(PCG64(SeedSequence(seed, spawn_key=(_STREAM,))))
+    rng = random(seed, _STREAM)
     space, at = space_of(recording.T_world_base[0]), places(recording.T_world_base)
     n, truth, stamps_ns = space.dimensions, recording.T_world_base[at], recording.stamps_ns[at]
     back: list[tuple[int, Index]] = []

@@ -1,17 +1,21 @@
 """A warehouse: a robot drives aisle after aisle and reads tags on racks and walls, each with its orientation."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
-from numpy.random import PCG64, Generator
 from numpy.typing import NDArray
 
 from graph_slam_ros.graph.geometry import PLANAR
 from graph_slam_ros.lie import se2
 from graph_slam_ros.slam import Sighting
-from graph_slam_ros.tools.simulation.motion import VelocityNoise
-from graph_slam_ros.tools.simulation.options import option
+from graph_slam_ros.tools.simulation.motion import (
+    CORRELATION_TIME,
+    SIGMA_SIDEWAYS,
+    SIGMA_SPEED,
+    SIGMA_TURN,
+    VelocityNoise,
+)
+from graph_slam_ros.tools.simulation.options import checked, option, random
 from graph_slam_ros.tools.simulation.recording import Recording, drive
 from graph_slam_ros.tools.simulation.sensing import KINDS, RangeBearing, sightings
 from graph_slam_ros.typing import Array, Numbers
@@ -31,33 +35,33 @@ SIGMA_YAW_RAD = np.deg2rad(2.0)
 START = (0.0, -CROSS_AISLE_M, 0.5 * np.pi)
 
 
-@dataclass(frozen=True, slots=True)
-class Warehouse:
-    """Options: aisles along y, driven one after the other at 1 m/s; odometry at 50 Hz, tags read at 6.25 Hz."""
-
-    aisles: int = option(3, "aisles, 4 m apart", "", 2, 100)
-    aisle_m: float = option(12.0, "length of an aisle", "m", 4, 1000)
+@checked("warehouse")
+def simulate(
+    seed: int,
+    aisles: int = option(3, "aisles, 4 m apart", "", 2, 100),
+    aisle_m: float = option(12.0, "length of an aisle", "m", 4, 1000),
     laps: int = option(
         2, "how often all aisles are driven; with an odd number of them, from the other end each time", "", 1, 1000
-    )
-    sensor: str = option("pose", "what the sensor measures of a tag", choices=("pose", *KINDS))
-    sigma_speed_m_s: float = option(0.05, "error of the measured speed", "m/s", 1e-6, 1)
-    sigma_sideways_m_s: float = option(0.01, "speed of slipping sideways", "m/s", 1e-6, 1)
-    sigma_turn_rad_s: float = option(0.05, "error of the measured turning speed", "rad/s", 1e-6, 1)
-    correlation_time_s: float = option(0.5, "how long such an error lasts (1/e)", "s", 0, 100)
+    ),
+    sensor: str = option("pose", "what the sensor measures of a tag", choices=("pose", *KINDS)),
+    sigma_speed_m_s: float = SIGMA_SPEED,
+    sigma_sideways_m_s: float = SIGMA_SIDEWAYS,
+    sigma_turn_rad_s: float = SIGMA_TURN,
+    correlation_time_s: float = CORRELATION_TIME,
+) -> Recording:
+    """Drive all aisles in a serpentine, return to the first and enter it again.
 
-
-def simulate(seed: int, options: Warehouse) -> Recording:
-    """Drive all aisles in a serpentine, return to the first and enter it again."""
-    rng = Generator(PCG64(seed))
-    names, tags = _tags(options)
+    The robot drives at 1 m/s, with odometry at 50 Hz; tags are read at 6.25 Hz.
+    """
+    rng = random(seed)
+    names, tags = _tags(aisles, aisle_m)
 
     def observe(T_world_base: Numbers) -> list[Sighting]:
         at = CAMERA.visible(T_world_base, tags[:, :2])
         at = at[_is_facing(T_world_base, tags[at])]
         seen = [names[k] for k in at]
-        if options.sensor != "pose":
-            return sightings(seen, options.sensor, *CAMERA.measure(rng, T_world_base, tags[at, :2], options.sensor))
+        if sensor != "pose":
+            return sightings(seen, sensor, *CAMERA.measure(rng, T_world_base, tags[at, :2], sensor))
         positions, covariance = CAMERA.measure(rng, T_world_base, tags[at, :2], "position")
         yaw = se2.wrap(tags[at, 2] - T_world_base[2] + SIGMA_YAW_RAD * rng.standard_normal(len(at)))
         full = np.zeros((len(at), 3, 3))
@@ -67,32 +71,29 @@ def simulate(seed: int, options: Warehouse) -> Recording:
         in_tangent = [PLANAR.in_tangent(tuple(z), c) for z, c in zip(poses.tolist(), full, strict=True)]
         return sightings(seen, "pose", poses, np.array(in_tangent).reshape(-1, 3, 3))
 
-    twists = follow(_route(options), CORNER_RADIUS_M, SPEED_M_S, TICK_NS * 1e-9)
-    noise = VelocityNoise(
-        (options.sigma_speed_m_s, options.sigma_sideways_m_s, options.sigma_turn_rad_s), options.correlation_time_s
-    )
+    twists = follow(_route(aisles, aisle_m, laps), CORNER_RADIUS_M, SPEED_M_S, TICK_NS * 1e-9)
+    noise = VelocityNoise((sigma_speed_m_s, sigma_sideways_m_s, sigma_turn_rad_s), correlation_time_s)
     landmarks = dict(zip(names, (tuple(tag) for tag in tags.tolist()), strict=True))
     return drive(rng, START, twists, TICK_NS, noise, observe, OBSERVE_EVERY, landmarks)
 
 
-def _tags(options: Warehouse) -> tuple[list[str], Array]:
+def _tags(aisles: int, aisle_m: float) -> tuple[list[str], Array]:
     """Names and poses (m, 3): along the racks, on their ends, and on the walls that aisles lead to.
 
     A tag's x axis points at the reader, out of the rack or wall.
     """
     south, north = -0.5 * np.pi, 0.5 * np.pi
-    length = options.aisle_m
-    count = max(1, int(length // TAG_SPACING_M))
-    along = ((np.arange(count) + 0.5) * (length / count)).tolist()
+    count = max(1, int(aisle_m // TAG_SPACING_M))
+    along = ((np.arange(count) + 0.5) * (aisle_m / count)).tolist()
     tags: dict[str, se2.Pose] = {}
-    for rack in range(options.aisles + 1):
+    for rack in range(aisles + 1):
         x = (rack - 0.5) * AISLE_SPACING_M
         tags |= {f"rack{rack}w{k}": (x - 0.5 * RACK_DEPTH_M, y, -np.pi) for k, y in enumerate(along)}
         tags |= {f"rack{rack}e{k}": (x + 0.5 * RACK_DEPTH_M, y, 0.0) for k, y in enumerate(along)}
-        tags |= {f"rack{rack}s": (x, 0.0, south), f"rack{rack}n": (x, length, north)}
-    for aisle in range(options.aisles):
+        tags |= {f"rack{rack}s": (x, 0.0, south), f"rack{rack}n": (x, aisle_m, north)}
+    for aisle in range(aisles):
         x = aisle * AISLE_SPACING_M
-        tags |= {f"wall{aisle}s": (x, -WALL_M, north), f"wall{aisle}n": (x, length + WALL_M, south)}
+        tags |= {f"wall{aisle}s": (x, -WALL_M, north), f"wall{aisle}n": (x, aisle_m + WALL_M, south)}
     return list(tags), np.array(list(tags.values()))
 
 
@@ -101,12 +102,12 @@ def _is_facing(T_world_base: Numbers, tags: Array) -> NDArray[np.bool_]:
     return np.asarray(np.abs(se2.wrap(toward - tags[:, 2])) <= MAX_SLANT_RAD)
 
 
-def _route(options: Warehouse) -> Array:
+def _route(aisles: int, aisle_m: float, laps: int) -> Array:
     """Waypoints (n, 2): a serpentine for each lap, then a cross aisle and the first aisle again."""
-    south, north = -CROSS_AISLE_M, options.aisle_m + CROSS_AISLE_M
+    south, north = -CROSS_AISLE_M, aisle_m + CROSS_AISLE_M
     points = [START[:2]]
-    for _ in range(options.laps):
-        for aisle in range(options.aisles):
+    for _ in range(laps):
+        for aisle in range(aisles):
             y = points[-1][1]
             points += [(aisle * AISLE_SPACING_M, y), (aisle * AISLE_SPACING_M, south if y == north else north)]
         points.append((0.0, points[-1][1]))

@@ -7,7 +7,7 @@ from reliability import times
 from graph_slam_ros.formats.parameters import parse_setting
 from graph_slam_ros.runs.check import check
 from graph_slam_ros.tools.simulation import Drive, Fault, simulate, spoil_messages, write_bag
-from graph_slam_ros.tools.simulation.instruments import Instruments, with_instruments
+from graph_slam_ros.tools.simulation.instruments import with_instruments
 
 SETTINGS = {
     "inputs.names": "odom detections imu",
@@ -21,7 +21,7 @@ SETTINGS = {
 def bag(tmp_path_factory):
     file = tmp_path_factory.mktemp("gyro") / "drive.mcap"
     recording = simulate("warehouse", 3, aisles=2, aisle_m=4.0, laps=1)
-    write_bag(with_instruments(recording, 3, Instruments(imu=50.0)), file)
+    write_bag(with_instruments(recording, 3, imu=50.0), file)
     return file
 
 
@@ -64,7 +64,7 @@ def laps(tmp_path_factory):
     """Long enough for landmarks to decide whether the gyro or odometry is wrong; first the robot stands."""
     file = tmp_path_factory.mktemp("gyro") / "laps.mcap"
     recording = stood(simulate("warehouse", 3, aisles=2, aisle_m=6.0, laps=2), 2.0)
-    write_bag(with_instruments(recording, 3, Instruments(imu=50.0)), file)
+    write_bag(with_instruments(recording, 3, imu=50.0), file)
     return file
 
 

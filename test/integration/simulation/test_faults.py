@@ -12,6 +12,7 @@ from graph_slam_ros.formats.g2o import read_g2o
 from graph_slam_ros.recordings.bag import open_bag
 from graph_slam_ros.tools.simulation import (
     KINDS,
+    MESSAGE_KINDS,
     Fault,
     city_graph,
     faulty_recording,
@@ -20,7 +21,6 @@ from graph_slam_ros.tools.simulation import (
     with_closures,
 )
 from graph_slam_ros.tools.simulation.false_closures import disagreement, false_closures
-from graph_slam_ros.tools.simulation.message_faults import MESSAGE_KINDS
 from graph_slam_ros.tools.simulation.motion import space_of
 from graph_slam_ros.tools.simulation.options import about
 
@@ -179,9 +179,9 @@ def test_the_help_tells_every_fault_and_all_that_can_be_set(capsys):
     assert "gnss_outage_s=0.0 [s]" in out and "aisle_m=12.0 [m]" in out
     for name, kind in (KINDS | MESSAGE_KINDS).items():
         assert f"  {name}: {about(kind)}" in out
-        for option in options_of(kind):
+        for key, option in options_of(kind).items():
             unit = f" [{option.unit}]" if option.unit else ""
-            assert f"    {option.name}={option.default}{unit}  {option.meaning}" in out
+            assert f"    {key}={option.default}{unit}  {option.meaning}" in out
 
 
 @pytest.mark.parametrize("world", ["city", "flight"])

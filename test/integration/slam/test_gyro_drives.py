@@ -11,7 +11,7 @@ from graph_slam_ros.cli import main
 from graph_slam_ros.slam import AngularVelocity
 from graph_slam_ros.tools.simulation import simulate
 from graph_slam_ros.tools.simulation.bag import write_bag
-from graph_slam_ros.tools.simulation.instruments import Instruments, with_instruments
+from graph_slam_ros.tools.simulation.instruments import with_instruments
 
 SEEDS = times(1, 20)
 BAND = (1.0, 5.0)
@@ -62,7 +62,7 @@ def bag(tmp_path_factory):
     """A short drive after a rest, with an IMU of bias 0.01 rad/s."""
     path = tmp_path_factory.mktemp("gyro") / "drive.mcap"
     recording = stood(simulate("warehouse", 3, aisles=2, laps=1, aisle_m=4.0), 2.0)
-    write_bag(with_instruments(recording, 3, Instruments(imu=100.0, imu_bias_rad_s=0.01)), path)
+    write_bag(with_instruments(recording, 3, imu=100.0, imu_bias_rad_s=0.01), path)
     return path
 
 
