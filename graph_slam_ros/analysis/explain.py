@@ -4,7 +4,7 @@ import textwrap
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from scipy.special import gammainc
 
@@ -206,58 +206,76 @@ def _edge(run: SavedGraph, edge: int) -> Iterator[str]:
     if e.label == PLACES:
         yield from (line for what, text in statements_of_place(run, e) for line in _words(what, text))
         return
-    history = [change for change in run.changes if change.edge == edge]
-    yield title(e, " and ".join(run.landmarks_of(e)))
-    for what, text in statements(e, [_vertex(run, e, v) for v in e.vertices], Numbers.of(e), history, run.config):
-        yield from _line(what, text)
-    for text in by_hand(run, edge):
-        yield from _line("by hand", text)
+    history, fields = [change for change in run.changes if change.edge == edge], fields_of(run, e)
+    yield title(e, run).format(**fields)
+    for what, text in statements(e, run, is_changed=bool(history)):
+        yield from _line(what, text.format(**fields))
+    for change in history if e.verdict else ():
+        yield from _line("changed", change_text(change))
+    for one in run.edits:
+        if edge in (*one.edges, *one.added):
+            yield from _line("by hand", one.text)
     if not e.verdict:
         return
     if e.reason not in FINAL:
         yield from _what_if(run, e)
     if not e.is_in:
-        yield from _line("to change", remedy(e))
+        yield from _line("to change", remedy(e).format(**fields))
 
 
-def by_hand(run: SavedGraph, edge: int) -> list[str]:
-    """Return the edits by hand of an edge: by whom, when and why."""
-    return [one.text for one in run.edits if edge in (*one.edges, *one.added)]
+# -- sentences: templates, which are filled in with the fields of an edge, here and in the page of a report ------------
 
 
-class Numbers(NamedTuple):
-    """The numbers of a measurement that are explained."""
-
-    measured: Sequence[float]
-    sigmas: Sequence[float]
-    expected: Sequence[float]
-
-    @classmethod
-    def of(cls, e: Entry) -> "Numbers":
-        """The numbers of one edge."""
-        return cls(measurement_text.measured(e), measurement_text.sigmas(e), measurement_text.expected(e))
+def fields_of(run: SavedGraph, e: Entry) -> dict[str, Any]:
+    """The values of the fields that sentences have."""
+    numbers = {name: float(column[0]) for name, column in measurement_text.columns([e]).items()}
+    ends = {f"end{slot}": run.name(vertex) for slot, vertex in enumerate(e.vertices)}
+    own = ("edge", "source", "landmark", "keyframe", "stamp_s", "statistic", "threshold", "chi2", "percent")
+    factor = {} if e.is_in or e.reason in FINAL else {"sigma_factor": e.sigma_factor}
+    return {name: getattr(e, name) for name in own} | factor | numbers | ends
 
 
-def title(e: Entry, of: str) -> str:
-    """An edge's title: its kind, the landmarks that it is ``of``, and the verdict on it."""
-    by = e.source and (f" {e.source}" if e.source == HAND_MADE else f" by {e.source}")
-    return f"edge {e.edge}: {_KIND.get(e.label, e.label)}{of and f' of {of}'}{by}: {_state(e.verdict, e.reason)}"
+def title(e: Entry, run: SavedGraph) -> str:
+    """An edge's title: its kind, the landmarks that it is of, and the verdict on it."""
+    of = "{landmark}" if e.landmark else " and ".join(map(_literal, run.landmarks_of(e)))
+    by = e.source and (f" {e.source}" if e.source == HAND_MADE else " by {source}")
+    return f"edge {{edge}}: {_KIND.get(e.label, e.label)}{of and f' of {of}'}{by}: {_state(e.verdict, e.reason)}"
 
 
-def statements(
-    e: Entry, ends: Sequence[str], numbers: Numbers, history: Sequence[VerdictChange], config: Config
-) -> Iterator[tuple[str, str]]:
-    """Sentences on an edge, each with its name: what was measured, what was decided, and how it fits now."""
-    yield "stamp", f"{e.stamp_s:.3f} s, of the newest keyframe that it is attached to"
-    yield "judged", f"first at keyframe {e.keyframe}"
-    yield "between", " and ".join(ends)
-    yield "measured", measurement_text.with_units(e, numbers.measured)
-    yield "sigmas", measurement_text.with_units(e, numbers.sigmas)
-    yield "expected", f"{measurement_text.with_units(e, numbers.expected)}, when it was judged first"
-    yield "decided", _decided(e, history, config)
+def ends_of(e: Entry, run: SavedGraph) -> list[str]:
+    """Call the vertices of an edge: keyframes by their numbers, landmarks by their names."""
+    out, name = list[str](), e.landmark and "{landmark}"
+    for slot, vertex in enumerate(e.vertices):
+        if run.keyframe(vertex) is not None:
+            out.append(f"keyframe {{end{slot}}}")
+        elif name or run.landmark_of(vertex):
+            out.append(f"landmark {name or _literal(run.landmark_of(vertex))}")
+            name = ""  # the landmark of an edge is one vertex
+        else:
+            out.append(f"vertex {{end{slot}}}")
+    return out
+
+
+def _literal(text: str) -> str:
+    return text.replace("{", "{{").replace("}", "}}")
+
+
+def statements(e: Entry, run: SavedGraph, *, is_changed: bool) -> Iterator[tuple[str, str]]:
+    """Sentences on an edge, each with its name: what was measured, what was decided, and how it fits now.
+
+    Parameters
+    ----------
+    is_changed : whether its verdict has changed
+    """
+    yield "stamp", "{stamp_s:.3f} s, of the newest keyframe that it is attached to"
+    yield "judged", "first at keyframe {keyframe}"
+    yield "between", " and ".join(ends_of(e, run))
+    yield "measured", measurement_text.template(e, "measured")
+    yield "sigmas", measurement_text.template(e, "sigmas")
+    yield "expected", f"{measurement_text.template(e, 'expected')}, when it was judged first"
+    yield "decided", _decided(e, run.config, is_changed=is_changed)
     if e.verdict:
-        yield "now", f"chi2 {e.chi2:.4g} by its own noise; {e.percent:.3g} % of its weight counts"
-        yield from (("changed", change_text(c)) for c in history)
+        yield "now", "chi2 {chi2:.4g} by its own noise; {percent:.3g} % of its weight counts"
 
 
 def change_text(c: VerdictChange) -> str:
@@ -265,15 +283,15 @@ def change_text(c: VerdictChange) -> str:
     return f"at keyframe {c.keyframe}: {_state(c.verdict, c.reason)}, chi2 {c.statistic:.4g} against {c.threshold:.4g}"
 
 
-def _decided(e: Entry, history: Sequence[VerdictChange], config: Config) -> str:
+def _decided(e: Entry, config: Config, *, is_changed: bool) -> str:
     limit = quantile(config.robust.gate, e.dof)
     chance = f"noise alone exceeds {limit:.4g} once in {1.0 / (1.0 - config.robust.gate):.0f} times"
     if e.threshold < _SAME * limit:
         chance += f", and what was accepted of {e.label} is much smaller than its stated noise"
     elif limit < _SAME * e.threshold:
         chance += ", but all noise may be larger than stated, robust.noise_factor"
-    numbers = f"chi2 {e.statistic:.4g} with {e.dof} degree{'s' * (e.dof > 1)} of freedom"
-    allowed = f"up to {e.threshold:.4g} would have passed ({chance})"
+    numbers = f"chi2 {{statistic:.4g}} with {e.dof} degree{'s' * (e.dof > 1)} of freedom"
+    allowed = f"up to {{threshold:.4g}} would have passed ({chance})"
     if not e.verdict:
         return "nothing: odometry and priors are not judged"
     match e.reason:
@@ -291,17 +309,17 @@ def _decided(e: Entry, history: Sequence[VerdictChange], config: Config) -> str:
             return "not by its chi2: a user decided it by hand"
         case Reason.DISPLACED:
             return (
-                f"{e.statistic:.0f} sightings more agreed on another pose of the robot than on this motion: it was"
+                "{statistic:.0f} sightings more agreed on another pose of the robot than on this motion: it was"
                 " carried, or its wheels slipped; an edge with very large noise replaces it"
             )
         case Reason.SLIP:
             return (
-                f"its stretch slips: the landmarks make that {e.statistic:.1f} likelier than not (twice the logarithm),"
-                f" more than {e.threshold:.1f}, the odds against it; an edge with more noise replaces it"
+                "its stretch slips: the landmarks make that {statistic:.1f} likelier than not (twice the logarithm),"
+                " more than {threshold:.1f}, the odds against it; an edge with more noise replaces it"
             )
     if e.verdict is Verdict.DOWN_WEIGHTED:
-        return f"it is accepted, but its loss leaves it little weight: {numbers}, above {e.threshold:.4g} ({chance})"
-    return f"{'it was accepted later' if history else 'it was accepted at once'}: {numbers}; {allowed}"
+        return f"it is accepted, but its loss leaves it little weight: {numbers}, above {{threshold:.4g}} ({chance})"
+    return f"{'it was accepted later' if is_changed else 'it was accepted at once'}: {numbers}; {allowed}"
 
 
 def _what_if(run: SavedGraph, e: Entry) -> Iterator[str]:
@@ -327,7 +345,7 @@ def remedy(e: Entry) -> str:
         return f"nothing in this run: {REASONS[e.reason]} is final; replay the run with another configuration"
     return (
         "it is accepted by itself as soon as the map agrees with it. If you know that it is true, a stated noise is too"
-        f" small, its own or that of the edges against it: with all sigmas {e.sigma_factor:.3g} times as large it would"
+        " small, its own or that of the edges against it: with all sigmas {sigma_factor:.3g} times as large it would"
         " pass (robust.noise_factor). With robust.decide=false nothing is held back"
     )
 
@@ -348,10 +366,3 @@ def _words(what: str, text: str) -> Iterator[str]:
     """The same with no word broken: commands and names stay whole."""
     wrapper = textwrap.TextWrapper(_WIDTH, f"{what:11s}", " " * 11, break_long_words=False, break_on_hyphens=False)
     yield from wrapper.wrap(text)
-
-
-def _vertex(run: SavedGraph, e: Entry, vertex: int) -> str:
-    if run.keyframe(vertex) is not None:
-        return f"keyframe {run.keyframe(vertex)}"
-    name = run.landmark_of(vertex)
-    return f"landmark {name}" if name else f"vertex {run.ids[vertex]}"

@@ -4,10 +4,10 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graph_slam_ros.lie import se2, se3, so3
 from graph_slam_ros.runs.ledger_file import Entry
+from graph_slam_ros.typing import Array
 
 _DEGREES = 180.0 / math.pi
 _LEAST = 1e-12  # of the largest eigenvalue: less is no information
@@ -35,56 +35,67 @@ _NAMES = {
 }
 
 
-def units(tag: str, count: int) -> list[tuple[str, str]]:
-    """Name and unit (m or rad) of each number that an edge measures."""
-    return [(what, unit) for what, unit in (name.rsplit(" ", 1) for name in _named(tag, count))]
+def columns(entries: Sequence[Entry]) -> dict[str, Array]:
+    """The numbers of measurements that sentences have fields for, in the units that are shown: NaN where one has less.
+
+    ``measured0``, ``sigmas0``, ``expected0`` and so on: what was measured, as many numbers as the residual has, with
+    rotations in space as vectors; the standard deviation of each; what was expected when it was judged first.
+    """
+    out: dict[str, Array] = {}
+    by_tag: dict[str, list[int]] = {}
+    for row, e in enumerate(entries):
+        by_tag.setdefault(e.tag, []).append(row)
+    for tag, rows in by_tag.items():
+        several = [entries[row] for row in rows]
+        dof = several[0].dof
+        upper, information = np.triu_indices(dof), np.zeros((len(several), dof, dof))
+        values = np.array([e.information for e in several])
+        information[:, upper[0], upper[1]] = information[:, upper[1], upper[0]] = values
+        z, r = (tuple(np.array(of).T) for of in zip(*((e.measured, e.residual) for e in several), strict=True))
+        found = {"measured": _measured(tag, dof, z), "expected": _expected(tag, dof, z, r)}
+        for name, numbers in {**found, "sigmas": tuple(sigmas_of(information).T)}.items():
+            for k, (column, of) in enumerate(zip(numbers, _names(tag, dof), strict=True)):
+                unit = _DEGREES if of.endswith("rad") else 1.0
+                out.setdefault(f"{name}{k}", np.full(len(entries), np.nan))[rows] = column * unit
+    return out
 
 
-def _named(tag: str, count: int) -> Sequence[str]:
-    return _NAMES.get(tag) or (_XY if count == 2 else _XYZ)
-
-
-def with_units(entry: Entry, numbers: Sequence[float]) -> str:
-    """One number for each that the edge measures, with their names; angles in degrees."""
+def template(entry: Entry, name: str) -> str:
+    """Fields for the numbers of a name of ``columns``, with what they are and their units; angles in degrees."""
     words = []
-    for (what, unit), number in zip(units(entry.tag, len(numbers)), numbers, strict=True):
-        words.append(f"{what} {number * _DEGREES:.2f} deg" if unit == "rad" else f"{what} {number:.3f} {unit}")
+    for k, (what, unit) in enumerate(of.rsplit(" ", 1) for of in _names(entry.tag, entry.dof)):
+        words.append(f"{what} {{{name}{k}:.2f}} deg" if unit == "rad" else f"{what} {{{name}{k}:.3f}} {unit}")
     return ", ".join(words)
 
 
-def measured(entry: Entry) -> tuple[float, ...]:
-    """Return what was measured, as many numbers as the residual has; rotations in space as vectors."""
-    z = entry.measured
-    if entry.tag == "EDGE_ATTITUDE_SE3":
+def _names(tag: str, dof: int) -> Sequence[str]:
+    """Name and unit of each number that an edge measures."""
+    return _NAMES.get(tag) or (_XY if dof == 2 else _XYZ)
+
+
+def _measured(tag: str, dof: int, z: tuple[Array, ...]) -> tuple[Array, ...]:
+    if tag == "EDGE_ATTITUDE_SE3":
         return tuple(so3.log(z))
-    if entry.dof == 6:
+    if dof == 6:
         return (*z[:3], *so3.log(z[3:]))
-    if entry.tag.startswith("EDGE_COORDINATE"):  # behind its direction, before the place on the robot
+    if tag.startswith("EDGE_COORDINATE"):  # behind its direction, before the place on the robot
         return z[len(z) // 2 : len(z) // 2 + 1]
-    return z[: entry.dof]
+    return z[:dof]
 
 
-def expected(entry: Entry) -> tuple[float, ...]:
-    """Return what was expected when it was judged first, in the same numbers."""
-    z, r = entry.measured, entry.residual
-    if entry.tag in ("EDGE_SE2", "EDGE_PRIOR_SE2"):
+def _expected(tag: str, dof: int, z: tuple[Array, ...], r: tuple[Array, ...]) -> tuple[Array, ...]:
+    if tag in ("EDGE_SE2", "EDGE_PRIOR_SE2"):
         x, y, heading = se2.compose(z, r)
         return (x, y, se2.wrap(heading))
-    if entry.tag == "EDGE_ATTITUDE_SE3":
+    if tag == "EDGE_ATTITUDE_SE3":
         return tuple(so3.log(so3.compose(z, so3.exp(r))))
-    if entry.dof == 6:
+    if dof == 6:
         pose = se3.compose(z, (*r[:3], *so3.exp(r[3:])))
         return (*pose[:3], *so3.log(pose[3:]))
-    return tuple(a + b for a, b in zip(measured(entry), r, strict=True))
+    return tuple(a + b for a, b in zip(_measured(tag, dof, z), r, strict=True))
 
 
-def sigmas(entry: Entry) -> tuple[float, ...]:
-    """Standard deviation of each of these numbers."""
-    deviations: list[float] = sigmas_of(entry.information_matrix).tolist()
-    return tuple(deviations)
-
-
-def sigmas_of(information: NDArray[np.float64]) -> NDArray[np.float64]:
+def sigmas_of(information: Array) -> Array:
     """Standard deviations (..., m) of information matrices (..., m, m); infinite where they determine nothing."""
     values, vectors = np.linalg.eigh(information)
     is_known = values > _LEAST * np.abs(values).max(axis=-1, keepdims=True)

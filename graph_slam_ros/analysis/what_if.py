@@ -19,7 +19,6 @@ from graph_slam_ros.runs.restore import of_all, restored
 from graph_slam_ros.runs.tables import numbered
 from graph_slam_ros.runs.whole_path import WholePath
 from graph_slam_ros.solver import Report, Solver
-from graph_slam_ros.typing import Array
 
 MOST_STEPS = 200  # an edge that all else contradicts needs more than a run's own map does
 _ACCEPTED = "believed"  # the class of what is let in: it has no loss
@@ -241,10 +240,6 @@ class SavedGraph:
                 exact_m = np.inf
             out.append(Influence(edge, float(first[k]), exact_m))
         return sorted(out, key=lambda one: -np.nan_to_num(one.exact_m, nan=one.first_order_m))
-
-    def first_order(self, edge: int) -> Array:
-        """The step (dof,) of the last keyframe, in its tangent space, if an edge is removed."""
-        return self.influence_model.without([self._row(edge)]).step[0]
 
 
 def _accepted(graph: Graph, row: int, entry: Entry) -> int:

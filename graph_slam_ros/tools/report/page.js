@@ -75,7 +75,7 @@ function valueOf(name, k) {
   return ofEdge(e.columns[name], k);
 }
 
-const filled = (text, k) => text.replace(/\{(\w+)(?::([^}]*))?\}/g, (_, name, spec) => formatted(valueOf(name, k), spec));
+const filled = (text, k) => text.replace(/(\{\{|\}\})|\{(\w+)(?::([^}]*))?\}/g, (_, brace, name, spec) => (brace ? brace[0] : formatted(valueOf(name, k), spec)));
 
 function explained(k) {
   const group = data.edges.groups[ofEdge(data.edges.group, k)], lines = [];

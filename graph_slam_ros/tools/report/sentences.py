@@ -1,17 +1,13 @@
-"""The sentences of ``explain`` for all edges of a run: a few templates, and the numbers to fill in.
-
-``explain`` itself makes each template, from an edge with placeholders as numbers. So page and command say the same.
-"""
+"""The sentences of ``explain`` for all edges of a run: its templates, and the numbers that fill them in."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
 from graph_slam_ros.analysis import measurement_text
-from graph_slam_ros.analysis.explain import Numbers, change_text, remedy, statements, title
+from graph_slam_ros.analysis.explain import change_text, ends_of, remedy, statements, title
 from graph_slam_ros.analysis.influence import Influences
 from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.chi_square import quantile
@@ -21,40 +17,6 @@ from graph_slam_ros.slam.edits import HAND_MADE
 from graph_slam_ros.slam.robust.ledger import FINAL
 from graph_slam_ros.tools.report.packing import shown
 from graph_slam_ros.typing import Array
-
-_DEGREES = 180.0 / np.pi
-
-
-class _Number(float):
-    """A number that is shown as its name and format: ``{chi2:.4g}``. It compares as itself."""
-
-    name: str
-
-    def __new__(cls, value: float, name: str) -> "_Number":
-        out = super().__new__(cls, value)
-        out.name = name
-        return out
-
-    def __format__(self, spec: str) -> str:
-        return f"{{{self.name}:{spec}}}" if spec else f"{{{self.name}}}"
-
-    def __mul__(self, factor: float) -> "_Number":
-        """Return itself: its column is in the unit that is shown."""
-        return self
-
-
-class _Text(str):
-    """A text that is shown as its name."""
-
-    name: str
-
-    def __new__(cls, value: str, name: str) -> "_Text":
-        out = super().__new__(cls, value)
-        out.name = name
-        return out
-
-    def __format__(self, spec: str) -> str:
-        return f"{{{self.name}}}" if self else ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +63,7 @@ class Sentences:
 
     Attributes
     ----------
-    groups : each a title, lines of name and text, and what its vertices are called
+    groups : each a title, and lines of name and text
     group : (n,) the group of each edge
     numbers : by name (n,) values, as the texts name them
     changes : changes of the verdict, by edge
@@ -124,63 +86,39 @@ def sentences(run: SavedGraph, found: Effects) -> Sentences:
     is_known = np.isfinite(found.end_m)
     for k, e in enumerate(entries):
         limit = limits[e.dof]
-        kinds = tuple(_kind(run, e, vertex) for vertex in e.vertices)
+        ends = tuple(ends_of(e, run))
         bounds = e.threshold < 0.99 * limit, limit < 0.99 * e.threshold
         effect = bool(is_known[k]), bool(found.is_alone[k]), int(found.end[k])
-        about = bool(e.landmark), e.source if e.source in ("", HAND_MADE) else True, k in history
-        key: tuple[Any, ...] = (e.tag, e.label, e.verdict, e.reason, *kinds, *bounds, *effect, *about)
+        about = bool(e.landmark), e.source if e.source in ("", HAND_MADE) else True, e.edge in history
+        key: tuple[Any, ...] = (e.tag, e.label, e.verdict, e.reason, *ends, *bounds, *effect, *about)
         key = (PLACES,) if e.label == PLACES else key
         if key not in known:
             known[key] = len(groups)
-            groups.append(_group(run, e, kinds, history.get(k, ()), effect))
+            groups.append(_group(run, e, ends, effect, is_changed=e.edge in history))
         at[k] = known[key]
     changes = {edge: [change_text(c) for c in several] for edge, several in history.items()}
-    return Sentences(groups, at, _numbers(entries), changes)
-
-
-def _kind(run: SavedGraph, e: Entry, vertex: int) -> str:
-    if run.keyframe(vertex) is not None:
-        return "keyframe"
-    return "landmark" if e.landmark else "vertex"
+    measured = [row for row, e in enumerate(entries) if e.label != PLACES]
+    numbers = {}
+    for name, column in measurement_text.columns([entries[row] for row in measured]).items():
+        numbers[name] = np.full(len(entries), np.nan)
+        numbers[name][measured] = column
+    return Sentences(groups, at, numbers, changes)
 
 
 def _group(
-    run: SavedGraph, e: Entry, kinds: Sequence[str], history: Sequence[Any], effect: tuple[bool, bool, int]
+    run: SavedGraph, e: Entry, ends: Sequence[str], effect: tuple[bool, bool, int], *, is_changed: bool
 ) -> dict[str, Any]:
-    """The texts of one edge, with places for what is its own."""
+    """The texts of edges that are like one."""
     if e.label == PLACES:
-        return {"title": "edge {edge}", "lines": [["", "{place}"]], "ends": []}
-    ends = ["landmark {landmark}" if kind == "landmark" else f"{kind} {{end{slot}}}" for slot, kind in enumerate(kinds)]
-    own: Any = SimpleNamespace(
-        edge=_Number(e.edge, "edge"),
-        label=e.label,
-        tag=e.tag,
-        source=_Text(e.source, "source"),
-        landmark=_Text(e.landmark, "landmark"),
-        keyframe=_Number(e.keyframe, "keyframe"),
-        stamp_s=_Number(e.stamp_s, "stamp_s"),
-        statistic=_Number(e.statistic, "statistic"),
-        dof=e.dof,
-        threshold=_Number(e.threshold, "threshold"),
-        chi2=_Number(e.chi2, "chi2"),
-        percent=_Number(0.0, "percent"),
-        sigma_factor=_Number(0.0, "sigma_factor"),
-        verdict=e.verdict,
-        reason=e.reason,
-        is_in=e.is_in,
-    )
-    several = Numbers.of(e)._asdict().items()
-    numbers = Numbers(*([_Number(0.0, f"{name}{k}") for k in range(len(of))] for name, of in several))
-    lines = [[what, text] for what, text in statements(own, ends, numbers, (), run.config) if not history]
-    if history:  # it says whether an edge came in later
-        lines = [[what, text] for what, text in statements(own, ends, numbers, history[:1], run.config)]
-        lines = [line for line in lines if line[0] != "changed"] + [["changed", "{changes}"]]
+        return {"title": "edge {edge}", "lines": [["", "{place}"]]}
+    lines = [[what, text] for what, text in statements(e, run, is_changed=is_changed)]
+    if is_changed:
+        lines.append(["changed", "{changes}"])
     if e.verdict and e.reason not in FINAL:
         lines.append(["what if", _what_if(run, e, ends, *effect)])
     if not e.is_in:
-        lines.append(["to change", remedy(own)])
-    of = "{landmark}" if e.landmark else " and ".join(run.landmarks_of(e))
-    return {"title": title(own, of), "lines": lines, "ends": ends}
+        lines.append(["to change", remedy(e)])
+    return {"title": title(e, run), "lines": lines}
 
 
 def _what_if(run: SavedGraph, e: Entry, ends: Sequence[str], is_known: bool, is_alone: bool, end: int) -> str:
@@ -195,28 +133,3 @@ def _what_if(run: SavedGraph, e: Entry, ends: Sequence[str], is_known: bool, is_
         f"it were {which}, to first order: cost {{cost:+.4g}}, the last pose moves by {{last_m:.3f}} m,"
         f" {ends[end]} by {{end_m:.3f}} m; {exactly}"
     )
-
-
-def _numbers(entries: Sequence[Entry]) -> dict[str, Array]:
-    """The numbers that texts have places for, in the units that are shown."""
-    out: dict[str, Array] = {}
-    by_tag: dict[str, list[tuple[int, Entry]]] = {}
-    for row, e in enumerate(entries):
-        if e.label != PLACES:
-            by_tag.setdefault(e.tag, []).append((row, e))
-    for tag, rows in by_tag.items():
-        at, several = np.array([row for row, _ in rows]), [e for _, e in rows]
-        m = several[0].dof
-        upper, information = np.triu_indices(m), np.zeros((len(several), m, m))
-        values = np.array([e.information for e in several])
-        information[:, upper[0], upper[1]] = information[:, upper[1], upper[0]] = values
-        of = {name: tuple(np.array([getattr(e, name) for e in several]).T) for name in ("measured", "residual")}
-        whole: Any = SimpleNamespace(tag=tag, dof=m, **of)
-        expected = measurement_text.expected(whole)
-        sigmas = tuple(measurement_text.sigmas_of(information).T)
-        for name, columns in zip(Numbers._fields, (measurement_text.measured(whole), sigmas, expected), strict=True):
-            is_angle = [unit == "rad" for _, unit in measurement_text.units(tag, len(columns))]
-            for k, column in enumerate(columns):
-                unit = _DEGREES if is_angle[k] else 1.0
-                out.setdefault(f"{name}{k}", np.full(len(entries), np.nan))[at] = column * unit
-    return out

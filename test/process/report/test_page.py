@@ -9,7 +9,7 @@ from faulty import faulty_run
 from pages import HOSTILE, chromium, drive, pages, violations
 
 from graph_slam_ros import cli
-from graph_slam_ros.analysis.explain import Numbers, explain_edge, statements, title
+from graph_slam_ros.analysis.explain import change_text, explain_edge, fields_of, statements, title
 from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.runs.ledger_file import read_ledger
 from graph_slam_ros.runs.recorder import RunRecorder
@@ -68,7 +68,7 @@ def test_a_page_says_why_as_explain_does(page, faulty):
     before = ranges(page)
     page.click(f".row[data-edge='{false.edge + 1}']")
     other = faulty.saved.edge(false.edge + 1)
-    assert title(other, other.landmark) in why(page)
+    assert title(other, faulty.saved).format(**fields_of(faulty.saved, other)) in why(page)
     assert ranges(page) == pytest.approx(before), "an edge that is seen does not move the map"
     page.evaluate("() => Plotly.relayout('map', {'xaxis.range': [900, 910], 'yaxis.range': [900, 910]})")
     page.evaluate("which => go('edge', which)", false.edge)
@@ -85,12 +85,12 @@ def test_each_sentence_of_the_page_is_explains(page, faulty):
     shown = page.evaluate("() => Array.from({length: data.edges.count}, (_, k) => explained(k))")
     number = re.compile(r"-?\d+(?:\.\d+)?(?:e[-+]\d+)?")
     for e, found in zip(faulty.saved.entries, shown, strict=True):
-        history = [change for change in faulty.saved.changes if change.edge == e.edge]
-        keyframe = faulty.saved.keyframe
-        ends = [f"keyframe {keyframe(v)}" if keyframe(v) is not None else f"landmark {e.landmark}" for v in e.vertices]
-        expected = [*statements(e, ends, Numbers.of(e), history, faulty.saved.config)]
+        history, fields = [one for one in faulty.saved.changes if one.edge == e.edge], fields_of(faulty.saved, e)
+        told = statements(e, faulty.saved, is_changed=bool(history))
+        expected = [(what, text.format(**fields)) for what, text in told]
+        expected += [("changed", change_text(one)) for one in history]
         lines = [tuple(line) for line in found["lines"] if line[0] not in ("what if", "to change")]
-        assert found["title"] == title(e, e.landmark)
+        assert found["title"] == title(e, faulty.saved).format(**fields)
         assert [what for what, _ in lines] == [what for what, _ in expected]
         for (_, text), (_, other) in zip(lines, expected, strict=True):
             assert number.sub("#", text) == number.sub("#", other)
