@@ -1,11 +1,17 @@
-"""The commands on the maps of runs: ``map diff``, ``map merge``, ``map freeze``."""
+"""The commands on the maps of runs: ``map diff``, ``map merge``, ``map edit``, ``map freeze``, ``map export``."""
 
 import argparse
 import json
 from pathlib import Path
 
 from graph_slam_ros.cli import arguments, console
+from graph_slam_ros.cli.evaluate import suggest_next
 from graph_slam_ros.cli.usage import CODES, CommandParser
+from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.measurements.edit_actions import ACTIONS
+
+_FILES = ("tum", "g2o", "mcap")
+_PICTURES = ("png", "svg", "pdf", "gif")
 
 
 def diff_options(sub: CommandParser) -> None:
@@ -56,6 +62,51 @@ def merge(args: argparse.Namespace) -> int:
     return console.report_losses(done.losses, moved)
 
 
+def edit_options(sub: CommandParser) -> None:
+    """Add the options of ``map edit``."""
+    sub.codes = f"explain RUN prints the ids of edges and the names of landmarks; so does ledger.csv. {CODES}"
+    sub.more = lambda: "\n".join(
+        [
+            "Kinds of edits, and their keys (docs/edits.md):",
+            *(f"  {do:16s} {action.keys_text}" for do, action in ACTIONS.items()),
+        ]
+    )
+    arguments.add_run(sub)
+    sub.add_argument("--plan", type=Path, metavar="FILE", help="JSON file with the edits")
+    sub.add_argument("--out", type=Path, metavar="DIR", help="new run folder for the result: nothing is replaced")
+    sub.add_argument("--dry-run", action="store_true", help="print what the plan would change, and write nothing")
+    sub.add_argument("--new-plan", type=Path, metavar="FILE", help="write a plan for this run, without edits, and end")
+
+
+def edit(args: argparse.Namespace) -> int:
+    """Apply a plan of edits to a run, or begin one."""
+    from graph_slam_ros.maps.edit import edit as edited
+    from graph_slam_ros.maps.edit import read_plan, write_empty_plan
+
+    if args.new_plan is not None:
+        write_empty_plan(args.run_folder, args.new_plan)
+        console.show(f"wrote {args.new_plan}: a plan for {args.run_folder}, with no edits: docs/edits.md has the keys")
+        console.then(f"{console.command('explain', args.run_folder)} (the ids of edges), then edit {args.new_plan}")
+        return console.DONE
+    if args.plan is None or (args.out is None) is not args.dry_run:
+        raise GraphSlamError("map edit needs --plan FILE with --out DIR or --dry-run, or --new-plan FILE")
+    done = edited(args.run_folder, read_plan(args.plan), args.out)
+    console.show(*(one.text for one in done.edits))
+    console.show(
+        f"chi2       {done.chi2[0]:14.4f}  ->  {done.chi2[1]:14.4f}",
+        f"last pose  moves by {done.final_m:.4f} m",
+        f"most       keyframe {done.moved[0]}, by {done.moved[1]:.4f} m",
+    )
+    console.show(*(fit.text for fit in done.by_hand))
+    if args.dry_run:
+        console.show("nothing was written")
+        console.then(console.command("map", "edit", args.run_folder, "--plan", args.plan, "--out", "NEW"))
+    else:
+        console.show(f"results in {args.out}; {args.run_folder} is as it was")
+        console.then(f"{console.command('map', 'diff', args.run_folder, args.out)} (what the edits have changed)")
+    return console.report_losses(done.losses, done.warnings)
+
+
 def freeze_options(sub: CommandParser) -> None:
     """Add the options of ``map freeze``."""
     arguments.add_run(sub)
@@ -75,3 +126,62 @@ def freeze(args: argparse.Namespace) -> int:
         f"the node locates itself in it with output.load:={args.out.name}, its folder in the directory of output.folder"
     )
     return console.report_losses(summary["losses"])
+
+
+def export_options(sub: CommandParser) -> None:
+    """Add the options of ``map export``."""
+    arguments.add_run(sub)
+    about = (
+        "output file; its ending says what: .tum the path; .g2o the graph, with stamps and names in a second file;"
+        " .mcap both as ROS messages; .png, .svg, .pdf a picture; .gif the drive and its correction"
+    )
+    sub.add_argument("--out", type=Path, required=True, metavar="FILE", help=about)
+    sub.add_argument("--last-drive", action="store_true", help="tum: only the last drive, not those of the loaded map")
+    arguments.add_truth(sub, required=False)
+    arguments.add_force(sub)
+
+
+def export(args: argparse.Namespace) -> int:
+    """Write a run in another format."""
+    from graph_slam_ros.formats.strict import ending
+    from graph_slam_ros.maps.export import export as exported
+    from graph_slam_ros.maps.export import files_of
+
+    target = ending(args.out).removeprefix(".")
+    if target in _PICTURES:
+        return _draw(args)
+    if target not in _FILES:
+        raise GraphSlamError(f"{args.out}: its ending is none of .{', .'.join((*_FILES, *_PICTURES))}")
+    if args.truth or args.topic or args.no_align:
+        raise GraphSlamError(f"map export: no use for --truth, --topic or --no-align: .{target} is no picture")
+    console.check_file(*files_of(args.out, target), force=args.force)
+    losses: list[str] = []
+    files = exported(args.run_folder, args.out, target, losses, last_drive=args.last_drive)
+    console.show(*(f"wrote {file}" for file in files))
+    use = {
+        "tum": f"evo_traj tum {args.out} --plot, or any reader of TUM trajectories",
+        "g2o": console.command("optimize", args.out),
+        "mcap": f"open {args.out} in Foxglove, or ros2 bag play {args.out}",
+    }
+    console.then(use[target])
+    return console.report_losses(losses)
+
+
+def _draw(args: argparse.Namespace) -> int:
+    from graph_slam_ros.analysis.animation import animate_run
+    from graph_slam_ros.analysis.plots import draw_run
+    from graph_slam_ros.runs.folder import changed_since
+    from graph_slam_ros.warmup import compile_all
+
+    if args.last_drive or (not args.truth and (args.topic or args.no_align)):
+        raise GraphSlamError("map export: no use for --last-drive in a picture, or --topic, --no-align without --truth")
+    console.check_file(args.out, force=args.force)
+    losses: list[str] = []
+    if args.out.suffix == ".gif":
+        compile_all()
+        losses = animate_run(args.run_folder, args.out, truth=args.truth, topic=args.topic, align=not args.no_align)
+    else:
+        draw_run(args.run_folder, args.truth, args.out, args.topic, align=not args.no_align)
+    console.show(f"picture in {args.out}")
+    suggest_next(args.run_folder)
+    return console.report_losses(losses, changed_since(args.run_folder))

@@ -49,7 +49,7 @@ COMMANDS: dict[str, Command | Group] = {
         "drive.mcap --set detections.offset_s=-0.096",
     ),
     "calibrate": Command(
-        "cli.calibrate:calibrate",
+        "cli.check:calibrate",
         "estimate odometry's scale, clocks and mounts from a recording, and print the settings",
         "drive.mcap",
         "drive.mcap --groups 'factors clock'",
@@ -110,7 +110,7 @@ COMMANDS: dict[str, Command | Group] = {
                 "monday_run tuesday_run --out site",
             ),
             "edit": Command(
-                "cli.edit:edit",
+                "cli.maps:edit",
                 "edit a run's map by hand with a plan: edges, closures, landmarks, where it lies",
                 "drive_run --new-plan edits.json",
                 "drive_run --plan edits.json --dry-run",
@@ -122,7 +122,7 @@ COMMANDS: dict[str, Command | Group] = {
                 "drive_run --out site",
             ),
             "export": Command(
-                "cli.export:export",
+                "cli.maps:export",
                 "write a run's path as TUM, its graph as g2o, both as an mcap of ROS messages, or a picture of it",
                 "drive_run --out path.tum",
                 "drive_run --out drive.png --truth drive.mcap:/ground_truth",
@@ -158,13 +158,13 @@ COMMANDS: dict[str, Command | Group] = {
         },
     ),
     "params": Command(
-        "cli.params:params",
+        "cli.installation:params",
         "list the parameters with default, unit, bounds and meaning",
         "keyframes",
         "'odometry.*'",
     ),
     "warmup": Command(
-        "cli.warmup:warmup",
+        "cli.installation:warmup",
         "compile the kernels, once per installation",
         "",
     ),
@@ -174,7 +174,7 @@ COMMANDS: dict[str, Command | Group] = {
         "--force",
     ),
     "completion": Command(
-        "cli.completion:completion",
+        "cli.installation:completion",
         "print a script for shell completion: eval it in ~/.bashrc or ~/.zshrc",
         "bash",
     ),

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from graph_slam_ros.cli import arguments, console
-from graph_slam_ros.cli.results import draw, suggest_next
+from graph_slam_ros.cli.evaluate import draw, suggest_next
 from graph_slam_ros.cli.usage import CommandParser
 from graph_slam_ros.errors import GraphSlamError
 

@@ -1,15 +1,18 @@
-"""The command ``completion``: a script for bash or zsh that completes commands, options and their choices.
+"""The commands on what is installed: ``params``, ``warmup``, ``completion``.
 
-The script is made from the parser, and does not start Python while the user types.
+The script of ``completion`` is made from the parser, and does not start Python while the user types.
 """
 
 import argparse
+import fnmatch
 import shlex
 from collections.abc import Iterator
 
 from graph_slam_ros.cli import console
-from graph_slam_ros.cli.parser import parser
 from graph_slam_ros.cli.usage import CommandParser
+from graph_slam_ros.config.config import parameters
+from graph_slam_ros.config.parameter import Parameter
+from graph_slam_ros.errors import GraphSlamError
 
 _SCRIPT = """\
 _graph_slam() {
@@ -36,6 +39,60 @@ complete -o bashdefault -o default -F _graph_slam graph_slam
 _ZSH = "autoload -U +X compinit && compinit -u\nautoload -U +X bashcompinit && bashcompinit\n"
 
 
+def params_options(sub: CommandParser) -> None:
+    """Add the options of ``params``."""
+    about = "part of a name or of its help, or a name with * (default: all)"
+    sub.add_argument("pattern", nargs="?", default="", metavar="PATTERN", help=about)
+
+
+def params(args: argparse.Namespace) -> int:
+    """List the parameters whose name or meaning matches a pattern."""
+    found = [p for p in parameters() if _matches(p, args.pattern)]
+    if not found:
+        raise GraphSlamError(f"no parameter matches {args.pattern!r} (without a pattern all are listed)")
+    for p in found:
+        console.show(*_lines(p))
+    console.then(f"set one with --set {found[0].name}={_word(found[0].default)}, or in a parameter file (--config)")
+    return console.DONE
+
+
+def _matches(p: Parameter, pattern: str) -> bool:
+    """Match by the name, with * and ?; a plain word also matches within the name or the meaning."""
+    word = pattern.lower()
+    return fnmatch.fnmatchcase(p.name, word) or word in p.name or word in p.meaning.lower()
+
+
+def _lines(p: Parameter) -> Iterator[str]:
+    unit = f" {p.unit}" if p.unit else ""
+    limits = ""
+    if p.choices:
+        limits = f"one of {', '.join(p.choices)}"
+    elif p.low is not None or p.high is not None:
+        limits = f"in {p.range_text()}"
+    when = "may change at any time" if p.live else "read at the start"
+    yield f"{p.name} = {_word(p.default)}{unit}   ({'; '.join(filter(None, (limits, when)))})"
+    yield f"    {p.meaning}"
+
+
+def _word(default: object) -> str:
+    if isinstance(default, bool):
+        return str(default).lower()
+    return f"{default:g}" if isinstance(default, float) else str(default) or '""'
+
+
+def warmup_options(_: CommandParser) -> None:
+    """Add no option."""
+
+
+def warmup(args: argparse.Namespace) -> int:
+    """Compile the kernels."""
+    from graph_slam_ros.warmup import warmup as compiled
+
+    console.warn(f"kernels ready after {compiled():.1f} s")
+    console.then(console.command("info", "RECORDING"))
+    return console.DONE
+
+
 def completion_options(sub: CommandParser) -> None:
     """Add the options of ``completion``."""
     sub.add_argument("shell", choices=("bash", "zsh"), help='shell; use: eval "$(graph_slam completion bash)"')
@@ -43,6 +100,8 @@ def completion_options(sub: CommandParser) -> None:
 
 def completion(args: argparse.Namespace) -> int:
     """Print the script."""
+    from graph_slam_ros.cli.parser import parser
+
     console.show(*((_ZSH if args.shell == "zsh" else "") + script(parser())).splitlines())
     return console.DONE
 
