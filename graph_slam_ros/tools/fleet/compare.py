@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.tools.fleet.table import read_table
+from graph_slam_ros.tools.fleet.store import read_table
 
 METRICS = ("rmse_m", "rpe_m_per_m", "angle_rad", "map_rmse_m", "nees", "cpu_s", "memory_mib")
 _SHORT = {"rmse": "rmse_m", "rpe": "rpe_m_per_m", "angle": "angle_rad", "map_rmse": "map_rmse_m", "cpu": "cpu_s"}

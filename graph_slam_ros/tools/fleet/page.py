@@ -36,13 +36,10 @@ def write_page(folder: Path, rows: Sequence[Mapping[str, Any]]) -> Path:
     failed = sum(row["state"] == "failed" for row in rows)
     incomplete = sum(row["state"] == "incomplete" for row in rows)
     head = f"{len(rows)} runs: {len(rows) - failed - incomplete} done, {incomplete} incomplete, {failed} failed"
-    settings = sorted({row["setting"] for row in rows})
     parts = [
         "<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content='width=device-width'>",
         "<meta http-equiv=Content-Security-Policy content=\"default-src 'none'; style-src 'unsafe-inline'\">",
         f"<title>{escape(folder.name)}</title><style>{style()}{_STYLE}</style><main><h1>{escape(folder.name)}</h1><p>{head}.</p>",
-        "<h2>Settings</h2>",
-        _table(["setting", "runs", "error [m], mean", "errors, sorted"], [_setting(s, rows) for s in settings]),
         "<h2>Runs, the worst first</h2>",
         _more(folder, rows),
         _table(
@@ -72,13 +69,6 @@ def _badness(row: Mapping[str, Any]) -> tuple[int, float, str, str]:
     states = {"failed": 0, "incomplete": 1}
     error = row.get("rmse_m")
     return states.get(row["state"], 2), -(error or 0.0), row["recording"], row["setting"]
-
-
-def _setting(setting: str, rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    errors = sorted(row["rmse_m"] for row in rows if row["setting"] == setting and row.get("rmse_m") is not None)
-    mean = f"{sum(errors) / len(errors):.3f}" if errors else ""
-    count = sum(row["setting"] == setting for row in rows)
-    return [f"<td>{escape(setting)}", _number(str(count)), _number(mean), f"<td>{_sparkline(errors)}"]
 
 
 def _run(folder: Path, row: Mapping[str, Any]) -> list[str]:

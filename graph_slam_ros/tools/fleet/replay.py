@@ -13,8 +13,7 @@ from graph_slam_ros.formats.parameters import parse_setting, read_parameters
 from graph_slam_ros.tools.fleet.engine import Progress, connected, run_jobs
 from graph_slam_ros.tools.fleet.job import Job
 from graph_slam_ros.tools.fleet.recordings import Source, find_sources
-from graph_slam_ros.tools.fleet.store import JOBS, REPORT, Row, Store, job_key
-from graph_slam_ros.tools.fleet.table import write_table
+from graph_slam_ros.tools.fleet.store import JOBS, REPORT, Row, Store, job_key, write_table
 
 DEFAULTS = "defaults"
 

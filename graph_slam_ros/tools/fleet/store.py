@@ -1,4 +1,4 @@
-"""The folder of a fleet: one folder for each job, written under another name first, and a table of all.
+"""The folder of a fleet: one folder for each job, written under another name first, and a table of all, as Parquet.
 
 fleet.json         what this folder is
 jobs/KEY/          row.json, and run/ as replay writes it; report.html
@@ -13,9 +13,12 @@ import os
 import platform
 import re
 import shutil
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
 
 from graph_slam_ros import __version__
 from graph_slam_ros.errors import GraphSlamError
@@ -26,6 +29,10 @@ MARK, FORMAT = "fleet.json", "graph_slam_ros fleet"
 JOBS, ROW, RUN, REPORT, TABLE = "jobs", "row.json", "run", "report.html", "table.parquet"
 ERRORS = "errors_m"
 """Errors of parts of a drive, in its order. The page draws them."""
+_ERROR = ("rmse_m", "rpe_m_per_m", "nees")
+_FIRST = ("recording", "setting", "state", *_ERROR, "keyframes", "cpu_s", "memory_mib", "reason")
+_TEXTS = {"key", "recording", "setting", "url", "truth", "state", "reason", "worker", "map_hash", "inputs"}
+_NO_COLUMNS = {"retry", ERRORS, *_FIRST}
 _ADDRESS = re.compile(r"[a-z][a-z0-9+.-]+:/")  # as Path leaves s3://
 
 Row = dict[str, Any]
@@ -123,3 +130,34 @@ def keep(folder: Path, key: str, made: Path, row: Row) -> None:
         if not (target / ROW).exists():
             raise
         shutil.rmtree(made, ignore_errors=True)
+
+
+# -- the table ---------------------------------------------------------------------------------------------------------
+
+
+def write_table(folder: Path, rows: Sequence[Row]) -> None:
+    """Write the rows as Parquet, by recording and setting; columns that a row lacks are null."""
+    names = [*_FIRST, *sorted({name for row in rows for name in row} - _NO_COLUMNS)]
+    table = pa.table({name: pa.array([row.get(name) for row in rows], _type(rows, name)) for name in names})
+    sink = pa.BufferOutputStream()
+    pq.write_table(table.sort_by([(name, "ascending") for name in ("recording", "setting")]), sink)
+    write_whole(folder / TABLE, sink.getvalue().to_pybytes())
+
+
+def _type(rows: Sequence[Row], name: str) -> pa.DataType:
+    if name in _TEXTS:
+        return pa.string()
+    values = [row[name] for row in rows if row.get(name) is not None]
+    return pa.int64() if values and all(isinstance(v, int) for v in values) else pa.float64()
+
+
+def read_table(folder: Path) -> list[Row]:
+    """Return the rows of a fleet's table. Raises GraphSlamError where there is none."""
+    file = folder / TABLE
+    if not file.is_file():
+        raise GraphSlamError(f"{folder}: no {TABLE} in it: graph_slam fleet replay writes it")
+    try:
+        rows: list[Row] = pq.read_table(file).to_pylist()
+    except (pa.ArrowException, OSError) as error:
+        raise GraphSlamError(" ".join(f"{file}: {error}".split())) from None
+    return rows

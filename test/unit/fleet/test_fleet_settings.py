@@ -14,8 +14,7 @@ from graph_slam_ros.tools.fleet.compare import compare, markdown, parse_limit
 from graph_slam_ros.tools.fleet.page import write_page
 from graph_slam_ros.tools.fleet.recordings import find_sources, local_copy
 from graph_slam_ros.tools.fleet.replay import settings_of, truth_of
-from graph_slam_ros.tools.fleet.store import job_key
-from graph_slam_ros.tools.fleet.table import write_table
+from graph_slam_ros.tools.fleet.store import job_key, write_table
 
 
 def test_settings_are_the_product_of_files_and_values(tmp_path):
