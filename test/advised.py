@@ -8,8 +8,7 @@ from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.slam import Config
 from graph_slam_ros.slam.weak_direction import position_covariance
 from graph_slam_ros.solver import Solver
-from graph_slam_ros.tools.advise.additions import NEW, expected, stored_values
-from graph_slam_ros.tools.advise.advice import KINDS, Advisor
+from graph_slam_ros.tools.advise.advice import KINDS, NEW, Advisor, expected, stored_values
 from graph_slam_ros.tools.advise.weakness import HEADING, Weakness
 from graph_slam_ros.tools.simulation import measurements, simulate
 

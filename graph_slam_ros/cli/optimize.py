@@ -79,7 +79,7 @@ def optimize(args: argparse.Namespace) -> int:
     graph, settings = file.graph, _settings(args, file.graph)
     solution = solve(file, settings, init=args.init)
     solver, report, start = solution.solver, solution.report, solution.start
-    certified = later("tools.certificate.command", "certified")
+    certified = later("tools.certificate.certify", "certified")
     proof, code, told = certified(solution) if args.certify else (None, console.DONE, "")
     if args.json:
         proved = {"certificate": proof.as_dict()} if proof else {}

@@ -1,8 +1,8 @@
 """The certificate that an estimate is the global optimum: SE-Sync's dual certificate for graphs of relative poses.
 
 * ``synchronization``: the problem it is about, which is chordal and isotropic,
-* ``polish``: from the solver's estimate to a critical point of that problem,
-* ``spectrum``: the smallest eigenvalue of the certificate matrix there,
+* ``spectrum``: from the solver's estimate to a critical point of that problem, and the smallest eigenvalue of the
+  certificate matrix there,
 * ``certify``: when it applies, what it says, and how far the two optima are apart.
 
 D. M. Rosen, L. Carlone, A. S. Bandeira, J. J. Leonard, "SE-Sync: a certifiably correct algorithm for synchronization

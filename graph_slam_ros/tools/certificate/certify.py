@@ -9,12 +9,12 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
+from graph_slam_ros.cli import console
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import POSE_PRIOR, POSE_PRIOR_3D, SE2, SE3, Graph
 from graph_slam_ros.optimization import Solution
 from graph_slam_ros.solver import Solver
-from graph_slam_ros.tools.certificate.polish import polish
-from graph_slam_ros.tools.certificate.spectrum import least_eigenvalue
+from graph_slam_ros.tools.certificate.spectrum import least_eigenvalue, polish
 from graph_slam_ros.tools.certificate.synchronization import RELATIVE, Edges, Poses, Synchronization
 from graph_slam_ros.typing import Array
 
@@ -227,3 +227,12 @@ def _local(a: Poses, b: Poses) -> Array:
     if moved.shape[1] == 2:
         return np.hstack([moved, np.arctan2(turn[:, 1, 0], turn[:, 0, 0])[:, None]])
     return np.hstack([moved, Rotation.from_matrix(turn).as_rotvec()])
+
+
+def certified(solution: Solution) -> tuple[Certificate, int, str]:
+    """Return the certificate of a solution, its exit code, and its lines for a person, for ``optimize``."""
+    found = certify(solution)
+    codes = {CERTIFIED: console.DONE, NOT_CERTIFIED: console.NOT_CERTIFIED}
+    again = found.verdict == NOT_CERTIFIED and solution.start != "chordal"
+    more = "\nanother start may lead to a lower optimum: --init chordal" if again else ""
+    return found, codes.get(found.verdict, console.NOT_APPLICABLE), f"{found}{more}"

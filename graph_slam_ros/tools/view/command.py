@@ -26,8 +26,7 @@ def view(args: argparse.Namespace) -> int:
     if not all(map(importlib.util.find_spec, _NEEDS)):
         raise GraphSlamError("view serves its page with Starlette and uvicorn: pip install 'graph_slam_ros[view]'")
     from graph_slam_ros.tools.report.contents import read_contents
-    from graph_slam_ros.tools.view.guard import Access
-    from graph_slam_ros.tools.view.server import application, listening, page_of, server
+    from graph_slam_ros.tools.view.server import Access, application, listening, page_of, server
     from graph_slam_ros.tools.view.workbench import Workbench
     from graph_slam_ros.warmup import compile_all
 

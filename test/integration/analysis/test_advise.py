@@ -12,8 +12,7 @@ from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.runs.recorder import RunRecorder
 from graph_slam_ros.runs.restore import freeze, map_of
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
-from graph_slam_ros.tools.advise.additions import CLOSURE, NEW, stored_values
-from graph_slam_ros.tools.advise.advice import KINDS, Advisor
+from graph_slam_ros.tools.advise.advice import CLOSURE, KINDS, NEW, Advisor, stored_values
 from graph_slam_ros.tools.advise.weakness import Weakness
 
 S = 1_000_000_000

@@ -28,8 +28,7 @@ from graph_slam_ros.graph import (
 from graph_slam_ros.lie import se2, se3
 from graph_slam_ros.solver import Settings
 from graph_slam_ros.tools.certificate import CERTIFIED, DOES_NOT_APPLY, NOT_CERTIFIED
-from graph_slam_ros.tools.certificate.polish import polish
-from graph_slam_ros.tools.certificate.spectrum import least_eigenvalue
+from graph_slam_ros.tools.certificate.spectrum import least_eigenvalue, polish
 from graph_slam_ros.tools.certificate.synchronization import Edges, Poses, Synchronization
 from graph_slam_ros.tools.simulation import write_graph
 

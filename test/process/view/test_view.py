@@ -30,9 +30,8 @@ from graph_slam_ros.tools.report.contents import read_contents
 pytest.importorskip("starlette", reason="view is tested with its extra: pip install 'graph_slam_ros[view]'")
 pytest.importorskip("uvicorn", reason="view is tested with its extra: pip install 'graph_slam_ros[view]'")
 
-from graph_slam_ros.tools.view import guard, server
-from graph_slam_ros.tools.view.guard import Access
-from graph_slam_ros.tools.view.server import page_of
+from graph_slam_ros.tools.view import server
+from graph_slam_ros.tools.view.server import Access, page_of
 from graph_slam_ros.tools.view.workbench import Workbench
 
 
@@ -191,14 +190,14 @@ def test_X7_large_bodies_and_heads_are_refused(attacked):
         own = f"origin: http://127.0.0.1:{attacked.port}", "content-type: application/json"
         return "\r\n".join(["POST /solve HTTP/1.1", *known, *own, *lines, "", ""]).encode()
 
-    large = b"x" * (guard.MOST_BYTES + 1)
+    large = b"x" * (server.MOST_BYTES + 1)
     assert asked(attacked, "POST", "/solve", large)[0] == 413
     assert b" 413 " in raw(attacked, head("content-length: 999999999999", "connection: close"))
     chunks = [b"10000\r\n" + 65536 * b"x" + b"\r\n" for _ in range(17)]
     found = raw(attacked, head("transfer-encoding: chunked", "connection: close"), *chunks, b"0\r\n\r\n")
     assert found == b"" or b" 413 " in found
     assert b" 400 " in raw(attacked, b"GET / HTTP/1.1\r\nx: " + 40_000 * b"x")
-    assert asked(attacked, "POST", "/solve", b"x" * guard.MOST_BYTES)[0] == 422
+    assert asked(attacked, "POST", "/solve", b"x" * server.MOST_BYTES)[0] == 422
     assert asked(attacked)[0] == 200
 
 
