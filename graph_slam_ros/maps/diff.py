@@ -11,7 +11,7 @@ import numpy as np
 
 from graph_slam_ros.edge_tags import tag_of
 from graph_slam_ros.maps.alignment import Alignment, align, as_they_are, laid_on, positions
-from graph_slam_ros.maps.compatibility import merge_trouble, refuse_other_space, shared_landmarks
+from graph_slam_ros.maps.merge import merge_trouble, refuse_other_space, shared_landmarks
 from graph_slam_ros.runs.restore import restored
 from graph_slam_ros.runs.whole_path import WholePath
 from graph_slam_ros.slam import GraphSlam

@@ -11,8 +11,7 @@ from scipy.special import gammainc
 
 from graph_slam_ros.analysis.consistency import nees_of_each
 from graph_slam_ros.analysis.evaluation import Scores, dimensions_of, evaluate, input_topics, scored_drive
-from graph_slam_ros.analysis.explain import REASONS, STATES, landmark_lines
-from graph_slam_ros.analysis.explain_condensed import statements_of_place
+from graph_slam_ros.analysis.explain import REASONS, STATES, landmark_lines, statements_of_place
 from graph_slam_ros.analysis.path_error import interpolated
 from graph_slam_ros.analysis.trajectories import Truth, read_truth
 from graph_slam_ros.analysis.what_if import SavedGraph
@@ -26,10 +25,9 @@ from graph_slam_ros.runs.tables import INPUT_COLUMNS
 from graph_slam_ros.runs.trajectory import read_covariances, read_rows
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict
 from graph_slam_ros.tools.report import drive, verdict
-from graph_slam_ros.tools.report.groups import closure_groups
 from graph_slam_ros.tools.report.packing import Packing, shown
 from graph_slam_ros.tools.report.places import floor_plan, keyframe_paths, outside, paths
-from graph_slam_ros.tools.report.sentences import effects, sentences
+from graph_slam_ros.tools.report.sentences import closure_groups, effects, sentences
 
 _BINS, _SHOWN = 60, 15
 _CLOCK_NS = 10**18  # stamps before are no dates

@@ -1,4 +1,4 @@
-"""The sentences of ``explain`` for all edges of a run: its templates, and the numbers that fill them in."""
+"""What each edge of a run does to it, and what ``explain`` says of it: its templates, and the numbers to fill in."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -8,15 +8,20 @@ import numpy as np
 
 from graph_slam_ros.analysis import measurement_text
 from graph_slam_ros.analysis.explain import change_text, ends_of, remedy, statements, title
-from graph_slam_ros.analysis.influence import Influences
-from graph_slam_ros.analysis.what_if import SavedGraph
+from graph_slam_ros.analysis.what_if import Influences, SavedGraph
 from graph_slam_ros.chi_square import quantile
+from graph_slam_ros.errors import GaugeError, SingularError
 from graph_slam_ros.graph.place import LABEL as PLACES
 from graph_slam_ros.runs.ledger_file import Entry
 from graph_slam_ros.slam.edits import HAND_MADE
 from graph_slam_ros.slam.robust.ledger import FINAL
 from graph_slam_ros.tools.report.packing import shown
 from graph_slam_ros.typing import Array
+
+Group = dict[str, Any]
+_NEAR = 10  # keyframes between two closures of one group, at both ends
+_MOST = 8  # groups that are solved without
+_MOST_EDGES = 2000  # of a class, above which groups are not what is wrong
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,3 +138,53 @@ def _what_if(run: SavedGraph, e: Entry, ends: Sequence[str], is_known: bool, is_
         f"it were {which}, to first order: cost {{cost:+.4g}}, the last pose moves by {{last_m:.3f}} m,"
         f" {ends[end]} by {{end_m:.3f}} m; {exactly}"
     )
+
+
+def closure_groups(run: SavedGraph) -> list[Group]:
+    """Groups of accepted closures that join the same parts of the drive; none where nothing contradicts any closure.
+
+    Closures of one group agree with one another. If they are wrong together, as where two aisles look alike, no
+    statistic of the run shows it. A person who sees the map without each group knows.
+
+    Returns
+    -------
+    of each group ``edges``, ``ends`` (first and last keyframe at either end), ``chi2`` with and without it, ``most``
+    (the keyframe that moves farthest without it, and by how much [m]); the last two are None where nothing else
+    determines the map without it
+    """
+    closures = [e for e in run.entries if e.label == "closures" and e.verdict and len(e.vertices) == 2]
+    inside = [e for e in closures if e.is_in]
+    if len(inside) == len(closures) or len(inside) > _MOST_EDGES:
+        return []
+    several = sorted(_joined(run, inside), key=len, reverse=True)[:_MOST]
+    return [_without(run, group) for group in sorted(several, key=lambda group: _ends(run, group[0]))]
+
+
+def _ends(run: SavedGraph, e: Entry) -> tuple[int, int]:
+    """The numbers of its two keyframes, the earlier first."""
+    a, b = sorted(run.keyframe(vertex) or 0 for vertex in e.vertices)
+    return a, b
+
+
+def _joined(run: SavedGraph, closures: Sequence[Entry]) -> list[list[Entry]]:
+    groups = list[list[Entry]]()
+    for e in sorted(closures, key=lambda e: _ends(run, e)):
+        a, b = _ends(run, e)
+        near = (group for group in groups for c, d in (_ends(run, group[-1]),) if max(abs(a - c), abs(b - d)) <= _NEAR)
+        group = next(near, None)
+        if group is None:
+            groups.append([e])
+        else:
+            group.append(e)
+    return groups
+
+
+def _without(run: SavedGraph, group: Sequence[Entry]) -> Group:
+    edges, ends = [e.edge for e in group], [_ends(run, e) for e in group]
+    out: Group = {"edges": edges, "ends": [[f(one[k] for one in ends) for f in (min, max)] for k in (0, 1)]}
+    try:
+        moved = run.moved(run.solve(edges))
+    except (GaugeError, SingularError):
+        return out | {"chi2": None, "most": None}
+    chi2 = [moved.before.chi2_final, moved.after.chi2_final]
+    return out | {"chi2": chi2, "most": [run.keyframe(moved.most[0]), moved.most[1]]}

@@ -60,10 +60,12 @@ def checked(name: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
 
     def with_name(function: Callable[..., Any]) -> Callable[..., Any]:
         known = options_of(function)
+        others = signature(function).parameters.keys() - known.keys()
 
         @functools.wraps(function)
         def call(*given: Any, **values: Any) -> Any:
-            return function(*given, **filled(name, known, values))
+            named = {key: values.pop(key) for key in others & values.keys()}
+            return function(*given, **named, **filled(name, known, values))
 
         return call
 
