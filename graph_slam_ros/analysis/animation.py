@@ -48,6 +48,8 @@ def animate_run(
 ) -> list[str]:
     """Repeat a run's drive and draw the estimate of each moment into a GIF, from above.
 
+    Raises GraphSlamError: a file that is missing or unreadable, or that cannot be written.
+
     Dead reckoning is black and begins where the estimate does; the estimate is red; truth is blue, laid on the whole
     path. A loop closure is seen as the moment at which the red path moves. The last frame is the solved graph.
 
@@ -60,11 +62,6 @@ def animate_run(
     Returns
     -------
     what of the drive could not be read, a line each
-
-    Raises
-    ------
-    GraphSlamError
-        A file that is missing or unreadable, or that cannot be written.
     """
     if out_gif.suffix != ".gif":
         raise GraphSlamError(f"{out_gif}: an animation is a .gif file")

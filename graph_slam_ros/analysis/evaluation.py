@@ -210,10 +210,7 @@ def input_topics(run: Path) -> set[str]:
 def scored_drive(run: Path, truth: Trajectory | None, estimate: str = "") -> Drive:
     """The last drive of a run that overlaps with the truth in time; without truth, the last drive.
 
-    Raises
-    ------
-    GraphSlamError
-        The path of the run cannot be read.
+    Raises GraphSlamError: the path of the run cannot be read.
     """
     drives = _drives(run)
     is_split = all(one["sighting"] for one in drives[1:])  # else an older version has condensed the begin of one

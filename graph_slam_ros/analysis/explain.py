@@ -68,10 +68,7 @@ _CHANCE = 1e-4  # that so many would all stay below that, were their noise as it
 def explain_run(run: SavedGraph) -> Iterator[str]:
     """Count the edges by class, verdict and reason, list the worst, and warn of gates that reject nothing.
 
-    Raises
-    ------
-    FormatError
-        The summary of the run is invalid.
+    Raises FormatError: the summary of the run is invalid.
     """
     entries = run.entries
     judged = [entry for entry in entries if entry.verdict]
@@ -161,12 +158,9 @@ def _rival(folder: Path, rival: Mapping[str, Any]) -> str:
 def explain_edge(run: SavedGraph, which: str) -> Iterator[str]:
     """Explain an edge, by id, or the observations of a landmark, by name.
 
-    If the name of a landmark is a number, write ``landmark:7``; ``7`` is edge 7.
+    Raises GraphSlamError: there is no such edge or landmark.
 
-    Raises
-    ------
-    GraphSlamError
-        There is no such edge or landmark.
+    If the name of a landmark is a number, write ``landmark:7``; ``7`` is edge 7.
     """
     return _edge(run, integer(which)) if which.isdecimal() else _landmark(run, which.removeprefix("landmark:"))
 

@@ -78,15 +78,12 @@ class Matched:
 def path_error(estimate: Trajectory, truth: Trajectory, dimensions: int = 2, *, align: bool = True) -> PathError:
     """Errors of one path.
 
+    Raises GraphSlamError: fewer than two common stamps, or positions that leave the alignment open.
+
     Parameters
     ----------
     dimensions : 2: height, roll and pitch of both are left out
     align : lay the path on the truth first; without, both are taken to be in one frame
-
-    Raises
-    ------
-    GraphSlamError
-        Fewer than two common stamps, or positions that leave the alignment open.
     """
     found = matched(estimate, truth, dimensions, align=align)
     path, reference = found.path, found.truth
@@ -116,10 +113,7 @@ def matched(estimate: Trajectory, truth: Trajectory, dimensions: int = 2, *, ali
 def associate(estimate: Trajectory, truth: Trajectory) -> tuple[Trajectory, Trajectory]:
     """The poses of both that belong together: nearest stamps, within 0.05 s, none before or after the truth.
 
-    Raises
-    ------
-    GraphSlamError
-        Fewer than two.
+    Raises GraphSlamError: fewer than two.
     """
     stamps_s, known_s = estimate.stamps_s, truth.stamps_s
     after = np.minimum(np.clip(np.searchsorted(known_s, stamps_s), 1, None), len(known_s) - 1)
@@ -140,13 +134,10 @@ def associate(estimate: Trajectory, truth: Trajectory) -> tuple[Trajectory, Traj
 def alignment(points: Array, reference: Array) -> se3.Pose:
     """The rigid motion that takes points (n, 2) or (n, 3) nearest to their reference.
 
+    Raises GraphSlamError: all points are in one place, or in space on a line.
+
     Of the plane where they have two coordinates: a rotation there cannot turn into the mirror image that turning over
     in space would allow.
-
-    Raises
-    ------
-    GraphSlamError
-        All points are in one place, or in space on a line.
     """
     dimensions = points.shape[1]
     moved = laid_on(PLANAR if dimensions == 2 else SPATIAL, reference, points)

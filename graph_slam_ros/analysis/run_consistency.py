@@ -37,17 +37,14 @@ _All = tuple[Nees | None, Nees | None, Nees | None]  # of the last pose, of pose
 class RelativeCovariances:
     """Covariances in the frame of a keyframe, or in the plane of the line from one keyframe's position to another's.
 
+    Raises GaugeError, SingularError from its functions, as of ``Solver.joint_marginal``.
+
     A run's covariances are relative to its first pose. What an estimate has in common with another frame is no error
     there; it is known from joint covariances of the graph.
 
     Parameters
     ----------
     frame : numbers of the keyframes: one, or two in the plane
-
-    Raises
-    ------
-    GaugeError, SingularError
-        From its functions, as of ``Solver.joint_marginal``.
     """
 
     def __init__(self, saved: SavedGraph, frame: tuple[int, ...]) -> None:

@@ -65,7 +65,7 @@ class Truth:
 
 
 def read_truth(truth: str | Path, topic: str = "", not_these: Collection[str] = ()) -> Truth:
-    """True poses and landmarks.
+    """True poses and landmarks. Raises GraphSlamError: no such file, or no such topic; those that exist are named.
 
     Parameters
     ----------
@@ -73,11 +73,6 @@ def read_truth(truth: str | Path, topic: str = "", not_these: Collection[str] = 
     topic : of the recording; of a topic of transforms also ``TOPIC:PARENT:CHILD``, the names of two frames.
         Default: ``/ground_truth``, else the only topic that can be the truth
     not_these : topics that are not chosen by default
-
-    Raises
-    ------
-    GraphSlamError
-        No such file, or no such topic; those that exist are named.
     """
     path, named = _file_and_topic(str(truth))
     topic = topic or named

@@ -224,6 +224,8 @@ class Influence:
 class SavedGraph:
     """The graph of a run, and the verdicts on all its edges, rejected ones included.
 
+    Raises GraphSlamError: there is no map, it cannot be read, or it cannot be solved.
+
     Parameters
     ----------
     losses : a line is added for each part of the run that could not be read
@@ -239,11 +241,6 @@ class SavedGraph:
     edits : by hand, in order
     landmarks : vertex of each landmark that an accepted edge is about, by its name
     held : vertices of a frozen map
-
-    Raises
-    ------
-    GraphSlamError
-        There is no map, it cannot be read, or it cannot be solved.
     """
 
     def __init__(self, folder: Path, losses: list[str]) -> None:
@@ -337,16 +334,13 @@ class SavedGraph:
     def problem(self, without: Iterable[int] = (), let_in: Sequence[int] = (), loss: Loss | None = None) -> Solver:
         """The problem that a what-if solves, at the saved estimate.
 
+        Raises GraphSlamError: there is no such edge, or one is both taken out and let in.
+
         A landmark without edges is left out. A keyframe without edges is an error.
 
         Parameters
         ----------
         loss : robust loss of all edges that may be outliers, instead of the run's
-
-        Raises
-        ------
-        GraphSlamError
-            There is no such edge, or one is both taken out and let in.
         """
         gone, anew = {self._row(e) for e in without}, list(dict.fromkeys(map(self._row, let_in)))
         if gone & set(anew):

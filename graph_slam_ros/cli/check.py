@@ -74,10 +74,7 @@ def check(args: argparse.Namespace) -> int:
 def settings_of(args: argparse.Namespace) -> dict[str, Any]:
     """The parameters of ``--config`` and ``--set``, by dotted name.
 
-    Raises
-    ------
-    GraphSlamError
-        The file or a setting cannot be read.
+    Raises GraphSlamError: the file or a setting cannot be read.
     """
     settings = dict(flatten(read_parameters(args.config, follow=True))) if args.config else {}
     return settings | dict(parse_setting(text) for text in args.set)

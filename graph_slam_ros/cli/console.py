@@ -53,11 +53,8 @@ def command(*words: object) -> str:
 def check_file(*paths: Path | None, force: bool, source: Path | None = None) -> None:
     """Refuse to replace a file, before anything is computed.
 
-    Raises
-    ------
-    GraphSlamError
-        A file exists and is not to be replaced, what has its name is not a regular file, or it is the source that is
-        about to be read.
+    Raises GraphSlamError: a file exists and is not to be replaced, what has its name is not a regular file, or it is
+    the source that is about to be read.
     """
     for path in paths:
         if path is not None and os.path.lexists(path):

@@ -143,12 +143,9 @@ def _shown(lines: Iterable[str]) -> Iterator[str]:
 def diff(a: Path, b: Path, losses: list[str]) -> Difference:
     """Compare the maps of two runs. What could not be read of them is added to ``losses``.
 
-    Keyframes that were condensed count, at their present poses. Their edges do not: what they measured is in places.
+    Raises GraphSlamError: one of them has no map, or another number of dimensions.
 
-    Raises
-    ------
-    GraphSlamError
-        One of them has no map, or another number of dimensions.
+    Keyframes that were condensed count, at their present poses. Their edges do not: what they measured is in places.
     """
     one, two = (restored(folder, losses) for folder in (a, b))
     refuse_other_space(one, two, a, b)

@@ -123,10 +123,7 @@ class Edited:
 def source_hash(folder: Path) -> str:
     """The hash of a run that a plan names: of its configuration, its journal and its map.
 
-    Raises
-    ------
-    RunError
-        It is no run, or a file of it cannot be read.
+    Raises RunError: it is no run, or a file of it cannot be read.
     """
     check_run(folder)
     digest = hashlib.sha256()
@@ -160,13 +157,7 @@ def write_empty_plan(folder: Path, file: Path) -> None:
 
 
 def read_plan(file: Path) -> Plan:
-    """Read a plan.
-
-    Raises
-    ------
-    FormatError
-        It is not a plan; the text names the edit and the key.
-    """
+    """Read a plan. Raises FormatError: it is not a plan; the text names the edit and the key."""
     try:
         if file.stat().st_size > _MOST_BYTES:
             raise FormatError(f"{file}: larger than {_MOST_BYTES} bytes: not read")
@@ -236,15 +227,12 @@ def _edits(several: Sequence[Any]) -> tuple[Edit, ...]:
 def edit(folder: Path, plan: Plan, out: Path | None) -> Edited:
     """Apply a plan to the map of a run, solve everything, and write it as another run.
 
+    Raises GraphSlamError: the plan is for another run, has no edits, or one cannot be applied; or the map cannot be
+    solved with it. Nothing was written.
+
     Parameters
     ----------
     out : nothing may be there; None: nothing is written
-
-    Raises
-    ------
-    GraphSlamError
-        The plan is for another run, has no edits, or one cannot be applied; or the map cannot be solved with it.
-        Nothing was written.
     """
     took = stopwatch()
     if out is not None:

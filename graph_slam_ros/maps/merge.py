@@ -55,10 +55,7 @@ def shared_landmarks(one: GraphSlam, two: GraphSlam) -> list[str]:
 def aligned_for_merge(one: GraphSlam, two: GraphSlam, a: Path, b: Path) -> tuple[list[str], Alignment]:
     """Return the landmarks that both maps share, and how the second map lies on the first.
 
-    Raises
-    ------
-    GraphSlamError
-        They cannot become one map.
+    Raises GraphSlamError: they cannot become one map.
     """
     _refuse_other_datum(one, two, a, b)
     _refuse_same_drive(one, two, a, b)
@@ -148,10 +145,7 @@ class Merged:
 def merge(a: Path, b: Path, out: Path, *, force: bool = False) -> Merged:
     """Write the run folder of one map of two runs, with the configuration of the first.
 
-    Raises
-    ------
-    GraphSlamError
-        They cannot be laid on one another.
+    Raises GraphSlamError: they cannot be laid on one another.
     """
     took = stopwatch()
     for folder in (a, b):

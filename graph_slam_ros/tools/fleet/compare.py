@@ -80,10 +80,7 @@ class Comparison:
 def parse_limit(text: str) -> Limit:
     """Return the limit of ``rmse>1.02x`` (ratio) or ``rmse_m>0.3`` (mean).
 
-    Raises
-    ------
-    GraphSlamError
-        It is not such a limit.
+    Raises GraphSlamError: it is not such a limit.
     """
     found = _LIMIT.fullmatch(text)
     if found is None:
@@ -95,10 +92,7 @@ def parse_limit(text: str) -> Limit:
 def compare(old: Path, new: Path, limits: Sequence[Limit] = ()) -> Comparison:
     """Compare the tables of two fleets.
 
-    Raises
-    ------
-    GraphSlamError
-        A folder without a table, nothing in common, or a limit on a metric that no row has.
+    Raises GraphSlamError: a folder without a table, nothing in common, or a limit on a metric that no row has.
     """
     before, after = _by_pair(old, new)
     common = sorted(before.keys() & after.keys())

@@ -35,10 +35,8 @@ Progress = Callable[[Iterable[Any], int], Iterable[Any]]
 def connected(scheduler: str, count: int) -> Iterator[Client]:
     """Connect to the workers of a scheduler; where its address is empty, start some here (0: one a core), and end them.
 
-    Raises
-    ------
-    GraphSlamError
-        The scheduler cannot be reached, has no worker, or its workers have another version of this package.
+    Raises GraphSlamError: the scheduler cannot be reached, has no worker, or its workers have another version of this
+    package.
     """
     with dask.config.set(_SETTINGS), contextlib.ExitStack() as stack:
         if scheduler:

@@ -36,14 +36,11 @@ class Source:
 def find_sources(texts: Iterable[str]) -> list[Source]:
     """Return the recordings that are named, the largest first.
 
+    Raises GraphSlamError: nothing is there, or no recording in it.
+
     Parameters
     ----------
     texts : files, folders of a recording, folders of recordings, or addresses (``s3://``, ``gs://``)
-
-    Raises
-    ------
-    GraphSlamError
-        Nothing is there, or no recording in it.
     """
     urls: dict[str, tuple[int, str]] = {}
     for text in texts:
@@ -108,10 +105,7 @@ def _short_names(urls: list[str]) -> dict[str, str]:
 def local_copy(url: str, folder: Path) -> Path:
     """Return where a recording can be read on this machine: itself, or a copy in ``folder``.
 
-    Raises
-    ------
-    GraphSlamError
-        It is not there, seen from this machine.
+    Raises GraphSlamError: it is not there, seen from this machine.
     """
     fs, root = url_to_fs(url)
     if not fs.exists(root):

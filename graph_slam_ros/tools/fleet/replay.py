@@ -82,10 +82,7 @@ def truth_of(pattern: str, source: Source) -> str:
 def jobs_of(fleet: Fleet) -> list[Job]:
     """Return the jobs, those of the largest recordings first.
 
-    Raises
-    ------
-    GraphSlamError
-        Nothing to replay, or a setting or a truth that cannot be used.
+    Raises GraphSlamError: nothing to replay, or a setting or a truth that cannot be used.
     """
     settings, out = settings_of(fleet.configs, fleet.settings), str(fleet.out.absolute())
     return [

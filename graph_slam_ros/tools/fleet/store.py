@@ -49,13 +49,7 @@ def job_key(identity: str, settings: Mapping[str, Any], truth: str) -> str:
 
 
 class Store:
-    """The folder of a fleet.
-
-    Raises
-    ------
-    GraphSlamError
-        The folder holds something else.
-    """
+    """The folder of a fleet. Raises GraphSlamError: the folder holds something else."""
 
     def __init__(self, folder: Path, *, new: bool = False) -> None:
         self.folder = folder
@@ -84,10 +78,7 @@ class Store:
     def locked(self) -> Iterator[None]:
         """Hold the folder against another fleet.
 
-        Raises
-        ------
-        GraphSlamError
-            Another fleet has it; its machine and process are named.
+        Raises GraphSlamError: another fleet has it; its machine and process are named.
         """
         fd = os.open(self.folder / ".lock", os.O_RDWR | os.O_CREAT, 0o644)
         try:

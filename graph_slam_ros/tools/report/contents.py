@@ -71,16 +71,14 @@ def read_contents(
 ) -> Contents:
     """Read a run.
 
+    Raises GraphSlamError: the folder is not a run; or the truth, the other run or the floor plan, which were asked for,
+    cannot be read.
+
     Parameters
     ----------
     truth, topic : as ``evaluate`` takes them
     other : another run, whose path is drawn and whose map is compared
     plan : a ``map.yaml`` of Nav2
-
-    Raises
-    ------
-    GraphSlamError
-        The folder is not a run; or the truth, the other run or the floor plan, which were asked for, cannot be read.
     """
     check_run(run)
     out = Contents(run)

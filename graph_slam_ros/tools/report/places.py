@@ -36,10 +36,7 @@ def paths(
 ) -> dict[str, Any]:
     """The paths and landmarks of a run, in the frame map; the truth is laid on them.
 
-    Raises
-    ------
-    GraphSlamError
-        A file that is missing or damaged.
+    Raises GraphSlamError: a file that is missing or damaged.
     """
     path, reckoned = keyframe_paths(run, saved)
     T_map_odom = se3.compose(tuple(path.poses[0].tolist()), se3.inverse(tuple(reckoned.poses[0].tolist())))
@@ -123,13 +120,7 @@ def _ellipses(points: Any, covariances: Any) -> Any:
 
 
 def floor_plan(file: Path) -> dict[str, Any]:
-    """The picture of a ``map.yaml`` of Nav2, and where it lies in map.
-
-    Raises
-    ------
-    GraphSlamError
-        It cannot be read.
-    """
+    """The picture of a ``map.yaml`` of Nav2, and where it lies in map. Raises GraphSlamError: it cannot be read."""
     from PIL import Image
 
     try:

@@ -56,6 +56,8 @@ def false_closures(
 ) -> Closures:
     """Draw false closures.
 
+    Raises GraphSlamError: unknown policy, too few poses, or all that can be drawn agrees with the truth.
+
     Parameters
     ----------
     truth : (n, 3) or (n, 7) true poses, in order of time
@@ -64,11 +66,6 @@ def false_closures(
         with the same measurement; ``aliased``: two stretches of the path taken for one place, so that each of its pairs
         is measured where one wrong rigid motion of the second stretch would have it, with the noise of a true closure
     group : pairs in a group
-
-    Raises
-    ------
-    GraphSlamError
-        Unknown policy, too few poses, or all that can be drawn agrees with the truth.
     """
     if policy not in POLICIES:
         raise GraphSlamError(f"false closures: {policy!r} is not one of {', '.join(POLICIES)}")

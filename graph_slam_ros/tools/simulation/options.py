@@ -75,10 +75,7 @@ def checked(name: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
 def filled(name: str, known: Mapping[str, Option], values: Mapping[str, Any]) -> dict[str, Any]:
     """All options of a world or fault: the named values; the rest have their defaults.
 
-    Raises
-    ------
-    GraphSlamError
-        Unknown option (those that exist are named), wrong type, or a value out of bounds.
+    Raises GraphSlamError: unknown option (those that exist are named), wrong type, or a value out of bounds.
     """
     for one in values:
         if one not in known:

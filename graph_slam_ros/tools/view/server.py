@@ -199,10 +199,7 @@ def _asked(answer: _Answer) -> Callable[[Request], Any]:
 def listening(port: int) -> socket.socket:
     """A socket that clients can connect to, and that answers when a server is run with it; port 0 is a free one.
 
-    Raises
-    ------
-    GraphSlamError
-        The port is somebody else's.
+    Raises GraphSlamError: the port is somebody else's.
     """
     bound = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     try:

@@ -36,15 +36,12 @@ _MOST_PATH = 10_000  # characters
 class Workbench:
     """Solves a run in other ways, and saves edits of it as other runs.
 
+    Raises GraphSlamError: the run has no map that can be shown.
+
     Parameters
     ----------
     made : the contents of its report
     scale : of a loss, as the page begins with it [sigmas]
-
-    Raises
-    ------
-    GraphSlamError
-        The run has no map that can be shown.
     """
 
     def __init__(self, made: Contents, scale: float) -> None:
@@ -97,15 +94,12 @@ class Workbench:
     def solve(self, body: bytes) -> dict[str, Any]:
         """Solve the run without some edges, with others, or with another loss, as ``graph_slam explain RUN --without``.
 
+        Raises GraphSlamError: it is nothing of that kind, or cannot be solved.
+
         Parameters
         ----------
         body : JSON with ``without`` and ``let_in``, lists of edges, and ``loss``: NAME:SCALE, none or empty;
             ``first`` asks for the first steps. Where ``is_solved`` is false, the answer is no solution
-
-        Raises
-        ------
-        GraphSlamError
-            It is nothing of that kind, or cannot be solved.
         """
         asked = _asked(body)
         with self._lock:
@@ -142,10 +136,7 @@ class Workbench:
     def save(self, body: bytes) -> dict[str, Any]:
         """Write the run that a plan makes of this one, next to it: as ``graph_slam map edit``. Nothing is replaced.
 
-        Raises
-        ------
-        GraphSlamError
-            The plan cannot be applied, or the run cannot be written. Nothing was written.
+        Raises GraphSlamError: the plan cannot be applied, or the run cannot be written. Nothing was written.
         """
         plan = plan_of(body.decode("utf-8", "replace"))
         self._check_source(plan.source)
