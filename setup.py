@@ -50,7 +50,7 @@ setup(
     author_email="maintainers@graph-slam-ros.example",
     python_requires=">=3.10",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
-    package_data={NAME: ["py.typed", "tools/report/page.*", "tools/view/edits*.*"]},
+    package_data={NAME: ["py.typed", "tools/*/page.*", "tools/view/edits*.*"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
@@ -79,6 +79,7 @@ setup(
             "dask>=2026.8",
             "distributed>=2026.8",
             "fsspec>=2025.9",
+            "jinja2>=3.1.6",
             "pyarrow>=21.0",
         ],
         "view": ["plotly>=7.1.0", "starlette>=1.0", "uvicorn>=0.40"],

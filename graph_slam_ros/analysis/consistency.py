@@ -85,8 +85,10 @@ class Consistency:
 
     @property
     def over_confidence(self) -> str:
-        """Return which errors are larger than the covariances say; empty if none are."""
-        return over_confidence(self.last_pose, self.poses, self.landmarks)
+        """Return which errors against the truth are larger than the covariances say; empty if none are."""
+        named = {"the last pose": self.last_pose, "poses": self.poses, "landmarks": self.landmarks}
+        beyond = {name: nees for name, nees in named.items() if nees is not None and nees.mean > nees.band[1]}
+        return ", ".join(f"NEES of {name} {nees.mean:.1f} of {nees.dof}" for name, nees in beyond.items())
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values."""
@@ -120,14 +122,6 @@ class Consistency:
 def _growth(one: NoiseScale) -> str:
     """Say that the noise is larger in motion, if it is."""
     return ", more in motion" if one.per_rad > 0.0 or one.per_m > 0.0 else ""
-
-
-def pose_nees(estimate: Array, truth: Array, covariances: Array) -> tuple[Nees | None, Nees | None]:
-    """NEES of the last pose and of all but the first, see ``pose_errors``; None where the first has no truth."""
-    if not len(estimate):
-        return None, None
-    errors, relative = pose_errors(estimate, truth, covariances)
-    return Nees.of(errors[-1:], relative[-1:]), Nees.of(errors, relative)
 
 
 def pose_errors(estimate: Array, truth: Array, covariances: Array) -> tuple[Array, Array]:
@@ -172,13 +166,6 @@ def _single(errors: Array, covariances: Array) -> Array:
     return out
 
 
-def landmark_nees(
-    positions: Array, truth: Array, covariances: Array, first: Array, true_first: Array, first_covariance: Array
-) -> Nees | None:
-    """NEES of landmarks' positions, see ``landmark_errors``; None where the first pose has no truth."""
-    return Nees.of(*landmark_errors(positions, truth, covariances, first, true_first, first_covariance))
-
-
 def landmark_errors(
     positions: Array, truth: Array, covariances: Array, first: Array, true_first: Array, first_covariance: Array
 ) -> tuple[Array, Array]:
@@ -213,13 +200,6 @@ def _along_arcs(estimate: Array, truth: Array) -> Array:
     width = np.linalg.norm(aside, axis=1, keepdims=True)
     arc = far * np.arctan2(width, along) * aside / np.maximum(width, _TINY)
     return np.where(far > _TINY, (true_far - far) * ahead + arc, truth)
-
-
-def over_confidence(last_pose: Nees | None, poses: Nees | None, landmarks: Nees | None) -> str:
-    """Return which errors against the truth are larger than the covariances say; empty if none are."""
-    named = {"the last pose": last_pose, "poses": poses, "landmarks": landmarks}
-    beyond = {name: nees for name, nees in named.items() if nees is not None and nees.mean > nees.band[1]}
-    return ", ".join(f"NEES of {name} {nees.mean:.1f} of {nees.dof}" for name, nees in beyond.items())
 
 
 def should_be(one: NoiseScale, over_confident: str = "") -> str:

@@ -7,6 +7,7 @@ from the line between two of them: the first, and the one that is farthest from 
 import json
 import os
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +15,9 @@ import numpy as np
 from graph_slam_ros.analysis.consistency import (
     Consistency,
     Nees,
-    landmark_nees,
+    landmark_errors,
     noise_advice,
-    over_confidence,
-    pose_nees,
+    pose_errors,
 )
 from graph_slam_ros.analysis.path_error import interpolated
 from graph_slam_ros.analysis.trajectories import Truth
@@ -139,18 +139,19 @@ def consistency_of(run: Path, known: Truth, keyframes: slice, *, is_first: bool)
     is_applied = config.robust.noise_scale == "estimated"
     reason = _why_no_nees(known, true, is_first=is_first, is_held=is_held, is_planar=is_planar)
     if reason:
-        advice = noise_advice(noise, is_applied=is_applied, config=config)
-        return Consistency(None, None, None, noise, {"poses and landmarks": reason}, advice)
-    landmarks = read_landmarks(run / "landmarks.csv")
-    drive = _Compared(run, path, true, landmarks, known)
-    if not known.trajectory.has_orientation:
-        found, frame = drive.positions()
-    elif np.isfinite(true[0]).all() and np.isfinite(covariances[0]).all():  # that of a condensed one is not known
-        found, frame = drive.poses(0, covariances, [one.covariance for one in landmarks.values()]), ""
+        found = Consistency(None, None, None, noise, {"poses and landmarks": reason})
     else:
-        found, frame = drive.later()
-    advice = noise_advice(noise, is_applied=is_applied, config=config, over_confident=over_confidence(*found))
-    return Consistency(*found, noise, _left_out(*found, known, len(landmarks)), advice, frame)
+        landmarks = read_landmarks(run / "landmarks.csv")
+        drive, frame = _Compared(run, path, true, landmarks, known), ""
+        if not known.trajectory.has_orientation:
+            several, frame = drive.positions()
+        elif np.isfinite(true[0]).all() and np.isfinite(covariances[0]).all():  # that of a condensed one is not known
+            several = drive.poses(0, covariances, [one.covariance for one in landmarks.values()])
+        else:
+            several, frame = drive.later()
+        found = Consistency(*several, noise, _left_out(*several, known, len(landmarks)), frame=frame)
+    advice = noise_advice(noise, is_applied=is_applied, config=config, over_confident=found.over_confidence)
+    return replace(found, advice=advice)
 
 
 class _Compared:
@@ -167,8 +168,9 @@ class _Compared:
         """NEES seen from a pose whose covariance all others contain; ``covariances`` begin there."""
         estimate, true = self._path.poses[first:], self._true[first:]
         spreads = np.array(of_landmarks).reshape(-1, 3, 3)
-        seen = landmark_nees(self._places, self._true_places, spreads, estimate[0], true[0], covariances[0])
-        return *pose_nees(estimate, true, covariances), seen
+        errors, relative = pose_errors(estimate, true, covariances)
+        seen = landmark_errors(self._places, self._true_places, spreads, estimate[0], true[0], covariances[0])
+        return Nees.of(errors[-1:], relative[-1:]), Nees.of(errors, relative), Nees.of(*seen)
 
     def later(self) -> tuple[_All, str]:
         """NEES seen from the first keyframe with truth, where that is not the first."""

@@ -10,7 +10,7 @@ from graph_slam_ros.cli import arguments, console
 from graph_slam_ros.cli.usage import CODES, CommandParser
 from graph_slam_ros.errors import GraphSlamError
 
-_NEEDED = ("dask", "distributed", "fsspec", "pyarrow")
+_NEEDED = ("dask", "distributed", "fsspec", "jinja2", "pyarrow")
 _MIB = 2**20
 _MOST_NAMED = 20
 
