@@ -2,7 +2,6 @@
 
 import io
 import os
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from graph_slam_ros.analysis.trajectories import Truth, read_truth
 from graph_slam_ros.colours import LIGHT, QUIET
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.durable import write_whole
+from graph_slam_ros.graph import Graph
 from graph_slam_ros.lie import se3
 from graph_slam_ros.runs.folder import COVARIANCES, recording_of
 from graph_slam_ros.runs.trajectory import Trajectory, read_covariances, read_landmarks, read_rows
@@ -235,32 +235,26 @@ def _run_figure(found: _Placed, points: Array, dimensions: int) -> tuple[Any, li
     return figure, panels, below
 
 
-def draw_graph(
-    out_png: Path,
-    initial: Array,
-    final: Array,
-    edges: Mapping[str, Index],
-    landmarks: Array | None = None,
-) -> None:
+def draw_graph(out_png: Path, graph: Graph, initial: Array, final: Array) -> None:
     """Draw a graph before and after optimisation, side by side.
+
+    Odometry is a dark line, sightings are faint, other edges red.
 
     Parameters
     ----------
-    initial, final : (n, 2) or more columns, x and y [m] of each vertex, in the same order
-    edges : (m, 2) rows of those arrays, by label: ``odometry`` as a dark line, ``landmarks`` faint, others red
-    landmarks : rows that are landmarks; the others are poses
+    initial, final : (n, 2) or more columns, x and y [m] of each vertex
     """
     figure, pair = _figure(2)
-    is_point = np.zeros(len(final), dtype=bool)
-    if landmarks is not None:
-        is_point[landmarks] = True
+    is_point = np.array([kind.name[0] == "R" for kind in graph.kinds])[graph.kind.values]
+    tables = [table for table in graph.tables.values() if table.vertices.values.shape[1] == 2]
     for axes, values, title in zip(pair, (initial, final), ("initial", "optimised"), strict=True):
         axes.set_title(title, loc="left", fontsize=11, color="#333333")
-        for label, ends in edges.items():
-            _draw_edges(axes, values[:, :2], np.asarray(ends).reshape(-1, 2), label)
+        for code, label in enumerate(graph.labels):
+            ends = [table.vertices.values[table.label.values == code] for table in tables]
+            _draw_edges(axes, values[:, :2], np.concatenate([np.empty((0, 2), dtype=np.int64), *ends]), label)
         if is_point.any():
             _draw_stars(axes, values[is_point, :2])
-        elif not edges:
+        elif not tables:
             axes.plot(values[:, 0], values[:, 1], ".", color=_ODOMETRY, markersize=2)
         axes.autoscale_view()
     _legend(pair[1], at=1.0, side="right")
@@ -289,6 +283,8 @@ def _with_gaps(truth: Trajectory) -> Trajectory:
 def _draw_edges(axes: Any, points: Array, ends: Index, label: str) -> None:
     from matplotlib.collections import LineCollection
 
+    if not len(ends):
+        return
     style = {"odometry": (_ODOMETRY, 1.0, 0.9, 4), "landmarks": (_LANDMARK, 0.4, 0.25, 2)}
     color, width, alpha, layer = style.get(label, (_CLOSURE, 0.6, 0.45, 3))
     name = "sightings" if label == "landmarks" else label

@@ -11,7 +11,7 @@ from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.measurements.edit_actions import ACTIONS
 
 _FILES = ("tum", "g2o", "mcap")
-_PICTURES = ("png", "svg", "pdf", "gif")
+_PICTURES = ("png", "gif")
 
 
 def diff_options(sub: CommandParser) -> None:
@@ -133,7 +133,7 @@ def export_options(sub: CommandParser) -> None:
     arguments.add_run(sub)
     about = (
         "output file; its ending says what: .tum the path; .g2o the graph, with stamps and names in a second file;"
-        " .mcap both as ROS messages; .png, .svg, .pdf a picture; .gif the drive and its correction"
+        " .mcap both as ROS messages; .png a picture; .gif the drive and its correction"
     )
     sub.add_argument("--out", type=Path, required=True, metavar="FILE", help=about)
     sub.add_argument("--last-drive", action="store_true", help="tum: only the last drive, not those of the loaded map")

@@ -91,7 +91,9 @@ def optimize(args: argparse.Namespace) -> int:
     if args.out:
         (write_trajectory if ending(args.out) == ".tum" else write_g2o)(args.out, file, solver.estimate)
     if args.plot:
-        _plot_graph(args.plot, graph, _positions(graph, started(file, start)[0]), _positions(graph, solver))
+        from graph_slam_ros.analysis.plots import draw_graph
+
+        draw_graph(args.plot, graph, _positions(graph, started(file, start)[0]), _positions(graph, solver))
     for note in file.notes:
         console.warn(note)
     if 1e-9 < report.chi2_final / max(1, solver.degrees_of_freedom) < 1e-3:  # public graphs: 0.01; without noise: 1e-11
@@ -230,14 +232,3 @@ def _positions(graph: "Graph", solver: "Solver") -> Any:
     import numpy as np
 
     return np.array([solver.estimate([v])[0][:2] for v in range(graph.vertex_count)])
-
-
-def _plot_graph(out: Path, graph: "Graph", initial: Any, final: Any) -> None:
-    import numpy as np
-
-    from graph_slam_ros.analysis.plots import draw_graph
-
-    ends = {label: [graph.edge(int(edge)).vertices for edge in graph.edges_of(label)] for label in graph.labels}
-    pairs = {label: [two for two in of_label if len(two) == 2] for label, of_label in ends.items()}
-    points: Any = np.flatnonzero([graph.kind_of(v).name[0] == "R" for v in range(graph.vertex_count)])
-    draw_graph(out, initial, final, {k: np.array(v) for k, v in pairs.items() if v}, points if len(points) else None)

@@ -409,34 +409,23 @@ class Advisor:
 
         A new landmark is eliminated: what remains is what its sightings together say of the poses.
         """
-        values, blocks = self._run.solver.values, []
-        wide: dict[int, int] = {}
+        width = {v: dof for edge in addition.edges for v, dof in zip(edge.vertices, edge.type.dofs, strict=True)}
+        start = dict(zip(width, np.cumsum([0, *width.values()]).tolist(), strict=False))
+        rows = []
         for edge in addition.edges:
-            x, at = stored_values(self._graph, values, edge, addition.value)
+            x, at = stored_values(self._graph, self._run.solver.values, edge, addition.value)
             _, jacobian = edge.type.linearize(x, at, edge.measured[None])
-            white, place = edge.share**0.5 * edge.noise.sqrt_information @ jacobian[0], 0
-            for vertex, dof in zip(edge.vertices, edge.type.dofs, strict=True):
-                wide.setdefault(vertex, dof)
-                blocks.append((len(white), vertex, white[:, place : place + dof]))
-                place += dof
-        starts = dict(zip(wide, np.cumsum([0, *wide.values()]).tolist(), strict=False))
-        out = np.zeros((sum(len(e.noise.sqrt_information) for e in addition.edges), sum(wide.values())))
-        row, filled = 0, iter(blocks)
-        for edge in addition.edges:
-            for _ in edge.vertices:
-                height, vertex, block = next(filled)
-                out[row : row + height, starts[vertex] : starts[vertex] + wide[vertex]] = block
-            row += height
-        return self._eliminated(out, starts, wide)
-
-    def _eliminated(self, rows: Array, starts: dict[int, int], wide: dict[int, int]) -> tuple[Array, Array]:
-        columns = np.concatenate([self._columns[v] for v in wide if v != NEW])
-        if NEW not in wide:
-            return rows, columns
-        new = np.arange(starts[NEW], starts[NEW] + wide[NEW])
-        left, singular, _ = np.linalg.svd(rows[:, new])
+            own = np.concatenate([start[v] + np.arange(width[v]) for v in edge.vertices])
+            wide = np.zeros((jacobian.shape[1], sum(width.values())))
+            wide[:, own] = edge.share**0.5 * edge.noise.sqrt_information @ jacobian[0]
+            rows.append(wide)
+        columns = np.concatenate([self._columns[v] for v in width if v != NEW])
+        if NEW not in width:
+            return np.vstack(rows), columns
+        new = start[NEW] + np.arange(width[NEW])
+        left, singular, _ = np.linalg.svd(np.vstack(rows)[:, new])
         rank = int((singular > 1e-9 * singular.max(initial=0.0)).sum())
-        return left[:, rank:].T @ np.delete(rows, new, axis=1), columns
+        return left[:, rank:].T @ np.delete(np.vstack(rows), new, axis=1), columns
 
     def predict(self, addition: Addition) -> tuple[Array, float]:
         """Predict the sigma of each weakest direction, and the root mean square of the position sigmas on the path."""

@@ -9,6 +9,7 @@ from graph_slam_ros.analysis.plots import draw_graph, draw_run
 from graph_slam_ros.cli import main
 from graph_slam_ros.formats.parameters import parameters_text
 from graph_slam_ros.formats.tum import tum_text
+from graph_slam_ros.graph import R2, RELATIVE_POSE, SE2, Gaussian, Graph
 from graph_slam_ros.lie import se3
 from graph_slam_ros.runs.trajectory import Trajectory, read_tum
 from graph_slam_ros.slam import Config
@@ -177,7 +178,12 @@ def test_a_graph_is_drawn_before_and_after_with_closures_unlike_odometry(tmp_pat
     final = np.array([[0.0, 0, 0], [10, 0, 0], [10, 10, 0], [0, 10, 0], [5, 7, 0]])
     initial = final * (1.0, 0.5, 1.0)
     edges = {"odometry": np.array([[0, 1], [1, 2], [2, 3]]), "closures": np.array([[0, 2]])}
-    draw_graph(tmp_path / "graph.png", initial, final, edges, landmarks=np.array([4]))
+    graph = Graph()
+    graph.add_vertices(SE2, final[:4])
+    graph.add_vertex(R2, final[4, :2])
+    for label, ends in edges.items():
+        graph.add_edges(RELATIVE_POSE, ends, np.zeros((len(ends), 3)), Gaussian.from_sigmas(1.0, 1.0, 1.0), label)
+    draw_graph(tmp_path / "graph.png", graph, initial, final)
     for axes, values in zip(figures[0].axes, (initial, final), strict=True):
         drawn = {c.get_label(): c for c in axes.collections}
         for kind, ends in edges.items():
