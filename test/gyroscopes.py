@@ -6,8 +6,7 @@ import numpy as np
 
 from graph_slam_ros.lie import so3
 from graph_slam_ros.slam import AngularVelocity, Config, Control, GraphSlam, Odometry, Sightings
-from graph_slam_ros.tools.simulation import simulate
-from graph_slam_ros.tools.simulation.instruments import with_instruments
+from graph_slam_ros.tools.simulation import simulate, with_instruments
 from graph_slam_ros.tools.simulation.motion import integrate
 from graph_slam_ros.tools.simulation.recording import measurements
 

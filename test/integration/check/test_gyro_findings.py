@@ -6,8 +6,7 @@ from reliability import times
 
 from graph_slam_ros.formats.parameters import parse_setting
 from graph_slam_ros.runs.check import check
-from graph_slam_ros.tools.simulation import Drive, Fault, simulate, spoil_messages, write_bag
-from graph_slam_ros.tools.simulation.instruments import with_instruments
+from graph_slam_ros.tools.simulation import Drive, Fault, simulate, spoil_messages, with_instruments, write_bag
 
 SETTINGS = {
     "inputs.names": "odom detections imu",

@@ -9,9 +9,8 @@ from reliability import tell, times
 
 from graph_slam_ros.cli import main
 from graph_slam_ros.slam import AngularVelocity
-from graph_slam_ros.tools.simulation import simulate
+from graph_slam_ros.tools.simulation import simulate, with_instruments
 from graph_slam_ros.tools.simulation.bag import write_bag
-from graph_slam_ros.tools.simulation.instruments import with_instruments
 
 SEEDS = times(1, 20)
 BAND = (1.0, 5.0)
