@@ -7,7 +7,7 @@ import numpy as np
 
 from graph_slam_ros.check.columns import Columns, OdometryColumns
 from graph_slam_ros.check.finding import Finding, Severity, Where
-from graph_slam_ros.config.frontend import OdometryConfig
+from graph_slam_ros.config.pipeline import OdometryConfig
 from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.typing import Array, Index, Mask
 

@@ -5,37 +5,22 @@ types and values out of range are refused with the name of the culprit.
 """
 
 import dataclasses
-import inspect
-import itertools
 import math
 import re
-import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
-from graph_slam_ros.config.frontend import KeyframesConfig, OdometryConfig, OrderingConfig
-from graph_slam_ros.config.gyro import GyroConfig
+from graph_slam_ros.config import node as outside
+from graph_slam_ros.config import pipeline
 from graph_slam_ros.config.inputs import DEFAULT_INPUTS, InputConfig, default_input
-from graph_slam_ros.config.landmarks import LandmarksConfig
-from graph_slam_ros.config.loss import landmark_stages, narrow_then_wide
-from graph_slam_ros.config.node import (
-    USUAL_INPUTS,
-    HealthConfig,
-    InitialPoseConfig,
-    InputsConfig,
-    JournalConfig,
-    NodeConfig,
-    OutputConfig,
-    TfConfig,
-    TimeConfig,
-)
+from graph_slam_ros.config.node import USUAL_INPUTS, InputsConfig
 from graph_slam_ros.config.parameter import Parameter, numbers, section_parameters
-from graph_slam_ros.config.robust import RobustConfig
-from graph_slam_ros.config.solve import SolveConfig
+from graph_slam_ros.config.pipeline import landmark_stages, narrow_then_wide
 from graph_slam_ros.config.survey import Surveyed, surveyed
-from graph_slam_ros.config.world import AnchorConfig, FramesConfig, MapConfig, WorldConfig
 from graph_slam_ros.errors import ConfigError, nearest
+from graph_slam_ros.formats.strict import lines
 from graph_slam_ros.graph import Loss
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL, Geometry
 from graph_slam_ros.lie import se3
@@ -103,25 +88,25 @@ class Config:
     names; ``config.keyframes.min_distance_m`` reads one. An input has a section of its own name, see ``inputs.names``.
     """
 
-    world: WorldConfig = WorldConfig()
-    frames: FramesConfig = FramesConfig()
-    odometry: OdometryConfig = OdometryConfig()
-    gyro: GyroConfig = GyroConfig()
-    keyframes: KeyframesConfig = KeyframesConfig()
-    landmarks: LandmarksConfig = LandmarksConfig()
-    anchor: AnchorConfig = AnchorConfig()
-    map: MapConfig = MapConfig()
-    ordering: OrderingConfig = OrderingConfig()
-    solve: SolveConfig = SolveConfig()
-    robust: RobustConfig = RobustConfig()
-    initialpose: InitialPoseConfig = InitialPoseConfig()
-    tf: TfConfig = TfConfig()
-    inputs: InputsConfig = InputsConfig()
-    output: OutputConfig = OutputConfig()
-    journal: JournalConfig = JournalConfig()
-    time: TimeConfig = TimeConfig()
-    health: HealthConfig = HealthConfig()
-    node: NodeConfig = NodeConfig()
+    world: pipeline.WorldConfig = pipeline.WorldConfig()
+    frames: pipeline.FramesConfig = pipeline.FramesConfig()
+    odometry: pipeline.OdometryConfig = pipeline.OdometryConfig()
+    gyro: pipeline.GyroConfig = pipeline.GyroConfig()
+    keyframes: pipeline.KeyframesConfig = pipeline.KeyframesConfig()
+    landmarks: pipeline.LandmarksConfig = pipeline.LandmarksConfig()
+    anchor: pipeline.AnchorConfig = pipeline.AnchorConfig()
+    map: pipeline.MapConfig = pipeline.MapConfig()
+    ordering: pipeline.OrderingConfig = pipeline.OrderingConfig()
+    solve: pipeline.SolveConfig = pipeline.SolveConfig()
+    robust: pipeline.RobustConfig = pipeline.RobustConfig()
+    initialpose: outside.InitialPoseConfig = outside.InitialPoseConfig()
+    tf: outside.TfConfig = outside.TfConfig()
+    inputs: outside.InputsConfig = outside.InputsConfig()
+    output: outside.OutputConfig = outside.OutputConfig()
+    journal: outside.JournalConfig = outside.JournalConfig()
+    time: outside.TimeConfig = outside.TimeConfig()
+    health: outside.HealthConfig = outside.HealthConfig()
+    node: outside.NodeConfig = outside.NodeConfig()
     sources: tuple[InputConfig, ...] = DEFAULT_INPUTS
 
     def __repr__(self) -> str:
@@ -269,6 +254,27 @@ class Config:
         )
 
 
+def with_survey(config: Config) -> Config:
+    """The configuration with the rows of ``landmarks.surveyed_file``, unless it has some, as a repeated run does.
+
+    Raises
+    ------
+    GraphSlamError
+        Naming the file, the line and what is wrong with it.
+    """
+    settings = config.landmarks
+    if not settings.surveyed_file or settings.surveyed:
+        return config
+    file = Path(settings.surveyed_file).expanduser()
+    text = "".join(line for _, line in lines(file))
+    try:
+        if not surveyed(text, config.world.dimensions):
+            raise ConfigError("no landmark in it")
+    except ConfigError as error:
+        raise ConfigError(f"{file}: {error}") from None
+    return config.changed({"landmarks.surveyed": text})
+
+
 def _sections() -> Iterator[tuple[str, Any]]:
     """Name and defaults of each section except those of inputs."""
     for section in dataclasses.fields(Config):
@@ -331,25 +337,3 @@ def flatten(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, 
             yield from flatten(value, f"{name}.")
         else:
             yield name, value
-
-
-def _described() -> str:
-    """The docstring of ``Config`` with every parameter by section: name, default, unit and meaning, folded."""
-    meanings = notes()
-    sections = dict(_sections()) | {name: default_input(name) for name in USUAL_INPUTS}
-    lines = ["    Parameters with their defaults:"]
-    for section, own in itertools.groupby(parameters(), lambda p: p.name.partition(".")[0]):
-        meaning, _, _ = (inspect.getdoc(sections[section]) or "").partition("\n")
-        lines += ["", f"    {section}: {meaning}", ""]
-        for p in own:
-            lines.append(f"      {p.name} = {p.default!r}")
-            lines += textwrap.wrap(meanings[p.name], 100, initial_indent=" " * 10, subsequent_indent=" " * 10)
-    return f"{Config.__doc__}\n" + "\n".join(lines) + "\n"
-
-
-Config.__doc__ = _described()
-_sections_by_name = inspect.Parameter("sections", inspect.Parameter.VAR_KEYWORD)  # with all defaults it is a screenful
-Config.__signature__ = inspect.Signature([_sections_by_name])  # type: ignore[attr-defined]
-Config.__init__.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
-    [inspect.Parameter("self", inspect.Parameter.POSITIONAL_ONLY), _sections_by_name]
-)

@@ -3,11 +3,12 @@
 import math
 from dataclasses import dataclass
 
-from graph_slam_ros.config.loss import LOSSES
 from graph_slam_ros.config.parameter import numbers, setting
+from graph_slam_ros.config.pipeline import LOSSES
 from graph_slam_ros.errors import ConfigError
 
 HIGHEST_M = 1e5  # above the ellipsoid or below it: beyond is no place for a robot
+USES = ("auto", "odometry", "gyro", "landmarks", "fix", "closure", "none")
 ASSUMED = "assumed"  # the mount of a sensor whose place nobody has given
 
 
@@ -21,9 +22,7 @@ class InputConfig:
     )
     type: str = setting("", "message type of the input, package/msg/Name")
     use: str = setting(
-        "auto",
-        "use of the input; auto: the first use that its type allows; none: the input is ignored",
-        choices=("auto", "odometry", "gyro", "landmarks", "fix", "closure", "none"),
+        "auto", "use of the input; auto: the first that its type allows; none: it is ignored", choices=USES
     )
     frame: str = setting("", "frame of the measurements, instead of the one in the messages; empty: as in the messages")
     mount: str = setting(
@@ -34,44 +33,24 @@ class InputConfig:
         "m, rad",
     )
     noise: str = setting(
-        "message",
-        "noise of the input: message: the messages' covariance, or the sigmas where it is unknown; "
-        "sigmas: always the sigmas",
-        choices=("message", "sigmas"),
+        "message", "message: the messages' covariance, or where unknown sigmas; sigmas", choices=("message", "sigmas")
     )
     sigma_m: float = setting(
-        0.0,
-        "position noise of the input; 0: landmarks.sigma_m for landmarks, other messages of unknown "
-        "covariance are refused",
-        "m",
-        low=0.0,
+        0.0, "position noise; 0: landmarks.sigma_m for landmarks, other messages of unknown covariance are refused", "m"
     )
-    sigma_per_m: float = setting(
-        0.0, "position noise that is added to sigma_m for each metre of distance", "m/m", low=0.0
-    )
-    sigma_rad: float = setting(
-        0.0, "noise of an orientation or bearing of the input; 0: unknown", "rad", low=0.0, high=math.pi
-    )
+    sigma_per_m: float = setting(0.0, "position noise that is added to sigma_m for each metre of distance", "m/m")
+    sigma_rad: float = setting(0.0, "noise of an orientation or bearing of the input; 0: unknown", "rad", high=math.pi)
     sigma_factor: float = setting(
-        1.0,
-        "of an odometry: factor of the standard deviations of its motion between keyframes",
-        "times",
-        low=1e-3,
-        high=1e3,
+        1.0, "of an odometry: factor of the sigmas of its motion between keyframes", "times", low=1e-3, high=1e3
     )
     correlation_s: float = setting(
         1.0,
         "correlation time of the errors of fixes: one fix is used each twice this long, or each "
         "keyframes.max_interval_s with more noise; 0: errors are independent, all are used",
         "s",
-        low=0.0,
     )
     offset_s: float = setting(
-        0.0,
-        "time added to the stamps of the input: how far its clock is behind",
-        "s",
-        low=-4e9,  # the stamps of a clock that counts from its start
-        high=4e9,
+        0.0, "time added to the stamps of the input: how far its clock is behind", "s", low=-4e9, high=4e9
     )
     mount_correction: str = setting(
         "",
@@ -80,19 +59,10 @@ class InputConfig:
         "m, rad",
     )
     range_factor: float = setting(
-        1.0,
-        "factor by which ranges and positions of the input are multiplied, before range_offset_m is added",
-        "times",
-        low=0.1,
-        high=10.0,
+        1.0, "factor of the input's ranges and positions, before range_offset_m is added", "times", low=0.1, high=10.0
     )
     range_offset_m: float = setting(0.0, "length added to ranges of the input", "m", low=-1000.0, high=1000.0)
-    max_distance_m: float = setting(
-        0.0,
-        "landmarks and closures farther away than this are refused; 0: 100 km",
-        "m",
-        low=0.0,
-    )
+    max_distance_m: float = setting(0.0, "landmarks and closures farther away than this are refused; 0: 100 km", "m")
     id: str = setting("", "landmark identity for messages that carry none")
     id_prefix: str = setting(
         "", "text put before every identity of the input, if two inputs use the same identities for different landmarks"
@@ -100,18 +70,11 @@ class InputConfig:
     frame_prefix: str = setting("", "beginning of the frame names of landmarks that are published as transforms")
     hamming_max: int = setting(255, "tags with more corrected bits than this are ignored", "bits", low=0, high=255)
     decision_margin_min: float = setting(
-        0.0, "tags with a smaller decision margin than this are ignored", "grey levels", low=0.0
+        0.0, "tags with a smaller decision margin than this are ignored", "grey levels"
     )
-    datum: str = setting(
-        "",
-        "latitude, longitude and altitude of the map's origin, in degrees and metres; empty: the first fix",
-        "deg, m",
-    )
+    datum: str = setting("", "latitude, longitude and altitude of the map's origin; empty: the first fix", "deg, m")
     loss: str = setting(
-        "auto",
-        "robust loss of the input's measurements; auto: landmarks.loss for landmarks, robust.loss for fixes "
-        "and closures; odometry has none",
-        choices=("auto", *LOSSES),
+        "auto", "robust loss; auto: landmarks.loss, or robust.loss; odometry has none", choices=("auto", *LOSSES)
     )
     reliability: str = setting(
         "auto",

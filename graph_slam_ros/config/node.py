@@ -40,27 +40,21 @@ class TfConfig:
     )
     stamp: str = setting(
         "odometry",
-        "stamp of map -> odom: odometry: that of the newest odometry; now: the clock; without new "
-        "odometry nothing is broadcast in either case",
+        "stamp of map -> odom: odometry: that of the newest odometry; now: the clock, as long as odometry comes",
         choices=("odometry", "now"),
         live=True,
     )
     transform_tolerance: float = setting(
-        0.1, "time by which map -> odom is dated ahead of tf.stamp", "s", low=0.0, high=10.0, live=True
+        0.1, "time by which map -> odom is dated ahead of tf.stamp", "s", high=10.0, live=True
     )
     max_speed_m_s: float = setting(
-        0.0, "map -> odom moves no faster than this after a correction; 0: at once", "m/s", low=0.0, live=True
+        0.0, "map -> odom moves no faster than this after a correction; 0: at once", "m/s", live=True
     )
     max_turn_rad_s: float = setting(
-        0.0, "map -> odom turns no faster than this after a correction; 0: at once", "rad/s", low=0.0, live=True
+        0.0, "map -> odom turns no faster than this after a correction; 0: at once", "rad/s", live=True
     )
     report_jump_m: float = setting(
-        0.5,
-        "a correction that moves map -> odom by more than this, or turns it by 0.2 rad, is reported with the edges "
-        "that caused it",
-        "m",
-        low=0.0,
-        live=True,
+        0.5, "a correction that moves map -> odom by more, or by 0.2 rad, is reported with its edges", "m", live=True
     )
 
 
@@ -70,26 +64,17 @@ class InputsConfig:
 
     names: str = setting(" ".join(USUAL_INPUTS), "names of the inputs; each has a section of its name")
     reliable: bool = setting(
-        False,
-        "true: subscriptions ask for reliable delivery; a best-effort publisher then does not connect;"
-        " an input's own reliability comes first",
+        False, "true: subscriptions ask for reliable delivery, unless INPUT.reliability says otherwise"
     )
     depth: int = setting(1000, "messages that the middleware holds for a subscription", "messages", low=1, high=100_000)
     queue: int = setting(
-        20_000,
-        "most messages that are queued for the solver; more are refused and counted",
-        "messages",
-        low=1,
-        high=1_000_000,
+        20_000, "messages that are queued for the solver; more are refused", "messages", low=1, high=1_000_000
     )
     tf: bool = setting(
         True, "whether the node subscribes to /tf, for sensors on moving joints; it always does to /tf_static"
     )
     tf_wait_s: float = setting(
-        0.2,
-        "an observation without a transform of /tf is refused when odometry is this much newer",
-        "s",
-        low=0.0,
+        0.2, "an observation without a transform of /tf is refused when odometry is this much newer", "s"
     )
 
 
@@ -115,33 +100,22 @@ class OutputConfig:
         "node, as in robot1_graph_slam; empty: nothing is written at shutdown",
     )
     keep_earlier: int = setting(
-        5,
-        "number of earlier runs that are kept, as folder-1, folder-2, ...; 0: an earlier run is replaced",
-        "runs",
-        low=0,
-        high=10_000,
+        5, "earlier runs that are kept, as folder-1, folder-2, ...; 0: they are replaced", "runs", low=0, high=10_000
     )
     load: str = setting(
-        "",
-        "name of the run that ~/load loads, a folder in the same directory as output.folder; empty: "
-        "the newest earlier run",
-        live=True,
+        "", "name of the run that ~/load loads, next to output.folder; empty: the newest earlier run", live=True
     )
     load_at_start: bool = setting(False, "true: the run of output.load is loaded when the node is configured")
     load_pose: str = setting(
         "",
         "pose of the robot in a loaded map: x y yaw or, in space, x y z roll pitch yaw, as uncertain "
-        "as initialpose.sigma_m and initialpose.sigma_rad; empty: unknown until a landmark is "
-        "recognised",
+        "as initialpose.sigma_m and initialpose.sigma_rad; empty: unknown until a landmark is recognised",
         live=True,
     )
     save_as: str = setting(
-        "",
-        "name of a run that ~/save also writes the map to, in the same directory as output.folder; an"
-        " existing run is never replaced; empty: none",
-        live=True,
+        "", "name of a new run, next to output.folder, that ~/save also writes the map to; empty: none", live=True
     )
-    path_period_s: float = setting(0.2, "shortest period of ~/path and ~/path_updates", "s", low=0.0, live=True)
+    path_period_s: float = setting(0.2, "shortest period of ~/path and ~/path_updates", "s", live=True)
     path_max_poses: int = setting(
         10_000, "most poses of ~/path; a longer path is thinned out", "poses", low=2, high=10_000_000, live=True
     )
@@ -172,10 +146,7 @@ class TimeConfig:
         live=True,
     )
     future_s: float = setting(
-        1.0,
-        "messages further ahead of the clock than this are refused, unless a recording is played; 0: none are refused",
-        "s",
-        low=0.0,
+        1.0, "messages further ahead of the clock are refused, but those of a recording; 0: none are", "s"
     )
 
 
@@ -183,16 +154,12 @@ class TimeConfig:
 class HealthConfig:
     """The limits above which ``/diagnostics`` calls the node degraded."""
 
-    odometry_silent_s: float = setting(1.0, "degraded: no odometry for longer than this", "s", low=0.0, live=True)
+    odometry_silent_s: float = setting(1.0, "degraded: no odometry for longer than this", "s", live=True)
     landmarks_silent_s: float = setting(
-        60.0, "degraded: no landmark observed for longer than this, after the first; 0: never", "s", low=0.0, live=True
+        60.0, "degraded: no landmark observed for longer than this, after the first; 0: never", "s", live=True
     )
-    lag_s: float = setting(1.0, "degraded: the solver is behind by more than this", "s", low=0.0, live=True)
-    stuck_s: float = setting(10.0, "degraded: one solve has taken longer than this", "s", low=0.0, live=True)
+    lag_s: float = setting(1.0, "degraded: the solver is behind by more than this", "s", live=True)
+    stuck_s: float = setting(10.0, "degraded: one solve has taken longer than this", "s", live=True)
     chi2_per_dof: float = setting(
-        10.0,
-        "degraded: the measurements contradict each other by more than this chi2",
-        "per degree of freedom",
-        low=0.0,
-        live=True,
+        10.0, "degraded: measurements contradict each other by more", "chi2 per degree of freedom", live=True
     )

@@ -59,9 +59,9 @@ def setting(
     choices: tuple[str, ...] = (),
     live: bool = False,
 ) -> Any:
-    """Declare a field of a section: default, meaning, unit, bounds and choices; ``live``: it may change at run time."""
+    """Declare a field of a section. A number is not negative, unless ``low`` says so."""
     if isinstance(default, float):
-        low, high = -_LARGEST if low is None else low, _LARGEST if high is None else high
+        low, high = 0.0 if low is None else low, _LARGEST if high is None else high
     return field(default=default, metadata={"about": (meaning, unit, low, high, choices, live)})
 
 

@@ -11,9 +11,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from graph_slam_ros.config.config import with_survey
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.measurements.types import Event
-from graph_slam_ros.messages.survey import with_survey
 from graph_slam_ros.node.diagnostics import Facts
 from graph_slam_ros.node.estimate import Estimate
 from graph_slam_ros.node.fact_collector import FactCollector

@@ -10,10 +10,10 @@ from typing import Any
 
 from graph_slam_ros.check.checks import first_of_replay, worst_of_replay
 from graph_slam_ros.check.columns import Collector
+from graph_slam_ros.config.config import with_survey
 from graph_slam_ros.measurements.reasons import warnings as mendable
 from graph_slam_ros.measurements.types import END, Measured, Odometry
 from graph_slam_ros.messages.from_msg import TF_STATIC, MessageConverter
-from graph_slam_ros.messages.survey import with_survey
 from graph_slam_ros.overview.chosen_inputs import Inputs, choose_inputs
 from graph_slam_ros.recordings.bag import Bag, BagMessage, open_bag
 from graph_slam_ros.recordings.definitions import recorded_decoder

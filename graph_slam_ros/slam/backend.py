@@ -4,7 +4,7 @@ from collections.abc import Container, Mapping, Sequence
 
 import numpy as np
 
-from graph_slam_ros.config.robust import RobustConfig
+from graph_slam_ros.config.pipeline import RobustConfig
 from graph_slam_ros.graph import Gaussian, Graph
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.measurements.counters import Counters

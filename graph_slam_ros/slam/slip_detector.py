@@ -17,7 +17,7 @@ from statistics import median
 import numpy as np
 
 from graph_slam_ros.chi_square import quantile
-from graph_slam_ros.config.frontend import OdometryConfig
+from graph_slam_ros.config.pipeline import OdometryConfig
 from graph_slam_ros.errors import GraphSlamError, SingularError
 from graph_slam_ros.graph import Gaussian
 from graph_slam_ros.graph.geometry import Geometry

@@ -9,7 +9,7 @@ import yaml
 from places import ROOT
 from rows import each
 
-from graph_slam_ros.config.world import FramesConfig
+from graph_slam_ros.config.pipeline import FramesConfig
 from graph_slam_ros.messages.topics import PUBLICATIONS, SUBSCRIPTIONS
 from graph_slam_ros.recordings.bag import open_bag
 from graph_slam_ros.runs.replay import replay

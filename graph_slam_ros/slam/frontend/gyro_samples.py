@@ -3,7 +3,7 @@
 from bisect import bisect_left, bisect_right, insort
 from dataclasses import dataclass
 
-from graph_slam_ros.config.gyro import GyroConfig
+from graph_slam_ros.config.pipeline import GyroConfig
 from graph_slam_ros.lie import so3
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.types import AngularVelocity

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from graph_slam_ros.config.frontend import OdometryConfig
+from graph_slam_ros.config.pipeline import OdometryConfig
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.slam.frontend.odometry_selector import Step
 from graph_slam_ros.typing import Array, Numbers

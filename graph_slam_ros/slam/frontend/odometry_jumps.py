@@ -2,7 +2,7 @@
 
 import math
 
-from graph_slam_ros.config.frontend import OdometryConfig
+from graph_slam_ros.config.pipeline import OdometryConfig
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.typing import Numbers
 

@@ -11,7 +11,7 @@ without the correction. Else no keyframe could be made where a sighting was.
 from bisect import insort
 from collections.abc import Sequence
 
-from graph_slam_ros.config.frontend import OrderingConfig
+from graph_slam_ros.config.pipeline import OrderingConfig
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.types import Observation, Odometry
 from graph_slam_ros.slam.frontend.ingest_gate import size_of

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.linalg import block_diag
 
-from graph_slam_ros.config.landmarks import LandmarksConfig
+from graph_slam_ros.config.pipeline import LandmarksConfig
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.lie import se2

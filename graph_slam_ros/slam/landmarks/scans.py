@@ -12,7 +12,7 @@ from itertools import pairwise
 import numpy as np
 
 from graph_slam_ros.chi_square import quantile
-from graph_slam_ros.config.frontend import OdometryConfig
+from graph_slam_ros.config.pipeline import OdometryConfig
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.measurements.types import Sighting
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp

@@ -8,7 +8,7 @@ did.
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from graph_slam_ros.config.robust import RobustConfig
+from graph_slam_ros.config.pipeline import RobustConfig
 from graph_slam_ros.slam.robust.hypotheses import CancelToken, FrozenGraph, Outcome, search_alternatives
 from graph_slam_ros.typing import Executor as Executor
 from graph_slam_ros.typing import Result

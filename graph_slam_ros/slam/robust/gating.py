@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graph_slam_ros.chi_square import quantile
-from graph_slam_ros.config.robust import RobustConfig
+from graph_slam_ros.config.pipeline import RobustConfig
 from graph_slam_ros.graph import Graph, Loss
 from graph_slam_ros.graph.losses import weight_and_cost
 from graph_slam_ros.slam.robust.innovation import innovations, likely_together

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from graph_slam_ros.config.robust import RobustConfig
+from graph_slam_ros.config.pipeline import RobustConfig
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import GROUPS, SE2, Graph, Loss
 from graph_slam_ros.graph.records import weights_of

@@ -7,10 +7,10 @@ import pytest
 from rows import each
 
 from graph_slam_ros.cli import main
+from graph_slam_ros.config.config import with_survey
 from graph_slam_ros.errors import ConfigError, FormatError, GraphSlamError
 from graph_slam_ros.graph import POINT_PRIOR, R2, R3
 from graph_slam_ros.lie import se2, se3, so3
-from graph_slam_ros.messages.survey import with_survey
 from graph_slam_ros.runs import outcome
 from graph_slam_ros.runs.folder import run_config
 from graph_slam_ros.runs.replay import replay

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from graph_slam_ros.config.gyro import GyroConfig
+from graph_slam_ros.config.pipeline import GyroConfig
 from graph_slam_ros.slam import AngularVelocity, Config, Counters
 from graph_slam_ros.slam.frontend.gyro import GyroFusion
 from graph_slam_ros.slam.frontend.gyro_samples import GyroSamples
