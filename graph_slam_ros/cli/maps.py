@@ -8,7 +8,7 @@ from graph_slam_ros.cli import arguments, console
 from graph_slam_ros.cli.evaluate import suggest_next
 from graph_slam_ros.cli.usage import CODES, CommandParser
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.measurements.edit_actions import ACTIONS
+from graph_slam_ros.measurements.edits import ACTIONS
 
 _FILES = ("tum", "g2o", "mcap")
 _PICTURES = ("png", "gif")

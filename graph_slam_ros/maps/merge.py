@@ -17,8 +17,7 @@ from graph_slam_ros.edge_tags import tag_of
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import Gaussian
 from graph_slam_ros.maps.alignment import Alignment, align, positions
-from graph_slam_ros.measurements.edit_actions import ALL_FIELDS, Argument
-from graph_slam_ros.measurements.edits import AppliedEdit
+from graph_slam_ros.measurements.edits import AppliedEdit, Argument, kind_of
 from graph_slam_ros.runs.condensed_map import CONDENSED
 from graph_slam_ros.runs.folder import check_room
 from graph_slam_ros.runs.journal import parts_of
@@ -254,7 +253,7 @@ class _Second:
 
     def _argument(self, key: str, value: Argument, number: Mapping[int, int]) -> Argument:
         """A value of an edit, with the ids and keyframes of the merged map."""
-        match ALL_FIELDS[key].kind, value:
+        match kind_of(key), value:
             case "edge", int():
                 return number.get(value, value)
             case "edges", tuple():

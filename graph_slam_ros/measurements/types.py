@@ -7,7 +7,8 @@ on the type of the message that they came from.
 
 import math
 import operator
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
@@ -22,55 +23,65 @@ Event: TypeAlias = Literal[
 EVENTS: tuple[Event, ...] = get_args(Event)
 _VALUES: dict[Event, dict[str, type]] = {"remove": {"edge": int, "landmark": str}}
 
-
-_POSE, _OF_POSE = (3, 7), (9, 36)  # numbers in the plane, in space; and of its covariance
-_KINDS: dict[str, tuple[tuple[int, ...], tuple[int, ...]]] = {  # numbers that are measured, and of their covariance
-    "position": ((2, 3), (4, 9)),
-    "pose": (_POSE, _OF_POSE),
-    "range_bearing": ((2, 3), (4, 9)),
-    "bearing": ((1, 2), (1, 4)),
-    "range": ((1,), (1,)),
-    "heading": ((1,), (1,)),
-    "attitude": ((4,), (9,)),
-}
 SIGHTING_KINDS = ("position", "pose", "range_bearing", "bearing", "range")
 FIX_KINDS = ("pose", "position", "heading", "attitude")
+Sizes: TypeAlias = Mapping[str, tuple[int, ...]]
+_POSE, _OF_POSE = (3, 7), (9, 36)  # numbers in the plane, in space; and of its covariance
+_KINDS: dict[str, Sizes] = {
+    "position": {"measured": (2, 3), "covariance": (4, 9)},
+    "pose": {"measured": _POSE, "covariance": _OF_POSE},
+    "range_bearing": {"measured": (2, 3), "covariance": (4, 9)},
+    "bearing": {"measured": (1, 2), "covariance": (1, 4)},
+    "range": {"measured": (1,), "covariance": (1,)},
+    "heading": {"measured": (1,), "covariance": (1,)},
+    "attitude": {"measured": (4,), "covariance": (9,)},
+}
+_MAY_BE_EMPTY = ("point", "datum")
 
 
-def _check_choice(cls: type, value: str, choices: tuple[str, ...]) -> None:
+def _check_choice(one: Any, value: str, choices: tuple[str, ...]) -> None:
     if value not in choices:
-        raise FormatError(f"{cls.__name__}: {value!r} is not one of {', '.join(choices)}")
+        raise FormatError(f"{type(one).__name__}: {value!r} is not one of {', '.join(choices)}")
 
 
-def _check(one: Any, **sizes: tuple[int, ...]) -> None:
-    """Make plain tuples of arrays. Raises FormatError for wrong numbers, or so many as there may not be."""
-    name, value = "stamp_ns", getattr(one, "stamp_ns", 0)
-    try:
-        if type(value) is not int:
-            object.__setattr__(one, name, operator.index(value))
-        for name in sizes:
-            value = getattr(one, name)
-            if value is not None and not (type(value) is tuple and {float}.issuperset(map(type, value))):
-                value = tuple(map(float, np.ravel(value).tolist()))
-                object.__setattr__(one, name, value)
-            if value is not None and (len(value) not in sizes[name] or not all(map(math.isfinite, value))):
-                raise ValueError
-    except (TypeError, ValueError, OverflowError):
-        right = f"{' or '.join(map(str, sizes[name]))} finite numbers" if name in sizes else "whole nanoseconds"
-        raise FormatError(f"{type(one).__name__}: {name} {value!r}: it must be {right}") from None
+class _Checked:
+    """What is measured: its numbers become plain tuples of floats, finite and as many as its table says."""
 
+    __slots__ = ()
 
-def _check_pair(one: Any, measured: str, allowed: tuple[tuple[int, ...], tuple[int, ...]], **more: Any) -> None:
-    """Check numbers that were measured, and that the covariance is of so many."""
-    _check(one, **{measured: allowed[0], "covariance": allowed[1]}, **more)
-    if allowed[0].index(len(getattr(one, measured))) != allowed[1].index(len(one.covariance)):
-        raise FormatError(
-            f"{type(one).__name__}: covariance of {len(one.covariance)} numbers is not that of {measured}"
-        )
+    def __post_init__(self) -> None:
+        name, value, sizes = "stamp_ns", getattr(self, "stamp_ns", 0), _sizes_of(self)
+        spaces = set()
+        try:
+            if type(value) is not int:
+                object.__setattr__(self, name, operator.index(value))
+            for name, allowed in sizes.items():
+                value = getattr(self, name)
+                if value is not None and not (type(value) is tuple and {float}.issuperset(map(type, value))):
+                    value = tuple(map(float, np.ravel(value).tolist()))
+                    object.__setattr__(self, name, value)
+                if value is None or (not value and name in _MAY_BE_EMPTY):
+                    continue
+                space = allowed.index(len(value))
+                if len(allowed) > 1:
+                    spaces.add(space)
+                if not all(map(math.isfinite, value)):
+                    raise ValueError
+        except (TypeError, ValueError, OverflowError):
+            right = f"{' or '.join(map(str, sizes[name]))} finite numbers" if name in sizes else "whole nanoseconds"
+            raise FormatError(f"{type(self).__name__}: {name} {value!r}: it must be {right}") from None
+        if len(spaces) > 1:
+            counts = " and ".join(f"{len(getattr(self, name) or ())} of {name}" for name in sizes)
+            raise FormatError(f"{type(self).__name__}: its numbers are of the plane and of space: {counts}")
+
+    def misfits(self, dimensions: int) -> bool:
+        """Return whether its numbers are of another space than that of so many dimensions."""
+        given = ((getattr(self, name), allowed) for name, allowed in _sizes_of(self).items())
+        return any(value and len(value) != allowed[min(dimensions - 2, len(allowed) - 1)] for value, allowed in given)
 
 
 @dataclass(frozen=True, slots=True)
-class Odometry:
+class Odometry(_Checked):
     """Absolute pose in the odometry frame; only the motion between two poses is used.
 
     Attributes
@@ -84,12 +95,9 @@ class Odometry:
     twist_covariance: Numbers | None = None
     source: str = "odometry"
 
-    def __post_init__(self) -> None:
-        _check(self, T_odom_base=_POSE, twist_covariance=_OF_POSE)
-
 
 @dataclass(frozen=True, slots=True)
-class AngularVelocity:
+class AngularVelocity(_Checked):
     """The turn rate of the base, by a gyro.
 
     Attributes
@@ -103,12 +111,9 @@ class AngularVelocity:
     rate: Numbers
     covariance: Numbers | None = None
 
-    def __post_init__(self) -> None:
-        _check(self, rate=(1, 3), covariance=(1, 9))
-
 
 @dataclass(frozen=True, slots=True)
-class Sighting:
+class Sighting(_Checked):
     """One observation of a landmark by a sensor of the robot.
 
     Attributes
@@ -138,25 +143,18 @@ class Sighting:
     sort: str = ""
     size: float = 0.0
 
-    def __post_init__(self) -> None:
-        _check_choice(Sighting, self.kind, SIGHTING_KINDS)
-        _check_pair(self, "measured", _KINDS[self.kind], T_base_sensor=_POSE)
-
 
 @dataclass(frozen=True, slots=True)
-class Sightings:
+class Sightings(_Checked):
     """All observations of one message, at their common stamp."""
 
     stamp_ns: int
     topic: str
     sightings: tuple[Sighting, ...]
 
-    def __post_init__(self) -> None:
-        _check(self)
-
 
 @dataclass(frozen=True, slots=True)
-class Fix:
+class Fix(_Checked):
     """An absolute measurement in the map frame: a GNSS position, a compass heading, a pose from another system.
 
     Attributes
@@ -182,13 +180,9 @@ class Fix:
     point: Numbers = ()
     datum: Numbers = ()
 
-    def __post_init__(self) -> None:
-        _check_choice(Fix, self.kind, FIX_KINDS)
-        _check_pair(self, "measured", _KINDS[self.kind], point=(0, 2, 3), datum=(0, 3))
-
 
 @dataclass(frozen=True, slots=True)
-class Closure:
+class Closure(_Checked):
     """A loop closure: the pose of the robot at one stamp, relative to its pose at another stamp.
 
     Attributes
@@ -204,12 +198,9 @@ class Closure:
     T_from_base: Numbers
     covariance: Numbers
 
-    def __post_init__(self) -> None:
-        _check_pair(self, "T_from_base", (_POSE, _OF_POSE))
-
 
 @dataclass(frozen=True, slots=True)
-class InitialPose:
+class InitialPose(_Checked):
     """A pose given by a user or another system; it is used from the next odometry on.
 
     Attributes
@@ -219,9 +210,6 @@ class InitialPose:
 
     T_map_base: Numbers
     covariance: Numbers
-
-    def __post_init__(self) -> None:
-        _check_pair(self, "T_map_base", (_POSE, _OF_POSE))
 
 
 @dataclass(frozen=True, slots=True)
@@ -248,7 +236,7 @@ class Control:
     values: tuple[tuple[str, Value], ...] = ()
 
     def __post_init__(self) -> None:
-        _check_choice(Control, self.event, EVENTS)
+        _check_choice(self, self.event, EVENTS)
         if self.event == "set":
             return
         known = _VALUES.get(self.event, {})
@@ -268,22 +256,14 @@ Measured: TypeAlias = Odometry | AngularVelocity | Observation
 Measurement: TypeAlias = Measured | InitialPose | Control
 
 
-def check_space(m: Measurement, dimensions: int) -> None:
-    """Raise FormatError for a measurement in the plane (2 dimensions) of a robot in space (3), or the reverse."""
-    several = m.sightings if isinstance(m, Sightings) else (m,) if isinstance(m, Fix) else ()
-    sizes = [(len(one.measured), _KINDS[one.kind][0]) for one in several]
-    of_type = [(one, *size) for one in (m, *several) for size in _SIZES.get(type(one), ())]
-    sizes += [(len(numbers), of) for one, name, of in of_type if (numbers := getattr(one, name))]
-    if any(size != of[min(dimensions - 2, len(of) - 1)] for size, of in sizes):
-        raise FormatError(f"{type(m).__name__}: its numbers are not of {dimensions} dimensions (world.dimensions)")
-
-
-_SIZES: dict[type, tuple[tuple[str, tuple[int, ...]], ...]] = {
-    Odometry: (("T_odom_base", _POSE), ("twist_covariance", _OF_POSE)),
-    AngularVelocity: (("rate", (1, 3)),),
-    Sighting: (("T_base_sensor", _POSE),),
-    Closure: (("T_from_base", _POSE),),
-    InitialPose: (("T_map_base", _POSE),),
+_SIZES: dict[type, Sizes] = {
+    Odometry: {"T_odom_base": _POSE, "twist_covariance": _OF_POSE},
+    AngularVelocity: {"rate": (1, 3), "covariance": (1, 9)},
+    Sighting: {"T_base_sensor": _POSE},
+    Sightings: {},
+    Fix: {"point": (2, 3), "datum": (3,)},
+    Closure: {"T_from_base": _POSE, "covariance": _OF_POSE},
+    InitialPose: {"T_map_base": _POSE, "covariance": _OF_POSE},
 }
 _TYPES = {
     "odometry": Odometry,
@@ -297,28 +277,33 @@ _TYPES = {
 _NAMES = {cls: name for name, cls in _TYPES.items()}
 
 
+def _sizes_of(one: Any) -> Sizes:
+    """How many numbers each field of a measurement has. Raises FormatError for an unknown kind."""
+    kinds = {Sighting: SIGHTING_KINDS, Fix: FIX_KINDS}.get(type(one))
+    if kinds is None:
+        return _SIZES[type(one)]
+    _check_choice(one, one.kind, kinds)
+    return {**_KINDS[one.kind], **_SIZES[type(one)]}
+
+
+def check_space(m: Measurement, dimensions: int) -> None:
+    """Raise FormatError for a measurement in the plane (2 dimensions) of a robot in space (3), or the reverse."""
+    several = m.sightings if isinstance(m, Sightings) else () if isinstance(m, Control) else (m,)
+    if any(one.misfits(dimensions) for one in several):
+        raise FormatError(f"{type(m).__name__}: its numbers are not of {dimensions} dimensions (world.dimensions)")
+
+
 def to_record(measurement: Measurement) -> dict[str, Any]:
     """Plain dictionary of a measurement; floats survive JSON exactly."""
-    match measurement:
-        case Odometry(stamp_ns, pose, covariance, source):  # by hand: thousands a second
-            out = {"type": "odometry", "stamp_ns": stamp_ns, "T_odom_base": pose, "twist_covariance": covariance}
-            return out | {"source": source}
-        case AngularVelocity(stamp_ns, topic, rate, covariance):
-            out = {"type": "angular_velocity", "stamp_ns": stamp_ns, "topic": topic}
-            return out | {"rate": rate, "covariance": covariance}
-        case Sightings(stamp_ns, topic, sightings):
-            out = {"type": "sightings", "stamp_ns": stamp_ns, "topic": topic}
-            return out | {"sightings": tuple(map(sighting_record, sightings))}
-        case _:
-            return {"type": _NAMES[type(measurement)], **asdict(measurement)}
+    out = {name: getattr(measurement, name) for name in measurement.__slots__}
+    if isinstance(measurement, Sightings):
+        out["sightings"] = tuple(map(sighting_record, measurement.sightings))
+    return {"type": _NAMES[type(measurement)], **out}
 
 
 def sighting_record(one: Sighting) -> dict[str, Any]:
     """Plain dictionary of a sighting. It has a size only where that is known."""
-    out = asdict(one)
-    if not one.size:
-        del out["size"]
-    return out
+    return {name: getattr(one, name) for name in one.__slots__ if name != "size" or one.size}
 
 
 def from_record(record: dict[str, Any]) -> Measurement:

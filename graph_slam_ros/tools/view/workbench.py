@@ -18,7 +18,7 @@ from graph_slam_ros.errors import FormatError, GaugeError, GraphSlamError, Singu
 from graph_slam_ros.graph import Loss
 from graph_slam_ros.graph.losses import NAMES
 from graph_slam_ros.maps.edit import FORMAT, VERSION, Edited, Rehearsal, edit, plan_of, source_hash
-from graph_slam_ros.measurements.edit_actions import ACTIONS
+from graph_slam_ros.measurements.edits import ACTIONS
 from graph_slam_ros.runs.folder import summary_of
 from graph_slam_ros.slam.map_view import MapView
 from graph_slam_ros.solver import Solver

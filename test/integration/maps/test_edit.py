@@ -13,8 +13,7 @@ from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.g2o import read_g2o
 from graph_slam_ros.maps.edit import Plan, edit_run, plan_text, source_hash
-from graph_slam_ros.measurements.edit_actions import ACTIONS
-from graph_slam_ros.measurements.edits import edit_of
+from graph_slam_ros.measurements.edits import ACTIONS, edit_of
 from graph_slam_ros.runs.ledger_file import read_ledger
 from graph_slam_ros.runs.restore import map_of, record_run, restored
 from graph_slam_ros.runs.saved_run import load_run

@@ -12,7 +12,7 @@ from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import Loss
 from graph_slam_ros.maps.edit import source_hash
-from graph_slam_ros.measurements.edit_actions import ACTIONS
+from graph_slam_ros.measurements.edits import ACTIONS
 from graph_slam_ros.runs.trajectory import read_landmarks, read_tum
 from graph_slam_ros.tools.report.contents import read_contents
 from graph_slam_ros.tools.view.workbench import Workbench

@@ -13,8 +13,7 @@ from rows import each
 
 from graph_slam_ros.errors import FormatError
 from graph_slam_ros.maps.edit import FORMAT, Plan, plan_text, read_plan
-from graph_slam_ros.measurements.edit_actions import ACTIONS
-from graph_slam_ros.measurements.edits import AppliedEdit, aliases, applied_edit, edit_of
+from graph_slam_ros.measurements.edits import ACTIONS, AppliedEdit, aliases, applied_edit, edit_of
 
 WHO = {"who": "Anna", "when": "2026-05-04T10:30:00Z", "why": "two aisles look alike"}
 VALUES = {"edge": 7, "landmark": "7", "to": "dock", "into": "8", "edges": [3, 9], "from": 2, "until": "7.5"}
@@ -88,9 +87,9 @@ out, split, closure = (partial(values_of, do) for do in ("remove_edge", "split_l
         (out(do="remove"), "do: 'remove' is none of remove_edge"),
         (out(do=["remove_edge"]), "do: ['remove_edge'] is none of"),
         (out(do="remove_landmark"), "'edge': unknown key; remove_landmark has"),
-        (out(who=""), "who: empty"),
-        (out(why=" \n"), "why: empty"),
-        (out(why="x" * 2001), "why: 2001 characters, at most 2000"),
+        (out(who=""), "who: '' is not a text of up to 200 characters"),
+        (out(why=" \n"), "is not a text of up to 2000 characters"),
+        (out(why="x" * 2001), "is not a text of up to 2000 characters"),
         (out(when="yesterday"), "when: 'yesterday' is not a time with its zone"),
         (out(when="2026-05-04T10:30:00"), "is not a time with its zone"),
         *((split(0, edges=edges), f"edges: {edges} is not a list of ids") for edges in ([], [3, 3], [3, -1], 7)),
