@@ -5,25 +5,26 @@ Intact and damaged files are read the same way. Everything intact is read; what 
 
 import heapq
 import re
+import shlex
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Protocol
+from typing import Any
 
-from mcap.records import Channel, Message, Schema
+import yaml
 from mcap.writer import CompressionType, Writer
 
-from graph_slam_ros.errors import FormatError, GraphSlamError, similar_file
-from graph_slam_ros.formats.bag_folder import as_listed, still_packed, unpacking
+from graph_slam_ros.errors import FormatError, similar_file
 from graph_slam_ros.formats.durable import AppendedFile
-from graph_slam_ros.formats.files import opened
-from graph_slam_ros.messages.from_msg import TRANSFORMS
+from graph_slam_ros.formats.files import opened, read_text
 from graph_slam_ros.messages.interfaces import typestore
 from graph_slam_ros.recordings import mcap_records, ros1_records, sqlite_records
 from graph_slam_ros.recordings.decompression import ZSTD_MAGIC, zstd_message
-from graph_slam_ros.recordings.recorded_types import ros1_store
+from graph_slam_ros.recordings.part import BagError, BagMessage, Part, Topic
+
+__all__ = ["Bag", "BagError", "BagMessage", "BagWriter", "Topic", "open_bag"]
 
 _SUFFIXES = (".mcap", ".db3", ".bag", ".bag.active", ".mcap.zstd", ".db3.zstd")
 _PACKED = {
@@ -38,36 +39,6 @@ _HEAD_BYTES, _TAR_AT = 512, 257
 _WINDOW_BYTES, _OVERHEAD = 64 * 2**20, 256
 
 
-class BagError(GraphSlamError):
-    """A recording that cannot be read, or lacks what was asked for."""
-
-
-@dataclass(frozen=True, slots=True)
-class Topic:
-    """A recorded topic.
-
-    Attributes
-    ----------
-    definition : the message definition recorded with it (ROS .msg text), or empty
-    encoding : of its messages; those of ROS 1 are converted to CDR where their type is known
-    """
-
-    name: str
-    type: str
-    count: int
-    definition: str = ""
-    encoding: str = "cdr"
-
-
-@dataclass(frozen=True, slots=True)
-class BagMessage:
-    """One recorded message: CDR bytes and the time it was received."""
-
-    topic: str
-    log_ns: int
-    cdr: bytes
-
-
 class Bag:
     """An open recording: one file, or several parts.
 
@@ -77,7 +48,7 @@ class Bag:
     losses, warnings : what could not be read, and what to beware of, as far as it has been read
     """
 
-    def __init__(self, parts: Sequence["_Part"]) -> None:
+    def __init__(self, parts: Sequence[Part]) -> None:
         self._parts = sorted(parts, key=lambda part: part.first_ns)
         self.topics: dict[str, Topic] = {}
         self.losses: list[str] = []
@@ -115,7 +86,7 @@ class Bag:
                 yield message
                 _push(heads, number, rest)
 
-    def _of(self, part: "_Part", topics: Collection[str]) -> Iterator[BagMessage]:
+    def _of(self, part: Part, topics: Collection[str]) -> Iterator[BagMessage]:
         losses, warnings, damaged = list[str](), list[str](), 0
         for message in part.messages(topics, losses, warnings):
             try:
@@ -146,13 +117,13 @@ def open_bag(path: Path | str) -> Bag:
     """
     path = Path(path)
     try:
-        files, missing, others = as_listed(path, _files(path))
+        files, missing, others = _as_listed(path, _files(path))
         bag = Bag([_part(file) for file in files])
     except OSError as error:
         raise BagError(f"{path}: {error.strerror}") from None
     except FormatError as error:
         raise BagError(str(error)) from None
-    bag.losses += [*missing, *still_packed(path, files)]
+    bag.losses += [*missing, *_still_packed(path, files)]
     bag.warnings += others
     names = {re.sub(r"[_-]?\d+$", "", file.stem) for file in files}
     if len(names) > 1 and not (path / "metadata.yaml").is_file():
@@ -181,7 +152,7 @@ def _natural(path: Path) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name)]
 
 
-def _part(file: Path) -> "_Part":
+def _part(file: Path) -> Part:
     """Open a file by its first bytes, whatever its name."""
     with opened(file, follow=True) as stream:
         begins = stream.read(_HEAD_BYTES)
@@ -192,126 +163,62 @@ def _part(file: Path) -> "_Part":
             return kind(file)
     for magic, codec in _PACKED.items():
         if begins.startswith(magic):
-            raise BagError(f"{file}: {unpacking(file, codec)}")
+            raise BagError(f"{file}: {_unpacking(file, codec)}")
     if begins[_TAR_AT:].startswith(b"ustar"):
-        raise BagError(f"{file}: {unpacking(file, 'tar')}")
+        raise BagError(f"{file}: {_unpacking(file, 'tar')}")
     raise BagError(f"{file}: not a readable recording: it begins as neither mcap, sqlite3 nor a ROS 1 bag")
 
 
-class _Part(Protocol):
-    """One file of a recording.
-
-    Attributes
-    ----------
-    first_ns : time of its first message, or 0 where that is not known
-    ros1 : by topic: from a message of ROS 1 to CDR
-    """
-
-    file: Path
-    topics: list[Topic]
-    first_ns: int
-    ros1: dict[str, Callable[[bytes], bytes]]
-
-    def messages(self, topics: Collection[str], losses: list[str], warnings: list[str]) -> Iterator[BagMessage]:
-        """Messages in order of the file."""
-
-
-class _McapPart:
-    def __init__(self, file: Path) -> None:
-        self.file = file
-        self._contents = found = mcap_records.contents(file)
-        self.first_ns, self.ros1 = found.first_ns, dict[str, Callable[[bytes], bytes]]()
-        self.topics = [
-            self._topic(channel, found.schemas.get(channel.schema_id), found.counts.get(channel.id, 0))
-            for channel in found.channels.values()
-        ]
-        if not self.topics:
-            lost: list[str] = []
-            for _ in mcap_records.records(file, lost):
-                pass
-            raise BagError(f"{file}: no topic in it{' that is whole; ' + lost[0] if lost else ''}")
-
-    def messages(self, topics: Collection[str], losses: list[str], warnings: list[str]) -> Iterator[BagMessage]:
-        # a channel's own record may sit in a damaged chunk: the summary knows it, too
-        names = {channel.id: channel.topic for channel in self._contents.channels.values()}
-        for record in mcap_records.records(self.file, losses, warnings):
-            if isinstance(record, Message):
-                name = names.get(record.channel_id, "")
-                if name in topics:
-                    yield BagMessage(name, record.log_time, record.data)
-            elif isinstance(record, Channel):
-                names[record.id] = record.topic
-
-    def _topic(self, channel: Channel, schema: Schema | None, count: int) -> Topic:
-        type_name = schema.name if schema else ""
-        if type_name.count("/") == 1:
-            type_name = type_name.replace("/", "/msg/")
-        has_text = schema is not None and schema.encoding in ("ros2msg", "ros1msg")
-        definition = schema.data.decode(errors="replace") if schema and has_text else ""
-        topic = Topic(channel.topic, type_name, count, definition, channel.message_encoding)
-        return _of_ros1(topic, channel.metadata.get("md5sum", ""), self.ros1) if topic.encoding == "ros1" else topic
-
-
-class _SqlitePart:
-    def __init__(self, file: Path) -> None:
-        self.file = file
-        self._contents = found = sqlite_records.contents(file)
-        self._damage: str | None = None  # not looked for yet: it takes as long as reading
-        self.first_ns, self.ros1 = found.first_ns, dict[str, Callable[[bytes], bytes]]()
-        self.topics = [
-            Topic(name, type_name, found.counts.get(number, 0), found.definitions.get(type_name, ""), encoding)
-            for number, (name, type_name, encoding) in found.topics.items()
-        ]
-
-    def messages(self, topics: Collection[str], losses: list[str], warnings: list[str]) -> Iterator[BagMessage]:
-        names = {number: name for number, (name, _, _) in self._contents.topics.items() if name in topics}
-        for number, log_ns, cdr in sqlite_records.messages(self.file, list(names), losses):
-            yield BagMessage(names[number], log_ns, cdr)
-        if self._damage is None:
-            self._damage = sqlite_records.damage(self.file)
-        if self._damage and not losses:
-            losses.append(f"{self.file.name}: damaged ({self._damage})")
-
-
-class _Ros1Part:
-    def __init__(self, file: Path) -> None:
-        self.file = file
-        found = ros1_records.contents(file)
-        if not found.connections:
-            raise BagError(f"{file}: no topic in it{' that is whole; ' + found.lost if found.lost else ''}")
-        self.first_ns, self.ros1 = found.first_ns, dict[str, Callable[[bytes], bytes]]()
-        by_name: dict[str, Topic] = {}
-        for number, of in found.connections.items():
-            known, count = by_name.get(of.topic), found.counts.get(number, 0)
-            topic = Topic(of.topic, of.type.replace("/", "/msg/"), count, of.definition, "ros1")
-            if known is None or known.encoding == "ros1":  # a publisher may have no definition, and the next has
-                known = _of_ros1(replace(topic, count=known.count if known else 0), of.md5, self.ros1)
-            by_name[of.topic] = replace(known, count=known.count + count)
-        self.topics = list(by_name.values())
-
-    def messages(self, topics: Collection[str], losses: list[str], warnings: list[str]) -> Iterator[BagMessage]:
-        for message in ros1_records.messages(self.file, losses):
-            if message.topic in topics:
-                yield BagMessage(message.topic, message.log_ns, message.data)
-
-
-def _of_ros1(topic: Topic, md5: str, converters: dict[str, Callable[[bytes], bytes]]) -> Topic:
-    """The topic of ROS 1 messages as it is in CDR, with its converter added; unchanged where its type is not known."""
-    type_name = TRANSFORMS if topic.type == "tf/msg/tfMessage" else topic.type
-    store = ros1_store(type_name, topic.definition, md5)
-    if store is None:
-        return topic
-    converters[topic.name] = lambda data: bytes(store.ros1_to_cdr(data, type_name))
-    text = store.generate_msgdef(type_name, ros_version=2)[0] if store is not typestore() else ""
-    return replace(topic, type=type_name, definition=text, encoding="cdr")
-
-
 # By how a file begins. rosbags reads whole files alone, and of a damaged one nothing.
-_KINDS: dict[bytes, Callable[[Path], _Part]] = {
-    mcap_records.MAGIC: _McapPart,
-    sqlite_records.MAGIC: _SqlitePart,
-    ros1_records.MAGIC: _Ros1Part,
+_KINDS: dict[bytes, Callable[[Path], Part]] = {
+    mcap_records.MAGIC: mcap_records.McapPart,
+    sqlite_records.MAGIC: sqlite_records.SqlitePart,
+    ros1_records.MAGIC: ros1_records.Ros1Part,
 }
+
+
+def _as_listed(path: Path, found: list[Path]) -> tuple[list[Path], list[str], list[str]]:
+    """The files that metadata.yaml names, the losses (named, and not there), and warnings (there, and not named)."""
+    there = {file.name.removesuffix(".zstd"): file for file in found}
+    named = [Path(name).name.removesuffix(".zstd") for name in _names_in(path / "metadata.yaml")]
+    files = [there[name] for name in dict.fromkeys(named) if name in there]
+    if not files:
+        return found, [], []
+    lost = [name for name in named if name not in there and not (path / f"{name}.zstd").is_file()]
+    missing = [f"{path / name}: not there, though metadata.yaml names it" for name in lost]
+    others = [file.name for file in found if file not in files]
+    mend = "metadata.yaml does not name it: if it is a part of the recording, ros2 bag reindex"
+    return files, missing, [f"{path / name}: not read, as {mend}" for name in others]
+
+
+def _still_packed(path: Path, files: list[Path]) -> list[str]:
+    """The losses of files that are compressed as a whole, next to others that are not."""
+    there = {file.name for file in files}
+    if not path.is_dir() or any(name.endswith(".zstd") for name in there):
+        return []
+    packed = sorted(file for file in path.glob("*.zstd") if file.name.removesuffix(".zstd") not in there)
+    return [f"{file.name}: not read: {_unpacking(file)}" for file in packed if file.stem.endswith((".db3", ".mcap"))]
+
+
+def _unpacking(file: Path, codec: str = "zstd") -> str:
+    """Say how a file is unpacked that is compressed as a whole, or is an archive."""
+    name = shlex.quote(str(file))
+    if codec in ("zip", "tar") or ".tar." in file.name or file.suffix in (".tgz", ".tbz", ".txz"):
+        return f"an archive: unpack it, and give the folder in it: {'unzip' if codec == 'zip' else 'tar xf'} {name}"
+    whole = file.with_suffix("") if file.suffix in (".zstd", ".gz", ".bz2", ".lz4") else Path("UNPACKED")
+    mend = f"unpack it first: {codec} -dc < {name} > {shlex.quote(str(whole))}"
+    return f"the whole file is compressed with {codec}: {mend}"
+
+
+def _names_in(metadata: Path) -> list[str]:
+    """The files that the metadata of a rosbag2 folder name; none where it has none, or they cannot be read."""
+    if not metadata.is_file():
+        return []
+    try:
+        content = yaml.safe_load(read_text(metadata, follow=True))
+        return [str(name) for name in content["rosbag2_bagfile_information"]["relative_file_paths"]]
+    except (OSError, ValueError, yaml.YAMLError, TypeError, KeyError, RecursionError):
+        return []
 
 
 def _push(heads: list[Any], number: int, messages: Iterator[BagMessage]) -> None:

@@ -1,17 +1,28 @@
 """Recorded message definitions: a bag is decoded by its own definitions if they have the fields that we need."""
 
+import re
+from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
-from rosbags.typesys import get_types_from_msg
+from rosbags.interfaces import Nodetype
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
 
-from graph_slam_ros.messages.from_msg import Decoder, decoder
+from graph_slam_ros.messages.from_msg import TRANSFORMS, Decoder, decoder
+from graph_slam_ros.messages.inputs import known_types
 from graph_slam_ros.messages.inputs.landmark_types import fields_used
 from graph_slam_ros.messages.inputs.plugins import input_type
 from graph_slam_ros.messages.interfaces import typestore
-from graph_slam_ros.recordings.bag import BagError, Topic
-from graph_slam_ros.recordings.recorded_types import MOST_TEXT, MOST_VALUES, has_too_many_values, store_with
+from graph_slam_ros.recordings.part import BagError, Topic
 
+_MOST_TEXT = 2**16
+"""Of a recorded definition; rosbags' parser takes a minute for two megabytes of blank lines."""
+_MOST_VALUES = 10_000
+"""Of a message of a recorded definition, each sequence with one value: rosbags' decoder is as long as that."""
+_HEADER = "std_msgs/msg/Header"
+_OF_ROS1 = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")  # words of its language
 _NEEDED = {
     "vision_msgs/msg/Detection3D": "header results bbox",
     "vision_msgs/msg/ObjectHypothesisWithPose": "pose",
@@ -61,7 +72,7 @@ def _of_any_version(type_name: str) -> Decoder:
     ours, recorded = decoder(type_name), dict[str, Any]()
     for name, text in _OLDER.items():
         recorded |= get_types_from_msg(text, name)
-    older = store_with(recorded)
+    older = _store_with(recorded)
 
     def decoded(cdr: bytes) -> Any:
         try:
@@ -73,8 +84,8 @@ def _of_any_version(type_name: str) -> Decoder:
 
 
 def _by_definition(topic: Topic, whose: str) -> Decoder:
-    if len(topic.definition) > MOST_TEXT:
-        raise BagError(f"topic {topic.name}: {whose} definition of {topic.type} is longer than {MOST_TEXT} bytes")
+    if len(topic.definition) > _MOST_TEXT:
+        raise BagError(f"topic {topic.name}: {whose} definition of {topic.type} is longer than {_MOST_TEXT} bytes")
     try:
         recorded = get_types_from_msg(topic.definition, topic.type)
     except Exception as error:  # rosbags' parser raises errors of its own grammar library
@@ -90,7 +101,92 @@ def _by_definition(topic: Topic, whose: str) -> Decoder:
                 raise BagError(f"topic {topic.name}: {name} of this recording has no field {field!r}")
             if there[field] != known[field]:
                 raise BagError(f"topic {topic.name}: field {field!r} of {name} has another type in this recording")
-    if has_too_many_values(recorded, topic.type):
-        raise BagError(f"topic {topic.name}: {whose} {topic.type} has more than {MOST_VALUES} values")
-    store = store_with(recorded)
+    if _has_too_many_values(recorded, topic.type):
+        raise BagError(f"topic {topic.name}: {whose} {topic.type} has more than {_MOST_VALUES} values")
+    store = _store_with(recorded)
     return lambda cdr: store.deserialize_cdr(cdr, topic.type)
+
+
+def in_cdr(topic: Topic, md5: str, converters: dict[str, Callable[[bytes], bytes]]) -> Topic:
+    """The topic of ROS 1 messages as it is in CDR, with its converter added; unchanged where its type is not known.
+
+    Parameters
+    ----------
+    md5 : the checksum that was recorded with the type; empty or ``*`` where there is none
+    """
+    type_name = TRANSFORMS if topic.type == "tf/msg/tfMessage" else topic.type
+    store = _ros1_store(type_name, topic.definition, md5)
+    if store is None:
+        return topic
+    converters[topic.name] = lambda data: bytes(store.ros1_to_cdr(data, type_name))
+    text = store.generate_msgdef(type_name, ros_version=2)[0] if store is not typestore() else ""
+    return replace(topic, type=type_name, definition=text, encoding="cdr")
+
+
+def _ros1_store(type_name: str, definition: str, md5: str = "") -> Typestore | None:
+    """Return the converter of messages of a recorded ROS 1 type to CDR.
+
+    None if the definition is unusable, or if it has other fields than ours (a header's ``seq`` aside) and no input
+    reads the type. Without a definition, as rosserial and goroslib record it, that of Noetic is used.
+    """
+    definition = definition.strip() or _of_noetic(type_name, md5)
+    if not definition or len(definition) > _MOST_TEXT:
+        return None
+    try:
+        recorded = get_types_from_msg(definition, type_name)
+    except Exception:  # rosbags' parser raises errors of its own grammar library
+        return None
+    if not set(re.findall(r"\w+/msg/\w+", repr(recorded))) <= {*recorded, *_OF_ROS1}:
+        return None
+    ours, foreign = typestore().fielddefs, {}
+    for name, (constants, fields) in recorded.items():
+        theirs = [field for field in fields if name != _HEADER or field[0] != "seq"]
+        if name not in _OF_ROS1 and (name not in ours or theirs != list(ours[name][1])):
+            foreign[name] = constants, theirs
+    if not foreign:
+        return typestore()
+    if _HEADER in foreign or type_name not in known_types() or _has_too_many_values(foreign, type_name):
+        return None
+    return _store_with(foreign)
+
+
+@cache
+def _of_noetic(type_name: str, md5: str) -> str:
+    """The definition of a type in ROS Noetic, or nothing where that has another checksum."""
+    store = get_typestore(Stores.ROS1_NOETIC)
+    if TRANSFORMS not in store.fielddefs:
+        store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms\n", TRANSFORMS))
+    if type_name not in store.fielddefs:
+        return ""
+    text, known = store.generate_msgdef(type_name, ros_version=1)
+    return text if md5 in ("", "*", known) else ""
+
+
+def _has_too_many_values(recorded: Any, type_name: str) -> bool:
+    """Return whether a message of a type has more than ``_MOST_VALUES``."""
+    return not _length({**typestore().fielddefs, **recorded}, type_name, {}) <= _MOST_VALUES
+
+
+def _length(types: Any, name: str, known: dict[str, float]) -> float:
+    """Return the least number of values of a message, with one element for each sequence."""
+    known[name] = float("inf")  # of a type that holds itself, there is no end
+    total = 0.0
+    for _, (kind, of) in types[name][1]:
+        count = 1
+        if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+            (inner, of), count = of[0], of[1] if kind == Nodetype.ARRAY else 1
+            kind, count = inner, count if inner == Nodetype.NAME else 1
+        if kind == Nodetype.NAME and of in types:
+            total += count * (known[of] if of in known else _length(types, of, known))
+        else:
+            total += 1
+    known[name] = total
+    return total
+
+
+def _store_with(recorded: Any) -> Typestore:
+    """Return a store of the recorded types, with ours for those that were not recorded."""
+    store = get_typestore(Stores.EMPTY)
+    basic = {name: fields for name, fields in typestore().fielddefs.items() if name not in recorded}
+    store.register({**basic, **recorded})
+    return store

@@ -9,10 +9,10 @@ import os
 import re
 import struct
 import zlib
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Collection, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile
@@ -26,6 +26,8 @@ from mcap.writer import Writer
 from graph_slam_ros.errors import FormatError
 from graph_slam_ros.formats.files import opened
 from graph_slam_ros.recordings.decompression import MOST_BYTES, decompressed
+from graph_slam_ros.recordings.definitions import in_cdr
+from graph_slam_ros.recordings.part import BagError, BagMessage, Part, Topic
 
 MAGIC = b"\x89MCAP0\r\n"
 LIBRARY = "graph_slam_ros"
@@ -46,14 +48,8 @@ _CHUNK = re.compile(rb"\x06(?=(.{8}).{28}(\0{4}|\x04\0{3}zstd|\x03\0{3}lz4)(.{8}
 _CHUNK_HEAD = 57
 
 
-@dataclass(frozen=True, slots=True)
-class Contents:
-    """The contents of a file: schemas and channels by id, messages by channel id, and the time of the first message."""
-
-    schemas: dict[int, Schema]
-    channels: dict[int, Channel]
-    counts: dict[int, int]
-    first_ns: int = 0
+Contents: TypeAlias = tuple[dict[int, Schema], dict[int, Channel], dict[int, int], int]
+"""Schemas and channels by id, messages by channel id, and the time of the first message."""
 
 
 class _Stream(io.BufferedReader):
@@ -81,28 +77,65 @@ def begin(profile: str = "", library: str = LIBRARY) -> bytes:
     return head.getvalue()
 
 
-def contents(path: Path) -> Contents:
-    """The contents, from the summary, or by reading everything if the summary is damaged or missing."""
+class McapPart(Part):
+    """An mcap file. Topics are read from the summary, or by reading everything if that is damaged or missing."""
+
+    def __init__(self, file: Path) -> None:
+        super().__init__(file)
+        losses: list[str] = []
+        schemas, self._channels, counts, self.first_ns = _summed_up(file) or _read_through(file, losses)
+        for number, channel in self._channels.items():
+            self.topics.append(self._topic(channel, schemas.get(channel.schema_id), counts.get(number, 0)))
+        if not self.topics:
+            raise BagError(f"{file}: no topic in it{' that is whole; ' + losses[0] if losses else ''}")
+
+    def messages(self, topics: Collection[str], losses: list[str], warnings: list[str]) -> Iterator[BagMessage]:
+        """Messages in order of the file."""
+        # a channel's own record may sit in a damaged chunk: the summary knows it, too
+        names = {channel.id: channel.topic for channel in self._channels.values()}
+        for record in records(self.file, losses, warnings):
+            if isinstance(record, Message):
+                name = names.get(record.channel_id, "")
+                if name in topics:
+                    yield BagMessage(name, record.log_time, record.data)
+            elif isinstance(record, Channel):
+                names[record.id] = record.topic
+
+    def _topic(self, channel: Channel, schema: Schema | None, count: int) -> Topic:
+        type_name = schema.name if schema else ""
+        if type_name.count("/") == 1:
+            type_name = type_name.replace("/", "/msg/")
+        has_text = schema is not None and schema.encoding in ("ros2msg", "ros1msg")
+        definition = schema.data.decode(errors="replace") if schema and has_text else ""
+        topic = Topic(channel.topic, type_name, count, definition, channel.message_encoding)
+        return in_cdr(topic, channel.metadata.get("md5sum", ""), self.ros1) if topic.encoding == "ros1" else topic
+
+
+def _summed_up(file: Path) -> Contents | None:
+    """The contents by the summary, or nothing if that is damaged or missing."""
     try:
-        with _Stream(path) as stream:
+        with _Stream(file) as stream:
             summary = _summary(stream)
     except Exception:  # of a damaged file the library raises almost anything
-        summary = None
-    if summary is not None and summary.statistics is not None and summary.channels:
-        statistics = summary.statistics
-        return Contents(
-            summary.schemas, summary.channels, statistics.channel_message_counts, statistics.message_start_time
-        )
-    schemas, channels, counts, first_ns = dict[int, Schema](), dict[int, Channel](), dict[int, int](), 2**64
-    for record in records(path, []):
+        return None
+    if summary is None or summary.statistics is None or not summary.channels:
+        return None
+    counts, first_ns = summary.statistics.channel_message_counts, summary.statistics.message_start_time
+    return summary.schemas, summary.channels, counts, first_ns
+
+
+def _read_through(file: Path, losses: list[str]) -> Contents:
+    """The contents by reading everything."""
+    schemas, channels, counts, first_ns = dict[int, Schema](), dict[int, Channel](), Counter[int](), 2**64
+    for record in records(file, losses):
         if isinstance(record, Message):
-            counts[record.channel_id] = counts.get(record.channel_id, 0) + 1
+            counts[record.channel_id] += 1
             first_ns = min(first_ns, record.log_time)
         elif isinstance(record, Schema):
             schemas[record.id] = record
         elif isinstance(record, Channel):
             channels[record.id] = record
-    return Contents(schemas, channels, counts, first_ns)
+    return schemas, channels, counts, first_ns
 
 
 def records(
@@ -121,7 +154,7 @@ def records(
         while True:
             try:
                 record, after = _record(stream, at)
-            except Exception as error:  # see contents
+            except Exception as error:  # see _summed_up
                 next_chunk = _next_chunk(stream, at + 1)
                 losses.append(f"{path.name}: {_lost(error, read, at, next_chunk, stream.size)}")
                 if next_chunk is None:
@@ -134,7 +167,7 @@ def records(
                     for inner in _inside(record):
                         read += isinstance(inner, Message)
                         yield inner
-                except Exception as error:  # see contents
+                except Exception as error:  # see _summed_up
                     losses.append(
                         f"{path.name}: a damaged chunk of {after - at} bytes was passed over ({_what(error)})"
                     )
@@ -266,7 +299,7 @@ def _announced(stream: _Stream) -> int | None:
     """Return the number of messages by the summary; None if it is damaged or does not have the number."""
     try:
         summary = _summary(stream)
-    except Exception:  # see contents
+    except Exception:  # see _summed_up
         return None
     return summary.statistics.message_count if summary is not None and summary.statistics is not None else None
 

@@ -5,81 +5,74 @@ rosbags needs the index, which is written when a recording ends, and fails with 
 
 import os
 import struct
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Collection, Iterator
+from dataclasses import replace
 from io import BufferedReader, BytesIO
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, TypeAlias
 
 from graph_slam_ros.errors import FormatError
 from graph_slam_ros.formats.files import opened
 from graph_slam_ros.recordings.decompression import MOST_BYTES, decompressed
+from graph_slam_ros.recordings.definitions import in_cdr
+from graph_slam_ros.recordings.part import BagError, BagMessage, Part, Topic
 
 MAGIC = b"#ROSBAG V2.0\n"
 _MESSAGE, _BAG, _CHUNK, _CHUNK_INFO, _CONNECTION = b"\x02", b"\x03", b"\x05", b"\x06", b"\x07"
 _MOST_HEADER = 2**20
-Fields = dict[str, bytes]
+Fields: TypeAlias = dict[str, bytes]
+Record: TypeAlias = tuple[Fields, bytes]
+_DAMAGE = (FormatError, struct.error, KeyError, ValueError)
 
 
-@dataclass(frozen=True, slots=True)
-class Connection:
-    """A topic of one publisher; the definition is ROS .msg text, or empty."""
+class Ros1Part(Part):
+    """A ROS 1 bag. Its topics are read from the index, or by reading everything. Raises FormatError, OSError."""
 
-    topic: str
-    type: str
-    definition: str
-    md5: str
+    def __init__(self, file: Path) -> None:
+        super().__init__(file)
+        losses: list[str] = []
+        try:
+            self._sum_up(_index(file))
+        except _DAMAGE:
+            self._sum_up(_records(file, losses))
+        if not self.topics:
+            raise BagError(f"{file}: no topic in it{' that is whole; ' + losses[0] if losses else ''}")
 
+    def _sum_up(self, records: Iterator[Record]) -> None:
+        """Count the messages of each topic, which may have several connections, one for each publisher."""
+        connections, counts, first_ns = dict[int, tuple[Topic, str]](), Counter[int](), 2**64
+        for fields, data in records:
+            if fields["op"] == _CONNECTION:
+                connections[_number(fields, "conn")] = _connection(fields, data)
+            elif fields["op"] == _CHUNK_INFO:
+                first_ns = min(first_ns, _time(fields["start_time"]))
+                for number, count in struct.iter_unpack("<II", data):
+                    counts[number] += count
+            else:
+                first_ns = min(first_ns, _time(fields["time"]))
+                counts[_number(fields, "conn")] += 1
+        by_name: dict[str, Topic] = {}
+        for number, (topic, md5) in connections.items():
+            known = by_name.get(topic.name)
+            if known is None or known.encoding == "ros1":  # a publisher may have no definition, and the next has
+                known = in_cdr(replace(topic, count=known.count if known else 0), md5, self.ros1)
+            by_name[topic.name] = replace(known, count=known.count + counts[number])
+        self.topics, self.first_ns = list(by_name.values()), first_ns
 
-@dataclass(frozen=True, slots=True)
-class Message:
-    """One message, in ROS 1's serialisation."""
-
-    topic: str
-    log_ns: int
-    data: bytes
-
-
-@dataclass(frozen=True, slots=True)
-class Contents:
-    """Connections and their messages by number, time of the first message, and what could not be read."""
-
-    connections: dict[int, Connection]
-    counts: dict[int, int]
-    first_ns: int
-    lost: str = ""
-
-
-def contents(path: Path) -> Contents:
-    """The contents, from the index or by reading everything. Raises FormatError, OSError."""
-    try:
-        return _indexed(path)
-    except (FormatError, struct.error, KeyError, ValueError):
-        pass
-    losses: list[str] = []
-    connections, counts, first_ns = dict[int, Connection](), dict[int, int](), 2**64
-    for fields, data in _records(path, losses):
-        number = _number(fields, "conn")
-        if fields["op"] == _CONNECTION:
-            connections[number] = _connection(fields, data)
-        else:
-            counts[number] = counts.get(number, 0) + 1
-            first_ns = min(first_ns, _time(fields["time"]))
-    return Contents(connections, counts, first_ns, losses[0] if losses else "")
+    def messages(self, topics: Collection[str], losses: list[str], warnings: list[str]) -> Iterator[BagMessage]:
+        """Messages in order of the file. A damaged chunk is skipped, a truncated end stops; ``losses`` says so."""
+        names: dict[int, str] = {}
+        for fields, data in _records(self.file, losses):
+            number = _number(fields, "conn")
+            if fields["op"] == _CONNECTION:
+                names[number] = _connection(fields, data)[0].name
+            elif names.get(number) in topics:
+                yield BagMessage(names[number], _time(fields["time"]), data)
 
 
-def messages(path: Path, losses: list[str]) -> Iterator[Message]:
-    """Messages in order of the file. A damaged chunk is skipped, a truncated end stops; each adds to ``losses``."""
-    topics: dict[int, str] = {}
-    for fields, data in _records(path, losses):
-        number = _number(fields, "conn")
-        if fields["op"] == _CONNECTION:
-            topics[number] = _connection(fields, data).topic
-        elif number in topics:
-            yield Message(topics[number], _time(fields["time"]), data)
-
-
-def _indexed(path: Path) -> Contents:
+def _index(path: Path) -> Iterator[Record]:
+    """Connections, and how many messages each chunk has of them."""
     with BufferedReader(opened(path, follow=True)) as stream:
         size = os.fstat(stream.fileno()).st_size
         stream.seek(len(MAGIC))
@@ -88,19 +81,13 @@ def _indexed(path: Path) -> Contents:
         if not len(MAGIC) < at < size:
             raise FormatError("no index")
         stream.seek(at)
-        connections, counts, first_ns = dict[int, Connection](), dict[int, int](), 2**64
         while stream.tell() < size:
-            fields, data = _record(stream, size)
-            if fields["op"] == _CONNECTION:
-                connections[_number(fields, "conn")] = _connection(fields, data)
-            elif fields["op"] == _CHUNK_INFO:
-                first_ns = min(first_ns, _time(fields["start_time"]))
-                for number, count in struct.iter_unpack("<II", data):
-                    counts[number] = counts.get(number, 0) + count
-        return Contents(connections, counts, first_ns)
+            record = _record(stream, size)
+            if record[0]["op"] in (_CONNECTION, _CHUNK_INFO):
+                yield record
 
 
-def _records(path: Path, losses: list[str]) -> Iterator[tuple[Fields, bytes]]:
+def _records(path: Path, losses: list[str]) -> Iterator[Record]:
     """Connections and messages, inside and outside of chunks."""
     read = 0
     with BufferedReader(opened(path, follow=True)) as stream:
@@ -109,41 +96,40 @@ def _records(path: Path, losses: list[str]) -> Iterator[tuple[Fields, bytes]]:
         while (at := stream.tell()) < size:
             try:
                 fields, data = _record(stream, size)
-            except (FormatError, struct.error, KeyError, ValueError) as error:
+            except _DAMAGE as error:
                 lost = f"{size - at} of {size} bytes are lost"
                 losses.append(f"{path.name}: cut off after {read} messages, {lost} ({error})")
                 return
             try:
-                if fields["op"] == _CHUNK:
-                    plain = decompressed(data, _word(fields, "compression"), _number(fields, "size"))
-                    inside = BytesIO(plain)
-                    while inside.tell() < len(plain):
-                        found = _checked(*_record(inside, len(plain)))
-                        if found is not None:
-                            read += found[0]["op"] == _MESSAGE
-                            yield found
-                else:
-                    found = _checked(fields, data)
-                    if found is not None:
-                        read += found[0]["op"] == _MESSAGE
-                        yield found
-            except (FormatError, struct.error, KeyError, ValueError) as error:
+                for record in _inside(fields, data) if fields["op"] == _CHUNK else [(fields, data)]:
+                    if _is_usable(*record):
+                        read += record[0]["op"] == _MESSAGE
+                        yield record
+            except _DAMAGE as error:
                 losses.append(f"{path.name}: a damaged chunk of {len(data)} bytes was passed over ({error})")
 
 
-def _checked(fields: Fields, data: bytes) -> tuple[Fields, bytes] | None:
-    """A connection or a message that can be used; nothing for other records. Raises as ``_record`` does."""
+def _inside(fields: Fields, data: bytes) -> Iterator[Record]:
+    """The records of a chunk."""
+    plain = decompressed(data, _word(fields, "compression"), _number(fields, "size"))
+    inside = BytesIO(plain)
+    while inside.tell() < len(plain):
+        yield _record(inside, len(plain))
+
+
+def _is_usable(fields: Fields, data: bytes) -> bool:
+    """Return whether a record is a connection or a message. Raises as ``_record`` does where that is damaged."""
     if fields["op"] == _CONNECTION:
         _connection(fields, data)
     elif fields["op"] == _MESSAGE:
         _time(fields["time"])
     else:
-        return None
+        return False
     _number(fields, "conn")
-    return fields, data
+    return True
 
 
-def _record(stream: BinaryIO, size: int) -> tuple[Fields, bytes]:
+def _record(stream: BinaryIO, size: int) -> Record:
     """The next record's header and data. A length beyond the end of the file is refused."""
     fields = _fields(_sized(stream, size, _MOST_HEADER))
     if "op" not in fields:
@@ -171,10 +157,11 @@ def _fields(header: bytes) -> Fields:
     return fields
 
 
-def _connection(fields: Fields, data: bytes) -> Connection:
+def _connection(fields: Fields, data: bytes) -> tuple[Topic, str]:
+    """The topic of a connection, and the checksum of its type."""
     more = _fields(data)
     md5, text = (more.get(name, b"").decode(errors="replace") for name in ("md5sum", "message_definition"))
-    return Connection(_word(fields, "topic"), _word(more, "type"), text, md5)
+    return Topic(_word(fields, "topic"), _word(more, "type").replace("/", "/msg/"), 0, text, "ros1"), md5
 
 
 def _word(fields: Fields, name: str) -> str:

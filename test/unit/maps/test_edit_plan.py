@@ -81,7 +81,7 @@ out, split, closure = (partial(values_of, do) for do in ("remove_edge", "split_l
     [
         (7, "7 is not an object"),
         *((out(edge=edge), f"edge: {edge!r} is not the id of an edge") for edge in (7.0, True, "7", -1, 2**63)),
-        *((out() | {key: None}, f"{key}: None is not a text") for key in ("name", "who", "when", "why")),
+        *((out() | {key: None}, f"{key}: None is not a text") for key in ("name", "who", "why")),
         *((out(**{key: None}), f"{key}: missing") for key in out()),
         (out(edgee=7), "'edgee': unknown key"),
         (out(do="remove"), "do: 'remove' is none of remove_edge"),
