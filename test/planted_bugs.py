@@ -159,8 +159,8 @@ BUGS = (
         "every_closure_believed",
         "false closures destroy the map",
         {
-            "config/robust.py: RobustConfig.decide": "setting(False, 'planted')",
-            "config/robust.py: RobustConfig.loss": "setting('none', 'planted', choices=LOSSES)",
+            "config/pipeline.py: RobustConfig.decide": "setting(False, 'planted')",
+            "config/pipeline.py: RobustConfig.loss": "setting('none', 'planted', choices=LOSSES)",
         },
         ("test_decisions.py::test_G10_false_closures_pull_nothing_and_all_true_ones_stay",),
     ),
