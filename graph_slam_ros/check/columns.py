@@ -6,26 +6,26 @@ A ``Collector`` gets each decoded message, and the measurements that the convert
 
 from array import array
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from graph_slam_ros.check.located import mount_corrections
-from graph_slam_ros.check.sightings import MOST, SightingCollector, SightingColumns, index
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.config.inputs import ASSUMED, InputConfig
 from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.measurements.counters import Counters
-from graph_slam_ros.measurements.types import AngularVelocity, Control, Fix, Measured, Odometry, Sightings
+from graph_slam_ros.measurements.types import AngularVelocity, Control, Fix, Measured, Odometry, Sighting, Sightings
 from graph_slam_ros.messages.from_msg import TF, TF_STATIC, OwnDecoder
 from graph_slam_ros.messages.inputs import uses
 from graph_slam_ros.messages.inputs.detections import names_of
 from graph_slam_ros.messages.inputs.odometry_bytes import OdometryBytes, OdometryRun
 from graph_slam_ros.messages.inputs.transforms import Transforms, assumed_mount, pose
-from graph_slam_ros.typing import Array, Index, Mask
+from graph_slam_ros.typing import Array, Index, Mask, Numbers
 
-_TWIST, _COLUMNS = (0, 7, 14, 21, 28, 35), 19  # places in a covariance; numbers of a message
+_MOST = 200_000  # messages of each topic that are collected
+_TWIST = (0, 7, 14, 21, 28, 35)  # places in a covariance
+_OF_ODOMETRY, _OF_GYRO, _OF_FIX, _OF_SIGHTING = 19, 7, 4, 6  # numbers of each
 Decoder = Callable[[bytes], Any]
 
 
@@ -70,8 +70,49 @@ class OdometryColumns:
 
     def some(self, which: Mask) -> "OdometryColumns":
         """Return the columns of some of the messages."""
-        rows = (self.stamp_ns[which], self.poses[which], self.twist[which], self.variances[which])
-        return OdometryColumns(self.input, self.topic, self.frame, self.child, *rows)
+        rows = ("stamp_ns", "poses", "twist", "variances")
+        return replace(self, **{row: getattr(self, row)[which] for row in rows})
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SightingColumns:
+    """The sightings of one input, as a replay uses them.
+
+    Attributes
+    ----------
+    names, name : identities, and (k,) the number of each sighting's; the empty one is of those without
+    points : (k, 3) in the base frame; NaN of a range or bearing alone
+    ranges : (k,) of a range alone [m]; NaN of others
+    bearings : (k,) of a bearing alone, in the plane or horizontal [rad]; NaN of others
+    sigmas : (k,) of the position or range [m], or of a bearing alone [rad]
+    frame, T_base_frame : the frame of the first message, and where it is on the robot
+    """
+
+    input: str
+    topic: str
+    stamp_ns: Index
+    names: tuple[str, ...]
+    name: Index
+    points: Array
+    ranges: Array
+    bearings: Array
+    sigmas: Array
+    frame: str
+    T_base_frame: se3.Pose
+
+    def some(self, which: Mask) -> "SightingColumns":
+        """Return the columns of some of the sightings."""
+        rows = ("stamp_ns", "name", "points", "ranges", "bearings", "sigmas")
+        return replace(self, **{row: getattr(self, row)[which] for row in rows})
+
+    def named(self, path_ns: Index) -> Mask:
+        """Return which have an identity, and are within the time of odometry."""
+        is_named = np.array([bool(name) for name in self.names], dtype=bool)[self.name]
+        return np.asarray(is_named & (self.stamp_ns >= path_ns[0]) & (self.stamp_ns <= path_ns[-1]))
+
+    def located(self, path_ns: Index) -> Mask:
+        """Return which have a point besides."""
+        return np.asarray(self.named(path_ns) & (np.abs(self.points) < 1e9).all(axis=1))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,7 +152,7 @@ class Columns:
     Attributes
     ----------
     assumed : parameters that were chosen for the recording, and that nobody has set
-    path_ns, path : (m,) and (m, 7) T_odom_base, as a replay uses odometry
+    path_ns, path : (m,) and (m, 7) T_odom_base, as a replay uses odometry, ``in_order``
     gyro_ns, gyro : (g,) stamps and turn rate about the robot's z [rad/s] of the gyro that is used
     felt : (g, 6) turn rates [rad/s] and accelerations [m/s^2] about and along the axes of its sensor
     gyro_frame, T_base_gyro : its frame, and where that is on the robot; None where it is not fixed or not known
@@ -138,30 +179,91 @@ class Columns:
         return next((topic for topic in self.topics.values() if source in topic.inputs), None)
 
 
+def in_order(path_ns: Index, path: Array) -> tuple[Index, Array]:
+    """Usable poses of a path, in order of stamp, one for each."""
+    usable = np.isfinite(path).all(axis=1) & (np.abs(path).max(axis=1, initial=0.0) < 1e9)
+    stamp_ns, first = np.unique(path_ns[usable], return_index=True)
+    return stamp_ns, path[usable][first]
+
+
+class _Rows:
+    """Rows of some whole numbers and some others, up to ``_MOST``."""
+
+    def __init__(self, whole: int, others: int) -> None:
+        self._sizes, self._whole, self._others = (whole, others), array("q"), array("d")
+
+    def __len__(self) -> int:
+        return len(self._whole) // self._sizes[0]
+
+    @property
+    def room(self) -> int:
+        """How many more there may be."""
+        return _MOST - len(self)
+
+    def add(self, whole: Iterable[int], others: Iterable[float] = ()) -> None:
+        """Add one or more rows, for which there is room."""
+        self._whole.extend(whole)
+        self._others.extend(others)
+
+    def columns(self) -> tuple[Index, Array]:
+        """The whole numbers (n, whole) and the others (n, others)."""
+        whole, others = np.array(self._whole, dtype=np.int64), np.array(self._others, dtype=np.float64)
+        return whole.reshape(-1, self._sizes[0]), others.reshape(len(self), self._sizes[1])
+
+
 class _Topic:
     def __init__(self, name: str, type_name: str, inputs: tuple[str, ...], use: str, offset_ns: int) -> None:
-        self.name, self.type, self.inputs, self.use, self.offset_ns = name, type_name, inputs, use, offset_ns
+        self._of, self._offset_ns = (name, type_name, inputs, use), offset_ns
         self.begin_anew()
 
     def begin_anew(self) -> None:
-        self.log_ns, self.stamp_ns = array("q"), array("q")
-        self.frames: dict[str, int] = {}
+        self.rows, self.frames = _Rows(2, 0), dict[str, int]()
 
-    def add(self, log_ns: int, message: Any) -> None:
-        header = getattr(message, "header", None)
-        if header is not None:
-            self.add_stamps([log_ns], [header.stamp.sec * 1_000_000_000 + header.stamp.nanosec], header.frame_id)
-
-    def add_stamps(self, log_ns: Sequence[int], stamps_ns: Sequence[int], frame: str) -> None:
-        if room := min(len(log_ns), MOST - len(self.log_ns)):
-            self.log_ns.extend(log_ns[:room])
-            self.stamp_ns.extend([stamp_ns + self.offset_ns if stamp_ns else 0 for stamp_ns in stamps_ns[:room]])
+    def add(self, log_ns: Sequence[int], stamps_ns: Sequence[int], frame: str) -> None:
+        if room := min(len(log_ns), self.rows.room):
+            rows = zip(log_ns[:room], map(self.stamp, stamps_ns[:room]), strict=True)
+            self.rows.add(number for row in rows for number in row)
             self.frames[frame] = self.frames.get(frame, 0) + room
 
+    def stamp(self, stamp_ns: int) -> int:
+        """A stamp with the input's offset; 0 is none."""
+        return stamp_ns + self._offset_ns if stamp_ns else 0
+
     def columns(self) -> TopicColumns:
-        return TopicColumns(
-            self.name, self.type, self.inputs, self.use, index(self.log_ns), index(self.stamp_ns), self.frames
-        )
+        log_ns, stamp_ns = self.rows.columns()[0].T
+        return TopicColumns(*self._of, log_ns, stamp_ns, self.frames)
+
+
+class _Sightings:
+    """The sightings of one input, whose mount is corrected by x, y, z, roll, pitch, yaw [m, rad]."""
+
+    def __init__(self, name: str, topic: str, mount: Numbers) -> None:
+        self.input, self.topic, self._mount = name, topic, mount
+        self.frame, self.T_base_frame = "", se3.IDENTITY
+        self.begin_anew()
+
+    def begin_anew(self) -> None:
+        self._rows, self._names = _Rows(2, _OF_SIGHTING), dict[str, int]()
+
+    def add(self, m: Sightings, heights: Mapping[str, float]) -> None:
+        """Collect a message, with the heights of landmarks above the base [m], by id, which the plane does not have."""
+        for one in m.sightings if self._rows.room > 0 else ():
+            (x, y, z), sigma = _located(one)
+            alone = (one.measured[0] if one.kind == kind else np.nan for kind in ("range", "bearing"))
+            name = self._names.setdefault(one.id, len(self._names))
+            self._rows.add((m.stamp_ns, name), (x, y, heights.get(one.id, z), *alone, sigma))
+
+    def columns(self) -> SightingColumns:
+        (stamp_ns, name), numbers = (rows.T for rows in self._rows.columns())
+        points: Array = np.ascontiguousarray(numbers[:3].T)
+        if any(self._mount):
+            origin = np.array(self.T_base_frame[:3])
+            turned = so3.act(so3.exp(tuple(self._mount[3:])), tuple((points - origin).T))
+            points = np.stack(turned, axis=1) + origin + self._mount[:3]
+        ranges, bearings, sigmas = numbers[3:]
+        place = self.frame, self.T_base_frame
+        names = tuple(self._names)
+        return SightingColumns(self.input, self.topic, stamp_ns, names, name, points, ranges, bearings, sigmas, *place)
 
 
 class Collector:
@@ -183,10 +285,13 @@ class Collector:
             names = tuple(name for name in used if topics[name] == topic)
             first = by_name[names[0]]
             self._topics[topic] = _Topic(topic, first.type, names, used[names[0]], round(first.offset_s * 1e9))
-        seen, mounts = (name for name, use in used.items() if use == "landmarks"), mount_corrections(config)
-        self._sightings = {name: SightingCollector(name, topics[name], mounts[name]) for name in seen}
+        self._sightings = {
+            name: _Sightings(name, topics[name], _mount_correction(config, by_name[name]))
+            for name, use in used.items()
+            if use == "landmarks"
+        }
         self._frame_of = {name: by_name[name].frame for name in used}
-        self._fixes: dict[str, list[Fix]] = {name: [] for name, use in used.items() if use == "fix"}
+        self._fixes = {name: _Rows(1, _OF_FIX) for name, use in used.items() if use == "fix"}
         self._frames_of_fixes = dict[str, str]()
         self._odometry_topic = topics.get(self._main, "")
         self._frame, self._child, self._gyro_frame = "", "", ""
@@ -201,10 +306,9 @@ class Collector:
             topic.begin_anew()
         for seen in self._sightings.values():
             seen.begin_anew()
-        self._odometry_ns, self._numbers = array("q"), array("d")
-        self._fixes = {name: list[Fix]() for name in self._fixes}
-        self._path_ns, self._path = array("q"), array("d")
-        self._gyro_ns, self._gyro, self._felt = array("q"), array("d"), array("d")
+        self._fixes = {name: _Rows(1, _OF_FIX) for name in self._fixes}
+        self._read, self._path = _Rows(1, _OF_ODOMETRY), _Rows(1, self._config.space.pose.size)
+        self._gyro = _Rows(1, _OF_GYRO)
 
     def decoder(self, decode: Decoder) -> Decoder:
         """The same decoder, of which the message is remembered until it is collected."""
@@ -234,16 +338,14 @@ class Collector:
             self._add_message(topic, names, log_ns, message)
         for m in measured:
             if isinstance(m, Odometry):
-                if m.source.partition("#")[0] == self._main and len(self._path_ns) < MOST:
-                    self._path_ns.append(m.stamp_ns)
-                    self._path.extend(m.T_odom_base)
-            elif isinstance(m, AngularVelocity) and len(self._gyro_ns) < MOST:
-                self._gyro_ns.append(m.stamp_ns)
-                self._gyro.append(m.rate[-1])
+                if m.source.partition("#")[0] == self._main and self._path.room:
+                    self._path.add((m.stamp_ns,), m.T_odom_base)
+            elif isinstance(m, AngularVelocity) and self._gyro.room:
                 parts = (getattr(message, of, None) for of in ("angular_velocity", "linear_acceleration"))
-                self._felt.extend(getattr(part, axis, np.nan) for part in parts for axis in "xyz")  # a node has none
-            elif isinstance(m, Fix) and len(self._fixes[m.topic]) < MOST:
-                self._fixes[m.topic].append(m)
+                felt = (getattr(part, axis, np.nan) for part in parts for axis in "xyz")  # a node has none
+                self._gyro.add((m.stamp_ns,), (m.rate[-1], *felt))
+            elif isinstance(m, Fix) and self._fixes[m.topic].room:
+                self._fixes[m.topic].add((m.stamp_ns,), _fixed(m, self._config.world.dimensions))
             elif isinstance(m, Sightings) and m.topic in self._sightings:
                 if message is not None and self._config.world.dimensions == 2:
                     heights = heights or _heights(message, self._sightings[m.topic].T_base_frame)
@@ -255,15 +357,16 @@ class Collector:
         if type(read) is OdometryRun:
             self._add_read(topic, log_ns, read)
         if run[0].source == self._main:
-            run = run[: MOST - len(self._path_ns)]
-            self._path_ns.extend([m.stamp_ns for m in run])
-            self._path.extend([x for m in run for x in m.T_odom_base])
+            run = run[: self._path.room]
+            self._path.add([m.stamp_ns for m in run], [x for m in run for x in m.T_odom_base])
 
     def _add_message(self, topic: str, names: Iterable[str], log_ns: int, message: Any) -> None:
-        if topic in self._topics:
-            self._topics[topic].add(log_ns, message)
-        if topic == self._odometry_topic and hasattr(message, "twist"):
-            self._add_odometry(message)
+        header = getattr(message, "header", None)
+        stamp_ns = header.stamp.sec * 1_000_000_000 + header.stamp.nanosec if header is not None else 0
+        if topic in self._topics and header is not None:
+            self._topics[topic].add([log_ns], [stamp_ns], header.frame_id)
+        if topic == self._odometry_topic and hasattr(message, "twist") and self._read.room:
+            self._add_odometry(message, self._topics[topic].stamp(stamp_ns))
         for name in names:
             if name in (TF, TF_STATIC):
                 self._add_transforms(message, fixed=name == TF_STATIC)
@@ -276,24 +379,22 @@ class Collector:
 
     def _add_read(self, topic: str, log_ns: Sequence[int], read: OdometryRun) -> None:
         """Collect odometry that was not decoded."""
+        read = read.first(len(log_ns))
+        stamps_ns = (read.sec * 1_000_000_000 + read.nanosec).tolist()
         if topic in self._topics:
-            stamps_ns = (read.sec * 1_000_000_000 + read.nanosec).tolist()
-            self._topics[topic].add_stamps(log_ns, stamps_ns, read.frame_id)
-        if topic == self._odometry_topic and (room := MOST - len(self._odometry_ns)):
+            self._topics[topic].add(log_ns, stamps_ns, read.frame_id)
+        if topic == self._odometry_topic and (room := self._read.room):
             self._note_frames(read.frame_id, read.child_frame_id)
-            rows = np.empty((min(room, len(read.numbers)), _COLUMNS))
-            rows[:, : -len(_TWIST)] = read.numbers[:room]
-            rows[:, -len(_TWIST) :] = np.frombuffer(read.twist_covariance, "<f8")[list(_TWIST)]
-            self._odometry_ns.extend(self._topics[topic].stamp_ns[-len(rows) :])
-            self._numbers.frombytes(rows.tobytes())
+            numbers = read.numbers[:room]
+            variances = np.frombuffer(read.twist_covariance, "<f8")[list(_TWIST)]
+            rows = np.hstack((numbers, np.tile(variances, (len(numbers), 1))))
+            self._read.add(map(self._topics[topic].stamp, stamps_ns[:room]), array("d", rows.tobytes()))
 
-    def _add_odometry(self, m: Any) -> None:
+    def _add_odometry(self, m: Any, stamp_ns: int) -> None:
         p, q, v, w = m.pose.pose.position, m.pose.pose.orientation, m.twist.twist.linear, m.twist.twist.angular
         numbers, c = (p.x, p.y, p.z, q.x, q.y, q.z, q.w, v.x, v.y, v.z, w.x, w.y, w.z), m.twist.covariance
-        if len(self._odometry_ns) < MOST:
-            self._note_frames(m.header.frame_id, m.child_frame_id)
-            self._odometry_ns.append(self._topics[self._odometry_topic].stamp_ns[-1])
-            self._numbers.extend((*numbers, *(c[k] for k in _TWIST)))
+        self._note_frames(m.header.frame_id, m.child_frame_id)
+        self._read.add((stamp_ns,), (*numbers, *(c[k] for k in _TWIST)))
 
     def _note_frames(self, frame: str, child: str) -> None:
         if not self._frame:
@@ -307,12 +408,10 @@ class Collector:
                 self._transforms.add(parent, child, pose(t.transform.translation, (r.x, r.y, r.z, r.w)))
             self._links[parent, child, fixed] = Link(parent, child, fixed)
 
-    def _place(self, found: SightingCollector, message: Any) -> None:
+    def _place(self, found: _Sightings, message: Any) -> None:
         """Find the place of an input's sensor on the robot, by its first message that names a frame."""
-        own = self._frame_of[found.input] or _frame(message)
-        if not own:
-            return
-        found.frame, found.T_base_frame = own, self._T_base(found.input, own) or se3.IDENTITY
+        if own := self._frame_of[found.input] or _frame(message):
+            found.frame, found.T_base_frame = own, self._T_base(found.input, own) or se3.IDENTITY
 
     def _T_base(self, name: str, frame: str) -> se3.Pose | None:
         """The fixed pose of an input's frame on the robot, by TF, else as configured; None where neither has it."""
@@ -323,57 +422,80 @@ class Collector:
 
     def columns(self, counters: Counters) -> Columns:
         """Everything that was collected, and what the converters have counted."""
+        path_ns, path = self._path.columns()
+        path = path if path.shape[1] == len(se3.IDENTITY) else se3.in_space(path).reshape(-1, 7)
+        gyro_ns, turned = self._gyro.columns()
         return Columns(
             self._config,
             {name: one.columns() for name, one in self._topics.items()},
-            self._odometry(),
-            index(self._path_ns),
-            self._poses(self._path),
+            self._odometry(path_ns[:, 0], path),
+            *in_order(path_ns[:, 0], path),
             tuple(one.columns() for one in self._sightings.values()),
             tuple(self._links.values()),
             counters,
             self._assumed,
-            index(self._gyro_ns),
-            np.array(self._gyro),
-            np.array(self._felt).reshape(-1, 6),
+            gyro_ns[:, 0],
+            turned[:, 0],
+            turned[:, 1:],
             self._gyro_frame,
             self._T_base(self._config.gyro_input, self._gyro_frame),
-            tuple(self._fixes_of(name, some) for name, some in self._fixes.items()),
+            tuple(self._fixes_of(name, rows) for name, rows in self._fixes.items()),
         )
 
-    def _fixes_of(self, name: str, some: Sequence[Fix]) -> FixColumns:
-        topic = next((topic.name for topic in self._topics.values() if name in topic.inputs), name)
-        n, frame = self._config.world.dimensions, self._frames_of_fixes.get(name, "")
-        has_point = [m.kind in ("position", "pose") for m in some]
-        points = [complex(*m.measured[:2]) if has else complex(np.nan) for m, has in zip(some, has_point, strict=True)]
-        sigmas = [m.covariance[0] ** 0.5 for m, has in zip(some, has_point, strict=True) if has]
-        kind = some[0].kind if some else ""
-        headings = [np.nan if m.kind == "position" else _yaw(m.measured, n) for m in some]
-        return FixColumns(
-            name,
-            topic,
-            np.array([m.stamp_ns for m in some], dtype=np.int64),
-            np.array(points),
-            np.array(headings),
-            float(np.median(sigmas)) if sigmas else 0.0,
-            frame if kind in ("heading", "attitude") else "",
-            self._T_base(name, frame) or se3.IDENTITY,
-        )
+    def _fixes_of(self, name: str, rows: _Rows) -> FixColumns:
+        topic = next((topic for topic, of in self._topics.items() if name in of.columns().inputs), name)
+        (stamp_ns,), (x, y, sigmas, headings) = (columns.T for columns in rows.columns())
+        frame, has_point = self._frames_of_fixes.get(name, ""), np.isfinite(x)
+        sigma_m = float(np.median(sigmas[has_point])) if has_point.any() else 0.0
+        of_heading = "" if has_point[:1].any() else frame
+        T_base_frame = self._T_base(name, frame) or se3.IDENTITY
+        return FixColumns(name, topic, stamp_ns, x + 1j * y, headings, sigma_m, of_heading, T_base_frame)
 
-    def _poses(self, numbers: "array[float]") -> Array:
-        poses = np.array(numbers).reshape(-1, self._config.space.pose.size)
-        return poses if poses.shape[1] == 7 else se3.in_space(poses).reshape(-1, 7)
-
-    def _odometry(self) -> OdometryColumns:
+    def _odometry(self, path_ns: Index, path: Array) -> OdometryColumns:
         names = (self._main, self._odometry_topic)
-        if len(self._odometry_ns):
-            rows = np.array(self._numbers).reshape(-1, _COLUMNS)
-            return OdometryColumns(
-                *names, self._frame, self._child, index(self._odometry_ns), rows[:, :7], rows[:, 7:13], rows[:, 13:]
-            )
-        frames, poses = self._config.frames, self._poses(self._path)
-        unknown = np.full((len(poses), 6), np.nan)
-        return OdometryColumns(*names, frames.odom, frames.base, index(self._path_ns), poses, unknown, unknown)
+        stamp_ns, read = self._read.columns()
+        if len(read):
+            parts = read[:, :7], read[:, 7:13], read[:, 13:]
+            return OdometryColumns(*names, self._frame, self._child, stamp_ns[:, 0], *parts)
+        unknown = np.full((len(path), 6), np.nan)
+        return OdometryColumns(
+            *names, self._config.frames.odom, self._config.frames.base, path_ns, path, unknown, unknown
+        )
+
+
+def _mount_correction(config: Config, of: InputConfig) -> Numbers:
+    """x, y, z, roll, pitch, yaw by which the mount of an input is corrected; in the plane only x, y and yaw."""
+    mount = of.numbers("mount_correction", 6) or (0.0,) * 6
+    return mount if config.world.dimensions == 3 else (*mount[:2], 0.0, 0.0, 0.0, mount[5])
+
+
+def _located(one: Sighting) -> tuple[tuple[float, float, float], float]:
+    """The point of a sighting in the base frame, NaN where it has none, and the standard deviation of it."""
+    m, c = one.measured, one.covariance
+    size = round(len(c) ** 0.5)
+    if one.kind in ("position", "pose"):
+        n = len(m) if one.kind == "position" else 2 if len(m) == 3 else 3
+        sigma = (sum(c[i * (size + 1)] for i in range(n)) / n) ** 0.5
+        return (m[0], m[1], m[2] if n == 3 else 0.0), sigma
+    if one.kind != "range_bearing":
+        return (np.nan, np.nan, np.nan), c[0] ** 0.5
+    elevation = m[2] if len(m) == 3 else 0.0
+    level = m[0] * np.cos(elevation)
+    seen = (level * np.cos(m[1]), level * np.sin(m[1]), m[0] * np.sin(elevation))
+    at = one.T_base_sensor
+    if at is not None:
+        T = tuple(at) if len(at) == 7 else tuple(se3.in_space(np.array([at]))[0])
+        seen = se3.act(T, seen)
+    sigma = ((c[0] + m[0] ** 2 * sum(c[i * (size + 1)] for i in range(1, size))) / size) ** 0.5
+    return (float(seen[0]), float(seen[1]), float(seen[2])), float(sigma)
+
+
+def _fixed(m: Fix, dimensions: int) -> tuple[float, float, float, float]:
+    """x, y and their sigma, and the heading of a fix; NaN where it has none."""
+    place = (*m.measured[:2], m.covariance[0] ** 0.5) if m.kind in ("position", "pose") else (np.nan,) * 3
+    if m.kind == "position":
+        return (*place, np.nan)
+    return (*place, float(m.measured[-1] if dimensions == 2 else so3.log(tuple(m.measured[-4:]))[2]))
 
 
 def _heights(message: Any, T_base_frame: se3.Pose) -> dict[str, float]:
@@ -384,11 +506,6 @@ def _heights(message: Any, T_base_frame: se3.Pose) -> dict[str, float]:
             p = one.results[0].pose.pose.position
             out |= dict.fromkeys(names_of(one), float(se3.act(T_base_frame, (p.x, p.y, p.z))[2]))
     return out
-
-
-def _yaw(measured: Sequence[float], dimensions: int) -> float:
-    """The heading at the end of a pose, an attitude or a heading."""
-    return float(measured[-1] if dimensions == 2 else so3.log(tuple(measured[-4:]))[2])
 
 
 def _frame(message: Any) -> str:

@@ -1,18 +1,25 @@
 """Checks of sightings against odometry without a fit: the same landmark, seen twice within a few seconds."""
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 
 import numpy as np
 
-from graph_slam_ros.check.bearings import check_bearings
-from graph_slam_ros.check.columns import Columns
-from graph_slam_ros.check.finding import Finding, Where
+from graph_slam_ros.check.columns import Columns, SightingColumns
+from graph_slam_ros.check.finding import Finding, where
 from graph_slam_ros.check.moving_landmarks import check_moving, motions_of
-from graph_slam_ros.check.noise import check_noise, check_noise_alone, noise_of, noisier
 from graph_slam_ros.check.odometry import ratio
-from graph_slam_ros.check.pairs import LATER_S, Pairs, pairs_of, path_of, usable
-from graph_slam_ros.check.ranges import check_ranges
-from graph_slam_ros.check.sightings import SightingColumns
+from graph_slam_ros.check.pairs import (
+    LATER_S,
+    Pairs,
+    check_bearings,
+    check_noise,
+    check_noise_alone,
+    check_ranges,
+    noise_of,
+    noisier,
+    pairs_of,
+)
 from graph_slam_ros.formats.parameters import assignment
 from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.typing import Array, Index, Mask
@@ -45,70 +52,61 @@ EXCHANGED, MIRRORED = "x and y exchanged", "y to the right"
 
 def check_contradictions(c: Columns) -> Iterator[Finding]:
     """Each input of landmarks against odometry: units, axes, mirrors, identities, and what is seen again."""
-    path_ns, path = path_of(c)
-    if len(path_ns) < 2:
-        return
-    for s in c.sightings:
+    for s in c.sightings if len(c.path_ns) > 1 else ():
         if not len(s.stamp_ns):
             continue
-        found = list(check_ranges(s, path_ns, path))
+        found = list(check_ranges(c, s))
         if c.config.world.dimensions == 2:
-            found += check_bearings(s, path_ns, path)
-        found += [*check_noise_alone(c, s), *_contradictions(c, s, path_ns, path)]
+            found += check_bearings(c, s)
+        found += [*check_noise_alone(c, s), *_contradictions(c, s)]
         yield from found
         yield from _identities(c, s)
         if not any(one.ends for one in found):
-            yield from _coverage(s, path_ns, path)
+            yield from _coverage(s, c.path_ns, c.path)
 
 
-def _contradictions(c: Columns, s: SightingColumns, path_ns: Index, path: Array) -> Iterator[Finding]:
-    use = usable(s, path_ns)
-    where: Where = {"topic": s.topic, "first_ns": int(s.stamp_ns[0]), "count": int(use.sum())}
+def _contradictions(c: Columns, s: SightingColumns) -> Iterator[Finding]:
+    """What the first check that finds anything finds: each makes those after it meaningless."""
+    use = s.located(c.path_ns)
     if not use.any():
         return
     distance_m = np.linalg.norm(s.points, axis=1)
     far_m = float(np.median(distance_m[use]))
     if far_m > _FAR_M:
         text = f"{s.topic}: the median distance of landmarks is {far_m:.0f} m: are these metres?"
-        yield Finding("units", "error", far_m, _FAR_M, "m", text, **where)
+        yield Finding("units", "error", far_m, _FAR_M, "m", text, **where(s.topic, s.stamp_ns, use.sum()))
         return
-    pairs = pairs_of(s, path_ns, path, c.config.world.dimensions)
+    pairs = pairs_of(c, s)
     if len(pairs.a) < _LEAST_PAIRS:
         text = f"{s.topic}: landmarks are seen again within {LATER_S:.0f} s of motion only {len(pairs.a)} times"
-        yield Finding("no_parallax", "note", len(pairs.a), _LEAST_PAIRS, "pairs", text, **where)
+        at = where(s.topic, s.stamp_ns, use.sum())
+        yield Finding("no_parallax", "note", len(pairs.a), _LEAST_PAIRS, "pairs", text, **at)
         return
-    where["count"] = len(pairs.a)
-    noise_m = noise_of(s, pairs)
-    along = list(check_moving(s, motions_of(s, pairs, path_ns, path, noise_m), where))
+    noise_m, count = noise_of(s, pairs), len(pairs.a)
+    along = list(check_moving(s, motions_of(c, s, pairs), count))
     yield from along
     if any(one.ends for one in along):
         return
-    found = (
-        _mirrored(c, s, pairs, noise_m, where) or _axes(s, pairs, noise_m, use, where) or _scaled(c, s, pairs, where)
-    )
-    if found is not None:
-        yield found
-        return
-    noises = list(check_noise(c, s, pairs))
-    yield from noises
-    if noises:
+    found = _mirrored(c, s, pairs, noise_m) or _axes(s, pairs, noise_m, use) or _scaled(c, s, pairs)
+    if noises := [found] if found is not None else list(check_noise(c, s, pairs)):
+        yield from noises
         return
     residual_m = float(np.median(pairs.residuals(s.points)))
     lever_m = np.linalg.norm(pairs.motion[:, :3], axis=1) + pairs.turned * np.minimum(distance_m[pairs.a], 1e3)
     share = residual_m / float(np.median(lever_m))
-    if share > _UNRELATED and residual_m > _UNRELATED_NOISES * noise_m and len(pairs.a) > _UNRELATED_PAIRS:
+    if share > _UNRELATED and residual_m > _UNRELATED_NOISES * noise_m and count > _UNRELATED_PAIRS:
         if residual_m < _RELATED * _of_others(s.points, pairs, use):
             yield from noisier(s, pairs)
             return
         text = f"{s.topic}: odometry does not explain {share:.0%} of the motion between two sightings of a landmark"
-        yield Finding("unrelated", "error", share, _UNRELATED, "part", text, **where)
+        yield Finding("unrelated", "error", share, _UNRELATED, "part", text, **where(s.topic, s.stamp_ns, count))
 
 
 def _of_others(points: Array, pairs: Pairs, use: Mask) -> float:
     """The median distance between two landmarks, whatever their identities: what chance would give."""
     chosen = np.flatnonzero(use)
-    shifted = Pairs(pairs.a, np.roll(chosen, len(chosen) // 2)[np.searchsorted(chosen, pairs.b)], pairs.motion)
-    return float(np.median(Pairs(shifted.a, shifted.b, shifted.motion, pairs.dimensions).residuals(points)))
+    shifted = np.roll(chosen, len(chosen) // 2)[np.searchsorted(chosen, pairs.b)]
+    return float(np.median(replace(pairs, b=shifted).residuals(points)))
 
 
 def _hypotheses(s: SightingColumns) -> dict[str, Array]:
@@ -123,12 +121,12 @@ def _hypotheses(s: SightingColumns) -> dict[str, Array]:
     return turned | {EXCHANGED: placed(seen[:, [1, 0, 2]]), MIRRORED: placed(seen * [1.0, -1.0, 1.0])}
 
 
-def _mirrored(c: Columns, s: SightingColumns, pairs: Pairs, noise_m: float, where: Where) -> Finding | None:
+def _mirrored(c: Columns, s: SightingColumns, pairs: Pairs, noise_m: float) -> Finding | None:
     """A mirror shows only where the robot turns."""
-    at = pairs.turned > _TURNED_RAD
-    if at.sum() < _LEAST_TURNED:
+    turns = pairs.turned > _TURNED_RAD
+    if turns.sum() < _LEAST_TURNED:
         return None
-    turning = Pairs(pairs.a[at], pairs.b[at], pairs.motion[at], pairs.dimensions)
+    turning = replace(pairs, a=pairs.a[turns], b=pairs.b[turns], motion=pairs.motion[turns])
     now_m = float(np.median(turning.residuals(s.points)))
     others = {what: float(np.median(turning.residuals(points))) for what, points in _hypotheses(s).items()}
     mirror_m = others.pop(MIRRORED)
@@ -140,11 +138,12 @@ def _mirrored(c: Columns, s: SightingColumns, pairs: Pairs, noise_m: float, wher
             f"{s.topic}: in turns, two sightings of a landmark differ by {now_m:.2f} m, but by {mirror_m:.2f} m if y "
             f"or bearings count to the right, or if {c.odometry.topic} turns the other way"
         )
-        return Finding("mirrored", "error", now_m / max(mirror_m, 1e-9), 1.0 / _HALF, "times", text, **where)
+        at = where(s.topic, s.stamp_ns, len(pairs.a))
+        return Finding("mirrored", "error", now_m / max(mirror_m, 1e-9), 1.0 / _HALF, "times", text, **at)
     return None
 
 
-def _axes(s: SightingColumns, pairs: Pairs, noise_m: float, use: Mask, where: Where) -> Finding | None:
+def _axes(s: SightingColumns, pairs: Pairs, noise_m: float, use: Mask) -> Finding | None:
     now_m, hypotheses = float(np.median(pairs.residuals(s.points))), _hypotheses(s)
     others = {what: float(np.median(pairs.residuals(points))) for what, points in hypotheses.items()}
     del others[MIRRORED]
@@ -155,14 +154,13 @@ def _axes(s: SightingColumns, pairs: Pairs, noise_m: float, use: Mask, where: Wh
         return None
     if_so = f"but by {others[what]:.2f} m if the axes are {what}"
     text = f"{s.topic}: two sightings of a landmark differ by {now_m:.2f} m, {if_so}"
-    settings = (
-        () if what == EXCHANGED else turned_mount(s.input, s.frame, s.T_base_frame, (0.0, 0.0, 0.0, *TURNS[what]))
-    )
-    value = now_m / max(others[what], 1e-9)
-    return Finding("axes", "error", value, 1.0 / _HALF, "times", text, settings=settings, **where)
+    turn = () if what == EXCHANGED else (0.0, 0.0, 0.0, *TURNS[what])
+    settings = turned_mount(s.input, s.frame, s.T_base_frame, turn) if turn else ()
+    value, at = now_m / max(others[what], 1e-9), where(s.topic, s.stamp_ns, len(pairs.a), settings)
+    return Finding("axes", "error", value, 1.0 / _HALF, "times", text, **at)
 
 
-def _scaled(c: Columns, s: SightingColumns, pairs: Pairs, where: Where) -> Finding | None:
+def _scaled(c: Columns, s: SightingColumns, pairs: Pairs) -> Finding | None:
     """Ranges by which two sightings of a landmark agree with odometry only if all are multiplied by one factor."""
     origin = np.array(s.T_base_frame[:3])
     n, by = pairs.dimensions, tuple(pairs.motion.T)
@@ -183,8 +181,8 @@ def _scaled(c: Columns, s: SightingColumns, pairs: Pairs, where: Where) -> Findi
         f"{s.topic}: ranges are {1.0 / factor:.2f} times as long as odometry says: is the size of the tags right "
         "(that of the black square), and is odometry in metres?"
     )
-    settings = (assignment(f"{s.input}.range_factor", round(now * factor, 3)),)
-    return Finding("range_scale", "error", 1.0 / factor, 1.0 + _OTHER_SCALE, "times", text, settings=settings, **where)
+    at = where(s.topic, s.stamp_ns, len(pairs.a), (assignment(f"{s.input}.range_factor", round(now * factor, 3)),))
+    return Finding("range_scale", "error", 1.0 / factor, 1.0 + _OTHER_SCALE, "times", text, **at)
 
 
 def turned_mount(name: str, frame: str, T_base_frame: se3.Pose, T_frame_true: se3.Pose) -> tuple[str, ...]:
@@ -210,26 +208,24 @@ def _identities(c: Columns, s: SightingColumns) -> Iterator[Finding]:
     share = twice / (len(s.stamp_ns) + twice)
     if share > _TWICE:
         text = f"{s.topic}: {share:.1%} of the sightings have an id that is twice in their message"
-        yield Finding("id_twice", "warning", share, _TWICE, "part", text, s.topic, int(s.stamp_ns[0]), twice)
+        yield Finding("id_twice", "warning", share, _TWICE, "part", text, **where(s.topic, s.stamp_ns, twice))
 
 
 def _coverage(s: SightingColumns, path_ns: Index, path: Array) -> Iterator[Finding]:
-    where: Where = {"topic": s.topic, "first_ns": int(s.stamp_ns[0]), "count": len(s.stamp_ns)}
-    inside = (s.stamp_ns >= path_ns[0]) & (s.stamp_ns <= path_ns[-1])
+    at, inside = where(s.topic, s.stamp_ns), (s.stamp_ns >= path_ns[0]) & (s.stamp_ns <= path_ns[-1])
     between = np.diff([0, *np.searchsorted(path_ns, np.sort(s.stamp_ns[inside])), len(path_ns)])
     silent = float(between.max()) / len(path_ns)
     if silent > _SILENT:
         text = f"{s.topic}: nothing is seen for {silent:.0%} of the drive, for {int(between.max())} poses of odometry"
-        yield Finding("silent", "warning", silent, _SILENT, "part", text, **where)
-    is_named = np.array([bool(name) for name in s.names], dtype=bool)[s.name]
-    chosen = np.flatnonzero(is_named & inside)
+        yield Finding("silent", "warning", silent, _SILENT, "part", text, **at)
+    chosen = np.flatnonzero(s.named(path_ns))
     if not len(chosen):
         return
     times = np.bincount(s.name[chosen])
     seldom = float((times[times > 0] < _SELDOM).mean())
     if seldom > _ONCE:
         text = f"{s.topic}: {seldom:.0%} of {int((times > 0).sum())} ids are seen less than {_SELDOM} times"
-        yield Finding("seen_once", "warning", seldom, _ONCE, "part", text, **where)
+        yield Finding("seen_once", "warning", seldom, _ONCE, "part", text, **at)
     driven = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path[:, :3], axis=0), axis=1))])
     seconds = (path_ns - path_ns[0]) * 1e-9
     reach_m, few, comes_back = seen_over(s, chosen, path_ns[0], seconds, driven)
@@ -238,7 +234,7 @@ def _coverage(s: SightingColumns, path_ns: Index, path: Array) -> Iterator[Findi
         again = "nothing joins its parts that are farther apart" if comes_back else "no landmark is seen again later"
         each = f"each landmark but {few}" if few else "each landmark"
         text = f"{s.topic}: {each} is seen over at most {reach_m:.1f} of {driven[-1]:.0f} m: {again}"
-        yield Finding("no_closure", "warning", reach_m, least_m, "m", text, **where)
+        yield Finding("no_closure", "warning", reach_m, least_m, "m", text, **at)
 
 
 def seen_over(

@@ -5,14 +5,14 @@ docs/check.md explains each row of ``KINDS``. A refusal that is counted is a fin
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeAlias
 
 from graph_slam_ros.formats.parameters import parse_setting
+from graph_slam_ros.typing import Index
 
 Severity: TypeAlias = Literal["error", "warning", "note"]
-Where: TypeAlias = dict[str, Any]
-"""Topic, first stamp and count of several findings."""
 
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 
@@ -288,6 +288,15 @@ class Finding:
         evidence = {"topic": self.topic, "input": self.source, "first_ns": self.first_ns, "count": self.count}
         first = {"code": self.code, "severity": self.severity, **finite, "unit": self.unit}
         return first | {"evidence": evidence, "text": self.text, "settings": list(self.settings)}
+
+
+def where(
+    topic: str, stamps_ns: Sequence[int] | Index = (), count: int | None = None, settings: tuple[str, ...] = ()
+) -> dict[str, Any]:
+    """Return the topic, first stamp and count (of the stamps, where it is not given) of a finding, and its settings."""
+    first_ns = int(stamps_ns[0]) if len(stamps_ns) else 0
+    number = len(stamps_ns) if count is None else int(count)
+    return {"topic": topic, "first_ns": first_ns, "count": number, "settings": settings}
 
 
 def in_order(findings: list[Finding]) -> list[Finding]:

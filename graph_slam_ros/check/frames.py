@@ -1,13 +1,13 @@
 """Checks of the frames of a recording: which are linked to the robot, and by how many publishers."""
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 
-from graph_slam_ros.check.columns import Columns, Link
-from graph_slam_ros.check.finding import Finding, Severity, Where
-from graph_slam_ros.check.sightings import SightingColumns
+from graph_slam_ros.check.columns import Columns, SightingColumns
+from graph_slam_ros.check.finding import Finding, Severity, where
 from graph_slam_ros.config.inputs import ASSUMED
 from graph_slam_ros.formats.parameters import assignment
 from graph_slam_ros.messages.inputs.transforms import MAP_FRAMES, assumed_mount
+from graph_slam_ros.overview.contents import root_of
 
 _OF_CAMERAS = "world"  # which visual odometry calls its frame, too
 _FIXED = (*MAP_FRAMES, _OF_CAMERAS)
@@ -53,22 +53,21 @@ def _of_sensor(c: Columns, s: SightingColumns) -> Iterator[Finding]:
     topic = c.topics.get(s.topic)
     if topic is None:
         return
-    first_ns = int(topic.stamp_ns[0]) if len(topic.stamp_ns) else 0
-    where: Where = {"topic": s.topic, "first_ns": first_ns, "count": len(topic.stamp_ns)}
+    at = where(s.topic, topic.stamp_ns)
     fixed = [frame for frame in topic.frames if frame.lstrip("/") in (*_FIXED, c.odometry.frame) and frame]
     if fixed:
         is_linked = any(link.child == c.odometry.child and link.parent == fixed[0].lstrip("/") for link in c.links)
         text = f"{s.topic} is given in {fixed[0]}, a frame that does not move with the robot"
         severity: Severity = "note" if is_linked else "error"
-        yield Finding("seen_in_fixed_frame", severity, topic.frames[fixed[0]], 0, "messages", text, **where)
+        yield Finding("seen_in_fixed_frame", severity, topic.frames[fixed[0]], 0, "messages", text, **at)
     elif f"{s.input}.frame" in c.assumed:
         text = f"{s.topic}: no transform has {next(iter(topic.frames))}: did you mean {s.frame}?"
-        where["settings"] = (assignment(f"{s.input}.frame", s.frame),)
-        yield Finding("frame_unlinked", "error", 1, 0, "frames", text, **where)
+        at = where(s.topic, topic.stamp_ns, settings=(assignment(f"{s.input}.frame", s.frame),))
+        yield Finding("frame_unlinked", "error", 1, 0, "frames", text, **at)
     elif next((one.mount for one in c.config.sources if one.name == s.input), "") == ASSUMED:
         named = next(filter(None, topic.frames), "") or "its sensor, whose messages name no frame,"
         text = f"{s.topic}: no transform links {named} to {c.config.frames.base}: a place at the base is assumed"
-        yield Finding("frame_unlinked", "error", 1, 0, "frames", text, **where)
+        yield Finding("frame_unlinked", "error", 1, 0, "frames", text, **at)
 
 
 def _unlinked(c: Columns, known: set[str]) -> Iterator[Finding]:
@@ -79,7 +78,9 @@ def _unlinked(c: Columns, known: set[str]) -> Iterator[Finding]:
         if topic is None or not times or topic.name in known:
             continue
         frames, base = tuple(topic.frames), c.config.frames.base
-        linked = [frame for frame in frames if frame and _root(frame, c.links) == _root(base, c.links)]
+        above = {link.child: link.parent for link in c.links}
+        root = root_of(above, base.lstrip("/"))
+        linked = [frame for frame in frames if frame and root_of(above, frame.lstrip("/")) == root]
         if "frame_unknown" not in counts:  # but that of odometry, or of a map
             linked = []
         lost = ", ".join([frame for frame in frames if frame not in linked][:4])
@@ -95,8 +96,8 @@ def _unlinked(c: Columns, known: set[str]) -> Iterator[Finding]:
         elif linked:  # a mount is not used for them
             text = f"{topic.name}: {times} measurements are refused: they come before /tf links {others} to {base}"
         severity: Severity = "error" if times > 0.5 * max(c.counters.received[source], 1) else "warning"
-        first_ns = int(topic.stamp_ns[0]) if len(topic.stamp_ns) else 0
-        yield Finding("frame_unlinked", severity, times, 0, "measurements", text, topic.name, first_ns, times, settings)
+        at = where(topic.name, topic.stamp_ns, times, settings)
+        yield Finding("frame_unlinked", severity, times, 0, "measurements", text, **at)
     key = f"{c.odometry.input}.mount"
     if key in c.assumed:
         named = c.odometry.child or "its child frame, which is empty,"
@@ -111,13 +112,3 @@ def _place(c: Columns, source: str, names: Sequence[str], lost: str, is_odometry
         return (assignment(f"{source}.mount", assumed_mount(lost)),)
     named, frames = next(iter(names), "odom"), c.config.frames
     return (assignment("frames.odom", named) if named != frames.map else assignment(f"{source}.frame", frames.odom),)
-
-
-def _root(frame: str, links: Collection[Link]) -> str:
-    """The frame that the tree of a frame begins with, whatever the stamps."""
-    above, frame = {link.child: link.parent for link in links}, frame.lstrip("/")
-    seen = {frame}
-    while frame in above and above[frame] not in seen:
-        frame = above[frame]
-        seen.add(frame)
-    return frame

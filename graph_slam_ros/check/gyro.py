@@ -8,12 +8,12 @@ import numpy as np
 
 from graph_slam_ros.check.columns import Columns
 from graph_slam_ros.check.contradictions import turned_mount
-from graph_slam_ros.check.finding import Finding, Severity, Where
-from graph_slam_ros.check.pairs import path_of, poses_at
+from graph_slam_ros.check.finding import Finding, Severity, where
+from graph_slam_ros.check.pairs import poses_at
 from graph_slam_ros.formats.parameters import assignment
 from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.slam.frontend.gyro import GyroState
-from graph_slam_ros.typing import Array, Numbers
+from graph_slam_ros.typing import Array, Index, Numbers
 
 _WINDOW_NS, _LEAST_WINDOWS, _LEAST_SAMPLES = 1_000_000_000, 20, 3
 _TURNING_RAD, _LEAST_TURNING = 0.1, 10
@@ -32,7 +32,7 @@ def check_gyro(c: Columns) -> Iterator[Finding]:
     odometry, gyro = _turns(c)
     if topic is None or not len(c.gyro_ns):
         return
-    where: Where = {"topic": topic.name, "first_ns": int(c.gyro_ns.min()), "count": len(c.gyro_ns)}
+    gyro_ns = np.sort(c.gyro_ns)
     if len(gyro) < _LEAST_WINDOWS:
         return
     factor, bias, left = _line(odometry, gyro)
@@ -45,29 +45,29 @@ def check_gyro(c: Columns) -> Iterator[Finding]:
         most = _UNEXPLAINED if abs(factor) > _GROSS else _OF_NOTHING
         if unexplained > most:
             text = f"{topic.name}: odometry's turns do not explain {unexplained:.0%} of those of the gyro"
-            yield Finding("gyro_unrelated", "warning", unexplained, most, "part", text, **where)
+            yield Finding("gyro_unrelated", "warning", unexplained, most, "part", text, **where(topic.name, gyro_ns))
             return
         if abs(factor - 1.0) > _SCALE:
-            yield _scale(c, factor, where)
+            yield _scale(c, factor, topic.name, gyro_ns)
             if abs(factor - 1.0) >= _GROSS:  # its offset means nothing
                 return
     if abs(bias) > limit:
         text = f"{topic.name}: its gyro turns by {bias:.3f} rad/s where odometry does not"
         settings = (assignment("gyro.bias_sigma", round(abs(bias), 3)),) if abs(bias) < _MOST_BIAS else ()
-        yield Finding("gyro_bias", "warning", bias, limit, "rad/s", text, settings=settings, **where)
+        yield Finding("gyro_bias", "warning", bias, limit, "rad/s", text, **where(topic.name, gyro_ns, None, settings))
 
 
 def check_doubted(c: Columns, gyro: GyroState | None) -> Iterator[Finding]:
     """A gyro that a replay does not use any more, where nothing else is found of it."""
     if gyro is not None and gyro.state == "doubted" and all(one.severity == "note" for one in check_gyro(c)):
         topic = c.topic_of(gyro.name)
-        where: Where = {"topic": topic.name if topic else "", "count": len(c.gyro_ns)}
-        yield Finding("gyro_unrelated", "warning", gyro.ratio or 0.0, 1.0, "times", gyro.fault, **where)
+        at = where(topic.name if topic else "", count=len(c.gyro_ns))
+        yield Finding("gyro_unrelated", "warning", gyro.ratio or 0.0, 1.0, "times", gyro.fault, **at)
 
 
 def _turns(c: Columns, rates: Array | None = None) -> tuple[Array, Array]:
     """The turns [rad] about the robot's z over each second, by odometry and by the gyro, or by other rates of it."""
-    path_ns, path = path_of(c)
+    path_ns, path = c.path_ns, c.path
     stamp_ns, first = np.unique(c.gyro_ns, return_index=True)
     if len(path_ns) < 2 or len(stamp_ns) < 2:
         return np.empty(0), np.empty(0)
@@ -101,9 +101,9 @@ def _line(x: Array, y: Array) -> tuple[float, float, Array]:
     return float(solution[0]), float(solution[1]), left
 
 
-def _scale(c: Columns, factor: float, where: Where) -> Finding:
+def _scale(c: Columns, factor: float, name: str, gyro_ns: Index) -> Finding:
     """A gyro that turns another way, or by another amount, and what mends it."""
-    text = f"{where['topic']}: its gyro turns {factor:.3g} times as much as odometry"
+    text = f"{name}: its gyro turns {factor:.3g} times as much as odometry"
     severity: Severity = "error"
     settings: tuple[str, ...] = ()
     if abs(factor - 1.0) < _GROSS:
@@ -119,7 +119,8 @@ def _scale(c: Columns, factor: float, where: Where) -> Finding:
         settings = _upright(c) if c.config.world.dimensions == 2 else ()
     elif abs(factor) > 1.0 / _GROSS:
         text += ": are these degrees?"
-    return Finding("gyro_scale", severity, factor, 1.0 + _SCALE, "times", text, settings=settings, **where)
+    at = where(name, gyro_ns, settings=settings)
+    return Finding("gyro_scale", severity, factor, 1.0 + _SCALE, "times", text, **at)
 
 
 def upright(felt: Numbers) -> tuple[float, float]:

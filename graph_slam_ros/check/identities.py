@@ -1,20 +1,23 @@
-"""Checks of identities: one id at two places, and landmarks that move. An estimate puts each sighting into the map."""
+"""Checks of identities by an estimate that puts each sighting into the map.
+
+One id is at two places, a landmark was moved, or sightings are far from their landmark.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from graph_slam_ros.check.finding import Finding
-from graph_slam_ros.check.pairs import usable
-from graph_slam_ros.check.sightings import SightingColumns
-from graph_slam_ros.lie import se3
+from graph_slam_ros.check.columns import SightingColumns
+from graph_slam_ros.check.finding import Finding, Severity
 from graph_slam_ros.typing import Array, Index, Mask
 
 _LEAST, _IN_EACH, _PART = 12, 5, 0.05
 _APART_M, _SIGMAS, _WIDTHS = 0.5, 8.0, 6.0
 _ROUNDS, _QUANTILE, _FIRST = 10, 95.0, 6
 _IN_TURN, _EXCHANGED, _MOST_MOVED = 0.9, 0.4, 3
+_LEAST_OF_PLACE, _NEAR_M, _FAR_SIGMAS, _OF_MEDIAN = 5, 0.5, 4.0, 1.48
+_OUTLIERS, _NOTED = 0.12, 0.02  # part of the sightings: a run leaves out a few that contradict its map
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,15 +46,10 @@ class TwoPlaces:
         return float(np.linalg.norm(self.second - self.first))
 
 
-def points_in_map(s: SightingColumns, poses: Array) -> Array:
-    """(k, 3) Where each sighting puts its landmark, by the poses (k, 7) of the base at their stamps."""
-    return np.stack(se3.act(tuple(poses.T), tuple(s.points.T)), axis=1)
-
-
 def at_two_places(s: SightingColumns, points: Array, path_ns: Index, dimensions: int) -> list[TwoPlaces]:
     """Identities that are of two places, by turns or one after the other."""
     points = points[:, :dimensions]
-    use = usable(s, path_ns) & np.isfinite(points).all(axis=1)
+    use = s.located(path_ns) & np.isfinite(points).all(axis=1)
     found = []
     for number, name in enumerate(s.names):
         chosen = np.flatnonzero(use & (s.name == number))
@@ -114,12 +112,8 @@ def _moved(s: SightingColumns, moved: list[TwoPlaces]) -> Iterator[Finding]:
             ends = np.linalg.norm(one.second - other.first), np.linalg.norm(other.second - one.first)
             if max(ends) < _EXCHANGED * one.apart_m:
                 exchanged |= {one.name, other.name}
-                text = (
-                    f"{s.topic}: landmarks {one.name} and {other.name}, {one.apart_m:.1f} m apart, exchange their ids"
-                )
-                yield Finding(
-                    "ids_exchanged", "warning", one.apart_m, _APART_M, "m", text, s.topic, one.first_ns, one.count
-                )
+                both = f"landmarks {one.name} and {other.name}, {one.apart_m:.1f} m apart,"
+                yield _of(one, "ids_exchanged", f"{s.topic}: {both} exchange their ids", s)
     rest = [one for one in moved if one.name not in exchanged]
     if len(rest) > _MOST_MOVED:
         text = f"{s.topic}: {len(rest)} landmarks are elsewhere after some time: the robot was carried, or slipped"
@@ -128,7 +122,11 @@ def _moved(s: SightingColumns, moved: list[TwoPlaces]) -> Iterator[Finding]:
         return
     for one in rest:
         text = f"{s.topic}: landmark {one.name} was moved: after some time it is {one.apart_m:.1f} m away"
-        yield Finding("landmark_moved", "warning", one.apart_m, _APART_M, "m", text, s.topic, one.first_ns, one.count)
+        yield _of(one, "landmark_moved", text, s)
+
+
+def _of(one: TwoPlaces, code: str, text: str, s: SightingColumns) -> Finding:
+    return Finding(code, "warning", one.apart_m, _APART_M, "m", text, s.topic, one.first_ns, one.count)
 
 
 def _reused(s: SightingColumns, reused: list[TwoPlaces], seen: int) -> Iterator[Finding]:
@@ -142,4 +140,29 @@ def _reused(s: SightingColumns, reused: list[TwoPlaces], seen: int) -> Iterator[
             f"{s.topic}: id {one.name} is seen at two places, {one.apart_m:.1f} m apart "
             f"({one.share:.0%} of its sightings are at the second)"
         )
-        yield Finding("id_reused", "warning", one.apart_m, _APART_M, "m", text, s.topic, one.first_ns, one.count)
+        yield _of(one, "id_reused", text, s)
+
+
+def check_outliers(s: SightingColumns, points: Array, inside: Mask, dimensions: int) -> Iterator[Finding]:
+    """Find sightings that are beyond their noise, and that of the others with their identity.
+
+    Parameters
+    ----------
+    points : (k, 3) where each sighting puts its landmark, in map
+    inside : (k,) of the sightings whose poses are known
+    """
+    at, far, compared = points[:, :dimensions], np.zeros(len(points), dtype=bool), 0
+    usable = inside & np.isfinite(at).all(axis=1)
+    for number, name in enumerate(s.names):
+        own = np.flatnonzero((s.name == number) & usable)
+        if name and len(own) >= _LEAST_OF_PLACE:
+            away = np.linalg.norm(at[own] - np.median(at[own], axis=0), axis=1)
+            spread = _OF_MEDIAN * float(np.median(away))
+            far[own] = away > np.maximum(_NEAR_M, _FAR_SIGMAS * np.maximum(s.sigmas[own], spread))
+            compared += len(own)
+    if (count := int(far.sum())) > _NOTED * compared:
+        share, first_ns = count / compared, int(s.stamp_ns[far].min())
+        severity: Severity = "warning" if share > _OUTLIERS else "note"
+        limit = _OUTLIERS if severity == "warning" else _NOTED
+        text = f"{s.topic}: {share:.1%} of the sightings are far from their landmark: a wrong place, or a wrong id"
+        yield Finding("outliers", severity, share, limit, "part", text, s.topic, first_ns, count)

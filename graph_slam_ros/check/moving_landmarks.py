@@ -5,11 +5,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from graph_slam_ros.check.columns import Columns
-from graph_slam_ros.check.finding import Finding, Where
-from graph_slam_ros.check.noise import noise_of
-from graph_slam_ros.check.pairs import Pairs, pairs_of, path_of, poses_at
-from graph_slam_ros.check.sightings import SightingColumns
+from graph_slam_ros.check.columns import Columns, SightingColumns
+from graph_slam_ros.check.finding import Finding, where
+from graph_slam_ros.check.pairs import Pairs, noise_of, pairs_of, poses_at
 from graph_slam_ros.lie import se3
 from graph_slam_ros.typing import Array, Index, Mask
 
@@ -57,8 +55,9 @@ class LandmarkMotions:
         return np.asarray(self._moves & ~self.moves_with_robot & (self.staying < _SOME))
 
 
-def motions_of(s: SightingColumns, pairs: Pairs, path_ns: Index, path: Array, noise_m: float) -> LandmarkMotions:
-    """Return how each landmark moves, by odometry of ``path_of``; two sightings differ by ``noise_m`` in any case."""
+def motions_of(c: Columns, s: SightingColumns, pairs: Pairs) -> LandmarkMotions:
+    """Return how each landmark moves, by odometry."""
+    noise_m = noise_of(s, pairs)
     on_ground = pairs.residuals(s.points)
     on_robot = np.linalg.norm((s.points[pairs.b] - s.points[pairs.a])[:, : pairs.dimensions], axis=1)
     of = s.name[pairs.a]
@@ -68,18 +67,13 @@ def motions_of(s: SightingColumns, pairs: Pairs, path_ns: Index, path: Array, no
     def median(values: Array) -> Array:
         return np.array([float(np.median(values[k])) for k in chosen])
 
-    poses = poses_at(np.clip(s.stamp_ns, path_ns[0], path_ns[-1]), path_ns, path)
+    poses = poses_at(np.clip(s.stamp_ns, c.path_ns[0], c.path_ns[-1]), c.path_ns, c.path)
     ground = np.stack(se3.act(tuple(poses.T), tuple(s.points.T)), axis=1)[:, : pairs.dimensions]
     moving = np.array([float((on_ground[k] > 2.0 * noise_m).mean()) for k in chosen])
     at = np.array([np.median(s.points[pairs.a[k]], axis=0) for k in chosen]).reshape(-1, 3)
-    staying = np.array([_staying(s.stamp_ns[own], ground[own], 2.0 * noise_m) for own in _own(s, names)])
+    own = (s.name == name for name in names)
+    staying = np.array([_staying(s.stamp_ns[one], ground[one], 2.0 * noise_m) for one in own])
     return LandmarkMotions(names, median(on_robot), median(on_ground), staying, moving, at, noise_m)
-
-
-def _own(s: SightingColumns, names: Index) -> Iterator[Index]:
-    """The sightings of each identity."""
-    for name in names:
-        yield np.flatnonzero(s.name == name)
 
 
 def _staying(stamp_ns: Index, ground: Array, near_m: float) -> float:
@@ -91,19 +85,19 @@ def _staying(stamp_ns: Index, ground: Array, near_m: float) -> float:
     return float(np.median(parts))
 
 
-def check_moving(s: SightingColumns, by: LandmarkMotions, where: Where) -> Iterator[Finding]:
-    """Sightings of a fixed frame, whatever frame they name, and landmarks that move."""
+def check_moving(s: SightingColumns, by: LandmarkMotions, count: int) -> Iterator[Finding]:
+    """Sightings of a fixed frame, whatever frame they name, and landmarks that move, by this many pairs."""
     if np.count_nonzero(by.moves_with_robot) >= max(_LEAST_NAMES, _MOST * len(by.names)):
         robot_m, ground_m = float(np.median(by.on_robot)), float(np.median(by.on_ground))
         text = (
             f"{s.topic}: while the robot drives, landmarks stay where they are on it to {robot_m:.2f} m, and "
             f"would move by {ground_m:.2f} m on the ground: they are given in a frame that does not move with the robot"
         )
-        value = ground_m / max(robot_m, 1e-9)
-        yield Finding("seen_in_fixed_frame", "error", value, 1.0 / _HALF, "times", text, **where)
+        value, at = ground_m / max(robot_m, 1e-9), where(s.topic, s.stamp_ns, count)
+        yield Finding("seen_in_fixed_frame", "error", value, 1.0 / _HALF, "times", text, **at)
         return
     for k in moving_alone(by)[:_MOST_NAMED]:
-        name, count = s.names[by.names[k]], int((s.name == by.names[k]).sum())
+        name, own_ns = s.names[by.names[k]], np.sort(s.stamp_ns[s.name == by.names[k]])
         text = f"{s.topic}: landmark {name} moves: it is {by.on_ground[k]:.2f} m from its place a few seconds later"
         if by.moves_with_robot[k]:
             x, y = by.at[k, :2]
@@ -111,8 +105,8 @@ def check_moving(s: SightingColumns, by: LandmarkMotions, where: Where) -> Itera
                 f"{s.topic}: landmark {name} moves along with the robot, at x {x:.2f} and y {y:.2f} m on it: it is a "
                 "part of the robot, or follows it"
             )
-        at: Where = {"topic": s.topic, "first_ns": int(s.stamp_ns[s.name == by.names[k]].min()), "count": count}
-        yield Finding("landmark_moves", "warning", by.on_ground[k], _NOISES * by.noise_m, "m", text, **at)
+        limit_m, at = _NOISES * by.noise_m, where(s.topic, own_ns)
+        yield Finding("landmark_moves", "warning", by.on_ground[k], limit_m, "m", text, **at)
 
 
 def moving_alone(by: LandmarkMotions) -> list[int]:
@@ -130,13 +124,12 @@ def moving_alone(by: LandmarkMotions) -> list[int]:
 
 def moving_names(c: Columns) -> dict[str, set[str]]:
     """Identities that move, by their input."""
-    path_ns, path = path_of(c)
     found: dict[str, set[str]] = {}
-    for s in c.sightings if len(path_ns) > 1 else ():
-        pairs = pairs_of(s, path_ns, path, c.config.world.dimensions) if len(s.stamp_ns) else None
+    for s in c.sightings if len(c.path_ns) > 1 else ():
+        pairs = pairs_of(c, s) if len(s.stamp_ns) else None
         if pairs is not None and len(pairs.a) >= _LEAST_PAIRS:
-            by = motions_of(s, pairs, path_ns, path, noise_of(s, pairs))
-            found |= {s.input: {s.names[by.names[k]] for k in moving_alone(by)}}
+            by = motions_of(c, s, pairs)
+            found[s.input] = {s.names[by.names[k]] for k in moving_alone(by)}
     return {name: names for name, names in found.items() if names}
 
 

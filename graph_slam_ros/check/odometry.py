@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from graph_slam_ros.check.columns import Columns, OdometryColumns
-from graph_slam_ros.check.finding import Finding, Severity, Where
+from graph_slam_ros.check.finding import Finding, Severity, where
 from graph_slam_ros.config.pipeline import OdometryConfig
 from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.typing import Array, Index, Mask
@@ -140,14 +140,14 @@ def check_odometry(c: Columns) -> Iterator[Finding]:
         text = f"{o.topic or 'odometry'}: {count} of {len(o.stamp_ns)} messages are usable; {LEAST} are needed"
         yield Finding("no_odometry", "error", count, LEAST, "messages", text, o.topic, count=len(o.stamp_ns))
         return
-    where: Where = {"topic": o.topic, "first_ns": int(o.stamp_ns[steps.index[0]]), "count": len(steps.index)}
+    at = where(o.topic, o.stamp_ns[steps.index])
     if steps.fastest_m_s > min(_FASTEST_M_S, c.config.odometry.max_speed_m_s):
         text = f"{o.topic}: the robot drives at {steps.fastest_m_s:.0f} m/s: is its position in metres?"
-        yield Finding("units", "error", steps.fastest_m_s, _FASTEST_M_S, "m/s", text, **where)
+        yield Finding("units", "error", steps.fastest_m_s, _FASTEST_M_S, "m/s", text, **at)
         return
     if (fastest := steps.fastest_turn_rad_s) > _FASTEST_RAD_S:
         text = f"{o.topic}: the orientation turns at {fastest:.0f} rad/s: are its angles in radians?"
-        yield Finding("units", "error", fastest, _FASTEST_RAD_S, "rad/s", text, **where)
+        yield Finding("units", "error", fastest, _FASTEST_RAD_S, "rad/s", text, **at)
         return
     jumps = steps.jumps
     yield from _jumps(o, steps, jumps, c.config.odometry.max_speed_m_s)
@@ -159,20 +159,20 @@ def check_odometry(c: Columns) -> Iterator[Finding]:
         speed_m_s = float(np.median(np.linalg.norm(o.twist[steps.index, :3], axis=1)))
         if speed_m_s > _SLOWEST_M_S:
             text = f"{o.topic}: its pose never changes, though its twist says {speed_m_s:.1f} m/s"
-            yield Finding("pose_stands", "error", speed_m_s, _SLOWEST_M_S, "m/s", text, **where)
+            yield Finding("pose_stands", "error", speed_m_s, _SLOWEST_M_S, "m/s", text, **at)
             return
         text = f"{o.topic}: the robot moves {total_m:.2f} m and {np.degrees(total_rad):.0f} degrees in {span_s:.0f} s"
-        yield Finding("static", "warning", total_m, _STILL_M, "m", text, **where)
+        yield Finding("static", "warning", total_m, _STILL_M, "m", text, **at)
         return
     if _has_no_orientation(steps, smooth, total_rad) and not _drives_sideways(o, steps):
         text = f"{o.topic}: its orientation never changes in {total_m:.0f} m, and it drives round bends"
-        yield Finding("no_orientation_of_odometry", "error", total_rad, 0.0, "rad", text, **where)
+        yield Finding("no_orientation_of_odometry", "error", total_rad, 0.0, "rad", text, **at)
         return
     yield from _plane(c, o)
     if np.isfinite(o.twist[steps.index]).all() and o.twist[steps.index].any() and c.config.odometry.noise != "density":
-        yield from _twist(o, steps, jumps, where)
+        yield from _twist(o, steps, jumps)
     if c.config.odometry.noise != "density" and np.isfinite(o.twist).any():
-        yield from _covariance(o, steps, where)
+        yield from _covariance(o, steps)
 
 
 def _has_no_orientation(steps: Steps, smooth: Mask, total_rad: float) -> bool:
@@ -225,8 +225,9 @@ def _plane(c: Columns, o: OdometryColumns) -> Iterator[Finding]:
         yield Finding("not_planar", "warning", share, _OFF_PLANE, "part", text, o.topic, 0, out, settings)
 
 
-def _twist(o: OdometryColumns, steps: Steps, jumps: Mask, where: Where) -> Iterator[Finding]:
+def _twist(o: OdometryColumns, steps: Steps, jumps: Mask) -> Iterator[Finding]:
     """The twist against the pose, over windows of a second: it may hold until or since its message."""
+    at = where(o.topic, o.stamp_ns[steps.index], settings=_DENSITY)
     width = max(1, round(_WINDOW_S / float(np.median(steps.dt))))
     starts = np.arange(0, len(steps.dt) - width + 1, max(1, width // 2))
     clock = np.concatenate([[0.0], np.cumsum(steps.dt)])
@@ -249,7 +250,7 @@ def _twist(o: OdometryColumns, steps: Steps, jumps: Mask, where: Where) -> Itera
         text = (
             f"{o.topic}: the twist is given along the axes of {o.frame}; nav_msgs/Odometry defines those of {o.child}"
         )
-        yield Finding("twist_frame", "warning", 1.0, _FITS, "times", text, settings=_DENSITY, **where)
+        yield Finding("twist_frame", "warning", 1.0, _FITS, "times", text, **at)
         return
     for what, (factor, left), total in (
         ("speed", speed, np.abs(moved).sum()),
@@ -261,10 +262,10 @@ def _twist(o: OdometryColumns, steps: Steps, jumps: Mask, where: Where) -> Itera
         if abs(factor - 1.0) > _SCALE and left < _EXPLAINED and (unit or width >= _LEAST_WIDTH):
             text = f"{o.topic}: the pose moves {factor:.3g} times as far as the {what} of the twist says"
             text += f" ({unit or 'another scale'})"
-            yield Finding("twist_scale", "warning", factor, _SCALE, "times", text, settings=_DENSITY, **where)
+            yield Finding("twist_scale", "warning", factor, _SCALE, "times", text, **at)
         elif left > _UNEXPLAINED and total > 5.0 and width >= _LEAST_WIDTH:
             text = f"{o.topic}: the {what} of the twist does not explain {left:.0%} of the motion of the pose"
-            yield Finding("twist_unrelated", "warning", left, _UNEXPLAINED, "part", text, settings=_DENSITY, **where)
+            yield Finding("twist_unrelated", "warning", left, _UNEXPLAINED, "part", text, **at)
 
 
 def _in_odom(o: OdometryColumns, steps: Steps, sums: Callable[[Array], Array], moved: Array, twist: Array) -> bool:
@@ -299,25 +300,24 @@ def ratio(x: Array, y: Array) -> tuple[float, float]:
     return factor, float(np.median(error[large]) / (np.median(size[large]) + 1e-9))
 
 
-def _covariance(o: OdometryColumns, steps: Steps, where: Where) -> Iterator[Finding]:
+def _covariance(o: OdometryColumns, steps: Steps) -> Iterator[Finding]:
     """The variances of the twist against what the robot does."""
+    at = where(o.topic, o.stamp_ns[steps.index], settings=_DENSITY)
     used = o.variances[:, [0, 1, 5]]
     bad = ~np.isfinite(used).all(axis=1) | (used < 0.0).any(axis=1)
     if bad.any():
         text = f"{o.topic}: {int(bad.sum())} messages have a variance of the twist that is negative or not a number"
         severity: Severity = "error" if bad.mean() > 0.5 else "warning"  # such messages are refused
-        yield Finding("covariance_negative", severity, int(bad.sum()), 0, "messages", text, settings=_DENSITY, **where)
+        yield Finding("covariance_negative", severity, int(bad.sum()), 0, "messages", text, **at)
         return
     if not used.any() or (np.median(used, axis=0) >= _UNUSED_M_S**2).any():
         return
     sigmas, speed = np.sqrt(np.median(used, axis=0)), max(steps.fastest_m_s, _SLOWEST_M_S)
     if sigmas[0] > _USELESS * speed:
         text = f"{o.topic}: the sigma of the twist is {sigmas[0]:.2g} m/s, but the robot drives at most {speed:.2g} m/s"
-        yield Finding(
-            "covariance_useless", "warning", sigmas[0] / speed, _USELESS, "times", text, settings=_DENSITY, **where
-        )
+        yield Finding("covariance_useless", "warning", sigmas[0] / speed, _USELESS, "times", text, **at)
     elif 0.0 < sigmas[0] < _TINY * speed or 0.0 < sigmas[2] < _TINY_RAD_S:
         text = (
             f"{o.topic}: the twist has sigmas of {sigmas[0]:.1g} m/s and {sigmas[2]:.1g} rad/s: no wheels are so good"
         )
-        yield Finding("covariance_tiny", "warning", sigmas[0] / speed, _TINY, "times", text, settings=_DENSITY, **where)
+        yield Finding("covariance_tiny", "warning", sigmas[0] / speed, _TINY, "times", text, **at)

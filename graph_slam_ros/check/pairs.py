@@ -1,20 +1,32 @@
-"""Pairs of sightings of the same landmark, seen twice within a few seconds: drift is negligible in so short a time."""
+"""The same landmark, seen twice within a few seconds: drift is negligible in so short a time.
+
+Ranges alone change from one sighting to the next by no more than the robot has driven; bearings alone turn to the right
+as the robot turns to the left.
+"""
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from graph_slam_ros.check.columns import Columns
-from graph_slam_ros.check.sightings import SightingColumns
-from graph_slam_ros.lie import se3, so3
-from graph_slam_ros.typing import Array, Index, Mask
+from graph_slam_ros.check.columns import Columns, SightingColumns
+from graph_slam_ros.check.finding import Finding, where
+from graph_slam_ros.lie import se2, se3, so3
+from graph_slam_ros.typing import Array, Index
 
 LATER_S = 6.0
 """Most time between both."""
+ASSUMED_RANGE_M, ASSUMED_BEARING_RAD = 0.5, 0.02
+"""Standard deviations of ranges and bearings whose noise nobody has stated."""
+_TYPICAL_M = 0.05  # what odometry and a detector err within a few seconds, at most, where nothing is wrong
 _SOONEST_S, _MOVED, _MOST_PAIRS = 0.3, 0.15, 4000
+_RANGE_LATER_S, _DRIVEN_M, _LEAST_RANGES, _FASTEST = 30.0, 1.0, 20, 10.0
+_MOST, _FEWEST = 1.3, 0.1  # m/m, which nearly none exceeds: feet, where beacons are ahead or behind
+_QUARTILE, _OF_RAYLEIGH, _WORSE = 0.25, 0.7585, 3.0
+_RAISED, _TINY, _TOO_SMALL = 0.5, 1e-3, 10.0
+_BEARING_LATER_S, _TURNED_RAD, _LEAST_BEARINGS, _MIRRORED = 2.0, 0.25, 25, 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,13 +57,6 @@ class Pairs:
         return np.linalg.norm(np.stack(so3.log(tuple(self.motion[:, 3:].T)), axis=1), axis=1)
 
 
-def path_of(c: Columns) -> tuple[Index, Array]:
-    """Odometry as a replay uses it, in order of stamp, one pose for each."""
-    usable = np.isfinite(c.path).all(axis=1) & (np.abs(c.path).max(axis=1, initial=0.0) < 1e9)
-    stamp_ns, first = np.unique(c.path_ns[usable], return_index=True)
-    return stamp_ns, c.path[usable][first]
-
-
 def poses_at(stamp_ns: Index, path_ns: Index, path: Array) -> Array:
     """Poses (n, 7) at stamps within the path, interpolated."""
     after = np.clip(np.searchsorted(path_ns, stamp_ns), 1, len(path_ns) - 1)
@@ -60,18 +65,11 @@ def poses_at(stamp_ns: Index, path_ns: Index, path: Array) -> Array:
     return np.stack(se3.interpolate(tuple(path[before].T), tuple(path[after].T), part), axis=1)
 
 
-def usable(s: SightingColumns, path_ns: Index) -> Mask:
-    """Sightings (k,) with an identity and a point, within the time of odometry."""
-    inside = (s.stamp_ns >= path_ns[0]) & (s.stamp_ns <= path_ns[-1])
-    is_named = np.array([bool(name) for name in s.names], dtype=bool)[s.name]
-    return np.asarray(inside & is_named & (np.abs(s.points) < 1e9).all(axis=1))
-
-
-def pairs_of(s: SightingColumns, path_ns: Index, path: Array, dimensions: int) -> Pairs:
+def pairs_of(c: Columns, s: SightingColumns) -> Pairs:
     """Pairs of sightings between which the robot moved, at most 6 s apart."""
-    use = np.flatnonzero(usable(s, path_ns))
+    use = np.flatnonzero(s.located(c.path_ns))
     order = use[np.argsort(s.stamp_ns[use], kind="stable")]
-    seconds = ((s.stamp_ns - path_ns[0]) * 1e-9).tolist()
+    seconds = ((s.stamp_ns - c.path_ns[0]) * 1e-9).tolist()
     names, found = s.name.tolist(), []
     recent: dict[int, deque[int]] = {}
     for k in order.tolist():
@@ -82,36 +80,122 @@ def pairs_of(s: SightingColumns, path_ns: Index, path: Array, dimensions: int) -
             found.append((held[0], k))
         held.append(k)
     a, b = np.array(found, dtype=np.int64).reshape(-1, 2).T
-    at = [poses_at(s.stamp_ns[k], path_ns, path) for k in (a, b)]
+    at = [poses_at(s.stamp_ns[k], c.path_ns, c.path) for k in (a, b)]
     motion = np.stack(np.broadcast_arrays(*se3.between(tuple(at[0].T), tuple(at[1].T))), axis=1)
-    out = Pairs(a, b, motion)
-    moved = (np.linalg.norm(motion[:, :3], axis=1) > _MOVED) | (out.turned > _MOVED)
+    moved = (np.linalg.norm(motion[:, :3], axis=1) > _MOVED) | (Pairs(a, b, motion).turned > _MOVED)
     chosen = np.flatnonzero(moved)
     if len(chosen) > _MOST_PAIRS:
         chosen = chosen[np.linspace(0, len(chosen) - 1, _MOST_PAIRS).astype(np.int64)]
-    return Pairs(a[chosen], b[chosen], motion[chosen], dimensions)
+    return Pairs(a[chosen], b[chosen], motion[chosen], c.config.world.dimensions)
 
 
-def changes_by_motion(
+def noise_of(s: SightingColumns, pairs: Pairs) -> float:
+    """Return by how much two sightings of a landmark differ within a few seconds [m], where nothing is wrong."""
+    return 1.5 * (float(np.median(s.sigmas[pairs.a])) * 2.0**0.5 + _TYPICAL_M)
+
+
+def noisier(s: SightingColumns, pairs: Pairs) -> Iterator[Finding]:
+    """Sightings that are far worse than their noise says, by the smaller residuals of pairs, which no outlier has."""
+    if not len(pairs.a):  # ranges or bearings alone
+        return
+    sigmas = np.hypot(s.sigmas[pairs.a], _TYPICAL_M) * 2.0**0.5
+    factor = float(np.quantile(pairs.residuals(s.points) / sigmas, _QUARTILE)) / _OF_RAYLEIGH
+    if factor > _WORSE:
+        text = f"{s.topic}: two sightings of a landmark differ by {factor:.1f} times what their noise says"
+        at = where(s.topic, s.stamp_ns, len(pairs.a), _sigmas(s, pairs))
+        yield Finding("over_confident", "warning", factor, _WORSE, "times", text, **at)
+
+
+def check_noise(c: Columns, s: SightingColumns, pairs: Pairs) -> Iterator[Finding]:
+    """A covariance that nobody has measured: it was raised to the least that a replay allows, and that is too small."""
+    raised, sigma_m = _raised(c, s), float(np.median(s.sigmas))
+    if not raised or not len(pairs.a):
+        return
+    factor = float(np.median(pairs.residuals(s.points) / s.sigmas[pairs.a]))
+    if factor > _TOO_SMALL:
+        text = (
+            f"{s.topic}: the covariance of {raised} of {len(s.stamp_ns)} sightings is nearly zero, and two sightings "
+            f"of a landmark differ by {factor * sigma_m:.2g} m"
+        )
+        at = where(s.topic, s.stamp_ns, raised, _sigmas(s, pairs))
+        yield Finding("noise_zero", "warning", factor, _TOO_SMALL, "sigmas", text, **at)
+
+
+def check_noise_alone(c: Columns, s: SightingColumns) -> Iterator[Finding]:
+    """The same of ranges or bearings alone, of which no two can be compared: no sensor is so exact."""
+    raised = _raised(c, s)
+    if raised and not np.isfinite(s.points).any():
+        text = f"{s.topic}: the covariance of {raised} of {len(s.stamp_ns)} sightings is nearly zero"
+        has_ranges = np.isfinite(s.ranges).any()
+        sigma = f"sigma_m={ASSUMED_RANGE_M}" if has_ranges else f"sigma_rad={ASSUMED_BEARING_RAD}"
+        settings = (f"{s.input}.noise=sigmas", f"{s.input}.{sigma}")
+        at = where(s.topic, s.stamp_ns, raised, settings)
+        yield Finding("noise_zero", "warning", raised / len(s.stamp_ns), _RAISED, "part", text, **at)
+
+
+def _raised(c: Columns, s: SightingColumns) -> int:
+    """The number of variances of an input that were raised; 0 unless it is most, and they are nearly zero."""
+    raised = c.counters.as_dict().get(s.input, {}).get("covariance_floored", 0)
+    return raised if raised >= _RAISED * len(s.stamp_ns) and float(np.median(s.sigmas)) <= _TINY else 0
+
+
+def _sigmas(s: SightingColumns, pairs: Pairs) -> tuple[str, ...]:
+    """Settings that state the noise as pairs have it."""
+    sigma_m = float(np.quantile(pairs.residuals(s.points), _QUARTILE)) / _OF_RAYLEIGH / 2.0**0.5
+    sigma_rad = sigma_m / max(float(np.median(np.linalg.norm(s.points[pairs.a], axis=1))), sigma_m)
+    settings = (
+        "noise=sigmas",
+        f"sigma_m={max(round(sigma_m, 3), 1e-3)}",
+        f"sigma_rad={max(round(sigma_rad, 4), 1e-4)}",
+    )
+    return tuple(f"{s.input}.{setting}" for setting in settings)
+
+
+def check_ranges(c: Columns, s: SightingColumns) -> Iterator[Finding]:
+    """Ranges alone in other units than metres."""
+    use = np.flatnonzero(np.isfinite(s.ranges) & s.named(c.path_ns))
+    places = poses_at(s.stamp_ns[use], c.path_ns, c.path)[:, :3]
+    each = _changes(s, use, s.ranges, places, _RANGE_LATER_S, _DRIVEN_M, lambda a, b: float(np.linalg.norm(b - a)))
+    factor, least = np.quantile(np.abs(each), [0.5, _FEWEST]).tolist() if len(each) >= _LEAST_RANGES else (0.0, 0.0)
+    if factor > _FASTEST or least > _MOST:
+        text = f"{s.topic}: ranges change by {factor:.3g} for each metre of odometry: are both metres?"
+        yield Finding("units", "error", factor, _MOST, "m/m", text, **where(s.topic, s.stamp_ns, len(use)))
+
+
+def check_bearings(c: Columns, s: SightingColumns) -> Iterator[Finding]:
+    """Bearings alone, in the plane, that count to the right."""
+    use = np.flatnonzero(np.isfinite(s.bearings) & s.named(c.path_ns))
+    headings = np.stack(so3.log(tuple(poses_at(s.stamp_ns[use], c.path_ns, c.path)[:, 3:].T)), axis=1)[:, 2]
+    turned = lambda a, b: float(se2.wrap(b - a))  # noqa: E731
+    each = _changes(s, use, s.bearings, headings, _BEARING_LATER_S, _TURNED_RAD, turned, turned)
+    factor = float(np.median(each)) if len(each) >= _LEAST_BEARINGS else 0.0
+    if factor > _MIRRORED:
+        text = (
+            f"{s.topic}: bearings change by {factor:+.2f} rad for each radian that the robot turns to the left, and "
+            "-1 is expected: do they count to the right, or does odometry turn the other way?"
+        )
+        yield Finding("mirrored", "error", factor, _MIRRORED, "rad/rad", text, **where(s.topic, s.stamp_ns, len(use)))
+
+
+def _changes(
     s: SightingColumns,
+    chosen: Index,
     measured: Array,
     at: Array,
-    chosen: Index,
     later_s: float,
     least: float,
-    differ: tuple[Callable[[Any, Any], float], Callable[[float, float], float]],
+    moved_between: Callable[[Any, Any], float],
+    changed: Callable[[float, float], float] = lambda a, b: b - a,
 ) -> Array:
     """Return the change of what is measured of each landmark, per metre or radian that the robot has moved.
 
     Parameters
     ----------
-    measured : (k,) of all sightings
+    chosen, measured : (m,) the sightings that count; (k,) of all sightings
     at : (m, ...) the pose of the robot at each chosen sighting, or a part of it
-    chosen : (m,) the sightings that count
     later_s, least : how long after one sighting another may be, and how far the robot has moved in between
-    differ : the motion between two of ``at``, and the change between two measured values
+    moved_between, changed : the motion between two of ``at``, and the change between two measured values
     """
-    moved_between, changed_between = differ
     found = []
     for name in np.unique(s.name[chosen]):
         own = np.flatnonzero(s.name[chosen] == name)
@@ -121,6 +205,6 @@ def changes_by_motion(
             if (s.stamp_ns[chosen[k]] - s.stamp_ns[chosen[first]]) * 1e-9 > later_s:
                 first = k
             elif abs(moved := moved_between(at[first], at[k])) > least:
-                found.append(changed_between(float(measured[chosen[first]]), float(measured[chosen[k]])) / moved)
+                found.append(changed(float(measured[chosen[first]]), float(measured[chosen[k]])) / moved)
                 first = k
     return np.array(found)

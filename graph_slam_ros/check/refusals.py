@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from graph_slam_ros.check.columns import Columns
-from graph_slam_ros.check.finding import Finding, Severity, Where
+from graph_slam_ros.check.finding import Finding, Severity, where
 from graph_slam_ros.check.times import rounded_s
 from graph_slam_ros.measurements.reasons import Effect, explain, remedy
 
@@ -51,11 +51,11 @@ def check_refusals(c: Columns) -> Iterator[Finding]:
             severity: Severity = "error" if share > _MOST else "warning" if share > limit else "note"
             mend = remedy(source, reason)
             text = f"{source}: {times} of {received} are refused: {row.meaning}{'; ' if mend else ''}{mend}"
-            first_ns = int(topic.stamp_ns[0]) if topic is not None and len(topic.stamp_ns) else 0
-            name = source if topic is None else topic.name
             is_sighting = any(s.input == source for s in c.sightings)
             settings = (f"{source}.noise=sigmas",) if reason in _OF_COVARIANCE and is_sighting else ()
-            yield Finding(reason, severity, share, limit, "part", text, name, first_ns, times, settings)
+            name, stamps_ns = (source, ()) if topic is None else (topic.name, topic.stamp_ns)
+            at = where(name, stamps_ns, times, settings)
+            yield Finding(reason, severity, share, limit, "part", text, **at)
 
 
 def check_unnamed(c: Columns) -> Iterator[Finding]:
@@ -69,6 +69,5 @@ def check_unnamed(c: Columns) -> Iterator[Finding]:
         share = float(np.mean(unnamed))
         severity: Severity = "error" if share > _MOST else "warning" if share > _USUAL_SHARE else "note"
         text = f"{s.topic}: {share:.1%} of the sightings have no id, and are not used"
-        at: Where = {"topic": s.topic, "first_ns": int(s.stamp_ns[unnamed][0]), "count": int(unnamed.sum())}
-        settings = ("landmarks.association=joint",)
-        yield Finding("no_id", severity, share, _USUAL_SHARE, "part", text, settings=settings, **at)
+        at = where(s.topic, s.stamp_ns[unnamed], settings=("landmarks.association=joint",))
+        yield Finding("no_id", severity, share, _USUAL_SHARE, "part", text, **at)

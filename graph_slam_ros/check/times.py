@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from graph_slam_ros.check.columns import Columns, OdometryColumns, TopicColumns
-from graph_slam_ros.check.finding import Finding, Severity, Where
+from graph_slam_ros.check.finding import Finding, Severity, where
 from graph_slam_ros.config.node import TimeConfig
 from graph_slam_ros.formats.parameters import assignment
 from graph_slam_ros.messages.receive_times import clock_offset_s
@@ -33,12 +33,10 @@ def check_times(c: Columns) -> Iterator[Finding]:
     for key, value in c.assumed.items():
         if key.endswith(".offset_s"):
             name = key.removesuffix(".offset_s")
-            text = (
-                f"{name}: its clock differs from that of odometry by {-float(value):.3f} s, by the times of recording"
-            )
-            topic = c.topic_of(name)
-            where: Where = {"topic": "" if topic is None else topic.name, "settings": (assignment(key, value),)}
-            yield Finding("clock_domains", "error", -value, _CLOCKS_DIFFER_S, "s", text, **where)
+            apart = f"{-float(value):.3f} s, by the times of recording"
+            text, topic = f"{name}: its clock differs from that of odometry by {apart}", c.topic_of(name)
+            at = where("" if topic is None else topic.name, settings=(assignment(key, value),))
+            yield Finding("clock_domains", "error", -value, _CLOCKS_DIFFER_S, "s", text, **at)
     stamped = {name: topic for name, topic in right.items() if np.count_nonzero(topic.stamp_ns) >= _FEW}
     yield from _clocks(c, stamped)
     for topic in stamped.values():
@@ -53,8 +51,7 @@ def _constant(topic: TopicColumns) -> Iterator[Finding]:
     is_input, count = topic.use in ("odometry", "landmarks"), len(stamp_ns)
     if is_input and count >= _MANY and not np.ptp(stamp_ns) and np.ptp(topic.log_ns):
         text = f"{topic.name}: all of its {count} messages have the stamp {stamp_ns[0] * 1e-9:.3f} s"
-        at: Where = {"topic": topic.name, "first_ns": int(stamp_ns[0]), "count": count}
-        yield Finding("constant_stamps", "error", count, _MANY, "messages", text, **at)
+        yield Finding("constant_stamps", "error", count, _MANY, "messages", text, **where(topic.name, stamp_ns))
 
 
 def _wrong(topics: Mapping[str, TopicColumns]) -> Iterator[Finding]:
@@ -65,12 +62,11 @@ def _wrong(topics: Mapping[str, TopicColumns]) -> Iterator[Finding]:
         if len(lag_s) < _MANY or not np.ptp(log_ns):
             continue
         step_ns, recorded_ns = np.diff(stamp_ns), np.diff(log_ns)
-        where: Where = {"topic": name, "first_ns": int(stamp_ns[0]), "count": len(stamp_ns)}
         part = int(np.quantile(stamp_ns % 10**9, _NEARLY_ALL))
         if 0 < part < _CROWDED * 1e9 and np.median(step_ns) < _CROWDED * np.median(recorded_ns):
             unit = next((unit for most, unit in _OF_A_SECOND.items() if part < most), "ticks")
             text = f"{name}: all that comes in a second is stamped within {part * 1e-6:.3g} ms: nanosec has {unit}"
-            yield Finding("wrong_stamps", "error", part * 1e-9, _CROWDED, "s", text, **where)
+            yield Finding("wrong_stamps", "error", part * 1e-9, _CROWDED, "s", text, **where(name, stamp_ns))
             return
         apart = max(1, len(lag_s) // 4)
         span_ns = np.maximum(log_ns[apart:] - log_ns[:-apart], 1)
@@ -80,7 +76,7 @@ def _wrong(topics: Mapping[str, TopicColumns]) -> Iterator[Finding]:
         others = [other for other in advance.values() if other != rate]
         if _differ(rate, usual) and any(_differ(rate, other) for other in others):
             text = f"{name}: its stamps advance by {rate:.3g} s for each second in which its messages were recorded"
-            at: Where = {"topic": name, "first_ns": int(topics[name].stamp_ns[0]), "count": len(topics[name].stamp_ns)}
+            at = where(name, topics[name].stamp_ns)
             yield Finding("wrong_stamps", "error", rate, _FASTER, "s/s", text, **at)
 
 
@@ -123,26 +119,27 @@ def _clocks(c: Columns, topics: dict[str, TopicColumns]) -> Iterator[Finding]:
     for topic in topics.values():
         lag_s, log_ns, stamp_ns = _lags(topic)
         apart_s = clock_offset_s(log_ns, lag_s, odometry_log_ns, odometry_lag_s)
-        where: Where = {"topic": topic.name, "first_ns": int(stamp_ns[0]), "count": len(stamp_ns)}
         if abs(apart_s) > _CLOCKS_DIFFER_S:
-            yield _other_clock(c, topic, of_odometry, apart_s, where)
+            yield _other_clock(c, topic, of_odometry, apart_s, stamp_ns)
         elif apart_s < -_EARLY_S:
             text = (
                 f"{topic.name}: recorded {-apart_s * 1e3:.0f} ms before the time in its stamps, compared with "
                 f"{c.odometry.topic}: its clock is ahead"
             )
-            setting = _offset(c, topic, apart_s)
-            yield Finding("latency", "warning", -apart_s, _EARLY_S, "s", text, settings=(setting,), **where)
+            at = where(topic.name, stamp_ns, settings=(_offset(c, topic, apart_s),))
+            yield Finding("latency", "warning", -apart_s, _EARLY_S, "s", text, **at)
 
 
-def _other_clock(c: Columns, topic: TopicColumns, of_odometry: TopicColumns, apart_s: float, where: Where) -> Finding:
+def _other_clock(
+    c: Columns, topic: TopicColumns, of_odometry: TopicColumns, apart_s: float, stamp_ns: Index
+) -> Finding:
     """A clock that is not that of odometry. Where odometry's alone is not the receiver's, it is odometry's."""
     is_right = abs(float(np.median(_lags(topic)[0]))) < _CLOCKS_DIFFER_S / 2.0
     wrong, right = (of_odometry, topic) if is_right else (topic, of_odometry)
     by_s = apart_s if wrong is topic else -apart_s
     text = f"{wrong.name}: its stamps are {-by_s:.1f} s away from those of {right.name}: another clock"
-    settings = (_offset(c, wrong, by_s),)
-    return Finding("clock_domains", "error", -by_s, _CLOCKS_DIFFER_S, "s", text, settings=settings, **where)
+    at = where(topic.name, stamp_ns, settings=(_offset(c, wrong, by_s),))
+    return Finding("clock_domains", "error", -by_s, _CLOCKS_DIFFER_S, "s", text, **at)
 
 
 def _offset(c: Columns, topic: TopicColumns, offset_s: float) -> str:
@@ -155,33 +152,31 @@ def _order(c: Columns, topic: TopicColumns) -> Iterator[Finding]:
     stamp_ns = topic.stamp_ns[topic.stamp_ns != 0]
     step_s = np.diff(stamp_ns) * 1e-9
     repeated, back = step_s == 0.0, step_s < 0.0
-    where: Where = {"topic": topic.name}
     share = float(repeated.mean())
     if topic.name == c.odometry.topic and share > _DUPLICATES and (each_s := rounded_s(c.odometry)):
         is_coarse = each_s > _COARSE_S
         text = f"{topic.name}: stamps are rounded to {each_s:.3g} s: {share:.1%} are that of the message before"
-        found = Finding("coarse_stamps", "error", each_s, _COARSE_S, "s", text, **where)
+        found = Finding("coarse_stamps", "error", each_s, _COARSE_S, "s", text, topic.name)
         yield found if is_coarse else replace(found, code="rounded_stamps", severity="note")
     elif topic.use == "odometry" and share > _DUPLICATES:
         text = (
             f"{topic.name}: {share:.1%} of the messages have the stamp of the one before: published or recorded twice"
         )
-        at, count = int(stamp_ns[1:][repeated][0]), int(repeated.sum())
-        yield Finding("duplicates", "warning", share, _DUPLICATES, "part", text, first_ns=at, count=count, **where)
+        at = where(topic.name, stamp_ns[1:][repeated])
+        yield Finding("duplicates", "warning", share, _DUPLICATES, "part", text, **at)
     if not back.any():
         return
-    most_s, at, count = -float(step_s.min()), int(stamp_ns[1:][back][0]), int(back.sum())
-    more: Where = {"first_ns": at, "count": count, **where}
+    most_s, count, at = -float(step_s.min()), int(back.sum()), where(topic.name, stamp_ns[1:][back])
     window_s = c.config.ordering.window_s if topic.use == "odometry" else c.config.ordering.late_s
     if most_s > 1.0 and most_s > window_s:
         text = f"{topic.name}: stamps step back by up to {most_s:.2f} s: the clock was set, or two drives were joined"
         is_expected = c.config.time.on_jump != TimeConfig().on_jump
         severity: Severity = "note" if is_expected else "error"
-        yield Finding("time_jump", severity, most_s, 1.0, "s", text, **more)
+        yield Finding("time_jump", severity, most_s, 1.0, "s", text, **at)
     elif topic.use == "odometry" and most_s > window_s and count > _OUT_OF_ORDER * len(step_s):
         text = f"{topic.name}: {count} messages are older than the one before, by up to {most_s * 1e3:.0f} ms"
-        setting = assignment("ordering.window_s", round(1.2 * most_s + 0.005, 3))
-        yield Finding("out_of_order", "warning", most_s, window_s, "s", text, settings=(setting,), **more)
+        at |= {"settings": (assignment("ordering.window_s", round(1.2 * most_s + 0.005, 3)),)}
+        yield Finding("out_of_order", "warning", most_s, window_s, "s", text, **at)
 
 
 def _rate(c: Columns) -> Iterator[Finding]:
@@ -192,7 +187,6 @@ def _rate(c: Columns) -> Iterator[Finding]:
     poses = o.poses[o.stamp_ns != 0][order]
     step_s = np.diff(stamp_ns) * 1e-9
     median_s = float(np.median(step_s))
-    where: Where = {"topic": o.topic, "first_ns": int(stamp_ns[0]), "count": len(stamp_ns)}
     most_s = max(_PERIODS * median_s, _LONG_S)
     long = np.flatnonzero(step_s > most_s)
     if len(long):
@@ -201,8 +195,7 @@ def _rate(c: Columns) -> Iterator[Finding]:
         was_set = _was_set(poses, step_s, long)
         for k in long[was_set]:
             text = f"{o.topic}: the clock was set forward by {_span(step_s[k])}: odometry goes on where it was"
-            at_k = int(stamp_ns[k + 1])
-            yield Finding("clock_jump", "warning", step_s[k], most_s, "s", text, o.topic, at_k, 1)
+            yield Finding("clock_jump", "warning", step_s[k], most_s, "s", text, **where(o.topic, stamp_ns[k + 1 :], 1))
         long, moved, turned = long[~was_set], moved[~was_set], turned[~was_set]
     if len(long):
         worst_s = float(step_s[long].max())
@@ -211,13 +204,13 @@ def _rate(c: Columns) -> Iterator[Finding]:
             f"{o.topic} comes at {1.0 / median_s:.0f} Hz, but is silent for more than {most_s:.1f} s "
             f"{_often(len(long))} (the longest {worst_s:.2f} s{'; the robot moved meanwhile' if is_bad else ''})"
         )
-        at: Where = {"topic": o.topic, "first_ns": int(stamp_ns[long[0]]), "count": len(long)}
+        at = where(o.topic, stamp_ns[long])
         yield Finding("gap", "warning" if is_bad else "note", worst_s, most_s, "s", text, **at)
     if 1.0 / median_s < _SLOW_HZ:
         between = _between(c, stamp_ns)
         text = f"{o.topic} comes at {1.0 / median_s:.1f} Hz: poses are interpolated over {median_s:.2f} s"
         severity: Severity = "warning" if between > 0.5 else "note"
-        yield Finding("slow_odometry", severity, 1.0 / median_s, _SLOW_HZ, "Hz", text, **where)
+        yield Finding("slow_odometry", severity, 1.0 / median_s, _SLOW_HZ, "Hz", text, **where(o.topic, stamp_ns))
 
 
 def _was_set(poses: Array, step_s: Array, gaps: Index) -> Mask:
@@ -259,7 +252,7 @@ def _overlap(c: Columns) -> Iterator[Finding]:
         share = float(outside.mean()) if len(outside) else 0.0
         if share <= _OUTSIDE:
             continue
-        at: Where = {"topic": s.topic, "first_ns": int(s.stamp_ns[outside][0]), "count": int(outside.sum())}
+        at = where(s.topic, s.stamp_ns[outside])
         ends = [(int(t) - first_ns) * 1e-9 for t in (s.stamp_ns.min(), s.stamp_ns.max())]
         if share < _NEARLY_ALL and _recorded_alone(c, s.topic) > _OUTSIDE:
             after_s = ends[1] - (last_ns - first_ns) * 1e-9

@@ -1,16 +1,13 @@
 """A trial of a recording: a replay in memory, then a fit of clock, mount and scales that starts at its estimate."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np
 
-from graph_slam_ros.check.columns import Columns, TopicColumns
-from graph_slam_ros.check.finding import Finding, Where
-from graph_slam_ros.check.identities import at_two_places, check_identities, points_in_map
-from graph_slam_ros.check.noise import noisier
-from graph_slam_ros.check.outliers import check_outliers
-from graph_slam_ros.check.pairs import pairs_of, path_of, poses_at
-from graph_slam_ros.check.slips import check_slips
+from graph_slam_ros.check.columns import Columns, SightingColumns
+from graph_slam_ros.check.finding import Finding, Severity, where
+from graph_slam_ros.check.identities import at_two_places, check_identities, check_outliers
+from graph_slam_ros.check.pairs import noisier, pairs_of, poses_at
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.parameters import assignment
 from graph_slam_ros.lie import se3
@@ -47,6 +44,13 @@ _OVER_CONFIDENT, _ODOMETRY_OVER_CONFIDENT, _LEAST_DOF = 2.0, 6.0**0.5, 100.0
 _OF_A_BREAK = ("ids_unsure", "map_breaks", "landmark_moved")  # a robot that was carried has them with right ids
 _MOST, _SHIFTS = 0.9, 2.0
 
+_TOGETHER = 5  # steps between keyframes that are summed for a slip: one is as rough as its landmarks
+_LEAST_WINDOWS = 20
+_SIGMA = 1.4826  # of a median absolute deviation
+_SLIP_SIGMAS, _PART = 6.0, 0.1
+_LEAST_M, _LEAST_RAD = 0.15, 0.3
+_LARGE_SIGMAS, _LARGE_M, _LARGE_RAD = 12.0, 0.5, 0.8
+
 
 def replayed(config: Config, measured: Iterable[Measurement]) -> GraphSlam:
     """The pipeline after all measurements, with fewer odometry, keyframes, solves and searches for other hypotheses.
@@ -67,56 +71,42 @@ def replayed(config: Config, measured: Iterable[Measurement]) -> GraphSlam:
     return slam
 
 
-def poses_in_map(
-    slam: GraphSlam, stamp_ns: Index, path_ns: Index, path: Array, trajectory: Array | None = None
-) -> Array:
-    """Poses (k, 7) at stamps by the estimate, or by other poses of keyframes; corrections are spread between two."""
-    keyframes = slam.keyframes
-    estimate = se3.in_space(slam.trajectory() if trajectory is None else trajectory).reshape(-1, 7)
-    own, at_ns = se3.in_space(keyframes.poses).reshape(-1, 7), keyframes.stamps_ns
-    order = np.argsort(at_ns, kind="stable")
-    at_ns = at_ns[order]
-    driven = poses_at(stamp_ns, path_ns, path)
+def _points_in_map(c: Columns, s: SightingColumns, slam: GraphSlam, stamp_ns: Index) -> Array:
+    """(k, 3) Where each sighting puts its landmark, by the estimate at these stamps, corrected between keyframes."""
+    order = np.argsort(slam.keyframes.stamps_ns, kind="stable")
+    estimate, own = (se3.in_space(poses).reshape(-1, 7)[order] for poses in (slam.trajectory(), slam.keyframes.poses))
+    at_ns, stamp_ns = slam.keyframes.stamps_ns[order], np.clip(stamp_ns, c.path_ns[0], c.path_ns[-1])
+    driven = poses_at(stamp_ns, c.path_ns, c.path)
     after = np.clip(np.searchsorted(at_ns, stamp_ns), 1, len(at_ns) - 1)
     ends = []
-    for k in (order[after - 1], order[after]):
+    for k in (after - 1, after):
         since = se3.between(tuple(own[k].T), tuple(driven.T))
         ends.append(se3.compose(tuple(estimate[k].T), since))
     span = np.maximum(at_ns[after] - at_ns[after - 1], 1)
     part = np.clip((stamp_ns - at_ns[after - 1]) / span, 0.0, 1.0)
-    return np.stack(se3.interpolate(ends[0], ends[1], part), axis=1)
-
-
-def _noise_scales(slam: GraphSlam) -> tuple[Sequence[NoiseScale], str]:
-    """Return the noise of each class and input, or none and why it cannot be estimated."""
-    try:
-        return slam.noise_scale(), ""
-    except GraphSlamError as error:
-        return (), str(error)
+    return np.stack(se3.act(se3.interpolate(ends[0], ends[1], part), tuple(s.points.T)), axis=1)
 
 
 def check_trial(c: Columns, slam: GraphSlam) -> Iterator[Finding]:
     """Findings of the replay and of the fit: clock, mount, scales, noise, identities, outliers."""
-    path_ns, path = path_of(c)
-    if len(slam.keyframes) < 3 or len(path_ns) < 2 or not slam.landmarks:
+    if len(slam.keyframes) < 3 or len(c.path_ns) < 2 or not slam.landmarks:
         return
     try:
         fit, fitted = slam.trial_fit(places=True)
     except GraphSlamError as error:
         yield Finding("fit_unsure", "note", 1, 0, "fits", f"the trial fit failed: {error}")
         return
-    scales, no_scales = _noise_scales(slam)
     clocks = [one for one in fitted if one.parameter.name == "clock" and one.verdict == "admitted"]
     is_void = fit.lost > MOST_LOST or absurd_range(fit) is not None
     late_s = {} if is_void else {one.parameter.source: one.value for one in clocks}
-    step_s = float(np.median(np.diff(path_ns))) * 1e-9
+    step_s = float(np.median(np.diff(c.path_ns))) * 1e-9
     known = [one for one in fitted if one.parameter.name in _LIMITS]
     off = {one.parameter: one.value for one in known if _is_far_off(fit, one, step_s)}
     slip = None if off else check_slips(c, slam)  # a clock or mount that is wrong bends the path in turns
     is_broken = slip is not None and slip[0].severity == "warning"
-    found = [] if off or _goes_back(c) else _places(c, slam, path_ns, path, late_s, slip if is_broken else None)
+    found = [] if off or _goes_back(c) else _places(c, slam, late_s, slip if is_broken else None)
     if is_void:
-        found += [one for s in c.sightings for one in noisier(s, pairs_of(s, path_ns, path, c.config.world.dimensions))]
+        found += [one for s in c.sightings for one in noisier(s, pairs_of(c, s))]
         yield from found or [_void(fit)]
         return
     yield from (found_one for one in fitted for found_one in _fitted(c, slam, one, off))
@@ -131,9 +121,17 @@ def check_trial(c: Columns, slam: GraphSlam) -> Iterator[Finding]:
         name = c.sightings[0].topic
         text = f"{name}: {new}"
         yield Finding("ids_renewed", "warning", new.same, 0, "landmarks", text, name, new.since_ns, new.new)
-    text = f"noise cannot be checked: {no_scales}"
-    yield from [Finding("fit_unsure", "note", 1, 0, "fits", text)] if no_scales else []
-    for noise in () if off else scales:
+    yield from _noise(c, slam, has_cause=bool(off))
+
+
+def _noise(c: Columns, slam: GraphSlam, *, has_cause: bool) -> Iterator[Finding]:
+    """Noise that is too small, and more than the run allows for, where nothing that is off explains it."""
+    try:
+        scales = slam.noise_scale()
+    except GraphSlamError as error:
+        yield Finding("fit_unsure", "note", 1, 0, "fits", f"noise cannot be checked: {error}")
+        return
+    for noise in () if has_cause else scales:
         limit = _ODOMETRY_OVER_CONFIDENT if noise.label == "odometry" else _OVER_CONFIDENT
         factor = float(np.sqrt(noise.per_dof))
         is_allowed_for = c.config.robust.noise_scale == "estimated" and noise.factor < LARGEST
@@ -184,13 +182,15 @@ def _fitted(c: Columns, slam: GraphSlam, one: Fitted, off: Mapping[Parameter, fl
     topic = c.topic_of(one.parameter.source)
     if one.parameter.name not in _LIMITS or topic is None:
         return
-    code, (unit, limit, unknown), where = CODES[one.parameter.name], _LIMITS[one.parameter.name], _where(topic)
+    code, (unit, limit, unknown) = CODES[one.parameter.name], _LIMITS[one.parameter.name]
     if one.parameter in off:
         text = f"{topic.name}: {sentence(one.parameter, one.value, one.sigma)}"
         settings = (assignment(*setting_of(one.parameter, off, slam.calibrated)),)
-        yield Finding(code, "warning", one.value, limit, unit, text, settings=settings, **where)
+        at = where(topic.name, topic.stamp_ns, settings=settings)
+        yield Finding(code, "warning", one.value, limit, unit, text, **at)
     elif one.sigma > unknown:
-        yield Finding("not_observable", "note", one.sigma, unknown, unit, one.text, **where)
+        at = where(topic.name, topic.stamp_ns)
+        yield Finding("not_observable", "note", one.sigma, unknown, unit, one.text, **at)
 
 
 def _clock_jumps(c: Columns, fit: TrialFit) -> Iterator[Finding]:
@@ -199,20 +199,12 @@ def _clock_jumps(c: Columns, fit: TrialFit) -> Iterator[Finding]:
         topic = c.topic_of(parameter.source)
         if topic is not None:
             text = f"{topic.name}: {jump_sentence(before, after, sigma)}"
-            yield Finding("clock_jump", "warning", after - before, limit, "s", text, **_where(topic))
-
-
-def _where(topic: TopicColumns) -> Where:
-    return {"topic": topic.name, "first_ns": int(topic.stamp_ns[:1].sum()), "count": len(topic.stamp_ns)}
+            at = where(topic.name, topic.stamp_ns)
+            yield Finding("clock_jump", "warning", after - before, limit, "s", text, **at)
 
 
 def _places(
-    c: Columns,
-    slam: GraphSlam,
-    path_ns: Index,
-    path: Array,
-    late_s: Mapping[str, float],
-    slip: tuple[Finding, int] | None,
+    c: Columns, slam: GraphSlam, late_s: Mapping[str, float], slip: tuple[Finding, int] | None
 ) -> list[Finding]:
     """Identities by where the estimate puts them, and sightings that are far from their landmark.
 
@@ -221,18 +213,73 @@ def _places(
     found: list[Finding] = []
     for s in c.sightings:
         late = round(late_s.get(s.input, 0.0) * 1e9)
-        inside = (s.stamp_ns + late >= path_ns[0]) & (s.stamp_ns + late <= path_ns[-1])
+        inside = (s.stamp_ns + late >= c.path_ns[0]) & (s.stamp_ns + late <= c.path_ns[-1])
         if slip is not None:
             inside &= (s.stamp_ns < slip[0].first_ns) | (s.stamp_ns > slip[1])
         if not inside.any():
             continue
-        stamps = (np.clip(stamp_ns, path_ns[0], path_ns[-1]) for stamp_ns in (s.stamp_ns, s.stamp_ns + late))
-        before, points = (points_in_map(s, poses_in_map(slam, one, path_ns, path)) for one in stamps)
+        before, points = (_points_in_map(c, s, slam, stamp_ns) for stamp_ns in (s.stamp_ns, s.stamp_ns + late))
         points[~inside] = np.nan
-        two = at_two_places(s, points, path_ns, c.config.world.dimensions)
+        two = at_two_places(s, points, c.path_ns, c.config.world.dimensions)
         shift = np.linalg.norm(points - before, axis=1)
         shift = shift[np.isfinite(shift)]  # ranges and bearings alone have no point
         shift_m = float(np.quantile(shift, _MOST)) if len(shift) else 0.0
         found += check_identities(s, [one for one in two if one.apart_m > _SHIFTS * shift_m])
         found += check_outliers(s, points, inside, c.config.world.dimensions)
     return found
+
+
+def check_slips(c: Columns, slam: GraphSlam) -> tuple[Finding, int] | None:
+    """Find the stretch in which odometry is worst, if it is far worse there than in the rest of the drive.
+
+    The errors of odometry's motion are summed over a few steps between keyframes. Their scale is that of the middle
+    half of them, so a wrong factor, which all of them have, is none.
+
+    Returns
+    -------
+    The finding, from the stamp on at which the stretch begins, and the stamp at which it ends.
+    """
+    errors, size, stamps_ns = _errors(slam)
+    if len(errors) < _LEAST_WINDOWS:
+        return None
+    errors = errors - np.median(errors, axis=0)
+    scale = _SIGMA * np.median(np.abs(errors), axis=0)
+    least, large = np.array([_LEAST_M, _LEAST_RAD]), np.array([_LARGE_M, _LARGE_RAD])
+    excess = np.abs(errors) / np.maximum(np.maximum(_SLIP_SIGMAS * scale, least), _PART * size)
+    k, part = np.unravel_index(int(np.argmax(excess)), excess.shape)
+    if excess[k, part] <= 1.0:
+        return None
+    error, unit = float(errors[k, part]), ("m", "rad")[part]
+    is_large = abs(error) > max(large[part], _LARGE_SIGMAS * scale[part])
+    severity: Severity = "warning" if is_large else "note"
+    many = np.count_nonzero((excess > 1.0).any(axis=1))
+    by = f"{('drives', 'turns')[part]} {abs(error):.2f} {unit} {'less' if error < 0.0 else 'more'} than odometry says"
+    if abs(error) > size[k, part]:
+        by = f"is elsewhere than odometry says, by {abs(error):.2f} {unit}"
+    text = (
+        f"{c.odometry.topic}: by the landmarks the robot {by}, in a stretch of "
+        f"{1e-9 * (stamps_ns[k + _TOGETHER] - stamps_ns[k]):.0f} s, where {scale[part]:.2f} {unit} is usual: its "
+        "wheels slip, or it is carried or held"
+    )
+    limit, at = float(np.abs(error) / excess[k, part]), where(c.odometry.topic, stamps_ns[k:], int(many))
+    return Finding("odometry_slips", severity, abs(error), limit, unit, text, **at), int(stamps_ns[k + _TOGETHER])
+
+
+def _errors(slam: GraphSlam) -> tuple[Array, Array, Index]:
+    """Errors (n, 2) of odometry ahead and in heading over a few steps, how much it says it moved, and stamps."""
+    own, estimate = (se3.in_space(poses).reshape(-1, 7) for poses in (slam.keyframes.poses, slam.trajectory()))
+    order = np.argsort(slam.keyframes.stamps_ns, kind="stable")
+    stamps_ns, own, estimate = slam.keyframes.stamps_ns[order], own[order], estimate[order]
+    if len(own) <= _TOGETHER:
+        return np.empty((0, 2)), np.empty((0, 2)), stamps_ns
+    stated, found = (se3.between(tuple(poses[:-1].T), tuple(poses[1:].T)) for poses in (own, estimate))
+    error = np.stack(se3.local(found, stated), axis=1)
+    decided = {index for alarm in slam.alarms if (index := getattr(alarm, "segment", None)) is not None}
+    begins = np.isin(order, [index for index in slam.segments if index not in decided])
+    error[begins[1:]] = 0.0  # odometry was restarted or jumps there, which is another finding
+    moved = np.stack(se3.local(stated, se3.IDENTITY), axis=1)
+    sizes = np.stack([np.linalg.norm(moved[:, :3], axis=1), np.linalg.norm(moved[:, 3:], axis=1)], axis=1)
+    kernel = np.ones(_TOGETHER)
+    columns = (error[:, [0, 5]], sizes)
+    summed = [np.stack([np.convolve(x, kernel, "valid") for x in rows.T], axis=1) for rows in columns]
+    return summed[0], summed[1], stamps_ns

@@ -1,7 +1,7 @@
 """A summary of a whole recording: the span and frames of each topic, and how it can be used."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import islice
 from typing import Any
@@ -103,7 +103,7 @@ class Recording:
     def is_linked(self, frame: str, base: str) -> bool:
         """Return whether TF has the pose of a frame on the robot."""
         links = self.fixed | {child: parent for child, parent in self.moving.items() if child != base}
-        return _root(links, frame) == _root(links, base)
+        return root_of(links, frame) == root_of(links, base)
 
     def alike(self, frame: str) -> str:
         """Return the frame of TF that differs from another one in slashes alone; empty if there is none."""
@@ -119,7 +119,8 @@ class Recording:
         return bool(seen) and base == frame
 
 
-def _root(links: dict[str, str], frame: str) -> str:
+def root_of(links: Mapping[str, str], frame: str) -> str:
+    """Return the frame that the tree of a frame begins with, given the parent of each."""
     seen = {frame}
     while frame in links and links[frame] not in seen:
         frame = links[frame]

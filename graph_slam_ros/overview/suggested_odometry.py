@@ -8,9 +8,8 @@ from graph_slam_ros.config.inputs import ASSUMED
 from graph_slam_ros.messages.from_msg import TRANSFORMS
 from graph_slam_ros.messages.inputs.landmark_types import LANDMARK_TYPES
 from graph_slam_ros.messages.inputs.transforms import MAP_FRAMES
-from graph_slam_ros.overview.chosen_inputs import TF_TOPIC
+from graph_slam_ros.overview.chosen_inputs import TF_TOPIC, WORD, is_truth, landmarks_of_other_robots
 from graph_slam_ros.overview.contents import Recording, TopicContents
-from graph_slam_ros.overview.namespaces import WORD, is_truth, landmarks_of_other_robots
 
 ODOMETRY, DETECTIONS = "nav_msgs/msg/Odometry", "vision_msgs/msg/Detection3DArray"
 POSES = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")

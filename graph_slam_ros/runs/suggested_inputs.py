@@ -8,9 +8,8 @@ from typing import Any
 from graph_slam_ros.config.inputs import default_input
 from graph_slam_ros.messages.from_msg import TF, TF_STATIC
 from graph_slam_ros.messages.inputs.landmark_types import LANDMARK_TYPES
-from graph_slam_ros.overview.chosen_inputs import Inputs, choose_inputs
+from graph_slam_ros.overview.chosen_inputs import Inputs, choose_inputs, is_truth
 from graph_slam_ros.overview.contents import recording_of
-from graph_slam_ros.overview.namespaces import is_truth
 from graph_slam_ros.overview.suggested_odometry import DETECTIONS, ODOMETRY
 from graph_slam_ros.recordings.bag import Bag, BagError, open_bag
 from graph_slam_ros.runs.suggestion import CLOUD, GNSS, Suggestion

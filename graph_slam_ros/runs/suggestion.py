@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from graph_slam_ros.check.gyro import upright
-from graph_slam_ros.check.noise import ASSUMED_BEARING_RAD, ASSUMED_RANGE_M
+from graph_slam_ros.check.pairs import ASSUMED_BEARING_RAD, ASSUMED_RANGE_M
 from graph_slam_ros.config.inputs import ASSUMED
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.parameters import assignment
@@ -15,9 +15,8 @@ from graph_slam_ros.messages.from_msg import TRANSFORMS
 from graph_slam_ros.messages.inputs import CONVERTERS, converters, known_types
 from graph_slam_ros.messages.inputs.landmark_types import APRILTAGS, LANDMARK_TYPES
 from graph_slam_ros.messages.inputs.transforms import MAP_FRAMES
-from graph_slam_ros.overview.chosen_inputs import TF_STATIC_TOPIC, TF_TOPIC, choose_inputs
+from graph_slam_ros.overview.chosen_inputs import TF_STATIC_TOPIC, TF_TOPIC, choose_inputs, is_truth
 from graph_slam_ros.overview.contents import Recording, TopicContents
-from graph_slam_ros.overview.namespaces import is_truth
 from graph_slam_ros.overview.suggested_odometry import DETECTIONS, ESTIMATE, POSES, OdometryChoice, readable
 from graph_slam_ros.recordings.bag import Bag
 from graph_slam_ros.runs.folder import suggested_out

@@ -7,9 +7,16 @@ import pytest
 from reliability import times
 
 from graph_slam_ros.check.checks import check_columns
-from graph_slam_ros.check.columns import Columns, FixColumns, Link, OdometryColumns, TopicColumns
+from graph_slam_ros.check.columns import (
+    Columns,
+    FixColumns,
+    Link,
+    OdometryColumns,
+    SightingColumns,
+    TopicColumns,
+    in_order,
+)
 from graph_slam_ros.check.finding import KINDS, SEVERITIES
-from graph_slam_ros.check.sightings import SightingColumns
 from graph_slam_ros.cli.check import lines
 from graph_slam_ros.formats.parameters import parse_setting
 from graph_slam_ros.lie import se3
@@ -66,7 +73,6 @@ def columns(seed):
         "detections",
         "/landmarks",
         seen_ns,
-        np.sort(rng.integers(0, 1 + k // 2, k)),
         names,
         rng.integers(0, len(names), k),
         numbers(rng, k, 3),
@@ -90,7 +96,8 @@ def columns(seed):
     x, y, yaw = 10.0 * rng.normal(size=(3, n))  # at stamps of which some are years from the others
     fixes = FixColumns("gps", "/gps", stamps(rng, n), x + 1j * y, yaw, 0.1, pick(), se3.IDENTITY)
     chosen = assumed if rng.random() < 0.3 else {}
-    return Columns(config, topics, o, odometry_ns, path, (seen,), links, counters, chosen, fixes=(fixes,))
+    driven = in_order(odometry_ns, path)
+    return Columns(config, topics, o, *driven, (seen,), links, counters, chosen, fixes=(fixes,))
 
 
 @pytest.mark.filterwarnings("error")
