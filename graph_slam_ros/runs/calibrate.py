@@ -24,8 +24,7 @@ from graph_slam_ros.runs.suggested_inputs import SuggestedInputs
 from graph_slam_ros.runs.tables import account
 from graph_slam_ros.slam import Config, Counters, GraphSlam
 from graph_slam_ros.slam.calibration.decision import Finding as Fitted
-from graph_slam_ros.slam.calibration.decision import amount
-from graph_slam_ros.slam.calibration.parameters import AUTO, DEFAULT_GROUPS, GROUPS, OF_ODOMETRY, QUANTITIES, Parameter
+from graph_slam_ros.slam.calibration.parameters import AUTO, GROUPS, Parameter, parameters_of
 from graph_slam_ros.slam.calibration.uncorrected import CODES, setting_of
 from graph_slam_ros.slam.trial_fits import FIRST_DUE
 from graph_slam_ros.warmup import warmup
@@ -101,7 +100,7 @@ def calibrate(
     name = "calibrate" if rounds.named else "replay"
     command = suggested.suggestion.command(found | dict(settings or {}) | found | rounds.named, name=name)
     outcome = parameters, command, rounds.count, rounds.is_complete, refused, rounds.fault
-    return Calibrated(found, *outcome, _once(bag.losses), _once(bag.warnings))
+    return Calibrated(found, *outcome, *(list(dict.fromkeys(lines)) for lines in (bag.losses, bag.warnings)))
 
 
 class _Rounds:
@@ -216,28 +215,19 @@ class _Rounds:
         """A finding as plain values. Of a parameter that was corrected its value is what is left of it."""
         parameter, text = one.parameter, one.text
         if one.verdict == "nothing_to_correct" and parameter in self._corrected:
-            left = f"{amount(parameter, one.value, 3)}, sigma {amount(parameter, one.sigma)}"
-            text = f"{parameter}: corrected, {left} is left"
+            text = f"{parameter}: corrected, {parameter.with_sigma(one.value, one.sigma)} is left"
         numbers = {"value": one.value, "sigma": one.sigma, "verdict": one.verdict, "text": text}
         return {"source": parameter.source, "name": parameter.name, **numbers}
 
 
-def _once(lines: Iterable[str]) -> list[str]:
-    """Return lines without repetitions."""
-    return list(dict.fromkeys(lines))
-
-
 def _undriven(config: Config, words: Sequence[str], keyframes: int) -> Iterator[dict[str, Any]]:
     """Yield each parameter with what to drive, where there was nothing to fit."""
-    uses, groups = recorded_uses(config), {*words, *DEFAULT_GROUPS * (AUTO in words)}
-    for name, quantity in QUANTITIES.items():
-        if quantity.group not in groups or (name in ("roll", "pitch", "z") and config.world.dimensions == 2):
-            continue
-        use = "odometry" if name in OF_ODOMETRY else "landmarks"
-        for source in (one for one, used in uses.items() if used == use):
-            why = f"not determined (the robot stood: {keyframes} keyframe{'' if keyframes == 1 else 's'})"
-            text = f"{Parameter(source, name)}: {why}: {quantity.manoeuvre}"
-            yield {"source": source, "name": name, "verdict": "not_determined", "text": text}
+    uses, why = recorded_uses(config), f"the robot stood: {keyframes} keyframe{'' if keyframes == 1 else 's'}"
+    odometries, seen = ([name for name, use in uses.items() if use == of] for of in ("odometry", "landmarks"))
+    kinds = dict.fromkeys(seen, ("range and bearing",))
+    for one in parameters_of(odometries, kinds, words, dimensions=config.world.dimensions, has_scale=True):
+        text = f"{one}: not determined ({why}): {one.quantity.manoeuvre}"
+        yield {"source": one.source, "name": one.name, "verdict": "not_determined", "text": text}
 
 
 def _words(text: str, config: Config) -> list[str]:

@@ -12,11 +12,10 @@ from graph_slam_ros.config.config import Config
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.calibration.decision import Finding, of_association
-from graph_slam_ros.slam.calibration.model import MeasurementModel, Values
-from graph_slam_ros.slam.calibration.parameters import Parameter
+from graph_slam_ros.slam.calibration.model import MeasurementModel, factors_of
+from graph_slam_ros.slam.calibration.parameters import Parameter, Values
 from graph_slam_ros.slam.calibration.recalibration import Recalibration
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
-from graph_slam_ros.slam.landmarks.explanation import SCALES
 from graph_slam_ros.slam.landmarks.landmark_frontend import LandmarkFrontend
 from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.solver import Report, Settings
@@ -109,8 +108,7 @@ class FoundFactors:
         for rows, poses in origins:
             self._origins.move(rows, poses)
         self.history += changes
-        factors = [1.0 + next((v for p, v in values.items() if p.name == name), 0.0) for name in SCALES]
-        self._anonymous.rescale((factors[0], factors[1]))
+        self._anonymous.rescale(factors_of(values))
         backend.cancel_search()
         return report
 
@@ -120,17 +118,18 @@ class FoundFactors:
         """Return the corrected measurements of all edges, and the corrected origins of sightings."""
         changes, origins = [], []
         for odometry in model.odometry:
-            z = model.corrected_odometry(odometry, values)
-            changes.append(Recalibration(odometry.table.type.name, odometry.rows, _exact(z), odometry.roots))
+            z = _exact(model.measured(odometry, values))
+            changes.append(Recalibration(odometry.table.type.name, odometry.rows, z, odometry.roots))
         for seen in model.sightings:
             T_keyframe_base = model.scaled(tuple(seen.T_keyframe_base.T), values)
-            z = model.from_pose(seen, model.seen(seen, values), T_keyframe_base)
-            roots = model.roots(seen, values, T_keyframe_base)
-            changes.append(Recalibration(seen.table.type.name, seen.rows, _exact(z), _exact(roots)))
+            z = _exact(model.from_pose(seen, seen.seen, T_keyframe_base))
+            roots = _exact(model.roots_from_pose(seen, T_keyframe_base))
+            changes.append(Recalibration(seen.table.type.name, seen.rows, z, roots))
             places = self._origins.places(seen.table.id.values[seen.rows])
             known = places >= 0
             origins.append((places[known], _exact(np.stack(T_keyframe_base, axis=-1)[known])))
-        return [one for change in changes if (one := change.only_changed(self._backend.graph)) is not None], origins
+        changed = [change.only_changed(self._backend.graph) for change in changes]
+        return [one for one in changed if len(one.rows)], origins
 
 
 def _rounded(value: float) -> float:

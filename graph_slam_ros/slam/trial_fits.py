@@ -10,7 +10,7 @@ moves the estimate, and the sigmas of all parameters add to it (S. F. Schmidt, "
 navigation problems", Advances in Control Systems 3, 1966: parameters that are considered, not estimated).
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TypeVar
 
@@ -19,10 +19,9 @@ import numpy as np
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.slam.backend import Backend
-from graph_slam_ros.slam.calibration.choice import parameters_of
-from graph_slam_ros.slam.calibration.decision import Finding, amount, decide
+from graph_slam_ros.slam.calibration.decision import Finding, decide
 from graph_slam_ros.slam.calibration.fit import TrialFit
-from graph_slam_ros.slam.calibration.model import MeasurementModel
+from graph_slam_ros.slam.calibration.model import stated_sigma_per_m
 from graph_slam_ros.slam.calibration.parameters import AUTO, Parameter
 from graph_slam_ros.slam.calibration.places import fit_with_places
 from graph_slam_ros.slam.calibration.rows import TrialProblem
@@ -73,8 +72,7 @@ class TrialFits:
         self._jobs = list[tuple[int, Trial]]()  # each with the keyframe from which on its outcome counts
         self._fits: Fits | None = None
         self._contradicting: TrialFit | None = None
-        self._fits_so_far: Fits | None = None
-        self._so_far: list[Uncorrected] = []
+        self._so_far: tuple[Fits | None, list[Uncorrected]] = (None, [])  # what the newest outcome says
         self._whole: Trial | None = None  # before anything is condensed
         self._of_whole: list[Uncorrected] = []  # what it found
         self._of_edges = -1  # the map that the newest trial of everything was of
@@ -83,53 +81,34 @@ class TrialFits:
 
     def after_solve(self, keyframe: int, *, is_of_everything: bool) -> None:
         """Start a trial if it is due, as it is where all that was measured was solved."""
-        driven, is_due = keyframe + 1 - self._first_keyframe, is_of_everything
+        driven = keyframe + 1 - self._first_keyframe
         if driven == self._config.map.window_keyframes and self._config.condenses:  # later it is of a part
-            self._whole = self._guarded(lambda: self._executor(self._trial()))
+            self._whole = self._started()
         if self._whole is not None and driven >= self._config.map.window_keyframes + _DONE_IN:
             self._of_whole, self._whole = self._off(self._whole()), None
-        if self._backend.holds_back or not (is_due or driven >= self._due):
+        if self._backend.holds_back or not (is_of_everything or driven >= self._due):
             return
-        while not is_due and driven >= self._due:
+        while not is_of_everything and driven >= self._due:
             self._due *= 2
         counts_from = keyframe + (0 if is_of_everything else self._config.robust.apply_after_keyframes)
-        trial = self._guarded(lambda: self._executor(self._trial(is_thorough=is_of_everything)))
+        trial = self._started(is_thorough=is_of_everything)
         if trial is not None:
             if is_of_everything:
                 self._jobs, self._of_edges = [], self._graph.edge_count
             self._jobs = [*self._jobs[-1:], (counts_from, trial)]  # each holds a copy of the map
 
+    def _started(self, *, is_thorough: bool = True) -> Trial | None:
+        """A trial of the map as it is now, in the background if possible."""
+        return self._guarded(lambda: self._executor(self._trial(is_thorough=is_thorough)))
+
     def _trial(self, *, is_thorough: bool = True) -> Trial:
         problem = self._problem()
 
         def run() -> Fits | None:
-            priors = self._parameters(problem)
+            priors = self._priors(problem)
             return fit_with_places(problem, priors, LOG_ODDS, is_thorough=is_thorough) if priors else None
 
         return lambda: self._guarded(run)
-
-    def _problem(self) -> TrialProblem:
-        """A copy of the map as it is now."""
-        path, origins, factors = self._frontend.path, self._landmarks.origins, self._frontend.corrections.factors
-        problem = self._backend.trial_problem(self._config.space, path, origins, factors)
-        slips = self._kidnaps.slipped(path.keyframes)
-        return replace(problem, first_edge=self._first_free_edge, slips=slips)
-
-    def fit(self, groups: Sequence[str], *, places: bool, is_to_correct: bool) -> tuple[TrialFit, list[Finding]]:
-        """Fit the map as it is now, as of ``GraphSlam.trial_fit``."""
-        problem = self._problem()
-        wanted = self._parameters(problem, groups, has_gyro=is_to_correct)
-        found = fit_with_places(problem, wanted, LOG_ODDS, has_places=places)[0]
-        return found, self._judged(found, is_confirmed=is_to_correct and "factors" not in groups)
-
-    def _parameters(
-        self, problem: TrialProblem, groups: Sequence[str] = (AUTO,), *, has_gyro: bool = True
-    ) -> dict[Parameter, float]:
-        """The parameters of groups, as of ``parameters_of``, with the sigmas of their priors."""
-        wanted = parameters_of(problem, groups)
-        if has_gyro and self._config.gyro_input:  # odometry's turn is mostly that of the gyro
-            wanted = [one for one in wanted if one.name != "turn"]
-        return {one: one.quantity.prior for one in wanted}
 
     def _guarded(self, job: Callable[[], Outcome | None]) -> Outcome | None:
         try:
@@ -137,6 +116,27 @@ class TrialFits:
         except Exception as error:
             self._counters.count_failure("calibration", error)
             return None
+
+    def _problem(self) -> TrialProblem:
+        """A copy of the map as it is now."""
+        path, origins, factors = self._frontend.path, self._landmarks.origins, self._frontend.corrections.factors
+        problem = self._backend.trial_problem(self._config.space, path, origins, factors)
+        slips = self._kidnaps.slipped(path.keyframes)
+        return replace(problem, first_edge=max(problem.first_edge, self._first_edge), slips=slips)
+
+    def fit(self, groups: Sequence[str], *, places: bool, is_to_correct: bool) -> tuple[TrialFit, list[Finding]]:
+        """Fit the map as it is now, as of ``GraphSlam.trial_fit``."""
+        problem = self._problem()
+        wanted = self._priors(problem, groups, has_gyro=is_to_correct)
+        found = fit_with_places(problem, wanted, LOG_ODDS, has_places=places)[0]
+        return found, self._judged(found, is_confirmed=is_to_correct and "factors" not in groups)
+
+    def _priors(
+        self, problem: TrialProblem, groups: Sequence[str] = (AUTO,), *, has_gyro: bool = True
+    ) -> dict[Parameter, float]:
+        """The parameters of groups, with the sigmas of their priors. Odometry's turn is mostly that of a gyro."""
+        has_turn = not (has_gyro and self._config.gyro_input)
+        return {one: one.quantity.prior for one in problem.parameters(groups) if one.name != "turn" or has_turn}
 
     def _judged(self, found: TrialFit, *, is_confirmed: bool = True) -> list[Finding]:
         """The finding of each parameter; landmarks without identities, where most are, may confirm factors merely."""
@@ -152,13 +152,7 @@ class TrialFits:
 
     def _stated(self) -> float:
         """The stated noise of odometry's way for each metre."""
-        keyframes, edges = self._frontend.path.keyframes, range(self._first_free_edge, self._graph.edge_count)
-        of = self._config.space, self._graph, self._landmarks.origins, keyframes.ids, keyframes.stamps_ns, edges
-        return MeasurementModel(*of).sigma_per_m()
-
-    @property
-    def _first_free_edge(self) -> int:
-        return max(self._backend.first_free_edge, self._first_edge)
+        return stated_sigma_per_m(self._config.space, self._graph, max(self._backend.first_free_edge, self._first_edge))
 
     # -- what they find ----------------------------------------------------------------------------------------------
 
@@ -190,7 +184,7 @@ class TrialFits:
         doubted = self._fits[0].doubted
         values = zip(found.parameters, found.values.tolist(), found.sigmas.tolist(), strict=True)
         return [
-            f"{one} {amount(one, value, 3)} (sigma {amount(one, sigma)})"
+            f"{one} {one.shown(value, 3)} (sigma {one.shown(sigma)})"
             for one, value, sigma in values
             if one not in doubted
         ]
@@ -211,9 +205,9 @@ class TrialFits:
         """Return what was wrong in the map at the newest trial."""
         if self._solver.is_current:
             self._compute()
-            if self._fits is not self._fits_so_far:
-                self._fits_so_far, self._so_far = self._fits, self._with_whole(self._off(self._fits))
-        return self._so_far
+            if self._fits is not self._so_far[0]:
+                self._so_far = self._fits, self._with_whole(self._off(self._fits))
+        return self._so_far[1]
 
     def _compute(self) -> None:
         """Compute the newest trial whose outcome counts."""
@@ -234,5 +228,5 @@ class TrialFits:
             return []
         keyframes, total = self._frontend.path.keyframes.ids, self._frontend.corrections.total
         vertices = sampled(keyframes[np.isin(keyframes, self._solver.vertices)], _MOST_POSES)
-        covariances: Mapping[int, Array] = dict(zip(vertices.tolist(), self._solver.marginal(vertices), strict=True))
+        covariances = dict(zip(vertices.tolist(), self._solver.marginal(vertices), strict=True))
         return uncorrected(fits[0], self._judged(fits[0]), covariances, lambda *key: total(key), self._stated())

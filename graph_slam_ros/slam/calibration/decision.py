@@ -59,6 +59,12 @@ class Finding:
     verdict: Verdict
     text: str
 
+    @classmethod
+    def of(cls, parameter: Parameter, value: float, sigma: float, verdict: Verdict, text: str) -> "Finding":
+        """Make a finding; ``{}`` in its text is the value with its sigma."""
+        shown = text.replace("{}", parameter.with_sigma(value, sigma))
+        return cls(parameter, value, sigma, verdict, f"{parameter}: {shown}")
+
     @property
     def is_determined(self) -> bool:
         """Return whether the drive determines the parameter."""
@@ -83,13 +89,16 @@ def decide(
     by_association : odometry's factors less 1 with sigmas, as far as the association of landmarks without identities
         found them; None where landmarks have identities
     """
-    void, moves = _void(found, landmarks, sigma_per_m), math.isfinite(sigma_per_m)
-    return [
-        _unsure(one, *found.doubted[one])
-        if one in found.doubted and not void
-        else _finding(found, k, void or _stands(one, moves), _slides(one, slides) or _unnamed(found, by_association, k))
-        for k, one in enumerate(found.parameters)
-    ]
+    void, out = _void(found, landmarks, sigma_per_m), []
+    for k, one in enumerate(found.parameters):
+        if one in found.doubted and not void:
+            value, sigma, why = found.doubted[one]
+            out.append(Finding.of(one, value, sigma, "not_separable", f"not sure ({{}}): {why}"))
+            continue
+        stands = _stands(one) if math.isinf(sigma_per_m) else ""
+        verdict, text = _verdict(found, k, void or stands, _slides(one, slides) or _unnamed(found, by_association, k))
+        out.append(Finding.of(one, float(found.values[k]), float(found.sigmas[k]), verdict, text))
+    return out
 
 
 def is_certain(found: TrialFit, parameter: Parameter) -> bool:
@@ -106,21 +115,13 @@ def of_association(parameter: Parameter, value: float, sigma: float, is_correcte
     The first two questions are asked. The others its search has answered: it compares whole explanations, each with
     the clocks and factors that fit it best.
     """
-    quantity = parameter.quantity
-    shown = f"{amount(parameter, value, 3)}, sigma {amount(parameter, sigma)}"
-    least = FOLLOWED * sigma if is_corrected else max(SIGMAS * sigma, quantity.least)
-    verdict: Verdict = "admitted"
-    if sigma >= quantity.determined_below and not is_corrected:
-        verdict, shown = "not_determined", f"not determined ({shown}): {quantity.manoeuvre}"
-    elif abs(value) < least:
-        verdict, shown = "nothing_to_correct", f"nothing to correct ({shown})"
-    return Finding(parameter, value, sigma, verdict, f"{parameter}: {shown}")
-
-
-def amount(parameter: Parameter, value: float, digits: int = 2) -> str:
-    """A value of a parameter in its unit, as text."""
-    quantity = parameter.quantity
-    return f"{value * quantity.shown:.{digits}g}{' ' * bool(quantity.unit)}{quantity.unit}"
+    least = FOLLOWED * sigma if is_corrected else max(SIGMAS * sigma, parameter.quantity.least)
+    if sigma >= parameter.quantity.determined_below and not is_corrected:
+        why = f"not determined ({{}}): {parameter.quantity.manoeuvre}"
+        return Finding.of(parameter, value, sigma, "not_determined", why)
+    if abs(value) < least:
+        return Finding.of(parameter, value, sigma, "nothing_to_correct", "nothing to correct ({})")
+    return Finding.of(parameter, value, sigma, "admitted", "{}")
 
 
 def _void(found: TrialFit, landmarks: int, sigma_per_m: float) -> str:
@@ -150,54 +151,42 @@ def absurd_range(found: TrialFit) -> int | None:
 
 def absurd_text(found: TrialFit, k: int) -> str:
     """Say how far off a parameter would be."""
-    one, value = found.parameters[k], float(found.values[k])
+    one = found.parameters[k]
     most = PRIOR_SIGMAS * max(float(found.priors[k]), one.quantity.prior)
-    return f"{one} would be off by {amount(one, value, 3)}, more than {amount(one, most)}"
-
-
-def _finding(found: TrialFit, k: int, void: str, slides: str) -> Finding:
-    parameter, value, sigma = found.parameters[k], float(found.values[k]), float(found.sigmas[k])
-    verdict, why = _verdict(found, k, void, slides)
-    return Finding(parameter, value, sigma, verdict, f"{parameter}: {why}")
-
-
-def _unsure(parameter: Parameter, value: float, sigma: float, why: str) -> Finding:
-    shown = f"{amount(parameter, value, 3)}, sigma {amount(parameter, sigma)}"
-    return Finding(parameter, value, sigma, "not_separable", f"{parameter}: not sure ({shown}): {why}")
+    return f"{one} would be off by {one.shown(float(found.values[k]), 3)}, more than {one.shown(most)}"
 
 
 def _verdict(found: TrialFit, k: int, void: str, slides: str) -> tuple[Verdict, str]:
     parameter, value, sigma = found.parameters[k], float(found.values[k]), float(found.sigmas[k])
     quantity, (correlation, other) = parameter.quantity, found.worst_correlation(k)
-    is_unseen = void.endswith(" are needed")
-    shown = f"{amount(parameter, value, 3)}, sigma {amount(parameter, sigma)}"
     if void:
+        is_unseen = void.endswith(" are needed")
         return "refused", f"not determined: {void}{f': {quantity.manoeuvre}' if is_unseen else ''}"
     if sigma >= quantity.determined_below:
-        needs = f"sigma {amount(parameter, sigma)}, needs {amount(parameter, quantity.determined_below)}"
+        needs = f"sigma {parameter.shown(sigma)}, needs {parameter.shown(quantity.determined_below)}"
         return "not_determined", f"not determined ({needs}): {quantity.manoeuvre}"
-    if abs(value) < max(SIGMAS * sigma, quantity.least):
-        why = f": within {SIGMAS:.0f} sigmas of zero" if abs(value) >= quantity.least else ""
-        return "nothing_to_correct", f"{'not corrected' if why else 'nothing to correct'} ({shown}){why}"
+    if abs(value) < quantity.least:
+        return "nothing_to_correct", "nothing to correct ({})"
+    if abs(value) < SIGMAS * sigma:
+        return "nothing_to_correct", f"not corrected ({{}}): within {SIGMAS:.0f} sigmas of zero"
     if slides:
-        return "refused", f"not used ({shown}): {slides}"
+        return "refused", f"not used ({{}}): {slides}"
     if correlation > MOST_CORRELATED:
         return "not_separable", f"not separable from {other} (correlation {correlation:.2f}): {quantity.manoeuvre}"
     if abs(value) > PRIOR_SIGMAS * found.priors[k]:
-        most = amount(parameter, PRIOR_SIGMAS * float(found.priors[k]))
-        return "refused", f"not used ({shown}): larger than {most}: correct the configuration first"
+        most = parameter.shown(PRIOR_SIGMAS * float(found.priors[k]))
+        return "refused", f"not used ({{}}): larger than {most}: correct the configuration first"
     halves = float(found.first[k]), float(found.second[k])
     if not _agree(*halves):
-        first, second = (amount(parameter, half, 3) for half in halves)
-        return "not_reproducible", f"not used ({shown}): {first} in one half of the drive, {second} in the other"
-    return "admitted", shown
+        first, second = (parameter.shown(half, 3) for half in halves)
+        return "not_reproducible", f"not used ({{}}): {first} in one half of the drive, {second} in the other"
+    return "admitted", "{}"
 
 
-def _stands(parameter: Parameter, moves: bool) -> str:
+def _stands(parameter: Parameter) -> str:
     """Return why an angle is not measured where odometry only turns; empty if it is."""
-    if moves or parameter.name not in _OF_MOTION:
-        return ""
-    return f"odometry does not move: {parameter.quantity.manoeuvre}"
+    is_of_motion = parameter.name in _OF_MOTION
+    return f"odometry does not move: {parameter.quantity.manoeuvre}" if is_of_motion else ""
 
 
 def _slides(parameter: Parameter, slides: tuple[float, float]) -> str:
@@ -224,7 +213,7 @@ def _unnamed(found: TrialFit, by_association: Mapping[str, tuple[float, float]] 
     value, sigma = by_association[parameter.name]
     if abs(value - float(found.values[k])) <= AGREEING_SIGMAS * math.hypot(sigma, float(found.sigmas[k])):
         return ""
-    has = f"{amount(parameter, value, 3)}, sigma {amount(parameter, sigma)}"
+    has = parameter.with_sigma(value, sigma)
     return f"the association of landmarks without ids, which leaves it open, has {has}. {remedy}"
 
 

@@ -17,7 +17,7 @@ from scipy import sparse
 from scipy.sparse.linalg import SuperLU, splu
 
 from graph_slam_ros.errors import SingularError
-from graph_slam_ros.graph import Graph, VertexKind
+from graph_slam_ros.graph import VertexKind
 from graph_slam_ros.slam.calibration.parameters import Parameter
 from graph_slam_ros.slam.calibration.rows import Linearization, Rows, TrialProblem
 from graph_slam_ros.typing import Array, Index
@@ -70,16 +70,14 @@ class TrialFit:
     def adds(self, vertex: int, dof: int) -> Array:
         """The covariance (dof, dof) that wrong parameters add to a vertex whose marginal takes them for known.
 
-        The error is how far the fit moves the vertex.
+        The error is how far the fit moves the vertex. A vertex that the fit did not have gets none.
         """
-        steps, bias = self._of(self.sensitivity, vertex, dof), self._of(self.shift, vertex, dof)
+        at = int(self.column[vertex]) if vertex < len(self.column) else -1
+        if at < 0:
+            return np.zeros((dof, dof))
+        steps, bias = self.sensitivity[at : at + dof], self.shift[at : at + dof]
         spread = steps @ (self.correlation * np.outer(self.sigmas, self.sigmas)) @ steps.T
         return np.asarray(spread + np.outer(bias, bias))
-
-    def _of(self, rows: Array, vertex: int, dof: int) -> Array:
-        """The rows of a vertex; 0 for one that the fit did not have."""
-        at = int(self.column[vertex]) if vertex < len(self.column) else -1
-        return rows[at : at + dof] if at >= 0 else np.zeros((dof, *rows.shape[1:]))
 
     @property
     def sigmas(self) -> Array:
@@ -109,14 +107,6 @@ class TrialFit:
         return float(row[other]), self.parameters[other] if row[other] > 0.0 else None
 
 
-def fit(problem: TrialProblem, priors: Mapping[Parameter, float], start: TrialFit | None = None) -> TrialFit:
-    """Fit parameters, with sigmas of their priors, and all unknowns, from the estimate or the outcome of another fit.
-
-    Raises SingularError if the edges do not determine the estimate.
-    """
-    return _Fit(problem, priors).run(start)
-
-
 def likelier_fit(
     problem: TrialProblem, priors: Mapping[Parameter, float], log_odds: float, start: TrialFit | None = None
 ) -> TrialFit:
@@ -131,12 +121,20 @@ def likelier_fit(
     return replace(without, slips=False) if without.evidence > found.evidence + log_odds * len(problem.slips) else found
 
 
+def fit(problem: TrialProblem, priors: Mapping[Parameter, float], start: TrialFit | None = None) -> TrialFit:
+    """Fit parameters, with sigmas of their priors, and all unknowns, from the estimate or the outcome of another fit.
+
+    The problem stays as it is. Raises SingularError if the edges do not determine the estimate.
+    """
+    return _Fit(problem, priors).run(start)
+
+
 class _Fit:
     def __init__(self, problem: TrialProblem, priors: Mapping[Parameter, float]) -> None:
-        self._p, self._parameters = problem, tuple(priors)
-        self._priors = np.array(list(priors.values()))
+        self._p = replace(problem, graph=problem.graph.copy())
+        self._parameters, self._priors = tuple(priors), np.array(list(priors.values()))
         self._free = np.setdiff1d(problem.vertices, problem.held)
-        self._linear = Linearization(problem, self._parameters, self._free)
+        self._linear = Linearization(self._p, self._parameters, self._free)
 
     def run(self, start: TrialFit | None) -> TrialFit:
         """Iterate until the parameters converge."""
@@ -165,26 +163,27 @@ class _Fit:
 
     def _stride(self, move: Array, step: Array) -> float:
         """The fraction of a step within the range of the linearisation."""
-        graph, lengths = self._p.graph, self._p.space.dimensions
-        largest = float(np.abs(step).max(initial=0.0)) / _STRIDE
-        for kind, _, steps in self._steps(graph, move):
+        lengths, largest = self._p.space.dimensions, float(np.abs(step).max(initial=0.0)) / _STRIDE
+        for kind, _, rows in self._unknowns():
+            steps = move[rows]
             turned = steps[:, lengths:] if kind is self._p.space.pose else steps[:, :0]
             largest = max(largest, float(np.abs(turned).max(initial=0.0)) / _STRIDE_RAD)
             largest = max(largest, float(np.abs(steps[:, :lengths]).max(initial=0.0)) / _STRIDE_M)
         return min(1.0, 1.0 / largest) if largest > 0.0 else 1.0
 
     def _moved(self, x: Array, move: Array) -> Array:
-        out, graph = x.copy(), self._p.graph
-        for kind, vertices, steps in self._steps(graph, move):
-            at = graph.offset.values[vertices][:, None] + np.arange(kind.size)
-            out[at] = kind.retract(x[at], steps)
+        out = x.copy()
+        for kind, at, rows in self._unknowns():
+            out[at] = kind.retract(x[at], move[rows])
         return out
 
-    def _steps(self, graph: Graph, move: Array) -> "Iterator[tuple[VertexKind, Index, Array]]":
-        """The unknowns of each kind, and their steps (n, dof)."""
+    def _unknowns(self) -> Iterator[tuple[VertexKind, Index, Index]]:
+        """Each kind, and of its unknowns the stored numbers (n, size) and the rows of their steps (n, dof)."""
+        graph, column = self._p.graph, self._linear.column
         for code, kind in enumerate(graph.kinds):
             vertices = self._free[graph.kind.values[self._free] == code]
-            yield kind, vertices, move[self._linear.column[vertices][:, None] + np.arange(kind.dof)]
+            at = graph.offset.values[vertices][:, None] + np.arange(kind.size)
+            yield kind, at, column[vertices][:, None] + np.arange(kind.dof)
 
     # -- what it says ----------------------------------------------------------------------------------------------
 
@@ -194,22 +193,24 @@ class _Fit:
         information = self._information(rest)
         covariance = np.asarray(np.linalg.inv(information))
         scores = rest * rows.residual[:, None]
-        robust = np.asarray(covariance @ self._meat(scores, rows) @ covariance)
-        first, second = self._halves(rest, scores, theta, rows.stamp_ns)
-        sightings = rows.landmark >= 0
-        lost = float(np.mean(rows.weight[sightings] < _LOST)) if sightings.any() else 0.0
-        found = self._parameters, theta, self._priors, covariance, robust, first, second, lost, x
+        sightings, shift = rows.landmark >= 0, np.zeros(self._linear.unknowns)
+        for kind, at, own in self._unknowns():
+            shift[own] = kind.local(self._p.values[at], x[at])
         curvature = float(np.log(np.abs(factor.U.diagonal())).sum() + np.linalg.slogdet(information)[1])
-        evidence = -0.5 * (float(np.sum(rows.cost) + np.sum((theta / self._priors) ** 2)) + curvature)
-        return TrialFit(*found, -border, self._way(x), self._linear.column, evidence)
-
-    def _way(self, x: Array) -> Array:
-        """Steps (unknowns,) of all unknowns from where the fit began."""
-        out, graph = np.zeros(self._linear.unknowns), self._p.graph
-        for kind, vertices, _ in self._steps(graph, out):
-            at = graph.offset.values[vertices][:, None] + np.arange(kind.size)
-            out[self._linear.column[vertices][:, None] + np.arange(kind.dof)] = kind.local(self._p.values[at], x[at])
-        return out
+        return TrialFit(
+            self._parameters,
+            theta,
+            self._priors,
+            covariance,
+            np.asarray(covariance @ self._meat(scores, rows) @ covariance),
+            *self._halves(rest, scores, theta, rows.stamp_ns),
+            float(np.mean(rows.weight[sightings] < _LOST)) if sightings.any() else 0.0,
+            x,
+            -border,
+            shift,
+            self._linear.column,
+            -0.5 * (float(np.sum(rows.cost) + np.sum((theta / self._priors) ** 2)) + curvature),
+        )
 
     def _meat(self, scores: Array, rows: Rows) -> Array:
         """The scatter of scores, grouped by landmark or by half a minute, whichever is larger relative to them."""

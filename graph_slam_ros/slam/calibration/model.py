@@ -11,7 +11,7 @@ error models", 1987, section 1.1: attenuation). With ``is_noise_measured`` noise
 The noise of a range is always that of what was measured.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,11 +21,10 @@ from graph_slam_ros.graph import Graph
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.graph.tables import EdgeTable
 from graph_slam_ros.lie import so3
-from graph_slam_ros.slam.calibration.parameters import BEND, OF_ODOMETRY, Parameter
+from graph_slam_ros.slam.calibration.parameters import BEND, OF_ODOMETRY, Values
 from graph_slam_ros.slam.frontend.sighting_edges import SightingEdges
 from graph_slam_ros.typing import Array, Index, Numbers
 
-Values = Mapping[Parameter, float]
 _POINTS = ("landmark position", "tag position")
 
 _BEND_RAD = 0.1
@@ -74,7 +73,27 @@ class Sightings:
     @property
     def kind(self) -> str:
         """The name of the edge type, without the number of dimensions."""
-        return self.table.type.name.removesuffix(" 3D")
+        return kind_of(self.table)
+
+
+Edges = OdometryEdges | Sightings
+
+
+def kind_of(table: EdgeTable) -> str:
+    """The name of a table's edge type, without the number of dimensions."""
+    return table.type.name.removesuffix(" 3D")
+
+
+def groups_of(graph: Graph, edges: range) -> Iterator[tuple[EdgeTable, str, str, Index]]:
+    """Yield table, class, input and rows of the edges that parameters may affect."""
+    labels = {"odometry", "landmarks"} & set(graph.labels)
+    for table in graph.tables.values():
+        here = (table.id.values >= edges.start) & (table.id.values < edges.stop)
+        for label in sorted(labels):
+            of_label = here & (table.label.values == graph.labels.index(label))
+            origins = np.unique(table.source.values[of_label]).tolist()
+            for origin in sorted(origins, key=lambda one: graph.sources[one]):
+                yield table, label, graph.sources[origin], np.flatnonzero(of_label & (table.source.values == origin))
 
 
 class MeasurementModel:
@@ -99,20 +118,19 @@ class MeasurementModel:
         *,
         is_noise_measured: bool = False,
     ) -> None:
-        self._space, self.is_noise_measured = space, is_noise_measured
+        self._space, self._is_noise_measured = space, is_noise_measured
         stamp_of = np.zeros(graph.vertex_count, dtype=np.int64)
         stamp_of[keyframes] = stamps_ns
         self.odometry: list[OdometryEdges] = []
         self.sightings: list[Sightings] = []
-        for table in graph.tables.values():
-            for label, source, rows in _rows(graph, table, edges):
-                ends = table.vertices.values[rows]
-                if label == "odometry":
-                    seconds = (stamp_of[ends[:, 1]] - stamp_of[ends[:, 0]]) * 1e-9
-                    measured, roots = table.measured.values[rows].copy(), table.sqrt_information.values[rows].copy()
-                    self.odometry.append(OdometryEdges(table, rows, source, measured, roots, seconds))
-                else:
-                    self.sightings.append(self._sightings(table, rows, source, origins, stamp_of[ends[:, 0]]))
+        for table, label, source, rows in groups_of(graph, edges):
+            stamps = stamp_of[table.vertices.values[rows]]
+            if label == "odometry":
+                measured, roots = table.measured.values[rows].copy(), table.sqrt_information.values[rows].copy()
+                seconds = (stamps[:, 1] - stamps[:, 0]) * 1e-9
+                self.odometry.append(OdometryEdges(table, rows, source, measured, roots, seconds))
+            else:
+                self.sightings.append(self._sightings(table, rows, source, origins, stamps[:, 0]))
 
     def _sightings(
         self, table: EdgeTable, rows: Index, source: str, origins: SightingEdges, stamps_ns: Index
@@ -133,40 +151,37 @@ class MeasurementModel:
             found.sensor[:] = found.seen[:, tail : tail + n]
         return found
 
-    def sigma_per_m(self) -> float:
-        """The stated noise of odometry's way for each metre, in the middle of all steps; infinite where it stands."""
-        n, found = self._space.dimensions, [np.empty(0)]
-        for edges in self.odometry:
-            roots = edges.table.sqrt_information.values[edges.rows]
-            covariance = np.linalg.inv(np.swapaxes(roots, 1, 2) @ roots)[:, :n, :n]
-            way_m = np.linalg.norm(edges.measured[:, :n], axis=1)
-            along = edges.measured[:, :n] / np.maximum(way_m, _MOVED_M)[:, None]
-            variance = np.einsum("ni,nij,nj->n", along, covariance, along)
-            is_moving = way_m > _MOVED_M
-            found.append(np.sqrt(np.maximum(variance[is_moving], 0.0)) / way_m[is_moving])
-        every = np.concatenate(found)
-        return float(np.median(every)) if len(every) else float("inf")
-
-    def corrected_odometry(self, edges: OdometryEdges, values: Values) -> Array:
-        """Measurements (n, size) of odometry with other factors."""
+    def measured(self, edges: Edges, values: Values) -> Array:
+        """Measurements (n, p): motions by odometry with other factors, or from the base at the stamp by a sensor."""
+        if isinstance(edges, Sightings):
+            return self._seen(edges, values)
         out = self.scaled(tuple(edges.measured.T), values)
-        bias = _of(values, edges.source, ("turn_bias",)).get("turn_bias", 0.0)
-        if bias:
+        if bias := _of(values, edges.source).get("turn_bias", 0.0):
             group = self._space.group
             tangent = list(group.log(out))
             tangent[-1] = tangent[-1] + bias * edges.seconds
             out = group.exp(tuple(tangent))
         return np.stack(out, axis=-1)
 
-    def odometry_roots(self, edges: OdometryEdges, values: Values) -> Array:
-        """Square roots (n, m, m) of the information of odometry with other factors."""
-        return edges.roots / self._factors(values) if self.is_noise_measured else edges.roots
+    def roots(self, edges: Edges, values: Values) -> Array:
+        """Square roots (n, m, m) of their information; of a turned sensor in the axes of the base."""
+        if isinstance(edges, OdometryEdges):
+            return edges.roots / self._factors(values) if self._is_noise_measured else edges.roots
+        named = _of(values, edges.source)
+        if edges.kind in _POINTS:
+            turn, _ = self._mount(named)
+            return edges.roots @ self._turns(tuple(np.atleast_1d(x) for x in turn)).swapaxes(1, 2)
+        if edges.kind.startswith("range") and (factor := 1.0 + named.get("range_factor", 0.0)) != 1.0:
+            out = edges.roots.copy()
+            out[:, :, 0] /= factor
+            return out
+        return edges.roots
 
     def scaled(self, pose: Numbers, values: Values) -> Numbers:
         """A motion by odometry with other factors; that for bends counts by half in a step of ``_BEND_RAD``."""
         group, n = self._space.group, self._space.dimensions
         tangent = [f * x for f, x in zip(self._factors(values), group.log(pose), strict=True)]
-        if bend := _of(values, None, (BEND,)).get(BEND, 0.0):
+        if bend := of_odometry(values).get(BEND, 0.0):
             turned = abs(tangent[-1])
             tangent[:n] = [x * (1.0 + bend * turned / (turned + _BEND_RAD)) for x in tangent[:n]]
         out: Numbers = group.exp(tuple(tangent))
@@ -174,12 +189,11 @@ class MeasurementModel:
 
     def _factors(self, values: Values) -> Array:
         """The factor (dof,) of each component of a motion."""
-        named, n = _of(values, None, OF_ODOMETRY), self._space.dimensions
-        distance, turn = (1.0 + named.get(name, 0.0) for name in ("distance", "turn"))
+        n = self._space.dimensions
+        distance, turn = factors_of(values)
         return np.array([distance] * n + [turn] * (self._space.dof - n))
 
-    def seen(self, edges: Sightings, values: Values) -> Array:
-        """Measurements (n, p) from the base at the stamp, by a sensor with a corrected position."""
+    def _seen(self, edges: Sightings, values: Values) -> Array:
         named, z, n = _of(values, edges.source), edges.seen.copy(), self._space.dimensions
         turn, shift = self._mount(named)
         sensor = tuple(edges.sensor.T)
@@ -194,24 +208,8 @@ class MeasurementModel:
         turned = self._space.group.compose(turn, around)
         z[:, tail:] = np.stack((*(turned[k] + sensor[k] + shift[k] for k in range(n)), *turned[n:]), axis=-1)
         if edges.kind.startswith("range"):
-            z[:, 0] = _range_factor(values, edges.source) * z[:, 0] + named.get("range_offset", 0.0)
+            z[:, 0] = (1.0 + named.get("range_factor", 0.0)) * z[:, 0] + named.get("range_offset", 0.0)
         return z
-
-    def roots(self, edges: Sightings, values: Values, T_a_b: Numbers | None = None) -> Array:
-        """Square roots (n, m, m) of their information for a turned sensor, in the axes of the base or of a keyframe."""
-        if edges.kind not in _POINTS:
-            return edges.roots
-        turn, _ = self._mount(_of(values, edges.source))
-        out = edges.roots @ self._turns(tuple(np.atleast_1d(x) for x in turn)).swapaxes(1, 2)
-        return out if T_a_b is None else out @ self._turns(T_a_b).swapaxes(1, 2)
-
-    def fitted_roots(self, edges: Sightings, values: Values) -> Array:
-        """The same where the factor of ranges is fitted: the noise is of what was measured, and grows with it."""
-        out = self.roots(edges, values)
-        if edges.kind.startswith("range") and (factor := _range_factor(values, edges.source)) != 1.0:
-            out = out.copy()
-            out[:, :, 0] /= factor
-        return out
 
     def _turns(self, poses: Any) -> Array:
         """Rotation matrices (n, d, d) of poses that are arrays."""
@@ -238,28 +236,38 @@ class MeasurementModel:
             out[:, tail:] = np.stack(group.compose(T_a_b, tuple(z[:, tail:].T)), axis=-1)
         return out
 
-
-def _range_factor(values: Values, source: str) -> float:
-    return 1.0 + _of(values, source).get("range_factor", 0.0)
-
-
-def clock_of(values: Values, source: str) -> float:
-    """The correction of an input's clock [s]."""
-    return _of(values, source).get("clock", 0.0)
+    def roots_from_pose(self, edges: Sightings, T_a_b: Numbers) -> Array:
+        """Square roots (n, m, m) of the information of what was seen from pose b, in the axes of pose a."""
+        return edges.roots @ self._turns(T_a_b).swapaxes(1, 2) if edges.kind in _POINTS else edges.roots
 
 
-def _of(values: Values, source: str | None, names: tuple[str, ...] = ()) -> dict[str, float]:
-    """Corrections of an input by name, or of names whatever the input."""
-    chosen = (p for p in values if (source is None or p.source == source) and (not names or p.name in names))
-    return {p.name: values[p] for p in chosen}
+def stated_sigma_per_m(space: Geometry, graph: Graph, first_edge: int) -> float:
+    """The stated noise of odometry's way for each metre, in the middle of all steps; infinite where it stands."""
+    n, found = space.dimensions, [np.empty(0)]
+    for table, label, _, rows in groups_of(graph, range(first_edge, graph.edge_count)):
+        if label == "odometry":
+            roots, measured = table.sqrt_information.values[rows], table.measured.values[rows, :n]
+            covariance = np.linalg.inv(np.swapaxes(roots, 1, 2) @ roots)[:, :n, :n]
+            way_m = np.linalg.norm(measured, axis=1)
+            along = measured / np.maximum(way_m, _MOVED_M)[:, None]
+            variance = np.einsum("ni,nij,nj->n", along, covariance, along)
+            is_moving = way_m > _MOVED_M
+            found.append(np.sqrt(np.maximum(variance[is_moving], 0.0)) / way_m[is_moving])
+    every = np.concatenate(found)
+    return float(np.median(every)) if len(every) else float("inf")
 
 
-def _rows(graph: Graph, table: EdgeTable, edges: range) -> "list[tuple[str, str, Index]]":
-    """Class, input and rows of the edges of a table that parameters may affect."""
-    ids, out = table.id.values, []
-    here = (ids >= edges.start) & (ids < edges.stop)
-    for label in {"odometry", "landmarks"} & set(graph.labels):
-        of_label = here & (table.label.values == graph.labels.index(label))
-        for origin in np.unique(table.source.values[of_label]).tolist():
-            out.append((label, graph.sources[origin], np.flatnonzero(of_label & (table.source.values == origin))))
-    return sorted(out, key=lambda one: one[:2])
+def factors_of(values: Values) -> tuple[float, float]:
+    """The factors of odometry's distance and turn."""
+    named = of_odometry(values)
+    return 1.0 + named.get("distance", 0.0), 1.0 + named.get("turn", 0.0)
+
+
+def of_odometry(values: Values) -> dict[str, float]:
+    """Corrections of odometry by name, whatever its input."""
+    return {p.name: value for p, value in values.items() if p.name in OF_ODOMETRY}
+
+
+def _of(values: Values, source: str) -> dict[str, float]:
+    """Corrections of an input by name."""
+    return {p.name: value for p, value in values.items() if p.source == source}

@@ -5,7 +5,6 @@ robot that stands and goes is nowhere near half-way when half of the time is ove
 """
 
 from collections.abc import Sequence
-from copy import copy
 from dataclasses import dataclass
 from typing import Any
 
@@ -37,18 +36,22 @@ class Between:
 
 
 class EstimatedPath:
-    """Keyframes with stamps (n,) and poses (n, size), and odometry between two of them in a segment."""
+    """Keyframes with stamps (n,), of segments between which odometry does not lead, and odometry between two of them.
 
-    def __init__(
-        self, space: Geometry, stamps_ns: Index, poses: Array, segments: Sequence[int], track: OdometryTrack
-    ) -> None:
+    Attributes
+    ----------
+    poses, factors : (n, size) of the keyframes, and odometry's factors of distance and turn; to be set
+    """
+
+    def __init__(self, space: Geometry, stamps_ns: Index, segments: Sequence[int], track: OdometryTrack) -> None:
         backwards = np.flatnonzero(np.diff(stamps_ns) <= 0)
         # Stamps began anew: before, nothing is known by its own.
         first = self._first = int(backwards[-1]) + 1 if len(backwards) else 0
-        self._space, self._poses, self._track = space, poses[first:], track
+        self._space, self._track = space, track
+        self.poses, self.factors = track.keyframes, (track.distance, track.turn)
         self._origin_ns = int(stamps_ns[first])
         self._own_s = (stamps_ns[first:] - self._origin_ns) * 1e-9
-        self._sample_s, self._samples = self._with_samples(track)
+        self._sample_s, self._samples = self._with_samples()
         before, after = tuple(self._samples[:-1].T), tuple(self._samples[1:].T)
         self._steps = np.stack(space.group.local(after, before), axis=-1)  # from each sample to the next
         stands = (np.diff(self._samples, axis=0) == 0.0).all(axis=1)
@@ -57,19 +60,13 @@ class EstimatedPath:
         joints = [k - first for k in segments if first < k < len(stamps_ns)]
         self._gaps = [*gaps, *((self._own_s[k - 1], self._own_s[k]) for k in joints)]
 
-    def moved(self, poses: Array, track: OdometryTrack) -> "EstimatedPath":
-        """The same keyframes at other poses (n, size), with the same odometry corrected by other factors."""
-        out = copy(self)
-        out._poses, out._track = poses[self._first :], track
-        return out
-
-    def _with_samples(self, track: OdometryTrack) -> tuple[Array, Array]:
+    def _with_samples(self) -> tuple[Array, Array]:
         """Seconds and poses of odometry at the keyframes and between them."""
-        since_s = (track.stamps_ns - self._origin_ns) * 1e-9
+        since_s = (self._track.stamps_ns - self._origin_ns) * 1e-9
         inside = (since_s > self._own_s[0]) & (since_s < self._own_s[-1]) & ~np.isin(since_s, self._own_s)
         seconds = np.concatenate((self._own_s, since_s[inside]))
         order = np.argsort(seconds, kind="stable")
-        return seconds[order], np.concatenate((track.keyframes[self._first :], track.poses[inside]))[order]
+        return seconds[order], np.concatenate((self._track.keyframes[self._first :], self._track.poses[inside]))[order]
 
     def knows(self, stamps_ns: Index, most_s: float) -> Mask:
         """Return whether (n,) the path is known around each stamp, up to a number of seconds away."""
@@ -85,20 +82,18 @@ class EstimatedPath:
         k, fraction = _interval(self._own_s, since_s)
         s, part = _interval(self._sample_s, since_s)
         step = group.exp(tuple(part * one for one in self._steps[s].T))
-        odom = group.compose(tuple(self._samples[s].T), step)
-        start, end = (tuple(self._track.keyframes[self._first + at].T) for at in (k, k + 1))
+        odom, k = group.compose(tuple(self._samples[s].T), step), k + self._first
+        start, end = (tuple(self._track.keyframes[at].T) for at in (k, k + 1))
         moved, whole = (self._corrected(group.between(start, one)) for one in (odom, end))
-        a, b = tuple(self._poses[k].T), tuple(self._poses[k + 1].T)
+        a, b = tuple(self.poses[k].T), tuple(self.poses[k + 1].T)
         rest = tuple(fraction * one for one in group.local(b, group.compose(a, whole)))
-        poses = group.compose(group.compose(a, moved), group.exp(rest))
-        return Between(k + self._first, fraction, np.stack(poses, axis=-1))
+        return Between(k, fraction, np.stack(group.compose(group.compose(a, moved), group.exp(rest)), axis=-1))
 
     def _corrected(self, motion: Numbers) -> Numbers:
-        n, factors = self._space.dimensions, (self._track.distance, self._track.turn)
-        if factors == (1.0, 1.0):
+        if self.factors == (1.0, 1.0):
             return motion
-        tangent = self._space.group.log(motion)
-        out: Numbers = self._space.group.exp(tuple(x * factors[k >= n] for k, x in enumerate(tangent)))
+        n, tangent = self._space.dimensions, self._space.group.log(motion)
+        out: Numbers = self._space.group.exp(tuple(x * self.factors[k >= n] for k, x in enumerate(tangent)))
         return out
 
     def velocity(self, stamps_ns: Index, after_s: float) -> Array:

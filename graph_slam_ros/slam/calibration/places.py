@@ -17,8 +17,7 @@ from dataclasses import replace
 import numpy as np
 
 from graph_slam_ros.errors import SingularError
-from graph_slam_ros.slam.calibration.choice import offsets_of, places_of
-from graph_slam_ros.slam.calibration.decision import SIGMAS, amount, is_certain
+from graph_slam_ros.slam.calibration.decision import SIGMAS, is_certain
 from graph_slam_ros.slam.calibration.fit import TrialFit, fit, likelier_fit
 from graph_slam_ros.slam.calibration.parameters import BEND, FACTORS, Parameter
 from graph_slam_ros.slam.calibration.rows import TrialProblem
@@ -41,27 +40,25 @@ def fit_with_places(
     These are fitted if ``has_places``, where another parameter is off or if ``is_thorough``. Returns the fit that is
     said, and the one with the places; the same where there is none. Raises SingularError as ``fit`` does.
     """
-    again, places, offsets = replace(problem, graph=problem.graph.copy()), places_of(problem), offsets_of(problem)
-    first = found = likelier_fit(problem, priors, log_odds)  # which overwrites the graph of its problem
-    every, used = found, priors
-    for lengths in (places, offsets) if has_places and (_off(found) or is_thorough) else ():
+    places = problem.places()
+    first = found = every = likelier_fit(problem, priors, log_odds)
+    is_wider = has_places and (is_thorough or bool(_off(found)))
+    for lengths in (places, problem.range_offsets()) if is_wider else ():
         if not lengths:
             continue
-        wider = {**priors, **dict.fromkeys(lengths, _SIGMA_M)}
         try:
-            other = likelier_fit(replace(again, graph=again.graph.copy()), wider, log_odds, first)
+            other = likelier_fit(problem, {**priors, **dict.fromkeys(lengths, _SIGMA_M)}, log_odds, first)
         except SingularError:
             continue
         every = other if lengths is places else every
         is_better = found is first or other.evidence > found.evidence
         if is_better and any(abs(other.value(one)) >= LEAST_M and is_certain(other, one) for one in lengths):
-            found, used = other, wider
+            found = other
     if _off(found):
-        again = again if found.slips else again.without_slips()
-        found, used = _with_bends(again, found, used)
-        if found.doubted:
-            every = _with_bends(again, every, dict(zip(every.parameters, every.priors.tolist(), strict=True)))[0]
-        found = _with_noise(again, found, used)
+        again = problem if found.slips else problem.without_slips()
+        found = _with_bends(again, found)
+        every = _with_bends(again, every) if found.doubted else every
+        found = _with_noise(again, found)
     return found, every
 
 
@@ -70,31 +67,31 @@ def _off(found: TrialFit) -> list[Parameter]:
     return [one for one, is_far in zip(found.parameters, far, strict=True) if is_far]
 
 
-def _with_bends(
-    problem: TrialProblem, found: TrialFit, priors: Mapping[Parameter, float]
-) -> tuple[TrialFit, Mapping[Parameter, float]]:
+def _priors(found: TrialFit) -> dict[Parameter, float]:
+    return dict(zip(found.parameters, found.priors.tolist(), strict=True))
+
+
+def _with_bends(problem: TrialProblem, found: TrialFit) -> TrialFit:
     """The same with another distance of odometry in bends, where that is off beyond doubt; then no factor mends it."""
     if (distance := next((one for one in found.parameters if one.name == "distance"), None)) is None:
-        return found, priors
+        return found
     bend = Parameter(distance.source, BEND)
-    wider = {**priors, bend: bend.quantity.prior}
     try:
-        other = fit(replace(problem, graph=problem.graph.copy()), wider, found)
+        other = fit(problem, {**_priors(found), bend: bend.quantity.prior}, found)
     except SingularError:
-        other = found
+        return found
     if bend not in _off(other) or other.evidence <= found.evidence:
-        return found, priors
-    why = {distance: f"in bends it is another, by {amount(bend, other.value(bend))}", bend: "no setting corrects it"}
+        return found
+    why = {distance: f"in bends it is another, by {bend.shown(other.value(bend))}", bend: "no setting corrects it"}
     doubted = {one: (other.value(one), other.sigma(one), text) for one, text in why.items()}
-    return replace(other, slips=found.slips, doubted=doubted), wider
+    return replace(other, slips=found.slips, doubted=doubted)
 
 
-def _with_noise(problem: TrialProblem, found: TrialFit, priors: Mapping[Parameter, float]) -> TrialFit:
+def _with_noise(problem: TrialProblem, found: TrialFit) -> TrialFit:
     """The same with doubt in the factors of odometry that are not off where its noise is of what was measured."""
     factors = [one for one in _off(found) if one.name in FACTORS and one not in found.doubted]
-    copy = replace(problem, graph=problem.graph.copy(), is_noise_measured=True)
     try:
-        other = fit(copy, priors, found) if factors else found
+        other = fit(replace(problem, is_noise_measured=True), _priors(found), found) if factors else found
     except SingularError:
         return found
     doubted = {

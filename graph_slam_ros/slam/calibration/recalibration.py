@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -27,34 +27,30 @@ class Recalibration:
     measured: Array
     roots: Array
 
-    def only_changed(self, graph: Graph) -> "Recalibration | None":
-        """The rows that differ from those of a graph; None if there is none."""
+    def present(self, graph: Graph) -> "Recalibration":
+        """The same rows as they are in a graph now; those that it lacks are left out."""
         z, roots = self._columns(graph)
-        same = (z[self.rows] == self.measured).all(axis=1) & (roots[self.rows] == self.roots).all(axis=(1, 2))
-        if same.all():
-            return None
+        rows = self.rows[self.rows < len(z)]
+        return Recalibration(self.table, rows, z[rows], roots[rows])
+
+    def only_changed(self, graph: Graph) -> "Recalibration":
+        """The rows that differ from those of a graph."""
+        now = self.present(graph)
+        same = (now.measured == self.measured).all(axis=1) & (now.roots == self.roots).all(axis=(1, 2))
         return Recalibration(self.table, self.rows[~same], self.measured[~same], self.roots[~same])
 
-    def present(self, graph: Graph) -> "Recalibration":
-        """The same rows as they are in a graph now."""
+    def apply(self, graph: Graph) -> "Recalibration":
+        """Correct them, but for those that a graph lacks. Returns the change that undoes it."""
         z, roots = self._columns(graph)
-        return replace(self, measured=z[self.rows], roots=roots[self.rows])
+        there, before = self.rows < len(z), self.present(graph)
+        z[before.rows], roots[before.rows] = self.measured[there], self.roots[there]
+        return before
 
     def _columns(self, graph: Graph) -> tuple[Array, Array]:
-        table = next(one for one in graph.tables.values() if one.type.name == self.table)
-        return table.measured.values, table.sqrt_information.values
-
-    def apply(self, graph: Graph) -> "Recalibration":
-        """Correct them. Returns the change that undoes it. Rows that a graph lacks are left out."""
-        if not any(edge_type.name == self.table for edge_type in graph.tables):
-            return self
-        z, roots = self._columns(graph)
-        if len(self.rows) and self.rows.max() >= len(z):
-            there = self.rows < len(z)
-            return Recalibration(self.table, self.rows[there], self.measured[there], self.roots[there]).apply(graph)
-        before = replace(self, measured=z[self.rows].copy(), roots=roots[self.rows].copy())
-        z[self.rows], roots[self.rows] = self.measured, self.roots
-        return before
+        for table in graph.tables.values():
+            if table.type.name == self.table:
+                return table.measured.values, table.sqrt_information.values
+        return self.measured[:0], self.roots[:0]
 
     def as_record(self) -> list[Any]:
         """Plain lists of it, for JSON."""

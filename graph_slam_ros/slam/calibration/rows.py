@@ -4,7 +4,7 @@ Each sighting is seen from a pose of its own, which is no unknown: it lies on th
 correction, between two keyframes whose steps move it. So a clock may be off by more than the time between keyframes.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 from operator import attrgetter
@@ -15,14 +15,17 @@ from scipy import sparse
 
 from graph_slam_ros.graph import Graph, Loss
 from graph_slam_ros.graph.geometry import Geometry
-from graph_slam_ros.slam.calibration.model import MeasurementModel, OdometryEdges, Sightings, Values, clock_of
-from graph_slam_ros.slam.calibration.parameters import BEND, FACTORS, OF_ODOMETRY, Parameter
+from graph_slam_ros.slam.calibration.model import Edges, MeasurementModel, Sightings, factors_of, groups_of, kind_of
+from graph_slam_ros.slam.calibration.parameters import BEND, FACTORS, Parameter, Values, only_ranges, parameters_of
 from graph_slam_ros.slam.calibration.path import EstimatedPath
 from graph_slam_ros.slam.frontend.odometry_track import OdometryTrack
 from graph_slam_ros.slam.frontend.sighting_edges import SightingEdges
 from graph_slam_ros.solver import LossKey, Settings
 from graph_slam_ros.solver.linearization import Block, Losses, linearize, rows_of
-from graph_slam_ros.typing import Array, Index, Mask, Numbers
+from graph_slam_ros.typing import Array, Index
+
+_LEAST_KEYFRAMES = 3
+_PROBE = 1e-4  # step of a numerical derivative
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +34,7 @@ class TrialProblem:
 
     Attributes
     ----------
-    graph : its measurements and ends of edges are overwritten; its weights say what is believed
+    graph : its weights say what is believed
     vertices, held : of the problem, and those of them that stay where they are
     values : stored numbers of all vertices, where the fit begins
     origins : of its sightings
@@ -64,26 +67,41 @@ class TrialProblem:
         graph.set_weights(pairs[:, 1], 0.0)
         return replace(self, graph=graph, slips=())
 
+    @property
+    def edges(self) -> range:
+        """Edges whose measurements may be corrected."""
+        return range(self.first_edge, self.graph.edge_count)
+
     def model(self) -> MeasurementModel:
         """Its measurements as functions of parameters."""
-        edges = range(self.first_edge, self.graph.edge_count)
-        of = self.space, self.graph, self.origins, self.keyframes, self.stamps_ns, edges
+        of = self.space, self.graph, self.origins, self.keyframes, self.stamps_ns, self.edges
         return MeasurementModel(*of, is_noise_measured=self.is_noise_measured)
 
-    def path(self, x: Array, values: Values, like: EstimatedPath | None = None) -> EstimatedPath:
-        """The path at stored values x and with other parameters.
+    def kinds(self) -> dict[str, set[str]]:
+        """The kinds of edges of each input of landmarks."""
+        found: dict[str, set[str]] = {}
+        for table, label, source, _ in groups_of(self.graph, self.edges):
+            if label == "landmarks":
+                found.setdefault(source, set()).add(kind_of(table))
+        return found
 
-        Parameters
-        ----------
-        like : another path of this problem, whose stamps are taken over
-        """
-        named, track = {p.name: value for p, value in values.items() if p.name in OF_ODOMETRY}, self.track
-        distance, turn = (1.0 + named.get(name, 0.0) for name in ("distance", "turn"))
-        track = replace(track, distance=track.distance * distance, turn=track.turn * turn)
-        poses = self.poses(x, self.keyframes)
-        if like is not None:
-            return like.moved(poses, track)
-        return EstimatedPath(self.space, self.stamps_ns, poses, self.segments, track)
+    def parameters(self, groups: Collection[str]) -> list[Parameter]:
+        """The parameters of some groups that its edges depend on."""
+        if len(self.keyframes) < _LEAST_KEYFRAMES:
+            return []
+        odometries = {source for _, label, source, _ in groups_of(self.graph, self.edges) if label == "odometry"}
+        has_scale = bool(set(self.graph.labels) - {"anchor", "odometry", "landmarks"}) or len(self.held) > 1
+        n = self.space.dimensions
+        return parameters_of(odometries, self.kinds(), groups, dimensions=n, has_scale=has_scale)
+
+    def places(self) -> list[Parameter]:
+        """The place (x, y) on the robot of each sensor whose sightings have a direction."""
+        seen = [source for source, kinds in self.kinds().items() if not only_ranges(kinds)]
+        return [Parameter(source, axis) for source in seen for axis in ("x", "y")]
+
+    def range_offsets(self) -> list[Parameter]:
+        """The offset of the ranges of each sensor that measures bearings, too."""
+        return [Parameter(s, "range_offset") for s, kinds in self.kinds().items() if "range and bearing" in kinds]
 
     def poses(self, x: Array, vertices: Index) -> Array:
         """The poses (n, size) of some vertices at stored values x."""
@@ -133,51 +151,33 @@ class _Eyes:
         self.steps = np.zeros((len(self._own), problem.space.dof, count))
         self._weight = edges.table.weight.values[edges.rows].copy()
 
-    def place(
-        self, x: Array, values: Values, model: MeasurementModel, path: EstimatedPath, parameters: tuple[Parameter, ...]
-    ) -> None:
-        """Move them to the path at the corrected stamps. It changes x."""
-        edges, offset = self._edges, self._p.graph.offset.values
-        at = offset[self.ids][:, None] + np.arange(self._p.space.pose.size)
+    def place(self, x: Array, values: Values, model: MeasurementModel, path: EstimatedPath) -> None:
+        """Move them to the path at the corrected stamps, or from their keyframes by odometry. It changes x."""
+        edges, p, group = self._edges, self._p, self._p.space.group
+        at = p.graph.offset.values[self.ids][:, None] + np.arange(p.space.pose.size)
         self.first, self.second, self.fraction = self._own.copy(), self._own.copy(), np.zeros(len(self._own))
         self.steps[:] = 0.0
         known = np.zeros(len(self._own), dtype=bool)
-        if (clock := Parameter(edges.source, "clock")) in parameters:
-            after_s = clock_of(values, edges.source)
+        if (clock := Parameter(edges.source, "clock")) in values:
+            after_s = values[clock]
             known = path.knows(edges.stamps_ns, abs(after_s))
-            x[at[known]] = self._place_on_path(known, after_s, path, parameters.index(clock))
+            there = path.at(edges.stamps_ns[known], after_s)
+            x[at[known]] = there.poses
+            self.first[known] = p.keyframes[there.first]
+            self.second[known] = p.keyframes[np.minimum(there.first + 1, len(p.keyframes) - 1)]
+            self.fraction[known] = there.fraction
+            self.steps[known, :, list(values).index(clock)] = path.velocity(edges.stamps_ns[known], after_s)
             # Where the path is not known, a sighting that is not brought to its time would contradict the others.
             edges.table.weight.values[edges.rows] = np.where(known | (after_s == 0.0), self._weight, 0.0)
-        if not known.all():
-            x[at[~known]] = self._place_by_odometry(~known, x, values, model, parameters)
-
-    def _place_on_path(self, rows: Mask, after_s: float, path: EstimatedPath, clock: int) -> Array:
-        """The poses of some on the path. It is as it is, whatever odometry says of it."""
-        stamps_ns, keyframes = self._edges.stamps_ns[rows], self._p.keyframes
-        there = path.at(stamps_ns, after_s)
-        self.first[rows] = keyframes[there.first]
-        self.second[rows] = keyframes[np.minimum(there.first + 1, len(keyframes) - 1)]
-        self.fraction[rows] = there.fraction
-        self.steps[rows, :, clock] = path.velocity(stamps_ns, after_s)
-        return there.poses
-
-    def _place_by_odometry(
-        self, rows: Mask, x: Array, values: Values, model: MeasurementModel, parameters: tuple[Parameter, ...]
-    ) -> Array:
-        """The poses of some by odometry since their keyframes."""
-        group, moved = self._p.space.group, tuple(self._edges.T_keyframe_base[rows].T)
-        for k, one in enumerate(parameters):
+        if known.all():
+            return
+        moved = tuple(edges.T_keyframe_base[~known].T)
+        for k, one in enumerate(values):
             if one.name in (*FACTORS, BEND):
-                self.steps[rows, :, k] = self._scaled_steps(one, moved, values, model)
-        own = tuple(self._p.poses(x, self._own[rows]).T)
-        return np.stack(group.compose(own, model.scaled(moved, values)), axis=-1)
-
-    def _scaled_steps(self, parameter: Parameter, moved: Numbers, values: Values, model: MeasurementModel) -> Array:
-        probe = parameter.quantity.probe
-        sides = [
-            model.scaled(moved, {**values, parameter: values.get(parameter, 0.0) + side}) for side in (probe, -probe)
-        ]
-        return np.stack(self._p.space.group.local(*sides), axis=-1) / (2.0 * probe)
+                sides = [model.scaled(moved, there) for there in _beside(values, one)]
+                self.steps[~known, :, k] = np.stack(group.local(*sides), axis=-1) / (2.0 * _PROBE)
+        own = tuple(p.poses(x, self._own[~known]).T)
+        x[at[~known]] = np.stack(group.compose(own, model.scaled(moved, values)), axis=-1)
 
 
 class Linearization:
@@ -193,7 +193,7 @@ class Linearization:
         graph = problem.graph
         self._edges = _weighted_edges(problem)
         self._model = problem.model()
-        known = graph.vertex_count
+        self._known = graph.vertex_count
         self._eyes = [_Eyes(problem, edges, len(parameters)) for edges in self._model.sightings]
         self.column = np.full(graph.vertex_count, -1)
         dof = np.array([kind.dof for kind in graph.kinds], dtype=np.int64)[graph.kind.values[free]]
@@ -203,9 +203,8 @@ class Linearization:
         self._stamp_of[problem.keyframes] = problem.stamps_ns
         for eyes, edges in zip(self._eyes, self._model.sightings, strict=True):
             self._stamp_of[eyes.ids] = edges.stamps_ns
-        self._known = known
         tables = graph.tables.values()  # how likely what odometry measured is does not change with its factors
-        self._path = problem.path(problem.values, {})
+        self._path = EstimatedPath(problem.space, problem.stamps_ns, problem.segments, problem.track)
         self._log_roots = {one.code: np.linalg.slogdet(one.sqrt_information.values)[1] for one in tables}
 
     def rows(self, x: Array, theta: Array, losses: Mapping[LossKey, Loss]) -> Rows:
@@ -213,9 +212,11 @@ class Linearization:
         graph = self._p.graph
         values = dict(zip(self._parameters, theta.tolist(), strict=True))
         all_x = np.concatenate((x, graph.initial.values[len(x) :]))
-        path = self._p.path(x, values, self._path)
+        self._path.poses, track = self._p.poses(x, self._p.keyframes), self._p.track
+        distance, turn = factors_of(values)
+        self._path.factors = track.distance * distance, track.turn * turn
         for eyes in self._eyes:
-            eyes.place(all_x, values, self._model, path, self._parameters)
+            eyes.place(all_x, values, self._model, self._path)
         derivative = self._correct(all_x, values)
         blocks = linearize(graph, all_x, rows_of(graph, self._edges), Losses(graph, losses))
         parts = [self._of_block(block, derivative, all_x) for block in _by_table(blocks)]
@@ -229,46 +230,34 @@ class Linearization:
     def _correct(self, x: Array, values: Values) -> dict[tuple[int, int], Array]:
         """Correct the measurements of the copy; returns derivatives (n, m) of residuals, by table and parameter."""
         out: dict[tuple[int, int], Array] = {}
-        concerned: list[OdometryEdges | Sightings] = [*self._model.odometry, *self._model.sightings]
+        concerned: list[Edges] = [*self._model.odometry, *self._model.sightings]
         for edges in concerned:
-            for k, parameter in enumerate(self._parameters):
+            for k, parameter in enumerate(values):
                 if parameter.source == edges.source and parameter.name != "clock":
                     key = edges.table.code, k
                     out.setdefault(key, np.zeros((len(edges.table), edges.table.type.residual_size)))
                     out[key][edges.rows] = self._derivative(edges, parameter, values, x)
-            edges.table.measured.values[edges.rows] = self._measured(edges, values)
-            edges.table.sqrt_information.values[edges.rows] = self._roots(edges, values)
+            edges.table.measured.values[edges.rows] = self._model.measured(edges, values)
+            edges.table.sqrt_information.values[edges.rows] = self._model.roots(edges, values)
         return out
 
-    def _roots(self, edges: OdometryEdges | Sightings, values: Values) -> Array:
-        if isinstance(edges, OdometryEdges):
-            return self._model.odometry_roots(edges, values)
-        return self._model.fitted_roots(edges, values)
-
-    def _measured(self, edges: OdometryEdges | Sightings, values: Values) -> Array:
-        if isinstance(edges, OdometryEdges):
-            return self._model.corrected_odometry(edges, values)
-        return self._model.seen(edges, values)
-
-    def _derivative(self, edges: OdometryEdges | Sightings, parameter: Parameter, values: Values, x: Array) -> Array:
+    def _derivative(self, edges: Edges, parameter: Parameter, values: Values, x: Array) -> Array:
         """Central difference of the residuals (n, m) with respect to one parameter, and what it makes of their noise.
 
         The noise of a position is turned with the sensor. Without that part, errors along and across the line of sight
         that go together would pass for a turned sensor.
         """
-        at = self._p.graph.offset.values[edges.table.vertices.values[edges.rows]]
-        probe, sides, roots = parameter.quantity.probe, [], []
-        for side in (probe, -probe):
-            there = {**values, parameter: values.get(parameter, 0.0) + side}
-            sides.append(edges.table.type.linearize(x, at, self._measured(edges, there))[0])
-            roots.append(self._roots(edges, there))
+        at, model = self._p.graph.offset.values[edges.table.vertices.values[edges.rows]], self._model
+        beside = _beside(values, parameter)
+        sides = [edges.table.type.linearize(x, at, model.measured(edges, there))[0] for there in beside]
+        roots = [model.roots(edges, there) for there in beside]
         difference = sides[0] - sides[1]
         wrapped = np.abs(difference) > np.pi
         out = difference - wrapped * np.sign(difference) * 2.0 * np.pi
         if not np.array_equal(roots[0], roots[1]):
             of_noise = np.einsum("nij,nj->ni", roots[0] - roots[1], 0.5 * (sides[0] + sides[1]))
-            out += np.linalg.solve(self._roots(edges, values), of_noise[..., None])[..., 0]
-        return np.asarray(out / (2.0 * probe))
+            out += np.linalg.solve(model.roots(edges, values), of_noise[..., None])[..., 0]
+        return np.asarray(out / (2.0 * _PROBE))
 
     # -- blocks to rows --------------------------------------------------------------------------------------------
 
@@ -323,6 +312,12 @@ class Linearization:
             seen = space.group.between(here, tuple(x[offset[keyframe][:, None] + size].T))
             parts.append(part[:, None, None] * (jacobian[:, :, :dof] @ _adjoints(space, seen)))
         return np.column_stack((first, second, ends[:, 1:])), np.concatenate((*parts, jacobian[:, :, dof:]), axis=2)
+
+
+def _beside(values: Values, parameter: Parameter) -> tuple[Values, Values]:
+    """The same values with one a little larger, and smaller."""
+    plus, minus = (values.get(parameter, 0.0) + side for side in (_PROBE, -_PROBE))
+    return {**values, parameter: plus}, {**values, parameter: minus}
 
 
 def _adjoints(space: Geometry, poses: Any) -> Array:

@@ -14,8 +14,7 @@ import numpy as np
 
 from graph_slam_ros.slam.calibration.decision import LEAST_SIGMA_PER_M, SIGMAS, Finding, is_certain
 from graph_slam_ros.slam.calibration.fit import TrialFit
-from graph_slam_ros.slam.calibration.model import Values
-from graph_slam_ros.slam.calibration.parameters import OF_ODOMETRY, Parameter
+from graph_slam_ros.slam.calibration.parameters import OF_ODOMETRY, Parameter, Values
 from graph_slam_ros.slam.calibration.places import LEAST_M
 from graph_slam_ros.slam.frontend.corrections import AXES
 from graph_slam_ros.typing import Array, Index
@@ -68,12 +67,8 @@ class Uncorrected:
     def as_dict(self) -> dict[str, Any]:
         """Plain values with six digits, because the last ones depend on the memory alignment of an array."""
         numbers = {name: float(f"{getattr(self, name):.6g}") for name in ("value", "sigma", "shift")}
-        return {
-            "code": self.code,
-            **numbers,
-            "text": str(self),
-            "settings": dict([self.setting] if self.setting else []),
-        }
+        settings = dict([self.setting] if self.setting else [])
+        return {"code": self.code, **numbers, "text": str(self), "settings": settings}
 
 
 def uncorrected(
@@ -91,15 +86,14 @@ def uncorrected(
     if sigma_per_m < LEAST_SIGMA_PER_M:
         return _too_sure(found, shifts, sigma_per_m)
     off = [k for k, one in enumerate(findings) if is_off(found, one) and shifts[k] > MOST_SHIFT]
-    off = [k for k in off if found.parameters[k].name in CODES]
-    values = {found.parameters[k]: float(found.values[k]) for k in off}
+    values = {found.parameters[k]: float(found.values[k]) for k in off if found.parameters[k].name in CODES}
     out = []
-    for k in off:
-        one, sigma = found.parameters[k], float(found.sigmas[k])
-        text = sentence(one, values[one], sigma)
+    for one, value in values.items():
+        sigma, shift = found.sigma(one), float(shifts[found.parameters.index(one)])
+        text = sentence(one, value, sigma)
         text += ", more than its stated noise allows for (odometry.noise)" * (one.name in OF_ODOMETRY)
-        more = (CODES[one.name], one.source, values[one], sigma, float(shifts[k]), text)
-        out.append(Uncorrected(*more, setting_of(one, values, total)))
+        setting = setting_of(one, values, total)
+        out.append(Uncorrected(CODES[one.name], one.source, value, sigma, shift, text, setting))
     jumps = [
         Uncorrected("clock_jump", one.source, after - before, sigma, 0.0, jump_sentence(before, after, sigma), ())
         for one, before, after, sigma, _ in clock_jumps(found)
@@ -133,18 +127,15 @@ def jump_sentence(before: float, after: float, sigma: float) -> str:
 
 def pose_shifts(found: TrialFit, covariances: Mapping[int, Array]) -> Array:
     """Root mean square (p,) by which each parameter's correction moves the poses, in their sigmas."""
-    known = {vertex: of for vertex, of in covariances.items() if vertex < len(found.column) and _at(found, vertex) >= 0}
+    begins = {vertex: int(found.column[vertex]) for vertex in covariances if vertex < len(found.column)}
+    known = {vertex: at for vertex, at in begins.items() if at >= 0}
     if not known:
         return np.zeros(len(found.parameters))
-    every = np.array(list(known.values()))
-    rows = np.array([_at(found, vertex) for vertex in known])[:, None] + np.arange(every.shape[1])
+    every = np.array([covariances[vertex] for vertex in known])
+    rows = np.array(list(known.values()))[:, None] + np.arange(every.shape[1])
     moved = found.sensitivity[rows] * found.values
     square = np.einsum("nip,nij,njp->np", moved, np.linalg.pinv(every, hermitian=True), moved)
     return np.asarray(np.sqrt(np.maximum(square, 0.0).mean(axis=0) / every.shape[1]))
-
-
-def _at(found: TrialFit, vertex: int) -> int:
-    return int(found.column[vertex])
 
 
 def _too_sure(found: TrialFit, shifts: Array, sigma_per_m: float) -> list[Uncorrected]:

@@ -7,7 +7,6 @@ import pytest
 from imperfect import Faults, driven, imperfect_drive
 from rows import each
 
-from graph_slam_ros.slam.calibration.choice import parameters_of
 from graph_slam_ros.slam.calibration.decision import decide
 from graph_slam_ros.slam.calibration.fit import TrialFit
 from graph_slam_ros.slam.calibration.parameters import GROUPS, Parameter
@@ -40,7 +39,7 @@ def test_derivatives_are_the_numeric_ones_and_a_fit_finds_what_was_wrong_and_cha
 
 def check_parameters(problem):
     """Their columns are the derivatives of the residuals."""
-    chosen = parameters_of(problem, [one for one in GROUPS if one != "clock"])
+    chosen = problem.parameters([one for one in GROUPS if one != "clock"])
     parameters = (*chosen, *[Parameter(one.source, "bend") for one in chosen if one.name == "distance"])
     linear = Linearization(problem, parameters, problem.vertices)
     theta = np.full(len(parameters), 0.02)
