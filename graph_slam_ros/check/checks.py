@@ -57,7 +57,9 @@ def check_columns(c: Columns, checks: tuple[Check, ...] = CHECKS) -> list[Findin
             if any(one.ends for one in found):
                 break
         else:
-            found += _nothing_corrects(c)
+            if not any(topic.use != "odometry" and len(topic.stamp_ns) for topic in c.topics.values()):
+                text = "the recording has no landmark, fix or closure that is used: a replay would be odometry alone"
+                found.append(Finding("no_landmarks", "warning", 0, 1, "topics", text, c.odometry.topic))
     return in_order(with_inputs(c, found))
 
 
@@ -91,20 +93,10 @@ def worst_while_driving(c: Columns) -> list[Finding]:
     """
     found = check_columns(of_one_publisher(c, is_live=True), OF_A_REPLAY)
     errors = [one for one in found if one.severity == "error" and one.code in _WHILE_DRIVING]
-    errors = [one for one in errors if one.code != "clock_domains" or not _may_be_late(c, one)]
-    if errors:
+    late = [one for one in errors if one.code == "clock_domains" and one.topic != c.odometry.topic]
+    late = [one for one in late if -_LATEST_S < one.value < 0.0]  # its clock may be right, and its messages come late
+    if errors := [one for one in errors if one not in late]:
         return errors[:1]
     way_m = float(np.linalg.norm(np.diff(c.path[:, :3], axis=0), axis=1).sum())
     codes = (*_ONCE_IT_MOVES, *(["seen_once"] if way_m > _MANY_IDS_M else []))
     return [one for one in found if one.severity != "note" and one.code in codes] if way_m > _LEAST_WAY_M else []
-
-
-def _may_be_late(c: Columns, found: Finding) -> bool:
-    """Return whether a clock may be right, and its messages come late: those are refused for that, or used."""
-    return found.topic != c.odometry.topic and -_LATEST_S < found.value < 0.0
-
-
-def _nothing_corrects(c: Columns) -> Iterator[Finding]:
-    if not any(topic.use != "odometry" and len(topic.stamp_ns) for topic in c.topics.values()):
-        text = "the recording has no landmark, fix or closure that is used: a replay would be odometry alone"
-        yield Finding("no_landmarks", "warning", 0, 1, "topics", text, c.odometry.topic)

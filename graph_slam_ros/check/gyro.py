@@ -113,7 +113,9 @@ def _scale(c: Columns, factor: float, name: str, gyro_ns: Index) -> Finding:
     elif abs(factor + 1.0) < _GROSS:
         text += ": its sensor is upside down, or odometry turns the wrong way"
         if c.config.world.dimensions == 2 and c.T_base_gyro is not None:  # in space x or y points the other way, too
-            settings = _turned_over(c, c.T_base_gyro)
+            R_base_gyro = se3.rotation(c.T_base_gyro)  # turned over about the robot's x
+            x, y, z, w = so3.compose(so3.compose(so3.inverse(R_base_gyro), (1.0, 0.0, 0.0, 0.0)), R_base_gyro)
+            settings = turned_mount(c.config.gyro_input, c.gyro_frame, c.T_base_gyro, (0.0, 0.0, 0.0, x, y, z, w))
     elif abs(factor) < _GROSS:
         text += ": another of its axes points upwards, or its driver sends zeros"
         settings = _upright(c) if c.config.world.dimensions == 2 else ()
@@ -154,10 +156,3 @@ def of_gyro_or_wheels(findings: list[Finding], gyro_input: str) -> list[Finding]
     text = f"{gyro.text.removesuffix(_EITHER)}: landmarks agree with odometry, so the scale of the gyro is wrong"
     mended = replace(gyro, text=text, settings=(assignment(f"{gyro_input}.use", "none"),))
     return [mended if one is gyro else one for one in rest if one.code not in _OF_A_HEADING]
-
-
-def _turned_over(c: Columns, T_base_gyro: se3.Pose) -> tuple[str, ...]:
-    """The settings of a gyro turned over about the robot's x. Of its TF or mount only the rotation has a part."""
-    R_base_gyro = se3.rotation(T_base_gyro)
-    x, y, z, w = so3.compose(so3.compose(so3.inverse(R_base_gyro), (1.0, 0.0, 0.0, 0.0)), R_base_gyro)
-    return turned_mount(c.config.gyro_input, c.gyro_frame, T_base_gyro, (0.0, 0.0, 0.0, x, y, z, w))

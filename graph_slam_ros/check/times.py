@@ -198,11 +198,11 @@ def _rate(c: Columns) -> Iterator[Finding]:
             yield Finding("clock_jump", "warning", step_s[k], most_s, "s", text, **where(o.topic, stamp_ns[k + 1 :], 1))
         long, moved, turned = long[~was_set], moved[~was_set], turned[~was_set]
     if len(long):
-        worst_s = float(step_s[long].max())
+        worst_s, often = float(step_s[long].max()), {1: "once", 2: "twice"}.get(len(long), f"{len(long)} times")
         is_bad = bool((step_s[long][moved | turned] > max(_PERIODS * median_s, _VERY_LONG_S)).any())
         text = (
             f"{o.topic} comes at {1.0 / median_s:.0f} Hz, but is silent for more than {most_s:.1f} s "
-            f"{_often(len(long))} (the longest {worst_s:.2f} s{'; the robot moved meanwhile' if is_bad else ''})"
+            f"{often} (the longest {worst_s:.2f} s{'; the robot moved meanwhile' if is_bad else ''})"
         )
         at = where(o.topic, stamp_ns[long])
         yield Finding("gap", "warning" if is_bad else "note", worst_s, most_s, "s", text, **at)
@@ -227,10 +227,6 @@ def _was_set(poses: Array, step_s: Array, gaps: Index) -> Mask:
 def _span(seconds: float) -> str:
     """A time in days or in seconds."""
     return f"{seconds / _DAY_S:.1f} days" if seconds > _DAY_S else f"{seconds:.1f} s"
-
-
-def _often(times: int) -> str:
-    return {1: "once", 2: "twice"}.get(times, f"{times} times")
 
 
 def _between(c: Columns, odometry_ns: Index) -> float:

@@ -13,12 +13,22 @@ from graph_slam_ros.formats.parameters import assignment
 from graph_slam_ros.lie import se3
 from graph_slam_ros.measurements.types import END, Measurement, Odometry
 from graph_slam_ros.slam import Config, GraphSlam
-from graph_slam_ros.slam.calibration.decision import MOST_LOST, PRIOR_SIGMAS, absurd_range, absurd_text
-from graph_slam_ros.slam.calibration.decision import Finding as Fitted
+from graph_slam_ros.slam.calibration.answers import (
+    CODES,
+    LEAST_M,
+    MOST_LOST,
+    PRIOR_SIGMAS,
+    absurd_range,
+    absurd_text,
+    clock_jumps,
+    is_off,
+    jump_sentence,
+    sentence,
+    setting_of,
+)
+from graph_slam_ros.slam.calibration.answers import Finding as Fitted
 from graph_slam_ros.slam.calibration.fit import TrialFit
 from graph_slam_ros.slam.calibration.parameters import Parameter
-from graph_slam_ros.slam.calibration.places import LEAST_M
-from graph_slam_ros.slam.calibration.uncorrected import CODES, clock_jumps, is_off, jump_sentence, sentence, setting_of
 from graph_slam_ros.slam.noise_scale import LARGEST, NoiseScale
 from graph_slam_ros.typing import Array, Index
 
@@ -104,7 +114,8 @@ def check_trial(c: Columns, slam: GraphSlam) -> Iterator[Finding]:
     off = {one.parameter: one.value for one in known if _is_far_off(fit, one, step_s)}
     slip = None if off else check_slips(c, slam)  # a clock or mount that is wrong bends the path in turns
     is_broken = slip is not None and slip[0].severity == "warning"
-    found = [] if off or _goes_back(c) else _places(c, slam, late_s, slip if is_broken else None)
+    goes_back = any((np.diff(t.stamp_ns[t.stamp_ns != 0]) < -1_000_000_000).any() for t in c.topics.values())
+    found = [] if off or goes_back else _places(c, slam, late_s, slip if is_broken else None)
     if is_void:
         found += [one for s in c.sightings for one in noisier(s, pairs_of(c, s))]
         yield from found or [_void(fit)]
@@ -147,11 +158,6 @@ def _void(fit: TrialFit) -> Finding:
         return Finding("fit_unsure", "warning", fit.lost, MOST_LOST, "part", text)
     text = f"{absurd_text(fit, k)}: many ranges are wrong, or it is so and to be configured; {unchecked}"
     return Finding("fit_unsure", "warning", abs(float(fit.values[k])) / fit.priors[k], PRIOR_SIGMAS, "sigmas", text)
-
-
-def _goes_back(c: Columns) -> bool:
-    """Return whether time jumps back: stamps then do not say where the robot was."""
-    return any((np.diff(t.stamp_ns[t.stamp_ns != 0]) < -1_000_000_000).any() for t in c.topics.values())
 
 
 def _over_confident(c: Columns, noise: NoiseScale, factor: float, limit: float) -> Finding:

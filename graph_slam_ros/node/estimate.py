@@ -22,7 +22,7 @@ from graph_slam_ros.runs.outcome import (
 from graph_slam_ros.runs.tables import accepted_lately, condensed_part
 from graph_slam_ros.runs.undetermined import wrong_sides
 from graph_slam_ros.slam import GraphSlam
-from graph_slam_ros.slam.calibration.uncorrected import Uncorrected
+from graph_slam_ros.slam.calibration.answers import Uncorrected
 from graph_slam_ros.slam.solution import Correction
 from graph_slam_ros.slam.weak_direction import WeakDirection, position_covariance, weakest_position, weakest_turn
 from graph_slam_ros.typing import Numbers

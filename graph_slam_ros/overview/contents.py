@@ -174,7 +174,10 @@ def _add(recording: Recording, one: TopicContents, m: Any, log_ns: int) -> None:
         stamp_ns = next(filter(None, (h.stamp.sec * 10**9 + h.stamp.nanosec for h in headers)), 0)
         one.is_stamped |= stamp_ns != 0
         one.add_lag(log_ns, stamp_ns)
-    _OF_TYPE.get(one.topic.type, _any)(one, m)
+    if one.topic.type in _OF_TYPE:
+        _OF_TYPE[one.topic.type](one, m)
+    else:  # landmarks of a package that may not be installed
+        one.items += next((len(getattr(m, name)) for name in _ITEMS if hasattr(m, name)), 0)
 
 
 def _plain(frame: str) -> str:
@@ -182,11 +185,6 @@ def _plain(frame: str) -> str:
 
 
 # -- by type -----------------------------------------------------------------------------------------------------------
-
-
-def _any(one: TopicContents, m: Any) -> None:
-    """The number of landmarks in a message of a package that may not be installed."""
-    one.items += next((len(getattr(m, name)) for name in _ITEMS if hasattr(m, name)), 0)
 
 
 def _odometry(one: TopicContents, m: Any) -> None:

@@ -23,9 +23,9 @@ from graph_slam_ros.runs.replay import RecordedRuns
 from graph_slam_ros.runs.suggested_inputs import SuggestedInputs
 from graph_slam_ros.runs.tables import account
 from graph_slam_ros.slam import Config, Counters, GraphSlam
-from graph_slam_ros.slam.calibration.decision import Finding as Fitted
+from graph_slam_ros.slam.calibration.answers import CODES, setting_of
+from graph_slam_ros.slam.calibration.answers import Finding as Fitted
 from graph_slam_ros.slam.calibration.parameters import AUTO, GROUPS, Parameter, parameters_of
-from graph_slam_ros.slam.calibration.uncorrected import CODES, setting_of
 from graph_slam_ros.slam.trial_fits import FIRST_DUE
 from graph_slam_ros.warmup import warmup
 

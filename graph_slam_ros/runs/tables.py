@@ -20,7 +20,7 @@ from graph_slam_ros.runs.folder import COVARIANCES, GRAPH, LANDMARKS, ODOMETRY, 
 from graph_slam_ros.runs.ledger_file import CHANGES, LEDGER, changes_text, ledger_text
 from graph_slam_ros.runs.whole_path import WholePath
 from graph_slam_ros.slam import Counters, GraphSlam
-from graph_slam_ros.slam.calibration.decision import SIGMAS
+from graph_slam_ros.slam.calibration.answers import SIGMAS
 from graph_slam_ros.slam.calibration.parameters import QUANTITIES
 from graph_slam_ros.slam.lifelong.state import BoundedState, Left, seen_from
 from graph_slam_ros.slam.robust.gating import CANDIDATES

@@ -11,7 +11,7 @@ import numpy as np
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.slam.backend import Backend
-from graph_slam_ros.slam.calibration.decision import Finding, of_association
+from graph_slam_ros.slam.calibration.answers import Finding, of_association
 from graph_slam_ros.slam.calibration.model import MeasurementModel, factors_of
 from graph_slam_ros.slam.calibration.parameters import Parameter, Values
 from graph_slam_ros.slam.calibration.recalibration import Recalibration
@@ -69,7 +69,8 @@ class FoundFactors:
         before = self._frontend.corrections.found
         findings = [of_association(Parameter(source, name), *scales[name], (source, name) in before) for name in names]
         used = [one for one in findings if one.verdict == "admitted"]
-        values = {one.parameter: _rounded(one.value) for one in used}
+        # Six digits, because the last ones of a sine depend on the memory alignment of an array.
+        values = {one.parameter: float(f"{one.value:.6g}") for one in used}
         report = self._correct(model, values, keyframe, everything) if values else None
         if report is not None:
             self.corrected += used
@@ -130,11 +131,6 @@ class FoundFactors:
             origins.append((places[known], _exact(np.stack(T_keyframe_base, axis=-1)[known])))
         changed = [change.only_changed(self._backend.graph) for change in changes]
         return [one for one in changed if len(one.rows)], origins
-
-
-def _rounded(value: float) -> float:
-    """A value with six digits, because the last ones of a sine depend on the memory alignment of an array."""
-    return float(f"{value:.6g}")
 
 
 def _exact(numbers: Array) -> Array:

@@ -10,11 +10,10 @@ from graph_slam_ros.config.config import Config
 from graph_slam_ros.measurements.edits import AppliedEdit
 from graph_slam_ros.slam.alarm import Alarm
 from graph_slam_ros.slam.backend import Backend
-from graph_slam_ros.slam.calibration.decision import Finding
+from graph_slam_ros.slam.calibration.answers import Finding, Uncorrected
 from graph_slam_ros.slam.calibration.fit import TrialFit
 from graph_slam_ros.slam.calibration.parameters import AUTO
 from graph_slam_ros.slam.calibration.recalibration import Recalibration
-from graph_slam_ros.slam.calibration.uncorrected import Uncorrected
 from graph_slam_ros.slam.found_factors import FoundFactors
 from graph_slam_ros.slam.frontend.gyro import GyroState, SavedBias
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend

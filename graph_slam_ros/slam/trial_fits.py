@@ -19,13 +19,12 @@ import numpy as np
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.slam.backend import Backend
-from graph_slam_ros.slam.calibration.decision import Finding, decide
+from graph_slam_ros.slam.calibration.answers import Finding, Uncorrected, decide, is_off, sampled, uncorrected
 from graph_slam_ros.slam.calibration.fit import TrialFit
 from graph_slam_ros.slam.calibration.model import stated_sigma_per_m
 from graph_slam_ros.slam.calibration.parameters import AUTO, Parameter
 from graph_slam_ros.slam.calibration.places import fit_with_places
 from graph_slam_ros.slam.calibration.rows import TrialProblem
-from graph_slam_ros.slam.calibration.uncorrected import Uncorrected, is_off, sampled, uncorrected
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
 from graph_slam_ros.slam.kidnap_detector import KidnapDetector
 from graph_slam_ros.slam.landmarks.landmark_frontend import LandmarkFrontend

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from graph_slam_ros.measurements.types import Measurement, Odometry
 from graph_slam_ros.slam.alarm import Alarm
 from graph_slam_ros.slam.bounded_map import BoundedMap, Condensation
-from graph_slam_ros.slam.calibration.decision import Finding
+from graph_slam_ros.slam.calibration.answers import Finding
 from graph_slam_ros.slam.map_view import MapView
 from graph_slam_ros.slam.motion_only import MotionOnly
 from graph_slam_ros.slam.robust.ledger import VerdictChange

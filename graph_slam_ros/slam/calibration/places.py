@@ -17,12 +17,11 @@ from dataclasses import replace
 import numpy as np
 
 from graph_slam_ros.errors import SingularError
-from graph_slam_ros.slam.calibration.decision import SIGMAS, is_certain
+from graph_slam_ros.slam.calibration.answers import LEAST_M, SIGMAS, is_certain
 from graph_slam_ros.slam.calibration.fit import TrialFit, fit, likelier_fit
 from graph_slam_ros.slam.calibration.parameters import BEND, FACTORS, Parameter
 from graph_slam_ros.slam.calibration.rows import TrialProblem
 
-LEAST_M = 0.2  # errors that last, as a robot that follows its commands late, are up to 0.14 m in recorded drives
 _SIGMA_M = 0.5
 _AGREEING, _PART = 2.0, 1.0 / 3.0  # a factor is off by so many sigmas, and so much of it, whatever its noise is of
 

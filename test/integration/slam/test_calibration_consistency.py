@@ -9,7 +9,7 @@ from random_drives import CLASSES, random_drive
 from reliability import tell, times
 from scipy.stats import chi2
 
-from graph_slam_ros.slam.calibration.uncorrected import setting_of
+from graph_slam_ros.slam.calibration.answers import setting_of
 
 SEEDS = times(1, 100)
 

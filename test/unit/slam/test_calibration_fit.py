@@ -7,7 +7,7 @@ import pytest
 from imperfect import Faults, driven, imperfect_drive
 from rows import each
 
-from graph_slam_ros.slam.calibration.decision import decide
+from graph_slam_ros.slam.calibration.answers import decide
 from graph_slam_ros.slam.calibration.fit import TrialFit
 from graph_slam_ros.slam.calibration.parameters import GROUPS, Parameter
 from graph_slam_ros.slam.calibration.rows import Linearization
