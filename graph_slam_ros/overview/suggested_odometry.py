@@ -52,15 +52,20 @@ class OdometryChoice:
         self.trouble = "" if self._of_topics() or self._of_tf() or self._of_poses() else self._nothing()
 
     def _of_topics(self) -> bool:
-        found = []
-        for one in readable(self._recording, self._unused, ODOMETRY):
+        return self._best_of(list(self._candidates(ODOMETRY)))
+
+    def _candidates(self, *types: str) -> Iterator[TopicContents]:
+        """Topics of some types that may be odometry."""
+        for one in readable(self._recording, self._unused, *types):
+            name = one.topic.name
             if one.frame in MAP_FRAMES:
-                self._unused[one.topic.name] = f"in frame {one.frame}: somebody's estimate, not odometry"
+                self._unused[name] = f"in frame {one.frame}: somebody's estimate, not odometry"
+            elif one.topic.type != ODOMETRY and ESTIMATE.search(name):
+                self._unused[name] = "the output of a localiser, or a goal, not odometry"
             elif one.is_zero:
-                self._unused[one.topic.name] = "its stamps are zero: have the driver fill in header.stamp"
+                self._unused[name] = "its stamps are zero: have the driver fill in header.stamp"
             else:
-                found.append(one)
-        return self._best_of(found)
+                yield one
 
     def _best_of(self, found: list[TopicContents]) -> bool:
         """Choose the best of several topics; False where there is none."""
@@ -83,17 +88,8 @@ class OdometryChoice:
 
     def _of_poses(self) -> bool:
         """Choose poses that are odometry by the name of their frame or topic."""
-        found = []
-        for one in readable(self._recording, self._unused, *POSES):
-            name, frame = one.topic.name, one.frame
-            if frame in MAP_FRAMES:
-                self._unused[name] = f"in frame {frame}: somebody's estimate, not odometry"
-            elif ESTIMATE.search(name):
-                self._unused[name] = "the output of a localiser, or a goal, not odometry"
-            elif one.is_zero:
-                self._unused[name] = "its stamps are zero: have the driver fill in header.stamp"
-            elif one.path_m > _LEAST_M and _OF_ODOMETRY.search(f"{frame} {name}"):
-                found.append(one)
+        moving = [one for one in self._candidates(*POSES) if one.path_m > _LEAST_M]
+        found = [one for one in moving if _OF_ODOMETRY.search(f"{one.frame} {one.topic.name}")]
         if not self._best_of(found):
             return False
         chosen = self._recording.topics[self.topic].topic

@@ -19,7 +19,7 @@ import numpy as np
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.slam.backend import Backend
-from graph_slam_ros.slam.calibration.answers import Finding, Uncorrected, decide, is_off, sampled, uncorrected
+from graph_slam_ros.slam.calibration.answers import Finding, Uncorrected, decide, is_off, uncorrected
 from graph_slam_ros.slam.calibration.fit import TrialFit
 from graph_slam_ros.slam.calibration.model import stated_sigma_per_m
 from graph_slam_ros.slam.calibration.parameters import AUTO, Parameter
@@ -226,6 +226,7 @@ class TrialFits:
         if fits is None or not self._solver.is_current:
             return []
         keyframes, total = self._frontend.path.keyframes.ids, self._frontend.corrections.total
-        vertices = sampled(keyframes[np.isin(keyframes, self._solver.vertices)], _MOST_POSES)
+        vertices = keyframes[np.isin(keyframes, self._solver.vertices)]
+        vertices = vertices[:: max(1, -(-len(vertices) // _MOST_POSES))]
         covariances = dict(zip(vertices.tolist(), self._solver.marginal(vertices), strict=True))
         return uncorrected(fits[0], self._judged(fits[0]), covariances, lambda *key: total(key), self._stated())

@@ -35,7 +35,7 @@ import numpy as np
 from graph_slam_ros.slam.calibration.fit import TrialFit
 from graph_slam_ros.slam.calibration.parameters import OF_ODOMETRY, Parameter, Values
 from graph_slam_ros.slam.frontend.corrections import AXES
-from graph_slam_ros.typing import Array, Index
+from graph_slam_ros.typing import Array
 
 SIGMAS = 4.0
 MOST_CORRELATED = 0.95
@@ -400,8 +400,3 @@ def setting_of(one: Parameter, values: Values, total: Total) -> tuple[str, Any]:
     if one.name == "turn_bias":
         return "odometry.turn_bias_rad_s", round(before + value, 6)
     return f"odometry.{one.name}_factor", round(before * (1.0 + value), 4)
-
-
-def sampled(vertices: Index, most: int) -> Index:
-    """Some of the vertices, evenly, at most so many."""
-    return vertices[:: max(1, -(-len(vertices) // most))]

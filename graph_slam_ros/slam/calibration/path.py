@@ -5,7 +5,6 @@ robot that stands and goes is nowhere near half-way when half of the time is ove
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,22 +16,6 @@ from graph_slam_ros.typing import Array, Index, Mask, Numbers
 _AROUND_S = 0.25  # to either side of a stamp: shorter, and a velocity is noise
 _LEAST_S = 1e-9  # of an interval: two keyframes may have one stamp
 _REST_S = 3.0  # between two samples of odometry: longer, and nobody knows when of it the robot moved
-
-
-@dataclass(frozen=True, slots=True)
-class Between:
-    """Poses between two keyframes each.
-
-    Attributes
-    ----------
-    first : (n,) index of the keyframe before; the other is the next
-    fraction : (n,) of the time between them
-    poses : (n, size)
-    """
-
-    first: Index
-    fraction: Array
-    poses: Array
 
 
 class EstimatedPath:
@@ -76,8 +59,11 @@ class EstimatedPath:
             inside &= (since_s + reach <= begin_s) | (since_s - reach >= end_s)
         return np.asarray(inside)
 
-    def at(self, stamps_ns: Index, after_s: float) -> Between:
-        """The poses at an offset from some stamps."""
+    def at(self, stamps_ns: Index, after_s: float) -> tuple[Index, Array, Array]:
+        """The poses (n, size) at an offset from some stamps.
+
+        Before them the index (n,) of the keyframe before, and which part of the time to the next is over.
+        """
         since_s, group = (stamps_ns - self._origin_ns) * 1e-9 + after_s, self._space.group
         k, fraction = _interval(self._own_s, since_s)
         s, part = _interval(self._sample_s, since_s)
@@ -87,7 +73,7 @@ class EstimatedPath:
         moved, whole = (self._corrected(group.between(start, one)) for one in (odom, end))
         a, b = tuple(self.poses[k].T), tuple(self.poses[k + 1].T)
         rest = tuple(fraction * one for one in group.local(b, group.compose(a, whole)))
-        return Between(k, fraction, np.stack(group.compose(group.compose(a, moved), group.exp(rest)), axis=-1))
+        return k, fraction, np.stack(group.compose(group.compose(a, moved), group.exp(rest)), axis=-1)
 
     def _corrected(self, motion: Numbers) -> Numbers:
         if self.factors == (1.0, 1.0):
@@ -98,7 +84,7 @@ class EstimatedPath:
 
     def velocity(self, stamps_ns: Index, after_s: float) -> Array:
         """Twist (n, dof) of the base around these times, in its own axes [m/s, rad/s]."""
-        before, behind = (self.at(stamps_ns, after_s + side).poses for side in (-_AROUND_S, _AROUND_S))
+        before, behind = (self.at(stamps_ns, after_s + side)[2] for side in (-_AROUND_S, _AROUND_S))
         tangent = self._space.group.local(tuple(behind.T), tuple(before.T))
         return np.stack(tangent, axis=-1) / (2.0 * _AROUND_S)
 

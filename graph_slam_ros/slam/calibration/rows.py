@@ -161,11 +161,9 @@ class _Eyes:
         if (clock := Parameter(edges.source, "clock")) in values:
             after_s = values[clock]
             known = path.knows(edges.stamps_ns, abs(after_s))
-            there = path.at(edges.stamps_ns[known], after_s)
-            x[at[known]] = there.poses
-            self.first[known] = p.keyframes[there.first]
-            self.second[known] = p.keyframes[np.minimum(there.first + 1, len(p.keyframes) - 1)]
-            self.fraction[known] = there.fraction
+            before, self.fraction[known], x[at[known]] = path.at(edges.stamps_ns[known], after_s)
+            self.first[known] = p.keyframes[before]
+            self.second[known] = p.keyframes[np.minimum(before + 1, len(p.keyframes) - 1)]
             self.steps[known, :, list(values).index(clock)] = path.velocity(edges.stamps_ns[known], after_s)
             # Where the path is not known, a sighting that is not brought to its time would contradict the others.
             edges.table.weight.values[edges.rows] = np.where(known | (after_s == 0.0), self._weight, 0.0)
