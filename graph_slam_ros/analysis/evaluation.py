@@ -213,13 +213,7 @@ def scored_drive(run: Path, truth: Trajectory | None, estimate: str = "") -> Dri
     Raises GraphSlamError: the path of the run cannot be read.
     """
     drives = _drives(run)
-    is_split = all(one["sighting"] for one in drives[1:])  # else an older version has condensed the begin of one
-    if estimate in _SIGHTINGS and not is_split:
-        raise GraphSlamError(
-            f"{run / estimate}: where its drives begin is not known, since an older version has condensed them:"
-            " --estimate path.tum"
-        )
-    of_sightings = estimate == _SIGHTINGS[0] or (not estimate and is_split and not is_empty(run / _SIGHTINGS[0]))
+    of_sightings = estimate == _SIGHTINGS[0] or (not estimate and not is_empty(run / _SIGHTINGS[0]))
     default, odometry = _SIGHTINGS if of_sightings else _KEYFRAMES
     name = estimate or default
     if is_empty(run / odometry):

@@ -3,7 +3,7 @@
 All sigmas are relative to what holds the map: the anchor at the first keyframe, fixes, surveyed landmarks.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -109,7 +109,7 @@ class Weakness:
         self._positions = [position_covariance(space, pose, covariance) for pose, covariance in pairs]
         self._turns = [weakest_turn(space, pose, covariance) for pose, covariance in pairs]
         self._sigmas = {
-            POSITION: np.sqrt([max(float(np.linalg.eigvalsh(one)[-1]), 0.0) for one in self._positions]),
+            POSITION: _largest_sigmas(self._positions),
             HEADING: np.array([one.sigma for one in self._turns]),
         }
 
@@ -126,50 +126,36 @@ class Weakness:
 
     def weakest(self) -> Iterator[Weakest]:
         """The weakest position and heading of a keyframe, and the weakest landmark, if there is one."""
-        space = self.run.space
         for what, sigmas in self._sigmas.items():
             k = int(sigmas.argmax())
             keyframe = int(self._free[k])
-            pose = tuple(self.poses[keyframe].tolist())
+            vertex, about = self.run.keyframes[keyframe], f"keyframe {self.run.numbers[keyframe]}"
             if what == POSITION:
                 direction = weakest_position(self._positions[k], self.path_at(keyframe))
-                in_map = np.concatenate([direction.axis, np.zeros(space.dof - space.dimensions)])
             else:
                 direction = self._turns[k]
-                in_map = np.concatenate([np.zeros(space.dimensions), direction.axis])
-            yield Weakest(
-                *(
-                    what,
-                    f"keyframe {self.run.numbers[keyframe]}",
-                    self.run.keyframes[keyframe],
-                    pose,
-                    keyframe,
-                    direction,
-                ),
-                *(float(np.median(sigmas)), self._in_tangent(pose, in_map)),
-            )
-        yield from self._weakest_landmark()
+            yield self._weakest(what, about, vertex, keyframe, direction, sigmas)
+        free = {name: vertex for name, vertex in self.run.landmarks.items() if vertex not in self.run.held}
+        if free:
+            covariances = [
+                position_covariance(self.run.space, self.value(vertex), covariance)
+                for vertex, covariance in zip(free.values(), self.run.solver.marginal([*free.values()]), strict=True)
+            ]
+            sigmas = _largest_sigmas(covariances)
+            k = int(sigmas.argmax())
+            name, vertex = [*free.items()][k]
+            keyframe = next((at for at, seen in enumerate(self.seen) if name in seen), 0)
+            direction = weakest_position(covariances[k])
+            yield self._weakest(LANDMARK, f"landmark {name}", vertex, keyframe, direction, sigmas)
 
-    def _weakest_landmark(self) -> Iterator[Weakest]:
-        run, n = self.run, self.run.space.dimensions
-        free = {name: vertex for name, vertex in run.landmarks.items() if vertex not in run.held}
-        if not free:
-            return
-        covariances = [
-            position_covariance(run.space, self.value(vertex), covariance)
-            for vertex, covariance in zip(free.values(), run.solver.marginal([*free.values()]), strict=True)
-        ]
-        sigmas = np.sqrt([max(float(np.linalg.eigvalsh(one)[-1]), 0.0) for one in covariances])
-        k = int(sigmas.argmax())
-        name, vertex = [*free.items()][k]
-        value, direction = self.value(vertex), weakest_position(covariances[k])
-        keyframes = [at for at, seen in enumerate(self.seen) if name in seen]
-        in_map = np.concatenate([direction.axis, np.zeros(run.graph.kind_of(vertex).dof - n)])
-        functional = in_map if len(value) == n else self._in_tangent(value, in_map)
-        yield Weakest(
-            *(LANDMARK, f"landmark {name}", vertex, value, keyframes[0] if keyframes else 0, direction),
-            *(float(np.median(sigmas)), functional),
-        )
+    def _weakest(
+        self, what: str, about: str, vertex: int, keyframe: int, direction: WeakDirection, sigmas: Array
+    ) -> Weakest:
+        space, value, dof = self.run.space, self.value(vertex), self.run.graph.kind_of(vertex).dof
+        in_map = np.zeros(dof)
+        in_map[slice(space.dimensions, None) if what == HEADING else slice(space.dimensions)] = direction.axis
+        functional = in_map if len(value) == space.dimensions else self._in_tangent(value, in_map)
+        return Weakest(what, about, vertex, value, keyframe, direction, float(np.median(sigmas)), functional)
 
     def value(self, vertex: int) -> Numbers:
         """The estimate of a vertex."""
@@ -235,11 +221,9 @@ class Weakness:
 
     def _stretch(self, what: str, first: int, last: int, sigma: float, usual: float) -> Stretch:
         stamps_ns = self.run.stamps_ns
-        return Stretch(
-            *(what, self.run.numbers[first], self.run.numbers[last], stamps_ns[first], stamps_ns[last]),
-            *(float(self.travelled_m[first]), self._length(first, last), sigma, usual),
-            self._reason(first, last) if what else "no landmark seen",
-        )
+        reason = self._reason(first, last) if what else "no landmark seen"
+        at = self.run.numbers[first], self.run.numbers[last], stamps_ns[first], stamps_ns[last]
+        return Stretch(what, *at, float(self.travelled_m[first]), self._length(first, last), sigma, usual, reason)
 
     def _reason(self, first: int, last: int) -> str:
         """Return the reason why a stretch is weak: what was seen in it, and what of that is known from elsewhere."""
@@ -262,6 +246,10 @@ class Weakness:
         if len(sightings) < _FEW * len(within):
             return f"only {few}"
         return f"loosely tied to what holds the map, by {few}"
+
+
+def _largest_sigmas(covariances: Sequence[Array]) -> Array:
+    return np.sqrt([max(float(np.linalg.eigvalsh(one)[-1]), 0.0) for one in covariances])
 
 
 def _runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:

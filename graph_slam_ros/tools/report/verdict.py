@@ -164,30 +164,25 @@ def versions(run: Path, summary: Mapping[str, Any]) -> list[Row]:
 
 def timing(summary: Mapping[str, Any]) -> list[Row]:
     """Time, memory and backlog of the run, as its summary has them."""
-    rows: list[Row] = []
-    if "time_s" in summary:
-        rows.append(["time", f"{summary['time_s']:.1f} s"])
-    if "cpu_s" in summary:
-        rows.append(["CPU time", f"{summary['cpu_s']:.1f} s"])
-    span_s, solves = summary.get("span_s"), summary.get("solves")
-    if span_s:
-        rows.append(["span of the drive", f"{span_s:.1f} s"])
-        if "cpu_s" in summary:
-            rows.append(["CPU time per second of the drive", f"{summary['cpu_s'] / span_s:.3f} s"])
-    if solves:
-        rows.append(["solves", str(solves)])
-        if "cpu_s" in summary:
-            rows.append(["CPU time per solve, with all else", f"{1e3 * summary['cpu_s'] / solves:.2f} ms"])
-    if summary.get("unprocessed"):
-        rows.append(["backlog at the end", f"{summary['unprocessed']} measurements accepted and not processed"])
-    elif "unprocessed" in summary:
+    cpu_s, span_s, solves = (summary.get(name) or None for name in ("cpu_s", "span_s", "solves"))
+    known = {
+        "time": (summary.get("time_s"), "{:.1f} s"),
+        "CPU time": (cpu_s, "{:.1f} s"),
+        "span of the drive": (span_s, "{:.1f} s"),
+        "CPU time per second of the drive": (cpu_s and span_s and cpu_s / span_s, "{:.3f} s"),
+        "solves": (solves, "{}"),
+        "CPU time per solve, with all else": (cpu_s and solves and 1e3 * cpu_s / solves, "{:.2f} ms"),
+        "backlog at the end": (summary.get("unprocessed") or None, "{} measurements accepted and not processed"),
+    }
+    rows: list[Row] = [[name, text.format(value)] for name, (value, text) in known.items() if value is not None]
+    if summary.get("unprocessed") == 0:
         rows.append(["backlog at the end", "none"])
     load = dict(summary.get("load") or {})
     if load:
         rows.append(["largest backlog", f"{max(load['backlog'])} measurements"])
         rows.append(["memory, at most", f"{max(load['memory_mib']):.0f} MiB, with Python and its libraries"])
     else:
-        rows.append(["memory", "not in this run folder: it was not ended, or is of an earlier version"])
+        rows.append(["memory", "not in this run folder: it was not ended"])
     return rows
 
 
