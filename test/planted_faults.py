@@ -18,7 +18,7 @@ from graph_slam_ros.messages.from_msg import decoder
 from graph_slam_ros.runs.check import check
 from graph_slam_ros.tools.simulation import Drive, Fault, simulate, spoil_messages, write_bag
 from graph_slam_ros.tools.simulation.drive import Sightings
-from graph_slam_ros.tools.simulation.odometry_faults import _moved
+from graph_slam_ros.tools.simulation.message_faults import _moved
 
 TRUTH = "/ground_truth"
 

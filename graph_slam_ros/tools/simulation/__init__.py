@@ -13,8 +13,7 @@ from graph_slam_ros.tools.simulation import flight, manhattan, pythonrobotics, w
 from graph_slam_ros.tools.simulation.bag import write_bag
 from graph_slam_ros.tools.simulation.draft import WrongLine, WrongMessage, write_table
 from graph_slam_ros.tools.simulation.drive import Drive
-from graph_slam_ros.tools.simulation.faults import KINDS, Fault, spoil_messages
-from graph_slam_ros.tools.simulation.faulty import faulty_graph, faulty_recording
+from graph_slam_ros.tools.simulation.faults import KINDS, Fault, faulty_graph, faulty_recording, spoil_messages
 from graph_slam_ros.tools.simulation.instruments import with_instruments
 from graph_slam_ros.tools.simulation.message_faults import MESSAGE_KINDS
 from graph_slam_ros.tools.simulation.options import filled, options_of
