@@ -19,20 +19,6 @@ from graph_slam_ros.typing import Array, Index, Numbers
 Measured = Literal["odometry", "sighting", "closure"]
 
 
-@dataclass(frozen=True, slots=True)
-class Wrong:
-    """A fault of a measurement.
-
-    Attributes
-    ----------
-    fault : its kind; where several hit one measurement, their kinds with ``+`` between
-    true_id : of a sighting, the landmark that was seen; empty of others
-    """
-
-    fault: str
-    true_id: str = ""
-
-
 @dataclass(slots=True)
 class Draft:
     """Odometry, sightings and closures of n poses, in order of time.
@@ -46,7 +32,8 @@ class Draft:
     landmarks : true places by id
     closures : of true places; false ones are added
     places : the poses that closures join
-    wrong : what faults have made wrong, by what was measured and its number; of odometry the later pose's
+    wrong : by what was measured and its number (of odometry the later pose's), the faults that hit it
+    true_ids : of the landmarks that were really seen, whatever ids the sightings have now
     """
 
     space: Geometry
@@ -58,7 +45,11 @@ class Draft:
     landmarks: Mapping[str, Numbers]
     closures: Closures
     places: Index
-    wrong: dict[tuple[Measured, int], Wrong] = field(default_factory=dict)
+    wrong: dict[tuple[Measured, int], list[str]] = field(default_factory=dict)
+    true_ids: list[str] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.true_ids = [s.id for s in self.sightings]
 
     def __len__(self) -> int:
         return len(self.odometry)
@@ -67,27 +58,27 @@ class Draft:
         """The pose at a fraction of the drive: 0 is the first, 1 the last."""
         return round(fraction * (len(self) - 1))
 
-    def true_id(self, number: int) -> str:
-        """The landmark that was really seen, whatever id the sighting has now."""
-        wrong = self.wrong.get(("sighting", number))
-        return wrong.true_id if wrong else self.sightings[number].id
+    def mark(self, what: Measured, number: int, fault: str) -> None:
+        """Note that a fault has hit a measurement."""
+        faults = self.wrong.setdefault((what, number), [])
+        if fault not in faults:
+            faults.append(fault)
 
     def spoil(self, number: int, fault: str, sighting: Sighting) -> None:
         """Replace a sighting by a wrong one."""
-        before = self.wrong.get(("sighting", number))
-        self.wrong["sighting", number] = Wrong(_both(before, fault), self.true_id(number))
+        self.mark("sighting", number, fault)
         self.sightings[number] = sighting
 
     def spoil_odometry(self, later: Sequence[int], fault: str) -> None:
         """Mark the motion up to some poses as wrong."""
         for pose in later:
-            self.wrong["odometry", pose] = Wrong(_both(self.wrong.get(("odometry", pose)), fault))
+            self.mark("odometry", pose, fault)
 
     def add_closures(self, false: Closures, fault: str) -> None:
         """Append false closures."""
         old = self.closures
         for k in range(len(old), len(old) + len(false)):
-            self.wrong["closure", k] = Wrong(fault)
+            self.mark("closure", k, fault)
         self.closures = Closures(
             np.concatenate([old.ends, false.ends]),
             np.concatenate([old.measured, false.measured]),
@@ -109,7 +100,7 @@ class Draft:
             return replace(old, measured=tuple(moved.tolist()))
         edge, at = self.space.sightings[old.kind], np.array([[0, len(T_world_base)]])
         whole = edge.whole(np.array([*old.measured, *(old.T_base_sensor or ())])[None])
-        true = np.array(self.landmarks[self.true_id(number)][:n])
+        true = np.array(self.landmarks[self.true_ids[number]][:n])
         before, after = (
             edge.linearize(np.concatenate([T_world_base, place]), at, whole)[0][0] for place in (true, true + displaced)
         )
@@ -117,10 +108,6 @@ class Draft:
         angles = slice("range" in old.kind, None)
         moved[angles] = se2.wrap(moved[angles])
         return replace(old, measured=tuple(moved.tolist()))
-
-
-def _both(before: Wrong | None, fault: str) -> str:
-    return fault if before is None or fault in before.fault.split("+") else f"{before.fault}+{fault}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,6 +4,7 @@ A fault is put into a ``Draft``, which lists what is wrong in it. The same seed 
 its own stream of random numbers, so that one more fault changes none of the others.
 """
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -55,14 +56,14 @@ def false_closures(
 
 def wrong_ids(draft: Draft, rng: Generator, rate: float = option(0.05, "of all sightings", "", 0, 1)) -> None:
     """Sightings with the id of another landmark, if possible one that is not in the same message."""
-    names = list(_times(draft, 0, 0))
+    names = list(dict.fromkeys(draft.true_ids))
     if len(names) < 2:
         raise GraphSlamError(f"wrong_ids: {len(names)} landmarks are seen; another one's id needs two")
     for k in _random_subset(rng, len(draft.sightings), rate):
         message = np.flatnonzero(draft.seen_at == draft.seen_at[k]).tolist()
-        others_in_message = {name for j in message for name in (draft.sightings[j].id, draft.true_id(j))}
+        others_in_message = {name for j in message for name in (draft.sightings[j].id, draft.true_ids[j])}
         others = [name for name in names if name not in others_in_message] or [
-            n for n in names if n != draft.true_id(k)
+            n for n in names if n != draft.true_ids[k]
         ]
         draft.spoil(k, "wrong_ids", replace(draft.sightings[k], id=others[rng.integers(len(others))]))
 
@@ -78,8 +79,8 @@ def swapped_ids(
     names = _some(rng, _seen_on_both_sides(draft, begin), 2 * pairs, "swapped_ids")
     other = dict(zip(names[::2] + names[1::2], names[1::2] + names[::2], strict=True))
     for k, s in enumerate(draft.sightings):
-        if draft.seen_at[k] >= begin and draft.true_id(k) in other:
-            draft.spoil(k, "swapped_ids", replace(s, id=other[draft.true_id(k)]))
+        if draft.seen_at[k] >= begin and draft.true_ids[k] in other:
+            draft.spoil(k, "swapped_ids", replace(s, id=other[draft.true_ids[k]]))
 
 
 def moved_landmarks(
@@ -96,8 +97,8 @@ def moved_landmarks(
     ways = distance_m * np.column_stack([np.cos(angles), np.sin(angles), np.zeros(len(names))])
     displaced = dict(zip(names, ways[:, : draft.space.dimensions], strict=True))
     for k in range(len(draft.sightings)):
-        if draft.seen_at[k] >= begin and draft.true_id(k) in displaced:
-            draft.spoil(k, "moved_landmarks", draft.seen_from(k, displaced[draft.true_id(k)]))
+        if draft.seen_at[k] >= begin and draft.true_ids[k] in displaced:
+            draft.spoil(k, "moved_landmarks", draft.seen_from(k, displaced[draft.true_ids[k]]))
 
 
 def outliers(
@@ -210,18 +211,12 @@ def _random_subset(rng: Generator, count: int, rate: float) -> list[int]:
     return np.sort(rng.permutation(count)[: round(rate * count)]).tolist()
 
 
-def _times(draft: Draft, first: int, end: int) -> Mapping[str, int]:
-    """Return how often each landmark is seen from a range of poses."""
-    out: dict[str, int] = {}
-    for k, at in enumerate(draft.seen_at.tolist()):
-        name = draft.true_id(k)
-        out[name] = out.get(name, 0) + (first <= at < end)
-    return out
-
-
 def _seen_on_both_sides(draft: Draft, pose: int) -> list[str]:
-    before, after = _times(draft, 0, pose), _times(draft, pose, len(draft))
-    return [name for name in before if min(before[name], after[name]) >= _OFTEN]
+    """The landmarks that are seen often enough before a pose, and from it on."""
+    is_before = (draft.seen_at < pose).tolist()
+    before = Counter(name for name, early in zip(draft.true_ids, is_before, strict=True) if early)
+    whole = Counter(draft.true_ids)
+    return [name for name in whole if min(before[name], whole[name] - before[name]) >= _OFTEN]
 
 
 def _some(rng: Generator, names: Sequence[str], count: int, fault: str) -> list[str]:
@@ -325,8 +320,8 @@ def faulty_recording(recording: Recording, faults: Sequence[Fault], seed: int) -
 
     names = recorded_names(recording)
     rows = [
-        WrongMessage(*message(what, k), wrong.fault, names.get(wrong.true_id, ""))
-        for (what, k), wrong in draft.wrong.items()
+        WrongMessage(*message(what, k), "+".join(kinds), names[draft.true_ids[k]] if what == "sighting" else "")
+        for (what, k), kinds in draft.wrong.items()
     ]
     return faulty, sorted(rows, key=lambda row: (row.stamp_ns, row.topic, row.index or 0))
 
