@@ -13,6 +13,7 @@ from graph_slam_ros.cli import console
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import POSE_PRIOR, POSE_PRIOR_3D, SE2, SE3, Graph
 from graph_slam_ros.optimization import Solution
+from graph_slam_ros.slam.landmarks.rigid_alignment import aligned
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.tools.certificate.spectrum import least_eigenvalue, polish
 from graph_slam_ros.tools.certificate.synchronization import RELATIVE, Edges, Poses, Synchronization
@@ -193,12 +194,9 @@ def _too_far(sigmas: float, verdict: str) -> str:
 
 
 def _distances(a: Array, b: Array) -> Array:
-    """The distances of points (n, d), after the rigid motion of b that makes their squares least (Kabsch 1976)."""
-    a, b = a - a.mean(axis=0), b - b.mean(axis=0)
-    u, _, vt = np.linalg.svd(b.T @ a)
-    sign = np.ones(a.shape[1])
-    sign[-1] = np.linalg.det(u @ vt)
-    return np.asarray(np.linalg.norm(b @ (u * sign) @ vt - a, axis=1))
+    """The distances of points (n, d), after the rigid motion of b that makes their squares least."""
+    turn, shift = aligned(b, a, np.ones(len(a)))
+    return np.asarray(np.linalg.norm(b @ turn.T + shift - a, axis=1))
 
 
 def _sigmas(graph: Graph, estimate: Array, here: Poses, there: Poses, root: int) -> float:
