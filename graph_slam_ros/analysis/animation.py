@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from graph_slam_ros.analysis.evaluation import dimensions_of, input_topics, scored_drive
-from graph_slam_ros.analysis.path_error import matched
+from graph_slam_ros.analysis.evaluation import input_topics, truth_in_map
 from graph_slam_ros.analysis.plots import canvas, dress
 from graph_slam_ros.analysis.trajectories import read_truth
 from graph_slam_ros.colours import LIGHT
@@ -65,7 +64,9 @@ def animate_run(
     """
     if out_gif.suffix != ".gif":
         raise GraphSlamError(f"{out_gif}: an animation is a .gif file")
-    known, losses = _truth(run, truth, topic, align=align) if truth else None, list[str]()
+    known, losses = None, list[str]()
+    if truth:
+        known = truth_in_map(run, read_truth(truth, topic, input_topics(run)), align=align)
     moments = list(_moments(run, frames, losses))
     if not moments:
         raise GraphSlamError(f"{run}: nothing of the drive can be repeated: it has no ingest.mcap, or an empty one")
@@ -80,13 +81,6 @@ def animate_run(
     except OSError as error:
         raise GraphSlamError(f"{out_gif}: {error.strerror or error}") from None
     return losses
-
-
-def _truth(run: Path, truth: str, topic: str, *, align: bool) -> Trajectory:
-    """The true path in the frame map."""
-    known = read_truth(truth, topic, input_topics(run)).trajectory
-    found = matched(scored_drive(run, known).estimate, known, dimensions_of(run), align=align)
-    return known.moved(se3.inverse(found.T_truth_path))
 
 
 def _moments(run: Path, frames: int, losses: list[str]) -> Iterator[_Moment]:

@@ -19,6 +19,7 @@ from graph_slam_ros.analysis.path_error import (
     Statistics,
     alignment,
     associate,
+    matched,
     path_error,
 )
 from graph_slam_ros.analysis.run_consistency import consistency_of
@@ -242,6 +243,13 @@ def scored_drive(run: Path, truth: Trajectory | None, estimate: str = "") -> Dri
         if truth is None or _overlap(part.estimate, truth):
             return part
     return chosen or Drive(whole.in_order(), odometry_path and odometry_path.in_order(), (name, odometry))
+
+
+def truth_in_map(run: Path, known: Truth, *, align: bool = True) -> Trajectory:
+    """The true path in the frame map: the drive that it is of is laid on it."""
+    drive = scored_drive(run, known.trajectory)
+    found = matched(drive.estimate, known.trajectory, dimensions_of(run), align=align)
+    return known.trajectory.moved(se3.inverse(found.T_truth_path))
 
 
 def _drives(run: Path) -> list[dict[str, int]]:

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from graph_slam_ros.analysis.evaluation import scored_drive
-from graph_slam_ros.analysis.path_error import matched
+from graph_slam_ros.analysis.evaluation import truth_in_map
 from graph_slam_ros.analysis.trajectories import Truth
 from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.errors import GraphSlamError
@@ -43,10 +42,7 @@ def paths(
     drawn = {"odometry": reckoned.moved(T_map_odom), "estimate": path}
     out: dict[str, Any] = {"keyframes": len(path.stamps_s), "stamps": pack.column(path.stamps_s, "f8")}
     if known is not None:
-        drive = scored_drive(run, known.trajectory)
-        one = matched(drive.estimate, known.trajectory, saved.space.dimensions, align=align)
-        T_map_truth = se3.inverse(one.T_truth_path)
-        drawn["truth"] = _thinned(known.trajectory, MOST_TRUTH).moved(T_map_truth)
+        drawn["truth"] = _thinned(truth_in_map(run, known, align=align), MOST_TRUTH)
     if other is not None:
         drawn["other"] = read_rows(other / "path.tum")
     every = max(1, math.ceil(len(path.stamps_s) / MOST_KEYFRAMES))
