@@ -20,7 +20,6 @@ from graph_slam_ros.typing import Array, Index, Numbers
 _SAME_M = 1e-3  # nobody calls that moved
 _DIGITS = 6  # of what was measured
 _SHOWN = 10
-StampedPath = tuple[Index, Array]
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,9 +96,6 @@ class Difference:
         apart = [None if math.isnan(metres) else metres for metres in self.keyframes_m]
         return asdict(self) | {"keyframes_m": apart, "same": self.is_same}
 
-    def __str__(self) -> str:
-        return "\n".join(self.lines())
-
     def lines(self) -> Iterator[str]:
         """Yield what differs, for people."""
         yield f"{'':10s}{'A':>14s}{'B':>14s}{'both':>14s}"
@@ -150,7 +146,7 @@ def diff(a: Path, b: Path, losses: list[str]) -> Difference:
     one, two = (restored(folder, losses) for folder in (a, b))
     refuse_other_space(one, two, a, b)
     common = shared_landmarks(one, two)
-    at = _of_one_stamp(*(whole_path(folder, slam) for folder, slam in ((a, one), (b, two))))
+    at = _of_one_stamp(WholePath.of(one, a), WholePath.of(two, b))
     aligned, by, T_a_b = _aligned(one, two, common, at)
     apart = _keyframe_distances(one, at, T_a_b)
     known = [set(slam.landmarks) for slam in (one, two)]
@@ -190,17 +186,11 @@ def _aligned(
     return as_they_are(space, a, b, T_a_b), by, T_a_b
 
 
-def whole_path(folder: Path, slam: GraphSlam) -> StampedPath:
-    """Return stamps [ns] (n,) and poses (n, size) of all keyframes of a run, those that were condensed included."""
-    whole = WholePath.of(slam, folder)
-    return whole.stamps_ns, whole.poses()
-
-
-def _of_one_stamp(one: StampedPath, two: StampedPath) -> tuple[Array, Array]:
+def _of_one_stamp(one: WholePath, two: WholePath) -> tuple[Array, Array]:
     """Poses of the keyframes with the same stamp. Several of one stamp are paired in order."""
-    a, b = _by_stamp(one[0]), _by_stamp(two[0])
+    a, b = _by_stamp(one.stamps_ns), _by_stamp(two.stamps_ns)
     common = [stamp for stamp in a if stamp in b]
-    return one[1][[a[stamp] for stamp in common]], two[1][[b[stamp] for stamp in common]]
+    return one.poses()[[a[stamp] for stamp in common]], two.poses()[[b[stamp] for stamp in common]]
 
 
 def _by_stamp(stamps_ns: Index) -> dict[tuple[int, int], int]:

@@ -66,10 +66,9 @@ class Workbench:
             }
             for do, action in ACTIONS.items()
         ]
-        edits = [
-            [shown(part) for part in (e.name, e.text, e.who, e.when, e.why)]
-            for e in (a.edit for a in self._saved.edits)
-        ]
+        run = self._saved
+        headings = np.round(run.whole_path.poses()[:, 2], _DECIMALS).tolist() if run.space.dimensions == 2 else []
+        edits = [[shown(part) for part in (e.name, e.text, e.who, e.when, e.why)] for e in (a.edit for a in run.edits)]
         return {
             "plan": {"format": FORMAT, "version": VERSION, "source": self._source},
             "kinds": kinds,
@@ -77,19 +76,10 @@ class Workbench:
             "scale": self._scale,
             "who": _user(),
             "edits": edits,
-            "headings": self._headings,
+            "headings": headings,
             "run": _path(self._run),
-            "names": [one.edit.name for one in self._saved.edits],
+            "names": [one.edit.name for one in run.edits],
         }
-
-    @property
-    def _headings(self) -> list[float]:
-        """The headings of the keyframes [rad]; none in space."""
-        run = self._saved
-        if run.space.dimensions == 3:
-            return []
-        values: list[float] = np.round(run.whole_path.poses()[:, 2], _DECIMALS).tolist()
-        return values
 
     def solve(self, body: bytes) -> dict[str, Any]:
         """Solve the run without some edges, with others, or with another loss, as ``graph_slam explain RUN --without``.
