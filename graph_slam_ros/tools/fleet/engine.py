@@ -2,8 +2,12 @@
 
 import contextlib
 import itertools
+import json
+import subprocess
+import sys
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import asdict
 from typing import Any
 
 import dask
@@ -11,10 +15,11 @@ from distributed import Client, LocalCluster, as_completed
 
 from graph_slam_ros import __version__
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.tools.fleet.isolation import MOST_ATTEMPTS, run_isolated
 from graph_slam_ros.tools.fleet.job import Job, failed
 from graph_slam_ros.tools.fleet.store import Row
 
+MOST_ATTEMPTS = 3
+_MODULE = "graph_slam_ros.tools.fleet.job"
 _SETTINGS = {
     "distributed.scheduler.allowed-failures": MOST_ATTEMPTS - 1,  # ends of a worker's process that a task survives
     "distributed.scheduler.worker-saturation": 1.0,  # tasks wait at the scheduler, in their order
@@ -77,6 +82,31 @@ def _version() -> str:
     except ImportError:
         return "not installed"
     return here
+
+
+def run_isolated(job: Job) -> Row:
+    """Run a job in a process of its own; returns its row.
+
+    So a limit, a crash or a kill ends the job and never the worker. A job is begun again where its process ends, or its
+    machine fails: three times in all.
+    """
+    reason, given = "", json.dumps(asdict(job)).encode()
+    for _ in range(MOST_ATTEMPTS):
+        command = [sys.executable, "-m", _MODULE]
+        try:
+            done = subprocess.run(
+                command, input=given, stdout=subprocess.PIPE, timeout=job.limit_s, start_new_session=True, check=False
+            )
+            row: Row = json.loads(done.stdout)
+        except subprocess.TimeoutExpired:
+            reason = f"took longer than the limit of time, {MOST_ATTEMPTS} times"
+        except ValueError:
+            reason = f"its process ended {MOST_ATTEMPTS} times: killed, out of memory, or a crash"
+        else:
+            if not row.get("retry"):
+                return row
+            reason = row["reason"]
+    return failed(job, reason)
 
 
 def run_jobs(

@@ -5,12 +5,16 @@ machine: then the job is begun again.
 """
 
 import contextlib
+import ctypes
 import errno
 import hashlib
+import json
 import os
 import platform
 import resource
 import shutil
+import signal
+import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping
@@ -32,6 +36,7 @@ if TYPE_CHECKING:
 _HASHED = ("graph.g2o", "ledger.csv", "path.tum", "landmarks.csv")
 _OF_THE_MACHINE = {errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS, errno.ESTALE, errno.EMFILE, errno.ENFILE}
 _PARTS = 40
+_PR_SET_PDEATHSIG = 1  # of Linux: the signal that comes when the parent ends
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,8 +146,6 @@ def _results(job: Job, made: Path) -> Row:
     from graph_slam_ros.runs.outcome import shortcomings
     from graph_slam_ros.runs.replay import replay
 
-    with contextlib.suppress(OSError):
-        Path("/proc/self/clear_refs").write_text("5")  # the peak of memory begins anew
     begun = time.process_time()
     with tempfile.TemporaryDirectory(prefix="graph_slam_fleet_") as scratch:
         source = local_copy(job.url, Path(scratch))
@@ -230,3 +233,20 @@ def _map_hash(run: Path) -> str:
     for name in _HASHED:
         digest.update(read_bytes(run / name))
     return digest.hexdigest()[:16]
+
+
+def _main() -> None:
+    """Run the job of standard input, and write its row to standard output; what it prints goes to standard error."""
+    with contextlib.suppress(OSError, AttributeError):  # nobody needs the job when its worker has ended
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    # Now: imports under a limit of memory fail in ways of their own.
+    import graph_slam_ros.analysis.evaluation
+    import graph_slam_ros.runs.replay  # noqa: F401
+
+    with contextlib.redirect_stdout(sys.stderr):
+        row = run_job(Job(**json.load(sys.stdin)))
+    sys.stdout.write(json.dumps(row))
+
+
+if __name__ == "__main__":
+    _main()

@@ -19,9 +19,8 @@ from reliability import times
 
 from graph_slam_ros import cli
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.tools.fleet import engine, isolation
-from graph_slam_ros.tools.fleet.engine import connected, run_jobs
-from graph_slam_ros.tools.fleet.isolation import run_isolated
+from graph_slam_ros.tools.fleet import engine
+from graph_slam_ros.tools.fleet.engine import connected, run_isolated, run_jobs
 from graph_slam_ros.tools.fleet.job import Job, run_job
 from graph_slam_ros.tools.fleet.replay import Fleet, jobs_of, replay_all
 from graph_slam_ros.tools.fleet.store import Store
@@ -183,7 +182,7 @@ def job(drives, out, **options):
 
 
 def test_a_job_beyond_its_limits_or_without_its_truth_is_a_row_that_says_so(drives, tmp_path, monkeypatch):
-    monkeypatch.setattr(isolation, "MOST_ATTEMPTS", 1)
+    monkeypatch.setattr(engine, "MOST_ATTEMPTS", 1)
     slow = run_isolated(job(drives, tmp_path / "out", limit_s=0.05))
     assert slow["state"] == "failed" and "limit of time" in slow["reason"]
     assert slow["retry"], "the next command runs it again"
