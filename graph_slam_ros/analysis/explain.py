@@ -104,7 +104,6 @@ def _worst(entries: Iterable[Entry]) -> Iterator[str]:
 
 
 def _least(entries: Iterable[Entry]) -> Iterator[str]:
-    """The accepted edges that fit worst now."""
     least = sorted(entries, key=lambda e: -e.chi2 / e.dof)[:_SHOWN]
     if least:
         yield "accepted; the largest chi2 first:"
@@ -318,7 +317,6 @@ def _decided(e: Entry, config: Config, *, is_changed: bool) -> str:
 
 
 def _what_if(run: SavedGraph, e: Entry) -> Iterator[str]:
-    """The effect on the map if this edge were accepted, or rejected."""
     which = "out" if e.is_in else "in with its full weight"
     try:
         moved = run.moved(run.solve([e.edge] if e.is_in else [], [] if e.is_in else [e.edge]))

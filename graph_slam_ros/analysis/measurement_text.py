@@ -69,7 +69,6 @@ def template(entry: Entry, name: str) -> str:
 
 
 def _names(tag: str, dof: int) -> Sequence[str]:
-    """Name and unit of each number that an edge measures."""
     return _NAMES.get(tag) or (_XY if dof == 2 else _XYZ)
 
 

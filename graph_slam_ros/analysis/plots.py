@@ -304,7 +304,6 @@ def canvas(size: tuple[float, float], dpi: int = _DPI) -> Any:
 
 
 def _figure(count: int) -> Any:
-    """A figure and its axes side by side, equal scales, metres."""
     figure = canvas((_INCHES * (1.0 + 0.6 * (count - 1)), _INCHES))
     axes = figure.subplots(1, count, squeeze=False)[0]
     for one in axes:

@@ -97,7 +97,6 @@ class RelativeCovariances:
         return np.hstack([(turned - np.eye(2)) @ self._by_position(first), -turned @ self._by_position(last)])
 
     def _by_position(self, pose: Numbers) -> Array:
-        """Jacobian of the position of a pose by its tangent space."""
         n = self._space.dimensions
         return np.hstack([self._space.turn(pose), np.zeros((n, self._space.dof - n))])
 

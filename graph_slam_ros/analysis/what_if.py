@@ -363,7 +363,6 @@ class SavedGraph:
         return solver
 
     def _ends(self, graph: Graph, row: int) -> Sequence[int]:
-        """The vertices of an edge of the run, or of one that is let in."""
         return self.entries[row].vertices if row < len(self.entries) else graph.edge(row).vertices
 
     def moved(self, solver: Solver) -> MovedVertex:

@@ -58,7 +58,6 @@ def explain(args: argparse.Namespace) -> int:
 
 
 def _solve(args: argparse.Namespace) -> int:
-    """Solve a run's graph again with other edges or another loss, and print what moves."""
     from graph_slam_ros.analysis.what_if import SavedGraph
 
     losses: list[str] = []
@@ -75,7 +74,6 @@ def _solve(args: argparse.Namespace) -> int:
 
 
 def _influence(args: argparse.Namespace) -> int:
-    """Print the edges with the largest influence on the last pose."""
     from graph_slam_ros.analysis.what_if import SavedGraph
 
     losses: list[str] = []

@@ -154,7 +154,6 @@ def _remedy(args: argparse.Namespace, solution: "Solution") -> str:
 
 
 def _options(args: argparse.Namespace) -> Iterable[str]:
-    """Yield the options of the solution as they were typed."""
     from graph_slam_ros.cli.parser import parser
 
     usual = parser(["optimize"]).parse_args(["optimize", "GRAPH"])

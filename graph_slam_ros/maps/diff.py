@@ -249,7 +249,6 @@ def _names(slam: GraphSlam) -> dict[int, int | str]:
 
 
 def _about(slam: GraphSlam, names: dict[int, int | str], edge: int) -> str:
-    """The edge's class, and its landmark or stamp."""
     one = slam.graph.edge(edge)
     name = names.get(one.vertices[-1], "")
     what = f"{name / 1e9:.3f} s" if isinstance(name, int) else name

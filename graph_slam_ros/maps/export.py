@@ -55,7 +55,6 @@ def files_of(out: Path, target: str) -> list[Path]:
 
 
 def _tum(slam: GraphSlam, left: Left, out: Path, first: int = 0) -> list[Path]:
-    """The keyframes from a number on."""
     whole = WholePath(slam, left)
     write_text(out, tum_text(whole.stamps_ns.tolist()[first:], whole.poses()[first:]))
     return [out]

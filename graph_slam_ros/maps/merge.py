@@ -79,7 +79,6 @@ def _refuse_other_datum(one: GraphSlam, two: GraphSlam, a: Path, b: Path) -> Non
 
 
 def _refuse_same_drive(one: GraphSlam, two: GraphSlam, a: Path, b: Path) -> None:
-    """Refuse two maps of one drive, because its measurements would count twice."""
     driven, again = (_driven(WholePath.of(slam, folder)) for slam, folder in ((one, a), (two, b)))
     same = len(driven & again)
     if same > 1:  # two robots may begin at one time
@@ -216,7 +215,6 @@ class _Second:
         }
 
     def _value(self, vertex: int, kind: str) -> list[Any]:
-        """Return its value in the first map."""
         space, value = self._one.space, tuple(self._two.solver.estimate([vertex])[0].tolist())
         of = self._two.graph.kind_of(vertex)
         if of is space.pose:

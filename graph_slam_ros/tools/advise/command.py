@@ -48,7 +48,6 @@ def advise(args: argparse.Namespace) -> int:
 
 
 def _best(some: "list[Advice]", count: int) -> "list[Advice]":
-    """The best of each kind, the best first."""
     kinds: dict[str, int] = {}
     out = []
     for one in some:

@@ -93,7 +93,6 @@ def _made(job: Job) -> Path:
 
 
 def _head(job: Job) -> Row:
-    """Return the columns that say which job it is."""
     return {"key": job.key, "recording": job.recording, "setting": job.setting, "url": job.url, "truth": job.truth}
 
 
@@ -133,7 +132,6 @@ def _memory_limit(memory: int) -> Iterator[None]:
 
 
 def _status_bytes(name: str) -> int:
-    """A size of this process, from Linux."""
     with contextlib.suppress(OSError), open("/proc/self/status") as lines:
         for line in lines:
             if line.startswith(f"{name}:"):
@@ -142,7 +140,6 @@ def _status_bytes(name: str) -> int:
 
 
 def _results(job: Job, made: Path) -> Row:
-    """Replay, score and report; the columns of the row."""
     from graph_slam_ros.runs.outcome import shortcomings
     from graph_slam_ros.runs.replay import replay
 
@@ -202,7 +199,6 @@ def columns(summary: Mapping[str, Any]) -> Row:
 
 
 def _scores(run: Path, truth: str) -> Row:
-    """The errors of a run against the truth."""
     from graph_slam_ros.analysis.evaluation import dimensions_of, evaluate, input_topics, scored_drive
     from graph_slam_ros.analysis.path_error import matched
     from graph_slam_ros.analysis.trajectories import read_truth

@@ -110,7 +110,6 @@ def read_contents(
 
 
 def _title(run: Path, saved: SavedGraph | None) -> str:
-    """The name of the recording, or of the run, and the date."""
     name, start_ns = shown(recording_of(run) or run.resolve().name), int(saved.whole_path.stamps_ns[0]) if saved else 0
     if start_ns < _CLOCK_NS:
         return name
@@ -124,7 +123,6 @@ def _once(lines: Sequence[str]) -> list[str]:
 
 
 def _edges(out: Contents, saved: SavedGraph) -> dict[str, Any]:
-    """The columns of the ledger, and the sentences on each edge."""
     pack, entries, found = out.packing, saved.entries, effects(saved)
     texts = sentences(saved, found)
     ends = [[_end(saved, e, vertex) for vertex in e.vertices] for e in entries]
@@ -189,7 +187,6 @@ def _end(saved: SavedGraph, e: Entry, vertex: int) -> int | str:
 
 
 def _by_hand(saved: SavedGraph) -> dict[str, list[str]]:
-    """The edits of each edge, in words."""
     found: dict[str, list[str]] = {}
     for one in saved.edits:
         for edge in (*one.edges, *one.added):
@@ -208,7 +205,6 @@ def _finite(values: Any) -> Any:
 
 
 def _landmark_texts(saved: SavedGraph, names: list[str]) -> list[str]:
-    """The lines of ``explain`` on each landmark."""
     seen: dict[str, list[Any]] = {name: [] for name in names}
     for e in saved.entries:
         for name in {_end(saved, e, vertex) for vertex in e.vertices} & seen.keys():
@@ -266,7 +262,6 @@ def _chi2_histograms(saved: SavedGraph) -> Iterator[dict[str, Any]]:
 
 
 def _drive(out: Contents, saved: SavedGraph) -> dict[str, Any]:
-    """The frames of the time slider, and the jumps of map -> odom."""
     frames = drive.frames(out.run, saved, out.losses)
     odometry = keyframe_paths(out.run, saved)[1]
     found = drive.corrections(out.run, odometry.stamps_s, odometry.poses, out.losses)
@@ -289,7 +284,6 @@ def _drive(out: Contents, saved: SavedGraph) -> dict[str, Any]:
 
 
 def _tables(out: Contents, summary: dict[str, Any], saved: Any, scores: Scores | None, known: Truth | None) -> None:
-    """The tables below the map."""
     config = out.attempt(lambda: run_config(out.run))
     edits = [one.edit for one in saved.edits] if saved else []
     out.data["tables"] = {

@@ -105,7 +105,6 @@ def jumps(
 
 
 def _published(run: Path, losses: list[str]) -> Iterator[tuple[int, tuple[float, ...]]]:
-    """Stamp and pose of each message of ``/pose``."""
     for file in parts_of(run, _RUN):
         of_pose = -1
         for record in records(file, losses, follow=False):

@@ -113,7 +113,6 @@ def sentences(run: SavedGraph, found: Effects) -> Sentences:
 def _group(
     run: SavedGraph, e: Entry, ends: Sequence[str], effect: tuple[bool, bool, int], *, is_changed: bool
 ) -> dict[str, Any]:
-    """The texts of edges that are like one."""
     if e.label == PLACES:
         return {"title": "edge {edge}", "lines": [["", "{place}"]]}
     lines = [[what, text] for what, text in statements(e, run, is_changed=is_changed)]
@@ -161,7 +160,6 @@ def closure_groups(run: SavedGraph) -> list[Group]:
 
 
 def _ends(run: SavedGraph, e: Entry) -> tuple[int, int]:
-    """The numbers of its two keyframes, the earlier first."""
     a, b = sorted(run.keyframe(vertex) or 0 for vertex in e.vertices)
     return a, b
 

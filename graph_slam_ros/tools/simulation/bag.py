@@ -141,7 +141,6 @@ def _is_polar(recording: Recording) -> bool:
 
 
 def _mounted_sensor(recording: Recording) -> Iterator[Message]:
-    """Where the sensor of ranges and bearings is."""
     if _is_polar(recording):
         T_base_sensor = next(s.T_base_sensor for one in recording.seen for s in one.sightings)
         at = T_base_sensor or space_of(recording.T_world_base[0]).identity

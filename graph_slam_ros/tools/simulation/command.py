@@ -68,7 +68,6 @@ def simulate(args: argparse.Namespace) -> int:
 
 
 def _spoil_recording(args: argparse.Namespace, faults: list[Any]) -> None:
-    """A recording of the user with faults in its messages."""
     from graph_slam_ros.tools.simulation import spoil_bag
 
     for fault in faults:

@@ -207,7 +207,6 @@ def _moved_after(draft: Draft, pose: int, to: Sequence[float]) -> Array:
 
 
 def _random_subset(rng: Generator, count: int, rate: float) -> list[int]:
-    """Choose so many of a number of things, in order."""
     return np.sort(rng.permutation(count)[: round(rate * count)]).tolist()
 
 

@@ -148,7 +148,6 @@ class Workbench:
             raise GraphSlamError("the plan is for another run than the one on this page")
 
     def _places(self, solver: Solver) -> list[list[float]]:
-        """Positions of the keyframes of the run, by axis."""
         n, path = self._saved.space.dimensions, self._saved.whole_path.poses(solver)
         places = np.zeros((3, len(path)))
         places[:n] = path[:, :n].T
@@ -199,7 +198,6 @@ def _landmarks(slam: MapView, solver: Solver) -> dict[str, list[Any]]:
 
 
 def _asked(body: bytes) -> dict[str, Any]:
-    """The question of a what-if. Raises FormatError."""
     try:
         asked = json.loads(body)
     except (ValueError, RecursionError):
@@ -237,7 +235,6 @@ def _free(run: Path) -> Path:
 
 
 def _path(folder: Path) -> str:
-    """A folder as it is typed in a command."""
     return shown(shlex.quote(str(folder)), _MOST_PATH)
 
 
