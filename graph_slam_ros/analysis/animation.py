@@ -47,6 +47,8 @@ def animate_run(
 ) -> list[str]:
     """Repeat a run's drive and draw the estimate of each moment into a GIF, from above.
 
+    Returns what of the drive could not be read, a line each.
+
     Raises GraphSlamError: a file that is missing or unreadable, or that cannot be written.
 
     Dead reckoning is black and begins where the estimate does; the estimate is red; truth is blue, laid on the whole
@@ -57,10 +59,6 @@ def animate_run(
     run : folder of a run, with its ``ingest.mcap``
     frames : at equal steps of time
     truth, topic, align : as ``plots.draw_run`` takes them
-
-    Returns
-    -------
-    what of the drive could not be read, a line each
     """
     if out_gif.suffix != ".gif":
         raise GraphSlamError(f"{out_gif}: an animation is a .gif file")

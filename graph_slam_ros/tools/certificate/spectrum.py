@@ -80,6 +80,9 @@ def factorize(matrix: csc_array) -> Callable[[Array], Array] | None:
 def least_eigenvalue(matrix: csc_array, eliminated: int, tolerance: float) -> float:
     """Smallest eigenvalue of the Schur complement S of a matrix, where its first unknowns are eliminated.
 
+    Returns the eigenvalue; where the iteration does not converge, the shift, which is below it; NaN where no shift is
+    enough, since the block of the first unknowns is not positive definite or cannot be told from rounding.
+
     Lanczos' method on ``(S - s)^-1``, which needs no more than a factorisation of the sparse matrix itself. The shift s
     is below the whole spectrum (or the factorisation fails, and a lower one is tried), so the eigenvalue sought
     is the largest of the inverse however many others are near to it: where a certificate holds, d of them are zero, and
@@ -89,11 +92,6 @@ def least_eigenvalue(matrix: csc_array, eliminated: int, tolerance: float) -> fl
     ----------
     matrix : symmetric; its block of the first ``eliminated`` unknowns is positive definite
     tolerance : the first shift is minus this, > 0
-
-    Returns
-    -------
-    The eigenvalue; where the iteration does not converge, the shift, which is below it; NaN where no shift is enough,
-    since the block of the first unknowns is not positive definite or cannot be told from rounding.
     """
     size = matrix.shape[0] - eliminated
     ones = np.concatenate([np.zeros(eliminated), np.ones(size)])

@@ -54,13 +54,11 @@ def frames(run: Path, saved: SavedGraph, losses: list[str]) -> list[Frame]:
 def corrections(run: Path, stamps_s: Array, odometry: Array, losses: list[str]) -> tuple[Array, Array, Array]:
     """Changes of ``map -> odom`` from keyframe to keyframe, as it was published.
 
+    Returns keyframes (m,), distances (m,) [m] by which the robot was moved at each, angles (m,) [rad].
+
     Parameters
     ----------
     stamps_s, odometry : (n,), (n, 7) of the keyframes, ``T_odom_base``
-
-    Returns
-    -------
-    keyframes (m,), distances (m,) [m] by which the robot was moved at each, angles (m,) [rad]
     """
     published = list(_published(run, losses))
     if len(published) < 2:

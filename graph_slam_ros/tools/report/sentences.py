@@ -142,14 +142,12 @@ def _what_if(run: SavedGraph, e: Entry, ends: Sequence[str], is_known: bool, is_
 def closure_groups(run: SavedGraph) -> list[Group]:
     """Groups of accepted closures that join the same parts of the drive; none where nothing contradicts any closure.
 
+    Returns of each group ``edges``, ``ends`` (first and last keyframe at either end), ``chi2`` with and without it,
+    ``most`` (the keyframe that moves farthest without it, and by how much [m]); the last two are None where nothing
+    else determines the map without it.
+
     Closures of one group agree with one another. If they are wrong together, as where two aisles look alike, no
     statistic of the run shows it. A person who sees the map without each group knows.
-
-    Returns
-    -------
-    of each group ``edges``, ``ends`` (first and last keyframe at either end), ``chi2`` with and without it, ``most``
-    (the keyframe that moves farthest without it, and by how much [m]); the last two are None where nothing else
-    determines the map without it
     """
     closures = [e for e in run.entries if e.label == "closures" and e.verdict and len(e.vertices) == 2]
     inside = [e for e in closures if e.is_in]
