@@ -95,13 +95,12 @@ def _progress(rows: Iterable[Any], total: int) -> Iterator[Any]:
 def compare(args: argparse.Namespace) -> int:
     """Compare two fleets."""
     _check_installed()
+    from graph_slam_ros.tools.fleet.compare import EXCEEDED, LOST, markdown, parse_limit
     from graph_slam_ros.tools.fleet.compare import compare as compared
-    from graph_slam_ros.tools.fleet.compare import markdown, parse_limit
 
     done = compared(args.old, args.new, [parse_limit(text) for text in args.fail])
     console.show(*markdown(done).splitlines())
-    for name in done.lost:
-        console.warn(f"failed now, and not before: {name}", most=console.SENTENCE)
-    for limit in done.exceeded:
-        console.warn(f"exceeded: {limit}", most=console.SENTENCE)
-    return console.DIFFERENT if done.lost or done.exceeded else console.DONE
+    wrong = [f"{title.lower()}: {name}" for title in (LOST, EXCEEDED) for name in done.notes[title]]
+    for line in wrong:
+        console.warn(line, most=console.SENTENCE)
+    return console.DIFFERENT if wrong else console.DONE

@@ -14,6 +14,8 @@ from graph_slam_ros.tools.fleet.store import read_table
 METRICS = ("rmse_m", "rpe_m_per_m", "angle_rad", "map_rmse_m", "nees", "cpu_s", "memory_mib")
 _SHORT = {"rmse": "rmse_m", "rpe": "rpe_m_per_m", "angle": "angle_rad", "map_rmse": "map_rmse_m", "cpu": "cpu_s"}
 _LIMIT = re.compile(r"\s*([a-z_0-9.]+)\s*>\s*([0-9.]+(?:e-?[0-9]+)?)(x?)\s*")
+EXCEEDED, LOST, GAINED = "Exceeded", "Failed now, and not before", "Done now, and not before"
+ONLY_NEW = "Only in the new table"
 _LEVEL, _SEED, _RESAMPLES = 0.95, 0, 2000
 
 
@@ -58,23 +60,10 @@ class Limit:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """Two fleets compared.
-
-    Attributes
-    ----------
-    changes : of each metric that both have
-    lost : recordings that were done in the old one and not in the new one, with the reason
-    gained : recordings that were not done in the old one
-    only_old, only_new : recordings of one of them alone
-    exceeded : the limits that are exceeded, in words
-    """
+    """Two fleets compared: the change of each metric that both have, and by their titles the recordings and limits."""
 
     changes: list[Change]
-    lost: list[str]
-    gained: list[str]
-    only_old: list[str]
-    only_new: list[str]
-    exceeded: list[str]
+    notes: dict[str, list[str]]
 
 
 def parse_limit(text: str) -> Limit:
@@ -98,19 +87,17 @@ def compare(old: Path, new: Path, limits: Sequence[Limit] = ()) -> Comparison:
     common = sorted(before.keys() & after.keys())
     if not common:
         raise GraphSlamError(f"{old} and {new}: no recording and setting in common")
-    lost = [f"{_name(k)}: {after[k]['reason']}" for k in common if _ok(before[k]) and not _ok(after[k])]
-    gained = [_name(k) for k in common if not _ok(before[k]) and _ok(after[k])]
     both = [k for k in common if _ok(before[k]) and _ok(after[k])]
     metrics = dict.fromkeys((*METRICS, *(one.metric for one in limits)))
     changes = [change for metric in metrics if (change := _change_of(metric, both, before, after))]
-    return Comparison(
-        changes,
-        lost,
-        gained,
-        [_name(k) for k in sorted(before.keys() - after.keys())],
-        [_name(k) for k in sorted(after.keys() - before.keys())],
-        _exceeded(limits, {one.metric: one for one in changes}),
-    )
+    notes = {
+        EXCEEDED: _exceeded(limits, {one.metric: one for one in changes}),
+        LOST: [f"{_name(k)}: {after[k]['reason']}" for k in common if _ok(before[k]) and not _ok(after[k])],
+        GAINED: [_name(k) for k in common if not _ok(before[k]) and _ok(after[k])],
+        "Only in the old table": [_name(k) for k in sorted(before.keys() - after.keys())],
+        ONLY_NEW: [_name(k) for k in sorted(after.keys() - before.keys())],
+    }
+    return Comparison(changes, notes)
 
 
 Key = tuple[str, str]
@@ -189,13 +176,7 @@ def markdown(done: Comparison) -> str:
             f"| {one.metric} | {one.count} | {one.old:.4g} | {one.new:.4g} | {one.ratio:.3f} ({low:.3f} to {high:.3f}) "
             f"| {one.verdict} | {_cell(one.worst[0])} {one.worst[1]:.2f}x |"
         )
-    for title, names in (
-        ("Exceeded", done.exceeded),
-        ("Failed now, and not before", done.lost),
-        ("Done now, and not before", done.gained),
-        ("Only in the old table", done.only_old),
-        ("Only in the new table", done.only_new),
-    ):
+    for title, names in done.notes.items():
         if names:
             lines += ["", f"**{title}**", "", *(f"* {_cell(name)}" for name in names)]
     return "\n".join(lines) + "\n"

@@ -10,7 +10,7 @@ pytest.importorskip("distributed", reason="the extra fleet is not installed")
 
 from graph_slam_ros.cli.parser import parser
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.tools.fleet.compare import compare, markdown, parse_limit
+from graph_slam_ros.tools.fleet.compare import EXCEEDED, GAINED, LOST, ONLY_NEW, compare, markdown, parse_limit
 from graph_slam_ros.tools.fleet.page import write_page
 from graph_slam_ros.tools.fleet.recordings import find_sources, local_copy
 from graph_slam_ros.tools.fleet.replay import settings_of, truth_of
@@ -89,7 +89,7 @@ def tables(folder, old, new):
 def test_a_regression_exceeds_its_limit_and_chance_does_not(tmp_path):
     limits = [parse_limit("rmse>1.02x"), parse_limit("cpu>1.5x"), parse_limit("rmse_m>0.2")]
     worse = compare(*tables(tmp_path, rows(), rows(1.1)), limits)
-    assert [line.split(":")[0] for line in worse.exceeded] == ["rmse>1.02x"]
+    assert [line.split(":")[0] for line in worse.notes[EXCEEDED]] == ["rmse>1.02x"]
     change = {one.metric: one for one in worse.changes}["rmse_m"]
     assert change.ratio == pytest.approx(1.1)
     assert change.verdict == "worse"
@@ -102,15 +102,15 @@ def test_a_regression_exceeds_its_limit_and_chance_does_not(tmp_path):
     assert change.ratio > 1.02
     assert change.interval[0] < 1.0
     assert change.verdict == "same"
-    assert not same.exceeded
+    assert not same.notes[EXCEEDED]
     assert change.worst == ("r0", pytest.approx(1.5))
 
 
 def test_a_recording_that_fails_now_is_named_whatever_the_limits(tmp_path):
     done = compare(*tables(tmp_path, rows(failed=(2,)), rows(failed=(5,), count=9)))
-    assert done.lost == ["r5: gone"]
-    assert done.gained == ["r2"]
-    assert done.only_new == ["r8"]
+    assert done.notes[LOST] == ["r5: gone"]
+    assert done.notes[GAINED] == ["r2"]
+    assert done.notes[ONLY_NEW] == ["r8"]
     assert "**Failed now, and not before**" in markdown(done)
 
 
