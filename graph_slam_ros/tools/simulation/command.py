@@ -8,13 +8,24 @@ from typing import Any
 import numpy as np
 
 from graph_slam_ros.cli import arguments, console
-from graph_slam_ros.cli.usage import CommandParser, later
+from graph_slam_ros.cli.usage import CommandParser
 from graph_slam_ros.errors import GraphSlamError, did_you_mean, similar_file
+from graph_slam_ros.formats.g2o import read_g2o
+from graph_slam_ros.formats.g2o_writer import write_g2o
+from graph_slam_ros.formats.graph_file import G2oFile
+from graph_slam_ros.formats.parameters import parse_setting
+from graph_slam_ros.formats.strict import ending
+from graph_slam_ros.formats.tum import write_trajectory
+from graph_slam_ros.optimization import optimize
+from graph_slam_ros.tools import simulation
+from graph_slam_ros.tools.simulation import GRAPH_WORLDS, WORLDS, Fault, WrongLine, WrongMessage
+from graph_slam_ros.tools.simulation.options import lines_about
+from graph_slam_ros.tools.simulation.pose_graph import values_of
 
 
 def simulate_options(sub: CommandParser) -> None:
     """Add the options of ``simulate``."""
-    sub.more = later("tools.simulation.command", "options_of_worlds")
+    sub.more = options_of_worlds
     about = "name of a world (city, sphere: a graph), or the file of a graph or recording"
     sub.add_argument("scenario", metavar="SCENARIO", help=about)
     about = "output file; by its ending a recording or a graph"
@@ -33,9 +44,6 @@ def simulate_options(sub: CommandParser) -> None:
 
 def simulate(args: argparse.Namespace) -> int:
     """Record a synthetic world, or write it as a graph; put faults into it."""
-    from graph_slam_ros.formats.strict import ending
-    from graph_slam_ros.tools.simulation import GRAPH_WORLDS, WORLDS, Fault
-
     source, is_world = Path(args.scenario), args.scenario in (*WORLDS, *GRAPH_WORLDS)
     faults = [Fault.parsed(text) for text in args.fault]
     as_graph = ending(args.out) == ".g2o"
@@ -67,41 +75,28 @@ def simulate(args: argparse.Namespace) -> int:
     return console.DONE
 
 
-def _spoil_recording(args: argparse.Namespace, faults: list[Any]) -> None:
-    from graph_slam_ros.tools.simulation import spoil_bag
-
+def _spoil_recording(args: argparse.Namespace, faults: list[Fault]) -> None:
     for fault in faults:
         if not fault.is_of_messages:
             raise GraphSlamError(f"{fault.kind}: needs the truth of a world, which {args.scenario} is not")
     if not faults:
         raise GraphSlamError(f"{args.scenario}: no --fault, so nothing to do")
-    spoil_bag(Path(args.scenario), args.out, faults, args.seed)
+    simulation.spoil_bag(Path(args.scenario), args.out, faults, args.seed)
     console.show(f"wrote {args.out}")
 
 
-def _write_bag(args: argparse.Namespace, faults: list[Any]) -> None:
-    from graph_slam_ros.tools.simulation import WrongMessage, with_closures, write_faulty_bag
-    from graph_slam_ros.tools.simulation import simulate as recorded
-
-    recording = recorded(args.scenario, args.seed, **_options(args))
+def _write_bag(args: argparse.Namespace, faults: list[Fault]) -> None:
+    recording = simulation.simulate(args.scenario, args.seed, **_options(args))
     if args.closures is not None:
-        recording = with_closures(recording, args.closures, args.seed)
-    wrong = write_faulty_bag(recording, args.out, faults, args.seed)
+        recording = simulation.with_closures(recording, args.closures, args.seed)
+    wrong = simulation.write_faulty_bag(recording, args.out, faults, args.seed)
     console.show(f"wrote {args.out}")
     if faults:
         _write_table(args.out, WrongMessage, wrong, "measurements")
 
 
-def _write_graph(args: argparse.Namespace, faults: list[Any], truth_file: Path) -> None:
+def _write_graph(args: argparse.Namespace, faults: list[Fault], truth_file: Path) -> None:
     """The graph of a world, or of a file, whose optimum is taken as the truth, with faults."""
-    from graph_slam_ros.formats.g2o import read_g2o
-    from graph_slam_ros.formats.g2o_writer import write_g2o
-    from graph_slam_ros.formats.graph_file import G2oFile
-    from graph_slam_ros.formats.tum import write_trajectory
-    from graph_slam_ros.optimization import optimize
-    from graph_slam_ros.tools.simulation import GRAPH_WORLDS, WrongLine, faulty_graph
-    from graph_slam_ros.tools.simulation.pose_graph import values_of
-
     world = GRAPH_WORLDS.get(args.scenario)
     if world:
         if args.closures is not None:
@@ -114,7 +109,7 @@ def _write_graph(args: argparse.Namespace, faults: list[Any], truth_file: Path) 
         file = read_g2o(Path(args.scenario))
         solver = optimize(file).solver
         truth = np.concatenate([solver.estimate([v])[0] for v in range(file.graph.vertex_count)])
-    out, wrong = faulty_graph(file, truth, faults, args.seed) if faults else (file, [])
+    out, wrong = simulation.faulty_graph(file, truth, faults, args.seed) if faults else (file, [])
     write_g2o(args.out, out, values_of(out.graph, out.graph.initial.values))
     console.show(f"wrote {args.out}")
     if faults:
@@ -125,15 +120,11 @@ def _write_graph(args: argparse.Namespace, faults: list[Any], truth_file: Path) 
 
 
 def _write_table(out: Path, of: type, wrong: list[Any], what: str) -> None:
-    from graph_slam_ros.tools.simulation import write_table
-
-    write_table(_companion(out, ".faults.csv"), of, wrong)
+    simulation.write_table(_companion(out, ".faults.csv"), of, wrong)
     console.show(f"wrote {_companion(out, '.faults.csv')}: {len(wrong)} {what} are wrong")
 
 
 def _options(args: argparse.Namespace) -> dict[str, Any]:
-    from graph_slam_ros.formats.parameters import parse_setting
-
     options = dict(parse_setting(text) for text in args.set)
     if "seed" in options:
         raise GraphSlamError("--set seed: no option of a world; --seed N")
@@ -150,14 +141,11 @@ def _companion(out: Path, ending: str) -> Path:
 
 def options_of_worlds() -> str:
     """Every option of the worlds and every kind of fault, with defaults."""
-    from graph_slam_ros.tools.simulation import GRAPH_WORLDS, KINDS, MESSAGE_KINDS, WORLDS, with_instruments
-    from graph_slam_ros.tools.simulation.options import lines_about
-
     parts: dict[str, dict[str, Callable[..., Any]]] = {
-        "options of the worlds, for --set:": {**WORLDS, "every world": with_instruments}
+        "options of the worlds, for --set:": {**WORLDS, "every world": simulation.with_instruments}
         | {f"{name}, a graph": world for name, world in GRAPH_WORLDS.items()},
-        "faults for --fault with their options; OUT.faults.csv lists what is wrong:": KINDS,
-        "faults of drivers, clocks and frames, in a world or in a recording of yours:": MESSAGE_KINDS,
+        "faults for --fault with their options; OUT.faults.csv lists what is wrong:": simulation.KINDS,
+        "faults of drivers, clocks and frames, in a world or in a recording of yours:": simulation.MESSAGE_KINDS,
     }
     lines = []
     for title, of in parts.items():
