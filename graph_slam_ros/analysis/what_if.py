@@ -34,24 +34,28 @@ _LEAST = 1e-9  # eigenvalue of I - A Sigma A': below it nothing else determines 
 
 @dataclass(frozen=True, slots=True)
 class Influences:
-    """The influence of some edges, to first order.
+    """The influence of each of n edges, to first order; NaN where it is not known, or was not asked for.
 
     Attributes
     ----------
-    edges : (n,) ids
-    step : (n, dof) step of the last keyframe, in its tangent space [m, rad]; NaN where it is not known
+    step : (n, dof) step of the last keyframe, in its tangent space [m, rad]
     end : (n,) which of its vertices moves farthest: 0 is the first
     end_m : (n,) how far [m]
     cost : (n,) change of the cost of all: negative without an edge
     is_alone : (n,) whether nothing else determines one of its vertices, so that it cannot be left out
     """
 
-    edges: Index
     step: Array
     end: Index
     end_m: Array
     cost: Array
     is_alone: NDArray[np.bool_]
+
+    @property
+    def last_m(self) -> Array:
+        """(n,) How far the last keyframe moves [m]."""
+        positions = (self.step.shape[1] + 1) // 2  # two of three numbers in the plane, three of six in space
+        return np.asarray(np.linalg.norm(self.step[:, :positions], axis=1))
 
 
 class InfluenceModel:
@@ -110,29 +114,35 @@ class InfluenceModel:
         label = self._graph.labels[label_code]
         return self._losses.get((label, self._graph.sources[source_code])) or self._losses[label]
 
-    def without(self, edges: Sequence[int]) -> Influences:
-        """The influence of edges of the problem: what changes without each of them."""
-        found, place = self._empty(edges)
-        known = self._solver.cross_covariances()
-        plain = Losses(self._curved, {})
-        for block in linearize(self._curved, self._values, rows_of(self._curved, found.edges), plain):
-            rows = block.table.at(block.rows)
-            block.residual[:] /= self._along[rows.ids, None] ** 2
-            ends = rows.vertices
-            joint, of_last = self._solver.edge_marginals(ends), known.with_vertex(self._last, ends)
-            _fill(found, place[rows.ids], block, joint, of_last, -1.0)
-            found.cost[place[rows.ids]] += np.sum(block.residual**2, axis=1) - self._cost[rows.ids]
+    def of(self, inside: Sequence[int], outside: Sequence[int] = ()) -> Influences:
+        """The influence of edges that are in: what changes without each; and of some that are out: with each of them.
+
+        An edge is let in without a loss. Steps are NaN where one step says nothing: it is so far off that others would
+        lose their weight.
+        """
+        count, dof = self._graph.edge_count, self._graph.kind_of(self._last).dof
+        unknown, none = np.full((dof + 2, count), np.nan), np.zeros(count, dtype=np.int64)
+        found = Influences(unknown[2:].T, none, unknown[0], unknown[1], none > 0)
+        if len(inside):
+            self._leave_out(found, np.array(inside))
+        if len(outside):
+            self._let_in(found, np.array(outside))
         return found
 
-    def with_them(self, edges: Sequence[int]) -> Influences:
-        """The influence of edges that are out: what changes with each of them, let in without a loss.
+    def _leave_out(self, found: Influences, edges: Index) -> None:
+        known = self._solver.cross_covariances()
+        plain = Losses(self._curved, {})
+        for block in linearize(self._curved, self._values, rows_of(self._curved, edges), plain):
+            rows = block.table.at(block.rows)
+            block.residual[:] /= self._along[rows.ids, None] ** 2
+            joint, of_last = self._solver.edge_marginals(rows.vertices), known.with_vertex(self._last, rows.vertices)
+            _fill(found, rows.ids, block, joint, of_last, -1.0)
+            found.cost[rows.ids] += np.sum(block.residual**2, axis=1) - self._cost[rows.ids]
 
-        Steps are NaN where one step says nothing: the edge is so far off that others would lose their weight.
-        """
-        found, place = self._empty(edges)
+    def _let_in(self, found: Influences, edges: Index) -> None:
         graph = self._graph.copy()
-        graph.set_weights(found.edges, 1.0)
-        for block in linearize(graph, self._values, rows_of(graph, found.edges), Losses(graph, {})):
+        graph.set_weights(edges, 1.0)
+        for block in linearize(graph, self._values, rows_of(graph, edges), Losses(graph, {})):
             rows = block.table.at(block.rows)
             for k, ends in enumerate(rows.vertices):  # they may be far apart in the tree
                 try:
@@ -140,19 +150,9 @@ class InfluenceModel:
                 except GraphSlamError:  # one of them is not in the problem: the edge would be its only one
                     continue
                 part = replace(block, residual=block.residual[k : k + 1], jacobian=block.jacobian[k : k + 1])
-                _fill(found, place[rows.ids[k : k + 1]], part, among[None], of_last[None], 1.0)
-        found.step[found.cost > _FAR], found.end_m[found.cost > _FAR] = np.nan, np.nan
-        return found
-
-    def _empty(self, edges: Sequence[int]) -> tuple[Influences, Index]:
-        """Influences to be filled in, and the place of each edge of the graph in them."""
-        ids = np.asarray(edges, dtype=np.int64)
-        place = np.zeros(self._graph.edge_count, dtype=np.int64)
-        place[ids] = np.arange(len(ids))
-        unknown = np.full(len(ids), np.nan)
-        step = np.full((len(ids), self._graph.kind_of(self._last).dof), np.nan)
-        none, false = np.zeros(len(ids), dtype=np.int64), np.zeros(len(ids), dtype=bool)
-        return Influences(ids, step, none, unknown.copy(), unknown.copy(), false), place
+                _fill(found, rows.ids[k : k + 1], part, among[None], of_last[None], 1.0)
+        far = np.isin(np.arange(len(found.cost)), edges) & (found.cost > _FAR)
+        found.step[far], found.end_m[far] = np.nan, np.nan
 
     def _joint(self, ends: Index) -> tuple[Array, Array]:
         """Covariances (D, D) of some vertices, and (d, D) of the last keyframe with them."""
@@ -384,8 +384,7 @@ class SavedGraph:
     def influences(self, count: int) -> list[Influence]:
         """The judged edges without which the last keyframe would move most, ranked to first order."""
         judged = [row for row, e in enumerate(self.entries) if e.is_in and e.verdict]
-        step = self.influence_model.without(judged).step
-        first = np.linalg.norm(step[:, : self.space.dimensions], axis=1)
+        first = self.influence_model.of(judged).last_m[judged]
         out = []
         for k in np.argsort(-first, kind="stable")[:count].tolist():
             edge = self.entries[judged[k]].edge

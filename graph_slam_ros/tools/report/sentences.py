@@ -24,42 +24,11 @@ _MOST = 8  # groups that are solved without
 _MOST_EDGES = 2000  # of a class, above which groups are not what is wrong
 
 
-@dataclass(frozen=True, slots=True)
-class Effects:
-    """The effects of leaving out each edge that is in, or of letting in each that is out: by edge, NaN where not known.
-
-    Attributes
-    ----------
-    last_m : motion of the last keyframe; end_m : of the vertex of the edge that moves farthest, ``end``
-    cost : change of the cost
-    is_alone : nothing else determines one of its vertices
-    """
-
-    last_m: Array
-    end_m: Array
-    end: Any
-    cost: Array
-    is_alone: Any
-
-
-def effects(run: SavedGraph) -> Effects:
-    """Compute the effects of all judged edges, to first order."""
-    count, n = len(run.entries), run.space.dimensions
-    last_m, end_m, cost = np.full((3, count), np.nan)
-    out = Effects(last_m, end_m, np.zeros(count, dtype=np.int64), cost, np.zeros(count, dtype=bool))
-
-    def enter(found: Influences) -> None:
-        at = found.edges
-        out.last_m[at], out.end_m[at] = np.linalg.norm(found.step[:, :n], axis=1), found.end_m
-        out.end[at], out.cost[at], out.is_alone[at] = found.end, found.cost, found.is_alone
-
+def effects(run: SavedGraph) -> Influences:
+    """The effects of leaving out each judged edge that is in, or of letting in each that is out, to first order."""
     inside = [row for row, e in enumerate(run.entries) if e.is_in and e.verdict]
     outside = [row for row, e in enumerate(run.entries) if not e.is_in and e.reason not in FINAL]
-    if inside:
-        enter(run.influence_model.without(inside))
-    if outside:
-        enter(run.influence_model.with_them(outside))
-    return out
+    return run.influence_model.of(inside, outside)
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +49,7 @@ class Sentences:
     changes: dict[int, list[str]]
 
 
-def sentences(run: SavedGraph, found: Effects) -> Sentences:
+def sentences(run: SavedGraph, found: Influences) -> Sentences:
     """Make the texts of all edges."""
     entries = run.entries
     history: dict[int, list[Any]] = {}
