@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from graph_slam_ros.graph.place import LABEL as PLACES
 from graph_slam_ros.lie import se2, se3, so3
 from graph_slam_ros.runs.ledger_file import Entry
 from graph_slam_ros.typing import Array
@@ -44,7 +45,8 @@ def columns(entries: Sequence[Entry]) -> dict[str, Array]:
     out: dict[str, Array] = {}
     by_tag: dict[str, list[int]] = {}
     for row, e in enumerate(entries):
-        by_tag.setdefault(e.tag, []).append(row)
+        if e.label != PLACES:  # which measures a whole visit
+            by_tag.setdefault(e.tag, []).append(row)
     for tag, rows in by_tag.items():
         several = [entries[row] for row in rows]
         dof = several[0].dof

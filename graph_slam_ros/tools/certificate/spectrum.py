@@ -19,11 +19,10 @@ _SMALLEST_STEP = 1e-10  # m, rad
 
 @dataclass(frozen=True, slots=True)
 class Polished:
-    """A critical point, its cost, and how many steps led there; ``converged``: whether it is one."""
+    """A critical point and its cost; ``converged``: whether it is one."""
 
     poses: Poses
     cost: float
-    steps: int
     converged: bool
 
 
@@ -35,8 +34,8 @@ def polish(problem: Synchronization, x: Poses, root: int) -> Polished:
     definite or the cost would rise, the scaled diagonal is added (Levenberg-Marquardt); so it ends in a minimum, which
     may be a local one.
     """
-    cost, damping, steps = problem.cost(x), 0.0, 0
-    while steps < _MOST_STEPS:
+    cost, damping = problem.cost(x), 0.0
+    for _ in range(_MOST_STEPS):
         model = problem.newton(x, root)
         while True:
             solve = factorize((model.hessian + damping * diags_array(model.scale)).tocsc())
@@ -47,18 +46,18 @@ def polish(problem: Synchronization, x: Poses, root: int) -> Polished:
                 if reached <= cost * (1.0 + _ROUNDING):
                     break
                 if np.abs(step).max() < _SMALLEST_STEP:  # noise alone keeps a cost of next to nothing from falling
-                    return Polished(x, cost, steps, True)
+                    return Polished(x, cost, True)
             damping = max(_DAMPING_FIRST, _FACTOR * damping)
             if damping > _DAMPING_MOST:
-                return Polished(x, cost, steps, False)
-        x, cost, steps = there, reached, steps + 1
+                return Polished(x, cost, False)
+        x, cost = there, reached
         model_decrease = -float(model.gradient @ step)
         if damping <= 1.0 and np.abs(step).max() < _SMALLEST_STEP:  # also at a saddle, which is critical, too
-            return Polished(x, cost, steps, True)
+            return Polished(x, cost, True)
         if not damping and model_decrease <= 0.1 * _ROUNDING * cost:
-            return Polished(x, cost, steps, True)
+            return Polished(x, cost, True)
         damping = damping / _FACTOR if damping > _DAMPING_FIRST else 0.0
-    return Polished(x, cost, steps, False)
+    return Polished(x, cost, False)
 
 
 def factorize(matrix: csc_array) -> Callable[[Array], Array] | None:

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 from scipy.special import gammainc
 
+from graph_slam_ros.analysis import measurement_text
 from graph_slam_ros.analysis.consistency import nees_of_each
 from graph_slam_ros.analysis.evaluation import Scores, dimensions_of, evaluate, input_topics, scored_drive
-from graph_slam_ros.analysis.explain import REASONS, STATES, landmark_lines, statements_of_place
+from graph_slam_ros.analysis.explain import REASONS, STATES, change_text, landmark_lines, statements_of_place
 from graph_slam_ros.analysis.path_error import interpolated
 from graph_slam_ros.analysis.trajectories import Truth, read_truth
 from graph_slam_ros.analysis.what_if import SavedGraph
@@ -124,7 +125,10 @@ def _once(lines: Sequence[str]) -> list[str]:
 
 def _edges(out: Contents, saved: SavedGraph) -> dict[str, Any]:
     pack, entries, found = out.packing, saved.entries, effects(saved)
-    texts = sentences(saved, found)
+    groups, group = sentences(saved, found)
+    changes: dict[str, list[str]] = {}
+    for change in saved.changes:
+        changes.setdefault(str(change.edge), []).append(change_text(change))
     ends = [[_end(saved, e, vertex) for vertex in e.vertices] for e in entries]
     names = list(dict.fromkeys(name for several in ends for name in several if isinstance(name, str) and name))
     places = {name: len(saved.slam.keyframes) + k for k, name in enumerate(names)}
@@ -149,7 +153,7 @@ def _edges(out: Contents, saved: SavedGraph) -> dict[str, Any]:
     columns |= {name: pack.column(_finite(getattr(found, name))) for name in ("last_m", "end_m", "cost")}
     columns["stamp_s"] = pack.column(numbers("stamp_s"), "f8")
     columns |= {name: pack.column(numbers(name), "i4") for name in ("keyframe", "dof")}
-    for name, values in texts.numbers.items():
+    for name, values in measurement_text.columns(entries).items():
         columns[name] = pack.fixed(values, _step(values))
     slots = max((len(e.vertices) for e in entries), default=0)
     for slot in range(slots):
@@ -159,9 +163,9 @@ def _edges(out: Contents, saved: SavedGraph) -> dict[str, Any]:
         "count": len(entries),
         "ids": pack.column([e.edge for e in entries], "i4") if is_condensed else None,
         "columns": columns,
-        "group": pack.column(texts.group, "i4"),
-        "groups": texts.groups,
-        "changes": {str(edge): lines for edge, lines in texts.changes.items()},
+        "group": pack.column(group, "i4"),
+        "groups": groups,
+        "changes": changes,
         "by_hand": _by_hand(saved),
         "condensed": {str(e.edge): [*statements_of_place(saved, e)] for e in entries if e.label == PLACES},
         "places": [pack.column(end(slot), "i4") for slot in range(max(slots, 2))],

@@ -1,13 +1,11 @@
 """What each edge of a run does to it, and what ``explain`` says of it: its templates, and the numbers to fill in."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from graph_slam_ros.analysis import measurement_text
-from graph_slam_ros.analysis.explain import change_text, ends_of, remedy, statements, title
+from graph_slam_ros.analysis.explain import ends_of, remedy, statements, title
 from graph_slam_ros.analysis.what_if import Influences, SavedGraph
 from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.errors import GaugeError, SingularError
@@ -16,7 +14,7 @@ from graph_slam_ros.runs.ledger_file import Entry
 from graph_slam_ros.slam.edits import HAND_MADE
 from graph_slam_ros.slam.robust.ledger import FINAL
 from graph_slam_ros.tools.report.packing import shown
-from graph_slam_ros.typing import Array
+from graph_slam_ros.typing import Index
 
 Group = dict[str, Any]
 _NEAR = 10  # keyframes between two closures of one group, at both ends
@@ -31,52 +29,25 @@ def effects(run: SavedGraph) -> Influences:
     return run.influence_model.of(inside, outside)
 
 
-@dataclass(frozen=True, slots=True)
-class Sentences:
-    """The texts, and which of them each edge has.
-
-    Attributes
-    ----------
-    groups : each a title, and lines of name and text
-    group : (n,) the group of each edge
-    numbers : by name (n,) values, as the texts name them
-    changes : changes of the verdict, by edge
-    """
-
-    groups: list[dict[str, Any]]
-    group: Any
-    numbers: Mapping[str, Array]
-    changes: dict[int, list[str]]
-
-
-def sentences(run: SavedGraph, found: Influences) -> Sentences:
-    """Make the texts of all edges."""
-    entries = run.entries
-    history: dict[int, list[Any]] = {}
-    for change in run.changes:
-        history.setdefault(change.edge, []).append(change)
-    limits = {dof: quantile(run.config.robust.gate, dof) for dof in {e.dof for e in entries}}
-    known, groups, at = dict[Any, int](), list[dict[str, Any]](), np.zeros(len(entries), dtype=np.int64)
+def sentences(run: SavedGraph, found: Influences) -> tuple[list[dict[str, Any]], Index]:
+    """Make the texts of all edges: groups with a title and lines of name and text, and the group (n,) of each edge."""
+    changed = {change.edge for change in run.changes}
+    limits = {dof: quantile(run.config.robust.gate, dof) for dof in {e.dof for e in run.entries}}
+    known, groups, at = dict[Any, int](), list[dict[str, Any]](), np.zeros(len(run.entries), dtype=np.int64)
     is_known = np.isfinite(found.end_m)
-    for k, e in enumerate(entries):
+    for k, e in enumerate(run.entries):
         limit = limits[e.dof]
         ends = tuple(ends_of(e, run))
         bounds = e.threshold < 0.99 * limit, limit < 0.99 * e.threshold
         effect = bool(is_known[k]), bool(found.is_alone[k]), int(found.end[k])
-        about = bool(e.landmark), e.source if e.source in ("", HAND_MADE) else True, e.edge in history
+        about = bool(e.landmark), e.source if e.source in ("", HAND_MADE) else True, e.edge in changed
         key: tuple[Any, ...] = (e.tag, e.label, e.verdict, e.reason, *ends, *bounds, *effect, *about)
         key = (PLACES,) if e.label == PLACES else key
         if key not in known:
             known[key] = len(groups)
-            groups.append(_group(run, e, ends, effect, is_changed=e.edge in history))
+            groups.append(_group(run, e, ends, effect, is_changed=e.edge in changed))
         at[k] = known[key]
-    changes = {edge: [change_text(c) for c in several] for edge, several in history.items()}
-    measured = [row for row, e in enumerate(entries) if e.label != PLACES]
-    numbers = {}
-    for name, column in measurement_text.columns([entries[row] for row in measured]).items():
-        numbers[name] = np.full(len(entries), np.nan)
-        numbers[name][measured] = column
-    return Sentences(groups, at, numbers, changes)
+    return groups, at
 
 
 def _group(
