@@ -6,7 +6,7 @@ from the line between two of them: the first, and the one that is farthest from 
 
 import json
 import os
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,95 +24,45 @@ from graph_slam_ros.analysis.trajectories import Truth
 from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.files import read_text
-from graph_slam_ros.lie import so3
 from graph_slam_ros.runs.folder import COVARIANCES, SUMMARY, run_config
 from graph_slam_ros.runs.trajectory import Landmark, Trajectory, read_covariances, read_landmarks, read_rows
 from graph_slam_ros.slam.noise_scale import NoiseScale
-from graph_slam_ros.typing import Array, Numbers
+from graph_slam_ros.slam.weak_direction import position_covariance
+from graph_slam_ros.typing import Array
 
 _MOST = 500  # poses for which joint covariances are computed
 _All = tuple[Nees | None, Nees | None, Nees | None]  # of the last pose, of poses, of landmarks
 
 
-class RelativeCovariances:
-    """Covariances in the frame of a keyframe, or in the plane of the line from one keyframe's position to another's.
+def line_covariances(saved: SavedGraph, line: tuple[int, int], vertices: Sequence[int | None]) -> Array:
+    """Covariances (n, 2, 2) of positions in the axes of map, seen from the line between those of two keyframes.
 
-    Raises GaugeError, SingularError from its functions, as of ``Solver.joint_marginal``.
-
-    A run's covariances are relative to its first pose. What an estimate has in common with another frame is no error
-    there; it is known from joint covariances of the graph.
-
-    Parameters
-    ----------
-    frame : numbers of the keyframes: one, or two in the plane
+    What a position has in common with the line is no error as seen from there. NaN where there is no vertex.
     """
+    ends, space, out = [saved.vertices[k] for k in line], saved.space, np.full((len(vertices), 2, 2), np.nan)
 
-    def __init__(self, saved: SavedGraph, frame: tuple[int, ...]) -> None:
-        self._saved, self._space = saved, saved.space
-        self._frame = [saved.vertices[k] for k in frame]
-        self._at = [self._value(vertex) for vertex in self._frame]
+    def value(vertex: int) -> Array:
+        return np.asarray(saved.solver.estimate([vertex])[0])
 
-    def poses(self, keyframes: Iterable[int]) -> Array:
-        """Covariances (n, d, d) of poses in the frame of one keyframe, each in its own tangent space; its own is 0."""
-        group, d = self._space.group, self._space.dof
-        out = []
-        for vertex in (self._saved.vertices[k] for k in keyframes):
-            by_frame = -group.adjoint(group.between(self._value(vertex), self._at[0]))
-            out.append(self._combined(vertex, by_frame, np.eye(d), np.zeros((d, d))))
-        return np.array(out).reshape(-1, d, d)
+    def by_position(pose: Array) -> Array:
+        """The Jacobian of a position by the tangent space of its vertex."""
+        return np.eye(2) if len(pose) == 2 else np.hstack([space.turn(tuple(pose)), np.zeros((2, space.dof - 2))])
 
-    def positions(self, keyframes: Iterable[int]) -> Array:
-        """Covariances (n, dimensions, dimensions) of the positions of keyframes, in the axes of map."""
-        return self._points(self._saved.vertices[k] for k in keyframes)
+    def across(arm: Array) -> Array:
+        return np.array([-arm[1], arm[0]])
 
-    def landmarks(self, names: Iterable[str]) -> Array:
-        """Covariances (m, dimensions, dimensions) of landmarks' positions in the axes of map; NaN where unknown."""
-        return self._points(self._saved.landmarks.get(name) for name in names)
-
-    def _points(self, vertices: Iterable[int | None]) -> Array:
-        n = self._space.dimensions
-        unknown = np.full((n, n), np.nan)
-        out = [unknown if vertex is None else self._point(vertex) for vertex in vertices]
-        return np.array(out).reshape(-1, n, n)
-
-    def _point(self, vertex: int) -> Array:
-        value, n = self._value(vertex), self._space.dimensions
-        of_point = np.eye(n) if len(value) == n else self._by_position(value)
-        by_frame = self._by_line(value) if len(self._frame) == 2 else self._by_pose(value)
-        return self._combined(vertex, by_frame, of_point, np.zeros((n, n)))
-
-    def _by_pose(self, point: Numbers) -> Array:
-        """Jacobian of a point, seen from the frame, by the tangent space of the pose that is the frame."""
-        n, pose = self._space.dimensions, self._at[0]
-        turn = self._space.turn(pose)
-        seen = turn.T @ np.subtract(point[:n], pose[:n])
-        lever = _across(seen)[:, None] if n == 2 else -so3.hat((seen[0], seen[1], seen[2]))
-        return np.asarray(-turn @ np.hstack([np.eye(n), lever]))
-
-    def _by_line(self, point: Numbers) -> Array:
-        """Jacobian of a point, seen from the line, by the tangent spaces of the poses at its ends."""
-        first, last = self._at
-        line, arm = np.subtract(last[:2], first[:2]), np.subtract(point[:2], first[:2])
-        turned = np.outer(_across(arm), _across(line)) / (line @ line)
-        return np.hstack([(turned - np.eye(2)) @ self._by_position(first), -turned @ self._by_position(last)])
-
-    def _by_position(self, pose: Numbers) -> Array:
-        n = self._space.dimensions
-        return np.hstack([self._space.turn(pose), np.zeros((n, self._space.dof - n))])
-
-    def _combined(self, vertex: int, by_frame: Array, by_own: Array, of_frame: Array) -> Array:
-        """The covariance of a linear function of the frame's tangent spaces and a vertex'; ``of_frame`` of its own."""
-        if vertex in self._frame:
-            return of_frame
-        both = np.hstack([by_frame, by_own])
-        return both @ self._saved.solver.joint_marginal([*self._frame, vertex]) @ both.T
-
-    def _value(self, vertex: int) -> Numbers:
-        return tuple(map(float, self._saved.solver.estimate([vertex])[0]))
-
-
-def _across(arm: Array) -> Array:
-    return np.array([-arm[1], arm[0]])
+    first, last = map(value, ends)
+    along = (last - first)[:2]
+    for k, vertex in enumerate(vertices):
+        if vertex in ends:
+            out[k] = 0.0
+        elif vertex is not None:
+            point = value(vertex)
+            turned = np.outer(across(point[:2] - first[:2]), across(along)) / (along @ along)
+            of_ends = (turned - np.eye(2)) @ by_position(first), -turned @ by_position(last)
+            jacobian = np.hstack([*of_ends, by_position(point)])
+            out[k] = jacobian @ saved.solver.joint_marginal([*ends, vertex]) @ jacobian.T
+    return out
 
 
 def consistency_of(run: Path, known: Truth, keyframes: slice, *, is_first: bool) -> Consistency | None:
@@ -172,14 +122,21 @@ class _Compared:
         return Nees.of(errors[-1:], relative[-1:]), Nees.of(errors, relative), Nees.of(*seen)
 
     def later(self) -> tuple[_All, str]:
-        """NEES seen from the first keyframe with truth, where that is not the first."""
+        """NEES seen from the first keyframe with truth, where that is not the first: it alone holds the map then."""
         saved = self._saved()
-        first, some = int(self._with_truth[0]), self._some()
-        frame = RelativeCovariances(saved, (first,))
-        of_some = frame.poses(some)
-        covariances = np.full((len(self._true) - first, *of_some.shape[1:]), np.nan)
-        covariances[some - first] = of_some
-        found = self.poses(first, covariances, _in_space(frame.landmarks(self._names)))
+        first, space = int(self._with_truth[0]), saved.space
+        solver = saved.problem([e.edge for e in saved.entries if e.is_in and len(e.vertices) == 1])
+        solver.hold(saved.vertices[first])
+        known = [k for k in saved.numbers if first <= k < len(self._true)]
+        covariances = np.full((len(self._true) - first, space.dof, space.dof), np.nan)
+        covariances[np.array(known) - first] = solver.marginal([saved.vertices[k] for k in known])
+        spreads = np.full((len(self._names), 3, 3), np.nan)
+        for spread, name in zip(spreads, self._names, strict=True):
+            if (vertex := saved.landmarks.get(name)) is not None:
+                value, n = tuple(solver.estimate([vertex])[0].tolist()), space.dimensions
+                spread[:n, :n] = position_covariance(space, value, solver.marginal([vertex])[0])
+                spread[n:], spread[:, n:] = 0.0, 0.0
+        found = self.poses(first, covariances, list(spreads))
         return found, f"seen from keyframe {first}, the first in the graph with a true pose"
 
     def positions(self) -> tuple[_All, str]:
@@ -188,7 +145,6 @@ class _Compared:
         saved = self._saved()
         first, some = int(self._with_truth[0]), self._some()
         last = int(some[np.argmax(np.linalg.norm(true[some] - true[first], axis=1))])
-        frame = RelativeCovariances(saved, (first, last))
         line, true_line = path[last] - path[first], true[last] - true[first]
         angle = np.arctan2(line[1], line[0]) - np.arctan2(true_line[1], true_line[0])
         turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
@@ -197,13 +153,11 @@ class _Compared:
             return path[first] + (truth[:, :2] - true[first]) @ turn.T - estimate[:, :2]
 
         some = some[some != first]
-        off, covariances = errors(path[some], true[some]), frame.positions(some)
-        off_landmarks = errors(self._places, self._true_places)
-        found = (
-            Nees.of(off[-1:], covariances[-1:]),
-            Nees.of(off, covariances),
-            Nees.of(off_landmarks, frame.landmarks(self._names)),
-        )
+        off = errors(path[some], true[some])
+        covariances = line_covariances(saved, (first, last), [saved.vertices[k] for k in some])
+        of_landmarks = line_covariances(saved, (first, last), [saved.landmarks.get(name) for name in self._names])
+        seen = Nees.of(errors(self._places, self._true_places), of_landmarks)
+        found = Nees.of(off[-1:], covariances[-1:]), Nees.of(off, covariances), seen
         text = f"of positions, seen from the line between keyframes {first} and {last}: the truth has no heading"
         return found, text
 
@@ -219,12 +173,6 @@ class _Compared:
         """The keyframes with truth, at most so many as are computed, the first and last among them."""
         known = self._with_truth
         return known[np.unique(np.linspace(0, len(known) - 1, min(_MOST, len(known))).astype(int))]
-
-
-def _in_space(covariances: Array) -> list[Array]:
-    """Covariances of positions in the plane or in space: (3, 3), 0 for what a plane does not have."""
-    missing = 3 - covariances.shape[1]
-    return [np.pad(one, ((0, missing), (0, missing))) for one in covariances]
 
 
 def _why_no_nees(known: Truth, true: Array, *, is_first: bool, is_held: bool, is_planar: bool) -> str:
