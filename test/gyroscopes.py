@@ -7,8 +7,7 @@ import numpy as np
 from graph_slam_ros.lie import so3
 from graph_slam_ros.slam import AngularVelocity, Config, Control, GraphSlam, Odometry, Sightings
 from graph_slam_ros.tools.simulation import simulate, with_instruments
-from graph_slam_ros.tools.simulation.motion import integrate
-from graph_slam_ros.tools.simulation.recording import measurements
+from graph_slam_ros.tools.simulation.recording import integrate, measurements
 
 TICK_NS, TICK_S = 20_000_000, 0.02
 GYRO = {"inputs.names": "odom detections imu", "imu.type": "sensor_msgs/msg/Imu", "imu.use": "gyro"}

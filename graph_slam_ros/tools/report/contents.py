@@ -333,7 +333,7 @@ def _compared(run: Path, other: Path, out: Contents) -> dict[str, Any]:
     return {"with": shown(other.resolve().name), "lines": lines}
 
 
-# -- the history of the drive: the estimate at some moments, and the jumps of map -> odom -------------------------------
+# -- the history of the drive: the estimate at some moments, and the jumps of map -> odom ------------------------------
 
 
 def frames(run: Path, saved: SavedGraph, losses: list[str]) -> list[tuple[int, Array, Array]]:

@@ -24,8 +24,7 @@ from graph_slam_ros.messages.to_msg import (
 )
 from graph_slam_ros.recordings.bag import BagWriter
 from graph_slam_ros.slam import Sighting, Sightings
-from graph_slam_ros.tools.simulation.motion import space_of
-from graph_slam_ros.tools.simulation.recording import CLOSURES_TOPIC, LANDMARKS_TOPIC, Gnss, Imu, Recording
+from graph_slam_ros.tools.simulation.recording import CLOSURES_TOPIC, LANDMARKS_TOPIC, Gnss, Imu, Recording, space_of
 from graph_slam_ros.typing import Numbers
 
 Message: TypeAlias = tuple[str, str, int, bytes]

@@ -14,7 +14,7 @@ from numpy.random import Generator
 from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph.geometry import Geometry
-from graph_slam_ros.tools.simulation.motion import space_of
+from graph_slam_ros.tools.simulation.recording import space_of
 from graph_slam_ros.typing import Array, Index
 
 POLICIES = ("random", "local", "group", "local-group", "aliased")

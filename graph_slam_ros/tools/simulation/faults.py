@@ -27,10 +27,9 @@ from graph_slam_ros.tools.simulation.draft import Draft, WrongLine, WrongMessage
 from graph_slam_ros.tools.simulation.drive import Drive
 from graph_slam_ros.tools.simulation.false_closures import Closures
 from graph_slam_ros.tools.simulation.message_faults import MESSAGE_KINDS
-from graph_slam_ros.tools.simulation.motion import space_of
 from graph_slam_ros.tools.simulation.options import filled, option, options_of, random
 from graph_slam_ros.tools.simulation.pose_graph import values_of
-from graph_slam_ros.tools.simulation.recording import CLOSURES_TOPIC, LANDMARKS_TOPIC, Recording, places
+from graph_slam_ros.tools.simulation.recording import CLOSURES_TOPIC, LANDMARKS_TOPIC, Recording, places, space_of
 from graph_slam_ros.typing import Array
 
 _OFTEN = 3  # times that a landmark must be seen, and seen again later, to be worth a fault

@@ -5,9 +5,8 @@ from scipy.spatial.transform import Rotation
 
 from graph_slam_ros.lie import se3
 from graph_slam_ros.slam import Sighting
-from graph_slam_ros.tools.simulation.motion import CORRELATION_TIME, VelocityNoise
 from graph_slam_ros.tools.simulation.options import checked, option, random
-from graph_slam_ros.tools.simulation.recording import Recording, drive
+from graph_slam_ros.tools.simulation.recording import CORRELATION_TIME, Recording, VelocityNoise, drive
 from graph_slam_ros.tools.simulation.sensing import KINDS, TagCamera
 from graph_slam_ros.typing import Array, Numbers
 

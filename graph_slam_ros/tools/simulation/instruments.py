@@ -11,9 +11,8 @@ from numpy.random import Generator
 
 from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.messages.inputs.fixes import east_north_up
-from graph_slam_ros.tools.simulation.motion import VelocityNoise
 from graph_slam_ros.tools.simulation.options import checked, option, random
-from graph_slam_ros.tools.simulation.recording import Gnss, Imu, Recording, Stamps
+from graph_slam_ros.tools.simulation.recording import Gnss, Imu, Recording, Stamps, VelocityNoise
 from graph_slam_ros.typing import Array, Numbers
 
 DATUM = (47.4, 8.55, 440.0)  # latitude [deg], longitude [deg], height above the ellipsoid [m] of the world's origin

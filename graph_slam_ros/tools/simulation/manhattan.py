@@ -4,15 +4,16 @@ import numpy as np
 from numpy.random import Generator
 
 from graph_slam_ros.slam import Sighting
-from graph_slam_ros.tools.simulation.motion import (
+from graph_slam_ros.tools.simulation.options import checked, option, random
+from graph_slam_ros.tools.simulation.recording import (
     CORRELATION_TIME,
     SIGMA_SIDEWAYS,
     SIGMA_SPEED,
     SIGMA_TURN,
+    Recording,
     VelocityNoise,
+    drive,
 )
-from graph_slam_ros.tools.simulation.options import checked, option, random
-from graph_slam_ros.tools.simulation.recording import Recording, drive
 from graph_slam_ros.tools.simulation.sensing import KINDS, RangeBearing
 from graph_slam_ros.typing import Array, Index, Numbers
 

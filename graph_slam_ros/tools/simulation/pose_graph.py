@@ -13,8 +13,8 @@ from graph_slam_ros.graph import Gaussian, Graph
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL, Geometry
 from graph_slam_ros.lie import se2, se3
 from graph_slam_ros.tools.simulation.manhattan import STEP_M, stroll
-from graph_slam_ros.tools.simulation.motion import integrate
 from graph_slam_ros.tools.simulation.options import checked, option, random
+from graph_slam_ros.tools.simulation.recording import integrate
 from graph_slam_ros.typing import Array, Index
 
 POSES_PER_CLOSURE = 3

@@ -4,9 +4,8 @@ import numpy as np
 
 from graph_slam_ros.lie import se2
 from graph_slam_ros.slam import Sighting
-from graph_slam_ros.tools.simulation.motion import VelocityNoise
 from graph_slam_ros.tools.simulation.options import checked, option, random
-from graph_slam_ros.tools.simulation.recording import Recording, drive
+from graph_slam_ros.tools.simulation.recording import Recording, VelocityNoise, drive
 from graph_slam_ros.tools.simulation.sensing import KINDS, RangeBearing
 from graph_slam_ros.typing import Numbers
 

@@ -8,15 +8,16 @@ from numpy.typing import NDArray
 from graph_slam_ros.graph.geometry import PLANAR
 from graph_slam_ros.lie import se2
 from graph_slam_ros.slam import Sighting
-from graph_slam_ros.tools.simulation.motion import (
+from graph_slam_ros.tools.simulation.options import checked, option, random
+from graph_slam_ros.tools.simulation.recording import (
     CORRELATION_TIME,
     SIGMA_SIDEWAYS,
     SIGMA_SPEED,
     SIGMA_TURN,
+    Recording,
     VelocityNoise,
+    drive,
 )
-from graph_slam_ros.tools.simulation.options import checked, option, random
-from graph_slam_ros.tools.simulation.recording import Recording, drive
 from graph_slam_ros.tools.simulation.sensing import KINDS, RangeBearing, sightings
 from graph_slam_ros.typing import Array, Numbers
 

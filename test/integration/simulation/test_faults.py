@@ -21,8 +21,8 @@ from graph_slam_ros.tools.simulation import (
     with_closures,
 )
 from graph_slam_ros.tools.simulation.false_closures import disagreement, false_closures
-from graph_slam_ros.tools.simulation.motion import space_of
 from graph_slam_ros.tools.simulation.options import about
+from graph_slam_ros.tools.simulation.recording import space_of
 
 WORLDS = {"warehouse": {"aisles": 2, "laps": 2, "aisle_m": 8.0}, "flight": {"laps": 2}}
 

@@ -14,7 +14,7 @@ from graph_slam_ros.runs.replay import measurements as measured
 from graph_slam_ros.slam import Config, Counters, Fix, Odometry
 from graph_slam_ros.tools.simulation import WORLDS, city_graph, measurements, simulate, sphere_graph, write_bag
 from graph_slam_ros.tools.simulation.instruments import ANTENNA_M, DATUM
-from graph_slam_ros.tools.simulation.motion import space_of
+from graph_slam_ros.tools.simulation.recording import space_of
 
 SMALL = {
     "pythonrobotics": {},

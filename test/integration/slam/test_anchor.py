@@ -7,7 +7,7 @@ from graph_slam_ros.graph import POINT_PRIOR, R2
 from graph_slam_ros.lie import se2, se3, so3
 from graph_slam_ros.slam import Config, Control, Fix, GraphSlam, Odometry, Sighting, Sightings
 from graph_slam_ros.tools.simulation import measurements, simulate
-from graph_slam_ros.tools.simulation.motion import space_of
+from graph_slam_ros.tools.simulation.recording import space_of
 
 END = (Control("end"), Control("optimize"))
 SMALL = {"warehouse": {"aisles": 2, "laps": 1, "aisle_m": 6.0}, "flight": {"laps": 1}}

@@ -16,8 +16,7 @@ from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, 
 from graph_slam_ros.slam.slip_review import Slip
 from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.tools.simulation import Fault, faulty_recording, measurements
-from graph_slam_ros.tools.simulation.motion import VelocityNoise
-from graph_slam_ros.tools.simulation.recording import drive
+from graph_slam_ros.tools.simulation.recording import VelocityNoise, drive
 from graph_slam_ros.tools.simulation.sensing import RangeBearing
 
 S = 1_000_000_000
