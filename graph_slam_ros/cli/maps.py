@@ -8,7 +8,6 @@ from graph_slam_ros.cli import arguments, console
 from graph_slam_ros.cli.evaluate import suggest_next
 from graph_slam_ros.cli.usage import CODES, CommandParser
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.measurements.edits import ACTIONS
 
 _FILES = ("tum", "g2o", "mcap")
 _PICTURES = ("png", "gif")
@@ -65,17 +64,19 @@ def merge(args: argparse.Namespace) -> int:
 def edit_options(sub: CommandParser) -> None:
     """Add the options of ``map edit``."""
     sub.codes = f"explain RUN prints the ids of edges and the names of landmarks; so does ledger.csv. {CODES}"
-    sub.more = lambda: "\n".join(
-        [
-            "Kinds of edits, and their keys (docs/edits.md):",
-            *(f"  {do:16s} {action.keys_text}" for do, action in ACTIONS.items()),
-        ]
-    )
+    sub.more = _kinds_of_edits
     arguments.add_run(sub)
     sub.add_argument("--plan", type=Path, metavar="FILE", help="JSON file with the edits")
     sub.add_argument("--out", type=Path, metavar="DIR", help="new run folder for the result: nothing is replaced")
     sub.add_argument("--dry-run", action="store_true", help="print what the plan would change, and write nothing")
     sub.add_argument("--new-plan", type=Path, metavar="FILE", help="write a plan for this run, without edits, and end")
+
+
+def _kinds_of_edits() -> str:
+    from graph_slam_ros.measurements.edits import ACTIONS
+
+    lines = [f"  {do:16s} {action.keys_text}" for do, action in ACTIONS.items()]
+    return "\n".join(["Kinds of edits, and their keys (docs/edits.md):", *lines])
 
 
 def edit(args: argparse.Namespace) -> int:
