@@ -85,12 +85,6 @@ def add_json(sub: CommandParser, what: str = "all of it") -> None:
     sub.add_argument("--json", action="store_true", help=f"print {what} as one line of JSON")
 
 
-def add_config(sub: CommandParser) -> None:
-    """Add ``--config`` and ``--set``."""
-    sub.add_argument("--config", type=Path, metavar="FILE", help="parameter file, as for the node")
-    sub.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="set one parameter")
-
-
 def add_truth(sub: CommandParser, *, required: bool) -> None:
     """Add the truth of a run, and how it is laid on it."""
     sub.add_argument("--truth", required=required, metavar="BAG|FILE.tum", help="the truth: a recording, or a TUM file")

@@ -83,15 +83,12 @@ def _influence(args: argparse.Namespace) -> int:
         f"  {'edge':<8s} {'':24s} {'first order':>12s} {'solved again':>12s}",
     )
     for one in run.influences(args.influence):
-        exact = f"{one.exact_m:10.4f} m" if math.isfinite(one.exact_m) else _without_number(one.exact_m)
+        failed = "not converged" if math.isnan(one.exact_m) else "undetermined"
+        exact = f"{one.exact_m:10.4f} m" if math.isfinite(one.exact_m) else failed
         text = f"{one.first_order_m:10.4f} m {exact}"
         console.show(f"  {one.edge:<8d} {run.edge(one.edge).about:24s} {text}")
     console.then(f"{console.command('explain', args.run_folder, 'EDGE')} (all about one of them)")
     return console.report_losses(losses)
-
-
-def _without_number(exact_m: float) -> str:
-    return "not converged" if math.isnan(exact_m) else "undetermined"
 
 
 def _moved_text(run: "SavedGraph", moved: "MovedVertex") -> Iterable[str]:

@@ -43,7 +43,10 @@ def demo(args: argparse.Namespace) -> int:
             write_bag(simulate("warehouse", 8, aisle_m=9.0), recording)
         compile_all(dimensions=2)  # before it: a live node would miss messages meanwhile
         start = time.perf_counter()
-        lost = (_live if live else _offline)(recording, out, console.progress)
+        if live:
+            lost = _live(recording, out, console.progress)
+        else:
+            lost = len(replay(recording, out, force=True, progress=console.progress("replay")).losses)
         elapsed_s = time.perf_counter() - start
         scores = evaluate(out, str(recording))
         draw_run(out, str(recording), out / "path.png")
@@ -70,7 +73,3 @@ def _live(recording: Path, out: Path, progress: Callable[[str], Any]) -> int:
     inputs = choose_inputs(bag, Config())
     with own_node(out, inputs, Config()) as own:
         return play(bag, inputs, own=own, progress=progress("play")).lost
-
-
-def _offline(recording: Path, out: Path, progress: Callable[[str], Any]) -> int:
-    return len(replay(recording, out, force=True, progress=progress("replay")).losses)
