@@ -127,6 +127,7 @@ class _Compared:
         first, space = int(self._with_truth[0]), saved.space
         solver = saved.problem([e.edge for e in saved.entries if e.is_in and len(e.vertices) == 1])
         solver.hold(saved.vertices[first])
+        solver.optimize()
         known = [k for k in saved.numbers if first <= k < len(self._true)]
         covariances = np.full((len(self._true) - first, space.dof, space.dof), np.nan)
         covariances[np.array(known) - first] = solver.marginal([saved.vertices[k] for k in known])
