@@ -137,6 +137,11 @@ def source_hash(folder: Path) -> str:
     return f"sha256:{digest.hexdigest()}"
 
 
+def plan_text(plan: Plan) -> str:
+    """A plan as JSON."""
+    return json.dumps(_content(plan), indent=2, ensure_ascii=False) + "\n"
+
+
 def _content(plan: Plan) -> dict[str, Any]:
     return {"format": FORMAT, "version": VERSION, "source": plan.source, "edits": [e.values for e in plan.edits]}
 
@@ -146,8 +151,7 @@ def write_empty_plan(folder: Path, file: Path) -> None:
     if os.path.lexists(file):
         raise GraphSlamError(f"{file}: exists already: choose another name")
     try:
-        content = _content(Plan(source_hash(folder), ()))
-        write_whole(file, f"{json.dumps(content, indent=2)}\n".encode())
+        write_whole(file, plan_text(Plan(source_hash(folder), ())).encode())
     except OSError as error:
         raise GraphSlamError(f"{file}: {error.strerror}") from None
 
