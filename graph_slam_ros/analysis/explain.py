@@ -194,11 +194,11 @@ def landmark_lines(folder: Path, name: str, seen: Sequence[Entry]) -> Iterator[s
 
 def _edge(run: SavedGraph, edge: int) -> Iterator[str]:
     if left := [row for row in edges_that_left(run) if row["edge"] == str(edge)]:
-        yield from (line for what, text in statements_of_one_that_left(run, left[0]) for line in _words(what, text))
+        yield from (line for what, text in statements_of_one_that_left(run, left[0]) for line in _line(what, text))
         return
     e = run.edge(edge)
     if e.label == PLACES:
-        yield from (line for what, text in statements_of_place(run, e) for line in _words(what, text))
+        yield from (line for what, text in statements_of_place(run, e) for line in _line(what, text))
         return
     history, fields = [change for change in run.changes if change.edge == edge], fields_of(run, e)
     yield title(e, run).format(**fields)
@@ -351,12 +351,7 @@ def _state(verdict: Verdict, reason: Reason) -> str:
 
 
 def _line(what: str, text: str) -> Iterator[str]:
-    """A paragraph with its name at the left."""
-    yield from textwrap.wrap(text, _WIDTH, initial_indent=f"{what:11s}", subsequent_indent=" " * 11)
-
-
-def _words(what: str, text: str) -> Iterator[str]:
-    """The same with no word broken: commands and names stay whole."""
+    """A paragraph with its name at the left; no word is broken, so that commands and names stay whole."""
     wrapper = textwrap.TextWrapper(_WIDTH, f"{what:11s}", " " * 11, break_long_words=False, break_on_hyphens=False)
     yield from wrapper.wrap(text)
 
