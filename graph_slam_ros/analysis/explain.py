@@ -20,7 +20,7 @@ from graph_slam_ros.runs.folder import SUMMARY, summary_of
 from graph_slam_ros.runs.ledger_file import Entry
 from graph_slam_ros.runs.restore import of_all
 from graph_slam_ros.slam import Config
-from graph_slam_ros.slam.condensed_edges import CONDENSED
+from graph_slam_ros.slam.bounded_map import CONDENSED
 from graph_slam_ros.slam.edits import HAND_MADE
 from graph_slam_ros.slam.robust.ledger import FINAL, Reason, Verdict, VerdictChange
 

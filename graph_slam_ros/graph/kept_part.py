@@ -26,27 +26,21 @@ def kept_part(graph: Graph, vertices: Index, edges: Index, values: Array) -> Gra
         (out.kind, kinds, count), (out.offset, ends - sizes, count), (out.initial, values[numbers], len(numbers))
     )
     count, code_of_edge, row_of_edge = len(edges), np.empty(len(edges), np.int64), np.empty(len(edges), np.int64)
-    new_edge, is_kept = new_ids(edges, graph.edge_count), np.zeros(graph.edge_count, dtype=bool)
-    is_kept[edges] = True
-    found = [(table, rows) for table in graph.tables.values() if len(rows := np.flatnonzero(is_kept[table.id.values]))]
-    for table, rows in sorted(
-        found, key=lambda one: int(one[0].id.values[one[1][0]])
-    ):  # as if it was added edge by edge
-        code = len(out.tables)
-        fresh = out.tables[table.type] = EdgeTable(table.type, code)
+    new_edge = new_ids(edges, graph.edge_count)
+    kept = [(table, np.flatnonzero(new_edge[table.id.values] >= 0)) for table in graph.tables.values()]
+    found = [(int(table.id.values[rows[0]]), table, rows) for table, rows in kept if len(rows)]
+    for _, table, rows in sorted(found):  # as if it was added edge by edge
+        fresh = out.tables[table.type] = EdgeTable(table.type, len(out.tables))
         out._in_order.append(fresh)
-        ids, some = new_edge[table.id.values[rows]], table.at(rows)
-        of_all = (fresh.id, ids), (fresh.vertices, moved[some.vertices]), (fresh.measured, some.measured)
-        rest = (fresh.sqrt_information, some.sqrt_information), (fresh.label, some.label), (fresh.source, some.source)
-        Column.extend(
-            *((column, rows_of, len(rows)) for column, rows_of in (*of_all, *rest, (fresh.weight, some.weight)))
-        )
-        code_of_edge[ids], row_of_edge[ids] = code, np.arange(len(rows))
+        columns = zip(fresh.columns, table.columns, strict=True)
+        Column.extend(*((column, of_all.values[rows], len(rows)) for column, of_all in columns))
+        fresh.id.values[:] = ids = new_edge[fresh.id.values]
+        fresh.vertices.values[:] = moved[fresh.vertices.values]
+        fresh.locate()
+        code_of_edge[ids], row_of_edge[ids] = fresh.code, np.arange(len(rows))
     Column.extend((out.table_of_edge, code_of_edge, count), (out.row_of_edge, row_of_edge, count))
     out.vertex_ids = graph.vertex_ids.kept(vertices, graph.vertex_count)
     out.edge_ids = graph.edge_ids.kept(edges, graph.edge_count)
-    for table in out.tables.values():
-        table.locate()
     out.locate()
     return out
 

@@ -44,6 +44,12 @@ class Column:
             self._values = self._buffer[: self.count]
         return self._values
 
+    def kept(self, rows: Index) -> "Column":
+        """Some of its rows, as a column of their own."""
+        out = Column(self.values.dtype.type)
+        out.__setstate__(self.values[rows])
+        return out
+
     @property
     def address(self) -> int:
         """The place in memory where it begins."""

@@ -31,10 +31,8 @@ from graph_slam_ros.graph import Graph
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.graph.lasting_ids import LastingIds
 from graph_slam_ros.runs.journal import read_records
-from graph_slam_ros.slam.bounded_map import Condensation
-from graph_slam_ros.slam.condensed_edges import CondensedEdge
-from graph_slam_ros.slam.lifelong.fit import VisitScale
-from graph_slam_ros.slam.lifelong.place import place_of
+from graph_slam_ros.slam.bounded_map import Condensation, CondensedEdge
+from graph_slam_ros.slam.lifelong.place import VisitScale, place_of
 from graph_slam_ros.slam.lifelong.state import BoundedState, Left, OldKeyframe, Records, record_type
 
 CONDENSED = "condensed"

@@ -1,6 +1,7 @@
 """The back-end: the graph, its solver, and what is believed of its edges, in step with one another."""
 
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
+from contextlib import suppress
 
 import numpy as np
 
@@ -15,15 +16,20 @@ from graph_slam_ros.slam.frontend.sighting_edges import SightingEdges
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.slam.lifelong.state import BoundedState
 from graph_slam_ros.slam.noise_scale import NoiseScale, estimate_noise, factors_of
-from graph_slam_ros.slam.robust.admission import Admission
-from graph_slam_ros.slam.robust.background import Background, Work, run_when_asked
 from graph_slam_ros.slam.robust.displacement_hypothesis import DisplacementHypothesis
 from graph_slam_ros.slam.robust.gating import OutlierGate
-from graph_slam_ros.slam.robust.hypotheses import Alternative, FrozenGraph, Outcome, search_alternatives
-from graph_slam_ros.slam.robust.ledger import Ledger, Reason
+from graph_slam_ros.slam.robust.hypotheses import (
+    Alternative,
+    Background,
+    FrozenGraph,
+    Outcome,
+    run_when_asked,
+    search_alternatives,
+)
+from graph_slam_ros.slam.robust.ledger import Ledger, Reason, Verdict
 from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.solver import Report, Settings, Solver
-from graph_slam_ros.typing import Array, Executor, Index, Numbers
+from graph_slam_ros.typing import Array, Executor, Index, Numbers, Result
 
 _MAX_PENDING = 200  # edges that are compared with all that is known at once, at most; reviews look at the others
 _NOISE_ROUNDS = 8  # at most, of estimating the scale of the noise and solving with it
@@ -65,7 +71,6 @@ class Backend:
         self.noise = NoiseScales(self.graph, start.noise_factors)
         self.solver = Solver(self.graph, settings)
         self.decisions = OutlierGate(config, self.graph, self.solver, start.ledger)
-        self._admission = Admission(self.graph, self.solver, self.decisions)
         self.handed_over, self.held = (0, 0), (0, 0)
         self.frozen, self.frozen_edges = start.frozen, start.ledger.final
         self.edits, self.bounded = list(start.edits), start.bounded or BoundedState()
@@ -157,14 +162,13 @@ class Backend:
         if is_due:
             self._reviewed = keyframe
             self.decisions.review(keyframe)
-        outcome = self._guarded(lambda: self._background.outcome(keyframe))
-        if outcome is not None and self._adopt(outcome, keyframe):
-            self.solver.start_at(outcome.carried_to(self.graph, self.solver.values))
-            self.solver.optimize()
+        found = self._background.found(keyframe)
+        if found is not None:
+            self.revise("second_look", lambda: self._use_found(found(), keyframe))
         self.solver.update()
         self._admit(keyframe)
         if is_due and (group := self.decisions.readmit_likely_group(keyframe)):
-            self._admission.make_fit(group, keyframe)
+            self.decisions.make_fit(group, keyframe)
         out = self.ledger.outside_count
         if self._config.decide and self._background.is_due(out):
             self._background.start(self._frozen_graph(keyframe, self.solver.settings), out)
@@ -176,11 +180,7 @@ class Backend:
         if not self._config.decide or self.holds_back:
             return report
         self._admit(keyframe)
-        outcome = self._guarded(lambda: search_alternatives(self._config, self._frozen_graph(keyframe, settings)))
-        if outcome is not None:
-            self._adopt(outcome, keyframe)
-            self.solver.start_at(outcome.values)
-            report = self.solver.optimize(settings)
+        report = self.revise("second_look", lambda: self._explained(keyframe, settings)) or report
         self.cancel_search()
         return report
 
@@ -195,24 +195,46 @@ class Backend:
         is_due = is_driven if everything is not None else self.noise.is_due(len(keyframes))
         if self._config.noise_scale != "estimated" or self.holds_back or not is_due:
             return None
-        first_edge, report = self.first_free_edge, None
+        report = None
         for _ in range(_NOISE_ROUNDS if everything else 1):
-            before = dict(self.noise.factors)
-            try:
-                found = factors_of(self.noise_scale(keyframes))
-                if not self.noise.change(found, first_edge):
-                    break
-                self.solver.rebuild()
-                report = self.solver.optimize(everything)
-            except Exception as error:
-                self._counters.count_failure("noise_scale", error)
-                self.use_noise(before)
-                report = self.solver.optimize(everything)
+            changed = self.revise("noise_scale", lambda: self._rescaled(keyframes, everything))
+            if changed is None:
                 break
+            report = changed
         if report is not None:
             self.decisions.recalibrate()
             self.cancel_search()
         return report if everything else None
+
+    def _rescaled(self, keyframes: StampedPoses[Keyframe], everything: Settings | None) -> Report | None:
+        """Solve with the noise that residuals show; None where that is the present one."""
+        if not self.noise.change(factors_of(self.noise_scale(keyframes)), self.first_free_edge):
+            return None
+        self.solver.rebuild()
+        return self.solver.optimize(everything)
+
+    def revise(self, what: str, change: Callable[[], Result | None]) -> Result | None:
+        """Change what was solved. After an exception, which is counted, all is as it was, and the result is None."""
+        before, handed_over = self._frozen_graph(0, self.solver.settings), self.handed_over
+        factors, rescalings, changes = dict(self.noise.factors), len(self.noise.history), len(self.ledger.history)
+        try:
+            return change()
+        except Exception as error:
+            self._counters.count_failure(what, error)
+        vars(self.graph).update(vars(before.graph))
+        vars(self.ledger).update(vars(before.ledger) | {"history": self.ledger.history[:changes]})
+        self.noise.go_back(factors, rescalings)
+        fresh = Solver(self.graph, self.solver.settings)
+        fresh.start_at(before.values)
+        fresh.add(before.vertices, np.arange(handed_over[1]))
+        for vertex in before.held.tolist():
+            fresh.hold(vertex)
+        with suppress(Exception):
+            fresh.update()
+        vars(self.solver).update(vars(fresh))
+        self.handed_over = handed_over
+        self.decisions.recount()
+        return None
 
     def noise_scale(self, keyframes: StampedPoses[Keyframe], labels: Container[str] = CLASSES) -> list[NoiseScale]:
         """Estimate the scale of the noise of some classes without changing anything."""
@@ -314,7 +336,7 @@ class Backend:
         edge = self.graph.add_edge(old.type, old.vertices, motion, noise, "odometry", old.source)
         self.hand_over()
         self.decisions.gate_new(self.handed_over[1], keyframe)
-        self.decisions.supersede(link, keyframe, found.evidence)
+        self.decisions.decide(link, keyframe, Verdict.REJECTED, Reason.DISPLACED, found.evidence)
         self.decisions.exchange(found.fitting, (*found.contradicting, *initial_poses), keyframe)
         self.solver.start_at(values)
         self._go_on(found, keyframe)
@@ -323,7 +345,7 @@ class Backend:
     def rejoin(self, link: int, replacement: int, keyframe: int, evidence: float = 0.0) -> None:
         """Undo ``split``: odometry's edge is accepted again, and its replacement is rejected."""
         self.decisions.withdraw([replacement], keyframe, Reason.REVOKED)
-        self.decisions.reinstate(link, keyframe, evidence)
+        self.decisions.decide(link, keyframe, Verdict.NOT_EVALUATED, Reason.NONE, evidence)
 
     def judge_anew(self, values: Array, found: DisplacementHypothesis, keyframe: int) -> None:
         """Judge all edges from other stored numbers of all vertices, and accept what shows where the robot is."""
@@ -341,7 +363,7 @@ class Backend:
     def _go_on(self, found: DisplacementHypothesis, keyframe: int) -> None:
         self.cancel_search()
         self.holds_back = False
-        self._admission.make_fit(list(found.fitting), keyframe)
+        self.decisions.make_fit(list(found.fitting), keyframe)
 
     def _admit(self, keyframe: int) -> None:
         """Judge held-back edges by the joint covariance of the estimate."""
@@ -349,15 +371,22 @@ class Backend:
         admitted = self.decisions.admit_compatible(pending, keyframe)
         self._pending = []
         if admitted:
-            self._admission.make_fit(admitted, keyframe, by_innovation=True)
+            self.decisions.make_fit(admitted, keyframe, by_innovation=True)
 
-    def _guarded(self, search: Work) -> Outcome | None:
-        """The outcome of a search; None if it failed, which changes nothing."""
-        try:
-            return search()
-        except Exception as error:
-            self._counters.count_failure("second_look", error)
+    def _use_found(self, outcome: Outcome | None, keyframe: int) -> None:
+        """Solve with what a search in the background has found, if that is another explanation."""
+        if outcome is not None and self._adopt(outcome, keyframe):
+            self.solver.start_at(outcome.carried_to(self.graph, self.solver.values))
+            self.solver.optimize()
+
+    def _explained(self, keyframe: int, settings: Settings) -> Report | None:
+        """Solve with the best explanation; None where a search finds none."""
+        outcome = search_alternatives(self._config, self._frozen_graph(keyframe, settings))
+        if outcome is None:
             return None
+        self._adopt(outcome, keyframe)
+        self.solver.start_at(outcome.values)
+        return self.solver.optimize(settings)
 
     def _adopt(self, outcome: Outcome, keyframe: int) -> bool:
         """Use the verdicts of a search. Returns whether it explains the measurements in another way than now."""

@@ -7,8 +7,7 @@ does.
 
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,19 +16,20 @@ from graph_slam_ros.graph.place import LABEL as PLACES
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.slam.anchor import Anchor
 from graph_slam_ros.slam.backend import Backend
-from graph_slam_ros.slam.condensed_edges import CONDENSED, CondensedEdge, archived
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
+from graph_slam_ros.slam.frontend.keyframes import Keyframe
+from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.slam.kidnap_detector import KidnapDetector
 from graph_slam_ros.slam.landmarks.landmark_frontend import LandmarkFrontend
-from graph_slam_ros.slam.lifelong.condenser import Condensed, Condenser, RemovedPose, compact
+from graph_slam_ros.slam.lifelong.condenser import CHAIN, Condensed, Condenser, RemovedPose, compact, seen_from
 from graph_slam_ros.slam.lifelong.place import Cell, PlaceEdge
 from graph_slam_ros.slam.lifelong.state import Left, OldKeyframe, Records, record_type
-from graph_slam_ros.slam.lifelong.surroundings import CHAIN, seen_from
 from graph_slam_ros.slam.robust.gating import CANDIDATES
+from graph_slam_ros.slam.robust.ledger import INSIDE, Reason, Verdict
 from graph_slam_ros.slam.solution import Solution
-from graph_slam_ros.solver import Solver
-from graph_slam_ros.typing import Array, Index
+from graph_slam_ros.typing import Index
 
+CONDENSED, EXPIRED = "condensed", "expired"
 BATCH = 200  # keyframes that leave the window together
 _VISITS, _BACKLOG = 4, 300  # most visits of an update, or it takes long; unless so many keyframes are to leave
 _ENOUGH = 3  # landmarks of a visit: with fewer it goes on in the next cell
@@ -38,6 +38,34 @@ _PATIENCE = 200  # keyframes that are out of the window while a visit waits
 _AGAIN = 20  # keyframes until it is tried again, where sightings without ids are not explained yet
 _SOURCE = "map"  # of what is counted
 _SUMMED = (PLACES, CHAIN)  # edges that a later one contains, when it takes their place
+
+
+@dataclass(frozen=True, slots=True)
+class CondensedEdge:
+    """An edge that left the map, and what was decided of it.
+
+    Attributes
+    ----------
+    edge : its lasting id
+    label, source, landmark : as in the ledger
+    keyframe : at which it was judged first
+    stamp_ns : of the newest keyframe that it was attached to
+    statistic, dof, threshold, verdict, reason : as in the ledger, in the end
+    became : ``condensed`` if it was believed: a place or a longer motion has what it measured; else ``expired``
+    """
+
+    edge: int
+    label: str
+    source: str
+    landmark: str
+    keyframe: int
+    stamp_ns: int
+    statistic: float
+    dof: int
+    threshold: float
+    verdict: Verdict
+    reason: Reason
+    became: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,21 +142,16 @@ class BoundedMap:
             self._tried = len(keyframes) + _AGAIN
             return None
         self._landmarks.map.withdraw_tentative(self._limit)
-        graph, values, places = backend.graph.copy(), backend.solver.values, _copies(self.state.places)
-        vertices, scale = backend.solver.vertices, replace(self.state.scale)
+        places, scale = _copies(self.state.places), replace(self.state.scale)
         self._tried = len(keyframes)
-        try:
-            rows, end = self._condensed_visits()
-            backend.note_condensed(len(keyframes) - 1)
-        except Exception as error:
-            self._counters.count_failure(_SOURCE, error)
+        condensed = backend.revise(_SOURCE, self._condensed_visits)
+        if condensed is None:
             self._tried += BATCH - 1  # the same would most likely fail at the next keyframe again
-            vars(backend.graph).update(vars(graph))
             self.state.places.clear()
             self.state.places.update(places)
             self.state.scale = self.condenser.scale = scale
-            _restart(backend.solver, vertices, values)
             return None
+        rows, end = condensed
         return self._compacted(rows, Left(self._left(rows), self._sightings(end)), end) if rows else None
 
     # -- visits ------------------------------------------------------------------------------------------------------
@@ -164,6 +187,7 @@ class BoundedMap:
             k, room = end, room - 1
         self.condenser.rescale()
         self._solution.guard.checked(solver.update)
+        self._backend.note_condensed(len(path.keyframes) - 1)
         return rows, first + k
 
     def _note_end(self, done: Condensed, keyframes: int) -> None:
@@ -302,13 +326,37 @@ def _copies(places: dict[Cell, list[PlaceEdge]]) -> dict[Cell, list[PlaceEdge]]:
     }
 
 
-def _restart(solver: Solver, vertices: Index, values: Array) -> None:
-    """Begin a solver anew with the graph as it is."""
-    held, fresh = solver.held.tolist(), Solver(solver.graph, solver.settings)
-    fresh.start_at(values)
-    fresh.add(vertices, np.arange(solver.graph.edge_count))
-    for vertex in held:
-        fresh.hold(vertex)
-    with suppress(Exception):
-        fresh.update()
-    vars(solver).update(vars(fresh))
+def archived(
+    backend: Backend, keyframes: StampedPoses[Keyframe], edges: Index, names: Mapping[int, str]
+) -> tuple[CondensedEdge, ...]:
+    """Return what is known of edges that are about to leave, without those that condensing itself has made.
+
+    Parameters
+    ----------
+    names : of landmarks, by their vertices
+    """
+    graph, ledger, out = backend.graph, backend.ledger, []
+    for number in edges.tolist():
+        edge = graph.edge(number)
+        if edge.label in (PLACES, CHAIN):
+            continue
+        newest = np.searchsorted(keyframes.ids, edge.vertices, side="right").max() - 1  # landmarks came after it
+        verdict = ledger.verdict_of(number)
+        is_in = verdict in INSIDE or verdict is Verdict.NOT_EVALUATED
+        out.append(
+            CondensedEdge(
+                graph.edge_ids.of(number),
+                edge.label,
+                edge.source,
+                next((names[vertex] for vertex in edge.vertices if vertex in names), ""),
+                ledger.keyframe.values.item(number),
+                int(keyframes.stamps_ns[max(newest, 0)]),
+                ledger.statistic.values.item(number),
+                ledger.numbers.values.item(number),
+                ledger.threshold.values.item(number),
+                verdict,
+                Reason(ledger.reason.values.item(number)),
+                CONDENSED if is_in else EXPIRED,
+            )
+        )
+    return tuple(out)

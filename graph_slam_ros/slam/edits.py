@@ -14,14 +14,13 @@ from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
 from graph_slam_ros.slam.landmarks.landmark_map import Landmarks
 from graph_slam_ros.slam.robust.gating import CANDIDATES
 from graph_slam_ros.slam.robust.landmark_support import landmark_of
-from graph_slam_ros.slam.robust.ledger import Ledger, Verdict
+from graph_slam_ros.slam.robust.ledger import OUTSIDE, Ledger
 
 SOURCE = "edit"
 BY_HAND = "by_hand"
 """The class of edges that were let in or added by hand: they have no loss and are never judged."""
 HAND_MADE = "by hand"
 """The input of edges that nobody measured: somebody added them by hand."""
-OUT = (Verdict.PENDING, Verdict.REJECTED)
 _EDIT = re.compile(r"\s*(edge|landmark)\s+(\S.{0,127}?)\s*", re.DOTALL)
 _ID = re.compile(r"\d{1,18}", re.ASCII)
 
@@ -110,7 +109,7 @@ def standing_edges(graph: Graph, ledger: Ledger, vertex: int) -> list[int]:
 def determining(graph: Graph, ledger: Ledger, vertex: int) -> list[int]:
     """The edges of a landmark without those that are out or do not determine where it is."""
     edges = standing_edges(graph, ledger, vertex)
-    return [edge for edge in edges if ledger.verdict_of(edge) not in OUT]
+    return [edge for edge in edges if ledger.verdict_of(edge) not in OUTSIDE]
 
 
 def anchors(graph: Graph, ledger: Ledger) -> list[int]:

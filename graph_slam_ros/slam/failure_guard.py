@@ -3,7 +3,6 @@
 All of it follows from the ingest sequence: a replay fails where the live run did, and recovers as it did.
 """
 
-from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -12,19 +11,19 @@ from typing import TypeVar
 import numpy as np
 
 from graph_slam_ros.errors import DivergedError, SingularError, message_of
-from graph_slam_ros.graph import GROUPS, SE2
+from graph_slam_ros.graph import GROUPS
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.slam.backend import Backend
+from graph_slam_ros.slam.landmarks.landmark_map import Landmarks
 from graph_slam_ros.slam.robust.gating import CANDIDATES
 from graph_slam_ros.slam.robust.landmark_support import landmark_of
 from graph_slam_ros.slam.robust.ledger import Reason
-from graph_slam_ros.typing import Array, Index
+from graph_slam_ros.typing import Array
 
 Result = TypeVar("Result")
 
 _FAR = 1.0  # m, rad: a number that changed by less has not diverged
 _RISE = 10.0  # times the cost before, or of residuals as large as their noise: more is no solution
-_MOST_WRAPPED = 10  # headings that are looked for, each by its place
 _TRIALS = 30  # solves in search of what is to blame
 
 
@@ -41,16 +40,16 @@ class FailureGuard:
 
     Parameters
     ----------
-    on_gone : called with the vertices of landmarks that are no part of the problem any more
+    landmarks : forgets those that are no part of the problem any more
 
     Attributes
     ----------
     failing : why the last solve failed; empty where it did not
     """
 
-    def __init__(self, backend: Backend, counters: Counters, on_gone: Callable[[set[int]], None]) -> None:
+    def __init__(self, backend: Backend, counters: Counters, landmarks: Landmarks) -> None:
         self.failing = ""
-        self._backend, self._counters, self._on_gone = backend, counters, on_gone
+        self._backend, self._counters, self._landmarks = backend, counters, landmarks
         self._graph, self._solver = backend.graph, backend.solver
         self._good = np.empty(0)  # stored numbers of all vertices after the last solve that succeeded
         self._good_vertices = self._good_edges = 0  # that it had
@@ -132,7 +131,7 @@ class FailureGuard:
             unmeasured.difference_update(self._graph.edge(edge).vertices)
         for vertex in unmeasured:
             self._solver.remove(vertex)
-        self._on_gone(unmeasured)
+        self._landmarks.forget(unmeasured)
 
     def _last_good(self) -> Array:
         """The last good estimate, with newer vertices at their initial values."""
@@ -145,9 +144,7 @@ class FailureGuard:
         values, before = self._solver.values, self._last_good()
         if not np.isfinite(values).all():
             raise DivergedError("the estimate is not finite")
-        moved = np.abs(values - before)
-        far = np.flatnonzero(~(moved <= _FAR))
-        if self._are_wrapped(far, moved[far]):
+        if (np.abs(values - before) <= _FAR).all():
             return
         now = self._solver.evaluate()
         if now.cost_final <= _RISE * sum(one.residuals for one in now.classes.values()):
@@ -155,18 +152,6 @@ class FailureGuard:
         then = self._solver.evaluate(at=before)
         if not now.cost_final <= _RISE * then.cost_final:
             raise DivergedError(f"the cost rose from {then.cost_final:.3g} to {now.cost_final:.3g}")
-
-    def _are_wrapped(self, far: Index, moved: Array) -> bool:
-        """Return whether all numbers that changed far, by their place, are headings that passed pi."""
-        is_turn = np.abs(moved - 2.0 * np.pi) <= _FAR
-        return len(far) <= _MOST_WRAPPED and bool(is_turn.all()) and all(map(self._is_heading, far.tolist()))
-
-    def _is_heading(self, place: int) -> bool:
-        """Return whether a stored number is the heading of a pose in the plane."""
-        graph = self._graph
-        after = bisect_right(range(graph.vertex_count), place, key=lambda vertex: graph.vertex(vertex).stored.start)
-        one = graph.vertex(after - 1)
-        return one.kind is SE2 and place == one.stored.stop - 1
 
     # -- quarantine --------------------------------------------------------------------------------------------------
 
@@ -192,7 +177,7 @@ class FailureGuard:
             self._counters.count(self._graph.label_of(one.edges[0]), "quarantined", len(one.edges))
             out = one.edges if one.landmark is None else self._solver.edges_on(one.landmark).tolist()
             self._backend.withdraw(out, keyframe, Reason.QUARANTINED)  # also edges that were held back before
-        self._on_gone({one.landmark for one in blamed if one.landmark is not None})
+        self._landmarks.forget({one.landmark for one in blamed if one.landmark is not None})
         return True
 
     def _suspects(self) -> list[_Suspect]:

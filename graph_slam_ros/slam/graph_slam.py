@@ -5,7 +5,8 @@ associated, and both become edges. The edges are gated, a kidnap is detected, an
 function of the configuration and the sequence of accepted measurements, and of nothing else.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 
 import numpy as np
 
@@ -31,7 +32,6 @@ from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.bounded_map import BoundedMap
 from graph_slam_ros.slam.edits import Edits
 from graph_slam_ros.slam.failure_guard import FailureGuard
-from graph_slam_ros.slam.faults import Faults
 from graph_slam_ros.slam.found_factors import FoundFactors
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
@@ -40,13 +40,13 @@ from graph_slam_ros.slam.kidnap_detector import KidnapDetector
 from graph_slam_ros.slam.landmarks.assignments import Assigned
 from graph_slam_ros.slam.landmarks.landmark_frontend import LandmarkFrontend
 from graph_slam_ros.slam.map_view import MapView
-from graph_slam_ros.slam.motion_only import MotionOnly
-from graph_slam_ros.slam.robust.background import Executor, run_when_asked
+from graph_slam_ros.slam.robust.hypotheses import run_when_asked
 from graph_slam_ros.slam.snapshot import MapSnapshot
-from graph_slam_ros.slam.solution import Solution, Solved
+from graph_slam_ros.slam.solution import Solution
 from graph_slam_ros.slam.trial_fits import TrialFits
 from graph_slam_ros.slam.update import Update, UpdateLog
-from graph_slam_ros.solver import Settings
+from graph_slam_ros.solver import Report, Settings
+from graph_slam_ros.typing import Array, Executor
 
 
 class GraphSlam(MapView):
@@ -64,6 +64,7 @@ class GraphSlam(MapView):
     ----------
     counters : counts of what was refused, repaired and used
     settings : parameters that were changed on the way
+    processed : the number of processed measurements and control events
     """
 
     def __init__(
@@ -82,12 +83,12 @@ class GraphSlam(MapView):
             trusts_sightings=lambda: backend.trusts_sightings,
             executor=executor,
         )
-        solution = Solution(config.space, backend, FailureGuard(backend, counters, landmarks.map.forget))
-        frontend = KeyframeFrontend(config, backend.noise, counters, solution.pose, start.datum if start else ())
+        solution = Solution(config.space, backend, FailureGuard(backend, counters, landmarks.map))
+        frontend = KeyframeFrontend(config, backend.noise, counters, backend.solver, start.datum if start else ())
         kidnaps = KidnapDetector(config, backend, counters, frontend.path.segments, landmarks.anonymous, start)
         super().__init__(config, backend, frontend, landmarks, kidnaps, solution)
         self.settings, self._anchor = dict[str, Value](), Anchor(config, backend)
-        self._sink, self._faults = sink or (lambda measurement: None), Faults(counters)
+        self._sink, self._faults = sink or (lambda measurement: None), list[Exception]()
         self._edits = Edits(backend, frontend, landmarks.map, counters)
         landmarks.map.aliases = aliases(backend.edits)
         self._found_factors = FoundFactors(config, backend, frontend, landmarks, counters, start)
@@ -95,13 +96,8 @@ class GraphSlam(MapView):
         self._trials = TrialFits(config, backend, frontend, landmarks, kidnaps, counters, executor, first)
         if start is not None and start.keyframes:
             self._restore(start)
-        bounded = BoundedMap(backend, frontend, landmarks, self._anchor, kidnaps, solution, counters)
-        self._updates = UpdateLog(self, bounded, MotionOnly(frontend, landmarks, bounded))
-
-    @property
-    def processed(self) -> int:
-        """The number of processed measurements and control events."""
-        return self._updates.begun
+        self._bounded = BoundedMap(backend, frontend, landmarks, self._anchor, kidnaps, solution, counters)
+        self._updates, self.processed = UpdateLog(self), 0
 
     def process(self, measurement: Measurement) -> Update:
         """Process one measurement or control event. Returns the changes.
@@ -111,11 +107,24 @@ class GraphSlam(MapView):
         """
         check_space(measurement, self.space.dimensions)
         self._sink(measurement)
-        if self._updates.begin(measurement):
-            with self._faults:
-                self._process(measurement)
-            self._faults.raise_first()
+        self.processed += 1
+        self._updates.begin(self._bounded.condense())
+        with self._collected():
+            self._process(measurement)
+        if self._faults:
+            (first, *others), self._faults = self._faults, []
+            for error in others:
+                self.counters.count("node", type(error).__name__)
+            raise first
         return self._updates.update()
+
+    @contextmanager
+    def _collected(self) -> Iterator[None]:
+        """Collect an exception: a fault loses only its own measurement, step or sighting."""
+        try:
+            yield
+        except Exception as error:
+            self._faults.append(error)
 
     def _process(self, m: Measurement) -> None:
         if isinstance(m, Control):
@@ -127,12 +136,12 @@ class GraphSlam(MapView):
 
     def _use(self, released: Iterable[Odometry | Observation]) -> None:
         for m in released:
-            with self._faults:
+            with self._collected():
                 if not isinstance(m, Odometry):
                     self._on_observation(self._frontend.corrections.observation(m))
                     continue
                 for step in self._frontend.steps(m):
-                    with self._faults:
+                    with self._collected():
                         self._on_step(step)
 
     def _on_step(self, step: Step) -> None:
@@ -140,8 +149,10 @@ class GraphSlam(MapView):
         frontend = self._frontend
         self._add_assigned(self._landmarks.travel(step))
         if not self.keyframes:
-            frontend.begin(step, self._anchor.begin)
-            self._solution.begin(self.keyframes[-1], len(self.keyframes))
+            frontend.begin(step)
+            first = self.keyframes[-1]
+            frontend.covariance = self._anchor.begin(first.vertex, self.config.start_pose or step.T_odom_base)
+            self._solution.begin(first, len(self.keyframes))
             return
         begins_segment = frontend.begins_segment(step)
         self._use_reached(frontend.integrate(step))
@@ -157,7 +168,7 @@ class GraphSlam(MapView):
 
     def _use_reached(self, until_ns: int) -> None:
         for m in self._frontend.pending.reached(until_ns):
-            with self._faults:
+            with self._collected():
                 self._on_observation(m)
 
     def _on_observation(self, m: Observation) -> None:
@@ -186,7 +197,7 @@ class GraphSlam(MapView):
     def _add_assigned(self, sightings: Iterable[Assigned]) -> None:
         """Add sightings of landmarks. The first one of a surveyed landmark locates the map."""
         for one in sightings:
-            with self._faults:
+            with self._collected():
                 found = self._landmarks.map.survey_of(one.name, one.sighting, one.where)
                 if found is not None and self._anchor.align_to_landmark(*found, len(self.keyframes) - 1):
                     self._note_moved(one.topic)
@@ -211,14 +222,21 @@ class GraphSlam(MapView):
         """Solve the new part, or everything. After a failure, which is counted, the last estimate stays."""
         if self.keyframes:
             count = len(self.keyframes)
-            solved = self._solution.solve(lambda: self._solved(count - 1, everything), self.keyframes[-1], count)
-            self._frontend.covariance = solved.covariance if solved else self._frontend.covariance
+            covariance = self._solution.solve(lambda: self._solved(count - 1, everything), self.keyframes[-1], count)
+            self._frontend.covariance = self._frontend.covariance if covariance is None else covariance
 
-    def _solved(self, keyframe: int, everything: Settings | None) -> Solved:
-        self.backend.hand_over()
+    def _solved(self, keyframe: int, everything: Settings | None) -> tuple[Report | None, Array]:
+        """Solve; then each policy looks at what is solved, in this order, and may change the past.
+
+        Landmarks without identities are told apart anew (``LandmarkFrontend``). Edges are judged, and a better
+        explanation that was found in the background is used (``Backend``). A robot that was moved, and odometry that
+        slipped, are found, or taken back (``KidnapDetector``). The noise is scaled (``Backend.scale_noise``), clocks,
+        mounts and scales are fitted, on a copy (``TrialFits``), and factors of odometry corrected (``FoundFactors``).
+        While an alarm is not decided (``Backend.holds_back``), nothing but that changes the past. What has left the
+        window is condensed before the next measurement (``BoundedMap``), when nothing of this goes on.
+        """
         now_ns, report = self._frontend.now_ns, None
         self._kidnaps.add(self.backend.handed_over[1], now_ns, self.keyframes)
-        fits = self._solution.fits()
         self._landmarks.review(self.keyframes, everything=everything is not None)
         if everything is None:
             self.backend.update(keyframe)
@@ -231,7 +249,7 @@ class GraphSlam(MapView):
         (covariance,) = self.solver.marginal([self.keyframes[keyframe].vertex])
         if not np.isfinite(covariance).all():
             raise DivergedError("the covariance is not finite")
-        return Solved(fits, report, covariance)
+        return report, covariance
 
     def _on_event(self, event: Event, values: dict[str, Value]) -> None:
         match event:

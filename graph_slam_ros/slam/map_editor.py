@@ -14,11 +14,11 @@ from graph_slam_ros.graph import EdgeType, Gaussian
 from graph_slam_ros.measurements.edits import AppliedEdit, Edit
 from graph_slam_ros.slam.anchor import TIGHT
 from graph_slam_ros.slam.backend import moved_values
-from graph_slam_ros.slam.edits import BY_HAND, HAND_MADE, OUT, anchors, determining, standing_edges, why_not_removed
+from graph_slam_ros.slam.edits import BY_HAND, HAND_MADE, anchors, determining, standing_edges, why_not_removed
 from graph_slam_ros.slam.landmarks.landmark import Landmark
 from graph_slam_ros.slam.robust.gating import CANDIDATES
 from graph_slam_ros.slam.robust.landmark_support import landmark_of
-from graph_slam_ros.slam.robust.ledger import Reason, Verdict
+from graph_slam_ros.slam.robust.ledger import OUTSIDE, Reason, Verdict
 from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.solver.linearization import evaluated
 from graph_slam_ros.typing import Array, Numbers
@@ -311,7 +311,7 @@ class MapEditor:
     def _refuse_located(self, values: Array, moved: set[int], T_new_old: Numbers) -> None:
         """Raise GraphSlamError where measurements say where the map lies."""
         graph, verdict = self._graph, self._ledger.verdict.values
-        edges = np.setdiff1d(np.flatnonzero(~np.isin(verdict, OUT)), list(moved))
+        edges = np.setdiff1d(np.flatnonzero(~np.isin(verdict, OUTSIDE)), list(moved))
         edges = edges[~graph.has_label(edges, _FOLLOWS)]
         before, after = (evaluated(graph, x, edges)[1] for x in (self.state.values, values))
         rounding = _SAME * (1.0 + math.hypot(*T_new_old[: self._space.dimensions]))

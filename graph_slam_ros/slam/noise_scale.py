@@ -12,6 +12,13 @@ independent ones. The variance of a sighting is therefore multiplied by the desi
 Errors of odometry may last, too, which edges cannot say. Errors of its rotation are therefore also summed over windows
 of two seconds, as for an Allan variance. Where they add up to more than single errors say, the noise is that of the
 sums. Sums of positions are not used: what the ranges of a pass have in common is also in them.
+
+The variance of an edge of odometry is what is configured times a factor, plus a variance for each radian turned and
+each metre driven: components of variance. They are estimated by expectation and maximisation (Dempster, Laird, Rubin,
+"Maximum likelihood from incomplete data via the EM algorithm", 1977). The expected square of an error is that of its
+residual plus the variance that all measurements together leave to it. The components are the regression of these
+squares, none below zero. One that says little of its own noise hardly moves it, and rounds are few. That is wanted:
+errors of a sensor that are alike within a pass look like those of odometry.
 """
 
 import math
@@ -20,6 +27,7 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from scipy.optimize import nnls
 
 from graph_slam_ros.graph import Graph
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
@@ -29,12 +37,13 @@ from graph_slam_ros.slam.frontend.noise_factors import (
     PER_M,
     PER_RAD,
     Key,
+    configured_variance,
     groups,
     grows,
     motion_parts,
+    motion_sizes,
     parts_of,
 )
-from graph_slam_ros.slam.motion_noise import Growth, Motions, fit_growth, growth_of
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.solver.blocks import loss_weights
 from graph_slam_ros.solver.linearization import Losses
@@ -50,8 +59,11 @@ SMALLEST, LARGEST = 0.3, 3.0  # factor of a sigma
 _ROUNDING = 1e-6  # degrees of freedom, less of which are rounding: another processor has none
 _MOST_WINDOWS = 100  # the same of windows
 _MOST_SAMPLED = 200  # edges of a group whose leverage is computed: their joint covariances cost most of all
-
-
+CONFIGURED_COUNT = 50.0  # steps of odometry: its configured noise counts as that of so many
+_ROUNDS = 4  # of the regression, each weighted by the variances of the last
+_LARGEST_SQUARE = 9.0  # variances: an error that is larger counts as that
+_LEAST, _MOST = 0.1, 3.0  # factor of the configured sigma
+_MOST_VARIANCE = 9.0  # of what is configured, in the mean over all edges
 _ONLY_LARGER = {
     "fixes": "errors of fixes that last leave no residuals",
     "closures": "closures that fit worst are not among the residuals",
@@ -120,18 +132,101 @@ def factors_of(scales: Sequence[NoiseScale]) -> dict[Key, float]:
 
 
 @dataclass(frozen=True, slots=True)
-class _Errors:
-    """Errors of a part of odometry, of edges or of windows: as for ``fit_growth``.
+class Growth:
+    """The noise of a part of odometry.
 
     Attributes
     ----------
-    count : number of edges or windows, of which these are a sample
+    factor : of the configured sigma
+    per_rad, per_m : variance that is added for each radian turned and each metre driven
+    """
+
+    factor: float = 1.0
+    per_rad: float = 0.0
+    per_m: float = 0.0
+
+
+def growth_of(factors: Mapping[Key, float], key: Key) -> Growth:
+    """The noise that a part of odometry has now."""
+    label, source, part = key
+    added = (factors.get((label, source, part + per), 0.0) for per in (PER_RAD, PER_M))
+    return Growth(factors.get(key, 1.0), *added)
+
+
+@dataclass(frozen=True, slots=True)
+class Motions:
+    """Motions that odometry measured, or sums over windows of them, each (n,).
+
+    Attributes
+    ----------
+    own : configured variance
+    turned, way : radians turned and metres driven
+    """
+
+    own: Array
+    turned: Array
+    way: Array
+
+    @classmethod
+    def of(cls, measured: Array, variance: Array, now: Growth) -> "Motions":
+        """Motions (n, 3) or (n, 7) whose variance (n,) is what it is with the present noise."""
+        of_group = {"": now.factor, PER_RAD: now.per_rad, PER_M: now.per_m}
+        return cls(configured_variance(variance, "", of_group, measured), *motion_sizes(measured))
+
+    def at(self, rows: Index) -> "Motions":
+        """Some of them."""
+        return Motions(self.own[rows], self.turned[rows], self.way[rows])
+
+    def summed(self, windows: Sequence[Index]) -> "Motions":
+        """Sums over windows of motions, which follow one another."""
+        columns = self.own, self.turned, self.way
+        return Motions(*(np.array([column[rows].sum() for rows in windows]) for column in columns))
+
+    def variance(self, noise: Growth) -> Array:
+        """The variance of each."""
+        return noise.factor**2 * self.own + noise.per_rad * self.turned + noise.per_m * self.way
+
+    def bounded(self, noise: Growth) -> Growth:
+        """A noise whose factor and added variance are within their limits."""
+        factor = float(np.clip(noise.factor, _LEAST, _MOST))
+        added = float(np.sum(self.variance(Growth(0.0, noise.per_rad, noise.per_m))))
+        share = min(1.0, _MOST_VARIANCE * float(np.sum(self.own)) / added) if added > 0.0 else 1.0
+        return Growth(factor, share * noise.per_rad, share * noise.per_m)
+
+
+@dataclass(frozen=True, slots=True)
+class _Errors:
+    """Errors of a part of odometry, of edges or of windows.
+
+    Attributes
+    ----------
+    square : (n,) square of each residual, or sum of residuals
+    left : (n,) the variance that all measurements together leave to its error
+    count : number of edges or windows, of which these are a sample; what is configured counts as
+        ``CONFIGURED_COUNT`` of them
     """
 
     motions: Motions
     square: Array
     left: Array
     count: int
+
+    def growth(self, now: Growth, *, is_rotation: bool) -> Growth:
+        """One step of expectation and maximisation, drawn to what is configured.
+
+        Turning adds to a rotation; a position grows with the way alone.
+        """
+        motions, at = self.motions, self.motions.variance(now)
+        expected = np.minimum(self.square + self.left, _LARGEST_SQUARE * at)
+        for _ in range(_ROUNDS):
+            columns = np.stack([motions.own, motions.turned * is_rotation, motions.way], axis=1) / at[:, None]
+            size = np.linalg.norm(columns, axis=0)
+            size[size == 0.0] = 1.0
+            found = nnls(columns / size, expected / at)[0] / size
+            now = motions.bounded(Growth(float(np.sqrt(found[0])), float(found[1]), float(found[2])))
+            at = motions.variance(now)
+        part = self.count / (self.count + CONFIGURED_COUNT)
+        return Growth(float(np.sqrt(part * now.factor**2 + 1.0 - part)), part * now.per_rad, part * now.per_m)
 
 
 @dataclass(slots=True)
@@ -182,7 +277,7 @@ def estimate_noise(
             block = _Block(table, rows, label, solver, values, losses)
             passes = _passes(block.ends, stamp_of) if label == "landmarks" else []
             does_grow = grows(table.type, label)
-            of_type = table.type, label, block.measured
+            of_type = table.type, block.measured
             parts = motion_parts(*of_type, block.roots) if does_grow else parts_of(*of_type)
             for part, axes in parts.items():
                 key, total = (label, source, part), sums.setdefault((label, source, part), _Sums())
@@ -202,7 +297,7 @@ def _grown(one: NoiseScale, total: _Sums, now: Growth) -> NoiseScale:
     found = now
     if not one.reason:
         every, is_rotation = total.errors[0].motions, one.part == "rotation"
-        fits = [fit_growth(e.motions, e.square, e.left, now, e.count, is_rotation=is_rotation) for e in total.errors]
+        fits = [errors.growth(now, is_rotation=is_rotation) for errors in total.errors]
         found = max(fits, key=lambda fit: float(every.variance(fit).sum()))
     per_s = found.factor**2 * total.own_per_s
     return replace(one, factor=found.factor, per_rad=found.per_rad, per_m=found.per_m, per_s=per_s)
@@ -247,10 +342,6 @@ class _Block:
             total.of_means += float(np.sum(np.sum(sums**2, axis=1) / sizes))
             total.of_singles += float(np.sum(squares / sizes))
 
-    def _seconds(self, stamp_of: Index) -> float:
-        """The time between the vertices of its edges, in all."""
-        return float(np.sum(np.abs(np.diff(stamp_of[self.ends[:, :2]], axis=1)))) * 1e-9
-
     def add_odometry(self, total: "_Sums", axes: Array, now: Growth, stamp_of: Index, *, is_rotation: bool) -> None:
         """Add a part of odometry's residuals, and how its noise grows."""
         count, kinds = len(self.residual), axes.shape[2]
@@ -262,7 +353,8 @@ class _Block:
         total.residuals += float(kinds * count)
         total.leverage += float((known / variance[self.sampled]).mean()) * kinds * count
         total.chi2 += kinds * float(np.sum(square / motions.own))
-        total.own_per_s = float(motions.own.sum()) / max(1e-9, self._seconds(stamp_of))
+        seconds = float(np.sum(np.abs(np.diff(stamp_of[self.ends[:, :2]], axis=1)))) * 1e-9
+        total.own_per_s = float(motions.own.sum()) / max(1e-9, seconds)
         total.errors = [_Errors(motions.at(self.sampled), square[self.sampled], known, count)]
         if is_rotation:
             total.errors.append(self._turns(motions, stamp_of))

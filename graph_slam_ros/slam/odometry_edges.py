@@ -22,8 +22,7 @@ def replace_odometry(
         new.append(graph.add_edge(old.type, old.vertices, old.measured, noise, "odometry", old.source))
     backend.gate_new(keyframe)
     for link in links:
-        backend.solver.set_weight(link, 0.0)
-        ledger.note(link, keyframe, Verdict.REJECTED, Reason.SLIP, evidence, threshold)
+        backend.decisions.decide(link, keyframe, Verdict.REJECTED, Reason.SLIP, evidence, threshold)
         ledger.threshold.values[link] = threshold
     backend.cancel_search()
     return new
@@ -34,6 +33,6 @@ def restore_odometry(backend: Backend, pairs: Sequence[tuple[int, int]], keyfram
     for link, replacement in pairs:
         backend.decisions.withdraw([replacement], keyframe, Reason.REVOKED)
         backend.ledger.threshold.values[link] = backend.ledger.threshold.values[replacement]
-        backend.decisions.reinstate(link, keyframe, evidence)
+        backend.decisions.decide(link, keyframe, Verdict.NOT_EVALUATED, Reason.NONE, evidence)
     backend.cancel_search()
     backend.solver.update()

@@ -33,22 +33,6 @@ class Correction:
     chi2: tuple[float, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class Solved:
-    """The result of a solve.
-
-    Attributes
-    ----------
-    fits : (chi2 per number measured, edge) of the new edges that fitted least before
-    report : of a solve of everything
-    covariance : (dof, dof) of the newest keyframe's pose
-    """
-
-    fits: list[tuple[float, int]]
-    report: Report | None
-    covariance: Array
-
-
 class Solution:
     """The outcome of the last solve, and the unsolved additions since.
 
@@ -113,20 +97,27 @@ class Solution:
         """Return whether enough is unsolved."""
         return keyframes - min(self._keyframes, keyframes) + self.resting >= every_keyframes
 
-    def solve(self, work: Callable[[], Solved], newest: Keyframe, keyframes: int) -> Solved | None:
-        """Solve by some work; None if it fails. A failure is counted, and the last estimate stays."""
+    def solve(self, work: Callable[[], tuple[Report | None, Array]], newest: Keyframe, keyframes: int) -> Array | None:
+        """Solve by some work; None if it fails. A failure is counted, and the last estimate stays.
+
+        Parameters
+        ----------
+        work : returns the report of a solve of everything, and the covariance of the newest pose, as this does
+        """
         self._keyframes, self.resting, self.vertices = keyframes, 0, 0
-        solved = self.guard.solve(work, keyframes - 1)
+        solved = self.guard.solve(lambda: (self._fits(), *work()), keyframes - 1)
         if solved is None:
             return None
-        self.report = solved.report or self.report
+        fits, report, covariance = solved
+        self.report = report or self.report
         self.solves += 1
         self.vertices, self._edges = self._backend.handed_over
-        self._note_correction(solved.fits, newest)
-        return solved
+        self._note_correction(fits, newest)
+        return covariance
 
-    def fits(self) -> list[tuple[float, int]]:
-        """(chi2 per degree of freedom, edge) of the new edges with the worst fit, which may move the map."""
+    def _fits(self) -> list[tuple[float, int]]:
+        """Return (chi2 per degree of freedom, edge) of the new edges with the worst fit, which may move the map."""
+        self._backend.hand_over()
         edges = range(self._edges, self._backend.handed_over[1])
         chi2, numbers = self._backend.solver.chi2_of(edges)
         fit = chi2 / numbers

@@ -2,12 +2,10 @@
 
 from dataclasses import dataclass
 
-from graph_slam_ros.measurements.types import Measurement, Odometry
 from graph_slam_ros.slam.alarm import Alarm
-from graph_slam_ros.slam.bounded_map import BoundedMap, Condensation
+from graph_slam_ros.slam.bounded_map import Condensation
 from graph_slam_ros.slam.calibration.answers import Finding
 from graph_slam_ros.slam.map_view import MapView
-from graph_slam_ros.slam.motion_only import MotionOnly
 from graph_slam_ros.slam.robust.ledger import VerdictChange
 from graph_slam_ros.slam.slip_review import Slip
 from graph_slam_ros.slam.solution import Correction
@@ -46,67 +44,38 @@ class Update:
     def __bool__(self) -> bool:
         return bool(self.keyframes) or self.solved or self.condensed is not None
 
-    def __repr__(self) -> str:
-        parts = [_counted(len(self.keyframes), "keyframe")] if self.keyframes else []
-        parts += [_counted(len(self.edges), "edge")] if self.edges else []
-        if self.solved:
-            moved = f", map -> odom moved {self.correction.distance_m:.3g} m"
-            parts.append(("solved everything" if self.report else "solved") + moved)
-        parts += [_counted(len(self.changes), "changed verdict")] if self.changes else []
-        return f"Update({', '.join(parts) or 'nothing'})"
-
 
 NOTHING = Update()
 
 
 class UpdateLog:
-    """Makes each update from the difference to the previous one.
+    """Makes each update from the difference to the previous one."""
 
-    Parameters
-    ----------
-    bounded : condenses what has left the window before an update begins
-    motion : adds odometry that changes nothing else
-
-    Attributes
-    ----------
-    begun : the number of updates that were begun
-    """
-
-    def __init__(self, view: MapView, bounded: BoundedMap, motion: MotionOnly) -> None:
-        self._view, self._bounded, self.begun = view, bounded, 0
-        self._motion, self._only_moves = motion, False
+    def __init__(self, view: MapView) -> None:
+        self._view = view
         self._keyframes = self._edges = self._solves = 0
         self._report: Report | None = None
         self._changes = len(view.ledger.history)  # of verdicts, that updates have reported
         self._alarms, self._corrections = view.alarms, len(view.corrected)
         self._condensed: Condensation | None = None
 
-    def begin(self, m: Measurement) -> bool:
-        """Begin the next update, before which something may be condensed. Returns whether more is to be processed."""
-        view = self._view
-        self.begun += 1
-        self._only_moves = isinstance(m, Odometry) and self._motion.add(m)
-        if self._only_moves:
-            return False
-        self._motion.forget()
-        self._condensed = self._bounded.condense()
-        if self._condensed is not None:
+    def begin(self, condensed: Condensation | None) -> None:
+        """Begin the next update, before which something may have been condensed."""
+        view, self._condensed = self._view, condensed
+        if condensed is not None:
             self._changes = len(view.ledger.history)
         self._keyframes, self._edges = len(view.keyframes), view.backend.handed_over[1]
         self._solves, self._report = view.solves, view.report
-        return True
 
     def update(self) -> Update:
-        """The changes since ``begin``; of verdicts and alarms, since the last update."""
-        if self._only_moves:
-            return NOTHING
+        """The changes since ``begin``; of verdicts, alarms and factors, since the last update that told any."""
         view = self._view
         solved, keyframes = view.solves > self._solves, range(self._keyframes, len(view.keyframes))
         if not solved and not keyframes:
             return NOTHING if self._condensed is None else Update(condensed=self._condensed)
         changes, self._changes = tuple(view.ledger.history[self._changes :]), len(view.ledger.history)
-        before, self._alarms = self._alarms, view.alarms
-        known = set(map(_state, before))
+        known, self._alarms = set(map(_state, self._alarms)), view.alarms
+        calibrated, self._corrections = tuple(view.corrected[self._corrections :]), len(view.corrected)
         return Update(
             tuple(keyframes),
             range(self._edges, view.backend.handed_over[1]),
@@ -115,19 +84,11 @@ class UpdateLog:
             view.correction if solved else _NO_CORRECTION,
             changes,
             tuple(one for one in self._alarms if _state(one) not in known),
-            self._new_corrections(),
+            calibrated,
             self._condensed,
         )
-
-    def _new_corrections(self) -> tuple[Finding, ...]:
-        first, self._corrections = self._corrections, len(self._view.corrected)
-        return tuple(self._view.corrected[first:])
 
 
 def _state(alarm: Alarm | Slip) -> tuple[int, int | None, int | None, str]:
     """The part of an alarm that changes when it begins, is decided or ends."""
     return alarm.began_ns, alarm.segment, alarm.ended_ns, alarm.outcome
-
-
-def _counted(count: int, what: str) -> str:
-    return f"{count} {what}{'' if count == 1 else 's'}"

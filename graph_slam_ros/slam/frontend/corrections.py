@@ -119,11 +119,6 @@ class Corrections:
         return self._factors[:2]
 
     @property
-    def leave_odometry(self) -> bool:
-        """Return whether odometry is used as it comes."""
-        return self._factors == (1.0, 1.0, 0.0)
-
-    @property
     def are_configured(self) -> bool:
         """Return whether the configuration corrects odometry."""
         c = self._config.odometry

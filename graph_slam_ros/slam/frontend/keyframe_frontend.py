@@ -1,7 +1,7 @@
 """The front end: odometry becomes keyframes. Each is a vertex, joined to the one before by an odometry edge."""
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import TypeGuard
 
 import numpy as np
@@ -35,6 +35,7 @@ from graph_slam_ros.slam.frontend.pose_edges import PoseEdges
 from graph_slam_ros.slam.frontend.stamp_order import PendingObservations, StampOrder
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.slam.frontend.thinning import ObservationThinning
+from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Index, Numbers
 
 _UNCERTAIN, _MAX_UNCERTAIN_M = 10.0, 1e5  # times as far as a given pose is away: so little odometry is trusted there
@@ -48,7 +49,7 @@ class KeyframeFrontend:
     Parameters
     ----------
     edges : adds edges to the graph
-    pose_of : the present estimate of a vertex
+    solver : tells where the last keyframe is
     datum : of a map that is loaded
 
     Attributes
@@ -75,10 +76,10 @@ class KeyframeFrontend:
         config: Config,
         edges: NoiseScales,
         counters: Counters,
-        pose_of: Callable[[int], Numbers],
+        solver: Solver,
         datum: tuple[float, ...] = (),
     ) -> None:
-        self.config, self._space, self._pose_of = config, config.space, pose_of
+        self.config, self._space, self._solver = config, config.space, solver
         self._edges, self._graph, self._counters = edges, edges.graph, counters
         self._noise = OdometryNoise(config.odometry, self._space)
         self.odometry = OdometrySelector(config.odometry, config.inputs.names.split(), self._space, counters)
@@ -178,11 +179,6 @@ class KeyframeFrontend:
             fused = self.gyro.fuse(self.corrections.without_bias(step), seconds)
             yield self.corrections.with_bias(fused, seconds)
 
-    @property
-    def uses_odometry_alone(self) -> bool:
-        """Return whether steps are those of the odometry in use, as it reports them: no gyro, nothing corrected."""
-        return self.gyro is None and self.corrections.leave_odometry
-
     def _add_to_gyro(self, m: AngularVelocity) -> None:
         if self.gyro is None or m.topic != self.gyro.name:
             self._counters.count(m.topic, "not_in_use")
@@ -216,28 +212,15 @@ class KeyframeFrontend:
         motion, longest_ns = self.path.motion, self.config.keyframes.max_interval_s * 1e9
         if motion is None or self.held_covariance is not None:
             return motion is not None
-        at = motion.now.T_keyframe_base
-        return self.is_far(at) or motion.is_long() or (motion.moving_ns >= longest_ns and not self._noise.is_jitter(at))
-
-    def is_far(self, T_keyframe_base: Numbers) -> bool:
-        """Return whether a motion since the last keyframe is so large that another is due."""
-        due, space = self.config.keyframes, self._space
-        return (
-            space.square(T_keyframe_base) >= due.min_distance_m**2 or space.angle(T_keyframe_base) >= due.min_angle_rad
-        )
+        at, due = motion.now.T_keyframe_base, self.config.keyframes
+        is_far = self._space.square(at) >= due.min_distance_m**2 or self._space.angle(at) >= due.min_angle_rad
+        return is_far or motion.is_long or (motion.moving_ns >= longest_ns and not self._noise.is_jitter(at))
 
     # -- keyframes -------------------------------------------------------------------------------------------------
 
-    def begin(self, step: Step, anchor: Callable[[int, Numbers], Array]) -> None:
-        """Add the first keyframe: at the pose of odometry, or at the initial pose that was given.
-
-        Parameters
-        ----------
-        anchor : holds a vertex at a pose, and returns its covariance
-        """
-        T_map_base = self.config.start_pose or step.T_odom_base
-        vertex = self._graph.add_vertex(self._space.pose, T_map_base)
-        self.covariance = anchor(vertex, T_map_base)
+    def begin(self, step: Step) -> None:
+        """Add the first keyframe: at the pose of odometry, or at the initial pose that was given."""
+        vertex = self._graph.add_vertex(self._space.pose, self.config.start_pose or step.T_odom_base)
         self.path.segments.append(0)
         self.path.append(vertex, step, self.config.ordering.late_s)
 
@@ -302,10 +285,14 @@ class KeyframeFrontend:
         assert motion is not None
         return motion
 
+    @property
+    def _last_pose(self) -> Numbers:
+        return tuple(self._solver.estimate([self.path.keyframes[-1].vertex])[0].tolist())
+
     def _append(self, step: Step, T_last_now: Numbers, covariance: Array, at: Numbers | None = None) -> None:
         """Add a vertex at odometry's pose, or at the given pose, and the edge from the vertex before."""
         group, last = self._space.group, self.path.keyframes[-1].vertex
-        vertex = self._graph.add_vertex(self._space.pose, at or group.compose(self._pose_of(last), T_last_now))
+        vertex = self._graph.add_vertex(self._space.pose, at or group.compose(self._last_pose, T_last_now))
         factor = self._sigma_factors.get(self.source, 1.0)
         covariance = covariance if factor == 1.0 else covariance * factor**2
         noise = edge_noise(self._counters, "odometry", covariance, self._space.dimensions)
@@ -321,8 +308,8 @@ class KeyframeFrontend:
         """
         if given is None:
             return JUMP_SIGMA_M, JUMP_SIGMA_RAD
-        group, last = self._space.group, self._pose_of(self.path.keyframes[-1].vertex)
-        away = group.between(group.compose(last, T_last_now), given.T_map_base)
+        group = self._space.group
+        away = group.between(group.compose(self._last_pose, T_last_now), given.T_map_base)
         far_m = math.hypot(*away[: self._space.dimensions])
         uncertain_m = min(_UNCERTAIN * far_m, _MAX_UNCERTAIN_M)
         return max(JUMP_SIGMA_M, uncertain_m), max(JUMP_SIGMA_RAD, _UNCERTAIN * math.pi)
@@ -366,7 +353,7 @@ class KeyframeFrontend:
             covariance = covariance + np.diag(np.square(self._space.sigmas(JUMP_SIGMA_M, JUMP_SIGMA_RAD)))
         self._append(Step(where.stamp_ns, self._space.identity, T_odom_base), motion.now.T_keyframe_base, covariance)
         if rest is not None:
-            self._motion.resume_after_cut(rest, stood)
+            self._motion.extend(rest, stood)
         keyframe = len(keyframes) - 1
         at_keyframe = self._space.identity, np.zeros((size, size))
         return PoseAtStamp(keyframe, keyframes[keyframe].vertex, where.stamp_ns, *at_keyframe)

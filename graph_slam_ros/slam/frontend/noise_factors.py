@@ -50,12 +50,7 @@ def configured_variance(now: Array, part: str, of_group: Mapping[str, float], me
     return np.maximum(own, _LEAST_OWN * now) / of_group.get(part, 1.0) ** 2
 
 
-def depends_on_place(edge: EdgeType, label: str) -> bool:
-    """Return whether the parts of the residual are along the line of sight, and across it."""
-    return edge.name.removesuffix(" 3D") in ("landmark position", "tag position")
-
-
-def parts_of(edge: EdgeType, label: str, measured: Array) -> dict[str, Array]:
+def parts_of(edge: EdgeType, measured: Array) -> dict[str, Array]:
     """Split the residual of edges into parts: orthonormal directions (n, m, k) of each.
 
     Parameters
@@ -65,7 +60,7 @@ def parts_of(edge: EdgeType, label: str, measured: Array) -> dict[str, Array]:
     n, m = len(measured), edge.residual_size
     axes = np.broadcast_to(np.eye(m), (n, m, m))
     name = edge.name.removesuffix(" 3D")
-    if depends_on_place(edge, label):
+    if name in ("landmark position", "tag position"):
         return _sight_parts(measured[:, :m])
     if name == "range and bearing":
         return {"range": axes[:, :, :1], "bearing": axes[:, :, 1:]}
@@ -77,7 +72,7 @@ def parts_of(edge: EdgeType, label: str, measured: Array) -> dict[str, Array]:
     return {"all": axes}
 
 
-def motion_parts(edge: EdgeType, label: str, measured: Array, roots: Array) -> dict[str, Array]:
+def motion_parts(edge: EdgeType, measured: Array, roots: Array) -> dict[str, Array]:
     """Split the residual of odometry's edges into parts: directions (n, m, k) of each, that are independent.
 
     A wrong heading at the begin of an edge moves its end sideways, so errors of position and rotation are correlated,
@@ -88,7 +83,7 @@ def motion_parts(edge: EdgeType, label: str, measured: Array, roots: Array) -> d
     ----------
     roots : (n, m, m) square roots of the information
     """
-    parts = parts_of(edge, label, measured)
+    parts = parts_of(edge, measured)
     information = np.swapaxes(roots, 1, 2) @ roots
     d = parts["position"].shape[2]
     given_rotation = np.linalg.solve(information[:, :d, :d], information[:, :d, d:])
@@ -164,7 +159,6 @@ class NoiseScales:
         self.factors: dict[Key, float] = dict(factors or {})
         self.history: list[Rescaling] = []
         self._due, self._once_more = FIRST_DUE, False
-        self._narrower: dict[tuple[EdgeType, str, str], Array] = {}  # where it does not depend on what is measured
 
     def is_due(self, keyframes: int) -> bool:
         """Return whether the number of keyframes has doubled since the last estimate, or had at the call before.
@@ -184,25 +178,9 @@ class NoiseScales:
         label, source = (*names, "")[:2]
         factors = _of(self.factors, label, source)
         if factors:
-            noise = Gaussian(self._scaled(edge, label, source, measured, noise.sqrt_information[None], factors)[0])
+            z = edge.whole(np.asarray(measured, dtype=float)[None])
+            noise = Gaussian(_rescaled(edge, label, z, noise.sqrt_information[None], {}, factors)[0])
         return self.graph.add_edge(edge, vertices, measured, noise, label, source)
-
-    def _scaled(
-        self,
-        edge: EdgeType,
-        label: str,
-        source: str,
-        measured: Sequence[float] | Array,
-        root: Array,
-        factors: Mapping[str, float],
-    ) -> Array:
-        """Return the square root (1, m, m) of the information of one edge, scaled by the factors of its group."""
-        z = edge.whole(np.asarray(measured, dtype=float)[None])
-        if grows(edge, label) or depends_on_place(edge, label):
-            return _rescaled(edge, label, z, root, {}, factors)
-        if (edge, label, source) not in self._narrower:
-            self._narrower[edge, label, source] = _narrower(edge, label, z, {}, factors)
-        return root @ self._narrower[edge, label, source]
 
     def change(self, factors: Mapping[Key, float], first_edge: int) -> bool:
         """Scale the edges from a number on, and all later ones, by these factors; return whether an edge changed."""
@@ -212,9 +190,13 @@ class NoiseScales:
         rescaling = Rescaling(first_edge, self.graph.edge_count, before, dict(factors))
         rescaling.apply(self.graph)
         self.factors |= factors
-        self._narrower.clear()
         self.history.append(rescaling)
         return True
+
+    def go_back(self, factors: dict[Key, float], changes: int) -> None:
+        """Return to factors after so many changes, where the graph has returned to its noise then."""
+        self.factors = factors
+        del self.history[changes:]
 
     def neutral(self) -> dict[Key, float]:
         """Return factors of all groups that change nothing."""
@@ -237,39 +219,21 @@ def _of(factors: Mapping[Key, float], label: str, source: str) -> dict[str, floa
 def _rescaled(
     edge: EdgeType, label: str, measured: Array, roots: Array, before: Mapping[str, float], after: Mapping[str, float]
 ) -> Array:
-    if grows(edge, label):
-        return _regrown(edge, label, measured, roots, before, after)
-    return roots @ _narrower(edge, label, measured, before, after)
-
-
-def _narrower(
-    edge: EdgeType, label: str, measured: Array, before: Mapping[str, float], after: Mapping[str, float]
-) -> Array:
-    """Return what scales the square roots (n, m, m) of edges whose noise does not grow with the measured motion."""
-    narrower = np.zeros((len(measured), edge.residual_size, edge.residual_size))
-    for part, axes in parts_of(edge, label, measured).items():
-        ratio = after.get(part, 1.0) / before.get(part, 1.0)
-        narrower += axes @ np.swapaxes(axes, 1, 2) / ratio
-    return narrower
-
-
-def _regrown(
-    edge: EdgeType, label: str, measured: Array, roots: Array, before: Mapping[str, float], after: Mapping[str, float]
-) -> Array:
+    """Return the square roots (n, m, m) of the information of edges by other factors of their noise."""
+    if not grows(edge, label):
+        narrower = np.zeros((len(measured), edge.residual_size, edge.residual_size))
+        for part, axes in parts_of(edge, measured).items():
+            ratio = after.get(part, 1.0) / before.get(part, 1.0)
+            narrower += axes @ np.swapaxes(axes, 1, 2) / ratio
+        return roots @ narrower
     into, scaled = list[Array](), list[Array]()
-    for part, axes in motion_parts(edge, label, measured, roots).items():
-        now = variance_of(roots, axes)
+    for part, axes in motion_parts(edge, measured, roots).items():
+        spread = np.linalg.solve(np.swapaxes(roots, 1, 2), axes)
+        now = np.einsum("nij,nij->n", spread, spread)
         own = configured_variance(now, part, before, measured) * after.get(part, 1.0) ** 2
-        ratio = np.sqrt((own + added_variance(part, after, measured)) / now)
         into.append(np.swapaxes(axes, 1, 2))
-        scaled.append(into[-1] / ratio[:, None, None])
+        scaled.append(into[-1] / np.sqrt((own + added_variance(part, after, measured)) / now)[:, None, None])
     return roots @ np.linalg.solve(np.concatenate(into, axis=1), np.concatenate(scaled, axis=1))
-
-
-def variance_of(roots: Array, axes: Array) -> Array:
-    """Return the variance (n,) along directions (n, m, k), summed over them."""
-    spread = np.linalg.solve(np.swapaxes(roots, 1, 2), axes)
-    return np.einsum("nij,nij->n", spread, spread)
 
 
 def groups(graph: Graph, edges: range) -> Iterator[tuple[EdgeTable, Index, str, str]]:

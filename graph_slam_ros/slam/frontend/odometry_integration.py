@@ -175,27 +175,14 @@ class IntegratedOdometry:
         """Stamp of the keyframe."""
         return self._moved[0].stamp_ns
 
-    def after(self, T_keyframe_base: Numbers, motion: Numbers) -> Numbers:
-        """Return ``T_keyframe_base`` after one more motion."""
-        out: Numbers = self._space.group.compose_one(T_keyframe_base, motion)
-        return out
+    def step(self, step: Step) -> None:
+        """Append one step of odometry."""
+        self.extend(step, self._rest.update(step, (step.stamp_ns - self._moved[-1].stamp_ns) * 1e-9))
 
-    def step(self, step: Step, to: Numbers | None = None) -> None:
-        """Append one step of odometry.
-
-        Parameters
-        ----------
-        to : where it leads to, if that is known (``after``)
-        """
-        stands = self._rest.update(step, (step.stamp_ns - self._moved[-1].stamp_ns) * 1e-9)
-        self._extend(step, to or self.after(self._moved[-1].T_keyframe_base, step.T_last_base), stands)
-
-    def resume_after_cut(self, rest: Step, stood: bool) -> None:
-        """Append what ``cut`` left over of the motion before, in which the robot stood or not."""
-        self._extend(rest, self.after(self._moved[-1].T_keyframe_base, rest.T_last_base), stood)
-
-    def _extend(self, step: Step, to: Numbers, stands: bool) -> None:
+    def extend(self, step: Step, stands: bool) -> None:
+        """Append a step in which the robot stood or not, as what ``cut`` left over of the motion before."""
         before = self._moved[-1]
+        to = self._space.group.compose_one(before.T_keyframe_base, step.T_last_base)
         moved = self._extended(before, to, step, stands)
         self.moving_ns += (moved.stamp_ns - before.stamp_ns) * (not moved.stands)
         if before.stands and moved.stands:  # of a robot that stands for hours, only the last is remembered
@@ -233,9 +220,10 @@ class IntegratedOdometry:
             return True
         return k < len(self._moved) and not self._moved[k].is_gap
 
-    def is_long(self, more: int = 0) -> bool:
-        """Return whether, with some more, too many messages are remembered, so that a keyframe is needed."""
-        return len(self._moved) + more >= _MOST
+    @property
+    def is_long(self) -> bool:
+        """Return whether too many messages are remembered, so that a keyframe is needed."""
+        return len(self._moved) >= _MOST
 
     @property
     def before_last_ns(self) -> int:

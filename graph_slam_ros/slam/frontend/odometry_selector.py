@@ -104,28 +104,6 @@ class OdometrySelector:
         self._counters.count(m.source, "not_in_use")
         return []
 
-    def motions(self, following: Sequence[Odometry]) -> list[Numbers] | None:
-        """The motion to each of some messages, if all are new, of the odometry in use and no jump; else None."""
-        if self._used is None or not self._past.get(self._used.source):
-            return None
-        at, last_ns, out = self._used, self._past[self._used.source][-1].stamp_ns, list[Numbers]()
-        for m in following:
-            if m.source != at.source or m.stamp_ns == last_ns:
-                return None
-            motion = self._space.group.between_one(at.T_odom_base, m.T_odom_base)
-            last = out[-1] if out else self._last_step
-            dt_ns = m.stamp_ns - at.stamp_ns
-            if dt_ns > self._longest_ns or self._jumps.kind(motion, m.T_odom_base, dt_ns * 1e-9, last):
-                return None
-            at, last_ns = m, m.stamp_ns
-            out.append(motion)
-        return out
-
-    def follow(self, m: Odometry, motion: Numbers) -> Step:
-        """Return the step to a message by its motion (``motions``)."""
-        self._past[m.source].append(m)
-        return self._use(m, motion, broken="")
-
     def _has_failed_over(self, m: Odometry, used: Odometry) -> bool:
         if self._order.index(m.source) < self._order.index(used.source):
             return m.stamp_ns >= used.stamp_ns

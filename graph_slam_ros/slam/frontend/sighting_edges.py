@@ -64,13 +64,9 @@ class SightingEdges:
     def renumber(self, edges: Index) -> None:
         """Take over new ids of edges, by old ones; -1: it was removed."""
         new = edges[self.edge]
-        rows = np.flatnonzero(new >= 0)
-        old = (self.edge, self.stamp_ns, self.T_keyframe_base, self.sensor)
-        fresh = SightingEdges(self._space)
-        columns = fresh._edge, fresh._stamp_ns, fresh._pose, fresh._sensor
-        values = (new[rows], *(of_all[rows] for of_all in old[1:]))
-        Column.extend(*((column, of_some, len(rows)) for column, of_some in zip(columns, values, strict=True)))
-        self._edge, self._stamp_ns, self._pose, self._sensor = columns
+        rows, columns = np.flatnonzero(new >= 0), (self._edge, self._stamp_ns, self._pose, self._sensor)
+        self._edge, self._stamp_ns, self._pose, self._sensor = (column.kept(rows) for column in columns)
+        self.edge[:] = new[rows]
 
     def copy(self) -> "SightingEdges":
         """Return a copy."""

@@ -9,7 +9,6 @@ without the correction. Else no keyframe could be made where a sighting was.
 """
 
 from bisect import insort
-from collections.abc import Sequence
 
 from graph_slam_ros.config.pipeline import OrderingConfig
 from graph_slam_ros.measurements.counters import Counters
@@ -109,29 +108,6 @@ class StampOrder:
             self._released_ns = max(self._released_ns or 0, min(out[-1][0], self._newest_odometry_ns))
         return [entry[-1] for entry in out]
 
-    def next_odometry(self, m: Odometry) -> list[Odometry] | None:
-        """Return the odometry that newer odometry releases; None if it is not newer, or releases more than that."""
-        newest_ns, out = self._newest_odometry_ns, list[Odometry]()
-        until_ns = m.stamp_ns - self._window_ns
-        if newest_ns is None or m.stamp_ns <= newest_ns or m.stamp_ns <= until_ns:
-            return None
-        for stamp_ns, rank, _, _, queued in self._queue:
-            if stamp_ns > until_ns:
-                break
-            if rank or not isinstance(queued, Odometry):
-                return None
-            out.append(queued)
-        return out
-
-    def exchange(self, m: Odometry, released: Sequence[Odometry]) -> None:
-        """Queue the odometry that ``next_odometry`` was asked with, and release what that has returned."""
-        if released:
-            del self._queue[: len(released)]
-            self._released_ns = max(self._released_ns or 0, released[-1].stamp_ns)
-        insort(self._queue, (m.stamp_ns, 0, "", self._arrivals, m))
-        self._arrivals += 1
-        self._newest_odometry_ns = m.stamp_ns
-
 
 class PendingObservations:
     """Observations newer than all odometry. Each is pending until odometry reaches its stamp.
@@ -167,9 +143,6 @@ class PendingObservations:
         else:
             self._pending.append(m)
         return False
-
-    def __len__(self) -> int:
-        return len(self._pending)
 
     def reached(self, until_ns: int) -> list[Observation]:
         """Return the pending observations that odometry has reached."""

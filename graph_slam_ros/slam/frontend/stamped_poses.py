@@ -65,8 +65,7 @@ class StampedPoses(Generic[Instant]):
 
     def _part(self, rows: Index, first: int) -> "StampedPoses[Instant]":
         out = StampedPoses(self._record, self.poses.shape[1], first)
-        columns = (out._id, self.ids), (out._stamp_ns, self.stamps_ns), (out._pose, self.poses)
-        Column.extend(*((column, values[rows], len(rows)) for column, values in columns))
+        out._id, out._stamp_ns, out._pose = (one.kept(rows) for one in (self._id, self._stamp_ns, self._pose))
         return out
 
     def __len__(self) -> int:

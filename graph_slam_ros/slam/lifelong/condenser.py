@@ -1,23 +1,25 @@
 """Condensing: the keyframes of a visit leave the problem, and an edge of the place has what they measured."""
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
 
 from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.errors import SingularError
-from graph_slam_ros.graph import Gaussian
+from graph_slam_ros.graph import Edge, Gaussian
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.graph.kept_part import kept_part, new_ids
-from graph_slam_ros.slam.lifelong.elimination import square_root
-from graph_slam_ros.slam.lifelong.fit import VisitScale, fit_of
-from graph_slam_ros.slam.lifelong.place import Cell, Place, PlaceEdge, added_place
-from graph_slam_ros.slam.lifelong.surroundings import CHAIN, CLOSURES, Surroundings, composed, surroundings
-from graph_slam_ros.slam.lifelong.visit import Visit, best_known, visit_of
+from graph_slam_ros.graph.losses import weight_and_cost
+from graph_slam_ros.slam.lifelong.elimination import product, square_root, symmetric
+from graph_slam_ros.slam.lifelong.place import Cell, Place, PlaceEdge, VisitScale, added_place, fit_of
+from graph_slam_ros.slam.lifelong.visit import best_known, visit_of
 from graph_slam_ros.solver import Solver
-from graph_slam_ros.typing import Index, Numbers
+from graph_slam_ros.typing import Array, Index, Numbers
 
+CLOSURES, FIXES, LANDMARKS = "closures", "fixes", "landmarks"  # labels
+CHAIN = "composed"  # label of edges that are composed of odometry
 ITSELF, PLACE = "it contradicts itself", "it contradicts its place"
 """Why the sightings of a visit are lost."""
 _FEWEST = 3  # ranges or bearings that are enough for a landmark whose visit is condensed
@@ -107,6 +109,127 @@ def compact(solver: Solver, vertices: Index | None = None, edges: Index | None =
     return out
 
 
+@dataclass(slots=True)
+class Surroundings:
+    """The edges that count on the keyframes of a visit, by id.
+
+    Attributes
+    ----------
+    inside : between its keyframes; sightings : of landmarks
+    into : from elsewhere to the first keyframe; onward : from the last one to the keyframe after the visit
+    steps : of each keyframe but the last, the edge of odometry to the next
+    factors : of ``inside`` and ``sightings``: how much each counts, by its weight and loss
+    unfit : why these cannot be condensed; empty where they can
+    """
+
+    inside: dict[int, Edge] = field(default_factory=dict)
+    sightings: dict[int, Edge] = field(default_factory=dict)
+    into: dict[int, Edge] = field(default_factory=dict)
+    onward: dict[int, Edge] = field(default_factory=dict)
+    steps: list[Edge] = field(default_factory=list)
+    factors: dict[int, float] = field(default_factory=dict)
+    unfit: str = ""
+
+    @property
+    def own(self) -> list[int]:
+        """The edges that are within the visit and its landmarks."""
+        return [*self.inside, *self.sightings]
+
+    @property
+    def seen(self) -> set[int]:
+        """The landmarks that are seen."""
+        return {edge.vertices[1] for edge in self.sightings.values()}
+
+
+def surroundings(space: Geometry, solver: Solver, visit: Sequence[int], after: int) -> Surroundings:
+    """Return the edges on the keyframes of a visit.
+
+    Parameters
+    ----------
+    visit : vertices of its keyframes, in order of time; after : the keyframe that follows
+    """
+    graph, out = solver.graph, Surroundings()
+    on_it = sorted({int(edge) for vertex in visit for edge in solver.edges_on(vertex)})
+    edges = {number: edge for number in on_it if (edge := graph.edge(number)).weight}
+    members = set(visit)
+    for number, edge in edges.items():
+        first, last = edge.vertices[0], edge.vertices[-1]
+        if len(edge.vertices) == 2 and (edge.label == LANDMARKS or graph.kind_of(last) is space.point):
+            out.sightings[number] = edge
+        elif edge.type is space.relative_pose:
+            if members >= {first, last}:
+                out.inside[number] = edge
+            elif edge.label != CLOSURES and (first, last) == (visit[-1], after):
+                out.onward[number] = edge
+            elif edge.label != CLOSURES and last == visit[0] and first not in members:
+                out.into[number] = edge
+            else:
+                out.unfit = f"edge {number} leads from the visit to vertex {last if first in members else first}"
+        else:
+            out.unfit = f"edge {number} is a {edge.type.name}"
+    by_ends = {edge.vertices: edge for edge in reversed(out.inside.values()) if edge.label != CLOSURES}
+    out.steps = [by_ends[ends] for ends in pairwise(visit) if ends in by_ends]
+    if len(out.steps) < len(visit) - 1 or len(out.onward) != 1 or len(out.into) > 1:
+        out.unfit = out.unfit or "odometry does not join its keyframes one by one"
+    out.factors = _factors(solver, {**out.inside, **out.sightings})
+    return out
+
+
+def seen_from(space: Geometry, solver: Solver, keyframes: Index) -> list[set[int] | None]:
+    """Return the landmarks that are seen from each keyframe, by vertices; None for one that cannot be condensed.
+
+    One can be if it is free, with edges of odometry, sightings, closures and fixes alone. One that is not free is of a
+    frozen map, or of a map that the robot is located in.
+    """
+    graph = solver.graph
+    held = np.isin(keyframes, solver.held).tolist()
+    out: list[set[int] | None] = [None if is_held else set() for is_held in held]
+    is_point = np.array([kind is space.point for kind in graph.kinds])
+    row_of = np.full(graph.vertex_count, -1)
+    row_of[keyframes] = np.arange(len(keyframes))
+    edges, codes = solver.edges, graph.table_of_edge.values[solver.edges]
+    for code, table in enumerate(graph.tables.values()):
+        rows = graph.row_of_edge.values[edges[codes == code]]
+        ends, numbers = table.vertices.values[rows], table.id.values[rows]
+        is_fit = graph.has_label(numbers, (CLOSURES, FIXES))
+        if table.type is space.relative_pose:
+            is_fit |= graph.has_label(numbers, ("odometry", CHAIN))
+        if ends.shape[1] == 2:
+            is_seen = graph.has_label(numbers, (LANDMARKS,)) | is_point[graph.kind.values[ends[:, 1]]]
+            is_fit |= is_seen
+            for row, mark in zip(row_of[ends[is_seen, 0]].tolist(), ends[is_seen, 1].tolist(), strict=True):
+                if row >= 0 and (of_row := out[row]) is not None:
+                    of_row.add(mark)
+        for row in row_of[ends[~is_fit]].ravel().tolist():
+            if row >= 0:
+                out[row] = None
+    return out
+
+
+def composed(space: Geometry, edges: Sequence[Edge]) -> tuple[Numbers, Array]:
+    """Return odometry, one edge after the other, as one relative pose, and the square root of its information."""
+    pose, covariance = space.identity, np.zeros((space.dof, space.dof))
+    for edge in edges:
+        step: Numbers = tuple(edge.measured.tolist())
+        information = edge.weight * product(edge.sqrt_information.T, edge.sqrt_information)
+        covariance = space.group.propagate(covariance, step, _inverse(information))
+        pose = tuple(map(float, space.group.compose(pose, step)))
+    return space.normalized(pose), square_root(symmetric(_inverse(covariance)))
+
+
+def _inverse(matrix: Array) -> Array:
+    return np.asarray(np.linalg.inv(matrix), dtype=np.float64)
+
+
+def _factors(solver: Solver, edges: dict[int, Edge]) -> dict[int, float]:
+    chi2, _ = solver.chi2_of(list(edges))
+    out = {}
+    for (number, edge), one in zip(edges.items(), chi2.tolist(), strict=True):
+        loss = solver.settings.last_loss(edge.label, edge.source)
+        out[number] = edge.weight * float(weight_and_cost(loss.kind, loss.scale, edge.weight * one)[0])
+    return out
+
+
 class Condenser:
     """Condenses visits in a graph and its solver, in order of time. The caller updates the solver after each.
 
@@ -154,10 +277,12 @@ class Condenser:
             inside = [vertex for vertex in visit if vertex not in ends]
             if visit[at] in ends:
                 return Condensed("kept", "it is one keyframe, which odometry joins to one that is in no place")
-            one = visit_of(self.space, self.solver.graph, self.solver.estimate, inside, visit[at], around.factors)
+            one, chi2, degrees = visit_of(
+                self.space, self.solver.graph, self.solver.estimate, inside, visit[at], around.factors
+            )
             if not ends <= set(one.members):
                 raise SingularError("odometry does not determine the visit")
-            if one.degrees > 0 and one.chi2 > quantile(self.limits.gate, one.degrees):
+            if degrees > 0 and chi2 > quantile(self.limits.gate, degrees):
                 return self._composed(visit, after, around, ITSELF)
             one = replace(one, information=one.information / self.scale.factor)
             if is_again and best is not None:
@@ -186,16 +311,16 @@ class Condenser:
 
     # -- what becomes of a visit -------------------------------------------------------------------------------------
 
-    def _first(self, visit: Sequence[int], base: int, around: Surroundings, one: Visit, cell: Cell) -> Condensed:
+    def _first(self, visit: Sequence[int], base: int, around: Surroundings, one: Place, cell: Cell) -> Condensed:
         """Begin a place, which has the ends of the visit as well: the odometry to what is around it stays as it is."""
         if lonely := self._left_alone(around, one.members):
             return Condensed("kept", f"landmark {lonely[0]} would be left without a measurement")
-        begun = added_place(self.space, self.solver.graph, base, Place.begun_by(one), square_root(one.information))
+        begun = added_place(self.space, self.solver.graph, base, one, square_root(one.information))
         self.places.setdefault(cell, []).append(begun)
         gone = [vertex for vertex in visit if vertex != base and vertex not in one.members]
         return Condensed("first", removed=self._replace(gone, base, around.own, [begun.edge]))
 
-    def _again(self, visit: Sequence[int], after: int, around: Surroundings, one: Visit, at: PlaceEdge) -> Condensed:
+    def _again(self, visit: Sequence[int], after: int, around: Surroundings, one: Place, at: PlaceEdge) -> Condensed:
         """Add a visit to a place, and cut the odometry on both sides of it."""
         guess = self._between(*self.solver.estimate([at.base, visit[len(visit) // 2]]).tolist())
         fit = fit_of(self.space, at.place, one, guess, self.limits.gate, at.strikes)

@@ -1,10 +1,16 @@
-"""A place: the joint Gaussian of all visits to it so far, one edge of the graph; and how a further visit is added."""
+"""A place: the joint Gaussian of all visits to it so far, one edge of the graph; and how a further visit is added.
+
+What is wrong with a calibration makes errors that last. The covariance of a visit does not have them, because they are
+alike in the visit. But visits differ by them: the robot drove another way. So the variances of visits are multiplied by
+chi2 per degree of freedom of all visits to places so far, which is never less than 1.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.errors import SingularError
 from graph_slam_ros.graph import Edge, Gaussian, Graph, place_edge
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL, Geometry
@@ -17,17 +23,20 @@ from graph_slam_ros.slam.lifelong.elimination import (
     solution,
     without,
 )
-from graph_slam_ros.slam.lifelong.visit import Visit
 from graph_slam_ros.typing import Array, Numbers
 
 Cell = tuple[int, ...]
 """A cell of the grid, by which visits and places are found."""
+_STRIKES = 2  # visits in a row that contradict a place in the same landmark: then that begins anew
+_WIDER = (2.0, 4.0, 9.0)  # factors of the variances of a visit that contradicts its place, the first that fits
+_DEGREES = 20  # of freedom that fit, before the first visit
+_CHANGE = 0.05  # of the factor, from which on places are scaled anew
 _STEPS, _STILL = 30, 1e-12  # Gauss-Newton steps of a motion, at most; until it moves by no more [m, rad]
 
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """The joint Gaussian of some landmarks, as seen from one pose.
+    """The joint Gaussian of some landmarks, as seen from one pose: a visit, or all visits so far.
 
     Attributes
     ----------
@@ -44,12 +53,7 @@ class Place:
     information: Array
     visits: int = 1
 
-    @classmethod
-    def begun_by(cls, visit: Visit) -> "Place":
-        """Return the place that one visit knows, seen from the pose that the visit is seen from."""
-        return cls(visit.members, visit.seen, visit.linearized_at, visit.information)
-
-    def shared(self, visit: Visit) -> list[int]:
+    def shared(self, visit: "Place") -> list[int]:
         """Return the members that a visit saw, too, in their order here."""
         theirs = set(visit.members)
         return [one for one in self.members if one in theirs]
@@ -81,15 +85,7 @@ class Fused:
     degrees: int
 
 
-def visit_without(visit: Visit, member: int) -> Visit:
-    """Return a visit after one of its landmarks was marginalised out."""
-    rest = Place.begun_by(visit).without(member)
-    return replace(
-        visit, members=rest.members, seen=rest.seen, linearized_at=rest.linearized_at, information=rest.information
-    )
-
-
-def fused(space: Geometry, place: Place, visit: Visit, T_place_visit: Numbers) -> Fused:
+def fused(space: Geometry, place: Place, visit: Place, T_place_visit: Numbers) -> Fused:
     """Add a visit to a place.
 
     The pose that the visit is seen from is freed, so that it says nothing of where the place is seen from. Before, the
@@ -122,7 +118,7 @@ def fused(space: Geometry, place: Place, visit: Visit, T_place_visit: Numbers) -
     return Fused(fusion, statistic, max(mine.size - space.dof, 0))
 
 
-def _sum(space: Geometry, place: Place, visit: Visit) -> tuple[Place, float]:
+def _sum(space: Geometry, place: Place, visit: Place) -> tuple[Place, float]:
     """Add a visit in the axes of the place to what the place has; returns chi2, too."""
     points, poses = (sorted({*one, *other}) for one, other in zip(_by_kind(place), _by_kind(visit), strict=True))
     members = [*points, *poses]
@@ -161,7 +157,7 @@ def _motion(
     return motion
 
 
-def _by_kind(one: Place | Visit) -> tuple[tuple[int, ...], tuple[int, ...]]:
+def _by_kind(one: Place) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """Return the members that are points, and those that are poses."""
     first = len(one.members) - len(one.seen.turns)
     return one.members[:first], one.members[first:]
@@ -171,6 +167,101 @@ def _rows(among: Sequence[int], wanted: Sequence[int]) -> list[int]:
     """Return where each of some members is among others."""
     at = {member: k for k, member in enumerate(among)}
     return [at[member] for member in wanted]
+
+
+@dataclass(slots=True)
+class VisitScale:
+    """The factor by which the variances of visits are larger than stated.
+
+    Attributes
+    ----------
+    chi2, degrees : of all visits against their places, with variances as stated
+    factor : in use
+    """
+
+    chi2: float = 0.0
+    degrees: int = 0
+    factor: float = 1.0
+
+    def add(self, fit: Fused, gate: float) -> None:
+        """Add the statistic of a visit, with variances in use. None counts for more than the quantile ``gate``."""
+        if fit.degrees > 0:
+            self.chi2 += self.factor * min(fit.statistic, quantile(gate, fit.degrees))
+            self.degrees += fit.degrees
+
+    def change(self) -> float:
+        """Use the factor by all visits so far. Returns by how much it changed; 1 where that is next to nothing."""
+        now = max(1.0, (self.chi2 + _DEGREES) / (self.degrees + _DEGREES))
+        by = now / self.factor
+        if abs(by - 1.0) < _CHANGE:
+            return 1.0
+        self.factor = now
+        return by
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """A visit laid on its place.
+
+    Attributes
+    ----------
+    as_is : the place with the whole visit; its statistic is how well that fits
+    result : the place with that part of the visit; None if nothing is added
+    without, anew : the landmark that contradicts the place and was left out, or that the place has anew
+    wider : the factor of the variances of the visit
+    """
+
+    as_is: Fused
+    result: Fused | None
+    without: int | None = None
+    anew: int | None = None
+    wider: float = 1.0
+
+
+def fit_of(space: Geometry, place: Place, visit: Place, guess: Numbers, gate: float, strikes: Mapping[int, int]) -> Fit:
+    """Return how a visit fits its place: as it is, without one landmark, or with larger variances.
+
+    Parameters
+    ----------
+    guess : about where the pose of the visit is in the axes of the place
+    gate : quantile of chi2 above which a visit contradicts its place
+    strikes : visits in a row that contradicted the place, of each landmark
+
+    Raises
+    ------
+    SingularError
+        As for ``fused``.
+    """
+    done = fused(space, place, visit, guess)
+    if _passes(done, gate):
+        return Fit(done, done)
+    without = _contradicting(space, place, visit, guess, gate)
+    if without is not None and strikes.get(without, 0) + 1 >= _STRIKES:
+        return Fit(done, fused(space, place.without(without), visit, guess), anew=without)
+    if without is not None:
+        return Fit(done, fused(space, place, visit.without(without), guess), without=without)
+    for wider in _WIDER:
+        result = fused(space, place, replace(visit, information=visit.information / wider), guess)
+        if _passes(result, gate):
+            return Fit(done, result, wider=wider)
+    return Fit(done, None)
+
+
+def _passes(done: Fused, gate: float) -> bool:
+    return done.degrees < 1 or done.statistic <= quantile(gate, done.degrees)
+
+
+def _contradicting(space: Geometry, place: Place, visit: Place, guess: Numbers, gate: float) -> int | None:
+    """Return the landmark without which a visit fits its place best; None where it fits without none of them."""
+    shared, found = place.shared(visit), list[tuple[float, int]]()
+    for k, mark in enumerate(shared):
+        rest = [place.members.index(one) for one in (*shared[:k], *shared[k + 1 :])]
+        if not place.seen.part(rest).lays(space):
+            continue
+        done = fused(space, place, visit.without(mark), guess)
+        if _passes(done, gate):
+            found.append((done.statistic, mark))
+    return min(found)[1] if found else None
 
 
 @dataclass(slots=True)

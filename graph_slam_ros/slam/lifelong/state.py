@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from graph_slam_ros.errors import FormatError
 from graph_slam_ros.graph.geometry import Geometry
-from graph_slam_ros.slam.lifelong.fit import VisitScale
-from graph_slam_ros.slam.lifelong.place import Cell, PlaceEdge
+from graph_slam_ros.slam.lifelong.place import Cell, PlaceEdge, VisitScale
 from graph_slam_ros.typing import Array, Index, Numbers
 
 Records = NDArray[np.void]

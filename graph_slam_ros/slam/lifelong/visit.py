@@ -1,7 +1,7 @@
 """A visit: a stretch of keyframes at one place, and what it measured of the landmarks, as one joint Gaussian."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import groupby
 
 import numpy as np
@@ -12,6 +12,7 @@ from graph_slam_ros.graph import Edge, EdgeType, Gaussian, Graph
 from graph_slam_ros.graph.geometry import Geometry, rigid_motions
 from graph_slam_ros.slam.lifelong.constellation import Constellation
 from graph_slam_ros.slam.lifelong.elimination import marginal_information, product
+from graph_slam_ros.slam.lifelong.place import Place
 from graph_slam_ros.solver import Settings, Solver
 from graph_slam_ros.typing import Array
 
@@ -21,31 +22,10 @@ _LEAST = 1e-6  # eigenvalue of the correlations of a landmark, given the poses: 
 Estimate = Callable[[ArrayLike], Array]
 
 
-@dataclass(frozen=True, slots=True)
-class Visit:
-    """The joint Gaussian of landmarks by some edges alone.
-
-    Attributes
-    ----------
-    members : vertices of the landmarks: points, ascending, and then poses, ascending
-    seen : how they lie in the axes of one pose of the visit
-    linearized_at : the same by the whole map, where the edges are linearised
-    information : (n, n) of a step of that, given that pose; all other poses are marginalised out
-    chi2, degrees : of the edges at their own optimum
-    """
-
-    members: tuple[int, ...]
-    seen: Constellation
-    linearized_at: Constellation
-    information: Array
-    chi2: float
-    degrees: int
-
-
 def visit_of(
     space: Geometry, graph: Graph, estimate: Estimate, poses: Sequence[int], base: int, edges: Mapping[int, float]
-) -> Visit:
-    """Return what some edges say of the landmarks on them, in the axes of one pose.
+) -> tuple[Place, float, int]:
+    """Return what some edges say of the landmarks on them, in the axes of one pose; chi2 and degrees of freedom, too.
 
     No other edge has a say in it, but they are linearised at the estimate of the whole map: there the visit is compared
     with others. At its own optimum landmarks may be far from there, where only odometry joins them. Landmarks whose
@@ -93,7 +73,8 @@ def visit_of(
                 raise
             marks = [mark for mark in marks if mark != order[error.vertex]]
             continue
-        return Visit(tuple(marks), seen, linearized_at, _of_positions(space, marginal, linearized_at), chi2, degrees)
+        information = _of_positions(space, marginal, linearized_at)
+        return Place(tuple(marks), seen, linearized_at, information), chi2, degrees
     raise SingularError("the visit determines no landmark")
 
 

@@ -3,9 +3,14 @@
 A candidate that is too unlikely given all earlier measurements is held back: its innovation is compared with the joint
 covariance of its vertices and its own (Neira and Tardos, "Data association in stochastic mapping using the joint
 compatibility test", 2001, eq. 2). One that fits badly loses weight, then is removed; all are judged again and again.
+
+The innovation predicts what accepting an edge costs. Where odometry is rough and closures are exact, an edge is
+millions off before the solve, and fits after it. A robust loss lets go of such a residual at the first step. So an edge
+that is expected to fit has its full weight until the solve has converged, and is judged then.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +21,9 @@ from graph_slam_ros.graph import Graph, Loss
 from graph_slam_ros.graph.losses import weight_and_cost
 from graph_slam_ros.slam.robust.innovation import innovations, likely_together
 from graph_slam_ros.slam.robust.landmark_support import LandmarkSupport, landmark_of
-from graph_slam_ros.slam.robust.ledger import FINAL, Ledger, Reason, Verdict
+from graph_slam_ros.slam.robust.ledger import FINAL, OUTSIDE, Ledger, Reason, Verdict
 from graph_slam_ros.slam.robust.tightness import TIGHTEST, TYPICAL, Tightness
-from graph_slam_ros.solver import Solver
+from graph_slam_ros.solver import Settings, Solver
 from graph_slam_ros.typing import Array, Index
 
 CANDIDATES = ("landmarks", "fixes", "closures", "initialpose")
@@ -27,19 +32,27 @@ _AT_ONCE = 10  # of them, until the first that is likely
 _AGREEING = 3  # edges that are out, at least, come in together between full solves: two agree by chance
 _RETESTS = 10  # edges that are out and are tried again at each review: ten innovations cost less than an update
 _OUT_BELOW = 0.01  # of its weight: what counts for less moves nothing, and is removed
+_UPDATES = 6  # until what was let in fits, before everything is solved for it
 _REVIEWED_AT_ONCE = 1000  # accepted edges that one review looks at, besides as many of the newest
 
 
 class OutlierGate:
-    """Judges the candidates among the edges of a graph. Its verdicts are weights, recorded in its ledger."""
+    """Judges the candidates among the edges of a graph. Its verdicts are weights, recorded in its ledger.
+
+    Attributes
+    ----------
+    is_calibrated : whether enough was measured twice to tell how good odometry is
+    stated_scale : the factor by which the gate of an innovation exceeds the chi-square quantile, by noise as stated
+    gate_scale : the same times the observed accuracy of odometry
+    """
 
     def __init__(self, config: RobustConfig, graph: Graph, solver: Solver, ledger: Ledger | None = None) -> None:
         self._config, self._graph, self._solver = config, graph, solver
         self.ledger = Ledger() if ledger is None else ledger
         self._support = LandmarkSupport(graph, solver, self.ledger.inside)
         self._tightness = Tightness(graph, solver)
-        self.is_calibrated = False  # whether enough was measured twice to tell how good odometry is
-        self._gate_scale = config.noise_factor**2  # of the gate of what all else predicts
+        self.is_calibrated = False
+        self.gate_scale = self.stated_scale = config.noise_factor**2
         self._withdrawn: dict[int, Reason] = {}  # before they were taken
         self._vertices = 0  # of the graph, at the last solve
         self._next = 0  # of the accepted, where the next review goes on
@@ -48,8 +61,12 @@ class OutlierGate:
     def renumber(self, new: Index) -> None:
         """Take over new ids of all edges, by old ones; -1: it was removed. Every edge has been judged."""
         self.ledger.renumber(new)
-        self._support = LandmarkSupport(self._graph, self._solver, self.ledger.inside)
+        self.recount()
         self._vertices = self._graph.vertex_count
+
+    def recount(self) -> None:
+        """Count what determines each landmark anew, after verdicts and weights have changed elsewhere."""
+        self._support = LandmarkSupport(self._graph, self._solver, self.ledger.inside)
 
     # -- what is new -------------------------------------------------------------------------------------------------
 
@@ -72,8 +89,8 @@ class OutlierGate:
         for edge in ids[judged & self._config.decide].tolist():
             is_unfit = edge in unfit and not self._support.is_needed(edge)  # by what is left of those before it
             if is_unfit or (not trusts_sightings and self._is_of_known(edge)):
-                self._exclude(edge)
-                self.ledger.hold_back(edge)
+                self._weigh(edge, is_in=False)
+                self.ledger.put(edge, Verdict.PENDING, Reason.UNLIKELY)
                 pending.append(edge)
         self._vertices = self._graph.vertex_count
         return pending
@@ -113,7 +130,7 @@ class OutlierGate:
         """Reject those of some edges that still do not fit. Returns whether there were any."""
         unfit = self.unfit(edges)
         for edge, fit in zip(unfit, self._solver.chi2_of(unfit)[0].tolist(), strict=True):
-            self._reject(edge, keyframe, Reason.DOES_NOT_FIT, fit)
+            self.decide(edge, keyframe, Verdict.REJECTED, Reason.DOES_NOT_FIT, fit)
         return len(unfit) > 0
 
     # -- what was decided ---------------------------------------------------------------------------------------------
@@ -153,7 +170,7 @@ class OutlierGate:
                 elif self._support.is_needed(edge):
                     continue
                 else:
-                    self._reject(edge, keyframe, Reason.DOES_NOT_FIT, fit)
+                    self.decide(edge, keyframe, Verdict.REJECTED, Reason.DOES_NOT_FIT, fit)
                 changed = True
         return changed
 
@@ -230,9 +247,7 @@ class OutlierGate:
                 self._solver.set_weight(edge, 0.0)
                 self._withdrawn[edge] = reason
             elif not self.ledger.is_withdrawn(edge):
-                if self.ledger.verdict.values[edge] == Verdict.NOT_EVALUATED:
-                    self._solver.set_weight(edge, 0.0)
-                self._reject(edge, keyframe, reason, float(self.ledger.statistic.values[edge]))
+                self.decide(edge, keyframe, Verdict.REJECTED, reason, float(self.ledger.statistic.values[edge]))
         landmarks = {landmark for edge in edges if (landmark := landmark_of(self._graph, edge)) is not None}
         for landmark in sorted(landmarks):
             if not self._support.is_determined(landmark):
@@ -243,19 +258,6 @@ class OutlierGate:
         for edge in np.intersect1d(edges, self.ledger.outside).tolist():
             if self.ledger.reason.values[edge] not in FINAL:
                 self._readmit(edge, keyframe, *_judged(self.ledger, edge))
-
-    @property
-    def gate_scale(self) -> float:
-        """The factor by which the gate of an innovation exceeds the chi-square quantile.
-
-        It is ``robust.noise_factor`` squared, times the observed accuracy of odometry.
-        """
-        return self._gate_scale
-
-    @property
-    def stated_scale(self) -> float:
-        """The same by noise as it is stated, ``robust.noise_factor`` squared, however accurate odometry has been."""
-        return self._config.noise_factor**2
 
     def are_beyond_noise(self, edges: Sequence[int]) -> bool:
         """Return whether most of some rejected edges are farther off than odometry's noise as stated explains."""
@@ -268,24 +270,15 @@ class OutlierGate:
         """Return the cost of accepting each of some rejected edges; infinite if it cannot be computed."""
         return innovations(self._graph, self._solver, edges)
 
-    def supersede(self, link: int, keyframe: int, evidence: float) -> None:
-        """Reject an odometry edge that another one with more noise replaces."""
-        self._solver.set_weight(link, 0.0)
-        self.ledger.note(link, keyframe, Verdict.REJECTED, Reason.DISPLACED, evidence)
-
-    def reinstate(self, link: int, keyframe: int, evidence: float) -> None:
-        """Undo ``supersede``."""
-        self._solver.set_weight(link, 1.0)
-        self.ledger.note(link, keyframe, Verdict.NOT_EVALUATED, Reason.NONE, evidence)
-
     def exchange(self, included: Sequence[int], excluded: Sequence[int], keyframe: int) -> None:
         """Accept some edges and reject others, which may come back. Their fit is judged afterwards."""
+        statistic = self.ledger.statistic.values
         for edge in included:
             if not self.ledger.is_inside(edge):
-                self._readmit(edge, keyframe, float(self.ledger.statistic.values[edge]))
+                self._readmit(edge, keyframe, statistic.item(edge))
         for edge in excluded:
             if self.ledger.is_inside(edge) and not self._support.is_needed(edge):
-                self._reject(edge, keyframe, Reason.DOES_NOT_FIT, float(self.ledger.statistic.values[edge]))
+                self.decide(edge, keyframe, Verdict.REJECTED, Reason.DOES_NOT_FIT, statistic.item(edge))
 
     def adopt_verdicts(self, other: Ledger, keyframe: int) -> bool:
         """Take over the verdicts of a search on the same edges. Returns whether that changed one."""
@@ -309,7 +302,7 @@ class OutlierGate:
         for edge in edges[~wanted & inside].tolist():
             if not self._support.is_needed(edge):
                 statistic, threshold = _judged(judge, edge)
-                self._reject(edge, keyframe, Reason.OUTVOTED, statistic, threshold)
+                self.decide(edge, keyframe, Verdict.REJECTED, Reason.OUTVOTED, statistic, threshold)
                 changed += 1
         return changed > 0
 
@@ -325,7 +318,7 @@ class OutlierGate:
             loss = self._solver.settings.last_loss(self._graph.label_of(edge), self._graph.source_of(edge))
             weight, _ = weight_and_cost(loss.kind, loss.scale, fit)
             if weight < _OUT_BELOW and not self._support.is_needed(edge):
-                self._reject(edge, keyframe, Reason.DOES_NOT_FIT, fit)
+                self.decide(edge, keyframe, Verdict.REJECTED, Reason.DOES_NOT_FIT, fit)
             elif weight < 1.0 and ledger.verdict.values[edge] == Verdict.ACCEPTED:
                 ledger.note(edge, keyframe, Verdict.DOWN_WEIGHTED, Reason.NONE, fit)
 
@@ -334,28 +327,105 @@ class OutlierGate:
 
     def _innovation_gate(self, edge: int) -> float:
         """Return the threshold of an innovation."""
-        return self._gate_scale * quantile(self._config.gate, int(self.ledger.numbers.values[edge]))
+        return self.gate_scale * quantile(self._config.gate, int(self.ledger.numbers.values[edge]))
+
+    # -- the solve after something was accepted ----------------------------------------------------------------------
+
+    def make_fit(self, admitted: Sequence[int], keyframe: int, *, by_innovation: bool = False) -> None:
+        """Solve until edges that were accepted despite a bad fit do fit. Those that still do not are rejected.
+
+        Their loss lets go of large residuals. They have their full weight only if they are expected to fit, or while
+        the accuracy of odometry is unknown: it would bend the map for false edges that are barely possible.
+
+        Parameters
+        ----------
+        by_innovation : whether the statistic of each is its innovation; where that is within its threshold, the edge
+            is expected to fit
+        """
+        solver = self._solver
+        before = solver.values
+        for _ in range(_UPDATES):
+            solver.update()
+            if not self.unfit(admitted):
+                break
+        if self._rose_since(before):  # an update's steps may overshoot where much turns; everything at once does not
+            solver.start_at(before)
+        elif not self.unfit(admitted):
+            return
+        if by_innovation and self.is_calibrated:
+            admitted = self._pull(admitted, keyframe)
+            if not self.unfit(admitted):
+                return
+        pulling = [] if self.is_calibrated else [Loss()]
+        losses = {key: [*pulling, stages[-1]] for key, stages in solver.settings.losses.items()}
+        solver.optimize(replace(solver.settings, losses=losses))
+        if self.refuse_unfit(admitted, keyframe):
+            solver.update()
+
+    def _pull(self, admitted: Sequence[int], keyframe: int) -> list[int]:
+        """Solve with the full weight of edges that are expected to fit. Returns the others, which have none meanwhile.
+
+        If the cost is higher than without them, the prediction was wrong: they are rejected, and the estimate stays.
+        """
+        solver, ledger = self._solver, self.ledger
+        unfit = np.array(self.unfit(admitted), dtype=np.int64)
+        is_expected = ledger.statistic.values[unfit] <= ledger.threshold.values[unfit]
+        expected, others = unfit[is_expected].tolist(), unfit[~is_expected].tolist()
+        if not expected:
+            return list(admitted)
+        for edge in others:
+            solver.set_weight(edge, 0.0)
+        before, without = solver.values, self._truncated_cost()
+        solver.optimize(self._without_loss(expected))
+        if self._truncated_cost() > without:
+            solver.start_at(before)
+        for edge in others:
+            solver.set_weight(edge, 1.0)
+        if self.refuse_unfit(expected, keyframe) or others:
+            solver.update()
+        return [edge for edge in admitted if edge not in expected]
+
+    def _without_loss(self, edges: Sequence[int]) -> Settings:
+        """Settings by which classes of edges have no loss until everything has converged, then their last one."""
+        labels, losses = {self._graph.label_of(edge) for edge in edges}, {}
+        for key, stages in self._solver.settings.losses.items():
+            label = key[0] if isinstance(key, tuple) else key
+            losses[key] = [*([Loss()] if label in labels else []), stages[-1]]
+        return replace(self._solver.settings, losses=losses)
+
+    def _truncated_cost(self) -> float:
+        """Chi2 of all edges that have a weight; of a candidate at most its threshold."""
+        ledger, edges = self.ledger, self._solver.edges
+        chi2, _ = self._solver.chi2_of(edges)
+        limit = np.where(np.isin(edges, ledger.inside), ledger.threshold.values[edges], np.inf)
+        return float(np.minimum(chi2, limit).sum())
+
+    def _rose_since(self, before: Array) -> bool:
+        return self._solver.evaluate().cost_final > self._solver.evaluate(at=before).cost_final
 
     # -- one edge ----------------------------------------------------------------------------------------------------
 
-    def _readmit(self, edge: int, keyframe: int, statistic: float, threshold: float | None = None) -> None:
-        self._include(edge)
-        self.ledger.note(edge, keyframe, Verdict.ACCEPTED, Reason.NONE, statistic, threshold)
-
-    def _reject(
-        self, edge: int, keyframe: int, reason: Reason, statistic: float, threshold: float | None = None
+    def decide(
+        self,
+        edge: int,
+        keyframe: int,
+        verdict: Verdict,
+        reason: Reason,
+        statistic: float,
+        threshold: float | None = None,
     ) -> None:
-        if self.ledger.is_inside(edge):
-            self._exclude(edge)
-        self.ledger.note(edge, keyframe, Verdict.REJECTED, reason, statistic, threshold)
+        """Change the verdict on an edge that was judged, and its weight with it: nothing else does."""
+        is_in = verdict not in OUTSIDE
+        if (self.ledger.verdict_of(edge) not in OUTSIDE) != is_in:
+            self._weigh(edge, is_in=is_in)
+        self.ledger.note(edge, keyframe, verdict, reason, statistic, threshold)
 
-    def _include(self, edge: int) -> None:
-        self._solver.set_weight(edge, 1.0)
-        self._support.count(edge, 1)
+    def _readmit(self, edge: int, keyframe: int, statistic: float, threshold: float | None = None) -> None:
+        self.decide(edge, keyframe, Verdict.ACCEPTED, Reason.NONE, statistic, threshold)
 
-    def _exclude(self, edge: int) -> None:
-        self._solver.set_weight(edge, 0.0)
-        self._support.count(edge, -1)
+    def _weigh(self, edge: int, *, is_in: bool) -> None:
+        self._solver.set_weight(edge, float(is_in))
+        self._support.count(edge, 1 if is_in else -1)
 
     # -- what is too much --------------------------------------------------------------------------------------------
 
@@ -388,7 +458,7 @@ class OutlierGate:
             # estimated noise allows for errors that are alike, so residuals are smaller: that says nothing of odometry
             is_stated = self._config.noise_scale == "configured"
             noise_ratio = self._solver.evaluate().chi2_final / freedom if is_stated else 1.0
-            self._gate_scale = min(factor, max(TIGHTEST, factor * noise_ratio))
+            self.gate_scale = min(factor, max(TIGHTEST, factor * noise_ratio))
         edges = ledger.candidates
         ledger.threshold.values[edges] = self._limits(edges, ledger.numbers.values[edges])
 

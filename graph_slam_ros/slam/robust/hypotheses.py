@@ -7,7 +7,7 @@ is judged by its residual, until no verdict changes. A rejected candidate costs 
 squares).
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -21,13 +21,14 @@ from graph_slam_ros.slam.robust.gating import OutlierGate
 from graph_slam_ros.slam.robust.ledger import FINAL, Ledger
 from graph_slam_ros.slam.robust.pairwise_consistency import consistent_groups, contradicting_sightings, odometry_in_use
 from graph_slam_ros.solver import Settings, Solver
-from graph_slam_ros.typing import Array, Index
+from graph_slam_ros.typing import Array, Executor, Index, Result
 
 _ITERATIONS = 20  # of each stage of the losses, from another start
 _ROUNDS = 10  # of a search at most: solve everything, then review all verdicts
 _HOPELESS = 2.0  # times the least cost that was found: another explanation is none
 _SAME = 1e-4  # of a cost, that one explanation may differ by from itself: solves end a little off the optimum
 _NEAR = 1e-3  # m or rad: what two solves of one optimum differ by at most
+_MORE = 1.5  # times as many out as at the last look: looks become rarer as their cost grows
 _STORY = 5  # closures that agree with one another and not with the map
 
 
@@ -311,3 +312,63 @@ def _along_odometry(graph: Graph, values: Array, held: set[int]) -> Array:
         if new.id not in held:
             out[new.stored] = GROUPS[new.kind].compose(tuple(out[last.stored]), tuple(one.measured))
     return out
+
+
+Work = Callable[[], Outcome | None]
+
+
+def run_when_asked(work: Callable[[], Result], /) -> Callable[[], Result]:
+    """Runs the work when its result is requested."""
+    return work
+
+
+@dataclass(frozen=True, slots=True)
+class _Job:
+    apply_at: int
+    outcome: Work
+    wanted: CancelToken
+
+
+class Background:
+    """Runs at most one search at a time, on a frozen copy, while the robot drives on.
+
+    Its outcome is used at a fixed later keyframe. If it is not done by then, the pipeline waits. Both keyframes follow
+    from the ingest sequence alone, so that a replay decides as the live run did.
+    """
+
+    def __init__(self, config: RobustConfig, executor: Executor) -> None:
+        self._config, self._executor = config, executor
+        self._out = 0  # candidates that were out at the last look
+        self._job: _Job | None = None
+
+    @property
+    def is_busy(self) -> bool:
+        """Return whether a search goes on."""
+        return self._job is not None
+
+    def is_due(self, out: int) -> bool:
+        """Return whether a search is due by this number of rejected candidates."""
+        after, self._out = self._config.second_look_after, min(self._out, out)
+        if self._job is not None or after <= 0:
+            return False
+        return out >= max(self._out + after, _MORE * self._out)
+
+    def start(self, frozen: FrozenGraph, out: int) -> None:
+        """Start with the present graph."""
+        self._out = out
+        wanted = CancelToken()
+        outcome = self._executor(lambda: search_alternatives(self._config, frozen, wanted))
+        self._job = _Job(frozen.keyframe + self._config.apply_after_keyframes, outcome, wanted)
+
+    def found(self, keyframe: int) -> Work | None:
+        """Return what waits for the outcome of the search, if that is due at this keyframe."""
+        if self._job is None or keyframe < self._job.apply_at:
+            return None
+        job, self._job = self._job, None
+        return job.outcome
+
+    def cancel(self, out: int) -> None:
+        """Cancel the running search, because everything was reviewed with this number of rejected candidates."""
+        if self._job is not None:
+            self._job.wanted.still = False
+        self._job, self._out = None, out

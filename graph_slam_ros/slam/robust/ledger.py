@@ -43,6 +43,7 @@ FINAL = (  # it is out for good
     Reason.SLIP,
 )
 INSIDE = (Verdict.ACCEPTED, Verdict.DOWN_WEIGHTED)
+OUTSIDE = (Verdict.PENDING, Verdict.REJECTED)
 _ACCEPTED, _DOWN_WEIGHTED = _INSIDE = tuple(map(int, INSIDE))  # comparing with members of an enumeration is slow
 _FINAL = frozenset(map(int, FINAL))
 
@@ -86,7 +87,7 @@ class Ledger:
         """Make the verdicts of the first edges, up to a count, final. All others may change."""
         self.final = edges
         verdict, reason = self.verdict.values[edges:], self.reason.values[edges:]
-        is_out = np.isin(verdict, (Verdict.PENDING, Verdict.REJECTED)) & ~np.isin(reason, FINAL)
+        is_out = np.isin(verdict, OUTSIDE) & ~np.isin(reason, FINAL)
         self._out = set((edges + np.flatnonzero(is_out)).tolist())
 
     def __len__(self) -> int:
@@ -98,15 +99,10 @@ class Ledger:
         numbers = self.numbers.values[kept]
         begins = np.cumsum(numbers) - numbers
         at = np.repeat(self._residual_at.values[kept] - begins, numbers) + np.arange(int(numbers.sum()))
-        residual, residual_at = Column(np.float64), Column(np.int64)
-        Column.extend((residual, self._residual.values[at], len(at)))
-        Column.extend((residual_at, begins, len(kept)))
-        self._residual, self._residual_at = residual, residual_at
-        for name in ("verdict", "reason", "statistic", "threshold", "numbers", "keyframe"):
-            old = getattr(self, name).values
-            column = Column(old.dtype.type)
-            Column.extend((column, old[kept], len(kept)))
-            setattr(self, name, column)
+        self._residual = self._residual.kept(at)
+        for name in ("verdict", "reason", "statistic", "threshold", "numbers", "keyframe", "_residual_at"):
+            setattr(self, name, getattr(self, name).kept(kept))
+        self._residual_at.values[:] = begins
         self.history[:] = [replace(one, edge=int(new[one.edge])) for one in self.history if new[one.edge] >= 0]
         self.final = int(np.count_nonzero(new[: self.final] >= 0))
         self._out = {edge for edge in new[sorted(self._out)].tolist() if edge >= 0}
@@ -149,15 +145,11 @@ class Ledger:
         )
         return ids
 
-    def hold_back(self, edge: int) -> None:
-        """Reject a new edge until it is compared with all others."""
-        self.put(edge, Verdict.PENDING, Reason.UNLIKELY)
-
     def put(self, edge: int, verdict: Verdict, reason: Reason) -> None:
         """Set a verdict without adding to the history."""
         self.changes += 1
         self.verdict.values[edge], self.reason.values[edge] = verdict, reason
-        if verdict in (Verdict.PENDING, Verdict.REJECTED) and reason not in FINAL:
+        if verdict in OUTSIDE and reason not in FINAL:
             self._out.add(edge)
         else:
             self._out.discard(edge)

@@ -10,7 +10,7 @@ from graph_slam_ros.lie import se2
 from graph_slam_ros.node.worker import run_in_thread
 from graph_slam_ros.slam import Config
 from graph_slam_ros.slam.backend import Backend
-from graph_slam_ros.slam.robust.background import run_when_asked
+from graph_slam_ros.slam.robust.hypotheses import run_when_asked
 from graph_slam_ros.slam.robust.innovation import joint_innovations
 from graph_slam_ros.slam.robust.ledger import Verdict
 
