@@ -19,7 +19,7 @@ from graph_slam_ros.measurements.types import AngularVelocity, Control, Fix, Mea
 from graph_slam_ros.messages.from_msg import TF, TF_STATIC, OwnDecoder
 from graph_slam_ros.messages.inputs import uses
 from graph_slam_ros.messages.inputs.detections import names_of
-from graph_slam_ros.messages.inputs.odometry_bytes import OdometryBytes, OdometryRun
+from graph_slam_ros.messages.inputs.odometry_bytes import OdometryRun
 from graph_slam_ros.messages.inputs.transforms import Transforms, assumed_mount, pose
 from graph_slam_ros.typing import Array, Index, Mask, Numbers
 
@@ -332,9 +332,7 @@ class Collector:
         """Collect a message: the one that was decoded last, of these inputs, and what became of it."""
         message, self._last = self._last, None
         heights: dict[str, float] = {}
-        if type(message) is OdometryBytes:
-            self._add_read(topic, [log_ns], message.alone())
-        elif message is not None:
+        if message is not None:
             self._add_message(topic, names, log_ns, message)
         for m in measured:
             if isinstance(m, Odometry):

@@ -109,7 +109,7 @@ class MessageConverter:
         self._config = config
         self._counters = counters
         self.on_fault: Callable[[str], object] = lambda line: None
-        self._transforms = Transforms(_TF_BUFFER_NS, self._is_far_in_time)
+        self._transforms = Transforms(_TF_BUFFER_NS, partial(counters.count, TF, "far_in_time"))
         self._links, self._awaits_stamp = 0, False  # of the last try of what waits
         self._sources: dict[str, InputContext] = {}
         self._convert: dict[str, Callable[[Any], Any]] = {}
@@ -125,9 +125,8 @@ class MessageConverter:
             self._types[name] = by_name[name].type
             self._convert[name] = partial((converters(by_name[name].type) or {})[use], source)
             if use == "odometry":
-                self._publishers[name] = OnePublisher(
-                    config.odometry.timeout_s, partial(self._is_of_another, name), partial(self._is_ahead, name)
-                )
+                refuse = (partial(counters.count, name, reason) for reason in ("other_publisher", "future"))
+                self._publishers[name] = OnePublisher(config.odometry.timeout_s, *refuse)
         for name, add in ((TF_STATIC, self._add_static), (TF, self._add_moving)):
             source = self._sources[name] = InputContext(InputConfig(name), "none", config, self._transforms)
             self._convert[name] = partial(self._transforms_of, source, add)
@@ -145,14 +144,12 @@ class MessageConverter:
         """Convert one message; returns its measurements and those that its transforms complete."""
         source = self._sources[name]
         self._counters.received[name] += 1
-        out = self._by_bytes(source, cdr) if name in self._readers else None
-        if out is None:
-            try:
-                message = self._decode[self._types[name]](cdr)
-            except Exception:  # of damaged bytes rosbags raises struct, index, unicode and assertion errors
-                self._counters.count(name, "undecodable")
-                return []
-            out = self._converted(source, message)
+        try:
+            message = self._decode[self._types[name]](cdr)
+        except Exception:  # of damaged bytes rosbags raises struct, index, unicode and assertion errors
+            self._counters.count(name, "undecodable")
+            return []
+        out = self._converted(source, message)
         if source.use == "odometry":
             accept = self._publishers[name].accept
             out = [one for m in out if isinstance(m, Odometry) for one in accept(m)]
@@ -229,32 +226,11 @@ class MessageConverter:
             publishers.forget_time()
         self._transforms.forget_time()
 
-    def _is_of_another(self, name: str) -> None:
-        self._counters.count(name, "other_publisher")
-
-    def _is_ahead(self, name: str) -> None:
-        self._counters.count(name, "future")
-
-    def _is_far_in_time(self) -> None:
-        self._counters.count(TF, "far_in_time")
-
     def _hurried(self, source: InputContext, message: Any) -> list[Measured]:
         before, source.hurried = source.hurried, True
         out = self._converted(source, message)
         source.hurried = before
         return out
-
-    def _by_bytes(self, source: InputContext, cdr: bytes) -> list[Any] | None:
-        """The odometry of a message without a fault that does not have to be decoded; None: as any other message."""
-        reader, own = self._readers[source.name]
-        read = reader.read(cdr)
-        m = None if read is None else odometry.of_bytes(source, read)
-        if m is None:
-            return None
-        if source.tally:
-            self._count_tally(source)
-        own.note(read)
-        return [m]
 
     @np.errstate(invalid="ignore")  # a signalling NaN warns where it is compared; it is refused by name
     def _converted(self, source: InputContext, message: Any) -> list[Any]:

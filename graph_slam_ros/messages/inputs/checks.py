@@ -8,7 +8,7 @@ import numpy as np
 
 from graph_slam_ros.lie import se2
 from graph_slam_ros.measurements.edge_noise import LEAST_M2, LEAST_RAD2
-from graph_slam_ros.typing import Array
+from graph_slam_ros.typing import Array, Mask
 
 _NORM_REPAIRED = 0.1  # a quaternion this far from unit length is normalised, beyond it is refused
 _NORM_EXACT, _SQUARE_EXACT = 1e-6, 1.9e-6
@@ -33,13 +33,13 @@ def stamp_ns(stamp: Any) -> int:
     return int(out)
 
 
-def is_sound(x: Any, y: Any, z: Any) -> Any:
-    """Return whether ``point`` accepts coordinates, which may be arrays."""
+def are_sound(x: Array, y: Array, z: Array) -> Mask:
+    """Return whether ``point`` accepts coordinates."""
     return (abs(x) <= _FARTHEST_M) & (abs(y) <= _FARTHEST_M) & (abs(z) <= _FARTHEST_M)
 
 
-def is_unit(x: Any, y: Any, z: Any, w: Any) -> Any:
-    """Return whether ``quaternion`` surely returns the numbers, which may be arrays, as they are."""
+def are_units(x: Array, y: Array, z: Array, w: Array) -> Mask:
+    """Return whether ``quaternion`` surely returns the numbers as they are."""
     return abs(x * x + y * y + z * z + w * w - 1.0) <= _SQUARE_EXACT
 
 

@@ -10,7 +10,7 @@ from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.measurements.types import AngularVelocity, Odometry
 from graph_slam_ros.messages.inputs import checks
 from graph_slam_ros.messages.inputs.checks import MessageError
-from graph_slam_ros.messages.inputs.odometry_bytes import OdometryBytes, OdometryRun
+from graph_slam_ros.messages.inputs.odometry_bytes import OdometryRun
 from graph_slam_ros.messages.inputs.source import InputContext
 from graph_slam_ros.messages.inputs.transforms import pose
 from graph_slam_ros.typing import Numbers
@@ -22,7 +22,7 @@ _UNUSED = 1e6  # [m^2/s^2, rad^2/s^2]: what drivers of wheels write for what the
 
 
 def odometry(source: InputContext, m: Any) -> Iterator[Odometry]:
-    """nav_msgs/Odometry, decoded; ``of_bytes`` does the same for nearly all messages."""
+    """nav_msgs/Odometry, decoded; ``of_run`` does the same for many at once."""
     stamp_ns = source.stamp_ns(m.header.stamp)
     p, parent = m.pose.pose, source.frame(m.header.frame_id)
     at = _in_odom(source, parent, _named(source, m.child_frame_id), p.position, p.orientation)
@@ -32,26 +32,11 @@ def odometry(source: InputContext, m: Any) -> Iterator[Odometry]:
     yield Odometry(stamp_ns, at, twist, source.name)
 
 
-def of_bytes(source: InputContext, read: OdometryBytes) -> Odometry | None:
-    """The odometry of a message in which nothing is refused or repaired but its covariance; else None."""
-    if not _is_of_base(source, read):
-        return None
-    stamp_ns = source.valid_stamp_ns(read.sec, read.nanosec)
-    x, y, z, qx, qy, qz, qw = numbers = read.numbers[:7]
-    if not stamp_ns or not checks.is_sound(x, y, z) or not checks.is_unit(qx, qy, qz, qw):
-        return None
-    at = source.of_robot_in_plane(numbers)
-    if at is None or not _is_judged(source, read.twist_covariance):
-        return None
-    count_repairs(source, 1)
-    return Odometry(stamp_ns, at, _twist_judged(source), source.name)
-
-
 @np.errstate(all="ignore")  # of strange numbers, which are decoded and refused by name
 def of_run(source: InputContext, read: OdometryRun, after_ns: int) -> list[Odometry]:
-    """The odometry of the first messages of a run, as far as ``of_bytes`` converts each, and as stamps ascend.
+    """The odometry of the first messages of a run, as far as stamps ascend, and nothing is refused or repaired.
 
-    Their repairs are for ``count_repairs``.
+    Only their covariance may be repaired, which is for ``count_repairs``.
 
     Parameters
     ----------
@@ -59,14 +44,14 @@ def of_run(source: InputContext, read: OdometryRun, after_ns: int) -> list[Odome
     """
     if not _is_of_base(source, read) or not _is_judged(source, read.twist_covariance):
         return []
-    numbers, stamps = read.numbers[:, :7], source.valid_stamp_ns(read.sec, read.nanosec)
-    are_sound = checks.is_sound(*numbers[:, :3].T) & checks.is_unit(*numbers[:, 3:].T)
+    numbers, stamps = read.numbers[:, :7], source.valid_stamps_ns(read.sec, read.nanosec)
+    are_sound = checks.are_sound(*numbers[:, :3].T) & checks.are_units(*numbers[:, 3:].T)
     poses = source.of_robots_in_plane(numbers, are_sound & (np.diff(stamps, prepend=after_ns) > 0))
-    twist = _twist_judged(source)
+    twist = source.state["judged"][0] if source.config.odometry.noise == "twist" else None
     return [Odometry(stamp, at, twist, source.name) for stamp, at in zip(stamps.tolist(), poses, strict=False)]
 
 
-def _is_of_base(source: InputContext, read: OdometryBytes | OdometryRun) -> bool:
+def _is_of_base(source: InputContext, read: OdometryRun) -> bool:
     """Return whether messages are of the base in odometry's frame, by names that need no change."""
     frames, parent, child = source.config.frames, source.settings.frame or read.frame_id, read.child_frame_id
     is_of_base = parent == frames.odom and child == frames.base and parent != child
@@ -78,12 +63,6 @@ def _is_judged(source: InputContext, raw: bytes) -> bool:
     if source.config.odometry.noise != "twist":
         return True
     return raw == source.state.get("raw") and not isinstance(source.state["judged"][0], MessageError)
-
-
-def _twist_judged(source: InputContext) -> Numbers | None:
-    """The covariance of the twist that was accepted before."""
-    out: Numbers | None = source.state["judged"][0] if source.config.odometry.noise == "twist" else None
-    return out
 
 
 def count_repairs(source: InputContext, times: int) -> None:

@@ -14,7 +14,7 @@ from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.messages.inputs import checks
 from graph_slam_ros.messages.inputs.checks import MessageError
 from graph_slam_ros.messages.inputs.transforms import Transforms, assumed_mount
-from graph_slam_ros.typing import Array, Mask, Numbers
+from graph_slam_ros.typing import Array, Index, Mask, Numbers
 
 _PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
 _BEYOND_MEANING = 1e12  # [m^2, rad^2]: larger numbers could not be turned into other axes
@@ -90,8 +90,8 @@ class InputContext:
             raise MessageError("bad_stamp")
         return out
 
-    def valid_stamp_ns(self, sec: Any, nanosec: Any) -> Any:
-        """The same of its two numbers, which may be arrays; 0 where it would be refused."""
+    def valid_stamps_ns(self, sec: Index, nanosec: Index) -> Index:
+        """The same of arrays of its two numbers; 0 where it would be refused."""
         out = sec * 1_000_000_000 + nanosec + self._offset_ns
         is_stamp = (sec >= 0) & (nanosec >= 0) & (nanosec < 1_000_000_000) & ((sec > 0) | (nanosec > 0))
         return out * (is_stamp & (out > 0) & (out <= LATEST_NS))
@@ -219,19 +219,8 @@ class InputContext:
                 self.count("out_of_plane")
         return self.projected(T)
 
-    def of_robot_in_plane(self, T: Any) -> Numbers | None:
-        """The same for a pose of floats that is not the first one, and that counts as nothing; else None."""
-        if self.space.dimensions == 3:
-            return tuple(T)
-        height = self.state.get("height")
-        if height is None or abs(T[2] - height) > _LEVEL_M:
-            return None
-        if abs(T[3]) + abs(T[4]) > _LITTLE and so3.act(se3.rotation(T), (0.0, 0.0, 1.0))[2] < _UPRIGHT:
-            return None
-        return self.projected(T)
-
     def of_robots_in_plane(self, numbers: Array, are_wanted: Mask) -> list[Numbers]:
-        """The same for the first of several poses (n, 7), as far as they are wanted, and surely count as nothing."""
+        """The same for the first of several poses (n, 7), as far as they are wanted, and surely are in the plane."""
         if self.space.dimensions == 3:
             return list(map(tuple, numbers[: _first_false(are_wanted)].tolist()))
         height = self.state.get("height")

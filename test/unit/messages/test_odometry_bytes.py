@@ -1,4 +1,4 @@
-"""Odometry read by the places of its bytes, alone or in runs, is what a decoder makes of it, with the same counters."""
+"""Odometry read in runs, by the places of its bytes, is what a decoder makes of it, with the same counters."""
 
 import itertools
 import math
@@ -9,7 +9,6 @@ from rows import each
 
 from graph_slam_ros.messages.from_msg import decoder
 from graph_slam_ros.messages.inputs.odometry import TYPE
-from graph_slam_ros.messages.inputs.odometry_bytes import OdometryReader
 
 TILTED = {"roll": 0.02, "pitch": -0.01}
 NAN_TWIST = np.full((6, 6), np.nan)
@@ -56,28 +55,18 @@ def together(out, messages):
     return measured
 
 
-def converted(messages, monkeypatch, *, decoded=False, in_runs=False, **sections):
-    """What is made of messages and what is counted, read by bytes or all decoded; and how many were decoded."""
-    with monkeypatch.context() as patched:
-        calls = []
-        if decoded:
-            patched.setattr(OdometryReader, "read", lambda self, cdr: None)
-        own = decoder(TYPE)
-        own.note = lambda message: calls.append(hasattr(message, "header"))
-        out = border(decoders={TYPE: own}, **sections)
-        measured = together(out, messages) if in_runs else [out.convert("odom", cdr) for cdr in messages]
-        return [*measured, out.finish()], counted(out), sum(calls)
-
-
-def compare(messages, monkeypatch, **sections):
-    """Messages are read by bytes, alone and in runs, as they are decoded."""
-    expected = converted(messages, monkeypatch, decoded=True, **sections)[:2]
-    for in_runs in (False, True):
-        assert converted(messages, monkeypatch, in_runs=in_runs, **sections)[:2] == expected
+def converted(messages, *, in_runs, **sections):
+    """What is made of messages, decoded or in runs, what is counted, and how many were decoded."""
+    decoded = []
+    own = decoder(TYPE)
+    own.note = lambda message: decoded.append(hasattr(message, "header"))
+    out = border(decoders={TYPE: own}, **sections)
+    measured = together(out, messages) if in_runs else [out.convert("odom", cdr) for cdr in messages]
+    return [*measured, out.finish()], counted(out), sum(decoded)
 
 
 @each("dimensions, seed", [*itertools.product([2, 3], range(4))])
-def test_any_messages_are_read_as_they_are_decoded(seed, dimensions, monkeypatch):
+def test_any_messages_are_read_as_they_are_decoded(seed, dimensions):
     """Odd ones among plain ones, in any order, with stamps that stand still, leap and go back."""
     rng = np.random.default_rng(seed)
     messages, stamp_ns = [], STAMP_NS
@@ -86,15 +75,15 @@ def test_any_messages_are_read_as_they_are_decoded(seed, dimensions, monkeypatch
         odd = list(ODD.values())[rng.integers(len(ODD))] if rng.random() < 0.25 else {}
         at = pose(0.1 * len(messages), *rng.normal(0.0, 0.02, 2), quaternion(yaw=rng.normal(), **TILTED))
         messages.append(odometry(**({"stamp_ns": stamp_ns, "at": at} | odd)))
-    compare(messages, monkeypatch, world={"dimensions": dimensions})
+    space = {"dimensions": dimensions}
+    assert converted(messages, in_runs=True, world=space)[:2] == converted(messages, in_runs=False, world=space)[:2]
 
 
-def test_nearly_all_messages_are_not_decoded(monkeypatch):
+def test_nearly_all_messages_are_not_decoded():
     messages = [*drive(50)]
-    measured, _, decoded = converted(messages, monkeypatch)
+    measured, _, decoded = converted(messages, in_runs=True)
     assert decoded == 1  # the first: it says how high the robot is, and its covariance is judged
     assert [len(some) for some in measured] == [1] * 50 + [0]
-    assert converted(messages, monkeypatch, decoded=True)[2] == 50
     out = border()
     assert not out.convert_run("odom", messages, 0)  # the first
     assert len(out.convert("odom", messages[0])) == 1
