@@ -7,6 +7,7 @@ explain a reason by its row here.
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
+from functools import partial
 
 
 class Effect(Enum):
@@ -36,7 +37,7 @@ class Reason:
     remedy: str = ""
 
 
-_REFUSED, _REPAIRED, _NOTED = Effect.REFUSED, Effect.REPAIRED, Effect.NOTED
+_refused, _repaired, _noted = (partial(Reason, effect) for effect in Effect)
 _COVARIANCE = "correct the driver's covariance, or INPUT.noise=sigmas; of odometry odometry.noise=density"
 _SIGMAS = "INPUT.sigma_m, INPUT.sigma_rad: its standard deviations; of closures with INPUT.noise=sigmas"
 _FRAMES = "publish the transform on /tf_static, or INPUT.mount, or frames.base as the messages name it"
@@ -45,202 +46,151 @@ _SPACE = "world.dimensions=3"
 
 REASONS: dict[str, Reason] = {
     # -- stamps and order
-    "bad_stamp": Reason(
-        _REFUSED, "the stamp is negative, beyond 2^31 s, or has 1e9 nanoseconds or more", "correct the driver's stamps"
-    ),
-    "zero_stamp": Reason(_REFUSED, "the stamp is zero", "have the driver fill in header.stamp"),
-    "late": Reason(
-        _REFUSED,
-        "it came after newer messages were used",
-        "ordering.window_s for odometry, ordering.late_s for others; INPUT.offset_s",
-    ),
-    "future": Reason(_REFUSED, "the stamp is ahead of the clock, or of odometry", "use_sim_time; INPUT.offset_s"),
-    "far_in_time": Reason(
-        _REFUSED, "the transform is dated 10 s away from the others of its frame", "one clock for all /tf"
-    ),
-    "before_jump": Reason(_REFUSED, "it was sent before the clock jumped back and arrived after"),
-    "before_odometry": Reason(_REFUSED, "it is older than all odometry", "begin with odometry; INPUT.offset_s"),
-    "after_odometry": Reason(_REFUSED, "it is newer than the last odometry", "end with odometry; INPUT.offset_s"),
-    "frozen": Reason(
-        _NOTED, "the robot moved past landmarks while odometry stood still", "its driver hangs, or it was towed"
-    ),
-    "odometry_gap": Reason(_REFUSED, "odometry was silent, or jumped, then", "find out why its driver paused"),
-    "overflow": Reason(_REFUSED, "too many messages waited", "inputs.queue of a node, ordering.max_waiting"),
-    "duplicate": Reason(_NOTED, "the same message has come before"),
-    "duplicate_stamp": Reason(
-        _REFUSED, "odometry says two different things for one stamp", "one publisher: ros2 topic info -v TOPIC"
-    ),
-    "sent_again": Reason(_NOTED, "the transform was sent before with the same stamp"),
-    "lost_in_transport": Reason(_REFUSED, "the middleware lost it", "INPUT.reliability: reliable; net.core.rmem_max"),
+    "bad_stamp": _refused("the stamp is negative, beyond 2^31 s, or has 1e9 ns or more", "correct the driver's stamps"),
+    "zero_stamp": _refused("the stamp is zero", "have the driver fill in header.stamp"),
+    "late": _refused("it came after newer ones were used", "ordering.window_s, ordering.late_s; INPUT.offset_s"),
+    "future": _refused("the stamp is ahead of the clock, or of odometry", "use_sim_time; INPUT.offset_s"),
+    "far_in_time": _refused("the transform is dated 10 s away from the others of its frame", "one clock for all /tf"),
+    "before_jump": _refused("it was sent before the clock jumped back and arrived after"),
+    "before_odometry": _refused("it is older than all odometry", "begin with odometry; INPUT.offset_s"),
+    "after_odometry": _refused("it is newer than the last odometry", "end with odometry; INPUT.offset_s"),
+    "frozen": _noted("the robot moved past landmarks while odometry stood still", "its driver hangs, or it was towed"),
+    "odometry_gap": _refused("odometry was silent, or jumped, then", "find out why its driver paused"),
+    "overflow": _refused("too many messages waited", "inputs.queue of a node, ordering.max_waiting"),
+    "duplicate": _noted("the same message has come before"),
+    "duplicate_stamp": _refused("odometry has two poses for one stamp", "ros2 topic info -v TOPIC: one publisher"),
+    "sent_again": _noted("the transform was sent before with the same stamp"),
+    "lost_in_transport": _refused("the middleware lost it", "INPUT.reliability: reliable; net.core.rmem_max"),
     # -- frames
-    "frame_slash_stripped": Reason(_REPAIRED, "the name of a frame began with a slash"),
-    "frame_empty": Reason(_REFUSED, "the message names no frame", "header.frame_id of its driver; or INPUT.frame"),
-    "frame_in_itself": Reason(_REFUSED, "a frame is its own parent", "correct the driver's frame names"),
-    "frame_unknown": Reason(_REFUSED, "no transform links the message's frame to the robot", _FRAMES),
-    "transform_gaps": Reason(_REFUSED, "/tf links the message's frame to the robot, but not at its stamp", _GAPS),
-    "odom_frame_unknown": Reason(_REFUSED, "no transform links it to frames.odom", "set frames.odom to its frame"),
-    "map_frame_unknown": Reason(_REFUSED, "no transform links it to frames.map", "set frames.map to its frame"),
-    "child_frame_unknown": Reason(_REFUSED, "no transform links the message's child frame to the robot", _FRAMES),
+    "frame_slash_stripped": _repaired("the name of a frame began with a slash"),
+    "frame_empty": _refused("the message names no frame", "header.frame_id of its driver; or INPUT.frame"),
+    "frame_in_itself": _refused("a frame is its own parent", "correct the driver's frame names"),
+    "frame_unknown": _refused("no transform links the message's frame to the robot", _FRAMES),
+    "transform_gaps": _refused("/tf links the message's frame to the robot, but not at its stamp", _GAPS),
+    "odom_frame_unknown": _refused("no transform links it to frames.odom", "set frames.odom to its frame"),
+    "map_frame_unknown": _refused("no transform links it to frames.map", "set frames.map to its frame"),
+    "child_frame_unknown": _refused("no transform links the message's child frame to the robot", _FRAMES),
     # -- numbers
-    "undecodable": Reason(_REFUSED, "the bytes are not a message of this type", "INPUT.type, or record it again"),
-    "plugin_failed": Reason(
-        _REFUSED, "the plugin of this type failed, or gave what is no measurement", "its first error is in the log"
-    ),
-    "nonfinite": Reason(_REFUSED, "a number is NaN or infinite", "correct the driver"),
-    "too_far": Reason(_REFUSED, "a coordinate is beyond 1e9 m", "correct the driver"),
-    "beyond_max_distance": Reason(_REFUSED, "it is beyond INPUT.max_distance_m, or 100 km", "INPUT.max_distance_m"),
-    "quaternion_normalized": Reason(_REPAIRED, "the quaternion was not quite of length one"),
-    "zero_quaternion": Reason(_REFUSED, "the quaternion is zero", "have the driver fill in the orientation"),
-    "denormal_quaternion": Reason(_REFUSED, "the quaternion's length is off by more than 10 %", "correct the driver"),
-    "no_heading": Reason(_REFUSED, "the x axis is nearly vertical, so there is no heading in the plane", _SPACE),
-    "out_of_plane": Reason(_NOTED, "the pose is 0.5 m above or below the first, or tilted by 20 degrees", _SPACE),
+    "undecodable": _refused("the bytes are not a message of this type", "INPUT.type, or record it again"),
+    "plugin_failed": _refused("its plugin failed, or gave what is no measurement", "its first error is in the log"),
+    "nonfinite": _refused("a number is NaN or infinite", "correct the driver"),
+    "too_far": _refused("a coordinate is beyond 1e9 m", "correct the driver"),
+    "beyond_max_distance": _refused("it is beyond INPUT.max_distance_m, or 100 km", "INPUT.max_distance_m"),
+    "quaternion_normalized": _repaired("the quaternion was not quite of length one"),
+    "zero_quaternion": _refused("the quaternion is zero", "have the driver fill in the orientation"),
+    "denormal_quaternion": _refused("the quaternion's length is off by more than 10 %", "correct the driver"),
+    "no_heading": _refused("the x axis is nearly vertical, so there is no heading in the plane", _SPACE),
+    "out_of_plane": _noted("the pose is 0.5 m above or below the first, or tilted by 20 degrees", _SPACE),
     # -- noise
-    "noise_unknown": Reason(_REFUSED, "neither the message nor the parameters have its noise", _SIGMAS),
-    "covariance_unknown": Reason(_REPAIRED, "the covariance is zero: the configured noise is used"),
-    "size_unknown": Reason(_NOTED, "the size of a landmark is negative, above 1 km or no number: it is unknown"),
-    "covariance_of_some_axes_unknown": Reason(_REPAIRED, "the twist's covariance lacks axes: configured noise is used"),
-    "covariance_clamped": Reason(_REPAIRED, "a variance above 1e6 m^2 or 1e3 rad^2 was lowered to that"),
-    "covariance_floored": Reason(_REPAIRED, "a variance that is nearly zero was raised"),
-    "covariance_symmetrized": Reason(_REPAIRED, "the covariance was slightly asymmetric"),
-    "covariance_asymmetric": Reason(_REFUSED, "the covariance is not symmetric", _COVARIANCE),
-    "covariance_not_positive_definite": Reason(_REFUSED, "the covariance is not positive definite", _COVARIANCE),
-    "nonfinite_covariance": Reason(_REFUSED, "the covariance has NaN, infinite or negative numbers", _COVARIANCE),
+    "noise_unknown": _refused("neither the message nor the parameters have its noise", _SIGMAS),
+    "covariance_unknown": _repaired("the covariance is zero: the configured noise is used"),
+    "size_unknown": _noted("the size of a landmark is negative, above 1 km or no number: it is unknown"),
+    "covariance_of_some_axes_unknown": _repaired("the twist's covariance lacks axes: configured noise is used"),
+    "covariance_clamped": _repaired("a variance above 1e6 m^2 or 1e3 rad^2 was lowered to that"),
+    "covariance_floored": _repaired("a variance that is nearly zero was raised"),
+    "covariance_symmetrized": _repaired("the covariance was slightly asymmetric"),
+    "covariance_asymmetric": _refused("the covariance is not symmetric", _COVARIANCE),
+    "covariance_not_positive_definite": _refused("the covariance is not positive definite", _COVARIANCE),
+    "nonfinite_covariance": _refused("the covariance has NaN, infinite or negative numbers", _COVARIANCE),
     # -- odometry
-    "not_in_use": Reason(
-        _NOTED, "another odometry is used: the first of inputs.names that is alive", "a filter makes one of several"
+    "not_in_use": _noted("another is used: the first of inputs.names that is alive", "a filter can fuse several"),
+    "switched_to": _noted("this odometry took over from one that fell silent, or is of higher priority"),
+    "switched_to_unlinked": _noted("this odometry took over; the motion between is unknown"),
+    "gyro_waiting": _noted("the gyro's bias is unknown until it stands", "stand for a second; gyro.bias_sigma"),
+    "gyro_silent": _noted("the gyro was silent longer than gyro.timeout_s", "gyro.timeout_s; INPUT.offset_s"),
+    "gyro_doubted": _noted("it contradicts odometry in most turns", "rad/s, counter-clockwise; its TF or INPUT.mount"),
+    "no_angular_velocity": _refused("the IMU says that it has no angular velocity", "INPUT.use=fix"),
+    "jump": _noted(
+        "odometry jumped, a segment begins; of tf: a correction", "odometry.max_speed_m_s; tf.report_jump_m"
     ),
-    "switched_to": Reason(_NOTED, "this odometry took over from one that fell silent, or is of higher priority"),
-    "switched_to_unlinked": Reason(_NOTED, "this odometry took over; the motion between is unknown"),
-    "gyro_waiting": Reason(_NOTED, "the gyro's bias is unknown until it stands", "stand for a second; gyro.bias_sigma"),
-    "gyro_silent": Reason(_NOTED, "the gyro was silent longer than gyro.timeout_s", "gyro.timeout_s; INPUT.offset_s"),
-    "gyro_doubted": Reason(
-        _NOTED, "the gyro contradicts odometry in most turns", "rad/s, counter-clockwise; its TF or INPUT.mount"
+    "other_publisher": _refused(
+        "it does not go on from the last: another node's, or an outlier", "ros2 topic info -v TOPIC; metres, radians"
     ),
-    "no_angular_velocity": Reason(_REFUSED, "the IMU says that it has no angular velocity", "INPUT.use=fix"),
-    "jump": Reason(
-        _NOTED, "odometry jumped: a segment begins; of tf: a correction", "odometry.max_speed_m_s; tf.report_jump_m"
-    ),
-    "other_publisher": Reason(
-        _REFUSED,
-        "the pose does not continue the odometry in use: another node's, or an outlier",
-        "one publisher: ros2 topic info -v TOPIC; metres and radians",
-    ),
-    "reset_to_zero": Reason(_NOTED, "odometry was set back to zero: a new segment begins"),
+    "reset_to_zero": _noted("odometry was set back to zero: a new segment begins"),
     # -- landmarks
-    "no_id": Reason(_REFUSED, "the detection has no identity", "landmarks.association=joint"),
-    "id_too_long": Reason(_REFUSED, "the identity has more than 128 bytes", "shorter ids, or landmarks.id_from"),
-    "id_conflict": Reason(_REFUSED, "one message has an identity at two places", "one id for each landmark"),
-    "id_merged": Reason(_REPAIRED, "one message has an identity twice, at places that agree: their mean is used"),
-    "id_of_an_unnamed": Reason(_REFUSED, "the identity is a name of landmarks without one", "INPUT.id_prefix"),
-    "unclear_which": Reason(
-        _REFUSED, "a detection without identity fits no landmark", "noise that is as large as the sensor's"
-    ),
-    "surveyed_orientation_unused": Reason(
-        _NOTED, "a surveyed orientation is not used: it was first seen without one", "a detector of orientations"
-    ),
-    "not_for_a_pose": Reason(_REFUSED, "a range or bearing to a landmark that is known as a pose", "INPUT.id_prefix"),
-    "not_used": Reason(_NOTED, "landmarks.association is none", "landmarks.association=id"),
-    "poor_tag": Reason(_NOTED, "the tag is beyond INPUT.hamming_max or below INPUT.decision_margin_min"),
-    "too_many": Reason(
-        _REFUSED, "the message has more than 1000 landmarks: the nearest are used", "a scan is no list of landmarks"
-    ),
-    "unknown_action": Reason(_REFUSED, "the marker's action is none of add, modify, delete", "correct the driver"),
-    "lengths_differ": Reason(_REFUSED, "the message has not as many ids as poses", "correct the driver"),
-    "range_not_positive": Reason(_REFUSED, "the range is zero, negative or beyond 1e9 m", "correct the driver"),
-    "bearing_wrapped": Reason(_REPAIRED, "the bearing was beyond half a turn"),
-    "bearing_out_of_range": Reason(_REFUSED, "an angle is far beyond a turn", "radians, not degrees"),
-    "no_elevation": Reason(_REFUSED, "a bearing in space needs an elevation", "world.dimensions=2"),
-    "sensor_tilted": Reason(_REFUSED, "an azimuth alone, of a sensor that is not level", "send the elevation"),
-    "overhead": Reason(_REFUSED, "the landmark is straight above or below: no direction in the plane", _SPACE),
-    "fields_unknown": Reason(
-        _REFUSED, "the cloud's fields are none of x y z, range, bearing, elevation", "a scan is no list of landmarks"
-    ),
-    "fields_beyond_point": Reason(_REFUSED, "a field of the cloud lies outside its point", "correct the driver"),
-    "too_many_points": Reason(_REFUSED, "the cloud has more than 100,000 points", "a scan is no list of landmarks"),
-    "cut_off": Reason(_REFUSED, "the cloud has fewer bytes than it says", "correct the driver"),
-    "undecided": Reason(_NOTED, "a stretch of the drive may be of several places that look alike: it is left as it is"),
-    "moves_left": Reason(_NOTED, "the search for landmarks that are in the map twice reached its limit"),
-    "reassigned": Reason(_NOTED, "what was seen without identity turned out to be of another landmark"),
-    "given_up": Reason(_NOTED, "a new unnamed landmark was not seen again within a minute"),
+    "no_id": _refused("the detection has no identity", "landmarks.association=joint"),
+    "id_too_long": _refused("the identity has more than 128 bytes", "shorter ids, or landmarks.id_from"),
+    "id_conflict": _refused("one message has an identity at two places", "one id for each landmark"),
+    "id_merged": _repaired("one message has an identity twice, at places that agree: their mean is used"),
+    "id_of_an_unnamed": _refused("the identity is a name of landmarks without one", "INPUT.id_prefix"),
+    "unclear_which": _refused("without identity, and it fits no landmark", "noise as large as the sensor's"),
+    "surveyed_orientation_unused": _noted("it was first seen without an orientation", "a detector of orientations"),
+    "not_for_a_pose": _refused("a range or bearing to a landmark that is known as a pose", "INPUT.id_prefix"),
+    "not_used": _noted("landmarks.association is none", "landmarks.association=id"),
+    "poor_tag": _noted("the tag is beyond INPUT.hamming_max or below INPUT.decision_margin_min"),
+    "too_many": _refused("more than 1000 in a message: the nearest are used", "a scan is no list of landmarks"),
+    "unknown_action": _refused("the marker's action is none of add, modify, delete", "correct the driver"),
+    "lengths_differ": _refused("the message has not as many ids as poses", "correct the driver"),
+    "range_not_positive": _refused("the range is zero, negative or beyond 1e9 m", "correct the driver"),
+    "bearing_wrapped": _repaired("the bearing was beyond half a turn"),
+    "bearing_out_of_range": _refused("an angle is far beyond a turn", "radians, not degrees"),
+    "no_elevation": _refused("a bearing in space needs an elevation", "world.dimensions=2"),
+    "sensor_tilted": _refused("an azimuth alone, of a sensor that is not level", "send the elevation"),
+    "overhead": _refused("the landmark is straight above or below: no direction in the plane", _SPACE),
+    "fields_unknown": _refused("it has neither x y z nor range, bearing, elevation", "a scan is no list of landmarks"),
+    "fields_beyond_point": _refused("a field of the cloud lies outside its point", "correct the driver"),
+    "too_many_points": _refused("the cloud has more than 100,000 points", "a scan is no list of landmarks"),
+    "cut_off": _refused("the cloud has fewer bytes than it says", "correct the driver"),
+    "undecided": _noted("a stretch of the drive may be of several places that look alike: it is left as it is"),
+    "moves_left": _noted("the search for landmarks that are in the map twice reached its limit"),
+    "reassigned": _noted("what was seen without identity turned out to be of another landmark"),
+    "given_up": _noted("a new unnamed landmark was not seen again within a minute"),
     # -- fixes
-    "no_fix": Reason(_REFUSED, "the receiver has no fix", "wait for one: a clear view of the sky"),
-    "no_position": Reason(_REFUSED, "latitude and longitude are zero", "wait for a fix"),
-    "not_on_earth": Reason(_REFUSED, "latitude, longitude or altitude is out of range", "degrees and metres"),
-    "far_from_datum": Reason(_REFUSED, "the fix is more than 100 km from the map's origin", "INPUT.datum"),
-    "other_datum": Reason(_REFUSED, "the fix counts from another origin than the map", "the same INPUT.datum for all"),
-    "thinned": Reason(
-        _NOTED, "it came so soon that its error is that of the last", "INPUT.correlation_s; keyframes.max_interval_s"
-    ),
-    "mount_unknown": Reason(
-        _REPAIRED,
+    "no_fix": _refused("the receiver has no fix", "wait for one: a clear view of the sky"),
+    "no_position": _refused("latitude and longitude are zero", "wait for a fix"),
+    "not_on_earth": _refused("latitude, longitude or altitude is out of range", "degrees and metres"),
+    "far_from_datum": _refused("the fix is more than 100 km from the map's origin", "INPUT.datum"),
+    "other_datum": _refused("the fix counts from another origin than the map", "the same INPUT.datum for all"),
+    "thinned": _noted("its error is still that of the last", "INPUT.correlation_s; keyframes.max_interval_s"),
+    "mount_unknown": _repaired(
         "no transform has the position of the antenna on the robot: the base is assumed",
         '--set INPUT.mount="X Y Z 0 0 0", its place from the base in metres; zeros say that it is there',
     ),
-    "mount_assumed": Reason(_NOTED, "no transform has the place of the sensor: the base is assumed", _FRAMES),
-    "map_moved": Reason(
-        _NOTED, "a fix or surveyed landmark was the first to locate the map", "anchor.sigma_m, anchor.sigma_rad"
-    ),
-    "no_altitude": Reason(_REPAIRED, "the fix has no altitude: it counts in the horizontal only"),
-    "no_orientation": Reason(_REFUSED, "the IMU says that it has no orientation", "its gyro alone: INPUT.use=gyro"),
-    "not_in_this_space": Reason(_REFUSED, "such a fix does not exist in so many dimensions", "world.dimensions"),
+    "mount_assumed": _noted("no transform has the place of the sensor: the base is assumed", _FRAMES),
+    "map_moved": _noted("the first fix or surveyed landmark located the map", "anchor.sigma_m, anchor.sigma_rad"),
+    "no_altitude": _repaired("the fix has no altitude: it counts in the horizontal only"),
+    "no_orientation": _refused("the IMU says that it has no orientation", "its gyro alone: INPUT.use=gyro"),
+    "not_in_this_space": _refused("such a fix does not exist in so many dimensions", "world.dimensions"),
     # -- closures
-    "id_not_a_stamp": Reason(_REFUSED, "a closure's id is not the earlier stamp in nanoseconds", "see docs/inputs.md"),
-    "closure_with_itself": Reason(_REFUSED, "a closure's two stamps are the same", "correct the publisher"),
-    "no_result": Reason(_REFUSED, "a closure has no result with a pose", "correct the publisher"),
-    "within_one_keyframe": Reason(_REFUSED, "a closure links two moments of one keyframe: it says nothing new"),
-    "from_where_there_was_no_odometry": Reason(
-        _REFUSED, "the earlier stamp of a closure or edge is outside the odometry", "stamps by the robot's clock"
+    "id_not_a_stamp": _refused("a closure's id is not the earlier stamp in nanoseconds", "see docs/inputs.md"),
+    "closure_with_itself": _refused("a closure's two stamps are the same", "correct the publisher"),
+    "no_result": _refused("a closure has no result with a pose", "correct the publisher"),
+    "within_one_keyframe": _refused("a closure links two moments of one keyframe: it says nothing new"),
+    "from_where_there_was_no_odometry": _refused(
+        "a closure's earlier stamp is outside odometry", "stamps by the robot's clock"
     ),
-    "from_condensed_keyframe": Reason(_REFUSED, "its start left the map", "map.condense=false"),
+    "from_condensed_keyframe": _refused("its start left the map", "map.condense=false"),
     # -- the map
-    "not_in_map": Reason(_NOTED, "the map does not have it, and map.localize is true", "map.localize=false to add it"),
-    "removed": Reason(_NOTED, "an edge or a landmark that was removed by hand (~/remove)"),
-    "unknown_edge": Reason(_NOTED, "~/remove named an edge that is not there", "graph_slam explain RUN lists ids"),
-    "unknown_landmark": Reason(
-        _NOTED, "~/remove named a landmark that is not in the map", "ros2 topic echo ~/landmarks_estimate lists names"
+    "not_in_map": _noted("the map does not have it, and map.localize is true", "map.localize=false to add it"),
+    "removed": _noted("an edge or a landmark that was removed by hand (~/remove)"),
+    "unknown_edge": _noted("~/remove named an edge that is not there", "graph_slam explain RUN lists ids"),
+    "unknown_landmark": _noted(
+        "~/remove named one that is not there", "ros2 topic echo ~/landmarks_estimate lists names"
     ),
-    "needed_edge": Reason(_NOTED, "~/remove named odometry or a prior: without it poses are undetermined"),
-    "held_in_map": Reason(_NOTED, "~/remove named a part of a map that is held", "map.localize=false"),
-    "condensed_in_map": Reason(_NOTED, "it is of a map with condensed visits", "edit a replay with map.condense=false"),
-    "condensed": Reason(_REFUSED, "it left before its landmark was determined or confirmed", "map.window_keyframes"),
-    "visit_condensed": Reason(_NOTED, "a visit was added to its place, begins one, or is one keyframe"),
-    "visit_wider": Reason(_NOTED, "a visit fits its place with larger sigmas only (up to 3 times)"),
-    "visit_lost": Reason(_NOTED, "a visit that contradicts itself or its place: its odometry alone is kept"),
-    "not_condensed": Reason(_NOTED, "a keyframe that stays, for its edges or as too little is seen around it"),
-    "held_keyframe": Reason(_NOTED, "a keyframe that stays: its map is frozen, or held by map.localize"),
-    "cleared": Reason(_NOTED, "loop closures that ~/clear_closures took out"),
-    "displaced": Reason(
-        _NOTED,
-        "landmarks showed that the robot was elsewhere: it slipped or was carried",
-        "graph_slam explain RUN; graph_slam check",
+    "needed_edge": _noted("~/remove named odometry or a prior: without it poses are undetermined"),
+    "held_in_map": _noted("~/remove named a part of a map that is held", "map.localize=false"),
+    "condensed_in_map": _noted("it is of a map with condensed visits", "edit a replay with map.condense=false"),
+    "condensed": _refused("it left before its landmark was determined or confirmed", "map.window_keyframes"),
+    "visit_condensed": _noted("a visit was added to its place, begins one, or is one keyframe"),
+    "visit_wider": _noted("a visit fits its place with larger sigmas only (up to 3 times)"),
+    "visit_lost": _noted("a visit that contradicts itself or its place: its odometry alone is kept"),
+    "not_condensed": _noted("a keyframe that stays, for its edges or as too little is seen around it"),
+    "held_keyframe": _noted("a keyframe that stays: its map is frozen, or held by map.localize"),
+    "cleared": _noted("loop closures that ~/clear_closures took out"),
+    "displaced": _noted("landmarks showed the robot elsewhere: carried, or slipped", "graph_slam explain RUN"),
+    "slip": _noted("landmarks contradicted odometry for seconds: it counts less", "graph_slam check; odometry.noise"),
+    "slip_taken_back": _noted("a slip was decided, and later sightings agree with odometry"),
+    "displacement_taken_back": _noted(
+        "later sightings contradict a displacement", "one id for each landmark; graph_slam check"
     ),
-    "slip": Reason(
-        _NOTED,
-        "landmarks contradicted odometry over some seconds: it counts for less there",
-        "graph_slam check; odometry.noise",
-    ),
-    "slip_taken_back": Reason(_NOTED, "a slip was decided, and later sightings agree with odometry"),
-    "displacement_taken_back": Reason(
-        _NOTED,
-        "a displacement was decided, and later sightings contradict it",
-        "one id for each landmark; graph_slam check",
-    ),
-    "new_while_elsewhere": Reason(
-        _REFUSED, "a landmark that is not known, while nobody knows where the robot is", "give initialpose"
-    ),
-    "quarantined": Reason(_REFUSED, "the solver works without these measurements only", "graph_slam explain RUN"),
+    "new_while_elsewhere": _refused("an unknown landmark, while the robot's place is unknown", "give initialpose"),
+    "quarantined": _refused("the solver works without these measurements only", "graph_slam explain RUN"),
     # -- the node and its solver
-    "paused": Reason(_NOTED, "it came while the node was paused", "~/resume"),
-    "stopped": Reason(_REFUSED, "time jumped back and time.on_jump is stop", "~/reset, or --set time.on_jump=segment"),
-    "worker_restarted": Reason(_NOTED, "a job would have ended the solver's thread, which went on", "report it"),
-    "unsolved": Reason(
-        _NOTED,
-        "a solve, a search or a fit failed, and what was known before it stands",
-        "graph_slam check; graph_slam explain RUN",
-    ),
-    "fault": Reason(
-        _NOTED, "an error of this program, by its type: what was known before it stands", "report it with the log"
-    ),
+    "paused": _noted("it came while the node was paused", "~/resume"),
+    "stopped": _refused("time jumped back and time.on_jump is stop", "~/reset, or --set time.on_jump=segment"),
+    "worker_restarted": _noted("a job would have ended the solver's thread, which went on", "report it"),
+    "unsolved": _noted("a solve, search or fit failed: what was known stands", "graph_slam check"),
+    "fault": _noted("an error of this program: what was known stands", "report it with the log"),
 }
 """By the name it is counted under; ``fault`` is for errors of the program, which are counted by their type."""
 
