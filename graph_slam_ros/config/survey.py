@@ -7,9 +7,8 @@ orientation: of the landmark's axes in those of map, as a pose of ROS has it.
 import csv
 import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 from graph_slam_ros.errors import ConfigError, NoiseError
 from graph_slam_ros.graph import Gaussian
@@ -19,20 +18,20 @@ from graph_slam_ros.typing import Numbers
 Columns = tuple[str, ...]
 Matrix = tuple[Numbers, ...]  # row by row
 
-_PLACE: tuple[Columns, ...] = (("id", "x", "y"), ("id", "x", "y", "z"))
-_PLACE_NOISE: tuple[Columns, ...] = (
-    *(("sigma_x", "sigma_y"), ("cov_xx", "cov_xy", "cov_yy")),  # these and yaw are for the plane alone
-    *(("sigma",), ("sigma_x", "sigma_y", "sigma_z")),
-    ("cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz"),
-)
-_TURN: tuple[Columns, ...] = (("yaw",), ("roll", "pitch", "yaw"), ("qx", "qy", "qz", "qw"))
-_TURN_NOISE: tuple[Columns, ...] = (("sigma_yaw",), ("sigma_rad",), ("sigma_roll", "sigma_pitch", "sigma_yaw"))
-_GROUPS = (_PLACE, _PLACE_NOISE, _TURN, _TURN_NOISE)
-_KNOWN = (
-    *("id", "x", "y", "z", "sigma", "sigma_x", "sigma_y", "sigma_z"),
-    *("cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz", "roll", "pitch", "yaw", "qx", "qy", "qz", "qw"),
-    *("sigma_rad", "sigma_roll", "sigma_pitch", "sigma_yaw"),
-)
+_SPATIAL_COVARIANCE = ("cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz")
+_GROUPS: dict[str, tuple[tuple[Columns, ...], tuple[Columns, ...]]] = {  # what the plane has alone, then both
+    "a position": ((("id", "x", "y"),), (("id", "x", "y", "z"),)),
+    "the noise of the position": (
+        (("sigma_x", "sigma_y"), ("cov_xx", "cov_xy", "cov_yy")),
+        (("sigma",), ("sigma_x", "sigma_y", "sigma_z"), _SPATIAL_COVARIANCE),
+    ),
+    "an orientation": ((("yaw",),), (("roll", "pitch", "yaw"), ("qx", "qy", "qz", "qw"))),
+    "the noise of the orientation": ((("sigma_yaw",),), (("sigma_rad",), ("sigma_roll", "sigma_pitch", "sigma_yaw"))),
+}
+_OPTIONAL = ("an orientation", "the noise of the orientation")
+_KNOWN = {
+    what: tuple(dict.fromkeys(key for one in (*both, *plane) for key in one)) for what, (plane, both) in _GROUPS.items()
+}
 _ANGLES = {"roll", "pitch", "yaw", "sigma_rad", "sigma_roll", "sigma_pitch", "sigma_yaw"}
 _UNIT = 0.1  # a quaternion this far from unit length is normalised, as in messages
 _FLAT = 0.5  # the horizontal part of an x axis that is too short to have a heading, as in messages
@@ -66,15 +65,6 @@ class Surveyed:
         return tuple(row[:n] for row in self.covariance[:n])
 
 
-class _Layout(NamedTuple):
-    """The columns of a table, in order, and those that have the noise and the orientation."""
-
-    header: Columns
-    place_noise: Columns
-    turn: Columns
-    turn_noise: Columns
-
-
 def surveyed(text: str, dimensions: int) -> dict[str, Surveyed]:
     """Landmarks by id, from lines of comma-separated values below a header.
 
@@ -86,17 +76,17 @@ def surveyed(text: str, dimensions: int) -> dict[str, Surveyed]:
         Naming the line, the column and what is wrong with it.
     """
     out: dict[str, Surveyed] = {}
-    layout: _Layout | None = None
+    table: _Table | None = None
     rows = csv.reader(io.StringIO(text, newline=""), strict=True)
     try:
         for row in rows:
             cells = [cell.strip() for cell in row]
             if not any(cells):
                 continue
-            if layout is None:
-                layout = _layout(cells, dimensions)
+            if table is None:
+                table = _Table(cells, dimensions)
                 continue
-            name, known = _landmark(cells, layout, dimensions)
+            name, known = table.landmark(cells)
             if name in out:
                 raise ConfigError(f"{name!r} is given twice")
             out[name] = known
@@ -107,95 +97,75 @@ def surveyed(text: str, dimensions: int) -> dict[str, Surveyed]:
     return out
 
 
-# -- the header ----------------------------------------------------------------------------------------------------
+class _Table:
+    """The header of a table: its columns, and those that have the noise and the orientation."""
+
+    def __init__(self, header: Sequence[str], dimensions: int) -> None:
+        self._header, self._dimensions = header, dimensions
+        for key in header:
+            if not any(key in known for known in _KNOWN.values()):
+                known = ",".join(key for keys in _KNOWN.values() for key in keys)
+                raise ConfigError(f"column {key!r} is not known: expected a header with some of {known}")
+            if header.count(key) > 1:
+                raise ConfigError(f"column {key!r} is given twice")
+        is_turned = any(key in _KNOWN[what] for what in _OPTIONAL for key in header)
+        _, self._noise, self._turn, self._turn_noise = (
+            self._chosen(what) if is_turned or what not in _OPTIONAL else () for what in _GROUPS
+        )
+
+    def _chosen(self, what: str) -> Columns:
+        """The alternative that the header has."""
+        plane, both = _GROUPS[what]
+        allowed = both if self._dimensions == 3 else plane + both
+        given = [key for key in self._header if key in _KNOWN[what]]
+        for one in allowed:
+            if set(given) == set(one):
+                return one
+        expected = " or ".join(",".join(one) for one in sorted(allowed, key=len))
+        raise ConfigError(f"columns of {what}: {','.join(given) or 'none'}, expected {expected}")
+
+    def landmark(self, cells: Sequence[str]) -> tuple[str, Surveyed]:
+        """The landmark of a line, and its id."""
+        if len(cells) != len(self._header):
+            raise ConfigError(f"{len(cells)} values, not {','.join(self._header)}")
+        row = dict(zip(self._header, cells, strict=True))
+        name = row.pop("id")
+        if not name:
+            raise ConfigError("the id is empty")
+        turn_columns = (*self._turn, *self._turn_noise)
+        is_turned = any(row[key] for key in turn_columns)
+        numbers = {key: _number(key, cell) for key, cell in row.items() if is_turned or key not in turn_columns}
+        n, axes = self._dimensions, "xyz"[: self._dimensions]
+        position = tuple(numbers[axis] for axis in axes)
+        if self._noise[0] == "cov_xx":
+            covariance = [[numbers["cov_" + min(a, b) + max(a, b)] for b in axes] for a in axes]
+        else:
+            covariance = _diagonal([numbers[key] for key in (self._noise * n)[:n]])
+        place = _checked(covariance, self._noise)
+        if not is_turned:
+            return name, Surveyed(position, place)
+        sigmas = [numbers[key] for key in (self._turn_noise * 3)[-3 if n == 3 else -1 :]]
+        angles = _checked(_diagonal(sigmas), self._turn_noise)
+        whole = *((*one, *[0.0] * len(angles)) for one in place), *((*[0.0] * n, *one) for one in angles)
+        return name, Surveyed(position, whole, _orientation([numbers[key] for key in self._turn], self._turn, n))
 
 
-def _layout(cells: Sequence[str], dimensions: int) -> _Layout:
-    for key in cells:
-        if key not in _KNOWN:
-            raise ConfigError(f"column {key!r} is not known: expected a header with some of {','.join(_KNOWN)}")
-        if cells.count(key) > 1:
-            raise ConfigError(f"column {key!r} is given twice")
-    in_space = dimensions == 3
-    _chosen("a position", cells, _PLACE[in_space:])
-    noise = _chosen("the noise of the position", cells, _PLACE_NOISE[2 * in_space :])
-    turns, turn_noises = _TURN[in_space:], _TURN_NOISE[in_space:]
-    turn: Columns = ()
-    turn_noise: Columns = ()
-    if not {key for one in (*_TURN, *_TURN_NOISE) for key in one}.isdisjoint(cells):
-        turn = _chosen("an orientation", cells, turns)
-        turn_noise = _chosen("the noise of the orientation", cells, turn_noises)
-    return _Layout(tuple(cells), noise, turn, turn_noise)
+def _diagonal(sigmas: Sequence[float]) -> list[list[float]]:
+    return [[one * one if j == k else 0.0 for j in range(len(sigmas))] for k, one in enumerate(sigmas)]
 
 
-def _chosen(what: str, cells: Sequence[str], allowed: Sequence[Columns]) -> Columns:
-    """The alternative that a header has."""
-    group = next(group for group in _GROUPS if allowed[-1] in group)
-    present = {key for one in group for key in one}.intersection(cells)
-    for one in allowed:
-        if present == set(one):
-            return one
-    given = ",".join(key for key in cells if key in present)
-    expected = " or ".join(",".join(one) for one in sorted(allowed, key=len))
-    raise ConfigError(f"columns of {what}: {given or 'none'}, expected {expected}")
-
-
-# -- a line ----------------------------------------------------------------------------------------------------
-
-
-def _landmark(cells: Sequence[str], layout: _Layout, dimensions: int) -> tuple[str, Surveyed]:
-    if len(cells) != len(layout.header):
-        raise ConfigError(f"{len(cells)} values, not {','.join(layout.header)}")
-    row = dict(zip(layout.header, cells, strict=True))
-    name = row.pop("id")
-    if not name:
-        raise ConfigError("the id is empty")
-    turn_columns = (*layout.turn, *layout.turn_noise)
-    is_turned = any(row[key] for key in turn_columns)
-    numbers = {key: _number(key, cell) for key, cell in row.items() if is_turned or key not in turn_columns}
-    position = tuple(numbers[key] for key in "xyz"[:dimensions])
-    covariance = _position_covariance(numbers, layout.place_noise, dimensions)
-    if not is_turned:
-        return name, Surveyed(position, covariance)
-    angles = _angles_covariance(numbers, layout.turn_noise, dimensions)
-    whole = *((*row, *[0.0] * len(angles)) for row in covariance), *((*[0.0] * dimensions, *row) for row in angles)
-    return name, Surveyed(position, whole, _orientation(numbers, layout.turn, dimensions))
-
-
-def _position_covariance(numbers: Mapping[str, float], columns: Columns, dimensions: int) -> Matrix:
-    axes = "xyz"[:dimensions]
-    if columns[0] == "cov_xx":
-        out = tuple(tuple(numbers["cov_" + min(a, b) + max(a, b)] for b in axes) for a in axes)
-        return _checked(out, columns)
-    return _diagonal(numbers, columns * dimensions if columns == ("sigma",) else columns[:dimensions], columns)
-
-
-def _angles_covariance(numbers: Mapping[str, float], columns: Columns, dimensions: int) -> Matrix:
-    """Covariance about the axes of map: of the heading (1, 1) in the plane, (3, 3) in space."""
-    keys = columns * 3 if columns == ("sigma_rad",) else columns
-    return _diagonal(numbers, keys if dimensions == 3 else keys[-1:], columns)
-
-
-def _diagonal(numbers: Mapping[str, float], keys: Columns, columns: Columns) -> Matrix:
-    variances = [numbers[key] * numbers[key] for key in keys]
-    return _checked(
-        tuple(tuple(v if j == k else 0.0 for j in range(len(keys))) for k, v in enumerate(variances)), columns
-    )
-
-
-def _checked(covariance: Matrix, columns: Columns) -> Matrix:
+def _checked(covariance: list[list[float]], columns: Columns) -> Matrix:
     try:
         Gaussian.from_covariance(covariance)
     except NoiseError:
         rows = "; ".join(" ".join(f"{x:g}" for x in row) for row in covariance)
         raise ConfigError(f"{','.join(columns)}: [{rows}] is no positive definite covariance") from None
-    return covariance
+    return tuple(map(tuple, covariance))
 
 
-def _orientation(numbers: Mapping[str, float], columns: Columns, dimensions: int) -> Numbers:
+def _orientation(given: Sequence[float], columns: Columns, dimensions: int) -> Numbers:
     if columns == ("yaw",):
-        return (numbers["yaw"],)
-    given = [numbers[key] for key in columns]
+        return tuple(given)
     if columns[0] == "qx":
         length = math.hypot(*given)
         if abs(length - 1.0) > _UNIT:
