@@ -74,7 +74,7 @@ LANDMARK_TYPES: Mapping[str, LandmarkType] = {
     ),
     "mrpt_msgs/msg/ObservationRangeBearing": LandmarkType(
         "beacons",
-        ranges.range_bearing,
+        ranges.mrpt,
         {
             "ObservationRangeBearing": f"{_MRPT} sensor_std_yaw sensor_std_pitch sensed_data",
             "SingleRangeBearingObservation": "range yaw pitch id",
@@ -82,7 +82,7 @@ LANDMARK_TYPES: Mapping[str, LandmarkType] = {
     ),
     "mrpt_msgs/msg/ObservationRangeBeacon": LandmarkType(
         "beacons",
-        ranges.range_beacon,
+        ranges.mrpt,
         {"ObservationRangeBeacon": f"{_MRPT} sensed_data", "SingleRangeBeaconObservation": "range id"},
     ),
 }

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from graph_slam_ros.lie import se3
 from graph_slam_ros.messages.inputs import checks
 from graph_slam_ros.messages.inputs.checks import MessageError
 from graph_slam_ros.messages.inputs.landmarks import ObservedLandmark
@@ -41,31 +40,23 @@ def point_cloud(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
         kind = "range"
     else:
         raise MessageError("fields_unknown")
+    names = ["range"] * ("range" in kind) + angles * ("bearing" in kind)
     for one in _points(m):
         row = {name: one[name].item() for name in there}
-        name, sigma = _identity(row.get("id")), row.get("sigma", 0.0)
+        sigma = row.get("sigma", 0.0)
+        sigma_rad = row.get("sigma_bearing", sigma if kind == "bearing" else 0.0)
+        if kind == "position":
+            covariance = np.diag([sigma * sigma] * 3 + [0.0] * 3).ravel() if "sigma" in there else None
+            at = SimpleNamespace(x=row["x"], y=row["y"], z=row.get("z", 0.0))
+            what: dict[str, Any] = {"position": at, "covariance": covariance}
+        else:
+            has_sigmas = there & {"sigma", "sigma_bearing"}
+            sigmas = [sigma if name == "range" else sigma_rad for name in names] if has_sigmas else None
+            what = {"polar": (kind, tuple(row[name] for name in names)), "sigmas": sigmas}
         size = row.get("size", row.get("diameter", 2.0 * row.get("radius", 0.0)))
         sort = next((_identity(row[one]) for one in _CLASSES if one in row), "")
-        if kind == "position":
-            at = SimpleNamespace(x=row["x"], y=row["y"], z=row.get("z", 0.0))
-            covariance = np.diag([sigma * sigma] * 3 + [0.0] * 3).ravel() if "sigma" in there else None
-            frame = m.header.frame_id
-            yield ObservedLandmark(m.header.stamp, frame, name, at, covariance=covariance, sort=sort, size=size)
-            continue
-        sigma_rad = row.get("sigma_bearing", sigma if kind == "bearing" else 0.0)
-        measured = [
-            row[name] for name in (["range"] if "range" in kind else []) + (angles if "bearing" in kind else [])
-        ]
-        sigmas = [sigma, *[sigma_rad] * 2][: len(measured)] if "range" in kind else [sigma_rad] * len(measured)
-        yield ObservedLandmark(
-            m.header.stamp,
-            m.header.frame_id,
-            name,
-            polar=(kind, tuple(measured)),
-            sigmas=sigmas if there & {"sigma", "sigma_bearing"} else None,
-            sort=sort,
-            size=size,
-        )
+        name = _identity(row.get("id"))
+        yield ObservedLandmark(m.header.stamp, m.header.frame_id, name, sort=sort, size=size, **what)
 
 
 def _points(m: Any) -> np.ndarray[Any, Any]:
@@ -87,14 +78,8 @@ def _points(m: Any) -> np.ndarray[Any, Any]:
         raise MessageError("cut_off")
     if not m.width * m.height * m.point_step:  # whatever its layout says
         return np.empty(0)
-    layout = np.dtype(
-        {
-            "names": list(fields),
-            "formats": [kind for kind, _ in fields.values()],
-            "offsets": [offset for _, offset in fields.values()],
-            "itemsize": m.point_step,
-        }
-    )
+    formats, offsets = zip(*fields.values(), strict=True)
+    layout = np.dtype({"names": list(fields), "formats": formats, "offsets": offsets, "itemsize": m.point_step})
     return np.concatenate([np.frombuffer(data, layout, m.width, row * m.row_step) for row in range(m.height)])
 
 
@@ -104,30 +89,16 @@ def _identity(value: float | int | None) -> str:
     return str(int(value)) if value == int(value) else str(value)
 
 
-def range_bearing(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
-    """mrpt_msgs/ObservationRangeBearing: MRPT's pitch is positive downwards, an id of -1 is none."""
-    T_frame_sensor = _sensor(source, m)
-    sigmas = m.sensor_std_range, m.sensor_std_yaw, m.sensor_std_pitch
-    for one in m.sensed_data:
-        polar = "range_bearing", (one.range, one.yaw, -one.pitch)
-        name = _identity(one.id)
-        yield ObservedLandmark(
-            m.header.stamp, m.header.frame_id, name, polar=polar, sigmas=sigmas, T_frame_sensor=T_frame_sensor
-        )
-
-
-def range_beacon(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
-    """mrpt_msgs/ObservationRangeBeacon: ranges alone."""
-    T_frame_sensor = _sensor(source, m)
-    for one in m.sensed_data:
-        polar = "range", (one.range,)
-        name, sigmas = _identity(one.id), [m.sensor_std_range]
-        yield ObservedLandmark(
-            m.header.stamp, m.header.frame_id, name, polar=polar, sigmas=sigmas, T_frame_sensor=T_frame_sensor
-        )
-
-
-def _sensor(source: InputContext, m: Any) -> se3.Pose:
+def mrpt(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
+    """mrpt_msgs/ObservationRangeBearing, ObservationRangeBeacon: pitch is positive downwards, an id of -1 is none."""
     at = m.sensor_pose_on_robot
     checks.point(at.position)
-    return pose(at.position, source.unit(at.orientation))
+    T_frame_sensor = pose(at.position, source.unit(at.orientation))
+    has_bearing = hasattr(m, "sensor_std_yaw")
+    sigmas = (m.sensor_std_range, m.sensor_std_yaw, m.sensor_std_pitch) if has_bearing else (m.sensor_std_range,)
+    for one in m.sensed_data:
+        polar = ("range_bearing", (one.range, one.yaw, -one.pitch)) if has_bearing else ("range", (one.range,))
+        head, name = m.header, _identity(one.id)
+        yield ObservedLandmark(
+            head.stamp, head.frame_id, name, polar=polar, sigmas=sigmas, T_frame_sensor=T_frame_sensor
+        )
