@@ -9,9 +9,8 @@ from graph_slam_ros.graph import POINT_PRIOR, R2, R3, SE2, SE3, EdgeType
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.graph.tables import EdgeRows
 from graph_slam_ros.messages.markers import Lines
-from graph_slam_ros.messages.path_thinning import thinned, worst_and_some
 from graph_slam_ros.slam import GraphSlam
-from graph_slam_ros.typing import Array
+from graph_slam_ros.typing import Array, Index
 
 Ends = tuple[Array, Array]
 
@@ -48,33 +47,50 @@ def graph_view(slam: GraphSlam, most: int) -> GraphView:
     misfit = np.zeros(graph.edge_count)
     misfit[ids] = chi2 / numbers
     shown = np.zeros(graph.edge_count, dtype=bool)
-    shown[worst_and_some(ids, misfit[ids], most)] = True
+    shown[_worst_and_some(ids, misfit[ids], most)] = True
 
-    lines: dict[str, list[Lines]] = {label: [] for label in (*graph.labels, "")}
+    parts = [(np.empty((0, 3)), np.empty((0, 3)), np.empty(0), np.empty(0, dtype=np.int64))]
     for table, ends in drawn.items():
-        rows = np.flatnonzero(shown[table.id.values])
-        some = table.at(rows)
-        start, end = ends(slam, at, some)
+        some = table.at(np.flatnonzero(shown[table.id.values]))
         label = np.where(some.weight == 0.0, len(graph.labels), some.label)
-        for code, name in enumerate(lines):
-            of = label == code
-            if of.any():
-                lines[name].append(Lines(start[of], end[of], misfit[some.ids[of]]))
-    joined = {name: _joined(parts) for name, parts in lines.items()}
+        parts.append((*ends(slam, at, some), misfit[some.ids], label))
+    start, end, fit, labels = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    which = {name: labels == code for code, name in enumerate((*graph.labels, ""))}
+    lines = {name: Lines(start[of], end[of], fit[of]) for name, of in which.items()}
     keyframes = slam.keyframes.ids[thinned(len(slam.keyframes.ids), most)]
     landmarks = np.array([mark.vertex for mark in slam.landmarks.values()], dtype=np.int64)
     landmarks = landmarks[thinned(len(landmarks), most)]
-    return GraphView(at[keyframes], at[landmarks], joined, rejected=joined.pop(""))
+    return GraphView(at[keyframes], at[landmarks], lines, rejected=lines.pop(""))
 
 
-def _joined(parts: list[Lines]) -> Lines:
-    none = Lines(np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
-    parts = parts or [none]
-    return Lines(
-        np.concatenate([part.start for part in parts]),
-        np.concatenate([part.end for part in parts]),
-        np.concatenate([part.misfit for part in parts]),
-    )
+def thinned(count: int, most: int) -> Index:
+    """Indices to show of ``count`` if at most ``most`` (two or more; 0: all) are allowed, with first and last.
+
+    It takes every second, every fourth, and so on. While the count grows the choice stays the same until it is too
+    large; then it is halved.
+    """
+    stride = 1
+    while most and -(-(count - 1) // stride) + 1 > max(most, 2):
+        stride *= 2
+    kept = np.arange(0, count, stride)
+    return kept if count == 0 or kept[-1] == count - 1 else np.append(kept, count - 1)
+
+
+def _worst_and_some(ids: Index, misfit: Array, most: int) -> Index:
+    """Select ids of edges with a misfit (n,), no more than ``most``, in order of their ids (n,).
+
+    Half of them are the worst edges. The others are all edges whose id is divisible by a power of two.
+    """
+    if len(ids) <= most:
+        return ids
+    half = most // 2
+    order = np.argpartition(-misfit, half)
+    worst, others = ids[order[:half]], ids[order[half:]]
+    stride = 1
+    while len(others) > most - half:
+        stride *= 2
+        others = others[others % stride == 0]
+    return np.sort(np.concatenate((worst, others)))
 
 
 def _positions(slam: GraphSlam) -> Array:
