@@ -1,17 +1,24 @@
 """Tags of edge types: the names by which files and maps call them. Built-in types are here, others are plugins'.
 
-This is the only table of them. A plugin's edge type is an entry point of the group ``graph_slam_ros.edges``.
+This is the only table of them. A plugin's edge type is an entry point of the group ``graph_slam_ros.edges``: it is
+tested once, and what it raises names the plugin.
 """
 
 import re
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from graph_slam_ros import graph as graphs
+from graph_slam_ros import plugins
 from graph_slam_ros.errors import ConfigError, FormatError
 from graph_slam_ros.graph import SE2, SE3, EdgeType, VertexKind, place_edge
+from graph_slam_ros.graph.check_edge import random_value
+from graph_slam_ros.graph.edge_type import numeric_jacobian
 from graph_slam_ros.graph.place import MOST_MEMBERS, members_of
-from graph_slam_ros.plugin_edges import fault_of, named
-from graph_slam_ros.plugins import EDGES, load, names
+from graph_slam_ros.plugins import EDGES, in_one_line, load, names
+from graph_slam_ros.typing import Array, Index
 
 VERTEX_TAGS: dict[str, VertexKind] = {
     "VERTEX_SE2": SE2,
@@ -63,6 +70,8 @@ _BUILT_IN = {edge: tag for tag, edge in EDGE_TAGS.items()} | {graphs.INVERSE_REL
 _RESERVED = frozenset({*EDGE_TAGS, *VERTEX_TAGS, OFFSET, "FIX"})
 _loaded: dict[str, EdgeType] = {}  # of plugins
 _tags: dict[EdgeType, str] = {}
+_TRIALS = 20  # at random values
+_TOLERANCE = 1e-4  # of the largest number of a Jacobian
 
 
 def built_in(tag: str) -> EdgeType | None:
@@ -123,15 +132,7 @@ def measured_sizes(tag: str) -> tuple[int, ...]:
 
 def described() -> list[str]:
     """Return a line for each edge type that an installed plugin has, and why it cannot be used where that is so."""
-    lines = []
-    for tag, distribution in sorted(names(EDGES).items()):
-        try:
-            lines.append(f"{tag}: {edge_of(tag).name!r}, an edge type of {distribution}")
-        except ConfigError as error:
-            lines.append(str(error))
-        if tag in _RESERVED:
-            lines[-1] = f"{tag}: the plugin of {distribution} is not used: the tag is built in"
-    return lines
+    return plugins.described(EDGES, _RESERVED, lambda tag, of: f"{tag}: {edge_of(tag).name!r}, an edge type of {of}")
 
 
 def _plugin(tag: str) -> EdgeType:
@@ -142,7 +143,7 @@ def _plugin(tag: str) -> EdgeType:
             raise ConfigError(f"{tag}: no plugin has an edge of this tag: {remedy}")
         if not re.fullmatch(r"[A-Za-z_][\w:.+-]*", tag, re.ASCII):
             raise ConfigError(f"{tag!r}: {found[1]}: a tag is one word of letters, digits and _:.+-")
-        _loaded[tag] = named(*found)
+        _loaded[tag] = _named(*found)
         _tags.update(dict.fromkeys((found[0], _loaded[tag]), tag))
     return _loaded[tag]
 
@@ -152,4 +153,53 @@ def _wrong(there: Any) -> str:
         return f"it is a {type(there).__name__}, not an EdgeType"
     kinds = {kind for kinds in there.accepts for kind in kinds}
     unknown = ", ".join(sorted(kind.name for kind in kinds - set(VERTEX_TAGS.values())))
-    return f"g2o has no tag for its vertices {unknown}" if unknown else fault_of(there)
+    return f"g2o has no tag for its vertices {unknown}" if unknown else _fault_of(there)
+
+
+def _fault_of(edge: EdgeType) -> str:
+    """Try an edge type at random values, which also compiles it; return what is wrong with it, or nothing.
+
+    A residual may raise at values that it is not made for: only what it returns is judged.
+    """
+    rng, tried, wrong = np.random.default_rng(0), 0, list[str]()
+    for _ in range(_TRIALS):
+        values = tuple(random_value(kinds[0], rng) for kinds in edge.accepts)
+        measured = edge.whole(rng.standard_normal(edge.measured_size - len(edge.tail)))
+        at = np.cumsum([0, *(value.size for value in values[:-1])])[None]
+        try:
+            residual, jacobian = edge.linearize(np.concatenate(values), at, measured[None])
+            numeric = numeric_jacobian(edge, values, measured)
+        except Exception:  # whatever another's function does
+            continue
+        if fault := _shape_fault(edge, residual, jacobian, 1):
+            return fault
+        if np.isfinite(jacobian).all() and np.isfinite(numeric).all():
+            tried += 1
+            off = np.abs(jacobian[0] - numeric)
+            row, column = np.unravel_index(int(off.argmax()), off.shape)
+            if off[row, column] > _TOLERANCE * max(1.0, float(np.abs(numeric).max())):
+                ours, true = jacobian[0, row, column], numeric[row, column]
+                wrong.append(f"Jacobian[{row}, {column}] is {ours:.6g}, the residual's derivative {true:.6g}")
+    return wrong[0] if 2 * len(wrong) > tried else ""
+
+
+def _named(edge: EdgeType, plugin: str) -> EdgeType:
+    """The same edge type, whose faults are a ConfigError that names the plugin."""
+
+    def linearize(x: Array, at: Index, measured: Array) -> tuple[Array, Array]:
+        try:
+            out = edge.linearize(x, at, measured)
+            fault = _shape_fault(edge, *out, len(at))
+        except Exception as error:  # whatever another's function does
+            fault = in_one_line(error)
+        if fault:
+            raise ConfigError(f"edge {edge.name!r}, {plugin}: {fault}")
+        return out
+
+    return replace(edge, linearize=linearize)
+
+
+def _shape_fault(edge: EdgeType, residual: Any, jacobian: Any, count: int) -> str:
+    due = (count, edge.residual_size), (count, edge.residual_size, sum(edge.dofs))
+    shapes = np.shape(residual), np.shape(jacobian)
+    return "" if shapes == due else f"shapes {shapes[0]} and {shapes[1]}, not {due[0]} and {due[1]}"

@@ -4,7 +4,7 @@ A plugin is imported when its name is first used. A built-in name is never looke
 """
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from functools import lru_cache
 from importlib.metadata import EntryPoint, EntryPoints, entry_points
 from typing import Any
@@ -18,6 +18,25 @@ EDGES = "graph_slam_ros.edges"  # of edge types: their tags in g2o files
 def names(group: str) -> dict[str, str]:
     """Return the names in a group with the distribution of each; nothing is imported."""
     return {entry.name: _distribution(entry) for entry in _installed(group)}
+
+
+def described(group: str, built_in: Container[str], say: Callable[[str, str], str]) -> list[str]:
+    """Return a line for each plugin of a group, by name, that ``say`` makes of name and distribution, or its fault.
+
+    Parameters
+    ----------
+    built_in : names of which plugins are not used
+    """
+    lines = []
+    for name, distribution in sorted(names(group).items()):
+        if name in built_in:
+            lines.append(f"{name}: the plugin of {distribution} is not used: it is built in")
+            continue
+        try:
+            lines.append(say(name, distribution))
+        except ConfigError as error:
+            lines.append(str(error))
+    return lines
 
 
 def _installed(group: str) -> EntryPoints:

@@ -93,7 +93,7 @@ def test_a_built_in_tag_is_never_a_plugins_and_info_lists_edge_types_of_plugins_
     install(EXAMPLE, name="EDGE_SE2", module="my_other")
     assert edge_tags.edge_of("EDGE_SE2") is RELATIVE_POSE
     assert edge_tags.described() == [
-        "EDGE_SE2: the plugin of my-other 1.0 is not used: the tag is built in",
+        "EDGE_SE2: the plugin of my-other 1.0 is not used: it is built in",
         "EDGE_TDOA: 'difference of ranges', an edge type of my-tdoa 1.0",
         "EDGE_WRONG: plugin my_wrong:tdoa of my-wrong 1.0: it is a int, not an EdgeType",
     ]

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from graph_slam_ros import edge_tags
-from graph_slam_ros.errors import ConfigError
+from graph_slam_ros import edge_tags, plugins
 from graph_slam_ros.measurements.reasons import REASONS
 from graph_slam_ros.measurements.types import AngularVelocity, Closure, Fix, Measured, Odometry, to_record
 from graph_slam_ros.messages.inputs.checks import MessageError
@@ -81,19 +80,13 @@ def types() -> set[str]:
 
 def described(built_in: Iterable[str]) -> list[str]:
     """Return a line for each type of an installed plugin, with the reason if it cannot be used."""
-    lines = []
-    for name, distribution in sorted(names(INPUTS).items()):
+
+    def say(name: str, distribution: str) -> str:
         type_name = name.replace(".", "/")
-        if type_name in built_in:
-            lines.append(f"{type_name}: the plugin of {distribution} is not used: the type is built in")
-            continue
-        try:
-            found = input_type(type_name)
-        except ConfigError as error:
-            lines.append(str(error))
-        else:
-            lines.append(f"{type_name}: read by {distribution} as {' or '.join(found.converters if found else ())}")
-    return lines + edge_tags.described()
+        found = input_type(type_name)
+        return f"{type_name}: read by {distribution} as {' or '.join(found.converters if found else ())}"
+
+    return plugins.described(INPUTS, {one.replace("/", ".") for one in built_in}, say) + edge_tags.described()
 
 
 def _wrong(there: Any) -> str:

@@ -51,7 +51,7 @@ def test_info_names_plugins_and_suggests_an_input_of_their_type(install, tmp_pat
     assert main(["info", str(recording(tmp_path / "a.mcap"))]) == 0
     out = capsys.readouterr().out
     assert f"plugin: {TYPE}: read by my-beacons 1.0 as landmarks\n" in out
-    assert "plugin: nav_msgs/msg/Odometry: the plugin of my-odometry 1.0 is not used: the type is built in\n" in out
+    assert "plugin: nav_msgs.msg.Odometry: the plugin of my-odometry 1.0 is not used: it is built in\n" in out
     line = "plugin my_other:X of my-other 1.0 cannot be loaded: ModuleNotFoundError: No module named 'not_there'\n"
     assert f"plugin: my_msgs.msg.Other: {line}" in out
     assert f"plugin.type={TYPE}" in out.splitlines()[-1]
