@@ -276,7 +276,6 @@ def with_survey(config: Config) -> Config:
 
 
 def _sections() -> Iterator[tuple[str, Any]]:
-    """Name and defaults of each section except those of inputs."""
     for section in dataclasses.fields(Config):
         if section.name != "sources":
             yield section.name, section.default
@@ -304,7 +303,6 @@ def _general(name: str, inputs: Iterable[str]) -> str:
 
 
 def _unlisted(name: str, names: list[str]) -> str:
-    """A hint if a parameter looks like one of an input."""
     section, _, key = name.partition(".")
     if section in names or section in dict(_sections()) or key not in InputConfig.__slots__:
         return ""

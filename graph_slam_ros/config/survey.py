@@ -114,7 +114,6 @@ class _Table:
         )
 
     def _chosen(self, what: str) -> Columns:
-        """The alternative that the header has."""
         plane, both = _GROUPS[what]
         allowed = both if self._dimensions == 3 else plane + both
         given = [key for key in self._header if key in _KNOWN[what]]

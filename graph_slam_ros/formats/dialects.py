@@ -92,7 +92,6 @@ def _vertex3(words: Words, _: Text) -> Words:
 
 
 def _edge3(words: Words, text: Text) -> Words:
-    """The fields of a g2o line; rotations are rotation vectors."""
     if len(words) != 9:
         expect(words, 29)
     values = numbers(words[3:])
@@ -168,7 +167,6 @@ DIALECTS = tuple(_TAGS)
 
 
 def _pose(xyz_rpy: list[float]) -> list[float]:
-    """Position and quaternion of a position with roll, pitch and yaw about fixed axes."""
     roll, pitch, yaw = xyz_rpy[3:6]
     about_z, about_y, about_x = so3.exp((0.0, 0.0, yaw)), so3.exp((0.0, pitch, 0.0)), so3.exp((roll, 0.0, 0.0))
     return [*xyz_rpy[:3], *(float(q) for q in so3.compose(so3.compose(about_z, about_y), about_x))]

@@ -336,7 +336,6 @@ def by_traces(information: Array, lengths: int) -> Array | None:
 
 
 def _quaternion_at(edge: EdgeType) -> int | None:
-    """Return the index of a quaternion in the measurement of an edge, if there is one."""
     if edge in (graphs.RELATIVE_POSE_3D, graphs.POSE_PRIOR_3D):
         return 3
     if edge is graphs.ATTITUDE_PRIOR_3D:

@@ -95,7 +95,6 @@ def _edge_lines(file: G2oFile) -> Iterator[tuple[int, int, str]]:
 
 
 def _short(edge: EdgeType, measured: list[float]) -> list[float]:
-    """The measured values without trailing default values."""
     head = edge.measured_size - len(edge.tail)
     return measured[:head] if tuple(measured[head:]) == edge.tail else measured
 

@@ -278,7 +278,6 @@ _NAMES = {cls: name for name, cls in _TYPES.items()}
 
 
 def _sizes_of(one: Any) -> Sizes:
-    """How many numbers each field of a measurement has. Raises FormatError for an unknown kind."""
     kinds = {Sighting: SIGHTING_KINDS, Fix: FIX_KINDS}.get(type(one))
     if kinds is None:
         return _SIZES[type(one)]

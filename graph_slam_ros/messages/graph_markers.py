@@ -141,7 +141,6 @@ def _of_coordinate(slam: GraphSlam, at: Array, some: EdgeRows) -> Ends:
 
 
 def _antenna(slam: GraphSlam, some: EdgeRows) -> Array:
-    """The measured position of the antenna, (n, 2) or (n, 3), at the end of the row."""
     poses = slam.solver.estimate(some.vertices[:, 0]).reshape(-1, slam.space.pose.size)
     lever = some.measured[:, -slam.space.dimensions :]
     return np.stack(slam.space.group.act(tuple(poses.T), tuple(lever.T)), axis=-1)

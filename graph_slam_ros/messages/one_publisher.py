@@ -98,7 +98,6 @@ class _Track:
 
 
 def _turn(a: Numbers, b: Numbers) -> float:
-    """Angle between two poses of space, whatever the axis."""
     return 2.0 * math.acos(min(1.0, abs(sum(p * q for p, q in zip(a[3:], b[3:], strict=True)))))
 
 

@@ -102,5 +102,4 @@ def landmark_estimates(slam: GraphSlam) -> list[Estimate]:
 
 
 def _stamp_ns(slam: GraphSlam) -> int:
-    """Stamp of the newest keyframe; 0 before the first."""
     return int(slam.keyframes.stamps_ns[-1]) if slam.keyframes else 0

@@ -211,7 +211,6 @@ def _unpacking(file: Path, codec: str = "zstd") -> str:
 
 
 def _names_in(metadata: Path) -> list[str]:
-    """The files that the metadata of a rosbag2 folder name; none where it has none, or they cannot be read."""
     if not metadata.is_file():
         return []
     try:

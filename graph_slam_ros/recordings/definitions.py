@@ -163,7 +163,6 @@ def _of_noetic(type_name: str, md5: str) -> str:
 
 
 def _has_too_many_values(recorded: Any, type_name: str) -> bool:
-    """Return whether a message of a type has more than ``_MOST_VALUES``."""
     return not _length({**typestore().fielddefs, **recorded}, type_name, {}) <= _MOST_VALUES
 
 

@@ -112,7 +112,6 @@ class McapPart(Part):
 
 
 def _summed_up(file: Path) -> Contents | None:
-    """The contents by the summary, or nothing if that is damaged or missing."""
     try:
         with _Stream(file) as stream:
             summary = _summary(stream)
@@ -125,7 +124,6 @@ def _summed_up(file: Path) -> Contents | None:
 
 
 def _read_through(file: Path, losses: list[str]) -> Contents:
-    """The contents by reading everything."""
     schemas, channels, counts, first_ns = dict[int, Schema](), dict[int, Channel](), Counter[int](), 2**64
     for record in records(file, losses):
         if isinstance(record, Message):

@@ -72,7 +72,6 @@ class Ros1Part(Part):
 
 
 def _index(path: Path) -> Iterator[Record]:
-    """Connections, and how many messages each chunk has of them."""
     with BufferedReader(opened(path, follow=True)) as stream:
         size = os.fstat(stream.fileno()).st_size
         stream.seek(len(MAGIC))
@@ -110,7 +109,6 @@ def _records(path: Path, losses: list[str]) -> Iterator[Record]:
 
 
 def _inside(fields: Fields, data: bytes) -> Iterator[Record]:
-    """The records of a chunk."""
     plain = decompressed(data, _word(fields, "compression"), _number(fields, "size"))
     inside = BytesIO(plain)
     while inside.tell() < len(plain):

@@ -5,7 +5,7 @@ rosbags sorts the file by time, so that one bad page makes all of it unreadable.
 
 import sqlite3
 import sys
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator
 from contextlib import closing, suppress
 from pathlib import Path
 from urllib.parse import quote
@@ -43,14 +43,29 @@ class SqlitePart(Part):
         ]
 
     def messages(self, topics: Collection[str], losses: list[str], warnings: list[str]) -> Iterator[BagMessage]:
-        """Messages in order of writing."""
-        names = {number: name for number, name in self._names.items() if name in topics}
-        for number, log_ns, cdr in _rows(self.file, list(names), losses):
-            yield BagMessage(names[number], log_ns, cdr)
+        """Messages in order of writing. What is lost adds to ``losses``."""
+        name, known, read = self.file.name, len(losses), 0
+        names = {number: topic for number, topic in self._names.items() if topic in topics}
+        if _has_companion(self.file, "-journal"):
+            losses.append(f"{name}: its recorder was stopped while it wrote; what it wrote last may be lost")
+        with closing(_connection(self.file)) as database:
+            marks = ", ".join("?" * len(names))
+            try:
+                # All rows: of a search for some, the last before the damage is lost, which may be all of /tf_static.
+                for number, stamp, data in database.execute(_ALL_ROWS.format(marks), list(names)):
+                    if number not in names:
+                        continue
+                    if isinstance(number, int) and isinstance(stamp, int) and isinstance(data, bytes):
+                        read += 1
+                        yield BagMessage(names[number], stamp, data)
+                    else:
+                        losses.append(f"{name}: a message without time or content was passed over")
+            except sqlite3.Error as error:
+                losses.append(f"{name}: cut off after {read} messages ({error})")
         if self._damage is None:
             self._damage = _damage(self.file)
-        if self._damage and not losses:
-            losses.append(f"{self.file.name}: damaged ({self._damage})")
+        if self._damage and len(losses) == known:
+            losses.append(f"{name}: damaged ({self._damage})")
 
 
 def _refuse_others(database: sqlite3.Connection, path: Path) -> None:
@@ -79,27 +94,6 @@ def _counted(database: sqlite3.Connection) -> tuple[dict[int, int], int]:
                 counts[topic] = counts.get(topic, 0) + 1
                 first_ns = min(first_ns, stamp)
     return counts, first_ns if counts else 0
-
-
-def _rows(path: Path, topics: Sequence[int], losses: list[str]) -> Iterator[tuple[int, int, bytes]]:
-    """Topic, time and bytes of each message of some topics in order of writing. What is lost adds to ``losses``."""
-    if _has_companion(path, "-journal"):
-        losses.append(f"{path.name}: its recorder was stopped while it wrote; what it wrote last may be lost")
-    read = 0
-    with closing(_connection(path)) as database:
-        marks = ", ".join("?" * len(topics))
-        try:
-            # All rows: of a search for some, the last one before the damage is lost, which may be all of /tf_static.
-            for topic, stamp, data in database.execute(_ALL_ROWS.format(marks), topics):
-                if topic not in topics:
-                    continue
-                if isinstance(topic, int) and isinstance(stamp, int) and isinstance(data, bytes):
-                    read += 1
-                    yield topic, stamp, data
-                else:
-                    losses.append(f"{path.name}: a message without time or content was passed over")
-        except sqlite3.Error as error:
-            losses.append(f"{path.name}: cut off after {read} messages ({error})")
 
 
 def _damage(path: Path) -> str:

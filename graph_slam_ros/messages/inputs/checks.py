@@ -105,7 +105,6 @@ def covariance(block: Array, lengths: int) -> tuple[Array, list[str]]:
 
 @cache
 def _bounds(size: int, lengths: int) -> tuple[Array, Array]:
-    """The most and the least variance (size,) of each number."""
     of_length = np.arange(size) < lengths
     return np.where(of_length, _MOST_M2, _MOST_RAD2), np.where(of_length, LEAST_M2, LEAST_RAD2)
 

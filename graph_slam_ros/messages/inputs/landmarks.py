@@ -100,7 +100,6 @@ def _size(source: InputContext, size: float) -> float:
 
 
 def _nearest(source: InputContext, found: list[ObservedLandmark]) -> list[ObservedLandmark]:
-    """The nearest landmarks of a message, up to the limit."""
     if len(found) <= _MOST:
         return found
     source.count("too_many", len(found) - _MOST)

@@ -99,7 +99,6 @@ def transforms(source: InputContext, m: Any) -> Iterator[Odometry]:
 
 
 def _note_similar(source: InputContext, parent: str, child: str, *, is_similar: bool) -> None:
-    """Remember a transform that may be the odometry under other names."""
     similar: dict[tuple[str, str], None] = source.state.setdefault("similar", {})
     if is_similar and len(similar) < _MOST_SIMILAR and not source.state.get("found"):
         similar[parent, child] = None
@@ -120,7 +119,6 @@ def angular_velocity(source: InputContext, m: Any) -> Iterator[AngularVelocity]:
 
 
 def _rate_covariance(source: InputContext, turn: so3.Quaternion, flat: Any) -> Numbers | None:
-    """The covariance of a turn rate in the axes of the base; None where it is unknown."""
     key = flat.tobytes(), turn
     if source.settings.noise == "message" and key != source.state.get("rate_key"):  # drivers repeat the same one
         rotation = so3.matrix(turn)
@@ -145,7 +143,6 @@ def not_found(source: InputContext) -> str:
 
 
 def _in_odom(source: InputContext, parent: str, child: str, position: Any, orientation: Any) -> Numbers:
-    """T_odom_base from the pose of a child frame in its parent."""
     if parent == child:
         raise MessageError("frame_in_itself")
     checks.point(position)

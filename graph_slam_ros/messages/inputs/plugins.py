@@ -90,7 +90,6 @@ def described(built_in: Iterable[str]) -> list[str]:
 
 
 def _wrong(there: Any) -> str:
-    """Return what is wrong with the object of an entry point; empty if nothing is."""
     if not isinstance(there, InputType):
         return f"it is a {type(there).__name__}, not an InputType"
     if not isinstance(there.converters, Mapping) or not there.converters or not set(there.converters) <= set(_YIELDS):
@@ -112,7 +111,6 @@ def _converted(
     source: InputContext,
     message: Any,
 ) -> list[Measured]:
-    """The measurements of a message, all or none."""
     try:
         found = list(read(source, message))
         for one in found:

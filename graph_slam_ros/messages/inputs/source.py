@@ -166,7 +166,6 @@ class InputContext:
         return 0.0, 0.0, 0.0
 
     def _may_come(self, stamp_ns: int) -> bool:
-        """Return whether a transform for a stamp may still come."""
         now_ns = self.transforms.now_ns
         return not (self.hurried or (now_ns is not None and now_ns > stamp_ns + self._wait_ns))
 
@@ -287,5 +286,4 @@ class InputContext:
 
 
 def _first_false(mask: Mask) -> int:
-    """The number of leading entries that are true."""
     return len(mask) if mask.all() else int(mask.argmin())
