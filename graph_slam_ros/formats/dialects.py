@@ -9,7 +9,7 @@ Each line is turned into the g2o line of the same meaning, so there is one reade
 * GTSAM: covariances, in rows of the upper triangle, in the plane. Landmarks have numbers of their own.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -19,7 +19,7 @@ from graph_slam_ros.edge_tags import SWITCHED
 from graph_slam_ros.errors import FormatError, NoiseError
 from graph_slam_ros.formats.strict import expect, integer, numbers
 from graph_slam_ros.graph import Gaussian
-from graph_slam_ros.lie import so3
+from graph_slam_ros.lie import se3
 from graph_slam_ros.typing import Array
 
 Words: TypeAlias = list[str]
@@ -88,7 +88,7 @@ def _edge2(words: Words, text: Text) -> Words:
 
 def _vertex3(words: Words, _: Text) -> Words:
     expect(words, 7)
-    return ["VERTEX_SE3:QUAT", words[1], *_written(_pose(numbers(words[2:])))]
+    return ["VERTEX_SE3:QUAT", words[1], *_written(se3.from_xyz_rpy(numbers(words[2:])))]
 
 
 def _edge3(words: Words, text: Text) -> Words:
@@ -98,7 +98,7 @@ def _edge3(words: Words, text: Text) -> Words:
     information = np.array(_squared(values[6:]) if text.dialect == "isam" and values[6:] else values[6:])
     if not text.raw and len(information):
         information = information / np.outer(_HALVED, _HALVED)[_UPPER_3D]
-    return ["EDGE_SE3:QUAT", *words[1:3], *_written(_pose(values[:6])), *_written(information.tolist())]
+    return ["EDGE_SE3:QUAT", *words[1:3], *_written(se3.from_xyz_rpy(values[:6])), *_written(information.tolist())]
 
 
 def _odometry(words: Words, text: Text) -> Words:
@@ -166,12 +166,6 @@ DIALECTS = tuple(_TAGS)
 # -- numbers ---------------------------------------------------------------------------------------------------------
 
 
-def _pose(xyz_rpy: list[float]) -> list[float]:
-    roll, pitch, yaw = xyz_rpy[3:6]
-    about_z, about_y, about_x = so3.exp((0.0, 0.0, yaw)), so3.exp((0.0, pitch, 0.0)), so3.exp((roll, 0.0, 0.0))
-    return [*xyz_rpy[:3], *(float(q) for q in so3.compose(so3.compose(about_z, about_y), about_x))]
-
-
 def symmetric(upper: Any) -> Array:
     """Matrices (m, m) or (n, m, m) of the rows of their upper triangles."""
     given = np.asarray(upper, dtype=np.float64)
@@ -193,5 +187,5 @@ def _inverse(upper: list[float]) -> list[float]:
     return [*inverse[np.triu_indices(len(inverse))]]
 
 
-def _written(values: list[float]) -> Words:
+def _written(values: Iterable[float]) -> Words:
     return [repr(float(value)) for value in values]

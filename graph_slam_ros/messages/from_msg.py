@@ -6,7 +6,8 @@ counter by input and reason.
 
 import struct
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -86,6 +87,17 @@ def twist_of(cdr: bytes, base_frame: str) -> bytes | None:
     return struct.pack("<42d", *twist) if child == base_frame.encode() else None
 
 
+@dataclass(slots=True)
+class _Input:
+    """What the messages of a topic pass: decoding, the converter of their type and, of odometry, its publisher."""
+
+    source: InputContext
+    decode: Decoder
+    convert: Callable[[InputContext, Any], Iterable[Any]]
+    publisher: OnePublisher | None = None
+    reader: OdometryReader | None = None  # of messages that need no decoding
+
+
 class MessageConverter:
     """Converts messages into measurements.
 
@@ -106,57 +118,51 @@ class MessageConverter:
     """
 
     def __init__(self, config: Config, counters: Counters, decoders: Mapping[str, Decoder] | None = None) -> None:
-        self._config = config
-        self._counters = counters
+        self._config, self._counters, self._decoders = config, counters, dict(decoders or {})
         self.on_fault: Callable[[str], object] = lambda line: None
         self._transforms = Transforms(_TF_BUFFER_NS, partial(counters.count, TF, "far_in_time"))
         self._links, self._awaits_stamp = 0, False  # of the last try of what waits
-        self._sources: dict[str, InputContext] = {}
-        self._convert: dict[str, Callable[[Any], Any]] = {}
-        self._publishers: dict[str, OnePublisher] = {}  # of each odometry
-        self._pending: deque[tuple[InputContext, Any]] = deque()  # for /tf to tell where their sensors were
-        self._types = {TF_STATIC: TRANSFORMS, TF: TRANSFORMS}
+        self._inputs: dict[str, _Input] = {}
+        self._pending: deque[tuple[_Input, Any]] = deque()  # for /tf to tell where their sensors were
         by_name = {settings.name: settings for settings in config.sources}
         datums = (settings.numbers("datum", 3) for settings in config.sources)
         self._origin = Origin(next(filter(None, datums), ()))
         for name, use in uses(config).items():
             counters.received[name] += 0
-            source = self._sources[name] = InputContext(by_name[name], use, config, self._transforms, self._origin)
-            self._types[name] = by_name[name].type
-            self._convert[name] = partial((converters(by_name[name].type) or {})[use], source)
-            if use == "odometry":
-                refuse = (partial(counters.count, name, reason) for reason in ("other_publisher", "future"))
-                self._publishers[name] = OnePublisher(config.odometry.timeout_s, *refuse)
+            type_name = by_name[name].type
+            self._add(by_name[name], type_name, use, (converters(type_name) or {})[use])
         for name, add in ((TF_STATIC, self._add_static), (TF, self._add_moving)):
-            source = self._sources[name] = InputContext(InputConfig(name), "none", config, self._transforms)
-            self._convert[name] = partial(self._transforms_of, source, add)
-        self._add_initial_pose()
-        known = typestore().types
-        ours: dict[str, Decoder] = {name: decoder(name) for name in self._types.values() if name in known}
-        self._decode = ours | dict(decoders or {})
-        self._readers: dict[str, tuple[OdometryReader, OwnDecoder]] = {}
-        own = self._decode.get(odometry.TYPE)
-        if isinstance(own, OwnDecoder):  # else its bytes may have other places
-            of_type = (name for name in self._publishers if self._types[name] == odometry.TYPE)
-            self._readers = {name: (OdometryReader(), own) for name in of_type}
+            self._add(InputConfig(name), TRANSFORMS, "none", partial(self._transforms_of, add))
+        given = InputConfig(INITIAL_POSE, sigma_m=config.initialpose.sigma_m, sigma_rad=config.initialpose.sigma_rad)
+        self._add(given, "geometry_msgs/msg/PoseWithCovarianceStamped", "none", fixes.initial_pose)
+
+    def _add(self, settings: InputConfig, type_name: str, use: str, convert: Callable[..., Any]) -> None:
+        name, source = settings.name, InputContext(settings, use, self._config, self._transforms, self._origin)
+        decode = self._decoders.get(type_name) or OwnDecoder(type_name)
+        one = self._inputs[name] = _Input(source, decode, convert)
+        if use == "odometry":
+            refuse = (partial(self._counters.count, name, reason) for reason in ("other_publisher", "future"))
+            one.publisher = OnePublisher(self._config.odometry.timeout_s, *refuse)
+            if type_name == odometry.TYPE and isinstance(decode, OwnDecoder):  # else its bytes may have other places
+                one.reader = OdometryReader()
 
     def convert(self, name: str, cdr: bytes) -> list[Measured]:
         """Convert one message; returns its measurements and those that its transforms complete."""
-        source = self._sources[name]
+        one = self._inputs[name]
         self._counters.received[name] += 1
         try:
-            message = self._decode[self._types[name]](cdr)
+            message = one.decode(cdr)
         except Exception:  # of damaged bytes rosbags raises struct, index, unicode and assertion errors
             self._counters.count(name, "undecodable")
             return []
-        out = self._converted(source, message)
-        if source.use == "odometry":
-            accept = self._publishers[name].accept
-            out = [one for m in out if isinstance(m, Odometry) for one in accept(m)]
+        out = self._converted(one, message)
+        if one.publisher is not None:
+            accept = one.publisher.accept
+            out = [m for given in out if isinstance(given, Odometry) for m in accept(given)]
             for m in out:
                 if m.stamp_ns > (self._transforms.now_ns or 0):
                     self._transforms.now_ns = m.stamp_ns
-        if (name == TF or source.use == "odometry") and self._may_be_usable():
+        if (name == TF or one.publisher is not None) and self._may_be_usable():
             self._awaits_stamp = False
             for _ in range(len(self._pending)):
                 out += self._converted(*self._pending.popleft())
@@ -179,35 +185,37 @@ class MessageConverter:
         ----------
         after_ns : a stamp that the first must be later than
         """
-        if name not in self._readers or self._pending:
+        one = self._inputs[name]
+        if one.reader is None or one.publisher is None or self._pending:
             return []
-        (reader, own), source = self._readers[name], self._sources[name]
-        read = reader.read_run(cdrs)
-        run = [] if read is None else odometry.of_run(source, read, after_ns)
-        count = self._publishers[name].accept_run(run)
+        read = one.reader.read_run(cdrs)
+        run = [] if read is None else odometry.of_run(one.source, read, after_ns)
+        count = one.publisher.accept_run(run)
         if read is None or not count:
             return []
-        odometry.count_repairs(source, count)
-        self._count_tally(source)
+        odometry.count_repairs(one.source, count)
+        self._count_tally(one.source)
         self._counters.received[name] += count
         self._transforms.now_ns = max(run[count - 1].stamp_ns, self._transforms.now_ns or 0)
-        own.note(read.first(count))
+        if isinstance(one.decode, OwnDecoder):
+            one.decode.note(read.first(count))
         return run[:count]
 
     def finish(self, *, is_end: bool = True) -> list[Measured]:
         """Use or refuse what still needs a transform; at the end of all messages also the odometry that is kept."""
-        out: list[Measured] = [m for one in self._publishers.values() for m in one.finish()] if is_end else []
+        publishers = self._publishers() if is_end else ()
+        out: list[Measured] = [m for one in publishers for m in one.finish()]
         out += [one for pending in self._pending for one in self._hurried(*pending)]
         self._pending.clear()
         return out
 
     def unlinked(self, name: str) -> tuple[tuple[str, str], ...]:
         """Frames of an input, each with the frame that it is not linked to, from the last messages refused for that."""
-        return tuple(self._sources[name].unlinked)
+        return tuple(self._inputs[name].source.unlinked)
 
     def not_found(self, name: str) -> str:
         """The odometry on /tf whose transform has never come, and the remedy; else empty."""
-        source = self._sources[name]
+        source = self._inputs[name].source
         return odometry.not_found(source) if source.use == "odometry" else ""
 
     def initial_pose(self, cdr: bytes) -> list[InitialPose]:
@@ -222,25 +230,29 @@ class MessageConverter:
     def forget_time(self) -> None:
         """Begin anew with the stamps: earlier transforms of moving joints belong to another time."""
         self._pending.clear()
-        for publishers in self._publishers.values():
-            publishers.forget_time()
+        for publisher in self._publishers():
+            publisher.forget_time()
         self._transforms.forget_time()
 
-    def _hurried(self, source: InputContext, message: Any) -> list[Measured]:
-        before, source.hurried = source.hurried, True
-        out = self._converted(source, message)
-        source.hurried = before
+    def _publishers(self) -> list[OnePublisher]:
+        return [one.publisher for one in self._inputs.values() if one.publisher is not None]
+
+    def _hurried(self, one: _Input, message: Any) -> list[Measured]:
+        before, one.source.hurried = one.source.hurried, True
+        out = self._converted(one, message)
+        one.source.hurried = before
         return out
 
     @np.errstate(invalid="ignore")  # a signalling NaN warns where it is compared; it is refused by name
-    def _converted(self, source: InputContext, message: Any) -> list[Any]:
+    def _converted(self, one: _Input, message: Any) -> list[Any]:
         out: list[Any] = []
+        source = one.source
         try:
-            out += self._convert[source.name](message)
+            out += one.convert(source, message)
         except NotYet as why:
             self._awaits_stamp |= why.is_linked
             source.tally.clear()
-            self._pending.append((source, message))
+            self._pending.append((one, message))
             return []
         except PluginFault as fault:
             source.count("plugin_failed")
@@ -257,17 +269,10 @@ class MessageConverter:
             self._counters.count(source.name, why, times)
         source.tally.clear()
 
-    def _add_initial_pose(self) -> None:
-        defaults = self._config.initialpose
-        settings = InputConfig(INITIAL_POSE, sigma_m=defaults.sigma_m, sigma_rad=defaults.sigma_rad)
-        source = self._sources[INITIAL_POSE] = InputContext(settings, "none", self._config, self._transforms)
-        self._types[INITIAL_POSE] = "geometry_msgs/msg/PoseWithCovarianceStamped"
-        self._convert[INITIAL_POSE] = partial(fixes.initial_pose, source)
-
     # -- transforms --------------------------------------------------------------------------------------------------
 
     def _transforms_of(
-        self, source: InputContext, add: Callable[[Any, str, str, Any], None], message: Any
+        self, add: Callable[[Any, str, str, Any], None], source: InputContext, message: Any
     ) -> list[Measured]:
         for t in message.transforms:
             try:
