@@ -49,7 +49,7 @@ class _Reader:
 
     def __init__(self, name: str, lenient: bool, text: Text) -> None:
         self.name, self.lenient, self.text = name, lenient, text
-        self.vertices: dict[int, tuple[str, list[float]]] = {}
+        self.vertices: dict[int, tuple[VertexKind, list[float]]] = {}
         self.edges: dict[str, list[_Edge]] = {tag: [] for tag in edge_tags.EDGE_TAGS}
         self.fixed: list[tuple[int, int]] = []
         self.offsets: dict[int, se3.Pose] = {}
@@ -81,7 +81,7 @@ class _Reader:
             words = in_g2o_words(words, self.text)
             tag = words[0]
             if tag in edge_tags.VERTEX_TAGS:
-                self._vertex(tag, words)
+                self._vertex(edge_tags.VERTEX_TAGS[tag], words)
             elif tag == edge_tags.OFFSET:
                 self._offset(words)
             elif tag == "FIX":
@@ -95,13 +95,11 @@ class _Reader:
         except (FormatError, NoiseError) as error:
             self.refuse(line, str(error))
 
-    def _vertex(self, tag: str, words: list[str]) -> None:
-        kind = edge_tags.VERTEX_TAGS[tag]
+    def _vertex(self, kind: VertexKind, words: list[str]) -> None:
         expect(words, 1 + kind.size)
         vertex, value = integer(words[1]), _with_unit_quaternion(numbers(words[2:]), 3 if kind is SE3 else None)
-        if vertex in self.vertices and self.vertices[vertex] != (tag, value):
+        if self.vertices.setdefault(vertex, (kind, value)) != (kind, value):
             raise FormatError(f"vertex {vertex} was declared before, with other values")
-        self.vertices[vertex] = (tag, value)
 
     def _offset(self, words: list[str]) -> None:
         expect(words, 1 + SE3.size)
@@ -136,28 +134,22 @@ class _Reader:
             for edge in edges:
                 for vertex, accepted in zip(edge.vertices, edge_tags.edge_of(tag).accepts, strict=True):
                     kinds.setdefault(vertex, accepted[0])
-        tags = {kind: tag for tag, kind in edge_tags.VERTEX_TAGS.items()}
         for vertex, kind in sorted(kinds.items(), key=lambda item: item[0]):
-            self.vertices[vertex] = (tags[kind], [0.0] * (kind.size - 1) + [float(kind is SE3)])
+            self.vertices[vertex] = (kind, [0.0] * (kind.size - 1) + [float(kind is SE3)])
 
     def graph(self, relative_pose: EdgeType) -> G2oFile:
         graph = Graph()
         at: dict[int, int] = {}
-        for tag, run in itertools.groupby(self.vertices.items(), key=lambda item: item[1][0]):
+        for kind, run in itertools.groupby(self.vertices.items(), key=lambda item: item[1][0]):
             values = {file_id: value for file_id, (_, value) in run}
-            at.update(
-                zip(values, graph.add_vertices(edge_tags.VERTEX_TAGS[tag], list(values.values())).tolist(), strict=True)
-            )
-        poses = sorted(
-            file_id for file_id, (tag, _) in self.vertices.items() if edge_tags.VERTEX_TAGS[tag] in (SE2, SE3)
-        )
+            at.update(zip(values, graph.add_vertices(kind, list(values.values())).tolist(), strict=True))
+        poses = sorted(file_id for file_id, (kind, _) in self.vertices.items() if kind in (SE2, SE3))
         follows = {one: next_ for one, next_ in itertools.pairwise(poses) if one >> 56 == next_ >> 56}  # of one robot
         for (tag, kind), other in edge_tags.OF_POSES.items():
             of_poses = [e for e in self.edges[tag] if self._kind(e.vertices[0]) is kind]
             self.edges[tag] = [e for e in self.edges[tag] if self._kind(e.vertices[0]) is not kind]
-            self.edges[other] += [
-                replace(e, measured=[*e.measured, *edge_tags.EDGE_TAGS[other].tail]) for e in of_poses
-            ]
+            tail = edge_tags.EDGE_TAGS[other].tail
+            self.edges[other] += [replace(e, measured=[*e.measured, *tail]) for e in of_poses]
         seen_from: dict[int, int] = {}
         for tag, edges in self.edges.items():
             edge_type = relative_pose if tag == "EDGE_SE2" else edge_tags.edge_of(tag)
@@ -176,7 +168,7 @@ class _Reader:
         return G2oFile(*own, self.skipped, self.text.raw, self.has_values, notes)
 
     def _kind(self, file_id: int) -> VertexKind | None:
-        return edge_tags.VERTEX_TAGS[self.vertices[file_id][0]] if file_id in self.vertices else None
+        return self.vertices[file_id][0] if file_id in self.vertices else None
 
     def _notes(self) -> Iterator[str]:
         if self.repaired:
@@ -213,7 +205,8 @@ class _Reader:
             if (kind := self._kind(file_id)) is None:
                 return f"edge to vertex {file_id}, which is not declared"
             if kind not in kinds:
-                return f"{tag} to vertex {file_id}, which is a {self.vertices[file_id][0]}"
+                other = next(tag for tag, of in edge_tags.VERTEX_TAGS.items() if of is kind)
+                return f"{tag} to vertex {file_id}, which is a {other}"
         if len(set(edge.vertices)) < len(edge.vertices):
             return f"edge from vertex {edge.vertices[0]} to itself"
         number = edge.offset or 0  # some files leave out parameter 0, which is then the robot's frame itself
