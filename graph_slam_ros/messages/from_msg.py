@@ -54,11 +54,6 @@ class OwnDecoder:
         return message
 
 
-def decoder(type_name: str) -> OwnDecoder:
-    """A decoder from CDR bytes to a message object of our own type store."""
-    return OwnDecoder(type_name)
-
-
 def is_correction(cdr: bytes, map_frame: str) -> bool:
     """Return whether a tf2_msgs/TFMessage has the map frame in its first transform, without decoding it."""
     reader = CdrReader(cdr)

@@ -12,7 +12,7 @@ from graph_slam_ros.check.columns import Collector, Columns
 from graph_slam_ros.check.finding import Finding
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.types import Measured, Odometry
-from graph_slam_ros.messages.from_msg import TF, TF_STATIC, TRANSFORMS, Decoder, decoder
+from graph_slam_ros.messages.from_msg import TF, TF_STATIC, TRANSFORMS, Decoder, OwnDecoder
 from graph_slam_ros.messages.inputs import uses
 from graph_slam_ros.slam import Config
 
@@ -53,7 +53,7 @@ class InputCheck:
 
     def decoders(self, installed: Mapping[str, Decoder]) -> dict[str, Decoder]:
         """Return these decoders, and those of landmarks and odometry, whose messages are collected, too."""
-        seen = {name: self._collector.decoder(installed.get(name) or decoder(name)) for name in self._types}
+        seen = {name: self._collector.decoder(installed.get(name) or OwnDecoder(name)) for name in self._types}
         return dict(installed) | seen
 
     def add(self, topic: str, names: Sequence[str], now_ns: int, measured: Sequence[Measured]) -> None:

@@ -10,7 +10,7 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from graph_slam_ros.messages.from_msg import TRANSFORMS, Decoder, decoder
+from graph_slam_ros.messages.from_msg import TRANSFORMS, Decoder, OwnDecoder
 from graph_slam_ros.messages.inputs import known_types
 from graph_slam_ros.messages.inputs.landmark_types import fields_used
 from graph_slam_ros.messages.inputs.plugins import input_type
@@ -58,7 +58,7 @@ def recorded_decoder(topic: Topic) -> Decoder:
     if not topic.definition and topic.type in _OLDER:
         return _of_any_version(topic.type)
     if not topic.definition and topic.type in typestore().types:
-        return decoder(topic.type)
+        return OwnDecoder(topic.type)
     if not topic.definition:
         plugin = input_type(topic.type)
         if plugin is None or not plugin.definition:
@@ -69,7 +69,7 @@ def recorded_decoder(topic: Topic) -> Decoder:
 
 def _of_any_version(type_name: str) -> Decoder:
     """A decoder without a recorded definition: by ours, else by the older one."""
-    ours, recorded = decoder(type_name), dict[str, Any]()
+    ours, recorded = OwnDecoder(type_name), dict[str, Any]()
     for name, text in _OLDER.items():
         recorded |= get_types_from_msg(text, name)
     older = _store_with(recorded)
@@ -92,7 +92,7 @@ def _by_definition(topic: Topic, whose: str) -> Decoder:
         raise BagError(f"topic {topic.name}: {whose} definition of {topic.type} is not valid") from error
     ours = typestore().fielddefs
     if all(ours.get(name) == definition for name, definition in recorded.items()):
-        return decoder(topic.type)
+        return OwnDecoder(topic.type)
     for name, (_, fields) in recorded.items():
         there = dict(fields)
         known = dict(ours[name][1]) if name in ours else there

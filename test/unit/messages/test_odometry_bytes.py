@@ -7,7 +7,7 @@ import numpy as np
 from messages import STAMP_NS, TWIST, border, counted, odometry, pose, quaternion
 from rows import each
 
-from graph_slam_ros.messages.from_msg import decoder
+from graph_slam_ros.messages.from_msg import OwnDecoder
 from graph_slam_ros.messages.inputs.odometry import TYPE
 
 TILTED = {"roll": 0.02, "pitch": -0.01}
@@ -58,7 +58,7 @@ def together(out, messages):
 def converted(messages, *, in_runs, **sections):
     """What is made of messages, decoded or in runs, what is counted, and how many were decoded."""
     decoded = []
-    own = decoder(TYPE)
+    own = OwnDecoder(TYPE)
     own.note = lambda message: decoded.append(hasattr(message, "header"))
     out = border(decoders={TYPE: own}, **sections)
     measured = together(out, messages) if in_runs else [out.convert("odom", cdr) for cdr in messages]
