@@ -124,12 +124,6 @@ def tag_of(edge: EdgeType) -> str:
     return found
 
 
-def measured_sizes(tag: str) -> tuple[int, ...]:
-    """Return how many numbers a measurement may have in a file: all, or without those that have defaults."""
-    edge = edge_of(tag)
-    return edge.measured_size, edge.measured_size - len(edge.tail)
-
-
 def described() -> list[str]:
     """Return a line for each edge type that an installed plugin has, and why it cannot be used where that is so."""
     return plugins.described(EDGES, _RESERVED, lambda tag, of: f"{tag}: {edge_of(tag).name!r}, an edge type of {of}")

@@ -110,7 +110,8 @@ class _Reader:
 
     def _edge(self, line: int, tag: str, words: list[str]) -> _Edge:
         edge = edge_tags.edge_of(tag)
-        m, from_offset, sizes = edge.residual_size, tag in AT_OFFSET, edge_tags.measured_sizes(tag)
+        m, from_offset = edge.residual_size, tag in AT_OFFSET
+        sizes = edge.measured_size, edge.measured_size - len(edge.tail)  # the last may be left out
         head, upper = len(edge.accepts) + from_offset, np.triu_indices(m)
         given, count = len(words) - 1 - head, len(upper[0])
         is_bare = given in sizes and given - count not in sizes
