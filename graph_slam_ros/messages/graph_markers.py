@@ -1,37 +1,19 @@
 """The graph as markers: which edges are drawn, from where to where, and how well each fits."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
 from graph_slam_ros.graph import POINT_PRIOR, R2, R3, SE2, SE3, EdgeType
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.graph.tables import EdgeRows
-from graph_slam_ros.messages.markers import Lines
+from graph_slam_ros.messages.markers import GraphView, Lines
 from graph_slam_ros.slam import GraphSlam
 from graph_slam_ros.typing import Array, Index
 
 Ends = tuple[Array, Array]
 
 _COORDINATES = {SE2: 2, SE3: 3, R2: 2, R3: 3}
-
-
-@dataclass(frozen=True, slots=True)
-class GraphView:
-    """The lines and points that represent a graph.
-
-    Attributes
-    ----------
-    poses, landmarks : (n, 3)
-    classes : lines of edges by label
-    rejected : those of edges that are out: their weight is 0
-    """
-
-    poses: Array
-    landmarks: Array
-    classes: dict[str, Lines]
-    rejected: Lines
 
 
 def graph_view(slam: GraphSlam, most: int) -> GraphView:

@@ -3,7 +3,7 @@
 An array deletes all markers before it draws its own: what is not in it any more is gone.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,6 +37,23 @@ class Lines:
     misfit: Array
 
 
+@dataclass(frozen=True, slots=True)
+class GraphView:
+    """The lines and points that represent a graph.
+
+    Attributes
+    ----------
+    poses, landmarks : (n, 3)
+    classes : lines of edges by label
+    rejected : those of edges that are out: their weight is 0
+    """
+
+    poses: Array
+    landmarks: Array
+    classes: dict[str, Lines]
+    rejected: Lines
+
+
 def landmark_markers(
     stamp_ns: int, frame: str, names: Sequence[str], positions: Array, covariances: Sequence[Array]
 ) -> bytes:
@@ -58,23 +75,21 @@ def landmark_markers(
     return out.message()
 
 
-def graph_markers(
-    stamp_ns: int, frame: str, poses: Array, landmarks: Array, classes: Mapping[str, Lines], rejected: Lines
-) -> bytes:
-    """Vertices as points (n, 3), and edges as lines: those of each class by their misfit, rejected ones dashed.
+def graph_markers(stamp_ns: int, frame: str, view: GraphView) -> bytes:
+    """Vertices as points, and edges as lines: those of each class by their misfit, rejected ones dashed.
 
     The namespaces are ``poses``, ``landmarks``, ``edges/CLASS`` and ``rejected``, as far as they are not empty: RViz
     reports a marker without points as an error.
     """
     shapes = [
-        ("poses", _POINTS, 0.06, poses, _OF_POSES, _PLAIN),
-        ("landmarks", _POINTS, 0.15, landmarks, _OF_LANDMARKS, _PLAIN),
+        ("poses", _POINTS, 0.06, view.poses, _OF_POSES, _PLAIN),
+        ("landmarks", _POINTS, 0.15, view.landmarks, _OF_LANDMARKS, _PLAIN),
     ]
-    for name, lines in classes.items():
+    for name, lines in view.classes.items():
         points = np.stack((lines.start, lines.end), axis=1).reshape(-1, 3)
         colours = np.repeat(misfit_colours(lines.misfit), 2, axis=0)
         shapes.append((f"edges/{name}", _LINE_LIST, 0.02, points, _OF_LANDMARKS, colours))
-    shapes.append(("rejected", _LINE_LIST, 0.01, _dashed(rejected), _OF_REJECTED, _PLAIN))
+    shapes.append(("rejected", _LINE_LIST, 0.01, _dashed(view.rejected), _OF_REJECTED, _PLAIN))
     shapes = [shape for shape in shapes if len(shape[3])]
     out = _Array(stamp_ns, frame, len(shapes))
     for name, type_, size, points, colour, colours in shapes:

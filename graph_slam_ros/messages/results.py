@@ -84,9 +84,7 @@ def landmarks_estimate(slam: GraphSlam, estimates: Sequence[Estimate] | None = N
 
 def graph(slam: GraphSlam, most: int) -> bytes:
     """The graph with a limited number of keyframes, landmarks and edges, coloured by how well they fit."""
-    view = graph_view(slam, most)
-    frame = slam.config.frames.map
-    return markers.graph_markers(_stamp_ns(slam), frame, view.poses, view.landmarks, view.classes, view.rejected)
+    return markers.graph_markers(_stamp_ns(slam), slam.config.frames.map, graph_view(slam, most))
 
 
 def landmark_estimates(slam: GraphSlam) -> list[Estimate]:

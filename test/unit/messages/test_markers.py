@@ -7,7 +7,7 @@ from rows import each
 from graph_slam_ros.lie import so3
 from graph_slam_ros.messages import markers
 from graph_slam_ros.messages.interfaces import typestore
-from graph_slam_ros.messages.markers import Lines
+from graph_slam_ros.messages.markers import GraphView, Lines
 
 STAMP_NS = 1_700_000_000_987_654_321
 MARKERS = "visualization_msgs/msg/MarkerArray"
@@ -17,12 +17,11 @@ def decode(cdr):
     return typestore().deserialize_cdr(cdr, MARKERS)
 
 
-NONE = Lines(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
-
-
 def test_an_edge_that_fits_is_green_and_one_of_three_sigmas_is_red_at_both_ends():
+    none = np.zeros((0, 3))
     lines = Lines(np.zeros((4, 3)), np.ones((4, 3)), np.array([0.0, 4.0, 9.0, 1e6]))
-    *_, edges = decode(markers.graph_markers(STAMP_NS, "map", NONE.start, NONE.start, {"a": lines}, NONE)).markers
+    view = GraphView(none, none, {"a": lines}, Lines(none, none, np.zeros(0)))
+    *_, edges = decode(markers.graph_markers(STAMP_NS, "map", view)).markers
     red, green, blue, alpha = np.array([(c.r, c.g, c.b, c.a) for c in edges.colors]).reshape(4, 2, 4).transpose(2, 0, 1)
     assert (red[:, 0] == red[:, 1]).all() and (alpha == 1.0).all() and (blue < 0.5).all()
     assert green[0, 0] > green[1, 0] > green[2, 0] == green[3, 0]

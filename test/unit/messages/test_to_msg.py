@@ -12,7 +12,7 @@ from graph_slam_ros.lie import so3
 from graph_slam_ros.messages import markers, results, to_msg
 from graph_slam_ros.messages.from_msg import is_correction, twist_of
 from graph_slam_ros.messages.interfaces import typestore
-from graph_slam_ros.messages.markers import Lines
+from graph_slam_ros.messages.markers import GraphView, Lines
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
 
 STAMP_NS = 1_700_000_000_987_654_321
@@ -40,7 +40,7 @@ def spread(rng, size):
 def graph(frame, rng, n):
     classes = {"": lines(rng, n), "o": lines(rng, n), "odometry": lines(rng, 2)}
     poses = rng.standard_normal((n, 3)), rng.standard_normal((2, 3))
-    return markers.graph_markers(STAMP_NS, frame, *poses, classes, lines(rng, n))
+    return markers.graph_markers(STAMP_NS, frame, GraphView(*poses, classes, lines(rng, n)))
 
 
 def path(frame, rng, n, size):
