@@ -14,8 +14,7 @@ from graph_slam_ros import graph as graphs
 from graph_slam_ros import plugins
 from graph_slam_ros.errors import ConfigError, FormatError
 from graph_slam_ros.graph import SE2, SE3, EdgeType, VertexKind, place_edge
-from graph_slam_ros.graph.check_edge import random_value
-from graph_slam_ros.graph.edge_type import numeric_jacobian
+from graph_slam_ros.graph.edge_type import numeric_jacobian, random_value
 from graph_slam_ros.graph.place import MOST_MEMBERS, members_of
 from graph_slam_ros.plugins import EDGES, in_one_line, load, names
 from graph_slam_ros.typing import Array, Index

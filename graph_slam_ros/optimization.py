@@ -14,7 +14,7 @@ from graph_slam_ros.formats.graph_file import G2oFile
 from graph_slam_ros.graph import Graph
 from graph_slam_ros.progress import report
 from graph_slam_ros.solver import Report, Settings, Solver, initial_values
-from graph_slam_ros.solver.incremental_initialization import OnPose
+from graph_slam_ros.solver.initialization import OnPose
 from graph_slam_ros.typing import Array, Index
 
 _FAR_ABOVE = 2.0  # times its degrees of freedom: chi2 of an optimum is about as large as these, or smaller

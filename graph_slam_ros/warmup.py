@@ -13,12 +13,13 @@ the same whether or not kernels of space are there.
 import contextlib
 import functools
 import gc
+import inspect
 import math
 import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,26 +29,17 @@ from numba import types
 
 from graph_slam_ros import graph as graphs
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.graph import SE2, SE3, EdgeType, Gaussian, Graph, Loss, retraction
+from graph_slam_ros.graph import SE2, SE3, EdgeType, Gaussian, Graph, Loss
+from graph_slam_ros.graph.vertices import PLANAR, adjoints_of_inverses
 from graph_slam_ros.lie import se2, se3
 from graph_slam_ros.lie.jit import CACHE_DIR
 from graph_slam_ros.progress import report
-from graph_slam_ros.solver import METHODS, Settings, Solver, compiled_update, covariance
-from graph_slam_ros.solver import least_cost as innovations
-from graph_slam_ros.solver import stretch_filter as stretches
-from graph_slam_ros.solver.clique_tree import (
-    advance,
-    incremental,
-    indices,
-    numeric,
-    ordering,
-    pools,
-    substitution,
-    symbolic,
-)
-from graph_slam_ros.solver.clique_tree.storage import empty_tree
+from graph_slam_ros.solver import METHODS, Settings, Solver, covariance, stretch_filter
+from graph_slam_ros.solver import update as updates
+from graph_slam_ros.solver.clique_tree import incremental, numeric, ordering, storage, substitution
+from graph_slam_ros.typing import Index
 
-_KERNELS = 199  # about so many there are; a test compares it with the cache
+_KERNELS = 195  # about so many there are; a test compares it with the cache
 _SHARED = "shared"  # file that is there when the kernels that two parts call are in the cache
 
 
@@ -67,13 +59,12 @@ class Compiling:
         return f"compiling kernels, once per installation: {100 * done / _KERNELS:.0f} %{left}"
 
 
+OnProgress = Callable[[Compiling], None]
+
+
 def are_compiled(dimensions: int = 3) -> bool:
     """Return whether all kernels are in the cache that work in the plane (2), or also in space (3)."""
     return bool(numba.config.DISABLE_JIT) or not _missing(dimensions)  # type: ignore[attr-defined]
-
-
-OnProgress = Callable[[Compiling], None]
-_Kernel = tuple[Any, tuple[Any, ...]]
 
 
 def warmup(
@@ -110,26 +101,20 @@ def compile_all(
     dimensions: int = 3,
 ) -> None:
     """Compile what is not compiled yet, and load nothing; as ``warmup``."""
-    if not are_compiled(dimensions):
-        _compile(_missing(dimensions), is_stop_requested, on_progress)
-
-
-def _missing(dimensions: int) -> list[str]:
-    """The parts that are not compiled."""
-    return [part for part in list(_PARTS)[:dimensions] if not (CACHE_DIR / f"complete-{part}").exists()]
-
-
-def _compile(parts: list[str], is_stop_requested: Callable[[], bool], on_progress: OnProgress) -> None:
-    """Compile parts, once per installation, into the cache on disk."""
+    if are_compiled(dimensions):
+        return
     start, began_with = time.perf_counter(), _cached()
-    at_once = max(2, len(os.sched_getaffinity(0)))  # two wait for each other
-    running: list[subprocess.Popen[bytes]] = []
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    command = [sys.executable, "-m", __name__]
+    running = [
+        subprocess.Popen([*command, part], env=environment, start_new_session=True, stderr=subprocess.PIPE)
+        for part in _missing(dimensions)
+    ]
     try:
-        while parts or running:
-            while parts and len(running) < at_once:
-                running.append(_started(parts.pop(0)))
+        while running:
             for process in running[:]:
-                if (errors := _ended(process)) is not None:
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    _, errors = process.communicate(timeout=0.1)
                     running.remove(process)
                     _refuse_failure(process.returncode, errors)
             on_progress(Compiling(_cached(), time.perf_counter() - start, began_with))
@@ -141,11 +126,9 @@ def _compile(parts: list[str], is_stop_requested: Callable[[], bool], on_progres
             process.communicate()
 
 
-def _started(part: str) -> "subprocess.Popen[bytes]":
-    """Start to compile a part."""
-    path = os.pathsep.join(filter(None, sys.path))
-    command, environment = [sys.executable, "-m", __name__, part], os.environ | {"PYTHONPATH": path}
-    return subprocess.Popen(command, env=environment, start_new_session=True, stderr=subprocess.PIPE)
+def _missing(dimensions: int) -> list[str]:
+    """The parts that are not compiled."""
+    return [part for part in list(_PARTS)[:dimensions] if not (CACHE_DIR / f"complete-{part}").exists()]
 
 
 def _refuse_failure(code: int, errors: bytes) -> None:
@@ -161,18 +144,13 @@ def _cached() -> int:
     return len({file.name for file in CACHE_DIR.rglob("*.nbi")})
 
 
-def _ended(process: "subprocess.Popen[bytes]") -> bytes | None:
-    """The compiler's standard error, if it ends soon."""
-    with contextlib.suppress(subprocess.TimeoutExpired):
-        return process.communicate(timeout=0.1)[1]
-    return None
-
-
 @functools.cache  # what is loaded stays
 def _load_plane() -> None:
     """Linearise every edge type of the plane, and solve a graph."""
     _load_edges(in_space=False)
-    _make(_shared_kernels() + _structure_kernels() + _number_kernels())
+    _make(*_TWICE, *_STRUCTURE, *_NUMBERS)
+    _make_filter()
+    adjoints_of_inverses(PLANAR, np.zeros((1, 3)))
     graph = Graph()
     poses = graph.add_vertices(SE2, np.zeros((2, 3)))
     point = graph.add_vertex(graphs.R2, np.zeros(2))
@@ -189,6 +167,8 @@ def _load_plane() -> None:
     graph.has_label(np.arange(graph.edge_count), ())
     solver.marginal([0])
     solver.joint_marginal([0, 1])
+    for are_inside in (True, False):
+        solver.edge_marginals(poses[None], are_inside=are_inside)
     solver.compact()
     solver.estimate([0])
     solver.add([], [edges.stop])
@@ -210,95 +190,44 @@ def _load_space() -> None:
 
 def _load_edges(*, in_space: bool) -> None:
     """Linearise an edge of each type with a pose in space, or of each other type, and propagate a covariance."""
-    for edge in _edge_types():
-        if in_space != any(SE3 in kinds for kinds in edge.accepts):
+    values = [
+        one for value in vars(graphs).values() for one in (value.values() if isinstance(value, dict) else [value])
+    ]
+    for edge in values:
+        if not isinstance(edge, EdgeType) or in_space != any(SE3 in kinds for kinds in edge.accepts):
             continue
         sizes = [kinds[0].size for kinds in edge.accepts]
         edge.linearize(np.ones(sum(sizes)), np.cumsum([[0, *sizes[:-1]]], axis=1), np.ones((1, edge.measured_size)))
-    if in_space:
-        se3.propagate_during(np.eye(6), se3.IDENTITY, np.eye(6))
-        se3.propagate(np.eye(6), se3.IDENTITY, np.eye(6))
-        se3.compose_one(se3.IDENTITY, se3.between_one(se3.IDENTITY, se3.IDENTITY))
-    else:
+    group, step = (se3, se3.IDENTITY) if in_space else (se2, (1.0, 0.0, 0.1))
+    unit = np.eye(6 if in_space else 3)
+    group.propagate_during(unit, step, unit)
+    group.propagate(unit, step, unit)
+    group.compose_one(group.IDENTITY, group.between_one(group.IDENTITY, group.IDENTITY))
+    if not in_space:
         SE2.retract(np.zeros((1, 3)), np.zeros((1, 3)))
-        se2.propagate_during(np.eye(3), (1.0, 0.0, 0.1), np.eye(3))
-        se2.propagate(np.eye(3), (1.0, 0.0, 0.1), np.eye(3))
-        se2.compose_one(se2.IDENTITY, se2.between_one(se2.IDENTITY, se2.IDENTITY))
 
 
-def _edge_types() -> Iterator[EdgeType]:
-    for value in vars(graphs).values():
-        if isinstance(value, dict):
-            yield from (edge for edge in value.values() if isinstance(edge, EdgeType))
-        elif isinstance(value, EdgeType):
-            yield value
-
-
-def _shared_kernels() -> list[_Kernel]:
-    """List kernels that two parts call, with the types of their arguments."""
-    tree, index, number, _ = _types()
-    return [
-        (indices.ascending, (index,)),
-        (indices.chosen, (index, index)),
-        (indices.in_order, (index,)),
-        (indices.joined, (index, index)),
-        (indices.lengthened, (index, number)),
-        (symbolic.mark, (tree, index)),
-        (numeric.accept_steps, (tree, index)),
-    ]
-
-
-def _structure_kernels() -> list[_Kernel]:
-    """List kernels that order vertices and group them into cliques."""
-    tree, index, number, real = _types()
-    limits = types.UniTuple(real, 3)  # type: ignore[no-untyped-call]
-    return [
-        (ordering.move_tail, (tree, index, index)),
-        (ordering.dissect, (tree, number)),
-        (advance.regroup, (tree, index, index, real, real)),
-        (incremental.reset, (tree, index)),  # after a failure, perhaps without memory to load it
-        (incremental.relinearize, (tree, index, limits)),
-        (incremental.reach_back, (tree, index)),
-        (pools.compact, (tree,)),
-    ]
-
-
-def _number_kernels() -> list[_Kernel]:
-    """List kernels that eliminate, substitute and find covariances."""
-    tree, index, number, real = _types()
-    limits = types.UniTuple(real, 3)  # type: ignore[no-untyped-call]
-    return [
-        (numeric.eliminate, (tree, index, real)),
-        (substitution.substitute, (tree, index, real, real, limits)),
-        (incremental.solve, (tree, index, real, real, limits)),
-        (compiled_update.update, (index, index, number, number, *[index] * 8, real, real, limits)),
-        (covariance.marginals, (tree, index)),
-        (covariance.joint, (tree, index)),
-        (covariance.among, (tree, types.int64[:, ::1])),
-        (covariance.joint_of_each, (tree, types.int64[:, ::1])),
-        *_evidence_kernels(),
-    ]
-
-
-def _evidence_kernels() -> list[_Kernel]:
-    """List kernels that tell what measurements say together: of an innovation, and of a stretch of odometry."""
-    _, index, number, real = _types()
-    indices, reals = types.int64[:, ::1], types.float64[:, ::1]
-    array, stack = types.float64[::1], types.float64[:, :, ::1]
-    of_stretch = (index, indices, index, array, index, reals, indices, reals, stack, reals, reals)
-    hypothesis = (number, array, number, number, real, real)
-    return [
-        (retraction.adjoints_of_inverses, (number, reals)),
-        (innovations.least_cost, (number, array, indices, reals, reals, reals, index, index, number)),
-        (stretches.filter_stretch, (*of_stretch, *hypothesis, array, reals, array, reals, stack, reals)),
-    ]
+# Kernels that take most of the time, and those that are needed after a failure, perhaps without memory to load them.
+# Two parts call the first
+_TWICE = (
+    *(storage.ascending, storage.chosen, storage.in_order, storage.joined, storage.lengthened),
+    *(incremental.mark, numeric.accept_steps),
+)
+_STRUCTURE = (
+    *(ordering.move_tail, ordering.dissect, incremental.regroup, incremental.reset),
+    *(incremental.relinearize, incremental.reach_back, storage.compact),
+)
+_NUMBERS = (
+    *(numeric.eliminate, substitution.substitute, incremental.solve, updates.update),
+    covariance.joint,
+)
 
 
 def _compile_structure() -> None:
     """Compile kernels that two parts call, those of the structure, and, when the plane's are there, what is left."""
-    _make(_shared_kernels())
+    _make(*_TWICE)
     (CACHE_DIR / _SHARED).touch()
-    _make(_structure_kernels())
+    _make(*_STRUCTURE)
     _wait_for("complete-plane")
     _load_plane()
 
@@ -307,20 +236,30 @@ def _compile_plane() -> None:
     """Compile the edges of the plane, then elimination and covariances."""
     _load_edges(in_space=False)
     _wait_for(_SHARED)
-    _make(_number_kernels())
+    _make(*_NUMBERS)
+    _make_filter()
 
 
-def _make(kernels: list[_Kernel]) -> None:
-    """Compile kernels, or load them."""
+def _make(*kernels: Any) -> None:
+    """Compile kernels, or load them, for arguments as their annotations say."""
     if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
         return
-    for kernel, given in kernels:
-        kernel.compile(given)
+    limits = types.UniTuple(types.float64, 3)  # type: ignore[no-untyped-call]
+    tree = numba.typeof(storage.empty_tree())  # type: ignore[no-untyped-call]
+    of = {storage.Tree: tree, Index: types.int64[::1], int: types.int64, float: types.float64, storage.Limits: limits}
+    for kernel in kernels:
+        kernel.compile(tuple(of[one.annotation] for one in inspect.signature(kernel.py_func).parameters.values()))
 
 
-def _types() -> tuple[Any, Any, Any, Any]:
-    """Return the types of a tree, of an array of indices, and of numbers, as the kernels get them."""
-    return numba.typeof(empty_tree()), types.int64[::1], types.int64, types.float64  # type: ignore[no-untyped-call]
+def _make_filter() -> None:
+    """Compile the filter of a stretch of odometry, or load it."""
+    if not numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
+        index, indices, array, table = types.int64[::1], types.int64[:, ::1], types.float64[::1], types.float64[:, ::1]
+        stack, number, real = types.float64[:, :, ::1], types.int64, types.float64
+        of_stretch = (index, indices, index, array, index, table, indices, table, stack, table, table)
+        hypothesis = (number, array, number, number, real, real)
+        kernel: Any = stretch_filter.filter_stretch
+        kernel.compile((*of_stretch, *hypothesis, array, table, array, table, stack, table))
 
 
 def _wait_for(name: str) -> None:

@@ -5,7 +5,7 @@ import numpy as np
 from graph_slam_ros.graph import R1, R2, SE2, EdgeType
 from graph_slam_ros.graph.records import TABLES
 from graph_slam_ros.solver.clique_tree import storage as t
-from graph_slam_ros.solver.clique_tree.pointers import pointers_of
+from graph_slam_ros.solver.clique_tree.storage import pointers_of
 
 # everything is linearised anew until nothing moves: the optimum of all there is
 EXACT = {

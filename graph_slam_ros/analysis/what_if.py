@@ -130,12 +130,12 @@ class InfluenceModel:
         return found
 
     def _leave_out(self, found: Influences, edges: Index) -> None:
-        known = self._solver.cross_covariances()
-        plain = Losses(self._curved, {})
-        for block in linearize(self._curved, self._values, rows_of(self._curved, edges), plain):
+        with_last = self._solver.covariances_with(self._last)
+        for block in linearize(self._curved, self._values, rows_of(self._curved, edges), Losses(self._curved, {})):
             rows = block.table.at(block.rows)
             block.residual[:] /= self._along[rows.ids, None] ** 2
-            joint, of_last = self._solver.edge_marginals(rows.vertices), known.with_vertex(self._last, rows.vertices)
+            joint = self._solver.edge_marginals(rows.vertices)
+            of_last = np.array([np.concatenate([with_last[v] for v in ends]).T for ends in rows.vertices.tolist()])
             _fill(found, rows.ids, block, joint, of_last, -1.0)
             found.cost[rows.ids] += np.sum(block.residual**2, axis=1) - self._cost[rows.ids]
 

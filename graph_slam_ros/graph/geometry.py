@@ -107,48 +107,25 @@ def _turn_3d(pose: Numbers) -> Array:
     return so3.matrix((pose[3], pose[4], pose[5], pose[6]))
 
 
-PLANAR = Geometry(
-    graph.SE2,
-    graph.R2,
-    se2,
-    se2.IDENTITY,
-    _turn_2d,
-    graph.RELATIVE_POSE,
-    graph.POSE_PRIOR,
-    graph.TAG_POSITION,
-    graph.COORDINATE_PRIOR,
-    graph.RANGE_WITH_OFFSET,
-    {
-        "position": graph.LANDMARK_POSITION,
-        "pose": graph.RELATIVE_POSE,
-        "range_bearing": graph.RANGE_BEARING,
-        "bearing": graph.BEARING,
-        "range": graph.RANGE,
-    },
-    {"pose": graph.POSE_PRIOR, "position": graph.POSITION_PRIOR, "heading": graph.HEADING_PRIOR},
-)
-SPATIAL = Geometry(
-    graph.SE3,
-    graph.R3,
-    se3,
-    se3.IDENTITY,
-    _turn_3d,
-    graph.RELATIVE_POSE_3D,
-    graph.POSE_PRIOR_3D,
-    graph.TAG_POSITION_3D,
-    graph.COORDINATE_PRIOR_3D,
-    graph.RANGE_WITH_OFFSET_3D,
-    {
-        "position": graph.LANDMARK_POSITION_3D,
-        "pose": graph.RELATIVE_POSE_3D,
-        "range_bearing": graph.RANGE_BEARING_3D,
-        "bearing": graph.BEARING_3D,
-        "range": graph.RANGE_3D,
-    },
-    {
-        "pose": graph.POSE_PRIOR_3D,
-        "position": graph.POSITION_PRIOR_3D,
-        "heading": graph.HEADING_PRIOR_3D,
-        "attitude": graph.ATTITUDE_PRIOR_3D,
-    },
-)
+_SIGHTINGS = {
+    "position": "LANDMARK_POSITION",
+    "pose": "RELATIVE_POSE",
+    "range_bearing": "RANGE_BEARING",
+    "bearing": "BEARING",
+    "range": "RANGE",
+}
+_OTHERS = "RELATIVE_POSE", "POSE_PRIOR", "TAG_POSITION", "COORDINATE_PRIOR", "RANGE_WITH_OFFSET"
+_FIXES = {"pose": "POSE_PRIOR", "position": "POSITION_PRIOR", "heading": "HEADING_PRIOR", "attitude": "ATTITUDE_PRIOR"}
+
+
+def _geometry(pose: VertexKind, point: VertexKind, group: Any, turn: Callable[[Numbers], Array], ends: str) -> Geometry:
+    """Return the geometry of edge types whose names end so."""
+    edges = {name.removesuffix(ends): edge for name, edge in vars(graph).items() if name.endswith(ends)}
+    sightings = {kind: edges[name] for kind, name in _SIGHTINGS.items()}
+    fixes = {kind: edges[name] for kind, name in _FIXES.items() if name in edges}
+    others = {name.lower(): edges[name] for name in _OTHERS}
+    return Geometry(pose, point, group, group.IDENTITY, turn, sightings=sightings, fixes=fixes, **others)
+
+
+PLANAR = _geometry(graph.SE2, graph.R2, se2, _turn_2d, "")
+SPATIAL = _geometry(graph.SE3, graph.R3, se3, _turn_3d, "_3D")

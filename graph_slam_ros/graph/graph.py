@@ -9,7 +9,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from graph_slam_ros.errors import GraphSlamError, NoiseError
 from graph_slam_ros.graph.edge_type import EdgeType
-from graph_slam_ros.graph.lasting_ids import LastingIds
 from graph_slam_ros.graph.noise import Gaussian
 from graph_slam_ros.graph.records import (
     FITS,
@@ -17,13 +16,13 @@ from graph_slam_ros.graph.records import (
     LINEARIZE,
     MISSING,
     NOT_FINITE,
+    address_of,
     append_edges,
     append_vertices,
     labels_of,
 )
-from graph_slam_ros.graph.tables import Column, Edge, EdgeTable, Vertex
+from graph_slam_ros.graph.tables import Column, Edge, EdgeTable, LastingIds, Vertex
 from graph_slam_ros.graph.vertices import VertexKind
-from graph_slam_ros.lie.addresses import address_of
 from graph_slam_ros.typing import Array, Index, Mask
 
 _INT64 = np.dtype(np.int64)
@@ -310,3 +309,46 @@ def _one(one: int, count: int, what: str) -> int:
 def _code(names: list[Any], name: Any) -> int:
     """Its place among the names, that behind the last if it is new."""
     return names.index(name) if name in names else len(names)
+
+
+def kept_part(graph: Graph, vertices: Index, edges: Index, values: Array) -> Graph:
+    """Return a graph of some vertices and edges, in the same order.
+
+    Parameters
+    ----------
+    vertices, edges : ids, ascending; all ends of the edges are among the vertices
+    values : stored numbers of all vertices, as ``Graph.initial``: what the vertices begin with
+    """
+    out, moved = Graph(), new_ids(vertices, graph.vertex_count)
+    out.kinds, out.labels, out.sources = list(graph.kinds), list(graph.labels), list(graph.sources)
+    kinds = graph.kind.values[vertices]
+    sizes = np.array([kind.size for kind in graph.kinds], dtype=np.int64)[kinds]
+    ends = np.cumsum(sizes)
+    numbers = np.repeat(graph.offset.values[vertices] - (ends - sizes), sizes) + np.arange(int(sizes.sum()))
+    out.kind.values, out.offset.values, out.initial.values = kinds, ends - sizes, values[numbers]
+    new_edge = new_ids(edges, graph.edge_count)
+    code_of_edge, row_of_edge = np.empty(len(edges), dtype=np.int64), np.empty(len(edges), dtype=np.int64)
+    kept_rows = ((table, np.flatnonzero(new_edge[table.id.values] >= 0)) for table in graph.tables.values())
+    found = [(table, rows) for table, rows in kept_rows if len(rows)]
+    found.sort(key=lambda one: int(one[0].id.values[one[1][0]]))  # as if it was added edge by edge
+    for table, rows in found:
+        fresh = EdgeTable(table.type, len(out.tables))
+        for column, of_all in zip(fresh.columns, table.columns, strict=True):
+            column.values = of_all.values[rows]
+        fresh.id.values, fresh.vertices.values = new_edge[fresh.id.values], moved[fresh.vertices.values]
+        code_of_edge[fresh.id.values], row_of_edge[fresh.id.values] = fresh.code, np.arange(len(rows))
+        fresh.locate()
+        out.tables[table.type] = fresh
+        out._in_order.append(fresh)
+    out.table_of_edge.values, out.row_of_edge.values = code_of_edge, row_of_edge
+    out.vertex_ids = graph.vertex_ids.kept(vertices, graph.vertex_count)
+    out.edge_ids = graph.edge_ids.kept(edges, graph.edge_count)
+    out.locate()
+    return out
+
+
+def new_ids(kept: Index, count: int) -> Index:
+    """Return the new id of each of so many, (count,): -1 where it is not kept."""
+    out = np.full(count, -1, dtype=np.int64)
+    out[kept] = np.arange(len(kept))
+    return out

@@ -11,7 +11,7 @@ import numpy as np
 
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph.edge_type import EdgeType
-from graph_slam_ros.graph.edges_3d import AXES
+from graph_slam_ros.graph.edges import AXES
 from graph_slam_ros.graph.vertices import R2, R3, SE2, SE3, VertexKind
 from graph_slam_ros.lie import se2, so3
 from graph_slam_ros.lie.jit import jitable, kernel

@@ -1,35 +1,142 @@
-"""The records of a graph for compiled code: one array of the addresses of all columns, and what appends to them.
+"""The records of a graph for compiled code, which gets arrays, and the linearisation of an edge, by their addresses.
 
-Rows are written beyond the end of the columns, which have room for them. The graph then counts them, all or none.
+Numba unpacks each array that a kernel gets, and a tuple of arrays is slower still: for a small change that costs more
+than the computation. A kernel that needs many arrays gets one array of their addresses instead. Whoever makes it keeps
+the arrays alive. Rows are written beyond the end of the columns, which have room for them. The graph then counts them,
+all or none.
 """
 
-import numpy as np
+from collections.abc import Callable, Sequence
+from ctypes import POINTER, addressof, c_bool, c_char, c_double, c_int64, cast
+from typing import Any
 
-from graph_slam_ros.lie.addresses import integers, reals
+import numpy as np
+from numba import carray, types  # type: ignore[attr-defined]
+from numba.core import cgutils
+from numba.extending import intrinsic, overload
+from numpy.typing import NDArray
+
 from graph_slam_ros.lie.jit import inner, kernel
 from graph_slam_ros.typing import Array, Index, Mask
+
+
+def address_of(array: NDArray[Any]) -> int:
+    """Return where an array begins. An array that is replaced or grows is elsewhere."""
+    if array.nbytes:  # NumPy's own way takes three times as long
+        return addressof(c_char.from_buffer(array))  # type: ignore[arg-type]
+    begin: int = array.__array_interface__["data"][0]
+    return begin
+
+
+def integers(address: int, count: int) -> Index:
+    """Return the integers at an address."""
+    return np.ctypeslib.as_array(cast(int(address), POINTER(c_int64)), (int(count),))
+
+
+def reals(address: int, count: int) -> Array:
+    """Return the numbers at an address."""
+    return np.ctypeslib.as_array(cast(int(address), POINTER(c_double)), (int(count),))
+
+
+def table(address: int, rows: int, columns: int) -> Index:
+    """Return the table of integers at an address."""
+    return integers(address, int(rows) * int(columns)).reshape(int(rows), int(columns))
+
+
+def flags(address: int, count: int) -> Mask:
+    """Return the truth values at an address."""
+    return np.ctypeslib.as_array(cast(int(address), POINTER(c_bool)), (int(count),)).view(np.bool_)
+
+
+@intrinsic
+def _pointer(_: Any, address: Any) -> tuple[Any, Callable[..., Any]]:
+    def generated(context: Any, builder: Any, _: Any, arguments: Any) -> Any:
+        return builder.inttoptr(arguments[0], context.get_value_type(types.voidptr))
+
+    return types.voidptr(types.int64), generated
+
+
+def _compiled(dtype: Any) -> Callable[..., Any]:
+    def typed(address: Any, count: Any) -> Callable[..., Any]:
+        def compiled(address: Any, count: Any) -> Any:
+            return carray(_pointer(address), count, dtype)  # type: ignore[call-arg]
+
+        return compiled
+
+    return typed
+
+
+for _function, _dtype in ((integers, np.int64), (reals, np.float64), (flags, np.bool_)):
+    overload(_function, jit_options={"error_model": "numpy"})(_compiled(_dtype))
+
+
+@overload(table, jit_options={"error_model": "numpy"})
+def _compiled_table(address: Any, rows: Any, columns: Any) -> Callable[..., Any]:
+    def compiled(address: Any, rows: Any, columns: Any) -> Any:
+        return carray(_pointer(address), (rows, columns), np.int64)  # type: ignore[call-arg]
+
+    return compiled
+
+
+_ARRAYS = types.float64[::1], types.int64[:, ::1], types.float64[:, ::1]
+_RETURNED: Any = types.Tuple((types.float64[:, ::1], types.float64[:, :, ::1]))  # type: ignore[no-untyped-call]
+
+_ADDRESSES: dict[Callable[..., Any], int] = {}  # of this process: to ask for one takes a tenth of a millisecond
+
+
+def native_address(linearize: Callable[..., Any]) -> int:
+    """Return where the machine code of ``EdgeType.linearize`` is; 0 if it is not compiled, or was never called."""
+    if (known := _ADDRESSES.get(linearize)) is not None:
+        return known
+    for compiled in getattr(linearize, "overloads", {}).values():
+        if tuple(compiled.signature.args) == _ARRAYS and compiled.signature.return_type == _RETURNED:
+            address: int = compiled.library.get_pointer_to_function(compiled.fndesc.llvm_func_name)
+            _ADDRESSES[linearize] = address
+            return address
+    return 0
+
+
+def call_native(linearize: Any, x: Array, at: Index, measured: Array) -> tuple[Array, Array]:
+    """Call a linearisation: compiled code by its address, plain Python the function itself."""
+    residual, jacobian = linearize(x, at, measured)
+    return np.array(residual, dtype=np.float64), np.array(jacobian, dtype=np.float64)
+
+
+@overload(call_native, jit_options={"error_model": "numpy"})
+def _compiled_call(linearize: Any, x: Any, at: Any, measured: Any) -> Callable[..., Any]:
+    def compiled(linearize: Any, x: Any, at: Any, measured: Any) -> Any:
+        return _call(linearize, x, at, measured)  # type: ignore[call-arg]
+
+    return compiled
+
+
+def native_or_plain(kernel: Callable[..., Any], linearize: Sequence[Callable[..., Any]]) -> tuple[Any, list[Any]]:
+    """Return a kernel and what it calls these linearisations by: addresses, or if one has none, all as plain Python."""
+    addresses = [native_address(one) for one in linearize]
+    return (kernel, addresses) if all(addresses) else (getattr(kernel, "py_func", kernel), list(linearize))
+
+
+@intrinsic
+def _call(_: Any, address: Any, x: Any, at: Any, measured: Any) -> tuple[Any, Callable[..., Any]]:
+    def generated(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        convention = context.call_conv
+        of = convention.get_function_type(_RETURNED, _ARRAYS).as_pointer()
+        function = builder.inttoptr(arguments[0], of)
+        status, returned = convention.call_function(builder, function, _RETURNED, _ARRAYS, arguments[1:])
+        with cgutils.if_unlikely(builder, status.is_error):  # type: ignore[no-untyped-call]
+            convention.return_status_propagate(builder, status)
+        return returned
+
+    return _RETURNED(types.int64, x, at, measured), generated
+
 
 # pointers of a graph: where its columns begin; how many edges there is room for; from TABLES on, where the pointers of
 # each table are
 KIND, OFFSET, INITIAL, TABLE_OF_EDGE, ROW_OF_EDGE, EDGE_ROOM, TABLES = range(7)
-# pointers of a table: where its columns begin; the rows that there is room for; the sizes of its edge type; where its
-# compiled linearisation begins, 0 where there is none
-(
-    ID,
-    VERTICES,
-    MEASURED,
-    SQRT_INFORMATION,
-    LABEL,
-    SOURCE,
-    WEIGHT,
-    ROOM,
-    ENDS,
-    MEASURED_SIZE,
-    RESIDUAL_SIZE,
-    WIDTH,
-    LINEARIZE,
-    TABLE_COLUMNS,
-) = range(14)
+# pointers of a table: where its columns begin; the rows that there is room for
+ID, VERTICES, MEASURED, SQRT_INFORMATION, LABEL, SOURCE, WEIGHT, ROOM = range(8)
+# the sizes of its edge type; where its compiled linearisation begins, 0 where there is none
+ENDS, MEASURED_SIZE, RESIDUAL_SIZE, WIDTH, LINEARIZE, TABLE_COLUMNS = range(8, 14)
 
 FITS, NOT_FINITE, MISSING, ITSELF, OF_ANOTHER_KIND = range(5)
 

@@ -1,6 +1,6 @@
 """The records of a graph as growing columns, and views of them: some edges of one type, one edge, one vertex."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -8,8 +8,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from graph_slam_ros.graph import records
 from graph_slam_ros.graph.edge_type import EdgeType
+from graph_slam_ros.graph.records import address_of
 from graph_slam_ros.graph.vertices import VertexKind
-from graph_slam_ros.lie.addresses import address_of
 from graph_slam_ros.typing import Array, Index
 
 
@@ -39,10 +39,14 @@ class Column:
 
     @property
     def values(self) -> NDArray[Any]:
-        """The rows so far, a view."""
+        """The rows so far, a view; other rows replace all."""
         if len(self._values) != self.count:
             self._values = self._buffer[: self.count]
         return self._values
+
+    @values.setter
+    def values(self, rows: NDArray[Any]) -> None:
+        self.__setstate__(rows)
 
     def kept(self, rows: Index) -> "Column":
         """Some of its rows, as a column of their own."""
@@ -80,7 +84,6 @@ class Column:
         self._buffer, self._values, self.room = grown, grown[: len(before)], len(grown)
 
 
-@dataclass(slots=True, eq=False)
 class EdgeTable:
     """All edges of one type, a row each.
 
@@ -93,35 +96,15 @@ class EdgeTable:
     pointers : where all of it is in memory, for compiled code (``records``)
     """
 
-    type: EdgeType
-    code: int
-    pointers: Index = field(init=False)
-    columns: tuple[Column, ...] = field(init=False)
-    width: int = field(init=False)
-    id: Column = field(init=False)
-    vertices: Column = field(init=False)
-    measured: Column = field(init=False)
-    sqrt_information: Column = field(init=False)
-    label: Column = field(init=False)
-    source: Column = field(init=False)
-    weight: Column = field(init=False)
-
-    def __post_init__(self) -> None:
-        m = self.type.residual_size
-        self.width = sum(self.type.dofs)
-        self.id = Column(np.int64)
-        self.vertices = Column(np.int64, len(self.type.accepts))
-        self.measured = Column(np.float64, self.type.measured_size)
-        self.sqrt_information = Column(np.float64, m, m)
-        self.label, self.source = Column(np.int64), Column(np.int64)
-        self.weight = Column(np.float64)
-        self.columns = (
-            *(self.id, self.vertices, self.measured, self.sqrt_information),
-            *(self.label, self.source, self.weight),
-        )
+    def __init__(self, edge: EdgeType, code: int) -> None:
+        self.type, self.code, self.width, m = edge, code, sum(edge.dofs), edge.residual_size
+        self.id, self.vertices = Column(np.int64), Column(np.int64, len(edge.accepts))
+        self.measured, self.sqrt_information = Column(np.float64, edge.measured_size), Column(np.float64, m, m)
+        self.label, self.source, self.weight = Column(np.int64), Column(np.int64), Column(np.float64)
+        of_edge = self.id, self.vertices, self.measured, self.sqrt_information
+        self.columns = (*of_edge, self.label, self.source, self.weight)
         self.pointers = np.zeros(records.TABLE_COLUMNS, dtype=np.int64)
-        sizes = len(self.type.accepts), self.type.measured_size, m, self.width
-        self.pointers[records.ENDS : records.LINEARIZE] = sizes
+        self.pointers[records.ENDS : records.LINEARIZE] = len(edge.accepts), edge.measured_size, m, self.width
         self.locate()
 
     def __len__(self) -> int:
@@ -146,47 +129,22 @@ class EdgeTable:
         return EdgeRows(self, rows)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class EdgeRows:
-    """Some of the edges of one type, as arrays that are copied when they are asked for."""
+    """Some of the edges of one type: ``ids``, and the columns of their table, copied when they are asked for."""
 
-    table: EdgeTable
-    rows: Index
+    __slots__ = ("rows", "table")
+
+    def __init__(self, table: EdgeTable, rows: Index) -> None:
+        self.table, self.rows = table, rows
 
     @property
     def ids(self) -> Index:
         """Edge ids, (n,)."""
         return self.table.id.values[self.rows]
 
-    @property
-    def vertices(self) -> Index:
-        """Vertex ids, (n, k)."""
-        return self.table.vertices.values[self.rows]
-
-    @property
-    def measured(self) -> Array:
-        """Measurements, (n, p)."""
-        return self.table.measured.values[self.rows]
-
-    @property
-    def sqrt_information(self) -> Array:
-        """Square root information matrices, (n, m, m)."""
-        return self.table.sqrt_information.values[self.rows]
-
-    @property
-    def label(self) -> Index:
-        """Codes into ``Graph.labels``, (n,)."""
-        return self.table.label.values[self.rows]
-
-    @property
-    def source(self) -> Index:
-        """Codes into ``Graph.sources``, (n,)."""
-        return self.table.source.values[self.rows]
-
-    @property
-    def weight(self) -> Array:
-        """Factors on the information, (n,)."""
-        return self.table.weight.values[self.rows]
+    def __getattr__(self, column: str) -> NDArray[Any]:
+        """These rows of a column of the table."""
+        return getattr(self.table, column).values[self.rows]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -224,3 +182,47 @@ class Vertex:
     kind: VertexKind
     initial: Array
     stored: slice
+
+
+class LastingIds:
+    """The lasting ids of the rows of a table, ascending. They are never used twice.
+
+    Until rows are removed, the id of a row is its number. After that, the first rows have ids of their own, and those
+    of all later ones follow one another.
+
+    Attributes
+    ----------
+    early : (n,) ids of the first n rows
+    later : the id of the row after these
+    """
+
+    __slots__ = ("early", "later")
+
+    def __init__(self, early: Index | None = None, later: int = 0) -> None:
+        self.early = np.empty(0, dtype=np.int64) if early is None else early
+        self.later = later
+
+    def of(self, row: int) -> int:
+        """The id of a row."""
+        count = len(self.early)
+        return int(self.early[row]) if row < count else self.later + row - count
+
+    def of_all(self, rows: Index) -> Index:
+        """The ids of rows, (n,)."""
+        count = len(self.early)
+        out = rows + (self.later - count)
+        is_early = rows < count
+        out[is_early] = self.early[rows[is_early]]
+        return out
+
+    def find(self, lasting: int) -> int | None:
+        """The row of an id; None where it was removed. The row of an id that comes later may not be there yet."""
+        count = len(self.early)
+        if lasting >= self.later:
+            return count + lasting - self.later
+        at = int(np.searchsorted(self.early, lasting))
+        return at if at < count and self.early[at] == lasting else None
+
+    def kept(self, rows: Index, count: int) -> "LastingIds":
+        """The ids after all of so many rows were removed but some, which are given in order."""
+        return LastingIds(self.of_all(rows), self.of(count))

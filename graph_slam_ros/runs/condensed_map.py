@@ -29,7 +29,7 @@ import numpy as np
 from graph_slam_ros.errors import FormatError
 from graph_slam_ros.graph import Graph
 from graph_slam_ros.graph.geometry import Geometry
-from graph_slam_ros.graph.lasting_ids import LastingIds
+from graph_slam_ros.graph.tables import LastingIds
 from graph_slam_ros.runs.journal import read_records
 from graph_slam_ros.slam.bounded_map import Condensation, CondensedEdge
 from graph_slam_ros.slam.lifelong.place import VisitScale, place_of

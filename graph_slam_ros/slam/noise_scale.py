@@ -45,8 +45,7 @@ from graph_slam_ros.slam.frontend.noise_factors import (
     parts_of,
 )
 from graph_slam_ros.solver import Solver
-from graph_slam_ros.solver.blocks import loss_weights
-from graph_slam_ros.solver.linearization import Losses
+from graph_slam_ros.solver.linearization import Losses, loss_weights
 from graph_slam_ros.typing import Array, Index
 
 ALIKE_NS = 2_000_000_000  # errors that are alike last less: a landmark not seen for so long is passed again

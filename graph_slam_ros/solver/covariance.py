@@ -1,56 +1,22 @@
-"""Covariances out of the clique tree.
+"""Covariances out of the clique tree: of some vertices together, and without some edges.
 
 After Kaess and Dellaert, "Covariance recovery from a square root information matrix for data association", 2009.
 """
 
+from collections.abc import Callable, Mapping
+
 import numpy as np
+from scipy.linalg.lapack import dpotrf, dpotrs, dtrtrs
 
+from graph_slam_ros.errors import SingularError
+from graph_slam_ros.graph import Graph
+from graph_slam_ros.graph.tables import EdgeTable
 from graph_slam_ros.lie.jit import inlined, inner, kernel
-from graph_slam_ros.solver.clique_tree.indices import ascending, chosen
-from graph_slam_ros.solver.clique_tree.storage import (
-    CLIQUE,
-    DOF,
-    FREE,
-    FRONT_DOF,
-    FRONTALS,
-    FULL_DOF,
-    KEY,
-    LOCAL,
-    MARK,
-    MEMBERS,
-    NOTHING,
-    PARENT,
-    SIZE,
-    Tree,
-    front_of,
-    row_of,
-)
-from graph_slam_ros.solver.clique_tree.symbolic import mark
+from graph_slam_ros.solver.clique_tree import storage as its
+from graph_slam_ros.solver.clique_tree.incremental import mark
+from graph_slam_ros.solver.clique_tree.storage import NOTHING, Tree, ascending, front_of, row_of
+from graph_slam_ros.solver.linearization import blocks_of, rows_of
 from graph_slam_ros.typing import Array, Index
-
-
-@kernel
-def marginals(t: Tree, vertices: Index) -> Array:
-    """Return the covariances of vertices, (dof, dof) each, one after the other."""
-    vertex, clique, members = t.vertex, t.clique, t.members
-    cliques = mark(t, vertices)[::-1]
-    start, pool = _of_cliques(t, cliques)
-    size = 0
-    for v in vertices:
-        size += vertex[v, DOF] ** 2
-    out = np.empty(size)
-    size = 0
-    for v in vertices:
-        c, dof = vertex[v, CLIQUE], vertex[v, DOF]
-        full, at = clique[c, FULL_DOF], _place_in(vertex, clique, members, c, v)
-        covariance = pool[start[clique[c, MARK]] : start[clique[c, MARK] + 1]].reshape(full, full)
-        for i in range(dof):
-            for j in range(dof):
-                out[size] = covariance[at + i, at + j]
-                size += 1
-    for c in cliques:
-        clique[c, MARK] = 0
-    return out
 
 
 @kernel
@@ -62,32 +28,32 @@ def among(t: Tree, ends: Index) -> Array:
     vertex, clique, members = t.vertex, t.clique, t.members
     n, count = ends.shape
     every = ends.ravel()
-    cliques = mark(t, every[vertex[every, FREE] == 1])[::-1]
+    cliques = mark(t, every[vertex[every, its.FREE] == 1])[::-1]
     start, pool = _of_cliques(t, cliques)
     width = 0
     for s in range(count):
-        width += vertex[ends[0, s], DOF]
+        width += vertex[ends[0, s], its.DOF]
     out, place = np.zeros((n, width, width)), np.empty(width, np.int64)
     for k in range(n):
         lowest, at = NOTHING, 0
         for v in ends[k]:
-            if vertex[v, FREE]:
-                lowest = max(lowest, clique[vertex[v, CLIQUE], MARK])
+            if vertex[v, its.FREE]:
+                lowest = max(lowest, clique[vertex[v, its.CLIQUE], its.MARK])
         if lowest == NOTHING:
             continue
         for v in ends[k]:
-            first = _place_in(vertex, clique, members, cliques[lowest], v) if vertex[v, FREE] else NOTHING
-            for i in range(vertex[v, DOF]):
-                place[at] = first + i if vertex[v, FREE] else NOTHING
+            first = _place_in(vertex, clique, members, cliques[lowest], v) if vertex[v, its.FREE] else NOTHING
+            for i in range(vertex[v, its.DOF]):
+                place[at] = first + i if vertex[v, its.FREE] else NOTHING
                 at += 1
-        full = clique[cliques[lowest], FULL_DOF]
+        full = clique[cliques[lowest], its.FULL_DOF]
         covariance = pool[start[lowest] : start[lowest + 1]].reshape(full, full)
         for i in range(width):
             for j in range(width):
                 if place[i] != NOTHING and place[j] != NOTHING:
                     out[k, i, j] = covariance[place[i], place[j]]
     for c in cliques:
-        clique[c, MARK] = 0
+        clique[c, its.MARK] = 0
     return out
 
 
@@ -100,18 +66,18 @@ def _of_cliques(t: Tree, cliques: Index) -> tuple[Index, Array]:
     clique = t.clique
     start = np.zeros(len(cliques) + 1, np.int64)
     for k in range(len(cliques)):
-        clique[cliques[k], MARK] = k
-        start[k + 1] = start[k] + clique[cliques[k], FULL_DOF] ** 2
+        clique[cliques[k], its.MARK] = k
+        start[k + 1] = start[k] + clique[cliques[k], its.FULL_DOF] ** 2
     pool = np.empty(start[-1])
     for k in range(len(cliques)):
         c = cliques[k]
-        full = clique[c, FULL_DOF]
+        full = clique[c, its.FULL_DOF]
         covariance = pool[start[k] : start[k + 1]].reshape(full, full)
-        if clique[c, PARENT] != NOTHING:
-            above = clique[clique[c, PARENT], MARK]
-            wide = clique[clique[c, PARENT], FULL_DOF]
+        if clique[c, its.PARENT] != NOTHING:
+            above = clique[clique[c, its.PARENT], its.MARK]
+            wide = clique[clique[c, its.PARENT], its.FULL_DOF]
             _inherit(t, c, pool[start[above] : start[above + 1]].reshape(wide, wide), covariance)
-        _complete(front_of(clique, t.fronts, c), clique[c, FRONT_DOF], covariance)
+        _complete(front_of(clique, t.fronts, c), clique[c, its.FRONT_DOF], covariance)
     return start, pool
 
 
@@ -119,9 +85,9 @@ def _of_cliques(t: Tree, cliques: Index) -> tuple[Index, Array]:
 def _place_in(vertex: Index, clique: Index, members: Index, c: int, v: int) -> int:
     """The row where a member begins in a clique's front."""
     at = 0
-    m = clique[c, MEMBERS]
+    m = clique[c, its.MEMBERS]
     while members[m] != v:
-        at += vertex[members[m], DOF]
+        at += vertex[members[m], its.DOF]
         m += 1
     return at
 
@@ -130,20 +96,20 @@ def _place_in(vertex: Index, clique: Index, members: Index, c: int, v: int) -> i
 def _inherit(t: Tree, c: int, above: Array, covariance: Array) -> None:
     """Copy the covariance of a separator out of the parent's."""
     vertex, clique, members = t.vertex, t.clique, t.members
-    frontal, full = clique[c, FRONT_DOF], clique[c, FULL_DOF]
-    parent = clique[c, PARENT]
+    frontal, full = clique[c, its.FRONT_DOF], clique[c, its.FULL_DOF]
+    parent = clique[c, its.PARENT]
     at = 0
-    for m in range(clique[parent, MEMBERS], clique[parent, MEMBERS] + clique[parent, SIZE]):
-        vertex[members[m], LOCAL] = at
-        at += vertex[members[m], DOF]
+    for m in range(clique[parent, its.MEMBERS], clique[parent, its.MEMBERS] + clique[parent, its.SIZE]):
+        vertex[members[m], its.LOCAL] = at
+        at += vertex[members[m], its.DOF]
     place = np.empty(full - frontal, np.int64)
     at = 0
-    for m in range(clique[c, MEMBERS] + clique[c, FRONTALS], clique[c, MEMBERS] + clique[c, SIZE]):
-        for i in range(vertex[members[m], DOF]):
-            place[at] = vertex[members[m], LOCAL] + i
+    for m in range(clique[c, its.MEMBERS] + clique[c, its.FRONTALS], clique[c, its.MEMBERS] + clique[c, its.SIZE]):
+        for i in range(vertex[members[m], its.DOF]):
+            place[at] = vertex[members[m], its.LOCAL] + i
             at += 1
-    for m in range(clique[parent, MEMBERS], clique[parent, MEMBERS] + clique[parent, SIZE]):
-        vertex[members[m], LOCAL] = NOTHING
+    for m in range(clique[parent, its.MEMBERS], clique[parent, its.MEMBERS] + clique[parent, its.SIZE]):
+        vertex[members[m], its.LOCAL] = NOTHING
     for i in range(at):
         for j in range(at):
             covariance[frontal + i, frontal + j] = above[place[i], place[j]]
@@ -174,28 +140,31 @@ def joint(t: Tree, vertices: Index) -> Array:
     cliques = mark(t, vertices)
     rows = widest = 0
     for c in cliques:
-        widest = max(widest, clique[c, FULL_DOF])
-        for m in range(clique[c, MEMBERS], clique[c, MEMBERS] + clique[c, FRONTALS]):
-            vertex[members[m], LOCAL] = rows
-            rows += vertex[members[m], DOF]
-    size = 0
-    for v in vertices:
-        size += vertex[v, DOF]
+        widest = max(widest, clique[c, its.FULL_DOF])
+        for m in range(clique[c, its.MEMBERS], clique[c, its.MEMBERS] + clique[c, its.FRONTALS]):
+            vertex[members[m], its.LOCAL] = rows
+            rows += vertex[members[m], its.DOF]
+    key, begin, size = np.empty(len(vertices), np.int64), np.empty(len(vertices), np.int64), 0
+    for k in range(len(vertices)):
+        key[k], begin[k] = vertex[vertices[k], its.KEY], size
+        size += vertex[vertices[k], its.DOF]
     y, first, end = np.zeros((rows, size)), np.full(rows, size), np.zeros(rows, np.int64)
-    column = 0
-    for v in chosen(vertices, _by_key(vertex, vertices)):
-        for row in range(vertex[v, LOCAL], vertex[v, LOCAL] + vertex[v, DOF]):
-            y[row, column] = 1.0
+    column, given = 0, np.empty(size, np.int64)  # where a column is in the order that was asked for
+    for k in ascending(key):
+        v = vertices[k]
+        for i in range(vertex[v, its.DOF]):
+            row = vertex[v, its.LOCAL] + i
+            y[row, column], given[column] = 1.0, begin[k] + i
             first[row], end[row] = column, column + 1
             column += 1
     place = np.empty(widest, np.int64)
     for c in cliques:
         front, at = front_of(clique, t.fronts, c), 0
-        for m in range(clique[c, MEMBERS], clique[c, MEMBERS] + clique[c, SIZE]):
-            for i in range(vertex[members[m], DOF]):
-                place[at] = vertex[members[m], LOCAL] + i
+        for m in range(clique[c, its.MEMBERS], clique[c, its.MEMBERS] + clique[c, its.SIZE]):
+            for i in range(vertex[members[m], its.DOF]):
+                place[at] = vertex[members[m], its.LOCAL] + i
                 at += 1
-        for a in range(clique[c, FRONT_DOF]):
+        for a in range(clique[c, its.FRONT_DOF]):
             p, packed = place[a], row_of(a, at)
             for k in range(first[p], end[p]):
                 y[p, k] *= front[packed + a]
@@ -205,10 +174,13 @@ def joint(t: Tree, vertices: Index) -> Array:
                     y[q, k] -= share * y[p, k]
                 first[q], end[q] = min(first[q], first[p]), max(end[q], end[p])
     for c in cliques:
-        for m in range(clique[c, MEMBERS], clique[c, MEMBERS] + clique[c, FRONTALS]):
-            vertex[members[m], LOCAL] = NOTHING
-    ordered = y.T @ y
-    return _in_order_asked_for(vertex, vertices, ordered)
+        for m in range(clique[c, its.MEMBERS], clique[c, its.MEMBERS] + clique[c, its.FRONTALS]):
+            vertex[members[m], its.LOCAL] = NOTHING
+    ordered, out = y.T @ y, np.empty((size, size))
+    for i in range(size):
+        for j in range(i + 1):
+            out[given[i], given[j]] = out[given[j], given[i]] = ordered[i, j]
+    return out
 
 
 @kernel
@@ -221,18 +193,18 @@ def joint_of_each(t: Tree, ends: Index) -> Array:
     n, count = ends.shape
     width = 0
     for s in range(count):
-        width += vertex[ends[0, s], DOF]
+        width += vertex[ends[0, s], its.DOF]
     out, free, place = np.zeros((n, width, width)), np.empty(count, np.int64), np.empty(width, np.int64)
     for k in range(n):
         many = size = at = 0
         for v in ends[k]:
-            if vertex[v, FREE]:
+            if vertex[v, its.FREE]:
                 free[many] = v
                 many += 1
-                for i in range(vertex[v, DOF]):
+                for i in range(vertex[v, its.DOF]):
                     place[size] = at + i
                     size += 1
-            at += vertex[v, DOF]
+            at += vertex[v, its.DOF]
         if many == 0:
             continue
         of_free = joint(t, free[:many])
@@ -242,31 +214,71 @@ def joint_of_each(t: Tree, ends: Index) -> Array:
     return out
 
 
-@inner
-def _by_key(vertex: Index, vertices: Index) -> Index:
-    """Return the indices that sort vertices by their order of elimination."""
-    key = np.empty(len(vertices), np.int64)
-    for k in range(len(vertices)):
-        key[k] = vertex[vertices[k], KEY]
-    return ascending(key)
+_LEAST_PIVOT = 1e-8  # of what is left of the information, in units of all of it: below, rounding would decide
 
 
-@inner
-def _in_order_asked_for(vertex: Index, vertices: Index, ordered: Array) -> Array:
-    """Return a symmetric matrix in the order of ``vertices``, from one in order of elimination."""
-    begin = np.empty(len(vertices), np.int64)
-    at = 0
-    for k in _by_key(vertex, vertices):
-        begin[k] = at
-        at += vertex[vertices[k], DOF]
-    place = np.empty(at, np.int64)
-    at = 0
-    for k in range(len(vertices)):
-        for i in range(vertex[vertices[k], DOF]):
-            place[at] = begin[k] + i
-            at += 1
-    out = np.empty((at, at))
-    for i in range(at):
-        for j in range(i + 1):
-            out[i, j] = out[j, i] = ordered[place[i], place[j]]
-    return out
+def without_edges(
+    graph: Graph, tree: Tree, joint: Callable[[Index], Array], vertices: Index, edges: Index
+) -> tuple[Array, Array]:
+    """Return stored values of vertices, one after the other, and their joint covariance (D, D); zero for held ones.
+
+    The tree has current numbers and steps, and ``joint`` the joint covariance with these edges. What they say is
+    subtracted, as it was linearised. All other edges stay linearised where they are. A SingularError where these do not
+    determine the vertices, or so weakly that rounding would decide.
+    """
+    if not tree.vertex[vertices, its.FREE].any():
+        return np.concatenate([tree.value[graph.vertex(v).stored] for v in vertices.tolist()]), joint(vertices)
+    rows = rows_of(graph, edges[tree.edge[edges, its.ACTIVE] == 1])
+    every = np.unique(np.concatenate([vertices, *(t.vertices.values[chosen].ravel() for t, chosen in rows.items())]))
+    is_free = tree.vertex[every, its.FREE] == 1
+    dof = tree.vertex[every, its.DOF] * is_free
+    begin, free = np.where(is_free, np.cumsum(dof) - dof, NOTHING), every[is_free]
+    step = tree.step[_ranges(tree.vertex[free, its.STEP], dof[is_free])]
+    information, gradient = _sums(tree, rows, every, begin, len(step))
+    root, left = _roots(joint(free), information)
+    # with Sigma = L L', what is left of the information is L'^-1 (1 - L' H L) L^-1
+    moved = step + root @ dpotrs(left, root.T @ (gradient + information @ step), lower=True)[0]
+    at = np.searchsorted(every, vertices)
+    values = [_moved(graph, tree, v, first, moved) for v, first in zip(vertices.tolist(), begin[at], strict=True)]
+    is_row = np.repeat(is_free[at], tree.vertex[vertices, its.DOF])
+    white = np.zeros((len(root), len(is_row)))
+    white[:, is_row] = dtrtrs(left, root[_ranges(begin[at], dof[at])].T, lower=True)[0]
+    return np.concatenate(values), white.T @ white
+
+
+def _roots(covariance: Array, information: Array) -> tuple[Array, Array]:
+    """Return the roots L of the covariance, and of what is left without the information, in its units: 1 - L' H L."""
+    root, failed = dpotrf(covariance, lower=True, clean=True)
+    if not failed:
+        left, failed = dpotrf(np.eye(len(root)) - root.T @ information @ root, lower=True, clean=True)
+    if failed or not np.square(left.diagonal()).min() >= _LEAST_PIVOT:  # nor is NaN
+        raise SingularError("the other edges do not determine what these edges are on")
+    return root, left
+
+
+def _sums(tree: Tree, rows: Mapping[EdgeTable, Index], every: Index, begin: Index, size: int) -> tuple[Array, Array]:
+    """Return information (size, size) and gradient (size,), at the linearisation points, of rows of tables.
+
+    Parameters
+    ----------
+    every : their vertices, in order; begin : where each begins, NOTHING for held ones
+    """
+    information, gradient = np.zeros((size + 1, size + 1)), np.zeros(size + 1)  # the last is for held vertices
+    for table, of_table in rows.items():
+        dofs, blocks = np.array(table.type.dofs), blocks_of(tree, table, of_table)
+        begins = np.repeat(begin[np.searchsorted(every, table.vertices.values[of_table])], dofs, axis=1)
+        at = np.where(begins < 0, size, begins + _ranges(np.zeros_like(dofs), dofs))
+        np.add.at(information, (at[:, :, None], at[:, None, :]), blocks[:, :, :-1])
+        np.add.at(gradient, at, blocks[:, :, -1])
+    return information[:size, :size], gradient[:size]
+
+
+def _moved(graph: Graph, tree: Tree, vertex: int, first: int, step: Array) -> Array:
+    """Return the stored values of a vertex at a step (size,) from its linearisation point; of a held one as it is."""
+    kind, value = graph.kind_of(vertex), tree.value[graph.vertex(vertex).stored]
+    return value if first < 0 else kind.retract(value[None], step[None, first : first + kind.dof])[0]
+
+
+def _ranges(begin: Index, count: Index) -> Index:
+    """Return the numbers from each begin on, so many, end to end."""
+    return np.repeat(begin - np.cumsum(count) + count, count) + np.arange(count.sum())

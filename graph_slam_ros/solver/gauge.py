@@ -7,9 +7,9 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from graph_slam_ros.errors import GaugeError, SingularError
-from graph_slam_ros.graph import R2, R3, SE2, SE3, Graph, VertexKind
+from graph_slam_ros.graph import GROUPS, R2, R3, SE2, SE3, Graph, VertexKind
+from graph_slam_ros.graph.geometry import rigid_motions
 from graph_slam_ros.graph.tables import EdgeTable
-from graph_slam_ros.lie import so3
 from graph_slam_ros.solver.linearization import Losses, linearize
 from graph_slam_ros.typing import Array, Index, Mask
 
@@ -81,25 +81,14 @@ def fix_the_whole(graph: Graph, x: Array, rows: Mapping[EdgeTable, Index]) -> bo
 
 def _motions(kind: VertexKind, values: Array, centre: Array) -> Array:
     """Return steps (n, dof, 3 or 6) of vertices as the whole moves along each axis and turns about it at the centre."""
-    axes = len(centre)
-    arm = values[:, :axes] - centre
-    along = np.broadcast_to(np.eye(axes), (len(values), axes, axes))
-    if axes == 2:
-        turning = np.stack([-arm[:, 1], arm[:, 0]], axis=-1)[:, :, None]
-        c, s = np.cos(values[:, -1]), np.sin(values[:, -1])
-        to_body = np.stack([np.stack([c, s], -1), np.stack([-s, c], -1)], axis=1) if kind is SE2 else along
-        turned = np.ones((len(values), 1, 1))
-    else:
-        turning = np.swapaxes(np.cross(np.eye(3)[None], arm[:, None]), 1, 2)
-        to_body = np.moveaxis(np.asarray(so3.matrix(tuple(values[:, 3:].T))), -1, 0) if kind is SE3 else along
-        to_body = np.swapaxes(to_body, 1, 2)
-        turned = to_body
-    position = to_body @ np.concatenate([along, turning], axis=2)
-    if kind not in (SE2, SE3):
+    count, axes = len(values), len(centre)
+    position = rigid_motions(values[:, :axes] - centre).reshape(count, axes, -1)
+    if kind not in GROUPS:
         return position
-    return np.concatenate(
-        [position, np.concatenate([np.zeros((len(values), len(turned[0]), axes)), turned], 2)], axis=1
-    )
+    to_body = GROUPS[kind].to_matrix(tuple(values.T))[:, :axes, :axes].swapaxes(1, 2)
+    turned = np.ones((count, 1, 1)) if axes == 2 else to_body
+    rotation = np.concatenate([np.zeros((count, turned.shape[1], axes)), turned], axis=2)
+    return np.concatenate([to_body @ position, rotation], axis=1)
 
 
 def degrees_of_freedom(graph: Graph, free: Index, held: Mask) -> int:

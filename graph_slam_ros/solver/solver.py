@@ -1,33 +1,140 @@
-"""The solution: the estimate of a problem, online and in batch, and its covariances."""
+"""The solution of a problem: which vertices and edges of a graph are solved for, their estimates and covariances."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.sparse import coo_array
+from scipy.sparse.linalg import splu
 
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import Graph
 from graph_slam_ros.graph.graph import whole_numbers
-from graph_slam_ros.solver.batch import BatchProblem, Settings, minimise
+from graph_slam_ros.graph.records import weights_of
+from graph_slam_ros.graph.tables import EdgeTable
+from graph_slam_ros.graph.vertices import code_of
+from graph_slam_ros.solver import update
+from graph_slam_ros.solver.batch import BatchProblem, Change, Report, Settings, minimise
 from graph_slam_ros.solver.clique_tree import incremental
-from graph_slam_ros.solver.clique_tree.storage import AFFECTED, CLIQUE, DOF, NOTHING, SUBSTITUTED
-from graph_slam_ros.solver.clique_tree.substitution import forget, read, show
-from graph_slam_ros.solver.covariance import among, joint, joint_of_each, marginals
-from graph_slam_ros.solver.cross_covariance import CrossCovariances
-from graph_slam_ros.solver.entry import enter_newest
-from graph_slam_ros.solver.gauge import undetermined
-from graph_slam_ros.solver.left_out import without_edges
-from graph_slam_ros.solver.linearization import Losses, costs, information, linearize, rows_of
-from graph_slam_ros.solver.online_problem import OnlineProblem
-from graph_slam_ros.solver.pending import NONE
-from graph_slam_ros.solver.problem import existing
-from graph_slam_ros.solver.report import Change, Report
-from graph_slam_ros.solver.transaction import Transaction
+from graph_slam_ros.solver.clique_tree import storage as its
+from graph_slam_ros.solver.clique_tree.incremental import DISSECT, DONE, more_room, restructure
+from graph_slam_ros.solver.clique_tree.numeric import accept_steps
+from graph_slam_ros.solver.clique_tree.ordering import dissect, ends_of
+from graph_slam_ros.solver.clique_tree.storage import (
+    NONE,
+    NOTHING,
+    Limits,
+    Tree,
+    compact,
+    empty_tree,
+    longer,
+    pointers_of,
+    with_room,
+)
+from graph_slam_ros.solver.clique_tree.substitution import forget, read, show, show_all
+from graph_slam_ros.solver.covariance import among, joint, joint_of_each, without_edges
+from graph_slam_ros.solver.gauge import check_gauge, degrees_of_freedom, fix_the_whole, undetermined
+from graph_slam_ros.solver.linearization import (
+    Losses,
+    chi2_of,
+    costs,
+    evaluated,
+    information,
+    linearize_into,
+    rows_of,
+)
+from graph_slam_ros.solver.relinearization import (
+    MAYBE,
+    NO_LIMITS,
+    SURELY,
+    LossStages,
+    RelinearizationSchedule,
+    neglected,
+)
 from graph_slam_ros.typing import Array, Index
 
 
-class Solver(OnlineProblem):
+class PendingChanges:
+    """Changes that the next update integrates.
+
+    Attributes
+    ----------
+    vertices : that were added
+    new, back : edges that were added; that came back, or have another weight or a newly held vertex
+    touched : vertices that lost an edge or a neighbour
+    may_float : whether something that held parts together may be gone
+    moved : whether all linearisation points were moved, so that nothing is linearised there yet
+    broken : whether the tree must be made anew
+    """
+
+    __slots__ = ("back", "broken", "may_float", "moved", "new", "touched", "vertices")
+
+    def __init__(self) -> None:
+        self.vertices = self.new = self.touched = NONE
+        self.back: list[Index] = []
+        self.may_float = self.moved = self.broken = False
+
+    def __bool__(self) -> bool:
+        is_changed = len(self.vertices) or len(self.new) or self.back or len(self.touched)
+        return bool(is_changed or self.moved or self.broken)
+
+    def is_plain(self) -> bool:
+        """Return whether vertices and edges were added, and nothing else was changed."""
+        is_special = self.back or self.may_float or self.moved or self.broken
+        return not is_special and len(self.vertices) + len(self.new) > 0
+
+    def add(self, vertices: Index, edges: Index) -> None:
+        """Append new vertices and edges."""
+        all_vertices = np.concatenate((self.vertices, vertices)) if len(self.vertices) else vertices
+        all_new = np.concatenate((self.new, edges)) if len(self.new) else edges
+        self.vertices, self.new = all_vertices, all_new  # both, or where memory lacks neither
+
+    def again(self, edges: Index) -> None:
+        """Append edges to be linearised again, even if they are pending already."""
+        self.back.append(edges)
+
+    def edges(self) -> Index:
+        """Return all edges to be linearised, each once."""
+        return np.unique(np.concatenate((self.new, *self.back))) if self.back else self.new
+
+    def touch(self, vertices: Index) -> None:
+        """Append vertices that lost an edge or a neighbour."""
+        self.touched = np.concatenate((self.touched, vertices))
+
+    def forget(self, vertices: Index) -> None:
+        """Drop vertices that were removed before an update integrated them."""
+        if len(self.vertices):
+            self.vertices = self.vertices[~np.isin(self.vertices, vertices)]
+
+
+class Transaction:
+    """The context in which all that is pending enters and is solved for; an error undoes it.
+
+    After an error it is pending again, and the estimate is that of before. The tree is rebuilt at the next update,
+    because its numbers are half old and half new; not so if nothing has entered yet.
+
+    A generator as context would take twice the time, in each update.
+    """
+
+    __slots__ = ("_entered", "_problem", "_substituted")
+
+    def __init__(self, problem: "Solver") -> None:
+        state = problem._tree.state
+        self._problem, self._entered, self._substituted = problem, int(state[its.ENTERED]), int(state[its.SUBSTITUTED])
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
+        if error is None:
+            self._problem._pending = PendingChanges()
+        elif self._problem._tree.state[its.ENTERED] != self._entered:
+            self._problem._undo(self._substituted)
+
+
+class Solver:
     """Maximum-likelihood estimate of the vertices it was given, online and in batch; it owns their estimates.
 
     Vertices and edges are records of a ``Graph``; the solver minimises over those that were added to it. ``update``
@@ -36,8 +143,181 @@ class Solver(OnlineProblem):
     """
 
     def __init__(self, graph: Graph, settings: Settings | None = None) -> None:
-        super().__init__(graph, settings)
+        self.graph = graph
+        self.settings = settings or Settings()
+        self._tree = empty_tree()
+        self._shapes = np.zeros((0, its.SHAPE_COLUMNS), dtype=np.int64)  # of the graph's kinds
+        self._room = 0, 0, 0  # for vertices, their numbers, and edges
+        self._vertices = 0  # of the graph, that have a record in the tree
+        self._inside = np.zeros(0, dtype=bool)  # vertices of the problem
+        self._held = np.zeros(0, dtype=bool)
+        self._edge_inside = np.zeros(0, dtype=bool)  # edges of the problem
+        self._pending = PendingChanges()
+        self._kept = np.zeros(0)  # the estimate that the last call left, of what was read since it changed
+        self._stages = LossStages(graph)
+        self._schedule = RelinearizationSchedule()
+        self._numbers_current = True  # the tree's numbers are those at its linearisation points
+        self._solved_with: Settings | None = None  # a batch that converged, and nothing was changed since
         self._unfinished = False  # a batch stopped before the optimum
+        self._locate()
+
+    # -- the problem ---------------------------------------------------------------------------------------------------
+
+    def add(self, vertices: ArrayLike, edges: ArrayLike) -> None:
+        """Add vertices (at their initial values) and edges of the graph to the problem, by id, each once."""
+        new, new_edges = whole_numbers(vertices, "vertex").ravel(), whole_numbers(edges, "edge").ravel()
+        self._pending.broken |= self._record(new, new_edges)  # removed before: they are in the order still
+        self._pending.add(new, new_edges)
+        self._inside[new], self._edge_inside[new_edges] = True, True
+
+    def start_at(self, values: Array) -> None:
+        """Start from other values than the graph's initial ones: the stored numbers of all vertices in one array."""
+        self._grow()
+        size = len(self.graph.initial)
+        if values.shape != (size,) or not np.isfinite(values).all():
+            raise GraphSlamError(f"start: expected {size} finite numbers, got an array {values.shape}")
+        self._set_estimate(values)
+        self._pending.moved |= bool(self._tree.state[its.CLIQUES])
+
+    def place(self, vertex: int, value: ArrayLike) -> None:
+        """Start a vertex that is not in the problem yet from another value than the graph's initial one."""
+        self._grow()
+        existing([vertex], self._vertices, "vertex")
+        if self._inside[vertex]:
+            raise GraphSlamError(f"vertex {vertex} is in the problem: it has an estimate")
+        numbers, at = np.asarray(value, dtype=float), int(self.graph.offset.values[vertex])
+        kind = self.graph.kind_of(vertex)
+        if numbers.shape != (kind.size,) or kind.fault(numbers[None]) is not None:
+            raise GraphSlamError(
+                f"vertex {vertex}: expected {kind.size} finite numbers of {kind.name}, got {numbers.tolist()}"
+            )
+        for array in (self._tree.value, self._tree.estimate, self._kept):
+            array[at : at + kind.size] = numbers
+
+    def set_weight(self, edge: int, weight: float) -> None:
+        """Multiply the information of an edge; 0 removes it from the structure, another value adds it again."""
+        if not (np.isfinite(weight) and weight >= 0.0):
+            raise GraphSlamError(f"edge {edge}: weight {weight} is not a finite number >= 0")
+        if not weight:
+            return self.leave_out([edge])
+        self._grow()
+        one = existing([edge], self.graph.edge_count, "edge")
+        table, row = self.graph.row(edge)
+        ends = table.vertices.values[row]
+        if self._edge_inside[edge] and not self._inside[ends].all():
+            raise GraphSlamError(f"edge {edge} needs vertex {int(ends[~self._inside[ends]][0])}, which was removed")
+        table.weight.values[row] = weight
+        if self._edge_inside[edge]:
+            self._pending.again(one)
+
+    def leave_out(self, edges: ArrayLike) -> None:
+        """Set the weight of edges to 0, as ``set_weight`` does one by one."""
+        self._grow()
+        ids = existing(edges, self.graph.edge_count, "edge")
+        self.graph.set_weights(ids, 0.0)
+        active = ids[self._edge_inside[ids] & (self._tree.edge[ids, its.ACTIVE] == 1)]
+        if len(active):
+            self._pending.touch(ends_of(self._tree, active))
+            self._pending.may_float = True
+            incremental.deactivate(self._tree, active)
+
+    def hold(self, vertex: int) -> None:
+        """Keep a vertex at its present estimate."""
+        self._grow()
+        one = existing([vertex], self._vertices, "vertex")
+        self._held[vertex] = True
+        if self._tree.vertex[vertex, its.FREE]:
+            on_it = incremental.edges_of(self._tree.vertex, self._tree.link, vertex)
+            on_it = on_it[self._tree.edge[on_it, its.ACTIVE] == 1]  # they are linearised where it is held
+            self._pending.again(on_it)
+            self._fix_at_estimate(one)
+
+    @property
+    def held(self) -> Index:
+        """Ids of the vertices that stay at their values."""
+        return np.flatnonzero(self._held)
+
+    def has(self, vertex: int) -> bool:
+        """Return whether a vertex is part of the problem."""
+        return vertex < len(self._inside) and bool(self._inside[vertex])
+
+    def is_held(self, vertex: int) -> bool:
+        """Return whether a vertex stays at its value."""
+        return vertex < len(self._held) and bool(self._held[vertex])
+
+    def remove(self, vertices: ArrayLike) -> None:
+        """Remove vertices from the problem; all their edges must have weight 0 before."""
+        self._grow()
+        ids = existing(vertices, self._vertices, "vertex")
+        if not self._inside[ids].all():
+            raise GraphSlamError(f"vertex {int(ids[~self._inside[ids]][0])} is not in the problem")
+        for vertex in ids.tolist():
+            needed = self._weighted(incremental.edges_of(self._tree.vertex, self._tree.link, vertex))
+            if len(needed):
+                raise GraphSlamError(f"vertex {vertex} is needed by edge {int(needed[0])}")
+        self._inside[ids] = self._held[ids] = False
+        self._pending.forget(ids)
+        self._fix_at_estimate(ids)
+
+    def edges_on(self, vertex: int) -> Index:
+        """Ids of the edges of the problem on one vertex, also those of weight 0."""
+        self._grow()
+        existing([vertex], self._vertices, "vertex")
+        return incremental.edges_of(self._tree.vertex, self._tree.link, vertex)
+
+    @property
+    def vertices(self) -> Index:
+        """Ids of the vertices of the problem."""
+        self._grow()
+        return np.flatnonzero(self._inside)
+
+    @property
+    def degrees_of_freedom(self) -> int:
+        """The measured numbers, without edges of weight 0, less the estimated numbers, also those of a frozen map."""
+        self._grow()
+        return degrees_of_freedom(self.graph, self._unknowns(), self._held[: self.graph.vertex_count])
+
+    @property
+    def edges(self) -> Index:
+        """Ids of the edges of the problem that have a weight."""
+        self._grow()
+        return self._weighted(np.flatnonzero(self._edge_inside))
+
+    def is_fixed(self) -> bool:
+        """Return whether a held vertex, or the edges on one vertex alone, fix position and heading of the whole."""
+        self._grow()
+        if (self._inside & self._held).any():
+            return True
+        rows = rows_of(self.graph, self.edges)
+        return fix_the_whole(self.graph, self._estimates(), rows)
+
+    @property
+    def values(self) -> Array:
+        """The estimates of all vertices, in the layout of ``Graph.initial``; ``start_at`` accepts them."""
+        self._grow()
+        return self._estimates()[: len(self.graph.initial)].copy()
+
+    def chi2_of(self, edges: ArrayLike) -> tuple[Array, Index]:
+        """Chi2 of each edge at the estimate: r' Omega r without loss and weight, and the size of r."""
+        self._grow()
+        ids = whole_numbers(edges, "edge").ravel()
+        if len(ids):
+            existing(ids, self.graph.edge_count, "edge")
+        return chi2_of(self.graph, self._estimates(), ids)
+
+    def residuals_of(self, edges: ArrayLike) -> Array:
+        """Residuals of edges at the estimate, not whitened, in the units of their types, end to end."""
+        self._grow()
+        return evaluated(self.graph, self._estimates(), existing(edges, self.graph.edge_count, "edge"))[0]
+
+    def compact(self) -> None:
+        """Move the fronts in use together in memory; memory is not returned to the system.
+
+        The solver does so itself before it asks for more memory.
+        """
+        compact(self._tree)
+
+    # -- the solution --------------------------------------------------------------------------------------------------
 
     def release(self, vertices: ArrayLike) -> None:
         """Estimate held vertices again. The whole structure is rebuilt."""
@@ -63,7 +343,7 @@ class Solver(OnlineProblem):
         """
         self._grow()
         state = self._tree.state
-        eliminated = int(state[AFFECTED])
+        eliminated = int(state[its.AFFECTED])
         found: list[Index] = []
         with Transaction(self):
             linearized, moved, solved, far = self._integrate()
@@ -80,7 +360,7 @@ class Solver(OnlineProblem):
         else:
             for these in found:
                 show(self._tree, self._kept, these)
-        return Change(int(state[AFFECTED]) - eliminated, linearized, moved)
+        return Change(int(state[its.AFFECTED]) - eliminated, linearized, moved)
 
     def optimize(self, settings: Settings | None = None) -> Report:
         """Minimise the cost over everything, from the present estimate, until converged.
@@ -99,8 +379,8 @@ class Solver(OnlineProblem):
         arriving = self._arriving(surely=bool(self._pending))
         self._estimates()
         with Transaction(self):
-            enter_newest(self._pointers, *arriving)
-            self._tree.state[SUBSTITUTED] += 1  # from here on, steps are those of the batch
+            incremental.enter(self._tree, *arriving)
+            self._tree.state[its.SUBSTITUTED] += 1  # from here on, steps are those of the batch
             self._forget_numbers()
             self._restructure(*arriving)
             unknowns = self._unknowns()
@@ -123,8 +403,8 @@ class Solver(OnlineProblem):
         self._grow()
         losses = Losses(self.graph, (settings or self.settings).stages()[-1])
         where = self._estimates() if at is None else at
-        now = costs(self.graph, linearize(self.graph, where, self._active_rows(), losses))
-        return Report("gn", "nothing_to_do", now.chi2, now.chi2, now.cost, now.cost, (), now.classes)
+        chi2, cost, classes = costs(self.graph, where, self._active_rows(), losses)
+        return Report("gn", "nothing_to_do", chi2, chi2, cost, cost, (), classes)
 
     def estimate(self, ids: ArrayLike) -> Array:
         """Values of vertices of one kind, (n, size)."""
@@ -151,17 +431,14 @@ class Solver(OnlineProblem):
             A covariance that does not exist is refused.
         """
         wanted = self._with_covariance(ids)
-        free = wanted[~self._held[wanted]]
+        dofs, out = self._tree.vertex[wanted, its.DOF], [np.empty((0, 0))] * len(wanted)
         with self._tree_remade_after_error():
-            numbers = joint(self._tree, free).ravel() if len(free) == 1 else marginals(self._tree, free)
-        out, at = [], 0
-        for vertex in wanted.tolist():
-            dof = self.graph.kind_of(vertex).dof
-            if self._held[vertex]:
-                out.append(np.zeros((dof, dof)))
-            else:
-                out.append(numbers[at : at + dof**2].reshape(dof, dof))
-                at += dof**2
+            for dof in np.unique(dofs):
+                of_size = np.flatnonzero(dofs == dof)
+                is_one = len(wanted) == 1 and not self._held[wanted[0]]
+                found = joint(self._tree, wanted)[None] if is_one else among(self._tree, wanted[of_size, None])
+                for k, covariance in zip(of_size.tolist(), found, strict=True):
+                    out[k] = covariance
         return out
 
     def joint_marginal(self, ids: ArrayLike) -> Array:
@@ -174,7 +451,7 @@ class Solver(OnlineProblem):
             of_free = np.zeros((0, 0)) if held.all() else joint(self._tree, wanted[~held])
         if not held.any():
             return of_free
-        free = np.repeat(~held, self._tree.vertex[wanted, DOF])
+        free = np.repeat(~held, self._tree.vertex[wanted, its.DOF])
         out = np.zeros((len(free), len(free)))
         out[np.ix_(free, free)] = of_free
         return out
@@ -204,10 +481,19 @@ class Solver(OnlineProblem):
             of_each = among if are_inside else joint_of_each
             return of_each(self._tree, np.ascontiguousarray(ends)) if len(ends) else np.zeros((0, 0, 0))
 
-    def cross_covariances(self) -> CrossCovariances:
-        """Covariances of all vertices with one of them, as ``joint_marginal`` has them."""
+    def covariances_with(self, vertex: int) -> list[Array]:
+        """Covariances (dof, d) of each vertex, by id, with one of them; zero for held ones.
+
+        ``joint_marginal`` of each pair would take a thousand times as long for a drive.
+        """
         self._with_covariance(self.vertices)
-        return CrossCovariances(self._tree, np.flatnonzero(self._inside & ~self._held))
+        held, dofs = (self._held | ~self._inside)[: self._vertices], self._tree.vertex[: self._vertices, its.DOF]
+        is_free, first = np.repeat(~held, dofs), int(self._tree.vertex[vertex, its.STEP])
+        out = np.zeros((len(is_free), int(dofs[vertex])))
+        if not held[vertex]:
+            unit = np.eye(*out.shape, -first)[is_free]
+            out[is_free] = splu(self._information().tocsc(), permc_spec="MMD_AT_PLUS_A").solve(unit)
+        return np.split(out, np.cumsum(dofs)[:-1])
 
     def information_matrix(self) -> Array:
         """H as a dense matrix, vertices in order of id, with pending edges: for tests and small examples.
@@ -216,9 +502,7 @@ class Solver(OnlineProblem):
         linearisation points may be a small step (``Settings.relinearize_above``) away.
         """
         self._grow()
-        free = np.flatnonzero(self._inside & ~self._held)
-        losses = self._stages.losses(self.settings)[-1]
-        return information(self.graph, self._estimates(), rows_of(self.graph, self.edges), free, losses)
+        return self._information().toarray()
 
     def rebuild(self) -> None:
         """Rebuild everything from the graph, at the present estimate; a failure leaves all as it was.
@@ -233,7 +517,286 @@ class Solver(OnlineProblem):
             fresh.hold(vertex)
         vars(self).update(vars(fresh))
 
-    # -- inside ------------------------------------------------------------------------------------------------------
+    # -- inside: the problem -------------------------------------------------------------------------------------------
+
+    def _estimates(self) -> Array:
+        """Return the estimates of all vertices, none of them waiting; they stay the tree's."""
+        state = self._tree.state
+        if state[its.STALE_COUNT] or state[its.DEFERRED_COUNT]:
+            show_all(self._tree, self._kept, self.settings.tolerance, self.settings.tolerance_sigmas)
+        return self._tree.estimate
+
+    def _grow(self) -> None:
+        """Follow the graph's growth: new vertices start at their initial values."""
+        graph = self.graph
+        if graph.kind.count > self._vertices or graph.row_of_edge.count > self._room[2]:
+            self._record(NONE, NONE)
+
+    def _record(self, new: Index, new_edges: Index) -> bool:
+        """Follow the graph's growth, and record what is added to the problem; nothing where some of it is unfit.
+
+        Returns whether one of the vertices is in the order of the tree still.
+        """
+        graph = self.graph
+        now = graph.kind.count, graph.initial.count, graph.row_of_edge.count
+        room = self._room
+        if now[0] > room[0] or now[1] > room[1] or now[2] > room[2] or len(self._shapes) != len(graph.kinds):
+            self._follow(*now)
+        how, what, blocks = update.record(graph.pointers, self._pointers, (self._vertices, *now), new, new_edges)
+        while how == update.NO_ROOM:
+            self._replace_tree(partial(with_room, link=what, blocks=blocks))
+            how, what, blocks = update.record(graph.pointers, self._pointers, (self._vertices, *now), new, new_edges)
+        self._vertices = now[0]
+        if how == update.RECORDED:
+            return bool(what)
+        if how == update.UNFIT_VERTEX:
+            _refuse_unfit(new, what, self._vertices, "vertex")
+        if how == update.UNFIT_EDGE:
+            _refuse_unfit(new_edges, what, graph.edge_count, "edge")
+        raise GraphSlamError(f"an edge needs vertex {what}, which was not added")
+
+    def _follow(self, count: int, size: int, edges: int) -> None:
+        """Make room for so many vertices, their stored numbers, and edges."""
+        try:
+            self._tree = with_room(
+                self._tree,
+                vertex=count, region=2 * count, tail=2 * count, listed=count, edge=edges,
+                diagonal=size, step=size, reference=size, value=size, estimate=size,
+            )  # fmt: skip
+            self._inside, self._held = longer(self._inside, count), longer(self._held, count)
+            self._edge_inside = longer(self._edge_inside, edges)
+            self._kept = longer(self._kept, len(self._tree.estimate))
+            if len(self._shapes) != len(self.graph.kinds):
+                self._shapes = np.array([(k.dof, k.size, code_of(k)) for k in self.graph.kinds])
+        finally:  # some may have grown in place
+            self._locate()
+        self._room = self._room_now()
+
+    def _locate(self) -> None:
+        """Note where the arrays are, after they moved in memory."""
+        more = self._kept, self._inside, self._held, self._edge_inside, self._shapes
+        self._pointers = pointers_of(self._tree, *more)
+
+    def _room_now(self) -> tuple[int, int, int]:
+        """Return for how many vertices, numbers of theirs, and edges there is room."""
+        t = self._tree
+        vertices = t.vertex, t.listed, self._inside, self._held, t.tail[::2], t.region[::2]
+        numbers = t.diagonal, t.step, t.reference, t.value, t.estimate, self._kept
+        return min(map(len, vertices)), min(map(len, numbers)), min(len(t.edge), len(self._edge_inside))
+
+    def _replace_tree(self, change: Callable[[Tree], Tree]) -> None:
+        """Take another tree for the present one, some of whose arrays may have grown in place even if this fails."""
+        try:
+            self._tree = change(self._tree)
+        finally:
+            self._locate()
+
+    def _unknowns(self) -> Index:
+        return np.flatnonzero(self._tree.vertex[: self._vertices, its.FREE])
+
+    def _active(self) -> Index:
+        return np.flatnonzero(self._tree.edge[:, its.ACTIVE])
+
+    def _active_rows(self) -> dict[EdgeTable, Index]:
+        return rows_of(self.graph, self._active())
+
+    def _weighted(self, edges: Index) -> Index:
+        """The edges among these that have a weight."""
+        has_weight = weights_of(self.graph.pointers, edges) != 0.0
+        return edges if np.count_nonzero(has_weight) == len(edges) else edges[has_weight]
+
+    def _arriving(self, *, surely: bool = False) -> tuple[Index, Index]:
+        """Return the unknowns and edges that enter the problem; nothing is changed.
+
+        A GaugeError where nothing would fix a part of the problem. This is checked if it may be so, or if ``surely``.
+        """
+        self._grow()
+        pending, graph = self._pending, self.graph
+        vertices, edges = pending.vertices, pending.edges()
+        found = update.anchorage(self._tree, graph.pointers, self._pointers, vertices, edges)
+        if found == update.LEFT_OUT:
+            vertices, edges = vertices[self._inside[vertices] & ~self._held[vertices]], self._weighted(edges)
+            found = update.anchorage(self._tree, graph.pointers, self._pointers, vertices, edges)
+        if surely or pending.may_float or pending.broken or found != update.ANCHORED:
+            self._refuse_floating()
+        return vertices, edges
+
+    def _undo(self, substituted: int) -> None:
+        """Undo what a transaction did since there were so many substitutions."""
+        self._pending.broken = True
+        state = self._tree.state
+        if state[its.SUBSTITUTED] == substituted:
+            with suppress(MemoryError):
+                self._estimates()  # what waits still can be solved
+        state[its.TAIL_FIRST] = state[its.TAIL_END] = 0  # it is filled anew with the tree
+        self._set_estimate(self._kept)
+        self._stages.young, self._numbers_current = NONE, True
+        incremental.leave(self._tree, self._pending.vertices, self._pending.edges())  # the last: it needs memory
+
+    def _fix_at_estimate(self, vertices: Index) -> None:
+        """Remove vertices from the unknowns; they stay at their estimates."""
+        self._estimates()
+        accept_steps(self._tree, vertices)
+        free = vertices[self._tree.vertex[vertices, its.FREE] == 1]
+        if len(free):
+            self._pending.touch(incremental.leave(self._tree, free, NONE))
+
+    def _set_estimate(self, values: Array) -> None:
+        for array in (self._tree.value, self._tree.estimate, self._kept):
+            array[: len(values)] = values
+        forget(self._tree)
+
+    def _refuse_floating(self) -> None:
+        """Raise GaugeError if nothing fixes a part of the problem, with all pending changes."""
+        rows = rows_of(self.graph, self.edges)
+        check_gauge(
+            self.graph, np.flatnonzero(self._inside & ~self._held), np.flatnonzero(self._inside & self._held), rows
+        )
+
+    # -- inside: the solution ------------------------------------------------------------------------------------------
+
+    def _integrate(self) -> tuple[int, int, Index, Index]:
+        """Solve with all that is pending, within a transaction.
+
+        Returns how many edges were linearised, and how many vertices were solved; then, if edges on these are far from
+        their linearisation point (now moved there), the vertices and the edges.
+        """
+        pending, stages, settings = self._pending, self._stages, self.settings
+        due, losses = self._schedule.is_due(settings.relinearize_every), stages.pointers(settings)
+        stage, vertices, edges, again = update.CHECK, pending.vertices, pending.new, NONE
+        young = stages.of_new(edges, settings)
+        if not (self._numbers_current and pending.is_plain()) or len(stages.young):
+            stage, vertices, edges, again, young = self._entered(due)
+            if stage == update.END:
+                return 0, 0, NONE, NONE
+        touched, unseen = pending.touched, self._schedule.unseen()
+        while True:
+            linear = np.union1d(edges, again) if len(again) else edges
+            how, what, count, found = update.update(
+                self.graph.pointers, self._pointers, stage, due,
+                vertices, edges, linear, again, touched, unseen, young, losses, *self._limits(),
+            )  # fmt: skip
+            if how == update.UNSURE:
+                stage, vertices, edges, again, young = self._entered(due)
+                continue
+            stages.young = young
+            if how == DONE:
+                break
+            stage = update.GROUP
+            if how == update.SEARCH:
+                stage, again = update.LINEARIZE, self._far_from_linearization()
+            elif how == update.IN_PYTHON:
+                stage = update.ORDER
+                self._linearize(linear)
+            elif how == DISSECT:
+                touched = np.concatenate((found, dissect(self._tree, what)))
+            else:
+                touched = found
+                self._replace_tree(more_room)
+        if what != NOTHING:
+            self._refuse_floating()
+            raise undetermined(what)
+        stages.mature(self._tree.value, settings)
+        self._solved_with, self._numbers_current = None, True
+        if not len(found):
+            return len(linear), count, NONE, NONE
+        return len(linear), count, found[:count], found[count:]
+
+    def _entered(self, due: int) -> tuple[int, Index, Index, Index, Index]:
+        """Let all that is pending enter, of whatever kind it is.
+
+        Returns the stage of the compiled update that comes next (END if there is nothing to do), and what it is called
+        with: vertices and edges that entered, edges that are to be linearised again, and young ones.
+        """
+        pending, stages = self._pending, self._stages
+        vertices, edges = self._arriving()
+        incremental.enter(self._tree, vertices, edges)
+        if not (self._numbers_current or pending.broken or pending.moved):
+            self._renumber_after_batch()
+        if due == MAYBE and len(edges) and not pending.broken and incremental.reach_back(self._tree, edges):
+            due = SURELY
+        again = self._far_from_linearization() if due == SURELY else NONE
+        if not pending and not len(stages.young) and not len(again):
+            return update.END, NONE, NONE, NONE, NONE
+        fresh = np.union1d(edges, stages.young) if len(stages.young) else edges
+        stages.young = young = stages.of_new(edges, self.settings)
+        if pending.broken:
+            self._forget_numbers()
+            fresh, vertices = self._active(), self._unknowns()
+            self._linearize(fresh)
+            self._estimates()
+            incremental.reset(self._tree, vertices)
+            return update.ORDER, vertices, fresh, NONE, young
+        if pending.moved:
+            self._forget_numbers()
+            again = np.setdiff1d(self._active(), fresh)
+        return update.LINEARIZE, vertices, fresh, again, young
+
+    def _far_from_linearization(self) -> Index:
+        """Search all vertices for large steps, and move their linearisation points; return the edges on them."""
+        settings = self.settings
+        self._tree.state[its.MOTION_MM] = self._schedule.begin(self.graph)
+        if self._pending.broken:
+            return NONE
+        if self._schedule.is_check_due(self.graph.edge_count, settings):
+            edges = self._active()
+            self._estimates()
+            self._schedule.learn(*neglected(self.graph, self._tree, edges), len(edges))
+        tightness = self._schedule.tightness
+        above, error = tightness * settings.relinearize_above, tightness**2 * settings.relinearize_error
+        return incremental.relinearize_changed(self._pointers, *self._limits()[:2], (above, above, error))
+
+    def _limits(self) -> tuple[float, float, Limits]:
+        """The tolerances of steps, and the limits above which a step is far (``substitute``)."""
+        return self._schedule.limits(self.graph, self.settings)
+
+    def _relinearized(self, far: Index) -> Iterator[tuple[int, Index]]:
+        """Linearise edges that are far, pass after pass; yields how many were, and the vertices that were solved."""
+        limits, passes = self._limits(), self.settings.relinearize_passes
+        for k in range(passes):
+            self._linearize(far)
+            failed, solved = incremental.renumber(self._tree, far, *limits)
+            if failed != NOTHING:
+                raise undetermined(failed)
+            yield len(far), solved
+            if k == passes - 1:
+                self._schedule.note(solved)
+                return
+            far = incremental.relinearize(self._tree, solved, *limits[2:])
+            if not len(far):
+                return
+
+    def _forget_numbers(self) -> None:
+        """Set the sums to zero, because all edges are about to be linearised."""
+        self._tree.blocks[:] = 0.0
+        self._tree.diagonal[:] = 0.0
+
+    def _restructure(self, vertices: Index, edges: Index) -> None:
+        """Order and group what new vertices and edges touch, without numbers."""
+        if self._pending.broken:
+            vertices = self._unknowns()
+            incremental.reset(self._tree, vertices)
+        touched, tolerances = self._pending.touched, self._limits()[:2]
+        self._replace_tree(lambda tree: restructure(tree, edges, touched, vertices, *tolerances))
+
+    def _renumber_after_batch(self) -> None:
+        """Compute the numbers of the tree at the result of a batch. The result stays."""
+        self._linearize(self._active())
+        failed, _ = incremental.renumber(self._tree, self._active(), np.inf, 0.0, NO_LIMITS)
+        if failed != NOTHING:
+            self._pending.broken = True
+        self._numbers_current = True
+
+    def _information(self) -> coo_array:
+        """H over the vertices that are not held, in order of id."""
+        free = np.flatnonzero(self._inside & ~self._held)
+        losses = self._stages.losses(self.settings)[-1]
+        return information(self.graph, self._estimates(), rows_of(self.graph, self.edges), free, losses)
+
+    def _linearize(self, edges: Index) -> None:
+        """Put the blocks of edges at the linearisation points into the tree."""
+        first, *_, last = 2 * self._stages.losses(self.settings)
+        linearize_into(self.graph, self._tree, edges, last, self._stages.young, first)
 
     def _with_covariance(self, ids: ArrayLike) -> Index:
         """Check vertices whose covariance is asked for, and integrate pending changes."""
@@ -246,9 +809,9 @@ class Solver(OnlineProblem):
                 self.update()
             elif not self._numbers_current:
                 with Transaction(self):
-                    enter_newest(self._pointers, NONE, NONE)
+                    incremental.enter(self._tree, NONE, NONE)
                     self._renumber_after_batch()
-            if (self._tree.vertex[wanted[~self._held[wanted]], CLIQUE] == NOTHING).any():
+            if (self._tree.vertex[wanted[~self._held[wanted]], its.CLIQUE] == NOTHING).any():
                 raise GraphSlamError("a covariance was asked for within an update")
         return wanted
 
@@ -269,3 +832,18 @@ class Solver(OnlineProblem):
             raise undetermined(failed)
         self._schedule.hasten(self.settings.relinearize_every)
         return solved, incremental.relinearize(self._tree, solved, *self._limits()[2:])
+
+
+def existing(ids: ArrayLike, count: int, what: str) -> Index:
+    """Ids as an array; raises GraphSlamError for one that is not below ``count``."""
+    at = whole_numbers(ids, what).ravel()
+    strange = (at < 0) | (at >= count)
+    if np.count_nonzero(strange):
+        raise GraphSlamError(f"{what} {int(at[strange][0])} does not exist")
+    return at
+
+
+def _refuse_unfit(ids: Index, unfit: int, count: int, what: str) -> None:
+    """Raise GraphSlamError for an id that does not exist, is in the problem already or is repeated."""
+    existing(ids[unfit], count, what)
+    raise GraphSlamError(f"{what} {int(ids[unfit])} was added before")

@@ -8,8 +8,8 @@ from math import log
 
 import numpy as np
 
-from graph_slam_ros.graph.native import call_native
-from graph_slam_ros.graph.retraction import adjoint_of_inverse, append_motion, retract_at, right_jacobian_at
+from graph_slam_ros.graph.records import call_native
+from graph_slam_ros.graph.vertices import adjoint_of_inverse, append_motion, retract_at, right_jacobian_at
 from graph_slam_ros.lie.jit import jitable, kernel
 from graph_slam_ros.typing import Array, Index
 

@@ -10,7 +10,7 @@ from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.errors import SingularError
 from graph_slam_ros.graph import Edge, Gaussian
 from graph_slam_ros.graph.geometry import Geometry
-from graph_slam_ros.graph.kept_part import kept_part, new_ids
+from graph_slam_ros.graph.graph import kept_part, new_ids
 from graph_slam_ros.graph.losses import weight_and_cost
 from graph_slam_ros.slam.lifelong.elimination import product, square_root, symmetric
 from graph_slam_ros.slam.lifelong.place import Cell, Place, PlaceEdge, VisitScale, added_place, fit_of

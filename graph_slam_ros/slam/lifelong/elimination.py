@@ -3,7 +3,7 @@
 import numpy as np
 
 from graph_slam_ros.errors import SingularError
-from graph_slam_ros.solver.clique_tree.dense import pack, partial_cholesky, solve_upper
+from graph_slam_ros.solver.clique_tree.numeric import pack, partial_cholesky, solve_upper
 from graph_slam_ros.solver.clique_tree.storage import NOTHING, packed_size
 from graph_slam_ros.typing import Array, Index
 

@@ -4,9 +4,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from graph_slam_ros.graph import POINT_SEEN_FROM, SE2, SE3, Edge, Graph
-from graph_slam_ros.graph.native import native_or_plain
-from graph_slam_ros.graph.retraction import code_of
+from graph_slam_ros.graph import POINT_SEEN_FROM, SE2, SE3, Graph
 from graph_slam_ros.graph.tables import EdgeTable
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.solver.least_cost import least_cost
@@ -14,7 +12,6 @@ from graph_slam_ros.solver.linearization import linearized, rows_of
 from graph_slam_ros.typing import Array, Index
 
 _ANGLES = {SE2: 1, SE3: 3}  # of a pose, its last coordinates
-_MOST_STEPS = 60  # of a search: with extreme numbers it would creep for seconds; the least it has found is taken
 _REGULAR = 1e10  # times its own noise: an innovation's variance that leaves a solve enough digits
 _LINEAR_RAD2 = 0.1  # of a direction: beyond, a linear prediction is none
 
@@ -73,7 +70,7 @@ def _least_costs(graph: Graph, solver: Solver, table: EdgeTable, rows: Index) ->
     for k in np.flatnonzero(is_linear & ~is_regular).tolist():
         out[k] = white[k] @ np.linalg.lstsq(spread[k], white[k], rcond=None)[0]
     for k in np.flatnonzero(~is_linear).tolist():
-        out[k] = _least_cost(graph, x, graph.edge(int(some.ids[k])), joint[k])
+        out[k] = least_cost(graph, x, graph.edge(int(some.ids[k])), joint[k])
     return np.where(np.isfinite(out), out, np.inf).tolist()
 
 
@@ -133,29 +130,6 @@ def likely_together(
             return group if together <= most_cost(group) else []
         group.remove(worst)
     return []
-
-
-def _least_cost(graph: Graph, x: Array, edge: Edge, joint: Array) -> float:
-    """The minimum of ``|u|^2 + |R r|^2`` over steps ``d = L u`` of the vertices, with ``L L' = Sigma``, by search."""
-    variances, axes = np.linalg.eigh(joint)
-    sigmas = axes * np.sqrt(np.maximum(variances, 0.0))
-    ends = [graph.vertex(v) for v in edge.vertices]
-    kinds = [end.kind for end in ends]
-    at = np.cumsum([0] + [kind.size for kind in kinds[:-1]])
-    search, (linearize,) = native_or_plain(least_cost, [edge.type.linearize])
-    return float(
-        search(
-            linearize,
-            np.concatenate([x[end.stored] for end in ends]),
-            at[None],
-            edge.measured[None],
-            edge.sqrt_information,
-            sigmas,
-            np.array([code_of(kind) for kind in kinds]),
-            np.array([kind.dof for kind in kinds]),
-            _MOST_STEPS * (len(sigmas) + 1),
-        )
-    )
 
 
 def _spread(graph: Graph, x: Array, ends: Index, joint: Array, predicted: Array) -> Array:

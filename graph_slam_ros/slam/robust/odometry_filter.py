@@ -13,8 +13,8 @@ import numpy as np
 from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.graph import Edge, Graph
 from graph_slam_ros.graph.geometry import Geometry
-from graph_slam_ros.graph.native import native_or_plain
-from graph_slam_ros.graph.retraction import code_of
+from graph_slam_ros.graph.records import native_or_plain
+from graph_slam_ros.graph.vertices import code_of
 from graph_slam_ros.solver import stretch_filter
 from graph_slam_ros.typing import Array, Index, Numbers
 

@@ -16,8 +16,8 @@ from scipy.spatial import cKDTree
 
 from graph_slam_ros.graph import GROUPS, POINT_SEEN_FROM, RELATIVE_POSE, RELATIVE_POSE_3D, SE2, SE3, Graph
 from graph_slam_ros.graph.geometry import rigid_motions
-from graph_slam_ros.graph.retraction import adjoints_of_inverses, code_of
 from graph_slam_ros.graph.tables import EdgeTable
+from graph_slam_ros.graph.vertices import adjoints_of_inverses, code_of
 from graph_slam_ros.typing import Array, Index
 
 _NEAR = 5.0  # poses between the ends of neighbours

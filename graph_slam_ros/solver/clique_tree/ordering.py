@@ -6,55 +6,299 @@ after both: a path from any vertex to the root is short, and an update touches l
 older part moves down, each vertex into the deepest region that keeps the separation true. A region whose subtree has
 grown too much is dissected anew; that is paid for by what was added to it. So is all of it when the numbers of its
 fronts have grown as much: by lap after lap along the same places they grow faster than the vertices.
+
+The separators are light sets of vertices without which a graph falls into two parts of about equal weight. They are
+found on several levels, as METIS does it (Karypis and Kumar, "A fast and high quality multilevel scheme for
+partitioning irregular graphs", SIAM J. Sci. Comput. 1998): contract pairs of neighbours until the graph is small,
+separate that in two ways, and carry the lighter separator back level after level, refining it on each (Fiduccia and
+Mattheyses 1982). A graph is (start, neighbour, strength, weight): the neighbours of u are
+neighbour[start[u]:start[u + 1]], each once, joined by so many edges of the original graph; weight is a vertex's degrees
+of freedom.
 """
 
 from typing import Any
 
 import numpy as np
 
-from graph_slam_ros.lie.jit import inner, kernel
-from graph_slam_ros.solver.clique_tree.indices import in_order, joined
-from graph_slam_ros.solver.clique_tree.pools import GROWTH, has_outgrown
-from graph_slam_ros.solver.clique_tree.separator import separate
+from graph_slam_ros.lie.jit import inlined, inner, kernel
+from graph_slam_ros.solver.clique_tree import storage as its
 from graph_slam_ros.solver.clique_tree.storage import (
-    ACTIVE,
-    COUNT,
-    DOF,
-    FLOPS,
-    FLOPS_SEEN,
-    FLOPS_USUAL,
-    FREE,
-    FREE_REGION,
-    KEY,
-    LINK,
-    LINK_EDGE,
-    LINK_END,
-    LINK_NEXT,
-    LINKED,
-    LIVE_MADE,
-    LOCAL,
-    NEXT,
     NOTHING,
-    R_COUNT,
-    R_DEPTH,
-    R_FIRST,
-    R_LEFT,
-    R_MADE,
-    R_PARENT,
-    R_RIGHT,
-    RECENT,
-    REGION,
-    REGIONS,
-    RESTRUCTURED,
-    RESTRUCTURED_SEEN,
-    TAIL_END,
-    TAIL_FIRST,
-    TAIL_KEPT,
-    TAIL_LEAST,
     ZERO,
     Tree,
+    ascending,
+    chosen,
+    has_outgrown,
+    in_order,
+    joined,
 )
-from graph_slam_ros.typing import Index
+from graph_slam_ros.typing import Array, Index
+
+COARSE = 40  # vertices of the graph that is separated first
+PASSES = 6  # of refinement on each level, at most
+PATIENCE = 40  # moves without gain before a pass ends
+HEAVIEST = 0.62  # share of one side
+SEPARATOR: Any = np.int64(2)  # side; not a literal, for which kernels would be compiled once more
+
+
+@kernel
+def separate(start: Index, neighbour: Index, strength: Index, weight: Index) -> Index:
+    """The side of each vertex, 0 or 1, or 2 where it separates them."""
+    if len(weight) <= COARSE:
+        return _first(start, neighbour, weight)
+    starts, neighbours, strengths, weights = [start], [neighbour], [strength], [weight]
+    coarser = [start[:0]]
+    while len(weights[-1]) > COARSE:
+        pair, count = _match(starts[-1], neighbours[-1], strengths[-1], weights[-1])
+        if 10 * count > 9 * len(pair):
+            break
+        a, b, c, d = _contract(starts[-1], neighbours[-1], strengths[-1], weights[-1], pair, count)
+        starts.append(a)
+        neighbours.append(b)
+        strengths.append(c)
+        weights.append(d)
+        coarser.append(pair)
+    side = _first(starts[-1], neighbours[-1], weights[-1])
+    for level in range(len(weights) - 2, -1, -1):
+        side = chosen(side, coarser[level + 1])
+        _refine(side, starts[level], neighbours[level], weights[level])
+    return side
+
+
+@inner
+def _match(start: Index, neighbour: Index, strength: Index, weight: Index) -> tuple[Index, int]:
+    """Pair each vertex with the neighbour that most edges join it to; return each vertex's pair, and their count."""
+    n = len(weight)
+    pair = np.full(n, NOTHING, np.int64)
+    neighbours, whole = np.empty(n, np.int64), 0
+    for u in range(n):
+        neighbours[u] = start[u + 1] - start[u]
+        whole += weight[u]
+    limit = 3 * whole // COARSE
+    count = 0
+    # those with few neighbours choose first: they have the least choice
+    for u in ascending(neighbours):
+        if pair[u] != NOTHING:
+            continue
+        best, mate = 0.0, u
+        for a in range(start[u], start[u + 1]):
+            w = neighbour[a]
+            if pair[w] == NOTHING and weight[u] + weight[w] <= limit and strength[a] / weight[w] > best:
+                best, mate = strength[a] / weight[w], w
+        pair[u] = pair[mate] = count
+        count += 1
+    return pair, count
+
+
+@inner
+def _contract(
+    start: Index, neighbour: Index, strength: Index, weight: Index, pair: Index, count: int
+) -> tuple[Index, Index, Index, Index]:
+    """The graph of the pairs."""
+    n = len(weight)
+    first, second = np.full(count, NOTHING, np.int64), np.full(count, NOTHING, np.int64)
+    heavier = np.zeros(count, np.int64)
+    for u in range(n):
+        heavier[pair[u]] += weight[u]
+        if first[pair[u]] == NOTHING:
+            first[pair[u]] = u
+        else:
+            second[pair[u]] = u
+    begin = np.zeros(count + 1, np.int64)
+    joined, stronger = np.empty(len(neighbour), np.int64), np.empty(len(neighbour), np.int64)
+    place = np.full(count, NOTHING, np.int64)
+    top = 0
+    for p in range(count):
+        begin[p] = top
+        for u in (first[p], second[p]):
+            if u == NOTHING:
+                continue
+            for a in range(start[u], start[u + 1]):
+                q = pair[neighbour[a]]
+                if q == p:
+                    continue
+                if place[q] < begin[p]:
+                    place[q] = top
+                    joined[top], stronger[top] = q, 0
+                    top += 1
+                stronger[place[q]] += strength[a]
+    begin[count] = top
+    return begin, joined[:top].copy(), stronger[:top].copy(), heavier
+
+
+@kernel
+def _first(start: Index, neighbour: Index, weight: Index) -> Index:
+    """Return the lighter of two separators: by the given order, and by the distance from its last vertex."""
+    order = np.arange(len(weight))
+    side = _sweep(order, start, neighbour, weight)
+    score = _refine(side, start, neighbour, weight)
+    other = _sweep(_by_distance(order[-1], start, neighbour), start, neighbour, weight)
+    return other if _refine(other, start, neighbour, weight) < score else side
+
+
+@inner
+def _by_distance(first: int, start: Index, neighbour: Index) -> Index:
+    """Return a breadth-first order from a vertex; parts that it does not reach follow, one by one."""
+    n = len(start) - 1
+    order = np.empty(n, np.int64)
+    seen = np.zeros(n, np.uint8)
+    order[0], seen[first] = first, 1
+    done, count, rest = 0, 1, 0
+    while done < n:
+        if done == count:
+            while seen[rest]:
+                rest += 1
+            order[count], seen[rest] = rest, 1
+            count += 1
+        u = order[done]
+        done += 1
+        for a in range(start[u], start[u + 1]):
+            w = neighbour[a]
+            if seen[w] == 0:
+                order[count], seen[w] = w, 1
+                count += 1
+    return order
+
+
+@inner
+def _sweep(order: Index, start: Index, neighbour: Index, weight: Index) -> Index:
+    """Cut an order in two; vertices of one part with a neighbour in the other separate. The lightest such cut."""
+    n = len(order)
+    position = np.empty(n, np.int64)
+    for k in range(n):
+        position[order[k]] = k
+    before, after = np.zeros(n + 2), np.zeros(n + 2)  # weight that begins or ends to separate at each cut
+    low, high = position.copy(), position.copy()
+    whole = 0
+    for u in range(n):
+        whole += weight[u]
+        for a in range(start[u], start[u + 1]):
+            q = position[neighbour[a]]
+            low[u], high[u] = min(low[u], q), max(high[u], q)
+        before[position[u] + 1] += weight[u]
+        before[high[u] + 1] -= weight[u]
+        after[low[u] + 1] += weight[u]
+        after[position[u] + 1] -= weight[u]
+    best, cut, of_before = np.inf, n // 2, True
+    x = y = 0.0
+    passed, half = 0.0, 0.5 * whole
+    for c in range(n):
+        x += before[c]
+        y += after[c]
+        if c > 0:
+            passed += weight[order[c - 1]]
+        score = min(x, y) * (1.0 + abs(passed - half) / half)
+        if abs(passed - half) <= 0.3 * half and score < best:
+            best, cut, of_before = score, c, x <= y
+    side = np.empty(n, np.int64)
+    for u in range(n):
+        if position[u] < cut:
+            side[u] = 2 if of_before and high[u] >= cut else 0
+        else:
+            side[u] = 2 if not of_before and low[u] < cut else 1
+    return side
+
+
+@inner
+def _refine(side: Index, start: Index, neighbour: Index, weight: Index) -> float:
+    """Lighten a separator by moving its vertices to a side, best first, even where it gets heavier for a while.
+
+    A vertex that moves to one side draws its neighbours on the other side into the separator. A pass ends without gain
+    for some moves and goes back to its best state. Returns the separator's weight, enlarged for unequal sides.
+    """
+    n = len(side)
+    total = np.zeros(3)
+    for u in range(n):
+        total[side[u]] += weight[u]
+    most = HEAVIEST * (total[0] + total[1] + total[2])
+    moved, was = np.empty(4 * n + 8, np.int64), np.empty(4 * n + 8, np.int64)
+    members, locked = np.empty(n, np.int64), np.empty(n, np.uint8)
+    score = _score(total)
+    for _ in range(PASSES):
+        count = ZERO
+        for u in range(n):
+            locked[u] = 0
+            if side[u] == 2:
+                members[count] = u
+                count += 1
+        begun = score
+        logged = kept = idle = 0
+        while idle < PATIENCE:
+            pick, to, count = _best_move(members, count, locked, total, most, side, start, neighbour, weight)
+            if pick == NOTHING or logged + 1 + start[pick + 1] - start[pick] > len(moved):
+                break
+            locked[pick] = 1
+            moved[logged], was[logged] = pick, 2
+            logged += 1
+            _shift(pick, to, side, total, weight)
+            for a in range(start[pick], start[pick + 1]):
+                w = neighbour[a]
+                if side[w] == 1 - to:
+                    moved[logged], was[logged] = w, 1 - to
+                    logged += 1
+                    _shift(w, SEPARATOR, side, total, weight)
+                    members[count] = w
+                    count += 1
+            idle += 1
+            if _score(total) < score:
+                score, kept, idle = _score(total), logged, 0
+        for m in range(logged - 1, kept - 1, -1):
+            _shift(moved[m], was[m], side, total, weight)
+        if score >= begun:
+            break
+    return score
+
+
+@inlined
+def _best_move(
+    members: Index,
+    count: int,
+    locked: Index,
+    total: Array,
+    most: float,
+    side: Index,
+    start: Index,
+    neighbour: Index,
+    weight: Index,
+) -> tuple[int, int, int]:
+    """Return the vertex whose move lightens the separator most, and its side; drop those that have left it."""
+    pick, to, best = NOTHING, 0, -np.inf
+    live = 0
+    for m in range(count):
+        u = members[m]
+        if side[u] != 2:
+            continue
+        members[live] = u
+        live += 1
+        if locked[u]:
+            continue
+        on_0 = on_1 = ZERO  # weight of its neighbours on each side
+        for a in range(start[u], start[u + 1]):
+            w = neighbour[a]
+            if side[w] == 0:
+                on_0 += weight[w]
+            elif side[w] == 1:
+                on_1 += weight[w]
+        for s in range(2):
+            gain = weight[u] - (on_1 if s == 0 else on_0)
+            if total[s] + weight[u] <= most and (gain > best or (gain == best and total[s] < total[to])):
+                pick, to, best = u, s, gain
+    return pick, to, live
+
+
+@inlined
+def _shift(u: int, to: int, side: Index, total: Array, weight: Index) -> None:
+    total[side[u]] -= weight[u]
+    side[u] = to
+    total[to] += weight[u]
+
+
+@inlined
+def _score(total: Array) -> float:
+    return total[2] * (1.0 + abs(total[0] - total[1]) / (total[0] + total[1] + total[2])) + 1e-3 * abs(
+        total[0] - total[1]
+    )
+
 
 LEAF = 6  # vertices a region need not be dissected for
 FEWEST = 64  # vertices by which a subtree must have grown as well: to dissect a small one costs more than it is worth
@@ -84,41 +328,41 @@ def move_tail(t: Tree, edges: Index, touched: Index) -> tuple[Index, int]:
     anew, or NOTHING.
     """
     vertex, region, tail, state = t.vertex, t.region, t.tail, t.state
-    first, end = state[TAIL_FIRST], state[TAIL_END]
+    first, end = state[its.TAIL_FIRST], state[its.TAIL_END]
     touched = joined(ends_of(t, edges), touched)
-    state[RESTRUCTURED] += 1
+    state[its.RESTRUCTURED] += 1
     if first == end:
         return touched, NOTHING
     back, beyond = ZERO, False
     for v in touched:
         back = max(back, tail[end - 1] - v)
-        beyond = beyond or vertex[v, REGION] != NOTHING
-    if back > TAIL_LEAST:
+        beyond = beyond or vertex[v, its.REGION] != NOTHING
+    if back > its.TAIL_LEAST:
         _decide_length(t, back)
-    keep = state[TAIL_KEPT]
-    beyond = beyond or (keep > TAIL_LEAST and back > TAIL_LEAST)
+    keep = state[its.TAIL_KEPT]
+    beyond = beyond or (keep > its.TAIL_LEAST and back > its.TAIL_LEAST)
     if end - first <= keep + (SLACK if beyond else SLACK_WITHOUT):
         return touched, NOTHING
     last = end - keep
     moving = tail[first:last]
-    state[TAIL_FIRST] = last
-    if last - first > max(region[0, R_COUNT], 4 * TAIL_LEAST):  # as many as there are: all in one go
+    state[its.TAIL_FIRST] = last
+    if last - first > max(region[0, its.R_COUNT], 4 * its.TAIL_LEAST):  # as many as there are: all in one go
         for v in moving:
-            if vertex[v, FREE] == 1:
+            if vertex[v, its.FREE] == 1:
                 _enter(t, v, ROOT)
         return touched, ROOT
     overgrown = NOTHING
     for v in moving:
-        if vertex[v, FREE] == 0:
+        if vertex[v, its.FREE] == 0:
             continue
         _enter(t, v, _deepest_place(t, v))
-        r = vertex[v, REGION]
+        r = vertex[v, its.REGION]
         while r != NOTHING:
-            if region[r, R_COUNT] > GROWTH * region[r, R_MADE] + FEWEST and (
-                overgrown == NOTHING or region[r, R_DEPTH] < region[overgrown, R_DEPTH]
+            if region[r, its.R_COUNT] > its.GROWTH * region[r, its.R_MADE] + FEWEST and (
+                overgrown == NOTHING or region[r, its.R_DEPTH] < region[overgrown, its.R_DEPTH]
             ):
                 overgrown = r
-            r = region[r, R_PARENT]
+            r = region[r, its.R_PARENT]
     if has_outgrown(t):
         overgrown = ROOT
     return joined(touched, neighbourhood(t, moving)), overgrown
@@ -136,17 +380,17 @@ def _decide_length(t: Tree, back: int) -> None:
     for k in range(len(reach) - 1):
         reach[k] = reach[k + 1]
     reach[-1] = back
-    updates = state[RESTRUCTURED] - state[RESTRUCTURED_SEEN]
-    spent = (state[FLOPS] - state[FLOPS_SEEN]) // updates
-    state[RESTRUCTURED_SEEN], state[FLOPS_SEEN] = state[RESTRUCTURED], state[FLOPS]
-    if state[TAIL_KEPT] == TAIL_LEAST:
-        state[FLOPS_USUAL] += (spent - state[FLOPS_USUAL]) // RECENT
-    enough = in_order(reach)[int(INSIDE * RECENT)] + 1
-    state[TAIL_KEPT] = TAIL_LEAST
+    updates = state[its.RESTRUCTURED] - state[its.RESTRUCTURED_SEEN]
+    spent = (state[its.FLOPS] - state[its.FLOPS_SEEN]) // updates
+    state[its.RESTRUCTURED_SEEN], state[its.FLOPS_SEEN] = state[its.RESTRUCTURED], state[its.FLOPS]
+    if state[its.TAIL_KEPT] == its.TAIL_LEAST:
+        state[its.FLOPS_USUAL] += (spent - state[its.FLOPS_USUAL]) // its.RECENT
+    enough = in_order(reach)[int(INSIDE * its.RECENT)] + 1
+    state[its.TAIL_KEPT] = its.TAIL_LEAST
     if enough <= TAIL_MOST:
-        size = (enough + SLACK) * t.vertex[t.tail[state[TAIL_END] - 1], DOF]
-        if 2 * size**3 <= state[FLOPS_USUAL]:
-            state[TAIL_KEPT] = enough
+        size = (enough + SLACK) * t.vertex[t.tail[state[its.TAIL_END] - 1], its.DOF]
+        if 2 * size**3 <= state[its.FLOPS_USUAL]:
+            state[its.TAIL_KEPT] = enough
 
 
 @kernel
@@ -155,12 +399,12 @@ def ends_of(t: Tree, edges: Index) -> Index:
     edge, link = t.edge, t.link
     count = 0
     for e in edges:
-        count += edge[e, COUNT]
+        count += edge[e, its.COUNT]
     out = np.empty(count, np.int64)
     count = 0
     for e in edges:
-        for s in range(edge[e, COUNT]):
-            out[count] = link[edge[e, LINKED] + s, LINK_END]
+        for s in range(edge[e, its.COUNT]):
+            out[count] = link[edge[e, its.LINKED] + s, its.LINK_END]
             count += 1
     return out
 
@@ -172,22 +416,22 @@ def neighbourhood(t: Tree, vertices: Index) -> Index:
     count = 0
     for v in vertices:
         count += 1
-        a = vertex[v, LINK]
+        a = vertex[v, its.LINK]
         while a != NOTHING:
-            count += edge[link[a, LINK_EDGE], COUNT]
-            a = link[a, LINK_NEXT]
+            count += edge[link[a, its.LINK_EDGE], its.COUNT]
+            a = link[a, its.LINK_NEXT]
     out = np.empty(count, np.int64)
     count = 0
     for v in vertices:
         out[count] = v
         count += 1
-        a = vertex[v, LINK]
+        a = vertex[v, its.LINK]
         while a != NOTHING:
-            e = link[a, LINK_EDGE]
-            for s in range(edge[e, COUNT]):
-                out[count] = link[edge[e, LINKED] + s, LINK_END]
+            e = link[a, its.LINK_EDGE]
+            for s in range(edge[e, its.COUNT]):
+                out[count] = link[edge[e, its.LINKED] + s, its.LINK_END]
                 count += 1
-            a = link[a, LINK_NEXT]
+            a = link[a, its.LINK_NEXT]
     return out
 
 
@@ -195,13 +439,13 @@ def neighbourhood(t: Tree, vertices: Index) -> Index:
 def _enter(t: Tree, v: int, region: int) -> None:
     """Put a vertex into a region."""
     vertex, t_region = t.vertex, t.region
-    vertex[v, REGION] = region
-    vertex[v, KEY] = key_of(t_region[region, R_DEPTH], region, v)
-    vertex[v, NEXT] = t_region[region, R_FIRST]
-    t_region[region, R_FIRST] = v
+    vertex[v, its.REGION] = region
+    vertex[v, its.KEY] = key_of(t_region[region, its.R_DEPTH], region, v)
+    vertex[v, its.NEXT] = t_region[region, its.R_FIRST]
+    t_region[region, its.R_FIRST] = v
     while region != NOTHING:
-        t_region[region, R_COUNT] += 1
-        region = t_region[region, R_PARENT]
+        t_region[region, its.R_COUNT] += 1
+        region = t_region[region, its.R_PARENT]
 
 
 @inner
@@ -211,43 +455,43 @@ def _deepest_place(t: Tree, v: int) -> int:
     deepest = NOTHING
     around = neighbourhood(t, np.full(1, v, np.int64))
     for u in around:
-        r = vertex[u, REGION]
-        if r != NOTHING and (deepest == NOTHING or region[r, R_DEPTH] > region[deepest, R_DEPTH]):
+        r = vertex[u, its.REGION]
+        if r != NOTHING and (deepest == NOTHING or region[r, its.R_DEPTH] > region[deepest, its.R_DEPTH]):
             deepest = r
     place = max(deepest, 0)
     apart = False
     for u in around:
-        r = vertex[u, REGION]
+        r = vertex[u, its.REGION]
         if r == NOTHING:
             continue
         a = deepest
-        while region[a, R_DEPTH] > region[r, R_DEPTH]:
-            a = region[a, R_PARENT]
+        while region[a, its.R_DEPTH] > region[r, its.R_DEPTH]:
+            a = region[a, its.R_PARENT]
         if a != r:
             apart = True
             while a != r:
-                a, r = region[a, R_PARENT], region[r, R_PARENT]
-            if region[a, R_DEPTH] < region[place, R_DEPTH]:
+                a, r = region[a, its.R_PARENT], region[r, its.R_PARENT]
+            if region[a, its.R_DEPTH] < region[place, its.R_DEPTH]:
                 place = a
-    while not apart and region[place, R_LEFT] != NOTHING:  # beyond a separator: begin in the emptier part
-        left, right = region[place, R_LEFT], region[place, R_RIGHT]
-        place = left if region[left, R_COUNT] <= region[right, R_COUNT] else right
+    while not apart and region[place, its.R_LEFT] != NOTHING:  # beyond a separator: begin in the emptier part
+        left, right = region[place, its.R_LEFT], region[place, its.R_RIGHT]
+        place = left if region[left, its.R_COUNT] <= region[right, its.R_COUNT] else right
     return place
 
 
 @inner
 def _new_region(t: Tree, parent: int) -> int:
     region, state = t.region, t.state
-    r = state[FREE_REGION]
+    r = state[its.FREE_REGION]
     if r != NOTHING:
-        state[FREE_REGION] = region[r, R_PARENT]
+        state[its.FREE_REGION] = region[r, its.R_PARENT]
     else:
-        r = state[REGIONS]
-        state[REGIONS] += 1
-    region[r, R_PARENT] = parent
-    region[r, R_DEPTH] = region[parent, R_DEPTH] + 1
-    region[r, R_LEFT] = region[r, R_RIGHT] = region[r, R_FIRST] = NOTHING
-    region[r, R_COUNT] = 0
+        r = state[its.REGIONS]
+        state[its.REGIONS] += 1
+    region[r, its.R_PARENT] = parent
+    region[r, its.R_DEPTH] = region[parent, its.R_DEPTH] + 1
+    region[r, its.R_LEFT] = region[r, its.R_RIGHT] = region[r, its.R_FIRST] = NOTHING
+    region[r, its.R_COUNT] = 0
     return r
 
 
@@ -255,31 +499,31 @@ def _new_region(t: Tree, parent: int) -> int:
 def _clear(t: Tree, region: int) -> Index:
     """Remove all vertices from a subtree of regions, and its inner regions; return the vertices by id."""
     vertex, t_region, state = t.vertex, t.region, t.state
-    out = np.empty(t_region[region, R_COUNT], np.int64)
+    out = np.empty(t_region[region, its.R_COUNT], np.int64)
     count = 0
     stack, top = np.empty(DEEPEST + 2, np.int64), 1
     stack[0] = region
     while top:
         top -= 1
         r = stack[top]
-        v = t_region[r, R_FIRST]
+        v = t_region[r, its.R_FIRST]
         while v != NOTHING:
-            if vertex[v, FREE] == 1:
+            if vertex[v, its.FREE] == 1:
                 out[count] = v
                 count += 1
-            v = vertex[v, NEXT]
-        if t_region[r, R_LEFT] != NOTHING:
-            stack[top], stack[top + 1] = t_region[r, R_LEFT], t_region[r, R_RIGHT]
+            v = vertex[v, its.NEXT]
+        if t_region[r, its.R_LEFT] != NOTHING:
+            stack[top], stack[top + 1] = t_region[r, its.R_LEFT], t_region[r, its.R_RIGHT]
             top += 2
         if r != region:
-            t_region[r, R_PARENT] = state[FREE_REGION]
-            state[FREE_REGION] = r
-    t_region[region, R_FIRST] = t_region[region, R_LEFT] = t_region[region, R_RIGHT] = NOTHING
-    gone = t_region[region, R_COUNT]
+            t_region[r, its.R_PARENT] = state[its.FREE_REGION]
+            state[its.FREE_REGION] = r
+    t_region[region, its.R_FIRST] = t_region[region, its.R_LEFT] = t_region[region, its.R_RIGHT] = NOTHING
+    gone = t_region[region, its.R_COUNT]
     r = region
     while r != NOTHING:
-        t_region[r, R_COUNT] -= gone
-        r = t_region[r, R_PARENT]
+        t_region[r, its.R_COUNT] -= gone
+        r = t_region[r, its.R_PARENT]
     return in_order(out[:count])
 
 
@@ -289,7 +533,7 @@ def dissect(t: Tree, region: int) -> Index:
     t_region = t.region
     vertices = _clear(t, region)
     if region == ROOT:
-        t.state[LIVE_MADE] = 0  # known as soon as there are cliques again
+        t.state[its.LIVE_MADE] = 0  # known as soon as there are cliques again
     start, neighbour, strength, weight = _graph_of(t, vertices)
     n = len(vertices)
     part = np.arange(n)
@@ -300,21 +544,21 @@ def dissect(t: Tree, region: int) -> Index:
         top -= 1
         low, high, r = stack[top, 0], stack[top, 1], stack[top, 2]
         mine, side = part[low:high].copy(), np.full(high - low, 2, np.int64)
-        if high - low > LEAF and t_region[r, R_DEPTH] < DEEPEST - 1:
+        if high - low > LEAF and t_region[r, its.R_DEPTH] < DEEPEST - 1:
             begin, joins, strong, heavy = _induced(mine, start, neighbour, strength, weight, place)
             side = separate(begin, joins, strong, heavy)
         middle, end = _parted(mine, side, part, low)
         whole = middle == low or end == middle  # it does not fall into two parts
         if not whole:
             left, right = _new_region(t, r), _new_region(t, r)
-            t_region[r, R_LEFT], t_region[r, R_RIGHT] = left, right
+            t_region[r, its.R_LEFT], t_region[r, its.R_RIGHT] = left, right
             stack[top, 0], stack[top, 1], stack[top, 2] = low, middle, left
             stack[top + 1, 0], stack[top + 1, 1], stack[top + 1, 2] = middle, end, right
             top += 2
         for k in range(len(mine)):
             if whole or side[k] == 2:
                 _enter(t, vertices[mine[k]], r)
-        t_region[r, R_MADE] = high - low
+        t_region[r, its.R_MADE] = high - low
     return vertices
 
 
@@ -342,23 +586,23 @@ def _graph_of(t: Tree, vertices: Index) -> tuple[Index, Index, Index, Index]:
     most = 0
     weight = np.empty(n, np.int64)
     for k in range(n):
-        vertex[vertices[k], LOCAL] = k
-        weight[k] = vertex[vertices[k], DOF]
-        a = vertex[vertices[k], LINK]
+        vertex[vertices[k], its.LOCAL] = k
+        weight[k] = vertex[vertices[k], its.DOF]
+        a = vertex[vertices[k], its.LINK]
         while a != NOTHING:
-            most += edge[link[a, LINK_EDGE], COUNT] - 1
-            a = link[a, LINK_NEXT]
+            most += edge[link[a, its.LINK_EDGE], its.COUNT] - 1
+            a = link[a, its.LINK_NEXT]
     start, neighbour, strength = np.zeros(n + 1, np.int64), np.empty(most, np.int64), np.empty(most, np.int64)
     place = np.full(n, NOTHING, np.int64)
     top = 0
     for k in range(n):
         start[k] = top
-        a = vertex[vertices[k], LINK]
+        a = vertex[vertices[k], its.LINK]
         while a != NOTHING:
-            e = link[a, LINK_EDGE]
-            a = link[a, LINK_NEXT]
-            for s in range(edge[e, COUNT] if edge[e, ACTIVE] else 0):
-                u = vertex[link[edge[e, LINKED] + s, LINK_END], LOCAL]
+            e = link[a, its.LINK_EDGE]
+            a = link[a, its.LINK_NEXT]
+            for s in range(edge[e, its.COUNT] if edge[e, its.ACTIVE] else 0):
+                u = vertex[link[edge[e, its.LINKED] + s, its.LINK_END], its.LOCAL]
                 if u in (NOTHING, k):
                     continue
                 if place[u] < start[k]:
@@ -368,7 +612,7 @@ def _graph_of(t: Tree, vertices: Index) -> tuple[Index, Index, Index, Index]:
                 strength[place[u]] += 1
     start[n] = top
     for v in vertices:
-        vertex[v, LOCAL] = NOTHING
+        vertex[v, its.LOCAL] = NOTHING
     return start, neighbour[:top], strength[:top], weight
 
 

@@ -9,50 +9,22 @@ A clique waits if a step of its separator changed after its own solution.
 import numpy as np
 
 from graph_slam_ros.graph import records
-from graph_slam_ros.graph.retraction import PLANAR, SPATIAL
-from graph_slam_ros.lie.addresses import integers
+from graph_slam_ros.graph.records import integers
+from graph_slam_ros.graph.vertices import PLANAR, SPATIAL
 from graph_slam_ros.lie.jit import inlined, inner, kernel
-from graph_slam_ros.solver.clique_tree.dense import solve_upper
-from graph_slam_ros.solver.clique_tree.indices import in_order, lengthened
-from graph_slam_ros.solver.clique_tree.numeric import retract_vertex
-from graph_slam_ros.solver.clique_tree.pointers import SHAPE_SIZE, kept_of, shapes_of, tree_of
+from graph_slam_ros.solver.clique_tree import storage as its
+from graph_slam_ros.solver.clique_tree.numeric import retract_vertex, solve_upper
 from graph_slam_ros.solver.clique_tree.storage import (
-    CHANGED,
-    CHILD,
-    CLIQUE,
-    DEFERRED,
-    DEFERRED_COUNT,
-    DOF,
-    FRONT_DOF,
-    FRONTALS,
-    FULL_DOF,
-    IN_DEFERRED,
-    IS_FAR,
-    IS_MUCH,
-    IS_SHIFTED,
-    IS_STALE,
-    KIND,
-    MARK,
-    MEMBERS,
-    MOTION_MM,
-    NOTED,
     NOTHING,
-    PARENT,
-    SEEN,
-    SHIFTED,
-    SHIFTED_COUNT,
-    SIBLING,
-    SIZE,
-    SOLUTIONS,
-    STALE,
-    STALE_COUNT,
-    STEP,
-    SUBSTITUTED,
-    VALUE,
     ZERO,
     Limits,
     Tree,
     front_of,
+    in_order,
+    kept_of,
+    lengthened,
+    shapes_of,
+    tree_of,
     with_children,
 )
 from graph_slam_ros.typing import Array, Index
@@ -76,10 +48,10 @@ def substitute(t: Tree, cliques: Index, tolerance: float, sigmas: float, far: Li
     solved, count = np.empty(64, np.int64), ZERO
     stack, top = np.empty(64, np.int64), ZERO
     x = np.empty(64)
-    t.state[SUBSTITUTED] += 1
+    t.state[its.SUBSTITUTED] += 1
     for c in cliques:
-        clique[c, MARK] = 1
-        if clique[c, PARENT] == NOTHING:
+        clique[c, its.MARK] = 1
+        if clique[c, its.PARENT] == NOTHING:
             if top == len(stack):
                 stack = lengthened(stack, top)
             stack[top] = c
@@ -87,11 +59,11 @@ def substitute(t: Tree, cliques: Index, tolerance: float, sigmas: float, far: Li
     while top:
         top -= 1
         c = stack[top]
-        clique[c, MARK] = 0
-        if len(x) < clique[c, FULL_DOF]:
-            x = np.empty(2 * clique[c, FULL_DOF])
+        clique[c, its.MARK] = 0
+        if len(x) < clique[c, its.FULL_DOF]:
+            x = np.empty(2 * clique[c, its.FULL_DOF])
         solve_clique(t, c, x, tolerance, sigmas)
-        low, frontals = clique[c, MEMBERS], clique[c, FRONTALS]
+        low, frontals = clique[c, its.MEMBERS], clique[c, its.FRONTALS]
         if count + frontals > len(solved):
             solved = lengthened(solved, count + frontals)
         for m in range(low, low + frontals):
@@ -99,19 +71,19 @@ def substitute(t: Tree, cliques: Index, tolerance: float, sigmas: float, far: Li
             solved[count] = v
             count += 1
             if is_large_step(t, v, False, far):
-                vertex[v, NOTED] |= IS_FAR
+                vertex[v, its.NOTED] |= its.IS_FAR
             else:
-                vertex[v, NOTED] &= ~IS_FAR
-        k = clique[c, CHILD]
+                vertex[v, its.NOTED] &= ~its.IS_FAR
+        k = clique[c, its.CHILD]
         while k != NOTHING:
-            if clique[k, MARK] == 1 or _is_noted(vertex, clique, members, k, IS_FAR):
+            if clique[k, its.MARK] == 1 or _is_noted(vertex, clique, members, k, its.IS_FAR):
                 if top == len(stack):
                     stack = lengthened(stack, top)
                 stack[top] = k
                 top += 1
             elif must_be_solved(vertex, clique, members, k):
                 _defer(t, k)
-            k = clique[k, SIBLING]
+            k = clique[k, its.SIBLING]
     return solved[:count]
 
 
@@ -126,12 +98,12 @@ def is_large_step(t: Tree, v: int, changed: bool, above: Limits) -> bool:
     ----------
     changed : whether the change since the last search is compared, instead of the whole step
     """
-    vertex, step, diagonal, unit = t.vertex, t.step, t.diagonal, 1e-3 * t.state[MOTION_MM]
-    first, kind = vertex[v, STEP], vertex[v, KIND]
-    turns = first + (2 if kind == PLANAR else 3 if kind == SPATIAL else vertex[v, DOF])
+    vertex, step, diagonal, unit = t.vertex, t.step, t.diagonal, 1e-3 * t.state[its.MOTION_MM]
+    first, kind = vertex[v, its.STEP], vertex[v, its.KIND]
+    turns = first + (2 if kind == PLANAR else 3 if kind == SPATIAL else vertex[v, its.DOF])
     is_pose = kind in (PLANAR, SPATIAL)
     largest = turned = information = 0.0
-    for i in range(first, first + vertex[v, DOF]):
+    for i in range(first, first + vertex[v, its.DOF]):
         scale, since = unit if is_pose and i < turns else 1.0, t.reference[i] if changed else 0.0
         one = abs(step[i] - since) / scale
         largest, turned = max(largest, one), max(turned, one if i >= turns else 0.0)
@@ -146,20 +118,20 @@ def solve_clique(t: Tree, c: int, x: Array, tolerance: float, sigmas: float) -> 
     vertex, clique, members, step, state = t.vertex, t.clique, t.members, t.step, t.state
     diagonal, listed = t.diagonal, t.listed
     limit = sigmas * abs(sigmas)
-    state[SOLUTIONS] += 1
-    clique[c, SEEN] = state[SOLUTIONS]
-    low, frontal = clique[c, MEMBERS], clique[c, FRONT_DOF]
+    state[its.SOLUTIONS] += 1
+    clique[c, its.SEEN] = state[its.SOLUTIONS]
+    low, frontal = clique[c, its.MEMBERS], clique[c, its.FRONT_DOF]
     at = frontal
-    for m in range(low + clique[c, FRONTALS], low + clique[c, SIZE]):
-        first = vertex[members[m], STEP]
-        for i in range(vertex[members[m], DOF]):
+    for m in range(low + clique[c, its.FRONTALS], low + clique[c, its.SIZE]):
+        first = vertex[members[m], its.STEP]
+        for i in range(vertex[members[m], its.DOF]):
             x[at + i] = step[first + i]
-        at += vertex[members[m], DOF]
-    solve_upper(front_of(clique, t.fronts, c), clique[c, FULL_DOF], frontal, x)
+        at += vertex[members[m], its.DOF]
+    solve_upper(front_of(clique, t.fronts, c), clique[c, its.FULL_DOF], frontal, x)
     at = 0
-    for m in range(low, low + clique[c, FRONTALS]):
+    for m in range(low, low + clique[c, its.FRONTALS]):
         v = members[m]
-        first, dof = vertex[v, STEP], vertex[v, DOF]
+        first, dof = vertex[v, its.STEP], vertex[v, its.DOF]
         change = error = 0.0
         for i in range(dof):
             d = abs(step[first + i] - x[at + i])
@@ -167,23 +139,23 @@ def solve_clique(t: Tree, c: int, x: Array, tolerance: float, sigmas: float) -> 
         if not (change <= tolerance or error <= limit):
             for i in range(dof):
                 step[first + i] = x[at + i]
-            vertex[v, CHANGED] = state[SOLUTIONS]
-            if vertex[v, NOTED] & IS_SHIFTED == 0:
-                listed[state[SHIFTED_COUNT], SHIFTED] = v
-                state[SHIFTED_COUNT] += 1
-            if vertex[v, NOTED] & IS_STALE == 0:
-                listed[state[STALE_COUNT], STALE] = v
-                state[STALE_COUNT] += 1
-            vertex[v, NOTED] |= IS_SHIFTED | IS_STALE
+            vertex[v, its.CHANGED] = state[its.SOLUTIONS]
+            if vertex[v, its.NOTED] & its.IS_SHIFTED == 0:
+                listed[state[its.SHIFTED_COUNT], its.SHIFTED] = v
+                state[its.SHIFTED_COUNT] += 1
+            if vertex[v, its.NOTED] & its.IS_STALE == 0:
+                listed[state[its.STALE_COUNT], its.STALE] = v
+                state[its.STALE_COUNT] += 1
+            vertex[v, its.NOTED] |= its.IS_SHIFTED | its.IS_STALE
         at += dof
 
 
 @inlined
 def must_be_solved(vertex: Index, clique: Index, members: Index, c: int) -> bool:
     """Return whether a step of a clique's separator changed after the clique was solved."""
-    seen = clique[c, SEEN]
-    for m in range(clique[c, MEMBERS] + clique[c, FRONTALS], clique[c, MEMBERS] + clique[c, SIZE]):
-        if vertex[members[m], CHANGED] > seen:
+    seen = clique[c, its.SEEN]
+    for m in range(clique[c, its.MEMBERS] + clique[c, its.FRONTALS], clique[c, its.MEMBERS] + clique[c, its.SIZE]):
+        if vertex[members[m], its.CHANGED] > seen:
             return True
     return False
 
@@ -191,8 +163,8 @@ def must_be_solved(vertex: Index, clique: Index, members: Index, c: int) -> bool
 @inlined
 def _is_noted(vertex: Index, clique: Index, members: Index, c: int, bit: int) -> bool:
     """Return whether a vertex of a clique's separator has a bit of ``NOTED``."""
-    for m in range(clique[c, MEMBERS] + clique[c, FRONTALS], clique[c, MEMBERS] + clique[c, SIZE]):
-        if vertex[members[m], NOTED] & bit:
+    for m in range(clique[c, its.MEMBERS] + clique[c, its.FRONTALS], clique[c, its.MEMBERS] + clique[c, its.SIZE]):
+        if vertex[members[m], its.NOTED] & bit:
             return True
     return False
 
@@ -200,10 +172,10 @@ def _is_noted(vertex: Index, clique: Index, members: Index, c: int, bit: int) ->
 @inlined
 def _defer(t: Tree, c: int) -> None:
     """Let a clique wait."""
-    if t.clique[c, IN_DEFERRED] == 0:
-        t.clique[c, IN_DEFERRED] = 1
-        t.listed[t.state[DEFERRED_COUNT], DEFERRED] = c
-        t.state[DEFERRED_COUNT] += 1
+    if t.clique[c, its.IN_DEFERRED] == 0:
+        t.clique[c, its.IN_DEFERRED] = 1
+        t.listed[t.state[its.DEFERRED_COUNT], its.DEFERRED] = c
+        t.state[its.DEFERRED_COUNT] += 1
 
 
 @inner
@@ -212,19 +184,19 @@ def solve_deferred(t: Tree, tolerance: float, sigmas: float) -> None:
     vertex, clique, members, listed, state = t.vertex, t.clique, t.members, t.listed, t.state
     stack, top = np.empty(64, np.int64), ZERO
     x = np.empty(64)
-    for i in range(state[DEFERRED_COUNT] - 1, -1, -1):  # the last first: it may be above an earlier one
-        stack[0], top = listed[i, DEFERRED], ZERO + 1
-        clique[stack[0], IN_DEFERRED] = 0
+    for i in range(state[its.DEFERRED_COUNT] - 1, -1, -1):  # the last first: it may be above an earlier one
+        stack[0], top = listed[i, its.DEFERRED], ZERO + 1
+        clique[stack[0], its.IN_DEFERRED] = 0
         while top:
             top -= 1
             c = stack[top]
             if not must_be_solved(vertex, clique, members, c):
                 continue
-            if len(x) < clique[c, FULL_DOF]:
-                x = np.empty(2 * clique[c, FULL_DOF])
+            if len(x) < clique[c, its.FULL_DOF]:
+                x = np.empty(2 * clique[c, its.FULL_DOF])
             solve_clique(t, c, x, tolerance, sigmas)
             stack, top = with_children(clique, c, stack, top)
-    state[DEFERRED_COUNT] = 0
+    state[its.DEFERRED_COUNT] = 0
 
 
 @inner
@@ -239,7 +211,7 @@ def solve_way(t: Tree, c: int, way: Index, tolerance: float, sigmas: float) -> I
         if must_be_solved(vertex, clique, members, c):
             first = count
         count += 1
-        c = clique[c, PARENT]
+        c = clique[c, its.PARENT]
     if first == NOTHING:
         return way
     x = np.empty(64)
@@ -247,14 +219,14 @@ def solve_way(t: Tree, c: int, way: Index, tolerance: float, sigmas: float) -> I
         c = way[i]
         if not must_be_solved(vertex, clique, members, c):
             continue
-        if len(x) < clique[c, FULL_DOF]:
-            x = np.empty(2 * clique[c, FULL_DOF])
+        if len(x) < clique[c, its.FULL_DOF]:
+            x = np.empty(2 * clique[c, its.FULL_DOF])
         solve_clique(t, c, x, tolerance, sigmas)
-        k = clique[c, CHILD]
+        k = clique[c, its.CHILD]
         while k != NOTHING:
             if must_be_solved(vertex, clique, members, k):
                 _defer(t, k)
-            k = clique[k, SIBLING]
+            k = clique[k, its.SIBLING]
     return way
 
 
@@ -273,8 +245,8 @@ def show(t: Tree, kept: Array, vertices: Index) -> None:
     vertex, value, step, estimate = t.vertex, t.value, t.step, t.estimate
     for v in vertices:
         retract_vertex(vertex, value, step, estimate, v)
-        x = vertex[v, VALUE]
-        for i in range(7 if vertex[v, KIND] == SPATIAL else vertex[v, DOF]):
+        x = vertex[v, its.VALUE]
+        for i in range(7 if vertex[v, its.KIND] == SPATIAL else vertex[v, its.DOF]):
             kept[x + i] = estimate[x + i]
 
 
@@ -282,13 +254,13 @@ def show(t: Tree, kept: Array, vertices: Index) -> None:
 def show_all(t: Tree, kept: Array, tolerance: float, sigmas: float) -> None:
     """Solve all that waits, and compute all estimates that have changed."""
     vertex, state = t.vertex, t.state
-    if state[DEFERRED_COUNT]:
+    if state[its.DEFERRED_COUNT]:
         solve_deferred(t, tolerance, sigmas)
-    stale = t.listed[: state[STALE_COUNT], STALE]
+    stale = t.listed[: state[its.STALE_COUNT], its.STALE]
     for v in stale:
-        vertex[v, NOTED] &= ~IS_STALE
+        vertex[v, its.NOTED] &= ~its.IS_STALE
     show(t, kept, stale.copy())
-    state[STALE_COUNT] = 0
+    state[its.STALE_COUNT] = 0
 
 
 @kernel
@@ -301,18 +273,18 @@ def read(
     for k in range(len(ids)):
         if ids[k] < 0 or ids[k] >= vertices or kind[ids[k]] != kind[ids[0]]:
             return k, np.empty((0, 0))
-    size = shapes_of(pointers)[kind[ids[0]], SHAPE_SIZE]
+    size = shapes_of(pointers)[kind[ids[0]], its.SHAPE_SIZE]
     out = np.empty((len(ids), size))
     if len(ids) > FEW:
         show_all(t, kept, tolerance, sigmas)
-    elif t.state[STALE_COUNT] or t.state[DEFERRED_COUNT]:
+    elif t.state[its.STALE_COUNT] or t.state[its.DEFERRED_COUNT]:
         way = np.empty(64, np.int64)
         for v in ids:
-            way = solve_way(t, vertex[v, CLIQUE], way, tolerance, sigmas)
-            if vertex[v, NOTED] & IS_STALE:  # and stays in the list
+            way = solve_way(t, vertex[v, its.CLIQUE], way, tolerance, sigmas)
+            if vertex[v, its.NOTED] & its.IS_STALE:  # and stays in the list
                 show(t, kept, np.full(1, v, np.int64))
     for k in range(len(ids)):
-        at = vertex[ids[k], VALUE]
+        at = vertex[ids[k], its.VALUE]
         for i in range(size):
             out[k, i] = estimate[at + i]
     return NOTHING, out
@@ -327,47 +299,47 @@ def find_changed(t: Tree, tolerance: float, sigmas: float, much: Limits) -> Inde
     """
     vertex, clique, members, listed, state = t.vertex, t.clique, t.members, t.listed, t.state
     step, reference = t.step, t.reference
-    for k in range(state[SHIFTED_COUNT]):
-        _note_if_much(t, listed[k, SHIFTED], much)
+    for k in range(state[its.SHIFTED_COUNT]):
+        _note_if_much(t, listed[k, its.SHIFTED], much)
     stack, top, x = np.empty(64, np.int64), ZERO, np.empty(64)
-    for k in range(state[DEFERRED_COUNT]):
-        stack[0], top = listed[k, DEFERRED], ZERO + 1
+    for k in range(state[its.DEFERRED_COUNT]):
+        stack[0], top = listed[k, its.DEFERRED], ZERO + 1
         while top:
             top -= 1
             c = stack[top]
             if not must_be_solved(vertex, clique, members, c):
                 continue
-            if not _is_noted(vertex, clique, members, c, IS_MUCH):
+            if not _is_noted(vertex, clique, members, c, its.IS_MUCH):
                 _defer(t, c)
                 continue
-            if len(x) < clique[c, FULL_DOF]:
-                x = np.empty(2 * clique[c, FULL_DOF])
+            if len(x) < clique[c, its.FULL_DOF]:
+                x = np.empty(2 * clique[c, its.FULL_DOF])
             solve_clique(t, c, x, tolerance, sigmas)
-            for m in range(clique[c, MEMBERS], clique[c, MEMBERS] + clique[c, FRONTALS]):
+            for m in range(clique[c, its.MEMBERS], clique[c, its.MEMBERS] + clique[c, its.FRONTALS]):
                 _note_if_much(t, members[m], much)
             stack, top = with_children(clique, c, stack, top)
     count = kept = 0
-    for k in range(state[DEFERRED_COUNT]):
-        c = listed[k, DEFERRED]
+    for k in range(state[its.DEFERRED_COUNT]):
+        c = listed[k, its.DEFERRED]
         if must_be_solved(vertex, clique, members, c):
-            listed[kept, DEFERRED] = c
+            listed[kept, its.DEFERRED] = c
             kept += 1
         else:
-            clique[c, IN_DEFERRED] = 0
-    state[DEFERRED_COUNT], kept = kept, 0
-    out = np.empty(state[SHIFTED_COUNT], np.int64)
-    for k in range(state[SHIFTED_COUNT]):
-        v = listed[k, SHIFTED]
-        if vertex[v, NOTED] & IS_MUCH:
-            for i in range(vertex[v, STEP], vertex[v, STEP] + vertex[v, DOF]):
+            clique[c, its.IN_DEFERRED] = 0
+    state[its.DEFERRED_COUNT], kept = kept, 0
+    out = np.empty(state[its.SHIFTED_COUNT], np.int64)
+    for k in range(state[its.SHIFTED_COUNT]):
+        v = listed[k, its.SHIFTED]
+        if vertex[v, its.NOTED] & its.IS_MUCH:
+            for i in range(vertex[v, its.STEP], vertex[v, its.STEP] + vertex[v, its.DOF]):
                 reference[i] = step[i]
-            vertex[v, NOTED] &= ~(IS_SHIFTED | IS_MUCH)
+            vertex[v, its.NOTED] &= ~(its.IS_SHIFTED | its.IS_MUCH)
             out[count] = v
             count += 1
         else:
-            listed[kept, SHIFTED] = v
+            listed[kept, its.SHIFTED] = v
             kept += 1
-    state[SHIFTED_COUNT] = kept
+    state[its.SHIFTED_COUNT] = kept
     return in_order(out[:count])
 
 
@@ -375,7 +347,7 @@ def find_changed(t: Tree, tolerance: float, sigmas: float, much: Limits) -> Inde
 def _note_if_much(t: Tree, v: int, much: Limits) -> None:
     """Note a vertex whose step has changed much since a search last found it."""
     if is_large_step(t, v, True, much):
-        t.vertex[v, NOTED] |= IS_MUCH
+        t.vertex[v, its.NOTED] |= its.IS_MUCH
 
 
 @kernel
@@ -383,8 +355,8 @@ def step_all(t: Tree, cliques: Index) -> None:
     """Solve cliques (children before parents) from the root down, to the last digit; estimates are not computed."""
     x = np.empty(64)
     for c in cliques[::-1]:
-        if len(x) < t.clique[c, FULL_DOF]:
-            x = np.empty(2 * t.clique[c, FULL_DOF])
+        if len(x) < t.clique[c, its.FULL_DOF]:
+            x = np.empty(2 * t.clique[c, its.FULL_DOF])
         solve_clique(t, c, x, -1.0, -1.0)
 
 
@@ -392,7 +364,7 @@ def step_all(t: Tree, cliques: Index) -> None:
 def forget(t: Tree) -> None:
     """Forget all steps, and what waits: the estimates are the linearisation points."""
     t.step[:] = t.reference[:] = 0.0
-    t.vertex[:, NOTED] = 0
-    t.clique[:, IN_DEFERRED] = 0
-    t.clique[:, SEEN] = t.state[SOLUTIONS]
-    t.state[SHIFTED_COUNT] = t.state[STALE_COUNT] = t.state[DEFERRED_COUNT] = 0
+    t.vertex[:, its.NOTED] = 0
+    t.clique[:, its.IN_DEFERRED] = 0
+    t.clique[:, its.SEEN] = t.state[its.SOLUTIONS]
+    t.state[its.SHIFTED_COUNT] = t.state[its.STALE_COUNT] = t.state[its.DEFERRED_COUNT] = 0

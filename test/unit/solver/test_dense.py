@@ -4,7 +4,7 @@ import numpy as np
 from rows import each
 from scipy.linalg import solve_triangular
 
-from graph_slam_ros.solver.clique_tree.dense import WIDE, pack, partial_cholesky, solve_upper
+from graph_slam_ros.solver.clique_tree.numeric import WIDE, pack, partial_cholesky, solve_upper
 from graph_slam_ros.solver.clique_tree.storage import NOTHING, packed_size
 
 SIZES = [(1, 1), (3, 3), (6, 2), (7, 7), (12, 5), (26, 2), (26, 3), (27, 3), (40, 33), (90, 47)]

@@ -5,7 +5,7 @@ from online import check_tree
 from rows import each
 
 from graph_slam_ros.solver import Settings, Solver
-from graph_slam_ros.solver.clique_tree.separator import HEAVIEST, separate
+from graph_slam_ros.solver.clique_tree.ordering import HEAVIEST, separate
 from graph_slam_ros.tools.simulation import city_graph
 
 

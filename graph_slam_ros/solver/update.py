@@ -1,52 +1,27 @@
-"""Vertices and edges on their way from the graph into the problem, and from there into the structure of the tree.
+"""An update in one compiled call: what arrives enters, is linearised and solved, and what is far is moved.
 
-Compiled code, which gets the graph and the problem by their pointers: ``Graph.pointers``, and the tree's
-(``clique_tree/pointers``) with the arrays of the problem behind them.
+Where Python is needed the call ends early, and is made again from the next stage on. Compiled code gets the graph and
+the problem by their pointers: ``Graph.pointers``, and the tree's (``pointers_of``) with the arrays of the problem
+behind them.
 """
 
 from graph_slam_ros.graph import records
-from graph_slam_ros.graph.records import table_at
-from graph_slam_ros.lie.addresses import flags, integers, reals
+from graph_slam_ros.graph.records import flags, integers, reals, table_at
 from graph_slam_ros.lie.jit import inner, kernel
-from graph_slam_ros.solver.clique_tree.incremental import enter
-from graph_slam_ros.solver.clique_tree.pointers import (
-    EDGE_INSIDE,
-    HELD,
-    INSIDE,
-    SHAPE_DOF,
-    SHAPE_KIND,
-    SHAPE_SIZE,
+from graph_slam_ros.solver.clique_tree import storage as its
+from graph_slam_ros.solver.clique_tree.incremental import DISSECT, advance_tree, enter, reach_back
+from graph_slam_ros.solver.clique_tree.storage import (
+    NOTHING,
+    ZERO,
+    Limits,
+    Tree,
     kept_of,
+    packed_size,
     shapes_of,
     tree_of,
 )
-from graph_slam_ros.solver.clique_tree.storage import (
-    ACTIVE,
-    BLOCK,
-    BLOCKS_TOP,
-    CHANGED,
-    COUNT,
-    DOF,
-    FREE,
-    KEY,
-    KIND,
-    LINK,
-    LINK_EDGE,
-    LINK_END,
-    LINK_NEXT,
-    LINKED,
-    LINKS,
-    LOCAL,
-    MARKED,
-    NOTED,
-    NOTHING,
-    OWNER,
-    STEP,
-    VALUE,
-    WIDTH,
-    Tree,
-    packed_size,
-)
+from graph_slam_ros.solver.linearization import linearize_edges
+from graph_slam_ros.solver.relinearization import MAYBE, SURELY
 from graph_slam_ros.typing import Index, Mask
 
 RECORDED, UNFIT_VERTEX, UNFIT_EDGE, WITHOUT_VERTEX, NO_ROOM = range(5)  # how ``record`` ends
@@ -77,7 +52,7 @@ def record(
     how many links and numbers of blocks there must be room for.
     """
     known, vertices, numbers, edge_count = counts
-    t, inside, edge_inside = tree_of(pointers), flags_at(pointers, INSIDE), flags_at(pointers, EDGE_INSIDE)
+    t, inside, edge_inside = tree_of(pointers), flags_at(pointers, its.INSIDE), flags_at(pointers, its.EDGE_INSIDE)
     _append_vertices(t, graph, pointers, known, vertices, numbers)
     bad = _unfit(new, inside, vertices)
     if bad != NOTHING:
@@ -92,7 +67,7 @@ def record(
     missing = _outside(graph, table_of, row_of, edges, inside, new)
     if missing != NOTHING:
         return WITHOUT_VERTEX, missing, 0
-    links, blocks, there = t.state[LINKS], t.state[BLOCKS_TOP], 0
+    links, blocks, there = t.state[its.LINKS], t.state[its.BLOCKS_TOP], 0
     for e in edges:
         table = table_at(graph, table_of[e])
         links += table[records.ENDS]
@@ -104,7 +79,7 @@ def record(
             if table_of[e] == code:
                 _append_edge(t, table_at(graph, code), e, row_of[e])
     for v in new:
-        there = max(there, t.vertex[v, KEY] != NOTHING)
+        there = max(there, t.vertex[v, its.KEY] != NOTHING)
     return RECORDED, there, 0
 
 
@@ -117,18 +92,18 @@ def _append_vertices(t: Tree, graph: Index, pointers: Index, first: int, end: in
     kept, shapes = kept_of(pointers), shapes_of(pointers)
     kinds, offset = integers(graph[records.KIND], end), integers(graph[records.OFFSET], end)
     initial = reals(graph[records.INITIAL], numbers)
-    step = 0 if first == 0 else vertex[first - 1, STEP] + vertex[first - 1, DOF]
+    step = 0 if first == 0 else vertex[first - 1, its.STEP] + vertex[first - 1, its.DOF]
     for v in range(first, end):
         for k in range(vertex.shape[1]):
             vertex[v, k] = NOTHING
-        vertex[v, FREE] = vertex[v, CHANGED] = vertex[v, NOTED] = 0
+        vertex[v, its.FREE] = vertex[v, its.CHANGED] = vertex[v, its.NOTED] = 0
         at, of = offset[v], kinds[v]
-        dof = shapes[of, SHAPE_DOF]
-        vertex[v, DOF], vertex[v, KIND] = dof, shapes[of, SHAPE_KIND]
-        vertex[v, STEP], vertex[v, VALUE] = step, at
+        dof = shapes[of, its.SHAPE_DOF]
+        vertex[v, its.DOF], vertex[v, its.KIND] = dof, shapes[of, its.SHAPE_KIND]
+        vertex[v, its.STEP], vertex[v, its.VALUE] = step, at
         for i in range(step, step + dof):
             t_step[i] = 0.0
-        for i in range(at, at + shapes[of, SHAPE_SIZE]):
+        for i in range(at, at + shapes[of, its.SHAPE_SIZE]):
             value[i] = estimate[i] = kept[i] = initial[i]
         step += dof
 
@@ -173,37 +148,31 @@ def _outside(graph: Index, table_of: Index, row_of: Index, edges: Index, inside:
 def _append_edge(t: Tree, table: Index, e: int, row: int) -> None:
     """Append the record of an edge, and link it to its vertices. It is not in the structure yet."""
     vertex, edge, t_link, state, blocks = t.vertex, t.edge, t.link, t.state, t.blocks
-    if edge[e, COUNT] > 0:  # by a call that was interrupted
+    if edge[e, its.COUNT] > 0:  # by a call that was interrupted
         return
     slots, width = table[records.ENDS], table[records.WIDTH]
     ends = integers(table[records.VERTICES], table[records.ROOM] * slots)
-    edge[e, COUNT], edge[e, LINKED] = slots, state[LINKS]
+    edge[e, its.COUNT], edge[e, its.LINKED] = slots, state[its.LINKS]
     for s in range(row * slots, (row + 1) * slots):
-        v, link = ends[s], state[LINKS]
-        state[LINKS] += 1
-        t_link[link, LINK_EDGE], t_link[link, LINK_END], t_link[link, LINK_NEXT] = e, v, vertex[v, LINK]
-        vertex[v, LINK] = link
-    edge[e, BLOCK] = state[BLOCKS_TOP]
-    state[BLOCKS_TOP] += packed_size(width)
-    edge[e, WIDTH], edge[e, ACTIVE], edge[e, OWNER], edge[e, MARKED] = width, 0, NOTHING, 0
-    for i in range(edge[e, BLOCK], state[BLOCKS_TOP]):
+        v, link = ends[s], state[its.LINKS]
+        state[its.LINKS] += 1
+        t_link[link, its.LINK_EDGE], t_link[link, its.LINK_END], t_link[link, its.LINK_NEXT] = e, v, vertex[v, its.LINK]
+        vertex[v, its.LINK] = link
+    edge[e, its.BLOCK] = state[its.BLOCKS_TOP]
+    state[its.BLOCKS_TOP] += packed_size(width)
+    edge[e, its.WIDTH], edge[e, its.ACTIVE], edge[e, its.OWNER], edge[e, its.MARKED] = width, 0, NOTHING, 0
+    for i in range(edge[e, its.BLOCK], state[its.BLOCKS_TOP]):
         blocks[i] = 0.0
 
 
 @kernel
-def anchorage(graph: Index, pointers: Index, vertices: Index, edges: Index) -> int:
+def anchorage(t: Tree, graph: Index, pointers: Index, vertices: Index, edges: Index) -> int:
     """Return ANCHORED if edges join each vertex, by a chain, to an older one or to an edge on one vertex alone.
 
     LEFT_OUT is returned if one of the vertices is no unknown, or one of the edges has no weight: without these it is to
     be asked again.
     """
-    return how_anchored(tree_of(pointers), graph, pointers, vertices, edges)
-
-
-@inner
-def how_anchored(t: Tree, graph: Index, pointers: Index, vertices: Index, edges: Index) -> int:
-    """Do as ``anchorage``, with the tree itself."""
-    inside, held = flags_at(pointers, INSIDE), flags_at(pointers, HELD)
+    inside, held = flags_at(pointers, its.INSIDE), flags_at(pointers, its.HELD)
     for v in vertices:
         if held[v] or not inside[v]:
             return LEFT_OUT
@@ -220,34 +189,85 @@ def how_anchored(t: Tree, graph: Index, pointers: Index, vertices: Index, edges:
 def _are_anchored(vertex: Index, edge: Index, link: Index, new: Index, edges: Index) -> bool:
     """Return whether edges join each new vertex, by a chain, to an older one or to an edge on one vertex alone."""
     for v in new:
-        vertex[v, LOCAL] = 0
+        vertex[v, its.LOCAL] = 0
     for e in edges:
-        edge[e, MARKED] = 1
+        edge[e, its.MARKED] = 1
     count, gained = 0, len(new) <= FEW
     while gained and count < len(new):
         gained = False
         for v in new:
-            a = vertex[v, LINK]
-            while a != NOTHING and vertex[v, LOCAL] == 0:
-                e = link[a, LINK_EDGE]
-                a = link[a, LINK_NEXT]
-                if edge[e, MARKED] == 0:
+            a = vertex[v, its.LINK]
+            while a != NOTHING and vertex[v, its.LOCAL] == 0:
+                e = link[a, its.LINK_EDGE]
+                a = link[a, its.LINK_NEXT]
+                if edge[e, its.MARKED] == 0:
                     continue
-                fixed = edge[e, COUNT] == 1
-                for s in range(edge[e, COUNT]):
-                    fixed = fixed or vertex[link[edge[e, LINKED] + s, LINK_END], LOCAL] != 0
+                fixed = edge[e, its.COUNT] == 1
+                for s in range(edge[e, its.COUNT]):
+                    fixed = fixed or vertex[link[edge[e, its.LINKED] + s, its.LINK_END], its.LOCAL] != 0
                 if fixed:
-                    vertex[v, LOCAL] = 1
+                    vertex[v, its.LOCAL] = 1
                     count += 1
                     gained = True
     for v in new:
-        vertex[v, LOCAL] = NOTHING
+        vertex[v, its.LOCAL] = NOTHING
     for e in edges:
-        edge[e, MARKED] = 0
+        edge[e, its.MARKED] = 0
     return count == len(new)
 
 
+CHECK, LINEARIZE, ORDER, GROUP, END = range(5)  # stages: where the call begins; after the last there is nothing to do
+UNSURE, SEARCH, IN_PYTHON = range(DISSECT + 1, DISSECT + 4)  # how it ends where the tree was not advanced
+
+
 @kernel
-def enter_newest(pointers: Index, vertices: Index, edges: Index) -> None:
-    """Call ``enter`` for the tree of some pointers."""
-    enter(tree_of(pointers), vertices, edges)
+def update(
+    graph: Index,
+    pointers: Index,
+    stage: int,
+    due: int,
+    vertices: Index,
+    edges: Index,
+    linear: Index,
+    again: Index,
+    touched: Index,
+    unseen: Index,
+    young: Index,
+    losses: Index,
+    tolerance: float,
+    sigmas: float,
+    far: Limits,
+) -> tuple[int, int, int, Index]:
+    """Integrate vertices and edges into the solution of a problem.
+
+    Parameters
+    ----------
+    graph, pointers : those of the graph, and of the problem
+    stage : CHECK: all of it; LINEARIZE: they have entered; ORDER: they are linearised; GROUP: their tail is moved
+    due : whether all vertices that moved are to be searched for large steps (``RelinearizationSchedule.is_due``)
+    vertices, edges : that enter or have changed
+    linear : edges to linearise: these, and those ``again`` that are far from where they were linearised
+    touched, unseen, tolerance, sigmas, far : see ``advance_tree``
+    young, losses : edges held to the first stage of their loss; pointers of the losses of first and last stage
+
+    Returns
+    -------
+    What ``advance_tree`` returns; or, and the rest says nothing:
+
+    * UNSURE: it may be that nothing fixes a vertex, or one is held, or an edge has no weight. Nothing was changed
+    * SEARCH: they have entered, and it is time to search
+    * IN_PYTHON: an edge is not compiled, or its cost is not finite; all are to be linearised in Python
+    """
+    t, nothing = tree_of(pointers), vertices[:0]
+    if stage <= CHECK:
+        if anchorage(t, graph, pointers, vertices, edges) != ANCHORED:
+            return UNSURE, ZERO, ZERO, nothing
+        enter(t, vertices, edges)
+        if due == SURELY or (due == MAYBE and reach_back(t, edges)):
+            return SEARCH, ZERO, ZERO, nothing
+    if stage <= LINEARIZE:
+        table, _ = linearize_edges(t, graph, linear, losses[4:], young, losses[:4])
+        if table != NOTHING:
+            return IN_PYTHON, ZERO, ZERO, nothing
+    tail = stage <= ORDER
+    return advance_tree(t, kept_of(pointers), edges, touched, vertices, tail, again, unseen, tolerance, sigmas, far)
