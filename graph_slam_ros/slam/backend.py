@@ -216,13 +216,14 @@ class Backend:
     def revise(self, what: str, change: Callable[[], Result | None]) -> Result | None:
         """Change what was solved. After an exception, which is counted, all is as it was, and the result is None."""
         before, handed_over = self._frozen_graph(0, self.solver.settings), self.handed_over
-        factors, rescalings, changes = dict(self.noise.factors), len(self.noise.history), len(self.ledger.history)
+        factors, rescalings, count = dict(self.noise.factors), len(self.noise.history), len(self.ledger.history)
         try:
             return change()
         except Exception as error:
             self._counters.count_failure(what, error)
         vars(self.graph).update(vars(before.graph))
-        vars(self.ledger).update(vars(before.ledger) | {"history": self.ledger.history[:changes]})
+        going_on = {"history": self.ledger.history[:count], "changes": self.ledger.changes + 1}
+        vars(self.ledger).update(vars(before.ledger) | going_on)
         self.noise.go_back(factors, rescalings)
         fresh = Solver(self.graph, self.solver.settings)
         fresh.start_at(before.values)
@@ -293,7 +294,7 @@ class Backend:
     def renumber(self, new: Index) -> None:
         """Take over new ids of edges, by old ones, after graph and solver were compacted."""
         self.decisions.renumber(new)
-        self.frozen_edges = self.ledger.final
+        self.frozen_edges = int(np.count_nonzero(new[: self.frozen_edges] >= 0))
         self.held = self.held[0], int(np.count_nonzero(new[: self.held[1]] >= 0))
         self.handed_over = self.graph.vertex_count, self.graph.edge_count
         self._rivals = ()

@@ -107,8 +107,7 @@ class BoundedMap:
         self._landmarks, self._anchor, self._kidnaps = landmarks, anchor, kidnaps
         self._solution, self._counters = solution, counters
         self.state = backend.bounded
-        self.condenser = Condenser(self._space, backend.solver)
-        self.condenser.places, self.condenser.scale = self.state.places, self.state.scale
+        self.condenser = Condenser(self._space, backend.solver, self.state)
         self._tried = 0  # keyframes at the last try
 
     @property
@@ -147,9 +146,7 @@ class BoundedMap:
         condensed = backend.revise(_SOURCE, self._condensed_visits)
         if condensed is None:
             self._tried += BATCH - 1  # the same would most likely fail at the next keyframe again
-            self.state.places.clear()
-            self.state.places.update(places)
-            self.state.scale = self.condenser.scale = scale
+            self.state.places, self.state.scale = places, scale
             return None
         rows, end = condensed
         return self._compacted(rows, Left(self._left(rows), self._sightings(end)), end) if rows else None
@@ -237,12 +234,8 @@ class BoundedMap:
         before = self.state.sightings
         vertices, edges = self._staying(int(keyframes.ids[end - keyframes.first]))
         gone = np.setdiff1d(np.arange(graph.edge_count), edges)
-        out = Condensation(
-            left,
-            keyframes.first,
-            before,
-            archived(self._backend, keyframes, gone, self._landmarks.map.names()),
-        )
+        archive = archived(self._backend, keyframes, gone, self._landmarks.map.names())
+        out = Condensation(left, keyframes.first, before, archive)
         new = compact(self._backend.solver, vertices, edges)
         self._backend.renumber(new.edges)
         self._frontend.forget_before(end, new.vertices[keyframes.ids[end - keyframes.first :]])

@@ -6,7 +6,6 @@ All of it follows from the ingest sequence: a replay fails where the live run di
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 
@@ -18,9 +17,7 @@ from graph_slam_ros.slam.landmarks.landmark_map import Landmarks
 from graph_slam_ros.slam.robust.gating import CANDIDATES
 from graph_slam_ros.slam.robust.landmark_support import landmark_of
 from graph_slam_ros.slam.robust.ledger import Reason
-from graph_slam_ros.typing import Array
-
-Result = TypeVar("Result")
+from graph_slam_ros.typing import Array, Result
 
 _FAR = 1.0  # m, rad: a number that changed by less has not diverged
 _RISE = 10.0  # times the cost before, or of residuals as large as their noise: more is no solution

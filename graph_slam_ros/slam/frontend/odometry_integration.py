@@ -36,19 +36,6 @@ class OdometryNoise:
     each step. A robot at rest adds none.
     """
 
-    __slots__ = (
-        "_by_motion",
-        "_by_twist",
-        "_config",
-        "_density",
-        "_flat",
-        "_heading",
-        "_none",
-        "_space",
-        "_square",
-        "_way",
-    )
-
     def __init__(self, config: OdometryConfig, space: Geometry) -> None:
         self._config, self._space = config, space
         c = config

@@ -13,7 +13,8 @@ from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.graph.graph import kept_part, new_ids
 from graph_slam_ros.graph.losses import weight_and_cost
 from graph_slam_ros.slam.lifelong.elimination import product, square_root, symmetric
-from graph_slam_ros.slam.lifelong.place import Cell, Place, PlaceEdge, VisitScale, added_place, fit_of
+from graph_slam_ros.slam.lifelong.place import Cell, Place, PlaceEdge, added_place, fit_of
+from graph_slam_ros.slam.lifelong.state import BoundedState
 from graph_slam_ros.slam.lifelong.visit import best_known, visit_of
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Index, Numbers
@@ -23,22 +24,9 @@ CHAIN = "composed"  # label of edges that are composed of odometry
 ITSELF, PLACE = "it contradicts itself", "it contradicts its place"
 """Why the sightings of a visit are lost."""
 _FEWEST = 3  # ranges or bearings that are enough for a landmark whose visit is condensed
+_MOST_MEMBERS, _MOST_PLACES = 48, 8  # landmarks of one place; places of one cell
+_GATE = 0.9999  # quantile of chi2 above which a visit contradicts itself or its place
 _AHEAD = 3  # landmarks of places that the keyframes after a visit must see before odometry to it is cut
-
-
-@dataclass(frozen=True, slots=True)
-class Limits:
-    """Limits of the size of places, and of what is believed.
-
-    Attributes
-    ----------
-    members : landmarks of one place, at most; places : of one cell, at most
-    gate : quantile of chi2 above which a visit contradicts itself or its place
-    """
-
-    members: int = 48
-    places: int = 8
-    gate: float = 0.9999
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,16 +221,13 @@ def _factors(solver: Solver, edges: dict[int, Edge]) -> dict[int, float]:
 class Condenser:
     """Condenses visits in a graph and its solver, in order of time. The caller updates the solver after each.
 
-    Attributes
+    Parameters
     ----------
-    places : by cell
-    scale : of the variances of visits
+    state : whose places and scale change
     """
 
-    def __init__(self, space: Geometry, solver: Solver, limits: Limits | None = None) -> None:
-        self.space, self.solver, self.limits = space, solver, limits or Limits()
-        self.places: dict[Cell, list[PlaceEdge]] = {}
-        self.scale = VisitScale()
+    def __init__(self, space: Geometry, solver: Solver, state: BoundedState) -> None:
+        self.space, self.solver, self.state = space, solver, state
 
     def condense(
         self, visit: Sequence[int], after: int, cell: Cell, ahead: Collection[int], *, waits: bool = True
@@ -258,11 +243,11 @@ class Condenser:
         around = surroundings(self.space, self.solver, visit, after)
         if around.unfit:
             return Condensed("kept", around.unfit)
-        in_cell, seen = self.places.get(cell, []), around.seen
+        in_cell, seen = self.state.places.get(cell, []), around.seen
         best = max(in_cell, key=lambda one: len(seen & set(one.place.members)), default=None)
-        fits = best is not None and len(seen | set(best.place.members)) <= self.limits.members
+        fits = best is not None and len(seen | set(best.place.members)) <= _MOST_MEMBERS
         is_again = fits and best is not None and self._lay(seen & set(best.place.members))
-        has_room = len(in_cell) < self.limits.places and self._lay(seen)
+        has_room = len(in_cell) < _MOST_PLACES and self._lay(seen)
         if is_again and len(self._known() & set(ahead)) < _AHEAD:
             if waits or not has_room:
                 return Condensed("waits")
@@ -282,9 +267,9 @@ class Condenser:
             )
             if not ends <= set(one.members):
                 raise SingularError("odometry does not determine the visit")
-            if degrees > 0 and chi2 > quantile(self.limits.gate, degrees):
+            if degrees > 0 and chi2 > quantile(_GATE, degrees):
                 return self._composed(visit, after, around, ITSELF)
-            one = replace(one, information=one.information / self.scale.factor)
+            one = replace(one, information=one.information / self.state.scale.factor)
             if is_again and best is not None:
                 return self._again(visit, after, around, one, best)
             return self._first(visit, visit[at], around, one, cell)
@@ -301,7 +286,7 @@ class Condenser:
 
     def rescale(self) -> None:
         """Scale all places, where visits so far say that their variances are larger or smaller."""
-        if (by := self.scale.change()) != 1.0:
+        if (by := self.state.scale.change()) != 1.0:
             for one in self._all():
                 place = replace(one.place, information=one.place.information / by)
                 now = added_place(self.space, self.solver.graph, one.base, place, square_root(place.information))
@@ -316,17 +301,17 @@ class Condenser:
         if lonely := self._left_alone(around, one.members):
             return Condensed("kept", f"landmark {lonely[0]} would be left without a measurement")
         begun = added_place(self.space, self.solver.graph, base, one, square_root(one.information))
-        self.places.setdefault(cell, []).append(begun)
+        self.state.places.setdefault(cell, []).append(begun)
         gone = [vertex for vertex in visit if vertex != base and vertex not in one.members]
         return Condensed("first", removed=self._replace(gone, base, around.own, [begun.edge]))
 
     def _again(self, visit: Sequence[int], after: int, around: Surroundings, one: Place, at: PlaceEdge) -> Condensed:
         """Add a visit to a place, and cut the odometry on both sides of it."""
         guess = self._between(*self.solver.estimate([at.base, visit[len(visit) // 2]]).tolist())
-        fit = fit_of(self.space, at.place, one, guess, self.limits.gate, at.strikes)
+        fit = fit_of(self.space, at.place, one, guess, _GATE, at.strikes)
         if fit.result is not None and (lonely := self._left_alone(around, fit.result.place.members)):
             return Condensed("kept", f"landmark {lonely[0]} would be left without a measurement")
-        self.scale.add(fit.as_is, self.limits.gate)
+        self.state.scale.add(fit.as_is, _GATE)
         if (result := fit.result) is None:
             return self._composed(visit, after, around, PLACE)
         now = added_place(self.space, self.solver.graph, at.base, result.place, square_root(result.place.information))
@@ -381,7 +366,7 @@ class Condenser:
         return is_pose or len(marks) >= self.space.dimensions
 
     def _all(self) -> list[PlaceEdge]:
-        return [one for in_cell in self.places.values() for one in in_cell]
+        return [one for in_cell in self.state.places.values() for one in in_cell]
 
     def _known(self) -> set[int]:
         return {mark for one in self._all() for mark in one.place.members}
