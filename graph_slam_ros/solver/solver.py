@@ -492,7 +492,7 @@ class Solver:
         out = np.zeros((len(is_free), int(dofs[vertex])))
         if not held[vertex]:
             unit = np.eye(*out.shape, -first)[is_free]
-            out[is_free] = splu(self._information().tocsc(), permc_spec="MMD_AT_PLUS_A").solve(unit)
+            out[is_free] = splu(self._information(self._tree.value).tocsc(), permc_spec="MMD_AT_PLUS_A").solve(unit)
         return np.split(out, np.cumsum(dofs)[:-1])
 
     def information_matrix(self) -> Array:
@@ -502,7 +502,7 @@ class Solver:
         linearisation points may be a small step (``Settings.relinearize_above``) away.
         """
         self._grow()
-        return self._information().toarray()
+        return self._information(self._estimates()).toarray()
 
     def rebuild(self) -> None:
         """Rebuild everything from the graph, at the present estimate; a failure leaves all as it was.
@@ -787,11 +787,11 @@ class Solver:
             self._pending.broken = True
         self._numbers_current = True
 
-    def _information(self) -> coo_array:
-        """H over the vertices that are not held, in order of id."""
+    def _information(self, x: Array) -> coo_array:
+        """H at the stored values x, over the vertices that are not held, in order of id."""
         free = np.flatnonzero(self._inside & ~self._held)
         losses = self._stages.losses(self.settings)[-1]
-        return information(self.graph, self._estimates(), rows_of(self.graph, self.edges), free, losses)
+        return information(self.graph, x, rows_of(self.graph, self.edges), free, losses)
 
     def _linearize(self, edges: Index) -> None:
         """Put the blocks of edges at the linearisation points into the tree."""
