@@ -88,14 +88,14 @@ HELD = "test_G7_where_nothing_that_has_come_is_to_blame_the_last_good_estimate_i
 CERTAIN = "test_A12_however_certain_odometry_says_it_is_its_edges_are_not_and_what_they_are_part_of_is_solved"
 STAYS = "test_T14_whatever_fails_at_any_solve_the_last_good_estimate_stays_and_soon_one_succeeds[6]"
 BEGINS = "test_B7_after_a_jump_of_time_what_is_older_than_the_map_is_used_and_begins_a_segment"
-_PLACED = "return '' if candidate.places else original(config, space, solver, candidate, glances)"
+_PLACED = "return '' if found else original(space, solver, seen, glances, found)"
 _UNCHECKED = "from dataclasses import replace\nreturn original(replace(chunk, uncompressed_crc=0))"
 _OVER = "(folder / name).write_bytes(text.encode())\nreturn checksum(text.encode())"
 BUGS = (
     Bug(
         "undetermined_landmark",
         "one landmark by bearing alone makes the whole problem singular",
-        {"slam/landmarks/determination.py: why_undetermined": _PLACED},
+        {"slam/landmarks/triangulation.py: why_undetermined": _PLACED},
         ("test_pipeline_kinds.py::test_G3_a_landmark_seen_by_bearing_from_one_place_waits_and_says_why",),
     ),
     Bug(  # all of the check: a cost that is not finite fails its second half, too

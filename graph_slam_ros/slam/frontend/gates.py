@@ -1,55 +1,39 @@
 """Gates: each refuses a part of the measurements, counts it under its reason, and passes the rest to the next."""
 
-from collections.abc import Callable, Sequence
-from typing import Generic, Protocol, TypeVar
+from collections.abc import Sequence
+from typing import Protocol
 
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.types import Closure, Fix, Observation
+from graph_slam_ros.slam.frontend.ingest_gate import size_of
 from graph_slam_ros.slam.frontend.keyframes import KeyframeList
 from graph_slam_ros.slam.frontend.odometry_selector import OdometrySelector
 
 
-class Arrival(Protocol):
-    """A measurement with a topic: a gate decides on it."""
-
-    @property
-    def topic(self) -> str:
-        """The input that it is counted under."""
-
-
-Item = TypeVar("Item", bound=Arrival)
-
-
-class Gate(Protocol[Item]):
+class Gate(Protocol):
     """A check of what arrives."""
 
     @property
     def reason(self) -> str:
         """The reason under which refused measurements are counted."""
 
-    def admit(self, m: Item) -> Item | None:
+    def admit(self, m: Observation) -> Observation | None:
         """Return the part that passes, or None."""
 
 
-class GateChain(Generic[Item]):
-    """Several gates, applied in order.
+class GateChain:
+    """Several gates, applied in order."""
 
-    Parameters
-    ----------
-    size : the number of things in an item; each that is refused counts
-    """
+    def __init__(self, gates: Sequence[Gate], counters: Counters) -> None:
+        self._gates, self._counters = gates, counters
 
-    def __init__(self, gates: Sequence[Gate[Item]], size: Callable[[Item], int], counters: Counters) -> None:
-        self._gates, self._size, self._counters = gates, size, counters
-
-    def admit(self, m: Item) -> Item | None:
+    def admit(self, m: Observation) -> Observation | None:
         """Return the part that passes all gates, or None."""
         for gate in self._gates:
             passed = gate.admit(m)
-            refused = self._size(m) - (self._size(passed) if passed is not None else 0)
+            refused = size_of(m) - (size_of(passed) if passed is not None else 0)
             if refused or passed is None:
-                reason = gate.reason
-                self._counters.count(m.topic, reason, refused)
+                self._counters.count(m.topic, gate.reason, refused)
             if passed is None:
                 return None
             m = passed

@@ -23,7 +23,6 @@ from graph_slam_ros.slam.frontend.corrections import Corrections
 from graph_slam_ros.slam.frontend.frozen_odometry import FrozenOdometry
 from graph_slam_ros.slam.frontend.gates import ClosureStart, DatumGate, GateChain
 from graph_slam_ros.slam.frontend.gyro import GyroFusion, SavedBias
-from graph_slam_ros.slam.frontend.ingest_gate import size_of
 from graph_slam_ros.slam.frontend.keyframes import Keyframe, KeyframeList, SightingPose
 from graph_slam_ros.slam.frontend.max_distance import MaxDistance
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
@@ -89,12 +88,10 @@ class KeyframeFrontend:
         self.order = StampOrder(config.ordering, counters, self.corrections.lag_ns)
         self.pending = PendingObservations(config.ordering, self.path, self.odometry, counters)
         self.datum = DatumGate(datum)
-        self._arrivals = GateChain[Observation]((self.datum,), size_of, counters)
+        self._arrivals = GateChain((self.datum,), counters)
         self._thinning = ObservationThinning(config, self.path)
-        self.gates = GateChain[Observation](
-            (ClosureStart(self.path, self.odometry), MaxDistance(self._space, config.sources), self._thinning),
-            size_of,
-            counters,
+        self.gates = GateChain(
+            (ClosureStart(self.path, self.odometry), MaxDistance(self._space, config.sources), self._thinning), counters
         )
         self._frozen = FrozenOdometry(self._noise, self._space)
         self.frozen_ns: int | None = None

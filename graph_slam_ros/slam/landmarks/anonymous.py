@@ -15,7 +15,6 @@ from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.measurements.counters import Counters
-from graph_slam_ros.measurements.edge_noise import LEAST_M2
 from graph_slam_ros.measurements.types import Sightings
 from graph_slam_ros.slam.frontend.keyframes import Keyframe
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
@@ -32,19 +31,10 @@ from graph_slam_ros.slam.landmarks.known_map import with_map
 from graph_slam_ros.slam.landmarks.landmark_map import Landmarks
 from graph_slam_ros.slam.landmarks.renumbered import first_of_later
 from graph_slam_ros.slam.landmarks.scan_history import ScanHistory
-from graph_slam_ros.slam.landmarks.scans import (
-    SCAN_NS,
-    DeadReckoning,
-    Motion,
-    Scan,
-    ScanBuilder,
-    Seen,
-)
-from graph_slam_ros.slam.landmarks.sighted_point import sighted_point, with_extent
+from graph_slam_ros.slam.landmarks.scans import SCAN_NS, DeadReckoning, Motion, Scan, ScanBuilder
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Executor, Index
 
-_CLOSE_M = 0.5  # objects of one message this close may be one: two poles of a group, or one of them seen twice
 _GATE_SAME = 0.9999  # probability of the chi2 test within which an observation may belong to a landmark
 _REVIEWED_EVERY = 10  # keyframes, some seconds: landmarks are confirmed and given up
 _POSITIONED = ("position", "pose", "range_bearing")
@@ -75,14 +65,13 @@ class AnonymousLandmarks:
         executor: Executor,
     ) -> None:
         c, space = config.landmarks, config.space
-        self._config, self._space = c, space
+        self._space = space
         self._landmarks, self._solver, self._counters = landmarks, solver, counters
         self._hand_over = hand_over
         self._noise = OdometryNoise(config.odometry, space)
         self._reckoning = DeadReckoning(space, config.ordering.late_s + 2.0)
         self._history = ScanHistory(space, config.odometry, self._reckoning)
-        extent = max(c.added_sigma_m**2 + c.unnamed_sigma_m**2, LEAST_M2) * np.eye(space.dimensions)
-        self._builder = ScanBuilder(space, extent, _CLOSE_M)
+        self._builder = ScanBuilder(space, c.unnamed_sigma_m, c.added_sigma_m)
         self._settings = BeamSettings(
             quantile(_GATE_SAME, space.dimensions),
             space.dimensions * float(np.log(c.density_per_m)),
@@ -131,10 +120,7 @@ class AnonymousLandmarks:
         at = self._reckoning.at(m.stamp_ns)
         out = self.end_scan() if self._builder.is_full(at) else []
         for s in m.sightings:
-            point, covariance = sighted_point(self._space, s)
-            whole = with_extent(self._space, s, self._config.unnamed_sigma_m)
-            seen = Seen(m.topic, whole, where)
-            self._builder.add(at, point, covariance, seen, s.sort)
+            self._builder.add(at, m.topic, s, where)
         return out
 
     def identified(self, m: Sightings, where: PoseAtStamp) -> list[Assigned]:

@@ -1,12 +1,11 @@
-"""The front end of landmarks: assigns sightings to landmarks, applies the gates, reviews sightings without id."""
+"""The front end of landmarks: assigns sightings to landmarks, refuses new ones, reviews sightings without id."""
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.types import Sightings
-from graph_slam_ros.slam.frontend.gates import GateChain
 from graph_slam_ros.slam.frontend.keyframes import Keyframe
 from graph_slam_ros.slam.frontend.max_distance import off_the_pole
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
@@ -19,50 +18,6 @@ from graph_slam_ros.slam.landmarks.landmark import Landmark
 from graph_slam_ros.slam.landmarks.landmark_map import Landmarks
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Executor, Index
-
-
-@dataclass(frozen=True, slots=True)
-class NamedSightings:
-    """Sightings of an input, each with the name of its landmark."""
-
-    topic: str
-    named: tuple[Assigned, ...]
-
-    def only(self, known: Mapping[str, Landmark]) -> "NamedSightings | None":
-        """The sightings of known landmarks; None if there is none."""
-        named = tuple(one for one in self.named if one.name in known)
-        return replace(self, named=named) if named else None
-
-
-class HeldMapGate:
-    """Refuses new landmarks while the map is held."""
-
-    reason = "not_in_map"
-
-    def __init__(self, landmarks: Landmarks) -> None:
-        self._landmarks = landmarks
-
-    def admit(self, m: NamedSightings) -> NamedSightings | None:
-        """The sightings of landmarks of the map."""
-        return m if self._landmarks.begins_new else m.only(self._landmarks.known)
-
-
-class AlarmGate:
-    """Refuses new landmarks during an undecided alarm, because the robot's pose is unknown then.
-
-    Parameters
-    ----------
-    trusts_sightings : whether it can be decided, or there is none
-    """
-
-    reason = "new_while_elsewhere"
-
-    def __init__(self, landmarks: Landmarks, trusts_sightings: Callable[[], bool]) -> None:
-        self._landmarks, self._trusts_sightings = landmarks, trusts_sightings
-
-    def admit(self, m: NamedSightings) -> NamedSightings | None:
-        """The sightings of landmarks that are in the map."""
-        return m if self._trusts_sightings() else m.only(self._landmarks.known)
 
 
 class LandmarkFrontend:
@@ -97,9 +52,7 @@ class LandmarkFrontend:
         self._config, self._space, self._counters = config.landmarks, config.space, counters
         self.map = Landmarks(config, edges, solver, counters, withdraw)
         self.anonymous = AnonymousLandmarks(config, self.map, solver, counters, hand_over, executor)
-        self._gates = GateChain[NamedSightings](
-            (HeldMapGate(self.map), AlarmGate(self.map, trusts_sightings)), lambda m: len(m.named), counters
-        )
+        self._trusts_sightings = trusts_sightings
 
     def restore(self, landmarks: dict[str, Landmark]) -> None:
         """Continue with the landmarks of a map."""
@@ -142,13 +95,19 @@ class LandmarkFrontend:
         """Return whether landmarks are told apart without identities, so that they need each step of odometry."""
         return self._config.association == "joint"
 
-    def _passed(self, named: Sequence[Assigned]) -> list[Assigned]:
-        """The sightings that pass the gates, by input."""
-        out: list[Assigned] = []
-        for topic in dict.fromkeys(one.topic for one in named):
-            passed = self._gates.admit(NamedSightings(topic, tuple(one for one in named if one.topic == topic)))
-            out += passed.named if passed else ()
-        return out
+    def _passed(self, named: list[Assigned]) -> list[Assigned]:
+        """The sightings that may be used: none begins a landmark in a held map, or while the pose is unknown."""
+        if not self.map.begins_new:
+            reason = "not_in_map"
+        elif not self._trusts_sightings():
+            reason = "new_while_elsewhere"
+        else:
+            return named
+        known = self.map.known
+        for one in named:
+            if one.name not in known:
+                self._counters.count(one.topic, reason)
+        return [one for one in named if one.name in known]
 
     def review(self, keyframes: StampedPoses[Keyframe], *, everything: bool) -> None:
         """Review the landmarks without id. The next solve includes the changes."""

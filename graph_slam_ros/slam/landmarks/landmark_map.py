@@ -16,10 +16,8 @@ from graph_slam_ros.slam.frontend import motion_compensation
 from graph_slam_ros.slam.frontend.motion_compensation import KeyframeMeasurement, PoseAtStamp
 from graph_slam_ros.slam.frontend.noise_factors import NoiseScales
 from graph_slam_ros.slam.frontend.sighting_edges import SightingEdges
-from graph_slam_ros.slam.landmarks import triangulation
-from graph_slam_ros.slam.landmarks.determination import why_undetermined
 from graph_slam_ros.slam.landmarks.landmark import Landmark, LandmarkEdge, UndeterminedLandmark
-from graph_slam_ros.slam.landmarks.triangulation import PartialObservation
+from graph_slam_ros.slam.landmarks.triangulation import PartialObservation, possible_places, why_undetermined
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Index, Numbers
 
@@ -320,8 +318,8 @@ class Landmarks:
         for where, s in candidate.seen:
             covariance = motion_compensation.as_matrix(s.covariance) + LEAST_RAD2 * np.eye(len(s.measured))
             glances.append(PartialObservation(self._sensor_pose(s, where), s.kind, s.measured, covariance))
-        candidate.places = triangulation.places(self._space, glances)
-        candidate.reason = why_undetermined(self._config.landmarks, self._space, self._solver, candidate, glances)
+        candidate.places = possible_places(self._space, glances)
+        candidate.reason = why_undetermined(self._space, self._solver, candidate.seen, glances, candidate.places)
         if not candidate.reason:
             del self.undetermined[name]
             at = tuple(candidate.places[0].position.tolist())

@@ -10,10 +10,28 @@ from dataclasses import dataclass
 import numpy as np
 
 from graph_slam_ros.slam.landmarks.explanation import UNUSED, Drive, Estimate
-from graph_slam_ros.slam.landmarks.view import is_missing
+from graph_slam_ros.typing import Array, Mask
 
+FIT_M = 0.5
+_SAME_DIRECTION_RAD = 0.3
 _MUCH_MORE = 4.0  # times what the sensor misses; maps that are right reach 2.3
 _LEAST_PART, _LEAST = 0.02, 10
+
+
+def is_missing(in_base: Array, view: Array, points: Array, fit_m: float = FIT_M) -> Mask:
+    """Return which of the landmarks should be seen and are not.
+
+    Parameters
+    ----------
+    in_base : (..., L, n) where they should be seen, in the base frame [m]
+    view : (V, n) what shows the field of view: what is nearer than a point in about the same direction is in view
+    points : (P, n) what is seen
+    fit_m : what is nearer to a landmark than this is the landmark
+    """
+    near, far = (np.linalg.norm(one, axis=-1) + 1e-9 for one in (in_base, view))
+    is_in_view = (in_base / near[..., None]) @ (view / far[:, None]).T > np.cos(_SAME_DIRECTION_RAD)
+    is_seen = np.linalg.norm(in_base[..., None, :] - points, axis=-1).min(axis=-1) < fit_m
+    return np.asarray((is_in_view & (near[..., None] < far)).any(axis=-1) & ~is_seen)
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,6 @@ from graph_slam_ros.slam.landmarks.scans import (
     NEARBY_NS,
     DeadReckoning,
     Motion,
-    MotionNoise,
     Scan,
     motion_between,
     rescaled_nearby,
@@ -39,7 +38,7 @@ class ScanHistory:
     """
 
     def __init__(self, space: Geometry, odometry: OdometryConfig, reckoning: DeadReckoning) -> None:
-        self._space, self._reckoning, self._noise = space, reckoning, MotionNoise.of(odometry)
+        self._space, self._reckoning, self._noise = space, reckoning, odometry
         self._jump = np.diag(np.square(space.sigmas(JUMP_SIGMA_M, JUMP_SIGMA_RAD)))
         self.scans: list[Scan] = []
         self.firsts: list[int] = []

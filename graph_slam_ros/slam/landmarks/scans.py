@@ -14,7 +14,9 @@ import numpy as np
 from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.config.pipeline import OdometryConfig
 from graph_slam_ros.graph.geometry import Geometry
+from graph_slam_ros.measurements.edge_noise import LEAST_M2
 from graph_slam_ros.measurements.types import Sighting
+from graph_slam_ros.slam.frontend import motion_compensation
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
 from graph_slam_ros.slam.frontend.odometry_selector import Step
 from graph_slam_ros.slam.landmarks.rotations import lever, rotation, turn_of
@@ -24,29 +26,8 @@ SCAN_NS, _SCAN_RAD = 500_000_000, 0.15
 NEARBY_S = np.linspace(-0.5, 0.5, 21)
 NEARBY_NS = 500_000_000
 """Times relative to a scan's stamp, at which its motion by odometry is kept, for clocks that differ."""
+_CLOSE_M = 0.5  # objects of one message this close may be one: two poles of a group, or one of them seen twice
 _SAME = 0.9973  # probability with which two sightings of one thing fall into one cluster
-
-
-@dataclass(frozen=True, slots=True)
-class MotionNoise:
-    """Variances of odometry that grow with what was turned and driven, and hardly with time.
-
-    Attributes
-    ----------
-    turn_per_rad, turn_per_m, turn_per_s : rad^2
-    way_per_m, way_per_s : m^2; a quarter of it sideways
-    """
-
-    turn_per_rad: float
-    turn_per_m: float
-    turn_per_s: float
-    way_per_m: float
-    way_per_s: float
-
-    @classmethod
-    def of(cls, c: OdometryConfig) -> "MotionNoise":
-        """The configured noise."""
-        return cls(c.turn_per_rad, c.turn_per_m, c.turn_per_s, c.way_per_m, c.way_per_s)
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,7 +165,7 @@ def interpolated_nearby(nearby: Array, at_s: Array) -> tuple[Array, Array]:
     return before + (at_s - NEARBY_S[k])[:, None] * rate, rate
 
 
-def motion_between(space: Geometry, noise: MotionNoise, a: Reckoned, b: Reckoned, jump: Array) -> Motion:
+def motion_between(space: Geometry, noise: OdometryConfig, a: Reckoned, b: Reckoned, jump: Array) -> Motion:
     """The motion from one instant to another.
 
     Parameters
@@ -247,13 +228,41 @@ class Scan:
         return np.array([one.point for one in self.clusters])
 
 
+def _sighted_point(space: Geometry, s: Sighting) -> tuple[Array, Array]:
+    """Return the observed point (n,) in the base frame, and its covariance (n, n)."""
+    n, own = space.dimensions, motion_compensation.as_matrix(s.covariance)
+    if s.kind == "range_bearing":
+        T_base_sensor = s.T_base_sensor or space.identity
+        point = tuple(motion_compensation.point_of(space, s.measured).tolist())
+        to_base = space.turn(T_base_sensor) @ motion_compensation.polar_derivative(space, s.measured)
+        point, own = tuple(map(float, space.group.act(T_base_sensor, point))), to_base @ own @ to_base.T
+    else:
+        point = s.measured[:n]
+        own = space.in_parent_axes(s.measured, own)[:n, :n] if s.kind == "pose" else own
+    rounding = motion_compensation.ROUNDING * (float(np.trace(own)) + sum(x * x for x in point))
+    return np.array(point), own + rounding * np.eye(n)
+
+
+def _with_extent(space: Geometry, s: Sighting, sigma_m: float) -> Sighting:
+    """Return a sighting with a covariance that includes where on its landmark it is seen."""
+    n, covariance = space.dimensions, motion_compensation.as_matrix(s.covariance)
+    axes = np.eye(n)
+    if s.kind == "range_bearing":
+        axes = motion_compensation.gradient(space, s.kind, motion_compensation.point_of(space, s.measured))
+    covariance[:n, :n] += sigma_m**2 * axes @ axes.T
+    return replace(s, covariance=tuple(covariance.ravel().tolist()))
+
+
 @dataclass(frozen=True, slots=True)
 class _Glimpse:
     at: Reckoned
     point: Array
     covariance: Array
     seen: Seen
-    sort: str
+
+    @property
+    def sort(self) -> str:
+        return self.seen.sighting.sort
 
 
 class ScanBuilder:
@@ -261,12 +270,13 @@ class ScanBuilder:
 
     Parameters
     ----------
-    extent : (n, n) covariance of where on a thing it is seen
-    close_m : things this close to one another are one
+    sigma_m : of where on a landmark it is seen
+    added_m : of errors that messages do not contain
     """
 
-    def __init__(self, space: Geometry, extent: Array, close_m: float) -> None:
-        self._space, self._extent, self._close_m = space, extent, close_m
+    def __init__(self, space: Geometry, sigma_m: float, added_m: float) -> None:
+        self._space, self._sigma_m = space, sigma_m
+        self._extent = max(added_m**2 + sigma_m**2, LEAST_M2) * np.eye(space.dimensions)
         self._glimpses: list[_Glimpse] = []
 
     @property
@@ -297,9 +307,11 @@ class ScanBuilder:
         """Take over dead reckoning that was corrected."""
         self._glimpses = [replace(one, at=at(one.at.stamp_ns)) for one in self._glimpses]
 
-    def add(self, at: Reckoned, point: Array, covariance: Array, seen: Seen, sort: str = "") -> None:
-        """Add a sighting of a point (n,) in the base frame, with its covariance (n, n)."""
-        self._glimpses.append(_Glimpse(at, point, covariance, seen, sort))
+    def add(self, at: Reckoned, topic: str, s: Sighting, where: PoseAtStamp) -> None:
+        """Add a sighting."""
+        point, covariance = _sighted_point(self._space, s)
+        whole = _with_extent(self._space, s, self._sigma_m)
+        self._glimpses.append(_Glimpse(at, point, covariance, Seen(topic, whole, where)))
 
     def close(self) -> Scan | None:
         """End the scan and begin another. Returns it; None if nothing was seen."""
@@ -309,7 +321,7 @@ class ScanBuilder:
         middle = glimpses[(len(glimpses) - 1) // 2]
         carried = [self._carried(one, middle.at) for one in glimpses]
         points, covariances = [point for point, _ in carried], [c + self._extent for _, c in carried]
-        groups = _clustered(points, covariances, glimpses, self._close_m)
+        groups = _clustered(points, covariances, glimpses)
         clusters = []
         for members in groups:
             point = np.mean([carried[k][0] for k in members], axis=0)
@@ -325,9 +337,7 @@ class ScanBuilder:
         return turn @ one.point + np.array(moved[: self._space.dimensions]), turn @ one.covariance @ turn.T
 
 
-def _clustered(
-    points: Sequence[Array], covariances: Sequence[Array], glimpses: Sequence[_Glimpse], close_m: float
-) -> list[list[int]]:
+def _clustered(points: Sequence[Array], covariances: Sequence[Array], glimpses: Sequence[_Glimpse]) -> list[list[int]]:
     """Indices of the sightings of each landmark. Those of one message are of one landmark only if they are close."""
     groups: list[list[int]] = []
     means: list[Array] = []
@@ -337,7 +347,7 @@ def _clustered(
         for at, (group, mean) in enumerate(zip(groups, means, strict=True)):
             first = group[0]
             away = point - mean
-            is_far = float(np.linalg.norm(away)) > close_m
+            is_far = float(np.linalg.norm(away)) > _CLOSE_M
             is_other = bool(glimpses[k].sort) and any(glimpses[i].sort not in ("", glimpses[k].sort) for i in group)
             if is_other or (is_far and _same_message(glimpses, group, k)):
                 continue

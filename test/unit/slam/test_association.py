@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from graph_slam_ros.chi_square import quantile
+from graph_slam_ros.config.pipeline import OdometryConfig
 from graph_slam_ros.graph.geometry import PLANAR
 from graph_slam_ros.measurements.types import Sighting
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
@@ -18,18 +19,10 @@ from graph_slam_ros.slam.landmarks.explanation import Costs, Drive, Estimate
 from graph_slam_ros.slam.landmarks.moves import refined
 from graph_slam_ros.slam.landmarks.presence_check import presence
 from graph_slam_ros.slam.landmarks.rotations import rotation
-from graph_slam_ros.slam.landmarks.scans import (
-    NEARBY_S,
-    Cluster,
-    MotionNoise,
-    Reckoned,
-    Scan,
-    Seen,
-    motion_between,
-)
+from graph_slam_ros.slam.landmarks.scans import NEARBY_S, Cluster, Reckoned, Scan, Seen, motion_between
 
 S = 1_000_000_000
-NOISE = MotionNoise(0.02, 0.002, 0.0002, 0.002, 0.0001)
+NOISE = OdometryConfig(turn_per_rad=0.02, turn_per_m=0.002, turn_per_s=0.0002, way_per_m=0.002, way_per_s=0.0001)
 SETTINGS = BeamSettings(quantile(0.9999, 2), 2 * float(np.log(0.03)))
 COSTS = Costs(14.0, 25.0, 6.0)
 WHERE = PoseAtStamp(0, 0, 0, PLANAR.identity, np.zeros((3, 3)))
