@@ -32,7 +32,7 @@ from benchmarks import fresh, lifelong, table
 from benchmarks.hall import STEP_S, Course, config, fitted, measured, rms, without_ids
 from graph_slam_ros.cli import arguments as values
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
-from graph_slam_ros.runs.whole_path import removed_path
+from graph_slam_ros.runs.condensed_map import removed_path
 from graph_slam_ros.slam import Control, GraphSlam, Measurement, Sightings
 from graph_slam_ros.slam.lifelong.state import Left
 from graph_slam_ros.typing import Array, Numbers

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from graph_slam_ros.errors import GaugeError, GraphSlamError, SingularError
 from graph_slam_ros.graph import EdgeType, Gaussian, Graph, Loss
 from graph_slam_ros.graph.losses import weight_and_cost
+from graph_slam_ros.runs.condensed_map import WholePath
 from graph_slam_ros.runs.folder import RunError
 from graph_slam_ros.runs.ledger_file import Entry, ledger_entries
 from graph_slam_ros.runs.restore import of_all, restored
 from graph_slam_ros.runs.tables import numbered
-from graph_slam_ros.runs.whole_path import WholePath
 from graph_slam_ros.solver import Report, Solver
 from graph_slam_ros.solver.linearization import Block, Losses, linearize, rows_of
 from graph_slam_ros.typing import Array, Index

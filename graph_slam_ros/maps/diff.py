@@ -12,8 +12,8 @@ import numpy as np
 from graph_slam_ros.edge_tags import tag_of
 from graph_slam_ros.maps.alignment import Alignment, align, as_they_are, laid_on, positions
 from graph_slam_ros.maps.merge import merge_trouble, refuse_other_space, shared_landmarks
+from graph_slam_ros.runs.condensed_map import WholePath
 from graph_slam_ros.runs.restore import restored
-from graph_slam_ros.runs.whole_path import WholePath
 from graph_slam_ros.slam import GraphSlam
 from graph_slam_ros.typing import Array, Index, Numbers
 

@@ -13,13 +13,11 @@ from graph_slam_ros.formats.strict import is_gzipped
 from graph_slam_ros.formats.tum import tum_text
 from graph_slam_ros.messages import results, to_msg
 from graph_slam_ros.recordings.bag import BagWriter
-from graph_slam_ros.runs.condensed_map import read_left
+from graph_slam_ros.runs.condensed_map import WholePath
 from graph_slam_ros.runs.folder import RunError, is_run
 from graph_slam_ros.runs.restore import restored
 from graph_slam_ros.runs.tables import graph_file, numbered
-from graph_slam_ros.runs.whole_path import WholePath
 from graph_slam_ros.slam import GraphSlam
-from graph_slam_ros.slam.lifelong.state import Left
 
 
 def export(folder: Path, out: Path, target: str, losses: list[str], *, last_drive: bool = False) -> list[Path]:
@@ -38,12 +36,12 @@ def export(folder: Path, out: Path, target: str, losses: list[str], *, last_driv
     if target == "mcap" and out.suffix != ".mcap":
         raise RunError(f"{out}: what reads mcap wants a name that ends in .mcap")
     slam = restored(folder, losses)
-    left = read_left(folder, slam.space, slam.bounded)
+    whole = WholePath.of(slam, folder)
     if last_drive:
         if target != "tum":
             raise RunError(f"--last-drive: {target} holds a whole map; as TUM it is the path of the last drive")
-        return _tum(slam, left, out, slam.drives[-1])
-    return TARGETS[target](slam, left, out)
+        return _tum(slam, whole, out, slam.drives[-1])
+    return TARGETS[target](slam, whole, out)
 
 
 def files_of(out: Path, target: str) -> list[Path]:
@@ -54,13 +52,12 @@ def files_of(out: Path, target: str) -> list[Path]:
     return [out, whole.with_name(f"{whole.stem}_vertices.csv")]
 
 
-def _tum(slam: GraphSlam, left: Left, out: Path, first: int = 0) -> list[Path]:
-    whole = WholePath(slam, left)
+def _tum(slam: GraphSlam, whole: WholePath, out: Path, first: int = 0) -> list[Path]:
     write_text(out, tum_text(whole.stamps_ns.tolist()[first:], whole.poses()[first:]))
     return [out]
 
 
-def _g2o(slam: GraphSlam, left: Left, out: Path) -> list[Path]:
+def _g2o(slam: GraphSlam, whole: WholePath, out: Path) -> list[Path]:
     """All accepted edges. g2o has neither stamps nor names; a second table has these."""
     ids, table = numbered(slam)
     _, names_file = files_of(out, "g2o")
@@ -69,15 +66,14 @@ def _g2o(slam: GraphSlam, left: Left, out: Path) -> list[Path]:
     return [out, names_file]
 
 
-def _mcap(slam: GraphSlam, left: Left, out: Path) -> list[Path]:
+def _mcap(slam: GraphSlam, whole: WholePath, out: Path) -> list[Path]:
     """Every keyframe at its stamp with its covariance; at the last stamp the path and the landmarks.
 
     The covariance of a keyframe that was condensed is not known: all variances are those of what a pose does not have.
     """
     frame, unused = slam.config.frames.map, to_msg.UNUSED
-    whole = WholePath(slam, left)
-    path, stamps_ns = whole.poses(), whole.stamps_ns.tolist()
-    unknown = np.broadcast_to(unused * np.eye(slam.space.dof), (len(left.keyframes), slam.space.dof, slam.space.dof))
+    path, stamps_ns, dof = whole.poses(), whole.stamps_ns.tolist(), slam.space.dof
+    unknown = np.broadcast_to(unused * np.eye(dof), (slam.first_keyframe, dof, dof))
     poses = zip(stamps_ns, path, np.concatenate((unknown, slam.keyframe_covariances())), strict=True)
     last_ns, landmarks = slam.keyframes[-1].stamp_ns, results.landmark_estimates(slam)
     with replaced(out) as new, BagWriter(new) as bag:

@@ -18,12 +18,11 @@ from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import Gaussian
 from graph_slam_ros.maps.alignment import Alignment, align, positions
 from graph_slam_ros.measurements.edits import AppliedEdit, Argument, kind_of
-from graph_slam_ros.runs.condensed_map import CONDENSED
+from graph_slam_ros.runs.condensed_map import CONDENSED, WholePath
 from graph_slam_ros.runs.folder import check_room
 from graph_slam_ros.runs.journal import parts_of
 from graph_slam_ros.runs.map_journal import MapGrowth, Record, extend, state_of
 from graph_slam_ros.runs.restore import config_to_go_on, record_run, restored_and_solved, stopwatch
-from graph_slam_ros.runs.whole_path import WholePath
 from graph_slam_ros.slam import Control, GraphSlam
 from graph_slam_ros.slam.alarm import Alarm
 from graph_slam_ros.slam.edits import HAND_MADE

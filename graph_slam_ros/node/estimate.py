@@ -18,9 +18,9 @@ from graph_slam_ros.runs.outcome import (
     contradicts,
     renewed_text,
     visit_faults,
+    wrong_sides,
 )
 from graph_slam_ros.runs.tables import accepted_lately, condensed_part
-from graph_slam_ros.runs.undetermined import wrong_sides
 from graph_slam_ros.slam import GraphSlam
 from graph_slam_ros.slam.calibration.answers import Uncorrected
 from graph_slam_ros.slam.solution import Correction

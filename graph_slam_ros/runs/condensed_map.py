@@ -1,4 +1,4 @@
-"""A condensed map on the disk: what it has besides a graph, and what has left it.
+"""A condensed map on the disk: what it has besides a graph, what has left it, and the whole path with that.
 
 The record ``condensed`` of a ``growth`` (``map_journal``) has
 
@@ -31,9 +31,12 @@ from graph_slam_ros.graph import Graph
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.graph.tables import LastingIds
 from graph_slam_ros.runs.journal import read_records
+from graph_slam_ros.slam import GraphSlam
 from graph_slam_ros.slam.bounded_map import Condensation, CondensedEdge
 from graph_slam_ros.slam.lifelong.place import VisitScale, place_of
 from graph_slam_ros.slam.lifelong.state import BoundedState, Left, OldKeyframe, Records, record_type
+from graph_slam_ros.solver import Solver
+from graph_slam_ros.typing import Array, Index
 
 CONDENSED = "condensed"
 """Name of the recording of what has left the map."""
@@ -118,47 +121,29 @@ def left_records(done: Condensation) -> Iterator[Record]:
 
 
 def read_left(folder: Path, space: Geometry, state: BoundedState | None) -> Left:
-    """Return what has left a map.
+    """Return what has left a map. Raises FormatError as ``carried``."""
+    known = carried(folder, space, state) if state is not None else []
+    return _joined(space, known)
 
-    Raises
-    ------
-    FormatError
-        Some of those that the map knows of are missing.
+
+def carried(folder: Path, space: Geometry, state: BoundedState) -> list[Record]:
+    """Return the records of what has left a map, which a run that goes on in it has, too.
+
+    Raises FormatError: some of those that the map knows of are missing.
     """
-    found: list[Left] = []
-    for record in read_records(folder, CONDENSED, [], "left") if state is not None else ():
-        if state is None or record["first"] >= state.keyframes:
-            break
-        found.append(Left(*(_rows(record[name], record_type(space)) for name in ("keyframes", "sightings"))))
-    out = Left.joined(space, found)
-    count = len(out.keyframes), len(out.sightings)
-    if state is not None and count != (state.keyframes, state.sightings):
-        raise _incomplete(folder, count[0], state)
-    return out
+    known = [record for record in read_records(folder, CONDENSED, []) if record["first"] < state.keyframes]
+    left = _joined(space, known)
+    if (len(left.keyframes), len(left.sightings)) != (state.keyframes, state.sightings):
+        raise FormatError(
+            f"{folder}: {CONDENSED}.mcap has {len(left.keyframes)} keyframes, and {state.keyframes} have left the map: "
+            f"the others are lost; graph_slam replay {folder} --out NEW makes the map anew"
+        )
+    return known
 
 
-def _incomplete(folder: Path, count: int, state: BoundedState) -> FormatError:
-    return FormatError(
-        f"{folder}: {CONDENSED}.mcap has {count} keyframes, and {state.keyframes} have left the map: the others "
-        f"are lost; graph_slam replay {folder} --out NEW makes the map anew"
-    )
-
-
-def carried(folder: Path, space: Geometry, state: BoundedState) -> Iterator[Record]:
-    """Yield the records of what has left a map, one by one, for the run that goes on in it.
-
-    Raises
-    ------
-    FormatError
-        Some of those that the map knows of are missing.
-    """
-    count = 0
-    for record in read_records(folder, CONDENSED, []):
-        if record["first"] < state.keyframes:
-            count += len(_rows(record.get("keyframes", ""), record_type(space)))
-            yield record
-    if count != state.keyframes:
-        raise _incomplete(folder, count, state)
+def _joined(space: Geometry, known: list[Record]) -> Left:
+    kind, left = record_type(space), [record for record in known if record["type"] == "left"]
+    return Left.joined(space, [Left(_rows(one["keyframes"], kind), _rows(one["sightings"], kind)) for one in left])
 
 
 def read_left_edges(folder: Path) -> Iterator[dict[str, str]]:
@@ -177,3 +162,44 @@ def _rows(text: str, kind: np.dtype[np.void]) -> Records:
 
 def _word(value: Any) -> Any:
     return value.name.lower() if hasattr(value, "name") else value
+
+
+class WholePath:
+    """All keyframes of a pipeline, those that were condensed included, in order of time.
+
+    Parameters
+    ----------
+    left : the part that has left the map
+
+    Attributes
+    ----------
+    stamps_ns : (n,) of the keyframes
+    odometry : (n, size) their poses by odometry alone, ``T_odom_base``
+    """
+
+    def __init__(self, slam: GraphSlam, left: Left) -> None:
+        self._slam, self._left = slam, left
+        removed, keyframes = left.keyframes, slam.keyframes
+        self.stamps_ns: Index = np.concatenate((removed["stamp_ns"], keyframes.stamps_ns))
+        self.odometry: Array = np.concatenate((removed["T_odom"], keyframes.poses.reshape(-1, slam.space.pose.size)))
+
+    @classmethod
+    def of(cls, slam: GraphSlam, folder: Path) -> "WholePath":
+        """Return that of a pipeline whose run folder has what was condensed. Raises FormatError where that is lost."""
+        return cls(slam, read_left(folder, slam.space, slam.bounded))
+
+    def poses(self, solver: Solver | None = None) -> Array:
+        """Return the poses ``T_map_base``, (n, size); of another solution of the graph if given."""
+        slam = self._slam
+        path = (solver or slam.solver).estimate(slam.keyframes.ids).reshape(-1, slam.space.pose.size)
+        return np.concatenate((removed_path(slam, self._left, solver), path))
+
+
+def removed_path(slam: GraphSlam, left: Left, solver: Solver | None = None) -> Array:
+    """Return the present poses of the keyframes that have left the map, (n, size); of another solution if given."""
+    if slam.bounded is None:
+        return np.empty((0, slam.space.pose.size))
+    solver = solver or slam.solver
+    vertices = np.array([*(one.vertex for one in slam.bounded.old), *slam.keyframes.ids.tolist()], dtype=np.int64)
+    vertices = np.sort(vertices)
+    return left.path(slam.space, slam.graph.vertex_ids.of_all(vertices), solver.estimate(vertices))

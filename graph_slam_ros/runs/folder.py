@@ -49,6 +49,7 @@ _OF_RECORDINGS = re.compile(r"(\.(mcap|db3|bag|active|zstd|gz))+$")
 _NO_FILE = (errno.ENOENT, errno.ENOTDIR)
 _ENDS = 2**16
 _NOT_A_FILE = "not a regular file"  # in place of a mark
+_MOST_SEARCHED, _MOST_NAMED = 200, 3  # folders in one that is not a run
 _TOPICS = {"/tf", "/pose", "/path", "/landmarks"}
 
 
@@ -91,6 +92,25 @@ def _is_recorded(file: Path) -> bool:
         channels = (r for r in records(file, [], follow=False) if isinstance(r, Channel))
         return first is None or getattr(next(channels, None), "topic", "") in _TOPICS
     return first is None or getattr(first, "name", "") == _SCHEMAS[name[1]]
+
+
+def check_run(folder: Path) -> None:
+    """Raise RunError where a folder is not a run."""
+    if is_run(folder):
+        return
+    if not os.path.lexists(folder):
+        raise RunError(f"{folder}: not a run's folder: there is nothing of that name{similar_file(folder)}")
+    if is_recording(folder):
+        what = "a recording" if folder.is_dir() else "a file"
+        made = "graph_slam replay BAG --out RUN makes a run of a recording"
+        raise RunError(f"{folder}: not a run's folder, but {what}: {made}")
+    runs = []
+    try:
+        inside = itertools.islice(sorted(folder.iterdir()), _MOST_SEARCHED)
+        runs = [str(one) for one in inside if one.is_dir() and is_run(one)][:_MOST_NAMED]
+    except OSError:  # then none is named
+        pass
+    raise RunError(f"{folder}: not a run's folder" + (f"; in it there are runs: {', '.join(runs)}" if runs else ""))
 
 
 def is_cut_off(folder: Path) -> bool:

@@ -12,7 +12,6 @@ from typing import Any
 from graph_slam_ros.check.finding import KINDS
 from graph_slam_ros.measurements.reasons import Effect, explain, remedy
 from graph_slam_ros.runs.tables import INPUT_COLUMNS
-from graph_slam_ros.runs.undetermined import wrong_sides
 from graph_slam_ros.slam.frontend.gyro import GyroState
 
 Summary = Mapping[str, Any]
@@ -30,6 +29,7 @@ _MENDED = (  # of what is noted, signs of a wrong setting
     *("displaced", "displacement_taken_back", "jump", "frozen"),
     *("not_in_use", "gyro_waiting", "gyro_silent", "gyro_doubted"),
 )
+_TWO, _MANY, _FEWEST = " places fit: ", 0.25, 4  # of the reasons; part and number of landmarks
 _CONTRADICT = (
     "graph_slam explain RUN says why. Check of this sensor and of odometry: metres and radians, y and bearings to the "
     "left, where the sensor is (TF or {0}.mount), its clock ({0}.offset_s), ids that are used twice. If only its noise "
@@ -399,3 +399,21 @@ def _counted(summary: Summary, name: str, effect: Effect) -> dict[str, int]:
     """Reasons of one effect for an input, the most frequent first."""
     some = [(r, times) for r, times in summary["counters"].get(name, {}).items() if explain(r).effect is effect]
     return dict(sorted(some, key=lambda one: (-one[1], one[0])))
+
+
+def wrong_sides(landmarks: int, waiting: Mapping[str, str]) -> str:
+    """Return that landmarks may be on the wrong side of the path; empty where few are undecided, or in the map.
+
+    Parameters
+    ----------
+    landmarks : that are in the map
+    waiting : landmarks that are not, with the reason
+    """
+    undecided = sum(_TWO in reason for reason in waiting.values())
+    if landmarks < _FEWEST or undecided < max(_FEWEST, _MANY * (landmarks + len(waiting))):
+        return ""
+    return (
+        f"ranges alone: of {undecided} of {landmarks + len(waiting)} landmarks two places fit, one on either side of "
+        "the path, so they are not used; others may be in the map on the wrong side, and covariances do not contain "
+        "that. Drive more turns in sight of them, or add bearings or surveyed landmarks (landmarks.surveyed)"
+    )

@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 
 from graph_slam_ros.formats.files import read_text
-from graph_slam_ros.runs.folder import COVARIANCES, SUMMARY, RunError, changed_since, run_config
+from graph_slam_ros.runs.folder import COVARIANCES, SUMMARY, RunError, changed_since, check_run, run_config
 from graph_slam_ros.runs.ledger_file import Entry, read_ledger
-from graph_slam_ros.runs.run_check import check_run
 from graph_slam_ros.runs.trajectory import Trajectory, read_covariances, read_landmarks, read_rows
 from graph_slam_ros.slam import Config
 from graph_slam_ros.typing import Array

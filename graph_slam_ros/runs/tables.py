@@ -16,9 +16,9 @@ from graph_slam_ros.formats.tum import tum_text
 from graph_slam_ros.graph.tables import EdgeTable
 from graph_slam_ros.messages import results
 from graph_slam_ros.messages.inputs import recorded_uses
+from graph_slam_ros.runs.condensed_map import WholePath
 from graph_slam_ros.runs.folder import COVARIANCES, GRAPH, LANDMARKS, ODOMETRY, PATH, PATH_ODOMETRY, SIGHTINGS, VERTICES
 from graph_slam_ros.runs.ledger_file import CHANGES, LEDGER, changes_text, ledger_text
-from graph_slam_ros.runs.whole_path import WholePath
 from graph_slam_ros.slam import Counters, GraphSlam
 from graph_slam_ros.slam.calibration.answers import SIGMAS
 from graph_slam_ros.slam.calibration.parameters import QUANTITIES

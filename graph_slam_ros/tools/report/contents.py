@@ -26,10 +26,9 @@ from graph_slam_ros.formats.cdr import CdrReader
 from graph_slam_ros.graph.place import LABEL as PLACES
 from graph_slam_ros.lie import se3
 from graph_slam_ros.recordings.mcap_records import records
-from graph_slam_ros.runs.folder import COVARIANCES, changed_since, recording_of, run_config, summary_of
+from graph_slam_ros.runs.folder import COVARIANCES, changed_since, check_run, recording_of, run_config, summary_of
 from graph_slam_ros.runs.journal import MAP, parts_of, read_records
 from graph_slam_ros.runs.ledger_file import Entry
-from graph_slam_ros.runs.run_check import check_run
 from graph_slam_ros.runs.tables import INPUT_COLUMNS
 from graph_slam_ros.runs.trajectory import read_covariances, read_rows
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict

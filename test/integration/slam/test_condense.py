@@ -11,7 +11,7 @@ from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
 from graph_slam_ros.graph.place import LABEL
 from graph_slam_ros.maps.diff import diff
-from graph_slam_ros.runs.condensed_map import read_left, read_left_edges
+from graph_slam_ros.runs.condensed_map import read_left, read_left_edges, removed_path
 from graph_slam_ros.runs.folder import changed_since
 from graph_slam_ros.runs.journal import read_measurements
 from graph_slam_ros.runs.map_journal import read_map
@@ -19,7 +19,6 @@ from graph_slam_ros.runs.outcome import text
 from graph_slam_ros.runs.restore import record_run
 from graph_slam_ros.runs.tables import summarize
 from graph_slam_ros.runs.trajectory import read_tum
-from graph_slam_ros.runs.whole_path import removed_path
 from graph_slam_ros.slam import Closure, Config, Control, Fix, GraphSlam, Odometry, Sightings
 from graph_slam_ros.slam.landmarks import hindsight
 from graph_slam_ros.slam.landmarks.hindsight import FrozenScans, explained
