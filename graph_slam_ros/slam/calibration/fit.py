@@ -154,9 +154,8 @@ class _Fit:
             x, theta = self._moved(x, part * move), theta + part * step
             sigmas = np.sqrt(np.diag(np.linalg.inv(information)))
             if k >= cautious and part == 1.0 and (np.abs(step) < _STILL * sigmas).all():
-                return self._outcome(x, theta, theta - step, rows, factor, border)  # the rows are still right
-        rows = self._linear.rows(x, theta, stages[-1])
-        return self._outcome(x, theta, theta, rows, *_factor(rows))
+                break
+        return self._outcome(x, theta, self._linear.rows(x, theta, stages[-1]))
 
     def _information(self, rest: Array) -> Array:
         """Return the information of the parameters with all else marginalised, priors included."""
@@ -188,9 +187,8 @@ class _Fit:
 
     # -- what it says ----------------------------------------------------------------------------------------------
 
-    def _outcome(
-        self, x: Array, theta: Array, theta_of_rows: Array, rows: Rows, factor: SuperLU, border: Array
-    ) -> TrialFit:
+    def _outcome(self, x: Array, theta: Array, rows: Rows) -> TrialFit:
+        factor, border = _factor(rows)
         rest = rows.columns - rows.jacobian @ border
         information = self._information(rest)
         covariance = np.asarray(np.linalg.inv(information))
@@ -205,7 +203,7 @@ class _Fit:
             self._priors,
             covariance,
             np.asarray(covariance @ self._meat(scores, rows) @ covariance),
-            *self._halves(rest, scores, theta_of_rows, rows.stamp_ns),
+            *self._halves(rest, scores, theta, rows.stamp_ns),
             float(np.mean(rows.weight[sightings] < _LOST)) if sightings.any() else 0.0,
             x,
             -border,
