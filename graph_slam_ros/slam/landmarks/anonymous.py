@@ -27,7 +27,6 @@ from graph_slam_ros.slam.landmarks.belief import SolverBelief
 from graph_slam_ros.slam.landmarks.elsewhere import Seen as AllSeen
 from graph_slam_ros.slam.landmarks.elsewhere import UnnamedDisplacement
 from graph_slam_ros.slam.landmarks.hindsight import Found, FrozenScans, Hindsight
-from graph_slam_ros.slam.landmarks.known_map import with_map
 from graph_slam_ros.slam.landmarks.landmark_map import Landmarks
 from graph_slam_ros.slam.landmarks.renumbered import first_of_later
 from graph_slam_ros.slam.landmarks.scan_history import ScanHistory
@@ -338,7 +337,7 @@ class AnonymousLandmarks:
         frozen = FrozenScans(tuple(scans), motions, history.nearby(), poses, scales.copy(), given, leader)
         if history.displacements:
             frozen = replace(frozen, displaced=history.displacements, undisplaced=history.undisplaced())
-        return with_map(frozen, self._belief, self.clusters.final)
+        return frozen.after_map(self._belief, self.clusters.final)
 
     def _adopt(self, found: Found | None, keyframes: StampedPoses[Keyframe]) -> None:
         """Use an explanation of all scans up to one."""

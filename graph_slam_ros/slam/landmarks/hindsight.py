@@ -4,7 +4,7 @@ The scans are solved in stages, once from odometry and once from the present pat
 Then moves correct the association. The result does not depend on when the work is done.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -16,15 +16,19 @@ from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.slam.frontend.keyframes import Keyframe
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.slam.landmarks.beam import NOTHING, BeamSettings, Ids
+from graph_slam_ros.slam.landmarks.belief import SolverBelief
 from graph_slam_ros.slam.landmarks.constellation import laid_on_the_map
 from graph_slam_ros.slam.landmarks.explanation import SCALES, UNUSED, Costs, Drive, Estimate
-from graph_slam_ros.slam.landmarks.moves import refined, without_few
+from graph_slam_ros.slam.landmarks.landmark import Landmark
+from graph_slam_ros.slam.landmarks.moves import LEAST_SCANS, refined, without_few
 from graph_slam_ros.slam.landmarks.presence_check import NOTHING_SEEN, Presence, presence
 from graph_slam_ros.slam.landmarks.rotations import matrices_of, poses_of
-from graph_slam_ros.slam.landmarks.scans import Motion, Scan
+from graph_slam_ros.slam.landmarks.scans import Cluster, Motion, Scan
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Executor
 
+_APART_NS = 100_000_000_000  # between scans that stand for the map: no stretch of the drive has two of them
+_LEAST_M2, _STILL = 1e-6, 1e-9  # variances of their landmarks, and of the motion between them
 _FIRST, _MORE = 100, 2.0  # scans at the first time; then times as many
 _AMBIGUITY_CHI2 = 6.0  # by which every alternative is worse where a stretch is laid on others: likelier by e^3
 _GATE_OTHER = 0.99999  # an observation outside this probability of every landmark is not used
@@ -45,7 +49,7 @@ class FrozenScans:
     given : (M,) the number of each cluster's landmark
     leader : (M,) the same, by the beam alone
     nearby : (N, S, dof) how the robot moved around each scan, by odometry
-    of_map : the first so many scans stand for the map (``known_map.py``); clusters_of_map : theirs
+    of_map : the first so many scans stand for the map (``after_map``); clusters_of_map : theirs
     times : (M,) how often the robot has seen what a cluster stands for; empty: once each
     displaced : keyframes at which the robot is thought to have been moved, by their vertices
     undisplaced : the motions as if it had not been; empty: it was nowhere
@@ -68,6 +72,46 @@ class FrozenScans:
     def count(self) -> int:
         """The number of scans of the robot."""
         return len(self.scans) - self.of_map
+
+    def after_map(self, belief: SolverBelief, known: Mapping[int, Landmark]) -> "FrozenScans":
+        """These scans after some that stand for the landmarks of the map which have sightings that are final.
+
+        They see these from the pose of the first scan. Together they know as much of their places, relative to that
+        pose, as the solver does.
+
+        Parameters
+        ----------
+        known : the landmarks, by number
+
+        Raises
+        ------
+        GraphSlamError
+            The solver has no covariance.
+        """
+        if not known or not self.scans:
+            return self
+        first, marks, count, dof = self.scans[0], list(known.values()), LEAST_SCANS, self.nearby.shape[-1]
+        points, covariances = belief.seen_from(first, [mark.name for mark in marks])
+        n = points.shape[1]
+        clusters = tuple(
+            Cluster(point, count * (covariance + _LEAST_M2 * np.eye(n)), (), mark.sort)
+            for mark, point, covariance in zip(marks, points, covariances, strict=True)
+        )
+        still = Motion(np.zeros(n), np.zeros(dof - n), _STILL * np.eye(dof), 1e-3, is_broken=False)
+        stamps_ns = [first.at.stamp_ns - k * _APART_NS for k in range(count, 0, -1)]
+        before = np.array([mark.sightings - len(mark.seen) for mark in marks])
+        return replace(
+            self,
+            scans=(*(Scan(replace(first.at, stamp_ns=at), first.where, clusters) for at in stamps_ns), *self.scans),
+            motions=(still,) * count + self.motions,
+            nearby=np.concatenate([np.zeros((count, *self.nearby.shape[1:])), self.nearby]),
+            poses=np.concatenate([np.tile(self.poses[:1], (count, 1)), self.poses]),
+            given=np.concatenate([np.tile(list(known), count), self.given]),
+            leader=np.concatenate([np.tile(list(known), count), self.leader]),
+            of_map=count,
+            clusters_of_map=count * len(known),
+            times=np.concatenate([np.tile(before / count, count), np.ones(len(self.given))]),
+        )
 
 
 @dataclass(frozen=True, slots=True)
