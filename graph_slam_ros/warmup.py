@@ -34,12 +34,12 @@ from graph_slam_ros.graph.vertices import PLANAR, adjoints_of_inverses
 from graph_slam_ros.lie import se2, se3
 from graph_slam_ros.lie.jit import CACHE_DIR
 from graph_slam_ros.progress import report
-from graph_slam_ros.solver import METHODS, Settings, Solver, covariance, stretch_filter
+from graph_slam_ros.solver import METHODS, Settings, Solver, covariance
 from graph_slam_ros.solver import update as updates
 from graph_slam_ros.solver.clique_tree import incremental, numeric, ordering, storage, substitution
 from graph_slam_ros.typing import Index
 
-_KERNELS = 195  # about so many there are; a test compares it with the cache
+_KERNELS = 179  # about so many there are; a test compares it with the cache
 _SHARED = "shared"  # file that is there when the kernels that two parts call are in the cache
 
 
@@ -149,7 +149,6 @@ def _load_plane() -> None:
     """Linearise every edge type of the plane, and solve a graph."""
     _load_edges(in_space=False)
     _make(*_TWICE, *_STRUCTURE, *_NUMBERS)
-    _make_filter()
     adjoints_of_inverses(PLANAR, np.zeros((1, 3)))
     graph = Graph()
     poses = graph.add_vertices(SE2, np.zeros((2, 3)))
@@ -237,7 +236,6 @@ def _compile_plane() -> None:
     _load_edges(in_space=False)
     _wait_for(_SHARED)
     _make(*_NUMBERS)
-    _make_filter()
 
 
 def _make(*kernels: Any) -> None:
@@ -249,17 +247,6 @@ def _make(*kernels: Any) -> None:
     of = {storage.Tree: tree, Index: types.int64[::1], int: types.int64, float: types.float64, storage.Limits: limits}
     for kernel in kernels:
         kernel.compile(tuple(of[one.annotation] for one in inspect.signature(kernel.py_func).parameters.values()))
-
-
-def _make_filter() -> None:
-    """Compile the filter of a stretch of odometry, or load it."""
-    if not numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
-        index, indices, array, table = types.int64[::1], types.int64[:, ::1], types.float64[::1], types.float64[:, ::1]
-        stack, number, real = types.float64[:, :, ::1], types.int64, types.float64
-        of_stretch = (index, indices, index, array, index, table, indices, table, stack, table, table)
-        hypothesis = (number, array, number, number, real, real)
-        kernel: Any = stretch_filter.filter_stretch
-        kernel.compile((*of_stretch, *hypothesis, array, table, array, table, stack, table))
 
 
 def _wait_for(name: str) -> None:

@@ -6,7 +6,7 @@ the arrays alive. Rows are written beyond the end of the columns, which have roo
 all or none.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from ctypes import POINTER, addressof, c_bool, c_char, c_double, c_int64, cast
 from typing import Any
 
@@ -108,12 +108,6 @@ def _compiled_call(linearize: Any, x: Any, at: Any, measured: Any) -> Callable[.
         return _call(linearize, x, at, measured)  # type: ignore[call-arg]
 
     return compiled
-
-
-def native_or_plain(kernel: Callable[..., Any], linearize: Sequence[Callable[..., Any]]) -> tuple[Any, list[Any]]:
-    """Return a kernel and what it calls these linearisations by: addresses, or if one has none, all as plain Python."""
-    addresses = [native_address(one) for one in linearize]
-    return (kernel, addresses) if all(addresses) else (getattr(kernel, "py_func", kernel), list(linearize))
 
 
 @intrinsic

@@ -108,28 +108,6 @@ def retract_at(x: Array, at: int, code: int, dof: int, step: Array, first: int) 
 
 
 @kernel
-def right_jacobian_at(code: int, dof: int, step: Array, first: int) -> Array:
-    """Return what steps (dof,) after a step are to a change of it (dof, dof)."""
-    if code == PLANAR:
-        return se2.right_jacobian((step[first], step[first + 1], step[first + 2]))
-    if code == SPATIAL:
-        return se3.right_jacobian(
-            (step[first], step[first + 1], step[first + 2], step[first + 3], step[first + 4], step[first + 5])
-        )
-    return np.eye(dof)
-
-
-@kernel
-def append_motion(x: Array, code: int, motion: Array) -> None:
-    """Move the pose with which ``x`` begins by a motion, in place; its angle is not wrapped."""
-    if code == PLANAR:
-        x[0], x[1], x[2] = se2.compose((x[0], x[1], x[2]), (motion[0], motion[1], motion[2]))
-    else:
-        m = (motion[0], motion[1], motion[2], motion[3], motion[4], motion[5], motion[6])
-        x[0], x[1], x[2], x[3], x[4], x[5], x[6] = se3.compose((x[0], x[1], x[2], x[3], x[4], x[5], x[6]), m)
-
-
-@kernel
 def adjoint_of_inverse(code: int, motion: Array) -> Array:
     """Return the adjoint (dof, dof) of the inverse of a motion: ``Exp(d) T = T Exp(Ad d)``."""
     if code == PLANAR:

@@ -16,6 +16,7 @@ from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.slam.alarm import Alarm
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.displacements import Displacement, Displacements
+from graph_slam_ros.slam.doubt.evidence import Moved
 from graph_slam_ros.slam.frontend.keyframes import Keyframe
 from graph_slam_ros.slam.frontend.odometry_jumps import JUMP_SIGMA_M, JUMP_SIGMA_RAD
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
@@ -25,7 +26,6 @@ from graph_slam_ros.slam.robust.displacement import DisplacementSearch
 from graph_slam_ros.slam.robust.displacement_hypothesis import DisplacementHypothesis
 from graph_slam_ros.slam.robust.innovation_monitor import InnovationMonitor
 from graph_slam_ros.slam.robust.landmark_history import LandmarkHistory
-from graph_slam_ros.slam.robust.odometry_hypotheses import Moved
 from graph_slam_ros.slam.slip_detector import SlipDetector
 from graph_slam_ros.slam.slip_review import Slip
 from graph_slam_ros.slam.snapshot import MapSnapshot

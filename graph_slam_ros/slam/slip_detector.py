@@ -23,6 +23,7 @@ from graph_slam_ros.graph import Gaussian
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.slam.backend import Backend
+from graph_slam_ros.slam.doubt.evidence import CARRIED, LOG_ODDS, SLIPS, Choice, Hypothesis, Moved, Stretch, carried
 from graph_slam_ros.slam.frontend.keyframes import Keyframe
 from graph_slam_ros.slam.frontend.odometry_jumps import JUMP_SIGMA_M, JUMP_SIGMA_RAD
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
@@ -30,8 +31,6 @@ from graph_slam_ros.slam.measured_noise import MeasuredNoise
 from graph_slam_ros.slam.odometry_edges import replace_odometry, restore_odometry
 from graph_slam_ros.slam.robust.landmark_history import LandmarkHistory
 from graph_slam_ros.slam.robust.odometry_errors import OdometryErrors, odometry_errors
-from graph_slam_ros.slam.robust.odometry_filter import OdometryFilter, Stretch
-from graph_slam_ros.slam.robust.odometry_hypotheses import CARRIED, LOG_ODDS, SLIPS, Choice, HypothesisTest, Moved
 from graph_slam_ros.slam.slip_noise import SlipNoise
 from graph_slam_ros.slam.slip_review import Link, Pair, Slip, View, covariance_of, revoke_slip, slipped_pairs
 from graph_slam_ros.solver import Solver
@@ -216,7 +215,7 @@ class SlipDetector:
     def _begin_slip(self, choice: Choice, keyframe: int, stamp_ns: int) -> None:
         links = self._stretch()[choice.first :]
         began_ns, vertex = links[0].stamps_ns[0], links[0].vertices[0]
-        slip = Slip(choice.kind, began_ns, stamp_ns, 2.0 * choice.log_ratio, len(choice.voters))
+        slip = Slip(choice.kind, began_ns, stamp_ns, 2.0 * choice.log_ratio, choice.voters)
         self.slips.append(slip)
         self._counters.count("odometry", "slip")
         self._replace(links, slip, keyframe)
@@ -230,19 +229,17 @@ class SlipDetector:
         is_determined = cache(partial(self._is_determined, first=first))
         seen = {view.vertex: self._known_seen(view, is_determined) for view in self._views if view.vertex > first}
         self.noise.measure(keyframes)
-        stretch = Stretch([link.edge for link in links], seen, self.noise.of_odometry, self.noise.of_all)
         edges = [edge for of_view in seen.values() for edge, _ in of_view if self._backend.ledger.is_inside(edge)]
-        filtered = OdometryFilter(self._space, self._backend.graph, partial(self._without, edges), stretch)
-        compared = HypothesisTest(filtered, self._space)
+        graph, prior, size = self._backend.graph, partial(self._without, edges), len(links)
+        every = [graph.edge(link.edge) for link in links]
+        stretch = Stretch(self._space, graph, every, seen, prior, self.noise.of_odometry, self.noise.of_all)
         firsts = sorted({self._first_of(links, since) for since in _SINCE if since < len(self._views)})
-        for kind, (variances, shared) in zip(SLIPS, self._added_noise(links, *SLIPS), strict=True):
-            for k in firsts:
-                compared.add_slip(kind, k, variances, shared)
+        hypotheses = [Hypothesis(kind, k, self._added_noise(kind, links, k, size)) for kind in SLIPS for k in firsts]
         if moved is not None:
-            k = next((k for k, link in enumerate(links) if link.vertices[1] >= moved.first), len(links) - 1)
+            k = next((k for k, link in enumerate(links) if link.vertices[1] >= moved.first), size - 1)
             there = moved.pose_of(links[k].vertices[1])
-            compared.add_moved(k, there, JUMP_SIGMA_M, JUMP_SIGMA_RAD)
-        return compared.choice()
+            hypotheses.append(carried(k, there, self._space.sigmas(JUMP_SIGMA_M, JUMP_SIGMA_RAD), size))
+        return stretch.choice(hypotheses)
 
     def _known_seen(self, view: View, is_determined: Callable[[int | str], bool]) -> list[tuple[int, int | str]]:
         """Edges of a view of what is determined without them, held back or not, and what they are of."""
@@ -266,17 +263,10 @@ class SlipDetector:
         before = self._views[-since - 1].vertex
         return next((k for k, link in enumerate(links) if link.vertices[0] >= before), len(links) - 1)
 
-    def _added_noise(self, links: Sequence[Link], *kinds: str) -> list[tuple[Array, Array]]:
-        """Variances (n, dof) that each kind of slip adds to links, and sigmas (n, dof) of the error that they share."""
-        motions = np.stack([self._added.motion(self._backend.graph.edge(link.edge).measured) for link in links])
-        seconds = np.array([link.seconds for link in links])
-        return [(self._added.variances(kind, seconds), self._added.shared(kind, motions)) for kind in kinds]
-
-    def _between(self, added: tuple[Array, Array], first: int, end: int) -> tuple[Array, Array]:
-        """Return the added noise (n dof,) of the links from ``first`` up to ``end``, and zero for the others."""
-        is_part = np.zeros((len(added[0]), 1), dtype=bool)
-        is_part[first:end] = True
-        return (added[0] * is_part).ravel(), (added[1] * is_part).ravel()
+    def _added_noise(self, kind: str, links: Sequence[Link], first: int, end: int) -> Array:
+        """Variances (n, dof) that a kind of slip adds to the links from ``first`` up to ``end``, of all links."""
+        is_part = (np.arange(len(links)) >= first) & (np.arange(len(links)) < end)
+        return self._added.variances(kind, np.array([link.seconds for link in links])) * is_part[:, None]
 
     def _without(self, edges: Sequence[int], vertices: Sequence[int]) -> tuple[Array, Array]:
         """Stored values of vertices and their joint covariance without some edges; an alarm alone changes nothing."""
@@ -316,10 +306,11 @@ class SlipDetector:
     def _began_earlier(
         self, now: Slip, links: Sequence[Link], begin: int, errors: OdometryErrors, keyframe: int
     ) -> bool:
-        best, (added,) = (_SURELY, 0), self._added_noise(links, now.kind)
+        best = (_SURELY, 0)
         for count in _EARLIER:
             if count <= begin:
-                best = max(best, (errors.log_ratio(*self._between(added, begin - count, begin)), count))
+                added = self._added_noise(now.kind, links, begin - count, begin)
+                best = max(best, (errors.log_ratio(added.ravel()), count))
         count = best[1]
         if count:
             earlier = replace(now, began_ns=links[begin - count].stamps_ns[0])

@@ -8,7 +8,6 @@ from graph_slam_ros.typing import Array
 _SLIP_M_S, _SLIP_RAD_S = 0.35, 0.35  # sigmas of what odometry does not notice: some of an indoor robot's speeds
 _LASTS_S = 0.5  # correlation time of the errors of a slip
 _LONGEST_S = 1.0  # of one edge; wheels that stand longer do not slip: the robot was carried
-_SHARED = 0.5  # sigma of the fraction of the motion that is lost in the whole stretch
 _OTHERS = 1.0 / 3.0  # sigma along the other axes, relative to the first
 
 
@@ -30,15 +29,3 @@ class SlipNoise:
             per_s[-1] = _SLIP_RAD_S
         independent = np.maximum(1.0, _LASTS_S / np.maximum(seconds, 1e-9))
         return np.asarray((np.asarray(seconds)[..., None] * per_s) ** 2 * independent[..., None])
-
-    def motion(self, measured: Array) -> Array:
-        """The motion (dof,) in the tangent space that an edge measured."""
-        space = self._space
-        return np.asarray(space.group.local(space.identity, tuple(measured.tolist())), dtype=float)
-
-    def shared(self, kind: str, motions: Array) -> Array:
-        """Sigmas (..., dof) of the error that all edges of a slip share, of motions (..., dof)."""
-        out, n = np.zeros_like(motions), self._space.dimensions
-        of_kind = slice(n) if kind == "translation" else slice(n, None)
-        out[..., of_kind] = _SHARED * motions[..., of_kind]
-        return out

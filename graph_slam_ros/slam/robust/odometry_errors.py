@@ -42,16 +42,9 @@ class OdometryErrors:
     covariance: Array
     noise_factor: float
 
-    def log_ratio(self, variances: Array, shared: Array) -> float:
-        """Return the logarithm of the likelihood ratio of the errors with added noise.
-
-        Parameters
-        ----------
-        variances : (n d,) that are added
-        shared : (n d,) standard deviations that are added, of one error that is the same in all
-        """
-        alike = self.axes @ shared
-        extra = ((self.axes * variances) @ self.axes.T + np.outer(alike, alike)) / self.noise_factor**2
+    def log_ratio(self, variances: Array) -> float:
+        """Return the logarithm of the likelihood ratio of the errors with variances (n d,) that are added."""
+        extra = (self.axes * variances) @ self.axes.T / self.noise_factor**2
         return self._log_likelihood(extra) - self._log_likelihood_as_stated
 
     def log_ratio_of(self, covariance: Array) -> float:
