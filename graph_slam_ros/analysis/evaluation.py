@@ -126,22 +126,16 @@ class Drive:
     ----------
     estimate, odometry : the paths; odometry is None if there is none
     names : the names of their files
+    keyframes : its rows in ``path.tum``
     number, count : number of the drive, from 1, and number of drives; the others were in the loaded map
-    first_keyframe, end_keyframe : its rows in ``path.tum``, without the second one; None: to the end
     """
 
     estimate: Trajectory
     odometry: Trajectory | None
     names: tuple[str, str]
+    keyframes: slice
     number: int = 1
     count: int = 1
-    first_keyframe: int = 0
-    end_keyframe: int | None = None
-
-    @property
-    def keyframes(self) -> slice:
-        """The rows of the drive in ``path.tum``."""
-        return slice(self.first_keyframe, self.end_keyframe)
 
 
 def evaluate(
@@ -230,19 +224,12 @@ def scored_drive(run: Path, truth: Trajectory | None, estimate: str = "") -> Dri
         reckoned = odometry_path and odometry_path.at(rows["sighting" if odometry in _SIGHTINGS else "keyframe"])
         if not len(estimated.stamps_s):
             continue
-        part = Drive(
-            estimated.in_order(),
-            reckoned and reckoned.in_order(),
-            (name, odometry),
-            k + 1,
-            len(drives),
-            drives[k]["keyframe"],
-            follows.get("keyframe"),
-        )
+        names, reckoned = (name, odometry), reckoned and reckoned.in_order()
+        part = Drive(estimated.in_order(), reckoned, names, rows["keyframe"], k + 1, len(drives))
         chosen = chosen or part
         if truth is None or _overlap(part.estimate, truth):
             return part
-    return chosen or Drive(whole.in_order(), odometry_path and odometry_path.in_order(), (name, odometry))
+    return chosen or Drive(whole.in_order(), odometry_path and odometry_path.in_order(), (name, odometry), slice(None))
 
 
 def truth_in_map(run: Path, known: Truth, *, align: bool = True) -> Trajectory:

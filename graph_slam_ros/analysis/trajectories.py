@@ -177,7 +177,7 @@ def _rows(bag: Bag, topic: str, kind: str) -> Iterator[Row]:
         elif kind == _POINT:
             yield stamp_ns, (message.point.x, message.point.y, message.point.z, *se3.IDENTITY[3:])
         else:
-            yield stamp_ns, _numbers(*_position_and_orientation(message))
+            yield stamp_ns, _pose(message)
 
 
 def _transforms(bag: Bag, path: Path, topic: str, frames: str) -> list[Row]:
@@ -187,7 +187,7 @@ def _transforms(bag: Bag, path: Path, topic: str, frames: str) -> list[Row]:
         for one in message.transforms:
             pair = (one.header.frame_id.lstrip("/"), one.child_frame_id.lstrip("/"))
             t = one.header.stamp
-            row = (t.sec * 10**9 + t.nanosec, _numbers(one.transform.translation, one.transform.rotation))
+            row = (t.sec * 10**9 + t.nanosec, _pose(one))
             found.setdefault(pair, []).append(row)
     names = ", ".join(f"{topic}:{parent}:{child}" for parent, child in sorted(found))
     if frames:
@@ -213,14 +213,13 @@ def _decoded(bag: Bag, topic: str) -> Iterator[Any]:
         yield message
 
 
-def _position_and_orientation(message: Any) -> tuple[Any, Any]:
+def _pose(message: Any) -> tuple[float, ...]:
+    """The numbers (7,) of a pose or transform, in a message of its own or in one of a header and of that."""
     if hasattr(message, "transform"):
-        return message.transform.translation, message.transform.rotation
-    pose = message.pose if hasattr(message.pose, "position") else message.pose.pose
-    return pose.position, pose.orientation
-
-
-def _numbers(p: Any, q: Any) -> tuple[float, ...]:
+        p, q = message.transform.translation, message.transform.rotation
+    else:
+        pose = message.pose if hasattr(message.pose, "position") else message.pose.pose
+        p, q = pose.position, pose.orientation
     return p.x, p.y, p.z, q.x, q.y, q.z, q.w
 
 

@@ -254,7 +254,8 @@ class Additions:
         """
         vertices = self._vertices
         pairs = cKDTree(np.stack(self._poses[: self._space.dimensions], axis=-1)).query_pairs(reach_m)
-        far = [(a, b) for a, b in sorted(pairs) if self._apart_m(a, b) > apart * reach_m]
+        driven = self._travelled_m[list(self._keyframes)]
+        far = [(a, b) for a, b in sorted(pairs) if abs(driven[b] - driven[a]) > apart * reach_m]
         noise, source, share, assumed = self._closure_noise()
         for a, b in far[:: max(1, -(-len(far) // most))]:
             ends, start = (vertices[a], vertices[b]), np.array(self._space.identity)
@@ -262,9 +263,6 @@ class Additions:
             names = " and ".join(str(self._run.numbers[self._keyframes[k]]) for k in (a, b))
             about = f"close the loop between keyframes {names} {self._at(vertices[b])}{assumed}"
             yield Addition(CLOSURE, about, (self._as_expected(like, ()),))
-
-    def _apart_m(self, a: int, b: int) -> float:
-        return float(abs(self._travelled_m[self._keyframes[b]] - self._travelled_m[self._keyframes[a]]))
 
     def _closure_noise(self) -> tuple[Gaussian, str, float, str]:
         """The noise of the run's closure of median precision; else that which is assumed."""
