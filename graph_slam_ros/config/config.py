@@ -5,6 +5,7 @@ types and values out of range are refused with the name of the culprit.
 """
 
 import dataclasses
+import inspect
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -86,6 +87,7 @@ class Config:
 
     ``Config()`` has the defaults. ``Config.from_mapping({"keyframes.min_distance_m": 0.5})`` takes nested or dotted
     names; ``config.keyframes.min_distance_m`` reads one. An input has a section of its own name, see ``inputs.names``.
+    ``graph_slam params`` lists all with default, unit and meaning.
     """
 
     world: pipeline.WorldConfig = pipeline.WorldConfig()
@@ -255,13 +257,7 @@ class Config:
 
 
 def with_survey(config: Config) -> Config:
-    """The configuration with the rows of ``landmarks.surveyed_file``, unless it has some, as a repeated run does.
-
-    Raises
-    ------
-    GraphSlamError
-        Naming the file, the line and what is wrong with it.
-    """
+    """The configuration with the rows of ``landmarks.surveyed_file``, if it has none. Raises GraphSlamError."""
     settings = config.landmarks
     if not settings.surveyed_file or settings.surveyed:
         return config
@@ -335,3 +331,7 @@ def flatten(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, 
             yield from flatten(value, f"{name}.")
         else:
             yield name, value
+
+
+_SHORT = inspect.Signature([inspect.Parameter("sections", inspect.Parameter.VAR_KEYWORD)])  # all defaults fill a screen
+Config.__signature__ = Config.__init__.__signature__ = _SHORT  # type: ignore[attr-defined]

@@ -127,7 +127,7 @@ class Settings:
     relinearize_error: float = 0.1
     relinearize_every: int = 10
     relinearize_neglected: float = 5e-5
-    relinearize_passes: int = 5
+    relinearize_passes: int = 1
     tolerance: float = 1e-5
     tolerance_sigmas: float = 1e-3
     at_once: bool = False
