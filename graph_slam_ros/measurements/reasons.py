@@ -48,7 +48,9 @@ REASONS: dict[str, Reason] = {
     # -- stamps and order
     "bad_stamp": _refused("the stamp is negative, beyond 2^31 s, or has 1e9 ns or more", "correct the driver's stamps"),
     "zero_stamp": _refused("the stamp is zero", "have the driver fill in header.stamp"),
-    "late": _refused("it came after newer ones were used", "ordering.window_s, ordering.late_s; INPUT.offset_s"),
+    "late": _refused(
+        "newer ones were used before it came", "ordering.window_s (odometry), ordering.late_s; INPUT.offset_s"
+    ),
     "future": _refused("the stamp is ahead of the clock, or of odometry", "use_sim_time; INPUT.offset_s"),
     "far_in_time": _refused("the transform is dated 10 s away from the others of its frame", "one clock for all /tf"),
     "before_jump": _refused("it was sent before the clock jumped back and arrived after"),
@@ -58,7 +60,7 @@ REASONS: dict[str, Reason] = {
     "odometry_gap": _refused("odometry was silent, or jumped, then", "find out why its driver paused"),
     "overflow": _refused("too many messages waited", "inputs.queue of a node, ordering.max_waiting"),
     "duplicate": _noted("the same message has come before"),
-    "duplicate_stamp": _refused("odometry has two poses for one stamp", "ros2 topic info -v TOPIC: one publisher"),
+    "duplicate_stamp": _refused("odometry has two poses for one stamp", "one publisher: ros2 topic info -v TOPIC"),
     "sent_again": _noted("the transform was sent before with the same stamp"),
     "lost_in_transport": _refused("the middleware lost it", "INPUT.reliability: reliable; net.core.rmem_max"),
     # -- frames
@@ -93,7 +95,7 @@ REASONS: dict[str, Reason] = {
     "covariance_not_positive_definite": _refused("the covariance is not positive definite", _COVARIANCE),
     "nonfinite_covariance": _refused("the covariance has NaN, infinite or negative numbers", _COVARIANCE),
     # -- odometry
-    "not_in_use": _noted("another is used: the first of inputs.names that is alive", "a filter can fuse several"),
+    "not_in_use": _noted("another odometry is used: the first alive of inputs.names", "a filter can fuse several"),
     "switched_to": _noted("this odometry took over from one that fell silent, or is of higher priority"),
     "switched_to_unlinked": _noted("this odometry took over; the motion between is unknown"),
     "gyro_waiting": _noted("the gyro's bias is unknown until it stands", "stand for a second; gyro.bias_sigma"),
@@ -104,7 +106,7 @@ REASONS: dict[str, Reason] = {
         "odometry jumped, a segment begins; of tf: a correction", "odometry.max_speed_m_s; tf.report_jump_m"
     ),
     "other_publisher": _refused(
-        "it does not go on from the last: another node's, or an outlier", "ros2 topic info -v TOPIC; metres, radians"
+        "it does not continue the odometry in use: another's, or an outlier", "one publisher: ros2 topic info -v TOPIC"
     ),
     "reset_to_zero": _noted("odometry was set back to zero: a new segment begins"),
     # -- landmarks
@@ -113,7 +115,7 @@ REASONS: dict[str, Reason] = {
     "id_conflict": _refused("one message has an identity at two places", "one id for each landmark"),
     "id_merged": _repaired("one message has an identity twice, at places that agree: their mean is used"),
     "id_of_an_unnamed": _refused("the identity is a name of landmarks without one", "INPUT.id_prefix"),
-    "unclear_which": _refused("without identity, and it fits no landmark", "noise as large as the sensor's"),
+    "unclear_which": _refused("a detection without identity fits no landmark", "noise as large as the sensor's"),
     "surveyed_orientation_unused": _noted("it was first seen without an orientation", "a detector of orientations"),
     "not_for_a_pose": _refused("a range or bearing to a landmark that is known as a pose", "INPUT.id_prefix"),
     "not_used": _noted("landmarks.association is none", "landmarks.association=id"),
@@ -141,7 +143,7 @@ REASONS: dict[str, Reason] = {
     "not_on_earth": _refused("latitude, longitude or altitude is out of range", "degrees and metres"),
     "far_from_datum": _refused("the fix is more than 100 km from the map's origin", "INPUT.datum"),
     "other_datum": _refused("the fix counts from another origin than the map", "the same INPUT.datum for all"),
-    "thinned": _noted("its error is still that of the last", "INPUT.correlation_s; keyframes.max_interval_s"),
+    "thinned": _noted("it came so soon that it errs as the last", "INPUT.correlation_s; keyframes.max_interval_s"),
     "mount_unknown": _repaired(
         "no transform has the position of the antenna on the robot: the base is assumed",
         '--set INPUT.mount="X Y Z 0 0 0", its place from the base in metres; zeros say that it is there',
@@ -157,16 +159,14 @@ REASONS: dict[str, Reason] = {
     "no_result": _refused("a closure has no result with a pose", "correct the publisher"),
     "within_one_keyframe": _refused("a closure links two moments of one keyframe: it says nothing new"),
     "from_where_there_was_no_odometry": _refused(
-        "a closure's earlier stamp is outside odometry", "stamps by the robot's clock"
+        "the earlier stamp of a closure is outside the odometry", "stamps by the robot's clock"
     ),
     "from_condensed_keyframe": _refused("its start left the map", "map.condense=false"),
     # -- the map
     "not_in_map": _noted("the map does not have it, and map.localize is true", "map.localize=false to add it"),
     "removed": _noted("an edge or a landmark that was removed by hand (~/remove)"),
     "unknown_edge": _noted("~/remove named an edge that is not there", "graph_slam explain RUN lists ids"),
-    "unknown_landmark": _noted(
-        "~/remove named one that is not there", "ros2 topic echo ~/landmarks_estimate lists names"
-    ),
+    "unknown_landmark": _noted("~/remove named an unknown landmark", "ros2 topic echo ~/landmarks_estimate"),
     "needed_edge": _noted("~/remove named odometry or a prior: without it poses are undetermined"),
     "held_in_map": _noted("~/remove named a part of a map that is held", "map.localize=false"),
     "condensed_in_map": _noted("it is of a map with condensed visits", "edit a replay with map.condense=false"),

@@ -62,7 +62,7 @@ def test_the_map_is_held_and_edited_while_the_node_runs_and_a_robot_that_was_car
     assert sum(one.startswith("initialpose: not used: ") for one in asked) == 2
     assert any(one.startswith("~/remove: landmark nort: ") and "did you mean 'north'?" in one for one in asked)
     assert "neither 'edge ID' nor 'landmark NAME'" in n.said
-    why = "~/remove named a landmark that is not in the map (unknown_landmark): ros2 topic echo"
+    why = "~/remove named an unknown landmark (unknown_landmark): ros2 topic echo"
     assert n.said.count(f"~/remove: landmark nobody: {why}") == 2, "each time"
     assert f"~/remove: landmark {min(held)}" not in n.said
     assert n.said.count("initialpose: not used: ") == 2, "each time"
