@@ -204,9 +204,7 @@ def caught(root, bug):
     finally:
         for file, text in before.items():
             file.write_text(text, encoding="utf-8")
-    failed = f"{len(bug.tests)} failed" in said and not re.search(
-        r"passed|skipped|\d error|(Import|Name|Syntax)Error", said
-    )
+    failed = " failed" in said and not re.search(r"passed|skipped|\d error|(Import|Name|Syntax)Error", said)
     verdict = "caught" if code == 1 and failed else "NOT CAUGHT"
     print(f"{verdict} {bug.name} ({bug.finding}), {time.monotonic() - start:.0f} s:\n{said}", flush=True)
     return verdict == "caught"
@@ -223,7 +221,7 @@ def main(*names):
         tests = dict.fromkeys(test for bug in bugs for test in bug.tests)
         code, said = ended(root, tests, FIRST_LIMIT_S)
         print(f"without any bug: {said}", flush=True)
-        if code != 0 or f"{len(tests)} passed" not in said:
+        if code != 0 or " passed" not in said or "skipped" in said:
             return 1
         count = sum(caught(root, bug) for bug in bugs)
     print(f"RELIABILITY planted_bugs tried={len(bugs)} caught={count} failed={len(bugs) - count}")
