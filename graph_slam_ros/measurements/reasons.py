@@ -49,7 +49,7 @@ REASONS: dict[str, Reason] = {
     "bad_stamp": _refused("the stamp is negative, beyond 2^31 s, or has 1e9 ns or more", "correct the driver's stamps"),
     "zero_stamp": _refused("the stamp is zero", "have the driver fill in header.stamp"),
     "late": _refused(
-        "newer ones were used before it came", "ordering.window_s (odometry), ordering.late_s; INPUT.offset_s"
+        "it came after newer ones were used", "ordering.window_s (odometry), ordering.late_s; INPUT.offset_s"
     ),
     "future": _refused("the stamp is ahead of the clock, or of odometry", "use_sim_time; INPUT.offset_s"),
     "far_in_time": _refused("the transform is dated 10 s away from the others of its frame", "one clock for all /tf"),
@@ -143,7 +143,7 @@ REASONS: dict[str, Reason] = {
     "not_on_earth": _refused("latitude, longitude or altitude is out of range", "degrees and metres"),
     "far_from_datum": _refused("the fix is more than 100 km from the map's origin", "INPUT.datum"),
     "other_datum": _refused("the fix counts from another origin than the map", "the same INPUT.datum for all"),
-    "thinned": _noted("it came so soon that it errs as the last", "INPUT.correlation_s; keyframes.max_interval_s"),
+    "thinned": _noted("too soon after the last to have another error", "INPUT.correlation_s; keyframes.max_interval_s"),
     "mount_unknown": _repaired(
         "no transform has the position of the antenna on the robot: the base is assumed",
         '--set INPUT.mount="X Y Z 0 0 0", its place from the base in metres; zeros say that it is there',
