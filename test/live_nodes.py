@@ -4,7 +4,6 @@ import contextlib
 import functools
 import os
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -31,6 +30,7 @@ from vision_msgs.msg import Detection3DArray
 
 from graph_slam_ros.messages import topics
 from graph_slam_ros.messages.message_class import message_class
+from graph_slam_ros.node.player import own_domain
 from graph_slam_ros.runs.replay import replay
 
 RESULTS = ("graph.g2o", "path.tum", "sightings.tum", "landmarks.csv", "ledger.csv", "ledger_changes.csv")
@@ -38,22 +38,6 @@ LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability
 RELIABLE = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 PATIENCE_S = 10.0
 PUBLICATIONS = {one.name.removeprefix("~/"): one for one in topics.PUBLICATIONS}
-_FIRST_PORT, _DOMAINS = 23_000, 100
-
-
-@contextlib.contextmanager
-def own_domain():
-    """A DDS domain that no other test on this machine has: a port of its number is held."""
-    for k in range(_DOMAINS):
-        domain = 1 + (k + 37 * os.getpid()) % _DOMAINS
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as held:
-            try:
-                held.bind(("127.0.0.1", _FIRST_PORT + domain))
-            except OSError:
-                continue
-            yield str(domain)
-            return
-    raise OSError("no DDS domain is free")
 
 
 _HELD = contextlib.ExitStack()

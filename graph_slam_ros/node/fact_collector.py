@@ -10,8 +10,7 @@ from graph_slam_ros.node.diagnostics import Facts
 from graph_slam_ros.node.handle import NodeHandle
 from graph_slam_ros.node.ingest import Ingest
 from graph_slam_ros.node.preparation import Preparation
-from graph_slam_ros.node.publishers import Publishers
-from graph_slam_ros.node.publishing_clock import PublishingClock
+from graph_slam_ros.node.publishers import Publishers, PublishingClock
 from graph_slam_ros.node.recent import RecentInputs
 from graph_slam_ros.node.session import Session
 from graph_slam_ros.node.subscriptions import Subscriptions

@@ -25,8 +25,7 @@ from graph_slam_ros.node.events import Outcome
 from graph_slam_ros.node.handle import NodeHandle
 from graph_slam_ros.node.input_check import InputCheck
 from graph_slam_ros.node.pose_extrapolator import PoseExtrapolator
-from graph_slam_ros.node.publishers import Publishers
-from graph_slam_ros.node.publishing_clock import PublishingClock
+from graph_slam_ros.node.publishers import Publishers, PublishingClock
 from graph_slam_ros.node.session import Session
 from graph_slam_ros.node.worker import Worker
 from graph_slam_ros.slam import Config, Control, Counters, Odometry

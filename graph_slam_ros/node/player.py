@@ -7,6 +7,7 @@ the order of the topics within the node's window of stamps. So no message is los
 import os
 import random
 import signal
+import socket
 import struct
 import subprocess
 import sys
@@ -15,7 +16,6 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +40,7 @@ from graph_slam_ros.recordings.bag import Bag, BagMessage
 from graph_slam_ros.slam import Config
 
 _LISTS = {"tf2_msgs/msg/TFMessage", "visualization_msgs/msg/MarkerArray"}  # a header stands in each item
+_FIRST_PORT = 23_000
 _AHEAD = 256  # messages on their way
 _OVERTAKE_NS = 20_000_000  # at most, and well inside the node's ordering window
 _CLOCK_NS = 5_000_000
@@ -95,7 +96,7 @@ class Player:
         patience_s = _START_S if self._own else _PATIENCE_S
         self._wait(lambda: self._before is not None, f"no {self._name}/received: is the node running?", patience_s)
         for topic, publisher in self._publishers.items():
-            self._wait(partial(_has_subscriber, publisher), f"nobody subscribes to {topic}")
+            self._wait(publisher.get_subscription_count, f"nobody subscribes to {topic}")
         for message in self._bag.messages({self._static} if self._static else ()):
             self._send(message)
         self._wait_until_received()
@@ -180,7 +181,7 @@ class Player:
         while (left := until - time.monotonic()) > 0.0:
             rclpy.spin_once(self._node, timeout_sec=left)
 
-    def _wait(self, condition: Callable[[], bool], complaint: str, patience_s: float = _PATIENCE_S) -> None:
+    def _wait(self, condition: Callable[[], object], complaint: str, patience_s: float = _PATIENCE_S) -> None:
         deadline = time.monotonic() + patience_s
         while not condition():
             self._check_node()
@@ -277,10 +278,23 @@ def play(
 
 
 @contextmanager
+def own_domain() -> Iterator[str]:
+    """A ROS domain that no other user of this function on this machine has: a port of its number is held."""
+    for domain in random.sample(range(1, 101), 100):
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as held:
+            try:
+                held.bind(("127.0.0.1", _FIRST_PORT + domain))
+            except OSError:
+                continue
+            yield str(domain)
+            return
+    raise PlayError("no ROS domain is free on this machine")
+
+
+@contextmanager
 def own_node(folder: Path, inputs: Inputs, config: Config) -> Iterator[subprocess.Popen[bytes]]:
     """A node of our own, on this machine and a ROS domain of its own, for as long as the context lasts."""
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-    os.environ["ROS_DOMAIN_ID"] = str(random.randint(1, 100))
     kept = config.output.keep_earlier if config.time.on_jump == "reset" else 0  # runs of this recording, too
     config = replace(
         config,
@@ -292,7 +306,8 @@ def own_node(folder: Path, inputs: Inputs, config: Config) -> Iterator[subproces
         output=replace(config.output, folder=str(folder), keep_earlier=kept),
         health=replace(config.health, lag_s=max(config.health.lag_s, _OWN_LAG_S)),
     )
-    with tempfile.TemporaryDirectory() as scratch:
+    with own_domain() as domain, tempfile.TemporaryDirectory() as scratch:
+        os.environ["ROS_DOMAIN_ID"] = domain
         parameters = Path(scratch) / "parameters.yaml"
         parameters.write_text(parameters_text(config.as_mapping()), encoding="utf-8")
         command = [sys.executable, "-m", "graph_slam_ros.node.node", "--ros-args", "--params-file", str(parameters)]
@@ -306,7 +321,3 @@ def own_node(folder: Path, inputs: Inputs, config: Config) -> Iterator[subproces
                 process.wait(timeout=60.0)
             except subprocess.TimeoutExpired:
                 process.kill()
-
-
-def _has_subscriber(publisher: Any) -> bool:
-    return bool(publisher.get_subscription_count())

@@ -20,8 +20,7 @@ from graph_slam_ros.node.fact_collector import FactCollector
 from graph_slam_ros.node.handle import NodeHandle
 from graph_slam_ros.node.ingest import Ingest
 from graph_slam_ros.node.preparation import Completion, Preparation
-from graph_slam_ros.node.publishers import Publishers
-from graph_slam_ros.node.publishing_clock import PublishingClock
+from graph_slam_ros.node.publishers import Publishers, PublishingClock
 from graph_slam_ros.node.qos import input_topics
 from graph_slam_ros.node.session import Session
 from graph_slam_ros.node.subscriptions import Subscriptions

@@ -23,11 +23,11 @@ DISTRIBUTES = {  # with the extra `fleet`
 }
 SPEAK_RCLPY = {
     f"node/{name}.py"
-    for name in ("bond", "node", "player", "qos", "ingest", "subscriptions", "publishers", "parameters", "static_rival")
+    for name in ("bond", "node", "player", "qos", "ingest", "subscriptions", "publishers", "parameters")
 }
 SPEAK_MESSAGES = SPEAK_RCLPY | {
     "messages/to_msg.py",
-    *(f"node/{name}.py" for name in ("tf_broadcaster", "services", "runtime", "fact_collector", "publishing_clock")),
+    *(f"node/{name}.py" for name in ("tf_broadcaster", "services", "runtime", "fact_collector")),
 }
 
 
