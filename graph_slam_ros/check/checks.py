@@ -50,7 +50,7 @@ def check_columns(c: Columns, checks: tuple[Check, ...] = CHECKS) -> list[Findin
     found: list[Finding] = []
     with np.errstate(all="ignore"):
         c = of_one_publisher(c)
-        if any(one.forbids_replay and one.topic == c.odometry.topic for one in check_refusals(c)):
+        if refused_odometry(c):
             checks = tuple(check for check in checks if check is check_refusals)  # the rest follows from that
         for check in checks:
             found += check(c)
@@ -67,6 +67,11 @@ def with_inputs(c: Columns, found: Iterable[Finding]) -> list[Finding]:
     """Findings with the name of the input that their topic is of."""
     inputs = {name: topic.inputs[0] for name, topic in c.topics.items() if topic.inputs}
     return [replace(one, source=inputs.get(one.topic, "")) for one in found]
+
+
+def refused_odometry(c: Columns) -> list[Finding]:
+    """What most of odometry is refused for: whatever else is wrong follows from it."""
+    return [one for one in check_refusals(c) if one.forbids_replay and one.topic == c.odometry.topic]
 
 
 def worst_of_replay(c: Columns) -> Finding | None:

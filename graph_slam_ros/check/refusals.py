@@ -11,19 +11,9 @@ from graph_slam_ros.measurements.reasons import Effect, explain, remedy
 
 _MOST = 0.5
 _USUAL = {  # of single messages: detectors err, and a recording begins and ends somewhere
-    *(
-        "zero_stamp",
-        "no_id",
-        "late",
-        "before_odometry",
-        "after_odometry",
-        "overhead",
-        "beyond_max_distance",
-        "no_fix",
-        "no_result",
-    ),
-    *("other_publisher", "future", "far_in_time", "id_conflict", "poor_tag", "duplicate_stamp", "undecodable"),
-    "transform_gaps",
+    *("zero_stamp", "no_id", "late", "before_odometry", "after_odometry", "overhead", "beyond_max_distance"),
+    *("no_fix", "no_result", "other_publisher", "future", "far_in_time", "id_conflict", "poor_tag"),
+    *("duplicate_stamp", "undecodable", "transform_gaps"),
 }
 _USUAL_SHARE = 0.05
 ELSEWHERE = {  # those that a check of its own explains better

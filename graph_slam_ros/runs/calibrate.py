@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from graph_slam_ros.check.checks import worst_of_replay
+from graph_slam_ros.check.checks import refused_odometry, worst_of_replay
 from graph_slam_ros.check.columns import Collector
-from graph_slam_ros.check.finding import Finding
+from graph_slam_ros.check.finding import Finding, worst
 from graph_slam_ros.config.config import with_survey
 from graph_slam_ros.errors import GraphSlamError, SingularError
 from graph_slam_ros.measurements.types import END
@@ -95,12 +95,11 @@ def calibrate(
     rounds.run()
     if not rounds.keyframes:
         raise GraphSlamError(f"{path}: no odometry of it could be used: graph_slam info {path}")
-    found, refused = rounds.found, rounds.refused
-    parameters = rounds.parameters or ([] if refused else list(_undriven(config, words, rounds.keyframes)))
+    parameters = rounds.parameters or ([] if rounds.refused else list(_undriven(config, words, rounds.keyframes)))
     name = "calibrate" if rounds.named else "replay"
-    command = suggested.suggestion.command(found | dict(settings or {}) | found | rounds.named, name=name)
-    outcome = parameters, command, rounds.count, rounds.is_complete, refused, rounds.fault
-    return Calibrated(found, *outcome, *(list(dict.fromkeys(lines)) for lines in (bag.losses, bag.warnings)))
+    command = suggested.suggestion.command(rounds.found | dict(settings or {}) | rounds.found | rounds.named, name=name)
+    outcome = parameters, command, rounds.count, rounds.is_complete, rounds.refused, rounds.fault
+    return Calibrated(rounds.found, *outcome, *(list(dict.fromkeys(lines)) for lines in (bag.losses, bag.warnings)))
 
 
 class _Rounds:
@@ -148,8 +147,7 @@ class _Rounds:
 
     def _replayed(self, due: float) -> GraphSlam:
         """Replay the whole recording; anew where a fit after ``due``, 2, 4 times as many keyframes finds more."""
-        is_over = False
-        while not is_over:
+        while True:
             self.count += 1
             config, counters = self._config.changed(self.found), Counters()
             slam, columns = GraphSlam(config), Collector(config, self._inputs.topics)
@@ -162,11 +160,13 @@ class _Rounds:
                     if self._set(slam, self._fitted(slam), are_followed=False):
                         break
             else:
-                is_over = True
+                break
         for event in END:
             slam.process(event)
         self.keyframes = len(slam.keyframes)
-        self.fault = worst_of_replay(columns.columns(counters)) if self.keyframes and due < math.inf else self.fault
+        if self.keyframes and due < math.inf:
+            read = columns.columns(counters)
+            self.fault = worst(refused_odometry(read)) or worst_of_replay(read)
         return slam
 
     def _does_harm(self, slam: GraphSlam) -> bool:

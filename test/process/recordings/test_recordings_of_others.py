@@ -322,6 +322,10 @@ def stamped_by(stamp):
     return odometry
 
 
+def ns(t):
+    return round((BEGINS_S + t) * 1e9)
+
+
 def leap(t):
     return t + 8.0e6 * (t >= 8.0)
 
@@ -337,18 +341,11 @@ def without_pose(robot):
 
 CAUSES = {
     **{
-        f"tags {k} times": (
-            (None, lambda r, k=k: r.seen_rows(times=k)),
-            "range_scale",
-            "times as long as odometry says",
-        )
+        f"tags {k} times": ((None, lambda r, k=k: r.seen_rows(times=k)), "range_scale", "as long as odometry says")
         for k in (0.55, 1.8)
     },
-    "microseconds": (
-        (stamped_by(lambda t: (BEGINS_S + t, round((BEGINS_S + t) * 1e9) % 10**9 // 1000)),),
-        "wrong_stamps",
-        "nanosec has microseconds",
-    ),
+    "microseconds": ((stamped_by(lambda t: (BEGINS_S + t, ns(t) % 10**9 // 1000)),), "wrong_stamps", "microseconds"),
+    "32 bits": ((stamped_by(lambda t: (BEGINS_S + t, ns(t) % 2**32)),), "bad_stamp", "are refused"),
     "a fast clock": ((stamped_by(lambda t: (186_000_000 + t * 1000, 0)),), "wrong_stamps", "1e+03 s for each second"),
     "NTP": (
         (lambda r: leapt(r.odometry_rows(leap)), lambda r: leapt(r.seen_rows(leap))),
@@ -381,6 +378,9 @@ def test_the_cause_alone_is_said_and_its_settings_mend_it(tmp_path, capsys):
         assert words in one[code]["text"], (name, one)
         if code == "range_scale":
             assert abs(one[code]["value"] / float(name.split()[1]) - 1.0) < 0.04, (name, one)
+        if code == "bad_stamp":
+            assert main(["calibrate", str(bag)]) == 3
+            assert "nothing is calibrated: mend bad_stamp first" in capsys.readouterr().err
         if settings := one[code]["settings"]:
             assert code not in found(capsys, bag, *settings), name
         if name not in ("tags 1.8 times", "no transform"):
