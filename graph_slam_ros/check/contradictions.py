@@ -66,7 +66,7 @@ def check_contradictions(c: Columns) -> Iterator[Finding]:
 
 
 def _contradictions(c: Columns, s: SightingColumns) -> Iterator[Finding]:
-    """What the first check that finds anything finds: each makes those after it meaningless."""
+    """Yield the findings of the first check that has any: they make all later ones meaningless."""
     use = s.located(c.path_ns)
     if not use.any():
         return

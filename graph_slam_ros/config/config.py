@@ -166,7 +166,7 @@ class Config:
 
     @classmethod
     def of_saved_run(cls, values: Mapping[str, Any]) -> "Config":
-        """As ``from_mapping``, without what earlier versions had. Raises as that."""
+        """Return the configuration of a saved run, without parameters that are gone. Raises as ``from_mapping``."""
         given = dict(flatten(values))
         names = _input_names(given.get("inputs.names", InputsConfig().names))
         general = {name: _general(name, names) for name in given}

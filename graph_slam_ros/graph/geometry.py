@@ -35,7 +35,6 @@ class Geometry:
     pose_prior: EdgeType
     tag_position: EdgeType
     coordinate_prior: EdgeType
-    range_with_offset: EdgeType
     sightings: Mapping[str, EdgeType]
     fixes: Mapping[str, EdgeType]
     dimensions: int = field(init=False)
@@ -114,7 +113,7 @@ _SIGHTINGS = {
     "bearing": "BEARING",
     "range": "RANGE",
 }
-_OTHERS = "RELATIVE_POSE", "POSE_PRIOR", "TAG_POSITION", "COORDINATE_PRIOR", "RANGE_WITH_OFFSET"
+_OTHERS = "RELATIVE_POSE", "POSE_PRIOR", "TAG_POSITION", "COORDINATE_PRIOR"
 _FIXES = {"pose": "POSE_PRIOR", "position": "POSITION_PRIOR", "heading": "HEADING_PRIOR", "attitude": "ATTITUDE_PRIOR"}
 
 

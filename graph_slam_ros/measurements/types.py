@@ -45,7 +45,7 @@ def _check_choice(one: Any, value: str, choices: tuple[str, ...]) -> None:
 
 
 class _Checked:
-    """What is measured: its numbers become plain tuples of floats, finite and as many as its table says."""
+    """The base of all measurements: numbers become tuples of floats, finite and as many as the table says."""
 
     __slots__ = ()
 

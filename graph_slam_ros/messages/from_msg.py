@@ -84,7 +84,7 @@ def twist_of(cdr: bytes, base_frame: str) -> bytes | None:
 
 @dataclass(slots=True)
 class _Input:
-    """What the messages of a topic pass: decoding, the converter of their type and, of odometry, its publisher."""
+    """How the messages of an input are read: the decoder, the converter and, of odometry, the publisher in use."""
 
     source: InputContext
     decode: Decoder

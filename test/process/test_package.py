@@ -17,9 +17,9 @@ import graph_slam_ros
 PACKAGE = ROOT / "graph_slam_ros"
 FILES = {path.relative_to(PACKAGE).as_posix(): path for path in sorted(PACKAGE.rglob("*.py"))}
 
-SERVES = {"view/guard.py", "view/server.py"}  # with the extra `view`, which may not be there
+SERVES = {"tools/view/server.py"}  # with the extra `view`, which may not be there
 DISTRIBUTES = {  # with the extra `fleet`
-    f"fleet/{name}.py" for name in ("recordings", "job", "table", "engine", "replay", "compare")
+    f"tools/fleet/{name}.py" for name in ("recordings", "job", "engine", "replay", "compare", "store", "page")
 }
 SPEAK_RCLPY = {
     f"node/{name}.py"

@@ -81,12 +81,12 @@ def types() -> set[str]:
 def described(built_in: Iterable[str]) -> list[str]:
     """Return a line for each type of an installed plugin, with the reason if it cannot be used."""
 
-    def say(name: str, distribution: str) -> str:
+    def description(name: str, distribution: str) -> str:
         type_name = name.replace(".", "/")
         found = input_type(type_name)
         return f"{type_name}: read by {distribution} as {' or '.join(found.converters if found else ())}"
 
-    return plugins.described(INPUTS, {one.replace("/", ".") for one in built_in}, say) + edge_tags.described()
+    return plugins.described(INPUTS, {one.replace("/", ".") for one in built_in}, description) + edge_tags.described()
 
 
 def _wrong(there: Any) -> str:

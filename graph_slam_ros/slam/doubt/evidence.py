@@ -32,7 +32,7 @@ _MOST_LINEARIZATIONS = 5
 
 @dataclass(frozen=True, slots=True)
 class Hypothesis:
-    """What odometry's errors may be.
+    """An assumption on the errors of odometry along a stretch.
 
     Attributes
     ----------
