@@ -111,7 +111,7 @@ class SightingColumns:
         return np.asarray(is_named & (self.stamp_ns >= path_ns[0]) & (self.stamp_ns <= path_ns[-1]))
 
     def located(self, path_ns: Index) -> Mask:
-        """Return which have a point besides."""
+        """Return which sightings have an identity, are within the time of odometry, and have a position."""
         return np.asarray(self.named(path_ns) & (np.abs(self.points) < 1e9).all(axis=1))
 
 
@@ -197,7 +197,7 @@ class _Rows:
 
     @property
     def room(self) -> int:
-        """How many more there may be."""
+        """The number of rows that may still be added."""
         return _MOST - len(self)
 
     def add(self, whole: Iterable[int], others: Iterable[float] = ()) -> None:

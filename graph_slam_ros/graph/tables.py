@@ -39,7 +39,7 @@ class Column:
 
     @property
     def values(self) -> NDArray[Any]:
-        """The rows so far, a view; other rows replace all."""
+        """The rows so far, a view; setting it replaces all rows."""
         if len(self._values) != self.count:
             self._values = self._buffer[: self.count]
         return self._values

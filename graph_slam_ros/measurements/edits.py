@@ -197,7 +197,7 @@ _COMMON = {
 
 
 def kind_of(key: str) -> str:
-    """Return what the key of an argument holds: the kind of its ``Field``."""
+    """Return the kind of value that the key of an argument has."""
     return _FIELDS[key].kind
 
 

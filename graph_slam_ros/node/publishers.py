@@ -27,7 +27,7 @@ _LANDMARKS = ("landmarks", "landmarks_estimate")
 _LATER = ("path", "path_updates", "graph", *_LANDMARKS)
 _MOVED_M, _MOVED_RAD = 0.02, 0.02  # a keyframe that moved by less looks the same in RViz
 _LANDMARKS_EVERY = 20  # keyframes, some seconds of driving
-_GRAPH_S, _MOST_EDGES = 2.0, 5000  # of ~/graph: its period, and a message of a MB that RViz draws at once
+_GRAPH_S, _MOST_EDGES = 2.0, 5000  # of ~/graph: its period, and the edges of one message, some MB
 _SPARE = 50.0  # of the worker's time, one part for each topic
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 

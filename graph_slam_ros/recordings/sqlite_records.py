@@ -21,7 +21,7 @@ _ALL_ROWS = "SELECT topic_id, timestamp, CASE WHEN topic_id IN ({}) THEN data EN
 
 
 class SqlitePart(Part):
-    """A file of rosbag2. Raises FormatError if it is none, or if its topics cannot be read."""
+    """A file of rosbag2. Raises FormatError if it is not one, or if its topics cannot be read."""
 
     def __init__(self, file: Path) -> None:
         super().__init__(file)

@@ -98,7 +98,7 @@ class Solution:
         return keyframes - min(self._keyframes, keyframes) + self.resting >= every_keyframes
 
     def solve(self, work: Callable[[], tuple[Report | None, Array]], newest: Keyframe, keyframes: int) -> Array | None:
-        """Solve by some work; None if it fails. A failure is counted, and the last estimate stays.
+        """Solve by calling ``work``; None if it fails. A failure is counted, and the last estimate stays.
 
         Parameters
         ----------

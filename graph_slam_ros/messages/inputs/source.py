@@ -91,7 +91,7 @@ class InputContext:
         return out
 
     def valid_stamps_ns(self, sec: Index, nanosec: Index) -> Index:
-        """The same of arrays of its two numbers; 0 where it would be refused."""
+        """The same for arrays of seconds and nanoseconds; 0 where a stamp would be refused."""
         out = sec * 1_000_000_000 + nanosec + self._offset_ns
         is_stamp = (sec >= 0) & (nanosec >= 0) & (nanosec < 1_000_000_000) & ((sec > 0) | (nanosec > 0))
         return out * (is_stamp & (out > 0) & (out <= LATEST_NS))

@@ -65,7 +65,7 @@ BEND = "bend"
 """What odometry's distance is wrong by in bends alone. No setting corrects it, but other parameters absorb it."""
 OF_ODOMETRY = (*FACTORS, BEND, "turn_bias")
 IN_SPACE = ("roll", "pitch", "z")
-"""Those that the plane does not have."""
+"""Corrections of a mount that only space has."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,7 +28,7 @@ class Recalibration:
     roots: Array
 
     def present(self, graph: Graph) -> "Recalibration":
-        """The same rows as they are in a graph now; those that it lacks are left out."""
+        """Return these edges as they are in a graph now, as far as it has them."""
         z, roots = self._columns(graph)
         rows = self.rows[self.rows < len(z)]
         return Recalibration(self.table, rows, z[rows], roots[rows])
@@ -40,7 +40,7 @@ class Recalibration:
         return Recalibration(self.table, self.rows[~same], self.measured[~same], self.roots[~same])
 
     def apply(self, graph: Graph) -> "Recalibration":
-        """Correct them, but for those that a graph lacks. Returns the change that undoes it."""
+        """Correct these edges of a graph, as far as it has them. Returns the change that undoes it."""
         z, roots = self._columns(graph)
         there, before = self.rows < len(z), self.present(graph)
         z[before.rows], roots[before.rows] = self.measured[there], self.roots[there]

@@ -152,7 +152,7 @@ class _Eyes:
         self._weight = edges.table.weight.values[edges.rows].copy()
 
     def place(self, x: Array, values: Values, model: MeasurementModel, path: EstimatedPath) -> None:
-        """Move them to the path at the corrected stamps, or from their keyframes by odometry. It changes x."""
+        """Move these edges along the path to corrected stamps, or by odometry from keyframes. It changes ``x``."""
         edges, p, group = self._edges, self._p, self._p.space.group
         at = p.graph.offset.values[self.ids][:, None] + np.arange(p.space.pose.size)
         self.first, self.second, self.fraction = self._own.copy(), self._own.copy(), np.zeros(len(self._own))

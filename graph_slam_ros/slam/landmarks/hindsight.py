@@ -74,7 +74,7 @@ class FrozenScans:
         return len(self.scans) - self.of_map
 
     def after_map(self, belief: SolverBelief, known: Mapping[int, Landmark]) -> "FrozenScans":
-        """These scans after some that stand for the landmarks of the map which have sightings that are final.
+        """Put scans before these that stand for landmarks of the map whose sightings are final.
 
         They see these from the pose of the first scan. Together they know as much of their places, relative to that
         pose, as the solver does.

@@ -65,7 +65,7 @@ class OutlierGate:
         self._vertices = self._graph.vertex_count
 
     def recount(self) -> None:
-        """Count what determines each landmark anew, after verdicts and weights have changed elsewhere."""
+        """Count anew which edges determine each landmark, after verdicts and weights have changed elsewhere."""
         self._support = LandmarkSupport(self._graph, self._solver, self.ledger.inside)
 
     # -- what is new -------------------------------------------------------------------------------------------------

@@ -361,7 +361,7 @@ class Background:
         self._job = _Job(frozen.keyframe + self._config.apply_after_keyframes, outcome, wanted)
 
     def found(self, keyframe: int) -> Work | None:
-        """Return what waits for the outcome of the search, if that is due at this keyframe."""
+        """Return a function that waits for the result of the search, if that is due at this keyframe."""
         if self._job is None or keyframe < self._job.apply_at:
             return None
         job, self._job = self._job, None
