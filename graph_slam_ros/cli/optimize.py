@@ -25,7 +25,7 @@ _MOST_TRIAL_S = 10.0
 
 def optimize_options(sub: CommandParser) -> None:
     """Add the options of ``optimize``."""
-    sub.codes = f"{CODES} With --certify: 4 not certified, 5 the certificate does not apply."
+    sub.codes = f"{CODES} With --certify: 4 not certified, 5 it does not apply; 3 goes first."
     sub.add_argument("graph", type=Path, metavar="GRAPH", help="file of a graph")
     about = "method of optimisation; gn (default) is damped only if it does not converge"
     sub.add_argument("--method", choices=("gn", "lm", "dogleg"), default="gn", help=about)
