@@ -24,7 +24,7 @@ from graph_slam_ros.runs.journal import parts_of
 from graph_slam_ros.runs.map_journal import MapGrowth, Record, extend, state_of
 from graph_slam_ros.runs.restore import config_to_go_on, record_run, restored_and_solved, stopwatch
 from graph_slam_ros.slam import Control, GraphSlam
-from graph_slam_ros.slam.alarm import Alarm
+from graph_slam_ros.slam.doubt.record import Alarm
 from graph_slam_ros.slam.edits import HAND_MADE
 from graph_slam_ros.slam.frontend.odometry_jumps import JUMP_SIGMA_M, JUMP_SIGMA_RAD
 from graph_slam_ros.slam.landmarks.assignments import NAME, last_number

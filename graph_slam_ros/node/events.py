@@ -5,9 +5,8 @@ from dataclasses import dataclass
 
 from graph_slam_ros.messages.to_msg import ERROR, OK, WARN, Status
 from graph_slam_ros.slam import GraphSlam, Update
-from graph_slam_ros.slam.alarm import Alarm
+from graph_slam_ros.slam.doubt.record import Alarm, Slip
 from graph_slam_ros.slam.robust.ledger import Verdict, VerdictChange
-from graph_slam_ros.slam.slip_review import Slip
 
 _EDGES = 1000  # of one update that are moved one by one
 

@@ -10,13 +10,13 @@ from graph_slam_ros.graph import Gaussian, Graph
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.slam.calibration.rows import TrialProblem
+from graph_slam_ros.slam.doubt.record import DisplacementHypothesis
 from graph_slam_ros.slam.frontend.keyframes import Keyframe, KeyframeList
 from graph_slam_ros.slam.frontend.noise_factors import CLASSES, Key, NoiseScales
 from graph_slam_ros.slam.frontend.sighting_edges import SightingEdges
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.slam.lifelong.state import BoundedState
 from graph_slam_ros.slam.noise_scale import NoiseScale, estimate_noise, factors_of
-from graph_slam_ros.slam.robust.displacement_hypothesis import DisplacementHypothesis
 from graph_slam_ros.slam.robust.gating import OutlierGate
 from graph_slam_ros.slam.robust.hypotheses import (
     Alternative,

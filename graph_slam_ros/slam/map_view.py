@@ -10,26 +10,25 @@ from graph_slam_ros.config.config import Config
 from graph_slam_ros.graph import Graph
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.measurements.edits import AppliedEdit
-from graph_slam_ros.slam.alarm import Alarm
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.calibration.answers import Finding, Uncorrected
 from graph_slam_ros.slam.calibration.fit import TrialFit
 from graph_slam_ros.slam.calibration.parameters import AUTO
 from graph_slam_ros.slam.calibration.recalibration import Recalibration
+from graph_slam_ros.slam.doubt.kidnap_detector import KidnapDetector
+from graph_slam_ros.slam.doubt.record import Alarm, Slip
 from graph_slam_ros.slam.found_factors import FoundFactors
 from graph_slam_ros.slam.frontend.gyro import GyroState, SavedBias
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
 from graph_slam_ros.slam.frontend.keyframes import Keyframe, SightingPose
 from graph_slam_ros.slam.frontend.noise_factors import Key, Rescaling
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
-from graph_slam_ros.slam.kidnap_detector import KidnapDetector
 from graph_slam_ros.slam.landmarks.landmark import Landmark
 from graph_slam_ros.slam.landmarks.landmark_frontend import LandmarkFrontend
 from graph_slam_ros.slam.landmarks.renewed_ids import LEAST, RenewedIds, renewed_ids
 from graph_slam_ros.slam.lifelong.state import BoundedState
 from graph_slam_ros.slam.noise_scale import NoiseScale
 from graph_slam_ros.slam.robust.ledger import Ledger
-from graph_slam_ros.slam.slip_review import Slip
 from graph_slam_ros.slam.solution import Correction, Solution
 from graph_slam_ros.slam.trial_fits import TrialFits
 from graph_slam_ros.solver import Report, Solver

@@ -26,8 +26,8 @@ from graph_slam_ros.slam.calibration.parameters import AUTO, Parameter
 from graph_slam_ros.slam.calibration.places import fit_with_places
 from graph_slam_ros.slam.calibration.rows import TrialProblem
 from graph_slam_ros.slam.doubt.evidence import LOG_ODDS
+from graph_slam_ros.slam.doubt.kidnap_detector import KidnapDetector
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
-from graph_slam_ros.slam.kidnap_detector import KidnapDetector
 from graph_slam_ros.slam.landmarks.landmark_frontend import LandmarkFrontend
 from graph_slam_ros.typing import Array, Executor, Index
 

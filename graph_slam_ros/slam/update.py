@@ -2,12 +2,11 @@
 
 from dataclasses import dataclass
 
-from graph_slam_ros.slam.alarm import Alarm
 from graph_slam_ros.slam.bounded_map import Condensation
 from graph_slam_ros.slam.calibration.answers import Finding
+from graph_slam_ros.slam.doubt.record import Alarm, Slip
 from graph_slam_ros.slam.map_view import MapView
 from graph_slam_ros.slam.robust.ledger import VerdictChange
-from graph_slam_ros.slam.slip_review import Slip
 from graph_slam_ros.slam.solution import Correction
 from graph_slam_ros.solver import Report
 

@@ -10,8 +10,8 @@ from graph_slam_ros.lie import se2
 from graph_slam_ros.measurements.types import InitialPose, Odometry
 from graph_slam_ros.runs.restore import map_of, record_run
 from graph_slam_ros.slam import Config, Control, GraphSlam
+from graph_slam_ros.slam.doubt.record import Slip
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict
-from graph_slam_ros.slam.slip_review import Slip
 from graph_slam_ros.tools.simulation import Fault, faulty_recording, measurements, simulate
 
 DISPLACED, SLIP = ("odometry", "displaced"), ("odometry", "slip")
@@ -284,22 +284,22 @@ def test_a_slip_that_was_none_is_taken_back_and_leaves_no_trace():
     recording = world(3, laps=1)
     half = int(recording.stamps_ns[len(recording.stamps_ns) // 2])
     plain, doubted, ended = (GraphSlam(Config()) for _ in range(3))
-    detector, links = doubted._kidnaps._slips, None
+    window, links = doubted._kidnaps._window, None
     for m in measurements(recording):
         for slam in (plain, doubted, ended):
             slam.process(m)
         if links is None and isinstance(m, Odometry) and m.stamp_ns > half:
-            links = list(detector._links)[-3:]
+            links = list(window.links.values())[-3:]
             doubt(doubted, links, m.stamp_ns)
             assert "odometry in doubt since" in str(doubted.displaced)
-            assert all(detector.active(link.own) == link.edge != link.own for link in links)
-            doubt(ended, list(ended._kidnaps._slips._links)[-5:], m.stamp_ns, ended_ns=m.stamp_ns + 1)
+            assert all(link.edge != link.own for link in links)
+            doubt(ended, list(ended._kidnaps._window.links.values())[-5:], m.stamp_ns, ended_ns=m.stamp_ns + 1)
         if links is not None and doubted.displaced is None:
             break
     edges = doubted.graph.edges_of("odometry")
     reasons = doubted.ledger.reason.values[edges]
     own = set(edges[reasons != Reason.REVOKED].tolist())
-    assert {detector.active(edge) for edge in edges.tolist()[-20:]} <= own
+    assert {link.edge for link in window.links.values()} <= own
     assert ended.counters[TAKEN_BACK] == 0
     for slam in (plain, doubted, ended):
         slam.process(Control("optimize"))

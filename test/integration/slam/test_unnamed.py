@@ -13,7 +13,7 @@ from graph_slam_ros.lie import se2
 from graph_slam_ros.runs.journal import RecordWriter
 from graph_slam_ros.runs.map_journal import MapGrowth, extend, read_map, state_of
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
-from graph_slam_ros.slam.slip_review import Slip
+from graph_slam_ros.slam.doubt.record import Slip
 from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.tools.simulation import Fault, faulty_recording, measurements
 from graph_slam_ros.tools.simulation.recording import VelocityNoise, drive

@@ -13,21 +13,18 @@ import numpy as np
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.graph import Gaussian
 from graph_slam_ros.measurements.counters import Counters
-from graph_slam_ros.slam.alarm import Alarm
 from graph_slam_ros.slam.backend import Backend
-from graph_slam_ros.slam.displacements import Displacement, Displacements
+from graph_slam_ros.slam.doubt.displacement import DisplacementSearch
+from graph_slam_ros.slam.doubt.displacements import Displacements
 from graph_slam_ros.slam.doubt.evidence import Moved
+from graph_slam_ros.slam.doubt.record import Alarm, Displacement, DisplacementHypothesis, Slip
+from graph_slam_ros.slam.doubt.slip_detector import SlipDetector
+from graph_slam_ros.slam.doubt.window import Window
 from graph_slam_ros.slam.frontend.keyframes import Keyframe
 from graph_slam_ros.slam.frontend.odometry_jumps import JUMP_SIGMA_M, JUMP_SIGMA_RAD
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.slam.landmarks.anonymous import AnonymousLandmarks
 from graph_slam_ros.slam.robust.connections import moved_values
-from graph_slam_ros.slam.robust.displacement import DisplacementSearch
-from graph_slam_ros.slam.robust.displacement_hypothesis import DisplacementHypothesis
-from graph_slam_ros.slam.robust.innovation_monitor import InnovationMonitor
-from graph_slam_ros.slam.robust.landmark_history import LandmarkHistory
-from graph_slam_ros.slam.slip_detector import SlipDetector
-from graph_slam_ros.slam.slip_review import Slip
 from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.solver import Report, Settings
 from graph_slam_ros.typing import Index, Numbers
@@ -68,13 +65,11 @@ class KidnapDetector:
         self._segments, self._anonymous = segments, anonymous
         self.alarms: list[Alarm] = []
         self.earlier: list[dict[str, Any]] = start.displacements if start else []
-        space, graph, solver = config.space, backend.graph, backend.solver
-        self._history = LandmarkHistory(graph, backend.ledger)
-        self._search = DisplacementSearch(space, graph, solver, backend.ledger, self._history)
-        self._monitor = InnovationMonitor(solver, backend.decisions, self._history)
-        self._slips = SlipDetector(space, config.odometry, backend, counters, self._history, anonymous.doubt)
-        self._next = graph.edge_count
-        self._decided = Displacements(space, backend, self._search, counters, segments, self.alarms, anonymous.rejoined)
+        self._window = Window(config.space, backend)
+        self._search = DisplacementSearch(config.space, backend, self._window)
+        self._slips = SlipDetector(config.space, config.odometry, backend, counters, self._window, anonymous.doubt)
+        self._next = backend.graph.edge_count
+        self._decided = Displacements(config.space, backend, self._search, counters, segments, self.alarms, anonymous)
         self._was_doubtful = False  # the association, when the present alarm began: it is no evidence then
 
     @property
@@ -92,15 +87,12 @@ class KidnapDetector:
         first : the first keyframe that stays, by its new vertex
         """
         graph = self._backend.graph
-        self._history.renumber(vertices, edges, first)
-        self._search.renumber(vertices, edges, first)
-        self._monitor.renumber(vertices, edges)
-        self._slips.renumber(vertices, edges)
+        self._window.renumber(vertices, edges, first)
         self._decided.renumber(vertices, edges, first)
         noted, self._next = edges[: self._next], graph.edge_count
         for number in range(int(np.count_nonzero(noted >= 0)), graph.edge_count):
             if (one := graph.edge(number)).label == "closures":
-                self._slips.add_seen(number, max(one.vertices), one.label)
+                self._window.add_seen(number, max(one.vertices), one.label, self._window.newest_ns)
 
     @property
     def slips(self) -> list[Slip]:
@@ -119,9 +111,7 @@ class KidnapDetector:
 
     def begin_segment(self, vertex: int, stamp_ns: int) -> None:
         """A segment begins at a keyframe, by a jump or a given pose: sightings before tell nothing of where it is."""
-        self._search.begin(vertex)
-        self._monitor.begin(vertex)
-        self._slips.begin(stamp_ns)
+        self._begin_anew(vertex, stamp_ns)
         self._decided.clear()
         self._anonymous.keep_displacements()
         if (now := self.now) is not None:
@@ -136,26 +126,22 @@ class KidnapDetector:
             self._add(edge, stamp_ns, keyframes)
 
     def _add(self, edge: int, stamp_ns: int, keyframes: StampedPoses[Keyframe]) -> None:
-        one, search = self._backend.graph.edge(edge), self._search
+        one, window = self._backend.graph.edge(edge), self._window
         vertices = one.vertices
         match one.label:
             case "odometry":
-                search.chain.add(edge, vertices, tuple(one.measured.tolist()), stamp_ns)
                 first, last = keyframes.stamps_ns[np.searchsorted(keyframes.ids, vertices)].tolist()
-                self._slips.add_odometry(edge, vertices, (first, last), len(keyframes) - 1)
-            case "initialpose":
-                search.add_initial_pose(edge, vertices[0])
+                if (link := window.add_odometry(edge, vertices, (first, last))) is not None:
+                    self._slips.add_odometry(link, len(keyframes) - 1)
             case "surveyed":
-                self._history.add_survey(vertices[0])
+                window.history.add_survey(vertices[0])
             case "landmarks":
-                self._history.add(edge, vertices[0], vertices[1])
-                search.add_sighting(edge, vertices[0], vertices[1])
-                self._monitor.add(edge, vertices[0], vertices[1], stamp_ns)
-                self._slips.add_seen(edge, vertices[0], vertices[1])
+                window.history.add(edge, vertices[0], vertices[1])
+                window.add_seen(edge, vertices[0], vertices[1], stamp_ns)
             case "fixes":
-                self._slips.add_seen(edge, vertices[0], one.label)
+                window.add_seen(edge, vertices[0], one.label, stamp_ns)
             case "closures":
-                self._slips.add_seen(edge, max(vertices), one.label)
+                window.add_seen(edge, max(vertices), one.label, stamp_ns)
 
     def check(self, keyframes: StampedPoses[Keyframe], stamp_ns: int) -> None:
         """Look at the evidence after a solve.
@@ -165,6 +151,7 @@ class KidnapDetector:
         stamp_ns : of the newest odometry
         """
         vertices = keyframes.ids
+        self._window.note_solved()
         if not self._backend.decides:
             return
         if self._rejoin(keyframes, stamp_ns):
@@ -203,7 +190,7 @@ class KidnapDetector:
             return None
         T_map_chain = found.T_map_chain
         return Moved(
-            found.first, lambda vertex: self._space.group.compose(T_map_chain, self._search.chain.pose(vertex))
+            found.first, lambda vertex: self._space.group.compose(T_map_chain, self._window.links[vertex].pose)
         )
 
     def _protect(self) -> None:
@@ -223,7 +210,7 @@ class KidnapDetector:
 
     def _note(self, found: DisplacementHypothesis | None, stamp_ns: int) -> None:
         """Begin an alarm, go on with it, or end it."""
-        now, sum_of = self.now, self._monitor.contradiction()
+        now, sum_of = self.now, self._window.contradiction()
         is_elsewhere = self._anonymous.elsewhere.since is not None
         is_contradicted = is_elsewhere or (sum_of is not None and sum_of.is_significant)
         evidence = found.evidence if found else 0
@@ -258,7 +245,7 @@ class KidnapDetector:
     def _is_calm(self, now: Alarm, stamp_ns: int) -> bool:
         """Return whether the alarm may end: where it was decided, the landmarks must have agreed for a while."""
         is_early = now.segment is not None and (stamp_ns - now.began_ns) * 1e-9 < _CALM_S
-        return self._monitor.is_calm and not is_early
+        return self._window.is_calm and not is_early
 
     def _decide(self, found: DisplacementHypothesis, keyframes: StampedPoses[Keyframe], stamp_ns: int) -> None:
         """Begin a segment where the landmarks say that the robot is."""
@@ -269,11 +256,11 @@ class KidnapDetector:
         moved = group.between(before, there)
         distance_m = float(np.linalg.norm(moved[: self._space.dimensions]))
         angle_rad = float(self._space.angle(moved))
-        T_map_chain_before = group.compose(before, group.inverse(self._search.chain.pose(found.first)))
-        link, motion, noise = self._replacement(found.first, there)
+        T_map_chain_before = group.compose(before, group.inverse(self._window.links[found.first].pose))
+        graph, (link, motion, noise) = self._backend.graph, self._replacement(found.first, there)
         replacement = self._backend.split(
             (link, motion, noise),
-            self._search.initial_poses(found.first),
+            [edge for edge in graph.edges_of("initialpose").tolist() if graph.edge(edge).vertices[0] >= found.first],
             moved_values(self._space, self._backend.solver, motions),
             found,
             len(keyframes) - 1,
@@ -299,8 +286,8 @@ class KidnapDetector:
                 replacement,
                 T_map_chain_before,
                 found.T_map_chain,
-                self._search.chain.pose(found.first),
-                self._search.chain.drift(found.first),
+                self._window.links[found.first].pose,
+                self._window.links[found.first].drift,
                 len(self.alarms) - 1,
             )
         )
@@ -322,16 +309,16 @@ class KidnapDetector:
 
     def _begin_anew(self, vertex: int, stamp_ns: int) -> None:
         """Compare no sighting from before a keyframe, by its vertex, with where the robot is."""
-        self._search.begin(vertex)
-        self._monitor.begin(vertex)
-        self._slips.begin(stamp_ns, vertex)
+        self._slips.begin(stamp_ns)
+        self._window.begin(vertex)
+        self._search.begin()
 
     def _estimate(self, vertex: int) -> Numbers:
         return tuple(self._backend.solver.estimate([vertex])[0].tolist())
 
     def _replacement(self, first: int, there: Numbers) -> tuple[int, Numbers, Gaussian]:
         """Odometry's edge to a keyframe, the motion that the landmarks show instead, and next to no trust in it."""
-        link = self._slips.active(self._search.chain.edge(first))
+        link = self._window.links[first].edge
         before = self._estimate(self._backend.graph.edge(link).vertices[0])
         motion = tuple(map(float, self._space.group.between(before, there)))
         return link, motion, Gaussian.from_sigmas(*self._space.sigmas(JUMP_SIGMA_M, JUMP_SIGMA_RAD))
@@ -341,11 +328,11 @@ class KidnapDetector:
 
         Those before the oldest sighting that was compared stay as they are to it, which landmarks may have measured.
         """
-        group, chain, motions = self._space.group, self._search.chain, dict[int, Numbers]()
-        vertices = chain.vertices[chain.vertices >= found.first].tolist()
+        group, links, motions = self._space.group, self._window.links, dict[int, Numbers]()
+        vertices = [vertex for vertex in links if vertex >= found.first]
         oldest = next(vertex for vertex in vertices if vertex >= found.seen_from)
         for vertex in vertices:
             at = max(vertex, oldest)
-            there = group.compose(found.T_map_chain, chain.pose(at))
+            there = group.compose(found.T_map_chain, links[at].pose)
             motions[vertex] = group.compose(there, group.inverse(self._estimate(at)))
         return motions

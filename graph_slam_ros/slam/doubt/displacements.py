@@ -1,45 +1,20 @@
 """The displacements that were decided in the present frame of odometry, and how one is taken back."""
 
-from collections.abc import Callable, Container
-from dataclasses import dataclass, replace
+from collections.abc import Container
+from dataclasses import replace
 
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.measurements.counters import Counters
-from graph_slam_ros.slam.alarm import Alarm
 from graph_slam_ros.slam.backend import Backend
+from graph_slam_ros.slam.doubt.displacement import SAME_M, SAME_RAD, DisplacementSearch
+from graph_slam_ros.slam.doubt.record import Alarm, Displacement, DisplacementHypothesis
+from graph_slam_ros.slam.landmarks.anonymous import AnonymousLandmarks
 from graph_slam_ros.slam.robust.connections import moved_values
-from graph_slam_ros.slam.robust.displacement import SAME_M, SAME_RAD, DisplacementSearch
-from graph_slam_ros.slam.robust.displacement_hypothesis import DisplacementHypothesis
-from graph_slam_ros.typing import Array, Index, Numbers
+from graph_slam_ros.typing import Index, Numbers
 
 _DRIFT = 3.0  # sigmas
 _CONTRADICTED = "taken back: later sightings contradict it"
 _EXPLAINED = "taken back: without it all sightings are explained better"
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Displacement:
-    """A displacement that was decided.
-
-    Attributes
-    ----------
-    first : vertex of the keyframe at which the segment begins
-    index : of that keyframe; None where a segment began there before
-    link, replacement : odometry's edge to it, which is out, and the edge with very large noise that replaces it
-    T_map_chain_before, T_map_chain : where the frame of odometry lay before, and lies since
-    chain, drift : where that frame had the keyframe, and the variances [m^2, rad^2] of odometry up to it
-    alarm : its index
-    """
-
-    first: int
-    index: int | None
-    link: int
-    replacement: int
-    T_map_chain_before: Numbers
-    T_map_chain: Numbers
-    chain: Numbers
-    drift: Array
-    alarm: int
 
 
 class Displacements:
@@ -49,7 +24,7 @@ class Displacements:
     ----------
     segments : indices of the keyframes at which segments begin; one that is taken back is removed
     alarms : the outcome of one that is taken back is noted
-    rejoined : called with the first vertex of one that is taken back, before the next solve
+    anonymous : told of one that is taken back, before the next solve
     """
 
     def __init__(
@@ -60,10 +35,10 @@ class Displacements:
         counters: Counters,
         segments: list[int],
         alarms: list[Alarm],
-        rejoined: Callable[[int], None],
+        anonymous: AnonymousLandmarks,
     ) -> None:
         self._space, self._backend, self._search, self._counters = space, backend, search, counters
-        self._segments, self._alarms, self._rejoined = segments, alarms, rejoined
+        self._segments, self._alarms, self._anonymous = segments, alarms, anonymous
         self._decided: list[Displacement] = []
         self._refuted: list[Numbers] = []  # where the frame does not lie: it was decided and taken back
 
@@ -96,7 +71,7 @@ class Displacements:
         one, search = self._decided[-1], self._search
         before_m, before_rad = search.difference(one.T_map_chain_before, found.T_map_chain, newest)
         after_m, _ = search.difference(one.T_map_chain, found.T_map_chain, newest)
-        drift_m, drift_rad = search.chain.drift_since(one.drift, one.chain, newest)
+        drift_m, drift_rad = search.window.drift_since(one.drift, one.chain, newest)
         is_back = before_m < min(after_m, SAME_M + _DRIFT * drift_m) and before_rad < SAME_RAD + _DRIFT * drift_rad
         return one if is_back else None
 
@@ -125,4 +100,4 @@ class Displacements:
         self._alarms[one.alarm] = replace(alarm, ended_ns=alarm.ended_ns or stamp_ns, outcome=outcome)
         self._decided.remove(one)
         self._refuted.append(one.T_map_chain)
-        self._rejoined(one.first)
+        self._anonymous.rejoined(one.first)

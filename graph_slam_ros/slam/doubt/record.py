@@ -1,0 +1,143 @@
+"""What was doubted and decided: alarms that the robot is elsewhere, displacements, and slips."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from graph_slam_ros.typing import Array, Numbers
+
+
+@dataclass(frozen=True, slots=True)
+class Alarm:
+    """A time when the landmarks said that the robot was elsewhere than odometry.
+
+    Attributes
+    ----------
+    began_ns, ended_ns : stamps of odometry; None while it goes on
+    evidence : sightings more for another pose than for odometry's, at most; 0 where none was found
+    segment : the keyframe, by its index, at which a segment begins since it was decided so; None where it was not
+    distance_m, angle_rad : how far the robot was moved there, against odometry
+    held_back, tested : when it began, of the newest sightings how many were held back, and all
+    determines_pose : whether what is held back can tell a pose; ranges and bearings alone do not
+    outcome : what came of it otherwise: it ended undecided since a segment began, or what was decided was taken back
+    """
+
+    began_ns: int
+    evidence: int
+    ended_ns: int | None = None
+    segment: int | None = None
+    distance_m: float = 0.0
+    angle_rad: float = 0.0
+    held_back: int = 0
+    tested: int = 0
+    determines_pose: bool = True
+    outcome: str = ""
+
+    def __str__(self) -> str:
+        at = f"{self.began_ns * 1e-9:.1f} s"
+        if self.segment is not None:
+            moved = f"{self.distance_m:.2f} m and {np.rad2deg(self.angle_rad):.1f} degrees"
+            return (
+                f"the landmarks said at {at} that the robot is elsewhere, {moved} from where odometry had it: "
+                f"a segment begins at keyframe {self.segment}{self.outcome and '; '}{self.outcome}"
+            )
+        why = f"{self.evidence} sightings more than not"
+        if not self.evidence:
+            why = f"{self.held_back} of the last {self.tested} sightings contradict odometry"
+            why = why if self.held_back else "what should be seen there is not"
+        if self.ended_ns is None:
+            remedy = (
+                "" if self.determines_pose else "; ranges or bearings alone do not determine the pose: give initialpose"
+            )
+            return f"the landmarks say since {at} that the robot is elsewhere ({why}){remedy}"
+        until = f"{self.ended_ns * 1e-9:.1f} s"
+        outcome = self.outcome or "it was not so"
+        return f"from {at} to {until} the landmarks said that the robot is elsewhere ({why}); {outcome}"
+
+
+@dataclass(frozen=True, slots=True)
+class DisplacementHypothesis:
+    """Another pose of the robot, and the evidence for it.
+
+    Attributes
+    ----------
+    first : the keyframe's vertex from which on the robot is there
+    seen_from : that of the oldest sighting that was compared; from ``first`` to there landmarks tell nothing
+    T_map_chain : where the evidence's own frame of odometry lies then in map
+    evidence : sightings that are held back and fit it, minus those that are believed and do not
+    landmarks, keyframes : how many are in agreement
+    has_headings : whether the landmarks were seen with their headings, which agree, too
+    fitting, contradicting : edges of sightings from ``first`` on that fit and that do not
+    rival : the evidence for a pose that differs from it
+    """
+
+    first: int
+    seen_from: int
+    T_map_chain: Numbers
+    evidence: int
+    landmarks: int
+    keyframes: int
+    has_headings: bool
+    fitting: tuple[int, ...]
+    contradicting: tuple[int, ...]
+    rival: int = 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Displacement:
+    """A displacement that was decided.
+
+    Attributes
+    ----------
+    first : vertex of the keyframe at which the segment begins
+    index : of that keyframe; None where a segment began there before
+    link, replacement : odometry's edge to it, which is out, and the edge with very large noise that replaces it
+    T_map_chain_before, T_map_chain : where the frame of odometry lay before, and lies since
+    chain, drift : where that frame had the keyframe, and the variances [m^2, rad^2] of odometry up to it
+    alarm : its index
+    """
+
+    first: int
+    index: int | None
+    link: int
+    replacement: int
+    T_map_chain_before: Numbers
+    T_map_chain: Numbers
+    chain: Numbers
+    drift: Array
+    alarm: int
+
+
+@dataclass(frozen=True, slots=True)
+class Slip:
+    """A stretch of odometry in which its errors are larger than its noise.
+
+    Attributes
+    ----------
+    kind : ``translation`` or ``rotation``
+    began_ns, decided_ns, ended_ns : stamps of odometry; the last is None while it goes on
+    evidence : twice the logarithm of the likelihood ratio of slip to no slip
+    landmarks : the number of landmarks, and of other classes of edges, that contradict odometry
+    edges : the number of odometry edges that were replaced
+    outcome : why it was taken back; empty if it was not
+    segment : always None, because no new segment begins
+    """
+
+    kind: str
+    began_ns: int
+    decided_ns: int
+    evidence: float
+    landmarks: int
+    edges: int = 0
+    ended_ns: int | None = None
+    outcome: str = ""
+    segment: None = None
+
+    def __str__(self) -> str:
+        since = f"{self.began_ns * 1e-9:.1f} s"
+        why = f"{self.landmarks} landmarks or other inputs contradict it, evidence {self.evidence:.0f}"
+        if self.ended_ns is None:
+            return f"odometry in doubt since {since}: its {self.kind} is wrong ({why}); it counts for less"
+        until = f"{self.ended_ns * 1e-9:.1f} s"
+        outcome = self.outcome or f"{self.edges} edges of odometry count for less"
+        return f"odometry was in doubt from {since} to {until}: its {self.kind} was wrong ({why}); {outcome}"

@@ -1,0 +1,360 @@
+"""Detection of slip: stretches of odometry whose errors are larger than its noise.
+
+A view is everything that was measured from one keyframe. If the last 1 to 16 views contradict odometry more than is
+usual in this drive, some of their keyframes are tested as the start of a slip, of translation or of rotation, beside
+the hypothesis that the robot was moved. The best must be a slip, exceed the odds against it, and be likelier than none
+also without any one landmark. Then edges with more noise replace the odometry edges of the stretch, and new odometry
+gets more noise, too. With each new view it is asked whether the slip began earlier, or has ended. If odometry with its
+own noise is likelier in the whole stretch, the slip is taken back, and everything is as before. When everything is
+solved, each slip is asked about again.
+"""
+
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from dataclasses import replace
+from functools import cache, partial
+from itertools import pairwise
+
+import numpy as np
+
+from graph_slam_ros.config.pipeline import OdometryConfig
+from graph_slam_ros.errors import GraphSlamError, SingularError
+from graph_slam_ros.graph import Gaussian
+from graph_slam_ros.graph.geometry import Geometry
+from graph_slam_ros.measurements.counters import Counters
+from graph_slam_ros.slam.backend import Backend
+from graph_slam_ros.slam.doubt.evidence import (
+    CARRIED,
+    LOG_ODDS,
+    SLIPS,
+    Choice,
+    Hypothesis,
+    Moved,
+    Stretch,
+    carried,
+    covariance_of,
+)
+from graph_slam_ros.slam.doubt.odometry_errors import NOISE_FACTOR, OdometryErrors, between
+from graph_slam_ros.slam.doubt.record import Slip
+from graph_slam_ros.slam.doubt.window import Link, View, Window
+from graph_slam_ros.slam.frontend.keyframes import Keyframe
+from graph_slam_ros.slam.frontend.odometry_jumps import JUMP_SIGMA_M, JUMP_SIGMA_RAD
+from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
+from graph_slam_ros.slam.measured_noise import MeasuredNoise
+from graph_slam_ros.slam.robust.ledger import Reason, Verdict
+from graph_slam_ros.solver import Solver
+from graph_slam_ros.typing import Array
+
+_VIEWS, _MOST_EDGES = 17, 60  # newest ones that are compared
+_SINCE = (1, 2, 4, 6, 8, 12, 16)  # views before which a slip may have begun
+_EARLIER = (1, 2, 3, 4, 6, 8)  # edges by which a slip may have begun before it was found
+_SURELY = 1.0  # logarithm of the likelihood ratio that this needs
+_AGAIN = (8, 12, 16)  # views for which odometry must be as likely by its own noise, for a slip to end
+_PART = 0.05  # of the views cause a comparison at most, but for so many that follow one another:
+_BURST = 20.0
+_SLIP_M_S, _SLIP_RAD_S = 0.35, 0.35  # sigmas of what odometry does not notice: some of an indoor robot's speeds
+_LASTS_S = 0.5  # correlation time of the errors of a slip
+_LONGEST_S = 1.0  # of one edge; wheels that stand longer do not slip: the robot was carried
+_OTHERS = 1.0 / 3.0  # sigma along the other axes, relative to the first
+
+Pair = tuple[int, int]
+"""An edge of odometry that slipped, and the one that replaces it."""
+
+Doubt = Callable[[int, Callable[[float], Array] | None], None]
+SeenOf = Mapping[int, Sequence[tuple[int, int | str]]]
+
+
+class SlipDetector:
+    """Detects slips, and keeps the edges of odometry in step with them.
+
+    Parameters
+    ----------
+    doubt : takes a stamp since when odometry has more noise, and the variances that so many seconds add; None: its own
+
+    Attributes
+    ----------
+    slips : in order; the last may go on
+    """
+
+    def __init__(
+        self,
+        space: Geometry,
+        odometry: OdometryConfig,
+        backend: Backend,
+        counters: Counters,
+        window: Window,
+        doubt: Doubt,
+    ) -> None:
+        self._space, self._config, self._backend, self._counters = space, odometry, backend, counters
+        self._window, self._doubt = window, doubt
+        self._checked: View | None = None
+        self._allowed = _BURST
+        self._noise = MeasuredNoise(space, backend)
+        self.slips: list[Slip] = []
+
+    @property
+    def now(self) -> Slip | None:
+        """The slip that goes on."""
+        return self.slips[-1] if self.slips and self.slips[-1].ended_ns is None else None
+
+    def begin(self, stamp_ns: int) -> None:
+        """A segment begins: a slip has ended."""
+        if (now := self.now) is not None:
+            self.slips[-1] = replace(now, ended_ns=max(stamp_ns, now.began_ns))
+            self._doubt(stamp_ns, None)
+
+    def add_odometry(self, link: Link, keyframe: int) -> None:
+        """Take over odometry to a new keyframe. During a slip it gets more noise."""
+        if (now := self.now) is not None:
+            self._replace([link], now, keyframe)
+
+    def check(
+        self, keyframes: StampedPoses[Keyframe], stamp_ns: int, moved: Moved | None = None, *, is_decided: bool = False
+    ) -> bool:
+        """Examine the evidence after a solve. Returns whether a slip explains it better than that the robot was moved.
+
+        Such a slip begins if it is sure.
+
+        Parameters
+        ----------
+        stamp_ns : of the newest odometry
+        moved : where the robot may have been moved to
+        is_decided : whether it is decided now, if a slip does not explain it better
+        """
+        views = list(self._window.views)[-_VIEWS:]
+        links = self._window.stretch(_VIEWS, _MOST_EDGES) if len(views) > 1 else []
+        if not self._config.doubt or not links:
+            return False
+        is_new, self._checked = views[-1] is not self._checked, views[-1]
+        self._allowed = min(_BURST, self._allowed + _PART * is_new)
+        try:
+            if self.now is None and (is_decided or (is_new and self._allowed >= 1.0 and self._window.is_alarmed)):
+                self._allowed = max(0.0, self._allowed - 1.0)
+                choice = self._compare(links, views, moved, keyframes)
+                if choice.is_slip:
+                    self._begin_slip(choice, links[choice.first :], len(keyframes) - 1, stamp_ns)
+                return choice.kind in SLIPS
+            if self.now is None or not is_new:
+                return False
+            explains = is_decided and self._compare(links, views, moved, keyframes).kind != CARRIED
+            self._update_slip(self.now, links, views, len(keyframes) - 1, stamp_ns)
+            return explains
+        except (GraphSlamError, np.linalg.LinAlgError):  # nothing can be compared: odometry counts as before
+            return False
+
+    # -- evidence --------------------------------------------------------------------------------------------------
+
+    def _compare(
+        self, links: Sequence[Link], views: Sequence[View], moved: Moved | None, keyframes: StampedPoses[Keyframe]
+    ) -> Choice:
+        """Compare the hypotheses: odometry's noise, a slip from each view on, and that the robot was moved."""
+        self._noise.measure(keyframes)
+        stretch = self._stretch([link.edge for link in links], self._seen(links, views))
+        firsts = sorted({_first_of(links, views[-since - 1]) for since in _SINCE if since < len(views)})
+        every = [Hypothesis(kind, k, self._added(kind, links, k, len(links))) for kind in SLIPS for k in firsts]
+        if moved is not None:
+            k = next((k for k, link in enumerate(links) if link.vertices[1] >= moved.first), len(links) - 1)
+            there = moved.pose_of(links[k].vertices[1])
+            every.append(carried(k, there, self._space.sigmas(JUMP_SIGMA_M, JUMP_SIGMA_RAD), len(links)))
+        return stretch.choice(every)
+
+    def _stretch(self, edges: Sequence[int], seen: SeenOf) -> Stretch:
+        """A stretch of odometry, and its likelihood without what was seen along it; an alarm alone changes nothing."""
+        graph, ledger, noise = self._backend.graph, self._backend.ledger, self._noise
+        out = [edge for of_view in seen.values() for edge, _ in of_view if ledger.is_inside(edge)]
+        prior = partial(self._without, out)
+        every = [graph.edge(edge) for edge in edges]
+        return Stretch(self._space, graph, every, seen, prior, noise.of_odometry, noise.of_all)
+
+    def _without(self, edges: Sequence[int], vertices: Sequence[int]) -> tuple[Array, Array]:
+        """Stored values of vertices and their joint covariance without some edges."""
+        solver, graph = self._backend.solver, self._backend.graph
+        try:
+            return solver.joint_marginal_without(vertices, edges)
+        except SingularError:  # a copy is solved anew
+            graph = graph.copy()
+        graph.set_weights(np.array(edges, dtype=np.int64), 0.0)
+        anew = Solver(graph, solver.settings.until_still())
+        anew.add(solver.vertices, range(self._backend.handed_over[1]))
+        anew.start_at(solver.values)
+        for vertex in solver.held.tolist():
+            anew.hold(vertex)
+        joint = anew.joint_marginal(vertices)
+        return np.concatenate([anew.values[graph.vertex(vertex).stored] for vertex in vertices]), joint
+
+    def _seen(self, links: Sequence[Link], views: Sequence[View]) -> SeenOf:
+        """What was seen from the keyframes after links, held back or not, and is determined without that."""
+        first, ledger = links[0].vertices[0], self._backend.ledger
+        ends = {link.vertices[1] for link in links}
+        is_determined = cache(partial(self._is_determined, known_by=first, keyframes=ends))
+        return {
+            view.vertex: [
+                (one.edge, one.what)
+                for one in view.seen
+                if one.edge < len(ledger) and not ledger.is_withdrawn(one.edge) and is_determined(one.what)
+            ]
+            for view in views
+            if view.vertex in ends
+        }
+
+    def _is_determined(self, what: int | str, known_by: int, keyframes: Container[int]) -> bool:
+        """Return whether one observation from another keyframe determines a landmark: then the rest can be left out."""
+        if isinstance(what, str) or self._window.known_from(what) >= known_by:
+            return isinstance(what, str)
+        graph, ledger, dof = self._backend.graph, self._backend.ledger, self._backend.graph.kind_of(what).dof
+        inside = (edge for edge in self._backend.solver.edges_on(what).tolist() if ledger.is_inside(edge))
+        return any(
+            one.vertices[0] not in keyframes and one.type.residual_size >= dof for one in map(graph.edge, inside)
+        )
+
+    def _added(self, kind: str, links: Sequence[Link], first: int, end: int) -> Array:
+        """Variances (n, dof) that a kind of slip adds to the links from ``first`` up to ``end``, of all links."""
+        is_part = (np.arange(len(links)) >= first) & (np.arange(len(links)) < end)
+        return _variances(self._space, kind, np.array([link.seconds for link in links])) * is_part[:, None]
+
+    def _wider(self, kind: str, links: Sequence[Link], first: int, end: int) -> Array:
+        """The same as covariances (n, dof, dof), as if all noise were larger."""
+        return self._added(kind, links, first, end)[:, :, None] * np.eye(self._space.dof) / NOISE_FACTOR**2
+
+    # -- a slip ------------------------------------------------------------------------------------------------------
+
+    def _begin_slip(self, choice: Choice, links: Sequence[Link], keyframe: int, stamp_ns: int) -> None:
+        began_ns, vertex, ledger = links[0].stamps_ns[0], links[0].vertices[0], self._backend.ledger
+        slip = Slip(choice.kind, began_ns, stamp_ns, 2.0 * choice.log_ratio, choice.voters)
+        self.slips.append(slip)
+        self._counters.count("odometry", "slip")
+        self._replace(links, slip, keyframe)
+        # what was held back since then is judged again, with the wider noise of odometry
+        edges = [one.edge for view in list(self._window.views)[-_VIEWS:] if view.vertex >= vertex for one in view.seen]
+        self._backend.admit([edge for edge in edges if edge < len(ledger) and not ledger.is_withdrawn(edge)], keyframe)
+        self._doubt(began_ns, partial(_variances, self._space, slip.kind))
+
+    def _update_slip(
+        self, now: Slip, links: Sequence[Link], views: Sequence[View], keyframe: int, stamp_ns: int
+    ) -> None:
+        """Move the start of a slip to an earlier keyframe, or end it."""
+        begin = next((k for k, link in enumerate(links) if link.edge != link.own), None)
+        if begin is None:
+            return
+        graph, own, used = self._backend.graph, [link.own for link in links], [link.edge for link in links]
+        errors = OdometryErrors(graph, self._backend.solver, used)
+        best, first = _SURELY, begin
+        for count in _EARLIER:
+            if count <= begin and (gain := errors.log_ratio(self._wider(now.kind, links, begin - count, begin))) > best:
+                best, first = gain, begin - count
+        if first < begin:
+            self._replace(links[first:begin], replace(now, began_ns=links[first].stamps_ns[0]), keyframe)
+            self._backend.solver.update()
+            return
+        narrower = between(graph, own, used)
+        firsts = sorted({_first_of(links, views[-since - 1]) for since in _AGAIN if since < len(views)})
+        is_since = [(np.arange(len(links)) >= first)[:, None, None] for first in firsts]
+        gains = [errors.log_ratio(narrower * of_each) for of_each in is_since]
+        if gains and max(gains) > 0.0:
+            self._end(now, links[firsts[int(np.argmax(gains))] :], max(gains), keyframe, stamp_ns)
+
+    def _end(self, now: Slip, links: Sequence[Link], gain: float, keyframe: int, stamp_ns: int) -> None:
+        """Use odometry with its own noise again, for these links."""
+        pairs = [(link.own, link.edge) for link in links if link.edge != link.own]
+        self._restore(pairs, keyframe, gain)
+        left = now.edges - len(pairs)
+        if not left:
+            self._counters.count("odometry", "slip_taken_back")
+        outcome = "" if left else "taken back: later views agree with odometry"
+        self.slips[-1] = replace(now, edges=left, ended_ns=stamp_ns, outcome=outcome)
+        self._doubt(stamp_ns, None)
+
+    def slipped(self, keyframes: StampedPoses[Keyframe]) -> tuple[tuple[Pair, ...], ...]:
+        """The edges of odometry of each slip that is not taken back, each with the one that replaces it."""
+        every = [self._slipped(keyframes, one) for one in self.slips]
+        return tuple(tuple(pairs) for pairs in every if pairs)
+
+    def review(self, keyframes: StampedPoses[Keyframe]) -> bool:
+        """Take back the slips that all measurements together contradict. Returns whether there were any."""
+        changed = False
+        for k, slip in enumerate(self.slips):
+            pairs = self._slipped(keyframes, slip) if slip.ended_ns else []
+            gain = self._gain_without(pairs) if pairs else 0.0
+            if gain > 0.0:
+                changed = True
+                self._restore(pairs, len(keyframes) - 1, gain)
+                self._counters.count("odometry", "slip_taken_back")
+                outcome = "taken back: all measurements together agree with odometry"
+                self.slips[k] = replace(slip, edges=max(0, slip.edges - len(pairs)), outcome=outcome)
+        return changed
+
+    def _gain_without(self, pairs: Sequence[Pair]) -> float:
+        """The logarithm of the likelihood ratio of no slip to a slip; 0 where it cannot be computed."""
+        graph = self._backend.graph
+        ends = [graph.edge(own).vertices for own, _ in pairs]
+        if any(a[1] != b[0] for a, b in pairwise(ends)):
+            return 0.0
+        own, used = zip(*pairs, strict=True)
+        try:
+            return OdometryErrors(graph, self._backend.solver, used).log_ratio(between(graph, own, used))
+        except (GraphSlamError, np.linalg.LinAlgError):
+            return 0.0
+
+    def _slipped(self, keyframes: StampedPoses[Keyframe], slip: Slip) -> list[Pair]:
+        """Odometry edges of a stretch that count as slip, each with its replacement, in order of time."""
+        graph, ledger = self._backend.graph, self._backend.ledger
+        edges = [edge for edge in graph.edges_of("odometry").tolist() if edge < len(ledger)]
+        used, out = dict[tuple[int, ...], int](), list[tuple[int, Pair]]()
+        for edge in edges:
+            if ledger.verdict_of(edge) is not Verdict.REJECTED:
+                used[tuple(graph.edge(edge).vertices)] = edge
+        for edge in edges:
+            ends = tuple(graph.edge(edge).vertices)
+            if edge < self._backend.first_free_edge or ends not in used:
+                continue
+            stamp_ns = int(keyframes.stamps_ns[np.searchsorted(keyframes.ids, ends[0])])
+            is_inside = slip.began_ns <= stamp_ns and (slip.ended_ns is None or stamp_ns < slip.ended_ns)
+            if is_inside and ledger.is_withdrawn(edge) and ledger.reason.values[edge] == Reason.SLIP:
+                out.append((ends[0], (edge, used[ends])))
+        return [pair for _, pair in sorted(out)]
+
+    # -- the graph: the ledger has both edges ------------------------------------------------------------------------
+
+    def _replace(self, links: Sequence[Link], slip: Slip, keyframe: int) -> None:
+        """Replace odometry edges by edges with more noise."""
+        backend, threshold = self._backend, -2.0 * LOG_ODDS
+        for link in links:
+            old, added = backend.graph.edge(link.own), _variances(self._space, slip.kind, np.array(link.seconds))
+            noise = Gaussian.from_covariance(covariance_of(old) + np.diag(added))
+            link.edge = backend.graph.add_edge(old.type, old.vertices, old.measured, noise, "odometry", old.source)
+        backend.gate_new(keyframe)
+        for link in links:
+            backend.decisions.decide(link.own, keyframe, Verdict.REJECTED, Reason.SLIP, slip.evidence, threshold)
+            backend.ledger.threshold.values[link.own] = threshold
+        backend.cancel_search()
+        self.slips[-1] = replace(slip, edges=slip.edges + len(links))
+
+    def _restore(self, pairs: Iterable[Pair], keyframe: int, gain: float) -> None:
+        """Undo ``_replace``."""
+        backend, links = self._backend, {link.own: link for link in self._window.links.values()}
+        for own, replacement in pairs:
+            backend.decisions.withdraw([replacement], keyframe, Reason.REVOKED)
+            backend.ledger.threshold.values[own] = backend.ledger.threshold.values[replacement]
+            backend.decisions.decide(own, keyframe, Verdict.NOT_EVALUATED, Reason.NONE, -2.0 * gain)
+            if own in links:
+                links[own].edge = own
+        backend.cancel_search()
+        backend.solver.update()
+
+
+def _first_of(links: Sequence[Link], view: View) -> int:
+    """The first link after a view, by its place."""
+    return next((k for k, link in enumerate(links) if link.vertices[0] >= view.vertex), len(links) - 1)
+
+
+def _variances(space: Geometry, kind: str, seconds: float | Array) -> Array:
+    """Variances (..., dof) that a kind of slip adds to edges that last so long (...)."""
+    n, seconds = space.dimensions, np.minimum(seconds, _LONGEST_S)
+    per_s = np.zeros(space.dof)
+    if kind == "translation":
+        per_s[:n] = _SLIP_M_S * _OTHERS
+        per_s[0] = _SLIP_M_S
+    else:
+        per_s[n:] = _SLIP_RAD_S * _OTHERS
+        per_s[-1] = _SLIP_RAD_S
+    independent = np.maximum(1.0, _LASTS_S / np.maximum(seconds, 1e-9))
+    return np.asarray((np.asarray(seconds)[..., None] * per_s) ** 2 * independent[..., None])
