@@ -71,7 +71,7 @@ class Displacements:
         one, search = self._decided[-1], self._search
         before_m, before_rad = search.difference(one.T_map_chain_before, found.T_map_chain, newest)
         after_m, _ = search.difference(one.T_map_chain, found.T_map_chain, newest)
-        drift_m, drift_rad = search.window.drift_since(one.drift, one.chain, newest)
+        drift_m, drift_rad = search.window.drift_since(one.to_first.drift, one.to_first.pose, newest)
         is_back = before_m < min(after_m, SAME_M + _DRIFT * drift_m) and before_rad < SAME_RAD + _DRIFT * drift_rad
         return one if is_back else None
 
@@ -99,5 +99,6 @@ class Displacements:
         alarm = self._alarms[one.alarm]
         self._alarms[one.alarm] = replace(alarm, ended_ns=alarm.ended_ns or stamp_ns, outcome=outcome)
         self._decided.remove(one)
+        one.to_first.edge = one.link
         self._refuted.append(one.T_map_chain)
         self._anonymous.rejoined(one.first)

@@ -286,8 +286,7 @@ class KidnapDetector:
                 replacement,
                 T_map_chain_before,
                 found.T_map_chain,
-                self._window.links[found.first].pose,
-                self._window.links[found.first].drift,
+                self._window.links[found.first],
                 len(self.alarms) - 1,
             )
         )

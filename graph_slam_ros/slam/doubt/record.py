@@ -4,7 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from graph_slam_ros.typing import Array, Numbers
+from graph_slam_ros.slam.doubt.window import Link
+from graph_slam_ros.typing import Numbers
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +94,7 @@ class Displacement:
     index : of that keyframe; None where a segment began there before
     link, replacement : odometry's edge to it, which is out, and the edge with very large noise that replaces it
     T_map_chain_before, T_map_chain : where the frame of odometry lay before, and lies since
-    chain, drift : where that frame had the keyframe, and the variances [m^2, rad^2] of odometry up to it
+    to_first : odometry to that keyframe, in that frame
     alarm : its index
     """
 
@@ -103,8 +104,7 @@ class Displacement:
     replacement: int
     T_map_chain_before: Numbers
     T_map_chain: Numbers
-    chain: Numbers
-    drift: Array
+    to_first: Link
     alarm: int
 
 
