@@ -1,11 +1,10 @@
-"""What was doubted and decided: alarms that the robot is elsewhere, displacements, and slips."""
+"""Odometry in doubt: its links, alarms that the robot is elsewhere, displacements, and slips."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from graph_slam_ros.slam.doubt.window import Link
-from graph_slam_ros.typing import Numbers
+from graph_slam_ros.typing import Array, Numbers
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +53,29 @@ class Alarm:
         until = f"{self.ended_ns * 1e-9:.1f} s"
         outcome = self.outcome or "it was not so"
         return f"from {at} to {until} the landmarks said that the robot is elsewhere ({why}); {outcome}"
+
+
+@dataclass(slots=True)
+class Link:
+    """Odometry from one keyframe to the next: the edge ``own``, or ``edge`` that replaces it in the problem.
+
+    Attributes
+    ----------
+    pose : of the later keyframe by odometry alone, in a frame of its own
+    drift : variances [m^2, rad^2] of odometry up to it since that frame began
+    """
+
+    edge: int
+    own: int
+    vertices: tuple[int, int]
+    stamps_ns: tuple[int, int]
+    pose: Numbers
+    drift: Array
+
+    @property
+    def seconds(self) -> float:
+        """The time that it took."""
+        return (self.stamps_ns[1] - self.stamps_ns[0]) * 1e-9
 
 
 @dataclass(frozen=True, slots=True)

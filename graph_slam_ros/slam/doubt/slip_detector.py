@@ -34,8 +34,8 @@ from graph_slam_ros.slam.doubt.evidence import (
     covariance_of,
 )
 from graph_slam_ros.slam.doubt.odometry_errors import NOISE_FACTOR, OdometryErrors, between
-from graph_slam_ros.slam.doubt.record import Slip
-from graph_slam_ros.slam.doubt.window import Link, View, Window
+from graph_slam_ros.slam.doubt.record import Link, Slip
+from graph_slam_ros.slam.doubt.window import View, Window
 from graph_slam_ros.slam.frontend.keyframes import Keyframe
 from graph_slam_ros.slam.frontend.odometry_jumps import JUMP_SIGMA_M, JUMP_SIGMA_RAD
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses

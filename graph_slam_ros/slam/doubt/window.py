@@ -20,6 +20,7 @@ from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.doubt.evidence import covariance_of
+from graph_slam_ros.slam.doubt.record import Link
 from graph_slam_ros.slam.frontend import motion_compensation
 from graph_slam_ros.slam.robust.landmark_history import LandmarkHistory
 from graph_slam_ros.typing import Array, Index, Numbers
@@ -35,29 +36,6 @@ _PER_LANDMARK = 4  # of them, at most
 REACH_S = 20.0  # sightings that are older are not compared with the newest
 _RATE_SURE = 0.999  # the rate of wrong ones is at most what it may be with this probability, by what was seen
 _CALM, _CALM_SURE = 12, 0.99  # newest sightings of which three quarters must agree for an alarm to end
-
-
-@dataclass(slots=True)
-class Link:
-    """Odometry from one keyframe to the next: the edge ``own``, or ``edge`` that replaces it in the problem.
-
-    Attributes
-    ----------
-    pose : of the later keyframe by odometry alone, in a frame of its own
-    drift : variances [m^2, rad^2] of odometry up to it since that frame began
-    """
-
-    edge: int
-    own: int
-    vertices: tuple[int, int]
-    stamps_ns: tuple[int, int]
-    pose: Numbers
-    drift: Array
-
-    @property
-    def seconds(self) -> float:
-        """The time that it took."""
-        return (self.stamps_ns[1] - self.stamps_ns[0]) * 1e-9
 
 
 @dataclass(frozen=True, slots=True)
