@@ -10,8 +10,7 @@ from graph_slam_ros.config.config import Config
 from graph_slam_ros.measurements.types import Odometry
 from graph_slam_ros.node.estimate import Estimate
 from graph_slam_ros.slam.frontend.odometry_integration import IntegratedOdometry, OdometryNoise, StationaryDetector
-from graph_slam_ros.slam.frontend.odometry_jumps import OdometryJumps
-from graph_slam_ros.slam.frontend.odometry_selector import Step
+from graph_slam_ros.slam.frontend.odometry_selector import OdometryJumps, Step
 from graph_slam_ros.typing import Numbers
 
 _MOST = 2_000  # messages since the newest keyframe: of a robot that stands there are many

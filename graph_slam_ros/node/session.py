@@ -32,7 +32,7 @@ from graph_slam_ros.runs.recorder import RunRecorder
 from graph_slam_ros.runs.restore import map_of, save_copy
 from graph_slam_ros.runs.tables import account, summarize
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Measurement, Update
-from graph_slam_ros.slam.frontend.odometry_jumps import JUMP_SIGMA_M
+from graph_slam_ros.slam.frontend.odometry_selector import JUMP_SIGMA_M
 from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.typing import Numbers
 

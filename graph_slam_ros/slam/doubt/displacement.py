@@ -20,7 +20,7 @@ from graph_slam_ros.lie import se2
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.doubt.record import DisplacementHypothesis, Link
 from graph_slam_ros.slam.doubt.window import REACH_S, Seen, View, Window
-from graph_slam_ros.slam.landmarks.rigid_alignment import aligned, are_spread
+from graph_slam_ros.slam.landmarks.rotations import aligned, are_spread
 from graph_slam_ros.slam.robust.connections import Connections, connections_across
 from graph_slam_ros.typing import Array, Index, Numbers
 

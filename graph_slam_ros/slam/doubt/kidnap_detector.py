@@ -21,7 +21,7 @@ from graph_slam_ros.slam.doubt.record import Alarm, Displacement, DisplacementHy
 from graph_slam_ros.slam.doubt.slip_detector import SlipDetector
 from graph_slam_ros.slam.doubt.window import Window
 from graph_slam_ros.slam.frontend.keyframes import Keyframe
-from graph_slam_ros.slam.frontend.odometry_jumps import JUMP_SIGMA_M, JUMP_SIGMA_RAD
+from graph_slam_ros.slam.frontend.odometry_selector import JUMP_SIGMA_M, JUMP_SIGMA_RAD
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.slam.landmarks.anonymous import AnonymousLandmarks
 from graph_slam_ros.slam.robust.connections import moved_values

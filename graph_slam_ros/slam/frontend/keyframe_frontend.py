@@ -21,19 +21,16 @@ from graph_slam_ros.measurements.types import (
 from graph_slam_ros.slam.frontend import motion_compensation
 from graph_slam_ros.slam.frontend.corrections import Corrections
 from graph_slam_ros.slam.frontend.frozen_odometry import FrozenOdometry
-from graph_slam_ros.slam.frontend.gates import ClosureStart, DatumGate, GateChain
+from graph_slam_ros.slam.frontend.gates import ClosureStart, DatumGate, GateChain, MaxDistance, ObservationThinning
 from graph_slam_ros.slam.frontend.gyro import GyroFusion, SavedBias
 from graph_slam_ros.slam.frontend.keyframes import Keyframe, KeyframeList, SightingPose
-from graph_slam_ros.slam.frontend.max_distance import MaxDistance
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
 from graph_slam_ros.slam.frontend.noise_factors import NoiseScales
 from graph_slam_ros.slam.frontend.odometry_integration import IntegratedOdometry, OdometryNoise
-from graph_slam_ros.slam.frontend.odometry_jumps import JUMP_SIGMA_M, JUMP_SIGMA_RAD
-from graph_slam_ros.slam.frontend.odometry_selector import OdometrySelector, Step
+from graph_slam_ros.slam.frontend.odometry_selector import JUMP_SIGMA_M, JUMP_SIGMA_RAD, OdometrySelector, Step
 from graph_slam_ros.slam.frontend.pose_edges import PoseEdges
 from graph_slam_ros.slam.frontend.stamp_order import PendingObservations, StampOrder
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
-from graph_slam_ros.slam.frontend.thinning import ObservationThinning
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Index, Numbers
 

@@ -4,7 +4,8 @@ Throughout, ``T_a_b`` is the base b seen from its keyframe a, with covariance M 
 motion is ``T_a_b Exp(m)``. A point p of b then moves by ``B m`` with ``B = [I, -hat(p)]``, in the axes of b.
 """
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from graph_slam_ros.typing import Array, Numbers
 
 ROUNDING = 100.0 * float(np.finfo(float).eps)  # of the largest variance that was added up to a covariance
 _NEAREST_M = 1e-9  # below this distance a direction is rounding
+_STEEP = 0.2  # cosine of an elevation: at 78.5 degrees and above the azimuth is turned away from the pole
 _UNKNOWN_M2 = 1e6  # a variance of this or more says that an axis was not measured
 
 
@@ -244,3 +246,27 @@ def closure(space: Geometry, m: Closure, earlier: PoseAtStamp, later: PoseAtStam
 
 def _floats(numbers: tuple[float, ...]) -> Numbers:
     return tuple(map(float, numbers))
+
+
+def off_the_pole(space: Geometry, s: Sighting) -> Sighting:
+    """Return the same sighting; a steep direction in space is expressed in a sensor frame that looks along it.
+
+    At the zenith and the nadir azimuth is undefined and its derivative infinite. So the sensor's frame is rotated until
+    its x axis points along the measured direction: azimuth and elevation are both 0. The sigma across the direction is
+    that of the elevation, or ``sigma_azimuth cos(elevation)`` if that is larger.
+    """
+    if space.dimensions == 2 or s.kind not in ("bearing", "range_bearing"):
+        return s
+    azimuth, elevation = s.measured[-2:]
+    if math.cos(elevation) >= _STEEP:
+        return s
+    half_a, half_e = 0.5 * azimuth, -0.5 * elevation
+    ca, sa, ce, se = math.cos(half_a), math.sin(half_a), math.cos(half_e), math.sin(half_e)
+    turn = (-sa * se, ca * se, sa * ce, ca * ce)  # about z by the azimuth, then about y by minus the elevation
+    sensor = space.group.compose(s.T_base_sensor or space.identity, (0.0, 0.0, 0.0, *turn))
+    scale = np.ones(len(s.measured))
+    scale[-2] = abs(math.cos(elevation))
+    covariance = scale[:, None] * as_matrix(s.covariance) * scale
+    covariance[-2, -2] = max(covariance[-2, -2], covariance[-1, -1])
+    measured = (*s.measured[:-2], 0.0, 0.0)
+    return replace(s, measured=measured, covariance=tuple(covariance.ravel().tolist()), T_base_sensor=sensor)

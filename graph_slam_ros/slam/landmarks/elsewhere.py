@@ -20,7 +20,7 @@ from graph_slam_ros.lie import se2
 from graph_slam_ros.slam.landmarks.beam import NOTHING
 from graph_slam_ros.slam.landmarks.landmark_map import Landmarks
 from graph_slam_ros.slam.landmarks.presence_check import FIT_M, is_missing
-from graph_slam_ros.slam.landmarks.rigid_alignment import aligned
+from graph_slam_ros.slam.landmarks.rotations import aligned
 from graph_slam_ros.slam.landmarks.scans import Scan
 from graph_slam_ros.typing import Array, Index
 

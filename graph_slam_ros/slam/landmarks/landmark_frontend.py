@@ -7,8 +7,7 @@ from graph_slam_ros.config.config import Config
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.types import Sightings
 from graph_slam_ros.slam.frontend.keyframes import Keyframe
-from graph_slam_ros.slam.frontend.max_distance import off_the_pole
-from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
+from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp, off_the_pole
 from graph_slam_ros.slam.frontend.noise_factors import NoiseScales
 from graph_slam_ros.slam.frontend.odometry_selector import Step
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses

@@ -7,7 +7,7 @@ import numpy as np
 
 from graph_slam_ros.config.pipeline import OdometryConfig
 from graph_slam_ros.graph.geometry import Geometry
-from graph_slam_ros.slam.frontend.odometry_jumps import JUMP_SIGMA_M, JUMP_SIGMA_RAD
+from graph_slam_ros.slam.frontend.odometry_selector import JUMP_SIGMA_M, JUMP_SIGMA_RAD
 from graph_slam_ros.slam.landmarks.renumbered import with_vertices
 from graph_slam_ros.slam.landmarks.scans import (
     NEARBY_NS,

@@ -11,19 +11,22 @@ that is expected to fit has its full weight until the solve has converged, and i
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.config.pipeline import RobustConfig
+from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import Graph, Loss
 from graph_slam_ros.graph.losses import weight_and_cost
+from graph_slam_ros.graph.tables import EdgeTable
 from graph_slam_ros.slam.robust.innovation import innovations, likely_together
 from graph_slam_ros.slam.robust.landmark_support import LandmarkSupport, landmark_of
 from graph_slam_ros.slam.robust.ledger import FINAL, OUTSIDE, Ledger, Reason, Verdict
-from graph_slam_ros.slam.robust.tightness import TIGHTEST, TYPICAL, Tightness
 from graph_slam_ros.solver import Settings, Solver
+from graph_slam_ros.solver.linearization import rows_of
 from graph_slam_ros.typing import Array, Index
 
 CANDIDATES = ("landmarks", "fixes", "closures", "initialpose")
@@ -34,6 +37,11 @@ _RETESTS = 10  # edges that are out and are tried again at each review: ten inno
 _OUT_BELOW = 0.01  # of its weight: what counts for less moves nothing, and is removed
 _UPDATES = 6  # until what was let in fits, before everything is solved for it
 _REVIEWED_AT_ONCE = 1000  # accepted edges that one review looks at, besides as many of the newest
+_TYPICAL = 30  # residuals tell what all are like
+_SLACK = 10.0  # times the residuals that are typical of a class its gate may be, where they are small
+_TIGHTEST = 0.1  # part of a gate that is left
+_REDUNDANT = 0.05  # of a measurement, that others say too: below, its residual says nothing of its noise
+_GROWN = 1.5  # times as many edges: their redundancy is computed again
 
 
 class OutlierGate:
@@ -453,14 +461,65 @@ class OutlierGate:
             of_label = self._graph.has_label(inside, (label,))
             self._tightness.update(label, inside[of_label], chi2[of_label], numbers[of_label])
         freedom = self._solver.degrees_of_freedom
-        self.is_calibrated = freedom >= TYPICAL
+        self.is_calibrated = freedom >= _TYPICAL
         if self.is_calibrated:
             # estimated noise allows for errors that are alike, so residuals are smaller: that says nothing of odometry
             is_stated = self._config.noise_scale == "configured"
             noise_ratio = self._solver.evaluate().chi2_final / freedom if is_stated else 1.0
-            self.gate_scale = min(factor, max(TIGHTEST, factor * noise_ratio))
+            self.gate_scale = min(factor, max(_TIGHTEST, factor * noise_ratio))
         edges = ledger.candidates
         ledger.threshold.values[edges] = self._limits(edges, ledger.numbers.values[edges])
+
+
+class Tightness:
+    """The factor of each class's gate, from 0.1 to 1: less where its residuals are smaller than its noise says.
+
+    With a configured noise that is ten times too large, a gate would accept everything. Residuals show that only where
+    several measurements say the same. A closure of 1 mm after rough odometry fits exactly once it is accepted. So they
+    are compared with what the edges' redundancy leaves of their noise.
+    """
+
+    def __init__(self, graph: Graph, solver: Solver) -> None:
+        self._graph, self._solver = graph, solver
+        self.of_class: dict[str, float] = {}
+        self._redundancy: dict[str, tuple[int, float]] = {}  # of each class: of so many edges, a median
+
+    def update(self, label: str, edges: Index, chi2: Array, numbers: Index) -> None:
+        """Compare the residuals of a class's accepted edges with their noise. False ones do not change a median."""
+        if len(edges) < _TYPICAL:
+            return
+        ratio = _SLACK * float(np.median(chi2 / np.array([_median(n) for n in numbers.tolist()])))
+        if ratio < 1.0:
+            redundancy = self._redundancy_of(label, edges)
+            ratio = ratio / redundancy if redundancy >= _REDUNDANT else 1.0
+        self.of_class[label] = min(1.0, max(_TIGHTEST, ratio))
+
+    def _redundancy_of(self, label: str, edges: Index) -> float:
+        """Return the median redundancy of a class, by some of its edges, from 0 to 1; of old ones while it grows."""
+        count, known = self._redundancy.get(label, (0, 0.0))
+        if len(edges) >= _GROWN * count:
+            some = np.linspace(0, len(edges) - 1, _TYPICAL).astype(int)
+            try:
+                found = [self._left_of(*of_table) for of_table in rows_of(self._graph, edges[some]).items()]
+            except (GraphSlamError, np.linalg.LinAlgError):
+                return known
+            known = float(np.median(np.concatenate(found)))
+            self._redundancy[label] = len(edges), known
+        return known
+
+    def _left_of(self, table: EdgeTable, rows: Index) -> Array:
+        """Return the expected chi2 (n,) of the residuals of accepted edges, for each number that they measure."""
+        some = table.at(rows)
+        ends = some.vertices
+        joint = self._solver.edge_marginals(ends)
+        _, jacobian = table.type.linearize(self._solver.values, self._graph.offset.values[ends], some.measured)
+        white = some.sqrt_information @ jacobian
+        return 1.0 - np.einsum("nij,njk,nik->n", white, joint, white) / white.shape[1]
+
+
+@cache
+def _median(numbers: int) -> float:
+    return quantile(0.5, numbers)
 
 
 def _judged(ledger: Ledger, edge: int) -> tuple[float, float]:

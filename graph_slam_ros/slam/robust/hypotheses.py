@@ -19,7 +19,12 @@ from graph_slam_ros.graph import GROUPS, SE2, Graph, Loss
 from graph_slam_ros.graph.records import weights_of
 from graph_slam_ros.slam.robust.gating import OutlierGate
 from graph_slam_ros.slam.robust.ledger import FINAL, Ledger
-from graph_slam_ros.slam.robust.pairwise_consistency import consistent_groups, contradicting_sightings, odometry_in_use
+from graph_slam_ros.slam.robust.pairwise_consistency import (
+    consistent_groups,
+    contradicting_sightings,
+    jumps_and_back,
+    odometry_in_use,
+)
 from graph_slam_ros.solver import Settings, Solver
 from graph_slam_ros.typing import Array, Executor, Index, Result
 
@@ -131,7 +136,7 @@ class CancelToken:
 def search_alternatives(config: RobustConfig, frozen: FrozenGraph, wanted: CancelToken | None = None) -> Outcome | None:
     """Explain a graph anew from each start; the lowest cost wins. None if nothing can be solved, or if cancelled."""
     search = _Search(config, frozen)
-    for name, start, inliers in _starts(config, frozen):
+    for name, start, inliers in search.starts():
         if wanted is not None and not wanted.still:
             return None
         if inliers is not None and search.explains_everything:
@@ -157,32 +162,6 @@ def _rival(one: Outcome, best: Outcome) -> Alternative | None:
     return Alternative(one.cost, best.cost, tuple(only_here.tolist()), tuple(only_there.tolist()))
 
 
-def _starts(config: RobustConfig, frozen: FrozenGraph) -> Iterator[tuple[str, Array, Index | None]]:
-    """The online verdicts; candidates that agree with a neighbour, at the online estimate and along odometry alone.
-
-    The last start accepts the largest rejected group alone.
-    """
-    yield "online", frozen.values, None
-    ledger, graph = frozen.ledger, frozen.graph
-    candidates = ledger.candidates
-    is_closure = graph.has_label(candidates, ("closures",))
-    closures, others = candidates[is_closure], candidates[~is_closure]
-    odometry = _along_odometry(graph, frozen.values, set(frozen.held.tolist()))
-    limits = config.noise_factor**2 * ledger.threshold.values[others]
-    others = np.setdiff1d(others, contradicting_sightings(graph, odometry, others, limits))
-    if not len(closures):
-        yield "neighbours", frozen.values, others
-        return
-    groups = consistent_groups(graph, odometry, closures, ledger.threshold.values[closures])
-    inliers = np.concatenate((others, *groups))
-    yield "neighbours", frozen.values, inliers
-    yield "odometry", odometry, inliers
-    out = [group[~np.isin(group, ledger.inside)] for group in groups]
-    largest = max(out, key=len, default=closures[:0])
-    if len(largest) >= _STORY:
-        yield "rejected", odometry, np.concatenate((others, largest))
-
-
 class _Search:
     """The starts of one search. They share one solver: from one to the next, what differs is ordered and grouped anew.
 
@@ -197,8 +176,11 @@ class _Search:
         self._weights = weights_of(self._graph.pointers, self._candidates)
         self._solver = Solver(self._graph, frozen.settings)
         self._solver.add(frozen.vertices, range(len(frozen.ledger)))
-        for vertex in frozen.held.tolist():
+        for vertex in (held := frozen.held.tolist()):
             self._solver.hold(vertex)
+        self._odometry = _along_odometry(self._graph, frozen.values, set(held))
+        limits = frozen.ledger.threshold.values[self._candidates]
+        self._jumps = jumps_and_back(self._graph, self._odometry, self._candidates, limits)
         self.found = list[Outcome]()
         self._ways = list[_Way]()
 
@@ -206,6 +188,32 @@ class _Search:
     def explains_everything(self) -> bool:
         """Return whether the online verdicts reject nothing."""
         return any(one.start == "online" and not len(one.ledger.outside) for one in self.found)
+
+    def starts(self) -> Iterator[tuple[str, Array, Index | None]]:
+        """The online verdicts; candidates that agree with a neighbour, at the online estimate and along odometry alone.
+
+        Between them all but fixes that have jumped and come back. The last accepts the largest rejected group alone.
+        """
+        frozen, candidates, odometry = self._frozen, self._candidates, self._odometry
+        ledger, graph = frozen.ledger, frozen.graph
+        yield "online", frozen.values, None
+        is_closure = graph.has_label(candidates, ("closures",))
+        closures, others = candidates[is_closure], candidates[~is_closure]
+        limits = self._config.noise_factor**2 * ledger.threshold.values[others]
+        others = np.setdiff1d(others, contradicting_sightings(graph, odometry, others, limits))
+        if self._jumps:
+            yield "fixes", frozen.values, np.setdiff1d(candidates, np.concatenate(self._jumps))
+        if not len(closures):
+            yield "neighbours", frozen.values, others
+            return
+        groups = consistent_groups(graph, odometry, closures, ledger.threshold.values[closures])
+        inliers = np.concatenate((others, *groups))
+        yield "neighbours", frozen.values, inliers
+        yield "odometry", odometry, inliers
+        out = [group[~np.isin(group, ledger.inside)] for group in groups]
+        largest = max(out, key=len, default=closures[:0])
+        if len(largest) >= _STORY:
+            yield "rejected", odometry, np.concatenate((others, largest))
 
     def explain_from(self, name: str, start: Array, inliers: Index | None) -> None:
         """Solve and judge in turn, starting with the verdicts of the ledger, or with these candidates.
@@ -220,15 +228,15 @@ class _Search:
             decisions.force_inliers(inliers, frozen.keyframe)
             solver.optimize(replace(frozen.settings, losses=decisions.cautious_losses(), max_iterations=_ITERATIONS))
             decisions.reclassify(frozen.keyframe)
-            here = _Way(mine.inside, solver.values, _cost(solver, mine))
+            here = _Way(mine.inside, solver.values, self._cost(mine))
             if any(here.joins(one) for one in self._ways):
                 return
             self._ways.append(here)
-        if inliers is None or _cost(solver, mine) <= 2.0 * hopeless:
+        if inliers is None or self._cost(mine) <= 2.0 * hopeless:
             self._alternate(decisions, hopeless)
         judged = mine.candidates
         mine.statistic.values[judged], _ = solver.chi2_of(judged)
-        cost = _cost(solver, mine)
+        cost = self._cost(mine)
         if np.isfinite(cost):
             self.found.append(Outcome(name, mine, solver.values, cost, frozen))
 
@@ -250,7 +258,7 @@ class _Search:
         solved = dict[bytes, Array]()  # values by verdicts
         for k in range(_ROUNDS):
             solver.optimize()
-            if k + 1 == _ROUNDS or _cost(solver, mine) > hopeless:
+            if k + 1 == _ROUNDS or self._cost(mine) > hopeless:
                 return
             solved[mine.inside.tobytes()] = solver.values
             if decisions.reclassify(keyframe):
@@ -258,11 +266,20 @@ class _Search:
                     continue
                 solver.start_at(values)
                 return
-            if _is_known(_cost(solver, mine), mine, self.found):
+            if _is_known(self._cost(mine), mine, self.found):
                 return
             costs = dict[int, float]()
             if not (decisions.readmit_next(keyframe, costs) or _together(decisions, solver, self._frozen, costs)):
                 return
+
+    def _cost(self, ledger: Ledger) -> float:
+        """Chi2 of all accepted edges; a candidate costs at most its threshold, and those of one jump that once."""
+        inside, outside, limits = ledger.inside, ledger.outside, ledger.threshold.values
+        chi2, _ = self._solver.chi2_of(inside)
+        jumped = np.concatenate([outside[:0], *(jump[1:] for jump in self._jumps)])
+        out = np.where(np.isin(outside, jumped), ledger.numbers.values[outside], limits[outside])
+        doubted = float(np.minimum(chi2, limits[inside]).sum() + out.sum())
+        return self._solver.evaluate().chi2_final - float(chi2.sum()) + doubted
 
 
 def _together(decisions: OutlierGate, solver: Solver, frozen: FrozenGraph, costs: Mapping[int, float]) -> bool:
@@ -293,14 +310,6 @@ def _is_known(cost: float, ledger: Ledger, found: Sequence[Outcome]) -> bool:
     return any(
         abs(cost - one.cost) <= _SAME * one.cost and np.array_equal(ledger.inside, one.ledger.inside) for one in found
     )
-
-
-def _cost(solver: Solver, ledger: Ledger) -> float:
-    """Chi2 of all accepted edges; a candidate costs at most its threshold."""
-    inside, limits = ledger.inside, ledger.threshold.values
-    chi2, _ = solver.chi2_of(inside)
-    doubted = float(np.minimum(chi2, limits[inside]).sum() + limits[ledger.outside].sum())
-    return solver.evaluate().chi2_final - float(chi2.sum()) + doubted
 
 
 def _along_odometry(graph: Graph, values: Array, held: set[int]) -> Array:

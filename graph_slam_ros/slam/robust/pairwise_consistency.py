@@ -1,4 +1,4 @@
-"""Pairwise consistency of loop closures that join the same two stretches of the path, and of sightings of a landmark.
+"""Pairwise consistency of loop closures between the same two stretches of the path, of sightings, and of fixes.
 
 Odometry between near poses is good. So two such closures and the two short ways between their ends form a loop that
 must close: pairwise consistency (Mangelson et al., "Pairwise consistent measurement set maximization", ICRA 2018,
@@ -10,13 +10,14 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from graph_slam_ros.graph import GROUPS, POINT_SEEN_FROM, RELATIVE_POSE, RELATIVE_POSE_3D, SE2, SE3, Graph
-from graph_slam_ros.graph.geometry import rigid_motions
-from graph_slam_ros.graph.tables import EdgeTable
+from graph_slam_ros.graph import SE2, EdgeType, Graph
+from graph_slam_ros.graph.geometry import PLANAR, SPATIAL, Geometry, rigid_motions
+from graph_slam_ros.graph.tables import EdgeRows, EdgeTable
 from graph_slam_ros.graph.vertices import adjoints_of_inverses, code_of
 from graph_slam_ros.typing import Array, Index
 
@@ -31,8 +32,8 @@ def consistent_groups(graph: Graph, values: Array, closures: Index, limits: Arra
     values : stored numbers of all vertices, the poses by odometry alone
     limits : of each closure, what chi2 its loops may have
     """
-    kind, edge_type = (SE2, RELATIVE_POSE) if SE2 in graph.kinds else (SE3, RELATIVE_POSE_3D)
-    table = graph.tables.get(edge_type)
+    space = space_of(graph)
+    table = graph.tables.get(space.relative_pose)
     if table is None:
         return []
     of_table = graph.table_of_edge.values[closures] == table.code
@@ -47,13 +48,12 @@ def consistent_groups(graph: Graph, values: Array, closures: Index, limits: Arra
     if not len(pairs):
         return []
     a, b = pairs.T
-    at = graph.offset.values[ends][:, :, None] + np.arange(kind.size)
-    path = values[at]  # (n, 2, size)
-    group = GROUPS[kind]
-    before = _between(group, path[b, 0], path[a, 0])
-    after = _between(group, path[a, 1], path[b, 1])
-    onwards = _compose(group, measured[a], after)
-    error = _columns(group.log, _between(group, measured[b], _compose(group, before, onwards)))
+    at = graph.offset.values[ends][:, :, None] + np.arange(space.pose.size)
+    path, group = values[at], space.group  # (n, 2, size)
+    before = _columns(group.between, path[b, 0], path[a, 0])
+    after = _columns(group.between, path[a, 1], path[b, 1])
+    onwards = _columns(group.compose, measured[a], after)
+    error = _columns(group.log, _columns(group.between, measured[b], _columns(group.compose, before, onwards)))
 
     noise = _covariances(table.at(rows).sqrt_information)
     steps = np.abs(walked[order[ends[a]]] - walked[order[ends[b]]])
@@ -77,26 +77,21 @@ def contradicting_sightings(graph: Graph, values: Array, sightings: Index, limit
     values : stored numbers of all vertices, the poses by odometry alone
     limits : of each sighting, what chi2 it may have
     """
-    kind, edge_type = (SE2, RELATIVE_POSE) if SE2 in graph.kinds else (SE3, RELATIVE_POSE_3D)
-    odometry, table = graph.tables.get(edge_type), graph.tables.get(POINT_SEEN_FROM[kind])
-    if odometry is None or table is None:
+    space = space_of(graph)
+    if (known := _on_path(graph, space, space.sightings["position"], sightings)) is None:
         return sightings[:0]
-    order, walked = _along_odometry(graph, odometry)
-    is_of_table = graph.table_of_edge.values[sightings] == table.code
-    sightings, limits = sightings[is_of_table], limits[is_of_table]
-    some = table.at(graph.row_of_edge.values[sightings])
+    order, walked, some, is_some = known
+    sightings, limits = sightings[is_some], limits[is_some]
     poses, landmarks = some.vertices.T
     in_time = np.lexsort((order[poses], landmarks))
-    in_time = in_time[order[poses[in_time]] >= 0]
     follows = landmarks[in_time[1:]] == landmarks[in_time[:-1]]
     a, b = in_time[:-1][follows], in_time[1:][follows]
     if not len(a):
         return sightings[:0]
-    group, path = GROUPS[kind], values[graph.offset.values[poses][:, None] + np.arange(kind.size)]
-    motion = _between(group, path[a], path[b])
-    back, size = group.inverse(tuple(motion.T)), some.measured.shape[1]
-    seen_before = np.stack(group.act(back, tuple(some.measured[a].T)), axis=-1)
-    axes = adjoints_of_inverses(code_of(kind), motion)[:, :size, :size]
+    group, path = space.group, values[graph.offset.values[poses][:, None] + np.arange(space.pose.size)]
+    motion = _columns(group.between, path[a], path[b])
+    seen_before, size = _columns(group.act, _columns(group.inverse, motion), some.measured[a]), space.dimensions
+    axes = adjoints_of_inverses(code_of(space.pose), motion)[:, :size, :size]
 
     noise = _covariances(some.sqrt_information)
     moves = rigid_motions(seen_before).reshape(len(a), size, -1)
@@ -108,9 +103,55 @@ def contradicting_sightings(graph: Graph, values: Array, sightings: Index, limit
     return sightings[np.setdiff1d(np.union1d(a, b), np.union1d(a[agree], b[agree]))]
 
 
+def jumps_and_back(graph: Graph, values: Array, fixes: Index, limits: Array) -> list[Index]:
+    """Stretches of fixes of positions between two steps that odometry does not explain, the second of which leads back.
+
+    Of all stretches without such a step, those are right that agree one with the next and have most fixes.
+
+    Parameters
+    ----------
+    values : stored numbers of all vertices, the poses by odometry alone
+    limits : of each fix, what chi2 it may have
+    """
+    space = space_of(graph)
+    if (known := _on_path(graph, space, space.fixes["position"], fixes)) is None:
+        return []
+    order, walked, some, is_some = known
+    fixes, limits, n = fixes[is_some], limits[is_some], space.dimensions
+    poses = some.vertices[:, 0]
+    path = values[graph.offset.values[poses][:, None] + np.arange(space.pose.size)]
+    places = some.measured[:, :n], _columns(space.group.act, path, some.measured[:, n:])
+    noise = np.trace(_covariances(some.sqrt_information), axis1=1, axis2=2)
+    way = np.trace(walked[order[poses]][:, :n, :n], axis1=1, axis2=2)
+
+    def agree(a: Index, b: Index) -> NDArray[np.bool_]:
+        """Return whether fixes are as far apart as odometry says."""
+        apart, driven = (np.linalg.norm(of[b] - of[a], axis=-1) for of in places)
+        variance = (noise[a] + noise[b] + np.abs(way[b] - way[a])) / n
+        return np.asarray((apart - driven) ** 2 <= np.minimum(limits[a], limits[b]) * variance)
+
+    in_time = np.argsort(order[poses], kind="stable")
+    runs = np.split(in_time, 1 + np.flatnonzero(~agree(in_time[:-1], in_time[1:])))
+    firsts, lasts = (np.array([run[k] for run in runs]) for k in (0, -1))
+    most, before = np.array([len(run) for run in runs]), np.full(len(runs), -1)
+    for k in range(1, len(runs)):
+        with_k = np.where(agree(lasts[:k], firsts[k : k + 1]), most[:k], 0)
+        before[k] = np.argmax(with_k) if with_k.any() else -1
+        most[k] += with_k.max()
+    right = [int(np.argmax(most))]
+    while before[right[-1]] >= 0:
+        right.append(before[right[-1]])
+    return [fixes[runs[k]] for k in range(right[-1], right[0]) if k not in right]
+
+
+def space_of(graph: Graph) -> Geometry:
+    """Return the plane if the graph has poses in it, else space."""
+    return PLANAR if SE2 in graph.kinds else SPATIAL
+
+
 def odometry_in_use(graph: Graph) -> Index:
     """Return one edge of odometry to each keyframe, in order: where several lead there, the newest with weight."""
-    table = graph.tables.get(RELATIVE_POSE if SE2 in graph.kinds else RELATIVE_POSE_3D)
+    table = graph.tables.get(space_of(graph).relative_pose)
     if table is None:
         return np.empty(0, dtype=np.int64)
     code = graph.labels.index("odometry") if "odometry" in graph.labels else -1
@@ -119,6 +160,20 @@ def odometry_in_use(graph: Graph) -> Index:
     rows = rows[np.lexsort((rows, weight > 0.0, to))]
     to = table.vertices.values[rows, 1]
     return table.id.values[rows[np.append(to[1:] != to[:-1], True)]] if len(rows) else rows
+
+
+def _on_path(
+    graph: Graph, space: Geometry, edge_type: EdgeType, edges: Index
+) -> tuple[Index, Array, EdgeRows, NDArray[np.bool_]] | None:
+    """Return ``_along_odometry``, the edges of a type that are from poses on it, and which of the given they are."""
+    odometry, table = graph.tables.get(space.relative_pose), graph.tables.get(edge_type)
+    if odometry is None or table is None:
+        return None
+    order, walked = _along_odometry(graph, odometry)
+    is_some = graph.table_of_edge.values[edges] == table.code
+    is_some[is_some] = order[table.at(graph.row_of_edge.values[edges[is_some]]).vertices[:, 0]] >= 0
+    some = table.at(graph.row_of_edge.values[edges[is_some]])
+    return (order, walked, some, is_some) if is_some.any() else None
 
 
 def _along_odometry(graph: Graph, table: EdgeTable) -> tuple[Index, Array]:
@@ -140,7 +195,8 @@ def _walked(group: Any, motion: Array, noise: Array) -> Array:
 
 def _propagated(motion: Array, covariance: Array) -> Array:
     """The covariance, in right tangent coordinates, after a further motion."""
-    adjoint = adjoints_of_inverses(code_of(SE2 if motion.shape[1] == SE2.size else SE3), motion)
+    space = PLANAR if motion.shape[1] == PLANAR.pose.size else SPATIAL
+    adjoint = adjoints_of_inverses(code_of(space.pose), motion)
     return adjoint @ covariance @ adjoint.transpose(0, 2, 1)
 
 
@@ -155,13 +211,5 @@ def _squared_sigmas(error: Array, covariance: Array) -> Array:
     return np.asarray(np.einsum("ki,ki->k", error, np.linalg.solve(covariance, error[:, :, None])[:, :, 0]))
 
 
-def _compose(group: Any, a: Array, b: Array) -> Array:
-    return np.stack(group.compose(tuple(a.T), tuple(b.T)), axis=-1)
-
-
-def _between(group: Any, a: Array, b: Array) -> Array:
-    return np.stack(group.between(tuple(a.T), tuple(b.T)), axis=-1)
-
-
-def _columns(function: Callable[[tuple[Array, ...]], tuple[Array, ...]], rows: Array) -> Array:
-    return np.stack(function(tuple(rows.T)), axis=-1)
+def _columns(function: Callable[..., tuple[Array, ...]], *rows: Array) -> Array:
+    return np.stack(function(*(tuple(of.T) for of in rows)), axis=-1)

@@ -7,7 +7,7 @@ import pytest
 
 from graph_slam_ros.graph.geometry import PLANAR
 from graph_slam_ros.slam import Closure, Config, Control, GraphSlam, Odometry, Sighting, Sightings
-from graph_slam_ros.slam.frontend.max_distance import MaxDistance
+from graph_slam_ros.slam.frontend.gates import MaxDistance
 
 S, RATE = 10**9, 10
 SOURCE = "detections"

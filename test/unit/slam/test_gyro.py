@@ -7,8 +7,7 @@ import pytest
 
 from graph_slam_ros.config.pipeline import GyroConfig
 from graph_slam_ros.slam import AngularVelocity, Config, Counters
-from graph_slam_ros.slam.frontend.gyro import GyroFusion
-from graph_slam_ros.slam.frontend.gyro_samples import GyroSamples
+from graph_slam_ros.slam.frontend.gyro import GyroFusion, GyroSamples
 from graph_slam_ros.slam.frontend.odometry_integration import OdometryNoise
 from graph_slam_ros.slam.frontend.odometry_selector import Step
 
