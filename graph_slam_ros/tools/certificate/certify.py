@@ -13,7 +13,7 @@ from graph_slam_ros.cli import console
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import POSE_PRIOR, POSE_PRIOR_3D, SE2, SE3, Graph
 from graph_slam_ros.optimization import Solution
-from graph_slam_ros.slam.landmarks.rigid_alignment import aligned
+from graph_slam_ros.slam.landmarks.rotations import aligned
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.tools.certificate.spectrum import least_eigenvalue, polish
 from graph_slam_ros.tools.certificate.synchronization import RELATIVE, Edges, Poses, Synchronization
