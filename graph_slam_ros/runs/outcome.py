@@ -219,6 +219,10 @@ def shortcomings(summary: Summary) -> Iterator[str]:
             yield f"{name}: no transform has the place of its sensor, and one is assumed: {remedy(name, why)}"
     yield from _gyro_faults(summary)
     yield from association_faults(summary.get("association", {}))
+    alarm: Mapping[str, Any] = next(reversed(summary.get("displacements", ())), {})
+    if not causes and is_undecided(alarm):
+        hint = _CONFUSED if summary.get("association") else "ids, units and clocks: graph_slam check BAG"
+        yield f"{alarm['text']}, which is not decided: the end of the path is by odometry. {hint}"
     if not sum(counts["believed"] or 0 for counts in inputs.values()):
         yield (
             "this is odometry alone: no landmark, fix or closure is in the result; "
@@ -243,12 +247,7 @@ def leaves_plane(name: str, counted: Mapping[str, int], received: int) -> str:
 
 
 def association_faults(found: Mapping[str, Any]) -> Iterator[str]:
-    """Yield why the association of sightings without identity is not to be believed; empty if it is.
-
-    Parameters
-    ----------
-    found : ``MapView.association_report``
-    """
+    """Yield why the association in a ``MapView.association_report`` is not to be believed; empty if it is."""
     if found.get("is_doubtful"):
         missing, lost = 100.0 * found["missing_part"], 100.0 * found["lost_part"]
         yield (
@@ -262,13 +261,13 @@ def association_faults(found: Mapping[str, Any]) -> Iterator[str]:
         )
 
 
-def ambiguities(rivals: Collection[Mapping[str, Any]]) -> Iterator[str]:
-    """Yield other explanations of the measurements that could not be ruled out.
+def is_undecided(alarm: Mapping[str, Any]) -> bool:
+    """Return whether an ``Alarm`` as a dictionary goes on, and nothing is decided of it."""
+    return "held_back" in alarm and alarm["ended_ns"] is None and alarm["segment"] is None
 
-    Parameters
-    ----------
-    rivals : ``Backend.rivals`` as dictionaries
-    """
+
+def ambiguities(rivals: Collection[Mapping[str, Any]]) -> Iterator[str]:
+    """Yield other explanations of the measurements that could not be ruled out: ``Backend.rivals`` as dictionaries."""
     if count := sum(len(rival["only_here"]) for rival in rivals):
         yield f"ambiguous: {count} loop closures that are not believed agree with one another as well"
 

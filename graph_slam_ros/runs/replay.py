@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import chain, groupby, islice
 from operator import attrgetter, itemgetter
 from pathlib import Path
@@ -20,7 +20,7 @@ from graph_slam_ros.recordings.definitions import recorded_decoder
 from graph_slam_ros.runs.folder import RunError, check_room, is_run, keep_earlier, missing, recording_of, run_config
 from graph_slam_ros.runs.journal import read_measurements
 from graph_slam_ros.runs.map_journal import read_map
-from graph_slam_ros.runs.outcome import checked, doubts, is_explained, unscaled
+from graph_slam_ros.runs.outcome import checked, doubts, is_explained, is_undecided, unscaled
 from graph_slam_ros.runs.restore import Stopwatch, config_of, map_of, record_run, stopwatch
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Measurement
 from graph_slam_ros.slam.frontend.ingest_gate import IngestGate
@@ -291,7 +291,7 @@ def _checked(columns: Collector, counters: Counters) -> dict[str, Any]:
 def _warnings(slam: GraphSlam, summary: dict[str, Any]) -> list[str]:
     return [
         *doubts(summary),
-        *(() if is_explained(summary) else map(str, slam.alarms)),
+        *(str(one) for one in slam.alarms if not is_explained(summary) and not is_undecided(asdict(one))),
         *unscaled(summary),
         *mendable(summary["counters"]),
     ]

@@ -6,6 +6,7 @@ from graph_slam_ros.runs.outcome import doubts, shortcomings
 
 LANDMARKS = {"use": "landmarks", "received": 90, "used": 90, "believed": 90}
 ODOMETRY = {"use": "odometry", "received": 100, "used": 100, "believed": None}
+ALARM = {"held_back": 8, "ended_ns": None, "segment": None, "text": "the landmarks say that the robot is elsewhere"}
 GYRO = {"name": "imu", "bias": [0.01], "sigma": [0.001], "state": "used", "ratio": 1.0}
 
 
@@ -20,7 +21,7 @@ def used(count, use="gyro"):
     return {"use": use, "received": 200, "used": count, "believed": None}
 
 
-def test_a_gyro_that_is_wrong_or_not_used_and_no_convergence_are_shortcomings_with_what_mends_them():
+def test_a_gyro_that_is_wrong_or_not_used_and_no_convergence_and_an_alarm_are_shortcomings_with_what_mends_them():
     assert not [*shortcomings(summary({}, GYRO, imu=used(200)))]
     wrong = GYRO | {"state": "doubted", "ratio": 57.3}
     (said,) = shortcomings(summary({"imu": {"gyro_doubted": 80}}, wrong, imu=used(200)))
@@ -37,6 +38,8 @@ def test_a_gyro_that_is_wrong_or_not_used_and_no_convergence_are_shortcomings_wi
     (said,) = shortcomings(summary({}) | {"converged": False, "stop": "max_iterations"})
     assert said.startswith("the last solve did not converge (max_iterations): ") and "--set solve.max_iter" in said
     assert not [*shortcomings(summary({}) | {"converged": True, "stop": "cost"})]
+    (said,) = shortcomings(summary({}) | {"displacements": [ALARM]})
+    assert "not decided" in said and not [*shortcomings(summary({}) | {"displacements": [ALARM | {"segment": 4}]})]
 
 
 @each("lost, condensed, is_said", [(0, 40, False), (1, 5, False), (2, 60, False), (2, 28, True), (6, 30, True)])
@@ -51,22 +54,19 @@ def test_several_odometries_on_one_topic_are_said_and_a_remedy_names_the_input()
     (said,) = doubts(two)
     assert said.startswith("odom: 2 odometries are on its topic")
     (refused,) = shortcomings(two)
-    assert refused.startswith("odom#2: most of it was refused")
-    assert "odom.offset_s" in refused
+    assert refused.startswith("odom#2: most of it was refused") and "odom.offset_s" in refused
     assert not list(doubts(summary({})))
     (jumps,) = shortcomings(summary({"odom": {"jump": 40}, "odom#2": {"jump": 9}}, **{"odom#2": ODOMETRY}))
     assert jumps.startswith("odom: 49 jumps")
-    silent = {"use": "odometry", "received": 0, "used": 0, "believed": None}
-    assert [*shortcomings(summary({}, vo=silent))] == ["vo: no message came"]
-    assert not [*shortcomings(summary({}, vo=silent | {"received": 90}))]
+    assert [*shortcomings(summary({}, vo=used(0, "odometry") | {"received": 0}))] == ["vo: no message came"]
+    assert not [*shortcomings(summary({}, vo=used(0, "odometry") | {"received": 90}))]
 
 
 @each("known, two_places, is_said", [(23, 27, True), (66, 8, False), (3, 3, False), (0, 27, False)])
 def test_ranges_alone_that_leave_many_landmarks_without_a_side_are_said(known, two_places, is_said):
     waiting = {str(k): "2 places fit: (1.56, -2.35) and (-2.20, -1.20)" for k in range(two_places)}
     waiting["seen once"] = "1 sighting by range: too few"
-    run = summary({}) | {"landmarks": known, "waiting": waiting}
-    said = list(doubts(run))
+    said = list(doubts(summary({}) | {"landmarks": known, "waiting": waiting}))
     assert len(said) == is_said
     if is_said:
         assert said[0].startswith("ranges alone: of 27 of 51 landmarks two places fit, one on either side")
