@@ -5,6 +5,7 @@
 # check         style, types and the unit tests, in a minute: after each change; no process, no ROS
 # test          install, then style, types and all tests; some of them: TESTS='-m "not process"', -m integration, a file
 # soak          the tests that take too long for every run: up to three hours, resumed where it was; ONLY=name,name
+# wheel         dist/: a wheel with compiled kernels in it, for the Python and the kind of machine that this is
 # colcon        build and test as ROS does, in a scratch folder; colcon goes into .venv-colcon; TESTS=, too
 # test-oldest   the tests without ROS, in .venv-oldest with the lowest versions that setup.py allows
 # lint, format  check style, layers, budgets and types; correct the style
@@ -31,7 +32,7 @@ ifeq ($(SYSTEM_ROS),)
 unexport LD_LIBRARY_PATH
 endif
 
-.PHONY: install demo check test soak colcon test-oldest lint format lock bench robust figures pictures clean
+.PHONY: install demo check test soak wheel colcon test-oldest lint format lock bench robust figures pictures clean
 .DELETE_ON_ERROR:
 
 install: $(VENV)/interfaces.stamp $(VENV)/kernels.stamp
@@ -52,6 +53,20 @@ soak: install
 	$(BIN)/python test/soak.py $(subst $(comma), ,$(ONLY))
 
 comma := ,
+
+# Of what git has, in a folder of its own. For which processor kernels are compiled there, the package says.
+DIST := dist
+PROCESSOR = from graph_slam_ros.lie.jit import PROCESSOR; print(PROCESSOR)
+ARCHIVE = import pathlib, shutil; (made,) = pathlib.Path("cache/graph_slam_ros").iterdir(); \
+  shutil.make_archive(f"graph_slam_ros/{made.name}", "zip", made)
+wheel: $(VENV)/package.stamp
+	@set -e; scratch=$$(mktemp -d); trap 'rm -rf "$$scratch"' EXIT; python="$(abspath $(BIN))/python"; \
+	git checkout-index --all --prefix="$$scratch/"; cd "$$scratch"; export PYTHONPATH="$$scratch"; \
+	processor=$$("$$python" -c '$(PROCESSOR)'); \
+	NUMBA_CPU_NAME=$$processor NUMBA_CPU_FEATURES= GRAPH_SLAM_CACHE=cache "$$python" -m graph_slam_ros.cli warmup; \
+	"$$python" -c '$(ARCHIVE)'; \
+	"$$python" -m pip wheel --quiet --no-deps --no-build-isolation --wheel-dir "$(abspath $(DIST))" .
+	@ls $(DIST)
 
 lint: $(VENV)/package.stamp
 	$(BIN)/ruff check
@@ -161,4 +176,4 @@ COMPILE = $(VENV)-lock/bin/uv pip compile --quiet --universal --python-version 3
   --no-emit-index-url --no-annotate --custom-compile-command 'make lock' $(LOCK)
 
 clean:
-	rm -rf $(VENV) $(VENV)-oldest $(VENV)-lock $(VENV)-bench $(VENV)-bench-g2o build install log *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	rm -rf $(VENV) $(VENV)-oldest $(VENV)-lock $(VENV)-bench $(VENV)-bench-g2o build dist install log *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache

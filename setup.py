@@ -1,15 +1,41 @@
 """Installation with pip, and with colcon as an ament_python package."""
 
+import os
 import re
 from glob import glob
+from importlib.metadata import distribution
 from pathlib import Path
 
-from setuptools import find_packages, setup
+from setuptools import Distribution, find_packages, setup
 
 NAME = "graph_slam_ros"
 HERE = Path(__file__).resolve().parent
 # The text is searched: importing the package here would need its dependencies.
 VERSION = re.search(r'^__version__ = "(.+)"$', (HERE / NAME / "__init__.py").read_text(), re.MULTILINE).group(1)
+
+HOME = f"https://github.com/{os.environ.get('GITHUB_REPOSITORY', 'graph-slam-ros/graph_slam_ros')}"
+README = (HERE / "README.md").read_text(encoding="utf-8")
+# Elsewhere than in the repository, pictures and pages are found by their whole addresses.
+README = re.sub(r'src="(?!http)', f'src="{HOME}/raw/{VERSION}/', README)
+README = re.sub(r"\]\((?!http|#)", f"]({HOME}/blob/{VERSION}/", README)
+
+# A wheel with compiled kernels (`make wheel`) needs the very Numba that compiled them, and has its Python and platform.
+HAS_KERNELS = bool(glob(f"{HERE}/{NAME}/kernels-*.zip"))
+COMPILER, PLATFORM = ["numba>=0.59.1"], {}
+if HAS_KERNELS:
+    COMPILER = [f"{name}=={distribution(name).version}" for name in ("numba", "llvmlite")]
+    PLATFORM = {
+        "plat_name": re.search(r"^Tag: .*-(.+)", distribution("numba").read_text("WHEEL"), re.MULTILINE).group(1)
+    }
+
+
+class WithKernels(Distribution):
+    """A distribution that is for one Python and one platform where it has compiled kernels."""
+
+    def has_ext_modules(self):
+        """Tell whether it is."""
+        return HAS_KERNELS
+
 
 # ROS 2 Jazzy for machines without ROS, from wheels that exist for Linux on x86-64 only. The versions are fixed because
 # they are one binary set. From cmake on: what generating tf2_msgs and vision_msgs needs (tools/generate_interfaces.py).
@@ -45,12 +71,30 @@ setup(
     name=NAME,
     version=VERSION,
     description="Online pose-graph SLAM for ROS 2: odometry and landmark sightings in, corrected path and map out",
+    long_description=README,
+    long_description_content_type="text/markdown",
+    url=HOME,
+    project_urls={
+        "Documentation": f"{HOME}/blob/{VERSION}/docs/index.md",
+        "Changelog": f"{HOME}/blob/{VERSION}/CHANGELOG.rst",
+    },
+    keywords="SLAM pose-graph ROS robotics localization mapping landmarks GNSS",
+    classifiers=[
+        "Development Status :: 4 - Beta",
+        "Environment :: Console",
+        "Intended Audience :: Science/Research",
+        "Operating System :: MacOS",
+        "Operating System :: POSIX :: Linux",
+        *(f"Programming Language :: Python :: 3.{minor}" for minor in range(10, 15)),
+        "Topic :: Scientific/Engineering",
+        "Typing :: Typed",
+    ],
     license="Apache-2.0",
     author="The graph_slam_ros maintainers",
     author_email="maintainers@graph-slam-ros.example",
     python_requires=">=3.10",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
-    package_data={NAME: ["py.typed", "tools/*/page.*", "tools/view/edits*.*"]},
+    package_data={NAME: ["py.typed", "kernels-*.zip", "tools/*/page.*", "tools/view/edits*.*"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
@@ -58,11 +102,13 @@ setup(
         (f"share/{NAME}/config", sorted(glob("config/*"))),
     ],
     zip_safe=False,
+    distclass=WithKernels,
+    options={"bdist_wheel": PLATFORM},
     # Each lower bound is what `make test-oldest` runs with (constraints-oldest.txt).
     install_requires=[
         "numpy>=1.26.4",
         "scipy>=1.11.4",
-        "numba>=0.59.1",
+        *COMPILER,
         "rosbags>=0.11.0",
         "mcap>=1.3.0",
         "lz4>=4.3.3",

@@ -32,9 +32,9 @@ from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import SE2, SE3, EdgeType, Gaussian, Graph, Loss
 from graph_slam_ros.graph.vertices import PLANAR, adjoints_of_inverses
 from graph_slam_ros.lie import se2, se3
-from graph_slam_ros.lie.jit import CACHE_DIR
+from graph_slam_ros.lie.jit import ARCHIVES, CACHE_DIR
 from graph_slam_ros.progress import report
-from graph_slam_ros.solver import METHODS, Settings, Solver, covariance
+from graph_slam_ros.solver import METHODS, Settings, Solver, covariance, linearization
 from graph_slam_ros.solver import update as updates
 from graph_slam_ros.solver.clique_tree import incremental, numeric, ordering, storage, substitution
 from graph_slam_ros.typing import Index
@@ -56,7 +56,8 @@ class Compiling:
         new = done - self.began_with
         left_s = self.elapsed_s * (_KERNELS - done) / new if new > 0 else 0.0
         left = "" if not left_s else f", about {10 * math.ceil(left_s / 10)} s more"
-        return f"compiling kernels, once per installation: {100 * done / _KERNELS:.0f} %{left}"
+        why = f" (the wheel's are not for Numba {numba.__version__} on this processor)" if ARCHIVES else ""
+        return f"compiling kernels, once per installation{why}: {100 * done / _KERNELS:.0f} %{left}"
 
 
 OnProgress = Callable[[Compiling], None]
@@ -150,6 +151,7 @@ def _load_plane() -> None:
     _load_edges(in_space=False)
     _make(*_TWICE, *_STRUCTURE, *_NUMBERS)
     adjoints_of_inverses(PLANAR, np.zeros((1, 3)))
+    linearization.loss_weights(0, 1.0, np.zeros(1))
     graph = Graph()
     poses = graph.add_vertices(SE2, np.zeros((2, 3)))
     point = graph.add_vertex(graphs.R2, np.zeros(2))
@@ -189,14 +191,12 @@ def _load_space() -> None:
 
 def _load_edges(*, in_space: bool) -> None:
     """Linearise an edge of each type with a pose in space, or of each other type, and propagate a covariance."""
-    values = [
-        one for value in vars(graphs).values() for one in (value.values() if isinstance(value, dict) else [value])
-    ]
-    for edge in values:
-        if not isinstance(edge, EdgeType) or in_space != any(SE3 in kinds for kinds in edge.accepts):
-            continue
-        sizes = [kinds[0].size for kinds in edge.accepts]
-        edge.linearize(np.ones(sum(sizes)), np.cumsum([[0, *sizes[:-1]]], axis=1), np.ones((1, edge.measured_size)))
+    for value in vars(graphs).values():
+        for edge in value.values() if isinstance(value, dict) else [value]:
+            if not isinstance(edge, EdgeType) or in_space != any(SE3 in kinds for kinds in edge.accepts):
+                continue
+            sizes = [kinds[0].size for kinds in edge.accepts]
+            edge.linearize(np.ones(sum(sizes)), np.cumsum([[0, *sizes[:-1]]], axis=1), np.ones((1, edge.measured_size)))
     group, step = (se3, se3.IDENTITY) if in_space else (se2, (1.0, 0.0, 0.1))
     unit = np.eye(6 if in_space else 3)
     group.propagate_during(unit, step, unit)

@@ -153,7 +153,7 @@ class Graph:
             self._lengthen((self.table_of_edge, first + count), (self.row_of_edge, first + count))
         there = self.kind.count, first, row
         codes = table.code, _code(self.labels, label), _code(self.sources, source)
-        given = _plain(at), _plain(z), np.asarray(noise.sqrt_information, dtype=np.float64).ravel()
+        given = _plain(at), _plain(z), _plain(np.asarray(noise.sqrt_information, dtype=np.float64).ravel())
         fault, *where = append_edges(self.pointers, table.pointers, there, *given, self._accepted_by(edge), codes)
         if fault != FITS:
             self._refuse_unfit(edge, at, z, fault, *where)

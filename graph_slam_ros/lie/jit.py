@@ -4,11 +4,15 @@ Numba keys its cache by the place of the compiled function's file. It sees neith
 another setting of the compiler (bounds checks). So the cache lives in one folder per digest of the code of all kernel
 sources, of what compiles them, its settings and the processor. Copies of the package that agree in these share it.
 Comments, docstrings and line breaks are no part of the code.
+
+A wheel brings such a folder as an archive, ``kernels-DIGEST.zip``, for a processor that most machines can stand for.
+It is unpacked into the user's cache; where it is for another Numba or an older processor, kernels are compiled.
 """
 
 import ast
 import hashlib
 import os
+import shutil
 import stat
 import sys
 import tempfile
@@ -20,33 +24,46 @@ from typing import Any, cast
 import llvmlite
 import llvmlite.binding
 import numba
-import numpy as np
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, UserProvidedCacheLocator
+from numba.core.codegen import get_host_cpu_features
 from numba.extending import register_jitable
 
 from graph_slam_ros.errors import GraphSlamError
 
-__all__ = ["CACHE_DIR", "inner", "jitable", "kernel"]
+__all__ = ["ARCHIVES", "CACHE_DIR", "PROCESSOR", "inlined", "inner", "jitable", "kernel"]
 
 _PACKAGE = Path(__file__).resolve().parents[1]
-_KERNEL_FOLDERS = ("lie", "graph", "solver")
-_SETTINGS = ("BOUNDSCHECK", "OPT", "CPU_NAME", "CPU_FEATURES", "ENABLE_AVX", "LOOP_VECTORIZE", "SLP_VECTORIZE")
+_DOCUMENTED = ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef
 
 
 def _sources() -> list[Path]:
-    folders = [path for folder in _KERNEL_FOLDERS for path in sorted((_PACKAGE / folder).rglob("*.py"))]
+    folders = [path for folder in ("lie", "graph", "solver") for path in sorted((_PACKAGE / folder).rglob("*.py"))]
     return [*folders, _PACKAGE / "warmup.py"]
 
 
-def _compiler() -> list[str]:
+_config: Any = numba.config
+_features: str = get_host_cpu_features()  # type: ignore[no-untyped-call]
+
+ARCHIVES = sorted(_PACKAGE.glob("kernels-*.zip"))
+"""What a wheel brings; a checkout has none."""
+
+PROCESSOR, _NEEDED = {
+    "x86_64": ("x86-64-v3", {"+avx2", "+bmi", "+bmi2", "+f16c", "+fma", "+lzcnt", "+movbe"}),
+    "aarch64": ("generic", set()),
+    "arm64": ("apple-m1", set()),
+}.get(os.uname().machine, ("", set()))
+"""For which processor a wheel's kernels are compiled (``make wheel``), and what it has, as LLVM names it."""
+
+if ARCHIVES and _config.CPU_NAME is None and _NEEDED.issubset(_features.split(",")):
+    _config.CPU_NAME, _config.CPU_FEATURES = PROCESSOR, ""
+
+
+def _compiler() -> list[Any]:
     """List what else the machine code depends on: versions, settings, the processor."""
-    versions = [sys.version.split()[0], sys.implementation.cache_tag, np.__version__]
-    versions += [numba.__version__, llvmlite.__version__]
-    settings = [f"{name}={getattr(numba.config, name, None)}" for name in _SETTINGS]
-    features = ""
-    with suppress(RuntimeError):  # LLVM does not know them
-        features = llvmlite.binding.get_host_cpu_features().flatten()
-    return [*versions, *settings, llvmlite.binding.get_host_cpu_name(), features]
+    settings = [_config.BOUNDSCHECK, _config.OPT, _config.ENABLE_AVX, _config.LOOP_VECTORIZE, _config.SLP_VECTORIZE]
+    processor = _config.CPU_NAME or llvmlite.binding.get_host_cpu_name()
+    features = _features if _config.CPU_FEATURES is None else _config.CPU_FEATURES
+    return [sys.implementation.cache_tag, numba.__version__, llvmlite.__version__, *settings, processor, features]
 
 
 def _digest(contents: Iterable[bytes]) -> str:
@@ -67,9 +84,6 @@ def _code_of(source: bytes) -> bytes:
     return ast.dump(tree).encode()
 
 
-_DOCUMENTED = ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef
-
-
 def _cache_dir() -> Path:
     """The first of the user's cache and a folder of this user and this code in /tmp that is usable and private.
 
@@ -88,7 +102,10 @@ def _cache_dir() -> Path:
             for known in sorted(parent.glob(f"{prefix}*/{same_sources}")):
                 if _is_usable(known.parent):
                     return known.parent
-            folder = parent / (prefix + _digest(map(_code_of, contents)))
+            code = _digest(map(_code_of, contents))
+            folder, archive = parent / (prefix + code), _PACKAGE / f"kernels-{code}.zip"
+            if archive in ARCHIVES and not folder.exists():
+                _unpack(archive, folder)
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             if _is_usable(folder):
                 (folder / same_sources).touch()
@@ -99,30 +116,31 @@ def _cache_dir() -> Path:
         raise GraphSlamError("no folder to keep compiled kernels in: set GRAPH_SLAM_CACHE to one of yours") from None
 
 
+def _unpack(archive: Path, folder: Path) -> None:
+    """Unpack kernels; where several processes do so, the first one's stay."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=folder.parent) as scratch:
+        shutil.unpack_archive(archive, scratch)
+        with suppress(OSError):
+            os.rename(scratch, folder)
+
+
 def _is_usable(folder: Path) -> bool:
-    """Return whether a folder is private, and files can be written to it."""
-    if not _is_private(folder):
-        return False
-    with tempfile.TemporaryFile(dir=folder):
-        return True
+    """Return whether files can be written to a folder, and nobody else can have: Numba runs what it caches.
 
-
-def _is_private(folder: Path) -> bool:
-    """Return whether nobody else can have written to the folder: Numba unpickles and runs what it caches.
-
-    If the folder is ours but others may write to it, as a lax umask leaves it, that is forbidden. All in it must be
-    ours.
+    If it is ours but others may write to it, as a lax umask leaves it, that is forbidden. All in it must be ours.
     """
     about = folder.lstat()
     if not stat.S_ISDIR(about.st_mode) or about.st_uid != os.getuid():
         return False
     if about.st_mode & 0o022:
         folder.chmod(0o700)
-    return all(entry.stat(follow_symlinks=False).st_uid == os.getuid() for entry in os.scandir(folder))
+    with tempfile.TemporaryFile(dir=folder):
+        return all(entry.stat(follow_symlinks=False).st_uid == os.getuid() for entry in os.scandir(folder))
 
 
 CACHE_DIR = _cache_dir()
-numba.config.CACHE_DIR = str(CACHE_DIR)  # type: ignore[attr-defined]
+_config.CACHE_DIR = str(CACHE_DIR)
 
 
 class _Locator(UserProvidedCacheLocator):
@@ -134,7 +152,7 @@ class _Locator(UserProvidedCacheLocator):
 
     def get_source_stamp(self) -> str:
         """Return the same for all: what was compiled of other sources lies in another folder."""
-        return CACHE_DIR.name
+        return "kernels"
 
     def get_disambiguator(self) -> str:
         """Return the same for all, and not the line: in a module each kernel has a name of its own."""
@@ -155,15 +173,16 @@ class _CacheImpl(CompileResultCacheImpl):
 class _Cache(FunctionCache):
     _impl_class = _CacheImpl
 
+    def _index_key(self, sig: Any, codegen: Any) -> tuple[Any, ...]:
+        """Leave out the name of the system, in which macOS has its version."""
+        signature, target, code = super()._index_key(sig, codegen)  # type: ignore[no-untyped-call]
+        return signature, target[1:], code
+
 
 def kernel(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
     """Compile a loop over arrays; it runs on one thread, without unsafe maths.
 
     A kernel that calls BLAS (wide fronts) may use more threads there. The same bytes every time need one.
-
-    Parameters
-    ----------
-    options : more of ``numba.njit``
     """
     # nothing here is called through a pointer, as SciPy would
     settings = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True} | options

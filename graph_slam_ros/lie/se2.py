@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.lie.jit import jitable, kernel
+from graph_slam_ros.lie.jit import inner, jitable, kernel
 from graph_slam_ros.typing import Array
 
 Pose: TypeAlias = tuple[Any, Any, Any]
@@ -151,20 +151,25 @@ def right_jacobian(d: Pose) -> NDArray[np.float64]:
     return np.array([[a, b, p * vx - q * vy], [-b, a, q * vx + p * vy], [0.0, 0.0, 1.0]])
 
 
+@inner
+def _turned(a: Array, covariance: Array) -> Array:
+    """``A Sigma A'``, of matrices (3, 3)."""
+    out = np.zeros((3, 3))
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                for m in range(3):
+                    out[i, j] += a[i, k] * covariance[k, m] * a[j, m]
+    return out
+
+
 @kernel
 def noise_during(step: Pose, covariance: NDArray[np.float64]) -> NDArray[np.float64]:
     """Noise (3, 3) of velocities that acted all through a step, in the tangent space at its end.
 
     With ``d = Log(step)`` and the covariance of d given, that of ``Exp(d)`` is ``J Sigma J'``.
     """
-    j = right_jacobian(log(step))
-    out = np.zeros((3, 3))
-    for r in range(3):
-        for c in range(3):
-            for k in range(3):
-                for m in range(3):
-                    out[r, c] += j[r, k] * covariance[k, m] * j[c, m]
-    return out
+    return _turned(right_jacobian(log(step)), covariance)
 
 
 @kernel
@@ -179,17 +184,10 @@ def propagate(covariance: NDArray[np.float64], step: Pose, added: NDArray[np.flo
     step : the pose ``T_b_c``
     added : (3, 3) covariance of the step
     """
-    x, y, theta = inverse(step)
-    c, s = np.cos(theta), np.sin(theta)
-    a = np.array([[c, -s, y], [s, c, -x], [0.0, 0.0, 1.0]])
-    out = added.copy()
+    out = _turned(adjoint(inverse(step)), covariance)
     for i in range(3):
         for j in range(3):
-            total = 0.0
-            for k in range(3):
-                for m in range(3):
-                    total += a[i, k] * covariance[k, m] * a[j, m]
-            out[i, j] += total
+            out[i, j] += added[i, j]
     return out
 
 

@@ -72,14 +72,8 @@ def from_matrix(matrix: ArrayLike) -> Pose:
     xy, xz, yz = r[1, 0] + r[0, 1], r[2, 0] + r[0, 2], r[2, 1] + r[1, 2]
     squares = 1.0 + np.stack([r[0, 0] - r[1, 1] - r[2, 2], r[1, 1] - r[0, 0] - r[2, 2], r[2, 2] - r[0, 0] - r[1, 1]])
     w = 1.0 + r[0, 0] + r[1, 1] + r[2, 2]
-    rows = np.stack(  # each is the quaternion times four times one of its components
-        [
-            np.stack([squares[0], xy, xz, x]),
-            np.stack([xy, squares[1], yz, y]),
-            np.stack([xz, yz, squares[2], z]),
-            np.stack([x, y, z, w]),
-        ]
-    )
+    # each row is the quaternion times four times one of its components
+    rows = np.array([[squares[0], xy, xz, x], [xy, squares[1], yz, y], [xz, yz, squares[2], z], [x, y, z, w]])
     largest = np.concatenate([squares, w[None]]).argmax(axis=0)
     q = np.take_along_axis(rows, largest[None, None], axis=0)[0]
     q = q / np.linalg.norm(q, axis=0) * np.where(q[3] < 0.0, -1.0, 1.0)
@@ -141,15 +135,8 @@ def exp(d: Tangent) -> Pose:
     wv = so3.cross(w, v)
     wwv = so3.cross(w, wv)
     q = so3.exp(w)
-    return (
-        v[0] + a * wv[0] + b * wwv[0],
-        v[1] + a * wv[1] + b * wwv[1],
-        v[2] + a * wv[2] + b * wwv[2],
-        q[0],
-        q[1],
-        q[2],
-        q[3],
-    )
+    t = (v[0] + a * wv[0] + b * wwv[0], v[1] + a * wv[1] + b * wwv[1], v[2] + a * wv[2] + b * wwv[2])
+    return t[0], t[1], t[2], q[0], q[1], q[2], q[3]
 
 
 @jitable
@@ -163,14 +150,8 @@ def log(a: Pose) -> Tangent:
     k = np.where(square < 1e-8, 1.0 / 12.0 + square / 720.0, exact)
     wt = so3.cross(w, t)
     wwt = so3.cross(w, wt)
-    return (
-        t[0] - 0.5 * wt[0] + k * wwt[0],
-        t[1] - 0.5 * wt[1] + k * wwt[1],
-        t[2] - 0.5 * wt[2] + k * wwt[2],
-        w[0],
-        w[1],
-        w[2],
-    )
+    v = (t[0] - 0.5 * wt[0] + k * wwt[0], t[1] - 0.5 * wt[1] + k * wwt[1], t[2] - 0.5 * wt[2] + k * wwt[2])
+    return v[0], v[1], v[2], w[0], w[1], w[2]
 
 
 @jitable

@@ -204,7 +204,6 @@ REFUSED = [
     ("info {bag}x", "no such file or folder; did you mean 'drive it.mcap'?"),
     ("replay {bag} --odom /odm --out {out}", "did you mean '/odom'?"),
     ("replay {bag} --out {out} --set tf.stamp=odometri", "did you mean 'odometry'?"),
-    ("explain {bag}s", "did you mean 'drive it.mcap'?"),
     ("simulate warehouse --out {out}.mcap --fault wrong_mout --fault wrong_ids", "did you mean 'wrong_mount'?"),
     ("fleet replay {bag} --config no.yaml --config {text} --out {out}", "no.yaml"),
     ("info {bag} --fast", "unrecognized arguments: --fast"),
@@ -216,17 +215,8 @@ REFUSED = [
     ("info {cut}", "cut.mcap: no topic in it that is whole; cut.mcap: cut off after 0"),
     ("info {fifo}", "neither a file nor a folder"),
     ("info {text}", "text.mcap: not a readable recording"),
-    (
-        "replay {bag} --out {out} --odom /wheel",
-        "no topic /wheel in the recording; of nav_msgs/msg/Odometry there is /odom",
-    ),
     ("replay {bag} --out {out} --odom odom", "no topic odom in the recording; of nav_msgs/msg/Odometry there is /odom"),
     ("replay {bag} --out {out} --landmarks /odom", "topic /odom is nav_msgs/msg/Odometry"),
-    ("replay {bag} --out {out} --set a.b=1", "unknown parameter 'a.b'; did you mean"),
-    (
-        "replay {bag} --out {out} --set base_frame=base_footprint",
-        "unknown parameter 'base_frame'; did you mean 'frames.base'?",
-    ),
     (
         "replay {bag} --out {out} --set calibrate.groups=auto",
         "calibrate.groups' was removed: graph_slam calibrate BAG prints the settings",
@@ -237,7 +227,6 @@ REFUSED = [
     ("replay {bag} --out {text}", "text.mcap: Not a directory"),
     ("recover {run} --out {there}", "holds a run already: choose another folder, or --force"),
     ("params warp", "no parameter matches 'warp'"),
-    ("completion fish", "invalid choice: 'fish'"),
     ("replay {run} --out {run}", "cannot be read from and written to at once"),
     ("replay {bag} --ros --rate -1", "argument --rate: -1 is not a positive number"),
     ("simulate mars --out {out}", "no world 'mars'; there are pythonrobotics"),
@@ -251,7 +240,6 @@ REFUSED = [
     ("optimize {text}", "no vertex in it of a kind that is known"),
     ("evaluate {run} --truth {run}", "a run, not the truth: graph_slam evaluate RUN"),
     ("report {bag}", "not a run's folder, but a file: graph_slam replay BAG --out RUN makes a run of a recording"),
-    ("evaluate none --truth {bag}", "none"),
     ("replay {bag} --out {out} --set frames.odom=world", "no odometry of it could be used"),
 ]
 
@@ -300,9 +288,8 @@ def test_a_fault_of_ours_is_one_line_with_code_1(bag, tmp_path, capsys, monkeypa
     monkeypatch.setattr("graph_slam_ros.runs.replay.replay", broken)
     code, _, err = told(capsys, "replay", bag, "--out", tmp_path / "run")
     assert code == 1
-    assert err == [
-        "graph_slam: internal error, ZeroDivisionError: division by zero (GRAPH_SLAM_TRACEBACK=1 shows where)"
-    ]
+    told_as = "internal error, ZeroDivisionError: division by zero (GRAPH_SLAM_TRACEBACK=1 shows where)"
+    assert err == [f"graph_slam: {told_as}"]
 
 
 def test_the_installed_command_passes_its_exit_code_on(tmp_path):
@@ -340,9 +327,8 @@ def test_without_ros_the_live_commands_say_so(bag, tmp_path, capsys, monkeypatch
         assert cli.node_main() == 2
     finally:
         signal.signal(signal.SIGINT, handler)
-    assert capsys.readouterr().err == (
-        "graph_slam_node: ROS 2 is not installed here (no rclpy); replay works without it\n"
-    )
+    node = "graph_slam_node: ROS 2 is not installed here (no rclpy); replay works without it\n"
+    assert capsys.readouterr().err == node
 
 
 def test_a_reader_that_stops_reading_is_no_fault(bag):

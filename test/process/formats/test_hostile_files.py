@@ -68,9 +68,8 @@ def test_F34_a_table_that_computes_its_messages_is_refused_before_any_is(tmp_pat
         database.execute(
             f"CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, {computed})"
         )
-        database.executemany(
-            "INSERT INTO messages(id, topic_id, timestamp) VALUES (?, 1, ?)", [(k, k) for k in range(99)]
-        )
+        rows = [(k, k) for k in range(99)]
+        database.executemany("INSERT INTO messages(id, topic_id, timestamp) VALUES (?, 1, ?)", rows)
     assert path.stat().st_size < 20_000
     with pytest.raises(BagError, match="the column data of messages is computed"):
         open_bag(path)

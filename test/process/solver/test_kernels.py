@@ -5,72 +5,95 @@ import shutil
 import subprocess
 import sys
 import venv
+from pathlib import Path
+from zipfile import ZipFile
 
 import pytest
 from places import ROOT
 from reliability import times
 
 from graph_slam_ros import warmup
-
-
-def python(*words, **environment):
-    inherited = {name: value for name, value in os.environ.items() if name != "PYTEST_ADDOPTS"}  # colcon's own
-    return subprocess.run(
-        [sys.executable, *words], capture_output=True, text=True, cwd=ROOT, env=inherited | environment, timeout=900
-    )
-
+from graph_slam_ros.lie import jit
 
 ONE_KERNEL = """
 import numpy as np
 from graph_slam_ros.graph.edges import _pose_prior
 from graph_slam_ros.lie.jit import CACHE_DIR
-_pose_prior(np.zeros(3), np.zeros((1, 1), int), np.zeros((1, 3)))
+result = _pose_prior(np.zeros(3), np.zeros((1, 1), int), np.array([[1.0, 2.0, 3.0]]))
 stats = _pose_prior.stats
-print(CACHE_DIR, sum(stats.cache_hits.values()), sum(stats.cache_misses.values()))
+print(CACHE_DIR, sum(stats.cache_hits.values()), sum(stats.cache_misses.values()), *(a.tobytes().hex() for a in result))
 """
 
 
+def copied(folder):
+    package = folder / "graph_slam_ros"
+    return shutil.copytree(ROOT / "graph_slam_ros", package, ignore=shutil.ignore_patterns("__pycache__"))
+
+
+def one_kernel(place, cache, executable=sys.executable, **more):
+    """Of a package copied there: where a kernel lies, loaded, compiled, and what it computes."""
+    path = os.pathsep.join([str(place), *(path for path in sys.path if path.endswith("-packages"))])
+    variables = {"PYTHONPATH": path, "PYTHONDONTWRITEBYTECODE": "1", "GRAPH_SLAM_CACHE": str(cache)} | more
+    command, variables = [str(executable), "-c", ONE_KERNEL], os.environ | variables
+    done = subprocess.run(command, cwd=place, env=variables, capture_output=True, text=True, timeout=120)
+    folder, hits, misses, *result = done.stdout.split()
+    return folder, int(hits), int(misses), result
+
+
 def test_a_moved_copy_and_a_second_environment_load_what_was_compiled(tmp_path):
-    environment = tmp_path / "environment"
+    environment, cache = tmp_path / "environment", tmp_path / "cache"
     venv.create(environment, symlinks=True, with_pip=False)
-    libraries = [path for path in sys.path if path.endswith("-packages")]
-
-    def answers(place, executable=sys.executable, **more):
-        path = os.pathsep.join([str(tmp_path / place), *libraries])
-        command = [str(executable), "-c", ONE_KERNEL]
-        variables = os.environ | {"PYTHONPATH": path, "GRAPH_SLAM_CACHE": str(tmp_path / "cache")} | more
-        done = subprocess.run(command, cwd=tmp_path, env=variables, capture_output=True, text=True, timeout=120)
-        folder, hits, misses = done.stdout.split()
-        return folder, int(hits), int(misses)
-
-    for place in ("one", "moved"):
-        package = tmp_path / place / "graph_slam_ros"
-        shutil.copytree(ROOT / "graph_slam_ros", package, ignore=shutil.ignore_patterns("__pycache__"))
-    folder, *counts = answers("one")
+    copied(tmp_path / "one")
+    package = copied(tmp_path / "moved")
+    folder, *counts, _ = one_kernel(tmp_path / "one", cache)
     assert counts == [0, 1]
     for file in package.rglob("*.py"):
         os.utime(file, (1e9, 1e9))
-    assert answers("moved", environment / "bin" / "python") == (folder, 1, 0)
-    other, *counts = answers("moved", NUMBA_BOUNDSCHECK="1")
+    assert one_kernel(package.parent, cache, environment / "bin" / "python")[:3] == (folder, 1, 0)
+    other, *counts, _ = one_kernel(package.parent, cache, NUMBA_BOUNDSCHECK="1")
     assert (other != folder, counts) == (True, [0, 1]), "what is compiled without checks of bounds has none"
     edges, so3 = package / "graph" / "edges.py", package / "lie" / "so3.py"
     edges.write_text('"""Another docstring.\n"""\n# and a comment\n' + edges.read_text().split('"""', 2)[2])
-    assert answers("moved") == (folder, 1, 0)
+    assert one_kernel(package.parent, cache)[:3] == (folder, 1, 0)
     so3.write_text(so3.read_text() + "_CHANGED = 1\n")
-    other, *counts = answers("moved")
-    assert other != folder
-    assert counts == [0, 1]
+    other, *counts, _ = one_kernel(package.parent, cache)
+    assert (other != folder, counts) == (True, [0, 1])
+
+
+def test_kernels_of_a_wheel_are_loaded_and_two_processors_compute_the_same_bytes(tmp_path):
+    package = copied(tmp_path / "wheel")
+    portable = {"NUMBA_CPU_NAME": jit.PROCESSOR, "NUMBA_CPU_FEATURES": ""}
+    made, *compiled = one_kernel(package.parent, tmp_path / "built", **portable)
+    assert compiled[:2] == [0, 1]
+    native, *counts, result = one_kernel(package.parent, tmp_path / "native")
+    assert (Path(native).name != Path(made).name, counts, result) == (True, [0, 1], compiled[2])
+    shutil.make_archive(package / Path(made).name, "zip", made)
+    files = sorted(package.rglob("*"))
+    assert one_kernel(package.parent, tmp_path / "user")[1:] == (1, 0, result)
+    assert one_kernel(package.parent, "/dev/null", TMPDIR=str(tmp_path))[1:] == (1, 0, result), "without a home"
+    assert one_kernel(package.parent, tmp_path / "user", NUMBA_OPT="2")[1:3] == (0, 1), "another compiler"
+    assert sorted(package.rglob("*")) == files
 
 
 @pytest.mark.skipif(not times(0, 1), reason="only in make soak")  # compiles for minutes
-@pytest.mark.parametrize("cores", [[0], sorted(os.sched_getaffinity(0))])
-def test_one_core_and_two_compile_code_that_computes_the_same_bytes(tmp_path, cores):
-    """Against the kernels that all tests use."""
+@pytest.mark.parametrize("how", ["one core", "two cores", "wheel"])
+def test_one_core_two_and_a_wheel_compute_the_same_bytes(tmp_path, how):
+    """Against the kernels that all tests use; those of the wheel are for another processor, and all are there."""
     command = [sys.executable, "-m", "graph_slam_ros.cli", "replay", str(ROOT / "data" / "demo.mcap"), "--out"]
     new = os.environ | {"GRAPH_SLAM_CACHE": str(tmp_path / "cache")}
+    if how == "wheel":
+        as_it_is = [f"VENV={sys.prefix}", "-o", f"{sys.prefix}/package.stamp"]
+        subprocess.run(["make", "wheel", f"DIST={tmp_path}", *as_it_is], cwd=ROOT, check=True, capture_output=True)
+        pip = [sys.executable, "-m", "pip", "install", "--no-deps", "--target", str(tmp_path / "site")]
+        subprocess.run([*pip, *map(str, tmp_path.glob("*.whl"))], check=True, capture_output=True)
+        new["PYTHONPATH"] = str(tmp_path / "site")
     subprocess.run([*command, str(tmp_path / "old")], check=True, capture_output=True)
-    with_these = {"env": new, "preexec_fn": lambda: os.sched_setaffinity(0, cores)}
-    subprocess.run([*command, str(tmp_path / "new")], check=True, capture_output=True, **with_these)
+    pinned = {"preexec_fn": lambda: os.sched_setaffinity(0, [0])} if how == "one core" else {}
+    command += [str(tmp_path / "new")]
+    subprocess.run(command, cwd=tmp_path, env=new, check=True, capture_output=True, **pinned)
+    for archive in (tmp_path / "site").glob("*/kernels-*.zip"):
+        brought = {Path(name).name for name in ZipFile(archive).namelist() if ".nb" in name}
+        assert {file.name for file in (tmp_path / "cache").rglob("*.nb?")} == brought
     names = {file.name for file in (tmp_path / "old").iterdir()} - {"run.json"}
     assert len(names) > 10
     for name in names:
@@ -121,14 +144,17 @@ print([name for name, count in signatures().items() if count != before.get(name,
 """
 
 
-def test_the_progress_of_the_compiler_counts_to_about_as_many_kernels_as_there_are():
+def test_the_progress_of_the_compiler_counts_to_about_as_many_kernels_as_there_are(monkeypatch):
     warmup.warmup()
     assert warmup._cached() == pytest.approx(warmup._KERNELS, rel=0.1)
     assert str(warmup.Compiling(warmup._KERNELS // 2, 30.0)).endswith(": 50 %, about 40 s more")
     assert str(warmup.Compiling(2 * warmup._KERNELS, 30.0)).endswith(": 99 %, about 10 s more")
+    monkeypatch.setattr(warmup, "ARCHIVES", ["kernels-of-another-numba.zip"])
+    assert "(the wheel's are not for Numba " in str(warmup.Compiling(1, 0.0))
 
 
 def test_the_warm_up_compiles_all_that_solving_a_graph_needs():
     graphs = [str(ROOT / "data" / name) for name in ("city.g2o", "landmarks.g2o")]
-    done = python("-c", COMPILED_LATER, *graphs)
+    command = [sys.executable, "-c", COMPILED_LATER, *graphs]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=900)
     assert done.stdout.splitlines() == ["[]"], done.stdout + done.stderr

@@ -30,13 +30,10 @@ def test_the_shipped_files_are_exactly_what_the_code_writes_of_its_defaults_or_s
 
 
 def test_every_input_has_a_section_and_only_those():
-    config = Config.from_mapping(
-        {"inputs.names": "odom gps", "gps": {"type": "sensor_msgs/msg/NavSatFix", "sigma_m": 2}}
-    )
-    assert [(one.name, one.topic, one.sigma_m) for one in config.sources] == [
-        ("odom", "odom", 0.0),
-        ("gps", "gps", 2.0),
-    ]
+    gps = {"type": "sensor_msgs/msg/NavSatFix", "sigma_m": 2}
+    config = Config.from_mapping({"inputs.names": "odom gps", "gps": gps})
+    inputs = [(one.name, one.topic, one.sigma_m) for one in config.sources]
+    assert inputs == [("odom", "odom", 0.0), ("gps", "gps", 2.0)]
     assert list(config.as_mapping())[-2:] == ["odom", "gps"]
     assert Config.from_mapping(config.as_mapping()) == config
     names = {p.name for p in parameters(["odom", "gps"])}

@@ -38,12 +38,7 @@ def tangents(dof, count=20):
 
 
 def matrix(a):
-    if len(a) == 7:
-        out = np.eye(4)
-        out[:3, :3], out[:3, 3] = so3.matrix(se3.rotation(a)), se3.position(a)
-        return out
-    c, s = np.cos(a[2]), np.sin(a[2])
-    return np.array([[c, -s, a[0]], [s, c, a[1]], [0, 0, 1.0]])
+    return (se3 if len(a) == 7 else se2).to_matrix(a)
 
 
 def hat(d):
@@ -104,7 +99,6 @@ def test_right_jacobians_are_the_numeric_ones():
         # central differences: step^2 times a third derivative (up to 10), and rounding / step
         found = numeric(lambda e, d=d: se2.local(se2.exp(d + e), se2.exp(d)), 3)
         assert se2.right_jacobian(tuple(d)) == pytest.approx(found, abs=2e-9)
-
     for d in tangents(6):
         w = tuple(d[3:])
         if np.linalg.norm(w) < 3.0:  # beyond, the two sides fall on different sheets
@@ -180,9 +174,7 @@ def test_matrices_of_poses_are_those_of_scipy_and_lead_back():
     assert (back[:, 6] >= 0.0).all()
     one = se3.from_matrix(se3.to_matrix(tuple(path[7])))
     assert se3.to_matrix(one) == pytest.approx(matrices[7], abs=1e-14)
-
     planar = samples("uniform")
-
     assert np.stack(se2.from_matrix(se2.to_matrix(tuple(planar.T))), axis=-1) == pytest.approx(planar, abs=1e-14)
 
 
