@@ -188,7 +188,7 @@ def _judged(solution: Solution, settings: Settings) -> Solution:
     gone, far = int((unlikely & has_loss).sum()), np.flatnonzero(unlikely & ~has_loss)
     freedom, kept = freedom - int(numbers[unlikely & has_loss].sum()), float(chi2[~(unlikely & has_loss)].sum())
     if not solution.report.converged:
-        doubt = f"it did not converge ({solution.report.stop})"
+        doubt = f"it did not converge ({solution.report.stop}){_hint(solution.file, edges)}"
     elif 2 * gone > has_loss.sum():
         doubt = f"the loss lets go of {gone} of {has_loss.sum()} edges"
     elif freedom > 0 and kept > max(_FAR_ABOVE * freedom, chdtri(freedom, _UNLIKELY)):

@@ -116,7 +116,10 @@ def _settings(args: argparse.Namespace, graph: "Graph") -> "Settings":
 
 def _after(args: argparse.Namespace, solution: "Solution") -> str:
     from graph_slam_ros.formats.strict import ending
+    from graph_slam_ros.optimization import W_FIRST
 
+    if solution.doubt.endswith(W_FIRST):
+        return "write x y z qx qy qz qw in the file, and solve it again"
     if not solution.report.converged:
         start = "online" if args.init == "chordal" else "chordal"
         words = _options(argparse.Namespace(**vars(args) | {"init": start}))
@@ -129,10 +132,6 @@ def _after(args: argparse.Namespace, solution: "Solution") -> str:
     if ending(args.out) == ".tum":
         return f"evo_traj tum {shlex.quote(str(args.out))} --plot, or any reader of TUM trajectories"
     return f"{console.command('optimize', args.out, '--out', 'POSES.tum')} (the poses as a trajectory)"
-
-
-def _told(solution: "Solution") -> str:
-    return f"the loss lets go of {solution.let_go} edges" if solution.let_go else "all edges fit"
 
 
 def _remedy(args: argparse.Namespace, solution: "Solution") -> str:
@@ -148,7 +147,8 @@ def _remedy(args: argparse.Namespace, solution: "Solution") -> str:
             tried = solve(solution.file, _settings(other, solution.file.graph), init=other.init)
             if not tried.doubt:
                 words = console.command("optimize", args.graph, *_options(other), "--out", "SOLVED.g2o")
-                return f"{words} (tried: {_told(tried)})"
+                told = f"the loss lets go of {tried.let_go} edges" if tried.let_go else "all edges fit"
+                return f"{words} (tried: {told})"
     ratio = (solution.report.chi2_final / max(1, solution.solver.degrees_of_freedom)) ** 0.5
     return f"the worst edges; if all fit alike, noise is {ratio:.3g} times what the information says (no loss helps)"
 
@@ -216,7 +216,7 @@ def _optimize_text(solution: "Solution", start: str, loss: "Loss") -> Iterable[s
     for name, part in report.classes.items():
         yield f"  {name:12s}{part.edges:7d} edges   chi2 {part.chi2:14.6f}"
     if solution.let_go:
-        yield f"  {_told(solution)}"
+        yield f"  the loss lets go of {solution.let_go} edges"
     if solution.doubt or solution.let_go:
         yield from (f"  worst: {edge}, chi2 {chi2:.4g}" for edge, chi2 in solution.worst())
 

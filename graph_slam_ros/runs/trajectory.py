@@ -72,13 +72,7 @@ class Landmark:
 
 
 def read_tum(path: Path, *, follow: bool = False) -> Trajectory:
-    """Poses of a TUM file (stamp x y z qx qy qz qw) in order of stamp; ``follow``: it may be a symbolic link.
-
-    Raises
-    ------
-    GraphSlamError
-        As ``read_rows``.
-    """
+    """Poses of a TUM file (stamp x y z qx qy qz qw) in order of stamp; ``follow``: it may be a symbolic link."""
     return read_rows(path, follow=follow).in_order()
 
 
@@ -169,8 +163,8 @@ def _landmark(row: dict[str, str]) -> Landmark:
         for j, b in enumerate(names[i:], start=i):
             covariance[i, j] = covariance[j, i] = float(row[f"cov_{a}{b}"])
     at = float(row["x"]), float(row["y"]), float(row.get("z", 0.0))
-    if not max(map(abs, at)) < 1e9:
-        raise ValueError(f"{row['id']} is at {at}")
+    if not max(map(abs, at)) < 1e9 or (np.abs(covariance) >= MOST).any():
+        raise ValueError(f"{row['id']} is at {at}, variance {covariance.max():.3g}")
     return Landmark(at, covariance)
 
 
@@ -179,6 +173,8 @@ def read_covariances(path: Path) -> Array:
     try:
         lines = read_text(path).splitlines()[1:]
         rows = np.array([[float(word) for word in line.split(",")[1:]] for line in lines])
+        if (np.abs(rows) >= MOST).any():
+            raise ValueError(f"a number of {MOST:.0e} or more")
         dof = {6: 3, 21: 6}[rows.shape[-1]]
     except OSError as error:
         raise GraphSlamError(f"{path}: {error.strerror}") from None

@@ -26,7 +26,7 @@ from graph_slam_ros.messages.to_msg import (
 from graph_slam_ros.recordings.bag import BagWriter
 from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.runs.restore import map_of, record_run
-from graph_slam_ros.runs.trajectory import Trajectory, read_tum
+from graph_slam_ros.runs.trajectory import Trajectory, read_landmarks, read_tum
 from graph_slam_ros.slam import Config, Control
 from graph_slam_ros.tools.simulation import measurements, simulate, write_bag
 from graph_slam_ros.tools.simulation.instruments import geodetic
@@ -166,14 +166,15 @@ def test_an_unknown_topic_is_refused_with_those_that_exist(run, tmp_path):
         ("1 1e155 3 0 0 0 0 1\n", "eight finite numbers below 1e.20"),
         ("1 two 3 0 0 0 0 1\n", "two"),
         ("1 2 3 0 0 0 0 0\n", "a quaternion of zeros"),
+        ("id,x,y,cov_xx,cov_xy,cov_yy\na,1,2,1,0,1e155\n", r"variance 1e\+155"),
     ],
 )
-def test_a_file_that_is_no_path_is_refused_by_name_in_one_line(tmp_path, text, reason):
+def test_a_file_that_is_no_path_or_map_is_refused_by_name_in_one_line(tmp_path, text, reason):
     (tmp_path / "bad.tum").write_text(text)
+    read = read_landmarks if text.startswith("id") else read_tum
     with pytest.raises(GraphSlamError, match=reason) as refused:
-        read_tum(tmp_path / "bad.tum")
-    assert "bad.tum" in str(refused.value)
-    assert "\n" not in str(refused.value)
+        read(tmp_path / "bad.tum")
+    assert "bad.tum" in str(refused.value) and "\n" not in str(refused.value)
 
 
 def test_absolute_and_relative_errors_are_those_of_evo():

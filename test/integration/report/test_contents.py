@@ -117,11 +117,9 @@ def test_what_is_of_another_place_or_drive_is_doubted(run, tmp_path):
     Image.new("L", (40, 20), 255).save(tmp_path / "hall.png")
     (tmp_path / "map.yaml").write_text("image: hall.png\nresolution: 0.5\norigin: [500.0, 2.0, 0.0]\n")
     other = drive(tmp_path / "other", ["elsewhere", "nowhere"])
-    stamps = np.loadtxt(run / "path.tum")[:, 0]
-    wrong = np.column_stack(
-        [stamps, *np.random.default_rng(1).normal(scale=30.0, size=(2, len(stamps))), *[0 * stamps] * 4]
-    )
-    np.savetxt(tmp_path / "wrong.tum", np.column_stack([wrong, 1 + 0 * stamps]), fmt="%.9f")
+    rng, stamps = np.random.default_rng(1), np.loadtxt(run / "path.tum")[:, 0]
+    wrong = np.column_stack([stamps, *rng.normal(scale=30.0, size=(2, len(stamps))), *[0 * stamps] * 4, 1 + 0 * stamps])
+    np.savetxt(tmp_path / "wrong.tum", wrong, fmt="%.9f")
     found = read_contents(run, str(tmp_path / "wrong.tum"), other, tmp_path / "map.yaml")
     plan, truth, compared = found.data["beware"]
     assert "443 of 443 keyframes are outside of the floor plan" in plan
