@@ -14,8 +14,8 @@ import numpy as np
 from benchmarks.live.streams import AFTER_NS, BEFORE_NS, CITY_SIGMA_M, CITY_SIGMA_RAD, STEP_NS
 from benchmarks.problem import city_problem
 from graph_slam_ros.lie import se2
-from graph_slam_ros.runs.map_journal import read_map
 from graph_slam_ros.runs.recorder import RunRecorder
+from graph_slam_ros.runs.restore import map_of
 from graph_slam_ros.slam import Closure, Config, Control, GraphSlam, Odometry
 from graph_slam_ros.warmup import warmup
 
@@ -65,8 +65,7 @@ def main() -> None:
         drove_s = time.process_time() - start_s
         written = {name: (run / f"{name}.mcap").stat().st_size / 2**20 for name in ("ingest", "map")}
         start, cpu_s = time.perf_counter(), time.process_time()
-        state = read_map(run, losses := [])
-        assert state is not None
+        state = map_of(run, losses := [])
         read_s = time.perf_counter() - start
         again = GraphSlam(config, start=state)
         took_s, cpu_s = time.perf_counter() - start, time.process_time() - cpu_s

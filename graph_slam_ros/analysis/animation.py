@@ -17,7 +17,7 @@ from graph_slam_ros.formats.durable import write_whole
 from graph_slam_ros.lie import se3
 from graph_slam_ros.runs.folder import recording_of, run_config
 from graph_slam_ros.runs.journal import read_measurements
-from graph_slam_ros.runs.map_journal import read_map
+from graph_slam_ros.runs.map_file import read_start
 from graph_slam_ros.runs.trajectory import Trajectory, read_rows
 from graph_slam_ros.slam import GraphSlam
 from graph_slam_ros.typing import Array
@@ -84,8 +84,8 @@ def animate_run(
 def _moments(run: Path, frames: int, losses: list[str]) -> Iterator[_Moment]:
     """The estimate after equal times, and at the end. Time goes on from keyframe to keyframe, also of a set clock."""
     config = run_config(run).changed({"map.condense": False})  # all of the path is drawn
-    start = read_map(run, losses, start_only=True)
-    stamps_s = read_rows(run / "path.tum").stamps_s[max(len(start.keyframes) - 1, 0) if start else 0 :]
+    start = read_start(run)
+    stamps_s = read_rows(run / "path.tum").stamps_s[max(start.keyframe_count - 1, 0) if start else 0 :]
     step_s = float(np.maximum(np.diff(stamps_s), 0.0).sum()) / max(frames - 1, 1)
     slam = GraphSlam(config, start=start)
     last_ns, passed_s, due_s = slam.keyframes[-1].stamp_ns if slam.keyframes else 0, 0.0, step_s

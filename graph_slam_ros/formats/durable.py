@@ -9,7 +9,7 @@ import fcntl
 import os
 import secrets
 import stat
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 from graph_slam_ros.formats.files import created
@@ -59,15 +59,6 @@ class AppendedFile:
         """Sync what was flushed, if anything was. It may be called from another thread. Raises OSError."""
         if (fd := self._fd) >= 0:
             os.fsync(fd)
-
-    def replace(self, path: Path, others: Sequence[Path] = ()) -> None:
-        """Take the place of a file, and remove others, if they are there; it is synced before. Raises OSError."""
-        self.sync()
-        for other in others:
-            other.unlink(missing_ok=True)
-        os.replace(self._path, path)
-        self._path = path
-        sync_folder(path.parent)
 
     def close(self) -> None:
         """Flush, sync and close. After an OSError the file is still open, and may be closed again."""

@@ -1,6 +1,5 @@
 """A plan of edits by hand, and the run that it makes from another run."""
 
-import copy
 import hashlib
 import json
 import math
@@ -20,8 +19,8 @@ from graph_slam_ros.formats.files import opened, read_text
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.edits import AppliedEdit, Edit, edit_of
 from graph_slam_ros.runs.folder import CONFIG, RunError, check_room, check_run, discard, recording_of
-from graph_slam_ros.runs.journal import INGEST, MAP, parts_of
-from graph_slam_ros.runs.map_journal import state_of
+from graph_slam_ros.runs.journal import INGEST, parts_of
+from graph_slam_ros.runs.map_file import MAP
 from graph_slam_ros.runs.restore import config_to_go_on, record_run, restored, stopwatch
 from graph_slam_ros.slam import Config, Control, GraphSlam
 from graph_slam_ros.slam.map_editor import MapEditor
@@ -126,7 +125,7 @@ def source_hash(folder: Path) -> str:
     """
     check_run(folder)
     digest = hashlib.sha256()
-    for file in (folder / CONFIG, *parts_of(folder, INGEST), *parts_of(folder, MAP)):
+    for file in (folder / CONFIG, *parts_of(folder, INGEST), *filter(os.path.lexists, [folder / MAP])):
         try:
             with opened(file, follow=False) as stream:
                 content = hashlib.file_digest(stream, "sha256").hexdigest()
@@ -287,15 +286,15 @@ class Rehearsal:
 
     def __init__(self, slam: GraphSlam, folder: Path) -> None:
         self._config, self._before = slam.config, slam
-        self._state = state_of(slam, folder)
+        self._state = slam.snapshot(folder)
         if len(slam.ledger) < slam.graph.edge_count:  # it never ended
             whole = GraphSlam(slam.config, start=self._state)
             whole.process(Control("optimize"))
-            self._state = state_of(whole, folder)
+            self._state = whole.snapshot(folder)
 
     def edited(self, edits: Sequence[Edit]) -> MapSnapshot:
         """A copy of the map to which edits were applied; nothing is solved. Raises GraphSlamError where one fails."""
-        state = copy.deepcopy(self._state, {id(self._state.graph): self._state.graph.copy()})  # kinds are shared
+        state = self._state.copy()
         editor = MapEditor(state, self._config)
         for one in edits:
             editor.apply(one)

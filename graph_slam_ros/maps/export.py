@@ -1,6 +1,6 @@
 """Export of a run to other formats: its path as TUM, its graph as g2o, both as mcap for viewers.
 
-Everything is read from ``map.mcap``. So a run that never ended can be exported, too.
+Everything is read from the map of the run. So a run that never ended can be exported, too.
 """
 
 from pathlib import Path

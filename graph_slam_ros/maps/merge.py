@@ -13,35 +13,31 @@ from typing import Any
 
 import numpy as np
 
-from graph_slam_ros.edge_tags import tag_of
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.graph import Gaussian
+from graph_slam_ros.graph import Gaussian, Graph
 from graph_slam_ros.maps.alignment import Alignment, align, positions
 from graph_slam_ros.measurements.edits import AppliedEdit, Argument, kind_of
 from graph_slam_ros.runs.condensed_map import CONDENSED, WholePath
 from graph_slam_ros.runs.folder import check_room
 from graph_slam_ros.runs.journal import parts_of
-from graph_slam_ros.runs.map_journal import MapGrowth, Record, extend, state_of
 from graph_slam_ros.runs.restore import config_to_go_on, record_run, restored_and_solved, stopwatch
 from graph_slam_ros.slam import Control, GraphSlam
 from graph_slam_ros.slam.doubt.record import Alarm
 from graph_slam_ros.slam.edits import HAND_MADE
 from graph_slam_ros.slam.frontend.odometry_selector import JUMP_SIGMA_M, JUMP_SIGMA_RAD
 from graph_slam_ros.slam.landmarks.assignments import NAME, last_number
+from graph_slam_ros.slam.landmarks.landmark import Landmark, LandmarkEdge
 from graph_slam_ros.slam.robust.landmark_support import landmark_of
-from graph_slam_ros.slam.robust.ledger import Reason, Verdict
+from graph_slam_ros.slam.robust.ledger import Ledger, Reason, Verdict
 from graph_slam_ros.slam.snapshot import MapSnapshot
 
 _ABSOLUTE = ("fixes", "surveyed")  # in the axes of map
-_ONCE = ("surveyed",)  # what both sessions were told is told once
 
 
 def refuse_other_space(one: GraphSlam, two: GraphSlam, a: Path, b: Path) -> None:
     """Raise GraphSlamError if one is in the plane and one in space."""
     if one.space is not two.space:
-        dimensions = (slam.space.dimensions for slam in (one, two))
-        counts = " and ".join(f"{folder}: {n}" for folder, n in zip((a, b), dimensions, strict=True))
-        raise GraphSlamError(f"world.dimensions differ ({counts})")
+        raise GraphSlamError(f"world.dimensions differ ({a}: {one.space.dimensions} and {b}: {two.space.dimensions})")
 
 
 def shared_landmarks(one: GraphSlam, two: GraphSlam) -> list[str]:
@@ -78,14 +74,13 @@ def _refuse_other_datum(one: GraphSlam, two: GraphSlam, a: Path, b: Path) -> Non
 
 
 def _refuse_same_drive(one: GraphSlam, two: GraphSlam, a: Path, b: Path) -> None:
-    driven, again = (_driven(WholePath.of(slam, folder)) for slam, folder in ((one, a), (two, b)))
+    driven, again = (
+        {(stamp, pose.tobytes()) for stamp, pose in zip(path.stamps_ns.tolist(), path.odometry, strict=True)}
+        for path in (WholePath.of(one, a), WholePath.of(two, b))
+    )
     same = len(driven & again)
     if same > 1:  # two robots may begin at one time
         raise GraphSlamError(f"{same} keyframes are of the same drive in {a} and {b}: nothing new is in one of them")
-
-
-def _driven(path: WholePath) -> set[tuple[int, bytes]]:
-    return {(stamp, pose.tobytes()) for stamp, pose in zip(path.stamps_ns.tolist(), path.odometry, strict=True)}
 
 
 def _shared(one: GraphSlam, two: GraphSlam, a: Path, b: Path) -> list[str]:
@@ -151,21 +146,20 @@ def merge(a: Path, b: Path, out: Path, *, force: bool = False) -> Merged:
     one, two = restored_and_solved(a, losses), restored_and_solved(b, losses, whole=True)
     refuse_other_space(one, two, a, b)
     shared, aligned = aligned_for_merge(one, two, a, b)
-    state = state_of(one, a)
+    state = one.snapshot(a)
     first_edge = state.graph.edge_count
     two.backend.use_noise(one.noise_factors)  # the merged map has one factor for each group
-    extend(state, _Second(one, two, aligned, shared).record())
+    _Second(one, two, aligned, shared).add_to(state)
     left_out = {name: aligned.distance(k) for k, name in enumerate(shared) if not aligned.fits[k]}
     chi2 = {one.landmarks[name].vertex: float(aligned.chi2[k]) for k, name in enumerate(shared) if name in left_out}
     _leave_out(state, first_edge, chi2, aligned.limit)
-    config = config_to_go_on(one, a)
-    _, summary = record_run(out, config, [Control("optimize")], losses, state, took=took, force=force)
+    _, summary = record_run(out, config_to_go_on(one, a), [Control("optimize")], losses, state, took=took, force=force)
     return Merged(summary, summary["losses"], len(shared), left_out, bool(parts_of(b, CONDENSED)))
 
 
 def _leave_out(state: MapSnapshot, first_edge: int, chi2: Mapping[int, float], limit: float) -> None:
     """Remove the second session's sightings of landmarks that are elsewhere in it. Those that fit come back later."""
-    last, inside = len(state.keyframes) - 1, state.ledger.inside
+    last, inside = state.keyframe_count - 1, state.ledger.inside
     for edge in inside[inside >= first_edge].tolist():
         statistic = chi2.get(landmark_of(state.graph, edge) or 0)
         if statistic is not None:
@@ -174,63 +168,70 @@ def _leave_out(state: MapSnapshot, first_edge: int, chi2: Mapping[int, float], l
 
 
 class _Second:
-    """The map of the second session as growth of the first."""
+    """The map of the second session, to be added to the first."""
 
     def __init__(self, one: GraphSlam, two: GraphSlam, aligned: Alignment, shared: list[str]) -> None:
         self._one, self._two, self._T = one, two, aligned.T_a_b
         self._keyframes = len(one.keyframes)
-        same = {two.landmarks[name].vertex: one.landmarks[name].vertex for name in shared}
-        self._vertex: dict[int, int] = same
-        self._new = [vertex for vertex in range(two.graph.vertex_count) if vertex not in same]
+        self._vertex = {two.landmarks[name].vertex: one.landmarks[name].vertex for name in shared}
+        self._new = [vertex for vertex in range(two.graph.vertex_count) if vertex not in self._vertex]
         self._vertex |= {vertex: one.graph.vertex_count + k for k, vertex in enumerate(self._new)}
         self._shared = set(shared)
 
-    def record(self) -> Record:
-        """A record with numbers of vertices, edges and keyframes that follow those of the first map."""
-        growth, first = MapGrowth().since(self._two), self._keyframes
-        others = MapGrowth().since(self._one)["edges"]
-        known = {(label, *vertices) for _, vertices, *_, label, _ in others if label in _ONCE}
-        edges = [self._edge(edge) for edge in growth["edges"]]
-        kept = [k for k, (_, vertices, *_, label, _) in enumerate(edges) if (label, *vertices) not in known]
-        number = {edge: self._one.graph.edge_count + k for k, edge in enumerate(kept)}
-        ids = {edge: self._one.graph.edge_ids.of(row) for edge, row in number.items()}
-        return {
-            "vertices": [self._value(vertex, growth["vertices"][vertex][0]) for vertex in self._new],
-            "edges": [edges[k] for k in kept],
-            "judged": [[first + keyframe, *rest] for keyframe, *rest in (growth["judged"][k] for k in kept)],
-            "changes": [[number[edge], first + keyframe, *rest] for edge, keyframe, *rest in growth.get("changes", ())],
-            "keyframes": [[self._vertex[vertex], *rest] for vertex, *rest in growth["keyframes"]],
-            "segments": [first + keyframe for keyframe in growth["segments"]],
-            "drives": [first + keyframe for keyframe in growth["drives"]],
-            "sightings": [[first + keyframe, *rest] for keyframe, *rest in growth.get("sightings", ())],
-            "landmarks": self._landmarks(growth.get("landmarks", {})),
-            "seen": [
-                [number[edge], topic, sighting, first + keyframe, self._vertex[vertex], *rest]
-                for edge, topic, sighting, keyframe, vertex, *rest in growth.get("seen", ())
-            ],
-            "edits": [self._edit_record(one, ids) for one in self._two.edits],
-            "displacements": [*self._one.displacements, *map(self._displacement, self._two.displacements)],
-            "datum": growth.get("datum", self._one.datum),
-        }
+    def add_to(self, state: MapSnapshot) -> None:
+        """Add it to the first map. Vertices, edges and keyframes follow those that are there."""
+        two, first, seen = self._two, self._keyframes, self._two.sighting_poses
+        for vertex in self._new:
+            state.graph.add_vertex(two.graph.kind_of(vertex), self._value(vertex))
+        state.values = np.concatenate((state.values, state.graph.initial.values[len(state.values) :]))
+        number = self._add_edges(state)
+        self._add_verdicts(state.ledger, number)
+        for keyframe in two.keyframes:
+            state.keyframes.append(self._vertex[keyframe.vertex], keyframe.stamp_ns, keyframe.T_odom_base)
+        state.sighting_poses.extend(seen.ids + first, seen.stamps_ns, seen.poses)
+        state.segments += [first + keyframe for keyframe in two.segments]
+        state.drives += [first + keyframe for keyframe in two.drives]
+        self._add_landmarks(state.landmarks, number)
+        ids = {edge: state.graph.edge_ids.of(row) for edge, row in number.items()}
+        state.edits += [self._edit(one, ids) for one in two.edits]
+        state.displacements = [*state.displacements, *map(self._displacement, two.displacements)]
+        state.datum = two.datum or state.datum
 
-    def _value(self, vertex: int, kind: str) -> list[Any]:
+    def _value(self, vertex: int) -> tuple[float, ...]:
         space, value = self._one.space, tuple(self._two.solver.estimate([vertex])[0].tolist())
-        of = self._two.graph.kind_of(vertex)
-        if of is space.pose:
-            value = space.group.compose(self._T, value)
-        elif of is space.point:
-            value = space.group.act(self._T, value)
-        return [kind, [float(x) for x in value]]
+        moved = {space.pose: space.group.compose, space.point: space.group.act}.get(self._two.graph.kind_of(vertex))
+        return tuple(moved(self._T, value)) if moved else value
 
-    def _edge(self, edge: list[Any]) -> list[Any]:
-        tag, vertices, measured, root, label, source = edge
-        if label == "anchor" or (source == HAND_MADE and len(vertices) == 1):
-            return self._bridge()
-        if label == "initialpose":  # it was told in the axes of the second
-            measured = [float(x) for x in self._one.space.group.compose(self._T, tuple(measured))]
-        return [tag, [self._vertex[vertex] for vertex in vertices], measured, root, label, source]
+    def _add_edges(self, state: MapSnapshot) -> dict[int, int]:
+        """Add its edges, but for what both sessions were told. Returns the new number of each, by its own."""
+        mine, number = state.graph, dict[int, int]()
+        known = {mine.edge(edge).vertices for edge in mine.edges_of("surveyed").tolist()}
+        for row in range(self._two.graph.edge_count):
+            edge = self._two.graph.edge(row)
+            vertices = tuple(self._vertex[vertex] for vertex in edge.vertices)
+            if edge.label == "surveyed" and vertices in known:  # both sessions were told
+                continue
+            measured, noise = edge.measured, Gaussian(edge.sqrt_information)
+            if edge.label == "anchor" or (edge.source == HAND_MADE and len(vertices) == 1):
+                number[row] = self._add_bridge(mine)
+                continue
+            if edge.label == "initialpose":  # it was told in the axes of the second
+                measured = np.array(self._one.space.group.compose(self._T, tuple(measured.tolist())))
+            number[row] = mine.add_edge(edge.type, vertices, measured, noise, edge.label, edge.source)
+            mine.set_weights(np.array([number[row]]), edge.weight)
+        return number
 
-    def _edit_record(self, one: AppliedEdit, number: Mapping[int, int]) -> list[Any]:
+    def _add_verdicts(self, ledger: Ledger, number: Mapping[int, int]) -> None:
+        theirs, first, rows = self._two.ledger, self._keyframes, np.array(list(number), dtype=np.int64)
+        verdict = theirs.verdict.values[rows]
+        residuals = np.concatenate([np.empty(0), *map(theirs.residual, rows.tolist())])
+        of_rows = theirs.statistic.values[rows], theirs.numbers.values[rows], theirs.threshold.values[rows]
+        ids = ledger.enter(first + theirs.keyframe.values[rows], *of_rows, residuals, verdict != Verdict.NOT_EVALUATED)
+        ledger.verdict.values[ids], ledger.reason.values[ids] = verdict, theirs.reason.values[rows]
+        ledger.finish(ledger.final)
+        ledger.history += [replace(one, edge=number[one.edge], keyframe=first + one.keyframe) for one in theirs.history]
+
+    def _edit(self, one: AppliedEdit, number: Mapping[int, int]) -> AppliedEdit:
         """An edit of the second map, renamed if the first has that name."""
         names = {other.edit.name for other in self._one.edits}
         free = chain([one.edit.name], (f"{one.edit.name}-{k}" for k in count(2)))
@@ -238,7 +239,7 @@ class _Second:
         edges, added = (tuple(number[e] for e in ids if e in number) for ids in (one.edges, one.added))
         arguments = {key: self._argument(key, x, number) for key, x in one.edit.arguments.items()}
         edit = replace(one.edit, name=name, arguments=arguments)
-        return AppliedEdit(edit, self._keyframes + one.keyframe, edges, added).record
+        return AppliedEdit(edit, self._keyframes + one.keyframe, edges, added)
 
     def _displacement(self, one: dict[str, Any]) -> dict[str, Any]:
         """An alarm of the second map, with the keyframe of the merged map at which its segment begins."""
@@ -259,28 +260,28 @@ class _Second:
                 return self._keyframes + value
         return value
 
-    def _bridge(self) -> list[Any]:
-        """A weak edge from the last keyframe of the first map to the first keyframe of the second."""
+    def _add_bridge(self, graph: Graph) -> int:
+        """Add a weak edge from the last keyframe of the first map to the first keyframe of the second."""
         space = self._one.space
         ends = [int(self._one.keyframes.ids[-1]), self._vertex[int(self._two.keyframes.ids[0])]]
-        last = tuple(self._one.trajectory()[-1].tolist())
         begun = space.group.compose(self._T, tuple(self._two.trajectory()[0].tolist()))
-        measured = [float(x) for x in space.group.between(last, begun)]
-        root = Gaussian.from_sigmas(*space.sigmas(JUMP_SIGMA_M, JUMP_SIGMA_RAD)).sqrt_information
-        return [tag_of(space.relative_pose), ends, measured, np.ravel(root).tolist(), "odometry", ""]
+        measured = space.group.between(tuple(self._one.trajectory()[-1].tolist()), begun)
+        noise = Gaussian.from_sigmas(*space.sigmas(JUMP_SIGMA_M, JUMP_SIGMA_RAD))
+        return graph.add_edge(space.relative_pose, ends, measured, noise, "odometry")
 
-    def _landmarks(self, landmarks: Mapping[str, Any]) -> dict[str, Any]:
-        out: dict[str, Any] = {}
-        known = self._one.touched_landmarks(0)
-        number = last_number({*known, *landmarks})
-        for name, fields in landmarks.items():
-            vertex, is_unnamed, is_tentative, sightings, first_ns, last_ns, *features = fields
+    def _add_landmarks(self, known: dict[str, Landmark], edges: Mapping[int, int]) -> None:
+        theirs = self._two.snapshot().landmarks
+        number = last_number({*known, *theirs})
+        for name, mark in theirs.items():
             if name in self._shared:
-                mark = self._one.landmarks[name]
-                sightings += mark.sightings
-                first_ns, last_ns = min(first_ns, mark.first_seen_ns), max(last_ns, mark.last_seen_ns)
-            elif name in known:
+                known[name].take_over(mark)
+                continue
+            if name in known:
                 number += 1
                 name = f"{NAME}{number}"
-            out[name] = [self._vertex[vertex], is_unnamed, is_tentative, sightings, first_ns, last_ns, *features]
-        return out
+            seen = [self._moved(one, edges) for one in mark.seen]
+            known[name] = replace(mark, name=name, vertex=self._vertex[mark.vertex], seen=seen)
+
+    def _moved(self, one: LandmarkEdge, edges: Mapping[int, int]) -> LandmarkEdge:
+        keyframe, vertex = self._keyframes + one.where.keyframe, self._vertex[one.where.vertex]
+        return replace(one, edge=edges[one.edge], where=replace(one.where, keyframe=keyframe, vertex=vertex))

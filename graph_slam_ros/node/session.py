@@ -64,7 +64,7 @@ class Session:
         self._begin()
 
     def _begin(self, start: MapSnapshot | None = None, loaded: Path | None = None) -> None:
-        slam = GraphSlam(self.config, None, run_in_thread, start)
+        slam = GraphSlam(self.config, None, run_in_thread, start and start.copy())
         recorder: RunRecorder | None = None
         if self._folder is not None:
             named = self._folder.with_name(load) if (load := self.config.output.load) else None
@@ -218,7 +218,7 @@ class Session:
         with self._accepting:
             gone, self._recorder, self._is_saved, self.recording_fails = self._recorder, None, False, True
             gone.abandon()
-            given = gone.folder, self.slam.config, _SYNC_S, self.slam
+            given = gone.folder, self.slam.config, _SYNC_S, self.slam.snapshot()
             self._recorder = RunRecorder(*given, force=True, accepted=gone.accepted)
             self.recording_fails = False
 

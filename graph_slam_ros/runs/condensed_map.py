@@ -1,25 +1,14 @@
-"""A condensed map on the disk: what it has besides a graph, what has left it, and the whole path with that.
+"""What has left a map when visits were condensed, in ``condensed.mcap``; and the whole path, with those keyframes.
 
-The record ``condensed`` of a ``growth`` (``map_journal``) has
-
-* ``first``: the number of the first keyframe that was not condensed;
-* ``vertices``, ``edges``: the lasting ids of the first rows, and that of the row after these;
-* ``old``: number, vertex, stamp and ``T_odom_base`` of each keyframe before the first that is in the graph;
-* ``places``: cell, edge, visits, the strikes against its landmarks, by vertex, and ``linearized_at``, of each place;
-* ``left``: how many keyframes, and poses at which something was seen, have left the map;
-* ``accepted``: of each drive, by its first keyframe, how many accepted measurements of each input have left the map;
-* ``begins``: of each drive whose first keyframe has left, that and the number of poses of sightings before it.
-
-What has left is in ``condensed.mcap``, a record ``left`` each time: the number of its first keyframe, how many poses
-had left before, and the rows of ``slam.lifelong.state.record_type`` in base64. ``left_edges`` has the table of the
-edges. A map may know of fewer than are there, if its run was killed: the others do not count.
+It has a record ``left`` each time: the number of its first keyframe, how many poses had left before, and the rows of
+``slam.lifelong.state.record_type`` in base64. ``left_edges`` has the table of the edges. A map may know of fewer than
+are there, if its run was killed: the others do not count.
 """
 
 import base64
 import csv
 import io
-from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import astuple, fields
 from pathlib import Path
 from typing import Any
@@ -27,14 +16,11 @@ from typing import Any
 import numpy as np
 
 from graph_slam_ros.errors import FormatError
-from graph_slam_ros.graph import Graph
 from graph_slam_ros.graph.geometry import Geometry
-from graph_slam_ros.graph.tables import LastingIds
 from graph_slam_ros.runs.journal import read_records
 from graph_slam_ros.slam import GraphSlam
 from graph_slam_ros.slam.bounded_map import Condensation, CondensedEdge
-from graph_slam_ros.slam.lifelong.place import VisitScale, place_of
-from graph_slam_ros.slam.lifelong.state import BoundedState, Left, OldKeyframe, Records, record_type
+from graph_slam_ros.slam.lifelong.state import BoundedState, Left, Records, record_type
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Index
 
@@ -42,70 +28,8 @@ CONDENSED = "condensed"
 """Name of the recording of what has left the map."""
 LEFT = "graph_slam_ros.Left"
 COLUMNS = [field.name for field in fields(CondensedEdge)]
-_IDS = {"vertices": "vertex_ids", "edges": "edge_ids"}
 
 Record = dict[str, Any]
-
-
-def condensed_record(graph: Graph, first: int, state: BoundedState) -> Record:
-    """Return the part of a map besides its graph."""
-    ids = ([*of.early.tolist(), of.later] for of in (graph.vertex_ids, graph.edge_ids))
-    places = [
-        [
-            list(cell),
-            one.edge,
-            one.place.visits,
-            [list(pair) for pair in one.strikes.items()],
-            one.place.linearized_at.numbers.tolist(),
-        ]
-        for cell, several in state.places.items()
-        for one in several
-    ]
-    old = [[one.number, one.vertex, one.stamp_ns, one.T_odom_base] for one in state.old]
-    return {
-        "first": first,
-        **dict(zip(("vertices", "edges"), ids, strict=True)),
-        "old": old,
-        "places": places,
-        "left": [state.keyframes, state.sightings],
-        "scale": astuple(state.scale),
-        "accepted": [[first, dict(of)] for first, of in state.accepted.items()],
-        "begins": list(state.begins.items()),
-    }
-
-
-def read_condensed(graph: Graph, record: Mapping[str, Any]) -> tuple[int, BoundedState]:
-    """Read ``condensed_record`` into a graph that has all of its edges; returns the number of its first keyframe, too.
-
-    Raises
-    ------
-    ValueError
-        The numbers contradict one another.
-    """
-    for name in ("vertices", "edges"):
-        ids = np.array(record[name], dtype=np.int64)
-        count = graph.vertex_count if name == "vertices" else graph.edge_count
-        if not len(ids) or (np.diff(ids) <= 0).any() or ids[0] < 0 or len(ids) - 1 > count:
-            raise ValueError(f"condensed: the ids of its {name} do not ascend, or are more than there are")
-        setattr(graph, _IDS[name], LastingIds(ids[:-1], int(ids[-1])))
-    keyframes, sightings = record["left"]
-    state = BoundedState(keyframes=keyframes, sightings=sightings, scale=VisitScale(*record["scale"]))
-    state.accepted |= {first: Counter(of) for first, of in record["accepted"]}
-    state.begins |= dict(record["begins"])
-    if not 1.0 <= state.scale.factor < np.inf:
-        raise ValueError(f"condensed: the variances of visits count {state.scale.factor} times")
-    for cell, number, visits, strikes, at in record["places"]:
-        edge, where = graph.edge(number), np.array(at, dtype=np.float64)
-        if len(where) != edge.type.measured_size:
-            raise ValueError(f"condensed: place {number} is linearised at {len(where)} numbers")
-        if not np.isfinite(where).all():
-            raise ValueError(f"condensed: place {number} has a landmark that is nowhere")
-        state.places.setdefault(tuple(cell), []).append(place_of(edge, where, visits, dict(strikes)))
-    state.old += [OldKeyframe(number, vertex, stamp, tuple(pose)) for number, vertex, stamp, pose in record["old"]]
-    known = [one.vertex for one in state.old]
-    if known and not 0 <= min(known) <= max(known) < graph.vertex_count:
-        raise ValueError("condensed: an old keyframe is no vertex")
-    return record["first"], state
 
 
 def left_records(done: Condensation) -> Iterator[Record]:

@@ -26,9 +26,9 @@ from graph_slam_ros.formats.files import is_regular, opened, read_bytes, read_te
 from graph_slam_ros.formats.parameters import read_parameters
 from graph_slam_ros.recordings.mcap_records import begin, records
 from graph_slam_ros.runs.condensed_map import CONDENSED, LEFT
-from graph_slam_ros.runs.journal import INGEST, MAP, MEASUREMENT, parts_of, read_ingest
+from graph_slam_ros.runs.journal import INGEST, MEASUREMENT, START, parts_of, read_ingest
 from graph_slam_ros.runs.ledger_file import CHANGES, LEDGER
-from graph_slam_ros.runs.map_journal import GROWTH, grew
+from graph_slam_ros.runs.map_file import MAP, SCHEMA
 from graph_slam_ros.slam import Config
 
 SUMMARY, CONFIG = "run.json", "config.yaml"
@@ -42,9 +42,9 @@ MARK = "graph_slam_ros run"
 """The ``format`` of the ``run.json`` of a run."""
 BEGUN = json.dumps({"format": MARK, "version": __version__, "ended": False}).encode()
 """The ``run.json`` of a run until it is saved."""
-_RECORDED = re.compile(r"(ingest|map|condensed|run)(_\d+)?\.mcap")
+_RECORDED = re.compile(r"(ingest|map|start|condensed|run)(_\d+)?\.mcap")
 _UNFINISHED = re.compile(r"\.[0-9a-f]{8}" + re.escape(NEW))
-_SCHEMAS = {INGEST: MEASUREMENT, MAP: GROWTH, CONDENSED: LEFT}
+_SCHEMAS = {INGEST: MEASUREMENT, "map": SCHEMA, "start": SCHEMA, CONDENSED: LEFT}
 _OF_RECORDINGS = re.compile(r"(\.(mcap|db3|bag|active|zstd|gz))+$")
 _NO_FILE = (errno.ENOENT, errno.ENOTDIR)
 _ENDS = 2**16
@@ -143,7 +143,8 @@ def _holds_something(folder: Path) -> bool:
     if not is_run(folder) or summary_of(folder).get("keyframes"):
         return is_run(folder)
     try:
-        return next(read_ingest(folder, []), None) is not None or grew(folder)
+        has_map = any(os.path.lexists(folder / name) for name in (MAP, START))
+        return has_map or next(read_ingest(folder, []), None) is not None
     except (FormatError, OSError):  # who knows
         return True
 
@@ -194,7 +195,7 @@ def changed_since(folder: Path) -> list[str]:
     """Files that differ from those of ``run.json``: from an interrupted save, exchanged, or edited."""
     out = list(_not_as_saved(folder, "files", lambda file: checksum(read_bytes(file))))
     out += [change for change in _not_as_saved(folder, "recorded", ends_of) if change not in out]
-    if any(now > then for _, then, now in _parts(folder)) or is_incomplete(folder):
+    if _went_on(folder) or is_incomplete(folder):
         out.append("the run went on after its results were saved: graph_slam recover has those of its end")
     return out
 
@@ -205,13 +206,21 @@ def missing(folder: Path) -> list[str]:
     return fewer + list(_not_as_saved(folder, "recorded", ends_of))
 
 
+def _went_on(folder: Path) -> bool:
+    """Return whether more was accepted after a run was saved."""
+    return any(now > then for _, then, now in _parts(folder))
+
+
 def _not_as_saved(folder: Path, kind: str, mark_of: Callable[[Path], str]) -> Iterator[str]:
     """The files whose checksum differs from the summary's, and those that are missing or unreadable."""
     summary = summary_of(folder)
     if not summary and os.path.lexists(folder / SUMMARY):
         yield f"{SUMMARY} is not the summary of a run: whether its files belong together is not known"
     recorded = summary.get(kind)
+    replaced = {MAP} if _went_on(folder) else set[str]()
     for name, mark in sorted(recorded.items()) if isinstance(recorded, dict) else ():
+        if name in replaced:
+            continue
         if name in _RESULTS or name == CONFIG or _RECORDED.fullmatch(name):  # no path out of the folder
             try:
                 if mark_of(folder / name) != mark:
@@ -227,9 +236,9 @@ def recorded_files(folder: Path) -> dict[str, str]:
 
     Somebody may have removed the configuration meanwhile, or put a link there: results are saved all the same.
     """
-    parts = [file for name in (INGEST, MAP, CONDENSED) for file in parts_of(folder, name)]
-    config = [folder / CONFIG] if os.path.lexists(folder / CONFIG) else []
-    return {file.name: ends_of(file) if is_regular(file) else _NOT_A_FILE for file in (*parts, *config)}
+    parts = [file for name in (INGEST, CONDENSED) for file in parts_of(folder, name)]
+    others = [file for name in (START, MAP, CONFIG) if os.path.lexists(file := folder / name)]
+    return {file.name: ends_of(file) if is_regular(file) else _NOT_A_FILE for file in (*parts, *others)}
 
 
 def ends_of(file: Path) -> str:
@@ -245,7 +254,7 @@ def _parts(folder: Path) -> Iterator[tuple[str, int, int]]:
     """The parts of each recording of a saved run: their number then and now."""
     parts = summary_of(folder).get("parts")
     recorded: dict[str, Any] = parts if isinstance(parts, dict) else {}
-    for name in (INGEST, MAP, CONDENSED):
+    for name in (INGEST, CONDENSED):
         if isinstance(then := recorded.get(name), int):
             yield name, then, len(parts_of(folder, name))
 

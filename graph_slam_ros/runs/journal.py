@@ -1,4 +1,4 @@
-"""JSON records in mcap, on disk as they come: the journal of what the pipeline accepted, and the map as it grew.
+"""JSON records in mcap, on disk as they come: the journal of what the pipeline accepted, and what left the map.
 
 One channel per kind of record; the order of the file is that in which they came, and ``sequence`` counts it. Each flush
 writes one chunk, which carries its CRC. What is recorded may be split over several files, ``ingest.mcap``,
@@ -22,12 +22,11 @@ from graph_slam_ros.recordings.mcap_records import LIBRARY, records
 
 _ENCODE = json.JSONEncoder(separators=(",", ":"), check_circular=False, allow_nan=False).encode
 _text = cache(_ENCODE)
-INGEST, MAP = "ingest", "map"
+INGEST = "ingest"
 BEGINS_IN_A_MAP = {"type": "begins_in_a_map"}
-"""The first record of the journal of such a run; its start is in ``map.mcap``."""
+"""The first record of the journal of such a run; its start is in ``start.mcap``."""
+START = "start.mcap"
 MEASUREMENT = "graph_slam_ros.Measurement"
-ANEW = "anew"
-"""Type of the record that ends all before it."""
 _SCHEMA = _ENCODE({"type": "object", "properties": {"type": {"type": "string"}}, "required": ["type"]}).encode()
 
 
@@ -93,7 +92,6 @@ class Parts:
     def __init__(self, folder: Path, name: str, schema: str) -> None:
         self._folder, self._name, self._schema = folder, name, schema
         self._part = 0
-        self._replaces: int | None = None  # the present part takes the place of all but so many before
         self._present: RecordWriter | None = None
         self._ended: list[AppendedFile] = []
 
@@ -108,31 +106,6 @@ class Parts:
         if several:
             self.begin().write(several)
 
-    def begin_anew(self, kept: int = 0) -> None:
-        """Begin a part that takes the place of all parts before, once its first records are on the disk.
-
-        Parameters
-        ----------
-        kept : so many of the first parts stay. Raises OSError as ``end`` does if the present part is one of them
-        """
-        if self._part < kept:
-            self.end()
-        else:
-            for file in self._files():
-                file.abandon()
-            self._part += bool(self._present)
-            self._ended, self._present = [], None
-        self._replaces = kept
-
-    def _replace(self, kept: int) -> None:
-        """Remove the parts between the kept ones and the present one, which is on the disk, and let it follow them."""
-        if self._present is None:
-            return
-        if self._part > kept:
-            between = [self._folder / part_name(self._name, part) for part in range(kept + 1, self._part)]
-            self._present.file.replace(self._folder / part_name(self._name, kept), between)
-        self._part, self._replaces = kept, None
-
     @property
     def unwritten(self) -> int:
         """The number of bytes that are not in files yet."""
@@ -143,8 +116,6 @@ class Parts:
         close_all(self._ended)
         for file in self._files():
             file.flush()
-        if self._replaces is not None:
-            self._replace(self._replaces)
 
     def sync(self) -> None:
         """Sync to disk what was flushed. It may be called from another thread. Raises OSError."""
@@ -155,8 +126,6 @@ class Parts:
     def end(self) -> None:
         """End the present part, and begin the next with the next record. Raises OSError as ``flush`` does."""
         if self._present is not None:
-            if self._replaces is not None:
-                self.flush()
             self._ended.append(self._present.end())
             self._present = None
             self._part += 1
@@ -205,8 +174,8 @@ def read_ingest(folder: Path, losses: list[str]) -> Iterator[dict[str, Any]]:
     for record in read_records(folder, INGEST, losses):
         if record != BEGINS_IN_A_MAP:
             yield record
-        elif not parts_of(folder, MAP):
-            losses.append(f"{part_name(MAP, 0)}: not there, though the run began in a map: what follows is without it")
+        elif not (folder / START).exists():
+            losses.append(f"{START}: not there, though the run began in a map: what follows is without it")
 
 
 def read_measurements(folder: Path, losses: list[str]) -> Iterator[Measurement]:
@@ -222,27 +191,32 @@ def _measurements(records: Iterable[dict[str, Any]], losses: list[str]) -> Itera
             losses.append(loss)
 
 
-def read_rest(folder: Path, processed: int, used_ns: int | None, losses: list[str]) -> list[Measurement]:
+def read_rest(folder: Path, processed: int, used_ns: int | None, losses: list[str]) -> Iterator[Measurement]:
     """The measurements that a map lacks which has processed a given number of records.
 
-    These are the records after them. Added are earlier ones that were not in order yet: newer than the last odometry
-    that was used. Events of another version add to ``losses``.
+    These are the records after them. Before them come earlier ones that were not in order yet: newer than the last
+    odometry that was used. Events of another version add to ``losses``.
     """
+    return _measurements(_rest(folder, processed, used_ns, losses), losses)
+
+
+def _rest(folder: Path, processed: int, used_ns: int | None, losses: list[str]) -> Iterator[dict[str, Any]]:
     waited: list[dict[str, Any]] = []
-    rest: list[dict[str, Any]] = []
     count = 0
     for file, channel, message in _messages(folder, INGEST, losses):
         if channel == BEGINS_IN_A_MAP["type"]:
             continue
         if count >= processed:
-            rest.append(_decoded(file, message))
+            yield from waited
+            waited.clear()
+            yield _decoded(file, message)
         elif channel == "control":
             if _decoded(file, message).get("event") in ("time_jump", "clock_step"):
                 waited.clear()
         elif channel != "initial_pose" and used_ns is not None and message.log_time > used_ns:
             waited.append(_decoded(file, message))
         count += 1
-    return list(_measurements(waited + rest, losses))
+    yield from waited
 
 
 def read_records(folder: Path, name: str, losses: list[str], kind: str = "") -> Iterator[dict[str, Any]]:
@@ -273,8 +247,6 @@ def _messages(folder: Path, name: str, losses: list[str]) -> Iterator[tuple[str,
     for part, file in enumerate(parts_of(folder, name)):
         if file.name != (due := part_name(name, part)):
             losses.append(f"{due}: not there; what came after was not read")
-        elif len(losses) > lost and _begins_anew(file):  # killed before it took the place of those before
-            del losses[lost:]
         if len(losses) > lost:
             if file.name == due:
                 losses.append(f"{due}: not read, with what came after it: it would be out of place")
@@ -292,17 +264,3 @@ def _messages(folder: Path, name: str, losses: list[str]) -> Iterator[tuple[str,
                     return
                 expected += 1
                 yield file.name, known[record.channel_id], record
-
-
-def _begins_anew(file: Path) -> bool:
-    """Return whether a part has all that was in the parts before it: then nothing is lost with these.
-
-    Its first records are one chunk. So the map that follows is there as a whole, too.
-    """
-    known: dict[int, str] = {}
-    for record in records(file, [], follow=False):
-        if isinstance(record, Channel):
-            known[record.id] = record.topic
-        elif isinstance(record, Message) and known.get(record.channel_id) != "map":
-            return known.get(record.channel_id) == ANEW
-    return False

@@ -2,12 +2,14 @@
 
 import contextlib
 import json
+import math
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -29,15 +31,26 @@ from graph_slam_ros.runs.folder import (
     room,
     summary_of,
 )
-from graph_slam_ros.runs.journal import BEGINS_IN_A_MAP, INGEST, MAP, MEASUREMENT, Parts, close_all, part_name, parts_of
-from graph_slam_ros.runs.map_journal import GROWTH, MapGrowth
+from graph_slam_ros.runs.journal import (
+    BEGINS_IN_A_MAP,
+    INGEST,
+    MEASUREMENT,
+    START,
+    Parts,
+    close_all,
+    part_name,
+    parts_of,
+)
+from graph_slam_ros.runs.map_file import MAP, write_map
 from graph_slam_ros.runs.resource_log import ResourceLog
 from graph_slam_ros.runs.tables import counted, fitted_summary, result_texts, summarize
 from graph_slam_ros.slam import Config, Counters, GraphSlam, Measurement, Update
-from graph_slam_ros.slam.bounded_map import Condensation
 from graph_slam_ros.slam.snapshot import MapSnapshot
 
+_TAIL_S = 3.0  # CPU time since the newest map was written, which a restart spends again: until the next
+_BYTES_PER_S = 3e8 / 3600  # of maps, at most: a larger one is written more rarely
 _PATH_GROWTH = 1.1  # the whole path is recorded again when it has grown by a tenth: its total stays linear
+_JUMPED_GROWTH, _JUMP_M = 1.01, 0.5  # or by a hundredth, when a solve has moved the robot so far
 _TOGETHER = 256  # measurements that are written at once: one by one, as they come, each takes several times as long
 
 
@@ -45,7 +58,8 @@ class RunRecorder:
     """Records a run while it goes on, and saves its results.
 
     What was accepted is in the journal once ``flush`` has returned. A full disk loses nothing: what could not be
-    written is written when there is room. One thread accepts measurements (``accept``), and another one processes
+    written is written when there is room. Now and then the whole map is written, in the background; a restart goes on
+    from there with the rest of the journal. One thread accepts measurements (``accept``), and another one processes
     them and makes all other calls. Both may call ``leave``.
 
     Parameters
@@ -61,7 +75,7 @@ class RunRecorder:
         folder: Path | str,
         config: Config,
         sync_s: float = 0.0,
-        start: MapSnapshot | GraphSlam | None = None,
+        start: MapSnapshot | None = None,
         *,
         force: bool = False,
         accepted: int = 0,
@@ -75,15 +89,16 @@ class RunRecorder:
         self.accepted = accepted  # measurements, written or not
         self._syncing: Future[None] | None = None
         self._journal = Parts(self.folder, INGEST, MEASUREMENT)
-        self._map = Parts(self.folder, MAP, GROWTH)
         self._left = Parts(self.folder, CONDENSED, LEFT)
         self._accepted: deque[Measurement] = deque()  # and not written yet
-        self._growth, self._begins_in_a_map = MapGrowth(start, accepted), start is not None
-        self._grown = self._growth.first
+        self._before = accepted
+        self._mapping: Future[None] | None = None
+        self._map_due_s = 0.0
+        self._map_cpu_s = -math.inf if accepted else time.process_time()  # what waits now is in no journal
         self._bag: BagWriter | None = None
         self._bags = 0
         self._ended_bags: list[AppendedFile] = []
-        self._next_path_at = 1.0
+        self._path_recorded = 0  # keyframes
         self._load = ResourceLog()
         self._room = ExitStack()
         self._room.enter_context(room(self.folder, force=force))
@@ -91,7 +106,8 @@ class RunRecorder:
             self._journal.begin()
             self._journal.write([BEGINS_IN_A_MAP] if start is not None else [])
             self._journal.flush()
-            self._carry(config, start)
+            if start is not None:
+                self._begin_in(start, config)
             _put(self.folder, CONFIG, parameters_text(config.as_mapping()))
         except (KeyboardInterrupt, FormatError):
             self.discard()
@@ -100,12 +116,14 @@ class RunRecorder:
             self.abandon()
             raise RunError(f"{self.folder}: {error.strerror}") from None
 
-    def _carry(self, config: Config, start: MapSnapshot | GraphSlam | None) -> None:
-        """Take over what has left the map that the run goes on in."""
-        if isinstance(start, MapSnapshot) and start.bounded is not None and start.folder is not None:
-            for record in carried(start.folder, config.space, start.bounded):
-                self._left.write([record])
-                self._left.flush()
+    def _begin_in(self, start: MapSnapshot, config: Config) -> None:
+        """Write the map that the run goes on in, and take over what has left it."""
+        if start.bounded is not None and start.folder is not None:
+            self._left.write(carried(start.folder, config.space, start.bounded))
+            self._left.flush()
+        if not self.accepted:  # a new drive begins
+            start = replace(start, used_ns=None, source="", drive={})
+        write_map(self.folder / START, replace(start, processed=0, settings={}))
 
     def accept(self, measurement: Measurement) -> None:
         """Add a measurement to the journal. It is kept in memory until ``flush`` or ``flush_in_background``."""
@@ -127,12 +145,12 @@ class RunRecorder:
                     self._syncing = self._sync_if_due()
 
     def _in_background(self, work: Callable[[], None]) -> Future[None]:
-        """Start work in a thread: one for a flush, and one for a sync.
+        """Start work in a thread: one for a flush, one for a sync, and one for a map.
 
         The flush may wait for somebody who waits for the sync.
         """
         with self._starting:
-            self._disk = self._disk or ThreadPoolExecutor(2, "journal")
+            self._disk = self._disk or ThreadPoolExecutor(3, "journal")
             return self._disk.submit(work)
 
     def _end_threads(self) -> None:
@@ -159,10 +177,12 @@ class RunRecorder:
         with self._writing:
             if self._is_ended:
                 return
-            self._fill()
+            self._fill_journal()
             self._journal.flush()
             self._left.flush()
-            self._map.flush()  # last: it is never ahead of what it came of
+            if self._mapping is not None and self._mapping.done():
+                written, self._mapping = self._mapping, None
+                written.result()
             if self._syncing is None or self._syncing.done():
                 synced, self._syncing = self._syncing, self._sync_if_due()
                 if synced is not None:
@@ -172,15 +192,10 @@ class RunRecorder:
         accepted = [self._accepted.popleft() for _ in range(len(self._accepted))]
         self._journal.write([m if isinstance(m, Odometry) else to_record(m) for m in accepted])
 
-    def _fill(self) -> None:
-        self._fill_journal()
-        grown, self._grown = self._grown, []
-        self._map.write(grown)
-
     @property
     def unwritten(self) -> int:
         """The number of bytes of the journal that are not on the disk."""
-        return self._journal.unwritten + self._left.unwritten + self._map.unwritten
+        return self._journal.unwritten + self._left.unwritten
 
     def _sync_if_due(self) -> Future[None] | None:
         """Start to sync in the background, because the disk may be slow."""
@@ -199,31 +214,47 @@ class RunRecorder:
     def _sync(self) -> None:
         self._journal.sync()
         self._left.sync()
-        self._map.sync()
 
     def record(self, slam: GraphSlam, update: Update) -> None:
-        """Append what an update changed: the map, pose and TF, and the path and the landmarks when they have grown."""
+        """Append what an update changed: pose and TF, and the path, the landmarks and the map when that is due."""
         if not update or not slam.keyframes:
             return
         self._load.add(len(slam.keyframes), max(0, self.accepted - slam.processed))
         with self._writing:
             if not self._is_ended:
-                self._record(slam, update.condensed)
+                self._record(slam, update)
 
-    def _record(self, slam: GraphSlam, condensed: Condensation | None) -> None:
-        if condensed is not None:
-            self._left.write(list(left_records(condensed)))
-            self._map.write(self._grown)  # the map that the run began in may not be written yet, and its part stays
-            self._map.begin_anew(kept=int(self._begins_in_a_map))
-            self._grown = []
-        self._grown += self._growth.of(slam, is_anew=condensed is not None)
+    def _record(self, slam: GraphSlam, update: Update) -> None:
+        if update.condensed is not None:
+            self._left.write(list(left_records(update.condensed)))
         stamp = slam.keyframes[-1].stamp_ns
         self._write("/tf", results.TF, stamp, results.map_to_odom(slam, stamp))
         self._write("/tf", results.TF, stamp, results.odom_to_base(slam))
         self._write("/pose", results.POSE, stamp, results.pose(slam))
-        if len(slam.keyframes) >= self._next_path_at:
-            self._next_path_at = len(slam.keyframes) * _PATH_GROWTH
+        growth = _JUMPED_GROWTH if slam.correction.distance_m > _JUMP_M else _PATH_GROWTH
+        if len(slam.keyframes) >= self._path_recorded * growth:
+            self._path_recorded = len(slam.keyframes)
             self._record_map(slam)
+        is_due = time.process_time() >= self._map_cpu_s + _TAIL_S and time.monotonic() >= self._map_due_s
+        if is_due and update.keyframes and self._mapping is None:  # between keyframes odometry would be lost
+            self.flush()  # a map is never ahead of what it came of
+            self._map_cpu_s, state = time.process_time(), self._snapshot(slam)
+            self._mapping = self._in_background(lambda: self._write_map(state))
+
+    def _snapshot(self, slam: GraphSlam) -> MapSnapshot:
+        return replace(slam.snapshot(), processed=max(0, slam.processed - self._before))
+
+    def _write_map(self, state: MapSnapshot) -> None:
+        """Write the whole map; the next one waits until the disk has had time for it."""
+        self._sync()
+        begin_s = time.monotonic()
+        self._map_due_s = begin_s + write_map(self.folder / MAP, state) / _BYTES_PER_S
+
+    def _join_map(self) -> None:
+        """Wait for a map that is being written. If it cannot be, the journal has all of it."""
+        if self._mapping is not None:
+            wait([self._mapping])
+        self._mapping = None
 
     def save(self, slam: GraphSlam, summary: dict[str, Any] | None = None) -> Path:
         """Write all results. Recording may go on, in new parts of ``ingest`` and ``run``. Returns the folder.
@@ -239,6 +270,8 @@ class RunRecorder:
                 if slam.keyframes:
                     self._record_map(slam)
                 self._end_parts()
+                if slam.keyframes:
+                    self._write_map(self._snapshot(slam))
                 parts = self._ended_parts()
             parts |= {"unprocessed": max(0, self.accepted - slam.processed), "load": self._load.as_dict()}
             save_results(self.folder, slam, (summary or {}) | parts, self._refuse_if_ended)
@@ -248,7 +281,7 @@ class RunRecorder:
 
     def _ended_parts(self) -> dict[str, Any]:
         """The parts for the summary: their number, which grows if the run goes on, and their checksums."""
-        parts = {name: len(of) for name in (INGEST, MAP, CONDENSED) if (of := parts_of(self.folder, name))}
+        parts = {name: len(of) for name in (INGEST, CONDENSED) if (of := parts_of(self.folder, name))}
         return {"parts": parts, "recorded": recorded_files(self.folder)}
 
     def _refuse_if_ended(self) -> None:
@@ -305,9 +338,9 @@ class RunRecorder:
 
     def _abandon(self) -> None:
         self._end_threads()
+        self._join_map()
         self._journal.abandon()
         self._left.abandon()
-        self._map.abandon()
         for bag in self._ended_bags:
             bag.abandon()
         if self._bag is not None:
@@ -322,16 +355,16 @@ class RunRecorder:
 
     def _end_parts(self) -> None:
         """End the present parts, and begin the next ones with the next record."""
-        self._fill()
+        self._fill_journal()
         failed = self._syncing.exception() if self._syncing is not None else None
         self._syncing = None
+        self._join_map()
         self._end_threads()
         if self._bag is not None:
             self._ended_bags.append(self._bag.end())
             self._bag, self._bags = None, self._bags + 1
         self._journal.end()
         self._left.end()
-        self._map.end()
         close_all(self._ended_bags)
         if failed is not None:
             raise failed

@@ -19,7 +19,7 @@ from graph_slam_ros.recordings.bag import Bag, BagMessage, open_bag
 from graph_slam_ros.recordings.definitions import recorded_decoder
 from graph_slam_ros.runs.folder import RunError, check_room, is_run, keep_earlier, missing, recording_of, run_config
 from graph_slam_ros.runs.journal import read_measurements
-from graph_slam_ros.runs.map_journal import read_map
+from graph_slam_ros.runs.map_file import read_start
 from graph_slam_ros.runs.outcome import checked, doubts, is_explained, is_undecided, unscaled
 from graph_slam_ros.runs.restore import Stopwatch, config_of, map_of, record_run, stopwatch
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Measurement
@@ -226,7 +226,7 @@ def replay(
     if config.world != own.world:
         raise RunError(f"{source}: world.dimensions is {own.world.dimensions} there")
     losses = missing(source)
-    state = read_map(source, losses, start_only=True)
+    state = read_start(source)
     warmup(dimensions=config.world.dimensions)
     measured = progress(read_measurements(source, losses), 0)
     slam, summary = record_run(

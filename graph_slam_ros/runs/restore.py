@@ -3,10 +3,11 @@
 import os
 import time
 from collections.abc import Callable, Iterable, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from graph_slam_ros.errors import ConfigError
+from graph_slam_ros.errors import ConfigError, FormatError
 from graph_slam_ros.formats.durable import claimed
 from graph_slam_ros.runs.folder import (
     SUMMARY,
@@ -19,8 +20,8 @@ from graph_slam_ros.runs.folder import (
     summary_of,
     was_saved_whole,
 )
-from graph_slam_ros.runs.journal import read_measurements, read_rest
-from graph_slam_ros.runs.map_journal import has_map, read_map, state_of
+from graph_slam_ros.runs.journal import BEGINS_IN_A_MAP, INGEST, START, read_records, read_rest
+from graph_slam_ros.runs.map_file import read_map, read_start
 from graph_slam_ros.runs.recorder import RunRecorder, save_results
 from graph_slam_ros.runs.tables import counters_of, fitted_summary, summarize
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Measurement
@@ -36,7 +37,7 @@ Stopwatch = Callable[[], dict[str, float]]
 
 
 def map_of(folder: Path, losses: list[str], counters: Counters | None = None) -> MapSnapshot:
-    """The map of a run: as recorded, with what its journal has in addition; or by repeating the drive.
+    """The map of a run: the newest that was written, with the rest of its journal; or by repeating the drive.
 
     Parameters
     ----------
@@ -55,11 +56,15 @@ def map_of(folder: Path, losses: list[str], counters: Counters | None = None) ->
         counters.update(counters_of(before))
     except ValueError as error:
         losses.append(f"{folder / SUMMARY}: what it had counted: {error}")
-    state = read_map(folder, losses) if has_map(folder) else None
+    try:
+        state = read_map(folder)
+    except FormatError as error:
+        losses.append(f"{error}: the drive is repeated from its journal")
+        state = None
     state = _repeated(folder, losses, counters) if state is None else _with_rest(folder, state, losses, counters)
     if not state.keyframes:
         raise RunError(f"{folder}: no keyframe, so there is no map")
-    if state.graph.kind_of(state.keyframes[0].vertex) is not space.pose:
+    if state.graph.kind_of(int(state.keyframes.ids[0])) is not space.pose:
         raise RunError(f"{folder}: its map is not in {space.dimensions} dimensions, as its configuration says")
     return state
 
@@ -73,29 +78,38 @@ def config_of(folder: Path, state: MapSnapshot) -> Config:
 
 
 def _repeated(folder: Path, losses: list[str], counters: Counters) -> MapSnapshot:
-    config = run_config(folder).changed(_NOTHING_LEAVES)
-    slam = GraphSlam(config, start=read_map(folder, [], start_only=True))  # its losses are known
-    for measurement in read_measurements(folder, losses):
-        slam.process(measurement)
-    slam.process(Control("end"))
-    counters.raise_to(slam.counters)
-    return state_of(slam, folder)
+    """The map by repeating the drive from its journal, in the map that it began in."""
+    again, start = Counters(), read_start(folder)
+    if start is None and next(read_records(folder, INGEST, []), None) == BEGINS_IN_A_MAP:
+        raise RunError(
+            f"{folder}: it began in a map, and {START}, which has that, is not there, as in runs of earlier releases: "
+            f"graph_slam replay {folder} --out NEW drives it without"
+        )
+    state = _driven(folder, start or MapSnapshot(), losses, again)
+    counters.raise_to(again)
+    return state
 
 
 def _with_rest(folder: Path, state: MapSnapshot, losses: list[str], counters: Counters) -> MapSnapshot:
     """The map with measurements that were accepted and not processed."""
-    if state.processed is None or was_saved_whole(folder):
+    if was_saved_whole(folder):
         return state
+    state.continues = True
+    return _driven(folder, state, losses, counters)
+
+
+def _driven(folder: Path, state: MapSnapshot, losses: list[str], counters: Counters) -> MapSnapshot:
+    """The map with the rest of the journal, if there is more."""
     rest = read_rest(folder, state.processed, state.used_ns, losses)
-    if not rest:
+    first = next(rest, None)
+    if first is None:
         return state
-    state.continues_with = state.source if state.used_ns is not None else ""
     settings = dict(state.settings)
     slam = GraphSlam(config_of(folder, state).changed(_NOTHING_LEAVES), start=state)
-    for measurement in [*rest, Control("end")]:
+    for measurement in chain([first], rest, [Control("end")]):
         slam.process(measurement)
     counters.update(slam.counters)
-    out = state_of(slam, folder)
+    out = slam.snapshot(folder)
     out.settings = settings | out.settings
     return out
 
@@ -277,7 +291,7 @@ def save_copy(slam: GraphSlam, out: Path, folder: Path) -> None:
     if not slam.is_solved:
         raise RunError(f"{out.name}: not written: the map cannot be solved: {slam.failing}")
     try:
-        record_run(out, slam.config, (), [], state_of(slam, folder))
+        record_run(out, slam.config, (), [], slam.snapshot(folder))
     except Exception:
         discard(out)
         raise
@@ -289,7 +303,7 @@ def freeze(folder: Path, out: Path, *, force: bool = False) -> Summary:
     check_room(out, folder, force=force)
     losses: list[str] = []
     slam = restored_and_solved(folder, losses)
-    state = state_of(slam, folder)
+    state = slam.snapshot(folder)
     state.freeze()
     config = config_to_go_on(slam, folder)
     return record_run(out, config, [Control("optimize")], losses, state, took=took, force=force)[1]

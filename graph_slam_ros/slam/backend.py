@@ -216,7 +216,7 @@ class Backend:
     def revise(self, what: str, change: Callable[[], Result | None]) -> Result | None:
         """Change what was solved. After an exception, which is counted, all is as it was, and the result is None."""
         before, handed_over = self._frozen_graph(0, self.solver.settings), self.handed_over
-        factors, rescalings, count = dict(self.noise.factors), len(self.noise.history), len(self.ledger.history)
+        factors, count = dict(self.noise.factors), len(self.ledger.history)
         try:
             return change()
         except Exception as error:
@@ -224,7 +224,7 @@ class Backend:
         vars(self.graph).update(vars(before.graph))
         going_on = {"history": self.ledger.history[:count], "changes": self.ledger.changes + 1}
         vars(self.ledger).update(vars(before.ledger) | going_on)
-        self.noise.go_back(factors, rescalings)
+        self.noise.factors = factors
         fresh = Solver(self.graph, self.solver.settings)
         fresh.start_at(before.values)
         fresh.add(before.vertices, np.arange(handed_over[1]))

@@ -8,7 +8,7 @@ does.
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from graph_slam_ros.slam.frontend.keyframes import Keyframe
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.slam.landmarks.landmark_frontend import LandmarkFrontend
 from graph_slam_ros.slam.lifelong.condenser import CHAIN, Condensed, Condenser, RemovedPose, compact, seen_from
-from graph_slam_ros.slam.lifelong.place import Cell, PlaceEdge
+from graph_slam_ros.slam.lifelong.place import Cell
 from graph_slam_ros.slam.lifelong.state import Left, OldKeyframe, Records, record_type
 from graph_slam_ros.slam.robust.gating import CANDIDATES
 from graph_slam_ros.slam.robust.ledger import INSIDE, Reason, Verdict
@@ -141,12 +141,12 @@ class BoundedMap:
             self._tried = len(keyframes) + _AGAIN
             return None
         self._landmarks.map.withdraw_tentative(self._limit)
-        places, scale = _copies(self.state.places), replace(self.state.scale)
+        before = self.state.copy()
         self._tried = len(keyframes)
         condensed = backend.revise(_SOURCE, self._condensed_visits)
         if condensed is None:
             self._tried += BATCH - 1  # the same would most likely fail at the next keyframe again
-            self.state.places, self.state.scale = places, scale
+            self.state.places, self.state.scale = before.places, before.scale
             return None
         rows, end = condensed
         return self._compacted(rows, Left(self._left(rows), self._sightings(end)), end) if rows else None
@@ -310,13 +310,6 @@ def _length(marks: Sequence[set[int] | None], cells: Sequence[Cell]) -> int:
             return k
         seen |= some
     return len(marks)
-
-
-def _copies(places: dict[Cell, list[PlaceEdge]]) -> dict[Cell, list[PlaceEdge]]:
-    return {
-        cell: [PlaceEdge(one.base, one.place, one.edge, dict(one.strikes)) for one in several]
-        for cell, several in places.items()
-    }
 
 
 def archived(

@@ -34,7 +34,6 @@ class FoundFactors:
     Attributes
     ----------
     corrected : findings that were used, in order
-    history : all corrections of measurements that were there, in order
     """
 
     def __init__(
@@ -49,7 +48,6 @@ class FoundFactors:
         self._config, self._backend, self._frontend, self._counters = config, backend, frontend, counters
         self._origins, self._anonymous = landmarks.map.origins, landmarks.anonymous
         self.corrected: list[Finding] = []
-        self.history: list[Recalibration] = []
         self._is_new = start is None or not start.keyframe_count
         if start is not None:
             frontend.corrections.restore(start.calibration)
@@ -108,7 +106,6 @@ class FoundFactors:
             return None
         for rows, poses in origins:
             self._origins.move(rows, poses)
-        self.history += changes
         self._anonymous.rescale(factors_of(values))
         backend.cancel_search()
         return report

@@ -300,9 +300,10 @@ class GraphSlam(MapView):
 
     def _restore(self, start: MapSnapshot) -> None:
         """Solve a loaded map. The robot's pose in it is not known yet."""
-        if self.graph.kind_of(start.keyframes[0].vertex) is not self.space.pose:
+        if self.graph.kind_of(int(start.keyframes.ids[0])) is not self.space.pose:
             raise GraphSlamError(f"the map is not in {self.space.dimensions} dimensions")
-        self._frontend.restore(*start.path, start.continues_with, start.gyro_bias, start.first_keyframe)
+        path = start.keyframes, start.segments, start.drives, start.sighting_poses
+        self._frontend.restore(*path, start.drive if start.continues else {}, start.gyro_bias)
         self._anchor.restore()
         self._landmarks.restore(start.landmarks)
         report = self.backend.restore(start.vertices, start.values, start.held if self.config.map.localize else (0, 0))

@@ -99,7 +99,7 @@ class MapEditor:
                 self._move(T_new_old, vertex, a)
             case "move_map":
                 anchor = anchors(self._graph, self._ledger)[-1:]
-                vertex = self._graph.edge(anchor[0]).vertices[0] if anchor else self.state.keyframes[0].vertex
+                vertex = self._graph.edge(anchor[0]).vertices[0] if anchor else int(self.state.keyframes.ids[0])
                 self._move(self._pose(a["pose"]), vertex, a)
 
     # -- edges -------------------------------------------------------------------------------------------------------
@@ -205,9 +205,7 @@ class MapEditor:
         del self._marks[name]
         a.seen += [replace(one, edge=copies[one.edge]) for one in seen if one.edge in copies]
         a.stamps |= {one.where.stamp_ns for one in seen}
-        a.note_features(b.sort, b.size, b.sized)
-        a.sightings += b.sightings
-        a.first_seen_ns, a.last_seen_ns = min(a.first_seen_ns, b.first_seen_ns), max(a.last_seen_ns, b.last_seen_ns)
+        a.take_over(b)
         a.is_tentative &= b.is_tentative
 
     def _split(self, name: str, to: str, edges: Sequence[int]) -> None:
@@ -252,7 +250,8 @@ class MapEditor:
 
         Where the first or last of all is not among them, it is the stamp of the keyframe that another was seen from.
         """
-        stamp_of = {one.vertex: one.stamp_ns for one in self.state.keyframes}
+        keyframes = self.state.keyframes
+        stamp_of = dict(zip(keyframes.ids.tolist(), keyframes.stamps_ns.tolist(), strict=True))
         ends = {edge: [stamp_of[end] for end in self._graph.edge(edge).vertices if end in stamp_of] for edge in known}
         stamps = {edge: max(at) for edge, at in ends.items() if at}
         of_some = [stamps[edge] for edge in some if edge in stamps] or [mark.first_seen_ns]
@@ -265,7 +264,7 @@ class MapEditor:
         first, last = self._at(a["from"]), self._at(a["until"])
         if first > last:
             raise GraphSlamError(f"no keyframe from {a['from']} until {a['until']}")
-        vertices = [one.vertex for one in self.state.keyframes[first : last + 1]]
+        vertices = self.state.keyframes.ids[first : last + 1]
         known = standing_edges(self._graph, self._ledger, self._known(a["landmark"]).vertex)
         edges = [edge for edge in known if np.isin(self._graph.edge(edge).vertices, vertices).any()]
         if not edges:
@@ -334,19 +333,19 @@ class MapEditor:
     # -- keyframes by number or stamp --------------------------------------------------------------------------------
 
     def _at(self, place: int | str) -> int:
-        """The index of the keyframe of a number, or of that nearest to a stamp."""
-        first, count = self.state.first_keyframe, len(self.state.keyframes)
+        """The number of a keyframe that is there, or of that nearest to a stamp."""
+        first, end = self.state.first_keyframe, self.state.keyframe_count
         if isinstance(place, int):
             if place < first:
                 raise GraphSlamError(f"keyframe {place}: {_WHY['condensed_in_map']}")
-            if place >= first + count:
-                raise GraphSlamError(f"no keyframe {place}: the map has {first} to {first + count - 1}")
-            return place - first
-        stamps = np.array([one.stamp_ns for one in self.state.keyframes])
+            if place >= end:
+                raise GraphSlamError(f"no keyframe {place}: the map has {first} to {end - 1}")
+            return place
+        stamps = self.state.keyframes.stamps_ns
         if (np.diff(stamps) < 0).any():
             raise GraphSlamError(f"the stamp {place} may be of several drives: name the keyframe by its number")
         seconds, _, fraction = place.partition(".")
         stamp_ns = int(seconds) * 10**9 + int(fraction.ljust(9, "0") or 0)
         if not stamps[0] - _AROUND_NS <= stamp_ns <= stamps[-1] + _AROUND_NS:
             raise GraphSlamError(f"no keyframe at {place} s")
-        return int(np.abs(stamps - stamp_ns).argmin())
+        return first + int(np.abs(stamps - stamp_ns).argmin())

@@ -10,18 +10,18 @@ from graph_slam_ros.config.config import Config
 from graph_slam_ros.graph import Graph
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.measurements.edits import AppliedEdit
+from graph_slam_ros.measurements.types import Value
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.calibration.answers import Finding, Uncorrected
 from graph_slam_ros.slam.calibration.fit import TrialFit
 from graph_slam_ros.slam.calibration.parameters import AUTO
-from graph_slam_ros.slam.calibration.recalibration import Recalibration
 from graph_slam_ros.slam.doubt.kidnap_detector import KidnapDetector
 from graph_slam_ros.slam.doubt.record import Alarm, Slip
 from graph_slam_ros.slam.found_factors import FoundFactors
 from graph_slam_ros.slam.frontend.gyro import GyroState, SavedBias
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
 from graph_slam_ros.slam.frontend.keyframes import Keyframe, SightingPose
-from graph_slam_ros.slam.frontend.noise_factors import Key, Rescaling
+from graph_slam_ros.slam.frontend.noise_factors import Key
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.slam.landmarks.landmark import Landmark
 from graph_slam_ros.slam.landmarks.landmark_frontend import LandmarkFrontend
@@ -29,6 +29,7 @@ from graph_slam_ros.slam.landmarks.renewed_ids import LEAST, RenewedIds, renewed
 from graph_slam_ros.slam.lifelong.state import BoundedState
 from graph_slam_ros.slam.noise_scale import NoiseScale
 from graph_slam_ros.slam.robust.ledger import Ledger
+from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.slam.solution import Correction, Solution
 from graph_slam_ros.slam.trial_fits import TrialFits
 from graph_slam_ros.solver import Report, Solver
@@ -59,6 +60,7 @@ class MapView:
         self._frontend, self._landmarks = frontend, landmarks
         self._kidnaps, self._solution = kidnaps, solution
 
+    settings: dict[str, Value]
     _trials: TrialFits
     _found_factors: FoundFactors
 
@@ -102,15 +104,6 @@ class MapView:
     def bounded(self) -> BoundedState | None:
         """The state of a condensed map that is not in its graph; None where nothing was condensed."""
         return self.backend.bounded if self.first_keyframe else None
-
-    def newer_keyframes(self, first: int) -> list[Keyframe]:
-        """The keyframes from a number on, without those that were condensed."""
-        return self.keyframes.after(first)
-
-    @property
-    def keyframe_count(self) -> int:
-        """The number of keyframes, condensed ones included."""
-        return len(self.keyframes)
 
     @property
     def segments(self) -> list[int]:
@@ -241,11 +234,6 @@ class MapView:
         """The factors by which the configured sigmas of the edges are multiplied, by class, input and part."""
         return self.backend.noise.factors
 
-    @property
-    def noise_changes(self) -> Sequence[Rescaling]:
-        """The changes of the noise of edges, in order."""
-        return self.backend.noise.history
-
     def noise_scale(self) -> list[NoiseScale]:
         """Estimate the noise from the residuals: a factor of the configured sigmas for each class, input and part.
 
@@ -331,20 +319,9 @@ class MapView:
         return self._found_factors.corrected
 
     @property
-    def recalibrations(self) -> Sequence[Recalibration]:
-        """The corrections of measurements that were in the graph, in order."""
-        return self._found_factors.history
-
-    def touched_landmarks(self, first: int) -> dict[str, Landmark | None]:
-        """The landmarks that changed after the ``first`` changes, tentative ones included; None: removed."""
-        landmarks = self._landmarks.map
-        since = max(first - landmarks.touched_before, 0)
-        return {name: landmarks.known.get(name) for name in landmarks.touched[since:]}
-
-    @property
     def landmark_changes(self) -> int:
         """The number of changes of landmarks."""
-        return self._landmarks.map.touched_before + len(self._landmarks.map.touched)
+        return self._landmarks.map.changes
 
     # -- covariances -----------------------------------------------------------------------------------------------
 
@@ -409,11 +386,6 @@ class MapView:
         return self.backend.frozen
 
     @property
-    def frozen_edges(self) -> int:
-        """The number of edges of that map; they come first, and their verdicts do not change."""
-        return self.backend.frozen_edges
-
-    @property
     def held(self) -> tuple[int, int]:
         """The numbers of vertices and edges that are held while ``map.localize`` is true; zeros otherwise."""
         return self.backend.held
@@ -427,6 +399,36 @@ class MapView:
     def datum(self) -> tuple[float, ...]:
         """Latitude, longitude [deg] and height [m] of the map's origin, from the first fix; empty: no fix had them."""
         return self._frontend.datum.datum
+
+    def snapshot(self, folder: Any = None) -> MapSnapshot:
+        """A copy of the map as it is now. What was condensed is in the run folder that is given."""
+        ledger, bounded = self.ledger.copy(), self.bounded
+        ledger.history = list(self.ledger.history)
+        ledger.finish(self.backend.frozen_edges)
+        return MapSnapshot(
+            graph=self.graph.copy(),
+            ledger=ledger,
+            values=self.solver.values,
+            keyframes=self.keyframes.since(self.first_keyframe),
+            segments=list(self.segments),
+            drives=list(self.drives),
+            sighting_poses=self.sighting_poses.since(0),
+            landmarks=self._landmarks.map.copies(),
+            frozen=self.frozen,
+            held=self.held,
+            datum=self.datum,
+            settings=dict(self.settings),
+            displacements=self.displacements,
+            used_ns=self.newest_odometry_ns,
+            source=self.odometry_source,
+            drive=self._frontend.drive,
+            noise_factors=dict(self.noise_factors),
+            edits=list(self.edits),
+            calibration=self.calibration,
+            gyro_bias=self.gyro_bias,
+            bounded=bounded.copy() if bounded else None,
+            folder=folder,
+        )
 
     # -- health ----------------------------------------------------------------------------------------------------
 

@@ -5,8 +5,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from graph_slam_ros.graph import Graph
 from graph_slam_ros.typing import Array, Index
 
@@ -51,19 +49,6 @@ class Recalibration:
             if table.type.name == self.table:
                 return table.measured.values, table.sqrt_information.values
         return self.measured[:0], self.roots[:0]
-
-    def as_record(self) -> list[Any]:
-        """Plain lists of it, for JSON."""
-        return [self.table, self.rows.tolist(), self.measured.tolist(), self.roots.tolist()]
-
-    @classmethod
-    def from_record(cls, record: Sequence[Any]) -> "Recalibration":
-        """Inverse of ``as_record``. Raises ValueError if a number is not finite, or missing."""
-        table, *numbers = record
-        rows, measured, roots = (np.array(one, dtype=float) for one in numbers)
-        if not (len(rows) == len(measured) == len(roots) and np.isfinite(measured).all() and np.isfinite(roots).all()):
-            raise ValueError(f"corrections of {table!r}: not finite, or of different numbers")
-        return cls(str(table), rows.astype(np.int64), measured, roots)
 
 
 Totals = dict[tuple[str, str], float]

@@ -148,6 +148,15 @@ class ObservationThinning:
         self._used_ns.clear()
         self._observed_ns.clear()
 
+    @property
+    def state(self) -> list[dict[str, int]]:
+        """The stamps by input of what was used last, to ``go_on`` with."""
+        return [dict(self._used_ns), dict(self._observed_ns)]
+
+    def go_on(self, state: list[dict[str, int]]) -> None:
+        """Take over what another one has used."""
+        self._used_ns, self._observed_ns = state
+
     def admit(self, m: Observation) -> Observation | None:
         """Return the observation as it is to be used; None if an earlier one has its information."""
         match m:

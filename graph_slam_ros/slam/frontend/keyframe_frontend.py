@@ -1,8 +1,8 @@
 """The front end: odometry becomes keyframes. Each is a vertex, joined to the one before by an odometry edge."""
 
 import math
-from collections.abc import Iterator, Sequence
-from typing import TypeGuard
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, TypeGuard
 
 import numpy as np
 
@@ -114,29 +114,39 @@ class KeyframeFrontend:
 
     def restore(
         self,
-        keyframes: Sequence[Keyframe],
+        keyframes: StampedPoses[Keyframe],
         segments: Sequence[int],
         drives: Sequence[int],
-        sighting_poses: Sequence[SightingPose],
-        continues_with: str,
+        sighting_poses: StampedPoses[SightingPose],
+        drive: Mapping[str, Any],
         gyro_bias: SavedBias | None,
-        first: int = 0,
     ) -> None:
-        """Continue after the keyframes of a map. If an input is given, its odometry continues the drive.
-
-        Parameters
-        ----------
-        first : the number of the first keyframe
-        """
-        self.path.restore(keyframes, segments, drives, first)
+        """Continue after the keyframes of a map, and where ``drive`` was, if that is given."""
+        self.path.restore(keyframes, segments, drives)
         if self.gyro and gyro_bias:
             self.gyro.restore(gyro_bias)
-        if continues_with:
-            newest = keyframes[-1]
-            self.path.continue_drive()
-            self.odometry.continue_drive(newest.stamp_ns, newest.T_odom_base, continues_with)
-        for pose in sighting_poses:
-            self.sighting_poses.append(pose.keyframe, pose.stamp_ns, pose.T_keyframe_base)
+        if drive:
+            self.path.go_on(drive["path"])
+            used = self.odometry.go_on(drive["odometry"])
+            self.T_odom_base = used.T_odom_base
+            self.order.go_on(used.stamp_ns)
+            self._thinning.go_on(drive["thinning"])
+            self._observed_from, self._observed = drive["observed"][0], set(drive["observed"][1])
+            self._edges.due = tuple(drive["noise_due"])
+        self.sighting_poses = sighting_poses
+
+    @property
+    def drive(self) -> dict[str, Any]:
+        """Plain values of what the next odometry continues, beside the map; empty where a new drive begins."""
+        if self.odometry.used is None:
+            return {}
+        return {
+            "path": self.path.state,
+            "odometry": self.odometry.state,
+            "thinning": self._thinning.state,
+            "observed": [self._observed_from, sorted(self._observed)],
+            "noise_due": self._edges.due,
+        }
 
     def forget_before(self, first: int, vertices: Index) -> None:
         """Forget the keyframes before a number. All others have other vertices now, given in order."""

@@ -3,6 +3,7 @@
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -91,32 +92,26 @@ class KeyframeList:
         while len(self._motions) > 2 and self._motions[1].start_ns <= oldest_ns:
             self._motions.popleft()
 
-    def restore(
-        self, keyframes: Sequence[Keyframe], segments: Sequence[int], drives: Sequence[int], first: int = 0
-    ) -> None:
-        """Continue after these keyframes. The motion from the last of them to the present is unknown.
-
-        Parameters
-        ----------
-        first : the number of the first of them: the others were condensed
-        """
-        self.keyframes.first = first
-        for one in keyframes:
-            self.keyframes.append(one.vertex, one.stamp_ns, one.T_odom_base)
+    def restore(self, keyframes: StampedPoses[Keyframe], segments: Sequence[int], drives: Sequence[int]) -> None:
+        """Continue after these keyframes. The motion from the last of them to the present is unknown."""
+        self.keyframes = keyframes
         self.segments += segments
-        self.drives += drives or [0]  # a map of an earlier version does not say
+        self.drives += drives
         self.forget_time()
 
-    def continue_drive(self) -> None:
-        """Continue the drive after ``restore``: odometry knows the motion since the last keyframe."""
-        last = len(self.keyframes) - 1
-        backwards = np.flatnonzero(np.diff(self.keyframes.stamps_ns) < 0)
-        jump = self.keyframes.first + int(backwards[-1]) + 1 if len(backwards) else 0
-        self._epoch = max(self.drives[-1], jump)
+    @property
+    def state(self) -> list[Any]:
+        """Plain values, to ``go_on`` with: what odometry knows since the keyframes that it remembers."""
+        return [self._epoch, self._rest.state, [[one.keyframe, one.state] for one in self._motions]]
+
+    def go_on(self, state: list[Any]) -> None:
+        """Continue the drive after ``restore``."""
+        self._epoch, rest, motions = state
         self._is_new_drive = False
-        self._motions.append(
-            IntegratedOdometry(self._noise, self._space, last, self.keyframes[last].stamp_ns, self._rest)
-        )
+        self._rest.go_on(rest)
+        for keyframe, moved in motions:
+            self._motions.append(IntegratedOdometry(self._noise, self._space, keyframe, 0, self._rest))
+            self._motions[-1].go_on(moved)
 
     def forget_before(self, first: int, vertices: Index) -> None:
         """Forget the keyframes before a number. The others have other vertices now, given in order."""

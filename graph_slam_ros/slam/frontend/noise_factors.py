@@ -5,7 +5,6 @@ odometry edge is the configured one times a factor, plus a variance per radian a
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -109,39 +108,14 @@ def _sight_parts(position: Array) -> dict[str, Array]:
     return {"range": along[:, :, None], "bearing": turned[:, :, 1:]}
 
 
-@dataclass(frozen=True, slots=True)
-class Rescaling:
-    """A change of the noise of existing edges.
-
-    Attributes
-    ----------
-    first, last : range of edge ids; ``last`` is excluded
-    before, after : the factors of each group that changed
-    """
-
-    first: int
-    last: int
-    before: dict[Key, float]
-    after: dict[Key, float]
-
-    def as_record(self) -> list[Any]:
-        """Return plain values."""
-        return [self.first, self.last, factors_record(self.before), factors_record(self.after)]
-
-    @classmethod
-    def from_record(cls, record: Sequence[Any]) -> "Rescaling":
-        """Undo ``as_record``. Raises ValueError if a factor is not positive."""
-        first, last, before, after = record
-        return cls(first, last, read_factors(before), read_factors(after))
-
-    def apply(self, graph: Graph) -> None:
-        """Rescale the edges of its range. A solver that has used them must start over."""
-        for table, rows, label, source in groups(graph, range(self.first, self.last)):
-            before, after = _of(self.before, label, source), _of(self.after, label, source)
-            if after:
-                roots = table.sqrt_information.values
-                measured = table.measured.values[rows]
-                roots[rows] = _rescaled(table.type, label, measured, roots[rows], before, after)
+def _rescale(graph: Graph, edges: range, before: Mapping[Key, float], after: Mapping[Key, float]) -> None:
+    """Rescale edges from some factors to others. A solver that has used them must start over."""
+    for table, rows, label, source in groups(graph, edges):
+        own_before, own_after = _of(before, label, source), _of(after, label, source)
+        if own_after:
+            roots = table.sqrt_information.values
+            measured = table.measured.values[rows]
+            roots[rows] = _rescaled(table.type, label, measured, roots[rows], own_before, own_after)
 
 
 class NoiseScales:
@@ -151,24 +125,24 @@ class NoiseScales:
     ----------
     graph
     factors : by group; a missing factor is 1
-    history : all changes of existing edges, in order
+    due : the number of keyframes of the next estimate, and whether one follows at once
     """
 
     def __init__(self, graph: Graph, factors: Mapping[Key, float] | None = None) -> None:
         self.graph = graph
         self.factors: dict[Key, float] = dict(factors or {})
-        self.history: list[Rescaling] = []
-        self._due, self._once_more = FIRST_DUE, False
+        self.due = FIRST_DUE, False
 
     def is_due(self, keyframes: int) -> bool:
         """Return whether the number of keyframes has doubled since the last estimate, or had at the call before.
 
         An estimate at other noise is another one. To repeat it at once would double the time of that update.
         """
-        has_doubled, once_more = keyframes >= self._due, self._once_more
-        while keyframes >= self._due:
-            self._due *= 2
-        self._once_more = has_doubled
+        due, once_more = self.due
+        has_doubled = keyframes >= due
+        while keyframes >= due:
+            due *= 2
+        self.due = due, has_doubled
         return has_doubled or once_more
 
     def add_edge(
@@ -187,16 +161,9 @@ class NoiseScales:
         before = {key: self.factors.get(key, neutral(key)) for key in factors}
         if all(_is_same(before[key], factor) for key, factor in factors.items()):
             return False
-        rescaling = Rescaling(first_edge, self.graph.edge_count, before, dict(factors))
-        rescaling.apply(self.graph)
+        _rescale(self.graph, range(first_edge, self.graph.edge_count), before, factors)
         self.factors |= factors
-        self.history.append(rescaling)
         return True
-
-    def go_back(self, factors: dict[Key, float], changes: int) -> None:
-        """Return to factors after so many changes, where the graph has returned to its noise then."""
-        self.factors = factors
-        del self.history[changes:]
 
     def neutral(self) -> dict[Key, float]:
         """Return factors of all groups that change nothing."""

@@ -3,6 +3,7 @@
 import math
 from bisect import bisect_right
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -112,6 +113,16 @@ class StationaryDetector:
         self._since_ns = 0
         self.is_on = False
 
+    @property
+    def state(self) -> list[Any]:
+        """Plain values, to ``go_on`` with."""
+        return [self._T_odom_base, self._since_ns, self.is_on]
+
+    def go_on(self, state: list[Any]) -> None:
+        """Take over what another one knew."""
+        there, self._since_ns, self.is_on = state
+        self._T_odom_base = there and tuple(there)
+
     def update(self, step: Step, dt: float) -> bool:
         """Add a step of dt seconds; return whether the robot stands."""
         stands = self._noise.stands(step.T_last_base, dt)
@@ -151,6 +162,21 @@ class IntegratedOdometry:
         self.moving_ns = 0  # whole numbers: a sum of seconds would round
         self._noise, self._space, self._rest = noise, space, rest
         self._moved = [OdometrySample(start_ns, space.identity, np.zeros((space.dof, space.dof)))]
+
+    @property
+    def state(self) -> list[Any]:
+        """Plain values, to ``go_on`` with."""
+        return [self.moving_ns, [[getattr(one, name) for name in one.__slots__] for one in self._moved]]
+
+    def go_on(self, state: list[Any]) -> None:
+        """Take over what another one remembered."""
+        self.moving_ns, moved = state
+        self._moved = [
+            OdometrySample(
+                stamp_ns, tuple(T), np.array(covariance), twist and tuple(twist), stands, turn and tuple(turn), gap
+            )
+            for stamp_ns, T, covariance, twist, stands, turn, gap in moved
+        ]
 
     @property
     def now(self) -> OdometrySample:

@@ -4,11 +4,12 @@ import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from graph_slam_ros.config.pipeline import OdometryConfig
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.measurements.counters import Counters
-from graph_slam_ros.measurements.types import Odometry
+from graph_slam_ros.measurements.types import Odometry, from_record, to_record
 from graph_slam_ros.typing import Numbers
 
 JUMP_SIGMA_M, JUMP_SIGMA_RAD = 10.0, 3.0  # of the motion across a jump: any heading, and anywhere within a hall
@@ -81,11 +82,20 @@ class OdometrySelector:
         self._used = None
         self._last_step = self._space.identity
 
-    def continue_drive(self, stamp_ns: int, T_odom_base: Numbers, source: str) -> None:
-        """Start as if an odometry message of this source had been used last."""
-        self._used = Odometry(stamp_ns, T_odom_base, None, source)
-        if source not in self._order:
-            self._order.append(source)
+    @property
+    def state(self) -> list[Any]:
+        """Plain values, to ``go_on`` with."""
+        return [self._used and to_record(self._used), list(self._order), self._last_step, self._usual_ns]
+
+    def go_on(self, state: list[Any]) -> Odometry:
+        """Continue after the odometry message that another one had used last, and return that."""
+        used, order, last_step, usual_ns = state
+        message = from_record(used)
+        assert isinstance(message, Odometry)
+        self._used, self._order, self._last_step = message, list(order), tuple(last_step)
+        self._past[message.source] = deque([message], maxlen=_REMEMBERED)
+        self._set_usual(usual_ns)
+        return message
 
     def steps(self, m: Odometry) -> list[Step]:
         """Return the steps that a message completes: none if its odometry is not in use."""
@@ -151,10 +161,13 @@ class OdometrySelector:
         dt_ns = m.stamp_ns - self._used.stamp_ns if self._used else 0
         is_gap = dt_ns > self._longest_ns and not broken
         usual_ns = self._usual_ns or dt_ns
-        self._usual_ns = usual_ns + 0.1 * (min(dt_ns, 2.0 * usual_ns) - usual_ns)
-        self._longest_ns = max(_LEAST_GAP_NS, _GAP * self._usual_ns) if self._usual_ns else math.inf
+        self._set_usual(usual_ns + 0.1 * (min(dt_ns, 2.0 * usual_ns) - usual_ns))
         self._used, self._last_step = m, self._space.identity if broken else step
         return Step(m.stamp_ns, step, m.T_odom_base, m.twist_covariance, bool(broken), is_gap)
+
+    def _set_usual(self, usual_ns: float) -> None:
+        self._usual_ns = usual_ns
+        self._longest_ns = max(_LEAST_GAP_NS, _GAP * usual_ns) if usual_ns else math.inf
 
 
 class OdometryJumps:

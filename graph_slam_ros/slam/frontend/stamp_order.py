@@ -101,6 +101,10 @@ class StampOrder:
         self._recent.clear()
         self._newest_odometry_ns = self._released_ns = None
 
+    def go_on(self, used_ns: int) -> None:
+        """Go on after odometry of this stamp."""
+        self._newest_odometry_ns = self._released_ns = used_ns
+
     def _release(self, until_ns: int) -> list[Odometry | Observation]:
         count = next((k for k, entry in enumerate(self._queue) if entry[0] > until_ns), len(self._queue))
         out, self._queue = self._queue[:count], self._queue[count:]

@@ -52,6 +52,12 @@ class StampedPoses(Generic[Instant]):
         """Add a row."""
         Column.extend((self._id, id_, 1), (self._stamp_ns, stamp_ns, 1), (self._pose, pose, 1))
 
+    def extend(self, ids: Index, stamps_ns: Index, poses: Array) -> None:
+        """Add rows; the poses may be end to end."""
+        count = len(ids)
+        poses = poses.reshape(count, self.poses.shape[1])
+        Column.extend((self._id, ids, count), (self._stamp_ns, stamps_ns, count), (self._pose, poses, count))
+
     def without(self, gone: Index) -> "StampedPoses[Instant]":
         """Return the same without some rows, by number."""
         return self._part(np.delete(np.arange(len(self.ids)), gone - self.first), self.first)
@@ -79,7 +85,3 @@ class StampedPoses(Generic[Instant]):
 
     def __iter__(self) -> Iterator[Instant]:
         return (self[k] for k in range(self.first, len(self)))
-
-    def after(self, number: int) -> list[Instant]:
-        """Return the rows from a number on that are there."""
-        return [self[k] for k in range(max(number, self.first), len(self))]

@@ -58,6 +58,13 @@ class Landmark:
             self.sized += sized
             self.size += (size - self.size) * sized / self.sized
 
+    def take_over(self, other: "Landmark") -> None:
+        """Add the counts, stamps, class and size of a landmark that is the same one."""
+        self.note_features(other.sort, other.size, other.sized)
+        self.sightings += other.sightings
+        self.first_seen_ns = min(self.first_seen_ns, other.first_seen_ns)
+        self.last_seen_ns = max(self.last_seen_ns, other.last_seen_ns)
+
     def reset_features(self) -> None:
         """Compute class and size anew from its sightings."""
         self.sort, self.size, self.sized = "", 0.0, 0

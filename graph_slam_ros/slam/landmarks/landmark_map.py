@@ -33,8 +33,7 @@ class Landmarks:
     ----------
     known : those in the graph, by identity
     undetermined : those that are not determined yet
-    touched : the name of a landmark of the graph for each change of it, in order
-    touched_before : changes that are not in ``touched`` any more
+    changes : how often a landmark of the graph has changed
     aliases : the landmark that an identity is of, where somebody has merged two
     origins : when each edge of a sighting was measured, and where from
     begins_new : whether what is not known begins a landmark; not so while the map is held
@@ -59,8 +58,7 @@ class Landmarks:
         for name, known in config.survey.items():
             if known.orientation:
                 self._noise_of_pose(name, known)
-        self.touched: list[str] = []
-        self.touched_before = 0
+        self.changes = 0
         self.aliases: dict[str, str] = {}
         self.origins = SightingEdges(self._space)
 
@@ -108,7 +106,11 @@ class Landmarks:
     def restore(self, known: dict[str, Landmark]) -> None:
         """Continue with these landmarks, whose vertices and edges are in the graph."""
         self.known.update(known)
-        self.touched += known
+        self.changes += len(known)
+
+    def copies(self) -> dict[str, Landmark]:
+        """Return a copy of each landmark of the graph, as ``restore`` takes them."""
+        return {name: replace(mark, seen=list(mark.seen), stamps=set(mark.stamps)) for name, mark in self.known.items()}
 
     def renumber(self, vertices: Index, edges: Index) -> None:
         """Take over new ids of vertices and edges, by old ones; -1: it was removed.
@@ -119,8 +121,6 @@ class Landmarks:
             landmark.vertex = int(vertices[landmark.vertex])
             landmark.seen = [one.renumbered(vertices, edges) for one in landmark.seen if edges[one.edge] >= 0]
             landmark.stamps = {one.where.stamp_ns for one in landmark.seen}
-        self.touched_before += len(self.touched) - len(self.known)
-        self.touched[:] = self.known
         self.origins.renumber(edges)
         for name, candidate in list(self.undetermined.items()):
             left = [(where, s) for where, s in candidate.seen if vertices[where.vertex] >= 0]
@@ -187,7 +187,7 @@ class Landmarks:
             landmark.note_features(s.sort, s.size)
         landmark.sightings += 1
         self._counters.used[topic] += 1
-        self.touched.append(landmark.name)
+        self.changes += 1
         landmark.first_seen_ns = min(landmark.first_seen_ns or where.stamp_ns, where.stamp_ns)
         landmark.last_seen_ns = max(landmark.last_seen_ns, where.stamp_ns)
 
@@ -212,14 +212,14 @@ class Landmarks:
     def prune(self, name: str) -> None:
         """Remove a landmark and its edges from the problem."""
         landmark = self.known.pop(name)
-        self.touched.append(name)
+        self.changes += 1
         self._withdraw_sightings(landmark.seen)
         self._solver.remove(landmark.vertex)
 
     def forget(self, vertices: set[int]) -> None:
         """Forget landmarks that were removed from the problem. A new observation begins a new landmark."""
         for name in [name for name, landmark in self.known.items() if landmark.vertex in vertices]:
-            self.touched.append(name)
+            self.changes += 1
             del self.known[name]
 
     def remove_sightings(self, name: str, seen: Set[tuple[int, str, Sighting]]) -> None:
@@ -238,7 +238,7 @@ class Landmarks:
             landmark.first_seen_ns, landmark.last_seen_ns = min(landmark.stamps), max(landmark.stamps)
             landmark.reset_features()
         self._withdraw_sightings(gone)
-        self.touched.append(name)
+        self.changes += 1
 
     def withdraw_tentative(self, keyframe: int) -> None:
         """Withdraw what was seen of tentative landmarks before a keyframe, and count it."""
@@ -252,7 +252,7 @@ class Landmarks:
     def confirm(self, name: str, *, is_sure: bool) -> None:
         """Mark a landmark as accepted, or as tentative again."""
         self.known[name].is_tentative = not is_sure
-        self.touched.append(name)
+        self.changes += 1
 
     def _withdraw_sightings(self, seen: Sequence[LandmarkEdge]) -> None:
         self._counters.used.subtract(one.topic for one in seen)

@@ -5,7 +5,7 @@ Each of these is stored relative to its base, a vertex that stays, and moves wit
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,6 +66,16 @@ class BoundedState:
     sightings: int = 0
     accepted: dict[int, Counter[str]] = field(default_factory=dict)
     begins: dict[int, int] = field(default_factory=dict)
+
+    def copy(self) -> "BoundedState":
+        """Return another one, which changes by itself."""
+        places = {
+            cell: [PlaceEdge(one.base, one.place, one.edge, dict(one.strikes)) for one in several]
+            for cell, several in self.places.items()
+        }
+        accepted = {first: Counter(of) for first, of in self.accepted.items()}
+        old, begins = list(self.old), dict(self.begins)
+        return replace(self, places=places, scale=replace(self.scale), old=old, accepted=accepted, begins=begins)
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,9 +25,11 @@ from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.cdr import CdrReader
 from graph_slam_ros.graph.place import LABEL as PLACES
 from graph_slam_ros.lie import se3
+from graph_slam_ros.messages import results
+from graph_slam_ros.messages.interfaces import typestore
 from graph_slam_ros.recordings.mcap_records import records
 from graph_slam_ros.runs.folder import COVARIANCES, changed_since, check_run, recording_of, run_config, summary_of
-from graph_slam_ros.runs.journal import MAP, parts_of, read_records
+from graph_slam_ros.runs.journal import parts_of
 from graph_slam_ros.runs.ledger_file import Entry
 from graph_slam_ros.runs.tables import INPUT_COLUMNS
 from graph_slam_ros.runs.trajectory import read_covariances, read_rows
@@ -335,32 +337,23 @@ def _compared(run: Path, other: Path, out: Contents) -> dict[str, Any]:
 # -- the history of the drive: the estimate at some moments, and the jumps of map -> odom ------------------------------
 
 
-def frames(run: Path, saved: SavedGraph, losses: list[str]) -> list[tuple[int, Array, Array]]:
-    """The estimates of a map's journal, some of them where there are many; each with a part of its keyframes.
-
-    Each is how many keyframes there were, positions (m, 3) of some of them, and of landmarks (l, 3), as known then.
-    """
-    several = [np.array(record["values"], dtype=float) for record in read_records(run, MAP, losses, "estimate")]
+def frames(run: Path, saved: SavedGraph, losses: list[str]) -> Iterator[tuple[int, Array, Array]]:
+    """The paths and landmarks that the run has recorded, some of them where there are many; each with a part."""
+    several = list(zip(*(_recorded(run, topic, losses) for topic in ("/path", "/landmarks")), strict=False))
     some = np.unique(np.linspace(0, len(several) - 1, min(len(several), MOST_FRAMES)).astype(int))
-    width = saved.space.dimensions
-    before, known = saved.slam.first_keyframe, saved.slam.keyframes.ids.tolist()
-    first = np.array([saved.graph.vertex(vertex).stored.start for vertex in known])
-    vertices = sorted(saved.landmarks.values())[:MOST_LANDMARKS]
-    marks = np.array([saved.graph.vertex(vertex).stored.start for vertex in vertices], dtype=int)
-    found = []
+    count = {stamp_ns: k for k, stamp_ns in enumerate(saved.whole_path.stamps_ns.tolist(), start=1)}
+    decode: Any = typestore().deserialize_cdr
+    for path, landmarks in (several[k] for k in some.tolist()):
+        newest_ns, poses = CdrReader(path).stamp_ns(), decode(path, results.PATH).poses
+        at = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), MOST_POINTS)).astype(int)).tolist()
+        markers = [one.pose.position for one in decode(landmarks, results.LANDMARKS).markers if one.ns == "landmarks"]
+        if newest_ns in count:
+            points = [poses[k].pose.position for k in at]
+            yield count[newest_ns], _positions(points), _positions(markers[:MOST_LANDMARKS])
 
-    def positions(values: Array, at: Array) -> Array:
-        out = np.zeros((len(at), 3))
-        out[:, :width] = values[at[:, None] + np.arange(width)]
-        return out
 
-    for values in (several[k] for k in some.tolist()):
-        count = int(np.searchsorted(first + width, len(values), side="right"))
-        if count:
-            at = first[np.unique(np.linspace(0, count - 1, min(count, MOST_POINTS)).astype(int))]
-            places = positions(values, at), positions(values, marks[marks + width <= len(values)])
-            found.append((before + count, *places))
-    return found
+def _positions(points: Sequence[Any]) -> Array:
+    return np.array([(one.x, one.y, one.z) for one in points], dtype=float).reshape(-1, 3)
 
 
 def corrections(run: Path, stamps_s: Array, odometry: Array, losses: list[str]) -> tuple[Array, Array, Array]:
@@ -415,13 +408,20 @@ def jumps(
 
 
 def _published(run: Path, losses: list[str]) -> Iterator[tuple[int, tuple[float, ...]]]:
+    """Stamp and pose of each message of ``/pose``."""
+    for data in _recorded(run, "/pose", losses):
+        with suppress(struct.error):  # shorter than a pose: as if it had not come
+            reader = CdrReader(data)
+            stamp_ns, _ = reader.stamp_ns(), reader.text()
+            yield stamp_ns, reader.numbers("d", 7)
+
+
+def _recorded(run: Path, topic: str, losses: list[str]) -> Iterator[bytes]:
+    """The messages of a topic."""
     for file in parts_of(run, "run"):
-        of_pose = -1
+        of_topic = -1
         for record in records(file, losses, follow=False):
-            if isinstance(record, Channel) and record.topic == "/pose":
-                of_pose = record.id
-            elif isinstance(record, Message) and record.channel_id == of_pose:
-                with suppress(struct.error):  # shorter than a pose: as if it had not come
-                    reader = CdrReader(record.data)
-                    stamp_ns, _ = reader.stamp_ns(), reader.text()
-                    yield stamp_ns, reader.numbers("d", 7)
+            if isinstance(record, Channel) and record.topic == topic:
+                of_topic = record.id
+            elif isinstance(record, Message) and record.channel_id == of_topic:
+                yield record.data

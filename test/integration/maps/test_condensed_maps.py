@@ -20,7 +20,7 @@ from graph_slam_ros.measurements.edits import edit_of
 from graph_slam_ros.runs import outcome
 from graph_slam_ros.runs.folder import run_config, summary_of
 from graph_slam_ros.runs.journal import read_measurements
-from graph_slam_ros.runs.map_journal import read_map
+from graph_slam_ros.runs.map_file import read_map, read_start
 from graph_slam_ros.runs.restore import freeze, record_run, recover
 from graph_slam_ros.runs.trajectory import read_tum
 from graph_slam_ros.slam import Sightings
@@ -74,7 +74,7 @@ def test_the_verdict_of_its_report_says_how_much_is_condensed(run, work):
     assert "500 keyframes and" in made.data["sentences"][1]
     assert f"{believed - in_map} more were believed, and are condensed" in made.data["sentences"][2]
     assert made.data["map"]["keyframes"] == KEYFRAMES
-    assert all(run[1].first_keyframe < frame["keyframes"] <= KEYFRAMES for frame in made.data["drive"]["frames"])
+    assert all(0 < frame["keyframes"] <= KEYFRAMES for frame in made.data["drive"]["frames"])
 
 
 def test_an_edge_of_the_window_is_taken_out_and_the_path_stays_whole(run, saved, tmp_path):
@@ -101,7 +101,7 @@ def test_an_edge_of_the_window_is_taken_out_and_the_path_stays_whole(run, saved,
     assert len(positions(tmp_path / "edited")) == KEYFRAMES
     moved = np.linalg.norm(positions(tmp_path / "edited") - positions(folder), axis=1)
     assert 0.0 < moved.max() < 1.0
-    start = read_map(tmp_path / "edited", [], start_only=True)
+    start = read_start(tmp_path / "edited")
     record_run(tmp_path / "again", after.config, read_measurements(tmp_path / "edited", []), [], start)
     assert (tmp_path / "again" / "path.tum").read_bytes() == (tmp_path / "edited" / "path.tum").read_bytes()
 
@@ -193,7 +193,7 @@ def test_a_drive_in_a_frozen_map_is_condensed_and_the_map_stays(tmp_path, name, 
     freeze(drive(name), tmp_path / "site")
     before = SavedGraph(tmp_path / "site", [])
     settings, measured = bounded(map_localize=localize), read_measurements(drive("b"), [])
-    slam, _ = record_run(tmp_path / "on", settings, measured, [], read_map(tmp_path / "site", []))
+    slam, _ = record_run(tmp_path / "on", settings, measured, [], read_map(tmp_path / "site"))
     assert slam.first_keyframe > FIRST + 50
     true = np.array([pose[:2] for pose in hall(SEED, BOTH).poses[FIRST:BOTH]])
     assert rms(positions(tmp_path / "on")[FIRST:], true) < 0.1

@@ -15,7 +15,7 @@ from graph_slam_ros.maps.alignment import laid_on
 from graph_slam_ros.messages.interfaces import typestore
 from graph_slam_ros.recordings.bag import open_bag
 from graph_slam_ros.runs.folder import run_config
-from graph_slam_ros.runs.map_journal import read_map
+from graph_slam_ros.runs.map_file import read_map
 from graph_slam_ros.runs.recorder import RunRecorder
 from graph_slam_ros.runs.restore import map_of, restored
 from graph_slam_ros.slam import Config, Control, GraphSlam, Sightings
@@ -288,7 +288,7 @@ def test_merge_and_diff_refuse_in_one_line(made, tmp_path, capsys):
 
 def assert_untouched(slam, source):
     """Not a bit of a frozen map has changed, neither value nor verdict."""
-    state = read_map(source, [])
+    state = read_map(source)
     count, edges = len(state.values), state.ledger.final
     assert state.frozen == state.graph.vertex_count > 50
     assert edges == state.graph.edge_count
@@ -336,7 +336,7 @@ def test_new_landmarks_are_added_to_a_frozen_map(tmp_path):
 def test_a_run_in_a_frozen_map_that_was_cut_off_is_taken_up_with_it_frozen(made, tmp_path):
     frozen, world = made("frozen"), drive_past(5)
     drive(tmp_path / "run", run_config(frozen), world[: len(world) // 2], map_of(frozen, []))
-    start = read_map(tmp_path / "run", [])
+    start = map_of(tmp_path / "run", [])
     assert start.frozen < start.graph.vertex_count
     slam = ended(tmp_path / "more", world[len(world) // 2 :], source=tmp_path / "run")
     assert_untouched(slam, frozen)

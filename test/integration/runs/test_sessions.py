@@ -13,10 +13,10 @@ from graph_slam_ros.maps.merge import merge
 from graph_slam_ros.measurements.types import Fix, Odometry
 from graph_slam_ros.node.session import Session
 from graph_slam_ros.runs.folder import RunError, changed_since, is_cut_off, is_run, run_config
-from graph_slam_ros.runs.map_journal import read_map
+from graph_slam_ros.runs.map_file import read_map
 from graph_slam_ros.runs.recorder import RunRecorder
 from graph_slam_ros.runs.replay import replay
-from graph_slam_ros.runs.restore import complete, recover
+from graph_slam_ros.runs.restore import complete, map_of, recover
 from graph_slam_ros.slam import Config, Control, Counters
 from graph_slam_ros.tools.simulation import measurements, simulate, write_bag
 
@@ -66,7 +66,7 @@ def test_what_was_set_on_the_way_is_in_effect_in_what_is_made_of_the_map(tmp_pat
     one.ingest([*WORLD[:50], Control("set", (("robust.gate", 0.5),)), *WORLD[50:90]])
     one.abandon()
     assert run_config(tmp_path / "run").robust.gate != 0.5
-    assert read_map(tmp_path / "run", []).settings == {"robust.gate": 0.5}
+    assert map_of(tmp_path / "run", []).settings == {"robust.gate": 0.5}
     recover(tmp_path / "run", tmp_path / "out")
     assert run_config(tmp_path / "out").robust.gate == 0.5
 
@@ -87,7 +87,7 @@ def test_a_folder_that_is_being_recorded_into_is_left_alone_by_everybody_else(tm
     assert sorted(path.name for path in tmp_path.rglob("*")) == before
     one.ingest(WORLD[60:90])
     one.finish()
-    assert len(read_map(tmp_path / "run", []).keyframes) == len(one.slam.keyframes)
+    assert len(read_map(tmp_path / "run").keyframes) == len(one.slam.keyframes)
     session(tmp_path / "run").finish()
     assert is_run(tmp_path / "run-1")
 
@@ -126,18 +126,18 @@ def in_a_map_once(tmp_path_factory):
 def test_where_the_map_that_a_run_began_in_or_the_last_part_of_a_recording_is_gone_it_is_told(in_a_map_once, tmp_path):
     assert replay(in_a_map_once, tmp_path / "again").losses == []
     without = Path(shutil.copytree(in_a_map_once, tmp_path / "without"))
-    for file in without.glob("map*.mcap"):
-        file.unlink()
+    for name in ("start.mcap", "map.mcap"):
+        (without / name).unlink()
     told = replay(without, tmp_path / "replayed").losses
-    assert "map.mcap: not there, though the run began in a map: what follows is without it" in told
-    assert recover(without, tmp_path / "recovered")["losses"]
-    for name in ("ingest", "map"):
-        run = Path(shutil.copytree(in_a_map_once, tmp_path / name))
-        parts = sorted(run.glob(f"{name}*.mcap"))
-        assert len(parts) > 1
-        parts[-1].unlink()
-        losses = recover(run, tmp_path / f"{name}_out")["losses"]
-        assert f"{name}: {len(parts)} parts when it was saved, {len(parts) - 1} now" in losses
+    assert "start.mcap: not there, though the run began in a map: what follows is without it" in told
+    with pytest.raises(RunError, match=r"it began in a map, and start\.mcap, .* graph_slam replay"):
+        recover(without, tmp_path / "recovered")
+    run = Path(shutil.copytree(in_a_map_once, tmp_path / "fewer"))
+    parts = sorted(run.glob("ingest*.mcap"))
+    assert len(parts) > 1
+    parts[-1].unlink()
+    losses = recover(run, tmp_path / "of_fewer")["losses"]
+    assert f"ingest: {len(parts)} parts when it was saved, {len(parts) - 1} now" in losses
 
 
 def test_a_summary_that_tells_nonsense_hurts_nobody_and_of_what_was_refused_it_is_a_loss(in_a_map_once, tmp_path):

@@ -14,7 +14,7 @@ from graph_slam_ros.maps.diff import diff
 from graph_slam_ros.runs.condensed_map import read_left, read_left_edges, removed_path
 from graph_slam_ros.runs.folder import changed_since
 from graph_slam_ros.runs.journal import read_measurements
-from graph_slam_ros.runs.map_journal import read_map
+from graph_slam_ros.runs.map_file import read_map, read_start
 from graph_slam_ros.runs.outcome import text
 from graph_slam_ros.runs.restore import record_run
 from graph_slam_ros.runs.tables import summarize
@@ -112,20 +112,17 @@ def test_the_run_folder_has_the_whole_path(recorded):
 
 def test_a_map_that_is_taken_up_again_goes_on_condensing(recorded, tmp_path):
     folder, slam, _ = recorded
-    losses = []
-    start = read_map(folder, losses)
-    start.continues_with = "odom"
+    start = read_map(folder)
+    start.continues = True
     longer = list(measurements(hall(SEED, MORE)))
     at_ns = slam.keyframes[-1].stamp_ns
     rest = [m for m in longer if m.stamp_ns > at_ns]
-    gone_on, summary = record_run(tmp_path / "more", bounded(), [*rest, Control("end")], losses, start)
-    assert losses == []
+    gone_on, summary = record_run(tmp_path / "more", bounded(), [*rest, Control("end")], [], start)
     assert gone_on.first_keyframe > slam.first_keyframe
     assert len(read_tum(tmp_path / "more" / "path.tum").stamps_s) == summary["keyframes"] > MORE - 50
-    again = read_map(tmp_path / "more", losses, start_only=True)
+    again = read_start(tmp_path / "more")
     assert again is not None and again.first_keyframe == slam.first_keyframe
-    assert read_map(tmp_path / "more", losses).first_keyframe == gone_on.first_keyframe
-    assert losses == []
+    assert read_map(tmp_path / "more").first_keyframe == gone_on.first_keyframe
 
 
 def test_with_closures_all_is_kept_and_the_end_says_why():
@@ -138,7 +135,7 @@ def test_with_closures_all_is_kept_and_the_end_says_why():
 
 def test_a_condensed_map_goes_on_with_closures_and_one_to_a_keyframe_that_has_left_is_refused_by_name(recorded):
     folder, slam, _ = recorded
-    more, covariance = GraphSlam(bounded(**LOOPS), start=read_map(folder, [])), tuple((0.01 * np.eye(3)).ravel())
+    more, covariance = GraphSlam(bounded(**LOOPS), start=read_map(folder)), tuple((0.01 * np.eye(3)).ravel())
     drive = [m for m in measurements(hall(SEED, 600)) if m.stamp_ns > slam.keyframes[-1].stamp_ns]
     at_ns, old_ns, new_ns = drive[-1].stamp_ns, slam.bounded.old[5].stamp_ns, drive[40].stamp_ns
     loops = [Closure(at_ns, one_ns, "loops", (1.0, 0.0, 0.0), covariance) for one_ns in (old_ns, new_ns)]
@@ -270,12 +267,10 @@ def test_the_map_is_small_and_each_landmark_is_there_once(world, without_names):
 @SOAKED
 def test_a_map_without_names_that_is_taken_up_again_goes_on_condensing(world, without_names, tmp_path):
     slam, folder = without_names
-    losses = []
-    start = read_map(folder, losses)
-    start.continues_with = "odom"
+    start = read_map(folder)
+    start.continues = True
     rest = drive(world, FIRST, FIRST + LATER)
-    more, _ = record_run(tmp_path / "more", unnamed(), [*rest, Control("end")], losses, start)
-    assert losses == []
+    more, _ = record_run(tmp_path / "more", unnamed(), [*rest, Control("end")], [], start)
     assert more.first_keyframe > slam.first_keyframe + 200
     assert_each_landmark_is_there_once(more, world, least=38)
 

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from driven import without_names
 
-from graph_slam_ros.runs.map_journal import state_of
 from graph_slam_ros.slam import Config, Control, GraphSlam
 from graph_slam_ros.slam.robust.ledger import Verdict
 from graph_slam_ros.tools.simulation import measurements, simulate
@@ -33,7 +32,7 @@ def test_while_the_map_is_held_it_stays_to_the_bit_the_robot_is_located_in_it_an
     assert seen.chi2 < 1.2 * seen.residuals
     assert held.landmark_covariances()[0].max() == 0.0
     assert driven(GraphSlam(), accepted).trajectory().tobytes() == held.trajectory().tobytes()
-    state = state_of(held)
+    state = held.snapshot()
     restored = GraphSlam(Config().changed(state.settings), start=state)
     assert restored.config.map.localize
     assert len(restored.solver.held) == len(restored.solver.vertices)

@@ -1,7 +1,6 @@
 """Landmarks without a name, in a simulated park: found, merged, parted again, given up."""
 
 import functools
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -10,11 +9,9 @@ from reliability import times
 
 from graph_slam_ros.graph import R2
 from graph_slam_ros.lie import se2
-from graph_slam_ros.runs.journal import RecordWriter
-from graph_slam_ros.runs.map_journal import MapGrowth, extend, read_map, state_of
+from graph_slam_ros.runs.map_file import read_map, write_map
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
 from graph_slam_ros.slam.doubt.record import Slip
-from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.tools.simulation import Fault, faulty_recording, measurements
 from graph_slam_ros.tools.simulation.recording import VelocityNoise, drive
 from graph_slam_ros.tools.simulation.sensing import RangeBearing
@@ -240,10 +237,8 @@ def test_landmarks_near_one_another_are_told_apart_by_their_class_and_a_map_has_
     marks = slam.landmarks.values()
     assert sorted(mark.sort for mark in marks) == ["pole"] * 8 + ["tree"] * 8
     assert all(mark.size == pytest.approx({"tree": 0.5, "pole": 0.15}[mark.sort]) for mark in marks)
-    writer = RecordWriter(tmp_path / "map.mcap")
-    writer.write([{"type": "map", "version": 1}, MapGrowth().since(state_of(slam))])
-    writer.close()
-    start = read_map(tmp_path, [])
+    write_map(tmp_path / "map.mcap", slam.snapshot())
+    start = read_map(tmp_path)
     assert [(m.sort, m.size, m.sized) for m in start.landmarks.values()] == [(m.sort, m.size, m.sized) for m in marks]
     again = seen_by(GraphSlam(slam.config, start=start), has_class=True)
     seen = {name: [one.sighting.sort for one in mark.seen] for name, mark in again.landmarks.items()}
@@ -320,16 +315,13 @@ def too_long(circle):
 
 
 @pytest.fixture(scope="module")
-def corrected(circle):
-    """The pipeline after the drive, and its map as its records have it."""
-    slam, growth, state = GraphSlam(Config.from_mapping(FACTORS)), MapGrowth(), MapSnapshot()
-    for k, m in enumerate(too_long(circle)):
+def corrected(circle, tmp_path_factory):
+    """The pipeline after the drive, and its map as it is read back."""
+    slam, folder = GraphSlam(Config.from_mapping(FACTORS)), tmp_path_factory.mktemp("corrected")
+    for m in too_long(circle):
         slam.process(m)
-        if k % 500 == 0 or m == Control("optimize"):
-            for record in growth.of(slam):
-                if record["type"] == "growth":
-                    extend(state, json.loads(json.dumps(record)))
-    return slam, state
+    write_map(folder / "map.mcap", slam.snapshot())
+    return slam, read_map(folder)
 
 
 def test_the_factor_that_the_association_finds_corrects_the_graph(circle, corrected):
@@ -344,7 +336,7 @@ def test_the_factor_that_the_association_finds_corrects_the_graph(circle, correc
 
 def test_a_map_has_the_corrected_measurements_and_goes_on_with_its_factors_whatever_is_configured(corrected):
     slam, state = corrected
-    assert slam.recalibrations
+    assert slam.corrected
     assert state.calibration == slam.calibration
     for mine, read in zip(slam.graph.tables.values(), state.graph.tables.values(), strict=True):
         np.testing.assert_array_equal(read.measured.values, mine.measured.values)

@@ -1,0 +1,415 @@
+"""A map on the disk, as a whole: ``map.mcap``, the newest of a run, and ``start.mcap``, that which the run began in.
+
+Each is an mcap file that is replaced as a whole. Its channels are
+
+* ``map``, one message in JSON: the version of the format, and all that is no column of numbers;
+* ``landmarks``, a message in JSON for each: its fields, and those of its sightings that do not tell which it is;
+* columns of numbers, end to end, little endian, ``<i8`` or ``<f8``: of vertices (``kind``, ``initial``, ``values``,
+  lasting ``vertex_ids``), of keyframes and of poses at which something was seen, of edges by type
+  (``EDGE_SE2/measured``; lasting ``edge_ids``), of verdicts (``ledger/statistic``), of their changes.
+"""
+
+import io
+import json
+import math
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import astuple, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.records import Channel, Message
+from mcap.writer import CompressionType, Writer
+from numpy.typing import NDArray
+
+from graph_slam_ros.edge_tags import edge_of, tag_of
+from graph_slam_ros.errors import FormatError, GraphSlamError
+from graph_slam_ros.formats.durable import write_whole
+from graph_slam_ros.graph import Gaussian, Graph
+from graph_slam_ros.graph.tables import LastingIds
+from graph_slam_ros.graph.vertices import GROUPS, R1, R2, R3, SE2, SE3, VertexKind
+from graph_slam_ros.measurements.edits import applied_edit
+from graph_slam_ros.measurements.types import Sighting, sighting_record
+from graph_slam_ros.recordings.mcap_records import LIBRARY, records
+from graph_slam_ros.runs.journal import START
+from graph_slam_ros.slam.calibration.recalibration import read_totals, totals_record
+from graph_slam_ros.slam.frontend.gyro import SavedBias
+from graph_slam_ros.slam.frontend.keyframes import Keyframe, SightingPose
+from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
+from graph_slam_ros.slam.frontend.noise_factors import factors_record, read_factors
+from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
+from graph_slam_ros.slam.landmarks.landmark import Landmark, LandmarkEdge
+from graph_slam_ros.slam.lifelong.place import VisitScale, place_of
+from graph_slam_ros.slam.lifelong.state import BoundedState, OldKeyframe
+from graph_slam_ros.slam.robust.ledger import Ledger, Reason, Verdict, VerdictChange
+from graph_slam_ros.slam.snapshot import MapSnapshot
+from graph_slam_ros.typing import Index
+
+MAP = "map.mcap"
+SCHEMA = "graph_slam_ros.Map"
+VERSION = 4
+_KINDS = {kind.name: kind for kind in (SE2, SE3, R1, R2, R3)}
+_OF_EDGES = ("id", "vertices", "measured", "sqrt_information", "label", "source", "weight")
+_OF_VERDICTS = ("keyframe", "statistic", "threshold", "numbers", "verdict", "reason")
+_OF_CHANGES = tuple(field.name for field in fields(VerdictChange))
+_OF_LANDMARKS = tuple(field.name for field in fields(Landmark) if field.name not in ("seen", "stamps"))
+
+Told = dict[str, Any]
+Columns = dict[str, NDArray[Any]]
+
+
+def write_map(file: Path, state: MapSnapshot) -> int:
+    """Write a map, completely or not at all. Returns the number of bytes. Raises OSError."""
+    data = _map_bytes(state)
+    write_whole(file, data)
+    return len(data)
+
+
+def read_map(folder: Path) -> MapSnapshot | None:
+    """The newest map of a run folder; None if there is none.
+
+    Raises
+    ------
+    FormatError
+        It is of another version, damaged, or no map.
+    """
+    return _read(folder / MAP)
+
+
+def read_start(folder: Path) -> MapSnapshot | None:
+    """The map that a run began in; None if it began in none. Raises FormatError as ``read_map`` does."""
+    state = _read(folder / START)
+    if state is not None:
+        state.continues = True
+    return state
+
+
+def _read(file: Path) -> MapSnapshot | None:
+    name, losses = f"{file.parent.name}/{file.name}", list[str]()
+    try:
+        parts = _parts(file, losses)
+        if parts is None:
+            return None
+        told = json.loads(parts.pop("map")[0])
+        if told["version"] != VERSION:
+            raise FormatError(f"its version is {told['version']}; this program knows version {VERSION}")
+        marks = list(map(json.loads, parts.pop("landmarks", [])))
+        state = _state(told, marks, {column: numbers for column, (numbers,) in parts.items()})
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, GraphSlamError) as error:
+        raise FormatError(f"{name}: {losses[0] if losses else f'no map: {error}'}") from None
+    if fault := losses[0] if losses else _fault_of(state):
+        raise FormatError(f"{name}: {fault}")
+    state.folder = file.parent
+    return state
+
+
+# -- the file ---------------------------------------------------------------------------------------------------------
+
+
+def _map_bytes(state: MapSnapshot) -> bytes:
+    out = io.BytesIO()
+    writer = Writer(out, compression=CompressionType.ZSTD)
+    writer.start(profile="", library=LIBRARY)
+    schema = writer.register_schema(SCHEMA, "", b"")
+    stamp_ns = int(state.keyframes.stamps_ns[-1])
+
+    def add(name: str, encoding: str, several: Iterator[bytes]) -> None:
+        channel = writer.register_channel(name, encoding, schema)
+        for sequence, data in enumerate(several):
+            writer.add_message(channel, stamp_ns, data, stamp_ns, sequence)
+
+    add("map", "json", iter([_as_json(_told(state))]))
+    add("landmarks", "json", (_as_json(_landmark(mark)) for mark in state.landmarks.values()))
+    for name, numbers in _columns(state):
+        encoding = "<f8" if numbers.dtype.kind == "f" else "<i8"
+        add(name, encoding, iter([np.ascontiguousarray(numbers, dtype=encoding).tobytes()]))
+    writer.finish()  # type: ignore[no-untyped-call]
+    return out.getvalue()
+
+
+def _as_json(content: Any) -> bytes:
+    return json.dumps(content, separators=(",", ":"), allow_nan=False, default=lambda one: one.tolist()).encode()
+
+
+def _parts(file: Path, losses: list[str]) -> dict[str, list[Any]] | None:
+    """The messages of each channel, those of numbers as arrays; None where there is no file."""
+    encodings, parts = dict[int, tuple[str, str]](), dict[str, list[Any]]()
+    try:
+        for record in records(file, losses, follow=False):
+            if isinstance(record, Channel):
+                encodings[record.id] = record.topic, record.message_encoding
+            elif isinstance(record, Message):
+                name, encoding = encodings[record.channel_id]
+                data = record.data if encoding == "json" else np.frombuffer(record.data, dtype=encoding)
+                parts.setdefault(name, []).append(data)
+    except FileNotFoundError:
+        return None
+    return parts
+
+
+# -- what is written --------------------------------------------------------------------------------------------------
+
+
+def _told(state: MapSnapshot) -> Told:
+    """All of a map but its columns and landmarks."""
+    graph, bounded = state.graph, state.bounded
+    ids = {"vertex": graph.vertex_ids, "edge": graph.edge_ids}
+    return {
+        "type": "map",
+        "version": VERSION,
+        "kinds": [kind.name for kind in graph.kinds],
+        "tags": [tag_of(edge) for edge in graph.tables],
+        "labels": graph.labels,
+        "sources": graph.sources,
+        "next": {name: of.later for name, of in ids.items()},
+        "first": state.first_keyframe,
+        "segments": state.segments,
+        "drives": state.drives,
+        "frozen": [state.frozen, state.ledger.final],
+        "held": state.held,
+        "datum": state.datum,
+        "settings": state.settings,
+        "displacements": state.displacements,
+        "processed": state.processed,
+        "used": [state.used_ns, state.source],
+        "drive": state.drive,
+        "noise": factors_record(state.noise_factors),
+        "calibration": totals_record(state.calibration),
+        "edits": [one.record for one in state.edits],
+        "gyro": None if state.gyro_bias is None else astuple(state.gyro_bias),
+        "condensed": None if bounded is None else _condensed(bounded),
+    }
+
+
+def _condensed(state: BoundedState) -> Told:
+    """The state of a condensed map that is not in its graph."""
+    places = [
+        [cell, one.edge, one.place.visits, list(one.strikes.items()), one.place.linearized_at.numbers.tolist()]
+        for cell, several in state.places.items()
+        for one in several
+    ]
+    return {
+        "places": places,
+        "old": [astuple(one) for one in state.old],
+        "left": [state.keyframes, state.sightings],
+        "scale": astuple(state.scale),
+        "accepted": [[first, dict(of)] for first, of in state.accepted.items()],
+        "begins": list(state.begins.items()),
+    }
+
+
+def _landmark(mark: Landmark) -> Told:
+    out = {name: getattr(mark, name) for name in _OF_LANDMARKS}
+    if mark.seen:
+        out["seen"] = [
+            [one.edge, one.topic, sighting_record(one.sighting), *_as_seen_from(one.where)] for one in mark.seen
+        ]
+    return out
+
+
+def _as_seen_from(where: PoseAtStamp) -> list[Any]:
+    return [where.keyframe, where.vertex, where.stamp_ns, where.T_keyframe_base, where.covariance.tolist()]
+
+
+def _columns(state: MapSnapshot) -> Iterator[tuple[str, NDArray[Any]]]:
+    graph, ledger = state.graph, state.ledger
+    yield from (("kind", graph.kind.values), ("initial", graph.initial.values), ("values", state.values))
+    yield from (("vertex_ids", graph.vertex_ids.early), ("edge_ids", graph.edge_ids.early))
+    for name, poses in (("keyframes", state.keyframes), ("sightings", state.sighting_poses)):
+        yield from ((f"{name}/id", poses.ids), (f"{name}/stamp_ns", poses.stamps_ns), (f"{name}/pose", poses.poses))
+    for edge, table in graph.tables.items():
+        yield from ((f"{tag_of(edge)}/{name}", getattr(table, name).values) for name in _OF_EDGES)
+    yield from ((f"ledger/{name}", getattr(ledger, name).values) for name in _OF_VERDICTS)
+    yield "ledger/residual", ledger.residuals
+    for name in _OF_CHANGES:
+        kind = np.float64 if name in ("statistic", "threshold") else np.int64
+        yield f"history/{name}", np.array([getattr(one, name) for one in ledger.history], dtype=kind)
+
+
+# -- what is read -----------------------------------------------------------------------------------------------------
+
+
+def _state(told: Told, marks: Sequence[Told], columns: Columns) -> MapSnapshot:
+    graph = _graph(told, columns)
+    frozen, frozen_edges = told["frozen"]
+    used_ns, source = told["used"]
+    first, gyro, condensed = told["first"], told["gyro"], told["condensed"]
+    pose = _pose_of(graph)
+    size = pose.size if pose else 3
+    return MapSnapshot(
+        graph=graph,
+        ledger=_ledger(columns, frozen_edges),
+        values=columns["values"].copy(),
+        keyframes=_poses(StampedPoses(Keyframe, size, first), "keyframes", columns),
+        segments=told["segments"],
+        drives=told["drives"],
+        sighting_poses=_poses(StampedPoses(SightingPose, size), "sightings", columns),
+        landmarks={mark["name"]: _read_landmark(mark) for mark in marks},
+        frozen=frozen,
+        held=tuple(told["held"]),
+        datum=tuple(told["datum"]),
+        settings=told["settings"],
+        displacements=told["displacements"],
+        processed=told["processed"],
+        used_ns=used_ns,
+        source=source,
+        drive=told["drive"],
+        noise_factors=read_factors(told["noise"]),
+        edits=list(map(applied_edit, told["edits"])),
+        calibration=read_totals(told["calibration"]),
+        gyro_bias=None if gyro is None else SavedBias(gyro[0], tuple(gyro[1]), tuple(gyro[2]), gyro[3]),
+        bounded=None if condensed is None else _bounded(graph, condensed),
+    )
+
+
+def _graph(told: Told, columns: Columns) -> Graph:
+    graph, codes, initial = Graph(), columns["kind"], columns["initial"]
+    kinds, begin = [_KINDS[name] for name in told["kinds"]], 0
+    for some in np.split(codes, np.flatnonzero(np.diff(codes)) + 1):
+        if len(some):
+            kind, end = kinds[some[0]], begin + len(some) * kinds[some[0]].size
+            graph.add_vertices(kind, initial[begin:end].reshape(len(some), kind.size))
+            begin = end
+    graph.labels[:], graph.sources[:] = told["labels"], told["sources"]
+    for tag in told["tags"]:
+        _add_edges(graph, tag, columns)
+    ids = np.concatenate([np.empty(0, dtype=np.int64), *(table.id.values for table in graph.tables.values())])
+    if not np.array_equal(np.sort(ids), np.arange(len(ids))):
+        raise ValueError("the edges are not numbered from 0")
+    for table in graph.tables.values():
+        graph.table_of_edge.values[table.id.values] = table.code
+        graph.row_of_edge.values[table.id.values] = np.arange(len(table))
+    graph.vertex_ids = _lasting(columns["vertex_ids"], told["next"]["vertex"], graph.vertex_count)
+    graph.edge_ids = _lasting(columns["edge_ids"], told["next"]["edge"], graph.edge_count)
+    return graph
+
+
+def _add_edges(graph: Graph, tag: str, columns: Columns) -> None:
+    """Add the edges of a type."""
+    edge, of = edge_of(tag), {name: columns[f"{tag}/{name}"] for name in _OF_EDGES}
+    count, m = len(of["id"]), edge.residual_size
+    if not count:
+        return
+    if not (_are_below(of["label"], len(graph.labels)) and _are_below(of["source"], len(graph.sources))):
+        raise ValueError(f"{tag}: a class or an input that is not named")
+    vertices = of["vertices"].reshape(count, len(edge.accepts))
+    measured, roots = of["measured"].reshape(count, -1), of["sqrt_information"].reshape(count, m, m)
+    graph.add_edges(edge, vertices, measured, Gaussian(roots), graph.labels[0], graph.sources[0])
+    for name in ("id", "label", "source", "weight"):
+        getattr(graph.tables[edge], name).values[:] = of[name]
+
+
+def _lasting(early: Index, later: int, count: int) -> LastingIds:
+    ascends = not len(early) or (early[0] >= 0 and (np.diff(early) > 0).all() and early[-1] < later)
+    if len(early) > count or not ascends or not _is_index(later, 2**62):
+        raise ValueError("ids do not ascend, or are more than there are")
+    return LastingIds(early.copy(), later)
+
+
+def _poses(out: StampedPoses[Any], name: str, columns: Columns) -> StampedPoses[Any]:
+    out.extend(columns[f"{name}/id"], columns[f"{name}/stamp_ns"], columns[f"{name}/pose"])
+    return out
+
+
+def _ledger(columns: Columns, final: int) -> Ledger:
+    ledger, of = Ledger(), {name: columns[f"ledger/{name}"] for name in _OF_VERDICTS}
+    residual, known = columns["ledger/residual"], {int(one) for one in Reason}
+    if int(of["numbers"].sum()) != len(residual) or (of["numbers"] < 0).any():
+        raise ValueError("verdicts without their residuals")
+    if not _are_below(of["verdict"], len(Verdict)) or not known.issuperset(np.unique(of["reason"]).tolist()):
+        raise ValueError("a verdict or a reason that is none")
+    is_judged = of["verdict"] != Verdict.NOT_EVALUATED
+    ledger.enter(of["keyframe"], of["statistic"], of["numbers"], of["threshold"], residual, is_judged)
+    ledger.verdict.values[:], ledger.reason.values[:] = of["verdict"], of["reason"]
+    changes = (columns[f"history/{name}"].tolist() for name in _OF_CHANGES)
+    ledger.history = [
+        VerdictChange(edge, keyframe, Verdict(verdict), Reason(reason), statistic, threshold)
+        for edge, keyframe, verdict, reason, statistic, threshold in zip(*changes, strict=True)
+    ]
+    if not _is_index(final, len(ledger) + 1):
+        raise ValueError("more verdicts are final than there are")
+    ledger.finish(final)
+    return ledger
+
+
+def _read_landmark(told: Told) -> Landmark:
+    mark = Landmark(**{name: told[name] for name in _OF_LANDMARKS})
+    for edge, topic, sighting, keyframe, vertex, stamp_ns, pose, covariance in told.get("seen", ()):
+        lists = {name: tuple(value) for name, value in sighting.items() if isinstance(value, list)}
+        where = PoseAtStamp(keyframe, vertex, stamp_ns, tuple(pose), np.array(covariance))
+        mark.seen.append(LandmarkEdge(edge, topic, Sighting(**sighting | lists), where))
+    mark.stamps = {one.where.stamp_ns for one in mark.seen}
+    return mark
+
+
+def _bounded(graph: Graph, told: Told) -> BoundedState:
+    keyframes, sightings = told["left"]
+    state = BoundedState(keyframes=keyframes, sightings=sightings, scale=VisitScale(*told["scale"]))
+    state.accepted |= {first: Counter(of) for first, of in told["accepted"]}
+    state.begins |= dict(told["begins"])
+    if not 1.0 <= state.scale.factor < math.inf:
+        raise ValueError(f"condensed: the variances of visits count {state.scale.factor} times")
+    for cell, number, visits, strikes, at in told["places"]:
+        edge, where = graph.edge(number), np.array(at, dtype=np.float64)
+        if len(where) != edge.type.measured_size or not np.isfinite(where).all():
+            raise ValueError(f"condensed: place {number} is not linearised at {edge.type.measured_size} numbers")
+        state.places.setdefault(tuple(cell), []).append(place_of(edge, where, visits, dict(strikes)))
+    state.old += [OldKeyframe(number, vertex, stamp, tuple(pose)) for number, vertex, stamp, pose in told["old"]]
+    if not all(_is_index(one.vertex, graph.vertex_count) for one in state.old):
+        raise ValueError("condensed: an old keyframe is no vertex")
+    return state
+
+
+# -- parts that contradict one another --------------------------------------------------------------------------------
+
+
+def _fault_of(state: MapSnapshot) -> str:
+    """Return the first fault of a map, in words; empty if there is none."""
+    graph, count = state.graph, state.keyframe_count
+    pose = _pose_of(graph)
+    is_pose = np.array([kind is pose for kind in graph.kinds], dtype=bool)[graph.kind.values]
+    ids, seen_from = state.keyframes.ids, state.sighting_poses.ids
+    if not _is_index(state.first_keyframe, count + 1) or not _are_below(ids, len(is_pose)) or not is_pose[ids].all():
+        return "a keyframe is not valid"
+    if not _are_below(seen_from, count) or (seen_from < state.first_keyframe).any():
+        return "a sighting is not valid"
+    for name, mark in state.landmarks.items():
+        counts = (mark.vertex, graph.vertex_count), (mark.sightings, 2**31), (mark.sized, 2**31)
+        stamps = (mark.first_seen_ns, 2**63), (mark.last_seen_ns, 2**63)
+        is_sized = isinstance(mark.sort, str) and isinstance(mark.size, int | float) and 0.0 <= mark.size < math.inf
+        if not (is_sized and all(_is_index(*one) for one in (*counts, *stamps))):
+            return f"landmark {name} is not valid"
+    if not all(_is_index(one, count) for one in (*state.segments, *state.drives)):
+        return "a segment or a drive begins where no keyframe is"
+    vertices, edges = state.held
+    if not (_is_index(max(state.frozen, vertices), len(is_pose) + 1) and _is_index(edges, len(state.ledger) + 1)):
+        return "more is frozen or held than there is"
+    if not (state.used_ns is None or _is_index(state.used_ns, 2**63)) or not isinstance(state.source, str):
+        return "what is said of the odometry that was used last is not valid"
+    if not _is_index(state.processed, 2**63):
+        return f"processed {state.processed!r} is no count"
+    gyro = () if state.gyro_bias is None else (*state.gyro_bias.bias, *state.gyro_bias.variance)
+    if len(state.datum) not in (0, 3) or not all(map(math.isfinite, (*state.datum, *gyro))):
+        return "the datum or the bias of the gyro is not valid"
+    changed = np.array([one.edge for one in state.ledger.history], dtype=np.int64)
+    if len(state.ledger) > graph.edge_count or not _are_below(changed, len(state.ledger)):
+        return f"{len(state.ledger)} verdicts on {graph.edge_count} edges"
+    numbers = state.values, state.keyframes.poses, state.sighting_poses.poses
+    is_whole = len(state.values) == len(graph.initial) and all(np.isfinite(one).all() for one in numbers)
+    return "" if is_whole else "an estimate is not finite"
+
+
+def _pose_of(graph: Graph) -> VertexKind | None:
+    """Return the kind of the keyframes; None where there is no vertex."""
+    return next((kind for kind in graph.kinds if kind in GROUPS), None)
+
+
+def _is_index(one: Any, count: int) -> bool:
+    """Return whether a value is a whole number from 0 up to a count."""
+    return isinstance(one, int) and not isinstance(one, bool) and 0 <= one < count
+
+
+def _are_below(several: Index, count: int) -> bool:
+    """Return whether all are from 0 up to a count."""
+    return not len(several) or bool(several.min() >= 0 and several.max() < count)
