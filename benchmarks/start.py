@@ -70,7 +70,7 @@ def _table() -> None:
     costs = _Costs()
     event.register("numba:compile", costs)
     warmup._load_plane()
-    warmup._load_space()
+    warmup._load_edges(in_space=True)
     print(f"\n{'kernel':64} CPU s  specialisations")
     for name, seconds in costs.seconds.most_common():
         print(f"{name:64} {seconds:5.2f}  {costs.count[name]}")

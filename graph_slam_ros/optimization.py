@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from scipy.special import chdtri
 
-from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.errors import GaugeError, GraphSlamError, SingularError
 from graph_slam_ros.formats.g2o import read_g2o
 from graph_slam_ros.formats.graph_file import G2oFile
 from graph_slam_ros.graph import Graph
@@ -23,20 +23,17 @@ _UNEVEN, _SEVERAL = 10.0, 10  # mean over median of what so many closures or mor
 _NO_RESIDUAL = 1e-6  # chi2 for each number measured: less is rounding
 _MOST_TIMES, _MOST_S, _QUIET_S = 5.0, 10.0, 2.0  # of the first solution, and seconds, that others may take together
 _NUMBERS = re.compile(r"(?<=vertex )\d+|(?<=FIX )[\d ]*\d")  # of vertices in errors: to be the file's
-W_FIRST = ": does w come first in its quaternions? g2o has qx qy qz qw"
+HINTS = _W_FIRST, _DEGREES, _COVARIANCE = (  # ends of a doubt that say what is wrong in the file
+    ": does w come first in its quaternions? g2o has qx qy qz qw",
+    ": are its angles in degrees? g2o has radians",
+    ": is a covariance given as information? g2o has its inverse",
+)
 _SAME = 1e-6  # part of the cost by which one optimum differs from start to start
 
 
 @dataclass(frozen=True, slots=True)
 class Attempt:
-    """The result of one start.
-
-    Attributes
-    ----------
-    start : ``file``, ``tree``, ``chordal`` or ``online``
-    chi2, cost : of the result; NaN if there is none
-    failure : the reason if there is no result; else empty
-    """
+    """The chi2 and cost from one start (``file``, ``tree``, ``chordal`` or ``online``); without them why it failed."""
 
     start: str
     chi2: float = float("nan")
@@ -132,7 +129,10 @@ def _solved(file: G2oFile, settings: Settings, init: str, on_pose: OnPose = lamb
         add_graph(solver, file)
         done = solver.optimize(settings)
     except GraphSlamError as error:
-        error.args = (_NUMBERS.sub(lambda n: " ".join(str(file.ids[int(k)]) for k in n[0].split()), str(error)),)
+        why = _NUMBERS.sub(lambda n: " ".join(str(file.ids[int(k)]) for k in n[0].split()), str(error))
+        if file.losses and isinstance(error, GaugeError | SingularError):  # the cause, not its consequence
+            why = f"{'; '.join(file.losses)}: without them {why.partition(': ')[0]}"
+        error.args = (why,)
         raise
     return Solution(file, solver, done, start, attempts=(Attempt(start, done.chi2_final, done.cost_final),))
 
@@ -175,7 +175,10 @@ def suspicion_of(solution: Solution, settings: Settings) -> str:
     chi2, numbers = solver.chi2_of(closures)
     each = chi2 / numbers
     is_uneven = len(each) >= _SEVERAL and each.mean() > max(_UNEVEN * float(np.median(each)), _NO_RESIDUAL)
-    return _judged(solution, settings).doubt or ("a few closures have nearly all of the residuals" if is_uneven else "")
+    doubt = _judged(solution, settings).doubt or (
+        "a few closures have nearly all of the residuals" if is_uneven else ""
+    )
+    return "" if doubt.endswith(_COVARIANCE) else doubt
 
 
 def _judged(solution: Solution, settings: Settings) -> Solution:
@@ -193,6 +196,8 @@ def _judged(solution: Solution, settings: Settings) -> Solution:
         doubt = f"the loss lets go of {gone} of {has_loss.sum()} edges"
     elif freedom > 0 and kept > max(_FAR_ABOVE * freedom, chdtri(freedom, _UNLIKELY)):
         doubt = f"chi2 {kept:.6g} is far above its {freedom} degrees of freedom{_hint(solution.file, edges)}"
+    elif freedom > 0 and 1e-9 < solution.report.chi2_final / freedom < 1e-3:  # without noise 1e-11, public graphs 0.01
+        doubt = f"chi2 {solution.report.chi2_final:.6g} is far below its {freedom} degrees of freedom{_COVARIANCE}"
     elif len(far):
         worst = far[np.argmax(chi2[far] / numbers[far])]
         what = f"{len(far)} residuals are far outside" if len(far) > 1 else "a residual is far outside"
@@ -201,10 +206,12 @@ def _judged(solution: Solution, settings: Settings) -> Solution:
 
 
 def _hint(file: G2oFile, edges: Index) -> str:
-    """Return that quaternions seem to have w first: then most edges would turn by half a turn about x."""
-    some = [file.graph.edge(int(edge)).measured for edge in edges[:100]]
-    turned = [one for one in some if len(one) == 7 and abs(one[3]) > abs(one[6])]
-    return W_FIRST if 2 * len(turned) > len(some) else ""
+    """What the first edges speak for: with w first, most turn by half a turn about x; in degrees, some by many."""
+    some = [file.graph.edge(int(edge)) for edge in edges[:1000]]
+    turned = [one for one in some if len(one.measured) == 7 and abs(one.measured[3]) > abs(one.measured[6])]
+    if 2 * len(turned) > len(some):
+        return _W_FIRST
+    return _DEGREES if any("relative pose" in one.type.name and abs(one.measured[2]) > 7.0 for one in some) else ""
 
 
 def edge_text(file: G2oFile, edge: int) -> str:

@@ -1,7 +1,7 @@
 """Names of array types for the whole package."""
 
 from collections.abc import Callable
-from typing import Protocol, TypeAlias, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +13,5 @@ Numbers: TypeAlias = tuple[float, ...]
 """A point, a pose or a covariance, row by row: what messages and measurements carry."""
 
 Result = TypeVar("Result")
-
-
-class Executor(Protocol):
-    """Begins work and returns what waits for its result."""
-
-    def __call__(self, work: Callable[[], Result], /) -> Callable[[], Result]:
-        """Begin."""
+Executor: TypeAlias = Callable[[Callable[[], Any]], Callable[[], Any]]
+"""Begins work and returns what waits for its result."""

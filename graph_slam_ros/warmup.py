@@ -92,7 +92,7 @@ def warmup(
     compile_all(is_stop_requested, on_progress, dimensions)
     _load_plane()
     if dimensions == 3:
-        _load_space()
+        _load_edges(in_space=True)
     return time.perf_counter() - start
 
 
@@ -184,11 +184,6 @@ def _load_plane() -> None:
 
 
 @functools.cache
-def _load_space() -> None:
-    """Linearise every edge type of space."""
-    _load_edges(in_space=True)
-
-
 def _load_edges(*, in_space: bool) -> None:
     """Linearise an edge of each type with a pose in space, or of each other type, and propagate a covariance."""
     for value in vars(graphs).values():
@@ -258,7 +253,8 @@ def _wait_for(name: str) -> None:
         time.sleep(0.05)
 
 
-_PARTS: dict[str, Callable[[], None]] = {"structure": _compile_structure, "plane": _compile_plane, "space": _load_space}
+_PARTS: dict[str, Callable[[], None]] = {"structure": _compile_structure, "plane": _compile_plane}
+_PARTS["space"] = functools.partial(_load_edges, in_space=True)
 """The plane needs the first two. They run at the same time, for each waits for kernels of the other."""
 
 

@@ -48,11 +48,8 @@ def check(args: argparse.Namespace) -> int:
     topics = {"odometry": args.odom, "landmarks": args.landmarks}
     done = checked(args.bag, settings, **topics, quick=args.quick, progress=console.progress("check"))
     if args.json:
-        console.show(
-            json.dumps(
-                {"findings": [one.as_dict() for one in done.findings], "command": done.command, "losses": done.losses}
-            )
-        )
+        found = [one.as_dict() for one in done.findings]
+        console.show(json.dumps({"findings": found, "command": done.command, "losses": done.losses}))
     else:
         for one in done.findings:
             console.show(*lines(one))
@@ -141,12 +138,8 @@ def calibrate(args: argparse.Namespace) -> int:
     if args.out:
         write_whole(args.out, _as_yaml(done).encode())
     if args.json:
-        console.show(
-            json.dumps(
-                {"settings": done.settings, "parameters": done.parameters, "rounds": done.rounds}
-                | {"refused": done.refused, "fault": done.fault and done.fault.as_dict()}
-            )
-        )
+        answer = {"settings": done.settings, "parameters": done.parameters, "rounds": done.rounds}
+        console.show(json.dumps(answer | {"refused": done.refused, "fault": done.fault and done.fault.as_dict()}))
     else:
         _show(done, args.bag)
     lost = console.report_losses(done.losses, done.warnings)

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 STARTS = {"file": "the file", "tree": "the spanning tree", "chordal": "the chordal relaxation"}
 STARTS["online"] = "the drive, pose after pose"
 _MOST_TRIAL_S = 10.0
+_OTHER_TAG = "give the lost edges a tag that is read (docs/graphs.md)"
 
 
 def optimize_options(sub: CommandParser) -> None:
@@ -65,7 +66,7 @@ def optimize(args: argparse.Namespace) -> int:
     from graph_slam_ros.formats.g2o_writer import write_g2o
     from graph_slam_ros.formats.strict import ending
     from graph_slam_ros.formats.tum import write_trajectory
-    from graph_slam_ros.optimization import W_FIRST, started
+    from graph_slam_ros.optimization import HINTS, started
     from graph_slam_ros.optimization import optimize as solve
     from graph_slam_ros.runs.folder import GRAPH, is_run
     from graph_slam_ros.warmup import compile_all
@@ -96,14 +97,12 @@ def optimize(args: argparse.Namespace) -> int:
         draw_graph(args.plot, graph, _positions(graph, started(file, start)[0]), _positions(graph, solver))
     for note in file.notes:
         console.warn(note)
-    if 1e-9 < report.chi2_final / max(1, solver.degrees_of_freedom) < 1e-3:  # public graphs: 0.01; without noise: 1e-11
-        console.warn("chi2 is far below its degrees of freedom: is a covariance given as information?")
-    if not args.json:
-        console.then(_after(args, solution))
-    why = ": wrong edges, which --loss cauchy lets go of, or too little noise in the information"
-    is_open = report.converged and _loss_text(args.loss) == "none" and not solution.doubt.endswith(W_FIRST)
-    beware = solution.doubt and solution.doubt + why * is_open
-    lost = console.report_losses(file.losses, [beware] if beware else ())
+    after = "" if args.json else _after(args, solution)
+    is_open = report.converged and _loss_text(args.loss) == "none" and not solution.doubt.endswith(HINTS)
+    beware = [solution.doubt + _why(after) * is_open] if solution.doubt else []
+    lost = console.report_losses(file.losses, beware)
+    if after:
+        console.then(after)
     return lost or (console.LOSSES if beware else code)
 
 
@@ -114,24 +113,38 @@ def _settings(args: argparse.Namespace, graph: "Graph") -> "Settings":
     return Settings(args.method, args.max_iterations, cost_tolerance=args.tolerance, losses=losses)
 
 
+def _why(after: str) -> str:
+    """The cause of a doubt that names none, by the command that comes next; without that, all that may be."""
+    wrong, tight = ": wrong edges, which --loss cauchy lets go of", ": too little noise in the information"
+    if "all edges fit" in after:
+        return ": a local minimum"
+    return wrong if "--loss" in after else tight if after else f"{wrong}, or {tight[2:]}"
+
+
 def _after(args: argparse.Namespace, solution: "Solution") -> str:
     from graph_slam_ros.formats.strict import ending
-    from graph_slam_ros.optimization import W_FIRST
+    from graph_slam_ros.optimization import HINTS
 
-    if solution.doubt.endswith(W_FIRST):
-        return "write x y z qx qy qz qw in the file, and solve it again"
+    is_wrong = solution.doubt.endswith(HINTS)
+    if is_wrong or (solution.file.losses and not args.lenient):
+        what = f"write {solution.doubt.rpartition('g2o has ')[2]} in the file" if is_wrong else _OTHER_TAG
+        return f"{what}, then {console.command('optimize', args.graph, *_options(args))}"
     if not solution.report.converged:
         start = "online" if args.init == "chordal" else "chordal"
         words = _options(argparse.Namespace(**vars(args) | {"init": start}))
         return f"{console.command('optimize', args.graph, *words)} (another start)"
     if solution.doubt:
         return _remedy(args, solution)
-    if args.out is None:
-        words = _options(args)
-        return f"{console.command('optimize', args.graph, *words, '--out', 'SOLVED.g2o')} (the same, and write it)"
-    if ending(args.out) == ".tum":
+    if args.out is not None and ending(args.out) == ".tum":
         return f"evo_traj tum {shlex.quote(str(args.out))} --plot, or any reader of TUM trajectories"
-    return f"{console.command('optimize', args.out, '--out', 'POSES.tum')} (the poses as a trajectory)"
+    name, what = ("POSES.tum", "as a trajectory") if args.out else ("SOLVED.g2o", "and write it")
+    return f"{console.command('optimize', args.graph, *_options(args), '--out', _free(name))} (the same, {what})"
+
+
+def _free(name: str) -> str:
+    """The name of a file that is not there: this one, or with a number."""
+    stem, _, suffix = name.partition(".")
+    return next(one for k in range(1, 10_000) if not Path(one := f"{stem}{k if k > 1 else ''}.{suffix}").exists())
 
 
 def _remedy(args: argparse.Namespace, solution: "Solution") -> str:
@@ -146,7 +159,7 @@ def _remedy(args: argparse.Namespace, solution: "Solution") -> str:
         with suppress(GraphSlamError):
             tried = solve(solution.file, _settings(other, solution.file.graph), init=other.init)
             if not tried.doubt:
-                words = console.command("optimize", args.graph, *_options(other), "--out", "SOLVED.g2o")
+                words = console.command("optimize", args.graph, *_options(other), "--out", _free("SOLVED.g2o"))
                 told = f"the loss lets go of {tried.let_go} edges" if tried.let_go else "all edges fit"
                 return f"{words} (tried: {told})"
     ratio = (solution.report.chi2_final / max(1, solution.solver.degrees_of_freedom)) ** 0.5
@@ -187,7 +200,7 @@ def _starts_text(solution: "Solution") -> Iterable[str]:
     if solution.start != first.start:
         yield f"  the answer is from {STARTS[solution.start]}: chi2 {first.chi2:.6f} was a local minimum"
     elif others and not all(one.failure for one in others):
-        yield "  no start is better: wrong closures or too little noise are likelier than a local minimum"
+        yield "  no start is better: a local minimum is unlikely"
     elif others:
         yield "  no other start could be solved: this may be a local minimum"
 

@@ -38,9 +38,7 @@ class Group:
 
 COMMANDS: dict[str, Command | Group] = {
     "info": Command(
-        "cli.info:info",
-        "show topics, types, rates, frames and span of a recording, and how to replay it",
-        "drive.mcap",
+        "cli.info:info", "show topics, types, rates, frames and span of a recording, and how to replay it", "drive.mcap"
     ),
     "check": Command(
         "cli.check:check",
@@ -163,20 +161,12 @@ COMMANDS: dict[str, Command | Group] = {
         "keyframes",
         "'odometry.*'",
     ),
-    "warmup": Command(
-        "cli.installation:warmup",
-        "compile the kernels, once per installation",
-        "",
-    ),
+    "warmup": Command("cli.installation:warmup", "compile the kernels, once per installation", ""),
     "demo": Command(
-        "tools.demo:demo",
-        "replay the recording that comes with the source through a live ROS graph",
-        "--force",
+        "tools.demo:demo", "replay the recording that comes with the source through a live ROS graph", "--force"
     ),
     "completion": Command(
-        "cli.installation:completion",
-        "print a script for shell completion: eval it in ~/.bashrc or ~/.zshrc",
-        "bash",
+        "cli.installation:completion", "print a script for shell completion: eval it in ~/.bashrc or ~/.zshrc", "bash"
     ),
 }
 

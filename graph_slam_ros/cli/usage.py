@@ -68,10 +68,7 @@ class CommandParser(argparse.ArgumentParser):
                 f"unrecognized arguments: {' '.join(rest)}{did_you_mean(options[0], self._option_string_actions)}"
             )
         if rest and hasattr(known, "bag"):
-            parts = (
-                f"{rest[0]} is one recording too many: parts of one drive go into one folder, and BAG is that folder"
-            )
-            self.error(parts)
+            self.error(f"{rest[0]} is one recording too many: put the parts of one drive into a folder, and name that")
         return known, rest
 
     def error(self, message: str) -> NoReturn:

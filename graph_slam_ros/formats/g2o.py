@@ -3,9 +3,8 @@
 Information matrices are taken as they are, but for one thing: g2o measures a rotation in space by the vector part of
 its quaternion, which is half the rotation vector, so a rotation's information counts a quarter in our residual.
 A sighting in space is measured in a sensor's frame, and names the parameter that says where that is on the robot; in
-the graph it is in the robot's. Tags of ours stand for what g2o has no word for. Unknown tags are kept, word for word,
-and written back. TORO's, iSAM's and GTSAM's texts are read as well (``dialects``), and files
-without vertex lines.
+the graph it is in the robot's. Unknown tags are kept, word for word, and written back. TORO's, iSAM's and GTSAM's texts
+are read as well (``dialects``), and files without vertex lines.
 """
 
 import itertools
@@ -55,8 +54,7 @@ class _Reader:
         self.offsets: dict[int, se3.Pose] = {}
         self.unknown, self.skipped, self.switched = list[str](), list[str](), list[str]()
         self.repaired, self.bare = list[int](), list[int]()  # lines whose information is not definite, or not there
-        self.assumed = 0  # the first line whose information may have been meant otherwise
-        self.has_values, self.label = True, ""
+        self.has_values, self.label, self.assumed = True, "", 0  # the first line that may have been meant otherwise
 
     def refuse(self, line: int, why: str) -> None:
         message = f"{self.name}:{line}: {why}"
@@ -93,7 +91,9 @@ class _Reader:
             else:
                 self.unknown.append(text.strip())
         except (FormatError, NoiseError) as error:
-            self.refuse(line, str(error))
+            tag = text.split()[0]
+            said = f"{tag}, read as {words[0]}," if tag != words[0] else tag
+            self.refuse(line, str(error).replace(words[0], said, 1))
 
     def _vertex(self, kind: VertexKind, words: list[str]) -> None:
         expect(words, 1 + kind.size)
@@ -196,7 +196,7 @@ class _Reader:
     def _known(self, tag: str, edges: Sequence[_Edge]) -> Iterator[_Edge]:
         for edge in edges:
             if fault := self._fault(tag, edge):
-                self.refuse(edge.line, fault)
+                self.refuse(edge.line, f"{fault} (--lenient leaves it out)")
             else:
                 yield edge
 

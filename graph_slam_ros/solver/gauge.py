@@ -27,7 +27,7 @@ def check_gauge(graph: Graph, free: Index, held: Index, rows: Mapping[EdgeTable,
     """Raise GaugeError unless each connected part has a held vertex or an edge on one vertex alone (a prior)."""
     fixed = np.zeros(graph.vertex_count, dtype=bool)
     fixed[held] = True
-    sources, targets = [], []
+    sources, targets = [free[:0]], [free[:0]]
     for table, chosen in rows.items():
         at = table.vertices.values[chosen]
         if at.shape[1] == 1:
@@ -35,19 +35,17 @@ def check_gauge(graph: Graph, free: Index, held: Index, rows: Mapping[EdgeTable,
         for slot in range(1, at.shape[1]):
             sources.append(at[:, 0])
             targets.append(at[:, slot])
-    if sources:
-        i, j = np.concatenate(sources), np.concatenate(targets)
-        links = coo_array((np.ones(len(i)), (i, j)), shape=(graph.vertex_count, graph.vertex_count))
-        _, part = connected_components(links, directed=False)
-    else:
-        part = np.arange(graph.vertex_count)
+    i, j = np.concatenate(sources), np.concatenate(targets)
+    links = coo_array((np.ones(len(i)), (i, j)), shape=(graph.vertex_count, graph.vertex_count))
+    _, part = connected_components(links, directed=False)
     floating = np.sort(free[~np.isin(part[free], part[fixed])])
     if len(floating):
         more = int((part[floating] == part[floating[0]]).sum()) - 1
+        of = f"{int(floating[0])}{f' and {more} more joined to it' if more else ''}"
         each = np.sort(floating[np.unique(part[floating], return_index=True)[1]])
+        ends = " ".join(map(str, [*held[:1], *each[:_NAMED]]))
         raise GaugeError(
-            f"nothing fixes the gauge of vertex {int(floating[0])} and {more} more joined to it: add a prior"
-            f" (an anchor) or hold a vertex (in a file: FIX {' '.join(map(str, [*held[:1], *each[:_NAMED]]))})"
+            f"nothing fixes the gauge of vertex {of}: add a prior (an anchor) or hold a vertex (in a file: FIX {ends})"
         )
 
 

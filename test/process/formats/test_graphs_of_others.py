@@ -65,6 +65,7 @@ FALSE = PLAIN + "".join(f"EDGE_SE2 {k} {k + 5} 3 {k} 1 {INFO[2]}\n" for k in (1,
 TIGHT = re.sub(r"(\d\.\d)\d+", r"\1", PLAIN).replace("100 0 0 100 0 400", "1e7 0 0 1e7 0 4e7")
 PRINTED = (PLAIN + edge(2, 9)).replace(INFO[2], "4 4.0004 0 4 0 9", 3)
 PARTS = PLAIN + "".join(f"VERTEX_SE2 {70 + k} 0 0 0\n" for k in range(2)) + "EDGE_SE2 70 71 1 0 0 1 0 0 1 0 1\n"
+DEGREES = re.sub(rf"(EDGE.*) (\S+)( {INFO[2]})", lambda e: f"{e[1]} {float(e[2]) * 180 / pi}{e[3]}", PLAIN)
 W_FIRST = re.sub(r"( 0 0)( \S+)( \S+)( 100.*)", r"\3\1\2\4", drive(3)) + edge(0, HALF, 3)
 READ = {  # content, exit code, what is said, edges of each class
     "switches in space": (switched(3, "EDGE_SE3_SWITCHABLE"), 0, "8 EDGE_SE3_SWITCHABLE are read", BOTH),
@@ -87,7 +88,11 @@ READ = {  # content, exit code, what is said, edges of each class
     "nonsense": (PLAIN.replace(INFO[2], "4 0 0 4 0 -9", 1), 2, "information is not positive definite", None),
     "false closures": (FALSE, 3, "wrong edges, which --loss cauchy lets go of", BOTH | {"closures": 11}),
     "w first": (W_FIRST, 3, "does w come first in its quaternions?", BOTH | {"closures": 1}),
-    "covariances": (TIGHT.replace("e7", "e-4"), 0, "is a covariance given as information?", BOTH),
+    "covariances": (TIGHT.replace("e7", "e-4"), 3, "is a covariance given as information?", BOTH),
+    "degrees": (DEGREES, 3, "are its angles in degrees? g2o has radians", BOTH),
+    "unknown edges alone": (PLAIN.replace("EDGE_", "EDGE_MY_"), 2, "23 EDGE_MY_SE2: of an unknown kind, so", None),
+    "too short": (f"{PLAIN}EDGE_SE2_MAXMIX 1 9 90 1 0 0 1\n", 2, "EDGE_SE2_MAXMIX, read as EDGE_SE2, needs", None),
+    "no such vertex": (f"{PLAIN}EDGE_SE2 1 99 1 0 0 {INFO[2]}\n", 2, "not declared (--lenient leaves it out)", None),
     "Boost": ("22 serialization::archive 18 0 0 0 Described 0 1.5", 2, "a Boost archive, as slam_toolbox's", None),
     "a database": (b"SQLite format 3\0\xff\xfe", 2, "a database. RTAB-Map's exports its graph", None),
 }
@@ -126,7 +131,7 @@ def test_the_remedies_mend(tmp_path, capsys):
     code, out, _ = solved(path, TIGHT, capsys)
     worst = r"next: the worst edges; if all fit alike, noise is [3-9]\d\d? times"
     assert code == 3 and re.match(worst, out.splitlines()[-1])
-    assert "next: write x y z qx qy qz qw" in solved(path, W_FIRST, capsys, "--max-iterations", "1")[1]
+    assert "next: write qx qy qz qw in the file" in solved(path, W_FIRST, capsys, "--max-iterations", "1")[1]
 
 
 def test_another_start_is_found_and_its_answer_is_not_in_doubt(tmp_path, capsys):

@@ -5,17 +5,7 @@ import pytest
 from rows import each
 
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.graph import (
-    LANDMARK_POSITION,
-    POSE_PRIOR,
-    R2,
-    RELATIVE_POSE,
-    SE2,
-    SE3,
-    EdgeType,
-    Gaussian,
-    Graph,
-)
+from graph_slam_ros.graph import LANDMARK_POSITION, POSE_PRIOR, R2, RELATIVE_POSE, SE2, SE3, EdgeType, Gaussian, Graph
 
 UNIT = Gaussian.from_sigmas(1.0, 1.0, 1.0)
 
