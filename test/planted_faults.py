@@ -128,6 +128,10 @@ def echoes(drive):
         seen.store()
 
 
+def mirrored(drive):
+    drive.poses = drive.poses * [1.0, -1.0, *np.ones(5)]
+
+
 def jumped(drive):
     poses = drive.poses
     at = len(poses) // 2
@@ -160,6 +164,8 @@ FAULTS = {
     "twist in degrees": (of("wrong_twist:angular=57.29578"), "twist_scale"),
     "two publishers of odometry": (of("other_publisher"), "other_publisher"),
     "odometry in millimetres": (of("wrong_scale:distance=1000.0"), "units"),
+    "position of odometry mirrored, turns right": (mirrored, "mirrored"),
+    "pose in feet, twist in metres": (of("wrong_scale:distance=3.28", "wrong_twist:linear=0.3049"), "units"),
     "twist in the odom frame": (of("wrong_twist:axes=odom"), "twist_frame"),
     "mount turned 5 degrees": (of("wrong_mount:yaw_deg=5.0"), "mount_yaw"),
     "mount turned -10 degrees": (of("wrong_mount:yaw_deg=-10.0"), "mount_yaw"),
@@ -209,7 +215,6 @@ FAULTS = {
 
 
 def planted(bag, target, name):
-    """A recording with a fault in it."""
     drive = Drive(bag)
     FAULTS[name][0](drive)
     drive.write(target)

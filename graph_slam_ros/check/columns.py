@@ -25,6 +25,7 @@ from graph_slam_ros.typing import Array, Index, Mask, Numbers
 
 _MOST = 200_000  # messages of each topic that are collected
 _TWIST = (0, 7, 14, 21, 28, 35)  # places in a covariance
+_UNKNOWN_M = 30.0  # so large is the sigma of an axis that a detector does not know
 _OF_ODOMETRY, _OF_GYRO, _OF_FIX, _OF_SIGHTING = 19, 7, 4, 6  # numbers of each
 Decoder = Callable[[bytes], Any]
 
@@ -152,7 +153,7 @@ class Columns:
     Attributes
     ----------
     assumed : parameters that were chosen for the recording, and that nobody has set
-    path_ns, path : (m,) and (m, 7) T_odom_base, as a replay uses odometry, ``in_order``
+    path_ns, path : (m,) and (m, 7) T_odom_base, as a replay uses odometry, its distances corrected, ``in_order``
     gyro_ns, gyro : (g,) stamps and turn rate about the robot's z [rad/s] of the gyro that is used
     felt : (g, 6) turn rates [rad/s] and accelerations [m/s^2] about and along the axes of its sensor
     gyro_frame, T_base_gyro : its frame, and where that is on the robot; None where it is not fixed or not known
@@ -422,12 +423,13 @@ class Collector:
         """Everything that was collected, and what the converters have counted."""
         path_ns, path = self._path.columns()
         path = path if path.shape[1] == len(se3.IDENTITY) else se3.in_space(path).reshape(-1, 7)
+        scale = [self._config.odometry.distance_factor] * 3 + [1.0] * 4
         gyro_ns, turned = self._gyro.columns()
         return Columns(
             self._config,
             {name: one.columns() for name, one in self._topics.items()},
             self._odometry(path_ns[:, 0], path),
-            *in_order(path_ns[:, 0], path),
+            *in_order(path_ns[:, 0], path * scale),
             tuple(one.columns() for one in self._sightings.values()),
             tuple(self._links.values()),
             counters,
@@ -473,7 +475,8 @@ def _located(one: Sighting) -> tuple[tuple[float, float, float], float]:
     size = round(len(c) ** 0.5)
     if one.kind in ("position", "pose"):
         n = len(m) if one.kind == "position" else 2 if len(m) == 3 else 3
-        sigma = (sum(c[i * (size + 1)] for i in range(n)) / n) ** 0.5
+        known = [c[i * (size + 1)] for i in range(n) if c[i * (size + 1)] < _UNKNOWN_M**2] or [_UNKNOWN_M**2]
+        sigma = (sum(known) / len(known)) ** 0.5
         return (m[0], m[1], m[2] if n == 3 else 0.0), sigma
     if one.kind != "range_bearing":
         return (np.nan, np.nan, np.nan), c[0] ** 0.5

@@ -2,13 +2,14 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from operator import itemgetter
 
 import numpy as np
 
 from graph_slam_ros.check.columns import Columns, SightingColumns
 from graph_slam_ros.check.finding import Finding, where
 from graph_slam_ros.check.moving_landmarks import check_moving, motions_of
-from graph_slam_ros.check.odometry import ratio
+from graph_slam_ros.check.odometry import ratio, twist_factor
 from graph_slam_ros.check.pairs import (
     LATER_S,
     Pairs,
@@ -27,11 +28,10 @@ from graph_slam_ros.typing import Array, Index, Mask
 _LEAST_PAIRS = 30
 _TURNED_RAD, _LEAST_TURNED = 0.25, 25
 _FAR_M = 200.0
-_HALF, _NOISES, _NEARLY = 0.5, 2.0, 1.2
+_HALF, _FIFTH, _NOISES, _NEARLY, _NEAR_M = 0.5, 0.2, 2.0, 1.2, 0.3
 _RELATED = 0.7
 _UNRELATED, _UNRELATED_NOISES, _UNRELATED_PAIRS = 0.6, 4.0, 100
-_TWICE = 0.002
-_ONCE, _SELDOM = 0.5, 3
+_TWICE, _ONCE, _SELDOM = 0.002, 0.5, 3
 _AGAIN_S, _AGAIN_M, _SPAN = 10.0, 3.0, 0.25
 _CHANCE, _MOST_BY_CHANCE = 0.02, 2
 _LOOP = 0.1  # of the way: landmarks that come back within less close no loop of the drive
@@ -39,15 +39,18 @@ _SILENT = 0.5
 _QUARTER = 0.5**0.5
 _CORRECTED = "_corrected"
 _OTHER_SCALE = 0.15  # less is found by a fit
+_ROUNDS = 10
 
+_OPTICAL = "those of an optical frame (z ahead, x to the right)"
 # Where a sensor would be turned on the robot, if its positions are in other axes: R_frame_true.
 TURNS: Mapping[str, so3.Quaternion] = {
     "turned by 90 degrees": (0.0, 0.0, _QUARTER, _QUARTER),
     "turned by -90 degrees": (0.0, 0.0, -_QUARTER, _QUARTER),
     "turned by 180 degrees": (0.0, 0.0, 1.0, 0.0),
-    "those of an optical frame (z ahead, x to the right)": (-0.5, 0.5, -0.5, 0.5),
+    _OPTICAL: (-0.5, 0.5, -0.5, 0.5),
 }
 EXCHANGED, MIRRORED = "x and y exchanged", "y to the right"
+_AHEAD, _INVERTED = "those of the robot (x ahead)", "those of its transform the other way round"
 
 
 def check_contradictions(c: Columns) -> Iterator[Finding]:
@@ -83,15 +86,15 @@ def _contradictions(c: Columns, s: SightingColumns) -> Iterator[Finding]:
         yield Finding("no_parallax", "note", len(pairs.a), _LEAST_PAIRS, "pairs", text, **at)
         return
     noise_m, count = noise_of(s, pairs), len(pairs.a)
-    along = list(check_moving(s, motions_of(c, s, pairs), count))
+    found = _mirrored(c, s, pairs, noise_m) or _axes(s, pairs, noise_m, use) or _scaled(c, s, pairs)
+    along = [] if found is not None else list(check_moving(s, motions_of(c, s, pairs), count))
     yield from along
     if any(one.ends for one in along):
         return
-    found = _mirrored(c, s, pairs, noise_m) or _axes(s, pairs, noise_m, use) or _scaled(c, s, pairs)
     if noises := [found] if found is not None else list(check_noise(c, s, pairs)):
         yield from noises
         return
-    residual_m = float(np.median(pairs.residuals(s.points)))
+    residual_m = pairs.apart_m(s.points)
     lever_m = np.linalg.norm(pairs.motion[:, :3], axis=1) + pairs.turned * np.minimum(distance_m[pairs.a], 1e3)
     share = residual_m / float(np.median(lever_m))
     if share > _UNRELATED and residual_m > _UNRELATED_NOISES * noise_m and count > _UNRELATED_PAIRS:
@@ -106,19 +109,51 @@ def _of_others(points: Array, pairs: Pairs, use: Mask) -> float:
     """The median distance between two landmarks, whatever their identities: what chance would give."""
     chosen = np.flatnonzero(use)
     shifted = np.roll(chosen, len(chosen) // 2)[np.searchsorted(chosen, pairs.b)]
-    return float(np.median(replace(pairs, b=shifted).residuals(points)))
+    return replace(pairs, b=shifted).apart_m(points)
+
+
+def _explains(if_so_m: float, now_m: float, noise_m: float) -> bool:
+    """Return whether sightings agree so much better that noise is no cause, even one that is stated too large."""
+    return if_so_m < _FIFTH * now_m or (if_so_m < _HALF * now_m and now_m > _NOISES * noise_m)
+
+
+def _mounts(s: SightingColumns) -> dict[str, se3.Pose]:
+    """Where the sensor would be on the robot, if its axes or its transform were others."""
+    T = tuple(s.T_base_frame)
+    found = {what: se3.compose(T, (0.0, 0.0, 0.0, *q)) for what, q in TURNS.items()}
+    return found | {_AHEAD: (*T[:3], *se3.rotation(se3.IDENTITY)), _INVERTED: se3.inverse(T)}
+
+
+def _placed(s: SightingColumns, T_base_true: se3.Pose) -> Array:
+    """Points (k, 3) in the base frame, if the sensor were there."""
+    T = se3.compose(T_base_true, se3.inverse(tuple(s.T_base_frame)))
+    return np.stack(se3.act(T, tuple(s.points.T)), axis=1)
 
 
 def _hypotheses(s: SightingColumns) -> dict[str, Array]:
     """Points (k, 3) in the base frame, if those of the sensor are in other axes."""
-    base_frame = tuple(s.T_base_frame)
-    seen = np.stack(se3.act(se3.inverse(base_frame), tuple(s.points.T)), axis=1)
+    T = tuple(s.T_base_frame)
+    seen = np.stack(se3.act(se3.inverse(T), tuple(s.points.T)), axis=1)
+    others = {EXCHANGED: seen[:, [1, 0, 2]], MIRRORED: seen * [1.0, -1.0, 1.0]}
+    turned = {what: _placed(s, there) for what, there in _mounts(s).items()}
+    return turned | {what: np.stack(se3.act(T, tuple(points.T)), axis=1) for what, points in others.items()}
 
-    def placed(points: Array) -> Array:
-        return np.stack(se3.act(base_frame, tuple(points.T)), axis=1)
 
-    turned = {what: placed(np.stack(so3.act(q, tuple(seen.T)), axis=1)) for what, q in TURNS.items()}
-    return turned | {EXCHANGED: placed(seen[:, [1, 0, 2]]), MIRRORED: placed(seen * [1.0, -1.0, 1.0])}
+def _fitted(s: SightingColumns, pairs: Pairs, T_base_true: se3.Pose) -> se3.Pose:
+    """Turn and shift a sensor in the plane so that its sightings agree with odometry best.
+
+    As complex numbers, with the motion (r, t) of the robot: z (a - r b) + (1 - r) d = t.
+    """
+    points, motion = _placed(s, T_base_true), pairs.motion
+    a, b = (points[k, 0] + 1j * points[k, 1] for k in (pairs.a, pairs.b))
+    t, r = motion[:, 0] + 1j * motion[:, 1], np.nan_to_num(np.exp(1j * so3.log(tuple(motion[:, 3:].T))[2]))
+    rows, weight = np.stack([a - r * b, 1.0 - r], axis=1), np.ones(len(r))
+    for _ in range(_ROUNDS):
+        z, d = np.linalg.lstsq(rows * weight[:, None], t * weight, rcond=None)[0]
+        left = np.abs(rows @ [z, d] - t)
+        weight = 1.0 / np.hypot(1.0, left / (3.0 * np.median(left) + 1e-6))
+    turn = 0.5 * np.angle(z)
+    return se3.compose((d.real, d.imag, 0.0, 0.0, 0.0, np.sin(turn), np.cos(turn)), T_base_true)
 
 
 def _mirrored(c: Columns, s: SightingColumns, pairs: Pairs, noise_m: float) -> Finding | None:
@@ -127,36 +162,49 @@ def _mirrored(c: Columns, s: SightingColumns, pairs: Pairs, noise_m: float) -> F
     if turns.sum() < _LEAST_TURNED:
         return None
     turning = replace(pairs, a=pairs.a[turns], b=pairs.b[turns], motion=pairs.motion[turns])
-    now_m = float(np.median(turning.residuals(s.points)))
-    others = {what: float(np.median(turning.residuals(points))) for what, points in _hypotheses(s).items()}
-    mirror_m = others.pop(MIRRORED)
+    if (now_m := turning.apart_m(s.points)) <= min(_NOISES * noise_m, _NEAR_M):
+        return None
+    others = {what: turning.apart_m(points) for what, points in _hypotheses(s).items()}
+    right = f"y or bearings count to the right, or if {c.odometry.topic} turns the other way"
+    mirrors = {right: others.pop(MIRRORED)}
     if c.config.world.dimensions == 2:
         back = turning.motion * [1.0, -1.0, 1.0, 1.0, 1.0, -1.0, 1.0]  # odometry that turns the other way
-        mirror_m = min(mirror_m, float(np.median(turning.residuals(s.points, back))))
-    if mirror_m < _HALF * now_m and now_m > _NOISES * noise_m and mirror_m < _NEARLY * min(others.values()):
-        text = (
-            f"{s.topic}: in turns, two sightings of a landmark differ by {now_m:.2f} m, but by {mirror_m:.2f} m if y "
-            f"or bearings count to the right, or if {c.odometry.topic} turns the other way"
-        )
-        at = where(s.topic, s.stamp_ns, len(pairs.a))
-        return Finding("mirrored", "error", now_m / max(mirror_m, 1e-9), 1.0 / _HALF, "times", text, **at)
-    return None
+        mirrors[right] = min(mirrors[right], turning.apart_m(s.points, back))
+        moved = pairs_of(replace(c, path=c.path * [1.0, -1.0, *np.ones(5)]), s).motion[turns]
+        what = f"x or y of the position of {c.odometry.topic} is mirrored, and its turns are right"
+        mirrors[what] = turning.apart_m(s.points, moved)
+    what, mirror_m = min(mirrors.items(), key=itemgetter(1))
+    if not _explains(mirror_m, now_m, noise_m) or mirror_m >= _NEARLY * min(others.values()):
+        return None
+    text = (
+        f"{s.topic}: in turns, two sightings of a landmark differ by {now_m:.2f} m, but by {mirror_m:.2f} m if {what}"
+    )
+    at = where(s.topic, s.stamp_ns, len(pairs.a))
+    return Finding("mirrored", "error", now_m / max(mirror_m, 1e-9), 1.0 / _HALF, "times", text, **at)
 
 
 def _axes(s: SightingColumns, pairs: Pairs, noise_m: float, use: Mask) -> Finding | None:
-    now_m, hypotheses = float(np.median(pairs.residuals(s.points))), _hypotheses(s)
-    others = {what: float(np.median(pairs.residuals(points))) for what, points in hypotheses.items()}
-    del others[MIRRORED]
-    what = min(others, key=lambda one: others[one])
-    if others[what] >= _HALF * now_m or now_m <= _NOISES * noise_m:
+    if (now_m := pairs.apart_m(s.points)) <= min(_NOISES * noise_m, _NEAR_M):
         return None
-    if others[what] >= _RELATED * _of_others(hypotheses[what], pairs, use):  # in the plane some axes hide any distance
-        return None
-    if_so = f"but by {others[what]:.2f} m if the axes are {what}"
-    text = f"{s.topic}: two sightings of a landmark differ by {now_m:.2f} m, {if_so}"
-    turn = () if what == EXCHANGED else (0.0, 0.0, 0.0, *TURNS[what])
-    settings = turned_mount(s.input, s.frame, s.T_base_frame, turn) if turn else ()
-    value, at = now_m / max(others[what], 1e-9), where(s.topic, s.stamp_ns, len(pairs.a), settings)
+    points, mounts = _hypotheses(s), _mounts(s)
+    del points[MIRRORED]
+    left = {what: pairs.apart_m(there) for what, there in points.items()}
+    if pairs.dimensions == 2 and (pairs.turned > _TURNED_RAD).sum() >= _LEAST_TURNED:
+        starts = {"turned": tuple(s.T_base_frame), **{what: mounts[what] for what in (_AHEAD, _OPTICAL)}}
+        for axes, start in starts.items():
+            mount = _fitted(s, pairs, start)
+            what = f"{axes}, and the sensor is at x {mount[0]:.2f}, y {mount[1]:.2f} m"
+            points[what], mounts[what] = _placed(s, mount), mount
+            left[what] = _NEARLY * pairs.apart_m(points[what])
+    what = min(left, key=lambda one: left[one])
+    if not _explains(left[what], now_m, noise_m) or left[what] >= _RELATED * _of_others(points[what], pairs, use):
+        return None  # in the plane some axes hide any distance
+    best_m = pairs.apart_m(points[what])
+    apart = f"two sightings of a landmark differ by {now_m:.2f} m, but by {best_m:.2f} m"
+    text = f"{s.topic}: {apart} if the axes are {what}"
+    is_all = best_m < _NOISES * noise_m  # else another mount is right
+    settings = turned_mount(s.input, s.frame, mounts[what], se3.IDENTITY) if is_all and what in mounts else ()
+    value, at = now_m / max(best_m, 1e-9), where(s.topic, s.stamp_ns, len(pairs.a), settings)
     return Finding("axes", "error", value, 1.0 / _HALF, "times", text, **at)
 
 
@@ -177,9 +225,16 @@ def _scaled(c: Columns, s: SightingColumns, pairs: Pairs) -> Finding | None:
     if left > _HALF or not (high < 1.0 - _OTHER_SCALE or low > 1.0 + _OTHER_SCALE) or not 0.1 <= factor <= 10.0:
         return None
     now = next((one.range_factor for one in c.config.sources if one.name == s.input), 1.0)
+    scale, o = c.config.odometry.distance_factor, c.odometry
+    of_pose = scale * twist_factor(o)
+    if abs(of_pose / factor - 1.0) < _OTHER_SCALE:
+        text = f"{o.topic}: its pose moves {of_pose:.3g} times as far as its twist and landmarks say: in metres?"
+        at = where(o.topic, c.path_ns, None, (assignment("odometry.distance_factor", round(scale / of_pose, 4)),))
+        return Finding("units", "error", of_pose, 1.0 + _OTHER_SCALE, "times", text, **at)
     text = (
         f"{s.topic}: ranges are {1.0 / factor:.2f} times as long as odometry says: is the size of the tags right "
-        "(that of the black square), and is odometry in metres?"
+        "(that of the black square)? If a measured way says that odometry is not: odometry.distance_factor="
+        f"{scale / factor:.4g}"
     )
     at = where(s.topic, s.stamp_ns, len(pairs.a), (assignment(f"{s.input}.range_factor", round(now * factor, 3)),))
     return Finding("range_scale", "error", 1.0 / factor, 1.0 + _OTHER_SCALE, "times", text, **at)

@@ -28,7 +28,7 @@ def check_fixes(c: Columns) -> Iterator[Finding]:
         stamp_ns, points, headings = f.stamp_ns[order], f.points[order], f.headings[order]
         poses = poses_at(stamp_ns, path_ns, path)
         factor = c.config.odometry.distance_factor
-        own, yaws = factor * (poses[:, 0] + 1j * poses[:, 1]), np.stack(so3.log(tuple(poses[:, 3:].T)), axis=1)[:, 2]
+        own, yaws = poses[:, 0] + 1j * poses[:, 1], np.stack(so3.log(tuple(poses[:, 3:].T)), axis=1)[:, 2]
         if np.isfinite(points).all():
             found = list(_positions(f, stamp_ns, points, own, factor))
             yield from found
@@ -64,7 +64,9 @@ def _positions(f: FixColumns, stamp_ns: Index, points: Array, own: Array, applie
         moved, driven = np.diff(points[ends]), np.diff(own[ends])
         now, mirrored = _mirrored(np.angle(moved[1:] / moved[:-1]), np.angle(driven[1:] / driven[:-1]))
         if mirrored < _HALF * now and now > _TURNED_RAD:
-            text = f"{f.topic}: fixes turn right where odometry turns left: axes are exchanged or mirrored"
+            what = "latitude and longitude, or east and north, are exchanged, or odometry's position is mirrored"
+            text = f"{f.topic}: fixes turn right where odometry turns left: {what}"
+            at = where(f.topic, stamp_ns, settings=(f"{f.input}.use=none",))
             yield Finding("fix_mirrored", "error", now, mirrored, "rad", text, **at)
             return
         factor = float(np.median(np.abs(moved)) / np.median(np.abs(driven)))

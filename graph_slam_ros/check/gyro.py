@@ -22,7 +22,7 @@ _OF_NOTHING = 0.2  # of odometry's turns: a gyro that measures none of them, but
 _ROUNDS, _EXPLAINED = 15, 0.5  # of a wrong heading: more than that is left where the gyro alone does not explain it
 _EITHER = ": the track width is wrong, or the scale of the gyro"
 _OF_A_HEADING = ("id_reused", "ids_unsure", "landmark_moved", "map_breaks", "outliers")  # where that is wrong
-_GRAVITY_M_S2 = 9.81
+_GRAVITY_M_S2, _LEAST_LATE_S, _MOST_LATE_S = 9.81, 0.1, 1.0
 _MOST_BIAS = 1.0  # [rad/s] that gyro.bias_sigma may be
 
 
@@ -43,6 +43,14 @@ def check_gyro(c: Columns) -> Iterator[Finding]:
         size = max(1.0, abs(factor)) * float(np.median(np.abs(odometry[is_turning])))
         unexplained = float(np.median(np.abs(left[is_turning]))) / size
         most = _UNEXPLAINED if abs(factor) > _GROSS else _OF_NOTHING
+        if (unexplained > most or abs(factor - 1.0) > _SCALE) and (late_s := _late_s(c)):
+            when = f"{abs(late_s) * 1e3:.0f} ms {'later' if late_s < 0.0 else 'earlier'} than stamped"
+            text = f"{topic.name}: its gyro turns as odometry does {when}: correct its clock"
+            before_s = next(one.offset_s for one in c.config.sources if one.name == c.config.gyro_input)
+            setting = assignment(f"{c.config.gyro_input}.offset_s", round(before_s - late_s, 3))
+            at = where(topic.name, gyro_ns, settings=(setting,))
+            yield Finding("clock_offset", "warning", -late_s, _LEAST_LATE_S, "s", text, **at)
+            return
         if unexplained > most:
             text = f"{topic.name}: odometry's turns do not explain {unexplained:.0%} of those of the gyro"
             yield Finding("gyro_unrelated", "warning", unexplained, most, "part", text, **where(topic.name, gyro_ns))
@@ -55,6 +63,15 @@ def check_gyro(c: Columns) -> Iterator[Finding]:
         text = f"{topic.name}: its gyro turns by {bias:.3f} rad/s where odometry does not"
         settings = (assignment("gyro.bias_sigma", round(abs(bias), 3)),) if abs(bias) < _MOST_BIAS else ()
         yield Finding("gyro_bias", "warning", bias, limit, "rad/s", text, **where(topic.name, gyro_ns, None, settings))
+
+
+def _late_s(c: Columns) -> float:
+    """Return how much too late the gyro is stamped, where odometry's turns are its own only then; else 0."""
+    tried_s = np.arange(-_MOST_LATE_S, _MOST_LATE_S + 0.01, _LEAST_LATE_S / 2.0)
+    turns = (_turns(replace(c, gyro_ns=c.gyro_ns - round(float(late_s) * 1e9))) for late_s in (0.0, *tried_s))
+    now, *left = (1.0 - abs(float(np.corrcoef(*both)[0, 1])) for both in turns)
+    late_s = float(tried_s[int(np.argmin(left))])
+    return late_s if min(left) < 0.2 * now and abs(late_s) >= _LEAST_LATE_S else 0.0
 
 
 def check_doubted(c: Columns, gyro: GyroState | None) -> Iterator[Finding]:

@@ -108,6 +108,15 @@ def steps_of(o: OdometryColumns) -> Steps | None:
     return Steps(index, dt, moved, turned, is_short, *map(_without_jumps, speeds[:, is_short]))
 
 
+def twist_factor(o: OdometryColumns) -> float:
+    """Return how many times as far as its twist says the pose moves; NaN where it has none."""
+    steps = steps_of(o)
+    if steps is None:
+        return np.nan
+    said = np.linalg.norm(o.twist[steps.index[1:], :3], axis=1) * steps.dt
+    return float(np.linalg.norm(steps.moved, axis=1).sum() / said.sum())
+
+
 def of_one_publisher(c: Columns, *, is_live: bool = False) -> Columns:
     """Return these columns without the odometry that other publishers on its topic have sent.
 
@@ -170,7 +179,7 @@ def check_odometry(c: Columns) -> Iterator[Finding]:
         return
     yield from _plane(c, o)
     if np.isfinite(o.twist[steps.index]).all() and o.twist[steps.index].any() and c.config.odometry.noise != "density":
-        yield from _twist(o, steps, jumps)
+        yield from _twist(o, steps, jumps, c.config.odometry.distance_factor)
     if c.config.odometry.noise != "density" and np.isfinite(o.twist).any():
         yield from _covariance(o, steps)
 
@@ -225,7 +234,7 @@ def _plane(c: Columns, o: OdometryColumns) -> Iterator[Finding]:
         yield Finding("not_planar", "warning", share, _OFF_PLANE, "part", text, o.topic, 0, out, settings)
 
 
-def _twist(o: OdometryColumns, steps: Steps, jumps: Mask) -> Iterator[Finding]:
+def _twist(o: OdometryColumns, steps: Steps, jumps: Mask, applied: float) -> Iterator[Finding]:
     """The twist against the pose, over windows of a second: it may hold until or since its message."""
     at = where(o.topic, o.stamp_ns[steps.index], settings=_DENSITY)
     width = max(1, round(_WINDOW_S / float(np.median(steps.dt))))
@@ -259,7 +268,11 @@ def _twist(o: OdometryColumns, steps: Steps, jumps: Mask) -> Iterator[Finding]:
         if total < 1.0 or not np.isfinite(factor):
             continue
         unit = next((why for k, why in _UNITS.items() if abs(factor / k - 1.0) < _SCALE), "")
-        if abs(factor - 1.0) > _SCALE and left < _EXPLAINED and (unit or width >= _LEAST_WIDTH):
+        if (
+            min(abs(factor - 1.0), abs(applied * factor - 1.0)) > _SCALE
+            and left < _EXPLAINED
+            and (unit or width >= _LEAST_WIDTH)
+        ):
             text = f"{o.topic}: the pose moves {factor:.3g} times as far as the {what} of the twist says"
             text += f" ({unit or 'another scale'})"
             yield Finding("twist_scale", "warning", factor, _SCALE, "times", text, **at)

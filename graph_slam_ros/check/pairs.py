@@ -51,6 +51,10 @@ class Pairs:
         apart = np.stack(se3.act(tuple(by.T), tuple(points[self.b].T)), axis=1) - points[self.a]
         return np.linalg.norm(apart[:, : self.dimensions], axis=1)
 
+    def apart_m(self, points: Array, motion: Array | None = None) -> float:
+        """The median of the residuals."""
+        return float(np.median(self.residuals(points, motion)))
+
     @property
     def turned(self) -> Array:
         """(n,) The rotation between both [rad]."""

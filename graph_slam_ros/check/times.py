@@ -121,7 +121,9 @@ def _clocks(c: Columns, topics: dict[str, TopicColumns]) -> Iterator[Finding]:
         apart_s = clock_offset_s(log_ns, lag_s, odometry_log_ns, odometry_lag_s)
         if abs(apart_s) > _CLOCKS_DIFFER_S:
             yield _other_clock(c, topic, of_odometry, apart_s, stamp_ns)
-        elif apart_s < -_EARLY_S:
+        elif apart_s < -_EARLY_S and not any(
+            one.offset_s for one in c.config.sources if one.name in (topic.inputs[0], c.odometry.input)
+        ):  # which somebody has set, and knows better
             text = (
                 f"{topic.name}: recorded {-apart_s * 1e3:.0f} ms before the time in its stamps, compared with "
                 f"{c.odometry.topic}: its clock is ahead"

@@ -7,6 +7,7 @@ import numpy as np
 from graph_slam_ros.check.columns import Columns, SightingColumns
 from graph_slam_ros.check.finding import Finding, Severity, where
 from graph_slam_ros.check.identities import at_two_places, check_identities, check_outliers
+from graph_slam_ros.check.odometry import twist_factor
 from graph_slam_ros.check.pairs import noisier, pairs_of, poses_at
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.parameters import assignment
@@ -23,6 +24,7 @@ from graph_slam_ros.slam.calibration.answers import (
     clock_jumps,
     is_off,
     jump_sentence,
+    ranges_instead,
     sentence,
     setting_of,
 )
@@ -87,6 +89,7 @@ def _points_in_map(c: Columns, s: SightingColumns, slam: GraphSlam, stamp_ns: In
     estimate, own = (se3.in_space(poses).reshape(-1, 7)[order] for poses in (slam.trajectory(), slam.keyframes.poses))
     at_ns, stamp_ns = slam.keyframes.stamps_ns[order], np.clip(stamp_ns, c.path_ns[0], c.path_ns[-1])
     driven = poses_at(stamp_ns, c.path_ns, c.path)
+    own[:, :3] *= c.config.odometry.distance_factor
     after = np.clip(np.searchsorted(at_ns, stamp_ns), 1, len(at_ns) - 1)
     ends = []
     for k in (after - 1, after):
@@ -120,7 +123,7 @@ def check_trial(c: Columns, slam: GraphSlam) -> Iterator[Finding]:
         found += [one for s in c.sightings for one in noisier(s, pairs_of(c, s))]
         yield from found or [_void(fit)]
         return
-    yield from (found_one for one in fitted for found_one in _fitted(c, slam, one, off))
+    yield from (found_one for one in fitted for found_one in _fitted(c, slam, fit, one, off))
     yield from _clock_jumps(c, fit)
     yield from [slip[0]] if slip else []
     if is_broken:
@@ -183,15 +186,22 @@ def _is_far_off(fit: TrialFit, one: Fitted, step_s: float) -> bool:
     return is_off(fit, one) and abs(one.value) > max(limit, sigmas * one.sigma)
 
 
-def _fitted(c: Columns, slam: GraphSlam, one: Fitted, off: Mapping[Parameter, float]) -> Iterator[Finding]:
+def _fitted(
+    c: Columns, slam: GraphSlam, fit: TrialFit, one: Fitted, off: Mapping[Parameter, float]
+) -> Iterator[Finding]:
     """A parameter that is among those that are far off, or that the drive does not tell."""
     topic = c.topic_of(one.parameter.source)
     if one.parameter.name not in _LIMITS or topic is None:
         return
     code, (unit, limit, unknown) = CODES[one.parameter.name], _LIMITS[one.parameter.name]
     if one.parameter in off:
-        text = f"{topic.name}: {sentence(one.parameter, one.value, one.sigma)}"
-        settings = (assignment(*setting_of(one.parameter, off, slam.calibrated)),)
+        settings: tuple[str, ...] = (assignment(*setting_of(one.parameter, off, slam.calibrated)),)
+        of_pose = twist_factor(c.odometry) * c.config.odometry.distance_factor
+        is_pose = abs(of_pose * (1.0 + one.value) - 1.0) < limit < abs(of_pose - 1.0)  # by its twist
+        is_open = code == "odometry_scale" and not is_pose
+        if ranges := ranges_instead(fit, one.value, slam.calibrated) if is_open else "":
+            ranges, settings = f"{ranges} instead of --set {settings[0]}", ()
+        text = f"{topic.name}: {sentence(one.parameter, one.value, one.sigma, ranges)}"
         at = where(topic.name, topic.stamp_ns, settings=settings)
         yield Finding(code, "warning", one.value, limit, unit, text, **at)
     elif one.sigma > unknown:

@@ -8,7 +8,6 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
-from graph_slam_ros.check.finding import KINDS
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.measurements.reasons import explain, remedy
 from graph_slam_ros.messages.inputs.transforms import MAP_FRAMES
@@ -222,7 +221,8 @@ def _refused(one: InputFacts) -> str:
     if recent.worst in _UNLINKED and one.frames:
         meaning = "no transform links " + ", ".join(f"{frame[:_LONGEST]} to {robots}" for frame, robots in one.frames)
     if recent.worst == "odom_frame_unknown" and any(frame in MAP_FRAMES for frame, _ in one.frames):
-        meaning, mend = KINDS["odometry_in_map"].meaning, f"{one.name}.topic:=TOPIC, that of the wheels"
+        meaning = "odometry is given in the frame of a map, so it is the output of a localiser"
+        mend = f"{one.name}.topic:=TOPIC, that of the wheels"
     much = "all" if recent.is_nothing_used else f"{recent.times} of {recent.came}"
     return f"{much} refused in {WINDOW_S:.0f} s ({recent.worst}): {meaning}{mend and ': '}{mend}"
 

@@ -89,11 +89,7 @@ def _word(value: Any) -> Any:
 
 
 class WholePath:
-    """All keyframes of a pipeline, those that were condensed included, in order of time.
-
-    Parameters
-    ----------
-    left : the part that has left the map
+    """All keyframes of a pipeline, with those ``left`` behind as they were condensed, in order of time.
 
     Attributes
     ----------

@@ -310,11 +310,8 @@ def keep_earlier(folder: Path, most: int, loaded: Path | None = None) -> Path | 
     """Move an earlier run away, to ``folder-1`` or the next number. A limited number of them is kept.
 
     Returns where it is now; None if there is none to keep. An empty run is not kept. A run that never ended, or that an
-    earlier version wrote, is always kept. Of older ones the files of the run are removed, and nothing else.
-
-    Parameters
-    ----------
-    loaded : the run whose map is gone on in, or is to be: it stays
+    earlier version wrote, is always kept, and so is ``loaded``, whose map is gone on in. Of older ones the files of the
+    run are removed, and nothing else.
     """
     is_of_earlier_version = is_run(folder) and not _is_marked(folder)
     most = max(most, is_cut_off(folder) or is_incomplete(folder) or is_of_earlier_version)

@@ -220,12 +220,7 @@ def _rest(folder: Path, processed: int, used_ns: int | None, losses: list[str]) 
 
 
 def read_records(folder: Path, name: str, losses: list[str], kind: str = "") -> Iterator[dict[str, Any]]:
-    """Records in the order of writing, up to the first that cannot be read. What is lost adds to ``losses``.
-
-    Parameters
-    ----------
-    kind : records of this ``type`` alone
-    """
+    """Records (of a ``type``) as they were written, up to the first that cannot be read; that adds to ``losses``."""
     for file, of, message in _messages(folder, name, losses):
         if not kind or of == kind:
             yield _decoded(file, message)

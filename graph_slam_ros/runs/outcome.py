@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
-from graph_slam_ros.check.finding import KINDS
+from graph_slam_ros.check.finding import FOLLOWS, KINDS
 from graph_slam_ros.measurements.reasons import Effect, explain, remedy
 from graph_slam_ros.runs.tables import INPUT_COLUMNS
 from graph_slam_ros.slam.frontend.gyro import GyroState
@@ -44,6 +44,7 @@ _NOT_CONVERGED = (
     "the estimate is not at its optimum: --set solve.max_iterations=1000. If that does not help, measurements that are "
     "believed contradict each other: graph_slam explain RUN lists those that fit worst"
 )
+_CONTRADICTED = "measurements contradict each other, so more iterations do not help: graph_slam explain RUN says which"
 _EXTREME = "distances or noise that no robot means do that: --set INPUT.max_distance_m=... or INPUT.noise=sigmas"
 
 
@@ -191,8 +192,9 @@ def shortcomings(summary: Summary) -> Iterator[str]:
     yield from causes
     if summary.get("failing"):
         yield f"the last solve failed ({summary['failing']}), and the estimate is the one before it: {_EXTREME}"
-    elif not summary.get("converged", True):
-        yield f"the last solve did not converge ({summary['stop']}): {_NOT_CONVERGED}"
+    elif not (summary.get("converged", True) or causes):
+        is_doubtful = any(_believed(counts) < 1.0 - _DOUBTED for counts in inputs.values())
+        yield f"the last solve did not converge ({summary['stop']}): {_CONTRADICTED if is_doubtful else _NOT_CONVERGED}"
     if stopped := sum(reasons.get("stopped", 0) for reasons in summary["counters"].values()):
         yield f"time jumped back, and time.on_jump is stop: {stopped} measurements after it were refused: {_ON_JUMP}"
     for name, counts in inputs.items():
@@ -207,7 +209,8 @@ def shortcomings(summary: Summary) -> Iterator[str]:
             counted = summary["counters"].get(name, {})
             yield from filter(None, (leaves_plane(name, counted, counts["received"] or counts["used"]),))
         jumps = sum(of.get("jump", 0) for one, of in summary["counters"].items() if one.partition("#")[0] == name)
-        if is_odometry and jumps > max(_MOST_JUMPS, _JUMPY * (counts["received"] or counts["used"])):
+        most = max(_MOST_JUMPS, _JUMPY * (counts["received"] or counts["used"]))
+        if is_odometry and jumps > most and "jump" not in _cause(summary)[1]:
             yield (
                 f"{name}: {jumps} jumps, each begins a segment, and the motion across it is not used: odometry in "
                 "metres and radians? A robot as fast as that: --set odometry.max_speed_m_s=..."
@@ -294,9 +297,9 @@ def doubts(summary: Summary) -> Iterator[str]:
                 "topic and an input of its own (inputs.names); one that jumps: is it in metres and radians?"
             )
     for name, counts in summary.get("inputs", {}).items():
-        if counts["use"] in MOTION or not counts["used"] or name == _cause(summary):
+        if counts["use"] in MOTION or not counts["used"] or name == _cause(summary)[0]:
             continue
-        accepted = (counts["believed"] or 0) / counts["used"]
+        accepted = _believed(counts)
         if _MOSTLY <= accepted < 1.0 - _DOUBTED:
             part, hint = 100.0 * (1.0 - accepted), _CONTRADICT.format(name)
             yield f"{name}: {part:.0f} % of {counts['used']} are not believed: {hint}"
@@ -313,9 +316,15 @@ def _is_mostly_refused(summary: Summary, name: str) -> bool:
     return bool(refused > _MOSTLY * (refused + summary["inputs"][name]["used"]))
 
 
-def _cause(summary: Summary) -> str:
-    """Return the input that the finding of the recording is of."""
-    return str((summary.get("check") or {}).get("evidence", {}).get("input", ""))
+def _believed(counts: Mapping[str, Any]) -> float:
+    """Return which part of the measurements of an input is believed; all of odometry, and of none."""
+    return 1.0 if counts["use"] in MOTION or not counts["used"] else (counts["believed"] or 0) / counts["used"]
+
+
+def _cause(summary: Summary) -> tuple[str, tuple[str, ...]]:
+    """Return the input that the finding of the recording is of, and what follows from it."""
+    found = summary.get("check") or {}
+    return found.get("evidence", {}).get("input", ""), FOLLOWS.get(found.get("code", ""), ())
 
 
 def _uncorrected(summary: Summary) -> Iterator[str]:
@@ -326,7 +335,7 @@ def _uncorrected(summary: Summary) -> Iterator[str]:
 
 def renewed_text(found: str) -> str:
     """Return that all ids are new from some time on, and what mends it."""
-    return f"ids_renewed: {found} {KINDS['ids_renewed'].mend}"
+    return f"ids_renewed: {found} {KINDS['ids_renewed']}"
 
 
 def condensed_text(summary: Mapping[str, Any]) -> str:
@@ -390,6 +399,8 @@ def _because(summary: Summary, name: str, counted: Mapping[str, int]) -> str:
 
 def _remedy(summary: Summary, name: str, reason: str) -> str:
     """Return what mends a reason; of a frame that is unknown since transforms name none, what mends the transforms."""
+    if reason in _cause(summary)[1]:
+        return ""
     empty = [one for one in ("tf", "tf_static") if summary["counters"].get(one, {}).get("frame_empty")]
     return remedy(empty[0], "frame_empty") if empty and reason == "frame_unknown" else remedy(name, reason)
 

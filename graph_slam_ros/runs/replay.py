@@ -274,7 +274,7 @@ def _recorded(
             state, took = None, stopwatch()
         refused = Counters()
         measured, name = _measured(run, runs, number, refused), source.resolve().name
-        options: dict[str, Any] = {"recording": name, "took": took, "more": lambda: _checked(columns, counters)}
+        options: dict[str, Any] = {"recording": name, "took": took, "more": lambda: _checked(columns, counters, bag)}
         slam, summary = record_run(out, config, measured, bag.losses, state, border=refused, force=force, **options)
         warnings += _warnings(slam, summary)
     return Replayed(
@@ -282,16 +282,17 @@ def _recorded(
     )
 
 
-def _checked(columns: Collector, counters: Counters) -> dict[str, Any]:
+def _checked(columns: Collector, counters: Counters, bag: Bag) -> dict[str, Any]:
     """The worst finding of the recording so far, from the checks that need no fit."""
-    found = worst_of_replay(columns.columns(counters))
+    found = worst_of_replay(columns.columns(counters), is_damaged=bool(bag.losses))
     return {} if found is None else {"check": found.as_dict()}
 
 
 def _warnings(slam: GraphSlam, summary: dict[str, Any]) -> list[str]:
+    is_late = any(one["code"] == "clock_offset" for one in summary.get("uncorrected", ()))  # then the robot seems moved
     return [
         *doubts(summary),
-        *(str(one) for one in slam.alarms if not is_explained(summary) and not is_undecided(asdict(one))),
+        *(str(one) for one in slam.alarms if not (is_late or is_explained(summary) or is_undecided(asdict(one)))),
         *unscaled(summary),
         *mendable(summary["counters"]),
     ]

@@ -53,14 +53,7 @@ Verdict = Literal["admitted", "nothing_to_correct", "not_determined", "not_repro
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """The judged result of a trial fit for one parameter.
-
-    Attributes
-    ----------
-    value, sigma : of the correction
-    verdict : whether it is let in, and else why not
-    text : the verdict with its reason, for a person
-    """
+    """The judged result of a trial fit for one parameter, with the reason of the verdict for a person."""
 
     parameter: Parameter
     value: float
@@ -300,7 +293,7 @@ def uncorrected(
     out = []
     for one, value in values.items():
         sigma, shift = found.sigma(one), float(shifts[found.parameters.index(one)])
-        text = sentence(one, value, sigma)
+        text = sentence(one, value, sigma, ranges_instead(found, value, total))
         text += ", more than its stated noise allows for (odometry.noise)" * (one.name in OF_ODOMETRY)
         setting = setting_of(one, values, total)
         out.append(Uncorrected(CODES[one.name], one.source, value, sigma, shift, text, setting))
@@ -323,7 +316,7 @@ def clock_jumps(found: TrialFit) -> Iterator[tuple[Parameter, float, float, floa
     for k, one in enumerate(found.parameters):
         before, after, sigma = float(found.first[k]), float(found.second[k]), 2.0**0.5 * float(sigmas[k])
         limit = max(_JUMPED_S, 2.0**0.5 * SIGMAS * sigma)
-        if one.name == "clock" and abs(after - before) > limit:
+        if one.name == "clock" and found.lost <= MOST_LOST and abs(after - before) > limit:
             yield one, before, after, sigma, limit
 
 
@@ -361,8 +354,14 @@ def _too_sure(found: TrialFit, shifts: Array, sigma_per_m: float) -> list[Uncorr
     return [Uncorrected(*more, ("odometry.noise", "motion"))]
 
 
-def sentence(one: Parameter, value: float, sigma: float) -> str:
-    """Say what is off, with its sigma."""
+def ranges_instead(found: TrialFit, distance: float, total: Total) -> str:
+    """Return the settings by which ranges are wrong, where the distance of odometry may be right."""
+    by = {one.source: total(one.source, "range_factor") for one in found.parameters if one.name == "yaw"}
+    return " ".join(f"--set {name}.range_factor={now / (1.0 + distance):.4g}" for name, now in by.items())
+
+
+def sentence(one: Parameter, value: float, sigma: float, ranges: str = "") -> str:
+    """Say what is off, with its sigma, and for the distance of odometry, what is right if ranges are wrong."""
     if one.name == "clock":
         when, other = ("later", "late") if value > 0.0 else ("earlier", "early")
         best = f"{abs(value) * 1e3:.0f} ms {when} than stamped (sigma {sigma * 1e3:.0f} ms)"
@@ -381,7 +380,8 @@ def sentence(one: Parameter, value: float, sigma: float) -> str:
         return f"ranges are {abs(value):.2f} m too {'short' if value > 0.0 else 'long'} (sigma {sigma:.2f} m)"
     what = "drives" if one.name == "distance" else "turns"
     text = f"the robot {what} {1.0 + value:.3f} times what odometry says (sigma {sigma:.3f})"
-    return f"{text}, or ranges are wrong by that factor" if one.name == "distance" else text
+    tells = f" ({ranges}; a measured way, or the size of a tag, tells)" * bool(ranges)
+    return f"{text}, or ranges are wrong by that factor{tells}" if one.name == "distance" else text
 
 
 def setting_of(one: Parameter, values: Values, total: Total) -> tuple[str, Any]:

