@@ -6,7 +6,8 @@ sources, of what compiles them, its settings and the processor. Copies of the pa
 Comments, docstrings and line breaks are no part of the code.
 
 A wheel brings such a folder as an archive, ``kernels-DIGEST.zip``, for a processor that most machines can stand for.
-It is unpacked into the user's cache; where it is for another Numba or an older processor, kernels are compiled.
+It is unpacked into the user's cache; where it is for another Numba or an older processor, kernels are compiled. Sums
+over wide fronts differ in their last digits between processors: bytes repeat with one wheel, or on one machine.
 """
 
 import ast
@@ -184,8 +185,7 @@ def kernel(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
 
     A kernel that calls BLAS (wide fronts) may use more threads there. The same bytes every time need one.
     """
-    # nothing here is called through a pointer, as SciPy would
-    settings = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True} | options
+    settings = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True} | options  # no call by a pointer
     compiled: Any = numba.njit(**settings)(function)  # type: ignore[call-overload]
     if compiled is not function:  # it is where compilation is switched off
         compiled._cache = _Cache(function)  # type: ignore[no-untyped-call]
