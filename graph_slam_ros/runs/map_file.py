@@ -33,7 +33,7 @@ from graph_slam_ros.measurements.edits import applied_edit
 from graph_slam_ros.measurements.types import Sighting, sighting_record
 from graph_slam_ros.recordings.mcap_records import LIBRARY, records
 from graph_slam_ros.runs.journal import START
-from graph_slam_ros.slam.calibration.recalibration import read_totals, totals_record
+from graph_slam_ros.slam.frontend.corrections import read_totals
 from graph_slam_ros.slam.frontend.gyro import SavedBias
 from graph_slam_ros.slam.frontend.keyframes import Keyframe, SightingPose
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
@@ -175,7 +175,7 @@ def _told(state: MapSnapshot) -> Told:
         "used": [state.used_ns, state.source],
         "drive": state.drive,
         "noise": factors_record(state.noise_factors),
-        "calibration": totals_record(state.calibration),
+        "calibration": factors_record(state.calibration),
         "edits": [one.record for one in state.edits],
         "gyro": None if state.gyro_bias is None else astuple(state.gyro_bias),
         "condensed": None if bounded is None else _condensed(bounded),

@@ -9,12 +9,10 @@ from collections.abc import Mapping
 import numpy as np
 
 from graph_slam_ros.config.config import Config
-from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.calibration.answers import Finding, of_association
-from graph_slam_ros.slam.calibration.model import MeasurementModel, factors_of
+from graph_slam_ros.slam.calibration.model import MeasurementModel, OdometryEdges, Sightings, factors_of
 from graph_slam_ros.slam.calibration.parameters import Parameter, Values
-from graph_slam_ros.slam.calibration.recalibration import Recalibration
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
 from graph_slam_ros.slam.landmarks.landmark_frontend import LandmarkFrontend
 from graph_slam_ros.slam.snapshot import MapSnapshot
@@ -42,10 +40,9 @@ class FoundFactors:
         backend: Backend,
         frontend: KeyframeFrontend,
         landmarks: LandmarkFrontend,
-        counters: Counters,
         start: MapSnapshot | None = None,
     ) -> None:
-        self._config, self._backend, self._frontend, self._counters = config, backend, frontend, counters
+        self._config, self._backend, self._frontend = config, backend, frontend
         self._origins, self._anonymous = landmarks.map.origins, landmarks.anonymous
         self.corrected: list[Finding] = []
         self._is_new = start is None or not start.keyframe_count
@@ -83,51 +80,46 @@ class FoundFactors:
         self, model: MeasurementModel, values: Values, keyframe: int, everything: Settings | None
     ) -> Report | None:
         """Correct all measurements, present and future, and solve. A failure is undone."""
-        backend, corrections = self._backend, self._frontend.corrections
-        before, start = corrections.found, backend.solver.values
-        changes, origins = self._changes(model, values)
-        undo = [change.apply(backend.graph) for change in changes]
-        try:
-            corrections.found = before | {
-                (one.source, one.name): before.get((one.source, one.name), 1.0) * (1.0 + value)
-                for one, value in values.items()
-            }
+        corrections, origins = self._frontend.corrections, list[tuple[Index, Array]]()
+        before = corrections.found
+        corrections.found = before | {
+            (one.source, one.name): before.get((one.source, one.name), 1.0) * (1.0 + value)
+            for one, value in values.items()
+        }
+
+        def solved() -> Report:
+            backend = self._backend
+            origins.extend(self._rewrite(model, values))
             backend.solver.rebuild()
             report = backend.solver.optimize(everything)
-            if backend.decisions.reclassify(keyframe):
-                report = backend.solver.optimize(everything)
-        except Exception as error:
-            self._counters.count_failure("calibration", error)
+            return backend.solver.optimize(everything) if backend.decisions.reclassify(keyframe) else report
+
+        report = self._backend.revise("calibration", solved)
+        if report is None:
             corrections.found = before
-            for change in undo:
-                change.apply(backend.graph)
-            backend.solver.start_at(start)
-            backend.solver.rebuild()
             return None
         for rows, poses in origins:
             self._origins.move(rows, poses)
         self._anonymous.rescale(factors_of(values))
-        backend.cancel_search()
+        self._backend.cancel_search()
         return report
 
-    def _changes(
-        self, model: MeasurementModel, values: Values
-    ) -> "tuple[list[Recalibration], list[tuple[Index, Array]]]":
-        """Return the corrected measurements of all edges, and the corrected origins of sightings."""
-        changes, origins = [], []
+    def _rewrite(self, model: MeasurementModel, values: Values) -> list[tuple[Index, Array]]:
+        """Correct what all edges have measured. Returns the corrected origins of sightings."""
+        changes: list[tuple[OdometryEdges | Sightings, Array, Array]] = []
+        origins = []
         for odometry in model.odometry:
-            z = _exact(model.measured(odometry, values))
-            changes.append(Recalibration(odometry.table.type.name, odometry.rows, z, odometry.roots))
+            changes.append((odometry, _exact(model.measured(odometry, values)), odometry.roots))
         for seen in model.sightings:
             T_keyframe_base = model.scaled(tuple(seen.T_keyframe_base.T), values)
             z = _exact(model.from_pose(seen, seen.seen, T_keyframe_base))
-            roots = _exact(model.roots_from_pose(seen, T_keyframe_base))
-            changes.append(Recalibration(seen.table.type.name, seen.rows, z, roots))
+            changes.append((seen, z, _exact(model.roots_from_pose(seen, T_keyframe_base))))
             places = self._origins.places(seen.table.id.values[seen.rows])
             known = places >= 0
             origins.append((places[known], _exact(np.stack(T_keyframe_base, axis=-1)[known])))
-        changed = [change.only_changed(self._backend.graph) for change in changes]
-        return [one for one in changed if len(one.rows)], origins
+        for edges, z, roots in changes:
+            edges.table.measured.values[edges.rows], edges.table.sqrt_information.values[edges.rows] = z, roots
+        return origins
 
 
 def _exact(numbers: Array) -> Array:

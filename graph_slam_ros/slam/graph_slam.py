@@ -91,7 +91,7 @@ class GraphSlam(MapView):
         self._sink, self._faults = sink or (lambda measurement: None), list[Exception]()
         self._edits = Edits(backend, frontend, landmarks.map, counters)
         landmarks.map.aliases = aliases(backend.edits)
-        self._found_factors = FoundFactors(config, backend, frontend, landmarks, counters, start)
+        self._found_factors = FoundFactors(config, backend, frontend, landmarks, start)
         first = start.keyframe_count if start is not None else 0
         self._trials = TrialFits(config, backend, frontend, landmarks, kidnaps, counters, executor, first)
         if start is not None and start.keyframes:

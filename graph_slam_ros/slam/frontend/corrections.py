@@ -4,8 +4,9 @@
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -184,3 +185,11 @@ class Corrections:
 def _square(flat: Numbers) -> Array:
     size = math.isqrt(len(flat))
     return np.array(flat).reshape(size, size)
+
+
+def read_totals(record: Sequence[Any]) -> dict[Key, float]:
+    """Read values by input and name from plain lists. Raises ValueError if one is not finite."""
+    totals = {(str(source), str(name)): float(value) for source, name, value in record}
+    if not all(map(math.isfinite, totals.values())):
+        raise ValueError(f"a calibration is not finite: {record}")
+    return totals

@@ -217,8 +217,8 @@ def groups(graph: Graph, edges: range) -> Iterator[tuple[EdgeTable, Index, str, 
                 yield table, rows, label, graph.sources[origin]
 
 
-def factors_record(factors: Mapping[Key, float]) -> list[list[Any]]:
-    """Return factors by group as plain lists, for JSON."""
+def factors_record(factors: Mapping[Any, float]) -> list[list[Any]]:
+    """Return factors by their names as plain lists, for JSON."""
     return [[*key, factor] for key, factor in factors.items()]
 
 
