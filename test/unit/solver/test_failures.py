@@ -9,15 +9,7 @@ from online import BATCH, EXACT, check_tree
 from rows import each
 
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.graph import (
-    DIFFERENCE,
-    POINT_PRIOR,
-    R1,
-    EdgeType,
-    Gaussian,
-    Graph,
-    edge_from_residual,
-)
+from graph_slam_ros.graph import DIFFERENCE, POINT_PRIOR, R1, EdgeType, Gaussian, Graph, edge_from_residual
 from graph_slam_ros.solver import Settings, Solver
 
 UNIT = Gaussian.from_sigmas(1.0)
