@@ -19,6 +19,7 @@ from graph_slam_ros.typing import Array, Index
 
 _FAR_ABOVE = 2.0  # times its degrees of freedom: chi2 of an optimum is about as large as these, or smaller
 _UNLIKELY = 1e-3  # that one edge of a graph has so large a residual by chance
+_ALIKE = 0.01  # squared, how much smaller these may be
 _UNEVEN, _SEVERAL = 10.0, 10  # mean over median of what so many closures or more have as chi2: in an optimum 1 to 4
 _NO_RESIDUAL = 1e-6  # chi2 for each number measured: less is rounding
 _MOST_TIMES, _MOST_S, _QUIET_S = 5.0, 10.0, 2.0  # of the first solution, and seconds, that others may take together
@@ -190,13 +191,15 @@ def _judged(solution: Solution, settings: Settings) -> Solution:
     has_loss = graph.has_label(edges, [label for label in graph.labels if settings.last_loss(label, "").kind])
     gone, far = int((unlikely & has_loss).sum()), np.flatnonzero(unlikely & ~has_loss)
     freedom, kept = freedom - int(numbers[unlikely & has_loss].sum()), float(chi2[~(unlikely & has_loss)].sum())
+    some = [np.square(graph.edge(edge).sqrt_information).sum(axis=0).mean() for edge in edges[:1000].tolist()]
+    stated = float(np.median(some)) if some else 0.0  # in a covariance, about as large as squared residuals
     if not solution.report.converged:
         doubt = f"it did not converge ({solution.report.stop}){_hint(solution.file, edges)}"
     elif 2 * gone > has_loss.sum():
         doubt = f"the loss lets go of {gone} of {has_loss.sum()} edges"
     elif freedom > 0 and kept > max(_FAR_ABOVE * freedom, chdtri(freedom, _UNLIKELY)):
         doubt = f"chi2 {kept:.6g} is far above its {freedom} degrees of freedom{_hint(solution.file, edges)}"
-    elif freedom > 0 and 1e-9 < solution.report.chi2_final / freedom < 1e-3:  # without noise 1e-11, public graphs 0.01
+    elif freedom > 0 and _ALIKE * stated**2 < kept / freedom < 1e-3:
         doubt = f"chi2 {solution.report.chi2_final:.6g} is far below its {freedom} degrees of freedom{_COVARIANCE}"
     elif len(far):
         worst = far[np.argmax(chi2[far] / numbers[far])]
@@ -211,7 +214,7 @@ def _hint(file: G2oFile, edges: Index) -> str:
     turned = [one for one in some if len(one.measured) == 7 and abs(one.measured[3]) > abs(one.measured[6])]
     if 2 * len(turned) > len(some):
         return _W_FIRST
-    return _DEGREES if any("relative pose" in one.type.name and abs(one.measured[2]) > 7.0 for one in some) else ""
+    return _DEGREES if any(one.type.name == "relative pose" and abs(one.measured[2]) > 7.0 for one in some) else ""
 
 
 def edge_text(file: G2oFile, edge: int) -> str:

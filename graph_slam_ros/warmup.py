@@ -211,10 +211,7 @@ _STRUCTURE = (
     *(ordering.move_tail, ordering.dissect, incremental.regroup, incremental.reset),
     *(incremental.relinearize, incremental.reach_back, storage.compact),
 )
-_NUMBERS = (
-    *(numeric.eliminate, substitution.substitute, incremental.solve, updates.update),
-    covariance.joint,
-)
+_NUMBERS = (*(numeric.eliminate, substitution.substitute, incremental.solve, updates.update), covariance.joint)
 
 
 def _compile_structure() -> None:

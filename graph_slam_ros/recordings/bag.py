@@ -166,7 +166,7 @@ def _part(file: Path) -> Part:
             raise BagError(f"{file}: {_unpacking(file, codec)}")
     if begins[_TAR_AT:].startswith(b"ustar"):
         raise BagError(f"{file}: {_unpacking(file, 'tar')}")
-    raise BagError(f"{file}: not a readable recording: it begins as neither mcap, sqlite3 nor a ROS 1 bag")
+    raise BagError(f"{file}: not a readable recording: neither mcap, sqlite3 nor ROS 1 (a graph: graph_slam optimize)")
 
 
 # By how a file begins. rosbags reads whole files alone, and of a damaged one nothing.

@@ -89,6 +89,7 @@ READ = {  # content, exit code, what is said, edges of each class
     "false closures": (FALSE, 3, "wrong edges, which --loss cauchy lets go of", BOTH | {"closures": 11}),
     "w first": (W_FIRST, 3, "does w come first in its quaternions?", BOTH | {"closures": 1}),
     "covariances": (TIGHT.replace("e7", "e-4"), 3, "is a covariance given as information?", BOTH),
+    "small residuals": (re.sub(r"(\d\.\d\d)\d+", r"\1", PLAIN).replace(INFO[2], "1 0 0 1 0 1"), 0, "", BOTH),
     "degrees": (DEGREES, 3, "are its angles in degrees? g2o has radians", BOTH),
     "unknown edges alone": (PLAIN.replace("EDGE_", "EDGE_MY_"), 2, "23 EDGE_MY_SE2: of an unknown kind, so", None),
     "too short": (f"{PLAIN}EDGE_SE2_MAXMIX 1 9 90 1 0 0 1\n", 2, "EDGE_SE2_MAXMIX, read as EDGE_SE2, needs", None),
@@ -131,6 +132,7 @@ def test_the_remedies_mend(tmp_path, capsys):
     code, out, _ = solved(path, TIGHT, capsys)
     worst = r"next: the worst edges; if all fit alike, noise is [3-9]\d\d? times"
     assert code == 3 and re.match(worst, out.splitlines()[-1])
+    assert main(["info", str(path)]) == 2 and "(a graph: graph_slam optimize)" in capsys.readouterr().err
     assert "next: write qx qy qz qw in the file" in solved(path, W_FIRST, capsys, "--max-iterations", "1")[1]
 
 
