@@ -569,4 +569,4 @@ def test_T12_P4_a_disk_that_fails_at_any_call_is_told_of_and_loses_nothing(memor
         tell("io_error_at_nth_call", tried=tried, faults=tried, failed=len(wrong))
         assert not wrong
         recovered += went_on
-    assert recovered > tried / 20  # recording was seen to fail, and to go on
+    assert recovered > (tried / 20 if IS_LONG else 0)  # recording was seen to fail, and to go on
