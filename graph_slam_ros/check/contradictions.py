@@ -161,7 +161,7 @@ def _mirrored(c: Columns, s: SightingColumns, pairs: Pairs, noise_m: float) -> F
     turns = pairs.turned > _TURNED_RAD
     if turns.sum() < _LEAST_TURNED:
         return None
-    turning = replace(pairs, a=pairs.a[turns], b=pairs.b[turns], motion=pairs.motion[turns])
+    turning = pairs.some(turns)
     if (now_m := turning.apart_m(s.points)) <= min(_NOISES * noise_m, _NEAR_M):
         return None
     others = {what: turning.apart_m(points) for what, points in _hypotheses(s).items()}
@@ -186,16 +186,17 @@ def _mirrored(c: Columns, s: SightingColumns, pairs: Pairs, noise_m: float) -> F
 def _axes(s: SightingColumns, pairs: Pairs, noise_m: float, use: Mask) -> Finding | None:
     if (now_m := pairs.apart_m(s.points)) <= min(_NOISES * noise_m, _NEAR_M):
         return None
-    points, mounts = _hypotheses(s), _mounts(s)
+    points, mounts, turning = _hypotheses(s), _mounts(s), pairs.some(pairs.turned > _TURNED_RAD)
     del points[MIRRORED]
-    left = {what: pairs.apart_m(there) for what, there in points.items()}
-    if pairs.dimensions == 2 and (pairs.turned > _TURNED_RAD).sum() >= _LEAST_TURNED:
+    both = (pairs, turning) if len(turning.a) >= _LEAST_TURNED else (pairs,)  # along a line another fits, too
+    left = {what: max(some.apart_m(there) for some in both) for what, there in points.items()}
+    if pairs.dimensions == 2 and len(both) > 1:
         starts = {"turned": tuple(s.T_base_frame), **{what: mounts[what] for what in (_AHEAD, _OPTICAL)}}
         for axes, start in starts.items():
             mount = _fitted(s, pairs, start)
             what = f"{axes}, and the sensor is at x {mount[0]:.2f}, y {mount[1]:.2f} m"
             points[what], mounts[what] = _placed(s, mount), mount
-            left[what] = _NEARLY * pairs.apart_m(points[what])
+            left[what] = _NEARLY * max(some.apart_m(points[what]) for some in both)
     what = min(left, key=lambda one: left[one])
     if not _explains(left[what], now_m, noise_m) or left[what] >= _RELATED * _of_others(points[what], pairs, use):
         return None  # in the plane some axes hide any distance

@@ -6,7 +6,7 @@ as the robot turns to the left.
 
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ import numpy as np
 from graph_slam_ros.check.columns import Columns, SightingColumns
 from graph_slam_ros.check.finding import Finding, where
 from graph_slam_ros.lie import se2, se3, so3
-from graph_slam_ros.typing import Array, Index
+from graph_slam_ros.typing import Array, Index, Mask
 
 LATER_S = 6.0
 """Most time between both."""
@@ -50,6 +50,10 @@ class Pairs:
         by = self.motion if motion is None else motion
         apart = np.stack(se3.act(tuple(by.T), tuple(points[self.b].T)), axis=1) - points[self.a]
         return np.linalg.norm(apart[:, : self.dimensions], axis=1)
+
+    def some(self, which: Mask) -> "Pairs":
+        """Return some of the pairs."""
+        return replace(self, a=self.a[which], b=self.b[which], motion=self.motion[which])
 
     def apart_m(self, points: Array, motion: Array | None = None) -> float:
         """The median of the residuals."""
@@ -191,14 +195,10 @@ def _changes(
     moved_between: Callable[[Any, Any], float],
     changed: Callable[[float, float], float] = lambda a, b: b - a,
 ) -> Array:
-    """Return the change of what is measured of each landmark, per metre or radian that the robot has moved.
+    """Return the change of what is measured (k,) of each landmark, per metre or radian that the robot has moved.
 
-    Parameters
-    ----------
-    chosen, measured : (m,) the sightings that count; (k,) of all sightings
-    at : (m, ...) the pose of the robot at each chosen sighting, or a part of it
-    later_s, least : how long after one sighting another may be, and how far the robot has moved in between
-    moved_between, changed : the motion between two of ``at``, and the change between two measured values
+    ``at`` is where it is at each ``chosen`` sighting, ``moved_between`` the motion between two of these, ``least`` in
+    so many seconds.
     """
     found = []
     for name in np.unique(s.name[chosen]):

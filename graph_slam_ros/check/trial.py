@@ -34,11 +34,11 @@ from graph_slam_ros.slam.calibration.parameters import Parameter
 from graph_slam_ros.slam.noise_scale import LARGEST, NoiseScale
 from graph_slam_ros.typing import Array, Index
 
-_THIN_NS = 80_000_000
-_APART_S = 1.0
+_THIN_NS, _APART_S = 80_000_000, 1.0
 _COARSE = {"solve.every_keyframes": 20, "odometry.doubt": False, "map.condense": False}  # a fit needs all keyframes
 _SIGMAS = 4.0
 _TURN_SIGMAS = 6.0  # a wheel's noise that lasts adds up in heading, which neither sigma of a fit knows
+_RECORDED_S, _EARLY_S = 5.0, 0.15  # by one clock, and before what a stamp says
 _OF_STEP = 0.25  # of the time between two poses of odometry
 _DEGREE = np.pi / 180.0
 # By parameter: unit, limit, and from which sigma on it is not observable.
@@ -57,10 +57,9 @@ _OF_A_BREAK = ("ids_unsure", "map_breaks", "landmark_moved")  # a robot that was
 _MOST, _SHIFTS = 0.9, 2.0
 
 _TOGETHER = 5  # steps between keyframes that are summed for a slip: one is as rough as its landmarks
-_LEAST_WINDOWS = 20
 _SIGMA = 1.4826  # of a median absolute deviation
 _SLIP_SIGMAS, _PART = 6.0, 0.1
-_LEAST_M, _LEAST_RAD = 0.15, 0.3
+_LEAST_M, _LEAST_RAD, _LEAST_WINDOWS = 0.15, 0.3, 20
 _LARGE_SIGMAS, _LARGE_M, _LARGE_RAD = 12.0, 0.5, 0.8
 
 
@@ -201,6 +200,9 @@ def _fitted(
         is_open = code == "odometry_scale" and not is_pose
         if ranges := ranges_instead(fit, one.value, slam.calibrated) if is_open else "":
             ranges, settings = f"{ranges} instead of --set {settings[0]}", ()
+        lag_s, own = float(np.median(topic.log_ns - topic.stamp_ns)) * 1e-9, c.odometry.input
+        if code == "clock_offset" and -_RECORDED_S < lag_s < one.value - _EARLY_S:  # none is recorded before it is seen
+            settings = (assignment(f"{own}.offset_s", round(slam.calibrated(own, "clock") - one.value, 3)),)
         text = f"{topic.name}: {sentence(one.parameter, one.value, one.sigma, ranges)}"
         at = where(topic.name, topic.stamp_ns, settings=settings)
         yield Finding(code, "warning", one.value, limit, unit, text, **at)
@@ -249,11 +251,8 @@ def check_slips(c: Columns, slam: GraphSlam) -> tuple[Finding, int] | None:
     """Find the stretch in which odometry is worst, if it is far worse there than in the rest of the drive.
 
     The errors of odometry's motion are summed over a few steps between keyframes. Their scale is that of the middle
-    half of them, so a wrong factor, which all of them have, is none.
-
-    Returns
-    -------
-    The finding, from the stamp on at which the stretch begins, and the stamp at which it ends.
+    half of them, so a wrong factor, which all of them have, is none. Returned are the finding, from the stamp on at
+    which the stretch begins, and the stamp at which it ends.
     """
     errors, size, stamps_ns = _errors(slam)
     if len(errors) < _LEAST_WINDOWS:

@@ -297,12 +297,15 @@ def doubts(summary: Summary) -> Iterator[str]:
                 "topic and an input of its own (inputs.names); one that jumps: is it in metres and radians?"
             )
     for name, counts in summary.get("inputs", {}).items():
-        if counts["use"] in MOTION or not counts["used"] or name == _cause(summary)[0]:
-            continue
-        accepted = _believed(counts)
-        if _MOSTLY <= accepted < 1.0 - _DOUBTED:
+        accepted, has_cause = _believed(counts), name == _cause(summary)[0] or is_late(summary)
+        if _MOSTLY <= accepted < 1.0 - _DOUBTED and not has_cause:
             part, hint = 100.0 * (1.0 - accepted), _CONTRADICT.format(name)
             yield f"{name}: {part:.0f} % of {counts['used']} are not believed: {hint}"
+
+
+def is_late(summary: Summary) -> bool:
+    """Return whether the clock of an input is off, so that the robot seems to be elsewhere in turns."""
+    return any(one.get("code") == "clock_offset" for one in summary.get("uncorrected", ()))
 
 
 def is_explained(summary: Summary) -> bool:

@@ -20,7 +20,7 @@ from graph_slam_ros.recordings.definitions import recorded_decoder
 from graph_slam_ros.runs.folder import RunError, check_room, is_run, keep_earlier, missing, recording_of, run_config
 from graph_slam_ros.runs.journal import read_measurements
 from graph_slam_ros.runs.map_file import read_start
-from graph_slam_ros.runs.outcome import checked, doubts, is_explained, is_undecided, unscaled
+from graph_slam_ros.runs.outcome import checked, doubts, is_explained, is_late, is_undecided, unscaled
 from graph_slam_ros.runs.restore import Stopwatch, config_of, map_of, record_run, stopwatch
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Measurement
 from graph_slam_ros.slam.frontend.ingest_gate import IngestGate
@@ -289,13 +289,9 @@ def _checked(columns: Collector, counters: Counters, bag: Bag) -> dict[str, Any]
 
 
 def _warnings(slam: GraphSlam, summary: dict[str, Any]) -> list[str]:
-    is_late = any(one["code"] == "clock_offset" for one in summary.get("uncorrected", ()))  # then the robot seems moved
-    return [
-        *doubts(summary),
-        *(str(one) for one in slam.alarms if not (is_late or is_explained(summary) or is_undecided(asdict(one)))),
-        *unscaled(summary),
-        *mendable(summary["counters"]),
-    ]
+    has_cause = is_late(summary) or is_explained(summary)
+    alarms = [] if has_cause else [str(one) for one in slam.alarms if not is_undecided(asdict(one))]
+    return [*doubts(summary), *alarms, *unscaled(summary), *mendable(summary["counters"])]
 
 
 def _kept(out: Path) -> Path:
