@@ -47,7 +47,7 @@ def check_gyro(c: Columns) -> Iterator[Finding]:
             when = f"{abs(late_s) * 1e3:.0f} ms {'later' if late_s < 0.0 else 'earlier'} than stamped"
             text = f"{topic.name}: its gyro turns as odometry does {when}: correct its clock"
             before_s = next(one.offset_s for one in c.config.sources if one.name == c.config.gyro_input)
-            setting = assignment(f"{c.config.gyro_input}.offset_s", round(before_s - late_s, 3))
+            setting = assignment(f"{c.config.gyro_input}.offset_s", round(before_s - late_s, 3) + 0.0)
             at = where(topic.name, gyro_ns, settings=(setting,))
             yield Finding("clock_offset", "warning", -late_s, _LEAST_LATE_S, "s", text, **at)
             return

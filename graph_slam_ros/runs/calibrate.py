@@ -216,6 +216,9 @@ class _Rounds:
         parameter, text = one.parameter, one.text
         if one.verdict == "nothing_to_correct" and parameter in self._corrected:
             text = f"{parameter}: corrected, {parameter.with_sigma(one.value, one.sigma)} is left"
+        factor = self._config.odometry.distance_factor / float(self.found.get("odometry.distance_factor", 1.0))
+        if parameter.name == "distance" and parameter in self._corrected and not self._config.survey:
+            text += f"; if a measured way tells that ranges are wrong instead: range_factor={factor:.4g}"
         numbers = {"value": one.value, "sigma": one.sigma, "verdict": one.verdict, "text": text}
         return {"source": parameter.source, "name": parameter.name, **numbers}
 

@@ -392,7 +392,6 @@ def _unused(summary: Summary, name: str, received: int | None) -> str:
 
 
 def _because(summary: Summary, name: str, counted: Mapping[str, int]) -> str:
-    """The most frequent reason, and its remedy."""
     if not counted:
         return "it holds nothing"
     reason = next(iter(counted))

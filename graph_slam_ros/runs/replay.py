@@ -311,5 +311,4 @@ def _measured(
 
 
 def _end(runs: RecordedRuns) -> Iterator[tuple[int, Sequence[Measurement]]]:
-    """The events at the end of the last run of a recording."""
     yield from ((len(runs.counted), [event]) for event in END)
