@@ -38,8 +38,7 @@ _LOOP = 0.1  # of the way: landmarks that come back within less close no loop of
 _SILENT = 0.5
 _QUARTER = 0.5**0.5
 _CORRECTED = "_corrected"
-_OTHER_SCALE = 0.15  # less is found by a fit
-_ROUNDS = 10
+_ROUNDS, _OTHER_SCALE = 10, 0.15  # less is found by a fit
 
 _OPTICAL = "those of an optical frame (z ahead, x to the right)"
 # Where a sensor would be turned on the robot, if its positions are in other axes: R_frame_true.

@@ -124,6 +124,7 @@ FOLLOWS = {
     "units": ("other_publisher", "odometry_gap", "jump", "twist_scale"),
     "mirrored": ("twist_unrelated", "twist_frame"),
     "damaged": ("no_closure", "silent"),
+    "clock_offset": ("latency",),
 }
 """What is no finding of its own beside an error or a warning."""
 
