@@ -203,12 +203,7 @@ def _along_arcs(estimate: Array, truth: Array) -> Array:
 
 
 def should_be(one: NoiseScale, over_confident: str = "") -> str:
-    """Return what the configured sigmas of a group should be, for a person.
-
-    Parameters
-    ----------
-    over_confident : which errors against the truth are larger than the covariances say; empty where none are known
-    """
+    """Return what the configured sigmas of a group should be, for a person; ``over_confident`` as below."""
     if one.reason:
         return f"not known: {one.reason}"
     why = _not_smaller(one, over_confident)
@@ -235,11 +230,8 @@ def noise_advice(
     kept = [" ".join(filter(None, one.key)) for one in noise if _not_smaller(one, over_confident)]
     if kept:
         out = f"no smaller sigmas are advised ({'; '.join(kept)})"
-        out += (
-            f": errors against the truth are larger than the covariances say ({over_confident})"
-            if over_confident
-            else ""
-        )
+        why = f": errors against the truth are larger than the covariances say ({over_confident})"
+        out += why if over_confident else ""
         out += "; the run used these factors" if is_applied else ""
     else:
         out = "the run used these factors" if is_applied else f"replay with --set {_ESTIMATED} to use these factors"
@@ -253,7 +245,7 @@ def _not_smaller(one: NoiseScale, over_confident: str) -> str:
     if one.reason or one.factor >= 1.0:
         return ""
     if over_confident:
-        return "the covariances are too small as it is"
+        return "errors against the truth are larger than the covariances say"
     return "errors of a pass are alike" if one.design_effect > _ALIKE else ""
 
 

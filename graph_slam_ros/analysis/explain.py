@@ -15,6 +15,7 @@ from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.errors import FormatError, GaugeError, GraphSlamError, SingularError, did_you_mean
 from graph_slam_ros.formats.strict import integer
 from graph_slam_ros.graph.place import LABEL as PLACES
+from graph_slam_ros.runs import outcome
 from graph_slam_ros.runs.condensed_map import read_left_edges
 from graph_slam_ros.runs.folder import SUMMARY, summary_of
 from graph_slam_ros.runs.ledger_file import Entry
@@ -58,6 +59,7 @@ _BECAME = {
 _SHOWN = 5
 _WIDTH = 110
 _SAME = 0.99
+_FEWEST_OUT, _MANY_OUT = 5, 0.25  # sightings of a landmark that are out: so many, and such a part
 _FAR = 0.5  # of the gate is the largest statistic that was ever seen
 _CHANCE = 1e-4  # that so many would all stay below that, were their noise as it is told
 
@@ -70,7 +72,9 @@ def explain_run(run: SavedGraph) -> Iterator[str]:
 
     Raises FormatError: the summary of the run is invalid.
     """
-    entries = run.entries
+    entries, found = run.entries, outcome.findings(summary_of(run.folder))
+    for text in (*found[0], *found[1]):
+        yield from _line("found", text)
     judged = [entry for entry in entries if entry.verdict]
     kinds = f"{len(judged)} are measurements that can be rejected, the others are odometry and priors"
     yield f"{len(entries)} edges; {kinds}"
@@ -79,6 +83,7 @@ def explain_run(run: SavedGraph) -> Iterator[str]:
     yield from _worst(e for e in judged if not e.is_in and e.reason not in FINAL)
     yield from _least(e for e in judged if e.is_in)
     yield from condensed_lines(run)
+    yield from _contested(judged)
     yield from _gates(judged, run.changes, run.config)
     yield from (f"by hand: {one.text}" for one in run.edits)
     yield from _rivals(run.folder)
@@ -133,6 +138,15 @@ def _gates(entries: Sequence[Entry], changes: Sequence[VerdictChange], config: C
                 f"warning: the gate of {label} is inert: of {len(of_label)} the largest chi2 ever seen is"
                 f" {largest:.2g} of it; the stated noise is too large, and false measurements may pass"
             )
+
+
+def _contested(entries: Iterable[Entry]) -> Iterator[str]:
+    """Warn of landmarks of which many sightings are not believed."""
+    seen = Counter((e.landmark, e.is_in) for e in entries if e.landmark)
+    for (name, is_in), out in seen.most_common():
+        count = out + seen[name, True]
+        if not is_in and out >= _FEWEST_OUT and out > _MANY_OUT * count:
+            yield f"warning: {name}: {out} of {count} sightings are not believed: did it move, or is its id used twice?"
 
 
 def _rivals(folder: Path) -> Iterator[str]:
@@ -255,12 +269,7 @@ def _literal(text: str) -> str:
 
 
 def statements(e: Entry, run: SavedGraph, *, is_changed: bool) -> Iterator[tuple[str, str]]:
-    """Sentences on an edge, each with its name: what was measured, what was decided, and how it fits now.
-
-    Parameters
-    ----------
-    is_changed : whether its verdict has changed
-    """
+    """Sentences on an edge, each with its name: what was measured, what was decided, and how it fits now."""
     yield "stamp", "{stamp_s:.3f} s, of the newest keyframe that it is attached to"
     yield "judged", "first at keyframe {keyframe}"
     yield "between", " and ".join(ends_of(e, run))

@@ -12,19 +12,14 @@ from pathlib import Path
 
 import numpy as np
 
-from graph_slam_ros.analysis.consistency import (
-    Consistency,
-    Nees,
-    landmark_errors,
-    noise_advice,
-    pose_errors,
-)
+from graph_slam_ros.analysis.consistency import Consistency, Nees, landmark_errors, noise_advice, pose_errors
 from graph_slam_ros.analysis.path_error import interpolated
 from graph_slam_ros.analysis.trajectories import Truth
 from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.files import read_text
-from graph_slam_ros.runs.folder import COVARIANCES, SUMMARY, run_config
+from graph_slam_ros.runs import outcome
+from graph_slam_ros.runs.folder import COVARIANCES, SUMMARY, run_config, summary_of
 from graph_slam_ros.runs.trajectory import Landmark, Trajectory, read_covariances, read_landmarks, read_rows
 from graph_slam_ros.slam.noise_scale import NoiseScale
 from graph_slam_ros.slam.weak_direction import position_covariance
@@ -77,9 +72,7 @@ def consistency_of(run: Path, known: Truth, keyframes: slice, *, is_first: bool)
         return None
     path, covariances = read_rows(run / "path.tum"), read_covariances(run / COVARIANCES)
     if len(covariances) != len(path.stamps_s):
-        raise GraphSlamError(
-            f"{run / COVARIANCES}: {len(covariances)} rows, and path.tum has {len(path.stamps_s)} poses"
-        )
+        raise GraphSlamError(f"{run / COVARIANCES}: {len(covariances)} rows for {len(path.stamps_s)} poses of path.tum")
     path, covariances = path.at(keyframes), covariances[keyframes]
     is_planar = covariances.shape[1] == 3
     true = interpolated(known.trajectory.in_plane() if is_planar else known.trajectory, path.stamps_s)
@@ -99,7 +92,9 @@ def consistency_of(run: Path, known: Truth, keyframes: slice, *, is_first: bool)
         else:
             several, frame = drive.later()
         found = Consistency(*several, noise, _left_out(*several, known, len(landmarks)), frame=frame)
-    advice = noise_advice(noise, is_applied=is_applied, config=config, over_confident=found.over_confidence)
+    is_void = outcome.findings(summary_of(run))[0]  # such a run says nothing of odometry's noise
+    config_of = None if is_void else config
+    advice = noise_advice(noise, is_applied=is_applied, config=config_of, over_confident=found.over_confidence)
     return replace(found, advice=advice)
 
 

@@ -28,14 +28,16 @@ def evaluate(args: argparse.Namespace) -> int:
     from graph_slam_ros.analysis.evaluation import evaluate as compared
     from graph_slam_ros.analysis.evaluation import input_topics
     from graph_slam_ros.analysis.trajectories import read_truth
-    from graph_slam_ros.runs.folder import changed_since
+    from graph_slam_ros.runs.folder import changed_since, summary_of
+    from graph_slam_ros.runs.outcome import findings
 
     console.check_file(args.plot, force=args.force)
     truth = read_truth(args.truth, args.topic, input_topics(args.run_folder))
     scores = compared(args.run_folder, truth, args.estimate, align=not args.no_align)
     console.show(*([json.dumps(scores.as_dict())] if args.json else str(scores).split("\n")))
     draw(args.run_folder, truth, args.plot, align=not args.no_align, quiet=args.json)
-    code = console.report_losses(scores.losses, [*scores.warnings, *changed_since(args.run_folder)])
+    found = sum(findings(summary_of(args.run_folder)), [])[:1]
+    code = console.report_losses(scores.losses, [*found, *scores.warnings, *changed_since(args.run_folder)])
     if not args.json:
         same = [*(("--topic", args.topic) if args.topic else ()), *(("--no-align",) if args.no_align else ())]
         with_truth = console.command("report", args.run_folder, "--truth", args.truth, *same)

@@ -123,9 +123,7 @@ def freeze(args: argparse.Namespace) -> int:
     console.show(
         *outcome.text(summary), f"results in {args.out}: what is there now stays, whatever is seen from now on"
     )
-    console.then(
-        f"the node locates itself in it with output.load:={args.out.name}, its folder in the directory of output.folder"
-    )
+    console.then(f"the node locates itself in it with output.load:={args.out.name}, beside output.folder")
     return console.report_losses(summary["losses"])
 
 

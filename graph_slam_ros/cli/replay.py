@@ -54,7 +54,8 @@ def replay(args: argparse.Namespace) -> int:
     console.show(f"results in {args.out}")
     draw(args.out)
     code = console.report_losses(done.losses, done.warnings) or code
-    suggest_next(args.out, None if is_run(args.bag) or not (code or done.warnings) else args.bag)
+    said = not code and not done.summary.get("check", {}).get("settings", True)  # check would say no more
+    suggest_next(args.out, None if is_run(args.bag) or said or not (code or done.warnings) else args.bag)
     return code
 
 
@@ -180,9 +181,7 @@ def _print_unused(source: Path, topics: Collection[str]) -> None:
     from graph_slam_ros.runs.suggested_inputs import unused_topics
 
     if unused := unused_topics(source, topics):
-        console.show(
-            f"not used   {', '.join(unused)}: {console.command('info', source)} prints the command, or says why"
-        )
+        console.show(f"not used   {', '.join(unused)}: {console.command('info', source)} says how, or why")
 
 
 def _print_earlier(folder: Path, summary: dict[str, Any]) -> int:

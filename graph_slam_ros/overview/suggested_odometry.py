@@ -123,11 +123,11 @@ class OdometryChoice:
         there = ", ".join(f"{name} ({one.topic.type or 'no type'})" for name, one in self._recording.topics.items())
         poses = [n for n, one in self._recording.topics.items() if one.topic.type in POSES and n not in self._unused]
         why = "".join(f"; {name}: {reason}" for name, reason in self._unused.items())
-        why += "".join(
-            f"; if {name} is odometry: --set odom.type={self._recording.topics[name].topic.type} "
-            f"--set odom.topic={name} --set odom.use=odometry"
-            for name in poses
-        )
+        if any(self._recording.topics[name].topic.type == ODOMETRY for name in self._unused):
+            return f"no odometry that can be used{why}"
+        for name in poses:
+            of = self._recording.topics[name].topic.type
+            why += f"; if {name} is odometry: --set odom.type={of} --set odom.topic={name} --set odom.use=odometry"
         return f"no odometry (nav_msgs/msg/Odometry, or odom -> base_link on /tf); there are {there}{why}"
 
     def _frames(self, parent: str, child: str) -> None:

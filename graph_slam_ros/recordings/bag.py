@@ -127,9 +127,7 @@ def open_bag(path: Path | str) -> Bag:
     bag.warnings += others
     names = {re.sub(r"[_-]?\d+$", "", file.stem) for file in files}
     if len(names) > 1 and not (path / "metadata.yaml").is_file():
-        bag.warnings.append(
-            f"{path}: {len(files)} files of different names are read as one recording; name one of them"
-        )
+        bag.warnings.append(f"{path}: {len(files)} files of different names are read as one recording: name one")
     return bag
 
 

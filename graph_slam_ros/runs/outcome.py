@@ -7,6 +7,7 @@ import shlex
 import textwrap
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
+from contextlib import suppress
 from typing import Any
 
 from graph_slam_ros.check.finding import FOLLOWS, KINDS
@@ -31,9 +32,9 @@ _MENDED = (  # of what is noted, signs of a wrong setting
 )
 _TWO, _MANY, _FEWEST = " places fit: ", 0.25, 4  # of the reasons; part and number of landmarks
 _CONTRADICT = (
-    "graph_slam explain RUN says why. Check of this sensor and of odometry: metres and radians, y and bearings to the "
-    "left, where the sensor is (TF or {0}.mount), its clock ({0}.offset_s), ids that are used twice. If only its noise "
-    "is larger than stated: --set {0}.noise=sigmas --set {0}.sigma_m=..."
+    "graph_slam explain RUN says why. Check units (metres, radians), signs (y and bearings to the left), the place of "
+    "the sensor (TF or {0}.mount), its clock ({0}.offset_s) and ids that are used twice. If only its noise is larger "
+    "than stated: --set {0}.noise=sigmas --set {0}.sigma_m=..."
 )
 _CONFUSED = (
     "Landmarks a few metres apart are confused less with a density that is theirs, e.g. for 2 m "
@@ -64,10 +65,8 @@ def text(summary: Summary) -> list[str]:
         cpu = f", {summary['cpu_s']:.1f} s of CPU time" if "cpu_s" in summary else ""
         lines.append(f"took       {summary['time_s']:10.1f} s{cpu}")
     undetermined = [f"waiting    {name}: {reason}" for name, reason in summary["waiting"].items()]
-    if len(undetermined) > _MAX_UNDETERMINED:
-        undetermined[_MAX_UNDETERMINED:] = [
-            f"waiting    and {len(undetermined) - _MAX_UNDETERMINED} more, see run.json"
-        ]
+    if rest := undetermined[_MAX_UNDETERMINED:]:
+        undetermined[_MAX_UNDETERMINED:] = [f"waiting    and {len(rest)} more, see run.json"]
     if unseen := summary.get("survey_unseen"):
         more = f" and {len(unseen) - _MAX_UNDETERMINED} more" if len(unseen) > _MAX_UNDETERMINED else ""
         names = ", ".join(unseen[:_MAX_UNDETERMINED])
@@ -183,6 +182,13 @@ def table(summary: Summary) -> list[str]:
             if mend := _remedy(summary, name, reason):
                 lines += textwrap.wrap(f"-> {mend}", _WIDTH, initial_indent="    ", subsequent_indent="       ")
     return lines
+
+
+def findings(summary: Summary) -> tuple[list[str], list[str]]:
+    """Shortcomings and doubts of a run; none where its summary is not whole."""
+    with suppress(LookupError, TypeError, ValueError, AttributeError):
+        return [*shortcomings(summary)], [*doubts(summary)]
+    return [], []
 
 
 def shortcomings(summary: Summary) -> Iterator[str]:
@@ -350,12 +356,7 @@ def condensed_text(summary: Mapping[str, Any]) -> str:
 
 
 def visit_faults(counted: Mapping[str, int]) -> Iterator[str]:
-    """Yield why a condensed map is worse than it should be; empty if it is not.
-
-    Parameters
-    ----------
-    counted : how often visits ended how, by the names of ``VISITS``
-    """
+    """Yield why a condensed map is worse than it should be, by how often visits ended how (``VISITS``)."""
     condensed, lost, wider = (counted.get(name, 0) for name in VISITS)
     doubted, visits = lost + wider, condensed + lost
     if doubted >= _FEWEST_LOST and doubted > _DOUBTED * visits:

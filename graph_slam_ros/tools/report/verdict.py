@@ -1,6 +1,7 @@
 """The verdict on a run in a few sentences, and its tables."""
 
 import math
+import shlex
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -41,20 +42,23 @@ def verdict(
     """
     if saved is None:
         return [f"There is no map to show: {losses[0] if losses else 'the run holds no keyframe'}."]
-    again = f"(graph_slam recover {run.name} --out DIR writes its results anew)"
-    short, doubts = list[str](), [f"a part of the run is lost: {loss} {again}" for loss in losses[:1]]
+    again = f"(graph_slam recover {shlex.quote(str(run))} --out DIR writes its results anew)"
+    doubts = [f"a part of the run is lost: {loss} {again}" for loss in losses[:1]]
     if summary.get("ended") is False:
         doubts = [f"it is still being written, or was cut off, and this is its map so far {again}"]
-    if {"counters", "inputs", "keyframes", "landmarks", "sightings", "waiting"} <= set(summary):
-        short, doubts = [*outcome.shortcomings(summary)], [*doubts, *outcome.doubts(summary)]
-    elif not summary.get("converged", True):
+    short, more = outcome.findings(summary)
+    doubts += more
+    if not short and not summary.get("converged", True):
         short = ["the last solve did not converge"]
     doubts += list(scores.warnings) if scores is not None else []
     doubts += [line.removeprefix("warning: ") for line in explain_run(saved) if line.startswith("warning: ")]
     doubts += _covariances(saved, scores)
     state = "Do not rely on this map yet" if short else "Use this map with care"
     first, *others = [*(one if one.endswith(".") else f"{one}." for one in (*short, *doubts)), ""]
-    out = [f"{state}: {first}"] if first else [f"Nothing wrong is found in this map: {_fit(saved)}."]
+    fine = (
+        f"No measurement of this run speaks against this map: {_fit(saved)}. graph_slam check looks at the recording."
+    )
+    out = [f"{state}: {first}" if first else fine]
     out += [f"Also: {one}" for one in others[:_MOST_REASONS] if one]
     out += [f"map -> odom jumped by up to {jump[1]:.2f} m, at keyframe {jump[0]}."] if jump else []
     size = f"{len(saved.slam.keyframes)} keyframes and {summary.get('landmarks', len(saved.landmarks))} landmarks"
@@ -64,20 +68,22 @@ def verdict(
             size += f", dead reckoning {scores.odometry.position_m['rmse']:.3f} m"
     out += [f"{size}{f'; {_fit(saved)}' if first else ''}.", _judged(saved)]
     if scores is None and not first:
-        out.append(
-            f"Next: compare it with a ground truth, if there is one: graph_slam report {run.name} --truth TRUTH."
-        )
+        again = shlex.join(["graph_slam", "report", str(run), "--truth", "TRUTH"])
+        out.append(f"Next: compare it with a ground truth, if there is one: {again}.")
     return out
 
 
 def _covariances(saved: SavedGraph, scores: Any) -> list[str]:
     """A sentence where errors against the truth are far larger than the covariances say; else none."""
-    poses = scores.consistency.poses if scores is not None and scores.consistency else None
-    if poses is None or scores.warnings or poses.mean < _MOST_NEES * poses.dof:
+    found = scores.consistency if scores is not None and not scores.warnings else None
+    both = {"poses": found.poses, "landmarks": found.landmarks} if found else {}
+    far = {name: one for name, one in both.items() if one and one.mean >= _MOST_NEES * one.dof}
+    bad = [f"{name} {one.mean:.1f}, where {one.dof} is expected" for name, one in far.items()]
+    if not bad:
         return []
     advised = [line for line in scores.consistency.advice.splitlines() if "--set" in line]
     estimated = f"; {'; '.join(advised)}" if advised else ""
-    return [f"its covariances are too small: NEES of poses {poses.mean:.1f}, where {poses.dof} is expected{estimated}"]
+    return [f"its covariances are too small: NEES of {', of '.join(bad)}{estimated}"]
 
 
 def _fit(saved: SavedGraph) -> str:
@@ -135,8 +141,7 @@ def inputs(summary: Mapping[str, Any]) -> list[Row]:
 
 def configuration(config: Config) -> list[Row]:
     """The parameters that differ from their defaults: name, value, default, meaning."""
-    names = config.inputs.names.split()
-    known = {p.name: p for p in parameters(names)}
+    known = {p.name: p for p in parameters(config.inputs.names.split())}
     rows = []
     for name, value in flatten(config.as_mapping()):
         p = known.get(name)
@@ -198,12 +203,7 @@ def load(summary: Mapping[str, Any]) -> dict[str, list[float]] | None:
 
 
 def noise(summary: Mapping[str, Any], scores: Any = None) -> list[Row]:
-    """Chi2 per degree of freedom and the factor that sigmas should have, by class, input and part.
-
-    Parameters
-    ----------
-    scores : of the evaluation, None without truth
-    """
+    """Chi2 per degree of freedom and the factor that sigmas should have, by class, input and part."""
     rows, over_confident = [], scores.consistency.over_confidence if scores is not None and scores.consistency else ""
     for one in summary.get("noise", ()):
         name = " ".join(filter(None, (one["label"], one["source"], one["part"])))

@@ -70,7 +70,7 @@ def test_the_verdict_of_its_report_says_how_much_is_condensed(run, work):
     in_map = sum(e.is_in for e in made.saved.entries if e.verdict)
     believed = run[2]["inputs"]["landmarks"]["believed"]
     assert made.losses == []
-    assert made.data["sentences"][0].startswith("Nothing wrong is found in this map")
+    assert made.data["sentences"][0].startswith("No measurement of this run speaks against this map")
     assert "500 keyframes and" in made.data["sentences"][1]
     assert f"{believed - in_map} more were believed, and are condensed" in made.data["sentences"][2]
     assert made.data["map"]["keyframes"] == KEYFRAMES

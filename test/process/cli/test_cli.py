@@ -206,7 +206,7 @@ REFUSED = [
     ("replay {bag} --out {out} --set tf.stamp=odometri", "did you mean 'odometry'?"),
     ("simulate warehouse --out {out}.mcap --fault wrong_mout --fault wrong_ids", "did you mean 'wrong_mount'?"),
     ("fleet replay {bag} --config no.yaml --config {text} --out {out}", "no.yaml"),
-    ("check {bag} {cut}", "cut.mcap is one recording too many: parts of one drive go into one folder"),
+    ("check {bag} {cut}", "cut.mcap is one recording too many: put the parts of one drive into a folder"),
     ("replay", "graph_slam replay: the following arguments are required: BAG"),
     ("replay {bag}", "replay needs --out DIR"),
     ("replay none.mcap --out {out}", "none.mcap: no such file or folder"),

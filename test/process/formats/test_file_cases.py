@@ -162,6 +162,7 @@ NO_RECORDINGS = {  # a file's name and content (None: a FIFO), what is opened, a
     "empty file": ("a.mcap", b"", "a.mcap", "a.mcap: the file is empty"),
     "wrong magic": ("a.mcap", b"hello, this is no recording", "a.mcap", "a.mcap: not a readable"),
     "wrong magic, no suffix": ("a", b"hello, this is no recording", "a", "a: not a readable"),
+    "a graph": ("a.g2o", b"VERTEX_SE2 0 0 0 0", "a.g2o", "(a graph: graph_slam optimize)"),
     "wrong magic in db3": ("a.db3", b"hello, world" * 100, "a.db3", "a.db3: not a readable"),
     "wrong magic in bag": ("a.bag", b"hello, world" * 100, "a.bag", "a.bag: not a readable"),
     "magic alone": ("a.mcap", b"\x89MCAP0\r\n", "a.mcap", "a.mcap: no topic in it"),

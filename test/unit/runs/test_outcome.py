@@ -2,7 +2,7 @@
 
 from rows import each
 
-from graph_slam_ros.runs.outcome import doubts, shortcomings
+from graph_slam_ros.runs.outcome import doubts, findings, shortcomings
 
 LANDMARKS = {"use": "landmarks", "received": 90, "used": 90, "believed": 90}
 ODOMETRY = {"use": "odometry", "received": 100, "used": 100, "believed": None}
@@ -37,7 +37,7 @@ def test_a_gyro_that_is_wrong_or_not_used_and_no_convergence_and_an_alarm_are_sh
     assert said == "imu: nothing of 200 messages was used: gyro_silent 100 (" + said.partition("(")[2]
     (said,) = shortcomings(summary({}) | {"converged": False, "stop": "max_iterations"})
     assert said.startswith("the last solve did not converge (max_iterations): ") and "--set solve.max_iter" in said
-    assert not [*shortcomings(summary({}) | {"converged": True, "stop": "cost"})]
+    assert findings(summary({}) | {"converged": True, "stop": "cost"}) == findings({"keyframes": 2}) == ([], [])
     (said,) = shortcomings(summary({}) | {"displacements": [ALARM]})
     assert "not decided" in said and not [*shortcomings(summary({}) | {"displacements": [ALARM | {"segment": 4}]})]
 
