@@ -81,7 +81,8 @@ def lines(one: Finding) -> Iterator[str]:
     """A finding for a person: its name, its value and limit, and its remedy."""
     first = f"[{one.severity}] {one.code}: {one.text}"
     yield from textwrap.wrap(" ".join(first.splitlines()), _WIDTH, subsequent_indent="    ", break_on_hyphens=False)
-    limit = f", limit {_amount(one.limit, one.unit)}" if one.limit else ""
+    word = "at least" if abs(one.value) < one.limit else "limit"
+    limit = f", {word} {_amount(one.limit, one.unit)}" if one.limit and (one.limit >= 1 or one.unit != "times") else ""
     amount = f"{_amount(one.value, one.unit)}{limit}" if one.value or limit else ""
     where = f"{one.count} in {one.topic}" if one.topic and one.count else ""
     since = f", from {one.first_ns * 1e-9:.3f} s" if where and one.first_ns else ""

@@ -181,7 +181,7 @@ def _print_unused(source: Path, topics: Collection[str]) -> None:
     from graph_slam_ros.runs.suggested_inputs import unused_topics
 
     if unused := unused_topics(source, topics):
-        console.show(f"not used   {', '.join(unused)}: {console.command('info', source)} says how, or why")
+        console.show(f"not used   {', '.join(unused)}: {console.command('info', source)} prints the command")
 
 
 def _print_earlier(folder: Path, summary: dict[str, Any]) -> int:

@@ -196,7 +196,7 @@ class LandmarksConfig:
         0.14, "position noise added to observations without identity: where on an object it is seen", "m"
     )
     density_per_m: float = setting(
-        0.03, "prior density of landmarks along each axis: one must fit better than a new one", "1/m", low=1e-4
+        0.03, "landmarks expected per metre of each axis: with more, a sighting makes a new one sooner", "1/m", low=1e-4
     )
     surveyed: str = setting(
         "",

@@ -143,7 +143,7 @@ REASONS: dict[str, Reason] = {
     "not_on_earth": _refused("latitude, longitude or altitude is out of range", "degrees and metres"),
     "far_from_datum": _refused("the fix is more than 100 km from the map's origin", "INPUT.datum"),
     "other_datum": _refused("the fix counts from another origin than the map", "the same INPUT.datum for all"),
-    "thinned": _noted("too soon after the last to have another error", "INPUT.correlation_s; keyframes.max_interval_s"),
+    "thinned": _noted("its error is that of the one before", "INPUT.correlation_s; keyframes.max_interval_s"),
     "mount_unknown": _repaired(
         "no transform has the position of the antenna on the robot: the base is assumed",
         '--set INPUT.mount="X Y Z 0 0 0", its place from the base in metres; zeros say that it is there',

@@ -79,9 +79,8 @@ def _of_namespace(bag: Bag, topic: str, namespaces: Sequence[str]) -> str:
 
 def _choose(bag: Bag, settings: InputConfig, named: str | None, option: str) -> str:
     fitting = ", ".join(t.name for t in bag.topics.values() if t.type == settings.type)
-    names = [t.name + " (no type)" * (not t.type) for t in bag.topics.values()]
-    others = ", ".join(names[:6]) + ", ..." * (len(names) > 6)
-    there = f"of {settings.type} there is {fitting}" if fitting else f"there are {others}"
+    others = ", ".join(t.name + " (no type)" * (not t.type) for t in [*bag.topics.values()][:6])
+    there = f"of {settings.type} there is {fitting}" if fitting else f"there are {len(bag.topics)} topics: {others}"
     usual = f"/{settings.topic.lstrip('/')}"
     if named is None and settings.topic != default_input(settings.name).topic:
         named = usual

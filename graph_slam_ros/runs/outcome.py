@@ -32,9 +32,9 @@ _MENDED = (  # of what is noted, signs of a wrong setting
 )
 _TWO, _MANY, _FEWEST = " places fit: ", 0.25, 4  # of the reasons; part and number of landmarks
 _CONTRADICT = (
-    "graph_slam explain RUN says why. Check units (metres, radians), signs (y and bearings to the left), the place of "
-    "the sensor (TF or {0}.mount), its clock ({0}.offset_s) and ids that are used twice. If only its noise is larger "
-    "than stated: --set {0}.noise=sigmas --set {0}.sigma_m=..."
+    "graph_slam explain RUN says why. Check units (metres and radians), signs (y and bearings to the left), the place "
+    "of the sensor (TF or {0}.mount), its clock ({0}.offset_s) and ids that are used twice. If only its noise is "
+    "larger than stated: --set {0}.noise=sigmas --set {0}.sigma_m=..."
 )
 _CONFUSED = (
     "Landmarks a few metres apart are confused less with a density that is theirs, e.g. for 2 m "

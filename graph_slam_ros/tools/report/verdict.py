@@ -54,7 +54,7 @@ def verdict(
     doubts += [line.removeprefix("warning: ") for line in explain_run(saved) if line.startswith("warning: ")]
     doubts += _covariances(saved, scores)
     state = "Do not rely on this map yet" if short else "Use this map with care"
-    first, *others = [*(one if one.endswith(".") else f"{one}." for one in (*short, *doubts)), ""]
+    first, *others = [*(one if one.endswith((".", "?")) else f"{one}." for one in (*short, *doubts)), ""]
     fine = (
         f"No measurement of this run speaks against this map: {_fit(saved)}. graph_slam check looks at the recording."
     )
