@@ -182,8 +182,8 @@ def test_G6_a_landmark_that_makes_the_problem_singular_is_taken_out_and_what_els
     assert verdicts(p, "landmarks") == {"ACCEPTED": 29, "REJECTED": 1}
     assert p.trajectory()[-1] == pytest.approx([14.5, 0.0, 0.0], abs=0.05)
     recorder = RunRecorder(tmp_path / "run", p.config)
-    recorder.record(p, p.process(Control("optimize")))
-    recorder.flush()
+    p.process(Control("optimize"))
+    recorder.save(p)
     again = GraphSlam(p.config, start=map_of(tmp_path / "run", []))
     assert 21 not in again.solver.vertices, "nor is it in the map that is taken up"
     assert again.trajectory() == pytest.approx(p.trajectory(), abs=1e-9)

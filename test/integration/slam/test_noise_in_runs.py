@@ -128,7 +128,7 @@ def test_smaller_sigmas_are_not_advised_where_errors_are_larger_than_the_covaria
     wrong = Consistency(*parts.values(), (SMALLER, LARGER), {}, "")
     assert f"NEES of {which.replace('_', ' ').replace('last', 'the last')} 11.4 of 6" in wrong.over_confidence
     assert "0.45 times" not in str(wrong)
-    assert "not smaller: the covariances are too small" in str(wrong)
+    assert "errors against the truth are larger than the covariances say" in str(wrong)
     assert "2 times as large" in str(wrong)
     for scales in ((SMALLER,), (SMALLER, LARGER)):
         advice = noise_advice(scales, is_applied=False, config=Config(), over_confident=wrong.over_confidence)
