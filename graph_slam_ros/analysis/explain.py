@@ -59,7 +59,6 @@ _BECAME = {
 _SHOWN = 5
 _WIDTH = 110
 _SAME = 0.99
-_FEWEST_OUT, _MANY_OUT = 5, 0.25  # sightings of a landmark that are out: so many, and such a part
 _FAR = 0.5  # of the gate is the largest statistic that was ever seen
 _CHANCE = 1e-4  # that so many would all stay below that, were their noise as it is told
 
@@ -83,7 +82,6 @@ def explain_run(run: SavedGraph) -> Iterator[str]:
     yield from _worst(e for e in judged if not e.is_in and e.reason not in FINAL)
     yield from _least(e for e in judged if e.is_in)
     yield from condensed_lines(run)
-    yield from _contested(judged)
     yield from _gates(judged, run.changes, run.config)
     yield from (f"by hand: {one.text}" for one in run.edits)
     yield from _rivals(run.folder)
@@ -138,15 +136,6 @@ def _gates(entries: Sequence[Entry], changes: Sequence[VerdictChange], config: C
                 f"warning: the gate of {label} is inert: of {len(of_label)} the largest chi2 ever seen is"
                 f" {largest:.2g} of it; the stated noise is too large, and false measurements may pass"
             )
-
-
-def _contested(entries: Iterable[Entry]) -> Iterator[str]:
-    """Warn of landmarks of which many sightings are not believed."""
-    seen = Counter((e.landmark, e.is_in) for e in entries if e.landmark)
-    for (name, is_in), out in seen.most_common():
-        count = out + seen[name, True]
-        if not is_in and out >= _FEWEST_OUT and out > _MANY_OUT * count:
-            yield f"warning: {name}: {out} of {count} sightings are not believed: did it move, or is its id used twice?"
 
 
 def _rivals(folder: Path) -> Iterator[str]:

@@ -19,7 +19,7 @@ from graph_slam_ros.messages.inputs import known_types
 from graph_slam_ros.messages.inputs.transforms import MAP_FRAMES
 from graph_slam_ros.overview.contents import Recording
 from graph_slam_ros.overview.suggested_odometry import ODOMETRY
-from graph_slam_ros.recordings.bag import Bag, open_bag
+from graph_slam_ros.recordings.bag import open_bag
 from graph_slam_ros.runs.replay import RecordedRuns
 from graph_slam_ros.runs.suggested_inputs import OF_LANDMARKS, SuggestedInputs
 from graph_slam_ros.runs.suggestion import Suggestion
@@ -96,7 +96,7 @@ def check(
         if some and not quick:
             measured.append((number, some))
     columns = collector.columns(counters)
-    found += _damage(bag)
+    found += [Finding("damaged", "error", 1, 0, "parts", loss) for loss in dict.fromkeys(bag.losses)]
     found += check_columns(columns)
     if not quick and not any(one.ends or one.forbids_replay for one in found):
         moving = moving_names(columns)
@@ -165,8 +165,3 @@ def _with_candidates(one: Finding, suggestion: Suggestion) -> Finding:
     return replace(
         one, text="; ".join([one.text, *(f"{name}: {suggestion.unused[name]}" for name in suggestion.perhaps)])
     )
-
-
-def _damage(bag: Bag) -> Iterator[Finding]:
-    for loss in dict.fromkeys(bag.losses):
-        yield Finding("damaged", "error", 1, 0, "parts", loss)

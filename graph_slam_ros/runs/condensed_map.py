@@ -21,6 +21,7 @@ from graph_slam_ros.runs.journal import read_records
 from graph_slam_ros.slam import GraphSlam
 from graph_slam_ros.slam.bounded_map import Condensation, CondensedEdge
 from graph_slam_ros.slam.lifelong.state import BoundedState, Left, Records, record_type
+from graph_slam_ros.slam.robust.ledger import Reason, Verdict
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Index
 
@@ -40,7 +41,7 @@ def left_records(done: Condensation) -> Iterator[Record]:
     if done.edges:
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
-        writer.writerows([_word(value) for value in astuple(one)] for one in done.edges)
+        writer.writerows([word(value) for value in astuple(one)] for one in done.edges)
         yield {"type": "left_edges", "first": done.first, "table": out.getvalue()}
 
 
@@ -84,8 +85,11 @@ def _rows(text: str, kind: np.dtype[np.void]) -> Records:
     return np.frombuffer(base64.b64decode(text), dtype=kind)
 
 
-def _word(value: Any) -> Any:
-    return value.name.lower() if hasattr(value, "name") else value
+def word(value: Any) -> str:
+    """Return a value as the tables of edges have it."""
+    if isinstance(value, Verdict | Reason):
+        return value.name.lower()
+    return " ".join(map(repr, value)) if isinstance(value, tuple) else str(value)
 
 
 class WholePath:

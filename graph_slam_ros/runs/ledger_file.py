@@ -22,7 +22,7 @@ from graph_slam_ros.errors import ConfigError, FormatError
 from graph_slam_ros.formats.strict import integer, lines, numbers, stamp
 from graph_slam_ros.graph.losses import weight_and_cost
 from graph_slam_ros.graph.tables import EdgeTable
-from graph_slam_ros.runs.condensed_map import CONDENSED
+from graph_slam_ros.runs.condensed_map import CONDENSED, word
 from graph_slam_ros.runs.journal import parts_of
 from graph_slam_ros.slam import GraphSlam
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict, VerdictChange
@@ -245,14 +245,8 @@ def _text(kind: type, rows: Iterable[Any]) -> str:
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(names)
-    writer.writerows([_word(getattr(row, name)) for name in names] for row in rows)
+    writer.writerows([word(getattr(row, name)) for name in names] for row in rows)
     return out.getvalue()
-
-
-def _word(value: Any) -> str:
-    if isinstance(value, Verdict | Reason):
-        return value.name.lower()
-    return " ".join(map(repr, value)) if isinstance(value, tuple) else str(value)
 
 
 def _read(kind: type[Row], file: Path) -> Iterator[tuple[int, Row]]:

@@ -200,16 +200,12 @@ def _condensed(state: BoundedState) -> Told:
 
 
 def _landmark(mark: Landmark) -> Told:
-    out = {name: getattr(mark, name) for name in _OF_LANDMARKS}
-    if mark.seen:
-        out["seen"] = [
-            [one.edge, one.topic, sighting_record(one.sighting), *_as_seen_from(one.where)] for one in mark.seen
-        ]
-    return out
-
-
-def _as_seen_from(where: PoseAtStamp) -> list[Any]:
-    return [where.keyframe, where.vertex, where.stamp_ns, where.T_keyframe_base, where.covariance.tolist()]
+    seen = []
+    for one in mark.seen:
+        at = one.where
+        where = [at.keyframe, at.vertex, at.stamp_ns, at.T_keyframe_base, at.covariance.tolist()]
+        seen.append([one.edge, one.topic, sighting_record(one.sighting), *where])
+    return {name: getattr(mark, name) for name in _OF_LANDMARKS} | ({"seen": seen} if seen else {})
 
 
 def _columns(state: MapSnapshot) -> Iterator[tuple[str, NDArray[Any]]]:

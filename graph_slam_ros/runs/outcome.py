@@ -295,6 +295,9 @@ def doubts(summary: Summary) -> Iterator[str]:
     yield from _uncorrected(summary)
     if renewed := summary.get("renewed_ids"):
         yield renewed_text(renewed)
+    contested = {} if renewed or summary.get("uncorrected") else summary.get("contested", {})
+    for name, (out, count) in contested.items() if len(contested) <= _MANY * summary.get("landmarks", 0) else ():
+        yield f"{name}: {out} of {count} sightings are not believed: did it move, or is its id used twice?"
     yield from visit_faults(summary["counters"].get("map", {}))
     for name, count in Counter(name.partition("#")[0] for name in summary.get("inputs", {})).items():
         if count > 1:
@@ -415,13 +418,7 @@ def _counted(summary: Summary, name: str, effect: Effect) -> dict[str, int]:
 
 
 def wrong_sides(landmarks: int, waiting: Mapping[str, str]) -> str:
-    """Return that landmarks may be on the wrong side of the path; empty where few are undecided, or in the map.
-
-    Parameters
-    ----------
-    landmarks : that are in the map
-    waiting : landmarks that are not, with the reason
-    """
+    """Return that landmarks may be on the wrong side of the path, where many that wait are undecided; else nothing."""
     undecided = sum(_TWO in reason for reason in waiting.values())
     if landmarks < _FEWEST or undecided < max(_FEWEST, _MANY * (landmarks + len(waiting))):
         return ""

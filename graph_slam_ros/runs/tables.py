@@ -29,6 +29,7 @@ from graph_slam_ros.typing import Mask
 
 Name = TypeVar("Name")
 _LATELY = 400  # edges
+_FEWEST_OUT, _MANY_OUT = 5, 0.25  # sightings of a landmark that are out: so many, and such a part
 _TANGENT = {3: ("x", "y", "theta"), 6: ("x", "y", "z", "rx", "ry", "rz")}
 _POSE = {3: "x,y,theta", 6: "x,y,z,qx,qy,qz,qw"}
 
@@ -109,6 +110,7 @@ def summarize(slam: GraphSlam, earlier: Counters | None = None) -> dict[str, Any
         | ({"gyro": asdict(gyro)} if (gyro := slam.gyro) else {})
         | ({"calibrated": settings} if (settings := slam.found_settings) else {})
         | ({"association": found} if (found := _association(slam)) else {})
+        | ({"contested": contested} if (contested := _contested(slam)) else {})
         | account(slam, counters)
     )
 
@@ -122,6 +124,15 @@ def condensed_part(slam: GraphSlam) -> dict[str, Any]:
     is_doubtful = slam.association_report.get("is_doubtful", False)
     why = slam.config.not_condensed or ("a doubtful map of landmarks without ids" if is_doubtful else "")
     return {"not_condensed": why} if is_long and why else {}
+
+
+def _contested(slam: GraphSlam) -> dict[str, tuple[int, int]]:
+    """Landmarks with ids of which many sightings are not believed, by name: how many, and how many there are."""
+    graph, edges = slam.graph, slam.graph.edges_of("landmarks").tolist()
+    seen = Counter((graph.edge(edge).vertices[-1], slam.ledger.is_inside(edge)) for edge in edges)
+    named = {name: one.vertex for name, one in slam.landmarks.items() if not one.is_unnamed}
+    counts = {name: (seen[vertex, False], seen[vertex, False] + seen[vertex, True]) for name, vertex in named.items()}
+    return {name: of for name, of in counts.items() if of[0] >= max(_FEWEST_OUT, _MANY_OUT * of[1])}
 
 
 def _association(slam: GraphSlam) -> dict[str, Any]:
