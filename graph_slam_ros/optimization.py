@@ -194,11 +194,11 @@ def _judged(solution: Solution, settings: Settings) -> Solution:
     some = [np.square(graph.edge(edge).sqrt_information).sum(axis=0).mean() for edge in edges[:1000].tolist()]
     stated = float(np.median(some)) if some else 0.0  # in a covariance, about as large as squared residuals
     if not solution.report.converged:
-        doubt = f"it did not converge ({solution.report.stop}){_hint(solution.file, edges)}"
+        doubt = f"it did not converge ({solution.report.stop}){_likely_mistake(solution.file, edges)}"
     elif 2 * gone > has_loss.sum():
         doubt = f"the loss lets go of {gone} of {has_loss.sum()} edges"
     elif freedom > 0 and kept > max(_FAR_ABOVE * freedom, chdtri(freedom, _UNLIKELY)):
-        doubt = f"chi2 {kept:.6g} is far above its {freedom} degrees of freedom{_hint(solution.file, edges)}"
+        doubt = f"chi2 {kept:.6g} is far above its {freedom} degrees of freedom{_likely_mistake(solution.file, edges)}"
     elif freedom > 0 and _ALIKE * stated**2 < kept / freedom < 1e-3:
         doubt = f"chi2 {solution.report.chi2_final:.6g} is far below its {freedom} degrees of freedom{_COVARIANCE}"
     elif len(far):
@@ -208,8 +208,8 @@ def _judged(solution: Solution, settings: Settings) -> Solution:
     return replace(solution, doubt=doubt, let_go=gone)
 
 
-def _hint(file: G2oFile, edges: Index) -> str:
-    """What the first edges speak for: with w first, most turn by half a turn about x; in degrees, some by many."""
+def _likely_mistake(file: G2oFile, edges: Index) -> str:
+    """A mistake that the first edges show: w first, if most turn half around x; degrees, if an angle is above 7."""
     some = [file.graph.edge(int(edge)) for edge in edges[:1000]]
     turned = [one for one in some if len(one.measured) == 7 and abs(one.measured[3]) > abs(one.measured[6])]
     if 2 * len(turned) > len(some):

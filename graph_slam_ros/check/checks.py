@@ -70,7 +70,7 @@ def with_inputs(c: Columns, found: Iterable[Finding]) -> list[Finding]:
 
 
 def refused_odometry(c: Columns) -> list[Finding]:
-    """What most of odometry is refused for: whatever else is wrong follows from it."""
+    """Findings that most messages of odometry were refused: all other findings may follow from these."""
     return [one for one in check_refusals(c) if one.forbids_replay and one.topic == c.odometry.topic]
 
 

@@ -35,7 +35,7 @@ class AppendedFile:
         return len(data)
 
     def tell(self) -> int:
-        """Return the position of the next byte."""
+        """Return the position of the next byte, as ``io.IOBase.tell`` does."""
         return self._end + len(self._unwritten)
 
     @property

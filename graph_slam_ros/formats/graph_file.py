@@ -51,7 +51,7 @@ class G2oFile:
 
     @property
     def losses(self) -> list[str]:
-        """What is not in the graph: bad lines, in lenient reading, and lines that may be edges of an unknown kind."""
+        """Lines of the file that are not in the graph: bad ones if reading was lenient, edges of unknown kinds."""
         edges = [line for line in self.unknown if not line.startswith(NO_EDGES)]
         return [*self.skipped, *(f"{tag}: of an unknown kind, so they are not in the graph" for tag in tags_of(edges))]
 

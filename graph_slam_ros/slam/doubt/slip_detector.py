@@ -148,7 +148,7 @@ class SlipDetector:
     ) -> Choice:
         """Compare the hypotheses: odometry's noise, a slip from each view on, and that the robot was moved."""
         self._noise.measure(keyframes)
-        stretch = self._stretch([link.edge for link in links], self._seen(links, views))
+        stretch = self._stretch([link.edge for link in links], self._measured_from(links, views))
         firsts = sorted({_first_of(links, views[-since - 1]) for since in _SINCE if since < len(views)})
         every = [Hypothesis(kind, k, self._added(kind, links, k, len(links))) for kind in SLIPS for k in firsts]
         if moved is not None:
@@ -181,8 +181,8 @@ class SlipDetector:
         joint = anew.joint_marginal(vertices)
         return np.concatenate([anew.values[graph.vertex(vertex).stored] for vertex in vertices]), joint
 
-    def _seen(self, links: Sequence[Link], views: Sequence[View]) -> SeenOf:
-        """What was seen from the keyframes after links, held back or not, and is determined without that."""
+    def _measured_from(self, links: Sequence[Link], views: Sequence[View]) -> SeenOf:
+        """Edges by the keyframe at the end of each link, accepted or not, of landmarks that other edges determine."""
         first, ledger = links[0].vertices[0], self._backend.ledger
         ends = {link.vertices[1] for link in links}
         is_determined = cache(partial(self._is_determined, known_by=first, keyframes=ends))

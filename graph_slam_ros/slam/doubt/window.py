@@ -66,7 +66,7 @@ class Seen:
 
 @dataclass(slots=True)
 class View:
-    """What was measured from one keyframe, and the sum of its innovations."""
+    """All that was measured from one keyframe, and the sum of its normalised innovations squared, ``statistic``."""
 
     vertex: int
     stamp_ns: int
@@ -77,7 +77,7 @@ class View:
 
 @dataclass(frozen=True, slots=True)
 class Contradiction:
-    """What the newest sightings of well known landmarks tell of odometry.
+    """Whether the newest sightings of well known landmarks contradict odometry.
 
     Attributes
     ----------

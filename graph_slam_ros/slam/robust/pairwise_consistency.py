@@ -22,6 +22,7 @@ from graph_slam_ros.graph.vertices import adjoints_of_inverses, code_of
 from graph_slam_ros.typing import Array, Index
 
 _NEAR = 5.0  # poses between the ends of neighbours
+_STRETCHES = 100  # of fixes, that many before it at most are compared with one: time grows with the number of fixes
 
 
 def consistent_groups(graph: Graph, values: Array, closures: Index, limits: Array) -> list[Index]:
@@ -106,12 +107,8 @@ def contradicting_sightings(graph: Graph, values: Array, sightings: Index, limit
 def jumps_and_back(graph: Graph, values: Array, fixes: Index, limits: Array) -> list[Index]:
     """Stretches of fixes of positions between two steps that odometry does not explain, the second of which leads back.
 
-    Of all stretches without such a step, those are right that agree one with the next and have most fixes.
-
-    Parameters
-    ----------
-    values : stored numbers of all vertices, the poses by odometry alone
-    limits : of each fix, what chi2 it may have
+    Of all stretches without such a step, those are right that agree one with the next and have most fixes. ``values``
+    and ``limits`` are as for ``contradicting_sightings``.
     """
     space = space_of(graph)
     if (known := _on_path(graph, space, space.fixes["position"], fixes)) is None:
@@ -135,8 +132,9 @@ def jumps_and_back(graph: Graph, values: Array, fixes: Index, limits: Array) -> 
     firsts, lasts = (np.array([run[k] for run in runs]) for k in (0, -1))
     most, before = np.array([len(run) for run in runs]), np.full(len(runs), -1)
     for k in range(1, len(runs)):
-        with_k = np.where(agree(lasts[:k], firsts[k : k + 1]), most[:k], 0)
-        before[k] = np.argmax(with_k) if with_k.any() else -1
+        since = max(0, k - _STRETCHES)
+        with_k = np.where(agree(lasts[since:k], firsts[k : k + 1]), most[since:k], 0)
+        before[k] = since + np.argmax(with_k) if with_k.any() else -1
         most[k] += with_k.max()
     right = [int(np.argmax(most))]
     while before[right[-1]] >= 0:
