@@ -24,7 +24,7 @@ from graph_slam_ros.slam.calibration.answers import SIGMAS
 from graph_slam_ros.slam.calibration.parameters import QUANTITIES
 from graph_slam_ros.slam.lifelong.state import BoundedState, Left, seen_from
 from graph_slam_ros.slam.robust.gating import CANDIDATES
-from graph_slam_ros.slam.robust.ledger import INSIDE, Verdict
+from graph_slam_ros.slam.robust.ledger import INSIDE, OUTSIDE, Verdict
 from graph_slam_ros.typing import Mask
 
 Name = TypeVar("Name")
@@ -129,9 +129,9 @@ def condensed_part(slam: GraphSlam) -> dict[str, Any]:
 def _contested(slam: GraphSlam) -> dict[str, tuple[int, int]]:
     """Landmarks with ids of which many sightings are not believed, by name: how many, and how many there are."""
     graph, edges = slam.graph, slam.graph.edges_of("landmarks").tolist()
-    seen = Counter((graph.edge(edge).vertices[-1], slam.ledger.is_inside(edge)) for edge in edges)
+    seen = Counter((graph.edge(edge).vertices[-1], slam.ledger.verdict_of(edge) in OUTSIDE) for edge in edges)
     named = {name: one.vertex for name, one in slam.landmarks.items() if not one.is_unnamed}
-    counts = {name: (seen[vertex, False], seen[vertex, False] + seen[vertex, True]) for name, vertex in named.items()}
+    counts = {name: (seen[vertex, True], seen[vertex, False] + seen[vertex, True]) for name, vertex in named.items()}
     return {name: of for name, of in counts.items() if of[0] >= max(_FEWEST_OUT, _MANY_OUT * of[1])}
 
 
