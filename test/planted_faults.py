@@ -208,7 +208,7 @@ FAULTS = {
     "an id for each sighting": (of("track_ids:sightings=1"), "no_parallax"),
     "wheels slip for a twentieth": (of("wrong_scale:distance=1.5,begin=0.5,lasting=0.05"), "odometry_slips"),
     "carried for a tenth": (carried, "odometry_slips"),
-    "six landmarks moved by 2 m": (six_moved, "map_breaks"),
+    "six landmarks moved by 2 m": (six_moved, "map_breaks landmark_moved"),
     "5 % of sightings too far": (echoes, "outliers"),
 }
 """By name: what is planted, and the codes of which one is to be found."""

@@ -24,7 +24,7 @@ from graph_slam_ros.slam.doubt.evidence import covariance_of
 from graph_slam_ros.slam.doubt.record import Link
 from graph_slam_ros.slam.frontend import motion_compensation
 from graph_slam_ros.slam.robust.ledger import Ledger
-from graph_slam_ros.typing import Array, Index, Numbers
+from graph_slam_ros.typing import Array, Index, Mask, Numbers
 
 _KEYFRAMES = 2000  # whose odometry is kept
 _VIEWS = 50  # that are kept
@@ -258,18 +258,13 @@ class Window:
 
     def contradiction(self) -> Contradiction | None:
         """Return what the newest sightings tell; None where there are too few."""
-        newest, ledger = list(self._newest()), self._backend.ledger
+        newest = list(self._newest())
         if len(newest) < _LEAST:
             return None
-        edges = np.array([one.edge for one in newest])
-        fits, numbers = self._backend.solver.chi2_of(edges)
-        is_out = ~np.array(ledger.are_inside(edges.tolist()), dtype=bool)
-        innovations = np.where(is_out, ledger.statistic.values[edges], fits)
+        innovations, numbers, is_out = self._innovations(newest)
         order = np.argsort(innovations / numbers, kind="stable")
-        counted = order[: max(0, len(order) - _wrong_by_chance(len(order), self._held_back, self._count))]
-        if not len(counted):  # all may be wrong by chance
-            return None
-        limit = self._backend.decisions.stated_scale * quantile(_SURE, int(numbers[counted].sum()))
+        counted = order[: len(order) - _wrong_by_chance(len(order), self._held_back, self._count)]
+        limit = self._backend.decisions.stated_scale * quantile(_SURE, int(numbers[counted].sum()))  # NaN of none
         landmarks = {newest[k].what for k in np.flatnonzero(is_out).tolist()}
         is_significant = len(landmarks) >= 2 and float(innovations[counted].sum()) > limit
         return Contradiction(int(np.count_nonzero(is_out)), len(newest), is_significant)
@@ -277,16 +272,21 @@ class Window:
     @property
     def is_calm(self) -> bool:
         """Return whether most of the newest sightings agree with odometry."""
-        decisions = self._backend.decisions
-        newest = np.array([one.edge for one in self._newest()][:_CALM], dtype=np.int64)
-        if not len(newest):
+        newest = list(islice(self._newest(), _CALM))
+        if not newest:
             return False
-        innovations, numbers = self._backend.solver.chi2_of(newest)
-        is_out = ~np.array(self._backend.ledger.are_inside(newest.tolist()), dtype=bool)
-        innovations[is_out] = decisions.innovations(newest[is_out].tolist())
+        innovations, numbers, _ = self._innovations(newest)
         counted = np.argsort(innovations / numbers, kind="stable")[: -(-3 * len(newest) // 4)]
-        limit = decisions.stated_scale * quantile(_CALM_SURE, int(numbers[counted].sum()))
+        limit = self._backend.decisions.stated_scale * quantile(_CALM_SURE, int(numbers[counted].sum()))
         return float(innovations[counted].sum()) <= limit
+
+    def _innovations(self, newest: Sequence[Seen]) -> tuple[Array, Index, Mask]:
+        """The costs of some sightings in the present estimate, their numbers, and which are held back."""
+        edges, backend = np.array([one.edge for one in newest]), self._backend
+        innovations, numbers = backend.solver.chi2_of(edges)
+        is_out = ~np.array(backend.ledger.are_inside(edges.tolist()), dtype=bool)
+        innovations[is_out] = backend.decisions.innovations(edges[is_out].tolist())
+        return innovations, numbers, is_out
 
     def _newest(self) -> Iterator[Seen]:
         """The newest sightings of well known landmarks, the newest first."""
