@@ -27,7 +27,7 @@ from graph_slam_ros.measurements.types import END
 from graph_slam_ros.overview.chosen_inputs import choose_inputs
 from graph_slam_ros.recordings.bag import open_bag
 from graph_slam_ros.runs.calibrate import calibrate
-from graph_slam_ros.runs.replay import measurements
+from graph_slam_ros.runs.replay import RecordedRuns
 from graph_slam_ros.slam import Config, Counters, GraphSlam
 
 WRONG = {
@@ -48,7 +48,7 @@ def drive(path: Path, settings: Mapping[str, object]) -> float:
     """The error of positions [m] of a replay in memory."""
     bag, config = open_bag(path), Config.from_mapping(settings)
     slam = GraphSlam(config)
-    for several in measurements(bag, choose_inputs(bag, config), config, Counters()):
+    for _, several in RecordedRuns(bag, choose_inputs(bag, config), config, Counters()):
         for m in several:
             slam.process(m)
     for event in END:

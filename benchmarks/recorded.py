@@ -28,7 +28,7 @@ from graph_slam_ros.analysis.trajectories import read_truth
 from graph_slam_ros.lie import se2, se3
 from graph_slam_ros.overview.chosen_inputs import choose_inputs
 from graph_slam_ros.recordings.bag import open_bag
-from graph_slam_ros.runs.replay import measurements
+from graph_slam_ros.runs.replay import RecordedRuns
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam
 
 _ROBOTS = range(1, 6)
@@ -101,7 +101,7 @@ def _mrclam(name: str, converter: Path, set_7: Path, robot: int) -> tuple[Drawn,
         subprocess.run(words, check=True, stdout=subprocess.DEVNULL)
         bag, config = open_bag(path), Config.from_mapping({"map.condense": False})  # every sighting is wanted
         slam = GraphSlam(config)
-        for several in measurements(bag, choose_inputs(bag, config), config, Counters()):
+        for _, several in RecordedRuns(bag, choose_inputs(bag, config), config, Counters()):
             for m in several:
                 slam.process(m)
         slam.process(Control("end"))

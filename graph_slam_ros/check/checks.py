@@ -99,8 +99,8 @@ def worst_while_driving(c: Columns) -> list[Finding]:
     """
     found = check_columns(of_one_publisher(c, is_live=True), OF_A_REPLAY)
     errors = [one for one in found if one.severity == "error" and one.code in _WHILE_DRIVING]
-    late = [one for one in errors if one.code == "clock_domains" and one.topic != c.odometry.topic]
-    late = [one for one in late if -_LATEST_S < one.value < 0.0]  # its clock may be right, and its messages come late
+    others = [one for one in errors if one.code == "clock_domains" and one.topic != c.odometry.topic]
+    late = [one for one in others if -_LATEST_S < one.value < 0.0]  # its clock may be right, and its messages come late
     if errors := [one for one in errors if one not in late]:
         return errors[:1]
     way_m = float(np.linalg.norm(np.diff(c.path[:, :3], axis=0), axis=1).sum())

@@ -42,7 +42,6 @@ class TopicColumns:
     """
 
     name: str
-    type: str
     inputs: tuple[str, ...]
     use: str
     log_ns: Index
@@ -71,8 +70,7 @@ class OdometryColumns:
 
     def some(self, which: Mask) -> "OdometryColumns":
         """Return the columns of some of the messages."""
-        rows = ("stamp_ns", "poses", "twist", "variances")
-        return replace(self, **{row: getattr(self, row)[which] for row in rows})
+        return replace(self, **{row: getattr(self, row)[which] for row in ("stamp_ns", "poses", "twist", "variances")})
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -138,21 +136,13 @@ class FixColumns:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Link:
-    """A transform from a parent to a child frame, from /tf_static (``fixed``) or /tf."""
-
-    parent: str
-    child: str
-    fixed: bool
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Columns:
     """The whole recording.
 
     Attributes
     ----------
     assumed : parameters that were chosen for the recording, and that nobody has set
+    links : the parent and child frame of each transform
     path_ns, path : (m,) and (m, 7) T_odom_base, as a replay uses odometry, its distances corrected, ``in_order``
     gyro_ns, gyro : (g,) stamps and turn rate about the robot's z [rad/s] of the gyro that is used
     felt : (g, 6) turn rates [rad/s] and accelerations [m/s^2] about and along the axes of its sensor
@@ -165,7 +155,7 @@ class Columns:
     path_ns: Index
     path: Array
     sightings: tuple[SightingColumns, ...]
-    links: tuple[Link, ...]
+    links: tuple[tuple[str, str], ...]
     counters: Counters
     assumed: Mapping[str, Any] = field(default_factory=dict)
     gyro_ns: Index = field(default_factory=lambda: np.empty(0, dtype=np.int64))
@@ -213,8 +203,8 @@ class _Rows:
 
 
 class _Topic:
-    def __init__(self, name: str, type_name: str, inputs: tuple[str, ...], use: str, offset_ns: int) -> None:
-        self._of, self._offset_ns = (name, type_name, inputs, use), offset_ns
+    def __init__(self, name: str, inputs: tuple[str, ...], use: str, offset_ns: int) -> None:
+        self._of, self._offset_ns = (name, inputs, use), offset_ns
         self.begin_anew()
 
     def begin_anew(self) -> None:
@@ -284,8 +274,7 @@ class Collector:
         self._topics: dict[str, _Topic] = {}
         for topic in dict.fromkeys(topics[name] for name in used):
             names = tuple(name for name in used if topics[name] == topic)
-            first = by_name[names[0]]
-            self._topics[topic] = _Topic(topic, first.type, names, used[names[0]], round(first.offset_s * 1e9))
+            self._topics[topic] = _Topic(topic, names, used[names[0]], round(by_name[names[0]].offset_s * 1e9))
         self._sightings = {
             name: _Sightings(name, topics[name], _mount_correction(config, by_name[name]))
             for name, use in used.items()
@@ -297,7 +286,7 @@ class Collector:
         self._odometry_topic = topics.get(self._main, "")
         self._frame, self._child, self._gyro_frame = "", "", ""
         self.begin_anew()
-        self._links: dict[tuple[str, str, bool], Link] = {}
+        self._links: dict[tuple[str, str], None] = {}
         self._transforms = Transforms()
         self._last: Any = None
 
@@ -405,7 +394,7 @@ class Collector:
             if fixed:
                 r = t.transform.rotation
                 self._transforms.add(parent, child, pose(t.transform.translation, (r.x, r.y, r.z, r.w)))
-            self._links[parent, child, fixed] = Link(parent, child, fixed)
+            self._links[parent, child] = None
 
     def _place(self, found: _Sightings, message: Any) -> None:
         """Find the place of an input's sensor on the robot, by its first message that names a frame."""
@@ -431,7 +420,7 @@ class Collector:
             self._odometry(path_ns[:, 0], path),
             *in_order(path_ns[:, 0], path * scale),
             tuple(one.columns() for one in self._sightings.values()),
-            tuple(self._links.values()),
+            tuple(self._links),
             counters,
             self._assumed,
             gyro_ns[:, 0],

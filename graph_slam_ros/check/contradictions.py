@@ -175,9 +175,8 @@ def _mirrored(c: Columns, s: SightingColumns, pairs: Pairs, noise_m: float) -> F
     what, mirror_m = min(mirrors.items(), key=itemgetter(1))
     if not _explains(mirror_m, now_m, noise_m) or mirror_m >= _NEARLY * min(others.values()):
         return None
-    text = (
-        f"{s.topic}: in turns, two sightings of a landmark differ by {now_m:.2f} m, but by {mirror_m:.2f} m if {what}"
-    )
+    apart = f"two sightings of a landmark differ by {now_m:.2f} m, but by {mirror_m:.2f} m"
+    text = f"{s.topic}: in turns, {apart} if {what}"
     at = where(s.topic, s.stamp_ns, len(pairs.a))
     return Finding("mirrored", "error", now_m / max(mirror_m, 1e-9), 1.0 / _HALF, "times", text, **at)
 

@@ -120,7 +120,15 @@ ENDS = {
 }
 """Findings while which others mean nothing."""
 
+_OF_STAMPS = (
+    *("after_odometry", "before_odometry", "late", "odometry_gap", "duplicate_stamp", "other_publisher"),
+    *("overflow", "frozen", "jump"),
+)
+
 FOLLOWS = {
+    **dict.fromkeys(("wrong_stamps", "constant_stamps", "coarse_stamps"), _OF_STAMPS),
+    "pose_stands": ("frozen",),
+    "frame_empty": ("frame_unknown",),
     "units": ("other_publisher", "odometry_gap", "jump", "twist_scale"),
     "mirrored": ("twist_unrelated", "twist_frame"),
     "damaged": ("no_closure", "silent"),

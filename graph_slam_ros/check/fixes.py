@@ -1,24 +1,30 @@
 """Checks of fixes and headings against the motion of odometry, and against one another."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
 from graph_slam_ros.check.columns import Columns, FixColumns
 from graph_slam_ros.check.contradictions import turned_mount
 from graph_slam_ros.check.finding import Finding, where
+from graph_slam_ros.check.odometry import TOGETHER, worst_stretch
 from graph_slam_ros.check.pairs import poses_at
+from graph_slam_ros.check.times import offset_setting
 from graph_slam_ros.lie import se2, so3
 from graph_slam_ros.typing import Array, Index
 
 _LEAST, _STEP_M, _SIGMAS, _SCALE = 8, 2.0, 6.0, 1.5
 _TURNED_RAD, _HALF, _OFF_RAD, _NEARLY_RAD = 0.2, 0.5, 0.17, 0.1
 _SAME_M, _FROZEN_M, _JUMP_M, _SOON_S, _OFF = 1e-6, 3.0, 3.0, 2.0, 0.1  # _OFF: of odometry's distances
+_STEP_NS, _SLIP_M, _SLIP_PART, _SLIP_SIGMAS = 2_000_000_000, 2.0, 0.25, 5.0
+_WINDOW_S, _MOST_LATE_S, _LATE_S, _BETTER = 20.0, 1.0, 0.15, 0.9
 
 
 def check_fixes(c: Columns) -> Iterator[Finding]:
     """Fixes that are mirrored, of another scale, frozen or jump, and headings that count clockwise or are off."""
     path_ns, path = c.path_ns, c.path
+    decided = ("fix_jumps", "odometry_slips") if any(len(s.stamp_ns) for s in c.sightings) else ()  # by landmarks
     known: tuple[Index, Array] | None = None  # stamps, and by how much odometry's frame is turned in the map
     for f in sorted(c.fixes, key=lambda f: bool(np.isnan(f.points).all())) if len(path_ns) > 1 else ():
         use = (f.stamp_ns >= path_ns[0]) & (f.stamp_ns <= path_ns[-1])
@@ -26,18 +32,23 @@ def check_fixes(c: Columns) -> Iterator[Finding]:
         if len(order) < _LEAST:
             continue
         stamp_ns, points, headings = f.stamp_ns[order], f.points[order], f.headings[order]
-        poses = poses_at(stamp_ns, path_ns, path)
-        factor = c.config.odometry.distance_factor
-        own, yaws = poses[:, 0] + 1j * poses[:, 1], np.stack(so3.log(tuple(poses[:, 3:].T)), axis=1)[:, 2]
+        own, yaws = _driven(f, poses_at(stamp_ns, path_ns, path))
         if np.isfinite(points).all():
-            found = list(_positions(f, stamp_ns, points, own, factor))
-            yield from found
+            seen = (list(check(c, f, stamp_ns, points, own)) for check in (_frozen, _turned, _late, _slipped))
+            found: list[Finding] = next(filter(None, seen), [])
+            yield from (replace(one, severity="warning") if one.code in decided else one for one in found)
             ends = _apart(own, max(_STEP_M, _SIGMAS * f.sigma_m))
-            if len(ends) > _LEAST and not any(one.severity == "error" for one in found):
+            if len(ends) > _LEAST and not any(one.ends or one.code == "fix_mirrored" for one in found):
                 at_ns = (stamp_ns[ends[1:]] + stamp_ns[ends[:-1]]) // 2
                 known = at_ns, np.angle(np.diff(points[ends]) / np.diff(own[ends]))
         if np.isfinite(headings).all():
             yield from _headings(f, stamp_ns, headings, yaws, known)
+
+
+def _driven(f: FixColumns, poses: Array) -> tuple[Array, Array]:
+    """Where the antenna is in the frame of odometry, as complex numbers, and the headings there."""
+    yaws = np.stack(so3.log(tuple(poses[:, 3:].T)), axis=1)[:, 2]
+    return np.asarray(poses[:, 0] + 1j * poses[:, 1] + np.exp(1j * yaws) * complex(*f.T_base_frame[:2])), yaws
 
 
 def _apart(own: Array, step_m: float) -> Index:
@@ -58,7 +69,18 @@ def _mirrored(turns: Array, own: Array) -> tuple[float, float]:
     return now, mirrored
 
 
-def _positions(f: FixColumns, stamp_ns: Index, points: Array, own: Array, applied: float) -> Iterator[Finding]:
+def _frozen(c: Columns, f: FixColumns, stamp_ns: Index, points: Array, own: Array) -> Iterator[Finding]:
+    way_m, moves = np.abs(np.diff(own)), np.abs(np.diff(points)) > _SAME_M
+    begins = np.flatnonzero(np.concatenate([[True], moves]))
+    for k, end in zip(begins, [*(begins[1:] - 1), len(points) - 1], strict=True):
+        if (drove_m := float(way_m[k:end].sum())) > _FROZEN_M:
+            span_s = (stamp_ns[end] - stamp_ns[k]) * 1e-9
+            text = f"{f.topic}: the fix stands still for {span_s:.0f} s, while odometry drives {drove_m:.0f} m"
+            yield Finding("fix_frozen", "warning", drove_m, _FROZEN_M, "m", text, **where(f.topic, stamp_ns[k:end]))
+
+
+def _turned(c: Columns, f: FixColumns, stamp_ns: Index, points: Array, own: Array) -> Iterator[Finding]:
+    """Fixes that are mirrored, of another scale, or jump."""
     at, ends = where(f.topic, stamp_ns), _apart(own, max(_STEP_M, _SIGMAS * f.sigma_m))
     if len(ends) > _LEAST:
         moved, driven = np.diff(points[ends]), np.diff(own[ends])
@@ -77,23 +99,59 @@ def _positions(f: FixColumns, stamp_ns: Index, points: Array, own: Array, applie
             return
         if abs(factor - 1.0) > max(_OFF, _SIGMAS * spread):
             text = f"{f.topic}: fixes move {factor:.3g} m for each metre of odometry"
-            at = where(f.topic, stamp_ns, settings=(f"odometry.distance_factor={applied * factor:.4g}",))
+            at = where(
+                f.topic,
+                stamp_ns,
+                settings=(f"odometry.distance_factor={c.config.odometry.distance_factor * factor:.4g}",),
+            )
             yield Finding("odometry_scale", "warning", factor, 1.0 + _OFF, "times", text, **at)
     step_m, way_m = np.abs(np.diff(points)), np.abs(np.diff(own))
-    begins = np.flatnonzero(np.concatenate([[True], step_m > _SAME_M]))
-    for k, end in zip(begins, [*(begins[1:] - 1), len(points) - 1], strict=True):
-        if (drove_m := float(way_m[k:end].sum())) > _FROZEN_M:
-            span_s = (stamp_ns[end] - stamp_ns[k]) * 1e-9
-            text = f"{f.topic}: the fix stands still for {span_s:.0f} s, while odometry drives {drove_m:.0f} m"
-            at = where(f.topic, stamp_ns[k:end])
-            yield Finding("fix_frozen", "warning", drove_m, _FROZEN_M, "m", text, **at)
-            step_m[end : end + 1] = 0.0
     far_m = max(_JUMP_M, 2.0 * _SIGMAS * f.sigma_m)
     jumps = (step_m - way_m > far_m) & (np.diff(stamp_ns) < _SOON_S * 1e9)
     if jumps.any():
-        text = f"{f.topic}: the fix jumps {int(jumps.sum())} times, by up to {step_m[jumps].max():.0f} m"
+        often = "once" if jumps.sum() == 1 else f"{jumps.sum()} times"
+        stays = bool(abs(np.diff(points)[jumps].sum()) > far_m)
+        text = f"{f.topic}: the fix jumps {often}, by up to {step_m[jumps].max():.0f} m{', and stays there' * stays}"
         at = where(f.topic, stamp_ns[1:][jumps])
-        yield Finding("fix_jumps", "warning", float(step_m[jumps].max()), far_m, "m", text, **at)
+        yield Finding("fix_jumps", "error" if stays else "warning", float(step_m[jumps].max()), far_m, "m", text, **at)
+
+
+def _late(c: Columns, f: FixColumns, stamp_ns: Index, points: Array, own: Array) -> Iterator[Finding]:
+    """Fixes that agree with odometry better at other times, in either half of the windows of the drive."""
+    antenna, _ = _driven(f, c.path)
+    path_s, at_s = ((some_ns - c.path_ns[0]) * 1e-9 for some_ns in (c.path_ns, stamp_ns))
+    begins = np.flatnonzero(np.diff(at_s // _WINDOW_S)) + 1
+    windows = [k for k in np.split(np.arange(len(at_s)), begins) if len(k) >= _LEAST]
+    tried_s, left = np.arange(-_MOST_LATE_S, _MOST_LATE_S + 0.01, _LATE_S / 3.0), list[list[float]]()
+    for late_s in tried_s:
+        own = np.interp(at_s - late_s, path_s, antenna)
+        left.append([_left(own[k], points[k]) for k in windows])
+    halves = [np.sum([row[n::2] for row in left], axis=1) for n in (0, 1)]
+    first_s, second_s, late_s = (float(tried_s[np.argmin(some)]) for some in (*halves, sum(halves)))
+    is_better = min(sum(halves)) < _BETTER * sum(halves)[len(tried_s) // 2]
+    if is_better and _LATE_S <= abs(late_s) < _MOST_LATE_S - 0.01 and abs(first_s - second_s) < _LATE_S:
+        when = f"{abs(late_s) * 1e3:.0f} ms {'earlier' if late_s > 0.0 else 'later'} than stamped"
+        text = f"{f.topic}: fixes agree with odometry best {when}, or their antenna is elsewhere on the robot"
+        at = where(f.topic, stamp_ns, settings=(offset_setting(c, f.input, -late_s),))
+        yield Finding("clock_offset", "warning", -late_s, _LATE_S, "s", text, **at)
+
+
+def _left(own: Array, points: Array) -> float:
+    """The sum of squares that is left of points when a path is turned and shifted onto them."""
+    return float(len(own) * (own.var() + points.var()) - 2.0 * abs(np.vdot(own - own.mean(), points)))
+
+
+def _slipped(c: Columns, f: FixColumns, stamp_ns: Index, points: Array, own: Array) -> Iterator[Finding]:
+    """A stretch in which fixes move by far more or less than odometry: of the two, one is wrong."""
+    begins = np.flatnonzero(np.diff((stamp_ns - stamp_ns[0]) // _STEP_NS, prepend=-1))
+    counts = np.diff([*begins, len(points)])
+    moved, driven = (np.abs(np.diff(np.add.reduceat(x, begins) / counts))[:, None] for x in (points, own))
+    if found := worst_stretch(moved - driven, driven, np.array([_SLIP_M]), _SLIP_PART, _SLIP_SIGMAS):
+        k, _, more_m, limit_m, _ = found
+        by = f"fixes move {abs(more_m):.1f} m {'more' if more_m > 0.0 else 'less'} than {c.odometry.topic} in 10 s"
+        text = f"{f.topic}: {by}: odometry slips there, or the fixes are wrong, and fixes alone do not tell which"
+        at = where(f.topic, stamp_ns[begins[k] :], TOGETHER)
+        yield Finding("odometry_slips", "error", abs(more_m), limit_m, "m", text, **at)
 
 
 def _headings(

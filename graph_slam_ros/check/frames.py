@@ -20,9 +20,8 @@ def check_frames(c: Columns) -> Iterator[Finding]:
     if c.odometry.frame in _FIXED:
         is_common = c.odometry.frame == _OF_CAMERAS
         severity: Severity = "note" if is_common else "warning"
-        what = (
-            "visual odometry, or the output of a localiser" if is_common else "the output of a localiser, not odometry"
-        )
+        localiser = "the output of a localiser"
+        what = f"visual odometry, or {localiser}" if is_common else f"{localiser}, not odometry"
         text = f"{c.odometry.topic} is given in frame {c.odometry.frame}: it is {what}"
         yield Finding("odometry_in_map", severity, 1, 0, "topics", text, c.odometry.topic)
     unlinked = set()
@@ -36,8 +35,8 @@ def check_frames(c: Columns) -> Iterator[Finding]:
 def _parents(c: Columns) -> Iterator[Finding]:
     """Frames that more than one frame is a parent of."""
     parents: dict[str, dict[str, None]] = {}
-    for link in c.links:
-        parents.setdefault(link.child, {})[link.parent] = None
+    for parent, child in c.links:
+        parents.setdefault(child, {})[parent] = None
     used = {s.frame for s in c.sightings} | {c.config.frames.base, c.odometry.child}
     for frame in tuple(used):
         while frame in parents and (above := next(iter(parents[frame]))) not in used:
@@ -56,7 +55,7 @@ def _of_sensor(c: Columns, s: SightingColumns) -> Iterator[Finding]:
     at = where(s.topic, topic.stamp_ns)
     fixed = [frame for frame in topic.frames if frame.lstrip("/") in (*_FIXED, c.odometry.frame) and frame]
     if fixed:
-        is_linked = any(link.child == c.odometry.child and link.parent == fixed[0].lstrip("/") for link in c.links)
+        is_linked = (fixed[0].lstrip("/"), c.odometry.child) in c.links
         text = f"{s.topic} is given in {fixed[0]}, a frame that does not move with the robot"
         severity: Severity = "note" if is_linked else "error"
         yield Finding("seen_in_fixed_frame", severity, topic.frames[fixed[0]], 0, "messages", text, **at)
@@ -81,11 +80,10 @@ def _unlinked(c: Columns, known: set[str]) -> Iterator[Finding]:
         if topic is None or not times or topic.name in known:
             continue
         frames, base = tuple(topic.frames), c.config.frames.base
-        above = {link.child: link.parent for link in c.links}
+        above = {child: parent for parent, child in c.links}
         root = root_of(above, base.lstrip("/"))
-        linked = [frame for frame in frames if frame and root_of(above, frame.lstrip("/")) == root]
-        if "frame_unknown" not in counts:  # but that of odometry, or of a map
-            linked = []
+        of_sensor = frames if "frame_unknown" in counts else ()  # else it is that of odometry, or of a map
+        linked = [frame for frame in of_sensor if frame and root_of(above, frame.lstrip("/")) == root]
         lost = ", ".join([frame for frame in frames if frame not in linked][:4])
         others = ", ".join(linked[:4])
         text = f"{topic.name}: {times} measurements are refused: no transform links frame {lost} to {base}"

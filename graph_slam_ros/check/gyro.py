@@ -10,6 +10,7 @@ from graph_slam_ros.check.columns import Columns
 from graph_slam_ros.check.contradictions import turned_mount
 from graph_slam_ros.check.finding import Finding, Severity, where
 from graph_slam_ros.check.pairs import poses_at
+from graph_slam_ros.check.times import offset_setting
 from graph_slam_ros.formats.parameters import assignment
 from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.slam.frontend.gyro import GyroState
@@ -30,11 +31,9 @@ def check_gyro(c: Columns) -> Iterator[Finding]:
     """Scale, sign, axis and bias of a gyro: both must turn alike over each second."""
     topic = c.topic_of(c.config.gyro_input)
     odometry, gyro = _turns(c)
-    if topic is None or not len(c.gyro_ns):
+    if topic is None or len(gyro) < _LEAST_WINDOWS:
         return
     gyro_ns = np.sort(c.gyro_ns)
-    if len(gyro) < _LEAST_WINDOWS:
-        return
     factor, bias, left = _line(odometry, gyro)
     limit = _BIAS_SIGMAS * c.config.gyro.bias_sigma
     is_turning = np.abs(odometry) > _TURNING_RAD
@@ -46,9 +45,7 @@ def check_gyro(c: Columns) -> Iterator[Finding]:
         if (unexplained > most or abs(factor - 1.0) > _SCALE) and (late_s := _late_s(c)):
             when = f"{abs(late_s) * 1e3:.0f} ms {'later' if late_s < 0.0 else 'earlier'} than stamped"
             text = f"{topic.name}: its gyro turns as odometry does {when}: correct its clock"
-            before_s = next(one.offset_s for one in c.config.sources if one.name == c.config.gyro_input)
-            setting = assignment(f"{c.config.gyro_input}.offset_s", round(before_s - late_s, 3) + 0.0)
-            at = where(topic.name, gyro_ns, settings=(setting,))
+            at = where(topic.name, gyro_ns, settings=(offset_setting(c, c.config.gyro_input, -late_s),))
             yield Finding("clock_offset", "warning", -late_s, _LEAST_LATE_S, "s", text, **at)
             return
         if unexplained > most:
@@ -106,16 +103,13 @@ def _turns(c: Columns, rates: Array | None = None) -> tuple[Array, Array]:
 
 def _line(x: Array, y: Array) -> tuple[float, float, Array]:
     """Robust slope and offset of y over x, and what they leave."""
-    rows: Array = np.stack([x, np.ones(len(x))], axis=1)
-    weight: Array = np.ones(len(x))
-    solution: Array = np.zeros(2)
-    left: Array = y
+    rows, weight = np.stack([x, np.ones(len(x))], axis=1), np.ones(len(x))
     for _ in range(_ROUNDS):
-        solution = np.asarray(np.linalg.lstsq(rows * weight[:, None], y * weight, rcond=None)[0], dtype=np.float64)
-        left = y - rows @ solution
+        factor, bias = np.linalg.lstsq(rows * weight[:, None], y * weight, rcond=None)[0].tolist()
+        left = y - rows @ [factor, bias]
         scale = 1.48 * float(np.median(np.abs(left))) + 1e-6
         weight = 1.0 / np.sqrt(1.0 + (left / (3.0 * scale)) ** 2)
-    return float(solution[0]), float(solution[1]), left
+    return factor, bias, left
 
 
 def _scale(c: Columns, factor: float, name: str, gyro_ns: Index) -> Finding:

@@ -60,9 +60,8 @@ def at_two_places(s: SightingColumns, points: Array, path_ns: Index, dimensions:
 
 def check_identities(s: SightingColumns, found: list[TwoPlaces]) -> Iterator[Finding]:
     """Findings of identities that are of two places."""
-    seen = sum(bool(name) for name in s.names)
     yield from _moved(s, [one for one in found if one.since_ns is not None])
-    yield from _reused(s, [one for one in found if one.since_ns is None], seen)
+    yield from _reused(s, [one for one in found if one.since_ns is None])
 
 
 def _two_places(name: str, chosen: Index, s: SightingColumns, points: Array) -> TwoPlaces | None:
@@ -129,17 +128,15 @@ def _of(one: TwoPlaces, code: str, text: str, s: SightingColumns) -> Finding:
     return Finding(code, "warning", one.apart_m, _APART_M, "m", text, s.topic, one.first_ns, one.count)
 
 
-def _reused(s: SightingColumns, reused: list[TwoPlaces], seen: int) -> Iterator[Finding]:
+def _reused(s: SightingColumns, reused: list[TwoPlaces]) -> Iterator[Finding]:
     if len(reused) > _MOST_MOVED:
-        text = f"{s.topic}: {len(reused)} of {seen} ids are seen at more than one place"
+        text = f"{s.topic}: {len(reused)} of {sum(map(bool, s.names))} ids are seen at more than one place"
         first_ns = min(one.first_ns for one in reused)
         yield Finding("ids_unsure", "warning", len(reused), _MOST_MOVED, "identities", text, s.topic, first_ns)
         return
     for one in reused:
-        text = (
-            f"{s.topic}: id {one.name} is seen at two places, {one.apart_m:.1f} m apart "
-            f"({one.share:.0%} of its sightings are at the second)"
-        )
+        apart = f"{one.apart_m:.1f} m apart ({one.share:.0%} of its sightings are at the second)"
+        text = f"{s.topic}: id {one.name} is seen at two places, {apart}"
         yield _of(one, "id_reused", text, s)
 
 

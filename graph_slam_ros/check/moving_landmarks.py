@@ -26,54 +26,40 @@ class LandmarkMotions:
     ----------
     names : (n,) numbers of the identities that are seen often enough
     on_robot, on_ground : (n,) on the robot, and on the ground if odometry is right [m]
-    staying : (n,) part of its sightings within some seconds that are at the same place on the ground
-    moving : (n,) part of its pairs that are farther apart on the ground than noise explains
     at : (n, 3) where it is on the robot
+    with_robot, by_itself : (n,) whether it stays at one place on the robot while that moves, or nowhere; those with
+        wrong ids now and then stay most of the time
     noise_m : what two sightings of a landmark differ by, where nothing is wrong
     """
 
     names: Index
     on_robot: Array
     on_ground: Array
-    staying: Array
-    moving: Array
     at: Array
+    with_robot: Mask
+    by_itself: Mask
     noise_m: float
-
-    @property
-    def _moves(self) -> Mask:
-        return np.asarray((self.on_ground > _NOISES * self.noise_m) & (self.moving > _MOST))
-
-    @property
-    def moves_with_robot(self) -> Mask:
-        """(n,) Landmarks that stay at one place on the robot while that moves."""
-        return np.asarray(self._moves & (self.on_robot < _HALF * self.on_ground))
-
-    @property
-    def moves_by_itself(self) -> Mask:
-        """(n,) Landmarks that stay nowhere; those with wrong ids now and then stay most of the time."""
-        return np.asarray(self._moves & ~self.moves_with_robot & (self.staying < _SOME))
 
 
 def motions_of(c: Columns, s: SightingColumns, pairs: Pairs) -> LandmarkMotions:
     """Return how each landmark moves, by odometry."""
     noise_m = noise_of(s, pairs)
-    on_ground = pairs.residuals(s.points)
-    on_robot = np.linalg.norm((s.points[pairs.b] - s.points[pairs.a])[:, : pairs.dimensions], axis=1)
+    grounds = pairs.residuals(s.points)
+    robots = np.linalg.norm((s.points[pairs.b] - s.points[pairs.a])[:, : pairs.dimensions], axis=1)
     of = s.name[pairs.a]
     names = np.flatnonzero(np.bincount(of, minlength=len(s.names)) >= _LEAST_PAIRS)
     chosen = [np.flatnonzero(of == name) for name in names]
 
-    def median(values: Array) -> Array:
-        return np.array([float(np.median(values[k])) for k in chosen])
-
+    on_robot, on_ground = (np.array([np.median(some[k]) for k in chosen]) for some in (robots, grounds))
     poses = poses_at(np.clip(s.stamp_ns, c.path_ns[0], c.path_ns[-1]), c.path_ns, c.path)
     ground = np.stack(se3.act(tuple(poses.T), tuple(s.points.T)), axis=1)[:, : pairs.dimensions]
-    moving = np.array([float((on_ground[k] > 2.0 * noise_m).mean()) for k in chosen])
+    moving = np.array([(grounds[k] > 2.0 * noise_m).mean() for k in chosen])
     at = np.array([np.median(s.points[pairs.a[k]], axis=0) for k in chosen]).reshape(-1, 3)
-    own = (s.name == name for name in names)
-    staying = np.array([_staying(s.stamp_ns[one], ground[one], 2.0 * noise_m) for one in own])
-    return LandmarkMotions(names, median(on_robot), median(on_ground), staying, moving, at, noise_m)
+    staying = np.array([_staying(s.stamp_ns[s.name == k], ground[s.name == k], 2.0 * noise_m) for k in names])
+    moves = (on_ground > _NOISES * noise_m) & (moving > _MOST)
+    with_robot = moves & (on_robot < _HALF * on_ground)
+    by_itself = moves & ~with_robot & (staying < _SOME)
+    return LandmarkMotions(names, on_robot, on_ground, at, with_robot, by_itself, noise_m)
 
 
 def _staying(stamp_ns: Index, ground: Array, near_m: float) -> float:
@@ -87,7 +73,7 @@ def _staying(stamp_ns: Index, ground: Array, near_m: float) -> float:
 
 def check_moving(s: SightingColumns, by: LandmarkMotions, count: int) -> Iterator[Finding]:
     """Sightings of a fixed frame, whatever frame they name, and landmarks that move, by this many pairs."""
-    if np.count_nonzero(by.moves_with_robot) >= max(_LEAST_NAMES, _MOST * len(by.names)):
+    if np.count_nonzero(by.with_robot) >= max(_LEAST_NAMES, _MOST * len(by.names)):
         robot_m, ground_m = float(np.median(by.on_robot)), float(np.median(by.on_ground))
         text = (
             f"{s.topic}: while the robot drives, landmarks stay where they are on it to {robot_m:.2f} m, and "
@@ -99,7 +85,7 @@ def check_moving(s: SightingColumns, by: LandmarkMotions, count: int) -> Iterato
     for k in moving_alone(by)[:_MOST_NAMED]:
         name, own_ns = s.names[by.names[k]], np.sort(s.stamp_ns[s.name == by.names[k]])
         text = f"{s.topic}: landmark {name} moves: it is {by.on_ground[k]:.2f} m from its place a few seconds later"
-        if by.moves_with_robot[k]:
+        if by.with_robot[k]:
             x, y = by.at[k, :2]
             text = (
                 f"{s.topic}: landmark {name} moves along with the robot, at x {x:.2f} and y {y:.2f} m on it: it is a "
@@ -111,7 +97,7 @@ def check_moving(s: SightingColumns, by: LandmarkMotions, count: int) -> Iterato
 
 def moving_alone(by: LandmarkMotions) -> list[int]:
     """The landmarks that move where the others do not, by their place in the columns; the farthest first."""
-    moves = by.moves_with_robot | by.moves_by_itself
+    moves = by.with_robot | by.by_itself
     rest = by.on_ground[~moves]
     if not moves.any() or moves.sum() > max(1.0, _SOME * len(moves)):
         return []

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
 
@@ -32,6 +33,9 @@ _AT_REST = 0.05  # of the root mean square
 _LATERAL, _FITS, _WORSE_M = 0.1, 0.3, 0.02
 _TINY, _USELESS, _UNUSED_M_S, _SLOWEST_M_S, _TINY_RAD_S = 1e-3, 3.0, 1e3, 0.05, 1e-4
 _OFF_PLANE, _LEVEL_M = 0.05, 0.5
+TOGETHER = 5
+"""Steps that are summed for a slip."""
+_SIGMA, _LEAST_STRETCHES = 1.4826, 20  # _SIGMA: of a median absolute deviation
 _UNITS = {
     -1.0: "mirrored",
     57.29578: "radians for degrees",
@@ -39,7 +43,7 @@ _UNITS = {
     1000.0: "metres for thousands",
     1e-3: "millimetres for metres",
 }
-_DENSITY = ("odometry.noise=density",)
+_DENSITY, _SPACE = ("odometry.noise=density",), ("world.dimensions=3",)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -164,12 +168,12 @@ def check_odometry(c: Columns) -> Iterator[Finding]:
     total_m = float(np.linalg.norm(steps.moved[smooth], axis=1).sum())
     total_rad = float(np.linalg.norm(steps.turned[smooth], axis=1).sum())
     if total_m < _STILL_M and total_rad < _STILL_RAD:
-        span_s = float(steps.dt.sum())
         speed_m_s = float(np.median(np.linalg.norm(o.twist[steps.index, :3], axis=1)))
         if speed_m_s > _SLOWEST_M_S:
             text = f"{o.topic}: its pose never changes, though its twist says {speed_m_s:.1f} m/s"
             yield Finding("pose_stands", "error", speed_m_s, _SLOWEST_M_S, "m/s", text, **at)
             return
+        span_s = float(steps.dt.sum())
         text = f"{o.topic}: the robot moves {total_m:.2f} m and {np.degrees(total_rad):.0f} degrees in {span_s:.0f} s"
         yield Finding("static", "warning", total_m, _STILL_M, "m", text, **at)
         return
@@ -230,8 +234,7 @@ def _plane(c: Columns, o: OdometryColumns) -> Iterator[Finding]:
     share = out / len(o.poses)
     if share > _OFF_PLANE:
         text = f"{o.topic}: {share:.0%} of the poses are more than {_LEVEL_M} m above or below the first, or tilted"
-        settings = ("world.dimensions=3",)
-        yield Finding("not_planar", "warning", share, _OFF_PLANE, "part", text, o.topic, 0, out, settings)
+        yield Finding("not_planar", "warning", share, _OFF_PLANE, "part", text, o.topic, 0, out, _SPACE)
 
 
 def _twist(o: OdometryColumns, steps: Steps, jumps: Mask, applied: float) -> Iterator[Finding]:
@@ -256,23 +259,16 @@ def _twist(o: OdometryColumns, steps: Steps, jumps: Mask, applied: float) -> Ite
         fits.append((ratio(driven, moved), ratio(rotated, turned)))
     speed, rate = min(fits, key=lambda pair: pair[0][1] + pair[1][1])
     if _in_odom(o, steps, sums, moved, twist[1:]):
-        text = (
-            f"{o.topic}: the twist is given along the axes of {o.frame}; nav_msgs/Odometry defines those of {o.child}"
-        )
+        text = f"{o.topic}: the twist is given along the axes of {o.frame}; nav_msgs/Odometry has those of {o.child}"
         yield Finding("twist_frame", "warning", 1.0, _FITS, "times", text, **at)
         return
-    for what, (factor, left), total in (
-        ("speed", speed, np.abs(moved).sum()),
-        ("turn rate", rate, np.abs(turned).sum()),
-    ):
+    for what, (factor, left), way in (("speed", speed, moved), ("turn rate", rate, turned)):
+        total = np.abs(way).sum()
         if total < 1.0 or not np.isfinite(factor):
             continue
         unit = next((why for k, why in _UNITS.items() if abs(factor / k - 1.0) < _SCALE), "")
-        if (
-            min(abs(factor - 1.0), abs(applied * factor - 1.0)) > _SCALE
-            and left < _EXPLAINED
-            and (unit or width >= _LEAST_WIDTH)
-        ):
+        is_other = min(abs(factor - 1.0), abs(applied * factor - 1.0)) > _SCALE
+        if is_other and left < _EXPLAINED and (unit or width >= _LEAST_WIDTH):
             text = f"{o.topic}: the pose moves {factor:.3g} times as far as the {what} of the twist says"
             text += f" ({unit or 'another scale'})"
             yield Finding("twist_scale", "warning", factor, _SCALE, "times", text, **at)
@@ -313,6 +309,27 @@ def ratio(x: Array, y: Array) -> tuple[float, float]:
     return factor, float(np.median(error[large]) / (np.median(size[large]) + 1e-9))
 
 
+Stretch: TypeAlias = tuple[int, int, float, float, float]
+
+
+def worst_stretch(errors: Array, sizes: Array, least: Array, part: float, sigmas: float) -> Stretch | None:
+    """Return where odometry is worst over some steps, if it is far worse there than in the rest of the drive.
+
+    The errors (n, c) of its steps are summed: one is as rough as its landmarks. Their scale is that of the middle half
+    of the sums, so a wrong factor, which all have, is none. ``least``, a part of the sizes (n, c), and some sigmas are
+    no error. Returned are the first step, the column, and of it the sum, its limit and its scale.
+    """
+    if len(errors) < _LEAST_STRETCHES + TOGETHER - 1:
+        return None
+    errors, sizes = (np.stack([np.convolve(x, np.ones(TOGETHER), "valid") for x in rows.T]) for rows in (errors, sizes))
+    errors = errors - np.median(errors, axis=1, keepdims=True)
+    scale = _SIGMA * np.median(np.abs(errors), axis=1)
+    limits = np.maximum(np.maximum(sigmas * scale, least)[:, None], part * sizes)
+    column, first = (int(k) for k in np.unravel_index(np.argmax(np.abs(errors) / limits), errors.shape))
+    error, limit = float(errors[column, first]), float(limits[column, first])
+    return (first, column, error, limit, float(scale[column])) if abs(error) > limit else None
+
+
 def _covariance(o: OdometryColumns, steps: Steps) -> Iterator[Finding]:
     """The variances of the twist against what the robot does."""
     at = where(o.topic, o.stamp_ns[steps.index], settings=_DENSITY)
@@ -330,7 +347,5 @@ def _covariance(o: OdometryColumns, steps: Steps) -> Iterator[Finding]:
         text = f"{o.topic}: the sigma of the twist is {sigmas[0]:.2g} m/s, but the robot drives at most {speed:.2g} m/s"
         yield Finding("covariance_useless", "warning", sigmas[0] / speed, _USELESS, "times", text, **at)
     elif 0.0 < sigmas[0] < _TINY * speed or 0.0 < sigmas[2] < _TINY_RAD_S:
-        text = (
-            f"{o.topic}: the twist has sigmas of {sigmas[0]:.1g} m/s and {sigmas[2]:.1g} rad/s: no wheels are so good"
-        )
+        text = f"{o.topic}: the twist has sigmas of {sigmas[0]:.1g} m/s, {sigmas[2]:.1g} rad/s: no wheels are so good"
         yield Finding("covariance_tiny", "warning", sigmas[0] / speed, _TINY, "times", text, **at)

@@ -151,12 +151,8 @@ def _sigmas(s: SightingColumns, pairs: Pairs) -> tuple[str, ...]:
     """Settings that state the noise as pairs have it."""
     sigma_m = float(np.quantile(pairs.residuals(s.points), _QUARTILE)) / _OF_RAYLEIGH / 2.0**0.5
     sigma_rad = sigma_m / max(float(np.median(np.linalg.norm(s.points[pairs.a], axis=1))), sigma_m)
-    settings = (
-        "noise=sigmas",
-        f"sigma_m={max(round(sigma_m, 3), 1e-3)}",
-        f"sigma_rad={max(round(sigma_rad, 4), 1e-4)}",
-    )
-    return tuple(f"{s.input}.{setting}" for setting in settings)
+    sigmas = f"sigma_m={max(round(sigma_m, 3), 1e-3)}", f"sigma_rad={max(round(sigma_rad, 4), 1e-4)}"
+    return tuple(f"{s.input}.{setting}" for setting in ("noise=sigmas", *sigmas))
 
 
 def check_ranges(c: Columns, s: SightingColumns) -> Iterator[Finding]:

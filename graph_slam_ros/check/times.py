@@ -19,7 +19,7 @@ _LEAST_ROUNDED_NS, _AS_OTHERS, _COARSE_S = 1_000_000, 0.1, 0.15
 _LONG_S, _VERY_LONG_S, _PERIODS, _MOVED_M, _TURNED = 1.0, 2.0, 10.0, 0.05, 0.05
 _SLOW_HZ, _BETWEEN_S = 5.0, 0.02
 _CROWDED, _FASTER = 0.2, 1.5
-_OF_A_SECOND = {1_000: "milliseconds", 1_000_000: "microseconds"}
+_OF_A_SECOND = {1: "nothing", 1_000: "milliseconds", 1_000_000: "microseconds"}
 _PACE, _GOES_ON, _STEPS = 0.05, 0.3, 5
 _OUTSIDE, _NEARLY_ALL, _MARGIN_NS = 0.2, 0.95, 500_000_000
 
@@ -27,7 +27,7 @@ _OUTSIDE, _NEARLY_ALL, _MARGIN_NS = 0.2, 0.95, 500_000_000
 def check_times(c: Columns) -> Iterator[Finding]:
     """Clocks of inputs against the recorder's and each other, and the order of the stamps of each."""
     right = {name: topic for name, topic in c.topics.items() if not c.counters[topic.inputs[0], "bad_stamp"]}
-    if wrong := [one for topic in right.values() for one in _constant(topic)] or list(_wrong(right)):
+    if wrong := list(_wrong(right)):
         yield from wrong
         return
     for key, value in c.assumed.items():
@@ -45,32 +45,28 @@ def check_times(c: Columns) -> Iterator[Finding]:
     yield from _overlap(c)
 
 
-def _constant(topic: TopicColumns) -> Iterator[Finding]:
-    """An input whose messages all have one stamp, though they were not recorded at one time."""
-    stamp_ns = topic.stamp_ns[topic.stamp_ns != 0]
-    is_input, count = topic.use in ("odometry", "landmarks"), len(stamp_ns)
-    if is_input and count >= _MANY and not np.ptp(stamp_ns) and np.ptp(topic.log_ns):
-        text = f"{topic.name}: all of its {count} messages have the stamp {stamp_ns[0] * 1e-9:.3f} s"
-        yield Finding("constant_stamps", "error", count, _MANY, "messages", text, **where(topic.name, stamp_ns))
-
-
 def _wrong(topics: Mapping[str, TopicColumns]) -> Iterator[Finding]:
-    """Inputs whose stamps crowd together in each second, or that advance much faster or slower than other inputs'."""
+    """Inputs whose stamps are all one, crowd together in each second, or advance much faster or slower than others'."""
     advance = dict[str, float]()
     for name, topic in topics.items():
         lag_s, log_ns, stamp_ns = _lags(topic)
         if len(lag_s) < _MANY or not np.ptp(log_ns):
             continue
-        step_ns, recorded_ns = np.diff(stamp_ns), np.diff(log_ns)
+        if not np.ptp(stamp_ns):
+            text = f"{name}: all of its {len(stamp_ns)} messages have the stamp {stamp_ns[0] * 1e-9:.3f} s"
+            at = where(name, stamp_ns)
+            yield Finding("constant_stamps", "error", len(stamp_ns), _MANY, "messages", text, **at)
+            continue
+        apart = max(1, len(lag_s) // 4)
+        span_ns = np.maximum(log_ns[apart:] - log_ns[:-apart], 1)
+        advance[name] = float(np.median((stamp_ns[apart:] - stamp_ns[:-apart]) / span_ns))
+        crowded = np.median(np.diff(stamp_ns)) < _CROWDED * np.median(np.diff(log_ns)) and advance[name] > _CROWDED
         part = int(np.quantile(stamp_ns % 10**9, _NEARLY_ALL))
-        if 0 < part < _CROWDED * 1e9 and np.median(step_ns) < _CROWDED * np.median(recorded_ns):
+        if part < _CROWDED * 1e9 and crowded and (part or topic.use != "odometry"):  # whose rounding is told apart
             unit = next((unit for most, unit in _OF_A_SECOND.items() if part < most), "ticks")
             text = f"{name}: all that comes in a second is stamped within {part * 1e-6:.3g} ms: nanosec has {unit}"
             yield Finding("wrong_stamps", "error", part * 1e-9, _CROWDED, "s", text, **where(name, stamp_ns))
             return
-        apart = max(1, len(lag_s) // 4)
-        span_ns = np.maximum(log_ns[apart:] - log_ns[:-apart], 1)
-        advance[name] = float(np.median((stamp_ns[apart:] - stamp_ns[:-apart]) / span_ns))
     usual = float(np.median(list(advance.values()))) if len(advance) > 2 else 1.0  # simulated time may be slow
     for name, rate in advance.items():
         others = [other for other in advance.values() if other != rate]
@@ -128,7 +124,7 @@ def _clocks(c: Columns, topics: dict[str, TopicColumns]) -> Iterator[Finding]:
                 f"{topic.name}: recorded {-apart_s * 1e3:.0f} ms before the time in its stamps, compared with "
                 f"{c.odometry.topic}: its clock is ahead"
             )
-            at = where(topic.name, stamp_ns, settings=(_offset(c, topic, apart_s),))
+            at = where(topic.name, stamp_ns, settings=(offset_setting(c, topic.inputs[0], apart_s),))
             yield Finding("latency", "warning", -apart_s, _EARLY_S, "s", text, **at)
 
 
@@ -140,14 +136,14 @@ def _other_clock(
     wrong, right = (of_odometry, topic) if is_right else (topic, of_odometry)
     by_s = apart_s if wrong is topic else -apart_s
     text = f"{wrong.name}: its stamps are {-by_s:.1f} s away from those of {right.name}: another clock"
-    at = where(topic.name, stamp_ns, settings=(_offset(c, wrong, by_s),))
+    at = where(topic.name, stamp_ns, settings=(offset_setting(c, wrong.inputs[0], by_s),))
     return Finding("clock_domains", "error", -by_s, _CLOCKS_DIFFER_S, "s", text, **at)
 
 
-def _offset(c: Columns, topic: TopicColumns, offset_s: float) -> str:
-    name = topic.inputs[0]
+def offset_setting(c: Columns, name: str, by_s: float) -> str:
+    """Return the setting that shifts the stamps of an input by so much more."""
     before_s = next(one.offset_s for one in c.config.sources if one.name == name)
-    return assignment(f"{name}.offset_s", round(before_s + offset_s, 3))
+    return assignment(f"{name}.offset_s", round(before_s + by_s, 3) + 0.0)
 
 
 def _order(c: Columns, topic: TopicColumns) -> Iterator[Finding]:
@@ -161,9 +157,7 @@ def _order(c: Columns, topic: TopicColumns) -> Iterator[Finding]:
         found = Finding("coarse_stamps", "error", each_s, _COARSE_S, "s", text, topic.name)
         yield found if is_coarse else replace(found, code="rounded_stamps", severity="note")
     elif topic.use == "odometry" and share > _DUPLICATES:
-        text = (
-            f"{topic.name}: {share:.1%} of the messages have the stamp of the one before: published or recorded twice"
-        )
+        text = f"{topic.name}: {share:.1%} of the messages have the stamp before: published or recorded twice"
         at = where(topic.name, stamp_ns[1:][repeated])
         yield Finding("duplicates", "warning", share, _DUPLICATES, "part", text, **at)
     if not back.any():
@@ -172,8 +166,7 @@ def _order(c: Columns, topic: TopicColumns) -> Iterator[Finding]:
     window_s = c.config.ordering.window_s if topic.use == "odometry" else c.config.ordering.late_s
     if most_s > 1.0 and most_s > window_s:
         text = f"{topic.name}: stamps step back by up to {most_s:.2f} s: the clock was set, or two drives were joined"
-        is_expected = c.config.time.on_jump != TimeConfig().on_jump
-        severity: Severity = "note" if is_expected else "error"
+        severity: Severity = "error" if c.config.time.on_jump == TimeConfig().on_jump else "note"
         yield Finding("time_jump", severity, most_s, 1.0, "s", text, **at)
     elif topic.use == "odometry" and most_s > window_s and count > _OUT_OF_ORDER * len(step_s):
         text = f"{topic.name}: {count} messages are older than the one before, by up to {most_s * 1e3:.0f} ms"

@@ -7,28 +7,14 @@ import numpy as np
 from graph_slam_ros.check.columns import Columns, SightingColumns
 from graph_slam_ros.check.finding import Finding, Severity, where
 from graph_slam_ros.check.identities import at_two_places, check_identities, check_outliers
-from graph_slam_ros.check.odometry import twist_factor
+from graph_slam_ros.check.odometry import TOGETHER, twist_factor, worst_stretch
 from graph_slam_ros.check.pairs import noisier, pairs_of, poses_at
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.parameters import assignment
 from graph_slam_ros.lie import se3
 from graph_slam_ros.measurements.types import END, Measurement, Odometry
 from graph_slam_ros.slam import Config, GraphSlam
-from graph_slam_ros.slam.calibration.answers import (
-    CODES,
-    LEAST_M,
-    MOST_LOST,
-    PRIOR_SIGMAS,
-    absurd_range,
-    absurd_text,
-    clock_jumps,
-    is_off,
-    jump_sentence,
-    ranges_instead,
-    sentence,
-    setting_of,
-)
-from graph_slam_ros.slam.calibration.answers import Finding as Fitted
+from graph_slam_ros.slam.calibration import answers
 from graph_slam_ros.slam.calibration.fit import TrialFit
 from graph_slam_ros.slam.calibration.parameters import Parameter
 from graph_slam_ros.slam.noise_scale import LARGEST, NoiseScale
@@ -45,8 +31,8 @@ _DEGREE = np.pi / 180.0
 _LIMITS = {
     "clock": ("s", 0.03, 0.05),
     "yaw": ("rad", 3.0 * _DEGREE, 3.0 * _DEGREE),
-    "x": ("m", LEAST_M, np.inf),
-    "y": ("m", LEAST_M, np.inf),
+    "x": ("m", answers.LEAST_M, np.inf),
+    "y": ("m", answers.LEAST_M, np.inf),
     "distance": ("part", 0.03, 0.05),
     "turn": ("part", 0.03, 0.05),
     "range_factor": ("part", 0.03, 0.05),
@@ -55,11 +41,7 @@ _LIMITS = {
 _OVER_CONFIDENT, _ODOMETRY_OVER_CONFIDENT, _LEAST_DOF = 2.0, 6.0**0.5, 100.0
 _OF_A_BREAK = ("ids_unsure", "map_breaks", "landmark_moved")  # a robot that was carried has them with right ids
 _MOST, _SHIFTS = 0.9, 2.0
-
-_TOGETHER = 5  # steps between keyframes that are summed for a slip: one is as rough as its landmarks
-_SIGMA = 1.4826  # of a median absolute deviation
-_SLIP_SIGMAS, _PART = 6.0, 0.1
-_LEAST_M, _LEAST_RAD, _LEAST_WINDOWS = 0.15, 0.3, 20
+_LEAST_M, _LEAST_RAD, _PART, _SLIP_SIGMAS = 0.15, 0.3, 0.1, 6.0
 _LARGE_SIGMAS, _LARGE_M, _LARGE_RAD = 12.0, 0.5, 0.8
 
 
@@ -109,7 +91,7 @@ def check_trial(c: Columns, slam: GraphSlam) -> Iterator[Finding]:
         yield Finding("fit_unsure", "note", 1, 0, "fits", f"the trial fit failed: {error}")
         return
     clocks = [one for one in fitted if one.parameter.name == "clock" and one.verdict == "admitted"]
-    is_void = fit.lost > MOST_LOST or absurd_range(fit) is not None
+    is_void = fit.lost > answers.MOST_LOST or answers.absurd_range(fit) is not None
     late_s = {} if is_void else {one.parameter.source: one.value for one in clocks}
     step_s = float(np.median(np.diff(c.path_ns))) * 1e-9
     known = [one for one in fitted if one.parameter.name in _LIMITS]
@@ -125,11 +107,8 @@ def check_trial(c: Columns, slam: GraphSlam) -> Iterator[Finding]:
     yield from (found_one for one in fitted for found_one in _fitted(c, slam, fit, one, off))
     yield from _clock_jumps(c, fit)
     yield from [slip[0]] if slip else []
-    if is_broken:
-        found = [one for one in found if one.code not in _OF_A_BREAK]
-    elif any(one.code == "map_breaks" for one in found):
-        found = [one for one in found if one.code != "ids_unsure"]
-    yield from found
+    hidden = _OF_A_BREAK if is_broken else ("ids_unsure",) * any(one.code == "map_breaks" for one in found)
+    yield from (one for one in found if one.code not in hidden)
     if new := slam.renewed_ids():
         name = c.sightings[0].topic
         text = f"{name}: {new}"
@@ -154,12 +133,14 @@ def _noise(c: Columns, slam: GraphSlam, *, has_cause: bool) -> Iterator[Finding]
 
 def _void(fit: TrialFit) -> Finding:
     """A fit of which nothing is believed."""
-    k, unchecked = absurd_range(fit), "clock, mount and scale cannot be checked"
-    if fit.lost > MOST_LOST or k is None:
+    k, unchecked = answers.absurd_range(fit), "clock, mount and scale cannot be checked"
+    if fit.lost > answers.MOST_LOST or k is None:
         text = f"{fit.lost:.0%} of the sightings do not fit: {unchecked}"
-        return Finding("fit_unsure", "warning", fit.lost, MOST_LOST, "part", text)
-    text = f"{absurd_text(fit, k)}: many ranges are wrong, or it is so and to be configured; {unchecked}"
-    return Finding("fit_unsure", "warning", abs(float(fit.values[k])) / fit.priors[k], PRIOR_SIGMAS, "sigmas", text)
+        return Finding("fit_unsure", "warning", fit.lost, answers.MOST_LOST, "part", text)
+    text = f"{answers.absurd_text(fit, k)}: many ranges are wrong, or it is so and to be configured; {unchecked}"
+    return Finding(
+        "fit_unsure", "warning", abs(float(fit.values[k])) / fit.priors[k], answers.PRIOR_SIGMAS, "sigmas", text
+    )
 
 
 def _over_confident(c: Columns, noise: NoiseScale, factor: float, limit: float) -> Finding:
@@ -178,32 +159,32 @@ def _over_confident(c: Columns, noise: NoiseScale, factor: float, limit: float) 
     return Finding(code, "note", factor, limit, "times", text, topic, settings=settings)
 
 
-def _is_far_off(fit: TrialFit, one: Fitted, step_s: float) -> bool:
+def _is_far_off(fit: TrialFit, one: answers.Finding, step_s: float) -> bool:
     """Return whether a parameter is far off by its limit and several sigmas. Between two poses a clock is no proof."""
     limit = max(_LIMITS[one.parameter.name][1], _OF_STEP * step_s * (one.parameter.name == "clock"))
     sigmas = _TURN_SIGMAS if one.parameter.name == "turn" else _SIGMAS
-    return is_off(fit, one) and abs(one.value) > max(limit, sigmas * one.sigma)
+    return answers.is_off(fit, one) and abs(one.value) > max(limit, sigmas * one.sigma)
 
 
 def _fitted(
-    c: Columns, slam: GraphSlam, fit: TrialFit, one: Fitted, off: Mapping[Parameter, float]
+    c: Columns, slam: GraphSlam, fit: TrialFit, one: answers.Finding, off: Mapping[Parameter, float]
 ) -> Iterator[Finding]:
     """A parameter that is among those that are far off, or that the drive does not tell."""
     topic = c.topic_of(one.parameter.source)
     if one.parameter.name not in _LIMITS or topic is None:
         return
-    code, (unit, limit, unknown) = CODES[one.parameter.name], _LIMITS[one.parameter.name]
+    code, (unit, limit, unknown) = answers.CODES[one.parameter.name], _LIMITS[one.parameter.name]
     if one.parameter in off:
-        settings: tuple[str, ...] = (assignment(*setting_of(one.parameter, off, slam.calibrated)),)
+        settings: tuple[str, ...] = (assignment(*answers.setting_of(one.parameter, off, slam.calibrated)),)
         of_pose = twist_factor(c.odometry) * c.config.odometry.distance_factor
         is_pose = abs(of_pose * (1.0 + one.value) - 1.0) < limit < abs(of_pose - 1.0)  # by its twist
         is_open = code == "odometry_scale" and not is_pose
-        if ranges := ranges_instead(fit, one.value, slam.calibrated) if is_open else "":
+        if ranges := answers.ranges_instead(fit, one.value, slam.calibrated) if is_open else "":
             ranges, settings = f"{ranges} instead of --set {settings[0]}", ()
         lag_s, own = float(np.median(topic.log_ns - topic.stamp_ns)) * 1e-9, c.odometry.input
         if code == "clock_offset" and -_RECORDED_S < lag_s < one.value - _EARLY_S:  # none is recorded before it is seen
             settings = (assignment(f"{own}.offset_s", round(slam.calibrated(own, "clock") - one.value, 3)),)
-        text = f"{topic.name}: {sentence(one.parameter, one.value, one.sigma, ranges)}"
+        text = f"{topic.name}: {answers.sentence(one.parameter, one.value, one.sigma, ranges)}"
         at = where(topic.name, topic.stamp_ns, settings=settings)
         yield Finding(code, "warning", one.value, limit, unit, text, **at)
     elif one.sigma > unknown:
@@ -213,10 +194,10 @@ def _fitted(
 
 def _clock_jumps(c: Columns, fit: TrialFit) -> Iterator[Finding]:
     """Clocks that are not the same in both halves of the drive, beyond a limit and the sigma of either half."""
-    for parameter, before, after, sigma, limit in clock_jumps(fit):
+    for parameter, before, after, sigma, limit in answers.clock_jumps(fit):
         topic = c.topic_of(parameter.source)
         if topic is not None:
-            text = f"{topic.name}: {jump_sentence(before, after, sigma)}"
+            text = f"{topic.name}: {answers.jump_sentence(before, after, sigma)}"
             at = where(topic.name, topic.stamp_ns)
             yield Finding("clock_jump", "warning", after - before, limit, "s", text, **at)
 
@@ -250,43 +231,32 @@ def _places(
 def check_slips(c: Columns, slam: GraphSlam) -> tuple[Finding, int] | None:
     """Find the stretch in which odometry is worst, if it is far worse there than in the rest of the drive.
 
-    The errors of odometry's motion are summed over a few steps between keyframes. Their scale is that of the middle
-    half of them, so a wrong factor, which all of them have, is none. Returned are the finding, from the stamp on at
-    which the stretch begins, and the stamp at which it ends.
+    Returned are the finding, from the stamp on at which the stretch begins, and the stamp at which it ends.
     """
-    errors, size, stamps_ns = _errors(slam)
-    if len(errors) < _LEAST_WINDOWS:
+    errors, sizes, stamps_ns = _errors(slam)
+    found = worst_stretch(errors, sizes, np.array([_LEAST_M, _LEAST_RAD]), _PART, _SLIP_SIGMAS)
+    if found is None:
         return None
-    errors = errors - np.median(errors, axis=0)
-    scale = _SIGMA * np.median(np.abs(errors), axis=0)
-    least, large = np.array([_LEAST_M, _LEAST_RAD]), np.array([_LARGE_M, _LARGE_RAD])
-    excess = np.abs(errors) / np.maximum(np.maximum(_SLIP_SIGMAS * scale, least), _PART * size)
-    k, part = np.unravel_index(int(np.argmax(excess)), excess.shape)
-    if excess[k, part] <= 1.0:
-        return None
-    error, unit = float(errors[k, part]), ("m", "rad")[part]
-    is_large = abs(error) > max(large[part], _LARGE_SIGMAS * scale[part])
+    k, part, error, limit, scale = found
+    stamps_ns, unit = stamps_ns[k : k + TOGETHER + 1], ("m", "rad")[part]
+    is_large = abs(error) > max((_LARGE_M, _LARGE_RAD)[part], _LARGE_SIGMAS * scale)
     severity: Severity = "warning" if is_large else "note"
-    many = np.count_nonzero((excess > 1.0).any(axis=1))
     by = f"{('drives', 'turns')[part]} {abs(error):.2f} {unit} {'less' if error < 0.0 else 'more'} than odometry says"
-    if abs(error) > size[k, part]:
+    if abs(error) > sizes[k : k + TOGETHER, part].sum():
         by = f"is elsewhere than odometry says, by {abs(error):.2f} {unit}"
     text = (
-        f"{c.odometry.topic}: by the landmarks the robot {by}, in a stretch of "
-        f"{1e-9 * (stamps_ns[k + _TOGETHER] - stamps_ns[k]):.0f} s, where {scale[part]:.2f} {unit} is usual: its "
-        "wheels slip, or it is carried or held"
+        f"{c.odometry.topic}: by the landmarks the robot {by}, in a stretch of {np.ptp(stamps_ns) * 1e-9:.0f} s, where "
+        f"{scale:.2f} {unit} is usual: its wheels slip, or it is carried or held"
     )
-    limit, at = float(np.abs(error) / excess[k, part]), where(c.odometry.topic, stamps_ns[k:], int(many))
-    return Finding("odometry_slips", severity, abs(error), limit, unit, text, **at), int(stamps_ns[k + _TOGETHER])
+    at = where(c.odometry.topic, stamps_ns, TOGETHER)
+    return Finding("odometry_slips", severity, abs(error), limit, unit, text, **at), int(stamps_ns[-1])
 
 
 def _errors(slam: GraphSlam) -> tuple[Array, Array, Index]:
-    """Errors (n, 2) of odometry ahead and in heading over a few steps, how much it says it moved, and stamps."""
+    """Errors (n, 2) of odometry ahead and in heading at each step, how much it says it moved, and stamps (n + 1,)."""
     own, estimate = (se3.in_space(poses).reshape(-1, 7) for poses in (slam.keyframes.poses, slam.trajectory()))
     order = np.argsort(slam.keyframes.stamps_ns, kind="stable")
-    stamps_ns, own, estimate = slam.keyframes.stamps_ns[order], own[order], estimate[order]
-    if len(own) <= _TOGETHER:
-        return np.empty((0, 2)), np.empty((0, 2)), stamps_ns
+    own, estimate = own[order], estimate[order]
     stated, found = (se3.between(tuple(poses[:-1].T), tuple(poses[1:].T)) for poses in (own, estimate))
     error = np.stack(se3.local(found, stated), axis=1)
     decided = {index for alarm in slam.alarms if (index := getattr(alarm, "segment", None)) is not None}
@@ -294,7 +264,4 @@ def _errors(slam: GraphSlam) -> tuple[Array, Array, Index]:
     error[begins[1:]] = 0.0  # odometry was restarted or jumps there, which is another finding
     moved = np.stack(se3.local(stated, se3.IDENTITY), axis=1)
     sizes = np.stack([np.linalg.norm(moved[:, :3], axis=1), np.linalg.norm(moved[:, 3:], axis=1)], axis=1)
-    kernel = np.ones(_TOGETHER)
-    columns = (error[:, [0, 5]], sizes)
-    summed = [np.stack([np.convolve(x, kernel, "valid") for x in rows.T], axis=1) for rows in columns]
-    return summed[0], summed[1], stamps_ns
+    return error[:, [0, 5]], sizes, slam.keyframes.stamps_ns[order]

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 STARTS = {"file": "the file", "tree": "the spanning tree", "chordal": "the chordal relaxation"}
 STARTS["online"] = "the drive, pose after pose"
 _MOST_TRIAL_S = 10.0
-_OTHER_TAG = "give the lost edges a tag that is read (docs/graphs.md)"
+_OTHER_TAG = "give what is lost a tag that is read, and its information (docs/graphs.md)"
 
 
 def optimize_options(sub: CommandParser) -> None:
@@ -115,10 +115,10 @@ def _settings(args: argparse.Namespace, graph: "Graph") -> "Settings":
 
 def _why(after: str) -> str:
     """The cause of a doubt that names none, by the command that comes next; without that, all that may be."""
-    wrong, tight = ": wrong edges, which --loss cauchy lets go of", ": too little noise in the information"
+    wrong, tight = ": wrong edges, which --loss cauchy lets go of", "too little noise in the information"
     if "all edges fit" in after:
         return ": a local minimum"
-    return wrong if "--loss" in after else tight if after else f"{wrong}, or {tight[2:]}"
+    return wrong if "--loss" in after else f": wrong edges, or {tight}" if after else f"{wrong}, or {tight}"
 
 
 def _after(args: argparse.Namespace, solution: "Solution") -> str:

@@ -172,26 +172,26 @@ class _Reader:
         return self.vertices[file_id][0] if file_id in self.vertices else None
 
     def _notes(self) -> Iterator[str]:
+        every = sum(len(edges) for edges in self.edges.values())
         if self.repaired:
-            every = sum(len(edges) for edges in self.edges.values())
             yield (
                 f"{self.name}:{self.repaired[0]}: {len(self.repaired)} of {every} information matrices are not positive"
                 " definite as printed: weights from the traces of position and rotation are used instead"
             )
         if self.bare:
-            yield (
-                f"{self.name}:{self.bare[0]}: {len(self.bare)} edges have no information: the identity is used, so all"
-                " of them weigh the same, a metre as much as a radian"
-            )
+            bare = f"{len(self.bare)} of {every} edges have no information: the identity is used"
+            bare = f"{self.name}:{self.bare[0]}: {bare}"
+            if len(self.bare) == every:
+                yield f"{bare}, so all of them weigh the same, a metre as much as a radian"
+            else:
+                self.skipped.append(f"{bare}, whatever the others have: was the line cut off?")
         for tag in tags_of(self.switched):
             yield f"{tag} are read as if they had no switch: --loss cauchy lets go of false ones"
         if kept := tags_of(line for line in self.unknown if line.startswith(NO_EDGES)):
             yield f"kept as they are, and not used: {', '.join(kept)}"
         if self.assumed:
-            yield (
-                f"{self.name}:{self.assumed}: EDGE3 is read as TORO's information (--from toro says that it is); iSAM"
-                " writes its square root: --from isam"
-            )
+            toro = "EDGE3 is read as TORO's information (--from toro says that it is)"
+            yield f"{self.name}:{self.assumed}: {toro}; iSAM writes its square root: --from isam"
 
     def _known(self, tag: str, edges: Sequence[_Edge]) -> Iterator[_Edge]:
         for edge in edges:
@@ -212,9 +212,9 @@ class _Reader:
             return f"edge from vertex {edge.vertices[0]} to itself"
         number = edge.offset or 0  # some files leave out parameter 0, which is then the robot's frame itself
         if number and number not in self.offsets:
-            others = {e.offset for at in AT_OFFSET for e in self.edges[at]} - {0, number, *self.offsets}
-            too = f" (nor are {', '.join(map(str, others))})" if others else ""
-            mend = f"a line {edge_tags.OFFSET} {number} 0 0 0 0 0 0 1 says that its sensor is at the robot's origin"
+            others = {e.offset or 0 for at in AT_OFFSET for e in self.edges[at]} - {0, number, *self.offsets}
+            too = f" (nor are {', '.join(map(str, sorted(others)[:3]))}{' ...' * (len(others) > 3)})" if others else ""
+            mend = f"a line {edge_tags.OFFSET} {number} 0 0 0 0 0 0 1 puts its sensor at the robot's origin"
             return f"parameter {number}, which is not declared{too}: {mend}"
         if tag == "EDGE_SE3_PRIOR" and self.offsets.get(number, se3.IDENTITY) != se3.IDENTITY:
             return f"{tag} of a sensor that is not at the robot's origin"

@@ -194,7 +194,7 @@ def findings(summary: Summary) -> tuple[list[str], list[str]]:
 def shortcomings(summary: Summary) -> Iterator[str]:
     """Yield the reasons why the result is incomplete, one sentence each; empty if it is complete."""
     inputs: Mapping[str, Any] = summary.get("inputs", {})
-    causes = list(checked(summary, "error"))
+    causes, follows = list(checked(summary, "error")), _cause(summary)[1]
     yield from causes
     if summary.get("failing"):
         yield f"the last solve failed ({summary['failing']}), and the estimate is the one before it: {_EXTREME}"
@@ -205,6 +205,8 @@ def shortcomings(summary: Summary) -> Iterator[str]:
         yield f"time jumped back, and time.on_jump is stop: {stopped} measurements after it were refused: {_ON_JUMP}"
     for name, counts in inputs.items():
         is_odometry = counts["use"] in MOTION
+        if (causes or not is_odometry) and next(iter(_counted(summary, name, Effect.REFUSED)), "") in follows:
+            continue
         if not counts["used"] and (counts["use"] != "odometry" or counts["received"] == 0):
             yield _unused(summary, name, counts["received"])
         elif _is_mostly_refused(summary, name):
@@ -216,12 +218,12 @@ def shortcomings(summary: Summary) -> Iterator[str]:
             yield from filter(None, (leaves_plane(name, counted, counts["received"] or counts["used"]),))
         jumps = sum(of.get("jump", 0) for one, of in summary["counters"].items() if one.partition("#")[0] == name)
         most = max(_MOST_JUMPS, _JUMPY * (counts["received"] or counts["used"]))
-        if is_odometry and jumps > most and "jump" not in _cause(summary)[1]:
+        if is_odometry and jumps > most and "jump" not in follows:
             yield (
                 f"{name}: {jumps} jumps, each begins a segment, and the motion across it is not used: odometry in "
                 "metres and radians? A robot as fast as that: --set odometry.max_speed_m_s=..."
             )
-        if (count := summary["counters"].get(name, {}).get("frozen", 0)) > 2:
+        if (count := summary["counters"].get(name, {}).get("frozen", 0)) > 2 and "frozen" not in follows:
             yield f"{name}: {explain('frozen').meaning} ({count} times): {remedy(name, 'frozen')}"
     for name, counted in summary["counters"].items():
         for why in {"mount_assumed", "mount_unknown"} & counted.keys():
@@ -237,7 +239,7 @@ def shortcomings(summary: Summary) -> Iterator[str]:
             "this is odometry alone: no landmark, fix or closure is in the result; "
             "graph_slam check BAG says what of the recording cannot be used"
         )
-    elif summary["landmarks"] and summary["sightings"] == summary["landmarks"]:
+    elif summary["landmarks"] and summary["sightings"] == summary["landmarks"] and not causes:
         yield "no landmark was seen twice, so they correct nothing: do ids change? --set landmarks.association=joint"
 
 
@@ -335,8 +337,11 @@ def _believed(counts: Mapping[str, Any]) -> float:
 
 def _cause(summary: Summary) -> tuple[str, tuple[str, ...]]:
     """Return the input that the finding of the recording is of, and what follows from it."""
-    found = summary.get("check") or {}
-    return found.get("evidence", {}).get("input", ""), FOLLOWS.get(found.get("code", ""), ())
+    if found := summary.get("check"):
+        return found.get("evidence", {}).get("input", ""), FOLLOWS.get(found.get("code", ""), ())
+    lost = [name for name, of in summary.get("inputs", {}).items() if of["use"] == "odometry" and "#" not in name]
+    own = [_counted(summary, name, Effect.REFUSED) for name in lost if _is_mostly_refused(summary, name)]
+    return "", tuple(one for one in FOLLOWS["wrong_stamps"] if own and not any(one in reasons for reasons in own))
 
 
 def _uncorrected(summary: Summary) -> Iterator[str]:

@@ -58,10 +58,8 @@ class Replayed:
     topics: tuple[str, ...] = ()
 
 
-def measurements(
-    bag: Bag, inputs: Inputs, config: Config, counters: Counters, datum: tuple[float, ...] = ()
-) -> Iterator[list[Measured | Control]]:
-    """The measurements of each recorded message, in order, and at the end those that were kept.
+class RecordedRuns:
+    """The measurements of each message of a recording, in order, with the number of their run.
 
     If the stamps of odometry begin anew, ``time.on_jump`` decides what happens to the run. Static transforms are read
     first, because they hold for the whole recording.
@@ -69,21 +67,6 @@ def measurements(
     Parameters
     ----------
     datum : where on earth the map begins: latitude [deg], longitude [deg], height [m]; empty: at the first fix
-
-    Raises
-    ------
-    BagError
-        At once, before anything is read: a recorded definition is not what we can use.
-    """
-    return (measured for _, measured in RecordedRuns(bag, inputs, config, counters, datum))
-
-
-class RecordedRuns:
-    """The measurements of a recording that pass the gate: one run, or several if ``time.on_jump`` is reset.
-
-    Parameters
-    ----------
-    datum : as of ``measurements``
     columns : collects what the checks of a recording look into
 
     Attributes

@@ -7,15 +7,7 @@ import pytest
 from reliability import times
 
 from graph_slam_ros.check.checks import check_columns
-from graph_slam_ros.check.columns import (
-    Columns,
-    FixColumns,
-    Link,
-    OdometryColumns,
-    SightingColumns,
-    TopicColumns,
-    in_order,
-)
+from graph_slam_ros.check.columns import Columns, FixColumns, OdometryColumns, SightingColumns, TopicColumns, in_order
 from graph_slam_ros.check.finding import KINDS, SEVERITIES
 from graph_slam_ros.cli.check import lines
 from graph_slam_ros.formats.parameters import parse_setting
@@ -85,13 +77,13 @@ def columns(seed):
     inputs = ("/odom", "odom", "odometry", odometry_ns), ("/landmarks", "detections", "landmarks", seen_ns)
     lag_ns = {name: rng.integers(0, 10**9, len(stamp_ns)) for name, _, _, stamp_ns in inputs}
     topics = {
-        name: TopicColumns(name, "", (own,), use, stamp_ns + lag_ns[name], stamp_ns, {pick(): 1})
+        name: TopicColumns(name, (own,), use, stamp_ns + lag_ns[name], stamp_ns, {pick(): 1})
         for name, own, use, stamp_ns in inputs
     }
     counters = Counters()
     for reason in rng.choice(list(REASONS), 3):
         counters.count(str(rng.choice(["odom", "detections", "tf"])), str(reason), int(rng.integers(1, 500)))
-    links = tuple(Link(pick(), pick(), bool(rng.integers(2))) for _ in range(rng.integers(0, 6)))
+    links = tuple((pick(), pick()) for _ in range(rng.integers(0, 6)))
     assumed = {"detections.offset_s": -2.5, "detections.mount": "0 0 0 0 0 0", "odom.mount": "0 0 0 0 0 0"}
     x, y, yaw = 10.0 * rng.normal(size=(3, n))  # at stamps of which some are years from the others
     fixes = FixColumns("gps", "/gps", stamps(rng, n), x + 1j * y, yaw, 0.1, pick(), se3.IDENTITY)

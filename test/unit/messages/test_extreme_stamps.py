@@ -24,7 +24,7 @@ from graph_slam_ros.formats.cdr import LATEST_NS
 from graph_slam_ros.messages import to_msg
 from graph_slam_ros.overview.chosen_inputs import choose_inputs
 from graph_slam_ros.recordings.bag import open_bag
-from graph_slam_ros.runs.replay import measurements
+from graph_slam_ros.runs.replay import RecordedRuns
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam
 
 S = 1_000_000_000
@@ -60,7 +60,7 @@ def drive(tmp_path_factory):
 
 def run(bag):
     counters, slam = Counters(), GraphSlam(CONFIG)
-    for some in measurements(bag, choose_inputs(bag, CONFIG), CONFIG, counters):
+    for _, some in RecordedRuns(bag, choose_inputs(bag, CONFIG), CONFIG, counters):
         for m in some:
             slam.process(m)
     for event in ("end", "optimize"):

@@ -78,6 +78,8 @@ def test_what_follows_from_odometry_that_is_refused_is_not_said_beside_it():
     well, refused = ({"odom": ODOMETRY | {"used": used}} for used in (100, 20))
     assert list(doubts(summary({"odom": {"bad_stamp": 80}}, **refused) | {"uncorrected": [late]})) == []
     assert len(list(doubts(summary({"odom": {"bad_stamp": 80}}, **well) | {"uncorrected": [late]}))) == 1
+    counters = {"odom": {"bad_stamp": 80, "frozen": 9}, "tags": {"odometry_gap": 900}}
+    assert [one[:5] for one in shortcomings(summary(counters, **refused)) if "alone" not in one] == ["odom:"]
 
 
 def test_an_input_whose_cause_is_known_has_no_general_advice():
