@@ -171,6 +171,7 @@ FAULTS = {
     "mount turned -10 degrees": (of("wrong_mount:yaw_deg=-10.0"), "mount_yaw"),
     "sensor 0.3 m to the left of its mount": (of("wrong_mount:yaw_deg=0.0,y_m=0.3"), "mount_place"),
     "sensor 0.4 m behind its mount": (of("wrong_mount:yaw_deg=0.0,x_m=-0.4"), "mount_place"),
+    "knocked by 10 degrees half-way": (of("wrong_mount:yaw_deg=10.0,begin=0.5"), "mount_moved"),
     "mount turned 180 degrees": (of("wrong_axes:how=backwards"), "axes"),
     "bearings mirrored": (of("wrong_axes:how=mirrored"), "mirrored"),
     "x and y exchanged": (of("wrong_axes:how=exchanged"), "axes mirrored"),

@@ -89,6 +89,7 @@ KINDS: dict[str, str] = {
     # -- a replay in memory, and a fit that begins at its estimate
     "clock_offset": f"set INPUT.offset_s; {_ONE_CLOCK}",
     "mount_place": "measure it, and correct its transform; or set INPUT.mount_correction",
+    "mount_moved": "fix the sensor on the robot, and cut the recording where it moved",
     "mount_yaw": "correct its transform, or set INPUT.mount_correction",
     "odometry_scale": "measure a way, and correct the wheel radius, or the size of the tags",
     "turn_scale": "correct the track width, or set odometry.turn_factor",
@@ -133,6 +134,7 @@ FOLLOWS = {
     "mirrored": ("twist_unrelated", "twist_frame"),
     "damaged": ("no_closure", "silent"),
     "clock_offset": ("latency",),
+    "mount_moved": ("odometry_slips", "landmark_moved", "map_breaks", "id_reused", "ids_unsure", "outliers"),
 }
 """What is no finding of its own beside an error or a warning."""
 

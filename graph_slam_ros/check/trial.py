@@ -33,9 +33,7 @@ _LIMITS = {
     "yaw": ("rad", 3.0 * _DEGREE, 3.0 * _DEGREE),
     "x": ("m", answers.LEAST_M, np.inf),
     "y": ("m", answers.LEAST_M, np.inf),
-    "distance": ("part", 0.03, 0.05),
-    "turn": ("part", 0.03, 0.05),
-    "range_factor": ("part", 0.03, 0.05),
+    **dict.fromkeys(("distance", "turn", "range_factor"), ("part", 0.03, 0.05)),
     "range_offset": ("m", 0.1, np.inf),
 }
 _OVER_CONFIDENT, _ODOMETRY_OVER_CONFIDENT, _LEAST_DOF = 2.0, 6.0**0.5, 100.0
@@ -105,7 +103,7 @@ def check_trial(c: Columns, slam: GraphSlam) -> Iterator[Finding]:
         yield from found or [_void(fit)]
         return
     yield from (found_one for one in fitted for found_one in _fitted(c, slam, fit, one, off))
-    yield from _clock_jumps(c, fit)
+    yield from _jumps(c, fit)
     yield from [slip[0]] if slip else []
     hidden = _OF_A_BREAK if is_broken else ("ids_unsure",) * any(one.code == "map_breaks" for one in found)
     yield from (one for one in found if one.code not in hidden)
@@ -188,18 +186,18 @@ def _fitted(
         at = where(topic.name, topic.stamp_ns, settings=settings)
         yield Finding(code, "warning", one.value, limit, unit, text, **at)
     elif one.sigma > unknown:
-        at = where(topic.name, topic.stamp_ns)
-        yield Finding("not_observable", "note", one.sigma, unknown, unit, one.text, **at)
+        yield Finding("not_observable", "note", one.sigma, unknown, unit, one.text, **where(topic.name, topic.stamp_ns))
 
 
-def _clock_jumps(c: Columns, fit: TrialFit) -> Iterator[Finding]:
-    """Clocks that are not the same in both halves of the drive, beyond a limit and the sigma of either half."""
-    for parameter, before, after, sigma, limit in answers.clock_jumps(fit):
-        topic = c.topic_of(parameter.source)
-        if topic is not None:
-            text = f"{topic.name}: {answers.jump_sentence(before, after, sigma)}"
-            at = where(topic.name, topic.stamp_ns)
-            yield Finding("clock_jump", "warning", after - before, limit, "s", text, **at)
+def _jumps(c: Columns, fit: TrialFit) -> Iterator[Finding]:
+    """Clocks and mounts that are not the same in both halves of the drive."""
+    for code, parameter, before, after, sigma, limit in answers.jumps(fit):
+        if (topic := c.topic_of(parameter.source)) is not None:
+            text, unit = (
+                f"{topic.name}: {answers.jump_sentence(parameter, before, after, sigma)}",
+                _LIMITS[parameter.name][0],
+            )
+            yield Finding(code, "warning", after - before, limit, unit, text, **where(topic.name, topic.stamp_ns))
 
 
 def _places(

@@ -194,7 +194,8 @@ def findings(summary: Summary) -> tuple[list[str], list[str]]:
 def shortcomings(summary: Summary) -> Iterator[str]:
     """Yield the reasons why the result is incomplete, one sentence each; empty if it is complete."""
     inputs: Mapping[str, Any] = summary.get("inputs", {})
-    causes, follows = list(checked(summary, "error")), _cause(summary)[1]
+    causes = list(checked(summary, "error")) or ([] if is_explained(summary) else list(_uncorrected(summary)))
+    follows = _cause(summary)[1]
     yield from causes
     if summary.get("failing"):
         yield f"the last solve failed ({summary['failing']}), and the estimate is the one before it: {_EXTREME}"
@@ -286,7 +287,7 @@ def ambiguities(rivals: Collection[Mapping[str, Any]]) -> Iterator[str]:
 def doubts(summary: Summary) -> Iterator[str]:
     """Yield a sentence for each input of which many measurements are rejected, and for what makes a result doubtful.
 
-    That are visits that contradict others, clocks, mounts or scales that are off, and other explanations.
+    That are visits that contradict others, and other explanations.
     """
     if is_explained(summary):
         return
@@ -294,7 +295,6 @@ def doubts(summary: Summary) -> Iterator[str]:
     for text in ambiguities(summary.get("rivals", ())):
         yield f"{text} (graph_slam explain RUN)"
     yield from filter(None, [wrong_sides(summary.get("landmarks", 0), summary.get("waiting", {}))])
-    yield from _uncorrected(summary)
     if renewed := summary.get("renewed_ids"):
         yield renewed_text(renewed)
     contested = {} if renewed or summary.get("uncorrected") else summary.get("contested", {})
@@ -308,15 +308,10 @@ def doubts(summary: Summary) -> Iterator[str]:
                 "topic and an input of its own (inputs.names); one that jumps: is it in metres and radians?"
             )
     for name, counts in summary.get("inputs", {}).items():
-        accepted, has_cause = _believed(counts), name == _cause(summary)[0] or is_late(summary)
+        accepted, has_cause = _believed(counts), name == _cause(summary)[0] or summary.get("uncorrected")
         if _MOSTLY <= accepted < 1.0 - _DOUBTED and not has_cause:
             part, hint = 100.0 * (1.0 - accepted), _CONTRADICT.format(name)
             yield f"{name}: {part:.0f} % of {counts['used']} are not believed: {hint}"
-
-
-def is_late(summary: Summary) -> bool:
-    """Return whether the clock of an input is off, so that the robot seems to be elsewhere in turns."""
-    return any(one.get("code") == "clock_offset" for one in summary.get("uncorrected", ()))
 
 
 def is_explained(summary: Summary) -> bool:
@@ -376,9 +371,10 @@ def visit_faults(counted: Mapping[str, int]) -> Iterator[str]:
 
 
 def checked(summary: Summary, severity: str) -> Iterator[str]:
-    """Yield the worst finding of the recording if it is severe enough; ``graph_slam check`` lists all."""
+    """Yield the worst finding of the recording if it is severe enough and a cause; ``graph_slam check`` lists all."""
     found = summary.get("check")
-    if found is not None and found["severity"] == severity:
+    follows = {code for one in summary.get("uncorrected", ()) for code in FOLLOWS.get(one.get("code", ""), ())}
+    if found is not None and found["severity"] == severity and found["code"] not in follows:
         mend = " ".join(f"--set {shlex.quote(text)}" for text in found["settings"])
         yield f"{found['code']}: {found['text']}{'; ' if mend else ''}{mend} (graph_slam check BAG lists all)"
 

@@ -20,7 +20,7 @@ from graph_slam_ros.recordings.definitions import recorded_decoder
 from graph_slam_ros.runs.folder import RunError, check_room, is_run, keep_earlier, missing, recording_of, run_config
 from graph_slam_ros.runs.journal import read_measurements
 from graph_slam_ros.runs.map_file import read_start
-from graph_slam_ros.runs.outcome import doubts, is_explained, is_late, is_undecided, unscaled
+from graph_slam_ros.runs.outcome import doubts, is_explained, is_undecided, unscaled
 from graph_slam_ros.runs.restore import Stopwatch, config_of, map_of, record_run, stopwatch
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Measurement
 from graph_slam_ros.slam.frontend.ingest_gate import IngestGate
@@ -271,7 +271,7 @@ def _checked(columns: Collector, counters: Counters, bag: Bag) -> dict[str, Any]
 
 
 def _warnings(slam: GraphSlam, summary: dict[str, Any]) -> list[str]:
-    has_cause = is_late(summary) or is_explained(summary)
+    has_cause = bool(summary.get("uncorrected")) or is_explained(summary)
     alarms = [] if has_cause else [str(one) for one in slam.alarms if not is_undecided(asdict(one))]
     return [*doubts(summary), *alarms, *unscaled(summary), *mendable(summary["counters"])]
 

@@ -235,9 +235,9 @@ CODES = {
 LEAST_M = 0.2  # errors that last, as a robot that follows its commands late, are up to 0.14 m in recorded drives
 MOST_SHIFT = 2.0**0.5  # sigmas of the poses: with more, their NEES is three times what is expected
 _DEGREE = np.pi / 180.0
-_JUMPED_S = 0.08
 _SIDES = {"x": ("ahead", "back"), "y": ("to the left", "to the right")}
 _AXIS = {"roll": "about the axis ahead ", "pitch": "about the axis to the left ", "yaw": ""}
+_JUMPED = {"clock": 0.08, **dict.fromkeys(_AXIS, 3.0 * _DEGREE)}  # s, rad; recorded robots: 0.04 s, 1.3 degrees
 
 Total = Callable[[str, str], float]
 """The value of a parameter of an input that measurements are corrected by at present."""
@@ -297,11 +297,11 @@ def uncorrected(
         text += ", more than its stated noise allows for (odometry.noise)" * (one.name in OF_ODOMETRY)
         setting = setting_of(one, values, total)
         out.append(Uncorrected(CODES[one.name], one.source, value, sigma, shift, text, setting))
-    jumps = [
-        Uncorrected("clock_jump", one.source, after - before, sigma, 0.0, jump_sentence(before, after, sigma), ())
-        for one, before, after, sigma, _ in clock_jumps(found)
+    jumped = [
+        Uncorrected(code, one.source, after - before, sigma, 0.0, jump_sentence(one, before, after, sigma), ())
+        for code, one, before, after, sigma, _ in jumps(found)
     ]
-    return [*jumps, *sorted(out, key=lambda one: -one.shift)]
+    return [*jumped, *sorted(out, key=lambda one: -one.shift)]
 
 
 def is_off(found: TrialFit, one: Finding) -> bool:
@@ -310,22 +310,22 @@ def is_off(found: TrialFit, one: Finding) -> bool:
     return is_known and (one.parameter.name not in _SIDES or abs(one.value) >= LEAST_M)
 
 
-def clock_jumps(found: TrialFit) -> Iterator[tuple[Parameter, float, float, float, float]]:
-    """Yield the clocks that differ in both halves of the drive, with both values, their sigma, and the limit [s]."""
-    sigmas = np.sqrt(np.diag(found.covariance))
-    for k, one in enumerate(found.parameters):
-        before, after, sigma = float(found.first[k]), float(found.second[k]), 2.0**0.5 * float(sigmas[k])
-        limit = max(_JUMPED_S, 2.0**0.5 * SIGMAS * sigma)
-        if one.name == "clock" and found.lost <= MOST_LOST and abs(after - before) > limit:
-            yield one, before, after, sigma, limit
+def jumps(found: TrialFit) -> Iterator[tuple[str, Parameter, float, float, float, float]]:
+    """Yield what is another one in the second half of the drive: code, parameter, both values, sigma, and limit."""
+    for k, one in enumerate(found.parameters if found.lost <= MOST_LOST else ()):
+        before, after, sigma = float(found.first[k]), float(found.second[k]), float(2.0 * found.covariance[k, k]) ** 0.5
+        limit = max(_JUMPED.get(one.name, np.inf), 2.0**0.5 * SIGMAS * sigma)
+        if abs(after - before) > limit:
+            yield "clock_jump" if one.name == "clock" else "mount_moved", one, before, after, sigma, limit
 
 
-def jump_sentence(before: float, after: float, sigma: float) -> str:
-    """Say what a clock is in either half of the drive."""
-    return (
-        f"sightings agree with odometry best {before * 1e3:+.0f} ms from their stamps in one half of the drive, "
-        f"{after * 1e3:+.0f} ms in the other (sigma {sigma * 1e3:.0f} ms)"
-    )
+def jump_sentence(one: Parameter, before: float, after: float, sigma: float) -> str:
+    """Say what a clock or an angle of a mount is in either half of the drive."""
+    first, second, spread = map(one.shown, (before, after, sigma))
+    halves = f"in one half of the drive, {second} in the other (sigma {spread})"
+    if one.name == "clock":
+        return f"sightings agree with odometry best {first} from their stamps {halves}"
+    return f"its sensor is turned by {first} {_AXIS[one.name]}on the robot {halves}: it was knocked, or is loose"
 
 
 def pose_shifts(found: TrialFit, covariances: Mapping[int, Array]) -> Array:

@@ -293,11 +293,10 @@ def two_parents(drive: Drive, _rng: Generator) -> None:
         drive.add_transform(parent, "camera_link", se3.IDENTITY)
 
 
-def _each(drive: Drive, change: Callable[[Sightings, Message], Array | None]) -> None:
-    for m in drive.landmarks:
+def _each(drive: Drive, change: Callable[[Sightings, Message], Array | None], begin: float = 0.0) -> None:
+    for m in drive.landmarks[round(begin * len(drive.landmarks)) :]:
         seen = Sightings(m)
-        turn = change(seen, m)
-        seen.store(turn)
+        seen.store(change(seen, m))
 
 
 def wrong_mount(
@@ -306,6 +305,7 @@ def wrong_mount(
     yaw_deg: float = option(5.0, "turned to the left", "degrees", -180, 180),
     x_m: float = option(0.0, "ahead of where it should be", "m", -10, 10),
     y_m: float = option(0.0, "to the left of it", "m", -10, 10),
+    begin: float = option(0.0, "when, as a part of the messages: 0 the first, 1 the last", "", 0, 1),
 ) -> None:
     """A sensor that is turned on the robot, or sits elsewhere, and nobody says so."""
     angle = -np.radians(yaw_deg)
@@ -315,7 +315,7 @@ def wrong_mount(
         seen.points = (seen.points - [x_m, y_m, 0.0]) @ turn.T
         return turn
 
-    _each(drive, change)
+    _each(drive, change, begin)
 
 
 _AXES = {

@@ -159,6 +159,7 @@ def laps(tmp_path_factory):
 
 FITTED = (
     ("landmark clock +100 ms", "clock_offset", -0.1, 0.02),
+    ("knocked by 10 degrees half-way", "mount_moved", 0.14, 0.05),
     ("mount turned 5 degrees", "mount_yaw", 0.0873, 0.01),
     ("sensor 0.3 m to the left of its mount", "mount_place", 0.3, 0.04),
     ("sensor 0.4 m behind its mount", "mount_place", -0.4, 0.04),
@@ -190,7 +191,7 @@ def found_and_mended(bag, code, settings):
     return found[code], {one.code for one in mended if one.severity != "note"}
 
 
-@pytest.mark.parametrize("name, code, value, within", times([FITTED[k] for k in (0, 6, 8)], FITTED))
+@pytest.mark.parametrize("name, code, value, within", times([FITTED[k] for k in (0, 1, 7, 9)], FITTED))
 def test_the_fit_finds_what_needs_an_estimate_and_its_settings_mend_it(laps, tmp_path, name, code, value, within):
     found, mended = found_and_mended(planted(laps, tmp_path / "faulty.mcap", name), code, {})
     assert value is None or found.value == pytest.approx(value, abs=within)
