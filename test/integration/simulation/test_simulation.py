@@ -10,7 +10,7 @@ from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.messages.from_msg import MessageConverter
 from graph_slam_ros.overview.chosen_inputs import choose_inputs
 from graph_slam_ros.recordings.bag import open_bag
-from graph_slam_ros.runs.replay import measurements as measured
+from graph_slam_ros.runs.replay import RecordedRuns
 from graph_slam_ros.slam import Config, Counters, Fix, Odometry
 from graph_slam_ros.tools.simulation import WORLDS, city_graph, measurements, simulate, sphere_graph, write_bag
 from graph_slam_ros.tools.simulation.instruments import ANTENNA_M, DATUM
@@ -85,7 +85,7 @@ def fixes_of(recording, path, name):
     dimensions = space_of(recording.T_world_base[0]).dimensions
     settings = {"inputs.names": f"odom {name}", name: INPUTS[name], "world.dimensions": dimensions}
     config, bag, counters = Config.from_mapping(settings), open_bag(path), Counters()
-    several = [m for some in measured(bag, choose_inputs(bag, config), config, counters) for m in some]
+    several = [m for _, some in RecordedRuns(bag, choose_inputs(bag, config), config, counters) for m in some]
     fixes = [m for m in several if isinstance(m, Fix)]
     at = np.searchsorted(recording.stamps_ns, [m.stamp_ns for m in fixes])
     return fixes, counters, se3.in_space(recording.T_world_base)[at]
