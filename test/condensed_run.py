@@ -20,12 +20,7 @@ def bounded(space=PLANAR, **values):
 
 @functools.cache
 def condensed_run(last=KEYFRAMES, *, condense=True, first=0, of=None):
-    """Drive and save, once; returns the folder, which nobody may change, the pipeline and the summary.
-
-    Parameters
-    ----------
-    last, first : of the keyframes of a drive of so many (``of``, by default ``last``) these are driven
-    """
+    """Drive keyframes ``first`` to ``last`` of ``of``, once: the folder, which nobody may change, pipeline, summary."""
     drive = list(measurements(hall(SEED, of or last)))
     begin_ns, end_ns = (drive[0].stamp_ns + round(k * STEP_S * 1e9) for k in (first, last))
     drive = [m for m in drive if begin_ns <= m.stamp_ns and (m.stamp_ns < end_ns or last == (of or last))]

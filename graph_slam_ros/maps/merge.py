@@ -16,7 +16,7 @@ import numpy as np
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import Gaussian, Graph
 from graph_slam_ros.maps.alignment import Alignment, align, positions
-from graph_slam_ros.measurements.edits import AppliedEdit, Argument, kind_of
+from graph_slam_ros.measurements.edits import ACTIONS, AppliedEdit, Argument
 from graph_slam_ros.runs.condensed_map import CONDENSED, WholePath
 from graph_slam_ros.runs.folder import check_room
 from graph_slam_ros.runs.journal import parts_of
@@ -237,7 +237,7 @@ class _Second:
         free = chain([one.edit.name], (f"{one.edit.name}-{k}" for k in count(2)))
         name = next(name for name in free if name not in names)
         edges, added = (tuple(number[e] for e in ids if e in number) for ids in (one.edges, one.added))
-        arguments = {key: self._argument(key, x, number) for key, x in one.edit.arguments.items()}
+        arguments = {key: self._argument(one.edit.do, key, x, number) for key, x in one.edit.arguments.items()}
         edit = replace(one.edit, name=name, arguments=arguments)
         return AppliedEdit(edit, self._keyframes + one.keyframe, edges, added)
 
@@ -249,9 +249,9 @@ class _Second:
         alarm = Alarm(**fields | {"segment": self._keyframes + one["segment"]})
         return asdict(alarm) | {"text": str(alarm)}
 
-    def _argument(self, key: str, value: Argument, number: Mapping[int, int]) -> Argument:
+    def _argument(self, do: str, key: str, value: Argument, number: Mapping[int, int]) -> Argument:
         """A value of an edit, with the ids and keyframes of the merged map."""
-        match kind_of(key), value:
+        match ACTIONS[do].known[key].kind, value:
             case "edge", int():
                 return number.get(value, value)
             case "edges", tuple():

@@ -20,9 +20,8 @@ def edge_noise(counters: Counters, source: str, covariance: Array, metres: int, 
     covariance : (m, m); its first ``metres`` rows are lengths, the others angles
     distance_m : distance of what was measured; the standard deviation is at least a millionth of it
     """
-    size = len(covariance)
     least_m2 = max(LEAST_M2, (_FINEST * distance_m) ** 2)
-    least = covariance + np.diag([least_m2] * metres + [LEAST_RAD2] * (size - metres))
+    least = covariance + np.diag([least_m2] * metres + [LEAST_RAD2] * (len(covariance) - metres))
     try:
         return Gaussian.from_covariance(least)
     except NoiseError:  # of extreme numbers: a kilometre's lever arm, an hour's motion in one step

@@ -89,10 +89,6 @@ def _is_positive(value: Any) -> bool:
     return _is_number(value) and value > 0
 
 
-def _is_stamp(value: Any) -> bool:
-    return isinstance(value, str) and bool(_STAMP.fullmatch(value))
-
-
 def _is_time(value: Any) -> bool:
     return isinstance(value, str) and bool(_WHEN.fullmatch(value))
 
@@ -116,7 +112,7 @@ _NAME = _text("name", "a text", 128)
 _KEYFRAME = Field(
     "keyframe",
     'the number of a keyframe, or a stamp [s] as a text: 17 or "1700000000.5"',
-    lambda value: _is_whole(value) or _is_stamp(value),
+    lambda value: _is_whole(value) or (isinstance(value, str) and _STAMP.fullmatch(value) is not None),
 )
 _POSE = Field(
     "pose",
@@ -132,7 +128,6 @@ _EXACT = {
     "sigma_m": Field("exact_m", "a standard deviation in metres; 0: exact (1 mm)", _is_not_negative, float),
     "sigma_rad": Field("exact_rad", "a standard deviation in radians; 0: exact (0.001 rad)", _is_not_negative, float),
 }
-_RANGE = {"from": _KEYFRAME, "until": _KEYFRAME}
 
 ACTIONS: dict[str, Action] = {
     "remove_edge": Action(
@@ -172,7 +167,7 @@ ACTIONS: dict[str, Action] = {
         "landmark {landmark} split: {chosen} of {to}",
         "Some of its sightings are of another landmark, with a name that no other has: those of `edges`, or those from "
         "keyframe `from` to keyframe `until`. Later observations are of the first.",
-        ({"edges": _EDGES}, _RANGE),
+        ({"edges": _EDGES}, {"from": _KEYFRAME, "until": _KEYFRAME}),
     ),
     "move_anchor": Action(
         {"keyframe": _KEYFRAME, "pose": _POSE, **_EXACT},
@@ -187,18 +182,12 @@ ACTIONS: dict[str, Action] = {
     ),
 }
 """What can be done by hand, by the value of ``do``."""
-_FIELDS = {key: field for action in ACTIONS.values() for key, field in action.known.items()}
 _COMMON = {
     "name": _text("name", "a text", 80),
     "who": _text("who", "a text", 200),
     "when": Field("when", "a time with its zone, such as 2026-05-04T10:30:00Z", _is_time),
     "why": _text("why", "a text", 2000),
 }
-
-
-def kind_of(key: str) -> str:
-    """Return the kind of value that the key of an argument has."""
-    return _FIELDS[key].kind
 
 
 @dataclass(frozen=True, slots=True)

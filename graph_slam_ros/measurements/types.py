@@ -7,8 +7,8 @@ on the type of the message that they came from.
 
 import math
 import operator
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import MISSING, dataclass
 from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
@@ -36,7 +36,7 @@ _KINDS: dict[str, Sizes] = {
     "heading": {"measured": (1,), "covariance": (1,)},
     "attitude": {"measured": (4,), "covariance": (9,)},
 }
-_MAY_BE_EMPTY = ("point", "datum")
+_UNIT = 1e-3  # so far from 1 the length of a quaternion may be
 
 
 def _check_choice(one: Any, value: str, choices: tuple[str, ...]) -> None:
@@ -45,39 +45,40 @@ def _check_choice(one: Any, value: str, choices: tuple[str, ...]) -> None:
 
 
 class _Checked:
-    """The base of all measurements: numbers become tuples of floats, finite and as many as the table says."""
+    """The base of all measurements: numbers become tuples of floats, and are what and as many as the table says."""
 
     __slots__ = ()
 
     def __post_init__(self) -> None:
-        name, value, sizes = "stamp_ns", getattr(self, "stamp_ns", 0), _sizes_of(self)
-        spaces = set()
+        value: Any = getattr(self, "stamp_ns", 0)
+        name, sizes, spaces = "stamp_ns", _sizes_of(self), set[int]()
         try:
-            if type(value) is not int:
-                object.__setattr__(self, name, operator.index(value))
+            if type(value) is not int or value.bit_length() > 63:
+                object.__setattr__(self, name, int(np.int64(operator.index(value))))
             for name, allowed in sizes.items():
                 value = getattr(self, name)
                 if value is not None and not (type(value) is tuple and {float}.issuperset(map(type, value))):
                     value = tuple(map(float, np.ravel(value).tolist()))
                     object.__setattr__(self, name, value)
-                if value is None or (not value and name in _MAY_BE_EMPTY):
+                if not value and self.__dataclass_fields__[name].default is not MISSING:  # type: ignore[attr-defined]
                     continue
                 space = allowed.index(len(value))
                 if len(allowed) > 1:
                     spaces.add(space)
-                if not all(map(math.isfinite, value)):
+                if "covariance" in name:
+                    is_right = min(value[:: math.isqrt(len(value)) + 1]) >= 0.0
+                else:
+                    is_right = len(value) not in (4, 7) or abs(math.hypot(*value[-4:]) - 1.0) < _UNIT
+                if not (is_right and all(map(math.isfinite, value))):
                     raise ValueError
         except (TypeError, ValueError, OverflowError):
             right = f"{' or '.join(map(str, sizes[name]))} finite numbers" if name in sizes else "whole nanoseconds"
+            right += ", no variance negative" if "covariance" in name else ""
+            right += ", in space with a quaternion (x, y, z, w) of length 1" if 7 in sizes.get(name, ()) else ""
             raise FormatError(f"{type(self).__name__}: {name} {value!r}: it must be {right}") from None
         if len(spaces) > 1:
             counts = " and ".join(f"{len(getattr(self, name) or ())} of {name}" for name in sizes)
             raise FormatError(f"{type(self).__name__}: its numbers are of the plane and of space: {counts}")
-
-    def misfits(self, dimensions: int) -> bool:
-        """Return whether its numbers are of another space than that of so many dimensions."""
-        given = ((getattr(self, name), allowed) for name, allowed in _sizes_of(self).items())
-        return any(value and len(value) != allowed[min(dimensions - 2, len(allowed) - 1)] for value, allowed in given)
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,6 +144,10 @@ class Sighting(_Checked):
     sort: str = ""
     size: float = 0.0
 
+    def __post_init__(self) -> None:
+        _Checked.__post_init__(self)
+        object.__setattr__(self, "id", "" if self.id is None else str(self.id))  # of AprilTags it is a number
+
 
 @dataclass(frozen=True, slots=True)
 class Sightings(_Checked):
@@ -151,6 +156,13 @@ class Sightings(_Checked):
     stamp_ns: int
     topic: str
     sightings: tuple[Sighting, ...]
+
+    def __post_init__(self) -> None:
+        _Checked.__post_init__(self)
+        several = self.sightings if isinstance(self.sightings, Iterable) else (self.sightings,)
+        object.__setattr__(self, "sightings", tuple(several))
+        if wrong := {type(one) for one in self.sightings} - {Sighting}:
+            raise FormatError(f"Sightings: one of its sightings is a {wrong.pop().__name__}, not a Sighting")
 
 
 @dataclass(frozen=True, slots=True)
@@ -286,10 +298,14 @@ def _sizes_of(one: Any) -> Sizes:
 
 
 def check_space(m: Measurement, dimensions: int) -> None:
-    """Raise FormatError for a measurement in the plane (2 dimensions) of a robot in space (3), or the reverse."""
-    several = m.sightings if isinstance(m, Sightings) else () if isinstance(m, Control) else (m,)
-    if any(one.misfits(dimensions) for one in several):
-        raise FormatError(f"{type(m).__name__}: its numbers are not of {dimensions} dimensions (world.dimensions)")
+    """Raise FormatError for what is no measurement, or is in the plane (2 dimensions) of a robot in space (3)."""
+    if type(m) not in _NAMES:
+        raise FormatError(f"{type(m).__name__} is not one of {', '.join(cls.__name__ for cls in _NAMES)}")
+    for one in m.sightings if isinstance(m, Sightings) else () if isinstance(m, Control) else (m,):
+        for name, allowed in _sizes_of(one).items():
+            value, expected = getattr(one, name), allowed[min(dimensions - 2, len(allowed) - 1)]
+            if value and len(value) != expected:
+                raise FormatError(f"{type(m).__name__}: {name} is not of {dimensions} dimensions (world.dimensions)")
 
 
 def to_record(measurement: Measurement) -> dict[str, Any]:
@@ -313,15 +329,11 @@ def from_record(record: dict[str, Any]) -> Measurement:
         raise FormatError(f"unknown kind of measurement {record.get('type')!r}")
     try:
         if cls is Sightings:
-            fields["sightings"] = tuple(Sighting(**_tuples(one)) for one in fields["sightings"])
+            fields["sightings"] = tuple(Sighting(**one) for one in fields["sightings"])
         if cls is Control:
             fields["values"] = tuple(
                 (name, tuple(value) if isinstance(value, list) else value) for name, value in fields.get("values", ())
             )
-        return cls(**_tuples(fields))
+        return cls(**fields)
     except (KeyError, TypeError, ValueError) as error:
         raise FormatError(f"{record['type']}: {error}") from None
-
-
-def _tuples(fields: dict[str, Any]) -> dict[str, Any]:
-    return {name: tuple(value) if isinstance(value, list) else value for name, value in fields.items()}

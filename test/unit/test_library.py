@@ -1,15 +1,14 @@
 """What a Python program meets: results of a run, short words for objects, and the table of edge types."""
 
-import pydoc
-
 import numpy as np
 import pytest
 import small_drive
 from messages import record_drive
 from places import ROOT
+from rows import each
 
 import graph_slam_ros
-from graph_slam_ros import Config, load_run
+from graph_slam_ros import GraphSlam, Odometry, Sighting, Sightings, load_run
 from graph_slam_ros import graph as edge_module
 from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.edge_tags import EDGE_TAGS
@@ -68,10 +67,22 @@ def test_what_is_no_run_or_has_no_results_is_refused(done, tmp_path):
         load_run(tmp_path)
 
 
-def test_help_of_the_parameters_can_be_read_in_a_terminal():
-    text = pydoc.render_doc(Config, renderer=pydoc.plaintext)
-    assert max(map(len, text.splitlines())) <= 130
-    assert "Config(**sections)" in text and "graph_slam params" in text
+@each(
+    "make, words",
+    [
+        (lambda: Odometry(0, None), "3 or 7 finite numbers"),
+        (lambda: Odometry(10**25, (0, 0, 0)), "whole nanoseconds"),
+        (lambda: Odometry(0, (0, 0, 0, 0, 0, 0, 2)), "of length 1"),
+        (lambda: Sighting("a", "position", (1, 2), -np.eye(2)), "no variance negative"),
+        (lambda: Sightings(0, "tags", [("a", 1, 2)]), "a tuple, not a Sighting"),
+        (lambda: GraphSlam().process(Sighting(7, "position", (1, 2), np.eye(2))), "Sighting is not one of Odometry"),
+    ],
+)
+def test_a_measurement_is_checked_where_it_is_made_and_may_be_of_arrays_lists_and_numbers(make, words):
+    with pytest.raises(GraphSlamError, match=words):
+        make()
+    several = Sightings(np.int64(0), "tags", [Sighting(np.int64(0), "position", np.ones(2), np.eye(2))])
+    assert (hash(several) != 0, several.sightings[0].id) == (True, "0")
 
 
 def documented():

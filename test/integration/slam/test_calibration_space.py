@@ -13,12 +13,7 @@ STEP_S, SIGMA_M = 0.05, 0.03
 
 
 def drive(mount, *, tilts, seed=0, seconds=34.0):
-    """Measurements of a robot among twelve landmarks whose sensor is not where and as it is configured.
-
-    Parameters
-    ----------
-    tilts : amplitude of the rates of roll and pitch [rad/s]; 0: it stays level
-    """
+    """Measurements by a sensor that is not as configured, of a robot that rolls and pitches by ``tilts`` [rad/s]."""
     random, out = np.random.default_rng(seed), []
     landmarks = 5.0 * random.uniform(-1.0, 1.0, (12, 3)) + (1.0, 2.0, 0.0)
     turned = so3.exp(tuple(mount.get(name, 0.0) for name in ("roll", "pitch", "yaw")))

@@ -12,10 +12,7 @@ LINKS, NOISE_FACTOR, SLIPPED = 6, 1.5, 2
 
 
 def drive(seed):
-    """Links whose noise is so small that all is linear, and landmarks of which each is seen for a while.
-
-    Returns the graph, the edges, what was seen by keyframe, the stored numbers and covariance of the prior.
-    """
+    """Links of little noise, landmarks seen for a while: graph, edges, what is seen by keyframe, the stored prior."""
     rng, graph = np.random.default_rng(seed), Graph()
     noise = Gaussian.from_covariance(1e-8 * np.diag([1.0, 2.0, 0.5]))
     poses = [se2.IDENTITY]
