@@ -9,7 +9,7 @@ from graph_slam_ros.slam.frontend.odometry_integration import OdometryNoise
 from graph_slam_ros.typing import Array, Numbers
 
 _SIGMAS, _LEAST_M, _OF_RANGE = 5.0, 0.1, 0.05  # a landmark is elsewhere: all three, the last times its distance
-_FEWEST, _IN_A_ROW = 2, 2  # landmarks, more than half of those seen again; and messages
+_FEWEST, _IN_A_ROW = 2, 2  # landmarks, more than half of those seen again, or one that goes on moving; and messages
 
 
 class FrozenOdometry:
@@ -19,23 +19,23 @@ class FrozenOdometry:
         self._noise, self._space = noise, space
         self._at: Numbers = ()
         self._seen: dict[tuple[str, str], tuple[Array, float]] = {}
-        self._in_a_row = 0
+        self._in_a_row, self._one_moved = 0, False
 
     def has_moved(self, m: Sightings, T_odom_base: Numbers) -> bool:
         """Return whether the robot has left a place where odometry says that it still is."""
         group = self._space.group
         if not self._at or not self._noise.is_jitter(group.between(self._at, T_odom_base)):
-            self._at, self._seen, self._in_a_row = T_odom_base, {}, 0
+            self._at, self._seen, self._in_a_row, self._one_moved = T_odom_base, {}, 0, False
         points = {(m.topic, s.id): p for s in m.sightings if s.id and (p := self._point(s)) is not None}
         again = [self._is_elsewhere(*self._seen[name], *p) for name, p in points.items() if name in self._seen]
         if again:
-            moved = sum(again) >= _FEWEST and 2 * sum(again) > len(again)
-            self._in_a_row = self._in_a_row + 1 if moved else 0
+            self._in_a_row = self._in_a_row + 1 if 2 * sum(again) > len(again) else 0
         self._seen = points | self._seen
         if self._in_a_row < _IN_A_ROW:
             return False
-        self._seen, self._in_a_row = points, 0
-        return True
+        is_sure = self._one_moved or sum(again) >= _FEWEST
+        self._seen, self._in_a_row, self._one_moved = points, 0, not is_sure
+        return is_sure
 
     def _point(self, s: Sighting) -> tuple[Array, float] | None:
         """The position of a landmark from the base, and the largest variance of it; None where it has none."""

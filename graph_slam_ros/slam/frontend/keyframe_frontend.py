@@ -261,7 +261,7 @@ class KeyframeFrontend:
         self.edges.closure(m, self.path.where(m.from_stamp_ns), where)
 
     def follow_frozen(self, m: Sightings) -> None:
-        """Add a keyframe with a loose edge where sightings show that the robot moved and odometry stood still."""
+        """Add a keyframe between loose edges where sightings show that the robot moved and odometry stood still."""
         where, motion = self.path.where(m.stamp_ns), self.path.motion
         if motion is None or where.keyframe != motion.keyframe or not motion.before_last_ns < m.stamp_ns:
             return
@@ -269,7 +269,7 @@ class KeyframeFrontend:
         if self._frozen.has_moved(m, T_odom_base):
             self._counters.count(self.source.partition("#")[0], "frozen")
             self.frozen_ns = m.stamp_ns
-            self._keyframe_at(where, motion, loose=True)
+            self._keyframe_at(where, motion)
             self._thinning.forget_time()
 
     def where(self, m: Observation) -> PoseAtStamp:
@@ -295,13 +295,14 @@ class KeyframeFrontend:
 
     def _append(self, step: Step, T_last_now: Numbers, covariance: Array, at: Numbers | None = None) -> None:
         """Add a vertex at odometry's pose, or at the given pose, and the edge from the vertex before."""
-        group, last = self._space.group, self.path.keyframes[-1].vertex
+        group, last = self._space.group, self.path.keyframes[-1]
         vertex = self._graph.add_vertex(self._space.pose, at or group.compose(self._last_pose, T_last_now))
-        factor = self._sigma_factors.get(self.source, 1.0)
-        covariance = covariance if factor == 1.0 else covariance * factor**2
+        covariance = covariance * self._sigma_factors.get(self.source, 1.0) ** 2
+        if self.frozen_ns in (last.stamp_ns, step.stamp_ns):  # nobody knows how far, before and after
+            covariance = covariance + np.diag(np.square(self._space.sigmas(JUMP_SIGMA_M, JUMP_SIGMA_RAD)))
         noise = edge_noise(self._counters, "odometry", covariance, self._space.dimensions)
         relative_pose = self._space.relative_pose
-        self._edges.add_edge(relative_pose, [last, vertex], T_last_now, noise, "odometry", self.source)
+        self._edges.add_edge(relative_pose, [last.vertex, vertex], T_last_now, noise, "odometry", self.source)
         self.covariance = group.propagate(self.covariance, T_last_now, covariance)
         self.path.append(vertex, step, self.config.ordering.late_s)
 
@@ -343,7 +344,7 @@ class KeyframeFrontend:
         is_near = max(math.hypot(*moved[: self._space.dimensions]), self._space.angle(moved)) < _NEAR
         return is_near and "" not in names and names <= self._observed
 
-    def _keyframe_at(self, where: PoseAtStamp, motion: IntegratedOdometry, *, loose: bool = False) -> PoseAtStamp:
+    def _keyframe_at(self, where: PoseAtStamp, motion: IntegratedOdometry) -> PoseAtStamp:
         """Add a keyframe at a stamp within the last step of odometry; the step is cut in two."""
         group, size, keyframes = self._space.group, self._space.dof, self.path.keyframes
         stood = motion.now.stands
@@ -352,10 +353,8 @@ class KeyframeFrontend:
         if self.gyro or self.corrections.found or self.corrections.are_configured:  # not in odometry's own frame
             left = self.corrections.uncorrected(rest.T_last_base) if rest is not None else self._space.identity
             T_odom_base = tuple(map(float, group.compose(self.T_odom_base, group.inverse(left))))
-        covariance = where.covariance
-        if loose:
-            covariance = covariance + np.diag(np.square(self._space.sigmas(JUMP_SIGMA_M, JUMP_SIGMA_RAD)))
-        self._append(Step(where.stamp_ns, self._space.identity, T_odom_base), motion.now.T_keyframe_base, covariance)
+        step = Step(where.stamp_ns, self._space.identity, T_odom_base)
+        self._append(step, motion.now.T_keyframe_base, where.covariance)
         if rest is not None:
             self._motion.extend(rest, stood)
         keyframe = len(keyframes) - 1

@@ -198,7 +198,8 @@ class OdometryJumps:
         (far_m, far_rad), (at_m, at_rad), (usual_m, usual_rad) = map(self._size, (motion, T_odom_base, last))
         most_m, most_rad = max(_RESET_M, _UNUSUAL * usual_m), max(_RESET_RAD, _UNUSUAL * usual_rad)
         is_at_zero = at_m <= most_m and at_rad <= most_rad if is_gap else max(at_m, at_rad) <= _AT_ZERO
-        return is_at_zero and (far_m > most_m or far_rad > most_rad)
+        is_far = far_m > most_m  # a heading may be that of a compass, which goes on
+        return (is_at_zero and (is_far or far_rad > most_rad)) or (at_m <= _AT_ZERO and is_far)
 
     def _size(self, pose: Numbers) -> tuple[float, float]:
         """Return the size of a motion in metres and radians."""
