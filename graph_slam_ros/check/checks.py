@@ -34,7 +34,8 @@ OF_A_REPLAY: tuple[Check, ...] = (check_times, check_frames, check_odometry, che
 
 _FROM_THE_BEGINNING = ("units", "mirrored", "axes", "unrelated")  # what is read later does not make it right
 _IN_OUTCOME = ("not_planar", "no_landmarks")
-_WHILE_DRIVING = (*_FROM_THE_BEGINNING, "clock_domains", "constant_stamps", "no_orientation_of_odometry", "noise_zero")
+_OF_POSE = ("no_orientation_of_odometry", "pose_stands")
+_WHILE_DRIVING = (*_FROM_THE_BEGINNING, "clock_domains", "constant_stamps", *_OF_POSE, "noise_zero")
 _OF_TWIST = ("twist_scale", "twist_frame", "twist_unrelated", "covariance_tiny", "covariance_useless")
 _ONCE_IT_MOVES = (*_OF_TWIST, "slow_odometry")
 _LATEST_S = 60.0  # that a message comes by a slow detector, and not by a clock that differs

@@ -173,8 +173,7 @@ def check_odometry(c: Columns) -> Iterator[Finding]:
             text = f"{o.topic}: its pose never changes, though its twist says {speed_m_s:.1f} m/s"
             yield Finding("pose_stands", "error", speed_m_s, _SLOWEST_M_S, "m/s", text, **at)
             return
-        span_s = float(steps.dt.sum())
-        text = f"{o.topic}: the robot moves {total_m:.2f} m and {np.degrees(total_rad):.0f} degrees in {span_s:.0f} s"
+        text = f"{o.topic}: it moves {total_m:.2f} m and {np.degrees(total_rad):.0f} degrees in {steps.dt.sum():.0f} s"
         yield Finding("static", "warning", total_m, _STILL_M, "m", text, **at)
         return
     if _has_no_orientation(steps, smooth, total_rad) and not _drives_sideways(o, steps):

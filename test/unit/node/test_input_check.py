@@ -105,6 +105,7 @@ def odometry(k, stamp_ns=None, unit=1.0, x=0.0, yaw=None, twist=None, covariance
         ({"twist": lambda a: (2 * math.cos(a), 2 * math.sin(a), 1.0)}, "twist_frame: /odom: the twist is given along"),
         ({"twist": lambda _: (2.0, 0.0, 57.3)}, "twist_scale: /odom: the pose moves 0.0175 times as far as the turn"),
         ({"twist": lambda _: (0.0, 0.0, 0.0)}, None),
+        ({"unit": 0.0, "yaw": lambda _: 0.0}, "pose_stands: /odom: its pose never changes, though its twist says 2.0"),
         ({"covariance": 1e4 * TWIST}, "covariance_useless: /odom: the sigma of the twist is 20 m/s, but the robot"),
     ],
 )
