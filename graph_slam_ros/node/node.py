@@ -157,12 +157,7 @@ class GraphSlamNode(LifecycleNode):
             self._bond = None
 
     def finish(self, patience_s: float | None = None) -> None:
-        """Save what was not saved yet, and remove everything.
-
-        Parameters
-        ----------
-        patience_s : how long what waits may still take; None: as long as it takes, unless a stop is requested
-        """
+        """Save what was not saved yet, and remove everything. Without a patience it takes its time until a stop."""
         self._end_bond()
         if self._run is not None:
             run, self._run = self._run, None

@@ -113,13 +113,9 @@ class Runtime:
         return self._node.config, self._session.estimate, self._ingest.extrapolator.newest
 
     def finish(self, patience_s: float | None, is_urgent: Callable[[], bool] = lambda: False) -> None:
-        """Save what is not saved yet, and remove everything.
+        """Save what is not saved yet, and remove everything, with the patience of ``Worker.stop``.
 
         The next start completes what takes longer, because all accepted measurements are in the journal.
-
-        Parameters
-        ----------
-        patience_s, is_urgent : as of ``Worker.stop``
         """
         self.deactivate()
         self._preparation.stop()

@@ -200,7 +200,12 @@ class Session:
 
     def evaluate(self) -> None:
         """Compute how well all measurements fit, and which are not believed, when idle, in a fiftieth of the time."""
-        self._keep_folder()
+        was_said = self.recording_fails
+        try:
+            self._keep_folder()
+        except GraphSlamError as error:  # it is tried again
+            if not was_said:
+                self._warn("output.folder", str(error))
         if self.estimate is None or self._fitted_at == self.slam.solves or time.perf_counter() < self._fit_due_s:
             return
         start = time.perf_counter()
@@ -211,15 +216,17 @@ class Session:
         self.estimate = replace(self.estimate, fit=self._fit, doubted=self._doubted)
 
     def _keep_folder(self) -> None:
-        """Begin the run folder anew with the whole map, where somebody has removed it."""
-        if self._recorder is None or (self._recorder.folder / CONFIG).exists() or not self.slam.keyframes:
+        """Begin the run folder anew with the whole map, where somebody has removed it. Raises RunError."""
+        if self._folder is None or (self._folder / CONFIG).exists() or not self.slam.keyframes:
             return
-        self._warn("output.folder", "the run folder was removed: it is made again, with the map as it is")
         with self._accepting:
             gone, self._recorder, self._is_saved, self.recording_fails = self._recorder, None, False, True
-            gone.abandon()
-            given = gone.folder, self.slam.config, _SYNC_S, self.slam.snapshot()
-            self._recorder = RunRecorder(*given, force=True, accepted=gone.accepted)
+            if gone is not None:
+                self._warn("output.folder", "the run folder was removed: it is made again, with the map as it is")
+                gone.abandon()
+            given = self._folder, self.slam.config, _SYNC_S, self.slam.snapshot()
+            accepted = self.slam.processed if gone is None else gone.accepted
+            self._recorder = RunRecorder(*given, force=True, accepted=accepted)
             self.recording_fails = False
 
     # -- services ----------------------------------------------------------------------------------------------------
@@ -354,6 +361,7 @@ class Session:
 
     def finish(self) -> str:
         """Save what is not saved yet, and end the recording. Returns the folder, or nothing."""
+        self._keep_folder()
         if self._recorder is None:
             return ""
         folder, recorder = "", self._recorder
