@@ -85,8 +85,8 @@ def edge_from_residual(
         An angle in it must be wrapped to (-pi, pi]
     jacobian : the same to (m, D), over the right perturbations side by side; without it, central differences are used
     """
+    accepts = (accepts,) if isinstance(accepts, VertexKind) else accepts
     kinds = tuple(one[0] if isinstance(one, tuple) else one for one in accepts)
-    sizes = [kind.size for kind in kinds]
 
     def checked(values: tuple[Array, ...], measured: Array) -> Array:
         found = np.atleast_1d(np.asarray(residual(values, measured), dtype=np.float64))
@@ -100,7 +100,7 @@ def edge_from_residual(
         residuals = np.empty((len(at), residual_size))
         jacobians = np.empty((len(at), residual_size, sum(kind.dof for kind in kinds)))
         for e, begins in enumerate(at.tolist()):
-            values = tuple(x[begin : begin + size] for begin, size in zip(begins, sizes, strict=True))
+            values = tuple(x[begin : begin + kind.size] for begin, kind in zip(begins, kinds, strict=True))
             residuals[e], jacobians[e] = checked(values, measured[e]), derivative(values, measured[e])
         return residuals, jacobians
 

@@ -95,13 +95,13 @@ def certify(solution: Solution) -> Certificate:
     translations, to robust losses, and where the critical point is more than 3 sigma away. What is not certified may be
     optimal all the same: with very large noise the relaxation is not tight.
     """
+    if not isinstance(solution, Solution):
+        raise GraphSlamError(f"certify takes a solution, not a {type(solution).__name__}: certify(optimize(...))")
     graph = solution.file.graph
-    reason = _no_relative_poses(graph)
-    if reason:
+    if reason := _no_relative_poses(graph):
         return Certificate(DOES_NOT_APPLY, reason)
     edges, anchors = Edges.of(graph), _anchors(solution)
-    reason = _ill_fitting(solution, edges, anchors)
-    if reason:
+    if reason := _ill_fitting(solution, edges, anchors):
         return Certificate(DOES_NOT_APPLY, reason)
     root = anchors[0] if anchors else int(np.argmin(solution.file.ids))
     estimate = solution.solver.estimate(np.arange(graph.vertex_count))
