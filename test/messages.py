@@ -202,11 +202,7 @@ DATUM = 48.0, 11.0, 500.0
 
 
 def record_drive(file, seconds=30):
-    """A robot that drives around a circle, its odometry turning too far, recorded with every kind of input.
-
-    A turret that turns sees three landmarks; a camera's detector tells of the fourth on /tf; there is a receiver.
-    ``/odom``, ``/landmarks``, ``/fix``, ``/tf``, ``/tf_static``; the correction of another SLAM is on /tf, too.
-    """
+    """A robot that drives round a circle with every kind of input: a turret, tags on /tf, a receiver, another SLAM."""
     truth = drifting = se2.IDENTITY
     with BagWriter(file) as bag:
         link = "base_link", "camera", (0.5, 0.0, 1.0), quaternion()

@@ -270,9 +270,9 @@ def _faults(facts: Facts, config: Config) -> Iterator[str]:
         yield f"{facts.overflows} messages refused: the queue is full (inputs.queue)"
     if facts.lag_s > health.lag_s:
         yield f"the solver is {facts.lag_s:.1f} s behind, {facts.waiting} messages wait"
-    if estimate and estimate.is_resumed:
+    if estimate and (since := "the restart" if estimate.is_resumed else "it jumped" if estimate.is_lost else ""):
         yield (
-            "goes on by odometry alone since the restart, nothing recognised yet:"
+            f"goes on by odometry alone since {since}, nothing recognised yet:"
             " drive past known landmarks, or give initialpose"
         )
     elif estimate and not estimate.is_confirmed:

@@ -118,6 +118,7 @@ class Estimate:
     gyro : its state and its bias; empty where no input is one
     calibration : settings of odometry's factors that the association found, and what is off without being corrected
     is_resumed : whether a drive that was cut off goes on by odometry alone: nothing was recognised since
+    is_lost : whether that is so since odometry jumped
     """
 
     T_map_odom: Numbers
@@ -147,6 +148,7 @@ class Estimate:
     ambiguity: str = ""
     gyro: str = ""
     is_resumed: bool = False
+    is_lost: bool = False
     calibration: Mapping[str, str] = field(default_factory=dict)
 
     @property

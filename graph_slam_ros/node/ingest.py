@@ -119,12 +119,7 @@ class Ingest:
     # -- measurements ------------------------------------------------------------------------------------------------
 
     def receive(self, measured: Sequence[Measured], cdr: bytes) -> None:
-        """Pass on the measurements of a message, and earlier ones that its transforms complete.
-
-        Parameters
-        ----------
-        cdr : the message
-        """
+        """Pass on the measurements of a message, and earlier ones that its transforms complete."""
         if self.gate.is_from_before(measured):
             self.refuse("before_jump", measured)
             return

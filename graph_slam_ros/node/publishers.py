@@ -45,12 +45,7 @@ class _Topic:
 
 
 class Publishers:
-    """Publishers of results. The node creates them, and the worker's thread uses them.
-
-    Parameters
-    ----------
-    node : the ROS node
-    """
+    """Publishers of results. The node creates them, and the worker's thread uses them."""
 
     def __init__(self, node: NodeHandle, config: Config) -> None:
         self._node = node

@@ -84,7 +84,7 @@ class Session:
         self.estimate = None
         self._is_saved, self._is_ended = True, False
         self.loaded_keyframes = len(self.slam.keyframes)
-        self._is_confirmed = not self.loaded_keyframes
+        self._is_confirmed, self._sure_segments = not self.loaded_keyframes, 0  # when it was last known where it is
         self._resumption: Resumption | None = None
         self._unseen, self._weakest = UnseenWay(self.loaded_keyframes, slam.landmark_changes), WeakestLandmark()
         self._slowest_s = 0.0
@@ -178,12 +178,15 @@ class Session:
         slam = self.slam
         if update.solved and not self._is_confirmed and len(slam.keyframes) > self.loaded_keyframes:
             self._is_confirmed = self._is_sure
+        if self._is_sure:
+            self._sure_segments = len(slam.segments)
         self._unseen = self._unseen.goes_on(slam)
         self.estimate = estimate_of(
             slam,
             correction=update.correction,
             is_confirmed=self._is_confirmed,
             is_resumed=not self._is_confirmed and self._resumption is not None and self._resumption.goes_on(slam),
+            is_lost=self._is_confirmed and not slam.displaced and len(slam.segments) > self._sure_segments,
             solve_s=solve_s,
             slowest_solve_s=self._slowest_s,
             fit=self._fit,

@@ -274,6 +274,16 @@ def test_P12_a_drive_that_was_cut_off_is_resumed_where_its_odometry_goes_on(tmp_
             assert again.estimate.T_map_odom == pytest.approx(before, abs=1e-6), name
 
 
+def test_after_a_jump_of_odometry_it_is_doubted_where_the_robot_is_until_something_is_recognised(tmp_path):
+    one, lost, half = session(tmp_path / "run"), [], len(WORLD) // 2
+    for k, m in enumerate(WORLD):
+        if k > half and isinstance(m, Odometry):
+            m = replace(m, T_odom_base=(m.T_odom_base[0] + 99.0, *m.T_odom_base[1:]))
+        one.ingest([m])
+        lost.append(one.estimate is not None and one.estimate.is_lost)
+    assert (any(lost[:half]), any(lost[half:]), lost[-1]) == (False, True, False)
+
+
 def test_P12_a_drive_whose_place_was_not_known_is_not_resumed(tmp_path):
     one = session(tmp_path / "run")
     one.ingest(straight(0, 41))

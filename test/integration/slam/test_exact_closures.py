@@ -18,10 +18,7 @@ def covariance(sigmas):
 
 
 def drive(around, false_every=0, seed=0, rough=(0.1, 0.1, 0.05)):
-    """Two laps of a circle with a few closures at the start, and true ones to the lap before at every fifth keyframe.
-
-    Returns the pipeline, its true closures and its false ones, which say that the robot is across the circle.
-    """
+    """Two laps, each fifth keyframe with a true closure: pipeline, true ones, false ones (from across the circle)."""
     rng, step = np.random.default_rng(seed), (0.5, 0.0, 2.0 * math.pi / around)
     true = [se2.IDENTITY]
     for _ in range(2 * around):

@@ -456,10 +456,7 @@ def empty(folder):
 
 
 def errors(state, root, kinds_of):
-    """One call after the other fails, or all from there on for a while: (tried, wrong, how often recording went on).
-
-    ``kinds_of`` has for each trial the kinds of faults, and whether they last.
-    """
+    """One call after the other fails, as ``kinds_of`` says: (tried, wrong, how often recording went on)."""
     reference = Reference.of(root / "reference")
     folder, wrong, tried, recovered = root / "run", [], 0, 0
     if state == "earlier run there":

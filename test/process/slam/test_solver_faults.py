@@ -168,10 +168,7 @@ BAD, RAISED_ONLY, DEGRADED, FINE = 5, 10, 11, 12
 
 
 def squeezed(p, measurements, seed):
-    """In a child: go on with hardly any memory, then with enough; how that went, as an exit code.
-
-    Pieces of less than 4 KiB are not taken away: without them Python itself ends.
-    """
+    """In a child: go on with hardly any memory (4 KiB for Python), then with enough; how that went, as an exit code."""
     rng, good, code, ballast = random.Random(seed), p.trajectory(), FINE, []
     mapped = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     unlimited = resource.getrlimit(resource.RLIMIT_AS)[1]
