@@ -87,18 +87,19 @@ $(VENV)/venv.stamp:
 	$(PYTHON) -m venv $(if $(SYSTEM_ROS),--system-site-packages) $(VENV)
 	@touch $@
 
-# The lines of requirements.txt that are for ROS alone are those for one kind of machine.
+# The lines of requirements.txt that are for ROS alone are those for one kind of machine. Python compiles what it imports:
+# all of it at once takes half of the installation.
 without = awk '/^[^ \#]/ {keep = !/$(1)/} keep' requirements.txt > $(VENV)/requirements.txt
 
 $(VENV)/requirements.stamp: requirements.txt $(VENV)/venv.stamp
 	@echo 'graph_slam_ros: installing into $(VENV), a minute or two the first time'
 ifeq ($(SYSTEM_ROS),)
-	@$(PIP) install --quiet --require-hashes -r requirements.txt || { \
+	@$(PIP) install --quiet --no-compile --require-hashes -r requirements.txt || { \
 	  echo 'graph_slam_ros: the ROS wheels cannot be installed, see above: going on without ROS'; \
-	  $(call without,platform_machine) && $(PIP) install --quiet --require-hashes -r $(VENV)/requirements.txt; }
+	  $(call without,platform_machine) && $(PIP) install --quiet --no-compile --require-hashes -r $(VENV)/requirements.txt; }
 else
 	@$(call without,platform_machine|^numpy==|^pandas==) && \
-	  $(PIP) install --quiet --require-hashes --no-deps -r $(VENV)/requirements.txt
+	  $(PIP) install --quiet --no-compile --require-hashes --no-deps -r $(VENV)/requirements.txt
 endif
 	@touch $@
 
