@@ -54,8 +54,8 @@ def optimize_options(sub: CommandParser) -> None:
     sub.add_argument("--information", choices=("g2o", "raw"), default="g2o", help=about)
     sub.add_argument("--lenient", action="store_true", help="leave out bad lines, list them, exit with 3")
     arguments.add_json(sub, "the answer")
-    about = "write the solved graph, or its poses"
-    sub.add_argument("--out", type=Path, metavar="FILE.g2o|FILE.tum", help=about)
+    about = "write the solved graph, or its poses; a name without an ending: a run folder, for report, explain and map"
+    sub.add_argument("--out", type=Path, metavar="FILE.g2o|FILE.tum|RUN", help=about)
     sub.add_argument("--plot", type=Path, metavar="FILE.png", help="draw the initial estimate and the result")
     arguments.add_force(sub)
 
@@ -68,11 +68,16 @@ def optimize(args: argparse.Namespace) -> int:
     from graph_slam_ros.formats.tum import write_trajectory
     from graph_slam_ros.optimization import HINTS, started
     from graph_slam_ros.optimization import optimize as solve
-    from graph_slam_ros.runs.folder import GRAPH, is_run
+    from graph_slam_ros.runs.folder import GRAPH, check_room, is_run
     from graph_slam_ros.warmup import compile_all
 
     compile_all()
-    console.check_file(args.out, args.plot, force=args.force, source=args.graph)
+    out_run = args.out if args.out and not args.out.suffix else None
+    if out_run is not None:
+        if not out_run.parent.is_dir():
+            raise GraphSlamError(f"{out_run}: there is no folder {out_run.parent}")
+        check_room(out_run, args.graph, force=args.force)
+    console.check_file(None if out_run else args.out, args.plot, force=args.force, source=args.graph)
     if is_run(args.graph):
         raise GraphSlamError(f"{args.graph}: a run folder; its graph is {args.graph / GRAPH}")
     how: dict[str, Any] = {"lenient": args.lenient, "raw": args.information == "raw", "dialect": args.source}
@@ -89,7 +94,11 @@ def optimize(args: argparse.Namespace) -> int:
     else:
         start_text = STARTS[start] + ("" if file.has_values else ": the file has no vertex lines")
         console.show(*_optimize_text(solution, start_text, args.loss), *_starts_text(solution), *told.splitlines())
-    if args.out:
+    if out_run is not None:
+        from graph_slam_ros.runs.graph_run import write_graph_run
+
+        write_graph_run(file, solver.values, out_run, args.graph.name, force=args.force)
+    elif args.out:
         (write_trajectory if ending(args.out) == ".tum" else write_g2o)(args.out, file, solver.estimate)
     if args.plot:
         from graph_slam_ros.analysis.plots import draw_graph
@@ -135,6 +144,8 @@ def _after(args: argparse.Namespace, solution: "Solution") -> str:
         return f"{console.command('optimize', args.graph, *words)} (another start)"
     if solution.doubt:
         return _remedy(args, solution)
+    if args.out is not None and not args.out.suffix:
+        return f"{console.command('report', args.out)} (one page: the map, and why each edge is in or out)"
     if args.out is not None and ending(args.out) == ".tum":
         return f"evo_traj tum {shlex.quote(str(args.out))} --plot, or any reader of TUM trajectories"
     name, what = ("POSES.tum", "as a trajectory") if args.out else ("SOLVED.g2o", "and write it")

@@ -1,5 +1,6 @@
 """The command ``graph_slam optimize``: answers, files, exit codes, and one line where it refuses."""
 
+import csv
 import json
 import shlex
 
@@ -182,3 +183,46 @@ def test_options_that_cannot_be_are_refused_in_one_line(graph, options, capsys):
     assert err.count("\n") == 1
     assert words[0] in err
     assert " _" not in err  # no name of a function
+
+
+def table(file):
+    return list(csv.DictReader(file.read_text().splitlines()))
+
+
+def test_a_graph_is_written_as_a_run_which_is_reported_explained_and_edited(run, graph, tmp_path, capsys):
+    folder, page, plan, edited = (tmp_path / name for name in ("of_graph", "page.html", "plan.json", "edited"))
+    code, out, _ = run(graph, "--out", folder)
+    assert (code, f"next: graph_slam report {folder}" in out) == (0, True)
+    assert [line.split()[0] for line in (folder / "path.tum").read_text().splitlines()] == [
+        f"{k}.000000000" for k in (3, 4, 5)
+    ]
+    assert main(["report", str(folder), "--out", str(page)]) == main(["explain", str(folder)]) == 0
+    assert "closures" in capsys.readouterr().out
+    assert main(["map", "edit", str(folder), "--new-plan", str(plan)]) == 0
+    told = json.loads(plan.read_text())
+    edge = next(row["edge"] for row in table(folder / "ledger.csv") if row["label"] == "closures")
+    who = {"name": "wrong", "who": "A", "when": "2026-05-04T10:30:00Z", "why": "it is"}
+    told["edits"] = [who | {"do": "remove_edge", "edge": int(edge)}]
+    plan.write_text(json.dumps(told))
+    assert main(["map", "edit", str(folder), "--plan", str(plan), "--out", str(edited)]) == 0
+    verdict = next(row for row in table(edited / "ledger.csv") if row["edge"] == edge)
+    assert verdict["verdict"] == "rejected"
+
+
+def test_what_is_no_run_is_refused_in_one_line(run, graph, tmp_path):
+    (other := tmp_path / "other").mkdir()
+    (other / "mine").touch()
+    (alone := tmp_path / "alone.g2o").write_text("\n".join(SMALL.splitlines()[:3] + SMALL.splitlines()[4:6]))
+    (text := tmp_path / "text.g2o").write_text("hello world\n")
+    assert run(graph, "--out", tmp_path / "again")[0] == 0
+    wrong = {
+        "holds a run already": (graph, "again"),
+        "not empty and not an earlier run": (graph, "other"),
+        "odometry alone": (alone, "new"),
+        "no vertex": (text, "new"),
+    }
+    for words, (file, out) in wrong.items():
+        code, _, err = run(file, "--out", tmp_path / out)
+        assert (code, len(err.splitlines()), words in err) == (2, 1, True), err
+    assert not (tmp_path / "new").exists()
+    assert list(other.iterdir()) == [other / "mine"]
