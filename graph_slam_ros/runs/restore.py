@@ -120,7 +120,7 @@ def of_all(folder: Path) -> str:
 
 
 def restored(folder: Path, losses: list[str], counters: Counters | None = None, *, whole: bool = False) -> GraphSlam:
-    """The map of a run, solved; see ``map_of``.
+    """The map of a run; see ``map_of``. Losses name its folder.
 
     Parameters
     ----------
@@ -131,11 +131,6 @@ def restored(folder: Path, losses: list[str], counters: Counters | None = None, 
     RunError
         The whole map is asked for, and the drive began in a map with condensed visits.
     """
-    return _started(folder, _map_with_names(folder, losses, counters, whole=whole), losses)
-
-
-def _map_with_names(folder: Path, losses: list[str], counters: Counters | None, *, whole: bool) -> MapSnapshot:
-    """The map of a run, whose losses name its folder."""
     lost = len(losses)
     state = map_of(folder, losses, counters)
     if state.bounded is not None and whole:
@@ -143,14 +138,8 @@ def _map_with_names(folder: Path, losses: list[str], counters: Counters | None, 
         if state.bounded is not None:
             raise RunError(f"{folder}: it began in a map with condensed visits, and this needs all keyframes")
     losses[lost:] = [f"{folder}: {loss}" for loss in losses[lost:]]
-    return state
-
-
-def _started(folder: Path, state: MapSnapshot, losses: list[str]) -> GraphSlam:
     # what is asked of a map is asked of all of it
-    config = config_of(folder, state).changed({"map.localize": False} | _NOTHING_LEAVES)
-    slam = GraphSlam(config, start=state)
-    return slam
+    return GraphSlam(config_of(folder, state).changed({"map.localize": False} | _NOTHING_LEAVES), start=state)
 
 
 def config_to_go_on(slam: GraphSlam, folder: Path) -> Config:
@@ -162,10 +151,7 @@ def restored_and_solved(
     folder: Path, losses: list[str], counters: Counters | None = None, *, whole: bool = False
 ) -> GraphSlam:
     """The same with all edges judged. Raises GraphSlamError also if it cannot be solved."""
-    return _solved(folder, restored(folder, losses, counters, whole=whole))
-
-
-def _solved(folder: Path, slam: GraphSlam) -> GraphSlam:
+    slam = restored(folder, losses, counters, whole=whole)
     slam.process(Control("optimize"))
     if not slam.is_solved:
         raise RunError(f"{folder}: its map cannot be solved: {slam.failing}")
@@ -260,12 +246,10 @@ def complete(folder: Path) -> Summary:
     try:
         with claimed(folder):
             before, counters = summary_of(folder), Counters()
-            state = _map_with_names(folder, losses, counters, whole=False)
-            slam = _solved(folder, _started(folder, state, losses))
+            slam = restored_and_solved(folder, losses, counters)
             kept = {key: before[key] for key in _OF_RECORDING if key in before}
-            now = summarize(slam, counters) | fitted_summary(slam) | took()
-            now |= {"losses": losses, "ended": True, "is_incomplete": False}
-            summary = kept | now
+            summary = kept | summarize(slam, counters) | fitted_summary(slam) | took()
+            summary |= {"losses": losses, "ended": True, "is_incomplete": False}
             save_results(folder, slam, summary)
     except OSError as error:
         raise RunError(f"{error.filename or folder}: {error.strerror}") from None
