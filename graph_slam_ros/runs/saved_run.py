@@ -1,6 +1,5 @@
 """Read a run folder in Python: paths with stamps, landmarks with names, edges."""
 
-import json
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -8,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from graph_slam_ros.formats.files import read_text
-from graph_slam_ros.runs.folder import COVARIANCES, SUMMARY, RunError, changed_since, check_run, run_config
+from graph_slam_ros.runs.folder import COVARIANCES, SUMMARY, RunError, changed_since, check_run, run_config, summary_of
 from graph_slam_ros.runs.ledger_file import Entry, read_ledger
 from graph_slam_ros.runs.trajectory import Trajectory, read_covariances, read_landmarks, read_rows
 from graph_slam_ros.slam import Config
@@ -68,15 +66,11 @@ class SavedRun:
 
     def trajectory(self) -> Trajectory:
         """Estimated poses ``T_map_base`` at the keyframes, in their order, with their stamps."""
-        return self._trajectory
+        return read_rows(self.folder / "path.tum")
 
     def odometry(self) -> Trajectory:
         """Poses of odometry alone at the keyframes, ``T_odom_base``."""
         return read_rows(self.folder / "path_odometry.tum")
-
-    @cached_property
-    def _trajectory(self) -> Trajectory:
-        return read_rows(self.folder / "path.tum")
 
     @cached_property
     def covariances(self) -> Array:
@@ -112,12 +106,6 @@ def load_run(folder: Path | str) -> SavedRun:
     """
     folder = Path(folder)
     check_run(folder)
-    if not (folder / SUMMARY).is_file():
-        raise RunError(f"{folder}: it has no results yet: graph_slam recover {folder} --out DIR")
-    try:
-        summary = json.loads(read_text(folder / SUMMARY))
-    except (OSError, ValueError) as error:
-        raise RunError(f"{folder / SUMMARY}: {error}") from None
-    if not isinstance(summary, dict):
-        raise RunError(f"{folder / SUMMARY}: not the summary of a run")
+    if not (summary := summary_of(folder)):
+        raise RunError(f"{folder}: no {SUMMARY} in it that can be read: graph_slam recover {folder} --out DIR")
     return SavedRun(folder, summary)

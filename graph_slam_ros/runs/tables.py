@@ -2,7 +2,7 @@
 
 import itertools
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any, TypeVar
 
@@ -13,7 +13,6 @@ from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.g2o_writer import graph_lines
 from graph_slam_ros.formats.graph_file import G2oFile
 from graph_slam_ros.formats.tum import tum_text
-from graph_slam_ros.graph.tables import EdgeTable
 from graph_slam_ros.messages import results
 from graph_slam_ros.messages.inputs import recorded_uses
 from graph_slam_ros.runs.condensed_map import WholePath
@@ -24,8 +23,8 @@ from graph_slam_ros.slam.calibration.answers import SIGMAS
 from graph_slam_ros.slam.calibration.parameters import QUANTITIES
 from graph_slam_ros.slam.lifelong.state import BoundedState, Left, seen_from
 from graph_slam_ros.slam.robust.gating import CANDIDATES
-from graph_slam_ros.slam.robust.ledger import INSIDE, OUTSIDE, Verdict
-from graph_slam_ros.typing import Mask
+from graph_slam_ros.slam.robust.ledger import OUTSIDE
+from graph_slam_ros.typing import Index
 
 Name = TypeVar("Name")
 _LATELY = 400  # edges
@@ -214,39 +213,25 @@ def _times(value: Any) -> int:
 
 def accepted_lately(slam: GraphSlam) -> dict[str, tuple[int, int]]:
     """Return by input how many of its edges among the newest of the graph are believed, and how many there are."""
-    first = slam.graph.edge_count - _LATELY
-    accepted, judged = _by_input(slam, lambda table: np.asarray(table.id.values >= first))
+    count = slam.graph.edge_count
+    accepted, judged = _by_input(slam, np.arange(max(0, count - _LATELY), count))
     return {name: (accepted[name], times) for name, times in judged.items()}
 
 
 def _accepted_by_input(slam: GraphSlam, first: int) -> Counter[str]:
     """Accepted edges of landmarks, fixes and closures by input that were judged first at a keyframe or later."""
-    keyframes = slam.ledger.keyframe.values
-
-    def is_since(table: EdgeTable) -> Mask:
-        ids, out = table.id.values, np.ones(len(table.id.values), dtype=bool)
-        judged = ids < len(keyframes)
-        out[judged] = keyframes[ids[judged]] >= first
-        return out
-
-    return _by_input(slam, is_since)[0]
+    is_since = np.ones(slam.graph.edge_count, dtype=bool)
+    is_since[: len(slam.ledger)] = slam.ledger.keyframe.values >= first
+    return _by_input(slam, np.flatnonzero(is_since))[0]
 
 
-def _by_input(slam: GraphSlam, chosen: Callable[[EdgeTable], Mask]) -> tuple[Counter[str], Counter[str]]:
-    """Edges of landmarks, fixes and closures by input, of the chosen ones: those that are accepted, and all."""
-    accepted, judged = Counter[str](), Counter[str]()
-    inside = [Verdict.NOT_EVALUATED, *INSIDE]
-    verdicts, sources = slam.ledger.verdict.values, slam.graph.sources
-    is_candidate = np.array([label in CANDIDATES for label in slam.graph.labels], dtype=bool)
-    for table in slam.graph.tables.values():
-        rows = np.flatnonzero(is_candidate[table.label.values] & chosen(table))
-        ids = table.at(rows).ids
-        is_in = ids >= len(verdicts)
-        is_in[~is_in] = np.isin(verdicts[ids[~is_in]], inside)
-        for counts, some in ((accepted, rows[is_in]), (judged, rows)):
-            for code, count in zip(*np.unique(table.at(some).source, return_counts=True), strict=True):
-                counts[sources[code]] += int(count)
-    return accepted, judged
+def _by_input(slam: GraphSlam, edges: Index) -> tuple[Counter[str], Counter[str]]:
+    """Those edges that are of landmarks, fixes and closures, by input: the accepted ones, and all."""
+    graph, is_out = slam.graph, np.zeros(slam.graph.edge_count, dtype=bool)
+    is_out[: len(slam.ledger)] = np.isin(slam.ledger.verdict.values, OUTSIDE)
+    judged = edges[graph.has_label(edges, CANDIDATES)]
+    accepted, every = (Counter(map(graph.source_of, some.tolist())) for some in (judged[~is_out[judged]], judged))
+    return accepted, every
 
 
 def _drives(slam: GraphSlam) -> list[dict[str, int]]:
