@@ -75,7 +75,7 @@ def _unnamed_map(bag: Path, run: Path) -> Iterator[Row]:
     path = path[(path[:, 0] > stamps_s[0]) & (path[:, 0] < stamps_s[-1])]
     true = np.stack([np.interp(path[:, 0], stamps_s, truth.trajectory.poses[:, k]) for k in (0, 1)], axis=1)
     turn, shift = fitted(path[:, 1:3], true)
-    marks = np.array([one.position[:2] for one in read_landmarks(run / "landmarks.csv").values()]) @ turn.T + shift
+    marks = read_landmarks(run / "landmarks.csv").positions[:, :2] @ turn.T + shift
     poles = np.array([one[:2] for one in truth.landmarks.values()])
     apart = np.linalg.norm(poles[:, None] - marks[None], axis=2)
     near = apart.min(axis=0)

@@ -163,7 +163,7 @@ def evaluate(
     known = truth if isinstance(truth, Truth) else read_truth(truth, topic, inputs)
     dimensions = dimensions_of(run)
     drive = scored_drive(run, known.trajectory, estimate)
-    landmarks = {name: landmark.position for name, landmark in read_landmarks(run / "landmarks.csv").items()}
+    landmarks = read_landmarks(run / "landmarks.csv")
     scored = {"truth": known.source, "estimate": _described(drive)}
     scored["frame"] = "aligned to the truth" if align else "not aligned to the truth"
     warnings = [known.doubt] if known.doubt else []
@@ -183,7 +183,7 @@ def evaluate(
     return Scores(
         error,
         None if odometry is None else path_error(odometry, known.trajectory, dimensions),
-        _map_rmse(landmarks, known.landmarks, dimensions),
+        _map_rmse(dict(zip(landmarks.names, landmarks.positions, strict=True)), known.landmarks, dimensions),
         consistency_of(run, known, drive.keyframes, is_first=drive.number == 1),
         dimensions,
         known.losses,
@@ -268,12 +268,12 @@ def _described(drive: Drive) -> str:
     return f"{drive.names[0]}, drive {drive.number} of {drive.count} alone: the others are of other recordings"
 
 
-def _map_rmse(landmarks: dict[str, Point], true: dict[str, Point], dimensions: int) -> float | None:
+def _map_rmse(landmarks: dict[str, Any], true: dict[str, Point], dimensions: int) -> float | None:
     """RMSE [m] of the landmarks with the same id; None with too few."""
     shared = sorted(set(landmarks) & set(true))
     if len(shared) < dimensions:
         return None
     flat = np.array([1.0, 1.0, 0.0 if dimensions == 2 else 1.0])
-    points, reference = (np.array([where[name] for name in shared]) * flat for where in (landmarks, true))
+    points, reference = (flat * [where[name] for name in shared] for where in (landmarks, true))
     moved = np.stack(se3.act(alignment(points[:, :dimensions], reference[:, :dimensions]), tuple(points.T)), axis=1)
     return float(np.sqrt(np.mean(np.sum((moved - reference) ** 2, axis=1))))

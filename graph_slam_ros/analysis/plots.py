@@ -57,9 +57,8 @@ def draw_run(
     whole = read_rows(run / "path.tum")
     found = _placed(drive, whole.at(drive.keyframes), known, dimensions, align=align)
     landmarks = read_landmarks(run / "landmarks.csv")
-    points = np.array([landmark.position for landmark in landmarks.values()]).reshape(-1, 3)
-    spreads = zip(points, (one.covariance for one in landmarks.values()), strict=True)
-    ellipses = [*_pose_spread(run, drive, found), *spreads]
+    points, names = landmarks.positions, set(landmarks.names)
+    ellipses = [*_pose_spread(run, drive, found), *zip(points, landmarks.covariances, strict=True)]
     figure, panels, below = _run_figure(found, points, dimensions)
     views = ([0, 1], [0, 2])
     for axes, shown in zip(panels, views, strict=False):
@@ -69,7 +68,7 @@ def draw_run(
         if len(points):
             _draw_stars(axes, points[:, shown])
         if known:
-            true_points = np.array([at for name, at in known.landmarks.items() if name in landmarks]).reshape(-1, 3)
+            true_points = np.array([at for name, at in known.landmarks.items() if name in names]).reshape(-1, 3)
             true_points = np.stack(se3.act(found.T_map_truth, tuple(true_points.T)), axis=1)
             if len(true_points):
                 circles = {"s": 90, "facecolors": "none", "edgecolors": _TRUTH, "linewidths": 1.0, "zorder": 5}

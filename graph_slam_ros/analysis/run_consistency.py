@@ -20,7 +20,7 @@ from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.files import read_text
 from graph_slam_ros.runs import outcome
 from graph_slam_ros.runs.folder import COVARIANCES, SUMMARY, run_config, summary_of
-from graph_slam_ros.runs.trajectory import Landmark, Trajectory, read_covariances, read_landmarks, read_rows
+from graph_slam_ros.runs.trajectory import LandmarkTable, Trajectory, read_covariances, read_landmarks, read_rows
 from graph_slam_ros.slam.noise_scale import NoiseScale
 from graph_slam_ros.slam.weak_direction import position_covariance
 from graph_slam_ros.typing import Array
@@ -88,7 +88,7 @@ def consistency_of(run: Path, known: Truth, keyframes: slice, *, is_first: bool)
         if not known.trajectory.has_orientation:
             several, frame = drive.positions()
         elif np.isfinite(true[0]).all() and np.isfinite(covariances[0]).all():  # that of a condensed one is not known
-            several = drive.poses(0, covariances, [one.covariance for one in landmarks.values()])
+            several = drive.poses(0, covariances, landmarks.covariances)
         else:
             several, frame = drive.later()
         found = Consistency(*several, noise, _left_out(*several, known, len(landmarks)), frame=frame)
@@ -101,17 +101,16 @@ def consistency_of(run: Path, known: Truth, keyframes: slice, *, is_first: bool)
 class _Compared:
     """A drive and its truth, in the frames that they can be compared in."""
 
-    def __init__(self, run: Path, path: Trajectory, true: Array, landmarks: dict[str, Landmark], known: Truth) -> None:
-        self._run, self._path, self._true, self._names = run, path, true, list(landmarks)
+    def __init__(self, run: Path, path: Trajectory, true: Array, landmarks: LandmarkTable, known: Truth) -> None:
+        self._run, self._path, self._true, self._names = run, path, true, landmarks.names
         unknown = (np.nan, np.nan, np.nan)
-        self._places = np.array([one.position for one in landmarks.values()]).reshape(-1, 3)
-        self._true_places = np.array([known.landmarks.get(name, unknown) for name in landmarks]).reshape(-1, 3)
+        self._places = landmarks.positions
+        self._true_places = np.array([known.landmarks.get(name, unknown) for name in self._names]).reshape(-1, 3)
         self._with_truth = np.flatnonzero(np.isfinite(true).all(axis=1))
 
-    def poses(self, first: int, covariances: Array, of_landmarks: list[Array]) -> _All:
+    def poses(self, first: int, covariances: Array, spreads: Array) -> _All:
         """NEES seen from a pose whose covariance all others contain; ``covariances`` begin there."""
         estimate, true = self._path.poses[first:], self._true[first:]
-        spreads = np.array(of_landmarks).reshape(-1, 3, 3)
         errors, relative = pose_errors(estimate, true, covariances)
         seen = landmark_errors(self._places, self._true_places, spreads, estimate[0], true[0], covariances[0])
         return Nees.of(errors[-1:], relative[-1:]), Nees.of(errors, relative), Nees.of(*seen)
@@ -132,7 +131,7 @@ class _Compared:
                 value, n = tuple(solver.estimate([vertex])[0].tolist()), space.dimensions
                 spread[:n, :n] = position_covariance(space, value, solver.marginal([vertex])[0])
                 spread[n:], spread[:, n:] = 0.0, 0.0
-        found = self.poses(first, covariances, list(spreads))
+        found = self.poses(first, covariances, spreads)
         return found, f"seen from keyframe {first}, the first in the graph with a true pose"
 
     def positions(self) -> tuple[_All, str]:

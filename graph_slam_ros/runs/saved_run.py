@@ -5,41 +5,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from graph_slam_ros.runs.folder import COVARIANCES, SUMMARY, RunError, changed_since, check_run, run_config, summary_of
 from graph_slam_ros.runs.ledger_file import Entry, read_ledger
-from graph_slam_ros.runs.trajectory import Trajectory, read_covariances, read_landmarks, read_rows
+from graph_slam_ros.runs.trajectory import LandmarkTable, Trajectory, read_covariances, read_landmarks, read_rows
 from graph_slam_ros.slam import Config
 from graph_slam_ros.typing import Array
-
-
-@dataclass(frozen=True, slots=True)
-class LandmarkTable:
-    """The landmarks of a run, in the same order in each.
-
-    Attributes
-    ----------
-    names : (n,) their ids
-    positions : (n, 3) in the map frame [m]; z is 0 in the plane
-    covariances : (n, 3, 3) of the positions, in the axes of the map frame [m^2]; NaN where unknown
-    """
-
-    names: tuple[str, ...]
-    positions: Array
-    covariances: Array
-
-    def __len__(self) -> int:
-        return len(self.names)
-
-    def __getitem__(self, name: str) -> Array:
-        """The position (3,) of one landmark. Raises KeyError for an unknown name."""
-        if name not in self.names:
-            raise KeyError(name)
-        return self.positions[self.names.index(name)]
-
-    def __repr__(self) -> str:
-        return f"LandmarkTable({len(self)} landmarks)"
 
 
 @dataclass(frozen=True)
@@ -80,10 +50,7 @@ class SavedRun:
     @cached_property
     def landmarks(self) -> LandmarkTable:
         """All landmarks."""
-        known = read_landmarks(self.folder / "landmarks.csv")
-        positions = np.array([one.position for one in known.values()], dtype=float).reshape(-1, 3)
-        covariances = np.array([one.covariance for one in known.values()], dtype=float).reshape(-1, 3, 3)
-        return LandmarkTable(tuple(known), positions, covariances)
+        return read_landmarks(self.folder / "landmarks.csv")
 
     @cached_property
     def edges(self) -> list[Entry]:

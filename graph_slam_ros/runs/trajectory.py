@@ -58,17 +58,31 @@ class Trajectory:
 
 
 @dataclass(frozen=True, slots=True)
-class Landmark:
-    """A landmark of a run.
+class LandmarkTable:
+    """The landmarks of a run, in the same order in each.
 
     Attributes
     ----------
-    position : in map [m]
-    covariance : (3, 3) of the position in the axes of map, zero for what a plane does not have; NaN where unknown
+    names : (n,) their ids
+    positions : (n, 3) in the map frame [m]; z is 0 in the plane
+    covariances : (n, 3, 3) of the positions, in the axes of the map frame [m^2]; NaN where unknown
     """
 
-    position: Point
-    covariance: Array
+    names: tuple[str, ...]
+    positions: Array
+    covariances: Array
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __getitem__(self, name: str) -> Array:
+        """The position (3,) of one landmark. Raises KeyError for an unknown name."""
+        if name not in self.names:
+            raise KeyError(name)
+        return self.positions[self.names.index(name)]
+
+    def __repr__(self) -> str:
+        return f"LandmarkTable({len(self)} landmarks)"
 
 
 def read_tum(path: Path, *, follow: bool = False) -> Trajectory:
@@ -143,20 +157,23 @@ def _normalized(stamps_s: Array, poses: Array, source: str) -> Trajectory:
     return Trajectory(stamps_s, np.hstack([poses[:, :3], poses[:, 3:] / norm]))
 
 
-def read_landmarks(path: Path) -> dict[str, Landmark]:
-    """Landmarks by id of a run's ``landmarks.csv``; empty where there is no such file."""
+def read_landmarks(path: Path) -> LandmarkTable:
+    """The landmarks of a run's ``landmarks.csv``; none where there is no such file."""
     try:
-        table = io.StringIO(read_text(path), newline="")
-        return {row["id"]: _landmark(row) for row in csv.DictReader(table)}
+        rows = csv.DictReader(io.StringIO(read_text(path), newline=""))
+        known = {row["id"]: _landmark(row) for row in rows}
     except FileNotFoundError:
-        return {}
+        known = {}
     except OSError as error:
         raise GraphSlamError(f"{path}: {error.strerror}") from None
     except (KeyError, TypeError, ValueError) as error:
         raise GraphSlamError(f"{path}: not a table of landmarks ({error})") from None
+    positions = np.array([at for at, _ in known.values()], dtype=float).reshape(-1, 3)
+    covariances = np.array([covariance for _, covariance in known.values()], dtype=float).reshape(-1, 3, 3)
+    return LandmarkTable(tuple(known), positions, covariances)
 
 
-def _landmark(row: dict[str, str]) -> Landmark:
+def _landmark(row: dict[str, str]) -> tuple[Point, Array]:
     names = "xyz" if "z" in row else "xy"
     covariance = np.zeros((3, 3))
     for i, a in enumerate(names):
@@ -165,7 +182,7 @@ def _landmark(row: dict[str, str]) -> Landmark:
     at = float(row["x"]), float(row["y"]), float(row.get("z", 0.0))
     if not max(map(abs, at)) < 1e9 or (np.abs(covariance) >= MOST).any():
         raise ValueError(f"{row['id']} is at {at}, variance {covariance.max():.3g}")
-    return Landmark(at, covariance)
+    return at, covariance
 
 
 def read_covariances(path: Path) -> Array:

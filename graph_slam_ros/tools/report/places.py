@@ -18,7 +18,7 @@ from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.files import read_bytes, read_text
 from graph_slam_ros.lie import se3
 from graph_slam_ros.runs.folder import LANDMARKS, PATH, PATH_ODOMETRY
-from graph_slam_ros.runs.trajectory import Landmark, Trajectory, read_landmarks, read_rows
+from graph_slam_ros.runs.trajectory import LandmarkTable, Trajectory, read_landmarks, read_rows
 from graph_slam_ros.tools.report.packing import Packing, shown
 from graph_slam_ros.typing import Array
 
@@ -69,17 +69,14 @@ def keyframe_paths(run: Path, saved: SavedGraph) -> tuple[Trajectory, Trajectory
     return of(PATH, whole.poses()), of(PATH_ODOMETRY, whole.odometry)
 
 
-def _known_landmarks(run: Path, saved: SavedGraph) -> dict[str, Landmark]:
+def _known_landmarks(run: Path, saved: SavedGraph) -> LandmarkTable:
     """The landmarks of the run's table; of its map, without covariances, where it has none yet."""
     if landmarks := read_landmarks(run / LANDMARKS):
         return landmarks
-    out, n = dict[str, Landmark](), saved.space.dimensions
-    for name, vertex in saved.landmarks.items():
-        point = np.zeros(3)
+    points, n = np.zeros((len(saved.landmarks), 3)), saved.space.dimensions
+    for point, vertex in zip(points, saved.landmarks.values(), strict=True):
         point[:n] = saved.slam.solver.estimate([vertex])[0][:n]
-        x, y, z = point.tolist()
-        out[name] = Landmark((x, y, z), np.full((3, 3), np.nan))
-    return out
+    return LandmarkTable(tuple(saved.landmarks), points, np.full((len(points), 3, 3), np.nan))
 
 
 def _thinned(path: Trajectory, most: int) -> Trajectory:
@@ -87,14 +84,13 @@ def _thinned(path: Trajectory, most: int) -> Trajectory:
     return path.at(slice(None, None, every))
 
 
-def _landmarks(pack: Packing, landmarks: dict[str, Landmark]) -> dict[str, Any]:
+def _landmarks(pack: Packing, landmarks: LandmarkTable) -> dict[str, Any]:
     """Positions by name, and an ellipse of two sigmas about each."""
-    points = np.array([one.position for one in landmarks.values()]).reshape(-1, 3)
-    covariances = np.array([one.covariance for one in landmarks.values()]).reshape(-1, 3, 3)
+    points, covariances = landmarks.positions, landmarks.covariances
     sigmas = np.sqrt(np.maximum(np.diagonal(covariances, axis1=1, axis2=2), 0.0))
     corners = _ellipses(points, covariances[:, :2, :2])
     return {
-        "names": pack.texts([shown(name) for name in landmarks]),
+        "names": pack.texts([shown(name) for name in landmarks.names]),
         "points": [pack.fixed(column, _MM) for column in points.T],
         "sigmas": [pack.column(column) for column in sigmas.T],
         "ellipses": [pack.fixed(column, _MM) for column in corners.T],
