@@ -103,7 +103,8 @@ def check(
         some = _for_trial(columns, [some for number, some in measured if number == 0])
         some = [_without(one, moving) for one in some] if moving else some
         found += with_inputs(columns, _trial(without(columns, moving), some))
-    found = [_with_candidates(one, suggestion) for one in found]
+    perhaps = [f"{name}: {suggestion.unused[name]}" for name in suggestion.perhaps]  # which may have landmarks
+    found = [replace(f, text="; ".join([f.text, *perhaps])) if f.code == "no_landmarks" else f for f in found]
     others = suggestion.settings.keys() - suggested.assumed.keys()
     command = "" if suggestion.trouble else suggestion.command(without=others)
     found = of_gyro_or_wheels(found, config.gyro_input)
@@ -156,12 +157,3 @@ def _unused(recording: Recording, suggestion: Suggestion, *, has_landmarks: bool
             text = f"{name} is not used: {why}"
             severity = "note" if has_landmarks and is_landmark else "error"
             yield Finding(code, severity, 1, 0, "topics", text, name, count=one.topic.count)
-
-
-def _with_candidates(one: Finding, suggestion: Suggestion) -> Finding:
-    """The finding that nothing corrects odometry, with the topics that may have landmarks."""
-    if one.code != "no_landmarks":
-        return one
-    return replace(
-        one, text="; ".join([one.text, *(f"{name}: {suggestion.unused[name]}" for name in suggestion.perhaps)])
-    )

@@ -78,10 +78,6 @@ class RecordWriter:
         self._writer.finish()  # type: ignore[no-untyped-call]
         return self.file
 
-    def close(self) -> None:
-        """Write the index and close the file."""
-        self.end().close()
-
 
 class Parts:
     """The records of one name in a folder, in parts, each of which is a file.

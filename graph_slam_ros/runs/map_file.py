@@ -61,7 +61,24 @@ Columns = dict[str, NDArray[Any]]
 
 def write_map(file: Path, state: MapSnapshot) -> int:
     """Write a map, completely or not at all. Returns the number of bytes. Raises OSError."""
-    data = _map_bytes(state)
+    out = io.BytesIO()
+    writer = Writer(out, compression=CompressionType.ZSTD)
+    writer.start(profile="", library=LIBRARY)
+    schema = writer.register_schema(SCHEMA, "", b"")
+    stamp_ns = int(state.keyframes.stamps_ns[-1])
+
+    def add(name: str, encoding: str, several: Iterator[bytes]) -> None:
+        channel = writer.register_channel(name, encoding, schema)
+        for sequence, data in enumerate(several):
+            writer.add_message(channel, stamp_ns, data, stamp_ns, sequence)
+
+    add("map", "json", iter([_as_json(_told(state))]))
+    add("landmarks", "json", (_as_json(_landmark(mark)) for mark in state.landmarks.values()))
+    for name, numbers in _columns(state):
+        encoding = "<f8" if numbers.dtype.kind == "f" else "<i8"
+        add(name, encoding, iter([np.ascontiguousarray(numbers, dtype=encoding).tobytes()]))
+    writer.finish()  # type: ignore[no-untyped-call]
+    data = out.getvalue()
     write_whole(file, data)
     return len(data)
 
@@ -105,27 +122,6 @@ def _read(file: Path) -> MapSnapshot | None:
 
 
 # -- the file ---------------------------------------------------------------------------------------------------------
-
-
-def _map_bytes(state: MapSnapshot) -> bytes:
-    out = io.BytesIO()
-    writer = Writer(out, compression=CompressionType.ZSTD)
-    writer.start(profile="", library=LIBRARY)
-    schema = writer.register_schema(SCHEMA, "", b"")
-    stamp_ns = int(state.keyframes.stamps_ns[-1])
-
-    def add(name: str, encoding: str, several: Iterator[bytes]) -> None:
-        channel = writer.register_channel(name, encoding, schema)
-        for sequence, data in enumerate(several):
-            writer.add_message(channel, stamp_ns, data, stamp_ns, sequence)
-
-    add("map", "json", iter([_as_json(_told(state))]))
-    add("landmarks", "json", (_as_json(_landmark(mark)) for mark in state.landmarks.values()))
-    for name, numbers in _columns(state):
-        encoding = "<f8" if numbers.dtype.kind == "f" else "<i8"
-        add(name, encoding, iter([np.ascontiguousarray(numbers, dtype=encoding).tobytes()]))
-    writer.finish()  # type: ignore[no-untyped-call]
-    return out.getvalue()
 
 
 def _as_json(content: Any) -> bytes:

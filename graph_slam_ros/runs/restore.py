@@ -61,7 +61,11 @@ def map_of(folder: Path, losses: list[str], counters: Counters | None = None) ->
     except FormatError as error:
         losses.append(f"{error}: the drive is repeated from its journal")
         state = None
-    state = _repeated(folder, losses, counters) if state is None else _with_rest(folder, state, losses, counters)
+    if state is None:
+        state = _repeated(folder, losses, counters)
+    elif not was_saved_whole(folder):  # measurements were accepted and not processed
+        state.continues = True
+        state = _driven(folder, state, losses, counters)
     if not state.keyframes:
         raise RunError(f"{folder}: no keyframe, so there is no map")
     if state.graph.kind_of(int(state.keyframes.ids[0])) is not space.pose:
@@ -88,14 +92,6 @@ def _repeated(folder: Path, losses: list[str], counters: Counters) -> MapSnapsho
     state = _driven(folder, start or MapSnapshot(), losses, again)
     counters.raise_to(again)
     return state
-
-
-def _with_rest(folder: Path, state: MapSnapshot, losses: list[str], counters: Counters) -> MapSnapshot:
-    """The map with measurements that were accepted and not processed."""
-    if was_saved_whole(folder):
-        return state
-    state.continues = True
-    return _driven(folder, state, losses, counters)
 
 
 def _driven(folder: Path, state: MapSnapshot, losses: list[str], counters: Counters) -> MapSnapshot:

@@ -94,7 +94,7 @@ def parts(tmp_path_factory):
         writer = RecordWriter(file_of(folder, number))
         for k in range(0, len(some), 3):
             writer.write(some[k : k + 3])
-        writer.close()
+        writer.end().close()
         data = file_of(folder, number).read_bytes()
         flushed = list(zip(chunk_ends(data), range(3, len(some) + 1, 3), strict=True))
         out.append(Part(data, some, flushed))
@@ -174,7 +174,7 @@ def test_F18_a_kind_of_record_that_is_not_known_is_refused_by_its_name(tmp_path)
     journal.unlink()
     writer = RecordWriter(journal)
     writer.write([to_record(Odometry(1, (0.0, 0.0, 0.0))), {"type": "sonar", "stamp_ns": 2}])
-    writer.close()
+    writer.end().close()
     with pytest.raises(FormatError, match="sonar"):
         replay(tmp_path / "run", tmp_path / "out")
 

@@ -134,7 +134,7 @@ def test_an_event_of_another_version_is_left_out_of_a_replay_and_a_sequence_that
     unknown = {"type": "control", "event": "dance", "values": []}
     writer = RecordWriter(ingest)
     writer.write([*records[:100], unknown, unknown, *records[100:]])
-    writer.close()
+    writer.end().close()
     again = replay(tmp_path / "newer", tmp_path / "again")
     (loss,) = (one for one in again.losses if "event" in one)
     assert loss == "ingest: event 'dance' is not known to this version; left out"
