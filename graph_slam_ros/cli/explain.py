@@ -39,16 +39,18 @@ def explain(args: argparse.Namespace) -> int:
     what_if = bool(args.without or args.let_in or args.loss)
     if bool(args.edge) + (args.influence is not None) + what_if > 1:
         raise GraphSlamError("explain: one of EDGE, --influence, and --without, --with and --loss together")
-    if what_if or args.influence is not None:
-        from graph_slam_ros.warmup import compile_all
-
-        compile_all()
-        return _solve(args) if what_if else _influence(args)
     from graph_slam_ros.analysis.explain import explain_edge, explain_run
     from graph_slam_ros.analysis.what_if import SavedGraph
+    from graph_slam_ros.warmup import compile_all
 
+    if what_if or args.influence is not None:
+        compile_all()
     losses: list[str] = []
     run = SavedGraph(args.run_folder, losses)
+    if what_if:
+        return _solve(args, run, losses)
+    if args.influence is not None:
+        return _influence(args, run, losses)
     console.show(*(explain_edge(run, args.edge) if args.edge else explain_run(run)))
     if args.edge:
         console.then(f"{console.command('explain', args.run_folder, '--without', 'EDGE')} (the drive without an edge)")
@@ -57,11 +59,7 @@ def explain(args: argparse.Namespace) -> int:
     return console.report_losses(losses)
 
 
-def _solve(args: argparse.Namespace) -> int:
-    from graph_slam_ros.analysis.what_if import SavedGraph
-
-    losses: list[str] = []
-    run = SavedGraph(args.run_folder, losses)
+def _solve(args: argparse.Namespace, run: "SavedGraph", losses: list[str]) -> int:
     start = time.process_time()
     solver = run.problem(args.without, args.let_in, args.loss)
     report = solver.optimize()
@@ -73,11 +71,7 @@ def _solve(args: argparse.Namespace) -> int:
     return code if report.converged else console.LOSSES
 
 
-def _influence(args: argparse.Namespace) -> int:
-    from graph_slam_ros.analysis.what_if import SavedGraph
-
-    losses: list[str] = []
-    run = SavedGraph(args.run_folder, losses)
+def _influence(args: argparse.Namespace, run: "SavedGraph", losses: list[str]) -> int:
     console.show(
         f"the last pose without each edge, the {args.influence} of most influence to first order",
         f"  {'edge':<8s} {'':24s} {'first order':>12s} {'solved again':>12s}",

@@ -2,7 +2,7 @@
 
 import argparse
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,6 +35,7 @@ def replay(args: argparse.Namespace) -> int:
     """Run a recording, or an earlier run, through the pipeline, or play it into a live ROS graph."""
     from graph_slam_ros.runs.folder import is_run
     from graph_slam_ros.runs.replay import replay as replayed
+    from graph_slam_ros.runs.suggested_inputs import unused_topics
     from graph_slam_ros.slam import Config
 
     _refuse_idle_options(args, is_run(args.bag))
@@ -47,10 +48,15 @@ def replay(args: argparse.Namespace) -> int:
     topics = {"odometry": args.odom, "landmarks": args.landmarks, "map_folder": args.map}
     shown = {"progress": console.progress("replay"), "warn": lambda text: console.warn(text, most=console.SENTENCE)}
     done = replayed(args.bag, args.out, own, **topics, force=args.force, **shown)
-    code = max([_print_earlier(run.folder, run.summary) for run in done.earlier], default=console.DONE)
+    code = console.DONE
+    for run in done.earlier:
+        code = max(code, _print_outcome(run.summary))
+        console.show(f"odometry went back in time, and time.on_jump is reset: the run until then is in {run.folder}")
+        draw(run.folder)
     code = max(code, _print_summary(args.bag, done.summary))
-    if done.topics and config.inputs.names == Config().inputs.names:
-        _print_unused(args.bag, done.topics)
+    are_chosen = not done.topics or config.inputs.names != Config().inputs.names
+    if unused := [] if are_chosen else unused_topics(args.bag, done.topics):
+        console.show(f"not used   {', '.join(unused)}: {console.command('info', args.bag)} prints the command")
     console.show(f"results in {args.out}")
     draw(args.out)
     code = console.report_losses(done.losses, done.warnings) or code
@@ -165,40 +171,20 @@ def config_of(args: argparse.Namespace, suggested: Mapping[str, Any] | None = No
 
 
 def _print_summary(source: Path, summary: dict[str, Any]) -> int:
-    """Print the outcome of a run; returns the exit code, 3 if the result is incomplete."""
-    from graph_slam_ros.runs import outcome
-
-    code = _print_shortcomings(summary) if summary["keyframes"] else console.LOSSES
-    console.show(*outcome.text(summary))
+    """Print the outcome of a run; returns the exit code. Raises GraphSlamError where there is no keyframe."""
+    code = _print_outcome(summary)
     if not summary["keyframes"]:
         why = f": {summary['losses'][0]}" if summary.get("losses") else ", see what was counted; graph_slam check BAG"
         raise GraphSlamError(f"{source}: no odometry of it could be used{why}")
     return code
 
 
-def _print_unused(source: Path, topics: Collection[str]) -> None:
-    """Name the topics of a recording that could be inputs and are none, where nobody has chosen inputs."""
-    from graph_slam_ros.runs.suggested_inputs import unused_topics
-
-    if unused := unused_topics(source, topics):
-        console.show(f"not used   {', '.join(unused)}: {console.command('info', source)} prints the command")
-
-
-def _print_earlier(folder: Path, summary: dict[str, Any]) -> int:
-    """Print the outcome of a run that ended when time jumped back; returns as ``_print_summary``."""
+def _print_outcome(summary: dict[str, Any]) -> int:
+    """Print the outcome of a run; returns the exit code, 3 if the result is incomplete."""
     from graph_slam_ros.runs import outcome
 
-    code = _print_shortcomings(summary)
-    console.show(*outcome.text(summary))
-    console.show(f"odometry went back in time, and time.on_jump is reset: the run until then is in {folder}")
-    draw(folder)
-    return code
-
-
-def _print_shortcomings(summary: dict[str, Any]) -> int:
-    from graph_slam_ros.runs import outcome
-
-    shortcomings = list(outcome.shortcomings(summary))
+    shortcomings = list(outcome.shortcomings(summary)) if summary["keyframes"] else []
     for sentence in shortcomings:
         console.warn(sentence, most=console.SENTENCE)
+    console.show(*outcome.text(summary))
     return console.LOSSES if shortcomings else console.DONE
