@@ -268,9 +268,8 @@ def numbered(slam: GraphSlam) -> tuple[list[int], str]:
 
 def graph_file(slam: GraphSlam, ids: list[int]) -> G2oFile:
     """The graph, with the vertices of a frozen map fixed, and without those that are not part of the map any more."""
-    named = {*slam.keyframes.ids.tolist(), *(mark.vertex for mark in slam.landmarks.values())}
-    named |= {one.vertex for one in slam.bounded.old} if slam.bounded else set()
-    absent = frozenset(range(slam.graph.vertex_count)) - named
+    count = len(slam.keyframes) + len(slam.landmarks)
+    absent = frozenset(vertex for vertex, number in enumerate(ids) if number >= count)
     return G2oFile(slam.graph, ids, slam.solver.held.tolist(), absent=absent)
 
 
