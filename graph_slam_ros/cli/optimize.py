@@ -72,12 +72,10 @@ def optimize(args: argparse.Namespace) -> int:
     from graph_slam_ros.warmup import compile_all
 
     compile_all()
-    out_run = args.out if args.out and not args.out.suffix else None
-    if out_run is not None:
-        if not out_run.parent.is_dir():
-            raise GraphSlamError(f"{out_run}: there is no folder {out_run.parent}")
-        check_room(out_run, args.graph, force=args.force)
-    console.check_file(None if out_run else args.out, args.plot, force=args.force, source=args.graph)
+    makes_run = _is_folder(args.out)
+    if makes_run:
+        check_room(args.out, args.graph, force=args.force)
+    console.check_file(None if makes_run else args.out, args.plot, force=args.force, source=args.graph)
     if is_run(args.graph):
         raise GraphSlamError(f"{args.graph}: a run folder; its graph is {args.graph / GRAPH}")
     how: dict[str, Any] = {"lenient": args.lenient, "raw": args.information == "raw", "dialect": args.source}
@@ -94,20 +92,22 @@ def optimize(args: argparse.Namespace) -> int:
     else:
         start_text = STARTS[start] + ("" if file.has_values else ": the file has no vertex lines")
         console.show(*_optimize_text(solution, start_text, args.loss), *_starts_text(solution), *told.splitlines())
-    if out_run is not None:
-        from graph_slam_ros.runs.graph_run import write_graph_run
-
-        write_graph_run(file, solver.values, out_run, args.graph.name, force=args.force)
-    elif args.out:
-        (write_trajectory if ending(args.out) == ".tum" else write_g2o)(args.out, file, solver.estimate)
+    after = "" if args.json else _after(args, solution)
     if args.plot:
         from graph_slam_ros.analysis.plots import draw_graph
 
         draw_graph(args.plot, graph, _positions(graph, started(file, start)[0]), _positions(graph, solver))
+    if makes_run:
+        from graph_slam_ros.runs.graph_run import write_graph_run
+
+        out, judged = write_graph_run(solution, args.out, args.graph.name, force=args.force)
+        if not args.json:
+            console.show(f"results in {args.out}: {out} of {judged} measurements are not in the map")
+    elif args.out:
+        (write_trajectory if ending(args.out) == ".tum" else write_g2o)(args.out, file, solver.estimate)
     for note in file.notes:
         console.warn(note)
-    after = "" if args.json else _after(args, solution)
-    is_open = report.converged and _loss_text(args.loss) == "none" and not solution.doubt.endswith(HINTS)
+    is_open = report.converged and _loss_text(args.loss) == "none" and not (makes_run or solution.doubt.endswith(HINTS))
     beware = [solution.doubt + _why(after) * is_open] if solution.doubt else []
     lost = console.report_losses(file.losses, beware)
     if after:
@@ -138,18 +138,23 @@ def _after(args: argparse.Namespace, solution: "Solution") -> str:
     if is_wrong or (solution.file.losses and not args.lenient):
         what = f"write {solution.doubt.rpartition('g2o has ')[2]} in the file" if is_wrong else _OTHER_TAG
         return f"{what}, then {console.command('optimize', args.graph, *_options(args))}"
+    if _is_folder(args.out):
+        return f"{console.command('report', args.out)} (one page: the map, and why each edge is in or out)"
     if not solution.report.converged:
         start = "online" if args.init == "chordal" else "chordal"
         words = _options(argparse.Namespace(**vars(args) | {"init": start}))
         return f"{console.command('optimize', args.graph, *words)} (another start)"
     if solution.doubt:
         return _remedy(args, solution)
-    if args.out is not None and not args.out.suffix:
-        return f"{console.command('report', args.out)} (one page: the map, and why each edge is in or out)"
     if args.out is not None and ending(args.out) == ".tum":
         return f"evo_traj tum {shlex.quote(str(args.out))} --plot, or any reader of TUM trajectories"
     name, what = ("POSES.tum", "as a trajectory") if args.out else ("SOLVED.g2o", "and write it")
     return f"{console.command('optimize', args.graph, *_options(args), '--out', _free(name))} (the same, {what})"
+
+
+def _is_folder(out: Path | None) -> bool:
+    """Whether a run is written there: the name has no ending."""
+    return out is not None and not out.suffix
 
 
 def _free(name: str) -> str:

@@ -48,6 +48,7 @@ _SCHEMAS = {INGEST: MEASUREMENT, "map": SCHEMA, "start": SCHEMA, CONDENSED: LEFT
 _OF_RECORDINGS = re.compile(r"(\.(mcap|db3|bag|active|zstd|gz))+$")
 _NO_FILE = (errno.ENOENT, errno.ENOTDIR)
 _ENDS = 2**16
+_MADE = "graph_slam replay BAG --out RUN makes a run of a recording, graph_slam optimize of a graph"
 _NOT_A_FILE = "not a regular file"  # in place of a mark
 _MOST_SEARCHED, _MOST_NAMED = 200, 3  # folders in one that is not a run
 _TOPICS = {"/tf", "/pose", "/path", "/landmarks"}
@@ -102,8 +103,7 @@ def check_run(folder: Path) -> None:
         raise RunError(f"{folder}: not a run's folder: there is nothing of that name{similar_file(folder)}")
     if is_recording(folder):
         what = "a recording" if folder.is_dir() else "a file"
-        made = "graph_slam replay BAG --out RUN makes a run of a recording"
-        raise RunError(f"{folder}: not a run's folder, but {what}: {made}")
+        raise RunError(f"{folder}: not a run's folder, but {what}: {_MADE}")
     runs = []
     try:
         inside = itertools.islice(sorted(folder.iterdir()), _MOST_SEARCHED)
@@ -182,7 +182,7 @@ def is_recording(path: Path) -> bool:
 def run_config(folder: Path) -> Config:
     """The configuration a run was made with. Raises ConfigError naming the file."""
     if not os.path.lexists(folder / CONFIG):
-        made = f"; graph_slam replay {folder.name} --out RUN makes one of a recording" * is_recording(folder)
+        made = f"; {_MADE}" * is_recording(folder)
         raise ConfigError(f"{folder}: not a run: no {CONFIG} in it{made or similar_file(folder)}")
     values = read_parameters(folder / CONFIG, follow=False)
     try:
