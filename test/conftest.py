@@ -14,6 +14,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the commands do, before
 import pytest
 import reliability
 
+from graph_slam_ros.cli import main
+from graph_slam_ros.tools.simulation import simulate, write_bag
 from graph_slam_ros.warmup import compile_all, warmup
 
 # Where Python is asked to keep no bytecode, each worker and each process would compile all sources and tests anew.
@@ -45,6 +47,29 @@ def undrawn(request, monkeypatch):  # type: ignore[no-untyped-def]
     """What a picture shows is told in test/process."""
     if kind(request.path) == "integration":
         monkeypatch.setattr("graph_slam_ros.cli.replay.draw", lambda *_: None)
+
+
+@pytest.fixture
+def told(capsys):  # type: ignore[no-untyped-def]
+    """Run a command: its exit code, and what it says on standard output and error."""
+
+    def run(*words):  # type: ignore[no-untyped-def]
+        capsys.readouterr()
+        try:
+            code = main([*map(str, words)])
+        except SystemExit as end:  # of the options
+            code = end.code
+        return code, *capsys.readouterr()
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def laps(tmp_path_factory):  # type: ignore[no-untyped-def]
+    """A recording that is long enough for a fit."""
+    file = tmp_path_factory.mktemp("laps") / "laps.mcap"
+    write_bag(simulate("warehouse", 3, aisles=2, aisle_m=6.0, laps=2), file)
+    return file
 
 
 def pytest_ignore_collect(collection_path, config):  # type: ignore[no-untyped-def]

@@ -33,19 +33,13 @@ def saved(replayed):
     return SavedGraph(replayed[1], [])
 
 
-def told(capsys, *words):
-    code = cli.main([*map(str, words)])
-    out, err = capsys.readouterr()
-    return code, out, err
-
-
 @pytest.fixture(scope="module")
 def run(replayed):
     return replayed[1]
 
 
-def explained(capsys, *words):
-    code, out, err = told(capsys, "explain", *words)
+def explained(told, *words):
+    code, out, err = told("explain", *words)
     return code, " ".join(out.split()), err
 
 
@@ -75,14 +69,14 @@ def test_what_is_false_bends_the_map_when_it_is_let_in_and_not_under_a_loss_that
     assert gain == sorted(gain, reverse=True)
 
 
-def test_what_leaves_a_keyframe_without_edges_is_refused(replayed, saved, capsys):
+def test_what_leaves_a_keyframe_without_edges_is_refused(replayed, saved, told):
     last = saved.keyframes[-1]
     for without in ([e.edge for e in saved.entries], [e.edge for e in saved.entries if last in e.vertices]):
-        code, out, err = told(capsys, "explain", replayed[1], "--without", *without)
+        code, out, err = told("explain", replayed[1], "--without", *without)
         assert (code, out, "nothing fixes the gauge of vertex" in err, err.count("\n")) == (2, "", True, 1)
 
 
-def test_influence_tells_which_edges_cannot_be_done_without(tmp_path, capsys):
+def test_influence_tells_which_edges_cannot_be_done_without(tmp_path, told):
     """Two bearings determine a landmark, one does not."""
     recorder = RunRecorder(tmp_path / "run", Config())
     slam = GraphSlam(Config(), sink=recorder.sink)
@@ -98,37 +92,37 @@ def test_influence_tells_which_edges_cannot_be_done_without(tmp_path, capsys):
     landmarks = {e.edge for e in read_ledger(run) if e.label == "landmarks"}
     assert {one.edge for one in SavedGraph(run, []).influences(5) if one.exact_m == np.inf} == landmarks
     assert len(landmarks) == 2
-    code, out, err = told(capsys, "explain", run, "--influence")
+    code, out, err = told("explain", run, "--influence")
     assert (code, out.count("undetermined"), err) == (0, 2, "")
 
 
-def test_what_does_not_converge_is_no_solution_and_is_said(replayed, saved, capsys, monkeypatch):
+def test_what_does_not_converge_is_no_solution_and_is_said(replayed, saved, told, monkeypatch):
     """Closures that all else contradicts, and few steps."""
     run, out = replayed[1], [e.edge for e in saved.entries if not e.is_in and e.label == "closures"]
     asked = json.dumps({"without": [], "let_in": out, "loss": "", "first": False}).encode()
-    assert told(capsys, "explain", run, "--with", *out)[0] == 0
+    assert told("explain", run, "--with", *out)[0] == 0
     assert Workbench(read_contents(run), 3.0).solve(asked)["is_solved"]
     monkeypatch.setattr(what_if, "MOST_STEPS", 1)  # then the run's own limit counts
-    code, said, err = told(capsys, "explain", run, "--with", *out)
+    code, said, err = told("explain", run, "--with", *out)
     assert (code, "NOT converged (max_iterations) after" in said, "not a solution" in err) == (3, True, True)
     assert not Workbench(read_contents(run), 3.0).solve(asked)["is_solved"]
 
 
-def test_the_commands_say_what_moves(replayed, saved, capsys):
+def test_the_commands_say_what_moves(replayed, saved, told):
     run = replayed[1]
     false = next(e for e in read_ledger(run) if not e.is_in and e.label == "closures")
-    code, out, _ = told(capsys, "explain", run, "--with", false.edge)
+    code, out, _ = told("explain", run, "--with", false.edge)
     moved = saved.moved(saved.solve(let_in=[false.edge]))
     assert code == 0
     assert f"{moved.before.chi2_final:.4f}  ->  " in out
     assert f"last pose  moves by {moved.final[0]:.4f} m" in out
     assert f"edge {moved.worse[0][0]} (" in out
-    code, out, _ = told(capsys, "explain", run, "--influence", "3")
+    code, out, _ = told("explain", run, "--influence", "3")
     assert code == 0
     *table, after = out.splitlines()
     assert [int(line.split()[0]) for line in table[2:]] == [one.edge for one in saved.influences(3)]
     assert after.startswith("next: graph_slam explain ")
-    code, _, err = told(capsys, "explain", run, "3", "--loss", "none")
+    code, _, err = told("explain", run, "3", "--loss", "none")
     assert (code, "one of EDGE, --influence, and --without, --with and --loss together" in err) == (2, True)
 
 
@@ -146,8 +140,8 @@ def test_without_an_edge_the_step_to_first_order_is_within_a_fifth_of_solving_ag
     assert min(right, near) >= 0.95 * tried > 40
 
 
-def test_the_summary_counts_what_the_ledger_has(run, capsys):
-    code, out, err = explained(capsys, run)
+def test_the_summary_counts_what_the_ledger_has(run, told):
+    code, out, err = explained(told, run)
     entries = read_ledger(run)
     assert (code, err) == (0, "")
     assert f"{len(entries)} edges; {sum(e.verdict > 0 for e in entries)} are measurements that can be rejected" in out
@@ -158,9 +152,9 @@ def test_the_summary_counts_what_the_ledger_has(run, capsys):
     assert "inert" not in out
 
 
-def test_a_stranger_learns_why_a_closure_was_rejected(run, capsys):
+def test_a_stranger_learns_why_a_closure_was_rejected(run, told):
     false = next(e for e in read_ledger(run) if (e.label, e.verdict) == ("closures", Verdict.PENDING))
-    _, out, _ = explained(capsys, run, false.edge)
+    _, out, _ = explained(told, run, false.edge)
     assert f"edge {false.edge}: a loop closure by closures: held back: unlikely" in out
     assert f"keyframe {false.vertices[0]} and keyframe {false.vertices[1]}" in out
     assert f"chi2 {false.statistic:.4g} with 3 degrees of freedom" in out
@@ -171,44 +165,45 @@ def test_a_stranger_learns_why_a_closure_was_rejected(run, capsys):
     assert all(read_ledger(run)[edge].is_in for edge in strained)
 
 
-def test_a_landmark_is_explained_by_name_and_an_unknown_one_is_refused(run, capsys):
+def test_a_landmark_is_explained_by_name_and_an_unknown_one_is_refused(run, told):
     wrong = next(e for e in read_ledger(run) if e.landmark and not e.is_in)
-    _, out, _ = explained(capsys, run, wrong.landmark)
+    _, out, _ = explained(told, run, wrong.landmark)
     assert f"landmark {wrong.landmark}:" in out
     assert f"edge {wrong.edge}" in out
-    code, _, err = explained(capsys, run, "landmark:7")
+    code, _, err = explained(told, run, "landmark:7")
     assert code == 2
     assert "7: neither the id of an edge nor a landmark; there are 0/0" in err
-    code, _, err = explained(capsys, run, "99999")
+    code, _, err = explained(told, run, "99999")
     assert (code, "no edge 99999: their ids are below" in err) == (2, True)
 
 
 @each("words", [(), ("--without", 3)])
-def test_a_run_that_was_never_saved_is_explained_from_its_map(run, tmp_path, words, capsys):
+def test_a_run_that_was_never_saved_is_explained_from_its_map(run, tmp_path, words, told):
     copy = Path(shutil.copytree(run, tmp_path / "run"))
     for name in (LEDGER, CHANGES, GRAPH):
         (copy / name).unlink()
     answers = []
     for folder in (run, copy):
-        assert cli.main(["explain", str(folder), *map(str, words)]) == 0
-        lines = capsys.readouterr().out.replace(str(folder), "RUN").splitlines()
+        code, out, _ = told("explain", folder, *words)
+        assert code == 0
+        lines = out.replace(str(folder), "RUN").splitlines()
         answers.append([line for line in lines if not line.startswith("solved in")])
     assert answers[0] == answers[1] != []
 
 
-def test_a_gate_that_decides_nothing_is_warned_of(tmp_path, capsys):
+def test_a_gate_that_decides_nothing_is_warned_of(tmp_path, told):
     """Nothing is false, and the noise of all sightings is told twenty times too large."""
     bag = tmp_path / "drive.mcap"
     assert cli.main(["simulate", "manhattan", "--out", str(bag), "--poses", "60", "--set", "blocks=4"]) == 0
     for sigma_m, is_inert in ((0.05, False), (3.0, True)):
         run = tmp_path / f"run of {sigma_m}"
         replay(bag, run, Config.from_mapping({"landmarks.added_sigma_m": sigma_m}))
-        assert ("warning: the gate of landmarks is inert" in explained(capsys, run)[1]) == is_inert
+        assert ("warning: the gate of landmarks is inert" in explained(told, run)[1]) == is_inert
 
 
-def test_another_explanation_is_warned_of_with_how_to_try_it(run, tmp_path, capsys):
+def test_another_explanation_is_warned_of_with_how_to_try_it(run, tmp_path, told):
     copy = Path(shutil.copytree(run, tmp_path / "run"))
     rival = {"cost": 120.0, "best_cost": 100.0, "only_here": [5, 6], "only_there": [7]}
     (copy / "run.json").write_text(json.dumps({"rivals": [rival]}))
-    _, text, _ = explained(capsys, copy)
+    _, text, _ = explained(told, copy)
     assert f"this explanation costs 100, another 120: graph_slam explain {copy} --with 5 6 --without 7" in text

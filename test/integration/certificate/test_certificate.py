@@ -170,12 +170,11 @@ def test_where_it_does_not_apply_it_says_why():
 
 
 @pytest.fixture
-def run(tmp_path, capsys):
+def run(tmp_path, told):
     def run(graph, *words):
         path = tmp_path / "graph.g2o"
         write_graph(graph, path)
-        code = main(["optimize", str(path), "--certify", *words])
-        out, err = capsys.readouterr()
+        code, out, err = told("optimize", path, "--certify", *words)
         assert (err == "") == (code != 3) and err.count("is far above its") <= 1, err
         return code, json.loads(out)["certificate"] if "--json" in words else out
 

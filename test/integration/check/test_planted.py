@@ -152,11 +152,6 @@ def test_faults_can_be_put_into_a_recording_of_a_user_but_not_those_that_need_th
     assert "a graph has no messages" in capsys.readouterr().err
 
 
-@pytest.fixture(scope="module")
-def laps(tmp_path_factory):
-    return recorded(tmp_path_factory.mktemp("planted"), aisle_m=6.0, laps=2)
-
-
 FITTED = (
     ("landmark clock +100 ms", "clock_offset", -0.1, 0.02),
     ("knocked by 10 degrees half-way", "mount_moved", 0.14, 0.05),

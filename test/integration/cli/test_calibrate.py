@@ -22,16 +22,9 @@ DEMO = str(ROOT / "data" / "demo.mcap")
 WRONG = ("--set", "detections.mount_correction=0 0 0 0 0 0.1", "--set", "odometry.distance_factor=1.08")
 
 
-@pytest.fixture(scope="module")
-def laps(tmp_path_factory):
-    file = str(tmp_path_factory.mktemp("laps") / "laps.mcap")
-    write_bag(simulate("warehouse", 3, aisles=2, aisle_m=6.0, laps=2), file)
-    return file
-
-
 def test_wrong_settings_of_a_recording_come_back_right(laps, tmp_path, capsys):
     file = tmp_path / "found.yaml"
-    assert main(["calibrate", laps, *WRONG, "--json", "--out", str(file)]) == 4
+    assert main(["calibrate", str(laps), *WRONG, "--json", "--out", str(file)]) == 4
     found = json.loads(capsys.readouterr().out)
     assert found["settings"]["odometry.distance_factor"] == pytest.approx(1.0, abs=0.01)
     assert float(found["settings"]["detections.mount_correction"].split()[5]) == pytest.approx(0.0, abs=0.01)
@@ -41,7 +34,7 @@ def test_wrong_settings_of_a_recording_come_back_right(laps, tmp_path, capsys):
     assert found["rounds"] > 1
     written = read_parameters(file)
     assert written["odometry"]["distance_factor"] == found["settings"]["odometry.distance_factor"]
-    assert main(["calibrate", laps, "--out", str(file)]) != 0, "a file of somebody's is not replaced"
+    assert main(["calibrate", str(laps), "--out", str(file)]) != 0, "a file of somebody's is not replaced"
     assert read_parameters(file) == written
 
 
@@ -75,14 +68,14 @@ def test_settings_with_which_less_is_believed_are_not_printed(tmp_path, monkeypa
 @SOAK
 def test_a_sensor_that_is_elsewhere_is_said_instead_of_what_would_hide_it(laps, capsys):
     """A camera 0.3 m to the side makes odometry seem to be of another scale."""
-    assert main(["calibrate", laps, "--set", "detections.mount_correction=0 0.3 0 0 0 0.1", "--json"]) == 3
+    assert main(["calibrate", str(laps), "--set", "detections.mount_correction=0 0.3 0 0 0 0.1", "--json"]) == 3
     found = json.loads(capsys.readouterr().out)
     assert (found["settings"], found["parameters"]) == ({}, [])
     assert "mount_place: detections: its sensor is 0." in found["refused"]
     mount = re.search("--set detections.mount_correction='(.*)'", found["refused"])[1].split()
     assert float(mount[1]) == pytest.approx(0.0, abs=0.05)
     assert float(mount[5]) == 0.1, "which is calibrated next"
-    assert main(["calibrate", laps, "--set", f"detections.mount_correction={' '.join(mount)}", "--json"]) == 4
+    assert main(["calibrate", str(laps), "--set", f"detections.mount_correction={' '.join(mount)}", "--json"]) == 4
     found = json.loads(capsys.readouterr().out)
     assert float(found["settings"]["detections.mount_correction"].split()[5]) == pytest.approx(0.0, abs=0.02)
 
@@ -108,26 +101,25 @@ def test_an_offset_of_ranges_is_said_instead_of_the_scale_that_would_hide_it(tmp
 
 
 @pytest.mark.parametrize(("how", "code"), [("mirrored", "mirrored"), *times([], [("backwards", "axes")])])
-def test_a_recording_that_is_wrong_in_itself_is_not_calibrated_and_says_what_is_wrong(tmp_path, capsys, how, code):
+def test_a_recording_that_is_wrong_in_itself_is_not_calibrated_and_says_what_is_wrong(tmp_path, told, how, code):
     bag, faulty = str(tmp_path / "drive.mcap"), str(tmp_path / "faulty.mcap")
     write_bag(simulate("warehouse", 1, aisles=2, aisle_m=4.0, laps=1), bag)
     assert main(["simulate", bag, "--out", faulty, "--fault", f"wrong_axes:how={how}"]) == 0
-    capsys.readouterr()
-    assert main(["calibrate", faulty]) == 3
-    out, err = capsys.readouterr()
+    code, out, err = told("calibrate", faulty)
+    assert code == 3
     assert out.startswith(f"[error] {code}: /landmarks: ")
     assert "nothing to correct" not in out
     assert out.endswith(f"next: graph_slam check {faulty}\n")
     assert err == f"graph_slam: nothing is calibrated: mend {code} first\n"
 
 
-def test_a_robot_that_stood_says_for_each_parameter_what_to_drive(tmp_path, capsys):
+def test_a_robot_that_stood_says_for_each_parameter_what_to_drive(tmp_path, told):
     bag, still = str(tmp_path / "drive.mcap"), str(tmp_path / "still.mcap")
     write_bag(simulate("warehouse", 1, aisles=2, aisle_m=4.0, laps=1), bag)
     assert main(["simulate", bag, "--out", still, "--fault", "standing"]) == 0
-    capsys.readouterr()
-    assert main(["calibrate", still, "--json"]) == 3
-    found = json.loads(capsys.readouterr().out)["parameters"]
+    code, out, _ = told("calibrate", still, "--json")
+    assert code == 3
+    found = json.loads(out)["parameters"]
     assert [one["name"] for one in found] == ["distance", "turn", "clock", "yaw"]
     for one in found:
         assert QUANTITIES[one["name"]].manoeuvre in one["text"]
@@ -147,10 +139,9 @@ def test_what_cannot_be_told_apart_is_refused(capsys, groups, why):
 
 
 @SOAK
-def test_a_fit_on_the_way_that_finds_something_begins_anew(tmp_path):
+def test_a_fit_on_the_way_that_finds_something_begins_anew(laps):
     """A large error is found before the drive to its end makes it look like noise, slips or wrong identities."""
-    bag, read = str(tmp_path / "drive.mcap"), []
-    write_bag(simulate("warehouse", 3, aisles=2, aisle_m=6.0, laps=2), bag)
+    read = []
 
     def counted(items, total):
         read.append(0)
@@ -158,7 +149,7 @@ def test_a_fit_on_the_way_that_finds_something_begins_anew(tmp_path):
             read[-1] += 1
             yield one
 
-    done = calibrate(bag, {"detections.offset_s": 0.2}, groups="clock", progress=counted)
+    done = calibrate(laps, {"detections.offset_s": 0.2}, groups="clock", progress=counted)
     assert abs(float(done.settings["detections.offset_s"])) < 0.01
     assert done.is_complete
     assert {one["name"] for one in done.parameters} == {"clock"}

@@ -63,14 +63,13 @@ def test_the_sentences_on_top_say_what_is_out_and_what_to_do(made, run, saved):
     assert all(len(row) == len(tables["input_columns"]) + 4 for row in tables["inputs"])
 
 
-def test_a_run_of_odometry_alone_has_a_report(tmp_path, capsys):
+def test_a_run_of_odometry_alone_has_a_report(tmp_path, told):
     bag, run = tmp_path / "drive.mcap", tmp_path / "run"
     assert cli.main(["simulate", "manhattan", "--out", str(bag), "--poses", "60", "--set", "landmarks=false"]) == 0
     assert cli.main(["replay", str(bag), "--out", str(run), "--set", "inputs.names=odom"]) == 3
     assert "NaN" not in (run / "run.json").read_text()
-    capsys.readouterr()
-    assert cli.main(["report", str(run)]) == 0
-    out = capsys.readouterr().out
+    code, out, _ = told("report", run)
+    assert code == 0
     assert out.startswith("Do not rely on this map yet: this is odometry alone")
     assert "graph_slam check" in out.partition("\n")[0], "the verdict has its reason, and what to do"
     assert (run / "report.html").stat().st_size > 10_000
@@ -150,18 +149,16 @@ def test_a_run_that_is_still_written_shows_its_map_so_far(run, tmp_path):
     assert np.isfinite([unpacked(made.packing, column) for column in points]).all()
 
 
-def test_a_damaged_run_shows_what_can_be_read_and_says_what_cannot(run, tmp_path, capsys):
+def test_a_damaged_run_shows_what_can_be_read_and_says_what_cannot(run, tmp_path, told):
     broken = shutil.copytree(run, tmp_path / "broken")
     (broken / "landmarks.csv").write_text("nonsense\n1\n")
     (broken / "map.mcap").write_bytes((broken / "map.mcap").read_bytes()[:-2000])
-    code = cli.main(["report", str(broken), "--out", str(tmp_path / "broken.html")])
-    out, err = capsys.readouterr()
-    assert code == 3
-    assert "lost: " in err
+    code, out, err = told("report", broken, "--out", tmp_path / "broken.html")
+    assert (code, "lost: " in err) == (3, True)
     assert "a part of the run is lost: " in out.partition("\n")[0]
 
 
-def test_what_cannot_be_a_report_is_refused(run, tmp_path, capsys):
+def test_what_cannot_be_a_report_is_refused(run, tmp_path, told):
     html = tmp_path / "a.html"
     for words, why in (
         ((tmp_path / "none",), "there is nothing of that name"),
@@ -172,8 +169,7 @@ def test_what_cannot_be_a_report_is_refused(run, tmp_path, capsys):
         ((run, "--out", html, "--truth", tmp_path / "none"), "none"),
         ((run, "--out", html, "--plan", run / "config.yaml"), "not a map.yaml"),
     ):
-        code = cli.main(["report", *map(str, words)])
-        out, err = capsys.readouterr()
+        code, out, err = told("report", *words)
         assert (code, out, err.count("\n")) == (2, "", 1)
         assert why in err
     assert not html.exists()

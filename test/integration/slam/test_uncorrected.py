@@ -15,7 +15,6 @@ from graph_slam_ros.node.diagnostics import Facts, judge, statuses
 from graph_slam_ros.node.estimate import UnseenWay, estimate_of
 from graph_slam_ros.runs.outcome import shortcomings
 from graph_slam_ros.slam import Config, Sightings
-from graph_slam_ros.tools.simulation import simulate, write_bag
 
 SECONDS = times(45.0, 60.0)
 SURE = {"odometry.translation_density": 1e-3, "odometry.lateral_density": 1e-3}
@@ -94,13 +93,6 @@ def test_nothing_is_told_of_a_drive_with_nothing_wrong(kind, seed):
     assert not slam.uncorrected()
     assert not slam.contradicted
     np.testing.assert_array_equal(slam.keyframe_covariances(), of_noise(slam))
-
-
-@pytest.fixture(scope="module")
-def laps(tmp_path_factory):
-    file = tmp_path_factory.mktemp("laps") / "laps.mcap"
-    write_bag(simulate("warehouse", 3, aisles=2, aisle_m=6.0, laps=2), file)
-    return file
 
 
 @pytest.mark.parametrize(

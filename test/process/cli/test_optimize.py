@@ -1,14 +1,12 @@
 """The command ``graph_slam optimize``: answers, files, exit codes, and one line where it refuses."""
 
-import csv
 import json
+import re
 import shlex
 
 import pytest
 from places import ROOT
 from rows import each
-
-from graph_slam_ros.cli import main
 
 DATA = ROOT / "data"
 CITY = DATA / "city.g2o"
@@ -36,13 +34,8 @@ def graph(tmp_path):
 
 
 @pytest.fixture
-def run(capsys):
-    def run(*words):
-        code = main(["optimize", *map(str, words)])
-        out, err = capsys.readouterr()
-        return code, out, err
-
-    return run
+def run(told):
+    return lambda *words: told("optimize", *words)
 
 
 def answer_of(run, *words, due=0):
@@ -161,7 +154,7 @@ def test_a_refusal_is_one_line_that_names_the_culprit_and_exit_code_2(run, graph
 
 
 def test_files_that_cannot_be_read_or_written_are_refusals(run, tmp_path, graph):
-    nowhere = tmp_path / "no" / "where"
+    nowhere = tmp_path / "no" / "where.g2o"
     for words in ([tmp_path], [tmp_path / ("x" * 4096)], [graph, "--out", nowhere], [graph, "--out", tmp_path],
                   [graph, "--plot", nowhere / "a.png"], [graph, "--plot", tmp_path / "a.nonsense"]):  # fmt: skip
         code, _, err = run(*words)
@@ -174,55 +167,48 @@ OPTIONS += "loss cauchy:-1,loss cauchy:inf,loss huber:1:2,what"
 
 
 @each("options", OPTIONS.split(","))
-def test_options_that_cannot_be_are_refused_in_one_line(graph, options, capsys):
+def test_options_that_cannot_be_are_refused_in_one_line(run, graph, options):
     words = f"--{options}".split()
-    with pytest.raises(SystemExit) as refusal:
-        main(["optimize", str(graph), *words])
-    assert refusal.value.code == 2
-    err = capsys.readouterr().err
-    assert err.count("\n") == 1
+    code, _, err = run(graph, *words)
+    assert (code, err.count("\n")) == (2, 1)
     assert words[0] in err
     assert " _" not in err  # no name of a function
 
 
-def table(file):
-    return list(csv.DictReader(file.read_text().splitlines()))
+def test_a_graph_as_a_run_judges_its_closures_and_is_reported_explained_and_edited(run, graph, tmp_path, told):
+    folder, plan, edited = (tmp_path / name for name in ("a/of_graph", "plan.json", "edited"))
+    more = "VERTEX_XY 10 0 2\nEDGE_SE2_XY 5 10 -2.5 2 9 0 9\nEDGE_SE2 3 5 -70 3 2 4 0 0 4 0 4\nFIX 3 10\n"
+    graph.write_text(SMALL + more)
+    code, out, err = run(graph, "--init", "file", "--out", folder)
+    assert (code, err.count("\n")) == (3, 1)
+    assert f"results in {folder}: 1 of 5 measurements are not in the map" in out
+    assert out.splitlines()[-1].startswith(f"next: graph_slam report {folder} (")
+    assert [pose.split()[0] for pose in (folder / "path.tum").open()] == [f"{k}.000000000" for k in (3, 4, 5)]
+    assert "1 of closures" in told("report", folder)[1] and told("view", folder, "--port", "x")[0] == 2
+    (edge,) = re.findall(r"edge (\d+) +closures.* held back", told("explain", folder)[1])
+    assert told("map", "edit", folder, "--new-plan", plan)[0] == 0
+    wrong = {"name": "wrong", "who": "A", "when": "2026-05-04T10:30:00Z", "why": "it is", "do": "remove_edge"}
+    plan.write_text(json.dumps(json.loads(plan.read_text()) | {"edits": [wrong | {"edge": int(edge)}]}))
+    assert told("map", "edit", folder, "--plan", plan, "--out", edited)[0] == 0
+    assert "rejected: by hand" in told("explain", edited, edge)[1]
+    assert run(edited / "graph.g2o")[0] == 0, "without it nothing is in doubt"
 
 
-def test_a_graph_is_written_as_a_run_which_is_reported_explained_and_edited(run, graph, tmp_path, capsys):
-    folder, page, plan, edited = (tmp_path / name for name in ("of_graph", "page.html", "plan.json", "edited"))
-    code, out, _ = run(graph, "--out", folder)
-    assert (code, f"next: graph_slam report {folder}" in out) == (0, True)
-    assert [line.split()[0] for line in (folder / "path.tum").read_text().splitlines()] == [
-        f"{k}.000000000" for k in (3, 4, 5)
-    ]
-    assert main(["report", str(folder), "--out", str(page)]) == main(["explain", str(folder)]) == 0
-    assert "closures" in capsys.readouterr().out
-    assert main(["map", "edit", str(folder), "--new-plan", str(plan)]) == 0
-    told = json.loads(plan.read_text())
-    edge = next(row["edge"] for row in table(folder / "ledger.csv") if row["label"] == "closures")
-    who = {"name": "wrong", "who": "A", "when": "2026-05-04T10:30:00Z", "why": "it is"}
-    told["edits"] = [who | {"do": "remove_edge", "edge": int(edge)}]
-    plan.write_text(json.dumps(told))
-    assert main(["map", "edit", str(folder), "--plan", str(plan), "--out", str(edited)]) == 0
-    verdict = next(row for row in table(edited / "ledger.csv") if row["edge"] == edge)
-    assert verdict["verdict"] == "rejected"
-
-
-def test_what_is_no_run_is_refused_in_one_line(run, graph, tmp_path):
+def test_what_is_no_run_is_refused_in_one_line(run, graph, tmp_path, told):
     (other := tmp_path / "other").mkdir()
     (other / "mine").touch()
     (alone := tmp_path / "alone.g2o").write_text("\n".join(SMALL.splitlines()[:3] + SMALL.splitlines()[4:6]))
-    (text := tmp_path / "text.g2o").write_text("hello world\n")
+    (offset := tmp_path / "offset.g2o").write_text(f"{SMALL}VERTEX_OFFSET 20 0.1\nEDGE_PRIOR_OFFSET 20 0.1 9\n")
     assert run(graph, "--out", tmp_path / "again")[0] == 0
     wrong = {
         "holds a run already": (graph, "again"),
         "not empty and not an earlier run": (graph, "other"),
+        "a run folder; its graph is": (tmp_path / "again", "new"),
         "odometry alone": (alone, "new"),
-        "no vertex": (text, "new"),
+        "vertices of R1": (offset, "new"),
     }
     for words, (file, out) in wrong.items():
         code, _, err = run(file, "--out", tmp_path / out)
         assert (code, len(err.splitlines()), words in err) == (2, 1, True), err
-    assert not (tmp_path / "new").exists()
-    assert list(other.iterdir()) == [other / "mine"]
+    assert not (tmp_path / "new").exists() and list(other.iterdir()) == [other / "mine"]
+    assert "graph_slam optimize of a graph" in told("report", graph)[2]

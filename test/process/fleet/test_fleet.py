@@ -72,15 +72,8 @@ def check(out, rows, serial, *, whole=True):
         assert [row["recording"] for row in rows if row["state"] == "failed"] == ["damaged.mcap"]
 
 
-def here(capsys, *arguments):
-    """Run the command in this process: exit code, and both outputs."""
-    capsys.readouterr()
-    code = cli.main(["fleet", *map(str, arguments)])
-    return code, *capsys.readouterr()
-
-
 def test_stopped_by_a_signal_it_goes_on_where_it_was_and_a_second_time_there_is_nothing_to_do(
-    drives, serial, tmp_path, capsys
+    drives, serial, tmp_path, told
 ):
     out = tmp_path / "out"
     options = ("--out", out, "--truth", "{path}", "--workers", 2, "--report")
@@ -99,7 +92,7 @@ def test_stopped_by_a_signal_it_goes_on_where_it_was_and_a_second_time_there_is_
             said = process.communicate(timeout=60)[1]
             assert process.returncode in (130, 3), said
     there = len(list(out.glob("jobs/*/row.json")))
-    code, _, said = here(capsys, "replay", drives, *options)
+    code, _, said = told("fleet", "replay", drives, *options)
     assert code == 3
     assert "failed: damaged.mcap (defaults):" in said
     assert "Traceback" not in said
@@ -116,9 +109,9 @@ def test_stopped_by_a_signal_it_goes_on_where_it_was_and_a_second_time_there_is_
             assert f"{row['key']}/report.html" in (out / "index.html").read_text()
     inputs = {row["recording"]: row.get("inputs") for row in rows}
     assert inputs["2.mcap"] == "odom ranges", "as info suggests where no topic is usual"
-    assert f"of them {COUNT + 1} were there" in here(capsys, "replay", drives, *options)[1]
+    assert f"of them {COUNT + 1} were there" in told("fleet", "replay", drives, *options)[1]
     assert {file: file.stat().st_mtime_ns for file in out.glob("jobs/*/row.json")} == stamps
-    assert here(capsys, "compare", out, out, "--fail", "rmse>1.02x")[0] == 0
+    assert told("fleet", "compare", out, out, "--fail", "rmse>1.02x")[0] == 0
 
 
 @contextlib.contextmanager
@@ -210,7 +203,7 @@ def test_a_full_disk_is_named_and_with_room_the_same_job_is_done(drives, serial,
         subprocess.run(["umount", "--lazy", tmp_path], check=False)
 
 
-def test_mistakes_are_refused_in_one_line(drives, tmp_path, capsys, monkeypatch):
+def test_mistakes_are_refused_in_one_line(drives, tmp_path, told, monkeypatch):
     monkeypatch.setattr(engine, "Client", lambda at, **options: Client(at, **options | {"timeout": "1s"}))
     out = ("--out", tmp_path / "o")
     for arguments, says in (
@@ -222,7 +215,7 @@ def test_mistakes_are_refused_in_one_line(drives, tmp_path, capsys, monkeypatch)
         (("replay", drives, "--out", drives), "not the folder of a fleet"),
         (("compare", drives, drives), "no table.parquet"),
     ):
-        code, _, said = here(capsys, *arguments)
+        code, _, said = told("fleet", *arguments)
         assert code == 2, said
         assert says in said
         assert len(said.splitlines()) == 1

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from graph_slam_ros import Graph, Solver, write_g2o
-from graph_slam_ros.cli import main
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import RELATIVE_POSE, SE2, check_edge, edge_from_residual
 from graph_slam_ros.lie import se2
@@ -100,50 +99,49 @@ READ = {  # content, exit code, what is said, edges of each class
 }
 
 
-def solved(path, content, capsys, *words):
+def solved(path, content, told, *words):
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
-    code = main(["optimize", str(path), *words])
-    out, err = capsys.readouterr()
-    return code, out, err
+    return told("optimize", path, *words)
 
 
-def test_what_others_write_is_read_or_lost_or_named(tmp_path, capsys):
+def test_what_others_write_is_read_or_lost_or_named(tmp_path, told):
     wrong = []
     for name, (content, due, said, edges) in READ.items():
-        code, out, err = solved(tmp_path / "a.g2o", content, capsys, "--json")
+        code, out, err = solved(tmp_path / "a.g2o", content, told, "--json")
         found = {label: part["edges"] for label, part in json.loads(out)["classes"].items()} if code != 2 else None
-        told = code != 2 and (json.loads(out)["losses"] or json.loads(out)["doubt"])
+        is_told = code != 2 and (json.loads(out)["losses"] or json.loads(out)["doubt"])
         ok = code == due and said in err and (edges is None or edges == found) and err.count("\n") <= 2
-        if not ok or (code == 3 and not told):
+        if not ok or (code == 3 and not is_told):
             wrong.append(f"{name}: {code} {found} {err}")
     assert not wrong, "\n".join(wrong)
 
 
-def test_the_remedies_mend(tmp_path, capsys):
+def test_the_remedies_mend(tmp_path, told):
     path = tmp_path / "a.g2o"
     declared = "".join(f"PARAMS_SE3OFFSET {k} 0 0 0 0 0 0 1\n" for k in (4, 8))
-    assert solved(path, declared + drive(3) + PRIOR, capsys)[0] == 0
-    fix = re.search(r"FIX [\d ]+", solved(path, PARTS, capsys)[2])[0]
-    assert solved(path, PARTS + fix, capsys)[0] == 0
-    code, out, _ = solved(path, FALSE, capsys)
+    assert solved(path, declared + drive(3) + PRIOR, told)[0] == 0
+    fix = re.search(r"FIX [\d ]+", solved(path, PARTS, told)[2])[0]
+    assert solved(path, PARTS + fix, told)[0] == 0
+    code, out, _ = solved(path, FALSE, told)
     assert (code, "worst: closures 4 9, chi2" in out) == (3, True)
     following = out.splitlines()[-1].removeprefix("next: ").partition(" (tried: the loss lets go of 3 edges)")[0]
-    assert main(shlex.split(following.replace("SOLVED", str(tmp_path / "solved")))[1:]) == 0
-    assert "the loss lets go of 3 edges" in capsys.readouterr().out
-    code, out, _ = solved(path, TIGHT, capsys)
+    code, out, _ = told(*shlex.split(following.replace("SOLVED", str(tmp_path / "solved")))[1:])
+    assert (code, "the loss lets go of 3 edges" in out) == (0, True)
+    code, out, _ = solved(path, TIGHT, told)
     worst = r"next: the worst edges; if all fit alike, noise is [3-9]\d\d? times"
     assert code == 3 and re.match(worst, out.splitlines()[-1])
-    assert main(["info", str(path)]) == 2 and "(a graph: graph_slam optimize)" in capsys.readouterr().err
-    assert "next: write qx qy qz qw in the file" in solved(path, W_FIRST, capsys, "--max-iterations", "1")[1]
+    code, _, err = told("info", path)
+    assert (code, "(a graph: graph_slam optimize)" in err) == (2, True)
+    assert "next: write qx qy qz qw in the file" in solved(path, W_FIRST, told, "--max-iterations", "1")[1]
 
 
-def test_another_start_is_found_and_its_answer_is_not_in_doubt(tmp_path, capsys):
+def test_another_start_is_found_and_its_answer_is_not_in_doubt(tmp_path, told):
     rng = np.random.default_rng(0)
     lost = "".join(f"VERTEX_SE2 {k} {' '.join(map(str, rng.normal(0, 3, 3)))}\n" for k in range(COUNT))
     edges = "".join(line + "\n" for line in PLAIN.splitlines() if line.startswith("EDGE"))
-    code, out, _ = solved(tmp_path / "a.g2o", lost + edges, capsys)
+    code, out, _ = solved(tmp_path / "a.g2o", lost + edges, told)
     assert (code, "suspicious from the file: chi2" in out, "was a local minimum" in out) == (0, True, True)
-    code, out, _ = solved(tmp_path / "a.g2o", lost + edges, capsys, "--init", "file")
+    code, out, _ = solved(tmp_path / "a.g2o", lost + edges, told, "--init", "file")
     assert (code, "--init" in out.splitlines()[-1], "all edges fit" in out) == (3, False, True)
 
 

@@ -365,7 +365,7 @@ def test_the_command_prints_an_address_and_ends_with_ctrl_c(tmp_path, capsys):
         process.communicate()
 
 
-def test_what_cannot_be_shown_is_one_line_and_opens_no_socket(tmp_path, capsys, monkeypatch):
+def test_what_cannot_be_shown_is_one_line_and_opens_no_socket(tmp_path, told, monkeypatch):
     def no_socket(*words):
         raise AssertionError("a socket")
 
@@ -376,10 +376,5 @@ def test_what_cannot_be_shown_is_one_line_and_opens_no_socket(tmp_path, capsys, 
     (damaged / "map.mcap").write_bytes(b"nonsense")
     (damaged / "ingest.mcap").write_bytes(b"nonsense")
     for words in ([empty], [damaged], [tmp_path / "none"], [damaged, "--topic", "/x"], [damaged, "--port", "70000"]):
-        try:
-            code = cli.main(["view", *map(str, words), "--no-browser"])
-        except SystemExit as error:
-            code = error.code
-        captured = capsys.readouterr()
-        assert (code, captured.out) == (2, ""), words
-        assert len(captured.err.splitlines()) == 1, captured.err
+        code, out, err = told("view", *words, "--no-browser")
+        assert (code, out, len(err.splitlines())) == (2, "", 1), (words, err)
