@@ -49,10 +49,10 @@ def replay(args: argparse.Namespace) -> int:
     shown = {"progress": console.progress("replay"), "warn": lambda text: console.warn(text, most=console.SENTENCE)}
     done = replayed(args.bag, args.out, own, **topics, force=args.force, **shown)
     code = console.DONE
-    for run in done.earlier:
-        code = max(code, _print_outcome(run.summary))
-        console.show(f"odometry went back in time, and time.on_jump is reset: the run until then is in {run.folder}")
-        draw(run.folder)
+    for folder, summary in done.earlier:
+        code = max(code, _print_outcome(summary))
+        console.show(f"odometry went back in time, and time.on_jump is reset: the run until then is in {folder}")
+        draw(folder)
     code = max(code, _print_summary(args.bag, done.summary))
     are_chosen = not done.topics or config.inputs.names != Config().inputs.names
     if unused := [] if are_chosen else unused_topics(args.bag, done.topics):

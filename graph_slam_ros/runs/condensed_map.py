@@ -47,8 +47,7 @@ def left_records(done: Condensation) -> Iterator[Record]:
 
 def read_left(folder: Path, space: Geometry, state: BoundedState | None) -> Left:
     """Return what has left a map. Raises FormatError as ``carried``."""
-    known = carried(folder, space, state) if state is not None else []
-    return _joined(space, known)
+    return _joined(space, [] if state is None else carried(folder, space, state))
 
 
 def carried(folder: Path, space: Geometry, state: BoundedState) -> list[Record]:

@@ -332,13 +332,12 @@ def keep_earlier(folder: Path, most: int, loaded: Path | None = None) -> Path | 
 
 def earlier_runs(folder: Path) -> dict[int, Path]:
     """Earlier runs next to a run folder, by number."""
-    return {number: run for number, run in _numbered(folder).items() if _is_readable_run(run)}
-
-
-def _is_readable_run(folder: Path) -> bool:
-    with contextlib.suppress(RunError):  # it stays as it is
-        return is_run(folder)
-    return False
+    out: dict[int, Path] = {}
+    for number, run in _numbered(folder).items():
+        with contextlib.suppress(RunError):  # it stays as it is
+            if is_run(run):
+                out[number] = run
+    return out
 
 
 def is_name_of_earlier(folder: Path, name: str) -> bool:

@@ -33,20 +33,12 @@ Progress = Callable[[Iterable[Any], int], Iterable[Any]]
 
 
 @dataclass(frozen=True, slots=True)
-class EarlierRun:
-    """A run that ended when time jumped back (``time.on_jump`` is reset), with its summary."""
-
-    folder: Path
-    summary: dict[str, Any]
-
-
-@dataclass(frozen=True, slots=True)
 class Replayed:
     """The result of a replay: the pipeline at its end, the summary, what could not be read, and warnings.
 
     Attributes
     ----------
-    earlier : the runs before the last, which were ended by ``time.on_jump: reset``
+    earlier : folder and summary of each run before the last, which ended by ``time.on_jump: reset``
     topics : of the recording that were read
     """
 
@@ -54,7 +46,7 @@ class Replayed:
     summary: dict[str, Any]
     losses: list[str]
     warnings: list[str]
-    earlier: tuple[EarlierRun, ...] = ()
+    earlier: tuple[tuple[Path, dict[str, Any]], ...] = ()
     topics: tuple[str, ...] = ()
 
 
@@ -247,12 +239,14 @@ def _recorded(
     if found := first_of_replay(columns.columns(counters), is_whole=len(ahead) < _READ_AHEAD):
         warn(f"the result will mean nothing: {found.code}: see what is said at the end")
     warmup(dimensions=config.world.dimensions)
-    earlier: list[EarlierRun] = []
+    earlier: list[tuple[Path, dict[str, Any]]] = []
     warnings: list[str] = []
     summary: dict[str, Any] = {}
     for number, run in groupby(progress(chain(ahead, read, _end(runs)), total), key=itemgetter(0)):
         if number:
-            earlier.append(EarlierRun(_kept(out), summary))
+            if (kept := keep_earlier(out, sys.maxsize)) is None:  # none is removed for that
+                raise RunError(f"{out}: the run until time jumped back holds nothing")
+            earlier.append((kept, summary))
             state, took = None, stopwatch()
         refused = Counters()
         measured, name = _measured(run, runs, number, refused), source.resolve().name
@@ -274,13 +268,6 @@ def _warnings(slam: GraphSlam, summary: dict[str, Any]) -> list[str]:
     has_cause = bool(summary.get("uncorrected")) or is_explained(summary)
     alarms = [] if has_cause else [str(one) for one in slam.alarms if not is_undecided(asdict(one))]
     return [*doubts(summary), *alarms, *unscaled(summary), *mendable(summary["counters"])]
-
-
-def _kept(out: Path) -> Path:
-    """Move a run away before the next one begins, as the node does. None is removed for that."""
-    if (kept := keep_earlier(out, sys.maxsize)) is None:
-        raise RunError(f"{out}: the run until time jumped back holds nothing")
-    return kept
 
 
 def _measured(

@@ -69,7 +69,11 @@ class Suggestion:
             self._choose_landmarks()
             self._choose_fixes()
             self._finish()
-            self.trouble = self._refused(bag)
+            try:  # whether the command would be refused
+                config = Config.from_mapping(self.settings)
+                choose_inputs(bag, config, self.topics.get("odom"), self.topics.get("detections"))
+            except GraphSlamError as error:
+                self.trouble = str(error)
 
     def command(
         self, more: Mapping[str, Any] | None = None, without: Collection[str] = (), name: str = "replay"
@@ -83,15 +87,6 @@ class Suggestion:
         for key, value in (own | dict(more or {})).items():
             words += ["--set", assignment(key, value)]
         return shlex.join([*words, *(("--out", str(suggested_out(self._path))) if name == "replay" else ())])
-
-    def _refused(self, bag: Bag) -> str:
-        """Return why the command would be refused; empty if it would not be."""
-        try:
-            config = Config.from_mapping(self.settings)
-            choose_inputs(bag, config, self.topics.get("odom"), self.topics.get("detections"))
-        except GraphSlamError as error:
-            return str(error)
-        return ""
 
     # -- landmarks -----------------------------------------------------------------------------------------------
 
