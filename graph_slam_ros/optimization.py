@@ -119,9 +119,7 @@ def optimize(source: Graph | G2oFile | Path | str, settings: Settings | None = N
         file = source if isinstance(source, G2oFile) else read_g2o(source)
     settings, began = settings or Settings(), time.perf_counter()
     first = _solved(file, settings, "file" if init == "auto" else init)
-    if init != "auto":
-        return _judged(first, settings)
-    return _best_of(first, settings, time.perf_counter() - began)
+    return _judged(first, settings) if init != "auto" else _best_of(first, settings, time.perf_counter() - began)
 
 
 def _solved(file: G2oFile, settings: Settings, init: str, on_pose: OnPose = lambda *_: None) -> Solution:
@@ -230,6 +228,8 @@ def started(file: G2oFile, init: str, on_pose: OnPose = lambda *_: None) -> tupl
     solver = Solver(file.graph)
     in_time = sorted(range(file.graph.vertex_count), key=lambda vertex: file.ids[vertex])
     solver.start_at(initial_values(file.graph, start, root or 0, in_time, on_pose))
+    for vertex in file.fixed if file.has_values else ():
+        solver.place(vertex, file.graph.initial.values[file.graph.vertex(vertex).stored])
     return solver, start
 
 

@@ -105,8 +105,8 @@ def test_a_recording_that_is_wrong_in_itself_is_not_calibrated_and_says_what_is_
     bag, faulty = str(tmp_path / "drive.mcap"), str(tmp_path / "faulty.mcap")
     write_bag(simulate("warehouse", 1, aisles=2, aisle_m=4.0, laps=1), bag)
     assert main(["simulate", bag, "--out", faulty, "--fault", f"wrong_axes:how={how}"]) == 0
-    code, out, err = told("calibrate", faulty)
-    assert code == 3
+    ended, out, err = told("calibrate", faulty)
+    assert ended == 3
     assert out.startswith(f"[error] {code}: /landmarks: ")
     assert "nothing to correct" not in out
     assert out.endswith(f"next: graph_slam check {faulty}\n")

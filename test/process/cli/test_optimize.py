@@ -83,11 +83,12 @@ def test_what_is_written_is_the_optimum_again_with_the_first_pose_held(run, tmp_
         assert again["chi2_initial"] == pytest.approx(first["chi2_final"], rel=1e-9)
         assert again["classes"].keys() == first["classes"].keys()
         assert answer_of(run, source)["chi2_initial"] == first["chi2_initial"]  # the source is as it was
-    for more, held in (("", "VERTEX_SE2 3 0.5 0.0 0.0"), ("FIX 5\n", "VERTEX_SE2 5 2.5 0.0 0.0")):
+    first, last = "VERTEX_SE2 3 0.5 0.0 0.0", "VERTEX_SE2 5 2.5 0.0 0.0"
+    for more, init, held in (("", "auto", first), ("FIX 5\n", "auto", last), ("FIX 3 5\n", "chordal", last)):
         graph.write_text(SMALL + more)
-        run(graph, "--out", out, "--force")
+        run(graph, "--init", init, "--out", out, "--force")
         assert held in (lines := [" ".join(line.split()) for line in out.read_text().splitlines()])
-        assert ("FIX 5" in lines) == (lines[0] != "VERTEX_SE2 3 0.5 0.0 0.0") == bool(more)
+        assert ("FIX 5" in lines, lines[0] == first) == (bool(more), more != "FIX 5\n")
 
 
 def test_a_trajectory_has_the_poses_in_order_of_id_with_the_id_as_stamp(run, tmp_path, graph):
