@@ -51,8 +51,10 @@ def check_columns(c: Columns, checks: tuple[Check, ...] = CHECKS) -> list[Findin
     found: list[Finding] = []
     with np.errstate(all="ignore"):
         c = of_one_publisher(c)
-        if refused_odometry(c):
-            checks = tuple(check for check in checks if check is check_refusals)  # the rest follows from that
+        if lost := refused_odometry(c):  # the rest follows from that, and this may follow from units
+            is_jumpy = all(one.code == "other_publisher" for one in lost)
+            found += [one for one in check_odometry(c) if is_jumpy and one.code == "units"]
+            checks = tuple(check for check in checks if check is check_refusals and not found)
         for check in checks:
             found += check(c)
             if any(one.ends for one in found):

@@ -447,9 +447,8 @@ class Collector:
             parts = read[:, :7], read[:, 7:13], read[:, 13:]
             return OdometryColumns(*names, self._frame, self._child, stamp_ns[:, 0], *parts)
         unknown = np.full((len(path), 6), np.nan)
-        return OdometryColumns(
-            *names, self._config.frames.odom, self._config.frames.base, path_ns, path, unknown, unknown
-        )
+        frames = self._config.frames
+        return OdometryColumns(*names, frames.odom, frames.base, path_ns, path, unknown, unknown)
 
 
 def _mount_correction(config: Config, of: InputConfig) -> Numbers:

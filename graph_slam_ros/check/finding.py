@@ -130,6 +130,7 @@ FOLLOWS = {
     **dict.fromkeys(("wrong_stamps", "constant_stamps", "coarse_stamps"), _OF_STAMPS),
     "pose_stands": ("frozen",),
     "frame_empty": ("frame_unknown",),
+    "frame_unlinked": ("mount_assumed",),
     "units": ("other_publisher", "odometry_gap", "jump", "twist_scale"),
     "mirrored": ("twist_unrelated", "twist_frame"),
     "damaged": ("no_closure", "silent"),

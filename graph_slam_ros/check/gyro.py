@@ -8,7 +8,7 @@ import numpy as np
 
 from graph_slam_ros.check.columns import Columns
 from graph_slam_ros.check.contradictions import turned_mount
-from graph_slam_ros.check.finding import Finding, Severity, where
+from graph_slam_ros.check.finding import Finding, where
 from graph_slam_ros.check.pairs import poses_at
 from graph_slam_ros.check.times import offset_setting
 from graph_slam_ros.formats.parameters import assignment
@@ -115,12 +115,10 @@ def _line(x: Array, y: Array) -> tuple[float, float, Array]:
 def _scale(c: Columns, factor: float, name: str, gyro_ns: Index) -> Finding:
     """A gyro that turns another way, or by another amount, and what mends it."""
     text = f"{name}: its gyro turns {factor:.3g} times as much as odometry"
-    severity: Severity = "error"
     settings: tuple[str, ...] = ()
     if abs(factor - 1.0) < _GROSS:
-        severity, now = "warning", c.config.odometry.turn_factor
         text += _EITHER
-        settings = (assignment("odometry.turn_factor", round(now * factor, 4)),)
+        settings = (assignment("odometry.turn_factor", round(c.config.odometry.turn_factor * factor, 4)),)
     elif abs(factor + 1.0) < _GROSS:
         text += ": its sensor is upside down, or odometry turns the wrong way"
         if c.config.world.dimensions == 2 and c.T_base_gyro is not None:  # in space x or y points the other way, too
@@ -133,7 +131,9 @@ def _scale(c: Columns, factor: float, name: str, gyro_ns: Index) -> Finding:
     elif abs(factor) > 1.0 / _GROSS:
         text += ": are these degrees?"
     at = where(name, gyro_ns, settings=settings)
-    return Finding("gyro_scale", severity, factor, 1.0 + _SCALE, "times", text, **at)
+    return Finding(
+        "gyro_scale", "warning" if abs(factor - 1.0) < _GROSS else "error", factor, 1.0 + _SCALE, "times", text, **at
+    )
 
 
 def upright(felt: Numbers) -> tuple[float, float]:

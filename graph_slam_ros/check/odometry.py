@@ -24,7 +24,7 @@ _LIMIT, _LEAST_LIMIT_M_S = 2.5, 0.5  # of the speed above which odometry jumps: 
 _IRREGULAR = 2.5  # spread of the times between messages, in medians; 3.2 where they come at random
 _AT_ZERO, _AWAY_M = 1e-9, 0.5
 _STILL_M, _STILL_RAD = 0.5, 1.0
-_NO_TURN_RAD, _BENDS = 1e-6, 0.05
+_NO_TURN_RAD, _BENDS, _TURNS = 1e-6, 0.05, 0.2  # _TURNS: of a quaternion's numbers
 _SIDEWAYS = 0.2  # of the speed ahead: a robot with wheels that cannot has no such twist
 _WINDOW_S, _LONGEST_S = 1.0, 3.0
 _LEAST_WIDTH = 4  # messages in a window: between fewer, the speed may be any
@@ -176,8 +176,11 @@ def check_odometry(c: Columns) -> Iterator[Finding]:
         text = f"{o.topic}: it moves {total_m:.2f} m and {np.degrees(total_rad):.0f} degrees in {steps.dt.sum():.0f} s"
         yield Finding("static", "warning", total_m, _STILL_M, "m", text, **at)
         return
-    if _has_no_orientation(steps, smooth, total_rad) and not _drives_sideways(o, steps):
+    quaternions = np.abs(o.poses[steps.index, 3:])
+    w_first = quaternions[:, 1:3].max() < _NO_TURN_RAD and np.ptp(quaternions[:, 0]) > _TURNS
+    if w_first or (_has_no_orientation(steps, smooth, total_rad) and not _drives_sideways(o, steps)):
         text = f"{o.topic}: its orientation never changes in {total_m:.0f} m, and it drives round bends"
+        text = f"{o.topic}: it rolls, and never turns: does w come first in its quaternions?" if w_first else text
         yield Finding("no_orientation_of_odometry", "error", total_rad, 0.0, "rad", text, **at)
         return
     yield from _plane(c, o)
@@ -272,7 +275,7 @@ def _twist(o: OdometryColumns, steps: Steps, jumps: Mask, applied: float) -> Ite
             text += f" ({unit or 'another scale'})"
             yield Finding("twist_scale", "warning", factor, _SCALE, "times", text, **at)
         elif left > _UNEXPLAINED and total > 5.0 and width >= _LEAST_WIDTH:
-            text = f"{o.topic}: the {what} of the twist does not explain {left:.0%} of the motion of the pose"
+            text = f"{o.topic}: the {what} of the twist does not explain {min(left, 1.0):.0%} of the motion of the pose"
             yield Finding("twist_unrelated", "warning", left, _UNEXPLAINED, "part", text, **at)
 
 

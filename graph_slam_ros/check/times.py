@@ -120,10 +120,8 @@ def _clocks(c: Columns, topics: dict[str, TopicColumns]) -> Iterator[Finding]:
         elif apart_s < -_EARLY_S and not any(
             one.offset_s for one in c.config.sources if one.name in (topic.inputs[0], c.odometry.input)
         ):  # which somebody has set, and knows better
-            text = (
-                f"{topic.name}: recorded {-apart_s * 1e3:.0f} ms before the time in its stamps, compared with "
-                f"{c.odometry.topic}: its clock is ahead"
-            )
+            other = f"compared with {c.odometry.topic}: its clock is ahead"
+            text = f"{topic.name}: recorded {-apart_s * 1e3:.0f} ms before the time in its stamps, {other}"
             at = where(topic.name, stamp_ns, settings=(offset_setting(c, topic.inputs[0], apart_s),))
             yield Finding("latency", "warning", -apart_s, _EARLY_S, "s", text, **at)
 
@@ -189,7 +187,8 @@ def _rate(c: Columns) -> Iterator[Finding]:
         turned = np.linalg.norm(np.diff(poses[:, 3:], axis=0)[long], axis=1) > _TURNED
         was_set = _was_set(poses, step_s, long)
         for k in long[was_set]:
-            text = f"{o.topic}: the clock was set forward by {_span(step_s[k])}: odometry goes on where it was"
+            span = f"{step_s[k] / _DAY_S:.1f} days" if step_s[k] > _DAY_S else f"{step_s[k]:.1f} s"
+            text = f"{o.topic}: the clock was set forward by {span}: odometry goes on where it was"
             yield Finding("clock_jump", "warning", step_s[k], most_s, "s", text, **where(o.topic, stamp_ns[k + 1 :], 1))
         long, moved, turned = long[~was_set], moved[~was_set], turned[~was_set]
     if len(long):
@@ -217,11 +216,6 @@ def _was_set(poses: Array, step_s: Array, gaps: Index) -> Mask:
         speeds = [float(pace[side].sum() / max(step_s[side].sum(), 1e-9)) for side in sides]
         out[n] = min(speeds) > _PACE and pace[k] < _GOES_ON * min(speeds) * step_s[k]
     return out
-
-
-def _span(seconds: float) -> str:
-    """A time in days or in seconds."""
-    return f"{seconds / _DAY_S:.1f} days" if seconds > _DAY_S else f"{seconds:.1f} s"
 
 
 def _between(c: Columns, odometry_ns: Index) -> float:

@@ -173,12 +173,13 @@ def _fitted(
         return
     code, (unit, limit, unknown) = answers.CODES[one.parameter.name], _LIMITS[one.parameter.name]
     if one.parameter in off:
-        settings: tuple[str, ...] = (assignment(*answers.setting_of(one.parameter, off, slam.calibrated)),)
+        setting = answers.setting_of(one.parameter, off, slam.calibrated)
+        settings: tuple[str, ...] = (assignment(*setting),)
         of_pose = twist_factor(c.odometry) * c.config.odometry.distance_factor
         is_pose = abs(of_pose * (1.0 + one.value) - 1.0) < limit < abs(of_pose - 1.0)  # by its twist
         is_open = code == "odometry_scale" and not is_pose
-        if ranges := answers.ranges_instead(fit, one.value, slam.calibrated) if is_open else "":
-            ranges, settings = f"{ranges} instead of --set {settings[0]}", ()
+        if ranges := answers.ranges_instead(fit, one.value, slam.calibrated, setting) if is_open else "":
+            settings = ()
         lag_s, own = float(np.median(topic.log_ns - topic.stamp_ns)) * 1e-9, c.odometry.input
         if code == "clock_offset" and -_RECORDED_S < lag_s < one.value - _EARLY_S:  # none is recorded before it is seen
             settings = (assignment(f"{own}.offset_s", round(slam.calibrated(own, "clock") - one.value, 3)),)

@@ -105,10 +105,12 @@ class Recording:
         links = self.fixed | {child: parent for child, parent in self.moving.items() if child != base}
         return root_of(links, frame) == root_of(links, base)
 
-    def alike(self, frame: str) -> str:
-        """Return the frame of TF that differs from another one in slashes alone; empty if there is none."""
-        known = {*self.fixed, *self.fixed.values(), *self.moving} - {frame}
-        return next((one for one in sorted(known) if frame and one.replace("/", "") == frame.replace("/", "")), "")
+    def alike(self, frame: str, base: str) -> str:
+        """Return the frame of TF that differs in slashes, blanks, capitals, or by the robot's prefix; empty if none."""
+        known = (frame, *self.fixed, *self.fixed.values(), *self.moving)
+        plain = {one: one.replace("/", "").strip().lower() for one in (f"{base.rpartition('/')[0]}{frame}", *known)}
+        wanted = list(plain.values())[:2]
+        return next((one for one in sorted({*known} - {frame}) if frame and plain[one] in wanted), "")
 
     def moves_in(self, base: str, frame: str) -> bool:
         """Return whether TF has the moving pose of the robot in a frame."""
@@ -188,8 +190,7 @@ def _plain(frame: str) -> str:
 
 
 def _odometry(one: TopicContents, m: Any) -> None:
-    if one.last_at is None:
-        one.has_noise = bool(m.twist.covariance.any())
+    one.has_noise |= one.last_at is None and bool(m.twist.covariance.any())
     _moved(one, m.pose.pose)
 
 
@@ -235,8 +236,7 @@ def _imu(one: TopicContents, m: Any) -> None:
     q, a = m.orientation, m.linear_acceleration
     one.felt = tuple(total + part for total, part in zip(one.felt, (a.x, a.y, a.z), strict=True))
     is_known = m.orientation_covariance[0] != -1.0 and math.hypot(q.x, q.y, q.z, q.w) > 0.5
-    if is_known and not one.usable:
-        one.has_noise = bool(m.orientation_covariance[8] > 0.0)
+    one.has_noise |= is_known and not one.usable and bool(m.orientation_covariance[8] > 0.0)
     one.usable += is_known
 
 

@@ -214,20 +214,19 @@ def shortcomings(summary: Summary) -> Iterator[str]:
             yield f"{name}: most of it was refused: {_because(summary, name, _counted(summary, name, Effect.REFUSED))}"
         elif not (is_odometry or causes) and (why := contradicts(name, counts["believed"] or 0, counts["used"])):
             yield why
-        if is_odometry:
-            counted = summary["counters"].get(name, {})
-            yield from filter(None, (leaves_plane(name, counted, counts["received"] or counts["used"]),))
+        counted, received = summary["counters"].get(name, {}), counts["received"] or counts["used"]
+        if is_odometry and (why := leaves_plane(name, counted, received)):
+            yield why
         jumps = sum(of.get("jump", 0) for one, of in summary["counters"].items() if one.partition("#")[0] == name)
-        most = max(_MOST_JUMPS, _JUMPY * (counts["received"] or counts["used"]))
-        if is_odometry and jumps > most and "jump" not in follows:
+        if is_odometry and jumps > max(_MOST_JUMPS, _JUMPY * received) and "jump" not in follows:
             yield (
                 f"{name}: {jumps} jumps, each begins a segment, and the motion across it is not used: odometry in "
                 "metres and radians? A robot as fast as that: --set odometry.max_speed_m_s=..."
             )
-        if (count := summary["counters"].get(name, {}).get("frozen", 0)) > 2 and "frozen" not in follows:
+        if (count := counted.get("frozen", 0)) > 2 and "frozen" not in follows:
             yield f"{name}: {explain('frozen').meaning} ({count} times): {remedy(name, 'frozen')}"
     for name, counted in summary["counters"].items():
-        for why in {"mount_assumed", "mount_unknown"} & counted.keys():
+        for why in ({"mount_assumed", "mount_unknown"} - {*follows}) & counted.keys():
             yield f"{name}: no transform has the place of its sensor, and one is assumed: {remedy(name, why)}"
     yield from _gyro_faults(summary)
     yield from association_faults(summary.get("association", {}))
@@ -341,7 +340,8 @@ def _cause(summary: Summary) -> tuple[str, tuple[str, ...]]:
 
 def _uncorrected(summary: Summary) -> Iterator[str]:
     for one in summary.get("uncorrected", ()):
-        mend = " ".join(f"--set {shlex.quote(f'{key}={value}')}" for key, value in one["settings"].items())
+        settings = {key: value for key, value in one["settings"].items() if f"{key}=" not in one["text"]}
+        mend = " ".join(f"--set {shlex.quote(f'{key}={value}')}" for key, value in settings.items())
         yield f"{one['text']}{mend and ': '}{mend} (graph_slam calibrate BAG compares the causes)"
 
 

@@ -250,7 +250,7 @@ class Suggestion:
         if frame == self._odom and self._recording.moves_in(self._base, frame):
             self.notes.append(f"{topic} is given in {frame}: /tf says where the robot is in it")
             return {}
-        if alike := self._recording.alike(frame):
+        if alike := self._recording.alike(frame, self._base):
             self.notes.append(f"{topic}: no transform has {frame}: did you mean {alike}? It is taken; mend the driver")
             return {"frame": alike}
         if not frame and self._recording.topics[topic].topic.type == APRILTAGS:
@@ -261,10 +261,9 @@ class Suggestion:
             self.notes.append(f"{why}: publish it in the sensor's frame, no setting mends that")
             return {"mount": ASSUMED}
         where = "at the base, looking ahead" if "optical" in frame else "at the base"
-        self.notes.append(
-            f"{topic}: no transform has the pose of {frame or 'its sensor, which it does not name,'} on the robot: "
-            f"{where} is assumed: publish it on /tf_static, or measure it and set its mount"
-        )
+        named = frame or "its sensor, which it does not name,"
+        assumed = f"{where} is assumed: publish it on /tf_static, or measure it and set its mount"
+        self.notes.append(f"{topic}: no transform has the pose of {named} on the robot: {assumed}")
         return {"mount": ASSUMED}
 
     def _free(self, name: str) -> str:

@@ -38,9 +38,8 @@ def result_texts(slam: GraphSlam, left: Left) -> dict[str, str]:
     ids, vertices = numbered(slam)
     whole, sightings = WholePath(slam, left), left.sightings
     path = whole.poses()
-    seen = np.concatenate(
-        (seen_from(slam.space, sightings, path), slam.sighting_trajectory().reshape(-1, path.shape[1]))
-    )
+    newest = slam.sighting_trajectory().reshape(-1, path.shape[1])
+    seen = np.concatenate((seen_from(slam.space, sightings, path), newest))
     seen_odometry = np.concatenate((sightings["T_odom"], slam.sighting_odometry().reshape(-1, path.shape[1])))
     stamps = [*sightings["stamp_ns"].tolist(), *slam.sighting_poses.stamps_ns.tolist()]
     stamps_ns = whole.stamps_ns.tolist()

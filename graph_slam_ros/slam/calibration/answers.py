@@ -233,6 +233,7 @@ CODES = {
 """The finding of ``graph_slam check`` by parameter."""
 
 LEAST_M = 0.2  # errors that last, as a robot that follows its commands late, are up to 0.14 m in recorded drives
+MOST_SCALE = 0.03  # of distances: with more, the map has another size if ranges are wrong, though its poses agree
 MOST_SHIFT = 2.0**0.5  # sigmas of the poses: with more, their NEES is three times what is expected
 _DEGREE = np.pi / 180.0
 _SIDES = {"x": ("ahead", "back"), "y": ("to the left", "to the right")}
@@ -264,7 +265,7 @@ class Uncorrected:
     setting: tuple[str, Any] | tuple[()]
 
     def __str__(self) -> str:
-        by = f"; by it the poses are off by {self.shift:.1f} times what noise does to them" if self.setting else ""
+        by = f"; by it the poses are off by {self.shift:.1f} times what noise does to them" * (self.shift > MOST_SHIFT)
         return f"{self.code}: {self.source}: {self.text}{by}"
 
     def as_dict(self) -> dict[str, Any]:
@@ -288,14 +289,15 @@ def uncorrected(
     shifts = pose_shifts(found, covariances)
     if sigma_per_m < LEAST_SIGMA_PER_M:
         return _too_sure(found, shifts, sigma_per_m)
-    off = [k for k, one in enumerate(findings) if is_off(found, one) and shifts[k] > MOST_SHIFT]
+    scaled = [one.parameter.name == "distance" and abs(one.value) > MOST_SCALE for one in findings]
+    off = [k for k, one in enumerate(findings) if is_off(found, one) and (shifts[k] > MOST_SHIFT or scaled[k])]
     values = {found.parameters[k]: float(found.values[k]) for k in off if found.parameters[k].name in CODES}
     out = []
     for one, value in values.items():
         sigma, shift = found.sigma(one), float(shifts[found.parameters.index(one)])
-        text = sentence(one, value, sigma, ranges_instead(found, value, total))
-        text += ", more than its stated noise allows for (odometry.noise)" * (one.name in OF_ODOMETRY)
         setting = setting_of(one, values, total)
+        text = sentence(one, value, sigma, ranges_instead(found, value, total, setting))
+        text += ", more than its stated noise allows for (odometry.noise)" * (one.name in OF_ODOMETRY)
         out.append(Uncorrected(CODES[one.name], one.source, value, sigma, shift, text, setting))
     jumped = [
         Uncorrected(code, one.source, after - before, sigma, 0.0, jump_sentence(one, before, after, sigma), ())
@@ -354,10 +356,11 @@ def _too_sure(found: TrialFit, shifts: Array, sigma_per_m: float) -> list[Uncorr
     return [Uncorrected(*more, ("odometry.noise", "motion"))]
 
 
-def ranges_instead(found: TrialFit, distance: float, total: Total) -> str:
-    """Return the settings by which ranges are wrong, where the distance of odometry may be right."""
+def ranges_instead(found: TrialFit, distance: float, total: Total, setting: tuple[str, Any] | tuple[()]) -> str:
+    """Return the settings by which ranges are wrong, where the distance of odometry may be right; else its own."""
     by = {one.source: total(one.source, "range_factor") for one in found.parameters if one.name == "yaw"}
-    return " ".join(f"--set {name}.range_factor={now / (1.0 + distance):.4g}" for name, now in by.items())
+    ranges = " ".join(f"--set {name}.range_factor={now / (1.0 + distance):.4g}" for name, now in by.items())
+    return f"{ranges} instead of --set {setting[0]}={setting[1]}" if ranges and setting else ranges
 
 
 def sentence(one: Parameter, value: float, sigma: float, ranges: str = "") -> str:
@@ -367,10 +370,8 @@ def sentence(one: Parameter, value: float, sigma: float, ranges: str = "") -> st
         best = f"{abs(value) * 1e3:.0f} ms {when} than stamped (sigma {sigma * 1e3:.0f} ms)"
         return f"sightings agree with odometry best {best}, or odometry is stamped as much too {other}"
     if one.name in _AXIS:
-        return (
-            f"its sensor is turned by {value / _DEGREE:.1f} degrees {_AXIS[one.name]}on the robot "
-            f"(sigma {sigma / _DEGREE:.1f})"
-        )
+        by = f"{value / _DEGREE:.1f} degrees {_AXIS[one.name]}on the robot (sigma {sigma / _DEGREE:.1f})"
+        return f"its sensor is turned by {by}"
     if one.name in _SIDES:
         where = _SIDES[one.name][value < 0.0]
         return f"its sensor is {abs(value):.2f} m further {where} than its mount says (sigma {sigma:.2f} m)"

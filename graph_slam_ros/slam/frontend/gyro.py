@@ -181,10 +181,8 @@ class GyroState:
             return f"{self.name}: the gyro is silent; the rotation is that of odometry alone (gyro.timeout_s)"
         if self.state == "doubted":
             turns = "" if self.ratio is None else f", it turns {self.ratio:.3g} times as much as odometry"
-            return (
-                f"{self.name}: gyro and odometry contradict each other{turns}; the gyro is not used. "
-                f"{_cause(self.ratio, self.name)}"
-            )
+            contradict = f"{self.name}: gyro and odometry contradict each other{turns}; the gyro is not used."
+            return f"{contradict} {_cause(self.ratio, self.name)}"
         return ""
 
     def __str__(self) -> str:

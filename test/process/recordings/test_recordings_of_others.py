@@ -33,10 +33,8 @@ class Robot:
         self.v = np.where(self.t < 1.0, 0.0, 0.8)
         self.w = np.where(self.t < 1.0, 0.0, 0.8 * np.cos(2.0 * np.pi * (self.t - 1.0) / 14.0) + 0.06)
         self.true = self.path_of(self.v, self.w)
-        self.driven = self.path_of(
-            self.v * (1.01 + rng.normal(0, 0.03, len(self.t))),
-            self.w + (self.v > 0) * rng.normal(0.004, 0.05, len(self.t)),
-        )
+        times = 1.01 + rng.normal(0, 0.03, len(self.t))
+        self.driven = self.path_of(self.v * times, self.w + (self.v > 0) * rng.normal(0.004, 0.05, len(self.t)))
         low, high = self.true[:, :2].min(0) - 2.5, self.true[:, :2].max(0) + 2.5
         x, y = (a.ravel() for a in np.meshgrid(*(np.arange(low[k], high[k], 2.0) for k in (0, 1))))
         self.tags = np.stack([x, y, np.full(len(x), 0.7)], 1) + rng.uniform(-0.4, 0.4, (len(x), 3))
@@ -90,13 +88,9 @@ class Robot:
     def odometry(self, t, pose, v=0.0, w=0.0):
         linear, angular = self.xyzw("Vector3", v), self.xyzw("Vector3", 0, 0, w)
         twist = self.make("geometry_msgs/msg/Twist", linear=linear, angular=angular)
-        return self.make(
-            ODOMETRY,
-            header=self.header(t, "odom"),
-            child_frame_id="base_link",
-            pose=self.pose(*pose[:2], 0, pose[2], covariance=np.zeros(36)),
-            twist=self.make("geometry_msgs/msg/TwistWithCovariance", twist=twist),
-        )
+        parts = {"header": self.header(t, "odom"), "pose": self.pose(*pose[:2], 0, pose[2], covariance=np.zeros(36))}
+        parts["twist"] = self.make("geometry_msgs/msg/TwistWithCovariance", twist=twist)
+        return self.make(ODOMETRY, child_frame_id="base_link", **parts)
 
     def odometry_rows(self, stamp=lambda t: t, **more):
         rows = zip(self.t.tolist(), self.driven, self.v, self.w, strict=True)
@@ -334,11 +328,19 @@ def leapt(rows):
     return [(leap(t), *rest) for t, *rest in rows]
 
 
+def with_w_first(robot):
+    for *row, message in robot.odometry_rows():
+        q = message.pose.pose.orientation
+        q.x, q.z, q.w = q.w, 0.0, q.z
+        yield *row, message
+
+
 def without_pose(robot):
     rows = zip(robot.t.tolist(), robot.v, robot.w, strict=True)
     return [(t, "/odom", ODOMETRY, robot.odometry(t, (0.0, 0.0, 0.0), v, w)) for t, v, w in rows]
 
 
+SLASHES = (lambda r: r.seen_rows(frame="Robot/cam "), lambda r: r.static_rows(("base_link", "robot//cam")))
 CAUSES = {
     "tags 0.55 times": ((None, lambda r: r.seen_rows(times=0.55)), "range_scale", "as long as odometry says"),
     "tags 1.8 times": ((None, lambda r: r.seen_rows(times=1.8)), "range_scale", "as long as odometry says"),
@@ -347,12 +349,9 @@ CAUSES = {
     "a fast clock": ((stamped_by(lambda t: (186_000_000 + t * 1000, 0)),), "wrong_stamps", "1e+03 s for each second"),
     "NTP": ((lambda r: leapt(r.odometry_rows(leap)), lambda r: leapt(r.seen_rows(leap))), "clock_jump", "92.6 days"),
     "a slow clock": ((stamped_by(lambda t: (BEGINS_S, t * 1e6)),), "wrong_stamps", "0.001 s for each second"),
+    "w first": ((with_w_first,), "no_orientation_of_odometry", "does w come first in its quaternions?"),
     "a twist alone": ((without_pose,), "pose_stands", "its twist says 0.8 m/s"),
-    "double slash": (
-        (None, lambda r: r.seen_rows(frame="robot/cam"), lambda r: r.static_rows(("base_link", "robot//cam"))),
-        "frame_unlinked",
-        "did you mean robot//cam?",
-    ),
+    "double slash": ((None, *SLASHES), "frame_unlinked", "did you mean robot//cam?"),
     "no transform": ((None, None, lambda r: []), "frame_unlinked", "is assumed"),
 }
 
