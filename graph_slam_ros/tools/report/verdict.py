@@ -47,18 +47,19 @@ def verdict(
     if summary.get("ended") is False:
         doubts = [f"it is still being written, or was cut off, and this is its map so far {again}"]
     short, more = outcome.findings(summary)
+    if summary.get("is_incomplete"):  # so are its counters
+        short, more = [f"the run was ended before its last results were written {again}"], []
     doubts += more
     if not short and not summary.get("converged", True):
         short = ["the last solve did not converge"]
     doubts += list(scores.warnings) if scores is not None else []
     doubts += [line.removeprefix("warning: ") for line in explain_run(saved) if line.startswith("warning: ")]
     doubts += _covariances(saved, scores)
-    state = "Do not rely on this map yet" if short else "Use this map with care"
     first, *others = [*(one if one.endswith((".", "?")) else f"{one}." for one in (*short, *doubts)), ""]
     fine = (
         f"No measurement of this run speaks against this map: {_fit(saved)}. graph_slam check looks at the recording."
     )
-    out = [f"{state}: {first}" if first else fine]
+    out = [f"{'Do not rely on this map yet' if short else 'Use this map with care'}: {first}" if first else fine]
     out += [f"Also: {one}" for one in others[:_MOST_REASONS] if one]
     out += [f"map -> odom jumped by up to {jump[1]:.2f} m, at keyframe {jump[0]}."] if jump else []
     size = f"{len(saved.slam.keyframes)} keyframes and {summary.get('landmarks', len(saved.landmarks))} landmarks"
@@ -177,11 +178,9 @@ def timing(summary: Mapping[str, Any]) -> list[Row]:
         "CPU time per second of the drive": (cpu_s and span_s and cpu_s / span_s, "{:.3f} s"),
         "solves": (solves, "{}"),
         "CPU time per solve, with all else": (cpu_s and solves and 1e3 * cpu_s / solves, "{:.2f} ms"),
-        "backlog at the end": (summary.get("unprocessed") or None, "{} measurements accepted and not processed"),
+        "backlog at the end": (summary.get("unprocessed"), "{} measurements accepted and not processed"),
     }
     rows: list[Row] = [[name, text.format(value)] for name, (value, text) in known.items() if value is not None]
-    if summary.get("unprocessed") == 0:
-        rows.append(["backlog at the end", "none"])
     load = dict(summary.get("load") or {})
     if load:
         rows.append(["largest backlog", f"{max(load['backlog'])} measurements"])

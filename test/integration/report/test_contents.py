@@ -137,12 +137,12 @@ def test_a_run_that_is_still_written_shows_its_map_so_far(run, tmp_path):
         if file.suffix in (".csv", ".tum", ".g2o"):
             file.unlink()
     made = read_contents(live)
+    (live / "run.json").write_text('{"ended": true, "is_incomplete": true}')
+    assert "ended before its last results were written" in read_contents(live).data["sentences"][0]
     assert "still being written" in made.data["sentences"][0]
     assert "20 keyframes and 2 landmarks" in " ".join(made.data["sentences"])
     for name in ("odometry", "estimate"):
-        columns = [
-            [unpacked(one.packing, column) for column in one.data["map"]["paths"][name]] for one in (before, made)
-        ]
+        columns = [[unpacked(one.packing, of) for of in one.data["map"]["paths"][name]] for one in (before, made)]
         np.testing.assert_allclose(columns[1], columns[0], atol=2e-3)
     names, points = (made.data["map"]["landmarks"][key] for key in ("names", "points"))
     assert sorted(unpacked(made.packing, names)) == ["a", "b"]
