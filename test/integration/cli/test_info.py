@@ -54,10 +54,10 @@ def from_robot(truth, place):
     return tuple(map(float, se2.act(se2.inverse(truth), place)))
 
 
-def seen(frame="base_link", lag_ns=0, unnamed=False, class_ids=False):
+def seen(frame="base_link", lag_ns=0, unnamed=False, class_ids=False, height=0.0):
     def made(k, stamp_ns, truth, drifting):
         found = [
-            detection(pose(*from_robot(truth, at)), np.eye(2) * 0.01, "" if unnamed else name,
+            detection(pose(*from_robot(truth, at), -height * k), np.eye(2) * 0.01, "" if unnamed else name,
                       class_id=name if class_ids else "kind")
             for name, at in PLACES.items()
         ]  # fmt: skip
@@ -100,7 +100,7 @@ def at(kind="PoseStamped", frame="map", covariance=None):
 
 
 ODOMETRY = ("/odom", ODOM, odom())
-SEEN = ("/tags", DETECTIONS, seen())
+SEEN, CLIMBING = (("/tags", DETECTIONS, seen(height=height)) for height in (0.0, 0.02))
 
 
 @pytest.fixture
@@ -201,11 +201,11 @@ OFFERED = {
         says=["note: odometry is odom_combined -> base_footprint of /tf: there is no topic with it"],
     ),
     "odometry that leaves the plane": row(
-        ("/odom", ODOM, odom(height=0.02)), SEEN, has=["world.dimensions=3"], says=["these are three dimensions"]
+        ("/odom", ODOM, odom(height=0.02)), CLIMBING, has=["world.dimensions=3"], says=["these are three dimensions"]
     ),
     **{
         f"poses that are odometry by name, in {frame}": row(
-            *(posed_odometry(name, frame), SEEN),
+            *(posed_odometry(name, frame), CLIMBING),
             has=["odom.use=odometry", f"odom.type={POSE}", "world.dimensions=3"],
             says=[f"note: odometry is {name}, poses without a child frame"],
         )
