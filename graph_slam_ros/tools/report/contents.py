@@ -385,12 +385,7 @@ def corrections(run: Path, stamps_s: Array, odometry: Array, losses: list[str]) 
 def jumps(
     found: tuple[Array, Array, Array], entries: Sequence[Entry], changed: dict[int, list[int]]
 ) -> list[tuple[int, float, float, list[int]]]:
-    """The largest corrections: keyframe, distance [m], angle [degrees], and the edges judged then that pulled most.
-
-    Parameters
-    ----------
-    changed : by keyframe, the edges whose verdict changed there
-    """
+    """The largest corrections: keyframe, distance [m], angle [degrees], and the edges judged then that pulled most."""
     keyframes, distances, angles = found
     came: dict[int, list[Entry]] = {}
     for e in entries:

@@ -20,7 +20,7 @@ from graph_slam_ros.tools.report.packing import shown
 
 Row = list[Any]
 _FINE = 0.5, 2.0  # chi2 per degree of freedom
-_MOST_NEES = 2.0  # times what is expected
+_MOST_NEES, _NEARLY_ALL = 2.0, 0.9  # times what is expected; of the measurements
 _MOST_REASONS = 3  # that are named: of rejected measurements, and of what else is wrong
 
 
@@ -55,6 +55,9 @@ def verdict(
     doubts += list(scores.warnings) if scores is not None else []
     doubts += [line.removeprefix("warning: ") for line in explain_run(saved) if line.startswith("warning: ")]
     doubts += _covariances(saved, scores)
+    judged = [e.is_in for e in saved.entries if e.verdict]
+    if sum(judged) < _NEARLY_ALL * len(judged):
+        doubts.append("more than a tenth of its measurements are not believed")
     first, *others = [*(one if one.endswith((".", "?")) else f"{one}." for one in (*short, *doubts)), ""]
     fine = (
         f"No measurement of this run speaks against this map: {_fit(saved)}. graph_slam check looks at the recording."
