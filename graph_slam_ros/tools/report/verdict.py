@@ -59,9 +59,9 @@ def verdict(
     if sum(judged) < _NEARLY_ALL * len(judged):
         doubts.append("more than a tenth of its measurements are not believed")
     first, *others = [*(one if one.endswith((".", "?")) else f"{one}." for one in (*short, *doubts)), ""]
-    fine = (
-        f"No measurement of this run speaks against this map: {_fit(saved)}. graph_slam check looks at the recording."
-    )
+    has_inputs = any(one["use"] for one in summary.get("inputs", {}).values())  # a graph's have no use
+    fine = f"No measurement of this run speaks against this map: {_fit(saved)}."
+    fine += " graph_slam check looks at the recording." * has_inputs
     out = [f"{'Do not rely on this map yet' if short else 'Use this map with care'}: {first}" if first else fine]
     out += [f"Also: {one}" for one in others[:_MOST_REASONS] if one]
     out += [f"map -> odom jumped by up to {jump[1]:.2f} m, at keyframe {jump[0]}."] if jump else []
