@@ -51,9 +51,8 @@ def check_columns(c: Columns, checks: tuple[Check, ...] = CHECKS) -> list[Findin
     found: list[Finding] = []
     with np.errstate(all="ignore"):
         c = of_one_publisher(c)
-        if lost := refused_odometry(c):  # the rest follows from that, and this may follow from units
-            is_jumpy = all(one.code == "other_publisher" for one in lost)
-            found += [one for one in check_odometry(c) if is_jumpy and one.code == "units"]
+        if codes := {one.code for one in refused_odometry(c)}:  # the rest follows from that, and this may from units
+            found += [one for one in check_odometry(c) if one.code == "units" and codes == {"other_publisher"}]
             checks = tuple(check for check in checks if check is check_refusals and not found)
         for check in checks:
             found += check(c)

@@ -131,7 +131,7 @@ FOLLOWS = {
     "pose_stands": ("frozen",),
     "frame_empty": ("frame_unknown",),
     "frame_unlinked": ("mount_assumed",),
-    "units": ("other_publisher", "odometry_gap", "jump", "twist_scale"),
+    "units": ("other_publisher", "odometry_gap", "jump", "late", "twist_scale"),
     "mirrored": ("twist_unrelated", "twist_frame"),
     "damaged": ("no_closure", "silent"),
     "clock_offset": ("latency",),

@@ -23,16 +23,15 @@ _WINDOW_S, _MOST_LATE_S, _LATE_S, _BETTER = 20.0, 1.0, 0.15, 0.9
 
 def check_fixes(c: Columns) -> Iterator[Finding]:
     """Fixes that are mirrored, of another scale, frozen or jump, and headings that count clockwise or are off."""
-    path_ns, path = c.path_ns, c.path
     decided = ("fix_jumps", "odometry_slips") if any(len(s.stamp_ns) for s in c.sightings) else ()  # by landmarks
     known: tuple[Index, Array] | None = None  # stamps, and by how much odometry's frame is turned in the map
-    for f in sorted(c.fixes, key=lambda f: bool(np.isnan(f.points).all())) if len(path_ns) > 1 else ():
-        use = (f.stamp_ns >= path_ns[0]) & (f.stamp_ns <= path_ns[-1])
+    for f in sorted(c.fixes, key=lambda f: bool(np.isnan(f.points).all())) if len(c.path_ns) > 1 else ():
+        use = (f.stamp_ns >= c.path_ns[0]) & (f.stamp_ns <= c.path_ns[-1])
         order = np.flatnonzero(use)[np.argsort(f.stamp_ns[use], kind="stable")]
         if len(order) < _LEAST:
             continue
         stamp_ns, points, headings = f.stamp_ns[order], f.points[order], f.headings[order]
-        own, yaws = _driven(f, poses_at(stamp_ns, path_ns, path))
+        own, yaws = _driven(f, poses_at(stamp_ns, c.path_ns, c.path))
         if np.isfinite(points).all():
             seen = (list(check(c, f, stamp_ns, points, own)) for check in (_frozen, _turned, _late, _slipped))
             found: list[Finding] = next(filter(None, seen), [])
@@ -122,10 +121,9 @@ def _late(c: Columns, f: FixColumns, stamp_ns: Index, points: Array, own: Array)
     path_s, at_s = ((some_ns - c.path_ns[0]) * 1e-9 for some_ns in (c.path_ns, stamp_ns))
     begins = np.flatnonzero(np.diff(at_s // _WINDOW_S)) + 1
     windows = [k for k in np.split(np.arange(len(at_s)), begins) if len(k) >= _LEAST]
-    tried_s, left = np.arange(-_MOST_LATE_S, _MOST_LATE_S + 0.01, _LATE_S / 3.0), list[list[float]]()
-    for late_s in tried_s:
-        own = np.interp(at_s - late_s, path_s, antenna)
-        left.append([_left(own[k], points[k]) for k in windows])
+    tried_s = np.arange(-_MOST_LATE_S, _MOST_LATE_S + 0.01, _LATE_S / 3.0)
+    paths = (np.interp(at_s - late_s, path_s, antenna) for late_s in tried_s)
+    left = [[_left(own[k], points[k]) for k in windows] for own in paths]
     halves = [np.sum([row[n::2] for row in left], axis=1) for n in (0, 1)]
     first_s, second_s, late_s = (float(tried_s[np.argmin(some)]) for some in (*halves, sum(halves)))
     is_better = min(sum(halves)) < _BETTER * sum(halves)[len(tried_s) // 2]
@@ -159,10 +157,12 @@ def _headings(
 ) -> Iterator[Finding]:
     _, ends = np.unique((stamp_ns - stamp_ns[0]) // 10**9, return_index=True)  # one in each second
     now, mirrored = _mirrored(se2.wrap(np.diff(headings[ends])), se2.wrap(np.diff(yaws[ends])))
-    if mirrored < _HALF * now and now > _TURNED_RAD:
-        text = f"{f.topic}: its heading turns to the right where odometry turns to the left: it counts clockwise (NED)"
+    if now > _TURNED_RAD:
+        mirror = "turns to the right where odometry turns to the left: it counts clockwise (NED)"
+        other = "does not turn as odometry does: does it stand, or is it in degrees?"
+        code, what = ("heading_clockwise", mirror) if mirrored < _HALF * now else ("unrelated", other)
         at = where(f.topic, stamp_ns, settings=(f"{f.input}.use=none",))
-        yield Finding("heading_clockwise", "error", now, mirrored, "rad", text, **at)
+        yield Finding(code, "error", now, min(mirrored, _TURNED_RAD), "rad", f"{f.topic}: its heading {what}", **at)
     elif known is not None:
         near = np.clip(np.searchsorted(stamp_ns, known[0]), 0, len(stamp_ns) - 1)
         turned = np.exp(1j * (headings[near] - yaws[near] - known[1]))
@@ -172,6 +172,7 @@ def _headings(
             quarter = round(off / (0.5 * np.pi)) * 0.5 * np.pi
             off = quarter if abs(off - quarter) < _NEARLY_RAD else off
             turn = (0.0, 0.0, 0.0, 0.0, 0.0, np.sin(0.5 * off), np.cos(0.5 * off))
-            settings = turned_mount(f.input, f.frame, f.T_base_frame, turn) if f.frame else ()
-            at = where(f.topic, stamp_ns, settings=settings)
+            at = where(
+                f.topic, stamp_ns, settings=turned_mount(f.input, f.frame, f.T_base_frame, turn) if f.frame else ()
+            )
             yield Finding("heading_offset", "error", off, _OFF_RAD, "rad", text, **at)

@@ -19,7 +19,7 @@ _LEAST_ROUNDED_NS, _AS_OTHERS, _COARSE_S = 1_000_000, 0.1, 0.15
 _LONG_S, _VERY_LONG_S, _PERIODS, _MOVED_M, _TURNED = 1.0, 2.0, 10.0, 0.05, 0.05
 _SLOW_HZ, _BETWEEN_S = 5.0, 0.02
 _CROWDED, _FASTER = 0.2, 1.5
-_OF_A_SECOND = {1: "nothing", 1_000: "milliseconds", 1_000_000: "microseconds"}
+_OF_A_SECOND = {1: "zeros", 1_000: "milliseconds", 1_000_000: "microseconds"}
 _PACE, _GOES_ON, _STEPS = 0.05, 0.3, 5
 _OUTSIDE, _NEARLY_ALL, _MARGIN_NS = 0.2, 0.95, 500_000_000
 

@@ -409,6 +409,7 @@ FIXES = {
     "stays": (lambda t, x, y: (x + 4.0 * (t > 20), y), lambda yaw: yaw, "fix_jumps"),
     "jumps": (lambda t, x, y: (x + 4.0 * (20 < t < 40), y), lambda yaw: yaw, "fix_jumps"),
     "zero at north": (lambda t, x, y: (x, y), lambda yaw: yaw - math.pi / 2, "heading_offset"),
+    "a compass that stands": (lambda t, x, y: (x, y), lambda yaw: 1.0, "unrelated"),
     "clockwise": (lambda t, x, y: (x, y), lambda yaw: math.pi / 2 - yaw, "heading_clockwise"),
 }
 
@@ -418,12 +419,11 @@ def test_fixes_and_headings_are_compared_with_odometry_and_with_one_another(tmp_
     inputs = "inputs.names=odom gps imu", "gps.type=sensor_msgs/msg/NavSatFix", "gps.topic=/gps"
     inputs = *inputs, "imu.type=sensor_msgs/msg/Imu", "imu.topic=/imu"
     for k, (name, (at, heading, code)) in enumerate(FIXES.items()):
-        rows, rng = [], np.random.default_rng(1)
+        rows, rng, late_s = [], np.random.default_rng(1), 0.5 * (name == "late")
         for t, (x, y, yaw) in zip(robot.t[::4].tolist(), robot.true[::4], strict=True):
             z = complex(x, y) * np.exp(1j * turn)
             place = at(t, z.real + rng.normal(0, 0.1), z.imag + rng.normal(0, 0.1))
-            late = t + 0.5 * (name == "late")
-            rows.append((late + 0.03, "/gps", "sensor_msgs/msg/NavSatFix", fix(robot, late, *place)))
+            rows.append((t + late_s + 0.03, "/gps", "sensor_msgs/msg/NavSatFix", fix(robot, t + late_s, *place)))
             rows.append((t + 0.01, "/imu", "sensor_msgs/msg/Imu", imu(robot, t, heading(yaw + turn))))
         bag = written(tmp_path / str(k), robot, robot.static_rows(), robot.odometry_rows(), rows)
         one = found(capsys, bag, *inputs)
