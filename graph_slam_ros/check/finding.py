@@ -125,7 +125,7 @@ _OF_STAMPS = (
     *("after_odometry", "before_odometry", "late", "odometry_gap", "duplicate_stamp", "other_publisher"),
     *("overflow", "frozen", "jump"),
 )
-
+_OF_A_PATH = ("odometry_slips", "landmark_moved", "map_breaks", "id_reused", "ids_unsure", "outliers", "over_confident")
 FOLLOWS = {
     **dict.fromkeys(("wrong_stamps", "constant_stamps", "coarse_stamps"), _OF_STAMPS),
     "pose_stands": ("frozen",),
@@ -135,7 +135,8 @@ FOLLOWS = {
     "mirrored": ("twist_unrelated", "twist_frame"),
     "damaged": ("no_closure", "silent"),
     "clock_offset": ("latency",),
-    "mount_moved": ("odometry_slips", "landmark_moved", "map_breaks", "id_reused", "ids_unsure", "outliers"),
+    **dict.fromkeys(("mount_moved", "covariance_tiny"), _OF_A_PATH),
+    **dict.fromkeys(("clock_jump", "gyro_scale"), (*_OF_A_PATH, "clock_offset")),
 }
 """What is no finding of its own beside an error or a warning."""
 

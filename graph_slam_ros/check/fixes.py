@@ -84,7 +84,12 @@ def _turned(c: Columns, f: FixColumns, stamp_ns: Index, points: Array, own: Arra
     if len(ends) > _LEAST:
         moved, driven = np.diff(points[ends]), np.diff(own[ends])
         now, mirrored = _mirrored(np.angle(moved[1:] / moved[:-1]), np.angle(driven[1:] / driven[:-1]))
-        if mirrored < _HALF * now and now > _TURNED_RAD:
+        ways, own_ways = (np.stack([some.real, some.imag], axis=1) for some in (moved, driven))
+        linear, left, *_ = np.linalg.lstsq(
+            own_ways, ways, rcond=None
+        )  # degrees of latitude and longitude are not equal
+        is_swapped = left.sum() < _OFF * np.sum(ways**2) and np.linalg.det(linear) < 0.0
+        if (mirrored < _HALF * now and now > _TURNED_RAD) or is_swapped:
             what = "latitude and longitude, or east and north, are exchanged, or odometry's position is mirrored"
             text = f"{f.topic}: fixes turn right where odometry turns left: {what}"
             at = where(f.topic, stamp_ns, settings=(f"{f.input}.use=none",))
@@ -98,11 +103,8 @@ def _turned(c: Columns, f: FixColumns, stamp_ns: Index, points: Array, own: Arra
             return
         if abs(factor - 1.0) > max(_OFF, _SIGMAS * spread):
             text = f"{f.topic}: fixes move {factor:.3g} m for each metre of odometry"
-            at = where(
-                f.topic,
-                stamp_ns,
-                settings=(f"odometry.distance_factor={c.config.odometry.distance_factor * factor:.4g}",),
-            )
+            setting = f"odometry.distance_factor={c.config.odometry.distance_factor * factor:.4g}"
+            at = where(f.topic, stamp_ns, settings=(setting,))
             yield Finding("odometry_scale", "warning", factor, 1.0 + _OFF, "times", text, **at)
     step_m, way_m = np.abs(np.diff(points)), np.abs(np.diff(own))
     far_m = max(_JUMP_M, 2.0 * _SIGMAS * f.sigma_m)
@@ -172,7 +174,6 @@ def _headings(
             quarter = round(off / (0.5 * np.pi)) * 0.5 * np.pi
             off = quarter if abs(off - quarter) < _NEARLY_RAD else off
             turn = (0.0, 0.0, 0.0, 0.0, 0.0, np.sin(0.5 * off), np.cos(0.5 * off))
-            at = where(
-                f.topic, stamp_ns, settings=turned_mount(f.input, f.frame, f.T_base_frame, turn) if f.frame else ()
-            )
+            settings = turned_mount(f.input, f.frame, f.T_base_frame, turn) if f.frame else ()
+            at = where(f.topic, stamp_ns, settings=settings)
             yield Finding("heading_offset", "error", off, _OFF_RAD, "rad", text, **at)

@@ -87,10 +87,8 @@ def check_moving(s: SightingColumns, by: LandmarkMotions, count: int) -> Iterato
         text = f"{s.topic}: landmark {name} moves: it is {by.on_ground[k]:.2f} m from its place a few seconds later"
         if by.with_robot[k]:
             x, y = by.at[k, :2]
-            text = (
-                f"{s.topic}: landmark {name} moves along with the robot, at x {x:.2f} and y {y:.2f} m on it: it is a "
-                "part of the robot, or follows it"
-            )
+            place = f"at x {x:.2f} and y {y:.2f} m on it"
+            text = f"{s.topic}: landmark {name} moves along with the robot, {place}: a part of it, or a follower"
         limit_m, at = _NOISES * by.noise_m, where(s.topic, own_ns)
         yield Finding("landmark_moves", "warning", by.on_ground[k], limit_m, "m", text, **at)
 

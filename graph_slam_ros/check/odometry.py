@@ -350,4 +350,4 @@ def _covariance(o: OdometryColumns, steps: Steps) -> Iterator[Finding]:
         yield Finding("covariance_useless", "warning", sigmas[0] / speed, _USELESS, "times", text, **at)
     elif 0.0 < sigmas[0] < _TINY * speed or 0.0 < sigmas[2] < _TINY_RAD_S:
         text = f"{o.topic}: the twist has sigmas of {sigmas[0]:.1g} m/s, {sigmas[2]:.1g} rad/s: no wheels are so good"
-        yield Finding("covariance_tiny", "warning", sigmas[0] / speed, _TINY, "times", text, **at)
+        yield Finding("covariance_tiny", "error", sigmas[0] / speed, _TINY, "times", text, **at)

@@ -121,10 +121,8 @@ def check_noise(c: Columns, s: SightingColumns, pairs: Pairs) -> Iterator[Findin
         return
     factor = float(np.median(pairs.residuals(s.points) / s.sigmas[pairs.a]))
     if factor > _TOO_SMALL:
-        text = (
-            f"{s.topic}: the covariance of {raised} of {len(s.stamp_ns)} sightings is nearly zero, and two sightings "
-            f"of a landmark differ by {factor * sigma_m:.2g} m"
-        )
+        few = f"the covariance of {raised} of {len(s.stamp_ns)} sightings is nearly zero"
+        text = f"{s.topic}: {few}, and two sightings of a landmark differ by {factor * sigma_m:.2g} m"
         at = where(s.topic, s.stamp_ns, raised, _sigmas(s, pairs))
         yield Finding("noise_zero", "warning", factor, _TOO_SMALL, "sigmas", text, **at)
 

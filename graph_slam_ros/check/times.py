@@ -13,7 +13,7 @@ from graph_slam_ros.messages.receive_times import clock_offset_s
 from graph_slam_ros.typing import Array, Index, Mask
 
 _FEW, _MANY, _BACK_NS = 3, 10, 1_000_000_000
-_CLOCKS_DIFFER_S, _EARLY_S, _DAY_S = 10.0, 0.15, 86400.0
+_CLOCKS_DIFFER_S, _SET_S, _EARLY_S, _DAY_S = 10.0, 1.0, 0.15, 86400.0
 _DUPLICATES, _OUT_OF_ORDER = 0.01, 0.001
 _LEAST_ROUNDED_NS, _AS_OTHERS, _COARSE_S = 1_000_000, 0.1, 0.15
 _LONG_S, _VERY_LONG_S, _PERIODS, _MOVED_M, _TURNED = 1.0, 2.0, 10.0, 0.05, 0.05
@@ -54,8 +54,7 @@ def _wrong(topics: Mapping[str, TopicColumns]) -> Iterator[Finding]:
             continue
         if not np.ptp(stamp_ns):
             text = f"{name}: all of its {len(stamp_ns)} messages have the stamp {stamp_ns[0] * 1e-9:.3f} s"
-            at = where(name, stamp_ns)
-            yield Finding("constant_stamps", "error", len(stamp_ns), _MANY, "messages", text, **at)
+            yield Finding("constant_stamps", "error", len(stamp_ns), _MANY, "messages", text, **where(name, stamp_ns))
             continue
         apart = max(1, len(lag_s) // 4)
         span_ns = np.maximum(log_ns[apart:] - log_ns[:-apart], 1)
@@ -72,8 +71,7 @@ def _wrong(topics: Mapping[str, TopicColumns]) -> Iterator[Finding]:
         others = [other for other in advance.values() if other != rate]
         if _differ(rate, usual) and any(_differ(rate, other) for other in others):
             text = f"{name}: its stamps advance by {rate:.3g} s for each second in which its messages were recorded"
-            at = where(name, topics[name].stamp_ns)
-            yield Finding("wrong_stamps", "error", rate, _FASTER, "s/s", text, **at)
+            yield Finding("wrong_stamps", "error", rate, _FASTER, "s/s", text, **where(name, topics[name].stamp_ns))
 
 
 def _differ(a: float, b: float) -> bool:
@@ -115,7 +113,15 @@ def _clocks(c: Columns, topics: dict[str, TopicColumns]) -> Iterator[Finding]:
     for topic in topics.values():
         lag_s, log_ns, stamp_ns = _lags(topic)
         apart_s = clock_offset_s(log_ns, lag_s, odometry_log_ns, odometry_lag_s)
-        if abs(apart_s) > _CLOCKS_DIFFER_S:
+        few = max(1, len(lag_s) // 5)
+        parts = ((log_ns[k], lag_s[k]) for k in (slice(few), slice(-few, None)))
+        first_s, last_s = (clock_offset_s(*part, odometry_log_ns, odometry_lag_s) for part in parts)
+        if abs(set_s := last_s - first_s) > _SET_S:
+            is_own = abs(np.median(lag_s[-few:]) - np.median(lag_s[:few])) > 0.5 * abs(set_s)
+            name = topic.name if is_own else c.odometry.topic
+            text = f"{name}: by the times of recording, its clock was set on the way by {abs(set_s):.1f} s"
+            yield Finding("clock_jump", "error", set_s, _SET_S, "s", text, **where(name, stamp_ns))
+        elif abs(apart_s) > _CLOCKS_DIFFER_S:
             yield _other_clock(c, topic, of_odometry, apart_s, stamp_ns)
         elif apart_s < -_EARLY_S and not any(
             one.offset_s for one in c.config.sources if one.name in (topic.inputs[0], c.odometry.input)
@@ -150,10 +156,9 @@ def _order(c: Columns, topic: TopicColumns) -> Iterator[Finding]:
     repeated, back = step_s == 0.0, step_s < 0.0
     share = float(repeated.mean())
     if topic.name == c.odometry.topic and share > _DUPLICATES and (each_s := rounded_s(c.odometry)):
-        is_coarse = each_s > _COARSE_S
         text = f"{topic.name}: stamps are rounded to {each_s:.3g} s: {share:.1%} are that of the message before"
         found = Finding("coarse_stamps", "error", each_s, _COARSE_S, "s", text, topic.name)
-        yield found if is_coarse else replace(found, code="rounded_stamps", severity="note")
+        yield found if each_s > _COARSE_S else replace(found, code="rounded_stamps", severity="note")
     elif topic.use == "odometry" and share > _DUPLICATES:
         text = f"{topic.name}: {share:.1%} of the messages have the stamp before: published or recorded twice"
         at = where(topic.name, stamp_ns[1:][repeated])
@@ -198,12 +203,12 @@ def _rate(c: Columns) -> Iterator[Finding]:
             f"{o.topic} comes at {1.0 / median_s:.0f} Hz, but is silent for more than {most_s:.1f} s "
             f"{often} (the longest {worst_s:.2f} s{'; the robot moved meanwhile' if is_bad else ''})"
         )
-        at = where(o.topic, stamp_ns[long])
-        yield Finding("gap", "warning" if is_bad else "note", worst_s, most_s, "s", text, **at)
+        severity: Severity = "warning" if is_bad else "note"
+        yield Finding("gap", severity, worst_s, most_s, "s", text, **where(o.topic, stamp_ns[long]))
     if 1.0 / median_s < _SLOW_HZ:
         between = _between(c, stamp_ns)
         text = f"{o.topic} comes at {1.0 / median_s:.1f} Hz: poses are interpolated over {median_s:.2f} s"
-        severity: Severity = "warning" if between > 0.5 else "note"
+        severity = "warning" if between > 0.5 else "note"
         yield Finding("slow_odometry", severity, 1.0 / median_s, _SLOW_HZ, "Hz", text, **where(o.topic, stamp_ns))
 
 
@@ -246,10 +251,8 @@ def _overlap(c: Columns) -> Iterator[Finding]:
             text = f"{s.topic}: {share:.0%} of the sightings were recorded without odometry, which {' and '.join(when)}"
             yield Finding("odometry_short", "warning", share, _OUTSIDE, "part", text, **at)
             continue
-        text = (
-            f"{s.topic}: {share:.0%} of the sightings are stamped outside the time of odometry ({ends[0]:.1f} "
-            f"to {ends[1]:.1f} s, odometry 0 to {(last_ns - first_ns) * 1e-9:.1f} s)"
-        )
+        span = f"({ends[0]:.1f} to {ends[1]:.1f} s, odometry 0 to {(last_ns - first_ns) * 1e-9:.1f} s)"
+        text = f"{s.topic}: {share:.0%} of the sightings are stamped outside the time of odometry {span}"
         yield Finding("no_overlap", "error", share, _OUTSIDE, "part", text, **at)
 
 

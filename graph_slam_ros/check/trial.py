@@ -243,10 +243,8 @@ def check_slips(c: Columns, slam: GraphSlam) -> tuple[Finding, int] | None:
     by = f"{('drives', 'turns')[part]} {abs(error):.2f} {unit} {'less' if error < 0.0 else 'more'} than odometry says"
     if abs(error) > sizes[k : k + TOGETHER, part].sum():
         by = f"is elsewhere than odometry says, by {abs(error):.2f} {unit}"
-    text = (
-        f"{c.odometry.topic}: by the landmarks the robot {by}, in a stretch of {np.ptp(stamps_ns) * 1e-9:.0f} s, where "
-        f"{scale:.2f} {unit} is usual: its wheels slip, or it is carried or held"
-    )
+    span = f"in a stretch of {np.ptp(stamps_ns) * 1e-9:.0f} s, where {scale:.2f} {unit} is usual"
+    text = f"{c.odometry.topic}: by the landmarks the robot {by}, {span}: its wheels slip, or it is carried or held"
     at = where(c.odometry.topic, stamps_ns, TOGETHER)
     return Finding("odometry_slips", severity, abs(error), limit, unit, text, **at), int(stamps_ns[-1])
 

@@ -107,10 +107,10 @@ class Recording:
 
     def alike(self, frame: str, base: str) -> str:
         """Return the frame of TF that differs in slashes, blanks, capitals, or by the robot's prefix; empty if none."""
-        known = (frame, *self.fixed, *self.fixed.values(), *self.moving)
-        plain = {one: one.replace("/", "").strip().lower() for one in (f"{base.rpartition('/')[0]}{frame}", *known)}
-        wanted = list(plain.values())[:2]
-        return next((one for one in sorted({*known} - {frame}) if frame and plain[one] in wanted), "")
+        known, prefixed = {*self.fixed, *self.fixed.values(), *self.moving}, f"{base.rpartition('/')[0]}{frame}"
+        plain = {one: one.replace("/", "").strip().lower() for one in (frame, prefixed, *known)}
+        wanted = (plain[frame], plain[prefixed])
+        return next((one for one in sorted(known - {frame}) if frame and plain[one] in wanted), "")
 
     def moves_in(self, base: str, frame: str) -> bool:
         """Return whether TF has the moving pose of the robot in a frame."""

@@ -240,7 +240,7 @@ def shortcomings(summary: Summary) -> Iterator[str]:
             "graph_slam check BAG says what of the recording cannot be used"
         )
     elif summary["landmarks"] and summary["sightings"] == summary["landmarks"] and not causes:
-        yield "no landmark was seen twice, so they correct nothing: do ids change? --set landmarks.association=joint"
+        yield "no landmark was seen twice, so they correct nothing: do ids change? Each landmark needs its own"
 
 
 def contradicts(name: str, accepted: int, count: int) -> str:

@@ -237,7 +237,7 @@ def _recorded(
     read = iter(runs)
     ahead = list(islice(read, _READ_AHEAD))
     if found := first_of_replay(columns.columns(counters), is_whole=len(ahead) < _READ_AHEAD):
-        warn(f"the result will mean nothing: {found.code}: see what is said at the end")
+        warn(f"the result will mean nothing: {found.code}: {found.text}")
     warmup(dimensions=config.world.dimensions)
     earlier: list[tuple[Path, dict[str, Any]]] = []
     warnings: list[str] = []
