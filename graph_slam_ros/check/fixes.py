@@ -18,6 +18,7 @@ _LEAST, _STEP_M, _SIGMAS, _SCALE = 8, 2.0, 6.0, 1.5
 _TURNED_RAD, _HALF, _OFF_RAD, _NEARLY_RAD = 0.2, 0.5, 0.17, 0.1
 _SAME_M, _FROZEN_M, _JUMP_M, _SOON_S, _OFF = 1e-6, 3.0, 3.0, 2.0, 0.1  # _OFF: of odometry's distances
 _STEP_NS, _SLIP_M, _SLIP_PART, _SLIP_SIGMAS = 2_000_000_000, 2.0, 0.25, 5.0
+_STANDS, _SPINS = 0.05, 3.0  # of odometry's turns: less, or more, is no heading
 _WINDOW_S, _MOST_LATE_S, _LATE_S, _BETTER = 20.0, 1.0, 0.15, 0.9
 
 
@@ -158,12 +159,16 @@ def _headings(
     f: FixColumns, stamp_ns: Index, headings: Array, yaws: Array, known: tuple[Index, Array] | None
 ) -> Iterator[Finding]:
     _, ends = np.unique((stamp_ns - stamp_ns[0]) // 10**9, return_index=True)  # one in each second
-    now, mirrored = _mirrored(se2.wrap(np.diff(headings[ends])), se2.wrap(np.diff(yaws[ends])))
+    steps = [se2.wrap(np.diff(some[ends])) for some in (headings, yaws)]
+    now, mirrored = _mirrored(*steps)
     if now > _TURNED_RAD:
+        turned, own = (float(np.abs(some).sum()) for some in steps)
+        is_faulty = mirrored < _HALF * now or not _STANDS * own < turned < _SPINS * own
         mirror = "turns to the right where odometry turns to the left: it counts clockwise (NED)"
-        other = "does not turn as odometry does: does it stand, or is it in degrees?"
+        other = f"turns {turned:.1f} rad where odometry turns {own:.1f} rad: "
+        other += "does it stand, or is it in degrees?" if is_faulty else "which of them is right?"
         code, what = ("heading_clockwise", mirror) if mirrored < _HALF * now else ("unrelated", other)
-        at = where(f.topic, stamp_ns, settings=(f"{f.input}.use=none",))
+        at = where(f.topic, stamp_ns, settings=(f"{f.input}.use=none",) * is_faulty)
         yield Finding(code, "error", now, min(mirrored, _TURNED_RAD), "rad", f"{f.topic}: its heading {what}", **at)
     elif known is not None:
         near = np.clip(np.searchsorted(stamp_ns, known[0]), 0, len(stamp_ns) - 1)

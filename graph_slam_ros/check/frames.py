@@ -65,10 +65,8 @@ def _of_sensor(c: Columns, s: SightingColumns) -> Iterator[Finding]:
         yield Finding("frame_unlinked", "error", 1, 0, "frames", text, **at)
     elif next((one.mount for one in c.config.sources if one.name == s.input), "") == ASSUMED:
         named = next(filter(None, topic.frames), "") or "its sensor, whose messages name no frame,"
-        text = (
-            f"{s.topic}: no transform links {named} to {c.config.frames.base}: a place at the base is assumed, as "
-            f"by --set '{s.input}.mount={assumed_mount(s.frame)}'"
-        )
+        assumed = f"a place at the base is assumed, as by --set '{s.input}.mount={assumed_mount(s.frame)}'"
+        text = f"{s.topic}: no transform links {named} to {c.config.frames.base}: {assumed}"
         yield Finding("frame_unlinked", "error", 1, 0, "frames", text, **at)
 
 

@@ -136,9 +136,8 @@ def _void(fit: TrialFit) -> Finding:
         text = f"{fit.lost:.0%} of the sightings do not fit: {unchecked}"
         return Finding("fit_unsure", "warning", fit.lost, answers.MOST_LOST, "part", text)
     text = f"{answers.absurd_text(fit, k)}: many ranges are wrong, or it is so and to be configured; {unchecked}"
-    return Finding(
-        "fit_unsure", "warning", abs(float(fit.values[k])) / fit.priors[k], answers.PRIOR_SIGMAS, "sigmas", text
-    )
+    value = abs(float(fit.values[k])) / fit.priors[k]
+    return Finding("fit_unsure", "warning", value, answers.PRIOR_SIGMAS, "sigmas", text)
 
 
 def _over_confident(c: Columns, noise: NoiseScale, factor: float, limit: float) -> Finding:
@@ -194,10 +193,8 @@ def _jumps(c: Columns, fit: TrialFit) -> Iterator[Finding]:
     """Clocks and mounts that are not the same in both halves of the drive."""
     for code, parameter, before, after, sigma, limit in answers.jumps(fit):
         if (topic := c.topic_of(parameter.source)) is not None:
-            text, unit = (
-                f"{topic.name}: {answers.jump_sentence(parameter, before, after, sigma)}",
-                _LIMITS[parameter.name][0],
-            )
+            text = f"{topic.name}: {answers.jump_sentence(parameter, before, after, sigma)}"
+            unit = _LIMITS[parameter.name][0]
             yield Finding(code, "warning", after - before, limit, unit, text, **where(topic.name, topic.stamp_ns))
 
 
