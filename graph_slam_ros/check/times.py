@@ -107,12 +107,13 @@ def _lags(topic: TopicColumns) -> tuple[Array, Index, Index]:
 
 def _clocks(c: Columns, topics: dict[str, TopicColumns]) -> Iterator[Finding]:
     of_odometry = topics.get(c.odometry.topic)
-    if of_odometry is None or any((np.diff(t.stamp_ns[t.stamp_ns != 0]) < -_BACK_NS).any() for t in topics.values()):
+    if of_odometry is None:
         return
+    is_set_back = any((np.diff(t.stamp_ns[t.stamp_ns != 0]) < -_BACK_NS).any() for t in topics.values())
     odometry_lag_s, odometry_log_ns, _ = _lags(of_odometry)
     for topic in topics.values():
         lag_s, log_ns, stamp_ns = _lags(topic)
-        apart_s = clock_offset_s(log_ns, lag_s, odometry_log_ns, odometry_lag_s)
+        apart_s = 0.0 if is_set_back else clock_offset_s(log_ns, lag_s, odometry_log_ns, odometry_lag_s)
         few = max(1, len(lag_s) // 5)
         parts = ((log_ns[k], lag_s[k]) for k in (slice(few), slice(-few, None)))
         first_s, last_s = (clock_offset_s(*part, odometry_log_ns, odometry_lag_s) for part in parts)
@@ -122,7 +123,7 @@ def _clocks(c: Columns, topics: dict[str, TopicColumns]) -> Iterator[Finding]:
             text = f"{name}: by the times of recording, its clock was set on the way by {abs(set_s):.1f} s"
             yield Finding("clock_jump", "error", set_s, _SET_S, "s", text, **where(name, stamp_ns))
         elif abs(apart_s) > _CLOCKS_DIFFER_S:
-            yield _other_clock(c, topic, of_odometry, apart_s, stamp_ns)
+            yield _other_clock(c, topic, of_odometry, apart_s)
         elif apart_s < -_EARLY_S and not any(
             one.offset_s for one in c.config.sources if one.name in (topic.inputs[0], c.odometry.input)
         ):  # which somebody has set, and knows better
@@ -132,11 +133,10 @@ def _clocks(c: Columns, topics: dict[str, TopicColumns]) -> Iterator[Finding]:
             yield Finding("latency", "warning", -apart_s, _EARLY_S, "s", text, **at)
 
 
-def _other_clock(
-    c: Columns, topic: TopicColumns, of_odometry: TopicColumns, apart_s: float, stamp_ns: Index
-) -> Finding:
+def _other_clock(c: Columns, topic: TopicColumns, of_odometry: TopicColumns, apart_s: float) -> Finding:
     """A clock that is not that of odometry. Where odometry's alone is not the receiver's, it is odometry's."""
-    is_right = abs(float(np.median(_lags(topic)[0]))) < _CLOCKS_DIFFER_S / 2.0
+    lag_s, _, stamp_ns = _lags(topic)
+    is_right = abs(float(np.median(lag_s))) < _CLOCKS_DIFFER_S / 2.0
     wrong, right = (of_odometry, topic) if is_right else (topic, of_odometry)
     by_s = apart_s if wrong is topic else -apart_s
     text = f"{wrong.name}: its stamps are {-by_s:.1f} s away from those of {right.name}: another clock"

@@ -37,12 +37,12 @@ def evaluate(args: argparse.Namespace) -> int:
     console.show(*([json.dumps(scores.as_dict())] if args.json else str(scores).split("\n")))
     draw(args.run_folder, truth, args.plot, align=not args.no_align, quiet=args.json)
     found = [one for some in findings(summary_of(args.run_folder)) for one in some][:1]
-    code = console.report_losses(scores.losses, [*found, *scores.warnings, *changed_since(args.run_folder)])
+    lost = console.report_losses(scores.losses, [*found, *scores.warnings, *changed_since(args.run_folder)])
     if not args.json:
         same = [*(("--topic", args.topic) if args.topic else ()), *(("--no-align",) if args.no_align else ())]
         with_truth = console.command("report", args.run_folder, "--truth", args.truth, *same)
         console.then(f"{with_truth} (one page: the map, its errors, and why each edge is in or out)")
-    return code
+    return console.LOSSES if scores.warnings else lost
 
 
 def draw(run: Path, truth: Any = None, out: Path | None = None, *, align: bool = True, quiet: bool = False) -> None:

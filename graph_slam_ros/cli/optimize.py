@@ -54,7 +54,7 @@ def optimize_options(sub: CommandParser) -> None:
     sub.add_argument("--information", choices=("g2o", "raw"), default="g2o", help=about)
     sub.add_argument("--lenient", action="store_true", help="leave out bad lines, list them, exit with 3")
     arguments.add_json(sub, "the answer")
-    about = "write the solved graph, or its poses; a name without an ending: a run folder, for report, explain and map"
+    about = "write the solved graph, or its poses; another name: a run folder, for report, explain and map"
     sub.add_argument("--out", type=Path, metavar="FILE.g2o|FILE.tum|RUN", help=about)
     sub.add_argument("--plot", type=Path, metavar="FILE.png", help="draw the initial estimate and the result")
     arguments.add_force(sub)
@@ -153,8 +153,8 @@ def _after(args: argparse.Namespace, solution: "Solution") -> str:
 
 
 def _is_folder(out: Path | None) -> bool:
-    """Whether a run is written there: the name has no ending."""
-    return out is not None and not out.suffix
+    """Whether a run is written there: the name has no ending of a graph or of poses."""
+    return out is not None and not out.name.lower().removesuffix(".gz").endswith((".g2o", ".tum"))
 
 
 def _free(name: str) -> str:

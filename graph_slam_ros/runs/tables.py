@@ -225,7 +225,7 @@ def _accepted_by_input(slam: GraphSlam, first: int) -> Counter[str]:
 
 
 def _by_input(slam: GraphSlam, edges: Index) -> tuple[Counter[str], Counter[str]]:
-    """Those edges that are of landmarks, fixes and closures, by input: the accepted ones, and all."""
+    """Count those edges that are of landmarks, fixes and closures, by input: the accepted ones, and all."""
     graph, is_out = slam.graph, np.zeros(slam.graph.edge_count, dtype=bool)
     is_out[: len(slam.ledger)] = np.isin(slam.ledger.verdict.values, OUTSIDE)
     judged = edges[graph.has_label(edges, CANDIDATES)]
