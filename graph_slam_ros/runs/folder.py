@@ -104,12 +104,10 @@ def check_run(folder: Path) -> None:
     if is_recording(folder):
         what = "a recording" if folder.is_dir() else "a file"
         raise RunError(f"{folder}: not a run's folder, but {what}: {_MADE}")
-    runs = []
-    try:
+    runs = list[str]()
+    with contextlib.suppress(OSError):  # then none is named
         inside = itertools.islice(sorted(folder.iterdir()), _MOST_SEARCHED)
         runs = [str(one) for one in inside if one.is_dir() and is_run(one)][:_MOST_NAMED]
-    except OSError:  # then none is named
-        pass
     raise RunError(f"{folder}: not a run's folder" + (f"; in it there are runs: {', '.join(runs)}" if runs else ""))
 
 
@@ -298,8 +296,6 @@ def check_room(folder: Path, source: Path | None = None, *, force: bool = False)
                 raise RunError(f"{foreign[0]}: not written by this run, and so never removed: choose another folder")
             if not force and _holds_something(folder):
                 raise RunError(f"{folder}: holds a run already: choose another folder, or --force replaces it")
-        elif is_run(folder):
-            raise RunError(f"{folder}: a run of an earlier version, which is never replaced: choose another folder")
         elif not all(map(_is_unfinished, folder.iterdir())):
             raise RunError(f"{folder}: not empty and not an earlier run; nothing was written")
     except OSError as error:

@@ -24,6 +24,7 @@ _JUMPY, _MOST_JUMPS = 0.02, 5  # of all messages of an odometry; with more its m
 _MOSTLY = 0.5
 MOTION = ("odometry", "gyro")  # uses whose measurements nobody doubts one by one
 _DOUBTED = 0.05  # of an input: as many that are not believed are said; so it is of visits to places
+_TOO_WIDE = 1e-4  # chi2 per degree of freedom: sigmas are a hundred times as large as what they are of
 _FEWEST_LOST = 2  # visits that are lost, which are said
 VISITS = ("visit_condensed", "visit_lost", "visit_wider")  # in the counters of "map"
 _MENDED = (  # of what is noted, signs of a wrong setting
@@ -239,8 +240,20 @@ def shortcomings(summary: Summary) -> Iterator[str]:
             "this is odometry alone: no landmark, fix or closure is in the result; "
             "graph_slam check BAG says what of the recording cannot be used"
         )
-    elif summary["landmarks"] and summary["sightings"] == summary["landmarks"] and not causes:
+    yield from _without_effect(summary.get("noise", ()))
+    if summary["landmarks"] and summary["sightings"] == summary["landmarks"] and not causes:
         yield "no landmark was seen twice, so they correct nothing: do ids change? Each landmark needs its own"
+
+
+def _without_effect(noise: Collection[Mapping[str, Any]]) -> Iterator[str]:
+    """Yield the inputs with so much noise that odometry is not measured by anything, from ``Noise`` as dictionaries."""
+    measured = [one for one in noise if one["dof"] >= 1.0]
+    if all(one["label"] != "odometry" for one in measured):
+        for name in dict.fromkeys(one["source"] for one in measured if one["per_dof"] < _TOO_WIDE):
+            yield (
+                f"{name}: its noise is stated more than 100 times too large, so it corrects nothing, and this is "
+                f"odometry alone: --set {name}.noise=sigmas --set {name}.sigma_m=..."
+            )
 
 
 def contradicts(name: str, accepted: int, count: int) -> str:

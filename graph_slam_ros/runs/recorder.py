@@ -303,13 +303,8 @@ class RunRecorder:
             if self._is_ended:
                 return 0
             self._end_parts()
-            now = {
-                "keyframes": keyframes,
-                "ended": True,
-                "is_incomplete": bool(unprocessed or keyframes),
-                "unprocessed": unprocessed,
-                "load": self._load.as_dict(),
-            }
+            now = {"ended": True, "keyframes": keyframes, "unprocessed": unprocessed, "load": self._load.as_dict()}
+            now["is_incomplete"] = bool(unprocessed or keyframes)
             contents = summary_of(self.folder) | now | counted(counters) | self._ended_parts()
             _put(self.folder, SUMMARY, json.dumps(contents, indent=2) + "\n")
             self._is_ended = True

@@ -198,12 +198,8 @@ def record_run(
         summary |= ({"recording": recording} if recording else {}) | more()
         summary |= fitted_summary(slam)
         recorder.save(slam, summary)
-    except KeyboardInterrupt:
-        if recorder is not None:
-            recorder.discard()
-        raise
-    except BaseException:
-        if recorder is not None and recorder.accepted:
+    except BaseException as error:
+        if recorder is not None and recorder.accepted and not isinstance(error, KeyboardInterrupt):
             recorder.close()
         elif recorder is not None:  # the first that was read was refused
             recorder.discard()

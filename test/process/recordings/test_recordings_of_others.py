@@ -163,7 +163,6 @@ def written_ros1(path, robot, *rows, without=()):
 
 
 def converted(path, robot, *rows):
-    """What ``mcap convert`` makes of a ROS 1 bag."""
     with path.open("wb") as stream:
         writer = McapWriter(stream)
         writer.start(profile="ros1", library="mcap go")
@@ -216,7 +215,6 @@ def of_ros1(robot, t, i, p):
 
 
 def older(robot, i, at):
-    """Fields of a detection of Noetic and Foxy."""
     is_number = dict(robot.store.fielddefs[HYPOTHESIS][1])["id"][1][0] == "int64"
     fields = {"results": [robot.make(HYPOTHESIS, id=i if is_number else str(i), score=1.0, pose=at)]}
     return fields if is_number else fields | {"is_tracking": True, "tracking_id": str(i)}
@@ -384,6 +382,18 @@ def test_the_cause_alone_is_said_and_its_settings_mend_it(tmp_path, capsys):
         mended = settings[0] if name != "no transform" else "detections.mount=0.2 0 0.4 -1.5707963 0 -1.5707963"
         code, text = pasted(capsys, bag, folder / "mended", "--set", mended)
         assert code == 0 and error_m(Robot(), folder / "mended") < 0.1, text
+
+
+def much_noise(robot, i, at):
+    at.covariance[:] = 1e6 * np.eye(6).ravel()
+
+
+def test_sightings_of_which_the_noise_is_so_large_that_they_correct_nothing_are_named(tmp_path, capsys):
+    bag = driven(tmp_path, seen=lambda robot: robot.seen_rows(fields=much_noise))
+    for how, expected in (("message", 3), ("sigmas", 0)):
+        code, text = pasted(capsys, bag, tmp_path / how, "--set", f"detections.noise={how}")
+        assert code == expected and ("odometry alone: --set detections.noise=sigmas" in text) == (code == 3), text
+        assert (error_m(Robot(), tmp_path / how) < 0.1) == (code == 0), text
 
 
 def fix(robot, t, east, north):
