@@ -129,8 +129,9 @@ def _solved(file: G2oFile, settings: Settings, init: str, on_pose: OnPose = lamb
         done = solver.optimize(settings)
     except GraphSlamError as error:
         why = _NUMBERS.sub(lambda n: " ".join(str(file.ids[int(k)]) for k in n[0].split()), str(error))
-        if file.losses and isinstance(error, GaugeError | SingularError):  # the cause, not its consequence
-            why = f"{'; '.join(file.losses)}: without them {why.partition(': ')[0]}"
+        lacks = file.losses or ["it has no edges"] * (not file.graph.edge_count)
+        if lacks and isinstance(error, GaugeError | SingularError):  # the cause, not its consequence
+            why = f"{'; '.join(lacks)}: without them {why.partition(': ')[0]}"
         error.args = (why,)
         raise
     return Solution(file, solver, done, start, attempts=(Attempt(start, done.chi2_final, done.cost_final),))

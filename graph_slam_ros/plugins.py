@@ -17,7 +17,7 @@ EDGES = "graph_slam_ros.edges"  # of edge types: their tags in g2o files
 
 def names(group: str) -> dict[str, str]:
     """Return the names in a group with the distribution of each; nothing is imported."""
-    return {entry.name: _distribution(entry) for entry in _installed(group)}
+    return {entry.name: _distribution(entry) for entry in _installed(group, tuple(sys.path))}
 
 
 def described(group: str, built_in: Container[str], say: Callable[[str, str], str]) -> list[str]:
@@ -39,12 +39,8 @@ def described(group: str, built_in: Container[str], say: Callable[[str, str], st
     return lines
 
 
-def _installed(group: str) -> EntryPoints:
-    return _read(group, tuple(sys.path))
-
-
 @lru_cache(4)
-def _read(group: str, path: tuple[str, ...]) -> EntryPoints:
+def _installed(group: str, path: tuple[str, ...]) -> EntryPoints:
     return entry_points(group=group)
 
 
@@ -65,7 +61,7 @@ def load(group: str, name: str, check: Callable[[Any], str]) -> tuple[Any, str] 
     ConfigError
         It cannot be imported, is not what the group is for, or two distributions have the name.
     """
-    found = sorted(set(_installed(group).select(name=name)), key=_distribution)
+    found = sorted(set(_installed(group, tuple(sys.path)).select(name=name)), key=_distribution)
     if not found:
         return None
     if len(found) > 1:

@@ -149,10 +149,8 @@ _READ: dict[str, Translation] = {
     **{tag: _named(plain, 3) for tag, plain in SWITCHED.items()},
 }
 
-
 _G2O = ("VERTEX_SE2", "VERTEX_XY", "EDGE_SE2", "EDGE_SE2_XY", "EDGE_PRIOR_SE2", "EDGE_SE2_POSITION")
 _G2O_3D = ("VERTEX_SE3:QUAT", "VERTEX_TRACKXYZ", "EDGE_SE3:QUAT")
-
 _TAGS = {
     "g2o": frozenset({*_G2O, *_G2O_3D, "FIX"}),
     "toro": frozenset({"VERTEX2", "EDGE2", "VERTEX3", "EDGE3"}),
@@ -161,9 +159,6 @@ _TAGS = {
     "rows": frozenset({"VERTEX2", "EDGE2"}),
 }
 DIALECTS = tuple(_TAGS)
-
-
-# -- numbers ---------------------------------------------------------------------------------------------------------
 
 
 def symmetric(upper: Any) -> Array:

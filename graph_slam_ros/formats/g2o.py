@@ -29,6 +29,7 @@ from graph_slam_ros.typing import Array
 
 _RELATIVE = ("EDGE_SE2", "EDGE_SE3:QUAT")
 _CLASS = re.compile(r"#\s+(?:\d+\s+\d+\s+)?class\s+(\S+)\s*", re.ASCII)  # our comment, the label of what follows it
+_COMMENTS = ("%", "//", ";")  # begin lines of other programs' comments
 _UNIT = 1e-12  # a squared quaternion norm this near to 1 is left as it was written
 ERROR_MAPS = {"relative": graphs.RELATIVE_POSE, "seed": graphs.INVERSE_RELATIVE_POSE}
 
@@ -68,8 +69,8 @@ class _Reader:
         return edge_tags.plugin_tags()
 
     def read_line(self, line: int, text: str) -> None:
-        words = text.split()
-        if not words or words[0].startswith("#"):
+        words = text.partition("#")[0].split()
+        if not words or words[0].startswith(_COMMENTS):
             labelled = _CLASS.fullmatch(text.strip())
             self.label = labelled[1] if labelled else self.label
             return
@@ -113,18 +114,23 @@ class _Reader:
         m, from_offset = edge.residual_size, tag in AT_OFFSET
         sizes = edge.measured_size, edge.measured_size - len(edge.tail)  # the last may be left out
         head, upper = len(edge.accepts) + from_offset, np.triu_indices(m)
-        given, count = len(words) - 1 - head, len(upper[0])
-        is_bare = given in sizes and given - count not in sizes
-        size = given if is_bare else given - count if given - count in sizes else edge.measured_size
-        expect(words, head + size + count * (not is_bare))
-        self.bare += [line] * is_bare
+        given, counts = len(words) - 1 - head, (len(upper[0]), m * m, 0)  # upper triangle, whole matrix, none
+        count = next((count for count in counts if given - count in sizes), counts[0])
+        size = given - count if given - count in sizes else edge.measured_size
+        expect(words, head + size + count)
+        self.bare += [line] * (not count)
         vertices = tuple(integer(word) for word in words[1 : 1 + len(edge.accepts)])
         values = numbers(words[1 + head :])
         measured = _with_unit_quaternion(values[:size], _quaternion_at(edge))
         measured += edge.tail[size - edge.measured_size + len(edge.tail) :]
         offset = integer(words[head]) if from_offset else None
-        sigmas = HALVED[edge] if is_bare and edge in HALVED and not self.text.raw else np.ones(m)
+        sigmas = HALVED[edge] if edge in HALVED and not self.text.raw else np.ones(m)
         information = values[size:] or np.diag(sigmas**-2.0)[upper].tolist()
+        if count > len(upper[0]):
+            whole = np.reshape(information, (m, m))
+            if not np.allclose(whole, whole.T):
+                raise FormatError(f"its information has {count} numbers, and is not symmetric")
+            information = whole[upper].tolist()
         return _Edge(line, vertices, measured, information, self.label, offset)
 
     def declare_all(self) -> None:
@@ -247,14 +253,11 @@ class _Reader:
         return {edge_id: edge.offset for edge_id, edge in seen_from if edge.offset is not None}
 
     def _root(self, edge: _Edge, information: Array, lengths: int, is_prior: bool) -> Array | None:
-        """The root of one information matrix, repaired where print has rounded it; None if the edge is left out.
-
-        A prior may say nothing in some directions, as a sum of fixes does.
-        """
+        """The root of one information matrix, repaired where print has rounded it; None if the edge is left out."""
         try:
             return Gaussian.from_information(information).sqrt_information
         except NoiseError as error:
-            if is_prior:
+            if is_prior:  # as a sum of fixes, it may say nothing in some directions
                 with suppress(NoiseError):
                     return Gaussian.from_semidefinite(information).sqrt_information
             weighted = by_traces(information, lengths)

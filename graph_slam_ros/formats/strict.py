@@ -18,7 +18,7 @@ from graph_slam_ros.formats.files import opened
 
 # float() also accepts 1_0, inf, nan and digits of other scripts. No part can match what the one before it gave back:
 # time is linear in the length of a word.
-_NUMBER = re.compile(r"[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
+_NUMBER = re.compile(r"[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eEdD][+-]?\d+)?", re.ASCII)
 MOST_DIGITS = 1100
 """Characters of a number; the longest double, written out, has 1,077 of them."""
 MOST_LINE = 2**20
@@ -33,6 +33,7 @@ _STAMP = re.compile(r"\d{1,18}|[1-8]\d{18}", re.ASCII)
 _FOREIGN = {
     b"SQLite format 3": "a database. RTAB-Map's exports its graph: rtabmap-databaseViewer, File, Export poses, g2o",
     b"22 serialization::archive": "a Boost archive, as slam_toolbox's .posegraph: no text of vertices and edges",
+    b"\xff\xfe": "UTF-16: iconv -f utf-16 -t utf-8 makes UTF-8 of it",
     b"PK\3\4": "a zip archive: unzip it first",
     b"\x1f\x8b": "compressed: give it a name that ends in .gz (a .tar.gz: tar xf)",
     b"\x89MCAP": "a recording: graph_slam info prints how to replay it",
@@ -114,11 +115,12 @@ def stamp(word: str) -> int:
 
 
 def numbers(words: list[str]) -> list[float]:
-    """Finite numbers. Raises FormatError naming the first that is none."""
+    """Finite numbers; their exponents may be Fortran's (1.0D+00). Raises FormatError naming the first that is none."""
+    found = list[float]()
     for word in words:
-        if len(word) > MOST_DIGITS or not _NUMBER.fullmatch(word) or float(word) in (np.inf, -np.inf):
-            comma = (
-                ": a decimal comma; sed 's/,/./g' FILE > POINTS makes points of them" if _COMMA.fullmatch(word) else ""
-            )
+        is_number = len(word) <= MOST_DIGITS and _NUMBER.fullmatch(word)
+        found.append(float(word.replace("D", "e").replace("d", "e")) if is_number else np.inf)
+        if found[-1] in (np.inf, -np.inf):
+            comma = ": a decimal comma; sed 's/,/./g' FILE > POINTS makes points of them" * bool(_COMMA.fullmatch(word))
             raise FormatError(f"{shortened(word)} is not a finite number{comma}")
-    return [float(word) for word in words]
+    return found
