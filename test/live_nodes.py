@@ -24,7 +24,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from reliability import lenient
+from reliability import calm_s
 from std_srvs.srv import Trigger
 from vision_msgs.msg import Detection3DArray
 
@@ -38,7 +38,6 @@ LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability
 RELIABLE = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 PATIENCE_S = 10.0
 PUBLICATIONS = {one.name.removeprefix("~/"): one for one in topics.PUBLICATIONS}
-
 
 _HELD = contextlib.ExitStack()
 ENVIRONMENT = dict(
@@ -66,16 +65,16 @@ def server():
     return Server(ENVIRONMENT)
 
 
-def graph_slam(*words, timeout=60.0):
+def graph_slam(*words):
     """Run a command: what it said, and its exit code."""
-    return server().run(["graph_slam", *map(str, words)], ENVIRONMENT, lenient(timeout))
+    return server().run(["graph_slam", *map(str, words)], ENVIRONMENT, 600.0)
 
 
 def until(condition, spin, what, patience_s=PATIENCE_S, but=lambda: ""):
     """Poll for what must come to be; ``but`` tells what there is instead."""
-    deadline = time.monotonic() + lenient(patience_s)
+    deadline = calm_s() + patience_s
     while not condition():
-        assert time.monotonic() < deadline, f"no {what} in {patience_s} s {but()}"
+        assert calm_s() < deadline, f"no {what} in {patience_s} s {but()}"
         spin(0.02)
 
 
@@ -205,18 +204,18 @@ class Robot:
         """
         if name in self._is_known:
             return
-        deadline = time.monotonic() + lenient(6 * PATIENCE_S)
-        while True:
+
+        def is_answered():
             probe = self.node.create_client(GetState, f"{self._of}/get_state")
             until(probe.service_is_ready, self.spin, "service ~/get_state")
             future, again = probe.call_async(GetState.Request()), time.monotonic() + 2.0
             while not future.done() and time.monotonic() < again:
                 self.spin(0.005)
             self.node.destroy_client(probe)
-            if future.done():
-                self._is_known.update(self._clients)
-                return
-            assert time.monotonic() < deadline, "no answer of ~/get_state"
+            return future.done()
+
+        until(is_answered, self.spin, "answer of ~/get_state", 6 * PATIENCE_S)
+        self._is_known.update(self._clients)
 
     def spin(self, seconds=0.02):
         """Leave a thread of its own the time to hear."""
@@ -224,12 +223,12 @@ class Robot:
 
     def settle(self, seconds=0.3):
         """Hear what is on its way: nothing for so long, but for diagnostics, which never end."""
-        before, since = None, time.monotonic()
-        while time.monotonic() - since < lenient(seconds):
+        before, since = None, calm_s()
+        while calm_s() - since < seconds:
             self.spin()
             count = sum(len(heard) for topic, heard in self.heard.items() if topic != "diagnostics")
             if count != before:
-                before, since = count, time.monotonic()
+                before, since = count, calm_s()
 
     def wait_for_node(self):
         for topic, publisher in self.publishers.items():
@@ -320,17 +319,15 @@ class Started:
 
     def ended(self, timeout_s=PATIENCE_S):
         """Wait for its end by itself: (exit code, what it logged)."""
-        code = self.process.wait(timeout=lenient(timeout_s))
+        until(lambda: not self.is_alive, time.sleep, "end", timeout_s, lambda: self.said)
         self._reader.join()
         self.process.stderr.close()
-        return code, self.said
+        return self.process.returncode, self.said
 
     def stop(self, number=signal.SIGINT):
-        """(exit code, seconds it took)."""
-        start = time.monotonic()
+        """Tell it to stop: (exit code, what it logged)."""
         self.process.send_signal(number)
-        code, _ = self.ended()
-        return code, time.monotonic() - start
+        return self.ended()
 
 
 @contextlib.contextmanager

@@ -5,13 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from reliability import lenient
 
 from graph_slam_ros.runs.recorder import RunRecorder
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
 
 CHROMIUM = Path("/usr/bin/chromium")
-PATIENCE_S = 30.0
+PATIENCE_S = 120.0
 SOFTWARE = ["--use-gl=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
 HOSTILE = [
     "<script>document.title='broken'</script>",
@@ -42,7 +41,7 @@ def pages(browser, *, offline=True):
     def go(address, place="", **options):
         context = browser.new_context(offline=offline, viewport={"width": 1400, "height": 900}, **options)
         contexts.append(context)
-        context.set_default_timeout(1000.0 * lenient(PATIENCE_S))
+        context.set_default_timeout(1000.0 * PATIENCE_S)
         page = context.new_page()
         origin = address if offline else address.split("?")[0]
         page.on("console", lambda m: wrong.append(m.text) if m.type == "error" else None)

@@ -2,7 +2,9 @@
 
 import json
 import os
+import time
 from collections import Counter, defaultdict
+from pathlib import Path
 
 _TOLD = defaultdict(Counter)
 _WORST = defaultdict(dict)
@@ -46,6 +48,8 @@ def lines():
         yield " ".join(["RELIABILITY", name, *(f"{key}={number}" for key, number in numbers.items()), *worst])
 
 
-def lenient(seconds):
-    """A limit of time on an idle machine, or as much more as this one has more to do than it can."""
-    return seconds * max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
+def calm_s():
+    """A clock for limits of time: it hardly goes on while a process of this machine waits for a processor."""
+    pressure = Path("/proc/pressure/cpu")
+    waited_us = int(pressure.read_text().split("total=")[1].split()[0]) if pressure.exists() else 0
+    return time.monotonic() - 0.9e-6 * waited_us

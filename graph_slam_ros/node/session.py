@@ -211,11 +211,11 @@ class Session:
                 self._warn("output.folder", str(error))
         if self.estimate is None or self._fitted_at == self.slam.solves or time.perf_counter() < self._fit_due_s:
             return
-        start = time.perf_counter()
+        start = time.thread_time()
         now, dof = self.slam.solver.evaluate(), self.slam.solver.degrees_of_freedom
         self._fit = now.chi2_final / dof if dof > 0 else float("nan")
         self._doubted, self._fitted_at = doubted_lately(self.slam), self.slam.solves
-        self._fit_due_s = start + 50.0 * (time.perf_counter() - start)
+        self._fit_due_s = time.perf_counter() + 50.0 * (time.thread_time() - start)
         self.estimate = replace(self.estimate, fit=self._fit, doubted=self._doubted)
 
     def _keep_folder(self) -> None:
