@@ -99,7 +99,7 @@ class FoundFactors:
             corrections.found = before
             return None
         for rows, poses in origins:
-            self._origins.move(rows, poses)
+            self._origins.T_keyframe_base[rows] = poses
         self._anonymous.rescale(factors_of(values))
         self._backend.cancel_search()
         return report

@@ -33,7 +33,7 @@ from typing import Any, Literal
 import numpy as np
 
 from graph_slam_ros.slam.calibration.fit import TrialFit
-from graph_slam_ros.slam.calibration.parameters import OF_ODOMETRY, Parameter, Values
+from graph_slam_ros.slam.calibration.parameters import BEND, OF_ODOMETRY, Parameter, Values
 from graph_slam_ros.slam.frontend.corrections import AXES
 from graph_slam_ros.typing import Array
 
@@ -295,7 +295,7 @@ def uncorrected(
     out = []
     for one, value in values.items():
         sigma, shift = found.sigma(one), float(shifts[found.parameters.index(one)])
-        setting = setting_of(one, values, total)
+        setting = () if one in found.doubted else setting_of(one, values, total)
         text = sentence(one, value, sigma, ranges_instead(found, value, total, setting))
         text += ", more than its stated noise allows for (odometry.noise)" * (one.name in OF_ODOMETRY)
         out.append(Uncorrected(CODES[one.name], one.source, value, sigma, shift, text, setting))
@@ -309,7 +309,13 @@ def uncorrected(
 def is_off(found: TrialFit, one: Finding) -> bool:
     """Return whether a parameter is off beyond doubt, though its sigma may be too large to correct it."""
     is_known = one.verdict == "admitted" or (one.verdict == "not_determined" and is_certain(found, one.parameter))
+    is_known |= one.parameter.name == "distance" and _has_bends(found) and abs(one.value) > SIGMAS * one.sigma
     return is_known and (one.parameter.name not in _SIDES or abs(one.value) >= LEAST_M)
+
+
+def _has_bends(found: TrialFit) -> bool:
+    """Return whether the distance in bends is fitted, too, so that of straight ways is not what that makes of it."""
+    return any(one.name == BEND for one in found.doubted)
 
 
 def jumps(found: TrialFit) -> Iterator[tuple[str, Parameter, float, float, float, float]]:
@@ -358,6 +364,8 @@ def _too_sure(found: TrialFit, shifts: Array, sigma_per_m: float) -> list[Uncorr
 
 def ranges_instead(found: TrialFit, distance: float, total: Total, setting: tuple[str, Any] | tuple[()]) -> str:
     """Return the settings by which ranges are wrong, where the distance of odometry may be right; else its own."""
+    if _has_bends(found):
+        return f"{next(iter(found.doubted.values()))[2]}, so no setting corrects it"
     by = {one.source: total(one.source, "range_factor") for one in found.parameters if one.name == "yaw"}
     ranges = " ".join(f"--set {name}.range_factor={now / (1.0 + distance):.4g}" for name, now in by.items())
     return f"{ranges} instead of --set {setting[0]}={setting[1]}" if ranges and setting else ranges

@@ -33,13 +33,12 @@ from graph_slam_ros.slam.doubt.evidence import (
     carried,
     covariance_of,
 )
-from graph_slam_ros.slam.doubt.odometry_errors import NOISE_FACTOR, OdometryErrors, between
+from graph_slam_ros.slam.doubt.odometry_errors import NOISE_FACTOR, MeasuredNoise, OdometryErrors, between
 from graph_slam_ros.slam.doubt.record import Link, Slip
 from graph_slam_ros.slam.doubt.window import View, Window
 from graph_slam_ros.slam.frontend.keyframes import Keyframe
 from graph_slam_ros.slam.frontend.odometry_selector import JUMP_SIGMA_M, JUMP_SIGMA_RAD
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
-from graph_slam_ros.slam.measured_noise import MeasuredNoise
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array

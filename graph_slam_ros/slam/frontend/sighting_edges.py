@@ -57,10 +57,6 @@ class SightingEdges:
         where = (self._pose, T_keyframe_base, 1), (self._sensor, sensor, 1)
         Column.extend((self._edge, edge, 1), (self._stamp_ns, stamp_ns, 1), *where)
 
-    def move(self, rows: Index, T_keyframe_base: Array) -> None:
-        """Correct the poses of some rows."""
-        self.T_keyframe_base[rows] = T_keyframe_base
-
     def renumber(self, edges: Index) -> None:
         """Take over new ids of edges, by old ones; -1: it was removed."""
         new = edges[self.edge]
