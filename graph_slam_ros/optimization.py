@@ -2,8 +2,11 @@
 
 import re
 import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from reprlib import repr as shortened
 
 import numpy as np
 from scipy.special import chdtri
@@ -11,7 +14,7 @@ from scipy.special import chdtri
 from graph_slam_ros.errors import GaugeError, GraphSlamError, SingularError
 from graph_slam_ros.formats.g2o import read_g2o
 from graph_slam_ros.formats.graph_file import G2oFile
-from graph_slam_ros.graph import Graph
+from graph_slam_ros.graph import RELATIVE_POSE, RELATIVE_POSE_3D, EdgeType, Graph
 from graph_slam_ros.progress import report
 from graph_slam_ros.solver import Report, Settings, Solver, initial_values
 from graph_slam_ros.solver.initialization import OnPose
@@ -24,21 +27,26 @@ _UNEVEN, _SEVERAL = 10.0, 10  # mean over median of what so many closures or mor
 _NO_RESIDUAL = 1e-6  # chi2 for each number measured: less is rounding
 _MOST_TIMES, _MOST_S, _QUIET_S = 5.0, 10.0, 2.0  # of the first solution, and seconds, that others may take together
 _NUMBERS = re.compile(r"(?<=vertex )\d+|(?<=FIX )[\d ]*\d")  # of vertices in errors: to be the file's
-HINTS = _W_FIRST, _DEGREES, _COVARIANCE = (  # ends of a doubt that say what is wrong in the file
-    ": does w come first in its quaternions? g2o has qx qy qz qw",
-    ": are its angles in degrees? g2o has radians",
-    ": is a covariance given as information? g2o has its inverse",
+_COVARIANCE = "is a covariance given as information? g2o has its inverse"
+_W_FIRST = "does w come first in the quaternions of its {}? g2o has qx qy qz qw"
+_DEGREES = "are the angles of its {} in degrees? g2o has radians"
+_BACKWARDS = "do its {} lead from j to i? g2o has the pose of j as seen from i"
+_FIXED = "FIX of {} contradicts the edges, which all fit without: are these places wrong? g2o has true ones, or no FIX"
+_MISTAKES: tuple[tuple[str, EdgeType, Callable[[Array, Index], tuple[Array, Index]]], ...] = (  # and what undoes each
+    (_W_FIRST, RELATIVE_POSE_3D, lambda seen, ends: (seen[:, [0, 1, 2, 4, 5, 6, 3]], ends)),
+    (_DEGREES, RELATIVE_POSE, lambda seen, ends: (seen * (1.0, 1.0, np.pi / 180.0), ends)),
+    *((_BACKWARDS, edge, lambda seen, ends: (seen, ends[:, ::-1])) for edge in (RELATIVE_POSE, RELATIVE_POSE_3D)),
 )
+_TRIAL_ITERATIONS = 30
 _SAME = 1e-6  # part of the cost by which one optimum differs from start to start
 
 
 @dataclass(frozen=True, slots=True)
 class Attempt:
-    """The chi2 and cost from one start (``file``, ``tree``, ``chordal`` or ``online``); without them why it failed."""
+    """The chi2 from one start (``file``, ``tree``, ``chordal`` or ``online``); without it why that failed."""
 
     start: str
     chi2: float = float("nan")
-    cost: float = float("nan")
     failure: str = ""
 
 
@@ -134,7 +142,7 @@ def _solved(file: G2oFile, settings: Settings, init: str, on_pose: OnPose = lamb
             why = f"{'; '.join(lacks)}: without them {why.partition(': ')[0]}"
         error.args = (why,)
         raise
-    return Solution(file, solver, done, start, attempts=(Attempt(start, done.chi2_final, done.cost_final),))
+    return Solution(file, solver, done, start, attempts=(Attempt(start, done.chi2_final),))
 
 
 def _best_of(first: Solution, settings: Settings, first_s: float) -> Solution:
@@ -165,7 +173,38 @@ def _best_of(first: Solution, settings: Settings, first_s: float) -> Solution:
             best = other
         if not suspicion_of(best, settings):  # a good one is found
             break
-    return _judged(replace(best, suspicion=suspicion, attempts=tuple(attempts)), settings)
+    judged = _judged(replace(best, suspicion=suspicion, attempts=tuple(attempts)), settings)
+    is_open = judged.doubt and not judged.doubt.endswith(_COVARIANCE)
+    return _explained(judged, settings, began + most_s) if is_open else judged
+
+
+def _explained(solution: Solution, settings: Settings, until: float) -> Solution:
+    """The solution, with the mistake in its file if there is one without which all edges fit: that is tried."""
+    limited = replace(settings, max_iterations=_TRIAL_ITERATIONS)
+    for mistake, file in _without_mistakes(solution.file):
+        if time.perf_counter() > until:
+            break
+        with suppress(GraphSlamError, np.linalg.LinAlgError):
+            tried = _judged(_solved(file, limited, "chordal"), limited)
+            if not tried.doubt:
+                return replace(solution, doubt=f"{solution.doubt}: {mistake}")
+    return solution
+
+
+def _without_mistakes(file: G2oFile) -> Iterator[tuple[str, G2oFile]]:
+    """Mistakes that may be in a file, of all edges or of a class, and the file without each."""
+    labels = file.graph.labels
+    if len(file.fixed) > 1 or (file.fixed and "priors" in labels):
+        yield _FIXED.format(shortened([file.ids[v] for v in file.fixed])[1:-1]), replace(file, fixed=[])
+    for mistake, edge, undo in _MISTAKES:
+        for label in ["edges", *labels] if edge in file.graph.tables else []:
+            graph = file.graph.copy()
+            table = graph.tables[edge]
+            rows = np.flatnonzero(graph.has_label(table.id.values, labels if label == "edges" else [label]))
+            if len(rows):
+                undone = undo(table.measured.values[rows], table.vertices.values[rows])
+                table.measured.values[rows], table.vertices.values[rows] = undone
+                yield mistake.format(label), replace(file, graph=graph)
 
 
 def suspicion_of(solution: Solution, settings: Settings) -> str:
@@ -175,9 +214,7 @@ def suspicion_of(solution: Solution, settings: Settings) -> str:
     chi2, numbers = solver.chi2_of(closures)
     each = chi2 / numbers
     is_uneven = len(each) >= _SEVERAL and each.mean() > max(_UNEVEN * float(np.median(each)), _NO_RESIDUAL)
-    doubt = _judged(solution, settings).doubt or (
-        "a few closures have nearly all of the residuals" if is_uneven else ""
-    )
+    doubt = _judged(solution, settings).doubt or "a few closures have nearly all of the residuals" * bool(is_uneven)
     return "" if doubt.endswith(_COVARIANCE) else doubt
 
 
@@ -193,27 +230,18 @@ def _judged(solution: Solution, settings: Settings) -> Solution:
     some = [np.square(graph.edge(edge).sqrt_information).sum(axis=0).mean() for edge in edges[:1000].tolist()]
     stated = float(np.median(some)) if some else 0.0  # in a covariance, about as large as squared residuals
     if not solution.report.converged:
-        doubt = f"it did not converge ({solution.report.stop}){_likely_mistake(solution.file, edges)}"
+        doubt = f"it did not converge ({solution.report.stop})"
     elif 2 * gone > has_loss.sum():
         doubt = f"the loss lets go of {gone} of {has_loss.sum()} edges"
     elif freedom > 0 and kept > max(_FAR_ABOVE * freedom, chdtri(freedom, _UNLIKELY)):
-        doubt = f"chi2 {kept:.6g} is far above its {freedom} degrees of freedom{_likely_mistake(solution.file, edges)}"
+        doubt = f"chi2 {kept:.6g} is far above its {freedom} degrees of freedom"
     elif freedom > 0 and _ALIKE * stated**2 < kept / freedom < 1e-3:
-        doubt = f"chi2 {solution.report.chi2_final:.6g} is far below its {freedom} degrees of freedom{_COVARIANCE}"
+        doubt = f"chi2 {solution.report.chi2_final:.6g} is far below its {freedom} degrees of freedom: {_COVARIANCE}"
     elif len(far):
         worst = far[np.argmax(chi2[far] / numbers[far])]
         what = f"{len(far)} residuals are far outside" if len(far) > 1 else "a residual is far outside"
         doubt = f"{what} of their noise, e.g. {edge_text(solution.file, int(edges[worst]))} with chi2 {chi2[worst]:.4g}"
     return replace(solution, doubt=doubt, let_go=gone)
-
-
-def _likely_mistake(file: G2oFile, edges: Index) -> str:
-    """A mistake that the first edges show: w first, if most turn half around x; degrees, if an angle is above 7."""
-    some = [file.graph.edge(int(edge)) for edge in edges[:1000]]
-    turned = [one for one in some if len(one.measured) == 7 and abs(one.measured[3]) > abs(one.measured[6])]
-    if 2 * len(turned) > len(some):
-        return _W_FIRST
-    return _DEGREES if any(one.type.name == "relative pose" and abs(one.measured[2]) > 7.0 for one in some) else ""
 
 
 def edge_text(file: G2oFile, edge: int) -> str:

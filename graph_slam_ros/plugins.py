@@ -23,9 +23,7 @@ def names(group: str) -> dict[str, str]:
 def described(group: str, built_in: Container[str], say: Callable[[str, str], str]) -> list[str]:
     """Return a line for each plugin of a group, by name, that ``say`` makes of name and distribution, or its fault.
 
-    Parameters
-    ----------
-    built_in : names of which plugins are not used
+    Plugins of names that are ``built_in`` are not used.
     """
     lines = []
     for name, distribution in sorted(names(group).items()):
@@ -45,21 +43,10 @@ def _installed(group: str, path: tuple[str, ...]) -> EntryPoints:
 
 
 def load(group: str, name: str, check: Callable[[Any], str]) -> tuple[Any, str] | None:
-    """Import what a plugin has under a name.
+    """Import what a plugin has under a name: the object, and the words that name it; None where there is none.
 
-    Parameters
-    ----------
-    check : what is wrong with the object, in words; empty where nothing is
-
-    Returns
-    -------
-    tuple or None
-        The object, and the words that name the plugin and its distribution; None where no plugin has the name.
-
-    Raises
-    ------
-    ConfigError
-        It cannot be imported, is not what the group is for, or two distributions have the name.
+    ``check`` says what is wrong with the object. Raises ConfigError: it cannot be imported, is not what the group is
+    for, or two distributions have the name.
     """
     found = sorted(set(_installed(group, tuple(sys.path)).select(name=name)), key=_distribution)
     if not found:

@@ -128,12 +128,10 @@ def compile_all(
 
 
 def _missing(dimensions: int) -> list[str]:
-    """The parts that are not compiled."""
     return [part for part in list(_PARTS)[:dimensions] if not (CACHE_DIR / f"complete-{part}").exists()]
 
 
 def _refuse_failure(code: int, errors: bytes) -> None:
-    """Raise where a part could not be compiled."""
     if code:
         why = errors.decode(errors="replace").strip().splitlines()[-1:] or [f"exit code {code}"]
         remedy = "GRAPH_SLAM_CACHE names a folder with 100 MB of room"

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 STARTS = {"file": "the file", "tree": "the spanning tree", "chordal": "the chordal relaxation"}
 STARTS["online"] = "the drive, pose after pose"
 _MOST_TRIAL_S = 10.0
+_RIGHT = "? g2o has "  # ends the question of a doubt that one mistake explains
 _OTHER_TAG = "give what is lost a tag that is read, and its information (docs/graphs.md)"
 
 
@@ -66,8 +67,8 @@ def optimize(args: argparse.Namespace) -> int:
     from graph_slam_ros.formats.g2o_writer import write_g2o
     from graph_slam_ros.formats.strict import ending
     from graph_slam_ros.formats.tum import write_trajectory
-    from graph_slam_ros.optimization import HINTS, started
     from graph_slam_ros.optimization import optimize as solve
+    from graph_slam_ros.optimization import started
     from graph_slam_ros.runs.folder import GRAPH, check_room, is_run
     from graph_slam_ros.warmup import compile_all
 
@@ -107,7 +108,7 @@ def optimize(args: argparse.Namespace) -> int:
         (write_trajectory if ending(args.out) == ".tum" else write_g2o)(args.out, file, solver.estimate)
     for note in file.notes:
         console.warn(note)
-    is_open = report.converged and _loss_text(args.loss) == "none" and not (makes_run or solution.doubt.endswith(HINTS))
+    is_open = report.converged and _loss_text(args.loss) == "none" and not (makes_run or _RIGHT in solution.doubt)
     beware = [solution.doubt + _why(after) * is_open] if solution.doubt else []
     lost = console.report_losses(file.losses, beware)
     if after:
@@ -132,11 +133,10 @@ def _why(after: str) -> str:
 
 def _after(args: argparse.Namespace, solution: "Solution") -> str:
     from graph_slam_ros.formats.strict import ending
-    from graph_slam_ros.optimization import HINTS
 
-    is_wrong = solution.doubt.endswith(HINTS)
-    if is_wrong or (solution.file.losses and not args.lenient):
-        what = f"write {solution.doubt.rpartition('g2o has ')[2]} in the file" if is_wrong else _OTHER_TAG
+    right = solution.doubt.partition(_RIGHT)[2]
+    if right or (solution.file.losses and not args.lenient):
+        what = f"write {right} in the file" if right else _OTHER_TAG
         return f"{what}, then {console.command('optimize', args.graph, *_options(args))}"
     if _is_folder(args.out):
         return f"{console.command('report', args.out)} (one page: the map, and why each edge is in or out)"

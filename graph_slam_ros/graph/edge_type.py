@@ -172,18 +172,23 @@ def check_edge(
         at = f"at vertices {[v.tolist() for v in values]} and measured {z.tolist()}"
         if not (np.isfinite(residual).all() and np.isfinite(jacobian).all()):
             raise GraphSlamError(f"{edge.name}: not finite {at}")
-        numeric = numeric_jacobian(edge, values, z)
-        off = np.abs(jacobian[0] - numeric)
-        if off.max() > tolerance * max(1.0, float(np.abs(numeric).max())):
-            row, column = np.unravel_index(int(off.argmax()), off.shape)
-            raise GraphSlamError(
-                f"{edge.name}: Jacobian[{row}, {column}] is {jacobian[0, row, column]:.6g}, the residual's derivative"
-                f" {numeric[row, column]:.6g} {at}"
-            )
+        if fault := jacobian_fault(edge, values, z, tolerance):
+            raise GraphSlamError(f"{edge.name}: {fault} {at}")
     together = _linearized(edge, trials)
     for e, one in enumerate(alone):
         if not all(np.allclose(a[e], b[0], rtol=1e-9, atol=1e-12) for a, b in zip(together, one, strict=True)):
             raise GraphSlamError(f"{edge.name}: edges linearised in one call are not what each is alone")
+
+
+def jacobian_fault(edge: EdgeType, values: tuple[Array, ...], measured: Array, tolerance: float) -> str:
+    """Return where the Jacobian of one edge is not the derivative of its residual; empty where it is."""
+    jacobian, numeric = _linearized(edge, [(values, measured)])[1][0], numeric_jacobian(edge, values, measured)
+    off = np.abs(jacobian - numeric)
+    row, column = np.unravel_index(int(off.argmax()), off.shape)
+    if not off[row, column] > tolerance * max(1.0, float(np.abs(numeric).max())):  # also where it is not finite
+        return ""
+    ours, true = jacobian[row, column], numeric[row, column]
+    return f"Jacobian[{row}, {column}] is {ours:.6g}, the residual's derivative {true:.6g}"
 
 
 def random_value(kind: VertexKind, rng: np.random.Generator) -> Array:

@@ -239,7 +239,6 @@ class Graph:
         return np.sort(np.concatenate(found))
 
     def _register(self, table: EdgeTable, label: str, source: str) -> None:
-        """Append what is new: a table, the name of a class, that of an input."""
         if table.code == len(self.tables):
             self._in_order[table.code :] = [table]  # also where this was interrupted before
             self.tables[table.type] = table
@@ -249,7 +248,6 @@ class Graph:
                 names.append(name)
 
     def _lengthen(self, *columns: tuple[Column, int]) -> None:
-        """Make room for so many rows."""
         try:
             for column, rows in columns:
                 column.lengthen(rows)
@@ -265,7 +263,6 @@ class Graph:
 
     @staticmethod
     def _refuse_shapes(edge: EdgeType, at: Index, measured: Array) -> None:
-        """Raise GraphSlamError for vertices and measurements that are not (n, k) and (n, p)."""
         for what, given, size in (("vertices", at, len(edge.accepts)), ("measurements", measured, edge.measured_size)):
             if given.ndim != 2 or given.shape[1] != size:
                 shape = tuple(given.shape)
@@ -273,7 +270,6 @@ class Graph:
         raise GraphSlamError(f"{edge.name}: {len(at)} edges but {len(measured)} measurements")
 
     def _refuse_unfit(self, edge: EdgeType, at: Index, measured: Array, fault: int, row: int, slot: int) -> None:
-        """Raise GraphSlamError for an edge (``misfit``)."""
         vertex = int(at[row, slot])
         if fault == NOT_FINITE:
             raise GraphSlamError(
@@ -287,7 +283,6 @@ class Graph:
         raise GraphSlamError(f"{edge.name}: vertex {vertex} is {self.kind_of(vertex).name}, not {kind}")
 
     def _accepted_by(self, edge: EdgeType) -> Mask:
-        """Return whether each slot of an edge takes each kind, (slots, kinds)."""
         found = self._accepted.get(edge)
         if found is None or found.shape[1] != len(self.kinds):
             rows = [[kind in kinds for kind in self.kinds] for kinds in edge.accepts]

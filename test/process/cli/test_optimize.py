@@ -134,7 +134,6 @@ def test_a_graph_of_edges_alone_is_solved_from_its_tree_and_says_so(run, tmp_pat
 
 
 BROKEN = {
-    "malformed": ("VERTEX_SE2 1 2\n", "small.g2o:10"),
     "undetermined": ("VERTEX_SE2 6 0 0 0\nEDGE_SE2_XY 6 9 1 1 1 0 1\n", "do not determine vertex"),
     "overflow": ("VERTEX_SE2 6 1e200 0 0\nEDGE_SE2 5 6 1 0 0 4 0 0 4 0 4\n", r"not finite"),
 }
