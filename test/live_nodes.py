@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+import json
 import os
 import signal
 import subprocess
@@ -52,6 +53,10 @@ def often(times):
 
 def results(folder):
     return {name: (folder / name).read_bytes() for name in RESULTS}
+
+
+def numbers(folder):
+    return json.loads((folder / "run.json").read_text())
 
 
 def replayed(run, tmp_path):
@@ -273,13 +278,8 @@ class Robot:
         self.context.try_shutdown()
 
 
-@contextlib.contextmanager
 def robot(**options):
-    r = Robot(**options)
-    try:
-        yield r
-    finally:
-        r.close()
+    return contextlib.closing(Robot(**options))
 
 
 MODULE = [sys.executable, "-m", "graph_slam_ros.node.node"]

@@ -57,6 +57,7 @@ REASONS: dict[str, Reason] = {
     "before_odometry": _refused("it is older than all odometry", "begin with odometry; INPUT.offset_s"),
     "after_odometry": _refused("it is newer than the last odometry", "end with odometry; INPUT.offset_s"),
     "frozen": _noted("the robot moved past landmarks while odometry stood still", "its driver hangs, or it was towed"),
+    "clock_set": _repaired("a clock was set: corrected", "one clock"),
     "odometry_gap": _refused("odometry was silent, or jumped, then", "find out why its driver paused"),
     "overflow": _refused("too many messages waited", "inputs.queue of a node, ordering.max_waiting"),
     "duplicate": _noted("the same message has come before"),
@@ -105,9 +106,7 @@ REASONS: dict[str, Reason] = {
     "jump": _noted(
         "odometry jumped, a segment begins; of tf: a correction", "odometry.max_speed_m_s; tf.report_jump_m"
     ),
-    "other_publisher": _refused(
-        "it does not continue the odometry in use: another's, or an outlier", "one publisher: ros2 topic info -v TOPIC"
-    ),
+    "other_publisher": _refused("it does not continue the odometry in use", "one publisher: ros2 topic info -v TOPIC"),
     "reset_to_zero": _noted("odometry was set back to zero: a new segment begins"),
     # -- landmarks
     "no_id": _refused("the detection has no identity", "landmarks.association=joint"),

@@ -150,7 +150,6 @@ class MapView:
 
     @property
     def _sighting_rows(self) -> Index:
-        """The row of the keyframe of each sighting."""
         return self.sighting_poses.ids - self.first_keyframe
 
     def _motions(self, keyframes: Index) -> Numbers:

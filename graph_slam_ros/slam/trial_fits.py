@@ -121,7 +121,8 @@ class TrialFits:
         path, origins, factors = self._frontend.path, self._landmarks.origins, self._frontend.corrections.factors
         problem = self._backend.trial_problem(self._config.space, path, origins, factors)
         slips = self._kidnaps.slipped(path.keyframes)
-        return replace(problem, first_edge=max(problem.first_edge, self._first_edge), slips=slips)
+        set_s = {Parameter(topic, "clock"): by_ns * 1e-9 for topic, by_ns in self._frontend.order.set_ns.items()}
+        return replace(problem, first_edge=max(problem.first_edge, self._first_edge), slips=slips, set_s=set_s)
 
     def fit(self, groups: Sequence[str], *, places: bool, is_to_correct: bool) -> tuple[TrialFit, list[Finding]]:
         """Fit the map as it is now, as of ``GraphSlam.trial_fit``."""
@@ -150,7 +151,6 @@ class TrialFits:
         )
 
     def _stated(self) -> float:
-        """The stated noise of odometry's way for each metre."""
         return stated_sigma_per_m(self._config.space, self._graph, max(self._backend.first_free_edge, self._first_edge))
 
     # -- what they find ----------------------------------------------------------------------------------------------
@@ -209,7 +209,6 @@ class TrialFits:
         return self._so_far[1]
 
     def _compute(self) -> None:
-        """Compute the newest trial whose outcome counts."""
         keyframe = len(self._frontend.path.keyframes) - 1
         ready = [job for begins, job in self._jobs if begins <= keyframe]
         if not ready:

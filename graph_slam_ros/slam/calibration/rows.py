@@ -5,7 +5,7 @@ correction, between two keyframes whose steps move it. So a clock may be off by 
 """
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import groupby
 from operator import attrgetter
 from typing import Any
@@ -43,6 +43,7 @@ class TrialProblem:
     first_edge : edges before are of a map that is held, and not corrected
     slips : of each stretch in which odometry counts for less, its edges, each with the one that replaces it
     is_noise_measured : as of ``MeasurementModel``
+    set_s : what stamps were corrected by since a clock was set on the way
     """
 
     space: Geometry
@@ -59,6 +60,7 @@ class TrialProblem:
     first_edge: int
     slips: tuple[tuple[tuple[int, int], ...], ...] = ()
     is_noise_measured: bool = False
+    set_s: Values = field(default_factory=dict)
 
     def without_slips(self) -> "TrialProblem":
         """The same with odometry as it was stated, in a copy of the graph."""
@@ -280,7 +282,6 @@ class Linearization:
         return Rows(*here, *each)
 
     def _sparse(self, ends: Index, jacobian: Array, dofs: Sequence[int]) -> sparse.csr_matrix:
-        """The Jacobians of some edges in the columns of their unknowns."""
         n, m, width = jacobian.shape
         slots, within = np.repeat(np.arange(len(dofs)), dofs), np.concatenate([np.arange(d) for d in dofs])
         begin = self.column[ends][:, slots]
@@ -313,7 +314,6 @@ class Linearization:
 
 
 def _beside(values: Values, parameter: Parameter) -> tuple[Values, Values]:
-    """The same values with one a little larger, and smaller."""
     plus, minus = (values.get(parameter, 0.0) + side for side in (_PROBE, -_PROBE))
     return {**values, parameter: plus}, {**values, parameter: minus}
 
@@ -329,14 +329,12 @@ def _adjoints(space: Geometry, poses: Any) -> Array:
 
 
 def _by_table(blocks: Iterable[Block]) -> Iterator[Block]:
-    """Join the blocks of each table, which follow one another."""
     for table, some in groupby(blocks, key=attrgetter("table")):
         columns = zip(*((one.rows, one.residual, one.jacobian, one.chi2, one.cost) for one in some), strict=True)
         yield Block(table, *map(np.concatenate, columns))
 
 
 def _weighted_edges(problem: TrialProblem) -> Index:
-    """Edges of the problem that have a weight."""
     graph = problem.graph
     inside = np.zeros(graph.vertex_count, dtype=bool)
     inside[problem.vertices] = True

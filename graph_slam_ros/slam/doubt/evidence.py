@@ -211,7 +211,6 @@ class Stretch:
         return Choice(best.kind, first, ratio, voters, is_sure, 1.0 - unfit / max(1, len(since)))
 
     def _end(self, one: Hypothesis, without: int | str | None = None) -> _State:
-        """The state at the end of the stretch."""
         begin = one.first if without is None else 0
         state = self._states[begin].copy()
         for k in range(begin, self.size):
@@ -267,7 +266,6 @@ class Stretch:
         state.cost += statistic + 2.0 * float(np.log(root.diagonal()).sum()) + seen.constant
 
     def _stepped(self, x: Array, step: Array) -> Array:
-        """Stored numbers after a step of all errors."""
         out = np.empty_like(x)
         for kind, stored, columns in self._kinds:
             out[stored] = kind.retract(x[stored], step[columns])

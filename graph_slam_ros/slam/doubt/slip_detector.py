@@ -314,7 +314,6 @@ class SlipDetector:
     # -- the graph: the ledger has both edges ------------------------------------------------------------------------
 
     def _replace(self, links: Sequence[Link], slip: Slip, keyframe: int) -> None:
-        """Replace odometry edges by edges with more noise."""
         backend, threshold = self._backend, -2.0 * LOG_ODDS
         for link in links:
             old, added = backend.graph.edge(link.own), _variances(self._space, slip.kind, np.array(link.seconds))
@@ -328,7 +327,6 @@ class SlipDetector:
         self.slips[-1] = replace(slip, edges=slip.edges + len(links))
 
     def _restore(self, pairs: Iterable[Pair], keyframe: int, gain: float) -> None:
-        """Undo ``_replace``."""
         backend, links = self._backend, {link.own: link for link in self._window.links.values()}
         for own, replacement in pairs:
             backend.decisions.withdraw([replacement], keyframe, Reason.REVOKED)
@@ -341,7 +339,6 @@ class SlipDetector:
 
 
 def _first_of(links: Sequence[Link], view: View) -> int:
-    """The first link after a view, by its place."""
     return next((k for k, link in enumerate(links) if link.vertices[0] >= view.vertex), len(links) - 1)
 
 

@@ -192,7 +192,6 @@ class GyroState:
 
 
 def _cause(ratio: float | None, name: str) -> str:
-    """The likely cause of a ratio of turns, and what mends it."""
     mount = f"its TF, or {name}.mount where there is none"
     if ratio is not None and abs(ratio) > 1.0 / _GROSS:
         return "It must be in rad/s: are these degrees? Correct its driver"

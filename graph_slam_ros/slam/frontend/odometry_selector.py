@@ -17,6 +17,7 @@ _AT_ZERO = 1e-9  # [m, rad]
 _RESET_M, _RESET_RAD, _UNUSUAL = 0.1, 0.1, 3.0
 _LEAST_S = 0.02  # stamps of some drivers crowd together: a pair of them says nothing of speed
 _GAP, _LEAST_GAP_NS = 10.0, 2_000_000_000  # times the usual period, at least; recorded robots pause for 1.4 s
+_FASTER, _FROM_REST_M_S = 2.0, 2.0  # times the speed before a gap, at least so much: more, and its driver began anew
 _REMEMBERED = 1000  # messages of a source that is not in use, to take over from where the one in use fell silent
 
 
@@ -150,7 +151,8 @@ class OdometrySelector:
     def _follow(self, a: Odometry, b: Odometry) -> Step:
         step = self._space.group.between_one(a.T_odom_base, b.T_odom_base)
         dt_ns = b.stamp_ns - a.stamp_ns
-        how = self._jumps.kind(step, b.T_odom_base, dt_ns * 1e-9, self._last_step, is_gap=dt_ns > self._longest_ns)
+        usual_s = self._usual_ns * 1e-9 if dt_ns > self._longest_ns else 0.0
+        how = self._jumps.kind(step, b.T_odom_base, dt_ns * 1e-9, self._last_step, usual_s)
         return self._use(b, step, broken=how)
 
     def _use(self, m: Odometry, step: Numbers, *, broken: str) -> Step:
@@ -176,7 +178,7 @@ class OdometryJumps:
     def __init__(self, config: OdometryConfig, space: Geometry) -> None:
         self._config, self._space = config, space
 
-    def kind(self, motion: Numbers, T_odom_base: Numbers, dt: float, last: Numbers, *, is_gap: bool = False) -> str:
+    def kind(self, motion: Numbers, T_odom_base: Numbers, dt: float, last: Numbers, usual_s: float = 0.0) -> str:
         """Return ``reset_to_zero`` or ``jump``; empty if a robot can move like this.
 
         Parameters
@@ -184,11 +186,15 @@ class OdometryJumps:
         motion, dt : from the message before [s]
         T_odom_base : where odometry is now
         last : the motion before
-        is_gap : odometry was silent for so long that its driver may have restarted, and driven on since
+        usual_s : time of the motion before, where odometry was silent for so long since that its driver may have
+            restarted, and driven on; else 0
         """
-        if self._is_reset(motion, T_odom_base, last, is_gap=is_gap):
+        if self._is_reset(motion, T_odom_base, last, is_gap=usual_s > 0.0):
             return "reset_to_zero"
-        is_jump = self._space.square(motion) > (self._config.max_speed_m_s * max(dt, _LEAST_S)) ** 2
+        most_m_s = self._config.max_speed_m_s
+        if usual_s:
+            most_m_s = min(most_m_s, max(_FROM_REST_M_S, _FASTER * self._size(last)[0] / usual_s))
+        is_jump = self._space.square(motion) > (most_m_s * max(dt, _LEAST_S)) ** 2
         return "jump" if is_jump else ""
 
     def _is_reset(self, motion: Numbers, T_odom_base: Numbers, last: Numbers, *, is_gap: bool) -> bool:
@@ -202,5 +208,4 @@ class OdometryJumps:
         return (is_at_zero and (is_far or far_rad > most_rad)) or (at_m <= _AT_ZERO and is_far)
 
     def _size(self, pose: Numbers) -> tuple[float, float]:
-        """Return the size of a motion in metres and radians."""
         return math.hypot(*pose[: self._space.dimensions]), self._space.angle(pose)

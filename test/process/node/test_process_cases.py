@@ -2,7 +2,6 @@
 
 import contextlib
 import itertools
-import json
 import subprocess
 import sys
 import threading
@@ -10,7 +9,7 @@ import threading
 import numpy as np
 import pytest
 from live_drive import Drive, distance
-from live_nodes import ENVIRONMENT, replayed, results, robot, until
+from live_nodes import ENVIRONMENT, numbers, replayed, results, robot, until
 from rclpy.clock import ClockType, JumpThreshold
 from rclpy.context import Context
 from rclpy.duration import Duration
@@ -93,7 +92,7 @@ def counted(r, name, reason):
 
 def faults(run):
     """What callbacks raised, by what was saved."""
-    return json.loads((run / "run.json").read_text())["counters"].get("node", {})
+    return numbers(run)["counters"].get("node", {})
 
 
 def test_P9_P10_P17_where_a_solve_does_not_end_it_says_so_refuses_what_is_too_much_and_goes_on(tmp_path, monkeypatch):
@@ -194,7 +193,7 @@ def test_A37_P6_behind_it_tells_what_there_is_and_stopped_then_the_next_start_ma
     records = list(read_ingest(run, losses := []))
     odometry = [one["stamp_ns"] for one in records if one["type"] == "odometry"]
     assert losses == [] and len(odometry) >= used > 10
-    summary = json.loads((run / "run.json").read_text())
+    summary = numbers(run)
     assert summary["ended"] and summary["unprocessed"] > 0 and max(summary["load"]["backlog"]) > 0
     assert is_incomplete(run) and not is_cut_off(run), "somebody ended it"
     recover(run, tmp_path / "recovered")

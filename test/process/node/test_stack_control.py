@@ -1,7 +1,6 @@
 """The node as others handle it: transitions, signals, parameters, services; in turn, out of turn, at any moment."""
 
 import functools
-import json
 import math
 import random
 import shutil
@@ -15,7 +14,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from live_drive import TAGS, Drive, earlier_run
-from live_nodes import ENVIRONMENT, MODULE, finish, node, often, replayed, results, robot, server, until
+from live_nodes import ENVIRONMENT, MODULE, finish, node, numbers, often, replayed, results, robot, server, until
 from messages import detection, detections, pose, posed, quaternion
 from rcl_interfaces.msg import Parameter, ParameterValue
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
@@ -32,10 +31,6 @@ from graph_slam_ros.runs.journal import read_ingest
 from graph_slam_ros.slam import Control
 
 SERVICES = "save", "load", "reset", "pause", "resume", "optimize", "clear_closures"
-
-
-def numbers(folder):
-    return json.loads((folder / "run.json").read_text())
 
 
 def accepted(folder):

@@ -1,15 +1,9 @@
 """The map of a running node: held while the robot is located in it, edited by hand, saved by name and loaded."""
 
-import json
-
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from live_drive import Drive, distance
-from live_nodes import finish, node, replayed, results, robot, until
+from live_nodes import finish, node, numbers, replayed, results, robot, until
 from std_msgs.msg import String
-
-
-def counters(folder):
-    return json.loads((folder / "run.json").read_text())["counters"]
 
 
 def places(message):
@@ -66,7 +60,7 @@ def test_the_map_is_held_and_edited_while_the_node_runs_and_a_robot_that_was_car
     assert n.said.count(f"~/remove: landmark nobody: {why}") == 2, "each time"
     assert f"~/remove: landmark {min(held)}" not in n.said
     assert n.said.count("initialpose: not used: ") == 2, "each time"
-    assert counters(tmp_path / "run")["edit"] == {"removed": 1, "unknown_landmark": 3}
+    assert numbers(tmp_path / "run")["counters"]["edit"] == {"removed": 1, "unknown_landmark": 3}
     assert replayed(tmp_path / "run", tmp_path) == results(tmp_path / "run")
 
 

@@ -1,10 +1,9 @@
 """The node with a clock of its own: played, paused, jumping, played again and again."""
 
 import itertools
-import json
 
 from live_drive import TAGS, Drive
-from live_nodes import finish, node, often, replayed, results, robot, until
+from live_nodes import finish, node, numbers, often, replayed, results, robot, until
 from rosgraph_msgs.msg import Clock
 
 NS = 10**9
@@ -39,10 +38,6 @@ def stamps(r):
 
 def is_ascending(numbers):
     return all(b > a for a, b in itertools.pairwise(numbers))
-
-
-def numbers(folder):
-    return json.loads((folder / "run.json").read_text())
 
 
 def parameters(folder):
