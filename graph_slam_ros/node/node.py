@@ -356,7 +356,6 @@ def _run() -> int:
 
 
 def _started(node: GraphSlamNode, stop: _StopRequest) -> bool:
-    """Configure and activate."""
     for trigger in (node.trigger_configure, node.trigger_activate):
         if stop.is_set:
             return True

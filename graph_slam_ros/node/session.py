@@ -4,6 +4,7 @@ The main thread accepts measurements (``accept``) in the order in which it passe
 worker does everything else. It replaces ``estimate`` as a whole, which other threads read.
 """
 
+import os
 import threading
 import time
 from collections import deque
@@ -153,7 +154,7 @@ class Session:
         self._slowest_s = max(self._slowest_s, solve_s) if update.solved else self._slowest_s
         recorded = self._recorded(lambda recorder: recorder.record(self.slam, update))
         if self._recorded(RunRecorder.flush) and recorded:  # nothing is published that a restart would not know
-            self.recording_fails = False
+            self.recording_fails = self._folder is None or not os.access(self._folder, os.W_OK)  # as a save would see
         self._update_estimate(update, solve_s)
         self._on_update(self.slam, update)
 
@@ -203,7 +204,7 @@ class Session:
 
     def evaluate(self) -> None:
         """Compute how well all measurements fit, and which are not believed, when idle, in a fiftieth of the time."""
-        was_said = self.recording_fails
+        was_said = self._recorder is None
         try:
             self._keep_folder()
         except GraphSlamError as error:  # it is tried again

@@ -129,7 +129,7 @@ class KeyframeFrontend:
             self.path.go_on(drive["path"])
             used = self.odometry.go_on(drive["odometry"])
             self.T_odom_base = used.T_odom_base
-            self.order.go_on(used.stamp_ns, drive["order"])
+            self.order.go_on(used.stamp_ns, drive.get("order", ({}, {})))
             self._thinning.go_on(drive["thinning"])
             self._observed_from, self._observed = drive["observed"][0], set(drive["observed"][1])
             self._edges.due = tuple(drive["noise_due"])

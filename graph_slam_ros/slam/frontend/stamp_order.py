@@ -144,7 +144,7 @@ class StampOrder:
         """Plain values, to ``go_on`` with."""
         return [dict(self.set_ns), {topic: [*came] for topic, came in self._came.items()}]
 
-    def go_on(self, used_ns: int, state: list[Any]) -> None:
+    def go_on(self, used_ns: int, state: Sequence[Any]) -> None:
         """Go on after odometry of this stamp."""
         self._newest_odometry_ns = self._released_ns = used_ns
         self.set_ns, self._came = Counter(state[0]), {topic: [*came] for topic, came in state[1].items()}
