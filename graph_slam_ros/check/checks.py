@@ -7,7 +7,7 @@ import numpy as np
 
 from graph_slam_ros.check.columns import Columns
 from graph_slam_ros.check.contradictions import check_contradictions
-from graph_slam_ros.check.finding import FOLLOWS, Finding, in_order, worst
+from graph_slam_ros.check.finding import FOLLOWS, Finding, in_order
 from graph_slam_ros.check.fixes import check_fixes
 from graph_slam_ros.check.frames import check_frames
 from graph_slam_ros.check.gyro import check_gyro
@@ -79,7 +79,8 @@ def refused_odometry(c: Columns) -> list[Finding]:
 def worst_of_replay(c: Columns, *, is_damaged: bool = False) -> Finding | None:
     """The worst error or warning beyond what the end of a replay says anyway; None where there is none."""
     known = (*_IN_OUTCOME, *(FOLLOWS["damaged"] if is_damaged else ()))
-    return worst([one for one in check_columns(c, OF_A_REPLAY) if one.code not in known])
+    found = check_columns(c, OF_A_REPLAY)
+    return next((one for one in found if one.severity != "note" and one.code not in known), None)
 
 
 def first_of_replay(c: Columns, *, is_whole: bool) -> Finding | None:

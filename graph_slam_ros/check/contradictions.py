@@ -7,9 +7,9 @@ from operator import itemgetter
 import numpy as np
 
 from graph_slam_ros.check.columns import Columns, SightingColumns
-from graph_slam_ros.check.finding import Finding, where
+from graph_slam_ros.check.finding import NO_IDS, Finding, Severity, where
 from graph_slam_ros.check.moving_landmarks import check_moving, motions_of
-from graph_slam_ros.check.odometry import ratio, twist_factor
+from graph_slam_ros.check.odometry import twist_factor
 from graph_slam_ros.check.pairs import (
     LATER_S,
     Pairs,
@@ -31,14 +31,15 @@ _FAR_M = 200.0
 _HALF, _FIFTH, _NOISES, _NEARLY, _NEAR_M = 0.5, 0.2, 2.0, 1.2, 0.3
 _RELATED = 0.7
 _UNRELATED, _UNRELATED_NOISES, _UNRELATED_PAIRS = 0.6, 4.0, 100
-_TWICE, _ONCE, _SELDOM = 0.002, 0.5, 3
+_TWICE, _NO_IDS, _ONCE, _SELDOM = 0.002, 0.2, 0.5, 3
 _AGAIN_S, _AGAIN_M, _SPAN = 10.0, 3.0, 0.25
 _CHANCE, _MOST_BY_CHANCE = 0.02, 2
 _LOOP = 0.1  # of the way: landmarks that come back within less close no loop of the drive
 _SILENT = 0.5
 _QUARTER = 0.5**0.5
 _CORRECTED = "_corrected"
-_ROUNDS, _OTHER_SCALE = 10, 0.15  # less is found by a fit
+_ROUNDS, _SIGMAS, _OTHER_SCALE, _LEAST_SCALE = 10, 4.0, 0.15, 0.1  # a fit finds less than _OTHER_SCALE
+_FIXED = 20.0  # sigmas, or metres, that fixes are apart
 
 _OPTICAL = "those of an optical frame (z ahead, x to the right)"
 # Where a sensor would be turned on the robot, if its positions are in other axes: R_frame_true.
@@ -55,14 +56,14 @@ _AHEAD, _INVERTED = "those of the robot (x ahead)", "those of its transform the 
 def check_contradictions(c: Columns) -> Iterator[Finding]:
     """Each input of landmarks against odometry: units, axes, mirrors, identities, and what is seen again."""
     for s in c.sightings if len(c.path_ns) > 1 else ():
-        if not len(s.stamp_ns):
+        yield from (twice := list(_identities(c, s)))
+        if not len(s.stamp_ns) or any(one.severity == "error" for one in twice):
             continue
         found = list(check_ranges(c, s))
         if c.config.world.dimensions == 2:
             found += check_bearings(c, s)
         found += [*check_noise_alone(c, s), *_contradictions(c, s)]
         yield from found
-        yield from _identities(c, s)
         if not any(one.ends for one in found):
             yield from _coverage(s, c.path_ns, c.path)
 
@@ -101,6 +102,7 @@ def _contradictions(c: Columns, s: SightingColumns) -> Iterator[Finding]:
             yield from noisier(s, pairs)
             return
         text = f"{s.topic}: odometry does not explain {share:.0%} of the motion between two sightings of a landmark"
+        text += " of which there is one" * (len(s.names) == 1)
         yield Finding("unrelated", "error", share, _UNRELATED, "part", text, **where(s.topic, s.stamp_ns, count))
 
 
@@ -138,7 +140,17 @@ def _hypotheses(s: SightingColumns) -> dict[str, Array]:
     return turned | {what: np.stack(se3.act(T, tuple(points.T)), axis=1) for what, points in others.items()}
 
 
-def _fitted(s: SightingColumns, pairs: Pairs, T_base_true: se3.Pose) -> se3.Pose:
+def fitted(rows: Array, y: Array) -> tuple[Array, float]:
+    """Robust least squares, with the sigma of the last number if the others were known."""
+    weight = np.ones(len(y))
+    for _ in range(_ROUNDS):
+        found = np.linalg.lstsq(rows * weight[:, None], y * weight, rcond=None)[0]
+        left = np.abs(rows @ found - y)
+        weight = 1.0 / np.hypot(1.0, left / (3.0 * np.median(left) + 1e-6))
+    return found, float(np.median(left) / np.linalg.norm(rows[:, -1] * weight))
+
+
+def _turned(s: SightingColumns, pairs: Pairs, T_base_true: se3.Pose) -> se3.Pose:
     """Turn and shift a sensor in the plane so that its sightings agree with odometry best.
 
     As complex numbers, with the motion (r, t) of the robot: z (a - r b) + (1 - r) d = t.
@@ -146,11 +158,7 @@ def _fitted(s: SightingColumns, pairs: Pairs, T_base_true: se3.Pose) -> se3.Pose
     points, motion = _placed(s, T_base_true), pairs.motion
     a, b = (points[k, 0] + 1j * points[k, 1] for k in (pairs.a, pairs.b))
     t, r = motion[:, 0] + 1j * motion[:, 1], np.nan_to_num(np.exp(1j * so3.log(tuple(motion[:, 3:].T))[2]))
-    rows, weight = np.stack([a - r * b, 1.0 - r], axis=1), np.ones(len(r))
-    for _ in range(_ROUNDS):
-        z, d = np.linalg.lstsq(rows * weight[:, None], t * weight, rcond=None)[0]
-        left = np.abs(rows @ [z, d] - t)
-        weight = 1.0 / np.hypot(1.0, left / (3.0 * np.median(left) + 1e-6))
+    (z, d), _ = fitted(np.stack([a - r * b, 1.0 - r], axis=1), t)
     turn = 0.5 * np.angle(z)
     return se3.compose((d.real, d.imag, 0.0, 0.0, 0.0, np.sin(turn), np.cos(turn)), T_base_true)
 
@@ -191,7 +199,7 @@ def _axes(s: SightingColumns, pairs: Pairs, noise_m: float, use: Mask) -> Findin
     if pairs.dimensions == 2 and len(both) > 1:
         starts = {"turned": tuple(s.T_base_frame), **{what: mounts[what] for what in (_AHEAD, _OPTICAL)}}
         for axes, start in starts.items():
-            mount = _fitted(s, pairs, start)
+            mount = _turned(s, pairs, start)
             what = f"{axes}, and the sensor is at x {mount[0]:.2f}, y {mount[1]:.2f} m"
             points[what], mounts[what] = _placed(s, mount), mount
             left[what] = _NEARLY * max(some.apart_m(points[what]) for some in both)
@@ -208,35 +216,37 @@ def _axes(s: SightingColumns, pairs: Pairs, noise_m: float, use: Mask) -> Findin
 
 
 def _scaled(c: Columns, s: SightingColumns, pairs: Pairs) -> Finding | None:
-    """Ranges by which two sightings of a landmark agree with odometry only if all are multiplied by one factor."""
-    origin = np.array(s.T_base_frame[:3])
-    n, by = pairs.dimensions, tuple(pairs.motion.T)
-    arms = [s.points[k] - origin for k in (pairs.a, pairs.b)]
-    sensor = np.stack(se3.act(by, tuple(np.broadcast_to(origin, arms[0].shape).T)), axis=1) - origin
-    x = (arms[0] - np.stack(so3.act(by[3:], tuple(arms[1].T)), axis=1))[:, :n]
-    y = sensor[:, :n]
-    least, left = ratio(x, y)
-    inverse, _ = ratio(y, x)
-    if not (least > 0.0 and inverse > 0.0):
+    """Ranges by which two sightings of a landmark agree with odometry only if all are multiplied by one factor.
+
+    Fixes tell which of them is wrong, or where the robot turns the place of the sensor on it, which neither measures.
+    """
+    n, rotation = pairs.dimensions, tuple(pairs.motion[:, 3:].T)
+    origin = np.broadcast_to(np.array(s.T_base_frame[:3]), (len(pairs.a), 3))
+    after, sensor = (np.stack(so3.act(rotation, tuple(points.T)), axis=1) for points in (s.points[pairs.b], origin))
+    moved, turned = pairs.motion[:, :n], (sensor - origin)[:, :n]
+    x = (s.points[pairs.a] - after)[:, :n] + turned
+    (drive, swing), sigma = fitted(np.stack([moved.ravel(), turned.ravel()], axis=1), x.ravel())
+    left = np.median(np.linalg.norm(x - drive * moved - swing * turned, axis=1))
+    if left > _HALF * np.median(np.linalg.norm(x, axis=1)) or drive <= 0.0 or abs(drive - 1.0) < _OTHER_SCALE:
         return None
-    factor = float(np.sqrt(least / inverse))
-    low, high = sorted((least, 1.0 / inverse))  # noise makes the one too small, and the other too large
-    if left > _HALF or not (high < 1.0 - _OTHER_SCALE or low > 1.0 + _OTHER_SCALE) or not 0.1 <= factor <= 10.0:
-        return None
+    if any(len(f.points) and np.abs(f.points - f.points[0]).max() > _FIXED * max(f.sigma_m, 1.0) for f in c.fixes):
+        swing, sigma = drive, 0.0  # which agree with odometry: else nothing was asked of landmarks
+    of_odometry, of_ranges = abs(swing - 1.0), abs(swing - drive)  # the place of the sensor is in metres
+    is_told = min(of_odometry, of_ranges) + _SIGMAS * sigma < _HALF * max(of_odometry, of_ranges)
     now = next((one.range_factor for one in c.config.sources if one.name == s.input), 1.0)
     scale, o = c.config.odometry.distance_factor, c.odometry
-    of_pose = scale * twist_factor(o)
-    if abs(of_pose / factor - 1.0) < _OTHER_SCALE:
-        text = f"{o.topic}: its pose moves {of_pose:.3g} times as far as its twist and landmarks say: in metres?"
-        at = where(o.topic, c.path_ns, None, (assignment("odometry.distance_factor", round(scale / of_pose, 4)),))
-        return Finding("units", "error", of_pose, 1.0 + _OTHER_SCALE, "times", text, **at)
-    text = (
-        f"{s.topic}: ranges are {1.0 / factor:.2f} times as long as odometry says: is the size of the tags right "
-        "(that of the black square)? If a measured way says that odometry is not: odometry.distance_factor="
-        f"{scale / factor:.4g}"
-    )
-    at = where(s.topic, s.stamp_ns, len(pairs.a), (assignment(f"{s.input}.range_factor", round(now * factor, 3)),))
-    return Finding("range_scale", "error", 1.0 / factor, 1.0 + _OTHER_SCALE, "times", text, **at)
+    by_ranges = assignment(f"{s.input}.range_factor", round(now / drive, 3))
+    by_odometry = assignment("odometry.distance_factor", round(scale * drive, 4))
+    is_twist = abs(scale * twist_factor(o) * drive - 1.0) < _OTHER_SCALE
+    if is_twist or drive < _LEAST_SCALE or (is_told and of_odometry < of_ranges):
+        text = f"{o.topic}: its pose moves {1.0 / drive:.3g} times as far as landmarks say: is it in metres?"
+        at = where(o.topic, c.path_ns, settings=(by_odometry,))
+        return Finding("units", "error", 1.0 / drive, 1.0 + _OTHER_SCALE, "times", text, **at)
+    text = f"{s.topic}: ranges are {drive:.2f} times as long as odometry says: is the tags' size right (black square)?"
+    if not is_told:
+        text += f" Or is odometry not in metres? Measure a way or a tag, and set {by_ranges} or {by_odometry}"
+    at = where(s.topic, s.stamp_ns, len(pairs.a), (by_ranges,) if is_told else ())
+    return Finding("range_scale", "error", drive, 1.0 + _OTHER_SCALE, "times", text, **at)
 
 
 def turned_mount(name: str, frame: str, T_base_frame: se3.Pose, T_frame_true: se3.Pose) -> tuple[str, ...]:
@@ -259,10 +269,12 @@ def _rpy(q: so3.Quaternion) -> tuple[float, float, float]:
 def _identities(c: Columns, s: SightingColumns) -> Iterator[Finding]:
     counts = c.counters.as_dict().get(s.input, {})
     twice = counts.get("id_merged", 0) + counts.get("id_conflict", 0)
-    share = twice / (len(s.stamp_ns) + twice)
+    share = twice / max(len(s.stamp_ns) + twice, 1)
     if share > _TWICE:
+        severity: Severity = "error" if share > _NO_IDS else "warning"
         text = f"{s.topic}: {share:.1%} of the sightings have an id that is twice in their message"
-        yield Finding("id_twice", "warning", share, _TWICE, "part", text, **where(s.topic, s.stamp_ns, twice))
+        at = where(s.topic, s.stamp_ns, twice, NO_IDS if severity == "error" else ())
+        yield Finding("id_twice", severity, share, _TWICE, "part", text, **at)
 
 
 def _coverage(s: SightingColumns, path_ns: Index, path: Array) -> Iterator[Finding]:

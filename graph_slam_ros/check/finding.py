@@ -20,6 +20,8 @@ _DRIVER = "correct the driver (REP 103: metres, radians, x ahead, y to the left,
 _DENSITY = "correct the driver; until then set odometry.noise=density"
 _ONE_CLOCK = "synchronise the clocks (chrony, PTP); set use_sim_time for all nodes or for none"
 _ID = "give each landmark an id of its own"
+NO_IDS = ("landmarks.association=joint", "landmarks.id_from=none")
+_NO_ID = f"{_ID}, or set {', '.join(NO_IDS)}"
 _ASSUMED, _MEND_FIRST = "frame_unlinked", "mend what is above first, then check again"
 _WHEELS = "choose the topic of the wheels with --odom"
 
@@ -83,7 +85,7 @@ KINDS: dict[str, str] = {
     "unrelated": "check the topic, the ids and the units of both",
     "id_twice": _ID,
     "noise_zero": "correct the driver; or set INPUT.noise=sigmas with INPUT.sigma_m",
-    "seen_once": "let the detector give each landmark its own id; without ids set landmarks.association=joint",
+    "seen_once": _NO_ID,
     "no_closure": "record a drive with a loop; where there was one, ids change: let each landmark have its own",
     "no_parallax": "record a drive past landmarks, with turns in sight of them",
     # -- a replay in memory, and a fit that begins at its estimate
@@ -102,9 +104,9 @@ KINDS: dict[str, str] = {
     "odometry_over_confident": "state it (odometry.noise); robust.noise_scale=estimated (the default) allows for it",
     "odometry_slips": "look at ground and tyres there; a run finds slips (odometry.doubt); a gyro helps in turns",
     "id_reused": _ID,
-    "ids_unsure": "correct the detector, or set landmarks.association=joint",
+    "ids_unsure": _NO_ID,
     "ids_exchanged": _ID,
-    "ids_renewed": "let the detector keep its ids when it begins anew; without ids set landmarks.association=joint",
+    "ids_renewed": _NO_ID,
     "landmark_moves": "let the detector leave out this id; a run believes no sighting of it that contradicts others",
     "landmark_moved": "use landmarks that nobody moves",
     "map_breaks": "find out whether the robot was carried or slipped",
@@ -117,7 +119,7 @@ KINDS: dict[str, str] = {
 ENDS = {
     *("no_odometry", "wrong_stamps", "no_overlap", "constant_stamps", "coarse_stamps", "seen_in_fixed_frame"),
     *("pose_stands", "static", "units", "no_orientation_of_odometry", "mirrored", "axes", "unrelated", "noise_zero"),
-    "range_scale",
+    *("range_scale", "odometry_scale"),
 }
 """Findings while which others mean nothing."""
 
@@ -133,6 +135,8 @@ FOLLOWS = {
     "frame_unlinked": ("mount_assumed",),
     "units": ("other_publisher", "odometry_gap", "jump", "late", "twist_scale"),
     "mirrored": ("twist_unrelated", "twist_frame"),
+    "id_twice": ("id_conflict",),
+    "seen_once": ("no_closure", "no_parallax", "not_observable"),
     "damaged": ("no_closure", "silent"),
     "clock_offset": ("latency",),
     **dict.fromkeys(("mount_moved", "covariance_tiny"), _OF_A_PATH),
@@ -223,8 +227,3 @@ def with_one_value(findings: list[Finding]) -> list[Finding]:
             values |= {key: (value, one.code) for key, value in own.items()}
             out[k] = one
     return [out[k] for k in range(len(findings))]
-
-
-def worst(findings: list[Finding]) -> Finding | None:
-    """The first of the most severe findings, notes left out; None where there is none."""
-    return next((one for one in in_order(findings) if one.severity != "note"), None)

@@ -86,27 +86,27 @@ def _turned(c: Columns, f: FixColumns, stamp_ns: Index, points: Array, own: Arra
         moved, driven = np.diff(points[ends]), np.diff(own[ends])
         now, mirrored = _mirrored(np.angle(moved[1:] / moved[:-1]), np.angle(driven[1:] / driven[:-1]))
         ways, own_ways = (np.stack([some.real, some.imag], axis=1) for some in (moved, driven))
-        linear, left, *_ = np.linalg.lstsq(
-            own_ways, ways, rcond=None
-        )  # degrees of latitude and longitude are not equal
-        is_swapped = left.sum() < _OFF * np.sum(ways**2) and np.linalg.det(linear) < 0.0
-        if (mirrored < _HALF * now and now > _TURNED_RAD) or is_swapped:
+        linear, left, *_ = np.linalg.lstsq(own_ways, ways, rcond=None)  # degrees of latitude and longitude differ
+        is_linear = left.sum() < _OFF * np.sum(ways**2)
+        if (mirrored < _HALF * now and now > _TURNED_RAD) or (is_linear and np.linalg.det(linear) < 0.0):
             what = "latitude and longitude, or east and north, are exchanged, or odometry's position is mirrored"
             text = f"{f.topic}: fixes turn right where odometry turns left: {what}"
             at = where(f.topic, stamp_ns, settings=(f"{f.input}.use=none",))
             yield Finding("fix_mirrored", "error", now, mirrored, "rad", text, **at)
             return
-        factor = float(np.median(np.abs(moved)) / np.median(np.abs(driven)))
+        is_odometry = is_linear and np.linalg.cond(linear) < 1.0 + _OFF
+        ways_m = np.median(np.abs(moved)), np.median(np.abs(driven))
+        factor = float(abs(np.linalg.det(linear)) ** 0.5 if is_odometry else ways_m[0] / ways_m[1])
         spread = float(np.median(np.abs(np.abs(moved) / np.abs(driven) - factor)) / len(moved) ** 0.5)
-        if not 1.0 / _SCALE < factor < _SCALE:
-            text = f"{f.topic}: fixes move {factor:.2g} m for each metre of odometry: are both metres?"
+        text = f"{f.topic}: fixes move {factor:.3g} m for each metre of odometry"
+        if factor < _OFF or not (is_odometry or 1.0 / _SCALE < factor < _SCALE):
+            text += ": are latitude and longitude in degrees, and odometry in metres?"
             yield Finding("unrelated", "error", factor, _SCALE, "times", text, **at)
             return
         if abs(factor - 1.0) > max(_OFF, _SIGMAS * spread):
-            text = f"{f.topic}: fixes move {factor:.3g} m for each metre of odometry"
             setting = f"odometry.distance_factor={c.config.odometry.distance_factor * factor:.4g}"
             at = where(f.topic, stamp_ns, settings=(setting,))
-            yield Finding("odometry_scale", "warning", factor, 1.0 + _OFF, "times", text, **at)
+            yield Finding("odometry_scale", "error", factor, 1.0 + _OFF, "times", text, **at)
     step_m, way_m = np.abs(np.diff(points)), np.abs(np.diff(own))
     far_m = max(_JUMP_M, 2.0 * _SIGMAS * f.sigma_m)
     jumps = (step_m - way_m > far_m) & (np.diff(stamp_ns) < _SOON_S * 1e9)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from graph_slam_ros.check.columns import Columns
-from graph_slam_ros.check.contradictions import turned_mount
+from graph_slam_ros.check.contradictions import fitted, turned_mount
 from graph_slam_ros.check.finding import Finding, where
 from graph_slam_ros.check.pairs import poses_at
 from graph_slam_ros.check.times import offset_setting
@@ -20,7 +20,7 @@ _WINDOW_NS, _LEAST_WINDOWS, _LEAST_SAMPLES = 1_000_000_000, 20, 3
 _TURNING_RAD, _LEAST_TURNING = 0.1, 10
 _SCALE, _GROSS, _UNEXPLAINED, _BIAS_SIGMAS = 0.1, 0.4, 0.5, 3.0
 _OF_NOTHING = 0.2  # of odometry's turns: a gyro that measures none of them, but others
-_ROUNDS, _EXPLAINED = 15, 0.5  # of a wrong heading: more than that is left where the gyro alone does not explain it
+_EXPLAINED = 0.5  # of a wrong heading: more than that is left where the gyro alone does not explain it
 _EITHER = ": the track width is wrong, or the scale of the gyro"
 _OF_A_HEADING = ("id_reused", "ids_unsure", "landmark_moved", "map_breaks", "outliers")  # where that is wrong
 _GRAVITY_M_S2, _LEAST_LATE_S, _MOST_LATE_S = 9.81, 0.1, 1.0
@@ -103,17 +103,12 @@ def _turns(c: Columns, rates: Array | None = None) -> tuple[Array, Array]:
 
 def _line(x: Array, y: Array) -> tuple[float, float, Array]:
     """Robust slope and offset of y over x, and what they leave."""
-    rows, weight = np.stack([x, np.ones(len(x))], axis=1), np.ones(len(x))
-    for _ in range(_ROUNDS):
-        factor, bias = np.linalg.lstsq(rows * weight[:, None], y * weight, rcond=None)[0].tolist()
-        left = y - rows @ [factor, bias]
-        scale = 1.48 * float(np.median(np.abs(left))) + 1e-6
-        weight = 1.0 / np.sqrt(1.0 + (left / (3.0 * scale)) ** 2)
-    return factor, bias, left
+    rows = np.stack([x, np.ones(len(x))], axis=1)
+    line, _ = fitted(rows, y)
+    return float(line[0]), float(line[1]), y - rows @ line
 
 
 def _scale(c: Columns, factor: float, name: str, gyro_ns: Index) -> Finding:
-    """A gyro that turns another way, or by another amount, and what mends it."""
     text = f"{name}: its gyro turns {factor:.3g} times as much as odometry"
     settings: tuple[str, ...] = ()
     if abs(factor - 1.0) < _GROSS:

@@ -58,12 +58,6 @@ def at_two_places(s: SightingColumns, points: Array, path_ns: Index, dimensions:
     return found
 
 
-def check_identities(s: SightingColumns, found: list[TwoPlaces]) -> Iterator[Finding]:
-    """Findings of identities that are of two places."""
-    yield from _moved(s, [one for one in found if one.since_ns is not None])
-    yield from _reused(s, [one for one in found if one.since_ns is None])
-
-
 def _two_places(name: str, chosen: Index, s: SightingColumns, points: Array) -> TwoPlaces | None:
     chosen = chosen[np.argsort(s.stamp_ns[chosen], kind="stable")]
     at, sigma_m = points[chosen], float(np.median(s.sigmas[chosen]))
@@ -103,9 +97,9 @@ def _parted(at: Array) -> Mask:
     return near
 
 
-def _moved(s: SightingColumns, moved: list[TwoPlaces]) -> Iterator[Finding]:
+def check_moved(s: SightingColumns, found: list[TwoPlaces]) -> Iterator[Finding]:
     """Landmarks that stand elsewhere from some time on; two that change places have exchanged their identities."""
-    exchanged = set()
+    moved, exchanged = [one for one in found if one.since_ns is not None], set()
     for k, one in enumerate(moved):
         for other in moved[k + 1 :]:
             ends = np.linalg.norm(one.second - other.first), np.linalg.norm(other.second - one.first)
@@ -128,7 +122,9 @@ def _of(one: TwoPlaces, code: str, text: str, s: SightingColumns) -> Finding:
     return Finding(code, "warning", one.apart_m, _APART_M, "m", text, s.topic, one.first_ns, one.count)
 
 
-def _reused(s: SightingColumns, reused: list[TwoPlaces]) -> Iterator[Finding]:
+def check_reused(s: SightingColumns, found: list[TwoPlaces]) -> Iterator[Finding]:
+    """Identities that are seen at two places by turns."""
+    reused = [one for one in found if one.since_ns is None]
     if len(reused) > _MOST_MOVED:
         text = f"{s.topic}: {len(reused)} of {sum(map(bool, s.names))} ids are seen at more than one place"
         first_ns = min(one.first_ns for one in reused)

@@ -6,7 +6,7 @@ import numpy as np
 
 from graph_slam_ros.check.columns import Columns, SightingColumns
 from graph_slam_ros.check.finding import Finding, Severity, where
-from graph_slam_ros.check.identities import at_two_places, check_identities, check_outliers
+from graph_slam_ros.check.identities import at_two_places, check_moved, check_outliers, check_reused
 from graph_slam_ros.check.odometry import TOGETHER, twist_factor, worst_stretch
 from graph_slam_ros.check.pairs import noisier, pairs_of, poses_at
 from graph_slam_ros.errors import GraphSlamError
@@ -130,7 +130,6 @@ def _noise(c: Columns, slam: GraphSlam, *, has_cause: bool) -> Iterator[Finding]
 
 
 def _void(fit: TrialFit) -> Finding:
-    """A fit of which nothing is believed."""
     k, unchecked = answers.absurd_range(fit), "clock, mount and scale cannot be checked"
     if fit.lost > answers.MOST_LOST or k is None:
         text = f"{fit.lost:.0%} of the sightings do not fit: {unchecked}"
@@ -141,7 +140,6 @@ def _void(fit: TrialFit) -> Finding:
 
 
 def _over_confident(c: Columns, noise: NoiseScale, factor: float, limit: float) -> Finding:
-    """Noise that is too small, and more than the run allows for."""
     code = "odometry_over_confident" if noise.label == "odometry" else "over_confident"
     of = c.topic_of(noise.source)
     topic = noise.source if of is None else of.name
@@ -166,7 +164,6 @@ def _is_far_off(fit: TrialFit, one: answers.Finding, step_s: float) -> bool:
 def _fitted(
     c: Columns, slam: GraphSlam, fit: TrialFit, one: answers.Finding, off: Mapping[Parameter, float]
 ) -> Iterator[Finding]:
-    """A parameter that is among those that are far off, or that the drive does not tell."""
     topic = c.topic_of(one.parameter.source)
     if one.parameter.name not in _LIMITS or topic is None:
         return
@@ -190,7 +187,6 @@ def _fitted(
 
 
 def _jumps(c: Columns, fit: TrialFit) -> Iterator[Finding]:
-    """Clocks and mounts that are not the same in both halves of the drive."""
     for code, parameter, before, after, sigma, limit in answers.jumps(fit):
         if (topic := c.topic_of(parameter.source)) is not None:
             text = f"{topic.name}: {answers.jump_sentence(parameter, before, after, sigma)}"
@@ -219,7 +215,8 @@ def _places(
         shift = np.linalg.norm(points - before, axis=1)
         shift = shift[np.isfinite(shift)]  # ranges and bearings alone have no point
         shift_m = float(np.quantile(shift, _MOST)) if len(shift) else 0.0
-        found += check_identities(s, [one for one in two if one.apart_m > _SHIFTS * shift_m])
+        two = [one for one in two if one.apart_m > _SHIFTS * shift_m]
+        found += [*check_moved(s, two), *check_reused(s, two)]
         found += check_outliers(s, points, inside, c.config.world.dimensions)
     return found
 

@@ -12,7 +12,7 @@ from typing import Any
 
 from graph_slam_ros.check.checks import refused_odometry, worst_of_replay
 from graph_slam_ros.check.columns import Collector
-from graph_slam_ros.check.finding import Finding, worst
+from graph_slam_ros.check.finding import Finding
 from graph_slam_ros.config.config import with_survey
 from graph_slam_ros.errors import GraphSlamError, SingularError
 from graph_slam_ros.measurements.types import END
@@ -166,7 +166,7 @@ class _Rounds:
         self.keyframes = len(slam.keyframes)
         if self.keyframes and due < math.inf:
             read = columns.columns(counters)
-            self.fault = worst(refused_odometry(read)) or worst_of_replay(read)
+            self.fault = next(iter(refused_odometry(read)), None) or worst_of_replay(read)
         return slam
 
     def _does_harm(self, slam: GraphSlam) -> bool:

@@ -145,8 +145,8 @@ def _sensor(source: InputContext, T_base_frame: se3.Pose) -> Numbers | None:
 
 
 def _identity(source: InputContext, name: str) -> str:
-    name = name or source.settings.id
-    if not name:  # what becomes of it is the pipeline's to say
+    name = (name or source.settings.id).strip()
+    if not name or source.config.landmarks.id_from == "none":  # what becomes of it is the pipeline's to say
         return ""
     name = source.settings.id_prefix + name
     if len(name.encode()) > _LONGEST_ID:
