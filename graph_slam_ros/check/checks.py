@@ -11,7 +11,7 @@ from graph_slam_ros.check.finding import FOLLOWS, Finding, in_order
 from graph_slam_ros.check.fixes import check_fixes
 from graph_slam_ros.check.frames import check_frames
 from graph_slam_ros.check.gyro import check_gyro
-from graph_slam_ros.check.odometry import check_odometry, of_one_publisher
+from graph_slam_ros.check.odometry import check_odometry, check_publishers, of_one_publisher
 from graph_slam_ros.check.refusals import check_refusals, check_unnamed
 from graph_slam_ros.check.times import check_times
 
@@ -50,7 +50,8 @@ def check_columns(c: Columns, checks: tuple[Check, ...] = CHECKS) -> list[Findin
     """
     found: list[Finding] = []
     with np.errstate(all="ignore"):
-        c = of_one_publisher(c)
+        whole, c = c, of_one_publisher(c)
+        found += check_publishers(whole) if whole is not c else []
         if codes := {one.code for one in refused_odometry(c)}:  # the rest follows from that, and this may from units
             found += [one for one in check_odometry(c) if one.code == "units" and codes == {"other_publisher"}]
             checks = tuple(check for check in checks if check is check_refusals and not found)

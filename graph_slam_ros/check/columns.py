@@ -276,7 +276,7 @@ class Collector:
             names = tuple(name for name in used if topics[name] == topic)
             self._topics[topic] = _Topic(topic, names, used[names[0]], round(by_name[names[0]].offset_s * 1e9))
         self._sightings = {
-            name: _Sightings(name, topics[name], _mount_correction(config, by_name[name]))
+            name: _Sightings(name, topics[name], by_name[name].numbers("mount_correction", 6))
             for name, use in used.items()
             if use == "landmarks"
         }
@@ -449,12 +449,6 @@ class Collector:
         unknown = np.full((len(path), 6), np.nan)
         frames = self._config.frames
         return OdometryColumns(*names, frames.odom, frames.base, path_ns, path, unknown, unknown)
-
-
-def _mount_correction(config: Config, of: InputConfig) -> Numbers:
-    """x, y, z, roll, pitch, yaw by which the mount of an input is corrected; in the plane only x, y and yaw."""
-    mount = of.numbers("mount_correction", 6) or (0.0,) * 6
-    return mount if config.world.dimensions == 3 else (*mount[:2], 0.0, 0.0, 0.0, mount[5])
 
 
 def _located(one: Sighting) -> tuple[tuple[float, float, float], float]:

@@ -136,6 +136,7 @@ FOLLOWS = {
     "units": ("other_publisher", "odometry_gap", "jump", "late", "twist_scale"),
     "mirrored": ("twist_unrelated", "twist_frame"),
     "id_twice": ("id_conflict",),
+    "duplicates": ("other_publisher", "duplicate_stamp", *_OF_A_PATH),
     "seen_once": ("no_closure", "no_parallax", "not_observable"),
     "damaged": ("no_closure", "silent"),
     "clock_offset": ("latency",),

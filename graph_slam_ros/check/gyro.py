@@ -88,8 +88,6 @@ def _turns(c: Columns, rates: Array | None = None) -> tuple[Array, Array]:
     rate, began_ns = (c.gyro if rates is None else rates)[first], max(path_ns[0], stamp_ns[0])
     begins = began_ns + np.unique((stamp_ns - began_ns) // _WINDOW_NS) * _WINDOW_NS  # none in a gap of years
     begins = begins[(begins >= began_ns) & (begins + _WINDOW_NS < min(path_ns[-1], stamp_ns[-1]))]
-    if not len(begins):
-        return np.empty(0), np.empty(0)
     edges = np.stack([begins, begins + _WINDOW_NS])
     motion = se3.between(*(tuple(poses_at(edge, path_ns, path).T) for edge in edges))
     odometry = so3.log(tuple(motion[3:]))[2] * c.config.odometry.turn_factor

@@ -137,13 +137,7 @@ def check_reused(s: SightingColumns, found: list[TwoPlaces]) -> Iterator[Finding
 
 
 def check_outliers(s: SightingColumns, points: Array, inside: Mask, dimensions: int) -> Iterator[Finding]:
-    """Find sightings that are beyond their noise, and that of the others with their identity.
-
-    Parameters
-    ----------
-    points : (k, 3) where each sighting puts its landmark, in map
-    inside : (k,) of the sightings whose poses are known
-    """
+    """Find sightings that put their landmark (``points`` in map) beyond their noise, and that of the others."""
     at, far, compared = points[:, :dimensions], np.zeros(len(points), dtype=bool), 0
     usable = inside & np.isfinite(at).all(axis=1)
     for number, name in enumerate(s.names):

@@ -8,6 +8,7 @@ import numpy as np
 
 from graph_slam_ros.check.columns import Columns, OdometryColumns
 from graph_slam_ros.check.finding import Finding, Severity, where
+from graph_slam_ros.check.pairs import poses_at
 from graph_slam_ros.config.pipeline import OdometryConfig
 from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.typing import Array, Index, Mask
@@ -43,6 +44,7 @@ _UNITS = {
     1000.0: "metres for thousands",
     1e-3: "millimetres for metres",
 }
+_ELSEWHERE_M = 0.3
 _DENSITY, _SPACE = ("odometry.noise=density",), ("world.dimensions=3",)
 
 
@@ -125,24 +127,44 @@ def of_one_publisher(c: Columns, *, is_live: bool = False) -> Columns:
     """Return these columns without the odometry that other publishers on its topic have sent.
 
     It was refused because it does not continue the odometry in use, and is by itself the motion of a robot that is
-    measured again and again. What is not is an outlier, or of the wrong unit, and stays.
-
-    Parameters
-    ----------
-    is_live : what a node has collected: messages come late and in bursts, and not all that is refused is counted yet,
-        so neither times nor counts decide
+    measured again and again. What is not is an outlier, or of the wrong unit, and stays. Messages that a node has
+    collected (``is_live``) come late and in bursts, and not all are counted yet: neither times nor counts decide.
     """
     o = c.odometry
-    if not is_live and c.counters[o.input, "other_publisher"] < LEAST:
+    if len(c.path_ns) < 2 or (not is_live and c.counters[o.input, "other_publisher"] < LEAST):
         return c
-    is_used = np.isin(o.stamp_ns, c.path_ns)
-    others, of_used = steps_of(o.some(~is_used)), replace(c, odometry=o.some(is_used))
+    is_used, _ = _used(c)
+    others, topic = steps_of(o.some(~is_used)), c.topics[o.topic]
+    of_used = replace(c, odometry=o.some(is_used))
+    if len(topic.stamp_ns) == len(is_used):
+        topic = replace(topic, log_ns=topic.log_ns[is_used], stamp_ns=topic.stamp_ns[is_used])
+        of_used = replace(of_used, topics={**c.topics, o.topic: topic})
     if others is None:
         return of_used if is_live and is_used.sum() >= LEAST else c
     if others.fastest_m_s > _FASTEST_M_S or others.fastest_turn_rad_s > _FASTEST_RAD_S:
         return c
     early_s, usual_s, late_s = np.percentile(others.dt, [10.0, 50.0, 90.0])
     return of_used if is_live or late_s - early_s <= _IRREGULAR * usual_s else c
+
+
+def _used(c: Columns) -> tuple[Mask, Array]:
+    """Which odometry is used, of one stamp the nearest to the path, and how far each is from it [m]."""
+    o = c.odometry
+    places = poses_at(o.stamp_ns, c.path_ns, c.path)[:, :3]
+    apart_m = np.linalg.norm(o.poses[:, :3] * c.config.odometry.distance_factor - places, axis=1)
+    order, is_used = np.lexsort((apart_m, o.stamp_ns)), np.isin(o.stamp_ns, c.path_ns)
+    is_used[order[1:]] &= np.diff(o.stamp_ns[order]) > 0
+    return is_used, apart_m
+
+
+def check_publishers(c: Columns) -> Iterator[Finding]:
+    """Odometry of which some is elsewhere: that of another publisher."""
+    o, (is_used, apart_m) = c.odometry, _used(c)
+    away_m = float(np.median(apart_m[~is_used]))
+    if away_m > _ELSEWHERE_M:
+        at = where(o.topic, o.stamp_ns[~is_used])
+        text = f"{o.topic}: two robots or drivers take turns: {at['count']} of its poses are {away_m:.1f} m elsewhere"
+        yield Finding("duplicates", "error", away_m, _ELSEWHERE_M, "m", text, **at)
 
 
 def check_odometry(c: Columns) -> Iterator[Finding]:

@@ -31,9 +31,8 @@ def check_refusals(c: Columns) -> Iterator[Finding]:
         topic = c.topic_of(source)
         for reason, times in counts.items():
             row = explain(reason)
-            is_of_twist = source == c.odometry.input and reason in _OF_TWIST
-            is_rounded = source == c.odometry.input and reason in _OF_ROUNDED and rounded_s(c.odometry) > 0.0
-            if row.effect is not Effect.REFUSED or reason in ELSEWHERE or is_of_twist or is_rounded:
+            is_told = reason in _OF_TWIST or (reason in _OF_ROUNDED and rounded_s(c.odometry) > 0.0)
+            if row.effect is not Effect.REFUSED or reason in ELSEWHERE or (source == c.odometry.input and is_told):
                 continue
             received = max(c.counters.received[source], items.get(source, 0) + times, times)
             share = times / received

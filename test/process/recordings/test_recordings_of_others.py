@@ -93,8 +93,8 @@ class Robot:
         parts["twist"] = self.make("geometry_msgs/msg/TwistWithCovariance", twist=twist)
         return self.make(ODOMETRY, child_frame_id="base_link", **parts)
 
-    def odometry_rows(self, stamp=lambda t: t, **more):
-        rows = zip(self.t.tolist(), self.driven, self.v, self.w, strict=True)
+    def odometry_rows(self, stamp=lambda t: t, driven=None, **more):
+        rows = zip(self.t.tolist(), self.driven if driven is None else driven, self.v, self.w, strict=True)
         return [(t, "/odom", ODOMETRY, self.odometry(stamp(t), pose, v, w, **more)) for t, pose, v, w in rows]
 
     def array(self, t, row, frame=FRAME, times=1.0, fields=lambda robot, i, at: {}):
@@ -336,16 +336,15 @@ def with_w_first(robot):
         yield *row, message
 
 
-def without_pose(robot):
-    rows = zip(robot.t.tolist(), robot.v, robot.w, strict=True)
-    return [(t, "/odom", ODOMETRY, robot.odometry(t, (0.0, 0.0, 0.0), v, w)) for t, v, w in rows]
-
-
 def in_feet(robot):
     for *row, message in robot.odometry_rows():
         at, v = message.pose.pose.position, message.twist.twist.linear
         at.x, at.y, v.x = (3.2808 * x for x in (at.x, at.y, v.x))
         yield *row, message
+
+
+def two_robots(robot):
+    return [*robot.odometry_rows(), *robot.odometry_rows(driven=robot.true + np.array([7.0, 3.0, 1.0]))]
 
 
 def renamed(name):
@@ -358,6 +357,7 @@ SLASHES = (lambda r: r.seen_rows(frame="Robot/cam "), lambda r: r.static_rows(("
 CAUSES = {
     "tags 1.8 times": ((None, lambda r: r.seen_rows(times=1.8)), "range_scale", "as long as odometry says"),
     "tags 1.2 times": ((None, lambda r: r.seen_rows(times=1.2)), "range_scale", "Or is odometry not in metres?"),
+    "two robots": ((two_robots,), "duplicates", "two robots or drivers take turns: 300 of its poses"),
     "feet": ((in_feet,), "units", "times as far as landmarks say"),
     "one id": ((None, renamed(lambda i: "tag")), "id_twice", "twice in their message"),
     "tracks": ((None, renamed(lambda i: str(next(COUNT)))), "seen_once", "less than 3"),
@@ -367,7 +367,7 @@ CAUSES = {
     "NTP": ((lambda r: leapt(r.odometry_rows(leap)), lambda r: leapt(r.seen_rows(leap))), "clock_jump", "92.6 days"),
     "a slow clock": ((stamped_by(lambda t: (BEGINS_S, t * 1e6)),), "wrong_stamps", "0.001 s for each second"),
     "w first": ((with_w_first,), "no_orientation_of_odometry", "does w come first in its quaternions?"),
-    "a twist alone": ((without_pose,), "pose_stands", "its twist says 0.8 m/s"),
+    "a twist alone": ((lambda r: r.odometry_rows(driven=0.0 * r.driven),), "pose_stands", "its twist says 0.8 m/s"),
     "double slash": ((None, *SLASHES), "frame_unlinked", "did you mean robot//cam?"),
     "no transform": ((None, None, lambda r: []), "frame_unlinked", "is assumed"),
 }
