@@ -208,5 +208,5 @@ def _noise(run: Path) -> tuple[bool, tuple[NoiseScale, ...]]:
         summary = json.loads(read_text(run / SUMMARY))
         is_held = bool({"fixes", "surveyed"} & set(summary["classes"]))
         return is_held, tuple(NoiseScale.from_dict(one) for one in summary.get("noise", ()))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise GraphSlamError(f"{run / SUMMARY}: not a summary of a run ({type(error).__name__}: {error})") from None
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        raise GraphSlamError(f"{run / SUMMARY}: not a summary of a run: replay BAG with --out {run} --force") from None

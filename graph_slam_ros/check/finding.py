@@ -30,7 +30,7 @@ KINDS: dict[str, str] = {
     "no_odometry": "record nav_msgs/Odometry, or odom -> base_link on /tf",
     "no_landmarks": "record a topic of landmarks",
     "input_unused": "record it as a type of docs/inputs.md, or name another topic with --odom or --landmarks",
-    "damaged": "try ros2 bag reindex, or record it again",
+    "damaged": "copy it again, with all of its files, or record it again",
     # -- times
     "wrong_stamps": "correct the driver: header.stamp has seconds, and nanoseconds of the second (0 to 999999999)",
     "clock_domains": f"{_ONE_CLOCK}; or set INPUT.offset_s",
@@ -138,7 +138,7 @@ FOLLOWS = {
     "id_twice": ("id_conflict",),
     "duplicates": ("other_publisher", "duplicate_stamp", *_OF_A_PATH),
     "seen_once": ("no_closure", "no_parallax", "not_observable"),
-    "damaged": ("no_closure", "silent"),
+    "damaged": ("no_closure", "silent", "gap", "clock_jump", "frame_unlinked", "mount_place"),
     "clock_offset": ("latency",),
     **dict.fromkeys(("mount_moved", "covariance_tiny"), _OF_A_PATH),
     **dict.fromkeys(("clock_jump", "gyro_scale"), (*_OF_A_PATH, "clock_offset")),

@@ -49,9 +49,7 @@ def _parents(c: Columns) -> Iterator[Finding]:
 
 
 def _of_sensor(c: Columns, s: SightingColumns) -> Iterator[Finding]:
-    topic = c.topics.get(s.topic)
-    if topic is None:
-        return
+    topic = c.topics[s.topic]
     at = where(s.topic, topic.stamp_ns)
     fixed = [frame for frame in topic.frames if frame.lstrip("/") in (*_FIXED, c.odometry.frame) and frame]
     if fixed:

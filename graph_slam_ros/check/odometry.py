@@ -9,6 +9,7 @@ import numpy as np
 from graph_slam_ros.check.columns import Columns, OdometryColumns
 from graph_slam_ros.check.finding import Finding, Severity, where
 from graph_slam_ros.check.pairs import poses_at
+from graph_slam_ros.check.times import rounded_s
 from graph_slam_ros.config.pipeline import OdometryConfig
 from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.typing import Array, Index, Mask
@@ -131,7 +132,8 @@ def of_one_publisher(c: Columns, *, is_live: bool = False) -> Columns:
     collected (``is_live``) come late and in bursts, and not all are counted yet: neither times nor counts decide.
     """
     o = c.odometry
-    if len(c.path_ns) < 2 or (not is_live and c.counters[o.input, "other_publisher"] < LEAST):
+    is_one = not is_live and c.counters[o.input, "other_publisher"] < LEAST
+    if len(c.path_ns) < 2 or is_one or rounded_s(o) > 0.0:
         return c
     is_used, _ = _used(c)
     others, topic = steps_of(o.some(~is_used)), c.topics[o.topic]

@@ -16,9 +16,8 @@ _USUAL = {  # of single messages: detectors err, and a recording begins and ends
     *("duplicate_stamp", "undecodable", "transform_gaps"),
 }
 _USUAL_SHARE = 0.05
-ELSEWHERE = {  # those that a check of its own explains better
-    *("frame_unknown", "child_frame_unknown", "odom_frame_unknown", "map_frame_unknown", "no_id", "id_merged"),
-}
+# those that a check of its own explains better
+ELSEWHERE = {"frame_unknown", "child_frame_unknown", "odom_frame_unknown", "map_frame_unknown", "no_id", "id_merged"}
 _OF_TWIST = ("covariance_not_positive_definite", "nonfinite_covariance")
 _OF_ROUNDED = ("other_publisher", "duplicate_stamp")  # of odometry whose stamps are rounded
 _OF_COVARIANCE = {*_OF_TWIST, "covariance_asymmetric"}
@@ -32,16 +31,16 @@ def check_refusals(c: Columns) -> Iterator[Finding]:
         for reason, times in counts.items():
             row = explain(reason)
             is_told = reason in _OF_TWIST or (reason in _OF_ROUNDED and rounded_s(c.odometry) > 0.0)
-            if row.effect is not Effect.REFUSED or reason in ELSEWHERE or (source == c.odometry.input and is_told):
+            is_lost = row.effect is Effect.REFUSED and reason not in ELSEWHERE
+            if not (is_lost or reason == "mount_unknown") or (source == c.odometry.input and is_told):
                 continue
             received = max(c.counters.received[source], items.get(source, 0) + times, times)
             share = times / received
             limit = _USUAL_SHARE if reason in _USUAL else 0.0
-            severity: Severity = "error" if share > _MOST else "warning" if share > limit else "note"
-            mend = remedy(source, reason)
-            text = f"{source}: {times} of {received} are refused: {row.meaning}{'; ' if mend else ''}{mend}"
-            is_sighting = any(s.input == source for s in c.sightings)
-            settings = (f"{source}.noise=sigmas",) if reason in _OF_COVARIANCE and is_sighting else ()
+            severity: Severity = "error" if share > _MOST and is_lost else "warning" if share > limit else "note"
+            what = f"{source}: {times} of {received}{' are refused' * is_lost}: {row.meaning}"
+            text = "; ".join(filter(None, (what, remedy(source, reason))))
+            settings = (f"{source}.noise=sigmas",) if reason in _OF_COVARIANCE and source in items else ()
             name, stamps_ns = (source, ()) if topic is None else (topic.name, topic.stamp_ns)
             at = where(name, stamps_ns, times, settings)
             yield Finding(reason, severity, share, limit, "part", text, **at)
@@ -49,9 +48,7 @@ def check_refusals(c: Columns) -> Iterator[Finding]:
 
 def check_unnamed(c: Columns) -> Iterator[Finding]:
     """Landmarks without identities, where identities are asked for."""
-    if c.config.landmarks.association != "id":
-        return
-    for s in c.sightings:
+    for s in c.sightings if c.config.landmarks.association == "id" else ():
         if not len(s.name) or "" not in s.names:
             continue
         unnamed = s.name == s.names.index("")

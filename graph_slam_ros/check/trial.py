@@ -63,16 +63,19 @@ def replayed(config: Config, measured: Iterable[Measurement]) -> GraphSlam:
 
 
 def _points_in_map(c: Columns, s: SightingColumns, slam: GraphSlam, stamp_ns: Index) -> Array:
-    """(k, 3) Where each sighting puts its landmark, by the nearest keyframe's estimate."""
+    """(k, 3) Where each sighting puts its landmark, by the estimate at these stamps, corrected between keyframes."""
     order = np.argsort(slam.keyframes.stamps_ns, kind="stable")
     estimate, own = (se3.in_space(poses).reshape(-1, 7)[order] for poses in (slam.trajectory(), slam.keyframes.poses))
     at_ns, stamp_ns = slam.keyframes.stamps_ns[order], np.clip(stamp_ns, c.path_ns[0], c.path_ns[-1])
     driven = poses_at(stamp_ns, c.path_ns, c.path)
     own[:, :3] *= c.config.odometry.distance_factor
     after = np.clip(np.searchsorted(at_ns, stamp_ns), 1, len(at_ns) - 1)
-    near = after - (stamp_ns - at_ns[after - 1] < at_ns[after] - stamp_ns)
-    since = se3.between(tuple(own[near].T), tuple(driven.T))
-    return np.stack(se3.act(se3.compose(tuple(estimate[near].T), since), tuple(s.points.T)), axis=1)
+    ends = []
+    for k in (after - 1, after):
+        since = se3.between(tuple(own[k].T), tuple(driven.T))
+        ends.append(se3.compose(tuple(estimate[k].T), since))
+    part = np.clip((stamp_ns - at_ns[after - 1]) / np.maximum(at_ns[after] - at_ns[after - 1], 1), 0.0, 1.0)
+    return np.stack(se3.act(se3.interpolate(*ends, part), tuple(s.points.T)), axis=1)
 
 
 def check_trial(c: Columns, slam: GraphSlam) -> Iterator[Finding]:
@@ -137,8 +140,7 @@ def _over_confident(c: Columns, noise: NoiseScale, factor: float, limit: float) 
     what = " ".join(filter(None, (noise.label, noise.part)))
     text = f"{topic}: residuals ({what}) are {factor:.1f} times as large as its noise says"
     if c.config.robust.noise_scale != "estimated":
-        mends = ("robust.noise_scale=estimated",)
-        return Finding(code, "warning", factor, limit, "times", text, topic, settings=mends)
+        return Finding(code, "warning", factor, limit, "times", text, topic, 0, 0, ("robust.noise_scale=estimated",))
     text += f"; a run allows for {LARGEST:g} times"
     own = next((one for one in c.config.sources if one.name == noise.source and one.use == "odometry"), None)
     settings = (f"{own.name}.sigma_factor={own.sigma_factor * factor:.2g}",) if own else ()

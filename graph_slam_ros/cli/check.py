@@ -58,7 +58,7 @@ def check(args: argparse.Namespace) -> int:
         mend = [text for one in done.findings if one.severity != "note" for text in one.settings]
         last = {parse_setting(text)[0]: text for text in [*args.set, *mend]}  # of several, the last one counts
         own = [f"--config {shlex.quote(str(args.config))}"] if args.config else []
-        if any(one.forbids_replay or (one.severity == "error" and not one.settings) for one in done.findings):
+        if any(one.severity == "error" and not one.settings for one in done.findings):
             console.then(f"correct what is an error, then check again: {console.command('check', args.bag)}")
         elif done.command:
             console.then(" ".join([_with(done.command, last), *own]))

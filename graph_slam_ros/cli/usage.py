@@ -62,11 +62,11 @@ class CommandParser(argparse.ArgumentParser):
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
         """Refuse options that the command does not have, with the option that is close, and a second recording."""
         known, rest = super().parse_known_args(args, namespace)
-        options = [word.partition("=")[0] for word in rest if word.startswith("--")]
-        if options:
-            self.error(
-                f"unrecognized arguments: {' '.join(rest)}{did_you_mean(options[0], self._option_string_actions)}"
-            )
+        if options := [word.partition("=")[0] for word in rest if word.startswith("--")]:
+            near = did_you_mean(options[0], self._option_string_actions)
+            self.error(f"unrecognized arguments: {' '.join(rest)}{near}")
+        if rest and (bare := [one for one in getattr(known, "set", None) or () if "=" not in one]):
+            self.error(f"--set {bare[0]}: a setting is KEY=VALUE, without a blank")
         if rest and hasattr(known, "bag"):
             self.error(f"{rest[0]} is one recording too many: put the parts of one drive into a folder, and name that")
         return known, rest

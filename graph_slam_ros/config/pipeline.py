@@ -179,7 +179,7 @@ class KeyframesConfig:
 class LandmarksConfig:
     """Landmark sightings."""
 
-    id_from: str = setting("id", "field of a detection with its identity; none: no", choices=("id", "class_id", "none"))
+    id_from: str = setting("id", "field of a detection; none: ids are ignored", choices=("id", "class_id", "none"))
     sigma_m: float = setting(
         0.1, "position noise of an observation whose message has an all-zero (unknown) covariance", "m", low=1e-4
     )

@@ -35,7 +35,7 @@ _PACKED = {
     b"\xfd7zXZ": "xz",
     b"PK": "zip",
 }
-_HEAD_BYTES, _TAR_AT = 512, 257
+_HEAD_BYTES, _TAR_AT, _MOST_NAMED = 512, 257, 5
 _WINDOW_BYTES, _OVERHEAD = 64 * 2**20, 256
 
 
@@ -126,6 +126,10 @@ def open_bag(path: Path | str) -> Bag:
     bag.losses += [*missing, *_still_packed(path, files)]
     bag.warnings += others
     names = {re.sub(r"[_-]?\d+$", "", file.stem) for file in files}
+    numbers = {int(found[0]) for file in files if (found := re.search(r"\d{1,4}$", file.stem))}
+    gaps = sorted({*range(min(numbers, default=0), max(numbers, default=0))} - numbers)
+    if len(names) == 1 and len(gaps) < len(files) and not missing:
+        bag.losses += [f"{path}: part {number} is not there, between others" for number in gaps]
     if len(names) > 1 and not (path / "metadata.yaml").is_file():
         bag.warnings.append(f"{path}: {len(files)} files of different names are read as one recording: name one")
     return bag
@@ -142,7 +146,9 @@ def _files(path: Path) -> list[Path]:
         found = sorted((file for file in path.glob(f"*{suffix}") if file.is_file()), key=_natural)
         if found:
             return found
-    raise BagError(f"{path}: no recording (.mcap, .db3, .bag) in this folder")
+    within = [*dict.fromkeys(str(one.parent) for suffix in _SUFFIXES for one in sorted(path.glob(f"*/*{suffix}")))]
+    several = f"; give one of those in it: {', '.join(within[:_MOST_NAMED])}" if within else ""
+    raise BagError(f"{path}: no recording (.mcap, .db3, .bag) in this folder{several}")
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:
@@ -209,8 +215,6 @@ def _unpacking(file: Path, codec: str = "zstd") -> str:
 
 
 def _names_in(metadata: Path) -> list[str]:
-    if not metadata.is_file():
-        return []
     try:
         content = yaml.safe_load(read_text(metadata, follow=True))
         return [str(name) for name in content["rosbag2_bagfile_information"]["relative_file_paths"]]

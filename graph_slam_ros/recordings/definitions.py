@@ -108,12 +108,7 @@ def _by_definition(topic: Topic, whose: str) -> Decoder:
 
 
 def in_cdr(topic: Topic, md5: str, converters: dict[str, Callable[[bytes], bytes]]) -> Topic:
-    """The topic of ROS 1 messages as it is in CDR, with its converter added; unchanged where its type is not known.
-
-    Parameters
-    ----------
-    md5 : the checksum that was recorded with the type; empty or ``*`` where there is none
-    """
+    """The topic of ROS 1 messages as it is in CDR, with its converter added; unchanged where its type is not known."""
     type_name = TRANSFORMS if topic.type == "tf/msg/tfMessage" else topic.type
     store = _ros1_store(type_name, topic.definition, md5)
     if store is None:

@@ -174,10 +174,7 @@ class Suggestion:
         receivers = sorted(readable(self._recording, self.unused, GNSS), key=lambda one: -one.usable)
         for one in receivers[1:]:
             self.unused[one.topic.name] = "another receiver"
-        for one in receivers[:1]:
-            if not one.usable:
-                self.unused[one.topic.name] = "no message has a fix"
-                continue
+        for one in [first for first in receivers[:1] if first.usable]:
             self._add("gps", one, {} if one.has_noise else {"sigma_m": 2.0}, linked=True)
             self._mount(one.topic.name, one.frame)  # says what is assumed; the input itself assumes and counts it
             if not one.has_noise:
@@ -301,13 +298,15 @@ class Suggestion:
             self.notes.append(note + own * (self.names == ["odom"]))
 
     def _perhaps_landmarks(self, one: TopicContents) -> str:
-        """Return how a topic is used that may have landmarks, by its type; empty for any other."""
+        """Return how a topic is used that may have landmarks or fixes, by its type; empty for any other."""
         name, of = one.topic.name, one.topic.type
         if is_truth(name) or not one.topic.count:
             return ""
         if of == MARKERS:
             chosen = f"--set 'inputs.names={' '.join([*self.names, 'markers'])}' --set markers.type={of}"
             return f"markers are mostly pictures; where they are landmarks: {chosen} --set markers.topic={name}"
+        if of == GNSS and not one.usable:
+            return "no message has a fix"
         if _WITHOUT_ID.search(of):
             return f"no input reads {of}, which has no ids; where these are landmarks, publish them as {DETECTIONS}"
         return ""

@@ -213,10 +213,8 @@ def test_the_mistakes_of_a_user_are_one_line_or_a_finding(drive, check, tmp_path
     assert (code, found["no_odometry"]["severity"]) == (4, "error")
     folder = tmp_path / "folder"
     folder.mkdir()
-    assert check(folder)[0] == 2
     to_ros1(folder / "drive.bag", messages)
     assert check(folder) == (0, {}, [])
-    assert check(tmp_path / "nothing.mcap")[0] == 2
     empty = write_mcap(tmp_path / "empty.mcap", [], types=TOPICS)
     code, found, _ = check(empty)
     assert (code, found["no_odometry"]["severity"]) == (4, "error")
@@ -230,11 +228,6 @@ def rounded(to_ns):
         m.header.stamp.sec, m.header.stamp.nanosec = divmod(stamp_ns, 10**9)
 
     return change
-
-
-def now_and_then_nan(m, k):
-    if k % 3 == 0:
-        m.pose.pose.position.x = float("nan")
 
 
 def first_at_zero(m, k):
@@ -269,7 +262,6 @@ NOT_TWO = ("duplicates", "other_publisher", "duplicate_stamp")
 @each(
     "odom, seen, exit_code, code, expected, others",
     [
-        (now_and_then_nan, None, 4, "nonfinite", {"text": ""}, ()),
         (first_at_zero, None, 0, "zero_stamp", {"severity": "note"}, ()),
         (of_frame("world"), None, 0, "odometry_in_map", {"severity": "note"}, ()),  # as cameras call theirs
         (of_frame("map"), None, 4, "odometry_in_map", {"severity": "error"}, ()),

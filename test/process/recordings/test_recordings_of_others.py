@@ -4,6 +4,7 @@ import itertools
 import json
 import math
 import shlex
+import shutil
 import sqlite3
 
 import numpy as np
@@ -352,7 +353,7 @@ def renamed(name):
     return lambda r: r.seen_rows(fields=lambda r, i, at: {"id": name(i), "results": [r.make(HYPOTHESIS, pose=at)]})
 
 
-COUNT, IGNORED = itertools.count(), ("landmarks.association=joint", "landmarks.id_from=none")
+COUNT = itertools.count()
 SLASHES = (lambda r: r.seen_rows(frame="Robot/cam "), lambda r: r.static_rows(("base_link", "robot//cam")))
 CAUSES = {
     "tags 1.8 times": ((None, lambda r: r.seen_rows(times=1.8)), "range_scale", "as long as odometry says"),
@@ -371,9 +372,6 @@ CAUSES = {
     "double slash": ((None, *SLASHES), "frame_unlinked", "did you mean robot//cam?"),
     "no transform": ((None, None, lambda r: []), "frame_unlinked", "is assumed"),
 }
-
-
-MENDED = {"no transform": ["detections.mount=0.2 0 0.4 -1.5707963 0 -1.5707963"], "tracks": IGNORED}
 
 
 def found(capsys, bag, *settings):
@@ -397,7 +395,8 @@ def test_the_cause_alone_is_said_and_its_settings_mend_it(tmp_path, capsys):
             assert "nothing is calibrated: mend bad_stamp first" in capsys.readouterr().err
         if settings := one[code]["settings"]:
             assert code not in found(capsys, bag, *settings), name
-        if not (mended := {**dict.fromkeys(("tags 1.8 times", "feet", "one id"), settings), **MENDED}.get(name)):
+        mount = ["detections.mount=0.2 0 0.4 -1.5707963 0 -1.5707963"]
+        if not (mended := {"tags 1.8 times": settings, "feet": settings, "no transform": mount}.get(name)):
             continue
         code, text = pasted(capsys, bag, folder / "run")
         assert code == 3 and words in text and "odometry was in doubt" not in text, text
@@ -417,10 +416,10 @@ def test_sightings_of_which_the_noise_is_so_large_that_they_correct_nothing_are_
         assert (error_m(Robot(), tmp_path / how) < 0.1) == (code == 0), text
 
 
-def fix(robot, t, east, north):
+def fix(robot, t, east, north, frame):
     longitude = 7.0 + math.degrees(east / (6_390_700.0 * math.cos(math.radians(52.0))))
     at = {"latitude": 52.0 + math.degrees(north / 6_364_900.0), "longitude": longitude, "position_covariance_type": 2}
-    covariance, header = np.diag([0.04, 0.04, 0.1]).ravel(), robot.header(t, "base_link")
+    covariance, header = np.diag([0.04, 0.04, 0.1]).ravel(), robot.header(t, frame)
     return robot.make("sensor_msgs/msg/NavSatFix", header=header, position_covariance=covariance, **at)
 
 
@@ -435,6 +434,8 @@ FIXES = {
     "north, east": (lambda t, x, y: (y, x), lambda yaw: yaw, "fix_mirrored"),
     "frozen": (lambda t, x, y: (x, y) if not 12 < t < 20 else (1.0, 1.0), lambda yaw: yaw, "fix_frozen"),
     "short": (lambda t, x, y: (0.7 * x, 0.7 * y), lambda yaw: yaw, "odometry_scale"),
+    "radians": (lambda t, x, y: (0.0175 * x, 0.0175 * y), lambda yaw: yaw, "unrelated"),
+    "no transform": (lambda t, x, y: (x, y), lambda yaw: yaw, "mount_unknown"),
     "slips": (lambda t, x, y: (x + np.clip(t - 20, 0, 7), y), lambda yaw: yaw, "odometry_slips"),
     "late": (lambda t, x, y: (x, y), lambda yaw: yaw, "clock_offset"),
     "stays": (lambda t, x, y: (x + 4.0 * (t > 20), y), lambda yaw: yaw, "fix_jumps"),
@@ -451,10 +452,11 @@ def test_fixes_and_headings_are_compared_with_odometry_and_with_one_another(tmp_
     inputs = *inputs, "imu.type=sensor_msgs/msg/Imu", "imu.topic=/imu"
     for k, (name, (at, heading, code)) in enumerate(FIXES.items()):
         rows, rng, late_s = [], np.random.default_rng(1), 0.5 * (name == "late")
+        frame = "gps" if name == "no transform" else "base_link"
         for t, (x, y, yaw) in zip(robot.t[::4].tolist(), robot.true[::4], strict=True):
             z = complex(x, y) * np.exp(1j * turn)
             place = at(t, z.real + rng.normal(0, 0.1), z.imag + rng.normal(0, 0.1))
-            rows.append((t + late_s + 0.03, "/gps", "sensor_msgs/msg/NavSatFix", fix(robot, t + late_s, *place)))
+            rows.append((t + late_s + 0.03, "/gps", "sensor_msgs/msg/NavSatFix", fix(robot, t + late_s, *place, frame)))
             rows.append((t + 0.01, "/imu", "sensor_msgs/msg/Imu", imu(robot, t, heading(yaw + turn))))
         bag = written(tmp_path / str(k), robot, robot.static_rows(), robot.odometry_rows(), rows)
         one = found(capsys, bag, *inputs)
@@ -470,10 +472,17 @@ def test_fixes_and_headings_are_compared_with_odometry_and_with_one_another(tmp_
 def test_what_cannot_be_read_is_named_for_what_it_is(tmp_path, capsys):
     robot = Robot(store_of(Stores.ROS1_NOETIC, ARUCO), seconds=3.0)
     rows = robot.static_rows(), robot.odometry_rows(), robot.tags_rows("aruco_msgs/msg/MarkerArray", aruco)
-    empty = written_ros1(tmp_path / "empty.bag", robot, *rows, without=("/tags",))
-    named = {"info": "its definition of aruco_msgs/msg/MarkerArray in the recording is empty", "check": "is not used"}
-    for command, words in named.items():
-        assert words in said(capsys, command, empty)[1]
+    (tmp_path / "a").mkdir()
+    empty = written_ros1(tmp_path / "a/empty_0.bag", robot, *rows, without=("/tags",))
+    shutil.copy(empty, tmp_path / "a/empty_2.bag")
+    for words, expected in {
+        ("info", empty): "its definition of aruco_msgs/msg/MarkerArray in the recording is empty",
+        ("check", empty): "is not used",
+        ("check", tmp_path): f"give one of those in it: {tmp_path / 'a'}",
+        ("check", empty, "--set", "odom.use", "none"): "--set odom.use: a setting is KEY=VALUE, without a blank",
+        ("info", tmp_path / "a"): f"lost: {tmp_path / 'a'}: part 1 is not there, between others",
+    }.items():
+        assert expected in said(capsys, *words)[1], words
 
 
 def test_truth_of_other_tools_is_read_or_named(tmp_path, capsys):
