@@ -119,10 +119,11 @@ def _scale(c: Columns, factor: float, name: str, gyro_ns: Index) -> Finding:
             x, y, z, w = so3.compose(so3.compose(so3.inverse(R_base_gyro), (1.0, 0.0, 0.0, 0.0)), R_base_gyro)
             settings = turned_mount(c.config.gyro_input, c.gyro_frame, c.T_base_gyro, (0.0, 0.0, 0.0, x, y, z, w))
     elif abs(factor) < _GROSS:
-        text += ": another of its axes points upwards, or its driver sends zeros"
+        text += ": another of its axes points upwards, it sends zeros, or odometry turns too much"
         settings = _upright(c) if c.config.world.dimensions == 2 else ()
     elif abs(factor) > 1.0 / _GROSS:
         text += ": are these degrees?"
+        settings = (assignment(f"{c.config.gyro_input}.use", "none"),)
     at = where(name, gyro_ns, settings=settings)
     return Finding(
         "gyro_scale", "warning" if abs(factor - 1.0) < _GROSS else "error", factor, 1.0 + _SCALE, "times", text, **at

@@ -308,14 +308,14 @@ def driven(folder, odometry=None, seen=None, static=None):
     return written(folder / "bag", robot, static, *rows)
 
 
-def stamped_by(stamp):
-    """Odometry whose stamps have seconds and nanoseconds by a function of time."""
+def stamped_by(stamp, of="odometry_rows"):
+    """Rows whose stamps have seconds and nanoseconds by a function of time."""
 
-    def odometry(robot):
+    def rows(robot):
         time = robot.store.types["builtin_interfaces/msg/Time"]
-        return robot.odometry_rows(stamp=lambda t: time(*map(int, stamp(t))))
+        return getattr(robot, of)(stamp=lambda t: time(*map(int, stamp(t))))
 
-    return odometry
+    return rows
 
 
 def ns(t):
@@ -353,7 +353,7 @@ def renamed(name):
     return lambda r: r.seen_rows(fields=lambda r, i, at: {"id": name(i), "results": [r.make(HYPOTHESIS, pose=at)]})
 
 
-COUNT = itertools.count()
+COUNT, ROWS = itertools.count(), ("odometry_rows", "seen_rows")
 SLASHES = (lambda r: r.seen_rows(frame="Robot/cam "), lambda r: r.static_rows(("base_link", "robot//cam")))
 CAUSES = {
     "tags 1.8 times": ((None, lambda r: r.seen_rows(times=1.8)), "range_scale", "as long as odometry says"),
@@ -366,7 +366,7 @@ CAUSES = {
     "32 bits": ((stamped_by(lambda t: (BEGINS_S + t, ns(t) % 2**32)),), "bad_stamp", "are refused"),
     "a fast clock": ((stamped_by(lambda t: (186_000_000 + t * 1000, 0)),), "wrong_stamps", "1e+03 s for each second"),
     "NTP": ((lambda r: leapt(r.odometry_rows(leap)), lambda r: leapt(r.seen_rows(leap))), "clock_jump", "92.6 days"),
-    "a slow clock": ((stamped_by(lambda t: (BEGINS_S, t * 1e6)),), "wrong_stamps", "0.001 s for each second"),
+    "seconds as ns": ([stamped_by(lambda t: (1, BEGINS_S - 1e9 + t), of) for of in ROWS], "wrong_stamps", "e-09 s"),
     "w first": ((with_w_first,), "no_orientation_of_odometry", "does w come first in its quaternions?"),
     "a twist alone": ((lambda r: r.odometry_rows(driven=0.0 * r.driven),), "pose_stands", "its twist says 0.8 m/s"),
     "double slash": ((None, *SLASHES), "frame_unlinked", "did you mean robot//cam?"),
