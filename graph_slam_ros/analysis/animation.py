@@ -29,12 +29,7 @@ _COLOURS = 64
 
 @dataclass(frozen=True, slots=True)
 class _Moment:
-    """Positions (n, 3) in the map, as they were estimated at one moment: keyframes, dead reckoning, landmarks.
-
-    Attributes
-    ----------
-    stamp_s : of the newest keyframe
-    """
+    """Positions (n, 3) in the map, as they were estimated at the newest keyframe's stamp."""
 
     stamp_s: float
     path: Array

@@ -5,6 +5,7 @@ the plane or in space, as the run is. Poses are compared if their stamps differ 
 computed in the frame of a pose.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,7 @@ from graph_slam_ros.runs.trajectory import Point, Trajectory, read_landmarks, re
 _KEYFRAMES = ("path.tum", "path_odometry.tum")  # estimate and dead reckoning
 _SIGHTINGS = ("sightings.tum", "odometry.tum")
 _FAR, _FAR_M = 0.5, 0.3  # an error larger than this part of the true path, and than that, is not one of a good map
+_MOST_LATE_S, _LATE_S, _LATE_M, _CLEARLY = 20.0, 0.1, 0.1, 0.4
 _ONE_DRIVE = [{"keyframe": 0, "sighting": 0}]
 
 
@@ -170,16 +172,7 @@ def evaluate(
     if known.topic in inputs:
         warnings.append(f"{known.topic} was an input of the run: the error says how well it fits, not how true it is")
     odometry, error = drive.odometry, path_error(drive.estimate, known.trajectory, dimensions, align=align)
-    extent_m = _extent(associate(drive.estimate, known.trajectory)[1])
-    if error.position_m["rmse"] > max(_FAR * extent_m, _FAR_M):
-        warnings.append(
-            f"the error is {error.position_m['rmse']:.3g} m on a true path of radius {extent_m:.3g} m (RMS): check "
-            "that the truth is of this robot and this drive"
-        )
-    w_first = replace(known.trajectory, poses=known.trajectory.poses[:, [0, 1, 2, 4, 5, 6, 3]])
-    turned = path_error(drive.estimate, w_first, dimensions, align=align).angle_rad
-    if turned and error.angle_rad and error.angle_rad["rmse"] > max(_FAR_M, 2.0 * turned["rmse"]):
-        warnings.append("the quaternions of the truth are read as x y z w, and fit far better if w comes first")
+    warnings += _doubts(drive.estimate, known.trajectory, error, dimensions)
     return Scores(
         error,
         None if odometry is None else path_error(odometry, known.trajectory, dimensions),
@@ -227,7 +220,7 @@ def scored_drive(run: Path, truth: Trajectory | None, estimate: str = "") -> Dri
         names, reckoned = (name, odometry), reckoned and reckoned.in_order()
         part = Drive(estimated.in_order(), reckoned, names, rows["keyframe"], k + 1, len(drives))
         chosen = chosen or part
-        if truth is None or _overlap(part.estimate, truth):
+        if truth is None or np.isfinite(_rmse_m(part.estimate, truth, 2)):
             return part
     return chosen or Drive(whole.in_order(), odometry_path and odometry_path.in_order(), (name, odometry), slice(None))
 
@@ -249,17 +242,40 @@ def _drives(run: Path) -> list[dict[str, int]]:
     return drives or _ONE_DRIVE
 
 
-def _extent(path: Trajectory) -> float:
-    """RMS distance [m] of the positions of a path from their mean."""
-    positions = path.poses[:, :3] if path.poses.shape[1] == 7 else path.poses[:, :2]
-    return float(np.sqrt(((positions - positions.mean(axis=0)) ** 2).sum(axis=1).mean()))
+def _doubts(path: Trajectory, truth: Trajectory, error: PathError, dimensions: int) -> Iterator[str]:
+    """What of the truth would have to be otherwise for a far better fit, and errors that no good map has."""
+    size_m, true_m = (float(np.linalg.norm(one.poses[:, :3].std(axis=0))) for one in associate(path, truth))
+    k = size_m / max(true_m, 1e-9)
+    tried = {
+        "": truth,
+        f"its ways are {1.0 / k:.3g} times ours: in metres?": replace(truth, poses=truth.poses * [k, k, k, 1, 1, 1, 1]),
+        "its y points to the other side": replace(truth, poses=truth.poses * [1, -1, 1, 1, 1, 1, 1]),
+    }
+    left_m = {what: _rmse_m(path, other, dimensions) for what, other in tried.items()}
+    for late_s in np.arange(-_MOST_LATE_S, _MOST_LATE_S, _LATE_S) if left_m[""] > _LATE_M else ():
+        what = f"its stamps are {abs(late_s):.1f} s {'late' if late_s > 0.0 else 'early'}: another clock?"
+        left_m[what] = _rmse_m(path, replace(truth, stamps_s=truth.stamps_s - late_s), dimensions, error.n // 2)
+    what, error_m = min(left_m, key=lambda one: left_m[one]), error.position_m["rmse"]
+    if left_m[what] < _CLEARLY * min(left_m[""], size_m) and left_m[""] > _LATE_M:
+        yield f"the truth would fit far better, but {what}"
+    elif error_m > max(_FAR * true_m, _FAR_M):
+        far = f"the error is {error_m:.3g} m on a true path of radius {true_m:.3g} m (RMS)"
+        yield f"{far}: check that the truth is of this robot and this drive"
+    w_first = replace(truth, poses=truth.poses[:, [0, 1, 2, 4, 5, 6, 3]])
+    angle, turned = error.angle_rad, path_error(path, w_first, dimensions).angle_rad
+    if turned and angle and angle["rmse"] > max(_FAR_M, 2.0 * turned["rmse"]):
+        yield "the quaternions of the truth are read as x y z w, and fit far better if w comes first"
+    elif angle and angle["median"] > _FAR_M and angle["max"] < 1.5 * angle["median"]:
+        yield f"the truth's headings are {np.degrees(angle['median']):.0f} degrees off throughout: is its x axis ahead?"
 
 
-def _overlap(path: Trajectory, truth: Trajectory) -> bool:
+def _rmse_m(path: Trajectory, truth: Trajectory, dimensions: int, least: int = 2) -> float:
+    """The RMSE of a path after alignment; infinite with fewer common stamps."""
     try:
-        return len(associate(path, truth)[0].stamps_s) > 1
+        errors_m = matched(path, truth, dimensions).position_errors_m
     except GraphSlamError:
-        return False
+        return np.inf
+    return float(np.sqrt(np.mean(errors_m**2))) if len(errors_m) >= least else np.inf
 
 
 def _described(drive: Drive) -> str:

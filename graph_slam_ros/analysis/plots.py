@@ -87,12 +87,7 @@ def draw_run(
 
 @dataclass(frozen=True, slots=True)
 class _Placed:
-    """A run where it is drawn: in map.
-
-    Attributes
-    ----------
-    errors, odometry_errors : stamps [s] and position errors [m], None where there is no truth
-    """
+    """A run where it is drawn, in map; errors are stamps [s] and position errors [m], where there is a truth."""
 
     path: Trajectory
     odometry: Trajectory | None

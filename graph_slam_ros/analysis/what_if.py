@@ -164,12 +164,7 @@ class InfluenceModel:
 
 
 def _fill(found: Influences, at: Index, block: Block, among: Array, of_last: Array, sign: float) -> None:
-    """Compute the influence of edges of one type; ``sign`` is 1 for edges that are let in, else -1.
-
-    Parameters
-    ----------
-    among : (n, D, D) covariances of their vertices; of_last : (n, d, D) of the last keyframe with them
-    """
+    """Compute the influence of edges of one type by the covariances of their vertices; ``sign``: 1 lets in, -1 out."""
     a, r = block.jacobian, block.residual
     inner = np.eye(r.shape[1]) + sign * (a @ among @ a.transpose(0, 2, 1))
     values, vectors = np.linalg.eigh(inner)

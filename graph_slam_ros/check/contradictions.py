@@ -147,7 +147,7 @@ def fitted(rows: Array, y: Array) -> tuple[Array, float]:
         found = np.linalg.lstsq(rows * weight[:, None], y * weight, rcond=None)[0]
         left = np.abs(rows @ found - y)
         weight = 1.0 / np.hypot(1.0, left / (3.0 * np.median(left) + 1e-6))
-    return found, float(np.median(left) / np.linalg.norm(rows[:, -1] * weight))
+    return np.asarray(found), float(np.median(left) / np.linalg.norm(rows[:, -1] * weight))
 
 
 def _turned(s: SightingColumns, pairs: Pairs, T_base_true: se3.Pose) -> se3.Pose:

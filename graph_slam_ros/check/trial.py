@@ -75,7 +75,7 @@ def _points_in_map(c: Columns, s: SightingColumns, slam: GraphSlam, stamp_ns: In
         since = se3.between(tuple(own[k].T), tuple(driven.T))
         ends.append(se3.compose(tuple(estimate[k].T), since))
     part = np.clip((stamp_ns - at_ns[after - 1]) / np.maximum(at_ns[after] - at_ns[after - 1], 1), 0.0, 1.0)
-    return np.stack(se3.act(se3.interpolate(*ends, part), tuple(s.points.T)), axis=1)
+    return np.stack(se3.act(se3.interpolate(ends[0], ends[1], part), tuple(s.points.T)), axis=1)
 
 
 def check_trial(c: Columns, slam: GraphSlam) -> Iterator[Finding]:

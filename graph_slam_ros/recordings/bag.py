@@ -146,7 +146,7 @@ def _files(path: Path) -> list[Path]:
         found = sorted((file for file in path.glob(f"*{suffix}") if file.is_file()), key=_natural)
         if found:
             return found
-    within = [*dict.fromkeys(str(one.parent) for suffix in _SUFFIXES for one in sorted(path.glob(f"*/*{suffix}")))]
+    within = [*dict.fromkeys(one.parent.name for suffix in _SUFFIXES for one in sorted(path.glob(f"*/*{suffix}")))]
     several = f"; give one of those in it: {', '.join(within[:_MOST_NAMED])}" if within else ""
     raise BagError(f"{path}: no recording (.mcap, .db3, .bag) in this folder{several}")
 

@@ -478,9 +478,8 @@ def test_what_cannot_be_read_is_named_for_what_it_is(tmp_path, capsys):
     for words, expected in {
         ("info", empty): "its definition of aruco_msgs/msg/MarkerArray in the recording is empty",
         ("check", empty): "is not used",
-        ("check", tmp_path): f"give one of those in it: {tmp_path / 'a'}",
-        ("check", empty, "--set", "odom.use", "none"): "--set odom.use: a setting is KEY=VALUE, without a blank",
-        ("info", tmp_path / "a"): f"lost: {tmp_path / 'a'}: part 1 is not there, between others",
+        ("check", tmp_path): "give one of those in it: a",
+        ("info", tmp_path / "a"): "part 1 is not there, between others",
     }.items():
         assert expected in said(capsys, *words)[1], words
 
@@ -491,6 +490,8 @@ def test_truth_of_other_tools_is_read_or_named(tmp_path, capsys):
     assert pasted(capsys, bag, tmp_path / "run")[0] == 0
     rows = [(t, x, y, math.sin(a / 2), math.cos(a / 2)) for t, (x, y, a) in zip(robot.t, robot.true, strict=True)]
     tum = [f"{BEGINS_S + t:.6f} {x} {y} 0 0 0 {s} {c}\n" for t, x, y, s, c in rows]
+    late = "".join(f"{BEGINS_S + t + 0.5:.6f} {x} {y} 0 0 0 {s} {c}\n" for t, x, y, s, c in rows)
+    large = "".join(f"{BEGINS_S + t:.6f} {1e3 * x} {1e3 * y} 0 0 0 {s} {c}\n" for t, x, y, s, c in rows)
     w_first = "".join(f"{BEGINS_S + t:.6f} {x} {y} 0 {c} 0 0 {s}\n" for t, x, y, s, c in rows)
     euroc = "".join(f"{round((BEGINS_S + t) * 1e9)},{x},{y},0,{c},0,0,{s},0\n" for t, x, y, s, c in rows)
     head = "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []\n"
@@ -502,6 +503,8 @@ def test_truth_of_other_tools_is_read_or_named(tmp_path, capsys):
         ("kitti.txt", "1 0 0 0 0 1 0 0 0 0 1 0\n", "without stamps"),
         ("utf16.tum", "".join(tum), "iconv"),
         ("w_first.tum", w_first, "w comes first"),
+        ("late.tum", late, "its stamps are 0.5 s late"),
+        ("large.tum", large, "its ways are 1e+03 times ours"),
     ):
         (tmp_path / name).write_text(text, encoding="utf-16" if name == "utf16.tum" else "utf-8")
         code, shown = said(capsys, "evaluate", tmp_path / "run", "--truth", tmp_path / name, "--json")
