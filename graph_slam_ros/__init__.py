@@ -73,5 +73,4 @@ if not TYPE_CHECKING:  # or type checkers would believe in every name
 
 
 def __dir__() -> list[str]:
-    """The public names, imported or not."""
     return sorted({*globals(), *__all__})

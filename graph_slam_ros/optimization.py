@@ -125,7 +125,9 @@ def optimize(source: Graph | G2oFile | Path | str, settings: Settings | None = N
         file = G2oFile(source, list(range(source.vertex_count)))
     else:
         file = source if isinstance(source, G2oFile) else read_g2o(source)
-    settings, began = settings or Settings(), time.perf_counter()
+    settings, began = Settings() if settings is None else settings, time.perf_counter()
+    if not isinstance(settings, Settings):
+        raise GraphSlamError(f"settings are a {type(settings).__name__}, not Settings(method, ...)")
     first = _solved(file, settings, "file" if init == "auto" else init)
     return _judged(first, settings) if init != "auto" else _best_of(first, settings, time.perf_counter() - began)
 

@@ -139,8 +139,7 @@ def _refuse_failure(code: int, errors: bytes) -> None:
 
 
 def _cached() -> int:
-    """Kernels in the cache, each in a file of its own."""
-    return len({file.name for file in CACHE_DIR.rglob("*.nbi")})
+    return len({kernel.name for kernel in CACHE_DIR.rglob("*.nbi")})
 
 
 @functools.cache  # what is loaded stays

@@ -12,7 +12,7 @@ from graph_slam_ros.errors import FormatError
 from graph_slam_ros.formats.durable import write_whole
 from graph_slam_ros.formats.graph_file import AT_OFFSET, HALVED, G2oFile, Values, moved
 from graph_slam_ros.formats.strict import is_gzipped
-from graph_slam_ros.graph import LANDMARK_POSITION_3D, POSE_PRIOR_3D, EdgeType, Graph
+from graph_slam_ros.graph import LANDMARK_POSITION_3D, POSE_PRIOR_3D, Graph
 from graph_slam_ros.lie import se3
 
 
@@ -23,8 +23,11 @@ def write_g2o(path: Path | str, file: G2oFile | Graph, values: Values | None = N
     17 significant digits: what is read back is what was written. The information of an edge is multiplied by its
     weight; one of weight 0 is out of the problem, and left out.
     """
-    if not isinstance(path, str | Path) or not isinstance(file, G2oFile | Graph):
-        raise FormatError("write_g2o(PATH, GRAPH, VALUES): PATH first, then a Graph or G2oFile, e.g. solution.file")
+    is_of_graph = isinstance(path, str | Path) and isinstance(file, G2oFile | Graph)
+    if not is_of_graph or not (values is None or callable(values)):
+        raise FormatError(
+            "write_g2o(PATH, GRAPH, VALUES): PATH first, then a Graph or solution.file, then solver.estimate"
+        )
     whole = file if isinstance(file, G2oFile) else G2oFile(file, list(range(file.vertex_count)))
     values = values or (lambda ids: np.array([whole.graph.vertex(vertex).initial for vertex in ids]))
     write_text(path, "\n".join(graph_lines(whole, values)) + "\n")
@@ -74,7 +77,7 @@ def _vertex_lines(file: G2oFile, values: Values) -> list[str]:
 def _edge_lines(file: G2oFile) -> Iterator[tuple[int, int, str]]:
     """Code of the label, id and line of each edge in the problem."""
     for edge_type, table in file.graph.tables.items():
-        tag = tag_of(edge_type)
+        tag, head = tag_of(edge_type), edge_type.measured_size - len(edge_type.tail)
         root, measured = table.sqrt_information.values, table.measured.values
         ids, labels, ends = (column.values.tolist() for column in (table.id, table.label, table.vertices))
         numbers = [file.seen_from.get(edge, 0) for edge in ids]
@@ -90,13 +93,10 @@ def _edge_lines(file: G2oFile) -> Iterator[tuple[int, int, str]]:
         for row in np.flatnonzero(table.weight.values != 0.0).tolist():
             words = [tag, *(str(file.ids[v]) for v in ends[row])]
             words += [str(numbers[row])] * (tag in AT_OFFSET)
-            words.append(_text([*_short(edge_type, measured[row].tolist()), *information[row].tolist()]))
+            seen = measured[row].tolist()
+            seen = seen[:head] if tuple(seen[head:]) == edge_type.tail else seen
+            words.append(_text([*seen, *information[row].tolist()]))
             yield labels[row], ids[row], " ".join(words)
-
-
-def _short(edge: EdgeType, measured: list[float]) -> list[float]:
-    head = edge.measured_size - len(edge.tail)
-    return measured[:head] if tuple(measured[head:]) == edge.tail else measured
 
 
 def _text(numbers: Sequence[float]) -> str:

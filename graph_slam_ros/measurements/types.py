@@ -50,11 +50,12 @@ class _Checked:
     __slots__ = ()
 
     def __post_init__(self) -> None:
-        value: Any = getattr(self, "stamp_ns", 0)
-        name, sizes, spaces = "stamp_ns", _sizes_of(self), set[int]()
+        sizes, spaces = _sizes_of(self), set[int]()
         try:
-            if type(value) is not int or value.bit_length() > 63:
-                object.__setattr__(self, name, int(np.int64(operator.index(value))))
+            for name in ("stamp_ns", "from_stamp_ns"):
+                value: Any = getattr(self, name, 0)
+                if type(value) is not int or value.bit_length() > 63:
+                    object.__setattr__(self, name, int(np.int64(operator.index(value))))
             for name, allowed in sizes.items():
                 value = getattr(self, name)
                 if value is not None and not (type(value) is tuple and {float}.issuperset(map(type, value))):
@@ -63,8 +64,7 @@ class _Checked:
                 if not value and self.__dataclass_fields__[name].default is not MISSING:  # type: ignore[attr-defined]
                     continue
                 space = allowed.index(len(value))
-                if len(allowed) > 1:
-                    spaces.add(space)
+                spaces.update([space] * (len(allowed) > 1))
                 if "covariance" in name:
                     is_right = min(value[:: math.isqrt(len(value)) + 1]) >= 0.0
                 else:

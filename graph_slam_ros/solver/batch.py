@@ -140,8 +140,8 @@ class Settings:
             if not getattr(self, name) >= least:  # nor is NaN
                 raise GraphSlamError(f"{name} {getattr(self, name)}: must be a number >= {least}")
         for label, stages in self.losses.items():
-            if not len(stages):
-                raise GraphSlamError(f"losses: {label!r} has no stage; leave it out, or give it a loss")
+            if not isinstance(stages, Sequence) or {type(stage) for stage in stages} != {Loss}:
+                raise GraphSlamError(f"losses: {label!r} has {stages!r}: leave it out, or give it a list of Loss")
 
     def last_loss(self, label: str, source: str) -> Loss:
         """The loss of the last stage of an edge."""

@@ -14,6 +14,7 @@ from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.edge_tags import EDGE_TAGS
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import EdgeType
+from graph_slam_ros.measurements import Closure
 from graph_slam_ros.runs.restore import map_of, record_run
 from graph_slam_ros.tools.report.places import keyframe_paths
 
@@ -71,7 +72,8 @@ def test_what_is_no_run_or_has_no_results_is_refused(done, tmp_path):
     "make, words",
     [
         (lambda: Odometry(0, None), "3 or 7 finite numbers"),
-        (lambda: Odometry(10**25, (0, 0, 0)), "whole nanoseconds"),
+        (lambda: Odometry(0.5, (0, 0, 0)), "stamp_ns 0.5: it must be whole nanoseconds"),
+        (lambda: Closure(0, 10**25, "scan", (0, 0, 0), np.eye(3)), "from_stamp_ns 10000000000000000000000000: it must"),
         (lambda: Odometry(0, (0, 0, 0, 0, 0, 0, 2)), "of length 1"),
         (lambda: Sighting("a", "position", (1, 2), -np.eye(2)), "no variance negative"),
         (lambda: Sightings(0, "tags", [("a", 1, 2)]), "a tuple, not a Sighting"),

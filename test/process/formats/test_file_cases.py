@@ -626,7 +626,6 @@ def graph_of(folder, text, **options):
 
 BAD_LINES = {
     "VERTEX_SE2 12 1 2": "VERTEX_SE2 needs 4 fields after the tag, found 3",
-    "VERTEX_SE2": "needs 4 fields after the tag, found 0",
     "EDGE_SE2 10 11 1 0 0.1 10 1 -2 20 3": "EDGE_SE2 needs 11 fields after the tag, found 10",
     "EDGE_SE2 10 7 1 0 0.1 10 1 -2 20 3 30": "EDGE_SE2 to vertex 7, which is a VERTEX_XY",
     "EDGE_SE2 11 11 1 0 0.1 10 1 -2 20 3 30": "edge from vertex 11 to itself",
@@ -636,15 +635,12 @@ BAD_LINES = {
     # F23: no plain finite number, no id
     **{f"VERTEX_SE2 12 1 2 {w}": f"'{w}' is not a finite number" for w in ("nan", "inf", "-Infinity", "1e999", "1_0")},
     **{f"VERTEX_SE2 12 {w} 2 3": f"'{w}' is not a finite number" for w in ("\u0661", "0x10", "1,5", ".")},
-    **{f"VERTEX_SE2 {w} 1 2 3": f"'{w}' is not an id" for w in ("1.0", "\u0661", "1_0")},
-    "VERTEX_SE2 99999999999999999999 1 2 3": "is not an id",
-    "FIX x": "'x' is not an id",
+    **{f"VERTEX_SE2 {w} 1 2 3": f"'{w}' is not an id" for w in ("1.0", "\u0661", "1_0", "9" * 20)},
     # F24: a vertex that is not there
-    "EDGE_SE2 10 12 1 0 0.1 10 1 -2 20 3 30": "edge to vertex 12, which is not declared",
+    "EDGE_SE2 10 12 1 0 0.1 10 1 -2 20 3 30": "edge to vertex 12, which is not declared (--lenient leaves it out)",
     "FIX 12": "FIX names vertex 12, which is not declared",
     # F25: no information, no turn
     "EDGE_SE2 10 11 1 0 0.1 0 0 0 0 0 0": "information is not positive definite",
-    "EDGE_PRIOR_SE2 11 0 0 0 -1 0 0 1 0 1": "information is not positive definite",
     "VERTEX_SE3:QUAT 12 0 0 0 0 0 0 0": "the quaternion is zero",
 }
 

@@ -8,7 +8,7 @@ from math import cos, pi, sin
 import numpy as np
 import pytest
 
-from graph_slam_ros import Graph, Solver, write_g2o
+from graph_slam_ros import Graph, Settings, Solver, optimize, write_g2o
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import RELATIVE_POSE, SE2, check_edge, edge_from_residual
 from graph_slam_ros.lie import se2
@@ -100,7 +100,6 @@ READ = {  # content, exit code, what is said, edges of each class
     "CRLF, tabs, comments, Fortran's numbers, whole matrices": (re.sub("\n", "\t\r\n", MADE), 0, "", BOTH),
     "whole and skew": (PLAIN.replace(INFO[2], "1 2 0 0 1 0 0 0 4", 1), 2, "has 9 numbers, and is not symmetric", None),
     "vertices alone": (PLAIN[: PLAIN.index("EDGE")], 2, "it has no edges: without them nothing fixes the gauge", None),
-    "no such vertex": (f"{PLAIN}EDGE_SE2 1 99 1 0 0 {INFO[2]}\n", 2, "not declared (--lenient leaves it out)", None),
     "Boost": ("22 serialization::archive 18 0 0 0 Described 0 1.5", 2, "a Boost archive, as slam_toolbox's", None),
     "a database": (b"SQLite format 3\0\xff\xfe", 2, "a database. RTAB-Map's exports its graph", None),
 }
@@ -159,6 +158,9 @@ def test_habits_of_other_libraries_get_one_line(tmp_path):
     for does, says in (
         (lambda: graph.add_edge(RELATIVE_POSE, ends, [1, 0, 0], np.eye(3), "a"), "Gaussian.from_sigmas, from_cov"),
         (lambda: write_g2o(graph, tmp_path / "own.g2o"), "PATH first"),
+        (lambda: write_g2o(tmp_path / "own.g2o", graph, np.zeros((2, 3))), "PATH first"),
+        (lambda: optimize(graph, {"method": "gn"}), "settings are a dict"),
+        (lambda: Settings(losses={"closures": "huber"}), "'closures' has 'huber': leave it out, or give it a list"),
         (lambda: Solver(graph).optimize(), "nothing to solve"),
         (lambda: check_edge(many), r"many: the residual has the shape \(3,\), not \(1,\)"),
     ):
