@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Container, Mapping, Sequence
 from contextlib import suppress
+from copy import deepcopy
 
 import numpy as np
 
@@ -273,7 +274,9 @@ class Backend:
         keyframes = rows.ids.copy(), rows.stamps_ns.copy(), tuple(dict.fromkeys(begins))
         problem = solver.vertices, solver.held, solver.values, solver.settings
         track = path.samples.track(path.keyframes.poses, factors)
-        return TrialProblem(space, graph, *problem, origins.copy(), *keyframes, track, self.first_free_edge)
+        return TrialProblem(
+            space, graph, *problem, deepcopy(origins, {id(space): space}), *keyframes, track, self.first_free_edge
+        )
 
     @property
     def is_handed_over(self) -> bool:

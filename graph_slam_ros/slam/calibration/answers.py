@@ -234,6 +234,7 @@ CODES = {
 
 LEAST_M = 0.2  # errors that last, as a robot that follows its commands late, are up to 0.14 m in recorded drives
 MOST_SCALE = 0.03  # of distances: with more, the map has another size if ranges are wrong, though its poses agree
+BESIDE_BENDS = 0.06  # of the distance where it is another in bends: in recorded robots with right ranges up to 0.05
 MOST_SHIFT = 2.0**0.5  # sigmas of the poses: with more, their NEES is three times what is expected
 _DEGREE = np.pi / 180.0
 _SIDES = {"x": ("ahead", "back"), "y": ("to the left", "to the right")}
@@ -308,9 +309,10 @@ def uncorrected(
 
 def is_off(found: TrialFit, one: Finding) -> bool:
     """Return whether a parameter is off beyond doubt, though its sigma may be too large to correct it."""
+    name, far = one.parameter.name, abs(one.value)
     is_known = one.verdict == "admitted" or (one.verdict == "not_determined" and is_certain(found, one.parameter))
-    is_known |= one.parameter.name == "distance" and _has_bends(found) and abs(one.value) > SIGMAS * one.sigma
-    return is_known and (one.parameter.name not in _SIDES or abs(one.value) >= LEAST_M)
+    is_known |= name == "distance" and _has_bends(found) and far > max(SIGMAS * one.sigma, BESIDE_BENDS)
+    return is_known and (name not in _SIDES or far >= LEAST_M)
 
 
 def _has_bends(found: TrialFit) -> bool:

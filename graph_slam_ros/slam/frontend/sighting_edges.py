@@ -1,7 +1,5 @@
 """The origin of each sighting edge: its stamp, and the poses of robot and sensor relative to its keyframe."""
 
-from copy import deepcopy
-
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -63,10 +61,6 @@ class SightingEdges:
         rows, columns = np.flatnonzero(new >= 0), (self._edge, self._stamp_ns, self._pose, self._sensor)
         self._edge, self._stamp_ns, self._pose, self._sensor = (column.kept(rows) for column in columns)
         self.edge[:] = new[rows]
-
-    def copy(self) -> "SightingEdges":
-        """Return a copy."""
-        return deepcopy(self, {id(self._space): self._space})
 
     def __len__(self) -> int:
         return len(self._edge)
