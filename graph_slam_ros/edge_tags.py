@@ -91,10 +91,7 @@ def plugin_tags() -> frozenset[str]:
 def edge_of(tag: str) -> EdgeType:
     """Return the edge type of a tag that is built in or of a plugin; what a plugin's raises names it.
 
-    Raises
-    ------
-    ConfigError
-        The plugin cannot be used, or there is none.
+    Raises ConfigError: the plugin cannot be used, or there is none.
     """
     return built_in(tag) or _plugin(tag)
 
@@ -102,10 +99,7 @@ def edge_of(tag: str) -> EdgeType:
 def tag_of(edge: EdgeType) -> str:
     """Return the tag of an edge type.
 
-    Raises
-    ------
-    FormatError
-        It is not built in, and no plugin has it; those that cannot be used are named.
+    Raises FormatError: it is not built in, and no plugin has it; those that cannot be used are named.
     """
     if members := members_of(edge):
         points, poses = members

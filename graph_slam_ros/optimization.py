@@ -14,7 +14,7 @@ from scipy.special import chdtri
 from graph_slam_ros.errors import GaugeError, GraphSlamError, SingularError
 from graph_slam_ros.formats.g2o import read_g2o
 from graph_slam_ros.formats.graph_file import G2oFile
-from graph_slam_ros.graph import RELATIVE_POSE, RELATIVE_POSE_3D, EdgeType, Graph
+from graph_slam_ros.graph import LANDMARK_POSITION, RELATIVE_POSE, RELATIVE_POSE_3D, EdgeType, Graph
 from graph_slam_ros.progress import report
 from graph_slam_ros.solver import Report, Settings, Solver, initial_values
 from graph_slam_ros.solver.initialization import OnPose
@@ -31,12 +31,17 @@ _COVARIANCE = "is a covariance given as information? g2o has its inverse"
 _W_FIRST = "does w come first in the quaternions of its {}? g2o has qx qy qz qw"
 _DEGREES = "are the angles of its {} in degrees? g2o has radians"
 _BACKWARDS = "do its {} lead from j to i? g2o has the pose of j as seen from i"
+_MILLIMETRES = "are its {} in millimetres, and its vertices in metres? g2o has metres"
 _FIXED = "FIX of {} contradicts the edges, which all fit without: are these places wrong? g2o has true ones, or no FIX"
 _MISTAKES: tuple[tuple[str, EdgeType, Callable[[Array, Index], tuple[Array, Index]]], ...] = (  # and what undoes each
     (_W_FIRST, RELATIVE_POSE_3D, lambda seen, ends: (seen[:, [0, 1, 2, 4, 5, 6, 3]], ends)),
     (_DEGREES, RELATIVE_POSE, lambda seen, ends: (seen * (1.0, 1.0, np.pi / 180.0), ends)),
     *((_BACKWARDS, edge, lambda seen, ends: (seen, ends[:, ::-1])) for edge in (RELATIVE_POSE, RELATIVE_POSE_3D)),
+    (_MILLIMETRES, RELATIVE_POSE, lambda seen, ends: (seen * (1e-3, 1e-3, 1.0), ends)),
+    (_MILLIMETRES, RELATIVE_POSE_3D, lambda seen, ends: (seen * (*[1e-3] * 3, *[1.0] * 4), ends)),
+    (_MILLIMETRES, LANDMARK_POSITION, lambda seen, ends: (seen * 1e-3, ends)),
 )
+_FAR_LONGER = 100.0  # measured lengths of edges than those of the file's values: only then other units are tried
 _TRIAL_ITERATIONS = 30
 _SAME = 1e-6  # part of the cost by which one optimum differs from start to start
 
@@ -199,14 +204,24 @@ def _without_mistakes(file: G2oFile) -> Iterator[tuple[str, G2oFile]]:
     if len(file.fixed) > 1 or (file.fixed and "priors" in labels):
         yield _FIXED.format(shortened([file.ids[v] for v in file.fixed])[1:-1]), replace(file, fixed=[])
     for mistake, edge, undo in _MISTAKES:
-        for label in ["edges", *labels] if edge in file.graph.tables else []:
+        for label in [*labels, "edges"] if edge in file.graph.tables else []:
             graph = file.graph.copy()
             table = graph.tables[edge]
             rows = np.flatnonzero(graph.has_label(table.id.values, labels if label == "edges" else [label]))
-            if len(rows):
-                undone = undo(table.measured.values[rows], table.vertices.values[rows])
+            seen, ends = table.measured.values[rows], table.vertices.values[rows]
+            if len(rows) and (mistake != _MILLIMETRES or _are_far_longer(file, seen, ends)):
+                undone = undo(seen, ends)
                 table.measured.values[rows], table.vertices.values[rows] = undone
                 yield mistake.format(label), replace(file, graph=graph)
+
+
+def _are_far_longer(file: G2oFile, seen: Array, ends: Index) -> bool:
+    """Whether edges measure far longer ways than there are between their vertices as the file has them."""
+    axes = np.arange(3 if seen.shape[1] == 7 else 2)
+    at = file.graph.initial.values[file.graph.offset.values[ends][:, :, None] + axes]
+    lengths = np.linalg.norm(at[:, 1] - at[:, 0], axis=1)
+    longer = np.median(np.linalg.norm(seen[:, axes], axis=1)) > _FAR_LONGER * np.median(lengths)
+    return bool(file.has_values and longer)
 
 
 def suspicion_of(solution: Solution, settings: Settings) -> str:

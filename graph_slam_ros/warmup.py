@@ -73,20 +73,10 @@ def warmup(
     on_progress: OnProgress = lambda now: report(str(now)),
     dimensions: int = 3,
 ) -> float:
-    """Compile what is not compiled yet, and load it; returns the seconds it took.
+    """Compile what is not compiled yet, and load it, before anything is computed whose bytes repeat; returns seconds.
 
-    Before anything is computed whose bytes are to be repeated.
-
-    Parameters
-    ----------
-    is_stop_requested : asked while kernels are compiled, which may take minutes
-    on_progress : called meanwhile, several times a second
-    dimensions : 2 where all is in the plane, which needs fewer kernels
-
-    Raises
-    ------
-    GraphSlamError
-        Stopped on request; the next warm-up goes on from there.
+    ``is_stop_requested`` and ``on_progress`` are called while kernels are compiled, which may take minutes. The plane
+    (2 ``dimensions``) needs fewer. Raises GraphSlamError: stopped on request; the next warm-up goes on from there.
     """
     start = time.perf_counter()
     compile_all(is_stop_requested, on_progress, dimensions)

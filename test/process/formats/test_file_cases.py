@@ -626,12 +626,10 @@ def graph_of(folder, text, **options):
 
 BAD_LINES = {
     "VERTEX_SE2 12 1 2": "VERTEX_SE2 needs 4 fields after the tag, found 3",
-    "EDGE_SE2 10 11 1 0 0.1 10 1 -2 20 3": "EDGE_SE2 needs 11 fields after the tag, found 10",
     "EDGE_SE2 10 7 1 0 0.1 10 1 -2 20 3 30": "EDGE_SE2 to vertex 7, which is a VERTEX_XY",
     "EDGE_SE2 11 11 1 0 0.1 10 1 -2 20 3 30": "edge from vertex 11 to itself",
     "FIX": "FIX names no vertex",
-    # F21: declared before
-    "VERTEX_SE2 11 1.5 -2e-3 .26": "vertex 11 was declared before, with other values",
+    "VERTEX_SE2 11 1.5 -2e-3 .26": "vertex 11 was declared before, with other values",  # F21
     # F23: no plain finite number, no id
     **{f"VERTEX_SE2 12 1 2 {w}": f"'{w}' is not a finite number" for w in ("nan", "inf", "-Infinity", "1e999", "1_0")},
     **{f"VERTEX_SE2 12 {w} 2 3": f"'{w}' is not a finite number" for w in ("\u0661", "0x10", "1,5", ".")},

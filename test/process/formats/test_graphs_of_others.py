@@ -66,6 +66,7 @@ PRINTED = (PLAIN + edge(2, 9)).replace(INFO[2], "4 4.0004 0 4 0 9", 3)
 PARTS = PLAIN + "".join(f"VERTEX_SE2 {70 + k} 0 0 0\n" for k in range(2)) + "EDGE_SE2 70 71 1 0 0 1 0 0 1 0 1\n"
 DEGREES = re.sub(rf"(EDGE.*) (\S+)( {INFO[2]})", lambda e: f"{e[1]} {float(e[2]) * 180 / pi}{e[3]}", PLAIN)
 BACK = drive() + "".join(edge(k, k + 5).replace(f"{k} {k + 5}", f"{k + 5} {k}", 1) for k in range(HALF))
+MM = drive() + re.sub(r"(EDGE\S+ \d+ \d+ \S+)(\.\S+) (\S+)(\.\S+)", r"\1\2e3 \3\4e3", closures())
 HELD = re.sub(r"SE2 5 \S+", "SE2 5 3.5", PLAIN, count=1) + "FIX 0 5 9\n"
 W_FIRST = re.sub(r"( 0 0)( \S+)( \S+)( 100.*)", r"\3\1\2\4", drive(3)) + edge(0, HALF, 3)
 MADE = re.sub(r"(\.\d+)", r"\1D+00", f"% a\n// b\n; c\n{PLAIN}").replace(INFO[2], "1 0 0 0 1 0 0 0 4 # all")
@@ -94,6 +95,7 @@ READ = {  # content, exit code, what is said, edges of each class
     "small residuals": (re.sub(r"(\d\.\d\d)\d+", r"\1", PLAIN).replace(INFO[2], "1 0 0 1 0 1"), 0, "", BOTH),
     "degrees": (DEGREES, 3, "are the angles of its edges in degrees? g2o has radians", BOTH),
     "j to i": (BACK, 3, " lead from j to i? g2o has the pose of j as seen from i", BOTH),
+    "millimetres": (MM, 3, "are its closures in millimetres, and its vertices in metres? g2o has metres", BOTH),
     "FIX at wrong places": (HELD, 3, "FIX of 0, 5, 9 contradicts the edges, which all fit without: are these", BOTH),
     "unknown edges alone": (PLAIN.replace("EDGE_", "EDGE_MY_"), 2, "23 EDGE_MY_SE2: of an unknown kind, so", None),
     "too short": (f"{PLAIN}EDGE_SE2_MAXMIX 1 9 90 1 0 0 1\n", 2, "EDGE_SE2_MAXMIX, read as EDGE_SE2, needs", None),
