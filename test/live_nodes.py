@@ -39,7 +39,6 @@ LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability
 RELIABLE = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 PATIENCE_S = 10.0
 PUBLICATIONS = {one.name.removeprefix("~/"): one for one in topics.PUBLICATIONS}
-
 _HELD = contextlib.ExitStack()
 ENVIRONMENT = dict(
     os.environ, ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST", ROS_DOMAIN_ID=_HELD.enter_context(own_domain())

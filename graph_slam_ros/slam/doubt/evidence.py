@@ -273,7 +273,6 @@ class Stretch:
 
 
 def _observed(what: int | str, one: Edge, places: Sequence[tuple[int, Index]]) -> _Observed:
-    """Lay out an observation of vertices that are at these places."""
     covariance, constant = covariance_of(one), 2.0 * float(np.linalg.slogdet(one.sqrt_information)[1])
     at, columns = np.array([[stored for stored, _ in places]]), np.concatenate([columns for _, columns in places])
     limit = quantile(_CAP, len(covariance))

@@ -112,7 +112,6 @@ class GyroSamples:
         return end_ns - self._samples[newest].stamp_ns <= self._gap_ns and all(map(self._is_followed, range(newest)))
 
     def _is_followed(self, k: int) -> bool:
-        """Return whether the next message is near enough to interpolate."""
         s = self._samples
         return k + 1 < len(s) and s[k + 1].stamp_ns - s[k].stamp_ns <= self._gap_ns
 

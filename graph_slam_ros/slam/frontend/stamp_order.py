@@ -12,7 +12,6 @@ from bisect import insort
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import pairwise
 from statistics import median
 from typing import Any
 
@@ -46,7 +45,9 @@ class StampOrder:
         self._counters = counters
         self._queue: list[tuple[int, int, str, int, Odometry | Observation]] = []  # ascending
         self._recent: dict[str, dict[Observation, None]] = {}  # in the order they came
-        self._came: dict[str, list[Sequence[int]]] = {}  # stamps of odometry then, and of the last messages of a topic
+        self._came: dict[
+            str, list[Sequence[int]]
+        ] = {}  # odometry then, stamps of a topic, and the longest step to each
         self.set_ns = Counter[str]()
         self._arrivals = 0
         self._newest_odometry_ns: int | None = None
@@ -111,16 +112,18 @@ class StampOrder:
         A sensor that becomes slow comes late, too, but no stamps go back; one that becomes fast is never early.
         """
         came, at_ns = self._came.setdefault(m.topic, []), self._newest_odometry_ns or 0
+        stamp_ns = m.stamp_ns + self.set_ns[m.topic]
+        step_ns = stamp_ns - came[-1][1] if came else 0
         if came and came[-1][0] == at_ns:
-            came.pop()
-        came.append((at_ns, m.stamp_ns + self.set_ns[m.topic]))
+            step_ns = max(step_ns, came.pop()[2])
+        came.append((at_ns, stamp_ns, step_ns))
         del came[:-_KEPT]
         if len(came) >= _FEWEST:
-            lags_ns = [odometry_ns - stamp_ns for odometry_ns, stamp_ns in came]
+            lags_ns = [odometry_ns - seen_ns for odometry_ns, seen_ns, _ in came]
             before_ns, now_ns = lags_ns[:-_IN_A_ROW], lags_ns[-_IN_A_ROW:]
-            steps_ns = [(b[0] - a[0], b[1] - a[1]) for a, b in pairwise(came)]
-            is_back = min(steps_ns[-_IN_A_ROW]) < 0
-            is_ahead = max(now_ns) < -_APART_NS and steps_ns[-_IN_A_ROW][1] > median(b for _, b in steps_ns) + _APART_NS
+            last, first = came[-_IN_A_ROW - 1], came[-_IN_A_ROW]
+            is_back = first[0] < last[0] or first[1] < last[1]
+            is_ahead = max(now_ns) < -_APART_NS and first[2] > median(step_ns for *_, step_ns in came) + _APART_NS
             apart_ns = max(min(now_ns) - max(before_ns), min(before_ns) - max(now_ns))
             if (is_back or is_ahead) and apart_ns > _APART_NS:
                 self.set_ns[m.topic] += round(median(now_ns) - median(before_ns))
