@@ -102,7 +102,6 @@ def _contradictions(c: Columns, s: SightingColumns) -> Iterator[Finding]:
             yield from noisier(s, pairs)
             return
         text = f"{s.topic}: odometry does not explain {share:.0%} of the motion between two sightings of a landmark"
-        text += " of which there is one" * (len(s.names) == 1)
         yield Finding("unrelated", "error", share, _UNRELATED, "part", text, **where(s.topic, s.stamp_ns, count))
 
 
@@ -226,8 +225,8 @@ def _scaled(c: Columns, s: SightingColumns, pairs: Pairs) -> Finding | None:
     moved, turned = pairs.motion[:, :n], (sensor - origin)[:, :n]
     x = (s.points[pairs.a] - after)[:, :n] + turned
     (drive, swing), sigma = fitted(np.stack([moved.ravel(), turned.ravel()], axis=1), x.ravel())
-    left = np.median(np.linalg.norm(x - drive * moved - swing * turned, axis=1))
-    if left > _HALF * np.median(np.linalg.norm(x, axis=1)) or drive <= 0.0 or abs(drive - 1.0) < _OTHER_SCALE:
+    left, size = (np.median(np.linalg.norm(some, axis=1)) for some in (x - drive * moved - swing * turned, x))
+    if len(s.names) == 1 or left > _HALF * size or drive <= 0.0 or abs(drive - 1.0) < _OTHER_SCALE:
         return None
     if any(len(f.points) and np.abs(f.points - f.points[0]).max() > _FIXED * max(f.sigma_m, 1.0) for f in c.fixes):
         swing, sigma = drive, 0.0  # which agree with odometry: else nothing was asked of landmarks
@@ -244,7 +243,7 @@ def _scaled(c: Columns, s: SightingColumns, pairs: Pairs) -> Finding | None:
         return Finding("units", "error", 1.0 / drive, 1.0 + _OTHER_SCALE, "times", text, **at)
     text = f"{s.topic}: ranges are {drive:.2f} times as long as odometry says: is the tags' size right (black square)?"
     if not is_told:
-        text += f" Or is odometry not in metres? Measure a way or a tag, and set {by_ranges} or {by_odometry}"
+        text += f" Or is odometry not in metres? The one needs {by_ranges}, the other {by_odometry}"
     at = where(s.topic, s.stamp_ns, len(pairs.a), (by_ranges,) if is_told else ())
     return Finding("range_scale", "error", drive, 1.0 + _OTHER_SCALE, "times", text, **at)
 

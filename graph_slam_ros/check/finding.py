@@ -95,7 +95,7 @@ KINDS: dict[str, str] = {
     "mount_yaw": "correct its transform, or set INPUT.mount_correction",
     "odometry_scale": "measure a way, and correct the wheel radius, or the size of the tags",
     "turn_scale": "correct the track width, or set odometry.turn_factor",
-    "range_scale": "correct the size of the tags, or the sensor's driver, or set INPUT.range_factor",
+    "range_scale": "correct the tags' size, the sensor's driver, or odometry: a measured way tells",
     "not_observable": "drive what the text names",
     "over_confident": (
         "correct its noise: INPUT.noise=sigmas with INPUT.sigma_m; robust.noise_scale=estimated (the default) allows "

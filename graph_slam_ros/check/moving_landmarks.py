@@ -85,6 +85,7 @@ def check_moving(s: SightingColumns, by: LandmarkMotions, count: int) -> Iterato
     for k in moving_alone(by)[:_MOST_NAMED]:
         name, own_ns = s.names[by.names[k]], np.sort(s.stamp_ns[s.name == by.names[k]])
         text = f"{s.topic}: landmark {name} moves: it is {by.on_ground[k]:.2f} m from its place a few seconds later"
+        text += ": do all have its id?" * (len(s.names) == 1)
         if by.with_robot[k]:
             x, y = by.at[k, :2]
             place = f"at x {x:.2f} and y {y:.2f} m on it"
