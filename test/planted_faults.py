@@ -206,7 +206,7 @@ FAULTS = {
     "no odometry": (of("missing:what=odometry"), "no_odometry"),
     "landmarks of another definition": (of("unreadable"), "input_unused"),
     "an id twice in a message": (of("same_ids"), "id_twice"),
-    "an id for each sighting": (of("track_ids:sightings=1"), "no_parallax"),
+    "an id for each sighting": (of("track_ids:sightings=1"), "seen_once no_parallax"),
     "wheels slip for a twentieth": (of("wrong_scale:distance=1.5,begin=0.5,lasting=0.05"), "odometry_slips"),
     "carried for a tenth": (carried, "odometry_slips"),
     "six landmarks moved by 2 m": (six_moved, "map_breaks landmark_moved"),

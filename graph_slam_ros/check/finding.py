@@ -140,6 +140,7 @@ FOLLOWS = {
     "seen_once": ("no_closure", "no_parallax", "not_observable"),
     "damaged": ("no_closure", "silent", "gap", "clock_jump", "frame_unlinked", "mount_place"),
     "clock_offset": ("latency",),
+    **dict.fromkeys(("out_of_order", "time_jump"), ("odometry_jumps", "corrected", "fit_unsure")),
     **dict.fromkeys(("mount_moved", "covariance_tiny"), _OF_A_PATH),
     **dict.fromkeys(("clock_jump", "gyro_scale"), (*_OF_A_PATH, "clock_offset")),
 }

@@ -33,7 +33,6 @@ def check_frames(c: Columns) -> Iterator[Finding]:
 
 
 def _parents(c: Columns) -> Iterator[Finding]:
-    """Frames that more than one frame is a parent of."""
     parents: dict[str, dict[str, None]] = {}
     for parent, child in c.links:
         parents.setdefault(child, {})[parent] = None
