@@ -42,8 +42,7 @@ _MISTAKES: tuple[tuple[str, EdgeType, Callable[[Array, Index], tuple[Array, Inde
     (_MILLIMETRES, LANDMARK_POSITION, lambda seen, ends: (seen * 1e-3, ends)),
 )
 _FAR_LONGER = 100.0  # measured lengths of edges than those of the file's values: only then other units are tried
-_TRIAL_ITERATIONS = 30
-_SAME = 1e-6  # part of the cost by which one optimum differs from start to start
+_SAME, _TRIAL_ITERATIONS = 1e-6, 30  # the first: part of the cost by which one optimum differs from start to start
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,13 +193,14 @@ def _explained(solution: Solution, settings: Settings, until: float) -> Solution
         with suppress(GraphSlamError, np.linalg.LinAlgError):
             tried = _judged(_solved(file, limited, "chordal"), limited)
             if not tried.doubt:
-                return replace(solution, doubt=f"{solution.doubt}: {mistake}")
+                return replace(solution, doubt=f"{solution.doubt}: {mistake}") if mistake else solution
     return solution
 
 
 def _without_mistakes(file: G2oFile) -> Iterator[tuple[str, G2oFile]]:
     """Mistakes that may be in a file, of all edges or of a class, and the file without each."""
     labels = file.graph.labels
+    yield "", file  # as it is: it may only lack iterations
     if len(file.fixed) > 1 or (file.fixed and "priors" in labels):
         yield _FIXED.format(shortened([file.ids[v] for v in file.fixed])[1:-1]), replace(file, fixed=[])
     for mistake, edge, undo in _MISTAKES:

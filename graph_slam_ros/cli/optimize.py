@@ -140,7 +140,7 @@ def _after(args: argparse.Namespace, solution: "Solution") -> str:
         return f"{what}, then {console.command('optimize', args.graph, *_options(args))}"
     if _is_folder(args.out):
         return f"{console.command('report', args.out)} (one page: the map, and why each edge is in or out)"
-    if not solution.report.converged:
+    if not solution.report.converged and args.init != "auto":  # which tries all of them
         start = "online" if args.init == "chordal" else "chordal"
         words = _options(argparse.Namespace(**vars(args) | {"init": start}))
         return f"{console.command('optimize', args.graph, *words)} (another start)"
@@ -149,7 +149,7 @@ def _after(args: argparse.Namespace, solution: "Solution") -> str:
     if args.out is not None and ending(args.out) == ".tum":
         return f"evo_traj tum {shlex.quote(str(args.out))} --plot, or any reader of TUM trajectories"
     name, what = ("POSES.tum", "as a trajectory") if args.out else ("SOLVED.g2o", "and write it")
-    return f"{console.command('optimize', args.graph, *_options(args), '--out', _free(name))} (the same, {what})"
+    return f"{console.command('optimize', args.graph, *_options(args), '--out', _unused_name(name))} (the same, {what})"
 
 
 def _is_folder(out: Path | None) -> bool:
@@ -157,8 +157,7 @@ def _is_folder(out: Path | None) -> bool:
     return out is not None and not out.name.lower().removesuffix(".gz").endswith((".g2o", ".tum"))
 
 
-def _free(name: str) -> str:
-    """The name of a file that is not there: this one, or with a number."""
+def _unused_name(name: str) -> str:
     stem, _, suffix = name.partition(".")
     return next(one for k in range(1, 10_000) if not Path(one := f"{stem}{k if k > 1 else ''}.{suffix}").exists())
 
@@ -175,11 +174,13 @@ def _remedy(args: argparse.Namespace, solution: "Solution") -> str:
         with suppress(GraphSlamError):
             tried = solve(solution.file, _settings(other, solution.file.graph), init=other.init)
             if not tried.doubt:
-                words = console.command("optimize", args.graph, *_options(other), "--out", _free("SOLVED.g2o"))
+                words = console.command("optimize", args.graph, *_options(other), "--out", _unused_name("SOLVED.g2o"))
                 told = f"the loss lets go of {tried.let_go} edges" if tried.let_go else "all edges fit"
                 return f"{words} (tried: {told})"
     ratio = (solution.report.chi2_final / max(1, solution.solver.degrees_of_freedom)) ** 0.5
-    return f"the worst edges; if all fit alike, noise is {ratio:.3g} times what the information says (no loss helps)"
+    more = "" if solution.report.converged else f"--max-iterations {10 * args.max_iterations}, or "
+    told = f"noise is {ratio:.3g} times what the information says (no loss helps)"
+    return f"{more}the worst edges; if all fit alike, {told}"
 
 
 def _options(args: argparse.Namespace) -> Iterable[str]:
@@ -196,7 +197,6 @@ def _options(args: argparse.Namespace) -> Iterable[str]:
 
 
 def _starts(solution: "Solution") -> dict[str, Any]:
-    """The starts for JSON: which were tried, and the reason if there was more than one."""
     tried = [(one.start, None if one.failure else one.chi2, one.failure) for one in solution.attempts]
     starts = [dict(zip(("start", "chi2", "failure"), one, strict=True)) for one in tried]
     worst = [{"edge": edge, "chi2": chi2} for edge, chi2 in solution.worst()] if solution.doubt else []

@@ -634,11 +634,9 @@ BAD_LINES = {
     **{f"VERTEX_SE2 12 1 2 {w}": f"'{w}' is not a finite number" for w in ("nan", "inf", "-Infinity", "1e999", "1_0")},
     **{f"VERTEX_SE2 12 {w} 2 3": f"'{w}' is not a finite number" for w in ("\u0661", "0x10", "1,5", ".")},
     **{f"VERTEX_SE2 {w} 1 2 3": f"'{w}' is not an id" for w in ("1.0", "\u0661", "1_0", "9" * 20)},
-    # F24: a vertex that is not there
     "EDGE_SE2 10 12 1 0 0.1 10 1 -2 20 3 30": "edge to vertex 12, which is not declared (--lenient leaves it out)",
-    "FIX 12": "FIX names vertex 12, which is not declared",
-    # F25: no information, no turn
-    "EDGE_SE2 10 11 1 0 0.1 0 0 0 0 0 0": "information is not positive definite",
+    "FIX 12": "FIX names vertex 12, which is not declared",  # F24, as the line before
+    "EDGE_SE2 10 11 1 0 0.1 0 0 0 0 0 0": "information is not positive definite",  # F25: no information, no turn
     "VERTEX_SE3:QUAT 12 0 0 0 0 0 0 0": "the quaternion is zero",
 }
 
