@@ -25,7 +25,7 @@ from graph_slam_ros.formats.strict import lines
 from graph_slam_ros.graph import Loss
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL, Geometry
 from graph_slam_ros.lie import se3
-from graph_slam_ros.solver import LossKey, Settings
+from graph_slam_ros.solver.settings import LossKey, Settings
 from graph_slam_ros.typing import Numbers
 
 _STEP_TOLERANCE = 1e-5  # [m, rad]: the solve at the end has converged, far below what any sensor resolves

@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields
 from graph_slam_ros.config.parameter import setting
 from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.graph import Loss
-from graph_slam_ros.solver import METHODS, Settings
+from graph_slam_ros.solver.settings import METHODS, Settings
 
 LOSSES = ("none", "huber", "cauchy", "geman_mcclure", "dcs", "huber_then_cauchy", "huber_then_dcs")
 _LEAST_LOSS_SCALE = 0.1

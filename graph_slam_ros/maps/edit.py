@@ -19,8 +19,7 @@ from graph_slam_ros.formats.files import opened, read_text
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.edits import AppliedEdit, Edit, edit_of
 from graph_slam_ros.runs.folder import CONFIG, RunError, check_room, check_run, discard, recording_of
-from graph_slam_ros.runs.journal import INGEST, parts_of
-from graph_slam_ros.runs.map_file import MAP
+from graph_slam_ros.runs.journal import INGEST, MAP, parts_of
 from graph_slam_ros.runs.restore import config_to_go_on, record_run, restored, stopwatch
 from graph_slam_ros.slam import Config, Control, GraphSlam
 from graph_slam_ros.slam.map_editor import MapEditor

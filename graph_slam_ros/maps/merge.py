@@ -17,9 +17,9 @@ from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import Gaussian, Graph
 from graph_slam_ros.maps.alignment import Alignment, align, positions
 from graph_slam_ros.measurements.edits import ACTIONS, AppliedEdit, Argument
-from graph_slam_ros.runs.condensed_map import CONDENSED, WholePath
+from graph_slam_ros.runs.condensed_map import WholePath
 from graph_slam_ros.runs.folder import check_room
-from graph_slam_ros.runs.journal import parts_of
+from graph_slam_ros.runs.journal import CONDENSED, parts_of
 from graph_slam_ros.runs.restore import config_to_go_on, record_run, restored_and_solved, stopwatch
 from graph_slam_ros.slam import Control, GraphSlam
 from graph_slam_ros.slam.doubt.record import Alarm

@@ -7,12 +7,12 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from graph_slam_ros.config import Config
 from graph_slam_ros.config.inputs import InputConfig, default_input
 from graph_slam_ros.errors import did_you_mean
 from graph_slam_ros.messages.from_msg import TF, TF_STATIC, TRANSFORMS
 from graph_slam_ros.messages.inputs import check_topics, uses
 from graph_slam_ros.recordings.bag import Bag, BagError
-from graph_slam_ros.slam import Config
 
 TF_STATIC_TOPIC, TF_TOPIC = "/tf_static", "/tf"
 _OPTIONS = {"odometry": "--odom", "landmarks": "--landmarks"}

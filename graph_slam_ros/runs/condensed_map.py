@@ -17,7 +17,7 @@ import numpy as np
 
 from graph_slam_ros.errors import FormatError
 from graph_slam_ros.graph.geometry import Geometry
-from graph_slam_ros.runs.journal import read_records
+from graph_slam_ros.runs.journal import CONDENSED, read_records
 from graph_slam_ros.slam import GraphSlam
 from graph_slam_ros.slam.bounded_map import Condensation, CondensedEdge
 from graph_slam_ros.slam.lifelong.state import BoundedState, Left, Records, record_type
@@ -25,9 +25,6 @@ from graph_slam_ros.slam.robust.ledger import Reason, Verdict
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Index
 
-CONDENSED = "condensed"
-"""Name of the recording of what has left the map."""
-LEFT = "graph_slam_ros.Left"
 COLUMNS = [field.name for field in fields(CondensedEdge)]
 
 Record = dict[str, Any]

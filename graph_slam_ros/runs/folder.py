@@ -20,16 +20,13 @@ from typing import Any
 from mcap.records import Channel, Schema
 
 from graph_slam_ros import __version__
+from graph_slam_ros.config import Config
 from graph_slam_ros.errors import ConfigError, FormatError, GraphSlamError, similar_file
 from graph_slam_ros.formats.durable import NEW, claimed, sync_folder, write_whole
 from graph_slam_ros.formats.files import is_regular, opened, read_bytes, read_text
 from graph_slam_ros.formats.parameters import read_parameters
 from graph_slam_ros.recordings.mcap_records import begin, records
-from graph_slam_ros.runs.condensed_map import CONDENSED, LEFT
-from graph_slam_ros.runs.journal import INGEST, MEASUREMENT, START, parts_of, read_ingest
-from graph_slam_ros.runs.ledger_file import CHANGES, LEDGER
-from graph_slam_ros.runs.map_file import MAP, SCHEMA
-from graph_slam_ros.slam import Config
+from graph_slam_ros.runs.journal import CHANGES, CONDENSED, INGEST, LEDGER, MAP, SCHEMAS, START, parts_of, read_ingest
 
 SUMMARY, CONFIG = "run.json", "config.yaml"
 GRAPH, VERTICES, COVARIANCES = "graph.g2o", "graph_vertices.csv", "covariances.csv"
@@ -44,7 +41,6 @@ BEGUN = json.dumps({"format": MARK, "version": __version__, "ended": False}).enc
 """The ``run.json`` of a run until it is saved."""
 _RECORDED = re.compile(r"(ingest|map|start|condensed|run)(_\d+)?\.mcap")
 _UNFINISHED = re.compile(r"\.[0-9a-f]{8}" + re.escape(NEW))
-_SCHEMAS = {INGEST: MEASUREMENT, "map": SCHEMA, "start": SCHEMA, CONDENSED: LEFT}
 _OF_RECORDINGS = re.compile(r"(\.(mcap|db3|bag|active|zstd|gz))+$")
 _NO_FILE = (errno.ENOENT, errno.ENOTDIR)
 _ENDS = 2**16
@@ -92,7 +88,7 @@ def _is_recorded(file: Path) -> bool:
     if name[1] == "run":
         channels = (r for r in records(file, [], follow=False) if isinstance(r, Channel))
         return first is None or getattr(next(channels, None), "topic", "") in _TOPICS
-    return first is None or getattr(first, "name", "") == _SCHEMAS[name[1]]
+    return first is None or getattr(first, "name", "") == SCHEMAS[name[1]]
 
 
 def check_run(folder: Path) -> None:

@@ -23,10 +23,14 @@ from graph_slam_ros.recordings.mcap_records import LIBRARY, records
 _ENCODE = json.JSONEncoder(separators=(",", ":"), check_circular=False, allow_nan=False).encode
 _text = cache(_ENCODE)
 INGEST = "ingest"
-BEGINS_IN_A_MAP = {"type": "begins_in_a_map"}
+IN_A_MAP = {"type": "begins_in_a_map"}
 """The first record of the journal of such a run; its start is in ``start.mcap``."""
-START = "start.mcap"
+START, MAP, SCHEMA = "start.mcap", "map.mcap", "graph_slam_ros.Map"
+CONDENSED, LEFT = "condensed", "graph_slam_ros.Left"  # of what has left the map
+LEDGER, CHANGES = "ledger.csv", "ledger_changes.csv"
 MEASUREMENT = "graph_slam_ros.Measurement"
+SCHEMAS = {INGEST: MEASUREMENT, "map": SCHEMA, "start": SCHEMA, CONDENSED: LEFT}
+"""Of the recordings of a run, by their names."""
 _SCHEMA = _ENCODE({"type": "object", "properties": {"type": {"type": "string"}}, "required": ["type"]}).encode()
 
 
@@ -85,8 +89,8 @@ class Parts:
     What the disk does not accept is kept, for ended parts and the present one, and is written in that order.
     """
 
-    def __init__(self, folder: Path, name: str, schema: str) -> None:
-        self._folder, self._name, self._schema = folder, name, schema
+    def __init__(self, folder: Path, name: str) -> None:
+        self._folder, self._name = folder, name
         self._part = 0
         self._present: RecordWriter | None = None
         self._ended: list[AppendedFile] = []
@@ -94,7 +98,7 @@ class Parts:
     def begin(self) -> RecordWriter:
         """Create the present part, even if there is nothing to write yet."""
         if self._present is None:
-            self._present = RecordWriter(self._folder / part_name(self._name, self._part), self._schema)
+            self._present = RecordWriter(self._folder / part_name(self._name, self._part), SCHEMAS[self._name])
         return self._present
 
     def write(self, several: Sequence[Mapping[str, Any] | Odometry]) -> None:
@@ -168,7 +172,7 @@ def parts_of(folder: Path, name: str = INGEST) -> list[Path]:
 def read_ingest(folder: Path, losses: list[str]) -> Iterator[dict[str, Any]]:
     """The measurements of a run folder in order of acceptance, as ``read_records`` reads them."""
     for record in read_records(folder, INGEST, losses):
-        if record != BEGINS_IN_A_MAP:
+        if record != IN_A_MAP:
             yield record
         elif not (folder / START).exists():
             losses.append(f"{START}: not there, though the run began in a map: what follows is without it")
@@ -200,7 +204,7 @@ def _rest(folder: Path, processed: int, used_ns: int | None, losses: list[str]) 
     waited: list[dict[str, Any]] = []
     count = 0
     for file, channel, message in _messages(folder, INGEST, losses):
-        if channel == BEGINS_IN_A_MAP["type"]:
+        if channel == IN_A_MAP["type"]:
             continue
         if count >= processed:
             yield from waited

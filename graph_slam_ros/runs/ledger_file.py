@@ -22,13 +22,12 @@ from graph_slam_ros.errors import ConfigError, FormatError
 from graph_slam_ros.formats.strict import integer, lines, numbers, stamp
 from graph_slam_ros.graph.losses import weight_and_cost
 from graph_slam_ros.graph.tables import EdgeTable
-from graph_slam_ros.runs.condensed_map import CONDENSED, word
-from graph_slam_ros.runs.journal import parts_of
+from graph_slam_ros.runs.condensed_map import word
+from graph_slam_ros.runs.journal import CONDENSED, LEDGER, parts_of
 from graph_slam_ros.slam import GraphSlam
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict, VerdictChange
 from graph_slam_ros.typing import Index, Numbers
 
-LEDGER, CHANGES = "ledger.csv", "ledger_changes.csv"
 Ids = tuple[int, ...]
 Stamp = NewType("Stamp", int)
 Row = TypeVar("Row")

@@ -32,7 +32,7 @@ from graph_slam_ros.graph.vertices import GROUPS, R1, R2, R3, SE2, SE3, VertexKi
 from graph_slam_ros.measurements.edits import applied_edit
 from graph_slam_ros.measurements.types import Sighting, sighting_record
 from graph_slam_ros.recordings.mcap_records import LIBRARY, records
-from graph_slam_ros.runs.journal import START
+from graph_slam_ros.runs.journal import MAP, SCHEMA, START
 from graph_slam_ros.slam.frontend.corrections import read_totals
 from graph_slam_ros.slam.frontend.gyro import SavedBias
 from graph_slam_ros.slam.frontend.keyframes import Keyframe, SightingPose
@@ -46,8 +46,6 @@ from graph_slam_ros.slam.robust.ledger import Ledger, Reason, Verdict, VerdictCh
 from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.typing import Index
 
-MAP = "map.mcap"
-SCHEMA = "graph_slam_ros.Map"
 VERSION = 4
 _KINDS = {kind.name: kind for kind in (SE2, SE3, R1, R2, R3)}
 _OF_EDGES = ("id", "vertices", "measured", "sqrt_information", "label", "source", "weight")

@@ -19,7 +19,7 @@ from graph_slam_ros.formats.parameters import parameters_text
 from graph_slam_ros.measurements.types import Odometry, to_record
 from graph_slam_ros.messages import results
 from graph_slam_ros.recordings.bag import BagWriter
-from graph_slam_ros.runs.condensed_map import CONDENSED, LEFT, carried, left_records, read_left
+from graph_slam_ros.runs.condensed_map import carried, left_records, read_left
 from graph_slam_ros.runs.folder import (
     CONFIG,
     MARK,
@@ -31,17 +31,8 @@ from graph_slam_ros.runs.folder import (
     room,
     summary_of,
 )
-from graph_slam_ros.runs.journal import (
-    BEGINS_IN_A_MAP,
-    INGEST,
-    MEASUREMENT,
-    START,
-    Parts,
-    close_all,
-    part_name,
-    parts_of,
-)
-from graph_slam_ros.runs.map_file import MAP, write_map
+from graph_slam_ros.runs.journal import CONDENSED, IN_A_MAP, INGEST, MAP, START, Parts, close_all, part_name, parts_of
+from graph_slam_ros.runs.map_file import write_map
 from graph_slam_ros.runs.resource_log import ResourceLog
 from graph_slam_ros.runs.tables import counted, fitted_summary, result_texts, summarize
 from graph_slam_ros.slam import Config, Counters, GraphSlam, Measurement, Update
@@ -88,8 +79,8 @@ class RunRecorder:
         self._flushing: Future[None] | None = None
         self.accepted = accepted  # measurements, written or not
         self._syncing: Future[None] | None = None
-        self._journal = Parts(self.folder, INGEST, MEASUREMENT)
-        self._left = Parts(self.folder, CONDENSED, LEFT)
+        self._journal = Parts(self.folder, INGEST)
+        self._left = Parts(self.folder, CONDENSED)
         self._accepted: deque[Measurement] = deque()  # and not written yet
         self._before = accepted
         self._mapping: Future[None] | None = None
@@ -104,7 +95,7 @@ class RunRecorder:
         self._room.enter_context(room(self.folder, force=force))
         try:
             self._journal.begin()
-            self._journal.write([BEGINS_IN_A_MAP] if start is not None else [])
+            self._journal.write([IN_A_MAP] if start is not None else [])
             self._journal.flush()
             if start is not None:
                 self._begin_in(start, config)

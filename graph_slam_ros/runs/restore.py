@@ -20,7 +20,7 @@ from graph_slam_ros.runs.folder import (
     summary_of,
     was_saved_whole,
 )
-from graph_slam_ros.runs.journal import BEGINS_IN_A_MAP, INGEST, START, read_records, read_rest
+from graph_slam_ros.runs.journal import IN_A_MAP, INGEST, START, read_records, read_rest
 from graph_slam_ros.runs.map_file import read_map, read_start
 from graph_slam_ros.runs.recorder import RunRecorder, save_results
 from graph_slam_ros.runs.tables import counters_of, fitted_summary, summarize
@@ -84,7 +84,7 @@ def config_of(folder: Path, state: MapSnapshot) -> Config:
 def _repeated(folder: Path, losses: list[str], counters: Counters) -> MapSnapshot:
     """The map by repeating the drive from its journal, in the map that it began in."""
     again, start = Counters(), read_start(folder)
-    if start is None and next(read_records(folder, INGEST, []), None) == BEGINS_IN_A_MAP:
+    if start is None and next(read_records(folder, INGEST, []), None) == IN_A_MAP:
         raise RunError(
             f"{folder}: it began in a map, and {START}, which has that, is not there, as in runs of earlier releases: "
             f"graph_slam replay {folder} --out NEW drives it without"

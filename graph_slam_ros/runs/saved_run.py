@@ -5,10 +5,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from graph_slam_ros.config import Config
 from graph_slam_ros.runs.folder import COVARIANCES, SUMMARY, RunError, changed_since, check_run, run_config, summary_of
 from graph_slam_ros.runs.ledger_file import Entry, read_ledger
 from graph_slam_ros.runs.trajectory import LandmarkTable, Trajectory, read_covariances, read_landmarks, read_rows
-from graph_slam_ros.slam import Config
 from graph_slam_ros.typing import Array
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from graph_slam_ros.config import Config
 from graph_slam_ros.config.inputs import default_input
 from graph_slam_ros.messages.from_msg import TF, TF_STATIC
 from graph_slam_ros.messages.inputs.landmark_types import LANDMARK_TYPES
@@ -13,7 +14,6 @@ from graph_slam_ros.overview.contents import recording_of
 from graph_slam_ros.overview.suggested_odometry import DETECTIONS, ODOMETRY
 from graph_slam_ros.recordings.bag import Bag, BagError, open_bag
 from graph_slam_ros.runs.suggestion import CLOUD, GNSS, Suggestion
-from graph_slam_ros.slam import Config
 
 OF_LANDMARKS = frozenset({DETECTIONS, CLOUD, *LANDMARK_TYPES})
 """Types of messages that have landmarks."""

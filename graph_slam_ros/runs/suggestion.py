@@ -6,8 +6,8 @@ from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from graph_slam_ros.check.gyro import upright
 from graph_slam_ros.check.pairs import ASSUMED_BEARING_RAD, ASSUMED_RANGE_M
+from graph_slam_ros.config import Config
 from graph_slam_ros.config.inputs import ASSUMED
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.parameters import assignment
@@ -20,7 +20,6 @@ from graph_slam_ros.overview.contents import Recording, TopicContents
 from graph_slam_ros.overview.suggested_odometry import DETECTIONS, ESTIMATE, POSES, OdometryChoice, readable
 from graph_slam_ros.recordings.bag import Bag
 from graph_slam_ros.runs.folder import suggested_out
-from graph_slam_ros.slam import Config
 
 MARKERS = "visualization_msgs/msg/MarkerArray"
 CLOUD, GNSS, IMU = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/Imu"
@@ -204,6 +203,8 @@ class Suggestion:
     def _choose_imu(self, found: Iterator[TopicContents], is_needed: bool) -> None:
         for one in sorted(found, key=lambda one: -one.usable):
             names = " ".join([*self.names, "imu"])
+            from graph_slam_ros.check.gyro import upright  # the pipeline is slow to import
+
             angles = upright(tuple(total / max(one.read, 1) for total in one.felt))
             turn = " ".join(f"{0.0 if abs(angle) < _LEVEL_RAD else angle:.4g}" for angle in angles)
             mount = "" if self._recording.is_linked(one.frame, self._base) else f" --set 'imu.mount=0 0 0 {turn} 0'"

@@ -17,7 +17,8 @@ from graph_slam_ros.messages import results
 from graph_slam_ros.messages.inputs import recorded_uses
 from graph_slam_ros.runs.condensed_map import WholePath
 from graph_slam_ros.runs.folder import COVARIANCES, GRAPH, LANDMARKS, ODOMETRY, PATH, PATH_ODOMETRY, SIGHTINGS, VERTICES
-from graph_slam_ros.runs.ledger_file import CHANGES, LEDGER, changes_text, ledger_text
+from graph_slam_ros.runs.journal import CHANGES, LEDGER
+from graph_slam_ros.runs.ledger_file import changes_text, ledger_text
 from graph_slam_ros.slam import Counters, GraphSlam
 from graph_slam_ros.slam.calibration.answers import SIGMAS
 from graph_slam_ros.slam.calibration.parameters import QUANTITIES

@@ -1,13 +1,13 @@
 """Batch optimisation on the clique tree: Gauss-Newton, Levenberg-Marquardt, dogleg, with losses in stages."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
-from typing import Any, NamedTuple
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
-from graph_slam_ros.errors import GraphSlamError, SingularError
-from graph_slam_ros.graph import Graph, Loss
+from graph_slam_ros.errors import SingularError
+from graph_slam_ros.graph import Graph
 from graph_slam_ros.graph.tables import EdgeTable
 from graph_slam_ros.solver.clique_tree import storage as its
 from graph_slam_ros.solver.clique_tree.incremental import mark
@@ -19,13 +19,13 @@ from graph_slam_ros.solver.linearization import (
     CHUNK,
     ClassCost,
     Losses,
-    LossKey,
     blocks_of,
     costs,
     linearize,
     refuse_nonfinite,
     store,
 )
+from graph_slam_ros.solver.settings import METHODS, Settings
 from graph_slam_ros.typing import Array, Index
 
 
@@ -84,83 +84,10 @@ class Report:
 
 
 _TINY = 1e-12  # a cost of zero up to rounding has converged
-_STILL = 1e-8  # m and rad
 _ON_THE_WAY = 1e-4  # where another stage follows, what the cost still changes by is of no interest
 _CRAWLS = 10  # steps of Gauss-Newton after which it is tried whether longer ones lead further down
 _DAMPING_FIRST, _DAMPING_LEAST, _DAMPING_MOST, _DAMPING_FACTOR = 1e-4, 1e-12, 1e12, 10.0
 _RADIUS_FIRST, _RADIUS_LEAST = 1.0, 1e-12
-
-
-@dataclass(frozen=True, slots=True)
-class Settings:
-    """Settings of the solver, online and in batch.
-
-    Attributes
-    ----------
-    method : of ``optimize``: ``gn`` (damped only after it fails to converge), ``lm`` or ``dogleg``
-    max_iterations : of each stage
-    step_tolerance : converged when no component of a step is larger [m, rad]
-    cost_tolerance : converged when the cost changes by a smaller fraction
-    losses : by label, or by (label, source) for the edges of one source: the stages of the loss. Each is minimised, the
-        last until converged; a loss with fewer stages keeps its last. Online an edge has the first at its first update
-        and the last from then on
-    relinearize_above : online, a vertex is linearised anew when a component of its step is larger [m, rad]; the
-        position of a pose in units of the typical motion between two, if that is longer than a metre
-    relinearize_error : or when its step squared is more than so many standard deviations of its strongest measurement
-    relinearize_every : that is looked for at every so many updates, or after two thirds of these at one that closes a
-        loop. Steps ten times as large are looked for at any update
-    relinearize_neglected : and so are turns whose square is more than this part of the expected chi2, as in a small
-        graph; inf: they wait, and the thresholds do not follow what linearisation neglects
-    relinearize_passes : how often at most within one update; after the first time for such steps
-    tolerance : online, changes of a step up to this are not followed [m, rad]
-    tolerance_sigmas : nor are those up to so many standard deviations of the vertex given its neighbours
-    at_once : an update computes the estimates of all vertices that it moves. Else those that nobody reads wait; then
-        what is read, and when, decides digits below the tolerances
-    """
-
-    method: str = "gn"
-    max_iterations: int = 50
-    step_tolerance: float = 1e-6
-    cost_tolerance: float = 1e-6
-    losses: Mapping[Any, Sequence[Loss]] = field(default_factory=dict)
-    relinearize_above: float = 0.05
-    relinearize_error: float = 0.1
-    relinearize_every: int = 10
-    relinearize_neglected: float = 5e-5
-    relinearize_passes: int = 1
-    tolerance: float = 1e-5
-    tolerance_sigmas: float = 1e-3
-    at_once: bool = False
-
-    def __post_init__(self) -> None:
-        if self.method not in METHODS:
-            raise GraphSlamError(f"method {self.method!r}: choose {', '.join(METHODS[:-1])} or {METHODS[-1]}")
-        for name in [one.name for one in fields(self) if one.name not in ("method", "losses", "at_once")]:
-            least = 1 if name == "relinearize_every" else 0
-            if not getattr(self, name) >= least:  # nor is NaN
-                raise GraphSlamError(f"{name} {getattr(self, name)}: must be a number >= {least}")
-        for label, stages in self.losses.items():
-            if not isinstance(stages, Sequence) or {type(stage) for stage in stages} != {Loss}:
-                raise GraphSlamError(f"losses: {label!r} has {stages!r}: leave it out, or give it a list of Loss")
-
-    def last_loss(self, label: str, source: str) -> Loss:
-        """The loss of the last stage of an edge."""
-        stages = self.losses.get((label, source)) or self.losses.get(label)
-        return stages[-1] if stages else Loss()
-
-    def stages(self) -> list[dict[LossKey, Loss]]:
-        """One loss for each key of ``losses``, for each stage."""
-        count = max((len(stages) for stages in self.losses.values()), default=1)
-        return [{name: s[min(k, len(s) - 1)] for name, s in self.losses.items()} for k in range(count)]
-
-    def until_still(self) -> "Settings":
-        """Return settings for an estimate near the optimum: the last stage alone, until no vertex moves."""
-        last = {label: stages[-1:] for label, stages in self.losses.items()}
-        return replace(self, losses=last, step_tolerance=_STILL, cost_tolerance=0.0)
-
-    def on_the_way(self) -> "Settings":
-        """Return settings for a stage that is followed by another."""
-        return replace(self, cost_tolerance=max(self.cost_tolerance, _ON_THE_WAY))
 
 
 class BatchProblem:
@@ -256,11 +183,12 @@ def minimise(problem: BatchProblem, settings: Settings) -> Report:
     chi2_initial, cost_initial = problem.chi2, problem.cost
     iterations: list[Iteration] = []
     used, stop = settings.method, ""
+    on_the_way = replace(settings, cost_tolerance=max(settings.cost_tolerance, _ON_THE_WAY))
     for losses in stages:
         begin = problem.here()
         if losses is not stages[0]:
             problem.linearize(losses)
-        until = settings if losses is stages[-1] else settings.on_the_way()
+        until = settings if losses is stages[-1] else on_the_way
         fresh: list[Iteration] = []
         stop = _DESCENTS[settings.method](problem, losses, until, fresh)
         if settings.method == "gn" and stop not in ("step", "cost"):
@@ -400,9 +328,4 @@ def _converged(previous: float, last: Iteration, settings: Settings) -> str:
     return ""
 
 
-_DESCENTS: dict[str, Callable[[BatchProblem, Losses, Settings, list[Iteration]], str]] = {
-    "gn": _gauss_newton,
-    "lm": _levenberg_marquardt,
-    "dogleg": _dogleg,
-}
-METHODS = tuple(_DESCENTS)
+_DESCENTS = dict(zip(METHODS, (_gauss_newton, _levenberg_marquardt, _dogleg), strict=True))

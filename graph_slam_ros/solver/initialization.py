@@ -42,10 +42,7 @@ OnPose: TypeAlias = Callable[[int, int], None]
 
 INITS = ("file", "tree", "chordal", "online")
 
-_RELATIVE: dict[VertexKind, tuple[EdgeType, ...]] = {
-    SE2: (RELATIVE_POSE, INVERSE_RELATIVE_POSE),
-    SE3: (RELATIVE_POSE_3D,),
-}
+_RELATIVE = {SE2: [RELATIVE_POSE, INVERSE_RELATIVE_POSE], SE3: [RELATIVE_POSE_3D]}
 
 
 def initial_values(

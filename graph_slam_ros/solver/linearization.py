@@ -3,7 +3,6 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite
-from typing import TypeAlias
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -16,6 +15,7 @@ from graph_slam_ros.graph.tables import EdgeTable
 from graph_slam_ros.lie.jit import inner, kernel
 from graph_slam_ros.solver.clique_tree.numeric import add_to_diagonal, clear_block
 from graph_slam_ros.solver.clique_tree.storage import BLOCK, MARKED, NOTHING, ZERO, Tree, row_of
+from graph_slam_ros.solver.settings import LossKey
 from graph_slam_ros.typing import Array, Index
 
 CHUNK = 512  # edges that are linearised together: arrays of that size stay in the cache and in the process
@@ -271,9 +271,6 @@ def _linearize_rows(t: Tree, graph: Index, table: Index, rows: Index, losses: In
         if bad != NOTHING:
             return bad
     return ZERO + NOTHING
-
-
-LossKey: TypeAlias = str | tuple[str, str]
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,9 +8,9 @@ import math
 import numpy as np
 
 from graph_slam_ros.graph import INVERSE_RELATIVE_POSE, RELATIVE_POSE, RELATIVE_POSE_3D, Graph
-from graph_slam_ros.solver.batch import Settings
 from graph_slam_ros.solver.clique_tree.storage import NONE, STEP, Limits, Tree
 from graph_slam_ros.solver.linearization import CHUNK, Losses, chi2_of, rows_of, squares
+from graph_slam_ros.solver.settings import Settings
 from graph_slam_ros.typing import Array, Index
 
 

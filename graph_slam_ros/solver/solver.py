@@ -13,10 +13,9 @@ from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import Graph
 from graph_slam_ros.graph.graph import whole_numbers
 from graph_slam_ros.graph.records import weights_of
-from graph_slam_ros.graph.tables import EdgeTable
 from graph_slam_ros.graph.vertices import code_of
 from graph_slam_ros.solver import update
-from graph_slam_ros.solver.batch import BatchProblem, Change, Report, Settings, minimise
+from graph_slam_ros.solver.batch import BatchProblem, Change, Report, minimise
 from graph_slam_ros.solver.clique_tree import incremental
 from graph_slam_ros.solver.clique_tree import storage as its
 from graph_slam_ros.solver.clique_tree.incremental import DISSECT, DONE, more_room, restructure
@@ -53,6 +52,7 @@ from graph_slam_ros.solver.relinearization import (
     RelinearizationSchedule,
     neglected,
 )
+from graph_slam_ros.solver.settings import Settings
 from graph_slam_ros.typing import Array, Index
 
 
@@ -90,10 +90,6 @@ class PendingChanges:
         all_vertices = np.concatenate((self.vertices, vertices)) if len(self.vertices) else vertices
         all_new = np.concatenate((self.new, edges)) if len(self.new) else edges
         self.vertices, self.new = all_vertices, all_new  # both, or where memory lacks neither
-
-    def again(self, edges: Index) -> None:
-        """Append edges to be linearised again, even if they are pending already."""
-        self.back.append(edges)
 
     def edges(self) -> Index:
         """Return all edges to be linearised, each once."""
@@ -208,7 +204,7 @@ class Solver:
             raise GraphSlamError(f"edge {edge} needs vertex {int(ends[~self._inside[ends]][0])}, which was removed")
         table.weight.values[row] = weight
         if self._edge_inside[edge]:
-            self._pending.again(one)
+            self._pending.back.append(one)
 
     def leave_out(self, edges: ArrayLike) -> None:
         """Set the weight of edges to 0, as ``set_weight`` does one by one."""
@@ -229,7 +225,7 @@ class Solver:
         if self._tree.vertex[vertex, its.FREE]:
             on_it = incremental.edges_of(self._tree.vertex, self._tree.link, vertex)
             on_it = on_it[self._tree.edge[on_it, its.ACTIVE] == 1]  # they are linearised where it is held
-            self._pending.again(on_it)
+            self._pending.back.append(on_it)
             self._fix_at_estimate(one)
 
     @property
@@ -288,8 +284,7 @@ class Solver:
         self._grow()
         if (self._inside & self._held).any():
             return True
-        rows = rows_of(self.graph, self.edges)
-        return fix_the_whole(self.graph, self._estimates(), rows)
+        return fix_the_whole(self.graph, self._estimates(), rows_of(self.graph, self.edges))
 
     @property
     def values(self) -> Array:
@@ -300,10 +295,7 @@ class Solver:
     def chi2_of(self, edges: ArrayLike) -> tuple[Array, Index]:
         """Chi2 of each edge at the estimate: r' Omega r without loss and weight, and the size of r."""
         self._grow()
-        ids = whole_numbers(edges, "edge").ravel()
-        if len(ids):
-            existing(ids, self.graph.edge_count, "edge")
-        return chi2_of(self.graph, self._estimates(), ids)
+        return chi2_of(self.graph, self._estimates(), existing(edges, self.graph.edge_count, "edge"))
 
     def residuals_of(self, edges: ArrayLike) -> Array:
         """Residuals of edges at the estimate, not whitened, in the units of their types, end to end."""
@@ -383,9 +375,9 @@ class Solver:
             self._tree.state[its.SUBSTITUTED] += 1  # from here on, steps are those of the batch
             self._forget_numbers()
             self._restructure(*arriving)
-            unknowns = self._unknowns()
+            active, unknowns = rows_of(self.graph, self._active()), self._unknowns()
             if len(unknowns):
-                report = minimise(BatchProblem(self.graph, self._tree, self._active_rows(), unknowns), settings)
+                report = minimise(BatchProblem(self.graph, self._tree, active, unknowns), settings)
             else:
                 report = self.evaluate(settings)
         forget(self._tree)
@@ -403,7 +395,7 @@ class Solver:
         self._grow()
         losses = Losses(self.graph, (settings or self.settings).stages()[-1])
         where = self._estimates() if at is None else at
-        chi2, cost, classes = costs(self.graph, where, self._active_rows(), losses)
+        chi2, cost, classes = costs(self.graph, where, rows_of(self.graph, self._active()), losses)
         return Report("gn", "nothing_to_do", chi2, chi2, cost, cost, (), classes)
 
     def estimate(self, ids: ArrayLike) -> Array:
@@ -596,9 +588,6 @@ class Solver:
 
     def _active(self) -> Index:
         return np.flatnonzero(self._tree.edge[:, its.ACTIVE])
-
-    def _active_rows(self) -> dict[EdgeTable, Index]:
-        return rows_of(self.graph, self._active())
 
     def _weighted(self, edges: Index) -> Index:
         """The edges among these that have a weight."""

@@ -13,8 +13,8 @@ from rows import each
 from graph_slam_ros import cli
 from graph_slam_ros.analysis import what_if
 from graph_slam_ros.analysis.what_if import SavedGraph
-from graph_slam_ros.runs.folder import GRAPH
-from graph_slam_ros.runs.ledger_file import CHANGES, LEDGER, read_ledger
+from graph_slam_ros.runs.folder import CHANGES, GRAPH, LEDGER
+from graph_slam_ros.runs.ledger_file import read_ledger
 from graph_slam_ros.runs.recorder import RunRecorder
 from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings

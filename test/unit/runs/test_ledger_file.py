@@ -9,7 +9,8 @@ import small_drive
 
 from graph_slam_ros.errors import FormatError
 from graph_slam_ros.node.events import of_update
-from graph_slam_ros.runs.ledger_file import CHANGES, LEDGER, read_ledger
+from graph_slam_ros.runs.journal import CHANGES, LEDGER
+from graph_slam_ros.runs.ledger_file import read_ledger
 from graph_slam_ros.runs.restore import record_run
 from graph_slam_ros.slam import Closure, GraphSlam
 from graph_slam_ros.slam.robust.ledger import Verdict
@@ -19,7 +20,6 @@ S = 10**9
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """A drive with a false closure: its measurements, its folder and what came of it."""
     folder, (*drive, end, optimize) = tmp_path_factory.mktemp("run"), small_drive.drive()
     false = Closure(1020 * S, 1003 * S, "closures", (3.0, 3.0, 1.0), tuple((1e-4 * np.eye(3)).ravel().tolist()))
     measured = [*drive, false, end, optimize]
