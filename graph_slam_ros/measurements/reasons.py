@@ -57,7 +57,6 @@ REASONS: dict[str, Reason] = {
     "before_odometry": _refused("it is older than all odometry", "begin with odometry; INPUT.offset_s"),
     "after_odometry": _refused("it is newer than the last odometry", "end with odometry; INPUT.offset_s"),
     "frozen": _noted("the robot moved past landmarks while odometry stood still", "its driver hangs, or it was towed"),
-    "clock_set": _repaired("a clock was set: corrected", "one clock"),
     "odometry_gap": _refused("odometry was silent, or jumped, then", "find out why its driver paused"),
     "overflow": _refused("too many messages waited", "inputs.queue of a node, ordering.max_waiting"),
     "duplicate": _noted("the same message has come before"),

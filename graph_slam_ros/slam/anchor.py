@@ -100,6 +100,7 @@ class Anchor:
         return np.maximum(self._sigmas, wanted) if (wanted > self._sigmas).any() else None
 
     def _position(self) -> Array:
+        """The sigmas (dof,) that positions determine."""
         n, angles = self._space.dimensions, self._space.dof - self._space.dimensions
         return np.array([_UNCERTAIN_M] * n + [_TILT_RAD] * (angles - 1) + [_UNCERTAIN_RAD])
 
@@ -144,6 +145,7 @@ class Anchor:
         return (*map(float, shift), *self._space.identity[self._space.dimensions :])
 
     def _turned(self, turn: Numbers) -> Numbers:
+        """The rotation about the first keyframe, as a motion of the map."""
         n = self._space.dimensions
         at = self._backend.solver.estimate([self._vertex])[0, :n]
         there = np.array(self._space.group.act(turn, tuple(at.tolist())))

@@ -188,6 +188,7 @@ class BoundedMap:
         return rows, first + k
 
     def _note_end(self, done: Condensed, keyframes: int) -> None:
+        """Count how a visit of so many keyframes ended."""
         if done.wider > 1.0:
             self._counters.count(_SOURCE, "visit_wider")
         if done.how == "kept":
@@ -213,6 +214,7 @@ class BoundedMap:
         return RemovedPose(vertex, vertex, self._space.identity)
 
     def _left(self, rows: Sequence[RemovedPose]) -> Records:
+        """Return the records of the keyframes that leave."""
         keyframes, lasting = self._frontend.path.keyframes, self._backend.graph.vertex_ids.of
         left = np.zeros(len(rows), dtype=record_type(self._space))
         for k, row in enumerate(rows):

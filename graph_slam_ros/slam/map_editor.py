@@ -105,6 +105,7 @@ class MapEditor:
     # -- edges -------------------------------------------------------------------------------------------------------
 
     def _row(self, lasting: int) -> int:
+        """The row of an edge in the graph, by its id."""
         row = self._graph.edge_ids.find(lasting)
         if row is None or row >= self._graph.edge_count:
             raise GraphSlamError(_WHY["condensed_in_map" if row is None else "unknown_edge"])
@@ -190,6 +191,7 @@ class MapEditor:
         mark.name = to
 
     def _merge(self, name: str, into: str) -> None:
+        """All edges of a landmark are of another from now on."""
         b = self._known(name)
         if into not in self._marks:
             raise GraphSlamError(f"landmark {into} is not in the map{did_you_mean(into, self._marks)}")
@@ -207,6 +209,7 @@ class MapEditor:
         a.is_tentative &= b.is_tentative
 
     def _split(self, name: str, to: str, edges: Sequence[int]) -> None:
+        """Some edges of a landmark are of a new one from now on."""
         graph, mark = self._graph, self._free(name)
         self._refuse_known(to)
         known, chosen = standing_edges(graph, self._ledger, mark.vertex), sorted(edges)
@@ -274,6 +277,7 @@ class MapEditor:
         return self._marks[name]
 
     def _free(self, name: str) -> Landmark:
+        """A landmark that is not part of a frozen map."""
         mark = self._known(name)
         if mark.vertex < self.state.frozen:
             raise GraphSlamError(_WHY["held_in_map"])

@@ -391,6 +391,7 @@ def _windows(ends: Index, stamp_of: Index) -> list[Index]:
 
 
 def _passes(ends: Index, stamp_of: Index) -> list[Index]:
+    """Sightings of each pass by a landmark, those of three or more."""
     stamps = stamp_of[ends[:, 0]]
     order = np.lexsort((stamps, ends[:, 1]))
     landmark, when = ends[order, 1], stamps[order]

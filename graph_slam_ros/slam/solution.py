@@ -124,6 +124,7 @@ class Solution:
         return [(float(fit[k]), edges[k]) for k in np.argsort(-fit, kind="stable")[:_BLAMED].tolist()]
 
     def _note_correction(self, fits: list[tuple[float, int]], newest: Keyframe) -> None:
+        """Note the difference to the pose by the previous solve and its odometry."""
         group = self._space.group
         before, self._T_map_odom = self._T_map_odom, self.T_map_odom(newest)
         moved = group.between(group.compose(before, newest.T_odom_base), self.pose(newest.vertex))

@@ -121,8 +121,7 @@ class TrialFits:
         path, origins, factors = self._frontend.path, self._landmarks.origins, self._frontend.corrections.factors
         problem = self._backend.trial_problem(self._config.space, path, origins, factors)
         slips = self._kidnaps.slipped(path.keyframes)
-        set_s = {Parameter(topic, "clock"): by_ns * 1e-9 for topic, by_ns in self._frontend.order.set_ns.items()}
-        return replace(problem, first_edge=max(problem.first_edge, self._first_edge), slips=slips, set_s=set_s)
+        return replace(problem, first_edge=max(problem.first_edge, self._first_edge), slips=slips)
 
     def fit(self, groups: Sequence[str], *, places: bool, is_to_correct: bool) -> tuple[TrialFit, list[Finding]]:
         """Fit the map as it is now, as of ``GraphSlam.trial_fit``."""
@@ -209,6 +208,7 @@ class TrialFits:
         return self._so_far[1]
 
     def _compute(self) -> None:
+        """Compute the newest trial whose outcome counts."""
         keyframe = len(self._frontend.path.keyframes) - 1
         ready = [job for begins, job in self._jobs if begins <= keyframe]
         if not ready:

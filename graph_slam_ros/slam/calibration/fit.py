@@ -231,7 +231,6 @@ class _Fit:
             for half, some in enumerate((order[:cut], order[cut:])):
                 pull = scores[some].sum(axis=0) + self._priors**-2.0 * theta
                 out[half, k] = (theta - np.linalg.solve(self._information(rest[some]), pull))[k]
-            out[1, k] += self._p.set_s.get(self._parameters[k], 0.0)
         return out[0], out[1]
 
 

@@ -188,6 +188,7 @@ class MeasurementModel:
         return out
 
     def _factors(self, values: Values) -> Array:
+        """The factor (dof,) of each component of a motion."""
         n = self._space.dimensions
         distance, turn = factors_of(values)
         return np.array([distance] * n + [turn] * (self._space.dof - n))
@@ -211,6 +212,7 @@ class MeasurementModel:
         return z
 
     def _turns(self, poses: Any) -> Array:
+        """Rotation matrices (n, d, d) of poses that are arrays."""
         n = self._space.dimensions
         rotation = (*(0.0 * x for x in poses[:n]), *poses[n:])
         columns = [np.stack(self._space.group.act(rotation, tuple(axis)), axis=-1) for axis in np.eye(n)]
@@ -267,4 +269,5 @@ def of_odometry(values: Values) -> dict[str, float]:
 
 
 def _of(values: Values, source: str) -> dict[str, float]:
+    """Corrections of an input by name."""
     return {p.name: value for p, value in values.items() if p.source == source}

@@ -44,6 +44,7 @@ class EstimatedPath:
         self._gaps = [*gaps, *((self._own_s[k - 1], self._own_s[k]) for k in joints)]
 
     def _with_samples(self) -> tuple[Array, Array]:
+        """Seconds and poses of odometry at the keyframes and between them."""
         since_s = (self._track.stamps_ns - self._origin_ns) * 1e-9
         inside = (since_s > self._own_s[0]) & (since_s < self._own_s[-1]) & ~np.isin(since_s, self._own_s)
         seconds = np.concatenate((self._own_s, since_s[inside]))

@@ -5,7 +5,7 @@ correction, between two keyframes whose steps move it. So a clock may be off by 
 """
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import groupby
 from operator import attrgetter
 from typing import Any
@@ -43,7 +43,6 @@ class TrialProblem:
     first_edge : edges before are of a map that is held, and not corrected
     slips : of each stretch in which odometry counts for less, its edges, each with the one that replaces it
     is_noise_measured : as of ``MeasurementModel``
-    set_s : what stamps were corrected by since a clock was set on the way
     """
 
     space: Geometry
@@ -60,7 +59,6 @@ class TrialProblem:
     first_edge: int
     slips: tuple[tuple[tuple[int, int], ...], ...] = ()
     is_noise_measured: bool = False
-    set_s: Values = field(default_factory=dict)
 
     def without_slips(self) -> "TrialProblem":
         """The same with odometry as it was stated, in a copy of the graph."""
@@ -314,6 +312,7 @@ class Linearization:
 
 
 def _beside(values: Values, parameter: Parameter) -> tuple[Values, Values]:
+    """The same values with one a little larger, and smaller."""
     plus, minus = (values.get(parameter, 0.0) + side for side in (_PROBE, -_PROBE))
     return {**values, parameter: plus}, {**values, parameter: minus}
 
@@ -329,6 +328,7 @@ def _adjoints(space: Geometry, poses: Any) -> Array:
 
 
 def _by_table(blocks: Iterable[Block]) -> Iterator[Block]:
+    """Join the blocks of each table, which follow one another."""
     for table, some in groupby(blocks, key=attrgetter("table")):
         columns = zip(*((one.rows, one.residual, one.jacobian, one.chi2, one.cost) for one in some), strict=True)
         yield Block(table, *map(np.concatenate, columns))

@@ -117,9 +117,11 @@ class DisplacementSearch:
 
     @property
     def _has_all(self) -> bool:
+        """Return whether all sightings since the segment began are compared."""
         return self.window.is_whole and len(self._newest()) < _SIGHTINGS
 
     def _newest(self) -> list[tuple[View, Seen]]:
+        """The newest sightings that tell a position, in order of time."""
         newest = (
             (view, one) for view in reversed(self.window.views) for one in reversed(view.seen) if one.point is not None
         )
@@ -279,6 +281,7 @@ class DisplacementSearch:
         return vertices[best]
 
     def _is_measured(self, keyframe: int) -> bool:
+        """Return whether more than odometry is believed of a keyframe."""
         edges = self._solver.edges_on(keyframe).tolist()
         return any(self._ledger.is_inside(one) for one in edges if self._graph.edge(one).label != "odometry")
 

@@ -211,6 +211,7 @@ class Stretch:
         return Choice(best.kind, first, ratio, voters, is_sure, 1.0 - unfit / max(1, len(since)))
 
     def _end(self, one: Hypothesis, without: int | str | None = None) -> _State:
+        """The state at the end of the stretch."""
         begin = one.first if without is None else 0
         state = self._states[begin].copy()
         for k in range(begin, self.size):
@@ -266,6 +267,7 @@ class Stretch:
         state.cost += statistic + 2.0 * float(np.log(root.diagonal()).sum()) + seen.constant
 
     def _stepped(self, x: Array, step: Array) -> Array:
+        """Stored numbers after a step of all errors."""
         out = np.empty_like(x)
         for kind, stored, columns in self._kinds:
             out[stored] = kind.retract(x[stored], step[columns])
@@ -273,6 +275,7 @@ class Stretch:
 
 
 def _observed(what: int | str, one: Edge, places: Sequence[tuple[int, Index]]) -> _Observed:
+    """Lay out an observation of vertices that are at these places."""
     covariance, constant = covariance_of(one), 2.0 * float(np.linalg.slogdet(one.sqrt_information)[1])
     at, columns = np.array([[stored for stored, _ in places]]), np.concatenate([columns for _, columns in places])
     limit = quantile(_CAP, len(covariance))

@@ -209,6 +209,7 @@ class KidnapDetector:
         return found if found and self._is_doubtful(found) and self._is_beyond_noise(found) else None
 
     def _note(self, found: DisplacementHypothesis | None, stamp_ns: int) -> None:
+        """Begin an alarm, go on with it, or end it."""
         now, sum_of = self.now, self._window.contradiction()
         is_elsewhere = self._anonymous.elsewhere.since is not None
         is_contradicted = is_elsewhere or (sum_of is not None and sum_of.is_significant)

@@ -314,6 +314,7 @@ class SlipDetector:
     # -- the graph: the ledger has both edges ------------------------------------------------------------------------
 
     def _replace(self, links: Sequence[Link], slip: Slip, keyframe: int) -> None:
+        """Replace odometry edges by edges with more noise."""
         backend, threshold = self._backend, -2.0 * LOG_ODDS
         for link in links:
             old, added = backend.graph.edge(link.own), _variances(self._space, slip.kind, np.array(link.seconds))
@@ -339,6 +340,7 @@ class SlipDetector:
 
 
 def _first_of(links: Sequence[Link], view: View) -> int:
+    """The first link after a view, by its place."""
     return next((k for k, link in enumerate(links) if link.vertices[0] >= view.vertex), len(links) - 1)
 
 

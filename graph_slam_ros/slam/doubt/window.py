@@ -289,6 +289,7 @@ class Window:
         return innovations, numbers, is_out
 
     def _newest(self) -> Iterator[Seen]:
+        """The newest sightings of well known landmarks, the newest first."""
         times, known_from = Counter[int](), cache(self.known_from)
         is_standing = self._backend.ledger.is_standing()
         for view in reversed(self.views):

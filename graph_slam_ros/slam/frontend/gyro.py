@@ -112,6 +112,7 @@ class GyroSamples:
         return end_ns - self._samples[newest].stamp_ns <= self._gap_ns and all(map(self._is_followed, range(newest)))
 
     def _is_followed(self, k: int) -> bool:
+        """Return whether the next message is near enough to interpolate."""
         s = self._samples
         return k + 1 < len(s) and s[k + 1].stamp_ns - s[k].stamp_ns <= self._gap_ns
 
@@ -191,6 +192,7 @@ class GyroState:
 
 
 def _cause(ratio: float | None, name: str) -> str:
+    """The likely cause of a ratio of turns, and what mends it."""
     mount = f"its TF, or {name}.mount where there is none"
     if ratio is not None and abs(ratio) > 1.0 / _GROSS:
         return "It must be in rad/s: are these degrees? Correct its driver"

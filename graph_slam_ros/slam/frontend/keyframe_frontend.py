@@ -129,7 +129,7 @@ class KeyframeFrontend:
             self.path.go_on(drive["path"])
             used = self.odometry.go_on(drive["odometry"])
             self.T_odom_base = used.T_odom_base
-            self.order.go_on(used.stamp_ns, drive.get("order", ({}, {})))
+            self.order.go_on(used.stamp_ns)
             self._thinning.go_on(drive["thinning"])
             self._observed_from, self._observed = drive["observed"][0], set(drive["observed"][1])
             self._edges.due = tuple(drive["noise_due"])
@@ -143,7 +143,6 @@ class KeyframeFrontend:
         return {
             "path": self.path.state,
             "odometry": self.odometry.state,
-            "order": self.order.state,
             "thinning": self._thinning.state,
             "observed": [self._observed_from, sorted(self._observed)],
             "noise_due": self._edges.due,
@@ -158,7 +157,7 @@ class KeyframeFrontend:
         """Keep the map and start over with the stamps: the next odometry begins a segment, or goes on."""
         motion = self.path.motion
         self._before_step = motion.now.covariance if motion is not None and goes_on else None
-        self.order.forget(goes_on=goes_on)
+        self.order.forget()
         self.odometry.forget()
         self.path.forget_time()
         self._thinning.forget_time()

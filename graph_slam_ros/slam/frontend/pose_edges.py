@@ -55,4 +55,5 @@ class PoseEdges:
         self._counters.used[m.topic] += 1
 
     def _noise(self, source: str, covariance: Array) -> Gaussian:
+        """The noise of a pose."""
         return edge_noise(self._counters, source, covariance, self._space.dimensions)

@@ -9,22 +9,16 @@ without the correction. Else no keyframe could be made where a sighting was.
 """
 
 from bisect import insort
-from collections import Counter
-from collections.abc import Sequence
-from dataclasses import replace
-from statistics import median
-from typing import Any
 
 from graph_slam_ros.config.pipeline import OrderingConfig
 from graph_slam_ros.measurements.counters import Counters
-from graph_slam_ros.measurements.types import Observation, Odometry, Sightings
+from graph_slam_ros.measurements.types import Observation, Odometry
 from graph_slam_ros.slam.frontend.ingest_gate import size_of
 from graph_slam_ros.slam.frontend.keyframes import KeyframeList
 from graph_slam_ros.slam.frontend.odometry_selector import OdometrySelector
 
 NS = 1_000_000_000
 _REMEMBERED = 100  # messages of each topic, by which one that comes again is known
-_KEPT, _FEWEST, _IN_A_ROW, _APART_NS = 30, 10, 3, 100_000_000  # messages; by what the last come later or earlier
 
 
 class StampOrder:
@@ -33,10 +27,6 @@ class StampOrder:
     Parameters
     ----------
     lag_ns : how long after odometry of the same stamp the sightings of a late sensor arrive
-
-    Attributes
-    ----------
-    set_ns : by topic, what is added to stamps because a clock was set on the way
     """
 
     def __init__(self, config: OrderingConfig, counters: Counters, lag_ns: int = 0) -> None:
@@ -45,10 +35,6 @@ class StampOrder:
         self._counters = counters
         self._queue: list[tuple[int, int, str, int, Odometry | Observation]] = []  # ascending
         self._recent: dict[str, dict[Observation, None]] = {}  # in the order they came
-        self._came: dict[
-            str, list[Sequence[int]]
-        ] = {}  # odometry then, stamps of a topic, and the longest step to each
-        self.set_ns = Counter[str]()
         self._arrivals = 0
         self._newest_odometry_ns: int | None = None
         self._released_ns: int | None = None
@@ -96,7 +82,6 @@ class StampOrder:
 
     def push(self, m: Odometry | Observation) -> list[Odometry | Observation]:
         """Queue one measurement; return those that are released."""
-        m = self._as_before(m) if isinstance(m, Sightings) else m
         rank, topic = (0, "") if isinstance(m, Odometry) else (1, m.topic)
         insort(self._queue, (m.stamp_ns, rank, topic, self._arrivals, m))
         self._arrivals += 1
@@ -106,51 +91,19 @@ class StampOrder:
             return []
         return self._release(self._newest_odometry_ns - self._window_ns)
 
-    def _as_before(self, m: Sightings) -> Sightings:
-        """Return sightings with the stamp that they would have if no clock had been set, theirs or odometry's.
-
-        A sensor that becomes slow comes late, too, but no stamps go back; one that becomes fast is never early.
-        """
-        came, at_ns = self._came.setdefault(m.topic, []), self._newest_odometry_ns or 0
-        stamp_ns = m.stamp_ns + self.set_ns[m.topic]
-        step_ns = stamp_ns - came[-1][1] if came else 0
-        if came and came[-1][0] == at_ns:
-            step_ns = max(step_ns, came.pop()[2])
-        came.append((at_ns, stamp_ns, step_ns))
-        del came[:-_KEPT]
-        if len(came) >= _FEWEST:
-            lags_ns = [odometry_ns - seen_ns for odometry_ns, seen_ns, _ in came]
-            before_ns, now_ns = lags_ns[:-_IN_A_ROW], lags_ns[-_IN_A_ROW:]
-            last, first = came[-_IN_A_ROW - 1], came[-_IN_A_ROW]
-            is_back = first[0] < last[0] or first[1] < last[1]
-            is_ahead = max(now_ns) < -_APART_NS and first[2] > median(step_ns for *_, step_ns in came) + _APART_NS
-            apart_ns = max(min(now_ns) - max(before_ns), min(before_ns) - max(now_ns))
-            if (is_back or is_ahead) and apart_ns > _APART_NS:
-                self.set_ns[m.topic] += round(median(now_ns) - median(before_ns))
-                self._counters.count(m.topic, "clock_set")
-                came.clear()
-        return replace(m, stamp_ns=m.stamp_ns + self.set_ns[m.topic])
-
     def flush(self) -> list[Odometry | Observation]:
         """Release all that is queued."""
         return self._release(self._queue[-1][0] if self._queue else 0)
 
-    def forget(self, *, goes_on: bool = False) -> None:
-        """Start over, for stamps of another time, in which the same drive may go on."""
+    def forget(self) -> None:
+        """Start over, for stamps of another time."""
         self._queue.clear()
         self._recent.clear()
-        self._came = self._came if goes_on else {}
         self._newest_odometry_ns = self._released_ns = None
 
-    @property
-    def state(self) -> list[Any]:
-        """Plain values, to ``go_on`` with."""
-        return [dict(self.set_ns), {topic: [*came] for topic, came in self._came.items()}]
-
-    def go_on(self, used_ns: int, state: Sequence[Any]) -> None:
+    def go_on(self, used_ns: int) -> None:
         """Go on after odometry of this stamp."""
         self._newest_odometry_ns = self._released_ns = used_ns
-        self.set_ns, self._came = Counter(state[0]), {topic: [*came] for topic, came in state[1].items()}
 
     def _release(self, until_ns: int) -> list[Odometry | Observation]:
         count = next((k for k, entry in enumerate(self._queue) if entry[0] > until_ns), len(self._queue))

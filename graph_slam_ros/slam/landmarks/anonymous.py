@@ -340,6 +340,7 @@ class AnonymousLandmarks:
         return frozen.after_map(self._belief, self.clusters.final)
 
     def _adopt(self, found: Found | None, keyframes: StampedPoses[Keyframe]) -> None:
+        """Use an explanation of all scans up to one."""
         if found is None:
             return
         if found.undecided:
@@ -358,6 +359,7 @@ class AnonymousLandmarks:
         self.hindsight.note(self.clusters.given)
 
     def _with_new(self, values: Array) -> Array:
+        """Stored numbers, extended by those of vertices that were added since."""
         return np.concatenate([values, self._solver.values[len(values) :]])
 
     def _named(self, places: dict[int, list[float]]) -> dict[str, list[float]]:

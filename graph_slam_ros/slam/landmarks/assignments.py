@@ -150,6 +150,7 @@ class Assignments:
         return bool(changed)
 
     def _add(self, cluster: int) -> None:
+        """Add the sightings of a cluster to its landmark."""
         landmark = self.given[cluster]
         name = self._name(landmark) if landmark != NOTHING else NOT_IN_MAP
         if name != NOT_IN_MAP:

@@ -194,6 +194,7 @@ class Beam:
         p[:, : n + r, : n + r] += g @ m.covariance @ g.transpose(0, 2, 1)
 
     def _slip(self, since_s: float) -> None:
+        """Copy each hypothesis, with a slip of odometry in this stretch."""
         c, count, n, r = self.settings, len(self.log_weight), self._n, self._r
         self._keep(np.tile(np.arange(count), 2))
         part = min(max(since_s / c.slip_every_s, 1.0), _SLIP_LONGEST)
@@ -291,6 +292,7 @@ class Beam:
     # -- landmarks that come and go ----------------------------------------------------------------------------------
 
     def _begin(self, which: Ids, cluster: Cluster, number: int) -> None:
+        """Add a new landmark at the cluster, in some hypotheses."""
         if not len(which):
             return
         if cluster.sort:

@@ -109,6 +109,7 @@ class SolverBelief:
         beam.recall(number, points, cross, own + left)
 
     def _shared(self, beam: Beam, number: int, names: Mapping[int, str]) -> Ids:
+        """The landmarks nearest to one that all hypotheses and the map share."""
         common = set(beam.ids[0].tolist())
         for row in beam.ids[1:].tolist():
             common &= set(row)
@@ -118,6 +119,7 @@ class SolverBelief:
         return numbers[np.argsort(apart, kind="stable")[:_MOST_SHARED]]
 
     def _points(self, numbers: Ids, names: Mapping[int, str]) -> Array:
+        """Positions (k, n) of landmarks in map."""
         marks = [self._landmarks.known[names[k]] for k in numbers.tolist()]
         return self._landmarks.positions([mark.vertex for mark in marks])
 

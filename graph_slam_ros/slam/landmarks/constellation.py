@@ -74,6 +74,7 @@ def stretches(drive: Drive, e: Estimate) -> list[tuple[int, int, int]]:
 
 
 def _grown(stamps: Array, first: int, last: int) -> tuple[int, int]:
+    """A stretch of scans without a gap."""
     while first > 0 and stamps[first] - stamps[first - 1] < _GAP_S and stamps[last] - stamps[first - 1] < _LONGEST_S:
         first -= 1
     while (
@@ -115,10 +116,12 @@ def _laid(drive: Drive, e: Estimate, landmark: int, first: int, last: int) -> Es
 
 
 def _are_apart(a: Estimate, b: Estimate, scans: slice) -> bool:
+    """Return whether two estimates have a stretch at different places."""
     return float(np.linalg.norm(a.position[scans] - b.position[scans], axis=1).max()) > _APART_M
 
 
 def _solved(drive: Drive, e: Estimate, inside: Ids, of_inside: Ids, scans: slice, turn: Array, move: Array) -> Estimate:
+    """Solve with a stretch moved, and its clusters assigned to other landmarks."""
     which, position, turns = e.which.copy(), e.position.copy(), e.turn.copy()
     which[inside] = of_inside
     position[scans], turns[scans] = position[scans] @ turn.T + move, turn @ turns[scans]
@@ -175,12 +178,14 @@ def _nearest(at: Array, there: Array, turn: Array, whiten: Array, reach: Array, 
 
 
 def _rough_scores(local: Array, there: Array, turns: Array, moves: Array) -> Array:
+    """The misfit of a stretch with the landmarks, for each motion."""
     at = np.einsum("mij,uj->mui", turns, local) + moves[:, None]
     nearest, _ = KDTree(there).query(at, distance_upper_bound=_MOVE_M * _MOST_COST**0.5)
     return np.asarray(np.minimum(np.square(nearest / _MOVE_M), _MOST_COST).sum(axis=1))
 
 
 def _priors(turns: Array, moves: Array, centre: Array) -> Array:
+    """The prior cost of each motion, from its rotation and translation."""
     gone = np.square(turns @ centre + moves - centre).sum(axis=1)
     return np.minimum(
         np.square(np.arctan2(turns[:, 1, 0], turns[:, 0, 0]) / _TURN_RAD) + gone / _MOVE_M**2, _MOST_PRIOR

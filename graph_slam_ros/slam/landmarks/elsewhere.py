@@ -239,6 +239,7 @@ def only_motion(points: Array, places: Array, here: tuple[float, ...]) -> tuple[
 
 
 def _motions(points: Array, places: Array) -> tuple[Array, Array]:
+    """Rotations (C,) and translations (C, 2) that lay two points on two places."""
     i, j = np.triu_indices(len(points), 1)
     apart = np.linalg.norm(points[i] - points[j], axis=1)
     i, j, apart = (one[apart > _LEAST_APART_M] for one in (i, j, apart))

@@ -139,4 +139,5 @@ def _at_origin(space: Geometry, rotations: Array) -> Numbers:
 
 
 def _turns(space: Geometry, poses: Numbers) -> Array:
+    """Return the rotations (b, 1) or (b, 4) of poses in arrays."""
     return np.stack([np.asarray(one) for one in poses[space.dimensions :]], axis=-1)

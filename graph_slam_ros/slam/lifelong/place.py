@@ -158,11 +158,13 @@ def _motion(
 
 
 def _by_kind(one: Place) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Return the members that are points, and those that are poses."""
     first = len(one.members) - len(one.seen.turns)
     return one.members[:first], one.members[first:]
 
 
 def _rows(among: Sequence[int], wanted: Sequence[int]) -> list[int]:
+    """Return where each of some members is among others."""
     at = {member: k for k, member in enumerate(among)}
     return [at[member] for member in wanted]
 

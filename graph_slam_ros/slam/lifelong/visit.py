@@ -119,6 +119,7 @@ def _marks(space: Geometry, graph: Graph, ends: Iterable[Sequence[int]], poses: 
 
 
 def _constellation(space: Geometry, solver: Solver, marks: Sequence[int]) -> Constellation:
+    """Return how some landmarks lie: points, and then poses."""
     points = [mark for mark in marks if solver.graph.kind_of(mark) is space.point]
     poses = solver.estimate(marks[len(points) :]).reshape(-1, space.pose.size)
     return Constellation.from_poses(space, solver.estimate(points), poses)

@@ -234,6 +234,7 @@ class OutlierGate:
         return group if len(group) > 1 else []
 
     def _nearest(self, count: int = _READMISSIONS) -> list[int]:
+        """Return the rejected edges that fit best."""
         outside = self.ledger.outside
         chi2, _ = self._solver.chi2_of(outside)
         nearest: list[int] = outside[np.argsort(chi2, kind="stable")[:count]].tolist()
@@ -333,6 +334,7 @@ class OutlierGate:
         return innovation <= self._innovation_gate(edge)
 
     def _innovation_gate(self, edge: int) -> float:
+        """Return the threshold of an innovation."""
         return self.gate_scale * quantile(self._config.gate, int(self.ledger.numbers.values[edge]))
 
     # -- the solve after something was accepted ----------------------------------------------------------------------
@@ -521,4 +523,5 @@ def _median(numbers: int) -> float:
 
 
 def _judged(ledger: Ledger, edge: int) -> tuple[float, float]:
+    """The statistic and its threshold."""
     return float(ledger.statistic.values[edge]), float(ledger.threshold.values[edge])

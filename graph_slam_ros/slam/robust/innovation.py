@@ -38,6 +38,7 @@ def innovations(graph: Graph, solver: Solver, edges: Sequence[int]) -> list[floa
 
 
 def _innovations(graph: Graph, solver: Solver, table: EdgeTable, rows: Index) -> dict[int, float]:
+    """The same of rows of a table whose vertices are of the same kinds, by edge."""
     ids = table.at(rows).ids.tolist()
     try:
         return dict(zip(ids, _least_costs(graph, solver, table, rows), strict=True))
@@ -51,6 +52,7 @@ def _innovations(graph: Graph, solver: Solver, table: EdgeTable, rows: Index) ->
 
 
 def _least_costs(graph: Graph, solver: Solver, table: EdgeTable, rows: Index) -> list[float]:
+    """The least costs of rows of a table."""
     some = table.at(rows)
     ends, root = some.vertices, some.sqrt_information
     joint = solver.edge_marginals(ends, are_inside=False)

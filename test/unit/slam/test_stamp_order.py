@@ -59,19 +59,3 @@ def test_B22_odometry_that_repeats_one_stamp_for_ever_fills_no_memory():
     queue, counters = order(max_waiting=3)
     assert len(through(queue, [odometry(7, x) for x in range(10)])) == 3
     assert counters.as_dict() == {"odometry": {"overflow": 7}}
-
-
-def test_stamps_go_on_where_a_clock_is_set_the_sensors_or_odometrys_but_not_where_one_becomes_slow():
-    was_set = (0, 530, 50, 0), (0, -530, 50, 0), (530, 0, 50, 0)
-    for one in (*was_set, (530, 530, 50, 0), (0, 0, 550, 0), (0, 0, 50, 300)):
-        (odometry_back, back, late, odometry_late), (queue, counters), out = one, order(), []
-        for t in range(0, 6000, 50):
-            if t == 3000 and odometry_back:
-                queue.forget(goes_on=True)
-            if not 3000 <= t < 3000 + odometry_late:
-                out += queue.push(odometry(t - (odometry_back + odometry_late) * (t >= 3000)))
-            if t % 100 == 0 and not 3000 <= t <= 3000 + late:
-                out += queue.push(seen(t - 50 if t < 3000 else t - late - back, "/tags"))
-        assert counters.as_dict() == ({"/tags": {"clock_set": 1}} if one in was_set else {})
-        seen_ns = [m.stamp_ns for m in out + queue.flush() if isinstance(m, Sightings)]
-        assert max(seen_ns) == T0 + (5900 - odometry_back - late) * MS
