@@ -154,7 +154,10 @@ class Session:
         self._slowest_s = max(self._slowest_s, solve_s) if update.solved else self._slowest_s
         recorded = self._recorded(lambda recorder: recorder.record(self.slam, update))
         if self._recorded(RunRecorder.flush) and recorded:  # nothing is published that a restart would not know
-            self.recording_fails = self._folder is None or not os.access(self._folder, os.W_OK)  # as a save would see
+            is_refused = self._folder is None or not os.access(self._folder, os.W_OK)  # as a save would see
+            if is_refused and not self.recording_fails:
+                self._warn("output.folder", "it cannot be written any more")
+            self.recording_fails = is_refused
         self._update_estimate(update, solve_s)
         self._on_update(self.slam, update)
 
@@ -331,23 +334,20 @@ class Session:
             raise
         if resumes and (len(start.drives) <= 1 or self._is_sure):  # else nobody knew where it was
             self._resumption = Resumption(self.slam, start.used_ns, start.source)
-        where = []
-        if T_map_base is not None:
-            self._place(T_map_base)
-            at = " ".join(f"{x:.6g}" for x in T_map_base[: self.config.space.dimensions])
-            where.append(f"the robot is taken to be at {at}")
+        where = [] if T_map_base is None else [self._place(T_map_base)]
         self._recorded(RunRecorder.flush)
         self._update_estimate(Update(), 0.0)
         return ": ".join([run.name, f"{len(self.slam.keyframes)} keyframes", *where, *losses[:1]])
 
-    def _place(self, T_map_base: Numbers) -> None:
-        """Begin the sequence with the robot's pose, as uncertain as a pose on ``initialpose`` without covariance."""
+    def _place(self, T_map_base: Numbers) -> str:
+        """Begin the sequence with the robot's pose, as uncertain as on ``initialpose`` without covariance; says so."""
         prior, space = self.config.initialpose, self.config.space
         sigmas = np.array(space.sigmas(prior.sigma_m, prior.sigma_rad))
         pose = InitialPose(T_map_base, tuple(np.diag(sigmas**2).ravel().tolist()))
         if (recorder := self._recorder) is not None:
             recorder.accept(pose)  # before what waits for ``release``
         self._process(pose)
+        return f"the robot is taken to be at {' '.join(f'{x:.6g}' for x in T_map_base[: space.dimensions])}"
 
     def earlier(self, name: str) -> Path:
         """The run of that name in the same directory; the newest earlier one for an empty name. Raises RunError."""

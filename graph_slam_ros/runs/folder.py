@@ -292,6 +292,8 @@ def check_room(folder: Path, source: Path | None = None, *, force: bool = False)
                 raise RunError(f"{foreign[0]}: not written by this run, and so never removed: choose another folder")
             if not force and _holds_something(folder):
                 raise RunError(f"{folder}: holds a run already: choose another folder, or --force replaces it")
+        elif is_run(folder):
+            raise RunError(f"{folder}: a run of an earlier version, which is never replaced: choose another folder")
         elif not all(map(_is_unfinished, folder.iterdir())):
             raise RunError(f"{folder}: not empty and not an earlier run; nothing was written")
     except OSError as error:

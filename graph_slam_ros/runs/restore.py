@@ -218,8 +218,7 @@ def recover(folder: Path, out: Path, *, force: bool = False) -> Summary:
     """Write the results of a run that never ended, from its map. The drive is not repeated."""
     took = stopwatch()
     check_room(out, folder, force=force)
-    losses: list[str] = []
-    counters = Counters()
+    losses, counters = list[str](), Counters()
     state = map_of(folder, losses, counters)
     options: dict[str, Any] = {"earlier": counters, "took": took, "recording": recording_of(folder)}
     return record_run(out, config_of(folder, state), (), losses, state, force=force, **options)[1]
@@ -233,8 +232,7 @@ def complete(folder: Path) -> Summary:
     RunError
         Somebody else has the folder, or its map cannot be solved.
     """
-    took = stopwatch()
-    losses: list[str] = []
+    took, losses = stopwatch(), list[str]()
     try:
         with claimed(folder):
             before, counters = summary_of(folder), Counters()

@@ -201,10 +201,10 @@ class Suggestion:
         return f"--set 'inputs.names={names}' {chosen}"
 
     def _choose_imu(self, found: Iterator[TopicContents], is_needed: bool) -> None:
+        from graph_slam_ros.check.gyro import upright  # the pipeline is slow to import
+
         for one in sorted(found, key=lambda one: -one.usable):
             names = " ".join([*self.names, "imu"])
-            from graph_slam_ros.check.gyro import upright  # the pipeline is slow to import
-
             angles = upright(tuple(total / max(one.read, 1) for total in one.felt))
             turn = " ".join(f"{0.0 if abs(angle) < _LEVEL_RAD else angle:.4g}" for angle in angles)
             mount = "" if self._recording.is_linked(one.frame, self._base) else f" --set 'imu.mount=0 0 0 {turn} 0'"

@@ -309,9 +309,9 @@ def uncorrected(
 
 def is_off(found: TrialFit, one: Finding) -> bool:
     """Return whether a parameter is off beyond doubt, though its sigma may be too large to correct it."""
-    name, far = one.parameter.name, abs(one.value)
+    name, far, limit = one.parameter.name, abs(one.value), max(SIGMAS * one.sigma, BESIDE_BENDS)
     is_known = one.verdict == "admitted" or (one.verdict == "not_determined" and is_certain(found, one.parameter))
-    is_known |= name == "distance" and _has_bends(found) and far > max(SIGMAS * one.sigma, BESIDE_BENDS)
+    is_known |= one.verdict == "not_separable" and name == "distance" and _has_bends(found) and far > limit
     return is_known and (name not in _SIDES or far >= LEAST_M)
 
 

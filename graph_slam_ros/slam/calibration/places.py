@@ -81,7 +81,7 @@ def _with_bends(problem: TrialProblem, found: TrialFit) -> TrialFit:
         return found
     if bend not in _off(other) or other.evidence <= found.evidence:
         return found
-    why = {distance: f"in bends it is another, by {bend.shown(other.value(bend))}", bend: "no setting corrects it"}
+    why = {distance: f"in bends the factor differs by {bend.shown(other.value(bend))}", bend: "no setting corrects it"}
     doubted = {one: (other.value(one), other.sigma(one), text) for one, text in why.items()}
     return replace(other, slips=found.slips, doubted=doubted)
 

@@ -17,7 +17,7 @@ _AT_ZERO = 1e-9  # [m, rad]
 _RESET_M, _RESET_RAD, _UNUSUAL = 0.1, 0.1, 3.0
 _LEAST_S = 0.02  # stamps of some drivers crowd together: a pair of them says nothing of speed
 _GAP, _LEAST_GAP_NS = 10.0, 2_000_000_000  # times the usual period, at least; recorded robots pause for 1.4 s
-_FASTER, _FROM_REST_M_S = 2.0, 2.0  # times the speed before a gap, at least so much: more, and its driver began anew
+_FASTER, _FROM_REST_M_S = 2.0, 5.0  # times the speed before a gap, or of a car that drove off in it
 _REMEMBERED = 1000  # messages of a source that is not in use, to take over from where the one in use fell silent
 
 
@@ -186,8 +186,8 @@ class OdometryJumps:
         motion, dt : from the message before [s]
         T_odom_base : where odometry is now
         last : the motion before
-        usual_s : time of the motion before, where odometry was silent for so long since that its driver may have
-            restarted, and driven on; else 0
+        usual_s : the usual period, where odometry was silent for so long that its driver may have restarted, and driven
+            on; else 0
         """
         if self._is_reset(motion, T_odom_base, last, is_gap=usual_s > 0.0):
             return "reset_to_zero"
