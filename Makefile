@@ -1,7 +1,7 @@
 # A fresh clone needs `make demo` or `make test`, and nothing before it.
 #
 # install       .venv with everything of requirements.txt, real ROS 2 included where there is none (default)
-# demo          install, then the demonstration
+# demo          install, without the kernels of space, then the demonstration
 # check         style, types and the unit tests, in a minute: after each change; no process, no ROS
 # test          install, then style, types and all tests; some of them: TESTS='-m "not process"', -m integration, a file
 # soak          the tests that take too long for every run: up to three hours, resumed where it was; ONLY=name,name
@@ -35,9 +35,11 @@ endif
 .PHONY: install demo check test soak wheel colcon test-oldest lint format lock bench robust figures pictures clean
 .DELETE_ON_ERROR:
 
-install: $(VENV)/interfaces.stamp $(VENV)/kernels.stamp
+install: $(VENV)/package.stamp
+	@$(MAKE) --no-print-directory -j2 $(VENV)/interfaces.stamp $(VENV)/kernels.stamp
 
-demo: install
+demo: $(VENV)/package.stamp
+	@$(MAKE) --no-print-directory -j2 $(VENV)/interfaces.stamp $(VENV)/planar.stamp
 	@$(BIN)/graph_slam demo --force
 
 # Four on two cores, too: tests of nodes wait for half of their time.
@@ -114,8 +116,8 @@ $(VENV)/package.stamp: setup.py setup.cfg pyproject.toml graph_slam_ros/__init__
 $(VENV)/interfaces.stamp: tools/generate_interfaces.py $(VENV)/package.stamp
 	@if $(BIN)/python tools/generate_interfaces.py; then touch $@; fi
 
-$(VENV)/kernels.stamp: $(SOURCES) $(VENV)/package.stamp
-	@$(BIN)/graph_slam warmup
+$(VENV)/kernels.stamp $(VENV)/planar.stamp: $(SOURCES) $(VENV)/package.stamp
+	@$(BIN)/graph_slam warmup --dimensions $(if $(findstring planar,$@),2,3)
 	@touch $@
 
 # The interfaces are generated with the package, which is then taken out again: what is tested is what colcon installs.

@@ -64,11 +64,8 @@ def _matches(p: Parameter, pattern: str) -> bool:
 
 def _lines(p: Parameter) -> Iterator[str]:
     unit = f" {p.unit}" if p.unit else ""
-    limits = ""
-    if p.choices:
-        limits = f"one of {', '.join(p.choices)}"
-    elif p.low is not None or p.high is not None:
-        limits = f"in {p.range_text()}"
+    in_range = f"in {p.range_text()}" if p.low is not None or p.high is not None else ""
+    limits = f"one of {', '.join(p.choices)}" if p.choices else in_range
     when = "may change at any time" if p.live else "read at the start"
     yield f"{p.name} = {_word(p.default)}{unit}   ({'; '.join(filter(None, (limits, when)))})"
     yield f"    {p.meaning}"
@@ -80,15 +77,16 @@ def _word(default: object) -> str:
     return f"{default:g}" if isinstance(default, float) else str(default) or '""'
 
 
-def warmup_options(_: CommandParser) -> None:
-    """Add no option."""
+def warmup_options(sub: CommandParser) -> None:
+    """Add the options of ``warmup``."""
+    sub.add_argument("--dimensions", type=int, choices=(2, 3), default=3, help="2: the plane alone (default: 3)")
 
 
 def warmup(args: argparse.Namespace) -> int:
     """Compile the kernels."""
     from graph_slam_ros.warmup import warmup as compiled
 
-    console.warn(f"kernels ready after {compiled():.1f} s")
+    console.warn(f"kernels ready after {compiled(dimensions=args.dimensions):.1f} s")
     console.then(console.command("info", "RECORDING"))
     return console.DONE
 
