@@ -80,8 +80,7 @@ def refused_odometry(c: Columns) -> list[Finding]:
 def worst_of_replay(c: Columns, *, is_damaged: bool = False) -> Finding | None:
     """The worst error or warning beyond what the end of a replay says anyway; None where there is none."""
     known = (*_IN_OUTCOME, *(FOLLOWS["damaged"] if is_damaged else ()))
-    found = check_columns(c, OF_A_REPLAY)
-    return next((one for one in found if one.severity != "note" and one.code not in known), None)
+    return next((f for f in check_columns(c, OF_A_REPLAY) if f.severity != "note" and f.code not in known), None)
 
 
 def first_of_replay(c: Columns, *, is_whole: bool) -> Finding | None:

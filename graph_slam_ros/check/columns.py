@@ -252,8 +252,7 @@ class _Sightings:
             turned = so3.act(so3.exp(tuple(self._mount[3:])), tuple((points - origin).T))
             points = np.stack(turned, axis=1) + origin + self._mount[:3]
         ranges, bearings, sigmas = numbers[3:]
-        place = self.frame, self.T_base_frame
-        names = tuple(self._names)
+        names, place = tuple(self._names), (self.frame, self.T_base_frame)
         return SightingColumns(self.input, self.topic, stamp_ns, names, name, points, ranges, bearings, sigmas, *place)
 
 
@@ -276,7 +275,7 @@ class Collector:
             names = tuple(name for name in used if topics[name] == topic)
             self._topics[topic] = _Topic(topic, names, used[names[0]], round(by_name[names[0]].offset_s * 1e9))
         self._sightings = {
-            name: _Sightings(name, topics[name], by_name[name].numbers("mount_correction", 6))
+            name: _Sightings(name, topics[name], _mount_correction(config, by_name[name]))
             for name, use in used.items()
             if use == "landmarks"
         }
@@ -446,9 +445,14 @@ class Collector:
         if len(read):
             parts = read[:, :7], read[:, 7:13], read[:, 13:]
             return OdometryColumns(*names, self._frame, self._child, stamp_ns[:, 0], *parts)
-        unknown = np.full((len(path), 6), np.nan)
-        frames = self._config.frames
+        unknown, frames = np.full((len(path), 6), np.nan), self._config.frames
         return OdometryColumns(*names, frames.odom, frames.base, path_ns, path, unknown, unknown)
+
+
+def _mount_correction(config: Config, of: InputConfig) -> Numbers:
+    """x, y, z, roll, pitch, yaw by which the mount of an input is corrected; in the plane only x, y and yaw."""
+    mount = of.numbers("mount_correction", 6) or (0.0,) * 6
+    return mount if config.world.dimensions == 3 else (*mount[:2], 0.0, 0.0, 0.0, mount[5])
 
 
 def _located(one: Sighting) -> tuple[tuple[float, float, float], float]:

@@ -40,6 +40,7 @@ _QUARTER = 0.5**0.5
 _CORRECTED = "_corrected"
 _ROUNDS, _SIGMAS, _OTHER_SCALE, _LEAST_SCALE = 10, 4.0, 0.15, 0.1  # a fit finds less than _OTHER_SCALE
 _FIXED = 20.0  # sigmas, or metres, that fixes are apart
+_PLACE_M = 0.03  # by which the place of a sensor may be wrong
 
 _OPTICAL = "those of an optical frame (z ahead, x to the right)"
 # Where a sensor would be turned on the robot, if its positions are in other axes: R_frame_true.
@@ -228,24 +229,30 @@ def _scaled(c: Columns, s: SightingColumns, pairs: Pairs) -> Finding | None:
     left, size = (np.median(np.linalg.norm(some, axis=1)) for some in (x - drive * moved - swing * turned, x))
     if len(s.names) == 1 or left > _HALF * size or drive <= 0.0 or abs(drive - 1.0) < _OTHER_SCALE:
         return None
+    doubt = _SIGMAS * sigma + _PLACE_M / max(float(np.hypot(*s.T_base_frame[:2])), 1e-9)
     if any(len(f.points) and np.abs(f.points - f.points[0]).max() > _FIXED * max(f.sigma_m, 1.0) for f in c.fixes):
-        swing, sigma = drive, 0.0  # which agree with odometry: else nothing was asked of landmarks
+        swing, doubt = drive, 0.0  # which agree with odometry: else nothing was asked of landmarks
     of_odometry, of_ranges = abs(swing - 1.0), abs(swing - drive)  # the place of the sensor is in metres
-    is_told = min(of_odometry, of_ranges) + _SIGMAS * sigma < _HALF * max(of_odometry, of_ranges)
+    is_told = min(of_odometry, of_ranges) + doubt < _HALF * max(of_odometry, of_ranges)
     now = next((one.range_factor for one in c.config.sources if one.name == s.input), 1.0)
     scale, o = c.config.odometry.distance_factor, c.odometry
-    by_ranges = assignment(f"{s.input}.range_factor", round(now / drive, 3))
-    by_odometry = assignment("odometry.distance_factor", round(scale * drive, 4))
+    by_ranges = factor_setting(f"{s.input}.range_factor", now / drive, 10.0)
+    by_odometry = factor_setting("odometry.distance_factor", scale * drive, 100.0)
     is_twist = abs(scale * twist_factor(o) * drive - 1.0) < _OTHER_SCALE
     if is_twist or drive < _LEAST_SCALE or (is_told and of_odometry < of_ranges):
         text = f"{o.topic}: its pose moves {1.0 / drive:.3g} times as far as landmarks say: is it in metres?"
-        at = where(o.topic, c.path_ns, settings=(by_odometry,))
+        at = where(o.topic, c.path_ns, settings=by_odometry)
         return Finding("units", "error", 1.0 / drive, 1.0 + _OTHER_SCALE, "times", text, **at)
     text = f"{s.topic}: ranges are {drive:.2f} times as long as odometry says: is the tags' size right (black square)?"
-    if not is_told:
-        text += f" Or is odometry not in metres? The one needs {by_ranges}, the other {by_odometry}"
-    at = where(s.topic, s.stamp_ns, len(pairs.a), (by_ranges,) if is_told else ())
+    if not is_told and by_ranges and by_odometry:
+        text += f" If the ranges are wrong: {by_ranges[0]}; if odometry is: {by_odometry[0]}"
+    at = where(s.topic, s.stamp_ns, len(pairs.a), by_ranges if is_told else ())
     return Finding("range_scale", "error", drive, 1.0 + _OTHER_SCALE, "times", text, **at)
+
+
+def factor_setting(key: str, factor: float, most: float) -> tuple[str, ...]:
+    """Return the setting of a factor, or none where it is beyond the limits of the parameter, 1 / most to most."""
+    return (assignment(key, float(f"{factor:.4g}")),) if 1.0 / most <= factor <= most else ()
 
 
 def turned_mount(name: str, frame: str, T_base_frame: se3.Pose, T_frame_true: se3.Pose) -> tuple[str, ...]:
@@ -267,10 +274,10 @@ def _rpy(q: so3.Quaternion) -> tuple[float, float, float]:
 
 def _identities(c: Columns, s: SightingColumns) -> Iterator[Finding]:
     counts = c.counters.as_dict().get(s.input, {})
-    twice = counts.get("id_merged", 0) + counts.get("id_conflict", 0)
-    share = twice / max(len(s.stamp_ns) + twice, 1)
-    if share > _TWICE:
-        severity: Severity = "error" if share > _NO_IDS else "warning"
+    conflicts = counts.get("id_conflict", 0)  # places differ; those of a tag in two cameras agree, and are merged
+    twice = counts.get("id_merged", 0) + conflicts
+    if (share := twice / max(len(s.stamp_ns) + twice, 1)) > _TWICE:
+        severity: Severity = "error" if share * conflicts / twice > _NO_IDS else "warning"
         text = f"{s.topic}: {share:.1%} of the sightings have an id that is twice in their message"
         at = where(s.topic, s.stamp_ns, twice, NO_IDS if severity == "error" else ())
         yield Finding("id_twice", severity, share, _TWICE, "part", text, **at)

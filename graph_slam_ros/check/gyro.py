@@ -8,7 +8,7 @@ import numpy as np
 
 from graph_slam_ros.check.columns import Columns
 from graph_slam_ros.check.contradictions import fitted, turned_mount
-from graph_slam_ros.check.finding import Finding, where
+from graph_slam_ros.check.finding import Finding, Severity, where
 from graph_slam_ros.check.pairs import poses_at
 from graph_slam_ros.check.times import offset_setting
 from graph_slam_ros.formats.parameters import assignment
@@ -124,10 +124,9 @@ def _scale(c: Columns, factor: float, name: str, gyro_ns: Index) -> Finding:
     elif abs(factor) > 1.0 / _GROSS:
         text += ": are these degrees?"
         settings = (assignment(f"{c.config.gyro_input}.use", "none"),)
+    severity: Severity = "warning" if abs(factor - 1.0) < _GROSS else "error"
     at = where(name, gyro_ns, settings=settings)
-    return Finding(
-        "gyro_scale", "warning" if abs(factor - 1.0) < _GROSS else "error", factor, 1.0 + _SCALE, "times", text, **at
-    )
+    return Finding("gyro_scale", severity, factor, 1.0 + _SCALE, "times", text, **at)
 
 
 def upright(felt: Numbers) -> tuple[float, float]:

@@ -67,9 +67,8 @@ def _two_places(name: str, chosen: Index, s: SightingColumns, points: Array) -> 
     a, b = np.median(at[near], axis=0), np.median(at[~near], axis=0)
     widths = [float(np.median(np.linalg.norm(at[part] - centre, axis=1))) for part, centre in ((near, a), (~near, b))]
     apart_m, fewest = float(np.linalg.norm(b - a)), int(min(near.sum(), (~near).sum()))
-    if fewest < max(_IN_EACH, _PART * len(at)):
-        return None
-    if not apart_m >= max(_APART_M, _SIGMAS * sigma_m, _WIDTHS * sum(widths)):
+    least_m = max(_APART_M, _SIGMAS * sigma_m, _WIDTHS * sum(widths))
+    if fewest < max(_IN_EACH, _PART * len(at)) or not apart_m >= least_m:
         return None
     before = np.cumsum(near)[:-1] / np.arange(1, len(at))
     after = (near.sum() - np.cumsum(near)[:-1]) / np.arange(len(at) - 1, 0, -1)

@@ -49,7 +49,6 @@ def motions_of(c: Columns, s: SightingColumns, pairs: Pairs) -> LandmarkMotions:
     of = s.name[pairs.a]
     names = np.flatnonzero(np.bincount(of, minlength=len(s.names)) >= _LEAST_PAIRS)
     chosen = [np.flatnonzero(of == name) for name in names]
-
     on_robot, on_ground = (np.array([np.median(some[k]) for k in chosen]) for some in (robots, grounds))
     poses = poses_at(np.clip(s.stamp_ns, c.path_ns[0], c.path_ns[-1]), c.path_ns, c.path)
     ground = np.stack(se3.act(tuple(poses.T), tuple(s.points.T)), axis=1)[:, : pairs.dimensions]
@@ -75,10 +74,8 @@ def check_moving(s: SightingColumns, by: LandmarkMotions, count: int) -> Iterato
     """Sightings of a fixed frame, whatever frame they name, and landmarks that move, by this many pairs."""
     if np.count_nonzero(by.with_robot) >= max(_LEAST_NAMES, _MOST * len(by.names)):
         robot_m, ground_m = float(np.median(by.on_robot)), float(np.median(by.on_ground))
-        text = (
-            f"{s.topic}: while the robot drives, landmarks stay where they are on it to {robot_m:.2f} m, and "
-            f"would move by {ground_m:.2f} m on the ground: they are given in a frame that does not move with the robot"
-        )
+        text = f"{s.topic}: while the robot drives, landmarks stay where they are on it to {robot_m:.2f} m, and would "
+        text += f"move by {ground_m:.2f} m on the ground: they are given in a frame that does not move with the robot"
         value, at = ground_m / max(robot_m, 1e-9), where(s.topic, s.stamp_ns, count)
         yield Finding("seen_in_fixed_frame", "error", value, 1.0 / _HALF, "times", text, **at)
         return
@@ -87,8 +84,7 @@ def check_moving(s: SightingColumns, by: LandmarkMotions, count: int) -> Iterato
         text = f"{s.topic}: landmark {name} moves: it is {by.on_ground[k]:.2f} m from its place a few seconds later"
         text += ": do all have its id?" * (len(s.names) == 1)
         if by.with_robot[k]:
-            x, y = by.at[k, :2]
-            place = f"at x {x:.2f} and y {y:.2f} m on it"
+            place = f"at x {by.at[k, 0]:.2f} and y {by.at[k, 1]:.2f} m on it"
             text = f"{s.topic}: landmark {name} moves along with the robot, {place}: a part of it, or a follower"
         limit_m, at = _NOISES * by.noise_m, where(s.topic, own_ns)
         yield Finding("landmark_moves", "warning", by.on_ground[k], limit_m, "m", text, **at)

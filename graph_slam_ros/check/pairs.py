@@ -172,10 +172,8 @@ def check_bearings(c: Columns, s: SightingColumns) -> Iterator[Finding]:
     each = _changes(s, use, s.bearings, headings, _BEARING_LATER_S, _TURNED_RAD, turned, turned)
     factor = float(np.median(each)) if len(each) >= _LEAST_BEARINGS else 0.0
     if factor > _MIRRORED:
-        text = (
-            f"{s.topic}: bearings change by {factor:+.2f} rad for each radian that the robot turns to the left, and "
-            "-1 is expected: do they count to the right, or does odometry turn the other way?"
-        )
+        text = f"{s.topic}: bearings change by {factor:+.2f} rad for each radian that the robot turns to the left, and "
+        text += "-1 is expected: do they count to the right, or does odometry turn the other way?"
         yield Finding("mirrored", "error", factor, _MIRRORED, "rad/rad", text, **where(s.topic, s.stamp_ns, len(use)))
 
 

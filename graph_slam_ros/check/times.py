@@ -199,10 +199,8 @@ def _rate(c: Columns) -> Iterator[Finding]:
     if len(long):
         worst_s, often = float(step_s[long].max()), {1: "once", 2: "twice"}.get(len(long), f"{len(long)} times")
         is_bad = bool((step_s[long][moved | turned] > max(_PERIODS * median_s, _VERY_LONG_S)).any())
-        text = (
-            f"{o.topic} comes at {1.0 / median_s:.0f} Hz, but is silent for more than {most_s:.1f} s "
-            f"{often} (the longest {worst_s:.2f} s{'; the robot moved meanwhile' if is_bad else ''})"
-        )
+        text = f"{o.topic} comes at {1.0 / median_s:.0f} Hz, but is silent for more than {most_s:.1f} s {often} "
+        text += f"(the longest {worst_s:.2f} s{'; the robot moved meanwhile' if is_bad else ''})"
         severity: Severity = "warning" if is_bad else "note"
         yield Finding("gap", severity, worst_s, most_s, "s", text, **where(o.topic, stamp_ns[long]))
     if 1.0 / median_s < _SLOW_HZ:

@@ -38,7 +38,7 @@ class Reason:
 
 
 _refused, _repaired, _noted = (partial(Reason, effect) for effect in Effect)
-_COVARIANCE = "correct the driver; or its section's noise=sigmas, of odometry odometry.noise=density"
+_COVARIANCE = "correct the driver, or set INPUT.noise=sigmas (odometry: odometry.noise=density)"
 _SIGMAS = "INPUT.sigma_m, INPUT.sigma_rad: its standard deviations; of closures with INPUT.noise=sigmas"
 _FRAMES = "publish the transform on /tf_static, or INPUT.mount, or frames.base as the messages name it"
 _GAPS = "publish the moving transform at 10 Hz or more, all the time; inputs.tf_wait_s where it comes late"

@@ -126,9 +126,10 @@ def open_bag(path: Path | str) -> Bag:
     bag.losses += [*missing, *_still_packed(path, files)]
     bag.warnings += others
     names = {re.sub(r"[_-]?\d+$", "", file.stem) for file in files}
-    numbers = {int(found[0]) for file in files if (found := re.search(r"\d{1,4}$", file.stem))}
-    gaps = sorted({*range(min(numbers, default=0), max(numbers, default=0))} - numbers)
-    if len(names) == 1 and len(gaps) < len(files) and not missing:
+    there = (re.search(r"_(\d{1,4})\.\w+(\.zstd)?$", file.name) for file in (*files, *path.glob("*.zstd")))
+    numbers = {int(found[1]) for found in there if found}
+    gaps = sorted({*range(max(numbers, default=0))} - numbers)
+    if len(names) == 1 and 0 in numbers and len(gaps) < len(files) and not _names_in(path / "metadata.yaml"):
         bag.losses += [f"{path}: part {number} is not there, between others" for number in gaps]
     if len(names) > 1 and not (path / "metadata.yaml").is_file():
         bag.warnings.append(f"{path}: {len(files)} files of different names are read as one recording: name one")
@@ -271,9 +272,8 @@ class BagWriter:
             if type_name not in self._schemas:
                 text, _ = typestore().generate_msgdef(type_name, ros_version=2)
                 self._schemas[type_name] = self._writer.register_schema(type_name, "ros2msg", text.encode())
-            self._channels[topic] = self._writer.register_channel(
-                topic, "cdr", self._schemas[type_name], {"offered_qos_profiles": ""}
-            )
+            schema, more = self._schemas[type_name], {"offered_qos_profiles": ""}
+            self._channels[topic] = self._writer.register_channel(topic, "cdr", schema, more)
         sequence = self._sequence[topic] = self._sequence.get(topic, -1) + 1
         self._writer.add_message(self._channels[topic], stamp_ns, cdr, stamp_ns, sequence)
         self._file.flush()

@@ -357,7 +357,7 @@ COUNT, ROWS = itertools.count(), ("odometry_rows", "seen_rows")
 SLASHES = (lambda r: r.seen_rows(frame="Robot/cam "), lambda r: r.static_rows(("base_link", "robot//cam")))
 CAUSES = {
     "tags 1.8 times": ((None, lambda r: r.seen_rows(times=1.8)), "range_scale", "as long as odometry says"),
-    "tags 1.2 times": ((None, lambda r: r.seen_rows(times=1.2)), "range_scale", "Or is odometry not in metres?"),
+    "tags 1.2 times": ((None, lambda r: r.seen_rows(times=1.2)), "range_scale", "if odometry is: odometry.distance"),
     "two robots": ((two_robots,), "duplicates", "two robots or drivers take turns: 300 of its poses"),
     "feet": ((in_feet,), "units", "times as far as landmarks say"),
     "one id": ((None, renamed(lambda i: "tag")), "id_twice", "twice in their message"),
