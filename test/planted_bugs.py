@@ -135,10 +135,7 @@ BUGS = (
         (f"test_timing_cases.py::{BEGINS}",),
     ),
     Bug(
-        "written_over",
-        "results are written straight over those of before",
-        {"runs/recorder.py: _put": _OVER},
-        (CRASH,),
+        "written_over", "results are written straight over those of before", {"runs/recorder.py: _put": _OVER}, (CRASH,)
     ),
     Bug(
         "journal_at_the_end",

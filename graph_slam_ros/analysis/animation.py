@@ -133,13 +133,8 @@ def _drawn(moments: list[_Moment], title: str, truth: Trajectory | None) -> Iter
     for moment in moments:
         newest_s = max(newest_s, moment.stamp_s)  # a clock that is set back takes nothing of the truth back
         so_far = 0 if truth is None else int(np.searchsorted(truth.stamps_s, newest_s, side="right"))
-        for line, points in (
-            (known, true[:so_far]),
-            (odometry, moment.odometry),
-            (path, moment.path),
-            (landmarks, moment.landmarks),
-            (robot, moment.path[-1:]),
-        ):
+        shown = true[:so_far], moment.odometry, moment.path, moment.landmarks, moment.path[-1:]
+        for line, points in zip((known, odometry, path, landmarks, robot), shown, strict=True):
             line.set_data(points[:, 0], points[:, 1])
         figure.canvas.draw()
         image = Image.fromarray(np.asarray(figure.canvas.buffer_rgba())).convert("RGB")

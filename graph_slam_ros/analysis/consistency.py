@@ -129,7 +129,12 @@ def pose_errors(estimate: Array, truth: Array, covariances: Array) -> tuple[Arra
 
     The origin of a map is the robot's first pose, so its position in the world is not an error of the estimate. The
     first pose is moved onto its true pose. All other covariances contain that of the first pose, so it is subtracted.
-    This is valid if only the first pose holds the map. Of the truth, what is not known is NaN.
+    This is valid if only the first pose holds the map.
+
+    Parameters
+    ----------
+    estimate, truth : (n, 7) T_map_base and T_world_base, of the latter NaN where unknown
+    covariances : (n, 3, 3) or (n, 6, 6) in the tangent space of each estimate
     """
     planar = covariances.shape[1] == 3
     true = np.stack(se3.compose(_T_map_world(estimate, truth), tuple(truth.T)), axis=1)

@@ -30,11 +30,13 @@ from graph_slam_ros.formats.files import is_empty
 from graph_slam_ros.lie import se3
 from graph_slam_ros.runs.folder import is_recording, is_run, run_config, summary_of
 from graph_slam_ros.runs.trajectory import Point, Trajectory, read_landmarks, read_rows
+from graph_slam_ros.typing import Array
 
 _KEYFRAMES = ("path.tum", "path_odometry.tum")  # estimate and dead reckoning
 _SIGHTINGS = ("sightings.tum", "odometry.tum")
 _FAR, _FAR_M = 0.5, 0.3  # an error larger than this part of the true path, and than that, is not one of a good map
 _MOST_LATE_S, _LATE_S, _LATE_M, _CLEARLY = 20.0, 0.1, 0.1, 0.4
+_MOST_POSES, _OVERLAP = 500, 0.8  # of hundreds of alignments; part of these that is not lost where stamps move
 _ONE_DRIVE = [{"keyframe": 0, "sighting": 0}]
 
 
@@ -153,10 +155,7 @@ def evaluate(
     topic : topic of the truth, as in ``read_truth``
     align : align the run to the truth; False: the map is already in the frame of the truth
 
-    Raises
-    ------
-    GraphSlamError
-        A file or topic that is missing or unreadable, or too few common stamps.
+    Raises GraphSlamError: a file or topic that is missing or unreadable, or too few common stamps.
     """
     run = Path(run)
     if is_recording(run):
@@ -172,7 +171,7 @@ def evaluate(
     if known.topic in inputs:
         warnings.append(f"{known.topic} was an input of the run: the error says how well it fits, not how true it is")
     odometry, error = drive.odometry, path_error(drive.estimate, known.trajectory, dimensions, align=align)
-    warnings += _doubts(drive.estimate, known.trajectory, error, dimensions)
+    warnings += _doubts(drive.estimate, known.trajectory, error, dimensions, align=align)
     return Scores(
         error,
         None if odometry is None else path_error(odometry, known.trajectory, dimensions),
@@ -242,40 +241,69 @@ def _drives(run: Path) -> list[dict[str, int]]:
     return drives or _ONE_DRIVE
 
 
-def _doubts(path: Trajectory, truth: Trajectory, error: PathError, dimensions: int) -> Iterator[str]:
-    """What of the truth would have to be otherwise for a far better fit, and errors that no good map has."""
-    size_m, true_m = (float(np.linalg.norm(one.poses[:, :3].std(axis=0))) for one in associate(path, truth))
-    k = size_m / max(true_m, 1e-9)
-    tried = {
-        "": truth,
-        f"its ways are {1.0 / k:.3g} times ours: in metres?": replace(truth, poses=truth.poses * [k, k, k, 1, 1, 1, 1]),
-        "its y points to the other side": replace(truth, poses=truth.poses * [1, -1, 1, 1, 1, 1, 1]),
-    }
-    left_m = {what: _rmse_m(path, other, dimensions) for what, other in tried.items()}
-    for late_s in np.arange(-_MOST_LATE_S, _MOST_LATE_S, _LATE_S) if left_m[""] > _LATE_M else ():
-        what = f"its stamps are {abs(late_s):.1f} s {'late' if late_s > 0.0 else 'early'}: another clock?"
-        left_m[what] = _rmse_m(path, replace(truth, stamps_s=truth.stamps_s - late_s), dimensions, error.n // 2)
-    what, error_m = min(left_m, key=lambda one: left_m[one]), error.position_m["rmse"]
-    if left_m[what] < _CLEARLY * min(left_m[""], size_m) and left_m[""] > _LATE_M:
-        yield f"the truth would fit far better, but {what}"
+def _doubts(path: Trajectory, truth: Trajectory, error: PathError, dimensions: int, *, align: bool) -> Iterator[str]:
+    """Errors that no good map has and, of what was aligned, what would make the truth fit far better."""
+    better = _better(path, truth, dimensions) if align else ""
+    error_m, true_m = error.position_m["rmse"], _size_m(associate(path, truth)[1], dimensions)
+    if better:
+        yield f"the truth fits far better if {better}"
     elif error_m > max(_FAR * true_m, _FAR_M):
         far = f"the error is {error_m:.3g} m on a true path of radius {true_m:.3g} m (RMS)"
         yield f"{far}: check that the truth is of this robot and this drive"
-    w_first = replace(truth, poses=truth.poses[:, [0, 1, 2, 4, 5, 6, 3]])
-    angle, turned = error.angle_rad, path_error(path, w_first, dimensions).angle_rad
-    if turned and angle and angle["rmse"] > max(_FAR_M, 2.0 * turned["rmse"]):
-        yield "the quaternions of the truth are read as x y z w, and fit far better if w comes first"
-    elif angle and angle["median"] > _FAR_M and angle["max"] < 1.5 * angle["median"]:
-        yield f"the truth's headings are {np.degrees(angle['median']):.0f} degrees off throughout: is its x axis ahead?"
+    elif align and (angle := error.angle_rad):
+        w_first = replace(truth, poses=truth.poses[:, [0, 1, 2, 4, 5, 6, 3]])
+        turned = path_error(path, w_first, dimensions).angle_rad
+        if turned and angle["rmse"] > max(_FAR_M, 2.0 * turned["rmse"]):
+            yield "the quaternions of the truth are read as x y z w, and fit far better if w comes first"
+        elif angle["median"] > _FAR_M and angle["max"] < 1.5 * angle["median"]:
+            turn = f"{np.degrees(angle['median']):.0f} degrees"
+            yield f"the truth's headings fit far better if turned by {turn}: is its x axis ahead?"
+
+
+def _better(path: Trajectory, truth: Trajectory, dimensions: int) -> str:
+    """What has to be done to the truth for a far better fit, and a question on its cause; empty if nothing helps."""
+    mine, true = associate(path, truth)
+    size_m, count = _size_m(mine, dimensions), len(mine.stamps_s)
+    k = size_m / max(_size_m(true, dimensions), 1e-9)
+    some = np.random.default_rng(0).permutation(len(path.stamps_s))  # even steps may miss a slow truth
+    path = path.at(some[: _MOST_POSES * len(some) // max(count, _MOST_POSES)])
+    left_m = {"": _rmse_m(path, truth, dimensions)}
+    if left_m[""] <= _LATE_M:
+        return ""
+    if not 0.8 < k < 1.25:  # in between, it may be a map with an error of scale
+        what = f"scaled by {k:.3g}: is it in {'millimetres' if 8e-4 < k < 1.25e-3 else 'metres'}?"
+        left_m[what] = _rmse_m(path, replace(truth, poses=truth.poses * [k, k, k, 1, 1, 1, 1]), dimensions)
+    other = replace(truth, poses=truth.poses * [1, -1, 1, 1, 1, 1, 1])
+    left_m["mirrored: does its y axis point to the left?"] = _rmse_m(path, other, dimensions)
+    least = int(_OVERLAP * min(count, _MOST_POSES))
+    for late_s in np.arange(-_MOST_LATE_S, _MOST_LATE_S, _LATE_S):
+        what = f"stamped {abs(late_s):.1f} s {'earlier' if late_s > 0.0 else 'later'}: is it of another clock?"
+        left_m[what] = _rmse_m(replace(path, stamps_s=path.stamps_s + late_s), truth, dimensions, least)
+    what = min(left_m, key=lambda one: left_m[one])
+    return what if left_m[what] < _CLEARLY * min(left_m[""], size_m) else ""
+
+
+def _size_m(path: Trajectory, dimensions: int) -> float:
+    """RMS distance of positions from their mean."""
+    return float(np.linalg.norm(path.poses[:, :dimensions].std(axis=0)))
 
 
 def _rmse_m(path: Trajectory, truth: Trajectory, dimensions: int, least: int = 2) -> float:
     """The RMSE of a path after alignment; infinite with fewer common stamps."""
     try:
-        errors_m = matched(path, truth, dimensions).position_errors_m
+        mine, true = associate(path, truth)
+        error_m = _laid_rmse_m(mine.poses[:, :3], true.poses[:, :3], dimensions)
     except GraphSlamError:
         return np.inf
-    return float(np.sqrt(np.mean(errors_m**2))) if len(errors_m) >= least else np.inf
+    return error_m if len(mine.stamps_s) >= least else np.inf
+
+
+def _laid_rmse_m(points: Array, reference: Array, dimensions: int) -> float:
+    """The RMSE of points (n, 3) that are laid on their reference, in the plane or in space."""
+    flat = np.array([1.0, 1.0, 0.0 if dimensions == 2 else 1.0])
+    T = alignment(points[:, :dimensions], reference[:, :dimensions])
+    moved = np.stack(se3.act(T, tuple((flat * points).T)), axis=1)
+    return float(np.sqrt(np.mean(np.sum((moved - flat * reference) ** 2, axis=1))))
 
 
 def _described(drive: Drive) -> str:
@@ -289,7 +317,5 @@ def _map_rmse(landmarks: dict[str, Any], true: dict[str, Point], dimensions: int
     shared = sorted(set(landmarks) & set(true))
     if len(shared) < dimensions:
         return None
-    flat = np.array([1.0, 1.0, 0.0 if dimensions == 2 else 1.0])
-    points, reference = (flat * [where[name] for name in shared] for where in (landmarks, true))
-    moved = np.stack(se3.act(alignment(points[:, :dimensions], reference[:, :dimensions]), tuple(points.T)), axis=1)
-    return float(np.sqrt(np.mean(np.sum((moved - reference) ** 2, axis=1))))
+    points, reference = (np.array([where[name] for name in shared]) for where in (landmarks, true))
+    return _laid_rmse_m(points, reference, dimensions)

@@ -33,18 +33,7 @@ STATES = {
     Verdict.REJECTED: "rejected",
 }
 """What a person reads of a verdict."""
-REASONS = {
-    Reason.NONE: "",
-    Reason.UNLIKELY: "unlikely",
-    Reason.DOES_NOT_FIT: "does not fit",
-    Reason.OUTVOTED: "outvoted",
-    Reason.WITHDRAWN: "withdrawn",
-    Reason.QUARANTINED: "quarantined",
-    Reason.DISPLACED: "displaced",
-    Reason.REVOKED: "revoked",
-    Reason.BY_HAND: "by hand",
-    Reason.SLIP: "slip",
-}
+REASONS = {one: one.name.lower().replace("_", " ") for one in Reason} | {Reason.NONE: ""}
 _KIND = {
     "closures": "a loop closure",
     "landmarks": "a sighting",

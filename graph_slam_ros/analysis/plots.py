@@ -46,10 +46,7 @@ def draw_run(
     truth, topic : as ``truth.read_truth`` takes them, or what it has read; None: there is none
     align : lay the truth on the run; False: it is in the frame map already
 
-    Raises
-    ------
-    GraphSlamError
-        A file that is missing or unreadable, or a truth that has nothing in common with the run.
+    Raises GraphSlamError: a file that is missing or unreadable, or a truth that has nothing in common with the run.
     """
     dimensions = dimensions_of(run)
     known = truth if isinstance(truth, Truth) or truth is None else read_truth(truth, topic, input_topics(run))
@@ -238,10 +235,15 @@ def draw_graph(out_png: Path, graph: Graph, initial: Array, final: Array) -> Non
     ----------
     initial, final : (n, 2) or more columns, x and y [m] of each vertex
     """
-    figure, pair = _figure(2)
+    figure = canvas((1.6 * _INCHES, _INCHES))
+    pair = figure.subplots(1, 2)
     is_point = np.array([kind.name[0] == "R" for kind in graph.kinds])[graph.kind.values]
     tables = [table for table in graph.tables.values() if table.vertices.values.shape[1] == 2]
     for axes, values, title in zip(pair, (initial, final), ("initial", "optimised"), strict=True):
+        dress(axes)
+        axes.set(xlabel="x [m]", ylabel="y [m]")
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.margins(0.05)
         axes.set_title(title, loc="left", fontsize=11, color="#333333")
         for code, label in enumerate(graph.labels):
             ends = [table.vertices.values[table.label.values == code] for table in tables]
@@ -295,18 +297,6 @@ def canvas(size: tuple[float, float], dpi: int = _DPI) -> Any:
     figure = Figure(figsize=size, dpi=dpi, layout="constrained")
     FigureCanvasAgg(figure)
     return figure
-
-
-def _figure(count: int) -> Any:
-    figure = canvas((_INCHES * (1.0 + 0.6 * (count - 1)), _INCHES))
-    axes = figure.subplots(1, count, squeeze=False)[0]
-    for one in axes:
-        dress(one)
-        one.set_aspect("equal", adjustable="datalim")
-        one.set_xlabel("x [m]")
-        one.set_ylabel("y [m]")
-        one.margins(0.05)
-    return figure, axes
 
 
 def dress(axes: Any) -> None:

@@ -16,7 +16,7 @@ from graph_slam_ros.analysis.consistency import Consistency, Nees, landmark_erro
 from graph_slam_ros.analysis.path_error import interpolated
 from graph_slam_ros.analysis.trajectories import Truth
 from graph_slam_ros.analysis.what_if import SavedGraph
-from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.errors import GraphSlamError, message_of
 from graph_slam_ros.formats.files import read_text
 from graph_slam_ros.runs import outcome
 from graph_slam_ros.runs.folder import COVARIANCES, SUMMARY, run_config, summary_of
@@ -178,9 +178,7 @@ def _why_no_nees(known: Truth, true: Array, *, is_first: bool, is_held: bool, is
         return "the map was there before the drive, so the first pose of the drive does not hold it"
     if np.count_nonzero(np.isfinite(true).all(axis=1)) < 2:
         return "fewer than two keyframes have a truth within 0.05 s"
-    if known.trajectory.has_orientation:
-        return ""
-    if not is_planar:
+    if not (known.trajectory.has_orientation or is_planar):
         return f"{known.source} has no orientation, which says how the map lies in its frame"
     return ""
 
@@ -194,11 +192,8 @@ def _left_out(
     elif last is None:
         out["last pose"] = "it has no truth within 0.05 s, or no covariance"
     if of_landmarks is None and landmarks:
-        out["landmarks"] = (
-            "none of them has a covariance and is among the true ones"
-            if known.landmarks
-            else "the truth has none (/landmarks_ground_truth)"
-        )
+        why = "none of them has a covariance and is among the true ones"
+        out["landmarks"] = why if known.landmarks else "the truth has none (/landmarks_ground_truth)"
     return out
 
 
@@ -208,5 +203,6 @@ def _noise(run: Path) -> tuple[bool, tuple[NoiseScale, ...]]:
         summary = json.loads(read_text(run / SUMMARY))
         is_held = bool({"fixes", "surveyed"} & set(summary["classes"]))
         return is_held, tuple(NoiseScale.from_dict(one) for one in summary.get("noise", ()))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        raise GraphSlamError(f"{run / SUMMARY}: not a summary of a run: replay BAG with --out {run} --force") from None
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        why = f"not a summary of a run ({message_of(error)}): graph_slam replay {run} --out NEW makes one"
+        raise GraphSlamError(f"{run / SUMMARY}: {why}") from None

@@ -164,7 +164,12 @@ class InfluenceModel:
 
 
 def _fill(found: Influences, at: Index, block: Block, among: Array, of_last: Array, sign: float) -> None:
-    """Compute the influence of edges of one type by the covariances of their vertices; ``sign``: 1 lets in, -1 out."""
+    """Compute the influence of edges of one type; ``sign`` is 1 for edges that are let in, else -1.
+
+    Parameters
+    ----------
+    among : (n, D, D) covariances of their vertices; of_last : (n, d, D) of the last keyframe with them
+    """
     a, r = block.jacobian, block.residual
     inner = np.eye(r.shape[1]) + sign * (a @ among @ a.transpose(0, 2, 1))
     values, vectors = np.linalg.eigh(inner)
@@ -307,20 +312,14 @@ class SavedGraph:
         if row is not None and row < len(self.entries):
             return row
         if (most := ids.of(len(self.entries))) > edge >= 0:
-            raise GraphSlamError(
-                f"edge {edge} is not in the map any more, since visits are condensed: {of_all(self.folder)}"
-            )
+            why = f"since visits are condensed: {of_all(self.folder)}"
+            raise GraphSlamError(f"edge {edge} is not in the map any more, {why}")
         raise GraphSlamError(f"no edge {edge}: their ids are below {most}")
 
     def solve(self, without: Iterable[int] = (), let_in: Sequence[int] = (), loss: Loss | None = None) -> Solver:
         """Solve the accepted edges without some, and with others at full weight, from the saved estimate.
 
-        Raises
-        ------
-        GraphSlamError
-            As ``problem``.
-        GaugeError, SingularError
-            What is left does not determine a vertex.
+        Raises GraphSlamError as ``problem``; GaugeError, SingularError: what is left does not determine a vertex.
         """
         solver = self.problem(without, let_in, loss)
         solver.optimize()

@@ -109,12 +109,30 @@ def test_the_map_is_aligned_by_itself_and_only_what_both_know_counts(run, tmp_pa
 
 def test_the_truth_of_another_drive_is_suspected(run, tmp_path):
     truth = eight()
-    write_truth(tmp_path / "other.mcap", truth.stamps_s, np.random.default_rng(1).permutation(truth.poses))
+    other = simulate("pythonrobotics", 1, poses=len(truth.stamps_s) - 1).T_world_base
+    write_truth(tmp_path / "other.mcap", truth.stamps_s, se3.in_space(other))
     assert evaluate(run, tmp_path / "truth.mcap").warnings == ()
     assert evaluate(run, tmp_path / "truth.mcap").estimate.position_m["max"] < 1e-6
     assert evaluate(run, tmp_path / "truth.mcap", align=False).estimate.position_m["rmse"] > 1.0, "a shift is an error"
     (warning,) = evaluate(run, tmp_path / "other.mcap").warnings
     assert "check that the truth is of this robot and this drive" in warning
+
+
+@each(
+    "scale, late_s, said",
+    [
+        ((10.2, 10.2), 0.0, ""),
+        ((1e4, 1e4), 0.0, "scaled by 0.001: is it in millimetres?"),
+        ((10, -10), 0.0, "mirrored: does its y axis point to the left?"),
+        ((10, 10), 2.0, "stamped 2.0 s earlier: is it of another clock?"),
+    ],
+)
+def test_what_would_make_the_truth_fit_far_better_is_said_and_no_error_of_scale(run, tmp_path, scale, late_s, said):
+    truth = eight()
+    write_tum(run / "sightings.tum", truth.stamps_s, truth.poses * (10, 10, *[1.0] * 5))
+    write_truth(tmp_path / "truth.mcap", truth.stamps_s + late_s, truth.poses * (*scale, *[1.0] * 5))
+    assert evaluate(run, tmp_path / "truth.mcap").warnings == (f"the truth fits far better if {said}",) * bool(said)
+    assert "if" not in "".join(evaluate(run, tmp_path / "truth.mcap", align=False).warnings)
 
 
 def write_topics(path, topics):
@@ -245,11 +263,8 @@ def write_transforms(path, *pairs):
             stamp_ns, transforms = round(stamp * 1e9), []
             for k, (parent, child) in enumerate(pairs):
                 at = pose((1.0, 2.0, 0.0)) if k else pose(tuple(p))
-                moved = make(
-                    "geometry_msgs/msg/Transform",
-                    translation=vector(at.position.x, at.position.y),
-                    rotation=at.orientation,
-                )
+                place = vector(at.position.x, at.position.y)
+                moved = make("geometry_msgs/msg/Transform", translation=place, rotation=at.orientation)
                 kind = "geometry_msgs/msg/TransformStamped"
                 transforms.append(make(kind, header=header(stamp_ns, parent), child_frame_id=child, transform=moved))
             cdr = encode(make("tf2_msgs/msg/TFMessage", transforms=transforms))
@@ -386,10 +401,8 @@ STAMPED = [f"geometry_msgs/msg/{name}Stamped" for name in ("Pose", "PoseWithCova
 
 @each("kind", [*STAMPED, "nav_msgs/msg/Odometry"])
 def test_truth_is_read_from_every_type_of_pose_or_point(tmp_path, kind):
-    stamp_ns, at = (
-        START_S * 10**9 + 123_456_789,
-        make("geometry_msgs/msg/Pose", position=point(1.0, 2.0, 9.0), orientation=heading(2.5)),
-    )
+    stamp_ns = START_S * 10**9 + 123_456_789
+    at = make("geometry_msgs/msg/Pose", position=point(1.0, 2.0, 9.0), orientation=heading(2.5))
     with BagWriter(tmp_path / "a.mcap") as bag:
         bag.write("/here", kind, 1, message(kind, stamp_ns, at))
     trajectory = read_truth(f"{tmp_path / 'a.mcap'}:/here").trajectory

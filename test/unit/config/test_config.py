@@ -70,11 +70,7 @@ def test_a_parameter_that_was_removed_is_refused_by_name_and_read_in_runs_that_h
 
 @each(
     "name, nearest",
-    [
-        ("solve.every_keyframe", "solve.every_keyframes"),
-        ("Frames.Odom", "frames.odom"),
-        ("frames", "frames.map"),
-    ],
+    [("solve.every_keyframe", "solve.every_keyframes"), ("Frames.Odom", "frames.odom"), ("frames", "frames.map")],
 )
 def test_F28_an_unknown_key_is_refused_with_the_nearest_known_one(name, nearest):
     with pytest.raises(ConfigError, match=f"unknown parameter '{re.escape(name)}'; did you mean '{nearest}'"):
