@@ -5,7 +5,6 @@ tested once, and what it raises names the plugin.
 """
 
 import re
-from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -13,7 +12,7 @@ import numpy as np
 
 from graph_slam_ros import graph as graphs
 from graph_slam_ros import plugins
-from graph_slam_ros.errors import ConfigError, FormatError
+from graph_slam_ros.errors import ConfigError, FormatError, GraphSlamError
 from graph_slam_ros.graph import SE2, SE3, EdgeType, VertexKind, place_edge
 from graph_slam_ros.graph.edge_type import jacobian_fault, random_value
 from graph_slam_ros.graph.place import MOST_MEMBERS, members_of
@@ -70,8 +69,7 @@ _BUILT_IN = {edge: tag for tag, edge in EDGE_TAGS.items()} | {graphs.INVERSE_REL
 _RESERVED = frozenset({*EDGE_TAGS, *VERTEX_TAGS, OFFSET, "FIX"})
 _loaded: dict[str, EdgeType] = {}  # of plugins
 _tags: dict[EdgeType, str] = {}
-_TRIALS = 20  # at random values
-_TOLERANCE = 1e-4  # of the largest number of a Jacobian
+_TRIALS, _TOLERANCE = 20, 1e-4  # at random values; of the largest number of a Jacobian
 
 
 def built_in(tag: str) -> EdgeType | None:
@@ -147,14 +145,19 @@ def _wrong(there: Any) -> str:
 def _fault_of(edge: EdgeType) -> str:
     """Try an edge type at random values, which also compiles it; return what is wrong with it, or nothing.
 
-    A residual may raise at values that it is not made for: only what it returns is judged.
+    A residual may raise, or not be finite, at values that it is not made for: only what else it returns is judged.
     """
     rng, faults = np.random.default_rng(0), list[str]()
     for _ in range(_TRIALS):
         values = tuple(random_value(kinds[0], rng) for kinds in edge.accepts)
         measured = edge.whole(rng.standard_normal(edge.measured_size - len(edge.tail)))
-        with suppress(Exception):  # whatever another's function does
-            faults.append(jacobian_fault(edge, values, measured, _TOLERANCE))
+        try:
+            fault = jacobian_fault(edge, values, measured, _TOLERANCE)
+            faults += [] if fault is None else [fault]
+        except GraphSlamError as error:
+            return str(error)
+        except Exception:  # whatever another's function does
+            continue
     wrong = [fault for fault in faults if fault]
     return wrong[0] if 2 * len(wrong) > len(faults) else ""
 

@@ -48,10 +48,8 @@ class EdgeType:
                 names = ", ".join(kind.name for kind in kinds) or "nothing"
                 raise GraphSlamError(f"{self.name}: slot {slot} takes {names}: not kinds of one and the same dof")
         if min(self.residual_size, self.measured_size - len(self.tail)) < 0 or not self.residual_size:
-            raise GraphSlamError(
-                f"{self.name}: a residual of {self.residual_size} numbers, a measurement of {self.measured_size}"
-                f" with a tail of {len(self.tail)}"
-            )
+            measured = f"a measurement of {self.measured_size} with a tail of {len(self.tail)}"
+            raise GraphSlamError(f"{self.name}: a residual of {self.residual_size} numbers, {measured}")
 
     @property
     def dofs(self) -> tuple[int, ...]:
@@ -180,12 +178,14 @@ def check_edge(
             raise GraphSlamError(f"{edge.name}: edges linearised in one call are not what each is alone")
 
 
-def jacobian_fault(edge: EdgeType, values: tuple[Array, ...], measured: Array, tolerance: float) -> str:
-    """Return where the Jacobian of one edge is not the derivative of its residual; empty where it is."""
+def jacobian_fault(edge: EdgeType, values: tuple[Array, ...], measured: Array, tolerance: float) -> str | None:
+    """Return where a Jacobian is not the derivative of the residual: empty if it is, None where one is not finite."""
     jacobian, numeric = _linearized(edge, [(values, measured)])[1][0], numeric_jacobian(edge, values, measured)
     off = np.abs(jacobian - numeric)
+    if not np.isfinite(off).all():
+        return None
     row, column = np.unravel_index(int(off.argmax()), off.shape)
-    if not off[row, column] > tolerance * max(1.0, float(np.abs(numeric).max())):  # also where it is not finite
+    if off[row, column] <= tolerance * max(1.0, float(np.abs(numeric).max())):
         return ""
     ours, true = jacobian[row, column], numeric[row, column]
     return f"Jacobian[{row}, {column}] is {ours:.6g}, the residual's derivative {true:.6g}"
@@ -219,8 +219,7 @@ def _linearized(edge: EdgeType, trials: list[tuple[tuple[Array, ...], Array]]) -
     if not all(np.array_equal(now, then) for now, then in zip((x, at, z), before, strict=True)):
         raise GraphSlamError(f"{edge.name}: linearize writes into what it was given")
     expected = (len(trials), edge.residual_size), (len(trials), edge.residual_size, sum(edge.dofs))
-    if (residual.shape, jacobian.shape) != expected:
-        raise GraphSlamError(
-            f"{edge.name}: shapes {residual.shape} and {jacobian.shape}, not {expected[0]} and {expected[1]}"
-        )
+    shapes = np.shape(residual), np.shape(jacobian)
+    if shapes != expected:
+        raise GraphSlamError(f"{edge.name}: shapes {shapes[0]} and {shapes[1]}, not {expected[0]} and {expected[1]}")
     return residual, jacobian

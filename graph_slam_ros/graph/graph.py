@@ -272,9 +272,8 @@ class Graph:
     def _refuse_unfit(self, edge: EdgeType, at: Index, measured: Array, fault: int, row: int, slot: int) -> None:
         vertex = int(at[row, slot])
         if fault == NOT_FINITE:
-            raise GraphSlamError(
-                f"{edge.name}: measurement {measured[row].tolist()} at vertices {at[row].tolist()} is not finite"
-            )
+            seen = f"measurement {measured[row].tolist()} at vertices {at[row].tolist()}"
+            raise GraphSlamError(f"{edge.name}: {seen} is not finite")
         if fault == MISSING:
             raise GraphSlamError(f"{edge.name}: vertex {vertex} does not exist")
         if fault == ITSELF:
@@ -283,6 +282,7 @@ class Graph:
         raise GraphSlamError(f"{edge.name}: vertex {vertex} is {self.kind_of(vertex).name}, not {kind}")
 
     def _accepted_by(self, edge: EdgeType) -> Mask:
+        """Return whether each slot of an edge takes each kind, (slots, kinds)."""
         found = self._accepted.get(edge)
         if found is None or found.shape[1] != len(self.kinds):
             rows = [[kind in kinds for kind in self.kinds] for kinds in edge.accepts]

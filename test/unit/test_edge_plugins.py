@@ -67,16 +67,10 @@ def test_a_tag_of_a_plugin_is_read_solved_written_and_read_again(install, graph,
     [
         ("import not_there", "cannot be loaded: ModuleNotFoundError: No module named 'not_there'"),
         ("tdoa = 3", "it is a int, not an EdgeType"),
-        (
-            "from graph_slam_ros.graph import *\ntdoa = edge_from_residual('mine', (), 1, 1, len)",
-            "cannot be loaded: Graph",
-        ),
+        ("from graph_slam_ros.graph import *\ntdoa = edge_from_residual('', (), 1, 1, len)", "cannot be loaded: Graph"),
         (EXAMPLE.replace("pose, one, other = values", "1 / 0"), "ZeroDivisionError: division by zero"),
         (EXAMPLE.replace("    return [", "    return [1.0, 2.0, "), "the residual has the shape (3,), not (1,)"),
-        (
-            EXAMPLE.replace("difference_of_ranges)", "difference_of_ranges, lambda v, z: np.ones((1, 7)))"),
-            "Jacobian[0, ",
-        ),
+        (EXAMPLE.replace("_of_ranges)", "_of_ranges, lambda v, z: np.ones((1, 7)))"), "Jacobian[0, "),
     ],
 )
 def test_a_plugin_that_cannot_be_used_or_raises_is_named_in_one_line(text, line, install, graph, capsys):
