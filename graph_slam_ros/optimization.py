@@ -32,7 +32,7 @@ _W_FIRST = "does w come first in the quaternions of its {}? g2o has qx qy qz qw"
 _DEGREES = "are the angles of its {} in degrees? g2o has radians"
 _BACKWARDS = "do its {} lead from j to i? g2o has the pose of j as seen from i"
 _MILLIMETRES = "are its {} in millimetres, and its vertices in metres? g2o has metres"
-_FIXED = "FIX of {} contradicts the edges, which all fit without: are these places wrong? g2o has true ones, or no FIX"
+_FIXED = "FIX of {} contradicts the edges, which all fit without: are these wrong? correct or remove the FIX lines"
 _MISTAKES: tuple[tuple[str, EdgeType, Callable[[Array, Index], tuple[Array, Index]]], ...] = (  # and what undoes each
     (_W_FIRST, RELATIVE_POSE_3D, lambda seen, ends: (seen[:, [0, 1, 2, 4, 5, 6, 3]], ends)),
     (_DEGREES, RELATIVE_POSE, lambda seen, ends: (seen * (1.0, 1.0, np.pi / 180.0), ends)),
@@ -41,7 +41,6 @@ _MISTAKES: tuple[tuple[str, EdgeType, Callable[[Array, Index], tuple[Array, Inde
     (_MILLIMETRES, RELATIVE_POSE_3D, lambda seen, ends: (seen * (*[1e-3] * 3, *[1.0] * 4), ends)),
     (_MILLIMETRES, LANDMARK_POSITION, lambda seen, ends: (seen * 1e-3, ends)),
 )
-_FAR_LONGER = 100.0  # measured lengths of edges than those of the file's values: only then other units are tried
 _SAME, _TRIAL_ITERATIONS = 1e-6, 30  # the first: part of the cost by which one optimum differs from start to start
 
 
@@ -95,12 +94,14 @@ class Solution:
     @property
     def poses(self) -> Array:
         """Estimates of all poses in order of id: (n, 3) as x, y, theta, or (n, 7) as x, y, z and quaternion xyzw."""
-        return self.solver.estimate(_vertices(self.file.graph, poses=True))
+        graph = self.file.graph
+        return self.solver.estimate([v for v in range(graph.vertex_count) if _is_pose(graph, v)])
 
     @property
     def points(self) -> Array:
         """Estimates of all point landmarks in order of id, (n, 2) or (n, 3)."""
-        return self.solver.estimate(_vertices(self.file.graph, poses=False))
+        graph = self.file.graph
+        return self.solver.estimate([v for v in range(graph.vertex_count) if not _is_pose(graph, v)])
 
 
 def optimize(source: Graph | G2oFile | Path | str, settings: Settings | None = None, *, init: str = "auto") -> Solution:
@@ -209,19 +210,22 @@ def _without_mistakes(file: G2oFile) -> Iterator[tuple[str, G2oFile]]:
             table = graph.tables[edge]
             rows = np.flatnonzero(graph.has_label(table.id.values, labels if label == "edges" else [label]))
             seen, ends = table.measured.values[rows], table.vertices.values[rows]
-            if len(rows) and (mistake != _MILLIMETRES or _are_far_longer(file, seen, ends)):
+            if len(rows) and _is_likely(mistake, file, seen, ends):
                 undone = undo(seen, ends)
                 table.measured.values[rows], table.vertices.values[rows] = undone
                 yield mistake.format(label), replace(file, graph=graph)
 
 
-def _are_far_longer(file: G2oFile, seen: Array, ends: Index) -> bool:
-    """Whether edges measure far longer ways than there are between their vertices as the file has them."""
+def _is_likely(mistake: str, file: G2oFile, seen: Array, ends: Index) -> bool:
+    """Degrees are likely above a whole turn, millimetres of ways 1000 times as long as in the file's values."""
+    if mistake == _DEGREES:
+        return bool(np.abs(seen[:, 2]).max() > 2.0 * np.pi)
+    if mistake != _MILLIMETRES:
+        return True
     axes = np.arange(3 if seen.shape[1] == 7 else 2)
     at = file.graph.initial.values[file.graph.offset.values[ends][:, :, None] + axes]
-    lengths = np.linalg.norm(at[:, 1] - at[:, 0], axis=1)
-    longer = np.median(np.linalg.norm(seen[:, axes], axis=1)) > _FAR_LONGER * np.median(lengths)
-    return bool(file.has_values and longer)
+    length, longer = (float(np.median(np.linalg.norm(way, axis=1))) for way in (at[:, 1] - at[:, 0], seen[:, axes]))
+    return length > 0.0 and 300.0 < longer / length < 3000.0
 
 
 def suspicion_of(solution: Solution, settings: Settings) -> str:
@@ -299,7 +303,3 @@ def _root(file: G2oFile) -> int | None:
 
 def _is_pose(graph: Graph, vertex: int) -> bool:
     return graph.kind_of(vertex).name.startswith("SE")
-
-
-def _vertices(graph: Graph, *, poses: bool) -> list[int]:
-    return [v for v in range(graph.vertex_count) if _is_pose(graph, v) is poses]

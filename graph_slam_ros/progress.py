@@ -6,7 +6,7 @@ listeners: list[Callable[[str], None]] = []
 """Called several times a second while kernels are compiled, with a sentence of progress."""
 
 
-def report(message: str) -> None:
+def report(message: object) -> None:
     """Call all listeners."""
     for listener in listeners:
-        listener(message)
+        listener(str(message))

@@ -69,9 +69,7 @@ def are_compiled(dimensions: int = 3) -> bool:
 
 
 def warmup(
-    is_stop_requested: Callable[[], bool] = lambda: False,
-    on_progress: OnProgress = lambda now: report(str(now)),
-    dimensions: int = 3,
+    is_stop_requested: Callable[[], bool] = lambda: False, on_progress: OnProgress = report, dimensions: int = 3
 ) -> float:
     """Compile what is not compiled yet, and load it, before anything is computed whose bytes repeat; returns seconds.
 
@@ -87,9 +85,7 @@ def warmup(
 
 
 def compile_all(
-    is_stop_requested: Callable[[], bool] = lambda: False,
-    on_progress: OnProgress = lambda now: report(str(now)),
-    dimensions: int = 3,
+    is_stop_requested: Callable[[], bool] = lambda: False, on_progress: OnProgress = report, dimensions: int = 3
 ) -> None:
     """Compile what is not compiled yet, and load nothing; as ``warmup``."""
     if are_compiled(dimensions):

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 STARTS = {"file": "the file", "tree": "the spanning tree", "chordal": "the chordal relaxation"}
 STARTS["online"] = "the drive, pose after pose"
 _MOST_TRIAL_S = 10.0
-_RIGHT = "? g2o has "  # ends the question of a doubt that one mistake explains
+_RIGHT = "? "  # ends the question of a doubt that one mistake explains
 _OTHER_TAG = "give what is lost a tag that is read, and its information (docs/graphs.md)"
 
 
@@ -37,19 +37,15 @@ def optimize_options(sub: CommandParser) -> None:
     sub.add_argument("--tolerance", type=arguments.positive, default=1e-6, metavar="X", help=about)
     about = f"robust loss of all edges but odometry; SCALE in sigmas (default: {arguments.LOSS_SCALE:g})"
     sub.add_argument("--loss", type=arguments.loss, default="none", metavar="none|huber|cauchy[:SCALE]", help=about)
-    about = (
-        "initial estimate; auto: the values of the file (without vertices: tree); if the result is suspicious,"
-        " chordal and then online (pose by pose) are tried, and the best result is used"
-    )
+    about = "initial estimate; auto: the values of the file (without vertices: tree); if the result is suspicious,"
+    about += " chordal and then online (pose by pose) are tried, and the best result is used"
     sub.add_argument("--init", choices=("auto", "file", "tree", "chordal", "online"), default="auto", help=about)
     about = "error of relative poses; seed: of the inverse"
     sub.add_argument("--error-map", choices=("relative", "seed"), default="relative", help=about)
     about = "prove that the result is the global optimum; for graphs of poses only"
     sub.add_argument("--certify", action="store_true", help=about)
-    about = (
-        "format of the lines; others are refused (default: each by its tag); isam: square roots of the"
-        " information; rows: information of EDGE2 in rows of its upper triangle"
-    )
+    about = "format of the lines; others are refused (default: each by its tag); isam: square roots of the"
+    about += " information; rows: information of EDGE2 in rows of its upper triangle"
     sub.add_argument("--from", dest="source", choices=("g2o", "toro", "gtsam", "isam", "rows"), help=about)
     about = "scale of the information of 3D rotations; raw: unscaled"
     sub.add_argument("--information", choices=("g2o", "raw"), default="g2o", help=about)
@@ -136,7 +132,7 @@ def _after(args: argparse.Namespace, solution: "Solution") -> str:
 
     right = solution.doubt.partition(_RIGHT)[2]
     if right or (solution.file.losses and not args.lenient):
-        what = f"write {right} in the file" if right else _OTHER_TAG
+        what = right.replace("g2o has", "write") or _OTHER_TAG
         return f"{what}, then {console.command('optimize', args.graph, *_options(args))}"
     if _is_folder(args.out):
         return f"{console.command('report', args.out)} (one page: the map, and why each edge is in or out)"
@@ -177,10 +173,12 @@ def _remedy(args: argparse.Namespace, solution: "Solution") -> str:
                 words = console.command("optimize", args.graph, *_options(other), "--out", _unused_name("SOLVED.g2o"))
                 told = f"the loss lets go of {tried.let_go} edges" if tried.let_go else "all edges fit"
                 return f"{words} (tried: {told})"
+    if solution.report.stop == "max_iterations":
+        more = _options(argparse.Namespace(**vars(args) | {"max_iterations": 10 * args.max_iterations}))
+        return f"{console.command('optimize', args.graph, *more)} (more iterations)"
     ratio = (solution.report.chi2_final / max(1, solution.solver.degrees_of_freedom)) ** 0.5
-    more = "" if solution.report.converged else f"--max-iterations {10 * args.max_iterations}, or "
-    told = f"noise is {ratio:.3g} times what the information says (no loss helps)"
-    return f"{more}the worst edges; if all fit alike, {told}"
+    told = f"; if all fit alike, noise is {ratio:.3g} times what the information says" * solution.report.converged
+    return f"the worst edges{told} (no loss helps)"
 
 
 def _options(args: argparse.Namespace) -> Iterable[str]:

@@ -66,7 +66,7 @@ class CommandParser(argparse.ArgumentParser):
             near = did_you_mean(options[0], self._option_string_actions)
             self.error(f"unrecognized arguments: {' '.join(rest)}{near}")
         if rest and (bare := [one for one in getattr(known, "set", None) or () if "=" not in one]):
-            self.error(f"--set {bare[0]}: a setting is KEY=VALUE, without a blank")
+            self.error(f"--set {bare[0]}: a setting is KEY=VALUE, no spaces around =; quote a value with spaces")
         if rest and hasattr(known, "bag"):
             self.error(f"{rest[0]} is one recording too many: put the parts of one drive into a folder, and name that")
         return known, rest

@@ -25,7 +25,7 @@ from graph_slam_ros.solver.linearization import (
     refuse_nonfinite,
     store,
 )
-from graph_slam_ros.solver.settings import METHODS, Settings
+from graph_slam_ros.solver.settings import Settings
 from graph_slam_ros.typing import Array, Index
 
 
@@ -328,4 +328,4 @@ def _converged(previous: float, last: Iteration, settings: Settings) -> str:
     return ""
 
 
-_DESCENTS = dict(zip(METHODS, (_gauss_newton, _levenberg_marquardt, _dogleg), strict=True))
+_DESCENTS = {"gn": _gauss_newton, "lm": _levenberg_marquardt, "dogleg": _dogleg}

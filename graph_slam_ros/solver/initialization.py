@@ -125,9 +125,8 @@ def _along_tree(
                 queue.append(other)
     missing = [v for v in poses.tolist() if v not in placed]
     if missing:
-        raise GraphSlamError(
-            f"no relative poses lead from vertex {root} to vertex {missing[0]} and {len(missing) - 1} more"
-        )
+        where = f"vertex {missing[0]} and {len(missing) - 1} more"
+        raise GraphSlamError(f"no relative poses lead from vertex {root} to {where}")
     ids = np.array(list(placed))
     values[_slots(graph, ids, kind.size)] = np.array([placed[v] for v in ids.tolist()])
 

@@ -61,6 +61,8 @@ class Settings:
             least = 1 if name == "relinearize_every" else 0
             if not getattr(self, name) >= least:  # nor is NaN
                 raise GraphSlamError(f"{name} {getattr(self, name)}: must be a number >= {least}")
+        if not isinstance(self.losses, Mapping):
+            raise GraphSlamError(f"losses {self.losses!r}: must be a dict")
         for label, stages in self.losses.items():
             if not isinstance(stages, Sequence) or {type(stage) for stage in stages} != {Loss}:
                 raise GraphSlamError(f"losses: {label!r} has {stages!r}: leave it out, or give it a list of Loss")

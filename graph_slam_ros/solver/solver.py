@@ -184,9 +184,8 @@ class Solver:
         numbers, at = np.asarray(value, dtype=float), int(self.graph.offset.values[vertex])
         kind = self.graph.kind_of(vertex)
         if numbers.shape != (kind.size,) or kind.fault(numbers[None]) is not None:
-            raise GraphSlamError(
-                f"vertex {vertex}: expected {kind.size} finite numbers of {kind.name}, got {numbers.tolist()}"
-            )
+            due = f"{kind.size} finite numbers of {kind.name}"
+            raise GraphSlamError(f"vertex {vertex}: expected {due}, got {numbers.tolist()}")
         for array in (self._tree.value, self._tree.estimate, self._kept):
             array[at : at + kind.size] = numbers
 

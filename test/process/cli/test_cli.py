@@ -201,7 +201,7 @@ REFUSED = [
     ("merge a b", "; graph_slam map merge (--help"),
     ("replya {bag}", "did you mean 'replay'?"),
     ("replay {bag} --frce", "arguments: --frce; did you mean '--force'?"),
-    ("check {bag} --set odom.use none", "--set odom.use: a setting is KEY=VALUE, without a blank"),
+    ("check {bag} --set odom.use none", "--set odom.use: a setting is KEY=VALUE, no spaces around ="),
     ("info {bag}x", "no such file or folder; did you mean 'drive it.mcap'?"),
     ("replay {bag} --odom /odm --out {out}", "did you mean '/odom'?"),
     ("replay {bag} --out {out} --set tf.stamp=odometri", "did you mean 'odometry'?"),
