@@ -15,16 +15,9 @@ PAGE = (ROOT / "docs/library.md").read_text()
 (EXAMPLE,) = re.findall(r"```python\n(import numpy as np\n.*?)check_edge\(tdoa\)", PAGE, re.DOTALL)
 (ENTRY,) = set(re.findall(r'\[project\.entry-points\."(.*)"\]\n(\w+) = "(\w+):(\w+)"', PAGE))
 LINES = ["EDGE_TDOA 0 1 2 -2.4 10000", "EDGE_TDOA 0 1 3 -3.6 10000", "EDGE_TDOA 0 1 4 -1.2 10000"]
-GRAPH = "\n".join(
-    [
-        "VERTEX_SE2 0 1 1 0",
-        *(f"VERTEX_XY {k} {x} {y}" for k, (x, y) in enumerate([(0, 0), (8, 0), (8, 6), (0, 6)], start=1)),
-        "FIX 1 2 3 4",
-        "EDGE_PRIOR_SE2 0 1 1 0 0.0123 0 0 0.0123 0 100",
-        *LINES,
-        "",
-    ]
-)
+GRAPH = "".join(f"VERTEX_XY {k} {x} {y}\n" for k, (x, y) in enumerate([(0, 0), (8, 0), (8, 6), (0, 6)], start=1))
+GRAPH += "FIX 1 2 3 4\nVERTEX_SE2 0 1 1 0\nEDGE_PRIOR_SE2 0 1 1 0 0.0123 0 0 0.0123 0 100\n"
+GRAPH += "".join(f"{line}\n" for line in LINES)
 
 
 @pytest.fixture
@@ -71,6 +64,10 @@ def test_a_tag_of_a_plugin_is_read_solved_written_and_read_again(install, graph,
         (EXAMPLE.replace("pose, one, other = values", "1 / 0"), "ZeroDivisionError: division by zero"),
         (EXAMPLE.replace("    return [", "    return [1.0, 2.0, "), "the residual has the shape (3,), not (1,)"),
         (EXAMPLE.replace("_of_ranges)", "_of_ranges, lambda v, z: np.ones((1, 7)))"), "Jacobian[0, "),
+        (
+            EXAMPLE.replace("_of_ranges)", "_of_ranges, lambda v, z: np.full((1, 7), 1 if z > 0.5 else np.nan))"),
+            "Jacobian[0, ",
+        ),
     ],
 )
 def test_a_plugin_that_cannot_be_used_or_raises_is_named_in_one_line(text, line, install, graph, capsys):
