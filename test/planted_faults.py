@@ -162,7 +162,7 @@ FAULTS = {
     "turn rate mirrored": (of("wrong_scale:distance=1.0,turn=-1.0"), "mirrored"),
     "twist mirrored, pose right": (of("wrong_twist:angular=-1.0"), "twist_scale"),
     "twist in degrees": (of("wrong_twist:angular=57.29578"), "twist_scale"),
-    "two publishers of odometry": (of("other_publisher"), "duplicates"),
+    "two publishers of odometry": (of("other_publisher"), "two_publishers"),
     "odometry in millimetres": (of("wrong_scale:distance=1000.0"), "units"),
     "position of odometry mirrored, turns right": (mirrored, "mirrored"),
     "pose in feet, twist in metres": (of("wrong_scale:distance=3.28", "wrong_twist:linear=0.3049"), "units"),

@@ -52,7 +52,8 @@ def check_columns(c: Columns, checks: tuple[Check, ...] = CHECKS) -> list[Findin
     with np.errstate(all="ignore"):
         whole, c = c, of_one_publisher(c)
         found += check_publishers(whole) if whole is not c else []
-        if codes := {one.code for one in refused_odometry(c)}:  # the rest follows from that, and this may from units
+        told = FOLLOWS["two_publishers"] if found else ()
+        if codes := {one.code for one in refused_odometry(c)}.difference(told):  # all follows, and this may from units
             found += [one for one in check_odometry(c) if one.code == "units" and codes == {"other_publisher"}]
             checks = tuple(check for check in checks if check is check_refusals and not found)
         for check in checks:

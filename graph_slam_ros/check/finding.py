@@ -43,6 +43,7 @@ KINDS: dict[str, str] = {
     "coarse_stamps": "stamp each message when it is measured, to the millisecond",
     "rounded_stamps": "stamp each message when it is measured, to the millisecond",
     "duplicates": "let one node publish the topic (ros2 topic info -v TOPIC), and record it once",
+    "two_publishers": "let one node publish the topic (ros2 topic info -v TOPIC)",
     "out_of_order": "set ordering.window_s",
     "gap": "check the CPU and the disk of the recorder, and the driver",
     "slow_odometry": "publish odometry at 10 Hz or more",
@@ -56,10 +57,7 @@ KINDS: dict[str, str] = {
     "static": "choose another topic with --odom, or drive",
     "units": _DRIVER,
     "no_orientation_of_odometry": "have the driver fill in the orientation of the pose",
-    "odometry_jumps": (
-        "correct the driver; a run begins a segment where it is faster than odometry.max_speed_m_s, and with that set "
-        "nothing is said"
-    ),
+    "odometry_jumps": "correct the driver; a run begins a segment where it is faster than odometry.max_speed_m_s",
     "odometry_reset": "cut the recording there",
     "corrected": _WHEELS,
     "not_planar": "set world.dimensions=3",
@@ -136,9 +134,10 @@ FOLLOWS = {
     "units": ("other_publisher", "odometry_gap", "jump", "late", "twist_scale"),
     "mirrored": ("twist_unrelated", "twist_frame"),
     "id_twice": ("id_conflict",),
-    "duplicates": ("other_publisher", "duplicate_stamp", *_OF_A_PATH),
+    "duplicates": ("other_publisher", "duplicate_stamp"),
+    "two_publishers": ("other_publisher", "duplicate_stamp", "duplicates"),
     "seen_once": ("no_closure", "no_parallax", "not_observable"),
-    "damaged": ("no_closure", "silent", "gap", "clock_jump", "frame_unlinked", "mount_place"),
+    "damaged": ("no_closure", "silent", "gap"),
     "clock_offset": ("latency",),
     **dict.fromkeys(("out_of_order", "time_jump"), ("odometry_jumps", "corrected", "fit_unsure")),
     **dict.fromkeys(("mount_moved", "covariance_tiny"), _OF_A_PATH),
@@ -182,7 +181,8 @@ class Finding:
     @property
     def ends(self) -> bool:
         """Return whether other findings mean nothing while it is there."""
-        return self.code in ENDS and self.severity != "note"
+        is_doubted = self.severity == "warning" and self.code == "odometry_scale"
+        return self.code in ENDS and self.severity != "note" and not is_doubted
 
     @property
     def forbids_replay(self) -> bool:

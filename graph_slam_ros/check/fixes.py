@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 
 from graph_slam_ros.check.columns import Columns, FixColumns
-from graph_slam_ros.check.contradictions import turned_mount
-from graph_slam_ros.check.finding import Finding, where
+from graph_slam_ros.check.contradictions import factor_setting, turned_mount
+from graph_slam_ros.check.finding import Finding, Severity, where
 from graph_slam_ros.check.odometry import TOGETHER, worst_stretch
 from graph_slam_ros.check.pairs import poses_at
 from graph_slam_ros.check.times import offset_setting
@@ -104,9 +104,10 @@ def _turned(c: Columns, f: FixColumns, stamp_ns: Index, points: Array, own: Arra
             yield Finding("unrelated", "error", factor, _SCALE, "times", text, **at)
             return
         if abs(factor - 1.0) > max(_OFF, _SIGMAS * spread):
-            setting = f"odometry.distance_factor={c.config.odometry.distance_factor * factor:.4g}"
-            at = where(f.topic, stamp_ns, settings=(setting,))
-            yield Finding("odometry_scale", "error", factor, 1.0 + _OFF, "times", text, **at)
+            setting = factor_setting("odometry.distance_factor", c.config.odometry.distance_factor * factor, 100.0)
+            severity: Severity = "error" if is_odometry else "warning"  # noise lengthens each way
+            at = where(f.topic, stamp_ns, settings=setting if is_odometry else ())
+            yield Finding("odometry_scale", severity, factor, 1.0 + _OFF, "times", text, **at)
     step_m, way_m = np.abs(np.diff(points)), np.abs(np.diff(own))
     far_m = max(_JUMP_M, 2.0 * _SIGMAS * f.sigma_m)
     jumps = (step_m - way_m > far_m) & (np.diff(stamp_ns) < _SOON_S * 1e9)

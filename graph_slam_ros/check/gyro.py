@@ -37,8 +37,7 @@ def check_gyro(c: Columns) -> Iterator[Finding]:
     factor, bias, left = _line(odometry, gyro)
     limit = _BIAS_SIGMAS * c.config.gyro.bias_sigma
     is_turning = np.abs(odometry) > _TURNING_RAD
-    turning = int(np.count_nonzero(is_turning))
-    if turning >= _LEAST_TURNING:
+    if np.count_nonzero(is_turning) >= _LEAST_TURNING:
         size = max(1.0, abs(factor)) * float(np.median(np.abs(odometry[is_turning])))
         unexplained = float(np.median(np.abs(left[is_turning]))) / size
         most = _UNEXPLAINED if abs(factor) > _GROSS else _OF_NOTHING

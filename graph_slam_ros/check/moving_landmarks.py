@@ -94,9 +94,8 @@ def moving_alone(by: LandmarkMotions) -> list[int]:
     """The landmarks that move where the others do not, by their place in the columns; the farthest first."""
     moves = by.with_robot | by.by_itself
     rest = by.on_ground[~moves]
-    if not moves.any() or moves.sum() > max(1.0, _SOME * len(moves)):
-        return []
-    if len(rest) and float(np.median(rest)) > 2.0 * by.noise_m:
+    is_rest_moving = len(rest) and float(np.median(rest)) > 2.0 * by.noise_m
+    if is_rest_moving or not moves.any() or moves.sum() > max(1.0, _SOME * len(moves)):
         return []
     least_m = _TIMES * float(np.quantile(rest, _NEARLY_ALL)) if len(rest) else 0.0  # odometry that is wrong moves all
     found = np.flatnonzero(moves & (by.on_ground > least_m))

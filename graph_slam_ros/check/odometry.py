@@ -45,7 +45,7 @@ _UNITS = {
     1000.0: "metres for thousands",
     1e-3: "millimetres for metres",
 }
-_ELSEWHERE_M = 0.3
+_ELSEWHERE_M, _OTHER_ROBOT_M = 0.3, 2.0
 _DENSITY, _SPACE = ("odometry.noise=density",), ("world.dimensions=3",)
 
 
@@ -160,13 +160,17 @@ def _used(c: Columns) -> tuple[Mask, Array]:
 
 
 def check_publishers(c: Columns) -> Iterator[Finding]:
-    """Odometry of which some is elsewhere: that of another publisher."""
+    """Odometry of which some is elsewhere: another robot's, or of another driver, whose drift differs."""
     o, (is_used, apart_m) = c.odometry, _used(c)
-    away_m = float(np.median(apart_m[~is_used]))
+    used, others_m = steps_of(o.some(is_used)), apart_m[~is_used]
+    away_m, first_m = float(np.median(others_m)), float(np.median(others_m[:LEAST]))
     if away_m > _ELSEWHERE_M:
+        hops_m = np.zeros(0) if used is None else np.linalg.norm(used.moved[used.jumps], axis=1)
+        is_mixed = np.count_nonzero(hops_m > _ELSEWHERE_M) >= _CORRECTED
+        severity: Severity = "error" if is_mixed or first_m > _OTHER_ROBOT_M else "warning"
         at = where(o.topic, o.stamp_ns[~is_used])
         text = f"{o.topic}: two robots or drivers take turns: {at['count']} of its poses are {away_m:.1f} m elsewhere"
-        yield Finding("duplicates", "error", away_m, _ELSEWHERE_M, "m", text, **at)
+        yield Finding("two_publishers", severity, away_m, _ELSEWHERE_M, "m", text, **at)
 
 
 def check_odometry(c: Columns) -> Iterator[Finding]:

@@ -134,8 +134,7 @@ def check_noise_alone(c: Columns, s: SightingColumns) -> Iterator[Finding]:
         text = f"{s.topic}: the covariance of {raised} of {len(s.stamp_ns)} sightings is nearly zero"
         has_ranges = np.isfinite(s.ranges).any()
         sigma = f"sigma_m={ASSUMED_RANGE_M}" if has_ranges else f"sigma_rad={ASSUMED_BEARING_RAD}"
-        settings = (f"{s.input}.noise=sigmas", f"{s.input}.{sigma}")
-        at = where(s.topic, s.stamp_ns, raised, settings)
+        at = where(s.topic, s.stamp_ns, raised, (f"{s.input}.noise=sigmas", f"{s.input}.{sigma}"))
         yield Finding("noise_zero", "warning", raised / len(s.stamp_ns), _RAISED, "part", text, **at)
 
 

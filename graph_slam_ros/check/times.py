@@ -32,8 +32,7 @@ def check_times(c: Columns) -> Iterator[Finding]:
         return
     for key, value in c.assumed.items():
         if key.endswith(".offset_s"):
-            name = key.removesuffix(".offset_s")
-            apart = f"{-float(value):.3f} s, by the times of recording"
+            name, apart = key.removesuffix(".offset_s"), f"{-float(value):.3f} s, by the times of recording"
             text, topic = f"{name}: its clock differs from that of odometry by {apart}", c.topic_of(name)
             at = where("" if topic is None else topic.name, settings=(assignment(key, value),))
             yield Finding("clock_domains", "error", -value, _CLOCKS_DIFFER_S, "s", text, **at)
@@ -204,9 +203,8 @@ def _rate(c: Columns) -> Iterator[Finding]:
         severity: Severity = "warning" if is_bad else "note"
         yield Finding("gap", severity, worst_s, most_s, "s", text, **where(o.topic, stamp_ns[long]))
     if 1.0 / median_s < _SLOW_HZ:
-        between = _between(c, stamp_ns)
         text = f"{o.topic} comes at {1.0 / median_s:.1f} Hz: poses are interpolated over {median_s:.2f} s"
-        severity = "warning" if between > 0.5 else "note"
+        severity = "warning" if _between(c, stamp_ns) > 0.5 else "note"
         yield Finding("slow_odometry", severity, 1.0 / median_s, _SLOW_HZ, "Hz", text, **where(o.topic, stamp_ns))
 
 

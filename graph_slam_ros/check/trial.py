@@ -91,8 +91,7 @@ def check_trial(c: Columns, slam: GraphSlam) -> Iterator[Finding]:
     is_void = fit.lost > answers.MOST_LOST or answers.absurd_range(fit) is not None
     late_s = {} if is_void else {one.parameter.source: one.value for one in clocks}
     step_s = float(np.median(np.diff(c.path_ns))) * 1e-9
-    known = [one for one in fitted if one.parameter.name in _LIMITS]
-    off = {one.parameter: one.value for one in known if _is_far_off(fit, one, step_s)}
+    off = {one.parameter: one.value for one in fitted if _is_far_off(fit, one, step_s)}
     slip = None if off else check_slips(c, slam)  # a clock or mount that is wrong bends the path in turns
     is_broken = slip is not None and slip[0].severity == "warning"
     goes_back = any((np.diff(t.stamp_ns[t.stamp_ns != 0]) < -1_000_000_000).any() for t in c.topics.values())
@@ -149,7 +148,7 @@ def _over_confident(c: Columns, noise: NoiseScale, factor: float, limit: float) 
 
 def _is_far_off(fit: TrialFit, one: answers.Finding, step_s: float) -> bool:
     """Return whether a parameter is far off by its limit and several sigmas. Between two poses a clock is no proof."""
-    limit = max(_LIMITS[one.parameter.name][1], _OF_STEP * step_s * (one.parameter.name == "clock"))
+    limit = max(_LIMITS.get(one.parameter.name, ("", np.inf))[1], _OF_STEP * step_s * (one.parameter.name == "clock"))
     sigmas = _TURN_SIGMAS if one.parameter.name == "turn" else _SIGMAS
     return answers.is_off(fit, one) and abs(one.value) > max(limit, sigmas * one.sigma)
 

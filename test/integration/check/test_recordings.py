@@ -251,7 +251,7 @@ def half_of_another_robot(m, k):
 
 
 OTHER = "links frame robot2/base_link to base_link; the others are of base_link"
-NOT_TWO = ("duplicates", "other_publisher", "duplicate_stamp")
+NOT_TWO = ("two_publishers", "duplicates", "other_publisher", "duplicate_stamp")
 
 
 @each(
