@@ -502,8 +502,8 @@ def test_truth_of_other_tools_is_read_or_named(tmp_path, capsys):
         ("kitti.txt", "1 0 0 0 0 1 0 0 0 0 1 0\n", "without stamps"),
         ("utf16.tum", "".join(tum), "iconv"),
         ("w_first.tum", w_first, "w comes first"),
-        ("late.tum", late, "its stamps are 0.5 s late"),
-        ("large.tum", large, "its ways are 1e+03 times ours"),
+        ("late.tum", late, "stamped 0.5 s earlier"),
+        ("large.tum", large, "scaled by 0.001: is it in millimetres?"),
     ):
         (tmp_path / name).write_text(text, encoding="utf-16" if name == "utf16.tum" else "utf-8")
         code, shown = said(capsys, "evaluate", tmp_path / "run", "--truth", tmp_path / name, "--json")
