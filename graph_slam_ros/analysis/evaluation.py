@@ -271,7 +271,7 @@ def _better(path: Trajectory, truth: Trajectory, dimensions: int) -> str:
     if left_m[""] <= _LATE_M:
         return ""
     if not 0.8 < k < 1.25:  # in between, it may be a map with an error of scale
-        what = f"scaled by {k:.3g}: is it in {'millimetres' if 8e-4 < k < 1.25e-3 else 'metres'}?"
+        what = f"scaled by {k:.2g}: is it in {'millimetres' if 8e-4 < k < 1.25e-3 else 'metres'}?"
         left_m[what] = _rmse_m(path, replace(truth, poses=truth.poses * [k, k, k, 1, 1, 1, 1]), dimensions)
     other = replace(truth, poses=truth.poses * [1, -1, 1, 1, 1, 1, 1])
     left_m["mirrored: does its y axis point to the left?"] = _rmse_m(path, other, dimensions)
