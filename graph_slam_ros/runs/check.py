@@ -91,10 +91,7 @@ def check(
     collector, counters = Collector(config, inputs.topics, suggested.assumed), Counters()
     runs = RecordedRuns(bag, inputs, config, counters, columns=collector)
     total = sum(bag.topics[topic].count for topic in inputs.by_topic())
-    measured: list[tuple[int, Measurements]] = []
-    for number, some in progress(runs, total):
-        if some and not quick:
-            measured.append((number, some))
+    measured = [(number, some) for number, some in progress(runs, total) if some and not quick]
     columns = collector.columns(counters)
     found += [Finding("damaged", "error", 1, 0, "parts", loss) for loss in dict.fromkeys(bag.losses)]
     found += check_columns(columns)
@@ -134,12 +131,15 @@ def _without(measured: Measurements, moving: Mapping[str, Collection[str]]) -> M
 def _trial(columns: Columns, measured: list[Measurements]) -> list[Finding]:
     """Findings of a replay in memory; none if the pipeline fails with such measurements, which a replay reports."""
     warmup(dimensions=columns.config.world.dimensions)
+    found = list[Finding]()
     try:
         with np.errstate(all="ignore"):
             slam = replayed(columns.config, (m for some in measured for m in some))
-            return [*check_doubted(columns, slam.gyro), *check_trial(columns, slam)]
+            found += check_doubted(columns, slam.gyro)
+            found += check_trial(columns, slam)  # one by one: what was found before an error stays
     except GraphSlamError as error:
-        return [Finding("fit_unsure", "warning", 1, 0, "replays", f"a replay fails: {error}")]
+        found.append(Finding("fit_unsure", "warning", 1, 0, "replays", f"a replay fails: {error}"))
+    return found
 
 
 def _unused(recording: Recording, suggestion: Suggestion, *, has_landmarks: bool) -> Iterator[Finding]:
