@@ -243,10 +243,10 @@ def _drives(run: Path) -> list[dict[str, int]]:
 
 def _doubts(path: Trajectory, truth: Trajectory, error: PathError, dimensions: int, *, align: bool) -> Iterator[str]:
     """Errors that no good map has and, of what was aligned, what would make the truth fit far better."""
-    better = _better(path, truth, dimensions) if align else ""
+    change = _change_that_fits(path, truth, dimensions) if align else ""
     error_m, true_m = error.position_m["rmse"], _size_m(associate(path, truth)[1], dimensions)
-    if better:
-        yield f"the truth fits far better if {better}"
+    if change:
+        yield f"the truth fits far better if {change}"
     elif error_m > max(_FAR * true_m, _FAR_M):
         far = f"the error is {error_m:.3g} m on a true path of radius {true_m:.3g} m (RMS)"
         yield f"{far}: check that the truth is of this robot and this drive"
@@ -260,7 +260,7 @@ def _doubts(path: Trajectory, truth: Trajectory, error: PathError, dimensions: i
             yield f"the truth's headings fit far better if turned by {turn}: is its x axis ahead?"
 
 
-def _better(path: Trajectory, truth: Trajectory, dimensions: int) -> str:
+def _change_that_fits(path: Trajectory, truth: Trajectory, dimensions: int) -> str:
     """What has to be done to the truth for a far better fit, and a question on its cause; empty if nothing helps."""
     mine, true = associate(path, truth)
     size_m, count = _size_m(mine, dimensions), len(mine.stamps_s)
