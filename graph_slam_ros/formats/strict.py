@@ -28,7 +28,6 @@ MOST_TEXT_RATIO = 100
 _FREE = 2**20  # characters that may be unpacked whatever the ratio
 _ID = re.compile(r"[+-]?\d{1,20}", re.ASCII)  # GTSAM's keys have 64 bits
 _COMMA = re.compile(r"[+-]?\d+,\d+(?:[eE][+-]?\d+)?", re.ASCII)
-_STAMP = re.compile(r"\d{1,18}|[1-8]\d{18}", re.ASCII)
 
 _FOREIGN = {
     b"SQLite format 3": "a database. RTAB-Map's exports its graph: rtabmap-databaseViewer, File, Export poses, g2o",
@@ -104,13 +103,6 @@ def integer(word: str) -> int:
     """An id. Raises FormatError."""
     if not _ID.fullmatch(word) or not -(2**63) <= int(word) < 2**64:
         raise FormatError(f"{shortened(word)} is not an id")
-    return int(word)
-
-
-def stamp(word: str) -> int:
-    """Nanoseconds that fit into 64 bits. Raises FormatError."""
-    if not _STAMP.fullmatch(word):
-        raise FormatError(f"{shortened(word)} is not a stamp")
     return int(word)
 
 

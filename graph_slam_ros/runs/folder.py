@@ -1,8 +1,7 @@
 """Run folders: which folder is a run, which run is the newest, and which files may be replaced.
 
 A folder is a run if its ``run.json`` says so (``format``), which is written when the run starts. Only such a folder is
-ever cleared, and only of the files of a run. A recording in it is read before it is removed. Runs of earlier versions
-lack this mark, or the file; they are recognised by their journal. They are read like others, and never cleared.
+ever cleared, and only of the files of a run. A recording in it is read before it is removed.
 """
 
 import contextlib
@@ -55,23 +54,14 @@ class RunError(GraphSlamError):
 
 
 def is_run(folder: Path) -> bool:
-    """Return whether a folder holds a run: ``run.json`` says so, or it is of an earlier version and has a journal.
+    """Return whether a folder holds a run: its ``run.json`` says so.
 
     Raises
     ------
     RunError
         The disk fails to tell: a run may be there, which nobody may take for another thing.
     """
-    if not folder.is_dir():
-        return False
-    try:
-        return _is_marked(folder) or (is_regular(folder / CONFIG) and any(map(_is_recorded, parts_of(folder)[:1])))
-    except OSError:  # its journal cannot be read
-        return False
-
-
-def _is_marked(folder: Path) -> bool:
-    return summary_of(folder).get("format") == MARK
+    return folder.is_dir() and summary_of(folder).get("format") == MARK
 
 
 def _is_recorded(file: Path) -> bool:
@@ -286,14 +276,12 @@ def check_room(folder: Path, source: Path | None = None, *, force: bool = False)
             return
         with claimed(folder):
             pass
-        if _is_marked(folder):
+        if is_run(folder):
             _, foreign = _contents(folder)
             if foreign:
                 raise RunError(f"{foreign[0]}: not written by this run, and so never removed: choose another folder")
             if not force and _holds_something(folder):
                 raise RunError(f"{folder}: holds a run already: choose another folder, or --force replaces it")
-        elif is_run(folder):
-            raise RunError(f"{folder}: a run of an earlier version, which is never replaced: choose another folder")
         elif not all(map(_is_unfinished, folder.iterdir())):
             raise RunError(f"{folder}: not empty and not an earlier run; nothing was written")
     except OSError as error:
@@ -303,12 +291,11 @@ def check_room(folder: Path, source: Path | None = None, *, force: bool = False)
 def keep_earlier(folder: Path, most: int, loaded: Path | None = None) -> Path | None:
     """Move an earlier run away, to ``folder-1`` or the next number. A limited number of them is kept.
 
-    Returns where it is now; None if there is none to keep. An empty run is not kept. A run that never ended, or that an
-    earlier version wrote, is always kept, and so is ``loaded``, whose map is gone on in. Of older ones the files of the
-    run are removed, and nothing else.
+    Returns where it is now; None if there is none to keep. An empty run is not kept. A run that never ended is always
+    kept, and so is ``loaded``, whose map is gone on in. Of older ones the files of the run are removed, and nothing
+    else.
     """
-    is_of_earlier_version = is_run(folder) and not _is_marked(folder)
-    most = max(most, is_cut_off(folder) or is_incomplete(folder) or is_of_earlier_version)
+    most = max(most, is_cut_off(folder) or is_incomplete(folder))
     if not _holds_something(folder) or not most:
         return None
     earlier = earlier_runs(folder)
@@ -317,7 +304,7 @@ def keep_earlier(folder: Path, most: int, loaded: Path | None = None) -> Path | 
         with claimed(folder):
             folder.rename(target)
         for number in sorted(earlier)[: max(0, len(earlier) + 1 - most)]:
-            if earlier[number] != loaded and _is_marked(earlier[number]):
+            if earlier[number] != loaded:
                 remove(earlier[number])
     except OSError as error:
         raise RunError(f"{folder}: cannot be moved to {target.name}: {error.strerror}") from None

@@ -17,7 +17,7 @@ from mcap.writer import CompressionType, Writer
 
 from graph_slam_ros.errors import FormatError
 from graph_slam_ros.formats.durable import AppendedFile
-from graph_slam_ros.measurements.types import EVENTS, Measurement, Odometry, from_record
+from graph_slam_ros.measurements.types import Measurement, Odometry, from_record
 from graph_slam_ros.recordings.mcap_records import LIBRARY, records
 
 _ENCODE = json.JSONEncoder(separators=(",", ":"), check_circular=False, allow_nan=False).encode
@@ -169,42 +169,27 @@ def parts_of(folder: Path, name: str = INGEST) -> list[Path]:
     return sorted(numbered, key=lambda file: numbered[file])
 
 
-def read_ingest(folder: Path, losses: list[str]) -> Iterator[dict[str, Any]]:
-    """The measurements of a run folder in order of acceptance, as ``read_records`` reads them."""
-    for record in read_records(folder, INGEST, losses):
-        if record != IN_A_MAP:
-            yield record
-        elif not (folder / START).exists():
-            losses.append(f"{START}: not there, though the run began in a map: what follows is without it")
+def read_measurements(
+    folder: Path, losses: list[str], processed: int = 0, used_ns: int | None = None
+) -> Iterator[Measurement]:
+    """The measurements and events of ``read_ingest``."""
+    return map(from_record, read_ingest(folder, losses, processed, used_ns))
 
 
-def read_measurements(folder: Path, losses: list[str]) -> Iterator[Measurement]:
-    """The measurements and events of ``read_ingest``; events of another version are left out and add to ``losses``."""
-    return _measurements(read_ingest(folder, losses), losses)
+def read_ingest(
+    folder: Path, losses: list[str], processed: int = 0, used_ns: int | None = None
+) -> Iterator[dict[str, Any]]:
+    """The journal of a run folder in order of acceptance; or what a map lacks that has processed some of its records.
 
-
-def _measurements(records: Iterable[dict[str, Any]], losses: list[str]) -> Iterator[Measurement]:
-    for record in records:
-        if record.get("type") != "control" or record.get("event") in EVENTS:
-            yield from_record(record)
-        elif (loss := f"{INGEST}: event {record.get('event')!r} is not known to this version; left out") not in losses:
-            losses.append(loss)
-
-
-def read_rest(folder: Path, processed: int, used_ns: int | None, losses: list[str]) -> Iterator[Measurement]:
-    """The measurements that a map lacks which has processed a given number of records.
-
-    These are the records after them. Before them come earlier ones that were not in order yet: newer than the last
-    odometry that was used. Events of another version add to ``losses``.
+    These are the records after them. Before them come earlier ones that were not in order yet: newer than ``used_ns``,
+    the stamp of the last odometry that was used.
     """
-    return _measurements(_rest(folder, processed, used_ns, losses), losses)
-
-
-def _rest(folder: Path, processed: int, used_ns: int | None, losses: list[str]) -> Iterator[dict[str, Any]]:
     waited: list[dict[str, Any]] = []
     count = 0
     for file, channel, message in _messages(folder, INGEST, losses):
         if channel == IN_A_MAP["type"]:
+            if not (processed or (folder / START).exists()):
+                losses.append(f"{START}: not there, though the run began in a map: what follows is without it")
             continue
         if count >= processed:
             yield from waited

@@ -5,33 +5,28 @@ Rows are in order of the edges' ids. A list of numbers is one field, with spaces
 
 import csv
 import io
-import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
-from enum import IntEnum
 from functools import cache
 from pathlib import Path
 from reprlib import repr as shortened
-from typing import Any, NewType, TypeVar, get_type_hints
+from typing import Any, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
 
-from graph_slam_ros.edge_tags import edge_of, tag_of
-from graph_slam_ros.errors import ConfigError, FormatError
-from graph_slam_ros.formats.strict import integer, lines, numbers, stamp
+from graph_slam_ros.edge_tags import tag_of
+from graph_slam_ros.errors import FormatError
+from graph_slam_ros.formats.files import read_text
 from graph_slam_ros.graph.losses import weight_and_cost
 from graph_slam_ros.graph.tables import EdgeTable
 from graph_slam_ros.runs.condensed_map import word
-from graph_slam_ros.runs.journal import CONDENSED, LEDGER, parts_of
+from graph_slam_ros.runs.journal import LEDGER
 from graph_slam_ros.slam import GraphSlam
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict, VerdictChange
 from graph_slam_ros.typing import Index, Numbers
 
 Ids = tuple[int, ...]
-Stamp = NewType("Stamp", int)
-Row = TypeVar("Row")
-_ROUNDING = 1e-6  # of a statistic, which is then below 0
 _VERDICTS, _REASONS = tuple(Verdict), {int(one): one for one in Reason}
 
 
@@ -65,7 +60,7 @@ class Entry:
     landmark: str
     vertices: Ids
     keyframe: int
-    stamp_ns: Stamp
+    stamp_ns: int
     measured: Numbers
     information: Numbers
     residual: Numbers
@@ -123,37 +118,17 @@ def changes_text(slam: GraphSlam) -> str:
 
 def read_ledger(folder: Path) -> list[Entry]:
     """The entries of a run, by edge. Raises FormatError naming the line."""
-    entries, is_condensed = list[Entry](), bool(parts_of(folder, CONDENSED))
-    for line, entry in _read(Entry, folder / LEDGER):
-        due = entries[-1].edge + 1 if entries else 0
-        is_due = entry.edge >= due if is_condensed else entry.edge == due
-        fault = _fault(entry) if is_due else f"edge {entry.edge} where {due} is due"
-        if fault:
-            raise FormatError(f"{folder / LEDGER}:{line}: {fault}")
-        entries.append(entry)
-    return entries
-
-
-def _fault(entry: Entry) -> str:
-    """Return which fields of an edge contradict one another."""
+    file, hints = folder / LEDGER, get_type_hints(Entry)
     try:
-        edge = edge_of(entry.tag)
-    except ConfigError as error:
-        return f"tag {shortened(entry.tag)} is none of a graph: {error}"
-    m = edge.residual_size
-    sizes = {
-        "vertices": (len(entry.vertices), len(edge.accepts)),
-        "measured": (len(entry.measured), edge.measured_size),
-        "information": (len(entry.information), m * (m + 1) // 2),
-        "residual": (len(entry.residual), m),
-    }
-    for name, (found, wanted) in sizes.items():
-        if found != wanted:
-            return f"{name}: {found} numbers, where {entry.tag} has {wanted}"
-    if entry.dof != m:
-        return f"dof: {entry.dof}, where {entry.tag} has {m}"
-    least = {"statistic": -_ROUNDING, "threshold": np.finfo(float).tiny, "chi2": 0.0, "weight": 0.0}
-    return next((f"{name}: {n} is too small" for name, low in least.items() if (n := getattr(entry, name)) < low), "")
+        rows = csv.DictReader(io.StringIO(read_text(file), newline=""))
+    except OSError as error:
+        raise FormatError(f"{file}: {error.strerror}: is it a run, and saved by this version?") from None
+    except UnicodeDecodeError as error:
+        raise FormatError(f"{file}: not a ledger: {error}") from None
+    try:
+        return [Entry(**{name: _PARSED[kind](row[name]) for name, kind in hints.items()}) for row in rows]
+    except (KeyError, TypeError, ValueError, AttributeError, csv.Error) as error:
+        raise FormatError(f"{file}:{rows.line_num}: not a ledger: {shortened(str(error))}") from None
 
 
 def ledger_entries(slam: GraphSlam, ids: Sequence[int]) -> Iterator[Entry]:
@@ -182,7 +157,7 @@ def ledger_entries(slam: GraphSlam, ids: Sequence[int]) -> Iterator[Entry]:
             landmark,
             vertices,
             keyframe,
-            Stamp(newest_ns or stamps_ns[max(keyframe - slam.first_keyframe, 0)]),
+            newest_ns or stamps_ns[max(keyframe - slam.first_keyframe, 0)],
             measured,
             information,
             tuple(residuals[ends[edge] - dof : ends[edge]]),
@@ -221,22 +196,14 @@ def _rows(slam: GraphSlam, table: EdgeTable, ids: Index) -> tuple[str, list[Any]
 # -- rows of a dataclass -----------------------------------------------------------------------------------------------
 
 _PARSED: dict[Any, Callable[[str], Any]] = {
-    int: integer,
-    Stamp: stamp,
-    float: lambda text: np.inf if text == "inf" else numbers([text])[0],  # no bound on what a statistic is
+    int: int,
+    float: float,
     str: str,
-    Ids: lambda text: tuple(map(integer, text.split())),
-    Numbers: lambda text: tuple(numbers(text.split())),
-    Verdict: lambda text: _member(Verdict, text),
-    Reason: lambda text: _member(Reason, text),
+    Ids: lambda text: tuple(map(int, text.split())),
+    Numbers: lambda text: tuple(map(float, text.split())),
+    Verdict: lambda text: Verdict[text.upper()],
+    Reason: lambda text: Reason[text.upper()],
 }
-
-
-def _member(kind: type[IntEnum], word: str) -> IntEnum:
-    names = [member.name.lower() for member in kind]
-    if word not in names:
-        raise FormatError(f"{shortened(word)} is none of {', '.join(names)}")
-    return kind[word.upper()]
 
 
 def _text(kind: type, rows: Iterable[Any]) -> str:
@@ -246,31 +213,3 @@ def _text(kind: type, rows: Iterable[Any]) -> str:
     writer.writerow(names)
     writer.writerows([word(getattr(row, name)) for name in names] for row in rows)
     return out.getvalue()
-
-
-def _read(kind: type[Row], file: Path) -> Iterator[tuple[int, Row]]:
-    """Each row with the number of its last line."""
-    hints = get_type_hints(kind)
-    if not os.path.lexists(file):
-        raise FormatError(f"{file}: no such file: is it a run, and saved by this version?")
-    rows = csv.reader((text for _, text in lines(file, follow=False)), strict=True)
-    try:
-        if next(rows, None) != list(hints):
-            raise FormatError(f"{file}: not a ledger: its first line is not {','.join(hints)}")
-        for row in rows:
-            if len(row) != len(hints):
-                raise FormatError(f"{file}:{rows.line_num}: {len(row)} columns, not {len(hints)}")
-            try:
-                yield rows.line_num, kind(*map(_parsed, hints.items(), row))
-            except FormatError as error:
-                raise FormatError(f"{file}:{rows.line_num}: {error}") from None
-    except csv.Error as error:
-        raise FormatError(f"{file}:{rows.line_num}: {error}") from None
-
-
-def _parsed(column: tuple[str, Any], word: str) -> Any:
-    name, kind = column
-    try:
-        return _PARSED[kind](word)
-    except FormatError as error:
-        raise FormatError(f"{name}: {error}") from None

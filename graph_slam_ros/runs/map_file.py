@@ -11,7 +11,6 @@ Each is an mcap file that is replaced as a whole. Its channels are
 
 import io
 import json
-import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import astuple, fields
@@ -44,7 +43,6 @@ from graph_slam_ros.slam.lifelong.place import VisitScale, place_of
 from graph_slam_ros.slam.lifelong.state import BoundedState, OldKeyframe
 from graph_slam_ros.slam.robust.ledger import Ledger, Reason, Verdict, VerdictChange
 from graph_slam_ros.slam.snapshot import MapSnapshot
-from graph_slam_ros.typing import Index
 
 VERSION = 4
 _KINDS = {kind.name: kind for kind in (SE2, SE3, R1, R2, R3)}
@@ -113,8 +111,8 @@ def _read(file: Path) -> MapSnapshot | None:
         state = _state(told, marks, {column: numbers for column, (numbers,) in parts.items()})
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, GraphSlamError) as error:
         raise FormatError(f"{name}: {losses[0] if losses else f'no map: {error}'}") from None
-    if fault := losses[0] if losses else _fault_of(state):
-        raise FormatError(f"{name}: {fault}")
+    if losses:
+        raise FormatError(f"{name}: {losses[0]}")
     state.folder = file.parent
     return state
 
@@ -264,14 +262,11 @@ def _graph(told: Told, columns: Columns) -> Graph:
     graph.labels[:], graph.sources[:] = told["labels"], told["sources"]
     for tag in told["tags"]:
         _add_edges(graph, tag, columns)
-    ids = np.concatenate([np.empty(0, dtype=np.int64), *(table.id.values for table in graph.tables.values())])
-    if not np.array_equal(np.sort(ids), np.arange(len(ids))):
-        raise ValueError("the edges are not numbered from 0")
     for table in graph.tables.values():
         graph.table_of_edge.values[table.id.values] = table.code
         graph.row_of_edge.values[table.id.values] = np.arange(len(table))
-    graph.vertex_ids = _lasting(columns["vertex_ids"], told["next"]["vertex"], graph.vertex_count)
-    graph.edge_ids = _lasting(columns["edge_ids"], told["next"]["edge"], graph.edge_count)
+    graph.vertex_ids = LastingIds(columns["vertex_ids"].copy(), told["next"]["vertex"])
+    graph.edge_ids = LastingIds(columns["edge_ids"].copy(), told["next"]["edge"])
     return graph
 
 
@@ -281,20 +276,11 @@ def _add_edges(graph: Graph, tag: str, columns: Columns) -> None:
     count, m = len(of["id"]), edge.residual_size
     if not count:
         return
-    if not (_are_below(of["label"], len(graph.labels)) and _are_below(of["source"], len(graph.sources))):
-        raise ValueError(f"{tag}: a class or an input that is not named")
     vertices = of["vertices"].reshape(count, len(edge.accepts))
     measured, roots = of["measured"].reshape(count, -1), of["sqrt_information"].reshape(count, m, m)
     graph.add_edges(edge, vertices, measured, Gaussian(roots), graph.labels[0], graph.sources[0])
     for name in ("id", "label", "source", "weight"):
         getattr(graph.tables[edge], name).values[:] = of[name]
-
-
-def _lasting(early: Index, later: int, count: int) -> LastingIds:
-    ascends = not len(early) or (early[0] >= 0 and (np.diff(early) > 0).all() and early[-1] < later)
-    if len(early) > count or not ascends or not _is_index(later, 2**62):
-        raise ValueError("ids do not ascend, or are more than there are")
-    return LastingIds(early.copy(), later)
 
 
 def _poses(out: StampedPoses[Any], name: str, columns: Columns) -> StampedPoses[Any]:
@@ -304,11 +290,7 @@ def _poses(out: StampedPoses[Any], name: str, columns: Columns) -> StampedPoses[
 
 def _ledger(columns: Columns, final: int) -> Ledger:
     ledger, of = Ledger(), {name: columns[f"ledger/{name}"] for name in _OF_VERDICTS}
-    residual, known = columns["ledger/residual"], {int(one) for one in Reason}
-    if int(of["numbers"].sum()) != len(residual) or (of["numbers"] < 0).any():
-        raise ValueError("verdicts without their residuals")
-    if not _are_below(of["verdict"], len(Verdict)) or not known.issuperset(np.unique(of["reason"]).tolist()):
-        raise ValueError("a verdict or a reason that is none")
+    residual = columns["ledger/residual"]
     is_judged = of["verdict"] != Verdict.NOT_EVALUATED
     ledger.enter(of["keyframe"], of["statistic"], of["numbers"], of["threshold"], residual, is_judged)
     ledger.verdict.values[:], ledger.reason.values[:] = of["verdict"], of["reason"]
@@ -317,8 +299,6 @@ def _ledger(columns: Columns, final: int) -> Ledger:
         VerdictChange(edge, keyframe, Verdict(verdict), Reason(reason), statistic, threshold)
         for edge, keyframe, verdict, reason, statistic, threshold in zip(*changes, strict=True)
     ]
-    if not _is_index(final, len(ledger) + 1):
-        raise ValueError("more verdicts are final than there are")
     ledger.finish(final)
     return ledger
 
@@ -338,68 +318,13 @@ def _bounded(graph: Graph, told: Told) -> BoundedState:
     state = BoundedState(keyframes=keyframes, sightings=sightings, scale=VisitScale(*told["scale"]))
     state.accepted |= {first: Counter(of) for first, of in told["accepted"]}
     state.begins |= dict(told["begins"])
-    if not 1.0 <= state.scale.factor < math.inf:
-        raise ValueError(f"condensed: the variances of visits count {state.scale.factor} times")
     for cell, number, visits, strikes, at in told["places"]:
-        edge, where = graph.edge(number), np.array(at, dtype=np.float64)
-        if len(where) != edge.type.measured_size or not np.isfinite(where).all():
-            raise ValueError(f"condensed: place {number} is not linearised at {edge.type.measured_size} numbers")
-        state.places.setdefault(tuple(cell), []).append(place_of(edge, where, visits, dict(strikes)))
+        place = place_of(graph.edge(number), np.array(at, dtype=np.float64), visits, dict(strikes))
+        state.places.setdefault(tuple(cell), []).append(place)
     state.old += [OldKeyframe(number, vertex, stamp, tuple(pose)) for number, vertex, stamp, pose in told["old"]]
-    if not all(_is_index(one.vertex, graph.vertex_count) for one in state.old):
-        raise ValueError("condensed: an old keyframe is no vertex")
     return state
-
-
-# -- parts that contradict one another --------------------------------------------------------------------------------
-
-
-def _fault_of(state: MapSnapshot) -> str:
-    """Return the first fault of a map, in words; empty if there is none."""
-    graph, count = state.graph, state.keyframe_count
-    pose = _pose_of(graph)
-    is_pose = np.array([kind is pose for kind in graph.kinds], dtype=bool)[graph.kind.values]
-    ids, seen_from = state.keyframes.ids, state.sighting_poses.ids
-    if not _is_index(state.first_keyframe, count + 1) or not _are_below(ids, len(is_pose)) or not is_pose[ids].all():
-        return "a keyframe is not valid"
-    if not _are_below(seen_from, count) or (seen_from < state.first_keyframe).any():
-        return "a sighting is not valid"
-    for name, mark in state.landmarks.items():
-        counts = (mark.vertex, graph.vertex_count), (mark.sightings, 2**31), (mark.sized, 2**31)
-        stamps = (mark.first_seen_ns, 2**63), (mark.last_seen_ns, 2**63)
-        is_sized = isinstance(mark.sort, str) and isinstance(mark.size, int | float) and 0.0 <= mark.size < math.inf
-        if not (is_sized and all(_is_index(*one) for one in (*counts, *stamps))):
-            return f"landmark {name} is not valid"
-    if not all(_is_index(one, count) for one in (*state.segments, *state.drives)):
-        return "a segment or a drive begins where no keyframe is"
-    vertices, edges = state.held
-    if not (_is_index(max(state.frozen, vertices), len(is_pose) + 1) and _is_index(edges, len(state.ledger) + 1)):
-        return "more is frozen or held than there is"
-    if not (state.used_ns is None or _is_index(state.used_ns, 2**63)) or not isinstance(state.source, str):
-        return "what is said of the odometry that was used last is not valid"
-    if not _is_index(state.processed, 2**63):
-        return f"processed {state.processed!r} is no count"
-    gyro = () if state.gyro_bias is None else (*state.gyro_bias.bias, *state.gyro_bias.variance)
-    if len(state.datum) not in (0, 3) or not all(map(math.isfinite, (*state.datum, *gyro))):
-        return "the datum or the bias of the gyro is not valid"
-    changed = np.array([one.edge for one in state.ledger.history], dtype=np.int64)
-    if len(state.ledger) > graph.edge_count or not _are_below(changed, len(state.ledger)):
-        return f"{len(state.ledger)} verdicts on {graph.edge_count} edges"
-    numbers = state.values, state.keyframes.poses, state.sighting_poses.poses
-    is_whole = len(state.values) == len(graph.initial) and all(np.isfinite(one).all() for one in numbers)
-    return "" if is_whole else "an estimate is not finite"
 
 
 def _pose_of(graph: Graph) -> VertexKind | None:
     """Return the kind of the keyframes; None where there is no vertex."""
     return next((kind for kind in graph.kinds if kind in GROUPS), None)
-
-
-def _is_index(one: Any, count: int) -> bool:
-    """Return whether a value is a whole number from 0 up to a count."""
-    return isinstance(one, int) and not isinstance(one, bool) and 0 <= one < count
-
-
-def _are_below(several: Index, count: int) -> bool:
-    """Return whether all are from 0 up to a count."""
-    return not len(several) or bool(several.min() >= 0 and several.max() < count)

@@ -20,7 +20,7 @@ from graph_slam_ros.runs.folder import (
     summary_of,
     was_saved_whole,
 )
-from graph_slam_ros.runs.journal import IN_A_MAP, INGEST, START, read_records, read_rest
+from graph_slam_ros.runs.journal import IN_A_MAP, INGEST, START, read_measurements, read_records
 from graph_slam_ros.runs.map_file import read_map, read_start
 from graph_slam_ros.runs.recorder import RunRecorder, save_results
 from graph_slam_ros.runs.tables import counters_of, fitted_summary, summarize
@@ -96,7 +96,7 @@ def _repeated(folder: Path, losses: list[str], counters: Counters) -> MapSnapsho
 
 def _driven(folder: Path, state: MapSnapshot, losses: list[str], counters: Counters) -> MapSnapshot:
     """The map with the rest of the journal, if there is more."""
-    rest = read_rest(folder, state.processed, state.used_ns, losses)
+    rest = read_measurements(folder, losses, state.processed, state.used_ns)
     first = next(rest, None)
     if first is None:
         return state

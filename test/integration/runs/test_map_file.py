@@ -18,7 +18,6 @@ from graph_slam_ros.runs.recorder import RunRecorder
 from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.runs.restore import map_of
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry
-from graph_slam_ros.slam.robust.ledger import Reason, Verdict, VerdictChange
 from graph_slam_ros.tools.simulation import measurements, simulate
 
 GOLDEN = ROOT / "test" / "golden"
@@ -128,31 +127,13 @@ def test_a_map_that_is_damaged_anywhere_is_repeated_from_the_journal_with_a_word
     assert list(state.keyframes) == list(slam.keyframes)
 
 
-CHANGE = VerdictChange(10**6, 0, Verdict.REJECTED, Reason.OUTVOTED, 1.0, 1.0)
-NO_MAP = {
-    "its version is 99": lambda state, patch: patch.setattr(map_file, "VERSION", 99),
-    "a keyframe is not valid": lambda state, _: state.keyframes.append(state.graph.vertex_count, 0, (0.0, 0.0, 0.0)),
-    "a sighting is not valid": lambda state, _: state.sighting_poses.append(10**6, 0, (0.0, 0.0, 0.0)),
-    "a segment or a drive begins where": lambda state, _: state.segments.append(10**6),
-    "landmark .* is not valid": lambda state, _: setattr(next(iter(state.landmarks.values())), "vertex", -1),
-    "more is frozen or held": lambda state, _: setattr(state, "frozen", 10**6),
-    "an estimate is not finite": lambda state, _: state.values.put(0, math.nan),
-    "used last": lambda state, _: setattr(state, "source", 3),
-    "processed -1": lambda state, _: setattr(state, "processed", -1),
-    "the datum": lambda state, _: setattr(state, "datum", (1.0,)),
-    "verdicts on": lambda state, _: state.ledger.history.append(CHANGE),
-    "a class or an input": lambda state, _: state.graph.labels.clear(),
-}
-
-
 @pytest.mark.parametrize("run", ["unnamed"], indirect=True)
-def test_what_is_no_map_is_refused_by_what_is_wrong(run, tmp_path):
-    for complaint, spoil in NO_MAP.items():
-        with pytest.MonkeyPatch.context() as patch:
-            spoil(state := run[1].snapshot(), patch)
-            write_map(tmp_path / "map.mcap", state)
-        with pytest.raises(FormatError, match=rf"map\.mcap: .*{complaint}"):
-            read_map(tmp_path)
+def test_what_is_no_map_is_refused_by_what_is_wrong(run, tmp_path, monkeypatch):
+    monkeypatch.setattr(map_file, "VERSION", 99)
+    write_map(tmp_path / "map.mcap", run[1].snapshot())
+    monkeypatch.undo()
+    with pytest.raises(FormatError, match=r"map\.mcap: .*its version is 99; this program knows"):
+        read_map(tmp_path)
 
 
 def test_a_run_is_cut_off_until_it_is_ended_and_kept_whatever_is_asked(tmp_path):

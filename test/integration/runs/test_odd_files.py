@@ -367,25 +367,6 @@ def test_what_else_is_in_a_run_folder_stays_when_the_run_is_replaced(bag, run):
     assert (run / "notes.txt").read_text() == "mine"
 
 
-def test_a_run_of_an_earlier_version_is_known_by_its_journal_read_and_never_replaced(bag, tmp_path):
-    (golden,) = GOLDEN.iterdir()
-    old = shutil.copytree(golden, tmp_path / "old")
-    assert is_run(old)
-    cut = shutil.copytree(golden, tmp_path / "cut")
-    (cut / "run.json").unlink()
-    assert is_run(cut), "cut off before it was saved"
-    for folder in (old, cut):
-        before = state(folder)
-        for force in (False, True):
-            with pytest.raises(RunError, match="a run of an earlier version, which is never replaced"):
-                replay(bag, folder, force=force)
-        assert state(folder) == before
-    keep_earlier(old, 0)
-    assert state(tmp_path / "old-1")["ingest.mcap"] == (golden / "ingest.mcap").read_bytes()
-    (cut / "ingest.mcap").write_bytes(bag.read_bytes())
-    assert not is_run(cut), "its journal is a recording"
-
-
 def test_a_run_or_a_file_that_is_there_is_replaced_with_force_alone(bag, run, tmp_path, capsys):
     graph, city = tmp_path / "world.g2o", ["simulate", "city", "--poses", "12", "--set", "blocks=2"]
     assert code_of(*city, "--out", graph) == 0

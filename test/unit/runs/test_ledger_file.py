@@ -50,7 +50,7 @@ def test_what_is_read_and_told_on_events_is_what_was_decided(run):
 
 
 def test_what_is_no_ledger_is_refused_by_name(run, tmp_path):
-    with pytest.raises(FormatError, match=r"ledger\.csv: no such file"):
+    with pytest.raises(FormatError, match=r"ledger\.csv: No such file"):
         read_ledger(tmp_path)
     (tmp_path / LEDGER).write_text("edge,label\n0,odometry\n")
     with pytest.raises(FormatError, match="not a ledger"):
