@@ -101,9 +101,8 @@ def _with_false_closures(problem: Problem, truth: Array, policy: str, rate: floa
     odometry, true = split(problem)
     if not len(true):
         raise GraphSlamError(f"{problem.name}: no closure in it: --policy {','.join(ID_POLICIES)}")
-    count, rng = generator.count_for(rate, len(true)), np.random.default_rng(seed)
-    false = generator.false_closures(truth, true.root, count, policy, rng)
-    both = joined(true, Edges(false.ends, false.measured, false.root))
+    rng = np.random.default_rng(seed)
+    both = joined(true, Edges(*generator.false_closures(truth, true.root, rng, policy, rate)))
     shuffled = rng.permutation(len(both))
     in_time = shuffled[np.argsort(both.ends[shuffled].max(axis=1), kind="stable")]
     sightings = np.zeros(len(problem.sightings), dtype=bool)
@@ -123,8 +122,8 @@ def _with_wrong_ids(problem: Problem, fault: Fault, seed: int) -> Trial:
         named,
         seen.ends[:, 0],
         {},
-        generator.Closures(closures.ends[:0], closures.measured[:0], closures.root[:0]),
         np.arange(len(nowhere)),
+        [],
     )
     put_faults(draft, [fault], seed)
     false = np.array([("sighting", k) in draft.wrong for k in range(len(named))], dtype=bool)

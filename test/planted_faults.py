@@ -18,7 +18,7 @@ from graph_slam_ros.messages.from_msg import OwnDecoder
 from graph_slam_ros.runs.check import check
 from graph_slam_ros.tools.simulation import Drive, Fault, simulate, spoil_messages, write_bag
 from graph_slam_ros.tools.simulation.drive import Sightings
-from graph_slam_ros.tools.simulation.message_faults import _moved
+from graph_slam_ros.tools.simulation.recording import moved_from
 
 TRUTH = "/ground_truth"
 
@@ -113,7 +113,7 @@ def carried(drive):
     """Odometry that notices nothing of the part of the drive from half to 0.6."""
     poses = drive.poses
     first, last = len(poses) // 2, round(0.6 * len(poses))
-    moved = _moved(poses, last, tuple(poses[first].tolist()))
+    moved = moved_from(poses, last, tuple(poses[first].tolist()))
     moved[first:last] = poses[first]
     drive.poses = moved
 
@@ -135,7 +135,7 @@ def mirrored(drive):
 def jumped(drive):
     poses = drive.poses
     at = len(poses) // 2
-    drive.poses = _moved(poses, at, se3.compose(tuple(poses[at].tolist()), (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)))
+    drive.poses = moved_from(poses, at, se3.compose(tuple(poses[at].tolist()), (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)))
 
 
 def of(*texts):
@@ -147,14 +147,14 @@ FAULTS = {
     "landmark clock +100 ms": (of("clock_offset:seconds=0.1"), "clock_offset"),
     "landmark clock -100 ms": (of("clock_offset:seconds=-0.1"), "clock_offset"),
     "landmark clock +400 ms": (of("clock_offset:seconds=0.4"), "clock_offset latency"),
-    "landmark clock set by 200 ms": (of("clock_jump:seconds=0.2"), "clock_jump"),
-    "landmark clock set by -400 ms": (of("clock_jump:seconds=-0.4"), "clock_jump"),
-    "landmarks by uptime": (of("uptime"), "clock_domains no_overlap"),
+    "landmark clock set by 200 ms": (of("clock_offset:seconds=0.2,begin=0.5"), "clock_jump"),
+    "landmark clock set by -400 ms": (of("clock_offset:seconds=-0.4,begin=0.5"), "clock_jump"),
+    "landmarks by uptime": (of("clock_offset:seconds=-1e9"), "clock_domains no_overlap"),
     "zero stamps": (of("zero_stamps"), "zero_stamp"),
     "odometry recorded twice": (of("recorded_twice"), "duplicates"),
     "odometry out of order by 0.2 s": (of("out_of_order"), "out_of_order"),
     "clock set back by 30 s": (of("clock_set_back"), "time_jump"),
-    "5 s of odometry lost": (of("gap"), "gap"),
+    "a twentieth of odometry lost": (of("missing:what=odometry,begin=0.33,lasting=0.05"), "gap"),
     "odometry at 2 Hz": (of("slow_odometry"), "slow_odometry"),
     "odometry scaled 1.05": (of("wrong_scale:distance=1.05"), "odometry_scale"),
     "odometry scaled 0.9": (of("wrong_scale:distance=0.9"), "odometry_scale"),
@@ -191,16 +191,16 @@ FAULTS = {
     "identities of tracks": (of("track_ids"), "seen_once"),
     "identities at random": (of("random_ids"), "unrelated ids_unsure outliers"),
     "30 % of ids wrong": (of("random_ids:rate=0.3"), "outliers ids_unsure"),
-    "odometry stands": (of("standing"), "static"),
+    "odometry stands": (of("wrong_scale:distance=0,turn=0"), "static"),
     "odometry jumps 1 m": (jumped, "odometry_jumps"),
     "odometry restarted": (of("restarted"), "odometry_reset"),
     "odometry corrected every 20 s": (of("corrected"), "corrected"),
     "odometry in frame map": (of("wrong_frames:odometry=map,landmarks=kept"), "odometry_in_map"),
     "all ids new each 15 s": (of("new_ids"), "no_closure"),
     "all ids new after 60 s": (of("new_ids:seconds=60"), "ids_renewed no_closure"),
-    "nothing seen after a quarter": (of("blind"), "silent"),
+    "nothing seen after a quarter": (of("missing:begin=0.25"), "silent"),
     "NaN in odometry": (of("not_a_number"), "nonfinite"),
-    "a tenth of the drive": (of("brief"), "not_observable"),
+    "a tenth of the drive": (of("missing:what=all,begin=0.1"), "not_observable"),
     "file cut off": (of("cut_off"), "damaged"),
     "no landmarks": (of("missing"), "no_landmarks"),
     "no odometry": (of("missing:what=odometry"), "no_odometry"),

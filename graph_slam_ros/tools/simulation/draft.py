@@ -12,8 +12,8 @@ import numpy as np
 from graph_slam_ros.formats.g2o_writer import write_text
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.lie import se2
-from graph_slam_ros.slam import Sighting
-from graph_slam_ros.tools.simulation.false_closures import Closures
+from graph_slam_ros.slam import Closure, Sighting
+from graph_slam_ros.tools.simulation.recording import CLOSURES_TOPIC
 from graph_slam_ros.typing import Array, Index, Numbers
 
 Measured = Literal["odometry", "sighting", "closure"]
@@ -30,8 +30,8 @@ class Draft:
     twist : (n, d) velocity since the pose before
     sightings, seen_at : what was seen, and (m,) from which pose
     landmarks : true places by id
-    closures : of true places; false ones are added
-    places : the poses that closures join
+    stamps_ns : (n,)
+    closures : true ones; false ones are added
     wrong : by what was measured and its number (of odometry the later pose's), the faults that hit it
     true_ids : of the landmarks that were really seen, whatever ids the sightings have now
     """
@@ -43,8 +43,8 @@ class Draft:
     sightings: list[Sighting]
     seen_at: Index
     landmarks: Mapping[str, Numbers]
-    closures: Closures
-    places: Index
+    stamps_ns: Index
+    closures: list[Closure]
     wrong: dict[tuple[Measured, int], list[str]] = field(default_factory=dict)
     true_ids: list[str] = field(init=False)
 
@@ -74,16 +74,13 @@ class Draft:
         for pose in later:
             self.mark("odometry", pose, fault)
 
-    def add_closures(self, false: Closures, fault: str) -> None:
+    def add_closures(self, ends: Index, measured: Array, root: Array, fault: str) -> None:
         """Append false closures."""
-        old = self.closures
-        for k in range(len(old), len(old) + len(false)):
-            self.mark("closure", k, fault)
-        self.closures = Closures(
-            np.concatenate([old.ends, false.ends]),
-            np.concatenate([old.measured, false.measured]),
-            np.concatenate([old.root, false.root]),
-        )
+        for (earlier, later), z, one in zip(self.stamps_ns[ends].tolist(), measured.tolist(), root, strict=True):
+            self.mark("closure", len(self.closures), fault)
+            covariance = np.linalg.inv(one.T @ one)
+            flat = tuple((0.5 * (covariance + covariance.T)).ravel().tolist())
+            self.closures.append(Closure(later, earlier, CLOSURES_TOPIC, tuple(z), flat))
 
     def seen_from(self, number: int, displaced: Array) -> Sighting:
         """A sighting as it would have been, with its noise, if the landmark had been elsewhere.

@@ -122,6 +122,18 @@ class Drive:
             (p.x, p.y, p.z, q.x, q.y, q.z, q.w) = row
 
     @property
+    def twists(self) -> Array:
+        """(n, 6) Velocities of odometry, linear and angular."""
+        both = [(m.content.twist.twist.linear, m.content.twist.twist.angular) for m in self.odometry]
+        return np.array([(v.x, v.y, v.z, w.x, w.y, w.z) for v, w in both])
+
+    @twists.setter
+    def twists(self, twists: Array) -> None:
+        for m, row in zip(self.odometry, twists.tolist(), strict=True):
+            v, w = m.content.twist.twist.linear, m.content.twist.twist.angular
+            (v.x, v.y, v.z, w.x, w.y, w.z) = row
+
+    @property
     def odometry_ns(self) -> Index:
         """(n,) Stamps of odometry."""
         return np.array([m.stamp_ns for m in self.odometry], dtype=np.int64)
@@ -166,13 +178,15 @@ class Sightings:
 
     Attributes
     ----------
+    stamp_ns : of the message
     ids : of each, as text
     points : (k, 3) in the frame of the message; of ranges and bearings as far as they say
     """
 
     def __init__(self, message: Message) -> None:
-        self._content = message.content
-        if message.type == DETECTIONS:
+        self._content, self._is_cloud = message.content, message.type == POINTS
+        self.stamp_ns = message.stamp_ns
+        if not self._is_cloud:
             self.ids = [one.id for one in self._content.detections]
             at = [_pose(one).position for one in self._content.detections]
             self.points = np.array([(p.x, p.y, p.z) for p in at]).reshape(-1, 3)
@@ -192,13 +206,13 @@ class Sightings:
     @property
     def sigmas(self) -> Array:
         """The standard deviation (k,) of the position along x, or of what is measured first."""
-        if hasattr(self, "_rows"):
+        if self._is_cloud:
             return np.array(self._column["sigma"])
         return np.array([max(float(one.results[0].pose.covariance[0]), 0.0) ** 0.5 for one in self._content.detections])
 
     def scale_bearings(self, factor: float) -> None:
         """Multiply bearings, also beyond half a turn."""
-        bearings = [name for name in getattr(self, "_column", {}) if name in ("bearing", "elevation")]
+        bearings = {"bearing", "elevation"} & self._column.keys() if self._is_cloud else ()
         if not bearings:
             raise GraphSlamError("the landmarks of this recording have no bearings")
         for name in bearings:
@@ -207,7 +221,7 @@ class Sightings:
 
     def set_noise(self, sigma: float) -> None:
         """Set the standard deviations of everything [m, rad]."""
-        if hasattr(self, "_rows"):
+        if self._is_cloud:
             for name in (name for name in self._column if name.startswith("sigma")):
                 self._column[name][:] = sigma
             self._content.data = self._rows.ravel().view(np.uint8)
@@ -216,9 +230,19 @@ class Sightings:
             for result in one.results:
                 result.pose.covariance = (sigma**2 * np.eye(6)).ravel()
 
-    def store(self, turn: Array | None = None) -> None:
-        """Write ids and points back. Orientations are turned by an orthogonal matrix (3, 3)."""
-        if hasattr(self, "_rows"):
+    def turn(self, by: Array) -> None:
+        """Turn points and orientations by an orthogonal matrix (3, 3)."""
+        self.points = self.points @ by.T
+        for one in self._content.detections if not self._is_cloud else ():
+            q, matrix = _pose(one).orientation, np.eye(4)
+            matrix[:3, :3] = by @ se3.to_matrix((0, 0, 0, q.x, q.y, q.z, q.w))[:3, :3]
+            if np.linalg.det(by) < 0.0:
+                matrix[:3, 1] *= -1.0  # what is mirrored stays a rotation
+            q.x, q.y, q.z, q.w = map(float, se3.from_matrix(matrix)[3:])
+
+    def store(self) -> None:
+        """Write ids and points back."""
+        if self._is_cloud:
             x, y, z = self.points.T
             self._column["id"][:] = [float(name) for name in self.ids]
             if "range" in self._column:
@@ -231,15 +255,8 @@ class Sightings:
             return
         for one, name, at in zip(self._content.detections, self.ids, self.points.tolist(), strict=True):
             one.id = name
-            for pose in (_pose(one), one.bbox.center):
-                p, q = pose.position, pose.orientation
+            for p in (_pose(one).position, one.bbox.center.position):
                 p.x, p.y, p.z = at
-                if turn is not None and pose is _pose(one):
-                    matrix = np.eye(4)
-                    matrix[:3, :3] = turn @ se3.to_matrix((0, 0, 0, q.x, q.y, q.z, q.w))[:3, :3]
-                    if np.linalg.det(turn) < 0.0:
-                        matrix[:3, 1] *= -1.0  # what is mirrored stays a rotation
-                    q.x, q.y, q.z, q.w = map(float, se3.from_matrix(matrix)[3:])
             for result in one.results:
                 result.hypothesis.class_id = name
 

@@ -6,8 +6,6 @@ that agrees with the truth is not false. It is drawn again, as in McGann et al. 
 mapping (riSAM)", 2023).
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.random import Generator
 
@@ -27,36 +25,20 @@ _ALIKE_OF = 30  # pairs of stretches of which the two most alike are taken for o
 _PATIENCE = 100  # draws for each that is wanted, before it is said that there are none
 
 
-@dataclass(frozen=True, slots=True)
-class Closures:
-    """Relative poses.
-
-    Attributes
-    ----------
-    ends : (n, 2) the earlier and the later pose
-    measured : (n, 3) or (n, 7), the later pose in the earlier one
-    root : (n, d, d), R with ``R'R`` the information in the tangent space of what is measured
-    """
-
-    ends: Index
-    measured: Array
-    root: Array
-
-    def __len__(self) -> int:
-        return len(self.ends)
-
-
-def count_for(rate: float, true: int) -> int:
-    """Return the number of false closures that makes up a fraction of all: ``p n / (1 - p)`` for n true ones."""
-    return round(rate * true / (1.0 - rate))
-
-
 def false_closures(
-    truth: Array, roots: Array, count: int, policy: str, rng: Generator, group: int = GROUP, margin: float = MARGIN
-) -> Closures:
+    truth: Array,
+    roots: Array,
+    rng: Generator,
+    policy: str,
+    rate: float = 0.0,
+    count: int = 0,
+    group: int = GROUP,
+    margin: float = MARGIN,
+) -> tuple[Index, Array, Array]:
     """Draw false closures.
 
-    Raises GraphSlamError: unknown policy, too few poses, or all that can be drawn agrees with the truth.
+    Raises GraphSlamError: no true closure, unknown policy, too few poses, or all that can be drawn agrees with the
+    truth.
 
     Parameters
     ----------
@@ -65,8 +47,18 @@ def false_closures(
     policy : ``random``: any two poses; ``local``: at most 20 apart; ``group``, ``local-group``: consecutive pairs, all
         with the same measurement; ``aliased``: two stretches of the path taken for one place, so that each of its pairs
         is measured where one wrong rigid motion of the second stretch would have it, with the noise of a true closure
+    rate, count : the fraction of all closures that is false then; or so many, whatever the rate
     group : pairs in a group
+
+    Returns
+    -------
+    ends : (k, 2) the earlier and the later pose
+    measured : (k, 3) or (k, 7), the later pose in the earlier one
+    root : (k, d, d), R with ``R'R`` the information in the tangent space of what is measured
     """
+    if not len(roots):
+        raise GraphSlamError("false_closures: there is no true one to be like (simulate records some with --closures)")
+    count = count or round(rate * len(roots) / (1.0 - rate))
     if policy not in POLICIES:
         raise GraphSlamError(f"false closures: {policy!r} is not one of {', '.join(POLICIES)}")
     pairs = group if policy.endswith("group") or policy == "aliased" else 1
@@ -90,7 +82,7 @@ def false_closures(
             measured.append(z[:wanted])
             root.append(np.tile(its_root, (wanted, 1, 1)))
             found += wanted
-    return Closures(np.concatenate(ends), np.concatenate(measured), np.concatenate(root))
+    return np.concatenate(ends), np.concatenate(measured), np.concatenate(root)
 
 
 def disagreement(poses: Array, ends: Index, measured: Array, root: Array) -> Array:

@@ -19,18 +19,23 @@ from graph_slam_ros.formats.g2o_writer import graph_lines
 from graph_slam_ros.formats.graph_file import G2oFile
 from graph_slam_ros.formats.parameters import parse_setting
 from graph_slam_ros.graph import Gaussian
-from graph_slam_ros.graph.geometry import PLANAR, SPATIAL, Geometry
-from graph_slam_ros.slam import Closure
+from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
 from graph_slam_ros.tools.simulation import false_closures as generator
 from graph_slam_ros.tools.simulation.bag import ODOMETRY_TOPIC, recorded_names
 from graph_slam_ros.tools.simulation.draft import Draft, WrongLine, WrongMessage
 from graph_slam_ros.tools.simulation.drive import Drive
-from graph_slam_ros.tools.simulation.false_closures import Closures
 from graph_slam_ros.tools.simulation.message_faults import MESSAGE_KINDS
 from graph_slam_ros.tools.simulation.options import filled, option, options_of, random
 from graph_slam_ros.tools.simulation.pose_graph import values_of
-from graph_slam_ros.tools.simulation.recording import CLOSURES_TOPIC, LANDMARKS_TOPIC, Recording, places, space_of
-from graph_slam_ros.typing import Array
+from graph_slam_ros.tools.simulation.recording import (
+    CLOSURES_TOPIC,
+    LANDMARKS_TOPIC,
+    Recording,
+    moved_from,
+    places,
+    space_of,
+)
+from graph_slam_ros.typing import Array, Index
 
 _OFTEN = 3  # times that a landmark must be seen, and seen again later, to be worth a fault
 _STREAMS = 1  # the world itself is drawn from the seed alone, true closures from stream 0
@@ -46,11 +51,10 @@ def false_closures(
     group: int = option(generator.GROUP, "pairs of poses in a group", "", 1, 1e4),
 ) -> None:
     """Closures between different places; one that agrees with the truth is drawn again."""
-    if not len(draft.closures):
-        raise GraphSlamError("false_closures: there is no true one to be like (simulate records some with --closures)")
-    wanted = count or generator.count_for(rate, len(draft.closures))
-    found = generator.false_closures(draft.truth[draft.places], draft.closures.root, wanted, policy, rng, group)
-    draft.add_closures(generator.Closures(draft.places[found.ends], found.measured, found.root), "false_closures")
+    covariances = np.reshape([c.covariance for c in draft.closures], (-1, draft.space.dof, draft.space.dof))
+    roots, at = Gaussian.from_covariance(covariances).sqrt_information, places(draft.truth)
+    ends, *false = generator.false_closures(draft.truth[at], roots, rng, policy, rate, count, group)
+    draft.add_closures(at[ends], *false, "false_closures")
 
 
 def wrong_ids(draft: Draft, rng: Generator, rate: float = option(0.05, "of all sightings", "", 0, 1)) -> None:
@@ -141,7 +145,7 @@ def slip(
     slipped = [tuple(poses[first].tolist())]
     for step in steps.tolist():
         slipped.append(group.compose(slipped[-1], tuple(step)))
-    draft.odometry = _moved_after(draft, last, slipped[-1])
+    draft.odometry = moved_from(draft.odometry, last, slipped[-1])
     draft.odometry[first : last + 1] = slipped
     draft.twist = draft.twist.copy()
     draft.twist[first + 1 : last + 1, :n] *= factor
@@ -161,7 +165,7 @@ def carried(
         raise GraphSlamError(f"carried: after {at:g} of the whole it comes no farther than {away.max():.1f} m")
     last = first + int(np.argmax(away >= distance_m))
     lifted = draft.odometry[first].copy()
-    draft.odometry = _moved_after(draft, last, tuple(lifted.tolist()))
+    draft.odometry = moved_from(draft.odometry, last, tuple(lifted.tolist()))
     draft.odometry[first:last] = lifted
     draft.twist = draft.twist.copy()
     draft.twist[first + 1 : last + 1] = 0.0
@@ -184,7 +188,7 @@ def jump(
     turned = [0.0] * (space.dof - space.dimensions - 1) + [turn_rad]
     ahead = [ahead_m, left_m, 0.0][: space.dimensions]
     before = tuple(draft.odometry[later].tolist())
-    draft.odometry = _moved_after(draft, later, space.group.retract(before, (*ahead, *turned)))
+    draft.odometry = moved_from(draft.odometry, later, space.group.retract(before, (*ahead, *turned)))
     draft.spoil_odometry([later], "jump")
 
 
@@ -193,16 +197,6 @@ KINDS = {
     for put in (false_closures, wrong_ids, swapped_ids, moved_landmarks, outliers, slip, carried, jump)
 }
 """Faults of worlds, whose truth is known."""
-
-
-def _moved_after(draft: Draft, pose: int, to: Sequence[float]) -> Array:
-    """Odometry, of which a pose and all after it are moved together so that it comes to lie there."""
-    group, poses = draft.space.group, draft.odometry
-    motion = group.compose(tuple(to), group.inverse(tuple(poses[pose].tolist())))
-    moved = poses.copy()
-    identity = tuple(np.zeros((draft.space.dof, len(poses) - pose)))
-    moved[pose:] = np.stack(group.retract(group.compose(motion, tuple(poses[pose:].T)), identity), axis=1)
-    return moved
 
 
 def _random_subset(rng: Generator, count: int, rate: float) -> list[int]:
@@ -294,8 +288,8 @@ def faulty_recording(recording: Recording, faults: Sequence[Fault], seed: int) -
         [s for one in recording.seen for s in one.sightings],
         np.repeat(np.array([at[one.stamp_ns] for one in recording.seen], dtype=np.int64), sizes),
         recording.landmarks,
-        _closures_of(recording, space, at),
-        places(recording.T_world_base),
+        recording.stamps_ns,
+        list(recording.closures),
     )
     put_faults(draft, faults, seed)
     starts = np.cumsum([0, *sizes]).tolist()
@@ -303,16 +297,16 @@ def faulty_recording(recording: Recording, faults: Sequence[Fault], seed: int) -
         replace(one, sightings=tuple(draft.sightings[start:end]))
         for one, (start, end) in zip(recording.seen, pairwise(starts), strict=True)
     )
-    closures, place = _recorded_closures(recording, draft)
+    closures = tuple(sorted(draft.closures, key=lambda closure: closure.stamp_ns))
     faulty = replace(recording, T_odom_base=draft.odometry, twist=draft.twist, seen=seen, closures=closures)
 
     def message(what: str, k: int) -> tuple[str, int, int | str, str]:
         if what == "odometry":
             return ODOMETRY_TOPIC, int(recording.stamps_ns[k]), "", ""
         if what == "closure":
-            one = closures[place[k]]
-            first = next(j for j, other in enumerate(closures) if other.stamp_ns == one.stamp_ns)
-            return CLOSURES_TOPIC, one.stamp_ns, place[k] - first, str(one.from_stamp_ns)
+            one = draft.closures[k]
+            before = sum(other.stamp_ns == one.stamp_ns for other in draft.closures[:k])  # in its message
+            return CLOSURES_TOPIC, one.stamp_ns, before, str(one.from_stamp_ns)
         of = int(np.searchsorted(starts, k, side="right")) - 1
         return LANDMARKS_TOPIC, recording.seen[of].stamp_ns, k - starts[of], names[draft.sightings[k].id]
 
@@ -322,29 +316,6 @@ def faulty_recording(recording: Recording, faults: Sequence[Fault], seed: int) -
         for (what, k), kinds in draft.wrong.items()
     ]
     return faulty, sorted(rows, key=lambda row: (row.stamp_ns, row.topic, row.index or 0))
-
-
-def _closures_of(recording: Recording, space: Geometry, at: Mapping[int, int]) -> Closures:
-    n, d = len(recording.closures), space.dof
-    ends = [(at[c.from_stamp_ns], at[c.stamp_ns]) for c in recording.closures]
-    covariances = np.reshape([c.covariance for c in recording.closures], (n, d, d))
-    root = Gaussian.from_covariance(covariances).sqrt_information if n else np.empty((0, d, d))
-    measured = np.reshape([c.T_from_base for c in recording.closures], (n, space.pose.size))
-    return Closures(np.array(ends, dtype=np.int64).reshape(n, 2), measured, root)
-
-
-def _recorded_closures(recording: Recording, draft: Draft) -> tuple[tuple[Closure, ...], list[int]]:
-    """All closures in order of their later stamp, and the place there of each of the draft's."""
-    found, new = list(recording.closures), draft.closures
-    for k in range(len(found), len(new)):
-        earlier, later = recording.stamps_ns[new.ends[k]].tolist()
-        covariance = np.linalg.inv(new.root[k].T @ new.root[k])
-        flat = tuple((0.5 * (covariance + covariance.T)).ravel().tolist())
-        found.append(Closure(later, earlier, CLOSURES_TOPIC, tuple(new.measured[k].tolist()), flat))
-    order = sorted(range(len(found)), key=lambda k: found[k].stamp_ns)
-    place = np.empty(len(order), dtype=np.int64)
-    place[order] = np.arange(len(order))
-    return tuple(found[k] for k in order), place.tolist()
 
 
 def faulty_graph(file: G2oFile, truth: Array, faults: Sequence[Fault], seed: int) -> tuple[G2oFile, list[WrongLine]]:
@@ -378,18 +349,18 @@ def faulty_graph(file: G2oFile, truth: Array, faults: Sequence[Fault], seed: int
     steps = np.flatnonzero(is_closure & (np.abs(ends[:, 1] - ends[:, 0]) == 1))
     is_closure[steps[np.unique(ends[steps].max(axis=1), return_index=True)[1]]] = False
     true = truth[graph.offset.values[poses][:, None] + np.arange(space.pose.size)]
-    closures = Closures(ends[is_closure], edges.measured[is_closure], edges.sqrt_information[is_closure])
-    draft, first = Draft(space, true, true, true, [], ends[:0, 0], {}, closures, np.arange(len(poses))), len(closures)
-    for fault in faults:
+    roots = edges.sqrt_information[is_closure]
+    added: dict[int, Index] = {}
+    for k, fault in enumerate(faults):
         if fault.kind != "false_closures":
             raise GraphSlamError(f"{fault.kind}: a graph has no messages and no drive: it takes false_closures alone")
-    put_faults(draft, faults, seed)
-    false = draft.closures.ends[first:], draft.closures.measured[first:], draft.closures.root[first:]
-    added = graph.add_edges(space.relative_pose, poses[false[0]], false[1], Gaussian(false[2]), "closures")
-    line_of = _lines(file)
-    rows = []
-    for edge, (i, j) in zip(added.tolist(), poses[false[0]].tolist(), strict=True):
-        rows.append(WrongLine(line_of[edge], tag_of(space.relative_pose), file.ids[i], file.ids[j], "false_closures"))
+        at, z, root = generator.false_closures(true, roots, random(seed, _STREAMS, k), **fault.options)
+        ids = graph.add_edges(space.relative_pose, poses[at], z, Gaussian(root), "closures")
+        added |= dict(zip(ids.tolist(), poses[at], strict=True))
+        roots = np.concatenate([roots, root])
+    line_of, tag = _lines(file), tag_of(space.relative_pose)
+    ends_of = {edge: (file.ids[i], file.ids[j]) for edge, (i, j) in added.items()}
+    rows = [WrongLine(line_of[edge], tag, *ends, "false_closures") for edge, ends in ends_of.items()]
     return file, sorted(rows, key=lambda row: row.line)
 
 

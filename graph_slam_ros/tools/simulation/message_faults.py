@@ -1,6 +1,7 @@
 """Faults of recordings, drivers, clocks and frames, put into messages: what ``graph_slam check`` finds."""
 
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Iterator
 from copy import deepcopy
 
 import numpy as np
@@ -12,12 +13,12 @@ from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.messages.to_msg import encode, transform
 from graph_slam_ros.tools.simulation.drive import DETECTIONS, POINTS, TRANSFORMS, Drive, Message, Sightings
 from graph_slam_ros.tools.simulation.options import option
-from graph_slam_ros.tools.simulation.recording import CLOSURES_TOPIC
-from graph_slam_ros.typing import Array
+from graph_slam_ros.tools.simulation.recording import CLOSURES_TOPIC, integrate, moved_from
 
 _IMU = "sensor_msgs/msg/Imu"
 _POSES = ("nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
 _OF_THE_ROBOT = (_IMU, "sensor_msgs/msg/NavSatFix", DETECTIONS, POINTS, TRANSFORMS, *_POSES)
+_BEGIN, _LASTING = "when, as a part of the messages: 0 the first, 1 the last", "for how long, as a part of the messages"
 
 
 # -- odometry ----------------------------------------------------------------------------------------------------------
@@ -37,12 +38,6 @@ def out_of_order(drive: Drive, rng: Generator) -> None:
         m.stamp_ns -= NS // 5 if rng.random() < 0.02 else 0
 
 
-def gap(drive: Drive, _rng: Generator) -> None:
-    """Odometry of which a stretch of 5 s is lost, after a third of the drive."""
-    at_ns = np.quantile(drive.odometry_ns, 0.33)
-    drive.drop([m for m in drive.odometry if at_ns < m.stamp_ns <= at_ns + 5 * NS])
-
-
 def slow_odometry(drive: Drive, _rng: Generator, hz: float = option(2.0, "so many a second", "Hz", 1e-3, 1e4)) -> None:
     """Odometry of which few messages are left."""
     number, out = -1, []
@@ -53,53 +48,22 @@ def slow_odometry(drive: Drive, _rng: Generator, hz: float = option(2.0, "so man
     drive.drop(out)
 
 
-def _chained(first: Array, moved: Array, turned: Array) -> Array:
-    """Poses (n + 1, 7) of steps: motions (n, 3) and rotation vectors (n, 3)."""
-    rotations = np.stack(so3.exp(tuple(turned.T)), axis=1)
-    poses = [tuple(first.tolist())]
-    for at, q in zip(moved.tolist(), rotations.tolist(), strict=True):
-        x, y, z, *turn = se3.compose(poses[-1], (*at, *q))
-        norm = sum(n * n for n in turn) ** 0.5
-        poses.append((x, y, z, *(n / norm for n in turn)))
-    return np.array(poses)
-
-
-def _steps(poses: Array) -> tuple[Array, Array]:
-    motion = np.stack(se3.between(tuple(poses[:-1].T), tuple(poses[1:].T)), axis=1)
-    return motion[:, :3], np.stack(so3.log(tuple(motion[:, 3:].T)), axis=1)
-
-
-def _twists(drive: Drive, change: Callable[[Array, Array, Array], tuple[Array, Array]]) -> None:
-    for m, pose in zip(drive.odometry, drive.poses, strict=True):
-        v, w = m.content.twist.twist.linear, m.content.twist.twist.angular
-        linear, angular = change(np.array([v.x, v.y, v.z]), np.array([w.x, w.y, w.z]), pose)
-        v.x, v.y, v.z = map(float, linear)
-        w.x, w.y, w.z = map(float, angular)
-
-
 def wrong_scale(
     drive: Drive,
     _rng: Generator,
     distance: float = option(1.05, "distance in odometry for each metre driven", "", -1e6, 1e6),
     turn: float = option(1.0, "and turn for each radian turned", "", -1e3, 1e3),
-    begin: float = option(0.0, "when, as a part of the messages: 0 the first, 1 the last", "", 0, 1),
-    lasting: float = option(1.0, "for how long, as a part of the messages", "", 0, 1),
+    begin: float = option(0.0, _BEGIN, "", 0, 1),
+    lasting: float = option(1.0, _LASTING, "", 0, 1),
 ) -> None:
     """Odometry that drives and turns more than the robot: wheels, track width, units, sign."""
     poses = drive.poses
-    moved, turned = _steps(poses)
     number = np.arange(len(poses))
-    first, last = begin * len(poses), (begin + lasting) * len(poses)
-    is_wrong = ((number >= first) & (number <= last))[:, None]
-    ways, turns = np.where(is_wrong, distance, 1.0), np.where(is_wrong, turn, 1.0)
-    drive.poses = _chained(poses[0], moved * ways[1:], turned * turns[1:])
-    factors = iter(zip(ways[:, 0].tolist(), turns[:, 0].tolist(), strict=True))
-
-    def changed(v: Array, w: Array, _: Array) -> tuple[Array, Array]:
-        of_way, of_turn = next(factors)
-        return v * of_way, w * of_turn
-
-    _twists(drive, changed)
+    is_wrong = (number >= begin * len(poses)) & (number <= (begin + lasting) * len(poses))
+    factors = np.stack([np.where(is_wrong, of, 1.0) for of in (distance, turn)], axis=1).repeat(3, axis=1)
+    steps = np.stack(se3.local(tuple(poses[1:].T), tuple(poses[:-1].T)), axis=1)
+    drive.poses = integrate(tuple(poses[0].tolist()), steps * factors[1:])
+    drive.twists = drive.twists * factors
 
 
 def wrong_twist(
@@ -110,12 +74,10 @@ def wrong_twist(
     axes: str = option("base", "along the axes of this frame", choices=("base", "odom")),
 ) -> None:
     """Odometry whose twist is in other units or axes than its pose."""
-
-    def changed(v: Array, w: Array, pose: Array) -> tuple[Array, Array]:
-        along = np.array(so3.act(tuple(pose[3:]), tuple(v))) if axes == "odom" else v
-        return along * linear, w * angular
-
-    _twists(drive, changed)
+    twists = drive.twists
+    if axes == "odom":
+        twists[:, :3] = np.stack(so3.act(tuple(drive.poses[:, 3:].T), tuple(twists[:, :3].T)), axis=1)
+    drive.twists = twists * [*[linear] * 3, *[angular] * 3]
 
 
 def twist_variance(
@@ -128,24 +90,11 @@ def twist_variance(
         m.content.twist.covariance = covariance
 
 
-def standing(drive: Drive, _rng: Generator) -> None:
-    """Odometry that is not connected: it always says the same pose."""
-    drive.poses = np.repeat(drive.poses[:1], len(drive.odometry), axis=0)
-    _twists(drive, lambda v, w, _: (0.0 * v, 0.0 * w))
-
-
-def _moved(poses: Array, at: int, T: se3.Pose) -> Array:
-    """Poses of which those from a number on are moved together, so that the first of them lies there."""
-    motion = se3.compose(T, se3.inverse(tuple(poses[at].tolist())))
-    later = np.stack(se3.compose(motion, tuple(poses[at:].T)), axis=1)
-    return np.concatenate([poses[:at], later])
-
-
 def restarted(drive: Drive, _rng: Generator) -> None:
     """Odometry whose driver is restarted half-way, and begins at zero again."""
     poses = drive.poses
     first = min(round(0.5 * len(poses)), len(poses) - 1)
-    moved = _moved(poses, first, se3.IDENTITY)
+    moved = moved_from(poses, first, se3.IDENTITY)
     moved[first] = se3.IDENTITY
     drive.poses = moved
 
@@ -156,7 +105,7 @@ def corrected(drive: Drive, rng: Generator) -> None:
     for at_ns in np.arange(stamps_ns[0] + 20.0 * NS, stamps_ns[-1], 20.0 * NS):
         at = int(np.searchsorted(stamps_ns, at_ns))
         by = (*(0.3 * rng.standard_normal(2)), 0.0, *so3.exp((0.0, 0.0, 0.05 * rng.normal())))
-        poses = _moved(poses, at, se3.compose(tuple(poses[at].tolist()), by))
+        poses = moved_from(poses, at, se3.compose(tuple(poses[at].tolist()), by))
     drive.poses = poses
 
 
@@ -185,23 +134,21 @@ def not_a_number(drive: Drive, rng: Generator) -> None:
 # -- recordings, landmarks and the IMU ---------------------------------------------------------------------------------
 
 
-def brief(drive: Drive, _rng: Generator) -> None:
-    """A recording of the first tenth of a drive."""
-    first_ns, last_ns = drive.messages[0].log_ns, drive.messages[-1].log_ns
-    end_ns = first_ns + 0.1 * (last_ns - first_ns)
-    drive.drop([m for m in drive.messages if m.log_ns > end_ns])
-
-
 def cut_off(drive: Drive, _rng: Generator) -> None:
     """A file that ends too early, as where a disk was full or the power failed."""
     drive.part_of_file = 0.7
 
 
 def missing(
-    drive: Drive, _rng: Generator, what: str = option("landmarks", "which", choices=("landmarks", "odometry"))
+    drive: Drive,
+    _rng: Generator,
+    what: str = option("landmarks", "which messages", choices=("landmarks", "odometry", "all")),
+    begin: float = option(0.0, _BEGIN, "", 0, 1),
+    lasting: float = option(1.0, _LASTING, "", 0, 1),
 ) -> None:
-    """A recording without one of its topics."""
-    drive.drop(drive.landmarks if what == "landmarks" else drive.odometry)
+    """A recording without its landmarks, its odometry or all, for a while or to the end."""
+    messages = {"landmarks": drive.landmarks, "odometry": drive.odometry, "all": drive.messages}[what]
+    drive.drop(messages[round(begin * len(messages)) : round((begin + lasting) * len(messages))])
 
 
 def unreadable(drive: Drive, _rng: Generator) -> None:
@@ -234,26 +181,20 @@ def other_tf(
 
 def same_ids(drive: Drive, rng: Generator) -> None:
     """A fifth of the messages in which two landmarks have one id."""
-    for m in drive.landmarks:
-        seen = Sightings(m)
+    for seen in _seen(drive):
         if len(seen.ids) > 1 and rng.random() < 0.2:
             seen.ids[1] = seen.ids[0]
-            seen.store()
 
 
-def clock_offset(drive: Drive, _rng: Generator, seconds: float = option(0.1, "by so much", "s", -1e10, 1e10)) -> None:
-    """Landmarks that are stamped too late, or too early where it is negative."""
-    drive.restamp(drive.landmarks, lambda t: t + round(seconds * NS))
-
-
-def clock_jump(drive: Drive, _rng: Generator, seconds: float = option(0.2, "by so much", "s", -1e5, 1e5)) -> None:
-    """Landmarks whose clock is set half-way."""
-    drive.restamp(drive.landmarks, lambda t: t + np.where(t > np.quantile(t, 0.5), round(seconds * NS), 0))
-
-
-def uptime(drive: Drive, _rng: Generator) -> None:
-    """Landmarks that are stamped by the time since their computer was started."""
-    drive.restamp(drive.landmarks, lambda t: t - t[0] + 1000 * NS)
+def clock_offset(
+    drive: Drive,
+    _rng: Generator,
+    seconds: float = option(0.1, "by so much", "s", -1e10, 1e10),
+    begin: float = option(0.0, _BEGIN, "", 0, 1),
+) -> None:
+    """Landmarks that are stamped too late, or too early where it is negative, all the time or from some time on."""
+    later = drive.landmarks[round(begin * len(drive.landmarks)) :]
+    drive.restamp(later, lambda t: t + round(seconds * NS))
 
 
 def zero_stamps(drive: Drive, rng: Generator) -> None:
@@ -293,10 +234,12 @@ def two_parents(drive: Drive, _rng: Generator) -> None:
         drive.add_transform(parent, "camera_link", se3.IDENTITY)
 
 
-def _each(drive: Drive, change: Callable[[Sightings, Message], Array | None], begin: float = 0.0) -> None:
+def _seen(drive: Drive, begin: float = 0.0) -> Iterator[Sightings]:
+    """The landmarks of each message from a part of the messages on. What is changed in them is written back."""
     for m in drive.landmarks[round(begin * len(drive.landmarks)) :]:
         seen = Sightings(m)
-        seen.store(change(seen, m))
+        yield seen
+        seen.store()
 
 
 def wrong_mount(
@@ -305,17 +248,14 @@ def wrong_mount(
     yaw_deg: float = option(5.0, "turned to the left", "degrees", -180, 180),
     x_m: float = option(0.0, "ahead of where it should be", "m", -10, 10),
     y_m: float = option(0.0, "to the left of it", "m", -10, 10),
-    begin: float = option(0.0, "when, as a part of the messages: 0 the first, 1 the last", "", 0, 1),
+    begin: float = option(0.0, _BEGIN, "", 0, 1),
 ) -> None:
     """A sensor that is turned on the robot, or sits elsewhere, and nobody says so."""
     angle = -np.radians(yaw_deg)
     turn = np.array([[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]])
-
-    def change(seen: Sightings, _: Message) -> Array:
-        seen.points = (seen.points - [x_m, y_m, 0.0]) @ turn.T
-        return turn
-
-    _each(drive, change, begin)
+    for seen in _seen(drive, begin):
+        seen.points = seen.points - [x_m, y_m, 0.0]
+        seen.turn(turn)
 
 
 _AXES = {
@@ -323,24 +263,13 @@ _AXES = {
     "exchanged": [[0, 1, 0], [1, 0, 0], [0, 0, 1]],
     "optical": [[0, -1, 0], [0, 0, -1], [1, 0, 0]],
     "backwards": [[-1, 0, 0], [0, -1, 0], [0, 0, 1]],
-    "left": [[0, 1, 0], [-1, 0, 0], [0, 0, 1]],
-    "right": [[0, -1, 0], [1, 0, 0], [0, 0, 1]],
 }
 
 
-def wrong_axes(
-    drive: Drive,
-    _rng: Generator,
-    how: str = option("mirrored", "which", choices=("mirrored", "exchanged", "optical", "backwards", "left", "right")),
-) -> None:
+def wrong_axes(drive: Drive, _rng: Generator, how: str = option("mirrored", "which", choices=tuple(_AXES))) -> None:
     """Landmarks in other axes than x ahead and y to the left."""
-    turn = np.array(_AXES[how], dtype=float)
-
-    def change(seen: Sightings, _: Message) -> Array:
-        seen.points = seen.points @ turn.T
-        return turn
-
-    _each(drive, change)
+    for seen in _seen(drive):
+        seen.turn(np.array(_AXES[how], dtype=float))
 
 
 def wrong_units(
@@ -350,13 +279,12 @@ def wrong_units(
     of: str = option("lengths", "which numbers", choices=("lengths", "bearings")),
 ) -> None:
     """Landmarks in other units than metres or radians."""
-    for m in drive.landmarks:
-        seen = Sightings(m)
-        if of == "bearings":
-            seen.scale_bearings(factor)
-        else:
-            seen.points = seen.points * factor
-            seen.store()
+    if of == "bearings":
+        for m in drive.landmarks:
+            Sightings(m).scale_bearings(factor)
+        return
+    for seen in _seen(drive):
+        seen.points = seen.points * factor
 
 
 def tiny_covariance(drive: Drive, _rng: Generator) -> None:
@@ -367,25 +295,18 @@ def tiny_covariance(drive: Drive, _rng: Generator) -> None:
 
 def noisy(drive: Drive, rng: Generator) -> None:
     """Landmarks that are eight times worse than their covariance."""
-
-    def change(seen: Sightings, _: Message) -> None:
+    for seen in _seen(drive):
         sigmas = np.maximum(seen.sigmas, 0.05)[:, None] * [8.0, 8.0, 0.0]
         seen.points = seen.points + sigmas * rng.standard_normal(seen.points.shape)
-
-    _each(drive, change)
 
 
 def track_ids(drive: Drive, _rng: Generator, sightings: int = option(2, "of one id", "", 1, 1e6)) -> None:
     """Landmarks with ids of tracks: after a few sightings a new one."""
-    times: dict[str, int] = {}
+    times = Counter[str]()
     names: dict[tuple[str, int], str] = {}
-
-    def change(seen: Sightings, _: Message) -> None:
-        for k, name in enumerate(seen.ids):
-            times[name] = times.get(name, 0) + 1
-            seen.ids[k] = names.setdefault((name, times[name] // sightings), str(len(names)))
-
-    _each(drive, change)
+    for seen in _seen(drive):
+        times.update(seen.ids)
+        seen.ids = [names.setdefault((name, times[name] // sightings), str(len(names))) for name in seen.ids]
 
 
 def random_ids(drive: Drive, rng: Generator, rate: float = option(1.0, "of all sightings", "", 0, 1)) -> None:
@@ -393,23 +314,17 @@ def random_ids(drive: Drive, rng: Generator, rate: float = option(1.0, "of all s
     names = sorted({name for m in drive.landmarks for name in Sightings(m).ids})
     if len(names) < 2:
         raise GraphSlamError("random_ids: needs two ids")
-
-    def change(seen: Sightings, _: Message) -> None:
+    for seen in _seen(drive):
         seen.ids = [names[rng.integers(len(names))] if rng.random() < rate else name for name in seen.ids]
-
-    _each(drive, change)
 
 
 def new_ids(drive: Drive, _rng: Generator, seconds: float = option(15.0, "how long", "s", 0.1, 1e6)) -> None:
     """Landmarks that nobody recognises: after a time all have new ids."""
     first_ns = drive.landmarks[0].stamp_ns
     names: dict[tuple[str, int], str] = {}
-
-    def change(seen: Sightings, m: Message) -> None:
-        period = int((m.stamp_ns - first_ns) / (seconds * NS))
+    for seen in _seen(drive):
+        period = int((seen.stamp_ns - first_ns) / (seconds * NS))
         seen.ids = [names.setdefault((name, period), str(len(names))) for name in seen.ids]
-
-    _each(drive, change)
 
 
 def wrong_gyro(
@@ -435,18 +350,11 @@ def wrong_gyro(
         m.stamp_ns += round(late_s * NS)
 
 
-def blind(drive: Drive, _rng: Generator) -> None:
-    """A sensor that sees nothing after a quarter of the drive."""
-    at_ns = np.quantile(drive.odometry_ns, 0.25)
-    drive.drop([m for m in drive.landmarks if m.stamp_ns >= at_ns])
-
-
 _KINDS = (
-    *(recorded_twice, out_of_order, gap, slow_odometry, wrong_scale, wrong_twist, twist_variance),
-    *(standing, restarted, corrected, other_publisher, not_a_number),
-    *(brief, cut_off, missing, unreadable, other_tf, same_ids),
-    *(clock_offset, clock_jump, uptime, zero_stamps, clock_set_back, wrong_frames, two_parents),
-    *(wrong_mount, wrong_axes, wrong_units, tiny_covariance, noisy, track_ids, random_ids, new_ids, wrong_gyro, blind),
+    *(recorded_twice, out_of_order, slow_odometry, wrong_scale, wrong_twist, twist_variance),
+    *(restarted, corrected, other_publisher, not_a_number, missing, cut_off, unreadable, other_tf, same_ids),
+    *(clock_offset, zero_stamps, clock_set_back, wrong_frames, two_parents),
+    *(wrong_mount, wrong_axes, wrong_units, tiny_covariance, noisy, track_ids, random_ids, new_ids, wrong_gyro),
 )
 MESSAGE_KINDS = {put.__name__: put for put in _KINDS}
 """Faults that any recording can have; those of worlds (``faults.KINDS``) need its truth."""

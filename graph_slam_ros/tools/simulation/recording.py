@@ -84,6 +84,14 @@ def _integrate_planar(start: Numbers, steps: Array) -> Array:
     return np.stack([x, y, se2.wrap(theta)], axis=1)
 
 
+def moved_from(poses: Array, number: int, to: Sequence[float]) -> Array:
+    """Poses of which those from a number on are moved together, so that the first of them lies there."""
+    space, later = space_of(poses[0]), tuple(poses[number:].T)
+    motion = space.group.compose(tuple(to), space.group.inverse(tuple(poses[number].tolist())))
+    moved = space.group.retract(space.group.compose(motion, later), tuple(np.zeros((space.dof, len(poses) - number))))
+    return np.concatenate([poses[:number], np.stack(moved, axis=1)])
+
+
 def accumulated(steps: Array, per_tick: Array) -> Array:
     """Covariance (n + 1, d, d) of the poses that n steps lead to, each in its tangent space; the first is zero."""
     n, d = steps.shape

@@ -143,12 +143,12 @@ def test_faults_can_be_put_into_a_recording_of_a_user_but_not_those_that_need_th
         (["--fault", "slip"], "needs the truth of a world"),
         (["--fault", "wrong_units:of=bearings"], "the landmarks of this recording have no bearings"),
         ([], "no --fault"),
-        (["--fault", "gap", "--poses", "5"], "no use for --poses"),
+        (["--fault", "missing", "--poses", "5"], "no use for --poses"),
     ):
         assert main(["simulate", str(drive), "--out", str(tmp_path / "b.mcap"), *words]) == 2
         assert why in capsys.readouterr().err
-    assert main(["simulate", str(drive), "--out", str(drive), "--fault", "gap", "--force"]) == 2
-    assert main(["simulate", "city", "--out", str(tmp_path / "c.g2o"), "--fault", "gap"]) == 2
+    assert main(["simulate", str(drive), "--out", str(drive), "--fault", "missing", "--force"]) == 2
+    assert main(["simulate", "city", "--out", str(tmp_path / "c.g2o"), "--fault", "missing"]) == 2
     assert "a graph has no messages" in capsys.readouterr().err
 
 
@@ -251,7 +251,7 @@ def test_each_finding_is_planted():
 @pytest.mark.parametrize("seconds", times([0.2], [0.2, -0.2]))
 def test_a_clock_that_is_set_on_the_way_is_found_by_the_fit_and_by_the_times_of_recording(laps, tmp_path, seconds):
     faulty = Drive(laps)
-    spoil_messages(faulty, [Fault.named("clock_jump", seconds=seconds)], seed=1)
+    spoil_messages(faulty, [Fault.named("clock_offset", seconds=seconds, begin=0.5)], seed=1)
     faulty.write(tmp_path / "faulty.mcap")
     by = {one.severity: one for one in check(tmp_path / "faulty.mcap").findings if one.code == "clock_jump"}
     assert by["warning"].value == pytest.approx(-seconds, abs=0.08)

@@ -116,7 +116,7 @@ def test_a_recording_that_is_wrong_in_itself_is_not_calibrated_and_says_what_is_
 def test_a_robot_that_stood_says_for_each_parameter_what_to_drive(tmp_path, told):
     bag, still = str(tmp_path / "drive.mcap"), str(tmp_path / "still.mcap")
     write_bag(simulate("warehouse", 1, aisles=2, aisle_m=4.0, laps=1), bag)
-    assert main(["simulate", bag, "--out", still, "--fault", "standing"]) == 0
+    assert main(["simulate", bag, "--out", still, "--fault", "wrong_scale:distance=0,turn=0"]) == 0
     code, out, _ = told("calibrate", still, "--json")
     assert code == 3
     found = json.loads(out)["parameters"]

@@ -196,8 +196,10 @@ def test_what_agrees_with_the_truth_is_no_false_closure(world):
         vague = root / (4.0 if policy == "local" else 10.0)
 
         def off(margin, policy=policy, vague=vague):
-            found = false_closures(truth, vague[None], 300, policy, np.random.default_rng(1), margin=margin)
-            return disagreement(truth, found.ends, found.measured, vague)
+            rng = np.random.default_rng(1)
+            return disagreement(
+                truth, *false_closures(truth, vague[None], rng, policy, count=300, margin=margin)[:2], vague
+            )
 
         assert off(4.0).min() > 4.0 * chi2.ppf(0.9999, dof)
         assert (off(0.0) < 4.0 * chi2.ppf(0.9999, dof)).any(), "or the test shows nothing"
