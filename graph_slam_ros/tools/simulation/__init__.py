@@ -17,7 +17,7 @@ from graph_slam_ros.tools.simulation.faults import KINDS, Fault, faulty_graph, f
 from graph_slam_ros.tools.simulation.instruments import with_instruments
 from graph_slam_ros.tools.simulation.message_faults import MESSAGE_KINDS
 from graph_slam_ros.tools.simulation.options import filled, options_of
-from graph_slam_ros.tools.simulation.pose_graph import GRAPH_WORLDS, city_graph, sphere_graph, write_graph
+from graph_slam_ros.tools.simulation.pose_graph import GRAPH_WORLDS, city_graph, sphere_graph
 from graph_slam_ros.tools.simulation.recording import Recording, measurements, with_closures
 
 WORLDS = {
@@ -83,6 +83,5 @@ __all__ = [
     "with_instruments",
     "write_bag",
     "write_faulty_bag",
-    "write_graph",
     "write_table",
 ]

@@ -5,8 +5,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from graph_slam_ros.cli import arguments, console
 from graph_slam_ros.cli.usage import CommandParser
 from graph_slam_ros.errors import GraphSlamError, did_you_mean, similar_file
@@ -20,7 +18,6 @@ from graph_slam_ros.optimization import optimize
 from graph_slam_ros.tools import simulation
 from graph_slam_ros.tools.simulation import GRAPH_WORLDS, WORLDS, Fault, WrongLine, WrongMessage
 from graph_slam_ros.tools.simulation.options import lines_about
-from graph_slam_ros.tools.simulation.pose_graph import values_of
 
 
 def simulate_options(sub: CommandParser) -> None:
@@ -108,14 +105,14 @@ def _write_graph(args: argparse.Namespace, faults: list[Fault], truth_file: Path
     else:
         file = read_g2o(Path(args.scenario))
         solver = optimize(file).solver
-        truth = np.concatenate([solver.estimate([v])[0] for v in range(file.graph.vertex_count)])
+        truth = solver.values
     out, wrong = simulation.faulty_graph(file, truth, faults, args.seed) if faults else (file, [])
-    write_g2o(args.out, out, values_of(out.graph, out.graph.initial.values))
+    write_g2o(args.out, out)
     console.show(f"wrote {args.out}")
     if faults:
         _write_table(args.out, WrongLine, wrong, "edges")
     if world:
-        write_trajectory(truth_file, file, values_of(file.graph, truth))
+        write_trajectory(truth_file, file, lambda vertices: poses[vertices])
         console.show(f"wrote {truth_file}: the true poses")
 
 

@@ -26,7 +26,6 @@ from graph_slam_ros.tools.simulation.draft import Draft, WrongLine, WrongMessage
 from graph_slam_ros.tools.simulation.drive import Drive
 from graph_slam_ros.tools.simulation.message_faults import MESSAGE_KINDS
 from graph_slam_ros.tools.simulation.options import filled, option, options_of, random
-from graph_slam_ros.tools.simulation.pose_graph import values_of
 from graph_slam_ros.tools.simulation.recording import (
     CLOSURES_TOPIC,
     LANDMARKS_TOPIC,
@@ -53,8 +52,8 @@ def false_closures(
     """Closures between different places; one that agrees with the truth is drawn again."""
     covariances = np.reshape([c.covariance for c in draft.closures], (-1, draft.space.dof, draft.space.dof))
     roots, at = Gaussian.from_covariance(covariances).sqrt_information, places(draft.truth)
-    ends, *false = generator.false_closures(draft.truth[at], roots, rng, policy, rate, count, group)
-    draft.add_closures(at[ends], *false, "false_closures")
+    ends, measured, root = generator.false_closures(draft.truth[at], roots, rng, policy, rate, count, group)
+    draft.add_closures(at[ends], measured, root, "false_closures")
 
 
 def wrong_ids(draft: Draft, rng: Generator, rate: float = option(0.05, "of all sightings", "", 0, 1)) -> None:
@@ -367,7 +366,7 @@ def faulty_graph(file: G2oFile, truth: Array, faults: Sequence[Fault], seed: int
 def _lines(file: G2oFile) -> dict[int, int]:
     """The line of each edge in the file that is written, from 1."""
     graph, tags = file.graph, {tag_of(edge) for edge in file.graph.tables}
-    text = graph_lines(file, values_of(graph, graph.initial.values))
+    text = graph_lines(file, lambda vertices: np.zeros((len(vertices), 1)))  # whatever the values are
     lines = [number for number, line in enumerate(text, start=1) if line.split()[0] in tags]
     labels = np.empty(graph.edge_count, dtype=np.int64)
     for table in graph.tables.values():

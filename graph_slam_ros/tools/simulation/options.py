@@ -4,55 +4,28 @@ A function with options is called with some of them; ``checked`` fills in the ot
 """
 
 import functools
-import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import replace
 from inspect import signature
 from typing import Any
 
 from numpy.random import PCG64, Generator, SeedSequence
 
+from graph_slam_ros.config.parameter import Parameter
 from graph_slam_ros.errors import GraphSlamError, did_you_mean
 
-_ARTICLE = {bool: "true or false", int: "an integer", float: "a number", str: "a text"}
+
+def option(
+    default: Any, meaning: str, unit: str = "", low: float = 0.0, high: float = 1e6, choices: tuple[str, ...] = ()
+) -> Any:
+    """An option, as the default of a parameter of a function."""
+    return Parameter("", type(default), default, meaning, unit, low, high, choices)
 
 
-@dataclass(frozen=True, slots=True)
-class Option:
-    """An option; ``low`` and ``high`` are inclusive, ``choices`` those of a text."""
-
-    default: Any
-    meaning: str
-    unit: str = ""
-    low: float = 0.0
-    high: float = 1e6
-    choices: tuple[str, ...] = ()
-
-    def check(self, what: str, value: Any) -> Any:
-        """The value in the option's type. Raises GraphSlamError with ``what`` and what is allowed."""
-        kind = type(self.default)
-        if kind is float and type(value) is int and abs(value) < 2**1000:
-            value = float(value)
-        if type(value) is not kind:
-            raise GraphSlamError(f"{what}: {value!r} is not {_ARTICLE[kind]}")
-        if kind is str:
-            if value not in self.choices:
-                near = did_you_mean(value, self.choices)
-                raise GraphSlamError(f"{what}: {value!r} is not one of {', '.join(self.choices)}{near}")
-        elif kind is not bool and not (self.low <= value <= self.high and value != math.inf):
-            raise GraphSlamError(f"{what}: {value!r} is not in [{self.low:g}, {self.high:g}]")
-        return value
-
-
-def option(*of: Any, **more: Any) -> Any:
-    """An option, as the default of a parameter; what it is made of as of ``Option``."""
-    return Option(*of, **more)
-
-
-def options_of(what: Callable[..., Any]) -> dict[str, Option]:
+def options_of(what: Callable[..., Any]) -> dict[str, Parameter]:
     """Every option of a function by its name, in order."""
     found = {name: parameter.default for name, parameter in signature(what).parameters.items()}
-    return {name: default for name, default in found.items() if isinstance(default, Option)}
+    return {name: default for name, default in found.items() if isinstance(default, Parameter)}
 
 
 def checked(name: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
@@ -72,7 +45,7 @@ def checked(name: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     return with_name
 
 
-def filled(name: str, known: Mapping[str, Option], values: Mapping[str, Any]) -> dict[str, Any]:
+def filled(name: str, known: Mapping[str, Parameter], values: Mapping[str, Any]) -> dict[str, Any]:
     """All options of a world or fault: the named values; the rest have their defaults.
 
     Raises GraphSlamError: unknown option (those that exist are named), wrong type, or a value out of bounds.
@@ -81,7 +54,8 @@ def filled(name: str, known: Mapping[str, Option], values: Mapping[str, Any]) ->
         if one not in known:
             near = did_you_mean(one, known)
             raise GraphSlamError(f"{name}: no option {one!r}; it has {', '.join(known)}{near}")
-    return {k: o.check(f"{name}: {k}", values[k]) if k in values else o.default for k, o in known.items()}
+    named = {key: replace(one, name=f"{name}: {key}") for key, one in known.items()}
+    return {key: one.check(values.get(key, one.default)) for key, one in named.items()}
 
 
 def lines_about(name: str, what: Callable[..., Any]) -> Iterator[str]:

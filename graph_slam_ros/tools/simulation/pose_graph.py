@@ -2,13 +2,10 @@
 
 from bisect import bisect_right
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 from numpy.random import Generator
 
-from graph_slam_ros.formats.g2o_writer import write_g2o
-from graph_slam_ros.formats.graph_file import G2oFile, Values
 from graph_slam_ros.graph import Gaussian, Graph
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL, Geometry
 from graph_slam_ros.lie import se2, se3
@@ -136,18 +133,3 @@ def _composed(space: Geometry, start: Array, steps: Array) -> Array:
     moved = se2.act((0.0, 0.0, theta[:-1]), (steps[:, 0], steps[:, 1]))
     x, y = (first + np.concatenate([[0.0], np.cumsum(d)]) for first, d in zip(start[:2], moved, strict=True))
     return np.stack([x, y, se2.wrap(theta)], axis=1)
-
-
-def write_graph(graph: Graph, path: Path | str) -> None:
-    """Write a graph as g2o at its initial values. A FIX line holds the first vertex."""
-    write_g2o(path, G2oFile(graph, list(range(graph.vertex_count)), [0]), values_of(graph, graph.initial.values))
-
-
-def values_of(graph: Graph, numbers: Array) -> Values:
-    """The values of vertices by id, of the stored numbers of all of them end to end."""
-
-    def values(ids: Sequence[int]) -> Array:
-        size = graph.kind_of(ids[0]).size
-        return np.asarray(numbers[graph.offset.values[ids][:, None] + np.arange(size)])
-
-    return values

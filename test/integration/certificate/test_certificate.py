@@ -8,7 +8,7 @@ import pytest
 from places import DATASETS
 from reliability import times
 
-from graph_slam_ros import certify, optimize, read_g2o
+from graph_slam_ros import certify, optimize, read_g2o, write_g2o
 from graph_slam_ros.cli import main
 from graph_slam_ros.formats.graph_file import G2oFile
 from graph_slam_ros.graph import (
@@ -30,7 +30,6 @@ from graph_slam_ros.solver import Settings
 from graph_slam_ros.tools.certificate import CERTIFIED, DOES_NOT_APPLY, NOT_CERTIFIED
 from graph_slam_ros.tools.certificate.spectrum import least_eigenvalue, polish
 from graph_slam_ros.tools.certificate.synchronization import Edges, Poses, Synchronization
-from graph_slam_ros.tools.simulation import write_graph
 
 GRAPHS = DATASETS / "pose_graphs"
 public = pytest.mark.skipif(not GRAPHS.exists(), reason=f"no public graphs under {GRAPHS}")
@@ -173,7 +172,7 @@ def test_where_it_does_not_apply_it_says_why():
 def run(tmp_path, told):
     def run(graph, *words):
         path = tmp_path / "graph.g2o"
-        write_graph(graph, path)
+        write_g2o(path, G2oFile(graph, list(range(graph.vertex_count)), [0]))
         code, out, err = told("optimize", path, "--certify", *words)
         assert (err == "") == (code != 3) and err.count("is far above its") <= 1, err
         return code, json.loads(out)["certificate"] if "--json" in words else out
@@ -208,7 +207,7 @@ def test_the_command_says_why_it_does_not_apply_and_what_was_lost_goes_first(run
     assert told == "does not apply: there are landmarks: vertices of kind R2"
     assert after.startswith("next: graph_slam optimize ")
     path = tmp_path / "graph.g2o"
-    write_graph(ring(PLANE, 2), path)
+    write_g2o(path, ring(PLANE, 2))
     path.write_text(path.read_text() + "VERTEX_SE2 99 nan 0 0\n")
     assert main(["optimize", str(path), "--init", "file", "--certify", "--lenient"]) == 3
     assert "\nnot certified\n" in capsys.readouterr().out

@@ -197,9 +197,8 @@ def test_what_agrees_with_the_truth_is_no_false_closure(world):
 
         def off(margin, policy=policy, vague=vague):
             rng = np.random.default_rng(1)
-            return disagreement(
-                truth, *false_closures(truth, vague[None], rng, policy, count=300, margin=margin)[:2], vague
-            )
+            ends, measured, _ = false_closures(truth, vague[None], rng, policy, count=300, margin=margin)
+            return disagreement(truth, ends, measured, vague)
 
         assert off(4.0).min() > 4.0 * chi2.ppf(0.9999, dof)
         assert (off(0.0) < 4.0 * chi2.ppf(0.9999, dof)).any(), "or the test shows nothing"
