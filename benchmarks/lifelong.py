@@ -32,7 +32,7 @@ from benchmarks import fresh, lifelong, table
 from benchmarks.hall import STEP_S, Course, config, fitted, measured, rms, without_ids
 from graph_slam_ros.cli import arguments as values
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
-from graph_slam_ros.runs.condensed_map import removed_path
+from graph_slam_ros.runs.condensed_map import WholePath
 from graph_slam_ros.slam import Control, GraphSlam, Measurement, Sightings
 from graph_slam_ros.slam.lifelong.state import Left
 from graph_slam_ros.typing import Array, Numbers
@@ -70,8 +70,7 @@ class Drive:
             parts = list[Left]()
             while left.peek(1):
                 parts.append(pickle.load(left))
-        before = removed_path(self.slam, Left.joined(self.slam.space, parts))
-        whole = np.concatenate((before, self.slam.trajectory()))
+        whole = WholePath(self.slam, Left.joined(self.slam.space, parts)).poses()
         self.path = whole[:, : self.slam.space.dimensions]
 
     def _run(self, left: IO[bytes]) -> None:

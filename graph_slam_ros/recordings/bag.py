@@ -259,8 +259,8 @@ class BagWriter:
     """
 
     def __init__(self, path: Path | str) -> None:
-        self._file = AppendedFile(Path(path))
-        self._writer = Writer(self._file, compression=CompressionType.ZSTD)  # type: ignore[arg-type]
+        self.file = AppendedFile(Path(path))
+        self._writer = Writer(self.file, compression=CompressionType.ZSTD)  # type: ignore[arg-type]
         self._writer.start(profile="ros2", library=mcap_records.LIBRARY)
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
@@ -276,16 +276,12 @@ class BagWriter:
             self._channels[topic] = self._writer.register_channel(topic, "cdr", schema, more)
         sequence = self._sequence[topic] = self._sequence.get(topic, -1) + 1
         self._writer.add_message(self._channels[topic], stamp_ns, cdr, stamp_ns, sequence)
-        self._file.flush()
+        self.file.flush()
 
     def end(self) -> AppendedFile:
         """Append the index. Returns the file, which the caller closes."""
         self._writer.finish()  # type: ignore[no-untyped-call]
-        return self._file
-
-    def abandon(self) -> None:
-        """Close the file as it is on the disk, without an index. What is in memory is lost."""
-        self._file.abandon()
+        return self.file
 
     def close(self) -> None:
         """Write the index and close the file."""

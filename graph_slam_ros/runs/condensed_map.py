@@ -42,11 +42,6 @@ def left_records(done: Condensation) -> Iterator[Record]:
         yield {"type": "left_edges", "first": done.first, "table": out.getvalue()}
 
 
-def read_left(folder: Path, space: Geometry, state: BoundedState | None) -> Left:
-    """Return what has left a map. Raises FormatError as ``carried``."""
-    return _joined(space, [] if state is None else carried(folder, space, state))
-
-
 def carried(folder: Path, space: Geometry, state: BoundedState) -> list[Record]:
     """Return the records of what has left a map, which a run that goes on in it has, too.
 
@@ -93,12 +88,13 @@ class WholePath:
 
     Attributes
     ----------
+    left : what has left its map
     stamps_ns : (n,) of the keyframes
     odometry : (n, size) their poses by odometry alone, ``T_odom_base``
     """
 
     def __init__(self, slam: GraphSlam, left: Left) -> None:
-        self._slam, self._left = slam, left
+        self._slam, self.left = slam, left
         removed, keyframes = left.keyframes, slam.keyframes
         self.stamps_ns: Index = np.concatenate((removed["stamp_ns"], keyframes.stamps_ns))
         self.odometry: Array = np.concatenate((removed["T_odom"], keyframes.poses.reshape(-1, slam.space.pose.size)))
@@ -106,20 +102,16 @@ class WholePath:
     @classmethod
     def of(cls, slam: GraphSlam, folder: Path) -> "WholePath":
         """Return that of a pipeline whose run folder has what was condensed. Raises FormatError where that is lost."""
-        return cls(slam, read_left(folder, slam.space, slam.bounded))
+        known = [] if slam.bounded is None else carried(folder, slam.space, slam.bounded)
+        return cls(slam, _joined(slam.space, known))
 
     def poses(self, solver: Solver | None = None) -> Array:
         """Return the poses ``T_map_base``, (n, size); of another solution of the graph if given."""
-        slam = self._slam
-        path = (solver or slam.solver).estimate(slam.keyframes.ids).reshape(-1, slam.space.pose.size)
-        return np.concatenate((removed_path(slam, self._left, solver), path))
-
-
-def removed_path(slam: GraphSlam, left: Left, solver: Solver | None = None) -> Array:
-    """Return the present poses of the keyframes that have left the map, (n, size); of another solution if given."""
-    if slam.bounded is None:
-        return np.empty((0, slam.space.pose.size))
-    solver = solver or slam.solver
-    vertices = np.array([*(one.vertex for one in slam.bounded.old), *slam.keyframes.ids.tolist()], dtype=np.int64)
-    vertices = np.sort(vertices)
-    return left.path(slam.space, slam.graph.vertex_ids.of_all(vertices), solver.estimate(vertices))
+        slam, solver = self._slam, solver or self._slam.solver
+        path = solver.estimate(slam.keyframes.ids).reshape(-1, slam.space.pose.size)
+        if slam.bounded is None:
+            return path
+        old = [one.vertex for one in slam.bounded.old]
+        vertices = np.sort(np.array([*old, *slam.keyframes.ids.tolist()], dtype=np.int64))
+        ids = slam.graph.vertex_ids.of_all(vertices)
+        return np.concatenate((self.left.path(slam.space, ids, solver.estimate(vertices)), path))

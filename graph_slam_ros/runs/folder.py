@@ -119,8 +119,7 @@ def is_incomplete(folder: Path) -> bool:
 
 def was_saved_whole(folder: Path) -> bool:
     """Return whether the map of a run includes all of its journal, by its summary."""
-    parts = list(_parts(folder))
-    return summary_of(folder).get("unprocessed") == 0 and bool(parts) and all(then == now for _, then, now in parts)
+    return summary_of(folder).get("unprocessed") == 0 and not _went_on(folder)
 
 
 def _holds_something(folder: Path) -> bool:
@@ -185,24 +184,29 @@ def changed_since(folder: Path) -> list[str]:
 
 
 def missing(folder: Path) -> list[str]:
-    """The recordings that have fewer or other parts than when the run was saved."""
-    fewer = [f"{name}: {then} parts when it was saved, {now} now" for name, then, now in _parts(folder) if now < then]
-    return fewer + list(_not_as_saved(folder, "recorded", ends_of))
+    """The recordings that are missing, or others than when the run was saved."""
+    return list(_not_as_saved(folder, "recorded", ends_of))
 
 
 def _went_on(folder: Path) -> bool:
-    """Return whether more was accepted after a run was saved."""
-    return any(now > then for _, then, now in _parts(folder))
+    """Return whether more was accepted after a run was saved: in parts that its summary does not know."""
+    known = _marks(folder, "recorded")
+    parts = [file.name for name in (INGEST, CONDENSED) for file in parts_of(folder, name)]
+    return bool(known) and not known.keys() >= set(parts)
+
+
+def _marks(folder: Path, kind: str) -> dict[str, Any]:
+    """The marks of files in the summary of a run, by name; none where it was not saved."""
+    marks = summary_of(folder).get(kind)
+    return marks if isinstance(marks, dict) else {}
 
 
 def _not_as_saved(folder: Path, kind: str, mark_of: Callable[[Path], str]) -> Iterator[str]:
     """The files whose checksum differs from the summary's, and those that are missing or unreadable."""
-    summary = summary_of(folder)
-    if not summary and os.path.lexists(folder / SUMMARY):
+    if not summary_of(folder) and os.path.lexists(folder / SUMMARY):
         yield f"{SUMMARY} is not the summary of a run: whether its files belong together is not known"
-    recorded = summary.get(kind)
     replaced = {MAP} if _went_on(folder) else set[str]()
-    for name, mark in sorted(recorded.items()) if isinstance(recorded, dict) else ():
+    for name, mark in sorted(_marks(folder, kind).items()):
         if name in replaced:
             continue
         if name in _RESULTS or name == CONFIG or _RECORDED.fullmatch(name):  # no path out of the folder
@@ -232,15 +236,6 @@ def ends_of(file: Path) -> str:
         first = stream.read(_ENDS)
         stream.seek(max(0, size - _ENDS))
         return f"{size}-{checksum(first + stream.read(_ENDS))}"
-
-
-def _parts(folder: Path) -> Iterator[tuple[str, int, int]]:
-    """The parts of each recording of a saved run: their number then and now."""
-    parts = summary_of(folder).get("parts")
-    recorded: dict[str, Any] = parts if isinstance(parts, dict) else {}
-    for name in (INGEST, CONDENSED):
-        if isinstance(then := recorded.get(name), int):
-            yield name, then, len(parts_of(folder, name))
 
 
 def checksum(data: bytes) -> str:

@@ -7,21 +7,19 @@ writes one chunk, which carries its CRC. What is recorded may be split over seve
 
 import json
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from functools import cache
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, Protocol, TypeVar
 
 from mcap.records import Channel, Message
 from mcap.writer import CompressionType, Writer
 
 from graph_slam_ros.errors import FormatError
 from graph_slam_ros.formats.durable import AppendedFile
-from graph_slam_ros.measurements.types import Measurement, Odometry, from_record
+from graph_slam_ros.measurements.types import Measurement, from_record
 from graph_slam_ros.recordings.mcap_records import LIBRARY, records
 
 _ENCODE = json.JSONEncoder(separators=(",", ":"), check_circular=False, allow_nan=False).encode
-_text = cache(_ENCODE)
 INGEST = "ingest"
 IN_A_MAP = {"type": "begins_in_a_map"}
 """The first record of the journal of such a run; its start is in ``start.mcap``."""
@@ -44,38 +42,19 @@ class RecordWriter:
         self._writer.start(profile="", library=LIBRARY)
         self._schema = self._writer.register_schema(schema, "jsonschema", _SCHEMA)
         self._channels: dict[str, int] = {}
-        self._sequence = 0
-        self._stamp_ns = 0
-        self._twist: Any = None
-        self._twist_text = "null"
+        self._sequence = self._stamp_ns = 0
 
-    def write(self, several: Iterable[Mapping[str, Any] | Odometry]) -> None:
-        """Append records, and odometry as it is, as one chunk. A record without a stamp gets the last stamp."""
-        *others, last = several
-        for record in others:
-            self._add(record)
-        self._add(last, is_last=True)
-
-    def _add(self, record: Mapping[str, Any] | Odometry, *, is_last: bool = False) -> None:
-        if isinstance(record, Odometry):
-            kind, self._stamp_ns, text = "odometry", record.stamp_ns, self._odometry_text(record)
-        else:
-            kind, self._stamp_ns, text = record["type"], record.get("stamp_ns", self._stamp_ns), _ENCODE(record)
-        if kind not in self._channels:
-            self._channels[kind] = self._writer.register_channel(kind, "json", self._schema)
-        self._chunk.is_full = is_last  # not before: a channel, too, ends a chunk that is full
-        self._writer.add_message(self._channels[kind], self._stamp_ns, text.encode(), self._stamp_ns, self._sequence)
-        self._chunk.is_full = False
-        self._sequence += 1
-
-    def _odometry_text(self, m: Odometry) -> str:
-        """The JSON of odometry, of which there is most, as the encoder writes it in three times the time."""
-        pose = ",".join(map(float.__repr__, m.T_odom_base))
-        if m.twist_covariance is not self._twist:  # drivers repeat the same one
-            self._twist_text = _ENCODE(m.twist_covariance)
-            self._twist = m.twist_covariance
-        ends = f'"twist_covariance":{self._twist_text},"source":{_text(m.source)}'
-        return f'{{"type":"odometry","stamp_ns":{m.stamp_ns},"T_odom_base":[{pose}],{ends}}}'
+    def write(self, several: Sequence[Mapping[str, Any]]) -> None:
+        """Append records as one chunk. A record without a stamp gets the last stamp."""
+        for record in several:
+            kind, self._stamp_ns = record["type"], record.get("stamp_ns", self._stamp_ns)
+            if kind not in self._channels:
+                self._channels[kind] = self._writer.register_channel(kind, "json", self._schema)
+            channel, data = self._channels[kind], _ENCODE(record).encode()
+            self._chunk.is_full = record is several[-1]  # not before: a channel, too, ends a chunk that is full
+            self._writer.add_message(channel, self._stamp_ns, data, self._stamp_ns, self._sequence)
+            self._chunk.is_full = False
+            self._sequence += 1
 
     def end(self) -> AppendedFile:
         """Append the index. Returns the file, which the caller closes."""
@@ -83,28 +62,38 @@ class RecordWriter:
         return self.file
 
 
-class Parts:
-    """The records of one name in a folder, in parts, each of which is a file.
+class _Part(Protocol):
+    """The writer of one file."""
+
+    file: AppendedFile
+
+    def end(self) -> AppendedFile: ...
+
+
+AnyPart = TypeVar("AnyPart", bound=_Part)
+
+
+class Parts(Generic[AnyPart]):
+    """What is recorded under one name in a folder, in parts, each of which is a file.
 
     What the disk does not accept is kept, for ended parts and the present one, and is written in that order.
+
+    Parameters
+    ----------
+    make : returns the writer of a new file
     """
 
-    def __init__(self, folder: Path, name: str) -> None:
-        self._folder, self._name = folder, name
+    def __init__(self, folder: Path, name: str, make: Callable[[Path], AnyPart]) -> None:
+        self._folder, self._name, self._make = folder, name, make
         self._part = 0
-        self._present: RecordWriter | None = None
+        self._present: AnyPart | None = None
         self._ended: list[AppendedFile] = []
 
-    def begin(self) -> RecordWriter:
-        """Create the present part, even if there is nothing to write yet."""
+    def present(self) -> AnyPart:
+        """The present part, which is created if there is none."""
         if self._present is None:
-            self._present = RecordWriter(self._folder / part_name(self._name, self._part), SCHEMAS[self._name])
+            self._present = self._make(self._folder / part_name(self._name, self._part))
         return self._present
-
-    def write(self, several: Sequence[Mapping[str, Any] | Odometry]) -> None:
-        """Append records. They are kept until ``flush``."""
-        if several:
-            self.begin().write(several)
 
     @property
     def unwritten(self) -> int:
@@ -113,7 +102,7 @@ class Parts:
 
     def flush(self) -> None:
         """Write what is kept in memory. Raises OSError; then some of it is still kept."""
-        close_all(self._ended)
+        self._close_ended()
         for file in self._files():
             file.flush()
 
@@ -129,22 +118,20 @@ class Parts:
             self._ended.append(self._present.end())
             self._present = None
             self._part += 1
-        close_all(self._ended)
+        self._close_ended()
 
     def abandon(self) -> None:
         """Leave everything on the disk as it is."""
         for file in self._files():
             file.abandon()
 
+    def _close_ended(self) -> None:
+        while self._ended:
+            self._ended[0].close()
+            del self._ended[0]
+
     def _files(self) -> list[AppendedFile]:
         return self._ended + ([self._present.file] if self._present is not None else [])
-
-
-def close_all(files: list[AppendedFile]) -> None:
-    """Close files in order. Closed ones leave the list. Raises OSError of the first that could not be closed."""
-    while files:
-        files[0].close()
-        del files[0]
 
 
 class _Chunk(int):

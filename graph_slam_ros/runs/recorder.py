@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import Any
 
 from graph_slam_ros.errors import FormatError
-from graph_slam_ros.formats.durable import AppendedFile, write_whole
+from graph_slam_ros.formats.durable import write_whole
 from graph_slam_ros.formats.parameters import parameters_text
-from graph_slam_ros.measurements.types import Odometry, to_record
+from graph_slam_ros.measurements.types import to_record
 from graph_slam_ros.messages import results
 from graph_slam_ros.recordings.bag import BagWriter
-from graph_slam_ros.runs.condensed_map import carried, left_records, read_left
+from graph_slam_ros.runs.condensed_map import WholePath, carried, left_records
 from graph_slam_ros.runs.folder import (
     CONFIG,
     MARK,
@@ -31,7 +31,7 @@ from graph_slam_ros.runs.folder import (
     room,
     summary_of,
 )
-from graph_slam_ros.runs.journal import CONDENSED, IN_A_MAP, INGEST, MAP, START, Parts, close_all, part_name, parts_of
+from graph_slam_ros.runs.journal import CONDENSED, IN_A_MAP, INGEST, LEFT, MAP, START, Parts, RecordWriter
 from graph_slam_ros.runs.map_file import write_map
 from graph_slam_ros.runs.resource_log import ResourceLog
 from graph_slam_ros.runs.tables import counted, fitted_summary, result_texts, summarize
@@ -73,29 +73,27 @@ class RunRecorder:
     ) -> None:
         self.folder = Path(folder)
         self._sync_s, self._due_s = sync_s, 0.0
-        self._disk: ThreadPoolExecutor | None = None
-        self._writing, self._starting = threading.RLock(), threading.Lock()
+        # for a flush, a sync and a map at once: the flush may wait for somebody who waits for the sync
+        self._disk = ThreadPoolExecutor(3, "journal")
+        self._writing = threading.RLock()
         self._is_ended = False
         self._flushing: Future[None] | None = None
         self.accepted = accepted  # measurements, written or not
         self._syncing: Future[None] | None = None
-        self._journal = Parts(self.folder, INGEST)
-        self._left = Parts(self.folder, CONDENSED)
+        self._journal = Parts(self.folder, INGEST, RecordWriter)
+        self._left = Parts(self.folder, CONDENSED, lambda file: RecordWriter(file, LEFT))
+        self._results = Parts(self.folder, "run", BagWriter)
         self._accepted: deque[Measurement] = deque()  # and not written yet
         self._before = accepted
         self._mapping: Future[None] | None = None
         self._map_due_s = 0.0
         self._map_cpu_s = -math.inf if accepted else time.process_time()  # what waits now is in no journal
-        self._bag: BagWriter | None = None
-        self._bags = 0
-        self._ended_bags: list[AppendedFile] = []
         self._path_recorded = 0  # keyframes
         self._load = ResourceLog()
         self._room = ExitStack()
         self._room.enter_context(room(self.folder, force=force))
         try:
-            self._journal.begin()
-            self._journal.write([IN_A_MAP] if start is not None else [])
+            self._journal.present().write([IN_A_MAP] if start is not None else [])
             self._journal.flush()
             if start is not None:
                 self._begin_in(start, config)
@@ -110,7 +108,7 @@ class RunRecorder:
     def _begin_in(self, start: MapSnapshot, config: Config) -> None:
         """Write the map that the run goes on in, and take over what has left it."""
         if start.bounded is not None and start.folder is not None:
-            self._left.write(carried(start.folder, config.space, start.bounded))
+            self._left.present().write(carried(start.folder, config.space, start.bounded))
             self._left.flush()
         if not self.accepted:  # a new drive begins
             start = replace(start, used_ns=None, source="", drive={})
@@ -125,7 +123,7 @@ class RunRecorder:
         """Write accepted measurements in a thread, because the thread that processes them may be busy for long."""
         if self._accepted and not self._is_ended and (self._flushing is None or self._flushing.done()):
             with contextlib.suppress(RuntimeError):  # the recording has just been ended
-                self._flushing = self._in_background(self._flush_journal)
+                self._flushing = self._disk.submit(self._flush_journal)
 
     def _flush_journal(self) -> None:
         with contextlib.suppress(OSError), self._writing:  # it waits, and the next flush raises that again
@@ -134,22 +132,6 @@ class RunRecorder:
                 self._journal.flush()
                 if self._syncing is None or (self._syncing.done() and not self._syncing.exception()):
                     self._syncing = self._sync_if_due()
-
-    def _in_background(self, work: Callable[[], None]) -> Future[None]:
-        """Start work in a thread: one for a flush, one for a sync, and one for a map.
-
-        The flush may wait for somebody who waits for the sync.
-        """
-        with self._starting:
-            self._disk = self._disk or ThreadPoolExecutor(3, "journal")
-            return self._disk.submit(work)
-
-    def _end_threads(self) -> None:
-        """Let the threads end after their work; others come with the next."""
-        with self._starting:
-            disk, self._disk = self._disk, None
-        if disk is not None:
-            disk.shutdown(wait=False)
 
     def sink(self, measurement: Measurement) -> None:
         """Append to the journal: the sink of ``GraphSlam``. Raises OSError as ``flush`` does."""
@@ -180,8 +162,8 @@ class RunRecorder:
                     synced.result()
 
     def _fill_journal(self) -> None:
-        accepted = [self._accepted.popleft() for _ in range(len(self._accepted))]
-        self._journal.write([m if isinstance(m, Odometry) else to_record(m) for m in accepted])
+        if accepted := [self._accepted.popleft() for _ in range(len(self._accepted))]:
+            self._journal.present().write(list(map(to_record, accepted)))
 
     @property
     def unwritten(self) -> int:
@@ -194,7 +176,7 @@ class RunRecorder:
         if not self._sync_s or now < self._due_s:
             return None
         self._due_s = now + self._sync_s
-        return self._in_background(self._sync)
+        return self._disk.submit(self._sync)
 
     def join_sync(self) -> None:
         """Wait until the disk has synced. Raises OSError once if it failed."""
@@ -217,7 +199,7 @@ class RunRecorder:
 
     def _record(self, slam: GraphSlam, update: Update) -> None:
         if update.condensed is not None:
-            self._left.write(list(left_records(update.condensed)))
+            self._left.present().write(list(left_records(update.condensed)))
         stamp = slam.keyframes[-1].stamp_ns
         self._write("/tf", results.TF, stamp, results.map_to_odom(slam, stamp))
         self._write("/tf", results.TF, stamp, results.odom_to_base(slam))
@@ -230,7 +212,7 @@ class RunRecorder:
         if is_due and update.keyframes and self._mapping is None:  # between keyframes odometry would be lost
             self.flush()  # a map is never ahead of what it came of
             self._map_cpu_s, state = time.process_time(), self._snapshot(slam)
-            self._mapping = self._in_background(lambda: self._write_map(state))
+            self._mapping = self._disk.submit(self._write_map, state)
 
     def _snapshot(self, slam: GraphSlam) -> MapSnapshot:
         return replace(slam.snapshot(), processed=max(0, slam.processed - self._before))
@@ -263,17 +245,12 @@ class RunRecorder:
                 self._end_parts()
                 if slam.keyframes:
                     self._write_map(self._snapshot(slam))
-                parts = self._ended_parts()
+                parts: dict[str, Any] = {"recorded": recorded_files(self.folder)}
             parts |= {"unprocessed": max(0, self.accepted - slam.processed), "load": self._load.as_dict()}
             save_results(self.folder, slam, (summary or {}) | parts, self._refuse_if_ended)
         except OSError as error:
             raise RunError(f"{self.folder}: {error.strerror}") from None
         return self.folder
-
-    def _ended_parts(self) -> dict[str, Any]:
-        """The parts for the summary: their number, which grows if the run goes on, and their checksums."""
-        parts = {name: len(of) for name in (INGEST, CONDENSED) if (of := parts_of(self.folder, name))}
-        return {"parts": parts, "recorded": recorded_files(self.folder)}
 
     def _refuse_if_ended(self) -> None:
         if self._is_ended:
@@ -296,9 +273,10 @@ class RunRecorder:
             self._end_parts()
             now = {"ended": True, "keyframes": keyframes, "unprocessed": unprocessed, "load": self._load.as_dict()}
             now["is_incomplete"] = bool(unprocessed or keyframes)
-            contents = summary_of(self.folder) | now | counted(counters) | self._ended_parts()
+            now["recorded"] = recorded_files(self.folder)
+            contents = summary_of(self.folder) | now | counted(counters)
             _put(self.folder, SUMMARY, json.dumps(contents, indent=2) + "\n")
-            self._is_ended = True
+            self._end()
             self._room.close()
         return unprocessed
 
@@ -312,32 +290,29 @@ class RunRecorder:
         """
         with self._writing:
             self._end_parts()
-            self._is_ended = True
+            self._end()
             self._room.close()
 
     def abandon(self) -> None:
         """End the recording as it is on the disk. What is in memory is lost."""
-        with self._writing:
-            self._is_ended = True
+        with self._writing, self._room:
             self._abandon()
-            self._room.close()
-
-    def _abandon(self) -> None:
-        self._end_threads()
-        self._join_map()
-        self._journal.abandon()
-        self._left.abandon()
-        for bag in self._ended_bags:
-            bag.abandon()
-        if self._bag is not None:
-            self._bag.abandon()
 
     def discard(self) -> None:
         """End the recording, and remove its files if it was never saved."""
         with self._writing, self._room:
-            self._is_ended = True
             self._abandon()
             discard(self.folder)
+
+    def _abandon(self) -> None:
+        self._end()
+        self._join_map()
+        for parts in (self._journal, self._left, self._results):
+            parts.abandon()
+
+    def _end(self) -> None:
+        self._is_ended = True
+        self._disk.shutdown(wait=False)
 
     def _end_parts(self) -> None:
         """End the present parts, and begin the next ones with the next record."""
@@ -345,13 +320,8 @@ class RunRecorder:
         failed = self._syncing.exception() if self._syncing is not None else None
         self._syncing = None
         self._join_map()
-        self._end_threads()
-        if self._bag is not None:
-            self._ended_bags.append(self._bag.end())
-            self._bag, self._bags = None, self._bags + 1
-        self._journal.end()
-        self._left.end()
-        close_all(self._ended_bags)
+        for parts in (self._journal, self._left, self._results):
+            parts.end()
         if failed is not None:
             raise failed
 
@@ -361,9 +331,7 @@ class RunRecorder:
         self._write("/landmarks", results.LANDMARKS, stamp, results.landmarks(slam))
 
     def _write(self, topic: str, type_name: str, stamp_ns: int, cdr: bytes) -> None:
-        if self._bag is None:
-            self._bag = BagWriter(self.folder / part_name("run", self._bags))
-        self._bag.write(topic, type_name, stamp_ns, cdr)
+        self._results.present().write(topic, type_name, stamp_ns, cdr)
 
 
 def save_results(
@@ -380,8 +348,8 @@ def save_results(
         check()
         return _put(folder, name, text)
 
-    left = read_left(folder, slam.space, slam.bounded)
-    files = {name: put(name, text) for name, text in result_texts(slam, left).items()}
+    texts = result_texts(slam, WholePath.of(slam, folder))
+    files = {name: put(name, text) for name, text in texts.items()}
     fitted = {} if "noise" in summary else fitted_summary(slam)
     contents = {"format": MARK} | summarize(slam) | summary | fitted | {"format": MARK, "files": files}
     put(SUMMARY, json.dumps(contents, indent=2) + "\n")

@@ -30,7 +30,7 @@ from graph_slam_ros.warmup import warmup
 
 Summary = dict[str, Any]
 _NOTHING_LEAVES = {"map.condense": False}  # what left while a map is made again would be in no file
-_OF_RECORDING = ("recording", "parts", "recorded", "unprocessed", "load", "check", "plan")
+_OF_RECORDING = ("recording", "recorded", "unprocessed", "load", "check", "plan")
 """Keys of a summary that a repeated computation does not change."""
 
 Stopwatch = Callable[[], dict[str, float]]

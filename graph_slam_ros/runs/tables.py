@@ -22,7 +22,7 @@ from graph_slam_ros.runs.ledger_file import changes_text, ledger_text
 from graph_slam_ros.slam import Counters, GraphSlam
 from graph_slam_ros.slam.calibration.answers import SIGMAS
 from graph_slam_ros.slam.calibration.parameters import QUANTITIES
-from graph_slam_ros.slam.lifelong.state import BoundedState, Left, seen_from
+from graph_slam_ros.slam.lifelong.state import BoundedState, seen_from
 from graph_slam_ros.slam.robust.gating import CANDIDATES
 from graph_slam_ros.slam.robust.ledger import OUTSIDE
 from graph_slam_ros.typing import Index
@@ -34,11 +34,10 @@ _TANGENT = {3: ("x", "y", "theta"), 6: ("x", "y", "z", "rx", "ry", "rz")}
 _POSE = {3: "x,y,theta", 6: "x,y,z,qx,qy,qz,qw"}
 
 
-def result_texts(slam: GraphSlam, left: Left) -> dict[str, str]:
-    """All results except the summary, by file name; ``left`` has what has left the map."""
+def result_texts(slam: GraphSlam, whole: WholePath) -> dict[str, str]:
+    """All results except the summary, by file name."""
     ids, vertices = numbered(slam)
-    whole, sightings = WholePath(slam, left), left.sightings
-    path = whole.poses()
+    sightings, path = whole.left.sightings, whole.poses()
     newest = slam.sighting_trajectory().reshape(-1, path.shape[1])
     seen = np.concatenate((seen_from(slam.space, sightings, path), newest))
     seen_odometry = np.concatenate((sightings["T_odom"], slam.sighting_odometry().reshape(-1, path.shape[1])))
@@ -51,7 +50,7 @@ def result_texts(slam: GraphSlam, left: Left) -> dict[str, str]:
         CHANGES: changes_text(slam),
         PATH: tum_text(stamps_ns, path),
         PATH_ODOMETRY: tum_text(stamps_ns, whole.odometry),
-        COVARIANCES: _covariance_table(slam, left.keyframes["stamp_ns"].tolist()),
+        COVARIANCES: _covariance_table(slam, whole.left.keyframes["stamp_ns"].tolist()),
         SIGHTINGS: tum_text(stamps, seen),
         ODOMETRY: tum_text(stamps, seen_odometry),
         LANDMARKS: _landmark_table(slam),

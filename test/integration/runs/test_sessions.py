@@ -137,14 +137,14 @@ def test_where_the_map_that_a_run_began_in_or_the_last_part_of_a_recording_is_go
     assert len(parts) > 1
     parts[-1].unlink()
     losses = recover(run, tmp_path / "of_fewer")["losses"]
-    assert f"ingest: {len(parts)} parts when it was saved, {len(parts) - 1} now" in losses
+    assert f"{parts[-1].name} is missing, with which run.json was saved" in losses
 
 
 def test_a_summary_that_tells_nonsense_hurts_nobody_and_of_what_was_refused_it_is_a_loss(in_a_map_once, tmp_path):
     run = Path(shutil.copytree(in_a_map_once, tmp_path / "run"))
     told, summary = json.loads((run / "run.json").read_text()), run / "run.json"
-    for parts in (3, {"ingest": "x"}, {"map": None, "more": 7}, [], {"ingest": 10**30}):
-        summary.write_text(json.dumps(told | {"parts": parts}))
+    for marks in (3, {"ingest.mcap": 3}, {"map": None, "more": 7}, [], {"ingest": 10**30}):
+        summary.write_text(json.dumps(told | {"recorded": marks}))
         changed_since(run)
     assert recover(run, tmp_path / "out")["keyframes"] == told["keyframes"]
     for k, wrong in enumerate(({"counters": {"a": {"b": "c"}}}, {"counters": 3}, {"inputs": {"odom": {"used": -1}}})):

@@ -11,7 +11,7 @@ from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
 from graph_slam_ros.graph.place import LABEL
 from graph_slam_ros.maps.diff import diff
-from graph_slam_ros.runs.condensed_map import read_left, read_left_edges, removed_path
+from graph_slam_ros.runs.condensed_map import WholePath, read_left_edges
 from graph_slam_ros.runs.folder import changed_since
 from graph_slam_ros.runs.journal import read_measurements
 from graph_slam_ros.runs.map_file import read_map, read_start
@@ -44,7 +44,7 @@ def true_path(world, count):
 
 def whole_path(slam, left):
     before = Left.joined(slam.space, [one.left for one in left])
-    return np.concatenate((removed_path(slam, before), slam.trajectory()))[:, : slam.space.dimensions]
+    return WholePath(slam, before).poses()[:, : slam.space.dimensions]
 
 
 def landmarks(world, slam):
@@ -94,7 +94,7 @@ def test_a_replay_condenses_as_the_live_run_did(recorded, tmp_path):
     assert again.solver.values.tobytes() == slam.solver.values.tobytes()
     for name in ("path.tum", "landmarks.csv", "ledger.csv", "sightings.tum", "graph.g2o", "graph_vertices.csv"):
         assert (tmp_path / "again" / name).read_bytes() == (folder / name).read_bytes(), name
-    ours, theirs = (read_left(at, PLANAR, slam.bounded) for at in (folder, tmp_path / "again"))
+    ours, theirs = (WholePath.of(slam, at).left for at in (folder, tmp_path / "again"))
     assert ours.keyframes.tobytes() == theirs.keyframes.tobytes()
     assert ours.sightings.tobytes() == theirs.sightings.tobytes()
 
@@ -260,7 +260,7 @@ def test_the_map_is_small_and_each_landmark_is_there_once(world, without_names):
     assert slam.first_keyframe > times(2 * WINDOW, 540)
     assert len(slam.solver.vertices) < times(0.8, 0.4) * (FIRST + 40)
     assert_each_landmark_is_there_once(slam, world, least=times(28, 38))
-    path = np.concatenate((removed_path(slam, read_left(folder, slam.space, slam.bounded)), slam.trajectory()))
+    path = WholePath.of(slam, folder).poses()
     assert rms(path[:, :2], np.array(world.poses)[:FIRST, :2]) < times(0.25, 0.1)
 
 
