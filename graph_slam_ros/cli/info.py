@@ -8,7 +8,7 @@ from graph_slam_ros.cli import console
 from graph_slam_ros.cli.usage import CommandParser
 from graph_slam_ros.messages.inputs import CONVERTERS
 from graph_slam_ros.messages.inputs.plugins import described
-from graph_slam_ros.overview.contents import TopicContents, recording_of
+from graph_slam_ros.overview.contents import TopicContents
 from graph_slam_ros.recordings.bag import Bag, open_bag
 from graph_slam_ros.runs.folder import is_run, suggested_out
 from graph_slam_ros.runs.suggestion import Suggestion
@@ -39,14 +39,14 @@ def describe(bag: Bag, path: Path) -> tuple[list[str], bool]:
     lines : the command is the last
     fits : whether there is one
     """
-    recording = recording_of(bag)
+    suggestion = Suggestion(bag, path)
+    recording = suggestion.recording
     lines = [_line(one) for _, one in sorted(recording.topics.items())]
     lines += [f"plugin: {text}" for text in described(CONVERTERS)]
     read = [one for one in recording.topics.values() if one.last_ns]
     if read:
         first, last = min(one.first_ns for one in read), max(one.last_ns for one in read)
         lines.append(f"span {(last - first) * 1e-9:.3f} s, from {first * 1e-9:.3f}")
-    suggestion = Suggestion(bag, recording, path)
     if suggestion.trouble:
         return [*lines, f"not ready for replay: {suggestion.trouble}"], False
     for text in suggestion.notes:

@@ -35,7 +35,7 @@ def replay(args: argparse.Namespace) -> int:
     """Run a recording, or an earlier run, through the pipeline, or play it into a live ROS graph."""
     from graph_slam_ros.runs.folder import is_run
     from graph_slam_ros.runs.replay import replay as replayed
-    from graph_slam_ros.runs.suggested_inputs import unused_topics
+    from graph_slam_ros.runs.suggestion import unused_topics
     from graph_slam_ros.slam import Config
 
     _refuse_idle_options(args, is_run(args.bag))
@@ -68,7 +68,7 @@ def replay(args: argparse.Namespace) -> int:
 def _with_suggestion(args: argparse.Namespace, config: "Config") -> "Config":
     """The configuration, with inputs that ``info`` suggests where a recording has no usual odometry or landmarks."""
     from graph_slam_ros.runs.folder import is_run
-    from graph_slam_ros.runs.suggested_inputs import suggestion_for_other_types
+    from graph_slam_ros.runs.suggestion import suggestion_for_other_types
 
     if args.config or args.landmarks or args.map or (args.ros and args.out is None) or is_run(args.bag):
         return config

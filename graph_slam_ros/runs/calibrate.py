@@ -20,7 +20,7 @@ from graph_slam_ros.messages.inputs import recorded_uses
 from graph_slam_ros.overview.chosen_inputs import Inputs
 from graph_slam_ros.recordings.bag import Bag, open_bag
 from graph_slam_ros.runs.replay import RecordedRuns
-from graph_slam_ros.runs.suggested_inputs import SuggestedInputs
+from graph_slam_ros.runs.suggestion import SuggestedInputs
 from graph_slam_ros.runs.tables import account
 from graph_slam_ros.slam import Config, Counters, GraphSlam
 from graph_slam_ros.slam.calibration.answers import CODES, setting_of
@@ -87,7 +87,7 @@ def calibrate(
         The recording or an input cannot be used, or has no keyframe; a group is unknown, or one scale with another.
     """
     path, bag = Path(path), open_bag(Path(path))
-    suggested = SuggestedInputs(bag, path, settings, odometry, landmarks)
+    suggested = SuggestedInputs(bag, path, settings or {}, odometry, landmarks)
     config = with_survey(Config.from_mapping(suggested.settings))
     words = _words(groups, config)
     warmup(dimensions=config.world.dimensions)
@@ -98,8 +98,9 @@ def calibrate(
     parameters = rounds.parameters or ([] if rounds.refused else list(_undriven(config, words, rounds.keyframes)))
     name = "calibrate" if rounds.named else "replay"
     command = suggested.suggestion.command(rounds.found | dict(settings or {}) | rounds.found | rounds.named, name=name)
-    outcome = parameters, command, rounds.count, rounds.is_complete, rounds.refused, rounds.fault
-    return Calibrated(rounds.found, *outcome, *(list(dict.fromkeys(lines)) for lines in (bag.losses, bag.warnings)))
+    losses, warnings = list(dict.fromkeys(bag.losses)), list(dict.fromkeys(bag.warnings))
+    outcome = rounds.found, parameters, command, rounds.count, rounds.is_complete, rounds.refused, rounds.fault
+    return Calibrated(*outcome, losses, warnings)
 
 
 class _Rounds:
@@ -124,7 +125,6 @@ class _Rounds:
         self._corrected = set[Parameter]()
         self._withdrawn = set[Parameter]()
         self._kept, self._accepted = dict[str, float | str](), (0, 0)  # by the replay before
-        self._total = sum(bag.topics[topic].count for topic in inputs.by_topic())
 
     def run(self) -> None:
         """Replay until nothing more is found, or what was found does harm, or is refused."""
@@ -152,7 +152,7 @@ class _Rounds:
             config, counters = self._config.changed(self.found), Counters()
             slam, columns = GraphSlam(config), Collector(config, self._inputs.topics)
             runs = RecordedRuns(self._bag, self._inputs, config, counters, columns=columns)
-            for _, some in self._progress(runs, self._total):
+            for _, some in self._progress(runs, runs.count):
                 for one in some:
                     slam.process(one)
                 if len(slam.keyframes) >= due and slam.is_solved and not slam.backend.holds_back:

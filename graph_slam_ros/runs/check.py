@@ -17,12 +17,10 @@ from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.measurements.types import Measured, Sightings
 from graph_slam_ros.messages.inputs import known_types
 from graph_slam_ros.messages.inputs.transforms import MAP_FRAMES
-from graph_slam_ros.overview.contents import Recording
 from graph_slam_ros.overview.suggested_odometry import ODOMETRY
 from graph_slam_ros.recordings.bag import open_bag
 from graph_slam_ros.runs.replay import RecordedRuns
-from graph_slam_ros.runs.suggested_inputs import OF_LANDMARKS, SuggestedInputs
-from graph_slam_ros.runs.suggestion import Suggestion
+from graph_slam_ros.runs.suggestion import OF_LANDMARKS, SuggestedInputs, Suggestion
 from graph_slam_ros.slam import Config, Control, Counters
 from graph_slam_ros.warmup import warmup
 
@@ -80,7 +78,7 @@ def check(
     bag = open_bag(path)
     suggested = SuggestedInputs(bag, path, settings, odometry, landmarks)
     suggestion = suggested.suggestion
-    found = list(_unused(suggested.recording, suggestion, has_landmarks=landmarks is not None))
+    found = list(_unused(suggestion, has_landmarks=landmarks is not None))
     if suggestion.trouble and odometry is None and not settings:
         if all(one.severity != "error" for one in found):  # which say why
             text = f"not ready for replay: {suggestion.trouble}"
@@ -90,8 +88,7 @@ def check(
     inputs = suggested.inputs(config)
     collector, counters = Collector(config, inputs.topics, suggested.assumed), Counters()
     runs = RecordedRuns(bag, inputs, config, counters, columns=collector)
-    total = sum(bag.topics[topic].count for topic in inputs.by_topic())
-    measured = [(number, some) for number, some in progress(runs, total) if some and not quick]
+    measured = [(number, some) for number, some in progress(runs, runs.count) if some and not quick]
     columns = collector.columns(counters)
     found += [Finding("damaged", "error", 1, 0, "parts", loss) for loss in dict.fromkeys(bag.losses)]
     found += check_columns(columns)
@@ -142,11 +139,11 @@ def _trial(columns: Columns, measured: list[Measurements]) -> list[Finding]:
     return found
 
 
-def _unused(recording: Recording, suggestion: Suggestion, *, has_landmarks: bool) -> Iterator[Finding]:
+def _unused(suggestion: Suggestion, *, has_landmarks: bool) -> Iterator[Finding]:
     """Topics that are meant as landmarks or odometry, and that cannot be used."""
     has_landmarks = has_landmarks or any(name not in ("odom", "gps", "imu", "pose") for name in suggestion.names)
     for name, why in suggestion.unused.items():
-        one = recording.topics[name]
+        one = suggestion.recording.topics[name]
         is_landmark = one.topic.type in OF_LANDMARKS and one.topic.type in known_types()
         if one.topic.type == ODOMETRY and one.frame in MAP_FRAMES:
             text = f"{name} is {why}"

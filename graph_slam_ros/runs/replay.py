@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from itertools import chain, groupby, islice
 from operator import attrgetter, itemgetter
 from pathlib import Path
@@ -22,7 +23,7 @@ from graph_slam_ros.runs.journal import read_measurements
 from graph_slam_ros.runs.map_file import read_start
 from graph_slam_ros.runs.outcome import doubts, is_explained, is_undecided, unscaled
 from graph_slam_ros.runs.restore import Stopwatch, config_of, map_of, record_run, stopwatch
-from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Measurement
+from graph_slam_ros.slam import Config, Control, Counters, GraphSlam
 from graph_slam_ros.slam.frontend.ingest_gate import IngestGate
 from graph_slam_ros.warmup import warmup
 
@@ -63,6 +64,7 @@ class RecordedRuns:
 
     Attributes
     ----------
+    count : of the messages
     counted : what was counted when each run but the last ended
 
     Raises
@@ -83,6 +85,7 @@ class RecordedRuns:
         self._bag, self._inputs, self._counters, self._columns = bag, inputs, counters, columns
         self._on_jump = config.time.on_jump
         self._gate = IngestGate(counters)
+        self.count = sum(bag.topics[topic].count for topic in inputs.by_topic())
         self.counted: list[Counters] = []
         used = [bag.topics[topic] for topic in inputs.topics.values()]
         decoders = {topic.type: recorded_decoder(topic) for topic in used}
@@ -232,26 +235,34 @@ def _recorded(
     inputs = choose_inputs(bag, config, *topics)
     columns, counters = Collector(config, inputs.topics), Counters()
     runs = RecordedRuns(bag, inputs, config, counters, state.datum if state is not None else (), columns)
-    total = sum(bag.topics[topic].count for topic in inputs.by_topic()) + 3
     bag.losses += losses
     read = iter(runs)
-    ahead = list(islice(read, _READ_AHEAD))
+    ahead, end = list(islice(read, _READ_AHEAD)), ((len(runs.counted), [event]) for event in END)
     if found := first_of_replay(columns.columns(counters), is_whole=len(ahead) < _READ_AHEAD):
         warn(f"the result will mean nothing: {found.code}: {found.text}")
     warmup(dimensions=config.world.dimensions)
     earlier: list[tuple[Path, dict[str, Any]]] = []
     warnings: list[str] = []
     summary: dict[str, Any] = {}
-    for number, run in groupby(progress(chain(ahead, read, _end(runs)), total), key=itemgetter(0)):
+    for number, run in groupby(progress(chain(ahead, read, end), runs.count + len(END)), key=itemgetter(0)):
         if number:
             if (kept := keep_earlier(out, sys.maxsize)) is None:  # none is removed for that
                 raise RunError(f"{out}: the run until time jumped back holds nothing")
             earlier.append((kept, summary))
             state, took = None, stopwatch()
-        refused = Counters()
-        measured, name = _measured(run, runs, number, refused), source.resolve().name
-        options: dict[str, Any] = {"recording": name, "took": took, "more": lambda: _checked(columns, counters, bag)}
-        slam, summary = record_run(out, config, measured, bag.losses, state, border=refused, force=force, **options)
+        measured = chain.from_iterable(some for _, some in run)
+        slam, summary = record_run(
+            out,
+            config,
+            measured,
+            bag.losses,
+            state,
+            border=partial(runs.counted_in, number),
+            took=took,
+            recording=source.resolve().name,
+            more=lambda: _checked(columns, counters, bag),
+            force=force,
+        )
         warnings += _warnings(slam, summary)
     return Replayed(
         slam, summary, summary["losses"], [*bag.warnings, *warnings], tuple(earlier), tuple(inputs.by_topic())
@@ -268,16 +279,3 @@ def _warnings(slam: GraphSlam, summary: dict[str, Any]) -> list[str]:
     has_cause = bool(summary.get("uncorrected")) or is_explained(summary)
     alarms = [] if has_cause else [str(one) for one in slam.alarms if not is_undecided(asdict(one))]
     return [*doubts(summary), *alarms, *unscaled(summary), *mendable(summary["counters"])]
-
-
-def _measured(
-    run: Iterable[tuple[int, Sequence[Measurement]]], runs: RecordedRuns, number: int, refused: Counters
-) -> Iterator[Measurement]:
-    """The measurements of a run one by one. At its end ``refused`` has what was counted meanwhile."""
-    for _, some in run:
-        yield from some
-    refused.update(runs.counted_in(number))
-
-
-def _end(runs: RecordedRuns) -> Iterator[tuple[int, Sequence[Measurement]]]:
-    yield from ((len(runs.counted), [event]) for event in END)

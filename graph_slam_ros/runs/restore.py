@@ -161,7 +161,7 @@ def record_run(
     losses: Sequence[str],
     start: MapSnapshot | None = None,
     *,
-    border: Counters | None = None,
+    border: Callable[[], Counters] = Counters,
     earlier: Counters | None = None,
     took: Stopwatch | None = None,
     recording: str = "",
@@ -174,7 +174,7 @@ def record_run(
     ----------
     losses : what could not be read, as known when the last measurement was
     start : the map to go on in
-    border : counters of what was refused before it came here
+    border : returns the counters of what was refused before it came here, when all is processed
     earlier : counters of the run whose results these are, up to ``start``
     took : the time since whatever is told as its beginning
     recording : the name of the file or folder that the measurements are from
@@ -193,7 +193,7 @@ def record_run(
         slam = GraphSlam(config, recorder.sink, start=start)
         for measurement in measurements:
             recorder.record(slam, slam.process(measurement))
-        slam.counters.update(border or Counters())
+        slam.counters.update(border())
         summary = summarize(slam, earlier) | took() | {"losses": list(dict.fromkeys(losses))}
         summary |= ({"recording": recording} if recording else {}) | more()
         summary |= fitted_summary(slam)

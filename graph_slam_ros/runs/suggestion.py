@@ -1,29 +1,35 @@
-"""The replay command that fits a recording: which topics are inputs, and which only look like inputs."""
+"""The replay command that fits a recording: which topics are inputs, and which only look like inputs.
+
+Users may have chosen some of its parameters and topics: these come before what is suggested.
+"""
 
 import re
 import shlex
 from collections.abc import Collection, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from graph_slam_ros.check.pairs import ASSUMED_BEARING_RAD, ASSUMED_RANGE_M
 from graph_slam_ros.config import Config
-from graph_slam_ros.config.inputs import ASSUMED
+from graph_slam_ros.config.inputs import ASSUMED, default_input
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.parameters import assignment
-from graph_slam_ros.messages.from_msg import TRANSFORMS
+from graph_slam_ros.messages.from_msg import TF, TF_STATIC, TRANSFORMS
 from graph_slam_ros.messages.inputs import CONVERTERS, converters, known_types
 from graph_slam_ros.messages.inputs.landmark_types import APRILTAGS, LANDMARK_TYPES
 from graph_slam_ros.messages.inputs.transforms import MAP_FRAMES
-from graph_slam_ros.overview.chosen_inputs import TF_STATIC_TOPIC, TF_TOPIC, choose_inputs, is_truth
-from graph_slam_ros.overview.contents import Recording, TopicContents
-from graph_slam_ros.overview.suggested_odometry import DETECTIONS, ESTIMATE, POSES, OdometryChoice, readable
-from graph_slam_ros.recordings.bag import Bag
+from graph_slam_ros.overview.chosen_inputs import TF_STATIC_TOPIC, TF_TOPIC, Inputs, choose_inputs, is_truth
+from graph_slam_ros.overview.contents import Recording, TopicContents, recording_of
+from graph_slam_ros.overview.suggested_odometry import DETECTIONS, ESTIMATE, ODOMETRY, POSES, OdometryChoice, readable
+from graph_slam_ros.recordings.bag import Bag, BagError, open_bag
 from graph_slam_ros.runs.folder import suggested_out
 
 MARKERS = "visualization_msgs/msg/MarkerArray"
 CLOUD, GNSS, IMU = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/Imu"
 POSE, POSE_WITH_COVARIANCE = POSES
+OF_LANDMARKS = frozenset({DETECTIONS, CLOUD, *LANDMARK_TYPES})
+"""Types of messages that have landmarks."""
 
 _TAG = re.compile(r"((?:.*[/_])?(?:tag|aruco|marker|fiducial).*?)[:_]?\d+", re.IGNORECASE)
 _TAG_TOPIC = re.compile(r"(?:tag|aruco|marker|fiducial)[_/:]?(\d+)(?:/pose)?$", re.IGNORECASE)
@@ -38,8 +44,13 @@ _CLOCKS_DIFFER_S = 2.0
 class Suggestion:
     """A command, and notes for the user.
 
+    Parameters
+    ----------
+    odometry, landmarks : topics; the suggestion is that for a recording in which they are the only ones of their kinds
+
     Attributes
     ----------
+    recording : its contents
     settings : parameters that differ from their defaults, by dotted name
     topics, names : of odom and detections; of all inputs
     notes : sentences: what was chosen and why, and what is assumed
@@ -48,15 +59,16 @@ class Suggestion:
     trouble : why there is no command; empty where there is one
     """
 
-    def __init__(self, bag: Bag, recording: Recording, path: Path) -> None:
-        self._recording, self._path = recording, path
+    def __init__(self, bag: Bag, path: Path, odometry: str | None = None, landmarks: str | None = None) -> None:
+        self.recording, self._path = recording_of(bag), path
+        self._recording = _with_only(self.recording, odometry, landmarks)
         self.settings: dict[str, Any] = {}
         self.notes: list[str] = []
         self.unused: dict[str, str] = {}
         self.perhaps: list[str] = []
         self.topics: dict[str, str] = {}  # of odom and detections
         self.names: list[str] = []
-        chosen = OdometryChoice(recording, self.unused)
+        chosen = OdometryChoice(self._recording, self.unused)
         self._odometry, self._base, self._odom = chosen.contents, chosen.base, chosen.odom
         self.settings |= chosen.settings
         self.notes += chosen.notes
@@ -169,30 +181,35 @@ class Suggestion:
     # -- fixes ---------------------------------------------------------------------------------------------------
 
     def _choose_fixes(self) -> None:
-        has_landmarks = len(self.names) > 1
         receivers = sorted(readable(self._recording, self.unused, GNSS), key=lambda one: -one.usable)
+        if receivers and receivers[0].usable:
+            self._receiver(receivers[0])
         for one in receivers[1:]:
             self.unused[one.topic.name] = "another receiver"
-        for one in [first for first in receivers[:1] if first.usable]:
-            self._add("gps", one, {} if one.has_noise else {"sigma_m": 2.0}, linked=True)
-            self._mount(one.topic.name, one.frame)  # says what is assumed; the input itself assumes and counts it
-            if not one.has_noise:
-                self.notes.append(f"{one.topic.name} has no covariance: 2 m is assumed")
         self._choose_imu(readable(self._recording, self.unused, IMU), is_needed=len(self.names) == 1)
         for one in readable(self._recording, self.unused, POSE, POSE_WITH_COVARIANCE):
-            name = one.topic.name
-            if self._tag_number(one) or name == self.topics.get("odom"):
-                pass  # a landmark, or odometry
-            elif ESTIMATE.search(name):
-                self.unused[name] = "the output of a localiser, or a goal: no measurement"
-            elif one.frame == self._odom:
-                self.unused[name] = "in the frame of the odometry: it says the same"
-            elif one.topic.type == POSE or has_landmarks or len(self.names) > 1:
-                self.unused[name] = f"a pose may be an estimate or the truth; as a fix: {self._as_fix(one)}"
-            else:
-                chosen: dict[str, Any] = {} if one.frame == "map" else {"frame": "map"}
-                self._add("pose", one, chosen | ({} if one.has_noise else {"sigma_m": 0.1}), linked=True)
-                self.notes.append(f"{name} is taken for a fix: if it is an estimate or the truth, leave it out")
+            is_landmark, is_odometry = bool(self._tag_number(one)), one.topic.name == self.topics.get("odom")
+            if not (is_landmark or is_odometry):
+                self._pose(one)
+
+    def _receiver(self, one: TopicContents) -> None:
+        self._add("gps", one, {} if one.has_noise else {"sigma_m": 2.0}, linked=True)
+        self._mount(one.topic.name, one.frame)  # says what is assumed; the input itself assumes and counts it
+        if not one.has_noise:
+            self.notes.append(f"{one.topic.name} has no covariance: 2 m is assumed")
+
+    def _pose(self, one: TopicContents) -> None:
+        name = one.topic.name
+        if ESTIMATE.search(name):
+            self.unused[name] = "the output of a localiser, or a goal: no measurement"
+        elif one.frame == self._odom:
+            self.unused[name] = "in the frame of the odometry: it says the same"
+        elif one.topic.type == POSE or len(self.names) > 1:
+            self.unused[name] = f"a pose may be an estimate or the truth; as a fix: {self._as_fix(one)}"
+        else:
+            chosen: dict[str, Any] = {} if one.frame == "map" else {"frame": "map"}
+            self._add("pose", one, chosen | ({} if one.has_noise else {"sigma_m": 0.1}), linked=True)
+            self.notes.append(f"{name} is taken for a fix: if it is an estimate or the truth, leave it out")
 
     def _as_fix(self, one: TopicContents) -> str:
         """The settings that make a topic of poses a fix, besides the inputs that are chosen."""
@@ -311,3 +328,109 @@ class Suggestion:
         if _WITHOUT_ID.search(of):
             return f"no input reads {of}, which has no ids; where these are landmarks, publish them as {DETECTIONS}"
         return ""
+
+
+def _with_only(recording: Recording, odometry: str | None, landmarks: str | None) -> Recording:
+    """The recording without other topics of odometry and landmarks than the given ones."""
+    topics = recording.topics
+    if odometry in topics:
+        kind = topics[odometry].topic.type
+        topics = {name: one for name, one in topics.items() if name == odometry or one.topic.type != kind}
+    if landmarks in topics:
+        topics = {n: one for n, one in topics.items() if n == landmarks or one.topic.type not in OF_LANDMARKS}
+    return replace(recording, topics=topics)
+
+
+class SuggestedInputs:
+    """The suggestion for a recording, and what of it holds where the user has chosen some parameters and topics.
+
+    Parameters
+    ----------
+    given : parameters by dotted name, which come before those that are suggested
+    odometry, landmarks : topics, as of a ``Suggestion``
+
+    Attributes
+    ----------
+    suggestion : for the recording
+    assumed : the suggested parameters that the user has not chosen; none where the inputs are given
+    settings : these and the given ones
+    """
+
+    def __init__(
+        self,
+        bag: Bag,
+        path: Path,
+        given: Mapping[str, Any],
+        odometry: str | None = None,
+        landmarks: str | None = None,
+    ) -> None:
+        has_names = "inputs.names" in given
+        if not has_names:
+            odometry, landmarks = odometry or _topic_of(given, "odom"), landmarks or _topic_of(given, "detections")
+        self._bag, self._odometry, self._landmarks = bag, odometry, landmarks
+        self.suggestion = Suggestion(bag, path, odometry, landmarks)
+        is_suggested = not self.suggestion.trouble and not has_names
+        suggested = self.suggestion.settings if is_suggested else {}
+        self._topics = self.suggestion.topics if is_suggested else {}
+        self.assumed = {name: value for name, value in suggested.items() if name not in given}
+        self.settings = self.assumed | dict(given)
+
+    def inputs(self, config: Config) -> Inputs:
+        """The topics of the inputs of a configuration: named, suggested, configured, or the only ones of their types.
+
+        Raises
+        ------
+        BagError
+            A topic does not exist or has another type, or there is none.
+        """
+        used = {one.name for one in config.sources if one.use != "none"}
+        topics = {name: topic for name, topic in self._topics.items() if name in used}
+        odometry, landmarks = self._odometry or topics.get("odom"), self._landmarks or topics.get("detections")
+        return choose_inputs(self._bag, config, odometry, landmarks)
+
+
+def _topic_of(given: Mapping[str, Any], name: str) -> str | None:
+    """The topic that somebody has given an input, with its slash."""
+    topic = given.get(f"{name}.topic")
+    return None if topic is None else f"/{str(topic).lstrip('/')}"
+
+
+def suggestion_for_other_types(path: Path, config: Config, odometry: str | None = None) -> Suggestion | None:
+    """Return how to replay a recording whose odometry or landmarks are of other types than the usual, or are fixes.
+
+    None where they are usual, where other inputs are configured, or where there is nothing else in it.
+
+    Parameters
+    ----------
+    odometry : its topic; None: the suggested one
+
+    Raises
+    ------
+    BagError
+        It cannot be read.
+    """
+    if config.inputs.names != Config().inputs.names:
+        return None
+    bag = open_bag(path)
+    try:
+        if any(name not in ("odom", TF, TF_STATIC) for name in choose_inputs(bag, config, odometry).topics):
+            return None
+    except BagError:  # which the replay says
+        is_usual = next(one for one in config.sources if one.name == "odom") == default_input("odom")
+        if odometry or not is_usual or any(topic.type == ODOMETRY for topic in bag.topics.values()):
+            return None
+    found = Suggestion(bag, path, odometry)
+    return None if found.trouble or len(found.names) < 2 else found
+
+
+def unused_topics(path: Path, used: Collection[str]) -> list[str]:
+    """Topics of a recording that have odometry, landmarks or fixes by their type, and that no input was read from.
+
+    Parameters
+    ----------
+    used : topics of the inputs
+    """
+    topics = (
+        one for one in open_bag(path).topics.values() if one.count and one.type in (*OF_LANDMARKS, ODOMETRY, GNSS)
+    )
+    return sorted(f"{one.name} ({one.type})" for one in topics if one.name not in used and not is_truth(one.name))

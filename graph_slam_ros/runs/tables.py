@@ -80,6 +80,13 @@ def summarize(slam: GraphSlam, earlier: Counters | None = None) -> dict[str, Any
     for some in (earlier or Counters(), slam.counters):
         counters.update(some)
     last = slam.report or (slam.solver.evaluate() if slam.is_solved else None)
+    optional = {
+        "survey_unseen": sorted(slam.config.survey.keys() - slam.landmarks.keys()),
+        "gyro": slam.gyro and asdict(slam.gyro),
+        "calibrated": slam.found_settings,
+        "association": _association(slam),
+        "contested": _contested(slam),
+    }
     return (
         {
             "version": __version__,
@@ -104,11 +111,7 @@ def summarize(slam: GraphSlam, earlier: Counters | None = None) -> dict[str, Any
             "span_s": (slam.keyframes[-1].stamp_ns - slam.began_ns) * 1e-9 if slam.keyframes else 0.0,
         }
         | condensed_part(slam)
-        | ({"survey_unseen": unseen} if (unseen := sorted(slam.config.survey.keys() - slam.landmarks.keys())) else {})
-        | ({"gyro": asdict(gyro)} if (gyro := slam.gyro) else {})
-        | ({"calibrated": settings} if (settings := slam.found_settings) else {})
-        | ({"association": found} if (found := _association(slam)) else {})
-        | ({"contested": contested} if (contested := _contested(slam)) else {})
+        | {name: value for name, value in optional.items() if value}
         | account(slam, counters)
     )
 
@@ -194,20 +197,14 @@ def counters_of(summary: Mapping[str, Any]) -> Counters:
     try:
         for source, counts in summary.get("counters", {}).items():
             for reason, times in counts.items():
-                out.count(str(source), str(reason), _times(times))
+                out.count(str(source), str(reason), int(times))
         for name, of in summary.get("inputs", {}).items():
-            out.used[name] += _times(of["used"])
+            out.used[name] += int(of["used"])
             if of["received"] is not None:
-                out.received[name] += _times(of["received"])
+                out.received[name] += int(of["received"])
     except (AttributeError, LookupError, TypeError) as error:
         raise ValueError(str(error)) from None
     return out
-
-
-def _times(value: Any) -> int:
-    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 2**63:
-        raise ValueError(f"{value!r:.20} is no count")
-    return value
 
 
 def accepted_lately(slam: GraphSlam) -> dict[str, tuple[int, int]]:

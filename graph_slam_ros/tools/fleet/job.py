@@ -173,7 +173,7 @@ def _results(job: Job, made: Path) -> Row:
 def _inputs(job: Job, recording: Path) -> tuple["Config", tuple[str | None, str | None]]:
     """The configuration, and topics of odometry and landmarks where ``info`` suggests other inputs than the usual."""
     from graph_slam_ros.config import Config
-    from graph_slam_ros.runs.suggested_inputs import suggestion_for_other_types
+    from graph_slam_ros.runs.suggestion import suggestion_for_other_types
 
     config = Config.from_mapping(dict(job.values))
     found = suggestion_for_other_types(recording, config)

@@ -10,7 +10,6 @@ from rows import each
 
 from graph_slam_ros.cli import main
 from graph_slam_ros.lie import se3
-from graph_slam_ros.overview.contents import recording_of
 from graph_slam_ros.recordings.bag import open_bag
 from graph_slam_ros.runs.check import check
 from graph_slam_ros.runs.suggestion import Suggestion
@@ -84,8 +83,7 @@ def test_landmarks_in_the_frame_of_odometry_need_no_mount_where_tf_has_the_robot
     drive, file = in_odom(Drive(short), "odom"), tmp_path / "odom.mcap"
     spoil_messages(drive, [Fault.named("other_tf", distance=1.0)], 0)
     drive.write(file)
-    bag = open_bag(file)
-    found = Suggestion(bag, recording_of(bag), file)
+    found = Suggestion(open_bag(file), file)
     assert "detections.mount" not in found.settings
     assert any("/landmarks is given in odom: /tf says where the robot is in it" in note for note in found.notes)
     assert [one.code for one in check(file).findings if one.severity != "note"] == []

@@ -14,7 +14,7 @@ from graph_slam_ros.overview.chosen_inputs import choose_inputs
 from graph_slam_ros.recordings.bag import BagError, BagWriter, open_bag
 from graph_slam_ros.runs.journal import read_ingest
 from graph_slam_ros.runs.replay import replay
-from graph_slam_ros.runs.suggested_inputs import SuggestedInputs
+from graph_slam_ros.runs.suggestion import SuggestedInputs
 from graph_slam_ros.slam import Config, Fix, Odometry, Sightings
 
 TF = "tf2_msgs/msg/TFMessage"

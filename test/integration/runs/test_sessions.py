@@ -147,7 +147,7 @@ def test_a_summary_that_tells_nonsense_hurts_nobody_and_of_what_was_refused_it_i
         summary.write_text(json.dumps(told | {"recorded": marks}))
         changed_since(run)
     assert recover(run, tmp_path / "out")["keyframes"] == told["keyframes"]
-    for k, wrong in enumerate(({"counters": {"a": {"b": "c"}}}, {"counters": 3}, {"inputs": {"odom": {"used": -1}}})):
+    for k, wrong in enumerate(({"counters": {"a": {"b": "c"}}}, {"counters": 3}, {"inputs": {"odom": {"used": "x"}}})):
         summary.write_text(json.dumps(told | wrong))
         done = recover(run, tmp_path / f"out{k}")
         assert any("what it had counted" in loss for loss in done["losses"]), wrong
