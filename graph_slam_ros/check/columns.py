@@ -6,11 +6,12 @@ A ``Collector`` gets each decoded message, and the measurements that the convert
 
 from array import array
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
+from graph_slam_ros.check.finding import OfTopic
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.config.inputs import ASSUMED, InputConfig
 from graph_slam_ros.lie import se3, so3
@@ -31,7 +32,7 @@ Decoder = Callable[[bytes], Any]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TopicColumns:
+class TopicColumns(OfTopic):
     """The messages of one topic.
 
     Attributes
@@ -41,7 +42,7 @@ class TopicColumns:
     frames : how many messages name each frame
     """
 
-    name: str
+    topic: str
     inputs: tuple[str, ...]
     use: str
     log_ns: Index
@@ -50,7 +51,7 @@ class TopicColumns:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class OdometryColumns:
+class OdometryColumns(OfTopic):
     """The odometry that is used, as its messages have it.
 
     Attributes
@@ -68,13 +69,9 @@ class OdometryColumns:
     twist: Array
     variances: Array
 
-    def some(self, which: Mask) -> "OdometryColumns":
-        """Return the columns of some of the messages."""
-        return replace(self, **{row: getattr(self, row)[which] for row in ("stamp_ns", "poses", "twist", "variances")})
-
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SightingColumns:
+class SightingColumns(OfTopic):
     """The sightings of one input, as a replay uses them.
 
     Attributes
@@ -99,11 +96,6 @@ class SightingColumns:
     frame: str
     T_base_frame: se3.Pose
 
-    def some(self, which: Mask) -> "SightingColumns":
-        """Return the columns of some of the sightings."""
-        rows = ("stamp_ns", "name", "points", "ranges", "bearings", "sigmas")
-        return replace(self, **{row: getattr(self, row)[which] for row in rows})
-
     def named(self, path_ns: Index) -> Mask:
         """Return which have an identity, and are within the time of odometry."""
         is_named = np.array([bool(name) for name in self.names], dtype=bool)[self.name]
@@ -115,7 +107,7 @@ class SightingColumns:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FixColumns:
+class FixColumns(OfTopic):
     """The fixes of one input, as a replay uses them.
 
     Attributes

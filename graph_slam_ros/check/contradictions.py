@@ -7,9 +7,9 @@ from operator import itemgetter
 import numpy as np
 
 from graph_slam_ros.check.columns import Columns, SightingColumns
-from graph_slam_ros.check.finding import NO_IDS, Finding, Severity, where
+from graph_slam_ros.check.finding import NO_IDS, Finding, Severity
 from graph_slam_ros.check.moving_landmarks import check_moving, motions_of
-from graph_slam_ros.check.odometry import twist_factor
+from graph_slam_ros.check.odometry import fitted, twist_factor
 from graph_slam_ros.check.pairs import (
     LATER_S,
     Pairs,
@@ -38,7 +38,7 @@ _LOOP = 0.1  # of the way: landmarks that come back within less close no loop of
 _SILENT = 0.5
 _QUARTER = 0.5**0.5
 _CORRECTED = "_corrected"
-_ROUNDS, _SIGMAS, _OTHER_SCALE, _LEAST_SCALE = 10, 4.0, 0.15, 0.1  # a fit finds less than _OTHER_SCALE
+_SIGMAS, _OTHER_SCALE, _LEAST_SCALE = 4.0, 0.15, 0.1  # a fit finds less than _OTHER_SCALE
 _FIXED = 20.0  # sigmas, or metres, that fixes are apart
 _PLACE_M = 0.03  # by which the place of a sensor may be wrong
 
@@ -77,14 +77,13 @@ def _contradictions(c: Columns, s: SightingColumns) -> Iterator[Finding]:
     distance_m = np.linalg.norm(s.points, axis=1)
     far_m = float(np.median(distance_m[use]))
     if far_m > _FAR_M:
-        text = f"{s.topic}: the median distance of landmarks is {far_m:.0f} m: are these metres?"
-        yield Finding("units", "error", far_m, _FAR_M, "m", text, **where(s.topic, s.stamp_ns, use.sum()))
+        text = f"the median distance of landmarks is {far_m:.0f} m: are these metres?"
+        yield s.finding("units", "error", far_m, _FAR_M, "m", text, use.sum())
         return
     pairs = pairs_of(c, s)
     if len(pairs.a) < _LEAST_PAIRS:
-        text = f"{s.topic}: landmarks are seen again within {LATER_S:.0f} s of motion only {len(pairs.a)} times"
-        at = where(s.topic, s.stamp_ns, use.sum())
-        yield Finding("no_parallax", "note", len(pairs.a), _LEAST_PAIRS, "pairs", text, **at)
+        text = f"landmarks are seen again within {LATER_S:.0f} s of motion only {len(pairs.a)} times"
+        yield s.finding("no_parallax", "note", len(pairs.a), _LEAST_PAIRS, "pairs", text, use.sum())
         return
     noise_m, count = noise_of(s, pairs), len(pairs.a)
     found = _mirrored(c, s, pairs, noise_m) or _axes(s, pairs, noise_m, use) or _scaled(c, s, pairs)
@@ -102,8 +101,8 @@ def _contradictions(c: Columns, s: SightingColumns) -> Iterator[Finding]:
         if residual_m < _RELATED * _of_others(s.points, pairs, use):
             yield from noisier(s, pairs)
             return
-        text = f"{s.topic}: odometry does not explain {share:.0%} of the motion between two sightings of a landmark"
-        yield Finding("unrelated", "error", share, _UNRELATED, "part", text, **where(s.topic, s.stamp_ns, count))
+        text = f"odometry does not explain {share:.0%} of the motion between two sightings of a landmark"
+        yield s.finding("unrelated", "error", share, _UNRELATED, "part", text, count)
 
 
 def _of_others(points: Array, pairs: Pairs, use: Mask) -> float:
@@ -140,16 +139,6 @@ def _hypotheses(s: SightingColumns) -> dict[str, Array]:
     return turned | {what: np.stack(se3.act(T, tuple(points.T)), axis=1) for what, points in others.items()}
 
 
-def fitted(rows: Array, y: Array) -> tuple[Array, float]:
-    """Robust least squares, with the sigma of the last number if the others were known."""
-    weight = np.ones(len(y))
-    for _ in range(_ROUNDS):
-        found = np.linalg.lstsq(rows * weight[:, None], y * weight, rcond=None)[0]
-        left = np.abs(rows @ found - y)
-        weight = 1.0 / np.hypot(1.0, left / (3.0 * np.median(left) + 1e-6))
-    return np.asarray(found), float(np.median(left) / np.linalg.norm(rows[:, -1] * weight))
-
-
 def _turned(s: SightingColumns, pairs: Pairs, T_base_true: se3.Pose) -> se3.Pose:
     """Turn and shift a sensor in the plane so that its sightings agree with odometry best.
 
@@ -184,9 +173,8 @@ def _mirrored(c: Columns, s: SightingColumns, pairs: Pairs, noise_m: float) -> F
     if not _explains(mirror_m, now_m, noise_m) or mirror_m >= _NEARLY * min(others.values()):
         return None
     apart = f"two sightings of a landmark differ by {now_m:.2f} m, but by {mirror_m:.2f} m"
-    text = f"{s.topic}: in turns, {apart} if {what}"
-    at = where(s.topic, s.stamp_ns, len(pairs.a))
-    return Finding("mirrored", "error", now_m / max(mirror_m, 1e-9), 1.0 / _HALF, "times", text, **at)
+    text = f"in turns, {apart} if {what}"
+    return s.finding("mirrored", "error", now_m / max(mirror_m, 1e-9), 1.0 / _HALF, "times", text, len(pairs.a))
 
 
 def _axes(s: SightingColumns, pairs: Pairs, noise_m: float, use: Mask) -> Finding | None:
@@ -208,11 +196,11 @@ def _axes(s: SightingColumns, pairs: Pairs, noise_m: float, use: Mask) -> Findin
         return None  # in the plane some axes hide any distance
     best_m = pairs.apart_m(points[what])
     apart = f"two sightings of a landmark differ by {now_m:.2f} m, but by {best_m:.2f} m"
-    text = f"{s.topic}: {apart} if the axes are {what}"
+    text = f"{apart} if the axes are {what}"
     is_all = best_m < _NOISES * noise_m  # else another mount is right
     settings = turned_mount(s.input, s.frame, mounts[what], se3.IDENTITY) if is_all and what in mounts else ()
-    value, at = now_m / max(best_m, 1e-9), where(s.topic, s.stamp_ns, len(pairs.a), settings)
-    return Finding("axes", "error", value, 1.0 / _HALF, "times", text, **at)
+    value = now_m / max(best_m, 1e-9)
+    return s.finding("axes", "error", value, 1.0 / _HALF, "times", text, len(pairs.a), settings=settings)
 
 
 def _scaled(c: Columns, s: SightingColumns, pairs: Pairs) -> Finding | None:
@@ -240,14 +228,13 @@ def _scaled(c: Columns, s: SightingColumns, pairs: Pairs) -> Finding | None:
     by_odometry = factor_setting("odometry.distance_factor", scale * drive, 100.0)
     is_twist = abs(scale * twist_factor(o) * drive - 1.0) < _OTHER_SCALE
     if is_twist or drive < _LEAST_SCALE or (is_told and of_odometry < of_ranges):
-        text = f"{o.topic}: its pose moves {1.0 / drive:.3g} times as far as landmarks say: is it in metres?"
-        at = where(o.topic, c.path_ns, settings=by_odometry)
-        return Finding("units", "error", 1.0 / drive, 1.0 + _OTHER_SCALE, "times", text, **at)
-    text = f"{s.topic}: ranges are {drive:.2f} times as long as odometry says: is the tags' size right (black square)?"
+        text = f"its pose moves {1.0 / drive:.3g} times as far as landmarks say: is it in metres?"
+        return o.finding("units", "error", 1.0 / drive, 1.0 + _OTHER_SCALE, "times", text, settings=by_odometry)
+    text = f"ranges are {drive:.2f} times as long as odometry says: is the tags' size right (black square)?"
     if not is_told and by_ranges and by_odometry:
         text += f" If the ranges are wrong: {by_ranges[0]}; if odometry is: {by_odometry[0]}"
-    at = where(s.topic, s.stamp_ns, len(pairs.a), by_ranges if is_told else ())
-    return Finding("range_scale", "error", drive, 1.0 + _OTHER_SCALE, "times", text, **at)
+    settings, limit = by_ranges if is_told else (), 1.0 + _OTHER_SCALE
+    return s.finding("range_scale", "error", drive, limit, "times", text, len(pairs.a), settings=settings)
 
 
 def factor_setting(key: str, factor: float, most: float) -> tuple[str, ...]:
@@ -273,31 +260,30 @@ def _rpy(q: so3.Quaternion) -> tuple[float, float, float]:
 
 
 def _identities(c: Columns, s: SightingColumns) -> Iterator[Finding]:
-    counts = c.counters.as_dict().get(s.input, {})
-    conflicts = counts.get("id_conflict", 0)  # places differ; those of a tag in two cameras agree, and are merged
-    twice = counts.get("id_merged", 0) + conflicts
+    conflicts = c.counters[s.input, "id_conflict"]  # places differ; those of a tag in two cameras agree, and are merged
+    twice = c.counters[s.input, "id_merged"] + conflicts
     if (share := twice / max(len(s.stamp_ns) + twice, 1)) > _TWICE:
         severity: Severity = "error" if share * conflicts / twice > _NO_IDS else "warning"
-        text = f"{s.topic}: {share:.1%} of the sightings have an id that is twice in their message"
-        at = where(s.topic, s.stamp_ns, twice, NO_IDS if severity == "error" else ())
-        yield Finding("id_twice", severity, share, _TWICE, "part", text, **at)
+        text = f"{share:.1%} of the sightings have an id that is twice in their message"
+        settings = NO_IDS if severity == "error" else ()
+        yield s.finding("id_twice", severity, share, _TWICE, "part", text, twice, settings=settings)
 
 
 def _coverage(s: SightingColumns, path_ns: Index, path: Array) -> Iterator[Finding]:
-    at, inside = where(s.topic, s.stamp_ns), (s.stamp_ns >= path_ns[0]) & (s.stamp_ns <= path_ns[-1])
+    inside = (s.stamp_ns >= path_ns[0]) & (s.stamp_ns <= path_ns[-1])
     between = np.diff([0, *np.searchsorted(path_ns, np.sort(s.stamp_ns[inside])), len(path_ns)])
     silent = float(between.max()) / len(path_ns)
     if silent > _SILENT:
-        text = f"{s.topic}: nothing is seen for {silent:.0%} of the drive, for {int(between.max())} poses of odometry"
-        yield Finding("silent", "warning", silent, _SILENT, "part", text, **at)
+        text = f"nothing is seen for {silent:.0%} of the drive, for {int(between.max())} poses of odometry"
+        yield s.finding("silent", "warning", silent, _SILENT, "part", text)
     chosen = np.flatnonzero(s.named(path_ns))
     if not len(chosen):
         return
     times = np.bincount(s.name[chosen])
     seldom = float((times[times > 0] < _SELDOM).mean())
     if seldom > _ONCE:
-        text = f"{s.topic}: {seldom:.0%} of {int((times > 0).sum())} ids are seen less than {_SELDOM} times"
-        yield Finding("seen_once", "warning", seldom, _ONCE, "part", text, **at)
+        text = f"{seldom:.0%} of {int((times > 0).sum())} ids are seen less than {_SELDOM} times"
+        yield s.finding("seen_once", "warning", seldom, _ONCE, "part", text)
     driven = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path[:, :3], axis=0), axis=1))])
     seconds = (path_ns - path_ns[0]) * 1e-9
     reach_m, few, comes_back = seen_over(s, chosen, path_ns[0], seconds, driven)
@@ -305,8 +291,8 @@ def _coverage(s: SightingColumns, path_ns: Index, path: Array) -> Iterator[Findi
     if reach_m < least_m and driven[-1] > _AGAIN_M:
         again = "nothing joins its parts that are farther apart" if comes_back else "no landmark is seen again later"
         each = f"each landmark but {few}" if few else "each landmark"
-        text = f"{s.topic}: {each} is seen over at most {reach_m:.1f} of {driven[-1]:.0f} m: {again}"
-        yield Finding("no_closure", "warning", reach_m, least_m, "m", text, **at)
+        text = f"{each} is seen over at most {reach_m:.1f} of {driven[-1]:.0f} m: {again}"
+        yield s.finding("no_closure", "warning", reach_m, least_m, "m", text)
 
 
 def seen_over(

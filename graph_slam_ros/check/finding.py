@@ -5,14 +5,16 @@ counter; ``measurements/reasons.py`` explains it.
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Literal, TypeAlias
+from dataclasses import dataclass, fields, replace
+from typing import Any, Literal, TypeAlias, TypeVar
+
+import numpy as np
 
 from graph_slam_ros.formats.parameters import parse_setting
-from graph_slam_ros.typing import Index
+from graph_slam_ros.typing import Index, Mask
 
 Severity: TypeAlias = Literal["error", "warning", "note"]
+OfSomeTopic = TypeVar("OfSomeTopic", bound="OfTopic")
 
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 
@@ -198,13 +200,36 @@ class Finding:
         return first | {"evidence": evidence, "text": self.text, "settings": list(self.settings)}
 
 
-def where(
-    topic: str, stamps_ns: Sequence[int] | Index = (), count: int | None = None, settings: tuple[str, ...] = ()
-) -> dict[str, Any]:
-    """Return the topic, first stamp and count (of the stamps, where it is not given) of a finding, and its settings."""
-    first_ns = int(stamps_ns[0]) if len(stamps_ns) else 0
-    number = len(stamps_ns) if count is None else int(count)
-    return {"topic": topic, "first_ns": first_ns, "count": number, "settings": settings}
+class OfTopic:
+    """What is known of each of n messages or measurements of a topic, in arrays; there are findings of it."""
+
+    __slots__ = ()
+    topic: str
+    stamp_ns: Index
+
+    def some(self: OfSomeTopic, which: Index | Mask) -> OfSomeTopic:
+        """The same of some of them."""
+        rows = {one.name: getattr(self, one.name) for one in fields(self)}  # type: ignore[arg-type]
+        arrays = {name: row[which] for name, row in rows.items() if isinstance(row, np.ndarray)}
+        return replace(self, **arrays)  # type: ignore[type-var]
+
+    def finding(
+        self,
+        code: str,
+        severity: Severity,
+        value: float,
+        limit: float,
+        unit: str,
+        text: str,
+        count: int | None = None,
+        at: Index | None = None,
+        settings: tuple[str, ...] = (),
+    ) -> Finding:
+        """A finding of the topic, or of so many of its messages, or those at some stamps."""
+        stamps_ns = self.stamp_ns if at is None else at
+        first_ns, number = int(next(iter(stamps_ns), 0)), len(stamps_ns) if count is None else int(count)
+        whole = f"{self.topic or 'odometry'}: {text}"
+        return Finding(code, severity, value, limit, unit, whole, self.topic, first_ns, number, settings)
 
 
 def in_order(findings: list[Finding]) -> list[Finding]:

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 
 from graph_slam_ros.check.columns import Columns, SightingColumns
-from graph_slam_ros.check.finding import Finding, Severity, where
+from graph_slam_ros.check.finding import Finding, Severity
 from graph_slam_ros.config.inputs import ASSUMED
 from graph_slam_ros.formats.parameters import assignment
 from graph_slam_ros.messages.inputs.transforms import MAP_FRAMES, assumed_mount
@@ -22,8 +22,8 @@ def check_frames(c: Columns) -> Iterator[Finding]:
         severity: Severity = "note" if is_common else "warning"
         localiser = "the output of a localiser"
         what = f"visual odometry, or {localiser}" if is_common else f"{localiser}, not odometry"
-        text = f"{c.odometry.topic} is given in frame {c.odometry.frame}: it is {what}"
-        yield Finding("odometry_in_map", severity, 1, 0, "topics", text, c.odometry.topic)
+        text = f"given in frame {c.odometry.frame}: it is {what}"
+        yield c.odometry.finding("odometry_in_map", severity, 1, 0, "topics", text, 0)
     unlinked = set()
     for s in c.sightings:
         found = list(_of_sensor(c, s))
@@ -49,22 +49,21 @@ def _parents(c: Columns) -> Iterator[Finding]:
 
 def _of_sensor(c: Columns, s: SightingColumns) -> Iterator[Finding]:
     topic = c.topics[s.topic]
-    at = where(s.topic, topic.stamp_ns)
     fixed = [frame for frame in topic.frames if frame.lstrip("/") in (*_FIXED, c.odometry.frame) and frame]
     if fixed:
         is_linked = (fixed[0].lstrip("/"), c.odometry.child) in c.links
-        text = f"{s.topic} is given in {fixed[0]}, a frame that does not move with the robot"
+        text = f"given in {fixed[0]}, a frame that does not move with the robot"
         severity: Severity = "note" if is_linked else "error"
-        yield Finding("seen_in_fixed_frame", severity, topic.frames[fixed[0]], 0, "messages", text, **at)
+        yield topic.finding("seen_in_fixed_frame", severity, topic.frames[fixed[0]], 0, "messages", text)
     elif f"{s.input}.frame" in c.assumed:
-        text = f"{s.topic}: no transform has {next(iter(topic.frames))}: did you mean {s.frame}?"
-        at = where(s.topic, topic.stamp_ns, settings=(assignment(f"{s.input}.frame", s.frame),))
-        yield Finding("frame_unlinked", "error", 1, 0, "frames", text, **at)
+        text = f"no transform has {next(iter(topic.frames))}: did you mean {s.frame}?"
+        settings = (assignment(f"{s.input}.frame", s.frame),)
+        yield topic.finding("frame_unlinked", "error", 1, 0, "frames", text, settings=settings)
     elif next((one.mount for one in c.config.sources if one.name == s.input), "") == ASSUMED:
         named = next(filter(None, topic.frames), "") or "its sensor, whose messages name no frame,"
         assumed = f"a place at the base is assumed, as by --set '{s.input}.mount={assumed_mount(s.frame)}'"
-        text = f"{s.topic}: no transform links {named} to {c.config.frames.base}: {assumed}"
-        yield Finding("frame_unlinked", "error", 1, 0, "frames", text, **at)
+        text = f"no transform links {named} to {c.config.frames.base}: {assumed}"
+        yield topic.finding("frame_unlinked", "error", 1, 0, "frames", text)
 
 
 def _unlinked(c: Columns, known: set[str]) -> Iterator[Finding]:
@@ -72,7 +71,7 @@ def _unlinked(c: Columns, known: set[str]) -> Iterator[Finding]:
     for source, counts in c.counters.as_dict().items():
         topic = c.topic_of(source)
         times = sum(counts.get(reason, 0) for reason in _UNKNOWN)
-        if topic is None or not times or topic.name in known:
+        if topic is None or not times or topic.topic in known:
             continue
         frames, base = tuple(topic.frames), c.config.frames.base
         above = {child: parent for parent, child in c.links}
@@ -81,25 +80,24 @@ def _unlinked(c: Columns, known: set[str]) -> Iterator[Finding]:
         linked = [frame for frame in of_sensor if frame and root_of(above, frame.lstrip("/")) == root]
         lost = ", ".join([frame for frame in frames if frame not in linked][:4])
         others = ", ".join(linked[:4])
-        text = f"{topic.name}: {times} measurements are refused: no transform links frame {lost} to {base}"
+        text = f"{times} measurements are refused: no transform links frame {lost} to {base}"
         settings = () if linked else _place(c, source, frames, lost, "odom_frame_unknown" in counts)
         if frames == ("",):
-            text = f"{topic.name}: {times} measurements name no frame: have their driver fill in header.frame_id"
-            yield Finding("frame_empty", "error", times, 0, "measurements", text, topic.name, 0, times)
+            text = f"{times} measurements name no frame: have their driver fill in header.frame_id"
+            yield topic.finding("frame_empty", "error", times, 0, "measurements", text, times)
             continue
         elif linked and lost:  # at a mount, what another robot sees would be seen by this one
             text += f"; the others are of {others}: is it another robot's frame, or a sensor without a transform?"
         elif linked:  # a mount is not used for them
-            text = f"{topic.name}: {times} measurements are refused: they come before /tf links {others} to {base}"
+            text = f"{times} measurements are refused: they come before /tf links {others} to {base}"
         severity: Severity = "error" if times > 0.5 * max(c.counters.received[source], 1) else "warning"
-        at = where(topic.name, topic.stamp_ns, times, settings)
-        yield Finding("frame_unlinked", severity, times, 0, "measurements", text, **at)
+        yield topic.finding("frame_unlinked", severity, times, 0, "measurements", text, times, settings=settings)
     key = f"{c.odometry.input}.mount"
     if key in c.assumed:
         named = c.odometry.child or "its child frame, which is empty,"
-        text = f"{c.odometry.topic}: no transform links {named} to {c.config.frames.base}: one place is assumed"
-        setting = assignment(key, assumed_mount(""))
-        yield Finding("frame_unlinked", "warning", 1, 0, "frames", text, c.odometry.topic, settings=(setting,))
+        text = f"no transform links {named} to {c.config.frames.base}: one place is assumed"
+        settings = (assignment(key, assumed_mount("")),)
+        yield c.odometry.finding("frame_unlinked", "warning", 1, 0, "frames", text, 0, settings=settings)
 
 
 def _place(c: Columns, source: str, names: Sequence[str], lost: str, is_odometry: bool) -> tuple[str, ...]:

@@ -6,15 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from graph_slam_ros.check.columns import Columns
-from graph_slam_ros.check.contradictions import fitted, turned_mount
-from graph_slam_ros.check.finding import Finding, Severity, where
+from graph_slam_ros.check.columns import Columns, TopicColumns
+from graph_slam_ros.check.contradictions import turned_mount
+from graph_slam_ros.check.finding import Finding, Severity
+from graph_slam_ros.check.odometry import fitted
 from graph_slam_ros.check.pairs import poses_at
 from graph_slam_ros.check.times import offset_setting
 from graph_slam_ros.formats.parameters import assignment
 from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.slam.frontend.gyro import GyroState
-from graph_slam_ros.typing import Array, Index, Numbers
+from graph_slam_ros.typing import Array, Numbers
 
 _WINDOW_NS, _LEAST_WINDOWS, _LEAST_SAMPLES = 1_000_000_000, 20, 3
 _TURNING_RAD, _LEAST_TURNING = 0.1, 10
@@ -33,7 +34,6 @@ def check_gyro(c: Columns) -> Iterator[Finding]:
     odometry, gyro = _turns(c)
     if topic is None or len(gyro) < _LEAST_WINDOWS:
         return
-    gyro_ns = np.sort(c.gyro_ns)
     factor, bias, left = _line(odometry, gyro)
     limit = _BIAS_SIGMAS * c.config.gyro.bias_sigma
     is_turning = np.abs(odometry) > _TURNING_RAD
@@ -43,22 +43,22 @@ def check_gyro(c: Columns) -> Iterator[Finding]:
         most = _UNEXPLAINED if abs(factor) > _GROSS else _OF_NOTHING
         if (unexplained > most or abs(factor - 1.0) > _SCALE) and (late_s := _late_s(c)):
             when = f"{abs(late_s) * 1e3:.0f} ms {'later' if late_s < 0.0 else 'earlier'} than stamped"
-            text = f"{topic.name}: its gyro turns as odometry does {when}: correct its clock"
-            at = where(topic.name, gyro_ns, settings=(offset_setting(c, c.config.gyro_input, -late_s),))
-            yield Finding("clock_offset", "warning", -late_s, _LEAST_LATE_S, "s", text, **at)
+            mend = (offset_setting(c, c.config.gyro_input, -late_s),)
+            text = f"its gyro turns as odometry does {when}: correct its clock"
+            yield topic.finding("clock_offset", "warning", -late_s, _LEAST_LATE_S, "s", text, settings=mend)
             return
         if unexplained > most:
-            text = f"{topic.name}: odometry's turns do not explain {unexplained:.0%} of those of the gyro"
-            yield Finding("gyro_unrelated", "warning", unexplained, most, "part", text, **where(topic.name, gyro_ns))
+            text = f"odometry's turns do not explain {unexplained:.0%} of those of the gyro"
+            yield topic.finding("gyro_unrelated", "warning", unexplained, most, "part", text)
             return
         if abs(factor - 1.0) > _SCALE:
-            yield _scale(c, factor, topic.name, gyro_ns)
+            yield _scale(c, factor, topic)
             if abs(factor - 1.0) >= _GROSS:  # its offset means nothing
                 return
     if abs(bias) > limit:
-        text = f"{topic.name}: its gyro turns by {bias:.3f} rad/s where odometry does not"
+        text = f"its gyro turns by {bias:.3f} rad/s where odometry does not"
         settings = (assignment("gyro.bias_sigma", round(abs(bias), 3)),) if abs(bias) < _MOST_BIAS else ()
-        yield Finding("gyro_bias", "warning", bias, limit, "rad/s", text, **where(topic.name, gyro_ns, None, settings))
+        yield topic.finding("gyro_bias", "warning", bias, limit, "rad/s", text, settings=settings)
 
 
 def _late_s(c: Columns) -> float:
@@ -73,9 +73,9 @@ def _late_s(c: Columns) -> float:
 def check_doubted(c: Columns, gyro: GyroState | None) -> Iterator[Finding]:
     """A gyro that a replay does not use any more, where nothing else is found of it."""
     if gyro is not None and gyro.state == "doubted" and all(one.severity == "note" for one in check_gyro(c)):
-        topic = c.topic_of(gyro.name)
-        at = where(topic.name if topic else "", count=len(c.gyro_ns))
-        yield Finding("gyro_unrelated", "warning", gyro.ratio or 0.0, 1.0, "times", gyro.fault, **at)
+        topic, count = c.topic_of(gyro.name), len(c.gyro_ns)
+        name = topic.topic if topic else ""
+        yield Finding("gyro_unrelated", "warning", gyro.ratio or 0.0, 1.0, "times", gyro.fault, name, count=count)
 
 
 def _turns(c: Columns, rates: Array | None = None) -> tuple[Array, Array]:
@@ -105,8 +105,8 @@ def _line(x: Array, y: Array) -> tuple[float, float, Array]:
     return float(line[0]), float(line[1]), y - rows @ line
 
 
-def _scale(c: Columns, factor: float, name: str, gyro_ns: Index) -> Finding:
-    text = f"{name}: its gyro turns {factor:.3g} times as much as odometry"
+def _scale(c: Columns, factor: float, topic: TopicColumns) -> Finding:
+    text = f"its gyro turns {factor:.3g} times as much as odometry"
     settings: tuple[str, ...] = ()
     if abs(factor - 1.0) < _GROSS:
         text += _EITHER
@@ -124,8 +124,7 @@ def _scale(c: Columns, factor: float, name: str, gyro_ns: Index) -> Finding:
         text += ": are these degrees?"
         settings = (assignment(f"{c.config.gyro_input}.use", "none"),)
     severity: Severity = "warning" if abs(factor - 1.0) < _GROSS else "error"
-    at = where(name, gyro_ns, settings=settings)
-    return Finding("gyro_scale", severity, factor, 1.0 + _SCALE, "times", text, **at)
+    return topic.finding("gyro_scale", severity, factor, 1.0 + _SCALE, "times", text, settings=settings)
 
 
 def upright(felt: Numbers) -> tuple[float, float]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from graph_slam_ros.check.columns import Columns, SightingColumns
-from graph_slam_ros.check.finding import Finding, where
+from graph_slam_ros.check.finding import Finding
 from graph_slam_ros.check.pairs import Pairs, noise_of, pairs_of, poses_at
 from graph_slam_ros.lie import se3
 from graph_slam_ros.typing import Array, Index, Mask
@@ -74,20 +74,20 @@ def check_moving(s: SightingColumns, by: LandmarkMotions, count: int) -> Iterato
     """Sightings of a fixed frame, whatever frame they name, and landmarks that move, by this many pairs."""
     if np.count_nonzero(by.with_robot) >= max(_LEAST_NAMES, _MOST * len(by.names)):
         robot_m, ground_m = float(np.median(by.on_robot)), float(np.median(by.on_ground))
-        text = f"{s.topic}: while the robot drives, landmarks stay where they are on it to {robot_m:.2f} m, and would "
+        text = f"while the robot drives, landmarks stay where they are on it to {robot_m:.2f} m, and would "
         text += f"move by {ground_m:.2f} m on the ground: they are given in a frame that does not move with the robot"
-        value, at = ground_m / max(robot_m, 1e-9), where(s.topic, s.stamp_ns, count)
-        yield Finding("seen_in_fixed_frame", "error", value, 1.0 / _HALF, "times", text, **at)
+        value = ground_m / max(robot_m, 1e-9)
+        yield s.finding("seen_in_fixed_frame", "error", value, 1.0 / _HALF, "times", text, count)
         return
     for k in moving_alone(by)[:_MOST_NAMED]:
         name, own_ns = s.names[by.names[k]], np.sort(s.stamp_ns[s.name == by.names[k]])
-        text = f"{s.topic}: landmark {name} moves: it is {by.on_ground[k]:.2f} m from its place a few seconds later"
+        text = f"landmark {name} moves: it is {by.on_ground[k]:.2f} m from its place a few seconds later"
         text += ": do all have its id?" * (len(s.names) == 1)
         if by.with_robot[k]:
             place = f"at x {by.at[k, 0]:.2f} and y {by.at[k, 1]:.2f} m on it"
-            text = f"{s.topic}: landmark {name} moves along with the robot, {place}: a part of it, or a follower"
-        limit_m, at = _NOISES * by.noise_m, where(s.topic, own_ns)
-        yield Finding("landmark_moves", "warning", by.on_ground[k], limit_m, "m", text, **at)
+            text = f"landmark {name} moves along with the robot, {place}: a part of it, or a follower"
+        limit_m = _NOISES * by.noise_m
+        yield s.finding("landmark_moves", "warning", by.on_ground[k], limit_m, "m", text, at=own_ns)
 
 
 def moving_alone(by: LandmarkMotions) -> list[int]:

@@ -7,7 +7,7 @@ from typing import TypeAlias
 import numpy as np
 
 from graph_slam_ros.check.columns import Columns, OdometryColumns
-from graph_slam_ros.check.finding import Finding, Severity, where
+from graph_slam_ros.check.finding import Finding, Severity
 from graph_slam_ros.check.pairs import poses_at
 from graph_slam_ros.check.times import rounded_s
 from graph_slam_ros.config.pipeline import OdometryConfig
@@ -37,6 +37,7 @@ _TINY, _USELESS, _UNUSED_M_S, _SLOWEST_M_S, _TINY_RAD_S = 1e-3, 3.0, 1e3, 0.05, 
 _OFF_PLANE, _LEVEL_M = 0.05, 0.5
 TOGETHER = 5
 """Steps that are summed for a slip."""
+_ROUNDS = 10
 _SIGMA, _LEAST_STRETCHES = 1.4826, 20  # _SIGMA: of a median absolute deviation
 _UNITS = {
     -1.0: "mirrored",
@@ -139,8 +140,7 @@ def of_one_publisher(c: Columns, *, is_live: bool = False) -> Columns:
     others, topic = steps_of(o.some(~is_used)), c.topics[o.topic]
     of_used = replace(c, odometry=o.some(is_used))
     if len(topic.stamp_ns) == len(is_used):
-        topic = replace(topic, log_ns=topic.log_ns[is_used], stamp_ns=topic.stamp_ns[is_used])
-        of_used = replace(of_used, topics={**c.topics, o.topic: topic})
+        of_used = replace(of_used, topics={**c.topics, o.topic: topic.some(is_used)})
     if others is None:
         return of_used if is_live and is_used.sum() >= LEAST else c
     if others.fastest_m_s > _FASTEST_M_S or others.fastest_turn_rad_s > _FASTEST_RAD_S:
@@ -168,9 +168,8 @@ def check_publishers(c: Columns) -> Iterator[Finding]:
         hops_m = np.zeros(0) if used is None else np.linalg.norm(used.moved[used.jumps], axis=1)
         is_mixed = np.count_nonzero(hops_m > _ELSEWHERE_M) >= _CORRECTED
         severity: Severity = "error" if is_mixed or first_m > _OTHER_ROBOT_M else "warning"
-        at = where(o.topic, o.stamp_ns[~is_used])
-        text = f"{o.topic}: two robots or drivers take turns: {at['count']} of its poses are {away_m:.1f} m elsewhere"
-        yield Finding("two_publishers", severity, away_m, _ELSEWHERE_M, "m", text, **at)
+        text = f"two robots or drivers take turns: {len(others_m)} of its poses are {away_m:.1f} m elsewhere"
+        yield o.finding("two_publishers", severity, away_m, _ELSEWHERE_M, "m", text, at=o.stamp_ns[~is_used])
 
 
 def check_odometry(c: Columns) -> Iterator[Finding]:
@@ -178,17 +177,16 @@ def check_odometry(c: Columns) -> Iterator[Finding]:
     o, steps = c.odometry, steps_of(c.odometry)
     if steps is None:
         count = len(_usable(o))
-        text = f"{o.topic or 'odometry'}: {count} of {len(o.stamp_ns)} messages are usable; {LEAST} are needed"
-        yield Finding("no_odometry", "error", count, LEAST, "messages", text, o.topic, count=len(o.stamp_ns))
+        text = f"{count} of {len(o.stamp_ns)} messages are usable; {LEAST} are needed"
+        yield o.finding("no_odometry", "error", count, LEAST, "messages", text)
         return
-    at = where(o.topic, o.stamp_ns[steps.index])
     if steps.fastest_m_s > min(_FASTEST_M_S, c.config.odometry.max_speed_m_s):
-        text = f"{o.topic}: the robot drives at {steps.fastest_m_s:.0f} m/s: is its position in metres?"
-        yield Finding("units", "error", steps.fastest_m_s, _FASTEST_M_S, "m/s", text, **at)
+        text = f"the robot drives at {steps.fastest_m_s:.0f} m/s: is its position in metres?"
+        yield o.finding("units", "error", steps.fastest_m_s, _FASTEST_M_S, "m/s", text)
         return
     if (fastest := steps.fastest_turn_rad_s) > _FASTEST_RAD_S:
-        text = f"{o.topic}: the orientation turns at {fastest:.0f} rad/s: are its angles in radians?"
-        yield Finding("units", "error", fastest, _FASTEST_RAD_S, "rad/s", text, **at)
+        text = f"the orientation turns at {fastest:.0f} rad/s: are its angles in radians?"
+        yield o.finding("units", "error", fastest, _FASTEST_RAD_S, "rad/s", text)
         return
     jumps = steps.jumps
     yield from _jumps(o, steps, jumps, c.config.odometry.max_speed_m_s)
@@ -198,18 +196,18 @@ def check_odometry(c: Columns) -> Iterator[Finding]:
     if total_m < _STILL_M and total_rad < _STILL_RAD:
         speed_m_s = float(np.median(np.linalg.norm(o.twist[steps.index, :3], axis=1)))
         if speed_m_s > _SLOWEST_M_S:
-            text = f"{o.topic}: its pose never changes, though its twist says {speed_m_s:.1f} m/s"
-            yield Finding("pose_stands", "error", speed_m_s, _SLOWEST_M_S, "m/s", text, **at)
+            text = f"its pose never changes, though its twist says {speed_m_s:.1f} m/s"
+            yield o.finding("pose_stands", "error", speed_m_s, _SLOWEST_M_S, "m/s", text)
             return
-        text = f"{o.topic}: it moves {total_m:.2f} m and {np.degrees(total_rad):.0f} degrees in {steps.dt.sum():.0f} s"
-        yield Finding("static", "warning", total_m, _STILL_M, "m", text, **at)
+        text = f"it moves {total_m:.2f} m and {np.degrees(total_rad):.0f} degrees in {steps.dt.sum():.0f} s"
+        yield o.finding("static", "warning", total_m, _STILL_M, "m", text)
         return
     quaternions = np.abs(o.poses[steps.index, 3:])
     w_first = quaternions[:, 1:3].max() < _NO_TURN_RAD and np.ptp(quaternions[:, 0]) > _TURNS
     if w_first or (_has_no_orientation(steps, smooth, total_rad) and not _drives_sideways(o, steps)):
-        text = f"{o.topic}: its orientation never changes in {total_m:.0f} m, and it drives round bends"
-        text = f"{o.topic}: it rolls, and never turns: does w come first in its quaternions?" if w_first else text
-        yield Finding("no_orientation_of_odometry", "error", total_rad, 0.0, "rad", text, **at)
+        text = f"its orientation never changes in {total_m:.0f} m, and it drives round bends"
+        text = "it rolls, and never turns: does w come first in its quaternions?" if w_first else text
+        yield o.finding("no_orientation_of_odometry", "error", total_rad, 0.0, "rad", text)
         return
     yield from _plane(c, o)
     if np.isfinite(o.twist[steps.index]).all() and o.twist[steps.index].any() and c.config.odometry.noise != "density":
@@ -240,36 +238,35 @@ def _jumps(o: OdometryColumns, steps: Steps, jumps: Mask, max_speed_m_s: float) 
             continue
         most_m = float(np.linalg.norm(steps.moved[is_there], axis=1).max())
         most_deg = float(np.degrees(np.linalg.norm(steps.turned[is_there], axis=1).max()))
-        first_ns = int(o.stamp_ns[steps.index[1:][is_there][0]])
         by = f"by up to {most_m:.2f} m and {most_deg:.0f} degrees in one step"
         often = "once" if count == 1 else f"{count} times"
-        text, settings = f"{o.topic} jumps {often}, {by}", tuple[str, ...]()
+        text, settings = f"jumps {often}, {by}", tuple[str, ...]()
         slowest_m_s = float((np.linalg.norm(steps.moved, axis=1) / steps.dt)[is_there].min())
         limit_m_s = max(_LEAST_LIMIT_M_S, _LIMIT * steps.fastest_m_s)
         if code == "odometry_reset":
-            text = f"{o.topic} goes back to zero {often}: its driver was restarted"
+            text = f"goes back to zero {often}: its driver was restarted"
         elif count >= _CORRECTED:
-            code, text = "corrected", f"{o.topic} jumps {count} times, {by}: is it the output of a localiser?"
+            code, text = "corrected", f"jumps {count} times, {by}: is it the output of a localiser?"
         elif limit_m_s < slowest_m_s <= max_speed_m_s:  # else a run finds the jump itself
             settings = (f"odometry.max_speed_m_s={limit_m_s:.2g}",)
         elif max_speed_m_s < min(slowest_m_s, OdometryConfig().max_speed_m_s):
             continue  # somebody has set the limit, so that a run begins anew there
-        yield Finding(code, "warning", count, 0, "times", text, o.topic, first_ns, count, settings)
+        at = o.stamp_ns[steps.index[1:][is_there]]
+        yield o.finding(code, "warning", count, 0, "times", text, at=at, settings=settings)
 
 
 def _plane(c: Columns, o: OdometryColumns) -> Iterator[Finding]:
     if c.config.world.dimensions == 3 or not len(o.poses):
         return
-    out = c.counters.as_dict().get(o.input, {}).get("out_of_plane", 0)
+    out = c.counters[o.input, "out_of_plane"]
     share = out / len(o.poses)
     if share > _OFF_PLANE:
-        text = f"{o.topic}: {share:.0%} of the poses are more than {_LEVEL_M} m above or below the first, or tilted"
-        yield Finding("not_planar", "warning", share, _OFF_PLANE, "part", text, o.topic, 0, out, _SPACE)
+        text = f"{share:.0%} of the poses are more than {_LEVEL_M} m above or below the first, or tilted"
+        yield o.finding("not_planar", "warning", share, _OFF_PLANE, "part", text, out, settings=_SPACE)
 
 
 def _twist(o: OdometryColumns, steps: Steps, jumps: Mask, applied: float) -> Iterator[Finding]:
     """The twist against the pose, over windows of a second: it may hold until or since its message."""
-    at = where(o.topic, o.stamp_ns[steps.index], settings=_DENSITY)
     width = max(1, round(_WINDOW_S / float(np.median(steps.dt))))
     starts = np.arange(0, len(steps.dt) - width + 1, max(1, width // 2))
     clock = np.concatenate([[0.0], np.cumsum(steps.dt)])
@@ -289,8 +286,8 @@ def _twist(o: OdometryColumns, steps: Steps, jumps: Mask, applied: float) -> Ite
         fits.append((ratio(driven, moved), ratio(rotated, turned)))
     speed, rate = min(fits, key=lambda pair: pair[0][1] + pair[1][1])
     if _in_odom(o, steps, sums, moved, twist[1:]):
-        text = f"{o.topic}: the twist is given along the axes of {o.frame}; nav_msgs/Odometry has those of {o.child}"
-        yield Finding("twist_frame", "warning", 1.0, _FITS, "times", text, **at)
+        text = f"the twist is given along the axes of {o.frame}; nav_msgs/Odometry has those of {o.child}"
+        yield o.finding("twist_frame", "warning", 1.0, _FITS, "times", text, settings=_DENSITY)
         return
     for what, (factor, left), way in (("speed", speed, moved), ("turn rate", rate, turned)):
         total = np.abs(way).sum()
@@ -299,12 +296,12 @@ def _twist(o: OdometryColumns, steps: Steps, jumps: Mask, applied: float) -> Ite
         unit = next((why for k, why in _UNITS.items() if abs(factor / k - 1.0) < _SCALE), "")
         is_other = min(abs(factor - 1.0), abs(applied * factor - 1.0)) > _SCALE
         if is_other and left < _EXPLAINED and (unit or width >= _LEAST_WIDTH):
-            text = f"{o.topic}: the pose moves {factor:.3g} times as far as the {what} of the twist says"
-            text += f" ({unit or 'another scale'})"
-            yield Finding("twist_scale", "warning", factor, _SCALE, "times", text, **at)
+            times = f"{factor:.3g} times as far as the {what} of the twist says"
+            text = f"the pose moves {times} ({unit or 'another scale'})"
+            yield o.finding("twist_scale", "warning", factor, _SCALE, "times", text, settings=_DENSITY)
         elif left > _UNEXPLAINED and total > 5.0 and width >= _LEAST_WIDTH:
-            text = f"{o.topic}: the {what} of the twist does not explain {min(left, 1.0):.0%} of the motion of the pose"
-            yield Finding("twist_unrelated", "warning", left, _UNEXPLAINED, "part", text, **at)
+            text = f"the {what} of the twist does not explain {min(left, 1.0):.0%} of the motion of the pose"
+            yield o.finding("twist_unrelated", "warning", left, _UNEXPLAINED, "part", text, settings=_DENSITY)
 
 
 def _in_odom(o: OdometryColumns, steps: Steps, sums: Callable[[Array], Array], moved: Array, twist: Array) -> bool:
@@ -329,14 +326,20 @@ def ratio(x: Array, y: Array) -> tuple[float, float]:
         return np.nan, 1.0
     moves = np.any([row > _AT_REST * np.sqrt((row**2).mean()) for row in (size, np.linalg.norm(x, axis=1))], axis=0)
     x, y, size = x[moves], y[moves], size[moves]
-    weight, factor = np.ones(len(x)), 1.0
-    for _ in range(15):
-        factor = float((weight[:, None] * x * y).sum() / max(float((weight[:, None] * x * x).sum()), 1e-15))
-        error = np.linalg.norm(y - factor * x, axis=1)
-        scale = 1.48 * float(np.median(error)) + 1e-6 + 0.01 * float(np.median(size))
-        weight = 1.0 / (1.0 + (error / (3.0 * scale)) ** 2)
+    factor = float(fitted(x.reshape(-1, 1), y.ravel())[0][0])
     large = size >= np.median(size)
-    return factor, float(np.median(error[large]) / (np.median(size[large]) + 1e-9))
+    left = np.linalg.norm(y - factor * x, axis=1)[large]
+    return factor, float(np.median(left) / (np.median(size[large]) + 1e-9))
+
+
+def fitted(rows: Array, y: Array) -> tuple[Array, float]:
+    """Robust least squares, with the sigma of the last number if the others were known."""
+    weight = np.ones(len(y))
+    for _ in range(_ROUNDS):
+        found = np.linalg.lstsq(rows * weight[:, None], y * weight, rcond=None)[0]
+        left = np.abs(rows @ found - y)
+        weight = 1.0 / np.hypot(1.0, left / (3.0 * np.median(left) + 1e-6))
+    return np.asarray(found), float(np.median(left) / np.linalg.norm(rows[:, -1] * weight))
 
 
 Stretch: TypeAlias = tuple[int, int, float, float, float]
@@ -362,20 +365,19 @@ def worst_stretch(errors: Array, sizes: Array, least: Array, part: float, sigmas
 
 def _covariance(o: OdometryColumns, steps: Steps) -> Iterator[Finding]:
     """The variances of the twist against what the robot does."""
-    at = where(o.topic, o.stamp_ns[steps.index], settings=_DENSITY)
     used = o.variances[:, [0, 1, 5]]
     bad = ~np.isfinite(used).all(axis=1) | (used < 0.0).any(axis=1)
     if bad.any():
-        text = f"{o.topic}: {int(bad.sum())} messages have a variance of the twist that is negative or not a number"
+        text = f"{int(bad.sum())} messages have a variance of the twist that is negative or not a number"
         severity: Severity = "error" if bad.mean() > 0.5 else "warning"  # such messages are refused
-        yield Finding("covariance_negative", severity, int(bad.sum()), 0, "messages", text, **at)
+        yield o.finding("covariance_negative", severity, int(bad.sum()), 0, "messages", text, settings=_DENSITY)
         return
     if not used.any() or (np.median(used, axis=0) >= _UNUSED_M_S**2).any():
         return
     sigmas, speed = np.sqrt(np.median(used, axis=0)), max(steps.fastest_m_s, _SLOWEST_M_S)
     if sigmas[0] > _USELESS * speed:
-        text = f"{o.topic}: the sigma of the twist is {sigmas[0]:.2g} m/s, but the robot drives at most {speed:.2g} m/s"
-        yield Finding("covariance_useless", "warning", sigmas[0] / speed, _USELESS, "times", text, **at)
+        text = f"the sigma of the twist is {sigmas[0]:.2g} m/s, but the robot drives at most {speed:.2g} m/s"
+        yield o.finding("covariance_useless", "warning", sigmas[0] / speed, _USELESS, "times", text, settings=_DENSITY)
     elif 0.0 < sigmas[0] < _TINY * speed or 0.0 < sigmas[2] < _TINY_RAD_S:
-        text = f"{o.topic}: the twist has sigmas of {sigmas[0]:.1g} m/s, {sigmas[2]:.1g} rad/s: no wheels are so good"
-        yield Finding("covariance_tiny", "error", sigmas[0] / speed, _TINY, "times", text, **at)
+        text = f"the twist has sigmas of {sigmas[0]:.1g} m/s, {sigmas[2]:.1g} rad/s: no wheels are so good"
+        yield o.finding("covariance_tiny", "error", sigmas[0] / speed, _TINY, "times", text, settings=_DENSITY)

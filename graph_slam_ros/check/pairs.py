@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from graph_slam_ros.check.columns import Columns, SightingColumns
-from graph_slam_ros.check.finding import Finding, where
+from graph_slam_ros.check.finding import Finding
 from graph_slam_ros.lie import se2, se3, so3
 from graph_slam_ros.typing import Array, Index, Mask
 
@@ -109,9 +109,10 @@ def noisier(s: SightingColumns, pairs: Pairs) -> Iterator[Finding]:
     sigmas = np.hypot(s.sigmas[pairs.a], _TYPICAL_M) * 2.0**0.5
     factor = float(np.quantile(pairs.residuals(s.points) / sigmas, _QUARTILE)) / _OF_RAYLEIGH
     if factor > _WORSE:
-        text = f"{s.topic}: two sightings of a landmark differ by {factor:.1f} times what their noise says"
-        at = where(s.topic, s.stamp_ns, len(pairs.a), _sigmas(s, pairs))
-        yield Finding("over_confident", "warning", factor, _WORSE, "times", text, **at)
+        text = f"two sightings of a landmark differ by {factor:.1f} times what their noise says"
+        yield s.finding(
+            "over_confident", "warning", factor, _WORSE, "times", text, len(pairs.a), settings=_sigmas(s, pairs)
+        )
 
 
 def check_noise(c: Columns, s: SightingColumns, pairs: Pairs) -> Iterator[Finding]:
@@ -122,25 +123,24 @@ def check_noise(c: Columns, s: SightingColumns, pairs: Pairs) -> Iterator[Findin
     factor = float(np.median(pairs.residuals(s.points) / s.sigmas[pairs.a]))
     if factor > _TOO_SMALL:
         few = f"the covariance of {raised} of {len(s.stamp_ns)} sightings is nearly zero"
-        text = f"{s.topic}: {few}, and two sightings of a landmark differ by {factor * sigma_m:.2g} m"
-        at = where(s.topic, s.stamp_ns, raised, _sigmas(s, pairs))
-        yield Finding("noise_zero", "warning", factor, _TOO_SMALL, "sigmas", text, **at)
+        text = f"{few}, and two sightings of a landmark differ by {factor * sigma_m:.2g} m"
+        yield s.finding("noise_zero", "warning", factor, _TOO_SMALL, "sigmas", text, raised, settings=_sigmas(s, pairs))
 
 
 def check_noise_alone(c: Columns, s: SightingColumns) -> Iterator[Finding]:
     """The same of ranges or bearings alone, of which no two can be compared: no sensor is so exact."""
     raised = _raised(c, s)
     if raised and not np.isfinite(s.points).any():
-        text = f"{s.topic}: the covariance of {raised} of {len(s.stamp_ns)} sightings is nearly zero"
+        text = f"the covariance of {raised} of {len(s.stamp_ns)} sightings is nearly zero"
         has_ranges = np.isfinite(s.ranges).any()
         sigma = f"sigma_m={ASSUMED_RANGE_M}" if has_ranges else f"sigma_rad={ASSUMED_BEARING_RAD}"
-        at = where(s.topic, s.stamp_ns, raised, (f"{s.input}.noise=sigmas", f"{s.input}.{sigma}"))
-        yield Finding("noise_zero", "warning", raised / len(s.stamp_ns), _RAISED, "part", text, **at)
+        settings, share = (f"{s.input}.noise=sigmas", f"{s.input}.{sigma}"), raised / len(s.stamp_ns)
+        yield s.finding("noise_zero", "warning", share, _RAISED, "part", text, raised, settings=settings)
 
 
 def _raised(c: Columns, s: SightingColumns) -> int:
     """The number of variances of an input that were raised; 0 unless it is most, and they are nearly zero."""
-    raised = c.counters.as_dict().get(s.input, {}).get("covariance_floored", 0)
+    raised = c.counters[s.input, "covariance_floored"]
     return raised if raised >= _RAISED * len(s.stamp_ns) and float(np.median(s.sigmas)) <= _TINY else 0
 
 
@@ -159,8 +159,8 @@ def check_ranges(c: Columns, s: SightingColumns) -> Iterator[Finding]:
     each = _changes(s, use, s.ranges, places, _RANGE_LATER_S, _DRIVEN_M, lambda a, b: float(np.linalg.norm(b - a)))
     factor, least = np.quantile(np.abs(each), [0.5, _FEWEST]).tolist() if len(each) >= _LEAST_RANGES else (0.0, 0.0)
     if factor > _FASTEST or least > _MOST:
-        text = f"{s.topic}: ranges change by {factor:.3g} for each metre of odometry: are both metres?"
-        yield Finding("units", "error", factor, _MOST, "m/m", text, **where(s.topic, s.stamp_ns, len(use)))
+        text = f"ranges change by {factor:.3g} for each metre of odometry: are both metres?"
+        yield s.finding("units", "error", factor, _MOST, "m/m", text, len(use))
 
 
 def check_bearings(c: Columns, s: SightingColumns) -> Iterator[Finding]:
@@ -171,9 +171,9 @@ def check_bearings(c: Columns, s: SightingColumns) -> Iterator[Finding]:
     each = _changes(s, use, s.bearings, headings, _BEARING_LATER_S, _TURNED_RAD, turned, turned)
     factor = float(np.median(each)) if len(each) >= _LEAST_BEARINGS else 0.0
     if factor > _MIRRORED:
-        text = f"{s.topic}: bearings change by {factor:+.2f} rad for each radian that the robot turns to the left, and "
+        text = f"bearings change by {factor:+.2f} rad for each radian that the robot turns to the left, and "
         text += "-1 is expected: do they count to the right, or does odometry turn the other way?"
-        yield Finding("mirrored", "error", factor, _MIRRORED, "rad/rad", text, **where(s.topic, s.stamp_ns, len(use)))
+        yield s.finding("mirrored", "error", factor, _MIRRORED, "rad/rad", text, len(use))
 
 
 def _changes(

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from graph_slam_ros.check.columns import Columns
-from graph_slam_ros.check.finding import Finding, Severity, where
+from graph_slam_ros.check.finding import Finding, Severity
 from graph_slam_ros.check.times import rounded_s
 from graph_slam_ros.measurements.reasons import Effect, explain, remedy
 
@@ -16,6 +16,7 @@ _USUAL = {  # of single messages: detectors err, and a recording begins and ends
     *("duplicate_stamp", "undecodable", "transform_gaps"),
 }
 _USUAL_SHARE = 0.05
+_JOINT = ("landmarks.association=joint",)
 # those that a check of its own explains better
 ELSEWHERE = {"frame_unknown", "child_frame_unknown", "odom_frame_unknown", "map_frame_unknown", "no_id", "id_merged"}
 _OF_TWIST = ("covariance_not_positive_definite", "nonfinite_covariance")
@@ -41,9 +42,8 @@ def check_refusals(c: Columns) -> Iterator[Finding]:
             what = f"{source}: {times} of {received}{' are refused' * is_lost}: {row.meaning}"
             text = "; ".join(filter(None, (what, remedy(source, reason))))
             settings = (f"{source}.noise=sigmas",) if reason in _OF_COVARIANCE and source in items else ()
-            name, stamps_ns = (source, ()) if topic is None else (topic.name, topic.stamp_ns)
-            at = where(name, stamps_ns, times, settings)
-            yield Finding(reason, severity, share, limit, "part", text, **at)
+            name, first_ns = (source, 0) if topic is None else (topic.topic, int(next(iter(topic.stamp_ns), 0)))
+            yield Finding(reason, severity, share, limit, "part", text, name, first_ns, times, settings)
 
 
 def check_unnamed(c: Columns) -> Iterator[Finding]:
@@ -54,6 +54,6 @@ def check_unnamed(c: Columns) -> Iterator[Finding]:
         unnamed = s.name == s.names.index("")
         share = float(np.mean(unnamed))
         severity: Severity = "error" if share > _MOST else "warning" if share > _USUAL_SHARE else "note"
-        text = f"{s.topic}: {share:.1%} of the sightings have no id, and are not used"
-        at = where(s.topic, s.stamp_ns[unnamed], settings=("landmarks.association=joint",))
-        yield Finding("no_id", severity, share, _USUAL_SHARE, "part", text, **at)
+        text = f"{share:.1%} of the sightings have no id, and are not used"
+        of_unnamed = s.some(unnamed)
+        yield of_unnamed.finding("no_id", severity, share, _USUAL_SHARE, "part", text, settings=_JOINT)

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from graph_slam_ros.check.columns import Columns, OdometryColumns, TopicColumns
-from graph_slam_ros.check.finding import Finding, Severity, where
+from graph_slam_ros.check.finding import Finding, Severity
 from graph_slam_ros.config.node import TimeConfig
 from graph_slam_ros.formats.parameters import assignment
 from graph_slam_ros.messages.receive_times import clock_offset_s
@@ -34,8 +34,8 @@ def check_times(c: Columns) -> Iterator[Finding]:
         if key.endswith(".offset_s"):
             name, apart = key.removesuffix(".offset_s"), f"{-float(value):.3f} s, by the times of recording"
             text, topic = f"{name}: its clock differs from that of odometry by {apart}", c.topic_of(name)
-            at = where("" if topic is None else topic.name, settings=(assignment(key, value),))
-            yield Finding("clock_domains", "error", -value, _CLOCKS_DIFFER_S, "s", text, **at)
+            of, settings = "" if topic is None else topic.topic, (assignment(key, value),)
+            yield Finding("clock_domains", "error", -value, _CLOCKS_DIFFER_S, "s", text, of, settings=settings)
     stamped = {name: topic for name, topic in right.items() if np.count_nonzero(topic.stamp_ns) >= _FEW}
     yield from _clocks(c, stamped)
     for topic in stamped.values():
@@ -52,8 +52,8 @@ def _wrong(topics: Mapping[str, TopicColumns]) -> Iterator[Finding]:
         if len(lag_s) < _MANY or not np.ptp(log_ns):
             continue
         if not np.ptp(stamp_ns):
-            text = f"{name}: all of its {len(stamp_ns)} messages have the stamp {stamp_ns[0] * 1e-9:.3f} s"
-            yield Finding("constant_stamps", "error", len(stamp_ns), _MANY, "messages", text, **where(name, stamp_ns))
+            text = f"all of its {len(stamp_ns)} messages have the stamp {stamp_ns[0] * 1e-9:.3f} s"
+            yield topic.finding("constant_stamps", "error", len(stamp_ns), _MANY, "messages", text, at=stamp_ns)
             continue
         apart = max(1, len(lag_s) // 4)
         span_ns = np.maximum(log_ns[apart:] - log_ns[:-apart], 1)
@@ -62,15 +62,15 @@ def _wrong(topics: Mapping[str, TopicColumns]) -> Iterator[Finding]:
         part = int(np.quantile(stamp_ns % 10**9, _NEARLY_ALL))
         if part < _CROWDED * 1e9 and crowded and (part or topic.use != "odometry"):  # whose rounding is told apart
             unit = next((unit for most, unit in _OF_A_SECOND.items() if part < most), "ticks")
-            text = f"{name}: all that comes in a second is stamped within {part * 1e-6:.3g} ms: nanosec has {unit}"
-            yield Finding("wrong_stamps", "error", part * 1e-9, _CROWDED, "s", text, **where(name, stamp_ns))
+            text = f"all that comes in a second is stamped within {part * 1e-6:.3g} ms: nanosec has {unit}"
+            yield topic.finding("wrong_stamps", "error", part * 1e-9, _CROWDED, "s", text, at=stamp_ns)
             return
     usual = float(np.median(list(advance.values()))) if len(advance) > 2 else 1.0  # simulated time may be slow
     for name, rate in advance.items():
         others = [other for other in advance.values() if other != rate]
         if rate < _STANDS or (_differ(rate, usual) and any(_differ(rate, other) for other in others)):
-            text = f"{name}: its stamps advance by {rate:.3g} s for each second in which its messages were recorded"
-            yield Finding("wrong_stamps", "error", rate, _FASTER, "s/s", text, **where(name, topics[name].stamp_ns))
+            text = f"its stamps advance by {rate:.3g} s for each second in which its messages were recorded"
+            yield topics[name].finding("wrong_stamps", "error", rate, _FASTER, "s/s", text)
 
 
 def _differ(a: float, b: float) -> bool:
@@ -118,18 +118,18 @@ def _clocks(c: Columns, topics: dict[str, TopicColumns]) -> Iterator[Finding]:
         first_s, last_s = (clock_offset_s(*part, odometry_log_ns, odometry_lag_s) for part in parts)
         if abs(set_s := last_s - first_s) > _SET_S:
             is_own = abs(np.median(lag_s[-few:]) - np.median(lag_s[:few])) > 0.5 * abs(set_s)
-            name = topic.name if is_own else c.odometry.topic
-            text = f"{name}: by the times of recording, its clock was set on the way by {abs(set_s):.1f} s"
-            yield Finding("clock_jump", "error", set_s, _SET_S, "s", text, **where(name, stamp_ns))
+            text = f"by the times of recording, its clock was set on the way by {abs(set_s):.1f} s"
+            of = topic if is_own else of_odometry
+            yield of.finding("clock_jump", "error", set_s, _SET_S, "s", text, at=stamp_ns)
         elif abs(apart_s) > _CLOCKS_DIFFER_S:
             yield _other_clock(c, topic, of_odometry, apart_s)
         elif apart_s < -_EARLY_S and not any(
             one.offset_s for one in c.config.sources if one.name in (topic.inputs[0], c.odometry.input)
         ):  # which somebody has set, and knows better
             other = f"compared with {c.odometry.topic}: its clock is ahead"
-            text = f"{topic.name}: recorded {-apart_s * 1e3:.0f} ms before the time in its stamps, {other}"
-            at = where(topic.name, stamp_ns, settings=(offset_setting(c, topic.inputs[0], apart_s),))
-            yield Finding("latency", "warning", -apart_s, _EARLY_S, "s", text, **at)
+            text = f"recorded {-apart_s * 1e3:.0f} ms before the time in its stamps, {other}"
+            settings = (offset_setting(c, topic.inputs[0], apart_s),)
+            yield topic.finding("latency", "warning", -apart_s, _EARLY_S, "s", text, at=stamp_ns, settings=settings)
 
 
 def _other_clock(c: Columns, topic: TopicColumns, of_odometry: TopicColumns, apart_s: float) -> Finding:
@@ -138,9 +138,9 @@ def _other_clock(c: Columns, topic: TopicColumns, of_odometry: TopicColumns, apa
     is_right = abs(float(np.median(lag_s))) < _CLOCKS_DIFFER_S / 2.0
     wrong, right = (of_odometry, topic) if is_right else (topic, of_odometry)
     by_s = apart_s if wrong is topic else -apart_s
-    text = f"{wrong.name}: its stamps are {-by_s:.1f} s away from those of {right.name}: another clock"
-    at = where(topic.name, stamp_ns, settings=(offset_setting(c, wrong.inputs[0], by_s),))
-    return Finding("clock_domains", "error", -by_s, _CLOCKS_DIFFER_S, "s", text, **at)
+    text = f"{wrong.topic}: its stamps are {-by_s:.1f} s away from those of {right.topic}: another clock"
+    found = topic.finding("clock_domains", "error", -by_s, _CLOCKS_DIFFER_S, "s", text, at=stamp_ns)
+    return replace(found, text=text, settings=(offset_setting(c, wrong.inputs[0], by_s),))
 
 
 def offset_setting(c: Columns, name: str, by_s: float) -> str:
@@ -154,26 +154,25 @@ def _order(c: Columns, topic: TopicColumns) -> Iterator[Finding]:
     step_s = np.diff(stamp_ns) * 1e-9
     repeated, back = step_s == 0.0, step_s < 0.0
     share = float(repeated.mean())
-    if topic.name == c.odometry.topic and share > _DUPLICATES and (each_s := rounded_s(c.odometry)):
-        text = f"{topic.name}: stamps are rounded to {each_s:.3g} s: {share:.1%} are that of the message before"
-        found = Finding("coarse_stamps", "error", each_s, _COARSE_S, "s", text, topic.name)
+    if topic.topic == c.odometry.topic and share > _DUPLICATES and (each_s := rounded_s(c.odometry)):
+        text = f"stamps are rounded to {each_s:.3g} s: {share:.1%} are that of the message before"
+        found = topic.finding("coarse_stamps", "error", each_s, _COARSE_S, "s", text)
         yield found if each_s > _COARSE_S else replace(found, code="rounded_stamps", severity="note")
     elif topic.use == "odometry" and share > _DUPLICATES:
-        text = f"{topic.name}: {share:.1%} of the messages have the stamp before: published or recorded twice"
-        at = where(topic.name, stamp_ns[1:][repeated])
-        yield Finding("duplicates", "warning", share, _DUPLICATES, "part", text, **at)
+        text = f"{share:.1%} of the messages have the stamp before: published or recorded twice"
+        yield topic.finding("duplicates", "warning", share, _DUPLICATES, "part", text, at=stamp_ns[1:][repeated])
     if not back.any():
         return
-    most_s, count, at = -float(step_s.min()), int(back.sum()), where(topic.name, stamp_ns[1:][back])
+    most_s, count, at = -float(step_s.min()), int(back.sum()), stamp_ns[1:][back]
     window_s = c.config.ordering.window_s if topic.use == "odometry" else c.config.ordering.late_s
     if most_s > 1.0 and most_s > window_s:
-        text = f"{topic.name}: stamps step back by up to {most_s:.2f} s: the clock was set, or two drives were joined"
+        text = f"stamps step back by up to {most_s:.2f} s: the clock was set, or two drives were joined"
         severity: Severity = "error" if c.config.time.on_jump == TimeConfig().on_jump else "note"
-        yield Finding("time_jump", severity, most_s, 1.0, "s", text, **at)
+        yield topic.finding("time_jump", severity, most_s, 1.0, "s", text, at=at)
     elif topic.use == "odometry" and most_s > window_s and count > _OUT_OF_ORDER * len(step_s):
-        text = f"{topic.name}: {count} messages are older than the one before, by up to {most_s * 1e3:.0f} ms"
-        at |= {"settings": (assignment("ordering.window_s", round(1.2 * most_s + 0.005, 3)),)}
-        yield Finding("out_of_order", "warning", most_s, window_s, "s", text, **at)
+        text = f"{count} messages are older than the one before, by up to {most_s * 1e3:.0f} ms"
+        settings = (assignment("ordering.window_s", round(1.2 * most_s + 0.005, 3)),)
+        yield topic.finding("out_of_order", "warning", most_s, window_s, "s", text, at=at, settings=settings)
 
 
 def _rate(c: Columns) -> Iterator[Finding]:
@@ -192,20 +191,20 @@ def _rate(c: Columns) -> Iterator[Finding]:
         was_set = _was_set(poses, step_s, long)
         for k in long[was_set]:
             span = f"{step_s[k] / _DAY_S:.1f} days" if step_s[k] > _DAY_S else f"{step_s[k]:.1f} s"
-            text = f"{o.topic}: the clock was set forward by {span}: odometry goes on where it was"
-            yield Finding("clock_jump", "warning", step_s[k], most_s, "s", text, **where(o.topic, stamp_ns[k + 1 :], 1))
+            text = f"the clock was set forward by {span}: odometry goes on where it was"
+            yield o.finding("clock_jump", "warning", step_s[k], most_s, "s", text, 1, at=stamp_ns[k + 1 :])
         long, moved, turned = long[~was_set], moved[~was_set], turned[~was_set]
     if len(long):
         worst_s, often = float(step_s[long].max()), {1: "once", 2: "twice"}.get(len(long), f"{len(long)} times")
         is_bad = bool((step_s[long][moved | turned] > max(_PERIODS * median_s, _VERY_LONG_S)).any())
-        text = f"{o.topic} comes at {1.0 / median_s:.0f} Hz, but is silent for more than {most_s:.1f} s {often} "
+        text = f"comes at {1.0 / median_s:.0f} Hz, but is silent for more than {most_s:.1f} s {often} "
         text += f"(the longest {worst_s:.2f} s{'; the robot moved meanwhile' if is_bad else ''})"
         severity: Severity = "warning" if is_bad else "note"
-        yield Finding("gap", severity, worst_s, most_s, "s", text, **where(o.topic, stamp_ns[long]))
+        yield o.finding("gap", severity, worst_s, most_s, "s", text, at=stamp_ns[long])
     if 1.0 / median_s < _SLOW_HZ:
-        text = f"{o.topic} comes at {1.0 / median_s:.1f} Hz: poses are interpolated over {median_s:.2f} s"
+        text = f"comes at {1.0 / median_s:.1f} Hz: poses are interpolated over {median_s:.2f} s"
         severity = "warning" if _between(c, stamp_ns) > 0.5 else "note"
-        yield Finding("slow_odometry", severity, 1.0 / median_s, _SLOW_HZ, "Hz", text, **where(o.topic, stamp_ns))
+        yield o.finding("slow_odometry", severity, 1.0 / median_s, _SLOW_HZ, "Hz", text, at=stamp_ns)
 
 
 def _was_set(poses: Array, step_s: Array, gaps: Index) -> Mask:
@@ -238,18 +237,18 @@ def _overlap(c: Columns) -> Iterator[Finding]:
         share = float(outside.mean()) if len(outside) else 0.0
         if share <= _OUTSIDE:
             continue
-        at = where(s.topic, s.stamp_ns[outside])
+        at = s.stamp_ns[outside]
         ends = [(int(t) - first_ns) * 1e-9 for t in (s.stamp_ns.min(), s.stamp_ns.max())]
         if share < _NEARLY_ALL and _recorded_alone(c, s.topic) > _OUTSIDE:
             after_s = ends[1] - (last_ns - first_ns) * 1e-9
             when = [f"begins {-ends[0]:.1f} s after the first of them"] * (-ends[0] > _MARGIN_NS * 1e-9)
             when += [f"ends {after_s:.1f} s before the last of them"] * (after_s > _MARGIN_NS * 1e-9)
-            text = f"{s.topic}: {share:.0%} of the sightings were recorded without odometry, which {' and '.join(when)}"
-            yield Finding("odometry_short", "warning", share, _OUTSIDE, "part", text, **at)
+            text = f"{share:.0%} of the sightings were recorded without odometry, which {' and '.join(when)}"
+            yield s.finding("odometry_short", "warning", share, _OUTSIDE, "part", text, at=at)
             continue
         span = f"({ends[0]:.1f} to {ends[1]:.1f} s, odometry 0 to {(last_ns - first_ns) * 1e-9:.1f} s)"
-        text = f"{s.topic}: {share:.0%} of the sightings are stamped outside the time of odometry {span}"
-        yield Finding("no_overlap", "error", share, _OUTSIDE, "part", text, **at)
+        text = f"{share:.0%} of the sightings are stamped outside the time of odometry {span}"
+        yield s.finding("no_overlap", "error", share, _OUTSIDE, "part", text, at=at)
 
 
 def _recorded_alone(c: Columns, name: str) -> float:

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator, Mapping
 import numpy as np
 
 from graph_slam_ros.check.columns import Columns, SightingColumns
-from graph_slam_ros.check.finding import Finding, Severity, where
+from graph_slam_ros.check.finding import Finding, Severity
 from graph_slam_ros.check.identities import at_two_places, check_moved, check_outliers, check_reused
 from graph_slam_ros.check.odometry import TOGETHER, twist_factor, worst_stretch
 from graph_slam_ros.check.pairs import noisier, pairs_of, poses_at
@@ -135,7 +135,7 @@ def _void(fit: TrialFit) -> Finding:
 def _over_confident(c: Columns, noise: NoiseScale, factor: float, limit: float) -> Finding:
     code = "odometry_over_confident" if noise.label == "odometry" else "over_confident"
     of = c.topic_of(noise.source)
-    topic = noise.source if of is None else of.name
+    topic = noise.source if of is None else of.topic
     what = " ".join(filter(None, (noise.label, noise.part)))
     text = f"{topic}: residuals ({what}) are {factor:.1f} times as large as its noise says"
     if c.config.robust.noise_scale != "estimated":
@@ -171,19 +171,18 @@ def _fitted(
         lag_s, own = float(np.median(topic.log_ns - topic.stamp_ns)) * 1e-9, c.odometry.input
         if code == "clock_offset" and -_RECORDED_S < lag_s < one.value - _EARLY_S:  # none is recorded before it is seen
             settings = (assignment(f"{own}.offset_s", round(slam.calibrated(own, "clock") - one.value, 3)),)
-        text = f"{topic.name}: {answers.sentence(one.parameter, one.value, one.sigma, ranges)}"
-        at = where(topic.name, topic.stamp_ns, settings=settings)
-        yield Finding(code, "warning", one.value, limit, unit, text, **at)
+        text = answers.sentence(one.parameter, one.value, one.sigma, ranges)
+        yield topic.finding(code, "warning", one.value, limit, unit, text, settings=settings)
     elif one.sigma > unknown:
-        yield Finding("not_observable", "note", one.sigma, unknown, unit, one.text, **where(topic.name, topic.stamp_ns))
+        yield Finding("not_observable", "note", one.sigma, unknown, unit, one.text, topic.topic)
 
 
 def _jumps(c: Columns, fit: TrialFit) -> Iterator[Finding]:
     for code, parameter, before, after, sigma, limit in answers.jumps(fit):
         if (topic := c.topic_of(parameter.source)) is not None:
-            text = f"{topic.name}: {answers.jump_sentence(parameter, before, after, sigma)}"
+            text = answers.jump_sentence(parameter, before, after, sigma)
             unit = _LIMITS[parameter.name][0]
-            yield Finding(code, "warning", after - before, limit, unit, text, **where(topic.name, topic.stamp_ns))
+            yield topic.finding(code, "warning", after - before, limit, unit, text)
 
 
 def _places(
@@ -230,9 +229,9 @@ def check_slips(c: Columns, slam: GraphSlam) -> tuple[Finding, int] | None:
     if abs(error) > sizes[k : k + TOGETHER, part].sum():
         by = f"is elsewhere than odometry says, by {abs(error):.2f} {unit}"
     span = f"in a stretch of {np.ptp(stamps_ns) * 1e-9:.0f} s, where {scale:.2f} {unit} is usual"
-    text = f"{c.odometry.topic}: by the landmarks the robot {by}, {span}: its wheels slip, or it is carried or held"
-    at = where(c.odometry.topic, stamps_ns, TOGETHER)
-    return Finding("odometry_slips", severity, abs(error), limit, unit, text, **at), int(stamps_ns[-1])
+    text = f"by the landmarks the robot {by}, {span}: its wheels slip, or it is carried or held"
+    slip = c.odometry.finding("odometry_slips", severity, abs(error), limit, unit, text, TOGETHER, at=stamps_ns)
+    return slip, int(stamps_ns[-1])
 
 
 def _errors(slam: GraphSlam) -> tuple[Array, Array, Index]:
