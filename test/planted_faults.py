@@ -16,7 +16,7 @@ from graph_slam_ros.formats.parameters import parse_setting
 from graph_slam_ros.lie import se3
 from graph_slam_ros.messages.from_msg import OwnDecoder
 from graph_slam_ros.runs.check import check
-from graph_slam_ros.tools.simulation import Drive, Fault, simulate, spoil_messages, write_bag
+from graph_slam_ros.tools.simulation import Drive, Fault, put_faults, simulate, write_bag
 from graph_slam_ros.tools.simulation.drive import Sightings
 from graph_slam_ros.tools.simulation.recording import moved_from
 
@@ -140,7 +140,7 @@ def jumped(drive):
 
 def of(*texts):
     faults = [Fault.parsed(text) for text in texts]
-    return lambda drive: spoil_messages(drive, faults, 1)
+    return lambda drive: put_faults(drive, faults, 1)
 
 
 FAULTS = {

@@ -13,7 +13,7 @@ from graph_slam_ros.tools.simulation import flight, manhattan, pythonrobotics, w
 from graph_slam_ros.tools.simulation.bag import write_bag
 from graph_slam_ros.tools.simulation.draft import WrongLine, WrongMessage, write_table
 from graph_slam_ros.tools.simulation.drive import Drive
-from graph_slam_ros.tools.simulation.faults import KINDS, Fault, faulty_graph, faulty_recording, spoil_messages
+from graph_slam_ros.tools.simulation.faults import KINDS, Fault, faulty_graph, faulty_recording, put_faults
 from graph_slam_ros.tools.simulation.instruments import with_instruments
 from graph_slam_ros.tools.simulation.message_faults import MESSAGE_KINDS
 from graph_slam_ros.tools.simulation.options import filled, options_of
@@ -56,7 +56,7 @@ def write_faulty_bag(recording: Recording, path: Path, faults: Sequence[Fault], 
 def spoil_bag(source: Path, out: Path, faults: Sequence[Fault], seed: int) -> None:
     """Write a copy of a recording, with faults in its messages."""
     drive = Drive(source)
-    spoil_messages(drive, faults, seed)
+    put_faults(drive, faults, seed)
     drive.write(out)
 
 
@@ -75,10 +75,10 @@ __all__ = [
     "faulty_recording",
     "measurements",
     "options_of",
+    "put_faults",
     "simulate",
     "sphere_graph",
     "spoil_bag",
-    "spoil_messages",
     "with_closures",
     "with_instruments",
     "write_bag",

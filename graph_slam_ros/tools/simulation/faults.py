@@ -77,12 +77,10 @@ def swapped_ids(
     at: float = option(0.5, _HALFWAY, "", 0, 1),
 ) -> None:
     """Pairs of landmarks that exchange their ids, from some time on."""
-    begin = draft.pose_at(at)
-    names = _some(rng, _seen_on_both_sides(draft, begin), 2 * pairs, "swapped_ids")
+    names, later = _seen_later(draft, rng, at, 2 * pairs, "swapped_ids")
     other = dict(zip(names[::2] + names[1::2], names[1::2] + names[::2], strict=True))
-    for k, s in enumerate(draft.sightings):
-        if draft.seen_at[k] >= begin and draft.true_ids[k] in other:
-            draft.spoil(k, "swapped_ids", replace(s, id=other[draft.true_ids[k]]))
+    for k in later:
+        draft.spoil(k, "swapped_ids", replace(draft.sightings[k], id=other[draft.true_ids[k]]))
 
 
 def moved_landmarks(
@@ -93,14 +91,12 @@ def moved_landmarks(
     distance_m: float = option(2.0, "by how much each, in a direction of its own", "m", 0, 1000),
 ) -> None:
     """Landmarks that stand elsewhere from some time on."""
-    begin = draft.pose_at(at)
-    names = _some(rng, _seen_on_both_sides(draft, begin), count, "moved_landmarks")
+    names, later = _seen_later(draft, rng, at, count, "moved_landmarks")
     angles = rng.uniform(-np.pi, np.pi, len(names))
     ways = distance_m * np.column_stack([np.cos(angles), np.sin(angles), np.zeros(len(names))])
     displaced = dict(zip(names, ways[:, : draft.space.dimensions], strict=True))
-    for k in range(len(draft.sightings)):
-        if draft.seen_at[k] >= begin and draft.true_ids[k] in displaced:
-            draft.spoil(k, "moved_landmarks", draft.seen_from(k, displaced[draft.true_ids[k]]))
+    for k in later:
+        draft.spoil(k, "moved_landmarks", draft.seen_from(k, displaced[draft.true_ids[k]]))
 
 
 def outliers(
@@ -202,18 +198,16 @@ def _random_subset(rng: Generator, count: int, rate: float) -> list[int]:
     return np.sort(rng.permutation(count)[: round(rate * count)]).tolist()
 
 
-def _seen_on_both_sides(draft: Draft, pose: int) -> list[str]:
-    """The landmarks that are seen often enough before a pose, and from it on."""
-    is_before = (draft.seen_at < pose).tolist()
-    before = Counter(name for name, early in zip(draft.true_ids, is_before, strict=True) if early)
+def _seen_later(draft: Draft, rng: Generator, at: float, count: int, fault: str) -> tuple[list[str], list[int]]:
+    """Some of the landmarks that are seen often enough before a part of the drive and from it on, and what is then."""
+    is_later = draft.seen_at >= draft.pose_at(at)
+    later = Counter(name for name, late in zip(draft.true_ids, is_later, strict=True) if late)
     whole = Counter(draft.true_ids)
-    return [name for name in whole if min(before[name], whole[name] - before[name]) >= _OFTEN]
-
-
-def _some(rng: Generator, names: Sequence[str], count: int, fault: str) -> list[str]:
-    if len(names) < count:
-        raise GraphSlamError(f"{fault}: needs {count} landmarks that are seen often enough; there are {len(names)}")
-    return [names[k] for k in rng.permutation(len(names))[:count].tolist()]
+    often = [name for name in whole if min(later[name], whole[name] - later[name]) >= _OFTEN]
+    if len(often) < count:
+        raise GraphSlamError(f"{fault}: needs {count} landmarks that are seen often enough; there are {len(often)}")
+    names = [often[k] for k in rng.permutation(len(often))[:count].tolist()]
+    return names, [k for k in np.flatnonzero(is_later).tolist() if draft.true_ids[k] in names]
 
 
 @dataclass(frozen=True, slots=True)
@@ -255,18 +249,12 @@ class Fault:
         return cls.named(kind, **values)
 
 
-def put_faults(draft: Draft, faults: Sequence[Fault], seed: int) -> None:
-    """Put faults into a draft, one after the other; those of messages are left to ``spoil_messages``."""
+def put_faults(into: Draft | Drive, faults: Sequence[Fault], seed: int) -> None:
+    """Put faults of a world into a draft, or those of messages into a drive, one after the other."""
+    kinds: dict[str, Any] = KINDS if isinstance(into, Draft) else MESSAGE_KINDS
     for k, fault in enumerate(faults):
-        if not fault.is_of_messages:
-            KINDS[fault.kind](draft, random(seed, _STREAMS, k), **fault.options)
-
-
-def spoil_messages(drive: Drive, faults: Sequence[Fault], seed: int) -> None:
-    """Put the faults of messages into a drive, one after the other."""
-    for k, fault in enumerate(faults):
-        if fault.is_of_messages:
-            MESSAGE_KINDS[fault.kind](drive, random(seed, _STREAMS, k), **fault.options)
+        if fault.kind in kinds:
+            kinds[fault.kind](into, random(seed, _STREAMS, k), **fault.options)
 
 
 def faulty_recording(recording: Recording, faults: Sequence[Fault], seed: int) -> tuple[Recording, list[WrongMessage]]:

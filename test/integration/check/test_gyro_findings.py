@@ -6,7 +6,7 @@ from reliability import times
 
 from graph_slam_ros.formats.parameters import parse_setting
 from graph_slam_ros.runs.check import check
-from graph_slam_ros.tools.simulation import Drive, Fault, simulate, spoil_messages, with_instruments, write_bag
+from graph_slam_ros.tools.simulation import Drive, Fault, put_faults, simulate, with_instruments, write_bag
 
 SETTINGS = {
     "inputs.names": "odom detections imu",
@@ -45,7 +45,7 @@ def of_the_gyro(bag, settings):
 )
 def test_a_gyro_that_is_wrong_is_found_and_its_setting_mends_it(bag, tmp_path, fault, code, value, has_setting):
     drive = Drive(bag)
-    spoil_messages(drive, [Fault.named("wrong_gyro", **fault)], seed=1)
+    put_faults(drive, [Fault.named("wrong_gyro", **fault)], seed=1)
     drive.write(tmp_path / "faulty.mcap")
     found = of_the_gyro(tmp_path / "faulty.mcap", {})
     assert found.keys() == {code}
@@ -73,7 +73,7 @@ def laps(tmp_path_factory):
 )
 def test_landmarks_decide_which_of_gyro_and_odometry_is_wrong_and_one_value_is_printed(laps, tmp_path, fault, setting):
     bag, drive = tmp_path / "faulty.mcap", Drive(laps)
-    spoil_messages(drive, [fault], seed=1)
+    put_faults(drive, [fault], seed=1)
     drive.write(bag)
     found = [one for one in check(bag, SETTINGS).findings if one.severity != "note"]
     assert [one.code for one in found] == ["gyro_scale"]
@@ -85,7 +85,7 @@ def test_landmarks_decide_which_of_gyro_and_odometry_is_wrong_and_one_value_is_p
 
 def test_a_gyro_that_is_tilted_and_upside_down_is_turned_over_about_the_robots_axes(bag, tmp_path):
     drive = Drive(bag)
-    spoil_messages(drive, [Fault.named("wrong_gyro", factor=1.0, axes="exchanged")], seed=1)
+    put_faults(drive, [Fault.named("wrong_gyro", factor=1.0, axes="exchanged")], seed=1)
     drive.write(tmp_path / "faulty.mcap")
     tilted = {"imu.frame": "tilted", "imu.mount": "0 0 0 0 1.2 0"}
     found = of_the_gyro(tmp_path / "faulty.mcap", tilted)["gyro_scale"]

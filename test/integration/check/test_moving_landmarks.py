@@ -13,7 +13,7 @@ from graph_slam_ros.lie import se3
 from graph_slam_ros.recordings.bag import open_bag
 from graph_slam_ros.runs.check import check
 from graph_slam_ros.runs.suggestion import Suggestion
-from graph_slam_ros.tools.simulation import Drive, Fault, spoil_messages
+from graph_slam_ros.tools.simulation import Drive, Fault, put_faults
 from graph_slam_ros.tools.simulation.drive import Sightings
 
 
@@ -81,7 +81,7 @@ def test_landmarks_of_a_map_that_name_the_robot_s_frame_are_found(short, tmp_pat
 
 def test_landmarks_in_the_frame_of_odometry_need_no_mount_where_tf_has_the_robot(short, tmp_path):
     drive, file = in_odom(Drive(short), "odom"), tmp_path / "odom.mcap"
-    spoil_messages(drive, [Fault.named("other_tf", distance=1.0)], 0)
+    put_faults(drive, [Fault.named("other_tf", distance=1.0)], 0)
     drive.write(file)
     found = Suggestion(open_bag(file), file)
     assert "detections.mount" not in found.settings

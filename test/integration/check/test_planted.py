@@ -12,7 +12,7 @@ from graph_slam_ros.formats.parameters import parse_setting
 from graph_slam_ros.runs.check import check
 from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.slam import Config
-from graph_slam_ros.tools.simulation import Drive, Fault, simulate, spoil_messages, write_bag, write_faulty_bag
+from graph_slam_ros.tools.simulation import Drive, Fault, put_faults, simulate, write_bag, write_faulty_bag
 from graph_slam_ros.tools.simulation.drive import Sightings
 
 SOAK = pytest.mark.skipif(not times(0, 1), reason="only in make soak")
@@ -208,7 +208,7 @@ def test_a_fit_of_ranges_of_which_many_are_too_long_is_not_trusted(tmp_path, see
 def test_random_identities_are_no_wrong_axes(laps, tmp_path):
     """In the plane, a sensor whose axes were turned upwards would see everything near itself."""
     drive = Drive(laps)
-    spoil_messages(drive, [Fault.named("random_ids", rate=0.6)], seed=1)
+    put_faults(drive, [Fault.named("random_ids", rate=0.6)], seed=1)
     drive.write(tmp_path / "faulty.mcap")
     errors = [one.code for one in check(tmp_path / "faulty.mcap", quick=True).findings if one.severity == "error"]
     assert errors == ["unrelated"]
@@ -251,7 +251,7 @@ def test_each_finding_is_planted():
 @pytest.mark.parametrize("seconds", times([0.2], [0.2, -0.2]))
 def test_a_clock_that_is_set_on_the_way_is_found_by_the_fit_and_by_the_times_of_recording(laps, tmp_path, seconds):
     faulty = Drive(laps)
-    spoil_messages(faulty, [Fault.named("clock_offset", seconds=seconds, begin=0.5)], seed=1)
+    put_faults(faulty, [Fault.named("clock_offset", seconds=seconds, begin=0.5)], seed=1)
     faulty.write(tmp_path / "faulty.mcap")
     by = {one.severity: one for one in check(tmp_path / "faulty.mcap").findings if one.code == "clock_jump"}
     assert by["warning"].value == pytest.approx(-seconds, abs=0.08)
