@@ -99,6 +99,22 @@ def add_truth(sub: CommandParser, *, required: bool) -> None:
     sub.add_argument("--no-align", action="store_true", help=about)
 
 
+def check_truth(args: argparse.Namespace, command: str) -> None:
+    """Refuse options of a truth that is not given. Raises GraphSlamError."""
+    if not args.truth and (args.topic or args.no_align):
+        raise GraphSlamError(f"{command}: no use for --topic or --no-align without --truth")
+
+
+def add_inputs(sub: CommandParser, recording: str = "file or folder of a recording") -> None:
+    """Add a recording, the topics that are used of it, and parameters."""
+    sub.add_argument("bag", type=Path, metavar="BAG", help=recording)
+    sub.add_argument("--odom", metavar="TOPIC", help="odometry topic (default: as info chooses)")
+    sub.add_argument("--landmarks", metavar="TOPIC", help="landmark topic (default: as info chooses)")
+    sub.add_argument("--config", type=Path, metavar="FILE", help="parameter file, as for the node")
+    about = "set one parameter, before the file's"
+    sub.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help=about)
+
+
 def add_shown(sub: CommandParser) -> None:
     """Add what a page on a run shows of other files."""
     add_truth(sub, required=False)

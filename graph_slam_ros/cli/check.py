@@ -23,17 +23,11 @@ if TYPE_CHECKING:
 _WIDTH = 100
 
 
-def check_options(sub: CommandParser, *, of_check: bool = True) -> None:
-    """Add the options of ``check``; without ``of_check``, those that ``calibrate`` has, too."""
+def check_options(sub: CommandParser) -> None:
+    """Add the options of ``check``."""
     sub.codes = f"{CODES} 4: something above a note was found."
-    sub.add_argument("bag", type=Path, metavar="BAG", help="file or folder of a recording")
-    sub.add_argument("--odom", metavar="TOPIC", help="odometry topic (default: as info chooses)")
-    sub.add_argument("--landmarks", metavar="TOPIC", help="landmark topic (default: as info chooses)")
-    sub.add_argument("--config", type=Path, metavar="FILE", help="parameter file; its values come before info's")
-    about = "set one parameter, before the file's"
-    sub.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help=about)
-    if of_check:
-        sub.add_argument("--quick", action="store_true", help="leave out what needs a replay and a fit")
+    arguments.add_inputs(sub)
+    sub.add_argument("--quick", action="store_true", help="leave out what needs a replay and a fit")
     arguments.add_json(sub)
 
 
@@ -115,13 +109,14 @@ def _amount(value: float, unit: str) -> str:
 
 def calibrate_options(sub: CommandParser) -> None:
     """Add the options of ``calibrate``."""
-    check_options(sub, of_check=False)
+    arguments.add_inputs(sub)
+    arguments.add_json(sub)
     sub.codes = f"{CODES} 4: something is to be corrected."
     about = "auto (default: odometry's factors, clocks, yaws; of ranges alone their factor and offset), or some of "
     about += f"{', '.join(GROUPS)}: what is estimated"
     sub.add_argument("--groups", default=AUTO, help=about)
     sub.add_argument("--out", type=Path, metavar="FILE", help="write the settings as a parameter file, too")
-    sub.add_argument("--force", action="store_true", help="replace an existing file")
+    arguments.add_force(sub)
 
 
 def calibrate(args: argparse.Namespace) -> int:

@@ -172,8 +172,9 @@ def _draw(args: argparse.Namespace) -> int:
     from graph_slam_ros.runs.folder import changed_since
     from graph_slam_ros.warmup import compile_all
 
-    if args.last_drive or (not args.truth and (args.topic or args.no_align)):
-        raise GraphSlamError("map export: no use for --last-drive in a picture, or --topic, --no-align without --truth")
+    arguments.check_truth(args, "map export")
+    if args.last_drive:
+        raise GraphSlamError("map export: no use for --last-drive in a picture")
     console.check_file(args.out, force=args.force)
     losses: list[str] = []
     if args.out.suffix == ".gif":

@@ -17,12 +17,8 @@ if TYPE_CHECKING:
 
 def replay_options(sub: CommandParser) -> None:
     """Add the options of ``replay``."""
-    sub.add_argument("bag", type=Path, metavar="BAG", help="file or folder of a recording, or a run folder")
+    arguments.add_inputs(sub, "file or folder of a recording, or a run folder")
     arguments.add_out(sub, required=False)  # not with --ros and --node
-    sub.add_argument("--odom", metavar="TOPIC", help="odometry topic (default: the only one, or /odom)")
-    sub.add_argument("--landmarks", metavar="TOPIC", help="landmark topic (default: the only one, or /landmarks)")
-    sub.add_argument("--config", type=Path, metavar="FILE", help="parameter file, as for the node")
-    sub.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="set one parameter")
     about = "continue in the map of a run, frozen or not, with its parameters"
     sub.add_argument("--map", type=Path, metavar="RUN", help=about)
     sub.add_argument("--ros", action="store_true", help="publish into a live ROS graph: a node of its own with --out")

@@ -6,7 +6,7 @@ import json
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict
 from typing import Any
 
@@ -32,8 +32,6 @@ _SETTINGS = {
     "distributed.admin.log-format": "%(message)s",
     "logging.distributed": "critical",
 }
-
-Progress = Callable[[Iterable[Any], int], Iterable[Any]]
 
 
 @contextlib.contextmanager
@@ -109,15 +107,8 @@ def run_isolated(job: Job) -> Row:
     return failed(job, reason)
 
 
-def run_jobs(
-    client: Client, jobs: Sequence[Job], progress: Progress, function: Callable[[Job], Row] = run_isolated
-) -> Iterator[Row]:
-    """Run jobs in their order, and yield the row of each when it is done."""
-    yield from progress(_rows(client, jobs, function), len(jobs))
-
-
-def _rows(client: Client, jobs: Sequence[Job], function: Callable[[Job], Row]) -> Iterator[Row]:
-    """The rows of jobs. The scheduler has one job for each thread of a worker.
+def run_jobs(client: Client, jobs: Iterable[Job], function: Callable[[Job], Row] = run_isolated) -> Iterator[Row]:
+    """Run jobs in their order, and yield the row of each when it is done. A worker has one for each of its threads.
 
     So a worker that ends takes no job with it that it has not begun, and a million jobs need no memory there.
     """

@@ -1,7 +1,7 @@
 """The product of recordings and settings, replayed on all workers into one folder."""
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,12 +10,13 @@ from graph_slam_ros.config import Config
 from graph_slam_ros.config.config import flatten
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.parameters import parse_setting, read_parameters
-from graph_slam_ros.tools.fleet.engine import Progress, connected, run_jobs
+from graph_slam_ros.tools.fleet.engine import connected, run_jobs
 from graph_slam_ros.tools.fleet.job import Job
 from graph_slam_ros.tools.fleet.recordings import Source, find_sources
 from graph_slam_ros.tools.fleet.store import JOBS, REPORT, Row, Store, job_key, write_table
 
 DEFAULTS = "defaults"
+Progress = Callable[[Iterable[Any], int], Iterable[Any]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +125,7 @@ def replay_all(
         try:
             if left:
                 with connected(scheduler, workers) as client:
-                    rows |= {row["key"]: row for row in run_jobs(client, left, progress)}
+                    rows |= {row["key"]: row for row in progress(run_jobs(client, left), len(left))}
         finally:
             write_table(store.folder, list(store.rows()))
     return list(rows.values()), reused

@@ -23,16 +23,21 @@ def report(args: argparse.Namespace) -> int:
     """Write the report on a run."""
     from graph_slam_ros.runs.folder import REPORT, is_own_page
     from graph_slam_ros.tools.report import write_report
+    from graph_slam_ros.tools.report.contents import read_contents
+    from graph_slam_ros.tools.report.page import plotly
 
-    if not args.truth and (args.topic or args.no_align):
-        raise GraphSlamError("report: no use for --topic or --no-align without --truth")
+    arguments.check_truth(args, "report")
     out = args.out or args.run_folder / REPORT
+    if out.suffix != ".html":
+        raise GraphSlamError(f"{out}: a report is a .html file")
     try:
         console.check_file(out, force=args.force or is_own_page(out, args.run_folder))
     except OSError as error:
         raise GraphSlamError(f"{out}: {error.strerror}") from None
+    script = plotly()  # or it is refused, before the run is read
     gc.disable()  # a map is a million small objects that all stay: to look through them is a sixth of the time
-    made = write_report(args.run_folder, out, args.truth, args.compare, args.plan, args.topic, align=not args.no_align)
+    made = read_contents(args.run_folder, args.truth, args.compare, args.plan, args.topic, align=not args.no_align)
+    write_report(made, script, out)
     gc.freeze()  # nor at the end of the process
     console.show(*made.data["sentences"] or (), f"report in {out}")
     console.then(f"open {out} in a browser: it needs no network")

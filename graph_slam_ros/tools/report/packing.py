@@ -2,7 +2,6 @@
 
 import base64
 import json
-import re
 import zlib
 from collections.abc import Sequence
 from typing import Any
@@ -10,18 +9,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from graph_slam_ros.cli.console import escaped
 from graph_slam_ros.errors import GraphSlamError
 
 MOST_TEXT = 200  # characters of a name that are shown
 UNKNOWN = -(2**31)  # of a column of integers: not a number
 _FORMATS = {"f4": np.float32, "f8": np.float64, "i4": np.int32, "u1": np.uint8}
-# Control characters, and those that change the direction of a text or are not seen.
-_HIDDEN = re.compile(r"[\x00-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u2069\ufeff\ud800-\udfff]")
 
 
 def shown(text: str, most: int = MOST_TEXT) -> str:
     r"""A name as a page shows it: hidden characters as Python writes them (``\x1b``), and not too long."""
-    text = _HIDDEN.sub(lambda found: repr(found[0])[1:-1], text)
+    text = escaped(text)
     return text if len(text) <= most else f"{text[: most - 3]}..."
 
 

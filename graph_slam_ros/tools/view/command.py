@@ -30,8 +30,7 @@ def view(args: argparse.Namespace) -> int:
     from graph_slam_ros.tools.view.workbench import Workbench
     from graph_slam_ros.warmup import compile_all
 
-    if not args.truth and (args.topic or args.no_align):
-        raise GraphSlamError("view: no use for --topic or --no-align without --truth")
+    arguments.check_truth(args, "view")
     compile_all()
     made = read_contents(args.run_folder, args.truth, args.compare, args.plan, args.topic, align=not args.no_align)
     work = Workbench(made, arguments.LOSS_SCALE)

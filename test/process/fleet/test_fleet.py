@@ -152,7 +152,7 @@ def test_over_tcp_a_worker_that_is_killed_changes_nothing(drives, serial, tmp_pa
             client.wait_for_workers(2, timeout=60)
             pids = client.run(os.getpid)
             jobs, most = [Job(f"{k}", "", f"{k}", "", {}, "", "", 10.0, 0, with_report=False) for k in range(9)], 0
-            for _ in run_jobs(client, jobs, lambda items, _: items, lambda job: {"key": job.key}):
+            for _ in run_jobs(client, jobs, lambda job: {"key": job.key}):
                 most = max(most, *map(len, client.processing().values()))
         assert most <= 1, "a worker has no job but the one that it runs"
 
