@@ -157,9 +157,8 @@ def _results(job: Job, made: Path) -> Row:
     if not done.summary["keyframes"]:
         raise GraphSlamError("no odometry of it could be used: graph_slam info says what is in it")
     if job.with_report:
-        from graph_slam_ros.tools.report import write_report
         from graph_slam_ros.tools.report.contents import read_contents
-        from graph_slam_ros.tools.report.page import plotly
+        from graph_slam_ros.tools.report.page import plotly, write_report
 
         write_report(read_contents(made / RUN), plotly(), made / REPORT)
     return row | {

@@ -22,9 +22,8 @@ def report_options(sub: CommandParser) -> None:
 def report(args: argparse.Namespace) -> int:
     """Write the report on a run."""
     from graph_slam_ros.runs.folder import REPORT, is_own_page
-    from graph_slam_ros.tools.report import write_report
     from graph_slam_ros.tools.report.contents import read_contents
-    from graph_slam_ros.tools.report.page import plotly
+    from graph_slam_ros.tools.report.page import plotly, write_report
 
     arguments.check_truth(args, "report")
     out = args.out or args.run_folder / REPORT

@@ -19,10 +19,9 @@ from reliability import times
 
 from graph_slam_ros import cli
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.tools.fleet import engine
-from graph_slam_ros.tools.fleet.engine import connected, run_isolated, run_jobs
+from graph_slam_ros.tools.fleet import replay as engine
 from graph_slam_ros.tools.fleet.job import Job, run_job
-from graph_slam_ros.tools.fleet.replay import Fleet, jobs_of, replay_all
+from graph_slam_ros.tools.fleet.replay import Fleet, connected, jobs_of, replay_all, run_isolated, run_jobs
 from graph_slam_ros.tools.fleet.store import Store
 
 COUNT, STOPS = times((2, 1), (12, 10))
