@@ -34,12 +34,8 @@ def check_options(sub: CommandParser) -> None:
 def check(args: argparse.Namespace) -> int:
     """Check a recording; returns 4 if there is a finding above a note."""
     from graph_slam_ros.runs.check import check as checked
-    from graph_slam_ros.runs.folder import is_run
 
-    if is_run(args.bag):
-        raise GraphSlamError(f"{args.bag}: a run folder; check its recording, or graph_slam explain {args.bag}")
-    settings = settings_of(args)
-    topics = {"odometry": args.odom, "landmarks": args.landmarks}
+    settings, topics = _asked(args, f"check its recording, or graph_slam explain {args.bag}")
     done = checked(args.bag, settings, **topics, quick=args.quick, progress=console.progress("check"))
     if args.json:
         found = [one.as_dict() for one in done.findings]
@@ -62,13 +58,15 @@ def check(args: argparse.Namespace) -> int:
     return console.DONE if done.is_clean else console.FOUND
 
 
-def settings_of(args: argparse.Namespace) -> dict[str, Any]:
-    """The parameters of ``--config`` and ``--set``, by dotted name.
+def _asked(args: argparse.Namespace, instead: str) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The parameters of ``--config`` and ``--set``, and the topics. Raises GraphSlamError, too, for a run folder."""
+    from graph_slam_ros.runs.folder import is_run
 
-    Raises GraphSlamError: the file or a setting cannot be read.
-    """
+    if is_run(args.bag):
+        raise GraphSlamError(f"{args.bag}: a run folder; {instead}")
     settings = dict(flatten(read_parameters(args.config, follow=True))) if args.config else {}
-    return settings | dict(parse_setting(text) for text in args.set)
+    topics = {"odometry": args.odom, "landmarks": args.landmarks}
+    return settings | dict(parse_setting(text) for text in args.set), topics
 
 
 def lines(one: Finding) -> Iterator[str]:
@@ -122,15 +120,10 @@ def calibrate_options(sub: CommandParser) -> None:
 def calibrate(args: argparse.Namespace) -> int:
     """Calibrate a recording; returns 4 if something is to be corrected, 3 if the data determine nothing."""
     from graph_slam_ros.runs.calibrate import calibrate as calibrated
-    from graph_slam_ros.runs.folder import is_run
 
-    if is_run(args.bag):
-        raise GraphSlamError(f"{args.bag}: a run folder; calibrate its recording")
-    if args.out:
-        console.check_file(args.out, force=args.force)
-    settings = settings_of(args)
-    topics = {"groups": args.groups, "odometry": args.odom, "landmarks": args.landmarks}
-    done = calibrated(args.bag, settings, **topics, progress=console.progress("calibrate"))
+    settings, topics = _asked(args, "calibrate its recording")
+    console.check_file(args.out, force=args.force)
+    done = calibrated(args.bag, settings, groups=args.groups, **topics, progress=console.progress("calibrate"))
     if args.out:
         write_whole(args.out, _as_yaml(done).encode())
     if args.json:

@@ -6,11 +6,12 @@ import shlex
 import time
 from collections.abc import Iterable
 from contextlib import suppress
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from graph_slam_ros.cli import arguments, console
-from graph_slam_ros.cli.usage import CODES, CommandParser, later
+from graph_slam_ros.cli.usage import CODES, CommandParser
 from graph_slam_ros.errors import GraphSlamError
 
 if TYPE_CHECKING:
@@ -80,8 +81,9 @@ def optimize(args: argparse.Namespace) -> int:
     graph, settings = file.graph, _settings(args, file.graph)
     solution = solve(file, settings, init=args.init)
     solver, report, start = solution.solver, solution.report, solution.start
-    certified = later("tools.certificate.certify", "certified")
-    proof, code, told = certified(solution) if args.certify else (None, console.DONE, "")
+    proof, code, told = None, console.DONE, ""
+    if args.certify:
+        proof, code, told = import_module("graph_slam_ros.tools.certificate.certify").certified(solution)
     if args.json:
         proved = {"certificate": proof.as_dict()} if proof else {}
         told_of = {"losses": file.losses, "notes": file.notes}

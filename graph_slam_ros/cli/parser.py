@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from importlib import import_module
 
 from graph_slam_ros import __version__
-from graph_slam_ros.cli.usage import CommandParser, later
+from graph_slam_ros.cli.usage import CommandParser
 
 
 class Command:
@@ -23,8 +23,9 @@ class Command:
 
     def add_to(self, sub: CommandParser) -> None:
         """Add the options, and the function as ``run``."""
-        getattr(import_module(f"graph_slam_ros.{self._module}"), f"{self._name}_options")(sub)
-        sub.set_defaults(run=later(self._module, self._name))
+        module = import_module(f"graph_slam_ros.{self._module}")
+        getattr(module, f"{self._name}_options")(sub)
+        sub.set_defaults(run=getattr(module, self._name))
 
 
 class Group:

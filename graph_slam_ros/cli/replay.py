@@ -112,7 +112,7 @@ def _replay_live(args: argparse.Namespace, config: "Config") -> int:
 
 def recover_options(sub: CommandParser) -> None:
     """Add the options of ``recover``."""
-    sub.add_argument("run_folder", type=Path, metavar="RUN", help="run folder")
+    arguments.add_run(sub)
     arguments.add_out(sub, required=False, default="RUN itself")
 
 

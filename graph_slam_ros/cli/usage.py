@@ -1,8 +1,7 @@
-"""Usage errors and help of the command line, and modules that are imported when they are needed."""
+"""Usage errors and help of the command line."""
 
 import argparse
 from collections.abc import Callable, Mapping, Sequence
-from importlib import import_module
 from types import MappingProxyType
 from typing import Any, NoReturn
 
@@ -10,18 +9,6 @@ from graph_slam_ros.cli import console
 from graph_slam_ros.errors import did_you_mean
 
 CODES = "Exit codes: 0 done, 1 internal error, 2 refused, 3 done but something was lost, 130 interrupted."
-
-
-def later(module: str, name: str) -> Callable[..., Any]:
-    """The function of a name in a module of the package, which is imported when the function is called.
-
-    Commands find tools by it: no module of the core imports one.
-    """
-
-    def call(*given: object) -> Any:
-        return getattr(import_module(f"graph_slam_ros.{module}"), name)(*given)
-
-    return call
 
 
 class _Formatter(argparse.HelpFormatter):

@@ -36,11 +36,11 @@ def polish(problem: Synchronization, x: Poses, root: int) -> Polished:
     """
     cost, damping = problem.cost(x), 0.0
     for _ in range(_MOST_STEPS):
-        model = problem.newton(x, root)
+        hessian, gradient, scale = problem.newton(x, root)
         while True:
-            solve = factorize((model.hessian + damping * diags_array(model.scale)).tocsc())
+            solve = factorize((hessian + damping * diags_array(scale)).tocsc())
             if solve is not None:
-                step = -solve(model.gradient)
+                step = -solve(gradient)
                 there = problem.retract(x, step, root)
                 reached = problem.cost(there)
                 if reached <= cost * (1.0 + _ROUNDING):
@@ -51,7 +51,7 @@ def polish(problem: Synchronization, x: Poses, root: int) -> Polished:
             if damping > _DAMPING_MOST:
                 return Polished(x, cost, False)
         x, cost = there, reached
-        model_decrease = -float(model.gradient @ step)
+        model_decrease = -float(gradient @ step)
         if damping <= 1.0 and np.abs(step).max() < _SMALLEST_STEP:  # also at a saddle, which is critical, too
             return Polished(x, cost, True)
         if not damping and model_decrease <= 0.1 * _ROUNDING * cost:

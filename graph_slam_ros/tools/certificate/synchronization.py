@@ -7,7 +7,8 @@ With n poses in d dimensions, X = [t_1 .. t_n R_1 .. R_n] (d x (1 + d)n), and fo
 which is Problem 1 of Rosen et al. (2019), and with M its Problem 2. Arrays hold X', one row for each column of X.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.sparse import coo_array, csc_array
@@ -109,22 +110,7 @@ class Poses:
         return np.vstack([self.positions, np.swapaxes(self.rotations, 1, 2).reshape(-1, d)])
 
 
-@dataclass(frozen=True, slots=True)
-class Newton:
-    """The second-order model of F over steps of all poses but the root: moves of position, then turns, pose by pose.
-
-    Attributes
-    ----------
-    hessian, gradient : half of F's
-    scale : the diagonal of the Hessian's Gauss-Newton part, which is never negative
-    """
-
-    hessian: csc_array
-    gradient: Array
-    scale: Array
-
-
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Synchronization:
     """SE-Sync's problem on n poses that m edges join.
 
@@ -140,10 +126,6 @@ class Synchronization:
     measured: Poses
     kappa: Array
     tau: Array
-    root: csc_array = field(init=False)  # A with M = A'A
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "root", self._root())
 
     @classmethod
     def of(cls, edges: Edges, poses: int) -> "Synchronization":
@@ -155,8 +137,9 @@ class Synchronization:
         """The dimensions of the space that the poses are in: 2 or 3."""
         return int(self.measured.positions.shape[1])
 
-    def _root(self) -> csc_array:
-        """Rows are whitened residuals of the edges: of translations, then of rotations' rows."""
+    @cached_property
+    def root(self) -> csc_array:
+        """``A`` with ``M = A'A``: rows are whitened residuals, of translations, then of rotations' rows."""
         d, m = self.dimensions, len(self.ends)
         i, j = self.ends.T
         weight, turn = np.sqrt(self.tau), np.sqrt(self.kappa)
@@ -200,8 +183,10 @@ class Synchronization:
         free = np.delete(np.arange((1 + d) * n), root)
         return matrix[free][:, free].tocsc()
 
-    def newton(self, x: Poses, root: int) -> Newton:
-        """The model at x: ``F(x [+] s) = F + 2 s'g + s'Hs + ..`` with ``t + u`` and ``R Exp(w)`` of ``s = (u, w)``.
+    def newton(self, x: Poses, root: int) -> tuple[csc_array, Array, Array]:
+        """H, g, and the diagonal of ``J'J``: ``F(x [+] s) = F + 2 s'g + s'Hs + ..`` with ``t + u`` and ``R Exp(w)``.
+
+        A step is ``s = (u, w)`` of all poses but the root: moves of position, then turns, pose by pose.
 
         ``H = J'J - C``: beside the first derivatives of the residuals, J, what turning does to second order,
         ``C_kl = <G_k Lambda_i, G_l>`` with the generators G, which is Hess F of Rosen et al. (2019), eq. (44) of their
@@ -235,7 +220,7 @@ class Synchronization:
         gradient = np.bincount(at.ravel(), of_edges.ravel(), size).astype(np.float64)
         free = np.delete(np.arange(size), np.arange(dof * root, dof * (root + 1)))
         hessian = (first - _blocks(second, turns, size)).tocsc()[free][:, free]
-        return Newton(hessian.tocsc(), gradient[free], first.diagonal()[free])
+        return hessian.tocsc(), gradient[free], first.diagonal()[free]
 
     def retract(self, x: Poses, step: Array, root: int) -> Poses:
         """Poses after a step of all but the root. A rotation moves on by the polar factor of ``R (1 + W)``."""

@@ -4,7 +4,7 @@ recording = simulate("warehouse", seed=7, aisles=5)
 write_bag(recording, "warehouse.mcap")
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from graph_slam_ros.tools.simulation.options import filled, options_of
 from graph_slam_ros.tools.simulation.pose_graph import GRAPH_WORLDS, city_graph, sphere_graph
 from graph_slam_ros.tools.simulation.recording import Recording, measurements, with_closures
 
-WORLDS = {
+WORLDS: dict[str, Callable[..., Recording]] = {
     "pythonrobotics": pythonrobotics.simulate,
     "manhattan": manhattan.simulate,
     "warehouse": warehouse.simulate,

@@ -5,7 +5,7 @@ from scipy.spatial.transform import Rotation
 
 from graph_slam_ros.lie import se3
 from graph_slam_ros.slam import Sighting
-from graph_slam_ros.tools.simulation.options import checked, option, random
+from graph_slam_ros.tools.simulation.options import option, random
 from graph_slam_ros.tools.simulation.recording import CORRELATION_TIME, Recording, VelocityNoise, drive
 from graph_slam_ros.tools.simulation.sensing import KINDS, TagCamera
 from graph_slam_ros.typing import Array, Numbers
@@ -34,7 +34,6 @@ CAMERA = TagCamera(
 )
 
 
-@checked("flight")
 def simulate(
     seed: int,
     laps: int = option(3, "how often around", "", 1, 1000),

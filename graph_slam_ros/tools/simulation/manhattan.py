@@ -4,7 +4,7 @@ import numpy as np
 from numpy.random import Generator
 
 from graph_slam_ros.slam import Sighting
-from graph_slam_ros.tools.simulation.options import checked, option, random
+from graph_slam_ros.tools.simulation.options import option, random
 from graph_slam_ros.tools.simulation.recording import (
     CORRELATION_TIME,
     SIGMA_SIDEWAYS,
@@ -55,7 +55,6 @@ def stroll(rng: Generator, steps: int, blocks: int) -> tuple[Index, Index]:
     return cells, ways
 
 
-@checked("manhattan")
 def simulate(
     seed: int,
     poses: int = option(500, "steps to drive, 1 m each", "", 1, 1e6),

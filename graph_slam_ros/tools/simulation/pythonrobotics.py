@@ -4,7 +4,7 @@ import numpy as np
 
 from graph_slam_ros.lie import se2
 from graph_slam_ros.slam import Sighting
-from graph_slam_ros.tools.simulation.options import checked, option, random
+from graph_slam_ros.tools.simulation.options import option, random
 from graph_slam_ros.tools.simulation.recording import Recording, VelocityNoise, drive
 from graph_slam_ros.tools.simulation.sensing import KINDS, RangeBearing
 from graph_slam_ros.typing import Numbers
@@ -16,7 +16,6 @@ MAX_RANGE_M = 30.0
 SIDEWAYS_M_S = 1e-3  # a covariance needs a sideways part; this one is drawn too
 
 
-@checked("pythonrobotics")
 def simulate(
     seed: int,
     poses: int = option(50, "ticks to drive, 2 s each", "", 1, 1e6),

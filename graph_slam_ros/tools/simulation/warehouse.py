@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from graph_slam_ros.graph.geometry import PLANAR
 from graph_slam_ros.lie import se2
 from graph_slam_ros.slam import Sighting
-from graph_slam_ros.tools.simulation.options import checked, option, random
+from graph_slam_ros.tools.simulation.options import option, random
 from graph_slam_ros.tools.simulation.recording import (
     CORRELATION_TIME,
     SIGMA_SIDEWAYS,
@@ -36,7 +36,6 @@ SIGMA_YAW_RAD = np.deg2rad(2.0)
 START = (0.0, -CROSS_AISLE_M, 0.5 * np.pi)
 
 
-@checked("warehouse")
 def simulate(
     seed: int,
     aisles: int = option(3, "aisles, 4 m apart", "", 2, 100),
