@@ -1,7 +1,6 @@
 """Odd files in the folder of a run, odd settings, and what is not ours: one line, its exit code, nothing is changed."""
 
 import contextlib
-import io
 import itertools
 import os
 import random
@@ -12,7 +11,7 @@ import signal
 import pytest
 import reliability
 from places import ROOT
-from plain_rights import plain_rights
+from plain_rights import answer, plain_rights
 
 from graph_slam_ros import cli
 from graph_slam_ros.cli.console import shortened
@@ -33,17 +32,6 @@ def made(tmp_path_factory):
         write_bag(simulate("warehouse", seed, aisles=2, laps=1, aisle_m=4.0), folder / f"{name}.mcap")
         replay(folder / f"{name}.mcap", folder / f"{name}_run")
     return folder
-
-
-def answer(*words):
-    """Exit code and the lines on standard error of a command, in this process."""
-    err = io.StringIO()
-    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(err):
-        try:
-            code = cli.main([str(word) for word in words])
-        except SystemExit as end:
-            code = end.code
-    return code, err.getvalue().splitlines()
 
 
 def sizes(folder):

@@ -1,8 +1,6 @@
 """A disk that is full, folders that are not there and odd variables: one line, its exit code, nothing half-written."""
 
-import contextlib
 import ctypes
-import io
 import multiprocessing
 import os
 import subprocess
@@ -11,7 +9,7 @@ from concurrent.futures import ProcessPoolExecutor
 
 import pytest
 import reliability
-from plain_rights import plain_rights
+from plain_rights import answer, plain_rights
 
 from graph_slam_ros import cli, warmup
 from graph_slam_ros.lie import jit
@@ -35,16 +33,6 @@ def in_a_child(function, *arguments):
     """What a function returns in a process of its own, which is a copy of this one."""
     with ProcessPoolExecutor(1, multiprocessing.get_context("fork")) as pool:
         return pool.submit(function, *arguments).result(120)
-
-
-def answer(*words):
-    err = io.StringIO()
-    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(err):
-        try:
-            code = cli.main([str(word) for word in words])
-        except SystemExit as end:
-            code = end.code
-    return code, err.getvalue().splitlines()
 
 
 def small(folder, kilobytes):

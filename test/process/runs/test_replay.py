@@ -21,7 +21,7 @@ from graph_slam_ros.measurements.types import from_record
 from graph_slam_ros.messages import results
 from graph_slam_ros.messages.interfaces import typestore
 from graph_slam_ros.recordings.bag import open_bag
-from graph_slam_ros.runs.folder import RunError, earlier_runs, is_run, keep_earlier, run_config
+from graph_slam_ros.runs.folder import RunError, run_config
 from graph_slam_ros.runs.journal import RecordWriter, parts_of, read_ingest
 from graph_slam_ros.runs.recorder import RunRecorder
 from graph_slam_ros.runs.replay import replay
@@ -285,17 +285,3 @@ def test_a_run_in_space_leaves_positions_rotations_and_all_covariances(tmp_path)
             assert word == "" if j >= dof else float(word) == pytest.approx(covariance[i, j], rel=1e-8)
     replay(tmp_path / "run", tmp_path / "again")
     assert contents(tmp_path / "again") == contents(tmp_path / "run")
-
-
-@each("most", [0, 2])
-def test_of_earlier_runs_the_last_ones_are_kept_and_no_others(tmp_path, most):
-    for k in range(5):
-        keep_earlier(tmp_path / "run", most)
-        recorder = RunRecorder(tmp_path / "run", Config(), force=True)
-        slam = GraphSlam(sink=recorder.sink)
-        slam.process(Odometry(1, (0.0, 0.0, 0.0)))
-        recorder.save(slam)
-        recorder.close()
-        last = range(max(1, k - most + 1), k + 1) if most else ()
-        assert set(earlier_runs(tmp_path / "run")) == set(last)
-    assert is_run(tmp_path / "run")

@@ -98,16 +98,6 @@ def odometry(seconds, name="odom"):
     return [Odometry(1000 * S + round(seconds * S), (0.0, 0.0, 0.0), None, name)]
 
 
-def test_P10_what_is_paused_or_finds_no_room_is_refused_by_its_reason_and_input():
-    gate = IngestGate(counters := Counters())
-    assert not gate.admit(odometry(0.0, "odom#2"), "segment", has_room=False).measured
-    gate.is_paused = True
-    assert not gate.admit(odometry(1.0), "segment", has_room=False).measured
-    gate.is_paused = False
-    assert gate.admit(odometry(2.0), "segment").measured
-    assert counters.as_dict() == {"odom": {"overflow": 1, "paused": 1}}
-
-
 def test_B7_what_was_on_its_way_when_the_clock_jumped_is_known_until_the_clock_is_there():
     clock = itertools.chain([1010 * S], itertools.repeat(1020 * S, 2), itertools.repeat(1100 * S))
     gate = IngestGate(Counters(), lambda: next(clock))

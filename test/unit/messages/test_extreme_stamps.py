@@ -96,10 +96,6 @@ WRONG = {
     "odometry an hour ahead": ([odom(STAMP_NS + 3600 * S)], 5, "odom", {"future": 5}),
     "odometry half a minute ahead": ([odom(STAMP_NS + 33 * S)], 1, "odom", {"future": 1}),
     "odometry at the beginning of time": ([odom(1)], 5, "odom", {"late": 5}),
-    "2^31 s as a signed number": ([odom(sec=-(2**31))], 3, "odom", {"bad_stamp": 3}),
-    "nanoseconds beyond a second": ([odom(nanosec=10**9)], 3, "odom", {"bad_stamp": 3}),
-    "all nanoseconds": ([odom(sec=0, nanosec=2**32 - 1)], 3, "odom", {"bad_stamp": 3}),
-    "zero": ([odom(sec=0, nanosec=0)], 3, "odom", {"zero_stamp": 3}),
     "detections at the end of time": ([seen(END_NS)] , 3, "detections", {"after_odometry": 3}),
     "so many that nothing else could wait": (
         [seen(END_NS - 60 * j) for j in range(10)], 20, "detections", {"after_odometry": None, "overflow": None}

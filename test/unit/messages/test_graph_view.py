@@ -130,17 +130,8 @@ def test_the_graph_is_published_in_the_map_at_the_newest_keyframe_in_place_of_th
     assert {(m.header.frame_id, m.header.stamp.sec) for m in drawn} == {("map", STAMP_NS // 10**9 + 9)}
     poses = [(p.x, p.y, p.z) for m in drawn if m.ns == "poses" for p in m.points]
     assert poses == [tuple(one) for one in positions(slam).tolist()]
-
-
-def test_landmarks_are_drawn_where_they_are_and_of_nothing_nothing_is(slam):
-    cdr = results.landmarks(slam)
-    assert cdr == results.landmarks(slam, results.landmark_estimates(slam))
-    drawn = typestore().deserialize_cdr(cdr, results.LANDMARKS).markers
-    at = {m.text: m.pose.position for m in drawn if m.ns == "names"}
-    assert at.keys() == {"point", "tag"}
-    assert all([p.x, p.y, p.z] == landmark(slam, name).tolist() for name, p in at.items())
     drawn = typestore().deserialize_cdr(results.graph(GraphSlam(), 100), results.LANDMARKS).markers
-    assert [(m.ns, m.action, m.header.stamp.sec) for m in drawn] == [("", 3, 0)]
+    assert [(m.ns, m.action, m.header.stamp.sec) for m in drawn] == [("", 3, 0)], "of nothing"
 
 
 def test_landmarks_are_published_with_identity_and_covariance_in_the_axes_of_the_map(slam):

@@ -1,9 +1,7 @@
 """Parts of the running node that need no ROS: what is told of map -> odom, who is ahead, how it is judged."""
 
-import contextlib
 import itertools
 import math
-import threading
 import time
 from dataclasses import replace
 
@@ -22,7 +20,6 @@ from graph_slam_ros.node.pose_extrapolator import PoseExtrapolator
 from graph_slam_ros.node.recent import Recent, RecentInputs
 from graph_slam_ros.node.session import Session
 from graph_slam_ros.node.tf_broadcaster import MapToOdom
-from graph_slam_ros.node.worker import Worker
 from graph_slam_ros.runs.tables import accepted_lately
 from graph_slam_ros.slam import Config, Counters, GraphSlam, Odometry, Sighting, Sightings
 
@@ -141,28 +138,6 @@ def test_the_weakest_direction_of_the_newest_pose_and_the_way_without_a_landmark
     assert seen.values["orientation"] == f"{math.degrees(covariance[2, 2] ** 0.5):.2f} deg heading"
 
 
-def test_P10_a_worker_does_everything_in_order_refuses_what_is_too_much_and_survives_what_fails():
-    faults = []
-    worker, gate, done = Worker(4, faults.append), threading.Event(), []
-    first = worker.call(gate.wait)
-    deadline = time.monotonic() + 10.0
-    while worker.waiting and time.monotonic() < deadline:
-        time.sleep(0.001)
-    taken = [worker.offer(lambda: [] + 1, lambda: done.append("then"))]
-    taken += [worker.offer(lambda k=k: done.append(k)) for k in range(5)]
-    failed, after = worker.call(lambda: 1 / 0), worker.call(lambda: done.append("last"))
-    assert taken == [True, True, True, True, False, False]
-    assert (worker.waiting, worker.is_alive) == (6, True)
-    gate.set()
-    assert first.result(10.0)
-    assert isinstance(failed.exception(10.0), ZeroDivisionError)
-    after.result(10.0)
-    assert done == ["then", 0, 1, 2, "last"]
-    assert [type(fault) for fault in faults] == [TypeError], "of an offered job; who called has it in the future"
-    assert worker.stop(10.0)
-    assert not worker.is_alive
-
-
 def odom(**values):
     return InputFacts(**{"name": "odom", "topic": "/odom", "use": "odometry", "publishers": ("/driver",)} | values)
 
@@ -251,27 +226,6 @@ def test_at_work_it_is_well_or_degraded_with_the_reason(values, inputs, reason):
     assert told[0].values["healthy"] == str(not reason)
     assert told[0].message == "; ".join(("DEGRADED", reason) if reason else ("OK",))
     assert told[-1].values["keyframes"] == str(estimate.keyframes)
-
-
-def test_T13_a_vertex_that_came_without_its_edge_costs_one_solve_and_nothing_else(monkeypatch):
-    robot, raised = round_a_curve(2, 0.4), []
-    add_edge = robot.slam.graph.add_edge
-
-    def faulty(*arguments):
-        if "landmarks" in arguments and not raised:
-            raised.append(MemoryError("injected"))
-            raise raised[0]
-        return add_edge(*arguments)
-
-    monkeypatch.setattr(robot.slam.graph, "add_edge", faulty)
-    failing = []
-    for k in range(20, 40):
-        with contextlib.suppress(MemoryError):
-            robot.ingest([drive(2, k), Sightings(drive(2, k).stamp_ns, "tags", (tag((1.0, 1.0), f"t{k}"),))])
-        failing.append(robot.slam.failing)
-    assert raised and any("vertex" in one for one in failing) and not failing[-1]
-    assert robot.slam.counters.as_dict() == {"solver": {"unsolved": 1}}
-    assert (len(robot.slam.keyframes), len(robot.slam.landmarks)) == (40, 19)
 
 
 @each("names", ["a{}", "b{}"])
