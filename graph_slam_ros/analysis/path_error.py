@@ -5,7 +5,6 @@ without scale. The relative error (RPE) is the error of the motion over one seco
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -167,14 +166,12 @@ def drift(path: Trajectory, truth: Trajectory, at: Array) -> Drift | None:
     if not truth.has_orientation:
         (moved, true) = (t.poses[last, :3] - t.poses[first, :3] for t in (path, truth))
         return Drift(statistics(np.linalg.norm(moved - true, axis=1) / length), None, len(first))
-    moved, true = (np.stack(_motions(t.poses, first, last), axis=1) for t in (path, truth))
+    moved, true = (
+        np.stack(se3.between(tuple(t.poses[first].T), tuple(t.poses[last].T)), axis=1) for t in (path, truth)
+    )
     off = np.stack(se3.between(tuple(true.T), tuple(moved.T)), axis=1)
     angles = angle_between(true, moved)
     return Drift(statistics(np.linalg.norm(off[:, :3], axis=1) / length), statistics(angles / length), len(first))
-
-
-def _motions(poses: Array, first: Any, last: Any) -> se3.Pose:
-    return se3.between(tuple(poses[first].T), tuple(poses[last].T))
 
 
 def angle_between(a: Array, b: Array) -> Array:

@@ -4,7 +4,6 @@ Errors are seen from the first keyframe with a true pose. Where the truth is pos
 from the line between two of them: the first, and the one that is farthest from it.
 """
 
-import json
 import os
 from collections.abc import Sequence
 from dataclasses import replace
@@ -17,7 +16,6 @@ from graph_slam_ros.analysis.path_error import interpolated
 from graph_slam_ros.analysis.trajectories import Truth
 from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.errors import GraphSlamError, message_of
-from graph_slam_ros.formats.files import read_text
 from graph_slam_ros.runs import outcome
 from graph_slam_ros.runs.folder import COVARIANCES, SUMMARY, run_config, summary_of
 from graph_slam_ros.runs.trajectory import LandmarkTable, Trajectory, read_covariances, read_landmarks, read_rows
@@ -200,9 +198,9 @@ def _left_out(
 def _noise(run: Path) -> tuple[bool, tuple[NoiseScale, ...]]:
     """Return whether fixes or surveyed landmarks hold the map, and the noise estimated, by the summary of a run."""
     try:
-        summary = json.loads(read_text(run / SUMMARY))
+        summary = summary_of(run)
         is_held = bool({"fixes", "surveyed"} & set(summary["classes"]))
         return is_held, tuple(NoiseScale.from_dict(one) for one in summary.get("noise", ()))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         why = f"not a summary of a run ({message_of(error)}): graph_slam replay {run} --out NEW makes one"
         raise GraphSlamError(f"{run / SUMMARY}: {why}") from None

@@ -233,6 +233,7 @@ class SavedGraph:
     Attributes
     ----------
     slam : the pipeline that holds the map
+    solver : the solution of the run: all its accepted edges
     keyframes, numbers, stamps_ns : vertices of the keyframes that are in the graph, in order of time, their numbers
         among all keyframes, and stamps
     vertices : of the keyframes that are in the graph, by number
@@ -249,7 +250,7 @@ class SavedGraph:
             raise RunError(f"{folder}: its map cannot be solved: {slam.failing}")
         self.slam, self.folder, self.space, self.config = slam, folder, slam.space, slam.config
         self.graph, self.held = slam.graph.copy(), slam.solver.held
-        self.restored = slam.solver
+        self.solver = slam.solver
         self.graph.initial.values[:] = slam.solver.values
         self.entries = list(ledger_entries(slam, range(self.graph.vertex_count)))
         number, old = self.graph.edge_ids.of, slam.bounded.old if slam.bounded else ()
@@ -267,14 +268,9 @@ class SavedGraph:
         self.vertices = dict(zip(self.numbers, self.keyframes, strict=True))
 
     @cached_property
-    def solver(self) -> Solver:
-        """The solution of the run: all its accepted edges."""
-        return self.solve()
-
-    @cached_property
     def influence_model(self) -> InfluenceModel:
         """The influence of each edge, to first order."""
-        return InfluenceModel(self.graph, self.restored, self.keyframes[-1])
+        return InfluenceModel(self.graph, self.solver, self.keyframes[-1])
 
     def keyframe(self, vertex: int) -> int | None:
         """The number of the keyframe of a vertex; None if it is not a keyframe."""

@@ -5,7 +5,7 @@ a map that is driven to its end with a wrong scale has learnt noise that hides i
 """
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from graph_slam_ros.measurements.types import END
 from graph_slam_ros.messages.inputs import recorded_uses
 from graph_slam_ros.overview.chosen_inputs import Inputs
 from graph_slam_ros.recordings.bag import Bag, open_bag
-from graph_slam_ros.runs.replay import RecordedRuns
+from graph_slam_ros.runs.replay import Progress, RecordedRuns
 from graph_slam_ros.runs.suggestion import SuggestedInputs
 from graph_slam_ros.runs.tables import account
 from graph_slam_ros.slam import Config, Counters, GraphSlam
@@ -32,8 +32,6 @@ from graph_slam_ros.warmup import warmup
 _HIDES = "nothing is calibrated, for what is found hides this"
 _ROUNDS = 4  # replays; a large clock needs two or three
 _STILL_ACCEPTED = 0.9  # of the part that was accepted before: with less, what was found does harm
-
-Progress = Callable[[Iterable[Any], int], Iterable[Any]]
 
 
 @dataclass(frozen=True, slots=True)

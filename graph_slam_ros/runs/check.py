@@ -1,6 +1,6 @@
 """The check of a recording: choose its inputs, read it once, collect all findings."""
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,14 +19,13 @@ from graph_slam_ros.messages.inputs import known_types
 from graph_slam_ros.messages.inputs.transforms import MAP_FRAMES
 from graph_slam_ros.overview.suggested_odometry import ODOMETRY
 from graph_slam_ros.recordings.bag import open_bag
-from graph_slam_ros.runs.replay import RecordedRuns
+from graph_slam_ros.runs.replay import Progress, RecordedRuns
 from graph_slam_ros.runs.suggestion import OF_LANDMARKS, SuggestedInputs, Suggestion
 from graph_slam_ros.slam import Config, Control, Counters
 from graph_slam_ros.warmup import warmup
 
 _UNNAMED_NS = 120_000_000_000
 Measurements = list[Measured | Control]
-Progress = Callable[[Iterable[Any], int], Iterable[Any]]
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,8 +8,8 @@ are there, if its run was killed: the others do not count.
 import base64
 import csv
 import io
-from collections.abc import Iterator
-from dataclasses import astuple, fields
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -36,10 +36,7 @@ def left_records(done: Condensation) -> Iterator[Record]:
     rows = {"keyframes": _text(left.keyframes), "sightings": _text(left.sightings)}
     yield {"type": "left", "first": done.first, "sightings_before": done.sightings_before, **rows}
     if done.edges:
-        out = io.StringIO()
-        writer = csv.writer(out, lineterminator="\n")
-        writer.writerows([word(value) for value in astuple(one)] for one in done.edges)
-        yield {"type": "left_edges", "first": done.first, "table": out.getvalue()}
+        yield {"type": "left_edges", "first": done.first, "table": rows_text(done.edges)}
 
 
 def carried(folder: Path, space: Geometry, state: BoundedState) -> list[Record]:
@@ -76,8 +73,16 @@ def _rows(text: str, kind: np.dtype[np.void]) -> Records:
     return np.frombuffer(base64.b64decode(text), dtype=kind)
 
 
-def word(value: Any) -> str:
-    """Return a value as the tables of edges have it."""
+def rows_text(rows: Iterable[Any], head: Sequence[str] = ()) -> str:
+    """Return dataclasses as rows of a table of edges, below its head if it has one."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerows([head] if head else [])
+    writer.writerows([_word(getattr(row, field.name)) for field in fields(row)] for row in rows)
+    return out.getvalue()
+
+
+def _word(value: Any) -> str:
     if isinstance(value, Verdict | Reason):
         return value.name.lower()
     return " ".join(map(repr, value)) if isinstance(value, tuple) else str(value)

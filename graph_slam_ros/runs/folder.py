@@ -1,7 +1,8 @@
 """Run folders: which folder is a run, which run is the newest, and which files may be replaced.
 
 A folder is a run if its ``run.json`` says so (``format``), which is written when the run starts. Only such a folder is
-ever cleared, and only of the files of a run. A recording in it is read before it is removed.
+ever cleared, and only of the files of a run. A recording in it is read before it is removed. A run whose ``run.json``
+is lost or damaged is recognised by its journal. It is read like others, and never cleared.
 """
 
 import contextlib
@@ -54,14 +55,23 @@ class RunError(GraphSlamError):
 
 
 def is_run(folder: Path) -> bool:
-    """Return whether a folder holds a run: its ``run.json`` says so.
+    """Return whether a folder holds a run: its ``run.json`` says so, or that is lost, and it has a journal.
 
     Raises
     ------
     RunError
         The disk fails to tell: a run may be there, which nobody may take for another thing.
     """
-    return folder.is_dir() and summary_of(folder).get("format") == MARK
+    if not folder.is_dir():
+        return False
+    try:
+        return _is_marked(folder) or (is_regular(folder / CONFIG) and any(map(_is_recorded, parts_of(folder)[:1])))
+    except OSError:  # its journal cannot be read
+        return False
+
+
+def _is_marked(folder: Path) -> bool:
+    return summary_of(folder).get("format") == MARK
 
 
 def _is_recorded(file: Path) -> bool:
@@ -271,7 +281,7 @@ def check_room(folder: Path, source: Path | None = None, *, force: bool = False)
             return
         with claimed(folder):
             pass
-        if is_run(folder):
+        if _is_marked(folder):
             _, foreign = _contents(folder)
             if foreign:
                 raise RunError(f"{foreign[0]}: not written by this run, and so never removed: choose another folder")
@@ -299,7 +309,7 @@ def keep_earlier(folder: Path, most: int, loaded: Path | None = None) -> Path | 
         with claimed(folder):
             folder.rename(target)
         for number in sorted(earlier)[: max(0, len(earlier) + 1 - most)]:
-            if earlier[number] != loaded:
+            if earlier[number] != loaded and _is_marked(earlier[number]):
                 remove(earlier[number])
     except OSError as error:
         raise RunError(f"{folder}: cannot be moved to {target.name}: {error.strerror}") from None

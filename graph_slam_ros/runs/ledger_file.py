@@ -5,7 +5,7 @@ Rows are in order of the edges' ids. A list of numbers is one field, with spaces
 
 import csv
 import io
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from pathlib import Path
@@ -20,7 +20,7 @@ from graph_slam_ros.errors import FormatError
 from graph_slam_ros.formats.files import read_text
 from graph_slam_ros.graph.losses import weight_and_cost
 from graph_slam_ros.graph.tables import EdgeTable
-from graph_slam_ros.runs.condensed_map import word
+from graph_slam_ros.runs.condensed_map import rows_text
 from graph_slam_ros.runs.journal import LEDGER
 from graph_slam_ros.slam import GraphSlam
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict, VerdictChange
@@ -107,13 +107,14 @@ class Entry:
 
 def ledger_text(slam: GraphSlam, ids: list[int]) -> str:
     """All edges of the solver as a table; ``ids`` are the numbers of the vertices in the file."""
-    return _text(Entry, ledger_entries(slam, ids))
+    return rows_text(ledger_entries(slam, ids), [field.name for field in fields(Entry)])
 
 
 def changes_text(slam: GraphSlam) -> str:
     """The history of all verdicts as a table."""
     number = slam.graph.edge_ids.of
-    return _text(VerdictChange, (replace(one, edge=number(one.edge)) for one in slam.ledger.history))
+    changes = [replace(one, edge=number(one.edge)) for one in slam.ledger.history]
+    return rows_text(changes, [field.name for field in fields(VerdictChange)])
 
 
 def read_ledger(folder: Path) -> list[Entry]:
@@ -193,8 +194,6 @@ def _rows(slam: GraphSlam, table: EdgeTable, ids: Index) -> tuple[str, list[Any]
     return tag_of(table.type), list(rows)
 
 
-# -- rows of a dataclass -----------------------------------------------------------------------------------------------
-
 _PARSED: dict[Any, Callable[[str], Any]] = {
     int: int,
     float: float,
@@ -204,12 +203,3 @@ _PARSED: dict[Any, Callable[[str], Any]] = {
     Verdict: lambda text: Verdict[text.upper()],
     Reason: lambda text: Reason[text.upper()],
 }
-
-
-def _text(kind: type, rows: Iterable[Any]) -> str:
-    names = [field.name for field in fields(kind)]
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(names)
-    writer.writerows([word(getattr(row, name)) for name in names] for row in rows)
-    return out.getvalue()

@@ -46,6 +46,7 @@ from graph_slam_ros.slam.snapshot import MapSnapshot
 
 VERSION = 4
 _KINDS = {kind.name: kind for kind in (SE2, SE3, R1, R2, R3)}
+_AS_THEY_ARE = ("segments", "drives", "settings", "displacements", "processed", "drive")  # of a snapshot, in JSON
 _OF_EDGES = ("id", "vertices", "measured", "sqrt_information", "label", "source", "weight")
 _OF_VERDICTS = ("keyframe", "statistic", "threshold", "numbers", "verdict", "reason")
 _OF_CHANGES = tuple(field.name for field in fields(VerdictChange))
@@ -156,21 +157,16 @@ def _told(state: MapSnapshot) -> Told:
         "sources": graph.sources,
         "next": {name: of.later for name, of in ids.items()},
         "first": state.first_keyframe,
-        "segments": state.segments,
-        "drives": state.drives,
         "frozen": [state.frozen, state.ledger.final],
         "held": state.held,
         "datum": state.datum,
-        "settings": state.settings,
-        "displacements": state.displacements,
-        "processed": state.processed,
         "used": [state.used_ns, state.source],
-        "drive": state.drive,
         "noise": factors_record(state.noise_factors),
         "calibration": factors_record(state.calibration),
         "edits": [one.record for one in state.edits],
         "gyro": None if state.gyro_bias is None else astuple(state.gyro_bias),
         "condensed": None if bounded is None else _condensed(bounded),
+        **{name: getattr(state, name) for name in _AS_THEY_ARE},
     }
 
 
@@ -230,24 +226,19 @@ def _state(told: Told, marks: Sequence[Told], columns: Columns) -> MapSnapshot:
         ledger=_ledger(columns, frozen_edges),
         values=columns["values"].copy(),
         keyframes=_poses(StampedPoses(Keyframe, size, first), "keyframes", columns),
-        segments=told["segments"],
-        drives=told["drives"],
         sighting_poses=_poses(StampedPoses(SightingPose, size), "sightings", columns),
         landmarks={mark["name"]: _read_landmark(mark) for mark in marks},
         frozen=frozen,
         held=tuple(told["held"]),
         datum=tuple(told["datum"]),
-        settings=told["settings"],
-        displacements=told["displacements"],
-        processed=told["processed"],
         used_ns=used_ns,
         source=source,
-        drive=told["drive"],
         noise_factors=read_factors(told["noise"]),
         edits=list(map(applied_edit, told["edits"])),
         calibration=read_totals(told["calibration"]),
         gyro_bias=None if gyro is None else SavedBias(gyro[0], tuple(gyro[1]), tuple(gyro[2]), gyro[3]),
         bounded=None if condensed is None else _bounded(graph, condensed),
+        **{name: told[name] for name in _AS_THEY_ARE},
     )
 
 

@@ -185,7 +185,8 @@ def replay(
 
     Returns
     -------
-    The pipeline at its end, with the summary.
+    The pipeline at its end, with the summary. Where time jumped back and ``time.on_jump`` is reset, the last run is in
+    ``out``, and the earlier ones are next to it.
 
     Raises
     ------
@@ -195,44 +196,18 @@ def replay(
     took = stopwatch()
     source, out = Path(source), Path(out)
     check_room(out, source, force=force)
-    if not is_run(source):
-        map_folder = None if map_folder is None else Path(map_folder)
-        return _recorded(source, out, config, (odometry, landmarks), map_folder, took, progress, warn, force=force)
-    if map_folder is not None:
-        raise RunError(f"{source}: a run is repeated in the map that it began in; a map is for a recording")
-    config, own = with_survey(config or run_config(source)), run_config(source)
-    if config.world != own.world:
-        raise RunError(f"{source}: world.dimensions is {own.world.dimensions} there")
-    losses = missing(source)
-    state = read_start(source)
-    warmup(dimensions=config.world.dimensions)
-    measured = progress(read_measurements(source, losses), 0)
-    slam, summary = record_run(
-        out, config, measured, losses, state, took=took, recording=recording_of(source), force=force
-    )
-    return Replayed(slam, summary, summary["losses"], _warnings(slam, summary))
-
-
-def _recorded(
-    source: Path,
-    out: Path,
-    config: Config | None,
-    topics: tuple[str | None, str | None],
-    map_folder: Path | None,
-    took: Stopwatch,
-    progress: Progress,
-    warn: Callable[[str], None],
-    *,
-    force: bool,
-) -> Replayed:
-    """The runs of a recording. The last is in ``out``, the earlier ones are next to it."""
+    if is_run(source):
+        if map_folder is not None:
+            raise RunError(f"{source}: a run is repeated in the map that it began in; a map is for a recording")
+        return _again(source, out, config, progress, took, force=force)
+    map_folder = None if map_folder is None else Path(map_folder)
     losses: list[str] = []
     state = None if map_folder is None else map_of(map_folder, losses)
     if map_folder is not None and state is not None:
         config = config or config_of(map_folder, state)
     config = with_survey(config or Config())
     bag = open_bag(source)
-    inputs = choose_inputs(bag, config, *topics)
+    inputs = choose_inputs(bag, config, odometry, landmarks)
     columns, counters = Collector(config, inputs.topics), Counters()
     runs = RecordedRuns(bag, inputs, config, counters, state.datum if state is not None else (), columns)
     bag.losses += losses
@@ -267,6 +242,24 @@ def _recorded(
     return Replayed(
         slam, summary, summary["losses"], [*bag.warnings, *warnings], tuple(earlier), tuple(inputs.by_topic())
     )
+
+
+def _again(
+    run: Path, out: Path, config: Config | None, progress: Progress, took: Stopwatch, *, force: bool
+) -> Replayed:
+    """Repeat a run with exactly its events, in the map that it began in."""
+    own = run_config(run)
+    config = with_survey(config or own)
+    if config.world != own.world:
+        raise RunError(f"{run}: world.dimensions is {own.world.dimensions} there")
+    losses = missing(run)
+    state = read_start(run)
+    warmup(dimensions=config.world.dimensions)
+    measured = progress(read_measurements(run, losses), 0)
+    slam, summary = record_run(
+        out, config, measured, losses, state, took=took, recording=recording_of(run), force=force
+    )
+    return Replayed(slam, summary, summary["losses"], _warnings(slam, summary))
 
 
 def _checked(columns: Collector, counters: Counters, bag: Bag) -> dict[str, Any]:

@@ -95,14 +95,14 @@ def _fit(saved: SavedGraph) -> str:
     if ratio is None:
         return "nothing in it can be compared with its noise"
     which = "as large as" if _FINE[0] <= ratio <= _FINE[1] else "larger than" if ratio > 1.0 else "smaller than"
-    chi2, dof = saved.restored.evaluate().chi2_final, saved.restored.degrees_of_freedom
+    chi2, dof = saved.solver.evaluate().chi2_final, saved.solver.degrees_of_freedom
     return f"residuals are {which} the stated noise (chi2 {chi2:.1f} of {dof} degrees of freedom)"
 
 
 def chi2_per_dof(saved: SavedGraph) -> float | None:
     """Chi2 by the residuals that are not used up by unknowns; None without any."""
-    dof = saved.restored.degrees_of_freedom
-    return saved.restored.evaluate().chi2_final / dof if dof > 0 else None
+    dof = saved.solver.degrees_of_freedom
+    return saved.solver.evaluate().chi2_final / dof if dof > 0 else None
 
 
 def _judged(saved: SavedGraph) -> str:

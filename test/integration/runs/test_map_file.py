@@ -129,9 +129,9 @@ def test_a_map_that_is_damaged_anywhere_is_repeated_from_the_journal_with_a_word
 
 @pytest.mark.parametrize("run", ["unnamed"], indirect=True)
 def test_what_is_no_map_is_refused_by_what_is_wrong(run, tmp_path, monkeypatch):
-    monkeypatch.setattr(map_file, "VERSION", 99)
-    write_map(tmp_path / "map.mcap", run[1].snapshot())
-    monkeypatch.undo()
+    with monkeypatch.context() as patch:
+        patch.setattr(map_file, "VERSION", 99)
+        write_map(tmp_path / "map.mcap", run[1].snapshot())
     with pytest.raises(FormatError, match=r"map\.mcap: .*its version is 99; this program knows"):
         read_map(tmp_path)
 

@@ -355,6 +355,12 @@ def test_what_else_is_in_a_run_folder_stays_when_the_run_is_replaced(bag, run):
     assert (run / "notes.txt").read_text() == "mine"
 
 
+def test_a_run_whose_run_json_is_lost_is_known_by_its_journal_and_never_replaced(bag, run):
+    (run / "run.json").unlink()
+    with pytest.raises(RunError, match="nothing was written"):
+        replay(bag, run, force=is_run(run))
+
+
 def test_a_run_or_a_file_that_is_there_is_replaced_with_force_alone(bag, run, tmp_path, capsys):
     graph, city = tmp_path / "world.g2o", ["simulate", "city", "--poses", "12", "--set", "blocks=2"]
     assert code_of(*city, "--out", graph) == 0

@@ -1,7 +1,6 @@
 """The ledger of a saved run: what it says is what was decided."""
 
 import csv
-import random
 
 import numpy as np
 import pytest
@@ -55,15 +54,10 @@ def test_what_is_no_ledger_is_refused_by_name(run, tmp_path):
     (tmp_path / LEDGER).write_text("edge,label\n0,odometry\n")
     with pytest.raises(FormatError, match="not a ledger"):
         read_ledger(tmp_path)
-    rng, refused, content = random.Random(0), 0, (run[1] / LEDGER).read_text().splitlines()
-    for k in range(30):
-        rows = list(csv.reader(content))
-        rows[rng.randrange(len(rows))][rng.randrange(len(rows[0]))] = ("nan", "1e400", "x", "", "9" * 5000)[k % 5]
+    rows = list(csv.reader((run[1] / LEDGER).read_text().splitlines()))
+    for word in ("", "x", "nan", "9" * 5000):
+        rows[2][0] = word
         with (tmp_path / LEDGER).open("w", newline="") as stream:
             csv.writer(stream).writerows(rows)
-        try:
-            assert len(read_ledger(tmp_path)) == len(rows) - 1
-        except FormatError as error:
-            assert LEDGER in str(error) and len(str(error)) < 1000
-            refused += 1
-    assert refused > 10
+        with pytest.raises(FormatError, match=r"ledger\.csv:3: not a ledger: .{,99}$"):
+            read_ledger(tmp_path)
