@@ -223,7 +223,7 @@ def _in_time_order(name: str, file: "G2oFile") -> Problem:
         sightings = replace(sightings, ends=np.column_stack([sightings.ends[:, 0], np.argsort(in_time)[which]]))
 
     def stored(vertices: Index, size: int) -> Array:
-        return values[graph.offset.values[vertices][:, None] + np.arange(size)]
+        return values[graph.begins(vertices)[:, None] + np.arange(size)]
 
     left_out = len(file.unknown) + len(file.skipped)
     return Problem(name, stored(poses, kind.size), stored(points, 2), relative, sightings, left_out)
@@ -276,6 +276,4 @@ def joined(*several: Edges) -> Edges:
 
 def _edges(graph: "Graph", edge_type: "EdgeType", index: Index) -> Edges:
     table = graph.tables[edge_type]
-    columns = (table.vertices, table.measured, table.sqrt_information)
-    ends, measured, root = (column.values.copy() for column in columns)
-    return Edges(index[ends], measured, root)
+    return Edges(index[table.vertices], table.measured.values.copy(), table.sqrt_information.values.copy())

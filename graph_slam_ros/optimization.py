@@ -95,13 +95,13 @@ class Solution:
     def poses(self) -> Array:
         """Estimates of all poses in order of id: (n, 3) as x, y, theta, or (n, 7) as x, y, z and quaternion xyzw."""
         graph = self.file.graph
-        return self.solver.estimate([v for v in range(graph.vertex_count) if _is_pose(graph, v)])
+        return self.solver.estimate([v for v in graph.vertex_ids.since().tolist() if _is_pose(graph, v)])
 
     @property
     def points(self) -> Array:
         """Estimates of all point landmarks in order of id, (n, 2) or (n, 3)."""
         graph = self.file.graph
-        return self.solver.estimate([v for v in range(graph.vertex_count) if not _is_pose(graph, v)])
+        return self.solver.estimate([v for v in graph.vertex_ids.since().tolist() if not _is_pose(graph, v)])
 
 
 def optimize(source: Graph | G2oFile | Path | str, settings: Settings | None = None, *, init: str = "auto") -> Solution:
@@ -127,7 +127,7 @@ def optimize(source: Graph | G2oFile | Path | str, settings: Settings | None = N
         The edges do not determine a vertex.
     """
     if isinstance(source, Graph):
-        file = G2oFile(source, list(range(source.vertex_count)))
+        file = G2oFile(source, list(range(source.vertex_ids.next)))
     else:
         file = source if isinstance(source, G2oFile) else read_g2o(source)
     settings, began = Settings() if settings is None else settings, time.perf_counter()
@@ -208,11 +208,11 @@ def _without_mistakes(file: G2oFile) -> Iterator[tuple[str, G2oFile]]:
         for label in [*labels, "edges"] if edge in file.graph.tables else []:
             graph = file.graph.copy()
             table = graph.tables[edge]
-            rows = np.flatnonzero(graph.has_label(table.id.values, labels if label == "edges" else [label]))
-            seen, ends = table.measured.values[rows], table.vertices.values[rows]
+            rows = np.flatnonzero(graph.has_label(table.ids, labels if label == "edges" else [label]))
+            seen, ends = table.measured.values[rows], table.vertex_rows.values[rows]
             if len(rows) and _is_likely(mistake, file, seen, ends):
                 undone = undo(seen, ends)
-                table.measured.values[rows], table.vertices.values[rows] = undone
+                table.measured.values[rows], table.vertex_rows.values[rows] = undone
                 yield mistake.format(label), replace(file, graph=graph)
 
 
@@ -276,7 +276,7 @@ def started(file: G2oFile, init: str, on_pose: OnPose = lambda *_: None) -> tupl
     if root is None or not _is_pose(file.graph, root):
         start = "file"
     solver = Solver(file.graph)
-    in_time = sorted(range(file.graph.vertex_count), key=lambda vertex: file.ids[vertex])
+    in_time = sorted(file.graph.vertex_ids.since().tolist(), key=lambda vertex: file.ids[vertex])
     solver.start_at(initial_values(file.graph, start, root or 0, in_time, on_pose))
     for vertex in file.fixed if file.has_values else ():
         solver.place(vertex, file.graph.initial.values[file.graph.vertex(vertex).stored])
@@ -286,7 +286,7 @@ def started(file: G2oFile, init: str, on_pose: OnPose = lambda *_: None) -> tupl
 def add_graph(solver: Solver, file: G2oFile) -> None:
     """Give a solver all of a graph, and hold what FIX lines name; the first pose where nothing else fixes it."""
     graph = file.graph
-    solver.add(range(graph.vertex_count), range(graph.edge_count))
+    solver.add(graph.vertex_ids.since(), graph.edge_ids.since())
     for vertex in file.fixed:
         solver.hold(vertex)
     root = _root(file)
@@ -297,7 +297,7 @@ def add_graph(solver: Solver, file: G2oFile) -> None:
 def _root(file: G2oFile) -> int | None:
     """The first pose of a FIX line, or that of the least id; where there are no poses, a landmark."""
     held = [v for v in file.fixed if _is_pose(file.graph, v)]
-    order = sorted(range(file.graph.vertex_count), key=lambda v: (not _is_pose(file.graph, v), file.ids[v]))
+    order = sorted(file.graph.vertex_ids.since().tolist(), key=lambda v: (not _is_pose(file.graph, v), file.ids[v]))
     return next(iter([*held, *order]), None)
 
 

@@ -36,10 +36,10 @@ class Reference:
         chosen[list(edges)] = True
         self.parts = []
         for table in graph.tables.values():
-            rows = np.flatnonzero(chosen[table.id.values] & (table.weight.values != 0.0))
+            rows = np.flatnonzero(chosen[table.ids] & (table.weight.values != 0.0))
             if not len(rows):
                 continue
-            at = table.vertices.values[rows]
+            at = table.vertices[rows]
             slots = np.concatenate([np.full(d, s) for s, d in enumerate(table.type.dofs)])
             within = np.concatenate([np.arange(d) for d in table.type.dofs])
             columns = np.where(self.first[at] >= 0, self.first[at], -self.size - 9)[:, slots] + within
@@ -48,7 +48,7 @@ class Reference:
     def linearized(self, x):
         """Whitened residuals (n, m), Jacobians (n, m, D) and their columns (n, D; negative: held), by edge type."""
         for table, rows, at, columns in self.parts:
-            r, j = table.type.linearize(x, self.graph.offset.values[at], table.measured.values[rows])
+            r, j = table.type.linearize(x, self.graph.begins(at), table.measured.values[rows])
             root = table.sqrt_information.values[rows] * np.sqrt(table.weight.values[rows])[:, None, None]
             r, j = (root @ r[:, :, None])[:, :, 0], root @ j
             label = table.label.values[rows]
@@ -99,7 +99,7 @@ class Reference:
         for code, kind in enumerate(graph.kinds):
             ids = self.free[graph.kind.values[self.free] == code]
             if len(ids):
-                slots = graph.offset.values[ids][:, None] + np.arange(kind.size)
+                slots = graph.begins(ids)[:, None] + np.arange(kind.size)
                 out[slots] = kind.retract(x[slots], step[self.first[ids][:, None] + np.arange(kind.dof)])
         return out
 
@@ -123,7 +123,7 @@ class Reference:
         for code, kind in enumerate(graph.kinds):
             ids = self.free[graph.kind.values[self.free] == code]
             if len(ids):
-                slots = graph.offset.values[ids][:, None] + np.arange(kind.size)
+                slots = graph.begins(ids)[:, None] + np.arange(kind.size)
                 largest = max(largest, float(np.abs(kind.local(x[slots], y[slots])).max()))
         return largest
 
@@ -134,5 +134,5 @@ def all_values(solver):
     out = graph.initial.values.copy()
     for code, kind in enumerate(graph.kinds):
         ids = np.flatnonzero(graph.kind.values == code)
-        out[graph.offset.values[ids][:, None] + np.arange(kind.size)] = solver.estimate(ids)
+        out[graph.begins(ids)[:, None] + np.arange(kind.size)] = solver.estimate(ids)
     return out

@@ -352,8 +352,7 @@ def edges_that_left(run: SavedGraph) -> Iterator[Mapping[str, str]]:
     Those that left after the map was recorded last, in a run that was killed, are still in it, and are none of these.
     """
     if run.slam.bounded is not None:
-        ids = run.graph.edge_ids
-        yield from (row for row in read_left_edges(run.folder) if ids.find(int(row["edge"])) is None)
+        yield from (row for row in read_left_edges(run.folder) if not run.graph.edge_ids.has(int(row["edge"])))
 
 
 def became(rows: Sequence[Mapping[str, str]]) -> str:
@@ -398,7 +397,7 @@ def statements_of_place(run: SavedGraph, e: Entry) -> Iterator[tuple[str, str]]:
     """Sentences on the edge of a place, each with its name."""
     places = run.slam.bounded.places if run.slam.bounded else {}
     several = ((cell, one) for cell, all_of_it in places.items() for one in all_of_it)
-    found = next(((cell, one) for cell, one in several if run.graph.edge_ids.of(one.edge) == e.edge), None)
+    found = next(((cell, one) for cell, one in several if one.edge == e.edge), None)
     if found is None:
         yield f"edge {e.edge}", "an earlier place: what it measured is in the place that took over from it"
         return

@@ -237,8 +237,8 @@ def draw_graph(out_png: Path, graph: Graph, initial: Array, final: Array) -> Non
     """
     figure = canvas((1.6 * _INCHES, _INCHES))
     pair = figure.subplots(1, 2)
-    is_point = np.array([kind.name[0] == "R" for kind in graph.kinds])[graph.kind.values]
-    tables = [table for table in graph.tables.values() if table.vertices.values.shape[1] == 2]
+    is_point = np.array([kind.name[0] == "R" for kind in graph.kinds])[graph.kind_codes(graph.vertex_ids.since())]
+    tables = [table for table in graph.tables.values() if table.vertices.shape[1] == 2]
     for axes, values, title in zip(pair, (initial, final), ("initial", "optimised"), strict=True):
         dress(axes)
         axes.set(xlabel="x [m]", ylabel="y [m]")
@@ -246,7 +246,7 @@ def draw_graph(out_png: Path, graph: Graph, initial: Array, final: Array) -> Non
         axes.margins(0.05)
         axes.set_title(title, loc="left", fontsize=11, color="#333333")
         for code, label in enumerate(graph.labels):
-            ends = [table.vertices.values[table.label.values == code] for table in tables]
+            ends = [graph.vertex_ids.rows(table.vertices[table.label.values == code]) for table in tables]
             _draw_edges(axes, values[:, :2], np.concatenate([np.empty((0, 2), dtype=np.int64), *ends]), label)
         if is_point.any():
             _draw_stars(axes, values[is_point, :2])

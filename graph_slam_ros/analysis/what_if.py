@@ -20,7 +20,7 @@ from graph_slam_ros.runs.ledger_file import Entry, ledger_entries
 from graph_slam_ros.runs.restore import of_all, restored
 from graph_slam_ros.runs.tables import numbered
 from graph_slam_ros.solver import Report, Solver
-from graph_slam_ros.solver.linearization import Block, Losses, linearize, rows_of
+from graph_slam_ros.solver.linearization import Block, Losses, linearize
 from graph_slam_ros.typing import Array, Index
 
 _POSITION = {"SE2": 2, "R2": 2, "SE3": 3, "R3": 3}  # first numbers of a step that are metres in map
@@ -78,10 +78,10 @@ class InfluenceModel:
         self._graph, self._values, self._last = graph, solver.values, last
         self._losses = {key: stages[-1] for key, stages in solver.settings.losses.items()}
         self._curved = graph.copy()
-        edges = solver.edges
-        self._along = np.ones(graph.edge_count)  # square root of the curvature along the residual
-        self._cost = np.zeros(graph.edge_count)
-        for block in linearize(graph, self._values, rows_of(graph, edges), Losses(graph, self._losses)):
+        edges, self._edges = solver.edges, graph.edge_ids.since()
+        self._along = np.ones(graph.edge_ids.next)  # of each edge, square root of the curvature along the residual
+        self._cost = np.zeros(graph.edge_ids.next)
+        for block in linearize(graph, self._values, graph.by_table(edges), Losses(graph, self._losses)):
             self._cost[block.table.at(block.rows).ids] = block.cost
             self._bend(block)
         self._solver = Solver(self._curved, replace(solver.settings, losses={}, relinearize_passes=0))  # at the optimum
@@ -117,10 +117,12 @@ class InfluenceModel:
     def of(self, inside: Sequence[int], outside: Sequence[int] = ()) -> Influences:
         """The influence of edges that are in: what changes without each; and of some that are out: with each of them.
 
+        It has a row for each edge of the graph, in order.
+
         An edge is let in without a loss. Steps are NaN where one step says nothing: it is so far off that others would
         lose their weight.
         """
-        count, dof = self._graph.edge_count, self._graph.kind_of(self._last).dof
+        count, dof = len(self._edges), self._graph.kind_of(self._last).dof
         unknown, none = np.full((dof + 2, count), np.nan), np.zeros(count, dtype=np.int64)
         found = Influences(unknown[2:].T, none, unknown[0], unknown[1], none > 0)
         if len(inside):
@@ -131,27 +133,29 @@ class InfluenceModel:
 
     def _leave_out(self, found: Influences, edges: Index) -> None:
         with_last = self._solver.covariances_with(self._last)
-        for block in linearize(self._curved, self._values, rows_of(self._curved, edges), Losses(self._curved, {})):
+        for block in linearize(self._curved, self._values, self._curved.by_table(edges), Losses(self._curved, {})):
             rows = block.table.at(block.rows)
             block.residual[:] /= self._along[rows.ids, None] ** 2
             joint = self._solver.edge_marginals(rows.vertices)
             of_last = np.array([np.concatenate([with_last[v] for v in ends]).T for ends in rows.vertices.tolist()])
-            _fill(found, rows.ids, block, joint, of_last, -1.0)
-            found.cost[rows.ids] += np.sum(block.residual**2, axis=1) - self._cost[rows.ids]
+            at = np.searchsorted(self._edges, rows.ids)
+            _fill(found, at, block, joint, of_last, -1.0)
+            found.cost[at] += np.sum(block.residual**2, axis=1) - self._cost[rows.ids]
 
     def _let_in(self, found: Influences, edges: Index) -> None:
         graph = self._graph.copy()
         graph.set_weights(edges, 1.0)
-        for block in linearize(graph, self._values, rows_of(graph, edges), Losses(graph, {})):
+        for block in linearize(graph, self._values, graph.by_table(edges), Losses(graph, {})):
             rows = block.table.at(block.rows)
+            at = np.searchsorted(self._edges, rows.ids)
             for k, ends in enumerate(rows.vertices):  # they may be far apart in the tree
                 try:
                     among, of_last = self._joint(ends)
                 except GraphSlamError:  # one of them is not in the problem: the edge would be its only one
                     continue
                 part = replace(block, residual=block.residual[k : k + 1], jacobian=block.jacobian[k : k + 1])
-                _fill(found, rows.ids[k : k + 1], part, among[None], of_last[None], 1.0)
-        far = np.isin(np.arange(len(found.cost)), edges) & (found.cost > _FAR)
+                _fill(found, at[k : k + 1], part, among[None], of_last[None], 1.0)
+        far = np.isin(self._edges, edges) & (found.cost > _FAR)
         found.step[far], found.end_m[far] = np.nan, np.nan
 
     def _joint(self, ends: Index) -> tuple[Array, Array]:
@@ -238,7 +242,7 @@ class SavedGraph:
         among all keyframes, and stamps
     vertices : of the keyframes that are in the graph, by number
     segments : numbers of the keyframes at which odometry begins
-    entries, changes : their edges have lasting ids; ``entries`` are in the order of the rows of the graph
+    entries : in order of their edges; changes : of verdicts
     edits : by hand, in order
     landmarks : vertex of each landmark that an accepted edge is about, by its name
     held : vertices of a frozen map
@@ -252,9 +256,9 @@ class SavedGraph:
         self.graph, self.held = slam.graph.copy(), slam.solver.held
         self.solver = slam.solver
         self.graph.initial.values[:] = slam.solver.values
-        self.entries = list(ledger_entries(slam, range(self.graph.vertex_count)))
-        number, old = self.graph.edge_ids.of, slam.bounded.old if slam.bounded else ()
-        self.changes = [replace(one, edge=number(one.edge)) for one in slam.ledger.history]
+        self.entries = list(ledger_entries(slam, range(self.graph.vertex_ids.next)))
+        self._entries, old = {one.edge: one for one in self.entries}, slam.bounded.old if slam.bounded else ()
+        self.changes = list(slam.ledger.history)
         self.edits = slam.edits
         self.ids, _ = numbered(slam)
         self.keyframes: list[int] = [*(one.vertex for one in old), *slam.keyframes.ids.tolist()]
@@ -288,7 +292,7 @@ class SavedGraph:
 
     def type_of(self, entry: Entry) -> EdgeType:
         """The type of an edge."""
-        return self.graph.edge(self._row(entry.edge)).type
+        return self.graph.edge(entry.edge).type
 
     def landmark_of(self, vertex: int) -> str:
         """The name of the landmark of a vertex; empty if it is not a landmark."""
@@ -300,14 +304,9 @@ class SavedGraph:
 
     def edge(self, edge: int) -> Entry:
         """The ledger entry of an edge. Raises GraphSlamError for an unknown id."""
-        return self.entries[self._row(edge)]
-
-    def _row(self, edge: int) -> int:
-        ids = self.graph.edge_ids
-        row = ids.find(edge) if edge >= 0 else None
-        if row is not None and row < len(self.entries):
-            return row
-        if (most := ids.of(len(self.entries))) > edge >= 0:
+        if (entry := self._entries.get(edge)) is not None:
+            return entry
+        if (most := self.slam.ledger.ids.next) > edge >= 0:
             why = f"since visits are condensed: {of_all(self.folder)}"
             raise GraphSlamError(f"edge {edge} is not in the map any more, {why}")
         raise GraphSlamError(f"no edge {edge}: their ids are below {most}")
@@ -332,35 +331,31 @@ class SavedGraph:
         ----------
         loss : robust loss of all edges that may be outliers, instead of the run's
         """
-        gone, anew = {self._row(e) for e in without}, list(dict.fromkeys(map(self._row, let_in)))
-        if gone & set(anew):
-            edge = self.entries[min(gone & set(anew))].edge
-            raise GraphSlamError(f"edge {edge}: cannot be taken out and let in at once")
-        edges = [row for row, e in enumerate(self.entries) if e.is_in and row not in gone]
+        gone, anew = {self.edge(e).edge for e in without}, dict.fromkeys(self.edge(e).edge for e in let_in)
+        if both := gone & set(anew):
+            raise GraphSlamError(f"edge {min(both)}: cannot be taken out and let in at once")
+        edges = [e.edge for e in self.entries if e.is_in and e.edge not in gone]
         graph, settings = self.graph, self.config.solver_settings()
         settings = replace(settings, max_iterations=max(settings.max_iterations, MOST_STEPS))
         if anew:
             graph = graph.copy()
-            edges += [_accepted(graph, row, self.entries[row]) for row in anew]
-            edges = [row for row in edges if row not in set(anew)]
+            edges += [_accepted(graph, self._entries[edge]) for edge in anew]
+            edges = [edge for edge in edges if edge not in anew]
         if loss is not None:
             settings = replace(settings, losses={label: [loss] for label in settings.losses})
         solver = Solver(graph, settings)
-        vertices = np.unique([*self.keyframes, *(v for row in edges for v in self._ends(graph, row))])
+        vertices = np.unique([*self.keyframes, *(v for edge in edges for v in graph.ends_of(edge))])
         solver.add(vertices, edges)
         for vertex in np.intersect1d(vertices, self.held).tolist():
             solver.hold(vertex)
         return solver
-
-    def _ends(self, graph: Graph, row: int) -> Sequence[int]:
-        return self.entries[row].vertices if row < len(self.entries) else graph.edge(row).vertices
 
     def moved(self, solver: Solver) -> MovedVertex:
         """Compare a solution with that of the run."""
         a, b = self.solver.estimate(self.keyframes), solver.estimate(self.keyframes)
         distance = np.linalg.norm(b[:, : self.space.dimensions] - a[:, : self.space.dimensions], axis=1)
         turned = self.space.angle(self.space.group.between(tuple(a[-1]), tuple(b[-1])))
-        inside = np.array([row for row, e in enumerate(self.entries) if e.is_in], dtype=np.int64)
+        inside = np.array([e.edge for e in self.entries if e.is_in], dtype=np.int64)
         before, after = self.solver.chi2_of(inside)[0], solver.chi2_of(inside)[0]
         worse = [k for k in np.argsort(before - after, kind="stable").tolist() if after[k] > before[k]]
         return MovedVertex(
@@ -368,13 +363,13 @@ class SavedGraph:
             solver.evaluate(),
             (float(distance[-1]), float(turned)),
             (self.keyframes[int(distance.argmax())], float(distance.max())),
-            [(self.entries[inside[k]].edge, float(before[k]), float(after[k])) for k in worse],
+            [(int(inside[k]), float(before[k]), float(after[k])) for k in worse],
         )
 
     def influences(self, count: int) -> list[Influence]:
         """The judged edges without which the last keyframe would move most, ranked to first order."""
         judged = [row for row, e in enumerate(self.entries) if e.is_in and e.verdict]
-        first = self.influence_model.of(judged).last_m[judged]
+        first = self.influence_model.of([self.entries[row].edge for row in judged]).last_m[judged]
         out = []
         for k in np.argsort(-first, kind="stable")[:count].tolist():
             edge = self.entries[judged[k]].edge
@@ -387,7 +382,7 @@ class SavedGraph:
         return sorted(out, key=lambda one: -np.nan_to_num(one.exact_m, nan=one.first_order_m))
 
 
-def _accepted(graph: Graph, row: int, entry: Entry) -> int:
+def _accepted(graph: Graph, entry: Entry) -> int:
     """Add a rejected edge again, as one that is never rejected."""
-    edge = graph.edge(row)
+    edge = graph.edge(entry.edge)
     return graph.add_edge(edge.type, entry.vertices, entry.measured, Gaussian(edge.sqrt_information), _ACCEPTED)

@@ -259,4 +259,4 @@ def _loss_text(loss: "Loss") -> str:
 def _positions(graph: "Graph", solver: "Solver") -> Any:
     import numpy as np
 
-    return np.array([solver.estimate([v])[0][:2] for v in range(graph.vertex_count)])
+    return np.array([solver.estimate([v])[0][:2] for v in graph.vertex_ids.since().tolist()])

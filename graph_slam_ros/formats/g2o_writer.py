@@ -28,7 +28,7 @@ def write_g2o(path: Path | str, file: G2oFile | Graph, values: Values | None = N
         raise FormatError(
             "write_g2o(PATH, GRAPH, VALUES): PATH first, then a Graph or solution.file, then solver.estimate"
         )
-    whole = file if isinstance(file, G2oFile) else G2oFile(file, list(range(file.vertex_count)))
+    whole = file if isinstance(file, G2oFile) else G2oFile(file, list(range(file.vertex_ids.next)))
     values = values or (lambda ids: np.array([whole.graph.vertex(vertex).initial for vertex in ids]))
     write_text(path, "\n".join(graph_lines(whole, values)) + "\n")
 
@@ -65,8 +65,9 @@ def _vertex_lines(file: G2oFile, values: Values) -> list[str]:
     graph = file.graph
     tag_of_kind = {kind: tag for tag, kind in VERTEX_TAGS.items()}
     rows: list[tuple[int, str]] = []
-    for code, kind in enumerate(graph.kinds):
-        members = [v for v in np.flatnonzero(graph.kind.values == code).tolist() if v not in file.absent]
+    every = [vertex for vertex in graph.vertex_ids.since().tolist() if vertex not in file.absent]
+    for kind in graph.kinds:
+        members = [vertex for vertex in every if graph.kind_of(vertex) is kind]
         if kind not in tag_of_kind:
             raise FormatError(f"g2o has no tag for a vertex {kind.name}")
         for vertex, value in zip(members, values(members).tolist(), strict=True):
@@ -79,7 +80,7 @@ def _edge_lines(file: G2oFile) -> Iterator[tuple[int, int, str]]:
     for edge_type, table in file.graph.tables.items():
         tag, head = tag_of(edge_type), edge_type.measured_size - len(edge_type.tail)
         root, measured = table.sqrt_information.values, table.measured.values
-        ids, labels, ends = (column.values.tolist() for column in (table.id, table.label, table.vertices))
+        ids, labels, ends = (of.tolist() for of in (table.ids, table.label.values, table.vertices))
         numbers = [file.seen_from.get(edge, 0) for edge in ids]
         if edge_type is LANDMARK_POSITION_3D:
             back = [se3.inverse(file.offsets.get(number, se3.IDENTITY)) for number in numbers]

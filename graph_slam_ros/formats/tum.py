@@ -32,9 +32,8 @@ def write_trajectory(path: Path, file: G2oFile, values: Values) -> None:
     kinds = [kind for kind in (SE2, SE3) if kind in file.graph.kinds]
     if len(kinds) != 1:
         raise FormatError(f"{path}: a trajectory needs poses of one kind, and this graph has {len(kinds)} kinds")
-    is_pose = [file.graph.kinds[code] is kinds[0] for code in file.graph.kind.values]
-    landmarks = _only_seen(file.graph)
-    poses = [vertex for vertex in np.flatnonzero(is_pose).tolist() if vertex not in landmarks]
+    landmarks, every = _only_seen(file.graph), file.graph.vertex_ids.since().tolist()
+    poses = [vertex for vertex in every if file.graph.kind_of(vertex) is kinds[0] and vertex not in landmarks]
     poses.sort(key=lambda vertex: file.ids[vertex])
     write_text(path, tum_text([NS * file.ids[vertex] for vertex in poses], values(poses)))
 
@@ -45,7 +44,7 @@ def _only_seen(graph: Graph) -> set[int]:
     others: set[int] = set()
     for table in graph.tables.values():
         of_landmark = np.array([label == "landmarks" for label in graph.labels])[table.label.values]
-        ends = table.vertices.values
+        ends = table.vertices
         seen.update(ends[of_landmark, -1].tolist())
         others.update(ends[of_landmark, :-1].ravel().tolist(), ends[~of_landmark].ravel().tolist())
     return seen - others

@@ -144,9 +144,6 @@ def _point_prior(x: Array, at: Index, measured: Array) -> tuple[Array, Array]:
     return residual, jacobian
 
 
-_POSE, _POINT = (SE2,), (R2,)
-
-
 AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
@@ -242,9 +239,6 @@ def _tag_position_3d(x: Array, at: Index, measured: Array) -> tuple[Array, Array
     return residual, jacobian
 
 
-_POSE, _POINT = (SE3,), (R3,)
-
-
 @kernel
 def _position(x: Array, at: Index, measured: Array) -> tuple[Array, Array]:
     """``r = t + R p - z`` with measured = (z, p)."""
@@ -333,8 +327,7 @@ def _attitude_3d(x: Array, at: Index, measured: Array) -> tuple[Array, Array]:
         w = so3.log(so3.compose(so3.inverse(z), (x[i + 3], x[i + 4], x[i + 5], x[i + 6])))
         residual[e, 0], residual[e, 1], residual[e, 2] = w
         for c in range(3):
-            axis = (1.0 if c == 0 else 0.0, 1.0 if c == 1 else 0.0, 1.0 if c == 2 else 0.0)
-            d = so3.right_jacobian_inverse(w, axis)
+            d = so3.right_jacobian_inverse(w, AXES[c])
             jacobian[e, 0, 3 + c], jacobian[e, 1, 3 + c], jacobian[e, 2, 3 + c] = d
     return residual, jacobian
 

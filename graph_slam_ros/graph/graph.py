@@ -20,36 +20,28 @@ from graph_slam_ros.graph.records import (
     append_edges,
     append_vertices,
     labels_of,
+    weights_of,
 )
-from graph_slam_ros.graph.tables import Column, Edge, EdgeTable, LastingIds, Vertex
+from graph_slam_ros.graph.tables import Column, Edge, EdgeTable, LastingIds, Vertex, whole_numbers
 from graph_slam_ros.graph.vertices import VertexKind
 from graph_slam_ros.typing import Array, Index, Mask
 
-_INT64 = np.dtype(np.int64)
-
-
-def whole_numbers(ids: ArrayLike, what: str) -> Index:
-    """Return ids as an array. Numbers with a fraction are refused."""
-    given = np.asarray(ids)
-    if given.dtype is _INT64:
-        return given
-    if given.dtype.kind not in "iu" and given.size:
-        raise GraphSlamError(f"{what}: ids must be whole numbers, got {given.ravel()[:5].tolist()}")
-    return given.astype(np.int64, copy=False)
-
 
 class Graph:
-    """Vertices with their initial values, and edges by type. Ids are dense and never reused.
+    """Vertices with their initial values, and edges by type. Ids ascend, last and are never reused.
+
+    Each record is a row, numbered from 0, of columns for the solver and compiled code. Until rows are removed
+    (``keep``) the id of a row is its number.
 
     An estimate does not live here: the solver owns it.
 
     Attributes
     ----------
-    kind : code of each vertex's kind, an index into ``kinds``
-    offset : where each vertex begins in ``initial``, the stored numbers of all vertices end to end
-    table_of_edge, row_of_edge : of each edge, its table (counted in the order of ``tables``) and row
+    kind : code of the kind of each row of a vertex, an index into ``kinds``
+    offset : where it begins in ``initial``, the stored numbers of all vertices end to end
+    table_of_edge, row_of_edge : of each row of an edge, its table (counted in the order of ``tables``) and row there
     pointers : where all of it is in memory, for compiled code (``records``)
-    vertex_ids, edge_ids : the ids that last, where rows were removed (``kept_part``); until then they are the same
+    vertex_ids, edge_ids : of the rows
     """
 
     def __init__(self) -> None:
@@ -64,7 +56,7 @@ class Graph:
         self.sources: list[str] = []
         self.table_of_edge = Column(np.int64)
         self.row_of_edge = Column(np.int64)
-        self.vertex_ids, self.edge_ids = LastingIds(), LastingIds()
+        self.vertex_ids, self.edge_ids = LastingIds("vertex", self.kind), LastingIds("edge", self.row_of_edge)
         self.locate()
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -83,13 +75,21 @@ class Graph:
 
     @property
     def vertex_count(self) -> int:
-        """Number of vertices; their ids are below it."""
+        """Number of vertices."""
         return self.kind.count
 
     @property
     def edge_count(self) -> int:
-        """Number of edges; their ids are below it."""
+        """Number of edges."""
         return self.row_of_edge.count
+
+    def kind_codes(self, vertices: Index) -> Index:
+        """The kinds of vertices, as indices into ``kinds``."""
+        return np.asarray(self.kind.values[self.vertex_ids.rows(vertices)])
+
+    def begins(self, vertices: Index) -> Index:
+        """Where the numbers of vertices begin among the stored numbers of all."""
+        return np.asarray(self.offset.values[self.vertex_ids.rows(vertices)])
 
     def add_vertices(self, kind: VertexKind, values: ArrayLike) -> Index:
         """Add n vertices with initial values (n, size), or (n,) where one number is stored; returns their ids."""
@@ -108,12 +108,13 @@ class Graph:
             fault = kind.fault(rows)
             if fault is not None:
                 row, why = fault
-                raise GraphSlamError(f"initial value {rows[row].tolist()} of vertex {first + row} {why}")
+                raise GraphSlamError(f"initial value {rows[row].tolist()} of vertex {self.vertex_ids.next + row} {why}")
         if code == len(self.kinds):
             self.kinds.append(kind)
         self.initial.count += rows.size
+        new = self.vertex_ids.next
         self.kind.count = self.offset.count = first + count
-        return np.arange(first, first + count)
+        return np.arange(new, new + count)
 
     def add_vertex(self, kind: VertexKind, value: ArrayLike) -> int:
         """Add one vertex with its initial value (size,); returns its id."""
@@ -132,22 +133,21 @@ class Graph:
         label : the class an edge is counted under, e.g. ``odometry``
         source : the input that measured it
         """
-        at, z = whole_numbers(vertices, edge.name), edge.whole(measured)
+        ids, z = whole_numbers(vertices, edge.name), edge.whole(measured)
+        at = self.vertex_ids.rows(ids)
         if z.ndim != 2 or z.shape[1] != edge.measured_size or at.shape != (len(z), len(edge.accepts)):
-            self._refuse_shapes(edge, at, z)
+            self._refuse_shapes(edge, ids, z)
         if not isinstance(noise, Gaussian):
-            what = f"noise is a {type(noise).__name__}, not a Gaussian"
-            raise NoiseError(
-                f"{edge.name}: {what}: Gaussian.from_sigmas, from_covariance or from_information makes one"
-            )
+            hint = "Gaussian.from_sigmas, from_covariance or from_information makes one"
+            raise NoiseError(f"{edge.name}: noise is a {type(noise).__name__}, not a Gaussian: {hint}")
         shape, count = noise.sqrt_information.shape, len(at)
         if shape[-1] != edge.residual_size or (len(shape) == 3 and shape[0] != count):
             raise GraphSlamError(f"{edge.name}: noise of shape {shape} does not fit")
         table = self.tables.get(edge)
         if table is None:
-            table = EdgeTable(edge, len(self.tables))
-        first, row = self.row_of_edge.count, table.id.count
-        if row + count > table.id.room:
+            table = EdgeTable(edge, len(self.tables), self.vertex_ids, self.edge_ids)
+        first, row = self.row_of_edge.count, len(table)
+        if row + count > table.edge_row.room:
             table.lengthen(row + count)
         if first + count > self.row_of_edge.room:
             self._lengthen((self.table_of_edge, first + count), (self.row_of_edge, first + count))
@@ -156,13 +156,14 @@ class Graph:
         given = _plain(at), _plain(z), _plain(np.asarray(noise.sqrt_information, dtype=np.float64).ravel())
         fault, *where = append_edges(self.pointers, table.pointers, there, *given, self._accepted_by(edge), codes)
         if fault != FITS:
-            self._refuse_unfit(edge, at, z, fault, *where)
+            self._refuse_unfit(edge, ids, z, fault, *where)
         if codes[0] == len(self.tables) or codes[1] == len(self.labels) or codes[2] == len(self.sources):
             self._register(table, label, source)
         for column in table.columns:
             column.count = row + count
+        new = self.edge_ids.next
         self.table_of_edge.count = self.row_of_edge.count = first + count
-        return np.arange(first, first + count)
+        return np.arange(new, new + count)
 
     def add_edge(
         self, edge: EdgeType, vertices: ArrayLike, measured: ArrayLike, noise: Gaussian, label: str, source: str = ""
@@ -173,22 +174,23 @@ class Graph:
 
     def kind_of(self, vertex: int) -> VertexKind:
         """The kind of one vertex."""
-        return self.kinds[self.kind.values[vertex]]
+        return self.kinds[self.kind.values[self.vertex_ids.row(vertex)]]
 
     def vertex(self, vertex_id: int) -> Vertex:
         """One vertex, by its id; a GraphSlamError where there is none."""
-        kind = self.kind_of(_one(vertex_id, self.vertex_count, "vertex"))
-        begin = int(self.offset.values[vertex_id])
+        (row,) = self.vertex_ids.existing([vertex_id]).tolist()
+        kind, begin = self.kinds[self.kind.values[row]], int(self.offset.values[row])
         stored = slice(begin, begin + kind.size)
         return Vertex(vertex_id, kind, self.initial.values[stored].copy(), stored)
 
     def edge(self, edge_id: int) -> Edge:
         """One edge, by its id; a GraphSlamError where there is none."""
-        table, row = self.row(_one(edge_id, self.edge_count, "edge"))
+        self.edge_ids.existing([edge_id])
+        table, row = self.row(edge_id)
         return Edge(
             edge_id,
             table.type,
-            tuple(table.vertices.values[row].tolist()),
+            self.ends_of(edge_id),
             table.measured.values[row].copy(),
             table.sqrt_information.values[row].copy(),
             self.labels[table.label.values[row]],
@@ -197,8 +199,34 @@ class Graph:
         )
 
     def row(self, edge_id: int) -> tuple[EdgeTable, int]:
-        """The table and row of an edge."""
-        return self._in_order[self.table_of_edge.values[edge_id]], int(self.row_of_edge.values[edge_id])
+        """The table of an edge, and its row there."""
+        row = self.edge_ids.row(edge_id)
+        return self._in_order[self.table_of_edge.values[row]], int(self.row_of_edge.values[row])
+
+    def places(self, edges: Index) -> tuple[Index, Index]:
+        """The table of each edge, counted in the order of ``tables``, and its row there."""
+        rows = self.edge_ids.rows(edges)
+        return self.table_of_edge.values[rows], self.row_of_edge.values[rows]
+
+    def by_table(self, edges: Index) -> dict[EdgeTable, Index]:
+        """Edges as rows of their tables."""
+        return self.rows_by_table(self.edge_ids.rows(edges))
+
+    def rows_by_table(self, edges: Index) -> dict[EdgeTable, Index]:
+        """The same of edges by their rows."""
+        rows: Index = self.row_of_edge.values[edges]
+        if len(edges) == 1:
+            return {self._in_order[self.table_of_edge.values[edges[0]]]: rows}
+        if len(self.tables) == 1:
+            return dict.fromkeys(self.tables.values(), rows)
+        codes = self.table_of_edge.values[edges]
+        by_table = ((table, rows[codes == code]) for code, table in enumerate(self._in_order))
+        return {table: of_table for table, of_table in by_table if len(of_table)}
+
+    def ends_of(self, edge_id: int) -> tuple[int, ...]:
+        """The vertices of an edge."""
+        table, row = self.row(edge_id)
+        return tuple(table.at(row).vertices.tolist())
 
     def label_of(self, edge_id: int) -> str:
         """The class of an edge."""
@@ -210,11 +238,14 @@ class Graph:
         table, row = self.row(edge_id)
         return self.sources[int(table.source.values[row])]
 
+    def weights(self, edges: Index) -> Array:
+        """The weights of some edges, (n,)."""
+        return np.asarray(weights_of(self.pointers, self.edge_ids.existing(edges)))
+
     def set_weights(self, edges: Index, weight: float) -> None:
         """Set the weight of some edges. Where a solver has them, use ``Solver.set_weight``."""
-        for code, table in enumerate(self._in_order):
-            of_table = edges[self.table_of_edge.values[edges] == code]
-            table.weight.values[self.row_of_edge.values[of_table]] = weight
+        for table, rows in self.by_table(edges).items():
+            table.weight.values[rows] = weight
 
     def copy(self) -> "Graph":
         """Another graph with the same records; kinds and types are the same objects."""
@@ -223,20 +254,46 @@ class Graph:
 
     def has_label(self, edges: Index, labels: Sequence[str]) -> NDArray[np.bool_]:
         """Return whether each of some edges is of one of these classes, (n,); a GraphSlamError where one is missing."""
-        if len(edges):  # compiled code does not look
-            _one(int(edges.min()), self.edge_count, "edge")
-            _one(int(edges.max()), self.edge_count, "edge")
         wanted = np.array([label in labels for label in self.labels], dtype=bool)
-        out: NDArray[np.bool_] = wanted[labels_of(self.pointers, np.ascontiguousarray(edges))]
-        return out
+        rows = np.ascontiguousarray(self.edge_ids.existing(edges))  # compiled code does not look
+        return np.asarray(wanted[labels_of(self.pointers, rows)])
 
     def edges_of(self, label: str) -> Index:
         """Ids of the edges of a class, in order."""
         if label not in self.labels:
             return np.empty(0, dtype=np.int64)
         code = self.labels.index(label)
-        found = [table.id.values[table.label.values == code] for table in self.tables.values()]
-        return np.sort(np.concatenate(found))
+        found = [table.edge_row.values[table.label.values == code] for table in self.tables.values()]
+        return self.edge_ids.of_all(np.sort(np.concatenate(found)))
+
+    def keep(self, vertices: Index, edges: Index, values: Array) -> None:
+        """Remove all but some vertices and edges, given in order; these vertices begin with other stored ``values``.
+
+        Solvers of the graph must be made anew.
+        """
+        kept, kept_edges = self.vertex_ids.existing(vertices), self.edge_ids.existing(edges)
+        self.vertex_ids.put(vertices, self.vertex_ids.next)
+        self.edge_ids.put(edges, self.edge_ids.next)
+        kinds = self.kind.values[kept]
+        sizes = np.array([kind.size for kind in self.kinds], dtype=np.int64)[kinds]
+        ends = np.cumsum(sizes)
+        numbers = np.repeat(self.offset.values[kept] - (ends - sizes), sizes) + np.arange(int(sizes.sum()))
+        self.kind.values, self.offset.values, self.initial.values = kinds, ends - sizes, values[numbers]
+        rows_of = ((table, np.flatnonzero(np.isin(table.edge_row.values, kept_edges))) for table in self._in_order)
+        found = [(table, rows) for table, rows in rows_of if len(rows)]
+        found.sort(key=lambda one: int(one[0].edge_row.values[one[1][0]]))  # as if it was added edge by edge
+        self.table_of_edge.values, self.row_of_edge.values = np.empty((2, len(edges)), dtype=np.int64)
+        for code, (table, rows) in enumerate(found):
+            for column in table.columns:
+                column.values = column.values[rows]
+            table.code, table.edge_row.values = code, np.searchsorted(kept_edges, table.edge_row.values)
+            table.vertex_rows.values = np.searchsorted(kept, table.vertex_rows.values)
+            self.table_of_edge.values[table.edge_row.values] = code
+            self.row_of_edge.values[table.edge_row.values] = np.arange(len(rows))
+            table.locate()
+        self._in_order = [table for table, _ in found]
+        self.tables = {table.type: table for table in self._in_order}
+        self.locate()
 
     def _register(self, table: EdgeTable, label: str, source: str) -> None:
         if table.code == len(self.tables):
@@ -265,8 +322,7 @@ class Graph:
     def _refuse_shapes(edge: EdgeType, at: Index, measured: Array) -> None:
         for what, given, size in (("vertices", at, len(edge.accepts)), ("measurements", measured, edge.measured_size)):
             if given.ndim != 2 or given.shape[1] != size:
-                shape = tuple(given.shape)
-                raise GraphSlamError(f"{edge.name}: {what} of shape {shape}, not (n, {size})")
+                raise GraphSlamError(f"{edge.name}: {what} of shape {given.shape}, not (n, {size})")
         raise GraphSlamError(f"{edge.name}: {len(at)} edges but {len(measured)} measurements")
 
     def _refuse_unfit(self, edge: EdgeType, at: Index, measured: Array, fault: int, row: int, slot: int) -> None:
@@ -295,55 +351,6 @@ def _plain(array: NDArray[Any]) -> NDArray[Any]:
     return array if array.flags.carray else array.copy()
 
 
-def _one(one: int, count: int, what: str) -> int:
-    if not 0 <= one < count:
-        raise GraphSlamError(f"{what} {one} does not exist")
-    return one
-
-
 def _code(names: list[Any], name: Any) -> int:
     """Its place among the names, that behind the last if it is new."""
     return names.index(name) if name in names else len(names)
-
-
-def kept_part(graph: Graph, vertices: Index, edges: Index, values: Array) -> Graph:
-    """Return a graph of some vertices and edges, in the same order.
-
-    Parameters
-    ----------
-    vertices, edges : ids, ascending; all ends of the edges are among the vertices
-    values : stored numbers of all vertices, as ``Graph.initial``: what the vertices begin with
-    """
-    out, moved = Graph(), new_ids(vertices, graph.vertex_count)
-    out.kinds, out.labels, out.sources = list(graph.kinds), list(graph.labels), list(graph.sources)
-    kinds = graph.kind.values[vertices]
-    sizes = np.array([kind.size for kind in graph.kinds], dtype=np.int64)[kinds]
-    ends = np.cumsum(sizes)
-    numbers = np.repeat(graph.offset.values[vertices] - (ends - sizes), sizes) + np.arange(int(sizes.sum()))
-    out.kind.values, out.offset.values, out.initial.values = kinds, ends - sizes, values[numbers]
-    new_edge = new_ids(edges, graph.edge_count)
-    code_of_edge, row_of_edge = np.empty(len(edges), dtype=np.int64), np.empty(len(edges), dtype=np.int64)
-    kept_rows = ((table, np.flatnonzero(new_edge[table.id.values] >= 0)) for table in graph.tables.values())
-    found = [(table, rows) for table, rows in kept_rows if len(rows)]
-    found.sort(key=lambda one: int(one[0].id.values[one[1][0]]))  # as if it was added edge by edge
-    for table, rows in found:
-        fresh = EdgeTable(table.type, len(out.tables))
-        for column, of_all in zip(fresh.columns, table.columns, strict=True):
-            column.values = of_all.values[rows]
-        fresh.id.values, fresh.vertices.values = new_edge[fresh.id.values], moved[fresh.vertices.values]
-        code_of_edge[fresh.id.values], row_of_edge[fresh.id.values] = fresh.code, np.arange(len(rows))
-        fresh.locate()
-        out.tables[table.type] = fresh
-        out._in_order.append(fresh)
-    out.table_of_edge.values, out.row_of_edge.values = code_of_edge, row_of_edge
-    out.vertex_ids = graph.vertex_ids.kept(vertices, graph.vertex_count)
-    out.edge_ids = graph.edge_ids.kept(edges, graph.edge_count)
-    out.locate()
-    return out
-
-
-def new_ids(kept: Index, count: int) -> Index:
-    """Return the new id of each of so many, (count,): -1 where it is not kept."""
-    out = np.full(count, -1, dtype=np.int64)
-    out[kept] = np.arange(len(kept))
-    return out

@@ -6,11 +6,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import records
 from graph_slam_ros.graph.edge_type import EdgeType
 from graph_slam_ros.graph.records import address_of
 from graph_slam_ros.graph.vertices import VertexKind
 from graph_slam_ros.typing import Array, Index
+
+_INT64 = np.dtype(np.int64)
 
 
 class Column:
@@ -48,12 +51,6 @@ class Column:
     def values(self, rows: NDArray[Any]) -> None:
         self.__setstate__(rows)
 
-    def kept(self, rows: Index) -> "Column":
-        """Some of its rows, as a column of their own."""
-        out = Column(self.values.dtype.type)
-        out.__setstate__(self.values[rows])
-        return out
-
     @property
     def address(self) -> int:
         """The place in memory where it begins."""
@@ -90,25 +87,38 @@ class EdgeTable:
     Attributes
     ----------
     code : its place among the graph's tables; width : degrees of freedom of all vertices of an edge
-    id : edge ids; vertices : (n, k) vertex ids; measured : (n, p); sqrt_information : (n, m, m)
+    edge_row : of each edge, its place in the graph; vertex_rows : (n, k) those of its vertices
+    measured : (n, p); sqrt_information : (n, m, m)
     label, source : codes into ``Graph.labels`` and ``Graph.sources``
     weight : a factor on the information, 0 = out of the problem
     pointers : where all of it is in memory, for compiled code (``records``)
+    vertex_ids, edge_ids : as of ``Graph``
     """
 
-    def __init__(self, edge: EdgeType, code: int) -> None:
+    def __init__(self, edge: EdgeType, code: int, vertex_ids: "LastingIds", edge_ids: "LastingIds") -> None:
+        self.vertex_ids, self.edge_ids = vertex_ids, edge_ids
         self.type, self.code, self.width, m = edge, code, sum(edge.dofs), edge.residual_size
-        self.id, self.vertices = Column(np.int64), Column(np.int64, len(edge.accepts))
+        self.edge_row, self.vertex_rows = Column(np.int64), Column(np.int64, len(edge.accepts))
         self.measured, self.sqrt_information = Column(np.float64, edge.measured_size), Column(np.float64, m, m)
         self.label, self.source, self.weight = Column(np.int64), Column(np.int64), Column(np.float64)
-        of_edge = self.id, self.vertices, self.measured, self.sqrt_information
+        of_edge = self.edge_row, self.vertex_rows, self.measured, self.sqrt_information
         self.columns = (*of_edge, self.label, self.source, self.weight)
         self.pointers = np.zeros(records.TABLE_COLUMNS, dtype=np.int64)
         self.pointers[records.ENDS : records.LINEARIZE] = len(edge.accepts), edge.measured_size, m, self.width
         self.locate()
 
     def __len__(self) -> int:
-        return self.id.count
+        return self.edge_row.count
+
+    @property
+    def ids(self) -> Index:
+        """Edge ids, (n,)."""
+        return self.edge_ids.of_all(self.edge_row.values)
+
+    @property
+    def vertices(self) -> Index:
+        """Vertex ids, (n, k)."""
+        return self.vertex_ids.of_all(self.vertex_rows.values)
 
     def lengthen(self, rows: int) -> None:
         """Make room for at least so many rows."""
@@ -124,23 +134,28 @@ class EdgeTable:
             self.pointers[k] = column.address
         self.pointers[records.ROOM] = min(column.room for column in self.columns)
 
-    def at(self, rows: Index) -> "EdgeRows":
+    def at(self, rows: Index | int) -> "EdgeRows":
         """Some rows, as arrays."""
         return EdgeRows(self, rows)
 
 
 class EdgeRows:
-    """Some of the edges of one type: ``ids``, and the columns of their table, copied when they are asked for."""
+    """Some of the edges of one type: their ids, and the columns of their table, copied when they are asked for."""
 
     __slots__ = ("rows", "table")
 
-    def __init__(self, table: EdgeTable, rows: Index) -> None:
+    def __init__(self, table: EdgeTable, rows: Index | int) -> None:
         self.table, self.rows = table, rows
 
     @property
     def ids(self) -> Index:
         """Edge ids, (n,)."""
-        return self.table.id.values[self.rows]
+        return self.table.edge_ids.of_all(self.table.edge_row.values[self.rows])
+
+    @property
+    def vertices(self) -> Index:
+        """Vertex ids, (n, k)."""
+        return self.table.vertex_ids.of_all(self.table.vertex_rows.values[self.rows])
 
     def __getattr__(self, column: str) -> NDArray[Any]:
         """These rows of a column of the table."""
@@ -185,7 +200,7 @@ class Vertex:
 
 
 class LastingIds:
-    """The lasting ids of the rows of a table, ascending. They are never used twice.
+    """The ids of vertices or edges, which have a row each: they ascend, last and are never used twice.
 
     Until rows are removed, the id of a row is its number. After that, the first rows have ids of their own, and those
     of all later ones follow one another.
@@ -194,35 +209,79 @@ class LastingIds:
     ----------
     early : (n,) ids of the first n rows
     later : the id of the row after these
+    shift : from there on, the difference between an id and its row
     """
 
-    __slots__ = ("early", "later")
+    __slots__ = ("_column", "_what", "early", "later", "shift")
 
-    def __init__(self, early: Index | None = None, later: int = 0) -> None:
-        self.early = np.empty(0, dtype=np.int64) if early is None else early
-        self.later = later
+    def __init__(self, what: str, column: Column) -> None:
+        self._what, self._column = what, column
+        self.put(np.empty(0, dtype=np.int64), 0)
+
+    def put(self, early: Index, later: int) -> None:
+        """Give the rows other ids, because others are removed, or all are read from a file."""
+        self.early, self.later, self.shift = early, later, later - len(early)
+
+    @property
+    def next(self) -> int:
+        """The id that the next one gets: all are below it."""
+        return self._column.count + self.shift
+
+    def since(self, first: int = 0, end: int | None = None) -> Index:
+        """All from one on, or up to another, in order."""
+        last = self._column.count if end is None else self.first_from(end)
+        return self.of_all(np.arange(self.first_from(first), last))
+
+    def has(self, one: int) -> bool:
+        """Return whether there is one of this id, which was not removed."""
+        return 0 <= self.row(one) < self._column.count
 
     def of(self, row: int) -> int:
         """The id of a row."""
-        count = len(self.early)
-        return int(self.early[row]) if row < count else self.later + row - count
+        return row + self.shift if not self.later or row >= len(self.early) else int(self.early[row])
 
     def of_all(self, rows: Index) -> Index:
-        """The ids of rows, (n,)."""
-        count = len(self.early)
-        out = rows + (self.later - count)
-        is_early = rows < count
+        """The ids of rows, of any shape."""
+        if not self.later:
+            return rows
+        out, is_early = rows + self.shift, rows < len(self.early)
         out[is_early] = self.early[rows[is_early]]
         return out
 
-    def find(self, lasting: int) -> int | None:
-        """The row of an id; None where it was removed. The row of an id that comes later may not be there yet."""
-        count = len(self.early)
-        if lasting >= self.later:
-            return count + lasting - self.later
-        at = int(np.searchsorted(self.early, lasting))
-        return at if at < count and self.early[at] == lasting else None
+    def row(self, one: int) -> int:
+        """The row of an id; -1 where it was removed."""
+        at = self.first_from(one)
+        return at if one >= self.later or (at < len(self.early) and self.early[at] == one) else -1
 
-    def kept(self, rows: Index, count: int) -> "LastingIds":
-        """The ids after all of so many rows were removed but some, which are given in order."""
-        return LastingIds(self.of_all(rows), self.of(count))
+    def rows(self, ids: Index) -> Index:
+        """The rows of ids, of any shape; -1 where one was removed."""
+        if not self.later:
+            return ids
+        out, is_early = ids - self.shift, ids < self.later
+        some = ids[is_early]
+        at = np.searchsorted(self.early, some)
+        out[is_early] = np.where(np.append(self.early, self.later)[at] == some, at, -1)
+        return out
+
+    def existing(self, ids: ArrayLike) -> Index:
+        """The rows of ids, (n,); a GraphSlamError where one does not exist."""
+        given = whole_numbers(ids, self._what).ravel()
+        rows = self.rows(given)
+        strange = (rows < 0) | (rows >= self._column.count)
+        if np.count_nonzero(strange):
+            raise GraphSlamError(f"{self._what} {int(given[strange][0])} does not exist")
+        return rows
+
+    def first_from(self, one: int) -> int:
+        """The first row whose id is not below one."""
+        return one - self.shift if one >= self.later else int(np.searchsorted(self.early, one))
+
+
+def whole_numbers(ids: ArrayLike, what: str) -> Index:
+    """Return ids as an array. Numbers with a fraction are refused."""
+    given = np.asarray(ids)
+    if given.dtype is _INT64:
+        return given
+    if given.dtype.kind not in "iu" and given.size:
+        raise GraphSlamError(f"{what}: ids must be whole numbers, got {given.ravel()[:5].tolist()}")
+    return given.astype(np.int64, copy=False)

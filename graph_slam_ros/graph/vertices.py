@@ -108,21 +108,16 @@ def retract_at(x: Array, at: int, code: int, dof: int, step: Array, first: int) 
 
 
 @kernel
-def adjoint_of_inverse(code: int, motion: Array) -> Array:
-    """Return the adjoint (dof, dof) of the inverse of a motion: ``Exp(d) T = T Exp(Ad d)``."""
-    if code == PLANAR:
-        return se2.adjoint(se2.inverse((motion[0], motion[1], motion[2])))
-    m = (motion[0], motion[1], motion[2], motion[3], motion[4], motion[5], motion[6])
-    return se3.adjoint(se3.inverse(m))
-
-
-@kernel
 def adjoints_of_inverses(code: int, motions: Array) -> Array:
-    """Return those (n, dof, dof) of motions (n, size)."""
+    """Return the adjoints (n, dof, dof) of the inverses of motions (n, size): ``Exp(d) T = T Exp(Ad d)``."""
     dof = 3 if code == PLANAR else 6
     out = np.empty((len(motions), dof, dof))
     for k in range(len(motions)):
-        one = adjoint_of_inverse(code, motions[k])
+        m = motions[k]
+        if code == PLANAR:
+            one = se2.adjoint(se2.inverse((m[0], m[1], m[2])))
+        else:
+            one = se3.adjoint(se3.inverse((m[0], m[1], m[2], m[3], m[4], m[5], m[6])))
         for i in range(dof):
             for j in range(dof):
                 out[k, i, j] = one[i, j]

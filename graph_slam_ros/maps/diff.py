@@ -225,15 +225,14 @@ def _edges(one: GraphSlam, two: GraphSlam) -> tuple[Counts, list[Judged]]:
         verdicts = one.ledger.verdict_of(in_a), two.ledger.verdict_of(in_b)
         if verdicts[0] is not verdicts[1]:
             words = [verdict.name.lower() for verdict in verdicts]
-            ids = one.graph.edge_ids.of(in_a), two.graph.edge_ids.of(in_b)
-            unlike.append(Judged(_about(one, names, in_a), *ids, *words))
+            unlike.append(Judged(_about(one, names, in_a), in_a, in_b, *words))
     return Counts(one.graph.edge_count, two.graph.edge_count, len(pairs)), unlike
 
 
 def _by_meaning(slam: GraphSlam) -> dict[Any, list[int]]:
     names = _names(slam)
     out: dict[Any, list[int]] = defaultdict(list)
-    for edge in range(slam.graph.edge_count):
+    for edge in slam.graph.edge_ids.since().tolist():
         one = slam.graph.edge(edge)
         ends = tuple(names.get(vertex) for vertex in one.vertices)
         measured = tuple(round(x, _DIGITS) + 0.0 for x in one.measured.tolist())

@@ -302,12 +302,11 @@ class Rehearsal:
     def attempt(self, edits: Sequence[Edit], losses: Sequence[str] = ()) -> tuple[GraphSlam, Edited]:
         """The map with edits, solved, and what changed. Raises GraphSlamError where one fails."""
         before, state = self._before, self.edited(edits)
-        known, ids = len(before.edits), state.graph.edge_ids
+        known = len(before.edits)
         done = tuple(state.edits[known:])
         added = [edge for one in done if one.edit.do in ("add_closure", "let_in_edge") for edge in one.added]
-        found = [row for row in map(ids.find, added) if row is not None]
-        rows = [row for row in found if not state.ledger.is_withdrawn(row)]
-        costs = _innovations(state, self._config, rows)
+        added = [edge for edge in added if not state.ledger.is_withdrawn(edge)]
+        costs = _innovations(state, self._config, added)
         try:
             slam = GraphSlam(self._config, start=state)
             slam.process(Control("optimize"))
@@ -323,33 +322,33 @@ class Rehearsal:
             (before.solver.evaluate().chi2_final, slam.solver.evaluate().chi2_final),
             (slam.first_keyframe + farthest, float(distances[farthest])),
             float(distances[-1]),
-            tuple(_fit(slam, row, cost) for row, cost in zip(rows, costs, strict=True)),
-            tuple(edge for row in inside if (edge := ids.of(row)) not in by_hand and not slam.ledger.is_inside(row)),
+            tuple(_fit(slam, edge, cost) for edge, cost in zip(added, costs, strict=True)),
+            tuple(edge for edge in inside if edge not in by_hand and not slam.ledger.is_inside(edge)),
             {},
             [*losses],
         )
 
 
-def _innovations(state: MapSnapshot, config: Config, rows: Sequence[int]) -> list[float]:
+def _innovations(state: MapSnapshot, config: Config, edges: Sequence[int]) -> list[float]:
     """chi2 of edges against a solution of all else; infinite where nothing else determines what they are between."""
-    if not rows:
+    if not edges:
         return []
     graph = state.graph.copy()
-    graph.set_weights(np.array(rows), 0.0)
+    graph.set_weights(np.array(edges), 0.0)
     solver = Solver(graph, config.solver_settings())
-    solver.add(state.vertices, range(graph.edge_count))
+    solver.add(state.vertices, graph.edge_ids.since())
     solver.start_at(state.values)
     for vertex in state.vertices:
         if vertex < state.frozen:
             solver.hold(vertex)
     try:
         solver.optimize()
-        return innovations(graph, solver, rows)
+        return innovations(graph, solver, edges)
     except (GaugeError, SingularError):
-        return [math.inf] if len(rows) == 1 else [cost for row in rows for cost in _innovations(state, config, [row])]
+        return [math.inf] if len(edges) == 1 else [cost for one in edges for cost in _innovations(state, config, [one])]
 
 
-def _fit(slam: GraphSlam, row: int, innovation: float) -> Fit:
-    (chi2,), residual = slam.solver.chi2_of([row])[0].tolist(), tuple(slam.solver.residuals_of([row]).tolist())
+def _fit(slam: GraphSlam, edge: int, innovation: float) -> Fit:
+    (chi2,), residual = slam.solver.chi2_of([edge])[0].tolist(), tuple(slam.solver.residuals_of([edge]).tolist())
     limit = slam.backend.decisions.gate_scale * quantile(slam.config.robust.gate, len(residual))
-    return Fit(slam.graph.edge_ids.of(row), innovation, limit, chi2, residual)
+    return Fit(edge, innovation, limit, chi2, residual)

@@ -147,7 +147,7 @@ def merge(a: Path, b: Path, out: Path, *, force: bool = False) -> Merged:
     refuse_other_space(one, two, a, b)
     shared, aligned = aligned_for_merge(one, two, a, b)
     state = one.snapshot(a)
-    first_edge = state.graph.edge_count
+    first_edge = state.graph.edge_ids.next
     two.backend.use_noise(one.noise_factors)  # the merged map has one factor for each group
     _Second(one, two, aligned, shared).add_to(state)
     left_out = {name: aligned.distance(k) for k, name in enumerate(shared) if not aligned.fits[k]}
@@ -174,8 +174,8 @@ class _Second:
         self._one, self._two, self._T = one, two, aligned.T_a_b
         self._keyframes = len(one.keyframes)
         self._vertex = {two.landmarks[name].vertex: one.landmarks[name].vertex for name in shared}
-        self._new = [vertex for vertex in range(two.graph.vertex_count) if vertex not in self._vertex]
-        self._vertex |= {vertex: one.graph.vertex_count + k for k, vertex in enumerate(self._new)}
+        self._new = [vertex for vertex in two.graph.vertex_ids.since().tolist() if vertex not in self._vertex]
+        self._vertex |= {vertex: one.graph.vertex_ids.next + k for k, vertex in enumerate(self._new)}
         self._shared = set(shared)
 
     def add_to(self, state: MapSnapshot) -> None:
@@ -192,8 +192,7 @@ class _Second:
         state.segments += [first + keyframe for keyframe in two.segments]
         state.drives += [first + keyframe for keyframe in two.drives]
         self._add_landmarks(state.landmarks, number)
-        ids = {edge: state.graph.edge_ids.of(row) for edge, row in number.items()}
-        state.edits += [self._edit(one, ids) for one in two.edits]
+        state.edits += [self._edit(one, number) for one in two.edits]
         state.displacements = [*state.displacements, *map(self._displacement, two.displacements)]
         state.datum = two.datum or state.datum
 
@@ -206,27 +205,28 @@ class _Second:
         """Add its edges, but for what both sessions were told. Returns the new number of each, by its own."""
         mine, number = state.graph, dict[int, int]()
         known = {mine.edge(edge).vertices for edge in mine.edges_of("surveyed").tolist()}
-        for row in range(self._two.graph.edge_count):
-            edge = self._two.graph.edge(row)
+        for edge in map(self._two.graph.edge, self._two.graph.edge_ids.since().tolist()):
             vertices = tuple(self._vertex[vertex] for vertex in edge.vertices)
             if edge.label == "surveyed" and vertices in known:  # both sessions were told
                 continue
             measured, noise = edge.measured, Gaussian(edge.sqrt_information)
             if edge.label == "anchor" or (edge.source == HAND_MADE and len(vertices) == 1):
-                number[row] = self._add_bridge(mine)
+                number[edge.id] = self._add_bridge(mine)
                 continue
             if edge.label == "initialpose":  # it was told in the axes of the second
                 measured = np.array(self._one.space.group.compose(self._T, tuple(measured.tolist())))
-            number[row] = mine.add_edge(edge.type, vertices, measured, noise, edge.label, edge.source)
-            mine.set_weights(np.array([number[row]]), edge.weight)
+            number[edge.id] = mine.add_edge(edge.type, vertices, measured, noise, edge.label, edge.source)
+            mine.set_weights(np.array([number[edge.id]]), edge.weight)
         return number
 
     def _add_verdicts(self, ledger: Ledger, number: Mapping[int, int]) -> None:
-        theirs, first, rows = self._two.ledger, self._keyframes, np.array(list(number), dtype=np.int64)
+        theirs, first, rows = self._two.ledger, self._keyframes, self._two.ledger.ids.existing(list(number))
         verdict = theirs.verdict.values[rows]
-        residuals = np.concatenate([np.empty(0), *map(theirs.residual, rows.tolist())])
+        residuals = np.concatenate([np.empty(0), *map(theirs.residual, number)])
         of_rows = theirs.statistic.values[rows], theirs.numbers.values[rows], theirs.threshold.values[rows]
-        ids = ledger.enter(first + theirs.keyframe.values[rows], *of_rows, residuals, verdict != Verdict.NOT_EVALUATED)
+        ids = ledger.ids.rows(
+            ledger.enter(first + theirs.keyframe.values[rows], *of_rows, residuals, verdict != Verdict.NOT_EVALUATED)
+        )
         ledger.verdict.values[ids], ledger.reason.values[ids] = verdict, theirs.reason.values[rows]
         ledger.finish(ledger.final)
         ledger.history += [replace(one, edge=number[one.edge], keyframe=first + one.keyframe) for one in theirs.history]

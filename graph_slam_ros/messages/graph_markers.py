@@ -24,16 +24,16 @@ def graph_view(slam: GraphSlam, most: int) -> GraphView:
     """
     graph, at = slam.graph, _positions(slam)
     drawn = {table: ends for table in graph.tables.values() if (ends := _drawn(slam.space, table.type))}
-    ids = np.concatenate([table.id.values for table in drawn] or [np.empty(0, dtype=np.int64)])
+    ids = np.concatenate([table.ids for table in drawn] or [np.empty(0, dtype=np.int64)])
     chi2, numbers = slam.solver.chi2_of(ids)
-    misfit = np.zeros(graph.edge_count)
+    misfit = np.zeros(graph.edge_ids.next)
     misfit[ids] = chi2 / numbers
-    shown = np.zeros(graph.edge_count, dtype=bool)
+    shown = np.zeros(graph.edge_ids.next, dtype=bool)
     shown[_worst_and_some(ids, misfit[ids], most)] = True
 
     parts = [(np.empty((0, 3)), np.empty((0, 3)), np.empty(0), np.empty(0, dtype=np.int64))]
     for table, ends in drawn.items():
-        some = table.at(np.flatnonzero(shown[table.id.values]))
+        some = table.at(np.flatnonzero(shown[table.ids]))
         label = np.where(some.weight == 0.0, len(graph.labels), some.label)
         parts.append((*ends(slam, at, some), misfit[some.ids], label))
     start, end, fit, labels = (np.concatenate(columns) for columns in zip(*parts, strict=True))
@@ -76,11 +76,11 @@ def _worst_and_some(ids: Index, misfit: Array, most: int) -> Index:
 
 
 def _positions(slam: GraphSlam) -> Array:
-    """Positions of all vertices that have one, (n, 3)."""
-    graph, out = slam.graph, np.zeros((slam.graph.vertex_count, 3))
+    """Positions of all vertices that have one, each at its id, (n, 3)."""
+    graph, out, every = slam.graph, np.zeros((slam.graph.vertex_ids.next, 3)), slam.graph.vertex_ids.since()
     for code, kind in enumerate(graph.kinds):
         if n := _COORDINATES.get(kind, 0):
-            ids = np.flatnonzero(graph.kind.values == code)
+            ids = every[graph.kind_codes(every) == code]
             out[ids, :n] = slam.solver.estimate(ids)[:, :n]
     return out
 

@@ -29,17 +29,16 @@ def of_update(slam: GraphSlam, update: Update) -> Iterator[Status]:
     graph = slam.graph
     for k in update.keyframes:
         keyframe = slam.keyframes[k]
-        values = {"vertex": graph.vertex_ids.of(keyframe.vertex), "stamp_ns": keyframe.stamp_ns}
+        values = {"vertex": keyframe.vertex, "stamp_ns": keyframe.stamp_ns}
         yield happened("vertex", f"keyframe {k}", **values)
         if k and k in slam.segments:
             yield happened("segment", f"a new segment begins at keyframe {k}", WARN, **values)
     for edge in list(update.edges)[:_EDGES]:
         one = graph.edge(edge)
-        label, vertices = one.label, list(map(graph.vertex_ids.of, one.vertices))
+        label, vertices = one.label, list(one.vertices)
         what, verdict = "closure" if label == "closures" else "edge", slam.ledger.verdict_of(edge).name.lower()
-        number = graph.edge_ids.of(edge)
         yield happened(
-            what, f"edge {number}: {label} of {vertices}", edge=number, label=label, vertices=vertices, verdict=verdict
+            what, f"edge {edge}: {label} of {vertices}", edge=edge, label=label, vertices=vertices, verdict=verdict
         )
     for change in update.changes[:_EDGES]:
         yield _verdict(slam, change)
@@ -55,7 +54,7 @@ def of_update(slam: GraphSlam, update: Update) -> Iterator[Status]:
 def _verdict(slam: GraphSlam, change: VerdictChange) -> Status:
     verdict, reason = change.verdict.name.lower(), change.reason.name.lower()
     why = f": {reason.replace('_', ' ')}" if change.reason else ""
-    edge = slam.graph.edge_ids.of(change.edge)
+    edge = change.edge
     return happened(
         "verdict",
         f"edge {edge} ({name_of(slam, change.edge)}) {verdict.replace('_', ' ')}{why},"
@@ -86,11 +85,8 @@ def _alarm(alarm: Alarm | Slip) -> Status:
 def correction(slam: GraphSlam, update: Update, level: int = OK) -> Status:
     """The motion of the robot in the map that a solve caused, and the edges that caused it."""
     moved = update.correction
-    number = slam.graph.edge_ids.of
     causes = [
-        f"{number(e)} ({name_of(slam, e)}, {fit:.1f})"
-        for e, fit in zip(moved.edges, moved.chi2, strict=True)
-        if fit > 1.0
+        f"{e} ({name_of(slam, e)}, {fit:.1f})" for e, fit in zip(moved.edges, moved.chi2, strict=True) if fit > 1.0
     ]
     return happened(
         "correction",
@@ -99,7 +95,7 @@ def correction(slam: GraphSlam, update: Update, level: int = OK) -> Status:
         level,
         distance_m=f"{moved.distance_m:.6f}",
         angle_rad=f"{moved.angle_rad:.6f}",
-        edges=" ".join(map(str, map(number, moved.edges))),
+        edges=" ".join(map(str, moved.edges)),
         chi2_per_dof=" ".join(f"{fit:.3g}" for fit in moved.chi2),
     )
 

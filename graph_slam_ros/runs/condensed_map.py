@@ -118,5 +118,4 @@ class WholePath:
             return path
         old = [one.vertex for one in slam.bounded.old]
         vertices = np.sort(np.array([*old, *slam.keyframes.ids.tolist()], dtype=np.int64))
-        ids = slam.graph.vertex_ids.of_all(vertices)
-        return np.concatenate((self.left.path(slam.space, ids, solver.estimate(vertices)), path))
+        return np.concatenate((self.left.path(slam.space, vertices, solver.estimate(vertices)), path))

@@ -62,7 +62,7 @@ def write_graph_run(solution: Solution, out: Path, name: str, *, force: bool = F
     state.keyframes, state.segments = _path(graph, space, poses, stamps_ns, solver.estimate(poses))
     state.drives = [0]
     state.sighting_poses = StampedPoses(SightingPose, space.pose.size)
-    seen = Counter(vertex for table in graph.tables.values() for vertex in table.vertices.values.ravel().tolist())
+    seen = Counter(vertex for table in graph.tables.values() for vertex in table.vertices.ravel().tolist())
     state.landmarks = {
         str(file.ids[v]): Landmark(str(file.ids[v]), v, sightings=seen[v], last_seen_ns=stamps_ns[-1])
         for v in sorted(seen.keys() - set(poses))

@@ -6,7 +6,7 @@ Rows are in order of the edges' ids. A list of numbers is one field, with spaces
 import csv
 import io
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
 from reprlib import repr as shortened
@@ -112,9 +112,7 @@ def ledger_text(slam: GraphSlam, ids: list[int]) -> str:
 
 def changes_text(slam: GraphSlam) -> str:
     """The history of all verdicts as a table."""
-    number = slam.graph.edge_ids.of
-    changes = [replace(one, edge=number(one.edge)) for one in slam.ledger.history]
-    return rows_text(changes, [field.name for field in fields(VerdictChange)])
+    return rows_text(slam.ledger.history, [field.name for field in fields(VerdictChange)])
 
 
 def read_ledger(folder: Path) -> list[Entry]:
@@ -133,25 +131,24 @@ def read_ledger(folder: Path) -> list[Entry]:
 
 
 def ledger_entries(slam: GraphSlam, ids: Sequence[int]) -> Iterator[Entry]:
-    """Each edge of the solver; ``ids`` are the numbers of its vertices in the file."""
+    """Each edge of the solver; ``ids`` are the numbers of vertices in the file, at their ids."""
     graph, ledger = slam.graph, slam.ledger
     stamps_ns: list[int] = slam.keyframes.stamps_ns.tolist()
-    lasting: list[int] = graph.edge_ids.of_all(np.arange(graph.edge_count)).tolist()
     judged = {change.edge: change.threshold for change in ledger.history}
-    last_loss, count = cache(slam.solver.settings.last_loss), len(ledger)
+    last_loss, edges = cache(slam.solver.settings.last_loss), ledger.ids.since()
     rows_of = {table.code: _rows(slam, table, np.asarray(ids, dtype=np.int64)) for table in graph.tables.values()}
     residuals, ends = ledger.residuals.tolist(), np.cumsum(ledger.numbers.values).tolist()
-    chi2, _ = slam.solver.chi2_of(np.arange(count))
+    chi2, _ = slam.solver.chi2_of(edges)
     columns = (ledger.keyframe, ledger.statistic, ledger.numbers, ledger.threshold, ledger.verdict, ledger.reason)
-    of_graph = (graph.table_of_edge.values[:count], graph.row_of_edge.values[:count], chi2)
-    numbered = zip(*(column.tolist() for column in of_graph), *(c.values.tolist() for c in columns), strict=True)
-    for edge, (code, row, now, keyframe, statistic, dof, threshold, verdict, reason) in enumerate(numbered):
+    of_graph = (edges, *graph.places(edges), chi2)
+    numbered = zip(*(column.tolist() for column in of_graph), ends, *(c.values.tolist() for c in columns), strict=True)
+    for edge, code, row, now, end, keyframe, statistic, dof, threshold, verdict, reason in numbered:
         tag, rows = rows_of[code]
         vertices, landmark, newest_ns, measured, information, label_code, source_code, factor = rows[row]
         label, source = graph.labels[label_code], graph.sources[source_code]
         loss = last_loss(label, source)
         yield Entry(
-            lasting[edge],
+            edge,
             label,
             tag,
             source,
@@ -161,7 +158,7 @@ def ledger_entries(slam: GraphSlam, ids: Sequence[int]) -> Iterator[Entry]:
             newest_ns or stamps_ns[max(keyframe - slam.first_keyframe, 0)],
             measured,
             information,
-            tuple(residuals[ends[edge] - dof : ends[edge]]),
+            tuple(residuals[end - dof : end]),
             statistic,
             dof,
             judged.get(edge, threshold),
@@ -174,13 +171,13 @@ def ledger_entries(slam: GraphSlam, ids: Sequence[int]) -> Iterator[Entry]:
 
 def _rows(slam: GraphSlam, table: EdgeTable, ids: Index) -> tuple[str, list[Any]]:
     """The tag of a table, and what an entry has of each row: all rows at once, as one by one is slow."""
-    stamp_of, names = np.zeros(slam.graph.vertex_count, dtype=np.int64), [""] * slam.graph.vertex_count
+    stamp_of, names = np.zeros(slam.graph.vertex_ids.next, dtype=np.int64), [""] * slam.graph.vertex_ids.next
     stamp_of[slam.keyframes.ids] = slam.keyframes.stamps_ns
     for one in slam.bounded.old if slam.bounded else ():
         stamp_of[one.vertex] = one.stamp_ns
     for name, mark in slam.landmarks.items():
         names[mark.vertex] = name
-    vertices, roots = table.vertices.values, table.sqrt_information.values
+    vertices, roots = table.vertices, table.sqrt_information.values
     upper = np.triu_indices(roots.shape[1])
     rows = zip(
         map(tuple, ids[vertices].tolist()),

@@ -26,7 +26,6 @@ from graph_slam_ros.edge_tags import edge_of, tag_of
 from graph_slam_ros.errors import FormatError, GraphSlamError
 from graph_slam_ros.formats.durable import write_whole
 from graph_slam_ros.graph import Gaussian, Graph
-from graph_slam_ros.graph.tables import LastingIds
 from graph_slam_ros.graph.vertices import GROUPS, R1, R2, R3, SE2, SE3, VertexKind
 from graph_slam_ros.measurements.edits import applied_edit
 from graph_slam_ros.measurements.types import Sighting, sighting_record
@@ -48,6 +47,7 @@ VERSION = 4
 _KINDS = {kind.name: kind for kind in (SE2, SE3, R1, R2, R3)}
 _AS_THEY_ARE = ("segments", "drives", "settings", "displacements", "processed", "drive")  # of a snapshot, in JSON
 _OF_EDGES = ("id", "vertices", "measured", "sqrt_information", "label", "source", "weight")
+_ROWS = {"id": "edge_row", "vertices": "vertex_rows"}  # as a table calls these: they are rows, not ids
 _OF_VERDICTS = ("keyframe", "statistic", "threshold", "numbers", "verdict", "reason")
 _OF_CHANGES = tuple(field.name for field in fields(VerdictChange))
 _OF_LANDMARKS = tuple(field.name for field in fields(Landmark) if field.name not in ("seen", "stamps"))
@@ -70,7 +70,7 @@ def write_map(file: Path, state: MapSnapshot) -> int:
             writer.add_message(channel, stamp_ns, data, stamp_ns, sequence)
 
     add("map", "json", iter([_as_json(_told(state))]))
-    add("landmarks", "json", (_as_json(_landmark(mark)) for mark in state.landmarks.values()))
+    add("landmarks", "json", (_as_json(_landmark(state.graph, mark)) for mark in state.landmarks.values()))
     for name, numbers in _columns(state):
         encoding = "<f8" if numbers.dtype.kind == "f" else "<i8"
         add(name, encoding, iter([np.ascontiguousarray(numbers, dtype=encoding).tobytes()]))
@@ -146,8 +146,7 @@ def _parts(file: Path, losses: list[str]) -> dict[str, list[Any]] | None:
 
 def _told(state: MapSnapshot) -> Told:
     """All of a map but its columns and landmarks."""
-    graph, bounded = state.graph, state.bounded
-    ids = {"vertex": graph.vertex_ids, "edge": graph.edge_ids}
+    graph, bounded, vertex, edge = state.graph, state.bounded, state.graph.vertex_ids, state.graph.edge_ids
     return {
         "type": "map",
         "version": VERSION,
@@ -155,31 +154,32 @@ def _told(state: MapSnapshot) -> Told:
         "tags": [tag_of(edge) for edge in graph.tables],
         "labels": graph.labels,
         "sources": graph.sources,
-        "next": {name: of.later for name, of in ids.items()},
+        "next": {"vertex": vertex.later, "edge": edge.later},
         "first": state.first_keyframe,
-        "frozen": [state.frozen, state.ledger.final],
-        "held": state.held,
+        "frozen": [vertex.first_from(state.frozen), edge.first_from(state.ledger.final)],
+        "held": [vertex.first_from(state.held[0]), edge.first_from(state.held[1])],
         "datum": state.datum,
         "used": [state.used_ns, state.source],
         "noise": factors_record(state.noise_factors),
         "calibration": factors_record(state.calibration),
         "edits": [one.record for one in state.edits],
         "gyro": None if state.gyro_bias is None else astuple(state.gyro_bias),
-        "condensed": None if bounded is None else _condensed(bounded),
+        "condensed": None if bounded is None else _condensed(graph, bounded),
         **{name: getattr(state, name) for name in _AS_THEY_ARE},
     }
 
 
-def _condensed(state: BoundedState) -> Told:
+def _condensed(graph: Graph, state: BoundedState) -> Told:
     """The state of a condensed map that is not in its graph."""
-    places = [
-        [cell, one.edge, one.place.visits, list(one.strikes.items()), one.place.linearized_at.numbers.tolist()]
-        for cell, several in state.places.items()
-        for one in several
-    ]
+    vertex, edge, places = graph.vertex_ids.row, graph.edge_ids.row, []
+    for cell, several in state.places.items():
+        for one in several:
+            strikes = [(vertex(mark), count) for mark, count in one.strikes.items()]
+            at = one.place.linearized_at.numbers.tolist()
+            places.append([cell, edge(one.edge), one.place.visits, strikes, at])
     return {
         "places": places,
-        "old": [astuple(one) for one in state.old],
+        "old": [(one.number, vertex(one.vertex), one.stamp_ns, one.T_odom_base) for one in state.old],
         "left": [state.keyframes, state.sightings],
         "scale": astuple(state.scale),
         "accepted": [[first, dict(of)] for first, of in state.accepted.items()],
@@ -187,28 +187,32 @@ def _condensed(state: BoundedState) -> Told:
     }
 
 
-def _landmark(mark: Landmark) -> Told:
-    seen = []
+def _landmark(graph: Graph, mark: Landmark) -> Told:
+    seen, vertex = [], graph.vertex_ids.row
     for one in mark.seen:
         at = one.where
-        where = [at.keyframe, at.vertex, at.stamp_ns, at.T_keyframe_base, at.covariance.tolist()]
-        seen.append([one.edge, one.topic, sighting_record(one.sighting), *where])
-    return {name: getattr(mark, name) for name in _OF_LANDMARKS} | ({"seen": seen} if seen else {})
+        where = [at.keyframe, vertex(at.vertex), at.stamp_ns, at.T_keyframe_base, at.covariance.tolist()]
+        seen.append([graph.edge_ids.row(one.edge), one.topic, sighting_record(one.sighting), *where])
+    told = {name: getattr(mark, name) for name in _OF_LANDMARKS} | {"vertex": vertex(mark.vertex)}
+    return told | ({"seen": seen} if seen else {})
 
 
 def _columns(state: MapSnapshot) -> Iterator[tuple[str, NDArray[Any]]]:
     graph, ledger = state.graph, state.ledger
     yield from (("kind", graph.kind.values), ("initial", graph.initial.values), ("values", state.values))
     yield from (("vertex_ids", graph.vertex_ids.early), ("edge_ids", graph.edge_ids.early))
+    yield "keyframes/id", graph.vertex_ids.rows(state.keyframes.ids)
+    yield "sightings/id", state.sighting_poses.ids
     for name, poses in (("keyframes", state.keyframes), ("sightings", state.sighting_poses)):
-        yield from ((f"{name}/id", poses.ids), (f"{name}/stamp_ns", poses.stamps_ns), (f"{name}/pose", poses.poses))
+        yield from ((f"{name}/stamp_ns", poses.stamps_ns), (f"{name}/pose", poses.poses))
     for edge, table in graph.tables.items():
-        yield from ((f"{tag_of(edge)}/{name}", getattr(table, name).values) for name in _OF_EDGES)
+        yield from ((f"{tag_of(edge)}/{name}", getattr(table, _ROWS.get(name, name)).values) for name in _OF_EDGES)
     yield from ((f"ledger/{name}", getattr(ledger, name).values) for name in _OF_VERDICTS)
     yield "ledger/residual", ledger.residuals
     for name in _OF_CHANGES:
         kind = np.float64 if name in ("statistic", "threshold") else np.int64
-        yield f"history/{name}", np.array([getattr(one, name) for one in ledger.history], dtype=kind)
+        numbers: NDArray[Any] = np.array([getattr(one, name) for one in ledger.history], dtype=kind)
+        yield f"history/{name}", ledger.ids.rows(numbers) if name == "edge" else numbers
 
 
 # -- what is read -----------------------------------------------------------------------------------------------------
@@ -216,20 +220,21 @@ def _columns(state: MapSnapshot) -> Iterator[tuple[str, NDArray[Any]]]:
 
 def _state(told: Told, marks: Sequence[Told], columns: Columns) -> MapSnapshot:
     graph = _graph(told, columns)
-    frozen, frozen_edges = told["frozen"]
+    (frozen, final), held, vertex, edge = told["frozen"], told["held"], graph.vertex_ids.of, graph.edge_ids.of
     used_ns, source = told["used"]
     first, gyro, condensed = told["first"], told["gyro"], told["condensed"]
     pose = _pose_of(graph)
     size = pose.size if pose else 3
+    columns["keyframes/id"] = graph.vertex_ids.of_all(columns["keyframes/id"])
     return MapSnapshot(
         graph=graph,
-        ledger=_ledger(columns, frozen_edges),
+        ledger=_ledger(graph, columns, final),
         values=columns["values"].copy(),
         keyframes=_poses(StampedPoses(Keyframe, size, first), "keyframes", columns),
         sighting_poses=_poses(StampedPoses(SightingPose, size), "sightings", columns),
-        landmarks={mark["name"]: _read_landmark(mark) for mark in marks},
-        frozen=frozen,
-        held=tuple(told["held"]),
+        landmarks={mark["name"]: _read_landmark(graph, mark) for mark in marks},
+        frozen=vertex(frozen),
+        held=(vertex(held[0]), edge(held[1])),
         datum=tuple(told["datum"]),
         used_ns=used_ns,
         source=source,
@@ -254,10 +259,10 @@ def _graph(told: Told, columns: Columns) -> Graph:
     for tag in told["tags"]:
         _add_edges(graph, tag, columns)
     for table in graph.tables.values():
-        graph.table_of_edge.values[table.id.values] = table.code
-        graph.row_of_edge.values[table.id.values] = np.arange(len(table))
-    graph.vertex_ids = LastingIds(columns["vertex_ids"].copy(), told["next"]["vertex"])
-    graph.edge_ids = LastingIds(columns["edge_ids"].copy(), told["next"]["edge"])
+        graph.table_of_edge.values[table.edge_row.values] = table.code
+        graph.row_of_edge.values[table.edge_row.values] = np.arange(len(table))
+    for name, of in (("vertex", graph.vertex_ids), ("edge", graph.edge_ids)):
+        of.put(columns[f"{name}_ids"].copy(), told["next"][name])
     return graph
 
 
@@ -271,7 +276,7 @@ def _add_edges(graph: Graph, tag: str, columns: Columns) -> None:
     measured, roots = of["measured"].reshape(count, -1), of["sqrt_information"].reshape(count, m, m)
     graph.add_edges(edge, vertices, measured, Gaussian(roots), graph.labels[0], graph.sources[0])
     for name in ("id", "label", "source", "weight"):
-        getattr(graph.tables[edge], name).values[:] = of[name]
+        getattr(graph.tables[edge], _ROWS.get(name, name)).values[:] = of[name]
 
 
 def _poses(out: StampedPoses[Any], name: str, columns: Columns) -> StampedPoses[Any]:
@@ -279,27 +284,28 @@ def _poses(out: StampedPoses[Any], name: str, columns: Columns) -> StampedPoses[
     return out
 
 
-def _ledger(columns: Columns, final: int) -> Ledger:
+def _ledger(graph: Graph, columns: Columns, final: int) -> Ledger:
     ledger, of = Ledger(), {name: columns[f"ledger/{name}"] for name in _OF_VERDICTS}
     residual = columns["ledger/residual"]
     is_judged = of["verdict"] != Verdict.NOT_EVALUATED
     ledger.enter(of["keyframe"], of["statistic"], of["numbers"], of["threshold"], residual, is_judged)
     ledger.verdict.values[:], ledger.reason.values[:] = of["verdict"], of["reason"]
+    ledger.ids.put(graph.edge_ids.early, graph.edge_ids.later)
     changes = (columns[f"history/{name}"].tolist() for name in _OF_CHANGES)
     ledger.history = [
-        VerdictChange(edge, keyframe, Verdict(verdict), Reason(reason), statistic, threshold)
+        VerdictChange(graph.edge_ids.of(edge), keyframe, Verdict(verdict), Reason(reason), statistic, threshold)
         for edge, keyframe, verdict, reason, statistic, threshold in zip(*changes, strict=True)
     ]
-    ledger.finish(final)
+    ledger.finish(graph.edge_ids.of(final))
     return ledger
 
 
-def _read_landmark(told: Told) -> Landmark:
-    mark = Landmark(**{name: told[name] for name in _OF_LANDMARKS})
+def _read_landmark(graph: Graph, told: Told) -> Landmark:
+    mark = Landmark(**{name: told[name] for name in _OF_LANDMARKS} | {"vertex": graph.vertex_ids.of(told["vertex"])})
     for edge, topic, sighting, keyframe, vertex, stamp_ns, pose, covariance in told.get("seen", ()):
         lists = {name: tuple(value) for name, value in sighting.items() if isinstance(value, list)}
-        where = PoseAtStamp(keyframe, vertex, stamp_ns, tuple(pose), np.array(covariance))
-        mark.seen.append(LandmarkEdge(edge, topic, Sighting(**sighting | lists), where))
+        where = PoseAtStamp(keyframe, graph.vertex_ids.of(vertex), stamp_ns, tuple(pose), np.array(covariance))
+        mark.seen.append(LandmarkEdge(graph.edge_ids.of(edge), topic, Sighting(**sighting | lists), where))
     mark.stamps = {one.where.stamp_ns for one in mark.seen}
     return mark
 
@@ -309,10 +315,12 @@ def _bounded(graph: Graph, told: Told) -> BoundedState:
     state = BoundedState(keyframes=keyframes, sightings=sightings, scale=VisitScale(*told["scale"]))
     state.accepted |= {first: Counter(of) for first, of in told["accepted"]}
     state.begins |= dict(told["begins"])
+    of = graph.vertex_ids.of
     for cell, number, visits, strikes, at in told["places"]:
-        place = place_of(graph.edge(number), np.array(at, dtype=np.float64), visits, dict(strikes))
+        edge, where = graph.edge(graph.edge_ids.of(number)), np.array(at, dtype=np.float64)
+        place = place_of(edge, where, visits, {of(mark): count for mark, count in strikes})
         state.places.setdefault(tuple(cell), []).append(place)
-    state.old += [OldKeyframe(number, vertex, stamp, tuple(pose)) for number, vertex, stamp, pose in told["old"]]
+    state.old += [OldKeyframe(number, of(vertex), stamp, tuple(pose)) for number, vertex, stamp, pose in told["old"]]
     return state
 
 

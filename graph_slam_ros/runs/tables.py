@@ -209,24 +209,21 @@ def counters_of(summary: Mapping[str, Any]) -> Counters:
 
 def accepted_lately(slam: GraphSlam) -> dict[str, tuple[int, int]]:
     """Return by input how many of its edges among the newest of the graph are believed, and how many there are."""
-    count = slam.graph.edge_count
-    accepted, judged = _by_input(slam, np.arange(max(0, count - _LATELY), count))
+    accepted, judged = _by_input(slam, slam.graph.edge_ids.since()[-_LATELY:])
     return {name: (accepted[name], times) for name, times in judged.items()}
 
 
 def _accepted_by_input(slam: GraphSlam, first: int) -> Counter[str]:
     """Accepted edges of landmarks, fixes and closures by input that were judged first at a keyframe or later."""
-    is_since = np.ones(slam.graph.edge_count, dtype=bool)
-    is_since[: len(slam.ledger)] = slam.ledger.keyframe.values >= first
-    return _by_input(slam, np.flatnonzero(is_since))[0]
+    edges, ledger = slam.graph.edge_ids.since(), slam.ledger
+    return _by_input(slam, np.delete(edges, np.flatnonzero(ledger.keyframe.values < first)))[0]
 
 
 def _by_input(slam: GraphSlam, edges: Index) -> tuple[Counter[str], Counter[str]]:
     """Count those edges that are of landmarks, fixes and closures, by input: the accepted ones, and all."""
-    graph, is_out = slam.graph, np.zeros(slam.graph.edge_count, dtype=bool)
-    is_out[: len(slam.ledger)] = np.isin(slam.ledger.verdict.values, OUTSIDE)
+    graph, out = slam.graph, slam.ledger.ids.since()[np.isin(slam.ledger.verdict.values, OUTSIDE)]
     judged = edges[graph.has_label(edges, CANDIDATES)]
-    accepted, every = (Counter(map(graph.source_of, some.tolist())) for some in (judged[~is_out[judged]], judged))
+    accepted, every = (Counter(map(graph.source_of, some.tolist())) for some in (np.setdiff1d(judged, out), judged))
     return accepted, every
 
 
@@ -238,7 +235,7 @@ def _drives(slam: GraphSlam) -> list[dict[str, int]]:
 
 
 def numbered(slam: GraphSlam) -> tuple[list[int], str]:
-    """The number of each vertex, and the table of all vertices.
+    """The number of each vertex, at its id, and the table of all vertices.
 
     Poses are numbered from 0 in order of time, landmarks after them, because other tools read odometry from that order.
     A vertex that is not part of the map any more is ``unused``: a deleted landmark.
@@ -250,11 +247,9 @@ def numbered(slam: GraphSlam) -> tuple[list[int], str]:
         names.append((k, keyframe.vertex, "keyframe", keyframe.stamp_ns, str(k)))
     for k, (name, landmark) in enumerate(slam.landmarks.items(), start=len(slam.keyframes)):
         names.append((k, landmark.vertex, "landmark", "", name))
-    named = {vertex for _, vertex, *_ in names}
-    rest = sorted(set(range(slam.graph.vertex_count)) - named)
-    more = enumerate(rest, start=len(slam.keyframes) + len(slam.landmarks))
-    names += [(k, vertex, "unused", "", "") for k, vertex in more]
-    ids = [0] * slam.graph.vertex_count
+    rest = np.setdiff1d(slam.graph.vertex_ids.since(), [vertex for _, vertex, *_ in names]).tolist()
+    names += [(k, vertex, "unused", "", "") for k, vertex in enumerate(rest, len(slam.keyframes) + len(slam.landmarks))]
+    ids = [0] * slam.graph.vertex_ids.next
     rows = ["id,vertex,stamp_ns,name"]
     for file_id, vertex, what, stamp, name in names:
         ids[vertex] = file_id

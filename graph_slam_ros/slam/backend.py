@@ -49,8 +49,8 @@ class Backend:
     ----------
     graph, solver : the problem; decisions : the outlier gate, which judges edges
     noise : adds edges to the graph, with noise in scale
-    handed_over : vertices and edges of the graph that the solver has
-    frozen, frozen_edges : the first so many vertices, and verdicts on the first so many edges, stay for good
+    handed_over : the solver has the vertices and edges of the graph below these ids
+    frozen, frozen_edges : vertices, and verdicts on edges, below these ids stay for good
     held : the same while the robot is only located (``hold_map``): vertices and edges; zeros otherwise
     holds_back : whether what does not fit stays out, and verdicts stay as they are, until somebody has decided
     trusts_sightings : whether a new sighting that fits is believed; else it waits until it is compared with all else
@@ -102,9 +102,9 @@ class Backend:
 
         Parameters
         ----------
-        held : so many vertices and edges are held, besides those of a frozen map
+        held : vertices and edges below these ids are held, besides those of a frozen map
         """
-        self.solver.add(vertices, range(self.graph.edge_count))
+        self.solver.add(vertices, self.graph.edge_ids.since())
         self.solver.start_at(values)
         for vertex in vertices:
             if vertex < self.frozen:
@@ -113,7 +113,7 @@ class Backend:
             self._hold(*held)
         if self._config.noise_scale != "estimated":
             self.use_noise({})
-        self.handed_over = self.graph.vertex_count, self.graph.edge_count
+        self.handed_over = self.graph.vertex_ids.next, self.graph.edge_ids.next
         report = self.solver.optimize(self.solver.settings.until_still())  # what is believed was decided before
         self.decisions.recalibrate()
         self.cancel_search()
@@ -123,7 +123,7 @@ class Backend:
         """Fix all present vertices, and the verdicts on all present edges."""
         self.hand_over()
         self.cancel_search()
-        self._hold(self.graph.vertex_count, len(self.ledger))
+        self._hold(self.graph.vertex_ids.next, self.ledger.ids.next)
 
     def _hold(self, vertices: int, edges: int) -> None:
         self.held = vertices, edges
@@ -144,8 +144,8 @@ class Backend:
         if self.is_handed_over:
             return
         vertices, edges = self.handed_over
-        self.solver.add(range(vertices, self.graph.vertex_count), range(edges, self.graph.edge_count))
-        self.handed_over = self.graph.vertex_count, self.graph.edge_count
+        self.solver.add(self.graph.vertex_ids.since(vertices), self.graph.edge_ids.since(edges))
+        self.handed_over = self.graph.vertex_ids.next, self.graph.edge_ids.next
 
     def gate_new(self, keyframe: int) -> None:
         """Judge new edges by their own noise. Those that do not fit are held back for a comparison with all others."""
@@ -228,7 +228,7 @@ class Backend:
         self.noise.factors = factors
         fresh = Solver(self.graph, self.solver.settings)
         fresh.start_at(before.values)
-        fresh.add(before.vertices, np.arange(handed_over[1]))
+        fresh.add(before.vertices, self.graph.edge_ids.since(0, handed_over[1]))
         for vertex in before.held.tolist():
             fresh.hold(vertex)
         with suppress(Exception):
@@ -240,7 +240,7 @@ class Backend:
 
     def noise_scale(self, keyframes: StampedPoses[Keyframe], labels: Container[str] = CLASSES) -> list[NoiseScale]:
         """Estimate the scale of the noise of some classes without changing anything."""
-        stamps = np.zeros(self.graph.vertex_count, dtype=np.int64)
+        stamps = np.zeros(self.graph.vertex_ids.next, dtype=np.int64)
         stamps[keyframes.ids] = keyframes.stamps_ns
         edges = range(self.first_free_edge, self.handed_over[1])
         return estimate_noise(self.graph, self.solver, self.noise.factors, stamps, edges, labels)
@@ -281,7 +281,7 @@ class Backend:
     @property
     def is_handed_over(self) -> bool:
         """Return whether the solver has all of the graph."""
-        return self.handed_over == (self.graph.vertex_count, self.graph.edge_count)
+        return self.handed_over == (self.graph.vertex_ids.next, self.graph.edge_ids.next)
 
     @property
     def is_quiet(self) -> bool:
@@ -291,15 +291,14 @@ class Backend:
 
     def note_condensed(self, keyframe: int) -> None:
         """Note edges that the solver has already: nobody doubts them."""
-        self.handed_over = self.graph.vertex_count, self.graph.edge_count
+        self.handed_over = self.graph.vertex_ids.next, self.graph.edge_ids.next
         self.decisions.gate_new(self.handed_over[1], keyframe)
 
-    def renumber(self, new: Index) -> None:
-        """Take over new ids of edges, by old ones, after graph and solver were compacted."""
-        self.decisions.renumber(new)
-        self.frozen_edges = int(np.count_nonzero(new[: self.frozen_edges] >= 0))
-        self.held = self.held[0], int(np.count_nonzero(new[: self.held[1]] >= 0))
-        self.handed_over = self.graph.vertex_count, self.graph.edge_count
+    def keep(self, vertices: Index, edges: Index) -> None:
+        """Remove all other vertices and edges from the graph."""
+        self.solver.keep(vertices, edges)
+        self.ledger.keep(edges)
+        self.decisions.recount()
         self._rivals = ()
         self.cancel_search()
 
@@ -405,10 +404,11 @@ class Backend:
 def moved_values(graph: Graph, values: Array, T_new_old: Numbers, space: Geometry) -> Array:
     """Stored numbers of all vertices of a map that is moved rigidly."""
     out = values.copy()
+    vertices = graph.vertex_ids.since()
     for kind in (space.pose, space.point):
         if kind in graph.kinds:
-            of_kind = graph.kind.values == graph.kinds.index(kind)
-            at = graph.offset.values[of_kind][:, None] + np.arange(kind.size)
+            of_kind = vertices[graph.kind_codes(vertices) == graph.kinds.index(kind)]
+            at = graph.begins(of_kind)[:, None] + np.arange(kind.size)
             move = space.group.compose if kind is space.pose else space.group.act
             out[at] = np.stack(move(T_new_old, tuple(values[at].T)), axis=-1)
     return out

@@ -21,7 +21,7 @@ from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
 from graph_slam_ros.slam.frontend.keyframes import Keyframe
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.slam.landmarks.landmark_frontend import LandmarkFrontend
-from graph_slam_ros.slam.lifelong.condenser import CHAIN, Condensed, Condenser, RemovedPose, compact, seen_from
+from graph_slam_ros.slam.lifelong.condenser import CHAIN, Condensed, Condenser, RemovedPose, seen_from
 from graph_slam_ros.slam.lifelong.place import Cell
 from graph_slam_ros.slam.lifelong.state import Left, OldKeyframe, Records, record_type
 from graph_slam_ros.slam.robust.gating import CANDIDATES
@@ -90,7 +90,7 @@ class BoundedMap:
 
     Parameters
     ----------
-    backend : its graph, solver and ``bounded`` are changed; all other parts get the new ids
+    backend : its graph, solver and ``bounded`` are changed; all other parts forget what has left
     """
 
     def __init__(
@@ -203,7 +203,7 @@ class BoundedMap:
             return out
         code = graph.labels.index("landmarks")
         for table in graph.tables.values():
-            ends = table.vertices.values
+            ends = table.vertices
             if ends.shape[1] > 1:
                 is_one = (table.label.values == code) & (table.weight.values > 0.0)
                 out.update(ends[is_one & (ends[:, 0] >= first) & (ends[:, 0] <= last), 1].tolist())
@@ -215,44 +215,39 @@ class BoundedMap:
 
     def _left(self, rows: Sequence[RemovedPose]) -> Records:
         """Return the records of the keyframes that leave."""
-        keyframes, lasting = self._frontend.path.keyframes, self._backend.graph.vertex_ids.of
+        keyframes = self._frontend.path.keyframes
         left = np.zeros(len(rows), dtype=record_type(self._space))
         for k, row in enumerate(rows):
             one = keyframes[keyframes.first + k]
-            left[k] = one.stamp_ns, lasting(row.vertex), lasting(row.base), row.T_base_vertex, one.T_odom_base
+            left[k] = one.stamp_ns, row.vertex, row.base, row.T_base_vertex, one.T_odom_base
         return left
 
     # -- compaction --------------------------------------------------------------------------------------------------
 
     def _compacted(self, rows: Sequence[RemovedPose], left: Left, end: int) -> Condensation:
-        """Remove what has left from the graph, and give all parts the new ids."""
-        keyframes, graph = self._frontend.path.keyframes, self._backend.graph
+        """Remove what has left from the graph, and let all parts forget it."""
+        keyframes = self._frontend.path.keyframes
         for k, row in enumerate(rows):
             if row.base == row.vertex:
                 one = keyframes[keyframes.first + k]
                 self.state.old.append(OldKeyframe(keyframes.first + k, row.vertex, one.stamp_ns, one.T_odom_base))
         before = self.state.sightings
         vertices, edges = self._staying(int(keyframes.ids[end - keyframes.first]))
-        gone = np.setdiff1d(np.arange(graph.edge_count), edges)
+        gone = np.setdiff1d(self._backend.graph.edge_ids.since(), edges)
         archive = archived(self._backend, keyframes, gone, self._landmarks.map.names())
         out = Condensation(left, keyframes.first, before, archive)
-        new = compact(self._backend.solver, vertices, edges)
-        self._backend.renumber(new.edges)
-        self._frontend.forget_before(end, new.vertices[keyframes.ids[end - keyframes.first :]])
-        self.condenser.renumber(new)
-        self.state.old[:] = [
-            OldKeyframe(one.number, int(new.vertices[one.vertex]), one.stamp_ns, one.T_odom_base)
-            for one in self.state.old
-        ]
+        self._backend.keep(vertices, edges)
+        self._frontend.forget_before(end)
+        self.condenser.forget_removed()
         for drive in self._frontend.path.drives:
             if out.first <= drive < end:
                 self.state.begins[drive] = before + int(np.sum(left.sightings["of"] < drive))
         self.state.keyframes, self.state.sightings = end, before + len(left.sightings)
         self._note_accepted(out.edges)
-        self._landmarks.forget_before(end, new.vertices, new.edges)
+        self._landmarks.forget_before(end)
         self._anchor.restore()
-        self._kidnaps.renumber(new.vertices, new.edges, int(self._frontend.path.keyframes.ids[0]))
-        self._solution.renumber()
+        self._kidnaps.forget_before(int(self._frontend.path.keyframes.ids[0]))
+        self._solution.solve_rest()
         return out
 
     def _note_accepted(self, edges: Sequence[CondensedEdge]) -> None:
@@ -270,17 +265,17 @@ class BoundedMap:
         those in whose place another has come.
         """
         backend, graph = self._backend, self._backend.graph
-        is_vertex = np.zeros(graph.vertex_count, dtype=bool)
-        is_vertex[backend.solver.vertices] = True
-        is_vertex[: max(backend.frozen, backend.held[0])] = True
-        is_edge = np.zeros(graph.edge_count, dtype=bool)
+        every = graph.vertex_ids.since()
+        vertices = np.union1d(backend.solver.vertices, every[every < max(backend.frozen, backend.held[0])])
+        staying = [np.empty(0, dtype=np.int64)]
         for table in graph.tables.values():
-            ids, ends = table.id.values, table.vertices.values
-            is_young = ((ends >= window) & is_vertex[ends]).any(axis=1)
-            is_edge[ids] = is_vertex[ends].all(axis=1) & ((table.weight.values > 0.0) | is_young)
+            ids, ends = table.ids, table.vertices
+            is_kept = np.isin(ends, vertices)
+            is_young = ((ends >= window) & is_kept).any(axis=1)
+            is_edge = is_kept.all(axis=1) & ((table.weight.values > 0.0) | is_young)
             is_superseded = (table.weight.values == 0.0) & graph.has_label(ids, _SUMMED)
-            is_edge[ids] |= (ids < backend.first_free_edge) & ~is_superseded
-        return np.flatnonzero(is_vertex), np.flatnonzero(is_edge)
+            staying.append(ids[is_edge | ((ids < backend.first_free_edge) & ~is_superseded)])
+        return vertices, np.sort(np.concatenate(staying))
 
     def _sightings(self, end: int) -> Records:
         """Records of the poses at which something was seen from the keyframes that leave."""
@@ -327,21 +322,21 @@ def archived(
         if edge.label in (PLACES, CHAIN):
             continue
         newest = np.searchsorted(keyframes.ids, edge.vertices, side="right").max() - 1  # landmarks came after it
-        verdict = ledger.verdict_of(number)
+        verdict, row = ledger.verdict_of(number), ledger.ids.row(number)
         is_in = verdict in INSIDE or verdict is Verdict.NOT_EVALUATED
         out.append(
             CondensedEdge(
-                graph.edge_ids.of(number),
+                number,
                 edge.label,
                 edge.source,
                 next((names[vertex] for vertex in edge.vertices if vertex in names), ""),
-                ledger.keyframe.values.item(number),
+                ledger.keyframe.values.item(row),
                 int(keyframes.stamps_ns[max(newest, 0)]),
-                ledger.statistic.values.item(number),
-                ledger.numbers.values.item(number),
-                ledger.threshold.values.item(number),
+                ledger.statistic.values.item(row),
+                ledger.numbers.values.item(row),
+                ledger.threshold.values.item(row),
                 verdict,
-                Reason(ledger.reason.values.item(number)),
+                Reason(ledger.reason.values.item(row)),
                 CONDENSED if is_in else EXPIRED,
             )
         )

@@ -70,13 +70,11 @@ class Edits:
             self._counters.count("closures", "cleared", len(closures))
         return bool(closures)
 
-    def _remove_edge(self, lasting: int, keyframe: int) -> str:
+    def _remove_edge(self, edge: int, keyframe: int) -> str:
         """Remove an edge, and a landmark with the last edge that determines it; returns what is counted."""
         graph, ledger = self._backend.graph, self._backend.ledger
-        edge = graph.edge_ids.find(lasting) if lasting >= 0 else lasting
         if reason := why_not_removed(graph, ledger, edge):
             return reason
-        assert edge is not None
         vertex = landmark_of(graph, edge)
         if vertex is not None and determining(graph, ledger, vertex) == [edge]:
             name = next((name for name, mark in self._landmarks.known.items() if mark.vertex == vertex), "")
@@ -102,7 +100,7 @@ class Edits:
 def standing_edges(graph: Graph, ledger: Ledger, vertex: int) -> list[int]:
     """The edges of a vertex that have not been withdrawn, whether or not they are believed."""
     tables = graph.tables.values()
-    found = [table.at(np.flatnonzero((table.vertices.values == vertex).any(axis=1))).ids for table in tables]
+    found = [table.at(np.flatnonzero((table.vertices == vertex).any(axis=1))).ids for table in tables]
     return [edge for edge in sorted(int(e) for ids in found for e in ids) if not ledger.is_withdrawn(edge)]
 
 
@@ -119,11 +117,11 @@ def anchors(graph: Graph, ledger: Ledger) -> list[int]:
     return [edge for edge in [*graph.edges_of("anchor").tolist(), *by_hand] if not ledger.is_withdrawn(edge)]
 
 
-def why_not_removed(graph: Graph, ledger: Ledger, edge: int | None) -> str:
-    """Return the reason why an edge, by row, cannot be removed; empty where it can."""
-    if edge is None:
-        reason = "condensed_in_map"
-    elif not 0 <= edge < graph.edge_count or ledger.is_withdrawn(edge):
+def why_not_removed(graph: Graph, ledger: Ledger, edge: int) -> str:
+    """Return the reason why an edge cannot be removed; empty where it can."""
+    if not graph.edge_ids.has(edge):
+        reason = "condensed_in_map" if 0 <= edge < graph.edge_ids.next else "unknown_edge"
+    elif ledger.is_withdrawn(edge):
         reason = "unknown_edge"
     elif graph.label_of(edge) not in (*CANDIDATES, BY_HAND) or anchors(graph, ledger) == [edge]:
         reason = "needed_edge"

@@ -49,7 +49,7 @@ class FailureGuard:
         self._backend, self._counters, self._landmarks = backend, counters, landmarks
         self._graph, self._solver = backend.graph, backend.solver
         self._good = np.empty(0)  # stored numbers of all vertices after the last solve that succeeded
-        self._good_vertices = self._good_edges = 0  # that it had
+        self._good_vertices = self._good_edges = 0  # it had those below
         self._in_a_row = 0  # failures since
         self._undetermined = set[int]()  # vertices that these named
 
@@ -94,8 +94,8 @@ class FailureGuard:
 
     def note_good(self) -> None:
         """Remember the present estimate as good."""
-        self._good, self._good_vertices = self._solver.values, self._graph.vertex_count
-        self._good_edges, self._in_a_row, self.failing = self._graph.edge_count, 0, ""
+        self._good, self._good_vertices = self._solver.values, self._graph.vertex_ids.next
+        self._good_edges, self._in_a_row, self.failing = self._graph.edge_ids.next, 0, ""
         self._undetermined.clear()
 
     def note_moved(self) -> None:
@@ -124,7 +124,7 @@ class FailureGuard:
         """Remove vertices that lost their edges by a fault, and are undetermined."""
         vertices = self._solver.vertices
         unmeasured = set(vertices[vertices >= self._good_vertices].tolist())
-        for edge in range(self._good_edges, self._graph.edge_count):
+        for edge in self._graph.edge_ids.since(self._good_edges).tolist():
             unmeasured.difference_update(self._graph.edge(edge).vertices)
         for vertex in unmeasured:
             self._solver.remove(vertex)

@@ -73,7 +73,7 @@ class FoundFactors:
 
     def _model(self) -> MeasurementModel:
         graph, keyframes = self._backend.graph, self._frontend.path.keyframes
-        edges = range(self._backend.first_free_edge, graph.edge_count)
+        edges = range(self._backend.first_free_edge, graph.edge_ids.next)
         return MeasurementModel(self._config.space, graph, self._origins, keyframes.ids, keyframes.stamps_ns, edges)
 
     def _correct(
@@ -114,7 +114,7 @@ class FoundFactors:
             T_keyframe_base = model.scaled(tuple(seen.T_keyframe_base.T), values)
             z = _exact(model.from_pose(seen, seen.seen, T_keyframe_base))
             changes.append((seen, z, _exact(model.roots_from_pose(seen, T_keyframe_base))))
-            places = self._origins.places(seen.table.id.values[seen.rows])
+            places = self._origins.places(seen.table.at(seen.rows).ids)
             known = places >= 0
             origins.append((places[known], _exact(np.stack(T_keyframe_base, axis=-1)[known])))
         for edges, z, roots in changes:

@@ -157,7 +157,7 @@ class GraphSlam(MapView):
         begins_segment = frontend.begins_segment(step)
         self._use_reached(frontend.integrate(step))
         if begins_segment:
-            self._kidnaps.begin_segment(self.graph.vertex_count, step.stamp_ns)
+            self._kidnaps.begin_segment(self.graph.vertex_ids.next, step.stamp_ns)
             if frontend.begin_segment(step):
                 self._solve()  # at the pose that was given
             self._solve_if_due()

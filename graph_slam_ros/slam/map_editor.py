@@ -60,7 +60,7 @@ class MapEditor:
         GraphSlamError
             It cannot be applied to this map; the text names the edit.
         """
-        state, first = self.state, self._graph.edge_count
+        state, first = self.state, self._graph.edge_ids.next
         self._out = []
         try:
             if any(one.edit.name == edit.name for one in state.edits):
@@ -73,16 +73,15 @@ class MapEditor:
             of += [f"{key} {edit.arguments[key]}" for key in ("edge", "landmark") if key in edit.arguments]
             name = f"{edit.name} ({', '.join(of)})" if of else edit.name
             raise GraphSlamError(f"edit {name}: {error}") from None
-        added, number = range(first, self._graph.edge_count), self._graph.edge_ids.of
-        out, new = (tuple(map(number, some)) for some in (self._out, added))
-        state.edits.append(AppliedEdit(edit, self._newest, out, new))
+        new = tuple(self._graph.edge_ids.since(first).tolist())
+        state.edits.append(AppliedEdit(edit, self._newest, tuple(self._out), new))
 
     def _apply(self, do: str, a: dict[str, Any]) -> None:
         match do:
             case "remove_edge":
-                self._remove_edge(self._row(a["edge"]))
+                self._remove_edge(a["edge"])
             case "let_in_edge":
-                self._let_in(self._row(a["edge"]))
+                self._let_in(a["edge"])
             case "add_closure":
                 self._add_closure(self._at(a["from_keyframe"]), self._at(a["to_keyframe"]), a)
             case "remove_landmark":
@@ -104,13 +103,6 @@ class MapEditor:
 
     # -- edges -------------------------------------------------------------------------------------------------------
 
-    def _row(self, lasting: int) -> int:
-        """The row of an edge in the graph, by its id."""
-        row = self._graph.edge_ids.find(lasting)
-        if row is None or row >= self._graph.edge_count:
-            raise GraphSlamError(_WHY["condensed_in_map" if row is None else "unknown_edge"])
-        return row
-
     def _remove_edge(self, edge: int) -> None:
         graph, ledger = self._graph, self._ledger
         if reason := why_not_removed(graph, ledger, edge):
@@ -123,6 +115,8 @@ class MapEditor:
 
     def _let_in(self, edge: int) -> None:
         """An edge without a loss, which is never judged, replaces an edge that may be out."""
+        if not self._graph.edge_ids.has(edge):
+            raise GraphSlamError(_WHY[why_not_removed(self._graph, self._ledger, edge)])
         one = self._graph.edge(edge)
         if one.label not in CANDIDATES or edge < self._ledger.final:
             raise GraphSlamError(_WHY["held_in_map" if one.label in CANDIDATES else "needed_edge"])
@@ -144,7 +138,7 @@ class MapEditor:
         """Take edges out for good, and the sightings of landmarks that they were made of."""
         self._graph.set_weights(np.array(edges, dtype=np.int64), 0.0)
         for edge in edges:
-            statistic = float(self._ledger.statistic.values[edge])
+            statistic = float(self._ledger.statistic.values[self._ledger.ids.row(edge)])
             self._ledger.note(edge, self._newest, Verdict.REJECTED, Reason.BY_HAND, statistic)
         self._out += edges
         gone = set(edges)
@@ -166,12 +160,12 @@ class MapEditor:
         one, noise = graph.edge(edge), Gaussian(graph.edge(edge).sqrt_information)
         copy = graph.add_edge(one.type, ends, measured or one.measured, noise, one.label, one.source)
         graph.set_weights(np.array([copy]), one.weight)
-        self._judge(copy, ledger.verdict_of(edge), Reason(int(ledger.reason.values[edge])))
+        self._judge(copy, ledger.verdict_of(edge), Reason(int(ledger.reason.values[ledger.ids.row(edge)])))
         return copy
 
     def _judge(self, edge: int, verdict: Verdict, reason: Reason) -> None:
         """Enter the verdict on a new edge, with its residual at the present estimate."""
-        residual, chi2, numbers = evaluated(self._graph, self.state.values, np.array([edge]))
+        residual, chi2, numbers = evaluated(self._graph, self.state.values, self._graph.edge_ids.existing([edge]))
         limit = np.array([quantile(self._gate, int(numbers[0]))])
         is_judged = np.array([verdict is not Verdict.NOT_EVALUATED])
         self._ledger.enter(self._newest, chi2, numbers, limit, residual, is_judged)
@@ -310,9 +304,9 @@ class MapEditor:
     def _refuse_located(self, values: Array, moved: set[int], T_new_old: Numbers) -> None:
         """Raise GraphSlamError where measurements say where the map lies."""
         graph, verdict = self._graph, self._ledger.verdict.values
-        edges = np.setdiff1d(np.flatnonzero(~np.isin(verdict, OUTSIDE)), list(moved))
+        edges = np.setdiff1d(self._ledger.ids.since()[~np.isin(verdict, OUTSIDE)], list(moved))
         edges = edges[~graph.has_label(edges, _FOLLOWS)]
-        before, after = (evaluated(graph, x, edges)[1] for x in (self.state.values, values))
+        before, after = (evaluated(graph, x, graph.edge_ids.existing(edges))[1] for x in (self.state.values, values))
         rounding = _SAME * (1.0 + math.hypot(*T_new_old[: self._space.dimensions]))
         other = edges[np.abs(after - before) > rounding * np.maximum(1.0, before)].tolist()
         if other:

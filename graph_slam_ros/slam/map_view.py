@@ -381,7 +381,7 @@ class MapView:
 
     @property
     def frozen(self) -> int:
-        """The number of vertices of a frozen map; they come first, and are held."""
+        """Vertices below this id are of a frozen map, and held."""
         return self.backend.frozen
 
     @property

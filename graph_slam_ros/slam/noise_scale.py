@@ -308,9 +308,9 @@ class _Block:
     def __init__(
         self, table: EdgeTable, rows: Index, label: str, solver: Solver, values: Array, losses: Losses
     ) -> None:
-        self.ends, self.measured = table.vertices.values[rows], table.measured.values[rows]
-        offset, code = solver.graph.offset.values, int(losses.codes(table, rows[:1])[0])
-        self.residual, self._jacobian = table.type.linearize(values, offset[self.ends], self.measured)
+        self.ends, self.measured = table.at(rows).vertices, table.measured.values[rows]
+        begins, code = solver.graph.begins(self.ends), int(losses.codes(table, rows[:1])[0])
+        self.residual, self._jacobian = table.type.linearize(values, begins, self.measured)
         self.roots = roots = table.sqrt_information.values[rows]
         chi2 = np.sum(np.einsum("nij,nj->ni", roots, self.residual) ** 2, axis=1)
         self._solver, self._dof = solver, table.type.dofs[0]

@@ -25,8 +25,8 @@ class MapSnapshot:
     Attributes
     ----------
     values : stored numbers of all vertices, as ``Graph.initial``: where solving begins
-    frozen : the first so many vertices stay there, and verdicts on what is between them as they are
-    held : so many vertices and edges were held when localization began (``map.localize``); zeros where the map grows
+    frozen : vertices below this id stay there, and verdicts on what is between them as they are
+    held : vertices and edges below these ids were held when localization began (``map.localize``), or zeros
     datum : of fixes on earth, as in ``Fix``
     settings : parameters that were changed on the way, by name
     displacements : alarms by then, of all drives, as in ``run.json``
@@ -97,12 +97,12 @@ class MapSnapshot:
         """
         for name in [name for name, mark in self.landmarks.items() if mark.is_tentative]:
             self._prune(name)
-        self.frozen = self.graph.vertex_count
-        self.ledger.finish(self.graph.edge_count)
+        self.frozen = self.graph.vertex_ids.next
+        self.ledger.finish(self.graph.edge_ids.next)
 
     def _prune(self, name: str) -> None:
         mark, last = self.landmarks.pop(name), self.keyframe_count - 1
         for edge in [one.edge for one in mark.seen]:
             self.graph.set_weights(np.array([edge]), 0.0)
-            statistic = float(self.ledger.statistic.values[edge])
+            statistic = float(self.ledger.statistic.values[self.ledger.ids.row(edge)])
             self.ledger.note(edge, last, Verdict.REJECTED, Reason.WITHDRAWN, statistic)

@@ -42,7 +42,7 @@ class Solution:
     solves : that succeeded
     report : of the last solve of everything
     correction : of the last solve
-    vertices : the first so many were part of the last solve; 0 where it failed
+    vertices : those below this id were part of the last solve; 0 where it failed
     resting : observations at rest since the last solve
     """
 
@@ -52,7 +52,7 @@ class Solution:
         self.report: Report | None = None
         self.correction = Correction()
         self.vertices = self.resting = 0
-        self._edges = 0  # that the last solve had
+        self._edges = 0  # the last solve had those below this id
         self._keyframes = 0  # when the last solve was tried
         self._T_map_odom = space.identity  # by the last solve
 
@@ -87,8 +87,8 @@ class Solution:
         """Return whether the last solve succeeded and has all of the graph."""
         return (self.vertices, self._edges) == self._backend.handed_over and self._backend.solver.is_current
 
-    def renumber(self) -> None:
-        """Take over the ids of a graph that was compacted, and solve it."""
+    def solve_rest(self) -> None:
+        """Solve a graph of which a part has left."""
         self.guard.note_good()
         self.vertices, self._edges = self._backend.handed_over
         self.guard.solve(self._backend.solver.update, self._keyframes - 1)
@@ -118,7 +118,7 @@ class Solution:
     def _fits(self) -> list[tuple[float, int]]:
         """Return (chi2 per degree of freedom, edge) of the new edges with the worst fit, which may move the map."""
         self._backend.hand_over()
-        edges = range(self._edges, self._backend.handed_over[1])
+        edges = self._backend.graph.edge_ids.since(self._edges).tolist()
         chi2, numbers = self._backend.solver.chi2_of(edges)
         fit = chi2 / numbers
         return [(float(fit[k]), edges[k]) for k in np.argsort(-fit, kind="stable")[:_BLAMED].tolist()]

@@ -66,7 +66,7 @@ class TrialFits:
         self._landmarks, self._anonymous = landmarks.map, landmarks.anonymous
         self._kidnaps, self._counters, self._executor = kidnaps, counters, executor
         self._graph, self._solver = backend.graph, backend.solver
-        self._first_keyframe, self._first_edge = first_keyframe, backend.graph.edge_count
+        self._first_keyframe, self._first_edge = first_keyframe, backend.graph.edge_ids.next
         self._due = FIRST_DUE
         self._jobs = list[tuple[int, Trial]]()  # each with the keyframe from which on its outcome counts
         self._fits: Fits | None = None
@@ -93,7 +93,7 @@ class TrialFits:
         trial = self._started(is_thorough=is_of_everything)
         if trial is not None:
             if is_of_everything:
-                self._jobs, self._of_edges = [], self._graph.edge_count
+                self._jobs, self._of_edges = [], self._graph.edge_ids.next
             self._jobs = [*self._jobs[-1:], (counts_from, trial)]  # each holds a copy of the map
 
     def _started(self, *, is_thorough: bool = True) -> Trial | None:
@@ -190,7 +190,7 @@ class TrialFits:
     def uncorrected(self) -> list[Uncorrected]:
         """Return what is wrong in the map as it is now."""
         self._compute()
-        is_newest = self._of_edges == self._graph.edge_count
+        is_newest = self._of_edges == self._graph.edge_ids.next
         return self._with_whole(self._off(self._fits if is_newest else self._trial()()))
 
     def _with_whole(self, now: list[Uncorrected]) -> list[Uncorrected]:

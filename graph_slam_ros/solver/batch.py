@@ -112,7 +112,7 @@ class BatchProblem:
         for b in linearize(self.graph, self.tree.value, self.rows, losses):
             if refuse:
                 refuse_nonfinite(b)
-            store(self.tree, b.rows, b.table.id.values, b.residual, b.jacobian)
+            store(self.tree, b.rows, b.table.edge_row.values, b.residual, b.jacobian)
             self.chi2 += float(b.chi2.sum())
             self.cost += float(b.cost.sum())
 
@@ -120,7 +120,7 @@ class BatchProblem:
         """Find the step of all unknowns, if the edges determine it; returns its largest component."""
         vertex = eliminate(self.tree, self._cliques, damping)
         if vertex != NOTHING:
-            raise undetermined(vertex)
+            raise undetermined(self.graph, vertex)
         step_all(self.tree, self._cliques)
         return float(np.abs(self.tree.step).max(initial=0.0))
 
@@ -142,7 +142,7 @@ class BatchProblem:
         for table, of_table in self.rows.items():
             for first in range(0, len(of_table), CHUNK):
                 rows = of_table[first : first + CHUNK]
-                ends = np.repeat(table.vertices.values[rows], table.type.dofs, axis=1)
+                ends = np.repeat(table.vertex_rows.values[rows], table.type.dofs, axis=1)
                 within = np.concatenate([np.arange(dof) for dof in table.type.dofs])
                 at = np.where(vertex[ends, its.FREE] == 1, vertex[ends, its.STEP] + within, len(self.tree.step))
                 yield at, blocks_of(self.tree, table, rows)

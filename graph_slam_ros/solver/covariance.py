@@ -15,7 +15,7 @@ from graph_slam_ros.lie.jit import inlined, inner, kernel
 from graph_slam_ros.solver.clique_tree import storage as its
 from graph_slam_ros.solver.clique_tree.incremental import mark
 from graph_slam_ros.solver.clique_tree.storage import NOTHING, Tree, ascending, front_of, row_of
-from graph_slam_ros.solver.linearization import blocks_of, rows_of
+from graph_slam_ros.solver.linearization import blocks_of
 from graph_slam_ros.typing import Array, Index
 
 
@@ -227,9 +227,9 @@ def without_edges(
     determine the vertices, or so weakly that rounding would decide.
     """
     if not tree.vertex[vertices, its.FREE].any():
-        return np.concatenate([tree.value[graph.vertex(v).stored] for v in vertices.tolist()]), joint(vertices)
-    rows = rows_of(graph, edges[tree.edge[edges, its.ACTIVE] == 1])
-    every = np.unique(np.concatenate([vertices, *(t.vertices.values[chosen].ravel() for t, chosen in rows.items())]))
+        return np.concatenate([_moved(graph, tree, v, NOTHING, tree.step) for v in vertices.tolist()]), joint(vertices)
+    rows = graph.rows_by_table(edges[tree.edge[edges, its.ACTIVE] == 1])
+    every = np.unique(np.concatenate([vertices, *(t.vertex_rows.values[chosen].ravel() for t, chosen in rows.items())]))
     is_free = tree.vertex[every, its.FREE] == 1
     dof = tree.vertex[every, its.DOF] * is_free
     begin, free = np.where(is_free, np.cumsum(dof) - dof, NOTHING), every[is_free]
@@ -266,7 +266,7 @@ def _sums(tree: Tree, rows: Mapping[EdgeTable, Index], every: Index, begin: Inde
     information, gradient = np.zeros((size + 1, size + 1)), np.zeros(size + 1)  # the last is for held vertices
     for table, of_table in rows.items():
         dofs, blocks = np.array(table.type.dofs), blocks_of(tree, table, of_table)
-        begins = np.repeat(begin[np.searchsorted(every, table.vertices.values[of_table])], dofs, axis=1)
+        begins = np.repeat(begin[np.searchsorted(every, table.vertex_rows.values[of_table])], dofs, axis=1)
         at = np.where(begins < 0, size, begins + _ranges(np.zeros_like(dofs), dofs))
         np.add.at(information, (at[:, :, None], at[:, None, :]), blocks[:, :, :-1])
         np.add.at(gradient, at, blocks[:, :, -1])
@@ -275,7 +275,8 @@ def _sums(tree: Tree, rows: Mapping[EdgeTable, Index], every: Index, begin: Inde
 
 def _moved(graph: Graph, tree: Tree, vertex: int, first: int, step: Array) -> Array:
     """Return the stored values of a vertex at a step (size,) from its linearisation point; of a held one as it is."""
-    kind, value = graph.kind_of(vertex), tree.value[graph.vertex(vertex).stored]
+    kind, at = graph.kinds[graph.kind.values[vertex]], tree.vertex[vertex, its.VALUE]
+    value = tree.value[at : at + kind.size]
     return value if first < 0 else kind.retract(value[None], step[None, first : first + kind.dof])[0]
 
 

@@ -18,8 +18,9 @@ _NAMED = 20  # parts of a graph
 _LEAST_EIGENVALUE = 1e-9  # of correlations: less is no information
 
 
-def undetermined(vertex: int) -> SingularError:
-    """Return the error for a vertex that the edges do not determine."""
+def undetermined(graph: Graph, row: int) -> SingularError:
+    """Return the error for a vertex, by its row, that the edges do not determine."""
+    vertex = graph.vertex_ids.of(row)
     return SingularError(f"a pivot cannot be told from rounding: the edges do not determine vertex {vertex}", vertex)
 
 
@@ -29,7 +30,7 @@ def check_gauge(graph: Graph, free: Index, held: Index, rows: Mapping[EdgeTable,
     fixed[held] = True
     sources, targets = [free[:0]], [free[:0]]
     for table, chosen in rows.items():
-        at = table.vertices.values[chosen]
+        at = table.vertex_rows.values[chosen]
         if at.shape[1] == 1:
             fixed[at[:, 0]] = True
         for slot in range(1, at.shape[1]):
@@ -41,9 +42,9 @@ def check_gauge(graph: Graph, free: Index, held: Index, rows: Mapping[EdgeTable,
     floating = np.sort(free[~np.isin(part[free], part[fixed])])
     if len(floating):
         more = int((part[floating] == part[floating[0]]).sum()) - 1
-        of = f"{int(floating[0])}{f' and {more} more joined to it' if more else ''}"
+        of = f"{graph.vertex_ids.of(int(floating[0]))}{f' and {more} more joined to it' if more else ''}"
         each = np.sort(floating[np.unique(part[floating], return_index=True)[1]])
-        ends = " ".join(map(str, [*held[:1], *each[:_NAMED]]))
+        ends = " ".join(map(str, graph.vertex_ids.of_all(np.append(held[:1], each[:_NAMED])).tolist()))
         raise GaugeError(
             f"nothing fixes the gauge of vertex {of}: add a prior (an anchor) or hold a vertex (in a file: FIX {ends})"
         )
@@ -62,7 +63,7 @@ def fix_the_whole(graph: Graph, x: Array, rows: Mapping[EdgeTable, Index]) -> bo
     motions = axes + (1 if axes == 2 else 3)
     information, centre = np.zeros((motions, motions)), None
     for block in linearize(graph, x, alone, Losses(graph, {})):
-        vertices = block.table.vertices.values[block.rows, 0]
+        vertices = block.table.vertex_rows.values[block.rows, 0]
         for code in np.unique(graph.kind.values[vertices]):
             kind, mine = graph.kinds[code], graph.kind.values[vertices] == code
             if _AXES.get(kind) != axes:
@@ -104,7 +105,7 @@ def degrees_of_freedom(graph: Graph, free: Index, held: Mask) -> int:
         rows = np.flatnonzero(table.weight.values)
         measured += table.type.residual_size * len(rows)
         if any_held:
-            ends = table.vertices.values[rows]
+            ends = table.vertex_rows.values[rows]
             is_estimated[ends[held[ends].all(axis=1)]] = True
     sizes = np.array([kind.dof for kind in graph.kinds], dtype=np.int64)
     return measured - int(sizes[graph.kind.values[is_estimated]].sum())

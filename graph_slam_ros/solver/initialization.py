@@ -70,10 +70,11 @@ def initial_values(
     kind = graph.kind_of(root)
     if kind not in GROUPS:
         raise GraphSlamError(f"init {method}: vertex {root} is {kind.name}, not a pose")
-    poses = np.flatnonzero(graph.kind.values == graph.kinds.index(kind))
+    every = graph.vertex_ids.since()
+    poses = every[graph.kind_codes(every) == graph.kinds.index(kind)]
     if method == "online":
         of_kind = set(poses.tolist())
-        others = [v for v in (range(graph.vertex_count) if in_time is None else in_time) if v in of_kind and v != root]
+        others = [v for v in (every.tolist() if in_time is None else in_time) if v in of_kind and v != root]
         return _replayed_values(graph, values, [root, *others], _RELATIVE[kind], POINT_SEEN_FROM[kind], on_pose)
     ends, measured = _relative_edges(graph, kind)
     _along_tree(graph, values, kind, root, poses, ends, measured)
@@ -88,9 +89,9 @@ def _relative_edges(graph: Graph, kind: VertexKind) -> tuple[Index, Array]:
     tables = [(graph.tables[edge], _weighted(graph.tables[edge])) for edge in _RELATIVE[kind] if edge in graph.tables]
     if not tables:
         return np.empty((0, 2), dtype=np.int64), np.empty((0, kind.size))
+    found = [table.at(rows) for table, rows in tables]
     ends, measured, ids = (
-        np.concatenate([getattr(table, name).values[rows] for table, rows in tables])
-        for name in ("vertices", "measured", "id")
+        np.concatenate([getattr(of, name) for of in found]) for name in ("vertices", "measured", "ids")
     )
     order = np.argsort(ids)
     return ends[order], measured[order]
@@ -102,7 +103,7 @@ def _weighted(table: EdgeTable) -> Index:
 
 
 def _slots(graph: Graph, vertices: Index, size: int) -> Index:
-    return graph.offset.values[vertices][:, None] + np.arange(size)
+    return graph.begins(vertices)[:, None] + np.arange(size)
 
 
 def _along_tree(
@@ -134,7 +135,7 @@ def _along_tree(
 def _chordal(
     graph: Graph, values: Array, kind: VertexKind, root: int, poses: Index, ends: Index, measured: Array
 ) -> None:
-    position = np.full(graph.vertex_count, -1, dtype=np.int64)
+    position = np.full(graph.vertex_ids.next, -1, dtype=np.int64)
     position[poses] = np.arange(len(poses))
     i, j = position[ends].T
     fixed = int(position[root])
@@ -186,9 +187,9 @@ def _place_landmarks(graph: Graph, values: Array, kind: VertexKind) -> None:
     if table is None:
         return
     rows = _weighted(table)
-    vertices, first = np.unique(table.vertices.values[rows, 1], return_index=True)
+    vertices, first = np.unique(table.vertices[rows, 1], return_index=True)
     first = rows[first]
-    poses = values[_slots(graph, table.vertices.values[first, 0], kind.size)]
+    poses = values[_slots(graph, table.vertices[first, 0], kind.size)]
     points = GROUPS[kind].act(tuple(poses.T), tuple(table.measured.values[first].T))
     values[_slots(graph, vertices, len(points))] = np.stack(points, axis=-1)
 
@@ -208,13 +209,13 @@ def _replayed_values(
     """
     group, solver = GROUPS[graph.kind_of(poses[0])], Solver(graph)
     solver.start_at(values)
-    rank = np.full(graph.vertex_count, -1, dtype=np.int64)
+    rank = np.full(graph.vertex_ids.next, -1, dtype=np.int64)
     rank[list(poses)] = np.arange(len(poses))
     arriving: list[list[int]] = [[] for _ in poses]
     for table in [graph.tables[edge] for edge in (*relative, sighting) if edge in graph.tables]:
         rows = _weighted(table)
-        newest = rank[table.vertices.values[rows]].max(axis=1)
-        for edge_id, k in zip(table.id.values[rows].tolist(), newest.tolist(), strict=True):
+        newest = rank[table.vertices[rows]].max(axis=1)
+        for edge_id, k in zip(table.ids[rows].tolist(), newest.tolist(), strict=True):
             arriving[k].append(edge_id)
     known: set[int] = set()
     for k, pose in enumerate(poses):

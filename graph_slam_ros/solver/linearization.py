@@ -337,7 +337,7 @@ def linearize(graph: Graph, x: Array, rows: Mapping[EdgeTable, Index], losses: L
 
 def _evaluate(graph: Graph, x: Array, table: EdgeTable, rows: Index) -> tuple[Array, Array]:
     """Return residuals (n, m) and Jacobians (n, m, width) of rows of a table at the stored values x."""
-    at, measured = gather(rows, table.vertices.values, graph.offset.values, table.measured.values)
+    at, measured = gather(rows, table.vertex_rows.values, graph.offset.values, table.measured.values)
     return table.type.linearize(x, at, measured)
 
 
@@ -354,7 +354,7 @@ def linearize_into(graph: Graph, tree: Tree, edges: Index, losses: Losses, young
     known = np.sort(young)  # not all edge types are compiled: one after the other
     is_young = np.isin(edges, known)
     for some, of_some in ((edges[is_young], first), (edges[~is_young], losses)):
-        for table, chosen in rows_of(graph, some).items():
+        for table, chosen in graph.rows_by_table(some).items():
             for begin in range(0, len(chosen), CHUNK):
                 rows = chosen[begin : begin + CHUNK]
                 given = _evaluate(graph, tree.value, table, rows)
@@ -366,7 +366,7 @@ def linearize_into(graph: Graph, tree: Tree, edges: Index, losses: Losses, young
 
 def linearized(graph: Graph, x: Array, edge: EdgeType, vertices: Sequence[int], measured: Array) -> tuple[Array, Array]:
     """Residual (m,) and Jacobian (m, width) of one measurement (p,) between vertices (k,) at the stored values x."""
-    residual, jacobian = edge.linearize(x, graph.offset.values[list(vertices)][None], measured[None])
+    residual, jacobian = edge.linearize(x, graph.begins(np.array([vertices])), measured[None])
     return residual[0], jacobian[0]
 
 
@@ -412,7 +412,7 @@ def information(graph: Graph, x: Array, rows: Mapping[EdgeTable, Index], free: I
     for b in linearize(graph, x, rows, losses):
         slots = np.repeat(np.arange(len(b.table.type.dofs)), b.table.type.dofs)
         within = np.concatenate([np.arange(d) for d in b.table.type.dofs])
-        begins = first[b.table.vertices.values[b.rows]][:, slots]
+        begins = first[b.table.vertex_rows.values[b.rows]][:, slots]
         row, column = np.broadcast_arrays((begins + within)[:, :, None], (begins + within)[:, None, :])
         is_free = (begins[:, :, None] != NOTHING) & (begins[:, None, :] != NOTHING)
         numbers.append((np.swapaxes(b.jacobian, 1, 2) @ b.jacobian)[is_free])
@@ -424,19 +424,7 @@ def blocks_of(tree: Tree, table: EdgeTable, rows: Index) -> Array:
     """Return what a tree has of rows of a table, (n, D, D + 1): J'J, and J'r as the last column."""
     row, column = np.indices((table.width, table.width + 1))
     packed = row_of(np.minimum(row, column), table.width) + np.maximum(row, column)
-    return tree.blocks[tree.edge[table.id.values[rows], BLOCK][:, None, None] + packed]
-
-
-def rows_of(graph: Graph, edges: Index) -> dict[EdgeTable, Index]:
-    """Edges, by id, as rows of their tables."""
-    rows = graph.row_of_edge.values[edges]
-    if len(edges) == 1:
-        return {graph.row(edges[0])[0]: rows}
-    if len(graph.tables) == 1:
-        return dict.fromkeys(graph.tables.values(), rows)
-    codes = graph.table_of_edge.values[edges]
-    by_table = ((table, rows[codes == code]) for code, table in enumerate(graph.tables.values()))
-    return {table: of_table for table, of_table in by_table if len(of_table)}
+    return tree.blocks[tree.edge[table.edge_row.values[rows], BLOCK][:, None, None] + packed]
 
 
 def refuse_nonfinite(block: Block) -> None:
@@ -450,8 +438,8 @@ def refuse_nonfinite(block: Block) -> None:
 def _refuse_row(table: EdgeTable, row: int) -> None:
     """Raise GraphSlamError for an edge whose cost is not finite."""
     raise GraphSlamError(
-        f"edge {int(table.id.values[row])} ({table.type.name}) between vertices"
-        f" {table.vertices.values[row].tolist()}: its chi2 is not finite"
+        f"edge {int(table.ids[row])} ({table.type.name}) between vertices {table.vertices[row].tolist()}:"
+        " its chi2 is not finite"
     )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from graph_slam_ros.graph import INVERSE_RELATIVE_POSE, RELATIVE_POSE, RELATIVE_POSE_3D, Graph
 from graph_slam_ros.solver.clique_tree.storage import NONE, STEP, Limits, Tree
-from graph_slam_ros.solver.linearization import CHUNK, Losses, chi2_of, rows_of, squares
+from graph_slam_ros.solver.linearization import CHUNK, Losses, chi2_of, squares
 from graph_slam_ros.solver.settings import Settings
 from graph_slam_ros.typing import Array, Index
 
@@ -54,7 +54,7 @@ class LossStages:
             return
         first, *_, last = self.losses(settings)
         chi2, _ = chi2_of(self._graph, values, self.young)
-        young: list[int] = self.young.tolist()
+        young: list[int] = self._graph.edge_ids.of_all(self.young).tolist()
         differ = [first.weight(edge, c) != last.weight(edge, c) for edge, c in zip(young, chi2, strict=True)]
         self.young = self.young[differ]
 
@@ -69,10 +69,10 @@ def neglected(graph: Graph, tree: Tree, edges: Index) -> tuple[float, float]:
     is below chi2 by about this sum: by 0.2 to 5 times as much on public graphs. Losses do not count.
     """
     rest_squared = chi2 = 0.0
-    for table, of_table in rows_of(graph, edges).items():
+    for table, of_table in graph.rows_by_table(edges).items():
         for begin in range(0, len(of_table), CHUNK):
             rows = of_table[begin : begin + CHUNK]
-            ends, measured = table.vertices.values[rows], table.measured.values[rows]
+            ends, measured = table.vertex_rows.values[rows], table.measured.values[rows]
             at, root = graph.offset.values[ends], table.sqrt_information.values
             here, _ = table.type.linearize(tree.estimate, at, measured)
             there, jacobian = table.type.linearize(tree.value, at, measured)

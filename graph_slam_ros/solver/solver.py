@@ -11,8 +11,8 @@ from scipy.sparse.linalg import splu
 
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import Graph
-from graph_slam_ros.graph.graph import whole_numbers
 from graph_slam_ros.graph.records import weights_of
+from graph_slam_ros.graph.tables import whole_numbers
 from graph_slam_ros.graph.vertices import code_of
 from graph_slam_ros.solver import update
 from graph_slam_ros.solver.batch import BatchProblem, Change, Report, minimise
@@ -42,7 +42,6 @@ from graph_slam_ros.solver.linearization import (
     evaluated,
     information,
     linearize_into,
-    rows_of,
 )
 from graph_slam_ros.solver.relinearization import (
     MAYBE,
@@ -161,8 +160,10 @@ class Solver:
 
     def add(self, vertices: ArrayLike, edges: ArrayLike) -> None:
         """Add vertices (at their initial values) and edges of the graph to the problem, by id, each once."""
-        new, new_edges = whole_numbers(vertices, "vertex").ravel(), whole_numbers(edges, "edge").ravel()
-        self._pending.broken |= self._record(new, new_edges)  # removed before: they are in the order still
+        ids, edge_ids = whole_numbers(vertices, "vertex").ravel(), whole_numbers(edges, "edge").ravel()
+        new, new_edges = self.graph.vertex_ids.rows(ids), self.graph.edge_ids.rows(edge_ids)
+        was_in = self._record(new, new_edges, (ids, edge_ids))  # and was removed: it is in the order still
+        self._pending.broken |= was_in
         self._pending.add(new, new_edges)
         self._inside[new], self._edge_inside[new_edges] = True, True
 
@@ -178,16 +179,15 @@ class Solver:
     def place(self, vertex: int, value: ArrayLike) -> None:
         """Start a vertex that is not in the problem yet from another value than the graph's initial one."""
         self._grow()
-        existing([vertex], self._vertices, "vertex")
-        if self._inside[vertex]:
+        one, numbers = self.graph.vertex(vertex), np.asarray(value, dtype=float)
+        if self.has(vertex):
             raise GraphSlamError(f"vertex {vertex} is in the problem: it has an estimate")
-        numbers, at = np.asarray(value, dtype=float), int(self.graph.offset.values[vertex])
-        kind = self.graph.kind_of(vertex)
+        kind = one.kind
         if numbers.shape != (kind.size,) or kind.fault(numbers[None]) is not None:
             due = f"{kind.size} finite numbers of {kind.name}"
             raise GraphSlamError(f"vertex {vertex}: expected {due}, got {numbers.tolist()}")
         for array in (self._tree.value, self._tree.estimate, self._kept):
-            array[at : at + kind.size] = numbers
+            array[one.stored] = numbers
 
     def set_weight(self, edge: int, weight: float) -> None:
         """Multiply the information of an edge; 0 removes it from the structure, another value adds it again."""
@@ -196,21 +196,22 @@ class Solver:
         if not weight:
             return self.leave_out([edge])
         self._grow()
-        one = existing([edge], self.graph.edge_count, "edge")
+        one = self.graph.edge_ids.existing([edge])
         table, row = self.graph.row(edge)
-        ends = table.vertices.values[row]
-        if self._edge_inside[edge] and not self._inside[ends].all():
-            raise GraphSlamError(f"edge {edge} needs vertex {int(ends[~self._inside[ends]][0])}, which was removed")
+        ends, is_inside = table.vertex_rows.values[row], self._edge_inside[one[0]]
+        if is_inside and len(removed := ends[~self._inside[ends]]):
+            raise GraphSlamError(f"edge {edge} needs vertex {self.graph.vertex_ids.of(removed[0])}, which was removed")
         table.weight.values[row] = weight
-        if self._edge_inside[edge]:
+        if is_inside:
             self._pending.back.append(one)
 
     def leave_out(self, edges: ArrayLike) -> None:
         """Set the weight of edges to 0, as ``set_weight`` does one by one."""
         self._grow()
-        ids = existing(edges, self.graph.edge_count, "edge")
-        self.graph.set_weights(ids, 0.0)
-        active = ids[self._edge_inside[ids] & (self._tree.edge[ids, its.ACTIVE] == 1)]
+        rows = self.graph.edge_ids.existing(edges)
+        for table, of_table in self.graph.rows_by_table(rows).items():
+            table.weight.values[of_table] = 0.0
+        active = rows[self._edge_inside[rows] & (self._tree.edge[rows, its.ACTIVE] == 1)]
         if len(active):
             self._pending.touch(ends_of(self._tree, active))
             self._pending.may_float = True
@@ -219,10 +220,10 @@ class Solver:
     def hold(self, vertex: int) -> None:
         """Keep a vertex at its present estimate."""
         self._grow()
-        one = existing([vertex], self._vertices, "vertex")
-        self._held[vertex] = True
-        if self._tree.vertex[vertex, its.FREE]:
-            on_it = incremental.edges_of(self._tree.vertex, self._tree.link, vertex)
+        one = self.graph.vertex_ids.existing([vertex])
+        self._held[one] = True
+        if self._tree.vertex[one[0], its.FREE]:
+            on_it = incremental.edges_of(self._tree.vertex, self._tree.link, int(one[0]))
             on_it = on_it[self._tree.edge[on_it, its.ACTIVE] == 1]  # they are linearised where it is held
             self._pending.back.append(on_it)
             self._fix_at_estimate(one)
@@ -230,41 +231,40 @@ class Solver:
     @property
     def held(self) -> Index:
         """Ids of the vertices that stay at their values."""
-        return np.flatnonzero(self._held)
+        return self.graph.vertex_ids.of_all(np.flatnonzero(self._held))
 
     def has(self, vertex: int) -> bool:
         """Return whether a vertex is part of the problem."""
-        return vertex < len(self._inside) and bool(self._inside[vertex])
+        return 0 <= (row := self.graph.vertex_ids.row(vertex)) < len(self._inside) and bool(self._inside[row])
 
     def is_held(self, vertex: int) -> bool:
         """Return whether a vertex stays at its value."""
-        return vertex < len(self._held) and bool(self._held[vertex])
+        return 0 <= (row := self.graph.vertex_ids.row(vertex)) < len(self._held) and bool(self._held[row])
 
     def remove(self, vertices: ArrayLike) -> None:
         """Remove vertices from the problem; all their edges must have weight 0 before."""
         self._grow()
-        ids = existing(vertices, self._vertices, "vertex")
-        if not self._inside[ids].all():
-            raise GraphSlamError(f"vertex {int(ids[~self._inside[ids]][0])} is not in the problem")
-        for vertex in ids.tolist():
-            needed = self._weighted(incremental.edges_of(self._tree.vertex, self._tree.link, vertex))
+        rows = self._of_problem(vertices)
+        for row in rows.tolist():
+            needed = self._weighted(incremental.edges_of(self._tree.vertex, self._tree.link, row))
             if len(needed):
-                raise GraphSlamError(f"vertex {vertex} is needed by edge {int(needed[0])}")
-        self._inside[ids] = self._held[ids] = False
-        self._pending.forget(ids)
-        self._fix_at_estimate(ids)
+                vertex, edge = self.graph.vertex_ids.of(row), self.graph.edge_ids.of(int(needed[0]))
+                raise GraphSlamError(f"vertex {vertex} is needed by edge {edge}")
+        self._inside[rows] = self._held[rows] = False
+        self._pending.forget(rows)
+        self._fix_at_estimate(rows)
 
     def edges_on(self, vertex: int) -> Index:
         """Ids of the edges of the problem on one vertex, also those of weight 0."""
         self._grow()
-        existing([vertex], self._vertices, "vertex")
-        return incremental.edges_of(self._tree.vertex, self._tree.link, vertex)
+        (row,) = self.graph.vertex_ids.existing([vertex]).tolist()
+        return self.graph.edge_ids.of_all(incremental.edges_of(self._tree.vertex, self._tree.link, row))
 
     @property
     def vertices(self) -> Index:
         """Ids of the vertices of the problem."""
         self._grow()
-        return np.flatnonzero(self._inside)
+        return self.graph.vertex_ids.of_all(np.flatnonzero(self._inside))
 
     @property
     def degrees_of_freedom(self) -> int:
@@ -276,14 +276,14 @@ class Solver:
     def edges(self) -> Index:
         """Ids of the edges of the problem that have a weight."""
         self._grow()
-        return self._weighted(np.flatnonzero(self._edge_inside))
+        return self.graph.edge_ids.of_all(self._in_use())
 
     def is_fixed(self) -> bool:
         """Return whether a held vertex, or the edges on one vertex alone, fix position and heading of the whole."""
         self._grow()
         if (self._inside & self._held).any():
             return True
-        return fix_the_whole(self.graph, self._estimates(), rows_of(self.graph, self.edges))
+        return fix_the_whole(self.graph, self._estimates(), self.graph.rows_by_table(self._in_use()))
 
     @property
     def values(self) -> Array:
@@ -294,12 +294,12 @@ class Solver:
     def chi2_of(self, edges: ArrayLike) -> tuple[Array, Index]:
         """Chi2 of each edge at the estimate: r' Omega r without loss and weight, and the size of r."""
         self._grow()
-        return chi2_of(self.graph, self._estimates(), existing(edges, self.graph.edge_count, "edge"))
+        return chi2_of(self.graph, self._estimates(), self.graph.edge_ids.existing(edges))
 
     def residuals_of(self, edges: ArrayLike) -> Array:
         """Residuals of edges at the estimate, not whitened, in the units of their types, end to end."""
         self._grow()
-        return evaluated(self.graph, self._estimates(), existing(edges, self.graph.edge_count, "edge"))[0]
+        return evaluated(self.graph, self._estimates(), self.graph.edge_ids.existing(edges))[0]
 
     def compact(self) -> None:
         """Move the fronts in use together in memory; memory is not returned to the system.
@@ -313,7 +313,7 @@ class Solver:
     def release(self, vertices: ArrayLike) -> None:
         """Estimate held vertices again. The whole structure is rebuilt."""
         self._grow()
-        self._held[existing(vertices, self._vertices, "vertex")] = False
+        self._held[self.graph.vertex_ids.existing(vertices)] = False
         self.rebuild()
 
     @property
@@ -374,7 +374,7 @@ class Solver:
             self._tree.state[its.SUBSTITUTED] += 1  # from here on, steps are those of the batch
             self._forget_numbers()
             self._restructure(*arriving)
-            active, unknowns = rows_of(self.graph, self._active()), self._unknowns()
+            active, unknowns = self.graph.rows_by_table(self._active()), self._unknowns()
             if len(unknowns):
                 report = minimise(BatchProblem(self.graph, self._tree, active, unknowns), settings)
             else:
@@ -394,20 +394,20 @@ class Solver:
         self._grow()
         losses = Losses(self.graph, (settings or self.settings).stages()[-1])
         where = self._estimates() if at is None else at
-        chi2, cost, classes = costs(self.graph, where, rows_of(self.graph, self._active()), losses)
+        chi2, cost, classes = costs(self.graph, where, self.graph.rows_by_table(self._active()), losses)
         return Report("gn", "nothing_to_do", chi2, chi2, cost, cost, (), classes)
 
     def estimate(self, ids: ArrayLike) -> Array:
         """Values of vertices of one kind, (n, size)."""
         self._grow()
-        at = whole_numbers(ids, "vertex").ravel()
+        at = self.graph.vertex_ids.rows(whole_numbers(ids, "vertex").ravel())
         if not len(at):
             return np.empty((0, 0))
         settings = self.settings
         tolerances = settings.tolerance, settings.tolerance_sigmas
         unfit, out = read(self.graph.pointers, self._pointers, self._vertices, at, *tolerances)
         if unfit != NOTHING:
-            existing(at, self._vertices, "vertex")
+            self.graph.vertex_ids.existing(ids)
             raise GraphSlamError("estimate: the vertices are not of one kind")
         return out
 
@@ -434,7 +434,9 @@ class Solver:
 
     def joint_marginal(self, ids: ArrayLike) -> Array:
         """Covariance (D, D) of some vertices together, in the order given, each once; as ``marginal`` for each."""
-        wanted = self._with_covariance(ids)
+        return self._joint(self._with_covariance(ids))
+
+    def _joint(self, wanted: Index) -> Array:
         if len(set(wanted.tolist())) < len(wanted):
             raise GraphSlamError("a joint covariance of a vertex with itself")
         held = self._held[wanted]
@@ -458,33 +460,34 @@ class Solver:
             Also where the other edges do not determine these vertices, or so weakly that rounding would decide.
         """
         wanted = self._with_covariance(ids)
-        left_out = existing(edges, self.graph.edge_count, "edge")
+        left_out = self.graph.edge_ids.existing(edges)
         self._estimates()
-        return without_edges(self.graph, self._tree, self.joint_marginal, wanted, left_out)
+        return without_edges(self.graph, self._tree, self._joint, wanted, left_out)
 
     def edge_marginals(self, ends: Index, *, are_inside: bool = True) -> Array:
         """Covariances (n, D, D) as ``joint_marginal`` has them, of the vertices (n, k) of edges of one type.
 
         It takes longer if the edges are not in the problem.
         """
-        self._with_covariance(ends)
+        rows = self._with_covariance(ends).reshape(ends.shape)
         with self._tree_remade_after_error():
             of_each = among if are_inside else joint_of_each
-            return of_each(self._tree, np.ascontiguousarray(ends)) if len(ends) else np.zeros((0, 0, 0))
+            return of_each(self._tree, rows) if len(rows) else np.zeros((0, 0, 0))
 
-    def covariances_with(self, vertex: int) -> list[Array]:
+    def covariances_with(self, vertex: int) -> dict[int, Array]:
         """Covariances (dof, d) of each vertex, by id, with one of them; zero for held ones.
 
         ``joint_marginal`` of each pair would take a thousand times as long for a drive.
         """
         self._with_covariance(self.vertices)
         held, dofs = (self._held | ~self._inside)[: self._vertices], self._tree.vertex[: self._vertices, its.DOF]
-        is_free, first = np.repeat(~held, dofs), int(self._tree.vertex[vertex, its.STEP])
-        out = np.zeros((len(is_free), int(dofs[vertex])))
-        if not held[vertex]:
+        row = self.graph.vertex_ids.row(vertex)
+        is_free, first = np.repeat(~held, dofs), int(self._tree.vertex[row, its.STEP])
+        out = np.zeros((len(is_free), int(dofs[row])))
+        if not held[row]:
             unit = np.eye(*out.shape, -first)[is_free]
             out[is_free] = splu(self._information(self._tree.value).tocsc(), permc_spec="MMD_AT_PLUS_A").solve(unit)
-        return np.split(out, np.cumsum(dofs)[:-1])
+        return dict(zip(self.graph.vertex_ids.since().tolist(), np.split(out, np.cumsum(dofs)[:-1]), strict=True))
 
     def information_matrix(self) -> Array:
         """H as a dense matrix, vertices in order of id, with pending edges: for tests and small examples.
@@ -500,11 +503,20 @@ class Solver:
 
         It is for an unforeseen fault: it removes whatever that left in the tree.
         """
-        values, vertices, edges = self.values, self.vertices, np.flatnonzero(self._edge_inside)
+        edges = self.graph.edge_ids.of_all(np.flatnonzero(self._edge_inside))
+        self._begin_anew(self.values, self.vertices, edges, self.held)
+
+    def keep(self, vertices: Index, edges: Index) -> None:
+        """Remove all but some vertices and edges, given in order, from the graph, too; what stays is pending."""
+        inside, held = (np.intersect1d(vertices, some) for some in (self.vertices, self.held))
+        self.graph.keep(vertices, edges, self.values)
+        self._begin_anew(self.graph.initial.values, inside, edges, held)
+
+    def _begin_anew(self, values: Array, vertices: Index, edges: Index, held: Index) -> None:
         fresh = Solver(self.graph, self.settings)
         fresh.start_at(values)
         fresh.add(vertices, edges)
-        for vertex in self.held.tolist():
+        for vertex in held.tolist():
             fresh.hold(vertex)
         vars(self).update(vars(fresh))
 
@@ -523,7 +535,7 @@ class Solver:
         if graph.kind.count > self._vertices or graph.row_of_edge.count > self._room[2]:
             self._record(NONE, NONE)
 
-    def _record(self, new: Index, new_edges: Index) -> bool:
+    def _record(self, new: Index, new_edges: Index, named: tuple[Index, Index] = (NONE, NONE)) -> bool:
         """Follow the graph's growth, and record what is added to the problem; nothing where some of it is unfit.
 
         Returns whether one of the vertices is in the order of the tree still.
@@ -540,11 +552,11 @@ class Solver:
         self._vertices = now[0]
         if how == update.RECORDED:
             return bool(what)
-        if how == update.UNFIT_VERTEX:
-            _refuse_unfit(new, what, self._vertices, "vertex")
-        if how == update.UNFIT_EDGE:
-            _refuse_unfit(new_edges, what, graph.edge_count, "edge")
-        raise GraphSlamError(f"an edge needs vertex {what}, which was not added")
+        if how == update.WITHOUT_VERTEX:
+            raise GraphSlamError(f"an edge needs vertex {graph.vertex_ids.of(int(what))}, which was not added")
+        one = int(named[how == update.UNFIT_EDGE][what])
+        (graph.edge if how == update.UNFIT_EDGE else graph.vertex)(one)  # it may not exist
+        raise GraphSlamError(f"{'edge' if how == update.UNFIT_EDGE else 'vertex'} {one} was added before")
 
     def _follow(self, count: int, size: int, edges: int) -> None:
         """Make room for so many vertices, their stored numbers, and edges."""
@@ -587,6 +599,16 @@ class Solver:
 
     def _active(self) -> Index:
         return np.flatnonzero(self._tree.edge[:, its.ACTIVE])
+
+    def _in_use(self) -> Index:
+        return self._weighted(np.flatnonzero(self._edge_inside))
+
+    def _of_problem(self, vertices: ArrayLike) -> Index:
+        """The rows of vertices, which must be in the problem."""
+        rows = self.graph.vertex_ids.existing(vertices)
+        if not (is_inside := self._inside[rows]).all():
+            raise GraphSlamError(f"vertex {self.graph.vertex_ids.of(rows[~is_inside][0])} is not in the problem")
+        return rows
 
     def _weighted(self, edges: Index) -> Index:
         """The edges among these that have a weight."""
@@ -636,7 +658,7 @@ class Solver:
 
     def _refuse_floating(self) -> None:
         """Raise GaugeError if nothing fixes a part of the problem, with all pending changes."""
-        rows = rows_of(self.graph, self.edges)
+        rows = self.graph.rows_by_table(self._in_use())
         check_gauge(
             self.graph, np.flatnonzero(self._inside & ~self._held), np.flatnonzero(self._inside & self._held), rows
         )
@@ -683,7 +705,7 @@ class Solver:
                 self._replace_tree(more_room)
         if what != NOTHING:
             self._refuse_floating()
-            raise undetermined(what)
+            raise undetermined(self.graph, what)
         stages.mature(self._tree.value, settings)
         self._solved_with, self._numbers_current = None, True
         if not len(found):
@@ -745,7 +767,7 @@ class Solver:
             self._linearize(far)
             failed, solved = incremental.renumber(self._tree, far, *limits)
             if failed != NOTHING:
-                raise undetermined(failed)
+                raise undetermined(self.graph, failed)
             yield len(far), solved
             if k == passes - 1:
                 self._schedule.note(solved)
@@ -779,7 +801,7 @@ class Solver:
         """H at the stored values x, over the vertices that are not held, in order of id."""
         free = np.flatnonzero(self._inside & ~self._held)
         losses = self._stages.losses(self.settings)[-1]
-        return information(self.graph, x, rows_of(self.graph, self.edges), free, losses)
+        return information(self.graph, x, self.graph.rows_by_table(self._in_use()), free, losses)
 
     def _linearize(self, edges: Index) -> None:
         """Put the blocks of edges at the linearisation points into the tree."""
@@ -789,9 +811,7 @@ class Solver:
     def _with_covariance(self, ids: ArrayLike) -> Index:
         """Check vertices whose covariance is asked for, and integrate pending changes."""
         self._grow()
-        wanted = existing(ids, self._vertices, "vertex")
-        if not self._inside[wanted].all():
-            raise GraphSlamError(f"vertex {int(wanted[~self._inside[wanted]][0])} is not in the problem")
+        wanted = self._of_problem(ids)
         if not self._held[wanted].all():
             if self._pending:
                 self.update()
@@ -817,21 +837,6 @@ class Solver:
         self._unfinished = False
         failed, solved = incremental.renumber(self._tree, self._active(), *self._limits())
         if failed != NOTHING:
-            raise undetermined(failed)
+            raise undetermined(self.graph, failed)
         self._schedule.hasten(self.settings.relinearize_every)
         return solved, incremental.relinearize(self._tree, solved, *self._limits()[2:])
-
-
-def existing(ids: ArrayLike, count: int, what: str) -> Index:
-    """Ids as an array; raises GraphSlamError for one that is not below ``count``."""
-    at = whole_numbers(ids, what).ravel()
-    strange = (at < 0) | (at >= count)
-    if np.count_nonzero(strange):
-        raise GraphSlamError(f"{what} {int(at[strange][0])} does not exist")
-    return at
-
-
-def _refuse_unfit(ids: Index, unfit: int, count: int, what: str) -> None:
-    """Raise GraphSlamError for an id that does not exist, is in the problem already or is repeated."""
-    existing(ids[unfit], count, what)
-    raise GraphSlamError(f"{what} {int(ids[unfit])} was added before")

@@ -52,7 +52,7 @@ def test_a_tag_of_a_plugin_is_read_solved_written_and_read_again(install, graph,
     assert [[float(x) for x in words[1:]] for words in again] == [[float(x) for x in s.split()[1:]] for s in LINES]
     file = read_g2o(solved)
     (edge,) = [one for one in file.graph.tables if one.name == "difference of ranges"]
-    assert len(file.graph.tables[edge].id.values) == 3
+    assert len(file.graph.tables[edge].ids) == 3
 
 
 @pytest.mark.parametrize(

@@ -181,8 +181,8 @@ class _Fit:
         """Each kind, and of its unknowns the stored numbers (n, size) and the rows of their steps (n, dof)."""
         graph, column = self._p.graph, self._linear.column
         for code, kind in enumerate(graph.kinds):
-            vertices = self._free[graph.kind.values[self._free] == code]
-            at = graph.offset.values[vertices][:, None] + np.arange(kind.size)
+            vertices = self._free[graph.kind_codes(self._free) == code]
+            at = graph.begins(vertices)[:, None] + np.arange(kind.size)
             yield kind, at, column[vertices][:, None] + np.arange(kind.dof)
 
     # -- what it says ----------------------------------------------------------------------------------------------

@@ -88,7 +88,7 @@ def groups_of(graph: Graph, edges: range) -> Iterator[tuple[EdgeTable, str, str,
     """Yield table, class, input and rows of the edges that parameters may affect."""
     labels = {"odometry", "landmarks"} & set(graph.labels)
     for table in graph.tables.values():
-        here = (table.id.values >= edges.start) & (table.id.values < edges.stop)
+        here = (table.ids >= edges.start) & (table.ids < edges.stop)
         for label in sorted(labels):
             of_label = here & (table.label.values == graph.labels.index(label))
             origins = np.unique(table.source.values[of_label]).tolist()
@@ -119,15 +119,15 @@ class MeasurementModel:
         is_noise_measured: bool = False,
     ) -> None:
         self._space, self._is_noise_measured = space, is_noise_measured
-        stamp_of = np.zeros(graph.vertex_count, dtype=np.int64)
+        stamp_of = np.zeros(graph.vertex_ids.next, dtype=np.int64)
         stamp_of[keyframes] = stamps_ns
         self.odometry: list[OdometryEdges] = []
         self.sightings: list[Sightings] = []
         for table, label, source, rows in groups_of(graph, edges):
-            stamps = stamp_of[table.vertices.values[rows]]
+            stamps = stamp_of[table.at(rows).vertices]
             if label == "odometry":
                 measured, roots = table.measured.values[rows].copy(), table.sqrt_information.values[rows].copy()
-                seconds = (stamps[:, 1] - stamps[:, 0]) * 1e-9
+                seconds = (stamps[:, 1] - stamps[:, 0]).astype(np.float64) * 1e-9
                 self.odometry.append(OdometryEdges(table, rows, source, measured, roots, seconds))
             else:
                 self.sightings.append(self._sightings(table, rows, source, origins, stamps[:, 0]))
@@ -136,7 +136,7 @@ class MeasurementModel:
         self, table: EdgeTable, rows: Index, source: str, origins: SightingEdges, stamps_ns: Index
     ) -> Sightings:
         """Sightings without a known origin, in older maps, are treated as taken at their keyframe."""
-        z, places, n = table.measured.values[rows].copy(), origins.places(table.id.values[rows]), self._space.dimensions
+        z, places, n = table.measured.values[rows].copy(), origins.places(table.at(rows).ids), self._space.dimensions
         known, roots = places >= 0, table.sqrt_information.values[rows].copy()
         poses = np.tile(np.array(self._space.identity), (len(rows), 1))
         sensor, stamps = np.zeros((len(rows), n)), stamps_ns.copy()
@@ -244,7 +244,7 @@ class MeasurementModel:
 def stated_sigma_per_m(space: Geometry, graph: Graph, first_edge: int) -> float:
     """The stated noise of odometry's way for each metre, in the middle of all steps; infinite where it stands."""
     n, found = space.dimensions, [np.empty(0)]
-    for table, label, _, rows in groups_of(graph, range(first_edge, graph.edge_count)):
+    for table, label, _, rows in groups_of(graph, range(first_edge, graph.edge_ids.next)):
         if label == "odometry":
             roots, measured = table.sqrt_information.values[rows], table.measured.values[rows, :n]
             covariance = np.linalg.inv(np.swapaxes(roots, 1, 2) @ roots)[:, :n, :n]

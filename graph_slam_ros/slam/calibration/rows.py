@@ -21,7 +21,7 @@ from graph_slam_ros.slam.calibration.path import EstimatedPath
 from graph_slam_ros.slam.frontend.odometry_track import OdometryTrack
 from graph_slam_ros.slam.frontend.sighting_edges import SightingEdges
 from graph_slam_ros.solver import LossKey, Settings
-from graph_slam_ros.solver.linearization import Block, Losses, linearize, rows_of
+from graph_slam_ros.solver.linearization import Block, Losses, linearize
 from graph_slam_ros.typing import Array, Index
 
 _LEAST_KEYFRAMES = 3
@@ -70,7 +70,7 @@ class TrialProblem:
     @property
     def edges(self) -> range:
         """Edges whose measurements may be corrected."""
-        return range(self.first_edge, self.graph.edge_count)
+        return range(self.first_edge, self.graph.edge_ids.next)
 
     def model(self) -> MeasurementModel:
         """Its measurements as functions of parameters."""
@@ -105,7 +105,7 @@ class TrialProblem:
 
     def poses(self, x: Array, vertices: Index) -> Array:
         """The poses (n, size) of some vertices at stored values x."""
-        return np.asarray(x[self.graph.offset.values[vertices][:, None] + np.arange(self.space.pose.size)])
+        return np.asarray(x[self.graph.begins(vertices)[:, None] + np.arange(self.space.pose.size)])
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,10 +143,10 @@ class _Eyes:
 
     def __init__(self, problem: TrialProblem, edges: Sightings, count: int) -> None:
         self._p, self._edges = problem, edges
-        self._own = edges.table.vertices.values[edges.rows, 0].copy()
+        self._own = edges.table.at(edges.rows).vertices[:, 0]
         start = np.tile(np.array(problem.space.identity), (len(self._own), 1))
         self.ids = problem.graph.add_vertices(problem.space.pose, start)
-        edges.table.vertices.values[edges.rows, 0] = self.ids
+        edges.table.vertex_rows.values[edges.rows, 0] = problem.graph.vertex_ids.existing(self.ids)
         self.first, self.second, self.fraction = self._own, self._own, np.zeros(len(self._own))
         self.steps = np.zeros((len(self._own), problem.space.dof, count))
         self._weight = edges.table.weight.values[edges.rows].copy()
@@ -154,7 +154,7 @@ class _Eyes:
     def place(self, x: Array, values: Values, model: MeasurementModel, path: EstimatedPath) -> None:
         """Move these edges along the path to corrected stamps, or by odometry from keyframes. It changes ``x``."""
         edges, p, group = self._edges, self._p, self._p.space.group
-        at = p.graph.offset.values[self.ids][:, None] + np.arange(p.space.pose.size)
+        at = p.graph.begins(self.ids)[:, None] + np.arange(p.space.pose.size)
         self.first, self.second, self.fraction = self._own.copy(), self._own.copy(), np.zeros(len(self._own))
         self.steps[:] = 0.0
         known = np.zeros(len(self._own), dtype=bool)
@@ -191,13 +191,13 @@ class Linearization:
         graph = problem.graph
         self._edges = _weighted_edges(problem)
         self._model = problem.model()
-        self._known = graph.vertex_count
+        self._known = graph.vertex_ids.next
         self._eyes = [_Eyes(problem, edges, len(parameters)) for edges in self._model.sightings]
-        self.column = np.full(graph.vertex_count, -1)
-        dof = np.array([kind.dof for kind in graph.kinds], dtype=np.int64)[graph.kind.values[free]]
+        self.column = np.full(graph.vertex_ids.next, -1)
+        dof = np.array([kind.dof for kind in graph.kinds], dtype=np.int64)[graph.kind_codes(free)]
         self.column[free] = np.cumsum(dof) - dof
         self.unknowns = int(dof.sum())
-        self._stamp_of = np.zeros(graph.vertex_count, dtype=np.int64)
+        self._stamp_of = np.zeros(graph.vertex_ids.next, dtype=np.int64)
         self._stamp_of[problem.keyframes] = problem.stamps_ns
         for eyes, edges in zip(self._eyes, self._model.sightings, strict=True):
             self._stamp_of[eyes.ids] = edges.stamps_ns
@@ -216,7 +216,7 @@ class Linearization:
         for eyes in self._eyes:
             eyes.place(all_x, values, self._model, self._path)
         derivative = self._correct(all_x, values)
-        blocks = linearize(graph, all_x, rows_of(graph, self._edges), Losses(graph, losses))
+        blocks = linearize(graph, all_x, graph.by_table(self._edges), Losses(graph, losses))
         parts = [self._of_block(block, derivative, all_x) for block in _by_table(blocks)]
         return Rows(
             sparse.vstack([part.jacobian for part in parts], format="csr"),
@@ -245,7 +245,7 @@ class Linearization:
         The noise of a position is turned with the sensor. Without that part, errors along and across the line of sight
         that go together would pass for a turned sensor.
         """
-        at, model = self._p.graph.offset.values[edges.table.vertices.values[edges.rows]], self._model
+        at, model = self._p.graph.begins(edges.table.at(edges.rows).vertices), self._model
         beside = _beside(values, parameter)
         sides = [edges.table.type.linearize(x, at, model.measured(edges, there))[0] for there in beside]
         roots = [model.roots(edges, there) for there in beside]
@@ -269,7 +269,7 @@ class Linearization:
         for (code, k), of_table in derivative.items():
             if code == table.code:
                 columns[:, :, k] = np.einsum("nij,nj->ni", root, of_table[rows])
-        ends, jacobian, dofs = table.vertices.values[rows], block.jacobian, table.type.dofs
+        ends, jacobian, dofs = table.at(rows).vertices, block.jacobian, table.type.dofs
         is_seen, stamps, landmark = ends[:, 0] >= self._known, self._stamp_of[ends[:, 0]], np.full(n, -1)
         if is_seen.any():
             ends, jacobian = self._through_eyes(ends, jacobian, columns, x)
@@ -294,7 +294,7 @@ class Linearization:
         For ``X = A Exp(f Log(A^-1 B))``, a step of X is that of A times 1 - f plus that of B times f, each in the frame
         of X, to first order in the motion from A to B.
         """
-        space, offset, size = self._p.space, self._p.graph.offset.values, np.arange(self._p.space.pose.size)
+        space, begins, size = self._p.space, self._p.graph.begins, np.arange(self._p.space.pose.size)
         dof = space.dof
         first, second, fraction = ends[:, 0].copy(), ends[:, 0].copy(), np.zeros(len(ends))
         for eyes in self._eyes:
@@ -303,10 +303,10 @@ class Linearization:
             k = at[mine]
             first[mine], second[mine], fraction[mine] = eyes.first[k], eyes.second[k], eyes.fraction[k]
             columns[mine] += np.einsum("nij,njk->nik", jacobian[mine, :, :dof], eyes.steps[k])
-        here = tuple(x[offset[ends[:, 0]][:, None] + size].T)
+        here = tuple(x[begins(ends[:, 0])[:, None] + size].T)
         parts = []
         for keyframe, part in ((first, 1.0 - fraction), (second, fraction)):
-            seen = space.group.between(here, tuple(x[offset[keyframe][:, None] + size].T))
+            seen = space.group.between(here, tuple(x[begins(keyframe)[:, None] + size].T))
             parts.append(part[:, None, None] * (jacobian[:, :, :dof] @ _adjoints(space, seen)))
         return np.column_stack((first, second, ends[:, 1:])), np.concatenate((*parts, jacobian[:, :, dof:]), axis=2)
 
@@ -336,10 +336,10 @@ def _by_table(blocks: Iterable[Block]) -> Iterator[Block]:
 
 def _weighted_edges(problem: TrialProblem) -> Index:
     graph = problem.graph
-    inside = np.zeros(graph.vertex_count, dtype=bool)
+    inside = np.zeros(graph.vertex_ids.next, dtype=bool)
     inside[problem.vertices] = True
     chosen = []
     for table in graph.tables.values():
-        fits = (table.weight.values > 0.0) & inside[table.vertices.values].all(axis=1)
-        chosen.append(table.id.values[fits])
+        fits = (table.weight.values > 0.0) & inside[table.vertices].all(axis=1)
+        chosen.append(table.ids[fits])
     return np.sort(np.concatenate(chosen))

@@ -10,7 +10,7 @@ from graph_slam_ros.slam.doubt.displacement import SAME_M, SAME_RAD, Displacemen
 from graph_slam_ros.slam.doubt.record import Alarm, Displacement, DisplacementHypothesis
 from graph_slam_ros.slam.landmarks.anonymous import AnonymousLandmarks
 from graph_slam_ros.slam.robust.connections import moved_values
-from graph_slam_ros.typing import Index, Numbers
+from graph_slam_ros.typing import Numbers
 
 _DRIFT = 3.0  # sigmas
 _CONTRADICTED = "taken back: later sightings contradict it"
@@ -51,14 +51,10 @@ class Displacements:
         self._decided.clear()
         self._refuted.clear()
 
-    def renumber(self, vertices: Index, edges: Index, first: int) -> None:
-        """Take over new ids of all vertices and edges, by old ones; -1: it was removed."""
-        of, edge = vertices.tolist(), edges.tolist()
-        new = [
-            replace(one, first=of[one.first], link=edge[one.link], replacement=edge[one.replacement])
-            for one in self._decided
-        ]
-        self._decided = [one for one in new if one.first > first and min(one.link, one.replacement) >= 0]
+    def forget_before(self, first: int) -> None:
+        """Forget those up to a keyframe, by its vertex, and those whose edges have left the graph."""
+        has = self._backend.graph.edge_ids.has
+        self._decided = [one for one in self._decided if one.first > first and has(one.link) and has(one.replacement)]
 
     def was_refuted(self, found: DisplacementHypothesis, newest: int) -> bool:
         """Return whether a displacement to there was decided and taken back."""

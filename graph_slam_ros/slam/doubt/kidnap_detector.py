@@ -27,7 +27,7 @@ from graph_slam_ros.slam.landmarks.anonymous import AnonymousLandmarks
 from graph_slam_ros.slam.robust.connections import moved_values
 from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.solver import Report, Settings
-from graph_slam_ros.typing import Index, Numbers
+from graph_slam_ros.typing import Numbers
 
 _ALARM = 4  # sightings more for another pose than for odometry's
 _ALARM_LANDMARKS, _ALARM_KEYFRAMES = 2, 2
@@ -68,7 +68,7 @@ class KidnapDetector:
         self._window = Window(config.space, backend)
         self._search = DisplacementSearch(config.space, backend, self._window)
         self._slips = SlipDetector(config.space, config.odometry, backend, counters, self._window, anonymous.doubt)
-        self._next = backend.graph.edge_count
+        self._next = backend.graph.edge_ids.next
         self._decided = Displacements(config.space, backend, self._search, counters, segments, self.alarms, anonymous)
         self._was_doubtful = False  # the association, when the present alarm began: it is no evidence then
 
@@ -77,22 +77,18 @@ class KidnapDetector:
         """Return whether no alarm goes on."""
         return self.now is None and self.slips_now is None
 
-    def renumber(self, vertices: Index, edges: Index, first: int) -> None:
-        """Take over new ids of all vertices and edges, by old ones; -1: it was removed.
+    def forget_before(self, first: int) -> None:
+        """Forget what has left the graph with the keyframes before one, by its vertex.
 
-        New edges took the place of others in the compaction. Of these, closures are noted.
-
-        Parameters
-        ----------
-        first : the first keyframe that stays, by its new vertex
+        New edges took the place of others then. Of these, closures are noted.
         """
         graph = self._backend.graph
-        self._window.renumber(vertices, edges, first)
-        self._decided.renumber(vertices, edges, first)
-        noted, self._next = edges[: self._next], graph.edge_count
-        for number in range(int(np.count_nonzero(noted >= 0)), graph.edge_count):
-            if (one := graph.edge(number)).label == "closures":
-                self._window.add_seen(number, max(one.vertices), one.label, self._window.newest_ns)
+        self._window.forget_before(first)
+        self._decided.forget_before(first)
+        for edge in graph.edge_ids.since(self._next).tolist():
+            if (one := graph.edge(edge)).label == "closures":
+                self._window.add_seen(edge, max(one.vertices), one.label, self._window.newest_ns)
+        self._next = graph.edge_ids.next
 
     @property
     def slips(self) -> list[Slip]:
@@ -119,9 +115,9 @@ class KidnapDetector:
             self.alarms[-1] = replace(now, ended_ns=max(stamp_ns, now.began_ns), outcome=outcome)
             self._protect()
 
-    def add(self, count: int, stamp_ns: int, keyframes: StampedPoses[Keyframe]) -> None:
-        """Note the edges that are new, up to a count, in order, at the stamp of the newest odometry."""
-        edges, self._next = range(self._next, count), count
+    def add(self, end: int, stamp_ns: int, keyframes: StampedPoses[Keyframe]) -> None:
+        """Note the edges that are new, up to an id, in order, at the stamp of the newest odometry."""
+        edges, self._next = range(self._next, end), end
         for edge in edges:
             self._add(edge, stamp_ns, keyframes)
 

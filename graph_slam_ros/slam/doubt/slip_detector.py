@@ -173,7 +173,7 @@ class SlipDetector:
             graph = graph.copy()
         graph.set_weights(np.array(edges, dtype=np.int64), 0.0)
         anew = Solver(graph, solver.settings.until_still())
-        anew.add(solver.vertices, range(self._backend.handed_over[1]))
+        anew.add(solver.vertices, graph.edge_ids.since(0, self._backend.handed_over[1]))
         anew.start_at(solver.values)
         for vertex in solver.held.tolist():
             anew.hold(vertex)
@@ -189,7 +189,7 @@ class SlipDetector:
             view.vertex: [
                 (one.edge, one.what)
                 for one in view.seen
-                if one.edge < len(ledger) and not ledger.is_withdrawn(one.edge) and is_determined(one.what)
+                if one.edge < ledger.ids.next and not ledger.is_withdrawn(one.edge) and is_determined(one.what)
             ]
             for view in views
             if view.vertex in ends
@@ -224,7 +224,8 @@ class SlipDetector:
         self._replace(links, slip, keyframe)
         # what was held back since then is judged again, with the wider noise of odometry
         edges = [one.edge for view in list(self._window.views)[-_VIEWS:] if view.vertex >= vertex for one in view.seen]
-        self._backend.admit([edge for edge in edges if edge < len(ledger) and not ledger.is_withdrawn(edge)], keyframe)
+        end = ledger.ids.next
+        self._backend.admit([edge for edge in edges if edge < end and not ledger.is_withdrawn(edge)], keyframe)
         self._doubt(began_ns, partial(_variances, self._space, slip.kind))
 
     def _update_slip(
@@ -296,7 +297,7 @@ class SlipDetector:
     def _slipped(self, keyframes: StampedPoses[Keyframe], slip: Slip) -> list[Pair]:
         """Odometry edges of a stretch that count as slip, each with its replacement, in order of time."""
         graph, ledger = self._backend.graph, self._backend.ledger
-        edges = [edge for edge in graph.edges_of("odometry").tolist() if edge < len(ledger)]
+        edges = [edge for edge in graph.edges_of("odometry").tolist() if edge < ledger.ids.next]
         used, out = dict[tuple[int, ...], int](), list[tuple[int, Pair]]()
         for edge in edges:
             if ledger.verdict_of(edge) is not Verdict.REJECTED:
@@ -307,7 +308,7 @@ class SlipDetector:
                 continue
             stamp_ns = int(keyframes.stamps_ns[np.searchsorted(keyframes.ids, ends[0])])
             is_inside = slip.began_ns <= stamp_ns and (slip.ended_ns is None or stamp_ns < slip.ended_ns)
-            if is_inside and ledger.is_withdrawn(edge) and ledger.reason.values[edge] == Reason.SLIP:
+            if is_inside and ledger.is_withdrawn(edge) and ledger.reason.values[ledger.ids.row(edge)] == Reason.SLIP:
                 out.append((ends[0], (edge, used[ends])))
         return [pair for _, pair in sorted(out)]
 
@@ -323,7 +324,7 @@ class SlipDetector:
         backend.gate_new(keyframe)
         for link in links:
             backend.decisions.decide(link.own, keyframe, Verdict.REJECTED, Reason.SLIP, slip.evidence, threshold)
-            backend.ledger.threshold.values[link.own] = threshold
+            backend.ledger.threshold.values[backend.ledger.ids.row(link.own)] = threshold
         backend.cancel_search()
         self.slips[-1] = replace(slip, edges=slip.edges + len(links))
 
@@ -331,7 +332,8 @@ class SlipDetector:
         backend, links = self._backend, {link.own: link for link in self._window.links.values()}
         for own, replacement in pairs:
             backend.decisions.withdraw([replacement], keyframe, Reason.REVOKED)
-            backend.ledger.threshold.values[own] = backend.ledger.threshold.values[replacement]
+            ledger = backend.ledger
+            ledger.threshold.values[ledger.ids.row(own)] = ledger.threshold.values[ledger.ids.row(replacement)]
             backend.decisions.decide(own, keyframe, Verdict.NOT_EVALUATED, Reason.NONE, -2.0 * gain)
             if own in links:
                 links[own].edge = own

@@ -120,28 +120,15 @@ class Window:
         self.views = deque(view for view in self.views if view.vertex >= vertex)
         self._new = [one for one in self._new if one[0].vertex >= vertex]
 
-    def renumber(self, vertices: Index, edges: Index, first: int) -> None:
-        """Take over new ids of all vertices and edges, by old ones; -1: it was removed.
-
-        Parameters
-        ----------
-        first : the first keyframe that stays, by its new vertex: motions from it on are kept
-        """
-        self.history.renumber(vertices, edges, first)
-        self.first = max(int(vertices[self.first]), first) if self.first < len(vertices) else first
+    def forget_before(self, first: int) -> None:
+        """Forget what has left the graph with the keyframes before one, by its vertex."""
+        graph = self._backend.graph
+        self.history.forget_before(first)
+        self.first = max(self.first, first)
         self._new.clear()
-        for link in self.links.values():
-            link.edge, link.own = int(edges[link.edge]), int(edges[link.own])
-            link.vertices = int(vertices[link.vertices[0]]), int(vertices[link.vertices[1]])
-        self.links = {link.vertices[1]: link for link in self.links.values() if link.vertices[1] > first}
+        self.links = {end: link for end, link in self.links.items() if end > first}
         for view in self.views:
-            view.vertex = int(vertices[view.vertex])
-            whats = [one.what if isinstance(one.what, str) else int(vertices[one.what]) for one in view.seen]
-            kept = [
-                replace(one, edge=int(edges[one.edge]), what=what)
-                for one, what in zip(view.seen, whats, strict=True)
-                if edges[one.edge] >= 0 and (isinstance(what, str) or what >= 0)
-            ]
+            kept = [one for one in view.seen if graph.edge_ids.has(one.edge)]
             self.is_whole &= len(kept) == len(view.seen)
             view.seen = kept
         self.is_whole &= all(view.vertex in self.links for view in self.views)
@@ -211,7 +198,7 @@ class Window:
 
     def known_from(self, landmark: int) -> int:
         """The keyframe from which on a landmark was well known, whatever is held back in this window."""
-        oldest = self.views[0].seen[0].edge if self.views else self._backend.graph.edge_count
+        oldest = self.views[0].seen[0].edge if self.views else self._backend.graph.edge_ids.next
         return self.history.known_from(landmark, oldest)
 
     @property
@@ -235,8 +222,9 @@ class Window:
         """Add the innovations of what came since the last solve to the sums."""
         ledger, usual = self._backend.ledger, self._usual()
         for view, one in self._new:
-            if one.edge < len(ledger) and (isinstance(one.what, str) or self.known_from(one.what) < view.vertex):
-                numbers, statistic = int(ledger.numbers.values[one.edge]), float(ledger.statistic.values[one.edge])
+            if one.edge < ledger.ids.next and (isinstance(one.what, str) or self.known_from(one.what) < view.vertex):
+                row = ledger.ids.row(one.edge)
+                numbers, statistic = int(ledger.numbers.values[row]), float(ledger.statistic.values[row])
                 self._ratios.append(statistic / quantile(0.5, numbers))
                 view.statistic += min(statistic / usual, quantile(_CAP, numbers))
                 view.numbers += numbers
@@ -320,24 +308,18 @@ class LandmarkHistory:
 
     def __init__(self, graph: Graph, ledger: Ledger) -> None:
         self._graph, self._ledger = graph, ledger
-        self._start = graph.vertex_count  # landmarks of a map that was loaded are known
+        self._start = graph.vertex_ids.next  # landmarks of a map that was loaded are known
         self._surveyed: set[int] = set()
         self._earliest: dict[int, list[tuple[int, int]]] = {}  # (edge, keyframe) of each landmark's first sightings
         self._known: dict[int, _Judged] = {}
 
-    def renumber(self, vertices: Index, edges: Index, first: int) -> None:
-        """Take over new ids of all vertices and edges, by old ones; -1: it was removed.
-
-        Parameters
-        ----------
-        first : the first keyframe that stays, by its new vertex; landmarks before it are known
-        """
+    def forget_before(self, first: int) -> None:
+        """Forget the sightings that have left the graph; landmarks before a keyframe, by its vertex, are known."""
         self._start = first
-        self._surveyed = {int(vertices[landmark]) for landmark in self._surveyed if vertices[landmark] >= 0}
         self._earliest = {
-            int(vertices[landmark]): [(int(edges[e]), int(vertices[k])) for e, k in earliest if edges[e] >= 0]
+            landmark: [one for one in earliest if self._graph.edge_ids.has(one[0])]
             for landmark, earliest in self._earliest.items()
-            if vertices[landmark] >= first
+            if landmark >= first and self._graph.vertex_ids.has(landmark)
         }
         self._known.clear()
 
@@ -363,14 +345,14 @@ class LandmarkHistory:
         _, accepted, held_back = self._judged(landmark)
         doubted = sum(edge < newest for edge in held_back)
         if doubted > _DOUBTED * (doubted + len(accepted)):
-            return self._graph.vertex_count
-        return accepted[_SUPPORT - 1] if len(accepted) >= _SUPPORT else self._graph.vertex_count
+            return self._graph.vertex_ids.next
+        return accepted[_SUPPORT - 1] if len(accepted) >= _SUPPORT else self._graph.vertex_ids.next
 
     def _judged(self, landmark: int) -> _Judged:
         """The verdicts on the first sightings of a landmark, looked up only where some may have changed."""
-        earliest, count = self._earliest[landmark], len(self._ledger)
+        earliest, end = self._earliest[landmark], self._ledger.ids.next
         judged = len(earliest)
-        while judged and earliest[judged - 1][0] >= count:
+        while judged and earliest[judged - 1][0] >= end:
             judged -= 1
         as_of = self._ledger.changes, judged
         known = self._known.get(landmark)

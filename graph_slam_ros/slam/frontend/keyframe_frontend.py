@@ -32,7 +32,7 @@ from graph_slam_ros.slam.frontend.pose_edges import PoseEdges
 from graph_slam_ros.slam.frontend.stamp_order import PendingObservations, StampOrder
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.solver import Solver
-from graph_slam_ros.typing import Array, Index, Numbers
+from graph_slam_ros.typing import Array, Numbers
 
 _UNCERTAIN, _MAX_UNCERTAIN_M = 10.0, 1e5  # times as far as a given pose is away: so little odometry is trusted there
 _SHARED_WHEN_SOON = 1.0  # of a variance: with more, what comes fast would seem better than it is
@@ -148,9 +148,9 @@ class KeyframeFrontend:
             "noise_due": self._edges.due,
         }
 
-    def forget_before(self, first: int, vertices: Index) -> None:
-        """Forget the keyframes before a number. All others have other vertices now, given in order."""
-        self.path.forget_before(first, vertices)
+    def forget_before(self, first: int) -> None:
+        """Forget the keyframes before a number."""
+        self.path.forget_before(first)
         self.sighting_poses = self.sighting_poses.without(np.flatnonzero(self.sighting_poses.ids < first))
 
     def forget_time(self, *, goes_on: bool = False) -> None:

@@ -13,7 +13,7 @@ from graph_slam_ros.slam.frontend.odometry_integration import IntegratedOdometry
 from graph_slam_ros.slam.frontend.odometry_selector import Step
 from graph_slam_ros.slam.frontend.odometry_track import OdometrySamples
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
-from graph_slam_ros.typing import Index, Numbers
+from graph_slam_ros.typing import Numbers
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,9 +113,9 @@ class KeyframeList:
             self._motions.append(IntegratedOdometry(self._noise, self._space, keyframe, 0, self._rest))
             self._motions[-1].go_on(moved)
 
-    def forget_before(self, first: int, vertices: Index) -> None:
-        """Forget the keyframes before a number. The others have other vertices now, given in order."""
-        self.keyframes = self.keyframes.since(first, vertices)
+    def forget_before(self, first: int) -> None:
+        """Forget the keyframes before a number."""
+        self.keyframes = self.keyframes.since(first)
         self.samples.forget_before(int(self.keyframes.stamps_ns[0]))
 
     def forget_time(self) -> None:

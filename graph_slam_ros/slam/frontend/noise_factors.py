@@ -161,7 +161,7 @@ class NoiseScales:
         before = {key: self.factors.get(key, neutral(key)) for key in factors}
         if all(_is_same(before[key], factor) for key, factor in factors.items()):
             return False
-        _rescale(self.graph, range(first_edge, self.graph.edge_count), before, factors)
+        _rescale(self.graph, range(first_edge, self.graph.edge_ids.next), before, factors)
         self.factors |= factors
         return True
 
@@ -206,7 +206,7 @@ def _rescaled(
 def groups(graph: Graph, edges: range) -> Iterator[tuple[EdgeTable, Index, str, str]]:
     """Yield table, rows, class and input of each group of a range of edges."""
     for table in graph.tables.values():
-        ids = table.id.values
+        ids = table.ids
         here = (ids >= edges.start) & (ids < edges.stop)
         for code, label in enumerate(graph.labels):
             if label not in CLASSES:

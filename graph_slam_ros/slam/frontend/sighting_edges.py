@@ -55,12 +55,11 @@ class SightingEdges:
         where = (self._pose, T_keyframe_base, 1), (self._sensor, sensor, 1)
         Column.extend((self._edge, edge, 1), (self._stamp_ns, stamp_ns, 1), *where)
 
-    def renumber(self, edges: Index) -> None:
-        """Take over new ids of edges, by old ones; -1: it was removed."""
-        new = edges[self.edge]
-        rows, columns = np.flatnonzero(new >= 0), (self._edge, self._stamp_ns, self._pose, self._sensor)
-        self._edge, self._stamp_ns, self._pose, self._sensor = (column.kept(rows) for column in columns)
-        self.edge[:] = new[rows]
+    def keep(self, edges: Index) -> None:
+        """Forget all but these edges."""
+        rows = np.flatnonzero(np.isin(self.edge, edges))
+        for column in (self._edge, self._stamp_ns, self._pose, self._sensor):
+            column.values = column.values[rows]
 
     def __len__(self) -> int:
         return len(self._edge)

@@ -62,16 +62,13 @@ class StampedPoses(Generic[Instant]):
         """Return the same without some rows, by number."""
         return self._part(np.delete(np.arange(len(self.ids)), gone - self.first), self.first)
 
-    def since(self, first: int, ids: Index | None = None) -> "StampedPoses[Instant]":
-        """Return the rows from a number on, with other ids if they are given."""
-        out = self._part(np.arange(first - self.first, len(self.ids)), first)
-        if ids is not None:
-            out.ids[:] = ids
-        return out
+    def since(self, first: int) -> "StampedPoses[Instant]":
+        """Return the rows from a number on."""
+        return self._part(np.arange(first - self.first, len(self.ids)), first)
 
     def _part(self, rows: Index, first: int) -> "StampedPoses[Instant]":
         out = StampedPoses(self._record, self.poses.shape[1], first)
-        out._id, out._stamp_ns, out._pose = (one.kept(rows) for one in (self._id, self._stamp_ns, self._pose))
+        out.extend(self.ids[rows], self.stamps_ns[rows], self.poses[rows])
         return out
 
     def __len__(self) -> int:

@@ -32,7 +32,7 @@ from graph_slam_ros.slam.landmarks.renumbered import first_of_later
 from graph_slam_ros.slam.landmarks.scan_history import ScanHistory
 from graph_slam_ros.slam.landmarks.scans import SCAN_NS, DeadReckoning, Motion, Scan, ScanBuilder
 from graph_slam_ros.solver import Solver
-from graph_slam_ros.typing import Array, Executor, Index
+from graph_slam_ros.typing import Array, Executor
 
 _GATE_SAME = 0.9999  # probability of the chi2 test within which an observation may belong to a landmark
 _REVIEWED_EVERY = 10  # keyframes, some seconds: landmarks are confirmed and given up
@@ -262,18 +262,13 @@ class AnonymousLandmarks:
             return True
         return self.hindsight.covers(first_of_later(scans, keyframe)) and not self.hindsight.is_doubtful
 
-    def forget_before(self, keyframe: int, vertices: Index) -> None:
-        """Forget the scans from keyframes before a number, which have left the graph: their landmarks are final.
-
-        Parameters
-        ----------
-        vertices : new ids by old ones
-        """
+    def forget_before(self, keyframe: int) -> None:
+        """Forget the scans from keyframes before a number, which have left the graph: their landmarks are final."""
         history = self._history
         k = first_of_later(history.scans, keyframe)
         self.hindsight.forget(k)
         clusters = history.firsts[k] if k < len(history.scans) else len(self.clusters.given)
-        history.forget(k, clusters, vertices)
+        history.forget(k, clusters)
         self._compared -= k
         new = self.clusters.forget(clusters, (c for scan in history.scans for c in scan.clusters))
         beam = self._beam
@@ -287,7 +282,6 @@ class AnonymousLandmarks:
         self._sorts = new.kept(self._sorts, kept)
         if beam is not None:
             beam.sorts = self._sorts
-        self._builder.renumber(vertices)
 
     # -- afterwards --------------------------------------------------------------------------------------------------
 

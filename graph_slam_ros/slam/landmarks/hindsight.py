@@ -184,8 +184,7 @@ class Found:
         a, b = (group.compose(tuple(correction[side].T), poses) for side in (before, after))
         way = group.local(a, b)
         moved = np.stack(group.retract(a, tuple(np.clip(part, 0.0, 1.0) * d for d in way)), axis=-1)
-        begins = np.array([solver.graph.vertex(vertex).stored.start for vertex in keyframes.ids.tolist()])
-        where = begins[:, None] + np.arange(space.pose.size)
+        where = solver.graph.begins(keyframes.ids)[:, None] + np.arange(space.pose.size)
         values[where] = moved if n == 2 else np.hstack([moved[:, :3], _unit(moved[:, 3:])])
         return values
 

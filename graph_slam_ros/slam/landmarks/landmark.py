@@ -1,11 +1,10 @@
 """The records of landmarks: of the graph, or not determined yet; and of their sightings."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 from graph_slam_ros.measurements.types import Sighting
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
 from graph_slam_ros.slam.landmarks.triangulation import PositionHypothesis
-from graph_slam_ros.typing import Index
 
 
 @dataclass(frozen=True, slots=True)
@@ -16,11 +15,6 @@ class LandmarkEdge:
     topic: str
     sighting: Sighting
     where: PoseAtStamp
-
-    def renumbered(self, vertices: Index, edges: Index) -> "LandmarkEdge":
-        """The same with new ids of vertices and edges, by old ones."""
-        where = replace(self.where, vertex=int(vertices[self.where.vertex]))
-        return replace(self, edge=int(edges[self.edge]), where=where)
 
 
 @dataclass(slots=True)

@@ -16,7 +16,7 @@ from graph_slam_ros.slam.landmarks.assignments import Assigned
 from graph_slam_ros.slam.landmarks.landmark import Landmark
 from graph_slam_ros.slam.landmarks.landmark_map import Landmarks
 from graph_slam_ros.solver import Solver
-from graph_slam_ros.typing import Executor, Index
+from graph_slam_ros.typing import Executor
 
 
 class LandmarkFrontend:
@@ -58,10 +58,10 @@ class LandmarkFrontend:
         self.map.restore(landmarks)
         self.anonymous.restore()
 
-    def forget_before(self, keyframe: int, vertices: Index, edges: Index) -> None:
-        """Take over new ids, by old ones, after the keyframes before a number have left; -1: it was removed."""
-        self.map.renumber(vertices, edges)
-        self.anonymous.forget_before(keyframe, vertices)
+    def forget_before(self, keyframe: int) -> None:
+        """Forget what has left the graph with the keyframes before a number."""
+        self.map.forget_removed()
+        self.anonymous.forget_before(keyframe)
 
     def identified(self, m: Sightings, where: PoseAtStamp) -> list[Assigned]:
         """The sightings that can be used now, each with its landmark. The others are counted."""

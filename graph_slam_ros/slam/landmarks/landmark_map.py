@@ -19,7 +19,7 @@ from graph_slam_ros.slam.frontend.sighting_edges import SightingEdges
 from graph_slam_ros.slam.landmarks.landmark import Landmark, LandmarkEdge, UndeterminedLandmark
 from graph_slam_ros.slam.landmarks.triangulation import PartialObservation, possible_places, why_undetermined
 from graph_slam_ros.solver import Solver
-from graph_slam_ros.typing import Array, Index, Numbers
+from graph_slam_ros.typing import Array, Numbers
 
 LABEL = "landmarks"
 _SOMEWHERE_M = 3.0  # away, of what was seen by its bearing alone
@@ -112,20 +112,19 @@ class Landmarks:
         """Return a copy of each landmark of the graph, as ``restore`` takes them."""
         return {name: replace(mark, seen=list(mark.seen), stamps=set(mark.stamps)) for name, mark in self.known.items()}
 
-    def renumber(self, vertices: Index, edges: Index) -> None:
-        """Take over new ids of vertices and edges, by old ones; -1: it was removed.
+    def forget_removed(self) -> None:
+        """Forget the sightings whose edges are not in the graph any more.
 
-        Sightings of landmarks that are not determined yet are forgotten with their keyframe, and counted.
+        Those of landmarks that are not determined yet are forgotten with their keyframe, and counted.
         """
         for landmark in self.known.values():
-            landmark.vertex = int(vertices[landmark.vertex])
-            landmark.seen = [one.renumbered(vertices, edges) for one in landmark.seen if edges[one.edge] >= 0]
+            landmark.seen = [one for one in landmark.seen if self._graph.edge_ids.has(one.edge)]
             landmark.stamps = {one.where.stamp_ns for one in landmark.seen}
-        self.origins.renumber(edges)
+        self.origins.keep(self._graph.edge_ids.since())
         for name, candidate in list(self.undetermined.items()):
-            left = [(where, s) for where, s in candidate.seen if vertices[where.vertex] >= 0]
+            left = [one for one in candidate.seen if self._graph.vertex_ids.has(one[0].vertex)]
             self._counters.count(candidate.topic, "condensed", len(candidate.seen) - len(left))
-            candidate.seen = [(replace(where, vertex=int(vertices[where.vertex])), s) for where, s in left]
+            candidate.seen = left
             if not left:
                 del self.undetermined[name]
 

@@ -1,15 +1,13 @@
 """New numbers of clusters and landmarks, after the oldest clusters have left: what they are of is final."""
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TypeVar
 
 import numpy as np
 
-from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
 from graph_slam_ros.slam.landmarks.beam import Decision, Ids
 from graph_slam_ros.slam.landmarks.scans import Scan
-from graph_slam_ros.typing import Index
 
 T = TypeVar("T")
 
@@ -61,16 +59,6 @@ class Renumbered:
                 now = done[id(old)] = Decision(now, old.cluster - self.gone, self.landmark(old.landmark), count)
             out.append(now)
         return out
-
-
-def with_vertices(scan: Scan, vertices: Index) -> Scan:
-    """Return a scan whose keyframes have new vertices, by old ones."""
-
-    def moved(where: PoseAtStamp) -> PoseAtStamp:
-        return replace(where, vertex=int(vertices[where.vertex]))
-
-    clusters = tuple(replace(c, seen=tuple(replace(s, where=moved(s.where)) for s in c.seen)) for c in scan.clusters)
-    return replace(scan, where=moved(scan.where), clusters=clusters)
 
 
 def first_of_later(scans: Sequence[Scan], keyframe: int) -> int:

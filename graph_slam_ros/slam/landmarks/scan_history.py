@@ -8,7 +8,6 @@ import numpy as np
 from graph_slam_ros.config.pipeline import OdometryConfig
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.slam.frontend.odometry_selector import JUMP_SIGMA_M, JUMP_SIGMA_RAD
-from graph_slam_ros.slam.landmarks.renumbered import with_vertices
 from graph_slam_ros.slam.landmarks.scans import (
     NEARBY_NS,
     DeadReckoning,
@@ -17,7 +16,7 @@ from graph_slam_ros.slam.landmarks.scans import (
     motion_between,
     rescaled_nearby,
 )
-from graph_slam_ros.typing import Array, Index
+from graph_slam_ros.typing import Array
 
 Added = Callable[[float], Array]
 """Variances (dof,) that so many seconds of motion add to odometry."""
@@ -136,14 +135,8 @@ class ScanHistory:
         k = next((k for k, scan in enumerate(self.scans) if scan.where.vertex >= vertex), 0)
         return k or None
 
-    def forget(self, count: int, clusters: int, vertices: Index) -> None:
-        """Forget the first scans and their clusters: their keyframes have left the graph.
-
-        Parameters
-        ----------
-        vertices : new ids by old ones
-        """
-        self.scans = [with_vertices(scan, vertices) for scan in self.scans[count:]]
+    def forget(self, count: int, clusters: int) -> None:
+        """Forget the first scans and their clusters."""
+        self.scans = self.scans[count:]
         self.motions, self._nearby = self.motions[count:], self._nearby[count:]
         self.firsts = [one - clusters for one in self.firsts[count:]]
-        self._split = {at for one in self._split if (at := int(vertices[one])) >= 0}

@@ -20,7 +20,7 @@ from graph_slam_ros.slam.frontend import motion_compensation
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
 from graph_slam_ros.slam.frontend.odometry_selector import Step
 from graph_slam_ros.slam.landmarks.rotations import lever, rotation, turn_of
-from graph_slam_ros.typing import Array, Index, Numbers
+from graph_slam_ros.typing import Array, Numbers
 
 SCAN_NS, _SCAN_RAD = 500_000_000, 0.15
 NEARBY_S = np.linspace(-0.5, 0.5, 21)
@@ -296,12 +296,6 @@ class ScanBuilder:
     def oldest_keyframe(self) -> int | None:
         """The number of the oldest keyframe that something was seen from; None if nothing was."""
         return min((one.seen.where.keyframe for one in self._glimpses), default=None)
-
-    def renumber(self, vertices: Index) -> None:
-        """Take over new vertices of keyframes, by old ones."""
-        for k, one in enumerate(self._glimpses):
-            where = replace(one.seen.where, vertex=int(vertices[one.seen.where.vertex]))
-            self._glimpses[k] = replace(one, seen=replace(one.seen, where=where))
 
     def reckon_anew(self, at: Callable[[int], Reckoned]) -> None:
         """Take over dead reckoning that was corrected."""

@@ -10,7 +10,6 @@ from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.errors import SingularError
 from graph_slam_ros.graph import Edge, Gaussian
 from graph_slam_ros.graph.geometry import Geometry
-from graph_slam_ros.graph.graph import kept_part, new_ids
 from graph_slam_ros.graph.losses import weight_and_cost
 from graph_slam_ros.slam.lifelong.elimination import product, square_root, symmetric
 from graph_slam_ros.slam.lifelong.place import Cell, Place, PlaceEdge, added_place, fit_of
@@ -61,40 +60,6 @@ class Condensed:
     def is_contradiction(self) -> bool:
         """Return whether the visit contradicts itself or its place."""
         return self.why in (ITSELF, PLACE)
-
-
-@dataclass(frozen=True, slots=True)
-class Renumbered:
-    """The new ids of vertices and edges by old ones, (n,): -1 where they were removed."""
-
-    vertices: Index
-    edges: Index
-
-
-def compact(solver: Solver, vertices: Index | None = None, edges: Index | None = None) -> Renumbered:
-    """Remove all other vertices and edges from a graph and its solver, in place. The estimate stays.
-
-    Whoever has an id of them must take over the new one. What the solver had is pending: the next update solves it.
-
-    Parameters
-    ----------
-    vertices, edges : that stay, ascending; by default those of the problem, and edges that have a weight
-    """
-    graph = solver.graph
-    vertices = solver.vertices if vertices is None else vertices
-    edges = solver.edges if edges is None else edges
-    inside, held = solver.vertices, solver.held
-    part = kept_part(graph, vertices, edges, solver.values)
-    out = Renumbered(new_ids(vertices, graph.vertex_count), new_ids(edges, graph.edge_count))
-    vars(graph).update(vars(part))
-    fresh = Solver(graph, solver.settings)
-    still = out.vertices[inside]
-    fresh.add(still[still >= 0], np.arange(graph.edge_count))
-    for vertex in out.vertices[held].tolist():
-        if vertex >= 0:
-            fresh.hold(vertex)
-    vars(solver).update(vars(fresh))
-    return out
 
 
 @dataclass(slots=True)
@@ -173,22 +138,20 @@ def seen_from(space: Geometry, solver: Solver, keyframes: Index) -> list[set[int
     held = np.isin(keyframes, solver.held).tolist()
     out: list[set[int] | None] = [None if is_held else set() for is_held in held]
     is_point = np.array([kind is space.point for kind in graph.kinds])
-    row_of = np.full(graph.vertex_count, -1)
-    row_of[keyframes] = np.arange(len(keyframes))
-    edges, codes = solver.edges, graph.table_of_edge.values[solver.edges]
-    for code, table in enumerate(graph.tables.values()):
-        rows = graph.row_of_edge.values[edges[codes == code]]
-        ends, numbers = table.vertices.values[rows], table.id.values[rows]
+    place = np.full(graph.vertex_ids.next, -1)
+    place[keyframes] = np.arange(len(keyframes))
+    for table, rows in graph.by_table(solver.edges).items():
+        ends, numbers = table.at(rows).vertices, table.at(rows).ids
         is_fit = graph.has_label(numbers, (CLOSURES, FIXES))
         if table.type is space.relative_pose:
             is_fit |= graph.has_label(numbers, ("odometry", CHAIN))
         if ends.shape[1] == 2:
-            is_seen = graph.has_label(numbers, (LANDMARKS,)) | is_point[graph.kind.values[ends[:, 1]]]
+            is_seen = graph.has_label(numbers, (LANDMARKS,)) | is_point[graph.kind_codes(ends[:, 1])]
             is_fit |= is_seen
-            for row, mark in zip(row_of[ends[is_seen, 0]].tolist(), ends[is_seen, 1].tolist(), strict=True):
+            for row, mark in zip(place[ends[is_seen, 0]].tolist(), ends[is_seen, 1].tolist(), strict=True):
                 if row >= 0 and (of_row := out[row]) is not None:
                     of_row.add(mark)
-        for row in row_of[ends[~is_fit]].ravel().tolist():
+        for row in place[ends[~is_fit]].ravel().tolist():
             if row >= 0:
                 out[row] = None
     return out
@@ -276,13 +239,10 @@ class Condenser:
         except SingularError as error:
             return self._without_place(visit, after, around, str(error))
 
-    def renumber(self, new: Renumbered) -> None:
-        """Take over new ids after a compaction."""
+    def forget_removed(self) -> None:
+        """Forget landmarks that are not in the graph any more."""
         for one in self._all():
-            one.base, one.edge = int(new.vertices[one.base]), int(new.edges[one.edge])
-            one.place = replace(one.place, members=tuple(new.vertices[list(one.place.members)].tolist()))
-            strikes = {int(new.vertices[mark]): count for mark, count in one.strikes.items()}
-            one.strikes = {mark: count for mark, count in strikes.items() if mark >= 0}
+            one.strikes = {mark: count for mark, count in one.strikes.items() if self.solver.graph.vertex_ids.has(mark)}
 
     def rescale(self) -> None:
         """Scale all places, where visits so far say that their variances are larger or smaller."""

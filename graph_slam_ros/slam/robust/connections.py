@@ -74,7 +74,7 @@ def landmarks_begun(graph: Graph, held: Index) -> Index:
     ----------
     held : vertices that are held in place
     """
-    count = graph.vertex_count
+    count = graph.vertex_ids.next
     begun, is_sighted, is_tied = np.arange(count), np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
     is_tied[held] = True
     for table in graph.tables.values():
@@ -102,7 +102,7 @@ def connections_across(graph: Graph, held: Index, keyframes: Index, end: int) ->
     begun, found = landmarks_begun(graph, held), [np.empty((0, 3), dtype=np.int64)]
     held_back = [np.empty((0, 2), dtype=np.int64)]
     for table in graph.tables.values():
-        is_used, of_landmark = table.weight.values > 0.0, graph.has_label(table.id.values, ("landmarks",))
+        is_used, of_landmark = table.weight.values > 0.0, graph.has_label(table.ids, ("landmarks",))
         if of_landmark.any():
             out = table.at(np.flatnonzero(of_landmark & ~is_used)).vertices[:, :2]
             held_back.append(out[(out[:, 0] >= keyframes[0]) & (out[:, 0] < end)])
@@ -131,8 +131,8 @@ def moved_values(space: Geometry, solver: Solver, motions: Mapping[int, Numbers]
     motions : of keyframes in map, by their vertices
     """
     graph, values, keyframes = solver.graph, solver.values, sorted(motions)
-    begun = landmarks_begun(graph, solver.held)
-    for vertex in np.flatnonzero(begun >= keyframes[0]).tolist():
+    begun, every = landmarks_begun(graph, solver.held), graph.vertex_ids.since()
+    for vertex in every[begun[every] >= keyframes[0]].tolist():
         motion, one = motions[keyframes[bisect_right(keyframes, begun[vertex]) - 1]], graph.vertex(vertex)
         numbers = tuple(values[one.stored].tolist())
         if one.kind is space.pose:

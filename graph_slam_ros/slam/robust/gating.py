@@ -26,7 +26,6 @@ from graph_slam_ros.slam.robust.innovation import innovations, likely_together
 from graph_slam_ros.slam.robust.landmark_support import LandmarkSupport, landmark_of
 from graph_slam_ros.slam.robust.ledger import FINAL, OUTSIDE, Ledger, Reason, Verdict
 from graph_slam_ros.solver import Settings, Solver
-from graph_slam_ros.solver.linearization import rows_of
 from graph_slam_ros.typing import Array, Index
 
 CANDIDATES = ("landmarks", "fixes", "closures", "initialpose")
@@ -62,15 +61,9 @@ class OutlierGate:
         self.is_calibrated = False
         self.gate_scale = self.stated_scale = config.noise_factor**2
         self._withdrawn: dict[int, Reason] = {}  # before they were taken
-        self._vertices = 0  # of the graph, at the last solve
+        self._vertices = 0  # those below were in the graph at the last solve
         self._next = 0  # of the accepted, where the next review goes on
         self._next_out = 0  # and of those that are out
-
-    def renumber(self, new: Index) -> None:
-        """Take over new ids of all edges, by old ones; -1: it was removed. Every edge has been judged."""
-        self.ledger.renumber(new)
-        self.recount()
-        self._vertices = self._graph.vertex_count
 
     def recount(self) -> None:
         """Count anew which edges determine each landmark, after verdicts and weights have changed elsewhere."""
@@ -78,12 +71,12 @@ class OutlierGate:
 
     # -- what is new -------------------------------------------------------------------------------------------------
 
-    def gate_new(self, count: int, keyframe: int, *, trusts_sightings: bool = True) -> list[int]:
-        """Judge the new edges, up to a count, by their own noise.
+    def gate_new(self, end: int, keyframe: int, *, trusts_sightings: bool = True) -> list[int]:
+        """Judge the new edges, up to an id, by their own noise.
 
         Those that fit are accepted. The others are returned and held back, as are all sightings if none is trusted.
         """
-        ids = np.arange(len(self.ledger), count)
+        ids = np.arange(self.ledger.ids.next, end)
         chi2, numbers = self._solver.chi2_of(ids)
         limit, judged = self._limits(ids, numbers), self._graph.has_label(ids, CANDIDATES)
         judged &= ~np.isin(ids, list(self._withdrawn))
@@ -91,7 +84,7 @@ class OutlierGate:
         for edge in ids[judged].tolist():
             self._support.count(edge, 1)
         for edge, reason in self._withdrawn.items():
-            self.ledger.note(edge, keyframe, Verdict.REJECTED, reason, self.ledger.statistic.values[edge])
+            self.ledger.note(edge, keyframe, Verdict.REJECTED, reason, _judged(self.ledger, edge)[0])
         self._withdrawn.clear()
         pending, unfit = list[int](), set(ids[chi2 > limit].tolist())
         for edge in ids[judged & self._config.decide].tolist():
@@ -100,7 +93,7 @@ class OutlierGate:
                 self._weigh(edge, is_in=False)
                 self.ledger.put(edge, Verdict.PENDING, Reason.UNLIKELY)
                 pending.append(edge)
-        self._vertices = self._graph.vertex_count
+        self._vertices = self._graph.vertex_ids.next
         return pending
 
     def _is_of_known(self, edge: int) -> bool:
@@ -116,7 +109,7 @@ class OutlierGate:
             likely = [edge for edge in out if self._is_likely(edge, innovation[edge])]
             if not likely:
                 break
-            best = min(likely, key=lambda edge: innovation[edge] / self.ledger.threshold.values[edge])
+            best = min(likely, key=lambda edge: innovation[edge] / _judged(self.ledger, edge)[1])
             for edge in likely if admitted else [best]:
                 self._readmit(edge, keyframe, innovation[edge], self._innovation_gate(edge))
                 admitted.append(edge)
@@ -132,7 +125,8 @@ class OutlierGate:
     def unfit(self, edges: Sequence[int]) -> list[int]:
         """Return those of some edges that do not fit at the present estimate."""
         chi2, _ = self._solver.chi2_of(edges)
-        return [edges[k] for k in np.flatnonzero(chi2 > self.ledger.threshold.values[edges]).tolist()]
+        limits = self.ledger.threshold.values[self.ledger.ids.existing(edges)]
+        return [edges[k] for k in np.flatnonzero(chi2 > limits).tolist()]
 
     def refuse_unfit(self, edges: Sequence[int], keyframe: int) -> bool:
         """Reject those of some edges that still do not fit. Returns whether there were any."""
@@ -154,10 +148,11 @@ class OutlierGate:
         self._reweight(inside, keyframe)
         outside = self.ledger.outside
         chi2, _ = self._solver.chi2_of(outside)
-        fits = chi2 <= self.ledger.threshold.values[outside]
+        rows = self.ledger.ids.rows(outside)
+        fits = chi2 <= self.ledger.threshold.values[rows]
         for edge, fit in zip(outside[fits].tolist(), chi2[fits].tolist(), strict=True):
             self._readmit(edge, keyframe, fit)
-        others = outside[~fits & (self.ledger.verdict.values[outside] == Verdict.PENDING)].tolist()
+        others = outside[~fits & (self.ledger.verdict.values[rows] == Verdict.PENDING)].tolist()
         turn = [others[(self._next_out + k) % len(others)] for k in range(min(_RETESTS, len(others)))]
         self._next_out += len(turn)
         judged = list(zip(turn, self.innovations(turn), strict=True))
@@ -171,7 +166,7 @@ class OutlierGate:
         inside, outside = ledger.inside, ledger.outside
         for edges, out in ((inside, True), (outside, False)):
             chi2, _ = self._solver.chi2_of(edges)
-            other = (chi2 > ledger.threshold.values[edges]) == out
+            other = (chi2 > ledger.threshold.values[ledger.ids.rows(edges)]) == out
             for edge, fit in zip(edges[other].tolist(), chi2[other].tolist(), strict=True):
                 if not out:
                     self._readmit(edge, keyframe, fit)
@@ -194,7 +189,7 @@ class OutlierGate:
             some = nearest[begin : begin + _AT_ONCE]
             costs |= zip(some, self.innovations(some), strict=True)
             for edge in some:
-                if costs[edge] <= self.ledger.threshold.values[edge] and self._is_likely(edge, costs[edge]):
+                if costs[edge] <= _judged(self.ledger, edge)[1] and self._is_likely(edge, costs[edge]):
                     self._readmit(edge, keyframe, costs[edge])
                     return True
         return False
@@ -242,8 +237,7 @@ class OutlierGate:
 
     def most_cost(self, edges: Sequence[int]) -> float:
         """Return what some rejected edges may cost together: for each its gate, or the limit of its residual."""
-        limits = self.ledger.threshold.values
-        return sum(min(self._innovation_gate(edge), float(limits[edge])) for edge in edges)
+        return sum(min(self._innovation_gate(edge), _judged(self.ledger, edge)[1]) for edge in edges)
 
     def withdraw(self, edges: Sequence[int], keyframe: int, reason: Reason = Reason.WITHDRAWN) -> None:
         """Remove edges permanently, for a reason other than their fit.
@@ -251,11 +245,11 @@ class OutlierGate:
         If only rejected edges are left of a landmark, they are accepted again, because nothing else determines it.
         """
         for edge in edges:
-            if edge >= len(self.ledger):
+            if edge >= self.ledger.ids.next:
                 self._solver.set_weight(edge, 0.0)
                 self._withdrawn[edge] = reason
             elif not self.ledger.is_withdrawn(edge):
-                self.decide(edge, keyframe, Verdict.REJECTED, reason, float(self.ledger.statistic.values[edge]))
+                self.decide(edge, keyframe, Verdict.REJECTED, reason, _judged(self.ledger, edge)[0])
         landmarks = {landmark for edge in edges if (landmark := landmark_of(self._graph, edge)) is not None}
         for landmark in sorted(landmarks):
             if not self._support.is_determined(landmark):
@@ -264,13 +258,13 @@ class OutlierGate:
     def _readmit_all(self, edges: Index, keyframe: int) -> None:
         """Accept all of these edges that were rejected, but not permanently."""
         for edge in np.intersect1d(edges, self.ledger.outside).tolist():
-            if self.ledger.reason.values[edge] not in FINAL:
+            if self.ledger.reason.values[self.ledger.ids.row(edge)] not in FINAL:
                 self._readmit(edge, keyframe, *_judged(self.ledger, edge))
 
     def are_beyond_noise(self, edges: Sequence[int]) -> bool:
         """Return whether most of some rejected edges are farther off than odometry's noise as stated explains."""
-        factor, numbers = self.stated_scale, self.ledger.numbers.values
-        limits = [factor * quantile(self._config.gate, int(numbers[edge])) for edge in edges]
+        numbers = self.ledger.numbers.values[self.ledger.ids.existing(edges)].tolist()
+        limits = [self.stated_scale * quantile(self._config.gate, one) for one in numbers]
         far = [cost > limit for cost, limit in zip(self.innovations(edges), limits, strict=True)]
         return 2 * sum(far) > len(far)
 
@@ -280,19 +274,21 @@ class OutlierGate:
 
     def exchange(self, included: Sequence[int], excluded: Sequence[int], keyframe: int) -> None:
         """Accept some edges and reject others, which may come back. Their fit is judged afterwards."""
-        statistic = self.ledger.statistic.values
         for edge in included:
             if not self.ledger.is_inside(edge):
-                self._readmit(edge, keyframe, statistic.item(edge))
+                self._readmit(edge, keyframe, _judged(self.ledger, edge)[0])
         for edge in excluded:
             if self.ledger.is_inside(edge) and not self._support.is_needed(edge):
-                self.decide(edge, keyframe, Verdict.REJECTED, Reason.DOES_NOT_FIT, statistic.item(edge))
+                self.decide(edge, keyframe, Verdict.REJECTED, Reason.DOES_NOT_FIT, _judged(self.ledger, edge)[0])
 
     def adopt_verdicts(self, other: Ledger, keyframe: int) -> bool:
         """Take over the verdicts of a search on the same edges. Returns whether that changed one."""
-        mine, known = self.ledger, len(other)
-        judged = mine.final + np.flatnonzero(mine.verdict.values[mine.final : known] != Verdict.NOT_EVALUATED)
-        standing = judged[~np.isin(mine.reason.values[judged], FINAL)]
+        mine = self.ledger
+        edges = mine.ids.since(mine.final)
+        edges = edges[edges < other.ids.next]
+        rows = mine.ids.rows(edges)
+        is_judged = mine.verdict.values[rows] != Verdict.NOT_EVALUATED
+        standing = edges[is_judged & ~np.isin(mine.reason.values[rows], FINAL)]
         return self._set_verdicts(standing, np.isin(standing, other.inside), keyframe, other)
 
     def force_inliers(self, edges: Index, keyframe: int) -> None:
@@ -318,8 +314,9 @@ class OutlierGate:
         """Reduce the weight of edges, or reject them, by the weight that their losses leave."""
         ledger = self.ledger
         chi2, _ = self._solver.chi2_of(edges)
-        unfit = chi2 > ledger.threshold.values[edges]
-        again = ~unfit & (ledger.verdict.values[edges] == Verdict.DOWN_WEIGHTED)
+        rows = ledger.ids.rows(edges)
+        unfit = chi2 > ledger.threshold.values[rows]
+        again = ~unfit & (ledger.verdict.values[rows] == Verdict.DOWN_WEIGHTED)
         for edge, fit in zip(edges[again].tolist(), chi2[again].tolist(), strict=True):
             ledger.note(edge, keyframe, Verdict.ACCEPTED, Reason.NONE, fit)
         for edge, fit in zip(edges[unfit].tolist(), chi2[unfit].tolist(), strict=True):
@@ -327,7 +324,7 @@ class OutlierGate:
             weight, _ = weight_and_cost(loss.kind, loss.scale, fit)
             if weight < _OUT_BELOW and not self._support.is_needed(edge):
                 self.decide(edge, keyframe, Verdict.REJECTED, Reason.DOES_NOT_FIT, fit)
-            elif weight < 1.0 and ledger.verdict.values[edge] == Verdict.ACCEPTED:
+            elif weight < 1.0 and ledger.verdict_of(edge) is Verdict.ACCEPTED:
                 ledger.note(edge, keyframe, Verdict.DOWN_WEIGHTED, Reason.NONE, fit)
 
     def _is_likely(self, edge: int, innovation: float) -> bool:
@@ -335,7 +332,7 @@ class OutlierGate:
 
     def _innovation_gate(self, edge: int) -> float:
         """Return the threshold of an innovation."""
-        return self.gate_scale * quantile(self._config.gate, int(self.ledger.numbers.values[edge]))
+        return self.gate_scale * quantile(self._config.gate, int(self.ledger.numbers.values[self.ledger.ids.row(edge)]))
 
     # -- the solve after something was accepted ----------------------------------------------------------------------
 
@@ -377,7 +374,8 @@ class OutlierGate:
         """
         solver, ledger = self._solver, self.ledger
         unfit = np.array(self.unfit(admitted), dtype=np.int64)
-        is_expected = ledger.statistic.values[unfit] <= ledger.threshold.values[unfit]
+        rows = ledger.ids.rows(unfit)
+        is_expected = ledger.statistic.values[rows] <= ledger.threshold.values[rows]
         expected, others = unfit[is_expected].tolist(), unfit[~is_expected].tolist()
         if not expected:
             return list(admitted)
@@ -405,7 +403,7 @@ class OutlierGate:
         """Chi2 of all edges that have a weight; of a candidate at most its threshold."""
         ledger, edges = self.ledger, self._solver.edges
         chi2, _ = self._solver.chi2_of(edges)
-        limit = np.where(np.isin(edges, ledger.inside), ledger.threshold.values[edges], np.inf)
+        limit = np.where(np.isin(edges, ledger.inside), ledger.threshold.values[ledger.ids.rows(edges)], np.inf)
         return float(np.minimum(chi2, limit).sum())
 
     def _rose_since(self, before: Array) -> bool:
@@ -468,7 +466,8 @@ class OutlierGate:
             noise_ratio = self._solver.evaluate().chi2_final / freedom if is_stated else 1.0
             self.gate_scale = min(factor, max(_TIGHTEST, factor * noise_ratio))
         edges = ledger.candidates
-        ledger.threshold.values[edges] = self._limits(edges, ledger.numbers.values[edges])
+        rows = ledger.ids.rows(edges)
+        ledger.threshold.values[rows] = self._limits(edges, ledger.numbers.values[rows])
 
 
 class Tightness:
@@ -500,7 +499,7 @@ class Tightness:
         if len(edges) >= _GROWN * count:
             some = np.linspace(0, len(edges) - 1, _TYPICAL).astype(int)
             try:
-                found = [self._left_of(*of_table) for of_table in rows_of(self._graph, edges[some]).items()]
+                found = [self._left_of(*of_table) for of_table in self._graph.by_table(edges[some]).items()]
             except (GraphSlamError, np.linalg.LinAlgError):
                 return known
             known = float(np.median(np.concatenate(found)))
@@ -512,7 +511,7 @@ class Tightness:
         some = table.at(rows)
         ends = some.vertices
         joint = self._solver.edge_marginals(ends)
-        _, jacobian = table.type.linearize(self._solver.values, self._graph.offset.values[ends], some.measured)
+        _, jacobian = table.type.linearize(self._solver.values, self._graph.begins(ends), some.measured)
         white = some.sqrt_information @ jacobian
         return 1.0 - np.einsum("nij,njk,nik->n", white, joint, white) / white.shape[1]
 
@@ -524,4 +523,5 @@ def _median(numbers: int) -> float:
 
 def _judged(ledger: Ledger, edge: int) -> tuple[float, float]:
     """The statistic and its threshold."""
-    return float(ledger.statistic.values[edge]), float(ledger.threshold.values[edge])
+    row = ledger.ids.row(edge)
+    return float(ledger.statistic.values[row]), float(ledger.threshold.values[row])

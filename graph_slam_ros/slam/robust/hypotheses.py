@@ -16,7 +16,6 @@ import numpy as np
 from graph_slam_ros.config.pipeline import RobustConfig
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import GROUPS, SE2, Graph, Loss
-from graph_slam_ros.graph.records import weights_of
 from graph_slam_ros.slam.robust.gating import OutlierGate
 from graph_slam_ros.slam.robust.ledger import FINAL, Ledger
 from graph_slam_ros.slam.robust.pairwise_consistency import (
@@ -75,7 +74,7 @@ class Alternative:
 
     def stands(self, ledger: Ledger) -> bool:
         """Return whether it is still possible: none of its edges was withdrawn."""
-        return not np.isin(ledger.reason.values[list(self.only_here)], FINAL).any()
+        return not np.isin(ledger.reason.values[ledger.ids.existing(self.only_here)], FINAL).any()
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +99,7 @@ class Outcome:
         kind, here = newest.kind, newest.stored
         group = GROUPS[kind]
         moved = group.compose(tuple(self.values[here]), group.inverse(tuple(values[here])))
-        for vertex in range(old.vertex_count, graph.vertex_count):
+        for vertex in graph.vertex_ids.since(old.vertex_ids.next).tolist():
             new = graph.vertex(vertex)
             numbers = tuple(values[new.stored])
             if new.kind is kind:
@@ -173,13 +172,13 @@ class _Search:
     def __init__(self, config: RobustConfig, frozen: FrozenGraph) -> None:
         self._config, self._frozen, self._graph = config, frozen, frozen.graph.copy()
         self._candidates = frozen.ledger.candidates
-        self._weights = weights_of(self._graph.pointers, self._candidates)
+        self._weights = self._graph.weights(self._candidates)
         self._solver = Solver(self._graph, frozen.settings)
-        self._solver.add(frozen.vertices, range(len(frozen.ledger)))
+        self._solver.add(frozen.vertices, frozen.ledger.ids.since())
         for vertex in (held := frozen.held.tolist()):
             self._solver.hold(vertex)
         self._odometry = _along_odometry(self._graph, frozen.values, set(held))
-        limits = frozen.ledger.threshold.values[self._candidates]
+        limits = frozen.ledger.threshold.values[frozen.ledger.ids.rows(self._candidates)]
         self._jumps = jumps_and_back(self._graph, self._odometry, self._candidates, limits)
         self.found = list[Outcome]()
         self._ways = list[_Way]()
@@ -199,14 +198,15 @@ class _Search:
         yield "online", frozen.values, None
         is_closure = graph.has_label(candidates, ("closures",))
         closures, others = candidates[is_closure], candidates[~is_closure]
-        limits = self._config.noise_factor**2 * ledger.threshold.values[others]
+        limits = self._config.noise_factor**2 * ledger.threshold.values[ledger.ids.rows(others)]
         others = np.setdiff1d(others, contradicting_sightings(graph, odometry, others, limits))
         if self._jumps:
             yield "fixes", frozen.values, np.setdiff1d(candidates, np.concatenate(self._jumps))
         if not len(closures):
             yield "neighbours", frozen.values, others
             return
-        groups = consistent_groups(graph, odometry, closures, ledger.threshold.values[closures])
+        limits = ledger.threshold.values[ledger.ids.rows(closures)]
+        groups = consistent_groups(graph, odometry, closures, limits)
         inliers = np.concatenate((others, *groups))
         yield "neighbours", frozen.values, inliers
         yield "odometry", odometry, inliers
@@ -235,14 +235,14 @@ class _Search:
         if inliers is None or self._cost(mine) <= 2.0 * hopeless:
             self._alternate(decisions, hopeless)
         judged = mine.candidates
-        mine.statistic.values[judged], _ = solver.chi2_of(judged)
+        mine.statistic.values[mine.ids.rows(judged)], _ = solver.chi2_of(judged)
         cost = self._cost(mine)
         if np.isfinite(cost):
             self.found.append(Outcome(name, mine, solver.values, cost, frozen))
 
     def _gate(self, start: Array, ledger: Ledger) -> OutlierGate:
         """Return the gate of a start, at whose values the weights of the frozen graph hold again."""
-        now = weights_of(self._graph.pointers, self._candidates)
+        now = self._graph.weights(self._candidates)
         for k in np.flatnonzero(now != self._weights).tolist():
             self._solver.set_weight(int(self._candidates[k]), float(self._weights[k]))
         self._solver.start_at(start)
@@ -275,10 +275,11 @@ class _Search:
     def _cost(self, ledger: Ledger) -> float:
         """Chi2 of all accepted edges; a candidate costs at most its threshold, and those of one jump that once."""
         inside, outside, limits = ledger.inside, ledger.outside, ledger.threshold.values
+        rows, rows_out = ledger.ids.rows(inside), ledger.ids.rows(outside)
         chi2, _ = self._solver.chi2_of(inside)
         jumped = np.concatenate([outside[:0], *(jump[1:] for jump in self._jumps)])
-        out = np.where(np.isin(outside, jumped), ledger.numbers.values[outside], limits[outside])
-        doubted = float(np.minimum(chi2, limits[inside]).sum() + out.sum())
+        out = np.where(np.isin(outside, jumped), ledger.numbers.values[rows_out], limits[rows_out])
+        doubted = float(np.minimum(chi2, limits[rows]).sum() + out.sum())
         return self._solver.evaluate().chi2_final - float(chi2.sum()) + doubted
 
 

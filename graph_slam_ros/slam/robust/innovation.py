@@ -8,7 +8,7 @@ from graph_slam_ros.graph import POINT_SEEN_FROM, SE2, SE3, Graph
 from graph_slam_ros.graph.tables import EdgeTable
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.solver.least_cost import least_cost
-from graph_slam_ros.solver.linearization import linearized, rows_of
+from graph_slam_ros.solver.linearization import linearized
 from graph_slam_ros.typing import Array, Index
 
 _ANGLES = {SE2: 1, SE3: 3}  # of a pose, its last coordinates
@@ -30,8 +30,8 @@ def innovations(graph: Graph, solver: Solver, edges: Sequence[int]) -> list[floa
         As for ``Solver.marginal``.
     """
     out = dict[int, float]()
-    for table, rows in rows_of(graph, np.array(edges, dtype=np.int64)).items():
-        kinds = graph.kind.values[table.at(rows).vertices]
+    for table, rows in graph.by_table(np.array(edges, dtype=np.int64)).items():
+        kinds = graph.kind_codes(table.at(rows).vertices)
         for some in [rows] if (kinds == kinds[0]).all() else np.split(rows, len(rows)):
             out |= _innovations(graph, solver, table, some)
     return [out[edge] for edge in edges]
@@ -57,7 +57,7 @@ def _least_costs(graph: Graph, solver: Solver, table: EdgeTable, rows: Index) ->
     ends, root = some.vertices, some.sqrt_information
     joint = solver.edge_marginals(ends, are_inside=False)
     x = solver.values  # after the covariance, which integrates pending changes
-    residual, jacobian = table.type.linearize(x, graph.offset.values[ends], some.measured)
+    residual, jacobian = table.type.linearize(x, graph.begins(ends), some.measured)
     predicted = jacobian @ joint @ jacobian.swapaxes(1, 2)
     white = (root @ residual[:, :, None])[:, :, 0]
     spread = root @ predicted @ root.swapaxes(1, 2) + np.eye(white.shape[1])
@@ -141,7 +141,7 @@ def _spread(graph: Graph, x: Array, ends: Index, joint: Array, predicted: Array)
     sighting = POINT_SEEN_FROM[pose]
     if len(kinds) > 1 and kinds[1] in sighting.accepts[1]:
         dof, size = pose.dof + kinds[1].dof, kinds[1].dof
-        at, jacobian = sighting.linearize(x, graph.offset.values[ends[:, :2]], np.zeros((len(ends), size)))
+        at, jacobian = sighting.linearize(x, graph.begins(ends[:, :2]), np.zeros((len(ends), size)))
         across = jacobian @ joint[:, :dof, :dof] @ jacobian.swapaxes(1, 2)
         return np.asarray(np.trace(across, axis1=1, axis2=2) / np.maximum(np.sum(at * at, axis=1), 1e-12))
     of_poses = predicted.shape[1] == pose.dof

@@ -23,11 +23,8 @@ class LandmarkSupport:
         self._holds: dict[int, int] = {}  # of each landmark, edges that are in of which one alone determines it
         self._helps: dict[int, int] = {}  # and those that do so only with others
         inside = inside[graph.has_label(inside, ("landmarks",))]
-        for table in graph.tables.values():
-            edges = inside[graph.table_of_edge.values[inside] == table.code]
-            if not len(edges):
-                continue
-            several = table.vertices.values[graph.row_of_edge.values[edges], 1]
+        for table, rows in graph.by_table(inside).items() if len(inside) else ():
+            several = table.at(rows).vertices[:, 1]
             for landmark, times in zip(*map(np.ndarray.tolist, np.unique(several, return_counts=True)), strict=True):
                 of = self._among(landmark, table.type.residual_size)
                 of[landmark] = of.get(landmark, 0) + times
@@ -70,5 +67,4 @@ class LandmarkSupport:
 
 def landmark_of(graph: Graph, edge: int) -> int | None:
     """The vertex of an edge's landmark."""
-    table, row = graph.row(edge)
-    return table.vertices.values.item(row, 1) if graph.label_of(edge) == "landmarks" else None
+    return graph.ends_of(edge)[1] if graph.label_of(edge) == "landmarks" else None

@@ -2,14 +2,14 @@
 
 from collections.abc import Callable, Iterable
 from copy import copy, deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from graph_slam_ros.graph.tables import Column
+from graph_slam_ros.graph.tables import Column, LastingIds
 from graph_slam_ros.typing import Array, Index
 
 
@@ -61,21 +61,23 @@ class VerdictChange:
 
 
 class Ledger:
-    """Verdicts of all edges of a graph, by edge.
+    """Verdicts of all edges of a graph: a row of each column for each, in order.
 
     Attributes
     ----------
+    ids : of the edges that have one, with their rows
     verdict, reason : codes of ``Verdict`` and ``Reason``
     statistic, threshold : chi2 that was last judged, and what it was held against
     numbers : how many numbers were measured, the statistic's degrees of freedom
     keyframe : at which it was judged first
     changes : how often a verdict was set after an edge was entered
-    final : verdicts of the first so many edges stay: they are of a map that is frozen
+    final : verdicts of edges below this id stay: they are of a map that is frozen
     history : every change after the first verdict, and first verdicts that are not ``ACCEPTED``, in order
     """
 
     def __init__(self) -> None:
         self.verdict, self.reason = Column(np.int64), Column(np.int64)
+        self.ids = LastingIds("edge", self.verdict)
         self.statistic, self.threshold = Column(np.float64), Column(np.float64)
         self.numbers, self.keyframe = Column(np.int64), Column(np.int64)
         self._residual, self._residual_at = Column(np.float64), Column(np.int64)
@@ -84,28 +86,30 @@ class Ledger:
         self._out: set[int] = set()
 
     def finish(self, edges: int) -> None:
-        """Make the verdicts of the first edges, up to a count, final. All others may change."""
+        """Make the verdicts of edges below an id final. All others may change."""
         self.final = edges
-        verdict, reason = self.verdict.values[edges:], self.reason.values[edges:]
+        first = self.ids.first_from(edges)
+        verdict, reason = self.verdict.values[first:], self.reason.values[first:]
         is_out = np.isin(verdict, OUTSIDE) & ~np.isin(reason, FINAL)
-        self._out = set((edges + np.flatnonzero(is_out)).tolist())
+        self._out = set(self.ids.since(edges)[is_out].tolist())
 
     def __len__(self) -> int:
         return len(self.verdict)
 
-    def renumber(self, new: Index) -> None:
-        """Take over new ids of all edges, by old ones; -1: it was removed. The history of those is gone."""
-        kept = np.flatnonzero(new >= 0)
-        numbers = self.numbers.values[kept]
+    def keep(self, edges: Index) -> None:
+        """Forget all edges but some, and the history of the others."""
+        rows = self.ids.rows(edges)
+        numbers = self.numbers.values[rows]
         begins = np.cumsum(numbers) - numbers
-        at = np.repeat(self._residual_at.values[kept] - begins, numbers) + np.arange(int(numbers.sum()))
-        self._residual = self._residual.kept(at)
-        for name in ("verdict", "reason", "statistic", "threshold", "numbers", "keyframe", "_residual_at"):
-            setattr(self, name, getattr(self, name).kept(kept))
-        self._residual_at.values[:] = begins
-        self.history[:] = [replace(one, edge=int(new[one.edge])) for one in self.history if new[one.edge] >= 0]
-        self.final = int(np.count_nonzero(new[: self.final] >= 0))
-        self._out = {edge for edge in new[sorted(self._out)].tolist() if edge >= 0}
+        at = np.repeat(self._residual_at.values[rows] - begins, numbers) + np.arange(int(numbers.sum()))
+        self.ids.put(edges, self.ids.next)
+        self._residual.values = self._residual.values[at]
+        for name in ("verdict", "reason", "statistic", "threshold", "numbers", "keyframe"):
+            column = getattr(self, name)
+            column.values = column.values[rows]
+        self._residual_at.values = begins
+        self.history[:] = [one for one in self.history if self.ids.has(one.edge)]
+        self._out = set(filter(self.ids.has, self._out))
 
     def copy(self) -> "Ledger":
         """Another ledger with the same records and an empty history."""
@@ -113,7 +117,8 @@ class Ledger:
         for name, column in vars(self).items():
             if isinstance(column, Column):
                 setattr(out, name, deepcopy(column))
-        out.history, out._out = [], set(self._out)
+        out.history, out._out, out.ids = [], set(self._out), LastingIds("edge", out.verdict)
+        out.ids.put(self.ids.early, self.ids.later)
         return out
 
     def enter(
@@ -132,7 +137,7 @@ class Ledger:
         residuals : what each measured differs from what was expected of it then, end to end
         """
         count = len(statistic)
-        ids = np.arange(len(self), len(self) + count)
+        ids = np.arange(self.ids.next, self.ids.next + count)
         Column.extend(
             (self.verdict, np.where(judged, Verdict.ACCEPTED, Verdict.NOT_EVALUATED), count),
             (self.reason, Reason.NONE, count),
@@ -148,7 +153,8 @@ class Ledger:
     def put(self, edge: int, verdict: Verdict, reason: Reason) -> None:
         """Set a verdict without adding to the history."""
         self.changes += 1
-        self.verdict.values[edge], self.reason.values[edge] = verdict, reason
+        row = self.ids.row(edge)
+        self.verdict.values[row], self.reason.values[row] = verdict, reason
         if verdict in OUTSIDE and reason not in FINAL:
             self._out.add(edge)
         else:
@@ -165,8 +171,9 @@ class Ledger:
     ) -> None:
         """Set a verdict and add it to the history. The default threshold is that of the edge."""
         self.put(edge, verdict, reason)
-        self.statistic.values[edge] = statistic
-        limit = float(self.threshold.values[edge]) if threshold is None else threshold
+        row = self.ids.row(edge)
+        self.statistic.values[row] = statistic
+        limit = float(self.threshold.values[row]) if threshold is None else threshold
         self.history.append(VerdictChange(edge, keyframe, verdict, reason, float(statistic), limit))
 
     @property
@@ -176,37 +183,40 @@ class Ledger:
 
     def residual(self, edge: int) -> Array:
         """Return the difference between the measurement and its prediction when it came, in its units."""
-        first = int(self._residual_at.values[edge])
-        out: Array = self._residual.values[first : first + int(self.numbers.values[edge])]
+        row = self.ids.row(edge)
+        first = int(self._residual_at.values[row])
+        out: Array = self._residual.values[first : first + int(self.numbers.values[row])]
         return out
 
     def verdict_of(self, edge: int) -> Verdict:
         """The verdict on one edge; new edges without a record have one, too."""
-        return Verdict(int(self.verdict.values[edge])) if edge < len(self) else Verdict.NOT_EVALUATED
+        row = self.ids.row(edge)
+        return Verdict(int(self.verdict.values[row])) if row < len(self) else Verdict.NOT_EVALUATED
 
     def is_inside(self, edge: int) -> bool:
         """Return whether an edge has a weight."""
-        return self.verdict.values.item(edge) in _INSIDE
+        return self.verdict.values.item(self.ids.row(edge)) in _INSIDE
 
     def are_inside(self, edges: Iterable[int]) -> list[bool]:
         """Return whether each of some edges has a weight."""
-        verdict = self.verdict.values
-        return [verdict.item(edge) in _INSIDE for edge in edges]
+        verdict, row = self.verdict.values, self.ids.row
+        return [verdict.item(row(edge)) in _INSIDE for edge in edges]
 
     def is_withdrawn(self, edge: int) -> bool:
         """Return whether an edge was removed permanently."""
-        return edge < len(self) and self.reason.values.item(edge) in _FINAL and self.verdict.values.item(edge) != 0
+        row = self.ids.row(edge)
+        return row < len(self) and self.reason.values.item(row) in _FINAL and self.verdict.values.item(row) != 0
 
     def is_standing(self) -> Callable[[int], bool]:
         """Return a function of an edge: whether it is judged and was not removed permanently, as it is now."""
-        count, reason, verdict = len(self), self.reason.values.item, self.verdict.values.item
-        return lambda edge: edge < count and not (reason(edge) in _FINAL and verdict(edge) != 0)
+        end, row, reason, verdict = self.ids.next, self.ids.row, self.reason.values.item, self.verdict.values.item
+        return lambda edge: edge < end and not (reason(row(edge)) in _FINAL and verdict(row(edge)) != 0)
 
     @property
     def inside(self) -> Index:
         """Judged edges with a weight that may be judged again."""
-        verdict = self.verdict.values[self.final :]
-        return self.final + np.flatnonzero((verdict == _ACCEPTED) | (verdict == _DOWN_WEIGHTED))
+        verdict = self.verdict.values[self.ids.first_from(self.final) :]
+        return self.ids.since(self.final)[(verdict == _ACCEPTED) | (verdict == _DOWN_WEIGHTED)]
 
     @property
     def outside(self) -> Index:

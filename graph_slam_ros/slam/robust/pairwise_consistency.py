@@ -37,9 +37,9 @@ def consistent_groups(graph: Graph, values: Array, closures: Index, limits: Arra
     table = graph.tables.get(space.relative_pose)
     if table is None:
         return []
-    of_table = graph.table_of_edge.values[closures] == table.code
-    closures, limits = closures[of_table], limits[of_table]
-    rows = graph.row_of_edge.values[closures]
+    codes, rows = graph.places(closures)
+    of_table = codes == table.code
+    closures, limits, rows = closures[of_table], limits[of_table], rows[of_table]
     ends, measured = table.at(rows).vertices, table.at(rows).measured
     order, walked = _along_odometry(graph, table)
     on_path = (order[ends] >= 0).all(axis=1)
@@ -49,7 +49,7 @@ def consistent_groups(graph: Graph, values: Array, closures: Index, limits: Arra
     if not len(pairs):
         return []
     a, b = pairs.T
-    at = graph.offset.values[ends][:, :, None] + np.arange(space.pose.size)
+    at = graph.begins(ends)[:, :, None] + np.arange(space.pose.size)
     path, group = values[at], space.group  # (n, 2, size)
     before = _columns(group.between, path[b, 0], path[a, 0])
     after = _columns(group.between, path[a, 1], path[b, 1])
@@ -89,7 +89,7 @@ def contradicting_sightings(graph: Graph, values: Array, sightings: Index, limit
     a, b = in_time[:-1][follows], in_time[1:][follows]
     if not len(a):
         return sightings[:0]
-    group, path = space.group, values[graph.offset.values[poses][:, None] + np.arange(space.pose.size)]
+    group, path = space.group, values[graph.begins(poses)[:, None] + np.arange(space.pose.size)]
     motion = _columns(group.between, path[a], path[b])
     seen_before, size = _columns(group.act, _columns(group.inverse, motion), some.measured[a]), space.dimensions
     axes = adjoints_of_inverses(code_of(space.pose), motion)[:, :size, :size]
@@ -116,7 +116,7 @@ def jumps_and_back(graph: Graph, values: Array, fixes: Index, limits: Array) -> 
     order, walked, some, is_some = known
     fixes, limits, n = fixes[is_some], limits[is_some], space.dimensions
     poses = some.vertices[:, 0]
-    path = values[graph.offset.values[poses][:, None] + np.arange(space.pose.size)]
+    path = values[graph.begins(poses)[:, None] + np.arange(space.pose.size)]
     places = some.measured[:, :n], _columns(space.group.act, path, some.measured[:, n:])
     noise = np.trace(_covariances(some.sqrt_information), axis1=1, axis2=2)
     way = np.trace(walked[order[poses]][:, :n, :n], axis1=1, axis2=2)
@@ -154,10 +154,10 @@ def odometry_in_use(graph: Graph) -> Index:
         return np.empty(0, dtype=np.int64)
     code = graph.labels.index("odometry") if "odometry" in graph.labels else -1
     rows = np.flatnonzero(table.label.values == code)
-    to, weight = table.vertices.values[rows, 1], table.weight.values[rows]
+    to, weight = table.at(rows).vertices[:, 1], table.weight.values[rows]
     rows = rows[np.lexsort((rows, weight > 0.0, to))]
-    to = table.vertices.values[rows, 1]
-    return table.id.values[rows[np.append(to[1:] != to[:-1], True)]] if len(rows) else rows
+    to = table.at(rows).vertices[:, 1]
+    return table.at(rows[np.append(to[1:] != to[:-1], True)]).ids if len(rows) else rows
 
 
 def _on_path(
@@ -168,16 +168,17 @@ def _on_path(
     if odometry is None or table is None:
         return None
     order, walked = _along_odometry(graph, odometry)
-    is_some = graph.table_of_edge.values[edges] == table.code
-    is_some[is_some] = order[table.at(graph.row_of_edge.values[edges[is_some]]).vertices[:, 0]] >= 0
-    some = table.at(graph.row_of_edge.values[edges[is_some]])
+    codes, rows = graph.places(edges)
+    is_some = codes == table.code
+    is_some[is_some] = order[table.at(rows[is_some]).vertices[:, 0]] >= 0
+    some = table.at(rows[is_some])
     return (order, walked, some, is_some) if is_some.any() else None
 
 
 def _along_odometry(graph: Graph, table: EdgeTable) -> tuple[Index, Array]:
     """The place of each vertex along odometry, -1 if none; and for each place the noise of all steps before it."""
-    rows = graph.row_of_edge.values[odometry_in_use(graph)]
-    order = np.full(graph.vertex_count, -1)
+    _, rows = graph.places(odometry_in_use(graph))
+    order = np.full(graph.vertex_ids.next, -1)
     vertices = table.at(rows).vertices
     order[vertices[:, 0]] = np.arange(len(rows))
     order[vertices[:, 1]] = np.arange(1, len(rows) + 1)

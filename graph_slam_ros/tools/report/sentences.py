@@ -24,8 +24,8 @@ _MOST_EDGES = 2000  # of a class, above which groups are not what is wrong
 
 def effects(run: SavedGraph) -> Influences:
     """The effects of leaving out each judged edge that is in, or of letting in each that is out, to first order."""
-    inside = [row for row, e in enumerate(run.entries) if e.is_in and e.verdict]
-    outside = [row for row, e in enumerate(run.entries) if not e.is_in and e.reason not in FINAL]
+    inside = [e.edge for e in run.entries if e.is_in and e.verdict]
+    outside = [e.edge for e in run.entries if not e.is_in and e.reason not in FINAL]
     return run.influence_model.of(inside, outside)
 
 

@@ -325,17 +325,17 @@ def faulty_graph(file: G2oFile, truth: Array, faults: Sequence[Fault], seed: int
     table = graph.tables[space.relative_pose]
     is_pose[np.flatnonzero(graph.kind.values == graph.kinds.index(space.pose))] = True
     if "landmarks" in graph.labels:  # tags with orientation are poses, too
-        is_pose[table.vertices.values[table.label.values == graph.labels.index("landmarks"), 1]] = False
+        is_pose[table.vertices[table.label.values == graph.labels.index("landmarks"), 1]] = False
     poses = np.flatnonzero(is_pose)
     poses = poses[np.argsort(np.asarray(file.ids)[poses])]
     place = np.full(graph.vertex_count, -1)
     place[poses] = np.arange(len(poses))
-    edges = table.at(np.argsort(table.id.values))
+    edges = table.at(np.argsort(table.ids))
     ends = place[edges.vertices]
     is_closure = np.asarray((ends >= 0).all(axis=1))
     steps = np.flatnonzero(is_closure & (np.abs(ends[:, 1] - ends[:, 0]) == 1))
     is_closure[steps[np.unique(ends[steps].max(axis=1), return_index=True)[1]]] = False
-    true = truth[graph.offset.values[poses][:, None] + np.arange(space.pose.size)]
+    true = truth[graph.begins(poses)[:, None] + np.arange(space.pose.size)]
     roots = edges.sqrt_information[is_closure]
     added: dict[int, Index] = {}
     for k, fault in enumerate(faults):
@@ -358,5 +358,5 @@ def _lines(file: G2oFile) -> dict[int, int]:
     lines = [number for number, line in enumerate(text, start=1) if line.split()[0] in tags]
     labels = np.empty(graph.edge_count, dtype=np.int64)
     for table in graph.tables.values():
-        labels[table.id.values] = table.label.values
+        labels[table.ids] = table.label.values
     return dict(zip(np.lexsort((np.arange(len(labels)), labels)).tolist(), lines, strict=True))

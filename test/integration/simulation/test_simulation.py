@@ -49,10 +49,10 @@ def test_a_bag_decodes_to_the_measurements_it_was_made_of(world, tmp_path):
 def chi2_at(graph, values, label, edge_type):
     """The mean square of whitened residuals, by how much it may be off one, and the ends of the edges of a class."""
     table, size = graph.tables[edge_type], values.shape[1]
-    residual, _ = edge_type.linearize(values.ravel(), size * table.vertices.values, table.measured.values)
+    residual, _ = edge_type.linearize(values.ravel(), size * table.vertices, table.measured.values)
     mine = table.label.values == graph.labels.index(label)
     whitened = np.einsum("nij,nj->ni", table.sqrt_information.values[mine], residual[mine])
-    return (whitened**2).mean(), 5.0 * np.sqrt(2.0 / whitened.size), table.vertices.values[mine]
+    return (whitened**2).mean(), 5.0 * np.sqrt(2.0 / whitened.size), table.vertices[mine]
 
 
 def test_the_truth_explains_the_graph_of_a_city_or_sphere_within_its_noise():

@@ -147,7 +147,7 @@ def test_G22_a_closure_that_names_a_time_whose_odometry_is_forgotten_joins_the_k
     run(p, Closure(T0 + 59 * S, T0 + S // 2, "/closures", measured, covariance), *END)
     (edge,) = p.graph.edges_of("closures").tolist()
     table, row = p.graph.row(edge)
-    assert table.vertices.values[row].tolist() == [p.keyframes[0].vertex, p.keyframes[-1].vertex]
+    assert table.vertices[row].tolist() == [p.keyframes[0].vertex, p.keyframes[-1].vertex]
     assert verdicts(p, "closures") == {"ACCEPTED": 1}
     assert not p.counters.as_dict()
 

@@ -20,14 +20,14 @@ def steps(graph):
     is_point = np.array([kind is R2 for kind in graph.kinds])[graph.kind.values]
     come = np.where(is_point, graph.vertex_count, np.arange(graph.vertex_count))  # with which pose each vertex comes
     for table in graph.tables.values():
-        ends = table.vertices.values
+        ends = table.vertices
         newest = np.where(is_point[ends], -1, ends).max(axis=1)
         for slot in range(ends.shape[1]):
             points = is_point[ends[:, slot]]
             np.minimum.at(come, ends[points, slot], newest[points])
     due = np.empty(graph.edge_count, dtype=np.int64)
     for table in graph.tables.values():
-        due[table.id.values] = come[table.vertices.values].max(axis=1)
+        due[table.ids] = come[table.vertices].max(axis=1)
     for pose in np.flatnonzero(~is_point):
         yield np.flatnonzero(come == pose), np.flatnonzero(due == pose)
 

@@ -44,7 +44,7 @@ def read(tmp_path):
 
 
 def values_of(graph):
-    return lambda ids: graph.initial.values[graph.offset.values[ids][:, None] + np.arange(graph.kind_of(ids[0]).size)]
+    return lambda ids: graph.initial.values[graph.begins(ids)[:, None] + np.arange(graph.kind_of(ids[0]).size)]
 
 
 def test_a_file_becomes_vertices_and_edges_in_its_own_words(read):
@@ -57,12 +57,12 @@ def test_a_file_becomes_vertices_and_edges_in_its_own_words(read):
     assert "landmarks" in graph.labels
     table = graph.tables[RELATIVE_POSE]
     assert graph.labels[table.label.values[1]] == "b", "as a comment of ours says"
-    assert table.vertices.values.tolist() == [[0, 1], [1, 0]]
+    assert table.vertices.tolist() == [[0, 1], [1, 0]]
     # the upper triangle, row by row
     information = Gaussian(table.sqrt_information.values[0]).information
     assert information == pytest.approx(np.array([[10, 1, -2], [1, 20, 3], [-2, 3, 30.0]]), rel=1e-13)
     sighting = graph.tables[LANDMARK_POSITION]
-    assert (sighting.vertices.values.tolist(), sighting.measured.values.tolist()) == ([[1, 2]], [[1, 2]])
+    assert (sighting.vertices.tolist(), sighting.measured.values.tolist()) == ([[1, 2]], [[1, 2]])
 
 
 def random_graph():
@@ -95,7 +95,7 @@ def test_what_is_written_is_read_back_to_the_bit(tmp_path, read):
     for kind, table in file.graph.tables.items():
         other = again.graph.tables[kind]
         order, order_again = (np.lexsort(t.measured.values.T) for t in (table, other))
-        assert np.array_equal(table.vertices.values[order], other.vertices.values[order_again])
+        assert np.array_equal(table.vertices[order], other.vertices[order_again])
         assert table.measured.values[order].tobytes() == other.measured.values[order_again].tobytes()
         one, two = (
             Gaussian(t.sqrt_information.values[o]).information for t, o in ((table, order), (other, order_again))

@@ -59,7 +59,7 @@ def by_label(file):
     for edge, table in file.graph.tables.items():
         for row in range(len(table)):
             label = file.graph.labels[table.label.values[row]]
-            ids = [file.ids[v] for v in table.vertices.values[row]]
+            ids = [file.ids[v] for v in table.vertices[row]]
             root = table.sqrt_information.values[row]
             out[label] = edge, ids, table.measured.values[row], root.T @ root
     return out

@@ -45,7 +45,7 @@ def costs(units, graph, sigmas):
         dof = vertex.kind.dof
         moved.append(vertex.kind.retract(vertex.initial[None], step[None, begin : begin + dof])[0])
         begin += dof
-    residual = edge.type.linearize(np.concatenate(moved), graph.offset.values[None], edge.measured[None])[0][0]
+    residual = edge.type.linearize(np.concatenate(moved), graph.begins(None), edge.measured[None])[0][0]
     return np.concatenate((units, edge.sqrt_information @ residual))
 
 

@@ -171,7 +171,7 @@ class Changes(RuleBasedStateMachine):
     def weigh(self, pick, weight):
         edge = pick % self.graph.edge_count
         table, row = self.graph.row(edge)
-        if all(v in self.inside for v in table.vertices.values[row].tolist()):
+        if all(v in self.inside for v in table.vertices[row].tolist()):
             self.solver.set_weight(edge, weight)
 
     @precondition(lambda self: len(self.inside) > 3)
@@ -187,7 +187,7 @@ class Changes(RuleBasedStateMachine):
         v = self.inside[pick % len(self.inside)]
         for edge in range(self.graph.edge_count):
             table, row = self.graph.row(edge)
-            if v in table.vertices.values[row]:
+            if v in table.vertices[row]:
                 self.solver.set_weight(edge, 0.0)
         self.solver.remove(v)
         self.inside.remove(v)
@@ -208,7 +208,7 @@ class Changes(RuleBasedStateMachine):
     def start_elsewhere(self, seed, far):
         rng, values = np.random.default_rng(seed), self.solver.values
         for v in set(self.inside) - self.held:
-            kind, at = self.graph.kind_of(v), int(self.graph.offset.values[v])
+            kind, at = self.graph.kind_of(v), int(self.graph.begins(v))
             values[at : at + kind.size] = kind.retract(self.truth[v][None], far * rng.standard_normal((1, kind.dof)))[0]
         self.solver.start_at(values)
 
@@ -223,7 +223,7 @@ class Changes(RuleBasedStateMachine):
         fixed = set(self.held)
         for edge in range(self.graph.edge_count):
             table, row = self.graph.row(edge)
-            ends = table.vertices.values[row].tolist()
+            ends = table.vertices[row].tolist()
             if table.weight.values[row] == 0.0:
                 continue
             if len(ends) == 1:

@@ -85,8 +85,8 @@ def test_the_tree_holds_after_edges_between_old_vertices_and_without_some(seed):
 
 def test_moving_cliques_together_in_memory_changes_nothing_else():
     graph, _ = city_graph(3, poses=300)
-    ends = np.concatenate([table.vertices.values.max(axis=1) for table in graph.tables.values()])
-    ids = np.concatenate([table.id.values for table in graph.tables.values()])
+    ends = np.concatenate([table.vertices.max(axis=1) for table in graph.tables.values()])
+    ids = np.concatenate([table.ids for table in graph.tables.values()])
     solvers = Solver(graph), Solver(graph)
     for pose in range(graph.vertex_count):
         for solver in solvers:
