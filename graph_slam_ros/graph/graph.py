@@ -267,10 +267,7 @@ class Graph:
         return self.edge_ids.of_all(np.sort(np.concatenate(found)))
 
     def keep(self, vertices: Index, edges: Index, values: Array) -> None:
-        """Remove all but some vertices and edges, given in order; these vertices begin with other stored ``values``.
-
-        Solvers of the graph must be made anew.
-        """
+        """Remove all but some vertices and edges, given in order. These vertices begin with other stored ``values``."""
         kept, kept_edges = self.vertex_ids.existing(vertices), self.edge_ids.existing(edges)
         self.vertex_ids.put(vertices, self.vertex_ids.next)
         self.edge_ids.put(edges, self.edge_ids.next)

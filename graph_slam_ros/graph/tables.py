@@ -212,7 +212,7 @@ class LastingIds:
     shift : from there on, the difference between an id and its row
     """
 
-    __slots__ = ("_column", "_what", "early", "later", "shift")
+    __slots__ = ("_bounds", "_column", "_what", "early", "later", "shift")
 
     def __init__(self, what: str, column: Column) -> None:
         self._what, self._column = what, column
@@ -221,6 +221,7 @@ class LastingIds:
     def put(self, early: Index, later: int) -> None:
         """Give the rows other ids, because others are removed, or all are read from a file."""
         self.early, self.later, self.shift = early, later, later - len(early)
+        self._bounds = np.append(early, later)
 
     @property
     def next(self) -> int:
@@ -260,7 +261,7 @@ class LastingIds:
         out, is_early = ids - self.shift, ids < self.later
         some = ids[is_early]
         at = np.searchsorted(self.early, some)
-        out[is_early] = np.where(np.append(self.early, self.later)[at] == some, at, -1)
+        out[is_early] = np.where(self._bounds[at] == some, at, -1)
         return out
 
     def existing(self, ids: ArrayLike) -> Index:
