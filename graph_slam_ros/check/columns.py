@@ -49,6 +49,11 @@ class TopicColumns(OfTopic):
     stamp_ns: Index
     frames: Mapping[str, int] = field(default_factory=dict)
 
+    @property
+    def lag_s(self) -> Array:
+        """(n,) By how much they were recorded later than stamped [s]."""
+        return np.asarray((self.log_ns - self.stamp_ns) * 1e-9)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OdometryColumns(OfTopic):

@@ -76,8 +76,8 @@ def check_moving(s: SightingColumns, by: LandmarkMotions, count: int) -> Iterato
         robot_m, ground_m = float(np.median(by.on_robot)), float(np.median(by.on_ground))
         text = f"while the robot drives, landmarks stay where they are on it to {robot_m:.2f} m, and would "
         text += f"move by {ground_m:.2f} m on the ground: they are given in a frame that does not move with the robot"
-        value = ground_m / max(robot_m, 1e-9)
-        yield s.finding("seen_in_fixed_frame", "error", value, 1.0 / _HALF, "times", text, count)
+        times = ground_m / max(robot_m, 1e-9)
+        yield s.finding("seen_in_fixed_frame", "error", times, 1.0 / _HALF, "times", text, count)
         return
     for k in moving_alone(by)[:_MOST_NAMED]:
         name, own_ns = s.names[by.names[k]], np.sort(s.stamp_ns[s.name == by.names[k]])
@@ -86,8 +86,7 @@ def check_moving(s: SightingColumns, by: LandmarkMotions, count: int) -> Iterato
         if by.with_robot[k]:
             place = f"at x {by.at[k, 0]:.2f} and y {by.at[k, 1]:.2f} m on it"
             text = f"landmark {name} moves along with the robot, {place}: a part of it, or a follower"
-        limit_m = _NOISES * by.noise_m
-        yield s.finding("landmark_moves", "warning", by.on_ground[k], limit_m, "m", text, at=own_ns)
+        yield s.finding("landmark_moves", "warning", by.on_ground[k], _NOISES * by.noise_m, "m", text, at=own_ns)
 
 
 def moving_alone(by: LandmarkMotions) -> list[int]:

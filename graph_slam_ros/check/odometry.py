@@ -12,7 +12,7 @@ from graph_slam_ros.check.pairs import poses_at
 from graph_slam_ros.check.times import rounded_s
 from graph_slam_ros.config.pipeline import OdometryConfig
 from graph_slam_ros.lie import se3, so3
-from graph_slam_ros.typing import Array, Index, Mask
+from graph_slam_ros.typing import Array, Mask
 
 LEAST = 10
 """Messages of odometry below which nothing is known of it."""
@@ -56,14 +56,14 @@ class Steps:
 
     Attributes
     ----------
-    index : (n + 1,) of the messages
+    of : the n + 1 messages
     dt : (n,) seconds, positive
     moved, turned : (n, 3) in the frame of the earlier pose, metres and radians
     is_short : (n,) whether no gap is between them
     fastest_m_s, fastest_rad_s : the fastest of those, without a few that may be jumps
     """
 
-    index: Index
+    of: OdometryColumns
     dt: Array
     moved: Array
     turned: Array
@@ -90,30 +90,30 @@ def _without_jumps(speeds: Array) -> float:
     return float(np.quantile(speeds, 1.0 - max(_FEW, min(_FEW_JUMPS / max(len(speeds), 1), _MANY))))
 
 
-def _usable(o: OdometryColumns) -> Index:
+def _usable(o: OdometryColumns) -> OdometryColumns:
     """The messages with a stamp and a pose, in order of stamp; of equal stamps the first."""
     norm = np.linalg.norm(o.poses[:, 3:], axis=1)
     usable = np.isfinite(o.poses).all(axis=1) & (np.abs(o.poses[:, :3]).max(axis=1, initial=0.0) < 1e9)
     usable &= (o.stamp_ns != 0) & (np.abs(norm - 1.0) < 0.1)
     _, first = np.unique(o.stamp_ns[usable], return_index=True)
-    return np.flatnonzero(usable)[first]
+    return o.some(np.flatnonzero(usable)[first])
 
 
 def steps_of(o: OdometryColumns) -> Steps | None:
     """The steps of odometry in order of stamp; None where there are too few."""
-    index = _usable(o)
-    if len(index) < LEAST:
+    o = _usable(o)
+    if len(o.poses) < LEAST:
         return None
-    stamp_ns, poses = o.stamp_ns[index], o.poses[index]
-    poses = np.concatenate([poses[:, :3], poses[:, 3:] / np.linalg.norm(poses[:, 3:], axis=1)[:, None]], axis=1)
+    unit = o.poses[:, 3:] / np.linalg.norm(o.poses[:, 3:], axis=1)[:, None]
+    poses = np.concatenate([o.poses[:, :3], unit], axis=1)
     motion = se3.between(tuple(poses[:-1].T), tuple(poses[1:].T))
     moved = np.stack(motion[:3], axis=1)
     turned = np.stack(so3.log(tuple(motion[3:])), axis=1)
-    dt = np.diff(stamp_ns) * 1e-9
+    dt = np.diff(o.stamp_ns) * 1e-9
     is_short = dt < max(1.0, 5.0 * float(np.median(dt)))
     rate = np.maximum(dt, float(np.median(dt)))
     speeds = np.stack([np.linalg.norm(moved, axis=1) / rate, np.linalg.norm(turned, axis=1) / rate])
-    return Steps(index, dt, moved, turned, is_short, *map(_without_jumps, speeds[:, is_short]))
+    return Steps(o, dt, moved, turned, is_short, *map(_without_jumps, speeds[:, is_short]))
 
 
 def twist_factor(o: OdometryColumns) -> float:
@@ -121,7 +121,7 @@ def twist_factor(o: OdometryColumns) -> float:
     steps = steps_of(o)
     if steps is None:
         return np.nan
-    said = np.linalg.norm(o.twist[steps.index[1:], :3], axis=1) * steps.dt
+    said = np.linalg.norm(steps.of.twist[1:, :3], axis=1) * steps.dt
     return float(np.linalg.norm(steps.moved, axis=1).sum() / said.sum())
 
 
@@ -174,12 +174,13 @@ def check_publishers(c: Columns) -> Iterator[Finding]:
 
 def check_odometry(c: Columns) -> Iterator[Finding]:
     """The odometry that is used, by its own messages alone."""
-    o, steps = c.odometry, steps_of(c.odometry)
+    steps = steps_of(c.odometry)
     if steps is None:
-        count = len(_usable(o))
-        text = f"{count} of {len(o.stamp_ns)} messages are usable; {LEAST} are needed"
-        yield o.finding("no_odometry", "error", count, LEAST, "messages", text)
+        count = len(_usable(c.odometry).poses)
+        text = f"{count} of {len(c.odometry.poses)} messages are usable; {LEAST} are needed"
+        yield c.odometry.finding("no_odometry", "error", count, LEAST, "messages", text)
         return
+    o = steps.of
     if steps.fastest_m_s > min(_FASTEST_M_S, c.config.odometry.max_speed_m_s):
         text = f"the robot drives at {steps.fastest_m_s:.0f} m/s: is its position in metres?"
         yield o.finding("units", "error", steps.fastest_m_s, _FASTEST_M_S, "m/s", text)
@@ -189,12 +190,12 @@ def check_odometry(c: Columns) -> Iterator[Finding]:
         yield o.finding("units", "error", fastest, _FASTEST_RAD_S, "rad/s", text)
         return
     jumps = steps.jumps
-    yield from _jumps(o, steps, jumps, c.config.odometry.max_speed_m_s)
+    yield from _jumps(steps, jumps, c.config.odometry.max_speed_m_s)
     smooth = steps.is_short & ~jumps
     total_m = float(np.linalg.norm(steps.moved[smooth], axis=1).sum())
     total_rad = float(np.linalg.norm(steps.turned[smooth], axis=1).sum())
     if total_m < _STILL_M and total_rad < _STILL_RAD:
-        speed_m_s = float(np.median(np.linalg.norm(o.twist[steps.index, :3], axis=1)))
+        speed_m_s = float(np.median(np.linalg.norm(o.twist[:, :3], axis=1)))
         if speed_m_s > _SLOWEST_M_S:
             text = f"its pose never changes, though its twist says {speed_m_s:.1f} m/s"
             yield o.finding("pose_stands", "error", speed_m_s, _SLOWEST_M_S, "m/s", text)
@@ -202,18 +203,20 @@ def check_odometry(c: Columns) -> Iterator[Finding]:
         text = f"it moves {total_m:.2f} m and {np.degrees(total_rad):.0f} degrees in {steps.dt.sum():.0f} s"
         yield o.finding("static", "warning", total_m, _STILL_M, "m", text)
         return
-    quaternions = np.abs(o.poses[steps.index, 3:])
+    quaternions = np.abs(o.poses[:, 3:])
     w_first = quaternions[:, 1:3].max() < _NO_TURN_RAD and np.ptp(quaternions[:, 0]) > _TURNS
-    if w_first or (_has_no_orientation(steps, smooth, total_rad) and not _drives_sideways(o, steps)):
+    if w_first or (_has_no_orientation(steps, smooth, total_rad) and not _drives_sideways(o)):
         text = f"its orientation never changes in {total_m:.0f} m, and it drives round bends"
         text = "it rolls, and never turns: does w come first in its quaternions?" if w_first else text
         yield o.finding("no_orientation_of_odometry", "error", total_rad, 0.0, "rad", text)
         return
-    yield from _plane(c, o)
-    if np.isfinite(o.twist[steps.index]).all() and o.twist[steps.index].any() and c.config.odometry.noise != "density":
-        yield from _twist(o, steps, jumps, c.config.odometry.distance_factor)
-    if c.config.odometry.noise != "density" and np.isfinite(o.twist).any():
-        yield from _covariance(o, steps)
+    yield from _plane(c, c.odometry)
+    if c.config.odometry.noise == "density":
+        return
+    if np.isfinite(o.twist).all() and o.twist.any():
+        yield from _twist(steps, jumps, c.config.odometry.distance_factor)
+    if np.isfinite(c.odometry.twist).any():
+        yield from _covariance(c.odometry, steps)
 
 
 def _has_no_orientation(steps: Steps, smooth: Mask, total_rad: float) -> bool:
@@ -223,14 +226,14 @@ def _has_no_orientation(steps: Steps, smooth: Mask, total_rad: float) -> bool:
     return total_rad < _NO_TURN_RAD and bool(least > _BENDS * most)
 
 
-def _drives_sideways(o: OdometryColumns, steps: Steps) -> bool:
+def _drives_sideways(o: OdometryColumns) -> bool:
     """Return whether the robot says that it drives sideways: then it needs no turn to go round a bend."""
-    ahead_m_s, sideways_m_s = np.nanmax(np.abs(o.twist[steps.index, :2]), axis=0, initial=0.0)
+    ahead_m_s, sideways_m_s = np.nanmax(np.abs(o.twist[:, :2]), axis=0, initial=0.0)
     return bool(sideways_m_s > _SIDEWAYS * max(ahead_m_s, 1e-9))
 
 
-def _jumps(o: OdometryColumns, steps: Steps, jumps: Mask, max_speed_m_s: float) -> Iterator[Finding]:
-    poses = o.poses[steps.index]
+def _jumps(steps: Steps, jumps: Mask, max_speed_m_s: float) -> Iterator[Finding]:
+    poses = steps.of.poses
     at_zero = (np.abs(poses[1:, :6]) < _AT_ZERO).all(axis=1) & (np.linalg.norm(poses[:-1, :3], axis=1) > _AWAY_M)
     for code, is_there in (("odometry_reset", at_zero), ("odometry_jumps", jumps & ~at_zero)):
         count = int(is_there.sum())
@@ -251,21 +254,19 @@ def _jumps(o: OdometryColumns, steps: Steps, jumps: Mask, max_speed_m_s: float) 
             settings = (f"odometry.max_speed_m_s={limit_m_s:.2g}",)
         elif max_speed_m_s < min(slowest_m_s, OdometryConfig().max_speed_m_s):
             continue  # somebody has set the limit, so that a run begins anew there
-        at = o.stamp_ns[steps.index[1:][is_there]]
-        yield o.finding(code, "warning", count, 0, "times", text, at=at, settings=settings)
+        at = steps.of.stamp_ns[1:][is_there]
+        yield steps.of.finding(code, "warning", count, 0, "times", text, at=at, settings=settings)
 
 
 def _plane(c: Columns, o: OdometryColumns) -> Iterator[Finding]:
-    if c.config.world.dimensions == 3 or not len(o.poses):
-        return
     out = c.counters[o.input, "out_of_plane"]
     share = out / len(o.poses)
-    if share > _OFF_PLANE:
+    if share > _OFF_PLANE and c.config.world.dimensions == 2:
         text = f"{share:.0%} of the poses are more than {_LEVEL_M} m above or below the first, or tilted"
         yield o.finding("not_planar", "warning", share, _OFF_PLANE, "part", text, out, settings=_SPACE)
 
 
-def _twist(o: OdometryColumns, steps: Steps, jumps: Mask, applied: float) -> Iterator[Finding]:
+def _twist(steps: Steps, jumps: Mask, applied: float) -> Iterator[Finding]:
     """The twist against the pose, over windows of a second: it may hold until or since its message."""
     width = max(1, round(_WINDOW_S / float(np.median(steps.dt))))
     starts = np.arange(0, len(steps.dt) - width + 1, max(1, width // 2))
@@ -279,13 +280,13 @@ def _twist(o: OdometryColumns, steps: Steps, jumps: Mask, applied: float) -> Ite
         return np.asarray(total[starts + width] - total[starts])
 
     moved, turned = sums(steps.moved), sums(steps.turned)
-    twist = o.twist[steps.index]
+    o, twist = steps.of, steps.of.twist
     fits = []
     for rows in (twist[:-1], twist[1:]):
         driven, rotated = (sums(part * steps.dt[:, None]) for part in (rows[:, :3], rows[:, 3:]))
         fits.append((ratio(driven, moved), ratio(rotated, turned)))
     speed, rate = min(fits, key=lambda pair: pair[0][1] + pair[1][1])
-    if _in_odom(o, steps, sums, moved, twist[1:]):
+    if _in_odom(steps, sums, moved):
         text = f"the twist is given along the axes of {o.frame}; nav_msgs/Odometry has those of {o.child}"
         yield o.finding("twist_frame", "warning", 1.0, _FITS, "times", text, settings=_DENSITY)
         return
@@ -304,11 +305,11 @@ def _twist(o: OdometryColumns, steps: Steps, jumps: Mask, applied: float) -> Ite
             yield o.finding("twist_unrelated", "warning", left, _UNEXPLAINED, "part", text, settings=_DENSITY)
 
 
-def _in_odom(o: OdometryColumns, steps: Steps, sums: Callable[[Array], Array], moved: Array, twist: Array) -> bool:
+def _in_odom(steps: Steps, sums: Callable[[Array], Array], moved: Array) -> bool:
     """Return whether the linear twist fits the motion along the axes of the odometry frame far better."""
-    turns = o.poses[steps.index[:-1], 3:]
+    turns = steps.of.poses[:-1, 3:]
     along = np.stack(so3.act(tuple(turns.T), tuple(steps.moved.T)), axis=1)
-    driven = sums(twist[:, :3] * steps.dt[:, None])
+    driven = sums(steps.of.twist[1:, :3] * steps.dt[:, None])
     if np.abs(driven[:, 1]).sum() < _LATERAL * np.abs(driven[:, 0]).sum():
         return False
     fixed = float(np.median(np.linalg.norm(sums(along) - driven, axis=1)))

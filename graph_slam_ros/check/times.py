@@ -26,8 +26,9 @@ _OUTSIDE, _NEARLY_ALL, _MARGIN_NS = 0.2, 0.95, 500_000_000
 
 def check_times(c: Columns) -> Iterator[Finding]:
     """Clocks of inputs against the recorder's and each other, and the order of the stamps of each."""
-    right = {name: topic for name, topic in c.topics.items() if not c.counters[topic.inputs[0], "bad_stamp"]}
-    if wrong := list(_wrong(right)):
+    right = [topic for topic in c.topics.values() if not c.counters[topic.inputs[0], "bad_stamp"]]
+    stamped = {topic.topic: topic.some(topic.stamp_ns != 0) for topic in right}
+    if wrong := list(_wrong(stamped)):
         yield from wrong
         return
     for key, value in c.assumed.items():
@@ -36,7 +37,7 @@ def check_times(c: Columns) -> Iterator[Finding]:
             text, topic = f"{name}: its clock differs from that of odometry by {apart}", c.topic_of(name)
             of, settings = "" if topic is None else topic.topic, (assignment(key, value),)
             yield Finding("clock_domains", "error", -value, _CLOCKS_DIFFER_S, "s", text, of, settings=settings)
-    stamped = {name: topic for name, topic in right.items() if np.count_nonzero(topic.stamp_ns) >= _FEW}
+    stamped = {name: topic for name, topic in stamped.items() if len(topic.stamp_ns) >= _FEW}
     yield from _clocks(c, stamped)
     for topic in stamped.values():
         yield from _order(c, topic)
@@ -48,14 +49,14 @@ def _wrong(topics: Mapping[str, TopicColumns]) -> Iterator[Finding]:
     """Inputs whose stamps are all one, crowd together in each second, or advance much faster or slower than others'."""
     advance = dict[str, float]()
     for name, topic in topics.items():
-        lag_s, log_ns, stamp_ns = _lags(topic)
-        if len(lag_s) < _MANY or not np.ptp(log_ns):
+        log_ns, stamp_ns = topic.log_ns, topic.stamp_ns
+        if len(log_ns) < _MANY or not np.ptp(log_ns):
             continue
         if not np.ptp(stamp_ns):
             text = f"all of its {len(stamp_ns)} messages have the stamp {stamp_ns[0] * 1e-9:.3f} s"
-            yield topic.finding("constant_stamps", "error", len(stamp_ns), _MANY, "messages", text, at=stamp_ns)
+            yield topic.finding("constant_stamps", "error", len(stamp_ns), _MANY, "messages", text)
             continue
-        apart = max(1, len(lag_s) // 4)
+        apart = max(1, len(log_ns) // 4)
         span_ns = np.maximum(log_ns[apart:] - log_ns[:-apart], 1)
         advance[name] = float(np.median((stamp_ns[apart:] - stamp_ns[:-apart]) / span_ns))
         crowded = np.median(np.diff(stamp_ns)) < _CROWDED * np.median(np.diff(log_ns)) and advance[name] > _CROWDED
@@ -63,7 +64,7 @@ def _wrong(topics: Mapping[str, TopicColumns]) -> Iterator[Finding]:
         if part < _CROWDED * 1e9 and crowded and (part or topic.use != "odometry"):  # whose rounding is told apart
             unit = next((unit for most, unit in _OF_A_SECOND.items() if part < most), "ticks")
             text = f"all that comes in a second is stamped within {part * 1e-6:.3g} ms: nanosec has {unit}"
-            yield topic.finding("wrong_stamps", "error", part * 1e-9, _CROWDED, "s", text, at=stamp_ns)
+            yield topic.finding("wrong_stamps", "error", part * 1e-9, _CROWDED, "s", text)
             return
     usual = float(np.median(list(advance.values()))) if len(advance) > 2 else 1.0  # simulated time may be slow
     for name, rate in advance.items():
@@ -97,30 +98,23 @@ def rounded_s(o: OdometryColumns) -> float:
     return float(own_ns.min()) * 1e-9 if is_rounded else 0.0
 
 
-def _lags(topic: TopicColumns) -> tuple[Array, Index, Index]:
-    """Recorded less stamped [s], and both, of the messages that have a stamp."""
-    is_stamped = topic.stamp_ns != 0
-    log_ns, stamp_ns = topic.log_ns[is_stamped], topic.stamp_ns[is_stamped]
-    return (log_ns - stamp_ns) * 1e-9, log_ns, stamp_ns
-
-
 def _clocks(c: Columns, topics: dict[str, TopicColumns]) -> Iterator[Finding]:
     of_odometry = topics.get(c.odometry.topic)
     if of_odometry is None:
         return
-    is_set_back = any((np.diff(t.stamp_ns[t.stamp_ns != 0]) < -_BACK_NS).any() for t in topics.values())
-    odometry_lag_s, odometry_log_ns, _ = _lags(of_odometry)
+    is_set_back = any((np.diff(t.stamp_ns) < -_BACK_NS).any() for t in topics.values())
+    own = of_odometry.log_ns, of_odometry.lag_s
     for topic in topics.values():
-        lag_s, log_ns, stamp_ns = _lags(topic)
-        apart_s = 0.0 if is_set_back else clock_offset_s(log_ns, lag_s, odometry_log_ns, odometry_lag_s)
+        log_ns, lag_s = topic.log_ns, topic.lag_s
+        apart_s = 0.0 if is_set_back else clock_offset_s(log_ns, lag_s, *own)
         few = max(1, len(lag_s) // 5)
         parts = ((log_ns[k], lag_s[k]) for k in (slice(few), slice(-few, None)))
-        first_s, last_s = (clock_offset_s(*part, odometry_log_ns, odometry_lag_s) for part in parts)
+        first_s, last_s = (clock_offset_s(*part, *own) for part in parts)
         if abs(set_s := last_s - first_s) > _SET_S:
             is_own = abs(np.median(lag_s[-few:]) - np.median(lag_s[:few])) > 0.5 * abs(set_s)
             text = f"by the times of recording, its clock was set on the way by {abs(set_s):.1f} s"
             of = topic if is_own else of_odometry
-            yield of.finding("clock_jump", "error", set_s, _SET_S, "s", text, at=stamp_ns)
+            yield of.finding("clock_jump", "error", set_s, _SET_S, "s", text, at=topic.stamp_ns)
         elif abs(apart_s) > _CLOCKS_DIFFER_S:
             yield _other_clock(c, topic, of_odometry, apart_s)
         elif apart_s < -_EARLY_S and not any(
@@ -129,17 +123,16 @@ def _clocks(c: Columns, topics: dict[str, TopicColumns]) -> Iterator[Finding]:
             other = f"compared with {c.odometry.topic}: its clock is ahead"
             text = f"recorded {-apart_s * 1e3:.0f} ms before the time in its stamps, {other}"
             settings = (offset_setting(c, topic.inputs[0], apart_s),)
-            yield topic.finding("latency", "warning", -apart_s, _EARLY_S, "s", text, at=stamp_ns, settings=settings)
+            yield topic.finding("latency", "warning", -apart_s, _EARLY_S, "s", text, settings=settings)
 
 
 def _other_clock(c: Columns, topic: TopicColumns, of_odometry: TopicColumns, apart_s: float) -> Finding:
     """A clock that is not that of odometry. Where odometry's alone is not the receiver's, it is odometry's."""
-    lag_s, _, stamp_ns = _lags(topic)
-    is_right = abs(float(np.median(lag_s))) < _CLOCKS_DIFFER_S / 2.0
+    is_right = abs(float(np.median(topic.lag_s))) < _CLOCKS_DIFFER_S / 2.0
     wrong, right = (of_odometry, topic) if is_right else (topic, of_odometry)
     by_s = apart_s if wrong is topic else -apart_s
     text = f"{wrong.topic}: its stamps are {-by_s:.1f} s away from those of {right.topic}: another clock"
-    found = topic.finding("clock_domains", "error", -by_s, _CLOCKS_DIFFER_S, "s", text, at=stamp_ns)
+    found = topic.finding("clock_domains", "error", -by_s, _CLOCKS_DIFFER_S, "s", text)
     return replace(found, text=text, settings=(offset_setting(c, wrong.inputs[0], by_s),))
 
 
@@ -150,7 +143,7 @@ def offset_setting(c: Columns, name: str, by_s: float) -> str:
 
 
 def _order(c: Columns, topic: TopicColumns) -> Iterator[Finding]:
-    stamp_ns = topic.stamp_ns[topic.stamp_ns != 0]
+    stamp_ns = topic.stamp_ns
     step_s = np.diff(stamp_ns) * 1e-9
     repeated, back = step_s == 0.0, step_s < 0.0
     share = float(repeated.mean())

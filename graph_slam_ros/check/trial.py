@@ -168,7 +168,7 @@ def _fitted(
         is_open = code == "odometry_scale" and not is_pose
         if ranges := answers.ranges_instead(fit, one.value, slam.calibrated, setting) if is_open else "":
             settings = ()
-        lag_s, own = float(np.median(topic.log_ns - topic.stamp_ns)) * 1e-9, c.odometry.input
+        lag_s, own = float(np.median(topic.lag_s)), c.odometry.input
         if code == "clock_offset" and -_RECORDED_S < lag_s < one.value - _EARLY_S:  # none is recorded before it is seen
             settings = (assignment(f"{own}.offset_s", round(slam.calibrated(own, "clock") - one.value, 3)),)
         text = answers.sentence(one.parameter, one.value, one.sigma, ranges)

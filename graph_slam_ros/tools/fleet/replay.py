@@ -110,17 +110,14 @@ def jobs_of(fleet: Fleet) -> list[Job]:
 
     Raises GraphSlamError: nothing to replay, or a setting or a truth that cannot be used.
     """
-    settings, out = settings_of(fleet.configs, fleet.settings), str(fleet.out.absolute())
-    return [
-        Job(
-            job_key(source.identity, values, truth),
-            *(source.url, source.name, label, values, truth, out),
-            *(fleet.limit_s, fleet.memory, fleet.with_report),
-        )
-        for source in find_sources(fleet.recordings)
-        for truth in (truth_of(fleet.truth, source),)
-        for label, values in settings.items()
-    ]
+    jobs, settings, out = list[Job](), settings_of(fleet.configs, fleet.settings), str(fleet.out.absolute())
+    limits: dict[str, Any] = {"limit_s": fleet.limit_s, "memory": fleet.memory, "with_report": fleet.with_report}
+    for source in find_sources(fleet.recordings):
+        truth = truth_of(fleet.truth, source)
+        for label, values in settings.items():
+            key = job_key(source.identity, values, truth)
+            jobs.append(Job(key, source.url, source.name, label, values, truth, out, **limits))
+    return jobs
 
 
 def replay_all(
