@@ -60,24 +60,22 @@ class Anchor:
         is_given = self._config.start_pose is not None or self._config.anchor.sigma_m > 0.0
         return is_given or bool((self._sigmas[: self._space.dimensions] > TIGHT).all())
 
-    def align_to_fix(self, m: Fix, T_map_base: Numbers, keyframe: int) -> bool:
+    def align_to_fix(self, m: Fix, T_map_base: Numbers) -> bool:
         """Loosen the prior for a more precise fix. Returns whether the map has moved.
 
         Parameters
         ----------
         T_map_base : where the robot is thought to be at the fix's stamp
-        keyframe : the newest
         """
         looser = self._looser(self._determined_by(m))
-        return looser is not None and self._move(self._onto_fix(m, T_map_base), looser, keyframe)
+        return looser is not None and self._move(self._onto_fix(m, T_map_base), looser)
 
-    def align_to_landmark(self, known: Surveyed, at: Array, keyframe: int) -> bool:
+    def align_to_landmark(self, known: Surveyed, at: Array) -> bool:
         """Loosen the prior for a surveyed landmark, as for a fix; returns whether the map has moved.
 
         Parameters
         ----------
         at : the landmark's estimate: a pose where its orientation counts, else a position (n,)
-        keyframe : the newest
         """
         n, group = self._space.dimensions, self._space.group
         wanted = self._position()
@@ -86,7 +84,7 @@ class Anchor:
             wanted[n:] = _UNCERTAIN_RAD
             T_new_old = _floats(group.compose(known.pose, group.inverse(tuple(at.tolist()))))
         looser = self._looser(wanted)
-        return looser is not None and self._move(T_new_old, looser, keyframe)
+        return looser is not None and self._move(T_new_old, looser)
 
     # -- how far ---------------------------------------------------------------------------------------------------
 
@@ -151,13 +149,13 @@ class Anchor:
         there = np.array(self._space.group.act(turn, tuple(at.tolist())))
         return (*map(float, at - there), *turn[n:])
 
-    def _move(self, T_new_old: Numbers, sigmas: Array, keyframe: int) -> bool:
+    def _move(self, T_new_old: Numbers, sigmas: Array) -> bool:
         """Move the map, unless its start is given, and replace the prior by a looser one."""
         moves = self._config.start_pose is None
         if moves:
-            self._backend.move(T_new_old, self._space)
+            self._backend.move(T_new_old)
         self._backend.hand_over()
-        self._backend.withdraw([self._edge], keyframe)
+        self._backend.withdraw([self._edge])
         self._sigmas = sigmas
         begins = self._backend.solver.estimate([self._vertex])[0] if moves else self._graph.edge(self._edge).measured
         at = tuple(begins.tolist())

@@ -2,36 +2,37 @@
 
 from collections.abc import Callable, Container, Mapping, Sequence
 from contextlib import suppress
-from copy import deepcopy
+from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from graph_slam_ros.config.pipeline import RobustConfig
-from graph_slam_ros.graph import Gaussian, Graph
-from graph_slam_ros.graph.geometry import Geometry
+from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.measurements.counters import Counters
-from graph_slam_ros.slam.calibration.rows import TrialProblem
-from graph_slam_ros.slam.doubt.record import DisplacementHypothesis
-from graph_slam_ros.slam.frontend.keyframes import Keyframe, KeyframeList
+from graph_slam_ros.slam.background import Background, CancelToken, Work, guarded, run_when_asked
+from graph_slam_ros.slam.frontend.keyframes import KeyframeList
 from graph_slam_ros.slam.frontend.noise_factors import CLASSES, Key, NoiseScales
-from graph_slam_ros.slam.frontend.sighting_edges import SightingEdges
-from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.slam.lifelong.state import BoundedState
 from graph_slam_ros.slam.noise_scale import NoiseScale, estimate_noise, factors_of
+from graph_slam_ros.slam.revision import Applied, Replacement, Revision
 from graph_slam_ros.slam.robust.gating import OutlierGate
 from graph_slam_ros.slam.robust.hypotheses import (
     Alternative,
-    Background,
     FrozenGraph,
     Outcome,
-    run_when_asked,
+    moved_rigidly,
     search_alternatives,
 )
 from graph_slam_ros.slam.robust.ledger import Ledger, Reason, Verdict
-from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.solver import Report, Settings, Solver
 from graph_slam_ros.typing import Array, Executor, Index, Numbers, Result
 
+if TYPE_CHECKING:
+    from graph_slam_ros.slam.snapshot import MapSnapshot
+
+_MORE = 1.5  # times as many edges out as at the last search
+SECOND_LOOK, NOISE = "second_look", "noise_scale"  # of what is counted
 _MAX_PENDING = 200  # edges that are compared with all that is known at once, at most; reviews look at the others
 _NOISE_ROUNDS = 8  # at most, of estimating the scale of the noise and solving with it
 _REVIEW_EVERY = 20  # keyframes: the newest verdicts are reviewed, and some of the others in turn
@@ -42,11 +43,12 @@ class Backend:
 
     Parameters
     ----------
-    executor : begins the work of a second look; the function that it returns waits for the result
     start : whose graph and ledger to go on with
+    executor : begins the work of a second look; the function that it returns waits for the result
 
     Attributes
     ----------
+    path : the keyframes
     graph, solver : the problem; decisions : the outlier gate, which judges edges
     noise : adds edges to the graph, with noise in scale
     handed_over : the solver has the vertices and edges of the graph below these ids
@@ -60,14 +62,14 @@ class Backend:
 
     def __init__(
         self,
+        path: KeyframeList,
         config: RobustConfig,
         settings: Settings,
+        start: "MapSnapshot",
+        counters: Counters,
         executor: Executor = run_when_asked,
-        start: MapSnapshot | None = None,
-        counters: Counters | None = None,
     ) -> None:
-        self._config, self._counters = config, counters or Counters()
-        start = start or MapSnapshot()
+        self.path, self._config, self._counters = path, config, counters
         self.graph = start.graph
         self.noise = NoiseScales(self.graph, start.noise_factors)
         self.solver = Solver(self.graph, settings)
@@ -75,7 +77,10 @@ class Backend:
         self.handed_over, self.held = (0, 0), (0, 0)
         self.frozen, self.frozen_edges = start.frozen, start.ledger.final
         self.edits, self.bounded = list(start.edits), start.bounded or BoundedState()
-        self._background = Background(config, executor)
+        self._background = Background[Outcome | None](
+            SECOND_LOOK, executor, config.apply_after_keyframes, self._counters
+        )
+        self._out = 0  # edges that were out at the last search
         self._rivals: tuple[Alternative, ...] = ()
         self.holds_back = False
         self.trusts_sightings = True
@@ -83,9 +88,9 @@ class Backend:
         self._pending: list[int] = []  # edges that have come and do not fit by themselves
 
     @property
-    def decides(self) -> bool:
-        """Return whether outlier rejection is on."""
-        return self._config.decide
+    def keyframe(self) -> int:
+        """The number of the newest keyframe, which decisions are noted with."""
+        return len(self.path.keyframes) - 1
 
     @property
     def ledger(self) -> Ledger:
@@ -147,77 +152,144 @@ class Backend:
         self.solver.add(self.graph.vertex_ids.since(vertices), self.graph.edge_ids.since(edges))
         self.handed_over = self.graph.vertex_ids.next, self.graph.edge_ids.next
 
-    def gate_new(self, keyframe: int) -> None:
+    def gate_new(self) -> None:
         """Judge new edges by their own noise. Those that do not fit are held back for a comparison with all others."""
         self.hand_over()
-        new = self.decisions.gate_new(self.handed_over[1], keyframe, trusts_sightings=self.trusts_sightings)
+        new = self.decisions.gate_new(self.handed_over[1], self.keyframe, trusts_sightings=self.trusts_sightings)
         self._pending = [*self._pending, *new][-_MAX_PENDING:]
 
-    def update(self, keyframe: int) -> None:
+    def update(self) -> None:
         """Solve with the new accepted edges, then judge the held-back ones."""
-        self.gate_new(keyframe)
+        self.gate_new()
         if self.holds_back:
             self.solver.update()
             return
-        is_due = self._config.decide and keyframe - self._reviewed >= _REVIEW_EVERY
+        is_due = self._config.decide and self.keyframe - self._reviewed >= _REVIEW_EVERY
         if is_due:
-            self._reviewed = keyframe
-            self.decisions.review(keyframe)
-        found = self._background.found(keyframe)
+            self._reviewed = self.keyframe
+            self.decisions.review(self.keyframe)
+        found = self._background.due(self.keyframe)
         if found is not None:
-            self.revise("second_look", lambda: self._use_found(found(), keyframe))
+            self._use_found(found())
         self.solver.update()
-        self._admit(keyframe)
-        if is_due and (group := self.decisions.readmit_likely_group(keyframe)):
-            self.decisions.make_fit(group, keyframe)
-        out = self.ledger.outside_count
-        if self._config.decide and self._background.is_due(out):
-            self._background.start(self._frozen_graph(keyframe, self.solver.settings), out)
+        self._admit()
+        if is_due and (group := self.decisions.readmit_likely_group(self.keyframe)):
+            self.decisions.make_fit(group, self.keyframe)
+        if self._is_search_due():
+            self._out = self.ledger.outside_count
+            self._background.begin(partial(self._search, self.solver.settings), self.keyframe)
 
-    def optimize(self, keyframe: int, settings: Settings) -> Report:
+    def optimize(self, settings: Settings) -> Report:
         """Solve everything, and search for a better explanation."""
-        self.gate_new(keyframe)
+        self.gate_new()
         report = self.solver.optimize(settings)
         if not self._config.decide or self.holds_back:
             return report
-        self._admit(keyframe)
-        report = self.revise("second_look", lambda: self._explained(keyframe, settings)) or report
+        self._admit()
+        outcome = guarded(self._counters, SECOND_LOOK, lambda: self._search(settings)(CancelToken()))
+        if outcome is not None:
+            self._rivals = outcome.rivals
+            revision = Revision(
+                SECOND_LOOK, verdicts=outcome.ledger, values=outcome.values, solves="all", settings=settings
+            )
+            applied = self.apply(revision)
+            report = (applied and applied.report) or report
         self.cancel_search()
         return report
 
-    def scale_noise(self, keyframes: StampedPoses[Keyframe], everything: Settings | None) -> Report | None:
+    def scale_noise(self, everything: Settings | None) -> Report | None:
         """Estimate the scale of the noise if that is due, and solve with it. Returns the last report of a solve.
 
         It is due at 50 keyframes, 100, 200 and so on, at the solve after each of these, and when everything is solved.
         A map that was edited by hand keeps its noise until a keyframe is added: residuals that an edit makes are not
         the noise of a sensor.
         """
-        is_driven = not self.edits or len(keyframes) > self.edits[-1].keyframe + 1
-        is_due = is_driven if everything is not None else self.noise.is_due(len(keyframes))
-        if self._config.noise_scale != "estimated" or self.holds_back or not is_due:
+        is_driven = not self.edits or self.keyframe > self.edits[-1].keyframe
+        is_due = is_driven if everything is not None else self.noise.is_due(self.keyframe + 1)
+        if self._config.noise_scale != "estimated" or not is_due:
             return None
-        report = None
+        applied = None
         for _ in range(_NOISE_ROUNDS if everything else 1):
-            changed = self.revise("noise_scale", lambda: self._rescaled(keyframes, everything))
+            noise = guarded(self._counters, NOISE, lambda: factors_of(self.noise_scale()))
+            changed = self.apply(Revision(NOISE, noise=noise, solves="all", settings=everything)) if noise else None
             if changed is None:
                 break
-            report = changed
-        if report is not None:
+            applied = changed
+        if applied is not None:
             self.decisions.recalibrate()
-            self.cancel_search()
-        return report if everything else None
+        return applied.report if applied and everything else None
 
-    def _rescaled(self, keyframes: StampedPoses[Keyframe], everything: Settings | None) -> Report | None:
-        """Solve with the noise that residuals show; None where that is the present one."""
-        if not self.noise.change(factors_of(self.noise_scale(keyframes)), self.first_free_edge):
+    # -- changes of what was solved ----------------------------------------------------------------------------------
+
+    def apply(self, revision: Revision) -> Applied | None:
+        """Change what was solved as a policy wants; None if it changes nothing, or fails: then all is as before."""
+        return self.all_or_nothing(revision.what, lambda: self._applied(revision))
+
+    def _applied(self, r: Revision) -> Applied | None:
+        solver, decisions, keyframe, report = self.solver, self.decisions, self.keyframe, None
+        named = *(one.edge for one in r.replaced), *(edge for edge, _ in r.restored), *r.accepted, *r.rejected
+        if named and min(named) < self.first_free_edge:
+            raise GraphSlamError(f"edge {min(named)} is of a map that is held")
+        if r.noise is not None and not self.noise.change(r.noise, self.first_free_edge):
             return None
-        self.solver.rebuild()
-        return self.solver.optimize(everything)
+        for one in r.remeasured:
+            one.table.measured.values[one.rows] = one.measured
+            one.table.sqrt_information.values[one.rows] = one.sqrt_information
+        if r.noise is not None or r.remeasured:
+            solver.rebuild()
+        replaced = self.replace(r.replaced, r.reason, r.evidence, r.threshold)
+        for edge, in_its_place in r.restored:
+            self._restore_odometry(edge, in_its_place, r.evidence)
+        if r.verdicts is not None and not decisions.adopt_verdicts(r.verdicts, keyframe) and r.settings is None:
+            return None
+        if r.values is not None:
+            solver.start_at(r.values)
+        if r.is_judged_anew:
+            decisions.reclassify(keyframe)
+        decisions.exchange(r.accepted, r.rejected, keyframe)
+        if r.noise is not None or r.remeasured or r.replaced or r.restored:
+            self.cancel_search()
+        if r.accepted:
+            self.holds_back = False
+            decisions.make_fit(list(r.accepted), keyframe)
+        elif r.solves == "all":
+            report = solver.optimize(r.settings)
+            if r.remeasured and decisions.reclassify(keyframe):
+                report = solver.optimize(r.settings)
+        elif r.solves == "new":
+            self._pending = [*self._pending, *r.compared][-_MAX_PENDING:]
+            solver.update()
+            self._admit()
+        return Applied(replaced, report)
 
-    def revise(self, what: str, change: Callable[[], Result | None]) -> Result | None:
+    def replace(
+        self, replaced: Sequence[Replacement], reason: Reason, evidence: float, threshold: float | None = None
+    ) -> tuple[tuple[int, int], ...]:
+        """Put edges in place of edges of odometry; returns both. The ledger has both."""
+        if not replaced:
+            return ()
+        graph, out = self.graph, list[tuple[int, int]]()
+        for one in replaced:
+            old = graph.edge(one.edge)
+            out.append((one.edge, graph.add_edge(old.type, old.vertices, one.motion, one.noise, old.label, old.source)))
+        self.gate_new()
+        for edge, _ in out:
+            self.decisions.decide(edge, self.keyframe, Verdict.REJECTED, reason, evidence, threshold)
+            if threshold is not None:
+                self.ledger.threshold.values[self.ledger.ids.row(edge)] = threshold
+        return tuple(out)
+
+    def _restore_odometry(self, edge: int, in_its_place: int, evidence: float) -> None:
+        """Undo ``replace``."""
+        threshold, row = self.ledger.threshold.values, self.ledger.ids.row
+        self.decisions.withdraw([in_its_place], self.keyframe, Reason.REVOKED)
+        threshold[row(edge)] = threshold[row(in_its_place)]
+        self.decisions.decide(edge, self.keyframe, Verdict.NOT_EVALUATED, Reason.NONE, evidence)
+
+    def all_or_nothing(self, what: str, change: Callable[[], Result | None]) -> Result | None:
         """Change what was solved. After an exception, which is counted, all is as it was, and the result is None."""
-        before, handed_over = self._frozen_graph(0, self.solver.settings), self.handed_over
-        factors, count = dict(self.noise.factors), len(self.ledger.history)
+        before, handed_over = self._frozen_graph(self.solver.settings), self.handed_over
+        factors, count, pending = dict(self.noise.factors), len(self.ledger.history), list(self._pending)
         try:
             return change()
         except Exception as error:
@@ -225,7 +297,7 @@ class Backend:
         vars(self.graph).update(vars(before.graph))
         going_on = {"history": self.ledger.history[:count], "changes": self.ledger.changes + 1}
         vars(self.ledger).update(vars(before.ledger) | going_on)
-        self.noise.factors = factors
+        self.noise.factors, self._pending = factors, pending
         fresh = Solver(self.graph, self.solver.settings)
         fresh.start_at(before.values)
         fresh.add(before.vertices, self.graph.edge_ids.since(0, handed_over[1]))
@@ -238,10 +310,24 @@ class Backend:
         self.decisions.recount()
         return None
 
-    def noise_scale(self, keyframes: StampedPoses[Keyframe], labels: Container[str] = CLASSES) -> list[NoiseScale]:
+    def withdraw(self, edges: Sequence[int], reason: Reason = Reason.WITHDRAWN, *, vertex: int | None = None) -> None:
+        """Remove edges permanently, and with all of its edges a vertex."""
+        self.decisions.withdraw(edges, self.keyframe, reason)
+        self._pending = [edge for edge in self._pending if edge not in edges]
+        if vertex is not None:
+            self.solver.remove(vertex)
+
+    def move(self, T_new_old: Numbers) -> None:
+        """Move everything rigidly. A running search is cancelled."""
+        self.solver.start_at(moved_rigidly(self.graph, self.solver.values, T_new_old))
+        self.cancel_search()
+
+    # -- noise -------------------------------------------------------------------------------------------------------
+
+    def noise_scale(self, labels: Container[str] = CLASSES) -> list[NoiseScale]:
         """Estimate the scale of the noise of some classes without changing anything."""
         stamps = np.zeros(self.graph.vertex_ids.next, dtype=np.int64)
-        stamps[keyframes.ids] = keyframes.stamps_ns
+        stamps[self.path.keyframes.ids] = self.path.keyframes.stamps_ns
         edges = range(self.first_free_edge, self.handed_over[1])
         return estimate_noise(self.graph, self.solver, self.noise.factors, stamps, edges, labels)
 
@@ -255,29 +341,6 @@ class Backend:
         """The first edge that is not of a frozen or held map."""
         return max(self.frozen_edges, self.held[1])
 
-    def trial_problem(
-        self,
-        space: Geometry,
-        path: KeyframeList,
-        origins: SightingEdges,
-        factors: tuple[float, float] = (1.0, 1.0),
-    ) -> TrialProblem:
-        """A copy of the present problem for a trial fit. Rejected sightings are included, under their loss.
-
-        Parameters
-        ----------
-        factors : of distance and turn, by which odometry is corrected
-        """
-        graph, solver, out = self.graph.copy(), self.solver, self.ledger.outside
-        graph.set_weights(out[graph.has_label(out, ("landmarks",))], 1.0)
-        rows, begins = path.keyframes, [max(k - path.keyframes.first, 0) for k in path.segments]
-        keyframes = rows.ids.copy(), rows.stamps_ns.copy(), tuple(dict.fromkeys(begins))
-        problem = solver.vertices, solver.held, solver.values, solver.settings
-        track = path.samples.track(path.keyframes.poses, factors)
-        return TrialProblem(
-            space, graph, *problem, deepcopy(origins, {id(space): space}), *keyframes, track, self.first_free_edge
-        )
-
     @property
     def is_handed_over(self) -> bool:
         """Return whether the solver has all of the graph."""
@@ -289,10 +352,10 @@ class Backend:
         is_judged = self.is_handed_over and len(self.ledger) == self.graph.edge_count and not self._pending
         return is_judged and not (self.holds_back or self._background.is_busy)
 
-    def note_condensed(self, keyframe: int) -> None:
+    def note_condensed(self) -> None:
         """Note edges that the solver has already: nobody doubts them."""
         self.handed_over = self.graph.vertex_ids.next, self.graph.edge_ids.next
-        self.decisions.gate_new(self.handed_over[1], keyframe)
+        self.decisions.gate_new(self.handed_over[1], self.keyframe)
 
     def keep(self, vertices: Index, edges: Index) -> None:
         """Remove all other vertices and edges from the graph."""
@@ -304,111 +367,35 @@ class Backend:
 
     def cancel_search(self) -> None:
         """Cancel a running search: the problem that it began with has changed."""
-        self._background.cancel(self.ledger.outside_count)
+        self._background.cancel()
+        self._out = self.ledger.outside_count
 
-    def move(self, T_new_old: Numbers, space: Geometry) -> None:
-        """Move everything rigidly. A running search is cancelled."""
-        self.solver.start_at(moved_values(self.graph, self.solver.values, T_new_old, space))
-        self.cancel_search()
+    def _is_search_due(self) -> bool:
+        """Return whether enough edges have come out since the last search: it gets rarer as its cost grows."""
+        after, out = self._config.second_look_after, self.ledger.outside_count
+        self._out = min(self._out, out)
+        is_on = self._config.decide and after > 0 and not self._background.is_busy
+        return is_on and out >= max(self._out + after, _MORE * self._out)
 
-    def withdraw(self, edges: Sequence[int], keyframe: int, reason: Reason = Reason.WITHDRAWN) -> None:
-        """Remove edges permanently."""
-        self.decisions.withdraw(edges, keyframe, reason)
-        self._pending = [edge for edge in self._pending if edge not in edges]
+    def _search(self, settings: Settings) -> Work[Outcome | None]:
+        frozen = self._frozen_graph(settings)
+        return lambda token: search_alternatives(self._config, frozen, token)
 
-    def split(
-        self,
-        replacement: tuple[int, Sequence[float], Gaussian],
-        initial_poses: Sequence[int],
-        values: Array,
-        found: DisplacementHypothesis,
-        keyframe: int,
-    ) -> int:
-        """Begin a segment in the past: odometry there gets next to no weight, and sightings are judged anew.
+    def _use_found(self, outcome: Outcome | None) -> None:
+        """Solve with what a search in the background has found, if that is another explanation."""
+        if outcome is not None:
+            self._rivals = outcome.rivals
+            values = outcome.carried_to(self.graph, self.solver.values)
+            self.apply(Revision(SECOND_LOOK, verdicts=outcome.ledger, values=values, solves="all"))
 
-        Returns the edge that replaces odometry's.
-
-        Parameters
-        ----------
-        replacement : the edge of odometry that leads there, and the motion and noise that it is to have instead
-        initial_poses : edges that are out from now on, until they fit
-        values : stored numbers of all vertices to go on from
-        """
-        link, motion, noise = replacement
-        old = self.graph.edge(link)
-        edge = self.graph.add_edge(old.type, old.vertices, motion, noise, "odometry", old.source)
-        self.hand_over()
-        self.decisions.gate_new(self.handed_over[1], keyframe)
-        self.decisions.decide(link, keyframe, Verdict.REJECTED, Reason.DISPLACED, found.evidence)
-        self.decisions.exchange(found.fitting, (*found.contradicting, *initial_poses), keyframe)
-        self.solver.start_at(values)
-        self._go_on(found, keyframe)
-        return edge
-
-    def rejoin(self, link: int, replacement: int, keyframe: int, evidence: float = 0.0) -> None:
-        """Undo ``split``: odometry's edge is accepted again, and its replacement is rejected."""
-        self.decisions.withdraw([replacement], keyframe, Reason.REVOKED)
-        self.decisions.decide(link, keyframe, Verdict.NOT_EVALUATED, Reason.NONE, evidence)
-
-    def judge_anew(self, values: Array, found: DisplacementHypothesis, keyframe: int) -> None:
-        """Judge all edges from other stored numbers of all vertices, and accept what shows where the robot is."""
-        self.solver.start_at(values)
-        self.decisions.reclassify(keyframe)
-        self.decisions.exchange(found.fitting, found.contradicting, keyframe)
-        self._go_on(found, keyframe)
-
-    def admit(self, edges: Sequence[int], keyframe: int) -> None:
-        """Compare some edges that may be out with all that is known."""
-        self._pending = [*self._pending, *edges][-_MAX_PENDING:]
-        self.solver.update()
-        self._admit(keyframe)
-
-    def _go_on(self, found: DisplacementHypothesis, keyframe: int) -> None:
-        self.cancel_search()
-        self.holds_back = False
-        self.decisions.make_fit(list(found.fitting), keyframe)
-
-    def _admit(self, keyframe: int) -> None:
+    def _admit(self) -> None:
         """Judge held-back edges by the joint covariance of the estimate."""
         pending = [edge for edge in self._pending if not self.ledger.is_inside(edge)]
-        admitted = self.decisions.admit_compatible(pending, keyframe)
+        admitted = self.decisions.admit_compatible(pending, self.keyframe)
         self._pending = []
         if admitted:
-            self.decisions.make_fit(admitted, keyframe, by_innovation=True)
+            self.decisions.make_fit(admitted, self.keyframe, by_innovation=True)
 
-    def _use_found(self, outcome: Outcome | None, keyframe: int) -> None:
-        """Solve with what a search in the background has found, if that is another explanation."""
-        if outcome is not None and self._adopt(outcome, keyframe):
-            self.solver.start_at(outcome.carried_to(self.graph, self.solver.values))
-            self.solver.optimize()
-
-    def _explained(self, keyframe: int, settings: Settings) -> Report | None:
-        """Solve with the best explanation; None where a search finds none."""
-        outcome = search_alternatives(self._config, self._frozen_graph(keyframe, settings))
-        if outcome is None:
-            return None
-        self._adopt(outcome, keyframe)
-        self.solver.start_at(outcome.values)
-        return self.solver.optimize(settings)
-
-    def _adopt(self, outcome: Outcome, keyframe: int) -> bool:
-        """Use the verdicts of a search. Returns whether it explains the measurements in another way than now."""
-        self._rivals = outcome.rivals
-        return self.decisions.adopt_verdicts(outcome.ledger, keyframe)
-
-    def _frozen_graph(self, keyframe: int, settings: Settings) -> FrozenGraph:
+    def _frozen_graph(self, settings: Settings) -> FrozenGraph:
         problem = self.graph.copy(), self.solver.vertices, self.solver.held, self.solver.values
-        return FrozenGraph(keyframe, *problem, settings, self.ledger.copy())
-
-
-def moved_values(graph: Graph, values: Array, T_new_old: Numbers, space: Geometry) -> Array:
-    """Stored numbers of all vertices of a map that is moved rigidly."""
-    out = values.copy()
-    vertices = graph.vertex_ids.since()
-    for kind in (space.pose, space.point):
-        if kind in graph.kinds:
-            of_kind = vertices[graph.kind_codes(vertices) == graph.kinds.index(kind)]
-            at = graph.begins(of_kind)[:, None] + np.arange(kind.size)
-            move = space.group.compose if kind is space.pose else space.group.act
-            out[at] = np.stack(move(T_new_old, tuple(values[at].T)), axis=-1)
-    return out
+        return FrozenGraph(self.keyframe, *problem, settings, self.ledger.copy())

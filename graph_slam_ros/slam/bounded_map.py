@@ -112,16 +112,10 @@ class BoundedMap:
 
     @property
     def is_due(self) -> bool:
-        """Return whether so many keyframes are out of the window that some should leave, and nothing else goes on."""
-        keyframes, map_ = self._frontend.path.keyframes, self._frontend.config.map
-        count = len(keyframes)
-        if (
-            not self._frontend.config.condenses
-            or count - keyframes.first < map_.window_keyframes + BATCH
-            or count <= self._tried
-        ):
-            return False
-        return self._backend.is_quiet and self._kidnaps.is_quiet and self._solution.is_whole
+        """Return whether so many keyframes are out of the window that some should leave."""
+        keyframes, config = self._frontend.path.keyframes, self._frontend.config
+        is_long = len(keyframes) - keyframes.first >= config.map.window_keyframes + BATCH
+        return config.condenses and is_long and len(keyframes) > self._tried
 
     @property
     def _limit(self) -> int:
@@ -130,12 +124,10 @@ class BoundedMap:
         return min(len(path.keyframes) - window, path.remembered_from)
 
     def condense(self) -> Condensation | None:
-        """Condense what has left the window, if that is due; returns what has left the map.
+        """Condense what has left the window, if all that was seen there is explained; returns what has left the map.
 
         A failure is counted, and changes nothing.
         """
-        if not self.is_due:
-            return None
         backend, keyframes = self._backend, self._frontend.path.keyframes
         if not self._landmarks.anonymous.may_forget_before(self._limit):
             self._tried = len(keyframes) + _AGAIN
@@ -143,7 +135,7 @@ class BoundedMap:
         self._landmarks.map.withdraw_tentative(self._limit)
         before = self.state.copy()
         self._tried = len(keyframes)
-        condensed = backend.revise(_SOURCE, self._condensed_visits)
+        condensed = backend.all_or_nothing(_SOURCE, self._condensed_visits)
         if condensed is None:
             self._tried += BATCH - 1  # the same would most likely fail at the next keyframe again
             self.state.places, self.state.scale = before.places, before.scale
@@ -184,7 +176,7 @@ class BoundedMap:
             k, room = end, room - 1
         self.condenser.rescale()
         self._solution.guard.checked(solver.update)
-        self._backend.note_condensed(len(path.keyframes) - 1)
+        self._backend.note_condensed()
         return rows, first + k
 
     def _note_end(self, done: Condensed, keyframes: int) -> None:

@@ -47,30 +47,30 @@ class Edits:
     def __init__(self, backend: Backend, frontend: KeyframeFrontend, landmarks: Landmarks, counters: Counters) -> None:
         self._backend, self._frontend, self._landmarks, self._counters = backend, frontend, landmarks, counters
 
-    def remove(self, what: Mapping[str, Value], keyframe: int) -> bool:
+    def remove(self, what: Mapping[str, Value]) -> bool:
         """Remove what a control event names, an edge or a landmark; returns whether that was possible."""
         self._backend.hand_over()
         edge, landmark = what.get("edge"), what.get("landmark")
         if landmark is None:
-            reason = self._remove_edge(int(str(edge)), keyframe)
+            reason = self._remove_edge(int(str(edge)))
         elif self._frontend.path.keyframes.first:
             reason = "condensed_in_map"
         else:
-            reason = self._remove_landmark(str(landmark), keyframe)
+            reason = self._remove_landmark(str(landmark))
         self._counters.count(SOURCE, reason)
         return reason == "removed"
 
-    def clear_closures(self, keyframe: int) -> bool:
+    def clear_closures(self) -> bool:
         """Remove all loop closures, but for those of a frozen map; returns whether there was any."""
         ledger = self._backend.ledger
         self._backend.hand_over()
         closures = [edge for edge in self._backend.graph.edges_of("closures").tolist() if edge >= ledger.final]
-        self._backend.withdraw(closures, keyframe)
+        self._backend.withdraw(closures)
         if closures:
             self._counters.count("closures", "cleared", len(closures))
         return bool(closures)
 
-    def _remove_edge(self, edge: int, keyframe: int) -> str:
+    def _remove_edge(self, edge: int) -> str:
         """Remove an edge, and a landmark with the last edge that determines it; returns what is counted."""
         graph, ledger = self._backend.graph, self._backend.ledger
         if reason := why_not_removed(graph, ledger, edge):
@@ -78,11 +78,11 @@ class Edits:
         vertex = landmark_of(graph, edge)
         if vertex is not None and determining(graph, ledger, vertex) == [edge]:
             name = next((name for name, mark in self._landmarks.known.items() if mark.vertex == vertex), "")
-            return self._remove_landmark(name, keyframe)
-        self._backend.withdraw([edge], keyframe)
+            return self._remove_landmark(name)
+        self._backend.withdraw([edge])
         return "removed"
 
-    def _remove_landmark(self, name: str, keyframe: int) -> str:
+    def _remove_landmark(self, name: str) -> str:
         """Remove a landmark and its edges; what is observed of that name later begins another."""
         backend, landmark = self._backend, self._landmarks.known.get(name)
         if landmark is None:
@@ -90,8 +90,8 @@ class Edits:
         elif backend.solver.is_held(landmark.vertex):
             reason = "held_in_map"
         else:
-            backend.withdraw(standing_edges(backend.graph, backend.ledger, landmark.vertex), keyframe)
-            backend.solver.remove(landmark.vertex)
+            edges = standing_edges(backend.graph, backend.ledger, landmark.vertex)
+            backend.withdraw(edges, vertex=landmark.vertex)
             self._landmarks.forget({landmark.vertex})
             reason = "removed"
         return reason

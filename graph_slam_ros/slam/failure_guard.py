@@ -53,7 +53,7 @@ class FailureGuard:
         self._in_a_row = 0  # failures since
         self._undetermined = set[int]()  # vertices that these named
 
-    def solve(self, work: Callable[[], Result], keyframe: int) -> Result | None:
+    def solve(self, work: Callable[[], Result]) -> Result | None:
         """Solve by ``work`` and return its result; None if it fails, or if its result is impossible."""
         try:
             return self.checked(work)
@@ -63,7 +63,7 @@ class FailureGuard:
         if (is_new and self._in_a_row == 1) or self._in_a_row.bit_count() > 1:  # at 2, 4, 8, ...: it costs some solves
             return None
         try:
-            return self.checked(work, again=False) if self._quarantine(keyframe) else None
+            return self.checked(work, again=False) if self._quarantine() else None
         except Exception:  # it is the same solve: counted already
             self.go_back()
             return None
@@ -152,7 +152,7 @@ class FailureGuard:
 
     # -- quarantine --------------------------------------------------------------------------------------------------
 
-    def _quarantine(self, keyframe: int) -> bool:
+    def _quarantine(self) -> bool:
         """Remove candidates permanently without which the problem can be solved. Returns whether it can.
 
         They are those that are new, and those on landmarks that the failures named: a landmark can move so far away in
@@ -173,7 +173,7 @@ class FailureGuard:
         for one in blamed:
             self._counters.count(self._graph.label_of(one.edges[0]), "quarantined", len(one.edges))
             out = one.edges if one.landmark is None else self._solver.edges_on(one.landmark).tolist()
-            self._backend.withdraw(out, keyframe, Reason.QUARANTINED)  # also edges that were held back before
+            self._backend.withdraw(out, Reason.QUARANTINED)  # also edges that were held back before
         self._landmarks.forget({one.landmark for one in blamed if one.landmark is not None})
         return True
 

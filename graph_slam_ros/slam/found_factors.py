@@ -11,10 +11,11 @@ import numpy as np
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.calibration.answers import Finding, of_association
-from graph_slam_ros.slam.calibration.model import MeasurementModel, OdometryEdges, Sightings, factors_of
+from graph_slam_ros.slam.calibration.model import MeasurementModel, factors_of
 from graph_slam_ros.slam.calibration.parameters import Parameter, Values
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
 from graph_slam_ros.slam.landmarks.landmark_frontend import LandmarkFrontend
+from graph_slam_ros.slam.revision import Remeasured, Revision
 from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.solver import Report, Settings
 from graph_slam_ros.typing import Array, Index
@@ -40,20 +41,19 @@ class FoundFactors:
         backend: Backend,
         frontend: KeyframeFrontend,
         landmarks: LandmarkFrontend,
-        start: MapSnapshot | None = None,
+        start: MapSnapshot,
     ) -> None:
         self._config, self._backend, self._frontend = config, backend, frontend
         self._origins, self._anonymous = landmarks.map.origins, landmarks.anonymous
         self.corrected: list[Finding] = []
-        self._is_new = start is None or not start.keyframe_count
-        if start is not None:
-            frontend.corrections.restore(start.calibration)
+        self._is_new = not start.keyframe_count
+        frontend.corrections.restore(start.calibration)
         self._used: Mapping[str, tuple[float, float]] = landmarks.anonymous.hindsight.found_scales
 
-    def after_solve(self, keyframe: int, everything: Settings | None) -> Report | None:
+    def after_solve(self, everything: Settings | None) -> Report | None:
         """Apply what the last explanation of all scans has found, if it is new. Returns the report of a solve."""
         scales = self._anonymous.hindsight.found_scales
-        if scales is self._used or not self._is_new or self._backend.holds_back:
+        if scales is self._used or not self._is_new:
             return None
         self._used, model = scales, self._model()
         sources = {edges.source for edges in model.odometry}
@@ -66,7 +66,7 @@ class FoundFactors:
         used = [one for one in findings if one.verdict == "admitted"]
         # Six digits, because the last ones of a sine depend on the memory alignment of an array.
         values = {one.parameter: float(f"{one.value:.6g}") for one in used}
-        report = self._correct(model, values, keyframe, everything) if values else None
+        report = self._correct(model, values, everything) if values else None
         if report is not None:
             self.corrected += used
         return report
@@ -76,50 +76,35 @@ class FoundFactors:
         edges = range(self._backend.first_free_edge, graph.edge_ids.next)
         return MeasurementModel(self._config.space, graph, self._origins, keyframes.ids, keyframes.stamps_ns, edges)
 
-    def _correct(
-        self, model: MeasurementModel, values: Values, keyframe: int, everything: Settings | None
-    ) -> Report | None:
+    def _correct(self, model: MeasurementModel, values: Values, everything: Settings | None) -> Report | None:
         """Correct all measurements, present and future, and solve. A failure is undone."""
-        corrections, origins = self._frontend.corrections, list[tuple[Index, Array]]()
-        before = corrections.found
-        corrections.found = before | {
-            (one.source, one.name): before.get((one.source, one.name), 1.0) * (1.0 + value)
-            for one, value in values.items()
-        }
-
-        def solved() -> Report:
-            backend = self._backend
-            origins.extend(self._rewrite(model, values))
-            backend.solver.rebuild()
-            report = backend.solver.optimize(everything)
-            return backend.solver.optimize(everything) if backend.decisions.reclassify(keyframe) else report
-
-        report = self._backend.revise("calibration", solved)
-        if report is None:
-            corrections.found = before
+        corrected, origins = self._corrected(model, values)
+        applied = self._backend.apply(Revision("calibration", remeasured=corrected, solves="all", settings=everything))
+        if applied is None:
             return None
+        corrections, before = self._frontend.corrections, self._frontend.corrections.found
+        now = {(one.source, one.name): value for one, value in values.items()}
+        corrections.found = before | {key: before.get(key, 1.0) * (1.0 + value) for key, value in now.items()}
         for rows, poses in origins:
             self._origins.T_keyframe_base[rows] = poses
         self._anonymous.rescale(factors_of(values))
-        self._backend.cancel_search()
-        return report
+        return applied.report
 
-    def _rewrite(self, model: MeasurementModel, values: Values) -> list[tuple[Index, Array]]:
-        """Correct what all edges have measured. Returns the corrected origins of sightings."""
-        changes: list[tuple[OdometryEdges | Sightings, Array, Array]] = []
-        origins = []
+    def _corrected(self, model: MeasurementModel, values: Values) -> tuple[list[Remeasured], list[tuple[Index, Array]]]:
+        """What all edges would have measured, and the corrected origins of sightings."""
+        out, origins = list[Remeasured](), list[tuple[Index, Array]]()
         for odometry in model.odometry:
-            changes.append((odometry, _exact(model.measured(odometry, values)), odometry.roots))
+            measured = _exact(model.measured(odometry, values))
+            out.append(Remeasured(odometry.table, odometry.rows, measured, odometry.roots))
         for seen in model.sightings:
             T_keyframe_base = model.scaled(tuple(seen.T_keyframe_base.T), values)
             z = _exact(model.from_pose(seen, seen.seen, T_keyframe_base))
-            changes.append((seen, z, _exact(model.roots_from_pose(seen, T_keyframe_base))))
+            roots = _exact(model.roots_from_pose(seen, T_keyframe_base))
+            out.append(Remeasured(seen.table, seen.rows, z, roots))
             places = self._origins.places(seen.table.at(seen.rows).ids)
             known = places >= 0
             origins.append((places[known], _exact(np.stack(T_keyframe_base, axis=-1)[known])))
-        for edges, z, roots in changes:
-            edges.table.measured.values[edges.rows], edges.table.sqrt_information.values[edges.rows] = z, roots
-        return origins
+        return out, origins
 
 
 def _exact(numbers: Array) -> Array:

@@ -8,10 +8,8 @@ function of the configuration and the sequence of accepted measurements, and of 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 
-import numpy as np
-
 from graph_slam_ros.config.config import Config
-from graph_slam_ros.errors import DivergedError, GraphSlamError
+from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.edits import aliases
 from graph_slam_ros.measurements.types import (
@@ -29,24 +27,27 @@ from graph_slam_ros.measurements.types import (
 )
 from graph_slam_ros.slam.anchor import Anchor
 from graph_slam_ros.slam.backend import Backend
+from graph_slam_ros.slam.background import run_when_asked
 from graph_slam_ros.slam.bounded_map import BoundedMap
 from graph_slam_ros.slam.doubt.kidnap_detector import KidnapDetector
 from graph_slam_ros.slam.edits import Edits
 from graph_slam_ros.slam.failure_guard import FailureGuard
 from graph_slam_ros.slam.found_factors import FoundFactors
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
+from graph_slam_ros.slam.frontend.keyframes import KeyframeList
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
+from graph_slam_ros.slam.frontend.odometry_integration import OdometryNoise
 from graph_slam_ros.slam.frontend.odometry_selector import Step
 from graph_slam_ros.slam.landmarks.assignments import Assigned
 from graph_slam_ros.slam.landmarks.landmark_frontend import LandmarkFrontend
 from graph_slam_ros.slam.map_view import MapView
-from graph_slam_ros.slam.robust.hypotheses import run_when_asked
+from graph_slam_ros.slam.policies import Policies
 from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.slam.solution import Solution
 from graph_slam_ros.slam.trial_fits import TrialFits
 from graph_slam_ros.slam.update import Update, UpdateLog
-from graph_slam_ros.solver import Report, Settings
-from graph_slam_ros.typing import Array, Executor
+from graph_slam_ros.solver import Settings
+from graph_slam_ros.typing import Executor
 
 
 class GraphSlam(MapView):
@@ -74,29 +75,27 @@ class GraphSlam(MapView):
         executor: Executor = run_when_asked,
         start: MapSnapshot | None = None,
     ) -> None:
-        config, self.counters = config or Config(), (counters := Counters())
-        backend = Backend(config.robust, config.solver_settings(), executor, start, counters)
-        landmarks = LandmarkFrontend(
-            *(config, backend.noise, backend.solver, counters),
-            withdraw=lambda edges: backend.withdraw(edges, len(self.keyframes) - 1),
-            hand_over=backend.hand_over,
-            trusts_sightings=lambda: backend.trusts_sightings,
-            executor=executor,
-        )
+        config, start = config or Config(), start or MapSnapshot()
+        self.counters = counters = Counters()
+        path = KeyframeList(OdometryNoise(config.odometry, config.space), config.space)
+        backend = Backend(path, config.robust, config.solver_settings(), start, counters, executor)
+        landmarks = LandmarkFrontend(config, backend, counters, executor)
         solution = Solution(config.space, backend, FailureGuard(backend, counters, landmarks.map))
-        frontend = KeyframeFrontend(config, backend.noise, counters, backend.solver, start.datum if start else ())
-        kidnaps = KidnapDetector(config, backend, counters, frontend.path.segments, landmarks.anonymous, start)
+        frontend = KeyframeFrontend(config, path, backend.noise, counters, backend.solver, start.datum)
+        kidnaps = KidnapDetector(config, backend, counters, landmarks.anonymous, start)
         super().__init__(config, backend, frontend, landmarks, kidnaps, solution)
         self.settings, self._anchor = dict[str, Value](), Anchor(config, backend)
         self._sink, self._faults = sink or (lambda measurement: None), list[Exception]()
         self._edits = Edits(backend, frontend, landmarks.map, counters)
         landmarks.map.aliases = aliases(backend.edits)
         self._found_factors = FoundFactors(config, backend, frontend, landmarks, start)
-        first = start.keyframe_count if start is not None else 0
+        first = start.keyframe_count
         self._trials = TrialFits(config, backend, frontend, landmarks, kidnaps, counters, executor, first)
-        if start is not None and start.keyframes:
+        if start.keyframes:
             self._restore(start)
-        self._bounded = BoundedMap(backend, frontend, landmarks, self._anchor, kidnaps, solution, counters)
+        bounded = BoundedMap(backend, frontend, landmarks, self._anchor, kidnaps, solution, counters)
+        parts = backend, frontend, landmarks, kidnaps, self._trials, self._found_factors, bounded, solution
+        self._policies = Policies(*parts)
         self._updates, self.processed = UpdateLog(self), 0
 
     def process(self, measurement: Measurement) -> Update:
@@ -108,7 +107,7 @@ class GraphSlam(MapView):
         check_space(measurement, self.space.dimensions)
         self._sink(measurement)
         self.processed += 1
-        self._updates.begin(self._bounded.condense())
+        self._updates.begin(self._policies.condense())
         with self._collected():
             self._process(measurement)
         if self._faults:
@@ -152,7 +151,7 @@ class GraphSlam(MapView):
             frontend.begin(step)
             first = self.keyframes[-1]
             frontend.covariance = self._anchor.begin(first.vertex, self.config.start_pose or step.T_odom_base)
-            self._solution.begin(first, len(self.keyframes))
+            self._solution.begin()
             return
         begins_segment = frontend.begins_segment(step)
         self._use_reached(frontend.integrate(step))
@@ -199,57 +198,30 @@ class GraphSlam(MapView):
         for one in sightings:
             with self._collected():
                 found = self._landmarks.map.survey_of(one.name, one.sighting, one.where)
-                if found is not None and self._anchor.align_to_landmark(*found, len(self.keyframes) - 1):
+                if found is not None and self._anchor.align_to_landmark(*found):
                     self._note_moved(one.topic)
                 self._landmarks.map.add(one.topic, one.name, one.sighting, one.where)
 
     def _add_fix(self, m: Fix, where: PoseAtStamp) -> None:
         pose_of, compose = self._solution.pose, self.space.group.compose
-        if self._anchor.align_to_fix(m, compose(pose_of(where.vertex), where.T_keyframe_base), len(self.keyframes) - 1):
+        if self._anchor.align_to_fix(m, compose(pose_of(where.vertex), where.T_keyframe_base)):
             self._note_moved(m.topic)
         self._frontend.edges.fix(m, where, pose_of(where.vertex))
 
     def _note_moved(self, topic: str) -> None:
         self.counters.count(topic, "map_moved")
-        self._landmarks.forget_where()
+        self._landmarks.anonymous.forget_belief()
         self._solution.guard.note_moved()
 
     def _solve_if_due(self) -> None:
-        if self._solution.is_due(len(self.keyframes), self.config.solve.every_keyframes):
+        if self._solution.is_due(self.config.solve.every_keyframes):
             self._solve()
 
     def _solve(self, everything: Settings | None = None) -> None:
         """Solve the new part, or everything. After a failure, which is counted, the last estimate stays."""
         if self.keyframes:
-            count = len(self.keyframes)
-            covariance = self._solution.solve(lambda: self._solved(count - 1, everything), self.keyframes[-1], count)
+            covariance = self._solution.solve(lambda: self._policies.solve(everything))
             self._frontend.covariance = self._frontend.covariance if covariance is None else covariance
-
-    def _solved(self, keyframe: int, everything: Settings | None) -> tuple[Report | None, Array]:
-        """Solve; then each policy looks at what is solved, in this order, and may change the past.
-
-        Landmarks without identities are told apart anew (``LandmarkFrontend``). Edges are judged, and a better
-        explanation that was found in the background is used (``Backend``). A robot that was moved, and odometry that
-        slipped, are found, or taken back (``KidnapDetector``). The noise is scaled (``Backend.scale_noise``), clocks,
-        mounts and scales are fitted, on a copy (``TrialFits``), and factors of odometry corrected (``FoundFactors``).
-        While an alarm is not decided (``Backend.holds_back``), nothing but that changes the past. What has left the
-        window is condensed before the next measurement (``BoundedMap``), when nothing of this goes on.
-        """
-        now_ns, report = self._frontend.now_ns, None
-        self._kidnaps.add(self.backend.handed_over[1], now_ns, self.keyframes)
-        self._landmarks.review(self.keyframes, everything=everything is not None)
-        if everything is None:
-            self.backend.update(keyframe)
-            self._kidnaps.check(self.keyframes, now_ns)
-        else:
-            report = self._kidnaps.optimize(self.keyframes, everything)
-        report = self.backend.scale_noise(self.keyframes, everything) or report
-        self._trials.after_solve(keyframe, is_of_everything=everything is not None)
-        report = self._found_factors.after_solve(keyframe, everything) or report
-        (covariance,) = self.solver.marginal([self.keyframes[keyframe].vertex])
-        if not np.isfinite(covariance).all():
-            raise DivergedError("the covariance is not finite")
-        return report, covariance
 
     def _on_event(self, event: Event, values: dict[str, Value]) -> None:
         match event:
@@ -264,10 +236,10 @@ class GraphSlam(MapView):
                 self._add_assigned(self._landmarks.end_scan())
                 self._solve(self.config.solver_settings())
             case "clear_closures":
-                if self._edits.clear_closures(len(self.keyframes) - 1):
+                if self._edits.clear_closures():
                     self._solve()
             case "remove":
-                if self._edits.remove(values, len(self.keyframes) - 1):
+                if self._edits.remove(values):
                     self._solve(self.config.solver_settings())
             case "set":
                 self._set(values)
@@ -305,9 +277,10 @@ class GraphSlam(MapView):
         path = start.keyframes, start.segments, start.drives, start.sighting_poses
         self._frontend.restore(*path, start.drive if start.continues else {}, start.gyro_bias)
         self._anchor.restore()
-        self._landmarks.restore(start.landmarks)
+        self._landmarks.map.restore(start.landmarks)
+        self._landmarks.anonymous.restore()
         report = self.backend.restore(start.vertices, start.values, start.held if self.config.map.localize else (0, 0))
-        self._solution.restore(report, self.keyframes[-1], len(self.keyframes))
+        self._solution.restore(report)
         (self._frontend.covariance,) = self.solver.marginal([self.keyframes[-1].vertex])
         if self.config.map.localize:
             self.backend.hold_map()

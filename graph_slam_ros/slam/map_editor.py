@@ -13,10 +13,10 @@ from graph_slam_ros.errors import GraphSlamError, did_you_mean
 from graph_slam_ros.graph import EdgeType, Gaussian
 from graph_slam_ros.measurements.edits import AppliedEdit, Edit
 from graph_slam_ros.slam.anchor import TIGHT
-from graph_slam_ros.slam.backend import moved_values
 from graph_slam_ros.slam.edits import BY_HAND, HAND_MADE, anchors, determining, standing_edges, why_not_removed
 from graph_slam_ros.slam.landmarks.landmark import Landmark
 from graph_slam_ros.slam.robust.gating import CANDIDATES
+from graph_slam_ros.slam.robust.hypotheses import moved_rigidly
 from graph_slam_ros.slam.robust.landmark_support import landmark_of
 from graph_slam_ros.slam.robust.ledger import OUTSIDE, Reason, Verdict
 from graph_slam_ros.slam.snapshot import MapSnapshot
@@ -290,7 +290,7 @@ class MapEditor:
             raise GraphSlamError(_WHY["held_in_map"])
         poses = [edge for edge in graph.edges_of("initialpose").tolist() if not ledger.is_withdrawn(edge)]
         fixed, compose = anchors(graph, ledger), self._space.group.compose
-        values = moved_values(graph, state.values, T_new_old, self._space)
+        values = moved_rigidly(graph, state.values, T_new_old)
         self._refuse_located(values, {*fixed, *poses}, T_new_old)
         state.values = values
         self._withdraw(fixed)

@@ -178,7 +178,7 @@ class MapView:
     @property
     def T_map_odom(self) -> Numbers:
         """The transform ``map -> odom``: it corrects odometry's drift at the newest keyframe."""
-        return self._solution.T_map_odom(self.keyframes[-1]) if self.keyframes else self.space.identity
+        return self._solution.T_map_odom if self.keyframes else self.space.identity
 
     @property
     def newest_odometry_ns(self) -> int | None:
@@ -241,7 +241,7 @@ class MapView:
         GaugeError, SingularError
             As for ``Solver.joint_marginal``.
         """
-        return self.backend.noise_scale(self.keyframes)
+        return self.backend.noise_scale()
 
     def trial_fit(
         self, groups: Sequence[str] = (AUTO,), *, places: bool = False, is_to_correct: bool = False

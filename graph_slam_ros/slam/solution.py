@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from graph_slam_ros.errors import DivergedError
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.failure_guard import FailureGuard
@@ -60,22 +61,27 @@ class Solution:
         """The present estimate of a pose."""
         return tuple(self._backend.solver.estimate([vertex])[0].tolist())
 
-    def T_map_odom(self, newest: Keyframe) -> Numbers:
+    @property
+    def _newest(self) -> Keyframe:
+        return self._backend.path.keyframes[-1]
+
+    @property
+    def T_map_odom(self) -> Numbers:
         """The correction of odometry's drift at the newest keyframe."""
-        group = self._space.group
+        group, newest = self._space.group, self._newest
         out: Numbers = group.compose(self.pose(newest.vertex), group.inverse(newest.T_odom_base))
         return out
 
-    def begin(self, newest: Keyframe, keyframes: int) -> None:
-        """Begin the map with a number of keyframes."""
-        self._T_map_odom, self._keyframes = self.T_map_odom(newest), keyframes
+    def begin(self) -> None:
+        """Begin the map with the present keyframes."""
+        self._T_map_odom, self._keyframes = self.T_map_odom, len(self._backend.path.keyframes)
 
-    def restore(self, report: Report, newest: Keyframe, keyframes: int) -> None:
+    def restore(self, report: Report) -> None:
         """Note that a loaded map was solved."""
         self.guard.note_good()
         self.report = report
         self.vertices, self._edges = self._backend.handed_over
-        self.begin(newest, keyframes)
+        self.begin()
 
     def go_back(self) -> None:
         """Use the last good estimate, which does not include all edges."""
@@ -91,28 +97,37 @@ class Solution:
         """Solve a graph of which a part has left."""
         self.guard.note_good()
         self.vertices, self._edges = self._backend.handed_over
-        self.guard.solve(self._backend.solver.update, self._keyframes - 1)
+        self.guard.solve(self._backend.solver.update)
 
-    def is_due(self, keyframes: int, every_keyframes: int) -> bool:
+    def is_due(self, every_keyframes: int) -> bool:
         """Return whether enough is unsolved."""
+        keyframes = len(self._backend.path.keyframes)
         return keyframes - min(self._keyframes, keyframes) + self.resting >= every_keyframes
 
-    def solve(self, work: Callable[[], tuple[Report | None, Array]], newest: Keyframe, keyframes: int) -> Array | None:
-        """Solve by calling ``work``; None if it fails. A failure is counted, and the last estimate stays.
+    def solve(self, work: Callable[[], Report | None]) -> Array | None:
+        """Solve by calling ``work``. Returns the covariance of the newest pose; None if it fails.
+
+        A failure is counted, and the last estimate stays.
 
         Parameters
         ----------
-        work : returns the report of a solve of everything, and the covariance of the newest pose, as this does
+        work : returns the report of a solve of everything
         """
-        self._keyframes, self.resting, self.vertices = keyframes, 0, 0
-        solved = self.guard.solve(lambda: (self._fits(), *work()), keyframes - 1)
+        self._keyframes, self.resting, self.vertices = len(self._backend.path.keyframes), 0, 0
+        solved = self.guard.solve(lambda: (self._fits(), work(), self._covariance()))
         if solved is None:
             return None
         fits, report, covariance = solved
         self.report = report or self.report
         self.solves += 1
         self.vertices, self._edges = self._backend.handed_over
-        self._note_correction(fits, newest)
+        self._note_correction(fits)
+        return covariance
+
+    def _covariance(self) -> Array:
+        (covariance,) = self._backend.solver.marginal([self._newest.vertex])
+        if not np.isfinite(covariance).all():
+            raise DivergedError("the covariance is not finite")
         return covariance
 
     def _fits(self) -> list[tuple[float, int]]:
@@ -123,10 +138,10 @@ class Solution:
         fit = chi2 / numbers
         return [(float(fit[k]), edges[k]) for k in np.argsort(-fit, kind="stable")[:_BLAMED].tolist()]
 
-    def _note_correction(self, fits: list[tuple[float, int]], newest: Keyframe) -> None:
+    def _note_correction(self, fits: list[tuple[float, int]]) -> None:
         """Note the difference to the pose by the previous solve and its odometry."""
-        group = self._space.group
-        before, self._T_map_odom = self._T_map_odom, self.T_map_odom(newest)
+        group, newest = self._space.group, self._newest
+        before, self._T_map_odom = self._T_map_odom, self.T_map_odom
         moved = group.between(group.compose(before, newest.T_odom_base), self.pose(newest.vertex))
         distance_m = math.hypot(*moved[: self._space.dimensions])
         chi2, edges = zip(*fits, strict=True) if fits else ((), ())

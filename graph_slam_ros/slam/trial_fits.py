@@ -10,15 +10,16 @@ moves the estimate, and the sigmas of all parameters add to it (S. F. Schmidt, "
 navigation problems", Advances in Control Systems 3, 1966: parameters that are considered, not estimated).
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
-from typing import TypeVar
+from collections.abc import Sequence
+from copy import deepcopy
+from functools import partial
 
 import numpy as np
 
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.slam.backend import Backend
+from graph_slam_ros.slam.background import Background, CancelToken, Work, guarded
 from graph_slam_ros.slam.calibration.answers import Finding, Uncorrected, decide, is_off, uncorrected
 from graph_slam_ros.slam.calibration.fit import TrialFit
 from graph_slam_ros.slam.calibration.model import stated_sigma_per_m
@@ -34,13 +35,11 @@ from graph_slam_ros.typing import Array, Executor, Index
 FIRST_DUE = 50  # keyframes
 _DIGITS = 12  # of an added variance: the last ones of a sine depend on the machine
 _DONE_IN = 20  # keyframes, in which a trial is done in the background: fewer than until anything is condensed
+_SOURCE = "calibration"  # of what is counted
 _MOST_POSES = 100  # whose covariances say whether what is not corrected matters
 
 Fits = tuple[TrialFit, TrialFit]
 """The fit whose findings are said, and the one that always has the places of all sensors."""
-
-Outcome = TypeVar("Outcome")
-Trial = Callable[[], "Fits | None"]
 
 
 class TrialFits:
@@ -64,68 +63,74 @@ class TrialFits:
     ) -> None:
         self._config, self._backend, self._frontend = config, backend, frontend
         self._landmarks, self._anonymous = landmarks.map, landmarks.anonymous
-        self._kidnaps, self._counters, self._executor = kidnaps, counters, executor
+        self._kidnaps, self._counters = kidnaps, counters
         self._graph, self._solver = backend.graph, backend.solver
         self._first_keyframe, self._first_edge = first_keyframe, backend.graph.edge_ids.next
         self._due = FIRST_DUE
-        self._jobs = list[tuple[int, Trial]]()  # each with the keyframe from which on its outcome counts
+        after = config.robust.apply_after_keyframes
+        self._background = Background[Fits | None](_SOURCE, executor, after, counters)
+        self._of_window = Background[Fits | None](_SOURCE, executor, _DONE_IN, counters)  # before anything is condensed
         self._fits: Fits | None = None
         self._contradicting: TrialFit | None = None
         self._so_far: tuple[Fits | None, list[Uncorrected]] = (None, [])  # what the newest outcome says
-        self._whole: Trial | None = None  # before anything is condensed
-        self._of_whole: list[Uncorrected] = []  # what it found
+        self._of_whole: list[Uncorrected] = []  # what the trial of the first window found
         self._of_edges = -1  # the map that the newest trial of everything was of
 
     # -- trials ------------------------------------------------------------------------------------------------------
 
-    def after_solve(self, keyframe: int, *, is_of_everything: bool) -> None:
+    def after_solve(self, *, is_of_everything: bool) -> None:
         """Start a trial if it is due, as it is where all that was measured was solved."""
+        keyframe = self._backend.keyframe
         driven = keyframe + 1 - self._first_keyframe
         if driven == self._config.map.window_keyframes and self._config.condenses:  # later it is of a part
-            self._whole = self._started()
-        if self._whole is not None and driven >= self._config.map.window_keyframes + _DONE_IN:
-            self._of_whole, self._whole = self._off(self._whole()), None
+            self._of_window.begin(self._frozen, driven)
+        if (found := self._of_window.due(driven)) is not None:
+            self._of_whole = self._off(found())
         if self._backend.holds_back or not (is_of_everything or driven >= self._due):
             return
         while not is_of_everything and driven >= self._due:
             self._due *= 2
-        counts_from = keyframe + (0 if is_of_everything else self._config.robust.apply_after_keyframes)
-        trial = self._started(is_thorough=is_of_everything)
-        if trial is not None:
-            if is_of_everything:
-                self._jobs, self._of_edges = [], self._graph.edge_ids.next
-            self._jobs = [*self._jobs[-1:], (counts_from, trial)]  # each holds a copy of the map
+        is_begun = self._background.begin(
+            partial(self._frozen, is_thorough=is_of_everything), keyframe, at_once=is_of_everything
+        )
+        if is_of_everything and is_begun:
+            self._of_edges = self._graph.edge_ids.next
 
-    def _started(self, *, is_thorough: bool = True) -> Trial | None:
-        """A trial of the map as it is now, in the background if possible."""
-        return self._guarded(lambda: self._executor(self._trial(is_thorough=is_thorough)))
+    def _frozen(self, *, is_thorough: bool = True) -> Work[Fits | None]:
+        """A trial of the map as it is now."""
+        problem = self.problem()
 
-    def _trial(self, *, is_thorough: bool = True) -> Trial:
-        problem = self._problem()
-
-        def run() -> Fits | None:
+        def run(_: CancelToken) -> Fits | None:
             priors = self._priors(problem)
             return fit_with_places(problem, priors, LOG_ODDS, is_thorough=is_thorough) if priors else None
 
-        return lambda: self._guarded(run)
+        return run
 
-    def _guarded(self, job: Callable[[], Outcome | None]) -> Outcome | None:
-        try:
-            return job()
-        except Exception as error:
-            self._counters.count_failure("calibration", error)
-            return None
-
-    def _problem(self) -> TrialProblem:
+    def problem(self) -> TrialProblem:
         """A copy of the map as it is now."""
         path, origins, factors = self._frontend.path, self._landmarks.origins, self._frontend.corrections.factors
-        problem = self._backend.trial_problem(self._config.space, path, origins, factors)
-        slips = self._kidnaps.slipped(path.keyframes)
-        return replace(problem, first_edge=max(problem.first_edge, self._first_edge), slips=slips)
+        graph, solver, out = self._graph.copy(), self._solver, self._backend.ledger.outside
+        graph.set_weights(out[graph.has_label(out, ("landmarks",))], 1.0)  # a fit has a loss for each sighting
+        rows, begins = path.keyframes, [max(k - path.keyframes.first, 0) for k in path.segments]
+        return TrialProblem(
+            space=self._config.space,
+            graph=graph,
+            vertices=solver.vertices,
+            held=solver.held,
+            values=solver.values,
+            settings=solver.settings,
+            origins=deepcopy(origins, {id(self._config.space): self._config.space}),
+            keyframes=rows.ids.copy(),
+            stamps_ns=rows.stamps_ns.copy(),
+            segments=tuple(dict.fromkeys(begins)),
+            track=path.samples.track(rows.poses, factors),
+            first_edge=max(self._backend.first_free_edge, self._first_edge),
+            slips=self._kidnaps.slipped(),
+        )
 
     def fit(self, groups: Sequence[str], *, places: bool, is_to_correct: bool) -> tuple[TrialFit, list[Finding]]:
         """Fit the map as it is now, as of ``GraphSlam.trial_fit``."""
-        problem = self._problem()
+        problem = self.problem()
         wanted = self._priors(problem, groups, has_gyro=is_to_correct)
         found = fit_with_places(problem, wanted, LOG_ODDS, has_places=places)[0]
         return found, self._judged(found, is_confirmed=is_to_correct and "factors" not in groups)
@@ -191,7 +196,8 @@ class TrialFits:
         """Return what is wrong in the map as it is now."""
         self._compute()
         is_newest = self._of_edges == self._graph.edge_ids.next
-        return self._with_whole(self._off(self._fits if is_newest else self._trial()()))
+        fits = self._fits if is_newest else guarded(self._counters, _SOURCE, lambda: self._frozen()(CancelToken()))
+        return self._with_whole(self._off(fits))
 
     def _with_whole(self, now: list[Uncorrected]) -> list[Uncorrected]:
         """Add what was found before anything was condensed, and the window that is left does not show."""
@@ -210,11 +216,10 @@ class TrialFits:
     def _compute(self) -> None:
         """Compute the newest trial whose outcome counts."""
         keyframe = len(self._frontend.path.keyframes) - 1
-        ready = [job for begins, job in self._jobs if begins <= keyframe]
-        if not ready:
+        ready = self._background.due(keyframe)
+        if ready is None:
             return
-        self._jobs = [one for one in self._jobs if one[0] > keyframe]
-        self._fits = ready[-1]()
+        self._fits = ready()
         self._contradicting = None
         if self._fits is not None:
             chosen, whole = self._fits

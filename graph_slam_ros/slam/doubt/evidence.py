@@ -50,20 +50,6 @@ class Hypothesis:
     log_odds: float = LOG_ODDS
 
 
-@dataclass(frozen=True, slots=True)
-class Moved:
-    """A place to which the robot may have been moved.
-
-    Attributes
-    ----------
-    first : vertex of the first keyframe there
-    pose_of : pose in map of such a keyframe, by its vertex
-    """
-
-    first: int
-    pose_of: Callable[[int], Numbers]
-
-
 def carried(first: int, there: Numbers, sigmas: Sequence[float], size: int) -> Hypothesis:
     """The hypothesis that the robot was moved somewhere across an edge of a stretch of a size."""
     variances = np.zeros((size, len(sigmas)))

@@ -14,19 +14,16 @@ from graph_slam_ros.config.config import Config
 from graph_slam_ros.graph import Gaussian
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.slam.backend import Backend
-from graph_slam_ros.slam.doubt.displacement import DisplacementSearch
-from graph_slam_ros.slam.doubt.displacements import Displacements
-from graph_slam_ros.slam.doubt.evidence import Moved
-from graph_slam_ros.slam.doubt.record import Alarm, Displacement, DisplacementHypothesis, Slip
+from graph_slam_ros.slam.doubt.displacement import SAME_M, SAME_RAD, DisplacementSearch
+from graph_slam_ros.slam.doubt.record import DOUBT, Alarm, Displacement, DisplacementHypothesis, Slip
 from graph_slam_ros.slam.doubt.slip_detector import SlipDetector
 from graph_slam_ros.slam.doubt.window import Window
-from graph_slam_ros.slam.frontend.keyframes import Keyframe
 from graph_slam_ros.slam.frontend.odometry_selector import JUMP_SIGMA_M, JUMP_SIGMA_RAD
-from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.slam.landmarks.anonymous import AnonymousLandmarks
+from graph_slam_ros.slam.revision import Replacement, Revision
 from graph_slam_ros.slam.robust.connections import moved_values
+from graph_slam_ros.slam.robust.ledger import Reason
 from graph_slam_ros.slam.snapshot import MapSnapshot
-from graph_slam_ros.solver import Report, Settings
 from graph_slam_ros.typing import Numbers
 
 _ALARM = 4  # sightings more for another pose than for odometry's
@@ -35,6 +32,7 @@ _DECIDED = 10
 _DECIDED_LANDMARKS, _DECIDED_KEYFRAMES = 3, 4  # two landmarks with headings tell as much as three without
 _TRIED = 5  # sightings that are compared with odometry's noise
 _MOST = 0.8  # part of the sightings since then that fit the other pose
+_DRIFT = 3.0  # sigmas of odometry since a displacement
 _CALM_S = 5.0  # after the decision the alarm goes on for so long at least
 
 
@@ -43,7 +41,6 @@ class KidnapDetector:
 
     Parameters
     ----------
-    segments : indices of the keyframes at which segments begin; one that begins in the past is appended
     anonymous : the association of landmarks without identities
 
     Attributes
@@ -57,19 +54,19 @@ class KidnapDetector:
         config: Config,
         backend: Backend,
         counters: Counters,
-        segments: list[int],
         anonymous: AnonymousLandmarks,
-        start: MapSnapshot | None = None,
+        start: MapSnapshot,
     ) -> None:
         self._space, self._backend, self._counters = config.space, backend, counters
-        self._segments, self._anonymous = segments, anonymous
+        self._path, self._anonymous, self._decides = backend.path, anonymous, config.robust.decide
         self.alarms: list[Alarm] = []
-        self.earlier: list[dict[str, Any]] = start.displacements if start else []
+        self.earlier: list[dict[str, Any]] = start.displacements
         self._window = Window(config.space, backend)
         self._search = DisplacementSearch(config.space, backend, self._window)
         self._slips = SlipDetector(config.space, config.odometry, backend, counters, self._window, anonymous.doubt)
         self._next = backend.graph.edge_ids.next
-        self._decided = Displacements(config.space, backend, self._search, counters, segments, self.alarms, anonymous)
+        self._decided: list[Displacement] = []  # since odometry's frame began
+        self._refuted: list[Numbers] = []  # where that frame does not lie: it was decided and taken back
         self._was_doubtful = False  # the association, when the present alarm began: it is no evidence then
 
     @property
@@ -84,7 +81,8 @@ class KidnapDetector:
         """
         graph = self._backend.graph
         self._window.forget_before(first)
-        self._decided.forget_before(first)
+        has = graph.edge_ids.has
+        self._decided = [one for one in self._decided if one.first > first and has(one.link) and has(one.replacement)]
         for edge in graph.edge_ids.since(self._next).tolist():
             if (one := graph.edge(edge)).label == "closures":
                 self._window.add_seen(edge, max(one.vertices), one.label, self._window.newest_ns)
@@ -109,26 +107,27 @@ class KidnapDetector:
         """A segment begins at a keyframe, by a jump or a given pose: sightings before tell nothing of where it is."""
         self._begin_anew(vertex, stamp_ns)
         self._decided.clear()
+        self._refuted.clear()
         self._anonymous.keep_displacements()
         if (now := self.now) is not None:
             outcome = "then a segment began" if now.segment is None else now.outcome
             self.alarms[-1] = replace(now, ended_ns=max(stamp_ns, now.began_ns), outcome=outcome)
             self._protect()
 
-    def add(self, end: int, stamp_ns: int, keyframes: StampedPoses[Keyframe]) -> None:
+    def add(self, end: int, stamp_ns: int) -> None:
         """Note the edges that are new, up to an id, in order, at the stamp of the newest odometry."""
         edges, self._next = range(self._next, end), end
         for edge in edges:
-            self._add(edge, stamp_ns, keyframes)
+            self._add(edge, stamp_ns)
 
-    def _add(self, edge: int, stamp_ns: int, keyframes: StampedPoses[Keyframe]) -> None:
+    def _add(self, edge: int, stamp_ns: int) -> None:
         one, window = self._backend.graph.edge(edge), self._window
-        vertices = one.vertices
+        vertices, keyframes = one.vertices, self._path.keyframes
         match one.label:
             case "odometry":
                 first, last = keyframes.stamps_ns[np.searchsorted(keyframes.ids, vertices)].tolist()
                 if (link := window.add_odometry(edge, vertices, (first, last))) is not None:
-                    self._slips.add_odometry(link, len(keyframes) - 1)
+                    self._slips.add_odometry(link)
             case "surveyed":
                 window.history.add_survey(vertices[0])
             case "landmarks":
@@ -139,55 +138,40 @@ class KidnapDetector:
             case "closures":
                 window.add_seen(edge, max(vertices), one.label, stamp_ns)
 
-    def check(self, keyframes: StampedPoses[Keyframe], stamp_ns: int) -> None:
+    def check(self, stamp_ns: int) -> None:
         """Look at the evidence after a solve.
 
         Parameters
         ----------
         stamp_ns : of the newest odometry
         """
-        vertices = keyframes.ids
+        newest = int(self._path.keyframes.ids[-1])
         self._window.note_solved()
-        if not self._backend.decides:
+        if not self._decides:
             return
-        if self._rejoin(keyframes, stamp_ns):
-            self._backend.decisions.reclassify(len(keyframes) - 1)
-        found = self._significant(int(vertices[-1]))
+        if self.rejoin(stamp_ns):
+            self._backend.decisions.reclassify(self._backend.keyframe)
+        found = self._significant(newest)
         found = found and self._search.begun_at(found, self._anonymous.elsewhere.fits_from)
         is_decided = found is not None and self._is_decided(found)
-        if self._slips.check(keyframes, stamp_ns, self._moved_to(found), is_decided=is_decided):
+        if self._slips.check(stamp_ns, found, is_decided=is_decided):
             is_decided = False
             found = found if self.slips_now is None else None  # too few landmarks say so yet: an alarm
         if found is not None and is_decided:
-            if (wrong := self._decided.refuted_by(found, int(vertices[-1]))) is not None:
-                self._revoke(wrong, found, len(keyframes) - 1, stamp_ns)
-                found = None
+            if (wrong := self._refuted_by(found, newest)) is not None:
+                found = found if not self._revoke(wrong, found, stamp_ns) else None
             elif not self._was_doubtful:
-                self._decide(found, keyframes, stamp_ns)
-                found = None
+                found = found if not self._decide(found, stamp_ns) else None
         self._note(found, stamp_ns)
         self._protect()
 
-    def optimize(self, keyframes: StampedPoses[Keyframe], settings: Settings) -> Report:
-        """Solve everything, and take back the slips that this contradicts."""
-        self._rejoin(keyframes, keyframes[-1].stamp_ns)
-        report = self._backend.optimize(len(keyframes) - 1, settings)
-        if self._slips.slips and self._slips.review(keyframes):
-            report = self._backend.optimize(len(keyframes) - 1, settings)
-        return report
+    def review(self) -> bool:
+        """Take back the slips that all measurements together contradict. Returns whether there were any."""
+        return self._slips.review()
 
-    def slipped(self, keyframes: StampedPoses[Keyframe]) -> tuple[tuple[tuple[int, int], ...], ...]:
+    def slipped(self) -> tuple[tuple[tuple[int, int], ...], ...]:
         """The edges of odometry of each slip, each with the one that replaces it."""
-        return self._slips.slipped(keyframes)
-
-    def _moved_to(self, found: DisplacementHypothesis | None) -> Moved | None:
-        """The place to which the robot was moved, if it was."""
-        if found is None:
-            return None
-        T_map_chain = found.T_map_chain
-        return Moved(
-            found.first, lambda vertex: self._space.group.compose(T_map_chain, self._window.links[vertex].pose)
-        )
+        return self._slips.slipped()
 
     def _protect(self) -> None:
         """Keep the map as it is while it is not decided; ranges or bearings fit a wrong pose by chance, too."""
@@ -200,7 +184,7 @@ class KidnapDetector:
         if self._search.held_back_count < _ALARM:
             return None
         found = self._search.hypothesis()
-        if found and self._decided.was_refuted(found, newest):
+        if found and not all(self._search.are_apart(one, found.T_map_chain, newest) for one in self._refuted):
             return None
         return found if found and self._is_doubtful(found) and self._is_beyond_noise(found) else None
 
@@ -243,8 +227,9 @@ class KidnapDetector:
         is_early = now.segment is not None and (stamp_ns - now.began_ns) * 1e-9 < _CALM_S
         return self._window.is_calm and not is_early
 
-    def _decide(self, found: DisplacementHypothesis, keyframes: StampedPoses[Keyframe], stamp_ns: int) -> None:
-        """Begin a segment where the landmarks say that the robot is."""
+    def _decide(self, found: DisplacementHypothesis, stamp_ns: int) -> bool:
+        """Begin a segment where the landmarks say that the robot is. Returns whether that can be solved."""
+        keyframes, segments = self._path.keyframes, self._path.segments
         index = keyframes.first + int(np.searchsorted(keyframes.ids, found.first))
         group, before = self._space.group, self._estimate(found.first)
         motions = self._motions(found)
@@ -253,18 +238,26 @@ class KidnapDetector:
         distance_m = float(np.linalg.norm(moved[: self._space.dimensions]))
         angle_rad = float(self._space.angle(moved))
         T_map_chain_before = group.compose(before, group.inverse(self._window.links[found.first].pose))
-        graph, (link, motion, noise) = self._backend.graph, self._replacement(found.first, there)
-        replacement = self._backend.split(
-            (link, motion, noise),
-            [edge for edge in graph.edges_of("initialpose").tolist() if graph.edge(edge).vertices[0] >= found.first],
-            moved_values(self._space, self._backend.solver, motions),
-            found,
-            len(keyframes) - 1,
+        graph = self._backend.graph
+        given = [e for e in graph.edges_of("initialpose").tolist() if graph.edge(e).vertices[0] >= found.first]
+        applied = self._backend.apply(
+            Revision(
+                DOUBT,
+                replaced=[self._replacement(found.first, there)],
+                values=moved_values(self._space, self._backend.solver, motions),
+                accepted=found.fitting,
+                rejected=(*found.contradicting, *given),
+                reason=Reason.DISPLACED,
+                evidence=found.evidence,
+            )
         )
+        if applied is None:
+            return False
+        ((link, replacement),) = applied.replaced
         self._counters.count("odometry", "displaced")
-        is_new = index not in self._segments  # where a pose was given, one begins already
+        is_new = index not in segments  # where a pose was given, one begins already
         if is_new:
-            self._segments.append(index)
+            segments.append(index)
         self._begin_anew(found.first, stamp_ns)
         self._anonymous.displaced(found.first)
         now, alarm = self.now, Alarm(stamp_ns, found.evidence, None, index, distance_m, angle_rad)
@@ -286,21 +279,65 @@ class KidnapDetector:
                 len(self.alarms) - 1,
             )
         )
+        return True
 
-    def _revoke(self, wrong: Displacement, found: DisplacementHypothesis, keyframe: int, stamp_ns: int) -> None:
+    def _refuted_by(self, found: DisplacementHypothesis, newest: int) -> Displacement | None:
+        """The last one if the robot is where it would be without it, but for odometry's drift since it began."""
+        if not self._decided:
+            return None
+        one, search = self._decided[-1], self._search
+        before_m, before_rad = search.difference(one.T_map_chain_before, found.T_map_chain, newest)
+        after_m, _ = search.difference(one.T_map_chain, found.T_map_chain, newest)
+        drift_m, drift_rad = self._window.drift_since(one.to_first.drift, one.to_first.pose, newest)
+        is_back = before_m < min(after_m, SAME_M + _DRIFT * drift_m) and before_rad < SAME_RAD + _DRIFT * drift_rad
+        return one if is_back else None
+
+    def _revoke(self, wrong: Displacement, found: DisplacementHypothesis, stamp_ns: int) -> bool:
         """Believe odometry again where the last segment begins: the landmarks show that it was right."""
-        self._decided.revoke(wrong, found, keyframe, stamp_ns)
+        group = self._space.group
+        back = group.compose(wrong.T_map_chain_before, group.inverse(wrong.T_map_chain))
+        revision = Revision(
+            DOUBT,
+            restored=((wrong.link, wrong.replacement),),
+            values=moved_values(self._space, self._backend.solver, {wrong.first: back}),
+            is_judged_anew=True,
+            accepted=found.fitting,
+            rejected=found.contradicting,
+            evidence=found.evidence,
+        )
+        if self._backend.apply(revision) is None:
+            return False
+        self._note_taken_back(wrong, "taken back: later sightings contradict it", stamp_ns)
         self._begin_anew(found.first, stamp_ns)
         if self.now is not None:
             self.alarms[-1] = replace(self.now, ended_ns=stamp_ns, outcome="the displacement before is taken back")
-
-    def _rejoin(self, keyframes: StampedPoses[Keyframe], stamp_ns: int) -> bool:
-        """Believe odometry again where the explanation of all scans has no displacement. Returns whether it has one."""
-        firsts = self._anonymous.pop_rejoined()
-        if not firsts or not self._decided.rejoin(firsts, len(keyframes) - 1, stamp_ns):
-            return False
-        self._begin_anew(keyframes[-1].vertex, stamp_ns)
         return True
+
+    def rejoin(self, stamp_ns: int) -> bool:
+        """Believe odometry again where the explanation of all scans has no displacement. Returns whether it has one.
+
+        The estimate is as without them already.
+        """
+        firsts = self._anonymous.pop_rejoined()
+        wrong = [one for one in self._decided if one.first in firsts]
+        pairs = [(one.link, one.replacement) for one in wrong]
+        if not wrong or self._backend.apply(Revision(DOUBT, restored=pairs, solves="nothing")) is None:
+            return False
+        for one in wrong:
+            self._note_taken_back(one, "taken back: without it all sightings are explained better", stamp_ns)
+        self._begin_anew(self._path.keyframes[-1].vertex, stamp_ns)
+        return True
+
+    def _note_taken_back(self, one: Displacement, outcome: str, stamp_ns: int) -> None:
+        self._counters.count("odometry", "displacement_taken_back")
+        if one.index is not None:
+            self._path.segments.remove(one.index)
+        alarm = self.alarms[one.alarm]
+        self.alarms[one.alarm] = replace(alarm, ended_ns=alarm.ended_ns or stamp_ns, outcome=outcome)
+        self._decided.remove(one)
+        one.to_first.edge = one.link
+        self._refuted.append(one.T_map_chain)
+        self._anonymous.rejoined(one.first)
 
     def _begin_anew(self, vertex: int, stamp_ns: int) -> None:
         """Compare no sighting from before a keyframe, by its vertex, with where the robot is."""
@@ -311,12 +348,12 @@ class KidnapDetector:
     def _estimate(self, vertex: int) -> Numbers:
         return tuple(self._backend.solver.estimate([vertex])[0].tolist())
 
-    def _replacement(self, first: int, there: Numbers) -> tuple[int, Numbers, Gaussian]:
+    def _replacement(self, first: int, there: Numbers) -> Replacement:
         """Odometry's edge to a keyframe, the motion that the landmarks show instead, and next to no trust in it."""
         link = self._window.links[first].edge
         before = self._estimate(self._backend.graph.edge(link).vertices[0])
         motion = tuple(map(float, self._space.group.between(before, there)))
-        return link, motion, Gaussian.from_sigmas(*self._space.sigmas(JUMP_SIGMA_M, JUMP_SIGMA_RAD))
+        return Replacement(link, motion, Gaussian.from_sigmas(*self._space.sigmas(JUMP_SIGMA_M, JUMP_SIGMA_RAD)))
 
     def _motions(self, found: DisplacementHypothesis) -> dict[int, Numbers]:
         """Return how each keyframe from the first displaced one on is moved in map, by its vertex.

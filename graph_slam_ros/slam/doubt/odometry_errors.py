@@ -14,8 +14,6 @@ from graph_slam_ros.graph import Graph
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.doubt.evidence import covariance_of
-from graph_slam_ros.slam.frontend.keyframes import Keyframe
-from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.solver.linearization import linearized
 from graph_slam_ros.typing import Array
@@ -92,14 +90,15 @@ class MeasuredNoise:
         self._measured_at = -_EVERY
         self.of_odometry, self.of_all = np.ones(space.dof), _UNKNOWN
 
-    def measure(self, keyframes: StampedPoses[Keyframe]) -> None:
+    def measure(self) -> None:
         """Measure it, if there are many keyframes more than last time."""
-        if len(keyframes) - self._measured_at < max(_EVERY, _MORE * self._measured_at):
+        keyframes = self._backend.keyframe + 1
+        if keyframes - self._measured_at < max(_EVERY, _MORE * self._measured_at):
             return
-        self._measured_at, n = len(keyframes), self._space.dimensions
+        self._measured_at, n = keyframes, self._space.dimensions
         parts = {"position": slice(n), "rotation": slice(n, None)}
         of_odometry, others = np.ones(self._space.dof), list[float]()
-        for one in self._backend.noise_scale(keyframes, ("odometry", "landmarks")):
+        for one in self._backend.noise_scale(("odometry", "landmarks")):
             if one.label == "odometry" and one.dof > 0.0:
                 variance = (one.per_dof * one.dof + _PRIOR_DOF) / (one.dof + _PRIOR_DOF)
                 factor = float(np.sqrt(np.clip(variance, 1.0, _LARGEST**2)))

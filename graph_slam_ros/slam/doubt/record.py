@@ -6,6 +6,9 @@ import numpy as np
 
 from graph_slam_ros.typing import Array, Numbers
 
+DOUBT = "odometry"
+"""The source that changes of the past for odometry's sake are counted under where they fail."""
+
 
 @dataclass(frozen=True, slots=True)
 class Alarm:

@@ -28,17 +28,15 @@ from graph_slam_ros.slam.doubt.evidence import (
     SLIPS,
     Choice,
     Hypothesis,
-    Moved,
     Stretch,
     carried,
     covariance_of,
 )
 from graph_slam_ros.slam.doubt.odometry_errors import NOISE_FACTOR, MeasuredNoise, OdometryErrors, between
-from graph_slam_ros.slam.doubt.record import Link, Slip
+from graph_slam_ros.slam.doubt.record import DOUBT, DisplacementHypothesis, Link, Slip
 from graph_slam_ros.slam.doubt.window import View, Window
-from graph_slam_ros.slam.frontend.keyframes import Keyframe
 from graph_slam_ros.slam.frontend.odometry_selector import JUMP_SIGMA_M, JUMP_SIGMA_RAD
-from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
+from graph_slam_ros.slam.revision import Replacement, Revision
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array
@@ -53,6 +51,7 @@ _BURST = 20.0
 _SLIP_M_S, _SLIP_RAD_S = 0.35, 0.35  # sigmas of what odometry does not notice: some of an indoor robot's speeds
 _LASTS_S = 0.5  # correlation time of the errors of a slip
 _LONGEST_S = 1.0  # of one edge; wheels that stand longer do not slip: the robot was carried
+_THRESHOLD = -2.0 * LOG_ODDS  # that the evidence of a slip is compared with
 _OTHERS = 1.0 / 3.0  # sigma along the other axes, relative to the first
 
 Pair = tuple[int, int]
@@ -89,6 +88,7 @@ class SlipDetector:
         self._allowed = _BURST
         self._noise = MeasuredNoise(space, backend)
         self.slips: list[Slip] = []
+        self._replaced = dict[int, tuple[int, int]]()  # of edges of odometry: by which slip, and the one in its place
 
     @property
     def now(self) -> Slip | None:
@@ -101,14 +101,13 @@ class SlipDetector:
             self.slips[-1] = replace(now, ended_ns=max(stamp_ns, now.began_ns))
             self._doubt(stamp_ns, None)
 
-    def add_odometry(self, link: Link, keyframe: int) -> None:
+    def add_odometry(self, link: Link) -> None:
         """Take over odometry to a new keyframe. During a slip it gets more noise."""
         if (now := self.now) is not None:
-            self._replace([link], now, keyframe)
+            wider = self._wider_edges([link], now)
+            self._note_replaced([link], now, self._backend.replace(wider, Reason.SLIP, now.evidence, _THRESHOLD))
 
-    def check(
-        self, keyframes: StampedPoses[Keyframe], stamp_ns: int, moved: Moved | None = None, *, is_decided: bool = False
-    ) -> bool:
+    def check(self, stamp_ns: int, moved: DisplacementHypothesis | None = None, *, is_decided: bool = False) -> bool:
         """Examine the evidence after a solve. Returns whether a slip explains it better than that the robot was moved.
 
         Such a slip begins if it is sure.
@@ -128,31 +127,29 @@ class SlipDetector:
         try:
             if self.now is None and (is_decided or (is_new and self._allowed >= 1.0 and self._window.is_alarmed)):
                 self._allowed = max(0.0, self._allowed - 1.0)
-                choice = self._compare(links, views, moved, keyframes)
+                choice = self._compare(links, views, moved)
                 if choice.is_slip:
-                    self._begin_slip(choice, links[choice.first :], len(keyframes) - 1, stamp_ns)
+                    self._begin_slip(choice, links[choice.first :], stamp_ns)
                 return choice.kind in SLIPS
             if self.now is None or not is_new:
                 return False
-            explains = is_decided and self._compare(links, views, moved, keyframes).kind != CARRIED
-            self._update_slip(self.now, links, views, len(keyframes) - 1, stamp_ns)
+            explains = is_decided and self._compare(links, views, moved).kind != CARRIED
+            self._update_slip(self.now, links, views, stamp_ns)
             return explains
         except (GraphSlamError, np.linalg.LinAlgError):  # nothing can be compared: odometry counts as before
             return False
 
     # -- evidence --------------------------------------------------------------------------------------------------
 
-    def _compare(
-        self, links: Sequence[Link], views: Sequence[View], moved: Moved | None, keyframes: StampedPoses[Keyframe]
-    ) -> Choice:
+    def _compare(self, links: Sequence[Link], views: Sequence[View], moved: DisplacementHypothesis | None) -> Choice:
         """Compare the hypotheses: odometry's noise, a slip from each view on, and that the robot was moved."""
-        self._noise.measure(keyframes)
+        self._noise.measure()
         stretch = self._stretch([link.edge for link in links], self._measured_from(links, views))
         firsts = sorted({_first_of(links, views[-since - 1]) for since in _SINCE if since < len(views)})
         every = [Hypothesis(kind, k, self._added(kind, links, k, len(links))) for kind in SLIPS for k in firsts]
         if moved is not None:
             k = next((k for k, link in enumerate(links) if link.vertices[1] >= moved.first), len(links) - 1)
-            there = moved.pose_of(links[k].vertices[1])
+            there = self._space.group.compose(moved.T_map_chain, links[k].pose)
             every.append(carried(k, there, self._space.sigmas(JUMP_SIGMA_M, JUMP_SIGMA_RAD), len(links)))
         return stretch.choice(every)
 
@@ -216,21 +213,20 @@ class SlipDetector:
 
     # -- a slip ------------------------------------------------------------------------------------------------------
 
-    def _begin_slip(self, choice: Choice, links: Sequence[Link], keyframe: int, stamp_ns: int) -> None:
+    def _begin_slip(self, choice: Choice, links: Sequence[Link], stamp_ns: int) -> None:
         began_ns, vertex, ledger = links[0].stamps_ns[0], links[0].vertices[0], self._backend.ledger
         slip = Slip(choice.kind, began_ns, stamp_ns, 2.0 * choice.log_ratio, choice.voters)
-        self.slips.append(slip)
-        self._counters.count("odometry", "slip")
-        self._replace(links, slip, keyframe)
         # what was held back since then is judged again, with the wider noise of odometry
         edges = [one.edge for view in list(self._window.views)[-_VIEWS:] if view.vertex >= vertex for one in view.seen]
-        end = ledger.ids.next
-        self._backend.admit([edge for edge in edges if edge < end and not ledger.is_withdrawn(edge)], keyframe)
+        compared = [edge for edge in edges if edge < ledger.ids.next and not ledger.is_withdrawn(edge)]
+        self.slips.append(slip)
+        if not self._replace(links, slip, compared):
+            self.slips.pop()
+            return
+        self._counters.count("odometry", "slip")
         self._doubt(began_ns, partial(_variances, self._space, slip.kind))
 
-    def _update_slip(
-        self, now: Slip, links: Sequence[Link], views: Sequence[View], keyframe: int, stamp_ns: int
-    ) -> None:
+    def _update_slip(self, now: Slip, links: Sequence[Link], views: Sequence[View], stamp_ns: int) -> None:
         """Move the start of a slip to an earlier keyframe, or end it."""
         begin = next((k for k, link in enumerate(links) if link.edge != link.own), None)
         if begin is None:
@@ -242,20 +238,20 @@ class SlipDetector:
             if count <= begin and (gain := errors.log_ratio(self._wider(now.kind, links, begin - count, begin))) > best:
                 best, first = gain, begin - count
         if first < begin:
-            self._replace(links[first:begin], replace(now, began_ns=links[first].stamps_ns[0]), keyframe)
-            self._backend.solver.update()
+            self._replace(links[first:begin], replace(now, began_ns=links[first].stamps_ns[0]))
             return
         narrower = between(graph, own, used)
         firsts = sorted({_first_of(links, views[-since - 1]) for since in _AGAIN if since < len(views)})
         is_since = [(np.arange(len(links)) >= first)[:, None, None] for first in firsts]
         gains = [errors.log_ratio(narrower * of_each) for of_each in is_since]
         if gains and max(gains) > 0.0:
-            self._end(now, links[firsts[int(np.argmax(gains))] :], max(gains), keyframe, stamp_ns)
+            self._end(now, links[firsts[int(np.argmax(gains))] :], max(gains), stamp_ns)
 
-    def _end(self, now: Slip, links: Sequence[Link], gain: float, keyframe: int, stamp_ns: int) -> None:
+    def _end(self, now: Slip, links: Sequence[Link], gain: float, stamp_ns: int) -> None:
         """Use odometry with its own noise again, for these links."""
         pairs = [(link.own, link.edge) for link in links if link.edge != link.own]
-        self._restore(pairs, keyframe, gain)
+        if not self._restore(pairs, gain):
+            return
         left = now.edges - len(pairs)
         if not left:
             self._counters.count("odometry", "slip_taken_back")
@@ -263,20 +259,19 @@ class SlipDetector:
         self.slips[-1] = replace(now, edges=left, ended_ns=stamp_ns, outcome=outcome)
         self._doubt(stamp_ns, None)
 
-    def slipped(self, keyframes: StampedPoses[Keyframe]) -> tuple[tuple[Pair, ...], ...]:
+    def slipped(self) -> tuple[tuple[Pair, ...], ...]:
         """The edges of odometry of each slip that is not taken back, each with the one that replaces it."""
-        every = [self._slipped(keyframes, one) for one in self.slips]
+        every = map(self._slipped, range(len(self.slips)))
         return tuple(tuple(pairs) for pairs in every if pairs)
 
-    def review(self, keyframes: StampedPoses[Keyframe]) -> bool:
+    def review(self) -> bool:
         """Take back the slips that all measurements together contradict. Returns whether there were any."""
         changed = False
         for k, slip in enumerate(self.slips):
-            pairs = self._slipped(keyframes, slip) if slip.ended_ns else []
+            pairs = self._slipped(k) if slip.ended_ns else []
             gain = self._gain_without(pairs) if pairs else 0.0
-            if gain > 0.0:
+            if gain > 0.0 and self._restore(pairs, gain):
                 changed = True
-                self._restore(pairs, len(keyframes) - 1, gain)
                 self._counters.count("odometry", "slip_taken_back")
                 outcome = "taken back: all measurements together agree with odometry"
                 self.slips[k] = replace(slip, edges=max(0, slip.edges - len(pairs)), outcome=outcome)
@@ -294,51 +289,53 @@ class SlipDetector:
         except (GraphSlamError, np.linalg.LinAlgError):
             return 0.0
 
-    def _slipped(self, keyframes: StampedPoses[Keyframe], slip: Slip) -> list[Pair]:
-        """Odometry edges of a stretch that count as slip, each with its replacement, in order of time."""
-        graph, ledger = self._backend.graph, self._backend.ledger
-        edges = [edge for edge in graph.edges_of("odometry").tolist() if edge < ledger.ids.next]
-        used, out = dict[tuple[int, ...], int](), list[tuple[int, Pair]]()
-        for edge in edges:
-            if ledger.verdict_of(edge) is not Verdict.REJECTED:
-                used[tuple(graph.edge(edge).vertices)] = edge
-        for edge in edges:
-            ends = tuple(graph.edge(edge).vertices)
-            if edge < self._backend.first_free_edge or ends not in used:
-                continue
-            stamp_ns = int(keyframes.stamps_ns[np.searchsorted(keyframes.ids, ends[0])])
-            is_inside = slip.began_ns <= stamp_ns and (slip.ended_ns is None or stamp_ns < slip.ended_ns)
-            if is_inside and ledger.is_withdrawn(edge) and ledger.reason.values[ledger.ids.row(edge)] == Reason.SLIP:
-                out.append((ends[0], (edge, used[ends])))
-        return [pair for _, pair in sorted(out)]
+    def _slipped(self, k: int) -> list[Pair]:
+        """Odometry edges of a slip, by its place, that count as such, each with its replacement, in order of time."""
+        ids, ledger = self._backend.graph.edge_ids, self._backend.ledger
+        pairs = [(own, used) for own, (slip, used) in sorted(self._replaced.items()) if slip == k]
+        there = [(own, used) for own, used in pairs if ids.has(own) and ids.has(used)]
+        is_slip = ledger.reason.values == Reason.SLIP
+        return [
+            (own, used)
+            for own, used in there
+            if is_slip[ledger.ids.row(own)] and ledger.verdict_of(used) is not Verdict.REJECTED
+        ]
 
     # -- the graph: the ledger has both edges ------------------------------------------------------------------------
 
-    def _replace(self, links: Sequence[Link], slip: Slip, keyframe: int) -> None:
-        """Replace odometry edges by edges with more noise."""
-        backend, threshold = self._backend, -2.0 * LOG_ODDS
+    def _replace(self, links: Sequence[Link], slip: Slip, compared: Sequence[int] = ()) -> bool:
+        """Put edges with more noise in place of odometry's, and solve. Returns whether that was possible."""
+        replaced, evidence = self._wider_edges(links, slip), slip.evidence
+        revision = Revision(
+            DOUBT, replaced=replaced, compared=compared, reason=Reason.SLIP, evidence=evidence, threshold=_THRESHOLD
+        )
+        if (applied := self._backend.apply(revision)) is not None:
+            self._note_replaced(links, slip, applied.replaced)
+        return applied is not None
+
+    def _wider_edges(self, links: Sequence[Link], slip: Slip) -> list[Replacement]:
+        out = []
         for link in links:
-            old, added = backend.graph.edge(link.own), _variances(self._space, slip.kind, np.array(link.seconds))
-            noise = Gaussian.from_covariance(covariance_of(old) + np.diag(added))
-            link.edge = backend.graph.add_edge(old.type, old.vertices, old.measured, noise, "odometry", old.source)
-        backend.gate_new(keyframe)
-        for link in links:
-            backend.decisions.decide(link.own, keyframe, Verdict.REJECTED, Reason.SLIP, slip.evidence, threshold)
-            backend.ledger.threshold.values[backend.ledger.ids.row(link.own)] = threshold
-        backend.cancel_search()
+            own, added = self._backend.graph.edge(link.own), _variances(self._space, slip.kind, np.array(link.seconds))
+            noise = Gaussian.from_covariance(covariance_of(own) + np.diag(added))
+            out.append(Replacement(link.own, own.measured, noise))
+        return out
+
+    def _note_replaced(self, links: Sequence[Link], slip: Slip, pairs: Iterable[Pair]) -> None:
+        for link, (own, used) in zip(links, pairs, strict=True):
+            link.edge = used
+            self._replaced[own] = len(self.slips) - 1, used
         self.slips[-1] = replace(slip, edges=slip.edges + len(links))
 
-    def _restore(self, pairs: Iterable[Pair], keyframe: int, gain: float) -> None:
-        backend, links = self._backend, {link.own: link for link in self._window.links.values()}
-        for own, replacement in pairs:
-            backend.decisions.withdraw([replacement], keyframe, Reason.REVOKED)
-            ledger = backend.ledger
-            ledger.threshold.values[ledger.ids.row(own)] = ledger.threshold.values[ledger.ids.row(replacement)]
-            backend.decisions.decide(own, keyframe, Verdict.NOT_EVALUATED, Reason.NONE, -2.0 * gain)
+    def _restore(self, pairs: Sequence[Pair], gain: float) -> bool:
+        """Use odometry's own edges again. Returns whether that could be solved."""
+        if self._backend.apply(Revision(DOUBT, restored=pairs, evidence=-2.0 * gain)) is None:
+            return False
+        links = {link.own: link for link in self._window.links.values()}
+        for own, _ in pairs:
             if own in links:
                 links[own].edge = own
-        backend.cancel_search()
-        backend.solver.update()
+        return True
 
 
 def _first_of(links: Sequence[Link], view: View) -> int:

@@ -70,6 +70,7 @@ class KeyframeFrontend:
     def __init__(
         self,
         config: Config,
+        path: KeyframeList,
         edges: NoiseScales,
         counters: Counters,
         solver: Solver,
@@ -79,7 +80,7 @@ class KeyframeFrontend:
         self._edges, self._graph, self._counters = edges, edges.graph, counters
         self._noise = OdometryNoise(config.odometry, self._space)
         self.odometry = OdometrySelector(config.odometry, config.inputs.names.split(), self._space, counters)
-        self.path = KeyframeList(self._noise, self._space)
+        self.path = path
         self.sighting_poses = StampedPoses(SightingPose, self._space.pose.size)
         self.corrections = Corrections(config)
         self.order = StampOrder(config.ordering, counters, self.corrections.lag_ns)

@@ -16,11 +16,11 @@ from graph_slam_ros.config.config import Config
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.types import Sightings
-from graph_slam_ros.slam.frontend.keyframes import Keyframe
+from graph_slam_ros.slam.backend import Backend
+from graph_slam_ros.slam.background import guarded
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
 from graph_slam_ros.slam.frontend.odometry_integration import OdometryNoise
 from graph_slam_ros.slam.frontend.odometry_selector import Step
-from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.slam.landmarks.assignments import Assigned, Assignments
 from graph_slam_ros.slam.landmarks.beam import NOTHING, Beam, BeamSettings, Decision, changes
 from graph_slam_ros.slam.landmarks.belief import SolverBelief
@@ -31,7 +31,7 @@ from graph_slam_ros.slam.landmarks.landmark_map import Landmarks
 from graph_slam_ros.slam.landmarks.renumbered import first_of_later
 from graph_slam_ros.slam.landmarks.scan_history import ScanHistory
 from graph_slam_ros.slam.landmarks.scans import SCAN_NS, DeadReckoning, Motion, Scan, ScanBuilder
-from graph_slam_ros.solver import Solver
+from graph_slam_ros.slam.revision import Revision
 from graph_slam_ros.typing import Array, Executor
 
 _GATE_SAME = 0.9999  # probability of the chi2 test within which an observation may belong to a landmark
@@ -44,7 +44,6 @@ class AnonymousLandmarks:
 
     Parameters
     ----------
-    hand_over : gives the solver what is new in the graph, so that its covariances are of all of it
     executor : begins work in the background
 
     Attributes
@@ -58,15 +57,14 @@ class AnonymousLandmarks:
         self,
         config: Config,
         landmarks: Landmarks,
-        solver: Solver,
+        backend: Backend,
         counters: Counters,
-        hand_over: Callable[[], None],
         executor: Executor,
     ) -> None:
         c, space = config.landmarks, config.space
         self._space = space
-        self._landmarks, self._solver, self._counters = landmarks, solver, counters
-        self._hand_over = hand_over
+        self._landmarks, self._backend, self._counters = landmarks, backend, counters
+        self._solver = backend.solver
         self._noise = OdometryNoise(config.odometry, space)
         self._reckoning = DeadReckoning(space, config.ordering.late_s + 2.0)
         self._history = ScanHistory(space, config.odometry, self._reckoning)
@@ -76,9 +74,9 @@ class AnonymousLandmarks:
             space.dimensions * float(np.log(c.density_per_m)),
             hypotheses=40,
         )
-        self._belief = SolverBelief(space, solver, landmarks)
-        self.hindsight = Hindsight(config, self._settings, executor)
-        self.clusters = Assignments(landmarks, counters, hand_over)
+        self._belief = SolverBelief(space, backend.solver, landmarks)
+        self.hindsight = Hindsight(config, self._settings, executor, counters)
+        self.clusters = Assignments(landmarks, counters, backend)
         self._beam: Beam | None = None
         self._sorts = dict[int, str]()  # of landmarks, whatever beam began them
         self._leader: Decision | None = None
@@ -154,7 +152,7 @@ class AnonymousLandmarks:
 
     def _explained(self, scan: Scan, first: int, motion: Motion | None) -> Decision | None:
         """Explain the scan after a motion. Returns the leader's last decision."""
-        self._hand_over()
+        self._backend.hand_over()
         beam, names = self._beam, self.clusters.names
         if beam is None or motion is None or motion.is_broken:
             scales, sigma = self.hindsight.scales
@@ -285,38 +283,34 @@ class AnonymousLandmarks:
 
     # -- afterwards --------------------------------------------------------------------------------------------------
 
-    def review(self, keyframes: StampedPoses[Keyframe]) -> None:
-        """Use the result of the background search, start the next one, and accept or remove landmarks."""
+    def review(self, *, everything: bool) -> None:
+        """Accept and remove landmarks, and explain all scans anew: at once, or in the background if that is due."""
+        if everything:
+            self._explain_all()
+            return
         if not self._landmarks.begins_new:
             self.clusters.finish()
             return
+        keyframes = self._backend.path.keyframes
         count = len(keyframes)
         if self._displaced is not None:  # it is solved now
             self._explain_from(self._displaced)
             self._displaced = None
         self._propose()
-        self._adopt(self._guarded(lambda: self.hindsight.outcome(count)), keyframes)
+        self._adopt(self.hindsight.outcome(count))
         if self.hindsight.is_due(len(self._history.scans)):
-            self._guarded(lambda: self.hindsight.start(self._frozen(), count))
+            self.hindsight.start(self._frozen, count)
         if count % _REVIEWED_EVERY == 0:
             self.clusters.judge(keyframes[-1].stamp_ns)
 
-    def explain_all(self, keyframes: StampedPoses[Keyframe]) -> None:
-        """Explain all scans at once, now."""
+    def _explain_all(self) -> None:
         if self._landmarks.begins_new and self._history.scans:
-            self._adopt(self._guarded(lambda: self.hindsight.found(self._frozen)), keyframes)
-            self.clusters.judge(keyframes[-1].stamp_ns)
-
-    def _guarded(self, search: Callable[[], Found | None]) -> Found | None:
-        """The outcome of a search; None if it failed, which changes nothing."""
-        try:
-            return search()
-        except Exception as error:
-            self._counters.count_failure("second_look", error)
-            return None
+            found = guarded(self._counters, "second_look", lambda: self.hindsight.found(self._frozen))
+            self._adopt(found)
+            self.clusters.judge(self._backend.path.keyframes[-1].stamp_ns)
 
     def _frozen(self) -> FrozenScans:
-        self._hand_over()
+        self._backend.hand_over()
         group, scans = self._space.group, self._history.scans
         moved = np.array([scan.where.T_keyframe_base for scan in scans])
         at = self._solver.estimate([scan.where.vertex for scan in scans])
@@ -333,7 +327,7 @@ class AnonymousLandmarks:
             frozen = replace(frozen, displaced=history.displacements, undisplaced=history.undisplaced())
         return frozen.after_map(self._belief, self.clusters.final)
 
-    def _adopt(self, found: Found | None, keyframes: StampedPoses[Keyframe]) -> None:
+    def _adopt(self, found: Found | None) -> None:
         """Use an explanation of all scans up to one."""
         if found is None:
             return
@@ -343,19 +337,12 @@ class AnonymousLandmarks:
             self._counters.count("landmarks", "moves_left")
         self._rejoined |= found.rejoined
         numbers = found.numbers(self.clusters.given, self.clusters.fresh)
-        values = found.carried_to(self._space, self._solver, keyframes)
+        values = found.carried_to(self._space, self._solver, self._backend.path.keyframes)
         changed, gone = found.changes(self.clusters.given, numbers)
         self._same = {k: gone.get(one, one) for k, one in (gone | self._same).items()}
         if self.clusters.give(changed):
-            places = dict(zip(numbers.tolist(), found.estimate.landmarks.tolist(), strict=True))
-            self._solver.start_at(self._landmarks.placed(self._with_new(values), self._named(places)))
-            self._solver.optimize()
+            names, places = self.clusters.names, zip(numbers.tolist(), found.estimate.landmarks.tolist(), strict=True)
+            with_new = np.concatenate([values, self._solver.values[len(values) :]])
+            values = self._landmarks.placed(with_new, {names[k]: place for k, place in places if k in names})
+            self._backend.apply(Revision("second_look", values=values, solves="all"))
         self.hindsight.note(self.clusters.given)
-
-    def _with_new(self, values: Array) -> Array:
-        """Stored numbers, extended by those of vertices that were added since."""
-        return np.concatenate([values, self._solver.values[len(values) :]])
-
-    def _named(self, places: dict[int, list[float]]) -> dict[str, list[float]]:
-        names = self.clusters.names
-        return {names[number]: place for number, place in places.items() if number in names}

@@ -1,7 +1,7 @@
 """The landmark of each cluster in the graph. It is assigned at once, and changed when another one fits better."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -10,6 +10,7 @@ import numpy as np
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.types import Sighting
+from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
 from graph_slam_ros.slam.landmarks.beam import NOTHING
 from graph_slam_ros.slam.landmarks.landmark import Landmark
@@ -48,7 +49,7 @@ class Assignments:
 
     Parameters
     ----------
-    hand_over : gives the solver what is new in the graph
+    backend : is told what is new in the graph
 
     Attributes
     ----------
@@ -58,8 +59,8 @@ class Assignments:
     before : of landmarks by number how many clusters there were that have left
     """
 
-    def __init__(self, landmarks: Landmarks, counters: Counters, hand_over: Callable[[], None]) -> None:
-        self._landmarks, self._counters, self._hand_over = landmarks, counters, hand_over
+    def __init__(self, landmarks: Landmarks, counters: Counters, backend: Backend) -> None:
+        self._landmarks, self._counters, self._backend = landmarks, counters, backend
         self.given: list[int] = []
         self.names: dict[int, str] = {}
         self.seen: list[tuple[Seen, ...]] = []
@@ -146,7 +147,7 @@ class Assignments:
             self._add(cluster)
         if changed:
             self._counters.count("landmarks", "reassigned", len(changed))
-            self._hand_over()
+            self._backend.hand_over()
         return bool(changed)
 
     def _add(self, cluster: int) -> None:

@@ -13,6 +13,8 @@ import numpy as np
 from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.graph.geometry import Geometry
+from graph_slam_ros.measurements.counters import Counters
+from graph_slam_ros.slam.background import Background, Work
 from graph_slam_ros.slam.frontend.keyframes import Keyframe
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.slam.landmarks.beam import NOTHING, BeamSettings, Ids
@@ -200,14 +202,14 @@ class Hindsight:
     newest : the explanation that was found last
     """
 
-    def __init__(self, config: Config, settings: BeamSettings, executor: Executor) -> None:
-        self._space, self._settings, self._executor = config.space, settings, executor
+    def __init__(self, config: Config, settings: BeamSettings, executor: Executor, counters: Counters) -> None:
+        self._space, self._settings = config.space, settings
         unused = quantile(_GATE_OTHER, config.space.dimensions)
         self._costs = Costs(max(-2.0 * settings.log_new, _LEAST_LANDMARK), unused, _AMBIGUITY_CHI2)
-        self._after = config.robust.apply_after_keyframes
+        after = config.robust.apply_after_keyframes
+        self._background = Background[Found | None]("second_look", executor, after, counters)
         self._next = _FIRST
         self._explained = 0  # scans of the last explanation that was begun
-        self._job: tuple[int, Callable[[], Found | None]] | None = None
         self._last: Ids | None = None
         self.is_on = True
         self.scales: tuple[Array, float] = np.zeros(2), settings.scale_sigma
@@ -216,18 +218,23 @@ class Hindsight:
 
     def is_due(self, scans: int) -> bool:
         """Return whether an explanation is due at this number of scans."""
-        return self.is_on and self._job is None and scans >= self._next
+        return self.is_on and not self._background.is_busy and scans >= self._next
 
-    def start(self, frozen: FrozenScans, keyframes: int) -> None:
+    def start(self, freeze: Callable[[], FrozenScans], keyframes: int) -> None:
         """Start with the present scans."""
-        self._next, self._explained = round(_MORE * frozen.count), frozen.count
-        work = self._executor(lambda: explained(self._space, frozen, self._settings, self._costs))
-        self._job = keyframes + self._after, work
+
+        def begun() -> Work[Found | None]:
+            frozen = freeze()
+            self._next, self._explained = round(_MORE * frozen.count), frozen.count
+            return lambda _: explained(self._space, frozen, self._settings, self._costs)
+
+        self._background.begin(begun, keyframes)
 
     def restart(self) -> None:
         """Drop the explanation in the background, and start another soon: what it began with is wrong."""
-        if self._job is not None:
-            self._job, self._next = None, 0
+        if self._background.is_busy:
+            self._background.cancel()
+            self._next = 0
 
     def rescale(self, factors: tuple[float, float]) -> None:
         """Use scales of odometry that was corrected by these factors."""
@@ -241,9 +248,9 @@ class Hindsight:
 
     def covers(self, scans: int) -> bool:
         """Return whether so many scans were explained, and the result used. If not, that is due."""
-        if self._job is None and self._explained < scans:
+        if not self._background.is_busy and self._explained < scans:
             self._next = 0
-        return self._job is None and self._explained >= scans
+        return not self._background.is_busy and self._explained >= scans
 
     @property
     def is_doubtful(self) -> bool:
@@ -256,14 +263,12 @@ class Hindsight:
 
     def outcome(self, keyframes: int) -> Found | None:
         """The explanation that is due at a keyframe. It waits for it."""
-        if self._job is None or keyframes < self._job[0]:
-            return None
-        (_, work), self._job = self._job, None
-        return self._noted(work())
+        due = self._background.due(keyframes)
+        return self._noted(due()) if due is not None else None
 
     def found(self, freeze: Callable[[], FrozenScans]) -> Found | None:
         """Explain the present scans at once; None if that was done before, or finds nothing."""
-        self._job = None
+        self._background.cancel()
         if not self.is_on:
             return None
         frozen = freeze()

@@ -1,21 +1,16 @@
 """The front end of landmarks: assigns sightings to landmarks, refuses new ones, reviews sightings without id."""
 
-from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.types import Sightings
-from graph_slam_ros.slam.frontend.keyframes import Keyframe
+from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp, off_the_pole
-from graph_slam_ros.slam.frontend.noise_factors import NoiseScales
 from graph_slam_ros.slam.frontend.odometry_selector import Step
-from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.slam.landmarks.anonymous import AnonymousLandmarks
 from graph_slam_ros.slam.landmarks.assignments import Assigned
-from graph_slam_ros.slam.landmarks.landmark import Landmark
 from graph_slam_ros.slam.landmarks.landmark_map import Landmarks
-from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Executor
 
 
@@ -24,10 +19,7 @@ class LandmarkFrontend:
 
     Parameters
     ----------
-    edges : adds edges to the graph
-    withdraw : takes edges out for good
-    hand_over : gives the solver what is new in the graph
-    trusts_sightings : whether new landmarks may begin: not so while an alarm cannot be decided
+    backend : no new landmark begins while it does not trust sightings
     executor : begins work in the background
 
     Attributes
@@ -39,24 +31,14 @@ class LandmarkFrontend:
     def __init__(
         self,
         config: Config,
-        edges: NoiseScales,
-        solver: Solver,
+        backend: Backend,
         counters: Counters,
-        *,
-        withdraw: Callable[[Sequence[int]], None],
-        hand_over: Callable[[], None],
-        trusts_sightings: Callable[[], bool],
         executor: Executor,
     ) -> None:
-        self._config, self._space, self._counters = config.landmarks, config.space, counters
-        self.map = Landmarks(config, edges, solver, counters, withdraw)
-        self.anonymous = AnonymousLandmarks(config, self.map, solver, counters, hand_over, executor)
-        self._trusts_sightings = trusts_sightings
-
-    def restore(self, landmarks: dict[str, Landmark]) -> None:
-        """Continue with the landmarks of a map."""
-        self.map.restore(landmarks)
-        self.anonymous.restore()
+        self._config, self._space = config.landmarks, config.space
+        self._backend, self._counters = backend, counters
+        self.map = Landmarks(config, backend, counters)
+        self.anonymous = AnonymousLandmarks(config, self.map, backend, counters, executor)
 
     def forget_before(self, keyframe: int) -> None:
         """Forget what has left the graph with the keyframes before a number."""
@@ -81,10 +63,6 @@ class LandmarkFrontend:
         """Add a step of odometry. Returns the sightings of earlier scans that can be used now."""
         return self._passed(self.anonymous.travel(step)) if self.is_anonymous else []
 
-    def forget_where(self) -> None:
-        """Forget what depends on the axes of the map, because it has moved."""
-        self.anonymous.forget_belief()
-
     def end_scan(self) -> list[Assigned]:
         """End the scan. Returns its sightings that can be used."""
         return self._passed(self.anonymous.end_scan())
@@ -98,7 +76,7 @@ class LandmarkFrontend:
         """The sightings that may be used: none begins a landmark in a held map, or while the pose is unknown."""
         if not self.map.begins_new:
             reason = "not_in_map"
-        elif not self._trusts_sightings():
+        elif not self._backend.trusts_sightings:
             reason = "new_while_elsewhere"
         else:
             return named
@@ -107,10 +85,3 @@ class LandmarkFrontend:
             if one.name not in known:
                 self._counters.count(one.topic, reason)
         return [one for one in named if one.name in known]
-
-    def review(self, keyframes: StampedPoses[Keyframe], *, everything: bool) -> None:
-        """Review the landmarks without id. The next solve includes the changes."""
-        if self.is_anonymous and everything:
-            self.anonymous.explain_all(keyframes)
-        elif self.is_anonymous:
-            self.anonymous.review(keyframes)

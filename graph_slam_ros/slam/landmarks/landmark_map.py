@@ -1,6 +1,6 @@
 """Landmarks: sightings become vertices and edges. A landmark that is not determined yet is kept with the reason."""
 
-from collections.abc import Callable, Mapping, Sequence, Set
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import replace
 
 import numpy as np
@@ -12,13 +12,12 @@ from graph_slam_ros.graph import POINT_PRIOR, Gaussian, VertexKind
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.edge_noise import LEAST_RAD2, edge_noise
 from graph_slam_ros.measurements.types import Sighting
+from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.frontend import motion_compensation
 from graph_slam_ros.slam.frontend.motion_compensation import KeyframeMeasurement, PoseAtStamp
-from graph_slam_ros.slam.frontend.noise_factors import NoiseScales
 from graph_slam_ros.slam.frontend.sighting_edges import SightingEdges
 from graph_slam_ros.slam.landmarks.landmark import Landmark, LandmarkEdge, UndeterminedLandmark
 from graph_slam_ros.slam.landmarks.triangulation import PartialObservation, possible_places, why_undetermined
-from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Numbers
 
 LABEL = "landmarks"
@@ -42,16 +41,15 @@ class Landmarks:
     def __init__(
         self,
         config: Config,
-        edges: NoiseScales,
-        solver: Solver,
+        backend: Backend,
         counters: Counters,
-        withdraw: Callable[[Sequence[int]], None],
     ) -> None:
         self.known: dict[str, Landmark] = {}
         self.undetermined: dict[str, UndeterminedLandmark] = {}
         self._config, self._space = config, config.space
-        self._edges, self._graph, self._solver = edges, edges.graph, solver
-        self._counters, self._withdraw, self.begins_new = counters, withdraw, True
+        self._backend, self._edges = backend, backend.noise
+        self._graph, self._solver = backend.graph, backend.solver
+        self._counters, self.begins_new = counters, True
         if config.landmarks.surveyed_file and not config.landmarks.surveyed:
             raise ConfigError(f"landmarks.surveyed_file: {config.landmarks.surveyed_file} has not been read")
         self._survey = config.survey
@@ -212,8 +210,7 @@ class Landmarks:
         """Remove a landmark and its edges from the problem."""
         landmark = self.known.pop(name)
         self.changes += 1
-        self._withdraw_sightings(landmark.seen)
-        self._solver.remove(landmark.vertex)
+        self._withdraw_sightings(landmark.seen, landmark.vertex)
 
     def forget(self, vertices: set[int]) -> None:
         """Forget landmarks that were removed from the problem. A new observation begins a new landmark."""
@@ -253,9 +250,9 @@ class Landmarks:
         self.known[name].is_tentative = not is_sure
         self.changes += 1
 
-    def _withdraw_sightings(self, seen: Sequence[LandmarkEdge]) -> None:
+    def _withdraw_sightings(self, seen: Sequence[LandmarkEdge], vertex: int | None = None) -> None:
         self._counters.used.subtract(one.topic for one in seen)
-        self._withdraw([one.edge for one in seen])
+        self._backend.withdraw([one.edge for one in seen], vertex=vertex)
 
     def names(self) -> dict[int, str]:
         """Return the names of all landmarks, by their vertices."""

@@ -7,7 +7,7 @@ is judged by its residual, until no verdict changes. A rejected candidate costs 
 squares).
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -15,7 +15,8 @@ import numpy as np
 
 from graph_slam_ros.config.pipeline import RobustConfig
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.graph import GROUPS, SE2, Graph, Loss
+from graph_slam_ros.graph import GROUPS, Graph, Loss
+from graph_slam_ros.slam.background import CancelToken
 from graph_slam_ros.slam.robust.gating import OutlierGate
 from graph_slam_ros.slam.robust.ledger import FINAL, Ledger
 from graph_slam_ros.slam.robust.pairwise_consistency import (
@@ -23,16 +24,16 @@ from graph_slam_ros.slam.robust.pairwise_consistency import (
     contradicting_sightings,
     jumps_and_back,
     odometry_in_use,
+    space_of,
 )
 from graph_slam_ros.solver import Settings, Solver
-from graph_slam_ros.typing import Array, Executor, Index, Result
+from graph_slam_ros.typing import Array, Index, Numbers
 
 _ITERATIONS = 20  # of each stage of the losses, from another start
 _ROUNDS = 10  # of a search at most: solve everything, then review all verdicts
 _HOPELESS = 2.0  # times the least cost that was found: another explanation is none
 _SAME = 1e-4  # of a cost, that one explanation may differ by from itself: solves end a little off the optimum
 _NEAR = 1e-3  # m or rad: what two solves of one optimum differ by at most
-_MORE = 1.5  # times as many out as at the last look: looks become rarer as their cost grows
 _STORY = 5  # closures that agree with one another and not with the map
 
 
@@ -90,24 +91,27 @@ class Outcome:
 
     def carried_to(self, graph: Graph, values: Array) -> Array:
         """Stored numbers of the grown graph. Newer vertices move with the newest pose of the search."""
-        out, known, old = values.copy(), len(self.values), self.frozen.graph
+        known, old, out = len(self.values), self.frozen.graph, values.copy()
         odometry = old.edges_of("odometry")
-        if known == len(values) or not len(odometry):
-            out[:known] = self.values
-            return out
-        newest = graph.vertex(old.edge(int(odometry[-1])).vertices[1])
-        kind, here = newest.kind, newest.stored
-        group = GROUPS[kind]
-        moved = group.compose(tuple(self.values[here]), group.inverse(tuple(values[here])))
-        for vertex in graph.vertex_ids.since(old.vertex_ids.next).tolist():
-            new = graph.vertex(vertex)
-            numbers = tuple(values[new.stored])
-            if new.kind is kind:
-                out[new.stored] = group.compose(moved, numbers)
-            elif new.kind.size == (2 if kind is SE2 else 3):
-                out[new.stored] = group.act(moved, numbers)
+        if known < len(values) and len(odometry):
+            here = graph.vertex(old.edge(int(odometry[-1])).vertices[1]).stored
+            group = space_of(graph).group
+            moved = group.compose(tuple(self.values[here]), group.inverse(tuple(values[here])))
+            out = moved_rigidly(graph, values, moved)
         out[:known] = self.values
         return out
+
+
+def moved_rigidly(graph: Graph, values: Array, T_new_old: Numbers) -> Array:
+    """Stored numbers of all vertices of a map that is moved rigidly."""
+    out, space, vertices = values.copy(), space_of(graph), graph.vertex_ids.since()
+    for kind in (space.pose, space.point):
+        if kind in graph.kinds:
+            of_kind = vertices[graph.kind_codes(vertices) == graph.kinds.index(kind)]
+            at = graph.begins(of_kind)[:, None] + np.arange(kind.size)
+            move = space.group.compose if kind is space.pose else space.group.act
+            out[at] = np.stack(move(T_new_old, tuple(values[at].T)), axis=-1)
+    return out
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,13 +127,6 @@ class _Way:
         if not (np.array_equal(self.inside, other.inside) and abs(self.cost - other.cost) <= _SAME * other.cost):
             return False
         return bool(np.abs(self.values - other.values).max() <= _NEAR)
-
-
-@dataclass(slots=True)
-class CancelToken:
-    """A token that cancels a search whose outcome is not needed any more."""
-
-    still: bool = True
 
 
 def search_alternatives(config: RobustConfig, frozen: FrozenGraph, wanted: CancelToken | None = None) -> Outcome | None:
@@ -322,63 +319,3 @@ def _along_odometry(graph: Graph, values: Array, held: set[int]) -> Array:
         if new.id not in held:
             out[new.stored] = GROUPS[new.kind].compose(tuple(out[last.stored]), tuple(one.measured))
     return out
-
-
-Work = Callable[[], Outcome | None]
-
-
-def run_when_asked(work: Callable[[], Result], /) -> Callable[[], Result]:
-    """Runs the work when its result is requested."""
-    return work
-
-
-@dataclass(frozen=True, slots=True)
-class _Job:
-    apply_at: int
-    outcome: Work
-    wanted: CancelToken
-
-
-class Background:
-    """Runs at most one search at a time, on a frozen copy, while the robot drives on.
-
-    Its outcome is used at a fixed later keyframe. If it is not done by then, the pipeline waits. Both keyframes follow
-    from the ingest sequence alone, so that a replay decides as the live run did.
-    """
-
-    def __init__(self, config: RobustConfig, executor: Executor) -> None:
-        self._config, self._executor = config, executor
-        self._out = 0  # candidates that were out at the last look
-        self._job: _Job | None = None
-
-    @property
-    def is_busy(self) -> bool:
-        """Return whether a search goes on."""
-        return self._job is not None
-
-    def is_due(self, out: int) -> bool:
-        """Return whether a search is due by this number of rejected candidates."""
-        after, self._out = self._config.second_look_after, min(self._out, out)
-        if self._job is not None or after <= 0:
-            return False
-        return out >= max(self._out + after, _MORE * self._out)
-
-    def start(self, frozen: FrozenGraph, out: int) -> None:
-        """Start with the present graph."""
-        self._out = out
-        wanted = CancelToken()
-        outcome = self._executor(lambda: search_alternatives(self._config, frozen, wanted))
-        self._job = _Job(frozen.keyframe + self._config.apply_after_keyframes, outcome, wanted)
-
-    def found(self, keyframe: int) -> Work | None:
-        """Return a function that waits for the result of the search, if that is due at this keyframe."""
-        if self._job is None or keyframe < self._job.apply_at:
-            return None
-        job, self._job = self._job, None
-        return job.outcome
-
-    def cancel(self, out: int) -> None:
-        """Cancel the running search, because everything was reviewed with this number of rejected candidates."""
-        if self._job is not None:
-            self._job.wanted.still = False
-        self._job, self._out = None, out

@@ -20,6 +20,7 @@ from graph_slam_ros.runs.restore import record_run
 from graph_slam_ros.runs.tables import summarize
 from graph_slam_ros.runs.trajectory import read_tum
 from graph_slam_ros.slam import Closure, Config, Control, Fix, GraphSlam, Odometry, Sightings
+from graph_slam_ros.slam.doubt.record import Slip
 from graph_slam_ros.slam.landmarks import hindsight
 from graph_slam_ros.slam.landmarks.hindsight import FrozenScans, explained
 from graph_slam_ros.slam.landmarks.presence_check import Presence
@@ -123,6 +124,35 @@ def test_a_map_that_is_taken_up_again_goes_on_condensing(recorded, tmp_path):
     again = read_start(tmp_path / "more")
     assert again is not None and again.first_keyframe == slam.first_keyframe
     assert read_map(tmp_path / "more").first_keyframe == gone_on.first_keyframe
+
+
+GOES_ON = {
+    "nothing": (lambda slam: None, True),
+    "a trial fit": (lambda slam: slam._trials._background.begin(lambda: lambda _: None, 0), True),
+    "a search": (lambda slam: slam.backend._background.begin(lambda: lambda _: None, 0), False),
+    "an alarm": (lambda slam: setattr(slam.backend, "holds_back", True), False),
+    "a slip": (lambda slam: slam._kidnaps.slips.append(Slip("rotation", 0, 0, 20.0, 2)), False),
+    "an edge that is held back": (lambda slam: slam.backend._pending.append(7), False),
+    "a solve that failed": (lambda slam: slam.restart(), False),
+}
+
+
+@pytest.fixture(scope="module")
+def due():
+    """The measurement before which a drive is condensed first."""
+    slam = GraphSlam(bounded())
+    return next(k for k, m in enumerate(measurements(hall(SEED, 500))) if slam.process(m).condensed is not None)
+
+
+@pytest.mark.parametrize("what", GOES_ON)
+def test_it_waits_for_what_could_change_a_verdict_and_for_nothing_else(what, due):
+    begin, is_condensed = GOES_ON[what]
+    *before, m = list(measurements(hall(SEED, 500)))[: due + 1]
+    slam = GraphSlam(bounded())
+    for one in before:
+        slam.process(one)
+    begin(slam)
+    assert (slam.process(m).condensed is not None) == is_condensed
 
 
 def test_with_closures_all_is_kept_and_the_end_says_why():

@@ -276,7 +276,7 @@ def doubt(slam, links, now_ns, **ended):
     slip = Slip("translation", links[0].stamps_ns[0], now_ns, 20.0, 2, **ended)
     detector = slam._kidnaps._slips
     detector.slips.append(slip)
-    detector._replace(links, slip, len(slam.keyframes) - 1)
+    detector._replace(links, slip)
 
 
 def test_a_slip_that_was_none_is_taken_back_and_leaves_no_trace():

@@ -22,7 +22,7 @@ def test_derivatives_are_the_numeric_ones_and_a_fit_finds_what_was_wrong_and_cha
     # order in that motion: they differ from the numeric ones by 5 % there.
     wrong = driven(imperfect_drive(FAULTS, kind=kind, seconds=60.0), {"odometry.doubt": False})
     for check in (check_parameters, check_unknowns):
-        check(wrong.backend.trial_problem(wrong.space, wrong._frontend.path, wrong._landmarks.map.origins))
+        check(wrong._trials.problem())
     before, measured = wrong.solver.values, [t.measured.values.copy() for t in wrong.graph.tables.values()]
     found, findings = wrong.trial_fit()
     assert (wrong.solver.values == before).all()

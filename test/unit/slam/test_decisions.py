@@ -7,12 +7,16 @@ import pytest
 
 from graph_slam_ros.graph import POSE_PRIOR, RELATIVE_POSE, SE2, Gaussian
 from graph_slam_ros.lie import se2
+from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.node.worker import run_in_thread
 from graph_slam_ros.slam import Config
 from graph_slam_ros.slam.backend import Backend
-from graph_slam_ros.slam.robust.hypotheses import run_when_asked
+from graph_slam_ros.slam.background import run_when_asked
+from graph_slam_ros.slam.frontend.keyframes import KeyframeList
+from graph_slam_ros.slam.frontend.odometry_integration import OdometryNoise
 from graph_slam_ros.slam.robust.innovation import joint_innovations
 from graph_slam_ros.slam.robust.ledger import Verdict
+from graph_slam_ros.slam.snapshot import MapSnapshot
 
 SIGMAS = (0.05, 0.05, 0.02)
 NOISE = Gaussian.from_sigmas(*SIGMAS)
@@ -32,12 +36,13 @@ class Drive:
     """A back-end that is driven around, with a true closure to the lap before at every pose, and others on demand."""
 
     def __init__(self, seed=0, beside=run_when_asked, **robust):
-        self.rng = np.random.default_rng(seed)
+        self.rng, self.counters = np.random.default_rng(seed), Counters()
         self.true = laps()
         robust = {"noise_scale": "configured"} | robust  # what is planted is not taken for noise
         config = Config.from_mapping({f"robust.{name}": value for name, value in robust.items()})
         self.settings = config.solver_settings()
-        self.backend = Backend(config.robust, self.settings, beside)
+        path = KeyframeList(OdometryNoise(config.odometry, config.space), config.space)
+        self.backend = Backend(path, config.robust, self.settings, MapSnapshot(), self.counters, beside)
         self.closures, self.false = [], []
         self.closes_laps = True
 
@@ -63,11 +68,12 @@ class Drive:
             if k >= 30 and self.closes_laps:
                 self.close(k - 28, k)
             lie(self, k)
-            self.backend.update(k)
+            self.backend.path.keyframes.append(k, k, self.true[k])
+            self.backend.update()
         return self
 
     def solve(self):
-        self.backend.optimize(self.backend.graph.vertex_count - 1, self.settings)
+        self.backend.optimize(self.settings)
         return self
 
     @property
@@ -126,7 +132,7 @@ def test_G14_what_was_held_back_comes_in_when_the_map_agrees_in_the_end():
 def test_the_joint_innovation_is_what_the_cost_would_grow_by_for_several():
     drive = Drive().go(60)
     solver, graph = drive.backend.solver, drive.backend.graph
-    drive.backend.optimize(59, drive.settings)
+    drive.backend.optimize(drive.settings)
     before = solver.evaluate().chi2_final
     edges = [graph.add_edge(RELATIVE_POSE, [k, 59], drive.noisy(k, 59), NOISE, "closures") for k in (10, 11)]
     edges.append(graph.add_edge(POSE_PRIOR, [59], drive.true[59], NOISE, "fixes"))

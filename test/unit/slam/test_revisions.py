@@ -1,0 +1,93 @@
+"""Revisions in any order: each is undone by its inverse, one that fails leaves nothing, and what is frozen stays."""
+
+import numpy as np
+import pytest
+from reliability import times
+from test_decisions import NOISE, Drive, lies
+
+from graph_slam_ros.graph import Gaussian
+from graph_slam_ros.slam.revision import Replacement, Revision
+from graph_slam_ros.slam.robust.ledger import Reason
+from graph_slam_ros.solver import Solver
+
+NOISE_KEY = ("closures", "", "position")
+
+
+def state(drive, edges=None, vertices=None):
+    """What is measured and believed of the first edges, and the first poses."""
+    graph, ledger = drive.backend.graph, drive.backend.ledger
+    every = [graph.edge(edge) for edge in range(graph.edge_count if edges is None else edges)]
+    numbers = np.concatenate([np.r_[one.measured, one.sqrt_information.ravel(), one.weight] for one in every])
+    factors = {key: factor for key, factor in drive.backend.noise.factors.items() if factor != 1.0}
+    told = ledger.verdict.values[: len(every)].tolist(), ledger.reason.values[: len(every)].tolist(), factors
+    return told, numbers, drive.backend.solver.values[: 3 * (vertices or graph.vertex_count)]
+
+
+def is_same(a, b, off=0.0):
+    """By bytes, or where something was solved and scaled back off by so much at most."""
+    return a[0] == b[0] and all(np.abs(one - other).max() <= off for one, other in zip(a[1:], b[1:], strict=True))
+
+
+class Reviser:
+    """Draws revisions of a drive, as policies make them."""
+
+    def __init__(self, drive, rng):
+        self.drive, self.rng, self.backend = drive, rng, drive.backend
+
+    def one(self):
+        graph = self.backend.graph
+        free = [e for e in graph.edges_of("odometry").tolist() if e >= self.backend.first_free_edge]
+        odometry = [e for e in free if graph.edge(e).weight][-10:]
+        some = self.rng.choice(odometry, size=min(3, len(odometry)), replace=False).tolist()
+        wider = [Replacement(e, graph.edge(e).measured, Gaussian.from_sigmas(1.0, 1.0, 1.0)) for e in some]
+        slip = Revision("odometry", replaced=wider, reason=Reason.SLIP, evidence=9.0, threshold=5.0)
+        noise = Revision("noise_scale", noise={NOISE_KEY: float(self.rng.uniform(0.5, 2.0))}, solves="all")
+        verdicts = Revision(
+            "second_look", verdicts=self.backend.ledger.copy(), settings=self.drive.settings, solves="all"
+        )
+        return [slip, noise, verdicts][self.rng.integers(3)]
+
+    def undone(self, revision, applied):
+        if revision.noise:
+            return Revision("noise_scale", noise={NOISE_KEY: 1.0}, solves="all")
+        return Revision("odometry", restored=applied.replaced, solves="all")
+
+
+@pytest.mark.parametrize("seed", range(times(3, 100)))
+def test_each_revision_is_undone_by_its_inverse_and_one_that_fails_leaves_nothing(seed, monkeypatch):
+    rng, drive = np.random.default_rng(seed), Drive(seed).go(70, lies(every=3)).solve()
+    reviser, applied_count = Reviser(drive, rng), 0
+    for step in range(12):
+        if step == 6:
+            drive.backend.hold_map()
+            held = drive.backend.held[::-1]
+            at_hold = state(drive, *held)
+            drive.go(82, lies(every=3)).solve()
+        before, edges = state(drive), drive.backend.graph.edge_count
+        revision = reviser.one()
+        if rng.random() < 0.4:
+            with monkeypatch.context() as broken:
+                for name in ("optimize", "update"):
+                    broken.setattr(Solver, name, lambda *_: 1 / 0)
+                assert drive.backend.apply(revision) is None
+            assert is_same(state(drive), before)
+            assert drive.backend.graph.edge_count == edges
+            continue
+        applied = drive.backend.apply(revision)
+        if applied is not None:
+            applied_count += 1
+            assert drive.backend.apply(reviser.undone(revision, applied)) is not None
+            drive.backend.solver.optimize()
+        assert is_same(state(drive, edges), before, off=1e-6)
+        if step >= 6:
+            assert is_same(state(drive, *held), at_hold)
+    assert applied_count > 2
+
+
+def test_a_revision_that_names_what_is_held_is_refused_and_counted():
+    drive = Drive().go(40).solve()
+    drive.backend.hold_map()
+    before = state(drive)
+    assert drive.backend.apply(Revision("odometry", replaced=[Replacement(5, (0.0, 0.0, 0.0), NOISE)])) is None
+    assert drive.counters["odometry", "unsolved"] == 1
+    assert is_same(state(drive), before)
