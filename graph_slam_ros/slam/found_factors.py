@@ -55,7 +55,10 @@ class FoundFactors:
         scales = self._anonymous.hindsight.found_scales
         if scales is self._used or not self._is_new:
             return None
-        self._used, model = scales, self._model()
+        graph, keyframes = self._backend.graph, self._frontend.path.keyframes
+        edges = range(self._backend.first_free_edge, graph.edge_ids.next)
+        space, ids, stamps_ns = self._config.space, keyframes.ids, keyframes.stamps_ns
+        self._used, model = scales, MeasurementModel(space, graph, self._origins, ids, stamps_ns, edges)
         sources = {edges.source for edges in model.odometry}
         if len(sources) != 1:
             return None
@@ -70,11 +73,6 @@ class FoundFactors:
         if report is not None:
             self.corrected += used
         return report
-
-    def _model(self) -> MeasurementModel:
-        graph, keyframes = self._backend.graph, self._frontend.path.keyframes
-        edges = range(self._backend.first_free_edge, graph.edge_ids.next)
-        return MeasurementModel(self._config.space, graph, self._origins, keyframes.ids, keyframes.stamps_ns, edges)
 
     def _correct(self, model: MeasurementModel, values: Values, everything: Settings | None) -> Report | None:
         """Correct all measurements, present and future, and solve. A failure is undone."""

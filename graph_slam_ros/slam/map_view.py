@@ -439,7 +439,7 @@ class MapView:
     @property
     def alarms(self) -> tuple[Alarm | Slip, ...]:
         """The times when the landmarks contradicted odometry, in order: displacements and slips. Some may go on."""
-        return tuple(sorted([*self._kidnaps.alarms, *self._kidnaps.slips], key=lambda one: one.began_ns))
+        return tuple(sorted([*self._kidnaps.alarms, *self._kidnaps.slip_detector.slips], key=lambda one: one.began_ns))
 
     @property
     def displacements(self) -> list[dict[str, Any]]:
@@ -450,4 +450,4 @@ class MapView:
     @property
     def displaced(self) -> Alarm | Slip | None:
         """The alarm that goes on, a displacement before a slip; or None."""
-        return self._kidnaps.now or self._kidnaps.slips_now
+        return self._kidnaps.now or self._kidnaps.slip_detector.now

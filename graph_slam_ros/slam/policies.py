@@ -56,7 +56,7 @@ class Policies:
         else:
             self._doubt.rejoin(keyframes[-1].stamp_ns)
             report = backend.optimize(everything)
-            if self._doubt.review():
+            if self._doubt.slip_detector.review():
                 report = backend.optimize(everything)
         if not backend.holds_back:
             report = backend.scale_noise(everything) or report

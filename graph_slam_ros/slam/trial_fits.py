@@ -125,7 +125,7 @@ class TrialFits:
             segments=tuple(dict.fromkeys(begins)),
             track=path.samples.track(rows.poses, factors),
             first_edge=max(self._backend.first_free_edge, self._first_edge),
-            slips=self._kidnaps.slipped(),
+            slips=self._kidnaps.slip_detector.slipped(),
         )
 
     def fit(self, groups: Sequence[str], *, places: bool, is_to_correct: bool) -> tuple[TrialFit, list[Finding]]:

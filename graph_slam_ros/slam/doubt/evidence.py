@@ -176,13 +176,9 @@ class Stretch:
         """The hypothesis that odometry has its own noise."""
         return Hypothesis(TIGHT, self.size, np.zeros((self.size, self._space.dof)), log_odds=0.0)
 
-    def gains(self, hypotheses: Sequence[Hypothesis]) -> list[float]:
-        """Logarithms of how much likelier hypotheses are than ``tight``, by their odds and by what was seen."""
-        return [one.log_odds + 0.5 * (self._states[-1].cost - self._end(one).cost) for one in hypotheses]
-
     def choice(self, hypotheses: Sequence[Hypothesis]) -> Choice:
         """Return the best of some hypotheses and ``tight``."""
-        gains = self.gains(hypotheses)
+        gains = [one.log_odds + 0.5 * (self._states[-1].cost - self._end(one).cost) for one in hypotheses]
         k = int(np.argmax(gains))
         best, first = hypotheses[k], hypotheses[k].first
         if gains[k] <= 0.0 or best.kind not in SLIPS:

@@ -15,7 +15,7 @@ from graph_slam_ros.graph import Gaussian
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.doubt.displacement import SAME_M, SAME_RAD, DisplacementSearch
-from graph_slam_ros.slam.doubt.record import DOUBT, Alarm, Displacement, DisplacementHypothesis, Slip
+from graph_slam_ros.slam.doubt.record import DOUBT, Alarm, Displacement, DisplacementHypothesis
 from graph_slam_ros.slam.doubt.slip_detector import SlipDetector
 from graph_slam_ros.slam.doubt.window import Window
 from graph_slam_ros.slam.frontend.odometry_selector import JUMP_SIGMA_M, JUMP_SIGMA_RAD
@@ -47,15 +47,11 @@ class KidnapDetector:
     ----------
     alarms : in order; the last may go on
     earlier : those of the map that it began in, as records of files
+    slip_detector : detects stretches in which odometry slipped
     """
 
     def __init__(
-        self,
-        config: Config,
-        backend: Backend,
-        counters: Counters,
-        anonymous: AnonymousLandmarks,
-        start: MapSnapshot,
+        self, config: Config, backend: Backend, counters: Counters, anonymous: AnonymousLandmarks, start: MapSnapshot
     ) -> None:
         self._space, self._backend, self._counters = config.space, backend, counters
         self._path, self._anonymous, self._decides = backend.path, anonymous, config.robust.decide
@@ -63,7 +59,7 @@ class KidnapDetector:
         self.earlier: list[dict[str, Any]] = start.displacements
         self._window = Window(config.space, backend)
         self._search = DisplacementSearch(config.space, backend, self._window)
-        self._slips = SlipDetector(config.space, config.odometry, backend, counters, self._window, anonymous.doubt)
+        self.slip_detector = SlipDetector(config, backend, counters, self._window, anonymous.doubt)
         self._next = backend.graph.edge_ids.next
         self._decided: list[Displacement] = []  # since odometry's frame began
         self._refuted: list[Numbers] = []  # where that frame does not lie: it was decided and taken back
@@ -72,7 +68,7 @@ class KidnapDetector:
     @property
     def is_quiet(self) -> bool:
         """Return whether no alarm goes on."""
-        return self.now is None and self.slips_now is None
+        return self.now is None and self.slip_detector.now is None
 
     def forget_before(self, first: int) -> None:
         """Forget what has left the graph with the keyframes before one, by its vertex.
@@ -87,16 +83,6 @@ class KidnapDetector:
             if (one := graph.edge(edge)).label == "closures":
                 self._window.add_seen(edge, max(one.vertices), one.label, self._window.newest_ns)
         self._next = graph.edge_ids.next
-
-    @property
-    def slips(self) -> list[Slip]:
-        """The stretches in which odometry slipped, in order; the last may go on."""
-        return self._slips.slips
-
-    @property
-    def slips_now(self) -> Slip | None:
-        """The slip that goes on."""
-        return self._slips.now
 
     @property
     def now(self) -> Alarm | None:
@@ -127,7 +113,7 @@ class KidnapDetector:
             case "odometry":
                 first, last = keyframes.stamps_ns[np.searchsorted(keyframes.ids, vertices)].tolist()
                 if (link := window.add_odometry(edge, vertices, (first, last))) is not None:
-                    self._slips.add_odometry(link)
+                    self.slip_detector.add_odometry(link)
             case "surveyed":
                 window.history.add_survey(vertices[0])
             case "landmarks":
@@ -154,9 +140,9 @@ class KidnapDetector:
         found = self._significant(newest)
         found = found and self._search.begun_at(found, self._anonymous.elsewhere.fits_from)
         is_decided = found is not None and self._is_decided(found)
-        if self._slips.check(stamp_ns, found, is_decided=is_decided):
+        if self.slip_detector.check(stamp_ns, found, is_decided=is_decided):
             is_decided = False
-            found = found if self.slips_now is None else None  # too few landmarks say so yet: an alarm
+            found = found if self.slip_detector.now is None else None  # too few landmarks say so yet: an alarm
         if found is not None and is_decided:
             if (wrong := self._refuted_by(found, newest)) is not None:
                 found = found if not self._revoke(wrong, found, stamp_ns) else None
@@ -164,14 +150,6 @@ class KidnapDetector:
                 found = found if not self._decide(found, stamp_ns) else None
         self._note(found, stamp_ns)
         self._protect()
-
-    def review(self) -> bool:
-        """Take back the slips that all measurements together contradict. Returns whether there were any."""
-        return self._slips.review()
-
-    def slipped(self) -> tuple[tuple[tuple[int, int], ...], ...]:
-        """The edges of odometry of each slip, each with the one that replaces it."""
-        return self._slips.slipped()
 
     def _protect(self) -> None:
         """Keep the map as it is while it is not decided; ranges or bearings fit a wrong pose by chance, too."""
@@ -341,7 +319,7 @@ class KidnapDetector:
 
     def _begin_anew(self, vertex: int, stamp_ns: int) -> None:
         """Compare no sighting from before a keyframe, by its vertex, with where the robot is."""
-        self._slips.begin(stamp_ns)
+        self.slip_detector.begin(stamp_ns)
         self._window.begin(vertex)
         self._search.begin()
 

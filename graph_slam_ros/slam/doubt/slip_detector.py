@@ -16,7 +16,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from graph_slam_ros.config.pipeline import OdometryConfig
+from graph_slam_ros.config.config import Config
 from graph_slam_ros.errors import GraphSlamError, SingularError
 from graph_slam_ros.graph import Gaussian
 from graph_slam_ros.graph.geometry import Geometry
@@ -73,20 +73,13 @@ class SlipDetector:
     slips : in order; the last may go on
     """
 
-    def __init__(
-        self,
-        space: Geometry,
-        odometry: OdometryConfig,
-        backend: Backend,
-        counters: Counters,
-        window: Window,
-        doubt: Doubt,
-    ) -> None:
-        self._space, self._config, self._backend, self._counters = space, odometry, backend, counters
+    def __init__(self, config: Config, backend: Backend, counters: Counters, window: Window, doubt: Doubt) -> None:
+        self._space, self._config = config.space, config.odometry
+        self._backend, self._counters = backend, counters
         self._window, self._doubt = window, doubt
         self._checked: View | None = None
         self._allowed = _BURST
-        self._noise = MeasuredNoise(space, backend)
+        self._noise = MeasuredNoise(config.space, backend)
         self.slips: list[Slip] = []
         self._replaced = dict[int, tuple[int, int]]()  # of edges of odometry: by which slip, and the one in its place
 

@@ -54,12 +54,7 @@ class AnonymousLandmarks:
     """
 
     def __init__(
-        self,
-        config: Config,
-        landmarks: Landmarks,
-        backend: Backend,
-        counters: Counters,
-        executor: Executor,
+        self, config: Config, landmarks: Landmarks, backend: Backend, counters: Counters, executor: Executor
     ) -> None:
         c, space = config.landmarks, config.space
         self._space = space

@@ -28,13 +28,7 @@ class LandmarkFrontend:
     anonymous : the association of those without identity
     """
 
-    def __init__(
-        self,
-        config: Config,
-        backend: Backend,
-        counters: Counters,
-        executor: Executor,
-    ) -> None:
+    def __init__(self, config: Config, backend: Backend, counters: Counters, executor: Executor) -> None:
         self._config, self._space = config.landmarks, config.space
         self._backend, self._counters = backend, counters
         self.map = Landmarks(config, backend, counters)

@@ -38,12 +38,7 @@ class Landmarks:
     begins_new : whether what is not known begins a landmark; not so while the map is held
     """
 
-    def __init__(
-        self,
-        config: Config,
-        backend: Backend,
-        counters: Counters,
-    ) -> None:
+    def __init__(self, config: Config, backend: Backend, counters: Counters) -> None:
         self.known: dict[str, Landmark] = {}
         self.undetermined: dict[str, UndeterminedLandmark] = {}
         self._config, self._space = config, config.space

@@ -131,7 +131,7 @@ GOES_ON = {
     "a trial fit": (lambda slam: slam._trials._background.begin(lambda: lambda _: None, 0), True),
     "a search": (lambda slam: slam.backend._background.begin(lambda: lambda _: None, 0), False),
     "an alarm": (lambda slam: setattr(slam.backend, "holds_back", True), False),
-    "a slip": (lambda slam: slam._kidnaps.slips.append(Slip("rotation", 0, 0, 20.0, 2)), False),
+    "a slip": (lambda slam: slam._kidnaps.slip_detector.slips.append(Slip("rotation", 0, 0, 20.0, 2)), False),
     "an edge that is held back": (lambda slam: slam.backend._pending.append(7), False),
     "a solve that failed": (lambda slam: slam.restart(), False),
 }

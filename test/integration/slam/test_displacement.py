@@ -274,7 +274,7 @@ def test_a_burst_of_wrong_identities_and_a_moved_landmark_are_no_slip():
 def doubt(slam, links, now_ns, **ended):
     """Put a slip into a pipeline where none was."""
     slip = Slip("translation", links[0].stamps_ns[0], now_ns, 20.0, 2, **ended)
-    detector = slam._kidnaps._slips
+    detector = slam._kidnaps.slip_detector
     detector.slips.append(slip)
     detector._replace(links, slip)
 
