@@ -222,15 +222,19 @@ class Backend:
     # -- changes of what was solved ----------------------------------------------------------------------------------
 
     def apply(self, revision: Revision) -> Applied | None:
-        """Change what was solved as a policy wants; None if it changes nothing, or fails: then all is as before."""
+        """Change what was solved as a policy wants; None if it changes nothing, or fails: then all is as before.
+
+        What is held is not touched: a revision that replaces an edge of it fails, and verdicts on it stay.
+        """
         return self.all_or_nothing(revision.what, lambda: self._applied(revision))
 
     def _applied(self, r: Revision) -> Applied | None:
         solver, decisions, keyframe, report = self.solver, self.decisions, self.keyframe, None
-        named = *(one.edge for one in r.replaced), *(edge for edge, _ in r.restored), *r.accepted, *r.rejected
-        if named and min(named) < self.first_free_edge:
+        named, first = [*(one.edge for one in r.replaced), *(edge for edge, _ in r.restored)], self.first_free_edge
+        if named and min(named) < first:
             raise GraphSlamError(f"edge {min(named)} is of a map that is held")
-        if r.noise is not None and not self.noise.change(r.noise, self.first_free_edge):
+        accepted, rejected = ([edge for edge in edges if edge >= first] for edges in (r.accepted, r.rejected))
+        if r.noise is not None and not self.noise.change(r.noise, first):
             return None
         for one in r.remeasured:
             one.table.measured.values[one.rows] = one.measured
@@ -246,12 +250,12 @@ class Backend:
             solver.start_at(r.values)
         if r.is_judged_anew:
             decisions.reclassify(keyframe)
-        decisions.exchange(r.accepted, r.rejected, keyframe)
+        decisions.exchange(accepted, rejected, keyframe)
         if r.noise is not None or r.remeasured or r.replaced or r.restored:
             self.cancel_search()
         if r.accepted:
             self.holds_back = False
-            decisions.make_fit(list(r.accepted), keyframe)
+            decisions.make_fit(accepted, keyframe)
         elif r.solves == "all":
             report = solver.optimize(r.settings)
             if r.remeasured and decisions.reclassify(keyframe):
