@@ -70,5 +70,7 @@ class Policies:
 
         It waits until all is judged and solved, and nothing goes on that could change a verdict.
         """
+        if not self._bounded.is_due:
+            return None
         is_quiet = self._backend.is_quiet and self._doubt.is_quiet and self._solution.is_whole
-        return self._bounded.condense() if is_quiet and self._bounded.is_due else None
+        return self._bounded.condense() if is_quiet else None
