@@ -9,13 +9,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from foreign import DEFINITIONS
-from messages import cloud, detection, detections, gnss, imu, odometry, part, pose, posed, quaternion, sent, transforms
+from messages import cloud, detection, detections, gnss, imu, odometry, pose, posed, quaternion, sent, transforms
 from recordings import definition, short_drive, write_mcap
 from rows import each
 
 from graph_slam_ros.cli import main
 from graph_slam_ros.lie import se2
-from graph_slam_ros.messages.to_msg import header, make, vector
+from graph_slam_ros.messages.to_msg import header
 from graph_slam_ros.recordings.bag import BagWriter
 from graph_slam_ros.runs.outcome import doubts, shortcomings
 from graph_slam_ros.tools.simulation import Drive
@@ -355,60 +355,27 @@ def test_the_gyro_of_an_imu_is_offered_as_a_part_of_odometry(info, capsys):
     assert "stand for a second" in err  # the bias of the gyro is learnt at rest
 
 
-def test_corners_without_poses_are_named_with_what_makes_poses_of_them(tmp_path, capsys):
-    name = "apriltag_msgs/msg/AprilTagDetectionArray"
+def test_corners_without_poses_are_named_with_what_makes_poses_of_them_and_a_map_of_tags_is_not(tmp_path, capsys):
+    name, map_name = "apriltag_msgs/msg/AprilTagDetectionArray", "fiducial_msgs/msg/FiducialMapEntryArray"
     corners = sent(name, header=header(START_NS, "camera"))
     file = write_mcap(
         tmp_path / "a.mcap",
         [
             SimpleNamespace(topic=topic, log_ns=START_NS, cdr=cdr)
-            for topic, cdr in (("/odom", odometry(stamp_ns=START_NS)), ("/tags", corners))
+            for topic, cdr in (
+                ("/odom", odometry(stamp_ns=START_NS)),
+                ("/tags", corners),
+                ("/fiducial_map", b"\0\1\0\0\0\0\0\0"),
+            )
         ],
-        types={"/odom": ODOM, "/tags": name},
-        text=lambda type_name: DEFINITIONS.get(type_name) or definition(type_name),
+        types={"/odom": ODOM, "/tags": name, "/fiducial_map": map_name},
+        text=lambda one: "int32[] fiducials\n" if one == map_name else DEFINITIONS.get(one) or definition(one),
     )
     assert main(["info", str(file)]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert "not used: /tags: these are corners without poses: run a pose estimator first" in " ".join(lines)
+    assert f"no input reads /fiducial_map ({map_name})" in " ".join(lines)
     assert "inputs.names=odom" in lines[-1]
-
-
-def test_tags_of_packages_that_need_not_be_there_are_offered_and_a_map_of_them_is_not(tmp_path, monkeypatch, capsys):
-    markers, fiducials = "aruco_markers_msgs/msg/MarkerArray", "fiducial_msgs/msg/FiducialTransformArray"
-    fiducial_map = "fiducial_msgs/msg/FiducialMapEntryArray"
-    written, truth = [], se2.IDENTITY
-    for k in range(STEPS):
-        stamp_ns = START_NS + k * NS // 10
-        head, late = header(stamp_ns, "base_link"), header(stamp_ns + NS // 20, "base_link")
-        of_markers, of_fiducials = [], []
-        for number, place in enumerate(PLACES.values()):
-            at = pose(*se2.act(se2.inverse(truth), place))
-            stamped, p = make("geometry_msgs/msg/PoseStamped", header=head, pose=at), at.position
-            moved = make("geometry_msgs/msg/Transform", translation=vector(p.x, p.y, 0.0), rotation=at.orientation)
-            of_markers.append(part("aruco_markers_msgs/msg/Marker", header=head, id=number, pose=stamped))
-            fiducial = {"fiducial_id": 100 + number, "transform": moved, "object_error": 0.01, "fiducial_area": 900.0}
-            of_fiducials.append(part("fiducial_msgs/msg/FiducialTransform", **fiducial))
-        for topic, cdr in (
-            ("/odom", odom()(k, stamp_ns, truth, truth)),
-            ("/aruco/markers", sent(markers, header=late, markers=of_markers)),
-            ("/fiducial_transforms", sent(fiducials, header=head, image_seq=k, transforms=of_fiducials)),
-            ("/fiducial_map", b"\0\1\0\0\0\0\0\0"),
-        ):
-            written.append(SimpleNamespace(topic=topic, log_ns=stamp_ns, cdr=cdr))
-        truth = se2.compose(truth, (0.2, 0.0, 0.05))
-    write_mcap(
-        tmp_path / "a.mcap",
-        written,
-        types=dict(zip((m.topic for m in written), (ODOM, markers, fiducials, fiducial_map), strict=False)),
-        text=lambda name: "int32[] fiducials\n" if name == fiducial_map else DEFINITIONS.get(name) or definition(name),
-    )
-    monkeypatch.chdir(tmp_path)
-    assert main(["info", "a.mcap"]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert f"no input reads /fiducial_map ({fiducial_map})" in " ".join(lines)
-    told, _, _ = run(shlex.split(lines[-1]), capsys)
-    assert told["landmarks"] == 6
-    assert [told["inputs"][name]["believed"] for name in ("tags", "tags_2")] == [3 * STEPS, 3 * STEPS]
 
 
 @pytest.mark.parametrize("name", ["a b's $drive.mcap", "-x.mcap", "drive.mcap"])

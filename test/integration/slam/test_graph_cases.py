@@ -228,19 +228,6 @@ def test_A12_however_certain_odometry_says_it_is_its_edges_are_not_and_what_they
     assert np.isfinite(p.keyframe_covariances()).all()
 
 
-def test_G19_of_what_is_not_determined_no_covariance_is_told():
-    graph = Graph()
-    graph.add_vertex(SE2, (0.0, 0.0, 0.0))
-    graph.add_vertex(R2, (3.0, 1.0))
-    graph.add_edge(POSE_PRIOR, [0], (0.0, 0.0, 0.0), POSE, "anchor")
-    graph.add_edge(BEARING, [0, 1], [0.3], Gaussian.from_sigmas(0.01), "landmarks")
-    solver = Solver(graph)
-    solver.add([0, 1], [0, 1])
-    for vertex in (0, 1):
-        with pytest.raises(SingularError, match="vertex 1"):
-            solver.marginal([vertex])
-
-
 def test_G16_what_an_update_costs_does_not_grow_with_the_graph_while_no_loop_is_closed():
     graph = Graph()
     solver = Solver(graph)

@@ -81,14 +81,3 @@ def test_a_recording_with_a_gyro_is_replayed_and_repeated_to_the_same_bytes(bag,
     assert main(["replay", str(tmp_path / "run"), "--out", str(tmp_path / "again")]) == 0
     for name in ("path.tum", "landmarks.csv", "graph.g2o", "ledger.csv"):
         assert (tmp_path / "again" / name).read_bytes() == (tmp_path / "run" / name).read_bytes()
-
-
-def test_a_gyro_in_degrees_is_said_at_the_end(bag, tmp_path, capsys, monkeypatch):
-    from graph_slam_ros.messages.inputs import odometry
-
-    usual = odometry.so3.act
-    monkeypatch.setattr(odometry.so3, "act", lambda q, v: tuple(57.3 * x for x in usual(q, v)))
-    replayed(bag, tmp_path / "run", ("odometry.noise", "motion"), ("odometry.turn_per_rad", 0.001))
-    said = " ".join(capsys.readouterr().err.split())
-    assert "imu: gyro and odometry contradict each other" in said
-    assert "are these degrees?" in said

@@ -158,14 +158,6 @@ def test_B10_what_was_held_up_or_comes_again_or_of_one_source_of_two_begins_noth
     assert not any(begins_anew(*two)), "the wheels go on"
 
 
-def test_B10_a_single_late_message_is_no_jump_back():
-    p = run(slam(), *straight(0, 3), at(-60, 5.0), seen(-60), *straight(3.1, 3), seen(6))
-    assert p.counters.as_dict() == {"odometry": {"late": 1}, "/landmarks": {"before_odometry": 1}}
-    assert p.segments == [0]
-    assert p.trajectory()[-1, 0] == pytest.approx(6.1, abs=0.3)
-    assert set(p.landmarks) == {"a"}
-
-
 def test_B19_where_nothing_is_seen_odometry_goes_on_and_the_covariance_grows():
     drive = straight(0, 60)
     p = slam()
@@ -190,16 +182,12 @@ def test_B21_however_often_odometry_comes_keyframes_come_by_the_way_and_not_by_m
     assert sigma_of_edges(p)[:, 0] == pytest.approx([0.02] * 20, rel=0.01), "of a second each"
 
 
-def test_B4_B5_a_zero_stamp_is_refused_on_every_topic_and_so_is_one_that_is_none():
+def test_B4_a_zero_stamp_is_refused_on_every_topic():
     for name, (made, cdr) in INPUTS.items():
         b = made()
         assert heard(b, name, cdr(0)) is None, name
         assert counted(b) == {name: {"zero_stamp": 1}}
         assert heard(b, name, cdr(STAMP_NS)).stamp_ns == STAMP_NS, name
-    for changes in ({"nanosec": 10**9}, {"nanosec": 2**32 - 1}, {"sec": -1}):
-        b = border()
-        assert heard(b, "odom", odometry(**changes)) is None, changes
-        assert counted(b) == {"odom": {"bad_stamp": 1}}
 
 
 def test_B3_B22_of_odometry_of_one_stamp_the_first_is_used_and_the_motion_is_not_lost():
@@ -213,6 +201,8 @@ def test_B3_B22_of_odometry_of_one_stamp_the_first_is_used_and_the_motion_is_not
     assert p.counters.as_dict() == {"odometry": {"duplicate_stamp": 90}}
     assert told == [("odometry", "duplicate_stamp")], "the topic is named once"
     assert p.trajectory()[:, 0] == pytest.approx(0.1 * np.arange(10))
+    p = run(slam(ordering__window_s=0.05, ordering__max_waiting=3), *(at(7, x) for x in range(10)))
+    assert p.counters.as_dict() == {"odometry": {"overflow": 7}}, "repeated for ever it fills no memory"
 
 
 def test_B9_B18_over_a_gap_odometry_is_one_edge_whose_noise_has_grown_with_time_or_no_motion_where_it_began_anew():

@@ -30,7 +30,6 @@ VERTEX_SE2 11 1.5 -2e-3 .25
 VERTEX_XY 7 3. +4
 EDGE_SE2 10 11 1 0 0.1 10 1 -2 20 3 30
 """
-EDGE = "EDGE_SE2 10 11 1 0 0.1 10 1 -2 20 3 30"
 
 
 @pytest.fixture

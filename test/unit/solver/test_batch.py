@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from places import ROOT
 from rows import each
 
 from graph_slam_ros.errors import GraphSlamError
@@ -30,7 +29,6 @@ from graph_slam_ros.lie import se3
 from graph_slam_ros.optimization import optimize
 from graph_slam_ros.solver import Settings, Solver, initial_values
 
-CITY = ROOT / "data/city.g2o"
 STARTS = ["file", "tree", "chordal", "online"]
 STEP = (1.0, 0.2, 0.0, *np.array([0.1, -0.2, 0.3, np.sqrt(0.86)]))
 
