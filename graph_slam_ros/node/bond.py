@@ -4,7 +4,7 @@ The manager notices when this node is gone. The protocol is that of bondcpp, wit
 Nav2's own servers, silence of the manager does not end the bond; only its message does.
 """
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
 from rclpy.clock import Clock, ClockType
@@ -12,7 +12,9 @@ from rclpy.duration import Duration
 
 from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.messages.message_class import message_class
-from graph_slam_ros.node.handle import NodeHandle
+
+if TYPE_CHECKING:
+    from graph_slam_ros.node.node import GraphSlamNode
 
 _TYPE = "bond/msg/Status"
 _PERIOD_S, _TIMEOUT_S = 0.25, 4.0  # Nav2's
@@ -45,7 +47,7 @@ class Bond:
         The messages are not installed.
     """
 
-    def __init__(self, node: NodeHandle) -> None:
+    def __init__(self, node: "GraphSlamNode") -> None:
         self._node, self._instance = node, str(uuid4())
         self._status = message_class(_TYPE)
         self._is_formed = self._is_over = False

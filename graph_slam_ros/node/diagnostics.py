@@ -14,7 +14,6 @@ from graph_slam_ros.messages.inputs.transforms import MAP_FRAMES
 from graph_slam_ros.messages.to_msg import ERROR, OK, WARN, Status
 from graph_slam_ros.node.estimate import OFF, Estimate
 from graph_slam_ros.node.events import Outcome
-from graph_slam_ros.node.recent import WINDOW_S, Recent
 from graph_slam_ros.runs.outcome import MOTION, leaves_plane
 from graph_slam_ros.runs.tables import INPUT_COLUMNS
 
@@ -30,6 +29,44 @@ _TRANSITIONS = {
     "inactive": "waits for ros2 lifecycle set NODE activate, or a lifecycle manager",
 }
 _UNLINKED = ("frame_unknown", "child_frame_unknown", "odom_frame_unknown", "map_frame_unknown")
+WINDOW_S = 10.0
+_SHARE, _LEAST = 0.1, 3  # of what came, and how much at least
+
+
+@dataclass(frozen=True, slots=True)
+class Recent:
+    """The counts of one input in the last ten seconds; of a message that holds several things, each counts.
+
+    Attributes
+    ----------
+    came : things
+    refused : how many of them by reason, by the border and by the pipeline; what was repaired is not refused
+    goes_on : whether something was refused in the last three seconds, or nothing came then
+    """
+
+    came: int = 0
+    refused: Mapping[str, int] = field(default_factory=dict)
+    goes_on: bool = False
+
+    @property
+    def times(self) -> int:
+        """The number of refusals."""
+        return sum(self.refused.values())
+
+    @property
+    def worst(self) -> str:
+        """The most frequent reason; empty if nothing was refused."""
+        return max(self.refused, key=lambda reason: self.refused[reason], default="")
+
+    @property
+    def is_bad(self) -> bool:
+        """Return whether more than a tenth was refused, and refusals go on."""
+        return self.goes_on and self.times >= _LEAST and self.times > _SHARE * self.came
+
+    @property
+    def is_nothing_used(self) -> bool:
+        """Return whether all was refused."""
+        return self.times >= self.came
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from graph_slam_ros.messages.to_msg import ERROR, OK, WARN, Status
+from graph_slam_ros.messages.to_msg import OK, WARN, Status
 from graph_slam_ros.slam import GraphSlam, Update
 from graph_slam_ros.slam.doubt.record import Alarm, Slip
 from graph_slam_ros.slam.robust.ledger import Verdict, VerdictChange
@@ -105,6 +105,3 @@ def name_of(slam: GraphSlam, edge: int) -> str:
     one = slam.graph.edge(edge)
     of = next((name for name, mark in slam.landmarks.items() if mark.vertex in one.vertices), "")
     return f"{one.label} {of}".strip()
-
-
-__all__ = ["ERROR", "OK", "WARN", "correction", "happened", "name_of", "of_update"]

@@ -1,22 +1,73 @@
 """Collects the facts from which the state of the node is judged."""
 
 import time
-from collections.abc import Callable
+from collections import Counter, deque
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from functools import partial
+from typing import TYPE_CHECKING
 
 from graph_slam_ros.errors import message_of
-from graph_slam_ros.node.diagnostics import Facts
-from graph_slam_ros.node.handle import NodeHandle
+from graph_slam_ros.measurements.reasons import Effect, explain
+from graph_slam_ros.node.diagnostics import WINDOW_S, Facts, Recent
 from graph_slam_ros.node.ingest import Ingest
 from graph_slam_ros.node.preparation import Preparation
 from graph_slam_ros.node.publishers import Publishers, PublishingClock
-from graph_slam_ros.node.recent import RecentInputs
 from graph_slam_ros.node.session import Session
 from graph_slam_ros.node.subscriptions import Subscriptions
 from graph_slam_ros.node.tf_broadcaster import TfBroadcaster
 from graph_slam_ros.node.worker import Worker, run_in_thread
 from graph_slam_ros.slam import Counters
+
+if TYPE_CHECKING:
+    from graph_slam_ros.node.node import GraphSlamNode
+
+
+_LATELY_S = 3.0
+_OF_ITS_OWN = {"overflow"}  # the verdict has a sentence for it
+Counts = Mapping[str, Mapping[str, int]]
+
+
+class RecentInputs:
+    """Remembers totals of the last seconds, and returns their differences."""
+
+    def __init__(self) -> None:
+        self._past: deque[tuple[float, Counter[str], Counter[tuple[str, str]]]] = deque([(0.0, Counter(), Counter())])
+
+    def observe(self, now_s: float, accepted: Mapping[str, int], before: Counts, after: Counts) -> dict[str, Recent]:
+        """Return the counts of each input in the last seconds. Call it about every second.
+
+        Parameters
+        ----------
+        now_s : by a clock that never stands
+        accepted : things that were handed to the pipeline since the start, by input
+        before, after : what was counted since the start by input and reason: before that, and by the pipeline
+        """
+        not_accepted, refused = _refused(before), _refused(before, after)
+        came = Counter(accepted)
+        for (name, _), times in not_accepted.items():
+            came[name] += times
+        self._past.append((now_s, came, refused))
+        while len(self._past) > 2 and self._past[1][0] <= now_s - WINDOW_S:
+            self._past.popleft()
+        lately = next(one for one in self._past if one[0] >= now_s - _LATELY_S or one is self._past[-1])
+        (_, came_before, refused_before), (_, came_lately, refused_lately) = self._past[0], lately
+        out = {}
+        for name in came:
+            mine = {reason: n for (of, reason), n in (refused - refused_before).items() if of == name}
+            is_refused = any(of == name for of, _ in refused - refused_lately)
+            out[name] = Recent(came[name] - came_before[name], mine, is_refused or came[name] == came_lately[name])
+        return out
+
+
+def _refused(*counts: Counts) -> Counter[tuple[str, str]]:
+    out: Counter[tuple[str, str]] = Counter()
+    for some in counts:
+        for name, reasons in some.items():
+            for reason, times in reasons.items():
+                if reason not in _OF_ITS_OWN and explain(reason).effect is Effect.REFUSED:
+                    out[name.partition("#")[0], reason] += times
+    return out
 
 
 class FactCollector:
@@ -29,7 +80,7 @@ class FactCollector:
 
     def __init__(
         self,
-        node: NodeHandle,
+        node: "GraphSlamNode",
         counters: Counters,
         session: Session,
         worker: Worker,

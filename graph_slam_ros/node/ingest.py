@@ -5,7 +5,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rclpy.clock import JumpThreshold
 from rclpy.duration import Duration
@@ -22,7 +22,6 @@ from graph_slam_ros.messages.message_class import message_class
 from graph_slam_ros.messages.to_msg import OK, WARN
 from graph_slam_ros.node import events
 from graph_slam_ros.node.events import Outcome
-from graph_slam_ros.node.handle import NodeHandle
 from graph_slam_ros.node.input_check import InputCheck
 from graph_slam_ros.node.pose_extrapolator import PoseExtrapolator
 from graph_slam_ros.node.publishers import Publishers, PublishingClock
@@ -32,6 +31,9 @@ from graph_slam_ros.slam import Config, Control, Counters, Odometry
 from graph_slam_ros.slam.edits import SOURCE as EDITS
 from graph_slam_ros.slam.edits import removal
 from graph_slam_ros.slam.frontend.ingest_gate import JUMP_BACK_S, IngestGate, Passage
+
+if TYPE_CHECKING:
+    from graph_slam_ros.node.node import GraphSlamNode
 
 OnJump = Callable[[Passage, str, str], None]
 
@@ -61,7 +63,7 @@ class Ingest:
 
     def __init__(
         self,
-        node: NodeHandle,
+        node: "GraphSlamNode",
         config: Config,
         counters: Counters,
         session: Session,
@@ -297,7 +299,7 @@ class FutureStamps:
         self._until_ns = 0
 
 
-def _full_topic(node: NodeHandle, topic: str) -> str:
+def _full_topic(node: "GraphSlamNode", topic: str) -> str:
     """The full name of a topic; as it is where it is not valid, which the activation refuses."""
     try:
         return node.resolve_topic_name(topic)

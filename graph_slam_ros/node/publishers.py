@@ -7,7 +7,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
@@ -17,11 +17,13 @@ from graph_slam_ros.messages.message_class import message_class
 from graph_slam_ros.messages.path_updates import PathUpdates
 from graph_slam_ros.messages.to_msg import Status
 from graph_slam_ros.node import events
-from graph_slam_ros.node.handle import NodeHandle
 from graph_slam_ros.node.session import Session
 from graph_slam_ros.node.worker import Worker
 from graph_slam_ros.slam import Config, GraphSlam, Update
 from graph_slam_ros.slam.frontend.ingest_gate import input_of, size_of
+
+if TYPE_CHECKING:
+    from graph_slam_ros.node.node import GraphSlamNode
 
 _LANDMARKS = ("landmarks", "landmarks_estimate")
 _LATER = ("path", "path_updates", "graph", *_LANDMARKS)
@@ -47,7 +49,7 @@ class _Topic:
 class Publishers:
     """Publishers of results. The node creates them, and the worker's thread uses them."""
 
-    def __init__(self, node: NodeHandle, config: Config) -> None:
+    def __init__(self, node: "GraphSlamNode", config: Config) -> None:
         self._node = node
         self._topics = {
             one.name.removeprefix("~/"): _Topic(
@@ -184,7 +186,7 @@ class PublishingClock:
     processed : measurements that the worker has processed, by input
     """
 
-    def __init__(self, node: NodeHandle, publishers: Publishers, worker: Worker) -> None:
+    def __init__(self, node: "GraphSlamNode", publishers: Publishers, worker: Worker) -> None:
         self._node, self._publishers, self._worker = node, publishers, worker
         self.refused = self._done = 0
         self.processed: Counter[str] = Counter()

@@ -2,15 +2,17 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.messages.from_msg import TF, TRANSFORMS
 from graph_slam_ros.messages.inputs import uses
-from graph_slam_ros.node.handle import NodeHandle
 from graph_slam_ros.slam import Config
+
+if TYPE_CHECKING:
+    from graph_slam_ros.node.node import GraphSlamNode
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +57,7 @@ class InputTopic:
     qos: InputQos
 
 
-def input_topics(node: NodeHandle, config: Config) -> list[InputTopic]:
+def input_topics(node: "GraphSlamNode", config: Config) -> list[InputTopic]:
     """The topics of the inputs, and /tf. Raises ConfigError as ``input_qos`` does."""
     topics: dict[tuple[str, str], list[str]] = {(TRANSFORMS, "/tf"): [TF]} if config.inputs.tf else {}
     used = uses(config)

@@ -9,25 +9,25 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from graph_slam_ros.config.config import with_survey
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.measurements.types import Event
 from graph_slam_ros.node.diagnostics import Facts
-from graph_slam_ros.node.estimate import Estimate
 from graph_slam_ros.node.fact_collector import FactCollector
-from graph_slam_ros.node.handle import NodeHandle
 from graph_slam_ros.node.ingest import Ingest
 from graph_slam_ros.node.preparation import Completion, Preparation
 from graph_slam_ros.node.publishers import Publishers, PublishingClock
-from graph_slam_ros.node.qos import input_topics
 from graph_slam_ros.node.session import Session
 from graph_slam_ros.node.subscriptions import Subscriptions
 from graph_slam_ros.node.tf_broadcaster import TfBroadcaster
 from graph_slam_ros.node.worker import Worker
-from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Odometry, Update
+from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Update
 from graph_slam_ros.slam.frontend.ingest_gate import Passage
+
+if TYPE_CHECKING:
+    from graph_slam_ros.node.node import GraphSlamNode
 
 _HINTS = {"future": ", ahead of the clock: is use_sim_time to be set, or does a clock differ?"}
 
@@ -44,7 +44,7 @@ class Runtime:
     counters : of what is refused before the pipeline; those of the pipeline belong to the worker's thread
     """
 
-    def __init__(self, node: NodeHandle) -> None:
+    def __init__(self, node: "GraphSlamNode") -> None:
         config = with_survey(node.config)
         self._node = node
         self.counters = Counters()
@@ -84,19 +84,9 @@ class Runtime:
         """Subscribe and broadcast. A second call changes nothing."""
         if self._subscriptions is not None:
             return
-        node, config, ingest = self._node, self._node.config, self._ingest
-        self._broadcaster = TfBroadcaster(node, config, node.guarded, self._now)
-        self._subscriptions = Subscriptions(
-            node,
-            config,
-            input_topics(node, config),
-            ingest.converter,
-            ingest.check.add,
-            ingest.receive,
-            node.guarded,
-            self._broadcaster.on_correction,
-            self.counters,
-        )
+        node, ingest = self._node, self._ingest
+        self._broadcaster = TfBroadcaster(node, self._session, ingest)
+        self._subscriptions = Subscriptions(node, node.config, ingest, self._broadcaster, self.counters)
         ingest.activate()
 
     def deactivate(self) -> None:
@@ -107,10 +97,6 @@ class Runtime:
         self._broadcaster.close()
         self._ingest.deactivate()
         self._subscriptions = self._broadcaster = None
-
-    def _now(self) -> tuple[Config, Estimate | None, Odometry | None]:
-        """Configuration, estimate and odometry, from which ``map -> odom`` is made."""
-        return self._node.config, self._session.estimate, self._ingest.extrapolator.newest
 
     def finish(self, patience_s: float | None, is_urgent: Callable[[], bool] = lambda: False) -> None:
         """Save what is not saved yet, and remove everything, with the patience of ``Worker.stop``.

@@ -5,12 +5,14 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from std_srvs.srv import Trigger
 
 from graph_slam_ros.errors import ConfigError, GraphSlamError, message_of
-from graph_slam_ros.node.handle import NodeHandle
+
+if TYPE_CHECKING:
+    from graph_slam_ros.node.node import GraphSlamNode
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +30,11 @@ Answer = Callable[[Any, str, BaseException | None], Any]
 
 
 def serve_later(
-    node: NodeHandle, name: str, start: Callable[[Any], "Future[str]"], kind: Any = Trigger, answer: Answer = _triggered
+    node: "GraphSlamNode",
+    name: str,
+    start: Callable[[Any], "Future[str]"],
+    kind: Any = Trigger,
+    answer: Answer = _triggered,
 ) -> None:
     """Serve requests, of ``std_srvs/Trigger`` by default: ``start`` starts the work, and its result is the message.
 
@@ -42,7 +48,7 @@ def serve_later(
         except Exception as error:
             return answer(response, "", error)
 
-    service = node.create_service(kind, name, on_request)
+    service: Any = node.create_service(kind, name, on_request)
     send = service.send_response
 
     def send_when_done(response: Any, header: Any) -> None:
@@ -97,7 +103,7 @@ def loaded_from(request: Any, dimensions: int) -> Values:
     return {"output.load": _name(request), "output.load_pose": pose, "map.localize": localizes}
 
 
-def serve_maps(node: NodeHandle, serve_later: Callable[..., None]) -> None:
+def serve_maps(node: "GraphSlamNode", serve_later: Callable[..., None]) -> None:
     """Serve ``~/serialize_map`` and ``~/deserialize_map`` if slam_toolbox is installed, by ``services.serve_later``."""
     try:
         types = import_module("slam_toolbox.srv")

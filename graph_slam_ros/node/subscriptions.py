@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial, wraps
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 try:
     from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventTypeError
@@ -17,16 +17,19 @@ from rclpy.utilities import get_rmw_implementation_identifier
 
 from graph_slam_ros.config.inputs import InputConfig
 from graph_slam_ros.measurements.types import Measured
-from graph_slam_ros.messages.from_msg import TF, TF_STATIC, TRANSFORMS, MessageConverter, is_correction
+from graph_slam_ros.messages.from_msg import TF, TF_STATIC, TRANSFORMS, is_correction
 from graph_slam_ros.messages.inputs import uses
 from graph_slam_ros.messages.inputs.landmark_types import LANDMARK_TYPES
 from graph_slam_ros.messages.message_class import message_class
-from graph_slam_ros.node.diagnostics import InputFacts
-from graph_slam_ros.node.handle import NodeHandle
-from graph_slam_ros.node.qos import InputQos, InputTopic
-from graph_slam_ros.node.recent import Recent
+from graph_slam_ros.node.diagnostics import InputFacts, Recent
+from graph_slam_ros.node.ingest import Ingest
+from graph_slam_ros.node.qos import InputQos, InputTopic, input_topics
 from graph_slam_ros.slam import Config, Counters
 from graph_slam_ros.slam.frontend.ingest_gate import input_of
+
+if TYPE_CHECKING:
+    from graph_slam_ros.node.node import GraphSlamNode
+    from graph_slam_ros.node.tf_broadcaster import TfBroadcaster
 
 _NUMBER = "publication_sequence_number"
 _UNSUPPORTED = 2**63
@@ -75,7 +78,7 @@ _MOST = 3  # that are named
 _LANDMARKS = frozenset({"vision_msgs/msg/Detection3DArray", *LANDMARK_TYPES})
 
 
-def alternatives(node: NodeHandle, one: InputConfig, use: str, subscribed: Collection[str]) -> tuple[str, ...]:
+def alternatives(node: "GraphSlamNode", one: InputConfig, use: str, subscribed: Collection[str]) -> tuple[str, ...]:
     """Return a text for each topic of another node that the input could use, with the parameters that choose it.
 
     Parameters
@@ -101,17 +104,13 @@ def _text(name: str, topic: str, kind: str, *, is_other_type: bool) -> str:
     return f"{topic} has this type: {name}.topic:={topic}"
 
 
-def _others(node: NodeHandle, topic: str) -> Iterator[bool]:
+def _others(node: "GraphSlamNode", topic: str) -> Iterator[bool]:
     """Yield for each publisher of a topic whether it belongs to another node."""
     own = node.get_name(), node.get_namespace()
     for publisher in node.get_publishers_info_by_topic(topic):
         yield (publisher.node_name, publisher.node_namespace) != own
 
 
-Callback = Callable[..., None]
-Guard = Callable[[Callback], Callback]
-Collect = Callable[[str, Sequence[str], int, Sequence[Measured]], None]
-Receive = Callable[[Sequence[Measured], bytes], None]
 _STATIC = InputQos(100, "/tf_static", "/tf_static")
 
 
@@ -146,30 +145,21 @@ class Subscriptions:
 
     Parameters
     ----------
-    topics : the topics of the inputs, and /tf
-    converter : makes measurements of messages
-    collect : is called with each topic, its inputs, the time, and the measurements of each message
-    receive : is called with the measurements of each message, which may be none, and the message
-    guarded : makes a callback that raises nothing
-    on_correction : is called with each transform from map
+    ingest : converts each message, and gets its measurements, which may be none
+    broadcaster : gets each transform from map
     counters : count the messages that the middleware has lost
     """
 
     def __init__(
         self,
-        node: NodeHandle,
+        node: "GraphSlamNode",
         config: Config,
-        topics: Sequence[InputTopic],
-        converter: MessageConverter,
-        collect: Collect,
-        receive: Receive,
-        guarded: Guard,
-        on_correction: Callable[[bytes], None],
+        ingest: Ingest,
+        broadcaster: "TfBroadcaster",
         counters: Counters,
     ) -> None:
-        self._node, self._config, self._converter = node, config, converter
-        self._collect, self._receive, self._guarded, self._on_correction = collect, receive, guarded, on_correction
-        self._counters = counters
+        self._node, self._config, self._ingest = node, config, ingest
+        self._broadcaster, self._counters = broadcaster, counters
         self._subscriptions: list[Any] = []
         self._topics: dict[str, _Received] = {}
         self._of_input: dict[str, InputTopic] = {}
@@ -177,7 +167,7 @@ class Subscriptions:
         self._on_tf: dict[str, _Received] = {}  # odometry there
         self._converted: Counter[str] = Counter()
         used = uses(config)
-        for topic in (InputTopic(TRANSFORMS, "/tf_static", [TF_STATIC], _STATIC), *topics):
+        for topic in (InputTopic(TRANSFORMS, "/tf_static", [TF_STATIC], _STATIC), *input_topics(node, config)):
             self._subscribe(topic)
             for name in topic.inputs:
                 if name in used:
@@ -193,7 +183,7 @@ class Subscriptions:
 
     def _subscribe(self, topic: InputTopic) -> None:
         """Convert every message of a topic for each of its inputs, one input after another."""
-        converter, map_frame, names, is_tf = self._converter, self._config.frames.map, topic.inputs, TF in topic.inputs
+        ingest, map_frame, names, is_tf = self._ingest, self._config.frames.map, topic.inputs, TF in topic.inputs
         counted = self._topics[topic.name] = _Received()
         losses = None if event_is_safe() else Losses(lambda: self._publisher_ids(topic.name))
 
@@ -209,19 +199,20 @@ class Subscriptions:
             if losses is not None:
                 count_lost(losses.before(info, time.monotonic_ns()))
             if is_tf and is_correction(cdr, map_frame):
-                self._on_correction(cdr)
+                self._broadcaster.on_correction(cdr)
                 return
             counted.received += 1
             measured: list[Measured] = []
             for name in names:
-                given = converter.convert(name, cdr)
+                given = ingest.converter.convert(name, cdr)
                 self._converted[name] += len(given)
                 self._note_late(name, given)
                 measured += given
-            self._receive(measured, cdr)
-            self._collect(topic.name, names, self._node.now_ns, measured)
+            ingest.receive(measured, cdr)
+            ingest.check.add(topic.name, names, self._node.now_ns, measured)
 
-        self._subscriptions.append(self._created(topic, _with_info(on_message, self._guarded), self._guarded(on_lost)))
+        guarded = self._node.guarded
+        self._subscriptions.append(self._created(topic, _with_info(guarded(on_message), on_message), guarded(on_lost)))
 
     def _note_late(self, name: str, given: Sequence[Measured]) -> None:
         """Note how late the newest measurement of a message is, by the node's clock."""
@@ -230,7 +221,7 @@ class Subscriptions:
             late_ns = now_ns - max(stamps_ns)
             self._late_ns[name] = min(late_ns, self._late_ns.get(name, late_ns))
 
-    def _created(self, topic: InputTopic, on_message: Callback, on_lost: Callback) -> Any:
+    def _created(self, topic: InputTopic, on_message: Callable[..., None], on_lost: Callable[..., None]) -> Any:
         """A subscription, with the event of lost messages if the middleware has one that can be used."""
         create = partial(self._node.create_subscription, message_class(topic.type_name), topic.name, on_message)
         if event_is_safe():
@@ -294,9 +285,9 @@ class Subscriptions:
                     names,
                     use_of[one.name] == "odometry" and one.type != TRANSFORMS and len(names) > 1,
                     self._mismatches(topic),
-                    self._converter.unlinked(one.name),
+                    self._ingest.converter.unlinked(one.name),
                     recent.get(one.name, Recent()),
-                    self._converter.not_found(one.name),
+                    self._ingest.converter.not_found(one.name),
                     () if names else alternatives(self._node, one, use_of[one.name], self._topics),
                     self._late_ns.pop(one.name, math.nan) * 1e-9,
                 )
@@ -309,12 +300,12 @@ class Subscriptions:
         return "; ".join(filter(None, (_mismatch(publisher, topic) for publisher in publishers)))
 
 
-def _with_info(on_message: Callable[[bytes, Mapping[str, Any]], None], guarded: Guard) -> Callback:
+def _with_info(call: Callable[..., None], on_message: Callable[..., None]) -> Callable[..., None]:
     """Return a callback that receives what rclpy says of a message, too.
 
-    rclpy reads from its signature that it wants both, and its events executor (7.1) gives them as one tuple.
+    rclpy reads from the signature of ``on_message`` that it wants both, and its events executor (7.1) gives them as one
+    tuple.
     """
-    call = guarded(on_message)
 
     @wraps(on_message)
     def received(*given: Any) -> None:

@@ -3,8 +3,7 @@
 import math
 import time
 from collections import deque
-from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from tf2_msgs.msg import TFMessage
@@ -13,11 +12,13 @@ from graph_slam_ros.config.config import Config
 from graph_slam_ros.config.node import TfConfig
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.messages import to_msg
-from graph_slam_ros.node.estimate import Estimate
-from graph_slam_ros.node.handle import NodeHandle
+from graph_slam_ros.node.ingest import Ingest
+from graph_slam_ros.node.session import Session
 from graph_slam_ros.node.subscriptions import full_name
-from graph_slam_ros.slam import Odometry
 from graph_slam_ros.typing import Numbers
+
+if TYPE_CHECKING:
+    from graph_slam_ros.node.node import GraphSlamNode
 
 
 class MapToOdom:
@@ -92,7 +93,7 @@ class StaticRival:
     Such a message comes once and stays valid. When a publisher of the topic has gone, all others are asked again.
     """
 
-    def __init__(self, node: NodeHandle, odom_frame: str) -> None:
+    def __init__(self, node: "GraphSlamNode", odom_frame: str) -> None:
         self._node, self._frame = node, odom_frame
         self._until_s, self._parent = -math.inf, ""
         self._publishers: set[bytes] = set()
@@ -142,8 +143,7 @@ class TfBroadcaster:
 
     Parameters
     ----------
-    guarded : makes a callback that raises nothing
-    now : gives the configuration, the last estimate and the newest odometry
+    session, ingest : have the last estimate, and the newest odometry
 
     Attributes
     ----------
@@ -152,19 +152,18 @@ class TfBroadcaster:
 
     def __init__(
         self,
-        node: NodeHandle,
-        config: Config,
-        guarded: Callable[[Callable[..., None]], Callable[..., None]],
-        now: Callable[[], tuple[Config, Estimate | None, Odometry | None]],
+        node: "GraphSlamNode",
+        session: Session,
+        ingest: Ingest,
     ) -> None:
-        self._node, self._now = node, now
+        self._node, self._session, self._ingest, config = node, session, ingest, node.config
         self._policy = MapToOdom(config)
         self._publisher = node.create_publisher(TFMessage, "/tf", 100)
         self._is_closed = False
         self._ours: deque[bytes] = deque(maxlen=_REMEMBERED)
         self._others_s = -1e9
         self.static = StaticRival(node, config.frames.odom)
-        self._timer = node.create_timer(config.tf.transform_publish_period, guarded(self._tick))
+        self._timer = node.create_timer(config.tf.transform_publish_period, node.guarded(self._tick))
 
     def close(self) -> None:
         """Remove timer and publisher. A tick that is already on its way finds them removed."""
@@ -199,7 +198,7 @@ class TfBroadcaster:
         return tuple(sorted(names - {own}))
 
     def _tick(self) -> None:
-        config, estimate, newest = self._now()
+        config, estimate, newest = self._node.config, self._session.estimate, self._ingest.extrapolator.newest
         if self._is_closed or estimate is None or newest is None or not config.tf.publish_tf or not estimate.is_located:
             return
         now_ns = self._node.get_clock().now().nanoseconds

@@ -12,12 +12,12 @@ from rows import each
 
 from graph_slam_ros.lie import se2, so3
 from graph_slam_ros.node import diagnostics
-from graph_slam_ros.node.diagnostics import Facts, InputFacts, judge, statuses
+from graph_slam_ros.node.diagnostics import Facts, InputFacts, Recent, judge, statuses
 from graph_slam_ros.node.estimate import doubted_lately
+from graph_slam_ros.node.fact_collector import RecentInputs
 from graph_slam_ros.node.ingest import FutureStamps
 from graph_slam_ros.node.parameters import files_for_others
 from graph_slam_ros.node.pose_extrapolator import PoseExtrapolator
-from graph_slam_ros.node.recent import Recent, RecentInputs
 from graph_slam_ros.node.session import Session
 from graph_slam_ros.node.tf_broadcaster import MapToOdom
 from graph_slam_ros.runs.tables import accepted_lately
