@@ -30,7 +30,7 @@ from std_srvs.srv import Trigger
 from vision_msgs.msg import Detection3DArray
 
 from graph_slam_ros.messages import topics
-from graph_slam_ros.messages.message_class import message_class
+from graph_slam_ros.messages.interfaces import message_class
 from graph_slam_ros.node.player import own_domain
 from graph_slam_ros.runs.replay import replay
 

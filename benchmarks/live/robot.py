@@ -24,7 +24,7 @@ from std_msgs.msg import UInt64
 
 from benchmarks.live.processes import asked, reply, ros, until
 from benchmarks.live.streams import STREAMS, TYPES, later, stamp_ns
-from graph_slam_ros.messages.message_class import message_class
+from graph_slam_ros.messages.interfaces import message_class
 from graph_slam_ros.recordings.bag import BagMessage
 
 HERE = "benchmarks.live.robot"

@@ -1,14 +1,17 @@
-"""Field layouts of the messages we use that have neither a wheel nor, for vision_msgs, a place in rosbags.
+"""Message types: field layouts of those we use that have neither a wheel nor, for vision_msgs, a place in rosbags.
 
-They are the published interfaces of tf2_msgs and vision_msgs, so what is generated from them (by the script
+The layouts are the published interfaces of tf2_msgs and vision_msgs, so what is generated from them (by the script
 ``tools/generate_interfaces.py``), what rosbags decodes with them (``typestore``) and an installed ROS exchange messages
 with each other.
 """
 
 from __future__ import annotations
 
+import importlib
 from functools import cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+from graph_slam_ros.errors import ConfigError
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
@@ -45,3 +48,18 @@ def typestore() -> Typestore:
         for message, fields in messages.items():
             store.register(get_types_from_msg(fields, f"{package}/msg/{message}"))
     return store
+
+
+def message_class(type_name: str) -> Any:
+    """The Python class of a type ``package/msg/Name``.
+
+    Raises
+    ------
+    ConfigError
+        The package is not installed, or has no such message.
+    """
+    package, _, name = type_name.split("/")
+    try:
+        return getattr(importlib.import_module(f"{package}.msg"), name)
+    except (ImportError, AttributeError):
+        raise ConfigError(f"{type_name}: {package} is not installed here, or has no such message") from None

@@ -11,7 +11,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 
 from graph_slam_ros.errors import ConfigError
-from graph_slam_ros.messages.message_class import message_class
+from graph_slam_ros.messages.interfaces import message_class
 
 if TYPE_CHECKING:
     from graph_slam_ros.node.node import GraphSlamNode

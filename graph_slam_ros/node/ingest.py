@@ -11,14 +11,13 @@ from rclpy.clock import JumpThreshold
 from rclpy.duration import Duration
 from rclpy.serialization import deserialize_message
 
-from graph_slam_ros.errors import GraphSlamError, did_you_mean, message_of
+from graph_slam_ros.errors import GraphSlamError, did_you_mean
 from graph_slam_ros.measurements.reasons import explain, remedy
 from graph_slam_ros.measurements.types import InitialPose, Measured
 from graph_slam_ros.messages import results, to_msg
 from graph_slam_ros.messages.from_msg import INITIAL_POSE, Decoder, MessageConverter, twist_of
 from graph_slam_ros.messages.inputs import uses
-from graph_slam_ros.messages.interfaces import typestore
-from graph_slam_ros.messages.message_class import message_class
+from graph_slam_ros.messages.interfaces import message_class, typestore
 from graph_slam_ros.messages.to_msg import OK, WARN
 from graph_slam_ros.node import events
 from graph_slam_ros.node.events import Outcome
@@ -140,7 +139,7 @@ class Ingest:
             self._session.accept(passage.measured)
             self._worker.offer(
                 partial(self._session.process, passage.measured),
-                partial(self._clock.after_message, self._session, passage.measured),
+                partial(self._clock.after_message, passage.measured),
             )
         else:
             self._clock.refused += 1
@@ -171,15 +170,6 @@ class Ingest:
         self._session.accept(events)
         return self._worker.call(partial(self._session.process, events))
 
-    def in_background(self, future: "Future[Any]") -> None:
-        """Log the exception of a job whose result is not used."""
-
-        def report(done: "Future[Any]") -> None:
-            if (error := done.exception()) is not None:
-                self._node.get_logger().error(message_of(error))
-
-        future.add_done_callback(report)
-
     def _on_initial_pose(self, cdr: bytes) -> None:
         before = self._counters.as_dict()
         poses = self.converter.initial_pose(cdr)
@@ -187,7 +177,7 @@ class Ingest:
             self._report(INITIAL_POSE, "initialpose: not used", before, self._counters)
         for pose in poses:
             self._publish_outcome("initialpose: used", is_done=True)
-            self.in_background(self.in_sequence([pose]))
+            self._node.in_background(self.in_sequence([pose]))
 
     def _on_remove(self, message: Any) -> None:
         try:
@@ -204,7 +194,7 @@ class Ingest:
             near = did_you_mean(str(dict(event.values).get("landmark", "")), known)
             self._report(EDITS, f"~/remove: {message.data[:_SHOWN]}", before, slam.counters, near)
 
-        self.in_background(self._worker.call(remove))
+        self._node.in_background(self._worker.call(remove))
 
     def _report(
         self, source: str, what: str, before: Mapping[str, Mapping[str, int]], counters: Counters, near: str = ""

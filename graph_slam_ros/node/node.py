@@ -26,7 +26,7 @@ from std_msgs.msg import UInt64
 
 from graph_slam_ros.errors import ConfigError, GraphSlamError, message_of
 from graph_slam_ros.messages import to_msg
-from graph_slam_ros.messages.message_class import message_class
+from graph_slam_ros.messages.interfaces import message_class
 from graph_slam_ros.node import bond, diagnostics
 from graph_slam_ros.node.parameters import changed, declare_parameters, files_for_others
 from graph_slam_ros.node.publishers import LATCHED
@@ -138,7 +138,7 @@ class GraphSlamNode(LifecycleNode):
             if self.config.journal.resume and run.was_cut_off:
                 unused = "" if self.config.load_pose is None else "; output.load_pose is not used: it has driven since"
                 self.get_logger().warn(f"the last run was never ended: going on in its map{unused}")
-                run.in_background(run.resume())
+                self.in_background(run.resume())
             elif self.config.output.load_at_start:
                 run.load_at_start()
 
@@ -250,6 +250,15 @@ class GraphSlamNode(LifecycleNode):
                 self.report_fault(error)
 
         return guarded
+
+    def in_background(self, future: "Future[Any]") -> None:
+        """Log the exception of a job whose result is not used."""
+
+        def report(done: "Future[Any]") -> None:
+            if (error := done.exception()) is not None:
+                self.get_logger().error(message_of(error))
+
+        future.add_done_callback(report)
 
     def report_fault(self, error: Exception) -> None:
         """Count an exception of a callback or a job, and log its traceback once."""

@@ -34,7 +34,7 @@ from graph_slam_ros.formats.cdr import CdrReader
 from graph_slam_ros.formats.parameters import parameters_text
 from graph_slam_ros.messages import to_msg
 from graph_slam_ros.messages.from_msg import TF, TF_STATIC, is_correction
-from graph_slam_ros.messages.message_class import message_class
+from graph_slam_ros.messages.interfaces import message_class
 from graph_slam_ros.overview.chosen_inputs import Inputs
 from graph_slam_ros.recordings.bag import Bag, BagMessage
 from graph_slam_ros.slam import Config

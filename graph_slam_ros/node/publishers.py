@@ -13,7 +13,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from graph_slam_ros.measurements.types import Measured
 from graph_slam_ros.messages import results, to_msg, topics
-from graph_slam_ros.messages.message_class import message_class
+from graph_slam_ros.messages.interfaces import message_class
 from graph_slam_ros.messages.path_updates import PathUpdates
 from graph_slam_ros.messages.to_msg import Status
 from graph_slam_ros.node import events
@@ -178,7 +178,7 @@ class PublishingClock:
 
     Parameters
     ----------
-    publishers : of the results
+    session : has the pipeline, whose results these are
 
     Attributes
     ----------
@@ -186,8 +186,8 @@ class PublishingClock:
     processed : measurements that the worker has processed, by input
     """
 
-    def __init__(self, node: "GraphSlamNode", publishers: Publishers, worker: Worker) -> None:
-        self._node, self._publishers, self._worker = node, publishers, worker
+    def __init__(self, node: "GraphSlamNode", session: Session, publishers: Publishers, worker: Worker) -> None:
+        self._node, self._session, self._publishers, self._worker = node, session, publishers, worker
         self.refused = self._done = 0
         self.processed: Counter[str] = Counter()
         self._acknowledged = -1
@@ -196,13 +196,13 @@ class PublishingClock:
 
     # -- in the main thread ------------------------------------------------------------------------------------------
 
-    def tick(self, session: Session) -> None:
+    def tick(self) -> None:
         """Offer the worker a job to publish what is due, ten times a second. It is overdue if the worker is busy."""
         self._has_player = self._node.has_player
         self._acknowledge()
         is_due = self._publishers.are_due(self._node.config)
         if is_due and self._worker.waiting < ACKNOWLEDGE:
-            self._worker.offer(lambda: self.publish_due(session.slam))
+            self._worker.offer(lambda: self.publish_due(self._session.slam))
         elif is_due and time.monotonic() - self._published_s > _MOST_UNPUBLISHED_S:
             self._is_overdue = True
 
@@ -214,19 +214,20 @@ class PublishingClock:
 
     # -- in the worker's thread --------------------------------------------------------------------------------------
 
-    def after_message(self, session: Session, measured: Sequence[Measured]) -> None:
+    def after_message(self, measured: Sequence[Measured]) -> None:
         """Count another processed message, publish what is overdue, and acknowledge."""
         self._done += 1
         for m in measured:
             self.processed[input_of(m)] += size_of(m)
         if self._is_overdue:
-            self.publish_due(session.slam)
+            self.publish_due(self._session.slam)
         if self._has_player and (not self._worker.waiting or self._done % ACKNOWLEDGE == 0):
             self._acknowledge()
 
-    def on_update(self, slam: GraphSlam, update: Update, *, is_located: bool) -> None:
+    def on_update(self, slam: GraphSlam, update: Update) -> None:
         """Publish what an update changed, and log large moves of the robot."""
-        self._publishers.update(slam, update, is_located=is_located)
+        estimate = self._session.estimate
+        self._publishers.update(slam, update, is_located=estimate is not None and estimate.is_located)
         moved, tf = update.correction, slam.config.tf
         if update.solved and (moved.distance_m > tf.report_jump_m or moved.angle_rad > _JUMP_RAD):
             slam.counters.count("tf", "jump")

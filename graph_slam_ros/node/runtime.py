@@ -56,7 +56,7 @@ class Runtime:
             undo.callback(self._publishers.close)
             self._worker = Worker(config.inputs.queue, node.report_fault, self._on_exit_of_a_job)
             undo.callback(self._worker.stop, 0.0)
-            self._clock = PublishingClock(node, self._publishers, self._worker)
+            self._clock = PublishingClock(node, self._session, self._publishers, self._worker)
             self._ingest = Ingest(
                 *(node, config, self.counters, self._session, self._worker),
                 *(self._publishers, self._clock, self._begin_anew),
@@ -137,7 +137,7 @@ class Runtime:
         self._ingest.tick()
         if self._subscriptions is not None:
             self._subscriptions.tick(self._node.now_ns)
-        self._clock.tick(self._session)
+        self._clock.tick()
 
     def _on_exit_of_a_job(self) -> None:
         """Continue from the last good estimate after an exception that would have ended the thread."""
@@ -153,17 +153,16 @@ class Runtime:
         if self._broadcaster is not None:
             self._broadcaster.forget_time()
         if passage.jump == "reset":
-            self.in_background(self.reset())
+            self._node.in_background(self.reset())
         elif passage.events:
-            self.in_background(self._ingest.in_sequence(passage.events))
+            self._node.in_background(self._ingest.in_sequence(passage.events))
 
     def _warn(self, source: str, reason: str) -> None:
         self._node.get_logger().warn(f"{source}: {reason}{_HINTS.get(reason, '')} (logged once, counted from now on)")
 
     def _on_update(self, slam: GraphSlam, update: Update) -> None:
         """Publish what an update changed, in the worker's thread."""
-        estimate = self._session.estimate
-        self._clock.on_update(slam, update, is_located=estimate is not None and estimate.is_located)
+        self._clock.on_update(slam, update)
 
     def facts(self, lifecycle: str) -> Facts:
         """Collect the facts from which the state of the node is judged."""
@@ -197,7 +196,7 @@ class Runtime:
         """Load the configured map. If it cannot be loaded, that is a state until another is."""
         loaded = self.load()
         loaded.add_done_callback(self._facts.note_load)
-        self.in_background(loaded)
+        self._node.in_background(loaded)
 
     def resume(self) -> "Future[str]":
         """Continue from the last run, which never ended."""
@@ -238,8 +237,4 @@ class Runtime:
 
     def set(self, values: dict[str, Any]) -> None:
         """Change parameters at this place in the ingest sequence."""
-        self.in_background(self._ingest.in_sequence([Control("set", tuple(values.items()))]))
-
-    def in_background(self, future: "Future[Any]") -> None:
-        """Log the exception of a job whose result is not used."""
-        self._ingest.in_background(future)
+        self._node.in_background(self._ingest.in_sequence([Control("set", tuple(values.items()))]))

@@ -20,7 +20,7 @@ from graph_slam_ros.measurements.types import Measured
 from graph_slam_ros.messages.from_msg import TF, TF_STATIC, TRANSFORMS, is_correction
 from graph_slam_ros.messages.inputs import uses
 from graph_slam_ros.messages.inputs.landmark_types import LANDMARK_TYPES
-from graph_slam_ros.messages.message_class import message_class
+from graph_slam_ros.messages.interfaces import message_class
 from graph_slam_ros.node.diagnostics import InputFacts, Recent
 from graph_slam_ros.node.ingest import Ingest
 from graph_slam_ros.node.qos import InputQos, InputTopic, input_topics
