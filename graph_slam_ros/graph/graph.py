@@ -185,12 +185,13 @@ class Graph:
 
     def edge(self, edge_id: int) -> Edge:
         """One edge, by its id; a GraphSlamError where there is none."""
-        self.edge_ids.existing([edge_id])
+        if type(edge_id) is not int or not self.edge_ids.has(edge_id):
+            self.edge_ids.existing([edge_id])
         table, row = self.row(edge_id)
         return Edge(
             edge_id,
             table.type,
-            self.ends_of(edge_id),
+            tuple(map(self.vertex_ids.of, table.vertex_rows.values[row].tolist())),
             table.measured.values[row].copy(),
             table.sqrt_information.values[row].copy(),
             self.labels[table.label.values[row]],
@@ -226,7 +227,7 @@ class Graph:
     def ends_of(self, edge_id: int) -> tuple[int, ...]:
         """The vertices of an edge."""
         table, row = self.row(edge_id)
-        return tuple(table.at(row).vertices.tolist())
+        return tuple(map(self.vertex_ids.of, table.vertex_rows.values[row].tolist()))
 
     def label_of(self, edge_id: int) -> str:
         """The class of an edge."""
@@ -262,8 +263,7 @@ class Graph:
         """Ids of the edges of a class, in order."""
         if label not in self.labels:
             return np.empty(0, dtype=np.int64)
-        code = self.labels.index(label)
-        found = [table.edge_row.values[table.label.values == code] for table in self.tables.values()]
+        found = [table.edge_row.values[table.label.values == self.labels.index(label)] for table in self._in_order]
         return self.edge_ids.of_all(np.sort(np.concatenate(found)))
 
     def keep(self, vertices: Index, edges: Index, values: Array) -> None:
@@ -277,10 +277,9 @@ class Graph:
         numbers = np.repeat(self.offset.values[kept] - (ends - sizes), sizes) + np.arange(int(sizes.sum()))
         self.kind.values, self.offset.values, self.initial.values = kinds, ends - sizes, values[numbers]
         rows_of = ((table, np.flatnonzero(np.isin(table.edge_row.values, kept_edges))) for table in self._in_order)
-        found = [(table, rows) for table, rows in rows_of if len(rows)]
-        found.sort(key=lambda one: int(one[0].edge_row.values[one[1][0]]))  # as if it was added edge by edge
+        found = sorted((int(table.edge_row.values[rows[0]]), table, rows) for table, rows in rows_of if len(rows))
         self.table_of_edge.values, self.row_of_edge.values = np.empty((2, len(edges)), dtype=np.int64)
-        for code, (table, rows) in enumerate(found):
+        for code, (_, table, rows) in enumerate(found):  # as if it was added edge by edge
             for column in table.columns:
                 column.values = column.values[rows]
             table.code, table.edge_row.values = code, np.searchsorted(kept_edges, table.edge_row.values)
@@ -288,7 +287,7 @@ class Graph:
             self.table_of_edge.values[table.edge_row.values] = code
             self.row_of_edge.values[table.edge_row.values] = np.arange(len(rows))
             table.locate()
-        self._in_order = [table for table, _ in found]
+        self._in_order = [table for _, table, _ in found]
         self.tables = {table.type: table for table in self._in_order}
         self.locate()
 

@@ -212,7 +212,7 @@ class LastingIds:
     shift : from there on, the difference between an id and its row
     """
 
-    __slots__ = ("_bounds", "_column", "_what", "early", "later", "shift")
+    __slots__ = ("_bounds", "_column", "_row_of", "_what", "early", "later", "shift")
 
     def __init__(self, what: str, column: Column) -> None:
         self._what, self._column = what, column
@@ -221,7 +221,7 @@ class LastingIds:
     def put(self, early: Index, later: int) -> None:
         """Give the rows other ids, because others are removed, or all are read from a file."""
         self.early, self.later, self.shift = early, later, later - len(early)
-        self._bounds = np.append(early, later)
+        self._bounds, self._row_of = np.append(early, later), dict(zip(early.tolist(), range(len(early)), strict=True))
 
     @property
     def next(self) -> int:
@@ -246,36 +246,37 @@ class LastingIds:
         if not self.later:
             return rows
         out, is_early = rows + self.shift, rows < len(self.early)
-        out[is_early] = self.early[rows[is_early]]
+        if is_early.any():
+            out[is_early] = self.early[rows[is_early]]
         return out
 
     def row(self, one: int) -> int:
         """The row of an id; -1 where it was removed."""
-        at = self.first_from(one)
-        return at if one >= self.later or (at < len(self.early) and self.early[at] == one) else -1
+        return one - self.shift if one >= self.later else self._row_of.get(one, -1)
 
     def rows(self, ids: Index) -> Index:
         """The rows of ids, of any shape; -1 where one was removed."""
         if not self.later:
             return ids
         out, is_early = ids - self.shift, ids < self.later
-        some = ids[is_early]
-        at = np.searchsorted(self.early, some)
-        out[is_early] = np.where(self._bounds[at] == some, at, -1)
+        if is_early.any():
+            some = ids[is_early]
+            at = self.early.searchsorted(some)
+            out[is_early] = np.where(self._bounds[at] == some, at, -1)
         return out
 
     def existing(self, ids: ArrayLike) -> Index:
         """The rows of ids, (n,); a GraphSlamError where one does not exist."""
         given = whole_numbers(ids, self._what).ravel()
         rows = self.rows(given)
-        strange = (rows < 0) | (rows >= self._column.count)
-        if np.count_nonzero(strange):
+        strange = rows.view(np.uint64) >= self._column.count  # negative ones, too
+        if strange.any():
             raise GraphSlamError(f"{self._what} {int(given[strange][0])} does not exist")
         return rows
 
     def first_from(self, one: int) -> int:
         """The first row whose id is not below one."""
-        return one - self.shift if one >= self.later else int(np.searchsorted(self.early, one))
+        return one - self.shift if one >= self.later else int(self.early.searchsorted(one))
 
 
 def whole_numbers(ids: ArrayLike, what: str) -> Index:
