@@ -250,7 +250,7 @@ class Graph:
 
     def copy(self) -> "Graph":
         """Another graph with the same records; kinds and types are the same objects."""
-        same = (*self.tables, *self._accepted, *self.kinds)
+        same = (*self.tables, *self._accepted, *self.kinds, self.vertex_ids.row_of, self.edge_ids.row_of)
         return deepcopy(self, {id(one): one for one in same})
 
     def has_label(self, edges: Index, labels: Sequence[str]) -> NDArray[np.bool_]:

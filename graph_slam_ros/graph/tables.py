@@ -207,12 +207,12 @@ class LastingIds:
 
     Attributes
     ----------
-    early : (n,) ids of the first n rows
+    early : (n,) ids of the first n rows; row_of : those rows, by id
     later : the id of the row after these
     shift : from there on, the difference between an id and its row
     """
 
-    __slots__ = ("_bounds", "_column", "_row_of", "_what", "early", "later", "shift")
+    __slots__ = ("_column", "_what", "early", "later", "row_of", "shift")
 
     def __init__(self, what: str, column: Column) -> None:
         self._what, self._column = what, column
@@ -221,7 +221,7 @@ class LastingIds:
     def put(self, early: Index, later: int) -> None:
         """Give the rows other ids, because others are removed, or all are read from a file."""
         self.early, self.later, self.shift = early, later, later - len(early)
-        self._bounds, self._row_of = np.append(early, later), dict(zip(early.tolist(), range(len(early)), strict=True))
+        self.row_of = {one: row for row, one in enumerate(early.tolist())}
 
     @property
     def next(self) -> int:
@@ -252,7 +252,7 @@ class LastingIds:
 
     def row(self, one: int) -> int:
         """The row of an id; -1 where it was removed."""
-        return one - self.shift if one >= self.later else self._row_of.get(one, -1)
+        return one - self.shift if one >= self.later else self.row_of.get(one, -1)
 
     def rows(self, ids: Index) -> Index:
         """The rows of ids, of any shape; -1 where one was removed."""
@@ -260,9 +260,7 @@ class LastingIds:
             return ids
         out, is_early = ids - self.shift, ids < self.later
         if is_early.any():
-            some = ids[is_early]
-            at = self.early.searchsorted(some)
-            out[is_early] = np.where(self._bounds[at] == some, at, -1)
+            out[is_early] = [self.row_of.get(one, -1) for one in ids[is_early].tolist()]
         return out
 
     def existing(self, ids: ArrayLike) -> Index:
