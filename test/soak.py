@@ -39,7 +39,7 @@ PROGRAMMES = {
     "journal": tests("test_journal.py"),
     "messages": tests("test_any_message.py", "test_any_measurement.py", "test_any_columns.py"),
     "permutations": tests("test_timing_cases.py", "-k", "B1"),
-    "solver_faults": tests("test_solver_faults.py", "test_graph_cases.py"),
+    "solver_faults": tests("test_solver_faults.py", "test_graph_cases.py", "test_revisions.py"),
     "recorded": tests("test_recorded.py"),
     "fuzzing": tests("test_fuzzing.py"),
     "kernels": tests("test_kernels.py"),

@@ -19,7 +19,7 @@ FILES = {path.relative_to(PACKAGE).as_posix(): path for path in sorted(PACKAGE.r
 
 SERVES = {"tools/view/server.py"}  # with the extra `view`, which may not be there
 DISTRIBUTES = {  # with the extra `fleet`
-    f"tools/fleet/{name}.py" for name in ("recordings", "job", "engine", "replay", "compare", "store", "page")
+    f"tools/fleet/{name}.py" for name in ("recordings", "job", "replay", "compare", "store", "page")
 }
 SPEAK_RCLPY = {
     f"node/{name}.py"

@@ -284,9 +284,9 @@ class SlipDetector:
 
     def _slipped(self, k: int) -> list[Pair]:
         """Odometry edges of a slip, by its place, that count as such, each with its replacement, in order of time."""
-        ids, ledger = self._backend.graph.edge_ids, self._backend.ledger
+        ids, ledger, first = self._backend.graph.edge_ids, self._backend.ledger, self._backend.first_free_edge
         pairs = [(own, used) for own, (slip, used) in sorted(self._replaced.items()) if slip == k]
-        there = [(own, used) for own, used in pairs if ids.has(own) and ids.has(used)]
+        there = [(own, used) for own, used in pairs if own >= first and ids.has(own) and ids.has(used)]
         is_slip = ledger.reason.values == Reason.SLIP
         return [
             (own, used)

@@ -207,9 +207,9 @@ class Window:
         return next(reversed(self.links.values())).stamps_ns[1] if self.links else 0
 
     def stretch(self, views: int, most: int) -> list[Link]:
-        """The newest links since the oldest of so many views, at most so many."""
-        oldest = self.views[-min(views, len(self.views))].vertex
-        newest = takewhile(lambda link: link.vertices[1] > oldest, reversed(self.links.values()))
+        """The newest links since the oldest of so many views, at most so many, and none of a map that is held."""
+        oldest, first = self.views[-min(views, len(self.views))].vertex, self._backend.first_free_edge
+        newest = takewhile(lambda link: link.vertices[1] > oldest and link.own >= first, reversed(self.links.values()))
         return list(islice(newest, most))[::-1]
 
     def drift_since(self, variances: Array, pose: Numbers, keyframe: int) -> tuple[float, float]:
