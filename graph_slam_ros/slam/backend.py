@@ -77,9 +77,7 @@ class Backend:
         self.handed_over, self.held = (0, 0), (0, 0)
         self.frozen, self.frozen_edges = start.frozen, start.ledger.final
         self.edits, self.bounded = list(start.edits), start.bounded or BoundedState()
-        self._background = Background[Outcome | None](
-            SECOND_LOOK, executor, config.apply_after_keyframes, self._counters
-        )
+        self._background = Background[Outcome | None](SECOND_LOOK, executor, config.apply_after_keyframes, counters)
         self._out = 0  # edges that were out at the last search
         self._rivals: tuple[Alternative, ...] = ()
         self.holds_back = False
@@ -263,7 +261,8 @@ class Backend:
         elif r.solves == "new":
             self._pending = [*self._pending, *r.compared][-_MAX_PENDING:]
             solver.update()
-            self._admit()
+            if r.compared:  # all others wait while an alarm is not decided
+                self._admit()
         return Applied(replaced, report)
 
     def replace(
