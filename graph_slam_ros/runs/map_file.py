@@ -233,8 +233,8 @@ def _state(told: Told, marks: Sequence[Told], columns: Columns) -> MapSnapshot:
         keyframes=_poses(StampedPoses(Keyframe, size, first), "keyframes", columns),
         sighting_poses=_poses(StampedPoses(SightingPose, size), "sightings", columns),
         landmarks={mark["name"]: _read_landmark(graph, mark) for mark in marks},
-        frozen=vertex(frozen),
-        held=(vertex(held[0]), edge(held[1])),
+        frozen=frozen and vertex(frozen),
+        held=(held[0] and vertex(held[0]), held[1] and edge(held[1])),
         datum=tuple(told["datum"]),
         used_ns=used_ns,
         source=source,
@@ -296,7 +296,7 @@ def _ledger(graph: Graph, columns: Columns, final: int) -> Ledger:
         VerdictChange(graph.edge_ids.of(edge), keyframe, Verdict(verdict), Reason(reason), statistic, threshold)
         for edge, keyframe, verdict, reason, statistic, threshold in zip(*changes, strict=True)
     ]
-    ledger.finish(graph.edge_ids.of(final))
+    ledger.finish(final and graph.edge_ids.of(final))
     return ledger
 
 
