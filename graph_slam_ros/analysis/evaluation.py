@@ -243,7 +243,7 @@ def _drives(run: Path) -> list[dict[str, int]]:
 
 def _doubts(path: Trajectory, truth: Trajectory, error: PathError, dimensions: int, *, align: bool) -> Iterator[str]:
     """Errors that no good map has and, of what was aligned, what would make the truth fit far better."""
-    change = _change_that_fits(path, truth, dimensions) if align else ""
+    change = _likely_mistake(path, truth, dimensions) if align else ""
     error_m, true_m = error.position_m["rmse"], _size_m(associate(path, truth)[1], dimensions)
     if change:
         yield f"the truth fits far better if {change}"
@@ -260,8 +260,8 @@ def _doubts(path: Trajectory, truth: Trajectory, error: PathError, dimensions: i
             yield f"the truth's headings fit far better if turned by {turn}: is its x axis ahead?"
 
 
-def _change_that_fits(path: Trajectory, truth: Trajectory, dimensions: int) -> str:
-    """What has to be done to the truth for a far better fit, and a question on its cause; empty if nothing helps."""
+def _likely_mistake(path: Trajectory, truth: Trajectory, dimensions: int) -> str:
+    """The mistake in the truth without which it fits far better, as a question; empty if there is none."""
     mine, true = associate(path, truth)
     size_m, count = _size_m(mine, dimensions), len(mine.stamps_s)
     k = size_m / max(_size_m(true, dimensions), 1e-9)

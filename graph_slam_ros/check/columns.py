@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from graph_slam_ros.check.finding import OfTopic
+from graph_slam_ros.check.finding import TopicData
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.config.inputs import ASSUMED, InputConfig
 from graph_slam_ros.lie import se3, so3
@@ -32,7 +32,7 @@ Decoder = Callable[[bytes], Any]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TopicColumns(OfTopic):
+class TopicColumns(TopicData):
     """The messages of one topic.
 
     Attributes
@@ -56,7 +56,7 @@ class TopicColumns(OfTopic):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class OdometryColumns(OfTopic):
+class OdometryColumns(TopicData):
     """The odometry that is used, as its messages have it.
 
     Attributes
@@ -76,7 +76,7 @@ class OdometryColumns(OfTopic):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SightingColumns(OfTopic):
+class SightingColumns(TopicData):
     """The sightings of one input, as a replay uses them.
 
     Attributes
@@ -112,7 +112,7 @@ class SightingColumns(OfTopic):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FixColumns(OfTopic):
+class FixColumns(TopicData):
     """The fixes of one input, as a replay uses them.
 
     Attributes

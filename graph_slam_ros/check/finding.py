@@ -14,7 +14,7 @@ from graph_slam_ros.formats.parameters import parse_setting
 from graph_slam_ros.typing import Index, Mask
 
 Severity: TypeAlias = Literal["error", "warning", "note"]
-OfSomeTopic = TypeVar("OfSomeTopic", bound="OfTopic")
+SomeTopicData = TypeVar("SomeTopicData", bound="TopicData")
 
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 
@@ -200,14 +200,14 @@ class Finding:
         return first | {"evidence": evidence, "text": self.text, "settings": list(self.settings)}
 
 
-class OfTopic:
-    """What is known of each of n messages or measurements of a topic, in arrays; there are findings of it."""
+class TopicData:
+    """Arrays with a row for each message or measurement of a topic; makes the findings on them."""
 
     __slots__ = ()
     topic: str
     stamp_ns: Index
 
-    def some(self: OfSomeTopic, which: Index | Mask) -> OfSomeTopic:
+    def some(self: SomeTopicData, which: Index | Mask) -> SomeTopicData:
         """The same of some of them."""
         rows = {one.name: getattr(self, one.name) for one in fields(self)}  # type: ignore[arg-type]
         arrays = {name: row[which] for name, row in rows.items() if isinstance(row, np.ndarray)}

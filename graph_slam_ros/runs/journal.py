@@ -73,8 +73,8 @@ class _Part(Protocol):
 AnyPart = TypeVar("AnyPart", bound=_Part)
 
 
-class Parts(Generic[AnyPart]):
-    """What is recorded under one name in a folder, in parts, each of which is a file.
+class PartedFile(Generic[AnyPart]):
+    """A recording under one name in a folder that is split into files, its parts.
 
     What the disk does not accept is kept, for ended parts and the present one, and is written in that order.
 

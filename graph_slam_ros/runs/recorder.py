@@ -31,7 +31,7 @@ from graph_slam_ros.runs.folder import (
     room,
     summary_of,
 )
-from graph_slam_ros.runs.journal import CONDENSED, IN_A_MAP, INGEST, LEFT, MAP, START, Parts, RecordWriter
+from graph_slam_ros.runs.journal import CONDENSED, IN_A_MAP, INGEST, LEFT, MAP, START, PartedFile, RecordWriter
 from graph_slam_ros.runs.map_file import write_map
 from graph_slam_ros.runs.resource_log import ResourceLog
 from graph_slam_ros.runs.tables import counted, fitted_summary, result_texts, summarize
@@ -80,9 +80,9 @@ class RunRecorder:
         self._flushing: Future[None] | None = None
         self.accepted = accepted  # measurements, written or not
         self._syncing: Future[None] | None = None
-        self._journal = Parts(self.folder, INGEST, RecordWriter)
-        self._left = Parts(self.folder, CONDENSED, lambda file: RecordWriter(file, LEFT))
-        self._results = Parts(self.folder, "run", BagWriter)
+        self._journal = PartedFile(self.folder, INGEST, RecordWriter)
+        self._left = PartedFile(self.folder, CONDENSED, lambda file: RecordWriter(file, LEFT))
+        self._results = PartedFile(self.folder, "run", BagWriter)
         self._accepted: deque[Measurement] = deque()  # and not written yet
         self._before = accepted
         self._mapping: Future[None] | None = None
