@@ -144,11 +144,10 @@ class Backend:
 
     def hand_over(self) -> None:
         """Pass new vertices and edges to the solver."""
-        if self.is_handed_over:
-            return
-        vertices, edges = self.handed_over
-        self.solver.add(self.graph.vertex_ids.since(vertices), self.graph.edge_ids.since(edges))
-        self.handed_over = self.graph.vertex_ids.next, self.graph.edge_ids.next
+        (vertices, edges), end = self.handed_over, (self.graph.vertex_ids.next, self.graph.edge_ids.next)
+        if (vertices, edges) != end:
+            self.solver.add(self.graph.vertex_ids.since(vertices), self.graph.edge_ids.since(edges))
+            self.handed_over = end
 
     def gate_new(self) -> None:
         """Judge new edges by their own noise. Those that do not fit are held back for a comparison with all others."""
@@ -185,15 +184,9 @@ class Backend:
             return report
         self._admit()
         outcome = guarded(self._counters, SECOND_LOOK, lambda: self._search(settings)(CancelToken()))
-        if outcome is not None:
-            self._rivals = outcome.rivals
-            revision = Revision(
-                SECOND_LOOK, verdicts=outcome.ledger, values=outcome.values, solves="all", settings=settings
-            )
-            applied = self.apply(revision)
-            report = (applied and applied.report) or report
+        applied = self._use_found(outcome, settings)
         self.cancel_search()
-        return report
+        return (applied and applied.report) or report
 
     def scale_noise(self, everything: Settings | None) -> Report | None:
         """Estimate the scale of the noise if that is due, and solve with it. Returns the last report of a solve.
@@ -208,8 +201,9 @@ class Backend:
             return None
         applied = None
         for _ in range(_NOISE_ROUNDS if everything else 1):
-            noise = guarded(self._counters, NOISE, lambda: factors_of(self.noise_scale()))
-            changed = self.apply(Revision(NOISE, noise=noise, solves="all", settings=everything)) if noise else None
+            changed = self.apply(
+                NOISE, lambda: Revision(noise=factors_of(self.noise_scale()), solves="all", settings=everything)
+            )
             if changed is None:
                 break
             applied = changed
@@ -219,12 +213,13 @@ class Backend:
 
     # -- changes of what was solved ----------------------------------------------------------------------------------
 
-    def apply(self, revision: Revision) -> Applied | None:
-        """Change what was solved as a policy wants; None if it changes nothing, or fails: then all is as before.
+    def apply(self, what: str, propose: Callable[[], Revision]) -> Applied | None:
+        """Change what was solved as a policy proposes; None if nothing changes, or it fails: then all is as before.
 
-        What is held is not touched: a revision that replaces an edge of it fails, and verdicts on it stay.
+        What is held is not touched: a revision that replaces an edge of it fails, and verdicts on it stay. A failure,
+        of the proposal, too, is counted under ``what``.
         """
-        return self.all_or_nothing(revision.what, lambda: self._applied(revision))
+        return self.all_or_nothing(what, lambda: self._applied(propose()))
 
     def _applied(self, r: Revision) -> Applied | None:
         solver, decisions, keyframe, report = self.solver, self.decisions, self.keyframe, None
@@ -345,14 +340,10 @@ class Backend:
         return max(self.frozen_edges, self.held[1])
 
     @property
-    def is_handed_over(self) -> bool:
-        """Return whether the solver has all of the graph."""
-        return self.handed_over == (self.graph.vertex_ids.next, self.graph.edge_ids.next)
-
-    @property
     def is_quiet(self) -> bool:
         """Return whether every edge was judged and solved, and nothing that could change a verdict goes on."""
-        is_judged = self.is_handed_over and len(self.ledger) == self.graph.edge_count and not self._pending
+        is_handed_over = self.handed_over == (self.graph.vertex_ids.next, self.graph.edge_ids.next)
+        is_judged = is_handed_over and len(self.ledger) == self.graph.edge_count and not self._pending
         return is_judged and not (self.holds_back or self._background.is_busy)
 
     def note_condensed(self) -> None:
@@ -384,12 +375,17 @@ class Backend:
         frozen = self._frozen_graph(settings)
         return lambda token: search_alternatives(self._config, frozen, token)
 
-    def _use_found(self, outcome: Outcome | None) -> None:
-        """Solve with what a search in the background has found, if that is another explanation."""
-        if outcome is not None:
-            self._rivals = outcome.rivals
+    def _use_found(self, outcome: Outcome | None, settings: Settings | None = None) -> Applied | None:
+        """Solve with what a search has found; without settings only if that is another explanation."""
+        if outcome is None:
+            return None
+        self._rivals = outcome.rivals
+
+        def proposed() -> Revision:
             values = outcome.carried_to(self.graph, self.solver.values)
-            self.apply(Revision(SECOND_LOOK, verdicts=outcome.ledger, values=values, solves="all"))
+            return Revision(verdicts=outcome.ledger, values=values, solves="all", settings=settings)
+
+        return self.apply(SECOND_LOOK, proposed)
 
     def _admit(self) -> None:
         """Judge held-back edges by the joint covariance of the estimate."""

@@ -76,8 +76,12 @@ class FoundFactors:
 
     def _correct(self, model: MeasurementModel, values: Values, everything: Settings | None) -> Report | None:
         """Correct all measurements, present and future, and solve. A failure is undone."""
-        corrected, origins = self._corrected(model, values)
-        applied = self._backend.apply(Revision("calibration", remeasured=corrected, solves="all", settings=everything))
+        origins = list[tuple[Index, Array]]()
+
+        def proposed() -> Revision:
+            return Revision(remeasured=self._remeasured(model, values, origins), solves="all", settings=everything)
+
+        applied = self._backend.apply("calibration", proposed)
         if applied is None:
             return None
         corrections, before = self._frontend.corrections, self._frontend.corrections.found
@@ -88,9 +92,11 @@ class FoundFactors:
         self._anonymous.rescale(factors_of(values))
         return applied.report
 
-    def _corrected(self, model: MeasurementModel, values: Values) -> tuple[list[Remeasured], list[tuple[Index, Array]]]:
-        """What all edges would have measured, and the corrected origins of sightings."""
-        out, origins = list[Remeasured](), list[tuple[Index, Array]]()
+    def _remeasured(
+        self, model: MeasurementModel, values: Values, origins: list[tuple[Index, Array]]
+    ) -> list[Remeasured]:
+        """What all edges measure with corrected odometry; ``origins`` gets where sightings were measured from then."""
+        out = list[Remeasured]()
         for odometry in model.odometry:
             measured = _exact(model.measured(odometry, values))
             out.append(Remeasured(odometry.table, odometry.rows, measured, odometry.roots))
@@ -102,7 +108,7 @@ class FoundFactors:
             places = self._origins.places(seen.table.at(seen.rows).ids)
             known = places >= 0
             origins.append((places[known], _exact(np.stack(T_keyframe_base, axis=-1)[known])))
-        return out, origins
+        return out
 
 
 def _exact(numbers: Array) -> Array:

@@ -1,4 +1,4 @@
-"""A change of what was solved, as data: what a policy wants. ``Backend.apply`` is the only place that does it."""
+"""A change of what was solved, as data: what a policy proposes. ``Backend.apply`` is the only place that does it."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -37,7 +37,6 @@ class Revision:
 
     Attributes
     ----------
-    what : the source that it is counted under if it fails
     noise : factors of the configured sigmas, by group of edges
     remeasured : what edges measured
     replaced : edges of odometry, for ``reason``
@@ -52,7 +51,6 @@ class Revision:
     reason, evidence, threshold : noted of edges that are replaced or restored
     """
 
-    what: str
     noise: Mapping[Key, float] | None = None
     remeasured: Sequence[Remeasured] = ()
     replaced: Sequence[Replacement] = ()

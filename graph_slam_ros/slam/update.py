@@ -44,9 +44,6 @@ class Update:
         return bool(self.keyframes) or self.solved or self.condensed is not None
 
 
-NOTHING = Update()
-
-
 class UpdateLog:
     """Makes each update from the difference to the previous one."""
 
@@ -71,7 +68,7 @@ class UpdateLog:
         view = self._view
         solved, keyframes = view.solves > self._solves, range(self._keyframes, len(view.keyframes))
         if not solved and not keyframes:
-            return NOTHING if self._condensed is None else Update(condensed=self._condensed)
+            return Update(condensed=self._condensed)
         changes, self._changes = tuple(view.ledger.history[self._changes :]), len(view.ledger.history)
         known, self._alarms = set(map(_state, self._alarms)), view.alarms
         calibrated, self._corrections = tuple(view.corrected[self._corrections :]), len(view.corrected)

@@ -67,7 +67,8 @@ class DisplacementSearch:
 
     def __init__(self, space: Geometry, backend: Backend, window: Window) -> None:
         self._space, self.window = space, window
-        self._graph, self._solver, self._ledger = backend.graph, backend.solver, backend.ledger
+        self._backend, self._graph = backend, backend.graph
+        self._solver, self._ledger = backend.solver, backend.ledger
         self._is_supported = False  # whether a sighting of a known landmark is believed since the segment began
 
     def begin(self) -> None:
@@ -309,8 +310,13 @@ class DisplacementSearch:
         far_m, turned_rad = self.difference(T_map_chain, other, keyframe)
         return far_m > SAME_M or turned_rad > SAME_RAD
 
-    def begun_at(self, found: DisplacementHypothesis, first: int | None) -> DisplacementHypothesis:
-        """Return a hypothesis that begins at an earlier keyframe, by its vertex, if odometry since is remembered."""
-        if first is None or first >= found.first or not self.window.links:
-            return found
-        return replace(found, first=max(first, self.window.first, int(self.vertices[0])))
+    def begun_at(self, found: DisplacementHypothesis, first: int | None) -> DisplacementHypothesis | None:
+        """Return a hypothesis that begins at an earlier keyframe, by its vertex, if odometry since is remembered.
+
+        It begins where a map that is held has ended, at the earliest; None where all of odometry is in it.
+        """
+        if first is not None and first < found.first and self.window.links:
+            found = replace(found, first=max(first, self.window.first, int(self.vertices[0])))
+        links, free = self.window.links.items(), self._backend.first_free_edge
+        begin = next((vertex for vertex, link in links if vertex >= found.first and link.edge >= free), None)
+        return None if begin is None else replace(found, first=begin, seen_from=max(found.seen_from, begin))

@@ -138,7 +138,7 @@ class KidnapDetector:
         if self.rejoin(stamp_ns):
             self._backend.decisions.reclassify(self._backend.keyframe)
         found = self._significant(newest)
-        found = found and self._search.begun_at(found, self._anonymous.elsewhere.fits_from)
+        found = self._search.begun_at(found, self._anonymous.elsewhere.fits_from) if found else None
         is_decided = found is not None and self._is_decided(found)
         if self.slip_detector.check(stamp_ns, found, is_decided=is_decided):
             is_decided = False
@@ -219,15 +219,15 @@ class KidnapDetector:
         graph = self._backend.graph
         given = [e for e in graph.edges_of("initialpose").tolist() if graph.edge(e).vertices[0] >= found.first]
         applied = self._backend.apply(
-            Revision(
-                DOUBT,
+            DOUBT,
+            lambda: Revision(
                 replaced=[self._replacement(found.first, there)],
                 values=moved_values(self._space, self._backend.solver, motions),
                 accepted=found.fitting,
                 rejected=(*found.contradicting, *given),
                 reason=Reason.DISPLACED,
                 evidence=found.evidence,
-            )
+            ),
         )
         if applied is None:
             return False
@@ -261,7 +261,7 @@ class KidnapDetector:
 
     def _refuted_by(self, found: DisplacementHypothesis, newest: int) -> Displacement | None:
         """The last one if the robot is where it would be without it, but for odometry's drift since it began."""
-        if not self._decided:
+        if not self._decided or self._decided[-1].link < self._backend.first_free_edge:
             return None
         one, search = self._decided[-1], self._search
         before_m, before_rad = search.difference(one.T_map_chain_before, found.T_map_chain, newest)
@@ -275,7 +275,6 @@ class KidnapDetector:
         group = self._space.group
         back = group.compose(wrong.T_map_chain_before, group.inverse(wrong.T_map_chain))
         revision = Revision(
-            DOUBT,
             restored=((wrong.link, wrong.replacement),),
             values=moved_values(self._space, self._backend.solver, {wrong.first: back}),
             is_judged_anew=True,
@@ -283,7 +282,7 @@ class KidnapDetector:
             rejected=found.contradicting,
             evidence=found.evidence,
         )
-        if self._backend.apply(revision) is None:
+        if self._backend.apply(DOUBT, lambda: revision) is None:
             return False
         self._note_taken_back(wrong, "taken back: later sightings contradict it", stamp_ns)
         self._begin_anew(found.first, stamp_ns)
@@ -297,9 +296,10 @@ class KidnapDetector:
         The estimate is as without them already.
         """
         firsts = self._anonymous.pop_rejoined()
-        wrong = [one for one in self._decided if one.first in firsts]
+        free = self._backend.first_free_edge
+        wrong = [one for one in self._decided if one.first in firsts and one.link >= free]
         pairs = [(one.link, one.replacement) for one in wrong]
-        if not wrong or self._backend.apply(Revision(DOUBT, restored=pairs, solves="nothing")) is None:
+        if not wrong or self._backend.apply(DOUBT, lambda: Revision(restored=pairs, solves="nothing")) is None:
             return False
         for one in wrong:
             self._note_taken_back(one, "taken back: without it all sightings are explained better", stamp_ns)

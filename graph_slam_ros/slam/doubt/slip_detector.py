@@ -300,9 +300,9 @@ class SlipDetector:
         """Put edges with more noise in place of odometry's, and solve. Returns whether that was possible."""
         replaced, evidence = self._wider_edges(links, slip), slip.evidence
         revision = Revision(
-            DOUBT, replaced=replaced, compared=compared, reason=Reason.SLIP, evidence=evidence, threshold=_THRESHOLD
+            replaced=replaced, compared=compared, reason=Reason.SLIP, evidence=evidence, threshold=_THRESHOLD
         )
-        if (applied := self._backend.apply(revision)) is not None:
+        if (applied := self._backend.apply(DOUBT, lambda: revision)) is not None:
             self._note_replaced(links, slip, applied.replaced)
         return applied is not None
 
@@ -322,7 +322,7 @@ class SlipDetector:
 
     def _restore(self, pairs: Sequence[Pair], gain: float) -> bool:
         """Use odometry's own edges again. Returns whether that could be solved."""
-        if self._backend.apply(Revision(DOUBT, restored=pairs, evidence=-2.0 * gain)) is None:
+        if self._backend.apply(DOUBT, lambda: Revision(restored=pairs, evidence=-2.0 * gain)) is None:
             return False
         links = {link.own: link for link in self._window.links.values()}
         for own, _ in pairs:

@@ -280,14 +280,16 @@ class AnonymousLandmarks:
 
     def review(self, *, everything: bool) -> None:
         """Accept and remove landmarks, and explain all scans anew: at once, or in the background if that is due."""
-        if everything:
-            self._explain_all()
-            return
+        keyframes = self._backend.path.keyframes
+        count = len(keyframes)
         if not self._landmarks.begins_new:
             self.clusters.finish()
             return
-        keyframes = self._backend.path.keyframes
-        count = len(keyframes)
+        if everything:
+            if self._history.scans:
+                self._adopt(guarded(self._counters, "second_look", lambda: self.hindsight.found(self._frozen)))
+                self.clusters.judge(keyframes[-1].stamp_ns)
+            return
         if self._displaced is not None:  # it is solved now
             self._explain_from(self._displaced)
             self._displaced = None
@@ -297,12 +299,6 @@ class AnonymousLandmarks:
             self.hindsight.start(self._frozen, count)
         if count % _REVIEWED_EVERY == 0:
             self.clusters.judge(keyframes[-1].stamp_ns)
-
-    def _explain_all(self) -> None:
-        if self._landmarks.begins_new and self._history.scans:
-            found = guarded(self._counters, "second_look", lambda: self.hindsight.found(self._frozen))
-            self._adopt(found)
-            self.clusters.judge(self._backend.path.keyframes[-1].stamp_ns)
 
     def _frozen(self) -> FrozenScans:
         self._backend.hand_over()
@@ -339,5 +335,5 @@ class AnonymousLandmarks:
             names, places = self.clusters.names, zip(numbers.tolist(), found.estimate.landmarks.tolist(), strict=True)
             with_new = np.concatenate([values, self._solver.values[len(values) :]])
             values = self._landmarks.placed(with_new, {names[k]: place for k, place in places if k in names})
-            self._backend.apply(Revision("second_look", values=values, solves="all"))
+            self._backend.apply("second_look", lambda: Revision(values=values, solves="all"))
         self.hindsight.note(self.clusters.given)
