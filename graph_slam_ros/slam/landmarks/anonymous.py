@@ -308,12 +308,9 @@ class AnonymousLandmarks:
         poses = np.stack(group.compose(tuple(at.T), tuple(moved.T)), axis=-1)
         scales = self._beam.scales[0] if self._beam else self.hindsight.scales[0]
         given = np.array(self.clusters.given)
-        leader = given.copy()
-        for cluster, landmark in changes(None, self._leader).items():
-            leader[cluster] = landmark
         history = self._history
         motions = tuple(history.motions)
-        frozen = FrozenScans(tuple(scans), motions, history.nearby(), poses, scales.copy(), given, leader)
+        frozen = FrozenScans(tuple(scans), motions, history.nearby(), poses, scales.copy(), given)
         if history.displacements:
             frozen = replace(frozen, displaced=history.displacements, undisplaced=history.undisplaced())
         return frozen.after_map(self._belief, self.clusters.final)

@@ -147,15 +147,6 @@ class Drive:
 
     # -- what it costs -----------------------------------------------------------------------------------------------
 
-    def along_odometry(self, position: Array, turn: Array, scales: Array) -> tuple[Array, Array]:
-        """Positions and rotations of the scans by odometry alone, from the first."""
-        positions, turns = [position], [turn]
-        ways = applied(rotation(0.5 * self.turned * scales[1]), self.way) * (1.0 + scales[0])
-        for way, turned in zip(ways, rotation(self.turned * (1.0 + scales[1])), strict=True):
-            positions.append(positions[-1] + turns[-1] @ way)
-            turns.append(turns[-1] @ turned)
-        return np.array(positions), np.array(turns)
-
     def seen_at(self, e: Estimate, clusters: Ids | slice = slice(None)) -> Array:
         """Positions of clusters in map (m, n)."""
         k = self.scan[clusters]

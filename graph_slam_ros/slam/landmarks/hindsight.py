@@ -1,7 +1,7 @@
 """Explains all scans at once, in the background on a copy. The result is used at a fixed later keyframe.
 
-The scans are solved in stages, once from odometry and once from the present path, and the cheaper solution is kept.
-Then moves correct the association. The result does not depend on when the work is done.
+The scans are solved in stages, from the graph's assignment on the present path. Then moves correct the association. The
+result does not depend on when the work is done.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -49,7 +49,6 @@ class FrozenScans:
     ----------
     poses : (N, 3) or (N, 7) of the scans, by the solver
     given : (M,) the number of each cluster's landmark
-    leader : (M,) the same, by the beam alone
     nearby : (N, S, dof) how the robot moved around each scan, by odometry
     of_map : the first so many scans stand for the map (``after_map``); clusters_of_map : theirs
     times : (M,) how often the robot has seen what a cluster stands for; empty: once each
@@ -63,7 +62,6 @@ class FrozenScans:
     poses: Array
     scales: Array
     given: Ids
-    leader: Ids
     of_map: int = 0
     clusters_of_map: int = 0
     times: Array = field(default_factory=lambda: np.empty(0))
@@ -109,7 +107,6 @@ class FrozenScans:
             nearby=np.concatenate([np.zeros((count, *self.nearby.shape[1:])), self.nearby]),
             poses=np.concatenate([np.tile(self.poses[:1], (count, 1)), self.poses]),
             given=np.concatenate([np.tile(list(known), count), self.given]),
-            leader=np.concatenate([np.tile(list(known), count), self.leader]),
             of_map=count,
             clusters_of_map=count * len(known),
             times=np.concatenate([np.tile(before / count, count), np.ones(len(self.given))]),
@@ -307,7 +304,7 @@ class Hindsight:
 
 
 def explained(space: Geometry, frozen: FrozenScans, settings: BeamSettings, costs: Costs) -> Found | None:
-    """Explain all scans, from the graph's assignment and from the beam's; None if too little was seen.
+    """Explain all scans, from the graph's assignment on the present path; None if too little was seen.
 
     Where the robot was moved, it is done once more as if it had not been. The larger evidence decides.
     """
@@ -333,24 +330,15 @@ def _log_volume(motions: Sequence[Motion]) -> float:
 
 
 def _given(space: Geometry, drive: Drive, frozen: FrozenScans) -> Found | None:
-    """Explain all scans, from the graph's assignment and from the beam's; None if too little was seen."""
-    given = [frozen.given] if np.array_equal(frozen.given, frozen.leader) else [frozen.given, frozen.leader]
-    found = [one for some in given for one in _from(space, drive, frozen, some)]
-    return _laid(drive, min(found, key=lambda one: drive.total(one.estimate))) if found else None
-
-
-def _from(space: Geometry, drive: Drive, frozen: FrozenScans, given: Ids) -> list[Found]:
-    """Explain all scans from an association; nothing if it has no landmark that was seen often enough."""
-    numbers, which = _indices(given)
+    """Explain all scans, from the graph's assignment on the present path; None if too little was seen."""
+    numbers, which = _indices(frozen.given)
     if not len(numbers):
-        return []
-    here = matrices_of(space, frozen.poses)
-    paths = here, drive.along_odometry(here[0][0], here[1][0], frozen.scales)
+        return None
     no_landmarks, clocks = np.empty((0, drive.n)), np.zeros(len(drive.topics))
-    starts = [Estimate(*path, no_landmarks, frozen.scales, clocks, which) for path in paths]
-    staged = min((drive.staged(start) for start in starts), key=lambda e: e.cost)
+    start = Estimate(*matrices_of(space, frozen.poses), no_landmarks, frozen.scales, clocks, which)
+    staged = drive.staged(start)
     drive.begin_moves()
-    return [Found(frozen, refined(drive, staged), is_whole=drive.may_move)]
+    return _laid(drive, Found(frozen, refined(drive, staged), is_whole=drive.may_move))
 
 
 def _laid(drive: Drive, found: Found) -> Found:

@@ -320,7 +320,7 @@ def test_a_stretch_at_a_wrong_place_is_laid_on_the_map(without_names):
     poses = frozen.poses.copy()
     poses[cut:, :2] += (1.5, -1.2)
     moved = FrozenScans(
-        *(frozen.scans, frozen.motions, frozen.nearby, poses, frozen.scales, wrong, wrong),
+        *(frozen.scans, frozen.motions, frozen.nearby, poses, frozen.scales, wrong),
         of_map=first,
         clusters_of_map=count,
         times=frozen.times,
