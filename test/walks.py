@@ -32,7 +32,7 @@ WITHIN = {  # calls on the way that belong to another walk; without a name, to n
         "slam/solution.py:begin": "solve",
         "runs/recorder.py:record": "solve",
         "runs/recorder.py:flush": "solve",
-        "node/session.py:_update_estimate": "solve",
+        "node/session.py:_estimated": "solve",
         "node/runtime.py:_on_update": "solve",
         "slam/map_view.py:snapshot": "",
         "node/publishers.py:publish_due": "",
@@ -43,7 +43,7 @@ WITHIN = {  # calls on the way that belong to another walk; without a name, to n
         "slam/map_view.py:snapshot": "",
         "runs/map_file.py:read_map": "",
         "warmup.py:warmup": "",
-        "node/session.py:_update_estimate": "",
+        "node/session.py:_estimated": "",
         "node/publishers.py:publish_due": "",
     },
 }

@@ -1,15 +1,21 @@
 """The estimate that the worker's thread publishes to the other threads."""
 
+import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from mcap.records import Message
 
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.measurements.reasons import explain, remedy
+from graph_slam_ros.measurements.types import Odometry, from_record
+from graph_slam_ros.recordings.mcap_records import records
+from graph_slam_ros.runs.journal import CORRECTION, parts_of
 from graph_slam_ros.runs.outcome import (
     VISITS,
     ambiguities,
@@ -21,7 +27,7 @@ from graph_slam_ros.runs.outcome import (
     wrong_sides,
 )
 from graph_slam_ros.runs.tables import accepted_lately, condensed_part
-from graph_slam_ros.slam import GraphSlam
+from graph_slam_ros.slam import Config, GraphSlam
 from graph_slam_ros.slam.calibration.answers import Uncorrected
 from graph_slam_ros.slam.solution import Correction
 from graph_slam_ros.slam.weak_direction import WeakDirection, position_covariance, weakest_position, weakest_turn
@@ -221,65 +227,67 @@ def _calibration(found: Mapping[str, float], contradicted: Sequence[str]) -> dic
     return settings | ({OFF: ", ".join(contradicted)} if contradicted else {})
 
 
-_LONGEST_NS = 60_000_000_000  # without odometry: after more, the robot may have been carried
-_SPEED_OF = 20  # keyframes before the end, which say how fast the robot was
-_LEAST, _MOST = 0.3, 1.2  # times the way at that speed: so far it has driven since
-_NEAR = 0.1  # m and rad: an odometry that begins anew so close to where it was does no harm
-
-
 class Resumption:
     """Compares the odometry before a restart with the first after it.
 
     Parameters
     ----------
-    slam : the pipeline in the map of the run that was cut off, before the first odometry
-    used_ns, source : stamp and input of the last odometry before; None and empty where there was none
+    T_map_odom, odometry : the last correction before, and the last odometry
     """
 
-    def __init__(self, slam: GraphSlam, used_ns: int | None, source: str) -> None:
-        self._first = len(slam.keyframes)  # of the new drive
-        self._used_ns, self._source = used_ns, source
-        self._goes_on: bool | None = None
+    def __init__(self, config: Config, T_map_odom: Numbers, odometry: Sequence[Odometry]) -> None:
+        self.T_map_odom = T_map_odom
+        self._is_on: bool | None = None
+        self._space, self._fastest_m_s, self._last = config.space, config.odometry.max_speed_m_s, odometry
 
-    def goes_on(self, slam: GraphSlam) -> bool:
-        """Return whether the odometry of the new drive continues the one before it, and has not jumped since."""
-        if len(slam.keyframes) <= self._first or slam.segments[-1] != self._first:
+    @classmethod
+    def of(cls, run: Path, config: Config) -> "Resumption | None":
+        """Return that of a run by the end of its journal, as much of it as has a correction; None without one."""
+        for file in reversed(parts_of(run)):
+            last_bytes, size = _TAIL_BYTES, file.stat().st_size
+            while last_bytes < 8 * size:
+                read = [
+                    json.loads(one.data) for one in records(file, [], last_bytes=last_bytes) if type(one) is Message
+                ]
+                if corrections := [one for one in read if one["type"] == CORRECTION]:
+                    last, of = corrections[-1], ("odometry", corrections[-1]["source"])
+                    used = [from_record(one) for one in read if (one["type"], one.get("source")) == of]
+                    if odometry := [one for one in used if isinstance(one, Odometry)]:
+                        return cls(config, tuple(last["T_map_odom"]), odometry)
+                last_bytes *= 8
+        return None
+
+    def goes_on(self, stamp_ns: int, T_odom_base: Numbers, source: str) -> bool:
+        """Return whether the first odometry that this was asked of continues the one before."""
+        if self._is_on is None:
+            self._is_on = self._is_continuous(stamp_ns, T_odom_base, source)
+        return self._is_on
+
+    def _is_continuous(self, stamp_ns: int, T_odom_base: Numbers, source: str) -> bool:
+        last, n = self._last[-1], self._space.dimensions
+        since_s = (stamp_ns - last.stamp_ns) * 1e-9
+        if _name(source) != _name(last.source) or not 0.0 < since_s <= _LONGEST_S:
             return False
-        if self._goes_on is None:
-            self._goes_on = self._is_continuous(slam)
-        return self._goes_on
-
-    def _is_continuous(self, slam: GraphSlam) -> bool:
-        last, first = slam.keyframes[self._first - 1], slam.keyframes[self._first]
-        if self._used_ns is None or _name(slam.odometry_source) != _name(self._source):
+        moved = self._space.group.between(last.T_odom_base, T_odom_base)
+        far_m = math.hypot(*moved[:n])
+        if far_m > self._fastest_m_s * since_s:
             return False
-        if not 0 < first.stamp_ns - self._used_ns <= _LONGEST_NS:
-            return False
-        moved = slam.space.group.between(last.T_odom_base, first.T_odom_base)
-        far_m = math.hypot(*moved[: slam.space.dimensions])
-        most_m = slam.config.odometry.max_speed_m_s * (first.stamp_ns - last.stamp_ns) * 1e-9
-        if far_m > most_m:
-            return False
-        return self._is_as_fast(slam, far_m, first.T_odom_base) or not _begins_anew(slam, moved, first.T_odom_base)
+        way_m = sum(math.dist(a.T_odom_base[:n], b.T_odom_base[:n]) for a, b in pairwise(self._last))
+        usual_m = way_m / max((last.stamp_ns - self._last[0].stamp_ns) * 1e-9, _LEAST_S) * since_s
+        far, from_begin = self._size(moved), self._size(T_odom_base)
+        is_as_fast = _LEAST * usual_m <= far_m <= _MOST * usual_m and from_begin > _NEAR
+        return is_as_fast or far <= _NEAR or from_begin >= far  # or it has begun anew, if nearer to its origin
 
-    def _is_as_fast(self, slam: GraphSlam, far_m: float, T_odom_base: Numbers) -> bool:
-        """Return whether the way since then fits the speed before, and odometry is not at its origin."""
-        several = [slam.keyframes[k] for k in range(max(self._first - _SPEED_OF, 0), self._first)]
-        seconds = (several[-1].stamp_ns - several[0].stamp_ns) * 1e-9
-        n, since_s = slam.space.dimensions, (slam.keyframes[self._first].stamp_ns - several[-1].stamp_ns) * 1e-9
-        way_m = sum(math.dist(a.T_odom_base[:n], b.T_odom_base[:n]) for a, b in pairwise(several))
-        usual_m = way_m / seconds * since_s if seconds > 0.0 else 0.0
-        return _LEAST * usual_m <= far_m <= _MOST * usual_m and _size(slam, T_odom_base) > _NEAR
+    def _size(self, pose: Numbers) -> float:
+        """How far a pose is from none. A metre counts as much as a radian."""
+        return math.hypot(*pose[: self._space.dimensions]) + self._space.angle(pose)
 
 
-def _begins_anew(slam: GraphSlam, moved: Numbers, T_odom_base: Numbers) -> bool:
-    """Return whether odometry is nearer to its origin than to its last pose. A metre counts as much as a radian."""
-    far, from_begin = (_size(slam, pose) for pose in (moved, T_odom_base))
-    return far > _NEAR and from_begin < far
-
-
-def _size(slam: GraphSlam, pose: Numbers) -> float:
-    return math.hypot(*pose[: slam.space.dimensions]) + slam.space.angle(pose)
+_LONGEST_S = 60.0  # without odometry: after more, the robot may have been carried
+_LEAST_S = 1e-3
+_TAIL_BYTES = 2**16  # some seconds of a robot's journal
+_LEAST, _MOST = 0.3, 1.2  # times the way at the speed before: so far it has driven since
+_NEAR = 0.1  # m and rad: an odometry that begins anew so close to where it was does no harm
 
 
 def _name(source: str) -> str:

@@ -38,6 +38,11 @@ class PoseExtrapolator:
         """The newest odometry of the source in use; None also after a jump that no estimate has yet."""
         return self._since[-1] if self._since and not self._jumped_ns else None
 
+    @property
+    def source(self) -> str:
+        """The odometry in use; empty before the first."""
+        return self._selector.used.source if self._selector.used else ""
+
     def on_odometry(self, m: Odometry, estimate: Estimate | None) -> bool:
         """Add an odometry message. Return whether there is a pose at it.
 

@@ -17,7 +17,7 @@ from graph_slam_ros.measurements.types import Event
 from graph_slam_ros.node.diagnostics import Facts
 from graph_slam_ros.node.fact_collector import FactCollector
 from graph_slam_ros.node.ingest import Ingest
-from graph_slam_ros.node.preparation import Completion, Preparation
+from graph_slam_ros.node.preparation import Preparation
 from graph_slam_ros.node.publishers import Publishers, PublishingClock
 from graph_slam_ros.node.session import Session
 from graph_slam_ros.node.subscriptions import Subscriptions
@@ -67,7 +67,8 @@ class Runtime:
             *(self._ingest, self._publishers, self._clock),
         )
         self._preparation = Preparation(node.get_logger(), config.world.dimensions)
-        self._completion = Completion(self._session.incomplete, node.get_logger())
+        for run in self._session.incomplete:
+            node.get_logger().warn(f"{run.name}: stopped while measurements waited: graph_slam recover {run}")
         self._subscriptions: Subscriptions | None = None
         self._broadcaster: TfBroadcaster | None = None
 
@@ -116,14 +117,13 @@ class Runtime:
         finally:
             self._session.abandon()
             self._publishers.close()
-            self._completion.stop()
 
     def _leave(self) -> None:
         waiting, lost = self._session.leave()
         folder, log = self._node.config.output.folder, self._node.get_logger()
         if folder and (waiting or self._session.slam.processed):
             what = f"while {waiting} measurements waited" if waiting else "before the last solve had ended"
-            ends = f"the next start completes the results, or graph_slam recover {folder}"
+            ends = f"graph_slam recover {folder} completes the results"
             log.warn(f"stopped {what}: all are in the journal; {ends}")
         if lost:
             log.error(f"{lost} measurements are lost: they came while another run was to begin, and it had not yet")
@@ -133,7 +133,6 @@ class Runtime:
     def tick(self) -> None:
         """Do what is due ten times a second."""
         self._session.flush_in_background()
-        self._completion.tick()
         self._ingest.tick()
         if self._subscriptions is not None:
             self._subscriptions.tick(self._node.now_ns)

@@ -9,6 +9,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -33,7 +34,7 @@ from graph_slam_ros.runs.recorder import RunRecorder
 from graph_slam_ros.runs.restore import map_of, save_copy
 from graph_slam_ros.runs.tables import account, summarize
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Measurement, Update
-from graph_slam_ros.slam.frontend.odometry_selector import JUMP_SIGMA_M
+from graph_slam_ros.slam.frontend.odometry_selector import JUMP_SIGMA_M, Step
 from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.typing import Numbers
 
@@ -60,9 +61,13 @@ class Session:
         self._is_left = False
         self._has_news = False  # since the last save was asked for
         self.recording_fails = False
+        self._resumption: Resumption | None = None
         self.loads = ""  # the run whose map is being loaded
         self.was_cut_off = self._folder is not None and is_cut_off(self._folder)
         self._begin()
+        if self.was_cut_off and config.journal.resume:
+            with suppress(GraphSlamError, OSError, LookupError, TypeError, ValueError):  # said when its map is loaded
+                self._resumption = Resumption.of(self.earlier(""), config)
 
     def _begin(self, start: MapSnapshot | None = None, loaded: Path | None = None) -> None:
         slam = GraphSlam(self.config, None, run_in_thread, start and start.copy())
@@ -86,7 +91,7 @@ class Session:
         self._is_saved, self._is_ended = True, False
         self.loaded_keyframes = len(self.slam.keyframes)
         self._is_confirmed, self._sure_segments = not self.loaded_keyframes, 0  # when it was last known where it is
-        self._resumption: Resumption | None = None
+        self._resumption = None
         self._unseen, self._weakest = UnseenWay(self.loaded_keyframes, slam.landmark_changes), WeakestLandmark()
         self._slowest_s = 0.0
         self._fit, self._fitted_at, self._fit_due_s, self._doubted = float("nan"), 0, 0.0, ""
@@ -152,13 +157,14 @@ class Session:
         if not update or self._is_left:
             return
         self._slowest_s = max(self._slowest_s, solve_s) if update.solved else self._slowest_s
+        estimate = self._estimated(update, solve_s)
         recorded = self._recorded(lambda recorder: recorder.record(self.slam, update))
         if self._recorded(RunRecorder.flush) and recorded:  # nothing is published that a restart would not know
             is_refused = self._folder is None or not os.access(self._folder, os.W_OK)  # as a save would see
             if is_refused and not self.recording_fails:
                 self._warn("output.folder", "it cannot be written any more")
             self.recording_fails = is_refused
-        self._update_estimate(update, solve_s)
+        self.estimate = estimate
         self._on_update(self.slam, update)
 
     def _recorded(self, write: Callable[[RunRecorder], None]) -> bool:
@@ -178,18 +184,19 @@ class Session:
             return False
         return True
 
-    def _update_estimate(self, update: Update, solve_s: float) -> None:
+    def _estimated(self, update: Update, solve_s: float) -> Estimate:
+        """Return the estimate after an update, and note its correction for the next start."""
         slam = self.slam
         if update.solved and not self._is_confirmed and len(slam.keyframes) > self.loaded_keyframes:
             self._is_confirmed = self._is_sure
         if self._is_sure:
             self._sure_segments = len(slam.segments)
         self._unseen = self._unseen.goes_on(slam)
-        self.estimate = estimate_of(
+        estimate = estimate_of(
             slam,
             correction=update.correction,
             is_confirmed=self._is_confirmed,
-            is_resumed=not self._is_confirmed and self._resumption is not None and self._resumption.goes_on(slam),
+            is_resumed=not self._is_confirmed and self._is_resumed,
             is_lost=self._is_confirmed and not slam.displaced and len(slam.segments) > self._sure_segments,
             solve_s=solve_s,
             slowest_solve_s=self._slowest_s,
@@ -198,12 +205,36 @@ class Session:
             unseen=self._unseen,
             weakest_landmark=self._weakest.goes_on(slam),
         )
+        if self._recorder is not None and estimate.is_located:
+            self._recorder.note_correction(estimate.T_map_odom, estimate.source)
+        return estimate
 
     @property
     def _is_sure(self) -> bool:
         """Return whether the newest keyframe is better known in the map than across a jump of odometry."""
         covariance = self.slam.pose_covariance
         return float(covariance[0, 0] + covariance[1, 1]) ** 0.5 < _CONFIRMED * JUMP_SIGMA_M
+
+    @property
+    def _is_resumed(self) -> bool:
+        """Return whether the drive that was cut off goes on, and odometry has not jumped since."""
+        slam, first, resumption = self.slam, self.loaded_keyframes, self._resumption
+        if resumption is None or len(slam.keyframes) <= first or slam.segments[-1] != first:
+            return False
+        return resumption.goes_on(
+            slam.keyframes[first].stamp_ns, slam.keyframes[first].T_odom_base, slam.odometry_source
+        )
+
+    def T_map_odom(self, newest: Step, source: str) -> Numbers | None:
+        """The correction to broadcast with the newest odometry; None while it is not known where the robot is.
+
+        While the map of a drive that was cut off is being loaded, it is the last one before, if odometry goes on.
+        """
+        estimate, resumption = self.estimate, self._resumption
+        if estimate is not None and (estimate.is_located or estimate.keyframes > self.loaded_keyframes):
+            return estimate.T_map_odom if estimate.is_located else None
+        goes_on = resumption is not None and resumption.goes_on(newest.stamp_ns, newest.T_odom_base, source)
+        return resumption.T_map_odom if resumption is not None and goes_on else None
 
     def evaluate(self) -> None:
         """Compute how well all measurements fit, and which are not believed, when idle, in a fiftieth of the time."""
@@ -306,6 +337,7 @@ class Session:
         try:
             return self._load(self.earlier(""), resumes=True)
         except GraphSlamError:
+            self._resumption = None
             if not self.config.output.load_at_start:
                 raise
             return self.load(self.config.output.load)
@@ -323,7 +355,7 @@ class Session:
             raise RunError(f"{run.name}: world.dimensions is {loaded.world.dimensions} there")
         if run == self._folder:
             self.finish()
-        losses: list[str] = []
+        losses, resumption = list[str](), self._resumption if resumes else None
         start = map_of(run, losses)
         self.finish()
         self.config = self.slam.config
@@ -332,11 +364,10 @@ class Session:
         except Exception:
             self._begin(loaded=run)
             raise
-        if resumes and (len(start.drives) <= 1 or self._is_sure):  # else nobody knew where it was
-            self._resumption = Resumption(self.slam, start.used_ns, start.source)
+        self._resumption = resumption
         where = [] if T_map_base is None else [self._place(T_map_base)]
         self._recorded(RunRecorder.flush)
-        self._update_estimate(Update(), 0.0)
+        self.estimate = self._estimated(Update(), 0.0)
         return ": ".join([run.name, f"{len(self.slam.keyframes)} keyframes", *where, *losses[:1]])
 
     def _place(self, T_map_base: Numbers) -> str:

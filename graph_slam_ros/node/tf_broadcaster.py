@@ -198,11 +198,15 @@ class TfBroadcaster:
         return tuple(sorted(names - {own}))
 
     def _tick(self) -> None:
-        config, estimate, newest = self._node.config, self._session.estimate, self._ingest.extrapolator.newest
-        if self._is_closed or estimate is None or newest is None or not config.tf.publish_tf or not estimate.is_located:
+        config, odometry = self._node.config, self._ingest.extrapolator
+        newest = odometry.newest
+        if self._is_closed or newest is None or not config.tf.publish_tf:
+            return
+        estimated = self._session.T_map_odom(newest, odometry.source)
+        if estimated is None:
             return
         now_ns = self._node.get_clock().now().nanoseconds
-        due = self._policy.next(config.tf, now_ns, newest.stamp_ns, newest.T_odom_base, estimate.T_map_odom)
+        due = self._policy.next(config.tf, now_ns, newest.stamp_ns, newest.T_odom_base, estimated)
         if due is None:
             return
         stamp_ns, T_map_odom = due

@@ -137,18 +137,18 @@ def _read_through(file: Path, losses: list[str]) -> Contents:
 
 
 def records(
-    path: Path, losses: list[str], warnings: list[str] | None = None, *, follow: bool = True
+    path: Path, losses: list[str], warnings: list[str] | None = None, *, follow: bool = True, last_bytes: int = 0
 ) -> Iterator[McapRecord]:
-    """Schemas, channels and messages in order of the file.
+    """Schemas, channels and messages in order of the file; of the last bytes alone, if so many are named.
 
     A damaged part is skipped up to the next chunk; a truncated end stops the reading. Each adds a line to ``losses``. A
-    line in ``warnings`` names damage in a file without checksums, which may have more, or a file that is cut off behind
-    its messages; without ``warnings`` the latter is a loss. ``follow``: the file may be a symbolic link.
+    line in ``warnings`` names damage in a file without checksums, which may have more, or one that is cut off behind
+    its messages, which else is a loss. ``follow``: the file may be a symbolic link.
     """
     known = len(losses)
     read, unchecked, is_unindexed = 0, False, False
     with _Stream(path, follow) as stream:
-        at = MAGIC_SIZE
+        at = (_next_chunk(stream, max(0, stream.size - last_bytes)) or stream.size) if last_bytes else MAGIC_SIZE
         while True:
             try:
                 record, after = _record(stream, at)

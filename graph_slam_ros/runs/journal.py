@@ -9,7 +9,7 @@ import json
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 
 from mcap.records import Channel, Message
 from mcap.writer import CompressionType, Writer
@@ -17,12 +17,14 @@ from mcap.writer import CompressionType, Writer
 from graph_slam_ros.errors import FormatError
 from graph_slam_ros.formats.durable import AppendedFile
 from graph_slam_ros.measurements.types import Measurement, from_record
+from graph_slam_ros.recordings.bag import BagWriter
 from graph_slam_ros.recordings.mcap_records import LIBRARY, records
 
 _ENCODE = json.JSONEncoder(separators=(",", ":"), check_circular=False, allow_nan=False).encode
 INGEST = "ingest"
 IN_A_MAP = {"type": "begins_in_a_map"}
 """The first record of the journal of such a run; its start is in ``start.mcap``."""
+CORRECTION = "correction"  # a record of T_map_odom, where that is known: a restart goes on with the last one at once
 START, MAP, SCHEMA = "start.mcap", "map.mcap", "graph_slam_ros.Map"
 CONDENSED, LEFT = "condensed", "graph_slam_ros.Left"  # of what has left the map
 LEDGER, CHANGES = "ledger.csv", "ledger_changes.csv"
@@ -62,15 +64,7 @@ class RecordWriter:
         return self.file
 
 
-class _Part(Protocol):
-    """The writer of one file."""
-
-    file: AppendedFile
-
-    def end(self) -> AppendedFile: ...
-
-
-AnyPart = TypeVar("AnyPart", bound=_Part)
+AnyPart = TypeVar("AnyPart", bound=RecordWriter | BagWriter)
 
 
 class PartedFile(Generic[AnyPart]):
@@ -174,8 +168,8 @@ def read_ingest(
     waited: list[dict[str, Any]] = []
     count = 0
     for file, channel, message in _messages(folder, INGEST, losses):
-        if channel == IN_A_MAP["type"]:
-            if not (processed or (folder / START).exists()):
+        if channel in (CORRECTION, IN_A_MAP["type"]):
+            if channel != CORRECTION and not (processed or (folder / START).exists()):
                 losses.append(f"{START}: not there, though the run began in a map: what follows is without it")
             continue
         if count >= processed:

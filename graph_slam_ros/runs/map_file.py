@@ -159,7 +159,7 @@ def _told(state: MapSnapshot) -> Told:
         "frozen": [vertex.first_from(state.frozen), edge.first_from(state.ledger.final)],
         "held": [vertex.first_from(state.held[0]), edge.first_from(state.held[1])],
         "datum": state.datum,
-        "used": [state.used_ns, state.source],
+        "used": [state.used_ns],
         "noise": factors_record(state.noise_factors),
         "calibration": factors_record(state.calibration),
         "edits": [one.record for one in state.edits],
@@ -221,7 +221,6 @@ def _columns(state: MapSnapshot) -> Iterator[tuple[str, NDArray[Any]]]:
 def _state(told: Told, marks: Sequence[Told], columns: Columns) -> MapSnapshot:
     graph = _graph(told, columns)
     (frozen, final), held, vertex, edge = told["frozen"], told["held"], graph.vertex_ids.of, graph.edge_ids.of
-    used_ns, source = told["used"]
     first, gyro, condensed = told["first"], told["gyro"], told["condensed"]
     pose = _pose_of(graph)
     size = pose.size if pose else 3
@@ -236,8 +235,7 @@ def _state(told: Told, marks: Sequence[Told], columns: Columns) -> MapSnapshot:
         frozen=frozen and vertex(frozen),
         held=(held[0] and vertex(held[0]), held[1] and edge(held[1])),
         datum=tuple(told["datum"]),
-        used_ns=used_ns,
-        source=source,
+        used_ns=told["used"][0],
         noise_factors=read_factors(told["noise"]),
         edits=list(map(applied_edit, told["edits"])),
         calibration=read_totals(told["calibration"]),

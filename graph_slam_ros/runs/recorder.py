@@ -31,12 +31,23 @@ from graph_slam_ros.runs.folder import (
     room,
     summary_of,
 )
-from graph_slam_ros.runs.journal import CONDENSED, IN_A_MAP, INGEST, LEFT, MAP, START, PartedFile, RecordWriter
+from graph_slam_ros.runs.journal import (
+    CONDENSED,
+    CORRECTION,
+    IN_A_MAP,
+    INGEST,
+    LEFT,
+    MAP,
+    START,
+    PartedFile,
+    RecordWriter,
+)
 from graph_slam_ros.runs.map_file import write_map
 from graph_slam_ros.runs.resource_log import ResourceLog
 from graph_slam_ros.runs.tables import counted, fitted_summary, result_texts, summarize
 from graph_slam_ros.slam import Config, Counters, GraphSlam, Measurement, Update
 from graph_slam_ros.slam.snapshot import MapSnapshot
+from graph_slam_ros.typing import Numbers
 
 _TAIL_S = 3.0  # CPU time since the newest map was written, which a restart spends again: until the next
 _BYTES_PER_S = 3e8 / 3600  # of maps, at most: a larger one is written more rarely
@@ -84,6 +95,7 @@ class RunRecorder:
         self._left = PartedFile(self.folder, CONDENSED, lambda file: RecordWriter(file, LEFT))
         self._results = PartedFile(self.folder, "run", BagWriter)
         self._accepted: deque[Measurement] = deque()  # and not written yet
+        self._noted: list[dict[str, Any]] = []  # the newest correction, until the next flush
         self._before = accepted
         self._mapping: Future[None] | None = None
         self._map_due_s = 0.0
@@ -111,13 +123,17 @@ class RunRecorder:
             self._left.present().write(carried(start.folder, config.space, start.bounded))
             self._left.flush()
         if not self.accepted:  # a new drive begins
-            start = replace(start, used_ns=None, source="", drive={})
+            start = replace(start, used_ns=None, drive={})
         write_map(self.folder / START, replace(start, processed=0, settings={}))
 
     def accept(self, measurement: Measurement) -> None:
         """Add a measurement to the journal. It is kept in memory until ``flush`` or ``flush_in_background``."""
         self._accepted.append(measurement)
         self.accepted += 1
+
+    def note_correction(self, T_map_odom: Numbers, source: str) -> None:
+        """Note where an odometry has led to, for the next start: the next flush writes it."""
+        self._noted = [{"type": CORRECTION, "T_map_odom": T_map_odom, "source": source}]
 
     def flush_in_background(self) -> None:
         """Write accepted measurements in a thread, because the thread that processes them may be busy for long."""
@@ -162,8 +178,9 @@ class RunRecorder:
                     synced.result()
 
     def _fill_journal(self) -> None:
-        if accepted := [self._accepted.popleft() for _ in range(len(self._accepted))]:
-            self._journal.present().write(list(map(to_record, accepted)))
+        if records := [to_record(self._accepted.popleft()) for _ in range(len(self._accepted))] + self._noted:
+            self._noted = []
+            self._journal.present().write(records)
 
     @property
     def unwritten(self) -> int:

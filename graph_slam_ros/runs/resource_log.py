@@ -1,28 +1,20 @@
 """Record CPU time, memory and backlog over a run, in a bounded number of samples."""
 
-import os
+import sys
 import time
-from pathlib import Path
+from resource import RUSAGE_SELF, getrusage
 from typing import Any
 
 COLUMNS = ("keyframes", "cpu_s", "memory_mib", "backlog")
 _MOST = 200  # samples: then every second one is dropped, and half as many are added
-_STATM = Path("/proc/self/statm")
-
-
-def resident_mib() -> float:
-    """The resident memory of this process in MiB; 0 if there is no /proc."""
-    try:
-        pages = int(_STATM.read_text().split()[1])
-    except OSError:
-        return 0.0
-    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+_PER_MIB = 2**20 if sys.platform == "darwin" else 2**10  # of the kernel's unit: bytes on macOS, KiB on Linux
 
 
 class ResourceLog:
     """Samples at updates, evenly spaced over the run, whatever its length.
 
-    The backlog of a sample is the largest since the sample before: measurements accepted and not processed.
+    The memory is the most that was resident until then. The backlog of a sample is the largest since the sample
+    before: measurements accepted and not processed.
     """
 
     def __init__(self) -> None:
@@ -36,9 +28,8 @@ class ResourceLog:
         self._next -= 1
         if self._next > 0:
             return
-        self._rows.append(
-            (keyframes, round(time.process_time() - self._begun, 3), round(resident_mib(), 1), self._backlog)
-        )
+        memory_mib = round(getrusage(RUSAGE_SELF).ru_maxrss / _PER_MIB, 1)
+        self._rows.append((keyframes, round(time.process_time() - self._begun, 3), memory_mib, self._backlog))
         if len(self._rows) >= _MOST:
             self._every *= 2
             kept = self._rows[1::2]

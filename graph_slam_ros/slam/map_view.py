@@ -419,7 +419,6 @@ class MapView:
             settings=dict(self.settings),
             displacements=self.displacements,
             used_ns=self.newest_odometry_ns,
-            source=self.odometry_source,
             drive=self._frontend.drive,
             noise_factors=dict(self.noise_factors),
             edits=list(self.edits),

@@ -32,7 +32,6 @@ class MapSnapshot:
     displacements : alarms by then, of all drives, as in ``run.json``
     processed : records of the ingest sequence that it came of
     used_ns : stamp of the last odometry that was used by then; None before the first
-    source : the input of that odometry
     noise_factors : of the configured sigmas, that the edges have, as ``NoiseScales.factors``
     calibration : factors of odometry that the association found, with those configured, by input and name
     edits : by hand, in order
@@ -58,7 +57,6 @@ class MapSnapshot:
     displacements: list[dict[str, Any]] = field(default_factory=list)
     processed: int = 0
     used_ns: int | None = None
-    source: str = ""
     drive: dict[str, Any] = field(default_factory=dict)
     continues: bool = False
     noise_factors: dict[Key, float] = field(default_factory=dict)

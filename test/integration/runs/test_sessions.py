@@ -18,6 +18,7 @@ from graph_slam_ros.runs.recorder import RunRecorder
 from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.runs.restore import complete, map_of, recover
 from graph_slam_ros.slam import Config, Control, Counters
+from graph_slam_ros.slam.frontend.odometry_selector import Step
 from graph_slam_ros.tools.simulation import measurements, simulate, write_bag
 
 WORLD = tuple(measurements(simulate("warehouse", 5, aisles=2, laps=1, aisle_m=4.0)))
@@ -236,10 +237,12 @@ def straight(first, last, *, from_x=0.0, since_ns=0, source="odom"):
 
 def resumed(folder, *later, **config):
     """Of a session that resumes after a drive of 20 m and is given these: whether the robot is located, and why."""
-    again = session(folder, **config)
-    again.resume()
-    assert not again.estimate.is_located
+    again, first = session(folder, **config), later[0]
+    now = Step(first.stamp_ns, first.T_odom_base, first.T_odom_base), first.source
+    at_once, _ = again.T_map_odom(*now), again.resume()  # before the map is loaded
+    assert not again.estimate.is_located and again.T_map_odom(*now) == at_once
     again.ingest(list(later))
+    assert again.estimate.is_located <= (again.T_map_odom(*now) == pytest.approx(at_once, abs=1e-6))
     return again, (again.estimate.is_confirmed, again.estimate.is_resumed)
 
 
@@ -264,8 +267,7 @@ LATER = {  # what comes after a drive of 20 m that was cut off, and whether that
 def test_P12_a_drive_that_was_cut_off_is_resumed_where_its_odometry_goes_on(tmp_path):
     for name, (later, goes_on) in LATER.items():
         run = tmp_path / name.replace(" ", "_") / "run"
-        one = session(run)
-        one.ingest(straight(0, 41))
+        (one := session(run)).ingest(straight(0, 41))
         before = one.slam.T_map_odom
         one.abandon()
         again, located = resumed(run, *later)
@@ -285,8 +287,7 @@ def test_after_a_jump_of_odometry_it_is_doubted_where_the_robot_is_until_somethi
 
 
 def test_P12_a_drive_whose_place_was_not_known_is_not_resumed(tmp_path):
-    one = session(tmp_path / "run")
-    one.ingest(straight(0, 41))
+    (one := session(tmp_path / "run")).ingest(straight(0, 41))
     one.abandon()
     lost, _ = resumed(tmp_path / "run", *straight(0, 41, since_ns=100 * 10**9))
     lost.abandon()
@@ -294,8 +295,7 @@ def test_P12_a_drive_whose_place_was_not_known_is_not_resumed(tmp_path):
 
 
 def test_P12_what_is_resumed_is_the_run_that_was_cut_off_also_where_another_is_named_to_be_loaded(tmp_path):
-    site = session(tmp_path / "site")
-    site.ingest(straight(0, 10))
+    (site := session(tmp_path / "site")).ingest(straight(0, 10))
     site.finish()
     one = session(tmp_path / "run", output__load="site", output__load_at_start=True)
     one.ingest(straight(0, 41))

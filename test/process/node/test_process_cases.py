@@ -22,7 +22,7 @@ from graph_slam_ros.node.pose_extrapolator import PoseExtrapolator
 from graph_slam_ros.node.session import Session
 from graph_slam_ros.runs.folder import is_cut_off, is_incomplete, was_saved_whole
 from graph_slam_ros.runs.journal import read_ingest
-from graph_slam_ros.runs.restore import recover
+from graph_slam_ros.runs.restore import complete, recover
 from graph_slam_ros.slam import GraphSlam
 from graph_slam_ros.solver import Solver
 
@@ -203,8 +203,8 @@ def test_A37_P6_behind_it_tells_what_there_is_and_stopped_then_the_next_start_ma
         whole.move()
     assert distance(path[-1, 1:3], whole.truth) < 0.2
     with inside("/next", output__folder=str(run)):
-        earlier = tmp_path / "run-1"
-        until(lambda: earlier.exists() and not is_incomplete(earlier), threading.Event().wait, "results", 60.0)
+        assert f"graph_slam recover {(earlier := tmp_path / 'run-1')}" in capfd.readouterr().err
+    assert complete(earlier) and not is_incomplete(earlier)
     assert abs(np.loadtxt(earlier / "path.tum")[-1, 0] * 1e9 - odometry[-1]) < 10**9
 
 
