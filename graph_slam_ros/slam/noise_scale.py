@@ -37,11 +37,12 @@ from graph_slam_ros.slam.frontend.noise_factors import (
     PER_M,
     PER_RAD,
     Key,
-    configured_variance,
+    components,
     groups,
+    grown_with,
     grows,
     motion_parts,
-    motion_sizes,
+    of_group,
     parts_of,
 )
 from graph_slam_ros.solver import Solver
@@ -63,6 +64,7 @@ _ROUNDS = 4  # of the regression, each weighted by the variances of the last
 _LARGEST_SQUARE = 9.0  # variances: an error that is larger counts as that
 _LEAST, _MOST = 0.1, 3.0  # factor of the configured sigma
 _MOST_VARIANCE = 9.0  # of what is configured, in the mean over all edges
+_CONFIGURED = np.array([1.0, 0.0, 0.0])  # components of variance: what is configured, and nothing is added
 _ONLY_LARGER = {
     "fixes": "errors of fixes that last leave no residuals",
     "closures": "closures that fit worst are not among the residuals",
@@ -131,101 +133,45 @@ def factors_of(scales: Sequence[NoiseScale]) -> dict[Key, float]:
 
 
 @dataclass(frozen=True, slots=True)
-class Growth:
-    """The noise of a part of odometry.
-
-    Attributes
-    ----------
-    factor : of the configured sigma
-    per_rad, per_m : variance that is added for each radian turned and each metre driven
-    """
-
-    factor: float = 1.0
-    per_rad: float = 0.0
-    per_m: float = 0.0
-
-
-def growth_of(factors: Mapping[Key, float], key: Key) -> Growth:
-    """The noise that a part of odometry has now."""
-    label, source, part = key
-    added = (factors.get((label, source, part + per), 0.0) for per in (PER_RAD, PER_M))
-    return Growth(factors.get(key, 1.0), *added)
-
-
-@dataclass(frozen=True, slots=True)
-class Motions:
-    """Motions that odometry measured, or sums over windows of them, each (n,).
-
-    Attributes
-    ----------
-    own : configured variance
-    turned, way : radians turned and metres driven
-    """
-
-    own: Array
-    turned: Array
-    way: Array
-
-    @classmethod
-    def of(cls, measured: Array, variance: Array, now: Growth) -> "Motions":
-        """Motions (n, 3) or (n, 7) whose variance (n,) is what it is with the present noise."""
-        of_group = {"": now.factor, PER_RAD: now.per_rad, PER_M: now.per_m}
-        return cls(configured_variance(variance, "", of_group, measured), *motion_sizes(measured))
-
-    def at(self, rows: Index) -> "Motions":
-        """Some of them."""
-        return Motions(self.own[rows], self.turned[rows], self.way[rows])
-
-    def summed(self, windows: Sequence[Index]) -> "Motions":
-        """Sums over windows of motions, which follow one another."""
-        columns = self.own, self.turned, self.way
-        return Motions(*(np.array([column[rows].sum() for rows in windows]) for column in columns))
-
-    def variance(self, noise: Growth) -> Array:
-        """The variance of each."""
-        return noise.factor**2 * self.own + noise.per_rad * self.turned + noise.per_m * self.way
-
-    def bounded(self, noise: Growth) -> Growth:
-        """A noise whose factor and added variance are within their limits."""
-        factor = float(np.clip(noise.factor, _LEAST, _MOST))
-        added = float(np.sum(self.variance(Growth(0.0, noise.per_rad, noise.per_m))))
-        share = min(1.0, _MOST_VARIANCE * float(np.sum(self.own)) / added) if added > 0.0 else 1.0
-        return Growth(factor, share * noise.per_rad, share * noise.per_m)
-
-
-@dataclass(frozen=True, slots=True)
 class _Errors:
     """Errors of a part of odometry, of edges or of windows.
 
     Attributes
     ----------
+    motions : (n, 3) what the variance of each grows with: what is configured, radians turned and metres driven
     square : (n,) square of each residual, or sum of residuals
     left : (n,) the variance that all measurements together leave to its error
     count : number of edges or windows, of which these are a sample; what is configured counts as
         ``CONFIGURED_COUNT`` of them
     """
 
-    motions: Motions
+    motions: Array
     square: Array
     left: Array
     count: int
 
-    def growth(self, now: Growth, *, is_rotation: bool) -> Growth:
-        """One step of expectation and maximisation, drawn to what is configured.
+    def components(self, now: Array, *, is_rotation: bool) -> Array:
+        """One step of expectation and maximisation of the components (3,), drawn to what is configured.
 
         Turning adds to a rotation; a position grows with the way alone.
         """
-        motions, at = self.motions, self.motions.variance(now)
+        motions, at = self.motions * [1.0, float(is_rotation), 1.0], self.motions @ now
         expected = np.minimum(self.square + self.left, _LARGEST_SQUARE * at)
         for _ in range(_ROUNDS):
-            columns = np.stack([motions.own, motions.turned * is_rotation, motions.way], axis=1) / at[:, None]
+            columns = motions / at[:, None]
             size = np.linalg.norm(columns, axis=0)
             size[size == 0.0] = 1.0
-            found = nnls(columns / size, expected / at)[0] / size
-            now = motions.bounded(Growth(float(np.sqrt(found[0])), float(found[1]), float(found[2])))
-            at = motions.variance(now)
+            now = _bounded(nnls(columns / size, expected / at)[0] / size, motions)
+            at = self.motions @ now
         part = self.count / (self.count + CONFIGURED_COUNT)
-        return Growth(float(np.sqrt(part * now.factor**2 + 1.0 - part)), part * now.per_rad, part * now.per_m)
+        return part * now + (1.0 - part) * _CONFIGURED
+
+
+def _bounded(components: Array, motions: Array) -> Array:
+    """Components (3,) whose factor and added variance are within their limits."""
+    own, added = motions.sum(axis=0)[0], float((motions[:, 1:] @ components[1:]).sum())
+    share = min(1.0, _MOST_VARIANCE * own / added) if added > 0.0 else 1.0
+    return np.array([np.clip(components[0], _LEAST**2, _MOST**2), *(share * components[1:])])
 
 
 @dataclass(slots=True)
@@ -279,27 +225,25 @@ def estimate_noise(
             of_type = table.type, block.measured
             parts = motion_parts(*of_type, block.roots) if does_grow else parts_of(*of_type)
             for part, axes in parts.items():
-                key, total = (label, source, part), sums.setdefault((label, source, part), _Sums())
+                total, now = sums.setdefault((label, source, part), _Sums()), of_group(factors, label, source)
                 if does_grow:
-                    now = growth_of(factors, key)
-                    block.add_odometry(total, axes, now, stamp_of, is_rotation=part == "rotation")
+                    block.add_odometry(total, axes, components(now, part), stamp_of, is_rotation=part == "rotation")
                 else:
-                    block.add_to(total, axes, factors.get(key, 1.0), passes)
+                    block.add_to(total, axes, now.get(part, 1.0), passes)
     scales = [_scale(key, total, factors.get(key, 1.0)) for key, total in sums.items()]
-    return [_grown(one, sums[one.key], growth_of(factors, one.key)) for one in scales]
+    return [_grown(one, sums[one.key], components(of_group(factors, *one.key[:2]), one.part)) for one in scales]
 
 
-def _grown(one: NoiseScale, total: _Sums, now: Growth) -> NoiseScale:
+def _grown(one: NoiseScale, total: _Sums, now: Array) -> NoiseScale:
     """The scale of a part of odometry, with how it grows; any other is as it was."""
     if not total.errors:
         return one
-    found = now
     if not one.reason:
-        every, is_rotation = total.errors[0].motions, one.part == "rotation"
-        fits = [errors.growth(now, is_rotation=is_rotation) for errors in total.errors]
-        found = max(fits, key=lambda fit: float(every.variance(fit).sum()))
-    per_s = found.factor**2 * total.own_per_s
-    return replace(one, factor=found.factor, per_rad=found.per_rad, per_m=found.per_m, per_s=per_s)
+        every = total.errors[0].motions
+        fits = [errors.components(now, is_rotation=one.part == "rotation") for errors in total.errors]
+        now = max(fits, key=lambda fit: float((every @ fit).sum()))
+    variance, per_rad, per_m = now.tolist()
+    return replace(one, factor=variance**0.5, per_rad=per_rad, per_m=per_m, per_s=variance * total.own_per_s)
 
 
 class _Block:
@@ -341,24 +285,24 @@ class _Block:
             total.of_means += float(np.sum(np.sum(sums**2, axis=1) / sizes))
             total.of_singles += float(np.sum(squares / sizes))
 
-    def add_odometry(self, total: "_Sums", axes: Array, now: Growth, stamp_of: Index, *, is_rotation: bool) -> None:
+    def add_odometry(self, total: "_Sums", axes: Array, now: Array, stamp_of: Index, *, is_rotation: bool) -> None:
         """Add a part of odometry's residuals, and how its noise grows."""
         count, kinds = len(self.residual), axes.shape[2]
         variance = np.einsum("nij,nik,nkj->n", axes, self.covariance, axes)
         square = np.sum(np.einsum("nij,ni->nj", axes, self.residual) ** 2, axis=1)
         known = np.einsum("nij,nik,nkj->n", axes[self.sampled], self.hat, axes[self.sampled])
-        motions = Motions.of(self.measured, variance, now)
+        motions = grown_with(variance, self.measured, now)
         total.edges += count
         total.residuals += float(kinds * count)
         total.leverage += float((known / variance[self.sampled]).mean()) * kinds * count
-        total.chi2 += kinds * float(np.sum(square / motions.own))
+        total.chi2 += kinds * float(np.sum(square / motions[:, 0]))
         seconds = float(np.sum(np.abs(np.diff(stamp_of[self.ends[:, :2]], axis=1)))) * 1e-9
-        total.own_per_s = float(motions.own.sum()) / max(1e-9, seconds)
-        total.errors = [_Errors(motions.at(self.sampled), square[self.sampled], known, count)]
+        total.own_per_s = float(motions[:, 0].sum()) / max(1e-9, seconds)
+        total.errors = [_Errors(motions[self.sampled], square[self.sampled], known, count)]
         if is_rotation:
             total.errors.append(self._turns(motions, stamp_of))
 
-    def _turns(self, motions: Motions, stamp_of: Index) -> _Errors:
+    def _turns(self, motions: Array, stamp_of: Index) -> _Errors:
         """Errors of rotation, summed over windows in the axes of the last pose of each."""
         every, dof = _windows(self.ends, stamp_of), self._dof
         space = PLANAR if dof == PLANAR.dof else SPATIAL
@@ -374,7 +318,8 @@ class _Block:
                 jacobian[:, dof * k : dof * (k + 2)] += into @ self._jacobian[row, n:]
             square.append(residual @ residual)
             left.append(np.trace(jacobian @ self._solver.joint_marginal(vertices) @ jacobian.T))
-        return _Errors(motions.summed(sample), np.array(square), np.array(left), len(every))
+        summed = np.array([motions[rows].sum(axis=0) for rows in sample]).reshape(-1, 3)
+        return _Errors(summed, np.array(square), np.array(left), len(every))
 
 
 def _windows(ends: Index, stamp_of: Index) -> list[Index]:

@@ -37,16 +37,21 @@ def motion_sizes(measured: Array) -> tuple[Array, Array]:
     return turned, np.linalg.norm(measured[:, :3], axis=1)
 
 
-def added_variance(part: str, of_group: Mapping[str, float], measured: Array) -> Array:
-    """Return the variance (n,) that motions add to a part of odometry, summed over its directions."""
-    turned, way = motion_sizes(measured)
-    return of_group.get(part + PER_RAD, 0.0) * turned + of_group.get(part + PER_M, 0.0) * way
+def components(factors: Mapping[str, float], part: str) -> Array:
+    """Return the variance (3,) of a part of odometry for each of its configured variance, radian turned and metre."""
+    return np.array([factors.get(part, 1.0) ** 2, factors.get(part + PER_RAD, 0.0), factors.get(part + PER_M, 0.0)])
 
 
-def configured_variance(now: Array, part: str, of_group: Mapping[str, float], measured: Array) -> Array:
-    """Return the configured variance (n,) of a part of odometry, from the variance that is scaled and increased."""
-    own = now - added_variance(part, of_group, measured)
-    return np.maximum(own, _LEAST_OWN * now) / of_group.get(part, 1.0) ** 2
+def grown_with(variance: Array, measured: Array, now: Array) -> Array:
+    """Return what the variance (n,) of motions grew with (n, 3): what is configured, radians turned, metres driven.
+
+    Parameters
+    ----------
+    now : (3,) the components that the variance has
+    """
+    sizes = np.stack(motion_sizes(measured), axis=1)
+    own = np.maximum(variance - sizes @ now[1:], _LEAST_OWN * variance) / now[0]
+    return np.column_stack((own, sizes))
 
 
 def parts_of(edge: EdgeType, measured: Array) -> dict[str, Array]:
@@ -111,7 +116,7 @@ def _sight_parts(position: Array) -> dict[str, Array]:
 def _rescale(graph: Graph, edges: range, before: Mapping[Key, float], after: Mapping[Key, float]) -> None:
     """Rescale edges from some factors to others. A solver that has used them must start over."""
     for table, rows, label, source in groups(graph, edges):
-        own_before, own_after = _of(before, label, source), _of(after, label, source)
+        own_before, own_after = of_group(before, label, source), of_group(after, label, source)
         if own_after:
             roots = table.sqrt_information.values
             measured = table.measured.values[rows]
@@ -150,7 +155,7 @@ class NoiseScales:
     ) -> int:
         """Add an edge to the graph as ``Graph.add_edge`` does, its configured noise scaled."""
         label, source = (*names, "")[:2]
-        factors = _of(self.factors, label, source)
+        factors = of_group(self.factors, label, source)
         if factors:
             z = edge.whole(np.asarray(measured, dtype=float)[None])
             noise = Gaussian(_rescaled(edge, label, z, noise.sqrt_information[None], {}, factors)[0])
@@ -179,7 +184,8 @@ def _is_same(before: float, after: float) -> bool:
     return abs(after - before) <= LEAST_CHANGE * before
 
 
-def _of(factors: Mapping[Key, float], label: str, source: str) -> dict[str, float]:
+def of_group(factors: Mapping[Key, float], label: str, source: str) -> dict[str, float]:
+    """Return the factors of the edges of a class and an input, by part."""
     return {part: factor for (one, other, part), factor in factors.items() if (one, other) == (label, source)}
 
 
@@ -197,9 +203,9 @@ def _rescaled(
     for part, axes in motion_parts(edge, measured, roots).items():
         spread = np.linalg.solve(np.swapaxes(roots, 1, 2), axes)
         now = np.einsum("nij,nij->n", spread, spread)
-        own = configured_variance(now, part, before, measured) * after.get(part, 1.0) ** 2
+        then = grown_with(now, measured, components(before, part)) @ components(after, part)
         into.append(np.swapaxes(axes, 1, 2))
-        scaled.append(into[-1] / np.sqrt((own + added_variance(part, after, measured)) / now)[:, None, None])
+        scaled.append(into[-1] / np.sqrt(then / now)[:, None, None])
     return roots @ np.linalg.solve(np.concatenate(into, axis=1), np.concatenate(scaled, axis=1))
 
 
