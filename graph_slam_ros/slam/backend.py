@@ -16,7 +16,7 @@ from graph_slam_ros.slam.frontend.noise_factors import CLASSES, Key, NoiseScales
 from graph_slam_ros.slam.lifelong.state import BoundedState
 from graph_slam_ros.slam.noise_scale import NoiseScale, estimate_noise, factors_of
 from graph_slam_ros.slam.revision import Applied, Replacement, Revision
-from graph_slam_ros.slam.robust.gating import OutlierGate
+from graph_slam_ros.slam.robust.gating import CANDIDATES, OutlierGate
 from graph_slam_ros.slam.robust.hypotheses import (
     Alternative,
     FrozenGraph,
@@ -223,7 +223,8 @@ class Backend:
 
     def _applied(self, r: Revision) -> Applied | None:
         solver, decisions, keyframe, report = self.solver, self.decisions, self.keyframe, None
-        named, first = [*(one.edge for one in r.replaced), *(edge for edge, _ in r.restored)], self.first_free_edge
+        named = [*(one.edge for one in r.replaced), *(edge for edge, _ in r.restored), *r.withdrawn]
+        first = self.first_free_edge
         if named and min(named) < first:
             raise GraphSlamError(f"edge {min(named)} is of a map that is held")
         accepted, rejected = ([edge for edge in edges if edge >= first] for edges in (r.accepted, r.rejected))
@@ -234,9 +235,10 @@ class Backend:
             one.table.sqrt_information.values[one.rows] = one.sqrt_information
         if r.noise is not None or r.remeasured:
             solver.rebuild()
+        self.withdraw(r.withdrawn, r.reason, vertex=r.vertex)
         replaced = self.replace(r.replaced, r.reason, r.evidence, r.threshold)
         for edge, in_its_place in r.restored:
-            self._restore_odometry(edge, in_its_place, r.evidence)
+            self._restore(edge, in_its_place, r.evidence)
         if r.verdicts is not None and not decisions.adopt_verdicts(r.verdicts, keyframe) and r.settings is None:
             return None
         if r.values is not None:
@@ -258,7 +260,7 @@ class Backend:
             solver.update()
             if r.compared:  # all others wait while an alarm is not decided
                 self._admit()
-        return Applied(replaced, report)
+        return Applied((*replaced, *((edge, -1) for edge in r.withdrawn)), report)
 
     def replace(
         self, replaced: Sequence[Replacement], reason: Reason, evidence: float, threshold: float | None = None
@@ -277,12 +279,17 @@ class Backend:
                 self.ledger.threshold.values[self.ledger.ids.row(edge)] = threshold
         return tuple(out)
 
-    def _restore_odometry(self, edge: int, in_its_place: int, evidence: float) -> None:
-        """Undo ``replace``."""
-        threshold, row = self.ledger.threshold.values, self.ledger.ids.row
-        self.decisions.withdraw([in_its_place], self.keyframe, Reason.REVOKED)
-        threshold[row(edge)] = threshold[row(in_its_place)]
-        self.decisions.decide(edge, self.keyframe, Verdict.NOT_EVALUATED, Reason.NONE, evidence)
+    def _restore(self, edge: int, in_its_place: int, evidence: float) -> None:
+        """Undo ``replace`` and ``withdraw``. A candidate is accepted, and judged as others are."""
+        ends = np.setdiff1d(self.graph.edge(edge).vertices, self.solver.vertices)
+        self.solver.add(ends.tolist(), [])
+        is_candidate = self.graph.label_of(edge) in CANDIDATES
+        if in_its_place >= 0:
+            threshold, row = self.ledger.threshold.values, self.ledger.ids.row
+            self.decisions.withdraw([in_its_place], self.keyframe, Reason.REVOKED)
+            threshold[row(edge)] = threshold[row(in_its_place)]
+        verdict = Verdict.ACCEPTED if is_candidate else Verdict.NOT_EVALUATED
+        self.decisions.decide(edge, self.keyframe, verdict, Reason.NONE, evidence)
 
     def all_or_nothing(self, what: str, change: Callable[[], Result | None]) -> Result | None:
         """Change what was solved. After an exception, which is counted, all is as it was, and the result is None."""

@@ -1,7 +1,7 @@
 """What a person removes from the map while the robot drives: an edge, a landmark, all loop closures."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -12,9 +12,10 @@ from graph_slam_ros.measurements.types import Control, Value
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
 from graph_slam_ros.slam.landmarks.landmark_map import Landmarks
+from graph_slam_ros.slam.revision import Revision
 from graph_slam_ros.slam.robust.gating import CANDIDATES
 from graph_slam_ros.slam.robust.landmark_support import landmark_of
-from graph_slam_ros.slam.robust.ledger import OUTSIDE, Ledger
+from graph_slam_ros.slam.robust.ledger import OUTSIDE, Ledger, Reason
 
 SOURCE = "edit"
 BY_HAND = "by_hand"
@@ -50,14 +51,15 @@ class Edits:
     def remove(self, what: Mapping[str, Value]) -> bool:
         """Remove what a control event names, an edge or a landmark; returns whether that was possible."""
         self._backend.hand_over()
-        edge, landmark = what.get("edge"), what.get("landmark")
+        landmark = what.get("landmark")
         if landmark is None:
-            reason = self._remove_edge(int(str(edge)))
+            reason = self._remove_edge(int(str(what.get("edge"))))
         elif self._frontend.path.keyframes.first:
             reason = "condensed_in_map"
         else:
             reason = self._remove_landmark(str(landmark))
-        self._counters.count(SOURCE, reason)
+        if reason:
+            self._counters.count(SOURCE, reason)
         return reason == "removed"
 
     def clear_closures(self) -> bool:
@@ -65,10 +67,9 @@ class Edits:
         ledger = self._backend.ledger
         self._backend.hand_over()
         closures = [edge for edge in self._backend.graph.edges_of("closures").tolist() if edge >= ledger.final]
-        self._backend.withdraw(closures)
-        if closures:
+        if done := bool(closures and self._withdraw(closures)):
             self._counters.count("closures", "cleared", len(closures))
-        return bool(closures)
+        return done
 
     def _remove_edge(self, edge: int) -> str:
         """Remove an edge, and a landmark with the last edge that determines it; returns what is counted."""
@@ -79,22 +80,24 @@ class Edits:
         if vertex is not None and determining(graph, ledger, vertex) == [edge]:
             name = next((name for name, mark in self._landmarks.known.items() if mark.vertex == vertex), "")
             return self._remove_landmark(name)
-        self._backend.withdraw([edge])
-        return "removed"
+        return self._withdraw([edge])
 
     def _remove_landmark(self, name: str) -> str:
         """Remove a landmark and its edges; what is observed of that name later begins another."""
         backend, landmark = self._backend, self._landmarks.known.get(name)
         if landmark is None:
-            reason = "unknown_landmark"
-        elif backend.solver.is_held(landmark.vertex):
-            reason = "held_in_map"
-        else:
-            edges = standing_edges(backend.graph, backend.ledger, landmark.vertex)
-            backend.withdraw(edges, vertex=landmark.vertex)
+            return "unknown_landmark"
+        if backend.solver.is_held(landmark.vertex):
+            return "held_in_map"
+        edges = standing_edges(backend.graph, backend.ledger, landmark.vertex)
+        if done := self._withdraw(edges, landmark.vertex):
             self._landmarks.forget({landmark.vertex})
-            reason = "removed"
-        return reason
+        return done
+
+    def _withdraw(self, edges: Sequence[int], vertex: int | None = None) -> str:
+        """Withdraw edges, and a vertex with all of its edges; returns what is counted, or nothing if that fails."""
+        out = Revision(withdrawn=edges, vertex=vertex, reason=Reason.WITHDRAWN, solves="nothing")
+        return "removed" if self._backend.apply(SOURCE, lambda: out) is not None else ""
 
 
 def standing_edges(graph: Graph, ledger: Ledger, vertex: int) -> list[int]:
@@ -120,11 +123,9 @@ def anchors(graph: Graph, ledger: Ledger) -> list[int]:
 def why_not_removed(graph: Graph, ledger: Ledger, edge: int) -> str:
     """Return the reason why an edge cannot be removed; empty where it can."""
     if not graph.edge_ids.has(edge):
-        reason = "condensed_in_map" if 0 <= edge < graph.edge_ids.next else "unknown_edge"
-    elif ledger.is_withdrawn(edge):
-        reason = "unknown_edge"
-    elif graph.label_of(edge) not in (*CANDIDATES, BY_HAND) or anchors(graph, ledger) == [edge]:
-        reason = "needed_edge"
-    else:
-        reason = "held_in_map" if edge < ledger.final else ""
-    return reason
+        return "condensed_in_map" if 0 <= edge < graph.edge_ids.next else "unknown_edge"
+    if ledger.is_withdrawn(edge):
+        return "unknown_edge"
+    if graph.label_of(edge) not in (*CANDIDATES, BY_HAND) or anchors(graph, ledger) == [edge]:
+        return "needed_edge"
+    return "held_in_map" if edge < ledger.final else ""

@@ -39,8 +39,9 @@ class Revision:
     ----------
     noise : factors of the configured sigmas, by group of edges
     remeasured : what edges measured
+    withdrawn : edges that are out for good, for ``reason``; and a ``vertex`` that goes with them
     replaced : edges of odometry, for ``reason``
-    restored : edges of odometry that are used again, each with the one that took its place
+    restored : edges that were withdrawn or replaced and are used again, each with what took its place, or -1
     verdicts : a ledger whose verdicts on the edges that it has are taken over
     values : stored numbers of all vertices to go on from
     is_judged_anew : whether all candidates are judged at these values
@@ -53,6 +54,8 @@ class Revision:
 
     noise: Mapping[Key, float] | None = None
     remeasured: Sequence[Remeasured] = ()
+    withdrawn: Sequence[int] = ()
+    vertex: int | None = None
     replaced: Sequence[Replacement] = ()
     restored: Sequence[tuple[int, int]] = ()
     verdicts: Ledger | None = None
@@ -74,7 +77,7 @@ class Applied:
 
     Attributes
     ----------
-    replaced : edges of odometry, each with the one that took its place: ``restored`` of the revision that undoes it
+    replaced : edges that are out, each with what took its place: ``restored`` of the revision that undoes this
     report : of a solve of all
     """
 

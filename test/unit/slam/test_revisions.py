@@ -38,15 +38,16 @@ class Reviser:
         return self.backend.apply("odometry", lambda: revision)
 
     def one(self):
-        graph = self.backend.graph
-        free = [e for e in graph.edges_of("odometry").tolist() if e >= self.backend.first_free_edge]
-        odometry = [e for e in free if graph.edge(e).weight][-10:]
-        some = self.rng.choice(odometry, size=min(3, len(odometry)), replace=False).tolist()
+        graph, first = self.backend.graph, self.backend.first_free_edge
+        every = map(graph.edges_of, ("odometry", "closures"))
+        odometry, closures = ([e for e in of.tolist() if e >= first and graph.edge(e).weight] for of in every)
+        some = self.rng.choice(odometry[-10:], size=min(3, len(odometry)), replace=False).tolist()
         wider = [Replacement(e, graph.edge(e).measured, Gaussian.from_sigmas(1.0, 1.0, 1.0)) for e in some]
         slip = Revision(replaced=wider, reason=Reason.SLIP, evidence=9.0, threshold=5.0)
         noise = Revision(noise={NOISE_KEY: float(self.rng.uniform(0.5, 2.0))}, solves="all")
         verdicts = Revision(verdicts=self.backend.ledger.copy(), settings=self.drive.settings, solves="all")
-        return [slip, noise, verdicts][self.rng.integers(3)]
+        removal = Revision(withdrawn=closures[-2:], reason=Reason.WITHDRAWN)
+        return (slip, noise, verdicts, removal)[self.rng.integers(4)]
 
     def undone(self, revision, applied):
         noise = {NOISE_KEY: 1.0} if revision.noise else None
@@ -70,8 +71,7 @@ def test_each_revision_is_undone_by_its_inverse_and_one_that_fails_leaves_nothin
                 for name in ("optimize", "update"):
                     broken.setattr(Solver, name, lambda *_: 1 / 0)
                 assert reviser.apply(revision) is None
-            assert is_same(state(drive), before)
-            assert drive.backend.graph.edge_count == edges
+            assert is_same(state(drive), before) and drive.backend.graph.edge_count == edges
             continue
         applied = reviser.apply(revision)
         if applied is not None:
