@@ -53,10 +53,10 @@ def drive(path: Path, settings: Mapping[str, object]) -> float:
             slam.process(m)
     for event in END:
         slam.process(event)
-    seen = slam.sighting_poses
+    seen = slam.view.sighting_poses
     truth = np.asarray(se3.in_plane(interpolated(read_truth(path).trajectory, seen.stamps_ns * 1e-9)))
     known = np.isfinite(truth).all(axis=1)
-    return judge.position_error(slam.sighting_trajectory()[known], truth[known])
+    return judge.position_error(slam.view.sighting_trajectory()[known], truth[known])
 
 
 def not_back(clean: Mapping[str, float | str], wrong: Mapping[str, float | str]) -> str:

@@ -20,7 +20,7 @@ from benchmarks import options, table
 from graph_slam_ros.analysis.consistency import Nees, landmark_errors, pose_errors
 from graph_slam_ros.lie import se3
 from graph_slam_ros.messages.results import landmark_estimates
-from graph_slam_ros.slam import Config, Control, GraphSlam
+from graph_slam_ros.slam import Config, Control, GraphSlam, MapView
 from graph_slam_ros.tools.simulation import Recording, measurements, simulate
 
 Array = NDArray[np.float64]
@@ -121,17 +121,17 @@ def drive(world: World, seed: int, settings: Mapping[str, Any]) -> Run:
     slam = GraphSlam(Config.from_mapping({"world.dimensions": world.dimensions, **settings, **world.settings}))
     for m in [*measurements(recording), Control("end"), Control("optimize")]:
         slam.process(m)
-    return compare(slam, recording)
+    return compare(slam.view, recording)
 
 
-def compare(slam: GraphSlam, recording: Recording) -> Run:
+def compare(view: MapView, recording: Recording) -> Run:
     """A solved run with the truth; keyframes are at stamps of odometry, for which the simulator knows the truth."""
-    estimate = se3.in_space(slam.trajectory()) if slam.space.dimensions == 2 else slam.trajectory()
-    at = np.searchsorted(recording.stamps_ns, slam.keyframes.stamps_ns)
+    estimate = se3.in_space(view.trajectory()) if view.space.dimensions == 2 else view.trajectory()
+    at = np.searchsorted(recording.stamps_ns, view.keyframes.stamps_ns)
     true = recording.T_world_base[at]
-    true = se3.in_space(true) if slam.space.dimensions == 2 else true
-    covariances = slam.keyframe_covariances()
-    n, found = slam.space.dimensions, landmark_estimates(slam)
+    true = se3.in_space(true) if view.space.dimensions == 2 else true
+    covariances = view.keyframe_covariances()
+    n, found = view.space.dimensions, landmark_estimates(view)
     positions, true_positions = np.zeros((len(found), 3)), np.zeros((len(found), 3))
     of_positions = np.zeros((len(found), 3, 3))
     for k, (name, value, covariance) in enumerate(found):

@@ -37,7 +37,7 @@ from graph_slam_ros.analysis.evaluation import evaluate
 from graph_slam_ros.analysis.trajectories import read_truth
 from graph_slam_ros.runs.replay import replay as replayed
 from graph_slam_ros.runs.trajectory import read_landmarks
-from graph_slam_ros.slam import Config, Control, GraphSlam, Measurement
+from graph_slam_ros.slam import Config, Control, GraphSlam, MapView, Measurement
 from graph_slam_ros.tools.simulation import Fault, Recording, faulty_recording, measurements, simulate, write_bag
 from graph_slam_ros.typing import Array
 
@@ -117,7 +117,7 @@ def carried(drives: Sequence[tuple[int, float]]) -> Iterator[Row]:
         slam = _driven(one.measurements())
         displaced, slips = _left(slam, "displaced", "displacement"), _left(slam, "slip", "slip")
         found, false = found + (displaced > 0), false + max(displaced - 1, 0) + slips
-        errors.append(_error_m(slam, one.true_positions(slam.keyframes.stamps_ns)))
+        errors.append(_error_m(slam.view, one.true_positions(slam.view.keyframes.stamps_ns)))
     yield Row("found", found, f"of {len(drives)}", "higher", 1.0)
     yield Row("false", false, tolerance=1.0, comment="slips, and displacements beside the true one")
     yield Row("path, median", float(np.median(errors)), "m")
@@ -140,7 +140,7 @@ def slips(drives: Sequence[tuple[int, str]]) -> Iterator[Row]:
             soon = decided if m.stamp_ns <= begin_ns + _SOON_S * 1e9 else soon
         slam.process(Control("end"))
         found, false = found + (soon > before), false + before + _left(slam, "displaced", "displacement")
-        errors.append(_error_m(slam, _true_positions(clean, slam)))
+        errors.append(_error_m(slam.view, _true_positions(clean, slam.view)))
     yield Row("found", found, f"of {len(drives)}", "higher", 1.0)
     yield Row("false", false, tolerance=1.0, comment="displacements, and slips before it slipped")
     yield Row("path", _rms(errors), "m")
@@ -311,13 +311,13 @@ def _left(slam: GraphSlam, counter: str, word: str) -> int:
     return slam.counters["odometry", counter] - slam.counters["odometry", f"{word}_taken_back"]
 
 
-def _true_positions(recording: Recording, slam: GraphSlam) -> Array:
-    at = np.searchsorted(recording.stamps_ns, slam.keyframes.stamps_ns, side="right") - 1
+def _true_positions(recording: Recording, view: MapView) -> Array:
+    at = np.searchsorted(recording.stamps_ns, view.keyframes.stamps_ns, side="right") - 1
     return recording.T_world_base[at, :2]
 
 
-def _error_m(slam: GraphSlam, positions: Array) -> float:
-    return judge.position_error(slam.trajectory(), np.pad(positions, ((0, 0), (0, 1))))
+def _error_m(view: MapView, positions: Array) -> float:
+    return judge.position_error(view.trajectory(), np.pad(positions, ((0, 0), (0, 1))))
 
 
 def _rms(values: Iterable[float]) -> float:

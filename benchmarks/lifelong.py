@@ -60,7 +60,7 @@ class Drive:
     def _begin(self, keyframes: int) -> None:
         self.update_s = array("d", bytes(8 * keyframes))
         self.looks, self.memory_mib = list[tuple[float, ...]](), [0.0, 0.0]
-        self.path = np.empty((0, self.slam.space.dimensions))  # estimated positions of all keyframes, at the end
+        self.path = np.empty((0, self.slam.view.space.dimensions))  # estimated positions of all keyframes, at the end
 
     def run(self) -> None:
         """Drive to the end."""
@@ -70,8 +70,8 @@ class Drive:
             parts = list[Left]()
             while left.peek(1):
                 parts.append(pickle.load(left))
-        whole = WholePath(self.slam, Left.joined(self.slam.space, parts)).poses()
-        self.path = whole[:, : self.slam.space.dimensions]
+        whole = WholePath(self.slam.view, Left.joined(self.slam.view.space, parts)).poses()
+        self.path = whole[:, : self.slam.view.space.dimensions]
 
     def _run(self, left: IO[bytes]) -> None:
         count = len(self.update_s)
@@ -97,19 +97,19 @@ class Drive:
 
     def landmarks(self) -> tuple[list[int], Array, Array]:
         """Vertices of the landmarks that are in the problem, estimated and true positions, or poses."""
-        known, course = set(self.slam.solver.vertices.tolist()), self.course
-        marks = {name: mark for name, mark in self.slam.landmarks.items() if mark.vertex in known}
+        known, course = set(self.slam.view.solver.vertices.tolist()), self.course
+        marks = {name: mark for name, mark in self.slam.view.landmarks.items() if mark.vertex in known}
         vertices, numbers = [mark.vertex for mark in marks.values()], [int(name[1:]) for name in marks]
         whole = course.points[numbers]
         if course.turns:
             whole = np.concatenate((whole, np.array(course.turns)[numbers]), axis=1)
         true = np.stack(self._in_map("compose" if course.turns else "act", tuple(whole.T)), axis=-1)
-        return vertices, self.slam.solver.estimate(vertices), true
+        return vertices, self.slam.view.solver.estimate(vertices), true
 
     def figures(self) -> dict[str, float]:
         """What was measured."""
         error, nees, of_marks = np.array(self.looks).T
-        there, right = (one[:, : self.slam.space.dimensions] for one in self.landmarks()[1:])
+        there, right = (one[:, : self.slam.view.space.dimensions] for one in self.landmarks()[1:])
         return {
             **self._sizes(),
             "newest m": float(np.sqrt((error**2).mean())),
@@ -122,14 +122,14 @@ class Drive:
 
     def _true(self) -> Array:
         """True positions of the keyframes."""
-        out = np.zeros((len(self.update_s), self.slam.space.dimensions))
+        out = np.zeros((len(self.update_s), self.slam.view.space.dimensions))
         out[:, :2] = self.course.where[: len(out)]
         return out
 
     def _sizes(self) -> dict[str, float]:
         return {
-            "vertices": len(self.slam.solver.vertices),
-            "edges": len(self.slam.solver.edges),
+            "vertices": len(self.slam.view.solver.vertices),
+            "edges": len(self.slam.view.solver.edges),
             "early MiB": self.memory_mib[0],
             "late MiB": self.memory_mib[1],
         }
@@ -151,13 +151,13 @@ class Drive:
 
     def _newest(self) -> tuple[float, ...]:
         """Return the error of the newest pose [m], its NEES, and that of the landmarks."""
-        slam, space, n = self.slam, self.course.space, self.course.space.dimensions
-        newest, (vertices, there, right) = slam.keyframes[-1].vertex, self.landmarks()
-        (pose,) = slam.solver.estimate([newest])
-        true = self._in_map("compose", self.course.pose(len(slam.keyframes) - 1))
+        view, space, n = self.slam.view, self.course.space, self.course.space.dimensions
+        newest, (vertices, there, right) = view.keyframes[-1].vertex, self.landmarks()
+        (pose,) = view.solver.estimate([newest])
+        true = self._in_map("compose", self.course.pose(len(view.keyframes) - 1))
         turn, shift = fitted(there[:, :n], right[:, :n])
         error = float(np.linalg.norm(turn @ pose[:n] + shift - np.array(true[:n])))
-        (covariance,) = slam.solver.marginal([newest])
+        (covariance,) = view.solver.marginal([newest])
         off = np.array(space.group.log(space.group.between(tuple(pose), true)))
         nees = float(off @ np.linalg.solve(covariance, off)) / len(off)
         return error, nees, self._shape_nees(vertices, there, right, (turn, shift))
@@ -169,15 +169,15 @@ class Drive:
         ----------
         laid : rotation and shift by which they lie on the true ones
         """
-        group, kind = self.course.space.group, self.slam.graph.kind_of(vertices[0])
-        act = group.compose if self.course.turns else group.act
+        group, view = self.course.space.group, self.slam.view
+        kind, act = view.graph.kind_of(vertices[0]), group.compose if self.course.turns else group.act
         onto = np.eye(len(laid[1]) + 1)
         onto[:-1, :-1], onto[:-1, -1] = laid
         whole = np.eye(self.course.space.dof) * _PROBE
         moves = [np.stack(act(group.exp(tuple(one)), tuple(there.T)), axis=-1) for one in whole]
         gauge = np.stack([kind.local(there, one).ravel() / _PROBE for one in moves], axis=-1)
         off = kind.local(there, np.stack(act(group.inverse(group.from_matrix(onto)), tuple(right.T)), axis=-1)).ravel()
-        off_, gauge_ = np.split(np.linalg.solve(self.slam.solver.joint_marginal(vertices), np.c_[off, gauge]), [1], 1)
+        off_, gauge_ = np.split(np.linalg.solve(view.solver.joint_marginal(vertices), np.c_[off, gauge]), [1], 1)
         pull = gauge.T @ off_[:, 0]
         chi2 = off @ off_[:, 0] - pull @ np.linalg.solve(gauge.T @ gauge_, pull)
         return float(chi2) / (len(off) - len(pull))
@@ -198,8 +198,8 @@ class UnnamedDrive(Drive):
 
     def landmarks(self) -> tuple[list[int], Array, Array]:
         """Vertices of the confirmed landmarks, estimated positions, and the true ones that these are of."""
-        vertices = [mark.vertex for mark in self.slam.landmarks.values() if not mark.is_tentative]
-        there = self.slam.solver.estimate(vertices)
+        vertices = [mark.vertex for mark in self.slam.view.landmarks.values() if not mark.is_tentative]
+        there = self.slam.view.solver.estimate(vertices)
         places = np.stack(self._in_map("act", tuple(self.course.points.T)), axis=-1)
         return vertices, there, places[self._nearest(there, places)]
 

@@ -29,7 +29,7 @@ from graph_slam_ros.lie import se2, se3
 from graph_slam_ros.overview.chosen_inputs import choose_inputs
 from graph_slam_ros.recordings.bag import open_bag
 from graph_slam_ros.runs.replay import RecordedRuns
-from graph_slam_ros.slam import Config, Control, Counters, GraphSlam
+from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, MapView
 
 _ROBOTS = range(1, 6)
 
@@ -51,10 +51,10 @@ class Drawn:
     T_keyframe_base: Array
 
     @classmethod
-    def of(cls, name: str, slam: GraphSlam) -> "Drawn":
+    def of(cls, name: str, view: MapView) -> "Drawn":
         """What the pipeline made of a drive."""
-        problem = in_order_of_sighting(landmark_problem(name, slam.graph, slam.trajectory()))
-        seen = slam.sighting_poses
+        problem = in_order_of_sighting(landmark_problem(name, view.graph, view.trajectory()))
+        seen = view.sighting_poses
         return cls(problem, seen.stamps_ns * 1e-9, seen.ids.copy(), seen.poses.copy())
 
     def course(self, at_sightings_m: Callable[[Array], float]) -> Course:
@@ -105,7 +105,7 @@ def _mrclam(name: str, converter: Path, set_7: Path, robot: int) -> tuple[Drawn,
             for m in several:
                 slam.process(m)
         slam.process(Control("end"))
-        drawn = Drawn.of(name, slam)
+        drawn = Drawn.of(name, slam.view)
         return drawn, np.asarray(se3.in_plane(interpolated(read_truth(path).trajectory, drawn.stamps_s)))
 
 
@@ -117,7 +117,7 @@ def _against_truth(truth: Array, poses: Array) -> float:
 def _victoria_park(drive: victoria_park.Drive) -> Drawn:
     options.say("Victoria Park: telling which tree is which takes a quarter of an hour")
     slam, _ = victoria_park.run(drive, victoria_park.SETTINGS)
-    return Drawn.of("Victoria Park", slam)
+    return Drawn.of("Victoria Park", slam.view)
 
 
 def _against_gps(drive: victoria_park.Drive, stamps_s: Array, poses: Array) -> float:

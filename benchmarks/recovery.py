@@ -61,19 +61,19 @@ def main() -> None:
     config = Config.from_mapping(every_m | {"map.condense": False})  # all keyframes are compared
     with tempfile.TemporaryDirectory() as folder:
         run = Path(folder) / "run"
-        start_s, slam = time.process_time(), drive(run, config, args.poses)
+        start_s, view = time.process_time(), drive(run, config, args.poses).view
         drove_s = time.process_time() - start_s
         written = {name: sum(f.stat().st_size for f in run.glob(f"{name}.mcap")) / 2**20 for name in ("ingest", "map")}
         start, cpu_s = time.perf_counter(), time.process_time()
         state = map_of(run, losses := [])
         read_s = time.perf_counter() - start
-        again = GraphSlam(config, start=state)
+        again = GraphSlam(config, start=state).view
         took_s, cpu_s = time.perf_counter() - start, time.process_time() - cpu_s
-        solved = slam.solver.optimize(slam.solver.settings.until_still())
-        apart_m = np.abs(again.trajectory() - slam.trajectory()).max()
-        same = (again.ledger.verdict.values == slam.ledger.verdict.values).all()
+        solved = view.solver.optimize(view.solver.settings.until_still())
+        apart_m = np.abs(again.trajectory() - view.trajectory()).max()
+        same = (again.ledger.verdict.values == view.ledger.verdict.values).all()
         print(
-            f"RELIABILITY recovery keyframes={len(slam.keyframes)} edges={slam.graph.edge_count} drove_s={drove_s:.1f}"
+            f"RELIABILITY recovery keyframes={len(view.keyframes)} edges={view.graph.edge_count} drove_s={drove_s:.1f}"
             f" journal_mib={written['ingest']:.1f} map_mib={written['map']:.1f} read_s={read_s:.2f}"
             f" recovered_s={took_s:.2f} cpu_s={cpu_s:.2f} verdicts={'same' if same else 'other'}"
             f" apart={apart_m:.1e} chi2={again.solver.evaluate().chi2_final / solved.chi2_final:.9f} lost={losses}"

@@ -191,15 +191,15 @@ def main() -> None:
         return
     drive = read_drive(args.folder)
     slam, cpu_s = run(drive, SETTINGS)
-    stamps_s = slam.sighting_poses.stamps_ns * 1e-9
+    stamps_s = slam.view.sighting_poses.stamps_ns * 1e-9
     odometry = Track.of_laser(drive.odometry[:, 0], drive.odometry[:, 1:])
     good = quiet(drive.gps, odometry)
     fixes = Track(drive.gps.stamps_s[good], drive.gps.positions[good])
-    for name, path in (("estimate", Track.of_laser(stamps_s, slam.sighting_trajectory())), ("odometry", odometry)):
+    for name, path in (("estimate", Track.of_laser(stamps_s, slam.view.sighting_trajectory())), ("odometry", odometry)):
         error = distances(path, fixes)
         rms = np.sqrt(np.mean(error**2))
         print(f"{name}: median {np.median(error):.2f} m, rms {rms:.2f} m, 95 % within {np.percentile(error, 95):.2f} m")
-    print(f"{good.sum()} of {len(good)} fixes; {len(slam.landmarks)} landmarks; {cpu_s:.0f} s CPU")
+    print(f"{good.sum()} of {len(good)} fixes; {len(slam.view.landmarks)} landmarks; {cpu_s:.0f} s CPU")
     print(slam.counters.as_dict())
 
 

@@ -26,12 +26,12 @@ class SimulatedRun:
         slam = drive(folder, config, measurements(recording))
         self.run = SavedGraph(folder, [])
         self.advisor = Advisor(Weakness(self.run))
-        self.truth = self._truth(recording, slam)
+        self.truth = self._truth(recording, slam.view)
 
-    def _truth(self, recording, slam):
+    def _truth(self, recording, view):
         """The true values of all vertices: the map lies as its first keyframe."""
         space, values = self.run.space, self.run.solver.values.copy()
-        true = recording.T_world_base[np.searchsorted(recording.stamps_ns, slam.keyframes.stamps_ns)]
+        true = recording.T_world_base[np.searchsorted(recording.stamps_ns, view.keyframes.stamps_ns)]
         true = true if space.dimensions == 3 else se3.in_plane(true) if true.shape[1] == 7 else true
         first = tuple(values[self.run.graph.vertex(self.run.keyframes[0]).stored].tolist())
         T_map_world = space.group.compose(first, space.group.inverse(tuple(true[0].tolist())))

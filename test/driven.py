@@ -13,8 +13,8 @@ def drive(folder, config, world, start=None):
     for m in [*world, Control("end"), Control("optimize")]:
         recorder.record(slam, slam.process(m))
         recorder.flush()
-    slam.solver.optimize(slam.solver.settings.until_still())
-    slam.solver.update()  # so that covariances are at hand
+    slam.view.solver.optimize(slam.view.solver.settings.until_still())
+    slam.view.solver.update()  # so that covariances are at hand
     return slam
 
 

@@ -67,7 +67,7 @@ def driven(measured, recording, settings):
     """The pipeline after a drive that begins where the robot truly was."""
     start = " ".join(map(repr, recording.T_world_base[0].tolist()))
     slam = GraphSlam(Config.from_mapping({"anchor.pose": start, **TRUE_NOISE, **settings}))
-    has_gyro = "imu" in slam.config.inputs.names
+    has_gyro = "imu" in slam.view.config.inputs.names
     for m in [*measured, Control("end"), Control("optimize")]:
         if has_gyro or not isinstance(m, AngularVelocity):
             slam.process(m)
@@ -76,11 +76,11 @@ def driven(measured, recording, settings):
 
 def errors(slam, recording):
     """RMS of the position's error [m], and the mean of the squares of some poses' errors in their sigmas (NEES)."""
-    at = np.searchsorted(recording.stamps_ns, slam.keyframes.stamps_ns)
-    truth, found = recording.T_world_base[at], slam.trajectory()
+    at = np.searchsorted(recording.stamps_ns, slam.view.keyframes.stamps_ns)
+    truth, found = recording.T_world_base[at], slam.view.trajectory()
     squares = []
     for k in range(5, len(found), 7):
-        (covariance,) = slam.solver.marginal([int(slam.keyframes.ids[k])])
-        d = np.array(slam.space.group.local(tuple(found[k].tolist()), tuple(truth[k].tolist())))
+        (covariance,) = slam.view.solver.marginal([int(slam.view.keyframes.ids[k])])
+        d = np.array(slam.view.space.group.local(tuple(found[k].tolist()), tuple(truth[k].tolist())))
         squares.append(d @ np.linalg.solve(covariance, d))
     return float(np.sqrt(np.mean(np.sum((found - truth)[:, :2] ** 2, axis=1)))), float(np.mean(squares))

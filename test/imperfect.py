@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from graph_slam_ros.lie import se2
-from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
+from graph_slam_ros.slam import Config, Control, GraphSlam, MapView, Odometry, Sighting, Sightings
 
 SECOND_NS = 10**9
 START_NS = 10**12
@@ -108,9 +108,9 @@ def driven(measurements: list[Odometry | Sightings], settings: dict[str, object]
     return slam
 
 
-def error_m(slam: GraphSlam, truth: Truth) -> float:
+def error_m(view: MapView, truth: Truth) -> float:
     """RMSE of the keyframes, moved onto the truth as well as a rigid motion can."""
-    poses, true = slam.trajectory()[:, :2], np.array([truth.at(int(s))[:2] for s in slam.keyframes.stamps_ns])
+    poses, true = view.trajectory()[:, :2], np.array([truth.at(int(s))[:2] for s in view.keyframes.stamps_ns])
     a, b = poses - poses.mean(axis=0), true - true.mean(axis=0)
     angle = np.arctan2(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), np.sum(a * b))
     moved = np.stack(se2.act((0.0, 0.0, float(angle)), tuple(a.T)), axis=-1)

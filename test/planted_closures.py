@@ -95,17 +95,17 @@ def run(folder, seed=0, *, with_wrong=True):
 
 def ends_of(folder):
     """The stamps of the keyframes of each closure."""
-    slam = restored(folder, [])
-    stamps = dict(zip(slam.keyframes.ids.tolist(), slam.keyframes.stamps_ns.tolist(), strict=True))
-    edges = slam.graph.edges_of("closures").tolist()
-    return {edge: tuple(stamps[vertex] for vertex in slam.graph.edge(edge).vertices) for edge in edges}
+    view = restored(folder, []).view
+    stamps = dict(zip(view.keyframes.ids.tolist(), view.keyframes.stamps_ns.tolist(), strict=True))
+    edges = view.graph.edges_of("closures").tolist()
+    return {edge: tuple(stamps[vertex] for vertex in view.graph.edge(edge).vertices) for edge in edges}
 
 
 def error_m(folder):
     """The root mean square error [m] of the path: it begins where the truth does."""
-    slam, truth = restored(folder, []), np.array(path())
-    at = truth[slam.keyframes.stamps_ns // 10**9 - START_S]
-    return float(np.sqrt(np.mean(np.sum((slam.trajectory()[:, :2] - at[:, :2]) ** 2, axis=1))))
+    view, truth = restored(folder, []).view, np.array(path())
+    at = truth[view.keyframes.stamps_ns // 10**9 - START_S]
+    return float(np.sqrt(np.mean(np.sum((view.trajectory()[:, :2] - at[:, :2]) ** 2, axis=1))))
 
 
 def main():

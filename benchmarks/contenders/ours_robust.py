@@ -15,7 +15,7 @@ from benchmarks.contenders import OURS, Believed
 from benchmarks.problem import Array, Edges, Problem
 from graph_slam_ros.graph.losses import weight_and_cost
 from graph_slam_ros.lie import se2, se3
-from graph_slam_ros.slam import Closure, Config, Control, GraphSlam, Measurement, Odometry, Sighting, Sightings
+from graph_slam_ros.slam import Closure, Config, Control, GraphSlam, MapView, Measurement, Odometry, Sighting, Sightings
 from graph_slam_ros.warmup import warmup
 
 _REHEARSED = 100  # poses that are driven before the clock runs, so that code is loaded
@@ -43,14 +43,14 @@ def believe(problem: Problem, closures: Edges, name: str) -> Believed:
     return _run(problem, closures, name)
 
 
-def weights(slam: GraphSlam, label: str) -> Array:
+def weights(view: MapView, label: str) -> Array:
     """What each edge of a class counts (n,), from 0 to 1: as it was decided, and as its loss has it now."""
-    edges = slam.graph.edges_of(label)
-    fit, _ = slam.solver.chi2_of(edges)
-    losses = slam.solver.settings.losses.get(label, ())
+    edges = view.graph.edges_of(label)
+    fit, _ = view.solver.chi2_of(edges)
+    losses = view.solver.settings.losses.get(label, ())
     out = np.empty(len(edges))
     for k, edge in enumerate(edges.tolist()):
-        table, row = slam.graph.row(edge)
+        table, row = view.graph.row(edge)
         loss = weight_and_cost(losses[-1].kind, losses[-1].scale, float(fit[k]))[0] if losses else 1.0
         out[k] = table.weight.values[row] * loss
     return out
@@ -87,18 +87,18 @@ def _run(problem: Problem, closures: Edges, name: str) -> Believed:
         slam.process(m)
     slam.process(Control("end"))
     believed.online_s = time.process_time() - begin
-    believed.online, believed.online_weights = slam.trajectory(), _weights(slam)
+    believed.online, believed.online_weights = slam.view.trajectory(), _weights(slam.view)
     begin = time.process_time()
     slam.process(Control("optimize"))
     believed.batch_s = time.process_time() - begin
-    believed.batch, believed.weights = slam.trajectory(), _weights(slam)
+    believed.batch, believed.weights = slam.view.trajectory(), _weights(slam.view)
     if len(believed.weights) != len(closures) + len(problem.sightings):
         believed.fault = f"not every measurement became an edge: {slam.counters.as_dict()}"
     return believed
 
 
-def _weights(slam: GraphSlam) -> Array:
-    return np.concatenate([weights(slam, label) for label in ("closures", "landmarks")])
+def _weights(view: MapView) -> Array:
+    return np.concatenate([weights(view, label) for label in ("closures", "landmarks")])
 
 
 def _twist_covariance(problem: Problem, relative: Edges) -> tuple[float, ...] | None:

@@ -59,7 +59,7 @@ def publish(keyframes: str, reps: str) -> None:
         cpu_ms: dict[str, list[float]] = {name: [] for name in _STEPS}
         for rep in range(int(reps) + 1):
             process, start = time.process_time(), time.thread_time()
-            message = results.path(slam, slam.config.output.path_max_poses)
+            message = results.path(slam.view, slam.view.config.output.path_max_poses)
             encoded = time.thread_time()
             publisher.publish(message)
             end = time.thread_time()
@@ -76,7 +76,7 @@ def publish(keyframes: str, reps: str) -> None:
 def _drive(keyframes: int) -> GraphSlam:
     """A robot with so many keyframes, which it has solved for now and then."""
     slam, pose, stamp_ns = GraphSlam(Config.from_mapping({"solve.every_keyframes": 100})), se2.IDENTITY, 1
-    while len(slam.keyframes) < keyframes:
+    while len(slam.view.keyframes) < keyframes:
         slam.process(Odometry(stamp_ns, pose))
         pose, stamp_ns = se2.compose(pose, _STEP), stamp_ns + 500_000_000
     return slam

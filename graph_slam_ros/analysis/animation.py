@@ -19,7 +19,7 @@ from graph_slam_ros.runs.folder import recording_of, run_config
 from graph_slam_ros.runs.journal import read_measurements
 from graph_slam_ros.runs.map_file import read_start
 from graph_slam_ros.runs.trajectory import Trajectory, read_rows
-from graph_slam_ros.slam import GraphSlam
+from graph_slam_ros.slam import GraphSlam, MapView
 from graph_slam_ros.typing import Array
 
 _FRAME_MS, _LAST_MS = 80, 2000
@@ -83,29 +83,30 @@ def _moments(run: Path, frames: int, losses: list[str]) -> Iterator[_Moment]:
     stamps_s = read_rows(run / "path.tum").stamps_s[max(start.keyframe_count - 1, 0) if start else 0 :]
     step_s = float(np.maximum(np.diff(stamps_s), 0.0).sum()) / max(frames - 1, 1)
     slam = GraphSlam(config, start=start)
-    last_ns, passed_s, due_s = slam.keyframes[-1].stamp_ns if slam.keyframes else 0, 0.0, step_s
+    view = slam.view
+    last_ns, passed_s, due_s = view.keyframes[-1].stamp_ns if view.keyframes else 0, 0.0, step_s
     for measurement in read_measurements(run, losses):
         slam.process(measurement)
-        if not slam.keyframes or slam.keyframes[-1].stamp_ns == last_ns:
+        if not view.keyframes or view.keyframes[-1].stamp_ns == last_ns:
             continue
-        now_ns = slam.keyframes[-1].stamp_ns
+        now_ns = view.keyframes[-1].stamp_ns
         passed_s += max(1e-9 * (now_ns - last_ns), 0.0) if last_ns else 0.0
         last_ns = now_ns
-        if passed_s >= due_s and len(slam.keyframes) > 1:
+        if passed_s >= due_s and len(view.keyframes) > 1:
             due_s = (passed_s // step_s + 1.0) * step_s if step_s else 0.0
-            yield _now(slam)
-    if len(slam.keyframes) > 1:
-        yield _now(slam)
+            yield _now(view)
+    if len(view.keyframes) > 1:
+        yield _now(view)
 
 
-def _now(slam: GraphSlam) -> _Moment:
-    poses = se3.in_space(slam.trajectory())
-    odometry = se3.in_space(np.array([keyframe.T_odom_base for keyframe in slam.keyframes]))
+def _now(view: MapView) -> _Moment:
+    poses = se3.in_space(view.trajectory())
+    odometry = se3.in_space(np.array([keyframe.T_odom_base for keyframe in view.keyframes]))
     T_map_odom = se3.compose(tuple(poses[0]), se3.inverse(tuple(odometry[0])))
     moved = np.stack(se3.compose(T_map_odom, tuple(odometry.T))[:3], axis=-1)
-    points = [slam.solver.estimate([mark.vertex])[0] for mark in slam.landmarks.values()]
-    in_space = [[*point[:2], point[2] if slam.space.dimensions == 3 else 0.0] for point in points]
-    stamp_s = 1e-9 * slam.keyframes[-1].stamp_ns
+    points = [view.solver.estimate([mark.vertex])[0] for mark in view.landmarks.values()]
+    in_space = [[*point[:2], point[2] if view.space.dimensions == 3 else 0.0] for point in points]
+    stamp_s = 1e-9 * view.keyframes[-1].stamp_ns
     return _Moment(stamp_s, poses[:, :3], moved, np.array(in_space).reshape(-1, 3))
 
 

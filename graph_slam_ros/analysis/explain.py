@@ -351,7 +351,7 @@ def edges_that_left(run: SavedGraph) -> Iterator[Mapping[str, str]]:
 
     Those that left after the map was recorded last, in a run that was killed, are still in it, and are none of these.
     """
-    if run.slam.bounded is not None:
+    if run.view.bounded is not None:
         yield from (row for row in read_left_edges(run.folder) if not run.graph.edge_ids.has(int(row["edge"])))
 
 
@@ -363,12 +363,12 @@ def became(rows: Sequence[Mapping[str, str]]) -> str:
 
 def condensed_lines(run: SavedGraph) -> Iterator[str]:
     """Say how much of a map is condensed; nothing if none is."""
-    if run.slam.bounded is None:
+    if run.view.bounded is None:
         return
-    places = [one.place for several in run.slam.bounded.places.values() for one in several]
-    visits, keyframes = sum(one.visits for one in places), run.slam.first_keyframe
+    places = [one.place for several in run.view.bounded.places.values() for one in several]
+    visits, keyframes = sum(one.visits for one in places), run.view.first_keyframe
     yield f"condensed: keyframes 0 to {keyframes - 1}, into {len(places)} places of {visits} visits"
-    factor = run.slam.bounded.scale.factor
+    factor = run.view.bounded.scale.factor
     if factor > 1.0:
         yield f"  visits to a place differ by {np.sqrt(factor):.1f} times their sigmas: the sigmas are scaled by that"
     if rows := list(edges_that_left(run)):
@@ -395,7 +395,7 @@ def statements_of_one_that_left(run: SavedGraph, row: Mapping[str, str]) -> Iter
 
 def statements_of_place(run: SavedGraph, e: Entry) -> Iterator[tuple[str, str]]:
     """Sentences on the edge of a place, each with its name."""
-    places = run.slam.bounded.places if run.slam.bounded else {}
+    places = run.view.bounded.places if run.view.bounded else {}
     several = ((cell, one) for cell, all_of_it in places.items() for one in all_of_it)
     found = next(((cell, one) for cell, one in several if one.edge == e.edge), None)
     if found is None:

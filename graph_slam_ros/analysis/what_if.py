@@ -236,7 +236,7 @@ class SavedGraph:
 
     Attributes
     ----------
-    slam : the pipeline that holds the map
+    view : the map, as a pipeline holds it
     solver : the solution of the run: all its accepted edges
     keyframes, numbers, stamps_ns : vertices of the keyframes that are in the graph, in order of time, their numbers
         among all keyframes, and stamps
@@ -249,25 +249,24 @@ class SavedGraph:
     """
 
     def __init__(self, folder: Path, losses: list[str]) -> None:
-        slam = restored(folder, losses)
-        if not slam.is_solved:
-            raise RunError(f"{folder}: its map cannot be solved: {slam.failing}")
-        self.slam, self.folder, self.space, self.config = slam, folder, slam.space, slam.config
-        self.graph, self.held = slam.graph.copy(), slam.solver.held
-        self.solver = slam.solver
-        self.graph.initial.values[:] = slam.solver.values
-        self.entries = list(ledger_entries(slam, range(self.graph.vertex_ids.next)))
-        self._entries, old = {one.edge: one for one in self.entries}, slam.bounded.old if slam.bounded else ()
-        self.changes = list(slam.ledger.history)
-        self.edits = slam.edits
-        self.ids, _ = numbered(slam)
-        self.keyframes: list[int] = [*(one.vertex for one in old), *slam.keyframes.ids.tolist()]
-        self._names = {mark.vertex: name for name, mark in slam.landmarks.items()}
-        self.stamps_ns: list[int] = [*(one.stamp_ns for one in old), *slam.keyframes.stamps_ns.tolist()]
-        self.segments = list(slam.segments)
+        self.view = view = restored(folder, losses).view
+        if not view.is_solved:
+            raise RunError(f"{folder}: its map cannot be solved: {view.failing}")
+        self.folder, self.space, self.config = folder, view.space, view.config
+        self.graph, self.solver, self.held = view.graph.copy(), view.solver, view.solver.held
+        self.graph.initial.values[:] = view.solver.values
+        self.entries = list(ledger_entries(view, range(self.graph.vertex_ids.next)))
+        self._entries, old = {one.edge: one for one in self.entries}, view.bounded.old if view.bounded else ()
+        self.changes = list(view.ledger.history)
+        self.edits = view.edits
+        self.ids, _ = numbered(view)
+        self.keyframes: list[int] = [*(one.vertex for one in old), *view.keyframes.ids.tolist()]
+        self._names = {mark.vertex: name for name, mark in view.landmarks.items()}
+        self.stamps_ns: list[int] = [*(one.stamp_ns for one in old), *view.keyframes.stamps_ns.tolist()]
+        self.segments = list(view.segments)
         joined = {vertex for entry in self.entries if entry.is_in for vertex in entry.vertices}
-        self.landmarks = {name: mark.vertex for name, mark in slam.landmarks.items() if mark.vertex in joined}
-        self.numbers: list[int] = [*(one.number for one in old), *range(slam.first_keyframe, len(slam.keyframes))]
+        self.landmarks = {name: mark.vertex for name, mark in view.landmarks.items() if mark.vertex in joined}
+        self.numbers: list[int] = [*(one.number for one in old), *range(view.first_keyframe, len(view.keyframes))]
         self._numbers = dict(zip(self.keyframes, self.numbers, strict=True))
         self.vertices = dict(zip(self.numbers, self.keyframes, strict=True))
 
@@ -288,7 +287,7 @@ class SavedGraph:
     @cached_property
     def whole_path(self) -> WholePath:
         """All keyframes, those that were condensed included."""
-        return WholePath.of(self.slam, self.folder)
+        return WholePath.of(self.view, self.folder)
 
     def type_of(self, entry: Entry) -> EdgeType:
         """The type of an edge."""
@@ -306,7 +305,7 @@ class SavedGraph:
         """The ledger entry of an edge. Raises GraphSlamError for an unknown id."""
         if (entry := self._entries.get(edge)) is not None:
             return entry
-        if (most := self.slam.ledger.ids.next) > edge >= 0:
+        if (most := self.view.ledger.ids.next) > edge >= 0:
             why = f"since visits are condensed: {of_all(self.folder)}"
             raise GraphSlamError(f"edge {edge} is not in the map any more, {why}")
         raise GraphSlamError(f"no edge {edge}: their ids are below {most}")

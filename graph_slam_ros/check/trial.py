@@ -13,7 +13,7 @@ from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.parameters import assignment
 from graph_slam_ros.lie import se3
 from graph_slam_ros.measurements.types import END, Measurement, Odometry
-from graph_slam_ros.slam import Config, GraphSlam
+from graph_slam_ros.slam import Config, GraphSlam, MapView
 from graph_slam_ros.slam.calibration import answers
 from graph_slam_ros.slam.calibration.fit import TrialFit
 from graph_slam_ros.slam.calibration.parameters import Parameter
@@ -62,11 +62,11 @@ def replayed(config: Config, measured: Iterable[Measurement]) -> GraphSlam:
     return slam
 
 
-def _points_in_map(c: Columns, s: SightingColumns, slam: GraphSlam, stamp_ns: Index) -> Array:
+def _points_in_map(c: Columns, s: SightingColumns, view: MapView, stamp_ns: Index) -> Array:
     """(k, 3) Where each sighting puts its landmark, by the estimate at these stamps, corrected between keyframes."""
-    order = np.argsort(slam.keyframes.stamps_ns, kind="stable")
-    estimate, own = (se3.in_space(poses).reshape(-1, 7)[order] for poses in (slam.trajectory(), slam.keyframes.poses))
-    at_ns, stamp_ns = slam.keyframes.stamps_ns[order], np.clip(stamp_ns, c.path_ns[0], c.path_ns[-1])
+    order = np.argsort(view.keyframes.stamps_ns, kind="stable")
+    estimate, own = (se3.in_space(poses).reshape(-1, 7)[order] for poses in (view.trajectory(), view.keyframes.poses))
+    at_ns, stamp_ns = view.keyframes.stamps_ns[order], np.clip(stamp_ns, c.path_ns[0], c.path_ns[-1])
     driven = poses_at(stamp_ns, c.path_ns, c.path)
     own[:, :3] *= c.config.odometry.distance_factor
     after = np.clip(np.searchsorted(at_ns, stamp_ns), 1, len(at_ns) - 1)
@@ -78,12 +78,12 @@ def _points_in_map(c: Columns, s: SightingColumns, slam: GraphSlam, stamp_ns: In
     return np.stack(se3.act(se3.interpolate(ends[0], ends[1], part), tuple(s.points.T)), axis=1)
 
 
-def check_trial(c: Columns, slam: GraphSlam) -> Iterator[Finding]:
+def check_trial(c: Columns, view: MapView) -> Iterator[Finding]:
     """Findings of the replay and of the fit: clock, mount, scales, noise, identities, outliers."""
-    if len(slam.keyframes) < 3 or len(c.path_ns) < 2 or not slam.landmarks:
+    if len(view.keyframes) < 3 or len(c.path_ns) < 2 or not view.landmarks:
         return
     try:
-        fit, fitted = slam.trial_fit(places=True)
+        fit, fitted = view.trial_fit(places=True)
     except GraphSlamError as error:
         yield Finding("fit_unsure", "note", 1, 0, "fits", f"the trial fit failed: {error}")
         return
@@ -92,29 +92,29 @@ def check_trial(c: Columns, slam: GraphSlam) -> Iterator[Finding]:
     late_s = {} if is_void else {one.parameter.source: one.value for one in clocks}
     step_s = float(np.median(np.diff(c.path_ns))) * 1e-9
     off = {one.parameter: one.value for one in fitted if _is_far_off(fit, one, step_s)}
-    slip = None if off else check_slips(c, slam)  # a clock or mount that is wrong bends the path in turns
+    slip = None if off else check_slips(c, view)  # a clock or mount that is wrong bends the path in turns
     is_broken = slip is not None and slip[0].severity == "warning"
     goes_back = any((np.diff(t.stamp_ns[t.stamp_ns != 0]) < -1_000_000_000).any() for t in c.topics.values())
-    found = [] if off or goes_back else _places(c, slam, late_s, slip if is_broken else None)
+    found = [] if off or goes_back else _places(c, view, late_s, slip if is_broken else None)
     if is_void:
         found += [one for s in c.sightings for one in noisier(s, pairs_of(c, s))]
         yield from found or [_void(fit)]
         return
-    yield from (found_one for one in fitted for found_one in _fitted(c, slam, fit, one, off))
+    yield from (found_one for one in fitted for found_one in _fitted(c, view, fit, one, off))
     yield from _jumps(c, fit)
     yield from [slip[0]] if slip else []
     hidden = _OF_A_BREAK if is_broken else ("ids_unsure",) * any(one.code == "map_breaks" for one in found)
     yield from (one for one in found if one.code not in hidden)
-    if new := slam.renewed_ids():
+    if new := view.renewed_ids():
         name = c.sightings[0].topic
         text = f"{name}: {new}"
         yield Finding("ids_renewed", "warning", new.same, 0, "landmarks", text, name, new.since_ns, new.new)
-    yield from _noise(c, slam, has_cause=bool(off))
+    yield from _noise(c, view, has_cause=bool(off))
 
 
-def _noise(c: Columns, slam: GraphSlam, *, has_cause: bool) -> Iterator[Finding]:
+def _noise(c: Columns, view: MapView, *, has_cause: bool) -> Iterator[Finding]:
     """Noise that is too small, and more than the run allows for, where nothing that is off explains it."""
-    for noise in () if has_cause else slam.noise_scale():
+    for noise in () if has_cause else view.backend.noise_scale():
         limit = _ODOMETRY_OVER_CONFIDENT if noise.label == "odometry" else _OVER_CONFIDENT
         factor = float(np.sqrt(noise.per_dof))
         is_allowed_for = c.config.robust.noise_scale == "estimated" and noise.factor < LARGEST
@@ -154,23 +154,23 @@ def _is_far_off(fit: TrialFit, one: answers.Finding, step_s: float) -> bool:
 
 
 def _fitted(
-    c: Columns, slam: GraphSlam, fit: TrialFit, one: answers.Finding, off: Mapping[Parameter, float]
+    c: Columns, view: MapView, fit: TrialFit, one: answers.Finding, off: Mapping[Parameter, float]
 ) -> Iterator[Finding]:
     topic = c.topic_of(one.parameter.source)
     if one.parameter.name not in _LIMITS or topic is None:
         return
     code, (unit, limit, unknown) = answers.CODES[one.parameter.name], _LIMITS[one.parameter.name]
     if one.parameter in off:
-        setting = answers.setting_of(one.parameter, off, slam.calibrated)
+        setting = answers.setting_of(one.parameter, off, view.calibrated)
         settings: tuple[str, ...] = (assignment(*setting),)
         of_pose = twist_factor(c.odometry) * c.config.odometry.distance_factor
         is_pose = abs(of_pose * (1.0 + one.value) - 1.0) < limit < abs(of_pose - 1.0)  # by its twist
         is_open = code == "odometry_scale" and not is_pose
-        if ranges := answers.ranges_instead(fit, one.value, slam.calibrated, setting) if is_open else "":
+        if ranges := answers.ranges_instead(fit, one.value, view.calibrated, setting) if is_open else "":
             settings = ()
         lag_s, own = float(np.median(topic.lag_s)), c.odometry.input
         if code == "clock_offset" and -_RECORDED_S < lag_s < one.value - _EARLY_S:  # none is recorded before it is seen
-            settings = (assignment(f"{own}.offset_s", round(slam.calibrated(own, "clock") - one.value, 3)),)
+            settings = (assignment(f"{own}.offset_s", round(view.calibrated(own, "clock") - one.value, 3)),)
         text = answers.sentence(one.parameter, one.value, one.sigma, ranges)
         yield topic.finding(code, "warning", one.value, limit, unit, text, settings=settings)
     elif one.sigma > unknown:
@@ -185,9 +185,7 @@ def _jumps(c: Columns, fit: TrialFit) -> Iterator[Finding]:
             yield topic.finding(code, "warning", after - before, limit, unit, text)
 
 
-def _places(
-    c: Columns, slam: GraphSlam, late_s: Mapping[str, float], slip: tuple[Finding, int] | None
-) -> list[Finding]:
+def _places(c: Columns, view: MapView, late_s: Mapping[str, float], slip: tuple[Finding, int] | None) -> list[Finding]:
     """Identities by where the estimate puts them, and sightings that are far from their landmark.
 
     Stamps are corrected by what inputs are late, and sightings within a slip are left out.
@@ -200,7 +198,7 @@ def _places(
             inside &= (s.stamp_ns < slip[0].first_ns) | (s.stamp_ns > slip[1])
         if not inside.any():
             continue
-        before, points = (_points_in_map(c, s, slam, stamp_ns) for stamp_ns in (s.stamp_ns, s.stamp_ns + late))
+        before, points = (_points_in_map(c, s, view, stamp_ns) for stamp_ns in (s.stamp_ns, s.stamp_ns + late))
         points[~inside] = np.nan
         two = at_two_places(s, points, c.path_ns, c.config.world.dimensions)
         shift = np.linalg.norm(points - before, axis=1)
@@ -212,12 +210,12 @@ def _places(
     return found
 
 
-def check_slips(c: Columns, slam: GraphSlam) -> tuple[Finding, int] | None:
+def check_slips(c: Columns, view: MapView) -> tuple[Finding, int] | None:
     """Find the stretch in which odometry is worst, if it is far worse there than in the rest of the drive.
 
     Returned are the finding, from the stamp on at which the stretch begins, and the stamp at which it ends.
     """
-    errors, sizes, stamps_ns = _errors(slam)
+    errors, sizes, stamps_ns = _errors(view)
     found = worst_stretch(errors, sizes, np.array([_LEAST_M, _LEAST_RAD]), _PART, _SLIP_SIGMAS)
     if found is None:
         return None
@@ -234,16 +232,16 @@ def check_slips(c: Columns, slam: GraphSlam) -> tuple[Finding, int] | None:
     return slip, int(stamps_ns[-1])
 
 
-def _errors(slam: GraphSlam) -> tuple[Array, Array, Index]:
+def _errors(view: MapView) -> tuple[Array, Array, Index]:
     """Errors (n, 2) of odometry ahead and in heading at each step, how much it says it moved, and stamps (n + 1,)."""
-    own, estimate = (se3.in_space(poses).reshape(-1, 7) for poses in (slam.keyframes.poses, slam.trajectory()))
-    order = np.argsort(slam.keyframes.stamps_ns, kind="stable")
+    own, estimate = (se3.in_space(poses).reshape(-1, 7) for poses in (view.keyframes.poses, view.trajectory()))
+    order = np.argsort(view.keyframes.stamps_ns, kind="stable")
     own, estimate = own[order], estimate[order]
     stated, found = (se3.between(tuple(poses[:-1].T), tuple(poses[1:].T)) for poses in (own, estimate))
     error = np.stack(se3.local(found, stated), axis=1)
-    decided = {index for alarm in slam.alarms if (index := getattr(alarm, "segment", None)) is not None}
-    begins = np.isin(order, [index for index in slam.segments if index not in decided])
+    decided = {index for alarm in view.alarms if (index := getattr(alarm, "segment", None)) is not None}
+    begins = np.isin(order, [index for index in view.segments if index not in decided])
     error[begins[1:]] = 0.0  # odometry was restarted or jumps there, which is another finding
     moved = np.stack(se3.local(stated, se3.IDENTITY), axis=1)
     sizes = np.stack([np.linalg.norm(moved[:, :3], axis=1), np.linalg.norm(moved[:, 3:], axis=1)], axis=1)
-    return error[:, [0, 5]], sizes, slam.keyframes.stamps_ns[order]
+    return error[:, [0, 5]], sizes, view.keyframes.stamps_ns[order]

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.lie import so3
-from graph_slam_ros.slam import GraphSlam
+from graph_slam_ros.slam import MapView
 from graph_slam_ros.typing import Array, Mask, Numbers
 
 _MOST_TRIALS = 2000  # minimal sets of points that are tried
@@ -48,17 +48,17 @@ class Alignment:
         return metres, metres / math.sqrt(float(way @ self.covariance[k] @ way) + _ROUNDING_M**2)
 
 
-def positions(slam: GraphSlam, names: Sequence[str]) -> tuple[Array, Array]:
+def positions(view: MapView, names: Sequence[str]) -> tuple[Array, Array]:
     """Positions of landmarks (k, n), and their joint covariance (k n, k n), in the axes of map."""
-    space, n = slam.space, slam.space.dimensions
-    vertices = [slam.landmarks[name].vertex for name in names]
-    values = [tuple(slam.solver.estimate([vertex])[0].tolist()) for vertex in vertices]
+    space, n = view.space, view.space.dimensions
+    vertices = [view.landmarks[name].vertex for name in names]
+    values = [tuple(view.solver.estimate([vertex])[0].tolist()) for vertex in vertices]
     if not names:
         return np.empty((0, n)), np.empty((0, 0))
-    joint, at = slam.solver.joint_marginal(vertices), 0
+    joint, at = view.solver.joint_marginal(vertices), 0
     axes = np.zeros((len(names) * n, len(joint)))
     for k, (vertex, value) in enumerate(zip(vertices, values, strict=True)):
-        dof = slam.graph.kind_of(vertex).dof
+        dof = view.graph.kind_of(vertex).dof
         axes[k * n : (k + 1) * n, at : at + n] = space.turn(value) if dof == space.dof else np.eye(n)
         at += dof
     return np.array([value[:n] for value in values]), axes @ joint @ axes.T

@@ -14,7 +14,7 @@ from graph_slam_ros.maps.alignment import Alignment, align, as_they_are, laid_on
 from graph_slam_ros.maps.merge import merge_trouble, refuse_other_space, shared_landmarks
 from graph_slam_ros.runs.condensed_map import WholePath
 from graph_slam_ros.runs.restore import restored
-from graph_slam_ros.slam import GraphSlam
+from graph_slam_ros.slam import MapView
 from graph_slam_ros.typing import Array, Index, Numbers
 
 _SAME_M = 1e-3  # nobody calls that moved
@@ -143,13 +143,13 @@ def diff(a: Path, b: Path, losses: list[str]) -> Difference:
 
     Keyframes that were condensed count, at their present poses. Their edges do not: what they measured is in places.
     """
-    one, two = (restored(folder, losses) for folder in (a, b))
+    one, two = (restored(folder, losses).view for folder in (a, b))
     refuse_other_space(one, two, a, b)
     common = shared_landmarks(one, two)
     at = _of_one_stamp(WholePath.of(one, a), WholePath.of(two, b))
     aligned, by, T_a_b = _aligned(one, two, common, at)
     apart = _keyframe_distances(one, at, T_a_b)
-    known = [set(slam.landmarks) for slam in (one, two)]
+    known = [set(view.landmarks) for view in (one, two)]
     edges, verdicts = _edges(one, two)
     moved = [MovedLandmark(name, *aligned.distance(k)) for k, name in enumerate(common)]
     return Difference(
@@ -171,9 +171,7 @@ def diff(a: Path, b: Path, losses: list[str]) -> Difference:
     )
 
 
-def _aligned(
-    one: GraphSlam, two: GraphSlam, common: list[str], at: tuple[Array, Array]
-) -> tuple[Alignment, str, Numbers]:
+def _aligned(one: MapView, two: MapView, common: list[str], at: tuple[Array, Array]) -> tuple[Alignment, str, Numbers]:
     """Align by landmarks, else by stamps, else use the maps as they are; ``at`` are the poses of one stamp."""
     space, robust = one.space, one.config.robust
     a, b = positions(one, common), positions(two, common)
@@ -202,21 +200,21 @@ def _by_stamp(stamps_ns: Index) -> dict[tuple[int, int], int]:
     return out
 
 
-def _keyframe_distances(one: GraphSlam, at: tuple[Array, Array], T_a_b: Numbers) -> Array:
+def _keyframe_distances(one: MapView, at: tuple[Array, Array], T_a_b: Numbers) -> Array:
     a, b = at
     n = one.space.dimensions
     moved = np.stack(one.space.group.act(T_a_b, tuple(b[:, :n].T)), axis=-1).reshape(-1, n)
     return np.linalg.norm(moved - a[:, :n], axis=1)
 
 
-def _chi2(slam: GraphSlam) -> float:
-    return slam.report.chi2_final if slam.report else math.nan
+def _chi2(view: MapView) -> float:
+    return view.report.chi2_final if view.report else math.nan
 
 
 # -- edges -------------------------------------------------------------------------------------------------------------
 
 
-def _edges(one: GraphSlam, two: GraphSlam) -> tuple[Counts, list[Judged]]:
+def _edges(one: MapView, two: MapView) -> tuple[Counts, list[Judged]]:
     """Edges in both maps, with equal type, vertices and measurement, and those of them with different verdicts."""
     a, b, names = _by_meaning(one), _by_meaning(two), _names(one)
     pairs = [pair for key in a if key in b for pair in zip(a[key], b[key], strict=False)]
@@ -229,26 +227,26 @@ def _edges(one: GraphSlam, two: GraphSlam) -> tuple[Counts, list[Judged]]:
     return Counts(one.graph.edge_count, two.graph.edge_count, len(pairs)), unlike
 
 
-def _by_meaning(slam: GraphSlam) -> dict[Any, list[int]]:
-    names = _names(slam)
+def _by_meaning(view: MapView) -> dict[Any, list[int]]:
+    names = _names(view)
     out: dict[Any, list[int]] = defaultdict(list)
-    for edge in slam.graph.edge_ids.since().tolist():
-        one = slam.graph.edge(edge)
+    for edge in view.graph.edge_ids.since().tolist():
+        one = view.graph.edge(edge)
         ends = tuple(names.get(vertex) for vertex in one.vertices)
         measured = tuple(round(x, _DIGITS) + 0.0 for x in one.measured.tolist())
         out[tag_of(one.type), one.label, ends, measured].append(edge)
     return out
 
 
-def _names(slam: GraphSlam) -> dict[int, int | str]:
+def _names(view: MapView) -> dict[int, int | str]:
     """Return the identity of a vertex in any map: a stamp, or a name."""
-    poses = dict(zip(slam.keyframes.ids.tolist(), slam.keyframes.stamps_ns.tolist(), strict=True))
-    poses |= {one.vertex: one.stamp_ns for one in slam.bounded.old} if slam.bounded else {}
-    return poses | {mark.vertex: name for name, mark in slam.landmarks.items()}
+    poses = dict(zip(view.keyframes.ids.tolist(), view.keyframes.stamps_ns.tolist(), strict=True))
+    poses |= {one.vertex: one.stamp_ns for one in view.bounded.old} if view.bounded else {}
+    return poses | {mark.vertex: name for name, mark in view.landmarks.items()}
 
 
-def _about(slam: GraphSlam, names: dict[int, int | str], edge: int) -> str:
-    one = slam.graph.edge(edge)
+def _about(view: MapView, names: dict[int, int | str], edge: int) -> str:
+    one = view.graph.edge(edge)
     name = names.get(one.vertices[-1], "")
     what = f"{name / 1e9:.3f} s" if isinstance(name, int) else name
     return f"{one.label} {what}"

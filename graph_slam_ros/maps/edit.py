@@ -21,7 +21,7 @@ from graph_slam_ros.measurements.edits import AppliedEdit, Edit, edit_of
 from graph_slam_ros.runs.folder import CONFIG, RunError, check_room, check_run, discard, recording_of
 from graph_slam_ros.runs.journal import INGEST, MAP, parts_of
 from graph_slam_ros.runs.restore import config_to_go_on, record_run, restored, stopwatch
-from graph_slam_ros.slam import Config, Control, GraphSlam
+from graph_slam_ros.slam import Config, Control, GraphSlam, MapView
 from graph_slam_ros.slam.map_editor import MapEditor
 from graph_slam_ros.slam.robust.innovation import innovations
 from graph_slam_ros.slam.snapshot import MapSnapshot
@@ -242,7 +242,7 @@ def edit(folder: Path, plan: Plan, out: Path | None) -> Edited:
         raise GraphSlamError("the plan has no edits")
     losses, counters = list[str](), Counters()
     slam = restored(folder, losses, counters)
-    rehearsal = Rehearsal(slam, folder)
+    rehearsal = Rehearsal(slam.view, folder)
     edited = rehearsal.attempt(plan.edits, losses)[1]
     if out is None:
         return edited
@@ -279,17 +279,17 @@ class Rehearsal:
 
     Parameters
     ----------
-    slam : the restored run, which stays as it is
+    view : the restored run, which stays as it is
     folder : of the run
     """
 
-    def __init__(self, slam: GraphSlam, folder: Path) -> None:
-        self._config, self._before = slam.config, slam
-        self._state = slam.snapshot(folder)
-        if len(slam.ledger) < slam.graph.edge_count:  # it never ended
-            whole = GraphSlam(slam.config, start=self._state)
+    def __init__(self, view: MapView, folder: Path) -> None:
+        self._config, self._before = view.config, view
+        self._state = view.snapshot(folder)
+        if len(view.ledger) < view.graph.edge_count:  # it never ended
+            whole = GraphSlam(view.config, start=self._state)
             whole.process(Control("optimize"))
-            self._state = whole.snapshot(folder)
+            self._state = whole.view.snapshot(folder)
 
     def edited(self, edits: Sequence[Edit]) -> MapSnapshot:
         """A copy of the map to which edits were applied; nothing is solved. Raises GraphSlamError where one fails."""
@@ -299,7 +299,7 @@ class Rehearsal:
             editor.apply(one)
         return state
 
-    def attempt(self, edits: Sequence[Edit], losses: Sequence[str] = ()) -> tuple[GraphSlam, Edited]:
+    def attempt(self, edits: Sequence[Edit], losses: Sequence[str] = ()) -> tuple[MapView, Edited]:
         """The map with edits, solved, and what changed. Raises GraphSlamError where one fails."""
         before, state = self._before, self.edited(edits)
         known = len(before.edits)
@@ -312,18 +312,18 @@ class Rehearsal:
             slam.process(Control("optimize"))
         except (GaugeError, SingularError) as error:
             raise GraphSlamError(f"the map cannot be solved with these edits: {error}") from None
-        if not slam.is_solved:
-            raise GraphSlamError(f"the map cannot be solved with these edits: {slam.failing}")
-        n, by_hand = slam.space.dimensions, {edge for one in done for edge in one.edges}
-        distances = np.linalg.norm(slam.trajectory()[:, :n] - before.trajectory()[:, :n], axis=1)
+        if not (after := slam.view).is_solved:
+            raise GraphSlamError(f"the map cannot be solved with these edits: {after.failing}")
+        n, by_hand = after.space.dimensions, {edge for one in done for edge in one.edges}
+        distances = np.linalg.norm(after.trajectory()[:, :n] - before.trajectory()[:, :n], axis=1)
         farthest, inside = int(distances.argmax()), before.ledger.inside.tolist()
-        return slam, Edited(
+        return after, Edited(
             done,
-            (before.solver.evaluate().chi2_final, slam.solver.evaluate().chi2_final),
-            (slam.first_keyframe + farthest, float(distances[farthest])),
+            (before.solver.evaluate().chi2_final, after.solver.evaluate().chi2_final),
+            (after.first_keyframe + farthest, float(distances[farthest])),
             float(distances[-1]),
-            tuple(_fit(slam, edge, cost) for edge, cost in zip(added, costs, strict=True)),
-            tuple(edge for edge in inside if edge not in by_hand and not slam.ledger.is_inside(edge)),
+            tuple(_fit(after, edge, cost) for edge, cost in zip(added, costs, strict=True)),
+            tuple(edge for edge in inside if edge not in by_hand and not after.ledger.is_inside(edge)),
             {},
             [*losses],
         )
@@ -348,7 +348,7 @@ def _innovations(state: MapSnapshot, config: Config, edges: Sequence[int]) -> li
         return [math.inf] if len(edges) == 1 else [cost for one in edges for cost in _innovations(state, config, [one])]
 
 
-def _fit(slam: GraphSlam, edge: int, innovation: float) -> Fit:
-    (chi2,), residual = slam.solver.chi2_of([edge])[0].tolist(), tuple(slam.solver.residuals_of([edge]).tolist())
-    limit = slam.backend.decisions.gate_scale * quantile(slam.config.robust.gate, len(residual))
+def _fit(view: MapView, edge: int, innovation: float) -> Fit:
+    (chi2,), residual = view.solver.chi2_of([edge])[0].tolist(), tuple(view.solver.residuals_of([edge]).tolist())
+    limit = view.backend.decisions.gate_scale * quantile(view.config.robust.gate, len(residual))
     return Fit(edge, innovation, limit, chi2, residual)

@@ -17,7 +17,7 @@ from graph_slam_ros.runs.condensed_map import WholePath
 from graph_slam_ros.runs.folder import RunError, is_run
 from graph_slam_ros.runs.restore import restored
 from graph_slam_ros.runs.tables import graph_file, numbered
-from graph_slam_ros.slam import GraphSlam
+from graph_slam_ros.slam import MapView
 
 
 def export(folder: Path, out: Path, target: str, losses: list[str], *, last_drive: bool = False) -> list[Path]:
@@ -35,13 +35,13 @@ def export(folder: Path, out: Path, target: str, losses: list[str], *, last_driv
         raise RunError(f"{out}: a run is there, with files of its own")
     if target == "mcap" and out.suffix != ".mcap":
         raise RunError(f"{out}: what reads mcap wants a name that ends in .mcap")
-    slam = restored(folder, losses)
-    whole = WholePath.of(slam, folder)
+    view = restored(folder, losses).view
+    whole = WholePath.of(view, folder)
     if last_drive:
         if target != "tum":
             raise RunError(f"--last-drive: {target} holds a whole map; as TUM it is the path of the last drive")
-        return _tum(slam, whole, out, slam.drives[-1])
-    return TARGETS[target](slam, whole, out)
+        return _tum(view, whole, out, view.drives[-1])
+    return TARGETS[target](view, whole, out)
 
 
 def files_of(out: Path, target: str) -> list[Path]:
@@ -52,37 +52,37 @@ def files_of(out: Path, target: str) -> list[Path]:
     return [out, whole.with_name(f"{whole.stem}_vertices.csv")]
 
 
-def _tum(slam: GraphSlam, whole: WholePath, out: Path, first: int = 0) -> list[Path]:
+def _tum(view: MapView, whole: WholePath, out: Path, first: int = 0) -> list[Path]:
     write_text(out, tum_text(whole.stamps_ns.tolist()[first:], whole.poses()[first:]))
     return [out]
 
 
-def _g2o(slam: GraphSlam, whole: WholePath, out: Path) -> list[Path]:
+def _g2o(view: MapView, whole: WholePath, out: Path) -> list[Path]:
     """All accepted edges. g2o has neither stamps nor names; a second table has these."""
-    ids, table = numbered(slam)
+    ids, table = numbered(view)
     _, names_file = files_of(out, "g2o")
-    write_g2o(out, graph_file(slam, ids), slam.solver.estimate)
+    write_g2o(out, graph_file(view, ids), view.solver.estimate)
     write_text(names_file, table)
     return [out, names_file]
 
 
-def _mcap(slam: GraphSlam, whole: WholePath, out: Path) -> list[Path]:
+def _mcap(view: MapView, whole: WholePath, out: Path) -> list[Path]:
     """Every keyframe at its stamp with its covariance; at the last stamp the path and the landmarks.
 
     The covariance of a keyframe that was condensed is not known: all variances are those of what a pose does not have.
     """
-    frame, unused = slam.config.frames.map, to_msg.UNUSED
-    path, stamps_ns, dof = whole.poses(), whole.stamps_ns.tolist(), slam.space.dof
-    unknown = np.broadcast_to(unused * np.eye(dof), (slam.first_keyframe, dof, dof))
-    poses = zip(stamps_ns, path, np.concatenate((unknown, slam.keyframe_covariances())), strict=True)
-    last_ns, landmarks = slam.keyframes[-1].stamp_ns, results.landmark_estimates(slam)
+    frame, unused = view.config.frames.map, to_msg.UNUSED
+    path, stamps_ns, dof = whole.poses(), whole.stamps_ns.tolist(), view.space.dof
+    unknown = np.broadcast_to(unused * np.eye(dof), (view.first_keyframe, dof, dof))
+    poses = zip(stamps_ns, path, np.concatenate((unknown, view.keyframe_covariances())), strict=True)
+    last_ns, landmarks = view.keyframes[-1].stamp_ns, results.landmark_estimates(view)
     with replaced(out) as new, BagWriter(new) as bag:
         for stamp_ns, at, covariance in poses:
             pose = to_msg.pose_with_covariance_stamped(stamp_ns, frame, tuple(at.tolist()), covariance, unused)
             bag.write("/pose", results.POSE, stamp_ns, pose)
         bag.write("/path", results.PATH, last_ns, to_msg.path(frame, np.array(stamps_ns), path))
-        bag.write("/landmarks", results.LANDMARKS, last_ns, results.landmarks(slam, landmarks))
-        bag.write("/landmarks_estimate", results.ESTIMATES, last_ns, results.landmarks_estimate(slam, landmarks))
+        bag.write("/landmarks", results.LANDMARKS, last_ns, results.landmarks(view, landmarks))
+        bag.write("/landmarks_estimate", results.ESTIMATES, last_ns, results.landmarks_estimate(view, landmarks))
     return [out]
 
 

@@ -21,7 +21,7 @@ from graph_slam_ros.runs.condensed_map import WholePath
 from graph_slam_ros.runs.folder import check_room
 from graph_slam_ros.runs.journal import CONDENSED, parts_of
 from graph_slam_ros.runs.restore import config_to_go_on, record_run, restored_and_solved, stopwatch
-from graph_slam_ros.slam import Control, GraphSlam
+from graph_slam_ros.slam import Control, MapView
 from graph_slam_ros.slam.doubt.record import Alarm
 from graph_slam_ros.slam.edits import HAND_MADE
 from graph_slam_ros.slam.frontend.odometry_selector import JUMP_SIGMA_M, JUMP_SIGMA_RAD
@@ -34,19 +34,19 @@ from graph_slam_ros.slam.snapshot import MapSnapshot
 _ABSOLUTE = ("fixes", "surveyed")  # in the axes of map
 
 
-def refuse_other_space(one: GraphSlam, two: GraphSlam, a: Path, b: Path) -> None:
+def refuse_other_space(one: MapView, two: MapView, a: Path, b: Path) -> None:
     """Raise GraphSlamError if one is in the plane and one in space."""
     if one.space is not two.space:
         raise GraphSlamError(f"world.dimensions differ ({a}: {one.space.dimensions} and {b}: {two.space.dimensions})")
 
 
-def shared_landmarks(one: GraphSlam, two: GraphSlam) -> list[str]:
+def shared_landmarks(one: MapView, two: MapView) -> list[str]:
     """The landmarks with the same id in both, without unnamed ones."""
-    named = [{name for name, mark in slam.landmarks.items() if not mark.is_unnamed} for slam in (one, two)]
+    named = [{name for name, mark in view.landmarks.items() if not mark.is_unnamed} for view in (one, two)]
     return [name for name in one.landmarks if name in named[0] & named[1]]
 
 
-def aligned_for_merge(one: GraphSlam, two: GraphSlam, a: Path, b: Path) -> tuple[list[str], Alignment]:
+def aligned_for_merge(one: MapView, two: MapView, a: Path, b: Path) -> tuple[list[str], Alignment]:
     """Return the landmarks that both maps share, and how the second map lies on the first.
 
     Raises GraphSlamError: they cannot become one map.
@@ -57,7 +57,7 @@ def aligned_for_merge(one: GraphSlam, two: GraphSlam, a: Path, b: Path) -> tuple
     return shared, _aligned(one, two, shared)
 
 
-def merge_trouble(one: GraphSlam, two: GraphSlam, a: Path, b: Path) -> str:
+def merge_trouble(one: MapView, two: MapView, a: Path, b: Path) -> str:
     """Return why two maps cannot become one; empty where they can."""
     try:
         aligned_for_merge(one, two, a, b)
@@ -66,14 +66,14 @@ def merge_trouble(one: GraphSlam, two: GraphSlam, a: Path, b: Path) -> str:
     return ""
 
 
-def _refuse_other_datum(one: GraphSlam, two: GraphSlam, a: Path, b: Path) -> None:
+def _refuse_other_datum(one: MapView, two: MapView, a: Path, b: Path) -> None:
     if one.datum and two.datum and one.datum != two.datum:
         raise GraphSlamError(
             f"fixes of {a} are from {one.datum}, of {b} from {two.datum}: configure one datum for both"
         )
 
 
-def _refuse_same_drive(one: GraphSlam, two: GraphSlam, a: Path, b: Path) -> None:
+def _refuse_same_drive(one: MapView, two: MapView, a: Path, b: Path) -> None:
     driven, again = (
         {(stamp, pose.tobytes()) for stamp, pose in zip(path.stamps_ns.tolist(), path.odometry, strict=True)}
         for path in (WholePath.of(one, a), WholePath.of(two, b))
@@ -83,7 +83,7 @@ def _refuse_same_drive(one: GraphSlam, two: GraphSlam, a: Path, b: Path) -> None
         raise GraphSlamError(f"{same} keyframes are of the same drive in {a} and {b}: nothing new is in one of them")
 
 
-def _shared(one: GraphSlam, two: GraphSlam, a: Path, b: Path) -> list[str]:
+def _shared(one: MapView, two: MapView, a: Path, b: Path) -> list[str]:
     """Landmarks in both maps. Raises GraphSlamError if a pair cannot be the same landmark."""
     for name, mark in two.landmarks.items():
         other = one.landmarks.get(name)
@@ -99,12 +99,12 @@ def _shared(one: GraphSlam, two: GraphSlam, a: Path, b: Path) -> list[str]:
     return shared_landmarks(one, two)
 
 
-def absolute_classes(slam: GraphSlam) -> list[str]:
+def absolute_classes(view: MapView) -> list[str]:
     """The classes of edges that are absolute in the map."""
-    return [label for label in _ABSOLUTE if len(slam.graph.edges_of(label))]
+    return [label for label in _ABSOLUTE if len(view.graph.edges_of(label))]
 
 
-def _aligned(one: GraphSlam, two: GraphSlam, shared: list[str]) -> Alignment:
+def _aligned(one: MapView, two: MapView, shared: list[str]) -> Alignment:
     needed, robust = one.space.dimensions, one.config.robust
     if len(shared) < needed:
         raise GraphSlamError(f"{len(shared)} landmarks are in both maps: it takes {needed} to lay one on the other")
@@ -143,17 +143,18 @@ def merge(a: Path, b: Path, out: Path, *, force: bool = False) -> Merged:
     for folder in (a, b):
         check_room(out, folder, force=force)
     losses: list[str] = []
-    one, two = restored_and_solved(a, losses), restored_and_solved(b, losses, whole=True)
+    mine, theirs = restored_and_solved(a, losses), restored_and_solved(b, losses, whole=True)
+    one, two = mine.view, theirs.view
     refuse_other_space(one, two, a, b)
     shared, aligned = aligned_for_merge(one, two, a, b)
     state = one.snapshot(a)
     first_edge = state.graph.edge_ids.next
-    two.backend.use_noise(one.noise_factors)  # the merged map has one factor for each group
+    two.backend.use_noise(one.backend.noise.factors)  # the merged map has one factor for each group
     _Second(one, two, aligned, shared).add_to(state)
     left_out = {name: aligned.distance(k) for k, name in enumerate(shared) if not aligned.fits[k]}
     chi2 = {one.landmarks[name].vertex: float(aligned.chi2[k]) for k, name in enumerate(shared) if name in left_out}
     _leave_out(state, first_edge, chi2, aligned.limit)
-    _, summary = record_run(out, config_to_go_on(one, a), [Control("optimize")], losses, state, took=took, force=force)
+    _, summary = record_run(out, config_to_go_on(mine, a), [Control("optimize")], losses, state, took=took, force=force)
     return Merged(summary, summary["losses"], len(shared), left_out, bool(parts_of(b, CONDENSED)))
 
 
@@ -170,7 +171,7 @@ def _leave_out(state: MapSnapshot, first_edge: int, chi2: Mapping[int, float], l
 class _Second:
     """The map of the second session, to be added to the first."""
 
-    def __init__(self, one: GraphSlam, two: GraphSlam, aligned: Alignment, shared: list[str]) -> None:
+    def __init__(self, one: MapView, two: MapView, aligned: Alignment, shared: list[str]) -> None:
         self._one, self._two, self._T = one, two, aligned.T_a_b
         self._keyframes = len(one.keyframes)
         self._vertex = {two.landmarks[name].vertex: one.landmarks[name].vertex for name in shared}

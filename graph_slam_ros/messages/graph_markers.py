@@ -8,7 +8,7 @@ from graph_slam_ros.graph import POINT_PRIOR, R2, R3, SE2, SE3, EdgeType
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.graph.tables import EdgeRows
 from graph_slam_ros.messages.markers import GraphView, Lines
-from graph_slam_ros.slam import GraphSlam
+from graph_slam_ros.slam import MapView
 from graph_slam_ros.typing import Array, Index
 
 Ends = tuple[Array, Array]
@@ -16,16 +16,16 @@ Ends = tuple[Array, Array]
 _COORDINATES = {SE2: 2, SE3: 3, R2: 2, R3: 3}
 
 
-def graph_view(slam: GraphSlam, most: int) -> GraphView:
+def graph_view(view: MapView, most: int) -> GraphView:
     """Draw at most so many keyframes, landmarks and edges of the graph at its estimate.
 
     An edge is a line between its vertices. An edge of a position alone is a line from there to the point of the robot.
     An edge without a position is not drawn.
     """
-    graph, at = slam.graph, _positions(slam)
-    drawn = {table: ends for table in graph.tables.values() if (ends := _drawn(slam.space, table.type))}
+    graph, at = view.graph, _positions(view)
+    drawn = {table: ends for table in graph.tables.values() if (ends := _drawn(view.space, table.type))}
     ids = np.concatenate([table.ids for table in drawn] or [np.empty(0, dtype=np.int64)])
-    chi2, numbers = slam.solver.chi2_of(ids)
+    chi2, numbers = view.solver.chi2_of(ids)
     misfit = np.zeros(graph.edge_ids.next)
     misfit[ids] = chi2 / numbers
     shown = np.zeros(graph.edge_ids.next, dtype=bool)
@@ -35,12 +35,12 @@ def graph_view(slam: GraphSlam, most: int) -> GraphView:
     for table, ends in drawn.items():
         some = table.at(np.flatnonzero(shown[table.ids]))
         label = np.where(some.weight == 0.0, len(graph.labels), some.label)
-        parts.append((*ends(slam, at, some), misfit[some.ids], label))
+        parts.append((*ends(view, at, some), misfit[some.ids], label))
     start, end, fit, labels = (np.concatenate(columns) for columns in zip(*parts, strict=True))
     which = {name: labels == code for code, name in enumerate((*graph.labels, ""))}
     lines = {name: Lines(start[of], end[of], fit[of]) for name, of in which.items()}
-    keyframes = slam.keyframes.ids[thinned(len(slam.keyframes.ids), most)]
-    landmarks = np.array([mark.vertex for mark in slam.landmarks.values()], dtype=np.int64)
+    keyframes = view.keyframes.ids[thinned(len(view.keyframes.ids), most)]
+    landmarks = np.array([mark.vertex for mark in view.landmarks.values()], dtype=np.int64)
     landmarks = landmarks[thinned(len(landmarks), most)]
     return GraphView(at[keyframes], at[landmarks], lines, rejected=lines.pop(""))
 
@@ -75,20 +75,20 @@ def _worst_and_some(ids: Index, misfit: Array, most: int) -> Index:
     return np.sort(np.concatenate((worst, others)))
 
 
-def _positions(slam: GraphSlam) -> Array:
+def _positions(view: MapView) -> Array:
     """Positions of all vertices that have one, each at its id, (n, 3)."""
-    graph, out, every = slam.graph, np.zeros((slam.graph.vertex_ids.next, 3)), slam.graph.vertex_ids.since()
+    graph, out, every = view.graph, np.zeros((view.graph.vertex_ids.next, 3)), view.graph.vertex_ids.since()
     for code, kind in enumerate(graph.kinds):
         if n := _COORDINATES.get(kind, 0):
             ids = every[graph.kind_codes(every) == code]
-            out[ids, :n] = slam.solver.estimate(ids)[:, :n]
+            out[ids, :n] = view.solver.estimate(ids)[:, :n]
     return out
 
 
 # -- the ends of the lines of some rows of a table ---------------------------------------------------------------------
 
 
-def _drawn(space: Geometry, kind: EdgeType) -> Callable[[GraphSlam, Array, EdgeRows], Ends] | None:
+def _drawn(space: Geometry, kind: EdgeType) -> Callable[[MapView, Array, EdgeRows], Ends] | None:
     if len(kind.accepts) > 1:
         return _between if all(slot[0] in _COORDINATES for slot in kind.accepts[:2]) else None
     return {
@@ -99,33 +99,33 @@ def _drawn(space: Geometry, kind: EdgeType) -> Callable[[GraphSlam, Array, EdgeR
     }.get(kind)
 
 
-def _between(slam: GraphSlam, at: Array, some: EdgeRows) -> Ends:
+def _between(view: MapView, at: Array, some: EdgeRows) -> Ends:
     ends = some.vertices
     return at[ends[:, 0]], at[ends[:, 1]]
 
 
-def _of_place(slam: GraphSlam, at: Array, some: EdgeRows) -> Ends:
-    n = slam.space.dimensions
+def _of_place(view: MapView, at: Array, some: EdgeRows) -> Ends:
+    n = view.space.dimensions
     return _in_space(some.measured[:, :n]), at[some.vertices[:, 0]]
 
 
-def _of_antenna(slam: GraphSlam, at: Array, some: EdgeRows) -> Ends:
-    n = slam.space.dimensions
-    return _in_space(some.measured[:, :n]), _in_space(_antenna(slam, some))
+def _of_antenna(view: MapView, at: Array, some: EdgeRows) -> Ends:
+    n = view.space.dimensions
+    return _in_space(some.measured[:, :n]), _in_space(_antenna(view, some))
 
 
-def _of_coordinate(slam: GraphSlam, at: Array, some: EdgeRows) -> Ends:
+def _of_coordinate(view: MapView, at: Array, some: EdgeRows) -> Ends:
     """A line from the nearest point with the measured coordinate."""
-    n, measured, antenna = slam.space.dimensions, some.measured, _antenna(slam, some)
+    n, measured, antenna = view.space.dimensions, some.measured, _antenna(view, some)
     along = measured[:, :n]
     residual = np.einsum("ij,ij->i", along, antenna) - measured[:, n]
     return _in_space(antenna - residual[:, None] * along), _in_space(antenna)
 
 
-def _antenna(slam: GraphSlam, some: EdgeRows) -> Array:
-    poses = slam.solver.estimate(some.vertices[:, 0]).reshape(-1, slam.space.pose.size)
-    lever = some.measured[:, -slam.space.dimensions :]
-    return np.stack(slam.space.group.act(tuple(poses.T), tuple(lever.T)), axis=-1)
+def _antenna(view: MapView, some: EdgeRows) -> Array:
+    poses = view.solver.estimate(some.vertices[:, 0]).reshape(-1, view.space.pose.size)
+    lever = some.measured[:, -view.space.dimensions :]
+    return np.stack(view.space.group.act(tuple(poses.T), tuple(lever.T)), axis=-1)
 
 
 def _in_space(points: Array) -> Array:

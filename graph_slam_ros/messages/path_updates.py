@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graph_slam_ros.messages import to_msg
-from graph_slam_ros.slam import GraphSlam
+from graph_slam_ros.slam import MapView
 from graph_slam_ros.typing import Array
 
 
@@ -34,33 +34,33 @@ class PathUpdates:
         self._sent: Array = np.empty((0, 0))
         self._first = 0  # the number of the first keyframe of these
 
-    def restart(self, slam: GraphSlam) -> bytes:
+    def restart(self, view: MapView) -> bytes:
         """nav_msgs/Path without poses: forget all; the next update contains every keyframe.
 
         It is due for a new subscriber, and after another ``GraphSlam`` has begun.
         """
         self.version = 1
-        self._sent, self._first = np.empty((0, 0)), slam.first_keyframe
-        return to_msg.path(slam.config.frames.map, [], self._sent)
+        self._sent, self._first = np.empty((0, 0)), view.first_keyframe
+        return to_msg.path(view.config.frames.map, [], self._sent)
 
-    def update(self, slam: GraphSlam) -> bytes | None:
+    def update(self, view: MapView) -> bytes | None:
         """nav_msgs/Path of the keyframes that are new or have moved, in order of time, with the newest stamp of all.
 
         None if there are none.
         """
-        now, old = slam.trajectory(), self._sent[slam.first_keyframe - self._first :]
+        now, old = view.trajectory(), self._sent[view.first_keyframe - self._first :]
         changed = np.ones(len(now), dtype=bool)
         if len(old):
-            changed[: len(old)] = self._moved(slam.space.dimensions, old, now[: len(old)])
+            changed[: len(old)] = self._moved(view.space.dimensions, old, now[: len(old)])
         which = np.flatnonzero(changed)
-        self._sent, self._first = old, slam.first_keyframe
+        self._sent, self._first = old, view.first_keyframe
         if not len(which):
             return None
         self._sent = np.concatenate((old.reshape(-1, now.shape[1]), now[len(old) :]))
         self._sent[which] = now[which]
         self.version += 1
-        newest_ns = int(slam.keyframes.stamps_ns[-1])
-        return to_msg.path(slam.config.frames.map, slam.keyframes.stamps_ns[which], now[which], newest_ns)
+        newest_ns = int(view.keyframes.stamps_ns[-1])
+        return to_msg.path(view.config.frames.map, view.keyframes.stamps_ns[which], now[which], newest_ns)
 
     def _moved(self, n: int, old: Array, now: Array) -> NDArray[np.bool_]:
         """Return whether poses have moved or turned too far; n is the number of coordinates of a position."""

@@ -27,7 +27,7 @@ from graph_slam_ros.runs.outcome import (
     wrong_sides,
 )
 from graph_slam_ros.runs.tables import accepted_lately, condensed_part
-from graph_slam_ros.slam import Config, GraphSlam
+from graph_slam_ros.slam import Config, GraphSlam, MapView
 from graph_slam_ros.slam.calibration.answers import Uncorrected
 from graph_slam_ros.slam.solution import Correction
 from graph_slam_ros.slam.weak_direction import WeakDirection, position_covariance, weakest_position, weakest_turn
@@ -56,17 +56,17 @@ class UnseenWay:
     since_ns: int = 0
     direction: Numbers = ()
 
-    def goes_on(self, slam: GraphSlam) -> "UnseenWay":
+    def goes_on(self, view: MapView) -> "UnseenWay":
         """Return the distance after an update."""
-        count, changes = len(slam.keyframes), slam.landmark_changes
-        since = max(self.keyframes - 1 - slam.first_keyframe, 0)
-        positions = slam.keyframes.poses[since:, : slam.space.dimensions]
+        count, changes = len(view.keyframes), view.landmark_changes
+        since = max(self.keyframes - 1 - view.first_keyframe, 0)
+        positions = view.keyframes.poses[since:, : view.space.dimensions]
         steps = np.diff(positions, axis=0)
         length_m, direction = self.length_m, self.direction
-        if len(steps) and slam.segments[-1] < self.keyframes:  # a jump of odometry is no way
+        if len(steps) and view.segments[-1] < self.keyframes:  # a jump of odometry is no way
             length_m += float(np.linalg.norm(steps, axis=1).sum())
             direction = tuple(steps[-1].tolist())
-        since_ns = self.since_ns if changes == self.changes and self.since_ns else slam.keyframes[-1].stamp_ns
+        since_ns = self.since_ns if changes == self.changes and self.since_ns else view.keyframes[-1].stamp_ns
         return UnseenWay(count, changes, length_m if changes == self.changes else 0.0, since_ns, direction)
 
 
@@ -77,19 +77,19 @@ class WeakestLandmark:
         self._found: dict[str, WeakDirection] = {}
         self._next = 0
 
-    def goes_on(self, slam: GraphSlam) -> str:
+    def goes_on(self, view: MapView) -> str:
         """Return the weakest landmark after an update, in words; empty where none is known."""
-        names = list(slam.landmarks)
-        if not names or not slam.is_solved:
+        names = list(view.landmarks)
+        if not names or not view.is_solved:
             return ""
-        self._found = {name: one for name, one in self._found.items() if name in slam.landmarks}
+        self._found = {name: one for name, one in self._found.items() if name in view.landmarks}
         turn = [names[(self._next + k) % len(names)] for k in range(min(_IN_TURN, len(names)))]
         self._next = (self._next + len(turn)) % len(names)
         chosen = list(dict.fromkeys([*filter(None, [self._name]), *turn]))
-        for name, covariance in zip(chosen, slam.landmark_covariances(chosen), strict=True):
+        for name, covariance in zip(chosen, view.landmark_covariances(chosen), strict=True):
             if np.isfinite(covariance).all():
-                value = tuple(slam.solver.estimate([slam.landmarks[name].vertex])[0].tolist())
-                self._found[name] = weakest_position(position_covariance(slam.space, value, covariance))
+                value = tuple(view.solver.estimate([view.landmarks[name].vertex])[0].tolist())
+                self._found[name] = weakest_position(position_covariance(view.space, value, covariance))
         if not self._found:
             return ""
         return f"landmark {self._name} {self._found[self._name].sigma:.3f} m {self._found[self._name].words}"
@@ -176,45 +176,45 @@ class Estimate:
 
 def estimate_of(slam: GraphSlam, **known: Any) -> Estimate:
     """Return the estimate of a pipeline that has keyframes, with the attributes that only the node knows."""
-    newest = slam.keyframes[-1]
+    view, newest = slam.view, slam.view.keyframes[-1]
     return Estimate(
-        T_map_odom=slam.T_map_odom,
+        T_map_odom=view.T_map_odom,
         T_odom_keyframe=newest.T_odom_base,
-        covariance=slam.pose_covariance,
+        covariance=view.pose_covariance,
         stamp_ns=newest.stamp_ns,
-        source=slam.odometry_source,
-        keyframes=len(slam.keyframes),
-        landmarks=len(slam.landmarks),
-        edges=slam.graph.edge_count,
-        segments=len(slam.segments),
-        solves=slam.solves,
-        displaced=str(slam.displaced or ""),
-        association="; ".join(association_faults(slam.association_report)),
-        condensed=condensed_text(condensed_part(slam)),
+        source=view.odometry_source,
+        keyframes=len(view.keyframes),
+        landmarks=len(view.landmarks),
+        edges=view.graph.edge_count,
+        segments=len(view.segments),
+        solves=view.solves,
+        displaced=str(view.displaced or ""),
+        association="; ".join(association_faults(view.association_report)),
+        condensed=condensed_text(condensed_part(view)),
         visits="; ".join(visit_faults({name: slam.counters["map", name] for name in VISITS})),
-        uncorrected="; ".join(": ".join([str(one), *_settings(one)]) for one in slam.uncorrected_so_far),
-        motion="; ".join(filter(None, (_frozen(slam), slam.gyro.fault if slam.gyro else ""))),
-        ambiguity=_ambiguity(slam),
-        gyro=str(slam.gyro or ""),
-        calibration=_calibration(slam.found_settings, slam.contradicted),
+        uncorrected="; ".join(": ".join([str(one), *_settings(one)]) for one in view.uncorrected_so_far),
+        motion="; ".join(filter(None, (_frozen(view), view.gyro.fault if view.gyro else ""))),
+        ambiguity=_ambiguity(view),
+        gyro=str(view.gyro or ""),
+        calibration=_calibration(view.found_settings, view.contradicted),
         **known,
     )
 
 
-def _frozen(slam: GraphSlam) -> str:
-    name = slam.odometry_source
-    return f"{name}: {explain('frozen').meaning}: {remedy(name, 'frozen')}" if slam.odometry_is_frozen else ""
+def _frozen(view: MapView) -> str:
+    name = view.odometry_source
+    return f"{name}: {explain('frozen').meaning}: {remedy(name, 'frozen')}" if view.odometry_is_frozen else ""
 
 
-def _ambiguity(slam: GraphSlam) -> str:
-    rivals = ambiguities([asdict(one) for one in slam.backend.rivals])
-    return "; ".join(filter(None, (*rivals, wrong_sides(len(slam.landmarks), slam.waiting))))
+def _ambiguity(view: MapView) -> str:
+    rivals = ambiguities([asdict(one) for one in view.backend.rivals])
+    return "; ".join(filter(None, (*rivals, wrong_sides(len(view.landmarks), view.waiting))))
 
 
-def doubted_lately(slam: GraphSlam) -> str:
+def doubted_lately(view: MapView) -> str:
     """Say of which inputs most measurements are not believed lately, and of ids that are new; empty where of none."""
-    lately = ((name, *of) for name, of in accepted_lately(slam).items() if of[1] >= _FEWEST_JUDGED)
-    renewed = [renewed_text(str(one))] if (one := slam.renewed_ids()) else []
+    lately = ((name, *of) for name, of in accepted_lately(view).items() if of[1] >= _FEWEST_JUDGED)
+    renewed = [renewed_text(str(one))] if (one := view.renewed_ids()) else []
     return "; ".join(filter(None, (*(contradicts(*of) for of in lately), *renewed)))
 
 

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from graph_slam_ros.messages.to_msg import OK, WARN, Status
-from graph_slam_ros.slam import GraphSlam, Update
+from graph_slam_ros.slam import MapView, Update
 from graph_slam_ros.slam.doubt.record import Alarm, Slip
 from graph_slam_ros.slam.robust.ledger import Verdict, VerdictChange
 
@@ -24,40 +24,40 @@ def happened(what: str, message: str, level: int = OK, **values: object) -> Stat
     return Status(level, f"graph_slam: {what}", message, "", {name: str(value) for name, value in values.items()})
 
 
-def of_update(slam: GraphSlam, update: Update) -> Iterator[Status]:
+def of_update(view: MapView, update: Update) -> Iterator[Status]:
     """New vertices, edges and segments, changed verdicts, and the correction if there was one."""
-    graph = slam.graph
+    graph = view.graph
     for k in update.keyframes:
-        keyframe = slam.keyframes[k]
+        keyframe = view.keyframes[k]
         values = {"vertex": keyframe.vertex, "stamp_ns": keyframe.stamp_ns}
         yield happened("vertex", f"keyframe {k}", **values)
-        if k and k in slam.segments:
+        if k and k in view.segments:
             yield happened("segment", f"a new segment begins at keyframe {k}", WARN, **values)
     for edge in list(update.edges)[:_EDGES]:
         one = graph.edge(edge)
         label, vertices = one.label, list(one.vertices)
-        what, verdict = "closure" if label == "closures" else "edge", slam.ledger.verdict_of(edge).name.lower()
+        what, verdict = "closure" if label == "closures" else "edge", view.ledger.verdict_of(edge).name.lower()
         yield happened(
             what, f"edge {edge}: {label} of {vertices}", edge=edge, label=label, vertices=vertices, verdict=verdict
         )
     for change in update.changes[:_EDGES]:
-        yield _verdict(slam, change)
+        yield _verdict(view, change)
     for found in update.calibrated:
         value, sigma, source = f"{found.value:.6g}", f"{found.sigma:.3g}", found.parameter.source
         yield happened("calibration", f"corrected {found.text}", value=value, sigma=sigma, source=source)
     for alarm in update.alarms:
         yield _alarm(alarm)
     if update.solved and update.correction.distance_m + update.correction.angle_rad > 0.0:
-        yield correction(slam, update)
+        yield correction(view, update)
 
 
-def _verdict(slam: GraphSlam, change: VerdictChange) -> Status:
+def _verdict(view: MapView, change: VerdictChange) -> Status:
     verdict, reason = change.verdict.name.lower(), change.reason.name.lower()
     why = f": {reason.replace('_', ' ')}" if change.reason else ""
     edge = change.edge
     return happened(
         "verdict",
-        f"edge {edge} ({name_of(slam, change.edge)}) {verdict.replace('_', ' ')}{why},"
+        f"edge {edge} ({name_of(view, change.edge)}) {verdict.replace('_', ' ')}{why},"
         f" chi2 {change.statistic:.3g} against {change.threshold:.3g}",
         OK if change.verdict is Verdict.ACCEPTED else WARN,
         edge=edge,
@@ -82,11 +82,11 @@ def _alarm(alarm: Alarm | Slip) -> Status:
     return happened(what, f"{agree}: {alarm}", OK, **values, ended_ns=alarm.ended_ns)
 
 
-def correction(slam: GraphSlam, update: Update, level: int = OK) -> Status:
+def correction(view: MapView, update: Update, level: int = OK) -> Status:
     """The motion of the robot in the map that a solve caused, and the edges that caused it."""
     moved = update.correction
     causes = [
-        f"{e} ({name_of(slam, e)}, {fit:.1f})" for e, fit in zip(moved.edges, moved.chi2, strict=True) if fit > 1.0
+        f"{e} ({name_of(view, e)}, {fit:.1f})" for e, fit in zip(moved.edges, moved.chi2, strict=True) if fit > 1.0
     ]
     return happened(
         "correction",
@@ -100,8 +100,8 @@ def correction(slam: GraphSlam, update: Update, level: int = OK) -> Status:
     )
 
 
-def name_of(slam: GraphSlam, edge: int) -> str:
+def name_of(view: MapView, edge: int) -> str:
     """The class of an edge, and the name of its landmark."""
-    one = slam.graph.edge(edge)
-    of = next((name for name, mark in slam.landmarks.items() if mark.vertex in one.vertices), "")
+    one = view.graph.edge(edge)
+    of = next((name for name, mark in view.landmarks.items() if mark.vertex in one.vertices), "")
     return f"{one.label} {of}".strip()

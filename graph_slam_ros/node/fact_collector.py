@@ -145,7 +145,7 @@ class FactCollector:
             busy_s=worker.busy_s,
             worker_is_alive=worker.is_alive,
             restarts=restarts - before[2],
-            failing=session.slam.failing,
+            failing=session.slam.view.failing,
             overflows=overflows - before[0],
             failures=failures - before[1],
             recording_fails=session.recording_fails,

@@ -189,7 +189,7 @@ class Ingest:
 
         def remove() -> None:
             slam = self._session.slam
-            before, known = slam.counters.as_dict(), list(slam.landmarks)
+            before, known = slam.counters.as_dict(), list(slam.view.landmarks)
             self._session.process([event])
             near = did_you_mean(str(dict(event.values).get("landmark", "")), known)
             self._report(EDITS, f"~/remove: {message.data[:_SHOWN]}", before, slam.counters, near)

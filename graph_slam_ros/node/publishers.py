@@ -19,7 +19,7 @@ from graph_slam_ros.messages.to_msg import Status
 from graph_slam_ros.node import events
 from graph_slam_ros.node.session import Session
 from graph_slam_ros.node.worker import Worker
-from graph_slam_ros.slam import Config, GraphSlam, Update
+from graph_slam_ros.slam import Config, GraphSlam, MapView, Update
 from graph_slam_ros.slam.frontend.ingest_gate import input_of, size_of
 
 if TYPE_CHECKING:
@@ -88,19 +88,19 @@ class Publishers:
 
     # -- at once -----------------------------------------------------------------------------------------------------
 
-    def update(self, slam: GraphSlam, update: Update, *, is_located: bool) -> None:
+    def update(self, view: MapView, update: Update, *, is_located: bool) -> None:
         """Publish pose and events, and note which topics have changed."""
         if is_located:
-            self._send("pose", results.pose(slam))
+            self._send("pose", results.pose(view))
         self._has_something = True
         for name in ("path", "path_updates", "graph"):
             self._topics[name].is_stale = True
-        if self._landmarks_due(slam, update):
-            self._landmarks_at = len(slam.keyframes) + _LANDMARKS_EVERY
+        if self._landmarks_due(view, update):
+            self._landmarks_at = len(view.keyframes) + _LANDMARKS_EVERY
             for name in _LANDMARKS:
                 self._topics[name].is_stale = True
         if self._events.get_subscription_count():
-            self.publish_events(slam.keyframes[-1].stamp_ns, events.of_update(slam, update))
+            self.publish_events(view.keyframes[-1].stamp_ns, events.of_update(view, update))
 
     def publish_events(self, stamp_ns: int, happened: Iterable[Status]) -> None:
         """Publish events, with or without subscribers."""
@@ -120,17 +120,17 @@ class Publishers:
         topic.publisher.publish(cdr)
         topic.is_stale, topic.sent_s = False, time.monotonic()
 
-    def _landmarks_due(self, slam: GraphSlam, update: Update) -> bool:
+    def _landmarks_due(self, view: MapView, update: Update) -> bool:
         """Return whether landmarks are due: regularly from the first on, and after each complete solve."""
-        regularly = bool(slam.landmarks) and len(slam.keyframes) >= self._landmarks_at
+        regularly = bool(view.landmarks) and len(view.keyframes) >= self._landmarks_at
         return update.report is not None or (update.solved and regularly)
 
-    def _send_updates(self, slam: GraphSlam) -> None:
+    def _send_updates(self, view: MapView) -> None:
         """Publish changes of the path. A late subscriber lacks the earlier ones, so the whole path is sent again."""
         if self._topics["path_updates"].begins_anew:
             self._topics["path_updates"].begins_anew = False
-            self._send("path_updates", self._updates.restart(slam))
-        if changed := self._updates.update(slam):
+            self._send("path_updates", self._updates.restart(view))
+        if changed := self._updates.update(view):
             self._send("path_updates", changed)
 
     # -- when due ----------------------------------------------------------------------------------------------------
@@ -151,22 +151,22 @@ class Publishers:
         period_s = max(period_s, _SPARE * topic.encode_s)  # what takes long comes seldom
         return self._has_something and topic.is_stale and bool(subscribers) and now_s - topic.sent_s >= period_s
 
-    def publish_due(self, slam: GraphSlam) -> None:
+    def publish_due(self, view: MapView) -> None:
         """Publish what is due, has changed and has a subscriber."""
-        now_s, output = time.monotonic(), slam.config.output
+        now_s, output = time.monotonic(), view.config.output
         make: dict[str, Callable[[], bytes]] = {
-            "path": lambda: results.path(slam, output.path_max_poses),
-            "graph": lambda: results.graph(slam, _MOST_EDGES),
-            "landmarks": lambda: results.landmarks(slam),
-            "landmarks_estimate": lambda: results.landmarks_estimate(slam),
+            "path": lambda: results.path(view, output.path_max_poses),
+            "graph": lambda: results.graph(view, _MOST_EDGES),
+            "landmarks": lambda: results.landmarks(view),
+            "landmarks_estimate": lambda: results.landmarks_estimate(view),
         }
         for name, encode in make.items():
-            if self._is_due(slam.config, name, now_s):
+            if self._is_due(view.config, name, now_s):
                 start = time.thread_time()
                 self._send(name, encode())
                 self._topics[name].encode_s = time.thread_time() - start
-        if self._is_due(slam.config, "path_updates", now_s):
-            self._send_updates(slam)
+        if self._is_due(view.config, "path_updates", now_s):
+            self._send_updates(view)
 
 
 ACKNOWLEDGE = 32  # messages
@@ -202,7 +202,7 @@ class PublishingClock:
         self._acknowledge()
         is_due = self._publishers.are_due(self._node.config)
         if is_due and self._worker.waiting < ACKNOWLEDGE:
-            self._worker.offer(lambda: self.publish_due(self._session.slam))
+            self._worker.offer(lambda: self.publish_due(self._session.slam.view))
         elif is_due and time.monotonic() - self._published_s > _MOST_UNPUBLISHED_S:
             self._is_overdue = True
 
@@ -220,20 +220,20 @@ class PublishingClock:
         for m in measured:
             self.processed[input_of(m)] += size_of(m)
         if self._is_overdue:
-            self.publish_due(self._session.slam)
+            self.publish_due(self._session.slam.view)
         if self._has_player and (not self._worker.waiting or self._done % ACKNOWLEDGE == 0):
             self._acknowledge()
 
     def on_update(self, slam: GraphSlam, update: Update) -> None:
         """Publish what an update changed, and log large moves of the robot."""
         estimate = self._session.estimate
-        self._publishers.update(slam, update, is_located=estimate is not None and estimate.is_located)
-        moved, tf = update.correction, slam.config.tf
+        self._publishers.update(slam.view, update, is_located=estimate is not None and estimate.is_located)
+        moved, tf = update.correction, slam.view.config.tf
         if update.solved and (moved.distance_m > tf.report_jump_m or moved.angle_rad > _JUMP_RAD):
             slam.counters.count("tf", "jump")
-            self._node.get_logger().warn(events.correction(slam, update).message, throttle_duration_sec=_AGAIN_S)
+            self._node.get_logger().warn(events.correction(slam.view, update).message, throttle_duration_sec=_AGAIN_S)
 
-    def publish_due(self, slam: GraphSlam) -> None:
+    def publish_due(self, view: MapView) -> None:
         """Publish what is due now."""
         self._is_overdue, self._published_s = False, time.monotonic()
-        self._publishers.publish_due(slam)
+        self._publishers.publish_due(view)

@@ -216,10 +216,10 @@ class Runtime:
             finally:
                 self._session.release()
             slam = self._session.slam
-            if slam.datum:
-                self._ingest.converter.begin_at(slam.datum)
-            self._publishers.begin(self._node.config, has_map=bool(slam.keyframes))
-            self._publishers.publish_due(slam)
+            if slam.view.datum:
+                self._ingest.converter.begin_at(slam.view.datum)
+            self._publishers.begin(self._node.config, has_map=bool(slam.view.keyframes))
+            self._publishers.publish_due(slam.view)
             return done
 
         return self._worker.call(begin)

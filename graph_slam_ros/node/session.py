@@ -89,10 +89,10 @@ class Session:
         self._refused_before.update(self._border)
         self.estimate = None
         self._is_saved, self._is_ended = True, False
-        self.loaded_keyframes = len(self.slam.keyframes)
+        self.loaded_keyframes = len(self.slam.view.keyframes)
         self._is_confirmed, self._sure_segments = not self.loaded_keyframes, 0  # when it was last known where it is
         self._resumption = None
-        self._unseen, self._weakest = UnseenWay(self.loaded_keyframes, slam.landmark_changes), WeakestLandmark()
+        self._unseen, self._weakest = UnseenWay(self.loaded_keyframes, slam.view.landmark_changes), WeakestLandmark()
         self._slowest_s = 0.0
         self._fit, self._fitted_at, self._fit_due_s, self._doubted = float("nan"), 0, 0.0, ""
 
@@ -186,24 +186,24 @@ class Session:
 
     def _estimated(self, update: Update, solve_s: float) -> Estimate:
         """Return the estimate after an update, and note its correction for the next start."""
-        slam = self.slam
-        if update.solved and not self._is_confirmed and len(slam.keyframes) > self.loaded_keyframes:
+        view = self.slam.view
+        if update.solved and not self._is_confirmed and len(view.keyframes) > self.loaded_keyframes:
             self._is_confirmed = self._is_sure
         if self._is_sure:
-            self._sure_segments = len(slam.segments)
-        self._unseen = self._unseen.goes_on(slam)
+            self._sure_segments = len(view.segments)
+        self._unseen = self._unseen.goes_on(view)
         estimate = estimate_of(
-            slam,
+            self.slam,
             correction=update.correction,
             is_confirmed=self._is_confirmed,
             is_resumed=not self._is_confirmed and self._is_resumed,
-            is_lost=self._is_confirmed and not slam.displaced and len(slam.segments) > self._sure_segments,
+            is_lost=self._is_confirmed and not view.displaced and len(view.segments) > self._sure_segments,
             solve_s=solve_s,
             slowest_solve_s=self._slowest_s,
             fit=self._fit,
             doubted=self._doubted,
             unseen=self._unseen,
-            weakest_landmark=self._weakest.goes_on(slam),
+            weakest_landmark=self._weakest.goes_on(view),
         )
         if self._recorder is not None and estimate.is_located:
             self._recorder.note_correction(estimate.T_map_odom, estimate.source)
@@ -212,17 +212,17 @@ class Session:
     @property
     def _is_sure(self) -> bool:
         """Return whether the newest keyframe is better known in the map than across a jump of odometry."""
-        covariance = self.slam.pose_covariance
+        covariance = self.slam.view.pose_covariance
         return float(covariance[0, 0] + covariance[1, 1]) ** 0.5 < _CONFIRMED * JUMP_SIGMA_M
 
     @property
     def _is_resumed(self) -> bool:
         """Return whether the drive that was cut off goes on, and odometry has not jumped since."""
-        slam, first, resumption = self.slam, self.loaded_keyframes, self._resumption
-        if resumption is None or len(slam.keyframes) <= first or slam.segments[-1] != first:
+        view, first, resumption = self.slam.view, self.loaded_keyframes, self._resumption
+        if resumption is None or len(view.keyframes) <= first or view.segments[-1] != first:
             return False
         return resumption.goes_on(
-            slam.keyframes[first].stamp_ns, slam.keyframes[first].T_odom_base, slam.odometry_source
+            view.keyframes[first].stamp_ns, view.keyframes[first].T_odom_base, view.odometry_source
         )
 
     def T_map_odom(self, newest: Step, source: str) -> Numbers | None:
@@ -244,25 +244,25 @@ class Session:
         except GraphSlamError as error:  # it is tried again
             if not was_said:
                 self._warn("output.folder", str(error))
-        if self.estimate is None or self._fitted_at == self.slam.solves or time.perf_counter() < self._fit_due_s:
+        if self.estimate is None or self._fitted_at == self.slam.view.solves or time.perf_counter() < self._fit_due_s:
             return
         start = time.thread_time()
-        now, dof = self.slam.solver.evaluate(), self.slam.solver.degrees_of_freedom
+        now, dof = self.slam.view.solver.evaluate(), self.slam.view.solver.degrees_of_freedom
         self._fit = now.chi2_final / dof if dof > 0 else float("nan")
-        self._doubted, self._fitted_at = doubted_lately(self.slam), self.slam.solves
+        self._doubted, self._fitted_at = doubted_lately(self.slam.view), self.slam.view.solves
         self._fit_due_s = time.perf_counter() + 50.0 * (time.thread_time() - start)
         self.estimate = replace(self.estimate, fit=self._fit, doubted=self._doubted)
 
     def _keep_folder(self) -> None:
         """Begin the run folder anew with the whole map, where somebody has removed it. Raises RunError."""
-        if self._folder is None or (self._folder / CONFIG).exists() or not self.slam.keyframes:
+        if self._folder is None or (self._folder / CONFIG).exists() or not self.slam.view.keyframes:
             return
         with self._accepting:
             gone, self._recorder, self._is_saved, self.recording_fails = self._recorder, None, False, True
             if gone is not None:
                 self._warn("output.folder", "the run folder was removed: it is made again, with the map as it is")
                 gone.abandon()
-            given = self._folder, self.slam.config, _SYNC_S, self.slam.snapshot()
+            given = self._folder, self.slam.view.config, _SYNC_S, self.slam.view.snapshot()
             accepted = self.slam.processed if gone is None else gone.accepted
             self._recorder = RunRecorder(*given, force=True, accepted=accepted)
             self.recording_fails = False
@@ -272,7 +272,7 @@ class Session:
     def control(self, event: Control) -> str:
         """Process an event that was accepted."""
         self.process([event])
-        return f"{len(self.slam.keyframes)} keyframes"
+        return f"{len(self.slam.view.keyframes)} keyframes"
 
     def accept_save(self) -> list[Control]:
         """The events that come before a save in the journal; none if nothing is new."""
@@ -302,7 +302,7 @@ class Session:
             )
         out = folder.with_name(name)
         try:
-            save_copy(self.slam, out, folder)
+            save_copy(self.slam.view, out, folder)
         except GraphSlamError as error:
             raise RunError(f"{folder.name} is saved; {error}") from None
         return out
@@ -319,7 +319,7 @@ class Session:
     def reset(self) -> str:
         """Save, keep that run, and begin a new one."""
         saved = self.finish() or ("recording was stopped" if self.recording_fails else "nothing to save")
-        self.config = self.slam.config
+        self.config = self.slam.view.config
         self._begin()
         return saved
 
@@ -358,7 +358,7 @@ class Session:
         losses, resumption = list[str](), self._resumption if resumes else None
         start = map_of(run, losses)
         self.finish()
-        self.config = self.slam.config
+        self.config = self.slam.view.config
         try:
             self._begin(start, run)
         except Exception:
@@ -368,7 +368,7 @@ class Session:
         where = [] if T_map_base is None else [self._place(T_map_base)]
         self._recorded(RunRecorder.flush)
         self.estimate = self._estimated(Update(), 0.0)
-        return ": ".join([run.name, f"{len(self.slam.keyframes)} keyframes", *where, *losses[:1]])
+        return ": ".join([run.name, f"{len(self.slam.view.keyframes)} keyframes", *where, *losses[:1]])
 
     def _place(self, T_map_base: Numbers) -> str:
         """Begin the sequence with the robot's pose, as uncertain as on ``initialpose`` without covariance; says so."""
@@ -400,7 +400,7 @@ class Session:
         if self._recorder is None:
             return ""
         folder, recorder = "", self._recorder
-        if not self._is_saved or (self.slam.keyframes and not self._is_ended):
+        if not self._is_saved or (self.slam.view.keyframes and not self._is_ended):
             self._recorded(RunRecorder.join_sync)
             for event in END if not self._is_saved else ():
                 recorder.accept(event)
@@ -422,7 +422,7 @@ class Session:
         if recorder is None:
             return 0, lost
         try:
-            return recorder.leave(self.slam.processed, len(self.slam.keyframes), self._counters()), lost
+            return recorder.leave(self.slam.processed, len(self.slam.view.keyframes), self._counters()), lost
         except OSError as error:
             recorder.abandon()
             raise RunError(f"{recorder.folder}: {error.strerror}") from None

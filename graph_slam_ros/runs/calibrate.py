@@ -22,7 +22,7 @@ from graph_slam_ros.recordings.bag import Bag, open_bag
 from graph_slam_ros.runs.replay import Progress, RecordedRuns
 from graph_slam_ros.runs.suggestion import SuggestedInputs
 from graph_slam_ros.runs.tables import account
-from graph_slam_ros.slam import Config, Counters, GraphSlam
+from graph_slam_ros.slam import Config, Counters, GraphSlam, MapView
 from graph_slam_ros.slam.calibration.answers import CODES, setting_of
 from graph_slam_ros.slam.calibration.answers import Finding as Fitted
 from graph_slam_ros.slam.calibration.parameters import AUTO, GROUPS, Parameter, parameters_of
@@ -130,16 +130,16 @@ class _Rounds:
             slam = self._replayed(math.inf if k else FIRST_DUE)
             if not self.keyframes or self._does_harm(slam):
                 return
-            findings = self._fitted(slam)
+            findings = self._fitted(slam.view)
             if self.fault is not None and self.fault.severity == "error":  # what is fitted to it means nothing
                 self.refused = f"nothing is calibrated: mend {self.fault.code} first"
             else:
-                self.refused, self.named = _misplaced(slam, self._config, findings)
+                self.refused, self.named = _misplaced(slam.view, self._config, findings)
             if self.refused:
                 self.found, self.parameters = {}, []
                 return
             self.parameters = [self._said(one) for one in findings]
-            self.is_complete = not self._set(slam, findings, are_followed=True)
+            self.is_complete = not self._set(slam.view, findings, are_followed=True)
             if self.is_complete:
                 return
 
@@ -153,15 +153,15 @@ class _Rounds:
             for _, some in self._progress(runs, runs.count):
                 for one in some:
                     slam.process(one)
-                if len(slam.keyframes) >= due and slam.is_solved and not slam.backend.holds_back:
+                if len(slam.view.keyframes) >= due and slam.view.is_solved and not slam.view.backend.holds_back:
                     due *= 2
-                    if self._set(slam, self._fitted(slam), are_followed=False):
+                    if self._set(slam.view, self._fitted(slam.view), are_followed=False):
                         break
             else:
                 break
         for event in END:
             slam.process(event)
-        self.keyframes = len(slam.keyframes)
+        self.keyframes = len(slam.view.keyframes)
         if self.keyframes and due < math.inf:
             read = columns.columns(counters)
             self.fault = next(iter(refused_odometry(read)), None) or worst_of_replay(read)
@@ -182,7 +182,7 @@ class _Rounds:
         self.found = kept
         return True
 
-    def _set(self, slam: GraphSlam, findings: Iterable[Fitted], *, are_followed: bool) -> bool:
+    def _set(self, view: MapView, findings: Iterable[Fitted], *, are_followed: bool) -> bool:
         """Set what was found, withdraw what the whole drive does not bear out. Returns whether it was anything.
 
         With ``are_followed`` a parameter that was set is set again where it is off by its sigma, though not by four.
@@ -193,19 +193,19 @@ class _Rounds:
             if (one.verdict == "admitted" and one.parameter not in self._withdrawn)
             or (are_followed and one.is_determined and one.parameter in self._corrected and abs(one.value) > one.sigma)
         }
-        more = slam.found_settings | dict(setting_of(one, values, slam.calibrated) for one in values)
+        more = view.found_settings | dict(setting_of(one, values, view.calibrated) for one in values)
         doubted = {one.parameter for one in findings if are_followed and not one.is_determined} & self._corrected
         for one in doubted:
-            self.found.pop(setting_of(one, {one: 0.0}, slam.calibrated)[0], None)
+            self.found.pop(setting_of(one, {one: 0.0}, view.calibrated)[0], None)
         self._withdrawn |= doubted
         self._corrected = (self._corrected | values.keys()) - doubted
         before, self.found = self.found, self.found | more
         return bool(doubted) or self.found != before
 
-    def _fitted(self, slam: GraphSlam) -> list[Fitted]:
+    def _fitted(self, view: MapView) -> list[Fitted]:
         """Fit the parameters of the groups; none where the edges do not determine the estimate."""
         try:
-            return slam.trial_fit(self._words, is_to_correct=True)[1]
+            return view.trial_fit(self._words, is_to_correct=True)[1]
         except SingularError:
             return []
 
@@ -244,13 +244,13 @@ def _words(text: str, config: Config) -> list[str]:
     return words
 
 
-def _misplaced(slam: GraphSlam, config: Config, findings: Iterable[Fitted]) -> tuple[str, dict[str, float | str]]:
+def _misplaced(view: MapView, config: Config, findings: Iterable[Fitted]) -> tuple[str, dict[str, float | str]]:
     """Return why nothing is used where a sensor is elsewhere on the robot, or its ranges have an offset; the setting.
 
     That passes for scale and yaw. The offset of ranges alone is fitted with the scale, and hides nothing.
     """
     fitted = {one.parameter.source for one in findings if one.parameter.name == "range_offset"}
-    for off in slam.uncorrected():
+    for off in view.uncorrected():
         if not off.setting:
             continue
         key, value = off.setting

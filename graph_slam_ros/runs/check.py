@@ -131,8 +131,8 @@ def _trial(columns: Columns, measured: list[Measurements]) -> list[Finding]:
     try:
         with np.errstate(all="ignore"):
             slam = replayed(columns.config, (m for some in measured for m in some))
-            found += check_doubted(columns, slam.gyro)
-            found += check_trial(columns, slam)  # one by one: what was found before an error stays
+            found += check_doubted(columns, slam.view.gyro)
+            found += check_trial(columns, slam.view)  # one by one: what was found before an error stays
     except GraphSlamError as error:
         found.append(Finding("fit_unsure", "warning", 1, 0, "replays", f"a replay fails: {error}"))
     return found

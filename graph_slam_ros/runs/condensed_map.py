@@ -18,7 +18,7 @@ import numpy as np
 from graph_slam_ros.errors import FormatError
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.runs.journal import CONDENSED, read_records
-from graph_slam_ros.slam import GraphSlam
+from graph_slam_ros.slam import MapView
 from graph_slam_ros.slam.bounded_map import Condensation, CondensedEdge
 from graph_slam_ros.slam.lifelong.state import BoundedState, Left, Records, record_type
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict
@@ -98,24 +98,24 @@ class WholePath:
     odometry : (n, size) their poses by odometry alone, ``T_odom_base``
     """
 
-    def __init__(self, slam: GraphSlam, left: Left) -> None:
-        self._slam, self.left = slam, left
-        removed, keyframes = left.keyframes, slam.keyframes
+    def __init__(self, view: MapView, left: Left) -> None:
+        self._view, self.left = view, left
+        removed, keyframes = left.keyframes, view.keyframes
         self.stamps_ns: Index = np.concatenate((removed["stamp_ns"], keyframes.stamps_ns))
-        self.odometry: Array = np.concatenate((removed["T_odom"], keyframes.poses.reshape(-1, slam.space.pose.size)))
+        self.odometry: Array = np.concatenate((removed["T_odom"], keyframes.poses.reshape(-1, view.space.pose.size)))
 
     @classmethod
-    def of(cls, slam: GraphSlam, folder: Path) -> "WholePath":
+    def of(cls, view: MapView, folder: Path) -> "WholePath":
         """Return that of a pipeline whose run folder has what was condensed. Raises FormatError where that is lost."""
-        known = [] if slam.bounded is None else carried(folder, slam.space, slam.bounded)
-        return cls(slam, _joined(slam.space, known))
+        known = [] if view.bounded is None else carried(folder, view.space, view.bounded)
+        return cls(view, _joined(view.space, known))
 
     def poses(self, solver: Solver | None = None) -> Array:
         """Return the poses ``T_map_base``, (n, size); of another solution of the graph if given."""
-        slam, solver = self._slam, solver or self._slam.solver
-        path = solver.estimate(slam.keyframes.ids).reshape(-1, slam.space.pose.size)
-        if slam.bounded is None:
+        view, solver = self._view, solver or self._view.solver
+        path = solver.estimate(view.keyframes.ids).reshape(-1, view.space.pose.size)
+        if view.bounded is None:
             return path
-        old = [one.vertex for one in slam.bounded.old]
-        vertices = np.sort(np.array([*old, *slam.keyframes.ids.tolist()], dtype=np.int64))
-        return np.concatenate((self.left.path(slam.space, vertices, solver.estimate(vertices)), path))
+        old = [one.vertex for one in view.bounded.old]
+        vertices = np.sort(np.array([*old, *view.keyframes.ids.tolist()], dtype=np.int64))
+        return np.concatenate((self.left.path(view.space, vertices, solver.estimate(vertices)), path))

@@ -74,7 +74,7 @@ def write_graph_run(solution: Solution, out: Path, name: str, *, force: bool = F
     settings = {"world.dimensions": space.dimensions, "robust.noise_scale": "configured", "map.condense": False}
     config, ended = Config.from_mapping(settings), [Control("optimize")]
     slam, _ = record_run(out, config, ended, file.losses, state, recording=name, force=force)
-    verdicts = slam.ledger.verdict.values
+    verdicts = slam.view.ledger.verdict.values
     return int(np.isin(verdicts, OUTSIDE).sum()), int((verdicts != Verdict.NOT_EVALUATED).sum())
 
 

@@ -22,7 +22,7 @@ from graph_slam_ros.graph.losses import weight_and_cost
 from graph_slam_ros.graph.tables import EdgeTable
 from graph_slam_ros.runs.condensed_map import rows_text
 from graph_slam_ros.runs.journal import LEDGER
-from graph_slam_ros.slam import GraphSlam
+from graph_slam_ros.slam import MapView
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict, VerdictChange
 from graph_slam_ros.typing import Index, Numbers
 
@@ -105,14 +105,14 @@ class Entry:
         return upper + np.triu(upper, 1).T
 
 
-def ledger_text(slam: GraphSlam, ids: list[int]) -> str:
+def ledger_text(view: MapView, ids: list[int]) -> str:
     """All edges of the solver as a table; ``ids`` are the numbers of the vertices in the file."""
-    return rows_text(ledger_entries(slam, ids), [field.name for field in fields(Entry)])
+    return rows_text(ledger_entries(view, ids), [field.name for field in fields(Entry)])
 
 
-def changes_text(slam: GraphSlam) -> str:
+def changes_text(view: MapView) -> str:
     """The history of all verdicts as a table."""
-    return rows_text(slam.ledger.history, [field.name for field in fields(VerdictChange)])
+    return rows_text(view.ledger.history, [field.name for field in fields(VerdictChange)])
 
 
 def read_ledger(folder: Path) -> list[Entry]:
@@ -130,15 +130,15 @@ def read_ledger(folder: Path) -> list[Entry]:
         raise FormatError(f"{file}:{rows.line_num}: not a ledger: {shortened(str(error))}") from None
 
 
-def ledger_entries(slam: GraphSlam, ids: Sequence[int]) -> Iterator[Entry]:
+def ledger_entries(view: MapView, ids: Sequence[int]) -> Iterator[Entry]:
     """Each edge of the solver; ``ids`` are the numbers of vertices in the file, at their ids."""
-    graph, ledger = slam.graph, slam.ledger
-    stamps_ns: list[int] = slam.keyframes.stamps_ns.tolist()
+    graph, ledger = view.graph, view.ledger
+    stamps_ns: list[int] = view.keyframes.stamps_ns.tolist()
     judged = {change.edge: change.threshold for change in ledger.history}
-    last_loss, edges = cache(slam.solver.settings.last_loss), ledger.ids.since()
-    rows_of = {table.code: _rows(slam, table, np.asarray(ids, dtype=np.int64)) for table in graph.tables.values()}
+    last_loss, edges = cache(view.solver.settings.last_loss), ledger.ids.since()
+    rows_of = {table.code: _rows(view, table, np.asarray(ids, dtype=np.int64)) for table in graph.tables.values()}
     residuals, ends = ledger.residuals.tolist(), np.cumsum(ledger.numbers.values).tolist()
-    chi2, _ = slam.solver.chi2_of(edges)
+    chi2, _ = view.solver.chi2_of(edges)
     columns = (ledger.keyframe, ledger.statistic, ledger.numbers, ledger.threshold, ledger.verdict, ledger.reason)
     of_graph = (edges, *graph.places(edges), chi2)
     numbered = zip(*(column.tolist() for column in of_graph), ends, *(c.values.tolist() for c in columns), strict=True)
@@ -155,7 +155,7 @@ def ledger_entries(slam: GraphSlam, ids: Sequence[int]) -> Iterator[Entry]:
             landmark,
             vertices,
             keyframe,
-            newest_ns or stamps_ns[max(keyframe - slam.first_keyframe, 0)],
+            newest_ns or stamps_ns[max(keyframe - view.first_keyframe, 0)],
             measured,
             information,
             tuple(residuals[end - dof : end]),
@@ -169,13 +169,13 @@ def ledger_entries(slam: GraphSlam, ids: Sequence[int]) -> Iterator[Entry]:
         )
 
 
-def _rows(slam: GraphSlam, table: EdgeTable, ids: Index) -> tuple[str, list[Any]]:
+def _rows(view: MapView, table: EdgeTable, ids: Index) -> tuple[str, list[Any]]:
     """The tag of a table, and what an entry has of each row: all rows at once, as one by one is slow."""
-    stamp_of, names = np.zeros(slam.graph.vertex_ids.next, dtype=np.int64), [""] * slam.graph.vertex_ids.next
-    stamp_of[slam.keyframes.ids] = slam.keyframes.stamps_ns
-    for one in slam.bounded.old if slam.bounded else ():
+    stamp_of, names = np.zeros(view.graph.vertex_ids.next, dtype=np.int64), [""] * view.graph.vertex_ids.next
+    stamp_of[view.keyframes.ids] = view.keyframes.stamps_ns
+    for one in view.bounded.old if view.bounded else ():
         stamp_of[one.vertex] = one.stamp_ns
-    for name, mark in slam.landmarks.items():
+    for name, mark in view.landmarks.items():
         names[mark.vertex] = name
     vertices, roots = table.vertices, table.sqrt_information.values
     upper = np.triu_indices(roots.shape[1])

@@ -45,7 +45,7 @@ from graph_slam_ros.runs.journal import (
 from graph_slam_ros.runs.map_file import write_map
 from graph_slam_ros.runs.resource_log import ResourceLog
 from graph_slam_ros.runs.tables import counted, fitted_summary, result_texts, summarize
-from graph_slam_ros.slam import Config, Counters, GraphSlam, Measurement, Update
+from graph_slam_ros.slam import Config, Counters, GraphSlam, MapView, Measurement, Update
 from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.typing import Numbers
 
@@ -207,9 +207,9 @@ class RunRecorder:
 
     def record(self, slam: GraphSlam, update: Update) -> None:
         """Append what an update changed: pose and TF, and the path, the landmarks and the map when that is due."""
-        if not update or not slam.keyframes:
+        if not update or not slam.view.keyframes:
             return
-        self._load.add(len(slam.keyframes), max(0, self.accepted - slam.processed))
+        self._load.add(len(slam.view.keyframes), max(0, self.accepted - slam.processed))
         with self._writing:
             if not self._is_ended:
                 self._record(slam, update)
@@ -217,14 +217,14 @@ class RunRecorder:
     def _record(self, slam: GraphSlam, update: Update) -> None:
         if update.condensed is not None:
             self._left.present().write(list(left_records(update.condensed)))
-        stamp = slam.keyframes[-1].stamp_ns
-        self._write("/tf", results.TF, stamp, results.map_to_odom(slam, stamp))
-        self._write("/tf", results.TF, stamp, results.odom_to_base(slam))
-        self._write("/pose", results.POSE, stamp, results.pose(slam))
-        growth = _JUMPED_GROWTH if slam.correction.distance_m > _JUMP_M else _PATH_GROWTH
-        if len(slam.keyframes) >= self._path_recorded * growth:
-            self._path_recorded = len(slam.keyframes)
-            self._record_map(slam)
+        view, stamp = slam.view, slam.view.keyframes[-1].stamp_ns
+        self._write("/tf", results.TF, stamp, results.map_to_odom(view, stamp))
+        self._write("/tf", results.TF, stamp, results.odom_to_base(view))
+        self._write("/pose", results.POSE, stamp, results.pose(view))
+        growth = _JUMPED_GROWTH if view.correction.distance_m > _JUMP_M else _PATH_GROWTH
+        if len(view.keyframes) >= self._path_recorded * growth:
+            self._path_recorded = len(view.keyframes)
+            self._record_map(view)
         is_due = time.process_time() >= self._map_cpu_s + _TAIL_S and time.monotonic() >= self._map_due_s
         if is_due and update.keyframes and self._mapping is None:  # between keyframes odometry would be lost
             self.flush()  # a map is never ahead of what it came of
@@ -232,7 +232,7 @@ class RunRecorder:
             self._mapping = self._disk.submit(self._write_map, state)
 
     def _snapshot(self, slam: GraphSlam) -> MapSnapshot:
-        return replace(slam.snapshot(), processed=max(0, slam.processed - self._before))
+        return replace(slam.view.snapshot(), processed=max(0, slam.processed - self._before))
 
     def _write_map(self, state: MapSnapshot) -> None:
         """Write the whole map; the next one waits until the disk has had time for it."""
@@ -257,10 +257,10 @@ class RunRecorder:
         try:
             with self._writing:
                 self._refuse_if_ended()
-                if slam.keyframes:
-                    self._record_map(slam)
+                if slam.view.keyframes:
+                    self._record_map(slam.view)
                 self._end_parts()
-                if slam.keyframes:
+                if slam.view.keyframes:
                     self._write_map(self._snapshot(slam))
                 parts: dict[str, Any] = {"recorded": recorded_files(self.folder)}
             parts |= {"unprocessed": max(0, self.accepted - slam.processed), "load": self._load.as_dict()}
@@ -342,10 +342,10 @@ class RunRecorder:
         if failed is not None:
             raise failed
 
-    def _record_map(self, slam: GraphSlam) -> None:
-        stamp = slam.keyframes[-1].stamp_ns
-        self._write("/path", results.PATH, stamp, results.path(slam))
-        self._write("/landmarks", results.LANDMARKS, stamp, results.landmarks(slam))
+    def _record_map(self, view: MapView) -> None:
+        stamp = view.keyframes[-1].stamp_ns
+        self._write("/path", results.PATH, stamp, results.path(view))
+        self._write("/landmarks", results.LANDMARKS, stamp, results.landmarks(view))
 
     def _write(self, topic: str, type_name: str, stamp_ns: int, cdr: bytes) -> None:
         self._results.present().write(topic, type_name, stamp_ns, cdr)
@@ -365,9 +365,9 @@ def save_results(
         check()
         return _put(folder, name, text)
 
-    texts = result_texts(slam, WholePath.of(slam, folder))
+    texts = result_texts(slam.view, WholePath.of(slam.view, folder))
     files = {name: put(name, text) for name, text in texts.items()}
-    fitted = {} if "noise" in summary else fitted_summary(slam)
+    fitted = {} if "noise" in summary else fitted_summary(slam.view)
     contents = {"format": MARK} | summarize(slam) | summary | fitted | {"format": MARK, "files": files}
     put(SUMMARY, json.dumps(contents, indent=2) + "\n")
 

@@ -23,7 +23,7 @@ from graph_slam_ros.runs.journal import read_measurements
 from graph_slam_ros.runs.map_file import read_start
 from graph_slam_ros.runs.outcome import doubts, is_explained, is_undecided, unscaled
 from graph_slam_ros.runs.restore import Stopwatch, config_of, map_of, record_run, stopwatch
-from graph_slam_ros.slam import Config, Control, Counters, GraphSlam
+from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, MapView
 from graph_slam_ros.slam.frontend.ingest_gate import IngestGate
 from graph_slam_ros.warmup import warmup
 
@@ -238,7 +238,7 @@ def replay(
             more=lambda: _checked(columns, counters, bag),
             force=force,
         )
-        warnings += _warnings(slam, summary)
+        warnings += _warnings(slam.view, summary)
     return Replayed(
         slam, summary, summary["losses"], [*bag.warnings, *warnings], tuple(earlier), tuple(inputs.by_topic())
     )
@@ -259,7 +259,7 @@ def _again(
     slam, summary = record_run(
         out, config, measured, losses, state, took=took, recording=recording_of(run), force=force
     )
-    return Replayed(slam, summary, summary["losses"], _warnings(slam, summary))
+    return Replayed(slam, summary, summary["losses"], _warnings(slam.view, summary))
 
 
 def _checked(columns: Collector, counters: Counters, bag: Bag) -> dict[str, Any]:
@@ -268,7 +268,7 @@ def _checked(columns: Collector, counters: Counters, bag: Bag) -> dict[str, Any]
     return {} if found is None else {"check": found.as_dict()}
 
 
-def _warnings(slam: GraphSlam, summary: dict[str, Any]) -> list[str]:
+def _warnings(view: MapView, summary: dict[str, Any]) -> list[str]:
     has_cause = bool(summary.get("uncorrected")) or is_explained(summary)
-    alarms = [] if has_cause else [str(one) for one in slam.alarms if not is_undecided(asdict(one))]
+    alarms = [] if has_cause else [str(one) for one in view.alarms if not is_undecided(asdict(one))]
     return [*doubts(summary), *alarms, *unscaled(summary), *mendable(summary["counters"])]

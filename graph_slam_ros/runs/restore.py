@@ -24,7 +24,7 @@ from graph_slam_ros.runs.journal import IN_A_MAP, INGEST, START, read_measuremen
 from graph_slam_ros.runs.map_file import read_map, read_start
 from graph_slam_ros.runs.recorder import RunRecorder, save_results
 from graph_slam_ros.runs.tables import counters_of, fitted_summary, summarize
-from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Measurement
+from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, MapView, Measurement
 from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.warmup import warmup
 
@@ -105,7 +105,7 @@ def _driven(folder: Path, state: MapSnapshot, losses: list[str], counters: Count
     for measurement in chain([first], rest, [Control("end")]):
         slam.process(measurement)
     counters.update(slam.counters)
-    out = slam.snapshot(folder)
+    out = slam.view.snapshot(folder)
     out.settings = settings | out.settings
     return out
 
@@ -140,7 +140,7 @@ def restored(folder: Path, losses: list[str], counters: Counters | None = None, 
 
 def config_to_go_on(slam: GraphSlam, folder: Path) -> Config:
     """The configuration of a run that goes on in a map that was restored from a folder: it condenses as that did."""
-    return slam.config.changed({"map.condense": run_config(folder).changed(slam.settings).map.condense})
+    return slam.view.config.changed({"map.condense": run_config(folder).changed(slam.settings).map.condense})
 
 
 def restored_and_solved(
@@ -149,8 +149,8 @@ def restored_and_solved(
     """The same with all edges judged. Raises GraphSlamError also if it cannot be solved."""
     slam = restored(folder, losses, counters, whole=whole)
     slam.process(Control("optimize"))
-    if not slam.is_solved:
-        raise RunError(f"{folder}: its map cannot be solved: {slam.failing}")
+    if not slam.view.is_solved:
+        raise RunError(f"{folder}: its map cannot be solved: {slam.view.failing}")
     return slam
 
 
@@ -196,7 +196,7 @@ def record_run(
         slam.counters.update(border())
         summary = summarize(slam, earlier) | took() | {"losses": list(dict.fromkeys(losses))}
         summary |= ({"recording": recording} if recording else {}) | more()
-        summary |= fitted_summary(slam)
+        summary |= fitted_summary(slam.view)
         recorder.save(slam, summary)
     except BaseException as error:
         if recorder is not None and recorder.accepted and not isinstance(error, KeyboardInterrupt):
@@ -238,7 +238,7 @@ def complete(folder: Path) -> Summary:
             before, counters = summary_of(folder), Counters()
             slam = restored_and_solved(folder, losses, counters)
             kept = {key: before[key] for key in _OF_RECORDING if key in before}
-            summary = kept | summarize(slam, counters) | fitted_summary(slam) | took()
+            summary = kept | summarize(slam, counters) | fitted_summary(slam.view) | took()
             summary |= {"losses": losses, "ended": True, "is_incomplete": False}
             save_results(folder, slam, summary)
     except OSError as error:
@@ -246,7 +246,7 @@ def complete(folder: Path) -> Summary:
     return summary
 
 
-def save_copy(slam: GraphSlam, out: Path, folder: Path) -> None:
+def save_copy(view: MapView, out: Path, folder: Path) -> None:
     """Write the map of a pipeline as a run of its own, which others can load. The pipeline goes on unchanged.
 
     Parameters
@@ -260,12 +260,12 @@ def save_copy(slam: GraphSlam, out: Path, folder: Path) -> None:
     """
     if os.path.lexists(out):
         raise RunError(f"{out.name}: is there already, and nothing is replaced: choose another name")
-    if not slam.keyframes:
+    if not view.keyframes:
         raise RunError(f"{out.name}: not written: there is no keyframe, so there is no map")
-    if not slam.is_solved:
-        raise RunError(f"{out.name}: not written: the map cannot be solved: {slam.failing}")
+    if not view.is_solved:
+        raise RunError(f"{out.name}: not written: the map cannot be solved: {view.failing}")
     try:
-        record_run(out, slam.config, (), [], slam.snapshot(folder))
+        record_run(out, view.config, (), [], view.snapshot(folder))
     except Exception:
         discard(out)
         raise
@@ -277,7 +277,7 @@ def freeze(folder: Path, out: Path, *, force: bool = False) -> Summary:
     check_room(out, folder, force=force)
     losses: list[str] = []
     slam = restored_and_solved(folder, losses)
-    state = slam.snapshot(folder)
+    state = slam.view.snapshot(folder)
     state.freeze()
     config = config_to_go_on(slam, folder)
     return record_run(out, config, [Control("optimize")], losses, state, took=took, force=force)[1]

@@ -19,7 +19,7 @@ from graph_slam_ros.runs.condensed_map import WholePath
 from graph_slam_ros.runs.folder import COVARIANCES, GRAPH, LANDMARKS, ODOMETRY, PATH, PATH_ODOMETRY, SIGHTINGS, VERTICES
 from graph_slam_ros.runs.journal import CHANGES, LEDGER
 from graph_slam_ros.runs.ledger_file import changes_text, ledger_text
-from graph_slam_ros.slam import Counters, GraphSlam
+from graph_slam_ros.slam import Counters, GraphSlam, MapView
 from graph_slam_ros.slam.calibration.answers import SIGMAS
 from graph_slam_ros.slam.calibration.parameters import QUANTITIES
 from graph_slam_ros.slam.lifelong.state import BoundedState, seen_from
@@ -34,114 +34,114 @@ _TANGENT = {3: ("x", "y", "theta"), 6: ("x", "y", "z", "rx", "ry", "rz")}
 _POSE = {3: "x,y,theta", 6: "x,y,z,qx,qy,qz,qw"}
 
 
-def result_texts(slam: GraphSlam, whole: WholePath) -> dict[str, str]:
+def result_texts(view: MapView, whole: WholePath) -> dict[str, str]:
     """All results except the summary, by file name."""
-    ids, vertices = numbered(slam)
+    ids, vertices = numbered(view)
     sightings, path = whole.left.sightings, whole.poses()
-    newest = slam.sighting_trajectory().reshape(-1, path.shape[1])
-    seen = np.concatenate((seen_from(slam.space, sightings, path), newest))
-    seen_odometry = np.concatenate((sightings["T_odom"], slam.sighting_odometry().reshape(-1, path.shape[1])))
-    stamps = [*sightings["stamp_ns"].tolist(), *slam.sighting_poses.stamps_ns.tolist()]
+    newest = view.sighting_trajectory().reshape(-1, path.shape[1])
+    seen = np.concatenate((seen_from(view.space, sightings, path), newest))
+    seen_odometry = np.concatenate((sightings["T_odom"], view.sighting_odometry().reshape(-1, path.shape[1])))
+    stamps = [*sightings["stamp_ns"].tolist(), *view.sighting_poses.stamps_ns.tolist()]
     stamps_ns = whole.stamps_ns.tolist()
     return {
-        GRAPH: "\n".join([*graph_lines(graph_file(slam, ids), slam.solver.estimate), ""]),
+        GRAPH: "\n".join([*graph_lines(graph_file(view, ids), view.solver.estimate), ""]),
         VERTICES: vertices,
-        LEDGER: ledger_text(slam, ids),
-        CHANGES: changes_text(slam),
+        LEDGER: ledger_text(view, ids),
+        CHANGES: changes_text(view),
         PATH: tum_text(stamps_ns, path),
         PATH_ODOMETRY: tum_text(stamps_ns, whole.odometry),
-        COVARIANCES: _covariance_table(slam, whole.left.keyframes["stamp_ns"].tolist()),
+        COVARIANCES: _covariance_table(view, whole.left.keyframes["stamp_ns"].tolist()),
         SIGHTINGS: tum_text(stamps, seen),
         ODOMETRY: tum_text(stamps, seen_odometry),
-        LANDMARKS: _landmark_table(slam),
+        LANDMARKS: _landmark_table(view),
     }
 
 
-def fitted_summary(slam: GraphSlam) -> dict[str, Any]:
+def fitted_summary(view: MapView) -> dict[str, Any]:
     """The estimated noise, whether it is applied, and the reason if there is none; and what nothing corrects."""
-    out: dict[str, Any] = {"noise_scale": slam.config.robust.noise_scale, "noise": []}
-    if not slam.is_solved:
+    out: dict[str, Any] = {"noise_scale": view.config.robust.noise_scale, "noise": []}
+    if not view.is_solved:
         return out | {"noise_unknown": "nothing is solved"}
-    if off := slam.uncorrected():
+    if off := view.uncorrected():
         out["uncorrected"] = [one.as_dict() for one in off]
-    if renewed := slam.renewed_ids():
+    if renewed := view.renewed_ids():
         out["renewed_ids"] = str(renewed)
-    if contradicted := slam.contradicted:
+    if contradicted := view.contradicted:
         out["contradicted"] = contradicted
     try:
-        return out | {"noise": [one.as_dict() for one in slam.noise_scale()]}
+        return out | {"noise": [one.as_dict() for one in view.backend.noise_scale()]}
     except GraphSlamError as error:  # what cannot be said of a singular map must not cost its results
         return out | {"noise_unknown": str(error)}
 
 
 def summarize(slam: GraphSlam, earlier: Counters | None = None) -> dict[str, Any]:
     """Return the numbers of a run; ``earlier`` was counted in the same run before this pipeline continued it."""
-    counters = Counters()
+    counters, view = Counters(), slam.view
     for some in (earlier or Counters(), slam.counters):
         counters.update(some)
-    last = slam.report or (slam.solver.evaluate() if slam.is_solved else None)
+    last = view.report or (view.solver.evaluate() if view.is_solved else None)
     optional = {
-        "survey_unseen": sorted(slam.config.survey.keys() - slam.landmarks.keys()),
-        "gyro": slam.gyro and asdict(slam.gyro),
-        "calibrated": slam.found_settings,
-        "association": _association(slam),
-        "contested": _contested(slam),
+        "survey_unseen": sorted(view.config.survey.keys() - view.landmarks.keys()),
+        "gyro": view.gyro and asdict(view.gyro),
+        "calibrated": view.found_settings,
+        "association": _association(view),
+        "contested": _contested(view),
     }
     return (
         {
             "version": __version__,
-            "keyframes": len(slam.keyframes),
-            "landmarks": len(slam.landmarks),
-            "waiting": slam.waiting,
-            "segments": len(slam.segments),
-            "drives": _drives(slam),
-            "sightings": sum(landmark.sightings for landmark in slam.landmarks.values()),
-            "edges": slam.graph.edge_count,
-            "solves": slam.solves,
+            "keyframes": len(view.keyframes),
+            "landmarks": len(view.landmarks),
+            "waiting": view.waiting,
+            "segments": len(view.segments),
+            "drives": _drives(view),
+            "sightings": sum(landmark.sightings for landmark in view.landmarks.values()),
+            "edges": view.graph.edge_count,
+            "solves": view.solves,
             "chi2": last.chi2_final if last else 0.0,
-            "dof": slam.solver.degrees_of_freedom,
+            "dof": view.solver.degrees_of_freedom,
             "cost": last.cost_final if last else 0.0,
             "ended": True,
             "converged": last.converged if last else True,
             "stop": last.stop if last else "nothing_to_do",
-            "failing": slam.failing,
+            "failing": view.failing,
             "classes": {name: asdict(share) for name, share in (last.classes if last else {}).items()},
-            "rivals": [asdict(rival) for rival in slam.backend.rivals],
-            "displacements": slam.displacements,
-            "span_s": (slam.keyframes[-1].stamp_ns - slam.began_ns) * 1e-9 if slam.keyframes else 0.0,
+            "rivals": [asdict(rival) for rival in view.backend.rivals],
+            "displacements": view.displacements,
+            "span_s": (view.keyframes[-1].stamp_ns - view.began_ns) * 1e-9 if view.keyframes else 0.0,
         }
-        | condensed_part(slam)
+        | condensed_part(view)
         | {name: value for name, value in optional.items() if value}
         | account(slam, counters)
     )
 
 
-def condensed_part(slam: GraphSlam) -> dict[str, Any]:
+def condensed_part(view: MapView) -> dict[str, Any]:
     """Return how many keyframes have left the map, or why none does where some should."""
-    settings = slam.config.map
-    if slam.first_keyframe:
-        return {"condensed": slam.first_keyframe}
-    is_long = settings.condense and len(slam.keyframes) > settings.window_keyframes
-    is_doubtful = slam.association_report.get("is_doubtful", False)
-    why = slam.config.not_condensed or ("a doubtful map of landmarks without ids" if is_doubtful else "")
+    settings = view.config.map
+    if view.first_keyframe:
+        return {"condensed": view.first_keyframe}
+    is_long = settings.condense and len(view.keyframes) > settings.window_keyframes
+    is_doubtful = view.association_report.get("is_doubtful", False)
+    why = view.config.not_condensed or ("a doubtful map of landmarks without ids" if is_doubtful else "")
     return {"not_condensed": why} if is_long and why else {}
 
 
-def _contested(slam: GraphSlam) -> dict[str, tuple[int, int]]:
+def _contested(view: MapView) -> dict[str, tuple[int, int]]:
     """Landmarks with ids of which many sightings are not believed, by name: how many, and how many there are."""
-    graph, edges = slam.graph, slam.graph.edges_of("landmarks").tolist()
-    seen = Counter((graph.edge(edge).vertices[-1], slam.ledger.verdict_of(edge) in OUTSIDE) for edge in edges)
-    named = {name: one.vertex for name, one in slam.landmarks.items() if not one.is_unnamed}
+    graph, edges = view.graph, view.graph.edges_of("landmarks").tolist()
+    seen = Counter((graph.edge(edge).vertices[-1], view.ledger.verdict_of(edge) in OUTSIDE) for edge in edges)
+    named = {name: one.vertex for name, one in view.landmarks.items() if not one.is_unnamed}
     counts = {name: (seen[vertex, True], seen[vertex, False] + seen[vertex, True]) for name, vertex in named.items()}
     return {name: of for name, of in counts.items() if of[0] >= max(_FEWEST_OUT, _MANY_OUT * of[1])}
 
 
-def _association(slam: GraphSlam) -> dict[str, Any]:
+def _association(view: MapView) -> dict[str, Any]:
     """The report on sightings without identity, with the setting of each clock that was found."""
-    report, clock = slam.association_report, QUANTITIES["clock"]
+    report, clock = view.association_report, QUANTITIES["clock"]
     for topic, one in report.get("clocks", {}).items():
         is_found = abs(one["value"]) > max(SIGMAS * one["sigma"], clock.least) and one["sigma"] < clock.determined_below
-        value = slam.calibrated(topic, "clock") + one["value"]
+        value = view.calibrated(topic, "clock") + one["value"]
         one["setting"] = f"{topic}.offset_s={value:.4g}" if is_found else ""
     return report
 
@@ -165,16 +165,16 @@ def account(slam: GraphSlam, counters: Counters) -> dict[str, Any]:
     ----------
     counters : those of the pipeline, of what stands before it, and of an earlier part of the run
     """
-    odometries = dict.fromkeys(slam.odometry_sources, "odometry")  # a source need not be an input
-    used_as = odometries | recorded_uses(slam.config)
+    view = slam.view
+    used_as = dict.fromkeys(view.odometry_sources, "odometry") | recorded_uses(view.config)  # sources may be no inputs
     is_of_map = not slam.counters.used  # nothing was measured since: a run that is written from its map
-    newest_drive = 0 if is_of_map or not slam.drives else slam.drives[-1]
-    accepted = _accepted_by_input(slam, newest_drive)
-    for drive, condensed in (slam.bounded.accepted if slam.bounded else {}).items():
+    newest_drive = 0 if is_of_map or not view.drives else view.drives[-1]
+    accepted = _accepted_by_input(view, newest_drive)
+    for drive, condensed in (view.bounded.accepted if view.bounded else {}).items():
         if drive >= newest_drive:
             accepted.update(condensed)
     inputs = {}
-    for name in dict.fromkeys([*slam.config.inputs.names.split(), *counters.used, *accepted]):
+    for name in dict.fromkeys([*view.config.inputs.names.split(), *counters.used, *accepted]):
         if name in counters.received or counters.used[name] or name in accepted:
             used = max(counters.used[name], accepted.get(name, 0) if is_of_map else 0)
             of_input = {"received": counters.received.get(name), "used": used, "believed": accepted.get(name)}
@@ -207,49 +207,49 @@ def counters_of(summary: Mapping[str, Any]) -> Counters:
     return out
 
 
-def accepted_lately(slam: GraphSlam) -> dict[str, tuple[int, int]]:
+def accepted_lately(view: MapView) -> dict[str, tuple[int, int]]:
     """Return by input how many of its edges among the newest of the graph are believed, and how many there are."""
-    accepted, judged = _by_input(slam, slam.graph.edge_ids.since()[-_LATELY:])
+    accepted, judged = _by_input(view, view.graph.edge_ids.since()[-_LATELY:])
     return {name: (accepted[name], times) for name, times in judged.items()}
 
 
-def _accepted_by_input(slam: GraphSlam, first: int) -> Counter[str]:
+def _accepted_by_input(view: MapView, first: int) -> Counter[str]:
     """Accepted edges of landmarks, fixes and closures by input that were judged first at a keyframe or later."""
-    edges, ledger = slam.graph.edge_ids.since(), slam.ledger
-    return _by_input(slam, np.delete(edges, np.flatnonzero(ledger.keyframe.values < first)))[0]
+    edges, ledger = view.graph.edge_ids.since(), view.ledger
+    return _by_input(view, np.delete(edges, np.flatnonzero(ledger.keyframe.values < first)))[0]
 
 
-def _by_input(slam: GraphSlam, edges: Index) -> tuple[Counter[str], Counter[str]]:
+def _by_input(view: MapView, edges: Index) -> tuple[Counter[str], Counter[str]]:
     """Count those edges that are of landmarks, fixes and closures, by input: the accepted ones, and all."""
-    graph, out = slam.graph, slam.ledger.ids.since()[np.isin(slam.ledger.verdict.values, OUTSIDE)]
+    graph, out = view.graph, view.ledger.ids.since()[np.isin(view.ledger.verdict.values, OUTSIDE)]
     judged = edges[graph.has_label(edges, CANDIDATES)]
     accepted, every = (Counter(map(graph.source_of, some.tolist())) for some in (np.setdiff1d(judged, out), judged))
     return accepted, every
 
 
-def _drives(slam: GraphSlam) -> list[dict[str, int]]:
+def _drives(view: MapView) -> list[dict[str, int]]:
     """Return the first row of each drive in ``path.tum`` and in ``sightings.tum``, from 0."""
-    of, state = slam.sighting_poses.ids, slam.bounded or BoundedState()
-    rows = {first: state.sightings + int(np.sum(of < first)) for first in slam.drives if first >= slam.first_keyframe}
-    return [{"keyframe": first, "sighting": rows.get(first, state.begins.get(first, 0))} for first in slam.drives]
+    of, state = view.sighting_poses.ids, view.bounded or BoundedState()
+    rows = {first: state.sightings + int(np.sum(of < first)) for first in view.drives if first >= view.first_keyframe}
+    return [{"keyframe": first, "sighting": rows.get(first, state.begins.get(first, 0))} for first in view.drives]
 
 
-def numbered(slam: GraphSlam) -> tuple[list[int], str]:
+def numbered(view: MapView) -> tuple[list[int], str]:
     """The number of each vertex, at its id, and the table of all vertices.
 
     Poses are numbered from 0 in order of time, landmarks after them, because other tools read odometry from that order.
     A vertex that is not part of the map any more is ``unused``: a deleted landmark.
     """
     names: list[tuple[int, int, str, int | str, str]] = []
-    for one in slam.bounded.old if slam.bounded else ():
+    for one in view.bounded.old if view.bounded else ():
         names.append((one.number, one.vertex, "keyframe", one.stamp_ns, str(one.number)))
-    for k, keyframe in enumerate(slam.keyframes, start=slam.first_keyframe):
+    for k, keyframe in enumerate(view.keyframes, start=view.first_keyframe):
         names.append((k, keyframe.vertex, "keyframe", keyframe.stamp_ns, str(k)))
-    for k, (name, landmark) in enumerate(slam.landmarks.items(), start=len(slam.keyframes)):
+    for k, (name, landmark) in enumerate(view.landmarks.items(), start=len(view.keyframes)):
         names.append((k, landmark.vertex, "landmark", "", name))
-    rest = np.setdiff1d(slam.graph.vertex_ids.since(), [vertex for _, vertex, *_ in names]).tolist()
-    names += [(k, vertex, "unused", "", "") for k, vertex in enumerate(rest, len(slam.keyframes) + len(slam.landmarks))]
-    ids = [0] * slam.graph.vertex_ids.next
+    rest = np.setdiff1d(view.graph.vertex_ids.since(), [vertex for _, vertex, *_ in names]).tolist()
+    names += [(k, vertex, "unused", "", "") for k, vertex in enumerate(rest, len(view.keyframes) + len(view.landmarks))]
+    ids = [0] * view.graph.vertex_ids.next
     rows = ["id,vertex,stamp_ns,name"]
     for file_id, vertex, what, stamp, name in names:
         ids[vertex] = file_id
@@ -257,34 +257,34 @@ def numbered(slam: GraphSlam) -> tuple[list[int], str]:
     return ids, "\n".join(rows) + "\n"
 
 
-def graph_file(slam: GraphSlam, ids: list[int]) -> G2oFile:
+def graph_file(view: MapView, ids: list[int]) -> G2oFile:
     """The graph, with the vertices of a frozen map fixed, and without those that are not part of the map any more."""
-    count = len(slam.keyframes) + len(slam.landmarks)
+    count = len(view.keyframes) + len(view.landmarks)
     absent = frozenset(vertex for vertex, number in enumerate(ids) if number >= count)
-    return G2oFile(slam.graph, ids, slam.solver.held.tolist(), absent=absent)
+    return G2oFile(view.graph, ids, view.solver.held.tolist(), absent=absent)
 
 
-def _covariance_table(slam: GraphSlam, before_ns: Sequence[int]) -> str:
+def _covariance_table(view: MapView, before_ns: Sequence[int]) -> str:
     """The covariances of all keyframes; of those that have left the map, with these stamps, nothing is known."""
-    dof = slam.config.space.dof
+    dof = view.config.space.dof
     unknown = ",".join(["nan"] * (dof * (dof + 1) // 2))
     rows = [f"stamp_ns,{','.join(f'tangent_{a}{b}' for a, b in _upper(_TANGENT[dof]))}"]
     rows += [f"{stamp_ns},{unknown}" for stamp_ns in before_ns]
-    for stamp_ns, covariance in zip(slam.keyframes.stamps_ns, slam.keyframe_covariances(), strict=True):
+    for stamp_ns, covariance in zip(view.keyframes.stamps_ns, view.keyframe_covariances(), strict=True):
         rows.append(f"{stamp_ns},{','.join(map(repr, covariance[np.triu_indices(dof)].tolist()))}")
     return "\n".join(rows) + "\n"
 
 
-def _landmark_table(slam: GraphSlam) -> str:
-    space = slam.config.space
+def _landmark_table(view: MapView) -> str:
+    space = view.config.space
     rows = [f"id,kind,{_POSE[space.dof]},sightings,{','.join(f'cov_{a}{b}' for a, b in _upper(_TANGENT[space.dof]))}"]
-    has_features = any(mark.sort or mark.sized for mark in slam.landmarks.values())
+    has_features = any(mark.sort or mark.sized for mark in view.landmarks.values())
     rows[0] += ",class,size" * has_features
-    for name, value, covariance in results.landmark_estimates(slam):
+    for name, value, covariance in results.landmark_estimates(view):
         kind = "pose" if len(value) == space.pose.size else "point"
         at = [*map(repr, value), *[""] * (space.pose.size - len(value))]
         spread = [f"{covariance[i, j]:.9e}" if j < len(covariance) else "" for i, j in _upper(range(space.dof))]
-        mark = slam.landmarks[name]
+        mark = view.landmarks[name]
         features = [_csv(mark.sort), repr(mark.size) if mark.sized else ""] if has_features else []
         rows.append(",".join([_csv(name), kind, *at, str(mark.sightings), *spread, *features]))
     return "\n".join(rows) + "\n"

@@ -15,6 +15,7 @@ from graph_slam_ros.measurements.types import (
 from graph_slam_ros.slam.frontend.keyframes import Keyframe
 from graph_slam_ros.slam.graph_slam import GraphSlam
 from graph_slam_ros.slam.landmarks.landmark import Landmark
+from graph_slam_ros.slam.map_view import MapView
 from graph_slam_ros.slam.update import Update
 
 __all__ = [
@@ -27,6 +28,7 @@ __all__ = [
     "GraphSlam",
     "Keyframe",
     "Landmark",
+    "MapView",
     "Measurement",
     "Odometry",
     "Sighting",

@@ -7,6 +7,7 @@ function of the configuration and the sequence of accepted measurements, and of 
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING, NoReturn
 
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.errors import GraphSlamError
@@ -50,7 +51,7 @@ from graph_slam_ros.solver import Settings
 from graph_slam_ros.typing import Executor
 
 
-class GraphSlam(MapView):
+class GraphSlam:
     """Online pose-graph SLAM, in the plane or in space, from odometry, landmarks, fixes and loop closures.
 
     Parameters
@@ -63,6 +64,7 @@ class GraphSlam(MapView):
 
     Attributes
     ----------
+    view : what can be read: the path, the landmarks, their covariances, and the health
     counters : counts of what was refused, repaired and used
     settings : parameters that were changed on the way
     processed : the number of processed measurements and control events
@@ -83,20 +85,31 @@ class GraphSlam(MapView):
         solution = Solution(config.space, backend, FailureGuard(backend, counters, landmarks.map))
         frontend = KeyframeFrontend(config, path, backend.noise, counters, backend.solver, start.datum)
         kidnaps = KidnapDetector(config, backend, counters, landmarks.anonymous, start)
-        super().__init__(config, backend, frontend, landmarks, kidnaps, solution)
-        self.settings, self._anchor = dict[str, Value](), Anchor(config, backend)
+        self._backend, self._frontend, self._landmarks = backend, frontend, landmarks
+        self._kidnaps, self._solution, self._anchor = kidnaps, solution, Anchor(config, backend)
+        self.settings = dict[str, Value]()
         self._sink, self._faults = sink or (lambda measurement: None), list[Exception]()
         self._edits = Edits(backend, frontend, landmarks.map, counters)
         landmarks.map.aliases = aliases(backend.edits)
-        self._found_factors = FoundFactors(config, backend, frontend, landmarks, start)
+        found = FoundFactors(config, backend, frontend, landmarks, start)
         first = start.keyframe_count
-        self._trials = TrialFits(config, backend, frontend, landmarks, kidnaps, counters, executor, first)
+        trials = TrialFits(config, backend, frontend, landmarks, kidnaps, counters, executor, first)
+        self.view = MapView(backend, frontend, landmarks, kidnaps, solution, trials, found, self.settings)
         if start.keyframes:
             self._restore(start)
         bounded = BoundedMap(backend, frontend, landmarks, self._anchor, kidnaps, solution, counters)
-        parts = backend, frontend, landmarks, kidnaps, self._trials, self._found_factors, bounded, solution
-        self._policies = Policies(*parts)
-        self._updates, self.processed = UpdateLog(self), 0
+        self._policies = Policies(backend, frontend, landmarks, kidnaps, trials, found, bounded, solution)
+        self._updates, self.processed = UpdateLog(self.view), 0
+
+    def __repr__(self) -> str:
+        return f"GraphSlam({self.view})"
+
+    if not TYPE_CHECKING:  # or type checkers would believe in every name
+
+        def __getattr__(self, name: str) -> NoReturn:
+            """Say where a name is that was here before."""
+            where = f": it is GraphSlam.view.{name}" if hasattr(MapView, name) else ""
+            raise AttributeError(f"GraphSlam has no attribute {name!r}{where}", name=name, obj=self)
 
     def process(self, measurement: Measurement) -> Update:
         """Process one measurement or control event. Returns the changes.
@@ -104,7 +117,7 @@ class GraphSlam(MapView):
         Of several exceptions the first is raised after everything else was processed; the others are counted. Raises
         FormatError for a measurement of other dimensions: then nothing has changed.
         """
-        check_space(measurement, self.space.dimensions)
+        check_space(measurement, self.view.space.dimensions)
         self._sink(measurement)
         self.processed += 1
         self._updates.begin(self._policies.condense())
@@ -147,16 +160,16 @@ class GraphSlam(MapView):
         """Integrate odometry, use the observations that it has reached, and add a keyframe if one is due."""
         frontend = self._frontend
         self._add_assigned(self._landmarks.travel(step))
-        if not self.keyframes:
+        if not self.view.keyframes:
             frontend.begin(step)
-            first = self.keyframes[-1]
-            frontend.covariance = self._anchor.begin(first.vertex, self.config.start_pose or step.T_odom_base)
+            first = self.view.keyframes[-1]
+            frontend.covariance = self._anchor.begin(first.vertex, frontend.config.start_pose or step.T_odom_base)
             self._solution.begin()
             return
         begins_segment = frontend.begins_segment(step)
         self._use_reached(frontend.integrate(step))
         if begins_segment:
-            self._kidnaps.begin_segment(self.graph.vertex_ids.next, step.stamp_ns)
+            self._kidnaps.begin_segment(self.view.graph.vertex_ids.next, step.stamp_ns)
             if frontend.begin_segment(step):
                 self._solve()  # at the pose that was given
             self._solve_if_due()
@@ -190,7 +203,7 @@ class GraphSlam(MapView):
 
     def _add_sightings(self, m: Sightings, where: PoseAtStamp) -> None:
         self._solution.resting += self._frontend.path.rests
-        self.sighting_poses.append(where.keyframe, m.stamp_ns, where.T_keyframe_base)
+        self._frontend.sighting_poses.append(where.keyframe, m.stamp_ns, where.T_keyframe_base)
         self._add_assigned(self._landmarks.identified(m, where))
 
     def _add_assigned(self, sightings: Iterable[Assigned]) -> None:
@@ -203,7 +216,7 @@ class GraphSlam(MapView):
                 self._landmarks.map.add(one.topic, one.name, one.sighting, one.where)
 
     def _add_fix(self, m: Fix, where: PoseAtStamp) -> None:
-        pose_of, compose = self._solution.pose, self.space.group.compose
+        pose_of, compose = self._solution.pose, self.view.space.group.compose
         if self._anchor.align_to_fix(m, compose(pose_of(where.vertex), where.T_keyframe_base)):
             self._note_moved(m.topic)
         self._frontend.edges.fix(m, where, pose_of(where.vertex))
@@ -214,12 +227,12 @@ class GraphSlam(MapView):
         self._solution.guard.note_moved()
 
     def _solve_if_due(self) -> None:
-        if self._solution.is_due(self.config.solve.every_keyframes):
+        if self._solution.is_due(self._frontend.config.solve.every_keyframes):
             self._solve()
 
     def _solve(self, everything: Settings | None = None) -> None:
         """Solve the new part, or everything. After a failure, which is counted, the last estimate stays."""
-        if self.keyframes:
+        if self.view.keyframes:
             covariance = self._solution.solve(lambda: self._policies.solve(everything))
             self._frontend.covariance = self._frontend.covariance if covariance is None else covariance
 
@@ -234,13 +247,13 @@ class GraphSlam(MapView):
                     self._frontend.forget_time(goes_on=event == "clock_step")
             case "optimize":
                 self._add_assigned(self._landmarks.end_scan())
-                self._solve(self.config.solver_settings())
+                self._solve(self._frontend.config.solver_settings())
             case "clear_closures":
                 if self._edits.clear_closures():
                     self._solve()
             case "remove":
                 if self._edits.remove(values):
-                    self._solve(self.config.solver_settings())
+                    self._solve(self._frontend.config.solver_settings())
             case "set":
                 self._set(values)
             case "restart":
@@ -251,38 +264,39 @@ class GraphSlam(MapView):
         self._solution.go_back()
 
     def _set(self, values: dict[str, Value]) -> None:
-        before, self.config = self.config, self.config.changed(values)
-        self._frontend.config = self.config
+        before = self._frontend.config
+        self._frontend.config = config = before.changed(values)
         self.settings |= values
-        self.solver.settings = self.config.solver_settings()
-        if self.config.map.localize != before.map.localize:
-            self._hold_map(self.config.map.localize)
+        self._backend.solver.settings = config.solver_settings()
+        if config.map.localize != before.map.localize:
+            self._hold_map(config.map.localize)
 
     def _hold_map(self, is_held: bool) -> None:
         """Begin or end localization: the map is fixed, and the pose's covariance adds to the next odometry edge."""
         if is_held:
-            self._solve(self.config.solver_settings())
-            self._frontend.held_covariance = self.pose_covariance if self.keyframes else None
-            self.backend.hold_map()
+            self._solve(self._frontend.config.solver_settings())
+            self._frontend.held_covariance = self.view.pose_covariance if self.view.keyframes else None
+            self._backend.hold_map()
         else:
             self._frontend.held_covariance = None
-            self.backend.release_map()
+            self._backend.release_map()
         self._landmarks.map.begins_new = not is_held
         self._solution.guard.note_good()
 
     def _restore(self, start: MapSnapshot) -> None:
         """Solve a loaded map. The robot's pose in it is not known yet."""
-        if self.graph.kind_of(int(start.keyframes.ids[0])) is not self.space.pose:
-            raise GraphSlamError(f"the map is not in {self.space.dimensions} dimensions")
+        if self.view.graph.kind_of(int(start.keyframes.ids[0])) is not self.view.space.pose:
+            raise GraphSlamError(f"the map is not in {self.view.space.dimensions} dimensions")
         path = start.keyframes, start.segments, start.drives, start.sighting_poses
         self._frontend.restore(*path, start.drive if start.continues else {}, start.gyro_bias)
         self._anchor.restore()
         self._landmarks.map.restore(start.landmarks)
         self._landmarks.anonymous.restore()
-        report = self.backend.restore(start.vertices, start.values, start.held if self.config.map.localize else (0, 0))
+        localizes = self._frontend.config.map.localize
+        report = self._backend.restore(start.vertices, start.values, start.held if localizes else (0, 0))
         self._solution.restore(report)
-        (self._frontend.covariance,) = self.solver.marginal([self.keyframes[-1].vertex])
-        if self.config.map.localize:
-            self.backend.hold_map()
-            self.solver.update()
+        (self._frontend.covariance,) = self._backend.solver.marginal([self.view.keyframes[-1].vertex])
+        if localizes:
+            self._backend.hold_map()
+            self._backend.solver.update()
             self._landmarks.map.begins_new = False

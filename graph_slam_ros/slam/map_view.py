@@ -1,4 +1,4 @@
-"""The read-only part of the pipeline: path, landmarks, covariances, statistics and health."""
+"""What can be read of a pipeline: path, landmarks, covariances, statistics and health."""
 
 from collections.abc import Sequence, Set
 from dataclasses import asdict
@@ -18,16 +18,14 @@ from graph_slam_ros.slam.calibration.parameters import AUTO
 from graph_slam_ros.slam.doubt.kidnap_detector import KidnapDetector
 from graph_slam_ros.slam.doubt.record import Alarm, Slip
 from graph_slam_ros.slam.found_factors import FoundFactors
-from graph_slam_ros.slam.frontend.gyro import GyroState, SavedBias
+from graph_slam_ros.slam.frontend.gyro import GyroState
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
 from graph_slam_ros.slam.frontend.keyframes import Keyframe, SightingPose
-from graph_slam_ros.slam.frontend.noise_factors import Key
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.slam.landmarks.landmark import Landmark
 from graph_slam_ros.slam.landmarks.landmark_frontend import LandmarkFrontend
 from graph_slam_ros.slam.landmarks.renewed_ids import LEAST, RenewedIds, renewed_ids
 from graph_slam_ros.slam.lifelong.state import BoundedState
-from graph_slam_ros.slam.noise_scale import NoiseScale
 from graph_slam_ros.slam.robust.ledger import Ledger
 from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.slam.solution import Correction, Solution
@@ -43,32 +41,34 @@ class MapView:
 
     Attributes
     ----------
-    config : the present parameters
     backend : the graph, its solver and the verdicts on its edges
     """
 
     def __init__(
         self,
-        config: Config,
         backend: Backend,
         frontend: KeyframeFrontend,
         landmarks: LandmarkFrontend,
         kidnaps: KidnapDetector,
         solution: Solution,
+        trials: TrialFits,
+        found_factors: FoundFactors,
+        settings: dict[str, Value],
     ) -> None:
-        self.config, self.backend = config, backend
-        self._frontend, self._landmarks = frontend, landmarks
-        self._kidnaps, self._solution = kidnaps, solution
-
-    settings: dict[str, Value]
-    _trials: TrialFits
-    _found_factors: FoundFactors
+        self.backend, self._frontend, self._landmarks = backend, frontend, landmarks
+        self._kidnaps, self._solution, self._settings = kidnaps, solution, settings
+        self._trials, self._found_factors = trials, found_factors
 
     def __repr__(self) -> str:
         counts = f"{len(self.keyframes)} keyframes, {len(self.landmarks)} landmarks, {self.graph.edge_count} edges"
         return f"{type(self).__name__}({counts}, {self.solves} solves)"
 
     # -- the path --------------------------------------------------------------------------------------------------
+
+    @property
+    def config(self) -> Config:
+        """The present parameters."""
+        return self._frontend.config
 
     @property
     def space(self) -> Geometry:
@@ -181,11 +181,6 @@ class MapView:
         return self._solution.T_map_odom if self.keyframes else self.space.identity
 
     @property
-    def newest_odometry_ns(self) -> int | None:
-        """Stamp of the last odometry that was used."""
-        return self._frontend.odometry.newest_ns
-
-    @property
     def odometry_source(self) -> str:
         """The name of the odometry input in use; empty before the first odometry."""
         return self._frontend.source
@@ -206,11 +201,6 @@ class MapView:
         """The present estimate of the gyro; None where no input is one."""
         return self._frontend.gyro.state if self._frontend.gyro else None
 
-    @property
-    def gyro_bias(self) -> SavedBias | None:
-        """The bias of the gyro that a map keeps; None without a gyro, and before the first odometry."""
-        return self._frontend.gyro.saved if self._frontend.gyro else None
-
     # -- landmarks -------------------------------------------------------------------------------------------------
 
     @property
@@ -227,21 +217,6 @@ class MapView:
             if mark.is_tentative
         }
         return {name: mark.reason for name, mark in self._landmarks.map.undetermined.items()} | tentative
-
-    @property
-    def noise_factors(self) -> dict[Key, float]:
-        """The factors by which the configured sigmas of the edges are multiplied, by class, input and part."""
-        return self.backend.noise.factors
-
-    def noise_scale(self) -> list[NoiseScale]:
-        """Estimate the noise from the residuals: a factor of the configured sigmas for each class, input and part.
-
-        Raises
-        ------
-        GaugeError, SingularError
-            As for ``Solver.joint_marginal``.
-        """
-        return self.backend.noise_scale()
 
     def trial_fit(
         self, groups: Sequence[str] = (AUTO,), *, places: bool = False, is_to_correct: bool = False
@@ -380,16 +355,6 @@ class MapView:
         return self._solution.correction
 
     @property
-    def frozen(self) -> int:
-        """Vertices below this id are of a frozen map, and held."""
-        return self.backend.frozen
-
-    @property
-    def held(self) -> tuple[int, int]:
-        """The numbers of vertices and edges that are held while ``map.localize`` is true; zeros otherwise."""
-        return self.backend.held
-
-    @property
     def edits(self) -> list[AppliedEdit]:
         """The edits by hand, in order."""
         return self.backend.edits
@@ -413,17 +378,17 @@ class MapView:
             drives=list(self.drives),
             sighting_poses=self.sighting_poses.since(0),
             landmarks=self._landmarks.map.copies(),
-            frozen=self.frozen,
-            held=self.held,
+            frozen=self.backend.frozen,
+            held=self.backend.held,
             datum=self.datum,
-            settings=dict(self.settings),
+            settings=dict(self._settings),
             displacements=self.displacements,
-            used_ns=self.newest_odometry_ns,
+            used_ns=self._frontend.odometry.newest_ns,
             drive=self._frontend.drive,
-            noise_factors=dict(self.noise_factors),
+            noise_factors=dict(self.backend.noise.factors),
             edits=list(self.edits),
             calibration=self.calibration,
-            gyro_bias=self.gyro_bias,
+            gyro_bias=self._frontend.gyro.saved if self._frontend.gyro else None,
             bounded=bounded.copy() if bounded else None,
             folder=folder,
         )

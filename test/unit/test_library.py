@@ -30,30 +30,32 @@ def test_replay_takes_texts_and_a_run_is_loaded_with_stamps_names_and_covariance
     slam, folder = done
     run = load_run(str(folder))
     path = run.trajectory()
-    assert path.stamps_s == pytest.approx(slam.keyframes.stamps_ns / 1e9, abs=1e-6)
-    assert path.poses[:, :2] == pytest.approx(slam.trajectory()[:, :2])
-    assert run.odometry().poses[:, :2] == pytest.approx(slam.keyframes.poses[:, :2])
-    assert run.covariances == pytest.approx(slam.keyframe_covariances(), nan_ok=True)
-    assert run.landmarks.names == tuple(slam.landmarks)
-    for name, landmark in slam.landmarks.items():
-        at = slam.solver.estimate([landmark.vertex])[0]
+    assert path.stamps_s == pytest.approx(slam.view.keyframes.stamps_ns / 1e9, abs=1e-6)
+    assert path.poses[:, :2] == pytest.approx(slam.view.trajectory()[:, :2])
+    assert run.odometry().poses[:, :2] == pytest.approx(slam.view.keyframes.poses[:, :2])
+    assert run.covariances == pytest.approx(slam.view.keyframe_covariances(), nan_ok=True)
+    assert run.landmarks.names == tuple(slam.view.landmarks)
+    for name, landmark in slam.view.landmarks.items():
+        at = slam.view.solver.estimate([landmark.vertex])[0]
         assert run.landmarks[name] == pytest.approx([*at[:2], 0.0])
-    assert (run.config, run.summary["recording"], run.warnings) == (slam.config, "bag.mcap", [])
-    assert len(run.edges) == slam.graph.edge_count
+    assert (run.config, run.summary["recording"], run.warnings) == (slam.view.config, "bag.mcap", [])
+    assert len(run.edges) == slam.view.graph.edge_count
+    with pytest.raises(AttributeError, match=r"GraphSlam\.view\.trajectory"):
+        slam.trajectory()  # as scripts had it before
 
 
 def test_an_older_drive_in_a_newer_map_is_read_by_keyframe(tmp_path):
     start = map_of(small_drive.run(tmp_path / "map", start_s=9000), [])
     slam, _ = record_run(tmp_path / "run", small_drive.config(), small_drive.drive(seed=1), [], start)
-    stamps_s = slam.keyframes.stamps_ns / 1e9
+    stamps_s = slam.view.keyframes.stamps_ns / 1e9
     assert np.diff(stamps_s).min() < -3000.0
     run = load_run(tmp_path / "run")
     pages = keyframe_paths(tmp_path / "run", SavedGraph(tmp_path / "run", []))
     for path in (run.trajectory(), pages[0]):
         assert path.stamps_s == pytest.approx(stamps_s, abs=1e-6)
-        assert path.poses[:, :2] == pytest.approx(slam.trajectory()[:, :2])
+        assert path.poses[:, :2] == pytest.approx(slam.view.trajectory()[:, :2])
     for path in (run.odometry(), pages[1]):
-        assert path.poses[:, :2] == pytest.approx(slam.keyframes.poses[:, :2])
+        assert path.poses[:, :2] == pytest.approx(slam.view.keyframes.poses[:, :2])
 
 
 def test_what_is_no_run_or_has_no_results_is_refused(done, tmp_path):

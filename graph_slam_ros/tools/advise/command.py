@@ -63,7 +63,7 @@ def _best(some: "list[Advice]", count: int) -> "list[Advice]":
 def _weak_text(weakness: "Weakness", advisor: "Advisor") -> Iterator[str]:
     run = weakness.run
     yield (
-        f"{len(run.slam.keyframes)} keyframes, {len(run.landmarks)} landmarks; all sigmas are relative to what holds"
+        f"{len(run.view.keyframes)} keyframes, {len(run.landmarks)} landmarks; all sigmas are relative to what holds"
         f" the map: {weakness.held_by()}"
     )
     yield "weakest"
@@ -122,7 +122,7 @@ def _as_dict(
 ) -> dict[str, Any]:
     stretches, unseen = [*weakness.stretches()], weakness.longest_unseen()
     return {
-        "keyframes": len(weakness.run.slam.keyframes),
+        "keyframes": len(weakness.run.view.keyframes),
         "landmarks": len(weakness.run.landmarks),
         "held_by": weakness.held_by(),
         "weakest": [

@@ -143,8 +143,8 @@ def _edges(out: Contents, saved: SavedGraph) -> dict[str, Any]:
         changes.setdefault(str(change.edge), []).append(change_text(change))
     ends = [[_end(saved, e, vertex) for vertex in e.vertices] for e in entries]
     names = list(dict.fromkeys(name for several in ends for name in several if isinstance(name, str) and name))
-    places = {name: len(saved.slam.keyframes) + k for k, name in enumerate(names)}
-    is_condensed = saved.slam.bounded is not None
+    places = {name: len(saved.view.keyframes) + k for k, name in enumerate(names)}
+    is_condensed = saved.view.bounded is not None
 
     def coded(values: list[str]) -> dict[str, Any]:
         several = list(dict.fromkeys(values))
@@ -231,7 +231,7 @@ def _landmark_texts(saved: SavedGraph, names: list[str]) -> list[str]:
 def _charts(out: Contents, saved: SavedGraph) -> dict[str, Any]:
     """Histograms: verdicts over the drive, and chi2 of each class against what it should be."""
     judged = [e for e in saved.entries if e.verdict]
-    count = max(1, len(saved.slam.keyframes))
+    count = max(1, len(saved.view.keyframes))
     edges = np.linspace(0, count, min(_BINS, count) + 1)
     over = {}
     for one in Verdict:

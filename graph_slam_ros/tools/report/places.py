@@ -75,7 +75,7 @@ def _known_landmarks(run: Path, saved: SavedGraph) -> LandmarkTable:
         return landmarks
     points, n = np.zeros((len(saved.landmarks), 3)), saved.space.dimensions
     for point, vertex in zip(points, saved.landmarks.values(), strict=True):
-        point[:n] = saved.slam.solver.estimate([vertex])[0][:n]
+        point[:n] = saved.view.solver.estimate([vertex])[0][:n]
     return LandmarkTable(tuple(saved.landmarks), points, np.full((len(points), 3, 3), np.nan))
 
 

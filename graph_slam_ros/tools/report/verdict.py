@@ -65,7 +65,7 @@ def verdict(
     out = [f"{'Do not rely on this map yet' if short else 'Use this map with care'}: {first}" if first else fine]
     out += [f"Also: {one}" for one in others[:_MOST_REASONS] if one]
     out += [f"map -> odom jumped by up to {jump[1]:.2f} m, at keyframe {jump[0]}."] if jump else []
-    size = f"{len(saved.slam.keyframes)} keyframes and {summary.get('landmarks', len(saved.landmarks))} landmarks"
+    size = f"{len(saved.view.keyframes)} keyframes and {summary.get('landmarks', len(saved.landmarks))} landmarks"
     if scores is not None:
         size += f", position error {scores.estimate.position_m['rmse']:.3f} m (RMSE, {scores.scored['frame']})"
         if scores.odometry is not None:
@@ -112,7 +112,7 @@ def _judged(saved: SavedGraph) -> str:
     out = [e for e in judged if not e.is_in]
     weak = sum(e.verdict.name == "DOWN_WEIGHTED" for e in judged)
     low = f"; {weak} more have little weight" if weak else ""
-    condensed = sum(sum(of.values()) for of in saved.slam.bounded.accepted.values()) if saved.slam.bounded else 0
+    condensed = sum(sum(of.values()) for of in saved.view.bounded.accepted.values()) if saved.view.bounded else 0
     low += f"; {condensed} more were believed, and are condensed" if condensed else ""
     if not out:
         return f"All {len(judged)} measurements are in the map{low}."

@@ -20,7 +20,7 @@ from graph_slam_ros.graph.losses import NAMES
 from graph_slam_ros.maps.edit import FORMAT, VERSION, Edited, Rehearsal, edit, plan_of, source_hash
 from graph_slam_ros.measurements.edits import ACTIONS
 from graph_slam_ros.runs.folder import summary_of
-from graph_slam_ros.slam.map_view import MapView
+from graph_slam_ros.slam import MapView
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.tools.report.contents import Contents
 from graph_slam_ros.tools.report.packing import shown
@@ -101,7 +101,7 @@ class Workbench:
             return {
                 "is_solved": report.converged,
                 "places": self._places(solver),
-                "landmarks": _landmarks(run.slam, solver),
+                "landmarks": _landmarks(run.view, solver),
                 "chi2": [moved.before.chi2_final, moved.after.chi2_final],
                 "cost": [moved.before.cost_final, moved.after.cost_final],
                 "final_m": moved.final[0],
@@ -114,12 +114,12 @@ class Workbench:
         self._check_source(plan.source)
         with self._lock:
             if self._rehearsal is None:
-                self._rehearsal = Rehearsal(self._saved.slam, self._run)
-            slam, edited = self._rehearsal.attempt(plan.edits)
+                self._rehearsal = Rehearsal(self._saved.view, self._run)
+            view, edited = self._rehearsal.attempt(plan.edits)
             return {
-                "places": self._places(slam.solver),
-                "landmarks": _landmarks(slam, slam.solver),
-                "changes": self._changes(slam, edited),
+                "places": self._places(view.solver),
+                "landmarks": _landmarks(view, view.solver),
+                "changes": self._changes(view, edited),
                 **_effect(edited),
             }
 
@@ -154,10 +154,10 @@ class Workbench:
         columns: list[list[float]] = np.round(places, _DECIMALS).tolist()
         return columns
 
-    def _changes(self, slam: MapView, edited: Edited) -> list[list[Any]]:
+    def _changes(self, view: MapView, edited: Edited) -> list[list[Any]]:
         """Edges whose verdict is another afterwards, and which were not named by an edit: id, before and after."""
         by_hand = {edge for one in edited.edits for edge in one.edges}
-        ledger, out = slam.ledger, []
+        ledger, out = view.ledger, []
         for row, e in enumerate(self._saved.entries):
             after = ledger.verdict_of(row)
             if after is not e.verdict and e.edge not in by_hand:
@@ -185,11 +185,11 @@ def _verdict(out: Path) -> str:
         return ""
 
 
-def _landmarks(slam: MapView, solver: Solver) -> dict[str, list[Any]]:
+def _landmarks(view: MapView, solver: Solver) -> dict[str, list[Any]]:
     """Positions of the landmarks that are in a solution, by name: as the page shows names."""
     inside = set(solver.vertices.tolist())
-    marks = {name: mark.vertex for name, mark in slam.landmarks.items() if mark.vertex in inside}
-    n = slam.space.dimensions
+    marks = {name: mark.vertex for name, mark in view.landmarks.items() if mark.vertex in inside}
+    n = view.space.dimensions
     return {
         shown(name): np.round(place[:n], _DECIMALS).tolist()
         for name, vertex in marks.items()

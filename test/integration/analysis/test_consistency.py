@@ -125,9 +125,9 @@ def test_a_flight_is_scored_in_space_in_words_and_in_plain_values(tmp_path):
     assert plain["position_m"]["rmse"] < 0.05 < plain["odometry"]["position_m"]["rmse"]
     assert plain["map_m"]["rmse"] < 0.1
     assert plain["consistency"]["poses"]["dof"] == 6
-    assert plain["consistency"]["poses"]["n"] == len(slam.keyframes) - 1
+    assert plain["consistency"]["poses"]["n"] == len(slam.view.keyframes) - 1
     assert plain["consistency"]["landmarks"]["dof"] == 3
-    assert plain["consistency"]["landmarks"]["n"] == len(slam.landmarks)
+    assert plain["consistency"]["landmarks"]["n"] == len(slam.view.landmarks)
     assert {one["label"] for one in plain["consistency"]["noise"]} == {"odometry", "landmarks"}
     text = str(scores)
     assert all(word in text for word in ("angle [deg]", "NEES", "last pose", "chi2/dof", "times as large"))
@@ -138,7 +138,7 @@ def test_a_flight_is_scored_in_space_in_words_and_in_plain_values(tmp_path):
     assert (held.last_pose, held.poses, held.landmarks) == (None, None, None), "the map is held elsewhere"
     assert "left out: fixes hold the map" in str(held)
     assert read_covariances(tmp_path / "run" / "covariances.csv") == pytest.approx(
-        np.array(slam.solver.marginal(slam.keyframes.ids))
+        np.array(slam.view.solver.marginal(slam.view.keyframes.ids))
     )
 
 

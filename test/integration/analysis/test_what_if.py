@@ -48,11 +48,11 @@ def test_what_is_taken_out_and_let_in_is_as_if_it_had_been_decided_so(replayed, 
     slam, entries = replayed[2].slam, saved.entries
     closure = next(e.edge for e in entries if e.label == "closures" and e.is_in)
     solver = saved.solve(without=[closure])
-    slam.solver.set_weight(closure, 0.0)
-    slam.solver.optimize()
-    assert solver.estimate(saved.keyframes) == pytest.approx(slam.trajectory(), abs=1e-5)
-    slam.solver.set_weight(closure, 1.0)
-    slam.solver.optimize()
+    slam.view.solver.set_weight(closure, 0.0)
+    slam.view.solver.optimize()
+    assert solver.estimate(saved.keyframes) == pytest.approx(slam.view.trajectory(), abs=1e-5)
+    slam.view.solver.set_weight(closure, 1.0)
+    slam.view.solver.optimize()
     back = saved.moved(saved.solve(let_in=[closure]))
     assert back.after.classes["believed"].edges == 1
     assert back.most[1] < 0.01

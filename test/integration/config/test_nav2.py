@@ -52,14 +52,14 @@ def test_a_drive_lies_on_the_plan_without_being_aligned(config, tmp_path):
     recording = simulate("warehouse", 7)
     write_bag(recording, tmp_path / "drive.mcap")
     done = replay(tmp_path / "drive.mcap", tmp_path / "run", config)
-    at = np.searchsorted(recording.stamps_ns, done.slam.keyframes.stamps_ns)
-    off = done.slam.trajectory() - recording.T_world_base[at]
+    at = np.searchsorted(recording.stamps_ns, done.slam.view.keyframes.stamps_ns)
+    off = done.slam.view.trajectory() - recording.T_world_base[at]
     assert np.hypot(off[:, 0], off[:, 1]).max() < 0.15
     assert np.abs(se2.wrap(off[:, 2])).max() < 0.05
     surveyed = done.summary["classes"]["surveyed"]
     assert surveyed["edges"] == len(config.survey)
     assert surveyed["chi2"] < 40.0  # of 20 numbers
-    assert len(done.slam.landmarks) > 2 * len(config.survey)
-    for name, landmark in done.slam.landmarks.items():
-        found = done.slam.solver.estimate([landmark.vertex])[0]
+    assert len(done.slam.view.landmarks) > 2 * len(config.survey)
+    for name, landmark in done.slam.view.landmarks.items():
+        found = done.slam.view.solver.estimate([landmark.vertex])[0]
         assert found[:2] == pytest.approx(recording.landmarks[name][:2], abs=0.15), "surveyed or not"

@@ -56,7 +56,7 @@ def positions(folder):
 
 def test_what_was_condensed_counts_as_believed(run, tmp_path):
     folder, slam, summary = run
-    assert slam.first_keyframe > 200
+    assert slam.view.first_keyframe > 200
     told = summary["inputs"]["landmarks"]
     seen = sum(len(m.sightings) for m in measurements(hall(SEED, KEYFRAMES)) if isinstance(m, Sightings))
     assert (told["used"], told["believed"]) == (seen, seen - 1), "one is an outlier"
@@ -91,9 +91,9 @@ def test_an_edge_of_the_window_is_taken_out_and_the_path_stays_whole(run, saved,
     ]
     edited = edit_run(folder, [one | BASE for one in edits], tmp_path / "edited")
     assert edited.losses == []
-    assert slam.first_keyframe <= edited.moved[0] < KEYFRAMES
+    assert slam.view.first_keyframe <= edited.moved[0] < KEYFRAMES
     (fit,) = edited.by_hand
-    assert fit.edge == slam.graph.edge_ids.of(slam.graph.edge_count)
+    assert fit.edge == slam.view.graph.edge_ids.of(slam.view.graph.edge_count)
     after = SavedGraph(tmp_path / "edited", [])
     assert not after.edge(edge).is_in
     assert after.edge(fit.edge).is_in
@@ -160,8 +160,8 @@ def test_merged_they_are_as_good_as_two_maps_of_all_keyframes(tmp_path, names):
     assert (done.losses, done.left_out, done.summary["keyframes"]) == ([], {}, BOTH)
     assert done.summary["inputs"]["landmarks"]["believed"] == done.summary["inputs"]["landmarks"]["used"]
     saved = SavedGraph(tmp_path / "both", [])
-    assert saved.slam.first_keyframe > BOTH - 200, "the merged map condenses as the first did"
-    assert len(saved.slam.drives) == 2
+    assert saved.view.first_keyframe > BOTH - 200, "the merged map condenses as the first did"
+    assert len(saved.view.drives) == 2
     with pytest.raises(GraphSlamError, match="are of the same drive"):
         merge(tmp_path / "both", drive(names[0]), tmp_path / "again")
     frozen = freeze(tmp_path / "both", tmp_path / "frozen")
@@ -194,15 +194,15 @@ def test_a_drive_in_a_frozen_map_is_condensed_and_the_map_stays(tmp_path, name, 
     before = SavedGraph(tmp_path / "site", [])
     settings, measured = bounded(map_localize=localize), read_measurements(drive("b"), [])
     slam, _ = record_run(tmp_path / "on", settings, measured, [], read_map(tmp_path / "site"))
-    assert slam.first_keyframe > FIRST + 50
+    assert slam.view.first_keyframe > FIRST + 50
     true = np.array([pose[:2] for pose in hall(SEED, BOTH).poses[FIRST:BOTH]])
     assert rms(positions(tmp_path / "on")[FIRST:], true) < 0.1
     after = SavedGraph(tmp_path / "on", [])
     for one in set(before.numbers) & set(after.numbers):
         if one < FIRST:
-            here, there = (x.slam.solver.estimate([x.vertices[one]]) for x in (before, after))
+            here, there = (x.view.solver.estimate([x.vertices[one]]) for x in (before, after))
             assert here == pytest.approx(there, abs=1e-12)
-    counting = {one.edge for cell in after.slam.bounded.places.values() for one in cell}
+    counting = {one.edge for cell in after.view.bounded.places.values() for one in cell}
     assert set(after.graph.edges_of(PLACES).tolist()) == counting, "a place that another took over is gone"
     recover(tmp_path / "on", tmp_path / "recovered")
     assert "nan" not in (tmp_path / "recovered" / "covariances.csv").read_text().splitlines()[-1]

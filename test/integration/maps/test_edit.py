@@ -52,37 +52,37 @@ def run(tmp_path_factory):
 def applied(run, folder, *edits):
     """A map before and after a plan."""
     edit_run(run, edits, folder / "new")
-    return restored(run, []), restored(folder / "new", [])
+    return restored(run, []).view, restored(folder / "new", []).view
 
 
 def test_a_closure_by_hand_is_in_and_pulls_as_its_sigmas_say(either, tmp_path):
-    before = restored(either, [])
+    before = restored(either, []).view
     space = before.space
     true = space.group.between(*map(tuple, before.trajectory()[[2, 21]]))
     pose = list(map(float, space.normalized((true[0] + 0.05, *true[1:]))))
     ends = {"from_keyframe": 2, "to_keyframe": "1021", "sigma_m": 1e-3, "sigma_rad": 1e-3}
-    before, slam = applied(either, tmp_path, one("add_closure", **ends, pose=pose))
-    now = space.group.between(*map(tuple, slam.trajectory()[[2, 21]]))
+    before, after = applied(either, tmp_path, one("add_closure", **ends, pose=pose))
+    now = space.group.between(*map(tuple, after.trajectory()[[2, 21]]))
     assert abs(now[0] - pose[0]) < 0.01
-    (edge,) = slam.edits[0].added
-    made = slam.graph.edge(edge)
+    (edge,) = after.edits[0].added
+    made = after.graph.edge(edge)
     assert (made.label, made.source, made.weight) == ("by_hand", "by hand", 1.0)
     assert np.linalg.inv(made.sqrt_information.T @ made.sqrt_information) == pytest.approx(1e-6 * np.eye(space.dof))
-    assert (slam.ledger.verdict_of(edge), slam.ledger.reason.values[edge]) == (Verdict.NOT_EVALUATED, Reason.BY_HAND)
+    assert (after.ledger.verdict_of(edge), after.ledger.reason.values[edge]) == (Verdict.NOT_EVALUATED, Reason.BY_HAND)
 
 
 def test_a_map_is_moved_rigidly_and_stays_there(either, tmp_path):
-    is_flat = restored(either, []).space.dimensions == 2
+    is_flat = restored(either, []).view.space.dimensions == 2
     pose = [10.0, 20.0, 1.0] if is_flat else [10.0, 20.0, 3.0, 0.0, 0.6, 0.0, 0.8]
-    before, slam = applied(either, tmp_path, one("move_anchor", keyframe=5, pose=pose, **EXACT))
-    group = slam.space.group
-    assert np.allclose(group.local(tuple(slam.trajectory()[5]), tuple(pose)), 0.0, atol=1e-6)
+    before, after = applied(either, tmp_path, one("move_anchor", keyframe=5, pose=pose, **EXACT))
+    group = after.space.group
+    assert np.allclose(group.local(tuple(after.trajectory()[5]), tuple(pose)), 0.0, atol=1e-6)
     for a, b in ((0, 5), (5, 20)):
-        then, now = (group.between(*map(tuple, of.trajectory()[[a, b]])) for of in (before, slam))
+        then, now = (group.between(*map(tuple, of.trajectory()[[a, b]])) for of in (before, after))
         assert np.allclose(group.local(now, then), 0.0, atol=1e-5)
-    covariances = slam.keyframe_covariances()
+    covariances = after.keyframe_covariances()
     assert np.trace(covariances[5]) < 1e-5 < np.trace(covariances[0])
-    assert slam.solver.evaluate().chi2_final == pytest.approx(before.solver.evaluate().chi2_final, rel=1e-6)
+    assert after.solver.evaluate().chi2_final == pytest.approx(before.solver.evaluate().chi2_final, rel=1e-6)
     (tmp_path / "map").mkdir()
     _, moved = applied(either, tmp_path / "map", one("move_map", pose=pose, sigma_m=0.3, sigma_rad=0.1))
     assert np.allclose(group.local(tuple(moved.trajectory()[0]), tuple(pose)), 0.0, atol=1e-5)
@@ -92,23 +92,23 @@ def test_a_map_is_moved_rigidly_and_stays_there(either, tmp_path):
 
 
 def test_a_landmark_is_split_by_edges_or_by_keyframes_and_merged_again(either, tmp_path):
-    before = restored(either, [])
+    before = restored(either, []).view
     vertex, sightings = before.landmarks["0"].vertex, before.graph.edges_of("landmarks").tolist()
     edges = [e for e in sightings if before.graph.edge(e).vertices[1] == vertex]
     late = [e for e in edges if before.graph.edge(e).vertices[0] >= before.keyframes.ids[12]]
     assert 0 < len(late) < len(edges)
-    _, slam = applied(either, tmp_path, split(**{"from": 12, "until": "1023"}))
-    assert restored(either, []).trajectory().tolist() == before.trajectory().tolist()
-    assert edit_run(either, [split(edges=late)]).edits[0].edges == slam.edits[0].edges == tuple(late)
-    a, b = slam.landmarks["0"], slam.landmarks["dock <2>"]
+    _, after = applied(either, tmp_path, split(**{"from": 12, "until": "1023"}))
+    assert restored(either, []).view.trajectory().tolist() == before.trajectory().tolist()
+    assert edit_run(either, [split(edges=late)]).edits[0].edges == after.edits[0].edges == tuple(late)
+    a, b = after.landmarks["0"], after.landmarks["dock <2>"]
     assert (a.sightings, b.sightings) == (len(edges) - len(late), len(late))
     assert a.last_seen_ns < b.first_seen_ns <= b.last_seen_ns == before.landmarks["0"].last_seen_ns
-    for new, old in zip(slam.edits[0].added, late, strict=True):
-        assert slam.graph.edge(new).measured.tolist() == before.graph.edge(old).measured.tolist()
-        assert slam.graph.edge(new).vertices == (before.graph.edge(old).vertices[0], b.vertex)
-        assert slam.ledger.is_inside(new)
+    for new, old in zip(after.edits[0].added, late, strict=True):
+        assert after.graph.edge(new).measured.tolist() == before.graph.edge(old).measured.tolist()
+        assert after.graph.edge(new).vertices == (before.graph.edge(old).vertices[0], b.vertex)
+        assert after.ledger.is_inside(new)
     edit_run(tmp_path / "new", [one("merge_landmarks", landmark="dock <2>", into="0")], tmp_path / "merged")
-    merged = restored(tmp_path / "merged", [])
+    merged = restored(tmp_path / "merged", []).view
     assert merged.trajectory() == pytest.approx(before.trajectory(), abs=1e-4)
     assert merged.landmarks.keys() == before.landmarks.keys()
     assert merged.landmarks["0"].sightings == len(edges)
@@ -116,9 +116,9 @@ def test_a_landmark_is_split_by_edges_or_by_keyframes_and_merged_again(either, t
 
 def all_edits(run):
     """One of each kind, in one plan."""
-    slam = restored(run, [])
-    edges = slam.graph.edges_of("landmarks").tolist()
-    pose = list(map(float, slam.space.group.between(*map(tuple, slam.trajectory()[[2, 21]]))))
+    view = restored(run, []).view
+    edges = view.graph.edges_of("landmarks").tolist()
+    pose = list(map(float, view.space.group.between(*map(tuple, view.trajectory()[[2, 21]]))))
     return [
         one("remove_edge", edge=edges[7]),
         one("let_in_edge", edge=edges[9]),
@@ -141,11 +141,11 @@ def edited(run, tmp_path_factory):
 
 
 def test_an_edited_run_has_one_edit_of_each_kind_and_is_repeated_to_the_same_bytes(run, edited, tmp_path):
-    before, slam = restored(run, []), restored(edited, [])
-    assert {done.edit.do for done in slam.edits} == ACTIONS.keys()
-    assert slam.landmarks.keys() == {*before.landmarks, "gate", "dock <2>"} - {"3", "4", "6"}
-    assert load_run(edited).trajectory().poses[:, :2] == pytest.approx(slam.trajectory()[:, :2], abs=1e-6)
-    assert set(load_run(edited).landmarks.names) == slam.landmarks.keys()
+    before, after = restored(run, []).view, restored(edited, []).view
+    assert {done.edit.do for done in after.edits} == ACTIONS.keys()
+    assert after.landmarks.keys() == {*before.landmarks, "gate", "dock <2>"} - {"3", "4", "6"}
+    assert load_run(edited).trajectory().poses[:, :2] == pytest.approx(after.trajectory()[:, :2], abs=1e-6)
+    assert set(load_run(edited).landmarks.names) == after.landmarks.keys()
     replay(edited, tmp_path / "again")
     assert contents(edited) == contents(tmp_path / "again")
 
@@ -155,7 +155,7 @@ def test_an_edit_is_undone_with_the_plan_that_an_edited_run_keeps(run, edited, t
     plan["edits"] = [values for values in plan["edits"] if values["do"] == "remove_landmark"]
     (tmp_path / "edits.json").write_text(json.dumps(plan))
     assert command(run, "--plan", tmp_path / "edits.json", "--out", tmp_path / "new") == 0
-    assert restored(tmp_path / "new", []).landmarks.keys() == restored(run, []).landmarks.keys() - {"3"}
+    assert restored(tmp_path / "new", []).view.landmarks.keys() == restored(run, []).view.landmarks.keys() - {"3"}
 
 
 def test_commands_on_maps_know_the_edits(run, edited, capsys, tmp_path):
@@ -164,11 +164,11 @@ def test_commands_on_maps_know_the_edits(run, edited, capsys, tmp_path):
         code = cli.main(list(map(str, arguments)))
         return code, " ".join(capsys.readouterr().out.split())
 
-    slam, saved = restored(edited, []), SavedGraph(edited, [])
+    view, saved = restored(edited, []).view, SavedGraph(edited, [])
     code, difference = said("map", "diff", run, edited)
     explained = said("explain", edited)[1]
     assert code == 4
-    for done in slam.edits:
+    for done in view.edits:
         assert f"by hand: {done.text}" in explained
         assert f"by hand only in B: {done.text}" in difference
         for edge in (*done.edges[:1], *done.added[:1]):
@@ -178,20 +178,20 @@ def test_commands_on_maps_know_the_edits(run, edited, capsys, tmp_path):
     file = read_g2o(tmp_path / "graph.g2o").graph
     assert file.edge_count == sum(e.is_in for e in saved.entries)
     poses = [file.vertex(v).initial for v in range(file.vertex_count) if file.kind_of(v).size == 3]
-    assert np.array(poses)[:, :2] == pytest.approx(slam.trajectory()[:, :2], abs=1e-4)
+    assert np.array(poses)[:, :2] == pytest.approx(view.trajectory()[:, :2], abs=1e-4)
     last = max(e.edge for e in saved.entries if e.is_in and e.verdict)
     chi2 = [solver.evaluate().chi2_final for solver in (saved.solver, saved.solve([last]))]
     assert "chi2 {:.4f} -> {:.4f}".format(*chi2) in said("explain", edited, "--without", last)[1]
     page = read_contents(edited)
     assert page.losses == []
-    assert page.data["tables"]["edits"] == [[e.edit.name, e.edit.text, *WHO.values()] for e in slam.edits]
-    assert page.data["edges"]["by_hand"].keys() == {str(k) for e in slam.edits for k in (*e.edges, *e.added)}
+    assert page.data["tables"]["edits"] == [[e.edit.name, e.edit.text, *WHO.values()] for e in view.edits]
+    assert page.data["edges"]["by_hand"].keys() == {str(k) for e in view.edits for k in (*e.edges, *e.added)}
     other = small_drive.run(tmp_path / "other", start_s=5000, seed=1, first=6)
     for command in (["map", "freeze", edited], ["map", "merge", edited, other], ["map", "merge", other, edited]):
         out = tmp_path / f"{command[1]}_{len(list(tmp_path.iterdir()))}"
         assert said(*command, "--out", out)[0] == 0
         state = map_of(out, [])
-        assert [done.edit.name for done in state.edits] == [done.edit.name for done in slam.edits]
+        assert [done.edit.name for done in state.edits] == [done.edit.name for done in view.edits]
         reasons = {state.ledger.reason.values[edge] for done in state.edits for edge in done.edges}
         assert reasons <= {Reason.BY_HAND, Reason.WITHDRAWN}
 
@@ -199,24 +199,21 @@ def test_commands_on_maps_know_the_edits(run, edited, capsys, tmp_path):
 def test_a_robot_that_goes_on_in_the_map_keeps_every_edit(edited, tmp_path):
     start = map_of(edited, [])
     decided = [edge for edge, reason in enumerate(start.ledger.reason.values) if reason == Reason.BY_HAND]
-    verdicts, edits, seen = (
-        start.ledger.verdict.values[decided].tolist(),
-        list(start.edits),
-        start.landmarks["5"].sightings,
-    )
+    verdicts, edits = start.ledger.verdict.values[decided].tolist(), list(start.edits)
+    seen = start.landmarks["5"].sightings
     assert {Verdict(verdict) for verdict in verdicts} == {Verdict.REJECTED, Verdict.NOT_EVALUATED}
     drive = small_drive.drive(start_s=9000, seed=2, first=3)
-    slam, _ = record_run(tmp_path / "on", small_drive.config(), drive, [], start)
-    assert slam.edits == edits
-    assert slam.ledger.verdict.values[decided].tolist() == verdicts
-    assert {slam.ledger.reason.values[edge] for edge in decided} == {Reason.BY_HAND}
-    assert len(slam.drives) == 2
-    assert "4" not in slam.landmarks and slam.landmarks["5"].sightings > seen, "its identity is that of another"
-    assert {"3", "6", "gate"} <= slam.landmarks.keys(), "what was removed or renamed begins anew"
-    last = tuple(slam.trajectory()[-1])
+    view = record_run(tmp_path / "on", small_drive.config(), drive, [], start)[0].view
+    assert view.edits == edits
+    assert view.ledger.verdict.values[decided].tolist() == verdicts
+    assert {view.ledger.reason.values[edge] for edge in decided} == {Reason.BY_HAND}
+    assert len(view.drives) == 2
+    assert "4" not in view.landmarks and view.landmarks["5"].sightings > seen, "its identity is that of another"
+    assert {"3", "6", "gate"} <= view.landmarks.keys(), "what was removed or renamed begins anew"
+    last = tuple(view.trajectory()[-1])
     replay(tmp_path / "on", tmp_path / "again")
     assert contents(tmp_path / "on") == contents(tmp_path / "again")
-    assert tuple(restored(tmp_path / "on", []).trajectory()[-1]) == pytest.approx(last, abs=1e-6)
+    assert tuple(restored(tmp_path / "on", []).view.trajectory()[-1]) == pytest.approx(last, abs=1e-6)
 
 
 MOVE = {"pose": [0.0] * 6 + [1.0], **EXACT}
@@ -277,8 +274,8 @@ def test_an_edge_in_by_hand_that_all_else_contradicts_is_warned_of(run, tmp_path
     (fit,) = (done := edit_run(run, [one("add_closure", **CLOSURE, pose=[3.0, 3.0, 0.0])])).by_hand
     assert fit.innovation > 10 * fit.limit
     assert f"edge {fit.edge} is in by hand, and all else contradicts it" in done.warnings[0]
-    slam = restored(run, [])
-    true = list(map(float, slam.space.group.between(*map(tuple, slam.trajectory()[[2, 21]]))))
+    view = restored(run, []).view
+    true = list(map(float, view.space.group.between(*map(tuple, view.trajectory()[[2, 21]]))))
     good = edit_run(run, [one("add_closure", **CLOSURE, pose=true)])
     assert good.warnings == []
     assert good.by_hand[0].innovation < 1.0

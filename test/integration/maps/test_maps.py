@@ -127,14 +127,14 @@ def test_export_as_messages_has_every_pose_at_its_stamp(cut_off, tmp_path):
     assert run("map", "export", folder, "--out", tmp_path / "map.mcap") == 3, "its end is missing"
     bag = open_bag(tmp_path / "map.mcap")
     counts = {name: topic.count for name, topic in bag.topics.items()}
-    assert counts == {"/pose": len(slam.keyframes), "/path": 1, "/landmarks": 1, "/landmarks_estimate": 1}
+    assert counts == {"/pose": len(slam.view.keyframes), "/path": 1, "/landmarks": 1, "/landmarks_estimate": 1}
     read = [(m.log_ns, typestore().deserialize_cdr(m.cdr, bag.topics["/pose"].type)) for m in bag.messages({"/pose"})]
-    assert [stamp for stamp, _ in read] == slam.keyframes.stamps_ns.tolist()
+    assert [stamp for stamp, _ in read] == slam.view.keyframes.stamps_ns.tolist()
     at = [(m.pose.pose.position.x, m.pose.pose.position.y) for _, m in read]
-    assert np.array(at) == pytest.approx(slam.trajectory()[:, :2], abs=1e-6)
+    assert np.array(at) == pytest.approx(slam.view.trajectory()[:, :2], abs=1e-6)
     variance = [m.pose.covariance[35] for _, m in read]
-    assert variance == pytest.approx(slam.keyframe_covariances()[:, 2, 2], rel=1e-3)
-    assert len(next(iter(bag.messages({"/landmarks_estimate"}))).cdr) > 100 * len(slam.landmarks)
+    assert variance == pytest.approx(slam.view.keyframe_covariances()[:, 2, 2], rel=1e-3)
+    assert len(next(iter(bag.messages({"/landmarks_estimate"}))).cdr) > 100 * len(slam.view.landmarks)
 
 
 def test_export_refuses_in_one_line(made, tmp_path, capsys):
@@ -172,8 +172,8 @@ def test_diff_of_a_run_and_what_it_repeats_to_is_nothing(made, tmp_path, capsys)
 
 
 def test_diff_finds_the_landmark_that_was_moved_and_what_is_only_in_one(made, tmp_path, capsys):
-    slam = restored(made("first"), [])
-    other, gone, *_ = sorted(slam.landmarks, key=lambda name: -slam.landmarks[name].sightings)
+    landmarks = restored(made("first"), []).view.landmarks
+    other, gone, *_ = sorted(landmarks, key=lambda name: -landmarks[name].sightings)
     without = seeing(seeing(drive_past(0), farther(other, 0.4)), lambda several: [s for s in several if s.id != gone])
     ended(tmp_path / "other", without)
     code, found = told(capsys, "map", "diff", made("first"), tmp_path / "other", "--json")
@@ -190,18 +190,18 @@ def test_diff_finds_the_landmark_that_was_moved_and_what_is_only_in_one(made, tm
     assert out.splitlines()[-2] == "they differ"
 
 
-def rmse(slam, *recordings):
+def rmse(view, *recordings):
     """Of the positions of keyframes, a segment of each recording, once they are laid on the truth as one."""
-    n, truth = slam.space.dimensions, []
-    for one, stamps in zip(recordings, np.split(slam.keyframes.stamps_ns, slam.segments[1:]), strict=True):
+    n, truth = view.space.dimensions, []
+    for one, stamps in zip(recordings, np.split(view.keyframes.stamps_ns, view.segments[1:]), strict=True):
         truth.append(one.T_world_base[np.searchsorted(one.stamps_ns, stamps), :n])
-    truth, at = np.concatenate(truth), slam.trajectory()[:, :n]
-    moved = slam.space.group.act(laid_on(slam.space, truth, at), tuple(at.T))
+    truth, at = np.concatenate(truth), view.trajectory()[:, :n]
+    moved = view.space.group.act(laid_on(view.space, truth, at), tuple(at.T))
     return np.sqrt(np.mean(np.sum((np.stack(moved, axis=-1) - truth) ** 2, axis=1)))
 
 
 def test_merge_lays_the_second_session_on_the_first(made):
-    one, two, both = (restored(made(name), []) for name in ("first", "second", "merged"))
+    one, two, both = (restored(made(name), []).view for name in ("first", "second", "merged"))
     count = len(one.keyframes)
     assert len(both.keyframes) == count + len(two.keyframes)
     assert both.segments == [*one.segments, *(count + k for k in two.segments)]
@@ -221,18 +221,18 @@ def test_a_merged_run_repeats_recovers_and_is_gone_on_in(made, tmp_path):
     assert run("recover", merged, "--out", tmp_path / "recovered") == 0
     assert run("map", "diff", merged, tmp_path / "recovered") == run("explain", merged) == 0
     slam = ended(tmp_path / "third", drive_past(0), source=merged)
-    assert set(slam.landmarks) == set(map_of(merged, []).landmarks)
-    assert rmse(slam, recording(0), recording(5), recording(0)) < 0.15
+    assert set(slam.view.landmarks) == set(map_of(merged, []).landmarks)
+    assert rmse(slam.view, recording(0), recording(5), recording(0)) < 0.15
 
 
 def test_merge_leaves_out_what_has_moved_and_tells(made, tmp_path, capsys):
-    one = restored(made("first"), [])
+    one = restored(made("first"), []).view
     name = max(one.landmarks, key=lambda name: one.landmarks[name].sightings)
     ended(tmp_path / "other", seeing(drive_past(5), farther(name, 1.5)), ELSEWHERE)
     assert run("map", "merge", made("first"), tmp_path / "other", "--out", tmp_path / "out") == 0
     (warning,) = capsys.readouterr().err.splitlines()
     assert f"landmark {name} is 1." in warning
-    both = restored(tmp_path / "out", [])
+    both = restored(tmp_path / "out", []).view
     _, found = told(capsys, "map", "diff", made("first"), tmp_path / "out", "--json")
     (same,) = (mark for mark in found["moved"] if mark["landmark"] == name)
     assert same["distance_m"] < 0.1, "it is where the first session saw it"
@@ -248,14 +248,14 @@ def test_merge_in_space(tmp_path):
     flights, runs = [simulate("flight", seed, laps=1) for seed in (0, 3)], (tmp_path / "0", tmp_path / "1")
     one, two = (ended(out, measurements(flight), FLIGHT) for out, flight in zip(runs, flights, strict=True))
     assert run("map", "merge", *runs, "--out", tmp_path / "out") == 0
-    both = restored(tmp_path / "out", [])
-    assert both.graph.vertex_count < one.graph.vertex_count + two.graph.vertex_count
-    assert rmse(both, *flights) < 0.05 + 0.5 * (rmse(one, flights[0]) + rmse(two, flights[1]))
+    both = restored(tmp_path / "out", []).view
+    assert both.graph.vertex_count < one.view.graph.vertex_count + two.view.graph.vertex_count
+    assert rmse(both, *flights) < 0.05 + 0.5 * (rmse(one.view, flights[0]) + rmse(two.view, flights[1]))
 
 
 def test_merge_and_diff_refuse_in_one_line(made, tmp_path, capsys):
     first, world = made("first"), drive_past(0)
-    names = [*restored(first, []).landmarks]
+    names = [*restored(first, []).view.landmarks]
     later = [replace(m, stamp_ns=m.stamp_ns + 86_400_000_000_000) for m in world]
     swapped = dict(zip(names, reversed(names), strict=True))
 
@@ -286,33 +286,33 @@ def test_merge_and_diff_refuse_in_one_line(made, tmp_path, capsys):
     assert run("map", "diff", tmp_path / "flight", tmp_path / "flight") == 0
 
 
-def assert_untouched(slam, source):
+def assert_untouched(view, source):
     """Not a bit of a frozen map has changed, neither value nor verdict."""
     state = read_map(source)
     count, edges = len(state.values), state.ledger.final
     assert state.frozen == state.graph.vertex_count > 50
     assert edges == state.graph.edge_count
-    assert slam.solver.values[:count].tobytes() == state.values.tobytes()
+    assert view.solver.values[:count].tobytes() == state.values.tobytes()
     for column in ("verdict", "reason", "statistic", "threshold"):
-        ours, theirs = (getattr(ledger, column).values[:edges].tolist() for ledger in (slam.ledger, state.ledger))
+        ours, theirs = (getattr(ledger, column).values[:edges].tolist() for ledger in (view.ledger, state.ledger))
         assert ours == theirs, column
 
 
 def test_freeze_changes_nothing_and_is_a_run_like_any_other(made, tmp_path):
     first, frozen = made("first"), made("frozen")
     assert run("map", "diff", first, frozen) == run("explain", frozen) == 0
-    of_first, of_frozen = (restored(folder, []).solver.degrees_of_freedom for folder in (first, frozen))
+    of_first, of_frozen = (restored(folder, []).view.solver.degrees_of_freedom for folder in (first, frozen))
     assert of_first == of_frozen > 0, "what is held was estimated before"
     assert not np.genfromtxt(frozen / "covariances.csv", delimiter=",", skip_header=1)[:, 1:].any(), "it is held"
     assert_repeated(frozen, tmp_path / "again")
 
 
 def test_in_a_frozen_map_the_robot_is_located_as_well_as_in_one_that_goes_on(made, tmp_path):
-    slam = restored(made("in_frozen"), [])
-    assert_untouched(slam, made("frozen"))
-    assert len(slam.keyframes) > 1.5 * slam.segments[1], "the drive is in the graph"
+    view = restored(made("in_frozen"), []).view
+    assert_untouched(view, made("frozen"))
+    assert len(view.keyframes) > 1.5 * view.segments[1], "the drive is in the graph"
     open_map = ended(tmp_path / "open", drive_past(5), source=made("first"))
-    assert rmse(slam, recording(0), recording(5)) < 1.5 * rmse(open_map, recording(0), recording(5)) + 0.02
+    assert rmse(view, recording(0), recording(5)) < 1.5 * rmse(open_map.view, recording(0), recording(5)) + 0.02
     assert_repeated(made("in_frozen"), tmp_path / "again")
 
 
@@ -322,15 +322,15 @@ def test_new_landmarks_are_added_to_a_frozen_map(tmp_path):
     ended(tmp_path / "half", seeing(drive_past(0), lambda several: [s for s in several if s.id in known]))
     assert run("map", "freeze", tmp_path / "half", "--out", tmp_path / "frozen") == 0
     slam = ended(tmp_path / "run", drive_past(5), source=tmp_path / "frozen")
-    assert_untouched(slam, tmp_path / "frozen")
-    assert set(slam.landmarks) == set(names)
+    assert_untouched(slam.view, tmp_path / "frozen")
+    assert set(slam.view.landmarks) == set(names)
     truth = recording(5).landmarks
-    at = np.array([slam.solver.estimate([slam.landmarks[name].vertex])[0][:2] for name in names])
+    at = np.array([slam.view.solver.estimate([slam.view.landmarks[name].vertex])[0][:2] for name in names])
     true = np.array([truth[name][:2] for name in names])
-    moved = np.stack(slam.space.group.act(laid_on(slam.space, true, at), tuple(at.T)), axis=-1)
+    moved = np.stack(slam.view.space.group.act(laid_on(slam.view.space, true, at), tuple(at.T)), axis=-1)
     assert np.sqrt(np.mean(np.sum((moved - true) ** 2, axis=1))) < 0.2
     new = [name for name in names if name not in known]
-    assert all(np.trace(slam.solver.marginal([slam.landmarks[name].vertex])[0]) > 0.0 for name in new)
+    assert all(np.trace(slam.view.solver.marginal([slam.view.landmarks[name].vertex])[0]) > 0.0 for name in new)
 
 
 def test_a_run_in_a_frozen_map_that_was_cut_off_is_taken_up_with_it_frozen(made, tmp_path):
@@ -339,6 +339,6 @@ def test_a_run_in_a_frozen_map_that_was_cut_off_is_taken_up_with_it_frozen(made,
     start = map_of(tmp_path / "run", [])
     assert start.frozen < start.graph.vertex_count
     slam = ended(tmp_path / "more", world[len(world) // 2 :], source=tmp_path / "run")
-    assert_untouched(slam, frozen)
+    assert_untouched(slam.view, frozen)
     assert run("map", "merge", frozen, made("second"), "--out", tmp_path / "merged") == 0
-    assert_untouched(restored(tmp_path / "merged", []), frozen)
+    assert_untouched(restored(tmp_path / "merged", []).view, frozen)

@@ -19,8 +19,8 @@ def test_the_page_leads_to_every_wrong_closure_and_the_edited_map_is_as_good_as_
     clean, before = planted_closures.error_m(tmp_path / "clean"), planted_closures.error_m(run)
     believed, others = wrong[:4], wrong[4:]
     assert len(wrong) == 12
-    slam = restored(run, [])
-    assert [slam.ledger.is_inside(edge) for edge in wrong] == [True] * 4 + [False] * 8
+    ledger = restored(run, []).view.ledger
+    assert [ledger.is_inside(edge) for edge in wrong] == [True] * 4 + [False] * 8
     assert before > 2 * clean
     page = read_contents(run).data
     assert set(others) == set(page["charts"]["worst"][:8])

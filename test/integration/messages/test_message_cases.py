@@ -277,9 +277,9 @@ def test_A24_what_is_told_twice_is_used_once_and_makes_nothing_surer():
     told = [at(0), seen(0), at(1, 0.5), seen(1, where=(1.5, 1.0))]
     once, twice = run(pipeline(), *told), run(pipeline(), *told, told[1], told[3], told[1], at(2, 1.0))
     assert twice.counters.as_dict() == {"/landmarks": {"duplicate": 3}}
-    assert len(twice.graph.tables[LANDMARK_POSITION]) == len(once.graph.tables[LANDMARK_POSITION]) == 2
+    assert len(twice.view.graph.tables[LANDMARK_POSITION]) == len(once.view.graph.tables[LANDMARK_POSITION]) == 2
     again = run(pipeline(), *told, seen(1, where=(1.5, 1.1)))
-    assert len(again.graph.tables[LANDMARK_POSITION]) == 3, "another value is another measurement"
+    assert len(again.view.graph.tables[LANDMARK_POSITION]) == 3, "another value is another measurement"
 
 
 def test_A25_repeats_that_agree_are_merged_by_their_information_and_those_that_disagree_are_all_dropped():
@@ -399,20 +399,20 @@ def test_A22_A23_A30_long_ranges_are_used_angles_wrapped_and_of_100_000_landmark
 def test_A26_A27_odometry_that_jumps_or_begins_anew_begins_a_segment_and_a_robot_that_drives_home_or_turns_does_not():
     slam = run(pipeline(), *(at(0.1 * k, 0.1 * k + (9.0 if k > 5 else 0.0)) for k in range(12)))
     assert slam.counters.as_dict() == {"odometry": {"jump": 1}}
-    assert slam.segments == [0, 6]
-    edges = slam.graph.tables[RELATIVE_POSE]
+    assert slam.view.segments == [0, 6]
+    edges = slam.view.graph.tables[RELATIVE_POSE]
     assert edges.measured.values[5].tolist() == [0.0, 0.0, 0.0], "not of 9.1 m"
     sigmas = np.sqrt(np.diag(np.linalg.inv(edges.sqrt_information.values[5].T @ edges.sqrt_information.values[5])))
     assert sigmas == pytest.approx([10.0, 10.0, 3.0])
-    assert np.diff(slam.trajectory()[:, 0]).max() < 0.2, "the path goes on where it was"
+    assert np.diff(slam.view.trajectory()[:, 0]).max() < 0.2, "the path goes on where it was"
     there = [at(0.1 * k, 0.02 * abs(30 - k)) for k in range(61)]
     slam = run(pipeline(), *there, *(at(7.0 + 0.1 * k, 0.6, 0.05 * abs(20 - k)) for k in range(41)))
     assert slam.counters.as_dict() == {}
-    assert slam.segments == [0]
+    assert slam.view.segments == [0]
     slam = run(pipeline(), *(at(0.1 * k, 0.02 * k, 0.01 * k) for k in range(31)), at(3.1), at(3.2, 0.02))
     assert slam.counters.as_dict() == {"odometry": {"reset_to_zero": 1}}
-    assert slam.segments == [0, 31]
-    assert slam.trajectory()[-1] == pytest.approx(slam.trajectory()[30] + [0.02, 0.0, 0.0], abs=0.01)
+    assert slam.view.segments == [0, 31]
+    assert slam.view.trajectory()[-1] == pytest.approx(slam.view.trajectory()[30] + [0.02, 0.0, 0.0], abs=0.01)
 
 
 def test_A33_a_closure_with_itself_within_one_keyframe_or_of_nothing_is_refused_and_the_others_of_its_message_are_not():
@@ -428,4 +428,4 @@ def test_A33_a_closure_with_itself_within_one_keyframe_or_of_nothing_is_refused_
     slam, covariance = GraphSlam(Config.from_mapping({"ordering.window_s": 0.0})), tuple(np.diag([0.01] * 3).ravel())
     run(slam, at(0), at(0.1, 0.01), Closure(STAMP_NS + S // 10, STAMP_NS + S // 20, "/loops", (0.0,) * 3, covariance))
     assert slam.counters.as_dict() == {"/loops": {"within_one_keyframe": 1}}
-    assert not slam.graph.edges_of("closures").size
+    assert not slam.view.graph.edges_of("closures").size

@@ -38,9 +38,9 @@ def test_the_example_of_the_page_reads_a_recording_with_its_definition_or_withou
     for defined in (True, False):
         file = recording(tmp_path / f"{defined}.mcap", defined=defined)
         done = replay(file, tmp_path / f"run_{defined}", Config.from_mapping(SETTINGS))
-        assert set(done.slam.landmarks) == set(BEACONS), defined
+        assert set(done.slam.view.landmarks) == set(BEACONS), defined
         for name, at in BEACONS.items():
-            found = done.slam.solver.estimate([done.slam.landmarks[name].vertex])[0]
+            found = done.slam.view.solver.estimate([done.slam.view.landmarks[name].vertex])[0]
             assert found == pytest.approx(at, abs=0.1), (defined, name)
 
 
@@ -108,7 +108,7 @@ def test_what_a_plugin_fails_at_is_counted_and_named_once_and_other_inputs_go_on
     install(f"{imports}def read(source, m):\n    {body}\nBEACONS = InputType({{'landmarks': read}})\n")
     done = replay(recording(tmp_path / "a.mcap"), tmp_path / "run", Config.from_mapping(SETTINGS))
     assert done.summary["counters"]["radio"]["plugin_failed"] == 150
-    assert len(done.slam.keyframes) > 20
+    assert len(done.slam.view.keyframes) > 20
     (told,) = [text for text in done.warnings if "plugin my_beacons" in text]
     assert re.match(rf"radio: plugin my_beacons:BEACONS of my-beacons 1.0:? {line}", told)
     assert "\n" not in told

@@ -41,7 +41,7 @@ def test_all_inputs_of_a_recording_are_used_together(drive, tmp_path):
     assert counts == {"detections": 150, "gps": 15, "tags": 150}
     assert not slam.counters["detections", "frame_unknown"]
     for name, there in LANDMARKS.items():
-        assert slam.solver.estimate([slam.landmarks[name].vertex])[0, :2] == pytest.approx(there, abs=0.05)
+        assert slam.view.solver.estimate([slam.view.landmarks[name].vertex])[0, :2] == pytest.approx(there, abs=0.05)
 
 
 def test_an_input_without_its_topic_takes_the_only_one_of_its_type_and_else_is_refused(drive):

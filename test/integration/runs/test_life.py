@@ -43,7 +43,7 @@ class Life:
         self.session = Session(self.config, Counters(), self.heard, lambda *said: None)
 
     def heard(self, slam, _update):
-        self.acknowledged = slam.keyframes.stamps_ns.tolist()
+        self.acknowledged = slam.view.keyframes.stamps_ns.tolist()
 
     # -- what may happen ---------------------------------------------------------------------------------------------
 
@@ -94,11 +94,11 @@ class Life:
         self.acknowledged = []
 
     def load(self):
-        known = self.session.slam.keyframes.stamps_ns.tolist()
+        known = self.session.slam.view.keyframes.stamps_ns.tolist()
         if known:
             self.session.reset()
             self.session.load("")
-            self.acknowledged = self.session.slam.keyframes.stamps_ns.tolist()
+            self.acknowledged = self.session.slam.view.keyframes.stamps_ns.tolist()
             assert self.acknowledged[: len(known)] == known
 
     def killed(self):
@@ -109,7 +109,7 @@ class Life:
         if told:
             assert self.session.was_cut_off
             self.session.load("")
-        kept = self.session.slam.keyframes.stamps_ns.tolist()
+        kept = self.session.slam.view.keyframes.stamps_ns.tolist()
         assert kept[: len(told)] == told, "an acknowledged keyframe is lost"
         self.acknowledged = kept
 
@@ -122,19 +122,19 @@ class Life:
         (what,) = self.rng.choices(list(HAPPENS), list(HAPPENS.values()))
         getattr(self, what)()
         slam = self.session.slam
-        assert np.isfinite(slam.trajectory()).all(), what
+        assert np.isfinite(slam.view.trajectory()).all(), what
         assert not self.session.failures, (what, slam.counters.as_dict())
-        assert len(slam.ledger) <= slam.graph.edge_count
+        assert len(slam.view.ledger) <= slam.view.graph.edge_count
         return what
 
     def end(self):
         """It is saved, its map is what it was, and a replay gives its bytes."""
         self.session.finish()
-        if not self.session.slam.keyframes:
+        if not self.session.slam.view.keyframes:
             return
         state = read_map(self.folder)
-        assert state.keyframes.stamps_ns.tolist() == self.session.slam.keyframes.stamps_ns.tolist()
-        assert state.ledger.verdict.values.tolist() == self.session.slam.ledger.verdict.values.tolist()
+        assert state.keyframes.stamps_ns.tolist() == self.session.slam.view.keyframes.stamps_ns.tolist()
+        assert state.ledger.verdict.values.tolist() == self.session.slam.view.ledger.verdict.values.tolist()
         again = self.folder.with_name("again")
         replay(self.folder, again)
         for name in RESULTS:

@@ -24,10 +24,10 @@ GOLDEN = ROOT / "test" / "golden"
 WORLDS = {"points": ({}, {}), "unnamed": ({"landmarks.association": "joint"}, {"sensor": "position"})}
 
 
-def told(slam):
+def told(view):
     """All that was measured and judged."""
-    columns = [column.values.tobytes() for table in slam.graph.tables.values() for column in table.columns]
-    return columns, slam.ledger.verdict.values.tolist(), list(slam.keyframes), list(slam.sighting_poses), slam.segments
+    columns = [column.values.tobytes() for table in view.graph.tables.values() for column in table.columns]
+    return columns, view.ledger.verdict.values.tolist(), list(view.keyframes), list(view.sighting_poses), view.segments
 
 
 @pytest.fixture(scope="module", params=[*WORLDS, "flight"])
@@ -45,14 +45,14 @@ def run(request, tmp_path_factory):
 
 def test_what_is_read_back_is_what_there_was_and_solved_to_where_it_was(run, tmp_path):
     folder, slam = run
-    write_map(tmp_path / "map.mcap", slam.snapshot())
+    write_map(tmp_path / "map.mcap", slam.view.snapshot())
     state = read_map(tmp_path)
     write_map(tmp_path / "again.mcap", state)
     assert (tmp_path / "again.mcap").read_bytes() == (tmp_path / "map.mcap").read_bytes()
     again = GraphSlam(run_config(folder), start=state)
-    assert told(again) == told(slam)
-    assert again.trajectory() == pytest.approx(slam.trajectory(), abs=1e-6)
-    assert again.report.cost_final == pytest.approx(slam.report.cost_final, rel=1e-9)
+    assert told(again.view) == told(slam.view)
+    assert again.view.trajectory() == pytest.approx(slam.view.trajectory(), abs=1e-6)
+    assert again.view.report.cost_final == pytest.approx(slam.view.report.cost_final, rel=1e-9)
 
 
 @pytest.mark.parametrize("world", ["warehouse", "flight"])
@@ -82,8 +82,8 @@ def test_whenever_it_is_killed_the_newest_map_and_the_rest_of_the_journal_end_wh
         shutil.copy(file, tmp_path / "run")
         again = GraphSlam(config, start=map_of(tmp_path / "run", []))
         again.process(Control("optimize"))
-        assert told(again) == told(slam), file
-        assert np.abs(again.trajectory() - slam.trajectory())[:, :2].max() < 1e-6
+        assert told(again.view) == told(slam.view), file
+        assert np.abs(again.view.trajectory() - slam.view.trajectory())[:, :2].max() < 1e-6
 
 
 def test_a_run_that_goes_on_in_a_map_knows_its_landmarks_and_is_repeated_byte_by_byte(tmp_path):
@@ -92,18 +92,18 @@ def test_a_run_that_goes_on_in_a_map_knows_its_landmarks_and_is_repeated_byte_by
     start = map_of(tmp_path / "before", [])
     recorder = RunRecorder(tmp_path / "after", Config(), start=start)
     slam = GraphSlam(Config(), recorder.sink, start=start)
-    assert len(slam.keyframes) == len(before.keyframes)
+    assert len(slam.view.keyframes) == len(before.view.keyframes)
     for m in [*world, Control("end"), Control("optimize")]:  # the same drive once more: where it is, landmarks tell
         recorder.record(slam, slam.process(m))
     recorder.save(slam)
     recorder.close()
-    assert slam.segments == slam.drives == [0, len(before.keyframes)]
-    assert read_map(tmp_path / "after").drives == slam.drives
+    assert slam.view.segments == slam.view.drives == [0, len(before.view.keyframes)]
+    assert read_map(tmp_path / "after").drives == slam.view.drives
     (first, second) = json.loads((tmp_path / "after" / "run.json").read_text())["drives"]
     assert first == {"keyframe": 0, "sighting": 0}
-    assert second == {"keyframe": len(before.keyframes), "sighting": len(before.sighting_poses)}
-    assert set(slam.landmarks) == set(before.landmarks)
-    first, second = np.split(slam.trajectory(), [len(before.keyframes)])
+    assert second == {"keyframe": len(before.view.keyframes), "sighting": len(before.view.sighting_poses)}
+    assert set(slam.view.landmarks) == set(before.view.landmarks)
+    first, second = np.split(slam.view.trajectory(), [len(before.view.keyframes)])
     assert np.hypot(*(first - second[: len(first)])[:, :2].T).max() < 0.2
     again = replay(tmp_path / "after", tmp_path / "again")
     assert again.losses == []
@@ -115,7 +115,7 @@ def test_a_run_that_goes_on_in_a_map_knows_its_landmarks_and_is_repeated_byte_by
 def test_a_map_that_is_damaged_anywhere_is_repeated_from_the_journal_with_a_word(run, tmp_path):
     folder, slam = run
     shutil.copytree(folder, tmp_path / "run")
-    write_map(tmp_path / "run" / "map.mcap", slam.snapshot())
+    write_map(tmp_path / "run" / "map.mcap", slam.view.snapshot())
     whole = (tmp_path / "run" / "map.mcap").read_bytes()
     for k, at in enumerate(np.linspace(len(whole) // 50, len(whole) // 2, 7, dtype=int).tolist()):
         damaged = whole[:at] if k % 2 else whole[:at] + bytes([whole[at] ^ 255]) + whole[at + 1 :]
@@ -124,14 +124,14 @@ def test_a_map_that_is_damaged_anywhere_is_repeated_from_the_journal_with_a_word
             read_map(tmp_path / "run")
     state = map_of(tmp_path / "run", losses := [])
     assert any("map.mcap" in loss and "is repeated from its journal" in loss for loss in losses)
-    assert list(state.keyframes) == list(slam.keyframes)
+    assert list(state.keyframes) == list(slam.view.keyframes)
 
 
 @pytest.mark.parametrize("run", ["unnamed"], indirect=True)
 def test_what_is_no_map_is_refused_by_what_is_wrong(run, tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(map_file, "VERSION", 99)
-        write_map(tmp_path / "map.mcap", run[1].snapshot())
+        write_map(tmp_path / "map.mcap", run[1].view.snapshot())
     with pytest.raises(FormatError, match=r"map\.mcap: .*its version is 99; this program knows"):
         read_map(tmp_path)
 
@@ -161,8 +161,8 @@ def test_the_map_of_a_run_that_is_kept_loads(tmp_path):
     (folder,) = GOLDEN.iterdir()
     summary = json.loads((folder / "run.json").read_text())
     again = GraphSlam(run_config(folder), start=read_map(folder))
-    assert len(again.keyframes) == summary["keyframes"]
-    assert len(again.landmarks) == summary["landmarks"]
-    assert again.report.chi2_final == pytest.approx(summary["chi2"], rel=1e-6)
+    assert len(again.view.keyframes) == summary["keyframes"]
+    assert len(again.view.landmarks) == summary["landmarks"]
+    assert again.view.report.chi2_final == pytest.approx(summary["chi2"], rel=1e-6)
     repeated = replay(folder, tmp_path / "again").summary  # keyframes are where this version makes them
     assert (repeated["landmarks"], repeated["sightings"]) == (summary["landmarks"], summary["sightings"])

@@ -43,14 +43,14 @@ def test_fixes_from_another_datum_are_refused_also_in_a_map_that_was_taken_up(tm
     first.abandon()
     again = session(tmp_path / "run")
     again.load("")
-    assert again.slam.datum == MUNICH
-    fixes = len(again.slam.graph.edges_of("fixes"))
+    assert again.slam.view.datum == MUNICH
+    fixes = len(again.slam.view.graph.edges_of("fixes"))
     later = WORLD[60:90]
     for m in later:
         again.ingest([m, Fix(m.stamp_ns, "gps", "position", (0.0, 0.0), (1.0, 0.0, 0.0, 1.0), (), OSLO)])
     again.finish()
     assert again.slam.counters["gps", "other_datum"] > 20
-    assert len(again.slam.graph.edges_of("fixes")) == fixes > 3
+    assert len(again.slam.view.graph.edges_of("fixes")) == fixes > 3
 
 
 def test_maps_whose_fixes_are_from_other_datums_are_not_merged(tmp_path):
@@ -88,7 +88,7 @@ def test_a_folder_that_is_being_recorded_into_is_left_alone_by_everybody_else(tm
     assert sorted(path.name for path in tmp_path.rglob("*")) == before
     one.ingest(WORLD[60:90])
     one.finish()
-    assert len(read_map(tmp_path / "run").keyframes) == len(one.slam.keyframes)
+    assert len(read_map(tmp_path / "run").keyframes) == len(one.slam.view.keyframes)
     session(tmp_path / "run").finish()
     assert is_run(tmp_path / "run-1")
 
@@ -268,7 +268,7 @@ def test_P12_a_drive_that_was_cut_off_is_resumed_where_its_odometry_goes_on(tmp_
     for name, (later, goes_on) in LATER.items():
         run = tmp_path / name.replace(" ", "_") / "run"
         (one := session(run)).ingest(straight(0, 41))
-        before = one.slam.T_map_odom
+        before = one.slam.view.T_map_odom
         one.abandon()
         again, located = resumed(run, *later)
         assert located == (False, goes_on), name
@@ -302,14 +302,14 @@ def test_P12_what_is_resumed_is_the_run_that_was_cut_off_also_where_another_is_n
     one.abandon()
     again, located = resumed(tmp_path / "run", *straight(41, 43), output__load="site", output__load_at_start=True)
     assert located == (False, True)
-    assert again.slam.keyframes.stamps_ns[-1] > 10 * 10**9
+    assert again.slam.view.keyframes.stamps_ns[-1] > 10 * 10**9
     again.finish()
     shutil.rmtree(tmp_path / "run-1")
     last = session(tmp_path / "run", output__load="site", output__load_at_start=True)
     for run in tmp_path.glob("run-*"):
         shutil.rmtree(run)
     last.resume()
-    assert len(last.slam.keyframes) == len(site.slam.keyframes), "where there is nothing to resume"
+    assert len(last.slam.view.keyframes) == len(site.slam.view.keyframes), "where there is nothing to resume"
 
 
 def test_a_run_folder_that_is_removed_while_driving_is_made_again_and_nothing_of_the_map_is_lost(tmp_path):
@@ -321,4 +321,5 @@ def test_a_run_folder_that_is_removed_while_driving_is_made_again_and_nothing_of
     one.abandon()
     (again := session(tmp_path / "run")).resume()
     assert [what for what, _ in told] == ["output.folder"]
-    assert again.slam.trajectory()[: len(one.slam.keyframes)] == pytest.approx(one.slam.trajectory(), abs=0.05)
+    before = one.slam.view.trajectory()
+    assert again.slam.view.trajectory()[: len(before)] == pytest.approx(before, abs=0.05)

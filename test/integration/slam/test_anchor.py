@@ -50,12 +50,12 @@ def drive_with_fixes(recording, *kinds, every=40, begin=0.0, **settings):
     return slam
 
 
-def errors(slam, recording, T_earth_world):
+def errors(view, recording, T_earth_world):
     """Of every keyframe [m, rad], nothing aligned."""
-    space = slam.space
-    at = np.searchsorted(recording.stamps_ns, slam.keyframes.stamps_ns)
+    space = view.space
+    at = np.searchsorted(recording.stamps_ns, view.keyframes.stamps_ns)
     true = space.group.compose(T_earth_world, tuple(recording.T_world_base[at].T))
-    off = np.stack(space.group.local(tuple(slam.trajectory().T), true), axis=1)
+    off = np.stack(space.group.local(tuple(view.trajectory().T), true), axis=1)
     n = space.dimensions
     return np.linalg.norm(off[:, :n], axis=1), np.linalg.norm(off[:, n:], axis=1)
 
@@ -66,23 +66,23 @@ def errors(slam, recording, T_earth_world):
 def test_the_map_lies_in_the_frame_of_the_fixes_from_whenever_they_come(world, kind, begin):
     recording = simulate(world, 4, **SMALL[world])
     slam = drive_with_fixes(recording, kind, begin=begin)
-    metres, radians = errors(slam, recording, T_EARTH_WORLD[slam.space.dimensions])
+    metres, radians = errors(slam.view, recording, T_EARTH_WORLD[slam.view.space.dimensions])
     assert metres.max() < 0.2
     assert radians.max() < 0.1
     assert slam.counters.as_dict() == {kind: {"map_moved": 1}}
-    assert slam.ledger.outside_count <= 2
+    assert slam.view.ledger.outside_count <= 2
 
 
 def test_a_heading_turns_the_map_about_where_it_begins_and_a_position_then_shifts_it():
     recording = simulate("warehouse", 4, **SMALL["warehouse"])
     slam = drive_with_fixes(recording, "heading")
-    turned = se2.wrap(slam.trajectory()[:, 2] - recording.T_world_base[
-        np.searchsorted(recording.stamps_ns, slam.keyframes.stamps_ns), 2] - 2.5)  # fmt: skip
+    turned = se2.wrap(slam.view.trajectory()[:, 2] - recording.T_world_base[
+        np.searchsorted(recording.stamps_ns, slam.view.keyframes.stamps_ns), 2] - 2.5)  # fmt: skip
     assert np.abs(turned).max() < 0.05
-    assert np.abs(slam.trajectory()[0, :2]).max() < 1e-3
-    assert np.sqrt(slam.keyframe_covariances()[0, 0, 0]) < 2e-3, "of its position the heading says nothing"
+    assert np.abs(slam.view.trajectory()[0, :2]).max() < 1e-3
+    assert np.sqrt(slam.view.keyframe_covariances()[0, 0, 0]) < 2e-3, "of its position the heading says nothing"
     slam = drive_with_fixes(recording, "heading", "position")
-    metres, radians = errors(slam, recording, T_EARTH_WORLD[2])
+    metres, radians = errors(slam.view, recording, T_EARTH_WORLD[2])
     assert metres.max() < 0.15 and radians.max() < 0.05
     assert slam.counters.as_dict() == {"heading": {"map_moved": 1}, "position": {"map_moved": 1}}
 
@@ -90,16 +90,16 @@ def test_a_heading_turns_the_map_about_where_it_begins_and_a_position_then_shift
 def test_what_is_set_holds_and_the_fixes_are_not_believed():
     recording = simulate("warehouse", 4, **SMALL["warehouse"])
     slam = drive_with_fixes(recording, "position", **HELD)
-    assert np.abs(slam.trajectory()[0]).max() < 0.01
+    assert np.abs(slam.view.trajectory()[0]).max() < 0.01
     assert slam.counters.as_dict() == {}
-    assert slam.ledger.outside_count == len(slam.graph.edges_of("fixes")) > 20
+    assert slam.view.ledger.outside_count == len(slam.view.graph.edges_of("fixes")) > 20
 
 
 def test_of_a_start_that_is_given_the_map_does_not_move_and_the_fixes_correct_it():
     recording = simulate("warehouse", 4, **SMALL["warehouse"])
     start = np.add(se2.compose(T_EARTH_WORLD[2], tuple(recording.T_world_base[0])), (0.4, -0.3, 0.1))
     slam = drive_with_fixes(recording, "position", **{"anchor.pose": " ".join(map(str, start))})
-    metres, _ = errors(slam, recording, T_EARTH_WORLD[2])
+    metres, _ = errors(slam.view, recording, T_EARTH_WORLD[2])
     assert metres.max() < 0.15
     assert slam.counters.as_dict() == {}
 
@@ -143,12 +143,12 @@ def test_one_tag_puts_the_run_into_the_frame_of_the_survey_whenever_it_comes(wor
     recording = simulate(world, 4, **SMALL[world])
     name, _ = seen_at(recording, part)
     slam = driven(recording, survey(recording, [name]))
-    metres, radians = errors(slam, recording, T_PLAN_WORLD[slam.space.dimensions])
+    metres, radians = errors(slam.view, recording, T_PLAN_WORLD[slam.view.space.dimensions])
     assert metres.max() < 0.5
     assert radians.max() < 0.1
     assert sum(counts.get("map_moved", 0) for counts in slam.counters.as_dict().values()) == 1
-    assert slam.report.classes["surveyed"].edges == 1
-    assert slam.ledger.outside_count <= 2
+    assert slam.view.report.classes["surveyed"].edges == 1
+    assert slam.view.ledger.outside_count <= 2
 
 
 @pytest.mark.parametrize(("world", "which"), [("warehouse", "first"), ("flight", "later")])
@@ -156,14 +156,14 @@ def test_a_tag_whose_surveyed_orientation_is_wrong_is_doubted_and_does_not_turn_
     recording = simulate(world, 4, **SMALL[world])
     first, order = seen_at(recording, 0.0)
     wrong = first if which == "first" else order[len(order) // 2]
-    slam = driven(recording, survey(recording, order, turned=wrong))
-    metres, radians = errors(slam, recording, T_PLAN_WORLD[slam.space.dimensions])
+    view = driven(recording, survey(recording, order, turned=wrong)).view
+    metres, radians = errors(view, recording, T_PLAN_WORLD[view.space.dimensions])
     assert metres.max() < 0.15
     assert radians.max() < 0.04
-    vertex = slam.landmarks[wrong].vertex
-    edges = [edge for edge in slam.graph.edges_of("landmarks").tolist() if slam.graph.edge(edge).vertices[1] == vertex]
-    assert sum(slam.ledger.is_inside(edge) for edge in edges) <= 1 < len(edges), "one alone joins it to the rest"
-    assert len(edges) - 1 <= slam.ledger.outside_count <= len(edges) + 1
+    vertex = view.landmarks[wrong].vertex
+    edges = [edge for edge in view.graph.edges_of("landmarks").tolist() if view.graph.edge(edge).vertices[1] == vertex]
+    assert sum(view.ledger.is_inside(edge) for edge in edges) <= 1 < len(edges), "one alone joins it to the rest"
+    assert len(edges) - 1 <= view.ledger.outside_count <= len(edges) + 1
 
 
 @pytest.mark.parametrize("kind", ["position", "range"])
@@ -175,7 +175,7 @@ def test_of_a_tag_that_is_seen_without_its_orientation_the_surveyed_position_is_
     measured = {"position": (2.0, 1.0), "range_bearing": (5**0.5, 0.46), "bearing": (0.46,), "range": (5**0.5,)}[kind]
     noise = tuple((0.01 * np.eye(len(measured))).ravel().tolist())
     slam.process(Sightings(0, "tags", (Sighting("a", kind, measured, noise),)))
-    prior = slam.graph.tables[POINT_PRIOR[R2]]
+    prior = slam.view.graph.tables[POINT_PRIOR[R2]]
     assert prior.measured.values.tolist() == [[2.0, 1.0]]
     assert prior.sqrt_information.values[0] == pytest.approx(10.0 * np.eye(2))
     assert slam.counters.as_dict()["tags"]["surveyed_orientation_unused"] == 1, "it is not silent"

@@ -167,13 +167,13 @@ def is_covariance(c):
     return np.isnan(c).all() or bool(np.isfinite(c).all() and (np.diag(c) > 0.0).all())
 
 
-def check(slam):
-    assert np.isfinite(slam.trajectory()).all()
-    assert np.isfinite(slam.T_map_odom).all()
-    assert is_covariance(slam.pose_covariance)
-    assert all(map(is_covariance, slam.keyframe_covariances()))
-    assert all(map(is_covariance, slam.landmark_covariances()))
-    assert all(slam.waiting.values())
+def check(view):
+    assert np.isfinite(view.trajectory()).all()
+    assert np.isfinite(view.T_map_odom).all()
+    assert is_covariance(view.pose_covariance)
+    assert all(map(is_covariance, view.keyframe_covariances()))
+    assert all(map(is_covariance, view.landmark_covariances()))
+    assert all(view.waiting.values())
 
 
 def drive(seed, dimensions, association, count=60):
@@ -182,21 +182,21 @@ def drive(seed, dimensions, association, count=60):
     for k, m in enumerate(stranger.measurements(count)):
         slam.process(m)
         if k % 50 == 49:
-            check(slam)
-    check(slam)
+            check(slam.view)
+    check(slam.view)
     return slam
 
 
 def written(slam):
-    parts = (slam.trajectory(), slam.keyframe_covariances(), *slam.landmark_covariances())
-    return [part.tobytes() for part in parts], slam.counters.as_dict(), slam.graph.edge_count
+    parts = (slam.view.trajectory(), slam.view.keyframe_covariances(), *slam.view.landmark_covariances())
+    return [part.tobytes() for part in parts], slam.counters.as_dict(), slam.view.graph.edge_count
 
 
 @pytest.mark.parametrize("dimensions, association", list(itertools.product((2, 3), ASSOCIATIONS)))
 def test_whatever_is_measured_nothing_is_raised_and_nothing_infinite_comes_out(dimensions, association):
     count = times(20, 60)
     once = drive(0, dimensions, association, count)
-    assert len(once.keyframes) > 1
+    assert len(once.view.keyframes) > 1
     assert written(drive(0, dimensions, association, count)) == written(once)
     for seed in range(1, times(1, 20)):
         drive(seed, dimensions, association, count)

@@ -45,7 +45,7 @@ def found(measurements, settings):
     slam = GraphSlam(Config.from_mapping({**noise, "landmarks.added_sigma_m": 0.0, "world.dimensions": 3, **settings}))
     for one in (*measurements, Control("end"), Control("optimize")):
         slam.process(one)
-    return {one.parameter.name: one for one in slam.trial_fit(GROUPS, is_to_correct=True)[1]}
+    return {one.parameter.name: one for one in slam.view.trial_fit(GROUPS, is_to_correct=True)[1]}
 
 
 @pytest.fixture(scope="module")

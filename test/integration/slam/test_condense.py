@@ -43,24 +43,25 @@ def true_path(world, count):
     return np.array([pose[: world.space.dimensions] for pose in world.poses[:count]])
 
 
-def whole_path(slam, left):
-    before = Left.joined(slam.space, [one.left for one in left])
-    return WholePath(slam, before).poses()[:, : slam.space.dimensions]
+def whole_path(view, left):
+    before = Left.joined(view.space, [one.left for one in left])
+    return WholePath(view, before).poses()[:, : view.space.dimensions]
 
 
-def landmarks(world, slam):
-    vertices = [mark.vertex for mark in slam.landmarks.values()]
-    return slam.solver.estimate(vertices)[:, : slam.space.dimensions], world.points[
-        [int(name[1:]) for name in slam.landmarks]
+def landmarks(world, view):
+    vertices = [mark.vertex for mark in view.landmarks.values()]
+    return view.solver.estimate(vertices)[:, : view.space.dimensions], world.points[
+        [int(name[1:]) for name in view.landmarks]
     ]
 
 
 @pytest.fixture(scope="module", params=times(["plane"], ["plane", "space with tags"]))
 def both(request):
-    """A world, and its drives with all keyframes and condensed: the pipeline, and what left its map."""
+    """A world, and its drives with all keyframes and condensed: the map, and what left its map."""
     name, _, tags = request.param.partition(" ")
     world = hall(2, KEYFRAMES, {"plane": PLANAR, "space": SPATIAL}[name], tags=bool(tags))
-    return world, driven(world, config(world.space)), driven(world, bounded(world.space))
+    drives = (driven(world, settings) for settings in (config(world.space), bounded(world.space)))
+    return world, *((slam.view, left) for slam, left in drives)
 
 
 def test_the_map_is_small_as_good_and_hardly_surer_and_the_whole_path_is_there(both):
@@ -76,8 +77,8 @@ def test_the_map_is_small_as_good_and_hardly_surer_and_the_whole_path_is_there(b
     assert rms(path, true) < 1.4 * rms(whole.trajectory()[:, : world.space.dimensions], true)
     assert rms(*landmarks(world, small)) < 1.25 * rms(*landmarks(world, whole))
     names = sorted(whole.landmarks)
-    known = [[slam.keyframes[-1].vertex, *(slam.landmarks[name].vertex for name in names)] for slam in (whole, small)]
-    before, after = (slam.solver.joint_marginal(at) for slam, at in zip((whole, small), known, strict=True))
+    known = [[one.keyframes[-1].vertex, *(one.landmarks[name].vertex for name in names)] for one in (whole, small)]
+    before, after = (one.solver.joint_marginal(at) for one, at in zip((whole, small), known, strict=True))
     root = np.linalg.inv(np.linalg.cholesky(before))
     variances = np.linalg.eigvalsh(root @ after @ root.T)
     assert 0.5 < variances[0] <= variances[-1] < 4.0
@@ -91,11 +92,11 @@ def recorded():
 def test_a_replay_condenses_as_the_live_run_did(recorded, tmp_path):
     folder, slam, _ = recorded
     again, _ = record_run(tmp_path / "again", bounded(), read_measurements(folder, []), [])
-    assert again.first_keyframe == slam.first_keyframe > 0
-    assert again.solver.values.tobytes() == slam.solver.values.tobytes()
+    assert again.view.first_keyframe == slam.view.first_keyframe > 0
+    assert again.view.solver.values.tobytes() == slam.view.solver.values.tobytes()
     for name in ("path.tum", "landmarks.csv", "ledger.csv", "sightings.tum", "graph.g2o", "graph_vertices.csv"):
         assert (tmp_path / "again" / name).read_bytes() == (folder / name).read_bytes(), name
-    ours, theirs = (WholePath.of(slam, at).left for at in (folder, tmp_path / "again"))
+    ours, theirs = (WholePath.of(slam.view, at).left for at in (folder, tmp_path / "again"))
     assert ours.keyframes.tobytes() == theirs.keyframes.tobytes()
     assert ours.sightings.tobytes() == theirs.sightings.tobytes()
 
@@ -116,23 +117,23 @@ def test_a_map_that_is_taken_up_again_goes_on_condensing(recorded, tmp_path):
     start = read_map(folder)
     start.continues = True
     longer = list(measurements(hall(SEED, MORE)))
-    at_ns = slam.keyframes[-1].stamp_ns
+    at_ns = slam.view.keyframes[-1].stamp_ns
     rest = [m for m in longer if m.stamp_ns > at_ns]
     gone_on, summary = record_run(tmp_path / "more", bounded(), [*rest, Control("end")], [], start)
-    assert gone_on.first_keyframe > slam.first_keyframe
+    assert gone_on.view.first_keyframe > slam.view.first_keyframe
     assert len(read_tum(tmp_path / "more" / "path.tum").stamps_s) == summary["keyframes"] > MORE - 50
     again = read_start(tmp_path / "more")
-    assert again is not None and again.first_keyframe == slam.first_keyframe
-    assert read_map(tmp_path / "more").first_keyframe == gone_on.first_keyframe
+    assert again is not None and again.first_keyframe == slam.view.first_keyframe
+    assert read_map(tmp_path / "more").first_keyframe == gone_on.view.first_keyframe
 
 
 GOES_ON = {
     "nothing": (lambda slam: None, True),
-    "a trial fit": (lambda slam: slam._trials._background.begin(lambda: lambda _: None, 0), True),
-    "a search": (lambda slam: slam.backend._background.begin(lambda: lambda _: None, 0), False),
-    "an alarm": (lambda slam: setattr(slam.backend, "holds_back", True), False),
+    "a trial fit": (lambda slam: slam.view._trials._background.begin(lambda: lambda _: None, 0), True),
+    "a search": (lambda slam: slam.view.backend._background.begin(lambda: lambda _: None, 0), False),
+    "an alarm": (lambda slam: setattr(slam.view.backend, "holds_back", True), False),
     "a slip": (lambda slam: slam._kidnaps.slip_detector.slips.append(Slip("rotation", 0, 0, 20.0, 2)), False),
-    "an edge that is held back": (lambda slam: slam.backend._pending.append(7), False),
+    "an edge that is held back": (lambda slam: slam.view.backend._pending.append(7), False),
     "a solve that failed": (lambda slam: slam.restart(), False),
 }
 
@@ -159,20 +160,20 @@ def test_with_closures_all_is_kept_and_the_end_says_why():
     assert Config().condenses
     assert bounded(**LOOPS).not_condensed == "loops.use=closure"
     slam, left = driven(hall(4, WINDOW + 300), bounded(**LOOPS))
-    assert not left and not slam.first_keyframe
+    assert not left and not slam.view.first_keyframe
     assert "condensed  nothing: not with loops.use=closure yet" in "\n".join(text(summarize(slam)))
 
 
 def test_a_condensed_map_goes_on_with_closures_and_one_to_a_keyframe_that_has_left_is_refused_by_name(recorded):
     folder, slam, _ = recorded
     more, covariance = GraphSlam(bounded(**LOOPS), start=read_map(folder)), tuple((0.01 * np.eye(3)).ravel())
-    drive = [m for m in measurements(hall(SEED, 600)) if m.stamp_ns > slam.keyframes[-1].stamp_ns]
-    at_ns, old_ns, new_ns = drive[-1].stamp_ns, slam.bounded.old[5].stamp_ns, drive[40].stamp_ns
+    drive = [m for m in measurements(hall(SEED, 600)) if m.stamp_ns > slam.view.keyframes[-1].stamp_ns]
+    at_ns, old_ns, new_ns = drive[-1].stamp_ns, slam.view.bounded.old[5].stamp_ns, drive[40].stamp_ns
     loops = [Closure(at_ns, one_ns, "loops", (1.0, 0.0, 0.0), covariance) for one_ns in (old_ns, new_ns)]
     for m in [*drive, *loops, Control("end")]:
         more.process(m)
-    assert more.first_keyframe == slam.first_keyframe
-    assert len(more.keyframes) > len(slam.keyframes) + 80
+    assert more.view.first_keyframe == slam.view.first_keyframe
+    assert len(more.view.keyframes) > len(slam.view.keyframes) + 80
     assert more.counters.as_dict()["loops"] == {"from_condensed_keyframe": 1}
 
 
@@ -197,15 +198,15 @@ def test_a_stretch_without_a_place_stays_if_it_has_fixes_else_its_odometry_does(
     for m in [*with_fixes(world, some), Control("end")]:
         whole.process(m)
         slam.process(m)
-    old = {one.number for one in slam.bounded.old}
-    assert slam.first_keyframe > KEYFRAMES - 200
+    old = {one.number for one in slam.view.bounded.old}
+    assert slam.view.first_keyframe > KEYFRAMES - 200
     assert set(some) <= old
     assert len(old & set(range(260, 340))) >= 70 if some else len(old & set(range(260, 340))) < 5
-    assert len(slam.graph.edges_of("fixes")) == len(some)
+    assert len(slam.view.graph.edges_of("fixes")) == len(some)
     assert slam.counters["map", "visit_lost"] == slam.counters["solver", "unsolved"] == 0
-    for one, other in zip(landmarks(world, slam), landmarks(world, whole), strict=True):
+    for one, other in zip(landmarks(world, slam.view), landmarks(world, whole.view), strict=True):
         assert one == pytest.approx(other, abs=0.05)
-    assert slam.trajectory()[-1] == pytest.approx(whole.trajectory()[-1], abs=0.05)
+    assert slam.view.trajectory()[-1] == pytest.approx(whole.view.trajectory()[-1], abs=0.05)
 
 
 @pytest.fixture(scope="module")
@@ -215,8 +216,8 @@ def saved(recorded):
 
 def test_each_edge_is_explained_by_its_lasting_id_and_the_whole_says_how_much_is_condensed(recorded, saved):
     folder, slam, _ = recorded
-    assert [saved.edge(e.edge).edge for e in saved.entries] == slam.graph.edge_ids.of_all(
-        np.arange(slam.graph.edge_count)
+    assert [saved.edge(e.edge).edge for e in saved.entries] == slam.view.graph.edge_ids.of_all(
+        np.arange(slam.view.graph.edge_count)
     ).tolist()
     left = list(read_left_edges(folder))
     for row in left[:: len(left) // 10]:
@@ -227,8 +228,8 @@ def test_each_edge_is_explained_by_its_lasting_id_and_the_whole_says_how_much_is
     place = next(e for e in saved.entries if e.label == LABEL)
     text = "\n".join(explain_edge(saved, str(place.edge)))
     assert all(f"{saved.landmark_of(vertex)} (" in text for vertex in place.vertices[1:])
-    text, places = "\n".join(explain_run(saved)), sum(map(len, slam.bounded.places.values()))
-    assert f"condensed: keyframes 0 to {slam.first_keyframe - 1}, into {places} places" in text
+    text, places = "\n".join(explain_run(saved)), sum(map(len, slam.view.bounded.places.values()))
+    assert f"condensed: keyframes 0 to {slam.view.first_keyframe - 1}, into {places} places" in text
     assert f"{len(left)} condensed (believed" in text
     seen = next(row["landmark"] for row in left if row["landmark"])
     assert "edges are not in the map any more" in "\n".join(explain_edge(saved, seen))
@@ -239,9 +240,9 @@ def test_diff_compares_the_whole_paths(recorded, tmp_path):
     record_run(tmp_path / "whole", config(PLANAR), read_measurements(folder, []), [])
     found = diff(tmp_path / "whole", folder, [])
     assert (found.keyframes.a, found.keyframes.b, found.keyframes.both) == (500, 500, 500)
-    assert found.condensed == (0, slam.first_keyframe)
+    assert found.condensed == (0, slam.view.first_keyframe)
     assert 0.0 < found.keyframes_m[0] < found.keyframes_m[1] < 0.2
-    assert f"{slam.first_keyframe}  keyframes, whose edges are in places" in "\n".join(found.lines())
+    assert f"{slam.view.first_keyframe}  keyframes, whose edges are in places" in "\n".join(found.lines())
     same = diff(folder, folder, [])
     assert same.is_same
     assert same.edges.a == same.edges.both
@@ -274,9 +275,9 @@ def without_names(world, tmp_path_factory):
     return slam, folder
 
 
-def assert_each_landmark_is_there_once(slam, world, least):
+def assert_each_landmark_is_there_once(view, world, least):
     """Confirmed landmarks, laid on the true ones."""
-    there = slam.solver.estimate([mark.vertex for mark in slam.landmarks.values() if not mark.is_tentative])
+    there = view.solver.estimate([mark.vertex for mark in view.landmarks.values() if not mark.is_tentative])
     space = world.space
     true = np.stack(space.group.act(space.group.inverse(world.poses[0]), tuple(world.points.T)), axis=-1)
     turn, shift = fitted(there, true[np.linalg.norm(there[:, None] - true[None], axis=2).argmin(axis=1)])
@@ -287,10 +288,10 @@ def assert_each_landmark_is_there_once(slam, world, least):
 
 def test_the_map_is_small_and_each_landmark_is_there_once(world, without_names):
     slam, folder = without_names
-    assert slam.first_keyframe > times(2 * WINDOW, 540)
-    assert len(slam.solver.vertices) < times(0.8, 0.4) * (FIRST + 40)
-    assert_each_landmark_is_there_once(slam, world, least=times(28, 38))
-    path = WholePath.of(slam, folder).poses()
+    assert slam.view.first_keyframe > times(2 * WINDOW, 540)
+    assert len(slam.view.solver.vertices) < times(0.8, 0.4) * (FIRST + 40)
+    assert_each_landmark_is_there_once(slam.view, world, least=times(28, 38))
+    path = WholePath.of(slam.view, folder).poses()
     assert rms(path[:, :2], np.array(world.poses)[:FIRST, :2]) < times(0.25, 0.1)
 
 
@@ -301,8 +302,8 @@ def test_a_map_without_names_that_is_taken_up_again_goes_on_condensing(world, wi
     start.continues = True
     rest = drive(world, FIRST, FIRST + LATER)
     more, _ = record_run(tmp_path / "more", unnamed(), [*rest, Control("end")], [], start)
-    assert more.first_keyframe > slam.first_keyframe + 200
-    assert_each_landmark_is_there_once(more, world, least=38)
+    assert more.view.first_keyframe > slam.view.first_keyframe + 200
+    assert_each_landmark_is_there_once(more.view, world, least=38)
 
 
 @SOAKED
@@ -325,7 +326,7 @@ def test_a_stretch_at_a_wrong_place_is_laid_on_the_map(without_names):
         clusters_of_map=count,
         times=frozen.times,
     )
-    found = explained(slam.space, moved, anonymous.hindsight._settings, anonymous.hindsight._costs)
+    found = explained(slam.view.space, moved, anonymous.hindsight._settings, anonymous.hindsight._costs)
     numbers = found.numbers(wrong[count:].tolist(), iter(range(-20_000, -30_000, -1)).__next__)
     now = np.where(found.estimate.which >= 0, numbers[found.estimate.which], -2)[count:]
     is_used = (now != -2) & (frozen.given[count:] != -2)
@@ -338,7 +339,7 @@ def test_a_doubtful_map_is_not_condensed_and_the_end_says_so(world, monkeypatch)
     slam = GraphSlam(unnamed())
     for m in [*drive(world, 0, 300), Control("end")]:
         slam.process(m)
-    assert slam.first_keyframe == 0
+    assert slam.view.first_keyframe == 0
     assert "condensed  nothing: not with a doubtful map of landmarks without ids yet" in "\n".join(
         text(summarize(slam))
     )

@@ -15,12 +15,12 @@ def test_in_straight_aisles_few_landmarks_are_on_the_wrong_side(seed):
     slam = GraphSlam(Config())
     for m in [*measurements(recording), Control("end"), Control("optimize")]:
         slam.process(m)
-    names = sorted(slam.landmarks)
-    found = slam.solver.estimate([slam.landmarks[name].vertex for name in names])
+    names = sorted(slam.view.landmarks)
+    found = slam.view.solver.estimate([slam.view.landmarks[name].vertex for name in names])
     true = np.array([recording.landmarks[name][:2] for name in names])
     assert len(names) >= 20
     assert np.count_nonzero(off(found, true) > 1.5) <= 4
-    assert any("as far as the path is known" in reason for reason in slam.waiting.values())
+    assert any("as far as the path is known" in reason for reason in slam.view.waiting.values())
 
 
 def off(points, true):

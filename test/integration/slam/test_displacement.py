@@ -45,12 +45,12 @@ def carried(recording, at=0.7, metres=10.0):
     return replace(recording, seen=(*before, *after), **kept_parts), int(stamps[a])
 
 
-def errors(slam, recording):
+def errors(view, recording):
     """Distances of all keyframes from the truth, in the frame of the first pose."""
     first = se2.compose(tuple(recording.T_odom_base[0]), se2.inverse(tuple(recording.T_world_base[0])))
-    at = np.searchsorted(recording.stamps_ns, slam.keyframes.stamps_ns, side="right") - 1
+    at = np.searchsorted(recording.stamps_ns, view.keyframes.stamps_ns, side="right") - 1
     true = np.array([se2.compose(first, tuple(pose)) for pose in recording.T_world_base[at]])
-    return np.linalg.norm((slam.trajectory() - true)[:, :2], axis=1)
+    return np.linalg.norm((view.trajectory() - true)[:, :2], axis=1)
 
 
 class Driven:
@@ -64,12 +64,12 @@ class Driven:
                 self.slam.process(given)
                 given = None
             is_new = bool(self.slam.process(m))
-            alarm = self.slam.displaced
+            alarm = self.slam.view.displaced
             if alarm is not None:
                 self.alarmed_s = self.alarmed_s or (alarm.began_ns - event_ns) * 1e-9
             is_decided = (alarm and alarm.segment) or self.slam.counters[DISPLACED] or self.slam.counters[SLIP]
             if is_new and m.stamp_ns > event_ns > 0 and not is_decided:
-                before = self.slam.trajectory()[self.slam.keyframes.stamps_ns <= event_ns, :2]
+                before = self.slam.view.trajectory()[self.slam.view.keyframes.stamps_ns <= event_ns, :2]
                 reference = before if reference is None else reference
                 self.moved_m = max(self.moved_m, float(np.linalg.norm(before - reference, axis=1).max()))
         self.slam.process(Control("end"))
@@ -77,25 +77,25 @@ class Driven:
 
 def test_G23_a_robot_that_was_carried_is_found_and_the_path_before_stays(recording):
     faulty, event_ns = carried(recording)
-    clean = errors(Driven(recording, 0).slam, recording)
+    clean = errors(Driven(recording, 0).slam.view, recording)
     driven = Driven(faulty, event_ns)
     slam = driven.slam
     assert 0.0 < driven.alarmed_s < 5.0
     assert driven.moved_m < 0.05
-    (alarm,) = slam.alarms
+    (alarm,) = slam.view.alarms
     assert alarm.distance_m == pytest.approx(10.0, abs=0.6)
-    assert slam.segments == [0, alarm.segment]
+    assert slam.view.segments == [0, alarm.segment]
     assert slam.counters[DISPLACED] == 1
     assert not slam.counters[SLIP]
-    found, was_before = errors(slam, faulty), slam.keyframes.stamps_ns <= event_ns
+    found, was_before = errors(slam.view, faulty), slam.view.keyframes.stamps_ns <= event_ns
     assert found[was_before].max() < clean.max() + 0.1
     assert found[~was_before].max() < clean.max() + 0.1
     slam.process(Control("optimize"))
-    assert errors(slam, faulty).max() < clean.max() + 0.1
-    edges = slam.graph.edges_of("odometry")
-    out = [edge for edge in edges.tolist() if slam.ledger.reason.values[edge] == Reason.DISPLACED]
+    assert errors(slam.view, faulty).max() < clean.max() + 0.1
+    edges = slam.view.graph.edges_of("odometry")
+    out = [edge for edge in edges.tolist() if slam.view.ledger.reason.values[edge] == Reason.DISPLACED]
     assert len(out) == 1
-    assert slam.ledger.verdict_of(out[0]) is Verdict.REJECTED
+    assert slam.view.ledger.verdict_of(out[0]) is Verdict.REJECTED
 
 
 @pytest.mark.parametrize("sensor", times(["bearing"], ["range", "bearing"]))
@@ -107,13 +107,13 @@ def test_G23_ranges_or_bearings_alone_raise_the_alarm_and_a_given_pose_ends_it(s
     slam, odometry = driven.slam, list(measurements(faulty))
     assert 0.0 < driven.alarmed_s < 5.0  # and none in the drive before
     assert driven.moved_m < 0.05
-    assert "do not determine the pose: give initialpose" in str(slam.displaced)
-    assert slam.segments == [0]
+    assert "do not determine the pose: give initialpose" in str(slam.view.displaced)
+    assert slam.view.segments == [0]
     slam.process(InitialPose((0.0, 0.0, 0.0), tuple((0.01 * np.eye(3)).ravel().tolist())))
     for m in [m for m in odometry if m.stamp_ns > faulty.stamps_ns[until][-1]][:20]:
         slam.process(m)
-    assert slam.displaced is None
-    assert "then a segment began" in str(slam.alarms[0])
+    assert slam.view.displaced is None
+    assert "then a segment began" in str(slam.view.alarms[0])
 
 
 @pytest.mark.parametrize("away_m, sigma_m", times([(3.0, 0.05)], [(3.0, 0.05), (48.0, 0.5), (1e6, 0.5)]))
@@ -122,9 +122,9 @@ def test_G24_a_wrong_pose_that_somebody_gives_is_found_out_by_the_landmarks(reco
     covariance = tuple(np.diag([sigma_m**2, sigma_m**2, 0.0025]).ravel().tolist())
     driven = Driven(recording, event_ns, InitialPose((away_m, 0.0, 0.0), covariance))
     slam = driven.slam
-    (given,) = slam.graph.edges_of("initialpose").tolist()
-    assert slam.ledger.verdict_of(given) is Verdict.REJECTED
-    assert errors(slam, recording).max() < 0.5
+    (given,) = slam.view.graph.edges_of("initialpose").tolist()
+    assert slam.view.ledger.verdict_of(given) is Verdict.REJECTED
+    assert errors(slam.view, recording).max() < 0.5
     assert driven.moved_m < 0.05
 
 
@@ -133,9 +133,9 @@ def test_G24_a_true_pose_that_somebody_gives_is_believed(recording):
     true = (tuple(recording.T_world_base[k]) for k in (0, np.searchsorted(recording.stamps_ns, event_ns)))
     said = InitialPose(se2.between(*true), tuple((0.01 * np.eye(3)).ravel().tolist()))
     slam = Driven(recording, event_ns, said).slam
-    assert slam.ledger.verdict_of(int(slam.graph.edges_of("initialpose")[0])) is Verdict.ACCEPTED
-    assert not slam.alarms
-    assert errors(slam, recording).max() < 0.5
+    assert slam.view.ledger.verdict_of(int(slam.view.graph.edges_of("initialpose")[0])) is Verdict.ACCEPTED
+    assert not slam.view.alarms
+    assert errors(slam.view, recording).max() < 0.5
 
 
 @SOAKED
@@ -163,12 +163,12 @@ def test_a_displacement_that_later_sightings_contradict_is_taken_back(recording)
     slam = Driven(faulty, begin_ns).slam
     assert slam.counters[DISPLACED] == 1
     assert slam.counters["odometry", "displacement_taken_back"] == 1
-    assert slam.segments == [0]
-    assert "taken back: later sightings contradict it" in str(slam.alarms[0])
-    edges = slam.graph.edges_of("odometry").tolist()
-    reasons = {Reason(int(slam.ledger.reason.values[edge])) for edge in edges}
+    assert slam.view.segments == [0]
+    assert "taken back: later sightings contradict it" in str(slam.view.alarms[0])
+    edges = slam.view.graph.edges_of("odometry").tolist()
+    reasons = {Reason(int(slam.view.ledger.reason.values[edge])) for edge in edges}
     assert reasons == {Reason.NONE, Reason.REVOKED}
-    assert errors(slam, recording).max() < 0.5
+    assert errors(slam.view, recording).max() < 0.5
 
 
 LONG = times(False, True)
@@ -200,32 +200,32 @@ def test_a_slip_is_found_ends_and_leaves_the_map_as_good_as_without(seed, tmp_pa
     seconds = 20.0 if LONG else 10.0
     recording, begin_ns = slipping(clean, seconds=seconds)
     slam, summary = record_run(tmp_path / "run", Config(), [*measurements(recording), Control("end")], [])
-    slips = [one for one in slam.alarms if isinstance(one, Slip)]
-    assert slam.alarms[0].began_ns >= begin_ns - 10**9
+    slips = [one for one in slam.view.alarms if isinstance(one, Slip)]
+    assert slam.view.alarms[0].began_ns >= begin_ns - 10**9
     assert slips
     assert {one.kind for one in slips} == {"translation"}
     assert (slips[0].decided_ns - begin_ns) * 1e-9 < 5.0
-    assert slam.displaced is None  # it has ended
-    assert slam.segments == [0]
+    assert slam.view.displaced is None  # it has ended
+    assert slam.view.segments == [0]
     assert (slips[-1].ended_ns - begin_ns) * 1e-9 < seconds + 5.0
     without = driven(clean)
-    assert not without.alarms
+    assert not without.view.alarms
     after_ns = begin_ns + (seconds + 5.0) * 1e9
     for is_part in (lambda stamps_ns: stamps_ns > after_ns, lambda stamps_ns: stamps_ns <= begin_ns):
-        each = (errors(one, clean)[is_part(one.keyframes.stamps_ns)] for one in (without, slam))
+        each = (errors(one.view, clean)[is_part(one.view.keyframes.stamps_ns)] for one in (without, slam))
         good, found = (float(np.sqrt(np.mean(np.square(one)))) for one in each)
         assert found < 1.2 * good + 0.05
-    assert_replaced(slam, slips, tmp_path)
-    assert [one["text"] for one in summary["displacements"]] == [str(one) for one in slam.alarms]
+    assert_replaced(slam.view, slips, tmp_path)
+    assert [one["text"] for one in summary["displacements"]] == [str(one) for one in slam.view.alarms]
     edges = sum(one.edges for one in slips)
     slam.process(Control("optimize"))
-    assert sum(one.edges for one in slam.alarms) == edges, "nor is it taken back when everything is solved"
+    assert sum(one.edges for one in slam.view.alarms) == edges, "nor is it taken back when everything is solved"
     assert slam.counters[TAKEN_BACK] == 0
 
 
-def assert_replaced(slam, slips, tmp_path):
+def assert_replaced(view, slips, tmp_path):
     """The ledger has each edge of the stretch and that in its place, and a map that is read has the same."""
-    edges, ledger, graph = slam.graph.edges_of("odometry"), slam.ledger, slam.graph
+    edges, ledger, graph = view.graph.edges_of("odometry"), view.ledger, view.graph
     out = edges[ledger.reason.values[edges] == Reason.SLIP].tolist()
     assert len(out) == sum(one.edges for one in slips)
     for edge in out:
@@ -241,8 +241,7 @@ def assert_replaced(slam, slips, tmp_path):
         ]
         assert np.array_equal(graph.edge(wider).measured, own.measured)
         assert np.linalg.det(graph.edge(wider).sqrt_information) < np.linalg.det(own.sqrt_information)
-    again = map_of(tmp_path / "run", [])
-    assert again.ledger.reason.values.tolist() == ledger.reason.values.tolist()
+    assert map_of(tmp_path / "run", []).ledger.reason.values.tolist() == ledger.reason.values.tolist()
 
 
 @SOAKED
@@ -267,7 +266,7 @@ def test_a_burst_of_wrong_identities_and_a_moved_landmark_are_no_slip():
         return replace(one, sightings=tuple({s.id: s for s in wrong}.values()))
 
     slam = driven(replace(moved, seen=tuple(map(spoiled, moved.seen))))
-    assert (slam.counters[SLIP], slam.segments) == (0, [0])
+    assert (slam.counters[SLIP], slam.view.segments) == (0, [0])
     assert [line.partition(":")[0] for line in doubts(summarize(slam)) if "did it move" in line] == ["rack2w0"]
 
 
@@ -291,25 +290,25 @@ def test_a_slip_that_was_none_is_taken_back_and_leaves_no_trace():
         if links is None and isinstance(m, Odometry) and m.stamp_ns > half:
             links = list(window.links.values())[-3:]
             doubt(doubted, links, m.stamp_ns)
-            assert "odometry in doubt since" in str(doubted.displaced)
+            assert "odometry in doubt since" in str(doubted.view.displaced)
             assert all(link.edge != link.own for link in links)
             doubt(ended, list(ended._kidnaps._window.links.values())[-5:], m.stamp_ns, ended_ns=m.stamp_ns + 1)
-        if links is not None and doubted.displaced is None:
+        if links is not None and doubted.view.displaced is None:
             break
-    edges = doubted.graph.edges_of("odometry")
-    reasons = doubted.ledger.reason.values[edges]
+    edges = doubted.view.graph.edges_of("odometry")
+    reasons = doubted.view.ledger.reason.values[edges]
     own = set(edges[reasons != Reason.REVOKED].tolist())
     assert {link.edge for link in window.links.values()} <= own
     assert ended.counters[TAKEN_BACK] == 0
     for slam in (plain, doubted, ended):
         slam.process(Control("optimize"))
-        slam.solver.optimize(slam.solver.settings.until_still())
-    assert "taken back: all measurements together agree with odometry" in str(ended.alarms[0])
+        slam.view.solver.optimize(slam.view.solver.settings.until_still())
+    assert "taken back: all measurements together agree with odometry" in str(ended.view.alarms[0])
     for slam, count in ((doubted, 3), (ended, 5)):
         assert slam.counters[TAKEN_BACK] == 1
-        (slip,) = slam.alarms
+        (slip,) = slam.view.alarms
         assert (slip.edges, "taken back" in str(slip)) == (0, True)
-        assert np.abs(plain.trajectory() - slam.trajectory()).max() < 1e-6
-        reasons = slam.ledger.reason.values[slam.graph.edges_of("odometry")].tolist()
+        assert np.abs(plain.view.trajectory() - slam.view.trajectory()).max() < 1e-6
+        reasons = slam.view.ledger.reason.values[slam.view.graph.edges_of("odometry")].tolist()
         assert set(reasons) == {Reason.NONE, Reason.REVOKED}
         assert reasons.count(Reason.REVOKED) >= count

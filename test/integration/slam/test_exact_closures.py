@@ -38,20 +38,20 @@ def drive(around, false_every=0, seed=0, rough=(0.1, 0.1, 0.05)):
             slam.process(Closure(k * SECOND_NS, earlier * SECOND_NS, source, measured, covariance(EXACT)))
             is_false.append(seen is None)
     slam.process(Control("end"))
-    edges = slam.graph.edges_of("closures")
-    in_order = sorted(edges.tolist(), key=lambda edge: int(slam.graph.source_of(edge)[8:]))
+    edges = slam.view.graph.edges_of("closures")
+    in_order = sorted(edges.tolist(), key=lambda edge: int(slam.view.graph.source_of(edge)[8:]))
     return slam, *([edge for edge, wrong in zip(in_order, is_false, strict=True) if wrong == w] for w in (False, True))
 
 
 def test_no_exact_closure_is_lost_however_far_odometry_is_off():
     """Judged before the solve has converged, each is rejected at once, at a chi2 of millions."""
     slam, true, _ = drive(60)
-    edges = [edge for edge in true if edge < len(slam.ledger)]
-    assert all(slam.ledger.are_inside(edges))
-    assert not [one for one in slam.ledger.history if one.verdict is Verdict.REJECTED]
+    edges = [edge for edge in true if edge < len(slam.view.ledger)]
+    assert all(slam.view.ledger.are_inside(edges))
+    assert not [one for one in slam.view.ledger.history if one.verdict is Verdict.REJECTED]
     slam.process(Control("optimize"))
-    assert all(slam.ledger.are_inside(true))
-    assert slam.solver.evaluate().chi2_final < 5 * len(true)  # odometry is noisy, too
+    assert all(slam.view.ledger.are_inside(true))
+    assert slam.view.solver.evaluate().chi2_final < 5 * len(true)  # odometry is noisy, too
 
 
 def test_false_closures_among_exact_ones_are_still_refused():
@@ -59,5 +59,5 @@ def test_false_closures_among_exact_ones_are_still_refused():
     slam, true, false = drive(60, false_every=8)
     slam.process(Control("optimize"))
     assert len(false) >= 6
-    assert all(slam.ledger.are_inside(true))
-    assert not any(slam.ledger.are_inside(false))
+    assert all(slam.view.ledger.are_inside(true))
+    assert not any(slam.view.ledger.are_inside(false))

@@ -52,7 +52,7 @@ def driven(fault, lasts_s, most=99):
             for one in (*passage.events, *passage.measured):
                 slam.process(one)
         if not is_silent and second >= BEGINS:
-            errors.append(np.linalg.norm(np.array(se2.compose(slam.T_map_odom, odometry))[:2] - now[:2]))
+            errors.append(np.linalg.norm(np.array(se2.compose(slam.view.T_map_odom, odometry))[:2] - now[:2]))
     for event in ("end", "optimize"):
         slam.process(Control(event))
     return slam, np.array(errors)
@@ -70,7 +70,7 @@ def driven(fault, lasts_s, most=99):
 def test_the_drive_goes_on_and_what_was_wrong_is_counted(fault, lasts_s, most, worst_m, segments, counted):
     slam, errors = driven(fault, lasts_s, most)
     assert errors.max() < worst_m
-    assert (len(slam.segments), slam.counters[counted] > 1) == (segments, True)
+    assert (len(slam.view.segments), slam.counters[counted] > 1) == (segments, True)
     summary = summarize(slam) | account(slam, slam.counters)
     assert any("stood still" in line for line in shortcomings(summary)) == (fault == "frozen")
 
@@ -79,6 +79,6 @@ def test_odometry_that_begins_anew_after_a_silence_ties_nothing_of_it_to_the_las
     for slam, errors in (driven("anew", 3.0), driven("anew by compass", 3.0)):
         assert np.count_nonzero(errors > 1.0) < RATE, "it is found again within a second"
         assert (slam.counters["camera", "odometry_gap"] > 10, slam.counters["odometry", "reset_to_zero"]) == (True, 1)
-        before = slam.keyframes.stamps_ns < 1e12 + 1e9 * BEGINS
-        there = np.array([truth(one) for one in 1e-9 * (slam.keyframes.stamps_ns[before] - 1e12)])[:, :2]
-        assert np.linalg.norm(slam.trajectory()[before, :2] - there, axis=1).max() < 0.3
+        before = slam.view.keyframes.stamps_ns < 1e12 + 1e9 * BEGINS
+        there = np.array([truth(one) for one in 1e-9 * (slam.view.keyframes.stamps_ns[before] - 1e12)])[:, :2]
+        assert np.linalg.norm(slam.view.trajectory()[before, :2] - there, axis=1).max() < 0.3

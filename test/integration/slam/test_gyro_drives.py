@@ -38,8 +38,8 @@ def test_a_bias_that_is_never_seen_at_rest_does_no_harm():
     """The robot drives from the first message on: odometry turns alone."""
     measured, recording = drive(0, bias=0.01, factor=1.05, aisles=2, laps=1, aisle_m=4.0)
     without, slam = (driven(measured, recording, settings) for settings in ({}, GYRO))
-    assert slam.trajectory().tobytes() == without.trajectory().tobytes()
-    assert slam.gyro.state == "waiting"
+    assert slam.view.trajectory().tobytes() == without.view.trajectory().tobytes()
+    assert slam.view.gyro.state == "waiting"
 
 
 def test_the_order_of_arrival_changes_nothing_and_a_silent_gyro_leaves_wheels_as_they_are():
@@ -48,12 +48,12 @@ def test_the_order_of_arrival_changes_nothing_and_a_silent_gyro_leaves_wheels_as
     others = [m for m in measured if not isinstance(m, AngularVelocity)]
     late = sorted(measured, key=lambda m: m.stamp_ns + 20_000_000 * isinstance(m, AngularVelocity))
     usual = driven(measured, recording, GYRO)
-    assert driven(late, recording, GYRO).trajectory().tobytes() == usual.trajectory().tobytes()
+    assert driven(late, recording, GYRO).view.trajectory().tobytes() == usual.view.trajectory().tobytes()
     assert usual.counters.used["imu"] > 0.99 * len(rates)
     without = driven(others, recording, {})
     alone = driven(others, recording, GYRO)
-    assert alone.trajectory().tobytes() == without.trajectory().tobytes()
-    assert alone.gyro.fault
+    assert alone.view.trajectory().tobytes() == without.view.trajectory().tobytes()
+    assert alone.view.gyro.fault
 
 
 @pytest.fixture(scope="module")
@@ -72,8 +72,7 @@ def replayed(bag, out, *settings):
 
 def test_a_recording_with_a_gyro_is_replayed_and_repeated_to_the_same_bytes(bag, tmp_path, capsys):
     assert replayed(bag, tmp_path / "run") == 0
-    said = capsys.readouterr().out
-    assert "gyro       bias 0.0" in said
+    assert "gyro       bias 0.0" in capsys.readouterr().out
     run = json.loads((tmp_path / "run/run.json").read_text())
     assert run["gyro"]["state"] == "used"
     assert run["gyro"]["bias"][0] == pytest.approx(0.01, abs=4.0 * run["gyro"]["sigma"][0])

@@ -29,7 +29,7 @@ def estimate(**settings):
     for event in ("end", "optimize"):
         slam.process(Control(event))
     assert slam.counters.used["bad"] > 5
-    return slam.trajectory()
+    return slam.view.trajectory()
 
 
 def test_the_loss_of_an_input_keeps_its_outliers_from_the_estimate():

@@ -28,13 +28,13 @@ def drive(tmp_path_factory):
     write_bag(simulate("warehouse", 1, laps=2), folder / "bag.mcap")
     configured = replay(folder / "bag.mcap", folder / "configured", CONFIGURED)
     estimated = replay(folder / "bag.mcap", folder / "estimated", ESTIMATED)
-    return folder, configured.slam, estimated.slam
+    return folder, configured.slam.view, estimated.slam.view
 
 
 def test_the_scale_is_said_always_and_applied_where_it_is_asked_for(drive):
     folder, configured, estimated = drive
-    assert configured.noise_factors == {}
-    assert estimated.noise_factors["landmarks", "detections", "position"] < 0.75
+    assert configured.backend.noise.factors == {}
+    assert estimated.backend.noise.factors["landmarks", "detections", "position"] < 0.75
     errors = []
     for name, is_advised in (("configured", True), ("estimated", False)):
         scores = evaluate(folder / name, folder / "bag.mcap")
@@ -59,14 +59,14 @@ def test_the_scale_is_said_always_and_applied_where_it_is_asked_for(drive):
 def test_a_saved_map_has_the_noise_of_the_run_and_a_run_that_goes_on_keeps_it_or_goes_back_to_what_is_configured(drive):
     folder, configured, estimated = drive
     saved = read_map(folder / "estimated")
-    assert saved.noise_factors == estimated.noise_factors
+    assert saved.noise_factors == estimated.backend.noise.factors
     for table, other in zip(saved.graph.tables.values(), estimated.graph.tables.values(), strict=True):
         assert np.array_equal(table.sqrt_information.values, other.sqrt_information.values)
     for settings, before in ((ESTIMATED, estimated), (CONFIGURED, configured)):
         slam = GraphSlam(settings, start=read_map(folder / "estimated"))
-        neutral = slam.backend.noise.neutral()
-        assert slam.noise_factors == (estimated.noise_factors if before is estimated else neutral)
-        for table in slam.graph.tables.values():
+        neutral = slam.view.backend.noise.neutral()
+        assert slam.view.backend.noise.factors == (estimated.backend.noise.factors if before is estimated else neutral)
+        for table in slam.view.graph.tables.values():
             then = before.graph.tables[table.type].sqrt_information.values[:1]
             now = table.sqrt_information.values[:1]
             assert len(then)
@@ -93,10 +93,10 @@ def test_a_scale_that_cannot_be_estimated_is_counted_changes_nothing_and_the_end
 
     monkeypatch.setattr("graph_slam_ros.slam.backend.estimate_noise", fails)
     run = replay(tmp_path / "short.mcap", tmp_path / "run", ESTIMATED)
-    assert len(run.slam.keyframes) > FIRST_DUE
+    assert len(run.slam.view.keyframes) > FIRST_DUE
     assert run.slam.counters["noise_scale", "unsolved"] >= 2
-    assert run.slam.noise_factors == {}
-    assert run.slam.is_solved
+    assert run.slam.view.backend.noise.factors == {}
+    assert run.slam.view.is_solved
     saved = json.loads((tmp_path / "run" / "run.json").read_text())
     assert (saved["noise"], saved["noise_unknown"]) == ([], "landmark 3 is not determined")
     assert any("no noise could be estimated at the end: landmark 3" in one for one in run.warnings)

@@ -83,11 +83,11 @@ def landmarks(space):
     return {name: (*p, *so3.exp(tuple(rng.standard_normal(3)))) for name, p in points.items()}
 
 
-def errors(space, pipeline, true):
+def errors(space, view, true):
     """Distance of every keyframe from where it was."""
-    k = (pipeline.keyframes.stamps_ns - T0) * HZ // S
+    k = (view.keyframes.stamps_ns - T0) * HZ // S
     n = space.dimensions
-    return np.linalg.norm(pipeline.trajectory()[:, :n] - np.array(true)[k, :n], axis=1)
+    return np.linalg.norm(view.trajectory()[:, :n] - np.array(true)[k, :n], axis=1)
 
 
 @pytest.mark.parametrize(
@@ -101,11 +101,11 @@ def test_landmarks_seen_in_any_way_put_the_path_right(space, kind):
     world, observe = everything(space, [kind])
     pipeline, true, odom = driven(space, 20.0, observe, drift=0.02, each=4)
     drifted = np.linalg.norm(np.subtract(true[-1], odom[-1])[: space.dimensions])
-    assert set(pipeline.landmarks) == set(world)
-    assert not pipeline.waiting
-    assert errors(space, pipeline, true).max() < 0.1 * drifted
-    for name, landmark in pipeline.landmarks.items():
-        found = pipeline.solver.estimate([landmark.vertex])[0]
+    assert set(pipeline.view.landmarks) == set(world)
+    assert not pipeline.view.waiting
+    assert errors(space, pipeline.view, true).max() < 0.1 * drifted
+    for name, landmark in pipeline.view.landmarks.items():
+        found = pipeline.view.solver.estimate([landmark.vertex])[0]
         assert found[: space.dimensions] == pytest.approx(world[name][: space.dimensions], abs=0.1 * drifted)
 
 
@@ -113,7 +113,7 @@ def test_landmarks_seen_in_any_way_put_the_path_right(space, kind):
 def test_what_is_seen_between_keyframes_by_a_sensor_anywhere_costs_nothing_where_all_is_exact(space):
     _, observe = everything(space, ["position", "pose", "range_bearing", "bearing", "range"])
     pipeline, *_ = driven(space, 6.0, observe, each=3, keyframes__min_distance_m=1.0)
-    assert pipeline.report.chi2_final < 1e-6
+    assert pipeline.view.report.chi2_final < 1e-6
 
 
 def test_G3_a_landmark_seen_by_bearing_from_one_place_waits_and_says_why():
@@ -123,8 +123,8 @@ def test_G3_a_landmark_seen_by_bearing_from_one_place_waits_and_says_why():
         pipeline.process(
             Sightings(stamp(k), "seen", (sighting(PLANAR, "bearing", "a", (3.0, 1.0, 0), PLANAR.identity),))
         )
-    assert not pipeline.landmarks
-    assert "too few" in pipeline.waiting["a"]
+    assert not pipeline.view.landmarks
+    assert "too few" in pipeline.view.waiting["a"]
 
 
 def test_G5_both_mirror_places_of_a_landmark_are_kept_until_the_robot_turns():
@@ -133,14 +133,15 @@ def test_G5_both_mirror_places_of_a_landmark_are_kept_until_the_robot_turns():
         pipeline.process(Odometry(stamp(k), at))
         if k == 60:  # straight ahead all the way: the beacon is on the left or on the right
             waiting = pipeline._landmarks.map.undetermined["a"]
-            assert "2 places fit" in pipeline.waiting["a"]
+            assert "2 places fit" in pipeline.view.waiting["a"]
             found = sorted((place.position.tolist() for place in waiting.places), key=lambda at: at[1])
             assert np.array(found) == pytest.approx(np.array([[2.0, -3.0], [2.0, 3.0]]), abs=0.01)
         s = Sighting("a", "range", (float(np.hypot(at[0] - 2.0, at[1] - 3.0)),), covariance(1, 0.01))
         pipeline.process(Sightings(stamp(k), "ranges", (s,)))
         at = se2.retract(at, (1.0 / HZ, 0.0, 0.0 if k < 60 else 0.8 / HZ))
-    assert pipeline.solver.estimate([pipeline.landmarks["a"].vertex])[0] == pytest.approx([2.0, 3.0], abs=0.05)
-    assert not pipeline.waiting
+    view = pipeline.view
+    assert view.solver.estimate([view.landmarks["a"].vertex])[0] == pytest.approx([2.0, 3.0], abs=0.05)
+    assert not view.waiting
 
 
 @BOTH
@@ -155,8 +156,8 @@ def test_a_fix_that_lacks_an_axis_tells_of_the_others(space):
     measured[0] = 1e5
     pipeline.process(Fix(stamp(len(odom) - 1), "fix", "position", floats(measured), floats(unknown.ravel())))
     [pipeline.process(event) for event in END]
-    assert len(pipeline.graph.tables[space.coordinate_prior]) == n - 1
-    last = pipeline.trajectory()[-1, :n]
+    assert len(pipeline.view.graph.tables[space.coordinate_prior]) == n - 1
+    last = pipeline.view.trajectory()[-1, :n]
     assert np.abs(np.array(odom[-1][1:n]) - measured[1:]).min() > 0.09, "odometry alone is off"
     assert last[1:] == pytest.approx(measured[1:], abs=0.03)
     assert abs(last[0] - true[-1][0]) < 2.0  # turned a little, but not drawn to the nonsense
@@ -175,8 +176,8 @@ def test_the_next_odometry_takes_over_where_the_first_falls_silent_and_gives_way
     assert counted["camera"]["switched_to"] == 1
     assert counted["wheels"]["switched_to"] == 2  # the camera came first of all
     assert counted["camera"]["not_in_use"] > 250
-    assert errors(SPATIAL, pipeline, [SPATIAL.group.compose(elsewhere, p) for p in true]).max() < 1e-3
-    assert np.diff(pipeline.keyframes.stamps_ns).max() < 0.5 * S
+    assert errors(SPATIAL, pipeline.view, [SPATIAL.group.compose(elsewhere, p) for p in true]).max() < 1e-3
+    assert np.diff(pipeline.view.keyframes.stamps_ns).max() < 0.5 * S
 
 
 def driven(space, seconds, observe, drift=0.0, each=7, **settings):

@@ -44,8 +44,8 @@ def parked(seconds, jitter_rad, jitter_m, rng, hz=20):
 @pytest.mark.parametrize("jitter_rad, jitter_m", times([(2e-3, 1e-3)], [(2e-3, 0.0), (2e-3, 1e-3), (0.0, 2e-3)]))
 def test_a_parked_robot_whose_odometry_jitters_gets_no_keyframes(jitter_rad, jitter_m):
     p = run(slam(), *parked(120, jitter_rad, jitter_m, np.random.default_rng(1)))
-    assert len(p.keyframes) <= 2
-    seen = len(p.sighting_poses)
+    assert len(p.view.keyframes) <= 2
+    seen = len(p.view.sighting_poses)
     assert 115 <= seen <= 180, "one a second, once it rests"
     assert p.counters["camera", "thinned"] > 2 * 1000
 
@@ -58,10 +58,10 @@ def test_an_imu_at_50_hz_makes_no_keyframe_each():
         p.process(heading(k, hz, 0.3))
     run(p)
     driven_m = 0.01 * hz * seconds
-    assert len(p.keyframes) <= 1.5 * driven_m / 0.25
-    assert len(p.graph.edges_of("fixes")) == pytest.approx(seconds, abs=2)
+    assert len(p.view.keyframes) <= 1.5 * driven_m / 0.25
+    assert len(p.view.graph.edges_of("fixes")) == pytest.approx(seconds, abs=2)
     assert p.counters["imu", "thinned"] > 2800
-    assert p.trajectory()[-1, 2] == pytest.approx(0.3, abs=1e-3)
+    assert p.view.trajectory()[-1, 2] == pytest.approx(0.3, abs=1e-3)
 
 
 def test_errors_that_last_do_not_average_out():
@@ -73,7 +73,7 @@ def test_errors_that_last_do_not_average_out():
             p.process(Odometry(T0 + k * S // 20, (0.0, 0.0, 0.0)))
             p.process(heading(k, 20, 0.3))
         run(p)
-        sigmas[correlation_s] = float(np.sqrt(p.pose_covariance[2, 2]))
+        sigmas[correlation_s] = float(np.sqrt(p.view.pose_covariance[2, 2]))
     assert sigmas[0.0] == pytest.approx(0.02 / np.sqrt(2000), rel=0.05)
     assert sigmas[1.0] == pytest.approx(0.02 / np.sqrt(100.0 / 2.0), rel=0.15)
     assert sigmas[1000.0] == pytest.approx(0.02, rel=0.05)
@@ -101,5 +101,5 @@ def past_tags(p, speed):
 )
 def test_a_camera_that_sees_tags_at_12_hz_makes_no_keyframe_at_each_sighting(speed, heading, most):
     p = past_tags(slam(**{"odometry.rotation_density": heading}), speed)
-    assert len(p.keyframes) / (speed * 12.0) < most
-    assert np.abs(p.trajectory()[:, 1]).max() < 0.05
+    assert len(p.view.keyframes) / (speed * 12.0) < most
+    assert np.abs(p.view.trajectory()[:, 1]).max() < 0.05

@@ -52,8 +52,8 @@ def drive(config, far=None, seconds=6):
     return slam, taken, at
 
 
-def written(slam):
-    return slam.trajectory().tobytes(), slam.keyframe_covariances().tobytes(), list(slam.landmarks)
+def written(view):
+    return view.trajectory().tobytes(), view.keyframe_covariances().tobytes(), list(view.landmarks)
 
 
 @pytest.mark.parametrize("dimensions, association", [(2, "joint"), (3, "id")])
@@ -62,15 +62,15 @@ def test_a_detection_at_1e8_m_is_refused_and_changes_nothing(dimensions, associa
     far = np.zeros(dimensions)
     far[-1] = 1e8
     slam, taken, _ = drive(config, far)
-    assert not slam.failing
+    assert not slam.view.failing
     counted = slam.counters.as_dict()
     assert counted[SOURCE].pop("beyond_max_distance") == 2 * RATE
     undisturbed, _, _ = drive(config)
-    assert written(slam) == written(undisturbed)
+    assert written(slam.view) == written(undisturbed.view)
     replayed = GraphSlam(config)
     for m in taken:
         replayed.process(m)
-    assert written(replayed) == written(slam)
+    assert written(replayed.view) == written(slam.view)
     assert replayed.counters.as_dict()[SOURCE]["beyond_max_distance"] == 2 * RATE
 
 
@@ -80,9 +80,9 @@ def test_where_it_is_allowed_to_see_so_far_every_solve_still_succeeds(dimensions
     far = np.zeros(dimensions)
     far[axis] = 1e8
     slam, _, at = drive(config, far)
-    assert not slam.failing
+    assert not slam.view.failing
     assert "solver" not in slam.counters.as_dict()
-    assert np.linalg.norm(slam.trajectory()[-1][: len(at)] - at) < 0.1
+    assert np.linalg.norm(slam.view.trajectory()[-1][: len(at)] - at) < 0.1
 
 
 def seen_at(*distances, kind="range"):
@@ -115,7 +115,7 @@ def test_a_closure_farther_than_any_is_refused_and_counted():
     for event in ("end", "optimize"):
         slam.process(Control(event))
     assert slam.counters.as_dict() == {"loops": {"beyond_max_distance": 1}}
-    assert len(slam.graph.edges_of("closures")) == 1
+    assert len(slam.view.graph.edges_of("closures")) == 1
 
 
 @pytest.mark.parametrize(
@@ -134,7 +134,7 @@ def test_a_landmark_at_the_zenith_or_nadir_is_found_and_every_solve_succeeds(kin
         slam.process(Sightings(S + k * S // RATE, SOURCE, (Sighting("lamp", kind, measured, covariance),)))
     for event in ("end", "optimize"):
         slam.process(Control(event))
-    assert not slam.failing
-    assert slam.report.converged
+    assert not slam.view.failing
+    assert slam.view.report.converged
     assert slam.counters.as_dict() == {}
-    assert np.linalg.norm(slam.solver.estimate([slam.landmarks["lamp"].vertex])[0] - mark) < 0.1
+    assert np.linalg.norm(slam.view.solver.estimate([slam.view.landmarks["lamp"].vertex])[0] - mark) < 0.1

@@ -57,7 +57,7 @@ class Computer:
             self.session.load("")
 
     def heard(self, slam, _update):
-        self.keyframes = len(slam.keyframes)
+        self.keyframes = len(slam.view.keyframes)
 
     def die(self):
         """Nothing is saved; what is told is all that may be known of afterwards."""
@@ -65,7 +65,7 @@ class Computer:
         told = self.keyframes
         self.session._recorder.abandon()
         self.start()
-        return told - len(self.session.slam.keyframes)
+        return told - len(self.session.slam.view.keyframes)
 
 
 def usage():
@@ -89,11 +89,11 @@ def test_T19_hours_of_driving_parking_and_dying(tmp_path):
         computer.session.ingest([m])
     session = computer.session
     after = usage()
-    keyframes = len(session.slam.keyframes)
+    keyframes = len(session.slam.view.keyframes)
     faults = computer.failures + session.failures
     session.finish()
-    names = list(session.slam.landmarks)
-    at = [session.slam.solver.estimate([session.slam.landmarks[name].vertex])[0][:2] for name in names]
+    names = list(session.slam.view.landmarks)
+    at = [session.slam.view.solver.estimate([session.slam.view.landmarks[name].vertex])[0][:2] for name in names]
     true = np.array([recording.landmarks[name][:2] for name in names])
     found = np.column_stack((at, np.zeros(len(at))))
     moved = np.stack(se3.act(alignment(found[:, :2], true), tuple(found.T)), axis=1)[:, :2]

@@ -25,17 +25,17 @@ WRONG = [
 ]
 
 
-def nees(slam, truth, covariances):
+def nees(view, truth, covariances):
     """Mean of the poses' normalised errors squared, the frame of the map being that of the first pose."""
-    true = np.array([truth.at(int(stamp)) for stamp in slam.keyframes.stamps_ns])
-    error = slam.space.group.log(slam.space.group.between(tuple(true.T), tuple(slam.trajectory().T)))
+    true = np.array([truth.at(int(stamp)) for stamp in view.keyframes.stamps_ns])
+    error = view.space.group.log(view.space.group.between(tuple(true.T), tuple(view.trajectory().T)))
     every = np.stack(error, axis=-1)
     return float(np.mean(np.einsum("ni,nij,nj->n", every, np.linalg.pinv(covariances), every)))
 
 
-def of_noise(slam):
+def of_noise(view):
     """Covariances (n, 3, 3) of the keyframes that take all parameters for known."""
-    return np.array(slam.solver.marginal(slam.keyframes.ids))
+    return np.array(view.solver.marginal(view.keyframes.ids))
 
 
 @pytest.mark.parametrize("seed", range(times(1, 4)))
@@ -45,17 +45,17 @@ def test_what_is_off_is_told_with_its_sigma_covariances_contain_it_and_the_setti
 ):
     drive, truth = imperfect_drive_and_truth(faults, seed=seed, seconds=SECONDS)
     slam = driven(drive, settings)
-    noise = of_noise(slam)
-    assert {sentence.split(" of ")[0] for sentence in slam.contradicted} == {
+    noise = of_noise(slam.view)
+    assert {sentence.split(" of ")[0] for sentence in slam.view.contradicted} == {
         *("distance", "turn", "clock", "yaw", "x", "y")
     }
-    by_noise = nees(slam, truth, noise)
-    assert nees(slam, truth, slam.keyframe_covariances()) < min(6.0, 0.2 * by_noise)  # 3 is expected
-    assert np.linalg.eigvalsh(slam.keyframe_covariances() - noise).min() > -1e-9
-    assert slam.pose_covariance == pytest.approx(slam.keyframe_covariances()[-1])
+    by_noise = nees(slam.view, truth, noise)
+    assert nees(slam.view, truth, slam.view.keyframe_covariances()) < min(6.0, 0.2 * by_noise)  # 3 is expected
+    assert np.linalg.eigvalsh(slam.view.keyframe_covariances() - noise).min() > -1e-9
+    assert slam.view.pose_covariance == pytest.approx(slam.view.keyframe_covariances()[-1])
     if seed:
         return  # covariances are a matter of many drives
-    (one,) = slam.uncorrected()
+    (one,) = slam.view.uncorrected()
     assert (one.code, one.setting[0]) == (code, key)
     assert one.value == pytest.approx(value, abs=max(0.015, 4.0 * one.sigma))
     assert code in str(one)
@@ -65,17 +65,18 @@ def test_what_is_off_is_told_with_its_sigma_covariances_contain_it_and_the_setti
         mended = driven(drive, settings)
     else:
         mended = driven(drive, settings | dict([one.setting]))
-    assert not mended.uncorrected()
-    assert not mended.contradicted
-    assert nees(mended, truth, of_noise(mended)) < 0.5 * by_noise
+    assert not mended.view.uncorrected()
+    assert not mended.view.contradicted
+    assert nees(mended.view, truth, of_noise(mended.view)) < 0.5 * by_noise
 
 
 def assert_the_node_says_so(slam):
     """Trials begin at keyframes 50, 100, 200; what they find is told 20 keyframes later, and corrects nothing."""
-    assert np.trace(slam.pose_covariance) > 2.0 * np.trace(slam.solver.marginal(slam.keyframes.ids[-1:])[0])
-    (one,) = slam.uncorrected_so_far
+    view = slam.view
+    assert np.trace(view.pose_covariance) > 2.0 * np.trace(view.solver.marginal(view.keyframes.ids[-1:])[0])
+    (one,) = view.uncorrected_so_far
     of = {"is_confirmed": True, "is_resumed": False, "solve_s": 0.0, "slowest_solve_s": 0.0, "fit": 1.0, "doubted": ""}
-    estimate = estimate_of(slam, correction=slam.correction, unseen=UnseenWay(0, 0), **of)
+    estimate = estimate_of(slam, correction=view.correction, unseen=UnseenWay(0, 0), **of)
     facts = Facts("active", estimate=estimate)
     health = judge(facts, Config())
     assert (health.state, health.level) == ("DEGRADED", WARN)
@@ -90,9 +91,9 @@ def assert_the_node_says_so(slam):
 @pytest.mark.parametrize("seed", range(times(1, 4)))
 def test_nothing_is_told_of_a_drive_with_nothing_wrong(kind, seed):
     slam = driven(imperfect_drive_and_truth(Faults(), seed=seed, seconds=40.0, kind=kind)[0])
-    assert not slam.uncorrected()
-    assert not slam.contradicted
-    np.testing.assert_array_equal(slam.keyframe_covariances(), of_noise(slam))
+    assert not slam.view.uncorrected()
+    assert not slam.view.contradicted
+    np.testing.assert_array_equal(slam.view.keyframe_covariances(), of_noise(slam.view))
 
 
 @pytest.mark.parametrize(
@@ -126,7 +127,7 @@ def test_a_clock_that_was_set_on_the_way_is_told():
         for m in drive
     ]
     slam = driven(sorted(late, key=lambda m: m.stamp_ns))
-    (one,) = [one for one in slam.uncorrected() if one.code == "clock_jump"]
+    (one,) = [one for one in slam.view.uncorrected() if one.code == "clock_jump"]
     assert abs(one.value) > 0.15
     assert "in one half of the drive" in str(one)
     assert one.as_dict()["settings"] == {}

@@ -72,21 +72,21 @@ def driven(recording, association="joint", **settings):
     return slam
 
 
-def path_rmse(slam, recording):
+def path_rmse(view, recording):
     """Without alignment: map begins at the true start."""
-    at = np.searchsorted(recording.stamps_ns, slam.keyframes.stamps_ns)
-    error = slam.trajectory()[:, :2] - recording.T_world_base[at, :2]
+    at = np.searchsorted(recording.stamps_ns, view.keyframes.stamps_ns)
+    error = view.trajectory()[:, :2] - recording.T_world_base[at, :2]
     return float(np.sqrt(np.mean(np.sum(error**2, axis=1))))
 
 
-def places(slam):
-    return np.array([slam.solver.estimate([mark.vertex])[0][:2] for mark in slam.landmarks.values()])
+def places(view):
+    return np.array([view.solver.estimate([mark.vertex])[0][:2] for mark in view.landmarks.values()])
 
 
-def nearest_true(slam, recording):
+def nearest_true(view, recording):
     """Of each landmark the nearest true one, and how far that is."""
     true = np.array(list(recording.landmarks.values()))
-    apart = np.linalg.norm(places(slam)[:, None] - true[None], axis=2)
+    apart = np.linalg.norm(places(view)[:, None] - true[None], axis=2)
     return apart.argmin(axis=1), apart.min(axis=1)
 
 
@@ -95,14 +95,14 @@ def test_without_ids_the_path_is_as_near_to_the_truth_and_each_tree_is_there_onc
     """Where a region was ordered anew, what hangs below it in the tree may have a later key: covariances are right."""
     recording = park(seed, laps=times(1, 2))
     named, slam = driven(recording, "id"), driven(recording)
-    assert not slam.alarms
-    assert path_rmse(slam, recording) < 1.5 * path_rmse(named, recording)
-    which, apart = nearest_true(slam, recording)
+    assert not slam.view.alarms
+    assert path_rmse(slam.view, recording) < 1.5 * path_rmse(named.view, recording)
+    which, apart = nearest_true(slam.view, recording)
     assert apart.max() < 1.0
     assert len(set(which.tolist())) == len(which) >= 0.8 * len(recording.landmarks)
-    vertices = [mark.vertex for mark in slam.landmarks.values()]
-    joint = slam.solver.joint_marginal(vertices)
-    for k, one in enumerate(slam.solver.marginal(vertices)):
+    vertices = [mark.vertex for mark in slam.view.landmarks.values()]
+    joint = slam.view.solver.joint_marginal(vertices)
+    for k, one in enumerate(slam.view.solver.marginal(vertices)):
         assert one == pytest.approx(joint[2 * k : 2 * k + 2, 2 * k : 2 * k + 2], abs=1e-9)
 
 
@@ -112,7 +112,7 @@ def test_what_moves_is_given_up():
     recording = park(4, laps=1, clutter=around)
     slam = driven(recording)
     assert slam.counters["landmarks", "given_up"] > 0
-    assert nearest_true(slam, recording)[1].max() < 1.0
+    assert nearest_true(slam.view, recording)[1].max() < 1.0
 
 
 POSITION = (0.01, 0.0, 0.0, 0.01)
@@ -142,7 +142,7 @@ def test_each_landmark_is_the_one_it_was_and_no_other(places_of, seconds, expect
     standing(slam, places_of, seconds)
     slam.process(Control("end"))
     slam.process(Control("optimize"))
-    assert sorted(places(slam).tolist()) == [pytest.approx(at, abs=0.1) for at in expected]
+    assert sorted(places(slam.view).tolist()) == [pytest.approx(at, abs=0.1) for at in expected]
 
 
 def slipped(slam):
@@ -170,32 +170,32 @@ def test_where_the_leader_changes_sightings_change_hands_and_a_replay_has_the_sa
     config = Config.from_mapping({"landmarks.association": "joint", "odometry.rotation_density": 0.3})
     slam = slipped(GraphSlam(config, sink=taken.append))
     assert slam.counters["landmarks", "reassigned"] > 0
-    assert np.sort(places(slam), axis=0) == pytest.approx(np.array([[4.0, -2.2], [4.0, 0.0], [4.0, 2.2]]), abs=0.1)
-    edges = slam.graph.edges_of("landmarks").tolist()
-    live = {(edge, slam.graph.edge(edge).vertices[1]) for edge in edges if not slam.ledger.is_withdrawn(edge)}
-    of = {mark.vertex: {one.edge for one in mark.seen} for mark in slam.landmarks.values()}
+    assert np.sort(places(slam.view), axis=0) == pytest.approx(np.array([[4.0, -2.2], [4.0, 0.0], [4.0, 2.2]]), abs=0.1)
+    edges = slam.view.graph.edges_of("landmarks").tolist()
+    live = {(edge, slam.view.graph.edge(edge).vertices[1]) for edge in edges if not slam.view.ledger.is_withdrawn(edge)}
+    of = {mark.vertex: {one.edge for one in mark.seen} for mark in slam.view.landmarks.values()}
     assert {edge for edge, vertex in live if vertex in of} == set().union(*of.values())
     assert all(edge in of[vertex] for edge, vertex in live if vertex in of)
-    again = GraphSlam(slam.config)
+    again = GraphSlam(slam.view.config)
     for m in taken:
         again.process(m)
-    assert again.solver.values.tobytes() == slam.solver.values.tobytes()
-    assert list(again.landmarks) == list(slam.landmarks)
+    assert again.view.solver.values.tobytes() == slam.view.solver.values.tobytes()
+    assert list(again.view.landmarks) == list(slam.view.landmarks)
 
 
 def test_G19_where_association_asks_of_what_cannot_be_solved_no_covariance_is_known():
     slam = pipeline("joint")
     standing(slam, lambda t_s: [(8.0, 2.0)], 10.0)
-    assert np.isfinite(slam.landmark_covariances()).all()
-    slam.graph.add_vertex(R2, [0.0, 0.0])  # nothing determines it
+    assert np.isfinite(slam.view.landmark_covariances()).all()
+    slam.view.graph.add_vertex(R2, [0.0, 0.0])  # nothing determines it
     slam._landmarks.anonymous.forget_belief()  # so that association asks the solver
     slam.process(Sightings(10 * S, "seen", (Sighting("", "position", (8.0, 2.0), POSITION),)))
     slam.process(Control("end"))
     slam.process(Control("optimize"))
     assert slam.counters["seen", "unclear_which"] == 2
-    assert not slam.is_solved
-    assert np.isnan(slam.landmark_covariances()).all()
-    assert np.isnan(slam.keyframe_covariances()).all()
+    assert not slam.view.is_solved
+    assert np.isnan(slam.view.landmark_covariances()).all()
+    assert np.isnan(slam.view.keyframe_covariances()).all()
 
 
 @functools.cache
@@ -228,20 +228,20 @@ def seen_by(slam, *, has_class):
 
 def test_landmarks_near_one_another_are_told_apart_by_their_class_and_a_map_has_it_and_their_size(tmp_path):
     slam = seen_by(pipeline("joint"), has_class=True)
-    at = places(slam)
+    at = places(slam.view)
     apart = np.linalg.norm(at[:, None] - at, axis=2) + 100.0 * np.eye(len(at))
     assert len(at) == 16
     assert apart.min(axis=1).max() < 0.6
-    assert len(seen_by(pipeline("joint"), has_class=False).landmarks) < 16
+    assert len(seen_by(pipeline("joint"), has_class=False).view.landmarks) < 16
 
-    marks = slam.landmarks.values()
+    marks = slam.view.landmarks.values()
     assert sorted(mark.sort for mark in marks) == ["pole"] * 8 + ["tree"] * 8
     assert all(mark.size == pytest.approx({"tree": 0.5, "pole": 0.15}[mark.sort]) for mark in marks)
-    write_map(tmp_path / "map.mcap", slam.snapshot())
+    write_map(tmp_path / "map.mcap", slam.view.snapshot())
     start = read_map(tmp_path)
     assert [(m.sort, m.size, m.sized) for m in start.landmarks.values()] == [(m.sort, m.size, m.sized) for m in marks]
-    again = seen_by(GraphSlam(slam.config, start=start), has_class=True)
-    seen = {name: [one.sighting.sort for one in mark.seen] for name, mark in again.landmarks.items()}
+    again = seen_by(GraphSlam(slam.view.config, start=start), has_class=True)
+    seen = {name: [one.sighting.sort for one in mark.seen] for name, mark in again.view.landmarks.items()}
     wrong = sum(kind != start.landmarks[name].sort for name in start.landmarks for kind in seen[name])
     assert sum(map(len, seen.values())) > 1.5 * sum(len(mark.seen) for mark in marks), "they are seen again"
     assert wrong < 0.01 * sum(map(len, seen.values()))
@@ -257,9 +257,9 @@ def test_where_odometry_slips_what_was_seen_since_is_explained_anew():
         if m.stamp_ns > until_ns:
             break
         slam.process(without_ids(m))
-    assert [type(one) for one in slam.alarms] == [Slip]
-    assert path_rmse(slam, recording) < 0.5
-    assert nearest_true(slam, recording)[1].max() < 1.0
+    assert [type(one) for one in slam.view.alarms] == [Slip]
+    assert path_rmse(slam.view, recording) < 0.5
+    assert nearest_true(slam.view, recording)[1].max() < 1.0
 
 
 def put_back(recording, from_ns, to_ns):
@@ -281,20 +281,20 @@ def test_a_robot_that_was_carried_is_found_by_what_it_sees_as_a_whole():
     slam = pipeline("joint")
     for m in before:
         slam.process(without_ids(m))
-    assert not slam.alarms
+    assert not slam.view.alarms
     for m in again:
         slam.process(without_ids(m))
         if m.stamp_ns > begin_ns + (from_s + 8) * S:
             break
-    (alarm,) = slam.alarms
+    (alarm,) = slam.view.alarms
     assert alarm.began_ns < begin_ns + (from_s + 5) * S
-    assert len(slam.segments) == 2
-    stamps_ns = slam.keyframes.stamps_ns
+    assert len(slam.view.segments) == 2
+    stamps_ns = slam.view.keyframes.stamps_ns
     after = np.flatnonzero(stamps_ns > begin_ns + (from_s + 1) * S)
     same = np.searchsorted(stamps_ns, stamps_ns[after] - (from_s - to_s) * S)  # it was there before, and sees the same
-    path = slam.trajectory()[:, :2]
+    path = slam.view.trajectory()[:, :2]
     assert np.linalg.norm(path[after] - path[same], axis=1).max() < 0.6
-    assert len(slam.landmarks) <= len(recording.landmarks)
+    assert len(slam.view.landmarks) <= len(recording.landmarks)
 
 
 SCALE = 1.1  # odometry tells so many times the way
@@ -320,28 +320,28 @@ def corrected(circle, tmp_path_factory):
     slam, folder = GraphSlam(Config.from_mapping(FACTORS)), tmp_path_factory.mktemp("corrected")
     for m in too_long(circle):
         slam.process(m)
-    write_map(folder / "map.mcap", slam.snapshot())
+    write_map(folder / "map.mcap", slam.view.snapshot())
     return slam, read_map(folder)
 
 
 def test_the_factor_that_the_association_finds_corrects_the_graph(circle, corrected):
     slam, _ = corrected
-    assert slam.calibrated("odometry", "distance") == pytest.approx(1.0 / SCALE, abs=0.015)
-    assert slam.calibrated("odometry", "turn") == 1.0, "one circle does not determine it"
-    assert slam.found_settings == {"odometry.distance_factor": pytest.approx(1.0 / SCALE, abs=0.015)}
-    assert [one.parameter.name for one in slam.corrected] == ["distance"] * len(slam.corrected)
-    assert path_rmse(slam, circle) < 0.4
-    assert len(slam.landmarks) == len(circle.landmarks)
+    assert slam.view.calibrated("odometry", "distance") == pytest.approx(1.0 / SCALE, abs=0.015)
+    assert slam.view.calibrated("odometry", "turn") == 1.0, "one circle does not determine it"
+    assert slam.view.found_settings == {"odometry.distance_factor": pytest.approx(1.0 / SCALE, abs=0.015)}
+    assert [one.parameter.name for one in slam.view.corrected] == ["distance"] * len(slam.view.corrected)
+    assert path_rmse(slam.view, circle) < 0.4
+    assert len(slam.view.landmarks) == len(circle.landmarks)
 
 
 def test_a_map_has_the_corrected_measurements_and_goes_on_with_its_factors_whatever_is_configured(corrected):
     slam, state = corrected
-    assert slam.corrected
-    assert state.calibration == slam.calibration
-    for mine, read in zip(slam.graph.tables.values(), state.graph.tables.values(), strict=True):
+    assert slam.view.corrected
+    assert state.calibration == slam.view.calibration
+    for mine, read in zip(slam.view.graph.tables.values(), state.graph.tables.values(), strict=True):
         np.testing.assert_array_equal(read.measured.values, mine.measured.values)
         np.testing.assert_array_equal(read.sqrt_information.values, mine.sqrt_information.values)
-    state.values = slam.solver.values
+    state.values = slam.view.solver.values
     again = GraphSlam(Config.from_mapping(FACTORS | {"odometry.distance_factor": 1.2}), start=state)
-    assert again.calibrated("odometry", "distance") == pytest.approx(slam.calibrated("odometry", "distance"))
-    assert again.calibration == pytest.approx(slam.calibration)
+    assert again.view.calibrated("odometry", "distance") == pytest.approx(slam.view.calibrated("odometry", "distance"))
+    assert again.view.calibration == pytest.approx(slam.view.calibration)

@@ -54,7 +54,7 @@ def test_a_what_if_is_that_of_solve(faulty, loss, capsys):
     assert places(found)[:, :2] == pytest.approx(expected[:, :2], abs=1e-5)
     assert np.abs(expected - faulty.saved.solver.estimate(faulty.saved.keyframes)).max() > 0.01, "something moves"
     for name, place in found["landmarks"].items():
-        assert place == pytest.approx(solver.estimate([faulty.saved.slam.landmarks[name].vertex])[0], abs=1e-5)
+        assert place == pytest.approx(solver.estimate([faulty.saved.view.landmarks[name].vertex])[0], abs=1e-5)
     words = ["explain", str(faulty.run), "--without", *map(str, out), "--with", *map(str, back)]
     assert cli.main([*words, *(["--loss", loss] if loss else [])]) == 0
     before, after = found["chi2"]
@@ -117,7 +117,7 @@ def test_edits_of_the_path_are_tried_as_they_are_saved_and_decisions_that_change
         {e.edge: e.verdict.name.lower().replace("_", " ") for e in one.entries} for one in (faulty.saved, saved)
     )
     changed = [[edge, was, after[edge]] for edge, was in before.items() if was != after[edge]]
-    own = {edge for done in saved.slam.edits for edge in done.edges}
+    own = {edge for done in saved.view.edits for edge in done.edges}
     assert attempted["changes"] == [one for one in changed if one[0] not in own] != []
 
 

@@ -94,8 +94,8 @@ def test_what_happens_to_a_recording_leaves_the_path_nearly_as_good(world, tmp_p
             for m in some:
                 bag.write(m.topic, opened.topics[m.topic].type, m.log_ns, m.cdr)
         slam = replay(tmp_path / "bag.mcap", tmp_path / "run", Config.from_mapping(config), force=True).slam
-        assert np.isfinite(slam.trajectory()).all() and np.isfinite(slam.keyframe_covariances()).all()
-        assert len(slam.segments) == segments
+        assert np.isfinite(slam.view.trajectory()).all() and np.isfinite(slam.view.keyframe_covariances()).all()
+        assert len(slam.view.segments) == segments
         return evaluate(tmp_path / "run", str(clean)).estimate.position_m["rmse"]
 
     before = error_m(messages, 1)

@@ -280,7 +280,7 @@ class Reference:
         assert not losses
         assert len({state["run.json"] for state in saved}) == 2
         acknowledged, slam = replayed(records, config_of(folder))
-        return cls(records, acknowledged, saved, slam.trajectory())
+        return cls(records, acknowledged, saved, slam.view.trajectory())
 
     def faults(self, folder, told, deep):
         """What is wrong with a folder that such a run has left, having told so much; ``deep``: by a replay, too."""
@@ -295,9 +295,9 @@ class Reference:
         least, keyframes = self.acknowledged[updates - 1]
         assert len(records) >= least, f"{len(records)} records of {least} that were acknowledged"
         if deep:
-            _, slam = replayed(records, run_config(folder))
-            assert len(slam.keyframes) >= keyframes, f"{len(slam.keyframes)} keyframes of {keyframes}"
-            known, restored = slam.keyframes.stamps_ns[:keyframes], map_of(folder, []).keyframes.stamps_ns[:keyframes]
+            again = replayed(records, run_config(folder))[1].view.keyframes
+            assert len(again) >= keyframes, f"{len(again)} keyframes of {keyframes}"
+            known, restored = (some.stamps_ns[:keyframes] for some in (again, map_of(folder, []).keyframes))
             assert restored.tolist() == known.tolist(), "the newest map, with the rest of the journal, has other ones"
         for name in RESULTS:
             there = (folder / name).read_bytes() if (folder / name).is_file() else None
@@ -324,7 +324,7 @@ def replayed(records, config):
     slam = GraphSlam(config, accepted.append)
     for record in records:
         if slam.process(from_record(record)):
-            acknowledged.append((len(accepted), len(slam.keyframes)))
+            acknowledged.append((len(accepted), len(slam.view.keyframes)))
     return acknowledged, slam
 
 
@@ -520,10 +520,10 @@ class Trial:
         assert not losses, losses
         assert measured(records) == measured(reference.records), "the journal is not complete"
         _, again = replayed(records, run_config(self._folder))
-        assert np.array_equal(again.trajectory(), session.slam.trajectory()), "the journal gives another path"
-        assert np.allclose(session.slam.trajectory(), reference.trajectory, rtol=0.0, atol=1e-6), "another path"
+        assert np.array_equal(again.view.trajectory(), session.slam.view.trajectory()), "the journal gives another path"
+        assert np.allclose(session.slam.view.trajectory(), reference.trajectory, rtol=0.0, atol=1e-6), "another path"
         assert not list(self._folder.glob(f"*{NEW}")), "a new file was left there"
-        assert json.loads((self._folder / "run.json").read_text())["keyframes"] == len(session.slam.keyframes)
+        assert json.loads((self._folder / "run.json").read_text())["keyframes"] == len(session.slam.view.keyframes)
 
 
 def measured(records):

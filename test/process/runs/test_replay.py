@@ -71,9 +71,9 @@ def contents(folder, names=RESULTS):
 def test_a_run_folder_holds_what_it_says(folder, run):
     assert {file.name for file in folder.iterdir()} == ALL
     summary = json.loads((folder / "run.json").read_text())
-    assert summary["keyframes"] == len(run.slam.keyframes) > 50
-    assert summary["landmarks"] == len(run.slam.landmarks) > 10
-    assert summary["edges"] == run.slam.graph.edge_count == summary["keyframes"] + summary["sightings"]
+    assert summary["keyframes"] == len(run.slam.view.keyframes) > 50
+    assert summary["landmarks"] == len(run.slam.view.landmarks) > 10
+    assert summary["edges"] == run.slam.view.graph.edge_count == summary["keyframes"] + summary["sightings"]
     assert sum(c["edges"] for c in summary["classes"].values()) == summary["edges"]
     assert sum(c["chi2"] for c in summary["classes"].values()) == pytest.approx(summary["chi2"])
     assert summary["converged"]
@@ -120,7 +120,7 @@ def test_a_run_in_several_parts_with_odd_names_is_replayed_as_one_with_its_confi
     assert len(parts_of(tmp_path / "run")) > 4
     assert run_config(tmp_path / "run") == config
     with (tmp_path / "run" / "landmarks.csv").open(newline="") as stream:
-        assert [row[0] for row in csv.reader(stream)][1:] == list(slam.landmarks)
+        assert [row[0] for row in csv.reader(stream)][1:] == list(slam.view.landmarks)
     replay(tmp_path / "run", tmp_path / "again")
     assert contents(tmp_path / "again") == contents(tmp_path / "run")
     assert run_config(tmp_path / "again") == config
@@ -171,26 +171,26 @@ def test_the_graph_file_reads_back_with_poses_first_and_stamps_beside_it(folder,
     table = [line.split(",") for line in (folder / "graph_vertices.csv").read_text().splitlines()]
     assert table[0] == ["id", "vertex", "stamp_ns", "name"]
     keyframes = [row for row in table[1:] if row[1] == "keyframe"]
-    assert [int(row[2]) for row in keyframes] == [k.stamp_ns for k in run.slam.keyframes]
-    assert [int(row[0]) for row in table[1:]] == list(range(run.slam.graph.vertex_count))
-    assert [row[3] for row in table[1 + len(keyframes) :]] == list(run.slam.landmarks)
+    assert [int(row[2]) for row in keyframes] == [k.stamp_ns for k in run.slam.view.keyframes]
+    assert [int(row[0]) for row in table[1:]] == list(range(run.slam.view.graph.vertex_count))
+    assert [row[3] for row in table[1 + len(keyframes) :]] == list(run.slam.view.landmarks)
     by_id = dict(zip(file.ids, range(len(file.ids)), strict=True))
     offset = file.graph.offset.values[[by_id[k] for k in range(len(keyframes))]]
     read = file.graph.initial.values[offset[:, None] + np.arange(3)]
-    assert read == pytest.approx(run.slam.trajectory(), abs=1e-12)
+    assert read == pytest.approx(run.slam.view.trajectory(), abs=1e-12)
 
 
 def test_trajectories_have_a_line_for_each_keyframe_and_each_sighting(folder, run):
     path = read_tum(folder / "path.tum")
-    assert path.poses[:, :2] == pytest.approx(run.slam.trajectory()[:, :2])
+    assert path.poses[:, :2] == pytest.approx(run.slam.view.trajectory()[:, :2])
     stamps = [
         int(a) * 10**9 + int(b) for a, b in re.findall(r"^(\d+)\.(\d{9}) ", (folder / "path.tum").read_text(), re.M)
     ]
-    assert stamps == [k.stamp_ns for k in run.slam.keyframes]
+    assert stamps == [k.stamp_ns for k in run.slam.view.keyframes]
     for name, poses in (
-        ("sightings.tum", run.slam.sighting_trajectory()),
-        ("odometry.tum", run.slam.sighting_odometry()),
-        ("path_odometry.tum", run.slam.keyframes.poses),
+        ("sightings.tum", run.slam.view.sighting_trajectory()),
+        ("odometry.tum", run.slam.view.sighting_odometry()),
+        ("path_odometry.tum", run.slam.view.keyframes.poses),
     ):
         assert read_tum(folder / name).poses[:, :2] == pytest.approx(poses[:, :2])
 
@@ -199,11 +199,11 @@ def test_the_table_of_landmarks_has_estimate_and_covariance(folder, run):
     rows = [line.split(",") for line in (folder / "landmarks.csv").read_text().splitlines()]
     spread = ["cov_xx", "cov_xy", "cov_xtheta", "cov_yy", "cov_ytheta", "cov_thetatheta"]
     assert rows[0] == ["id", "kind", "x", "y", "theta", "sightings", *spread]
-    covariances = {name: covariance for name, _, covariance in results.landmark_estimates(run.slam)}
-    assert [row[0] for row in rows[1:]] == list(run.slam.landmarks)
+    covariances = {name: covariance for name, _, covariance in results.landmark_estimates(run.slam.view)}
+    assert [row[0] for row in rows[1:]] == list(run.slam.view.landmarks)
     for row in rows[1:]:
-        landmark = run.slam.landmarks[row[0]]
-        assert [float(v) for v in row[2:5]] == run.slam.solver.estimate([landmark.vertex])[0].tolist()
+        landmark = run.slam.view.landmarks[row[0]]
+        assert [float(v) for v in row[2:5]] == run.slam.view.solver.estimate([landmark.vertex])[0].tolist()
         assert int(row[5]) == landmark.sightings
         assert np.array(row[6:], float) == pytest.approx(covariances[row[0]][np.triu_indices(3)], rel=1e-8)
 
@@ -268,13 +268,13 @@ def test_a_run_in_space_leaves_positions_rotations_and_all_covariances(tmp_path)
     for m in [*flown[: len(flown) // 4], Control("end"), Control("optimize")]:
         recorder.record(slam, slam.process(m))
     recorder.save(slam)
-    assert read_tum(tmp_path / "run" / "path.tum").poses == pytest.approx(slam.trajectory(), abs=1e-12)
+    assert read_tum(tmp_path / "run" / "path.tum").poses == pytest.approx(slam.view.trajectory(), abs=1e-12)
     header, *rows = [line.split(",") for line in (tmp_path / "run" / "landmarks.csv").read_text().splitlines()]
     names = ["x", "y", "z", "rx", "ry", "rz"]
     pairs = [(i, j) for i in range(6) for j in range(i, 6)]
     assert header[:10] == ["id", "kind", "x", "y", "z", "qx", "qy", "qz", "qw", "sightings"]
     assert header[10:] == [f"cov_{names[i]}{names[j]}" for i, j in pairs]
-    estimates = {name: (value, covariance) for name, value, covariance in results.landmark_estimates(slam)}
+    estimates = {name: (value, covariance) for name, value, covariance in results.landmark_estimates(slam.view)}
     assert {row[1] for row in rows} == {"pose", "point"}
     for row in rows:
         value, covariance = estimates[row[0]]

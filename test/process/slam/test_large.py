@@ -35,10 +35,10 @@ def test_G25_a_drive_past_very_many_identities_has_each_where_it_is():
         slam.process(Sightings(10**18 + k * S // 2, "tags", tuple(seen)))
     for event in ("end", "optimize"):
         slam.process(Control(event))
-    assert len(slam.landmarks) == count
+    assert len(slam.view.landmarks) == count
     assert slam.counters.as_dict() == {}
-    found = np.array([slam.solver.estimate([mark.vertex]) for mark in slam.landmarks.values()]).reshape(-1, 2)
-    told = slam.trajectory()[np.arange(count) // EACH]
+    found = np.array([slam.view.solver.estimate([mark.vertex]) for mark in slam.view.landmarks.values()]).reshape(-1, 2)
+    told = slam.view.trajectory()[np.arange(count) // EACH]
     off = found - told[:, :2] - np.array([[1.0 + 0.2 * (k % EACH), 2.0] for k in range(count)])
     assert np.abs(off).max() < 0.2, "each stands where it was seen from its keyframe"
     worst = {"cpu_s": time.process_time() - start_s, "mib": mebibytes(resource.RUSAGE_SELF)}

@@ -74,10 +74,10 @@ class Faulty:
     """The real solver of a pipeline, one of whose calls goes wrong from the n-th on, so many times."""
 
     def __init__(self, p, method, kind, first, count, rng):
-        self.solver, self.kind, self.rng = p.solver, kind, rng
+        self.solver, self.kind, self.rng = p.view.solver, kind, rng
         self.calls, self.first, self.end = 0, first, first + count
-        self.real = getattr(p.solver, method)
-        setattr(p.solver, method, self)
+        self.real = getattr(p.view.solver, method)
+        setattr(p.view.solver, method, self)
 
     @property
     def struck(self):
@@ -117,25 +117,25 @@ def struck(seed):
     good, failing_for = np.empty((0, 3)), 0
     for m in (*drive(seed % 10), *END):
         update = p.process(m)
-        poses = p.trajectory()
+        poses = p.view.trajectory()
         assert np.isfinite(poses).all()
-        assert np.isfinite(p.pose_covariance).all()
-        if p.failing:
+        assert np.isfinite(p.view.pose_covariance).all()
+        if p.view.failing:
             assert poses[: len(good)] == pytest.approx(good, abs=1e-12), "the last good estimate stays"
             failing_for += len(update.keyframes)
-            assert failing_for <= 3, f"{failing_for} keyframes of {p.failing}"
+            assert failing_for <= 3, f"{failing_for} keyframes of {p.view.failing}"
         elif update.solved:
             good, failing_for = poses, 0
     for _ in range(3):
-        if p.failing:
+        if p.view.failing:
             p.process(Control("optimize"))
-    assert not p.failing
+    assert not p.view.failing
     return p, faulty
 
 
 @cache
 def undisturbed(seed):
-    return run(pipeline(), (*drive(seed), *END)).trajectory()
+    return run(pipeline(), (*drive(seed), *END)).view.trajectory()
 
 
 @pytest.mark.parametrize("part", times([6], range(10)))
@@ -144,7 +144,7 @@ def test_T14_whatever_fails_at_any_solve_the_last_good_estimate_stays_and_soon_o
     for seed in range(part, times(60, 2000), 10):
         p, faulty = struck(seed)
         tried, hit = tried + 1, hit + faulty.struck
-        assert p.trajectory() == pytest.approx(undisturbed(seed % 10), abs=0.05)
+        assert p.view.trajectory() == pytest.approx(undisturbed(seed % 10), abs=0.05)
     tell("solver_faults", tried=tried, faults=hit, failed=0)
     assert hit > 0.3 * tried
 
@@ -155,12 +155,12 @@ def test_P23_to_go_back_to_the_last_good_estimate_in_a_solver_made_anew_changes_
     for k, m in enumerate(drive(0)):
         p.process(m)
         if k == at:
-            before = p.trajectory()
+            before = p.view.trajectory()
             p.process(Control("restart"))
-            assert p.trajectory() == pytest.approx(before, abs=1e-12)
-            assert np.isnan(p.keyframe_covariances()).all(), "unknown until the next solve"
+            assert p.view.trajectory() == pytest.approx(before, abs=1e-12)
+            assert np.isnan(p.view.keyframe_covariances()).all(), "unknown until the next solve"
     run(p, END)
-    assert p.trajectory() == pytest.approx(undisturbed(0), abs=1e-4)
+    assert p.view.trajectory() == pytest.approx(undisturbed(0), abs=1e-4)
     assert not p.counters.as_dict()
 
 
@@ -169,7 +169,7 @@ BAD, RAISED_ONLY, DEGRADED, FINE = 5, 10, 11, 12
 
 def squeezed(p, measurements, seed):
     """In a child: go on with hardly any memory (4 KiB for Python), then with enough; how that went, as an exit code."""
-    rng, good, code, ballast = random.Random(seed), p.trajectory(), FINE, []
+    rng, good, code, ballast = random.Random(seed), p.view.trajectory(), FINE, []
     mapped = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     unlimited = resource.getrlimit(resource.RLIMIT_AS)[1]
     resource.setrlimit(resource.RLIMIT_AS, (mapped + rng.choice([0, 1 << 20, 1 << 22]), unlimited))
@@ -182,20 +182,20 @@ def squeezed(p, measurements, seed):
     for m in measurements[:-20]:
         try:
             p.process(m)
-            code = min(code, DEGRADED if p.failing else FINE)
+            code = min(code, DEGRADED if p.view.failing else FINE)
         except (MemoryError, SystemError):  # what the node counts, and goes on; compiled code raises either
             code = RAISED_ONLY
     resource.setrlimit(resource.RLIMIT_AS, (unlimited, unlimited))
     del ballast
-    if not is_where_it_was(p, good):
+    if not is_where_it_was(p.view, good):
         return BAD
     run(p, measurements[-20:])
-    return code if not p.failing and is_where_it_was(p, good) else BAD + 1
+    return code if not p.view.failing and is_where_it_was(p.view, good) else BAD + 1
 
 
-def is_where_it_was(p, good):
+def is_where_it_was(view, good):
     """Headings that differ by whole turns are the same."""
-    now = p.trajectory()
+    now = view.trajectory()
     away = [np.abs(se2.between(tuple(a), tuple(b))).max() for a, b in zip(good, now[: len(good)], strict=True)]
     return bool(np.isfinite(now).all()) and max(away) < 0.01
 

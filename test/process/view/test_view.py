@@ -277,7 +277,7 @@ def test_a_map_is_repaired_by_what_the_page_says(browser, tmp_path):
         page.click("#save")
         page.wait_for_function("document.getElementById('saved').innerText.startsWith('Saved')")
         assert "The saved map: " in page.inner_text("#saved")
-    assert sorted(e.edit.values["edge"] for e in restored(tmp_path / "run_edited", []).edits) == sorted(wrong[:4])
+    assert sorted(e.edit.values["edge"] for e in restored(tmp_path / "run_edited", []).view.edits) == sorted(wrong[:4])
 
 
 def test_a_closure_is_dragged_and_axe_finds_nothing_wrong(browser, faulty):
@@ -301,7 +301,7 @@ def test_a_closure_is_dragged_and_axe_finds_nothing_wrong(browser, faulty):
         page.wait_for_function("() => field('pose').value")
         pose = [float(number) for number in page.input_value("#fields input[name=pose]").split(",")]
         saved = SavedGraph(faulty, [])
-        (x, y, turn), (_, _, other) = saved.slam.solver.estimate([saved.keyframes[5], saved.keyframes[30]])
+        (x, y, turn), (_, _, other) = saved.view.solver.estimate([saved.keyframes[5], saved.keyframes[30]])
         c, s = np.cos(turn), np.sin(turn)
         assert x + c * pose[0] - s * pose[1] == pytest.approx(place[0], abs=0.3)
         assert y + s * pose[0] + c * pose[1] == pytest.approx(place[1], abs=0.3)

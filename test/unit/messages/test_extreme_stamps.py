@@ -117,7 +117,7 @@ def test_B25_what_is_dated_beyond_all_else_counts_and_the_rest_gives_what_it_giv
     assert found.keys() == expected.keys()
     assert sum(found.values()) == times * len(wrong), "each is counted once"
     assert all(n is None or n == found[reason] for reason, n in expected.items())
-    np.testing.assert_array_equal(slam.trajectory(), clean[0].trajectory())
+    np.testing.assert_array_equal(slam.view.trajectory(), clean[0].view.trajectory())
     tell("extreme_stamps", tried=times * len(wrong), failed=0)
 
 
@@ -126,7 +126,7 @@ def test_B25_a_drive_that_begins_or_ends_where_time_does_is_the_same_drive(tmp_p
     monkeypatch.setattr("messages.STAMP_NS", start_ns)
     slam, counts = run(open_bag(record_drive(tmp_path / f"{start_ns}.mcap", 4)))
     assert counts == clean[1]
-    np.testing.assert_allclose(slam.trajectory(), clean[0].trajectory(), atol=1e-9)
+    np.testing.assert_allclose(slam.view.trajectory(), clean[0].view.trajectory(), atol=1e-9)
 
 
 def test_B25_an_offset_does_not_lead_beyond_the_end_of_time_and_results_are_not_dated_there():

@@ -164,11 +164,11 @@ def record(file, ends):
 def test_A34_a_recording_of_two_odometries_on_one_topic_gives_what_one_would_also_where_the_first_ends(tmp_path, ends):
     truth = record(tmp_path / "two.mcap", ends)
     done = replay(tmp_path / "two.mcap", tmp_path / "run")
-    assert done.slam.segments == [0], "no segment begins"
-    k = round((done.slam.keyframes[-1].stamp_ns - 10**18) / 10**8)
-    assert k > 290 and math.dist(done.slam.trajectory()[-1][:2], truth[k][:2]) < 0.3
+    assert done.slam.view.segments == [0], "no segment begins"
+    k = round((done.slam.view.keyframes[-1].stamp_ns - 10**18) / 10**8)
+    assert k > 290 and math.dist(done.slam.view.trajectory()[-1][:2], truth[k][:2]) < 0.3
     counters = done.summary["counters"]
     assert counters["odom#2"]["switched_to"] == 1 if ends < 300 else counters["odom"] == {"other_publisher": 300}
     for name, at in TAGS.items():
-        there = done.slam.solver.estimate([done.slam.landmarks[name].vertex])[0, :2]
+        there = done.slam.view.solver.estimate([done.slam.view.landmarks[name].vertex])[0, :2]
         assert math.dist(there, at) < 0.3

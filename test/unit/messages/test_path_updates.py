@@ -16,7 +16,7 @@ STAMP_NS = 1_700_000_000_000_000_000
 
 
 def standing_in(space, poses, first=0):
-    """What an update reads of a GraphSlam, with poses of our choice; ``first`` is the number of the first."""
+    """What an update reads of a MapView, with poses of our choice; ``first`` is the number of the first."""
     poses = np.array(poses, dtype=float)
     return SimpleNamespace(
         space=space,

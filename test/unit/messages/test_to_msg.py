@@ -151,18 +151,18 @@ def test_what_is_published_of_a_drive_fits_together_and_covariances_are_in_the_a
         slam.process(Sightings(STAMP_NS + k * 10**9, "/landmarks", (tag,)))
     for event in ("flush", "optimize"):
         slam.process(Control(event))
-    whole, pose = decode(results.path(slam), results.PATH), decode(results.pose(slam), results.POSE)
+    whole, pose = decode(results.path(slam.view), results.PATH), decode(results.pose(slam.view), results.POSE)
     last = whole.poses[-1]
     assert whole.header.frame_id == pose.header.frame_id == "world"
     assert pose.header.stamp == last.header.stamp
     assert numbers(pose.pose.pose)[:2] == pytest.approx(numbers(last.pose)[:2], abs=1e-9)
-    thin = decode(results.path(slam, 4), results.PATH)
+    thin = decode(results.path(slam.view, 4), results.PATH)
     assert (len(whole.poses), thin.poses, thin.header) == (8, [whole.poses[k] for k in (0, 4, 7)], whole.header)
-    ((_, (*_, yaw), covariance),) = results.landmark_estimates(slam)
-    (marginal,) = slam.solver.marginal([slam.landmarks["tag"].vertex])
+    ((_, (*_, yaw), covariance),) = results.landmark_estimates(slam.view)
+    (marginal,) = slam.view.solver.marginal([slam.view.landmarks["tag"].vertex])
     turn = so3.matrix(so3.exp((0.0, 0.0, yaw)))
     assert covariance == pytest.approx(turn @ marginal @ turn.T)
-    slam.graph.add_vertex(R2, [0.0, 0.0])  # nothing determines it: the next solve fails
+    slam.view.graph.add_vertex(R2, [0.0, 0.0])  # nothing determines it: the next solve fails
     slam.process(Control("optimize"))
     assert slam.counters.as_dict() == {"solver": {"unsolved": 1}}
-    assert all(np.isnan(one).all() for _, _, one in results.landmark_estimates(slam)), "nothing to be mistaken for one"
+    assert all(np.isnan(one).all() for _, _, one in results.landmark_estimates(slam.view)), "none is mistaken for one"

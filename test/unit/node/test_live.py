@@ -21,7 +21,7 @@ from graph_slam_ros.node.pose_extrapolator import PoseExtrapolator
 from graph_slam_ros.node.session import Session
 from graph_slam_ros.node.tf_broadcaster import MapToOdom
 from graph_slam_ros.runs.tables import accepted_lately
-from graph_slam_ros.slam import Config, Counters, GraphSlam, Odometry, Sighting, Sightings
+from graph_slam_ros.slam import Config, Counters, MapView, Odometry, Sighting, Sightings
 
 NS = 1_000_000_000
 
@@ -74,14 +74,14 @@ def test_odometry_in_the_map_is_ahead_of_the_keyframes_and_as_uncertain_as_a_key
     at, covariance = reckoning.pose(rare.estimate)
     often.ingest([drive(dimensions, 20)])
     slam = often.slam
-    assert (slam.keyframes[-1].stamp_ns, len(slam.keyframes)) == (drive(dimensions, 20).stamp_ns, 21)
+    assert (slam.view.keyframes[-1].stamp_ns, len(slam.view.keyframes)) == (drive(dimensions, 20).stamp_ns, 21)
     assert rare.estimate.keyframes < 10
-    assert at == pytest.approx(slam.trajectory()[-1], abs=1e-9)
+    assert at == pytest.approx(slam.view.trajectory()[-1], abs=1e-9)
     assert at == pytest.approx(
-        rare.slam.space.group.compose(rare.slam.T_map_odom, drive(dimensions, 20).T_odom_base), abs=1e-9
+        rare.slam.view.space.group.compose(rare.slam.view.T_map_odom, drive(dimensions, 20).T_odom_base), abs=1e-9
     )
     if heard_from == 0:
-        assert covariance == pytest.approx(slam.pose_covariance, rel=1e-3, abs=1e-6)  # an edge has a least noise
+        assert covariance == pytest.approx(slam.view.pose_covariance, rel=1e-3, abs=1e-6)  # an edge has a least noise
 
 
 def seen(stamp_ns):
@@ -125,12 +125,12 @@ def test_the_weakest_direction_of_the_newest_pose_and_the_way_without_a_landmark
         if k == 30:
             assert session.estimate.unseen.length_m == pytest.approx(0.0, abs=0.5)
             assert "no landmark" not in status((tags(),)).message
-    assert session.slam.segments[-1] > 0
+    assert session.slam.view.segments[-1] > 0
     assert session.estimate.unseen.length_m == pytest.approx(20.7, abs=0.7)
     seen = status((odom(), tags()))
     for_m = f"; position and heading weak for {session.estimate.unseen.length_m:.0f} m: no landmark seen"
     assert seen.message.endswith(for_m)
-    (landmark,), covariance = session.slam.landmark_covariances(["a"]), session.slam.pose_covariance
+    (landmark,), covariance = session.slam.view.landmark_covariances(["a"]), session.slam.view.pose_covariance
     known, sigma = (float(np.sqrt(np.linalg.eigvalsh(one[:2, :2])[-1])) for one in (landmark, covariance))
     assert seen.values["landmark"].startswith(f"landmark a {known:.3f} m ")
     assert "no landmark" not in status((odom(),)).message, "none is used"
@@ -249,8 +249,8 @@ def test_an_input_of_which_most_is_not_accepted_lately_is_named():
         robot.ingest([drive(2, k)])
         seen = (tag(se2.act(se2.inverse(drive(2, k).T_odom_base), at)),)
         robot.ingest([Sightings(drive(2, k).stamp_ns, "tags", seen)])
-        assert k != 26 or doubted_lately(robot.slam) == "", "of a few nothing is said"
-    believed, count = accepted_lately(robot.slam)["tags"]
+        assert k != 26 or doubted_lately(robot.slam.view) == "", "of a few nothing is said"
+    believed, count = accepted_lately(robot.slam.view)["tags"]
     assert believed < 0.5 * count
     robot.evaluate()
     said = f"tags: only {believed} of {count} are believed: graph_slam explain RUN says why. "
@@ -325,7 +325,7 @@ def test_A35_what_is_refused_is_judged_by_the_last_seconds_wherever_it_was_refus
 
 def test_while_an_association_is_not_to_be_believed_the_node_is_degraded(monkeypatch):
     report = {"is_whole": True, "is_doubtful": True, "missing_part": 0.11, "lost_part": 0.013, "clocks": {}}
-    monkeypatch.setattr(GraphSlam, "association_report", property(lambda slam: report))
+    monkeypatch.setattr(MapView, "association_report", property(lambda slam: report))
     verdict = judge(Facts("active", (WELL,), round_a_curve(2, 3.2).estimate), Config())
     assert verdict.state == "DEGRADED"
     assert verdict.reasons[0].startswith("sightings without identity: 11 % of the landmarks that should be seen")

@@ -27,10 +27,10 @@ def run(tmp_path_factory):
 
 def test_what_is_read_and_told_on_events_is_what_was_decided(run):
     measured, folder, slam = run
-    entries, stamps = read_ledger(folder), slam.keyframes.stamps_ns
-    assert [entry.edge for entry in entries] == list(range(slam.graph.edge_count))
-    assert [entry.verdict for entry in entries] == slam.ledger.verdict.values.tolist()
-    chi2, numbers = slam.solver.chi2_of(np.arange(len(entries)))
+    entries, stamps = read_ledger(folder), slam.view.keyframes.stamps_ns
+    assert [entry.edge for entry in entries] == list(range(slam.view.graph.edge_count))
+    assert [entry.verdict for entry in entries] == slam.view.ledger.verdict.values.tolist()
+    chi2, numbers = slam.view.solver.chi2_of(np.arange(len(entries)))
     assert [(entry.chi2, entry.dof) for entry in entries] == list(zip(chi2.tolist(), numbers.tolist(), strict=True))
     for entry in entries:  # keyframes are the first vertices of the file
         attached = [vertex for vertex in entry.vertices if vertex < len(stamps)]
@@ -39,10 +39,10 @@ def test_what_is_read_and_told_on_events_is_what_was_decided(run):
     assert (false.source, false.weight) == ("closures", 0.0)
     again, told = GraphSlam(small_drive.config()), []
     for m in measured:
-        told += of_update(again, again.process(m))
+        told += of_update(again.view, again.process(m))
     with (folder / CHANGES).open(newline="") as stream:
         rows = [(int(row["edge"]), Verdict[row["verdict"].upper()]) for row in csv.DictReader(stream)]
-    changes = [(change.edge, change.verdict) for change in slam.ledger.history]
+    changes = [(change.edge, change.verdict) for change in slam.view.ledger.history]
     events = [dict(status.values) for status in told if status.name == "graph_slam: verdict"]
     assert rows == changes and (false.edge, Verdict.PENDING) in changes
     assert [int(event["edge"]) for event in events] == [edge for edge, _ in changes]

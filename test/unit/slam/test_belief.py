@@ -39,25 +39,25 @@ def drive(request):
     return n, slam
 
 
-def a_scan(n, slam):
+def a_scan(n, view):
     """Half a second after the last keyframe, with odometry's covariance since; one cluster at landmark 2."""
     space, rng = SPACES[n], np.random.default_rng(7)
     root = 0.02 * rng.normal(size=(space.dof, space.dof))
-    last, vertex = len(slam.keyframes) - 1, int(slam.keyframes.ids[-1])
+    last, vertex = len(view.keyframes) - 1, int(view.keyframes.ids[-1])
     where = PoseAtStamp(last, vertex, 9 * S // 2, moved(n, 0.4, -0.2, 0.5), root @ root.T)
-    base = space.group.compose(tuple(slam.solver.estimate([vertex])[0]), where.T_keyframe_base)
+    base = space.group.compose(tuple(view.solver.estimate([vertex])[0]), where.T_keyframe_base)
     seen = np.array(space.group.act(space.group.inverse(base), tuple(MARKS[2, :n])))
     return Scan(Reckoned(0, space.identity), where, (Cluster(seen, np.eye(n), ()),))
 
 
-def dense(n, slam, scan, names):
+def dense(n, view, scan, names):
     """Covariance of position, rotation in the robot's frame and landmarks: central differences of dense marginals."""
-    space, solver = SPACES[n], slam.solver
+    space, solver = SPACES[n], view.solver
     covariance = np.linalg.inv(solver.information_matrix())
-    vertices = np.arange(slam.graph.vertex_count)
-    dof = [slam.graph.kind_of(v).dof for v in vertices.tolist()]
+    vertices = np.arange(view.graph.vertex_count)
+    dof = [view.graph.kind_of(v).dof for v in vertices.tolist()]
     first = np.cumsum([0, *dof])
-    marks = [slam.landmarks[name].vertex for name in names]
+    marks = [view.landmarks[name].vertex for name in names]
     keyframe = scan.where.vertex
     rows = np.concatenate([np.arange(first[v], first[v + 1]) for v in (keyframe, *marks)])
     covariance = covariance[np.ix_(rows, rows)]
@@ -82,7 +82,7 @@ def dense(n, slam, scan, names):
 
 
 def belief_of(n, slam):
-    return SolverBelief(SPACES[n], slam.solver, slam._landmarks.map)
+    return SolverBelief(SPACES[n], slam.view.solver, slam._landmarks.map)
 
 
 def without_scales(covariance, dof):
@@ -92,9 +92,9 @@ def without_scales(covariance, dof):
 
 def test_a_beam_begins_with_the_joint_gaussian_of_the_whole_graph(drive):
     n, slam = drive
-    scan, names = a_scan(n, slam), {k: str(k) for k in range(len(MARKS))}
+    scan, names = a_scan(n, slam.view), {k: str(k) for k in range(len(MARKS))}
     seed = belief_of(n, slam).seed(scan, names, np.zeros(2), SCALE_SIGMA)
     dof = SPACES[n].dof
-    expected = dense(n, slam, scan, [names[k] for k in seed.numbers.tolist()])
+    expected = dense(n, slam.view, scan, [names[k] for k in seed.numbers.tolist()])
     assert without_scales(seed.covariance, dof) == pytest.approx(expected, rel=1e-5, abs=1e-9)
     assert seed.covariance[dof : dof + 2] == pytest.approx(SCALE_SIGMA**2 * np.eye(len(seed.covariance))[dof : dof + 2])

@@ -22,11 +22,11 @@ def test_derivatives_are_the_numeric_ones_and_a_fit_finds_what_was_wrong_and_cha
     # order in that motion: they differ from the numeric ones by 5 % there.
     wrong = driven(imperfect_drive(FAULTS, kind=kind, seconds=60.0), {"odometry.doubt": False})
     for check in (check_parameters, check_unknowns):
-        check(wrong._trials.problem())
-    before, measured = wrong.solver.values, [t.measured.values.copy() for t in wrong.graph.tables.values()]
-    found, findings = wrong.trial_fit()
-    assert (wrong.solver.values == before).all()
-    for table, old in zip(wrong.graph.tables.values(), measured, strict=True):
+        check(wrong.view._trials.problem())
+    before, measured = wrong.view.solver.values, [t.measured.values.copy() for t in wrong.view.graph.tables.values()]
+    found, findings = wrong.view.trial_fit()
+    assert (wrong.view.solver.values == before).all()
+    for table, old in zip(wrong.view.graph.tables.values(), measured, strict=True):
         assert (table.measured.values == old).all()
     by_name = {one.parameter.name: one for one in findings}
     for name, truth in TRUTH.items():
