@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graph_slam_ros.slam.landmarks.beam import BeamSettings
-from graph_slam_ros.slam.landmarks.bordered import BorderedEquations, Pattern, Rows
+from graph_slam_ros.slam.landmarks.bordered import BorderedEquations, Rows
 from graph_slam_ros.slam.landmarks.rotations import applied, lever, product, rotation, rotation_vector
 from graph_slam_ros.slam.landmarks.scans import Motion, Scan, interpolated_nearby
 from graph_slam_ros.typing import Array, Mask
@@ -109,7 +109,6 @@ class Drive:
         self._set_motions(motions)
         self._set_inputs(scans, nearby)
         self.work = self._free = 0
-        self._pattern: tuple[Ids | None, Pattern] = None, Pattern()  # of the equations of an assignment
 
     @property
     def size(self) -> int:
@@ -314,9 +313,7 @@ class Drive:
         self.work += self.size + len(self.scan)
         own = np.concatenate([e.scales, e.clocks])
         rows = [self._odometry_rows(e, of_landmarks, slips=slips), self._cluster_rows(e, of_landmarks + 2, loss_scale)]
-        if self._pattern[0] is not e.which:
-            self._pattern = e.which, Pattern()
-        normal = BorderedEquations(rows, count, of_landmarks + len(own), 2 * self._dof, len(own), self._pattern[1])
+        normal = BorderedEquations(rows, count, of_landmarks + len(own), 2 * self._dof)
         floor = np.zeros(count + of_landmarks + len(own))
         floor[: self._dof], floor[count : count + of_landmarks] = _HELD, _WEAK_PRIOR
         sigmas = [self.settings.scale_sigma] * 2 + [self.settings.clock_sigma_s] * len(e.clocks)
