@@ -88,17 +88,19 @@ def check_trial(c: Columns, view: MapView) -> Iterator[Finding]:
         yield Finding("fit_unsure", "note", 1, 0, "fits", f"the trial fit failed: {error}")
         return
     clocks = [one for one in fitted if one.parameter.name == "clock" and one.verdict == "admitted"]
-    is_void = fit.lost > answers.MOST_LOST or answers.absurd_range(fit) is not None
-    late_s = {} if is_void else {one.parameter.source: one.value for one in clocks}
+    unsure = answers.unsure(fit)
+    late_s = {} if unsure else {one.parameter.source: one.value for one in clocks}
     step_s = float(np.median(np.diff(c.path_ns))) * 1e-9
     off = {one.parameter: one.value for one in fitted if _is_far_off(fit, one, step_s)}
     slip = None if off else check_slips(c, view)  # a clock or mount that is wrong bends the path in turns
     is_broken = slip is not None and slip[0].severity == "warning"
     goes_back = any((np.diff(t.stamp_ns[t.stamp_ns != 0]) < -1_000_000_000).any() for t in c.topics.values())
     found = [] if off or goes_back else _places(c, view, late_s, slip if is_broken else None)
-    if is_void:
+    if unsure is not None:
         found += [one for s in c.sightings for one in noisier(s, pairs_of(c, s))]
-        yield from found or [_void(fit)]
+        why, value, limit, unit = unsure
+        text = f"{why}: clock, mount and scale cannot be checked"
+        yield from found or [Finding("fit_unsure", "warning", value, limit, unit, text)]
         return
     yield from (found_one for one in fitted for found_one in _fitted(c, view, fit, one, off))
     yield from _jumps(c, fit)
@@ -120,16 +122,6 @@ def _noise(c: Columns, view: MapView, *, has_cause: bool) -> Iterator[Finding]:
         is_allowed_for = c.config.robust.noise_scale == "estimated" and noise.factor < LARGEST
         if factor > limit and noise.dof > _LEAST_DOF and not noise.reason and not is_allowed_for:
             yield _over_confident(c, noise, factor, limit)
-
-
-def _void(fit: TrialFit) -> Finding:
-    k, unchecked = answers.absurd_range(fit), "clock, mount and scale cannot be checked"
-    if fit.lost > answers.MOST_LOST or k is None:
-        text = f"{fit.lost:.0%} of the sightings do not fit: {unchecked}"
-        return Finding("fit_unsure", "warning", fit.lost, answers.MOST_LOST, "part", text)
-    text = f"{answers.absurd_text(fit, k)}: many ranges are wrong, or it is so and to be configured; {unchecked}"
-    value = abs(float(fit.values[k])) / fit.priors[k]
-    return Finding("fit_unsure", "warning", value, answers.PRIOR_SIGMAS, "sigmas", text)
 
 
 def _over_confident(c: Columns, noise: NoiseScale, factor: float, limit: float) -> Finding:

@@ -28,7 +28,7 @@ from graph_slam_ros.runs.outcome import (
 )
 from graph_slam_ros.runs.tables import accepted_lately, condensed_part
 from graph_slam_ros.slam import Config, GraphSlam, MapView
-from graph_slam_ros.slam.calibration.answers import Uncorrected
+from graph_slam_ros.slam.calibration.answers import Finding
 from graph_slam_ros.slam.solution import Correction
 from graph_slam_ros.slam.weak_direction import WeakDirection, position_covariance, weakest_position, weakest_turn
 from graph_slam_ros.typing import Numbers
@@ -218,7 +218,7 @@ def doubted_lately(view: MapView) -> str:
     return "; ".join(filter(None, (*(contradicts(*of) for of in lately), *renewed)))
 
 
-def _settings(one: Uncorrected) -> list[str]:
+def _settings(one: Finding) -> list[str]:
     return [f"{key}={value}" for key, value in one.as_dict()["settings"].items()]
 
 

@@ -254,10 +254,10 @@ def _misplaced(view: MapView, config: Config, findings: Iterable[Fitted]) -> tup
         if not off.setting:
             continue
         key, value = off.setting
-        if key == f"{off.source}.range_offset_m" and off.source not in fitted:
+        if key == f"{off.parameter.source}.range_offset_m" and off.parameter.source not in fitted:
             return f"{_HIDES}: {off}. Set it, and calibrate again: --set {key}={value}", {key: value}
         if off.code == CODES["x"]:
-            source = next(one for one in config.sources if one.name == off.source)
+            source = next(one for one in config.sources if one.name == off.parameter.source)
             turn = source.numbers("mount_correction", 6)[3:] or (0.0, 0.0, 0.0)
             mount = " ".join((*str(value).split()[:3], *(f"{angle:.5g}" for angle in turn)))
             text = f"{_HIDES}: {off}. Measure it, or calibrate again with --set {key}='{mount}'"

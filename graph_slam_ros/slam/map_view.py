@@ -12,7 +12,7 @@ from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.measurements.edits import AppliedEdit
 from graph_slam_ros.measurements.types import Value
 from graph_slam_ros.slam.backend import Backend
-from graph_slam_ros.slam.calibration.answers import Finding, Uncorrected
+from graph_slam_ros.slam.calibration.answers import Finding
 from graph_slam_ros.slam.calibration.fit import TrialFit
 from graph_slam_ros.slam.calibration.parameters import AUTO
 from graph_slam_ros.slam.doubt.kidnap_detector import KidnapDetector
@@ -242,7 +242,7 @@ class MapView:
         """
         return self._trials.fit(groups, places=places, is_to_correct=is_to_correct)
 
-    def uncorrected(self) -> list[Uncorrected]:
+    def uncorrected(self) -> list[Finding]:
         """A clock, a mount or a scale that is off by so much that the poses are worse than their covariances say.
 
         A trial fit finds it, on a copy: nothing is changed.
@@ -250,7 +250,7 @@ class MapView:
         return self._trials.uncorrected() if self.is_solved else []
 
     @property
-    def uncorrected_so_far(self) -> Sequence[Uncorrected]:
+    def uncorrected_so_far(self) -> Sequence[Finding]:
         """The same of the last trial fit in the background."""
         return self._trials.uncorrected_so_far()
 

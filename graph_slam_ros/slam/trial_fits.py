@@ -12,7 +12,6 @@ navigation problems", Advances in Control Systems 3, 1966: parameters that are c
 
 from collections.abc import Sequence
 from copy import deepcopy
-from functools import partial
 
 import numpy as np
 
@@ -20,7 +19,7 @@ from graph_slam_ros.config.config import Config
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.background import Background, CancelToken, Work, guarded
-from graph_slam_ros.slam.calibration.answers import Finding, Uncorrected, decide, is_off, uncorrected
+from graph_slam_ros.slam.calibration.answers import Finding, decide, is_off, uncorrected
 from graph_slam_ros.slam.calibration.fit import TrialFit
 from graph_slam_ros.slam.calibration.model import stated_sigma_per_m
 from graph_slam_ros.slam.calibration.parameters import AUTO, Parameter
@@ -62,7 +61,7 @@ class TrialFits:
         first_keyframe: int = 0,
     ) -> None:
         self._config, self._backend, self._frontend = config, backend, frontend
-        self._landmarks, self._anonymous = landmarks.map, landmarks.anonymous
+        self._landmarks = landmarks.map
         self._kidnaps, self._counters = kidnaps, counters
         self._graph, self._solver = backend.graph, backend.solver
         self._first_keyframe, self._first_edge = first_keyframe, backend.graph.edge_ids.next
@@ -72,8 +71,8 @@ class TrialFits:
         self._of_window = Background[Fits | None](_SOURCE, executor, _DONE_IN, counters)  # before anything is condensed
         self._fits: Fits | None = None
         self._contradicting: TrialFit | None = None
-        self._so_far: tuple[Fits | None, list[Uncorrected]] = (None, [])  # what the newest outcome says
-        self._of_whole: list[Uncorrected] = []  # what the trial of the first window found
+        self._so_far: tuple[Fits | None, list[Finding]] = (None, [])  # what the newest outcome says
+        self._of_whole: list[Finding] = []  # what the trial of the first window found
         self._of_edges = -1  # the map that the newest trial of everything was of
 
     # -- trials ------------------------------------------------------------------------------------------------------
@@ -90,19 +89,17 @@ class TrialFits:
             return
         while not is_of_everything and driven >= self._due:
             self._due *= 2
-        is_begun = self._background.begin(
-            partial(self._frozen, is_thorough=is_of_everything), keyframe, at_once=is_of_everything
-        )
+        is_begun = self._background.begin(self._frozen, keyframe, at_once=is_of_everything)
         if is_of_everything and is_begun:
             self._of_edges = self._graph.edge_ids.next
 
-    def _frozen(self, *, is_thorough: bool = True) -> Work[Fits | None]:
+    def _frozen(self) -> Work[Fits | None]:
         """A trial of the map as it is now."""
         problem = self.problem()
 
         def run(_: CancelToken) -> Fits | None:
             priors = self._priors(problem)
-            return fit_with_places(problem, priors, LOG_ODDS, is_thorough=is_thorough) if priors else None
+            return fit_with_places(problem, priors, LOG_ODDS) if priors else None
 
         return run
 
@@ -133,7 +130,7 @@ class TrialFits:
         problem = self.problem()
         wanted = self._priors(problem, groups, has_gyro=is_to_correct)
         found = fit_with_places(problem, wanted, LOG_ODDS, has_places=places)[0]
-        return found, self._judged(found, is_confirmed=is_to_correct and "factors" not in groups)
+        return found, self._judged(found, are_factors_asked="factors" in groups or not is_to_correct)
 
     def _priors(
         self, problem: TrialProblem, groups: Sequence[str] = (AUTO,), *, has_gyro: bool = True
@@ -142,16 +139,16 @@ class TrialFits:
         has_turn = not (has_gyro and self._config.gyro_input)
         return {one: one.quantity.prior for one in problem.parameters(groups) if one.name != "turn" or has_turn}
 
-    def _judged(self, found: TrialFit, *, is_confirmed: bool = True) -> list[Finding]:
-        """The finding of each parameter; landmarks without identities, where most are, may confirm factors merely."""
+    def _judged(self, found: TrialFit, *, are_factors_asked: bool = False) -> list[Finding]:
+        """The finding of each parameter."""
         known = [mark.is_unnamed for mark in self._landmarks.known.values() if not mark.is_tentative]
-        is_confirmed = is_confirmed and not self._first_keyframe and 2 * sum(known) > len(known)
+        is_unnamed = not self._first_keyframe and 2 * sum(known) > len(known)
         return decide(
             found,
             len(known),
             slides=self._config.odometry.slides,
             sigma_per_m=self._stated(),
-            by_association=self._anonymous.hindsight.found_scales if is_confirmed else None,
+            is_unnamed=is_unnamed and not are_factors_asked,
         )
 
     def _stated(self) -> float:
@@ -192,20 +189,20 @@ class TrialFits:
             if one not in doubted
         ]
 
-    def uncorrected(self) -> list[Uncorrected]:
+    def uncorrected(self) -> list[Finding]:
         """Return what is wrong in the map as it is now."""
         self._compute()
         is_newest = self._of_edges == self._graph.edge_ids.next
         fits = self._fits if is_newest else guarded(self._counters, _SOURCE, lambda: self._frozen()(CancelToken()))
         return self._with_whole(self._off(fits))
 
-    def _with_whole(self, now: list[Uncorrected]) -> list[Uncorrected]:
+    def _with_whole(self, now: list[Finding]) -> list[Finding]:
         """Add what was found before anything was condensed, and the window that is left does not show."""
-        known = {(one.code, one.source) for one in now}
+        known = {(one.code, one.parameter.source) for one in now}
         whole = self._of_whole * bool(self._frontend.path.keyframes.first)
-        return now + [one for one in whole if (one.code, one.source) not in known]
+        return now + [one for one in whole if (one.code, one.parameter.source) not in known]
 
-    def uncorrected_so_far(self) -> Sequence[Uncorrected]:
+    def uncorrected_so_far(self) -> Sequence[Finding]:
         """Return what was wrong in the map at the newest trial."""
         if self._solver.is_current:
             self._compute()
@@ -226,7 +223,7 @@ class TrialFits:
             is_wrong = chosen.doubted or any(is_off(chosen, one) for one in self._judged(chosen))
             self._contradicting = whole if is_wrong else None
 
-    def _off(self, fits: Fits | None) -> list[Uncorrected]:
+    def _off(self, fits: Fits | None) -> list[Finding]:
         if fits is None or not self._solver.is_current:
             return []
         keyframes, total = self._frontend.path.keyframes.ids, self._frontend.corrections.total

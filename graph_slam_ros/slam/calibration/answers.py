@@ -12,8 +12,8 @@ The sigmas of the first two hang on the noise that odometry states: where it is 
 for a wrong factor. So nothing is let in where odometry states less noise than any wheels have.
 
 Landmarks without identities were identified by this odometry. So they confirm its factors, whatever these are. A factor
-is refused, unless the association of these landmarks, which leaves it open, has found the same within three sigmas, it
-is asked for by name, or the map was there before.
+is refused, unless it is asked for by name, or the map was there before. Their association leaves factors open, and what
+it finds is corrected (``found_factors``).
 
 A yaw (in space a pitch, too) is measured against the direction in which odometry moves. So it is refused for a robot
 that is configured to slide across that direction, and for one that only turned on the spot: there the errors of other
@@ -40,7 +40,6 @@ from graph_slam_ros.typing import Array
 SIGMAS = 4.0
 MOST_CORRELATED = 0.95
 PRIOR_SIGMAS = 3.0
-AGREEING_SIGMAS = 3.0
 MOST_LOST = 0.2
 LEAST_LANDMARKS = 3
 MOST_SLIDING = 0.3  # of odometry's noise ahead: with more sideways, a turned sensor and a robot that slides are one
@@ -53,13 +52,25 @@ Verdict = Literal["admitted", "nothing_to_correct", "not_determined", "not_repro
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """The judged result of a trial fit for one parameter, with the reason of the verdict for a person."""
+    """What a trial fit finds of one parameter.
+
+    Attributes
+    ----------
+    value, sigma : of the correction, or of a jump; of a noise that is too small, the stated one [m for each metre], 0
+    text : the reason of the verdict for a person
+    code : the finding of ``graph_slam check``, where it makes the estimate worse than that says; empty elsewhere
+    shift : root mean square by which it moves the poses, in their sigmas
+    setting : a parameter of the configuration, and the value that mends it; empty where none does
+    """
 
     parameter: Parameter
     value: float
     sigma: float
     verdict: Verdict
     text: str
+    code: str = ""
+    shift: float = 0.0
+    setting: tuple[str, Any] | tuple[()] = ()
 
     @classmethod
     def of(cls, parameter: Parameter, value: float, sigma: float, verdict: Verdict, text: str) -> "Finding":
@@ -72,6 +83,16 @@ class Finding:
         """Return whether the drive determines the parameter."""
         return self.verdict in ("admitted", "nothing_to_correct")
 
+    def __str__(self) -> str:
+        by = f"; by it the poses are off by {self.shift:.1f} times what noise does to them" * (self.shift > MOST_SHIFT)
+        return f"{self.code}: {self.parameter.source}: {self.text}{by}"
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values with six digits, because the last ones depend on the memory alignment of an array."""
+        numbers = {name: float(f"{getattr(self, name):.6g}") for name in ("value", "sigma", "shift")}
+        settings = dict([self.setting] if self.setting else [])
+        return {"code": self.code, **numbers, "text": str(self), "settings": settings}
+
 
 def decide(
     found: TrialFit,
@@ -79,7 +100,7 @@ def decide(
     *,
     slides: tuple[float, float] = (0.0, 0.0),
     sigma_per_m: float = 1.0,
-    by_association: Mapping[str, tuple[float, float]] | None = None,
+    is_unnamed: bool = False,
 ) -> list[Finding]:
     """Answer the four questions for each parameter of a trial fit.
 
@@ -88,8 +109,7 @@ def decide(
     landmarks : how many were seen
     slides : configured noise of odometry sideways and upwards, relative to that ahead
     sigma_per_m : of odometry's position for each metre, as stated, in the middle of all steps; infinite if none moves
-    by_association : odometry's factors less 1 with sigmas, as far as the association of landmarks without identities
-        found them; None where landmarks have identities
+    is_unnamed : whether this odometry has identified the landmarks, so that its factors are not to be had from them
     """
     void, out = _void(found, landmarks, sigma_per_m), []
     for k, one in enumerate(found.parameters):
@@ -99,7 +119,7 @@ def decide(
             continue
         stands = math.isinf(sigma_per_m) and one.name in _OF_MOTION
         why = void or (f"odometry does not move: {one.quantity.manoeuvre}" if stands else "")
-        verdict, text = _verdict(found, k, why, _slides(one, slides) or _unnamed(found, by_association, k))
+        verdict, text = _verdict(found, k, why, _slides(one, slides) or (_unnamed(one) if is_unnamed else ""))
         out.append(Finding.of(one, float(found.values[k]), float(found.sigmas[k]), verdict, text))
     return out
 
@@ -109,7 +129,7 @@ def is_certain(found: TrialFit, parameter: Parameter) -> bool:
     k = found.parameters.index(parameter)
     is_far = SIGMAS * found.sigmas[k] < abs(found.values[k]) <= PRIOR_SIGMAS * found.priors[k]
     is_alone = found.worst_correlation(k)[0] <= MOST_CORRELATED
-    return bool(is_far and is_alone and _agree(float(found.first[k]), float(found.second[k])))
+    return bool(is_far and is_alone and _agree(*(float(half[k]) for half in found.halves)))
 
 
 def of_association(parameter: Parameter, value: float, sigma: float, is_corrected: bool) -> Finding:
@@ -131,32 +151,26 @@ def _void(found: TrialFit, landmarks: int, sigma_per_m: float) -> str:
     """Return why a whole fit is not used; empty if it may be."""
     if landmarks < LEAST_LANDMARKS:
         return f"{landmarks} landmark{' was' if landmarks == 1 else 's were'} seen, {LEAST_LANDMARKS} are needed"
-    if found.lost > MOST_LOST:
-        return f"{found.lost:.0%} of the sightings do not fit, more than {MOST_LOST:.0%}: check their ids and noise"
-    if (k := absurd_range(found)) is not None:
-        return f"{absurd_text(found, k)}: check ids and noise, or configure it"
+    if why := unsure(found):
+        return f"{why[0]}: check ids and noise, or configure it"
     if sigma_per_m < LEAST_SIGMA_PER_M:
         stated = f"odometry states {sigma_per_m:.1g} m of noise for each metre"
         return f"{stated}, no wheels are so good: set odometry.noise=motion"
     return ""
 
 
-def absurd_range(found: TrialFit) -> int | None:
-    """Return a parameter of ranges, by its place, that is far beyond its prior; None where none is.
+def unsure(found: TrialFit) -> tuple[str, float, float, str] | None:
+    """Return why nothing of a fit is believed, with a value, its limit and their unit; None if it may be.
 
     Of ranges alone, many of which are wrong, the likeliest map may be shrunk to next to nothing. All else follows it.
     """
-    of_ranges = np.array([one.name.startswith("range") for one in found.parameters], dtype=bool)
-    priors = np.maximum(found.priors, [one.quantity.prior for one in found.parameters])
-    far = of_ranges * np.abs(found.values) / priors
-    return int(far.argmax()) if len(far) and far.max() > PRIOR_SIGMAS else None
-
-
-def absurd_text(found: TrialFit, k: int) -> str:
-    """Say how far off a parameter would be."""
-    one = found.parameters[k]
-    most = PRIOR_SIGMAS * max(float(found.priors[k]), one.quantity.prior)
-    return f"{one} would be off by {one.shown(float(found.values[k]), 3)}, more than {one.shown(most)}"
+    if found.lost > MOST_LOST:
+        return f"{found.lost:.0%} of the sightings do not fit", found.lost, MOST_LOST, "part"
+    for one, value, prior in zip(found.parameters, found.values.tolist(), found.priors.tolist(), strict=True):
+        sigmas = abs(value) / max(prior, one.quantity.prior)
+        if one.name.startswith("range") and sigmas > PRIOR_SIGMAS:
+            return f"many ranges are wrong, or {one} is off by {one.shown(value, 3)}", sigmas, PRIOR_SIGMAS, "sigmas"
+    return None
 
 
 def _verdict(found: TrialFit, k: int, void: str, slides: str) -> tuple[Verdict, str]:
@@ -179,7 +193,7 @@ def _verdict(found: TrialFit, k: int, void: str, slides: str) -> tuple[Verdict, 
     if abs(value) > PRIOR_SIGMAS * found.priors[k]:
         most = parameter.shown(PRIOR_SIGMAS * float(found.priors[k]))
         return "refused", f"not used ({{}}): larger than {most}: correct the configuration first"
-    halves = float(found.first[k]), float(found.second[k])
+    halves = [float(half[k]) for half in found.halves]
     if not _agree(*halves):
         first, second = (parameter.shown(half, 3) for half in halves)
         return "not_reproducible", f"not used ({{}}): {first} in one half of the drive, {second} in the other"
@@ -199,19 +213,12 @@ def _slides(parameter: Parameter, slides: tuple[float, float]) -> str:
     )
 
 
-def _unnamed(found: TrialFit, by_association: Mapping[str, tuple[float, float]] | None, k: int) -> str:
+def _unnamed(parameter: Parameter) -> str:
     """Return why a factor of odometry is not believed of landmarks without identities; empty if it may be."""
-    parameter = found.parameters[k]
-    if by_association is None or parameter.name not in OF_ODOMETRY:
+    if parameter.name not in OF_ODOMETRY:
         return ""
     remedy = f"Use ids, or ask for it: graph_slam calibrate --groups {parameter.quantity.group}"
-    if parameter.name not in by_association:
-        return f"landmarks without ids were identified by this odometry. {remedy}"
-    value, sigma = by_association[parameter.name]
-    if abs(value - float(found.values[k])) <= AGREEING_SIGMAS * math.hypot(sigma, float(found.sigmas[k])):
-        return ""
-    has = parameter.with_sigma(value, sigma)
-    return f"the association of landmarks without ids, which leaves it open, has {has}. {remedy}"
+    return f"landmarks without ids were identified by this odometry. {remedy}"
 
 
 def _agree(first: float, second: float) -> bool:
@@ -245,44 +252,13 @@ Total = Callable[[str, str], float]
 """The value of a parameter of an input that measurements are corrected by at present."""
 
 
-@dataclass(frozen=True, slots=True)
-class Uncorrected:
-    """A parameter that is off, or a noise that is too small, so that the estimate is worse than it says.
-
-    Attributes
-    ----------
-    code : the finding of ``graph_slam check``
-    value, sigma : of the correction, in s, rad, m, or as a part; of a noise, the stated one [m for each metre], and 0
-    shift : root mean square by which it moves the poses, in their sigmas
-    setting : a parameter of the configuration, and the value that mends it; empty where none does
-    """
-
-    code: str
-    source: str
-    value: float
-    sigma: float
-    shift: float
-    text: str
-    setting: tuple[str, Any] | tuple[()]
-
-    def __str__(self) -> str:
-        by = f"; by it the poses are off by {self.shift:.1f} times what noise does to them" * (self.shift > MOST_SHIFT)
-        return f"{self.code}: {self.source}: {self.text}{by}"
-
-    def as_dict(self) -> dict[str, Any]:
-        """Plain values with six digits, because the last ones depend on the memory alignment of an array."""
-        numbers = {name: float(f"{getattr(self, name):.6g}") for name in ("value", "sigma", "shift")}
-        settings = dict([self.setting] if self.setting else [])
-        return {"code": self.code, **numbers, "text": str(self), "settings": settings}
-
-
 def uncorrected(
     found: TrialFit,
     findings: Sequence[Finding],
     covariances: Mapping[int, Array],
     total: Total,
     sigma_per_m: float,
-) -> list[Uncorrected]:
+) -> list[Finding]:
     """Return what is off by more than the poses' sigmas allow, the worst first.
 
     Findings are of each parameter, covariances (dof, dof) of poses by vertex, ``sigma_per_m`` is that of odometry.
@@ -299,9 +275,9 @@ def uncorrected(
         setting = () if one in found.doubted else setting_of(one, values, total)
         text = sentence(one, value, sigma, ranges_instead(found, value, total, setting))
         text += ", more than its stated noise allows for (odometry.noise)" * (one.name in OF_ODOMETRY)
-        out.append(Uncorrected(CODES[one.name], one.source, value, sigma, shift, text, setting))
+        out.append(Finding(one, value, sigma, "admitted", text, CODES[one.name], shift, setting))
     jumped = [
-        Uncorrected(code, one.source, after - before, sigma, 0.0, jump_sentence(one, before, after, sigma), ())
+        Finding(one, after - before, sigma, "not_reproducible", jump_sentence(one, before, after, sigma), code)
         for code, one, before, after, sigma, _ in jumps(found)
     ]
     return [*jumped, *sorted(out, key=lambda one: -one.shift)]
@@ -323,7 +299,7 @@ def _has_bends(found: TrialFit) -> bool:
 def jumps(found: TrialFit) -> Iterator[tuple[str, Parameter, float, float, float, float]]:
     """Yield what is another one in the second half of the drive: code, parameter, both values, sigma, and limit."""
     for k, one in enumerate(found.parameters if found.lost <= MOST_LOST else ()):
-        before, after, sigma = float(found.first[k]), float(found.second[k]), float(2.0 * found.covariance[k, k]) ** 0.5
+        (before, after), sigma = (float(half[k]) for half in found.halves), float(2.0 * found.covariance[k, k]) ** 0.5
         limit = max(_JUMPED.get(one.name, np.inf), 2.0**0.5 * SIGMAS * sigma)
         if abs(after - before) > limit:
             yield "clock_jump" if one.name == "clock" else "mount_moved", one, before, after, sigma, limit
@@ -351,17 +327,16 @@ def pose_shifts(found: TrialFit, covariances: Mapping[int, Array]) -> Array:
     return np.asarray(np.sqrt(np.maximum(square, 0.0).mean(axis=0) / every.shape[1]))
 
 
-def _too_sure(found: TrialFit, shifts: Array, sigma_per_m: float) -> list[Uncorrected]:
+def _too_sure(found: TrialFit, shifts: Array, sigma_per_m: float) -> list[Finding]:
     """Odometry whose noise is so small that the fit of its factors is not believed, if it matters."""
     far = np.abs(found.values) > SIGMAS * found.sigmas
     of_odometry = [k for k, one in enumerate(found.parameters) if one.name in OF_ODOMETRY and far[k]]
     worst = max(of_odometry, key=lambda k: float(shifts[k]), default=-1)
     if worst < 0 or shifts[worst] <= MOST_SHIFT:
         return []
-    source = found.parameters[worst].source
     text = f"odometry states {sigma_per_m:.1g} m of noise for each metre, no wheels are so good"
-    more = ("odometry_over_confident", source, sigma_per_m, 0.0, float(shifts[worst]), text)
-    return [Uncorrected(*more, ("odometry.noise", "motion"))]
+    more = "odometry_over_confident", float(shifts[worst]), ("odometry.noise", "motion")
+    return [Finding(found.parameters[worst], sigma_per_m, 0.0, "refused", text, *more)]
 
 
 def ranges_instead(found: TrialFit, distance: float, total: Total, setting: tuple[str, Any] | tuple[()]) -> str:

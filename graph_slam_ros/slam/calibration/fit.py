@@ -9,8 +9,9 @@ information of any part of the drive, and scores whose sums by landmark and by s
 covariance (White, "Maximum likelihood estimation of misspecified models", 1982): errors that are alike count once.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from scipy import sparse
@@ -29,7 +30,7 @@ _BLOCK_S = 30.0  # errors within are taken for alike
 _LOST = 0.1  # of its weight: a sighting with less is not believed
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class TrialFit:
     """The outcome of a trial fit of some parameters.
 
@@ -38,34 +39,89 @@ class TrialFit:
     parameters : (p,)
     values : (p,) corrections; 0 is what is configured
     priors : (p,) their sigmas, around 0
-    covariance : (p, p) by curvature
-    robust_covariance : (p, p) where errors by one landmark, or within half a minute, are taken for alike
-    first, second : estimates (p,) from the halves of the drive that tell as much of each parameter
+    rest : (r, p) how the whitened residuals change with each parameter if all else follows
+    residual, landmark, stamp_ns : (r,) of each row, as of ``Rows``
     lost : part of the sightings that have less than a tenth of their weight
-    path : stored numbers of all vertices
     sensitivity : (unknowns, p) steps of all unknowns with each parameter
-    shift : (unknowns,) steps from the estimate that the fit began at to ``path``
+    shift : (unknowns,) steps from the estimate that the fit began at to its own
     column : (vertices,) first row of each vertex in ``sensitivity`` and ``shift``, or -1
     evidence : logarithm of the likelihood of all measurements, whatever unknowns and parameters are, but for a constant
-    slips : whether odometry counts for less where slips were found
     doubted : parameters that something else explains as well: value, sigma, and what
     """
 
     parameters: tuple[Parameter, ...]
     values: Array
     priors: Array
-    covariance: Array
-    robust_covariance: Array
-    first: Array
-    second: Array
+    rest: Array
+    residual: Array
+    landmark: Index
+    stamp_ns: Index
     lost: float
-    path: Array
     sensitivity: Array
     shift: Array
     column: Index
     evidence: float
-    slips: bool = True
     doubted: Mapping[Parameter, tuple[float, float, str]] = field(default_factory=dict)
+
+    def without(self, left_out: Collection[Parameter]) -> "TrialFit":
+        """The fit in which some parameters are what is configured, to first order, and its evidence."""
+        gone = np.array([one in left_out for one in self.parameters])
+        if not gone.any():
+            return self
+        between, own = self.covariance[:, gone], self.covariance[np.ix_(gone, gone)]
+        at_zero = np.linalg.solve(own, self.values[gone])
+        step, kept = -between @ at_zero, tuple(one for one in self.parameters if one not in left_out)
+        spread = np.linalg.slogdet(own)[1] - 2.0 * np.sum(np.log(self.priors[gone]))
+        return TrialFit(
+            kept,
+            (self.values + step)[~gone],
+            self.priors[~gone],
+            self.rest[:, ~gone],
+            self.residual + self.rest @ step,
+            self.landmark,
+            self.stamp_ns,
+            self.lost,
+            self.sensitivity[:, ~gone],
+            self.shift + self.sensitivity @ step,
+            self.column,
+            self.evidence - 0.5 * float(self.values[gone] @ at_zero + spread),
+        )
+
+    @cached_property
+    def covariance(self) -> Array:
+        """The covariance (p, p) by curvature."""
+        return np.asarray(np.linalg.inv(self._information(self.rest)))
+
+    @cached_property
+    def robust_covariance(self) -> Array:
+        """The covariance (p, p) where errors by one landmark, or within half a minute, are taken for alike.
+
+        Scores are grouped by one or the other, whichever has more scatter relative to them.
+        """
+        scores = self.rest * self.residual[:, None]
+        block = ((self.stamp_ns - self.stamp_ns.min()) * 1e-9 // _BLOCK_S).astype(np.int64)
+        by_landmark = np.where(self.landmark >= 0, self.landmark, int(self.landmark.max()) + 1 + block)
+        both = [_scatter(scores, clusters) for clusters in (block, by_landmark)]
+        scale = np.maximum(np.linalg.norm(scores, axis=0), np.finfo(float).tiny ** 0.5)
+        meat = max(both, key=lambda one: float(np.sum(np.diag(one) / scale**2)))
+        return np.asarray(self.covariance @ meat @ self.covariance)
+
+    @cached_property
+    def halves(self) -> tuple[Array, Array]:
+        """Each parameter's estimates (p,) from the halves of the drive that tell as much of it."""
+        order = np.argsort(self.stamp_ns, kind="stable")
+        out = np.zeros((2, len(self.values)))
+        for k in range(len(self.values)):
+            known = np.cumsum(self.rest[order, k] ** 2)
+            cut = int(np.searchsorted(known, 0.5 * known[-1])) + 1
+            for half, some in enumerate((order[:cut], order[cut:])):
+                rest = self.rest[some]
+                pull = rest.T @ self.residual[some] + self.priors**-2.0 * self.values
+                out[half, k] = (self.values - np.linalg.solve(self._information(rest), pull))[k]
+        return out[0], out[1]
+
+    def _information(self, rest: Array) -> Array:
+        return np.asarray(rest.T @ rest + np.diag(self.priors**-2.0))
 
     def adds(self, vertex: int, dof: int) -> Array:
         """The covariance (dof, dof) that wrong parameters add to a vertex whose marginal takes them for known.
@@ -79,7 +135,7 @@ class TrialFit:
         spread = steps @ (self.correlation * np.outer(self.sigmas, self.sigmas)) @ steps.T
         return np.asarray(spread + np.outer(bias, bias))
 
-    @property
+    @cached_property
     def sigmas(self) -> Array:
         """Standard deviations (p,): the larger one of curvature's and of the sandwich's."""
         plain, robust = np.diag(self.covariance), np.diag(self.robust_covariance)
@@ -107,26 +163,16 @@ class TrialFit:
         return float(row[other]), self.parameters[other] if row[other] > 0.0 else None
 
 
-def likelier_fit(
-    problem: TrialProblem, priors: Mapping[Parameter, float], log_odds: float, start: TrialFit | None = None
-) -> TrialFit:
-    """Fit parameters with the slips that were found and, if there are any, without: what is wrong passes for slips.
+def fit(problem: TrialProblem, priors: Mapping[Parameter, float], log_odds: float) -> TrialFit:
+    """Fit parameters, with sigmas of their priors, and all unknowns, from the estimate. The problem stays as it is.
 
-    Returns the fit of more evidence (MacKay, "Bayesian interpolation", 1992); each slip has these odds beforehand.
+    Where slips were found it is done with them and without: what is wrong passes for slips. Returned is the fit of more
+    evidence (MacKay, "Bayesian interpolation", 1992); each slip has these odds beforehand. Raises SingularError if the
+    edges do not determine the estimate.
     """
-    if not problem.slips:
-        return fit(problem, priors, start)
-    without = fit(problem.without_slips(), priors, start)
-    found = fit(problem, priors, start)
-    return replace(without, slips=False) if without.evidence > found.evidence + log_odds * len(problem.slips) else found
-
-
-def fit(problem: TrialProblem, priors: Mapping[Parameter, float], start: TrialFit | None = None) -> TrialFit:
-    """Fit parameters, with sigmas of their priors, and all unknowns, from the estimate or the outcome of another fit.
-
-    The problem stays as it is. Raises SingularError if the edges do not determine the estimate.
-    """
-    return _Fit(problem, priors).run(start)
+    found = _Fit(problem, priors).run()
+    without = _Fit(problem.without_slips(), priors).run() if problem.slips else found
+    return without if without.evidence > found.evidence + log_odds * len(problem.slips) else found
 
 
 class _Fit:
@@ -136,14 +182,11 @@ class _Fit:
         self._free = np.setdiff1d(problem.vertices, problem.held)
         self._linear = Linearization(self._p, self._parameters, self._free)
 
-    def run(self, start: TrialFit | None) -> TrialFit:
+    def run(self) -> TrialFit:
         """Iterate until the parameters converge."""
-        x, theta, cautious = self._p.values.copy(), np.zeros(len(self._parameters)), _CAUTIOUS
-        if start is not None:
-            x, theta, cautious = start.path.copy(), np.array([start.value(one) for one in self._parameters]), 0
-        stages = self._p.settings.stages()
+        x, theta, stages = self._p.values.copy(), np.zeros(len(self._parameters)), self._p.settings.stages()
         for k in range(_ITERATIONS):
-            rows = self._linear.rows(x, theta, stages[0 if k < cautious else -1])
+            rows = self._linear.rows(x, theta, stages[0 if k < _CAUTIOUS else -1])
             factor, border = _factor(rows)
             information = self._information(rows.columns - rows.jacobian @ border)
             pull = rows.jacobian.T @ rows.residual
@@ -153,7 +196,7 @@ class _Fit:
             part = self._stride(move, step)
             x, theta = self._moved(x, part * move), theta + part * step
             sigmas = np.sqrt(np.diag(np.linalg.inv(information)))
-            if k >= cautious and part == 1.0 and (np.abs(step) < _STILL * sigmas).all():
+            if k >= _CAUTIOUS and part == 1.0 and (np.abs(step) < _STILL * sigmas).all():
                 break
         return self._outcome(x, theta, self._linear.rows(x, theta, stages[-1]))
 
@@ -189,49 +232,25 @@ class _Fit:
 
     def _outcome(self, x: Array, theta: Array, rows: Rows) -> TrialFit:
         factor, border = _factor(rows)
-        rest = rows.columns - rows.jacobian @ border
-        information = self._information(rest)
-        covariance = np.asarray(np.linalg.inv(information))
-        scores = rest * rows.residual[:, None]
-        sightings, shift = rows.landmark >= 0, np.zeros(self._linear.unknowns)
+        rest, sightings = rows.columns - rows.jacobian @ border, rows.landmark >= 0
+        shift = np.zeros(self._linear.unknowns)
         for kind, at, own in self._unknowns():
             shift[own] = kind.local(self._p.values[at], x[at])
-        curvature = float(np.log(np.abs(factor.U.diagonal())).sum() + np.linalg.slogdet(information)[1])
+        curvature = float(np.log(np.abs(factor.U.diagonal())).sum() + np.linalg.slogdet(self._information(rest))[1])
         return TrialFit(
             self._parameters,
             theta,
             self._priors,
-            covariance,
-            np.asarray(covariance @ self._meat(scores, rows) @ covariance),
-            *self._halves(rest, scores, theta, rows.stamp_ns),
+            rest,
+            rows.residual,
+            rows.landmark,
+            rows.stamp_ns,
             float(np.mean(rows.weight[sightings] < _LOST)) if sightings.any() else 0.0,
-            x,
             -border,
             shift,
             self._linear.column,
             -0.5 * (float(np.sum(rows.cost) + np.sum((theta / self._priors) ** 2)) + curvature),
         )
-
-    def _meat(self, scores: Array, rows: Rows) -> Array:
-        """The scatter of scores, grouped by landmark or by half a minute, whichever is larger relative to them."""
-        block = ((rows.stamp_ns - self._p.stamps_ns.min()) * 1e-9 // _BLOCK_S).astype(np.int64)
-        block -= block.min()
-        by_landmark = np.where(rows.landmark >= 0, rows.landmark, int(rows.landmark.max()) + 1 + block)
-        both = [_scatter(scores, clusters) for clusters in (block, by_landmark)]
-        scale = np.maximum(np.linalg.norm(scores, axis=0), np.finfo(float).tiny ** 0.5)
-        return max(both, key=lambda meat: float(np.sum(np.diag(meat) / scale**2)))
-
-    def _halves(self, rest: Array, scores: Array, theta: Array, stamps_ns: Index) -> tuple[Array, Array]:
-        """Each parameter's estimates from two halves of the drive, split at half of its information."""
-        order = np.argsort(stamps_ns, kind="stable")
-        out = np.zeros((2, len(theta)))
-        for k in range(len(theta)):
-            known = np.cumsum(rest[order, k] ** 2)
-            cut = int(np.searchsorted(known, 0.5 * known[-1])) + 1
-            for half, some in enumerate((order[:cut], order[cut:])):
-                pull = scores[some].sum(axis=0) + self._priors**-2.0 * theta
-                out[half, k] = (theta - np.linalg.solve(self._information(rest[some]), pull))[k]
-        return out[0], out[1]
 
 
 def _factor(rows: Rows) -> tuple[SuperLU, Array]:

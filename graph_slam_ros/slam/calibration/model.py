@@ -22,6 +22,7 @@ from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.graph.tables import EdgeTable
 from graph_slam_ros.lie import so3
 from graph_slam_ros.slam.calibration.parameters import BEND, OF_ODOMETRY, Values
+from graph_slam_ros.slam.frontend.corrections import moved_with_sensor
 from graph_slam_ros.slam.frontend.sighting_edges import SightingEdges
 from graph_slam_ros.typing import Array, Index, Numbers
 
@@ -194,19 +195,11 @@ class MeasurementModel:
         return np.array([distance] * n + [turn] * (self._space.dof - n))
 
     def _seen(self, edges: Sightings, values: Values) -> Array:
-        named, z, n = _of(values, edges.source), edges.seen.copy(), self._space.dimensions
+        named, z, space = _of(values, edges.source), edges.seen.copy(), self._space
         turn, shift = self._mount(named)
-        sensor = tuple(edges.sensor.T)
-        if edges.kind in _POINTS:
-            around = tuple(z[:, k] - sensor[k] for k in range(n))
-            turned = self._space.group.act(turn, around)
-            z[:, :n] = np.stack([turned[k] + sensor[k] + shift[k] for k in range(n)], axis=-1)
-            return z
-        tail = z.shape[1] - self._space.pose.size
-        pose = z[:, tail:].T
-        around = (*(pose[k] - sensor[k] for k in range(n)), *pose[n:])
-        turned = self._space.group.compose(turn, around)
-        z[:, tail:] = np.stack((*(turned[k] + sensor[k] + shift[k] for k in range(n)), *turned[n:]), axis=-1)
+        begin, end = (0, space.dimensions) if edges.kind in _POINTS else (z.shape[1] - space.pose.size, z.shape[1])
+        moved = moved_with_sensor(space, tuple(z[:, begin:end].T), tuple(edges.sensor.T), turn, shift)
+        z[:, begin:end] = np.stack(moved, axis=-1)
         if edges.kind.startswith("range"):
             z[:, 0] = (1.0 + named.get("range_factor", 0.0)) * z[:, 0] + named.get("range_offset", 0.0)
         return z

@@ -12,6 +12,7 @@ import numpy as np
 
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.config.inputs import InputConfig
+from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.lie import so3
 from graph_slam_ros.measurements.types import Observation, Sighting, Sightings
 from graph_slam_ros.slam.frontend.odometry_selector import Step
@@ -158,28 +159,33 @@ class Corrections:
         return (0.0, 0.0, 0.0, *map(float, so3.exp((mount[3], mount[4], mount[5]))))
 
     def _sighting(self, s: Sighting, mount: list[float], turn: Numbers, scale: float, offset: float) -> Sighting:
-        space, n = self._space, self._space.dimensions
+        space = self._space
         T_base_sensor = s.T_base_sensor or space.identity
         if s.kind in ("position", "pose"):
-            moved = self._moved((*s.measured[:n], *(s.measured[n:] or space.identity[n:])), T_base_sensor, mount, turn)
-            own = s.measured[:n] if s.kind == "position" else s.measured
+            moved = moved_with_sensor(space, s.measured, T_base_sensor, turn, mount)
             covariance = s.covariance
             if s.kind == "position":
                 rotation = space.turn(turn)
                 covariance = tuple((rotation @ _square(covariance) @ rotation.T).ravel().tolist())
-            return replace(s, measured=tuple(map(float, moved[: len(own)])), covariance=covariance)
-        at = self._moved(T_base_sensor, T_base_sensor, mount, turn)
+            return replace(s, measured=tuple(map(float, moved)), covariance=covariance)
+        at = moved_with_sensor(space, T_base_sensor, T_base_sensor, turn, mount)
         measured = s.measured
         if s.kind in ("range", "range_bearing"):
             measured = (scale * measured[0] + offset, *measured[1:])
         return replace(s, measured=measured, T_base_sensor=tuple(map(float, at)))
 
-    def _moved(self, pose: Numbers, T_base_sensor: Numbers, mount: list[float], turn: Numbers) -> Numbers:
-        """A pose in the base frame after its sensor was turned about its origin, and moved."""
-        n = self._space.dimensions
-        around = (*(pose[k] - T_base_sensor[k] for k in range(n)), *pose[n:])
-        turned = self._space.group.compose(turn, around)
-        return (*(turned[k] + T_base_sensor[k] + mount[k] for k in range(n)), *turned[n:])
+
+def moved_with_sensor(
+    space: Geometry, pose: Numbers, sensor: Numbers, turn: Numbers, shift: Sequence[float] | Array
+) -> Numbers:
+    """Return a pose or a point in the base frame after its sensor was turned about its origin, and moved.
+
+    Numbers may be arrays. ``sensor`` begins with the sensor's position, ``turn`` is a pose without one.
+    """
+    n = space.dimensions
+    around = (*(pose[k] - sensor[k] for k in range(n)), *pose[n:])
+    turned = space.group.act(turn, around) if len(around) == n else space.group.compose(turn, around)
+    return (*(turned[k] + sensor[k] + shift[k] for k in range(n)), *turned[n:])
 
 
 def _square(flat: Numbers) -> Array:

@@ -70,25 +70,19 @@ def check_unknowns(problem):
         np.testing.assert_allclose(column, difference, atol=0.03 * np.abs(difference).max())
 
 
-def associated(there):
-    return {"by_association": {"distance": (there, 0.01)}}
-
-
 @each(
     "name, value, sigma, known, verdict",
     [
         ("clock", 0.3, 0.035, {}, "not_determined"),
-        ("clock", 0.3, 0.025, {"by_association": {}, "sigma_per_m": math.inf}, "admitted"),
+        ("clock", 0.3, 0.025, {"is_unnamed": True, "sigma_per_m": math.inf}, "admitted"),
         ("yaw", -0.17, 0.01, {}, "admitted"),
         ("yaw", -0.17, 0.01, {"sigma_per_m": math.inf}, "refused"),  # of a robot that only turns
         ("distance", -0.11, 0.01, {}, "admitted"),
-        ("distance", -0.11, 0.01, {"by_association": {}}, "refused"),  # odometry told the landmarks apart
-        ("distance", -0.11, 0.01, associated(-0.1), "admitted"),
-        ("distance", -0.11, 0.01, associated(0.11), "refused"),
+        ("distance", -0.11, 0.01, {"is_unnamed": True}, "refused"),  # odometry told the landmarks apart
     ],
 )
 def test_what_a_fit_finds_is_admitted_where_something_else_measured_it(name, value, sigma, known, verdict):
-    one, variance, none = np.array([value]), np.array([[sigma**2]]), np.zeros(0)
-    found = one, np.array([0.5]), variance, variance, one, one, 0.0, none, np.zeros((0, 1)), none, none.astype(int), 0.0
+    rest, none, rows = np.full((2, 1), 0.5**0.5 / sigma), np.zeros(0), np.arange(2)
+    found = np.array([value]), np.array([0.5]), rest, np.zeros(2), rows, rows, 0.0, none, none, none.astype(int), 0.0
     parameter = Parameter("odom" if name == "distance" else "detections", name)
     assert decide(TrialFit((parameter,), *found), 10, **known)[0].verdict == verdict
