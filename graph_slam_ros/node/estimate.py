@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from mcap.records import Message
 
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.measurements.reasons import explain, remedy
-from graph_slam_ros.measurements.types import Odometry, from_record
+from graph_slam_ros.measurements.types import Odometry, check_space, from_record
 from graph_slam_ros.recordings.mcap_records import records
 from graph_slam_ros.runs.journal import CORRECTION, parts_of
 from graph_slam_ros.runs.outcome import (
@@ -242,23 +242,24 @@ class Resumption:
 
     @classmethod
     def of(cls, run: Path, config: Config) -> "Resumption | None":
-        """Return that of a run by the end of its journal, as much of it as has a correction; None without one."""
+        """Read the last correction, and the odometry around it, at the end of a run's journal; None without one."""
         for file in reversed(parts_of(run)):
-            last_bytes, size = _TAIL_BYTES, file.stat().st_size
-            while last_bytes < 8 * size:
-                read = [
-                    json.loads(one.data) for one in records(file, [], last_bytes=last_bytes) if type(one) is Message
-                ]
+            last_bytes = _TAIL_BYTES
+            while last_bytes < 8 * max(file.stat().st_size, _TAIL_BYTES):
+                ending = records(file, [], follow=False, last_bytes=last_bytes)
+                read = [json.loads(one.data) for one in ending if isinstance(one, Message)]
                 if corrections := [one for one in read if one["type"] == CORRECTION]:
                     last, of = corrections[-1], ("odometry", corrections[-1]["source"])
-                    used = [from_record(one) for one in read if (one["type"], one.get("source")) == of]
-                    if odometry := [one for one in used if isinstance(one, Odometry)]:
-                        return cls(config, tuple(last["T_map_odom"]), odometry)
+                    odometry = [from_record(one) for one in read if (one["type"], one.get("source")) == of]
+                    if odometry and isinstance(odometry[-1], Odometry):
+                        now = replace(odometry[-1], T_odom_base=last["T_map_odom"])  # checked as any pose is
+                        check_space(now, config.space.dimensions)
+                        return cls(config, now.T_odom_base, [one for one in odometry if isinstance(one, Odometry)])
                 last_bytes *= 8
         return None
 
     def goes_on(self, stamp_ns: int, T_odom_base: Numbers, source: str) -> bool:
-        """Return whether the first odometry that this was asked of continues the one before."""
+        """Return whether odometry continues: the first one after the restart decides."""
         if self._is_on is None:
             self._is_on = self._is_continuous(stamp_ns, T_odom_base, source)
         return self._is_on
@@ -279,12 +280,11 @@ class Resumption:
         return is_as_fast or far <= _NEAR or from_begin >= far  # or it has begun anew, if nearer to its origin
 
     def _size(self, pose: Numbers) -> float:
-        """How far a pose is from none. A metre counts as much as a radian."""
+        """The distance of a pose from the identity. A metre counts as much as a radian."""
         return math.hypot(*pose[: self._space.dimensions]) + self._space.angle(pose)
 
 
-_LONGEST_S = 60.0  # without odometry: after more, the robot may have been carried
-_LEAST_S = 1e-3
+_LEAST_S, _LONGEST_S = 1e-3, 60.0  # without odometry: after more, the robot may have been carried
 _TAIL_BYTES = 2**16  # some seconds of a robot's journal
 _LEAST, _MOST = 0.3, 1.2  # times the way at the speed before: so far it has driven since
 _NEAR = 0.1  # m and rad: an odometry that begins anew so close to where it was does no harm

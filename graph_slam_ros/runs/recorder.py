@@ -132,7 +132,7 @@ class RunRecorder:
         self.accepted += 1
 
     def note_correction(self, T_map_odom: Numbers, source: str) -> None:
-        """Note where an odometry has led to, for the next start: the next flush writes it."""
+        """Note the present correction of an odometry for the next start: the next flush writes it."""
         self._noted = [{"type": CORRECTION, "T_map_odom": T_map_odom, "source": source}]
 
     def flush_in_background(self) -> None:

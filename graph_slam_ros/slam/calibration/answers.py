@@ -56,9 +56,9 @@ class Finding:
 
     Attributes
     ----------
-    value, sigma : of the correction, or of a jump; of a noise that is too small, the stated one [m for each metre], 0
+    value, sigma : the correction or the jump; where the stated noise is too small, that noise [m for each metre], and 0
     text : the reason of the verdict for a person
-    code : the finding of ``graph_slam check``, where it makes the estimate worse than that says; empty elsewhere
+    code : the finding of ``graph_slam check``, if the poses are worse for it than their covariances say; else empty
     shift : root mean square by which it moves the poses, in their sigmas
     setting : a parameter of the configuration, and the value that mends it; empty where none does
     """

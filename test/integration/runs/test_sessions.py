@@ -267,7 +267,7 @@ LATER = {  # what comes after a drive of 20 m that was cut off, and whether that
 def test_P12_a_drive_that_was_cut_off_is_resumed_where_its_odometry_goes_on(tmp_path):
     for name, (later, goes_on) in LATER.items():
         run = tmp_path / name.replace(" ", "_") / "run"
-        (one := session(run)).ingest(straight(0, 41))
+        (one := session(run)).ingest(straight(36, 41))
         before = one.slam.view.T_map_odom
         one.abandon()
         again, located = resumed(run, *later)
