@@ -14,7 +14,7 @@ import numpy as np
 from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.slam import Config
-from graph_slam_ros.slam.noise_scale import NoiseScale
+from graph_slam_ros.slam.noise.scale import NoiseScale
 from graph_slam_ros.typing import Array
 
 _TINY = 1e-300  # m

@@ -19,7 +19,7 @@ from graph_slam_ros.errors import GraphSlamError, message_of
 from graph_slam_ros.runs import outcome
 from graph_slam_ros.runs.folder import COVARIANCES, SUMMARY, run_config, summary_of
 from graph_slam_ros.runs.trajectory import LandmarkTable, Trajectory, read_covariances, read_landmarks, read_rows
-from graph_slam_ros.slam.noise_scale import NoiseScale
+from graph_slam_ros.slam.noise.scale import NoiseScale
 from graph_slam_ros.slam.weak_direction import position_covariance
 from graph_slam_ros.typing import Array
 

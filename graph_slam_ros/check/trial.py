@@ -17,7 +17,7 @@ from graph_slam_ros.slam import Config, GraphSlam, MapView
 from graph_slam_ros.slam.calibration import answers
 from graph_slam_ros.slam.calibration.fit import TrialFit
 from graph_slam_ros.slam.calibration.parameters import Parameter
-from graph_slam_ros.slam.noise_scale import LARGEST, NoiseScale
+from graph_slam_ros.slam.noise.scale import LARGEST, NoiseScale
 from graph_slam_ros.typing import Array, Index
 
 _THIN_NS, _APART_S = 80_000_000, 1.0

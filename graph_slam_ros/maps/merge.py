@@ -22,10 +22,10 @@ from graph_slam_ros.runs.folder import check_room
 from graph_slam_ros.runs.journal import CONDENSED, parts_of
 from graph_slam_ros.runs.restore import config_to_go_on, record_run, restored_and_solved, stopwatch
 from graph_slam_ros.slam import Control, MapView
+from graph_slam_ros.slam.association.assignments import NAME, last_number
 from graph_slam_ros.slam.doubt.record import Alarm
 from graph_slam_ros.slam.edits import HAND_MADE
 from graph_slam_ros.slam.frontend.odometry_selector import JUMP_SIGMA_M, JUMP_SIGMA_RAD
-from graph_slam_ros.slam.landmarks.assignments import NAME, last_number
 from graph_slam_ros.slam.landmarks.landmark import Landmark, LandmarkEdge
 from graph_slam_ros.slam.robust.landmark_support import landmark_of
 from graph_slam_ros.slam.robust.ledger import Ledger, Reason, Verdict

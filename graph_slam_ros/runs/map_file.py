@@ -35,11 +35,11 @@ from graph_slam_ros.slam.frontend.corrections import read_totals
 from graph_slam_ros.slam.frontend.gyro import SavedBias
 from graph_slam_ros.slam.frontend.keyframes import Keyframe, SightingPose
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
-from graph_slam_ros.slam.frontend.noise_factors import factors_record, read_factors
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.slam.landmarks.landmark import Landmark, LandmarkEdge
 from graph_slam_ros.slam.lifelong.place import VisitScale, place_of
 from graph_slam_ros.slam.lifelong.state import BoundedState, OldKeyframe
+from graph_slam_ros.slam.noise.factors import factors_record, read_factors
 from graph_slam_ros.slam.robust.ledger import Ledger, Reason, Verdict, VerdictChange
 from graph_slam_ros.slam.snapshot import MapSnapshot
 

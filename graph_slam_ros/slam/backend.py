@@ -12,9 +12,9 @@ from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.slam.background import Background, CancelToken, Work, guarded, run_when_asked
 from graph_slam_ros.slam.frontend.keyframes import KeyframeList
-from graph_slam_ros.slam.frontend.noise_factors import CLASSES, Key, NoiseScales
 from graph_slam_ros.slam.lifelong.state import BoundedState
-from graph_slam_ros.slam.noise_scale import NoiseScale, estimate_noise, factors_of
+from graph_slam_ros.slam.noise.factors import CLASSES, Key, NoiseScales
+from graph_slam_ros.slam.noise.scale import NoiseScale, estimate_noise, factors_of
 from graph_slam_ros.slam.revision import Applied, Replacement, Revision
 from graph_slam_ros.slam.robust.gating import CANDIDATES, OutlierGate
 from graph_slam_ros.slam.robust.hypotheses import (

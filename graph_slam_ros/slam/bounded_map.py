@@ -15,12 +15,12 @@ import numpy as np
 from graph_slam_ros.graph.place import LABEL as PLACES
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.slam.anchor import Anchor
+from graph_slam_ros.slam.association.landmark_frontend import LandmarkFrontend
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.doubt.kidnap_detector import KidnapDetector
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
 from graph_slam_ros.slam.frontend.keyframes import Keyframe
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
-from graph_slam_ros.slam.landmarks.landmark_frontend import LandmarkFrontend
 from graph_slam_ros.slam.lifelong.condenser import CHAIN, Condensed, Condenser, RemovedPose, seen_from
 from graph_slam_ros.slam.lifelong.place import Cell
 from graph_slam_ros.slam.lifelong.state import Left, OldKeyframe, Records, record_type

@@ -9,12 +9,12 @@ from collections.abc import Mapping
 import numpy as np
 
 from graph_slam_ros.config.config import Config
+from graph_slam_ros.slam.association.landmark_frontend import LandmarkFrontend
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.calibration.answers import Finding, of_association
 from graph_slam_ros.slam.calibration.model import MeasurementModel, factors_of
 from graph_slam_ros.slam.calibration.parameters import Parameter, Values
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
-from graph_slam_ros.slam.landmarks.landmark_frontend import LandmarkFrontend
 from graph_slam_ros.slam.revision import Remeasured, Revision
 from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.solver import Report, Settings

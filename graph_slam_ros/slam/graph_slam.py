@@ -27,6 +27,8 @@ from graph_slam_ros.measurements.types import (
     check_space,
 )
 from graph_slam_ros.slam.anchor import Anchor
+from graph_slam_ros.slam.association.assignments import Assigned
+from graph_slam_ros.slam.association.landmark_frontend import LandmarkFrontend
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.background import run_when_asked
 from graph_slam_ros.slam.bounded_map import BoundedMap
@@ -39,8 +41,6 @@ from graph_slam_ros.slam.frontend.keyframes import KeyframeList
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
 from graph_slam_ros.slam.frontend.odometry_integration import OdometryNoise
 from graph_slam_ros.slam.frontend.odometry_selector import Step
-from graph_slam_ros.slam.landmarks.assignments import Assigned
-from graph_slam_ros.slam.landmarks.landmark_frontend import LandmarkFrontend
 from graph_slam_ros.slam.map_view import MapView
 from graph_slam_ros.slam.policies import Policies
 from graph_slam_ros.slam.snapshot import MapSnapshot

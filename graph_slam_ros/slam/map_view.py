@@ -11,6 +11,7 @@ from graph_slam_ros.graph import Graph
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.measurements.edits import AppliedEdit
 from graph_slam_ros.measurements.types import Value
+from graph_slam_ros.slam.association.landmark_frontend import LandmarkFrontend
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.calibration.answers import Finding
 from graph_slam_ros.slam.calibration.fit import TrialFit
@@ -23,7 +24,6 @@ from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
 from graph_slam_ros.slam.frontend.keyframes import Keyframe, SightingPose
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.slam.landmarks.landmark import Landmark
-from graph_slam_ros.slam.landmarks.landmark_frontend import LandmarkFrontend
 from graph_slam_ros.slam.landmarks.renewed_ids import LEAST, RenewedIds, renewed_ids
 from graph_slam_ros.slam.lifelong.state import BoundedState
 from graph_slam_ros.slam.robust.ledger import Ledger

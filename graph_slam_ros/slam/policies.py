@@ -15,12 +15,12 @@ While an alarm is not decided (``Backend.holds_back``), only what decides it cha
 failure guard takes out what nothing can be solved with, and a person what ``~/remove`` and ``~/clear_closures`` name.
 """
 
+from graph_slam_ros.slam.association.landmark_frontend import LandmarkFrontend
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.bounded_map import BoundedMap, Condensation
 from graph_slam_ros.slam.doubt.kidnap_detector import KidnapDetector
 from graph_slam_ros.slam.found_factors import FoundFactors
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
-from graph_slam_ros.slam.landmarks.landmark_frontend import LandmarkFrontend
 from graph_slam_ros.slam.solution import Solution
 from graph_slam_ros.slam.trial_fits import TrialFits
 from graph_slam_ros.solver import Report, Settings

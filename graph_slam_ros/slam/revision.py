@@ -6,7 +6,7 @@ from typing import Literal
 
 from graph_slam_ros.graph import Gaussian
 from graph_slam_ros.graph.tables import EdgeTable
-from graph_slam_ros.slam.frontend.noise_factors import Key
+from graph_slam_ros.slam.noise.factors import Key
 from graph_slam_ros.slam.robust.ledger import Ledger, Reason
 from graph_slam_ros.solver import Report, Settings
 from graph_slam_ros.typing import Array, Index, Numbers

@@ -10,10 +10,10 @@ from graph_slam_ros.graph import Graph
 from graph_slam_ros.measurements.edits import AppliedEdit
 from graph_slam_ros.slam.frontend.gyro import SavedBias
 from graph_slam_ros.slam.frontend.keyframes import Keyframe, SightingPose
-from graph_slam_ros.slam.frontend.noise_factors import Key
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.slam.landmarks.landmark import Landmark
 from graph_slam_ros.slam.lifelong.state import BoundedState
+from graph_slam_ros.slam.noise.factors import Key
 from graph_slam_ros.slam.robust.ledger import Ledger, Reason, Verdict
 from graph_slam_ros.typing import Array
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.measurements.counters import Counters
+from graph_slam_ros.slam.association.landmark_frontend import LandmarkFrontend
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.background import Background, CancelToken, Work, guarded
 from graph_slam_ros.slam.calibration.answers import Finding, decide, is_off, uncorrected
@@ -28,7 +29,6 @@ from graph_slam_ros.slam.calibration.rows import TrialProblem
 from graph_slam_ros.slam.doubt.evidence import LOG_ODDS
 from graph_slam_ros.slam.doubt.kidnap_detector import KidnapDetector
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
-from graph_slam_ros.slam.landmarks.landmark_frontend import LandmarkFrontend
 from graph_slam_ros.typing import Array, Executor, Index
 
 FIRST_DUE = 50  # keyframes

@@ -13,13 +13,13 @@ import numpy as np
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.graph import Gaussian
 from graph_slam_ros.measurements.counters import Counters
+from graph_slam_ros.slam.association.anonymous import AnonymousLandmarks
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.doubt.displacement import SAME_M, SAME_RAD, DisplacementSearch
 from graph_slam_ros.slam.doubt.record import DOUBT, Alarm, Displacement, DisplacementHypothesis
 from graph_slam_ros.slam.doubt.slip_detector import SlipDetector
 from graph_slam_ros.slam.doubt.window import Window
 from graph_slam_ros.slam.frontend.odometry_selector import JUMP_SIGMA_M, JUMP_SIGMA_RAD
-from graph_slam_ros.slam.landmarks.anonymous import AnonymousLandmarks
 from graph_slam_ros.slam.revision import Replacement, Revision
 from graph_slam_ros.slam.robust.connections import moved_values
 from graph_slam_ros.slam.robust.ledger import Reason

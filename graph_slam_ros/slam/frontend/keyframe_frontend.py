@@ -28,11 +28,11 @@ from graph_slam_ros.slam.frontend.gates import ClosureStart, DatumGate, GateChai
 from graph_slam_ros.slam.frontend.gyro import GyroFusion, SavedBias
 from graph_slam_ros.slam.frontend.keyframes import Keyframe, KeyframeList, SightingPose
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
-from graph_slam_ros.slam.frontend.noise_factors import NoiseScales
 from graph_slam_ros.slam.frontend.odometry_integration import IntegratedOdometry, OdometryNoise
 from graph_slam_ros.slam.frontend.odometry_selector import JUMP_SIGMA_M, JUMP_SIGMA_RAD, OdometrySelector, Step
 from graph_slam_ros.slam.frontend.stamp_order import PendingObservations, StampOrder
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
+from graph_slam_ros.slam.noise.factors import NoiseScales
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Numbers
 

@@ -1,1 +1,1 @@
-"""Landmarks from observations: triangulation, data association, landmarks with and without ids."""
+"""Landmarks from observations: their map, triangulation, lifetimes."""

@@ -14,20 +14,15 @@ def product(a: Array, b: Array) -> Array:
     out = np.empty((*np.broadcast_shapes(a.shape[:-2], b.shape[:-2]), a.shape[-2], b.shape[-1]))
     for i in range(a.shape[-2]):
         for k in range(b.shape[-1]):
-            out[..., i, k] = _sum_of_products(a[..., i, :], b[..., :, k])
+            out[..., i, k] = a[..., i, 0] * b[..., 0, k]
+            for j in range(1, a.shape[-1]):
+                out[..., i, k] += a[..., i, j] * b[..., j, k]
     return out
 
 
 def applied(matrices: Array, vectors: Array) -> Array:
     """The products (..., i) of many small matrices (..., i, j) and vectors (..., j), as ``product``."""
     return product(matrices, vectors[..., None])[..., 0]
-
-
-def _sum_of_products(a: Array, b: Array) -> Array:
-    out: Array = a[..., 0] * b[..., 0]
-    for j in range(1, a.shape[-1]):
-        out += a[..., j] * b[..., j]
-    return out
 
 
 def rotation(vectors: Array) -> Array:

@@ -15,7 +15,7 @@ from graph_slam_ros.config.config import Config, flatten, parameters
 from graph_slam_ros.measurements.reasons import Effect, explain, remedy
 from graph_slam_ros.runs import outcome
 from graph_slam_ros.runs.tables import INPUT_COLUMNS
-from graph_slam_ros.slam.noise_scale import NoiseScale
+from graph_slam_ros.slam.noise.scale import NoiseScale
 from graph_slam_ros.tools.report.packing import shown
 
 Row = list[Any]

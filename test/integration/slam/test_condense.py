@@ -20,10 +20,10 @@ from graph_slam_ros.runs.restore import record_run
 from graph_slam_ros.runs.tables import summarize
 from graph_slam_ros.runs.trajectory import read_tum
 from graph_slam_ros.slam import Closure, Config, Control, Fix, GraphSlam, Odometry, Sightings
+from graph_slam_ros.slam.association import hindsight
+from graph_slam_ros.slam.association.hindsight import FrozenScans, explained
+from graph_slam_ros.slam.association.presence_check import Presence
 from graph_slam_ros.slam.doubt.record import Slip
-from graph_slam_ros.slam.landmarks import hindsight
-from graph_slam_ros.slam.landmarks.hindsight import FrozenScans, explained
-from graph_slam_ros.slam.landmarks.presence_check import Presence
 from graph_slam_ros.slam.lifelong.state import Left
 
 KEYFRAMES, MORE = 700, times(800, 900)

@@ -13,8 +13,8 @@ from graph_slam_ros.runs.map_file import read_map
 from graph_slam_ros.runs.outcome import noise
 from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.slam import GraphSlam
-from graph_slam_ros.slam.frontend.noise_factors import FIRST_DUE
-from graph_slam_ros.slam.noise_scale import NoiseScale
+from graph_slam_ros.slam.noise.factors import FIRST_DUE
+from graph_slam_ros.slam.noise.scale import NoiseScale
 from graph_slam_ros.tools.simulation import simulate, write_bag
 
 CONFIGURED = Config.from_mapping({"robust.noise_scale": "configured"})

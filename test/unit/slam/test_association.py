@@ -10,16 +10,16 @@ from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.config.pipeline import OdometryConfig
 from graph_slam_ros.graph.geometry import PLANAR
 from graph_slam_ros.measurements.types import Sighting
+from graph_slam_ros.slam.association import hindsight
+from graph_slam_ros.slam.association.beam import BeamSettings
+from graph_slam_ros.slam.association.bordered import BorderedEquations, Rows
+from graph_slam_ros.slam.association.constellation import laid_on_the_map
+from graph_slam_ros.slam.association.explanation import Costs, Drive, Estimate
+from graph_slam_ros.slam.association.moves import refined
+from graph_slam_ros.slam.association.presence_check import presence
+from graph_slam_ros.slam.association.scans import NEARBY_S, Cluster, Reckoned, Scan, Seen, motion_between
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
-from graph_slam_ros.slam.landmarks import hindsight
-from graph_slam_ros.slam.landmarks.beam import BeamSettings
-from graph_slam_ros.slam.landmarks.bordered import BorderedEquations, Rows
-from graph_slam_ros.slam.landmarks.constellation import laid_on_the_map
-from graph_slam_ros.slam.landmarks.explanation import Costs, Drive, Estimate
-from graph_slam_ros.slam.landmarks.moves import refined
-from graph_slam_ros.slam.landmarks.presence_check import presence
 from graph_slam_ros.slam.landmarks.rotations import rotation
-from graph_slam_ros.slam.landmarks.scans import NEARBY_S, Cluster, Reckoned, Scan, Seen, motion_between
 
 S = 1_000_000_000
 NOISE = OdometryConfig(turn_per_rad=0.02, turn_per_m=0.002, turn_per_s=0.0002, way_per_m=0.002, way_per_s=0.0001)
@@ -123,7 +123,7 @@ def test_moves_end_at_their_limit_of_work_and_that_is_said(monkeypatch):
     frozen = hindsight.FrozenScans(tuple(scans), steps, nearby, poses, np.zeros(2), wrong)
     found = {}
     for most in (1_000_000, 0):
-        monkeypatch.setattr("graph_slam_ros.slam.landmarks.explanation._MOST_WORK", most)
+        monkeypatch.setattr("graph_slam_ros.slam.association.explanation._MOST_WORK", most)
         found[most] = hindsight.explained(PLANAR, frozen, SETTINGS, COSTS)
     assert [(one.is_whole, len(one.estimate.landmarks)) for one in found.values()] == [(True, 5), (False, 6)]
 

@@ -5,10 +5,10 @@ import pytest
 
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
+from graph_slam_ros.slam.association.belief import SolverBelief
+from graph_slam_ros.slam.association.scans import Cluster, Reckoned, Scan
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
-from graph_slam_ros.slam.landmarks.belief import SolverBelief
 from graph_slam_ros.slam.landmarks.rotations import rotation_vector
-from graph_slam_ros.slam.landmarks.scans import Cluster, Reckoned, Scan
 
 S = 1_000_000_000
 SPACES = {2: PLANAR, 3: SPATIAL}

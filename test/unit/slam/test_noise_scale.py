@@ -15,8 +15,8 @@ from graph_slam_ros.graph import (
     Graph,
 )
 from graph_slam_ros.lie import se2
-from graph_slam_ros.slam.frontend.noise_factors import NoiseScales
-from graph_slam_ros.slam.noise_scale import estimate_noise, factors_of
+from graph_slam_ros.slam.noise.factors import NoiseScales
+from graph_slam_ros.slam.noise.scale import estimate_noise, factors_of
 from graph_slam_ros.solver import Solver
 
 STEP_NS = 500_000_000

@@ -7,8 +7,7 @@ import numpy as np
 
 from graph_slam_ros.config.pipeline import OdometryConfig
 from graph_slam_ros.graph.geometry import Geometry
-from graph_slam_ros.slam.frontend.odometry_selector import JUMP_SIGMA_M, JUMP_SIGMA_RAD
-from graph_slam_ros.slam.landmarks.scans import (
+from graph_slam_ros.slam.association.scans import (
     NEARBY_NS,
     DeadReckoning,
     Motion,
@@ -16,6 +15,7 @@ from graph_slam_ros.slam.landmarks.scans import (
     motion_between,
     rescaled_nearby,
 )
+from graph_slam_ros.slam.frontend.odometry_selector import JUMP_SIGMA_M, JUMP_SIGMA_RAD
 from graph_slam_ros.typing import Array
 
 Added = Callable[[float], Array]

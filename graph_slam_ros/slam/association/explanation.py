@@ -11,10 +11,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from graph_slam_ros.slam.landmarks.beam import BeamSettings
-from graph_slam_ros.slam.landmarks.bordered import BorderedEquations, Rows
+from graph_slam_ros.slam.association.beam import BeamSettings
+from graph_slam_ros.slam.association.bordered import BorderedEquations, Rows
+from graph_slam_ros.slam.association.scans import Motion, Scan, interpolated_nearby
 from graph_slam_ros.slam.landmarks.rotations import applied, lever, product, rotation, rotation_vector
-from graph_slam_ros.slam.landmarks.scans import Motion, Scan, interpolated_nearby
 from graph_slam_ros.typing import Array, Mask
 
 UNUSED = -1

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from graph_slam_ros.slam.landmarks.explanation import UNUSED, Drive, Estimate
+from graph_slam_ros.slam.association.explanation import UNUSED, Drive, Estimate
 from graph_slam_ros.typing import Array, Mask
 
 FIT_M = 0.5

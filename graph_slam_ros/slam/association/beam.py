@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from graph_slam_ros.slam.association.scans import Cluster, Motion, Scan
 from graph_slam_ros.slam.landmarks.rotations import lever, rotation
-from graph_slam_ros.slam.landmarks.scans import Cluster, Motion, Scan
 from graph_slam_ros.typing import Array
 
 NOTHING = -2

@@ -10,14 +10,14 @@ import numpy as np
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.types import Sighting
+from graph_slam_ros.slam.association.beam import NOTHING
+from graph_slam_ros.slam.association.moves import LEAST_SCANS
+from graph_slam_ros.slam.association.renumbered import Renumbered
+from graph_slam_ros.slam.association.scans import Cluster, Seen
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
-from graph_slam_ros.slam.landmarks.beam import NOTHING
 from graph_slam_ros.slam.landmarks.landmark import Landmark
 from graph_slam_ros.slam.landmarks.landmark_map import Landmarks
-from graph_slam_ros.slam.landmarks.moves import LEAST_SCANS
-from graph_slam_ros.slam.landmarks.renumbered import Renumbered
-from graph_slam_ros.slam.landmarks.scans import Cluster, Seen
 
 NOT_IN_MAP = ""  # in place of a name, where the map is held and nothing in it fits
 NAME = "unnamed"

@@ -5,11 +5,11 @@ from dataclasses import replace
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.types import Sightings
+from graph_slam_ros.slam.association.anonymous import AnonymousLandmarks
+from graph_slam_ros.slam.association.assignments import Assigned
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp, off_the_pole
 from graph_slam_ros.slam.frontend.odometry_selector import Step
-from graph_slam_ros.slam.landmarks.anonymous import AnonymousLandmarks
-from graph_slam_ros.slam.landmarks.assignments import Assigned
 from graph_slam_ros.slam.landmarks.landmark_map import Landmarks
 from graph_slam_ros.typing import Executor
 

@@ -17,11 +17,11 @@ from scipy.special import bdtrc
 
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.lie import se2
-from graph_slam_ros.slam.landmarks.beam import NOTHING
+from graph_slam_ros.slam.association.beam import NOTHING
+from graph_slam_ros.slam.association.presence_check import FIT_M, is_missing
+from graph_slam_ros.slam.association.scans import Scan
 from graph_slam_ros.slam.landmarks.landmark_map import Landmarks
-from graph_slam_ros.slam.landmarks.presence_check import FIT_M, is_missing
 from graph_slam_ros.slam.landmarks.rotations import aligned
-from graph_slam_ros.slam.landmarks.scans import Scan
 from graph_slam_ros.typing import Array, Index
 
 _SCANS, _CLUSTERS = 6, 8  # the newest, and at least so many in them

@@ -5,10 +5,10 @@ from collections.abc import Mapping
 import numpy as np
 
 from graph_slam_ros.graph.geometry import Geometry
-from graph_slam_ros.slam.landmarks.beam import Beam, Ids, Seed
+from graph_slam_ros.slam.association.beam import Beam, Ids, Seed
+from graph_slam_ros.slam.association.scans import Scan
 from graph_slam_ros.slam.landmarks.landmark_map import Landmarks
 from graph_slam_ros.slam.landmarks.rotations import lever, rotation_vector
-from graph_slam_ros.slam.landmarks.scans import Scan
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Numbers
 

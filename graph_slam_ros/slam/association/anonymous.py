@@ -16,21 +16,21 @@ from graph_slam_ros.config.config import Config
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.types import Sightings
+from graph_slam_ros.slam.association.assignments import Assigned, Assignments
+from graph_slam_ros.slam.association.beam import NOTHING, Beam, BeamSettings, Decision, changes
+from graph_slam_ros.slam.association.belief import SolverBelief
+from graph_slam_ros.slam.association.elsewhere import Seen as AllSeen
+from graph_slam_ros.slam.association.elsewhere import UnnamedDisplacement
+from graph_slam_ros.slam.association.hindsight import Found, FrozenScans, Hindsight
+from graph_slam_ros.slam.association.renumbered import first_of_later
+from graph_slam_ros.slam.association.scan_history import ScanHistory
+from graph_slam_ros.slam.association.scans import SCAN_NS, DeadReckoning, Motion, Scan, ScanBuilder
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.background import guarded
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
 from graph_slam_ros.slam.frontend.odometry_integration import OdometryNoise
 from graph_slam_ros.slam.frontend.odometry_selector import Step
-from graph_slam_ros.slam.landmarks.assignments import Assigned, Assignments
-from graph_slam_ros.slam.landmarks.beam import NOTHING, Beam, BeamSettings, Decision, changes
-from graph_slam_ros.slam.landmarks.belief import SolverBelief
-from graph_slam_ros.slam.landmarks.elsewhere import Seen as AllSeen
-from graph_slam_ros.slam.landmarks.elsewhere import UnnamedDisplacement
-from graph_slam_ros.slam.landmarks.hindsight import Found, FrozenScans, Hindsight
 from graph_slam_ros.slam.landmarks.landmark_map import Landmarks
-from graph_slam_ros.slam.landmarks.renumbered import first_of_later
-from graph_slam_ros.slam.landmarks.scan_history import ScanHistory
-from graph_slam_ros.slam.landmarks.scans import SCAN_NS, DeadReckoning, Motion, Scan, ScanBuilder
 from graph_slam_ros.slam.revision import Revision
 from graph_slam_ros.typing import Array, Executor
 

@@ -6,8 +6,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from graph_slam_ros.slam.landmarks.beam import Decision, Ids
-from graph_slam_ros.slam.landmarks.scans import Scan
+from graph_slam_ros.slam.association.beam import Decision, Ids
+from graph_slam_ros.slam.association.scans import Scan
 
 T = TypeVar("T")
 

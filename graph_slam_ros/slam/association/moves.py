@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from graph_slam_ros.slam.landmarks.explanation import UNUSED, Drive, Estimate, Ids, compressed
+from graph_slam_ros.slam.association.explanation import UNUSED, Drive, Estimate, Ids, compressed
 from graph_slam_ros.typing import Array, Mask
 
 LEAST_SCANS = 3  # of a landmark

@@ -11,8 +11,8 @@ from itertools import pairwise
 import numpy as np
 from scipy.spatial import KDTree
 
-from graph_slam_ros.slam.landmarks.explanation import UNUSED, Drive, Estimate, Ids, compressed
-from graph_slam_ros.slam.landmarks.moves import TRIAL, are_others, merged, reassigned, sorts_of, without_few
+from graph_slam_ros.slam.association.explanation import UNUSED, Drive, Estimate, Ids, compressed
+from graph_slam_ros.slam.association.moves import TRIAL, are_others, merged, reassigned, sorts_of, without_few
 from graph_slam_ros.slam.landmarks.rotations import yaw
 from graph_slam_ros.typing import Array, Mask
 

@@ -14,18 +14,18 @@ from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.measurements.counters import Counters
+from graph_slam_ros.slam.association.beam import NOTHING, BeamSettings, Ids
+from graph_slam_ros.slam.association.belief import SolverBelief
+from graph_slam_ros.slam.association.constellation import laid_on_the_map
+from graph_slam_ros.slam.association.explanation import SCALES, UNUSED, Costs, Drive, Estimate
+from graph_slam_ros.slam.association.moves import LEAST_SCANS, refined, without_few
+from graph_slam_ros.slam.association.presence_check import NOTHING_SEEN, Presence, presence
+from graph_slam_ros.slam.association.scans import Cluster, Motion, Scan
 from graph_slam_ros.slam.background import Background, Work
 from graph_slam_ros.slam.frontend.keyframes import Keyframe
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
-from graph_slam_ros.slam.landmarks.beam import NOTHING, BeamSettings, Ids
-from graph_slam_ros.slam.landmarks.belief import SolverBelief
-from graph_slam_ros.slam.landmarks.constellation import laid_on_the_map
-from graph_slam_ros.slam.landmarks.explanation import SCALES, UNUSED, Costs, Drive, Estimate
 from graph_slam_ros.slam.landmarks.landmark import Landmark
-from graph_slam_ros.slam.landmarks.moves import LEAST_SCANS, refined, without_few
-from graph_slam_ros.slam.landmarks.presence_check import NOTHING_SEEN, Presence, presence
 from graph_slam_ros.slam.landmarks.rotations import matrices_of, poses_of
-from graph_slam_ros.slam.landmarks.scans import Cluster, Motion, Scan
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Executor
 

@@ -32,7 +32,7 @@ from scipy.optimize import nnls
 from graph_slam_ros.graph import Graph
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
 from graph_slam_ros.graph.tables import EdgeTable
-from graph_slam_ros.slam.frontend.noise_factors import (
+from graph_slam_ros.slam.noise.factors import (
     CLASSES,
     PER_M,
     PER_RAD,

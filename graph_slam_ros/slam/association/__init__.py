@@ -1,0 +1,1 @@
+"""Landmarks without ids: which one is seen, now and with hindsight."""

@@ -1,0 +1,1 @@
+"""The scale of noise: estimated from residuals, and used for what comes."""
