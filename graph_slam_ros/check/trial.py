@@ -170,11 +170,10 @@ def _fitted(
 
 
 def _jumps(c: Columns, fit: TrialFit) -> Iterator[Finding]:
-    for code, parameter, before, after, sigma, limit in answers.jumps(fit):
-        if (topic := c.topic_of(parameter.source)) is not None:
-            text = answers.jump_sentence(parameter, before, after, sigma)
-            unit = _LIMITS[parameter.name][0]
-            yield topic.finding(code, "warning", after - before, limit, unit, text)
+    for one, limit in answers.jumps(fit):
+        if (topic := c.topic_of(one.parameter.source)) is not None:
+            unit = _LIMITS[one.parameter.name][0]
+            yield topic.finding(one.code, "warning", one.value, limit, unit, one.text)
 
 
 def _places(c: Columns, view: MapView, late_s: Mapping[str, float], slip: tuple[Finding, int] | None) -> list[Finding]:

@@ -1,6 +1,7 @@
 """Trial fits of clocks, mounts and scales at fixed keyframes: what is off is said, and covariances contain it.
 
-A trial starts at keyframes 50, 100, 200 and so on of this drive, and when everything is solved. It works on a copy, in
+A trial starts at keyframes 50, 100, 200 and so on of this drive, where odometry was in doubt four times and more than
+twice as often as at the last one, and when everything is solved. It works on a copy, in
 the background if possible, and corrects nothing. Its outcome counts a fixed number of keyframes later, so that a replay
 says what the live run did.
 
@@ -20,7 +21,7 @@ from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.slam.association.landmark_frontend import LandmarkFrontend
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.background import Background, CancelToken, Work, guarded
-from graph_slam_ros.slam.calibration.answers import Finding, decide, is_off, uncorrected
+from graph_slam_ros.slam.calibration.answers import Finding, decide, is_off, jumps, uncorrected
 from graph_slam_ros.slam.calibration.fit import TrialFit
 from graph_slam_ros.slam.calibration.model import stated_sigma_per_m
 from graph_slam_ros.slam.calibration.parameters import AUTO, Parameter
@@ -32,6 +33,7 @@ from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
 from graph_slam_ros.typing import Array, Executor, Index
 
 FIRST_DUE = 50  # keyframes
+_DOUBTS = 4  # in recorded drives odometry is rightly in doubt up to twice
 _DIGITS = 12  # of an added variance: the last ones of a sine depend on the machine
 _DONE_IN = 20  # keyframes, in which a trial is done in the background: fewer than until anything is condensed
 _SOURCE = "calibration"  # of what is counted
@@ -65,7 +67,7 @@ class TrialFits:
         self._kidnaps, self._counters = kidnaps, counters
         self._graph, self._solver = backend.graph, backend.solver
         self._first_keyframe, self._first_edge = first_keyframe, backend.graph.edge_ids.next
-        self._due = FIRST_DUE
+        self._due, self._due_slips = FIRST_DUE, _DOUBTS
         after = config.robust.apply_after_keyframes
         self._background = Background[Fits | None](_SOURCE, executor, after, counters)
         self._of_window = Background[Fits | None](_SOURCE, executor, _DONE_IN, counters)  # before anything is condensed
@@ -85,8 +87,11 @@ class TrialFits:
             self._of_window.begin(self._frozen, driven)
         if (found := self._of_window.due(driven)) is not None:
             self._of_whole = self._off(found())
-        if self._backend.holds_back or not (is_of_everything or driven >= self._due):
+        slips = len(self._kidnaps.slip_detector.slips)
+        is_due = is_of_everything or driven >= self._due or slips >= self._due_slips
+        if self._backend.holds_back or not is_due:
             return
+        self._due_slips = max(_DOUBTS, 2 * slips)
         while not is_of_everything and driven >= self._due:
             self._due *= 2
         is_begun = self._background.begin(self._frozen, keyframe, at_once=is_of_everything)
@@ -220,7 +225,7 @@ class TrialFits:
         self._contradicting = None
         if self._fits is not None:
             chosen, whole = self._fits
-            is_wrong = chosen.doubted or any(is_off(chosen, one) for one in self._judged(chosen))
+            is_wrong = chosen.doubted or any(jumps(chosen)) or any(is_off(chosen, one) for one in self._judged(chosen))
             self._contradicting = whole if is_wrong else None
 
     def _off(self, fits: Fits | None) -> list[Finding]:

@@ -276,11 +276,7 @@ def uncorrected(
         text = sentence(one, value, sigma, ranges_instead(found, value, total, setting))
         text += ", more than its stated noise allows for (odometry.noise)" * (one.name in OF_ODOMETRY)
         out.append(Finding(one, value, sigma, "admitted", text, CODES[one.name], shift, setting))
-    jumped = [
-        Finding(one, after - before, sigma, "not_reproducible", jump_sentence(one, before, after, sigma), code)
-        for code, one, before, after, sigma, _ in jumps(found)
-    ]
-    return [*jumped, *sorted(out, key=lambda one: -one.shift)]
+    return [*(one for one, _ in jumps(found)), *sorted(out, key=lambda one: -one.shift)]
 
 
 def is_off(found: TrialFit, one: Finding) -> bool:
@@ -296,22 +292,22 @@ def _has_bends(found: TrialFit) -> bool:
     return any(one.name == BEND for one in found.doubted)
 
 
-def jumps(found: TrialFit) -> Iterator[tuple[str, Parameter, float, float, float, float]]:
-    """Yield what is another one in the second half of the drive: code, parameter, both values, sigma, and limit."""
+def jumps(found: TrialFit) -> Iterator[tuple[Finding, float]]:
+    """Yield what is another one later in the drive, a clock or an angle of a mount, with the limit."""
     for k, one in enumerate(found.parameters if found.lost <= MOST_LOST else ()):
         (before, after), sigma = (float(half[k]) for half in found.halves), float(2.0 * found.covariance[k, k]) ** 0.5
         limit = max(_JUMPED.get(one.name, np.inf), 2.0**0.5 * SIGMAS * sigma)
         if abs(after - before) > limit:
-            yield "clock_jump" if one.name == "clock" else "mount_moved", one, before, after, sigma, limit
-
-
-def jump_sentence(one: Parameter, before: float, after: float, sigma: float) -> str:
-    """Say what a clock or an angle of a mount is in either half of the drive."""
-    first, second, spread = map(one.shown, (before, after, sigma))
-    halves = f"in one half of the drive, {second} in the other (sigma {spread})"
-    if one.name == "clock":
-        return f"sightings agree with odometry best {first} from their stamps {halves}"
-    return f"its sensor is turned by {first} {_AXIS[one.name]}on the robot {halves}: it was knocked, or is loose"
+            since = f"since {found.since_ns * 1e-9:.1f} s" if found.since_ns else "in the second half of the drive"
+            then = f"at first, {one.shown(after)} {since} (sigma {one.shown(sigma)})"
+            turned = f"its sensor is turned by {one.shown(before)} {_AXIS.get(one.name, '')}on the robot {then}"
+            code, text = "mount_moved", f"{turned}: it was knocked, or is loose"
+            if one.name == "clock":
+                code, text = (
+                    "clock_jump",
+                    f"sightings agree with odometry best {one.shown(before)} from their stamps {then}",
+                )
+            yield Finding(one, after - before, sigma, "not_reproducible", text, code), limit
 
 
 def pose_shifts(found: TrialFit, covariances: Mapping[int, Array]) -> Array:

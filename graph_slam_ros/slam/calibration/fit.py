@@ -47,6 +47,7 @@ class TrialFit:
     column : (vertices,) first row of each vertex in ``sensitivity`` and ``shift``, or -1
     evidence : logarithm of the likelihood of all measurements, whatever unknowns and parameters are, but for a constant
     doubted : parameters that something else explains as well: value, sigma, and what
+    since_ns : when odometry was in doubt first, if all parameters are what is configured until then; else 0
     """
 
     parameters: tuple[Parameter, ...]
@@ -62,6 +63,7 @@ class TrialFit:
     column: Index
     evidence: float
     doubted: Mapping[Parameter, tuple[float, float, str]] = field(default_factory=dict)
+    since_ns: int = 0
 
     def without(self, left_out: Collection[Parameter]) -> "TrialFit":
         """The fit in which some parameters are what is configured, to first order, and its evidence."""
@@ -85,6 +87,7 @@ class TrialFit:
             self.shift + self.sensitivity @ step,
             self.column,
             self.evidence - 0.5 * float(self.values[gone] @ at_zero + spread),
+            since_ns=self.since_ns,
         )
 
     @cached_property
@@ -109,6 +112,8 @@ class TrialFit:
     @cached_property
     def halves(self) -> tuple[Array, Array]:
         """Each parameter's estimates (p,) from the halves of the drive that tell as much of it."""
+        if self.since_ns:
+            return np.zeros(len(self.values)), self.values
         order = np.argsort(self.stamp_ns, kind="stable")
         out = np.zeros((2, len(self.values)))
         for k in range(len(self.values)):
@@ -166,13 +171,18 @@ class TrialFit:
 def fit(problem: TrialProblem, priors: Mapping[Parameter, float], log_odds: float) -> TrialFit:
     """Fit parameters, with sigmas of their priors, and all unknowns, from the estimate. The problem stays as it is.
 
-    Where slips were found it is done with them and without: what is wrong passes for slips. Returned is the fit of more
-    evidence (MacKay, "Bayesian interpolation", 1992); each slip has these odds beforehand. Raises SingularError if the
-    edges do not determine the estimate.
+    Where slips were found it is done with them, without, and without of what was measured since the first: what is
+    wrong, or became so, passes for slips. Returned is the fit of more evidence (MacKay, "Bayesian interpolation",
+    1992); each slip has these odds beforehand. Raises SingularError if the edges do not determine the estimate.
     """
     found = _Fit(problem, priors).run()
-    without = _Fit(problem.without_slips(), priors).run() if problem.slips else found
-    return without if without.evidence > found.evidence + log_odds * len(problem.slips) else found
+    if not problem.slips:
+        return found
+    stated, first = problem.without_slips(), min(own for slip in problem.slips for own, _ in slip)
+    begin = np.searchsorted(problem.keyframes, problem.graph.edge(first).vertices[0])
+    moved = replace(_Fit(replace(stated, first_edge=first), priors).run(), since_ns=int(problem.stamps_ns[begin]))
+    best = max(_Fit(stated, priors).run(), moved, key=lambda one: one.evidence)
+    return best if best.evidence > found.evidence + log_odds * len(problem.slips) else found
 
 
 class _Fit:

@@ -58,7 +58,6 @@ class OdometrySelector:
 
     def __init__(self, config: OdometryConfig, priority: Sequence[str], space: Geometry, counters: Counters) -> None:
         self._config, self._space, self._counters = config, space, counters
-        self._jumps = OdometryJumps(config, space)
         self._silent_ns = round(config.timeout_s * 1e9)
         self.sources: set[str] = set()
         self._order = list(priority)
@@ -152,7 +151,7 @@ class OdometrySelector:
         step = self._space.group.between_one(a.T_odom_base, b.T_odom_base)
         dt_ns = b.stamp_ns - a.stamp_ns
         usual_s = self._usual_ns * 1e-9 if dt_ns > self._longest_ns else 0.0
-        how = self._jumps.kind(step, b.T_odom_base, dt_ns * 1e-9, self._last_step, usual_s)
+        how = self._jump(step, b.T_odom_base, dt_ns * 1e-9, usual_s)
         return self._use(b, step, broken=how)
 
     def _use(self, m: Odometry, step: Numbers, *, broken: str) -> Step:
@@ -171,37 +170,25 @@ class OdometrySelector:
         self._usual_ns = usual_ns
         self._longest_ns = max(_LEAST_GAP_NS, _GAP * usual_ns) if usual_ns else math.inf
 
-
-class OdometryJumps:
-    """Detects jumps by the motion between two messages of one odometry."""
-
-    def __init__(self, config: OdometryConfig, space: Geometry) -> None:
-        self._config, self._space = config, space
-
-    def kind(self, motion: Numbers, T_odom_base: Numbers, dt: float, last: Numbers, usual_s: float = 0.0) -> str:
+    def _jump(self, motion: Numbers, T_odom_base: Numbers, dt: float, usual_s: float) -> str:
         """Return ``reset_to_zero`` or ``jump``; empty if a robot can move like this.
 
-        Parameters
-        ----------
-        motion, dt : from the message before [s]
-        T_odom_base : where odometry is now
-        last : the motion before
-        usual_s : the usual period, where odometry was silent for so long that its driver may have restarted, and driven
-            on; else 0
+        ``usual_s`` is the usual period where odometry was silent for so long that its driver may have restarted, and
+        driven on; else 0.
         """
-        if self._is_reset(motion, T_odom_base, last, is_gap=usual_s > 0.0):
+        if self._is_reset(motion, T_odom_base, is_gap=usual_s > 0.0):
             return "reset_to_zero"
         most_m_s = self._config.max_speed_m_s
         if usual_s:
-            most_m_s = min(most_m_s, max(_FROM_REST_M_S, _FASTER * self._size(last)[0] / usual_s))
+            most_m_s = min(most_m_s, max(_FROM_REST_M_S, _FASTER * self._size(self._last_step)[0] / usual_s))
         is_jump = self._space.square(motion) > (most_m_s * max(dt, _LEAST_S)) ** 2
         return "jump" if is_jump else ""
 
-    def _is_reset(self, motion: Numbers, T_odom_base: Numbers, last: Numbers, *, is_gap: bool) -> bool:
+    def _is_reset(self, motion: Numbers, T_odom_base: Numbers, *, is_gap: bool) -> bool:
         """Return whether the driver restarted: odometry is at the origin, farther away than robots move in a step."""
         if abs(T_odom_base[0]) > _AT_ZERO and not is_gap:
             return False
-        (far_m, far_rad), (at_m, at_rad), (usual_m, usual_rad) = map(self._size, (motion, T_odom_base, last))
+        (far_m, far_rad), (at_m, at_rad), (usual_m, usual_rad) = map(self._size, (motion, T_odom_base, self._last_step))
         most_m, most_rad = max(_RESET_M, _UNUSUAL * usual_m), max(_RESET_RAD, _UNUSUAL * usual_rad)
         is_at_zero = at_m <= most_m and at_rad <= most_rad if is_gap else max(at_m, at_rad) <= _AT_ZERO
         is_far = far_m > most_m  # a heading may be that of a compass, which goes on
