@@ -154,17 +154,13 @@ def read_problem(path: Path) -> Problem:
     return _in_time_order(path.name.split(".")[0], read_g2o(path, lenient=True, raw=True))
 
 
-def city_problem(poses: int, seed: int = 1, dimensions: int = 2) -> Problem:
-    """Our simulator's Manhattan: 60 by 60 blocks, a closure per three poses once streets are revisited.
-
-    In space (``dimensions`` 3) the same streets, driven with noise in height, roll and pitch as well.
-    """
+def city_problem(poses: int, seed: int = 1) -> Problem:
+    """Our simulator's Manhattan: 60 by 60 blocks, a closure per three poses once streets are revisited."""
     from graph_slam_ros.formats.graph_file import G2oFile
     from graph_slam_ros.tools.simulation.pose_graph import city_graph
 
     graph, _ = city_graph(seed, poses=poses)
-    problem = _in_time_order(f"city{poses}", G2oFile(graph, list(range(graph.vertex_count))))
-    return problem if dimensions == 2 else _in_space(problem, seed)
+    return _in_time_order(f"city{poses}", G2oFile(graph, list(range(graph.vertex_count))))
 
 
 def sphere_problem(poses: int = 2500, seed: int = 0) -> Problem:
@@ -174,20 +170,6 @@ def sphere_problem(poses: int = 2500, seed: int = 0) -> Problem:
 
     graph, _ = sphere_graph(seed, poses=poses, sigma_rad=0.1)
     return _in_time_order("noisy sphere", G2oFile(graph, list(range(graph.vertex_count))))
-
-
-def _in_space(problem: Problem, seed: int) -> Problem:
-    """A drive in the plane as one in space, whose measurements are as noisy along and about all axes."""
-    from graph_slam_ros.lie import se3
-
-    (to_metre, _, to_radian), count = np.diagonal(problem.relative.root[0]), len(problem.relative)
-    whitening = np.repeat([to_metre, to_radian], 3)
-    noise = np.random.default_rng(seed).standard_normal((count, 6)) / whitening * [0, 0, 1, 1, 1, 0]
-    exact = tuple(np.asarray(se3.in_space(problem.relative.measured)).T)
-    measured = np.stack(se3.retract(exact, tuple(noise.T)), axis=1)
-    relative = Edges(problem.relative.ends, measured, np.tile(np.diag(whitening), (count, 1, 1)))
-    poses = np.asarray(se3.in_space(problem.poses))
-    return replace(problem, name=f"{problem.name} in space", poses=poses, relative=relative)
 
 
 def _in_time_order(name: str, file: "G2oFile") -> Problem:

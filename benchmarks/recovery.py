@@ -11,8 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.live.streams import AFTER_NS, BEFORE_NS, CITY_SIGMA_M, CITY_SIGMA_RAD, STEP_NS
-from benchmarks.problem import city_problem
+from benchmarks.live.streams import AFTER_NS, BEFORE_NS, CITY_SIGMA_M, CITY_SIGMA_RAD, STEP_NS, city_steps
 from graph_slam_ros.lie import se2
 from graph_slam_ros.runs import recorder as recording
 from graph_slam_ros.runs.restore import map_of
@@ -24,11 +23,8 @@ START_NS = 10**15
 
 def drive(folder: Path, config: Config, poses: int) -> GraphSlam:
     """A run that nobody ends."""
-    problem = city_problem(poses, dimensions=2)
+    steps, closures = city_steps(poses)
     covariance = tuple(np.diag(np.square([CITY_SIGMA_M, CITY_SIGMA_M, CITY_SIGMA_RAD])).ravel().tolist())
-    steps, closures = {}, {}
-    for ends, measured in zip(problem.relative.ends.tolist(), problem.relative.measured.tolist(), strict=True):
-        (steps if ends[1] == ends[0] + 1 else closures)[ends[1]] = ends[0], tuple(measured)
     recording._BYTES_PER_S = np.inf  # the drive takes a hundredth of its time
     recorder = recording.RunRecorder(folder, config, 1.0)
     slam, at = GraphSlam(config, recorder.sink), se2.IDENTITY

@@ -1,4 +1,4 @@
-"""Processes that are measured from outside: started, asked what they cost, and ended by their id."""
+"""The node and who is around it, each a process: started, asked what it costs, and ended by its id."""
 
 import contextlib
 import json
@@ -7,6 +7,7 @@ import random
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -16,8 +17,10 @@ import rclpy
 from rclpy.signals import SignalHandlerOptions
 
 from benchmarks.fresh import ROOT
+from benchmarks.live.streams import LANDMARKS, ODOMETRY
 
 PATIENCE_S = 10.0
+HELPERS = "benchmarks.live.robot"
 _TICK_S = 1.0 / os.sysconf("SC_CLK_TCK")
 _DOMAIN = str(random.randint(1, 100))
 ENVIRONMENT = os.environ | {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_DOMAIN_ID": _DOMAIN}
@@ -43,10 +46,11 @@ class Process:
         fields = Path(f"/proc/{self._popen.pid}/stat").read_text().rsplit(")", 1)[1].split()
         return (int(fields[11]) + int(fields[12])) * _TICK_S
 
-    def memory_bytes(self, kind: str = "VmRSS") -> int:
-        """Resident bytes."""
+    @property
+    def memory_mib(self) -> float:
+        """Resident memory."""
         status = Path(f"/proc/{self._popen.pid}/status").read_text()
-        return 1024 * int(next(line for line in status.splitlines() if line.startswith(kind)).split()[1])
+        return int(next(line for line in status.splitlines() if line.startswith("VmRSS")).split()[1]) / 1024.0
 
     def ask(self, **question: Any) -> Any:
         """Send a question as a line of JSON and wait for the answer."""
@@ -78,6 +82,33 @@ class Process:
             self._popen.communicate()
 
 
+class Node(Process):
+    """Our node, recording into a folder."""
+
+    def __init__(self, folder: Path, parameters: dict[str, Any]) -> None:
+        self._folder = folder
+        given = {"output.folder": folder} | parameters
+        words = [word for key, value in given.items() for word in ("-p", f"{key}:={_text(value)}")]
+        super().__init__("graph_slam_ros.node.node", "--ros-args", "--log-level", "error", *words, name="the node")
+
+    def finished(self) -> dict[str, Any]:
+        """What it tells of its run, once it has ended."""
+        self.stop()
+        told: dict[str, Any] = json.loads((self._folder / "run.json").read_text(encoding="utf-8"))
+        return told
+
+
+def sender(stream: str, *topics: str, **values: Any) -> Process:
+    """Who sends a stream, see ``benchmarks.live.streams``."""
+    names = ",".join(topics or (ODOMETRY, LANDMARKS))
+    return Process(HELPERS, "send", stream, json.dumps(values), names, name="the sender")
+
+
+def listener(*names: str) -> Process:
+    """Who listens to outputs of the node."""
+    return Process(HELPERS, "listen", *names, name="the listener")
+
+
 @contextlib.contextmanager
 def running(*processes: Process) -> Iterator[None]:
     """Whatever happens, they end."""
@@ -86,6 +117,19 @@ def running(*processes: Process) -> Iterator[None]:
     finally:
         for process in processes:
             process.stop()
+
+
+@contextlib.contextmanager
+def node(parameters: dict[str, Any], *others: Process) -> Iterator[Node]:
+    """A node for as long as the context lasts; the others end with it."""
+    with tempfile.TemporaryDirectory() as folder:
+        ours = Node(Path(folder) / "run", parameters)
+        with running(*others, ours):
+            yield ours
+
+
+def _text(value: Any) -> str:
+    return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def until(condition: Callable[[], bool], rest: Callable[[], Any], what: str, patience_s: float = PATIENCE_S) -> None:

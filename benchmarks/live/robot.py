@@ -1,4 +1,4 @@
-"""Helpers around a node, each a process of its own: who sends, who listens, and a bare node to compare with.
+"""Helpers around a node, each a process of its own: who sends, listens, manages, and a bare node to compare with.
 
 Each is told what to do, and answers, in lines of JSON (``benchmarks.live.processes``).
 """
@@ -14,20 +14,18 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray
-from rcl_interfaces.srv import GetParameters
+from lifecycle_msgs.srv import ChangeState
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import UInt64
 
-from benchmarks.live.processes import asked, reply, ros, until
+from benchmarks.live.processes import PATIENCE_S, asked, reply, ros, until
 from benchmarks.live.streams import STREAMS, TYPES, later, stamp_ns
 from graph_slam_ros.messages.interfaces import message_class
 from graph_slam_ros.recordings.bag import BagMessage
 
-HERE = "benchmarks.live.robot"
 NODE = "/graph_slam"
 _LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _DEEP = QoSProfile(depth=1000)
@@ -41,7 +39,6 @@ _AHEAD = 256  # messages on their way, where the node sets the pace
 _APART_NS = 20_000_000  # of stamps, before a message of another topic waits for those before it
 _START_S = 120.0  # the first start of an installation compiles
 _SLOW_S = 60.0  # nothing that a node does takes longer
-_ASK_S = 0.1  # how often a service is called
 
 
 class _Sender:
@@ -54,7 +51,6 @@ class _Sender:
             topic: self._node.create_publisher(message_class(TYPES[topic]), topic, _DEEP) for topic in topics
         }
         self._sent = self._received = 0
-        self._seen: dict[str, int] = {}
         self._behind_ns: int | None = None  # the stream, where it is played at the present
 
     def wait_for_node(self) -> None:
@@ -62,18 +58,17 @@ class _Sender:
         for topic, publisher in self._publishers.items():
             until(lambda p=publisher: p.get_subscription_count() > 0, self._rest, f"subscriber of {topic}", _START_S)
 
-    def play(self, seconds: float | None = None, pace: float = 1.0, every: int = 1, tell: bool = False) -> Any:
+    def play(self, seconds: float | None = None, pace: float = 1.0, tell: bool = False) -> Any:
         """Send a part of the stream.
 
         Parameters
         ----------
         seconds : of stamps, how long a part; None: all that is left
         pace : times real time, at 1 stamped with the present; 0: as fast as the node takes it
-        every : of each topic every so many messages only
         tell : whether to answer when each was sent
         """
         begin, before, when = time.monotonic(), self._sent, []
-        part = self._part(seconds, every)
+        part = self._part(seconds)
         if pace == 1.0:
             part = self._at_present(part)
         for m in _paced(part, pace) if pace else self._awaited(part):
@@ -92,16 +87,14 @@ class _Sender:
                 self._rest(0.5)
             return last
 
-    def _part(self, seconds: float | None, every: int) -> Iterator[BagMessage]:
+    def _part(self, seconds: float | None) -> Iterator[BagMessage]:
         first_ns: int | None = None
         for m in self._stream:
             first_ns = m.log_ns if first_ns is None else first_ns
             if seconds is not None and m.log_ns - first_ns >= seconds * 1e9:
                 self._stream = itertools.chain([m], self._stream)
                 return
-            self._seen[m.topic] = self._seen.get(m.topic, -1) + 1
-            if self._seen[m.topic] % every == 0:
-                yield m
+            yield m
 
     def _at_present(self, part: Iterator[BagMessage]) -> Iterator[BagMessage]:
         for m in part:
@@ -169,62 +162,27 @@ def send(name: str, values: str, topics: str) -> None:
 
 
 def listen(*names: str) -> None:
-    """Subscribe to outputs of the node; tells, when asked, when what stamps came since it was last asked.
-
-    ``diagnostics`` are told in full, ``service`` is how long answers of a parameter service took.
-    """
+    """Subscribe to outputs of the node; tells, when asked, when what stamps came since it was last asked."""
     with ros():
         node, orders = Node("listener"), _orders()
         heard: dict[str, list[Any]] = {name: [] for name in names}
 
         def keep(name: str, at: int) -> Callable[[bytes], None]:
-            return lambda cdr: heard[name].append((time.monotonic_ns(), stamp_ns(cdr, at), len(cdr)))
+            return lambda cdr: heard[name].append((time.monotonic_ns(), stamp_ns(cdr, at)))
 
-        for name in set(names) & set(_OUTPUTS):
+        for name in names:
             topic, type_name, qos, at = _OUTPUTS[name]
             node.create_subscription(message_class(type_name), topic, keep(name, at), qos, raw=True)
-        if "diagnostics" in names:
-            node.create_subscription(
-                DiagnosticArray, "/diagnostics", lambda m: heard["diagnostics"].append(_diagnostics(m)), 10
-            )
-        ask = _service(node, heard["service"]) if "service" in names else lambda: None
         executor = EventsExecutor()
         executor.add_node(node)
         while True:
             executor.spin_once(timeout_sec=0.02)
-            ask()
             if not orders.empty():
                 if orders.get() is None:
                     return
                 reply(heard)
                 for some in heard.values():
                     some.clear()
-
-
-def _diagnostics(message: DiagnosticArray) -> Any:
-    told = {one.name: {v.key: v.value for v in one.values} | {"": one.message} for one in message.status}
-    return time.monotonic_ns(), told
-
-
-def _service(node: Node, took: list[Any]) -> Callable[[], None]:
-    """A call now and then, never more than one on its way."""
-    client = node.create_client(GetParameters, f"{NODE}/get_parameters")
-    asked_ns, future = 0, None
-
-    def ask() -> None:
-        nonlocal asked_ns, future
-        now = time.monotonic_ns()
-        if future is None and now - asked_ns > _ASK_S * 1e9 and client.service_is_ready():
-            asked_ns = now
-            future = client.call_async(GetParameters.Request(names=["use_sim_time"]))
-            future.add_done_callback(lambda _: answered())
-
-    def answered() -> None:
-        nonlocal future
-        took.append((asked_ns, time.monotonic_ns() - asked_ns))
-        future = None
-
-    return ask
 
 
 def bare(*topics: str) -> None:
@@ -237,6 +195,28 @@ def bare(*topics: str) -> None:
         executor.add_node(node)
         while True:
             executor.spin_once(timeout_sec=1.0)  # so that it can be told to end
+
+
+def manage() -> None:
+    """Ask the node for the transitions that are told; answers the seconds that each took."""
+    with ros():
+        manager = Node("manager")
+        client = manager.create_client(ChangeState, f"{NODE}/change_state")
+
+        def rest() -> None:
+            rclpy.spin_once(manager, timeout_sec=0.02)
+
+        until(client.service_is_ready, rest, "service of the node", 6 * PATIENCE_S)
+        reply("ready")
+        while True:
+            request: Any = ChangeState.Request()
+            request.transition.label = asked()["transition"]
+            start = time.monotonic()
+            future = client.call_async(request)
+            until(future.done, rest, "answer", 6 * PATIENCE_S)
+            if not future.result().success:
+                raise SystemExit(f"{request.transition.label} failed")
+            reply(time.monotonic() - start)
 
 
 def _orders() -> "queue.Queue[Any]":
@@ -253,4 +233,4 @@ def _orders() -> "queue.Queue[Any]":
 
 
 if __name__ == "__main__":
-    {"send": send, "listen": listen, "bare": bare}[sys.argv[1]](*sys.argv[2:])
+    {"send": send, "listen": listen, "manage": manage, "bare": bare}[sys.argv[1]](*sys.argv[2:])

@@ -3,13 +3,14 @@
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TypeAlias
 from unittest.mock import patch
 
 import numpy as np
 from numpy.random import PCG64, Generator
 
 from benchmarks.problem import Array, city_problem
-from graph_slam_ros.lie import se2, se3
+from graph_slam_ros.lie import se2
 from graph_slam_ros.messages import to_msg
 from graph_slam_ros.recordings.bag import BagMessage, open_bag
 from graph_slam_ros.tools.simulation import simulate, write_bag
@@ -22,6 +23,8 @@ TYPES = {
     LANDMARKS: "vision_msgs/msg/Detection3DArray",
     CLOSURES: "vision_msgs/msg/Detection3DArray",
 }
+Motion: TypeAlias = tuple[int, se2.Pose]
+Motions: TypeAlias = dict[int, Motion]
 _NS = 1_000_000_000
 _UNUSED = 1e6
 _LAP_S = 60.0  # of a warehouse, at least
@@ -42,30 +45,32 @@ def warehouse(seconds: float, odometry_hz: int, landmarks_hz: int) -> Iterator[B
     yield from found
 
 
-def city(poses: int, dimensions: int = 2) -> Iterator[BagMessage]:
+def city_steps(poses: int) -> tuple[Motions, Motions]:
+    """Odometry and closures of Manhattan by their later pose: the earlier one, and the motion."""
+    relative, steps, closures = city_problem(poses).relative, dict[int, Motion](), dict[int, Motion]()
+    for (earlier, later), measured in zip(relative.ends.tolist(), relative.measured.tolist(), strict=True):
+        (steps if later == earlier + 1 else closures)[later] = earlier, tuple(measured)
+    return steps, closures
+
+
+def city(poses: int) -> Iterator[BagMessage]:
     """Manhattan of 60 by 60 blocks with a closure per three poses.
 
     A pose per second: its odometry, the closure that ends there, and odometry that releases both.
     """
-    problem = city_problem(poses, dimensions=dimensions)
-    group = se2 if dimensions == 2 else se3
-    sigmas = [CITY_SIGMA_M] * dimensions + [CITY_SIGMA_RAD] * (len(problem.relative.root[0]) - dimensions)
-    covariance = np.diag(np.square(sigmas))
-    steps, closures = {}, {}
-    for ends, measured in zip(problem.relative.ends.tolist(), problem.relative.measured.tolist(), strict=True):
-        (steps if ends[1] == ends[0] + 1 else closures)[ends[1]] = ends[0], tuple(measured)
-    at = group.IDENTITY
+    steps, closures = city_steps(poses)
+    covariance, at = np.diag(np.square([CITY_SIGMA_M, CITY_SIGMA_M, CITY_SIGMA_RAD])), se2.IDENTITY
     for k in range(poses):
         stamp_ns = START_NS + k * STEP_NS
         if k:
-            at = tuple(map(float, group.compose(at, steps[k][1])))
+            at = tuple(map(float, se2.compose(at, steps[k][1])))
         yield BagMessage(ODOMETRY, stamp_ns, _odometry(stamp_ns, at))
         if k in closures:
             yield _closure(stamp_ns - BEFORE_NS, START_NS + closures[k][0] * STEP_NS, closures[k][1], covariance)
         if k + 1 < poses:
-            ahead = group.interpolate(group.IDENTITY, steps[k + 1][1], AFTER_NS / STEP_NS)
+            ahead = se2.interpolate(se2.IDENTITY, steps[k + 1][1], AFTER_NS / STEP_NS)
             then_ns = stamp_ns + AFTER_NS
-            yield BagMessage(ODOMETRY, then_ns, _odometry(then_ns, group.compose(at, ahead)))
+            yield BagMessage(ODOMETRY, then_ns, _odometry(then_ns, se2.compose(at, ahead)))
 
 
 def standing(hours: float, jitter_m: float) -> Iterator[BagMessage]:
@@ -94,15 +99,13 @@ def stamp_ns(cdr: bytes, at: int = 4) -> int:
 
 
 def _odometry(stamp_ns: int, at: tuple[float, ...], twist: bytes | None = None) -> bytes:
-    return to_msg.odometry(stamp_ns, "odom", "base_link", at, np.eye(3 if len(at) == 3 else 6), _UNUSED, twist)
+    return to_msg.odometry(stamp_ns, "odom", "base_link", at, np.eye(3), _UNUSED, twist)
 
 
 def _closure(stamp_ns: int, earlier_ns: int, T_earlier_later: tuple[float, ...], covariance: Array) -> BagMessage:
     """Where the robot was earlier, as it is seen from where it is."""
-    planar = len(T_earlier_later) == 3
-    group = se2 if planar else se3
-    seen = tuple(map(float, group.inverse(T_earlier_later)))
-    turned = group.adjoint(T_earlier_later)
+    seen = tuple(map(float, se2.inverse(T_earlier_later)))
+    turned = se2.adjoint(T_earlier_later)
     posed = to_msg.pose_with_covariance(seen, turned @ covariance @ turned.T, _UNUSED)
     head, make = to_msg.header(stamp_ns, "base_link"), to_msg.make
     hypothesis = make("vision_msgs/msg/ObjectHypothesis", class_id="", score=1.0)
