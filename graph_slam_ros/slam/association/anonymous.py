@@ -19,10 +19,8 @@ from graph_slam_ros.measurements.types import Sightings
 from graph_slam_ros.slam.association.assignments import Assigned, Assignments
 from graph_slam_ros.slam.association.beam import NOTHING, Beam, BeamSettings, Decision, changes
 from graph_slam_ros.slam.association.belief import SolverBelief
-from graph_slam_ros.slam.association.elsewhere import Seen as AllSeen
-from graph_slam_ros.slam.association.elsewhere import UnnamedDisplacement
+from graph_slam_ros.slam.association.elsewhere import Elsewhere
 from graph_slam_ros.slam.association.hindsight import Found, FrozenScans, Hindsight
-from graph_slam_ros.slam.association.renumbered import first_of_later
 from graph_slam_ros.slam.association.scan_history import ScanHistory
 from graph_slam_ros.slam.association.scans import SCAN_NS, DeadReckoning, Motion, Scan, ScanBuilder
 from graph_slam_ros.slam.backend import Backend
@@ -73,13 +71,12 @@ class AnonymousLandmarks:
         self.hindsight = Hindsight(config, self._settings, executor, counters)
         self.clusters = Assignments(landmarks, counters, backend)
         self._beam: Beam | None = None
-        self._sorts = dict[int, str]()  # of landmarks, whatever beam began them
         self._leader: Decision | None = None
         self._same: dict[int, int] = {}  # landmarks of the beam that are others in the graph
         self._compared = 0  # scans
         self._rejoined = frozenset[int]()  # keyframes at which an explanation has no displacement, by their vertices
         self._displaced: int | None = None  # the scan from which on all are explained anew
-        self.elsewhere = UnnamedDisplacement(space, landmarks)
+        self.elsewhere = Elsewhere(space, landmarks, self._history, self.clusters)
 
     def restore(self) -> None:
         """Continue with the landmarks of a map."""
@@ -97,7 +94,7 @@ class AnonymousLandmarks:
 
     def forget_belief(self) -> None:
         """Restart the beam from the solver's estimate, because the map has moved."""
-        self._beam = None
+        self._beam = self._leader = None
 
     def rescale(self, factors: tuple[float, float]) -> None:
         """Take over that odometry's distance and turn were multiplied."""
@@ -153,7 +150,6 @@ class AnonymousLandmarks:
             scales, sigma = self.hindsight.scales
             seed = self._belief.seed(scan, names, scales if beam is None else beam.scales[0], sigma)
             beam, self._leader = Beam(self._settings, seed), None
-            beam.sorts = self._classes()
         else:
             beam.advance(motion)
             self._belief.recall(beam, scan, names)
@@ -162,14 +158,6 @@ class AnonymousLandmarks:
             raise GraphSlamError("the hypotheses are not finite")
         self._beam = beam
         return decision
-
-    def _classes(self) -> dict[int, str]:
-        """Classes of landmarks, also of those that no beam began: of a map, or of an explanation of all."""
-        for number, name in self.clusters.names.items():
-            mark = self._landmarks.known.get(name)
-            if mark is not None and mark.sort:
-                self._sorts[number] = mark.sort
-        return self._sorts
 
     def doubt(self, since_ns: int, added: Callable[[float], Array] | None) -> None:
         """Use odometry with more noise, or as stated again. In the first case the scans since then are explained anew.
@@ -182,22 +170,13 @@ class AnonymousLandmarks:
         if since is not None:
             self.explain_since(since)
 
-    def _propose(self) -> None:
-        """Assign the newest scans, where they contradict the pose, to the landmarks that they fit elsewhere."""
-        scans = self._history.scans
-        if len(scans) not in (0, self._compared):
-            self._compared = len(scans)
-            given = np.array(self.clusters.given, dtype=np.int64)
-            seen = AllSeen(scans, self._history.firsts, given, self.clusters.names, self.clusters.before)
-            self.clusters.give(self.elsewhere.propose(seen))
-
     def displaced(self, first: int) -> None:
         """Begin anew at a keyframe, by its vertex: the robot was moved there."""
         self._beam = None
         self.hindsight.restart()
         k = self._history.split(first)
         if k is not None and (since := self.elsewhere.since) is not None:  # what was begun at the wrong place
-            lost = [c for c in range(since, len(self.clusters.given)) if c not in self.elsewhere.proposed]
+            lost = [c for c in range(since, self.clusters.count) if c not in self.elsewhere.proposed]
             self.clusters.give(dict.fromkeys((c for c in lost if self.clusters.given[c] >= since), NOTHING))
             self._displaced = k
         self.elsewhere.end()
@@ -221,14 +200,14 @@ class AnonymousLandmarks:
 
     def explain_since(self, first: int) -> None:
         """Explain the scans anew from one on: what they were thought to be is forgotten."""
-        self.clusters.give(dict.fromkeys(range(self._history.firsts[first], len(self.clusters.given)), NOTHING))
+        self.clusters.give(dict.fromkeys(range(self._history.firsts[first], self.clusters.count), NOTHING))
         self._solver.update()
         self._explain_from(first)
 
     def _explain_from(self, first: int) -> None:
         """Explain the scans anew from one on, by the map and the path as they are."""
         history = self._history
-        clusters = range(history.firsts[first], len(self.clusters.given))
+        clusters = range(history.firsts[first], self.clusters.count)
         self.hindsight.restart()
         self._beam = self._leader = now = None
         try:
@@ -253,28 +232,19 @@ class AnonymousLandmarks:
         scans = self._history.scans
         if not self.hindsight.is_on or not scans:
             return True
-        return self.hindsight.covers(first_of_later(scans, keyframe)) and not self.hindsight.is_doubtful
+        return self.hindsight.covers(self._history.since(keyframe)) and not self.hindsight.is_doubtful
 
     def forget_before(self, keyframe: int) -> None:
         """Forget the scans from keyframes before a number, which have left the graph: their landmarks are final."""
         history = self._history
-        k = first_of_later(history.scans, keyframe)
+        k = history.since(keyframe)
         self.hindsight.forget(k)
-        clusters = history.firsts[k] if k < len(history.scans) else len(self.clusters.given)
-        history.forget(k, clusters)
+        first = history.firsts[k] if k < len(history.scans) else self.clusters.count
+        history.forget(k)
+        self.clusters.forget_before(first)
         self._compared -= k
-        new = self.clusters.forget(clusters, (c for scan in history.scans for c in scan.clusters))
-        beam = self._beam
-        self._leader, *last = new.histories([self._leader, *(beam.history if beam else ())])
-        self._same = {new.landmark(one): new.landmark(other) for one, other in self._same.items()}
-        kept = {*self.clusters.names, *self.clusters.given}
-        if beam is not None:
-            beam.history = last
-            beam.renumber(new.landmark, new.landmarks(beam.ids))
-            kept |= set(beam.ids.ravel().tolist())
-        self._sorts = new.kept(self._sorts, kept)
-        if beam is not None:
-            beam.sorts = self._sorts
+        if self._beam is not None:
+            self._beam.forget_before(first)
 
     # -- afterwards --------------------------------------------------------------------------------------------------
 
@@ -293,7 +263,9 @@ class AnonymousLandmarks:
         if self._displaced is not None:  # it is solved now
             self._explain_from(self._displaced)
             self._displaced = None
-        self._propose()
+        if len(self._history.scans) not in (0, self._compared):
+            self._compared = len(self._history.scans)
+            self.clusters.give(self.elsewhere.look())
         self._adopt(self.hindsight.outcome(count))
         if self.hindsight.is_due(len(self._history.scans)):
             self.hindsight.start(self._frozen, count)
@@ -307,7 +279,7 @@ class AnonymousLandmarks:
         at = self._solver.estimate([scan.where.vertex for scan in scans])
         poses = np.stack(group.compose(tuple(at.T), tuple(moved.T)), axis=-1)
         scales = self._beam.scales[0] if self._beam else self.hindsight.scales[0]
-        given = np.array(self.clusters.given)
+        given = np.array(list(self.clusters.given.values()))
         history = self._history
         motions = tuple(history.motions)
         frozen = FrozenScans(tuple(scans), motions, history.nearby(), poses, scales.copy(), given)

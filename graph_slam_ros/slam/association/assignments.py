@@ -12,7 +12,6 @@ from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.types import Sighting
 from graph_slam_ros.slam.association.beam import NOTHING
 from graph_slam_ros.slam.association.moves import LEAST_SCANS
-from graph_slam_ros.slam.association.renumbered import Renumbered
 from graph_slam_ros.slam.association.scans import Cluster, Seen
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
@@ -53,22 +52,22 @@ class Assignments:
 
     Attributes
     ----------
-    given : of each cluster the number of its landmark, or ``NOTHING``
-    seen : of each cluster its sightings
+    count : clusters so far; each keeps its number, which is that of the landmark that it began, too
+    given : by cluster the number of its landmark, or ``NOTHING``
+    seen : by cluster its sightings
     names : of landmarks by number
-    before : of landmarks by number how many clusters there were that have left
     """
 
     def __init__(self, landmarks: Landmarks, counters: Counters, backend: Backend) -> None:
         self._landmarks, self._counters, self._backend = landmarks, counters, backend
-        self.given: list[int] = []
+        self.count = 0
+        self.given: dict[int, int] = {}
         self.names: dict[int, str] = {}
-        self.seen: list[tuple[Seen, ...]] = []
+        self.seen: dict[int, tuple[Seen, ...]] = {}
         self._scans: Counter[int] = Counter()  # of each landmark
         self._begun, self._fresh = 0, _FROM_MAP
-        self._final = 0  # clusters whose landmarks stay
+        self._final = 0  # the first cluster whose landmark may change
         self._given_up: dict[int, list[int]] = {}  # landmarks that were, with their clusters
-        self.before: Counter[int] = Counter()
 
     def restore(self) -> bool:
         """Continue with the landmarks of a map, if there are any. New names differ from theirs."""
@@ -90,37 +89,30 @@ class Assignments:
 
     def finish(self) -> None:
         """Fix the assignment of all present clusters."""
-        self._final = len(self.given)
+        self._final = self.count
 
-    def forget(self, gone: int, stay: Iterable[Cluster]) -> Renumbered:
-        """Forget the oldest clusters: their landmarks are final. Returns the new numbers.
-
-        Parameters
-        ----------
-        gone : how many leave; stay : the others
-        """
-        new, known = Renumbered(gone, self.fresh), self._landmarks.known
-        self.before.update(k for k in self.given[:gone] if k != NOTHING)
-        self.given = [new.landmark(k) for k in self.given[gone:]]
-        self.seen = [cluster.seen for cluster in stay]
-        up = {k: [c - gone for c in clusters if c >= gone] for k, clusters in self._given_up.items()}
-        self._given_up = {new.landmark(k): clusters for k, clusters in up.items() if clusters}
-        numbers = {*self.given, *self._given_up, *(new.landmark(k) for k, one in self.names.items() if one in known)}
-        self.names = new.kept(self.names, numbers)
-        self._scans, self.before = (Counter(new.kept(one, numbers)) for one in (self._scans, self.before))
-        self._final = max(self._final - gone, 0)
-        return new
+    def forget_before(self, first: int) -> None:
+        """Forget the clusters before one: their landmarks are final."""
+        for cluster in [one for one in self.given if one < first]:
+            del self.seen[cluster]
+            del self.given[cluster]
+        up = {k: [one for one in clusters if one >= first] for k, clusters in self._given_up.items()}
+        self._given_up = {k: clusters for k, clusters in up.items() if clusters}
+        used, known = {*self.given.values(), *self._given_up}, self._landmarks.known
+        self.names = {k: name for k, name in self.names.items() if k in used or name in known}
+        self._scans = Counter({k: count for k, count in self._scans.items() if k in used or k in self.names})
 
     def append(self, clusters: Sequence[Cluster]) -> int:
         """Add clusters without a landmark. Returns the number of the first."""
-        self.seen += [cluster.seen for cluster in clusters]
-        self.given += [NOTHING] * len(clusters)
-        return len(self.given) - len(clusters)
+        first, self.count = self.count, self.count + len(clusters)
+        for number, cluster in enumerate(clusters, first):
+            self.seen[number], self.given[number] = cluster.seen, NOTHING
+        return first
 
     def begin(self, first: int, landmarks: Mapping[int, int]) -> list[Assigned]:
         """Assign new clusters, from a number on. Returns their sightings, each with its landmark's name."""
         out = []
-        for cluster in range(first, len(self.given)):
+        for cluster in range(first, self.count):
             landmark = self.given[cluster] = landmarks.get(cluster, NOTHING)
             self._scans[landmark] += 1
             for one in self.seen[cluster]:
@@ -131,8 +123,8 @@ class Assignments:
         return out
 
     def give(self, changed: Mapping[int, int]) -> bool:
-        """Assign clusters to other landmarks. Returns whether there were any."""
-        changed = {c: k for c, k in changed.items() if c >= self._final and self.given[c] != k}
+        """Assign clusters to other landmarks, unless theirs are final. Returns whether there were any."""
+        changed = {c: k for c, k in changed.items() if c >= self._final and self.given.get(c, k) != k}
         lost: dict[str, set[tuple[int, str, Sighting]]] = {}
         for cluster in changed:
             name = self.names.get(self.given[cluster], NOT_IN_MAP)
@@ -191,5 +183,5 @@ class Assignments:
                 self._landmarks.confirm(name, is_sure=is_sure)
             if not is_sure and now_ns - mark.last_seen_ns > _GIVE_UP_NS:
                 self._landmarks.prune(name)
-                self._given_up[number] = [cluster for cluster, k in enumerate(self.given) if k == number]
+                self._given_up[number] = [cluster for cluster, k in self.given.items() if k == number]
                 self._counters.count("landmarks", "given_up")

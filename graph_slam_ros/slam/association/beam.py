@@ -6,13 +6,12 @@ another with the joint covariance, so that the assignments are jointly compatibl
 likeliest are kept. Of hypotheses with the same recent decisions only the best is kept. The first one is the leader.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from graph_slam_ros.slam.association.scans import Cluster, Motion, Scan
+from graph_slam_ros.slam.association.scans import Cluster, Motion, Scan, are_others
 from graph_slam_ros.slam.landmarks.rotations import lever, rotation
 from graph_slam_ros.typing import Array
 
@@ -57,7 +56,7 @@ class BeamSettings:
     slip_sigma_rad: float = 0.3
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Decision:
     """The landmark of a cluster, linked to the previous decision; ``count`` decisions in all."""
 
@@ -85,7 +84,7 @@ def changes(last: Decision | None, now: Decision | None) -> dict[int, int]:
 
 @dataclass(frozen=True, slots=True)
 class Seed:
-    """The start of a beam: position (n,), rotation (n, n), odometry's scales, landmarks (k, n) by number.
+    """The start of a beam: position (n,), rotation (n, n), odometry's scales, landmarks (k, n) by number and class.
 
     Attributes
     ----------
@@ -97,6 +96,7 @@ class Seed:
     scales: Array
     landmarks: Array
     numbers: Ids
+    sorts: list[str]
     covariance: Array
 
 
@@ -117,6 +117,7 @@ class Beam:
     log_weight : (K,) relative to the best
     position, turn, scales : (K, n), (K, n, n), (K, 2)
     landmarks, ids : (K, L, n), (K, L); the number of a landmark, or -1 where the slot is free
+    sorts : (K, L) class of a landmark; empty where it has none
     covariance : (K, D, D) of position, rotation in the robot's frame, scales, landmarks
     last : (K, L) the scan in which a landmark was seen last
     history : of each the last decision
@@ -131,10 +132,10 @@ class Beam:
         self.position, self.turn = seed.position[None].copy(), seed.turn[None].copy()
         self.scales, self.landmarks = seed.scales[None].copy(), seed.landmarks.reshape(1, slots, n).copy()
         self.ids, self.last = seed.numbers.reshape(1, slots).copy(), np.zeros((1, slots), dtype=np.int64)
+        self.sorts = np.array(seed.sorts, dtype=object).reshape(1, slots)
         self.covariance = seed.covariance[None].copy()
         self.log_weight = np.zeros(1)
         self.history: list[Decision | None] = [None]
-        self.sorts: dict[int, str] = {}
         self._signs: list[tuple[int, ...]] = [()]
         self._scans, self._since_slip = 0, 0.0
 
@@ -166,7 +167,7 @@ class Beam:
         return self.history[0]
 
     def _keep(self, which: Ids) -> None:
-        for name in ("position", "turn", "scales", "landmarks", "ids", "last", "covariance", "log_weight"):
+        for name in ("position", "turn", "scales", "landmarks", "ids", "sorts", "last", "covariance", "log_weight"):
             setattr(self, name, getattr(self, name)[which])
         self.history = [self.history[i] for i in which.tolist()]
         self._signs = [self._signs[i] for i in which.tolist()]
@@ -258,9 +259,7 @@ class Beam:
         residual = cluster.point - seen
         chi2 = (residual[..., None, :] @ inverse @ residual[..., None])[..., 0, 0]
         is_possible = (self.ids != _FREE) & (determinant > 0.0) & (chi2 >= 0.0) & (chi2 < self.settings.gate)
-        if cluster.sort:
-            sorts = [[self.sorts.get(one, cluster.sort) == cluster.sort for one in row] for row in self.ids.tolist()]
-            is_possible &= np.array(sorts, dtype=bool).reshape(is_possible.shape)
+        is_possible &= ~are_others(self.sorts, cluster.sort)
         volume = np.log(np.where(is_possible, determinant, 1.0)) + n * np.log(2.0 * np.pi)
         log_likelihood = np.where(is_possible, -0.5 * (chi2 + volume), -np.inf)
         return _Expected(log_likelihood, residual, inverse, of_turn, back)
@@ -295,8 +294,6 @@ class Beam:
         """Add a new landmark at the cluster, in some hypotheses."""
         if not len(which):
             return
-        if cluster.sort:
-            self.sorts[number] = cluster.sort
         n, r = self._n, self._r
         slot = self._slots_for(which)
         turn, p = self.turn[which], self.covariance[which]
@@ -304,25 +301,24 @@ class Beam:
         j = np.concatenate([np.broadcast_to(np.eye(n), turn.shape), turn @ lever(cluster.point)], axis=-1)
         rows = j @ p[:, : n + r]
         own = rows[:, :, : n + r] @ j.transpose(0, 2, 1) + turn @ cluster.covariance @ turn.transpose(0, 2, 1)
-        self._place(which, slot, self.position[which] + away, rows, own, number)
+        self._place(which, slot, self.position[which] + away, rows, own, number, cluster.sort)
 
-    def recall(self, number: int, points: Array, rows: Array, own: Array) -> None:
+    def recall(self, number: int, sort: str, points: Array, rows: Array, own: Array) -> None:
         """Bring back a landmark in all hypotheses, with its position (K, n) and covariance, as for a new one."""
         which = np.arange(len(self.ids))
         slot = self._slots_for(which)
-        self._place(
-            which,
-            slot,
-            points,
-            np.pad(rows, ((0, 0), (0, 0), (0, self.covariance.shape[1] - rows.shape[2]))),
-            own,
-            number,
-        )
+        whole = np.pad(rows, ((0, 0), (0, 0), (0, self.covariance.shape[1] - rows.shape[2])))
+        self._place(which, slot, points, whole, own, number, sort)
 
-    def renumber(self, new: Callable[[int], int], ids: Ids) -> None:
-        """Take over new numbers of landmarks, also as ``ids``."""
-        self.ids = ids
-        self._signs = [tuple(map(new, sign)) for sign in self._signs]
+    def forget_before(self, cluster: int) -> None:
+        """Forget the decisions on clusters before a number. Hypotheses share what they decided long ago."""
+        done = set[int]()
+        for one in self.history:
+            while one is not None and id(one) not in done:
+                done.add(id(one))
+                if one.before is not None and one.before.cluster < cluster:
+                    one.before = None
+                one = one.before
 
     @property
     def is_sound(self) -> bool:
@@ -333,7 +329,7 @@ class Beam:
             and np.isfinite(self.landmarks).all()
         )
 
-    def _place(self, which: Ids, slot: Ids, points: Array, rows: Array, own: Array, number: int) -> None:
+    def _place(self, which: Ids, slot: Ids, points: Array, rows: Array, own: Array, number: int, sort: str) -> None:
         """Store a landmark in some hypotheses, with its cross-covariance (m, n, D) and covariance (m, n, n)."""
         n, b = self._n, self._base
         columns = b + n * slot[:, None] + np.arange(n)
@@ -342,7 +338,7 @@ class Beam:
         p[which[:, None], :, columns] = rows
         p[which[:, None, None], columns[:, :, None], columns[:, None]] = own
         self.landmarks[which, slot] = points
-        self.ids[which, slot] = number
+        self.ids[which, slot], self.sorts[which, slot] = number, sort
         self.last[which, slot] = self._scans
 
     def _slots_for(self, which: Ids) -> Ids:
@@ -362,6 +358,7 @@ class Beam:
     def _grow(self, more: int) -> None:
         count, n = len(self.ids), self._n
         self.ids = np.concatenate([self.ids, np.full((count, more), _FREE)], axis=1)
+        self.sorts = np.concatenate([self.sorts, np.full((count, more), "", dtype=object)], axis=1)
         self.last = np.concatenate([self.last, np.zeros((count, more), dtype=np.int64)], axis=1)
         self.landmarks = np.concatenate([self.landmarks, np.zeros((count, more, n))], axis=1)
         self.covariance = np.pad(self.covariance, ((0, 0), (0, n * more), (0, n * more)))

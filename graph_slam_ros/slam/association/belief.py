@@ -46,7 +46,8 @@ class SolverBelief:
         whole = np.zeros((len(covariance) + 2,) * 2)
         whole[np.ix_(where, where)] = covariance
         whole[[dof, dof + 1], [dof, dof + 1]] = scale_sigma**2
-        return Seed(position, turn, scales, points[near], numbers[near], whole)
+        sorts = [self._landmarks.known[names[k]].sort for k in numbers[near].tolist()]
+        return Seed(position, turn, scales, points[near], numbers[near], sorts, whole)
 
     def recall(self, beam: Beam, scan: Scan, names: Mapping[int, str]) -> None:
         """Bring back landmarks of the map that the beam lacks, if something is seen near them."""
@@ -106,7 +107,7 @@ class SolverBelief:
         points = self._points(np.array([number]), names) + np.concatenate(away, axis=1) @ given.T
         cross = given @ beam.covariance[rows[:, None], at]
         own = np.take_along_axis(cross, np.broadcast_to(at[:, None], (len(rows), n, at.shape[1])), axis=2) @ given.T
-        beam.recall(number, points, cross, own + left)
+        beam.recall(number, self._landmarks.known[names[number]].sort, points, cross, own + left)
 
     def _shared(self, beam: Beam, number: int, names: Mapping[int, str]) -> Ids:
         """The landmarks nearest to one that all hypotheses and the map share."""

@@ -16,11 +16,11 @@ from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.slam.association.beam import NOTHING, BeamSettings, Ids
 from graph_slam_ros.slam.association.belief import SolverBelief
-from graph_slam_ros.slam.association.constellation import laid_on_the_map
 from graph_slam_ros.slam.association.explanation import SCALES, UNUSED, Costs, Drive, Estimate
 from graph_slam_ros.slam.association.moves import LEAST_SCANS, refined, without_few
 from graph_slam_ros.slam.association.presence_check import NOTHING_SEEN, Presence, presence
 from graph_slam_ros.slam.association.scans import Cluster, Motion, Scan
+from graph_slam_ros.slam.association.stretches import laid_on_the_map
 from graph_slam_ros.slam.background import Background, Work
 from graph_slam_ros.slam.frontend.keyframes import Keyframe
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
@@ -135,10 +135,10 @@ class Found:
     presence: Presence = NOTHING_SEEN
     rejoined: frozenset[int] = frozenset()
 
-    def numbers(self, given: Sequence[int], fresh: Callable[[], int]) -> Ids:
+    def numbers(self, given: Mapping[int, int], fresh: Callable[[], int]) -> Ids:
         """The number of each landmark: that of the map or of most of its clusters, each used once, or a fresh one."""
         which, of_map = self.estimate.which, self.frozen.clusters_of_map
-        before = np.concatenate([self.frozen.given[:of_map], np.array(given)[: len(which) - of_map]])
+        before = np.concatenate([self.frozen.given[:of_map], np.array(list(given.values()))[: len(which) - of_map]])
         both = np.stack([which, before])[:, which >= 0]
         pairs, of = np.unique(both, axis=1, return_inverse=True)
         sizes = np.bincount(of.ravel(), np.where(np.arange(len(which)) < of_map, len(which), 1)[which >= 0])
@@ -151,9 +151,9 @@ class Found:
             out[landmark] = fresh()
         return out
 
-    def changes(self, given: Sequence[int], numbers: Ids) -> tuple[dict[int, int], dict[int, int]]:
+    def changes(self, given: Mapping[int, int], numbers: Ids) -> tuple[dict[int, int], dict[int, int]]:
         """The new landmark of each changed cluster, later clusters included, and the successor of each removed one."""
-        which, before = self.estimate.which[self.frozen.clusters_of_map :], np.array(given)
+        which, before = self.estimate.which[self.frozen.clusters_of_map :], np.array(list(given.values()))
         after, frozen = before.copy(), before[: len(which)]
         of_none = np.where(np.isin(frozen, _indices(frozen)[0]), NOTHING, frozen)
         after[: len(which)] = np.where(which >= 0, numbers[which], of_none)
@@ -163,7 +163,8 @@ class Found:
             names, counts = np.unique(now[frozen == landmark], return_counts=True)
             gone[landmark] = int(names[counts.argmax()])
             after[since & (before == landmark)] = gone[landmark]
-        return {c: int(after[c]) for c in np.flatnonzero(after != before).tolist()}, gone
+        is_other = after != before
+        return dict(zip(np.array(list(given))[is_other].tolist(), after[is_other].tolist(), strict=True)), gone
 
     def carried_to(self, space: Geometry, solver: Solver, keyframes: StampedPoses[Keyframe]) -> Array:
         """Stored numbers with the keyframes moved to this explanation. Keyframes between scans are interpolated."""
@@ -274,9 +275,9 @@ class Hindsight:
         self._explained = frozen.count
         return self._noted(explained(self._space, frozen, self._settings, self._costs))
 
-    def note(self, given: Sequence[int]) -> None:
+    def note(self, given: Mapping[int, int]) -> None:
         """Note that everything was explained, and the landmark of each cluster."""
-        self._last = np.array(given)
+        self._last = np.array(list(given.values()))
 
     @property
     def report(self) -> dict[str, Any]:

@@ -1,12 +1,12 @@
 """Moves that correct an association: merge two landmarks, reassign clusters. A move is kept if it costs less."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
 from graph_slam_ros.slam.association.explanation import UNUSED, Drive, Estimate, Ids, compressed
-from graph_slam_ros.typing import Array, Mask
+from graph_slam_ros.slam.association.scans import are_others
+from graph_slam_ros.typing import Array
 
 LEAST_SCANS = 3  # of a landmark
 _MERGE_M = 3.0
@@ -117,11 +117,6 @@ def sorts_of(drive: Drive, e: Estimate) -> Array:
     used = (e.which >= 0) & (drive.sort != "")
     out[e.which[used]] = drive.sort[used]
     return out
-
-
-def are_others(a: Any, b: Any) -> Mask:
-    """Return whether two sorts differ, elementwise; one that is not known differs from none."""
-    return np.asarray((a != b) & (a != "") & (b != ""))
 
 
 def without_few(which: Ids) -> Ids:

@@ -5,6 +5,7 @@ scans that follow one another show. If over the whole drive far more is missing,
 """
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -81,6 +82,10 @@ def presence(drive: Drive, e: Estimate, first: int = 0) -> Presence:
         is_absent = is_missing((e.landmarks - e.position[k]) @ e.turn[k], points, points)
         is_absent[list(names[k - first])] = False
         missing += int(np.count_nonzero(is_absent))
+    return Presence(sum(map(len, names)), missing, *lost_of(names))
+
+
+def lost_of(names: Sequence[set[int]]) -> tuple[int, int]:
+    """Count the landmarks that the scans before and after one have seen, and those of them that it has not."""
     both = [(before & after, between) for before, between, after in zip(names, names[1:], names[2:], strict=False)]
-    followed, lost = sum(len(one) for one, _ in both), sum(len(one - between) for one, between in both)
-    return Presence(sum(map(len, names)), missing, followed, lost)
+    return sum(len(one) for one, _ in both), sum(len(one - between) for one, between in both)

@@ -135,8 +135,15 @@ class ScanHistory:
         k = next((k for k, scan in enumerate(self.scans) if scan.where.vertex >= vertex), 0)
         return k or None
 
-    def forget(self, count: int, clusters: int) -> None:
-        """Forget the first scans and their clusters."""
+    def since(self, keyframe: int) -> int:
+        """Return the first scan from which on nothing was seen from a keyframe before a number."""
+        for k in range(len(self.scans), 0, -1):
+            if any(seen.where.keyframe < keyframe for c in self.scans[k - 1].clusters for seen in c.seen):
+                return k
+        return 0
+
+    def forget(self, count: int) -> None:
+        """Forget the first scans."""
         self.scans = self.scans[count:]
         self.motions, self._nearby = self.motions[count:], self._nearby[count:]
-        self.firsts = [one - clusters for one in self.firsts[count:]]
+        self.firsts = self.firsts[count:]

@@ -8,6 +8,7 @@ from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from graph_slam_ros.slam.frontend import motion_compensation
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
 from graph_slam_ros.slam.frontend.odometry_selector import Step
 from graph_slam_ros.slam.landmarks.rotations import lever, rotation, turn_of
-from graph_slam_ros.typing import Array, Numbers
+from graph_slam_ros.typing import Array, Mask, Numbers
 
 SCAN_NS, _SCAN_RAD = 500_000_000, 0.15
 NEARBY_S = np.linspace(-0.5, 0.5, 21)
@@ -360,3 +361,8 @@ def _clustered(points: Sequence[Array], covariances: Sequence[Array], glimpses: 
 def _same_message(glimpses: Sequence[_Glimpse], group: Sequence[int], k: int) -> bool:
     one = glimpses[k]
     return any(glimpses[i].at.stamp_ns == one.at.stamp_ns and glimpses[i].seen.topic == one.seen.topic for i in group)
+
+
+def are_others(a: Any, b: Any) -> Mask:
+    """Return whether two sorts differ, elementwise; one that is not known differs from none."""
+    return np.asarray((a != b) & (a != "") & (b != ""))

@@ -317,7 +317,7 @@ def test_a_stretch_at_a_wrong_place_is_laid_on_the_map(without_names):
     cut = first + frozen.count // 3
     of_scan = np.repeat(np.arange(len(frozen.scans)), [len(one.clusters) for one in frozen.scans])
     wrong = frozen.given.copy()
-    wrong[of_scan >= cut] += np.where(wrong[of_scan >= cut] < -100, -10_000, 0)
+    wrong[of_scan >= cut] += np.where(wrong[of_scan >= cut] != -2, 100_000, 0)
     poses = frozen.poses.copy()
     poses[cut:, :2] += (1.5, -1.2)
     moved = FrozenScans(
@@ -327,7 +327,7 @@ def test_a_stretch_at_a_wrong_place_is_laid_on_the_map(without_names):
         times=frozen.times,
     )
     found = explained(slam.view.space, moved, anonymous.hindsight._settings, anonymous.hindsight._costs)
-    numbers = found.numbers(wrong[count:].tolist(), iter(range(-20_000, -30_000, -1)).__next__)
+    numbers = found.numbers(dict(enumerate(wrong[count:].tolist())), iter(range(-20_000, -30_000, -1)).__next__)
     now = np.where(found.estimate.which >= 0, numbers[found.estimate.which], -2)[count:]
     is_used = (now != -2) & (frozen.given[count:] != -2)
     assert np.count_nonzero(is_used) > 0.9 * len(now)

@@ -13,11 +13,11 @@ from graph_slam_ros.measurements.types import Sighting
 from graph_slam_ros.slam.association import hindsight
 from graph_slam_ros.slam.association.beam import BeamSettings
 from graph_slam_ros.slam.association.bordered import BorderedEquations, Rows
-from graph_slam_ros.slam.association.constellation import laid_on_the_map
 from graph_slam_ros.slam.association.explanation import Costs, Drive, Estimate
 from graph_slam_ros.slam.association.moves import refined
 from graph_slam_ros.slam.association.presence_check import presence
 from graph_slam_ros.slam.association.scans import NEARBY_S, Cluster, Reckoned, Scan, Seen, motion_between
+from graph_slam_ros.slam.association.stretches import laid_on_the_map
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
 from graph_slam_ros.slam.landmarks.rotations import rotation
 
