@@ -14,7 +14,6 @@ from graph_slam_ros.check.pairs import poses_at
 from graph_slam_ros.check.times import offset_setting
 from graph_slam_ros.formats.parameters import assignment
 from graph_slam_ros.lie import se3, so3
-from graph_slam_ros.slam.frontend.gyro import GyroState
 from graph_slam_ros.typing import Array, Numbers
 
 _WINDOW_NS, _LEAST_WINDOWS, _LEAST_SAMPLES = 1_000_000_000, 20, 3
@@ -68,14 +67,6 @@ def _late_s(c: Columns) -> float:
     now, *left = (1.0 - abs(float(np.corrcoef(*both)[0, 1])) for both in turns)
     late_s = float(tried_s[int(np.argmin(left))])
     return late_s if min(left) < 0.2 * now and abs(late_s) >= _LEAST_LATE_S else 0.0
-
-
-def check_doubted(c: Columns, gyro: GyroState | None) -> Iterator[Finding]:
-    """A gyro that a replay does not use any more, where nothing else is found of it."""
-    if gyro is not None and gyro.state == "doubted" and all(one.severity == "note" for one in check_gyro(c)):
-        topic, count = c.topic_of(gyro.name), len(c.gyro_ns)
-        name = topic.topic if topic else ""
-        yield Finding("gyro_unrelated", "warning", gyro.ratio or 0.0, 1.0, "times", gyro.fault, name, count=count)
 
 
 def _turns(c: Columns, rates: Array | None = None) -> tuple[Array, Array]:

@@ -6,6 +6,7 @@ import numpy as np
 
 from graph_slam_ros.check.columns import Columns, SightingColumns
 from graph_slam_ros.check.finding import Finding, Severity
+from graph_slam_ros.check.gyro import check_gyro
 from graph_slam_ros.check.identities import at_two_places, check_moved, check_outliers, check_reused
 from graph_slam_ros.check.odometry import TOGETHER, twist_factor, worst_stretch
 from graph_slam_ros.check.pairs import noisier, pairs_of, poses_at
@@ -17,6 +18,7 @@ from graph_slam_ros.slam import Config, GraphSlam, MapView
 from graph_slam_ros.slam.calibration import answers
 from graph_slam_ros.slam.calibration.fit import TrialFit
 from graph_slam_ros.slam.calibration.parameters import Parameter
+from graph_slam_ros.slam.frontend.gyro import GyroState
 from graph_slam_ros.slam.noise.scale import LARGEST, NoiseScale
 from graph_slam_ros.typing import Array, Index
 
@@ -112,6 +114,13 @@ def check_trial(c: Columns, view: MapView) -> Iterator[Finding]:
         text = f"{name}: {new}"
         yield Finding("ids_renewed", "warning", new.same, 0, "landmarks", text, name, new.since_ns, new.new)
     yield from _noise(c, view, has_cause=bool(off))
+
+
+def check_doubted(c: Columns, gyro: GyroState | None) -> Iterator[Finding]:
+    """A gyro that a replay does not use any more, where nothing else is found of it."""
+    if gyro is not None and gyro.state == "doubted" and all(one.severity == "note" for one in check_gyro(c)):
+        name = topic.topic if (topic := c.topic_of(gyro.name)) else ""
+        yield Finding("gyro_unrelated", "warning", gyro.ratio or 0.0, 1.0, "times", gyro.fault, name, 0, len(c.gyro_ns))
 
 
 def _noise(c: Columns, view: MapView, *, has_cause: bool) -> Iterator[Finding]:

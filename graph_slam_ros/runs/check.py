@@ -10,9 +10,9 @@ import numpy as np
 from graph_slam_ros.check.checks import check_columns, with_inputs
 from graph_slam_ros.check.columns import Collector, Columns
 from graph_slam_ros.check.finding import Finding, Severity, in_order, with_one_value
-from graph_slam_ros.check.gyro import check_doubted, of_gyro_or_wheels
+from graph_slam_ros.check.gyro import of_gyro_or_wheels
 from graph_slam_ros.check.moving_landmarks import moving_names, without
-from graph_slam_ros.check.trial import check_trial, replayed
+from graph_slam_ros.check.trial import check_doubted, check_trial, replayed
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.measurements.types import Measured, Sightings
 from graph_slam_ros.messages.inputs import known_types

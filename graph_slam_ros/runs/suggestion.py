@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from graph_slam_ros.check.gyro import upright
 from graph_slam_ros.check.pairs import ASSUMED_BEARING_RAD, ASSUMED_RANGE_M
 from graph_slam_ros.config import Config
 from graph_slam_ros.config.inputs import ASSUMED, default_input
@@ -218,8 +219,6 @@ class Suggestion:
         return f"--set 'inputs.names={names}' {chosen}"
 
     def _choose_imu(self, found: Iterator[TopicContents], is_needed: bool) -> None:
-        from graph_slam_ros.check.gyro import upright  # the pipeline is slow to import
-
         for one in sorted(found, key=lambda one: -one.usable):
             names = " ".join([*self.names, "imu"])
             angles = upright(tuple(total / max(one.read, 1) for total in one.felt))
