@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.lie import so3
 from graph_slam_ros.slam import MapView
+from graph_slam_ros.slam.landmarks.rotations import aligned, pose_of
 from graph_slam_ros.typing import Array, Mask, Numbers
 
 _MOST_TRIALS = 2000  # minimal sets of points that are tried
@@ -83,14 +83,14 @@ def align(
     for _ in range(_ROUNDS):
         if not _is_determined(a, b, fits):
             return None
-        turn, shift = _motion(a[0][fits], b[0][fits])
+        turn, shift = aligned(b[0][fits], a[0][fits])
         apart = a[0] - b[0] @ turn.T - shift
         covariance = _covariance(a, b, turn, fits)
         chi2 = np.einsum("ki,kij,kj->k", apart, np.linalg.inv(covariance), apart)
         before, fits = fits, chi2 <= limit
         if (fits == before).all():
             break
-    return Alignment(_pose(space, turn, shift), apart, covariance, chi2, limit, fits)
+    return Alignment(pose_of(space, turn, shift), apart, covariance, chi2, limit, fits)
 
 
 def as_they_are(space: Geometry, a: tuple[Array, Array], b: tuple[Array, Array], T_a_b: Numbers) -> Alignment:
@@ -109,22 +109,7 @@ def laid_on(space: Geometry, a: Array, b: Array) -> Numbers | None:
     n = space.dimensions
     if len(spread) < n - 1 or len(b) < n or spread[n - 2] < 1e-6 * len(b):
         return None
-    return _pose(space, *_motion(a, b))
-
-
-def _motion(a: Array, b: Array) -> tuple[Array, Array]:
-    """Rotations (..., n, n) and translations (..., n) that best align points (..., k, n) of b with those of a."""
-    middle_a, middle_b = a.mean(axis=-2, keepdims=True), b.mean(axis=-2, keepdims=True)
-    u, _, vt = np.linalg.svd(np.swapaxes(a - middle_a, -1, -2) @ (b - middle_b))
-    u[..., -1] *= np.sign(np.linalg.det(u @ vt))[..., None]
-    turn: Array = u @ vt
-    return turn, (middle_a - middle_b @ np.swapaxes(turn, -1, -2))[..., 0, :]
-
-
-def _pose(space: Geometry, turn: Array, shift: Array) -> Numbers:
-    if space.dimensions == 2:
-        return (*shift.tolist(), math.atan2(turn[1, 0], turn[0, 0]))
-    return (*shift.tolist(), *Rotation.from_matrix(turn).as_quat().tolist())
+    return pose_of(space, *aligned(b, a))
 
 
 def _variances(*maps: tuple[Array, Array]) -> Array:
@@ -139,7 +124,7 @@ def _first(a: tuple[Array, Array], b: tuple[Array, Array], limit: float) -> Mask
         sets = np.array(list(combinations(range(count), n)))
     else:
         sets = np.random.default_rng(0).random((_MOST_TRIALS, count)).argpartition(n, axis=1)[:, :n]
-    turns, shifts = _motion(a[0][sets], b[0][sets])
+    turns, shifts = aligned(b[0][sets], a[0][sets])
     apart = a[0] - np.einsum("tij,kj->tki", turns, b[0]) - shifts[:, None]
     chi2 = np.einsum("tki,tki->tk", apart, apart) / _variances(a, b)
     best = int(np.minimum(chi2, limit).sum(axis=1).argmin())

@@ -12,7 +12,6 @@ from itertools import combinations, islice
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.graph.geometry import Geometry
@@ -20,7 +19,7 @@ from graph_slam_ros.lie import se2
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.doubt.record import DisplacementHypothesis, Link
 from graph_slam_ros.slam.doubt.window import REACH_S, Seen, View, Window
-from graph_slam_ros.slam.landmarks.rotations import aligned, are_spread
+from graph_slam_ros.slam.landmarks.rotations import aligned, are_spread, pose_of
 from graph_slam_ros.slam.robust.connections import Connections, connections_across
 from graph_slam_ros.typing import Array, Index, Numbers
 
@@ -178,7 +177,7 @@ class DisplacementSearch:
                 abs(np.linalg.norm(p[i] - p[j]) - np.linalg.norm(m[i] - m[j])) < allowed
                 for i, j in combinations(range(len(seeds)), 2)
             ):
-                yield self._refined(window, aligned(p, m, np.ones(len(seeds))), seeds[0]), seeds[0]
+                yield self._refined(window, aligned(p, m), seeds[0]), seeds[0]
 
     def _refined(self, window: _Sightings, motion: tuple[Array, Array], at: int) -> tuple[Array, Array]:
         """The motion by all sightings that are held back and fit it, the vaguer the less."""
@@ -235,7 +234,7 @@ class DisplacementSearch:
             most = int(counted[1:].max())
             is_earlier = counted[0] > most or (
                 counted[0] + before.explained > most
-                and not self._is_drift(before.first, self._pose(motion), int(window.keyframes[-1]))
+                and not self._is_drift(before.first, pose_of(self._space, *motion), int(window.keyframes[-1]))
             )
         best = 0 if is_earlier else len(firsts) - 1 - int(np.argmax(counted[::-1]))
         if counted[best] <= 0:
@@ -250,7 +249,7 @@ class DisplacementSearch:
         return DisplacementHypothesis(
             first,
             max(first, int(window.keyframes[0])),
-            self._pose(motion),
+            pose_of(self._space, *motion),
             int(counted[best]),
             len(set(window.landmarks[agreeing].tolist())),
             len(set(window.keyframes[agreeing].tolist())),
@@ -285,12 +284,6 @@ class DisplacementSearch:
         """Return whether more than odometry is believed of a keyframe."""
         edges = self._solver.edges_on(keyframe).tolist()
         return any(self._ledger.is_inside(one) for one in edges if self._graph.edge(one).label != "odometry")
-
-    def _pose(self, motion: tuple[Array, Array]) -> Numbers:
-        turn, shift = motion
-        if self._space.dimensions == 2:
-            return *map(float, shift), float(np.arctan2(turn[1, 0], turn[0, 0]))
-        return *map(float, shift), *map(float, Rotation.from_matrix(turn).as_quat())
 
     @property
     def vertices(self) -> Index:

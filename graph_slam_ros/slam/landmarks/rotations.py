@@ -74,6 +74,11 @@ def poses_of(space: Geometry, positions: Array, turns: Array) -> Array:
     return np.hstack([positions, Rotation.from_matrix(turns).as_quat()])
 
 
+def pose_of(space: Geometry, turn: Array, shift: Array) -> Numbers:
+    """The pose with a rotation matrix (n, n) and a position (n,)."""
+    return tuple(poses_of(space, shift[None], turn[None])[0].tolist())
+
+
 def turn_of(space: Geometry, pose: Numbers) -> Array:
     """Rotation vector (1,) or (3,) of a pose."""
     return rotation_vector(space.turn(pose)[None])[0]
@@ -85,12 +90,13 @@ def are_spread(points: Array) -> bool:
     return bool(spread[points.shape[1] - 2] >= 0.5 * _LEAST_APART_M)
 
 
-def aligned(points: Array, places: Array, weights: Array) -> tuple[Array, Array]:
-    """Rotation and translation that move points onto their counterparts with weighted least squares (Kabsch)."""
-    w = weights / weights.sum()
+def aligned(points: Array, places: Array, weights: Array | None = None) -> tuple[Array, Array]:
+    """Rotations (..., n, n) and translations (..., n) that lay points (..., k, n) on their places best (Kabsch)."""
+    w = np.ones(points.shape[-2]) if weights is None else weights
+    w = w / w.sum()
     p, m = w @ points, w @ places
-    u, _, vt = np.linalg.svd((points - p).T @ ((places - m) * w[:, None]))
-    mirror = np.ones(points.shape[1])
-    mirror[-1] = np.sign(np.linalg.det(vt.T @ u.T))
-    turn = vt.T @ np.diag(mirror) @ u.T
-    return turn, m - turn @ p
+    correlation = np.swapaxes(points - p[..., None, :], -1, -2) @ ((places - m[..., None, :]) * w[:, None])
+    u, _, vt = np.linalg.svd(correlation)
+    vt[..., -1, :] *= np.sign(np.linalg.det(u @ vt))[..., None]
+    turn = np.swapaxes(u @ vt, -1, -2)
+    return turn, m - applied(turn, p)

@@ -195,7 +195,7 @@ def _too_far(sigmas: float, verdict: str) -> str:
 
 def _distances(a: Array, b: Array) -> Array:
     """The distances of points (n, d), after the rigid motion of b that makes their squares least."""
-    turn, shift = aligned(b, a, np.ones(len(a)))
+    turn, shift = aligned(b, a)
     return np.asarray(np.linalg.norm(b @ turn.T + shift - a, axis=1))
 
 
