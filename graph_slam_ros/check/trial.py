@@ -85,7 +85,7 @@ def check_trial(c: Columns, view: MapView) -> Iterator[Finding]:
     if len(view.keyframes) < 3 or len(c.path_ns) < 2 or not view.landmarks:
         return
     try:
-        fit, fitted = view.trial_fit(places=True)
+        fit, fitted = view.trial_fit()
     except GraphSlamError as error:
         yield Finding("fit_unsure", "note", 1, 0, "fits", f"the trial fit failed: {error}")
         return
@@ -162,18 +162,15 @@ def _fitted(
         return
     code, (unit, limit, unknown) = answers.CODES[one.parameter.name], _LIMITS[one.parameter.name]
     if one.parameter in off:
-        setting = answers.setting_of(one.parameter, off, view.calibrated)
-        settings: tuple[str, ...] = (assignment(*setting),)
         of_pose = twist_factor(c.odometry) * c.config.odometry.distance_factor
         is_pose = abs(of_pose * (1.0 + one.value) - 1.0) < limit < abs(of_pose - 1.0)  # by its twist
-        is_open = code == "odometry_scale" and not is_pose
-        if ranges := answers.ranges_instead(fit, one.value, view.calibrated, setting) if is_open else "":
-            settings = ()
-        lag_s, own = float(np.median(topic.lag_s)), c.odometry.input
+        told = answers.off_by(fit, one.parameter, off, view.calibrated, may_be_ranges=not is_pose)
+        setting, lag_s, own = told.setting, float(np.median(topic.lag_s)), c.odometry.input
         if code == "clock_offset" and -_RECORDED_S < lag_s < one.value - _EARLY_S:  # none is recorded before it is seen
-            settings = (assignment(f"{own}.offset_s", round(view.calibrated(own, "clock") - one.value, 3)),)
-        text = answers.sentence(one.parameter, one.value, one.sigma, ranges)
-        yield topic.finding(code, "warning", one.value, limit, unit, text, settings=settings)
+            setting = f"{own}.offset_s", round(view.calibrated(own, "clock") - one.value, 3)
+        is_open = code == "odometry_scale" and not is_pose
+        settings = () if is_open or not setting else (assignment(*setting),)
+        yield topic.finding(code, "warning", one.value, limit, unit, told.text, settings=settings)
     elif one.sigma > unknown:
         yield Finding("not_observable", "note", one.sigma, unknown, unit, one.text, topic.topic)
 

@@ -6,7 +6,7 @@ a map that is driven to its end with a wrong scale has learnt noise that hides i
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +34,7 @@ _ROUNDS = 4  # replays; a large clock needs two or three
 _STILL_ACCEPTED = 0.9  # of the part that was accepted before: with less, what was found does harm
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Calibrated:
     """The outcome of a calibration.
 
@@ -50,15 +50,15 @@ class Calibrated:
     losses, warnings : what could not be read
     """
 
-    settings: dict[str, float | str]
-    parameters: list[dict[str, Any]]
-    command: str
-    rounds: int
-    is_complete: bool
-    refused: str
-    fault: Finding | None
-    losses: list[str]
-    warnings: list[str]
+    settings: dict[str, float | str] = field(default_factory=dict)
+    parameters: list[dict[str, Any]] = field(default_factory=list)
+    command: str = ""
+    rounds: int = 0
+    is_complete: bool = False
+    refused: str = ""
+    fault: Finding | None = None
+    losses: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
 
 
 def calibrate(
@@ -93,12 +93,13 @@ def calibrate(
     rounds.run()
     if not rounds.keyframes:
         raise GraphSlamError(f"{path}: no odometry of it could be used: graph_slam info {path}")
-    parameters = rounds.parameters or ([] if rounds.refused else list(_undriven(config, words, rounds.keyframes)))
-    name = "calibrate" if rounds.named else "replay"
-    command = suggested.suggestion.command(rounds.found | dict(settings or {}) | rounds.found | rounds.named, name=name)
-    losses, warnings = list(dict.fromkeys(bag.losses)), list(dict.fromkeys(bag.warnings))
-    outcome = rounds.found, parameters, command, rounds.count, rounds.is_complete, rounds.refused, rounds.fault
-    return Calibrated(*outcome, losses, warnings)
+    done, named = rounds.out, rounds.named
+    if not done.parameters and not done.refused:
+        done.parameters = list(_undriven(config, words, rounds.keyframes))
+    wanted = done.settings | dict(settings or {}) | done.settings | named
+    done.command = suggested.suggestion.command(wanted, name="calibrate" if named else "replay")
+    done.losses, done.warnings = list(dict.fromkeys(bag.losses)), list(dict.fromkeys(bag.warnings))
+    return done
 
 
 class _Rounds:
@@ -106,18 +107,14 @@ class _Rounds:
 
     Attributes
     ----------
-    found, parameters, refused, fault, is_complete, count (of replays) : as of ``Calibrated``
-    named : the setting that is to be made first, if ``refused`` names one
+    out : the outcome, as far as the replays give it
+    named : the setting that is to be made first, if it is refused for one
     keyframes : of the last replay of the whole recording
     """
 
     def __init__(self, bag: Bag, inputs: Inputs, config: Config, words: Sequence[str], progress: Progress) -> None:
-        self.found: dict[str, float | str] = {}
-        self.parameters: list[dict[str, Any]] = []
-        self.refused, self.is_complete = "", False
+        self.out, self.keyframes = Calibrated(), 0
         self.named: dict[str, float | str] = {}
-        self.fault: Finding | None = None
-        self.count = self.keyframes = 0
         self._config = config.changed({"map.condense": False})  # a fit is of all keyframes
         self._bag, self._inputs, self._words, self._progress = bag, inputs, words, progress
         self._corrected = set[Parameter]()
@@ -131,23 +128,23 @@ class _Rounds:
             if not self.keyframes or self._does_harm(slam):
                 return
             findings = self._fitted(slam.view)
-            if self.fault is not None and self.fault.severity == "error":  # what is fitted to it means nothing
-                self.refused = f"nothing is calibrated: mend {self.fault.code} first"
+            if self.out.fault is not None and self.out.fault.severity == "error":  # what is fitted to it means nothing
+                self.out.refused = f"nothing is calibrated: mend {self.out.fault.code} first"
             else:
-                self.refused, self.named = _misplaced(slam.view, self._config, findings)
-            if self.refused:
-                self.found, self.parameters = {}, []
+                self.out.refused, self.named = _misplaced(slam.view, self._config, findings)
+            if self.out.refused:
+                self.out.settings, self.out.parameters = {}, []
                 return
-            self.parameters = [self._said(one) for one in findings]
-            self.is_complete = not self._set(slam.view, findings, are_followed=True)
-            if self.is_complete:
+            self.out.parameters = [self._said(one) for one in findings]
+            self.out.is_complete = not self._set(slam.view, findings, are_followed=True)
+            if self.out.is_complete:
                 return
 
     def _replayed(self, due: float) -> GraphSlam:
         """Replay the whole recording; anew where a fit after ``due``, 2, 4 times as many keyframes finds more."""
         while True:
-            self.count += 1
-            config, counters = self._config.changed(self.found), Counters()
+            self.out.rounds += 1
+            config, counters = self._config.changed(self.out.settings), Counters()
             slam, columns = GraphSlam(config), Collector(config, self._inputs.topics)
             runs = RecordedRuns(self._bag, self._inputs, config, counters, columns=columns)
             for _, some in self._progress(runs, runs.count):
@@ -164,7 +161,7 @@ class _Rounds:
         self.keyframes = len(slam.view.keyframes)
         if self.keyframes and due < math.inf:
             read = columns.columns(counters)
-            self.fault = next(iter(refused_odometry(read)), None) or worst_of_replay(read)
+            self.out.fault = next(iter(refused_odometry(read)), None) or worst_of_replay(read)
         return slam
 
     def _does_harm(self, slam: GraphSlam) -> bool:
@@ -173,13 +170,13 @@ class _Rounds:
         accepted, every = sum(one["believed"] or 0 for one in of_inputs), sum(one["used"] for one in of_inputs)
         (before, of), kept = self._accepted, self._kept
         if accepted * of >= _STILL_ACCEPTED * before * every:
-            self._accepted, self._kept = (accepted, every), dict(self.found)
+            self._accepted, self._kept = (accepted, every), dict(self.out.settings)
             return False
-        lines = ", ".join(f"{name}={value}" for name, value in self.found.items() if kept.get(name) != value)
-        self.refused = (
+        lines = ", ".join(f"{name}={value}" for name, value in self.out.settings.items() if kept.get(name) != value)
+        self.out.refused = (
             f"not used: {lines}: with it {accepted} of {every} measurements are accepted, without it {before} of {of}"
         )
-        self.found = kept
+        self.out.settings = kept
         return True
 
     def _set(self, view: MapView, findings: Iterable[Fitted], *, are_followed: bool) -> bool:
@@ -196,11 +193,11 @@ class _Rounds:
         more = view.found_settings | dict(setting_of(one, values, view.calibrated) for one in values)
         doubted = {one.parameter for one in findings if are_followed and not one.is_determined} & self._corrected
         for one in doubted:
-            self.found.pop(setting_of(one, {one: 0.0}, view.calibrated)[0], None)
+            self.out.settings.pop(setting_of(one, {one: 0.0}, view.calibrated)[0], None)
         self._withdrawn |= doubted
         self._corrected = (self._corrected | values.keys()) - doubted
-        before, self.found = self.found, self.found | more
-        return bool(doubted) or self.found != before
+        before, self.out.settings = self.out.settings, self.out.settings | more
+        return bool(doubted) or self.out.settings != before
 
     def _fitted(self, view: MapView) -> list[Fitted]:
         """Fit the parameters of the groups; none where the edges do not determine the estimate."""
@@ -214,7 +211,7 @@ class _Rounds:
         parameter, text = one.parameter, one.text
         if one.verdict == "nothing_to_correct" and parameter in self._corrected:
             text = f"{parameter}: corrected, {parameter.with_sigma(one.value, one.sigma)} is left"
-        factor = self._config.odometry.distance_factor / float(self.found.get("odometry.distance_factor", 1.0))
+        factor = self._config.odometry.distance_factor / float(self.out.settings.get("odometry.distance_factor", 1.0))
         if parameter.name == "distance" and parameter in self._corrected and not self._config.survey:
             text += f"; if a measured way tells that ranges are wrong instead: range_factor={factor:.4g}"
         numbers = {"value": one.value, "sigma": one.sigma, "verdict": one.verdict, "text": text}

@@ -11,7 +11,7 @@ import numpy as np
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.slam.association.landmark_frontend import LandmarkFrontend
 from graph_slam_ros.slam.backend import Backend
-from graph_slam_ros.slam.calibration.answers import Finding, of_association
+from graph_slam_ros.slam.calibration.answers import SIGMAS, Finding
 from graph_slam_ros.slam.calibration.model import MeasurementModel, factors_of
 from graph_slam_ros.slam.calibration.parameters import Parameter, Values
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
@@ -21,6 +21,7 @@ from graph_slam_ros.solver import Report, Settings
 from graph_slam_ros.typing import Array, Index
 
 _DIGITS = 12  # of a corrected measurement: the last ones of a sine depend on the machine
+_FOLLOWED = 0.1  # of a sigma: what is left of a correction that is used is followed from there on
 
 
 class FoundFactors:
@@ -65,8 +66,11 @@ class FoundFactors:
         (source,) = sources
         names = [name for name in scales if name != "turn" or not self._config.gyro_input]  # its turn is the gyro's
         before = self._frontend.corrections.found
-        findings = [of_association(Parameter(source, name), *scales[name], (source, name) in before) for name in names]
-        used = [one for one in findings if one.verdict == "admitted"]
+        used = list[Finding]()
+        for name in names:
+            one, (value, sigma) = Parameter(source, name), scales[name]
+            if _is_used(one, value, sigma, is_corrected=(source, name) in before):
+                used.append(Finding.of(one, value, sigma, "admitted", "{}"))
         # Six digits, because the last ones of a sine depend on the memory alignment of an array.
         values = {one.parameter: float(f"{one.value:.6g}") for one in used}
         report = self._correct(model, values, everything) if values else None
@@ -109,6 +113,13 @@ class FoundFactors:
             known = places >= 0
             origins.append((places[known], _exact(np.stack(T_keyframe_base, axis=-1)[known])))
         return out
+
+
+def _is_used(one: Parameter, value: float, sigma: float, *, is_corrected: bool) -> bool:
+    """The first two questions of ``answers``: its search compares whole explanations, which answers the others."""
+    if is_corrected:
+        return abs(value) >= _FOLLOWED * sigma
+    return sigma < one.quantity.determined_below and abs(value) >= max(SIGMAS * sigma, one.quantity.least)
 
 
 def _exact(numbers: Array) -> Array:

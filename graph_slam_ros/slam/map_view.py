@@ -219,16 +219,16 @@ class MapView:
         return {name: mark.reason for name, mark in self._landmarks.map.undetermined.items()} | tentative
 
     def trial_fit(
-        self, groups: Sequence[str] = (AUTO,), *, places: bool = False, is_to_correct: bool = False
+        self, groups: Sequence[str] = (AUTO,), *, is_to_correct: bool = False
     ) -> tuple[TrialFit, list[Finding]]:
         """Fit the calibration of odometry and sensors with the map, on a copy: nothing is changed.
 
         Parameters
         ----------
         groups : of ``slam.calibration.parameters.GROUPS``, or ``auto``
-        places : fit the places of sensors, too, where one is so far off that it passes for other parameters
         is_to_correct : whether somebody sets what is found: what a gyro measures, and factors that landmarks without
-            identities merely confirm, are left out
+            identities merely confirm, are left out. Else the places of sensors are fitted, too, where one is so far off
+            that it passes for other parameters.
 
         Returns
         -------
@@ -240,7 +240,7 @@ class MapView:
         SingularError
             The edges do not determine the estimate.
         """
-        return self._trials.fit(groups, places=places, is_to_correct=is_to_correct)
+        return self._trials.fit(groups, is_to_correct=is_to_correct)
 
     def uncorrected(self) -> list[Finding]:
         """A clock, a mount or a scale that is off by so much that the poses are worse than their covariances say.

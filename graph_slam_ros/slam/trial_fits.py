@@ -130,11 +130,11 @@ class TrialFits:
             slips=self._kidnaps.slip_detector.slipped(),
         )
 
-    def fit(self, groups: Sequence[str], *, places: bool, is_to_correct: bool) -> tuple[TrialFit, list[Finding]]:
+    def fit(self, groups: Sequence[str], *, is_to_correct: bool) -> tuple[TrialFit, list[Finding]]:
         """Fit the map as it is now, as of ``GraphSlam.trial_fit``."""
         problem = self.problem()
         wanted = self._priors(problem, groups, has_gyro=is_to_correct)
-        found = fit_with_places(problem, wanted, LOG_ODDS, has_places=places)[0]
+        found = fit_with_places(problem, wanted, LOG_ODDS, has_places=not is_to_correct)[0]
         return found, self._judged(found, are_factors_asked="factors" in groups or not is_to_correct)
 
     def _priors(

@@ -27,7 +27,7 @@ freedom are expected.
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -45,7 +45,6 @@ LEAST_LANDMARKS = 3
 MOST_SLIDING = 0.3  # of odometry's noise ahead: with more sideways, a turned sensor and a robot that slides are one
 LEAST_SIGMA_PER_M = 1e-3  # of odometry: the noise of its position [m] for each metre
 _OF_MOTION = {"yaw": 0, "pitch": 1}  # angles that are measured against the motion, and the direction across it
-FOLLOWED = 0.1  # of a sigma: what is left of a correction that is used is followed from there on
 
 Verdict = Literal["admitted", "nothing_to_correct", "not_determined", "not_reproducible", "not_separable", "refused"]
 
@@ -130,21 +129,6 @@ def is_certain(found: TrialFit, parameter: Parameter) -> bool:
     is_far = SIGMAS * found.sigmas[k] < abs(found.values[k]) <= PRIOR_SIGMAS * found.priors[k]
     is_alone = found.worst_correlation(k)[0] <= MOST_CORRELATED
     return bool(is_far and is_alone and _agree(*(float(half[k]) for half in found.halves)))
-
-
-def of_association(parameter: Parameter, value: float, sigma: float, is_corrected: bool) -> Finding:
-    """Judge a factor of odometry that the association of landmarks without identities has left open and found.
-
-    The first two questions are asked. The others its search has answered: it compares whole explanations, each with
-    the clocks and factors that fit it best.
-    """
-    least = FOLLOWED * sigma if is_corrected else max(SIGMAS * sigma, parameter.quantity.least)
-    if sigma >= parameter.quantity.determined_below and not is_corrected:
-        why = f"not determined ({{}}): {parameter.quantity.manoeuvre}"
-        return Finding.of(parameter, value, sigma, "not_determined", why)
-    if abs(value) < least:
-        return Finding.of(parameter, value, sigma, "nothing_to_correct", "nothing to correct ({})")
-    return Finding.of(parameter, value, sigma, "admitted", "{}")
 
 
 def _void(found: TrialFit, landmarks: int, sigma_per_m: float) -> str:
@@ -270,13 +254,19 @@ def uncorrected(
     off = [k for k, one in enumerate(findings) if is_off(found, one) and (shifts[k] > MOST_SHIFT or scaled[k])]
     values = {found.parameters[k]: float(found.values[k]) for k in off if found.parameters[k].name in CODES}
     out = []
-    for one, value in values.items():
-        sigma, shift = found.sigma(one), float(shifts[found.parameters.index(one)])
-        setting = () if one in found.doubted else setting_of(one, values, total)
-        text = sentence(one, value, sigma, ranges_instead(found, value, total, setting))
-        text += ", more than its stated noise allows for (odometry.noise)" * (one.name in OF_ODOMETRY)
-        out.append(Finding(one, value, sigma, "admitted", text, CODES[one.name], shift, setting))
+    for one in values:
+        shift, told = float(shifts[found.parameters.index(one)]), off_by(found, one, values, total)
+        text = f"{told.text}, more than its stated noise allows for (odometry.noise)"
+        out.append(replace(told, shift=shift, text=text if one.name in OF_ODOMETRY else told.text))
     return [*(one for one, _ in jumps(found)), *sorted(out, key=lambda one: -one.shift)]
+
+
+def off_by(found: TrialFit, one: Parameter, values: Values, total: Total, *, may_be_ranges: bool = True) -> Finding:
+    """Return what a parameter is off by, and the setting that mends it with others that are off, too."""
+    value, sigma = values[one], found.sigma(one)
+    setting = () if one in found.doubted else setting_of(one, values, total)
+    ranges = _ranges_instead(found, value, total, setting) if may_be_ranges and one.name == "distance" else ""
+    return Finding(one, value, sigma, "admitted", _sentence(one, value, sigma, ranges), CODES[one.name], 0.0, setting)
 
 
 def is_off(found: TrialFit, one: Finding) -> bool:
@@ -300,13 +290,14 @@ def jumps(found: TrialFit) -> Iterator[tuple[Finding, float]]:
         if abs(after - before) > limit:
             since = f"since {found.since_ns * 1e-9:.1f} s" if found.since_ns else "in the second half of the drive"
             then = f"at first, {one.shown(after)} {since} (sigma {one.shown(sigma)})"
-            turned = f"its sensor is turned by {one.shown(before)} {_AXIS.get(one.name, '')}on the robot {then}"
-            code, text = "mount_moved", f"{turned}: it was knocked, or is loose"
             if one.name == "clock":
                 code, text = (
                     "clock_jump",
                     f"sightings agree with odometry best {one.shown(before)} from their stamps {then}",
                 )
+            else:
+                turned = f"its sensor is turned by {one.shown(before)} {_AXIS[one.name]}on the robot"
+                code, text = "mount_moved", f"{turned} {then}: it was knocked, or is loose"
             yield Finding(one, after - before, sigma, "not_reproducible", text, code), limit
 
 
@@ -335,7 +326,7 @@ def _too_sure(found: TrialFit, shifts: Array, sigma_per_m: float) -> list[Findin
     return [Finding(found.parameters[worst], sigma_per_m, 0.0, "refused", text, *more)]
 
 
-def ranges_instead(found: TrialFit, distance: float, total: Total, setting: tuple[str, Any] | tuple[()]) -> str:
+def _ranges_instead(found: TrialFit, distance: float, total: Total, setting: tuple[str, Any] | tuple[()]) -> str:
     """Return the settings by which ranges are wrong, where the distance of odometry may be right; else its own."""
     if _has_bends(found):
         return f"{next(iter(found.doubted.values()))[2]}, so no setting corrects it"
@@ -344,7 +335,7 @@ def ranges_instead(found: TrialFit, distance: float, total: Total, setting: tupl
     return f"{ranges} instead of --set {setting[0]}={setting[1]}" if ranges and setting else ranges
 
 
-def sentence(one: Parameter, value: float, sigma: float, ranges: str = "") -> str:
+def _sentence(one: Parameter, value: float, sigma: float, ranges: str) -> str:
     """Say what is off, with its sigma, and for the distance of odometry, what is right if ranges are wrong."""
     if one.name == "clock":
         when, other = ("later", "late") if value > 0.0 else ("earlier", "early")

@@ -22,7 +22,7 @@ from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.graph.tables import EdgeTable
 from graph_slam_ros.lie import so3
 from graph_slam_ros.slam.calibration.parameters import BEND, OF_ODOMETRY, Values
-from graph_slam_ros.slam.frontend.corrections import moved_with_sensor
+from graph_slam_ros.slam.frontend.corrections import moved_with_sensor, scaled
 from graph_slam_ros.slam.frontend.sighting_edges import SightingEdges
 from graph_slam_ros.typing import Array, Index, Numbers
 
@@ -156,13 +156,8 @@ class MeasurementModel:
         """Measurements (n, p): motions by odometry with other factors, or from the base at the stamp by a sensor."""
         if isinstance(edges, Sightings):
             return self._seen(edges, values)
-        out = self.scaled(tuple(edges.measured.T), values)
-        if bias := _of(values, edges.source).get("turn_bias", 0.0):
-            group = self._space.group
-            tangent = list(group.log(out))
-            tangent[-1] = tangent[-1] + bias * edges.seconds
-            out = group.exp(tuple(tangent))
-        return np.stack(out, axis=-1)
+        bias = _of(values, edges.source).get("turn_bias", 0.0)
+        return np.stack(self.scaled(tuple(edges.measured.T), values, bias * edges.seconds), axis=-1)
 
     def roots(self, edges: Edges, values: Values) -> Array:
         """Square roots (n, m, m) of their information; of a turned sensor in the axes of the base."""
@@ -178,15 +173,13 @@ class MeasurementModel:
             return out
         return edges.roots
 
-    def scaled(self, pose: Numbers, values: Values) -> Numbers:
+    def scaled(self, motion: Numbers, values: Values, turned: Any = 0.0) -> Numbers:
         """A motion by odometry with other factors; that for bends counts by half in a step of ``_BEND_RAD``."""
-        group, n = self._space.group, self._space.dimensions
-        tangent = [f * x for f, x in zip(self._factors(values), group.log(pose), strict=True)]
+        distance, turn = factors_of(values)
         if bend := of_odometry(values).get(BEND, 0.0):
-            turned = abs(tangent[-1])
-            tangent[:n] = [x * (1.0 + bend * turned / (turned + _BEND_RAD)) for x in tangent[:n]]
-        out: Numbers = group.exp(tuple(tangent))
-        return out
+            bent = abs(turn * self._space.group.log(motion)[-1])
+            distance = distance * (1.0 + bend * bent / (bent + _BEND_RAD))
+        return scaled(self._space, motion, distance, turn, turned)
 
     def _factors(self, values: Values) -> Array:
         """The factor (dof,) of each component of a motion."""

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from graph_slam_ros.graph.geometry import Geometry
+from graph_slam_ros.slam.frontend.corrections import scaled
 from graph_slam_ros.slam.frontend.odometry_track import OdometryTrack
-from graph_slam_ros.typing import Array, Index, Mask, Numbers
+from graph_slam_ros.typing import Array, Index, Mask
 
 _AROUND_S = 0.25  # to either side of a stamp: shorter, and a velocity is noise
 _LEAST_S = 1e-9  # of an interval: two keyframes may have one stamp
@@ -70,17 +71,10 @@ class EstimatedPath:
         step = group.exp(tuple(part * one for one in self._steps[s].T))
         odom, k = group.compose(tuple(self._samples[s].T), step), k + self._first
         start, end = (tuple(self._track.keyframes[at].T) for at in (k, k + 1))
-        moved, whole = (self._corrected(group.between(start, one)) for one in (odom, end))
+        moved, whole = (scaled(self._space, group.between(start, one), *self.factors) for one in (odom, end))
         a, b = tuple(self.poses[k].T), tuple(self.poses[k + 1].T)
         rest = tuple(fraction * one for one in group.local(b, group.compose(a, whole)))
         return k, fraction, np.stack(group.compose(group.compose(a, moved), group.exp(rest)), axis=-1)
-
-    def _corrected(self, motion: Numbers) -> Numbers:
-        if self.factors == (1.0, 1.0):
-            return motion
-        n, tangent = self._space.dimensions, self._space.group.log(motion)
-        out: Numbers = self._space.group.exp(tuple(x * self.factors[k >= n] for k, x in enumerate(tangent)))
-        return out
 
     def velocity(self, stamps_ns: Index, after_s: float) -> Array:
         """Twist (n, dof) of the base around these times, in its own axes [m/s, rad/s]."""

@@ -226,7 +226,7 @@ class Linearization:
     # -- measurements ----------------------------------------------------------------------------------------------
 
     def _correct(self, x: Array, values: Values) -> dict[tuple[int, int], Array]:
-        """Correct the measurements of the copy; returns derivatives (n, m) of residuals, by table and parameter."""
+        """Correct the measurements of the copy; returns derivatives of whitened residuals, by table and parameter."""
         out: dict[tuple[int, int], Array] = {}
         concerned: list[Edges] = [*self._model.odometry, *self._model.sightings]
         for edges in concerned:
@@ -240,7 +240,7 @@ class Linearization:
         return out
 
     def _derivative(self, edges: Edges, parameter: Parameter, values: Values, x: Array) -> Array:
-        """Central difference of the residuals (n, m) with respect to one parameter, and what it makes of their noise.
+        """Central difference of the whitened residuals (n, m) with respect to one parameter.
 
         The noise of a position is turned with the sensor. Without that part, errors along and across the line of sight
         that go together would pass for a turned sensor.
@@ -248,14 +248,11 @@ class Linearization:
         at, model = self._p.graph.begins(edges.table.at(edges.rows).vertices), self._model
         beside = _beside(values, parameter)
         sides = [edges.table.type.linearize(x, at, model.measured(edges, there))[0] for there in beside]
-        roots = [model.roots(edges, there) for there in beside]
-        difference = sides[0] - sides[1]
-        wrapped = np.abs(difference) > np.pi
-        out = difference - wrapped * np.sign(difference) * 2.0 * np.pi
-        if not np.array_equal(roots[0], roots[1]):
-            of_noise = np.einsum("nij,nj->ni", roots[0] - roots[1], 0.5 * (sides[0] + sides[1]))
-            out += np.linalg.solve(model.roots(edges, values), of_noise[..., None])[..., 0]
-        return np.asarray(out / (2.0 * _PROBE))
+        sides[0] -= 2.0 * np.pi * np.round((sides[0] - sides[1]) / (2.0 * np.pi))  # of an angle
+        plus, minus = (
+            np.einsum("nij,nj->ni", model.roots(edges, there), side) for there, side in zip(beside, sides, strict=True)
+        )
+        return np.asarray((plus - minus) / (2.0 * _PROBE))
 
     # -- blocks to rows --------------------------------------------------------------------------------------------
 
@@ -264,11 +261,11 @@ class Linearization:
         n, m, _ = block.jacobian.shape
         norm = np.sum(block.residual**2, axis=1)
         slope = np.where(block.chi2 > 1e-12, norm / np.maximum(block.chi2, 1e-12), 1.0)
-        root = table.sqrt_information.values[rows] * np.sqrt(slope * table.weight.values[rows])[:, None, None]
+        kept = np.sqrt(slope * table.weight.values[rows])[:, None]
         columns = np.zeros((n, m, len(self._parameters)))
         for (code, k), of_table in derivative.items():
             if code == table.code:
-                columns[:, :, k] = np.einsum("nij,nj->ni", root, of_table[rows])
+                columns[:, :, k] = kept * of_table[rows]
         ends, jacobian, dofs = table.at(rows).vertices, block.jacobian, table.type.dofs
         is_seen, stamps, landmark = ends[:, 0] >= self._known, self._stamp_of[ends[:, 0]], np.full(n, -1)
         if is_seen.any():

@@ -28,7 +28,12 @@ _ODOMETRY = {"distance": "distance_factor", "turn": "turn_factor", "turn_bias": 
 
 
 class Corrections:
-    """The corrections that apply at present."""
+    """The corrections that apply at present.
+
+    Attributes
+    ----------
+    factors : of odometry's distance and turn
+    """
 
     def __init__(self, config: Config) -> None:
         self._config, self._space = config, config.space
@@ -47,7 +52,7 @@ class Corrections:
     def found(self, found: dict[Key, float]) -> None:
         self._found = found
         distance, turn = (self._factor(name) for name in _FACTORS)
-        self._factors = distance, turn, self._config.odometry.turn_bias_rad_s
+        self.factors = distance, turn
 
     def _factor(self, name: str) -> float:
         found = next((value for (_, other), value in self.found.items() if other == name), 1.0)
@@ -83,42 +88,29 @@ class Corrections:
 
     # -- odometry ----------------------------------------------------------------------------------------------------
 
-    def step(self, step: Step, seconds: float) -> Step:
-        """A step of odometry that lasts some seconds, corrected; where it leads to in its own frame stays."""
-        motion = self.motion(step.T_last_base, seconds)
-        return step if motion is step.T_last_base else replace(step, T_last_base=motion)
+    def step(self, step: Step, seconds: float = 0.0) -> Step:
+        """A step of odometry that lasts some seconds, corrected; where it leads to in its own frame stays.
 
-    def without_bias(self, step: Step) -> Step:
-        """A step of odometry with its factors corrected, before the turn of a gyro is part of it."""
-        factors = (*self.factors, 0.0)
-        return replace(step, T_last_base=self._corrected(step.T_last_base, 0.0, factors))
+        Without seconds its turn is without the configured bias.
+        """
+        return replace(step, T_last_base=self.motion(step.T_last_base, seconds))
 
     def with_bias(self, step: Step, seconds: float) -> Step:
         """A step whose factors are corrected, with the turn rate that is added."""
-        factors = 1.0, 1.0, self._factors[2]
-        return replace(step, T_last_base=self._corrected(step.T_last_base, seconds, factors))
+        return replace(step, T_last_base=self._corrected(step.T_last_base, 1.0, 1.0, seconds))
 
     def motion(self, motion: Numbers, seconds: float = 0.0) -> Numbers:
         """A motion by odometry, corrected; its numbers may be arrays."""
-        return self._corrected(motion, seconds, self._factors)
+        return self._corrected(motion, *self.factors, seconds)
 
-    def _corrected(self, motion: Numbers, seconds: float, factors: tuple[float, float, float]) -> Numbers:
-        """A motion, its distance and turn multiplied, and turned at a rate besides."""
-        distance, turn, bias = factors
-        if (distance, turn, bias) == (1.0, 1.0, 0.0):
+    def _corrected(self, motion: Numbers, distance: float, turn: float, seconds: float) -> Numbers:
+        turned = self._config.odometry.turn_bias_rad_s * seconds
+        if (distance, turn, turned) == (1.0, 1.0, 0.0):
             return motion
-        group, n = self._space.group, self._space.dimensions
-        tangent = group.log(motion)
-        moves = bias != 0.0 and any(np.any(x) for x in tangent)
-        scaled = [x * (distance if k < n else turn) for k, x in enumerate(tangent)]
-        scaled[-1] = scaled[-1] + moves * bias * seconds
-        out = group.exp(tuple(scaled))
+        if turned and motion == self._space.identity:  # it stands
+            turned = 0.0
+        out = scaled(self._space, motion, distance, turn, turned)
         return out if isinstance(out[0], np.ndarray) else tuple(map(float, out))
-
-    @property
-    def factors(self) -> tuple[float, float]:
-        """The factors of distance and turn."""
-        return self._factors[:2]
 
     @property
     def are_configured(self) -> bool:
@@ -128,11 +120,8 @@ class Corrections:
 
     def uncorrected(self, motion: Numbers) -> Numbers:
         """Undo the correction of a motion, except for its bias."""
-        group, n = self._space.group, self._space.dimensions
         distance, turn = self.factors
-        tangent = group.log(motion)
-        out: Numbers = group.exp(tuple(x / (distance if k < n else turn) for k, x in enumerate(tangent)))
-        return out
+        return scaled(self._space, motion, 1.0 / distance, 1.0 / turn)
 
     # -- sightings ---------------------------------------------------------------------------------------------------
 
@@ -173,6 +162,15 @@ class Corrections:
         if s.kind in ("range", "range_bearing"):
             measured = (scale * measured[0] + offset, *measured[1:])
         return replace(s, measured=measured, T_base_sensor=tuple(map(float, at)))
+
+
+def scaled(space: Geometry, motion: Numbers, distance: Any, turn: float, turned: Any = 0.0) -> Numbers:
+    """A motion with its distance and turn multiplied, and turned by an angle besides. Numbers may be arrays."""
+    n = space.dimensions
+    tangent = [x * (distance if k < n else turn) for k, x in enumerate(space.group.log(motion))]
+    tangent[-1] = tangent[-1] + turned
+    out: Numbers = space.group.exp(tuple(tangent))
+    return out
 
 
 def moved_with_sensor(

@@ -183,7 +183,7 @@ class KeyframeFrontend:
             if self.gyro is None:
                 yield self.corrections.step(step, seconds)
                 continue
-            fused = self.gyro.fuse(self.corrections.without_bias(step), seconds)
+            fused = self.gyro.fuse(self.corrections.step(step), seconds)
             yield self.corrections.with_bias(fused, seconds)
 
     def _add_to_gyro(self, m: AngularVelocity) -> None:
