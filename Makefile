@@ -10,7 +10,7 @@
 # test-oldest   the tests without ROS, in .venv-oldest with the lowest versions that setup.py allows
 # lint, format  check style, layers, budgets and types; correct the style
 # lock          write requirements.txt and constraints-oldest.txt from setup.py; LOCK=--upgrade takes newer versions
-# bench         measure ours against GTSAM, g2o and python-graphslam into docs/benchmarks.md and accuracy.md; hours
+# bench         measure ours against GTSAM and g2o into docs/benchmarks.md and accuracy.md; hours
 # robust        measure ours and GTSAM with false closures and wrong ids, into docs/robustness.md; two hours, resumed where it was
 # figures       measure the table that must not get worse, docs/figures/figures.csv, and compare; half an hour; WRITE=1 replaces it
 # pictures      draw the pictures of README.md and docs/ again, in Chromium

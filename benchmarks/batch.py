@@ -1,78 +1,53 @@
-"""The whole graph at once, from arrays in memory to convergence: ours, GTSAM, g2o and python-graphslam.
+"""The whole graph at once, from arrays in memory to convergence: ours, GTSAM and g2o.
 
 ``python -m benchmarks.batch [FILE ...]``. All start from the file's values (along a tree where it has none) and end
-when the cost changes by less than a millionth. Ordering and symbolic analysis are included, parsing is not; making the
-library's own graph from arrays is, and is told apart, because the peers have to do it edge by edge from Python.
+when the cost changes by less than a millionth. Making the library's own graph, ordering and symbolic analysis are
+included, parsing is not.
 """
 
-import sys
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
-
-if not __package__:  # run as a script: what it imports is in the repository, not in its folder
-    sys.path[0] = str(Path(__file__).resolve().parents[1])
 
 from benchmarks import contenders, fresh, judge, options, table
 from benchmarks.contenders import BATCH_PEERS, OURS, OURS_AS_G2O, Solved
 from benchmarks.problem import Problem
 
 
-def race(problem: Problem, peers: Sequence[str], reps: int) -> list[table.Row]:
-    """One row for ours and each peer."""
+def race(problem: Problem, peers: Sequence[str], reps: int) -> table.Row:
+    """A line of the table: CPU seconds, and in brackets what part of a peer's ours takes."""
+
+    def ask(name: str) -> Solved:
+        try:
+            return fresh.call(contenders.solve, name, problem, python=contenders.python_of(name))
+        except fresh.Crashed as error:
+            return Solved(fault=f"crashes: {error}")
+
     names = [OURS, *peers]
-    if not problem.planar and any(name.startswith("g2o") for name in peers):
-        names.insert(1, OURS_AS_G2O)  # the problem that g2o solves
-    solved: dict[str, list[Solved]] = {name: [] for name in names}
-    for _ in range(reps):
-        for name in names:
-            if not solved[name] or _seconds(solved[name][0]) < options.SLOW_S:
-                solved[name].append(_one(name, problem))
-                options.say(f"{problem.name}: {name} {_seconds(solved[name][-1]):.3f} s {solved[name][-1].fault}")
-    return [_row(problem, name, solved[name]) for name in names]
-
-
-def _one(name: str, problem: Problem) -> Solved:
-    try:
-        return fresh.call(contenders.solve, name, problem, python=contenders.python_of(name))
-    except fresh.Crashed as error:
-        return Solved(fault=f"crashes: {error}")
-
-
-def _seconds(solved: Solved) -> float:
-    return solved.build_s + solved.solve_s
-
-
-def _row(problem: Problem, name: str, solved: Sequence[Solved]) -> table.Row:
-    last = solved[-1]
-    return {
-        "graph": problem.name,
-        "poses": len(problem.poses),
-        "edges": len(problem.relative) + len(problem.sightings),
-        "who": name,
-        "reps": len(solved),
-        "total_s": float(np.median([_seconds(one) for one in solved])),
-        "build_s": float(np.median([one.build_s for one in solved])),
-        "solve_s": float(np.median([one.solve_s for one in solved])),
-        "iterations": last.iterations,
-        "chi2": judge.all_costs(problem, last.poses, last.landmarks),
-        "error_map": contenders.error_map(name, problem.planar),
-        "fault": last.fault,
-        "reached": len(problem.poses),
-        "whole": problem.whole,
-    }
+    if not problem.planar and "g2o-gn" in peers:
+        names.append(OURS_AS_G2O)  # the problem that g2o solves
+    options.say(problem.name)
+    solved = options.in_turn(names, reps, ask, lambda one: one.cpu_s)
+    spent = {name: float(np.median([one.cpu_s for one in several])) for name, several in solved.items()}
+    last = {name: several[-1] for name, several in solved.items()}
+    costs = {name: judge.chi2(problem, one.poses, one.landmarks) for name, one in last.items()}
+    row: table.Row = {"graph": problem.name}
+    for name in (OURS, *peers):
+        row[name] = options.told(spent[name], last[name].fault, costs[name])
+        ours = OURS_AS_G2O if name == "g2o-gn" and OURS_AS_G2O in spent else OURS
+        if name != OURS and not (last[ours].fault or last[name].fault):
+            row[name] += f" ({spent[ours] / spent[name]:.2f})"
+    return row | {"of best, ours": options.of_best(problem, list(costs.values()))[0]}
 
 
 def main() -> None:
     """The programme."""
-    parser = options.parser(__doc__, BATCH_PEERS, ("gtsam-gn", "gtsam-lm", "g2o-gn"))
-    options.add_files(parser)
+    parser = options.parser(__doc__)
+    options.add_repetitions(parser)
+    options.add_peers(parser, BATCH_PEERS)
     args = parser.parse_args()
-    rows = []
-    for problem in options.problems(args):
-        rows += race(problem, args.peers, args.reps)
-    table.finish(table.results("batch", rows), args.json)
+    rows = [race(problem, args.peers, args.reps) for problem in options.problems(args)]
+    table.finish(table.results("batch", rows, f"medians of {args.reps} repetitions"), args.json)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from benchmarks.hall import measured
+from benchmarks.hall import measured, seen_from
 from graph_slam_ros.lie import se2
 from graph_slam_ros.slam import Measurement
 from graph_slam_ros.typing import Array
@@ -92,8 +92,5 @@ def _seen(rng: np.random.Generator, marks: Array, pose: tuple[float, ...]) -> It
     """Return sightings of the landmarks within reach, as of ``hall.measured``."""
     for mark, at in enumerate(marks.tolist()):
         there = np.array(se2.act(se2.inverse(pose), tuple(at)))
-        distance = float(np.hypot(*there))
-        if 0.3 < distance < _REACH_M:
-            ray, across = there / distance, _SIGMA_BEARING * distance
-            covariance = across**2 * np.eye(2) + (_SIGMA_RANGE**2 - across**2) * np.outer(ray, ray)
-            yield mark, there + np.linalg.cholesky(covariance) @ rng.standard_normal(2), covariance
+        if 0.3 < np.hypot(*there) < _REACH_M:
+            yield mark, *seen_from(there, _SIGMA_RANGE, _SIGMA_BEARING, rng)

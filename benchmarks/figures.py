@@ -9,7 +9,6 @@ Results are the same in each run, so these are measured two at a time. What take
 
 import argparse
 import os
-import resource
 import sys
 import tempfile
 import time
@@ -22,17 +21,15 @@ from typing import Any
 import numpy as np
 from scipy.io import loadmat
 
-from benchmarks import figures, fresh, judge, lifelong, online, recorded, replay, start
+from benchmarks import courses, datasets, figures, fresh, judge, lifelong, online, replay
 from benchmarks.carried import MOMENTS_S, Carried
 from benchmarks.contenders import OURS
-from benchmarks.courses import of_graph
+from benchmarks.datasets import DATASETS, Absent, mrclam
 from benchmarks.figure_rows import COST, NEVER, TABLE, TIME, Outcome, Row, compare, read_table, write_table
-from benchmarks.hall import fitted
-from benchmarks.kept import Kept
+from benchmarks.fresh import Kept
 from benchmarks.options import say
 from benchmarks.problem import Problem, read_problem
-from benchmarks.robust import Race
-from benchmarks.scores import score
+from benchmarks.robust import Race, score
 from graph_slam_ros.analysis.evaluation import evaluate
 from graph_slam_ros.analysis.trajectories import read_truth
 from graph_slam_ros.runs.replay import replay as replayed
@@ -41,22 +38,14 @@ from graph_slam_ros.slam import Config, Control, GraphSlam, MapView, Measurement
 from graph_slam_ros.tools.simulation import Fault, Recording, faulty_recording, measurements, simulate, write_bag
 from graph_slam_ros.typing import Array
 
-sys.path.append(str(fresh.ROOT / "test"))
-import places
-import public_recordings
-
 _NEAR_M = 0.5  # farther than that from all poles, a landmark is wrong
 _SLIP_S, _SOON_S, _LOSS = 20.0, 4.0, 0.2
 _RANGES = {"inputs.names": "odom ranges", "ranges.type": "sensor_msgs/msg/PointCloud2", "ranges.topic": "/ranges"}
 
 
-class Absent(Exception):
-    """Data are not at hand."""
-
-
 def recorded_robot(robot: int, ids: str) -> Iterator[Row]:
     """A robot of MR.CLAM set 7, with its ids or without."""
-    bag, run = _mrclam(robot, *(() if ids == "known" else ("--ids", "none"))), Path("run")
+    bag, run = mrclam(robot, Path("bag"), *(() if ids == "known" else ("--ids", "none"))), Path("run")
     replayed(bag, run, Config.from_mapping({} if ids == "known" else {"landmarks.association": "joint"}))
     scores = evaluate(run, str(bag))
     yield Row("position", scores.estimate.position_m["rmse"], "m")
@@ -74,7 +63,7 @@ def _unnamed_map(bag: Path, run: Path) -> Iterator[Row]:
     stamps_s = truth.trajectory.stamps_s
     path = path[(path[:, 0] > stamps_s[0]) & (path[:, 0] < stamps_s[-1])]
     true = np.stack([np.interp(path[:, 0], stamps_s, truth.trajectory.poses[:, k]) for k in (0, 1)], axis=1)
-    turn, shift = fitted(path[:, 1:3], true)
+    turn, shift = judge.fitted(path[:, 1:3], true)
     marks = read_landmarks(run / "landmarks.csv").positions[:, :2] @ turn.T + shift
     poles = np.array([one[:2] for one in truth.landmarks.values()])
     apart = np.linalg.norm(poles[:, None] - marks[None], axis=2)
@@ -86,11 +75,9 @@ def _unnamed_map(bag: Path, run: Path) -> Iterator[Row]:
 
 def plaza() -> Iterator[Row]:
     """Ranges alone, to four beacons."""
-    source = public_recordings.RECORDED / "plaza2"
-    _check(source)
-    bag = public_recordings.plaza(Path())
-    stamps_s, x, y, _ = loadmat(source / "Plaza2_.mat")["GT"].T
-    rows = np.column_stack([stamps_s + public_recordings.EPOCH_S, x, y, np.zeros((len(x), 4)), np.ones(len(x))])
+    bag, epoch_s, truth = datasets.plaza()
+    stamps_s, x, y, _ = loadmat(truth)["GT"].T
+    rows = np.column_stack([stamps_s + epoch_s, x, y, np.zeros((len(x), 4)), np.ones(len(x))])
     np.savetxt("truth.tum", rows, fmt="%.9f")
     replayed(bag, Path("run"), Config.from_mapping(_RANGES))
     yield Row("position", evaluate(Path("run"), "truth.tum").estimate.position_m["rmse"], "m")
@@ -157,12 +144,11 @@ def clean(drives: Sequence[tuple[str, int, dict[str, Any]]]) -> Iterator[Row]:
 
 def false_closures(name: str, poses: int, policy: str, rate: float) -> Iterator[Row]:
     """False measurements in a graph, or wrong ids of a robot; everything is solved at the end."""
-    race = Race((), 1, NEVER, 1, Kept(Path("kept")))
+    race = Race((), 1, 1, Kept(Path("kept")))
     if name.startswith("MR.CLAM"):
-        _check(places.CONVERTER, places.SET_7)
-        course = recorded.of_robot(race.kept, int(name[-1]), places.CONVERTER, places.SET_7)
+        course = courses.of_robot(race.kept, int(name[-1]))
     else:
-        course = of_graph(_graph(name).prefix(poses))
+        course = courses.of_graph(_graph(name).prefix(poses))
     trial = course.trial(policy, rate, 0)
     found = score(course, trial, race.believe(OURS, trial), "batch")
     if found.fault:
@@ -175,17 +161,20 @@ def false_closures(name: str, poses: int, policy: str, rate: float) -> Iterator[
 
 def against_isam2(name: str) -> Iterator[Row]:
     """Pose by pose, the newest pose read after each; both take turns."""
-    ours, theirs = online.race(_graph(name), ["isam2-10"], 3, False, 600.0)
-    if ours["fault"] or theirs["fault"]:
-        raise RuntimeError(ours["fault"] or theirs["fault"])
-    yield Row("CPU of iSAM2's", ours["total_s"] / theirs["total_s"], "times", tolerance=TIME)
-    chi2 = [one["chi2"]["relative"] for one in (ours, theirs)]
+    problem = _graph(name)
+    drives = online.race(problem, 3, False)
+    faults = [several[-1].fault for several in drives.values() if several[-1].fault]
+    if faults:
+        raise RuntimeError(faults[0])
+    times = [online.times(several)[0] for several in drives.values()]
+    yield Row("CPU of iSAM2's", times[0] / times[1], "times", tolerance=TIME)
+    chi2 = [judge.chi2(problem, one.poses, one.landmarks) for *_, one in drives.values()]
     yield Row("chi2 of iSAM2's", chi2[0] / chi2[1], "times", tolerance=COST)
 
 
 def hall(keyframes: int, window: int) -> Iterator[Row]:
     """A robot that drives in one hall, its map bounded."""
-    found = next(iter(lifelong.measure(keyframes, [0], [window], 2, world="points")))
+    found = next(iter(lifelong.measure(keyframes, [0], [window])))
     yield Row("path", found["path m"], "m")
     yield Row("landmarks", found["landmarks m"], "m")
     yield Row("memory", found["late MiB"], "MiB", tolerance=1.05)
@@ -195,16 +184,14 @@ def hall(keyframes: int, window: int) -> Iterator[Row]:
 
 def replay_cpu() -> Iterator[Row]:
     """The whole command, as a multiple of reading its recording with rosbags."""
-    _, command_s, reading_s = replay.times(_mrclam(5), "replay", [], 3)
+    _, command_s, reading_s = replay.times(mrclam(5, Path("bag")), "replay", [], 3)
     ratio = float(np.median(np.divide(command_s, reading_s)))
     yield Row("CPU of reading", ratio, "times", tolerance=TIME)
 
 
 def kernels() -> Iterator[Row]:
     """All of them, into an empty cache."""
-    cpu_s, _, status = start.run(start.COMPILE.format(dimensions=3), Path("cache").absolute())
-    if status:
-        raise RuntimeError(f"exit code {status}")
+    cpu_s, _ = replay.commanded(["warmup", "--dimensions", "3"], GRAPH_SLAM_CACHE=str(Path("cache").absolute()))
     yield Row("CPU to compile", cpu_s, "s", tolerance=1.2)
 
 
@@ -226,9 +213,7 @@ class Job:
             except Absent as error:
                 absent = str(error)
             os.chdir(fresh.ROOT)
-        children = resource.getrusage(resource.RUSAGE_CHILDREN)
-        cpu_s = time.process_time() - began_s + children.ru_utime + children.ru_stime
-        return Outcome(rows, absent, cpu_s=cpu_s)
+        return Outcome(rows, absent, cpu_s=time.process_time() - began_s + fresh.children_s())
 
     def apart(self) -> Outcome:
         """As ``run``, in a fresh process."""
@@ -282,20 +267,9 @@ def run(name: str) -> Outcome:
     return next(job for job in (*RESULTS, *TIMED) if job.name == name).run()
 
 
-def _check(*paths: Path) -> None:
-    for path in paths:
-        if not path.exists():
-            raise Absent(f"no {path.name} in {places.DATASETS}: set GRAPH_SLAM_DATASETS")
-
-
-def _mrclam(robot: int, *options: str) -> Path:
-    _check(places.CONVERTER, places.SET_7)
-    return Path(places.mrclam(robot, Path("bag").resolve(), *options))
-
-
 def _graph(name: str) -> Problem:
-    file = places.DATASETS / f"pose_graphs/{name}.g2o"
-    _check(file)
+    file = DATASETS / f"pose_graphs/{name}.g2o"
+    datasets.check(file)
     return read_problem(file)
 
 

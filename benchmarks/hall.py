@@ -33,11 +33,6 @@ class Hall:
     steps: list[tuple[float, ...]]
     sightings: list[list[Seen]]
 
-    @property
-    def sigmas(self) -> list[float]:
-        """Standard deviations of a step of odometry."""
-        return _sigmas(self.space)
-
 
 class Course:
     """The same drive, a keyframe at a time: only its positions are in memory.
@@ -48,12 +43,10 @@ class Course:
     points : true positions of the landmarks; turns : their rotations, where they are tags
     """
 
-    def __init__(
-        self, seed: int, keyframes: int, space: Geometry = PLANAR, landmarks: int = 40, *, tags: bool = False
-    ) -> None:
+    def __init__(self, seed: int, keyframes: int, space: Geometry = PLANAR, *, tags: bool = False) -> None:
         self.space, self._rng, n = space, np.random.default_rng(seed), space.dimensions
         self.where = _driven(self._rng, keyframes + 1)
-        grid = np.array([(60 * (i + 0.5) / 8, 40 * (j + 0.5) / 5) for i in range(8) for j in range(5)])[:landmarks]
+        grid = np.array([(60 * (i + 0.5) / 8, 40 * (j + 0.5) / 5) for i in range(8) for j in range(5)])
         self.points = np.zeros((len(grid), n))
         self.points[:, :2] = grid + self._rng.uniform(-2.5, 2.5, grid.shape)
         self.points[:, 2:] = self._rng.uniform(0.0, 3.0, (len(grid), n - 2))
@@ -76,11 +69,13 @@ class Course:
                 step = tuple(map(float, group.compose(group.between(before, pose), error)))
             local = np.stack(group.act(group.inverse(pose), tuple(self.points.T)), axis=-1)
             near = (np.hypot(*local.T[:2]) < REACH_M) & (rng.random(len(self.points)) < SEEN)
-            yield pose, step, [self._seen(m, pose, *_seen(local[m], rng)) for m in np.flatnonzero(near).tolist()]
+            seen = [self._seen(mark, pose, local[mark]) for mark in np.flatnonzero(near).tolist()]
+            yield pose, step, seen
             before = pose
 
-    def _seen(self, mark: int, pose: Numbers, position: Array, covariance: Array) -> Seen:
+    def _seen(self, mark: int, pose: Numbers, there: Array) -> Seen:
         """Return a sighting: of a tag with its orientation."""
+        position, covariance = seen_from(there, SIGMA_RANGE, SIGMA_BEARING, self._rng)
         if not self.turns:
             return mark, position, covariance
         space, group, n = self.space, self.space.group, self.space.dimensions
@@ -91,9 +86,9 @@ class Course:
         return mark, np.array((*position.tolist(), *group.compose(seen, group.exp(error))[n:])), whole
 
 
-def hall(seed: int, keyframes: int, space: Geometry = PLANAR, landmarks: int = 40, *, tags: bool = False) -> Hall:
+def hall(seed: int, keyframes: int, space: Geometry = PLANAR, *, tags: bool = False) -> Hall:
     """Make a drive."""
-    course = Course(seed, keyframes, space, landmarks, tags=tags)
+    course = Course(seed, keyframes, space, tags=tags)
     poses, steps, sightings = zip(*course.keyframes(), strict=True)
     return Hall(space, list(poses), course.points, list(steps[1:]), list(sightings))
 
@@ -126,11 +121,10 @@ def _pose(space: Geometry, x: float, y: float, yaw: float) -> tuple[float, ...]:
     return x, y, 0.0, 0.0, 0.0, float(np.sin(yaw / 2)), float(np.cos(yaw / 2))
 
 
-def _seen(there: Array, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Return a sighting: noise along the ray, and as much as the bearing has across it."""
+def seen_from(there: Array, along: float, bearing: float, rng: np.random.Generator) -> tuple[Array, Array]:
+    """A sighting of what is there: noise along the ray, and as much as the bearing has across it."""
     distance = float(np.linalg.norm(there))
-    ray = there / distance
-    along, across = SIGMA_RANGE, SIGMA_BEARING * distance
+    ray, across = there / distance, bearing * distance
     covariance = across**2 * np.eye(len(there)) + (along**2 - across**2) * np.outer(ray, ray)
     return there + np.linalg.cholesky(covariance) @ rng.standard_normal(len(there)), covariance
 
@@ -172,18 +166,3 @@ def measured(T_odom_base: Numbers, stamp_ns: int, seen: Sequence[tuple[int, Arra
 def without_ids(m: Sightings) -> Sightings:
     """Return the sightings without the ids of their landmarks."""
     return replace(m, sightings=tuple(replace(one, id="") for one in m.sightings))
-
-
-def fitted(estimated: Array, true: Array) -> tuple[Array, Array]:
-    """Return the rotation and shift that lay the one on the other best."""
-    middle, centre = estimated.mean(axis=0), true.mean(axis=0)
-    u, _, vt = np.linalg.svd((estimated - middle).T @ (true - centre))
-    flip = np.diag([*[1.0] * (len(middle) - 1), np.sign(np.linalg.det(vt.T @ u.T))])
-    turn = vt.T @ flip @ u.T
-    return turn, centre - turn @ middle
-
-
-def rms(estimated: Array, true: Array) -> float:
-    """Return the root mean square of what is left after one was laid on the other [m]."""
-    turn, shift = fitted(estimated, true)
-    return float(np.sqrt((((estimated @ turn.T + shift) - true) ** 2).sum(axis=1).mean()))

@@ -1,8 +1,8 @@
 """The node as a robot has it: what it costs, how much it takes, and how soon it answers.
 
 ``python -m benchmarks.node [NAME ...]``, where ROS 2 is installed; without names everything, which takes an hour.
-Publishers, subscribers and the node are processes of their own on this machine's loopback. CPU time is what the kernel
-counts for a process, with the middleware's threads.
+The node is a process of its own, and this process sends to it and listens, on this machine's loopback. CPU time is what
+the kernel counts for a process, with the middleware's threads.
 """
 
 import argparse
@@ -11,23 +11,15 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from statistics import median
-from typing import Any
+
+import numpy as np
 
 from benchmarks import options, table
-from benchmarks.live.processes import HELPERS, Process, listener, node, percentile, running, sender
-from benchmarks.live.streams import (
-    AFTER_NS,
-    BEFORE_NS,
-    CITY_SIGMA_M,
-    CITY_SIGMA_RAD,
-    CLOSURES,
-    LANDMARKS,
-    ODOMETRY,
-)
+from benchmarks.live.robot import BARE, Process, Robot, node, ros, running, transitions
+from benchmarks.live.streams import AFTER_NS, BEFORE_NS, CITY_SIGMA_M, CITY_SIGMA_RAD, CLOSURES, LANDMARKS, ODOMETRY
 from benchmarks.table import Row
 from graph_slam_ros.warmup import warmup
 
-_OUTPUTS = ("path", "pose", "odometry", "tf")
 _WARM_S = 5.0
 _TRANSITIONS = ("configure", "activate", "deactivate", "cleanup")
 _CITY = {  # a keyframe for each pose, and the noise that the world has
@@ -65,125 +57,101 @@ def cpu(short: bool) -> list[Row]:
 
 
 def _cpu_of(who: str, seconds: float) -> float:
-    robot = sender("warehouse", seconds=seconds + 2 * _WARM_S, odometry_hz=100, landmarks_hz=10)
+    driven = {"seconds": seconds + 2 * _WARM_S, "odometry_hz": 100, "landmarks_hz": 10}
     if who == "a bare node":
-        bare = Process(HELPERS, "bare", ODOMETRY, LANDMARKS)
-        with running(robot, bare):
+        with running(BARE, ODOMETRY, LANDMARKS) as bare, Robot("warehouse", **driven) as robot:
             return _spent(bare, robot, seconds)
-    with node({}, robot, listener(*_OUTPUTS)) as ours:
+    with node({}) as (ours, _), Robot("warehouse", "path", "pose", "odometry", "tf", **driven) as robot:
         return _spent(ours, robot, seconds)
 
 
-def _spent(who: Process, robot: Process, seconds: float) -> float:
+def _spent(who: Process, robot: Robot, seconds: float) -> float:
     """CPU seconds per second."""
-    robot.answer()
-    robot.ask(seconds=_WARM_S)
-    begin, start = who.cpu_s, time.monotonic()
-    robot.ask(seconds=seconds)
-    return (who.cpu_s - begin) / (time.monotonic() - start)
+    robot.play(_WARM_S)
+    begin_s, start_s = who.cpu_s, time.monotonic()
+    robot.play(seconds)
+    return (who.cpu_s - begin_s) / (time.monotonic() - start_s)
 
 
 def rate(short: bool) -> list[Row]:
     """Odometry at 1 kHz; late is from its sending to the arrival of the node's own of that stamp."""
     seconds = 5.0 if short else 60.0
-    robot, ears = sender("warehouse", seconds=seconds, odometry_hz=1000, landmarks_hz=10), listener("odometry")
-    with node({}, robot, ears) as ours:
-        robot.answer()
-        begin = ours.cpu_s
-        told = robot.ask(seconds=seconds, tell=True)
-        cpu_s = ours.cpu_s - begin
-        received = robot.ask()
-        sent_at = {stamp: at for topic, stamp, at in told["when"] if topic == ODOMETRY}
-        late = [1e-6 * (at - sent_at[stamp]) for at, stamp in ears.ask()["odometry"] if stamp in sent_at]
-    return [
-        {
-            "sent": told["sent"],
-            "received": received,
-            "% of a core": 100.0 * cpu_s / told["took_s"],
-            "~/odometry": len(late),
-            "late, median ms": percentile(late, 0.5),
-            "p99 ms": percentile(late, 0.99),
-            "max ms": percentile(late, 1.0),
-        }
-    ]
+    driven = {"seconds": seconds, "odometry_hz": 1000, "landmarks_hz": 10}
+    with node({}) as (ours, _), Robot("warehouse", "odometry", **driven) as robot:
+        begin_s, start_s = ours.cpu_s, time.monotonic()
+        sent = robot.play(seconds)
+        share = (ours.cpu_s - begin_s) / (time.monotonic() - start_s)
+        received = robot.received()
+        sent_at = {stamp: at for topic, stamp, at in sent if topic == ODOMETRY}
+        late_ms = [1e-6 * (at - sent_at[stamp]) for at, stamp in robot.heard["odometry"] if stamp in sent_at]
+    counts = {"sent": robot.sent, "received": received, "% of a core": 100.0 * share, "~/odometry": len(late_ms)}
+    return [counts | _quantiles(late_ms, "late, median ms")]
 
 
 def latency(short: bool) -> list[Row]:
     """From the odometry that releases a closure to the corrected pose, while a city becomes large."""
     sizes, measured = ((300, 600), 100) if short else ((3_500, 20_000), 900)
-    robot = sender("city", ODOMETRY, CLOSURES, poses=sizes[-1] + measured + 1)
-    ears, rows, driven = listener("pose"), list[Row](), 0
-    with node(_CITY, robot, ears):
-        robot.answer()
+    rows, driven = list[Row](), 0
+    with node(_CITY), Robot("city", "pose", poses=sizes[-1] + measured + 1) as robot:
         for size in sizes:
-            filled = robot.ask(seconds=size - driven, pace=0)
-            ears.ask()
-            told = robot.ask(seconds=measured, pace=10.0, tell=True)
+            robot.play(size - driven, pace=0)
+            robot.heard["pose"].clear()
+            sent = robot.play(measured, pace=10.0)
             driven = size + measured
-            robot.ask()  # until all of it has been taken
-            rows.append({"keyframes": size, **_answered(told["when"], ears.ask()["pose"])})
-            options.say(f"latency: filled in {filled['took_s']:.0f} s; {rows[-1]}")
+            robot.received()  # until all of it has been taken
+            rows.append({"keyframes": size, **_answered(sent, robot.heard["pose"])})
+            options.say(f"latency: {rows[-1]}")
     return rows
 
 
-def _answered(sent: list[Any], heard: list[Any]) -> Row:
+def _answered(sent: list[tuple[str, int, int]], heard: list[tuple[int, int]]) -> Row:
     """When the first pose came that is dated by a closure: by the keyframe that it got."""
     sent_at = {stamp: at for topic, stamp, at in sent if topic == ODOMETRY}
     first: dict[int, int] = {}
     for at, stamp in heard:
         first.setdefault(stamp, at)
     closures = [stamp for topic, stamp, _ in sent if topic == CLOSURES]
-    took = []
+    took_ms = []
     for stamp in closures:
         released_at = sent_at.get(stamp + BEFORE_NS + AFTER_NS)
         if stamp in first and released_at is not None:
-            took.append(1e-6 * (first[stamp] - released_at))
-    return {
-        "closures": len(closures),
-        "answered": len(took),
-        "median ms": percentile(took, 0.5),
-        "p99 ms": percentile(took, 0.99),
-        "max ms": percentile(took, 1.0),
-    }
+            took_ms.append(1e-6 * (first[stamp] - released_at))
+    return {"closures": len(closures), "answered": len(took_ms), **_quantiles(took_ms, "median ms")}
+
+
+def _quantiles(values: list[float], middle: str) -> Row:
+    names, shares = (middle, "p99 ms", "max ms"), (0.5, 0.99, 1.0)
+    found = np.quantile(values, shares).tolist() if values else [None] * len(shares)
+    return dict(zip(names, found, strict=True))
 
 
 def idle(short: bool) -> list[Row]:
     """A robot that stands for eight hours."""
     rows, hours = list[Row](), 0.2 if short else 8.0
     for jitter_m in (0.0, 2e-5, 2e-4):
-        robot = sender("standing", ODOMETRY, hours=hours, jitter_m=jitter_m)
-        with node({"inputs.reliable": True}, robot) as ours:
-            robot.answer()
-            robot.ask(seconds=3600 * hours / 8, pace=0)
-            after_an_eighth = ours.memory_mib
-            robot.ask(pace=0)
-            at_the_end = ours.memory_mib
-            keyframes = ours.finished()["keyframes"]
-        rows.append(
-            {
-                "jitter mm": 1e3 * jitter_m,
-                "hours": hours,
-                "keyframes": keyframes,
-                "RSS MiB after an eighth": after_an_eighth,
-                "at the end": at_the_end,
-            }
-        )
+        with node({"inputs.reliable": True}) as (ours, run):
+            with Robot("standing", hours=hours, jitter_m=jitter_m) as robot:
+                robot.play(3600 * hours / 8, pace=0)
+                memory_mib = [ours.memory_mib]
+                robot.play(pace=0)
+                memory_mib.append(ours.memory_mib)
+            ours.stop()
+            keyframes = json.loads((run / "run.json").read_text(encoding="utf-8"))["keyframes"]
+        rows.append({"jitter mm": 1e3 * jitter_m, "hours": hours, "keyframes": keyframes})
+        rows[-1] |= dict(zip(("RSS MiB after an eighth", "at the end"), memory_mib, strict=True))
         options.say(f"idle: {rows[-1]}")
     return rows
 
 
 def lifecycle(short: bool) -> list[Row]:
     """How long a lifecycle manager waits for each transition: Nav2's gives up after 5 s."""
-    took: dict[str, list[float]] = {name: [] for name in _TRANSITIONS}
+    took = []
     for _ in range(3 if short else 10):
-        manager = Process(HELPERS, "manage")
-        with node({"node.autostart": False}, manager):
-            manager.answer()
-            for name in _TRANSITIONS:
-                took[name].append(manager.ask(transition=name))
+        with node({"node.autostart": False}):
+            took.append(list(transitions(*_TRANSITIONS)))
     return [
         {"transition": name, "starts": len(of), "median s": median(of), "longest s": max(of)}
-        for name, of in took.items()
+        for name, of in zip(_TRANSITIONS, zip(*took, strict=True), strict=True)
     ]
 
 
@@ -210,7 +178,9 @@ def main() -> None:
     measured = []
     for name in args.names or FIGURES:
         options.say(f"{name}{', a short look' if args.short else ''}")
-        measured.append(table.results(f"node-{name}", FIGURES[name](args.short), "a short look" if args.short else ""))
+        with ros():
+            rows = FIGURES[name](args.short)
+        measured.append(table.results(f"node-{name}", rows, "a short look" if args.short else ""))
         print(f"{name}\n\n{table.markdown(measured[-1])}\n", flush=True)
         if args.json is not None:
             args.json.parent.mkdir(parents=True, exist_ok=True)

@@ -1,38 +1,62 @@
-"""What the programmes' command lines have in common, and where the graphs come from."""
+"""What the programmes that race have in common: command lines, graphs, turns, and how costs are told."""
 
 import argparse
-import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from importlib.util import find_spec
 from pathlib import Path
+from typing import TypeVar
 
-from benchmarks.fresh import ROOT
-from benchmarks.problem import Problem, read_problem, sphere_problem
+from benchmarks.datasets import DATASETS
+from benchmarks.problem import Problem, chain_problem, read_problem, sphere_problem
 from graph_slam_ros.cli import arguments as values
 from graph_slam_ros.errors import GraphSlamError
 
-PATIENCE_S = 600.0
-SLOW_S = 60.0  # who takes longer is not asked again
-_SPHERE = Path("sphere")  # no file: simulated
+_SLOW_S = 60.0  # who takes longer is not asked again
+_SIMULATED = {"sphere": sphere_problem, "chain": chain_problem}
 _OF_GTSAM = ("w10000.graph", "sphere_smallnoise.graph")
+# The lowest cost that anybody has found, in our error map with the information matrices of the file.
+_BEST_KNOWN = {
+    "input_INTEL": 215.83,
+    "intel_943": 546.461,
+    "M3500": 137.913,
+    "manhattanOlson3500": 146.077,
+    "sphere2500": 1351.36,
+    "parking-garage": 1.26838,
+    "torus3D": 24234.71,
+    "smallGrid3D": 1033.894,
+    "ring": 11.1631,
+    "victoria_park": 6184.12,
+    "w10000": 289.7259,
+}
+_Answer = TypeVar("_Answer")
 
 
-def parser(about: str | None, peers: Sequence[str], usual: Sequence[str]) -> argparse.ArgumentParser:
-    """Options of a programme that races ours against peers."""
+def parser(about: str | None) -> argparse.ArgumentParser:
+    """Options of a programme that races on graphs."""
     options = argparse.ArgumentParser(description=(about or "").splitlines()[0])
-    options.add_argument(
-        "--peers",
-        type=lambda text: _names(text, peers),
-        default=list(usual),
-        metavar="NAME,...",
-        help=f"of {', '.join(peers)} (default: {','.join(usual)})",
-    )
+    about = "graphs; sphere and chain are simulated (default: all that are at hand, and the sphere)"
+    options.add_argument("files", nargs="*", type=Path, metavar="FILE", help=about)
+    options.add_argument("--poses", type=values.count, metavar="N", help="the first N poses of each graph only")
     options.add_argument("--json", type=Path, metavar="OUT", help="write the results there as well")
     return options
 
 
-def _names(text: str, known: Sequence[str]) -> list[str]:
+def add_repetitions(options: argparse.ArgumentParser) -> None:
+    """How often."""
+    options.add_argument("--reps", type=values.count, default=3, metavar="N", help="medians of so many are told (3)")
+
+
+def add_peers(options: argparse.ArgumentParser, names: Sequence[str]) -> None:
+    """Whom to race against."""
+    about = f"of {', '.join(names)} (default: all)"
+    options.add_argument(
+        "--peers", type=lambda text: chosen(text, names), default=names, metavar="NAME,...", help=about
+    )
+
+
+def chosen(text: str, known: Sequence[str]) -> list[str]:
+    """Names in a list. Raises ArgumentTypeError."""
     names = [name for name in text.split(",") if name]
     for name in names:
         if name not in known:
@@ -40,28 +64,11 @@ def _names(text: str, known: Sequence[str]) -> list[str]:
     return names
 
 
-def add_files(options: argparse.ArgumentParser) -> None:
-    """Graphs to race on, and how often."""
-    about = "graphs, or sphere: simulated, with 0.1 rad of noise (default: all that are at hand)"
-    options.add_argument("files", nargs="*", type=Path, metavar="FILE", help=about)
-    options.add_argument(
-        "--reps", type=values.count, default=3, metavar="N", help="repetitions; their medians are told"
-    )
-    options.add_argument("--poses", type=values.count, metavar="N", help="the first N poses of each graph only")
-
-
-def add_patience(options: argparse.ArgumentParser) -> None:
-    """When to call a drive off."""
-    options.add_argument(
-        "--patience", type=values.positive, default=PATIENCE_S, metavar="S", help="CPU seconds for a drive"
-    )
-
-
 def problems(args: argparse.Namespace) -> Iterator[Problem]:
     """The graphs asked for, one after the other; what cannot be raced is said and skipped."""
-    for path in args.files or [*usual_files(), _SPHERE]:
+    for path in args.files or [*_usual_files(), Path("sphere")]:
         try:
-            problem = sphere_problem() if path == _SPHERE else read_problem(path)
+            problem = _SIMULATED[path.name]() if path.name in _SIMULATED else read_problem(path)
         except GraphSlamError as error:
             say(f"skipped: {error}")
             continue
@@ -70,9 +77,9 @@ def problems(args: argparse.Namespace) -> Iterator[Problem]:
         yield problem.prefix(args.poses) if args.poses else problem
 
 
-def usual_files() -> list[Path]:
+def _usual_files() -> list[Path]:
     """All public graphs at hand: those of the data folder, and two that come with GTSAM."""
-    folder = Path(os.environ.get("GRAPH_SLAM_DATASETS", ROOT.parent / "shared/datasets")) / "pose_graphs"
+    folder = DATASETS / "pose_graphs"
     found = sorted(path for path in folder.glob("*") if path.suffix in (".g2o", ".gz", ".txt", ".graph"))
     if not found:
         say(f"no graphs in {folder}: set GRAPH_SLAM_DATASETS; going on with those that come with GTSAM")
@@ -80,6 +87,32 @@ def usual_files() -> list[Path]:
     if gtsam is not None and gtsam.origin is not None:
         found += [Path(gtsam.origin).parent / "Data" / name for name in _OF_GTSAM]
     return found
+
+
+def in_turn(
+    names: Sequence[str], reps: int, ask: Callable[[str], _Answer], seconds: Callable[[_Answer], float]
+) -> dict[str, list[_Answer]]:
+    """Answers of contenders that take turns; who is slow is asked once."""
+    found: dict[str, list[_Answer]] = {name: [] for name in names}
+    for _ in range(reps):
+        for name, answers in found.items():
+            if not answers or seconds(answers[0]) < _SLOW_S:
+                answers.append(ask(name))
+                say(f"{name}: {seconds(answers[-1]):.3f} s")
+    return found
+
+
+def told(cpu_s: float, fault: str, cost: float | None) -> str:
+    """CPU time, or why there is none; what was reached and is no optimum is said."""
+    return fault if cost is None else ", ".join(filter(None, (f"{cpu_s:.3f}", fault)))
+
+
+def of_best(problem: Problem, costs: Sequence[float | None]) -> list[str]:
+    """Costs as multiples of the lowest that is known."""
+    known = [cost for cost in costs if cost is not None]
+    if problem.whole and problem.name in _BEST_KNOWN:
+        known.append(_BEST_KNOWN[problem.name])
+    return ["" if cost is None else f"{cost / min(known):.4f}" for cost in costs]
 
 
 def say(text: str) -> None:

@@ -41,6 +41,9 @@ class Edges:
         return Edges(self.ends[rows], self.measured[rows], self.root[rows])
 
 
+_NO_SIGHTINGS = Edges(np.empty((0, 2), dtype=np.int64), np.empty((0, 2)), np.empty((0, 2, 2)))
+
+
 @dataclass(frozen=True, slots=True)
 class Step:
     """What arrives with one pose.
@@ -90,6 +93,11 @@ class Problem:
     def planar(self) -> bool:
         """Whether it is in the plane."""
         return self.poses.shape[1] == 3
+
+    @property
+    def edges(self) -> int:
+        """How many there are."""
+        return len(self.relative) + len(self.sightings)
 
     def prefix(self, poses: int) -> "Problem":
         """The graph when it had that many poses."""
@@ -163,6 +171,19 @@ def city_problem(poses: int, seed: int = 1) -> Problem:
     return _in_time_order(f"city{poses}", G2oFile(graph, list(range(graph.vertex_count))))
 
 
+def chain_problem(poses: int = 3000) -> Problem:
+    """A robot that goes a metre at a time and turns at random: one odometry edge each."""
+    from graph_slam_ros.lie import se2
+
+    rng, count, start = np.random.default_rng(0), poses - 1, [(0.0, 0.0, 0.0)]
+    measured = np.array([1.0, 0.0, 0.0]) + rng.normal(size=(count, 3)) * [0.02, 0.02, 0.1]
+    for motion in measured.tolist():
+        start.append(se2.compose(start[-1], tuple(motion)))
+    ends = np.column_stack([np.arange(count), np.arange(1, poses)])
+    relative = Edges(ends, measured, np.tile(np.diag([10.0, 10.0, 50.0]), (count, 1, 1)))
+    return Problem("chain", np.array(start), np.zeros((0, 2)), relative, _NO_SIGHTINGS)
+
+
 def sphere_problem(poses: int = 2500, seed: int = 0) -> Problem:
     """Our simulator's sphere, with 0.1 rad of noise in each rotation."""
     from graph_slam_ros.formats.graph_file import G2oFile
@@ -194,8 +215,7 @@ def _in_time_order(name: str, file: "G2oFile") -> Problem:
     if not joined.all():
         raise FormatError(f"{name}: pose {ids[poses[1:][~joined][0]]} is joined to no earlier pose")
 
-    points = np.empty(0, dtype=np.int64)
-    sightings = Edges(np.empty((0, 2), dtype=np.int64), np.empty((0, 2)), np.empty((0, 2, 2)))
+    points, sightings = np.empty(0, dtype=np.int64), _NO_SIGHTINGS
     if LANDMARK_POSITION in graph.tables:
         sightings = _edges(graph, LANDMARK_POSITION, index)
         sightings = sightings[np.lexsort((sightings.ends[:, 1], sightings.ends[:, 0]))]

@@ -11,39 +11,21 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.live.streams import AFTER_NS, BEFORE_NS, CITY_SIGMA_M, CITY_SIGMA_RAD, STEP_NS, city_steps
-from graph_slam_ros.lie import se2
+from benchmarks.live.streams import city_measurements
 from graph_slam_ros.runs import recorder as recording
 from graph_slam_ros.runs.restore import map_of
-from graph_slam_ros.slam import Closure, Config, Control, GraphSlam, Odometry
+from graph_slam_ros.slam import Config, Control, GraphSlam
 from graph_slam_ros.warmup import warmup
-
-START_NS = 10**15
 
 
 def drive(folder: Path, config: Config, poses: int) -> GraphSlam:
     """A run that nobody ends."""
-    steps, closures = city_steps(poses)
-    covariance = tuple(np.diag(np.square([CITY_SIGMA_M, CITY_SIGMA_M, CITY_SIGMA_RAD])).ravel().tolist())
     recording._BYTES_PER_S = np.inf  # the drive takes a hundredth of its time
     recorder = recording.RunRecorder(folder, config, 1.0)
-    slam, at = GraphSlam(config, recorder.sink), se2.IDENTITY
-    for k in range(poses):
-        stamp_ns = START_NS + k * STEP_NS
-        at = tuple(map(float, se2.compose(at, steps[k][1]))) if k else at
-        measurements = [Odometry(stamp_ns, at)]
-        if k in closures:
-            earlier, T_earlier_now = closures[k]
-            from_ns = START_NS + earlier * STEP_NS
-            measurements.append(Closure(stamp_ns - BEFORE_NS, from_ns, "closures", T_earlier_now, covariance))
-        if k + 1 < poses:
-            ahead = se2.interpolate(se2.IDENTITY, steps[k + 1][1], AFTER_NS / STEP_NS)
-            measurements.append(Odometry(stamp_ns + AFTER_NS, tuple(map(float, se2.compose(at, ahead)))))
-        for m in measurements:
-            recorder.record(slam, slam.process(m))
-            recorder.flush()
-    recorder.record(slam, slam.process(Control("flush")))
-    recorder.flush()
+    slam = GraphSlam(config, recorder.sink)
+    for m in (*city_measurements(poses), Control("flush")):
+        recorder.record(slam, slam.process(m))
+        recorder.flush()
     return slam
 
 

@@ -8,17 +8,16 @@ first.
 
 import argparse
 import os
-import resource
 import shlex
 import statistics
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+import time
 from pathlib import Path
 
-from benchmarks.fresh import ROOT
-from benchmarks.options import say
+from benchmarks import datasets
+from benchmarks.fresh import ROOT, children_s
 from graph_slam_ros.cli import arguments as values
 
 _READ = """
@@ -43,20 +42,20 @@ def read(bag: Path) -> tuple[int, float]:
     return int(count), float(cpu_s)
 
 
-def commanded(words: list[str]) -> float:
-    """Run a command of ``graph_slam``; return its CPU time [s]. Raises SystemExit where it is refused."""
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+def commanded(words: list[str], **environment: str) -> tuple[float, float]:
+    """Run a command of ``graph_slam``; return its CPU and wall time [s]. Raises SystemExit where it is refused."""
+    before_s, since_s = children_s(), time.perf_counter()
     done = subprocess.run(
-        [sys.executable, "-c", "import sys; from graph_slam_ros.cli import main; sys.exit(main())", *words],
+        [sys.executable, "-m", "graph_slam_ros.cli", *words],
         cwd=ROOT,
+        env=os.environ | environment,
         check=False,
         capture_output=True,
         text=True,
     )
     if done.returncode not in (0, 3, 4):  # 4: check or calibrate has found something
         raise SystemExit(f"graph_slam {shlex.join(words)}: exit code {done.returncode}\n{done.stderr}")
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return children_s() - before_s, time.perf_counter() - since_s
 
 
 def times(bag: Path, command: str, options: list[str], reps: int) -> tuple[int, list[float], list[float]]:
@@ -68,7 +67,7 @@ def times(bag: Path, command: str, options: list[str], reps: int) -> tuple[int, 
         for _ in range(reps):
             count, cpu_s = read(bag)
             reading_s.append(cpu_s)
-            command_s.append(commanded([command, str(bag.resolve()), *out, *options]))
+            command_s.append(commanded([command, str(bag.resolve()), *out, *options])[0])
     return count, command_s, reading_s
 
 
@@ -83,20 +82,6 @@ def compare(bag: Path, command: str, options: list[str], reps: int) -> str:
     )
 
 
-def _usual(folder: str) -> Iterator[Path]:
-    """A recorded robot, if the data sets are there."""
-    datasets = Path(os.environ.get("GRAPH_SLAM_DATASETS", ROOT.parent / "shared/datasets"))
-    converter, set_7 = datasets.parent / "tools/mrclam_to_mcap.py", datasets / "recorded/mrclam7"
-    for path in (converter, set_7):
-        if not path.exists():
-            say(f"no {path}: set GRAPH_SLAM_DATASETS, or name a recording")
-            return
-    bag = Path(folder) / f"mrclam7_{_ROBOT}"
-    words = [sys.executable, str(converter), str(set_7), str(_ROBOT), str(bag), "--map"]
-    subprocess.run(words, check=True, stdout=subprocess.DEVNULL)
-    yield bag
-
-
 def main() -> None:
     """Compare, and print a line for each recording."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
@@ -106,7 +91,7 @@ def main() -> None:
     parser.add_argument("--options", default="", metavar="TEXT", help="more options of the command, in one word")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="recording-") as folder:
-        for bag in args.bags or _usual(folder):
+        for bag in args.bags or [datasets.mrclam(_ROBOT, Path(folder) / f"mrclam7_{_ROBOT}")]:
             print(compare(bag, args.command, shlex.split(args.options), args.reps), flush=True)
 
 

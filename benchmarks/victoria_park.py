@@ -25,27 +25,24 @@ from typing import Any
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the commands do, before NumPy comes in
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.io import loadmat
 
-from benchmarks import options
-from benchmarks.fresh import ROOT
+from benchmarks import datasets, judge
 from graph_slam_ros.lie import se2
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
-
-Array = NDArray[np.float64]
+from graph_slam_ros.typing import Array
 
 # The car: between the axles, left rear wheel (which has the encoder) beside the middle, and the laser before the axle.
-_AXLES_M, _WHEEL_M, _LASER = 2.83, 0.76, (2.83 + 0.95, 0.5, 0.0)
+_AXLES_M, _WHEEL_M, LASER = 2.83, 0.76, (2.83 + 0.95, 0.5, 0.0)
 
 # What its sensors are good for: of the speed a part, for slip and tyres; of the steering the offset between its two
 # extractions several times over, for backlash; sideways the same angle. Both last for seconds.
 _SPEED_PART, _STEERING_RAD, _ERROR_LASTS_S = 0.05, 0.02, 1.0
 # A beam every half degree and edges that fall between two, at a trunk of which one side is seen.
-_BEARING_RAD, _RANGE_M, _TRUNK_PART = 0.01, 0.1, 0.25
+BEARING_RAD, RANGE_M, TRUNK_PART = 0.01, 0.1, 0.25
 
 # Trees of a park stand some 15 m apart. What the car drives between two scans is a keyframe; less is none.
-SETTINGS: Mapping[str, Any] = {
+_SETTINGS: Mapping[str, Any] = {
     "map.condense": False,  # all of it is compared
     "landmarks.association": "joint",
     "landmarks.density_per_m": 0.07,
@@ -66,7 +63,7 @@ class Track:
     @classmethod
     def of_laser(cls, stamps_s: Array, poses: Array) -> "Track":
         """Where the laser is, of poses (n, 3) of the base."""
-        return cls(stamps_s, np.column_stack(se2.act(tuple(poses.T), _LASER[:2])))
+        return cls(stamps_s, np.column_stack(se2.act(tuple(poses.T), LASER[:2])))
 
     def at(self, stamps_s: Array) -> Array:
         """Positions (n, 2) at other stamps, straight between two."""
@@ -90,6 +87,25 @@ class Drive:
     scans: Sequence[tuple[float, Array]]
     gps: Track
 
+    def path_of_odometry(self) -> Track:
+        """Where odometry alone has the laser."""
+        return Track.of_laser(self.odometry[:, 0], self.odometry[:, 1:])
+
+    def quiet_fixes(self) -> Track:
+        """The fixes that a path can be judged by."""
+        gps, odometry = self.gps, self.path_of_odometry()
+        moved = odometry.at(gps.stamps_s)
+        late = np.diff(gps.stamps_s, prepend=-np.inf) > _USUAL_S
+        good = np.zeros(len(late), dtype=bool)
+        for k, stamp_s in enumerate(gps.stamps_s):
+            first = int(np.searchsorted(gps.stamps_s, stamp_s - _QUIET_S - 0.5 * _USUAL_S))
+            if stamp_s - gps.stamps_s[first] < _QUIET_S - 0.5 * _USUAL_S or late[first + 1 : k + 1].any():
+                continue
+            far, ours = (np.linalg.norm(x[first:k] - x[k], axis=1) for x in (gps.positions, moved))
+            good[k] = float(np.abs(far - ours).max()) < _JUMP_M
+        good &= (gps.stamps_s >= odometry.stamps_s[0]) & (gps.stamps_s <= odometry.stamps_s[-1])
+        return Track(gps.stamps_s[good], gps.positions[good])
+
     def measurements(self) -> Iterator[Odometry | Sightings | Control]:
         """All of it but GPS, in order of time."""
         scans = iter([*self.scans, (np.inf, np.empty((3, 0)))])
@@ -103,7 +119,8 @@ class Drive:
 
 
 def read_drive(folder: Path) -> Drive:
-    """Read the recording."""
+    """Read the recording. Raises ``datasets.Absent``."""
+    datasets.check(folder)
     recorded = loadmat(folder / "VictoriaParkSinSincronizar.mat")
     stamps_s = recorded["time"].ravel()
     speed, steering = recorded["u"]
@@ -135,10 +152,10 @@ def _twist_covariance(speed: float, steering: float) -> tuple[float, ...]:
 def _sightings(stamp_s: float, trees: Array) -> Sightings:
     out = []
     for distance, bearing, diameter in trees.T.tolist():
-        variance = _RANGE_M**2 + (_TRUNK_PART * diameter) ** 2
+        variance = RANGE_M**2 + (TRUNK_PART * diameter) ** 2
         ahead = bearing - 0.5 * np.pi
-        covariance = (variance, 0.0, 0.0, _BEARING_RAD**2)
-        out.append(Sighting("", "range_bearing", (distance, ahead), covariance, _LASER))
+        covariance = (variance, 0.0, 0.0, BEARING_RAD**2)
+        out.append(Sighting("", "range_bearing", (distance, ahead), covariance, LASER))
     return Sightings(_ns(stamp_s), "trees", tuple(out))
 
 
@@ -146,60 +163,31 @@ def _ns(stamp_s: float) -> int:
     return round(stamp_s * 1e9)
 
 
-def quiet(gps: Track, odometry: Track) -> NDArray[np.bool_]:
-    """Which fixes (n,) can be judged by."""
-    moved = odometry.at(gps.stamps_s)
-    late = np.diff(gps.stamps_s, prepend=-np.inf) > _USUAL_S
-    out = np.zeros(len(late), dtype=bool)
-    for k, stamp_s in enumerate(gps.stamps_s):
-        first = int(np.searchsorted(gps.stamps_s, stamp_s - _QUIET_S - 0.5 * _USUAL_S))
-        if stamp_s - gps.stamps_s[first] < _QUIET_S - 0.5 * _USUAL_S or late[first + 1 : k + 1].any():
-            continue
-        far, ours = (np.linalg.norm(x[first:k] - x[k], axis=1) for x in (gps.positions, moved))
-        out[k] = float(np.abs(far - ours).max()) < _JUMP_M
-    return out & (gps.stamps_s >= odometry.stamps_s[0]) & (gps.stamps_s <= odometry.stamps_s[-1])
-
-
-def distances(path: Track, gps: Track) -> Array:
-    """Distances (n,) of a path from fixes after the rigid motion that fits best."""
-    at = path.at(gps.stamps_s)
-    a, b = at - at.mean(axis=0), gps.positions - gps.positions.mean(axis=0)
-    h = a.T @ b
-    angle = np.arctan2(h[0, 1] - h[1, 0], h[0, 0] + h[1, 1])
-    c, s = np.cos(angle), np.sin(angle)
-    return np.asarray(np.linalg.norm(a @ np.array([[c, s], [-s, c]]) - b, axis=1))
-
-
-def run(drive: Drive, settings: Mapping[str, Any]) -> tuple[GraphSlam, float]:
-    """The pipeline after the whole drive, and its CPU seconds."""
-    slam = GraphSlam(Config.from_mapping(settings))
-    begun = time.process_time()
+def run(drive: Drive) -> GraphSlam:
+    """The pipeline after the whole drive."""
+    slam = GraphSlam(Config.from_mapping(_SETTINGS))
     for m in drive.measurements():
         slam.process(m)
     slam.process(Control("optimize"))
-    return slam, time.process_time() - begun
+    return slam
 
 
 def main() -> None:
     """The programme."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    usual = Path(os.environ.get("GRAPH_SLAM_DATASETS", ROOT.parent / "shared/datasets")) / "recorded/victoria_park"
-    parser.add_argument("folder", nargs="?", type=Path, default=usual, metavar="FOLDER")
-    args = parser.parse_args()
-    if not args.folder.is_dir():
-        options.say(f"skipped: no {args.folder}: set GRAPH_SLAM_DATASETS")
-        return
-    drive = read_drive(args.folder)
-    slam, cpu_s = run(drive, SETTINGS)
-    stamps_s = slam.view.sighting_poses.stamps_ns * 1e-9
-    odometry = Track.of_laser(drive.odometry[:, 0], drive.odometry[:, 1:])
-    good = quiet(drive.gps, odometry)
-    fixes = Track(drive.gps.stamps_s[good], drive.gps.positions[good])
-    for name, path in (("estimate", Track.of_laser(stamps_s, slam.view.sighting_trajectory())), ("odometry", odometry)):
-        error = distances(path, fixes)
+    parser.add_argument("folder", nargs="?", type=Path, default=datasets.PARK, metavar="FOLDER")
+    drive = read_drive(parser.parse_args().folder)
+    begun_s = time.process_time()
+    slam = run(drive)
+    cpu_s, fixes, view = time.process_time() - begun_s, drive.quiet_fixes(), slam.view
+    estimate = Track.of_laser(view.sighting_poses.stamps_ns * 1e-9, view.sighting_trajectory())
+    for name, path in (("estimate", estimate), ("odometry", drive.path_of_odometry())):
+        error = judge.distances(path.at(fixes.stamps_s), fixes.positions)
         rms = np.sqrt(np.mean(error**2))
         print(f"{name}: median {np.median(error):.2f} m, rms {rms:.2f} m, 95 % within {np.percentile(error, 95):.2f} m")
-    print(f"{good.sum()} of {len(good)} fixes; {len(slam.view.landmarks)} landmarks; {cpu_s:.0f} s CPU")
+    print(
+        f"{len(fixes.stamps_s)} of {len(drive.gps.stamps_s)} fixes; {len(view.landmarks)} landmarks; {cpu_s:.0f} s CPU"
+    )
     print(slam.counters.as_dict())
 
 

@@ -65,16 +65,16 @@ def plaza(folder):
 def park(folder):
     """A car among trees that have no names."""
     sys.path.insert(0, str(ROOT))
-    from benchmarks.victoria_park import _BEARING_RAD, _LASER, _RANGE_M, _TRUNK_PART, read_drive
+    from benchmarks.victoria_park import BEARING_RAD, LASER, RANGE_M, TRUNK_PART, read_drive
 
     drive = read_drive(RECORDED / "victoria_park")
     out = [odometry(stamp_s, pose) for stamp_s, *pose in drive.odometry.tolist()]
     for stamp_s, trees in drive.scans:
         far, bearing, diameter = trees.reshape(3, -1)
-        sigmas = {"sigma": np.hypot(_RANGE_M, _TRUNK_PART * diameter), "sigma_bearing": np.full(len(far), _BEARING_RAD)}
+        sigmas = {"sigma": np.hypot(RANGE_M, TRUNK_PART * diameter), "sigma_bearing": np.full(len(far), BEARING_RAD)}
         seen = cloud(ns(stamp_s), "laser", range=far, bearing=bearing - 0.5 * np.pi, **sigmas)
         out.append(("/trees", seen[0], ns(stamp_s), seen[1]))
-    return write(folder / "victoria_park.mcap", sorted(out, key=itemgetter(2)), ("laser", _LASER))
+    return write(folder / "victoria_park.mcap", sorted(out, key=itemgetter(2)), ("laser", LASER))
 
 
 def recordings(folder):

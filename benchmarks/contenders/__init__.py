@@ -2,6 +2,7 @@
 
 import sys
 from dataclasses import dataclass, field
+from functools import cache
 from importlib import import_module
 from typing import Protocol
 
@@ -10,30 +11,27 @@ import numpy as np
 from benchmarks.fresh import ROOT
 from benchmarks.problem import Array, Edges, Problem, Step
 
-OURS, OURS_AS_G2O = "ours", "ours-quaternion"
+OURS, OURS_AS_G2O, OURS_PLAIN, ISAM2 = "ours", "ours-quaternion", "ours-plain", "iSAM2"
 TOLERANCE = 1e-6  # converged when the cost changes by a smaller fraction, or no step is larger
 MAX_ITERATIONS = 100
 
-_ONLINE = {OURS: "ours", "isam2-10": "isam2", "isam2-1": "isam2"}
+_ONLINE = {OURS: "ours", ISAM2: "isam2"}
 _BATCH = {
     OURS: "ours",
     OURS_AS_G2O: "ours",
     "gtsam-gn": "gtsam_batch",
     "gtsam-lm": "gtsam_batch",
     "g2o-gn": "g2o_batch",
-    "g2o-lm": "g2o_batch",
-    "graphslam": "graphslam_batch",
 }
 _ROBUST = {
     OURS: "ours_robust",
-    "gtsam-huber": "gtsam_robust",
-    "gtsam-gm": "gtsam_robust",
-    "gtsam-dcs": "gtsam_robust",
-    "gtsam-gnc": "gtsam_robust",
-    "isam2-dcs": "isam2_robust",
+    OURS_PLAIN: "ours_robust",
+    "gtsam-huber": "gtsam_batch",
+    "gtsam-gm": "gtsam_batch",
+    "gtsam-gnc": "gtsam_batch",
+    "isam2-dcs": "isam2",
 }
-_WITHOUT_LOSS = {"ours_robust": "ours-plain", "gtsam_robust": "gtsam-lm", "isam2_robust": "isam2"}  # of each module
-ONLINE_PEERS, BATCH_PEERS, ROBUST_PEERS = tuple(_ONLINE)[1:], tuple(_BATCH)[2:], tuple(_ROBUST)[1:]
+BATCH_PEERS, ROBUST_PEERS = tuple(_BATCH)[2:], tuple(_ROBUST)[2:]
 
 
 class Online(Protocol):
@@ -61,36 +59,14 @@ class Solved:
 
     Attributes
     ----------
-    build_s : CPU time for making the library's own graph from arrays
-    solve_s : CPU time from there to convergence, ordering and symbolic analysis included
+    cpu_s : CPU time from arrays to convergence: making the library's own graph, ordering and symbolic analysis included
     fault : why there is no estimate, or it is none to be proud of; empty where all is well
     """
 
-    build_s: float = 0.0
-    solve_s: float = 0.0
-    iterations: int = 0
+    cpu_s: float = 0.0
     poses: Array = field(default_factory=lambda: np.empty(0))
     landmarks: Array = field(default_factory=lambda: np.empty(0))
     fault: str = ""
-
-
-def settled(before: float, after: float) -> bool:
-    """The rule by which every iteration ends."""
-    return abs(before - after) <= TOLERANCE * after
-
-
-def online(name: str, problem: Problem) -> Online:
-    """A contender for driving."""
-    contender: Online = import_module(f"benchmarks.contenders.{_ONLINE[name]}").Online(problem, name)
-    return contender
-
-
-def solve(name: str, problem: Problem) -> Solved:
-    """Solve a graph as a whole; the first pose is held."""
-    module = import_module(f"benchmarks.contenders.{_BATCH[name]}")
-    module.solve(problem.prefix(100), name)  # so that its code is loaded and compiled
-    solved: Solved = module.solve(problem, name)
-    return solved
 
 
 @dataclass(slots=True)
@@ -114,6 +90,20 @@ class Believed:
     fault: str = ""
 
 
+def online(name: str, problem: Problem) -> Online:
+    """A contender for driving."""
+    contender: Online = import_module(f"benchmarks.contenders.{_ONLINE[name]}").Online(problem)
+    return contender
+
+
+def solve(name: str, problem: Problem) -> Solved:
+    """Solve a graph as a whole; the first pose is held."""
+    module = import_module(f"benchmarks.contenders.{_BATCH[name]}")
+    module.solve(problem.prefix(100), name)  # so that its code is loaded and compiled
+    solved: Solved = module.solve(problem, name)
+    return solved
+
+
 def believe(name: str, problem: Problem, closures: Edges) -> Believed:
     """Find the path from odometry, and from closures and sightings of which nobody knows whether they are true.
 
@@ -122,27 +112,21 @@ def believe(name: str, problem: Problem, closures: Edges) -> Believed:
     problem : without closures; its poses are the odometry, composed
     closures : in order of their later pose
     """
-    believed: Believed = import_module(f"benchmarks.contenders.{robust_module(name)}").believe(problem, closures, name)
+    believed: Believed = import_module(f"benchmarks.contenders.{_ROBUST[name]}").believe(problem, closures, name)
     return believed
 
 
-def plain(name: str) -> str:
-    """The same contender without a loss: what robustness costs is told by it."""
-    return _WITHOUT_LOSS[_ROBUST[name]]
+def settled(before: float, after: float) -> bool:
+    """The rule by which every iteration ends."""
+    return abs(before - after) <= TOLERANCE * after
 
 
-def robust_module(name: str) -> str:
-    """Where a contender's ``believe`` is, with a loss or without."""
-    return _ROBUST.get(name) or next(module for module, without in _WITHOUT_LOSS.items() if without == name)
-
-
-def error_map(name: str, planar: bool) -> str:
-    """What a contender minimises, see ``judge``."""
-    if name.startswith(("isam2", "gtsam")):
-        return "logarithm"
-    if name == "graphslam":
-        return "inverse"
-    return "quaternion" if not planar and name in ("g2o-gn", "g2o-lm", OURS_AS_G2O) else "relative"
+@cache
+def code_of(name: str) -> bytes:
+    """What a contender among false measurements runs: when that changes, it is asked anew."""
+    files = [ROOT / "benchmarks/contenders" / f"{_ROBUST[name]}.py", ROOT / "benchmarks/requirements.txt"]
+    files += sorted((ROOT / "graph_slam_ros").rglob("*.py")) if name.startswith(OURS) else []
+    return b"".join(file.read_bytes() for file in files)
 
 
 def python_of(name: str) -> str:

@@ -1,4 +1,4 @@
-"""g2o's Gauss-Newton and Levenberg-Marquardt on sparse Cholesky factors, ended by its own action of the same rule."""
+"""g2o's Gauss-Newton on sparse Cholesky factors, ended by its own action of the same rule."""
 
 import time
 
@@ -15,7 +15,7 @@ def solve(problem: Problem, name: str) -> Solved:
     of_sightings = np.swapaxes(problem.sightings.root, 1, 2) @ problem.sightings.root
     begin = time.process_time()
     optimizer = g2o.SparseOptimizer()
-    optimizer.set_algorithm(_algorithm(problem, name))
+    optimizer.set_algorithm(_algorithm(problem))
     pose_vertex, pose_edge = (g2o.VertexSE2, g2o.EdgeSE2) if problem.planar else (g2o.VertexSE3, g2o.EdgeSE3)
     poses = [_vertex(optimizer, pose_vertex, k, _pose(values)) for k, values in enumerate(problem.poses)]
     points = [
@@ -30,30 +30,28 @@ def solve(problem: Problem, name: str) -> Solved:
     action = g2o.SparseOptimizerTerminateAction()
     action.set_gain_threshold(TOLERANCE)
     optimizer.add_post_iteration_action(action)
-    built = time.process_time()
     optimizer.initialize_optimization()
     optimizer.compute_active_errors()
     start = optimizer.active_chi2()
     iterations = optimizer.optimize(MAX_ITERATIONS)
     optimizer.compute_active_errors()
     end = optimizer.active_chi2()
-    done = time.process_time()
+    cpu_s = time.process_time() - begin
     fault = "" if end < start else "diverged"
     if iterations in (0, MAX_ITERATIONS):
         fault = fault or "not converged"
     landmarks = np.array([point.estimate() for point in points]).reshape(-1, 2)
-    return Solved(built - begin, done - built, iterations, _numbers(poses, problem.planar), landmarks, fault)
+    return Solved(cpu_s, _numbers(poses, problem.planar), landmarks, fault)
 
 
-def _algorithm(problem: Problem, name: str) -> g2o.OptimizationAlgorithm:
+def _algorithm(problem: Problem) -> g2o.OptimizationAlgorithm:
     if len(problem.landmarks):
         blocks = g2o.BlockSolverX(g2o.LinearSolverEigenX())
     elif problem.planar:
         blocks = g2o.BlockSolverSE2(g2o.LinearSolverEigenSE2())
     else:
         blocks = g2o.BlockSolverSE3(g2o.LinearSolverEigenSE3())
-    algorithm = g2o.OptimizationAlgorithmGaussNewton if name == "g2o-gn" else g2o.OptimizationAlgorithmLevenberg
-    return algorithm(blocks)
+    return g2o.OptimizationAlgorithmGaussNewton(blocks)
 
 
 def _vertex(optimizer: g2o.SparseOptimizer, kind: type, index: int, value: object) -> "g2o.Vertex":

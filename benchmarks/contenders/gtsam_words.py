@@ -52,6 +52,23 @@ def prepared_edges(relative: Edges) -> Edges:
     return replace(relative, root=triangular(relative.root[:, :, _ROTATION_FIRST]))
 
 
+def graph_of(
+    given: Problem, candidates: Edges | None = None, loss: Loss | None = None
+) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+    """A prepared problem, with more relative poses; these and the sightings under a loss where one is given."""
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    for k, at in enumerate(given.poses.tolist()):
+        values.insert(k, pose(at))
+    for k, point in enumerate(given.landmarks):
+        values.insert(landmark(k), point)
+    add_anchor(graph, given.poses[0])
+    add_relative(graph, given.relative)
+    if candidates is not None:
+        add_relative(graph, candidates, loss)
+    add_sightings(graph, given.sightings, loss)
+    return graph, values
+
+
 def add_anchor(graph: gtsam.NonlinearFactorGraph, at: Array) -> None:
     """A prior on the first pose."""
     prior, dof = (gtsam.PriorFactorPose2, 3) if len(at) == 3 else (gtsam.PriorFactorPose3, 6)
@@ -81,3 +98,8 @@ def estimate(values: gtsam.Values, poses: int, landmarks: int, planar: bool) -> 
     at = values.atPose2 if planar else values.atPose3
     points = [values.atPoint2(landmark(j)) for j in range(landmarks)]
     return np.array([numbers(at(k)) for k in range(poses)]), np.array(points).reshape(-1, 2)
+
+
+def thrown(error: Exception) -> str:
+    """The first line of what GTSAM throws."""
+    return f"throws: {str(error).strip().splitlines()[0]}"

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.contenders import OURS, Believed
+from benchmarks.contenders import OURS, OURS_PLAIN, Believed
 from benchmarks.problem import Array, Edges, Problem
 from graph_slam_ros.graph.losses import weight_and_cost
 from graph_slam_ros.lie import se2, se3
@@ -32,7 +32,7 @@ _AS_THE_GRAPH: Mapping[str, Any] = {
 }
 _LOSSES: Mapping[str, Mapping[str, Any]] = {
     OURS: {},
-    "ours-plain": {"landmarks.loss": "none", "robust.loss": "none", "robust.decide": False},
+    OURS_PLAIN: {"landmarks.loss": "none", "robust.loss": "none", "robust.decide": False},
 }
 
 

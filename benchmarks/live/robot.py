@@ -1,82 +1,167 @@
-"""Helpers around a node, each a process of its own: who sends, listens, manages, and a bare node to compare with.
+"""The node under test, a process of its own; and the robot around it: it sends a stream, and hears what the node says.
 
-Each is told what to do, and answers, in lines of JSON (``benchmarks.live.processes``).
+Run as a programme, this is a bare node to compare with: it does nothing with the topics that it subscribes to.
 """
 
 import contextlib
 import itertools
-import json
-import queue
+import os
+import random
+import signal
+import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import rclpy
 from lifecycle_msgs.srv import ChangeState
-from rclpy.executors import SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import UInt64
 
-from benchmarks.live.processes import PATIENCE_S, asked, reply, ros, until
+from benchmarks.fresh import ROOT
 from benchmarks.live.streams import STREAMS, TYPES, later, stamp_ns
 from graph_slam_ros.messages.interfaces import message_class
 from graph_slam_ros.recordings.bag import BagMessage
 
-NODE = "/graph_slam"
+NODE, BARE = "graph_slam_ros.node.node", "benchmarks.live.robot"
+_NAME = "/graph_slam"
 _LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _DEEP = QoSProfile(depth=1000)
 _OUTPUTS = {  # topic, type, how to subscribe, and where in the bytes the stamp is
-    "path": (f"{NODE}/path", "nav_msgs/msg/Path", _LATCHED, 4),
-    "pose": (f"{NODE}/pose", "geometry_msgs/msg/PoseWithCovarianceStamped", _LATCHED, 4),
-    "odometry": (f"{NODE}/odometry", "nav_msgs/msg/Odometry", _DEEP, 4),
+    "path": (f"{_NAME}/path", "nav_msgs/msg/Path", _LATCHED, 4),
+    "pose": (f"{_NAME}/pose", "geometry_msgs/msg/PoseWithCovarianceStamped", _LATCHED, 4),
+    "odometry": (f"{_NAME}/odometry", "nav_msgs/msg/Odometry", _DEEP, 4),
     "tf": ("/tf", "tf2_msgs/msg/TFMessage", _DEEP, 8),
 }
 _AHEAD = 256  # messages on their way, where the node sets the pace
 _APART_NS = 20_000_000  # of stamps, before a message of another topic waits for those before it
-_START_S = 120.0  # the first start of an installation compiles
-_SLOW_S = 60.0  # nothing that a node does takes longer
+_PATIENCE_S = 120.0  # nothing takes longer; the first start of an installation compiles
+_TICK_S = 1.0 / os.sysconf("SC_CLK_TCK")
 
 
-class _Sender:
-    """Plays a stream: in parts, each at a pace of its own."""
+class Process:
+    """A module in a process of its own, measured from outside."""
 
-    def __init__(self, stream: Iterator[BagMessage], topics: list[str]) -> None:
-        self._node = Node("robot")
-        self._stream = stream
-        self._publishers = {
-            topic: self._node.create_publisher(message_class(TYPES[topic]), topic, _DEEP) for topic in topics
-        }
-        self._sent = self._received = 0
+    def __init__(self, module: str, *words: str) -> None:
+        self._popen = subprocess.Popen([sys.executable, "-m", module, *words], cwd=ROOT)
+
+    @property
+    def cpu_s(self) -> float:
+        """CPU seconds so far, of all threads, as the kernel counts them: in hundredths."""
+        fields = Path(f"/proc/{self._popen.pid}/stat").read_text().rsplit(")", 1)[1].split()
+        return (int(fields[11]) + int(fields[12])) * _TICK_S
+
+    @property
+    def memory_mib(self) -> float:
+        """Resident memory."""
+        status = Path(f"/proc/{self._popen.pid}/status").read_text()
+        return int(next(line for line in status.splitlines() if line.startswith("VmRSS")).split()[1]) / 1024.0
+
+    def stop(self) -> None:
+        """Ask it to end; after a while, end it."""
+        if self._popen.poll() is None:
+            self._popen.send_signal(signal.SIGINT)
+        try:
+            self._popen.wait(_PATIENCE_S)
+        except subprocess.TimeoutExpired:
+            self._popen.kill()
+            self._popen.wait()
+
+
+@contextlib.contextmanager
+def running(module: str, *words: str) -> Iterator[Process]:
+    """A process for as long as the context lasts."""
+    process = Process(module, *words)
+    try:
+        yield process
+    finally:
+        process.stop()
+
+
+@contextlib.contextmanager
+def node(parameters: dict[str, Any]) -> Iterator[tuple[Process, Path]]:
+    """Our node, and the folder that it records into."""
+    with tempfile.TemporaryDirectory() as folder:
+        given = {"output.folder": f"{folder}/run"} | parameters
+        texts = {key: str(value).lower() if isinstance(value, bool) else value for key, value in given.items()}
+        words = [word for key, text in texts.items() for word in ("-p", f"{key}:={text}")]
+        with running(NODE, "--ros-args", "--log-level", "error", *words) as ours:
+            yield ours, Path(folder) / "run"
+
+
+@contextlib.contextmanager
+def ros() -> Iterator[None]:
+    """ROS in this process, among us alone on this machine."""
+    os.environ |= {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_DOMAIN_ID": str(random.randint(1, 100))}
+    rclpy.init(args=[])
+    try:
+        yield
+    finally:
+        rclpy.try_shutdown()
+
+
+class Robot:
+    """Sends a stream of ``streams.STREAMS`` in parts, each at a pace of its own.
+
+    Attributes
+    ----------
+    heard : of each output, when messages came, and their stamps [ns]
+    sent : how many messages so far
+    """
+
+    def __init__(self, stream: str, *outputs: str, **values: Any) -> None:
+        make, topics = STREAMS[stream]
+        messages = make(**values)
+        self._stream = itertools.chain([next(messages)], messages)  # it is simulated before the node is there
+        self._node = Node("robot", enable_rosout=False)
+        self._publishers = {t: self._node.create_publisher(message_class(TYPES[t]), t, _DEEP) for t in topics}
+        self.heard: dict[str, list[tuple[int, int]]] = {name: [] for name in outputs}
+        for name in outputs:
+            topic, type_name, qos, at = _OUTPUTS[name]
+            self._node.create_subscription(message_class(type_name), topic, self._keep(name, at), qos, raw=True)
+        self.sent = self._received = 0
         self._behind_ns: int | None = None  # the stream, where it is played at the present
+        self._executor = EventsExecutor()
+        self._executor.add_node(self._node)
+        self._is_over = threading.Event()
+        self._thread = threading.Thread(target=self._spin, daemon=True)
+        self._thread.start()
 
-    def wait_for_node(self) -> None:
-        """Until somebody subscribes to everything."""
+    def __enter__(self) -> "Robot":
+        """Wait until somebody subscribes to everything."""
         for topic, publisher in self._publishers.items():
-            until(lambda p=publisher: p.get_subscription_count() > 0, self._rest, f"subscriber of {topic}", _START_S)
+            _until(lambda p=publisher: p.get_subscription_count() > 0, f"subscriber of {topic}")
+        return self
 
-    def play(self, seconds: float | None = None, pace: float = 1.0, tell: bool = False) -> Any:
-        """Send a part of the stream.
+    def __exit__(self, *_: object) -> None:
+        """Be no more."""
+        self._is_over.set()
+        self._thread.join()
+        self._node.destroy_node()
+
+    def play(self, seconds: float | None = None, pace: float = 1.0) -> list[tuple[str, int, int]]:
+        """Send a part of the stream; returns topic, stamp and when it was sent of each message [ns].
 
         Parameters
         ----------
         seconds : of stamps, how long a part; None: all that is left
         pace : times real time, at 1 stamped with the present; 0: as fast as the node takes it
-        tell : whether to answer when each was sent
         """
-        begin, before, when = time.monotonic(), self._sent, []
-        part = self._part(seconds)
+        part, when = self._part(seconds), []
         if pace == 1.0:
             part = self._at_present(part)
         for m in _paced(part, pace) if pace else self._awaited(part):
-            if tell:
-                when.append((m.topic, m.log_ns, time.monotonic_ns()))
+            when.append((m.topic, m.log_ns, time.monotonic_ns()))
             self._publishers[m.topic].publish(m.cdr)
-            self._sent += 1
-        return {"sent": self._sent - before, "took_s": time.monotonic() - begin, "when": when}
+            self.sent += 1
+        return when
 
     def received(self) -> int:
         """What the node says it has received in all, when that changes no more."""
@@ -84,8 +169,15 @@ class _Sender:
             last = -1
             while last != self._received:
                 last = self._received
-                self._rest(0.5)
+                time.sleep(0.5)
             return last
+
+    def _spin(self) -> None:
+        while not self._is_over.is_set():
+            self._executor.spin_once(timeout_sec=0.05)
+
+    def _keep(self, name: str, at: int) -> Callable[[bytes], None]:
+        return lambda cdr: self.heard[name].append((time.monotonic_ns(), stamp_ns(cdr, at)))
 
     def _part(self, seconds: float | None) -> Iterator[BagMessage]:
         first_ns: int | None = None
@@ -105,132 +197,74 @@ class _Sender:
     def _awaited(self, part: Iterator[BagMessage]) -> Iterator[BagMessage]:
         """Never further ahead than the node's queues hold, nor so that one topic could overtake another by much."""
         with self._acknowledged() as until_received:
-            until_received(self._sent)
+            until_received(self.sent)
             last: BagMessage | None = None
             for m in part:
                 if last and m.topic != last.topic and m.log_ns - last.log_ns >= _APART_NS:
-                    until_received(self._sent)
-                elif self._sent - self._received >= _AHEAD:
-                    until_received(self._sent - _AHEAD // 2)
+                    until_received(self.sent)
+                elif self.sent - self._received >= _AHEAD:
+                    until_received(self.sent - _AHEAD // 2)
                 yield m
                 last = m
-            until_received(self._sent)
+            until_received(self.sent)
 
     @contextlib.contextmanager
     def _acknowledged(self) -> Iterator[Callable[[int], None]]:
         """While somebody listens, the node acknowledges each message."""
-        subscription = self._node.create_subscription(UInt64, f"{NODE}/received", self._take, _LATCHED)
-
-        def until_received(count: int) -> None:
-            until(lambda: self._received >= count, self._rest, f"{count} received, but {self._received}", _SLOW_S)
-
+        subscription = self._node.create_subscription(UInt64, f"{_NAME}/received", self._take, _LATCHED)
         try:
-            yield until_received
+            yield lambda count: _until(lambda: self._received >= count, f"{count} received", 0.0005)
         finally:
             self._node.destroy_subscription(subscription)
 
     def _take(self, message: UInt64) -> None:
         self._received = message.data
 
-    def _rest(self, seconds: float = 0.05) -> None:
-        rclpy.spin_once(self._node, timeout_sec=seconds)
+
+def transitions(*names: str) -> Iterator[float]:
+    """Ask the node for transitions; yields the seconds that each took."""
+    manager = Node("manager", enable_rosout=False)
+    client = manager.create_client(ChangeState, f"{_NAME}/change_state")
+    _until(client.service_is_ready, "service of the node")
+    for name in names:
+        request: Any = ChangeState.Request()
+        request.transition.label = name
+        start_s = time.monotonic()
+        future = client.call_async(request)
+        rclpy.spin_until_future_complete(manager, future, timeout_sec=_PATIENCE_S)
+        if not future.done() or not future.result().success:
+            raise SystemExit(f"{name} failed")
+        yield time.monotonic() - start_s
+    manager.destroy_node()
 
 
 def _paced(part: Iterator[BagMessage], pace: float) -> Iterator[BagMessage]:
     """At its stamps where these are of the present, else from now on."""
-    begin, first_ns = None, 0
+    begin_s, first_ns = None, 0
     for m in part:
-        if begin is None:
-            wait_s, first_ns = 1e-9 * (m.log_ns - time.time_ns()), m.log_ns
-            begin = time.monotonic() + (wait_s if abs(wait_s) < _SLOW_S else 0.0)
-        if (left := begin + 1e-9 * (m.log_ns - first_ns) / pace - time.monotonic()) > 0.0:
-            time.sleep(left)
+        if begin_s is None:
+            begin_s, first_ns = time.monotonic(), m.log_ns
+            if pace == 1.0:
+                begin_s += 1e-9 * (m.log_ns - time.time_ns())
+        if (left_s := begin_s + 1e-9 * (m.log_ns - first_ns) / pace - time.monotonic()) > 0.0:
+            time.sleep(left_s)
         yield m
 
 
-def send(name: str, values: str, topics: str) -> None:
-    """Play a stream in parts, as told: the keywords of ``_Sender.play``, or nothing to be told what has arrived."""
-    with ros():
-        stream = STREAMS[name](**json.loads(values))
-        first = next(stream)
-        sender = _Sender(itertools.chain([first], stream), topics.split(","))
-        sender.wait_for_node()
-        reply("ready")
-        while True:
-            order = asked()
-            reply(sender.play(**order) if order else sender.received())
-
-
-def listen(*names: str) -> None:
-    """Subscribe to outputs of the node; tells, when asked, when what stamps came since it was last asked."""
-    with ros():
-        node, orders = Node("listener"), _orders()
-        heard: dict[str, list[Any]] = {name: [] for name in names}
-
-        def keep(name: str, at: int) -> Callable[[bytes], None]:
-            return lambda cdr: heard[name].append((time.monotonic_ns(), stamp_ns(cdr, at)))
-
-        for name in names:
-            topic, type_name, qos, at = _OUTPUTS[name]
-            node.create_subscription(message_class(type_name), topic, keep(name, at), qos, raw=True)
-        executor = EventsExecutor()
-        executor.add_node(node)
-        while True:
-            executor.spin_once(timeout_sec=0.02)
-            if not orders.empty():
-                if orders.get() is None:
-                    return
-                reply(heard)
-                for some in heard.values():
-                    some.clear()
-
-
-def bare(*topics: str) -> None:
-    """A node that does nothing with what it subscribes to."""
-    with ros():
-        node = Node("bare")
-        for topic in topics:
-            node.create_subscription(message_class(TYPES[topic]), topic, lambda message: None, _DEEP)
-        executor = SingleThreadedExecutor()
-        executor.add_node(node)
-        while True:
-            executor.spin_once(timeout_sec=1.0)  # so that it can be told to end
-
-
-def manage() -> None:
-    """Ask the node for the transitions that are told; answers the seconds that each took."""
-    with ros():
-        manager = Node("manager")
-        client = manager.create_client(ChangeState, f"{NODE}/change_state")
-
-        def rest() -> None:
-            rclpy.spin_once(manager, timeout_sec=0.02)
-
-        until(client.service_is_ready, rest, "service of the node", 6 * PATIENCE_S)
-        reply("ready")
-        while True:
-            request: Any = ChangeState.Request()
-            request.transition.label = asked()["transition"]
-            start = time.monotonic()
-            future = client.call_async(request)
-            until(future.done, rest, "answer", 6 * PATIENCE_S)
-            if not future.result().success:
-                raise SystemExit(f"{request.transition.label} failed")
-            reply(time.monotonic() - start)
-
-
-def _orders() -> "queue.Queue[Any]":
-    """What this process is told, read by a thread; None when nobody is there any more."""
-    orders: queue.Queue[Any] = queue.Queue()
-
-    def read() -> None:
-        for line in sys.stdin:
-            orders.put(json.loads(line))
-        orders.put(None)
-
-    threading.Thread(target=read, daemon=True).start()
-    return orders
+def _until(condition: Callable[[], bool], what: str, rest_s: float = 0.02) -> None:
+    """Poll for what must come to be."""
+    deadline_s = time.monotonic() + _PATIENCE_S
+    while not condition():
+        if time.monotonic() > deadline_s:
+            raise SystemExit(f"no {what} in {_PATIENCE_S:g} s")
+        time.sleep(rest_s)
 
 
 if __name__ == "__main__":
-    {"send": send, "listen": listen, "manage": manage, "bare": bare}[sys.argv[1]](*sys.argv[2:])
+    rclpy.init()
+    bare, executor = Node("bare"), SingleThreadedExecutor()
+    for name in sys.argv[1:]:
+        bare.create_subscription(message_class(TYPES[name]), name, lambda message: None, _DEEP)
+    executor.add_node(bare)
+    with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
+        executor.spin()

@@ -1,18 +1,18 @@
 """What a robot sends, in the order it sends it: messages as the middleware's own bytes, made by our simulator."""
 
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TypeAlias
 from unittest.mock import patch
 
 import numpy as np
 from numpy.random import PCG64, Generator
 
-from benchmarks.problem import Array, city_problem
-from graph_slam_ros.lie import se2
+from benchmarks.problem import city_problem
+from graph_slam_ros.lie import se2, se3
 from graph_slam_ros.messages import to_msg
 from graph_slam_ros.recordings.bag import BagMessage, open_bag
+from graph_slam_ros.slam import Closure, Odometry
 from graph_slam_ros.tools.simulation import simulate, write_bag
 from graph_slam_ros.tools.simulation import warehouse as slower
 from graph_slam_ros.tools.simulation.recording import START_NS
@@ -23,8 +23,6 @@ TYPES = {
     LANDMARKS: "vision_msgs/msg/Detection3DArray",
     CLOSURES: "vision_msgs/msg/Detection3DArray",
 }
-Motion: TypeAlias = tuple[int, se2.Pose]
-Motions: TypeAlias = dict[int, Motion]
 _NS = 1_000_000_000
 _UNUSED = 1e6
 _LAP_S = 60.0  # of a warehouse, at least
@@ -45,32 +43,39 @@ def warehouse(seconds: float, odometry_hz: int, landmarks_hz: int) -> Iterator[B
     yield from found
 
 
-def city_steps(poses: int) -> tuple[Motions, Motions]:
-    """Odometry and closures of Manhattan by their later pose: the earlier one, and the motion."""
-    relative, steps, closures = city_problem(poses).relative, dict[int, Motion](), dict[int, Motion]()
-    for (earlier, later), measured in zip(relative.ends.tolist(), relative.measured.tolist(), strict=True):
-        (steps if later == earlier + 1 else closures)[later] = earlier, tuple(measured)
-    return steps, closures
-
-
-def city(poses: int) -> Iterator[BagMessage]:
+def city_measurements(poses: int) -> Iterator[Odometry | Closure]:
     """Manhattan of 60 by 60 blocks with a closure per three poses.
 
     A pose per second: its odometry, the closure that ends there, and odometry that releases both.
     """
-    steps, closures = city_steps(poses)
-    covariance, at = np.diag(np.square([CITY_SIGMA_M, CITY_SIGMA_M, CITY_SIGMA_RAD])), se2.IDENTITY
+    relative, steps, closures = city_problem(poses).relative, dict[int, se2.Pose](), dict[int, tuple[int, se2.Pose]]()
+    for (earlier, later), measured in zip(relative.ends.tolist(), relative.measured, strict=True):
+        if later == earlier + 1:
+            steps[later] = tuple(measured.tolist())
+        else:
+            closures[later] = earlier, tuple(measured.tolist())
+    covariance = tuple(np.diag(np.square([CITY_SIGMA_M, CITY_SIGMA_M, CITY_SIGMA_RAD])).ravel().tolist())
+    at = se2.IDENTITY
     for k in range(poses):
         stamp_ns = START_NS + k * STEP_NS
-        if k:
-            at = tuple(map(float, se2.compose(at, steps[k][1])))
-        yield BagMessage(ODOMETRY, stamp_ns, _odometry(stamp_ns, at))
+        at = tuple(map(float, se2.compose(at, steps[k]))) if k else at
+        yield Odometry(stamp_ns, at)
         if k in closures:
-            yield _closure(stamp_ns - BEFORE_NS, START_NS + closures[k][0] * STEP_NS, closures[k][1], covariance)
+            earlier, T_earlier_now = closures[k]
+            from_ns = START_NS + earlier * STEP_NS
+            yield Closure(stamp_ns - BEFORE_NS, from_ns, "closures", T_earlier_now, covariance)
         if k + 1 < poses:
-            ahead = se2.interpolate(se2.IDENTITY, steps[k + 1][1], AFTER_NS / STEP_NS)
-            then_ns = stamp_ns + AFTER_NS
-            yield BagMessage(ODOMETRY, then_ns, _odometry(then_ns, se2.compose(at, ahead)))
+            ahead = se2.interpolate(se2.IDENTITY, steps[k + 1], AFTER_NS / STEP_NS)
+            yield Odometry(stamp_ns + AFTER_NS, tuple(map(float, se2.compose(at, ahead))))
+
+
+def city(poses: int) -> Iterator[BagMessage]:
+    """The same as messages."""
+    for m in city_measurements(poses):
+        if isinstance(m, Odometry):
+            yield BagMessage(ODOMETRY, m.stamp_ns, _odometry(m.stamp_ns, m.T_odom_base))
+        else:
+            yield _closure(m)
 
 
 def standing(hours: float, jitter_m: float) -> Iterator[BagMessage]:
@@ -83,7 +88,12 @@ def standing(hours: float, jitter_m: float) -> Iterator[BagMessage]:
         yield BagMessage(ODOMETRY, stamp_ns, _odometry(stamp_ns, tuple(pose), still))
 
 
-STREAMS = {"warehouse": warehouse, "city": city, "standing": standing}
+STREAMS: dict[str, tuple[Callable[..., Iterator[BagMessage]], tuple[str, ...]]] = {
+    "warehouse": (warehouse, (ODOMETRY, LANDMARKS)),
+    "city": (city, (ODOMETRY, CLOSURES)),
+    "standing": (standing, (ODOMETRY,)),
+}
+"""What makes each, and its topics."""
 
 
 def later(m: BagMessage, by_ns: int) -> BagMessage:
@@ -102,18 +112,10 @@ def _odometry(stamp_ns: int, at: tuple[float, ...], twist: bytes | None = None) 
     return to_msg.odometry(stamp_ns, "odom", "base_link", at, np.eye(3), _UNUSED, twist)
 
 
-def _closure(stamp_ns: int, earlier_ns: int, T_earlier_later: tuple[float, ...], covariance: Array) -> BagMessage:
+def _closure(m: Closure) -> BagMessage:
     """Where the robot was earlier, as it is seen from where it is."""
-    seen = tuple(map(float, se2.inverse(T_earlier_later)))
-    turned = se2.adjoint(T_earlier_later)
-    posed = to_msg.pose_with_covariance(seen, turned @ covariance @ turned.T, _UNUSED)
-    head, make = to_msg.header(stamp_ns, "base_link"), to_msg.make
-    hypothesis = make("vision_msgs/msg/ObjectHypothesis", class_id="", score=1.0)
-    one = make(
-        "vision_msgs/msg/Detection3D",
-        header=head,
-        results=[make("vision_msgs/msg/ObjectHypothesisWithPose", hypothesis=hypothesis, pose=posed)],
-        bbox=make("vision_msgs/msg/BoundingBox3D", center=posed.pose, size=to_msg.vector(0.0, 0.0)),
-        id=str(earlier_ns),
-    )
-    return BagMessage(CLOSURES, stamp_ns, to_msg.encode(make(TYPES[CLOSURES], header=head, detections=[one])))
+    seen, turned = tuple(map(float, se2.inverse(m.T_from_base))), se2.adjoint(m.T_from_base)
+    posed = to_msg.pose_with_covariance(seen, turned @ np.reshape(m.covariance, (3, 3)) @ turned.T, _UNUSED)
+    poses, names = np.asarray(se3.in_space(np.array([seen]))), [str(m.from_stamp_ns)]
+    cdr = to_msg.detections(m.stamp_ns, "base_link", names, poses, np.reshape(posed.covariance, (1, 6, 6)))
+    return BagMessage(CLOSURES, m.stamp_ns, cdr)

@@ -33,7 +33,6 @@ def test_a_block_of_the_docs_prints_what_it_says(block, folder, capsys):
 
 
 def test_the_docs_have_every_way():
-    assert len(BLOCKS) == 9
     assert all(re.search(rf"\b{name}\b", "".join(BLOCKS)) for name in ("optimize", "Solver", "GraphSlam"))
 
 

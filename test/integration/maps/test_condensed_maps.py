@@ -10,7 +10,8 @@ import pytest
 from condensed_run import KEYFRAMES, SEED, bounded, condensed_run
 from reliability import times
 
-from benchmarks.hall import hall, measurements, rms
+from benchmarks.hall import hall, measurements
+from benchmarks.judge import rms
 from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.errors import FormatError, GraphSlamError
 from graph_slam_ros.graph.place import LABEL as PLACES
