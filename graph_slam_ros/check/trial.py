@@ -236,7 +236,7 @@ def _errors(view: MapView) -> tuple[Array, Array, Index]:
     own, estimate = own[order], estimate[order]
     stated, found = (se3.between(tuple(poses[:-1].T), tuple(poses[1:].T)) for poses in (own, estimate))
     error = np.stack(se3.local(found, stated), axis=1)
-    decided = {index for alarm in view.alarms if (index := getattr(alarm, "segment", None)) is not None}
+    decided = {alarm.segment for alarm in view.alarms}
     begins = np.isin(order, [index for index in view.segments if index not in decided])
     error[begins[1:]] = 0.0  # odometry was restarted or jumps there, which is another finding
     moved = np.stack(se3.local(stated, se3.IDENTITY), axis=1)

@@ -23,7 +23,7 @@ from graph_slam_ros.runs.journal import CONDENSED, parts_of
 from graph_slam_ros.runs.restore import config_to_go_on, record_run, restored_and_solved, stopwatch
 from graph_slam_ros.slam import Control, MapView
 from graph_slam_ros.slam.association.assignments import NAME, last_number
-from graph_slam_ros.slam.doubt.record import Alarm
+from graph_slam_ros.slam.doubt.record import Doubt
 from graph_slam_ros.slam.edits import HAND_MADE
 from graph_slam_ros.slam.frontend.odometry_selector import JUMP_SIGMA_M, JUMP_SIGMA_RAD
 from graph_slam_ros.slam.landmarks.landmark import Landmark, LandmarkEdge
@@ -247,7 +247,7 @@ class _Second:
         if one.get("segment") is None:
             return one
         fields = {key: value for key, value in one.items() if key != "text"}
-        alarm = Alarm(**fields | {"segment": self._keyframes + one["segment"]})
+        alarm = Doubt(**fields | {"segment": self._keyframes + one["segment"]})
         return asdict(alarm) | {"text": str(alarm)}
 
     def _argument(self, do: str, key: str, value: Argument, number: Mapping[int, int]) -> Argument:

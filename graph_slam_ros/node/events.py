@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from graph_slam_ros.messages.to_msg import OK, WARN, Status
 from graph_slam_ros.slam import MapView, Update
-from graph_slam_ros.slam.doubt.record import Alarm, Slip
+from graph_slam_ros.slam.doubt.record import ELSEWHERE, Doubt
 from graph_slam_ros.slam.robust.ledger import Verdict, VerdictChange
 
 _EDGES = 1000  # of one update that are moved one by one
@@ -69,11 +69,11 @@ def _verdict(view: MapView, change: VerdictChange) -> Status:
     )
 
 
-def _alarm(alarm: Alarm | Slip) -> Status:
+def _alarm(alarm: Doubt) -> Status:
     """An alarm that began, was decided or ended."""
     values: dict[str, object] = {"began_ns": alarm.began_ns, "evidence": alarm.evidence}
-    what = "slip" if isinstance(alarm, Slip) else "displaced"
-    if not isinstance(alarm, Slip) and alarm.segment is not None:
+    what = "displaced" if alarm.kind == ELSEWHERE else "slip"
+    if alarm.segment is not None:
         values |= {"segment": alarm.segment, "distance_m": f"{alarm.distance_m:.6f}"}
         values |= {"angle_rad": f"{alarm.angle_rad:.6f}"}
     if alarm.ended_ns is None:

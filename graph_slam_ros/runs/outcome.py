@@ -286,8 +286,8 @@ def association_faults(found: Mapping[str, Any]) -> Iterator[str]:
 
 
 def is_undecided(alarm: Mapping[str, Any]) -> bool:
-    """Return whether an ``Alarm`` as a dictionary goes on, and nothing is decided of it."""
-    return "held_back" in alarm and alarm["ended_ns"] is None and alarm["segment"] is None
+    """Return whether a ``Doubt`` as a dictionary is of where the robot is, goes on, and nothing is decided of it."""
+    return "held_back" in alarm and all(alarm.get(key) is None for key in ("decided_ns", "ended_ns", "segment"))
 
 
 def ambiguities(rivals: Collection[Mapping[str, Any]]) -> Iterator[str]:

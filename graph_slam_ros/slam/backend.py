@@ -15,7 +15,7 @@ from graph_slam_ros.slam.frontend.keyframes import KeyframeList
 from graph_slam_ros.slam.lifelong.state import BoundedState
 from graph_slam_ros.slam.noise.factors import CLASSES, Key, NoiseScales
 from graph_slam_ros.slam.noise.scale import NoiseScale, estimate_noise, factors_of
-from graph_slam_ros.slam.revision import Applied, Replacement, Revision
+from graph_slam_ros.slam.revision import Applied, Revision
 from graph_slam_ros.slam.robust.gating import CANDIDATES, OutlierGate
 from graph_slam_ros.slam.robust.hypotheses import (
     Alternative,
@@ -236,7 +236,7 @@ class Backend:
         if r.noise is not None or r.remeasured:
             solver.rebuild()
         self.withdraw(r.withdrawn, r.reason, vertex=r.vertex)
-        replaced = self.replace(r.replaced, r.reason, r.evidence, r.threshold)
+        replaced = self._replace(r)
         for edge, in_its_place in r.restored:
             self._restore(edge, in_its_place, r.evidence)
         if r.verdicts is not None and not decisions.adopt_verdicts(r.verdicts, keyframe) and r.settings is None:
@@ -262,25 +262,23 @@ class Backend:
                 self._admit()
         return Applied((*replaced, *((edge, -1) for edge in r.withdrawn)), report)
 
-    def replace(
-        self, replaced: Sequence[Replacement], reason: Reason, evidence: float, threshold: float | None = None
-    ) -> tuple[tuple[int, int], ...]:
+    def _replace(self, r: Revision) -> tuple[tuple[int, int], ...]:
         """Put edges in place of edges of odometry; returns both. The ledger has both."""
-        if not replaced:
+        if not r.replaced:
             return ()
         graph, out = self.graph, list[tuple[int, int]]()
-        for one in replaced:
+        for one in r.replaced:
             old = graph.edge(one.edge)
             out.append((one.edge, graph.add_edge(old.type, old.vertices, one.motion, one.noise, old.label, old.source)))
         self.gate_new()
         for edge, _ in out:
-            self.decisions.decide(edge, self.keyframe, Verdict.REJECTED, reason, evidence, threshold)
-            if threshold is not None:
-                self.ledger.threshold.values[self.ledger.ids.row(edge)] = threshold
+            self.decisions.decide(edge, self.keyframe, Verdict.REJECTED, r.reason, r.evidence, r.threshold)
+            if r.threshold is not None:
+                self.ledger.threshold.values[self.ledger.ids.row(edge)] = r.threshold
         return tuple(out)
 
     def _restore(self, edge: int, in_its_place: int, evidence: float) -> None:
-        """Undo ``replace`` and ``withdraw``. A candidate is accepted, and judged as others are."""
+        """Undo ``_replace`` and ``withdraw``. A candidate is accepted, and judged as others are."""
         ends = np.setdiff1d(self.graph.edge(edge).vertices, self.solver.vertices)
         self.solver.add(ends.tolist(), [])
         is_candidate = self.graph.label_of(edge) in CANDIDATES

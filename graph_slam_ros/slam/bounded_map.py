@@ -17,7 +17,7 @@ from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.slam.anchor import Anchor
 from graph_slam_ros.slam.association.landmark_frontend import LandmarkFrontend
 from graph_slam_ros.slam.backend import Backend
-from graph_slam_ros.slam.doubt.kidnap_detector import KidnapDetector
+from graph_slam_ros.slam.doubt.detector import OdometryDoubt
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
 from graph_slam_ros.slam.frontend.keyframes import Keyframe
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
@@ -99,7 +99,7 @@ class BoundedMap:
         frontend: KeyframeFrontend,
         landmarks: LandmarkFrontend,
         anchor: Anchor,
-        kidnaps: KidnapDetector,
+        kidnaps: OdometryDoubt,
         solution: Solution,
         counters: Counters,
     ) -> None:

@@ -32,7 +32,7 @@ from graph_slam_ros.slam.association.landmark_frontend import LandmarkFrontend
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.background import run_when_asked
 from graph_slam_ros.slam.bounded_map import BoundedMap
-from graph_slam_ros.slam.doubt.kidnap_detector import KidnapDetector
+from graph_slam_ros.slam.doubt.detector import OdometryDoubt
 from graph_slam_ros.slam.edits import Edits
 from graph_slam_ros.slam.failure_guard import FailureGuard
 from graph_slam_ros.slam.found_factors import FoundFactors
@@ -84,7 +84,7 @@ class GraphSlam:
         landmarks = LandmarkFrontend(config, backend, counters, executor)
         solution = Solution(config.space, backend, FailureGuard(backend, counters, landmarks.map))
         frontend = KeyframeFrontend(config, path, backend.noise, counters, backend.solver, start.datum)
-        kidnaps = KidnapDetector(config, backend, counters, landmarks.anonymous, start)
+        kidnaps = OdometryDoubt(config, backend, counters, landmarks.anonymous, start)
         self._backend, self._frontend, self._landmarks = backend, frontend, landmarks
         self._kidnaps, self._solution, self._anchor = kidnaps, solution, Anchor(config, backend)
         self.settings = dict[str, Value]()

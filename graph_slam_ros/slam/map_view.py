@@ -16,8 +16,8 @@ from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.calibration.answers import Finding
 from graph_slam_ros.slam.calibration.fit import TrialFit
 from graph_slam_ros.slam.calibration.parameters import AUTO
-from graph_slam_ros.slam.doubt.kidnap_detector import KidnapDetector
-from graph_slam_ros.slam.doubt.record import Alarm, Slip
+from graph_slam_ros.slam.doubt.detector import OdometryDoubt
+from graph_slam_ros.slam.doubt.record import Doubt
 from graph_slam_ros.slam.found_factors import FoundFactors
 from graph_slam_ros.slam.frontend.gyro import GyroState
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
@@ -49,7 +49,7 @@ class MapView:
         backend: Backend,
         frontend: KeyframeFrontend,
         landmarks: LandmarkFrontend,
-        kidnaps: KidnapDetector,
+        kidnaps: OdometryDoubt,
         solution: Solution,
         trials: TrialFits,
         found_factors: FoundFactors,
@@ -401,9 +401,9 @@ class MapView:
         return self._solution.guard.failing
 
     @property
-    def alarms(self) -> tuple[Alarm | Slip, ...]:
+    def alarms(self) -> tuple[Doubt, ...]:
         """The times when the landmarks contradicted odometry, in order: displacements and slips. Some may go on."""
-        return tuple(sorted([*self._kidnaps.alarms, *self._kidnaps.slip_detector.slips], key=lambda one: one.began_ns))
+        return tuple(sorted(self._kidnaps.doubts, key=lambda one: one.began_ns))
 
     @property
     def displacements(self) -> list[dict[str, Any]]:
@@ -412,6 +412,6 @@ class MapView:
         return [*self._kidnaps.earlier, *own]
 
     @property
-    def displaced(self) -> Alarm | Slip | None:
+    def displaced(self) -> Doubt | None:
         """The alarm that goes on, a displacement before a slip; or None."""
-        return self._kidnaps.now or self._kidnaps.slip_detector.now
+        return self._kidnaps.now

@@ -18,7 +18,7 @@ failure guard takes out what nothing can be solved with, and a person what ``~/r
 from graph_slam_ros.slam.association.landmark_frontend import LandmarkFrontend
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.bounded_map import BoundedMap, Condensation
-from graph_slam_ros.slam.doubt.kidnap_detector import KidnapDetector
+from graph_slam_ros.slam.doubt.detector import OdometryDoubt
 from graph_slam_ros.slam.found_factors import FoundFactors
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
 from graph_slam_ros.slam.solution import Solution
@@ -34,7 +34,7 @@ class Policies:
         backend: Backend,
         frontend: KeyframeFrontend,
         landmarks: LandmarkFrontend,
-        doubt: KidnapDetector,
+        doubt: OdometryDoubt,
         trials: TrialFits,
         factors: FoundFactors,
         bounded: BoundedMap,
@@ -56,8 +56,6 @@ class Policies:
         else:
             self._doubt.rejoin(keyframes[-1].stamp_ns)
             report = backend.optimize(everything)
-            if self._doubt.slip_detector.review():
-                report = backend.optimize(everything)
         if not backend.holds_back:
             report = backend.scale_noise(everything) or report
         self._trials.after_solve(is_of_everything=everything is not None)
@@ -72,5 +70,5 @@ class Policies:
         """
         if not self._bounded.is_due:
             return None
-        is_quiet = self._backend.is_quiet and self._doubt.is_quiet and self._solution.is_whole
+        is_quiet = self._backend.is_quiet and self._doubt.now is None and self._solution.is_whole
         return self._bounded.condense() if is_quiet else None

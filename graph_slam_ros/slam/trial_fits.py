@@ -27,8 +27,8 @@ from graph_slam_ros.slam.calibration.model import stated_sigma_per_m
 from graph_slam_ros.slam.calibration.parameters import AUTO, Parameter
 from graph_slam_ros.slam.calibration.places import fit_with_places
 from graph_slam_ros.slam.calibration.rows import TrialProblem
+from graph_slam_ros.slam.doubt.detector import OdometryDoubt
 from graph_slam_ros.slam.doubt.evidence import LOG_ODDS
-from graph_slam_ros.slam.doubt.kidnap_detector import KidnapDetector
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
 from graph_slam_ros.typing import Array, Executor, Index
 
@@ -57,7 +57,7 @@ class TrialFits:
         backend: Backend,
         frontend: KeyframeFrontend,
         landmarks: LandmarkFrontend,
-        kidnaps: KidnapDetector,
+        kidnaps: OdometryDoubt,
         counters: Counters,
         executor: Executor,
         first_keyframe: int = 0,
@@ -87,7 +87,7 @@ class TrialFits:
             self._of_window.begin(self._frozen, driven)
         if (found := self._of_window.due(driven)) is not None:
             self._of_whole = self._off(found())
-        slips = len(self._kidnaps.slip_detector.slips)
+        slips = self._counters["odometry", "slip"]
         is_due = is_of_everything or driven >= self._due or slips >= self._due_slips
         if self._backend.holds_back or not is_due:
             return
@@ -127,7 +127,7 @@ class TrialFits:
             segments=tuple(dict.fromkeys(begins)),
             track=path.samples.track(rows.poses, factors),
             first_edge=max(self._backend.first_free_edge, self._first_edge),
-            slips=self._kidnaps.slip_detector.slipped(),
+            slips=self._kidnaps.slipped(),
         )
 
     def fit(self, groups: Sequence[str], *, is_to_correct: bool) -> tuple[TrialFit, list[Finding]]:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from graph_slam_ros.slam.bounded_map import Condensation
 from graph_slam_ros.slam.calibration.answers import Finding
-from graph_slam_ros.slam.doubt.record import Alarm, Slip
+from graph_slam_ros.slam.doubt.record import Doubt
 from graph_slam_ros.slam.map_view import MapView
 from graph_slam_ros.slam.robust.ledger import VerdictChange
 from graph_slam_ros.slam.solution import Correction
@@ -36,7 +36,7 @@ class Update:
     report: Report | None = None
     correction: Correction = _NO_CORRECTION
     changes: tuple[VerdictChange, ...] = ()
-    alarms: tuple[Alarm | Slip, ...] = ()
+    alarms: tuple[Doubt, ...] = ()
     calibrated: tuple[Finding, ...] = ()
     condensed: Condensation | None = None
 
@@ -85,6 +85,6 @@ class UpdateLog:
         )
 
 
-def _state(alarm: Alarm | Slip) -> tuple[int, int | None, int | None, str]:
+def _state(alarm: Doubt) -> tuple[int, int | None, int | None, str]:
     """The part of an alarm that changes when it begins, is decided or ends."""
     return alarm.began_ns, alarm.segment, alarm.ended_ns, alarm.outcome

@@ -49,6 +49,7 @@ class AnonymousLandmarks:
     clusters : with their landmarks
     hindsight : explains all scans at once
     elsewhere : whether the newest scans contradict the pose
+    rejoins : keyframes at which the last explanation believes odometry again, by their vertices
     """
 
     def __init__(
@@ -74,7 +75,7 @@ class AnonymousLandmarks:
         self._leader: Decision | None = None
         self._same: dict[int, int] = {}  # landmarks of the beam that are others in the graph
         self._compared = 0  # scans
-        self._rejoined = frozenset[int]()  # keyframes at which an explanation has no displacement, by their vertices
+        self.rejoins = frozenset[int]()
         self._displaced: int | None = None  # the scan from which on all are explained anew
         self.elsewhere = Elsewhere(space, landmarks, self._history, self.clusters)
 
@@ -191,12 +192,7 @@ class AnonymousLandmarks:
     def keep_displacements(self) -> None:
         """Note that another frame of odometry begins: displacements in the last one are taken back no more."""
         self._history.keep_displacements()
-        self._rejoined = frozenset()
-
-    def pop_rejoined(self) -> frozenset[int]:
-        """Return the keyframes at which the last explanation believes odometry again, by their vertices, once."""
-        out, self._rejoined = self._rejoined, frozenset()
-        return out
+        self.rejoins = frozenset()
 
     def explain_since(self, first: int) -> None:
         """Explain the scans anew from one on: what they were thought to be is forgotten."""
@@ -295,7 +291,7 @@ class AnonymousLandmarks:
             self._counters.count("landmarks", "undecided", found.undecided)
         if not found.is_whole:
             self._counters.count("landmarks", "moves_left")
-        self._rejoined |= found.rejoined
+        self.rejoins |= found.rejoined
         numbers = found.numbers(self.clusters.given, self.clusters.fresh)
         values = found.carried_to(self._space, self._solver, self._backend.path.keyframes)
         changed, gone = found.changes(self.clusters.given, numbers)

@@ -7,7 +7,6 @@ evidence is a count: held-back sightings that fit the other pose, minus believed
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import cache
 from itertools import combinations, islice
 
 import numpy as np
@@ -17,10 +16,10 @@ from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.lie import se2
 from graph_slam_ros.slam.backend import Backend
+from graph_slam_ros.slam.doubt.connections import Connections, connections_across
 from graph_slam_ros.slam.doubt.record import DisplacementHypothesis, Link
 from graph_slam_ros.slam.doubt.window import REACH_S, Seen, View, Window
 from graph_slam_ros.slam.landmarks.rotations import aligned, are_spread, pose_of
-from graph_slam_ros.slam.robust.connections import Connections, connections_across
 from graph_slam_ros.typing import Array, Index, Numbers
 
 Flags = NDArray[np.bool_]
@@ -68,20 +67,12 @@ class DisplacementSearch:
         self._space, self.window = space, window
         self._backend, self._graph = backend, backend.graph
         self._solver, self._ledger = backend.solver, backend.ledger
-        self._is_supported = False  # whether a sighting of a known landmark is believed since the segment began
-
-    def begin(self) -> None:
-        """A segment begins."""
-        self._is_supported = False
 
     @property
     def held_back_count(self) -> int:
         """The number of the newest sightings of well known landmarks that are held back."""
-        known_from = cache(self.window.known_from)  # many are of the same landmark
-        known = [one.edge for view, one in self._standing() if known_from(one.what) < view.vertex]
-        are_inside = self._ledger.are_inside(known)
-        self._is_supported |= any(are_inside)
-        return len(known) - sum(are_inside)
+        known = [one.edge for view, one in self._standing() if self.window.known_from(one.what) < view.vertex]
+        return self._ledger.are_inside(known).count(False)
 
     def hypothesis(self) -> DisplacementHypothesis | None:
         """The other pose for which the evidence is greatest; None where there is none."""
@@ -152,7 +143,7 @@ class DisplacementSearch:
             np.array([one.heading_variance for one in marks]),
             places,
             np.array([estimate[2] if len(estimate) == 3 and n == 2 else np.nan for estimate in estimates]),
-            np.array(list(map(cache(self.window.known_from), (one.what for one in marks)))),
+            np.array([self.window.known_from(one.what) for one in marks]),
             np.array([self._ledger.is_inside(one.edge) for one in marks]),
             np.array(fits_now),
         )
@@ -240,10 +231,9 @@ class DisplacementSearch:
         if counted[best] <= 0:
             return None
         first = int(firsts[best])
-        if not self._is_supported or (self._has_all and not window.is_in[window.keyframes < first].any()):
+        is_believed = window.is_in & (window.supports < window.keyframes)
+        if self._has_all and not is_believed[window.keyframes < first].any():
             first = max(self.window.first, int(self.vertices[0]))  # nothing supports what came before in this segment
-        else:
-            first = self._after_the_longest_link(first)
         both = since[best] & known[best]
         agreeing = both & (fits if is_earlier else for_it)  # the first that is seen again may fit both poses
         return DisplacementHypothesis(
@@ -265,25 +255,6 @@ class DisplacementSearch:
         off_m, off_rad = self.difference(group.compose(now, group.inverse(chain)), T_map_chain, newest)
         drift_m, drift_rad = self.window.drift_since(link.drift, chain, newest)
         return off_m < _DRIFT * drift_m and off_rad < _DRIFT * drift_rad
-
-    def _after_the_longest_link(self, first: int) -> int:
-        """Return a keyframe, or that after the longest of the links before it between which nothing was seen.
-
-        Nothing tells in which of these links the robot was moved: most probably in the one that took longest.
-        """
-        seen = {view.vertex for view, _ in self._newest()}
-        links, vertices = self.window.links, list(self.window.links)
-        best = k = vertices.index(first)
-        while k > 1 and vertices[k - 1] not in seen and not self._is_measured(vertices[k - 1]):
-            k -= 1
-            if links[vertices[k]].seconds > links[vertices[best]].seconds:
-                best = k
-        return vertices[best]
-
-    def _is_measured(self, keyframe: int) -> bool:
-        """Return whether more than odometry is believed of a keyframe."""
-        edges = self._solver.edges_on(keyframe).tolist()
-        return any(self._ledger.is_inside(one) for one in edges if self._graph.edge(one).label != "odometry")
 
     @property
     def vertices(self) -> Index:

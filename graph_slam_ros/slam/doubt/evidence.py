@@ -4,9 +4,9 @@ An extended Kalman filter of the pose and of all that was seen follows the stret
 that the solver has without these observations. An observation that does not fit costs the same whatever the errors are,
 and changes nothing. So observations that the pipeline holds back are evidence, too, and wrong ones decide nothing.
 
-Hypotheses are that odometry has its own noise (tight), that its errors are larger from a keyframe on (slip), and that
-the robot was moved at one (carried): the generalized likelihood ratio test of Willsky and Jones ("A generalized
-likelihood ratio approach to the detection and estimation of jumps in linear systems", 1976).
+A hypothesis is that odometry is as stated, that its errors are larger over a part of the stretch (it slipped), or that
+the robot was moved at a keyframe: the generalized likelihood ratio test of Willsky and Jones ("A generalized likelihood
+ratio approach to the detection and estimation of jumps in linear systems", 1976).
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -18,16 +18,18 @@ from scipy.linalg.lapack import dpotrf, dpotrs
 from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.graph import Edge, EdgeType, Graph, VertexKind
 from graph_slam_ros.graph.geometry import Geometry
+from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.typing import Array, Index, Numbers
 
-TIGHT, CARRIED = "tight", "carried"
-SLIPS = ("translation", "rotation")
 LOG_ODDS = float(np.log(1e-6))  # of a slip within a stretch of odometry, before anything is seen
-_LOG_ODDS_MOVED = float(np.log(1e-2))  # of a robot that was moved, relative to one that slipped
+LOG_ODDS_MOVED = float(np.log(1e-2))  # of a robot that was moved, relative to one that slipped
 _LEAST_FITTING = 0.6  # part of what was seen since then that a slip must explain
 _CAP = 0.9999  # an observation beyond this quantile does not fit
 _LINEAR_RAD = 0.1  # by which an observation turns the pose: beyond, it is linearised again
 _MOST_LINEARIZATIONS = 5
+_PRIOR_DOF = 20.0  # degrees of freedom that would say that odometry's noise is as stated
+_LARGEST = 3.0
+_UNKNOWN, _KNOWN = 1.5, 1.2  # all noise may be larger by this factor, where it is not measured and where it is
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,51 +38,18 @@ class Hypothesis:
 
     Attributes
     ----------
-    kind : ``tight``, ``translation`` or ``rotation`` (a slip), or ``carried``
-    first : place of the first edge of odometry that it concerns
     variances : (n, dof) that are added to the noise of n edges
-    there : pose in map of the keyframe after the first edge, where the robot was carried
-    log_odds : before anything is seen, relative to ``tight``
+    log_odds : before anything is seen, relative to odometry as it is stated
+    kind : of a slip
+    first : place of the first edge of odometry that it concerns
+    there : pose in map of the keyframe after that edge, where the robot was moved
     """
 
-    kind: str
-    first: int
     variances: Array
+    log_odds: float = 0.0
+    kind: str = ""
+    first: int = 0
     there: Numbers | None = None
-    log_odds: float = LOG_ODDS
-
-
-def carried(first: int, there: Numbers, sigmas: Sequence[float], size: int) -> Hypothesis:
-    """The hypothesis that the robot was moved somewhere across an edge of a stretch of a size."""
-    variances = np.zeros((size, len(sigmas)))
-    variances[first] = np.square(sigmas)
-    return Hypothesis(CARRIED, first, variances, there, LOG_ODDS + _LOG_ODDS_MOVED)
-
-
-@dataclass(frozen=True, slots=True)
-class Choice:
-    """The hypothesis of highest probability.
-
-    Attributes
-    ----------
-    kind, first : of the hypothesis
-    log_ratio : logarithm of the likelihood ratio to ``tight``
-    voters : the number of landmarks, and of other classes of edges, without which that is less
-    is_sure : whether it is above 0 also without any one of them
-    fitting : the part of what was seen since then that fits
-    """
-
-    kind: str
-    first: int
-    log_ratio: float = 0.0
-    voters: int = 0
-    is_sure: bool = False
-    fitting: float = 1.0
-
-    @property
-    def is_slip(self) -> bool:
-        """Return whether at least two landmarks or classes say that odometry slipped, and that explains most of it."""
-        return self.kind in SLIPS and self.is_sure and self.voters >= 2 and self.fitting >= _LEAST_FITTING
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,9 +131,11 @@ class Stretch:
             ]
             for end, every in zip(ends, edges, strict=True)
         ]
-        self._states = [_State(*prior([first, *others]))]  # before each edge, and at the end: tight
+        # before each edge, and at the end: odometry as stated
+        self._states = [_State(*prior([first, *others]))]
+        stated = self.as_stated
         for k in range(len(links)):
-            self._states.append(self._followed(self._states[k].copy(), k, self.tight, None))
+            self._states.append(self._followed(self._states[k].copy(), k, stated, None))
 
     @property
     def size(self) -> int:
@@ -172,25 +143,29 @@ class Stretch:
         return len(self._motions)
 
     @property
-    def tight(self) -> Hypothesis:
+    def as_stated(self) -> Hypothesis:
         """The hypothesis that odometry has its own noise."""
-        return Hypothesis(TIGHT, self.size, np.zeros((self.size, self._space.dof)), log_odds=0.0)
+        return Hypothesis(np.zeros((self.size, self._space.dof)), first=self.size)
 
-    def choice(self, hypotheses: Sequence[Hypothesis]) -> Choice:
-        """Return the best of some hypotheses and ``tight``."""
-        gains = [one.log_odds + 0.5 * (self._states[-1].cost - self._end(one).cost) for one in hypotheses]
-        k = int(np.argmax(gains))
-        best, first = hypotheses[k], hypotheses[k].first
-        if gains[k] <= 0.0 or best.kind not in SLIPS:
-            return Choice(best.kind if gains[k] > 0.0 else TIGHT, first)
-        ratio, voters, is_sure = gains[k] - best.log_odds, 0, True
-        since = [one for of_keyframe in self._seen[first:] for one in of_keyframe]
-        for what in dict.fromkeys(one.what for one in since):
-            without = 0.5 * (self._end(self.tight, what).cost - self._end(best, what).cost)
-            is_sure &= without > 0.0
-            voters += without < ratio
-        unfit = self._end(best).unfit - self._states[first].unfit
-        return Choice(best.kind, first, ratio, voters, is_sure, 1.0 - unfit / max(1, len(since)))
+    def likeliest(self, hypotheses: Sequence[Hypothesis]) -> tuple[Hypothesis, float]:
+        """The hypothesis of highest probability, and the logarithm of its likelihood ratio to odometry as stated."""
+        ratios = [0.5 * (self._states[-1].cost - self._end(one).cost) for one in hypotheses]
+        k = max(range(len(ratios)), key=lambda k: ratios[k] + hypotheses[k].log_odds)
+        return hypotheses[k], ratios[k]
+
+    def voters(self, one: Hypothesis, log_ratio: float) -> int:
+        """The number of landmarks, and of other classes of edges, without which a slip is less likely.
+
+        0 where it is not likelier than none without any one of them, or leaves too much of what was seen unexplained.
+        """
+        since = [seen for of_keyframe in self._seen[one.first :] for seen in of_keyframe]
+        unfit = self._end(one).unfit - self._states[one.first].unfit
+        if unfit > (1.0 - _LEAST_FITTING) * len(since):
+            return 0
+        stated, without = self.as_stated, list[float]()
+        for what in dict.fromkeys(seen.what for seen in since):
+            without.append(0.5 * (self._end(stated, what).cost - self._end(one, what).cost))
+        return sum(ratio < log_ratio for ratio in without) if min(without, default=0.0) > 0.0 else 0
 
     def _end(self, one: Hypothesis, without: int | str | None = None) -> _State:
         """The state at the end of the stretch."""
@@ -262,6 +237,19 @@ def _observed(what: int | str, one: Edge, places: Sequence[tuple[int, Index]]) -
     at, columns = np.array([[stored for stored, _ in places]]), np.concatenate([columns for _, columns in places])
     limit = quantile(_CAP, len(covariance))
     return _Observed(what, one.type, at, columns, one.measured[None], covariance, constant, limit)
+
+
+def measured_noise(space: Geometry, backend: Backend) -> tuple[Array, float]:
+    """Factors (dof,) by which odometry's sigmas are larger than stated, at least 1, and by which all noise may be."""
+    n, of_odometry, others = space.dimensions, np.ones(space.dof), list[float]()
+    for one in backend.noise_scale(("odometry", "landmarks")):
+        if one.label == "odometry" and one.dof > 0.0:
+            variance = (one.per_dof * one.dof + _PRIOR_DOF) / (one.dof + _PRIOR_DOF)
+            part = slice(n) if one.part == "position" else slice(n, None)
+            of_odometry[part] = np.maximum(of_odometry[part], np.sqrt(np.clip(variance, 1.0, _LARGEST**2)))
+        elif one.label == "landmarks" and not one.reason:
+            others.append(one.factor)
+    return of_odometry, _KNOWN * max([1.0, *others]) if others else _UNKNOWN
 
 
 def covariance_of(one: Edge) -> Array:

@@ -11,8 +11,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from graph_slam_ros.graph import Graph
-from graph_slam_ros.graph.geometry import Geometry
-from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.doubt.evidence import covariance_of
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.solver.linearization import linearized
@@ -20,11 +18,7 @@ from graph_slam_ros.typing import Array
 
 _OBSERVED = 0.95  # largest eigenvalue of a direction that other measurements observe
 _LEAST = 1e-6
-_EVERY, _MORE = 100, 0.2  # keyframes since the last time, and as a part of those then: one measurement looks at all
-_PRIOR_DOF = 20.0  # degrees of freedom that would say that odometry's noise is as stated
-_LARGEST = 3.0
-_UNKNOWN, _KNOWN = 1.5, 1.2  # all noise may be larger by this factor, where it is not measured and where it is
-NOISE_FACTOR = 1.5  # all noise may be larger than stated by this factor
+_NOISE_FACTOR = 1.5  # all noise may be larger than stated by this factor
 
 
 class OdometryErrors:
@@ -65,7 +59,7 @@ class OdometryErrors:
 
     def _log_likelihood(self, extra: Array) -> float:
         root = np.linalg.cholesky(np.diag(1.0 + self._variances) + extra)
-        white = np.linalg.solve(root, self._errors / NOISE_FACTOR)
+        white = np.linalg.solve(root, self._errors / _NOISE_FACTOR)
         return float(-np.log(np.diag(root)).sum() - 0.5 * white @ white)
 
 
@@ -74,36 +68,3 @@ def between(graph: Graph, edges: Sequence[int], others: Sequence[int]) -> Array:
     return np.stack(
         [covariance_of(graph.edge(a)) - covariance_of(graph.edge(b)) for a, b in zip(edges, others, strict=True)]
     )
-
-
-class MeasuredNoise:
-    """Factors of noise, measured anew as the drive goes on.
-
-    Attributes
-    ----------
-    of_odometry : (dof,) of its sigmas, at least 1
-    of_all : of all sigmas
-    """
-
-    def __init__(self, space: Geometry, backend: Backend) -> None:
-        self._space, self._backend = space, backend
-        self._measured_at = -_EVERY
-        self.of_odometry, self.of_all = np.ones(space.dof), _UNKNOWN
-
-    def measure(self) -> None:
-        """Measure it, if there are many keyframes more than last time."""
-        keyframes = self._backend.keyframe + 1
-        if keyframes - self._measured_at < max(_EVERY, _MORE * self._measured_at):
-            return
-        self._measured_at, n = keyframes, self._space.dimensions
-        parts = {"position": slice(n), "rotation": slice(n, None)}
-        of_odometry, others = np.ones(self._space.dof), list[float]()
-        for one in self._backend.noise_scale(("odometry", "landmarks")):
-            if one.label == "odometry" and one.dof > 0.0:
-                variance = (one.per_dof * one.dof + _PRIOR_DOF) / (one.dof + _PRIOR_DOF)
-                factor = float(np.sqrt(np.clip(variance, 1.0, _LARGEST**2)))
-                of_odometry[parts[one.part]] = np.maximum(of_odometry[parts[one.part]], factor)
-            elif one.label == "landmarks" and not one.reason:
-                others.append(one.factor)
-        self.of_odometry = of_odometry
-        self.of_all = _KNOWN * max([1.0, *others]) if others else _UNKNOWN

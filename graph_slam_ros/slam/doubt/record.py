@@ -1,4 +1,4 @@
-"""Odometry in doubt: its links, alarms that the robot is elsewhere, displacements, and slips."""
+"""Odometry in doubt: its links, what is doubted of it, and displacements that were decided."""
 
 from dataclasses import dataclass
 
@@ -8,25 +8,31 @@ from graph_slam_ros.typing import Array, Numbers
 
 DOUBT = "odometry"
 """The source that changes of the past for odometry's sake are counted under where they fail."""
+ELSEWHERE = "elsewhere"
+SLIPS = ("translation", "rotation")
 
 
 @dataclass(frozen=True, slots=True)
-class Alarm:
-    """A time when the landmarks said that the robot was elsewhere than odometry.
+class Doubt:
+    """A time when what was seen contradicted odometry.
 
     Attributes
     ----------
     began_ns, ended_ns : stamps of odometry; None while it goes on
-    evidence : sightings more for another pose than for odometry's, at most; 0 where none was found
+    evidence : of a slip, twice the logarithm of the likelihood ratio to none. Else the sightings more for another pose
+        than for odometry's, at most; 0 where none was found
+    kind : ``elsewhere``: the robot is elsewhere than odometry; ``translation`` or ``rotation``: that part of it slipped
     segment : the keyframe, by its index, at which a segment begins since it was decided so; None where it was not
     distance_m, angle_rad : how far the robot was moved there, against odometry
     held_back, tested : when it began, of the newest sightings how many were held back, and all
     determines_pose : whether what is held back can tell a pose; ranges and bearings alone do not
     outcome : what came of it otherwise: it ended undecided since a segment began, or what was decided was taken back
+    decided_ns, landmarks, edges : of a slip: when, how many landmarks and other classes of edges contradict odometry,
+        and how many edges of odometry count for less
     """
 
     began_ns: int
-    evidence: int
+    evidence: float
     ended_ns: int | None = None
     segment: int | None = None
     distance_m: float = 0.0
@@ -35,13 +41,23 @@ class Alarm:
     tested: int = 0
     determines_pose: bool = True
     outcome: str = ""
+    kind: str = ELSEWHERE
+    decided_ns: int | None = None
+    landmarks: int = 0
+    edges: int = 0
 
     def __str__(self) -> str:
-        at = f"{self.began_ns * 1e-9:.1f} s"
+        began, until = f"{self.began_ns * 1e-9:.1f} s", f"{(self.ended_ns or 0) * 1e-9:.1f} s"
+        if self.kind != ELSEWHERE:
+            why = f"{self.landmarks} landmarks or other inputs contradict it, evidence {self.evidence:.0f}"
+            if self.ended_ns is None:
+                return f"odometry in doubt since {began}: its {self.kind} is wrong ({why}); it counts for less"
+            outcome = self.outcome or f"{self.edges} edges of odometry count for less"
+            return f"odometry was in doubt from {began} to {until}: its {self.kind} was wrong ({why}); {outcome}"
         if self.segment is not None:
             moved = f"{self.distance_m:.2f} m and {np.rad2deg(self.angle_rad):.1f} degrees"
             return (
-                f"the landmarks said at {at} that the robot is elsewhere, {moved} from where odometry had it: "
+                f"the landmarks said at {began} that the robot is elsewhere, {moved} from where odometry had it: "
                 f"a segment begins at keyframe {self.segment}{self.outcome and '; '}{self.outcome}"
             )
         why = f"{self.evidence} sightings more than not"
@@ -52,10 +68,9 @@ class Alarm:
             remedy = (
                 "" if self.determines_pose else "; ranges or bearings alone do not determine the pose: give initialpose"
             )
-            return f"the landmarks say since {at} that the robot is elsewhere ({why}){remedy}"
-        until = f"{self.ended_ns * 1e-9:.1f} s"
+            return f"the landmarks say since {began} that the robot is elsewhere ({why}){remedy}"
         outcome = self.outcome or "it was not so"
-        return f"from {at} to {until} the landmarks said that the robot is elsewhere ({why}); {outcome}"
+        return f"from {began} to {until} the landmarks said that the robot is elsewhere ({why}); {outcome}"
 
 
 @dataclass(slots=True)
@@ -120,7 +135,7 @@ class Displacement:
     link, replacement : odometry's edge to it, which is out, and the edge with very large noise that replaces it
     T_map_chain_before, T_map_chain : where the frame of odometry lay before, and lies since
     to_first : odometry to that keyframe, in that frame
-    alarm : its index
+    doubt : its index
     """
 
     first: int
@@ -130,39 +145,4 @@ class Displacement:
     T_map_chain_before: Numbers
     T_map_chain: Numbers
     to_first: Link
-    alarm: int
-
-
-@dataclass(frozen=True, slots=True)
-class Slip:
-    """A stretch of odometry in which its errors are larger than its noise.
-
-    Attributes
-    ----------
-    kind : ``translation`` or ``rotation``
-    began_ns, decided_ns, ended_ns : stamps of odometry; the last is None while it goes on
-    evidence : twice the logarithm of the likelihood ratio of slip to no slip
-    landmarks : the number of landmarks, and of other classes of edges, that contradict odometry
-    edges : the number of odometry edges that were replaced
-    outcome : why it was taken back; empty if it was not
-    segment : always None, because no new segment begins
-    """
-
-    kind: str
-    began_ns: int
-    decided_ns: int
-    evidence: float
-    landmarks: int
-    edges: int = 0
-    ended_ns: int | None = None
-    outcome: str = ""
-    segment: None = None
-
-    def __str__(self) -> str:
-        since = f"{self.began_ns * 1e-9:.1f} s"
-        why = f"{self.landmarks} landmarks or other inputs contradict it, evidence {self.evidence:.0f}"
-        if self.ended_ns is None:
-            return f"odometry in doubt since {since}: its {self.kind} is wrong ({why}); it counts for less"
-        until = f"{self.ended_ns * 1e-9:.1f} s"
-        outcome = self.outcome or f"{self.edges} edges of odometry count for less"
-        return f"odometry was in doubt from {since} to {until}: its {self.kind} was wrong ({why}); {outcome}"
+    doubt: int

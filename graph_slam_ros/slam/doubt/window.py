@@ -9,7 +9,7 @@ however good odometry is. So the worst are left out of it, as many as the rate o
 from collections import Counter, deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, lru_cache
+from functools import lru_cache
 from itertools import islice, takewhile
 from statistics import median
 
@@ -17,14 +17,12 @@ import numpy as np
 from scipy.special import bdtr, betaincinv
 
 from graph_slam_ros.chi_square import quantile
-from graph_slam_ros.graph import Graph
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.doubt.evidence import covariance_of
 from graph_slam_ros.slam.doubt.record import Link
 from graph_slam_ros.slam.frontend import motion_compensation
-from graph_slam_ros.slam.robust.ledger import Ledger
-from graph_slam_ros.typing import Array, Index, Mask, Numbers
+from graph_slam_ros.typing import Array, Mask, Numbers
 
 _KEYFRAMES = 2000  # whose odometry is kept
 _VIEWS = 50  # that are kept
@@ -39,10 +37,6 @@ _RATE_SURE = 0.999  # the rate of wrong ones is at most what it may be with this
 _CALM, _CALM_SURE = 12, 0.99  # newest sightings of which three quarters must agree for an alarm to end
 _SUPPORT, _FIRST = 4, 20  # accepted sightings, of the first so many, that make a landmark one to compare with
 _DOUBTED = 0.3  # part of them that may be held back: else the landmark itself stands at the wrong place
-
-_Judged = tuple[tuple[int, int], list[int], list[int]]
-"""Of a landmark's first sightings: changes of the ledger and the number of those judged; keyframes of those that are
-accepted; edges of those that are held back."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,21 +69,6 @@ class View:
     numbers: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class Contradiction:
-    """Whether the newest sightings of well known landmarks contradict odometry.
-
-    Attributes
-    ----------
-    held_back, count : sightings that are held back, and all
-    is_significant : whether neither noise nor wrong identities explain them
-    """
-
-    held_back: int
-    count: int
-    is_significant: bool
-
-
 class Window:
     """The newest keyframes.
 
@@ -103,7 +82,10 @@ class Window:
 
     def __init__(self, space: Geometry, backend: Backend) -> None:
         self._space, self._backend = space, backend
-        self.history = LandmarkHistory(backend.graph, backend.ledger)
+        self._start = backend.graph.vertex_ids.next  # landmarks of a map that was loaded are known
+        self._surveyed: set[int] = set()
+        self._earliest: dict[int, list[tuple[int, int]]] = {}  # (edge, keyframe) of each landmark's first sightings
+        self._known: dict[int, int] = {}  # what was looked up since the last solve
         self.links: dict[int, Link] = {}
         self.views: deque[View] = deque()
         self.first, self.is_whole = 0, True
@@ -123,8 +105,13 @@ class Window:
     def forget_before(self, first: int) -> None:
         """Forget what has left the graph with the keyframes before one, by its vertex."""
         graph = self._backend.graph
-        self.history.forget_before(first)
-        self.first = max(self.first, first)
+        self.first, self._start = max(self.first, first), first
+        self._earliest = {
+            landmark: [one for one in earliest if graph.edge_ids.has(one[0])]
+            for landmark, earliest in self._earliest.items()
+            if landmark >= first and graph.vertex_ids.has(landmark)
+        }
+        self._known.clear()
         self._new.clear()
         self.links = {end: link for end, link in self.links.items() if end > first}
         for view in self.views:
@@ -154,8 +141,14 @@ class Window:
                 self._leave_behind(self.views.popleft())
         return link
 
+    def add_survey(self, landmark: int) -> None:
+        """Note a landmark, by its vertex, whose position is surveyed."""
+        self._surveyed.add(landmark)
+
     def add_seen(self, edge: int, vertex: int, what: int | str, stamp_ns: int) -> None:
         """Add an edge that was measured from a keyframe: of a landmark, by its vertex, or of another class."""
+        if not isinstance(what, str) and len(earliest := self._earliest.setdefault(what, [])) < _FIRST:
+            earliest.append((edge, vertex))
         if not self.views or self.views[-1].vertex < vertex:
             self.views.append(View(vertex, stamp_ns, []))
             if len(self.views) > _VIEWS:
@@ -196,10 +189,23 @@ class Window:
 
     # -- what it tells -------------------------------------------------------------------------------------------
 
-    def known_from(self, landmark: int) -> int:
-        """The keyframe from which on a landmark was well known, whatever is held back in this window."""
-        oldest = self.views[0].seen[0].edge if self.views else self._backend.graph.edge_ids.next
-        return self.history.known_from(landmark, oldest)
+    def known_from(self, landmark: int | str) -> int:
+        """The keyframe, by its vertex, from which on a landmark was well known; -1 of other classes.
+
+        What is held back in this window tells nothing against it.
+        """
+        if isinstance(landmark, str) or landmark < self._start or landmark in self._surveyed:
+            return -1
+        if landmark not in self._known:
+            graph, ledger = self._backend.graph, self._backend.ledger
+            oldest = self.views[0].seen[0].edge if self.views else graph.edge_ids.next
+            earliest = [one for one in self._earliest[landmark] if one[0] < ledger.ids.next]
+            are_inside = ledger.are_inside(edge for edge, _ in earliest)
+            accepted = [keyframe for (_, keyframe), is_in in zip(earliest, are_inside, strict=True) if is_in]
+            doubted = sum(edge < oldest and not is_in for (edge, _), is_in in zip(earliest, are_inside, strict=True))
+            is_known = len(accepted) >= _SUPPORT and doubted <= _DOUBTED * (doubted + len(accepted))
+            self._known[landmark] = accepted[_SUPPORT - 1] if is_known else graph.vertex_ids.next
+        return self._known[landmark]
 
     @property
     def newest_ns(self) -> int:
@@ -221,8 +227,9 @@ class Window:
     def note_solved(self) -> None:
         """Add the innovations of what came since the last solve to the sums."""
         ledger, usual = self._backend.ledger, self._usual()
+        self._known.clear()
         for view, one in self._new:
-            if one.edge < ledger.ids.next and (isinstance(one.what, str) or self.known_from(one.what) < view.vertex):
+            if one.edge < ledger.ids.next and self.known_from(one.what) < view.vertex:
                 row = ledger.ids.row(one.edge)
                 numbers, statistic = int(ledger.numbers.values[row]), float(ledger.statistic.values[row])
                 self._ratios.append(statistic / quantile(0.5, numbers))
@@ -244,41 +251,38 @@ class Window:
                 return True
         return False
 
-    def contradiction(self) -> Contradiction | None:
-        """Return what the newest sightings tell; None where there are too few."""
+    def contradiction(self) -> tuple[int, int, bool]:
+        """Of the newest sightings, how many are held back, all, and whether they contradict odometry.
+
+        They do where neither noise nor wrong identities explain them; a few tell nothing.
+        """
         newest = list(self._newest())
         if len(newest) < _LEAST:
-            return None
-        innovations, numbers, is_out = self._innovations(newest)
-        order = np.argsort(innovations / numbers, kind="stable")
-        counted = order[: len(order) - _wrong_by_chance(len(order), self._held_back, self._count)]
-        limit = self._backend.decisions.stated_scale * quantile(_SURE, int(numbers[counted].sum()))  # NaN of none
+            return 0, 0, False
+        wrong = _wrong_by_chance(len(newest), self._held_back, self._count)
+        is_beyond, is_out = self._is_beyond(newest, wrong, _SURE)
         landmarks = {newest[k].what for k in np.flatnonzero(is_out).tolist()}
-        is_significant = len(landmarks) >= 2 and float(innovations[counted].sum()) > limit
-        return Contradiction(int(np.count_nonzero(is_out)), len(newest), is_significant)
+        return int(np.count_nonzero(is_out)), len(newest), is_beyond and len(landmarks) >= 2
 
     @property
     def is_calm(self) -> bool:
         """Return whether most of the newest sightings agree with odometry."""
         newest = list(islice(self._newest(), _CALM))
-        if not newest:
-            return False
-        innovations, numbers, _ = self._innovations(newest)
-        counted = np.argsort(innovations / numbers, kind="stable")[: -(-3 * len(newest) // 4)]
-        limit = self._backend.decisions.stated_scale * quantile(_CALM_SURE, int(numbers[counted].sum()))
-        return float(innovations[counted].sum()) <= limit
+        return bool(newest) and not self._is_beyond(newest, len(newest) // 4, _CALM_SURE)[0]
 
-    def _innovations(self, newest: Sequence[Seen]) -> tuple[Array, Index, Mask]:
-        """The costs of some sightings in the present estimate, their numbers, and which are held back."""
+    def _is_beyond(self, newest: Sequence[Seen], left_out: int, sure: float) -> tuple[bool, Mask]:
+        """Whether the costs of sightings now, without the worst, are beyond noise in sum; and which are held back."""
         edges, backend = np.array([one.edge for one in newest]), self._backend
         innovations, numbers = backend.solver.chi2_of(edges)
         is_out = ~np.array(backend.ledger.are_inside(edges.tolist()), dtype=bool)
         innovations[is_out] = backend.decisions.innovations(edges[is_out].tolist())
-        return innovations, numbers, is_out
+        counted = np.argsort(innovations / numbers, kind="stable")[: len(newest) - left_out]
+        limit = backend.decisions.stated_scale * quantile(sure, int(numbers[counted].sum()))  # NaN of none
+        return float(innovations[counted].sum()) > limit, is_out
 
     def _newest(self) -> Iterator[Seen]:
         """The newest sightings of well known landmarks, the newest first."""
-        times, known_from = Counter[int](), cache(self.known_from)
+        times = Counter[int]()
         is_standing = self._backend.ledger.is_standing()
         for view in reversed(self.views):
             for one in reversed(view.seen):
@@ -286,7 +290,7 @@ class Window:
                     return
                 if isinstance(one.what, str) or times[one.what] == _PER_LANDMARK or not is_standing(one.edge):
                     continue
-                if known_from(one.what) < view.vertex:
+                if self.known_from(one.what) < view.vertex:
                     times[one.what] += 1
                     yield one
 
@@ -296,70 +300,3 @@ def _wrong_by_chance(count: int, held_back: int, seen: int) -> int:
     """The most of a count that are wrong, at the rate by which some of those seen were held back."""
     rate = betaincinv(1 + held_back, 1 + seen - held_back, _RATE_SURE)
     return next((k for k in range(count) if bdtr(k, count, rate) >= _SURE), count)
-
-
-class LandmarkHistory:
-    """The first sightings of each landmark.
-
-    Parameters
-    ----------
-    graph, ledger : of the back-end
-    """
-
-    def __init__(self, graph: Graph, ledger: Ledger) -> None:
-        self._graph, self._ledger = graph, ledger
-        self._start = graph.vertex_ids.next  # landmarks of a map that was loaded are known
-        self._surveyed: set[int] = set()
-        self._earliest: dict[int, list[tuple[int, int]]] = {}  # (edge, keyframe) of each landmark's first sightings
-        self._known: dict[int, _Judged] = {}
-
-    def forget_before(self, first: int) -> None:
-        """Forget the sightings that have left the graph; landmarks before a keyframe, by its vertex, are known."""
-        self._start = first
-        self._earliest = {
-            landmark: [one for one in earliest if self._graph.edge_ids.has(one[0])]
-            for landmark, earliest in self._earliest.items()
-            if landmark >= first and self._graph.vertex_ids.has(landmark)
-        }
-        self._known.clear()
-
-    def add_survey(self, landmark: int) -> None:
-        """Note a landmark, by its vertex, whose position is surveyed."""
-        self._surveyed.add(landmark)
-
-    def add(self, edge: int, keyframe: int, landmark: int) -> None:
-        """Note a sighting of a landmark."""
-        earliest = self._earliest.setdefault(landmark, [])
-        if len(earliest) < _FIRST:
-            earliest.append((edge, keyframe))
-
-    def known_from(self, landmark: int, newest: int) -> int:
-        """The keyframe, by its vertex, from which on a landmark was well known.
-
-        Parameters
-        ----------
-        newest : from this edge on a sighting that is held back tells nothing against the landmark
-        """
-        if landmark < self._start or landmark in self._surveyed:
-            return -1
-        _, accepted, held_back = self._judged(landmark)
-        doubted = sum(edge < newest for edge in held_back)
-        if doubted > _DOUBTED * (doubted + len(accepted)):
-            return self._graph.vertex_ids.next
-        return accepted[_SUPPORT - 1] if len(accepted) >= _SUPPORT else self._graph.vertex_ids.next
-
-    def _judged(self, landmark: int) -> _Judged:
-        """The verdicts on the first sightings of a landmark, looked up only where some may have changed."""
-        earliest, end = self._earliest[landmark], self._ledger.ids.next
-        judged = len(earliest)
-        while judged and earliest[judged - 1][0] >= end:
-            judged -= 1
-        as_of = self._ledger.changes, judged
-        known = self._known.get(landmark)
-        if known is None or known[0] != as_of:
-            are_inside = self._ledger.are_inside(edge for edge, _ in earliest[:judged])
-            verdicts = list(zip(earliest, are_inside, strict=False))
-            accepted = [k for (_, k), is_inside in verdicts if is_inside]
-            known = as_of, accepted, [edge for (edge, _), is_inside in verdicts if not is_inside]
-            self._known[landmark] = known
-        return known

@@ -10,9 +10,9 @@ from graph_slam_ros.maps.merge import merge
 from graph_slam_ros.runs.folder import summary_of
 from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.runs.restore import complete, freeze, map_of, record_run, recover
-from graph_slam_ros.slam.doubt.record import Alarm
+from graph_slam_ros.slam.doubt.record import Doubt
 
-ALARM = Alarm(1_010_000_000_000, 30, 1_012_000_000_000, segment=7, distance_m=3.0)
+ALARM = Doubt(1_010_000_000_000, 30, 1_012_000_000_000, segment=7, distance_m=3.0)
 TOLD = asdict(ALARM) | {"text": str(ALARM)}
 EDIT = {"name": "a", "who": "b", "when": "2026-05-04T10:30:00Z", "why": "c", "do": "rename_landmark", "landmark": "1"}
 

@@ -24,7 +24,7 @@ from graph_slam_ros.slam import Closure, Config, Control, Fix, GraphSlam, Odomet
 from graph_slam_ros.slam.association import hindsight
 from graph_slam_ros.slam.association.hindsight import FrozenScans, explained
 from graph_slam_ros.slam.association.presence_check import Presence
-from graph_slam_ros.slam.doubt.record import Slip
+from graph_slam_ros.slam.doubt.record import Doubt
 from graph_slam_ros.slam.lifelong.state import Left
 
 KEYFRAMES, MORE = 700, times(800, 900)
@@ -133,7 +133,7 @@ GOES_ON = {
     "a trial fit": (lambda slam: slam.view._trials._background.begin(lambda: lambda _: None, 0), True),
     "a search": (lambda slam: slam.view.backend._background.begin(lambda: lambda _: None, 0), False),
     "an alarm": (lambda slam: setattr(slam.view.backend, "holds_back", True), False),
-    "a slip": (lambda slam: slam._kidnaps.slip_detector.slips.append(Slip("rotation", 0, 0, 20.0, 2)), False),
+    "a slip": (lambda slam: slam._kidnaps.doubts.append(Doubt(0, 20.0, kind="rotation")), False),
     "an edge that is held back": (lambda slam: slam.view.backend._pending.append(7), False),
     "a solve that failed": (lambda slam: slam.restart(), False),
 }

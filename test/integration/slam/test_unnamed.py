@@ -11,7 +11,6 @@ from graph_slam_ros.graph import R2
 from graph_slam_ros.lie import se2
 from graph_slam_ros.runs.map_file import read_map, write_map
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
-from graph_slam_ros.slam.doubt.record import Slip
 from graph_slam_ros.tools.simulation import Fault, faulty_recording, measurements
 from graph_slam_ros.tools.simulation.recording import VelocityNoise, drive
 from graph_slam_ros.tools.simulation.sensing import RangeBearing
@@ -257,7 +256,7 @@ def test_where_odometry_slips_what_was_seen_since_is_explained_anew():
         if m.stamp_ns > until_ns:
             break
         slam.process(without_ids(m))
-    assert [type(one) for one in slam.view.alarms] == [Slip]
+    assert [one.kind for one in slam.view.alarms] == ["translation"]
     assert path_rmse(slam.view, recording) < 0.5
     assert nearest_true(slam.view, recording)[1].max() < 1.0
 

@@ -89,5 +89,5 @@ def test_the_likelihood_ratio_is_that_of_one_covariance_of_all_that_was_seen():
         prior = prior_of(graph, joint, ids[1])
         stretch = Stretch(PLANAR, graph, [graph.edge(link) for link in links], seen, prior, np.ones(3), NOISE_FACTOR)
         costs = [dense_cost(graph, links, seen, joint, ids, added) for added in (0.0 * variances, variances)]
-        choice = stretch.choice([Hypothesis("translation", SLIPPED, variances, log_odds=1e3)])
-        assert 2.0 * choice.log_ratio == pytest.approx(costs[0] - costs[1], abs=2e-3)
+        _, log_ratio = stretch.likeliest([Hypothesis(variances, kind="translation", first=SLIPPED)])
+        assert 2.0 * log_ratio == pytest.approx(costs[0] - costs[1], abs=2e-3)
